@@ -1,0 +1,176 @@
+"""Checks at the rim: every public function asks here whether its input makes sense, before it computes anything.
+
+Each check returns the value as the code below wants it (a float64 array, a float) or raises :class:`InputError`, whose message names
+the value, the place (name and index) and the remedy. Kernels check nothing.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+from types import EllipsisType
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+UNIT_NORM_TOLERANCE = 1e-6
+"""A quaternion whose norm is off by more than this is taken for a mistake, not for rounding (float32 files stay below it)."""
+
+ROUNDING = 1e-14
+"""Norm errors below this are left as they are."""
+
+
+class InputError(ValueError):
+    """Bad input: the message names the value, the place and the remedy."""
+
+
+def _place(name: str, index: tuple[np.intp, ...]) -> str:
+    return f"{name}[{', '.join(str(int(i)) for i in index)}]" if index else name
+
+
+def _first(mask: NDArray[np.bool_]) -> tuple[np.intp, ...]:
+    return tuple(np.argwhere(mask)[0]) if mask.ndim else ()
+
+
+def array(name: str, value: ArrayLike, shape: Sequence[int | str | EllipsisType], *, allow_nan: bool = False) -> Array:
+    """Return ``value`` as a finite float64 array of the given shape.
+
+    Parameters
+    ----------
+    name : str
+        What the caller calls it; named in the error.
+    value : array_like
+    shape : sequence
+        One entry an axis: an ``int`` is exact, a ``str`` names a free length, a leading ``...`` any leading axes.
+    allow_nan : bool
+        Let NaN through (it marks missing samples); infinities never pass.
+    """
+    try:
+        result = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} is not an array of numbers ({error}); pass floats") from None
+    tail = list(shape[1:]) if shape and shape[0] is ... else list(shape)
+    wanted = "(" + ", ".join("..." if s is ... else str(s) for s in shape) + ("," if len(shape) == 1 else "") + ")"
+    free = bool(shape) and shape[0] is ...
+    axes = result.shape[len(result.shape) - len(tail) :] if result.ndim >= len(tail) else None
+    if axes is None or (not free and result.ndim != len(tail)):
+        raise InputError(f"{name} has shape {result.shape}, wanted {wanted}; reshape it or check what was passed")
+    for have, want in zip(axes, tail, strict=True):
+        if isinstance(want, int) and have != want:
+            raise InputError(f"{name} has shape {result.shape}, wanted {wanted}; reshape it or check what was passed")
+    bad = np.isinf(result) if allow_nan else ~np.isfinite(result)
+    if bad.any():
+        index = _first(bad)
+        raise InputError(f"{_place(name, index)} is {result[index]}; remove or interpolate such samples first")
+    return result
+
+
+def positive(name: str, value: float, *, unit: str = "") -> float:
+    """Return ``value`` as a float above zero."""
+    number = finite(name, value, unit=unit)
+    if number <= 0.0:
+        raise InputError(f"{name} is {number:g}{_unit(unit)}; it must be greater than zero")
+    return number
+
+
+def non_negative(name: str, value: float, *, unit: str = "") -> float:
+    """Return ``value`` as a float of zero or more."""
+    number = finite(name, value, unit=unit)
+    if number < 0.0:
+        raise InputError(f"{name} is {number:g}{_unit(unit)}; it must not be negative")
+    return number
+
+
+def finite(name: str, value: float, *, unit: str = "") -> float:
+    """Return ``value`` as a finite float."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} is {value!r}; it must be one number{_unit(unit, ' in ')}") from None
+    if not np.isfinite(number):
+        raise InputError(f"{name} is {number}; it must be a finite number{_unit(unit, ' in ')}")
+    return number
+
+
+def count(name: str, value: int, *, least: int = 1) -> int:
+    """Return ``value`` as a whole number of at least ``least``."""
+    if isinstance(value, bool) or int(value) != value or value < least:
+        raise InputError(f"{name} is {value!r}; it must be a whole number of {least} or more")
+    return int(value)
+
+
+def _unit(unit: str, glue: str = " ") -> str:
+    return f"{glue}{unit}" if unit else ""
+
+
+def unit_quaternions(name: str, value: ArrayLike) -> Array:
+    """Return ``value`` as an array (..., 4) of unit quaternions; the norm errors of single precision are normalised away.
+
+    Those of double-precision rounding are left, so that a state handed on is the same to the bit.
+    """
+    q = array(name, value, (..., 4))
+    norm = np.linalg.norm(q, axis=-1)
+    bad = np.abs(norm - 1.0) > UNIT_NORM_TOLERANCE
+    if np.any(bad):
+        index = _first(bad)
+        raise InputError(
+            f"{_place(name, index)} has norm {norm[index]:.9g}, not 1; normalise it (quaternion.normalize) "
+            "and check that it is a quaternion, scalar first"
+        )
+    return np.asarray(np.where(np.abs(norm - 1.0)[..., None] > ROUNDING, q / norm[..., None], q))
+
+
+def increasing(name: str, time: ArrayLike, *, least: int = 1) -> Array:
+    """Return ``time`` as an array (n,) of strictly increasing stamps, s."""
+    stamps = array(name, time, ("n",))
+    if len(stamps) < least:
+        raise InputError(f"{name} has {len(stamps)} stamps; at least {least} are needed")
+    steps = np.diff(stamps)
+    if np.any(steps <= 0.0):
+        k = int(np.argmax(steps <= 0.0))
+        what = "repeats" if steps[k] == 0.0 else "goes back to"
+        raise InputError(
+            f"{name}[{k + 1}] {what} {stamps[k + 1]:.9g} s after {stamps[k]:.9g} s; sort the stamps and drop repeated ones"
+        )
+    return stamps
+
+
+def covariance(name: str, value: ArrayLike, size: int) -> Array:
+    """Return ``value`` as a symmetric positive-definite matrix (size, size)."""
+    matrix = array(name, value, (size, size))
+    if not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0.0):
+        i, j = _first(~np.isclose(matrix, matrix.T, rtol=1e-9, atol=0.0))
+        raise InputError(
+            f"{name} is not symmetric: [{i}, {j}] is {matrix[i, j]:g} but [{j}, {i}] is {matrix[j, i]:g}; use ½(P + Pᵀ)"
+        )
+    # Scaled to unit diagonal first, so that rad² beside (rad/s)² does not look indefinite.
+    scale = np.sqrt(np.diag(matrix)) if np.all(np.diag(matrix) > 0.0) else np.full(size, np.nan)
+    least = (
+        float(np.linalg.eigvalsh(matrix / np.outer(scale, scale))[0])
+        if np.all(scale > 0.0)
+        else float(np.diag(matrix).min())
+    )
+    if not least > 0.0:
+        raise InputError(
+            f"{name} is not positive definite: its least (scaled) eigenvalue is {least:.3g}; "
+            "give every state a variance above zero"
+        )
+    return matrix
+
+
+def one_of(name: str, value: str, choices: Iterable[str]) -> str:
+    """Return ``value`` if it is one of ``choices``; the error suggests the nearest."""
+    known = list(choices)
+    if value in known:
+        return value
+    near = difflib.get_close_matches(str(value), known, n=1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    raise InputError(f"{name} {value!r} is not known{hint} (known: {', '.join(known)})")
+
+
+def known_keys(place: str, given: Iterable[str], known: Iterable[str]) -> None:
+    """Refuse keys that nothing reads, naming the nearest known one."""
+    for key in given:
+        one_of(f"{place}: key", key, known)
