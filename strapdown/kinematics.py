@@ -1,0 +1,113 @@
+"""Kinematics of attitude: rates and quaternion derivatives, equations (3), (4), (15)–(17), and the Jacobians of the rotation vector.
+
+Equation numbers are those of *Quaternion differentiation*, the document this project comes from. It writes one letter W for both
+rates; here ``w_b`` is the angular velocity in body axes, ``w_f`` the same vector in fixed axes, rad/s, shapes (..., 3).
+"""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from strapdown import quaternion
+from strapdown.checks import Array, array
+
+
+def _pure(v: Array) -> Array:
+    """Return vectors as quaternions with zero scalar part, equation (2)."""
+    return np.concatenate([np.zeros((*v.shape[:-1], 1)), v], axis=-1)
+
+
+def fixed_quaternion_derivative(q: ArrayLike, w_f: ArrayLike) -> Array:
+    """Return q̇ = ½ W ⊗ q, equation (3) (its components are (4)), for the rate in fixed axes."""
+    return 0.5 * quaternion.multiply(_pure(array("w_f", w_f, (..., 3))), q)
+
+
+def body_quaternion_derivative(q: ArrayLike, w_b: ArrayLike) -> Array:
+    """Return q̇ = ½ q ⊗ W̄, equation (17), for the rate in body axes. The process model of the filters."""
+    return 0.5 * quaternion.multiply(q, _pure(array("w_b", w_b, (..., 3))))
+
+
+def fixed_rate(q: ArrayLike, q_dot: ArrayLike) -> Array:
+    """Return w_f, the vector part of 2 q̇ ⊗ q⁻¹, equation (15), rad/s in fixed axes."""
+    return 2.0 * quaternion.multiply(q_dot, quaternion.inverse(q))[..., 1:]
+
+
+def body_rate(q: ArrayLike, q_dot: ArrayLike) -> Array:
+    """Return w_b, the vector part of 2 q⁻¹ ⊗ q̇, the body twin of equation (15), rad/s in body axes."""
+    return 2.0 * quaternion.multiply(quaternion.inverse(q), q_dot)[..., 1:]
+
+
+def body_to_fixed_rate(q: ArrayLike, w_b: ArrayLike) -> Array:
+    """Return w_f = q ⊗ w_b ⊗ q⁻¹, equation (16)."""
+    return quaternion.rotate(q, w_b)
+
+
+def fixed_to_body_rate(q: ArrayLike, w_f: ArrayLike) -> Array:
+    """Return w_b = q⁻¹ ⊗ w_f ⊗ q, equation (16) the other way."""
+    return quaternion.rotate(quaternion.conjugate(q), w_f)
+
+
+def skew(v: ArrayLike) -> Array:
+    """Return the skew matrices [v] (..., 3, 3) with [v] u = v × u."""
+    vector = array("v", v, (..., 3))
+    result = np.zeros((*vector.shape[:-1], 3, 3))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        result[..., k, j] = vector[..., i]
+        result[..., j, k] = -vector[..., i]
+    return result
+
+
+# Series and closed form meet at θ² = 4, where the closed forms below have lost no more than two bits and the series have converged.
+_JOIN = 4.0
+_THIRD = np.array([(-1.0) ** k / math.factorial(2 * k + 3) for k in range(15)])
+
+
+def _bernoulli_coefficients(terms: int) -> Array:
+    """Return the Taylor coefficients of (1 − (θ/2) cot(θ/2))/θ² in θ²: |B₂ₖ|/(2k)!, k = 1, 2, …, from exact rationals."""
+    numbers = [Fraction(1)]
+    for m in range(1, 2 * terms + 1):
+        numbers.append(-sum((math.comb(m + 1, k) * numbers[k] for k in range(m)), Fraction(0)) / (m + 1))
+    return np.array([float(abs(numbers[2 * k]) / math.factorial(2 * k)) for k in range(1, terms + 1)])
+
+
+_INVERSE = _bernoulli_coefficients(20)
+
+
+def _joined(x: Array, coefficients: Array, closed_form: Array) -> Array:
+    return np.asarray(
+        np.where(x < _JOIN, np.polynomial.polynomial.polyval(np.minimum(x, _JOIN), coefficients), closed_form)
+    )
+
+
+def right_jacobian(rotation_vector: ArrayLike) -> Array:
+    """Return J_r(φ) (..., 3, 3): exp(φ + δ) = exp(φ) ⊗ exp(J_r(φ) δ) to first order in δ, and w_b = J_r(φ) φ̇.
+
+    ``J_r = I − (1 − cos θ)/θ² [φ] + (θ − sin θ)/θ³ [φ]²``, θ = |φ| (Solà, Deray, Atchuthan 2018, *A micro Lie theory*, eq. (143)).
+    """
+    phi = array("rotation_vector", rotation_vector, (..., 3))
+    theta = np.linalg.norm(phi, axis=-1)
+    x, safe = theta * theta, np.maximum(theta, math.sqrt(_JOIN))
+    sinc_half = np.sinc(theta / (2.0 * math.pi))  # (1 − cos θ)/θ² = ½ sinc²(θ/2) loses no digits at any θ
+    third = _joined(x, _THIRD, (safe - np.sin(safe)) / safe**3)
+    cross = skew(phi)
+    return np.asarray(
+        np.eye(3) - (0.5 * sinc_half**2)[..., None, None] * cross + third[..., None, None] * (cross @ cross)
+    )
+
+
+def inverse_right_jacobian(rotation_vector: ArrayLike) -> Array:
+    """Return J_r(φ)⁻¹ (..., 3, 3): φ̇ = J_r(φ)⁻¹ w_b, the Bortz equation. For |φ| < 2π.
+
+    ``J_r⁻¹ = I + ½ [φ] + (1 − (θ/2) cot(θ/2))/θ² [φ]²`` (Solà et al. 2018, eq. (144); Bortz 1971, eq. (12)).
+    """
+    phi = array("rotation_vector", rotation_vector, (..., 3))
+    theta = np.linalg.norm(phi, axis=-1)
+    x, safe = theta * theta, np.maximum(theta, math.sqrt(_JOIN))
+    factor = _joined(x, _INVERSE, (1.0 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2)
+    cross = skew(phi)
+    return np.asarray(np.eye(3) + 0.5 * cross + factor[..., None, None] * (cross @ cross))

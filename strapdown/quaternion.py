@@ -1,0 +1,168 @@
+"""Quaternion algebra: Hamilton product, scalar first ``(w, x, y, z)``, shape ``(..., 4)``, vectorised over leading axes.
+
+A unit quaternion ``q_fb`` takes body vectors to the fixed frame, ``v_f = q_fb ⊗ v_b ⊗ q_fb⁻¹`` (equation (5) of the source document).
+Equation numbers below are those of *Quaternion differentiation*, the document this project comes from.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from strapdown.checks import Array, InputError, array, unit_quaternions
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
+IDENTITY: Array = np.array([1.0, 0.0, 0.0, 0.0])
+IDENTITY.flags.writeable = False
+
+ROTATION_MATRIX_TOLERANCE = 1e-6
+"""Largest entry of ``R Rᵀ − I`` that is taken for rounding."""
+
+
+def multiply(p: ArrayLike, q: ArrayLike) -> Array:
+    """Return the Hamilton product p ⊗ q, shapes (..., 4) broadcast; neither need be of unit norm."""
+    a, b = array("p", p, (..., 4)), array("q", q, (..., 4))
+    pw, px, py, pz = np.moveaxis(a, -1, 0)
+    qw, qx, qy, qz = np.moveaxis(b, -1, 0)
+    return np.stack(
+        [
+            pw * qw - px * qx - py * qy - pz * qz,
+            pw * qx + px * qw + py * qz - pz * qy,
+            pw * qy - px * qz + py * qw + pz * qx,
+            pw * qz + px * qy - py * qx + pz * qw,
+        ],
+        axis=-1,
+    )
+
+
+def conjugate(q: ArrayLike) -> Array:
+    """Return the conjugate (w, −x, −y, −z)."""
+    return np.asarray(array("q", q, (..., 4)) * np.array([1.0, -1.0, -1.0, -1.0]))
+
+
+def inverse(q: ArrayLike) -> Array:
+    """Return q⁻¹, the conjugate divided by the *squared* norm, so that q ⊗ q⁻¹ = 1 (8) for any norm but zero."""
+    value = array("q", q, (..., 4))
+    squared = np.sum(value * value, axis=-1, keepdims=True)
+    _refuse_zero(squared[..., 0] == 0.0)
+    return np.asarray(conjugate(value) / squared)
+
+
+def normalize(q: ArrayLike) -> Array:
+    """Return q / |q|; a zero quaternion is refused."""
+    value = array("q", q, (..., 4))
+    norm = np.linalg.norm(value, axis=-1, keepdims=True)
+    _refuse_zero(norm[..., 0] == 0.0)
+    return np.asarray(value / norm)
+
+
+def _refuse_zero(zero: np.ndarray) -> None:
+    if np.any(zero):
+        place = [int(i) for i in np.argwhere(zero)[0]] if zero.ndim else []
+        raise InputError(f"q{place or ''} is the zero quaternion, which has no direction; remove it")
+
+
+def rotate(q: ArrayLike, v: ArrayLike) -> Array:
+    """Return q ⊗ v ⊗ q⁻¹ (5): a body vector in the fixed frame, for unit ``q_fb`` (..., 4) and ``v_b`` (..., 3).
+
+    Rotate by ``conjugate(q)`` for the way back.
+    """
+    value = unit_quaternions("q", q)
+    vector = array("v", v, (..., 3))
+    w, u = value[..., :1], value[..., 1:]
+    # v + 2 w (u × v) + 2 u × (u × v): no matrix, no loss for small angles
+    t = 2.0 * np.cross(u, vector)
+    return np.asarray(vector + w * t + np.cross(u, t))
+
+
+def exp(rotation_vector: ArrayLike) -> Array:
+    """Return the unit quaternion (cos θ/2, φ/θ sin θ/2) of a rotation vector φ (..., 3), rad, θ = |φ|. Any θ."""
+    phi = array("rotation_vector", rotation_vector, (..., 3))
+    half = 0.5 * np.linalg.norm(phi, axis=-1, keepdims=True)
+    # sin x / x needs no series: the quotient is accurate for every x but zero.
+    safe = np.where(half > 0.0, half, 1.0)
+    sinc = np.where(half > 0.0, np.sin(safe) / safe, 1.0)
+    return np.concatenate([np.cos(half), 0.5 * sinc * phi], axis=-1)
+
+
+def log(q: ArrayLike) -> Array:
+    """Return the rotation vector (..., 3), rad, of unit quaternions; the shorter way round, |φ| ≤ π.
+
+    ``q`` and ``−q`` are the same attitude and give the same vector.
+    """
+    value = unit_quaternions("q", q)
+    w, u = value[..., :1], value[..., 1:]
+    # Scaled by its largest entry, so that the squares of a 1e-200 rad rotation do not underflow.
+    largest = np.max(np.abs(u), axis=-1, keepdims=True)
+    scale = np.where(largest > 0.0, largest, 1.0)
+    norm = scale * np.linalg.norm(u / scale, axis=-1, keepdims=True)
+    sign = np.where(w < 0.0, -1.0, 1.0)
+    safe = np.where(norm > 0.0, norm, 1.0)
+    factor = np.where(norm > 0.0, 2.0 * np.arctan2(norm, np.abs(w)) / safe, 2.0)
+    return np.asarray(sign * factor * u)
+
+
+def to_matrix(q: ArrayLike) -> Array:
+    """Return the rotation matrix R_fb (..., 3, 3) of unit quaternions q_fb: v_f = R_fb v_b."""
+    from strapdown.kernels.rotation import rotation_matrix
+
+    value = unit_quaternions("q", q)
+    entries = rotation_matrix(tuple(np.moveaxis(value, -1, 0)))
+    return np.stack(entries, axis=-1).reshape(*value.shape[:-1], 3, 3)
+
+
+def from_matrix(matrix: ArrayLike) -> Array:
+    """Return unit quaternions q_fb (..., 4), w ≥ 0, of rotation matrices R_fb (..., 3, 3).
+
+    Shepperd's method: the largest of the four components is computed first, so no branch divides by a small number.
+
+    Raises
+    ------
+    InputError
+        If a matrix is not orthogonal or is a reflection.
+    """
+    R = array("matrix", matrix, (..., 3, 3))
+    defect = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(axis=(-2, -1))
+    if np.any(defect > ROTATION_MATRIX_TOLERANCE):
+        raise InputError(
+            f"matrix is not orthogonal: an entry of R Rᵀ − I is {np.max(defect):.3g}; orthonormalise it first"
+        )
+    if np.any(np.linalg.det(R) < 0.0):
+        raise InputError("matrix is a reflection (determinant −1), not a rotation; check the signs of its axes")
+    trace = np.trace(R, axis1=-2, axis2=-1)
+    diagonal = np.diagonal(R, axis1=-2, axis2=-1)
+    # Rows of 4 q qᵀ: the row of the largest component, normalised, is the quaternion.
+    outer = np.empty((*R.shape[:-2], 4, 4))
+    outer[..., 0, 0] = 1.0 + trace
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        outer[..., i + 1, i + 1] = 1.0 + 2.0 * diagonal[..., i] - trace
+        outer[..., 0, i + 1] = outer[..., i + 1, 0] = R[..., k, j] - R[..., j, k]
+        outer[..., i + 1, j + 1] = outer[..., j + 1, i + 1] = R[..., i, j] + R[..., j, i]
+    best = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
+    row = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
+    q = row / np.linalg.norm(row, axis=-1, keepdims=True)
+    return np.asarray(np.where(q[..., :1] < 0.0, -q, q))
+
+
+def to_rotation(q: ArrayLike) -> Rotation:
+    """Return the ``scipy.spatial.transform.Rotation`` that takes body vectors to the fixed frame (its storage is scalar last)."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_quat(np.roll(unit_quaternions("q", q), -1, axis=-1))
+
+
+def from_rotation(rotation: Rotation) -> Array:
+    """Return unit quaternions q_fb, scalar first, of a SciPy ``Rotation`` that takes body vectors to the fixed frame."""
+    return np.roll(np.asarray(rotation.as_quat(), dtype=np.float64), 1, axis=-1)
+
+
+def angle_between(p: ArrayLike, q: ArrayLike) -> Array:
+    """Return the angle (...,), rad in [0, π], of the rotation that takes attitude p to attitude q. Accurate for tiny angles too."""
+    return np.asarray(
+        np.linalg.norm(log(multiply(conjugate(unit_quaternions("p", p)), unit_quaternions("q", q))), axis=-1)
+    )
