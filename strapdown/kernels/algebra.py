@@ -1,0 +1,206 @@
+"""Vectors, 3×3 matrices and symmetric matrices as tuples of scalars.
+
+A 3-vector is a 3-tuple, a 3×3 matrix a 9-tuple by rows, a symmetric one the 6-tuple of its upper triangle (00, 01, 02, 11, 12, 22).
+The scalars may be Python floats, numba scalars, lanes, or NumPy arrays.
+"""
+
+from __future__ import annotations
+
+import math
+
+
+def square_root(x):
+    """Return √x (the lanes overload this one function)."""
+    return math.sqrt(x)
+
+
+def dot(a, b):
+    """Return a · b."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def cross(a, b):
+    """Return a × b."""
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+def add(a, b):
+    """Return a + b of two 3-vectors."""
+    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
+
+
+def subtract(a, b):
+    """Return a − b of two 3-vectors."""
+    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
+
+
+def scale(s, a):
+    """Return s a of a scalar and a 3-vector."""
+    return (s * a[0], s * a[1], s * a[2])
+
+
+def combine(s, a, t, b):
+    """Return s a + t b of scalars and 3-vectors."""
+    return (s * a[0] + t * b[0], s * a[1] + t * b[1], s * a[2] + t * b[2])
+
+
+def matrix_times_vector(A, v):
+    """Return A v."""
+    return (
+        A[0] * v[0] + A[1] * v[1] + A[2] * v[2],
+        A[3] * v[0] + A[4] * v[1] + A[5] * v[2],
+        A[6] * v[0] + A[7] * v[1] + A[8] * v[2],
+    )
+
+
+def transpose_times_vector(A, v):
+    """Return Aᵀ v."""
+    return (
+        A[0] * v[0] + A[3] * v[1] + A[6] * v[2],
+        A[1] * v[0] + A[4] * v[1] + A[7] * v[2],
+        A[2] * v[0] + A[5] * v[1] + A[8] * v[2],
+    )
+
+
+def symmetric_times_vector(S, v):
+    """Return S v of a symmetric matrix."""
+    return (
+        S[0] * v[0] + S[1] * v[1] + S[2] * v[2],
+        S[1] * v[0] + S[3] * v[1] + S[4] * v[2],
+        S[2] * v[0] + S[4] * v[1] + S[5] * v[2],
+    )
+
+
+def multiply(A, B):
+    """Return A B."""
+    return (
+        A[0] * B[0] + A[1] * B[3] + A[2] * B[6],
+        A[0] * B[1] + A[1] * B[4] + A[2] * B[7],
+        A[0] * B[2] + A[1] * B[5] + A[2] * B[8],
+        A[3] * B[0] + A[4] * B[3] + A[5] * B[6],
+        A[3] * B[1] + A[4] * B[4] + A[5] * B[7],
+        A[3] * B[2] + A[4] * B[5] + A[5] * B[8],
+        A[6] * B[0] + A[7] * B[3] + A[8] * B[6],
+        A[6] * B[1] + A[7] * B[4] + A[8] * B[7],
+        A[6] * B[2] + A[7] * B[5] + A[8] * B[8],
+    )
+
+
+def multiply_add(A, B, S):
+    """Return A B + S, summed so that every product fuses with an addition."""
+    return (
+        A[0] * B[0] + (A[1] * B[3] + (A[2] * B[6] + S[0])),
+        A[0] * B[1] + (A[1] * B[4] + (A[2] * B[7] + S[1])),
+        A[0] * B[2] + (A[1] * B[5] + (A[2] * B[8] + S[2])),
+        A[3] * B[0] + (A[4] * B[3] + (A[5] * B[6] + S[3])),
+        A[3] * B[1] + (A[4] * B[4] + (A[5] * B[7] + S[4])),
+        A[3] * B[2] + (A[4] * B[5] + (A[5] * B[8] + S[5])),
+        A[6] * B[0] + (A[7] * B[3] + (A[8] * B[6] + S[6])),
+        A[6] * B[1] + (A[7] * B[4] + (A[8] * B[7] + S[7])),
+        A[6] * B[2] + (A[7] * B[5] + (A[8] * B[8] + S[8])),
+    )
+
+
+def transpose(A):
+    """Return Aᵀ."""
+    return (A[0], A[3], A[6], A[1], A[4], A[7], A[2], A[5], A[8])
+
+
+def full(S):
+    """Return a symmetric matrix as a 9-tuple."""
+    return (S[0], S[1], S[2], S[1], S[3], S[4], S[2], S[4], S[5])
+
+
+def add_matrices(A, B):
+    """Return A + B of two 9-tuples."""
+    return (
+        A[0] + B[0],
+        A[1] + B[1],
+        A[2] + B[2],
+        A[3] + B[3],
+        A[4] + B[4],
+        A[5] + B[5],
+        A[6] + B[6],
+        A[7] + B[7],
+        A[8] + B[8],
+    )
+
+
+def add_to_diagonal(S, d):
+    """Return S + d I of a symmetric matrix."""
+    return (S[0] + d, S[1], S[2], S[3] + d, S[4], S[5] + d)
+
+
+def times_transpose_upper(A, B):
+    """Return the upper triangle of A Bᵀ, known to be symmetric."""
+    return (
+        A[0] * B[0] + A[1] * B[1] + A[2] * B[2],
+        A[0] * B[3] + A[1] * B[4] + A[2] * B[5],
+        A[0] * B[6] + A[1] * B[7] + A[2] * B[8],
+        A[3] * B[3] + A[4] * B[4] + A[5] * B[5],
+        A[3] * B[6] + A[4] * B[7] + A[5] * B[8],
+        A[6] * B[6] + A[7] * B[7] + A[8] * B[8],
+    )
+
+
+def times_transpose_upper_add(A, B, S):
+    """Return the upper triangle of A Bᵀ + S, summed so that every product fuses with an addition (S symmetric, 6-tuple)."""
+    return (
+        A[0] * B[0] + (A[1] * B[1] + (A[2] * B[2] + S[0])),
+        A[0] * B[3] + (A[1] * B[4] + (A[2] * B[5] + S[1])),
+        A[0] * B[6] + (A[1] * B[7] + (A[2] * B[8] + S[2])),
+        A[3] * B[3] + (A[4] * B[4] + (A[5] * B[5] + S[3])),
+        A[3] * B[6] + (A[4] * B[7] + (A[5] * B[8] + S[4])),
+        A[6] * B[6] + (A[7] * B[7] + (A[8] * B[8] + S[5])),
+    )
+
+
+def minus_outer(A, a, b):
+    """Return A − a bᵀ."""
+    return (
+        A[0] - a[0] * b[0],
+        A[1] - a[0] * b[1],
+        A[2] - a[0] * b[2],
+        A[3] - a[1] * b[0],
+        A[4] - a[1] * b[1],
+        A[5] - a[1] * b[2],
+        A[6] - a[2] * b[0],
+        A[7] - a[2] * b[1],
+        A[8] - a[2] * b[2],
+    )
+
+
+def symmetric_minus_outer(S, a, b):
+    """Return S − a bᵀ, known to be symmetric."""
+    return (
+        S[0] - a[0] * b[0],
+        S[1] - a[0] * b[1],
+        S[2] - a[0] * b[2],
+        S[3] - a[1] * b[1],
+        S[4] - a[1] * b[2],
+        S[5] - a[2] * b[2],
+    )
+
+
+def skew_polynomial(identity, linear, quadratic, v):
+    """Return ``identity`` I + ``linear`` [v] + ``quadratic`` [v]², with [v] the skew matrix of v and [v]² = v vᵀ − |v|² I."""
+    xx = v[0] * v[0]
+    yy = v[1] * v[1]
+    zz = v[2] * v[2]
+    xy = quadratic * (v[0] * v[1])
+    xz = quadratic * (v[0] * v[2])
+    yz = quadratic * (v[1] * v[2])
+    x = linear * v[0]
+    y = linear * v[1]
+    z = linear * v[2]
+    return (
+        identity - quadratic * (yy + zz),
+        xy - z,
+        xz + y,
+        xy + z,
+        identity - quadratic * (xx + zz),
+        yz - x,
+        xz - y,
+        yz + x,
+        identity - quadratic * (xx + yy),
+    )

@@ -1,0 +1,139 @@
+"""The filter over one whole record: the scalar machine. Compiled by :func:`strapdown.kernels.machine.compiled`."""
+
+from __future__ import annotations
+
+import math
+
+from strapdown.kernels.algebra import dot, matrix_times_vector, scale, transpose_times_vector
+from strapdown.kernels.filter_step import predict, update_direction, update_heading
+from strapdown.kernels.rotation import rotation_matrix
+from strapdown.kernels.series import LARGEST_ANGLE
+
+DIRECTION = 0
+"""Kind of an event: a unit direction, two degrees of freedom."""
+VECTOR = 1
+"""Kind of an event: a whole vector over the length of its reference, three degrees of freedom."""
+HEADING = 2
+"""Kind of an event: a body vector of which only the heading of its horizontal part is used, one degree of freedom."""
+
+
+def vector_at(array, k):
+    """Return row k of an (n, 3) array as a 3-tuple."""
+    return (array[k, 0], array[k, 1], array[k, 2])
+
+
+def heading_error(R, z, reference):
+    """Return the angle about the fixed z axis from the horizontal part of R z to that of ``reference``, rad in (−π, π]."""
+    x, y, _ = matrix_times_vector(R, z)
+    return math.atan2(x * reference[1] - y * reference[0], x * reference[0] + y * reference[1])
+
+
+def run_filter(
+    edges,
+    increments,
+    angle_variance,
+    rate_variance,
+    event_time,
+    event_kind,
+    event_value,
+    event_variance,
+    event_reference,
+    triads,
+    state,
+    every,
+    attitude_out,
+    bias_out,
+    variance_out,
+    covariance_out,
+    innovation_out,
+):
+    """Run the filter over a record; events are sorted by time and lie between the first and the last edge.
+
+    The interval from ``edges[k]`` to ``edges[k + 1]`` is split at the times of the events inside it. ``state`` holds (q, b, A, B, C) as
+    28 numbers and is left at the end state, so a run may be continued. Row j of the outputs is the state after ``every · j`` intervals;
+    ``covariance_out`` (blocks A, B, C as 21 numbers) may be empty. ``innovation_out`` gets e₁, s₁, e₂, s₂, e₃, s₃ of each event:
+    independent innovations and their variances, as many as it has degrees of freedom.
+    """
+    q = (state[0], state[1], state[2], state[3])
+    b = (state[4], state[5], state[6])
+    A = (state[7], state[8], state[9], state[10], state[11], state[12])
+    B = (state[13], state[14], state[15], state[16], state[17], state[18], state[19], state[20], state[21])
+    C = (state[22], state[23], state[24], state[25], state[26], state[27])
+    events = len(event_time)
+    e = 0
+    k = -1  # the interval before the first edge has no length; its end takes the events at the first edge
+    now = edges[0]
+    end = now
+    whole = 1.0
+    longest = 1.0
+    theta = (0.0, 0.0, 0.0)
+    countdown = 0
+    row = 0
+    # One pass predicts to the next event or edge, takes in the event, and closes the interval, each where there is one.
+    while k < len(increments):
+        due = e < events and event_time[e] <= end
+        stop = event_time[e] if due else end
+        dt = stop - now
+        if dt > 0.0:
+            if dt > longest:
+                dt = longest
+                stop = now + dt
+                due = False
+            q, A, B, C = predict(q, b, A, B, C, scale(dt / whole, theta), dt, angle_variance, rate_variance)
+            now = stop
+        if due:
+            R = rotation_matrix(q)
+            z = vector_at(event_value, e)
+            t = event_reference[e]
+            if event_kind[e] != HEADING:
+                u = (triads[t, 0], triads[t, 1], triads[t, 2])
+                v = (triads[t, 3], triads[t, 4], triads[t, 5])
+                if event_kind[e] == VECTOR:
+                    # Its length says nothing of the attitude, but belongs to the innovation.
+                    r = (triads[t, 6], triads[t, 7], triads[t, 8])
+                    innovation_out[e, 4] = dot(transpose_times_vector(R, r), z) - 1.0
+                    innovation_out[e, 5] = event_variance[e]
+                q, b, A, B, C, e1, s1, e2, s2 = update_direction(q, b, A, B, C, R, u, v, z, event_variance[e])
+            else:
+                error = heading_error(R, z, (triads[t, 6], triads[t, 7], triads[t, 8]))
+                q, b, A, B, C, e1, s1 = update_heading(q, b, A, B, C, R, error, event_variance[e])
+                e2, s2 = 0.0, 1.0
+            innovation_out[e, 0] = e1
+            innovation_out[e, 1] = s1
+            innovation_out[e, 2] = e2
+            innovation_out[e, 3] = s2
+            e += 1
+        if now >= end and (e == events or event_time[e] > end):
+            if countdown == 0:
+                countdown = every
+                attitude_out[row, 0], attitude_out[row, 1], attitude_out[row, 2], attitude_out[row, 3] = q
+                bias_out[row, 0], bias_out[row, 1], bias_out[row, 2] = b
+                variance_out[row, 0], variance_out[row, 1], variance_out[row, 2] = A[0], A[3], A[5]
+                variance_out[row, 3], variance_out[row, 4], variance_out[row, 5] = C[0], C[3], C[5]
+                if row < len(covariance_out):
+                    for i in range(6):
+                        covariance_out[row, i] = A[i]
+                        covariance_out[row, 15 + i] = C[i]
+                    for i in range(9):
+                        covariance_out[row, 6 + i] = B[i]
+                row += 1
+            countdown -= 1
+            k += 1
+            if k < len(increments):
+                end = edges[k + 1]
+                whole = end - now
+                theta = vector_at(increments, k)
+                # Beyond the range of the polynomials, sub-steps: at constant rate they compose exactly, so this is the same model.
+                squared = dot(theta, theta)
+                longest = whole
+                if squared > LARGEST_ANGLE * LARGEST_ANGLE:
+                    longest = whole * (LARGEST_ANGLE / math.sqrt(squared))
+    for i in range(4):
+        state[i] = q[i]
+    for i in range(3):
+        state[4 + i] = b[i]
+    for i in range(6):
+        state[7 + i] = A[i]
+        state[22 + i] = C[i]
+    for i in range(9):
+        state[13 + i] = B[i]

@@ -1,0 +1,167 @@
+"""The multiplicative extended Kalman filter, one step at a time, on tuples.
+
+State: attitude ``q_fb``, gyro bias ``b`` (rad/s) and the covariance ``P`` of the error (δθ, δb) in three blocks: ``A`` = P_θθ (6-tuple),
+``B`` = P_θb (9-tuple), ``C`` = P_bb (6-tuple). The error is body side, ``q_true = q ⊗ exp(δθ)``, ``δb = b_true − b``.
+
+A measurement of any kind enters as scalar rows ``y = h · δθ + noise``. Rows of one measurement share a correction: each row's innovation
+takes off what the rows before it corrected, and the attitude is moved, and the covariance reset, once at the end.
+"""
+
+from __future__ import annotations
+
+from strapdown.kernels.algebra import (
+    add_matrices,
+    add_to_diagonal,
+    combine,
+    dot,
+    full,
+    minus_outer,
+    multiply,
+    multiply_add,
+    skew_polynomial,
+    symmetric_minus_outer,
+    symmetric_times_vector,
+    times_transpose_upper,
+    times_transpose_upper_add,
+    transpose,
+    transpose_times_vector,
+)
+from strapdown.kernels.rotation import right_jacobian, turned
+from strapdown.kernels.series import cosine, fifth, fourth, sinc, third
+
+
+def transition(phi, dt):
+    """Return Φ11 and Φ12 of the error state over a turn φ = ω dt at constant rate ω (6×6 Φ = [[Φ11, Φ12], [0, I]]).
+
+    ``Φ11 = exp(−[φ])``, ``Φ12 = −dt J_r(φ)``: the exact solution of δθ̇ = −[ω] δθ − δb (Markley & Crassidis 2014, eq. (6.83)).
+    """
+    x = dot(phi, phi)
+    y = 0.25 * x
+    s = sinc(y)
+    first = s * cosine(y)  # sin θ / θ
+    second = 0.5 * s * s  # (1 − cos θ)/θ²
+    return (
+        skew_polynomial(1.0, -first, second, phi),
+        skew_polynomial(-dt, dt * second, -dt * third(x), phi),
+    )
+
+
+def process_noise(phi, dt, angle_variance, rate_variance):
+    """Return Q11 (symmetric), Q12 and the diagonal of Q22 over a turn φ = ω dt, exact at constant ω.
+
+    ``angle_variance`` is σ_v² (rad²/s), ``rate_variance`` σ_u² (rad²/s³). With x = |φ|, n = φ/x:
+    ``Q11 = σ_v² dt I + σ_u² dt³ {n nᵀ/3 + 2 (x − sin x)/x³ (I − n nᵀ)}``,
+    ``Q12 = −σ_u² dt² {I/2 − [φ] (x − sin x)/x³ + [φ]² (x²/2 − 1 + cos x)/x⁴}``, ``Q22 = σ_u² dt I``.
+    """
+    x = dot(phi, phi)
+    t = third(x)
+    u = rate_variance * dt
+    v = u * dt
+    w = v * dt
+    g = w * fifth(x)
+    d = angle_variance * dt + 2.0 * w * t
+    q11 = (
+        d + g * (phi[0] * phi[0]),
+        g * (phi[0] * phi[1]),
+        g * (phi[0] * phi[2]),
+        d + g * (phi[1] * phi[1]),
+        g * (phi[1] * phi[2]),
+        d + g * (phi[2] * phi[2]),
+    )
+    return q11, skew_polynomial(-0.5 * v, v * t, -v * fourth(x), phi), u
+
+
+def predict(q, b, A, B, C, delta_theta, dt, angle_variance, rate_variance):
+    """Propagate over one gyro increment ``delta_theta`` (rad, the integral of the measured rate over dt).
+
+    Attitude by the exponential of the bias-free increment, equation (17) at constant rate; covariance by ``Φ P Φᵀ + Q``, all exact at
+    constant rate. |delta_theta − b dt| must not exceed ``series.LARGEST_ANGLE``.
+    """
+    phi = combine(1.0, delta_theta, -dt, b)
+    phi11, phi12 = transition(phi, dt)
+    q11, q12, q22 = process_noise(phi, dt, angle_variance, rate_variance)
+    theta_bias = multiply_add(phi11, B, multiply(phi12, full(C)))
+    theta_theta = multiply_add(phi11, full(A), multiply(phi12, transpose(B)))
+    return (
+        turned(q, phi),
+        times_transpose_upper_add(theta_theta, phi11, times_transpose_upper_add(theta_bias, phi12, q11)),
+        add_matrices(theta_bias, q12),
+        add_to_diagonal(C, q22),
+    )
+
+
+def update_row(correction, b, A, B, C, h, y, variance):
+    """Take in one scalar row ``y = h · δθ + v``, Var v = ``variance``; return (correction, b, A, B, C, innovation, its variance).
+
+    ``correction`` is the attitude correction of the rows of this measurement so far. Joseph's form, written as the short form plus the
+    vector ``d = r k − (P − k p) h`` which is nothing but the short form's rounding error: it costs a third more and keeps P positive
+    definite when the measurement is many orders better than the prior (Bierman 1977, ch. V).
+    """
+    pa = symmetric_times_vector(A, h)
+    pb = transpose_times_vector(B, h)
+    s = dot(h, pa) + variance
+    inverse = 1.0 / s
+    ka = (inverse * pa[0], inverse * pa[1], inverse * pa[2])
+    kb = (inverse * pb[0], inverse * pb[1], inverse * pb[2])
+    innovation = y - dot(h, correction)
+    short = symmetric_minus_outer(A, ka, pa)
+    d = combine(1.0, symmetric_times_vector(short, h), -variance, ka)
+    return (
+        combine(1.0, correction, innovation, ka),
+        combine(1.0, b, innovation, kb),
+        symmetric_minus_outer(short, d, ka),
+        minus_outer(minus_outer(B, ka, pb), d, kb),
+        symmetric_minus_outer(C, kb, pb),
+        innovation,
+        s,
+    )
+
+
+def reset(q, A, B, correction):
+    """Move the attitude by the correction and carry the covariance to the new tangent space: G = J_r(correction) on the attitude side.
+
+    ``A ← G A Gᵀ``, ``B ← G B`` (conventions of :mod:`strapdown`; Markley & Crassidis 2014, section 6.2.1). Without it the filter is
+    conservative or optimistic by second-order terms, and differs from its fixed-side twin.
+    """
+    G = right_jacobian(correction)
+    return (
+        turned(q, correction),
+        times_transpose_upper(multiply(G, full(A)), G),
+        multiply(G, B),
+    )
+
+
+def direction_rows(R, u, v, z):
+    """Return the two rows (h, y), (h, y) of a unit direction ``z`` (body) whose reference r has the right-handed triad u × v = r (fixed).
+
+    A direction has two degrees of freedom: its components along the predicted u and v. With ``z = r_b + r_b × δθ``:
+    ``u_b · z = −v_b · δθ``, ``v_b · z = u_b · δθ``.
+    """
+    ub = transpose_times_vector(R, u)
+    vb = transpose_times_vector(R, v)
+    return (-vb[0], -vb[1], -vb[2]), dot(ub, z), ub, dot(vb, z)
+
+
+def update_direction(q, b, A, B, C, R, u, v, z, variance):
+    """Update with a unit direction, two degrees of freedom; return (q, b, A, B, C) and both innovations with their variances.
+
+    ``R`` is the matrix of q, ``variance`` that of each component, rad². The innovations are independent: the NIS is e₁²/s₁ + e₂²/s₂.
+    """
+    h1, y1, h2, y2 = direction_rows(R, u, v, z)
+    zero = 0.0 * y1
+    correction, b, A, B, C, e1, s1 = update_row((zero, zero, zero), b, A, B, C, h1, y1, variance)
+    correction, b, A, B, C, e2, s2 = update_row(correction, b, A, B, C, h2, y2, variance)
+    q, A, B = reset(q, A, B, correction)
+    return q, b, A, B, C, e1, s1, e2, s2
+
+
+def update_heading(q, b, A, B, C, R, error, variance):
+    """Update with a heading error (rad, about the fixed z axis, true minus estimated), one degree of freedom.
+
+    ``h`` is the fixed z axis in the body frame: a turn δθ of the body turns the heading by h · δθ.
+    """
+    zero = 0.0 * error
+    h = (R[6], R[7], R[8])
+    correction, b, A, B, C, e, s = update_row((zero, zero, zero), b, A, B, C, h, error, variance)
+    q, A, B = reset(q, A, B, correction)
+    return q, b, A, B, C, e, s

@@ -1,0 +1,93 @@
+"""Compiling kernels: plain functions in, numba dispatchers out, with a disk cache that notices every edit.
+
+A kernel names its helpers as ordinary module globals. :func:`compiled` follows those names, compiles each helper once, and binds the
+compiled twins together, so that the source needs no decorator and stays plain Python.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import platform
+from collections.abc import Callable
+from pathlib import Path
+from types import FunctionType, ModuleType
+from typing import Any
+
+PACKAGE = __package__
+
+
+@functools.cache
+def sources_digest() -> str:
+    """Return a digest of all kernel sources: numba's own stamp misses an edited helper module or constant."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob("**/*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def _is_kernel(value: object) -> bool:
+    return isinstance(value, FunctionType) and (value.__module__ or "").startswith(PACKAGE)
+
+
+def _twin(function: FunctionType) -> FunctionType:
+    """Return a copy of ``function`` whose kernel globals are the compiled helpers."""
+    bound: dict[str, Any] = {"__name__": function.__module__}
+    for name in function.__code__.co_names:
+        if name in function.__globals__:
+            value = function.__globals__[name]
+            if isinstance(value, ModuleType) and value.__name__.startswith(PACKAGE):
+                raise TypeError(f"kernel {function.__name__} names module {name}; import its functions by name instead")
+            bound[name] = helper(value) if _is_kernel(value) else value
+    twin = FunctionType(function.__code__, bound, function.__name__, function.__defaults__, function.__closure__)
+    twin.__qualname__ = function.__qualname__
+    twin.__doc__ = function.__doc__
+    return twin
+
+
+def _options() -> dict[str, Any]:
+    # Only 'contract' (fused multiply-add): full fastmath silently breaks isnan and isfinite.
+    return {"fastmath": {"contract"}, "error_model": "numpy", "nogil": True}
+
+
+@functools.cache
+def helper(function: FunctionType) -> Any:
+    """Return ``function`` compiled for use inside another kernel, always inlined: a call costs more than a 3-vector's work."""
+    import numba
+
+    return numba.njit(forceinline=True, **_options())(_twin(function))
+
+
+@functools.cache
+def compiled(function: Callable[..., Any]) -> Any:
+    """Return ``function`` compiled for calls from Python, cached on disk under the digest of all kernel sources.
+
+    Releases the GIL while it runs, so records can be spread over threads.
+    """
+    import numba
+    from numba.core.caching import FunctionCache
+
+    class KernelCache(FunctionCache):  # type: ignore[misc]
+        def _index_key(self, signature: Any, codegen: Any) -> Any:
+            return (*super()._index_key(signature, codegen), sources_digest())
+
+    if not _is_kernel(function):
+        raise TypeError(f"{function!r} does not live in {PACKAGE}; move it there before compiling it")
+    dispatcher = numba.njit(**_options())(_twin(function))  # type: ignore[arg-type]
+    with contextlib.suppress(RuntimeError):  # no writable place for a cache: compile in every process
+        dispatcher._cache = KernelCache(dispatcher.py_func)
+    return dispatcher
+
+
+def describe() -> dict[str, str]:
+    """Return what the kernels run on: CPU, numba, LLVM and threads, for `strapdown info` and benchmark headings."""
+    import llvmlite.binding
+    import numba
+
+    return {
+        "machine": platform.machine(),
+        "cpu": llvmlite.binding.get_host_cpu_name(),
+        "numba": numba.__version__,
+        "llvm": ".".join(str(part) for part in llvmlite.binding.llvm_version_info),
+    }
