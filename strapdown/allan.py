@@ -1,0 +1,812 @@
+"""Allan variance of a gyro record at rest, and identification of its noises.
+
+Two views of one record:
+
+- :func:`allan_deviation` is the picture: the overlapping (or a robust) Allan deviation with χ² confidence bands.
+- :func:`fit_noise` is the estimator: quantisation Q, angle random walk N, bias instability B, rate random walk K and rate ramp R by
+  maximum likelihood on the cosine transform of the record, with profile-likelihood intervals.
+
+Why not least squares on the Allan deviation: its values at neighbouring τ share nearly all their data, so their errors are strongly
+correlated, and at long τ, which alone tells of K and R, they are far from Gaussian. The cosine (DCT-II) coefficients of averaged-rate
+samples are independent and Gaussian instead, exactly for angle and rate random walk, which a DCT diagonalises, and nearly for flicker
+and quantisation, whose exact variances are used; the Allan variance is a smoothing of their squares and holds no more. So no
+covariance between taus has to be modelled, and the intervals are those of a likelihood.
+
+The noises, with the Allan variance σ²(τ) of samples that average the rate over the sample interval (exact at every τ; bias: the floor):
+
+============  ======================  =============  ==========================================================================
+term          two-sided PSD of rate   σ²(τ)          unit
+============  ======================  =============  ==========================================================================
+quantization  (2π f)² Q² dt           3 Q²/τ²        rad; white error of the integrated angle at each sample, standard deviation Q
+angle         N²                      N²/τ           rad/√s
+bias          B²/(2π f)               (2 ln 2/π) B²  rad/s; flicker up to the Nyquist frequency, see :func:`flicker_variance`
+rate          K²/(2π f)²              K² τ/3         rad/s/√s
+ramp          deterministic R t       R² τ²/2        rad/s²
+============  ======================  =============  ==========================================================================
+
+Quantisation is white only while successive angles differ by noise or motion of about half a step or more; below that its error follows
+the motion, no coefficient describes it, and ``NoiseFit.misfit_probability`` falls to nothing.
+
+Sources: IEEE Std 952-1997 annex C; NIST SP 1065 (Riley 2008); Greenhall & Riley, "Uncertainty of stability variances based on finite
+differences", PTTI 2003; Riley & Greenhall, "Power law noise identification using the lag 1 autocorrelation", EFTF 2004.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from strapdown import checks, units
+from strapdown.checks import Array, InputError
+from strapdown.kernels.allan import accumulate, second_difference_sizes, second_difference_squares
+from strapdown.kernels.machine import compiled
+
+TERMS = ("quantization", "angle_random_walk", "bias_instability", "rate_random_walk", "rate_ramp")
+"""The noise terms, in the order of every array over terms; also the names of the gyro specification."""
+
+NOISE_TYPES = {
+    2: "quantization",
+    1: "flicker angle",
+    0: "angle random walk",
+    -1: "bias instability",
+    -2: "rate random walk",
+}
+"""Name of each power law: the PSD of the rate goes as f to the key."""
+
+SYMBOLS = dict(zip(TERMS, "QNBKR", strict=True))
+UNITS = {
+    "quantization": ("arcsec", units.ARCSECOND),
+    "angle_random_walk": ("°/√h", units.DEGREE_PER_ROOT_HOUR),
+    "bias_instability": ("°/h", units.DEGREE_PER_HOUR),
+    "rate_random_walk": ("°/h/√h", units.DEGREE_PER_HOUR_PER_ROOT_HOUR),
+    "rate_ramp": ("°/h/h", units.DEGREE_PER_HOUR / 3600.0),
+}
+"""Unit at the rim and its factor to SI, for each term."""
+
+SUPPORT_PROBABILITY = 1e-3
+"""A term is supported when a record without it would show its likelihood ratio by chance less often than this."""
+
+_MEDIAN_OF_NORMAL = 0.6744897501960817  # Φ⁻¹(3/4): median of |z|, z standard normal
+_MEDIAN_EFFICIENCY = (
+    0.3675  # of the median of |z| against the mean square, independent normal data: 8 (z φ(z))², z = Φ⁻¹(3/4)
+)
+_FEWEST_BLOCKS = 30  # below this the lag-1 autocorrelation says little (SP 1065, §5.5.6)
+_MOST_BLOCKS = 1 << 17
+_BIN_GROWTH = 1.05
+_LARGEST_EXACT = 1 << 16
+_FLICKER_SUM_LIMIT = 4096
+
+
+@dataclass(frozen=True, kw_only=True)
+class AllanDeviation:
+    """Allan deviation of a record with its confidence band.
+
+    Attributes
+    ----------
+    taus : (t,) s
+    deviation, lower, upper : (axes, t) rad/s
+    edf : (axes, t)
+        Equivalent degrees of freedom of ``deviation``².
+    noise_type : (axes, t) str
+        A value of :data:`NOISE_TYPES`, found from the lag-1 autocorrelation at each τ.
+    level : float
+        Confidence of the band, pointwise.
+    estimator : str
+        ``"overlapping"`` or ``"robust"``.
+    """
+
+    taus: Array
+    deviation: Array
+    lower: Array
+    upper: Array
+    edf: Array
+    noise_type: NDArray[np.str_]
+    level: float
+    estimator: str
+    samples: int
+    sample_interval: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoiseFit:
+    """Noise coefficients of a record, SI units.
+
+    Attributes
+    ----------
+    terms : tuple of str
+        The terms that were fitted, a subset of :data:`TERMS`; they index the last axis below.
+    estimate : (axes, terms)
+        NaN where the term is not supported by the record.
+    lower, upper : (axes, terms)
+        Two-sided interval of confidence ``level``. Where the term is not supported ``lower`` is 0 and ``upper`` a one-sided bound
+        (for the ramp: on its size).
+    supported : (axes, terms) bool
+    covariance : (axes, terms, terms)
+        Of the estimates, from the Fisher information; NaN for unsupported terms.
+    misfit_probability : (axes,)
+        Probability that a record of the fitted noises departs as far from the fitted spectrum. Near zero: the record holds something
+        else (a vibration line, a low-pass filter, outliers, a Gauss–Markov bias), and the intervals are not to be believed.
+    """
+
+    terms: tuple[str, ...]
+    estimate: Array
+    lower: Array
+    upper: Array
+    supported: NDArray[np.bool_]
+    covariance: Array
+    misfit_probability: Array
+    level: float
+    samples: int
+    sample_interval: float
+
+
+def allan_deviation(
+    values: ArrayLike,
+    sample_interval: float,
+    *,
+    kind: str = "rate",
+    taus: ArrayLike | None = None,
+    estimator: str = "overlapping",
+    level: float = 0.95,
+) -> AllanDeviation:
+    """Return the Allan deviation of a record with its confidence band.
+
+    The phase is kept as float64: the sum of the rate less its mean, carried with its rounding error, so that each value is rounded once
+    (½ unit in the last place of the largest phase) also after 1e8 samples. Memory: one float64 a sample beyond the record, an axis at a
+    time. Time: proportional to the samples for each τ.
+
+    The overlapping estimator equals ``allantools.oadev``. The robust one takes the median size of the second differences, divided by
+    what it is for a Gaussian; it stands single outliers, bursts and bias steps as long as well under half of all spans of 2τ are
+    touched, so at long τ only few of them. Not for records of a few coarse counts: their median sits on the counts.
+
+    Parameters
+    ----------
+    values : (n,) or (n, axes)
+        Averaged-rate samples, rad/s, or angle increments, rad; at most three axes.
+    sample_interval : float
+        s.
+    kind : {"rate", "increments"}
+    taus : array_like, optional
+        Averaging times, s; each is rounded to a multiple of the sample interval, repeated ones are dropped. Default: 12 a decade, up to
+        a third of the record.
+    estimator : {"overlapping", "robust"}
+    level : float
+        Confidence of the band.
+
+    Raises
+    ------
+    InputError
+        On samples that are not finite, a τ outside [sample interval, half the record], or an unknown ``kind`` or ``estimator``.
+    """
+    record, dt, scale = _record(values, sample_interval, kind)
+    checks.one_of("estimator", estimator, ("overlapping", "robust"))
+    level = _level(level)
+    samples = record.shape[0]
+    multiples = _multiples(taus, samples, dt)
+    deviation = np.empty((record.shape[1], len(multiples)))
+    edf = np.empty_like(deviation)
+    alphas = np.empty(deviation.shape, dtype=int)
+    phase, lanes = np.empty(samples + 1), np.empty(512)
+    for axis in range(record.shape[1]):
+        rate = record[:, axis]
+        compiled(accumulate)(rate, float(np.mean(rate)), phase)
+        alpha = 0
+        for i, m in enumerate(int(m) for m in multiples):
+            alpha = _power_law(phase, m, alpha)
+            alphas[axis, i] = alpha
+            edf[axis, i] = equivalent_degrees_of_freedom(alpha, samples, m)
+            if estimator == "robust":
+                deviation[axis, i] = _median_deviation(phase, m, alpha)
+                edf[axis, i] *= _MEDIAN_EFFICIENCY
+        if estimator == "overlapping":
+            squares = np.empty(len(multiples))
+            compiled(second_difference_squares)(phase, multiples, lanes, squares)
+            deviation[axis] = np.sqrt(squares / (2.0 * (samples + 1 - 2 * multiples))) / multiples
+    deviation *= scale
+    from scipy.stats import chi2
+
+    return AllanDeviation(
+        taus=np.asarray(multiples * dt),
+        deviation=deviation,
+        lower=deviation * np.sqrt(edf / chi2.ppf(0.5 + 0.5 * level, edf)),
+        upper=deviation * np.sqrt(edf / chi2.ppf(0.5 - 0.5 * level, edf)),
+        edf=edf,
+        noise_type=np.vectorize(NOISE_TYPES.__getitem__)(alphas),
+        level=level,
+        estimator=estimator,
+        samples=samples,
+        sample_interval=dt,
+    )
+
+
+def equivalent_degrees_of_freedom(alpha: int, samples: int, m: int) -> float:
+    """Return the equivalent degrees of freedom of the overlapping Allan variance of m samples, out of ``samples`` of the rate.
+
+    ``2 E²/Var`` of the mean of squared second differences, by summing their squared autocorrelation (Greenhall & Riley 2003). Sampled
+    phase of a noise that is white, flicker or random walk in continuous time has the generalised covariances −|t|, t² ln|t| and |t|³,
+    which need no further approximation; quantisation is white phase.
+
+    Parameters
+    ----------
+    alpha : int
+        Power law of the rate, a key of :data:`NOISE_TYPES`.
+    """
+    if alpha not in NOISE_TYPES:
+        raise InputError(f"alpha is {alpha!r}; it must be one of {', '.join(map(str, NOISE_TYPES))}")
+    checks.count("samples", samples, least=2)
+    if not 1 <= m <= samples // 2:
+        raise InputError(f"m is {m!r}; with {samples} samples it must lie between 1 and {samples // 2}")
+    count = samples + 1 - 2 * m
+    if alpha == 2:
+        overlaps = 18.0 * count + 16.0 * max(count - m, 0) + max(count - 2 * m, 0)  # 6² / 2, 4², 1² by lag 0, m, 2m
+        return 18.0 * count**2 / overlaps
+    # Cells of one lag near the peaks at 0, m and 2m (sharp for flicker phase), wider ones elsewhere, each by its middle.
+    end = min(count, 6 * m)
+    if m <= 1000:
+        edges = np.arange(end + 1)
+    else:
+        fine = [np.arange(centre - 1000, centre + 1001) for centre in (0, m, 2 * m)]
+        edges = np.unique(np.concatenate([*fine, np.arange(0, end, m // 500), [0, end]]))
+        edges = edges[(edges >= 0) & (edges <= end)]
+    width = np.diff(edges)
+    lag = edges[:-1] + 0.5 * (width - 1)
+    correlation = _second_difference_covariance(alpha, lag, m) / _second_difference_covariance(alpha, np.zeros(1), m)
+    both_sides = np.where(edges[:-1] == 0, 1.0, 2.0) * width
+    return float(max(1.0, count / float(np.sum(both_sides * correlation**2 * (1.0 - lag / count)))))
+
+
+def _second_difference_covariance(alpha: int, lag: Array, m: int) -> Array:
+    """Return the autocovariance of x[k + 2m] − 2 x[k + m] + x[k], up to a factor, from the generalised covariance of x."""
+
+    def phase_covariance(k: Array) -> Array:
+        t = np.abs(k) / m
+        logarithm = np.log(np.where(t > 0.0, t, 1.0))
+        if alpha == 0:
+            return np.asarray(-t)
+        if alpha == -1:
+            return np.asarray(t * t * logarithm)
+        if alpha == -2:
+            return np.asarray(t**3)
+
+        # Flicker of the phase has infinite variance unless its band ends: Greenhall's second difference over one sample interval.
+        def smooth(j: Array) -> Array:
+            size = np.abs(j)
+            return np.asarray(size * size * np.log(np.where(size > 0.0, size, 1.0)))
+
+        near = np.minimum(np.abs(k), 1000)
+        difference = 2.0 * smooth(near) - smooth(near - 1) - smooth(near + 1)
+        return np.asarray(np.where(np.abs(k) <= 1000, difference, -2.0 * np.log(np.maximum(np.abs(k), 1)) - 3.0))
+
+    g = phase_covariance
+    return g(lag) * 6.0 - 4.0 * (g(lag - m) + g(lag + m)) + g(lag - 2 * m) + g(lag + 2 * m)
+
+
+def _median_deviation(phase: Array, m: int, alpha: int) -> float:
+    """Return the median size of the second differences, scaled to the standard deviation of a Gaussian, as an Allan deviation."""
+    # Spans that overlap by 15/16 hold nearly all there is, unless the noise is in the phase itself.
+    stride = 1 if alpha > 0 else max(1, m // 16)
+    sizes = np.empty((len(phase) - 1 - 2 * m) // stride + 1)
+    compiled(second_difference_sizes)(phase, m, stride, sizes)
+    return float(np.median(sizes, overwrite_input=True)) / (_MEDIAN_OF_NORMAL * math.sqrt(2.0) * m)
+
+
+def _power_law(phase: Array, m: int, otherwise: int) -> int:
+    """Return the power law of the rate averaged over m samples, by the lag-1 autocorrelation (Riley & Greenhall 2004).
+
+    A series with correlation r at lag 1 has fractional-difference parameter δ = r/(1 + r); it is differenced while δ ≥ ¼. A middle
+    stretch of the record is enough where there are very many averages.
+    """
+    edges = phase[::m]
+    spare = max(0, len(edges) - _MOST_BLOCKS) // 2
+    blocks = np.diff(edges[spare : spare + _MOST_BLOCKS])
+    if len(blocks) < _FEWEST_BLOCKS:
+        return otherwise
+    for differenced in range(3):
+        centred = blocks - blocks.mean()
+        power = float(centred @ centred)
+        if power <= 0.0:
+            return -2
+        correlation = float(centred[1:] @ centred[:-1]) / power
+        delta = correlation / (1.0 + correlation) if correlation > -1.0 else -math.inf
+        if delta < 0.25 or differenced == 2:
+            return int(np.clip(np.round(-2.0 * (max(delta, -2.0) + differenced)), -2, 2))
+        blocks = np.diff(blocks)
+    return otherwise
+
+
+def fit_noise(
+    values: ArrayLike,
+    sample_interval: float,
+    *,
+    kind: str = "rate",
+    terms: Sequence[str] = TERMS,
+    highest_frequency: float | None = None,
+    level: float = 0.95,
+) -> NoiseFit:
+    """Return the noise coefficients of a record at rest, each with its interval, or with a bound where the record does not support it.
+
+    The squared DCT-II coefficients of the record, j = 1 … n − 1 at frequency j/(2 n dt), are taken as independent χ² of one degree of
+    freedom around ``Σ θ_i V_i(j)``, θ = (Q², N², B², K²) ≥ 0, V the exact expectation for each noise on a finite record; a rate ramp is
+    a mean. Coefficients are pooled in bins of 5 % in frequency. θ maximises the likelihood restricted for the ramp (REML); intervals
+    are those where twice the log-likelihood, maximised over all other terms, falls by the χ² quantile. Terms without support stay in
+    the model at their most likely value while the others are judged, so what is not known about them widens the other intervals.
+
+    Parameters
+    ----------
+    values, sample_interval, kind
+        As in :func:`allan_deviation`; at least 64 samples.
+    terms : sequence of str
+        The terms to consider, of :data:`TERMS`.
+    highest_frequency : float, optional
+        Hz; leave out what lies above, where a low-pass filter or a vibration shapes the spectrum. The samples are then taken to be
+        averages below it.
+    level : float
+        Confidence of the intervals and of the one-sided bounds.
+
+    Raises
+    ------
+    InputError
+        On samples that are not finite, a record without noise, an unknown term, or too short a record.
+    """
+    record, dt, scale = _record(values, sample_interval, kind)
+    level = _level(level)
+    chosen = tuple(checks.one_of("terms: term", term, TERMS) for term in terms)
+    chosen = tuple(term for term in TERMS if term in chosen)
+    if not set(chosen) - {"rate_ramp"}:
+        raise InputError("terms names no random noise; add one of quantization, angle_random_walk, …")
+    samples = record.shape[0]
+    if samples < 64:
+        raise InputError(f"values has {samples} samples; at least 64 are needed to tell noises apart")
+    last = samples - 1
+    if highest_frequency is not None:
+        last = min(last, int(2.0 * samples * dt * checks.positive("highest_frequency", highest_frequency, unit="Hz")))
+        if last < 32:
+            raise InputError(
+                f"highest_frequency is {highest_frequency:g} Hz: only {last} coefficients lie below; raise it"
+            )
+    starts = _bin_starts(last)
+    random_terms = tuple(term for term in chosen if term != "rate_ramp")
+    basis = np.stack([_basis(term, samples, dt, starts, last) for term in random_terms])
+    fits = [
+        _fit_axis(
+            _binned(record[:, axis], basis, starts, axis=axis, scale=scale, dt=dt, last=last),
+            random_terms,
+            "rate_ramp" in chosen,
+            level,
+        )
+        for axis in range(record.shape[1])
+    ]
+    return NoiseFit(
+        terms=chosen,
+        estimate=np.stack([f.estimate for f in fits]),
+        lower=np.stack([f.lower for f in fits]),
+        upper=np.stack([f.upper for f in fits]),
+        supported=np.stack([f.supported for f in fits]),
+        covariance=np.stack([f.covariance for f in fits]),
+        misfit_probability=np.array([f.misfit_probability for f in fits]),
+        level=level,
+        samples=samples,
+        sample_interval=dt,
+    )
+
+
+def flicker_variance(multiples: ArrayLike) -> Array:
+    """Return the exact Allan variance, over B², of samples with the two-sided PSD B²/(2π f) up to the Nyquist frequency.
+
+    ``∫ (4/(2π f)) sin⁴(π f m)/(m sin π f)² df`` over f in (0, ½), as a sum over the autocovariance −Cin(π k)/π of the samples. It tends
+    to 2 ln 2/π as 1/m² (to 1e-7 at m = 4096, beyond which the limit is returned), from above: one sample shows 19 % more.
+
+    Parameters
+    ----------
+    multiples : array_like of int
+        Averaging times in samples, m ≥ 1.
+    """
+    m_all = np.atleast_1d(checks.array("multiples", multiples, (...,)))
+    limit = int(min(m_all.max(initial=1.0), _FLICKER_SUM_LIMIT))
+    covariance = _flicker_covariance(2 * limit + 1)
+    result = np.empty(m_all.shape)
+    for index, m_float in np.ndenumerate(m_all):
+        m = int(m_float)
+        if m < 1:
+            raise InputError(f"multiples holds {m_float:g}; an averaging time is at least one sample")
+        if m > _FLICKER_SUM_LIMIT:
+            result[index] = 2.0 * math.log(2.0) / math.pi
+        else:
+            lag = np.arange(1 - m, m)
+            weight = m - np.abs(lag)
+            result[index] = weight @ (covariance[np.abs(lag)] - covariance[lag + m]) / m**2
+    return result
+
+
+def model_deviation(parameters: Mapping[str, float], taus: ArrayLike, sample_interval: float) -> dict[str, Array]:
+    """Return the Allan deviation of each term and their ``"total"``, rad/s, at the given taus (t,), s.
+
+    Parameters
+    ----------
+    parameters : mapping
+        SI coefficients by name, of :data:`TERMS`; absent ones are zero.
+    """
+    checks.known_keys("parameters", parameters, TERMS)
+    tau = checks.array("taus", taus, ("t",))
+    dt = checks.positive("sample_interval", sample_interval, unit="s")
+    shape = {
+        "quantization": 3.0 / tau**2,
+        "angle_random_walk": 1.0 / tau,
+        "bias_instability": flicker_variance(np.maximum(np.round(tau / dt), 1.0)),
+        "rate_random_walk": tau / 3.0,
+        "rate_ramp": 0.5 * tau**2,
+    }
+    variance = {term: checks.finite(term, value) ** 2 * shape[term] for term, value in parameters.items()}
+    total = np.sum(list(variance.values()), axis=0) if variance else np.zeros(len(tau))
+    return {term: np.sqrt(value) for term, value in {**variance, "total": total}.items()}
+
+
+def to_gyro_parameters(fit: NoiseFit) -> dict[str, float | tuple[float, ...]]:
+    """Return the coefficients by the names of the gyro specification, SI; one number, or one an axis; 0 where not supported."""
+    columns = np.where(fit.supported, fit.estimate, 0.0).T
+    filled = {term: tuple(float(v) for v in columns[fit.terms.index(term)]) for term in fit.terms}
+    return {term: values[0] if len(values) == 1 else values for term, values in filled.items()}
+
+
+def table(fit: NoiseFit) -> list[dict[str, object]]:
+    """Return one row an axis and term for printing, in the units of :data:`UNITS`: estimate, lower and upper (NaN: no such value)."""
+    rows: list[dict[str, object]] = []
+    for axis, i in np.ndindex(*fit.estimate.shape):
+        term = fit.terms[i]
+        unit, factor = UNITS[term]
+        rows.append(
+            {
+                "axis": axis,
+                "term": term,
+                "symbol": SYMBOLS[term],
+                "estimate": float(fit.estimate[axis, i] / factor),
+                "lower": float(fit.lower[axis, i] / factor),
+                "upper": float(fit.upper[axis, i] / factor),
+                "unit": unit,
+                "supported": bool(fit.supported[axis, i]),
+            }
+        )
+    return rows
+
+
+def _level(level: float) -> float:
+    number = checks.positive("level", level)
+    if not 0.5 < number < 1.0:
+        raise InputError(f"level is {number:g}; a confidence lies between 0.5 and 1, for example 0.95")
+    return number
+
+
+def _record(values: ArrayLike, sample_interval: float, kind: str) -> tuple[Array, float, float]:
+    """Return the record (n, axes), its sample interval, and the factor that makes rates of its values."""
+    dt = checks.positive("sample_interval", sample_interval, unit="s")
+    checks.one_of("kind", kind, ("rate", "increments"))
+    record = checks.array("values", values, ("n",) if np.ndim(values) == 1 else ("n", "axes"))
+    if record.ndim == 1:
+        record = record[:, None]
+    if not 1 <= record.shape[1] <= 3:
+        raise InputError(
+            f"values has {record.shape[1]} axes; pass (n,) or (n, axes) with one to three axes (transpose it?)"
+        )
+    if len(record) < 3:
+        raise InputError(f"values has {len(record)} samples; an Allan deviation needs at least 3")
+    return record, dt, 1.0 if kind == "rate" else 1.0 / dt
+
+
+def _multiples(taus: ArrayLike | None, samples: int, dt: float) -> NDArray[np.int64]:
+    if taus is None:
+        largest = max(1, samples // 3)
+        return np.unique(np.round(np.geomspace(1, largest, 2 + int(12 * math.log10(largest)))).astype(np.int64))
+    wanted = np.atleast_1d(checks.array("taus", taus, (...,))).ravel()
+    multiples = np.round(wanted / dt)
+    for tau, m in zip(wanted, multiples, strict=True):
+        if not 1 <= m <= samples // 2:
+            raise InputError(
+                f"taus holds {tau:g} s; with {samples} samples of {dt:g} s it must lie between {dt:g} s and {samples // 2 * dt:g} s"
+            )
+    if len(multiples) == 0:
+        raise InputError("taus is empty; leave it out for the default")
+    return np.unique(multiples.astype(np.int64))
+
+
+# Spectra of the cosine transform
+
+
+def _bin_starts(last: int) -> NDArray[np.int64]:
+    """Return the first index of each bin of DCT coefficients 1 … last; each bin spans 5 % or one coefficient."""
+    starts = [1]
+    while (following := max(starts[-1] + 1, math.ceil(starts[-1] * _BIN_GROWTH))) <= last:
+        starts.append(following)
+    return np.array(starts, dtype=np.int64)
+
+
+def _slices(starts: NDArray[np.int64], last: int) -> list[slice]:
+    return [slice(int(a), int(b)) for a, b in zip(starts, [*starts[1:], last + 1], strict=True)]
+
+
+def _basis(term: str, samples: int, dt: float, starts: NDArray[np.int64], last: int) -> Array:
+    """Return the mean over each bin of the expected squared DCT-II coefficient for a unit coefficient of ``term``."""
+    return np.array(
+        [float(np.mean(_expected_power(term, samples, dt, np.arange(s.start, s.stop)))) for s in _slices(starts, last)]
+    )
+
+
+def _expected_power(term: str, samples: int, dt: float, j: NDArray[np.int64]) -> Array:
+    """Return the expected square of the orthonormal DCT-II coefficients j of averaged-rate samples, unit coefficient of ``term``.
+
+    With θ = πj/n: white rate is white. The difference of averaged random-walk samples has covariance dt (2/3, 1/6 at lag 1), which the
+    sine transform diagonalises as the cosine transform does for the samples. Quantised phase, differenced, is the same Laplacian plus
+    its two corners.
+    """
+    theta = np.pi * j / samples
+    laplacian = 4.0 * np.sin(0.5 * theta) ** 2
+    if term == "angle_random_walk":
+        return np.full(j.shape, 1.0 / dt)
+    if term == "rate_random_walk":
+        return np.asarray(dt * (2.0 / 3.0 + np.cos(theta) / 3.0) / laplacian)
+    if term == "quantization":
+        return np.asarray((laplacian + 4.0 / samples * np.cos(0.5 * theta) ** 2) / dt**2)
+    spectrum = samples / (np.pi * j)  # B²/(2π f dt) at f dt = j/2n
+    ratio = _flicker_leakage(min(samples, _LARGEST_EXACT))
+    known = (
+        len(ratio) if samples <= _LARGEST_EXACT else len(ratio) // 8
+    )  # far from both ends the ratio depends on j alone, and tends to 1
+    return np.asarray(spectrum * np.where(j < known, ratio[np.minimum(j, known - 1)], 1.0))
+
+
+def _flicker_covariance(count: int) -> Array:
+    """Return the generalised autocovariance −Cin(πk)/π of unit flicker samples band-limited at Nyquist, k = 0 … count − 1.
+
+    Flicker has infinite variance; the constant that is left out cancels in every combination of samples whose weights sum to zero.
+    """
+    from scipy.special import sici
+
+    x = np.pi * np.arange(1, count)
+    return np.concatenate([[0.0], -(np.euler_gamma + np.log(x) - sici(x)[1]) / np.pi])
+
+
+@functools.lru_cache(maxsize=8)
+def _flicker_leakage(samples: int) -> Array:
+    """Return the expected squared DCT-II coefficients of flicker over its spectrum, by index j (entry 0 unused).
+
+    ``E c_j² = γ_0 + (2/n) Σ_h γ_h ((n − h) cos hθ − sin hθ / sin θ)``, θ = πj/n: the autocorrelation of a cosine row, summed.
+    """
+    from scipy.fft import rfft
+
+    lag = np.arange(samples)
+    covariance = _flicker_covariance(samples)
+    j = np.arange(1, samples)
+    cosine_sum = rfft(covariance * (samples - lag), 2 * samples).real[1:samples]
+    sine_sum = -rfft(covariance, 2 * samples).imag[1:samples]
+    power = 2.0 / samples * (cosine_sum - sine_sum / np.sin(np.pi * j / samples))
+    return np.concatenate([[1.0], power * np.pi * j / samples])
+
+
+def _ramp_coefficients(samples: int, j: NDArray[np.int64]) -> Array:
+    """Return the orthonormal DCT-II coefficients j ≥ 1 of the sequence 0, 1, 2, …: −√(2/n) cos(θ/2)/(2 sin² θ/2) for odd j, else 0."""
+    half = 0.5 * np.pi * j / samples
+    return np.asarray(np.where(j % 2 == 1, -math.sqrt(2.0 / samples) * np.cos(half) / (2.0 * np.sin(half) ** 2), 0.0))
+
+
+class _Bins(NamedTuple):
+    """Sums over each bin: of squared coefficients less a first slope, their product with the ramp's, the ramp's squares."""
+
+    number: Array
+    square: Array
+    product: Array
+    ramp: Array
+    basis: Array
+    first_slope: float
+
+
+def _binned(
+    rate: Array, basis: Array, starts: NDArray[np.int64], *, axis: int, scale: float, dt: float, last: int
+) -> _Bins:
+    from scipy.fft import dct
+
+    samples = len(rate)
+    coefficient = dct(rate - rate.mean(), type=2, norm="ortho", overwrite_x=True)
+    coefficient *= scale
+    low = np.arange(1, min(last, 1 << 20) + 1)
+    ramp = dt * _ramp_coefficients(samples, low)
+    slope = float(ramp @ coefficient[1 : len(low) + 1] / (ramp @ ramp))
+    sums = []
+    for s in _slices(starts, last):
+        ramp = dt * _ramp_coefficients(samples, np.arange(s.start, s.stop))
+        rest = coefficient[s] - slope * ramp
+        sums.append((len(rest), rest @ rest, rest @ ramp, ramp @ ramp))
+    count, square, product, ramp_square = np.array(sums, dtype=float).T
+    noise_floor = (1e-13 * np.max(np.abs(rate)) * scale) ** 2 * count
+    if not np.any(square > noise_floor):
+        raise InputError(
+            f"values, axis {axis}, holds no noise (it is constant or a straight line); pass a recorded gyro"
+        )
+    return _Bins(count, square, product, ramp_square, basis, slope)
+
+
+# Likelihood
+
+
+class _Optimum(NamedTuple):
+    loss: float
+    theta: Array
+    slope: float
+    variance: Array
+
+
+class _AxisFit(NamedTuple):
+    estimate: Array
+    lower: Array
+    upper: Array
+    supported: NDArray[np.bool_]
+    covariance: Array
+    misfit_probability: float
+
+
+def _loss(bins: _Bins, theta: Array, slope: float | None, restricted: bool) -> _Optimum:
+    """Return −log likelihood at ``theta``; ``slope`` None profiles the ramp, restricted (REML) or not."""
+    variance = theta @ bins.basis
+    if not np.all(variance > 0.0):
+        return _Optimum(math.inf, theta, 0.0, variance)
+    information = float(np.sum(bins.ramp / variance))
+    best = float(np.sum(bins.product / variance)) / information if slope is None else slope
+    power = bins.square - 2.0 * best * bins.product + best * best * bins.ramp
+    loss = 0.5 * float(np.sum(bins.number * np.log(variance) + power / variance))
+    if slope is None and restricted:
+        loss += 0.5 * math.log(information)
+    return _Optimum(loss, theta, best, variance)
+
+
+def _maximise(
+    bins: _Bins, start: Array, *, held: int | None = None, slope: float | None = None, restricted: bool = True
+) -> _Optimum:
+    """Return the most likely theta ≥ 0 by Fisher scoring, each step a non-negative least-squares problem, with step halving.
+
+    ``held`` keeps that component at its value in ``start``.
+    """
+    from scipy.optimize import nnls
+
+    free = np.array([i != held for i in range(len(start))])
+    point = _loss(bins, start, slope, restricted)
+    if not free.any():
+        return point
+    for _ in range(100):
+        variance = point.variance
+        power = bins.square - 2.0 * point.slope * bins.product + point.slope**2 * bins.ramp
+        if slope is None and restricted:
+            power = power + bins.ramp / np.sum(bins.ramp / variance)
+        weight = np.sqrt(bins.number) / variance
+        residual = power / bins.number - (start[held] * bins.basis[held] if held is not None else 0.0)
+        design = (bins.basis[free] * weight).T
+        norm = np.linalg.norm(design, axis=0)
+        target = start.copy()
+        target[free] = nnls(design / norm, residual * weight)[0] / norm
+        step, trial = 1.0, _loss(bins, target, slope, restricted)
+        while trial.loss > point.loss and step > 1e-6:
+            step *= 0.5
+            trial = _loss(bins, point.theta + step * (target - point.theta), slope, restricted)
+        gain = point.loss - trial.loss
+        if gain > 0.0:
+            point = trial
+        if gain < 1e-9:
+            break
+    return point
+
+
+def _first_guess(bins: _Bins) -> Array:
+    """Return a positive theta: every term at the level where it alone would explain the quietest octave it is strongest in."""
+    edges = np.searchsorted(np.cumsum(bins.number), 2.0 ** np.arange(3, 60))
+    edges = np.unique(np.concatenate([[0], edges[edges < len(bins.number)]]))
+    power = np.add.reduceat(bins.square, edges) / np.add.reduceat(bins.number, edges)
+    basis = np.add.reduceat(bins.basis * bins.number, edges, axis=1) / np.add.reduceat(bins.number, edges)
+    return np.asarray(np.min(np.maximum(power, 1e-9 * power.max()) / basis, axis=1) / len(basis))
+
+
+def _information(bins: _Bins, variance: Array) -> Array:
+    """Return the Fisher information of theta."""
+    weighted = bins.basis * np.sqrt(0.5 * bins.number) / variance
+    return np.asarray(weighted @ weighted.T)
+
+
+def _standard_errors(information: Array) -> Array:
+    scale = 1.0 / np.sqrt(np.diag(information))
+    inverse = np.linalg.pinv(information * np.outer(scale, scale))
+    return np.asarray(np.sqrt(np.maximum(np.diag(inverse), 0.0)) * scale)
+
+
+def _fit_axis(bins: _Bins, random_terms: tuple[str, ...], with_ramp: bool, level: float) -> _AxisFit:
+    from scipy.stats import chi2
+
+    fixed_slope = None if with_ramp else -bins.first_slope
+    best = _maximise(bins, _first_guess(bins), slope=fixed_slope)
+    two_sided = 0.5 * float(chi2.ppf(level, 1))
+    one_sided = 0.5 * float(chi2.ppf(2.0 * level - 1.0, 1))
+    support = 0.5 * float(chi2.ppf(1.0 - 2.0 * SUPPORT_PROBABILITY, 1))
+    information = _information(bins, best.variance)
+    errors = _standard_errors(information)
+    count = len(random_terms)
+    estimate, lower, upper = np.full(count, np.nan), np.zeros(count), np.empty(count)
+    supported = np.zeros(count, dtype=bool)
+    for i in range(count):
+
+        def fall(value: float, i: int = i) -> float:
+            start = best.theta.copy()
+            start[i] = value
+            if not np.any(start > 0.0):
+                start = errors.copy()
+                start[i] = value
+            return _maximise(bins, start, held=i, slope=fixed_slope).loss - best.loss
+
+        supported[i] = best.theta[i] > 0.0 and (count == 1 or fall(0.0) > support)
+        if supported[i]:
+            estimate[i] = math.sqrt(best.theta[i])
+            lower[i] = math.sqrt(_crossing(fall, best.theta[i], -best.theta[i], two_sided))
+        upper[i] = math.sqrt(_crossing(fall, best.theta[i], 2.0 * errors[i], two_sided if supported[i] else one_sided))
+    covariance = np.full((count, count), np.nan)
+    used = np.flatnonzero(best.theta > 0.0)
+    shrink = 1.0 / np.sqrt(np.diag(information)[used])
+    inverse = np.linalg.pinv(information[np.ix_(used, used)] * np.outer(shrink, shrink)) * np.outer(shrink, shrink)
+    slope_of_root = 0.5 / np.sqrt(best.theta[used])  # d√θ/dθ
+    covariance[np.ix_(used, used)] = inverse * np.outer(slope_of_root, slope_of_root)
+    covariance[~supported, :] = np.nan
+    covariance[:, ~supported] = np.nan
+    if with_ramp:
+        ramp = _fit_ramp(bins, best, two_sided, support)
+        estimate, lower, upper = np.append(estimate, ramp[0]), np.append(lower, ramp[1]), np.append(upper, ramp[2])
+        supported = np.append(supported, not math.isnan(ramp[0]))
+        wide = np.full((count + 1, count + 1), np.nan)
+        wide[:count, :count] = covariance
+        if supported[-1]:
+            wide[-1, :-1] = wide[:-1, -1] = np.where(supported[:-1], 0.0, np.nan)
+            wide[-1, -1] = 1.0 / np.sum(bins.ramp / best.variance)
+        covariance = wide
+    return _AxisFit(estimate, lower, upper, supported, covariance, _misfit_probability(bins, best))
+
+
+def _crossing(fall: Callable[[float], float], centre: float, step: float, level: float) -> float:
+    """Return where ``fall`` reaches ``level``, seen from ``centre`` in the direction of ``step`` (downwards: between 0 and centre)."""
+    from scipy.optimize import brentq
+
+    if step < 0.0:
+        if fall(0.0) <= level:
+            return 0.0
+        return float(brentq(lambda v: fall(v) - level, 0.0, centre, xtol=1e-5 * centre))
+    near, far = centre, centre + step
+    while fall(far) < level:
+        near, far = far, centre + 2.0 * (far - centre)
+    return float(brentq(lambda v: fall(v) - level, near, far, xtol=1e-5 * (far - near)))
+
+
+def _fit_ramp(bins: _Bins, best: _Optimum, two_sided: float, support: float) -> tuple[float, float, float]:
+    """Return estimate, lower and upper of the ramp; unsupported: NaN, 0 and a bound on its size.
+
+    The ramp's own interval profiles the unrestricted likelihood: how far K may go to explain the trend is part of it.
+    """
+    top = _maximise(bins, best.theta, restricted=False)
+
+    def fall(slope: float) -> float:
+        return _maximise(bins, top.theta, slope=slope).loss - top.loss
+
+    error = 1.0 / math.sqrt(float(np.sum(bins.ramp / top.variance)))
+    low = -_crossing(lambda v: fall(-v), -top.slope, 2.0 * error, two_sided) + bins.first_slope
+    high = _crossing(fall, top.slope, 2.0 * error, two_sided) + bins.first_slope
+    if fall(-bins.first_slope) > support:
+        return top.slope + bins.first_slope, low, high
+    return math.nan, 0.0, max(abs(low), abs(high))
+
+
+def _misfit_probability(bins: _Bins, best: _Optimum) -> float:
+    """Return the probability of as large a Pearson statistic, from bins of enough coefficients to be near Gaussian."""
+    from scipy.stats import chi2
+
+    many = bins.number >= min(30.0, bins.number.max())
+    power = bins.square - 2.0 * best.slope * bins.product + best.slope**2 * bins.ramp
+    ratio = power[many] / (bins.number[many] * best.variance[many])
+    statistic = float(np.sum(0.5 * bins.number[many] * (ratio - 1.0) ** 2))
+    freedom = max(1, int(many.sum()) - int(np.sum(best.theta > 0.0)))
+    return float(chi2.sf(statistic, freedom))
