@@ -1,0 +1,507 @@
+"""Attitude from vector observations: exact data, oracles at any weights, covariance by Monte Carlo, and what is refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import mpmath
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from strapdown import quaternion, wahba
+from strapdown.checks import InputError
+
+METHODS = ("svd", "davenport", "quest", "foam")
+BATCHES = [(), (1,), (5,), (2, 3)]
+
+
+def directions(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    v = rng.standard_normal((*shape, 3))
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def geometry(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    """Directions whose first two are at least 30° from one line."""
+    while True:
+        r = directions(rng, *shape)
+        if np.all(np.linalg.norm(np.cross(r[..., 0, :], r[..., 1, :]), axis=-1) > 0.5):
+            return r
+
+
+def measured(q: np.ndarray, r: np.ndarray, sigmas: np.ndarray | float, rng: np.random.Generator) -> np.ndarray:
+    exact = quaternion.rotate(quaternion.conjugate(q)[..., None, :], r)
+    noisy = exact + np.broadcast_to(sigmas, r.shape[:-1])[..., None] * rng.standard_normal(r.shape)
+    return noisy / np.linalg.norm(noisy, axis=-1, keepdims=True)
+
+
+def attitudes(rng: np.random.Generator) -> list[np.ndarray]:
+    """Random ones, identity, and turns at and near 180° about the axes and about random ones."""
+    axes = [*np.eye(3), *directions(rng, 4)]
+    near = [math.pi, *(math.pi - 10.0 ** rng.uniform(-15, 0, 4))]
+    turns = [quaternion.exp(angle * axis) for axis in axes for angle in near]
+    return [quaternion.IDENTITY, *turns, *quaternion.normalize(rng.standard_normal((20, 4)))]
+
+
+def optimum(b: np.ndarray, r: np.ndarray, sigmas: np.ndarray) -> tuple[np.ndarray, float]:
+    """Davenport's eigenvector and the loss with 60 digits, from the rotation matrix of a quaternion written out."""
+    with mpmath.workdps(60):
+        K = mpmath.zeros(4)
+        for bi, ri, si in zip(b, r, sigmas, strict=True):
+            # exactly unit directions, as the loss has them
+            u, v = mpmath.matrix(bi.tolist()), mpmath.matrix(ri.tolist())
+            u, v = u / mpmath.norm(u), v / mpmath.norm(v)
+            # |b q⁻¹ − q⁻¹ r|² = |L(r) q − R(b) q|² / |q|²; both are linear in q, so that K is a sum of products
+            left = mpmath.matrix(
+                [[0, -v[0], -v[1], -v[2]], [v[0], 0, -v[2], v[1]], [v[1], v[2], 0, -v[0]], [v[2], -v[1], v[0], 0]]
+            )
+            right = mpmath.matrix(
+                [[0, -u[0], -u[1], -u[2]], [u[0], 0, u[2], -u[1]], [u[1], -u[2], 0, u[0]], [u[2], u[1], -u[0], 0]]
+            )
+            D = left - right
+            K += D.T * D / mpmath.mpf(float(si)) ** 2
+        values, vectors = mpmath.eigsy(K)
+        q = np.array([float(vectors[i, 0]) for i in range(4)])
+        return np.where(q[0] < 0.0, -q, q), float(values[0] / 2)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# TRIAD
+
+
+@pytest.mark.parametrize("shape", BATCHES)
+def test_triad_is_exact_for_exact_data(shape: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(1)
+    for q in attitudes(rng):
+        r = geometry(rng, *shape, 2)
+        b = measured(np.broadcast_to(q, (*shape, 4)), r, 0.0, rng)
+        found = wahba.triad(3.0 * b[..., 0, :], b[..., 1, :], r[..., 0, :], 1e-3 * r[..., 1, :], sigmas=[1e-9, 1e-9])
+        assert found.shape == (*shape, 4)
+        assert np.max(quaternion.angle_between(found, np.broadcast_to(q, found.shape))) < 5e-15
+
+
+def test_triad_takes_one_reference_for_many_measurements() -> None:
+    rng = np.random.default_rng(2)
+    r = geometry(rng, 2)
+    q = quaternion.normalize(rng.standard_normal((6, 4)))
+    b = measured(q, np.broadcast_to(r, (6, 2, 3)), 0.0, rng)
+    found = wahba.triad(b[:, 0], b[:, 1], r[0], r[1], sigmas=[1e-6, 1e-6])
+    assert np.max(quaternion.angle_between(found, q)) < 5e-15
+
+
+def test_triad_meets_the_first_exactly_and_keeps_the_second_in_the_plane() -> None:
+    rng = np.random.default_rng(3)
+    r = geometry(rng, 50, 2)
+    b = measured(quaternion.normalize(rng.standard_normal((50, 4))), r, 0.1, rng)
+    q = wahba.triad(b[:, 0], b[:, 1], r[:, 0], r[:, 1])
+    first, second = quaternion.rotate(q, b[:, 0]), quaternion.rotate(q, b[:, 1])
+    np.testing.assert_allclose(first, r[:, 0], atol=2e-15)
+    assert np.max(np.abs(np.sum(second * np.cross(r[:, 0], r[:, 1]), axis=-1))) < 2e-15
+    assert np.min(np.sum(np.cross(first, second) * np.cross(r[:, 0], r[:, 1]), axis=-1)) > 0.0
+    assert np.max(quaternion.angle_between(wahba.triad(b[:, 1], b[:, 0], r[:, 1], r[:, 0]), q)) > 0.01
+
+
+def whiteness(error: np.ndarray, covariance: np.ndarray) -> None:
+    """Sample covariance over covariance is I and the NEES χ²₃, both two-sided at about 1e-5."""
+    n = len(error)
+    white = np.linalg.solve(np.linalg.cholesky(covariance), error[..., None])[..., 0]
+    sample = white.T @ white / n
+    np.testing.assert_allclose(np.diag(sample), 1.0, atol=4.5 * math.sqrt(2.0 / n))
+    np.testing.assert_allclose(sample - np.diag(np.diag(sample)), 0.0, atol=4.5 / math.sqrt(n))
+    low, high = chi2.ppf([5e-6, 1.0 - 5e-6], 3 * n) / n
+    assert low < np.mean(np.sum(white**2, axis=-1)) < high
+
+
+@pytest.mark.parametrize("sigmas", [(1e-4, 1e-4), (1e-5, 3e-4), (3e-4, 1e-5)])
+@pytest.mark.parametrize("angle", [0.2, math.pi / 2, 2.5])
+def test_triad_covariance_by_monte_carlo(sigmas: tuple[float, float], angle: float) -> None:
+    rng = np.random.default_rng(4)
+    n = 20000
+    r = np.broadcast_to([[0.0, 0.6, 0.8], [math.sin(angle), 0.6 * math.cos(angle), 0.8 * math.cos(angle)]], (n, 2, 3))
+    q = quaternion.normalize(rng.standard_normal((n, 4)))
+    b = measured(q, r, np.array(sigmas), rng)
+    found = wahba.triad(b[:, 0], b[:, 1], r[:, 0], r[:, 1])
+    error = quaternion.log(quaternion.multiply(quaternion.conjugate(found), q))
+    whiteness(error, wahba.triad_covariance(b[:, 0], b[:, 1], *sigmas))
+
+
+def test_triad_covariance_is_that_of_shuster_and_oh() -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        w1, w2 = geometry(rng, 2)
+        s1, s2 = 10.0 ** rng.uniform(-4, -2, 2)
+        square = np.sum(np.cross(w1, w2) ** 2)
+        cross_terms = (w1 @ w2) * (np.outer(w1, w2) + np.outer(w2, w1))
+        published = s1**2 * np.eye(3) + ((s2**2 - s1**2) * np.outer(w1, w1) + s1**2 * cross_terms) / square
+        np.testing.assert_allclose(
+            wahba.triad_covariance(w1, w2, s1, s2), published, atol=1e-13 * np.trace(published), rtol=0.0
+        )
+
+
+def test_triad_is_never_better_than_the_optimum() -> None:
+    rng = np.random.default_rng(6)
+    for _ in range(20):
+        r = geometry(rng, 2)
+        sigmas = 10.0 ** rng.uniform(-4, -2, 2)
+        best = wahba.solve(r, r, sigmas).covariance
+        excess = np.linalg.eigvalsh(wahba.triad_covariance(*r, *sigmas) - best)
+        assert excess[0] > -1e-12 * np.trace(best)
+    # and reaches it as the first direction becomes exact
+    best = wahba.solve(r, r, [1e-9, 1e-3]).covariance
+    np.testing.assert_allclose(wahba.triad_covariance(*r, 1e-9, 1e-3), best, atol=1e-9 * np.trace(best))
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The optimum
+
+
+@pytest.mark.parametrize("refine", [True, False])
+@pytest.mark.parametrize("method", METHODS)
+def test_exact_data_give_the_exact_attitude(method: wahba.Method, refine: bool) -> None:
+    rng = np.random.default_rng(11)
+    for q in attitudes(rng):
+        for n in (2, 3, 7):
+            r = geometry(rng, n)
+            b = measured(q, r, 0.0, rng)
+            found = wahba.solve(b, r, 1e-6, method=method, refine=refine)
+            assert quaternion.angle_between(found.attitude, q) < (3e-15 if refine else 1e-12)
+            assert found.attitude[0] >= 0.0
+            assert found.chi_square < 1e-15
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_exact_data_with_weights_over_eight_decades(method: wahba.Method) -> None:
+    rng = np.random.default_rng(12)
+    for q in attitudes(rng):
+        r = geometry(rng, 4)
+        sigmas = 1e-5 / np.sqrt(10.0 ** rng.uniform(-6, 2, 4))
+        found = wahba.solve(measured(q, r, 0.0, rng), r, sigmas, method=method)
+        assert quaternion.angle_between(found.attitude, q) < 1e-14
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_optimum_of_noisy_data_with_weights_over_eight_decades(method: wahba.Method) -> None:
+    rng = np.random.default_rng(13)
+    for q in attitudes(rng)[::3]:
+        n = int(rng.integers(2, 6))
+        r = geometry(rng, n)
+        # σ from 1e-6 to 1e-2 rad
+        sigmas = 1e-5 / np.sqrt(10.0 ** rng.uniform(-6, 2, n))
+        b = measured(q, r, sigmas, rng)
+        found = wahba.solve(b, r, sigmas, method=method)
+        best, loss = optimum(b, r, sigmas)
+        assert quaternion.angle_between(found.attitude, best) < 1e-14
+        # The least loss there is, but for the rounding 1e-16/σ of each residual.
+        np.testing.assert_allclose(found.loss, loss, rtol=1e-8, atol=1e-9)
+        raw = wahba.solve(b, r, sigmas, method=method, refine=False)
+        ratio = float(np.max(sigmas) / np.min(sigmas))
+        assert quaternion.angle_between(raw.attitude, best) < 1e-14 + 2e-15 * ratio**2
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("ratio", [1e4, 1e7, 1e10])
+def test_the_optimum_at_extreme_ratios_of_sigma(method: wahba.Method, ratio: float) -> None:
+    rng = np.random.default_rng(20)
+    for q in attitudes(rng)[::3]:
+        r = geometry(rng, 4)
+        sigmas = 1e-12 * rng.permutation(ratio ** np.array([0.0, 1.0, *rng.random(2)]))
+        b = measured(q, r, sigmas, rng)
+        found = wahba.solve(b, r, sigmas, method=method).attitude
+        assert quaternion.angle_between(found, optimum(b, r, sigmas)[0]) < 1e-14 + 2e-23 * ratio
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("spread", [0, 3, 6])
+def test_agrees_with_scipy(method: wahba.Method, spread: int) -> None:
+    rng = np.random.default_rng(14)
+    for q in attitudes(rng):
+        n = int(rng.integers(2, 9))
+        r = geometry(rng, n)
+        weights = 10.0 ** rng.uniform(-spread, min(spread, 2), n)
+        sigmas = 1e-3 / np.sqrt(weights) if spread < 4 else 1e-5 / np.sqrt(weights)
+        b = measured(q, r, sigmas, rng)
+        theirs = quaternion.from_rotation(Rotation.align_vectors(r, b, weights=weights)[0])
+        ours = wahba.solve(b, r, sigmas, method=method).attitude
+        assert quaternion.angle_between(ours, theirs) < 1e-14 + 2e-15 * float(np.max(weights) / np.min(weights))
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("noise", [0.03, 0.3])
+def test_coarse_noise_leaves_the_methods_at_the_same_minimum(method: wahba.Method, noise: float) -> None:
+    rng = np.random.default_rng(15)
+    for q in attitudes(rng)[::2]:
+        r = np.concatenate([np.eye(3), directions(rng, 3)])
+        b = measured(q, r, noise, rng)
+        best, loss = optimum(b, r, np.full(6, noise))
+        for refine in (False, True):
+            found = wahba.solve(b, r, noise, method=method, refine=refine)
+            assert quaternion.angle_between(found.attitude, best) < 1e-13
+            np.testing.assert_allclose(found.loss, loss, rtol=1e-12)
+
+
+@pytest.mark.parametrize("angle", [1e-1, 1e-3, 1e-5])
+@pytest.mark.parametrize("method", METHODS)
+def test_narrow_fields_of_view(method: wahba.Method, angle: float) -> None:
+    rng = np.random.default_rng(16)
+    for q in attitudes(rng)[::3]:
+        r = np.array([0.0, 0.0, 1.0]) + angle * np.array([[1.0, 0.0, 0.0], [-0.3, 0.8, 0.0], [0.1, -0.9, 0.0]])
+        r /= np.linalg.norm(r, axis=-1, keepdims=True)
+        sigma = 1e-2 * angle
+        b = measured(q, r, sigma, rng)
+        found = wahba.solve(b, r, sigma, method=method).attitude
+        # A residual's rounding turns the attitude about the line of sight by 1e-16/angle.
+        assert quaternion.angle_between(found, optimum(b, r, np.full(3, sigma))[0]) < 1e-14 + 4e-16 / angle
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("shape", BATCHES)
+def test_batches_equal_single_sets(method: wahba.Method, shape: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(17)
+    q = quaternion.normalize(rng.standard_normal((*shape, 4)))
+    r = geometry(rng, *shape, 4)
+    sigmas = 10.0 ** rng.uniform(-5, -2, (*shape, 4))
+    b = measured(q, r, sigmas, rng)
+    found = wahba.solve(b, r, sigmas, method=method)
+    assert (found.attitude.shape, found.covariance.shape, found.loss.shape) == ((*shape, 4), (*shape, 3, 3), shape)
+    for index in np.ndindex(shape):
+        one = wahba.solve(b[index], r[index], sigmas[index], method=method)
+        np.testing.assert_allclose(found.attitude[index], one.attitude, atol=2e-15)
+        np.testing.assert_allclose(
+            found.covariance[index], one.covariance, rtol=1e-9, atol=1e-9 * np.trace(one.covariance)
+        )
+        np.testing.assert_allclose(found.chi_square[index], one.chi_square, rtol=1e-9)
+
+
+def test_one_catalogue_and_one_set_of_sigmas_serve_many_measurements() -> None:
+    rng = np.random.default_rng(19)
+    r, sigmas = geometry(rng, 3), np.array([1e-4, 1e-3, 1e-3])
+    b = measured(quaternion.normalize(rng.standard_normal((6, 4))), np.broadcast_to(r, (6, 3, 3)), sigmas, rng)
+    found = wahba.solve(b, r, sigmas)
+    for k in range(6):
+        np.testing.assert_allclose(found.attitude[k], wahba.solve(b[k], r, sigmas).attitude, atol=2e-15)
+
+
+def test_lengths_and_order_do_not_matter() -> None:
+    rng = np.random.default_rng(18)
+    r = geometry(rng, 5)
+    sigmas = 10.0 ** rng.uniform(-4, -2, 5)
+    b = measured(quaternion.normalize(rng.standard_normal(4)), r, sigmas, rng)
+    plain = wahba.solve(b, r, sigmas)
+    order = rng.permutation(5)
+    length = np.array([1e-200, 1e-3, 1.0, 9.81, 1e200])[:, None]
+    other = wahba.solve((length * b)[order], (length[::-1] * r)[order], sigmas[order])
+    np.testing.assert_allclose(other.attitude, plain.attitude, atol=2e-15)
+    np.testing.assert_allclose(other.loss, plain.loss, rtol=1e-10)
+    np.testing.assert_allclose(other.covariance, plain.covariance, atol=1e-12 * np.trace(plain.covariance))
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Covariance and residual
+
+
+def test_two_orthogonal_equal_directions() -> None:
+    rng = np.random.default_rng(21)
+    sigma = 1e-3
+    for q in quaternion.normalize(rng.standard_normal((10, 4))):
+        r = quaternion.rotate(quaternion.normalize(rng.standard_normal(4)), np.eye(3))
+        b = measured(q, r, 0.0, rng)
+        P = wahba.solve(b[:2], r[:2], sigma).covariance
+        # One direction tells nothing about the turn about itself, both tell about that across both.
+        np.testing.assert_allclose(b @ P @ b.T, sigma**2 * np.diag([1.0, 1.0, 0.5]), atol=1e-14 * sigma**2)
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1e2, 1e4])
+def test_covariance_is_the_inverse_of_the_information(ratio: float) -> None:
+    rng = np.random.default_rng(22)
+    for _ in range(10):
+        r = geometry(rng, 3)
+        sigmas = 1e-6 * np.array([1.0, math.sqrt(ratio), ratio])
+        q = quaternion.normalize(rng.standard_normal(4))
+        b = measured(q, r, 0.0, rng)
+        P = wahba.solve(b, r, sigmas).covariance
+        with mpmath.workdps(60):
+            information = mpmath.zeros(3)
+            for bi, si in zip(b, sigmas, strict=True):
+                u = mpmath.matrix(bi.tolist())
+                information += (mpmath.eye(3) - u * u.T / (u.T * u)[0]) / mpmath.mpf(float(si)) ** 2
+            exact = np.array((information**-1).tolist(), dtype=float)
+        np.testing.assert_allclose(P, exact, atol=1e-13 * np.trace(exact))
+        np.testing.assert_array_equal(P, P.T)
+        # Relative to the least variance, too: rounding of the directions, 1e-16 rad, turns the axes of P.
+        least, theirs = np.linalg.eigvalsh(np.linalg.inv(P))[-1], np.linalg.eigvalsh(np.linalg.inv(exact))[-1]
+        assert abs(least / theirs - 1.0) < 1e-14 * ratio**2
+
+
+@pytest.mark.parametrize("sigmas", [(1e-3, 1e-3), (1e-4, 3e-3, 1e-3), (1e-5, 1e-3, 1e-2, 3e-3, 1e-4, 1e-3)])
+@pytest.mark.parametrize("method", METHODS)
+def test_covariance_and_residual_by_monte_carlo(sigmas: tuple[float, ...], method: wahba.Method) -> None:
+    rng = np.random.default_rng(23)
+    count, n = 5000, len(sigmas)
+    r = np.broadcast_to(geometry(rng, n), (count, n, 3))
+    q = quaternion.normalize(rng.standard_normal((count, 4)))
+    found = wahba.solve(measured(q, r, np.array(sigmas), rng), r, sigmas, method=method)
+    whiteness(quaternion.log(quaternion.multiply(quaternion.conjugate(found.attitude), q)), found.covariance)
+    assert found.dof == 2 * n - 3
+    low, high = chi2.ppf([5e-6, 1.0 - 5e-6], found.dof * count) / count
+    assert low < np.mean(found.chi_square) < high
+    # Its probability is uniform: mean ½ and variance 1/12.
+    assert abs(np.mean(found.probability) - 0.5) < 4.5 / math.sqrt(12.0 * count)
+    np.testing.assert_allclose(found.probability, chi2.sf(2.0 * found.loss, found.dof), rtol=1e-12)
+
+
+def test_the_residual_shows_a_sigma_too_small() -> None:
+    rng = np.random.default_rng(24)
+    r = geometry(rng, 40)
+    b = measured(quaternion.normalize(rng.standard_normal(4)), r, 1.5e-3, rng)
+    assert wahba.solve(b, r, 1.5e-3).probability > 0.01
+    assert wahba.solve(b, r, 1e-3).probability < 1e-4
+
+
+def test_results_are_frozen() -> None:
+    solution = wahba.solve(np.eye(3), np.eye(3), 1e-3)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        solution.loss = np.array(0.0)  # type: ignore[misc]
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The vertical and the heading
+
+
+def test_level_body_by_hand() -> None:
+    # A field of 60° dip; body x East and y North, then the body turned left by 90°: its x axis points North.
+    np.testing.assert_allclose(
+        wahba.from_vertical_and_heading([0.0, 0.0, 9.81], [0.0, 25.0, -43.3]), quaternion.IDENTITY, atol=1e-15
+    )
+    np.testing.assert_allclose(
+        wahba.from_vertical_and_heading([0.0, 0.0, 9.81], [25.0, 0.0, -43.3]),
+        [math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)],
+        atol=1e-15,
+    )
+    # Nose (y) up by 90°: body y points up, body z South.
+    np.testing.assert_allclose(
+        quaternion.to_matrix(wahba.from_vertical_and_heading([0.0, 9.81, 0.0], [0.0, -43.3, -25.0])),
+        [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]],
+        atol=1e-15,
+    )
+
+
+@pytest.mark.parametrize("shape", BATCHES)
+def test_vertical_and_heading_for_any_attitude_and_dip(shape: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(31)
+    for q in attitudes(rng):
+        many = np.broadcast_to(q, (*shape, 4))
+        dip = rng.uniform(-1.4, 1.4, shape)
+        field_f = 48.0 * np.stack([np.zeros(shape), np.cos(dip), -np.sin(dip)], axis=-1)
+        up_b = quaternion.rotate(quaternion.conjugate(many), np.array([0.0, 0.0, 9.8]))
+        found = wahba.from_vertical_and_heading(up_b, quaternion.rotate(quaternion.conjugate(many), field_f))
+        assert found.shape == (*shape, 4)
+        assert np.max(quaternion.angle_between(found, many)) < 1e-14
+
+
+def test_the_vertical_counts_most() -> None:
+    rng = np.random.default_rng(32)
+    up, field = directions(rng, 2)
+    q = wahba.from_vertical_and_heading(up, field)
+    np.testing.assert_allclose(quaternion.rotate(q, up), [0.0, 0.0, 1.0], atol=1e-15)
+    x, y, _ = quaternion.rotate(q, field)
+    assert abs(x) < 1e-15
+    assert y > 0.0
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What is refused
+
+EYE = np.eye(3)
+SKEWED = np.array([[1.3, 0.3, 0.3], [0.5, 1.5, 0.5], [0.1, 0.1, 1.1]])
+REFUSED = {
+    "one direction": ((EYE[:1], EYE[:1], 1e-3), "1 direction"),
+    "parallel": (([EYE[0], EYE[0]], [EYE[1], EYE[1]], 1e-3), "directions 0 and 1 .* 0° apart"),
+    "opposite": (([EYE[0], -EYE[0]], [EYE[1], -EYE[1]], 1e-3), "directions 0 and 1 .* 180° apart"),
+    "many on one line": (
+        (np.outer([1, -2, 3], [1, 2, 3]), np.outer([1, -2, 3], [3, 2, 1]), 1e-3),
+        "not determined.*add a direction",
+    ),
+    "parallel but for rounding": (
+        (np.outer([1.0, 0.1], [1.0, 2.0, 3.0]), np.outer([1.0, 0.1], [1.0, 2.0, 3.0]), 1e-18),
+        "not determined",
+    ),
+    "closer than the noise": (([EYE[0], EYE[0] + 1e-4 * EYE[1]],) * 2 + (1e-3,), "1σ of 1[0-9.]* rad.*0.005729"),
+    "nearly opposite": (([EYE[0], 1e-4 * EYE[1] - EYE[0]],) * 2 + (1e-3,), "179.99"),
+    "parallel in the body only": (
+        ([EYE[0], EYE[0] + 1e-5 * EYE[1]], [EYE[0], EYE[0] + 5e-3 * EYE[1]], 1e-3),
+        r"vectors_b: the attitude is not determined",
+    ),
+    "inconsistent": (
+        ([EYE[0], EYE[1], EYE[2]], [EYE[0], EYE[1], EYE[2] + 0.1 * EYE[1]], 1e-3),
+        r"directions 1 and 2 are 90° apart in the body frame but 84.2894° in the fixed frame.*0.486",
+    ),
+    "swapped": ((EYE[[1, 0, 2]] + 0.3, SKEWED, 1e-3), "mixed-up pair"),
+    "zero body": (([EYE[0], 0.0 * EYE[1]], EYE[:2], 1e-3), r"vectors_b\[1\] is the zero vector"),
+    "zero reference": ((EYE[:2], [0.0 * EYE[0], EYE[1]], 1e-3), r"references_f\[0\] is the zero vector"),
+    "NaN": (([EYE[0], [0.0, np.nan, 1.0]], EYE[:2], 1e-3), r"vectors_b\[1, 1\] is nan"),
+    "infinite": ((EYE[:2], [EYE[0], [0.0, np.inf, 1.0]], 1e-3), r"references_f\[1, 1\] is inf"),
+    "NaN sigma": ((EYE[:2], EYE[:2], [1e-3, np.nan]), r"sigmas\[1\] is nan"),
+    "zero sigma": ((EYE[:2], EYE[:2], [1e-3, 0.0]), r"sigmas\[1\] is 0 rad"),
+    "number of sigmas": ((EYE[:2], EYE[:2], [1e-3] * 3), r"sigmas has shape \(3,\), wanted \(2,\)"),
+    "number of directions": ((EYE, EYE[:2], 1e-3), "3 directions but references_f has 2"),
+    "leading axes": ((np.stack([EYE] * 2), np.stack([EYE] * 3), 1e-3), "do not broadcast"),
+    "one vector": ((EYE[0], EYE[0], 1e-3), r"wanted \(\.\.\., n, 3\)"),
+    "sigma of radians as weights": ((EYE[:2], EYE[:2], 100.0), "smaller sigmas"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+@pytest.mark.parametrize("method", METHODS)
+def test_refused(case: str, method: wahba.Method) -> None:
+    arguments, message = REFUSED[case]
+    with pytest.raises(InputError, match=message):
+        wahba.solve(*arguments, method=method)
+
+
+def test_a_refusal_names_the_set_of_a_batch() -> None:
+    b = np.broadcast_to(EYE, (2, 3, 3, 3)).copy()
+    r = b.copy()
+    b[1, 2, 0] = [1.0, 0.2, 0.0]
+    with pytest.raises(InputError, match=r"directions 0 and 1 of set \[1, 2\]"):
+        wahba.solve(b, r, 1e-3)
+    b[1, 2] = r[1, 2] = EYE[:1]
+    with pytest.raises(InputError, match=r"references_f\[1, 2\]: the attitude is not determined"):
+        wahba.solve(b, r, 1e-3)
+
+
+def test_an_unknown_method_is_refused() -> None:
+    with pytest.raises(InputError, match="did you mean 'quest'"):
+        wahba.solve(EYE, EYE, 1e-3, method="qest")  # type: ignore[arg-type]
+
+
+def test_noise_as_given_is_not_refused() -> None:
+    rng = np.random.default_rng(41)
+    r = np.broadcast_to(geometry(rng, 4), (5000, 4, 3))
+    sigmas = np.array([1e-4, 1e-3, 3e-3, 1e-2])
+    wahba.solve(measured(quaternion.normalize(rng.standard_normal((5000, 4))), r, sigmas, rng), r, sigmas)
+
+
+def test_triad_refuses_what_it_cannot_use() -> None:
+    with pytest.raises(InputError, match=r"primary_b and secondary_b are 180° apart"):
+        wahba.triad(EYE[0], -EYE[0], EYE[0], EYE[1])
+    with pytest.raises(InputError, match=r"primary_f\[1\] and secondary_f\[1\] are 0° apart"):
+        wahba.triad(EYE[0], EYE[1], EYE[[0, 1]], EYE[[1, 1]])
+    with pytest.raises(InputError, match=r"90° apart in the body frame but 45°"):
+        wahba.triad(EYE[0], EYE[1], EYE[0], EYE[0] + EYE[1], sigmas=[1e-2, 1e-2])
+    with pytest.raises(InputError, match=r"secondary_b is the zero vector"):
+        wahba.triad(EYE[0], 0.0 * EYE[0], EYE[0], EYE[1])
+    with pytest.raises(InputError, match=r"primary_b and secondary_b are 0° apart"):
+        wahba.triad_covariance(EYE[0], EYE[0], 1e-3, 1e-3)
+    with pytest.raises(InputError, match=r"sigmas\[1\] is -0.001 rad"):
+        wahba.triad_covariance(EYE[0], EYE[1], 1e-3, -1e-3)
+
+
+def test_heading_refuses_a_vertical_field_and_free_fall() -> None:
+    with pytest.raises(InputError, match=r"up_b and magnetic_b are 179.9\d*° apart"):
+        wahba.from_vertical_and_heading([0.0, 0.0, 9.8], [0.0, 0.01, -48.0])
+    with pytest.raises(InputError, match=r"up_b is the zero vector"):
+        wahba.from_vertical_and_heading([0.0, 0.0, 0.0], [0.0, 0.01, -48.0])
+    with pytest.raises(InputError, match=r"magnetic_b\[2\] is nan"):
+        wahba.from_vertical_and_heading([0.0, 0.0, 9.8], [0.0, 0.01, np.nan])
