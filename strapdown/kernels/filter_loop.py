@@ -28,6 +28,26 @@ def heading_error(R, z, reference):
     return math.atan2(x * reference[1] - y * reference[0], x * reference[0] + y * reference[1])
 
 
+def store_state(out, q, b, A, B, C):
+    """Write (q, b, A, B, C) to 28 numbers."""
+    for i in range(4):
+        out[i] = q[i]
+    for i in range(3):
+        out[4 + i] = b[i]
+    for i in range(6):
+        out[7 + i] = A[i]
+        out[22 + i] = C[i]
+    for i in range(9):
+        out[13 + i] = B[i]
+
+
+def store_segment(out, k, dt, part, q, b, A, B, C):
+    """Write row k of the segments: dt, increment, state."""
+    out[k, 0] = dt
+    out[k, 1], out[k, 2], out[k, 3] = part
+    store_state(out[k, 4:], q, b, A, B, C)
+
+
 def run_filter(
     edges,
     increments,
@@ -46,13 +66,16 @@ def run_filter(
     variance_out,
     covariance_out,
     innovation_out,
+    segment_out,
 ):
     """Run the filter over a record; events are sorted by time and lie between the first and the last edge.
 
     The interval from ``edges[k]`` to ``edges[k + 1]`` is split at the times of the events inside it. ``state`` holds (q, b, A, B, C) as
     28 numbers and is left at the end state, so a run may be continued. Row j of the outputs is the state after ``every · j`` intervals;
     ``covariance_out`` (blocks A, B, C as 21 numbers) may be empty. ``innovation_out`` gets e₁, s₁, e₂, s₂, e₃, s₃ of each event:
-    independent innovations and their variances, as many as it has degrees of freedom.
+    independent innovations and their variances, as many as it has degrees of freedom. ``segment_out`` (segments, 32), which may be
+    empty, gets what a smoother needs of each predicted segment: its dt, its increment (3) and the state (28) that it starts from.
+    Returns the number of segments stored.
     """
     q = (state[0], state[1], state[2], state[3])
     b = (state[4], state[5], state[6])
@@ -69,6 +92,7 @@ def run_filter(
     theta = (0.0, 0.0, 0.0)
     countdown = 0
     row = 0
+    segments = 0
     # One pass predicts to the next event or edge, takes in the event, and closes the interval, each where there is one.
     while k < len(increments):
         due = e < events and event_time[e] <= end
@@ -79,7 +103,11 @@ def run_filter(
                 dt = longest
                 stop = now + dt
                 due = False
-            q, A, B, C = predict(q, b, A, B, C, scale(dt / whole, theta), dt, angle_variance, rate_variance)
+            part = scale(dt / whole, theta)
+            if segments < len(segment_out):
+                store_segment(segment_out, segments, dt, part, q, b, A, B, C)
+                segments += 1
+            q, A, B, C = predict(q, b, A, B, C, part, dt, angle_variance, rate_variance)
             now = stop
         if due:
             R = rotation_matrix(q)
@@ -128,12 +156,5 @@ def run_filter(
                 longest = whole
                 if squared > LARGEST_ANGLE * LARGEST_ANGLE:
                     longest = whole * (LARGEST_ANGLE / math.sqrt(squared))
-    for i in range(4):
-        state[i] = q[i]
-    for i in range(3):
-        state[4 + i] = b[i]
-    for i in range(6):
-        state[7 + i] = A[i]
-        state[22 + i] = C[i]
-    for i in range(9):
-        state[13 + i] = B[i]
+    store_state(state, q, b, A, B, C)
+    return segments

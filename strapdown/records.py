@@ -1,0 +1,225 @@
+"""The IMU record, the estimate, and their files.
+
+Everything is told by *edges*: the n + 1 times that bound the n sample intervals. A gyro sample is the rotation increment over its
+interval; attitude, bias and covariance are values at the edges. So nobody need ask which end of an interval a stamp means.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+import strapdown
+from strapdown import coning
+from strapdown.checks import Array, InputError, array, increasing, unit_quaternions
+from strapdown.files import written_beside
+from strapdown.vectors import VectorMeasurements
+
+CONVENTIONS = (
+    "quaternions Hamilton, scalar first, body to fixed frame: v_f = q v_b q^-1; error state (dtheta, db): "
+    "q_true = q exp(dtheta), db = b_true - b; SI units and radians"
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Truth:
+    """What only a simulation, or a reference system, knows."""
+
+    attitude: Array
+    """True q_fb at the edges (n + 1, 4)."""
+    bias: Array
+    """True gyro bias at the edges (n + 1, 3), rad/s."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImuRecord:
+    """Gyro increments and vector measurements over one run."""
+
+    time: Array
+    """Edges of the sample intervals (n + 1,), s, strictly increasing."""
+    increments: Array
+    """Integrals of the measured body rate over each interval (n, 3), rad."""
+    vectors: tuple[VectorMeasurements, ...] = ()
+    """Vector measurements, each with its own times."""
+    truth: Truth | None = None
+
+    def __post_init__(self) -> None:
+        """Check shapes, order and finiteness."""
+        time = increasing("time", self.time, least=2)
+        increments = array("increments", self.increments, (len(time) - 1, 3))
+        object.__setattr__(self, "time", time)
+        object.__setattr__(self, "increments", increments)
+        object.__setattr__(self, "vectors", tuple(self.vectors))
+        names = [series.sensor for series in self.vectors]
+        if len(set(names)) < len(names):
+            raise InputError(f"vectors holds two series of one name among {names}; give each sensor its own")
+        if self.truth is not None:
+            truth = Truth(
+                attitude=unit_quaternions(
+                    "truth.attitude", array("truth.attitude", self.truth.attitude, (len(time), 4))
+                ),
+                bias=array("truth.bias", self.truth.bias, (len(time), 3)),
+            )
+            object.__setattr__(self, "truth", truth)
+
+    @property
+    def rates(self) -> Array:
+        """Averaged body rate over each interval (n, 3), rad/s."""
+        return np.asarray(self.increments / np.diff(self.time)[:, None])
+
+
+def compress(record: ImuRecord, algorithm: coning.Algorithm) -> ImuRecord:
+    """Return the record at the rate of an N-sample coning algorithm: each N increments become one rotation vector.
+
+    The rotation vector stands for the increment of the longer interval: with commutation corrected, a filter may take it for a turn
+    at constant rate. Intervals left over at the end are dropped.
+    """
+    n = algorithm.samples
+    kept = len(record.increments) // n * n
+    if kept == 0:
+        raise InputError(f"record has {len(record.increments)} intervals; {algorithm.name} needs at least {n}")
+    every = slice(0, kept + 1, n)
+    truth = (
+        None if record.truth is None else Truth(attitude=record.truth.attitude[every], bias=record.truth.bias[every])
+    )
+    return dataclasses.replace(
+        record,
+        time=record.time[every],
+        increments=coning.rotation_vectors(record.increments[:kept], algorithm),
+        truth=truth,
+    )
+
+
+def cut(record: ImuRecord, first: int, last: int) -> ImuRecord:
+    """Return the part of the record from edge ``first`` to edge ``last``; measurements in (t_first, t_last] go along.
+
+    Measurements exactly at the first edge of the whole record belong to its first part.
+    """
+    if not 0 <= first < last < len(record.time):
+        raise InputError(
+            f"cut from edge {first} to {last} of a record with edges 0 to {len(record.time) - 1}; choose 0 ≤ first < last"
+        )
+    t0, t1 = record.time[first], record.time[last]
+    vectors = []
+    for series in record.vectors:
+        inside = (series.time > t0) & (series.time <= t1)
+        if first == 0:
+            inside |= series.time == t0
+        vectors.append(
+            dataclasses.replace(
+                series, time=series.time[inside], vector_b=series.vector_b[inside], sigma=series.sigma[inside]
+            )
+        )
+    edges = slice(first, last + 1)
+    truth = (
+        None if record.truth is None else Truth(attitude=record.truth.attitude[edges], bias=record.truth.bias[edges])
+    )
+    return ImuRecord(
+        time=record.time[edges], increments=record.increments[first:last], vectors=tuple(vectors), truth=truth
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Innovations:
+    """Innovations of one sensor, in the order of its measurements."""
+
+    time: Array
+    """Times of the measurements used (m,), s."""
+    whitened: Array
+    """Independent innovations, each over its own standard deviation (m, dof)."""
+
+    @property
+    def nis(self) -> Array:
+        """Normalised innovation squared (m,), χ² with ``whitened.shape[1]`` degrees of freedom if the filter is right."""
+        return np.asarray(np.sum(self.whitened**2, axis=1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """What a filter made of a record, at the kept edges."""
+
+    time: Array
+    """Times (m,), s."""
+    attitude: Array
+    """q_fb (m, 4)."""
+    bias: Array
+    """Gyro bias (m, 3), rad/s, body axes."""
+    variance: Array
+    """Diagonal of P (m, 6): attitude error rad², bias error (rad/s)²."""
+    covariance: Array | None = None
+    """Whole P (m, 6, 6), if it was asked for."""
+    innovations: Mapping[str, Innovations] = field(default_factory=dict)
+    """Innovations by sensor."""
+    skipped: Mapping[str, int] = field(default_factory=dict)
+    """Measurements not used, by sensor: missing (NaN) ones and those outside the record's time."""
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations (m, 6): rad, rad/s."""
+        return np.sqrt(self.variance)
+
+
+_ESTIMATE_UNITS = {
+    "time": "s",
+    "attitude": "1",
+    "bias": "rad/s",
+    "variance": "rad^2 (columns 0-2), (rad/s)^2 (columns 3-5)",
+    "covariance": "rad^2, rad^2/s, (rad/s)^2",
+}
+
+
+def write_estimate(
+    path: str | os.PathLike[str], estimate: Estimate, attributes: Mapping[str, Any] | None = None
+) -> None:
+    """Write an estimate to HDF5, units and conventions as attributes; the file appears whole or not at all."""
+    import h5py
+
+    with written_beside(path) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs["kind"] = "strapdown estimate"
+        file.attrs["version"] = strapdown.__version__
+        file.attrs["conventions"] = CONVENTIONS
+        for name, value in (attributes or {}).items():
+            file.attrs[name] = value
+        for name, unit in _ESTIMATE_UNITS.items():
+            value = getattr(estimate, name)
+            if value is not None:
+                file.create_dataset(name, data=value, compression="gzip", shuffle=True).attrs["unit"] = unit
+        for sensor, innovations in estimate.innovations.items():
+            group = file.create_group(f"innovations/{sensor}")
+            group.create_dataset("time", data=innovations.time, compression="gzip").attrs["unit"] = "s"
+            group.create_dataset("whitened", data=innovations.whitened, compression="gzip").attrs["unit"] = "1"
+            group.attrs["skipped"] = estimate.skipped.get(sensor, 0)
+
+
+def read_estimate(path: str | os.PathLike[str]) -> Estimate:
+    """Read an estimate written by :func:`write_estimate`."""
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("kind") != "strapdown estimate":
+                raise InputError(
+                    f"{path} is not a strapdown estimate; pass the estimate.h5 that `strapdown estimate` writes"
+                )
+            group = file.get("innovations", {})
+            return Estimate(
+                time=file["time"][:],
+                attitude=file["attitude"][:],
+                bias=file["bias"][:],
+                variance=file["variance"][:],
+                covariance=file["covariance"][:] if "covariance" in file else None,
+                innovations={
+                    name: Innovations(time=part["time"][:], whitened=part["whitened"][:])
+                    for name, part in group.items()
+                },
+                skipped={name: int(part.attrs["skipped"]) for name, part in group.items()},
+            )
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist; check the path") from None
+    except (OSError, KeyError) as error:
+        raise InputError(f"{path} cannot be read as HDF5 ({error}); the file is truncated or of another kind") from None
