@@ -1,0 +1,136 @@
+"""Whole records through the extended Kalman filters beside the MEKF. Compiled by :func:`strapdown.kernels.machine.compiled`.
+
+A record comes as a list of steps (:class:`strapdown.family.stepping.Steps`): each predicts over ``dt`` if it is greater than zero, then
+takes in the event that it names, if any, then stores the output row that it names, if any.
+"""
+
+from __future__ import annotations
+
+from strapdown.kernels.algebra import dot, matrix_times_vector, transpose, transpose_times_vector
+from strapdown.kernels.family_step import (
+    attitude_turned_axes,
+    bias_turned_axes,
+    close_fixed_side,
+    close_geometric,
+    close_right_invariant,
+    close_two_frame,
+    from_geometric,
+    negated,
+    predict_fixed_side,
+    predict_two_frame,
+    to_geometric,
+)
+from strapdown.kernels.filter_loop import HEADING, VECTOR, heading_error, store_state, vector_at
+from strapdown.kernels.filter_step import predict, update_row
+from strapdown.kernels.rotation import rotation_matrix
+
+FIXED_SIDE = 0
+RIGHT_INVARIANT = 1
+TWO_FRAME = 2
+GEOMETRIC = 3
+
+
+def state_at(state):
+    """Return (q, b, A, B, C) of 28 numbers."""
+    return (
+        (state[0], state[1], state[2], state[3]),
+        (state[4], state[5], state[6]),
+        (state[7], state[8], state[9], state[10], state[11], state[12]),
+        (state[13], state[14], state[15], state[16], state[17], state[18], state[19], state[20], state[21]),
+        (state[22], state[23], state[24], state[25], state[26], state[27]),
+    )
+
+
+def from_body_side(variant, q, A, B, C):
+    """Return the blocks of a filter's own error coordinates of those of the body side (δθ, δb)."""
+    if variant != GEOMETRIC:
+        R = rotation_matrix(q)
+        A, B = attitude_turned_axes(R, A, B)
+        if variant == TWO_FRAME:
+            B, C = bias_turned_axes(R, B, C)
+    return A, B, C
+
+
+def to_body_side(variant, q, A, B, C):
+    """Return the blocks of the body side (δθ, δb) of those of a filter's own error coordinates."""
+    if variant != GEOMETRIC:
+        R = transpose(rotation_matrix(q))
+        A, B = attitude_turned_axes(R, A, B)
+        if variant == TWO_FRAME:
+            B, C = bias_turned_axes(R, B, C)
+    return A, B, C
+
+
+def run_extended(
+    variant,
+    dt,
+    increment,
+    event,
+    row,
+    angle_variance,
+    rate_variance,
+    event_kind,
+    event_value,
+    event_variance,
+    event_reference,
+    triads,
+    state,
+    state_out,
+    innovation_out,
+):
+    """Run one extended Kalman filter over the steps of a record.
+
+    ``state`` (28 numbers: q, b, A, B, C, body side) is the initial state; ``state_out`` (rows, 28) gets the states, body side too;
+    ``innovation_out`` (events, 6) gets e₁, s₁, e₂, s₂, e₃, s₃ of each event as :func:`strapdown.kernels.filter_loop.run_filter` does.
+    """
+    q, b, A, B, C = state_at(state)
+    A, B, C = from_body_side(variant, q, A, B, C)
+    for k in range(len(dt)):
+        if dt[k] > 0.0:
+            theta = vector_at(increment, k)
+            if variant == GEOMETRIC:
+                q, A, B, C = predict(q, b, A, B, C, theta, dt[k], angle_variance, rate_variance)
+            elif variant == TWO_FRAME:
+                q, A, B, C = predict_two_frame(q, b, A, B, C, theta, dt[k], angle_variance, rate_variance)
+            else:
+                q, A, B, C = predict_fixed_side(q, b, A, B, C, theta, dt[k], angle_variance, rate_variance)
+        e = event[k]
+        if e >= 0:
+            R = rotation_matrix(q)
+            z = vector_at(event_value, e)
+            t = event_reference[e]
+            r = (triads[t, 6], triads[t, 7], triads[t, 8])
+            heading = event_kind[e] == HEADING
+            # With z_f = R z = r + r × δφ and the triad u × v = r of the reference: u · z_f = −v · δφ, v · z_f = u · δφ.
+            u = (triads[t, 0], triads[t, 1], triads[t, 2])
+            v = (triads[t, 3], triads[t, 4], triads[t, 5])
+            z_f = matrix_times_vector(R, z)
+            h1 = (0.0, 0.0, 1.0) if heading else negated(v)
+            h2 = u
+            y1 = heading_error(R, z, r) if heading else dot(u, z_f)
+            if variant == GEOMETRIC:
+                h1 = transpose_times_vector(R, h1)
+                h2 = transpose_times_vector(R, h2)
+                B, C = to_geometric(b, A, B, C)
+            a = (0.0, 0.0, 0.0)
+            c = (0.0, 0.0, 0.0)
+            a, c, A, B, C, e1, s1 = update_row(a, c, A, B, C, h1, y1, event_variance[e])
+            e2, s2 = 0.0, 1.0
+            if not heading:
+                a, c, A, B, C, e2, s2 = update_row(a, c, A, B, C, h2, dot(v, z_f), event_variance[e])
+            if variant == FIXED_SIDE:
+                q, b, A, B = close_fixed_side(q, b, A, B, a, c)
+            elif variant == RIGHT_INVARIANT:
+                q, b = close_right_invariant(q, b, a, c)
+            elif variant == TWO_FRAME:
+                q, b = close_two_frame(q, b, a, c)
+            else:
+                q, b = close_geometric(q, b, a, c)
+                B, C = from_geometric(b, A, B, C)
+            innovation_out[e, 0], innovation_out[e, 1] = e1, s1
+            innovation_out[e, 2], innovation_out[e, 3] = e2, s2
+            if event_kind[e] == VECTOR:
+                innovation_out[e, 4], innovation_out[e, 5] = dot(r, z_f) - 1.0, event_variance[e]
+        if row[k] >= 0:
+            A_b, B_b, C_b = to_body_side(variant, q, A, B, C)
+            store_state(state_out[row[k]], q, b, A_b, B_b, C_b)

@@ -1,0 +1,165 @@
+"""Steps of the filters beside the MEKF, one at a time, on tuples: the same state (q, b, A, B, C), other definitions of the error.
+
+``A``, ``B``, ``C`` are the blocks of the covariance of the error as each filter defines it (R = R_fb of the estimate):
+
+- fixed-side and right-invariant: ``q_true = exp(δφ) ⊗ q``, ``δb = b_true − b``: δφ in fixed axes, δb in body axes;
+- two-frame: ``q_true = exp(δφ) ⊗ q``, ``β = R (b_true − b)`` to first order: both in fixed axes;
+- geometric: body side, carried as (δθ, δb) between updates and as (δθ, η), ``η = b_true − exp(−[δθ]) b``, inside one.
+
+Rows of a measurement are given in fixed axes, ``y = h · δφ + noise``: there they depend on the reference alone and not on the estimate.
+"""
+
+from __future__ import annotations
+
+from strapdown.kernels.algebra import (
+    add,
+    add_matrices,
+    add_to_diagonal,
+    combine,
+    full,
+    matrix_times_vector,
+    multiply,
+    multiply_add,
+    skew_polynomial,
+    times_transpose_upper,
+    times_transpose_upper_add,
+    transpose,
+    transpose_times_vector,
+)
+from strapdown.kernels.filter_step import process_noise, transition
+from strapdown.kernels.rotation import (
+    exponential,
+    quaternion_multiply,
+    renormalized,
+    right_jacobian,
+    rotation_matrix,
+    turned,
+)
+
+
+def negated(v):
+    """Return −v."""
+    return (-v[0], -v[1], -v[2])
+
+
+def turned_in_fixed_axes(q, phi):
+    """Return exp(φ) ⊗ q, norm brought back to one: a turn by φ given in fixed axes."""
+    return renormalized(quaternion_multiply(exponential(phi), q))
+
+
+def congruent(M, S):
+    """Return the symmetric M S Mᵀ."""
+    return times_transpose_upper(multiply(M, full(S)), M)
+
+
+def predict_fixed_side(q, b, A, B, C, delta_theta, dt, angle_variance, rate_variance):
+    """Propagate (δφ, δb) over one gyro increment: ``δφ̇ = −R δb − R n_v``, ``δḃ = n_u``.
+
+    Markley & Crassidis 2014, section 6.2 (error in the reference frame): Φ11 = I, Φ12 = −∫R dt = −dt R₁ J_r(φ) with R₁ at the end; the noise
+    is that of the body side seen from fixed axes, ``Q11(R₁φ)`` and ``R₁ Q12(φ)``.
+    """
+    phi = combine(1.0, delta_theta, -dt, b)
+    q = turned(q, phi)
+    R = rotation_matrix(q)
+    _, body12 = transition(phi, dt)
+    phi12 = multiply(R, body12)
+    q11, _, q22 = process_noise(matrix_times_vector(R, phi), dt, angle_variance, rate_variance)
+    _, q12, _ = process_noise(phi, dt, angle_variance, rate_variance)
+    theta_bias = multiply_add(phi12, full(C), B)
+    theta_theta = multiply_add(phi12, transpose(B), full(A))
+    identity = skew_polynomial(1.0, 0.0, 0.0, phi)
+    return (
+        q,
+        times_transpose_upper_add(theta_theta, identity, times_transpose_upper_add(theta_bias, phi12, q11)),
+        multiply_add(R, q12, theta_bias),
+        add_to_diagonal(C, q22),
+    )
+
+
+def predict_two_frame(q, b, A, B, C, delta_theta, dt, angle_variance, rate_variance):
+    """Propagate (δφ, β) over one gyro increment: ``δφ̇ = −β − R n_v``, ``β̇ = [w_f] β + R n_u``.
+
+    Two-frames group of Barrau & Bonnabel (2023, The geometry of navigation problems), right-invariant error. With φ_f = R φ:
+    Φ11 = I, Φ12 = −dt J_l(φ_f), Φ22 = exp([φ_f]); the noise is isotropic in fixed axes.
+    """
+    phi = combine(1.0, delta_theta, -dt, b)
+    q = turned(q, phi)
+    phi_f = matrix_times_vector(rotation_matrix(q), phi)
+    phi22, phi12 = transition(negated(phi_f), dt)
+    q11, q12, q22 = process_noise(phi_f, dt, angle_variance, rate_variance)
+    theta_bias = multiply_add(phi12, full(C), B)
+    theta_theta = multiply_add(phi12, transpose(B), full(A))
+    identity = skew_polynomial(1.0, 0.0, 0.0, phi)
+    return (
+        q,
+        times_transpose_upper_add(theta_theta, identity, times_transpose_upper_add(theta_bias, phi12, q11)),
+        add_matrices(multiply(theta_bias, transpose(phi22)), q12),
+        add_to_diagonal(congruent(phi22, C), q22),
+    )
+
+
+def close_fixed_side(q, b, A, B, correction, bias_correction):
+    """Move the state by a correction of (δφ, δb) and carry the covariance to the new tangent space.
+
+    ``exp(δφ) = exp(δφ⁺) ⊗ exp(a)`` gives ``δφ⁺ = J_l(a) (δφ − a)`` to first order: G = J_l(a), the mirror image of the body side's J_r.
+    """
+    G = right_jacobian(negated(correction))
+    return turned_in_fixed_axes(q, correction), add(b, bias_correction), congruent(G, A), multiply(G, B)
+
+
+def close_right_invariant(q, b, correction, bias_correction):
+    """Move the state by a correction of (δφ, δb) and leave the covariance, as invariant filters do (Barrau & Bonnabel 2017, section II)."""
+    return turned_in_fixed_axes(q, correction), add(b, bias_correction)
+
+
+def close_two_frame(q, b, correction, bias_correction):
+    """Move the state by the group exponential of a correction (a, c) of (δφ, β), ``χ⁺ = exp(a, c) • χ``; the covariance stays.
+
+    Of the group law (R₁, b₁) • (R₂, b₂) = (R₁R₂, b₂ + R₂ᵀ b₁) the exponential is (exp a, J_r(a) c): ``b⁺ = b + Rᵀ J_r(a) c``.
+    """
+    moved = matrix_times_vector(right_jacobian(correction), bias_correction)
+    return turned_in_fixed_axes(q, correction), add(b, transpose_times_vector(rotation_matrix(q), moved))
+
+
+def close_geometric(q, b, correction, bias_correction):
+    """Move the state by a correction (a, c) of (δθ, η): ``b⁺ = exp(−[a]) b + c`` (Andrle & Crassidis 2015); the covariance stays."""
+    back, _ = transition(correction, 1.0)
+    return turned(q, correction), add(matrix_times_vector(back, b), bias_correction)
+
+
+def sheared(A, B, C, X):
+    """Return the blocks of the covariance of (x, y + X x) of those of (x, y)."""
+    AX = multiply(full(A), transpose(X))
+    S = times_transpose_upper_add(X, transpose(AX), C)
+    XB = multiply(X, B)
+    return (
+        add_matrices(B, AX),
+        (
+            S[0] + 2.0 * XB[0],
+            S[1] + (XB[1] + XB[3]),
+            S[2] + (XB[2] + XB[6]),
+            S[3] + 2.0 * XB[4],
+            S[4] + (XB[5] + XB[7]),
+            S[5] + 2.0 * XB[8],
+        ),
+    )
+
+
+def to_geometric(b, A, B, C):
+    """Return blocks B and C of (δθ, η) of those of (δθ, δb): η = δb − [b] δθ to first order."""
+    return sheared(A, B, C, skew_polynomial(0.0, -1.0, 0.0, b))
+
+
+def from_geometric(b, A, B, C):
+    """Return blocks B and C of (δθ, δb) of those of (δθ, η): δb = η + [b] δθ to first order."""
+    return sheared(A, B, C, skew_polynomial(0.0, 1.0, 0.0, b))
+
+
+def attitude_turned_axes(M, A, B):
+    """Return blocks A and B with the attitude error taken to other axes by the rotation M."""
+    return congruent(M, A), multiply(M, B)
+
+
+def bias_turned_axes(M, B, C):
+    """Return blocks B and C with the bias error taken to other axes by the rotation M."""
+    return multiply(B, transpose(M)), congruent(M, C)

@@ -1,0 +1,254 @@
+"""Steps that solve q̇ = ½ q ⊗ w on a rate polynomial: to rounding by a power series, or by Magnus, commutator-free, Runge–Kutta, Euler."""
+
+from __future__ import annotations
+
+from strapdown.kernels.algebra import add, combine, cross, dot, square_root
+from strapdown.kernels.integration import large_exponential, pair_correction
+from strapdown.kernels.rotation import quaternion_multiply, renormalized
+
+NEGLIGIBLE = 2.0**-56
+"""rad; powers of the rate that together turn less are left out, and the series ends when all terms to come turn less."""
+
+LARGEST_RATE = 4.0
+"""rad a sample interval, for a bound of the polynomial's rate: beyond it the polynomial is no description of the motion."""
+
+TERMS_PER_SAMPLE = 2
+"""With ``EXTRA_TERMS``, the room for the power series: a series that has not ended there belongs to data too rough for the polynomial."""
+
+EXTRA_TERMS = 24
+"""For a steady rate of ``LARGEST_RATE`` the terms fall as 1/n!, below rounding at n = 18."""
+
+MAGNUS_4 = 0
+MAGNUS_6 = 1
+COMMUTATOR_FREE_4 = 2
+RUNGE_KUTTA_4 = 3
+EULER = 4
+
+
+def quaternion_times_vector(q, v):
+    """Return q ⊗ (0, v)."""
+    return (
+        -q[1] * v[0] - q[2] * v[1] - q[3] * v[2],
+        q[0] * v[0] + q[2] * v[2] - q[3] * v[1],
+        q[0] * v[1] + q[3] * v[0] - q[1] * v[2],
+        q[0] * v[2] + q[1] * v[1] - q[2] * v[0],
+    )
+
+
+def fitted_rates(increments, first, fit, rates):
+    """Write the powers of s of the rate polynomial through the window from row ``first`` on; return (bound of the rate, powers kept).
+
+    ``fit`` (M, M) holds, for each increment, its weights in the powers; ``rates`` is (4, M): by axis, and then the sum of the bounds of
+    this power and all higher ones.
+    """
+    window = len(fit)
+    for m in range(window):
+        rates[0, m] = 0.0
+        rates[1, m] = 0.0
+        rates[2, m] = 0.0
+    for j in range(window):
+        x = increments[first + j, 0]
+        y = increments[first + j, 1]
+        z = increments[first + j, 2]
+        for m in range(window):
+            rates[0, m] += fit[j, m] * x
+            rates[1, m] += fit[j, m] * y
+            rates[2, m] += fit[j, m] * z
+    bound = 0.0
+    kept = 1
+    power = 0.5 ** (window - 1)
+    for m in range(window - 1, -1, -1):  # from the least, so that ``bound`` is the tail's until it counts
+        bound += power * (abs(rates[0, m]) + abs(rates[1, m]) + abs(rates[2, m]))
+        rates[3, m] = bound
+        power *= 2.0
+        if bound > NEGLIGIBLE and kept <= m:
+            kept = m + 1
+    return (bound, kept)
+
+
+def interval_quaternion(rates, kept, series):
+    """Return (rotation over one sample interval, whether its series has ended), from the powers of the rate polynomial.
+
+    With s ∈ [−½, ½] measured from the interval's middle, w = Σ Ω_m sᵐ and q = Σ q_n sⁿ, equation (17) is
+    2(n + 1) q_{n+1} = Σ_m q_{n−m} ⊗ Ω_m. The series from the middle gives both ends at once: δq = q(−½)* ⊗ q(½).
+
+    ``rates`` (4, M) is that of fitted_rates, its first ``kept`` powers count; ``series`` (terms, 4) is work.
+    """
+    series[0, 0] = 1.0
+    series[0, 1] = 0.0
+    series[0, 2] = 0.0
+    series[0, 3] = 0.0
+    even = (1.0, 0.0, 0.0, 0.0)
+    odd = (0.0, 0.0, 0.0, 0.0)
+    power = 1.0
+    ended = False
+    for n in range(len(series) - 1):
+        w = 0.0
+        x = 0.0
+        y = 0.0
+        z = 0.0
+        for m in range(min(n + 1, kept)):
+            i = n - m
+            part = quaternion_times_vector(
+                (series[i, 0], series[i, 1], series[i, 2], series[i, 3]), (rates[0, m], rates[1, m], rates[2, m])
+            )
+            w += part[0]
+            x += part[1]
+            y += part[2]
+            z += part[3]
+        s = 0.5 / (n + 1)
+        series[n + 1, 0] = s * w
+        series[n + 1, 1] = s * x
+        series[n + 1, 2] = s * y
+        series[n + 1, 3] = s * z
+        power *= 0.5
+        s *= power
+        if n % 2:
+            even = (even[0] + s * w, even[1] + s * x, even[2] + s * y, even[3] + s * z)
+        else:
+            odd = (odd[0] + s * w, odd[1] + s * x, odd[2] + s * y, odd[3] + s * z)
+        if (
+            s * (abs(w) + abs(x) + abs(y) + abs(z)) < NEGLIGIBLE
+            and terms_to_come(rates, kept, series, n + 1) < NEGLIGIBLE
+        ):
+            ended = True
+            break
+    backward = (even[0] - odd[0], odd[1] - even[1], odd[2] - even[2], odd[3] - even[3])
+    forward = (even[0] + odd[0], even[1] + odd[1], even[2] + odd[2], even[3] + odd[3])
+    return (quaternion_multiply(backward, forward), ended)
+
+
+def terms_to_come(rates, kept, series, n):
+    """Return a bound of the turn in all terms of the series after the n-th, from the last ``kept`` ones.
+
+    Term n − m reaches later ones through the powers m and higher only, whose bounds sum to ``rates[3, m]``, and is divided by 2(n + 1)
+    or more, and by 2 for the half interval; what those terms add in turn is less again.
+    """
+    total = 0.0
+    for m in range(min(kept, n + 1)):
+        i = n - m
+        size = abs(series[i, 0]) + abs(series[i, 1]) + abs(series[i, 2]) + abs(series[i, 3])
+        total += rates[3, m] * size * 0.5**i
+    return total / (2.0 * (n + 1))
+
+
+def polynomial_steps(increments, samples, previous, fits, correction, rates, series, steps):
+    """Write the step quaternions (m, 4): the equation on the polynomial, then exp(Σ C_ij Δθ_i × Δθ_j).
+
+    ``fits`` (M, M, M) is indexed by the interval's place in the window, increments, powers. Near the ends of the record the window stays
+    inside it and the step sits elsewhere in the window, without the correction, which is made for one place only. Where the data are too
+    rough for the polynomial, the interval's increment alone is its rotation vector.
+    """
+    window = len(fits)
+    latest = len(increments) - window
+    for k in range(len(steps)):
+        first = k * samples
+        start = min(max(first - previous, 0), latest)
+        smooth = first - start == previous
+        q = (1.0, 0.0, 0.0, 0.0)
+        for i in range(first, first + samples):
+            bound, kept = fitted_rates(increments, start, fits[i - start], rates)
+            step, ended = interval_quaternion(rates, kept, series)
+            if bound > LARGEST_RATE or not ended:
+                step = large_exponential((increments[i, 0], increments[i, 1], increments[i, 2]))
+                smooth = False
+            q = quaternion_multiply(q, step)
+        if smooth:
+            q = quaternion_multiply(q, large_exponential(pair_correction(increments, start, correction)))
+        q = renormalized(q)
+        steps[k, 0] = q[0]
+        steps[k, 1] = q[1]
+        steps[k, 2] = q[2]
+        steps[k, 3] = q[3]
+
+
+def magnus_4(b0, b1):
+    """Return exp(B₀ + B₀ × B₁), B_n = T⁻ⁿ ∫ (t − T/2)ⁿ w dt."""
+    return large_exponential(add(b0, cross(b0, b1)))
+
+
+def magnus_6(b0, b1, b2):
+    """Return the sixth-order Magnus step (Blanes, Casas, Ros 2000), with [a, b] = −a × b because equation (17) multiplies on the right."""
+    a1 = combine(2.25, b0, -15.0, b2)
+    a2 = (12.0 * b1[0], 12.0 * b1[1], 12.0 * b1[2])
+    a3 = combine(-15.0, b0, 180.0, b2)
+    c1 = cross(a2, a1)
+    c2 = cross(a1, combine(2.0 / 60.0, a3, 1.0 / 60.0, c1))
+    left = (-20.0 * a1[0] - a3[0] + c1[0], -20.0 * a1[1] - a3[1] + c1[1], -20.0 * a1[2] - a3[2] + c1[2])
+    return large_exponential(
+        add(combine(1.0, a1, 1.0 / 12.0, a3), combine(1.0 / 240.0, cross(add(a2, c2), left), 0.0, a1))
+    )
+
+
+def commutator_free_4(b0, b1):
+    """Return exp(½B₀ − 2B₁) ⊗ exp(½B₀ + 2B₁)."""
+    return quaternion_multiply(
+        large_exponential(combine(0.5, b0, -2.0, b1)), large_exponential(combine(0.5, b0, 2.0, b1))
+    )
+
+
+def normalized(q):
+    """Return q / |q|."""
+    s = 1.0 / square_root(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    return (s * q[0], s * q[1], s * q[2], s * q[3])
+
+
+def runge_kutta_4(start, middle, end):
+    """Return the classical Runge–Kutta step of equation (17), normalised; the arguments are T × rate at 0, T/2, T."""
+    k1 = (0.0, 0.5 * start[0], 0.5 * start[1], 0.5 * start[2])
+    k2 = quaternion_times_vector((0.5 + 0.25 * k1[0], 0.25 * k1[1], 0.25 * k1[2], 0.25 * k1[3]), middle)
+    k3 = quaternion_times_vector((0.5 + 0.25 * k2[0], 0.25 * k2[1], 0.25 * k2[2], 0.25 * k2[3]), middle)
+    k4 = quaternion_times_vector((0.5 + 0.5 * k3[0], 0.5 * k3[1], 0.5 * k3[2], 0.5 * k3[3]), end)
+    s = 1.0 / 6.0
+    return normalized(
+        (
+            1.0 + s * (k1[0] + 2.0 * (k2[0] + k3[0]) + k4[0]),
+            s * (k1[1] + 2.0 * (k2[1] + k3[1]) + k4[1]),
+            s * (k1[2] + 2.0 * (k2[2] + k3[2]) + k4[2]),
+            s * (k1[3] + 2.0 * (k2[3] + k3[3]) + k4[3]),
+        )
+    )
+
+
+def euler(increment):
+    """Return 1 + ½ Δθ, normalised."""
+    s = 1.0 / square_root(1.0 + 0.25 * dot(increment, increment))
+    return (s, 0.5 * s * increment[0], 0.5 * s * increment[1], 0.5 * s * increment[2])
+
+
+def weighted(increments, first, weights, row):
+    """Return Σ_j weights[row, j] Δθ_j over the window that starts at row ``first``."""
+    x = 0.0
+    y = 0.0
+    z = 0.0
+    for j in range(weights.shape[1]):
+        s = weights[row, j]
+        x += s * increments[first + j, 0]
+        y += s * increments[first + j, 1]
+        z += s * increments[first + j, 2]
+    return (x, y, z)
+
+
+def scheme_steps(increments, weights, scheme, steps):
+    """Write the step quaternions (m, 4) of a one-step scheme on three weighted sums (moments or rates) of the N increments of a step."""
+    samples = weights.shape[1]
+    for k in range(len(steps)):
+        first = k * samples
+        a = weighted(increments, first, weights, 0)
+        b = weighted(increments, first, weights, 1)
+        c = weighted(increments, first, weights, 2)
+        if scheme == MAGNUS_4:
+            q = magnus_4(a, b)
+        elif scheme == MAGNUS_6:
+            q = magnus_6(a, b, c)
+        elif scheme == COMMUTATOR_FREE_4:
+            q = commutator_free_4(a, b)
+        elif scheme == RUNGE_KUTTA_4:
+            q = runge_kutta_4(a, b, c)
+        else:
+            q = euler(a)
+        q = renormalized(q)
+        steps[k, 0] = q[0]
+        steps[k, 1] = q[1]
+        steps[k, 2] = q[2]
+        steps[k, 3] = q[3]

@@ -1,0 +1,141 @@
+"""Attitude under harmonic body rates by Taylor series about evenly spaced nodes, used as truth by :mod:`strapdown.motion`.
+
+About a node the rate is a power series known in closed form, so equation (17), ``q̇ = ½ q ⊗ w_b``, gives the attitude relative to the
+node by recurrence: ``q_{n+1} = ½/(n + 1) Σ q_i ⊗ w_{n−i}``. Deviations from the identity are kept, not quaternions, and summed with
+compensation: a chain of nodes then loses rounding of the deviations only.
+"""
+
+from __future__ import annotations
+
+from strapdown.kernels.rotation import quaternion_multiply
+
+
+def rate_series(cosines, sines, factors, amplitudes, mean, series):
+    """Fill ``series`` (terms, 3) with the Taylor coefficients of ``mean + Σ a_j cos(ω_j t + θ_j)`` about a node.
+
+    ``cosines`` and ``sines`` are those of the phases at the node; ``factors`` (harmonics, terms) holds ω^n/n! rounded once, because an
+    error in them would be the same at every node and add up.
+    """
+    for n in range(series.shape[0]):
+        for axis in range(3):
+            series[n, axis] = mean[axis] if n == 0 else 0.0
+    for j in range(factors.shape[0]):
+        c = cosines[j]
+        s = sines[j]
+        for n in range(series.shape[0]):
+            value = factors[j, n] * c
+            for axis in range(3):
+                series[n, axis] += amplitudes[j, axis] * value
+            c, s = -s, c
+
+
+def attitude_series(rate, series):
+    """Fill ``series`` (terms + 1, 4) with the Taylor coefficients of the attitude relative to the node, the first the identity."""
+    series[0, 0] = 1.0
+    series[0, 1] = 0.0
+    series[0, 2] = 0.0
+    series[0, 3] = 0.0
+    for n in range(rate.shape[0]):
+        w = 0.0
+        x = 0.0
+        y = 0.0
+        z = 0.0
+        for i in range(n + 1):
+            q0 = series[i, 0]
+            q1 = series[i, 1]
+            q2 = series[i, 2]
+            q3 = series[i, 3]
+            wx = rate[n - i, 0]
+            wy = rate[n - i, 1]
+            wz = rate[n - i, 2]
+            w -= q1 * wx + q2 * wy + q3 * wz
+            x += q0 * wx + q2 * wz - q3 * wy
+            y += q0 * wy + q3 * wx - q1 * wz
+            z += q0 * wz + q1 * wy - q2 * wx
+        divisor = 2.0 * (n + 1.0)
+        series[n + 1, 0] = w / divisor
+        series[n + 1, 1] = x / divisor
+        series[n + 1, 2] = y / divisor
+        series[n + 1, 3] = z / divisor
+
+
+def deviation(series, t):
+    """Return the sum of an attitude series at ``t`` less the identity, by Horner's rule."""
+    w = 0.0
+    x = 0.0
+    y = 0.0
+    z = 0.0
+    for n in range(series.shape[0] - 1, 0, -1):
+        w = (w + series[n, 0]) * t
+        x = (x + series[n, 1]) * t
+        y = (y + series[n, 2]) * t
+        z = (z + series[n, 3]) * t
+    return (w, x, y, z)
+
+
+def node_deviations(cosines, sines, factors, amplitudes, mean, half, rate, series, before, after):
+    """Fill ``before`` and ``after`` (n, 4): each node's deviation half a spacing earlier and later."""
+    for k in range(cosines.shape[0]):
+        rate_series(cosines[k], sines[k], factors, amplitudes, mean, rate)
+        attitude_series(rate, series)
+        earlier = deviation(series, -half)
+        later = deviation(series, half)
+        for i in range(4):
+            before[k, i] = earlier[i]
+            after[k, i] = later[i]
+
+
+def advance(q, low, d):
+    """Return q ⊗ (1 + d) of a quaternion held as the unevaluated sum ``q + low``, in the same form (two-sum, Knuth)."""
+    p = quaternion_multiply((q[0] + low[0], q[1] + low[1], q[2] + low[2], q[3] + low[3]), d)
+    s0 = q[0] + p[0]
+    s1 = q[1] + p[1]
+    s2 = q[2] + p[2]
+    s3 = q[3] + p[3]
+    b0 = s0 - q[0]
+    b1 = s1 - q[1]
+    b2 = s2 - q[2]
+    b3 = s3 - q[3]
+    return (
+        (s0, s1, s2, s3),
+        (
+            low[0] + ((q[0] - (s0 - b0)) + (p[0] - b0)),
+            low[1] + ((q[1] - (s1 - b1)) + (p[1] - b1)),
+            low[2] + ((q[2] - (s2 - b2)) + (p[2] - b2)),
+            low[3] + ((q[3] - (s3 - b3)) + (p[3] - b3)),
+        ),
+    )
+
+
+def chain(leaving, arriving, attitudes, lows):
+    """Fill rows 1… of ``attitudes`` and ``lows`` (n, 4), attitudes at consecutive nodes, from row 0.
+
+    ``leaving[k]`` takes node k to the point half-way to the next, ``arriving[k + 1]`` is that point as seen from node k + 1: the step
+    is ``(1 + a) ⊗ (1 + b)*``, its deviation ``a + b* + a ⊗ b*``.
+    """
+    q = (attitudes[0, 0], attitudes[0, 1], attitudes[0, 2], attitudes[0, 3])
+    low = (lows[0, 0], lows[0, 1], lows[0, 2], lows[0, 3])
+    for k in range(leaving.shape[0] - 1):
+        a = (leaving[k, 0], leaving[k, 1], leaving[k, 2], leaving[k, 3])
+        b = (arriving[k + 1, 0], -arriving[k + 1, 1], -arriving[k + 1, 2], -arriving[k + 1, 3])
+        ab = quaternion_multiply(a, b)
+        q, low = advance(q, low, (a[0] + b[0] + ab[0], a[1] + b[1] + ab[1], a[2] + b[2] + ab[2], a[3] + b[3] + ab[3]))
+        for i in range(4):
+            attitudes[k + 1, i] = q[i]
+            lows[k + 1, i] = low[i]
+
+
+def evaluate(node, offset, cosines, sines, factors, amplitudes, mean, attitudes, lows, rate, series, result):
+    """Fill ``result`` (n, 4) with the attitudes at ``offset`` from each time's node; ``node`` is sorted, so each series is made once."""
+    last = -1
+    for k in range(node.shape[0]):
+        j = node[k]
+        if j != last:
+            rate_series(cosines[j], sines[j], factors, amplitudes, mean, rate)
+            attitude_series(rate, series)
+            last = j
+        q = (attitudes[j, 0], attitudes[j, 1], attitudes[j, 2], attitudes[j, 3])
+        low = (lows[j, 0], lows[j, 1], lows[j, 2], lows[j, 3])
+        q, low = advance(q, low, deviation(series, offset[k]))
+        for i in range(4):
+            result[k, i] = q[i] + low[i]

@@ -1,0 +1,132 @@
+"""Smooth motion through given attitudes."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from strapdown import checks, quaternion
+from strapdown.checks import Array
+from strapdown.motion.parameters import edge_stamps, times
+from strapdown.motion.quadrature import interval_integrals
+
+_WIDEST_DEGREES = 170.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SampledAttitude:
+    """Smooth motion through given attitudes: a spline through the quaternions in four dimensions, scaled to the unit sphere.
+
+    ``q = s/|s|`` with s a spline of degree 5 (four continuous derivatives) or 3 (two). Unlike a spline of rotation vectors it needs no
+    iteration, has no small-angle switch, and turning the body or the fixed axes turns the motion with them. The rate
+    ``w_b = 2 vec(s* ⊗ ṡ)/|s|²`` is exact for this motion; increments are its integrals, converged to rounding.
+
+    Parameters
+    ----------
+    time : sequence of n floats
+        s, increasing; the motion is defined between the first and the last.
+    attitudes : sequence of n quaternions
+        q_fb, either sign; consecutive ones less than 170° apart.
+    degree : int
+        5 or 3.
+    ends : str
+        ``"free"`` (no condition beyond the samples) or ``"rest"`` (rate zero at both ends; with degree 5 angular acceleration too).
+    """
+
+    time: Array
+    attitudes: Array
+    degree: int = 5
+    ends: str = "free"
+
+    def __post_init__(self) -> None:
+        if self.degree not in (3, 5):
+            raise checks.InputError(f"degree is {self.degree!r}; it must be 3 or 5")
+        checks.one_of("ends", self.ends, ("free", "rest"))
+        least = self.degree + 1 if self.ends == "free" else 2
+        time = checks.increasing("time", self.time, least=least).copy()
+        samples = checks.unit_quaternions("attitudes", checks.array("attitudes", self.attitudes, ("n", 4)))
+        if len(samples) != len(time):
+            raise checks.InputError(f"attitudes has {len(samples)} rows for {len(time)} stamps; give one a stamp")
+        turns = np.sum(samples[1:] * samples[:-1], axis=-1)
+        wide = np.abs(turns) < math.cos(0.5 * math.radians(_WIDEST_DEGREES))
+        if wide.any():
+            k = int(np.argmax(wide))
+            raise checks.InputError(
+                f"attitudes[{k + 1}] is {math.degrees(2.0 * math.acos(min(1.0, abs(turns[k])))):.0f}° from the one before; "
+                f"give samples less than {_WIDEST_DEGREES:g}° apart, so that the way between them is plain"
+            )
+        samples[1:] *= np.cumprod(np.where(turns < 0.0, -1.0, 1.0))[:, None]
+        time.flags.writeable = samples.flags.writeable = False
+        object.__setattr__(self, "time", time)
+        object.__setattr__(self, "attitudes", samples)
+        object.__setattr__(self, "degree", int(self.degree))
+
+    @property
+    def breaks(self) -> Array:
+        """The times of the samples, s: the spline changes polynomial there."""
+        return self.time
+
+    @functools.cached_property
+    def _splines(self) -> tuple[Any, Any, Any]:
+        from scipy.interpolate import make_interp_spline
+
+        still = [(order, np.zeros(4)) for order in range(1, (self.degree + 1) // 2)]
+        ends = (still, still) if self.ends == "rest" else None
+        spline = make_interp_spline(self.time, self.attitudes, k=self.degree, bc_type=ends)
+        return spline, spline.derivative(), spline.derivative(2)
+
+    def _inside(self, time: Array) -> Array:
+        outside = (time < self.time[0]) | (time > self.time[-1])
+        if outside.any():
+            value = float(time[outside][0]) if time.ndim else float(time)
+            raise checks.InputError(
+                f"time {value:g} s is outside the samples, {self.time[0]:g} s to {self.time[-1]:g} s; "
+                "a sampled motion does not extrapolate"
+            )
+        return time
+
+    def _smooth(self, time: Array, derivatives: int) -> tuple[Array, ...]:
+        t = self._inside(time)
+        return tuple(np.asarray(spline(t)) for spline in self._splines[: derivatives + 1])
+
+    def _smooth_rate(self, time: Array) -> Array:
+        s, velocity = self._smooth(time, 1)
+        product = quaternion.multiply(quaternion.conjugate(s), velocity)[..., 1:]
+        return np.asarray(2.0 * product / np.sum(s * s, axis=-1, keepdims=True))
+
+    def attitude(self, time: ArrayLike) -> Array:
+        """Return q_fb (..., 4)."""
+        return quaternion.normalize(self._smooth(times(time), 0)[0])
+
+    def body_rate(self, time: ArrayLike) -> Array:
+        """Return w_b = 2 vec(s* ⊗ ṡ)/|s|², rad/s."""
+        return self._smooth_rate(times(time))
+
+    def fixed_rate(self, time: ArrayLike) -> Array:
+        """Return w_f = 2 vec(ṡ ⊗ s*)/|s|², rad/s."""
+        s, velocity = self._smooth(times(time), 1)
+        product = quaternion.multiply(velocity, quaternion.conjugate(s))[..., 1:]
+        return np.asarray(2.0 * product / np.sum(s * s, axis=-1, keepdims=True))
+
+    def body_angular_acceleration(self, time: ArrayLike) -> Array:
+        """Return dw_b/dt = 2 vec(s* ⊗ s̈)/|s|² − 2 w_b (s · ṡ)/|s|², rad/s²."""
+        s, velocity, acceleration = self._smooth(times(time), 2)
+        back, squared = quaternion.conjugate(s), np.sum(s * s, axis=-1, keepdims=True)
+        growth = 2.0 * np.sum(s * velocity, axis=-1, keepdims=True) / squared
+        rate = 2.0 * quaternion.multiply(back, velocity)[..., 1:] / squared
+        return np.asarray(2.0 * quaternion.multiply(back, acceleration)[..., 1:] / squared - growth * rate)
+
+    def increments(self, edges: ArrayLike) -> Array:
+        """Return ∫ w_b dt over each interval, rad, by converged quadrature between the samples."""
+        stamps = self._inside(edge_stamps(edges))
+        return interval_integrals(self._smooth_rate, stamps, self.time)
+
+
+def waypoints(time: ArrayLike, attitudes: ArrayLike, *, degree: int = 5) -> SampledAttitude:
+    """Return the smooth motion from rest through the given attitudes q_fb (n, 4) at the given times to rest, n ≥ 2."""
+    return SampledAttitude(time=np.asarray(time), attitudes=np.asarray(attitudes), degree=degree, ends="rest")

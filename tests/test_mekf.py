@@ -1,0 +1,381 @@
+"""The filter as a whole: two faces, independent references, closed forms, splits, gaps and bad input."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.integrate
+import scipy.linalg
+from filterpy.common import Saver
+from filterpy.kalman import KalmanFilter
+
+from strapdown import coning, consistency, gyro, mekf, motion, quaternion, records, vectors
+from strapdown.checks import InputError
+from strapdown.mekf import ProcessNoise, StepFilter, initial_state
+from strapdown.randomness import generator
+from strapdown.records import ImuRecord, Truth
+from strapdown.scenarios import Scenario, simulate
+from strapdown.vectors import VectorMeasurements, VectorSensor
+
+NOISE = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)
+SENSORS = (
+    VectorSensor(name="a", reference_f=np.array([1.0, 0.0, 0.0]), sigma=1e-3, rate=13.0),
+    VectorSensor(name="b", reference_f=np.array([0.0, 1.0, 1.0]), sigma=2e-3, rate=5.0, phase=0.013),
+    VectorSensor(name="north", reference_f=np.array([0.0, 1.0, -1.0]), sigma=5e-3, rate=4.0, kind="heading"),
+)
+
+
+def scenario(body_motion=None, sensors=SENSORS, duration=8.0):
+    return Scenario(
+        motion=body_motion or motion.Coning(angle=0.02, frequency=1.0),
+        gyro=gyro.GyroSpec(angle_random_walk=1e-4, rate_random_walk=1e-5, turn_on_bias=np.array([1e-3, -2e-3, 5e-4])),
+        sensors=sensors,
+        rate=100.0,
+        duration=duration,
+    )
+
+
+def off(record, error=(1e-2, -2e-2, 1e-2)):
+    attitude = quaternion.multiply(record.truth.attitude[0], quaternion.exp(error))
+    return initial_state(attitude, attitude_sigma=2e-2, bias_sigma=3e-3)
+
+
+def with_vector_series(record):
+    """Add a whole-vector series (three degrees of freedom) of unit 9.8 at times of its own."""
+    time = np.linspace(0.05, record.time[-1] - 0.03, 61)
+    index = np.searchsorted(record.time, time)
+    up = np.array([0.0, 0.0, 9.8])
+    noise = 0.05 * generator(3, 0, "force").standard_normal((len(time), 3))
+    value = quaternion.rotate(quaternion.conjugate(record.truth.attitude[index]), up) + noise
+    series = VectorMeasurements(
+        sensor="force", kind="vector", time=time, vector_b=value, reference_f=up, sigma=np.full(len(time), 0.05)
+    )
+    return replace(record, vectors=(*record.vectors, series))
+
+
+def stepped(record, initial, saver=None):
+    """Run the step-by-step face over a record, splitting intervals at the measurements: a plain loop of its own."""
+    f = StepFilter(NOISE, initial)
+    history = Saver(f) if saver else None
+    events = sorted((t, i, k) for i, s in enumerate(record.vectors) for k, t in enumerate(s.time))
+    out = []
+    for k, delta in enumerate(record.increments):
+        now, end = record.time[k], record.time[k + 1]
+        whole = end - now
+        while events and events[0][0] <= end:
+            t, i, j = events.pop(0)
+            if t > now:
+                f.predict(delta * ((t - now) / whole), t - now)
+                now = t
+            series = record.vectors[i]
+            update = {"direction": f.update_direction, "vector": f.update_vector, "heading": f.update_heading}
+            update[series.kind](series.vector_b[j], series.reference_f, series.sigma[j])
+            if history is not None:
+                history.save()
+        if end > now:
+            f.predict(delta * ((end - now) / whole), end - now)
+        out.append((f.attitude, f.bias, f.P))
+    return [np.array(x) for x in zip(*out, strict=True)], history
+
+
+@pytest.mark.parametrize("fast", [False, True], ids=["slow turn", "12 rad/s"])
+def test_both_faces_are_one_filter(fast):
+    body_motion = motion.ConstantRate(rate=(80.0, -60.0, 70.0)) if fast else None  # 1.2 rad a sample: sub-steps
+    record = with_vector_series(simulate(scenario(body_motion, duration=4.0), 1))
+    initial = off(record)
+    whole = mekf.run(record, NOISE, initial, full_covariance=True)
+    (attitude, bias, P), _ = stepped(record, initial)
+    d = np.sqrt(np.einsum("kii->ki", P))
+    assert np.max(quaternion.angle_between(attitude, whole.attitude[1:])) < 1e-10
+    assert np.abs(bias - whole.bias[1:]).max() < 1e-10
+    assert np.abs((P - whole.covariance[1:]) / (d[:, :, None] * d[:, None, :])).max() < 1e-10
+
+
+def test_the_step_face_keeps_what_filterpys_users_expect():
+    record = simulate(scenario(duration=2.0), 1)
+    _, history = stepped(record, off(record), saver=True)
+    assert {np.shape(y)[0] for y in history.y} == {1, 2}
+    assert all(np.shape(K) == (6, np.shape(y)[0]) for K, y in zip(history.K, history.y, strict=True))
+    assert np.array_equal(history.x[-1], np.zeros(6))
+    assert np.linalg.norm(history.x_post[0]) > 0.0
+
+
+def test_innovations_agree_with_the_step_face():
+    record = simulate(scenario(sensors=SENSORS[:1], duration=3.0), 1)
+    whole = mekf.run(record, NOISE, off(record))
+    _, history = stepped(record, off(record), saver=True)
+    nis = [float(y @ np.linalg.solve(S, y)) for y, S in zip(history.y, history.S, strict=True)]
+    assert np.allclose(whole.innovations["a"].nis, nis, rtol=1e-8)
+
+
+@pytest.mark.parametrize("at", [1, 333, 799])
+def test_a_split_run_is_the_whole_run_to_the_bit(at):
+    record = with_vector_series(simulate(scenario(), 1))
+    whole, end = mekf.run_on(record, NOISE, off(record), full_covariance=True)
+    first, middle = mekf.run_on(records.cut(record, 0, at), NOISE, off(record), full_covariance=True)
+    second, last = mekf.run_on(records.cut(record, at, len(record.increments)), NOISE, middle, full_covariance=True)
+    for name in ("attitude", "bias", "variance", "covariance"):
+        joined = np.concatenate([getattr(first, name)[:-1], getattr(second, name)])
+        assert np.array_equal(joined, getattr(whole, name)), name
+    assert np.array_equal(last.covariance, end.covariance)
+
+
+def noise_free(record, body_motion):
+    """The same record with exact increments and vectors; the filter still believes in noise."""
+    series = tuple(
+        replace(s, vector_b=quaternion.rotate(quaternion.conjugate(body_motion.attitude(s.time)), s.reference_f))
+        for s in record.vectors
+    )
+    return replace(record, increments=body_motion.increments(record.time), vectors=series)
+
+
+def test_without_noise_there_is_no_error():
+    body_motion = motion.ConstantRate(rate=(0.4, -0.3, 0.2), initial_attitude=(0.5, 0.5, -0.5, 0.5))
+    record = noise_free(simulate(scenario(body_motion, duration=20.0), 1), body_motion)
+    truth = Truth(attitude=body_motion.attitude(record.time), bias=np.zeros((len(record.time), 3)))
+    result = mekf.run(record, NOISE, initial_state(truth.attitude[0], attitude_sigma=1e-2, bias_sigma=1e-3))
+    error = consistency.errors(result.attitude, result.bias, truth.attitude, truth.bias)
+    assert np.abs(error[:, :3]).max() < 1e-14
+    assert np.abs(error[:, 3:]).max() < 1e-15
+
+
+def test_small_angles_about_one_axis_are_the_linear_kalman_filter():
+    """One axis, a body at rest, directions across it: two-state filterpy KalmanFilter with the exact two-state model."""
+    dt, steps, sigma = 0.1, 300, 1e-6
+    angle = 1e-6 * generator(1, 0, "angle").standard_normal(steps)
+    delta = 1e-7 * generator(1, 0, "gyro").standard_normal(steps)
+    time = dt * np.arange(steps + 1)
+    increments = np.zeros((steps, 3))
+    increments[:, 2] = delta
+    # A turn θ about z shows the fixed x axis at (cos θ, −sin θ, 0) in the body.
+    seen = np.stack([np.cos(angle), -np.sin(angle), np.zeros(steps)], axis=-1)
+    series = VectorMeasurements(
+        sensor="x",
+        kind="direction",
+        time=time[1:],
+        vector_b=seen,
+        reference_f=[1.0, 0.0, 0.0],
+        sigma=np.full(steps, sigma),
+    )
+    noise = ProcessNoise(angle_random_walk=1e-7, rate_random_walk=1e-8)
+    initial = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-5, bias_sigma=1e-6)
+    result = mekf.run(ImuRecord(time=time, increments=increments, vectors=(series,)), noise, initial)
+    kf = KalmanFilter(dim_x=2, dim_z=1, dim_u=1)
+    kf.F, kf.B, kf.H = np.array([[1.0, -dt], [0.0, 1.0]]), np.array([[1.0], [0.0]]), np.array([[1.0, 0.0]])
+    v, u = noise.angle_random_walk**2, noise.rate_random_walk**2
+    kf.Q = np.array([[v * dt + u * dt**3 / 3, -u * dt**2 / 2], [-u * dt**2 / 2, u * dt]])
+    kf.R, kf.P, kf.x = np.array([[sigma**2]]), np.diag([1e-10, 1e-12]), np.zeros((2, 1))
+    for k in range(steps):
+        kf.predict(u=np.array([[delta[k]]]))
+        kf.update(angle[k])
+        estimate = quaternion.log(result.attitude[k + 1])[2], result.bias[k + 1, 2]
+        assert np.allclose(estimate, kf.x.ravel(), rtol=1e-9, atol=1e-15)
+        assert np.allclose(result.variance[k + 1, [2, 5]], np.diag(kf.P), rtol=1e-9)
+
+
+def test_steady_state_is_farrenkopfs_closed_form():
+    """One axis at rest (Farrenkopf 1978; the covariance is that of two states however many axes there are)."""
+    dt, sigma, steps = 1.0, 1e-4, 20_000
+    noise = ProcessNoise(angle_random_walk=3e-5, rate_random_walk=1e-6)
+    time = dt * np.arange(steps + 1)
+    series = tuple(
+        VectorMeasurements(
+            sensor=name, kind="direction", time=time[1:], vector_b=np.tile(r, (steps, 1)), reference_f=r, sigma=sigma
+        )
+        for name, r in (("x", [1.0, 0.0, 0.0]),)
+    )
+    record = ImuRecord(time=time, increments=np.zeros((steps, 3)), vectors=series)
+    initial = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-3, bias_sigma=1e-4)
+    after = mekf.run(record, noise, initial, every=steps, full_covariance=True).covariance[-1]
+    s_u, s_v = 1e-6 * dt**1.5 / sigma, 3e-5 * np.sqrt(dt) / sigma
+    gamma = np.sqrt(1.0 + s_v**2 / 4.0 + s_u**2 / 48.0)
+    zeta = gamma + s_u / 4.0 + 0.5 * np.sqrt(2.0 * gamma * s_u + s_v**2 + s_u**2 / 3.0)
+    bias = 1e-6 * sigma / np.sqrt(dt) * (zeta - 1.0 / zeta) - 0.5 * 1e-12 * dt
+    for axis in (1, 2):  # the axes that the fixed x direction shows
+        assert after[axis, axis] == pytest.approx(sigma**2 * (1.0 - zeta**-2), rel=1e-9)
+        assert after[3 + axis, 3 + axis] == pytest.approx(bias, rel=1e-9)
+
+
+def test_steady_state_of_a_turning_body_solves_the_riccati_equation():
+    """Three axes, two directions a second, the body turning at a constant rate: scipy.linalg.solve_discrete_are.
+
+    Seen from a frame that turns with the body the directions must turn too, so the references are along and across the spin axis, and
+    the period of measurement is a whole turn.
+    """
+    dt, sigma = 0.5, 1e-4
+    w = np.array(
+        [0.0, 0.0, 2.0 * np.pi / dt / 8.0]
+    )  # an eighth of a turn a step, measured each step with σ alike across all axes
+    body_motion = motion.ConstantRate(rate=tuple(w))
+    steps = 4000
+    time = dt * np.arange(steps + 1)
+    noise = ProcessNoise(angle_random_walk=3e-5, rate_random_walk=1e-6)
+    axes = np.eye(3)
+    series = tuple(
+        VectorMeasurements(
+            sensor=f"axis {i}",
+            kind="direction",
+            time=time[1:],
+            vector_b=quaternion.rotate(quaternion.conjugate(body_motion.attitude(time[1:])), axes[i]),
+            reference_f=axes[i],
+            sigma=sigma,
+        )
+        for i in range(3)
+    )
+    record = ImuRecord(time=time, increments=body_motion.increments(time), vectors=series)
+    initial = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-3, bias_sigma=1e-4)
+    after = mekf.run(record, noise, initial, every=steps, full_covariance=True).covariance[-1]
+    # Three orthogonal equal directions give the information 2/σ² about every axis, in whatever frame.
+    F = scipy.linalg.expm(np.block([[-_skew(w), -np.eye(3)], [np.zeros((3, 6))]]) * dt)
+    grid = np.linspace(0.0, dt, 2001)
+    G = np.diag([noise.angle_random_walk**2] * 3 + [noise.rate_random_walk**2] * 3)
+    slices = [scipy.linalg.expm(np.block([[-_skew(w), -np.eye(3)], [np.zeros((3, 6))]]) * s) for s in grid]
+    Q = scipy.integrate.simpson([f @ G @ f.T for f in slices], x=grid, axis=0)
+    H = np.hstack([np.eye(3), np.zeros((3, 3))])
+    scale = np.diag([1e4] * 3 + [1e6] * 3)  # like sizes for the solver
+    prior = scipy.linalg.solve_discrete_are(
+        (scale @ F @ np.linalg.inv(scale)).T,
+        (H @ np.linalg.inv(scale)).T,
+        scale @ Q @ scale,
+        np.eye(3) * sigma**2 / 2.0,
+    )
+    prior = np.linalg.inv(scale) @ prior @ np.linalg.inv(scale)
+    gain = prior @ H.T @ np.linalg.inv(H @ prior @ H.T + np.eye(3) * sigma**2 / 2.0)
+    posterior = (np.eye(6) - gain @ H) @ prior
+    d = np.sqrt(np.diag(posterior))
+    assert np.abs((after - posterior) / np.outer(d, d)).max() < 1e-7
+
+
+def _skew(w):
+    return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+
+
+def test_two_orthogonal_equal_directions_and_a_diffuse_prior():
+    """P = σ² diag(1, 1, ½): the axis across both directions is seen twice."""
+    sigma = 1e-3
+    series = tuple(
+        VectorMeasurements(sensor=n, kind="direction", time=[0.0], vector_b=[r], reference_f=r, sigma=sigma)
+        for n, r in (("x", [1.0, 0.0, 0.0]), ("y", [0.0, 1.0, 0.0]))
+    )
+    record = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=series)
+    initial = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e3, bias_sigma=1.0)
+    after = mekf.run(record, NOISE, initial, full_covariance=True).covariance[0, :3, :3]
+    assert np.allclose(after, sigma**2 * np.diag([1.0, 1.0, 0.5]), rtol=1e-9, atol=1e-9 * sigma**2)
+
+
+def test_a_long_outage_grows_the_covariance_as_the_closed_form_says():
+    dt, steps = 0.1, 5000
+    record = ImuRecord(time=dt * np.arange(steps + 1), increments=np.zeros((steps, 3)))
+    initial = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-3, bias_sigma=1e-4)
+    end = mekf.run(record, NOISE, initial, every=steps, full_covariance=True).covariance[-1]
+    T = dt * steps
+    v, u = NOISE.angle_random_walk**2, NOISE.rate_random_walk**2
+    assert end[0, 0] == pytest.approx(1e-6 + 1e-8 * T**2 + v * T + u * T**3 / 3.0, rel=1e-10)
+    assert end[0, 3] == pytest.approx(-1e-8 * T - u * T**2 / 2.0, rel=1e-10)
+    assert end[3, 3] == pytest.approx(1e-8 + u * T, rel=1e-10)
+
+
+def test_one_interval_or_many_at_constant_rate_are_the_same():
+    """The model is exact at constant rate: a turn of 3 rad in one interval (sub-steps) equals a thousand small ones."""
+    turn = np.array([1.0, -2.0, 2.0])
+    initial = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-3, bias_sigma=1e-4)
+    one = mekf.run(ImuRecord(time=[0.0, 1.0], increments=[turn]), NOISE, initial, full_covariance=True)
+    many = ImuRecord(time=np.linspace(0.0, 1.0, 1001), increments=np.tile(turn / 1000.0, (1000, 1)))
+    fine = mekf.run(many, NOISE, initial, every=1000, full_covariance=True)
+    assert quaternion.angle_between(one.attitude[-1], fine.attitude[-1]) < 1e-13
+    assert quaternion.angle_between(one.attitude[-1], quaternion.exp(turn)) < 1e-14
+    d = np.sqrt(np.diag(one.covariance[-1]))
+    assert np.abs((one.covariance[-1] - fine.covariance[-1]) / np.outer(d, d)).max() < 1e-11
+
+
+def test_missing_and_outside_measurements_are_counted():
+    record = simulate(scenario(sensors=SENSORS[:1]), 1)
+    series = record.vectors[0]
+    value = series.vector_b.copy()
+    value[3:7] = np.nan
+    holed = replace(record, vectors=(replace(series, vector_b=value),))
+    result = mekf.run(holed, NOISE, off(record))
+    assert result.skipped == {"a": 4}
+    assert len(result.innovations["a"].time) == len(series.time) - 4
+    short = replace(records.cut(record, 0, 100), vectors=record.vectors)
+    assert mekf.run(short, NOISE, off(record)).skipped["a"] == int(np.sum(series.time > 1.0))
+
+
+def test_compressed_steps_feed_the_filter():
+    record = simulate(scenario(motion.Coning(angle=0.01, frequency=5.0), sensors=SENSORS[:2], duration=8.0), 1)
+    short = records.compress(record, coning.ALGORITHMS["two-sample"])
+    assert len(short.increments) == 400
+    result = mekf.run(short, NOISE, off(record))
+    assert np.array_equal(result.time, record.time[::2])
+
+
+BAD = {
+    "zero angle random walk": (lambda: ProcessNoise(angle_random_walk=0.0, rate_random_walk=0.0), "angle_random_walk"),
+    "negative rate random walk": (
+        lambda: ProcessNoise(angle_random_walk=1.0, rate_random_walk=-1e-9),
+        "rate_random_walk",
+    ),
+    "not unit": (lambda: initial_state((1.0, 0.1, 0.0, 0.0), attitude_sigma=1.0, bias_sigma=1.0), "norm"),
+    "zero sigma": (
+        lambda: initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1.0, bias_sigma=[1.0, 0.0, 1.0]),
+        r"bias_sigma\[1\]",
+    ),
+    "not positive definite": (
+        lambda: mekf.State(
+            attitude=np.array([1.0, 0, 0, 0]), bias=np.zeros(3), covariance=np.eye(6) - 0.3 * np.ones((6, 6))
+        ),
+        "positive definite",
+    ),
+    "not symmetric": (
+        lambda: mekf.State(
+            attitude=np.array([1.0, 0, 0, 0]), bias=np.zeros(3), covariance=np.eye(6) + np.diag([0.1] * 5, 1)
+        ),
+        "not symmetric",
+    ),
+    "unsorted": (lambda: ImuRecord(time=[0.0, 2.0, 1.0], increments=np.zeros((2, 3))), r"time\[2\]"),
+    "repeated": (lambda: ImuRecord(time=[0.0, 1.0, 1.0], increments=np.zeros((2, 3))), "repeats"),
+    "wrong shape": (lambda: ImuRecord(time=[0.0, 1.0, 2.0], increments=np.zeros((3, 3))), r"\(3, 3\)"),
+    "NaN": (lambda: ImuRecord(time=[0.0, 1.0], increments=[[0.0, np.nan, 0.0]]), r"increments\[0, 1\] is nan"),
+    "not a unit vector": (
+        lambda: VectorMeasurements(
+            sensor="s", kind="direction", time=[0.0], vector_b=[[2.0, 0, 0]], reference_f=[1.0, 0, 0], sigma=1.0
+        ),
+        "length 2",
+    ),
+    "unknown kind": (
+        lambda: VectorMeasurements(
+            sensor="s", kind="directoin", time=[0.0], vector_b=[[1.0, 0, 0]], reference_f=[1.0, 0, 0], sigma=1.0
+        ),
+        "did you mean 'direction'",
+    ),
+    "zero reference": (
+        lambda: VectorMeasurements(
+            sensor="s", kind="direction", time=[0.0], vector_b=[[1.0, 0, 0]], reference_f=[0.0, 0, 0], sigma=1.0
+        ),
+        "zero vector",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_is_named(case):
+    make, words = BAD[case]
+    with pytest.raises(InputError, match=words):
+        make()
+
+
+def test_zero_measurement_noise_is_refused_by_the_filter():
+    series = VectorMeasurements(
+        sensor="star", kind="direction", time=[0.5], vector_b=[[1.0, 0, 0]], reference_f=[1.0, 0, 0], sigma=0.0
+    )
+    record = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=(series,))
+    with pytest.raises(InputError, match=r"star: sigma\[0\] is 0"):
+        mekf.run(record, NOISE, initial_state((1.0, 0, 0, 0), attitude_sigma=1.0, bias_sigma=1.0))
+
+
+def test_triad_is_right_handed():
+    for r in np.random.default_rng(0).normal(size=(50, 3)):
+        frame = vectors.triad(r)
+        assert np.allclose(frame @ frame.T, np.eye(3), atol=1e-15)
+        assert np.linalg.det(frame) == pytest.approx(1.0)
+        assert np.allclose(frame[2], r / np.linalg.norm(r))

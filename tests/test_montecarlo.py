@@ -1,0 +1,176 @@
+"""Is the filter as good as it says? Statistics over independent runs, fixed seeds, two-sided bounds."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from strapdown import coning, mekf, montecarlo, motion, quaternion
+from strapdown.checks import InputError
+from strapdown.coning_study import ConingParameters
+from strapdown.mekf import ProcessNoise
+from strapdown.montecarlo import FilterSetup
+
+PARAMETERS = ConingParameters(duration=60.0)
+SCENARIO = PARAMETERS.scenario
+NOISE = ProcessNoise(angle_random_walk=PARAMETERS.angle_random_walk, rate_random_walk=PARAMETERS.rate_random_walk)
+EPOCHS = np.arange(5, 101, 5)
+
+
+def setup(algorithm="matched-4-11", noise=NOISE, **changes):
+    return FilterSetup(
+        process_noise=noise,
+        attitude_sigma=PARAMETERS.attitude_sigma,
+        bias_sigma=PARAMETERS.bias_sigma,
+        integration=coning.ALGORITHMS[algorithm],
+        **changes,
+    )
+
+
+def inside(statistics, subset, probability=0.99):
+    """Whether no more of the 20 epochs lie outside their own bounds than chance allows (binomial, once in 1000)."""
+    verdict = statistics.verdict(EPOCHS, subset, probability)
+    low, high = verdict.bounds
+    outside = np.sum((verdict.mean < low) | (verdict.mean > high))
+    return outside <= scipy.stats.binom.ppf(0.999, len(EPOCHS), 1.0 - probability)
+
+
+MOTIONS = {
+    "10 Hz coning": SCENARIO.motion,
+    "rest": motion.rest(),
+    "spinning at 2 rad/s": motion.ConstantRate(rate=(1.0, -1.5, 0.8)),
+}
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_the_filter_is_as_good_as_it_says_over_500_runs(name):
+    algorithm = "matched-4-11" if "coning" in name else "one-sample"
+    (statistics,) = montecarlo.run(replace(SCENARIO, motion=MOTIONS[name]), (setup(algorithm),), runs=500, seed=3)
+    for subset in ("state", "attitude", "bias"):
+        assert inside(statistics, subset), (subset, statistics.verdict(EPOCHS, subset).mean)
+    low, high = statistics.nis_bounds()
+    assert low < statistics.mean_nis < high
+    # RMS error against the filter's own σ: (500 runs × 3 axes) at each epoch
+    ratio = np.sqrt((statistics.rms_error[EPOCHS] ** 2).reshape(20, 2, 3).mean(axis=2)) / np.sqrt(
+        (statistics.sigma[EPOCHS] ** 2).reshape(20, 2, 3).mean(axis=2)
+    )
+    assert np.all(np.abs(ratio - 1.0) < 4.5 / np.sqrt(2 * 500 * 3))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MOTIONS)
+def test_the_filter_is_as_good_as_it_says_over_5000_runs(name):
+    algorithm = "matched-4-11" if "coning" in name else "one-sample"
+    long = ConingParameters(duration=240.0).scenario
+    (statistics,) = montecarlo.run(replace(long, motion=MOTIONS[name]), (setup(algorithm),), runs=5000, seed=4)
+    for subset in ("state", "attitude", "bias"):
+        assert inside(statistics, subset), (subset, statistics.verdict(EPOCHS, subset).mean)
+
+
+WRONG = {
+    "half the process noise": setup(
+        noise=ProcessNoise(
+            angle_random_walk=NOISE.angle_random_walk / np.sqrt(2.0),
+            rate_random_walk=NOISE.rate_random_walk / np.sqrt(2.0),
+        )
+    ),
+    "twice the process noise": setup(
+        noise=ProcessNoise(
+            angle_random_walk=NOISE.angle_random_walk * np.sqrt(2.0),
+            rate_random_walk=NOISE.rate_random_walk * np.sqrt(2.0),
+        )
+    ),
+    "sigma 20 % too small": setup(measurement_sigma_factor=0.8),
+    "sigma 20 % too large": setup(measurement_sigma_factor=1.25),
+    "no coning correction": setup("one-sample"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_filter_is_found_out(name):
+    (statistics,) = montecarlo.run(SCENARIO, (WRONG[name],), runs=200, seed=5)
+    subset = "bias" if "coning" in name else "attitude"
+    verdict = statistics.verdict(EPOCHS, subset)
+    assert not verdict.consistent
+    # and on the side that it must be
+    too_sure = "half" in name or "small" in name or "coning" in name
+    assert (verdict.mean.mean() > 1.0) == too_sure
+
+
+def large_errors(runs, seed, strip_reset=False):
+    """NEES after a few updates from large initial errors, where the covariance reset matters."""
+    sensors = tuple(replace(s, sigma=0.02, rate=25.0) for s in SCENARIO.sensors)
+    scenario = replace(SCENARIO, motion=motion.rest(), sensors=sensors, duration=12.0)
+    big = replace(setup("one-sample"), attitude_sigma=0.1, bias_sigma=0.05)
+    (statistics,) = montecarlo.run(scenario, (big,), runs=runs, seed=seed)
+    return statistics
+
+
+def test_the_filter_is_consistent_from_large_errors_too():
+    """Initial errors of 0.1 rad an axis, known to a fifth of that after one measurement."""
+    statistics = large_errors(400, 6)
+    verdict = statistics.verdict(np.arange(1, 100, 5), "attitude")
+    assert verdict.consistent, verdict.mean
+
+
+@pytest.mark.parametrize(("threads", "chunk"), [(1, 10), (2, 3), (3, 40)])
+def test_statistics_do_not_depend_on_threads(threads, chunk):
+    one = montecarlo.run(SCENARIO, (setup(),), runs=12, seed=1, threads=1, chunk=10)[0]
+    other = montecarlo.run(SCENARIO, (setup(),), runs=12, seed=1, threads=threads, chunk=chunk)[0]
+    assert np.array_equal(one.example_error, other.example_error)
+    for name in ("error_sum", "variance_sum", "nees_sum", "nis_sum"):
+        exact = chunk == 10
+        a, b = getattr(one, name), getattr(other, name)
+        assert np.array_equal(a, b) if exact else np.allclose(a, b, rtol=1e-12, atol=1e-12 * np.abs(a).max()), name
+
+
+def test_a_run_does_not_depend_on_the_others():
+    few = montecarlo.run(SCENARIO, (setup(),), runs=2, seed=1)[0]
+    many = montecarlo.run(SCENARIO, (setup(), setup("one-sample")), runs=5, seed=1)[0]
+    assert np.array_equal(few.example_error, many.example_error[:2])
+    other = montecarlo.run(SCENARIO, (setup(),), runs=2, seed=2)[0]
+    assert not np.array_equal(few.example_error, other.example_error)
+
+
+def test_statistics_are_plain_sums():
+    """Against the runs taken one by one through mekf.run."""
+    from strapdown import consistency
+    from strapdown.records import compress
+    from strapdown.scenarios import simulate
+
+    statistics = montecarlo.run(SCENARIO, (setup(),), runs=3, seed=9)[0]
+    nees, square = 0.0, 0.0
+    for run in range(3):
+        record = simulate(SCENARIO, 9, run)
+        short = compress(record, coning.ALGORITHMS["matched-4-11"])
+        every = len(short.increments) // 100
+        result = mekf.run(short, NOISE, montecarlo.start(record, setup(), 9, run), every=every, full_covariance=True)
+        truth = short.truth
+        e = consistency.errors(result.attitude, result.bias, truth.attitude[::every], truth.bias[::every])
+        nees = nees + consistency.nees(e, result.covariance)
+        square = square + e**2
+    assert np.allclose(statistics.anees[:, 0], nees / 18.0, rtol=1e-12)
+    assert np.allclose(statistics.rms_error, np.sqrt(square / 3.0), rtol=1e-12)
+
+
+def test_the_start_is_drawn_from_the_prior():
+    from strapdown.scenarios import simulate
+
+    record = simulate(replace(SCENARIO, duration=1.2), 1)
+    draws = []
+    for run in range(400):
+        state = montecarlo.start(record, setup(), 1, run)
+        delta = quaternion.log(quaternion.multiply(quaternion.conjugate(state.attitude), record.truth.attitude[0]))
+        draws.append(
+            np.concatenate(
+                [delta / PARAMETERS.attitude_sigma, (record.truth.bias[0] - state.bias) / PARAMETERS.bias_sigma]
+            )
+        )
+    assert np.all(np.abs(np.mean(draws, axis=0)) < 4.0 / 20.0)
+    assert np.all(np.abs(np.var(draws, axis=0) - 1.0) < 4.0 * np.sqrt(2.0 / 400.0))
+
+
+def test_epochs_must_be_whole_steps():
+    with pytest.raises(InputError, match="multiple of"):
+        montecarlo.run(replace(SCENARIO, duration=1.01), (setup("three-sample"),), runs=1, seed=1)
