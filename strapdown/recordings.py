@@ -1,0 +1,219 @@
+"""Recordings from the bench and the field: reading BROAD HDF5 files and CSV, with clear words where a file is not what it should be.
+
+A recording holds point samples of rate, specific force and magnetic field as a device gave them, on one time axis. What a filter makes
+of it is in :mod:`strapdown.ahrs`.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from strapdown.checks import Array, InputError, array, increasing, one_of
+from strapdown.units import DEGREE, STANDARD_GRAVITY
+
+RATE_UNITS = {"rad/s": 1.0, "deg/s": DEGREE}
+"""Units of a gyro column, and their factor to rad/s."""
+FORCE_UNITS = {"m/s2": 1.0, "g": STANDARD_GRAVITY}
+"""Units of an accelerometer column, and their factor to m/s²."""
+TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+"""Units of a time column, and their factor to s."""
+
+_COLUMNS = {"gyro": ("gx", "gy", "gz"), "accelerometer": ("ax", "ay", "az"), "magnetometer": ("mx", "my", "mz")}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recording:
+    """A recording of one inertial measurement unit."""
+
+    source: str
+    """Where it comes from: the file's name."""
+    time: Array
+    """Time stamps (n,), s, increasing."""
+    rate: Array
+    """Angular rate at the stamps (n, 3), rad/s, body axes."""
+    specific_force: Array
+    """Specific force (n, 3), m/s², body axes: at rest 9.81 upwards; rows of NaN are missing."""
+    magnetic_field: Array | None = None
+    """Magnetic field (n, 3), any one unit, body axes; rows of NaN are missing."""
+    true_attitude: Array | None = None
+    """Reference q_fb (n, 4), fixed frame East-North-Up with magnetic North; rows of NaN are missing."""
+    movement: np.ndarray | None = None
+    """Samples that errors are judged over (n,), bool."""
+
+    def __post_init__(self) -> None:
+        """Check shapes, order and values."""
+        time = increasing(f"{self.source}: time", self.time, least=2)
+        n = len(time)
+        object.__setattr__(self, "time", time)
+        object.__setattr__(self, "rate", array(f"{self.source}: rate", self.rate, (n, 3)))
+        for name, width in (("specific_force", 3), ("magnetic_field", 3), ("true_attitude", 4)):
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, array(f"{self.source}: {name}", value, (n, width), allow_nan=True))
+        if self.movement is not None and np.shape(self.movement) != (n,):
+            raise InputError(f"{self.source}: movement has shape {np.shape(self.movement)}, wanted ({n},)")
+
+    def since(self, first: int) -> Recording:
+        """Return the recording from sample ``first`` on."""
+        rows = slice(first, None)
+        fields = ("time", "rate", "specific_force", "magnetic_field", "true_attitude", "movement")
+        return replace(self, **{n: None if getattr(self, n) is None else getattr(self, n)[rows] for n in fields})
+
+
+def read(path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> Recording:
+    """Read a recording, HDF5 in the layout of BROAD or CSV, told apart by the suffix.
+
+    Parameters
+    ----------
+    path : path
+        ``.hdf5``, ``.h5`` or ``.csv``.
+    units : mapping, optional
+        For CSV: units of ``time``, ``gyro`` and ``accelerometer`` where the header does not declare them.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, truncated, of another layout, or its units are unknown or undeclared.
+    """
+    file = Path(path)
+    if not file.exists():
+        raise InputError(f"{file} does not exist; check the path")
+    if file.suffix.lower() in (".hdf5", ".h5"):
+        return read_broad(file)
+    if file.suffix.lower() == ".csv":
+        return read_csv(file, units=units)
+    raise InputError(f"{file} has the suffix {file.suffix!r}; recordings are .hdf5 or .h5 (BROAD layout) or .csv")
+
+
+def read_broad(path: str | os.PathLike[str]) -> Recording:
+    """Read a trial of the BROAD data set (Laidig et al. 2021): ``imu_gyr``, ``imu_acc``, ``imu_mag``, ``opt_quat``, ``movement``."""
+    import h5py
+
+    name = Path(path).name
+    try:
+        with h5py.File(path, "r") as file:
+            missing = [key for key in ("imu_gyr", "imu_acc") if key not in file]
+            if "sampling_rate" not in file.attrs:
+                missing.append("the attribute sampling_rate")
+            if missing:
+                raise InputError(
+                    f"{name} lacks {', '.join(missing)}; it is not in the layout of BROAD (has: {', '.join(file)})"
+                )
+            rate = file["imu_gyr"][:]
+            return Recording(
+                source=name,
+                time=np.arange(len(rate)) / float(file.attrs["sampling_rate"]),
+                rate=rate,
+                specific_force=file["imu_acc"][:],
+                magnetic_field=file["imu_mag"][:] if "imu_mag" in file else None,
+                true_attitude=file["opt_quat"][:] if "opt_quat" in file else None,
+                movement=file["movement"][:].astype(bool) if "movement" in file else None,
+            )
+    except OSError as error:
+        raise InputError(f"{name} cannot be read as HDF5 ({error}); the file is truncated or of another kind") from None
+
+
+def read_csv(path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> Recording:
+    """Read columns ``time, gx, gy, gz, ax, ay, az[, mx, my, mz]`` in any order; other columns are left alone.
+
+    A header may declare units in brackets, ``gx [deg/s]``; ``units`` ("time", "gyro", "accelerometer") declares them for files that do
+    not. A gyro or accelerometer without a unit is refused rather than guessed: a factor of 57.3 or 9.81 is the commonest mistake there
+    is. Time is in s unless declared otherwise. Empty fields of the accelerometer and the magnetometer are missing samples.
+    """
+    file = Path(path)
+    with open(file, newline="", encoding="utf-8-sig") as stream:
+        rows = csv.reader(line for line in stream if line.strip() and not line.lstrip().startswith("#"))
+        header = next(rows, None)
+        if header is None:
+            raise InputError(f"{file.name} is empty; wanted a header like time,gx,gy,gz,ax,ay,az")
+        names, declared = _header(file.name, header)
+        needed = ["time", *_COLUMNS["gyro"], *_COLUMNS["accelerometer"]]
+        missing = [name for name in needed if name not in names]
+        if missing:
+            raise InputError(f"{file.name}: the header lacks {', '.join(missing)} (it has: {', '.join(names)})")
+        values = _numbers(file.name, rows, len(names), header)
+    factors = _factors(file.name, declared, units or {})
+
+    def columns(group: str) -> Array:
+        return values[:, [names.index(name) for name in _COLUMNS[group]]] * factors[group]
+
+    magnetic = all(name in names for name in _COLUMNS["magnetometer"])
+    return Recording(
+        source=file.name,
+        time=values[:, names.index("time")] * factors["time"],
+        rate=columns("gyro"),
+        specific_force=columns("accelerometer"),
+        magnetic_field=columns("magnetometer") if magnetic else None,
+    )
+
+
+def _header(source: str, header: list[str]) -> tuple[list[str], dict[str, str]]:
+    """Return the column names and, by group, the units that the header declares."""
+    names: list[str] = []
+    declared: dict[str, str] = {}
+    groups = {name: group for group, members in _COLUMNS.items() for name in members} | {"time": "time"}
+    for field in header:
+        name, bracket, rest = field.strip().partition("[")
+        name = name.strip().lower()
+        if name in names:
+            raise InputError(f"{source}: the header names the column {name!r} twice; rename or drop one")
+        names.append(name)
+        if bracket and name in groups:
+            unit = rest.strip().removesuffix("]").strip().replace("²", "2").replace("^", "").replace("°", "deg")
+            if declared.setdefault(groups[name], unit) != unit:
+                raise InputError(
+                    f"{source}: column {name} is in {unit} but another {groups[name]} column in {declared[groups[name]]}; "
+                    "give all axes of one sensor the same unit"
+                )
+    return names, declared
+
+
+def _numbers(source: str, rows: csv.reader, width: int, header: list[str]) -> Array:  # type: ignore[valid-type]
+    result: list[list[float]] = []
+    for k, row in enumerate(rows):  # type: ignore[var-annotated,arg-type]
+        if len(row) != width:
+            raise InputError(
+                f"{source}: data row {k + 1} has {len(row)} fields, the header {width}; the file is truncated or damaged there"
+            )
+        try:
+            result.append([float(field) if field.strip() else np.nan for field in row])
+        except ValueError:
+            bad = next(j for j, field in enumerate(row) if not _is_number(field))
+            raise InputError(
+                f"{source}: data row {k + 1}, column {header[bad].strip()} is {row[bad]!r}, not a number"
+            ) from None
+    if not result:
+        raise InputError(f"{source} has a header but no data rows")
+    return np.array(result)
+
+
+def _is_number(field: str) -> bool:
+    try:
+        float(field or "nan")
+    except ValueError:
+        return False
+    return True
+
+
+def _factors(source: str, declared: Mapping[str, str], given: Mapping[str, str]) -> dict[str, float]:
+    known = {"time": TIME_UNITS, "gyro": RATE_UNITS, "accelerometer": FORCE_UNITS}
+    factors = {"magnetometer": 1.0}
+    for group, units in known.items():
+        unit = given.get(group) or declared.get(group) or ("s" if group == "time" else None)
+        if unit is None:
+            raise InputError(
+                f"{source} does not say the unit of its {group} columns; declare it in the header, as in "
+                f"{_COLUMNS[group][0]} [{next(iter(units))}], or by option ({' or '.join(units)})"
+            )
+        if given.get(group) and declared.get(group) and given[group] != declared[group]:
+            raise InputError(
+                f"{source}: the header says {declared[group]} for the {group}, the option {given[group]}; drop one"
+            )
+        factors[group] = units[one_of(f"{source}: unit of the {group}", unit, units)]
+    return factors
