@@ -1,0 +1,273 @@
+"""The coning study: what commutation error does to integration, and what a filter makes of it.
+
+Under coning motion, equation (18), an integration algorithm errs by a constant rate along the cone's axis. A filter that estimates gyro
+bias cannot tell that rate from a bias: its attitude stays good, its bias is wrong by the drift, and only the bias NEES says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from strapdown import coning, montecarlo, quaternion
+from strapdown.checks import Array, count, positive
+from strapdown.gyro import GyroSpec
+from strapdown.mekf import ProcessNoise
+from strapdown.montecarlo import FilterSetup, Statistics
+from strapdown.motion import Coning
+from strapdown.scenarios import Scenario
+from strapdown.units import (
+    ARCSECOND,
+    DEGREE,
+    DEGREE_PER_HOUR,
+    DEGREE_PER_HOUR_PER_ROOT_HOUR,
+    DEGREE_PER_ROOT_HOUR,
+)
+from strapdown.vectors import VectorSensor
+
+ALGORITHMS = ("one-sample", "two-sample", "three-sample", "four-sample", "matched-4-11")
+"""Integration algorithms that the study compares, by name in :data:`strapdown.coning.ALGORITHMS`."""
+
+STEP_MULTIPLE = 12
+"""Samples between measurements and epochs are a multiple of this, so that they end on whole steps of 1, 2, 3, 4, 6 or 12 samples.
+
+A compressed step split in its middle would be taken for a turn at constant rate, which under coning it is not."""
+
+EPOCHS = 100
+VERDICT_EPOCHS = 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConingParameters:
+    """Parameters of the study, SI and radians. The defaults show its point: the gyro is sampled only ten times a cycle."""
+
+    angle: float = 0.7 * DEGREE
+    """Half-angle β of the cone, rad."""
+    frequency: float = 10.0
+    """Coning frequency, Hz."""
+    rate: float = 100.0
+    """Gyro samples a second, Hz."""
+    duration: float = 240.0
+    """Length of each run, s; rounded to whole epochs."""
+    runs: int = 100
+    seed: int = 1
+    angle_random_walk: float = 0.08 * DEGREE_PER_ROOT_HOUR
+    """rad/√s."""
+    rate_random_walk: float = 1.0 * DEGREE_PER_HOUR_PER_ROOT_HOUR
+    """rad/s/√s."""
+    direction_sigma: float = 20.0 * ARCSECOND
+    """Noise of each component of two measured directions, rad, about once a second."""
+    attitude_sigma: float = 200.0 * ARCSECOND
+    """Initial attitude error, each axis, rad."""
+    bias_sigma: float = 20.0 * DEGREE_PER_HOUR
+    """Initial bias error, each axis, rad/s."""
+    probability: float = 0.99
+    """Probability content of all bounds."""
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        for name in (
+            "angle",
+            "frequency",
+            "rate",
+            "duration",
+            "angle_random_walk",
+            "direction_sigma",
+            "attitude_sigma",
+            "bias_sigma",
+        ):
+            positive(name, getattr(self, name))
+        count("runs", self.runs)
+        count("seed", self.seed, least=0)
+
+    @property
+    def samples(self) -> int:
+        """Gyro samples in a run: the duration, rounded to a multiple of ``EPOCHS`` times ``STEP_MULTIPLE``."""
+        block = EPOCHS * STEP_MULTIPLE
+        return block * max(1, round(self.duration * self.rate / block))
+
+    @property
+    def measurement_interval(self) -> float:
+        """Interval of the direction measurements, s: about a second, in whole steps."""
+        return STEP_MULTIPLE * max(1, round(self.rate / STEP_MULTIPLE)) / self.rate
+
+    @property
+    def scenario(self) -> Scenario:
+        """The motion and the sensors."""
+        references = {"direction x": np.array([1.0, 0.0, 0.0]), "direction yz": np.array([0.0, 1.0, 1.0])}
+        return Scenario(
+            motion=Coning(angle=self.angle, frequency=self.frequency),
+            gyro=GyroSpec(angle_random_walk=self.angle_random_walk, rate_random_walk=self.rate_random_walk),
+            sensors=tuple(
+                VectorSensor(name=name, reference_f=r, sigma=self.direction_sigma, rate=1.0 / self.measurement_interval)
+                for name, r in references.items()
+            ),
+            rate=self.rate,
+            duration=self.samples / self.rate,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Drift:
+    """Drift of one integration algorithm, rad/s along the cone's axis: estimated minus true."""
+
+    algorithm: str
+    samples: int
+    measured: float
+    """Of a long noise-free run against the closed form."""
+    predicted: float
+    """By the formula."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilterOutcome:
+    """What the filter made of one integration algorithm."""
+
+    integration: str
+    statistics: Statistics
+    probability: float
+    epochs: Array = field(repr=False)
+    """Indices of the epochs judged."""
+
+    @property
+    def consistent(self) -> bool:
+        """Whether NEES of the state, of the attitude and of the bias and the NIS all lie inside their bounds."""
+        low, high = self.statistics.nis_bounds(self.probability)
+        nees = all(
+            self.statistics.verdict(self.epochs, subset, self.probability).consistent
+            for subset in ("state", "attitude", "bias")
+        )
+        return nees and low <= self.statistics.mean_nis <= high
+
+    def summary(self) -> dict[str, Any]:
+        """Return the outcome in degrees and hours, as ``coning.json`` tells it. ANEES and NIS are per degree of freedom.
+
+        RMS errors are over the judged epochs and axes; ``anees`` is the mean over the judged epochs and its bounds are those of one epoch.
+        The verdict holds every epoch against simultaneous bounds.
+        """
+        statistics = self.statistics
+        verdicts = {
+            subset: statistics.verdict(self.epochs, subset, self.probability)
+            for subset in ("state", "attitude", "bias")
+        }
+        square = statistics.rms_error[self.epochs] ** 2
+        return {
+            "integration": self.integration,
+            "runs": statistics.runs,
+            "attitude_rms_arcsec": float(np.sqrt(square[:, :3].mean()) / ARCSECOND),
+            "attitude_sigma_arcsec": float(np.sqrt((statistics.sigma[self.epochs, :3] ** 2).mean()) / ARCSECOND),
+            "bias_rms_deg_per_hour": float(np.sqrt(square[:, 3:].mean()) / DEGREE_PER_HOUR),
+            "bias_sigma_deg_per_hour": float(
+                np.sqrt((statistics.sigma[self.epochs, 3:] ** 2).mean()) / DEGREE_PER_HOUR
+            ),
+            "bias_mean_deg_per_hour": [
+                float(x) for x in statistics.mean_error[self.epochs, 3:].mean(axis=0) / DEGREE_PER_HOUR
+            ],
+            "anees": float(verdicts["state"].mean.mean()),
+            "anees_bounds": list(verdicts["state"].bounds),
+            "anees_attitude": float(verdicts["attitude"].mean.mean()),
+            "anees_attitude_bounds": list(verdicts["attitude"].bounds),
+            "anees_bias": float(verdicts["bias"].mean.mean()),
+            "anees_bias_bounds": list(verdicts["bias"].bounds),
+            "epochs": len(self.epochs),
+            "epochs_outside": {subset: verdict.outside for subset, verdict in verdicts.items()},
+            "nis": statistics.mean_nis,
+            "nis_bounds": list(statistics.nis_bounds(self.probability)),
+            "consistent": self.consistent,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConingStudy:
+    """Result of the study."""
+
+    parameters: ConingParameters
+    drifts: tuple[Drift, ...]
+    outcomes: tuple[FilterOutcome, ...]
+
+    def summary(self) -> dict[str, Any]:
+        """Return the study as ``coning.json`` holds it: degrees, hours, arcseconds, with the unit in each key."""
+        p = self.parameters
+        return {
+            "scenario": {
+                "motion": "coning, equation (18)",
+                "angle_deg": p.angle / DEGREE,
+                "frequency_hz": p.frequency,
+                "rate_hz": p.rate,
+                "samples_per_cycle": p.rate / p.frequency,
+                "duration_s": p.samples / p.rate,
+                "runs": p.runs,
+                "seed": p.seed,
+                "angle_random_walk_deg_per_root_hour": p.angle_random_walk / DEGREE_PER_ROOT_HOUR,
+                "rate_random_walk_deg_per_hour_per_root_hour": p.rate_random_walk / DEGREE_PER_HOUR_PER_ROOT_HOUR,
+                "direction_sigma_arcsec": p.direction_sigma / ARCSECOND,
+                "direction_interval_s": p.measurement_interval,
+                "bounds_probability": p.probability,
+            },
+            "integration": [
+                {
+                    "algorithm": drift.algorithm,
+                    "samples": drift.samples,
+                    "drift_deg_per_hour": drift.measured / DEGREE_PER_HOUR,
+                    "predicted_deg_per_hour": drift.predicted / DEGREE_PER_HOUR,
+                }
+                for drift in self.drifts
+            ],
+            "filter": [outcome.summary() for outcome in self.outcomes],
+        }
+
+
+def measured_drift(motion: Coning, rate: float, algorithm: coning.Algorithm, steps: int = 60_000) -> float:
+    """Return the drift of noise-free integration against the closed form, rad/s along the cone's axis: estimated minus true.
+
+    Drift turns the estimate about the fixed z axis at a constant rate; the run ends where coning cycles and steps have come closest
+    together, so that the periodic error does not enter, or earlier if the estimate would turn by more than a radian.
+    """
+    expected = abs(coning.predicted_coning_drift(algorithm, motion.angle, motion.frequency, 1.0 / rate))
+    step = algorithm.samples / rate
+    longest = int(min(steps, max(1.0 / (expected * step), 100.0))) if expected > 0.0 else steps
+    cycles = np.arange(longest // 2, longest + 1) * (step * motion.frequency)
+    chosen = longest // 2 + int(np.argmin(np.abs(cycles - np.round(cycles))))
+    edges = np.arange(chosen * algorithm.samples + 1) / rate
+    estimate = coning.integrate(motion.increments(edges), algorithm, motion.attitude(0.0))[-1]
+    error_f = quaternion.log(quaternion.multiply(estimate, quaternion.conjugate(motion.attitude(edges[-1]))))
+    return float(error_f[2] / edges[-1])
+
+
+def run(parameters: ConingParameters, *, progress: Callable[[int], None] | None = None) -> ConingStudy:
+    """Run the study; ``progress`` is called with the number of Monte Carlo runs just finished."""
+    scenario = parameters.scenario
+    algorithms = [coning.ALGORITHMS[name] for name in ALGORITHMS]
+    motion = Coning(angle=parameters.angle, frequency=parameters.frequency)
+    drifts = tuple(
+        Drift(
+            algorithm=algorithm.name,
+            samples=algorithm.samples,
+            measured=measured_drift(motion, parameters.rate, algorithm),
+            predicted=coning.predicted_coning_drift(algorithm, motion.angle, motion.frequency, 1.0 / parameters.rate),
+        )
+        for algorithm in algorithms
+    )
+    noise = ProcessNoise(angle_random_walk=parameters.angle_random_walk, rate_random_walk=parameters.rate_random_walk)
+    setups = tuple(
+        FilterSetup(
+            process_noise=noise,
+            attitude_sigma=parameters.attitude_sigma,
+            bias_sigma=parameters.bias_sigma,
+            integration=algorithm,
+        )
+        for algorithm in algorithms
+    )
+    statistics = montecarlo.run(
+        scenario, setups, runs=parameters.runs, seed=parameters.seed, epochs=EPOCHS, progress=progress
+    )
+    # The first verdict epoch comes late enough for the bias to have been seen.
+    epochs = np.linspace(EPOCHS // VERDICT_EPOCHS, EPOCHS, VERDICT_EPOCHS).astype(int)
+    outcomes = tuple(
+        FilterOutcome(integration=algorithm.name, statistics=part, probability=parameters.probability, epochs=epochs)
+        for algorithm, part in zip(algorithms, statistics, strict=True)
+    )
+    return ConingStudy(parameters=parameters, drifts=drifts, outcomes=outcomes)
