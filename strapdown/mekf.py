@@ -106,29 +106,29 @@ class Schedule:
 
 def schedule(vectors: tuple[VectorMeasurements, ...], start: float, end: float) -> Schedule:
     """Return the measurements inside [start, end] in order of time; missing (NaN) ones and those outside are counted as skipped."""
-    keep, skipped = [], {}
-    for series in vectors:
-        if np.any(series.sigma == 0.0):
-            k = int(np.argmax(series.sigma == 0.0))
+    skipped, parts = {}, []
+    for i, series in enumerate(vectors):
+        if not np.all(series.sigma > 0.0):
+            k = int(np.argmin(series.sigma > 0.0))
             raise InputError(f"{series.sensor}: sigma[{k}] is 0 rad; a filter needs a noise greater than zero")
-        used = np.isfinite(series.vector_b).all(axis=1) & (series.time >= start) & (series.time <= end)
-        keep.append(used)
-        skipped[series.sensor] = int(np.sum(~used))
-
-    def joined(parts: list[np.ndarray], empty: tuple[int, ...], dtype: type = np.float64) -> np.ndarray:
-        return np.concatenate(parts) if parts else np.empty(empty, dtype)
-
-    pairs = list(zip(vectors, keep, strict=True))
-    time = joined([s.time[used] for s, used in pairs], (0,))
-    kind = joined([np.full(used.sum(), _KIND_CODES[s.kind]) for s, used in pairs], (0,), np.int64)
-    # A vector is taken over the length of its reference, so that the kernel sees unit references only.
-    lengths = [float(np.linalg.norm(s.reference_f)) for s in vectors]
-    value = joined([s.vector_b[used] / r for (s, used), r in zip(pairs, lengths, strict=True)], (0, 3))
-    variance = joined([(s.sigma[used] / r) ** 2 for (s, used), r in zip(pairs, lengths, strict=True)], (0,))
-    reference = joined([np.full(used.sum(), i) for i, (_, used) in enumerate(pairs)], (0,), np.int64)
-    if len(vectors) > 1:
-        order = np.argsort(time, kind="stable")
-        time, kind, value, variance, reference = (a[order] for a in (time, kind, value, variance, reference))
+        inside = slice(*np.searchsorted(series.time, [start, np.nextafter(end, np.inf)]))
+        time, value, variance = series.time[inside], series.vector_b[inside], series.sigma[inside] ** 2
+        if series.kind == "vector":
+            # A vector is taken over the length of its reference, so that the kernel sees unit references only.
+            length = float(np.linalg.norm(series.reference_f))
+            value, variance = value / length, variance / length**2
+        if not np.isfinite(value).all():
+            known = np.isfinite(value).all(axis=1)
+            time, value, variance = time[known], value[known], variance[known]
+        skipped[series.sensor] = len(series.time) - len(time)
+        parts.append((time, value, variance, np.full(len(time), i), np.full(len(time), _KIND_CODES[series.kind])))
+    if not parts:
+        parts.append((np.empty(0), np.empty((0, 3)), np.empty(0), np.empty(0, np.int64), np.empty(0, np.int64)))
+    columns = parts[0] if len(parts) == 1 else [np.concatenate(column) for column in zip(*parts, strict=True)]
+    if len(parts) > 1:
+        order = np.argsort(columns[0], kind="stable")
+        columns = [column[order] for column in columns]
+    time, value, variance, reference, kind = columns
     return Schedule(
         time=time,
         kind=kind,
@@ -142,12 +142,22 @@ def schedule(vectors: tuple[VectorMeasurements, ...], start: float, end: float) 
     )
 
 
+def innovations_by_sensor(events: Schedule, rows: Array) -> dict[str, Innovations]:
+    """Return what the kernel wrote of each event, e and its variance for each degree of freedom, sorted by sensor and whitened."""
+    result = {}
+    for i, (sensor, kind) in enumerate(zip(events.sensors, events.kinds, strict=True)):
+        mine = slice(None) if len(events.sensors) == 1 else events.reference == i
+        values = rows[mine, : 2 * KINDS[kind]]
+        result[sensor] = Innovations(time=events.time[mine], whitened=values[:, 0::2] / np.sqrt(values[:, 1::2]))
+    return result
+
+
 def run(
     record: ImuRecord, process_noise: ProcessNoise, initial: State, *, every: int = 1, full_covariance: bool = False
 ) -> Estimate:
     """Run the filter over a whole record, compiled.
 
-    Gyro intervals are split exactly at the times of measurements. Intervals in which the body turns by more than half a radian are
+    Gyro intervals are split exactly at the times of measurements. Intervals in which the body turns by more than a third of a radian are
     taken in sub-steps of the same constant-rate model.
 
     Parameters
@@ -201,19 +211,13 @@ def run_on(
         innovation,
         np.empty((0, 32)),
     )
-    innovations = {}
-    for i, (sensor, kind) in enumerate(zip(events.sensors, events.kinds, strict=True)):
-        mine = slice(None) if len(events.sensors) == 1 else events.reference == i
-        filled = slice(0, 2 * KINDS[kind])  # e and its variance for each degree of freedom
-        values = innovation[mine, filled]
-        innovations[sensor] = Innovations(time=events.time[mine], whitened=values[:, 0::2] / np.sqrt(values[:, 1::2]))
     estimate = Estimate(
         time=record.time[::every],
         attitude=attitude,
         bias=bias,
         variance=variance,
         covariance=covariance_matrices(blocks) if full_covariance else None,
-        innovations=innovations,
+        innovations=innovations_by_sensor(events, innovation),
         skipped=events.skipped,
     )
     end = State(attitude=state[:4], bias=state[4:7], covariance=covariance_matrices(state[7:]))
@@ -288,7 +292,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
 
 
 def transition_and_noise(phi: ArrayLike, dt: float, process_noise: ProcessNoise) -> tuple[Array, Array]:
-    """Return Φ and Q (6, 6) of the error state over a turn φ = ω dt (3,) at constant rate, |φ| ≤ 0.5 rad.
+    """Return Φ and Q (6, 6) of the error state over a turn φ = ω dt (3,) at constant rate, |φ| ≤ 1/3 rad.
 
     The kernels' own formulas (:mod:`strapdown.kernels.filter_step`), as matrices.
     """

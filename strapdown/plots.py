@@ -84,7 +84,8 @@ def drift_by_algorithm(drifts: Sequence[Drift], ax: Axes | None = None) -> Axes:
     for place, value, line in zip(places, measured, predicted, strict=True):
         ax.annotate(f"{value:.3g}", (place, max(value, line)), xytext=(0, 5), textcoords="offset points", ha="center")
     ax.set_yscale("log")
-    low, high = min(*measured, *predicted), max(*measured, *predicted)
+    high = max(*measured, *predicted)
+    low = max(min(*measured, *predicted), 1e-9 * high)  # what lies at rounding need not be drawn to scale
     ax.set_ylim(low / 4.0, high * 8.0)
     ax.set_xticks(places, [drift.algorithm for drift in drifts])
     ax.grid(visible=False, axis="x")
@@ -165,19 +166,19 @@ def coning_errors(outcomes: Sequence[FilterOutcome]) -> Figure:
     return figure
 
 
-def coning_consistency(study: ConingStudy) -> Figure:
+def coning_consistency(outcomes: Sequence[FilterOutcome]) -> Figure:
     """Draw NEES of attitude and of bias and NIS over time for each integration algorithm, with the bounds of a right filter."""
     figure, axes = new_figure(1, 3, size=(12.0, 4.2))
-    named = [(outcome.integration, outcome.statistics) for outcome in study.outcomes]
-    first = study.outcomes[0]
+    named = [(outcome.integration, outcome.statistics) for outcome in outcomes]
+    first = outcomes[0]
     for ax, subset in zip(axes[:2], ("attitude", "bias"), strict=True):
         nees_over_time(named, first.statistics.verdict(first.epochs, subset, first.probability).bounds, subset, ax)
     low, high = axes[0].get_ylim()
     axes[0].set_ylim(min(0.3, low), max(3.0, min(high, 30.0)))
     nis_over_time(named, axes[2], probability=first.probability)
     for ax, subset in zip(axes[:2], ("attitude", "bias"), strict=True):
-        passed = sum(o.statistics.verdict(o.epochs, subset, o.probability).consistent for o in study.outcomes)
-        ax.set_title(f"{subset.capitalize()}: {passed} of {len(study.outcomes)} inside the bounds")
+        passed = sum(o.statistics.verdict(o.epochs, subset, o.probability).consistent for o in outcomes)
+        ax.set_title(f"{subset.capitalize()}: {passed} of {len(outcomes)} inside the bounds")
     axes[2].set_title("Innovations")
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
@@ -196,7 +197,7 @@ def draw_coning_study(study: ConingStudy, folder: str | os.PathLike[str]) -> lis
     return [
         save(figure, target / "drift.png"),
         save(coning_errors(study.outcomes), target / "errors.png"),
-        save(coning_consistency(study), target / "consistency.png"),
+        save(coning_consistency(study.outcomes), target / "consistency.png"),
     ]
 
 

@@ -11,7 +11,6 @@ from strapdown.kernels.algebra import (
     skew_polynomial,
     symmetric_times_vector,
     times_transpose_upper,
-    transpose,
     transpose_times_vector,
 )
 from strapdown.kernels.family_loop import state_at
@@ -21,9 +20,31 @@ from strapdown.kernels.filter_step import predict, reset
 from strapdown.kernels.rotation import rotation_matrix
 
 
-def combined(s, A, t, B):
-    """Return s A + t B of matrices of any one form."""
-    return tuple([s * a + t * b for a, b in zip(A, B)])  # noqa: B905  (numba has no strict)
+def combine_matrices(s, A, t, B):
+    """Return s A + t B of two 3×3 matrices."""
+    return (
+        s * A[0] + t * B[0],
+        s * A[1] + t * B[1],
+        s * A[2] + t * B[2],
+        s * A[3] + t * B[3],
+        s * A[4] + t * B[4],
+        s * A[5] + t * B[5],
+        s * A[6] + t * B[6],
+        s * A[7] + t * B[7],
+        s * A[8] + t * B[8],
+    )
+
+
+def combine_symmetric(s, A, t, B):
+    """Return s A + t B of two symmetric matrices."""
+    return (
+        s * A[0] + t * B[0],
+        s * A[1] + t * B[1],
+        s * A[2] + t * B[2],
+        s * A[3] + t * B[3],
+        s * A[4] + t * B[4],
+        s * A[5] + t * B[5],
+    )
 
 
 def corrected_covariance(A, B, C, M, gain, bias_gain, variance):
@@ -32,21 +53,16 @@ def corrected_covariance(A, B, C, M, gain, bias_gain, variance):
     With M the projector on the axes that the measurement shows, ``δθ⁺ = (I − g M) δθ − g n``, ``δb⁺ = δb − κ (M δθ + n)`` and
     Cov n = σ² M: Joseph's form ``(I − K H) P (I − K H)ᵀ + K R Kᵀ``, which holds for any gain (Gelb 1974, section 4.2).
     """
-    nothing = (0.0, 0.0, 0.0)
-    identity = skew_polynomial(1.0, 0.0, 0.0, nothing)
     projector = full(M)
-    left = combined(1.0, identity, -gain, projector)
-    AM = multiply(full(A), projector)
+    left = combine_matrices(1.0, (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0), -gain, projector)
+    reduced = combine_matrices(1.0, B, -bias_gain, multiply(full(A), projector))
     MB = multiply(projector, B)
-    MAM = congruent(projector, A)
-    mixed = multiply(left, combined(1.0, B, -bias_gain, AM))
-    symmetric = combined(1.0, MB, 1.0, transpose(MB))
-    upper = (symmetric[0], symmetric[1], symmetric[2], symmetric[4], symmetric[5], symmetric[8])
-    squared = bias_gain * bias_gain
+    twice = (2.0 * MB[0], MB[1] + MB[3], MB[2] + MB[6], 2.0 * MB[4], MB[5] + MB[7], 2.0 * MB[8])
+    shown = combine_symmetric(1.0, congruent(projector, A), variance, M)
     return (
-        combined(1.0, congruent(left, A), gain * gain * variance, M),
-        combined(1.0, mixed, gain * bias_gain * variance, projector),
-        combined(1.0, combined(1.0, C, -bias_gain, upper), squared, combined(1.0, MAM, variance, M)),
+        combine_symmetric(1.0, congruent(left, A), gain * gain * variance, M),
+        combine_matrices(1.0, multiply(left, reduced), gain * bias_gain * variance, projector),
+        combine_symmetric(1.0, combine_symmetric(1.0, C, -bias_gain, twice), bias_gain * bias_gain, shown),
     )
 
 
@@ -70,8 +86,8 @@ def run_complementary(
 ):
     """Run the filter over the steps of a record; ``gain`` and ``bias_gain`` (1/s) hold one number a sensor.
 
-    ``ω_mes = z × R̂ᵀ r`` of each measurement turns the attitude by ``gain`` ω_mes and moves the bias by ``bias_gain`` ω_mes: equations (32) of
-    the paper over the interval of one sample, k_P dt and −k_I dt. A heading enters as the turn about the fixed z axis.
+    ``ω_mes = z × R̂ᵀ r`` of each measurement turns the attitude by ``gain`` ω_mes and moves the bias by ``bias_gain`` ω_mes: equations (32)
+    of the paper over the interval of one sample, k_P dt and −k_I dt. A heading enters as the turn about the fixed z axis.
     """
     q, b, A, B, C = state_at(state)
     for k in range(len(dt)):

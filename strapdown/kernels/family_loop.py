@@ -18,10 +18,11 @@ from strapdown.kernels.family_step import (
     negated,
     predict_fixed_side,
     predict_two_frame,
+    take_row,
     to_geometric,
 )
 from strapdown.kernels.filter_loop import HEADING, VECTOR, heading_error, store_state, vector_at
-from strapdown.kernels.filter_step import predict, update_row
+from strapdown.kernels.filter_step import predict
 from strapdown.kernels.rotation import rotation_matrix
 
 FIXED_SIDE = 0
@@ -114,10 +115,10 @@ def run_extended(
                 B, C = to_geometric(b, A, B, C)
             a = (0.0, 0.0, 0.0)
             c = (0.0, 0.0, 0.0)
-            a, c, A, B, C, e1, s1 = update_row(a, c, A, B, C, h1, y1, event_variance[e])
+            a, c, A, B, C, e1, s1 = take_row(a, c, A, B, C, h1, y1, event_variance[e])
             e2, s2 = 0.0, 1.0
             if not heading:
-                a, c, A, B, C, e2, s2 = update_row(a, c, A, B, C, h2, dot(v, z_f), event_variance[e])
+                a, c, A, B, C, e2, s2 = take_row(a, c, A, B, C, h2, dot(v, z_f), event_variance[e])
             if variant == FIXED_SIDE:
                 q, b, A, B = close_fixed_side(q, b, A, B, a, c)
             elif variant == RIGHT_INVARIANT:

@@ -16,11 +16,16 @@ from strapdown.kernels.algebra import (
     add_matrices,
     add_to_diagonal,
     combine,
+    dot,
     full,
     matrix_times_vector,
+    minus_outer,
     multiply,
     multiply_add,
+    scale,
     skew_polynomial,
+    symmetric_minus_outer,
+    symmetric_times_vector,
     times_transpose_upper,
     times_transpose_upper_add,
     transpose,
@@ -55,8 +60,8 @@ def congruent(M, S):
 def predict_fixed_side(q, b, A, B, C, delta_theta, dt, angle_variance, rate_variance):
     """Propagate (δφ, δb) over one gyro increment: ``δφ̇ = −R δb − R n_v``, ``δḃ = n_u``.
 
-    Markley & Crassidis 2014, section 6.2 (error in the reference frame): Φ11 = I, Φ12 = −∫R dt = −dt R₁ J_r(φ) with R₁ at the end; the noise
-    is that of the body side seen from fixed axes, ``Q11(R₁φ)`` and ``R₁ Q12(φ)``.
+    The MEKF of Markley & Crassidis (2014, chapter 6) with its error in the reference frame: Φ11 = I, Φ12 = −∫R dt = −dt R₁ J_r(φ) with
+    R₁ at the end; the noise is that of the body side seen from fixed axes, ``Q11(R₁φ)`` and ``R₁ Q12(φ)``.
     """
     phi = combine(1.0, delta_theta, -dt, b)
     q = turned(q, phi)
@@ -98,6 +103,31 @@ def predict_two_frame(q, b, A, B, C, delta_theta, dt, angle_variance, rate_varia
     )
 
 
+def take_row(a, c, A, B, C, h, y, variance):
+    """Take in one scalar row ``y = h · (attitude error) + v``, Var v = ``variance``, where rows before it have corrected by (a, c).
+
+    Returns (a, c, A, B, C, innovation, its variance). Joseph's form ``(I − k hᵀ) P (I − k hᵀ)ᵀ + r k kᵀ``, written as the short form plus
+    its rounding error on the attitude side, ``d = (P − k p) h − r k``.
+    """
+    pa = symmetric_times_vector(A, h)
+    pb = transpose_times_vector(B, h)
+    s = dot(h, pa) + variance
+    ka = scale(1.0 / s, pa)
+    kb = scale(1.0 / s, pb)
+    innovation = y - dot(h, a)
+    short = symmetric_minus_outer(A, ka, pa)
+    d = combine(1.0, symmetric_times_vector(short, h), -variance, ka)
+    return (
+        combine(1.0, a, innovation, ka),
+        combine(1.0, c, innovation, kb),
+        symmetric_minus_outer(short, d, ka),
+        minus_outer(minus_outer(B, ka, pb), d, kb),
+        symmetric_minus_outer(C, kb, pb),
+        innovation,
+        s,
+    )
+
+
 def close_fixed_side(q, b, A, B, correction, bias_correction):
     """Move the state by a correction of (δφ, δb) and carry the covariance to the new tangent space.
 
@@ -108,7 +138,7 @@ def close_fixed_side(q, b, A, B, correction, bias_correction):
 
 
 def close_right_invariant(q, b, correction, bias_correction):
-    """Move the state by a correction of (δφ, δb) and leave the covariance, as invariant filters do (Barrau & Bonnabel 2017, section II)."""
+    """Move the state by a correction of (δφ, δb) and leave the covariance, as invariant filters do (Barrau & Bonnabel 2017)."""
     return turned_in_fixed_axes(q, correction), add(b, bias_correction)
 
 

@@ -10,6 +10,7 @@ takes off what the rows before it corrected, and the attitude is moved, and the 
 from __future__ import annotations
 
 from strapdown.kernels.algebra import (
+    add,
     add_matrices,
     add_to_diagonal,
     combine,
@@ -18,6 +19,7 @@ from strapdown.kernels.algebra import (
     minus_outer,
     multiply,
     multiply_add,
+    scale,
     skew_polynomial,
     symmetric_minus_outer,
     symmetric_times_vector,
@@ -27,7 +29,10 @@ from strapdown.kernels.algebra import (
     transpose_times_vector,
 )
 from strapdown.kernels.rotation import right_jacobian, turned
-from strapdown.kernels.series import cosine, fifth, fourth, sinc, third
+from strapdown.kernels.series import fifth, fourth, second, sinc, third
+
+SHORT_FORM = 1000.0
+"""Where an innovation's variance is less than this many times the measurement's, the short form loses no more than three digits."""
 
 
 def transition(phi, dt):
@@ -36,13 +41,10 @@ def transition(phi, dt):
     ``Φ11 = exp(−[φ])``, ``Φ12 = −dt J_r(φ)``: the exact solution of δθ̇ = −[ω] δθ − δb (Markley & Crassidis 2014, eq. (6.83)).
     """
     x = dot(phi, phi)
-    y = 0.25 * x
-    s = sinc(y)
-    first = s * cosine(y)  # sin θ / θ
-    second = 0.5 * s * s  # (1 − cos θ)/θ²
+    c = second(x)
     return (
-        skew_polynomial(1.0, -first, second, phi),
-        skew_polynomial(-dt, dt * second, -dt * third(x), phi),
+        skew_polynomial(1.0, -sinc(x), c, phi),
+        skew_polynomial(-dt, dt * c, -dt * third(x), phi),
     )
 
 
@@ -90,29 +92,31 @@ def predict(q, b, A, B, C, delta_theta, dt, angle_variance, rate_variance):
     )
 
 
-def update_row(correction, b, A, B, C, h, y, variance):
-    """Take in one scalar row ``y = h · δθ + v``, Var v = ``variance``; return (correction, b, A, B, C, innovation, its variance).
+def update_row(b, A, B, C, h, innovation, variance):
+    """Take in one scalar row ``innovation = h · δθ + v``, Var v = ``variance``.
 
-    ``correction`` is the attitude correction of the rows of this measurement so far. Joseph's form, written as the short form plus the
-    vector ``d = r k − (P − k p) h`` which is nothing but the short form's rounding error: it costs a third more and keeps P positive
-    definite when the measurement is many orders better than the prior (Bierman 1977, ch. V).
+    Returns the attitude correction, b, A, B, C and the innovation's variance. Joseph's form, written as the short form plus the vector
+    ``d = (P − k p) h − r k`` which is nothing but the short form's rounding error: it keeps P positive definite when the measurement is
+    many orders better than the prior (Bierman 1977, ch. V), and can be left out where it is not.
     """
     pa = symmetric_times_vector(A, h)
     pb = transpose_times_vector(B, h)
     s = dot(h, pa) + variance
     inverse = 1.0 / s
-    ka = (inverse * pa[0], inverse * pa[1], inverse * pa[2])
-    kb = (inverse * pb[0], inverse * pb[1], inverse * pb[2])
-    innovation = y - dot(h, correction)
-    short = symmetric_minus_outer(A, ka, pa)
-    d = combine(1.0, symmetric_times_vector(short, h), -variance, ka)
+    ka = scale(inverse, pa)
+    kb = scale(inverse, pb)
+    A = symmetric_minus_outer(A, ka, pa)
+    B = minus_outer(B, ka, pb)
+    if s > SHORT_FORM * variance:
+        d = combine(1.0, symmetric_times_vector(A, h), -variance, ka)
+        A = symmetric_minus_outer(A, d, ka)
+        B = minus_outer(B, d, kb)
     return (
-        combine(1.0, correction, innovation, ka),
+        scale(innovation, ka),
         combine(1.0, b, innovation, kb),
-        symmetric_minus_outer(short, d, ka),
-        minus_outer(minus_outer(B, ka, pb), d, kb),
+        A,
+        B,
         symmetric_minus_outer(C, kb, pb),
-        innovation,
         s,
     )
 
@@ -147,10 +151,34 @@ def update_direction(q, b, A, B, C, R, u, v, z, variance):
 
     ``R`` is the matrix of q, ``variance`` that of each component, rad². The innovations are independent: the NIS is e₁²/s₁ + e₂²/s₂.
     """
-    h1, y1, h2, y2 = direction_rows(R, u, v, z)
-    zero = 0.0 * y1
-    correction, b, A, B, C, e1, s1 = update_row((zero, zero, zero), b, A, B, C, h1, y1, variance)
-    correction, b, A, B, C, e2, s2 = update_row(correction, b, A, B, C, h2, y2, variance)
+    h1, e1, h2, y2 = direction_rows(R, u, v, z)
+    pa1 = symmetric_times_vector(A, h1)
+    pa2 = symmetric_times_vector(A, h2)
+    s1 = dot(h1, pa1) + variance
+    s12 = dot(h1, pa2)
+    s22 = dot(h2, pa2) + variance
+    if s1 + s22 < SHORT_FORM * variance:
+        # Both rows at once: one division in the chain of dependence instead of two.
+        inverse = 1.0 / (s1 * s22 - s12 * s12)
+        i11, i12, i22 = s22 * inverse, -s12 * inverse, s1 * inverse
+        pb1 = transpose_times_vector(B, h1)
+        pb2 = transpose_times_vector(B, h2)
+        ka1 = combine(i11, pa1, i12, pa2)
+        ka2 = combine(i12, pa1, i22, pa2)
+        kb1 = combine(i11, pb1, i12, pb2)
+        kb2 = combine(i12, pb1, i22, pb2)
+        correction = combine(e1, ka1, y2, ka2)
+        b = add(b, combine(e1, kb1, y2, kb2))
+        A = symmetric_minus_outer(symmetric_minus_outer(A, ka1, pa1), ka2, pa2)
+        B = minus_outer(minus_outer(B, ka1, pb1), ka2, pb2)
+        C = symmetric_minus_outer(symmetric_minus_outer(C, kb1, pb1), kb2, pb2)
+        e2 = y2 - s12 / s1 * e1
+        s2 = 1.0 / i22
+    else:
+        first, b, A, B, C, s1 = update_row(b, A, B, C, h1, e1, variance)
+        e2 = y2 - dot(h2, first)  # what the first row has corrected is taken off the second
+        second, b, A, B, C, s2 = update_row(b, A, B, C, h2, e2, variance)
+        correction = add(first, second)
     q, A, B = reset(q, A, B, correction)
     return q, b, A, B, C, e1, s1, e2, s2
 
@@ -160,8 +188,6 @@ def update_heading(q, b, A, B, C, R, error, variance):
 
     ``h`` is the fixed z axis in the body frame: a turn δθ of the body turns the heading by h · δθ.
     """
-    zero = 0.0 * error
-    h = (R[6], R[7], R[8])
-    correction, b, A, B, C, e, s = update_row((zero, zero, zero), b, A, B, C, h, error, variance)
+    correction, b, A, B, C, s = update_row(b, A, B, C, (R[6], R[7], R[8]), error, variance)
     q, A, B = reset(q, A, B, correction)
-    return q, b, A, B, C, e, s
+    return q, b, A, B, C, error, s

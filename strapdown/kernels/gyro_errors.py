@@ -79,9 +79,9 @@ def drift_and_noise(
 ):
     """Fill increments (n, 3) and bias (n + 1, 3) from the true increments.
 
-    Parameters by axis (3,): ``white`` σ_v, ``walk`` σ_u, ``markov`` √q, ``flicker`` B, and the rest. ``streams`` (3, 4, 2, 4) are the
-    generators by axis and term; ``words`` (2, BLOCK/2) and ``normals`` (4, BLOCK) scratch. ``flicker_before`` is the flicker of the interval
-    before the first; the bias at an edge holds the mean of the flicker of the intervals beside it.
+    Parameters by axis (3,): ``white`` σ_v, ``walk`` σ_u, ``markov`` √q, ``flicker`` B, and the rest. ``streams`` (3, terms, 2, 4) are the
+    generators by axis and term; ``words`` (2, BLOCK/2) and ``normals`` (4, BLOCK) scratch. ``flicker_before`` is the flicker of the
+    interval before the first; the bias at an edge holds the mean of the flicker of the intervals beside it.
     """
     n = increments.shape[0]
     start = edges[0]
@@ -131,7 +131,9 @@ def drift_and_noise(
                         decay, variance, mean, remainder = markov_step(dt, correlation_time[axis])
                         markov_spread = math.sqrt(q * variance)
                         spread = math.sqrt(
-                            white[axis] * white[axis] * dt + walk[axis] * walk[axis] * dt * dt * dt / 12.0 + q * remainder
+                            white[axis] * white[axis] * dt
+                            + walk[axis] * walk[axis] * dt * dt * dt / 12.0
+                            + q * remainder
                         )
                     r1 = r + walk_step * walking[i]
                     g1 = decay * g + markov_spread * wandering[i]
@@ -165,9 +167,9 @@ def low_pass(dt, transition, factor, white, state, streams, words, normals, incr
             for i in range(m):
                 k = first + i
                 mean = increments[k, axis] / dt
-                left = increments[max(k - 1, 0), axis]
-                right = increments[min(k + 1, n - 1), axis]
-                slope = (right - left) / (2.0 * dt * dt)
+                left = max(k - 1, 0)
+                right = min(k + 1, n - 1)
+                slope = (increments[right, axis] - increments[left, axis]) / (max(right - left, 1) * dt * dt)
                 e0 = sigma * normals[0, i]
                 e1 = sigma * normals[1, i]
                 e2 = sigma * normals[2, i]
@@ -175,7 +177,9 @@ def low_pass(dt, transition, factor, white, state, streams, words, normals, incr
                 area = t[2, 0] * y + t[2, 1] * v + t[2, 2] * mean + t[2, 3] * slope
                 area += factor[2, 0] * e0 + factor[2, 1] * e1 + factor[2, 2] * e2
                 y1 = t[0, 0] * y + t[0, 1] * v + t[0, 2] * mean + t[0, 3] * slope + factor[0, 0] * e0
-                v1 = t[1, 0] * y + t[1, 1] * v + t[1, 2] * mean + t[1, 3] * slope + factor[1, 0] * e0 + factor[1, 1] * e1
+                v1 = (
+                    t[1, 0] * y + t[1, 1] * v + t[1, 2] * mean + t[1, 3] * slope + factor[1, 0] * e0 + factor[1, 1] * e1
+                )
                 y = y1
                 v = v1
                 out[k, axis] = area

@@ -19,8 +19,12 @@ from strapdown.kernels.algebra import square_root
 
 _ZERO, _ONE, _TWO, _THREE, _FOUR, _FIVE = (np.uint64(k) for k in range(6))
 _PARITY = np.uint64(0x1BD11BDAA9FC1A22)
-_S10, _S11, _S12, _S16, _S17, _S19, _S21, _S22, _S23, _S24 = (np.uint64(k) for k in (10, 11, 12, 16, 17, 19, 21, 22, 23, 24))
-_S31, _S32, _S33, _S40, _S41, _S42, _S43, _S45, _S48, _S52 = (np.uint64(k) for k in (31, 32, 33, 40, 41, 42, 43, 45, 48, 52))
+_S10, _S11, _S12, _S16, _S17, _S19, _S21, _S22, _S23, _S24 = (
+    np.uint64(k) for k in (10, 11, 12, 16, 17, 19, 21, 22, 23, 24)
+)
+_S31, _S32, _S33, _S40, _S41, _S42, _S43, _S45, _S48, _S52 = (
+    np.uint64(k) for k in (31, 32, 33, 40, 41, 42, 43, 45, 48, 52)
+)
 _S62, _S63 = np.uint64(62), np.uint64(63)
 _UNIT = np.uint64(0x3FF0000000000000)
 """Bits of 1.0: a mantissa or-ed to it is a number in [1, 2)."""
@@ -36,7 +40,9 @@ _L0, _L1, _L2, _L3, _L4, _L5, _L6, _L7, _L8, _L9 = (1.0 / (2 * k + 1) for k in r
 _S0, _S1, _S2, _S3, _S4, _S5, _S6, _S7 = (
     (-1.0) ** k * (0.5 * math.pi) ** (2 * k + 1) / math.factorial(2 * k + 1) for k in range(8)
 )
-_C0, _C1, _C2, _C3, _C4, _C5, _C6, _C7, _C8 = ((-1.0) ** k * (0.5 * math.pi) ** (2 * k) / math.factorial(2 * k) for k in range(9))
+_C0, _C1, _C2, _C3, _C4, _C5, _C6, _C7, _C8 = (
+    (-1.0) ** k * (0.5 * math.pi) ** (2 * k) / math.factorial(2 * k) for k in range(9)
+)
 
 
 def bits_of(x):

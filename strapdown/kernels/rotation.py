@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from strapdown.kernels.algebra import dot, skew_polynomial
-from strapdown.kernels.series import cosine, sinc, third
+from strapdown.kernels.series import cosine, second, sinc, third
 
 
 def quaternion_multiply(p, q):
@@ -71,5 +71,4 @@ def rotation_matrix(q):
 def right_jacobian(phi):
     """Return J_r(φ) = I − (1 − cos θ)/θ² [φ] + (θ − sin θ)/θ³ [φ]²: exp(φ + δ) = exp(φ) ⊗ exp(J_r(φ) δ) to first order."""
     x = dot(phi, phi)
-    s = sinc(0.25 * x)
-    return skew_polynomial(1.0, -0.5 * s * s, third(x), phi)
+    return skew_polynomial(1.0, -second(x), third(x), phi)

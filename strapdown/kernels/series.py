@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import math
 
-LARGEST_ANGLE = 0.5
+LARGEST_ANGLE = 1.0 / 3.0
 """rad; the polynomials below are good to rounding up to this angle. Loops that meet a larger one take sub-steps. Beyond it they
-degrade gracefully: at 1 rad the exponential is good to 1e-12, at 2 rad to 1e-8."""
+degrade gracefully: at 1 rad they are good to 1e-10, at 2 rad to 1e-6."""
 
 _COSINE = tuple((-1.0) ** k / math.factorial(2 * k) for k in range(6))
 _SINC = tuple((-1.0) ** k / math.factorial(2 * k + 1) for k in range(6))
+_SECOND = tuple((-1.0) ** k / math.factorial(2 * k + 2) for k in range(6))
 _THIRD = tuple((-1.0) ** k / math.factorial(2 * k + 3) for k in range(6))
 _FOURTH = tuple((-1.0) ** k / math.factorial(2 * k + 4) for k in range(6))
 _FIFTH = tuple(2.0 * (-1.0) ** k / math.factorial(2 * k + 5) for k in range(6))
 
 _C0, _C1, _C2, _C3, _C4, _C5 = _COSINE
 _S0, _S1, _S2, _S3, _S4, _S5 = _SINC
+_H0, _H1, _H2, _H3, _H4, _H5 = _SECOND
 _T0, _T1, _T2, _T3, _T4, _T5 = _THIRD
 _F0, _F1, _F2, _F3, _F4, _F5 = _FOURTH
 _G0, _G1, _G2, _G3, _G4, _G5 = _FIFTH
@@ -39,6 +41,11 @@ def cosine(x):
 def sinc(x):
     """Return sin √x / √x."""
     return polynomial(x, _S0, _S1, _S2, _S3, _S4, _S5)
+
+
+def second(x):
+    """Return (1 − cos θ)/θ² at θ = √x; tends to 1/2."""
+    return polynomial(x, _H0, _H1, _H2, _H3, _H4, _H5)
 
 
 def third(x):

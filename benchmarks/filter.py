@@ -1,0 +1,172 @@
+"""Whole-record filters side by side, in one process and one thread: ns a sample, and ratios. ``python benchmarks/filter.py``.
+
+Each is fed the same record: gyro, and a vector a sample (an accelerometer at rest under noise). The filters do not estimate the same
+states or aim at the same thing; the table compares what a user waits for, not how good they are.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from strapdown import mekf
+from strapdown.files import write_json
+from strapdown.kernels.machine import describe
+from strapdown.mekf import ProcessNoise, StepFilter, initial_state
+from strapdown.records import ImuRecord
+from strapdown.vectors import VectorMeasurements
+
+RATE = 100.0
+NOISE = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6)
+START = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-2, bias_sigma=1e-3)
+
+
+def samples(n: int, vectors: int) -> tuple[ImuRecord, np.ndarray, np.ndarray, np.ndarray]:
+    """Return a record with one or two directions a sample, and the same as rate, specific force and field."""
+    generator = np.random.default_rng(0)
+    rate = 0.1 * generator.standard_normal((n, 3))
+    force = np.array([0.0, 0.0, 9.81]) + 0.1 * generator.standard_normal((n, 3))
+    field = np.array([20.0, 0.0, -40.0]) + 0.1 * generator.standard_normal((n, 3))
+    edges = np.arange(n + 1) / RATE
+    series = tuple(
+        VectorMeasurements(
+            sensor=name,
+            kind="direction",
+            time=edges[1:],
+            vector_b=value / np.linalg.norm(value, axis=1, keepdims=True),
+            reference_f=reference,
+            sigma=np.full(n, 0.01),
+        )
+        for name, value, reference in (("up", force, [0.0, 0.0, 1.0]), ("field", field, [20.0, 0.0, -40.0]))
+    )
+    return ImuRecord(time=edges, increments=rate / RATE, vectors=series[:vectors]), rate, force, field
+
+
+def seconds(work: Callable[[], Any], repeats: int) -> list[float]:
+    """Return the times of ``repeats`` calls after one to warm up."""
+    work()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - start)
+    return times
+
+
+def peers(rate: np.ndarray, force: np.ndarray, field: np.ndarray) -> dict[str, tuple[Callable[[], Any], int]]:
+    """Return what each installed peer does with the record, and how many samples of it it gets (slow ones get fewer)."""
+    found: dict[str, tuple[Callable[[], Any], int]] = {}
+    n = len(rate)
+    try:
+        from vqf import VQF
+
+        found["vqf VQF.updateBatch 6D (C++)"] = (lambda: VQF(1.0 / RATE).updateBatch(rate, force), n)
+        found["vqf VQF.updateBatch 9D (C++)"] = (lambda: VQF(1.0 / RATE).updateBatch(rate, force, field), n)
+    except ImportError:
+        pass
+    try:
+        import imufusion
+
+        few = 20_000
+
+        def fusion() -> None:
+            ahrs = imufusion.Ahrs()
+            ahrs.set_sample_period(1.0 / RATE)
+            degrees = np.degrees(rate[:few])
+            for k in range(few):
+                ahrs.update_no_magnetometer(degrees[k], force[k])
+
+        found["imufusion update_no_magnetometer (C, a call a sample)"] = (fusion, few)
+    except ImportError:
+        pass
+    try:
+        from ahrs.filters import EKF
+
+        few_ekf = 2_000
+        found["ahrs EKF"] = (lambda: EKF(gyr=rate[:few_ekf], acc=force[:few_ekf], frequency=RATE), few_ekf)
+    except ImportError:
+        pass
+    return found
+
+
+def step_by_step(record: ImuRecord, few: int) -> Callable[[], None]:
+    """Return a loop of the filterpy face over the first ``few`` samples."""
+
+    def work() -> None:
+        f = StepFilter(NOISE, START)
+        up = record.vectors[0]
+        for k in range(few):
+            f.predict(record.increments[k], 1.0 / RATE)
+            f.update_direction(up.vector_b[k], up.reference_f, 0.01)
+
+    return work
+
+
+def import_times(repeats: int = 7) -> tuple[float, float]:
+    """Return median wall times of ``import numpy`` and ``import strapdown, strapdown.mekf`` in fresh processes, s."""
+
+    def once(what: str) -> float:
+        start = time.perf_counter()
+        subprocess.run([sys.executable, "-c", f"import {what}"], check=True)
+        return time.perf_counter() - start
+
+    pairs = [(once("numpy"), once("numpy, strapdown")) for _ in range(repeats)]
+    return statistics.median(a for a, _ in pairs), statistics.median(b for _, b in pairs)
+
+
+def main(*, n: int = 200_000, repeats: int = 7) -> dict[str, Any]:
+    """Return ns a sample (median and least) of each, the ratios to ours, and the import times."""
+    one, rate, force, field = samples(n, 1)
+    two, *_ = samples(n, 2)
+    works = {
+        "strapdown mekf.run, one vector": (lambda: mekf.run(one, NOISE, START), n),
+        "strapdown mekf.run, two vectors": (lambda: mekf.run(two, NOISE, START), n),
+        **peers(rate, force, field),
+        "strapdown StepFilter on filterpy": (step_by_step(one, 1000), 1000),
+    }
+    for work, _ in works.values():
+        work()
+    # Taken in turn, so that a drift of the machine's speed falls on all alike.
+    times: dict[str, list[float]] = {name: [] for name in works}
+    for _ in range(repeats):
+        for name, (work, count) in works.items():
+            start = time.perf_counter()
+            work()
+            times[name].append((time.perf_counter() - start) / count * 1e9)
+    base = statistics.median(times["strapdown mekf.run, one vector"])
+    rows = [
+        {"name": name, "ns_per_sample": statistics.median(t), "least": min(t), "ratio": statistics.median(t) / base}
+        for name, t in times.items()
+    ]
+    numpy_alone, with_strapdown = import_times()
+    return {
+        "machine": describe(),
+        "samples": n,
+        "rows": rows,
+        "import_seconds": {"numpy": numpy_alone, "numpy and strapdown": with_strapdown},
+    }
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--samples", type=int, default=200_000)
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    result = main(n=arguments.samples, repeats=arguments.repeats)
+    print(json.dumps(result["machine"]))
+    print(f"{'':56s} {'ns/sample':>10s} {'least':>10s} {'ratio':>8s}")
+    for row in result["rows"]:
+        print(f"{row['name']:56s} {row['ns_per_sample']:10.1f} {row['least']:10.1f} {row['ratio']:8.2f}")
+    print({name: round(value, 3) for name, value in result["import_seconds"].items()})
+    if arguments.json:
+        write_json(arguments.json, result)

@@ -1,0 +1,384 @@
+"""The algorithms: frozen tables that refuse to be made when their order conditions fail, and the catalogue of all of them."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from fractions import Fraction
+
+import numpy as np
+
+from strapdown import checks
+from strapdown.checks import Array, InputError
+from strapdown.coning import coefficients as exact
+from strapdown.coning.coefficients import Rationals, Table
+
+SOLVERS = {
+    "compressed": "rotation vector with one cross product",
+    "pairs": "rotation vector with all cross products",
+    "polynomial": "quaternion equation solved to rounding on the rate polynomial",
+    "magnus-4": "one exponential of two moments",
+    "magnus-6": "one exponential of three moments",
+    "commutator-free-4": "two exponentials of two moments",
+    "runge-kutta-4": "classical Runge–Kutta on the quaternion",
+    "euler": "first-order update of the quaternion, normalised",
+}
+"""How an algorithm turns the increments of a step into its rotation."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Algorithm:
+    """An integration algorithm as a table; refuses to be made if the drift order it claims is not the one its coefficients have.
+
+    The claim is checked exactly, in rationals: the power series of the drift under small coning must begin at λ^``drift_order``.
+    """
+
+    name: str
+    solver: str
+    """One of :data:`SOLVERS`."""
+    samples: int
+    """N, increments in a step."""
+    previous: int = 0
+    """p, increments used of those before the step."""
+    following: int = 0
+    """f, increments used of those after the step: the delay, in samples."""
+    rate_points: int = 0
+    """Rate samples in the quadrature that forms one increment; 0 where the algorithm takes true increments."""
+    order: int
+    """Global order of convergence on any smooth motion, with all increments exact."""
+    drift_order: int
+    """The drift under small coning falls as λ to this power."""
+    coefficients: Rationals = field(default=(), repr=False)
+    """Of the compressed solver: k_1 … k_{N−1+p} in φ = Σ Δθ_i + (Σ_j k_j Δθ_{N−j}) × Δθ_N."""
+    pairs: Table = field(default=(), repr=False)
+    """Of the other solvers: all products of two increments in the step, as a pair table over the window (see ``coefficients``)."""
+    correction: Table = field(default=(), repr=False)
+    """Of the polynomial solver: the part of ``pairs`` that is added to the solution of the quaternion equation."""
+    source: str = ""
+    """Where it was published."""
+
+    def __post_init__(self) -> None:
+        """Check shapes and order conditions."""
+        checks.one_of(f"{self.name}: solver", self.solver, SOLVERS)
+        for what, value in (("samples", self.samples), ("order", self.order)):
+            checks.count(f"{self.name}: {what}", value)
+        for what, value in (
+            ("previous", self.previous),
+            ("following", self.following),
+            ("rate_points", self.rate_points),
+        ):
+            checks.count(f"{self.name}: {what}", value, least=0)
+        m = self.window
+        if self.solver == "compressed":
+            if len(self.coefficients) != m - 1:
+                raise InputError(f"{self.name}: {len(self.coefficients)} coefficients; N − 1 + p = {m - 1} are needed")
+        elif len(self.pairs) != m or any(len(row) != m for row in self.pairs):
+            raise InputError(f"{self.name}: the pair table is not {m} by {m}, one row for each increment of the window")
+        elif any(self.pairs[i][j] != -self.pairs[j][i] for i in range(m) for j in range(i + 1)):
+            raise InputError(
+                f"{self.name}: the pair table is not antisymmetric; Δθ_i × Δθ_j changes sign with its order"
+            )
+        series = self._drift_series(self.drift_order // 2 + 1)
+        bad = next((n for n, c in enumerate(series[:-1]) if c != 0), None)
+        if bad is not None:
+            raise InputError(
+                f"{self.name}: the drift begins at λ^{2 * bad}, not λ^{self.drift_order}; derive the table anew"
+            )
+        if series[-1] == 0:
+            raise InputError(f"{self.name}: the drift at λ^{self.drift_order} is zero; claim a higher drift_order")
+
+    @property
+    def window(self) -> int:
+        """M = N + p + f, increments used for one step."""
+        return self.samples + self.previous + self.following
+
+    @property
+    def needs(self) -> str:
+        """What the algorithm takes, in words."""
+        if self.rate_points:
+            return f"rates ({self.rate_points}-point quadrature)"
+        return "increments" + (f", {self.following} samples late" if self.following else "")
+
+    @functools.cached_property
+    def lags(self) -> Rationals:
+        """k_1 … k_{M−1}: sums of the pair table by lag."""
+        return self.coefficients if self.solver == "compressed" else exact.lag_sums(self.pairs)
+
+    @functools.cached_property
+    def drift_constant(self) -> Fraction:
+        """C of the leading drift −C β² ω λ^``drift_order``; for N + p samples, compressed, (M!)²/(2(2M+1)!)."""
+        return -self._drift_series(self.drift_order // 2 + 1)[-1]
+
+    # The kernels' forms of the tables, kept with them: hashing hundreds of fractions for a cache costs more than a short record.
+
+    @functools.cached_property
+    def coefficient_array(self) -> Array:
+        """``coefficients`` as floats."""
+        return np.array([float(k) for k in self.coefficients])
+
+    @functools.cached_property
+    def pair_array(self) -> Array:
+        """``pairs`` as floats."""
+        return exact.floats(self.pairs)
+
+    @functools.cached_property
+    def correction_array(self) -> Array:
+        """``correction`` as floats."""
+        return exact.floats(self.correction)
+
+    def _drift_series(self, terms: int) -> Rationals:
+        """Return the powers 0, 2, 4, … of λ of the drift over β²ω."""
+        return tuple(c / self.samples for c in exact.residuals(self.lags, self.samples, self.rate_points, terms))
+
+    @functools.cached_property
+    def drift_series(self) -> tuple[float, ...]:
+        """The powers 0, 2, 4, … of λ of the drift over β²ω, enough of them for λ ≤ 1 and a window of 17."""
+        return tuple(float(c) for c in self._drift_series(48))
+
+
+# ------------------------------------------------------------------------------------------------------------------- makers
+
+
+def compressed(samples: int, previous: int = 0, rate_points: int = 0) -> Algorithm:
+    """Return the coning-optimal compressed algorithm with N samples and p of the step before."""
+    name = f"{_NUMBERS[samples - 1]}-sample" + (f"-previous-{previous}" if previous else "")
+    m = samples + previous
+    if rate_points:
+        name += f"-rate-{rate_points}"
+        table = exact.rate_compressed_coefficients(samples, previous, rate_points)
+    else:
+        table = exact.compressed_coefficients(samples, previous)
+    return Algorithm(
+        name=name,
+        solver="compressed",
+        samples=samples,
+        previous=previous,
+        rate_points=rate_points,
+        # One lag-symmetric cross product serves coning; for a general motion it is exact for linear rates only, and two samples alone
+        # are symmetric enough to gain an order.
+        order=2 if m == 1 or rate_points == 2 else 4 if (samples, previous) == (2, 0) else 3,
+        drift_order=2 * m,
+        coefficients=table,
+        source="this package, from rate samples" if rate_points else "Miller 1983; Ignagni 1996; Savage 2010",
+    )
+
+
+def uncompressed_taylor(samples: int) -> Algorithm:
+    """Return the rotation-vector algorithm exact, to second order, for a rate polynomial of degree N − 1."""
+    return Algorithm(
+        name=f"time-taylor-{samples}",
+        solver="pairs",
+        samples=samples,
+        order=4,
+        drift_order=_fitted_order(samples),
+        pairs=exact.taylor_pairs(samples),
+        source="Jordan 1969; Savage 1998; Song 2013",
+    )
+
+
+def uncompressed_optimal(samples: int) -> Algorithm:
+    """Return the uncompressed algorithm that is optimal under coning and keeps what it can of the time-Taylor one."""
+    return Algorithm(
+        name=f"uncompressed-{samples}",
+        solver="pairs",
+        samples=samples,
+        order=4,
+        drift_order=2 * samples,
+        pairs=exact.sum_of_tables(exact.taylor_pairs(samples), exact.matched_correction(samples)),
+        source="Song 2013, with the freedom used as in matched_correction",
+    )
+
+
+def polynomial(samples: int) -> Algorithm:
+    """Return the quaternion equation solved to rounding on the rate polynomial through the N increments of a step."""
+    return Algorithm(
+        name=f"polynomial-{samples}",
+        solver="polynomial",
+        samples=samples,
+        order=_fitted_order(samples),
+        drift_order=_fitted_order(samples),
+        pairs=exact.taylor_pairs(samples),
+        correction=((Fraction(0),) * samples,) * samples,
+        source="Wu 2018 (RodFIter, QuatFIter); Yan 2017 (Picard)",
+    )
+
+
+def matched(samples: int, previous: int, following: int = 0) -> Algorithm:
+    """Return this package's own algorithm; :func:`strapdown.coning.coefficients.matched_correction` derives it."""
+    m = samples + previous + following
+    correction = exact.matched_correction(samples, previous, following)
+    return Algorithm(
+        name=f"matched-{samples}-{previous}" + (f"-{following}" if following else ""),
+        solver="polynomial",
+        samples=samples,
+        previous=previous,
+        following=following,
+        order=_fitted_order(m) if previous == following else m + 1,
+        drift_order=2 * m,
+        pairs=exact.sum_of_tables(exact.taylor_pairs(samples, previous, following), correction),
+        correction=correction,
+        source="this package",
+    )
+
+
+def magnus(order: int) -> Algorithm:
+    """Return the Magnus integrator of order 4 (three samples) or 6 (four samples), on moments of the rate polynomial."""
+    samples = {4: 3, 6: 4}[order]
+    b = exact.step_moments(samples, order // 2)
+    if order == 4:
+        pairs = exact.outer_pairs(b[0], b[1])
+    else:
+        # α₁ = 9/4 B₀ − 15 B₂, α₂ = 12 B₁, α₃ = −15 B₀ + 180 B₂; (20 α₁ + α₃) × α₂ / 240.
+        pairs = exact.outer_pairs(
+            tuple((30 * x - 120 * z) / 240 for x, z in zip(b[0], b[2], strict=True)), tuple(12 * y for y in b[1])
+        )
+    return Algorithm(
+        name=f"magnus-{order}",
+        solver=f"magnus-{order}",
+        samples=samples,
+        order=order,
+        drift_order=order,
+        pairs=pairs,
+        source="Blanes, Casas, Ros 2000",
+    )
+
+
+def commutator_free() -> Algorithm:
+    """Return the commutator-free integrator of order 4: two exponentials, exp(½B₀ − 2B₁) ⊗ exp(½B₀ + 2B₁), three samples."""
+    b = exact.step_moments(3, 2)
+    return Algorithm(
+        name="commutator-free-4",
+        solver="commutator-free-4",
+        samples=3,
+        order=4,
+        drift_order=4,
+        pairs=exact.outer_pairs(b[0], b[1]),
+        source="Blanes, Moan 2006",
+    )
+
+
+def runge_kutta() -> Algorithm:
+    """Return classical Runge–Kutta on equation (17), with rates at 0, T/2, T of the polynomial through three increments."""
+    w = exact.step_rates_at(3, (Fraction(0), Fraction(3, 2), Fraction(3)))
+    # Products of two in the vector part of the step quaternion, doubled: T²/12 (w₀ × w_½ + w_½ × w₁).
+    pairs = exact.sum_of_tables(exact.outer_pairs(w[0], w[1]), exact.outer_pairs(w[1], w[2]))
+    return Algorithm(
+        name="runge-kutta-4",
+        solver="runge-kutta-4",
+        samples=3,
+        order=4,
+        drift_order=4,
+        pairs=tuple(tuple(x / 12 for x in row) for row in pairs),
+        source="Kutta 1901",
+    )
+
+
+def euler() -> Algorithm:
+    """Return q + ½ q ⊗ Δθ, normalised: what many small projects do."""
+    return Algorithm(
+        name="quaternion-euler",
+        solver="euler",
+        samples=1,
+        order=2,
+        drift_order=2,
+        pairs=((Fraction(0),),),
+        source="Euler 1768",
+    )
+
+
+def _fitted_order(samples: int) -> int:
+    # A symmetric window with an even number of increments gains an order, as Simpson's rule does.
+    return samples + 1 if samples % 2 else samples + 2
+
+
+_NUMBERS = ("one", "two", "three", "four", "five", "six", "seven", "eight")
+
+
+# ---------------------------------------------------------------------------------------------------------------- catalogue
+
+
+class Catalogue(Mapping[str, Algorithm]):
+    """Algorithms by name, each made (and so checked) when first asked for: importing costs nothing."""
+
+    def __init__(self, makers: dict[str, Callable[[], Algorithm]]) -> None:
+        self._makers = makers
+        self._made: dict[str, Algorithm] = {}
+
+    def __getitem__(self, name: str) -> Algorithm:
+        if name not in self._made:
+            self._made[name] = self._makers[name]()
+        return self._made[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._makers)
+
+    def __len__(self) -> int:
+        return len(self._makers)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._makers
+
+
+def _makers() -> dict[str, Callable[[], Algorithm]]:
+    makers: dict[str, Callable[[], Algorithm]] = {}
+    for p in range(4):
+        for n, number in enumerate(_NUMBERS, start=1):
+            makers[f"{number}-sample" + (f"-previous-{p}" if p else "")] = functools.partial(compressed, n, p)
+    for n in range(2, 7):
+        makers[f"time-taylor-{n}"] = functools.partial(uncompressed_taylor, n)
+    for n in range(2, 7):
+        makers[f"uncompressed-{n}"] = functools.partial(uncompressed_optimal, n)
+    for n in range(2, 9):
+        makers[f"polynomial-{n}"] = functools.partial(polynomial, n)
+    makers |= {
+        "magnus-4": functools.partial(magnus, 4),
+        "magnus-6": functools.partial(magnus, 6),
+        "commutator-free-4": commutator_free,
+        "runge-kutta-4": runge_kutta,
+        "quaternion-euler": euler,
+        "one-sample-rate-2": functools.partial(compressed, 1, 0, 2),
+        "two-sample-rate-2": functools.partial(compressed, 2, 0, 2),
+        "four-sample-rate-2": functools.partial(compressed, 4, 0, 2),
+        "four-sample-rate-4": functools.partial(compressed, 4, 0, 4),
+        "four-sample-rate-8": functools.partial(compressed, 4, 0, 8),
+        "one-sample-previous-3-rate-2": functools.partial(compressed, 1, 3, 2),
+        "matched-2-8": functools.partial(matched, 2, 8),
+        "matched-4-11": functools.partial(matched, 4, 11),
+        "matched-1-4-4": functools.partial(matched, 1, 4, 4),
+        "matched-1-8-8": functools.partial(matched, 1, 8, 8),
+    }
+    return makers
+
+
+ALGORITHMS: Mapping[str, Algorithm] = Catalogue(_makers())
+"""Every algorithm by name."""
+
+
+def named(algorithm: str | Algorithm) -> Algorithm:
+    """Return the algorithm of that name, or the one given."""
+    if isinstance(algorithm, Algorithm):
+        return algorithm
+    return ALGORITHMS[checks.one_of("algorithm", algorithm, ALGORITHMS)]
+
+
+def algorithm_rows() -> list[dict[str, str | int | float]]:
+    """Return the printed table of the catalogue, one row an algorithm: name, samples, orders, drift constant, what it needs, source.
+
+    ``drift constant`` is C of the leading drift −C β² ω λ^``drift order`` under small coning (λ = ω × sample interval).
+    """
+    return [
+        {
+            "name": a.name,
+            "samples": a.samples,
+            "previous": a.previous,
+            "following": a.following,
+            "order": a.order,
+            "drift order": a.drift_order,
+            "drift constant": float(a.drift_constant),
+            "needs": a.needs,
+            "method": SOLVERS[a.solver],
+            "source": a.source,
+        }
+        for a in ALGORITHMS.values()
+    ]

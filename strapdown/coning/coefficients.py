@@ -1,0 +1,288 @@
+"""Coefficients of the integration algorithms, in exact rationals.
+
+Time is counted in sample intervals. A window of M increments covers [0, M]; a step of N of them starts at sample p of the window and
+leaves f = M − N − p after it. A *pair table* K is antisymmetric and stands for Σ_{i<j} K_ij Δθ_i × Δθ_j. Its *lag sums*
+``k_l = Σ_i K_{i,i+l}`` are all that small coning sees: two increments l samples apart have the mean product 2(1 − cos λ) sin lλ, so that
+the drift of a step, for small β, is ``β² [Σ k_l 2(1 − cos λ) sin lλ − ½(Nλ − sin Nλ)]``.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+from fractions import Fraction
+
+import numpy as np
+
+from strapdown.checks import Array
+
+Rationals = tuple[Fraction, ...]
+Table = tuple[Rationals, ...]
+
+
+def compressed_coefficients(samples: int, previous: int = 0) -> Rationals:
+    """Return k_1 … k_{M−1} of the compressed coning correction with ``samples`` N and ``previous`` p, M = N + p, in closed form.
+
+    They solve ``Σ k_j 2(1 − cos λ) sin jλ = ½(Nλ − sin Nλ)`` up to the power λ^{2M−1}. In the second differences
+    ``e_l = k_{l−1} − 2k_l + k_{l+1}`` (k_0 = k_M = 0) the system is a Vandermonde one in l², with the solution
+
+        e_l = ½δ_{lN} + (−1)^l (N/l) (M!)² / ((M−l)! (M+l)!),    l = 1 … M.
+    """
+    m = samples + previous
+    e = [Fraction(0)] * (m + 1)
+    for lag in range(1, m + 1):
+        numerator = (-1) ** lag * samples * math.factorial(m) ** 2
+        e[lag] = Fraction(numerator, lag * math.factorial(m - lag) * math.factorial(m + lag))
+    e[samples] += Fraction(1, 2)
+    k = [Fraction(0)] * (m + 2)
+    for lag in range(m, 1, -1):
+        k[lag - 1] = e[lag] + 2 * k[lag] - k[lag + 1]
+    return tuple(k[1:m])
+
+
+@functools.cache
+def rate_basis(window: int) -> tuple[tuple[int, ...], ...]:
+    """Return, for each increment of the window, M! times the powers 0 … M−1 of t of the rate polynomial it contributes.
+
+    The polynomial of degree M − 1 whose integrals over the M sample intervals are the increments is the derivative of the Lagrange
+    interpolant of the summed angle at 0, 1, … M.
+    """
+    nodal = [1]
+    for node in range(window + 1):
+        nodal = [low - node * high for low, high in zip([0, *nodal], [*nodal, 0], strict=True)]
+    lagrange = []
+    for node in range(window + 1):
+        quotient = [0] * (window + 1)
+        for power in range(window, -1, -1):  # synthetic division by (t − node)
+            quotient[power] = nodal[power + 1] + (node * quotient[power + 1] if power < window else 0)
+        factor = (-1) ** (window - node) * math.comb(window, node)
+        lagrange.append([factor * c for c in quotient])
+    # Increment i raises the summed angle at every node after it.
+    summed = [[sum(column) for column in zip(*lagrange[i + 1 :], strict=True)] for i in range(window)]
+    return tuple(tuple(power * c for power, c in enumerate(angle) if power) for angle in summed)
+
+
+def _shifted(polynomial: Sequence[int], origin: int) -> list[int]:
+    """Return the powers of (t − origin) of an integer polynomial in t."""
+    c = list(polynomial)
+    for low in range(len(c)):
+        for power in range(len(c) - 2, low - 1, -1):
+            c[power] += origin * c[power + 1]
+    return c
+
+
+def interval_rates(window: int, interval: int) -> Table:
+    """Return, for each increment of the window, the powers of s ∈ [−½, ½] of the rate polynomial, s measured from the interval's middle."""
+    rows = []
+    for basis in rate_basis(window):
+        doubled = [c * 2 ** (window - 1 - power) for power, c in enumerate(basis)]  # in x = 2t
+        centred = _shifted(doubled, 2 * interval + 1)
+        rows.append(
+            tuple(Fraction(c * 2**power, 2 ** (window - 1) * math.factorial(window)) for power, c in enumerate(centred))
+        )
+    return tuple(rows)
+
+
+def _step_rates(samples: int, previous: int, following: int) -> Table:
+    """Return, for each increment of the window, the powers of t − p of the rate polynomial."""
+    window = samples + previous + following
+    scale = math.factorial(window)
+    return tuple(tuple(Fraction(c, scale) for c in _shifted(basis, previous)) for basis in rate_basis(window))
+
+
+@functools.cache
+def taylor_pairs(samples: int, previous: int = 0, following: int = 0) -> Table:
+    """Return the time-Taylor pair table: ``K_ij = ½ ∫ (L_i L_j' − L_j L_i') dt`` over the step, L_i' the rate basis, L_i = 0 at its start.
+
+    Exact, to second order in the rotation, for a body rate polynomial of degree M − 1.
+    """
+    rates = _step_rates(samples, previous, following)
+    m = len(rates)
+    moment = [
+        [Fraction(samples ** (a + b + 2), a + b + 2) * (Fraction(1, a + 1) - Fraction(1, b + 1)) / 2 for b in range(m)]
+        for a in range(m)
+    ]
+    half = [[sum((r[a] * moment[a][b] for a in range(m)), Fraction(0)) for b in range(m)] for r in rates]
+    return tuple(tuple(sum((h[b] * r[b] for b in range(m)), Fraction(0)) for r in rates) for h in half)
+
+
+def lag_sums(pairs: Table) -> Rationals:
+    """Return k_1 … k_{M−1} of a pair table: the sums along its upper diagonals."""
+    m = len(pairs)
+    return tuple(sum((pairs[i][i + lag] for i in range(m - lag)), Fraction(0)) for lag in range(1, m))
+
+
+@functools.cache
+def matched_correction(samples: int, previous: int = 0, following: int = 0) -> Table:
+    """Return the pair table C that, added to an algorithm exact for rate polynomials, makes it optimal under coning as well.
+
+    This is the package's own family, ``matched-N-p-f``. Its step is ``δq = δq_polynomial ⊗ exp(Σ C_ij Δθ_i × Δθ_j)``: the quaternion
+    equation solved to rounding on the rate polynomial through all M = N + p + f increments of the window, and then C. Derivation:
+
+    1. *The polynomial* carries every power of the rotation, so no floor of order β⁴ωλ⁴ remains: what is left is the error of the
+       interpolation, of relative order λ^M, in the products of two, three, … rates.
+    2. *Products of two* make the drift at small β. Only the lag sums matter there, and the best M − 1 of them are the closed form of
+       :func:`compressed_coefficients` (the step's position in the window does not enter): drift λ^{2M} instead of about λ^{M+1}. So the
+       lag sums of C must be the difference between those and the lag sums of :func:`taylor_pairs`.
+    3. *Nothing else may suffer.* Any pair table with those lag sums would do for two axes in quadrature, but would wrongly turn, say, a
+       constant rate beside an oscillation into a periodic error, of order β³. Both tables being exact for polynomials, the difference of
+       their generating functions is divisible by (2 − z − 1/z)^d, d = ⌊M/2⌋: C = Dᵀ S D with D the d-th difference. C then gives exactly
+       zero whenever either factor is a polynomial of degree below d, and is of the order of the interpolation error itself otherwise.
+    4. S has its lag sums from the division, spread evenly along its diagonals.
+
+    With f = 0 the algorithm is causal; with f > 0 it needs f samples of delay (or a recorded file), the step lies inside the window
+    where interpolation is at its best, and errors fall by two to four powers of ten.
+    """
+    m = samples + previous + following
+    d = m // 2
+    wanted = compressed_coefficients(samples, m - samples)
+    difference = [a - b for a, b in zip(wanted, lag_sums(taylor_pairs(samples, previous, following)), strict=True)]
+    for _ in range(d):
+        quotient = [Fraction(0)] * (len(difference) + 1)
+        for lag in range(len(difference) - 1, 0, -1):
+            quotient[lag - 1] = 2 * quotient[lag] - quotient[lag + 1] - difference[lag]
+        if difference[0] != 2 * quotient[0] - quotient[1]:
+            raise ArithmeticError("the two tables are not exact for the same polynomials")
+        difference = quotient[: len(difference) - 1]
+    size = m - d
+    weight = [Fraction(0), *(s / (size - lag) for lag, s in enumerate(difference, start=1))]
+    spread = [[weight[abs(j - i)] * (1 if j > i else -1) for j in range(size)] for i in range(size)]
+    d_th = [
+        [(-1) ** (d - j + i) * math.comb(d, j - i) if 0 <= j - i <= d else 0 for j in range(m)] for i in range(size)
+    ]
+    half = [[sum((spread[a][b] * d_th[b][j] for b in range(size)), Fraction(0)) for j in range(m)] for a in range(size)]
+    return tuple(
+        tuple(sum((d_th[a][i] * half[a][j] for a in range(size)), Fraction(0)) for j in range(m)) for i in range(m)
+    )
+
+
+def floats(table: Table) -> Array:
+    """Return a table as an array."""
+    return np.array([[float(x) for x in row] for row in table])
+
+
+def sum_of_tables(a: Table, b: Table) -> Table:
+    """Return a + b."""
+    return tuple(tuple(x + y for x, y in zip(r, s, strict=True)) for r, s in zip(a, b, strict=True))
+
+
+def step_moments(samples: int, count: int) -> Table:
+    """Return, for n = 0 … count − 1, the weights of the increments in ``B_n = T⁻ⁿ ∫ (t − T/2)ⁿ w dt`` over the step of N samples, T = N."""
+    rows = []
+    for n in range(count):
+        row = []
+        for basis in _step_rates(samples, 0, 0):
+            total = Fraction(0)
+            for power, c in enumerate(basis):
+                for i in range(n + 1):  # (t − N/2)ⁿ by the binomial theorem
+                    factor = math.comb(n, i) * Fraction(-samples, 2) ** (n - i)
+                    total += c * factor * Fraction(samples ** (power + i + 1), power + i + 1)
+            row.append(total / samples**n)
+        rows.append(tuple(row))
+    return tuple(rows)
+
+
+def step_rates_at(samples: int, instants: Sequence[Fraction]) -> Table:
+    """Return the weights of the increments in T × (rate at each instant, 0 … N) of the polynomial through a step of N samples."""
+    basis = _step_rates(samples, 0, 0)
+    return tuple(
+        tuple(samples * sum((c * t**power for power, c in enumerate(b)), Fraction(0)) for b in basis) for t in instants
+    )
+
+
+def outer_pairs(a: Rationals, b: Rationals) -> Table:
+    """Return the pair table of (Σ a_i Δθ_i) × (Σ b_j Δθ_j)."""
+    return tuple(tuple(x * v - u * y for u, v in zip(a, b, strict=True)) for x, y in zip(a, b, strict=True))
+
+
+def rate_weights(points: int, interval: int | None = None) -> Rationals:
+    """Return the weights that integrate the polynomial through ``points`` rate samples over one interval (the middle one by default).
+
+    Two points: the trapezoid, ½ and ½. Four: −1/24, 13/24, 13/24, −1/24.
+    """
+    start = Fraction(points // 2 - 1 if interval is None else interval)
+    weights = []
+    for node in range(points):
+        polynomial = [Fraction(1)]
+        for other in range(points):
+            if other != node:
+                scale = Fraction(1, node - other)
+                zero = Fraction(0)
+                shifted = zip([zero, *polynomial], [*polynomial, zero], strict=True)
+                polynomial = [scale * (low - other * high) for low, high in shifted]
+        weights.append(
+            sum(
+                (c * ((start + 1) ** (k + 1) - start ** (k + 1)) / (k + 1) for k, c in enumerate(polynomial)),
+                Fraction(0),
+            )
+        )
+    return tuple(weights)
+
+
+def squared_gain(points: int, terms: int) -> Rationals:
+    """Return the powers 0, 2, 4, … of λ of g², g the factor by which increments formed from rate samples scale an oscillation.
+
+    ``g = Σ_j b_j cos((j − ½)λ) (λ/2)/sin(λ/2)``, b the two-sided weights; 1 − λ²/6 + … for the trapezoid. ``points`` = 0 means true
+    increments, g = 1.
+    """
+    if points == 0:
+        return (Fraction(1), *(Fraction(0),) * (terms - 1))
+    weights = rate_weights(points)
+    middle = Fraction(points - 1, 2)
+    cosine = [
+        sum((w * (j - middle) ** (2 * n) for j, w in enumerate(weights)), Fraction(0))
+        * Fraction((-1) ** n, math.factorial(2 * n))
+        for n in range(terms)
+    ]
+    sine = [Fraction((-1) ** n, 4**n * math.factorial(2 * n + 1)) for n in range(terms)]
+    gain: list[Fraction] = []
+    for n in range(terms):
+        gain.append(cosine[n] - sum((gain[k] * sine[n - k] for k in range(n)), Fraction(0)))
+    return tuple(sum((gain[k] * gain[n - k] for k in range(n + 1)), Fraction(0)) for n in range(terms))
+
+
+def residuals(lags: Rationals, samples: int, points: int, terms: int) -> Rationals:
+    """Return the powers 1, 3, 5, … of λ of a step's drift over β²: ``g² Σ k_l 2(1 − cos λ) sin lλ − ½(Nλ − g² sin Nλ)``."""
+    sines = []
+    for n in range(terms):
+        q = 2 * n + 1
+        moment = sum((k * ((j + 1) ** q + (j - 1) ** q - 2 * j**q) for j, k in enumerate(lags, start=1)), Fraction(0))
+        sines.append((Fraction(samples**q, 2) - moment) * Fraction((-1) ** n, math.factorial(q)))
+    gain = squared_gain(points, terms)
+    total = [sum((sines[k] * gain[n - k] for k in range(n + 1)), Fraction(0)) for n in range(terms)]
+    total[0] -= Fraction(samples, 2)
+    return tuple(total)
+
+
+def rate_compressed_coefficients(samples: int, previous: int, points: int) -> Rationals:
+    """Return the compressed coefficients for increments formed from rate samples: they undo, in the drift, what the quadrature lost.
+
+    A quadrature over ``points`` rate samples scales an oscillation by g ≠ 1, which makes a drift of order λ^points whatever is done with
+    the increments as such. The coefficients here solve ``g² Σ k_j 2(1 − cos λ) sin jλ = ½(Nλ − g² sin Nλ)`` instead, up to λ^{2M−1}, so
+    the drift is of order λ^{2M} again; the periodic error stays that of the quadrature.
+    """
+    m = samples + previous
+    if m == 1:
+        return ()
+    base = residuals((Fraction(0),) * (m - 1), samples, points, m)[1:]
+    rows = []
+    for lag in range(1, m):
+        unit = tuple(Fraction(int(j == lag)) for j in range(1, m))
+        with_lag = residuals(unit, samples, points, m)[1:]
+        rows.append([a - b for a, b in zip(with_lag, base, strict=True)])
+    return solve([[row[q] for row in rows] for q in range(m - 1)], [-b for b in base])
+
+
+def solve(matrix: list[list[Fraction]], right: list[Fraction]) -> Rationals:
+    """Return the exact solution of a square linear system (Gauss–Jordan)."""
+    n = len(right)
+    rows = [[*row, value] for row, value in zip(matrix, right, strict=True)]
+    for i in range(n):
+        pivot = next(k for k in range(i, n) if rows[k][i] != 0)
+        rows[i], rows[pivot] = rows[pivot], rows[i]
+        rows[i] = [x / rows[i][i] for x in rows[i]]
+        for k in range(n):
+            if k != i and rows[k][i] != 0:
+                rows[k] = [x - rows[k][i] * y for x, y in zip(rows[k], rows[i], strict=True)]
+    return tuple(row[n] for row in rows)

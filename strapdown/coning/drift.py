@@ -1,0 +1,135 @@
+"""What vibration costs: the attitude drift that coning leaves behind, in closed form, and its sum over a spectrum."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from strapdown import checks
+from strapdown.checks import InputError
+from strapdown.coning.algorithms import ALGORITHMS, Algorithm, named
+
+
+def predicted_coning_drift(algorithm: str | Algorithm, angle: float, frequency: float, sample_interval: float) -> float:
+    """Return the leading term of the attitude drift under coning, rad/s about the cone's axis, for small ``angle``.
+
+    Parameters
+    ----------
+    algorithm : str or Algorithm
+    angle : float
+        Half-angle β of the cone, rad.
+    frequency : float
+        Of the coning, Hz; ω = 2π × frequency.
+    sample_interval : float
+        h, s; λ = ωh.
+
+    Returns
+    -------
+    float
+        −C β² ω λ^{drift order}; −c_M β² ω λ^{2M}, c_M = (M!)²/(2(2M+1)!), for M = N + p compressed samples. For one sample without
+        correction the exact −½ sin²β ω (1 − sin λ/λ).
+    """
+    table = named(algorithm)
+    beta, omega, lam = _motion(angle, frequency, sample_interval)
+    if table.window == 1 and table.solver == "compressed" and not table.rate_points:
+        return -0.5 * math.sin(beta) ** 2 * omega * (1.0 - math.sin(lam) / lam)
+    return -float(table.drift_constant) * beta**2 * omega * lam**table.drift_order
+
+
+def small_angle_drift(algorithm: str | Algorithm, frequency_ratio: float) -> float:
+    """Return the drift over β²ω for small β at any λ = ω × sample interval up to 1: the whole power series, not its leading term only."""
+    table = named(algorithm)
+    lam = checks.non_negative("frequency_ratio", frequency_ratio)
+    if lam > 1.0:
+        raise InputError(f"frequency_ratio is {lam:g}; the series serves up to 1 (6 samples a period): sample faster")
+    total = 0.0
+    for c in reversed(table.drift_series):
+        total = total * lam * lam + c
+    return total
+
+
+def _motion(angle: float, frequency: float, sample_interval: float) -> tuple[float, float, float]:
+    beta = checks.finite("angle", angle, unit="rad")
+    omega = 2.0 * math.pi * checks.positive("frequency", frequency, unit="Hz")
+    return beta, omega, omega * checks.positive("sample_interval", sample_interval, unit="s")
+
+
+@dataclass(frozen=True, kw_only=True)
+class VibrationLine:
+    """One line of an angular vibration spectrum: two orthogonal axes at one frequency."""
+
+    frequency: float
+    """Hz"""
+    angle: float
+    """Amplitude about the first axis, rad."""
+    angle_across: float | None = None
+    """Amplitude about the second axis, rad; the same as ``angle`` if not given."""
+    phase: float = 0.5 * math.pi
+    """By which the second axis lags the first, rad; π/2 is coning, 0 or π rocking without drift."""
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        checks.positive("frequency", self.frequency, unit="Hz")
+        checks.non_negative("angle", self.angle, unit="rad")
+        if self.angle_across is not None:
+            checks.non_negative("angle_across", self.angle_across, unit="rad")
+        checks.finite("phase", self.phase, unit="rad")
+
+    @property
+    def coning_square(self) -> float:
+        """β² of the circular coning that drifts as much: θ_x θ_y sin(phase), rad²."""
+        across = self.angle if self.angle_across is None else self.angle_across
+        return self.angle * across * math.sin(self.phase)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConingBudget:
+    """The drift that a vibration spectrum leaves with each algorithm at each sample rate.
+
+    Lines at different frequencies do not drift together (their products average out), so the drifts of the lines add. Angles are taken
+    as small: of each drift the part in β² is counted. The β⁴ floor of the rotation-vector forms comes on top; it matters above a degree
+    or so (``sims/coning_algorithms.py`` shows where).
+    """
+
+    lines: tuple[VibrationLine, ...]
+    sample_rates: tuple[float, ...]
+    """Hz"""
+    algorithms: tuple[str, ...] = ("one-sample", "two-sample", "four-sample", "matched-4-11", "matched-1-8-8")
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        if not self.lines:
+            raise InputError("lines is empty; give at least one VibrationLine")
+        if not self.sample_rates:
+            raise InputError("sample_rates is empty; give at least one rate in Hz")
+        for name in self.algorithms:
+            checks.one_of("algorithm", name, ALGORITHMS)
+        highest = max(line.frequency for line in self.lines)
+        for rate in self.sample_rates:
+            checks.positive("sample rate", rate, unit="Hz")
+            if 2.0 * math.pi * highest / rate > 1.0:
+                raise InputError(
+                    f"sample rate {rate:g} Hz is below 2π × the highest line, {highest:g} Hz: the drift series does not serve there; "
+                    f"sample at {2.0 * math.pi * highest:.4g} Hz or more, or leave out the line"
+                )
+
+    def drift(self, algorithm: str, sample_rate: float) -> float:
+        """Return the sum of the lines' drifts, rad/s about the third axis."""
+        return math.fsum(self.drifts(algorithm, sample_rate))
+
+    def drifts(self, algorithm: str, sample_rate: float) -> tuple[float, ...]:
+        """Return each line's drift, rad/s."""
+        table = named(algorithm)
+        omegas = [2.0 * math.pi * line.frequency for line in self.lines]
+        return tuple(
+            line.coning_square * omega * small_angle_drift(table, omega / sample_rate)
+            for line, omega in zip(self.lines, omegas, strict=True)
+        )
+
+    def rows(self) -> list[dict[str, str | float]]:
+        """Return one row an algorithm and rate: algorithm, sample rate (Hz), drift (rad/s)."""
+        return [
+            {"algorithm": name, "sample_rate": rate, "drift": self.drift(name, rate)}
+            for name in self.algorithms
+            for rate in self.sample_rates
+        ]

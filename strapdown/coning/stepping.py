@@ -1,0 +1,218 @@
+"""From records to attitude: increments or rates in, rotation vectors or attitude out, by any algorithm of the catalogue."""
+
+from __future__ import annotations
+
+import functools
+import math
+import time
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from strapdown import checks, quaternion
+from strapdown.checks import Array, InputError
+from strapdown.coning import coefficients as exact
+from strapdown.coning.algorithms import Algorithm, named
+
+IDENTITY = (1.0, 0.0, 0.0, 0.0)
+_VECTOR_SOLVERS = ("compressed", "pairs")
+
+
+def integrate(
+    increments: ArrayLike,
+    algorithm: str | Algorithm = "one-sample",
+    initial_attitude: ArrayLike = IDENTITY,
+    *,
+    frame: str = "body",
+) -> Array:
+    """Return attitude q_fb at the step edges, (n // N + 1, 4), the first row being the initial attitude.
+
+    Parameters
+    ----------
+    increments : array_like, (n, 3)
+        Integrals of the rate over each sample interval, rad; a rest of n % N increments is left out.
+    algorithm : str or Algorithm
+        See :func:`strapdown.coning.algorithm_rows`.
+    initial_attitude : array_like, (4,)
+    frame : {"body", "fixed"}
+        Of the increments: body rates, equation (17), or rates in the fixed frame, equation (3).
+    """
+    from strapdown.kernels.integration import BLOCK, accumulate_quaternions, accumulate_vectors
+    from strapdown.kernels.machine import compiled
+
+    table = named(algorithm)
+    checks.one_of("frame", frame, ("body", "fixed"))
+    initial = checks.unit_quaternions("initial_attitude", initial_attitude)
+    if initial.shape != (4,):
+        raise InputError(f"initial_attitude has shape {initial.shape}, wanted (4,); pass one quaternion")
+    samples = _increments(increments)
+    if frame == "fixed":
+        # The conjugate of equation (3) is equation (17) for q* and −w.
+        samples = -samples
+        initial = quaternion.conjugate(initial)
+    attitude = np.empty((len(samples) // table.samples + 1, 4))
+    work = np.empty((4, BLOCK))
+    if table.solver in _VECTOR_SOLVERS:
+        compiled(accumulate_vectors)(_vectors(samples, table).reshape(-1), initial, *work, attitude.reshape(-1))
+    else:
+        compiled(accumulate_quaternions)(_steps(samples, table).reshape(-1), initial, *work, attitude.reshape(-1))
+    return quaternion.conjugate(attitude) if frame == "fixed" else attitude
+
+
+def integrate_rates(
+    rates: ArrayLike,
+    sample_interval: float,
+    algorithm: str | Algorithm = "four-sample-rate-2",
+    initial_attitude: ArrayLike = IDENTITY,
+    *,
+    frame: str = "body",
+) -> Array:
+    """Return attitude q_fb at the step edges from rate samples (n + 1, 3) rad/s at the edges of n equal sample intervals.
+
+    An algorithm made for rates (``…-rate-2``) says by its number how many samples its quadrature uses, and undoes in the drift what the
+    quadrature loses. Any other gets the eight-point quadrature: the drift and the periodic error are then of order λ⁸ at best. The plain
+    trapezoid under a coning correction made for increments drifts by β²ωλ²/12, as much as no correction at all.
+    """
+    table = named(algorithm)
+    points = table.rate_points or 8
+    return integrate(increments_from_rates(rates, sample_interval, points), table, initial_attitude, frame=frame)
+
+
+def increments_from_rates(rates: ArrayLike, sample_interval: float, points: int = 2) -> Array:
+    """Return increments (n, 3) rad from rate samples (n + 1, 3) rad/s at the edges of the intervals.
+
+    Each increment is the integral of the polynomial through the ``points`` (even; 2 is the trapezoid) nearest samples. For an oscillation
+    it is too small by a relative error of order λ^points. Near the ends the samples lie to one side.
+    """
+    samples = checks.array("rates", rates, ("n", 3))
+    interval = checks.positive("sample_interval", sample_interval, unit="s")
+    checks.count("points", points, least=2)
+    if points % 2:
+        raise InputError(
+            f"points is {points}; it must be even, so that as many samples lie before an interval as after"
+        )
+    if len(samples) < 2:
+        raise InputError(f"rates has {len(samples)} samples; at least 2 are needed, one at each edge of an interval")
+    n = len(samples) - 1
+    points = min(points, len(samples) - len(samples) % 2)
+    middle = points // 2 - 1
+    increments = np.zeros((n, 3))
+    for j, weight in enumerate(_quadrature(points, middle)):
+        increments[middle : n - middle] += weight * samples[j : j + n - 2 * middle]
+    for i in range(middle):
+        increments[i] = np.asarray(_quadrature(points, i)) @ samples[:points]
+        increments[n - 1 - i] = np.asarray(_quadrature(points, points - 2 - i)) @ samples[n + 1 - points :]
+    return np.asarray(increments * interval)
+
+
+def rotation_vectors(increments: ArrayLike, algorithm: str | Algorithm = "one-sample") -> Array:
+    """Return the body rotation vector of each step, (n // N, 3) rad, from gyro increments (n, 3) rad; a rest of n % N is left out.
+
+    The solvers that work on quaternions give the logarithm of their step, of length at most π.
+    """
+    table = named(algorithm)
+    samples = _increments(increments)
+    if table.solver in _VECTOR_SOLVERS:
+        vectors = _vectors(samples, table)
+        return vectors.copy() if vectors is samples else vectors
+    return quaternion.log(_steps(samples, table))
+
+
+def time_per_sample(algorithm: str | Algorithm, samples: int = 20_160, repeats: int = 5) -> float:
+    """Return the least time that :func:`integrate` takes here, s a sample, compiling not counted."""
+    table = named(algorithm)
+    checks.count("samples", samples, least=table.window)
+    increments = 1e-3 * np.random.default_rng(0).standard_normal((samples, 3))
+    best = math.inf
+    for _ in range(checks.count("repeats", repeats) + 1):
+        start = time.perf_counter()
+        integrate(increments, table)
+        best = min(best, time.perf_counter() - start)
+    return best / samples
+
+
+def _increments(increments: ArrayLike) -> Array:
+    return np.ascontiguousarray(checks.array("increments", increments, ("n", 3)))
+
+
+def _vectors(increments: Array, table: Algorithm) -> Array:
+    from strapdown.kernels.integration import compressed_vectors, one_sample_vectors, pair_vectors
+    from strapdown.kernels.machine import compiled
+
+    if table.window == 1:
+        return increments
+    vectors = np.empty((len(increments) // table.samples, 3))
+    if table.solver == "compressed":
+        # The first steps look ahead for want of history; a record too short for that gets the member of the family that fits it.
+        previous = min(table.previous, max(0, len(increments) - table.samples) // 2)
+        coefficients = _compressed_array(table, previous)
+        flat, rows = increments.reshape(-1), vectors.reshape(-1)
+        if table.samples == 1:
+            compiled(one_sample_vectors)(flat, coefficients, rows)
+        else:
+            compiled(compressed_vectors)(flat, coefficients, table.samples, rows)
+    else:
+        compiled(pair_vectors)(increments, table.pair_array, vectors)
+    return vectors
+
+
+def _steps(increments: Array, table: Algorithm) -> Array:
+    from strapdown.kernels import integration_polynomial as kernels
+    from strapdown.kernels.machine import compiled
+
+    steps = np.empty((len(increments) // table.samples, 4))
+    if table.solver == "polynomial":
+        # A record shorter than the window is fitted whole, by a polynomial of lower degree, and without the correction.
+        window = min(table.window, len(increments))
+        correction = table.correction_array if window == table.window else np.zeros((1, 1))
+        previous = table.previous if window == table.window else len(increments)
+        rates = np.empty((4, window))
+        series = np.empty((kernels.TERMS_PER_SAMPLE * window + kernels.EXTRA_TERMS, 4))
+        compiled(kernels.polynomial_steps)(
+            increments, table.samples, previous, _fits(window), correction, rates, series, steps
+        )
+        return steps
+    weights, scheme = _scheme(table.solver, table.samples)
+    compiled(kernels.scheme_steps)(increments, weights, scheme, steps)
+    return steps
+
+
+def _compressed_array(table: Algorithm, previous: int) -> Array:
+    if previous == table.previous:
+        return table.coefficient_array
+    if table.rate_points:
+        row = exact.rate_compressed_coefficients(table.samples, previous, table.rate_points)
+    else:
+        row = exact.compressed_coefficients(table.samples, previous)
+    return np.array([float(k) for k in row])
+
+
+@functools.cache
+def _fits(window: int) -> Array:
+    """Return (interval, increment, power): the increments' weights in the powers of the rate polynomial about the interval's middle."""
+    tables = [exact.interval_rates(window, i) for i in range(window)]
+    return np.array([exact.floats(table) for table in tables]).reshape(window, window, window)
+
+
+@functools.cache
+def _scheme(solver: str, samples: int) -> tuple[Array, int]:
+    from strapdown.kernels import integration_polynomial as kernels
+
+    numbers = {
+        "magnus-4": kernels.MAGNUS_4,
+        "magnus-6": kernels.MAGNUS_6,
+        "commutator-free-4": kernels.COMMUTATOR_FREE_4,
+        "runge-kutta-4": kernels.RUNGE_KUTTA_4,
+        "euler": kernels.EULER,
+    }
+    if solver == "runge-kutta-4":
+        table = exact.step_rates_at(samples, (Fraction(0), Fraction(samples, 2), Fraction(samples)))
+    else:
+        table = exact.step_moments(samples, 3)
+    return exact.floats(table), numbers[solver]
+
+
+@functools.cache
+def _quadrature(points: int, interval: int) -> tuple[float, ...]:
+    return tuple(float(w) for w in exact.rate_weights(points, interval))

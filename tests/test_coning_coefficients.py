@@ -1,0 +1,197 @@
+"""The coefficient tables against independent derivations, in exact rationals."""
+
+import dataclasses
+import math
+from fractions import Fraction
+
+import pytest
+
+from strapdown import coning
+from strapdown.checks import InputError
+from strapdown.coning import ALGORITHMS
+from strapdown.coning import coefficients as exact
+
+NUMBERS = ("one", "two", "three", "four", "five", "six", "seven", "eight")
+FAMILY = [(n, p) for n in range(1, 9) for p in range(4)]
+
+
+def compressed_name(n, p):
+    return f"{NUMBERS[n - 1]}-sample" + (f"-previous-{p}" if p else "")
+
+
+def sine_products(lag, power):
+    """Return the coefficient of λ^power in 2(1 − cos λ) sin(lag λ), by multiplying the two series."""
+    total = Fraction(0)
+    for even in range(2, power, 2):
+        odd = power - even
+        one_minus_cos = -Fraction((-1) ** (even // 2), math.factorial(even)) * 2
+        sine = Fraction((-1) ** (odd // 2) * lag**odd, math.factorial(odd))
+        total += one_minus_cos * sine
+    return total
+
+
+@pytest.mark.parametrize(("n", "p"), FAMILY)
+def test_compressed_closed_form_solves_the_coning_equations(n, p):
+    m = n + p
+    powers = [2 * k + 1 for k in range(1, m)]
+    matrix = [[sine_products(lag, q) for lag in range(1, m)] for q in powers]
+    right = [-Fraction((-1) ** (q // 2) * n**q, 2 * math.factorial(q)) for q in powers]
+    assert ALGORITHMS[compressed_name(n, p)].coefficients == exact.solve(matrix, right)
+
+
+def test_solve_is_a_solver():
+    matrix = [
+        [Fraction(0), Fraction(2), Fraction(1)],
+        [Fraction(1), Fraction(1, 3), Fraction(5)],
+        [Fraction(7), Fraction(0), Fraction(-2)],
+    ]
+    x = exact.solve([row[:] for row in matrix], [Fraction(1), Fraction(2), Fraction(3)])
+    assert [sum(a * b for a, b in zip(row, x, strict=True)) for row in matrix] == [1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ("name", "published"),
+    [
+        ("two-sample", [Fraction(2, 3)]),
+        ("three-sample", [Fraction(27, 20), Fraction(9, 20)]),
+        ("four-sample", [Fraction(214, 105), Fraction(92, 105), Fraction(54, 105)]),
+        ("five-sample", [Fraction(1375, 504), Fraction(650, 504), Fraction(525, 504), Fraction(250, 504)]),
+        ("one-sample-previous-1", [Fraction(1, 12)]),
+        ("one-sample-previous-2", [Fraction(7, 60), Fraction(-1, 60)]),
+        ("one-sample-previous-3", [Fraction(113, 840), Fraction(-13, 420), Fraction(1, 280)]),
+    ],
+)
+def test_published_compressed_coefficients(name, published):
+    assert list(ALGORITHMS[name].coefficients) == published
+
+
+@pytest.mark.parametrize(("n", "p"), FAMILY)
+def test_drift_constant_is_the_closed_form(n, p):
+    m = n + p
+    algorithm = ALGORITHMS[compressed_name(n, p)]
+    assert algorithm.drift_order == 2 * m
+    assert algorithm.drift_constant == Fraction(math.factorial(m) ** 2, 2 * math.factorial(2 * m + 1))
+
+
+@pytest.mark.parametrize(
+    ("n", "denominator", "published"),
+    [
+        (2, 3, {(0, 1): 2}),
+        (3, 80, {(0, 1): 57, (1, 2): 57, (0, 2): 33}),
+        (4, 945, {(0, 1): 736, (2, 3): 736, (0, 2): 334, (1, 3): 334, (0, 3): 526, (1, 2): 654}),
+    ],
+)
+def test_published_time_taylor_coefficients(n, denominator, published):
+    table = ALGORITHMS[f"time-taylor-{n}"].pairs
+    assert {pair: table[pair[0]][pair[1]] for pair in published} == {
+        k: Fraction(v, denominator) for k, v in published.items()
+    }
+
+
+def monomial_increments(power, first, last):
+    return [Fraction((k + 1) ** (power + 1) - k ** (power + 1), power + 1) for k in range(first, last)]
+
+
+def second_order(a, b, n):
+    """Return ½ ∫ (A b − B a) dt over [0, n] for the rates tᵃ, tᵇ: the rotation vector's cross term of two axes."""
+    return Fraction(n ** (a + b + 2), a + b + 2) * (Fraction(1, a + 1) - Fraction(1, b + 1)) / 2
+
+
+@pytest.mark.parametrize(
+    ("n", "p", "f"), [(n, 0, 0) for n in range(2, 7)] + [(2, 3, 0), (4, 2, 0), (1, 3, 3), (2, 1, 2)]
+)
+def test_time_taylor_is_exact_for_rate_polynomials(n, p, f):
+    table = exact.taylor_pairs(n, p, f)
+    m = n + p + f
+    for a in range(m):
+        for b in range(a):
+            x, y = monomial_increments(a, -p, n + f), monomial_increments(b, -p, n + f)
+            got = sum(table[i][j] * (x[i] * y[j] - x[j] * y[i]) for i in range(m) for j in range(i + 1, m))
+            assert got == second_order(a, b, n)
+
+
+@pytest.mark.parametrize(("n", "p", "f"), [(2, 8, 0), (3, 4, 0), (4, 0, 0), (1, 4, 4), (1, 8, 8)])
+def test_matched_correction(n, p, f):
+    c = exact.matched_correction(n, p, f)
+    m = n + p + f
+    assert all(c[i][j] == -c[j][i] for i in range(m) for j in range(m))
+    lags = [a + b for a, b in zip(exact.lag_sums(c), exact.lag_sums(exact.taylor_pairs(n, p, f)), strict=True)]
+    assert tuple(lags) == exact.compressed_coefficients(n, m - n)
+    for power in range(m // 2):  # nothing is corrected where one axis moves as a low polynomial
+        x = monomial_increments(power, -p, n + f)
+        assert all(sum(c[i][j] * x[j] for j in range(m)) == 0 for i in range(m))
+
+
+@pytest.mark.parametrize("window", [1, 2, 3, 5, 9])
+def test_interval_rates_reproduce_their_increments(window):
+    for interval in range(window):
+        rows = exact.interval_rates(window, interval)
+        for j, powers in enumerate(rows):
+            for i in range(window):  # integral over interval i, seen from the middle of `interval`
+                low, high = Fraction(2 * (i - interval) - 1, 2), Fraction(2 * (i - interval) + 1, 2)
+                integral = sum(c * (high ** (k + 1) - low ** (k + 1)) / (k + 1) for k, c in enumerate(powers))
+                assert integral == (1 if i == j else 0)
+
+
+def test_step_moments_and_rates_of_known_polynomials():
+    # w = t² over a step of 3 samples: T⁻¹ ∫ (t − 3/2) t² dt = 27/8·… by hand: (81/4 − 27/2)/3 = 9/4.
+    increments = monomial_increments(2, 0, 3)
+    moments = [sum(w * x for w, x in zip(row, increments, strict=True)) for row in exact.step_moments(3, 2)]
+    assert moments == [9, Fraction(9, 4)]
+    rates = [
+        sum(w * x for w, x in zip(row, increments, strict=True))
+        for row in exact.step_rates_at(3, (Fraction(0), Fraction(3, 2), Fraction(3)))
+    ]
+    assert rates == [0, Fraction(27, 4), 27]
+
+
+@pytest.mark.parametrize("points", [2, 4, 6, 8])
+def test_rate_weights_integrate_polynomials(points):
+    for interval in range(points - 1):
+        weights = exact.rate_weights(points, interval)
+        for power in range(points):
+            assert sum(w * j**power for j, w in enumerate(weights)) == Fraction(
+                (interval + 1) ** (power + 1) - interval ** (power + 1), power + 1
+            )
+
+
+def test_published_rate_weights():
+    assert exact.rate_weights(4) == (Fraction(-1, 24), Fraction(13, 24), Fraction(13, 24), Fraction(-1, 24))
+    assert exact.squared_gain(2, 2) == (1, Fraction(-1, 6))  # (½λ cot ½λ)²
+
+
+@pytest.mark.parametrize(
+    "name", ["four-sample", "time-taylor-3", "magnus-6", "runge-kutta-4", "matched-2-8", "four-sample-rate-2"]
+)
+def test_a_table_with_one_wrong_coefficient_refuses_to_be_made(name):
+    good = ALGORITHMS[name]
+    if good.solver == "compressed":
+        bad = {"coefficients": (good.coefficients[0] + Fraction(1, 1000), *good.coefficients[1:])}
+    else:
+        rows = [list(row) for row in good.pairs]
+        rows[0][1] += Fraction(1, 1000)
+        rows[1][0] -= Fraction(1, 1000)
+        bad = {"pairs": tuple(map(tuple, rows))}
+    with pytest.raises(InputError, match=name):
+        dataclasses.replace(good, **bad)
+
+
+def test_a_table_must_be_antisymmetric_and_complete():
+    good = ALGORITHMS["time-taylor-3"]
+    with pytest.raises(InputError, match="antisymmetric"):
+        dataclasses.replace(good, pairs=((Fraction(1),) * 3,) * 3)
+    with pytest.raises(InputError, match="3 by 3"):
+        dataclasses.replace(good, pairs=good.pairs[:2])
+    with pytest.raises(InputError, match="coefficients"):
+        dataclasses.replace(ALGORITHMS["two-sample"], coefficients=())
+    with pytest.raises(InputError, match="claim a higher"):
+        dataclasses.replace(ALGORITHMS["one-sample"], samples=2, coefficients=(Fraction(2, 3),), drift_order=2)
+
+
+def test_catalogue_names_are_the_algorithms_names():
+    assert all(ALGORITHMS[name].name == name for name in ALGORITHMS)
+    assert len(coning.algorithm_rows()) == len(ALGORITHMS)
+    assert "two-sample" in ALGORITHMS
+    assert "two-samples" not in ALGORITHMS
+    with pytest.raises(InputError, match="did you mean 'two-sample'"):
+        coning.named("two-samples")

@@ -1,0 +1,189 @@
+"""Drift under coning: 50-digit truth, the closed forms, and the double-precision code, against one another."""
+
+import math
+
+import mpmath as mp
+import numpy as np
+import pytest
+
+from sims.coning_algorithms import OWN, PUBLISHED, coning_increments, exact_error, rate_increments
+from strapdown import coning, quaternion
+from strapdown.checks import InputError
+from strapdown.coning import ALGORITHMS, ConingBudget, VibrationLine
+
+
+def double_precision_drift(name, angle, ratio):
+    """Return the drift over ω of the package's code, by the fixed-rotation trick on one step far from the record's ends."""
+    table = ALGORITHMS[name]
+    n = table.samples
+    before = n * max(2, -(-table.previous // n))
+    first, last = -before, n + table.previous + table.following + 2
+    with mp.workdps(40):
+        beta, lam = mp.mpf(angle), mp.mpf(ratio)
+        exact = (
+            rate_increments(beta, lam, first, last, table.rate_points)
+            if table.rate_points
+            else coning_increments(beta, lam, first, last)
+        )
+    attitude = coning.integrate(np.array(exact, dtype=float), table)
+    step = quaternion.multiply(quaternion.conjugate(attitude[before // n]), attitude[before // n + 1])
+    turn = 0.5 * n * ratio
+    fixed = quaternion.multiply(step, np.array([math.cos(turn), 0.0, 0.0, math.sin(turn)]))
+    half = (
+        math.atan2(np.linalg.norm(fixed[1:]), fixed[0])
+        if math.sin(turn) > 0
+        else math.atan2(-np.linalg.norm(fixed[1:]), fixed[0])
+    )
+    return 2.0 * (math.remainder(half - turn, math.pi)) / (n * ratio)
+
+
+@pytest.mark.parametrize("name", list(ALGORITHMS))
+@pytest.mark.parametrize(("angle", "ratio"), [(0.02, 0.3), (0.3, 0.21), (0.3, 0.6)])
+def test_double_precision_agrees_with_fifty_digits(name, angle, ratio):
+    true = float(exact_error(name, angle, ratio, digits=30).drift)
+    step = ALGORITHMS[name].samples * ratio
+    rounding = 6e-16 / step / min(abs(math.sin(0.5 * step)), 1.0)
+    assert double_precision_drift(name, angle, ratio) == pytest.approx(true, rel=0.01, abs=rounding)
+
+
+COMPRESSED = [
+    name for name in ALGORITHMS if ALGORITHMS[name].solver == "compressed" and not ALGORITHMS[name].rate_points
+]
+
+
+@pytest.mark.parametrize("name", COMPRESSED)
+def test_drift_is_the_closed_form_and_its_order_is_2m(name):
+    # With digits enough β can be so small that no second-order floor shows, for every N and p.
+    m = ALGORITHMS[name].samples + ALGORITHMS[name].previous
+    ratios = np.geomspace(0.003, 0.03, 4)
+    drifts = np.array(
+        [float(exact_error(name, 1e-30, float(lam), digits=150).drift / mp.mpf(1e-30) ** 2) for lam in ratios]
+    )
+    c = math.factorial(m) ** 2 / (2 * math.factorial(2 * m + 1))
+    np.testing.assert_allclose(drifts, -c * ratios ** (2.0 * m), rtol=0.02)
+    slope = np.polyfit(np.log(ratios), np.log(-drifts), 1)[0]
+    assert slope == pytest.approx(2 * m, abs=0.05)
+
+
+@pytest.mark.parametrize("name", list(ALGORITHMS))
+def test_drift_order_and_constant_of_every_table(name):
+    table = ALGORITHMS[name]
+    ratios = (0.02, 0.04)
+    drifts = [float(exact_error(name, 1e-32, lam, digits=150).drift / mp.mpf(1e-32) ** 2) for lam in ratios]
+    assert math.log2(drifts[1] / drifts[0]) == pytest.approx(table.drift_order, abs=0.05)
+    assert drifts[0] == pytest.approx(-float(table.drift_constant) * ratios[0] ** table.drift_order, rel=0.02)
+
+
+@pytest.mark.parametrize("name", list(ALGORITHMS))
+@pytest.mark.parametrize("ratio", [0.1, 0.5, 1.0])
+def test_small_angle_drift_is_the_whole_series(name, ratio):
+    true = float(exact_error(name, 1e-15, ratio, digits=70).drift / mp.mpf(1e-15) ** 2)
+    assert coning.small_angle_drift(name, ratio) == pytest.approx(true, rel=1e-6, abs=1e-17)
+
+
+def test_one_sample_drift_is_exact_at_any_angle():
+    beta, frequency, h = 0.4, 3.0, 0.02
+    omega = 2 * math.pi * frequency
+    # The exact drift of ∫ w_b alone is not the small-angle form; the small-angle form in sin²β holds to β⁴.
+    true = omega * float(exact_error("one-sample", 0.01, omega * h).drift)
+    assert coning.predicted_coning_drift("one-sample", 0.01, frequency, h) == pytest.approx(true, rel=1e-4)
+    lam = omega * h
+    assert coning.predicted_coning_drift("one-sample", beta, frequency, h) == pytest.approx(
+        -0.5 * math.sin(beta) ** 2 * omega * (1 - math.sin(lam) / lam), rel=1e-14
+    )
+
+
+@pytest.mark.parametrize(
+    ("angle_degrees", "ratio"),
+    [
+        (0.01, 0.1),
+        (0.01, 1.0),
+        (0.3, 0.9),
+        (3.0, 0.6),
+        (3.0, 1.0),
+        (20.0, 0.3),
+        (45.0, 0.02),
+        (45.0, 0.6),
+        (45.0, 0.95),
+        (45.0, 1.0),
+    ],
+)
+def test_own_best_beats_every_published_algorithm(angle_degrees, ratio):
+    """Lower drift and lower periodic error than any algorithm published, or at rounding. The sim covers the whole grid."""
+    angle = math.radians(angle_degrees)
+    own = exact_error("matched-1-8-8", angle, ratio, digits=30)
+    others = [exact_error(name, angle, ratio, digits=30) for name in PUBLISHED]
+    rounding = 2.0**-52
+    assert abs(own.drift) < max(min(abs(e.drift) for e in others), rounding / ratio)
+    assert own.periodic < max(min(e.periodic for e in others), rounding)
+
+
+def test_second_order_forms_have_a_floor_and_own_best_has_not():
+    angle, ratio = math.radians(20.0), 0.2
+    assert abs(exact_error("eight-sample", angle, ratio).drift) > 10 * abs(
+        exact_error("three-sample", angle, ratio).drift
+    )
+    assert all(abs(exact_error(name, angle, ratio).drift) < 1e-9 for name in OWN)
+
+
+# ------------------------------------------------------------------------------------------------------------------ budget
+
+
+def simulated_drift(line, rate, name, seconds):
+    """Return the z drift that the code makes of a two-axis vibration with exact increments; the truth by fine two-sample steps."""
+    omega = 2 * math.pi * line.frequency
+    across = line.angle if line.angle_across is None else line.angle_across
+
+    def angles(t):
+        return np.stack([line.angle * np.sin(omega * t), across * np.sin(omega * t - line.phase), 0 * t], axis=-1)
+
+    def drifted(h, algorithm):
+        n = round(seconds / h)
+        t = np.arange(n + 1) * h
+        rotation = quaternion.log(coning.integrate(np.diff(angles(t), axis=0), algorithm)[-1])
+        return rotation[2] / (n * h)
+
+    return drifted(1 / rate, name) - drifted(1 / rate / 40, "matched-1-4-4")
+
+
+@pytest.mark.parametrize("phase", [math.pi / 2, 0.5, -1.0])
+@pytest.mark.parametrize("name", ["one-sample", "two-sample", "time-taylor-3"])
+def test_budget_agrees_with_simulation(phase, name):
+    line = VibrationLine(frequency=5.0, angle=2e-3, angle_across=1e-3, phase=phase)
+    budget = ConingBudget(lines=(line,), sample_rates=(60.0,), algorithms=(name,))
+    assert budget.drift(name, 60.0) == pytest.approx(simulated_drift(line, 60.0, name, 20.0), rel=0.01)
+
+
+def test_budget_adds_lines():
+    lines = (VibrationLine(frequency=5.0, angle=1e-3), VibrationLine(frequency=11.0, angle=3e-4, phase=-0.4))
+    budget = ConingBudget(lines=lines, sample_rates=(100.0, 200.0), algorithms=("one-sample", "two-sample"))
+    assert [row["algorithm"] for row in budget.rows()] == ["one-sample", "one-sample", "two-sample", "two-sample"]
+    alone = [ConingBudget(lines=(line,), sample_rates=(100.0,)).drift("two-sample", 100.0) for line in lines]
+    assert budget.drift("two-sample", 100.0) == pytest.approx(sum(alone), rel=1e-14)
+    assert budget.drift("one-sample", 100.0) == pytest.approx(4 * budget.drift("one-sample", 200.0), rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"lines": ()}, "lines is empty"),
+        ({"sample_rates": ()}, "sample_rates is empty"),
+        ({"sample_rates": (20.0,)}, "sample rate 20 Hz"),
+        ({"algorithms": ("five-samples",)}, "did you mean"),
+    ],
+)
+def test_budget_refuses_nonsense(change, message):
+    good = {"lines": (VibrationLine(frequency=5.0, angle=1e-3),), "sample_rates": (100.0,)}
+    with pytest.raises(InputError, match=message):
+        ConingBudget(**(good | change))
+
+
+@pytest.mark.parametrize("change", [{"frequency": 0.0}, {"angle": -1.0}, {"phase": math.nan}, {"angle_across": -1e-3}])
+def test_vibration_line_refuses_nonsense(change):
+    with pytest.raises(InputError):
+        VibrationLine(**({"frequency": 5.0, "angle": 1e-3} | change))
+
+
+def test_small_angle_drift_refuses_ratios_beyond_its_series():
+    with pytest.raises(InputError, match="sample faster"):
+        coning.small_angle_drift("two-sample", 1.5)

@@ -1,0 +1,454 @@
+"""Integration of records: orders of convergence on exact motions, rounding over an hour, frames, rates, short records, bad input."""
+
+import dataclasses
+import functools
+import itertools
+import math
+from fractions import Fraction
+
+import mpmath as mp
+import numpy as np
+import pytest
+
+from sims.coning_algorithms import exact_step, polynomial_step
+from strapdown import coning, motion, quaternion
+from strapdown.checks import InputError
+from strapdown.coning import ALGORITHMS
+from strapdown.coning import coefficients as exact
+from strapdown.kernels import integration as kernels
+from strapdown.kernels import integration_polynomial as polynomial_kernels
+from strapdown.kernels.machine import compiled
+
+MOTIONS = {
+    "coning": motion.Coning(angle=0.5, frequency=0.45),
+    "spin-cone": motion.SpinCone(precession_rate=2.5, spin_rate=-1.4, angle=0.7),
+    "torque-free": motion.TorqueFree(inertia=(1.0, 1.7, 2.4), initial_rate=(1.2, 1.5, -0.9)),
+    "harmonics": motion.HarmonicRates(
+        harmonics=(
+            motion.Harmonic(amplitude=(1.1, -0.3, 0.2), frequency=0.4),
+            motion.Harmonic(amplitude=(0.2, 0.9, -0.5), frequency=0.31, phase=1.1),
+        ),
+        mean=(0.3, -0.2, 0.6),
+    ),
+}
+SECONDS = 12.0
+
+
+@functools.cache
+def truth(name, n):
+    edges = np.linspace(0.0, SECONDS, n + 1)
+    return MOTIONS[name].attitude(edges), MOTIONS[name].increments(edges), MOTIONS[name].body_rate(edges)
+
+
+def angle_errors(estimate, true):
+    """Return the angles between two series of attitudes, rad, good to rounding for small ones."""
+    return np.linalg.norm(quaternion.log(quaternion.multiply(quaternion.conjugate(estimate), true)), axis=-1)
+
+
+def greatest_error(algorithm, name, n):
+    true, increments, rates = truth(name, n)
+    if algorithm.rate_points:
+        estimate = coning.integrate_rates(rates, SECONDS / n, algorithm, true[0])
+    else:
+        estimate = coning.integrate(increments, algorithm, true[0])
+    return angle_errors(estimate, true[:: algorithm.samples]).max()
+
+
+def measured_order(algorithm, name):
+    """Return the slope of the error between the two finest records of a ladder whose errors stand above rounding."""
+    n = algorithm.samples
+    ladder = [n * (k // n + 1) for k in (60, 75, 95, 120, 150, 190, 240, 480, 960, 1920, 3840)]
+    ladder = ladder[:-4] if algorithm.order > 4 else ladder[5:]
+    for coarse, fine in reversed(list(itertools.pairwise(ladder))):
+        fine_error = greatest_error(algorithm, name, fine)
+        if fine_error > 5e-13:
+            return math.log(greatest_error(algorithm, name, coarse) / fine_error) / math.log(fine / coarse)
+    raise AssertionError("every error of the ladder is at rounding")
+
+
+@pytest.mark.parametrize(("name", "key"), list(itertools.product(ALGORITHMS, MOTIONS)))
+def test_order_of_convergence(name, key):
+    algorithm = ALGORITHMS[name]
+    if (name, key) in {("matched-4-11", "spin-cone"), ("matched-1-8-8", "spin-cone")}:
+        assert greatest_error(algorithm, key, 76) < 1e-12  # at rounding on the coarsest records: no order to see
+        return
+    order = measured_order(algorithm, key)
+    # Not below the stated order; above it where the motion is kind to the algorithm. The highest orders meet rounding before their
+    # leading term rules (in 50 digits, test_coning_drift shows it).
+    below = 0.15 if algorithm.order <= 4 else 0.6 if algorithm.order <= 11 else 5.0
+    assert order > algorithm.order - below
+    assert order < algorithm.order + (1.3 if algorithm.order <= 11 else 4.0)
+
+
+@pytest.mark.parametrize("name", list(ALGORITHMS))
+def test_constant_rate_is_exact(name):
+    algorithm = ALGORITHMS[name]
+    if algorithm.solver in ("euler", "runge-kutta-4"):
+        pytest.skip("approximates even a constant rate")
+    spin = motion.ConstantRate(rate=(0.3, -0.5, 0.7))
+    t = np.arange(8 * 21 + 1) * 0.1
+    if algorithm.rate_points:
+        attitude = coning.integrate_rates(spin.body_rate(t), 0.1, algorithm)
+    else:
+        attitude = coning.integrate(spin.increments(t), algorithm)
+    assert angle_errors(attitude, spin.attitude(t)[:: algorithm.samples]).max() < (
+        2e-13 if name == "matched-4-11" else 5e-14
+    )
+
+
+@pytest.mark.parametrize(
+    "name", ["one-sample", "three-sample", "time-taylor-4", "magnus-6", "polynomial-3", "matched-4-11"]
+)
+def test_fixed_frame_rates(name):
+    # Equation (3) with a fixed-frame rate; the body rates of the inverse motion, reversed, are the independent reference.
+    generator = np.random.default_rng(3)
+    increments = 0.05 * generator.standard_normal((120, 3))
+    initial = quaternion.exp(np.array([0.3, -1.0, 0.4]))
+    attitude = coning.integrate(increments, name, initial, frame="fixed")
+    fine = motion.SpinCone(precession_rate=1.3, spin_rate=0.8, angle=0.4)
+    t = np.linspace(0.0, 3.0, 121)
+    nodes, weights = np.polynomial.legendre.leggauss(12)
+    middles, half = 0.5 * (t[1:] + t[:-1]), 0.5 * (t[1] - t[0])
+    fixed_increments = sum(w * half * fine.fixed_rate(middles + half * x) for x, w in zip(nodes, weights, strict=True))
+    estimate = coning.integrate(fixed_increments, name, fine.attitude(0.0), frame="fixed")
+    one_sample = angle_errors(
+        coning.integrate(fixed_increments, "one-sample", fine.attitude(0.0), frame="fixed"), fine.attitude(t)
+    ).max()
+    error = angle_errors(estimate, fine.attitude(t)[:: ALGORITHMS[name].samples]).max()
+    assert error < (1.01 * one_sample if name == "one-sample" else 0.1 * one_sample)
+    # Its conjugate is the body-frame integration of the negated increments.
+    mirrored = coning.integrate(-increments, name, quaternion.conjugate(initial))
+    np.testing.assert_allclose(attitude, quaternion.conjugate(mirrored), atol=1e-15)
+
+
+def test_body_and_fixed_rates_of_one_motion_agree():
+    cone = motion.SpinCone(precession_rate=1.3, spin_rate=0.8, angle=0.4)
+    t = np.linspace(0.0, 3.0, 61)
+    body = coning.integrate(cone.increments(t), "matched-1-8-8", cone.attitude(0.0))
+    assert angle_errors(body, cone.attitude(t)).max() < 1e-13
+
+
+def test_an_hour_at_a_kilohertz_accumulates_rounding_as_the_root_of_the_count():
+    # Single-axis increments commute, so that the truth is the angle's exact sum; a generic axis makes every product round.
+    n = 3_600_000
+    increment = np.array([0.0011, -0.0007, 0.0013])
+    attitude = coning.integrate(np.broadcast_to(increment, (n, 3)))
+    angle = math.sqrt(math.fsum(float(x) ** 2 for x in increment))
+    axis = increment / angle
+    counts = np.arange(n + 1)[:: n // 3600]
+    # The angle n × θ is reduced in extended precision.
+    half = np.asarray(
+        np.fmod(counts * np.longdouble(0.5) * np.sqrt(np.sum(np.longdouble(increment) ** 2)), 2 * np.longdouble(np.pi)),
+        float,
+    )
+    true = np.concatenate([np.cos(half)[:, None], np.sin(half)[:, None] * axis], axis=1)
+    error = angle_errors(attitude[:: n // 3600], true)
+    # A root of the count of half-ulps, and a bias of the same rounded step repeated: ten times a random walk's spread is ample.
+    assert error[-1] < 1e-12 + n * 2.0**-54 * angle
+    norm = np.abs(np.sqrt(np.einsum("ij,ij->i", attitude, attitude)) - 1.0)
+    assert norm.max() <= 4e-16
+
+
+@pytest.mark.parametrize("name", ["one-sample", "four-sample", "polynomial-3"])
+def test_random_hour_stays_within_the_random_walk_of_rounding(name):
+    generator = np.random.default_rng(11)
+    n = 360_000
+    increments = 1e-3 * generator.standard_normal((n, 3))
+    attitude = coning.integrate(increments, name)
+    norm = np.abs(np.sqrt(np.einsum("ij,ij->i", attitude, attitude)) - 1.0)
+    assert norm.max() <= 4e-16
+    if name == "one-sample":
+        reference = extended_product(increments)
+        error = angle_errors(attitude[-1], reference)
+        assert error < 4 * math.sqrt(n) * 2.0**-53
+        assert error > 0.01 * math.sqrt(n) * 2.0**-53
+
+
+def extended_product(increments):
+    """Return the product of all exp(Δθ) in 64-bit mantissas, by pairwise reduction."""
+    v = increments.astype(np.longdouble)
+    half = np.sqrt(np.sum(v * v, axis=1)) / 2
+    q = np.concatenate([np.cos(half)[:, None], (np.sin(half) / (2 * half))[:, None] * v], axis=1)
+    while len(q) > 1:
+        last = q[len(q) - len(q) % 2 :]
+        p, r = q[: len(q) - len(q) % 2 : 2], q[1 : len(q) - len(q) % 2 : 2]
+        w = p[:, :1] * r[:, :1] - np.sum(p[:, 1:] * r[:, 1:], axis=1, keepdims=True)
+        u = p[:, :1] * r[:, 1:] + r[:, :1] * p[:, 1:] + np.cross(p[:, 1:], r[:, 1:])
+        q = np.concatenate([np.concatenate([w, u], axis=1), last])
+    return np.asarray(q[0], float)
+
+
+def test_renormalisation_does_not_hide_a_fault():
+    # A step quaternion of norm 1.001 shows in every row after it: one Newton step takes 1e-3 to 1e-6, not to nothing.
+    steps = np.tile([1.0, 0.0, 0.0, 0.0], (10, 1))
+    steps[5] *= 1.001
+    attitude = np.empty((11, 4))
+    compiled(kernels.accumulate_quaternions)(
+        steps.reshape(-1), np.array([1.0, 0.0, 0.0, 0.0]), *np.empty((4, kernels.BLOCK)), attitude.reshape(-1)
+    )
+    assert np.all(np.abs(np.linalg.norm(attitude[6:], axis=1) - 1.0) > 1e-7)
+    assert np.all(attitude[:6, 0] == 1.0)
+
+
+def test_the_running_product_is_renormalised():
+    # Steps a little too long, as rounding might leave them, do not add up: without renormalisation 20,000 of them make 2e-5.
+    steps = np.tile([1.0 + 1e-9, 0.0, 0.0, 0.0], (20_000, 1))
+    attitude = np.empty((20_001, 4))
+    initial = np.array([1.0, 0.0, 0.0, 0.0])
+    compiled(kernels.accumulate_quaternions)(
+        steps.reshape(-1), initial, *np.empty((4, kernels.BLOCK)), attitude.reshape(-1)
+    )
+    assert np.abs(np.linalg.norm(attitude, axis=1) - 1.0).max() < 1e-12
+
+
+def test_the_first_steps_of_a_matched_algorithm_have_no_correction():
+    # Near the record's ends the step has another place in the window, for which the correction is not made.
+    matched = ALGORITHMS["matched-4-11"]
+    pairs = exact.taylor_pairs(4, 11)
+    order = next(2 * n for n, c in enumerate(exact.residuals(exact.lag_sums(pairs), 4, 0, 30)) if c)
+    zero = ((Fraction(0),) * 15,) * 15
+    plain = dataclasses.replace(matched, name="plain", pairs=pairs, correction=zero, drift_order=order)
+    increments = motion.Coning(angle=0.5, frequency=0.15).increments(np.arange(61.0))
+    with_correction, without = (coning.rotation_vectors(increments, a) for a in (matched, plain))
+    np.testing.assert_array_equal(with_correction[:3], without[:3])  # 11 samples of history are missing
+    assert np.all(np.any(with_correction[3:] != without[3:], axis=1))
+
+
+@pytest.mark.parametrize("size", [0.01, 0.03, 0.06, 0.1, 0.2])
+def test_rough_data_are_solved_to_rounding_or_not_fitted_at_all(size):
+    algorithm = ALGORITHMS["matched-1-8-8"]
+    increments = size * np.random.default_rng(int(1000 * size)).standard_normal((17, 3))
+    step = quaternion.exp(coning.rotation_vectors(increments, algorithm)[8])
+    with mp.workdps(40):
+        exactly = np.array(exact_step(algorithm, [tuple(map(mp.mpf, row)) for row in increments.tolist()]), dtype=float)
+    plain = quaternion.exp(increments[8])
+    assert min(angle_errors(step, exactly), angle_errors(step, plain)) < 1e-14
+    if size <= 0.03:
+        assert angle_errors(step, exactly) < 1e-14
+
+
+@pytest.mark.parametrize("top", [1e-3, 1.0, 3.9])
+def test_a_series_ruled_by_its_highest_power_is_not_taken_for_ended(top):
+    # Two factors of the highest power meet only in term 2M, after many that vanish.
+    m = 17
+    rates = np.zeros((4, m))
+    rates[0, m - 1] = top * 2.0 ** (m - 1)
+    rates[1, 2] = 1e-3
+    rates[3] = top
+    series = np.empty((2 * m + 24, 4))
+    step, ended = polynomial_kernels.interval_quaternion(rates, m, series)
+    with mp.workdps(30):
+        # About the middle, s from −½ to ½; polynomial_step starts at t = 0.
+        powers = [(mp.mpf(rates[0, k]), mp.mpf(rates[1, k]), mp.mpf(0)) for k in range(m)]
+        moved = [
+            tuple(
+                sum(mp.binomial(k, j) * (-mp.mpf(1) / 2) ** (k - j) * powers[k][axis] for k in range(j, m))
+                for axis in range(3)
+            )
+            for j in range(m)
+        ]
+        exactly = np.array(polynomial_step(moved, 1), dtype=float)
+    assert ended == (top < 0.1)
+    if ended:
+        np.testing.assert_allclose(step, exactly, atol=3e-16)
+
+
+def test_fitted_rates_bound_what_is_left_out():
+    fit = (
+        np.random.default_rng(1).standard_normal((6, 6))
+        * 10.0 ** -np.arange(6.0)
+        * np.array([1, 1, 1, 1, 1e-20, 1e-20])
+    )
+    increments = np.random.default_rng(2).standard_normal((9, 3))
+    rates = np.empty((4, 6))
+    bound, kept = polynomial_kernels.fitted_rates(increments, 2, fit, rates)
+    np.testing.assert_allclose(rates[:3], (fit.T @ increments[2:8]).T, rtol=1e-12)
+    sizes = np.abs(rates[:3]).sum(axis=0) * 0.5 ** np.arange(6)
+    np.testing.assert_allclose(rates[3], sizes[::-1].cumsum()[::-1], rtol=1e-14)
+    assert (bound, kept) == (rates[3, 0], 4)
+
+
+def test_a_series_without_room_to_end_is_not_used():
+    increments = 0.05 * np.random.default_rng(1).standard_normal((12, 3))
+    fits = np.array([exact.floats(exact.interval_rates(4, i)) for i in range(4)])
+    steps = np.empty((3, 4))
+    for room, used in ((32, True), (3, False)):
+        work = np.empty((4, 4)), np.empty((room, 4))
+        polynomial_kernels.polynomial_steps(increments, 4, 0, fits, np.zeros((4, 4)), *work, steps)
+        plain = coning.integrate(increments)[::4]
+        distance = angle_errors(steps, quaternion.multiply(quaternion.conjugate(plain[:-1]), plain[1:]))
+        assert np.all(distance > 1e-6) if used else np.all(distance < 1e-15)
+
+
+def test_increment_algorithms_take_rates_by_the_eight_point_quadrature():
+    cone = motion.Coning(angle=0.1, frequency=0.5)
+    t = np.arange(201) * 0.05
+    estimate = coning.integrate_rates(cone.body_rate(t), 0.05, "matched-1-4-4", cone.attitude(0.0))
+    trapezoid = coning.integrate(
+        coning.increments_from_rates(cone.body_rate(t), 0.05), "matched-1-4-4", cone.attitude(0.0)
+    )
+    true = cone.attitude(t)
+    assert angle_errors(estimate, true).max() < 1e-3 * angle_errors(trapezoid, true).max()
+
+
+@pytest.mark.parametrize("length", [0, 1, 2, 5, 191, 192, 193, 1000])
+def test_blocks_join(length):
+    increments = 0.4 * np.random.default_rng(length).standard_normal((length, 3))
+    attitude = coning.integrate(increments)
+    assert attitude.shape == (length + 1, 4)
+    q = np.array([1.0, 0.0, 0.0, 0.0])
+    for k, phi in enumerate(increments):
+        q = quaternion.multiply(q, quaternion.exp(phi))
+        assert angle_errors(attitude[k + 1], q) < 1e-14 * math.sqrt(k + 1)
+
+
+@pytest.mark.parametrize("size", [1e-9, 0.5, 0.999, 1.001, 2.0, 3.1, 7.0, 40.0])
+def test_large_rotation_vectors(size):
+    phi = size * np.array([0.6, -0.64, 0.48])
+    attitude = coning.integrate(phi[None, :])
+    np.testing.assert_allclose(attitude[1], quaternion.exp(phi), atol=2e-15 * max(1.0, size))
+
+
+@pytest.mark.parametrize("name", list(ALGORITHMS))
+def test_rotation_vectors_are_the_steps_of_integrate(name):
+    algorithm = ALGORITHMS[name]
+    increments = 0.03 * np.random.default_rng(5).standard_normal((8 * 15, 3))
+    vectors = coning.rotation_vectors(increments, name)
+    attitude = coning.integrate(increments, name)
+    assert vectors.shape == (len(increments) // algorithm.samples, 3)
+    steps = quaternion.multiply(quaternion.conjugate(attitude[:-1]), attitude[1:])
+    np.testing.assert_allclose(quaternion.log(steps), vectors, atol=3e-15)
+
+
+@pytest.mark.parametrize("name", list(ALGORITHMS))
+@pytest.mark.parametrize("extra", [0, 1, 3, 7])
+def test_short_records_and_rests(name, extra):
+    # Every length works; the motion is slow enough that any algorithm of second order follows it.
+    algorithm = ALGORITHMS[name]
+    cone = motion.Coning(angle=0.1, frequency=0.05)
+    n = algorithm.samples + extra
+    t = np.arange(n + 1) * 0.1
+    if algorithm.rate_points:
+        attitude = coning.integrate_rates(cone.body_rate(t), 0.1, algorithm, cone.attitude(0.0))
+    else:
+        attitude = coning.integrate(cone.increments(t), algorithm, cone.attitude(0.0))
+    assert len(attitude) == n // algorithm.samples + 1
+    assert angle_errors(attitude, cone.attitude(t)[:: algorithm.samples][: len(attitude)]).max() < 2e-5
+
+
+@pytest.mark.parametrize("name", ["matched-4-11", "matched-1-8-8"])
+def test_data_too_rough_for_a_polynomial_fall_back_to_their_increments(name):
+    increments = 2.0 * np.random.default_rng(4).standard_normal((120, 3))
+    attitude = coning.integrate(increments, name)
+    plain = coning.integrate(increments)[:: ALGORITHMS[name].samples]
+    assert np.abs(np.linalg.norm(attitude, axis=1) - 1.0).max() < 4e-16
+    assert angle_errors(attitude, plain).max() < 1e-12
+
+
+@pytest.mark.parametrize("name", ["one-sample-previous-3", "four-sample-previous-2", "one-sample-previous-1"])
+def test_the_first_steps_are_as_good_as_the_rest(name):
+    # Looking ahead instead of back, the first steps keep the order: reversing the record in time reverses the rotations.
+    increments = 0.05 * np.random.default_rng(2).standard_normal((40, 3))
+    n, p = ALGORITHMS[name].samples, ALGORITHMS[name].previous
+    forward = coning.rotation_vectors(increments, name)
+    backward = -coning.rotation_vectors(-increments[::-1], name)[::-1]
+    first = -(-p // n)
+    np.testing.assert_allclose(forward[:first], backward[:first], atol=1e-16)
+
+
+@pytest.mark.parametrize("points", [2, 4, 6, 8])
+def test_increments_from_rates_are_exact_for_polynomials_everywhere(points):
+    t = np.arange(14) * 0.1
+    power = points - 1
+    rates = np.stack([t**power, 1.0 - t**power, 0.5 + t], axis=1)
+    integral = np.stack(
+        [t ** (power + 1) / (power + 1), t - t ** (power + 1) / (power + 1), 0.5 * t + 0.5 * t * t], axis=1
+    )
+    np.testing.assert_allclose(coning.increments_from_rates(rates, 0.1, points), np.diff(integral, axis=0), atol=2e-15)
+
+
+def test_increments_from_few_rates():
+    rates = np.array([[1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [4.0, 0.0, 0.0]])
+    np.testing.assert_allclose(coning.increments_from_rates(rates, 0.5, 8)[:, 0], [0.75, 1.5])
+
+
+def test_rate_samples_cost_what_the_docstring_says():
+    # The trapezoid under an increment correction drifts like no correction at all; made for rates, the table drifts at λ⁴.
+    cone = motion.Coning(angle=0.01, frequency=1.0)
+    h = 0.02
+    t = np.arange(4001) * h
+    lam = 2 * math.pi * h
+    true = cone.attitude(t)
+
+    def drift(attitude):
+        error = quaternion.multiply(attitude[100], quaternion.conjugate(true[200]))
+        last = quaternion.multiply(attitude[-1], quaternion.conjugate(true[-1]))
+        return 2 * (last[3] - error[3]) / (t[-1] - t[200]) / (cone.angle**2 * 2 * math.pi)
+
+    naive = coning.integrate(coning.increments_from_rates(cone.body_rate(t), h, 2), "two-sample", true[0])
+    made = coning.integrate_rates(cone.body_rate(t), h, "two-sample-rate-2", true[0])
+    assert drift(naive) == pytest.approx(-(lam**2) / 12, rel=0.05)
+    assert drift(made) == pytest.approx(-float(ALGORITHMS["two-sample-rate-2"].drift_constant) * lam**4, rel=0.05)
+
+
+def test_plain_python_kernels_equal_the_compiled_ones():
+    generator = np.random.default_rng(7)
+    increments = 0.1 * generator.standard_normal((12, 3))
+    for kernel, arguments, shape in [
+        (kernels.compressed_vectors, (increments.reshape(-1), np.array([0.7, 0.2, -0.1]), 2), (18,)),
+        (kernels.pair_vectors, (increments, np.triu(generator.standard_normal((3, 3)), 1)), (4, 3)),
+        (
+            polynomial_kernels.scheme_steps,
+            (increments, generator.standard_normal((3, 3)), polynomial_kernels.MAGNUS_6),
+            (4, 4),
+        ),
+        (
+            polynomial_kernels.scheme_steps,
+            (increments, generator.standard_normal((3, 3)), polynomial_kernels.RUNGE_KUTTA_4),
+            (4, 4),
+        ),
+    ]:
+        plain, fast = np.zeros(shape), np.zeros(shape)
+        kernel(*arguments, plain)
+        compiled(kernel)(*arguments, fast)
+        np.testing.assert_allclose(fast, plain, atol=1e-14)
+        assert np.any(plain)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (([[1.0, 2.0]],), "increments has shape"),
+        (([[0.0, math.nan, 0.0]],), r"increments\[0, 1\] is nan"),
+        (([[0.0, 0.0, 0.0]], "two-samples"), "did you mean 'two-sample'"),
+        (([[0.0, 0.0, 0.0]], "one-sample", (2.0, 0.0, 0.0, 0.0)), "norm 2"),
+        (([[0.0, 0.0, 0.0]], "one-sample", np.eye(4)), "initial_attitude has shape"),
+    ],
+)
+def test_bad_input(arguments, message):
+    with pytest.raises(InputError, match=message):
+        coning.integrate(*arguments)
+
+
+def test_bad_frame_and_rates():
+    with pytest.raises(InputError, match="did you mean 'fixed'"):
+        coning.integrate([[0.0, 0.0, 0.0]], frame="fixd")
+    with pytest.raises(InputError, match="even"):
+        coning.increments_from_rates(np.zeros((5, 3)), 0.1, 3)
+    with pytest.raises(InputError, match="at least 2"):
+        coning.increments_from_rates(np.zeros((1, 3)), 0.1)
+    with pytest.raises(InputError, match="sample_interval"):
+        coning.integrate_rates(np.zeros((5, 3)), 0.0)
+
+
+def test_time_per_sample_is_a_time():
+    assert 1e-10 < coning.time_per_sample("two-sample", 1000) < 1e-3
+    with pytest.raises(InputError, match="samples"):
+        coning.time_per_sample("eight-sample", 4)
+
+
+def test_input_is_not_changed_and_output_is_its_own():
+    increments = np.full((4, 3), 0.1)
+    vectors = coning.rotation_vectors(increments, "one-sample")
+    vectors[:] = 9.0
+    assert np.all(increments == 0.1)
