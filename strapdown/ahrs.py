@@ -11,7 +11,7 @@ import numpy as np
 
 from strapdown import mekf, wahba
 from strapdown.checks import Array, InputError, positive
-from strapdown.recordings import Recording
+from strapdown.recordings import Recording, increments
 from strapdown.records import Estimate, ImuRecord
 from strapdown.units import DEGREE
 from strapdown.vectors import VectorMeasurements
@@ -80,6 +80,7 @@ def imu_record(recording: Recording, quiet: slice, parameters: AhrsParameters) -
     The strengths of gravity and of the field are those of the samples ``quiet``.
     """
     spread = np.sqrt(1.0 / (np.median(np.diff(recording.time)) * parameters.reference_rate))
+    assert recording.specific_force is not None
     gravity = _norm(_mean(recording.specific_force[quiet], recording.source, "accelerometer"))
     vectors = [
         VectorMeasurements(
@@ -105,12 +106,12 @@ def imu_record(recording: Recording, quiet: slice, parameters: AhrsParameters) -
                 sigma=np.hypot(parameters.heading_sigma, parameters.field_strength_weight * deviation) * spread,
             )
         )
-    middle = 0.5 * (recording.rate[1:] + recording.rate[:-1])
-    return ImuRecord(time=recording.time, increments=middle * np.diff(recording.time)[:, None], vectors=tuple(vectors))
+    return ImuRecord(time=recording.time, increments=increments(recording), vectors=tuple(vectors))
 
 
 def start(recording: Recording, quiet: slice, parameters: AhrsParameters) -> mekf.State:
     """Return the state at the quiet samples: attitude by TRIAD from the mean vertical and field; any North without a magnetometer."""
+    assert recording.specific_force is not None
     up = _mean(recording.specific_force[quiet], recording.source, "accelerometer")
     sigma = np.full(3, parameters.attitude_sigma)
     if recording.magnetic_field is None:
@@ -137,6 +138,8 @@ def estimate(
 ) -> AhrsEstimate:
     """Return attitude and gyro bias over a recording, at its time stamps from the first quiet second on."""
     chosen = parameters or AhrsParameters()
+    if recording.specific_force is None:
+        raise InputError(f"{recording.source} has no accelerometer, which shows the vertical; add columns ax, ay, az")
     span = quiet_span(recording)
     used = recording.since(span.start)
     quiet = slice(0, span.stop - span.start)

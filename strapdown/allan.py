@@ -447,6 +447,15 @@ def model_deviation(parameters: Mapping[str, float], taus: ArrayLike, sample_int
     return {term: np.sqrt(value) for term, value in {**variance, "total": total}.items()}
 
 
+def curves_by_axis(fit: NoiseFit, deviation: AllanDeviation) -> list[dict[str, Array]]:
+    """Return, for each axis, the deviation (rad/s) of each fitted term and their total at the taus of ``deviation``, to be drawn."""
+    filled = np.where(fit.supported, fit.estimate, 0.0)
+    return [
+        model_deviation(dict(zip(fit.terms, map(float, row), strict=True)), deviation.taus, fit.sample_interval)
+        for row in filled
+    ]
+
+
 def to_gyro_parameters(fit: NoiseFit) -> dict[str, float | tuple[float, ...]]:
     """Return the coefficients by the names of the gyro specification, SI; one number, or one an axis; 0 where not supported."""
     columns = np.where(fit.supported, fit.estimate, 0.0).T

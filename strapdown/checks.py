@@ -83,7 +83,7 @@ def non_negative(name: str, value: float, *, unit: str = "") -> float:
     return number
 
 
-def finite(name: str, value: float, *, unit: str = "") -> float:
+def finite(name: str, value: float | str, *, unit: str = "") -> float:
     """Return ``value`` as a finite float."""
     try:
         number = float(value)

@@ -72,27 +72,27 @@ class Statistics:
     @property
     def mean_error(self) -> Array:
         """Mean error at each epoch (m, 6)."""
-        return self.error_sum / self.runs
+        return np.asarray(self.error_sum / self.runs)
 
     @property
     def rms_error(self) -> Array:
         """Root mean square error at each epoch (m, 6)."""
-        return np.sqrt(self.error_square_sum / self.runs)
+        return np.asarray(np.sqrt(self.error_square_sum / self.runs))
 
     @property
     def sigma(self) -> Array:
         """The filter's own standard deviation, root mean over runs (m, 6)."""
-        return np.sqrt(self.variance_sum / self.runs)
+        return np.asarray(np.sqrt(self.variance_sum / self.runs))
 
     @property
     def anees(self) -> Array:
         """NEES averaged over runs and states (m, 3): of all six states, attitude, bias; 1 for a right filter."""
-        return self.nees_sum / (self.runs * np.array([6.0, 3.0, 3.0]))
+        return np.asarray(self.nees_sum / (self.runs * np.array([6.0, 3.0, 3.0])))
 
     @property
     def nis(self) -> Array:
         """NIS per degree of freedom, averaged over runs and over each bin (k,); 1 for a right filter."""
-        return self.nis_sum / (self.runs * self.nis_degrees)
+        return np.asarray(self.nis_sum / (self.runs * self.nis_degrees))
 
     @property
     def mean_nis(self) -> float:
@@ -184,8 +184,8 @@ def run(
             for numbers, results in zip(chunks, _in_order(pool, one_chunk, chunks), strict=True):
                 for setup_sums, part in zip(sums, map(list, zip(*results, strict=True)), strict=True):
                     _merge(setup_sums, part)
-                for kept, part in zip(examples, zip(*results, strict=True), strict=True):
-                    kept.extend(part[: EXAMPLES - len(kept)])
+                for kept, of_setup in zip(examples, zip(*results, strict=True), strict=True):
+                    kept.extend(of_setup[: EXAMPLES - len(kept)])
                 if progress is not None:
                     progress(len(numbers))
         except BaseException:  # Ctrl-C too: drop what has not started

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from strapdown.checks import Array, InputError, array, increasing, one_of
+from strapdown import recordfiles
+from strapdown.checks import Array, InputError, array, increasing, one_of, positive
 from strapdown.units import DEGREE, STANDARD_GRAVITY
 
 RATE_UNITS = {"rad/s": 1.0, "deg/s": DEGREE}
@@ -37,7 +39,7 @@ class Recording:
     """Time stamps (n,), s, increasing."""
     rate: Array
     """Angular rate at the stamps (n, 3), rad/s, body axes."""
-    specific_force: Array
+    specific_force: Array | None = None
     """Specific force (n, 3), m/s², body axes: at rest 9.81 upwards; rows of NaN are missing."""
     magnetic_field: Array | None = None
     """Magnetic field (n, 3), any one unit, body axes; rows of NaN are missing."""
@@ -63,7 +65,8 @@ class Recording:
         """Return the recording from sample ``first`` on."""
         rows = slice(first, None)
         fields = ("time", "rate", "specific_force", "magnetic_field", "true_attitude", "movement")
-        return replace(self, **{n: None if getattr(self, n) is None else getattr(self, n)[rows] for n in fields})
+        parts: dict[str, Any] = {n: None if getattr(self, n) is None else getattr(self, n)[rows] for n in fields}
+        return replace(self, **parts)
 
 
 def read(path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> Recording:
@@ -98,7 +101,7 @@ def read_broad(path: str | os.PathLike[str]) -> Recording:
     name = Path(path).name
     try:
         with h5py.File(path, "r") as file:
-            missing = [key for key in ("imu_gyr", "imu_acc") if key not in file]
+            missing = [key for key in ("imu_gyr",) if key not in file]
             if "sampling_rate" not in file.attrs:
                 missing.append("the attribute sampling_rate")
             if missing:
@@ -110,7 +113,7 @@ def read_broad(path: str | os.PathLike[str]) -> Recording:
                 source=name,
                 time=np.arange(len(rate)) / float(file.attrs["sampling_rate"]),
                 rate=rate,
-                specific_force=file["imu_acc"][:],
+                specific_force=file["imu_acc"][:] if "imu_acc" in file else None,
                 magnetic_field=file["imu_mag"][:] if "imu_mag" in file else None,
                 true_attitude=file["opt_quat"][:] if "opt_quat" in file else None,
                 movement=file["movement"][:].astype(bool) if "movement" in file else None,
@@ -120,7 +123,7 @@ def read_broad(path: str | os.PathLike[str]) -> Recording:
 
 
 def read_csv(path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> Recording:
-    """Read columns ``time, gx, gy, gz, ax, ay, az[, mx, my, mz]`` in any order; other columns are left alone.
+    """Read columns ``time, gx, gy, gz[, ax, ay, az[, mx, my, mz]]`` in any order; other columns are left alone.
 
     A header may declare units in brackets, ``gx [deg/s]``; ``units`` ("time", "gyro", "accelerometer") declares them for files that do
     not. A gyro or accelerometer without a unit is refused rather than guessed: a factor of 57.3 or 9.81 is the commonest mistake there
@@ -133,23 +136,27 @@ def read_csv(path: str | os.PathLike[str], *, units: Mapping[str, str] | None = 
         if header is None:
             raise InputError(f"{file.name} is empty; wanted a header like time,gx,gy,gz,ax,ay,az")
         names, declared = _header(file.name, header)
-        needed = ["time", *_COLUMNS["gyro"], *_COLUMNS["accelerometer"]]
-        missing = [name for name in needed if name not in names]
+        present = {group: any(name in names for name in members) for group, members in _COLUMNS.items()}
+        needed = [
+            "time",
+            *_COLUMNS["gyro"],
+            *(name for group in _COLUMNS if present[group] for name in _COLUMNS[group]),
+        ]
+        missing = [name for name in dict.fromkeys(needed) if name not in names]
         if missing:
             raise InputError(f"{file.name}: the header lacks {', '.join(missing)} (it has: {', '.join(names)})")
         values = _numbers(file.name, rows, len(names), header)
-    factors = _factors(file.name, declared, units or {})
+    factors = _factors(file.name, {group for group, there in present.items() if there}, declared, units or {})
 
     def columns(group: str) -> Array:
         return values[:, [names.index(name) for name in _COLUMNS[group]]] * factors[group]
 
-    magnetic = all(name in names for name in _COLUMNS["magnetometer"])
     return Recording(
         source=file.name,
         time=values[:, names.index("time")] * factors["time"],
         rate=columns("gyro"),
-        specific_force=columns("accelerometer"),
-        magnetic_field=columns("magnetometer") if magnetic else None,
+        specific_force=columns("accelerometer") if present["accelerometer"] else None,
+        magnetic_field=columns("magnetometer") if present["magnetometer"] else None,
     )
 
 
@@ -201,10 +208,15 @@ def _is_number(field: str) -> bool:
     return True
 
 
-def _factors(source: str, declared: Mapping[str, str], given: Mapping[str, str]) -> dict[str, float]:
+def _factors(
+    source: str, present: Collection[str], declared: Mapping[str, str], given: Mapping[str, str]
+) -> dict[str, float]:
+    """Return the factor to SI of each group of columns that the file has."""
     known = {"time": TIME_UNITS, "gyro": RATE_UNITS, "accelerometer": FORCE_UNITS}
     factors = {"magnetometer": 1.0}
     for group, units in known.items():
+        if group != "time" and group not in present:
+            continue
         unit = given.get(group) or declared.get(group) or ("s" if group == "time" else None)
         if unit is None:
             raise InputError(
@@ -217,3 +229,72 @@ def _factors(source: str, declared: Mapping[str, str], given: Mapping[str, str])
             )
         factors[group] = units[one_of(f"{source}: unit of the {group}", unit, units)]
     return factors
+
+
+def increments(recording: Recording) -> Array:
+    """Return body increments (n − 1, 3), rad, over the intervals between the stamps, by the trapezoid rule.
+
+    Point samples of rate say no more at uneven stamps; at even ones :func:`strapdown.coning.increments_from_rates` fits higher
+    polynomials.
+    """
+    return np.asarray(0.5 * (recording.rate[1:] + recording.rate[:-1]) * np.diff(recording.time)[:, None])
+
+
+@dataclass(frozen=True, kw_only=True)
+class GyroSamples:
+    """Gyro samples at even intervals, for noise identification."""
+
+    values: Array
+    """Rates (n, axes), rad/s, or increments, rad."""
+    sample_interval: float
+    """s"""
+    kind: str
+    """"rate" or "increments"."""
+
+
+EVEN = 1e-3
+"""Largest relative departure of a sample interval from their mean that still counts as even."""
+
+
+def read_gyro(
+    path: str | os.PathLike[str], *, rate: float | None = None, units: Mapping[str, str] | None = None
+) -> GyroSamples:
+    """Read the gyro of a simulated record (HDF5), a BROAD trial, a CSV file, or a NPY array (n,) or (n, 3) of rates.
+
+    An array tells neither its rate nor its unit: give ``rate`` in Hz and ``units={"gyro": ...}``. Samples must lie at even intervals.
+    """
+    file = Path(path)
+    if not file.exists():
+        raise InputError(f"{file} does not exist; check the path")
+    given = dict(units or {})
+    if file.suffix.lower() == ".npy":
+        if rate is None or "gyro" not in given:
+            raise InputError(f"{file.name} is a bare array; give its rate in Hz and its unit (rad/s or deg/s)")
+        try:
+            values = np.load(file, allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            raise InputError(
+                f"{file.name} cannot be read as an array ({error}); the file is truncated or of another kind"
+            ) from None
+        factor = RATE_UNITS[one_of(f"{file.name}: unit of the gyro", given["gyro"], RATE_UNITS)]
+        columns = array(file.name, values if values.ndim == 2 else np.reshape(values, (-1, 1)), ("n", "axes"))
+        return GyroSamples(
+            values=columns * factor, sample_interval=1.0 / positive("rate", rate, unit="Hz"), kind="rate"
+        )
+    if recordfiles.is_record(file):
+        record = recordfiles.read_record(file)
+        return GyroSamples(values=record.increments, sample_interval=_even(file.name, record.time), kind="increments")
+    recording = read(file, units=given)
+    return GyroSamples(values=recording.rate, sample_interval=_even(file.name, recording.time), kind="rate")
+
+
+def _even(source: str, time: Array) -> float:
+    steps = np.diff(time)
+    mean = float(steps.mean())
+    worst = int(np.argmax(np.abs(steps - mean)))
+    if abs(steps[worst] - mean) > EVEN * mean:
+        raise InputError(
+            f"{source}: the interval after {time[worst]:.6g} s is {steps[worst]:.6g} s, the mean {mean:.6g} s; cut the recording to where "
+            "its samples lie at even intervals"
+        )
+    return mean

@@ -196,6 +196,22 @@ def write_estimate(
             group.attrs["skipped"] = estimate.skipped.get(sensor, 0)
 
 
+def write_attitude(
+    path: str | os.PathLike[str], time: Array, attitude: Array, attributes: Mapping[str, Any] | None = None
+) -> None:
+    """Write times (n,), s, and attitudes q_fb (n, 4) to HDF5; the file appears whole or not at all."""
+    import h5py
+
+    with written_beside(path) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs["kind"] = "strapdown attitude"
+        file.attrs["version"] = strapdown.__version__
+        file.attrs["conventions"] = CONVENTIONS
+        for name, value in (attributes or {}).items():
+            file.attrs[name] = value
+        file.create_dataset("time", data=time, compression="gzip").attrs["unit"] = "s"
+        file.create_dataset("attitude", data=attitude, compression="gzip", shuffle=True).attrs["unit"] = "1"
+
+
 def read_estimate(path: str | os.PathLike[str]) -> Estimate:
     """Read an estimate written by :func:`write_estimate`."""
     import h5py

@@ -19,7 +19,13 @@ package's own; :func:`strapdown.coning.coefficients.matched_correction` derives 
 """
 
 from strapdown.coning.algorithms import ALGORITHMS, Algorithm, algorithm_rows, named
-from strapdown.coning.drift import ConingBudget, VibrationLine, predicted_coning_drift, small_angle_drift
+from strapdown.coning.drift import (
+    ConingBudget,
+    VibrationLine,
+    predicted_coning_drift,
+    read_vibration,
+    small_angle_drift,
+)
 from strapdown.coning.stepping import (
     increments_from_rates,
     integrate,
@@ -39,6 +45,7 @@ __all__ = [
     "integrate_rates",
     "named",
     "predicted_coning_drift",
+    "read_vibration",
     "rotation_vectors",
     "small_angle_drift",
     "time_per_sample",

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import csv
 import math
+import os
 from dataclasses import dataclass
+from pathlib import Path
 
 from strapdown import checks
 from strapdown.checks import InputError
 from strapdown.coning.algorithms import ALGORITHMS, Algorithm, named
+from strapdown.units import DEGREE
 
 
 def predicted_coning_drift(algorithm: str | Algorithm, angle: float, frequency: float, sample_interval: float) -> float:
@@ -133,3 +137,49 @@ class ConingBudget:
             for name in self.algorithms
             for rate in self.sample_rates
         ]
+
+
+_COLUMNS = ("frequency_hz", "angle_deg", "angle_across_deg", "phase_deg")
+
+
+def read_vibration(path: str | os.PathLike[str]) -> tuple[VibrationLine, ...]:
+    """Read vibration lines from CSV with the columns ``frequency_hz, angle_deg[, angle_across_deg][, phase_deg]``.
+
+    Left out, the second axis has the amplitude of the first and lags it by 90°: coning.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, a column is unknown or lacking, or a field is no number.
+    """
+    file = Path(path)
+    try:
+        text = file.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(f"{file} does not exist; check the path") from None
+    rows = csv.reader(line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#"))
+    names = [name.strip() for name in next(rows, [])]
+    checks.known_keys(f"{file.name}: columns", names, _COLUMNS)
+    lacking = [name for name in _COLUMNS[:2] if name not in names]
+    if lacking:
+        raise InputError(f"{file.name} lacks the column {' and '.join(lacking)}; wanted {', '.join(_COLUMNS)}")
+    lines = []
+    for k, row in enumerate(rows):
+        if len(row) != len(names):
+            raise InputError(f"{file.name}: data row {k + 1} has {len(row)} fields, the header {len(names)}")
+        cell = {
+            name: checks.finite(f"{file.name}: data row {k + 1}, {name}", field)
+            for name, field in zip(names, row, strict=True)
+        }
+        across = cell.get("angle_across_deg")
+        lines.append(
+            VibrationLine(
+                frequency=cell["frequency_hz"],
+                angle=cell["angle_deg"] * DEGREE,
+                angle_across=None if across is None else across * DEGREE,
+                phase=cell.get("phase_deg", 90.0) * DEGREE,
+            )
+        )
+    if not lines:
+        raise InputError(f"{file.name} has a header but no lines")
+    return tuple(lines)

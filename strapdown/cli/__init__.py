@@ -1,0 +1,58 @@
+"""The command line. Only this package prints; units are degrees, hours and arcseconds here and radians and seconds below.
+
+``terminal``
+    What every command shares.
+``studies``
+    ``coning``
+``integration``
+    ``algorithms``, ``integrate``, ``coning-budget``
+``estimation``
+    ``estimate``
+``sensors``
+    ``simulate``, ``scenarios``, ``allan``
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import typer
+
+from strapdown.checks import InputError
+from strapdown.cli import estimation, integration, sensors, studies  # noqa: F401  (each registers its commands)
+from strapdown.cli.terminal import app, console, errors
+
+
+@app.callback(invoke_without_command=True)
+def _about(
+    version: Annotated[bool, typer.Option("--version", help="Print the version and stop.", is_eager=True)] = False,
+) -> None:
+    if version:
+        import strapdown
+
+        console.print(f"strapdown {strapdown.__version__}")
+        raise typer.Exit
+
+
+@app.command()
+def info() -> None:
+    """Tell what the kernels run on."""
+    import strapdown
+    from strapdown.kernels.machine import describe
+
+    console.print(f"strapdown {strapdown.__version__}", highlight=False)
+    for name, value in describe().items():
+        console.print(f"{name}: {value}", highlight=False)
+
+
+def main() -> None:
+    """Run the command line; bad input ends with one clear line and status 2, Ctrl-C with status 130."""
+    try:
+        app(standalone_mode=True)
+    except InputError as error:
+        errors.print(f"[red]error:[/] {error}", highlight=False, soft_wrap=True)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        errors.print("interrupted")
+        sys.exit(130)

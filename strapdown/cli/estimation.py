@@ -1,0 +1,79 @@
+"""The filter on a recording."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from strapdown.cli.terminal import app, console, table, written
+
+
+@app.command()
+def estimate(
+    recording: Annotated[
+        Path, typer.Argument(help="BROAD HDF5 file, or CSV with time, gx, gy, gz, ax, ay, az[, mx, my, mz].")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for estimate.h5, errors.json and the figures.")] = Path(
+        "estimate-results"
+    ),
+    gyro_unit: Annotated[str | None, typer.Option(help="Unit of a CSV file's gyro: rad/s or deg/s.")] = None,
+    accelerometer_unit: Annotated[
+        str | None, typer.Option(help="Unit of a CSV file's accelerometer: m/s2 or g.")
+    ] = None,
+    time_unit: Annotated[str | None, typer.Option(help="Unit of a CSV file's time: s, ms, us or ns.")] = None,
+    gyro: Annotated[
+        Path | None,
+        typer.Option(help="TOML with a [gyro] table, as `strapdown allan` writes it: the filter believes its noise."),
+    ] = None,
+    full_covariance: Annotated[
+        bool, typer.Option(help="Write whole 6 x 6 covariances, not only their diagonals.")
+    ] = False,
+) -> None:
+    """Estimate attitude and gyro bias from a recording: accelerometer as the vertical, magnetometer as the heading."""
+    from strapdown import ahrs, plots, recordings
+    from strapdown.consistency import reference_errors
+    from strapdown.files import write_json
+    from strapdown.gyro import process_noise, read_spec
+    from strapdown.records import write_estimate
+    from strapdown.units import DEGREE
+
+    given = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
+    source = recordings.read(recording, units={name: unit for name, unit in given.items() if unit})
+    parameters = ahrs.AhrsParameters()
+    if gyro is not None:
+        parameters = replace(parameters, **process_noise(read_spec(gyro)))
+    result = ahrs.estimate(source, parameters, full_covariance=full_covariance)
+    used = result.recording
+    write_estimate(
+        out / "estimate.h5",
+        result.estimate,
+        {
+            "source": used.source,
+            "fixed_frame": "East-North-Up, magnetic North",
+            **{f"parameter.{name}": value for name, value in vars(parameters).items()},
+        },
+    )
+    console.print(
+        f"{used.source}: {len(used.time)} samples over {used.time[-1] - used.time[0]:.1f} s, started in the quiet second "
+        f"from {used.time[0]:.2f} s."
+    )
+    for sensor, number in result.estimate.skipped.items():
+        if number:
+            console.print(f"{number} samples of the {sensor} are missing and were skipped.")
+    figure = plots.estimate_overview(result.estimate, title=used.source)
+    paths = [out / "estimate.h5", plots.save(figure, out / "estimate.png")]
+    if used.true_attitude is not None:
+        errors_found = reference_errors(result.estimate.attitude, used.true_attitude)
+        rms = {name: value / DEGREE for name, value in errors_found.rms(used.movement).items()}
+        write_json(
+            out / "errors.json", {"source": used.source, **{f"{name}_rmse_deg": value for name, value in rms.items()}}
+        )
+        rows = table("RMS error over the movement phase, degrees", *rms)
+        rows.add_row(*(f"{value:.2f}" for value in rms.values()))
+        console.print(rows)
+        figure = plots.recording_errors(used.time, errors_found, used.movement)
+        paths += [out / "errors.json", plots.save(figure, out / "errors.png")]
+    written(*paths)

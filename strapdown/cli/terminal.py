@@ -1,0 +1,55 @@
+"""What every command shares: the application, the two consoles, tables and progress."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+app = typer.Typer(
+    help="Strapdown gyro attitude estimation: simulate, estimate, judge.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+console = Console()
+errors = Console(stderr=True)
+
+
+@contextmanager
+def progress_bar(what: str, total: int) -> Iterator[Any]:
+    """Yield a function that advances a bar by so many units; on standard error, and only on a terminal."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as progress:
+        task = progress.add_task(what, total=total)
+        yield lambda done: progress.advance(task, done)
+
+
+def table(title: str, *columns: str, left: int = 1) -> Table:
+    """Print the title and return an empty table, its first ``left`` columns text and the others numbers.
+
+    The title stands outside because one longer than its table would wrap inside it.
+    """
+    console.print(f"[bold]{title}[/]", highlight=False)
+    result = Table(box=box.SIMPLE_HEAD, header_style="", pad_edge=False, padding=(0, 1, 0, 0))
+    for k, column in enumerate(columns):
+        result.add_column(column, justify="left" if k < left else "right", no_wrap=k > 0 or left == 1)
+    return result
+
+
+def written(*paths: Any) -> None:
+    """Say which files were written."""
+    console.print("Written: " + ", ".join(str(path) for path in paths), soft_wrap=True, highlight=False)

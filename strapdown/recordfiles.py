@@ -1,0 +1,326 @@
+"""IMU records in files: HDF5, whole and self-describing; CSV, for exchange.
+
+HDF5 holds everything to the last bit: increments, every vector series, the truth, the specification of the gyro, the scenario, seed, units,
+conventions and version. CSV holds the gyro in one file, and each vector series in one beside it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import strapdown
+from strapdown import gyro
+from strapdown.checks import Array, InputError
+from strapdown.files import written_beside
+from strapdown.gyro import GyroSpec
+from strapdown.records import CONVENTIONS, ImuRecord, Truth
+from strapdown.vectors import KINDS, VectorMeasurements
+
+KIND = "strapdown record"
+"""The attribute ``kind`` of a record's file."""
+
+FORMAT = 1
+"""Version of the layout; a reader refuses a newer one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordFile:
+    """A record with what its file tells of its making."""
+
+    record: ImuRecord
+    gyro: GyroSpec | None = None
+    """The specification it was simulated with."""
+    scenario: str = ""
+    """The scenario, as TOML."""
+    seed: int | None = None
+    run: int | None = None
+    version: str = strapdown.__version__
+    """Version of the package that wrote it."""
+    attributes: Mapping[str, Any] = field(default_factory=dict)
+    """Further attributes: numbers and texts."""
+
+
+_SERIES = {
+    "time": "s",
+    "vector_b": "1 (kind vector: the unit of sigma)",
+    "reference_f": "1 (kind vector: the unit of sigma)",
+    "sigma": "rad (kind vector: the unit of the vector)",
+    "attitude": "1",
+    "sigma_axes": "rad",
+    "arrival": "s",
+}
+_RESERVED = ("kind", "format", "version", "conventions", "gyro", "scenario", "seed", "run")
+
+
+def write_record(
+    path: str | os.PathLike[str],
+    record: ImuRecord,
+    *,
+    gyro_spec: GyroSpec | None = None,
+    scenario: str = "",
+    seed: int | None = None,
+    run: int | None = None,
+    attributes: Mapping[str, Any] | None = None,
+) -> None:
+    """Write a record to HDF5; the file appears whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+    record : ImuRecord
+    gyro_spec : GyroSpec, optional
+    scenario : str
+        The scenario as TOML (:func:`strapdown.scenarios.scenario_to_toml`).
+    seed, run : int, optional
+        What the streams of random numbers were named by.
+    attributes : mapping, optional
+        Further attributes of the file.
+    """
+    import h5py
+
+    for name in attributes or {}:
+        if name in _RESERVED:
+            raise InputError(f"attributes holds {name!r}, which the file has already; choose another name")
+    with written_beside(path) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs.update(kind=KIND, format=FORMAT, version=strapdown.__version__, conventions=CONVENTIONS)
+        if gyro_spec is not None:
+            file.attrs["gyro"] = json.dumps(gyro.to_table(gyro_spec))
+        if scenario:
+            file.attrs["scenario"] = scenario
+        for name, value in {"seed": seed, "run": run, **(attributes or {})}.items():
+            if value is not None:
+                file.attrs[name] = value
+        _put(file, "time", record.time, "s", "edges of the sample intervals, one more than there are increments")
+        _put(
+            file,
+            "increments",
+            record.increments,
+            "rad",
+            "integral of the measured body rate over each interval, body axes",
+        )
+        for number, series in enumerate(record.vectors):
+            group = file.create_group(f"vectors/{number}")
+            group.attrs.update(sensor=series.sensor, kind=series.kind, degrees_of_freedom=KINDS[series.kind])
+            for name, unit in _SERIES.items():
+                value = getattr(series, name)
+                if value is not None and not (series.kind == "attitude" and name in ("vector_b", "sigma")):
+                    _put(group, name, value, unit)
+        if record.truth is not None:
+            _put(file, "truth/attitude", record.truth.attitude, "1", "q_fb at the edges")
+            _put(file, "truth/bias", record.truth.bias, "rad/s", "gyro bias at the edges, body axes")
+
+
+def _put(group: Any, name: str, value: Array, unit: str, meaning: str = "") -> None:
+    large = value.size > 256
+    dataset = group.create_dataset(
+        name, data=value, **({"compression": "gzip", "compression_opts": 1, "shuffle": True} if large else {})
+    )
+    dataset.attrs["unit"] = unit
+    if meaning:
+        dataset.attrs["meaning"] = meaning
+
+
+def is_record(path: str | os.PathLike[str]) -> bool:
+    """Return whether a file is an HDF5 file that says it holds a record of :func:`write_record`; its content is not checked."""
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            return bool(file.attrs.get("kind") == KIND)
+    except OSError:
+        return False
+
+
+def read_record(path: str | os.PathLike[str]) -> ImuRecord:
+    """Read the record of a file written by :func:`write_record`."""
+    return read_record_file(path).record
+
+
+def read_record_file(path: str | os.PathLike[str]) -> RecordFile:
+    """Read a file written by :func:`write_record` with all that it tells.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, truncated, no HDF5, another kind of file, or of a newer layout.
+    """
+    import h5py
+
+    if not Path(path).is_file():
+        raise InputError(f"{path} does not exist; check the path")
+    try:
+        with h5py.File(path, "r") as file:
+            kind = file.attrs.get("kind")
+            if kind != KIND:
+                raise InputError(
+                    f"{path} is {f'a {kind}' if kind else 'HDF5 of another program'}, not a {KIND}; pass one that write_record wrote"
+                )
+            if int(file.attrs["format"]) > FORMAT:
+                raise InputError(
+                    f"{path} has layout {int(file.attrs['format'])}, this version ({strapdown.__version__}) reads up to {FORMAT}; update it"
+                )
+            group = file.get("vectors", {})
+            series = tuple(_series(group[str(number)]) for number in range(len(group)))
+            truth = Truth(attitude=file["truth/attitude"][:], bias=file["truth/bias"][:]) if "truth" in file else None
+            return RecordFile(
+                record=ImuRecord(time=file["time"][:], increments=file["increments"][:], vectors=series, truth=truth),
+                gyro=gyro.from_table(json.loads(file.attrs["gyro"]), f"{path}: gyro") if "gyro" in file.attrs else None,
+                scenario=file.attrs.get("scenario", ""),
+                seed=int(file.attrs["seed"]) if "seed" in file.attrs else None,
+                run=int(file.attrs["run"]) if "run" in file.attrs else None,
+                version=file.attrs["version"],
+                attributes={
+                    name: value.item() if hasattr(value, "item") else value
+                    for name, value in file.attrs.items()
+                    if name not in _RESERVED
+                },
+            )
+    except InputError:
+        raise
+    except (OSError, KeyError, RuntimeError, ValueError) as error:
+        raise InputError(
+            f"{path} cannot be read ({error}); the file is truncated, damaged or of another kind"
+        ) from None
+
+
+def _series(group: Any) -> VectorMeasurements:
+    fields = {name: group[name][:] for name in _SERIES if name in group}
+    return VectorMeasurements(sensor=group.attrs["sensor"], kind=group.attrs["kind"], **fields)
+
+
+# --------------------------------------------------------------------------------------------------------------------- CSV
+
+_GYRO_COLUMNS: tuple[str, ...] = ("time_s", "increment_x_rad", "increment_y_rad", "increment_z_rad")
+_TRUTH_COLUMNS = ("q_w", "q_x", "q_y", "q_z", "bias_x_rad_per_s", "bias_y_rad_per_s", "bias_z_rad_per_s")
+_VECTOR_COLUMNS = ("time_s", "x_b", "y_b", "z_b", "sigma", "x_f", "y_f", "z_f")
+_ATTITUDE_COLUMNS = ("time_s", "q_w", "q_x", "q_y", "q_z", "sigma_x_rad", "sigma_y_rad", "sigma_z_rad")
+_ARRIVAL = "arrival_s"
+_MARK = "# strapdown"
+
+
+def export_csv(path: str | os.PathLike[str], record: ImuRecord) -> tuple[Path, ...]:
+    """Write a record as CSV, 17 digits a number, and return the files.
+
+    ``path`` holds one row an edge: its time, the increment of the interval that ends there (none in the first row), and the truth if there
+    is one. Each vector series goes to ``STEM-vectors-N.csv`` beside it. The first line of each is a comment that tells what it is; then
+    come the names of the columns, with their units.
+    """
+    target = Path(path)
+    first = np.full((1, 3), np.nan)
+    columns = [record.time[:, None], np.concatenate([first, record.increments])]
+    names = _GYRO_COLUMNS
+    if record.truth is not None:
+        columns += [record.truth.attitude, record.truth.bias]
+        names += _TRUTH_COLUMNS
+    written = [target]
+    _write_csv(
+        target,
+        f"{_MARK} record, version {strapdown.__version__}; {CONVENTIONS}",
+        names,
+        np.concatenate(columns, axis=1),
+    )
+    for number, series in enumerate(record.vectors):
+        beside = target.with_name(f"{target.stem}-vectors-{number}.csv")
+        if series.kind == "attitude" and series.attitude is not None and series.sigma_axes is not None:
+            names, columns = _ATTITUDE_COLUMNS, [series.time[:, None], series.attitude, series.sigma_axes]
+        else:
+            names, columns = (
+                _VECTOR_COLUMNS,
+                [series.time[:, None], series.vector_b, series.sigma[:, None], series.references_f],
+            )
+        if series.arrival is not None:
+            names, columns = (*names, _ARRIVAL), [*columns, series.arrival[:, None]]
+        head = json.dumps(
+            {"sensor": series.sensor, "kind": series.kind, "constant_reference": series.reference_f.ndim == 1}
+        )
+        _write_csv(beside, f"{_MARK} vectors {head}", names, np.concatenate(columns, axis=1))
+        written.append(beside)
+    return tuple(written)
+
+
+def _write_csv(path: Path, comment: str, names: tuple[str, ...], rows: Array) -> None:
+    with written_beside(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
+        file.write(f"{comment}\n{','.join(names)}\n")
+        np.savetxt(file, rows, delimiter=",", fmt="%.17g")
+
+
+def import_csv(path: str | os.PathLike[str]) -> ImuRecord:
+    """Read what :func:`export_csv` wrote, with the vector series beside the file.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, is not such a file, or a row is cut short or holds no number (its line is named).
+    """
+    target = Path(path)
+    comment, names, rows = _read_csv(target)
+    if not comment.startswith(f"{_MARK} record"):
+        raise InputError(f"{target} does not begin with '{_MARK} record'; it is no record that export_csv wrote")
+    if names not in (_GYRO_COLUMNS, _GYRO_COLUMNS + _TRUTH_COLUMNS):
+        raise InputError(
+            f"{target} has the columns {', '.join(names)}; wanted {', '.join(_GYRO_COLUMNS)} and perhaps {', '.join(_TRUTH_COLUMNS)}"
+        )
+    truth = Truth(attitude=rows[:, 4:8], bias=rows[:, 8:11]) if len(names) > 4 else None
+    series: list[VectorMeasurements] = []
+    while (beside := target.with_name(f"{target.stem}-vectors-{len(series)}.csv")).is_file():
+        series.append(_import_series(beside))
+    return ImuRecord(time=rows[:, 0], increments=rows[1:, 1:4], vectors=tuple(series), truth=truth)
+
+
+def _import_series(path: Path) -> VectorMeasurements:
+    comment, names, rows = _read_csv(path)
+    mark = f"{_MARK} vectors "
+    try:
+        if not comment.startswith(mark):
+            raise ValueError
+        head = json.loads(comment.removeprefix(mark))
+        attitude = head["kind"] == "attitude"
+        wanted = _ATTITUDE_COLUMNS if attitude else _VECTOR_COLUMNS
+        if names[:8] != wanted or names[8:] not in ((), (_ARRIVAL,)):
+            raise ValueError
+        own: dict[str, Any] = {"sensor": head["sensor"], "kind": head["kind"], "time": rows[:, 0]}
+        constant = bool(head["constant_reference"])
+    except (ValueError, KeyError, TypeError):
+        raise InputError(f"{path} is no vector series that export_csv wrote; check its first two lines") from None
+    if attitude:
+        own.update(attitude=rows[:, 1:5], sigma_axes=rows[:, 5:8])
+    else:
+        own.update(vector_b=rows[:, 1:4], sigma=rows[:, 4])
+        if len(rows):
+            own["reference_f"] = rows[0, 5:8] if constant else rows[:, 5:8]
+    if len(names) > 8:
+        own["arrival"] = rows[:, 8]
+    return VectorMeasurements(**own)
+
+
+def _read_csv(path: Path) -> tuple[str, tuple[str, ...], Array]:
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist; check the path") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read as text ({error}); pass a CSV file") from None
+    if len(lines) < 2 or not lines[0].startswith(_MARK):
+        raise InputError(f"{path} does not begin with '{_MARK}'; it is no file that export_csv wrote")
+    names = tuple(lines[1].split(","))
+    rows = np.empty((len(lines) - 2, len(names)))
+    for number, line in enumerate(lines[2:]):
+        cells = line.split(",")
+        try:
+            rows[number] = (
+                [float(cell) for cell in cells] if len(cells) == len(names) else _ragged(len(cells), len(names))
+            )
+        except ValueError as error:
+            raise InputError(f"{path}, line {number + 3}: {error}; the file is cut short or edited") from None
+    return lines[0], names, rows
+
+
+def _ragged(have: int, wanted: int) -> Array:
+    raise ValueError(f"{have} cells in place of {wanted}")

@@ -1,0 +1,145 @@
+"""Smoother: attitude and gyro bias at each edge from the measurements before *and after* it.
+
+A Rauch–Tung–Striebel smoother on the manifold (Rauch, Tung & Striebel 1965; Särkkä 2013, section 8.2), over the states that the filter
+of :mod:`strapdown.mekf` passed through. The filter moves its attitude at each correction and carries its covariance along, so every
+covariance has a tangent space of its own; the backward pass carries them from one to the next by the Jacobians of the rotation vector
+(:mod:`strapdown.kernels.smoother_step`). To first order in the errors this is the least-squares estimate over the whole record.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from strapdown import mekf
+from strapdown.checks import Array, non_negative
+from strapdown.kernels import filter_loop, smoother_loop
+from strapdown.kernels.machine import compiled
+from strapdown.kernels.series import LARGEST_ANGLE
+from strapdown.mekf import ProcessNoise, State
+from strapdown.records import Estimate, ImuRecord, Innovations
+from strapdown.vectors import KINDS
+
+STAMP_TOLERANCE = 1e-6
+"""Of the mean gyro interval: an edge that lies beyond t + lag by no more is taken for one at t + lag."""
+
+
+def run(record: ImuRecord, process_noise: ProcessNoise, initial: State, *, full_covariance: bool = False) -> Estimate:
+    """Return the fixed-interval smoother's estimate at every edge of a record.
+
+    Parameters
+    ----------
+    record : ImuRecord
+    process_noise : ProcessNoise
+    initial : State
+        State at the first edge before any measurement, as for :func:`strapdown.mekf.run`.
+    full_covariance : bool
+        Keep whole covariance matrices too.
+
+    Returns
+    -------
+    Estimate
+        Attitude, bias and variance are smoothed; those at the last edge are the filter's. The innovations are the filter's.
+        Memory for the filter's states: 256 bytes a gyro interval and a measurement.
+    """
+    return _smoothed(record, process_noise, initial, np.inf, full_covariance)
+
+
+def run_fixed_lag(
+    record: ImuRecord, process_noise: ProcessNoise, initial: State, *, lag: float, full_covariance: bool = False
+) -> Estimate:
+    """Return the fixed-lag smoother's estimate: at each edge t, what the measurements up to the last edge at or before t + lag tell.
+
+    Exact: equal to :func:`run` on the record cut there. Work grows with the number of gyro intervals in ``lag``: one backward step each
+    for every edge. ``lag`` in s; 0 is the filter, the length of the record or more is :func:`run`.
+    """
+    return _smoothed(record, process_noise, initial, non_negative("lag", lag, unit="s"), full_covariance)
+
+
+def _smoothed(
+    record: ImuRecord, process_noise: ProcessNoise, initial: State, lag: float, full_covariance: bool
+) -> Estimate:
+    forward, segments, starts = _filtered(record, process_noise, initial)
+    edges = len(record.time)
+    slack = STAMP_TOLERANCE * (record.time[-1] - record.time[0]) / (edges - 1)
+    until = np.searchsorted(record.time, record.time + (lag + slack), side="right") - 1
+    # One pass for each edge that does not see the end of the record, then one for all that do.
+    whole = int(np.searchsorted(until, edges - 1))
+    attitude, bias, variance = np.empty((edges, 4)), np.empty((edges, 3)), np.empty((edges, 6))
+    blocks = np.empty((edges if full_covariance else 0, 21))
+    compiled(smoother_loop.smooth_back)(
+        segments,
+        starts,
+        np.arange(whole + 1),
+        until[: whole + 1],
+        process_noise.angle_random_walk**2,
+        process_noise.rate_random_walk**2,
+        attitude,
+        bias,
+        variance,
+        blocks,
+    )
+    return Estimate(
+        time=record.time,
+        attitude=attitude,
+        bias=bias,
+        variance=variance,
+        covariance=mekf.covariance_matrices(blocks) if full_covariance else None,
+        innovations=forward.innovations,
+        skipped=forward.skipped,
+    )
+
+
+def _most_segments(record: ImuRecord, events: int) -> int:
+    """Return a bound of the number of segments: one an interval and an event, and the sub-steps of large turns."""
+    squared = np.einsum("ij,ij->i", record.increments, record.increments)
+    large = squared[squared > LARGEST_ANGLE**2]
+    return len(record.increments) + events + int(np.sum(np.floor(np.sqrt(large) / LARGEST_ANGLE) + 1.0))
+
+
+def _filtered(record: ImuRecord, process_noise: ProcessNoise, initial: State) -> tuple[Estimate, Array, np.ndarray]:
+    """Run the filter and keep its segments; return its estimate, the segments with the end state, and the segment of each edge."""
+    events = mekf.schedule(record.vectors, record.time[0], record.time[-1])
+    rows = len(record.time)
+    state = mekf._pack(initial)
+    innovation = np.empty((len(events.time), 6))
+    segments = np.empty((_most_segments(record, len(events.time)) + 1, 32))
+    number = compiled(filter_loop.run_filter)(
+        record.time,
+        np.ascontiguousarray(record.increments),
+        process_noise.angle_random_walk**2,
+        process_noise.rate_random_walk**2,
+        events.time,
+        events.kind,
+        events.vector_b,
+        events.variance,
+        events.reference,
+        events.triads,
+        state,
+        rows,
+        np.empty((1, 4)),
+        np.empty((1, 3)),
+        np.empty((1, 6)),
+        np.empty((0, 21)),
+        innovation,
+        segments,
+    )
+    segments[number, :4] = 0.0
+    segments[number, 4:] = state
+    starts = np.empty(rows, np.int64)
+    compiled(smoother_loop.locate_edges)(record.time, events.time, segments, number, starts)
+    innovations = {}
+    for i, (sensor, kind) in enumerate(zip(events.sensors, events.kinds, strict=True)):
+        values = innovation[events.reference == i, : 2 * KINDS[kind]]
+        innovations[sensor] = Innovations(
+            time=events.time[events.reference == i], whitened=values[:, 0::2] / np.sqrt(values[:, 1::2])
+        )
+    end = segments[number, 4:]
+    last = Estimate(
+        time=record.time[-1:],
+        attitude=end[None, :4],
+        bias=end[None, 4:7],
+        variance=mekf.covariance_matrices(end[7:]).diagonal()[None],
+        innovations=innovations,
+        skipped=events.skipped,
+    )
+    return last, segments, starts

@@ -1,0 +1,543 @@
+"""Vector sensors: what is known in the fixed frame, measured in the body frame, ``q⁻¹ r q + v``, or the attitude itself.
+
+Every sensor has its own rate, phase and :class:`Faults` (latency, outages, outliers, correlated noise), and gives a series of
+:class:`VectorMeasurements`. The series tells the *nominal* noise: outliers, correlation, hard iron and acceleration are what the filter is
+not told.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from strapdown import quaternion
+from strapdown.checks import (
+    ROUNDING,
+    Array,
+    InputError,
+    array,
+    finite,
+    increasing,
+    non_negative,
+    one_of,
+    positive,
+    unit_quaternions,
+)
+from strapdown.motion import Motion
+from strapdown.units import STANDARD_GRAVITY
+
+Kind = Literal["direction", "heading", "vector", "attitude"]
+KINDS: dict[str, int] = {"direction": 2, "heading": 1, "vector": 3, "attitude": 3}
+"""Kinds of measurement and their degrees of freedom: of a direction both components across it; of a heading only the turn about the
+fixed z axis of the vector's horizontal part; of a vector all three components; of an attitude the whole rotation."""
+
+GRAVITY_F = (0.0, 0.0, -STANDARD_GRAVITY)
+"""Acceleration of gravity where the fixed z axis points up, m/s²."""
+
+Attitude = Callable[[Array], Array]
+VectorField = Callable[[Array], Array]
+"""A vector of the fixed frame at given times: (m,) s to (m, 3)."""
+
+
+class Sensor(Protocol):
+    """What a scenario wants of a sensor."""
+
+    @property
+    def name(self) -> str:
+        """Name of the sensor and of its stream of random numbers."""
+
+    def observe(self, motion: Any, start: float, end: float, generator: np.random.Generator) -> VectorMeasurements:
+        """Return the measurements over (start, end] of a body that moves so."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class VectorMeasurements:
+    """A series of measurements of one sensor."""
+
+    sensor: str
+    """Name of the sensor."""
+    kind: Kind
+    time: Array
+    """Times of measurement (m,), s, increasing."""
+    reference_f: Array = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    """What is measured, in the fixed frame: a unit direction (3,), or (m, 3) if it changes; for kind ``"vector"`` with its length. Not used
+    for kind ``"attitude"``."""
+    vector_b: Array = field(default_factory=lambda: np.empty((0, 3)))
+    """Measured vectors (m, 3), body frame; of unit length but for kind ``"vector"``; rows of NaN are missing samples. For kind
+    ``"attitude"`` there are none and this is filled with NaN."""
+    sigma: Array = field(default_factory=lambda: np.zeros(1))
+    """Noise of each component (across the direction: rad; of a vector: its unit), (m,); a scalar is spread over all samples. For kind
+    ``"attitude"`` the root mean square of ``sigma_axes``."""
+    attitude: Array | None = None
+    """Measured q_fb (m, 4) for kind ``"attitude"``, with the error on the body side."""
+    sigma_axes: Array | None = None
+    """Noise about each body axis (m, 3), rad, for kind ``"attitude"``; (3,) is spread over all samples."""
+    arrival: Array | None = None
+    """When each sample arrives (m,), s, not before its time; None: at once."""
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        one_of(f"{self.sensor}: kind", self.kind, KINDS)
+        time = increasing(f"{self.sensor}: time", self.time, least=0) if len(self.time) else np.empty(0)
+        m = len(time)
+        store: dict[str, Any] = {"time": time}
+        if self.kind == "attitude":
+            if self.attitude is None or self.sigma_axes is None:
+                raise InputError(
+                    f"{self.sensor}: a series of kind 'attitude' needs attitude (m, 4) and sigma_axes (m, 3)"
+                )
+            given = array(f"{self.sensor}: attitude", self.attitude, (m, 4))
+            store["attitude"] = unit_quaternions(f"{self.sensor}: attitude", given)
+            axes = np.broadcast_to(np.asarray(self.sigma_axes, np.float64), (m, 3))
+            store["sigma_axes"] = array(f"{self.sensor}: sigma_axes", axes, (m, 3))
+            if np.any(axes < 0.0):
+                raise InputError(f"{self.sensor}: sigma_axes has a negative entry; give standard deviations in rad")
+            store["vector_b"] = np.full((m, 3), np.nan)
+            sigma = np.sqrt(np.mean(axes**2, axis=1))
+        else:
+            if self.attitude is not None or self.sigma_axes is not None:
+                raise InputError(f"{self.sensor}: attitude and sigma_axes belong to kind 'attitude', not {self.kind!r}")
+            vector = array(f"{self.sensor}: vector_b", self.vector_b, (m, 3), allow_nan=True)
+            if self.kind != "vector":
+                _need_unit(f"{self.sensor}: vector_b", vector)
+            store["vector_b"] = vector
+            sigma = (
+                np.broadcast_to(self.sigma, time.shape)
+                if np.ndim(self.sigma) == 0 or len(self.sigma) != m
+                else self.sigma
+            )
+        sigma = array(f"{self.sensor}: sigma", sigma, (m,))
+        if np.any(sigma < 0.0):
+            k = int(np.argmax(sigma < 0.0))
+            raise InputError(f"{self.sensor}: sigma[{k}] is {sigma[k]:g}; it must not be negative")
+        store["sigma"] = sigma
+        store["reference_f"] = self._reference(m)
+        if self.arrival is not None:
+            arrival = array(f"{self.sensor}: arrival", self.arrival, (m,))
+            if np.any(arrival < time):
+                k = int(np.argmax(arrival < time))
+                raise InputError(f"{self.sensor}: arrival[{k}] is {arrival[k]:.9g} s, before its time {time[k]:.9g} s")
+            store["arrival"] = arrival
+        for name, value in store.items():
+            object.__setattr__(self, name, value)
+
+    def _reference(self, m: int) -> Array:
+        name = f"{self.sensor}: reference_f"
+        reference = np.asarray(self.reference_f, np.float64)
+        if reference.ndim == 2:
+            reference = array(name, reference, (m, 3))
+            if self.kind != "vector":
+                length = np.linalg.norm(reference, axis=1, keepdims=True)
+                if np.any(length == 0.0):
+                    raise InputError(f"{name}[{int(np.argmin(length))}] is the zero vector, which has no direction")
+                reference = np.where(np.abs(length - 1.0) <= ROUNDING, reference, reference / length)
+        else:
+            reference = array(name, reference, (3,)) if self.kind == "vector" else _direction(name, reference)
+        if self.kind == "heading":
+            level = np.atleast_1d(np.hypot(reference[..., 0], reference[..., 1]))
+            if np.any(level < 1e-3):
+                raise InputError(f"{name} is vertical and shows no heading; give one with a horizontal part")
+        return reference
+
+    @property
+    def references_f(self) -> Array:
+        """The reference of every sample (m, 3)."""
+        return np.broadcast_to(self.reference_f, (len(self.time), 3))
+
+    def taken(self, which: Any) -> VectorMeasurements:
+        """Return the samples that a mask (m,), slice or array of indices picks, with all that belongs to them."""
+        rows = {name: getattr(self, name) for name in ("time", "sigma", "sigma_axes", "attitude", "arrival")}
+        changed = {name: value[which] for name, value in rows.items() if value is not None}
+        if self.kind != "attitude":
+            changed["vector_b"] = self.vector_b[which]
+        if self.reference_f.ndim == 2:
+            changed["reference_f"] = self.reference_f[which]
+        return dataclasses.replace(self, **changed)
+
+
+def _need_unit(name: str, vector: Array) -> None:
+    norm = np.linalg.norm(vector, axis=-1)
+    bad = np.abs(norm - 1.0) > 1e-6
+    if np.any(bad):
+        k = int(np.argmax(bad))
+        raise InputError(
+            f"{name}[{k}] has length {norm[k]:.6g}; divide each vector by its length (missing ones are NaN)"
+        )
+
+
+def _direction(name: str, value: ArrayLike) -> Array:
+    vector = array(name, value, (3,))
+    length = float(np.linalg.norm(vector))
+    if length == 0.0:
+        raise InputError(f"{name} is the zero vector, which has no direction")
+    # A unit vector but for rounding stays as it is, so that one written to a file and read is the same to the bit.
+    return vector if abs(length - 1.0) <= ROUNDING else np.asarray(vector / length)
+
+
+def _unit(vector: Array) -> Array:
+    return np.asarray(vector / np.linalg.norm(vector, axis=-1, keepdims=True))
+
+
+def triad(reference_f: Array) -> Array:
+    """Return unit vectors (u, v, r) as rows (3, 3), right-handed (u × v = r), r along ``reference_f``."""
+    r = _direction("reference_f", reference_f)
+    u = np.cross(np.eye(3)[np.argmin(np.abs(r))], r)
+    u /= np.linalg.norm(u)
+    return np.stack([u, np.cross(r, u), r])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Faults:
+    """What is amiss with a sensor beyond its white noise. The default is nothing."""
+
+    latency: float = 0.0
+    """Samples arrive so much after their time, s."""
+    outages: Sequence[tuple[float, float]] = ()
+    """Windows [from, to] without samples, s: eclipse, blinding, a lost fix."""
+    outlier_probability: float = 0.0
+    """Probability that a sample is an outlier, each by itself."""
+    outlier_scale: float = 10.0
+    """The noise of outliers over that of the others: contaminated normal (Tukey 1960)."""
+    correlated_sigma: float = 0.0
+    """Standard deviation of a first-order Gauss–Markov noise on top, of each component, in the unit of sigma."""
+    correlation_time: float = 100.0
+    """Its correlation time, s."""
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        non_negative("latency", self.latency, unit="s")
+        windows = tuple(
+            (finite("outages: from", a, unit="s"), finite("outages: to", b, unit="s")) for a, b in self.outages
+        )
+        for a, b in windows:
+            if b < a:
+                raise InputError(f"outages has a window from {a:g} s to {b:g} s; give (from, to) with from ≤ to")
+        object.__setattr__(self, "outages", windows)
+        non_negative("outlier_probability", self.outlier_probability)
+        if self.outlier_probability > 1.0:
+            raise InputError(f"outlier_probability is {self.outlier_probability:g}; it must not be above 1")
+        positive("outlier_scale", self.outlier_scale)
+        non_negative("correlated_sigma", self.correlated_sigma)
+        positive("correlation_time", self.correlation_time, unit="s")
+
+    def noise(self, time: Array, generator: np.random.Generator) -> tuple[Array, Array]:
+        """Return white noise of unit σ with its outliers, and the correlated noise, (m, 3) each.
+
+        The white noise is drawn first and in one go, so a sensor has the same one with faults and without.
+        """
+        white = generator.standard_normal((len(time), 3))
+        struck = (
+            generator.random(len(time)) < self.outlier_probability
+            if self.outlier_probability > 0.0
+            else np.zeros(len(time), bool)
+        )
+        white = np.where(struck[:, None], self.outlier_scale * white, white)
+        correlated = np.zeros_like(white)
+        if self.correlated_sigma > 0.0 and len(time):
+            drive = self.correlated_sigma * generator.standard_normal(white.shape)
+            decay = np.exp(-np.diff(time) / self.correlation_time)
+            correlated[0] = drive[0]
+            for k, (phi, share) in enumerate(zip(decay, np.sqrt(1.0 - decay**2), strict=True)):
+                correlated[k + 1] = phi * correlated[k] + share * drive[k + 1]
+        return white, correlated
+
+    def heard(self, series: VectorMeasurements) -> VectorMeasurements:
+        """Return the series without the samples in outages, with the times of arrival if there is a latency."""
+        arrival = series.time + self.latency if self.latency > 0.0 else None
+        series = dataclasses.replace(series, arrival=arrival)
+        if not self.outages:
+            return series
+        lost = np.any([(series.time >= a) & (series.time <= b) for a, b in self.outages], axis=0)
+        return series.taken(~lost)
+
+
+def sample_times(rate: float, phase: float, start: float, end: float) -> Array:
+    """Return the measurement times in (start, end], s: the first after ``phase``, or after one interval if that is 0."""
+    first = start + (phase if phase > 0.0 else 1.0 / rate)
+    # The tolerance of a millionth of an interval keeps the last one when end falls on it but for rounding.
+    number = int(np.floor((finite("end", end) - first) * rate + 1e-6)) + 1
+    return np.minimum(first + np.arange(max(number, 0)) / rate, end)
+
+
+def _check_sampling(name: str, sigma: float, unit: str, rate: float, phase: float) -> None:
+    non_negative(f"{name}: sigma", sigma, unit=unit)
+    positive(f"{name}: rate", rate, unit="Hz")
+    non_negative(f"{name}: phase", phase, unit="s")
+
+
+def _body(motion: Any, time: Array, vector_f: Array) -> Array:
+    """Return R_fbᵀ v_f; ``motion`` is a motion or its attitude function."""
+    attitude = motion if callable(motion) else motion.attitude
+    return quaternion.rotate(quaternion.conjugate(attitude(time)), vector_f)
+
+
+@dataclass(frozen=True, kw_only=True)
+class VectorSensor:
+    """A sensor of one known direction: a star, the sun, a beacon."""
+
+    name: str
+    reference_f: Array
+    """Direction in the fixed frame (3,); its length does not matter."""
+    sigma: float
+    """Noise of each component across the unit direction, rad."""
+    rate: float
+    """Measurements a second, Hz."""
+    phase: float = 0.0
+    """Time of the first measurement after the start, s; 0 means one interval after it."""
+    kind: Kind = "direction"
+    faults: Faults = field(default_factory=Faults)
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        object.__setattr__(self, "reference_f", _direction(f"{self.name}: reference_f", self.reference_f))
+        _check_sampling(self.name, self.sigma, "rad", self.rate, self.phase)
+        one_of(f"{self.name}: kind", self.kind, ("direction", "heading"))
+
+    def times(self, start: float, end: float) -> Array:
+        """Return the measurement times in (start, end], s."""
+        return sample_times(self.rate, self.phase, start, end)
+
+    def observe(self, motion: Any, start: float, end: float, generator: np.random.Generator) -> VectorMeasurements:
+        """Return noisy measurements over (start, end] of a body that moves so (a motion, or its attitude q_fb as a function of time)."""
+        time = self.times(start, end)
+        white, correlated = self.faults.noise(time, generator)
+        noisy = _body(motion, time, self.reference_f) + self.sigma * white + correlated
+        series = VectorMeasurements(
+            sensor=self.name,
+            kind=self.kind,
+            time=time,
+            vector_b=_unit(noisy),
+            reference_f=self.reference_f,
+            sigma=np.full(len(time), self.sigma),
+        )
+        return self.faults.heard(series)
+
+
+def star_directions(
+    name: str, stars_f: ArrayLike, *, sigma: float, rate: float, phase: float = 0.0, faults: Faults | None = None
+) -> tuple[VectorSensor, ...]:
+    """Return a star tracker that gives several stars (k, 3) as directions: one sensor a star, all at the same times."""
+    stars = array(f"{name}: stars_f", stars_f, ("k", 3))
+    return tuple(
+        VectorSensor(
+            name=f"{name} {i + 1}", reference_f=star, sigma=sigma, rate=rate, phase=phase, faults=faults or Faults()
+        )
+        for i, star in enumerate(stars)
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class AttitudeSensor:
+    """A star tracker that gives the attitude as a quaternion; coarse about its boresight, fine across it."""
+
+    name: str
+    sigma_across: float
+    """Noise about the axes across the boresight, rad."""
+    sigma_about: float
+    """Noise about the boresight, rad."""
+    rate: float
+    """Hz."""
+    boresight: Literal["x", "y", "z"] = "z"
+    """Body axis along which it looks."""
+    phase: float = 0.0
+    faults: Faults = field(default_factory=Faults)
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        _check_sampling(self.name, self.sigma_across, "rad", self.rate, self.phase)
+        non_negative(f"{self.name}: sigma_about", self.sigma_about, unit="rad")
+        one_of(f"{self.name}: boresight", self.boresight, ("x", "y", "z"))
+
+    @property
+    def sigma_axes(self) -> Array:
+        """Noise about each body axis (3,), rad."""
+        return np.where(np.arange(3) == "xyz".index(self.boresight), self.sigma_about, self.sigma_across)
+
+    def observe(self, motion: Any, start: float, end: float, generator: np.random.Generator) -> VectorMeasurements:
+        """Return ``q_measured = q ⊗ exp(v)`` over (start, end]."""
+        time = sample_times(self.rate, self.phase, start, end)
+        white, correlated = self.faults.noise(time, generator)
+        attitude = motion if callable(motion) else motion.attitude
+        error = quaternion.exp(self.sigma_axes * white + correlated)
+        series = VectorMeasurements(
+            sensor=self.name,
+            kind="attitude",
+            time=time,
+            attitude=quaternion.multiply(attitude(time), error).reshape(-1, 4),
+            sigma_axes=self.sigma_axes,
+        )
+        return self.faults.heard(series)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Magnetometer:
+    """A magnetometer in a known field: ``m_b = (I + S) R_fbᵀ B_f + h + v``, S soft iron, h hard iron (the calibration left over)."""
+
+    name: str
+    field_f: Array | VectorField
+    """The field in the fixed frame, T: a vector (3,), or a function of time (m,) that returns (m, 3)."""
+    sigma: float
+    """Noise of each component, T."""
+    rate: float
+    """Hz."""
+    hard_iron: Array = field(default_factory=lambda: np.zeros(3))
+    """(3,), T."""
+    soft_iron: Array = field(default_factory=lambda: np.zeros((3, 3)))
+    """(3, 3)."""
+    kind: Kind = "direction"
+    """``"direction"``, ``"heading"`` (about the fixed z axis) or ``"vector"`` (T)."""
+    phase: float = 0.0
+    faults: Faults = field(default_factory=Faults)
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        _check_sampling(self.name, self.sigma, "T", self.rate, self.phase)
+        one_of(f"{self.name}: kind", self.kind, ("direction", "heading", "vector"))
+        if not callable(self.field_f):
+            object.__setattr__(self, "field_f", array(f"{self.name}: field_f", self.field_f, (3,)))
+        object.__setattr__(self, "hard_iron", array(f"{self.name}: hard_iron", self.hard_iron, (3,)))
+        object.__setattr__(self, "soft_iron", array(f"{self.name}: soft_iron", self.soft_iron, (3, 3)))
+
+    def observe(self, motion: Any, start: float, end: float, generator: np.random.Generator) -> VectorMeasurements:
+        """Return measurements over (start, end]; the sigma of a direction is the noise over the field's strength."""
+        time = sample_times(self.rate, self.phase, start, end)
+        white, correlated = self.faults.noise(time, generator)
+        varies = callable(self.field_f)
+        true_f = (
+            array(f"{self.name}: field_f", self.field_f(time), (len(time), 3))
+            if callable(self.field_f)
+            else self.field_f
+        )
+        exact = _body(motion, time, true_f) @ (np.eye(3) + self.soft_iron).T + self.hard_iron
+        measured = exact + self.sigma * white + correlated
+        strength = np.broadcast_to(np.linalg.norm(true_f, axis=-1), time.shape)
+        level = np.broadcast_to(np.hypot(true_f[..., 0], true_f[..., 1]), time.shape)
+        scale = {"vector": np.ones(len(time)), "direction": strength, "heading": level}[self.kind]
+        series = VectorMeasurements(
+            sensor=self.name,
+            kind=self.kind,
+            time=time,
+            vector_b=measured if self.kind == "vector" else _unit(measured),
+            reference_f=true_f if varies else np.asarray(self.field_f),
+            sigma=self.sigma / scale,
+        )
+        return self.faults.heard(series)
+
+
+def specific_force(
+    motion: Motion,
+    time: ArrayLike,
+    *,
+    lever_arm_b: ArrayLike = (0.0, 0.0, 0.0),
+    acceleration_f: VectorField | None = None,
+    gravity_f: ArrayLike = GRAVITY_F,
+) -> Array:
+    """Return the specific force (..., 3), m/s², body axes, at a point of the body: what an ideal accelerometer there feels.
+
+    ``f_b = R_fbᵀ (a_f − g_f) + ẇ_b × r + w_b × (w_b × r)`` at the lever arm r from the point that moves with a_f.
+    """
+    t = np.asarray(time, np.float64)
+    arm = array("lever_arm_b", lever_arm_b, (3,))
+    rate = motion.body_rate(t)
+    pull = np.broadcast_to(-array("gravity_f", gravity_f, (3,)), (*t.shape, 3))
+    if acceleration_f is not None:
+        pull = pull + acceleration_f(t)
+    turning = np.cross(motion.body_angular_acceleration(t), arm) + np.cross(rate, np.cross(rate, arm))
+    return np.asarray(_body(motion, t, pull) + turning)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Accelerometer:
+    """An accelerometer taken for a sensor of the vertical: right at rest, wrong by whatever the body accelerates."""
+
+    name: str
+    sigma: float
+    """Noise of each component, m/s²."""
+    rate: float
+    """Hz."""
+    lever_arm_b: Array = field(default_factory=lambda: np.zeros(3))
+    """Place on the body (3,), m, from the point that moves with ``acceleration_f``."""
+    bias: Array = field(default_factory=lambda: np.zeros(3))
+    """(3,), m/s²."""
+    acceleration_f: VectorField | None = None
+    """Acceleration of that point in the fixed frame, m/s²; None: none."""
+    gravity_f: Array = field(default_factory=lambda: np.array(GRAVITY_F))
+    """(3,), m/s²."""
+    kind: Kind = "direction"
+    """``"direction"`` or ``"vector"`` (m/s²)."""
+    phase: float = 0.0
+    faults: Faults = field(default_factory=Faults)
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        _check_sampling(self.name, self.sigma, "m/s²", self.rate, self.phase)
+        one_of(f"{self.name}: kind", self.kind, ("direction", "vector"))
+        for name in ("lever_arm_b", "bias", "gravity_f"):
+            object.__setattr__(self, name, array(f"{self.name}: {name}", getattr(self, name), (3,)))
+        _direction(f"{self.name}: gravity_f", self.gravity_f)
+
+    def observe(self, motion: Motion, start: float, end: float, generator: np.random.Generator) -> VectorMeasurements:
+        """Return measurements of the direction up over (start, end]; ``motion`` must give rates too."""
+        time = sample_times(self.rate, self.phase, start, end)
+        white, correlated = self.faults.noise(time, generator)
+        exact = specific_force(
+            motion, time, lever_arm_b=self.lever_arm_b, acceleration_f=self.acceleration_f, gravity_f=self.gravity_f
+        )
+        measured = exact + self.bias + self.sigma * white + correlated
+        whole = self.kind == "vector"
+        series = VectorMeasurements(
+            sensor=self.name,
+            kind=self.kind,
+            time=time,
+            vector_b=measured if whole else _unit(measured),
+            reference_f=-self.gravity_f,
+            sigma=np.full(len(time), self.sigma / (1.0 if whole else float(np.linalg.norm(self.gravity_f)))),
+        )
+        return self.faults.heard(series)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeadingPair:
+    """Two GNSS antennas on the body: the heading of the line between them.
+
+    The line is known in the body and measured in the fixed frame, so ``vector_b`` is exact and ``reference_f`` (m, 3) has the noise.
+    """
+
+    name: str
+    baseline_b: Array
+    """From the first antenna to the second (3,), m, body axes."""
+    sigma: float
+    """Noise of each component of the relative position, m; the heading's is that over the baseline's level length."""
+    rate: float
+    """Hz."""
+    phase: float = 0.0
+    faults: Faults = field(default_factory=Faults)
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        _check_sampling(self.name, self.sigma, "m", self.rate, self.phase)
+        object.__setattr__(self, "baseline_b", array(f"{self.name}: baseline_b", self.baseline_b, (3,)))
+        _direction(f"{self.name}: baseline_b", self.baseline_b)
+
+    def observe(self, motion: Any, start: float, end: float, generator: np.random.Generator) -> VectorMeasurements:
+        """Return headings over (start, end]."""
+        time = sample_times(self.rate, self.phase, start, end)
+        white, correlated = self.faults.noise(time, generator)
+        attitude = motion if callable(motion) else motion.attitude
+        line_f = quaternion.rotate(attitude(time), self.baseline_b).reshape(-1, 3)
+        level = np.hypot(line_f[:, 0], line_f[:, 1])
+        measured = (line_f + self.sigma * white + correlated) * np.array([1.0, 1.0, 0.0])
+        series = VectorMeasurements(
+            sensor=self.name,
+            kind="heading",
+            time=time,
+            vector_b=np.tile(_unit(self.baseline_b), (len(time), 1)),
+            reference_f=measured,
+            sigma=self.sigma / level,
+        )
+        return self.faults.heard(series)
