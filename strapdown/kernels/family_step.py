@@ -48,7 +48,10 @@ def negated(v):
 
 
 def turned_in_fixed_axes(q, phi):
-    """Return exp(φ) ⊗ q, norm brought back to one: a turn by φ given in fixed axes."""
+    """Return exp(φ) ⊗ q, norm brought back to one: a turn by φ given in fixed axes.
+
+    A correction may be larger than the polynomials are made for; brought back to one at the end, the norm cannot show it.
+    """
     return renormalized(quaternion_multiply(exponential(phi), q))
 
 
@@ -154,7 +157,7 @@ def close_two_frame(q, b, correction, bias_correction):
 def close_geometric(q, b, correction, bias_correction):
     """Move the state by a correction (a, c) of (δθ, η): ``b⁺ = exp(−[a]) b + c`` (Andrle & Crassidis 2015); the covariance stays."""
     back, _ = transition(correction, 1.0)
-    return turned(q, correction), add(matrix_times_vector(back, b), bias_correction)
+    return renormalized(turned(q, correction)), add(matrix_times_vector(back, b), bias_correction)
 
 
 def sheared(A, B, C, X):

@@ -15,7 +15,6 @@ import math
 
 from strapdown.kernels.algebra import (
     add,
-    add_matrices,
     combine,
     dot,
     full,
