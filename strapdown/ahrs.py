@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from strapdown import mekf, wahba
-from strapdown.checks import Array, InputError, positive
+from strapdown.checks import Array, InputError, non_negative, positive
 from strapdown.recordings import Recording, increments
 from strapdown.records import Estimate, ImuRecord
 from strapdown.units import DEGREE
@@ -51,8 +51,8 @@ class AhrsParameters:
     def __post_init__(self) -> None:
         """Check every field."""
         for name in self.__dataclass_fields__:
-            if name not in ("field_strength_weight", "rate_random_walk"):
-                positive(name, getattr(self, name))
+            check = non_negative if name in ("field_strength_weight", "rate_random_walk") else positive
+            check(name, getattr(self, name))
 
 
 def quiet_span(recording: Recording) -> slice:
@@ -94,8 +94,9 @@ def imu_record(recording: Recording, quiet: slice, parameters: AhrsParameters) -
     ]
     if recording.magnetic_field is not None:
         strength = np.linalg.norm(recording.magnetic_field, axis=1, keepdims=True)
-        usual = np.linalg.norm(recording.magnetic_field[quiet], axis=1)
-        deviation = np.nan_to_num(strength[:, 0] / np.nanmean(usual) - 1.0)
+        strength[strength == 0.0] = np.nan  # a field of zero is no field: a missing sample
+        _mean(recording.magnetic_field[quiet], recording.source, "magnetometer")
+        deviation = np.nan_to_num(strength[:, 0] / np.nanmean(strength[quiet]) - 1.0)
         vectors.append(
             VectorMeasurements(
                 sensor="magnetometer",

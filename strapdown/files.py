@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from strapdown.checks import InputError
+
 
 @contextlib.contextmanager
 def written_beside(path: str | os.PathLike[str]) -> Iterator[Path]:
@@ -28,6 +30,20 @@ def written_beside(path: str | os.PathLike[str]) -> Iterator[Path]:
         os.replace(temporary, target)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def usable_folder(name: str, folder: str | os.PathLike[str]) -> None:
+    """Refuse a folder that results cannot go to, before they are computed: one below a file, or that may not be written.
+
+    Nothing is made; the folder appears with the first file written.
+    """
+    place = Path(folder).absolute()
+    while not place.exists():
+        place = place.parent
+    if not place.is_dir():
+        raise InputError(f"{name} is {folder}, but {place} is a file; choose another folder")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise InputError(f"{name} is {folder}, but {place} may not be written; choose another folder")
 
 
 def write_json(path: str | os.PathLike[str], content: Any) -> None:

@@ -91,8 +91,9 @@ class Statistics:
 
     @property
     def nis(self) -> Array:
-        """NIS per degree of freedom, averaged over runs and over each bin (k,); 1 for a right filter."""
-        return np.asarray(self.nis_sum / (self.runs * self.nis_degrees))
+        """NIS per degree of freedom, averaged over runs and over each bin (k,); 1 for a right filter, NaN where nothing was measured."""
+        seen = self.nis_degrees > 0.0
+        return np.asarray(np.where(seen, self.nis_sum / (self.runs * np.where(seen, self.nis_degrees, 1.0)), np.nan))
 
     @property
     def mean_nis(self) -> float:

@@ -7,6 +7,7 @@ of it is in :mod:`strapdown.ahrs`.
 from __future__ import annotations
 
 import csv
+import io
 import os
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from strapdown import recordfiles
-from strapdown.checks import Array, InputError, array, increasing, one_of, positive
+from strapdown.checks import Array, InputError, array, increasing, known_keys, one_of, positive
 from strapdown.units import DEGREE, STANDARD_GRAVITY
 
 RATE_UNITS = {"rad/s": 1.0, "deg/s": DEGREE}
@@ -88,6 +89,10 @@ def read(path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None
     if not file.exists():
         raise InputError(f"{file} does not exist; check the path")
     if file.suffix.lower() in (".hdf5", ".h5"):
+        if units:
+            raise InputError(
+                f"{file.name} is HDF5, whose layout says its units; drop the option for {', '.join(units)}"
+            )
         return read_broad(file)
     if file.suffix.lower() == ".csv":
         return read_csv(file, units=units)
@@ -109,9 +114,10 @@ def read_broad(path: str | os.PathLike[str]) -> Recording:
                     f"{name} lacks {', '.join(missing)}; it is not in the layout of BROAD (has: {', '.join(file)})"
                 )
             rate = file["imu_gyr"][:]
+            sampling = positive(f"{name}: sampling_rate", file.attrs["sampling_rate"], unit="Hz")
             return Recording(
                 source=name,
-                time=np.arange(len(rate)) / float(file.attrs["sampling_rate"]),
+                time=np.arange(len(rate)) / sampling,
                 rate=rate,
                 specific_force=file["imu_acc"][:] if "imu_acc" in file else None,
                 magnetic_field=file["imu_mag"][:] if "imu_mag" in file else None,
@@ -130,7 +136,12 @@ def read_csv(path: str | os.PathLike[str], *, units: Mapping[str, str] | None = 
     is. Time is in s unless declared otherwise. Empty fields of the accelerometer and the magnetometer are missing samples.
     """
     file = Path(path)
-    with open(file, newline="", encoding="utf-8-sig") as stream:
+    known_keys("units", units or {}, ("time", "gyro", "accelerometer"))
+    try:
+        stream = io.StringIO(file.read_text(encoding="utf-8-sig"), newline="")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{file.name} cannot be read as text ({error}); pass a CSV file in UTF-8") from None
+    with stream:
         rows = csv.reader(line for line in stream if line.strip() and not line.lstrip().startswith("#"))
         header = next(rows, None)
         if header is None:

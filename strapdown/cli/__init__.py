@@ -41,9 +41,9 @@ def info() -> None:
     import strapdown
     from strapdown.kernels.machine import describe
 
-    console.print(f"strapdown {strapdown.__version__}", highlight=False)
+    console.print(f"strapdown {strapdown.__version__}")
     for name, value in describe().items():
-        console.print(f"{name}: {value}", highlight=False)
+        console.print(f"{name}: {value}")
 
 
 def main() -> None:
@@ -51,7 +51,7 @@ def main() -> None:
     try:
         app(standalone_mode=True)
     except InputError as error:
-        errors.print(f"[red]error:[/] {error}", highlight=False, soft_wrap=True)
+        errors.print(f"error: {error}", soft_wrap=True)
         sys.exit(2)
     except KeyboardInterrupt:
         errors.print("interrupted")

@@ -35,7 +35,7 @@ def estimate(
     """Estimate attitude and gyro bias from a recording: accelerometer as the vertical, magnetometer as the heading."""
     from strapdown import ahrs, plots, recordings
     from strapdown.consistency import reference_errors
-    from strapdown.files import write_json
+    from strapdown.files import usable_folder, write_json
     from strapdown.gyro import process_noise, read_spec
     from strapdown.records import write_estimate
     from strapdown.units import DEGREE
@@ -45,10 +45,19 @@ def estimate(
     parameters = ahrs.AhrsParameters()
     if gyro is not None:
         parameters = replace(parameters, **process_noise(read_spec(gyro)))
+    usable_folder("out", out)
     result = ahrs.estimate(source, parameters, full_covariance=full_covariance)
     used = result.recording
+    errors_found = None
+    if used.true_attitude is not None:
+        errors_found = reference_errors(result.estimate.attitude, used.true_attitude)
+        rms = {name: value / DEGREE for name, value in errors_found.rms(used.movement).items()}
+    figures = {"estimate.png": plots.estimate_overview(result.estimate, title=used.source)}
+    if errors_found is not None:
+        figures["errors.png"] = plots.recording_errors(used.time, errors_found, used.movement)
+    paths = [out / "estimate.h5"]
     write_estimate(
-        out / "estimate.h5",
+        paths[0],
         result.estimate,
         {
             "source": used.source,
@@ -63,17 +72,10 @@ def estimate(
     for sensor, number in result.estimate.skipped.items():
         if number:
             console.print(f"{number} samples of the {sensor} are missing and were skipped.")
-    figure = plots.estimate_overview(result.estimate, title=used.source)
-    paths = [out / "estimate.h5", plots.save(figure, out / "estimate.png")]
-    if used.true_attitude is not None:
-        errors_found = reference_errors(result.estimate.attitude, used.true_attitude)
-        rms = {name: value / DEGREE for name, value in errors_found.rms(used.movement).items()}
-        write_json(
-            out / "errors.json", {"source": used.source, **{f"{name}_rmse_deg": value for name, value in rms.items()}}
-        )
-        rows = table("RMS error over the movement phase, degrees", *rms)
+    if errors_found is not None:
+        paths.append(out / "errors.json")
+        write_json(paths[-1], {"source": used.source, **{f"{name}_rmse_deg": value for name, value in rms.items()}})
+        rows = table("RMS error over the movement phase, degrees", *rms, left=0)
         rows.add_row(*(f"{value:.2f}" for value in rms.values()))
         console.print(rows)
-        figure = plots.recording_errors(used.time, errors_found, used.movement)
-        paths += [out / "errors.json", plots.save(figure, out / "errors.png")]
-    written(*paths)
+    written(*paths, *(plots.save(figure, out / name) for name, figure in figures.items()))

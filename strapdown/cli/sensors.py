@@ -21,7 +21,7 @@ def scenarios() -> None:
         listing.add_row(str(row["name"]), f"{row['duration_s']:g}", f"{row['rate_hz']:g}", str(row["gyro"]))
     console.print(listing)
     for row in rows:
-        console.print(f"{row['name']}: {row['description']}", highlight=False)
+        console.print(f"{row['name']}: {row['description']}")
 
 
 @app.command()
@@ -41,7 +41,7 @@ def simulate(
     chosen = catalogue.load_scenario(scenario)
     toml = catalogue.scenario_to_toml(chosen)
     if show:
-        console.print(toml, highlight=False, markup=False, soft_wrap=True)
+        console.print(toml, soft_wrap=True)
         return
     used = chosen.seed if seed is None else seed
     target = out or Path(f"{chosen.name or Path(scenario).stem}.h5")
@@ -60,7 +60,7 @@ def simulate(
         highlight=False,
     )
     for series in record.vectors:
-        console.print(f"  {series.sensor}: {len(series.time)} measurements ({series.kind})", highlight=False)
+        console.print(f"  {series.sensor}: {len(series.time)} measurements ({series.kind})")
     written(*paths)
 
 
@@ -82,9 +82,10 @@ def allan(
 
     from strapdown import allan as identification
     from strapdown import gyro, plots, recordings
-    from strapdown.files import write_json, written_beside
+    from strapdown.files import usable_folder, write_json, written_beside
 
     given = {"gyro": gyro_unit, "time": time_unit}
+    usable_folder("out", out)
     source = recordings.read_gyro(recording, rate=rate, units={name: unit for name, unit in given.items() if unit})
     with progress_bar("deviation, fit, figure", 3) as advance:
         deviation = identification.allan_deviation(
@@ -117,8 +118,8 @@ def allan(
     for axis, probability in enumerate(fit.misfit_probability):
         if probability < 1e-3:
             console.print(
-                f"[yellow]axis {'xyz'[axis]}: the record holds something that no such noise explains (probability {probability:.1g}): "
-                "motion, a vibration line, a filter, outliers. Do not believe its intervals.[/]"
+                f"axis {'xyz'[axis]}: the record holds something that no such noise explains (probability {probability:.1g}): "
+                "motion, a vibration line, a filter, outliers. Do not believe its intervals."
             )
     parameters: dict[str, Any] = dict(identification.to_gyro_parameters(fit))
     spec = gyro.GyroSpec(**parameters)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from strapdown.cli.terminal import app, console, progress_bar, table, written
+from strapdown.cli.terminal import app, console, progress_bar, table, verdict, written
 
 
 @app.command()
@@ -22,12 +22,13 @@ def coning(
 ) -> None:
     """Study coning: the drift of each integration algorithm, and what a filter makes of it."""
     from strapdown import coning_study
-    from strapdown.files import write_json
+    from strapdown.files import usable_folder, write_json
     from strapdown.units import DEGREE
 
     parameters = coning_study.ConingParameters(
         angle=angle * DEGREE, frequency=frequency, rate=rate, duration=duration, runs=runs, seed=seed
     )
+    usable_folder("out", out)
     with progress_bar("Monte Carlo runs", runs) as advance:
         study = coning_study.run(parameters, progress=advance)
     summary = study.summary()
@@ -68,7 +69,7 @@ def coning(
             f"{row['anees_attitude']:.3f}",
             f"{row['anees_bias']:.3f}" if row["anees_bias"] < 100.0 else f"{row['anees_bias']:.1e}",
             f"{row['nis']:.4f}",
-            "[green]pass[/]" if row["consistent"] else "[red]FAIL[/]",
+            verdict(row["consistent"]),
         )
     console.print(verdicts)
     low, high = summary["filter"][0]["anees_bias_bounds"]

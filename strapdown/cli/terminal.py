@@ -11,6 +11,7 @@ from rich import box
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 app = typer.Typer(
     help="Strapdown gyro attitude estimation: simulate, estimate, judge.",
@@ -18,8 +19,9 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-console = Console()
-errors = Console(stderr=True)
+# Without markup, so that a file name in brackets is said as it is.
+console = Console(markup=False, highlight=False)
+errors = Console(stderr=True, markup=False, highlight=False)
 
 
 @contextmanager
@@ -43,13 +45,18 @@ def table(title: str, *columns: str, left: int = 1) -> Table:
 
     The title stands outside because one longer than its table would wrap inside it.
     """
-    console.print(f"[bold]{title}[/]", highlight=False)
+    console.print(Text(title, style="bold"))
     result = Table(box=box.SIMPLE_HEAD, header_style="", pad_edge=False, padding=(0, 1, 0, 0))
     for k, column in enumerate(columns):
         result.add_column(column, justify="left" if k < left else "right", no_wrap=k > 0 or left == 1)
     return result
 
 
+def verdict(good: bool) -> Text:
+    """Return "pass" or "FAIL", coloured where the terminal can."""
+    return Text("pass", style="green") if good else Text("FAIL", style="red")
+
+
 def written(*paths: Any) -> None:
     """Say which files were written."""
-    console.print("Written: " + ", ".join(str(path) for path in paths), soft_wrap=True, highlight=False)
+    console.print("Written: " + ", ".join(str(path) for path in paths), soft_wrap=True)

@@ -1,0 +1,117 @@
+"""The explicit complementary filter with bias correction (Mahony, Hamel & Pflimlin 2008, equations (32)): the baseline.
+
+It has fixed gains and converges from almost any start. It knows no covariance of its own; the one reported is that of its linearised error
+under its own gains, so that it can be judged like the others.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from strapdown.checks import Array, array
+from strapdown.family import stepping
+from strapdown.kernels import family_complementary
+from strapdown.kernels.machine import compiled
+from strapdown.mekf import ProcessNoise, Schedule, State
+from strapdown.records import Estimate, ImuRecord
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gains:
+    """What one measurement of each sensor, in the order of the record, does with ``ω_mes = z × R̂ᵀ r``."""
+
+    attitude: Array
+    """Turn of the attitude, rad a rad (sensors,): k_P times the weight of the sensor times its sample interval."""
+    bias: Array
+    """Change of the bias, rad/s a rad (sensors,), not positive: −k_I times the same."""
+
+
+def farrenkopf_gains(
+    angle_random_walk: float, rate_random_walk: float, sigma: float, interval: float
+) -> tuple[float, float]:
+    """Return the steady-state Kalman gains (attitude, bias in 1/s) of one axis measured with ``sigma`` rad every ``interval`` s.
+
+    Farrenkopf 1978, for a gyro read continuously (Markley & Crassidis 2014, chapter 6):
+    ``K_θ = 1 − ζ⁻²``, ``K_b = −σ_u √dt / (σ_n ζ)``.
+    """
+    su = rate_random_walk * interval**1.5 / sigma
+    sv = angle_random_walk * math.sqrt(interval) / sigma
+    gamma = math.sqrt(1.0 + sv * sv / 4.0 + su * su / 48.0)
+    zeta = gamma + su / 4.0 + 0.5 * math.sqrt(2.0 * gamma * su + sv * sv + su * su / 3.0)
+    # (ζ² − 1)/ζ² written by (ζ − 1), which keeps its digits when the gain is small.
+    return (zeta - 1.0) * (zeta + 1.0) / (zeta * zeta), -su / (interval * zeta)
+
+
+def steady_gains(record: ImuRecord, process_noise: ProcessNoise, initial: State) -> Gains:
+    """Return gains for a record: Farrenkopf's of all its sensors together, shared among them by information.
+
+    A gain that is fixed must serve the start as well as the end. It is designed for random walks that would carry attitude and bias through
+    their initial standard deviations over the record, on top of the gyro's own.
+    """
+    events, _ = stepping.events_and_steps(record, 1)
+    return _steady_gains(record, events, process_noise, initial)
+
+
+def _steady_gains(record: ImuRecord, events: Schedule, process_noise: ProcessNoise, initial: State) -> Gains:
+    duration = float(record.time[-1] - record.time[0])
+    number = np.bincount(events.reference, minlength=len(events.sensors))
+    if not number.any():
+        return Gains(attitude=np.zeros(len(number)), bias=np.zeros(len(number)))
+    information = np.bincount(events.reference, weights=1.0 / events.variance, minlength=len(number)) / duration
+    interval = duration / np.maximum(number, 1)
+    longest = float(interval[number > 0].max())
+    initial_sigma = np.sqrt(np.diag(initial.covariance) / duration)
+    attitude, bias = farrenkopf_gains(
+        math.hypot(process_noise.angle_random_walk, float(initial_sigma[:3].max())),
+        math.hypot(process_noise.rate_random_walk, float(initial_sigma[3:].max())),
+        1.0 / math.sqrt(information.sum() * longest),
+        longest,
+    )
+    share = information / information.sum() * interval / longest
+    return Gains(attitude=attitude * share, bias=bias * share)
+
+
+def run(
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    initial: State,
+    *,
+    every: int = 1,
+    full_covariance: bool = False,
+    gains: Gains | None = None,
+) -> Estimate:
+    """Run the filter over a whole record, compiled.
+
+    Parameters
+    ----------
+    record, process_noise, initial, every, full_covariance
+        As :func:`strapdown.family.run`.
+    gains : Gains, optional
+        Default: :func:`steady_gains`.
+    """
+    events, steps = stepping.events_and_steps(record, every)
+    chosen = _steady_gains(record, events, process_noise, initial) if gains is None else gains
+    sensors = len(events.sensors)
+    states, innovation = np.empty((len(steps.time), 28)), np.empty((len(events.time), 6))
+    compiled(family_complementary.run_complementary)(
+        steps.dt,
+        steps.increment,
+        steps.event,
+        steps.row,
+        process_noise.angle_random_walk**2,
+        process_noise.rate_random_walk**2,
+        events.kind,
+        events.vector_b,
+        events.variance,
+        events.reference,
+        events.triads,
+        array("gains.attitude", chosen.attitude, (sensors,)),
+        array("gains.bias", chosen.bias, (sensors,)),
+        stepping.packed(initial.attitude, initial.bias, initial.covariance),
+        states,
+        innovation,
+    )
+    return stepping.estimate(events, steps, states, innovation, full_covariance)

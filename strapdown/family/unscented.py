@@ -1,0 +1,137 @@
+"""USQUE, the unscented quaternion estimator (Crassidis & Markley 2003), on the sigma points of filterpy.
+
+The attitude error of each sigma point is three generalised Rodrigues parameters p about the central quaternion, body side,
+``q_true = q ⊗ δq(p)``, scaled so that p is the rotation vector for small errors. Two points are not the paper's: the process noise is the
+exact one of :mod:`strapdown.mekf`, added after the propagation, where the paper adds half of a trapezoid before and half after; and a
+direction enters with all three components and noise σ² I (Shuster's trick), its innovation told as its two degrees of freedom.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from filterpy.kalman import JulierSigmaPoints, unscented_transform
+from numpy.typing import ArrayLike
+
+from strapdown import mekf, quaternion
+from strapdown.checks import Array, InputError
+from strapdown.family import stepping
+from strapdown.kernels.filter_loop import HEADING, VECTOR, heading_error
+from strapdown.kernels.rotation import quaternion_multiply
+from strapdown.mekf import ProcessNoise, Schedule, State
+from strapdown.records import Estimate, ImuRecord
+
+_CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
+_A = 1.0
+_F = 2.0 * (_A + 1.0)
+
+
+def rodrigues_to_quaternion(p: ArrayLike) -> Array:
+    """Return δq (..., 4) of generalised Rodrigues parameters p (..., 3), a = 1, f = 4 (Crassidis & Markley 2003)."""
+    vector = np.asarray(p, np.float64)
+    squared = np.sum(vector * vector, axis=-1, keepdims=True)
+    w = (-_A * squared + _F * np.sqrt(_F**2 + (1.0 - _A**2) * squared)) / (_F**2 + squared)
+    return np.concatenate([w, (_A + w) / _F * vector], axis=-1)
+
+
+def quaternion_to_rodrigues(q: ArrayLike) -> Array:
+    """Return p (..., 3) of unit quaternions (..., 4): f ρ / (a + w) = f tan(θ/4) n, of the shorter turn."""
+    dq = np.asarray(q, np.float64)
+    dq = np.where(dq[..., :1] < 0.0, -dq, dq)
+    return np.asarray(_F * dq[..., 1:] / (_A + dq[..., :1]))
+
+
+def run(
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    initial: State,
+    *,
+    every: int = 1,
+    full_covariance: bool = False,
+    points: Any = None,
+) -> Estimate:
+    """Run the filter over a whole record, in NumPy: about 0.2 ms a step.
+
+    Parameters
+    ----------
+    record, process_noise, initial, every, full_covariance
+        As :func:`strapdown.family.run`.
+    points : object, optional
+        ``filterpy.kalman.JulierSigmaPoints`` or ``MerweScaledSigmaPoints`` of 6 states. Default: Julier's with κ = 1, the paper's λ, all
+        weights positive.
+    """
+    points = JulierSigmaPoints(6, kappa=1.0) if points is None else points
+    if points.n != 6:
+        raise InputError(f"points are of {points.n} states; USQUE has 6 (three of attitude, three of bias)")
+    events, steps = stepping.events_and_steps(record, every)
+    q, b, P = initial.attitude, initial.bias, initial.covariance
+    states, innovation = np.empty((len(steps.time), 28)), np.zeros((len(events.time), 6))
+    rows = zip(steps.dt, steps.increment, steps.event, steps.row, strict=True)
+    for dt, increment, event, row in rows:
+        if dt > 0.0:
+            q, b, P = _predict(points, q, b, P, increment, dt, process_noise)
+        if event >= 0:
+            q, b, P, innovation[event] = _update(points, q, b, P, events, event)
+        if row >= 0:
+            states[row] = stepping.packed(q, b, P)
+    return stepping.estimate(events, steps, states, innovation, full_covariance)
+
+
+def _product(p: Array, q: Array) -> Array:
+    """Return p ⊗ q of clouds of quaternions, without the checks of :func:`strapdown.quaternion.multiply`, which would double the time."""
+    return np.array(quaternion_multiply(p.T, q.T)).T
+
+
+def _spread(points: Any, q: Array, b: Array, P: Array) -> tuple[Array, Array]:
+    """Return the sigma points (13, 6) of (p, b) about p = 0, and their quaternions (13, 4)."""
+    sigma = points.sigma_points(np.concatenate([np.zeros(3), b]), P)
+    return sigma, _product(q, rodrigues_to_quaternion(sigma[:, :3]))
+
+
+def _predict(
+    points: Any, q: Array, b: Array, P: Array, increment: Array, dt: float, process_noise: ProcessNoise
+) -> tuple[Array, Array, Array]:
+    """Propagate each sigma point by equation (17) with its own bias."""
+    sigma, attitudes = _spread(points, q, b, P)
+    attitudes = _product(attitudes, quaternion.exp(increment - dt * sigma[:, 3:]))
+    sigma[:, :3] = quaternion_to_rodrigues(_product(attitudes[0] * _CONJUGATE, attitudes))
+    _, noise = mekf.transition_and_noise(increment - dt * b, dt, process_noise)
+    mean, covariance = unscented_transform(sigma, points.Wm, points.Wc, noise)
+    return _moved(attitudes[0], mean), mean[3:], 0.5 * (covariance + covariance.T)
+
+
+def _moved(q: Array, mean: Array) -> Array:
+    return quaternion.normalize(_product(q, rodrigues_to_quaternion(mean[:3])))
+
+
+def _update(
+    points: Any, q: Array, b: Array, P: Array, events: Schedule, event: int
+) -> tuple[Array, Array, Array, Array]:
+    """Take in one measurement; return the innovations too, made independent, with their variances."""
+    sigma, attitudes = _spread(points, q, b, P)
+    kind, z, variance = events.kind[event], events.vector_b[event], events.variance[event]
+    triad = events.triads[events.reference[event]].reshape(3, 3)
+    if kind == HEADING:
+        residuals = np.array([heading_error(R.ravel(), z, triad[2]) for R in quaternion.to_matrix(attitudes)])[:, None]
+        # Angles near the central one, so that the cut at π parts no two points of one cloud by a whole turn.
+        residuals = residuals[0] + (residuals - residuals[0] + np.pi) % (2.0 * np.pi) - np.pi
+        degrees = 1
+    else:
+        # Components along the predicted triad: the first two are across the direction, the third is along it.
+        basis = quaternion.rotate(quaternion.conjugate(q), triad)
+        residuals = (z - quaternion.rotate(quaternion.conjugate(attitudes), triad[2])) @ basis.T
+        degrees = 3 if kind == VECTOR else 2
+    mean, S = unscented_transform(residuals, points.Wm, points.Wc, variance * np.eye(residuals.shape[1]))
+    prior = np.concatenate([np.zeros(3), b])
+    cross = -(points.Wc[:, None] * (sigma - prior)).T @ (residuals - mean)
+    gain = np.linalg.solve(S, cross.T).T
+    state = prior + gain @ mean
+    covariance = P - gain @ S @ gain.T
+    factor = np.linalg.cholesky(S)
+    pivots = np.diag(factor)
+    independent = pivots * np.linalg.solve(factor, mean)
+    record = np.zeros(6)
+    record[1::2] = 1.0
+    record[0 : 2 * degrees : 2], record[1 : 2 * degrees : 2] = independent[:degrees], pivots[:degrees] ** 2
+    return _moved(q, state), state[3:], 0.5 * (covariance + covariance.T), record

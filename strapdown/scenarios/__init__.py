@@ -1,0 +1,416 @@
+"""Scenarios: a motion, a gyro and sensors for so many seconds; simulating one gives a record with its truth.
+
+A scenario is a TOML file, units in the names of its keys; the built-in ones (``SCENARIOS``) are such files beside this module.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from strapdown import gyro, motion, tables, vectors
+from strapdown.checks import Array, InputError, array, count, known_keys, one_of, positive
+from strapdown.gyro import GyroSpec
+from strapdown.motion import Motion
+from strapdown.orbit import CircularOrbit
+from strapdown.randomness import generator
+from strapdown.records import ImuRecord, Truth
+from strapdown.tables import Form
+from strapdown.vectors import Sensor
+
+_BUILTIN = Path(__file__).parent / "builtin"
+
+SCENARIOS: tuple[str, ...] = tuple(sorted(path.stem for path in _BUILTIN.glob("*.toml")))
+"""Names of the built-in scenarios."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenario:
+    """What is simulated."""
+
+    motion: Motion
+    gyro: GyroSpec
+    sensors: tuple[Sensor, ...]
+    rate: float
+    """Gyro samples a second, Hz."""
+    duration: float
+    """s; rounded to whole gyro samples."""
+    name: str = ""
+    description: str = ""
+    seed: int = 0
+    """The seed that is used where none is given."""
+    gravity_f: tuple[float, ...] = vectors.GRAVITY_F
+    """Gravity where the body is held up, m/s², fixed frame: what a g-sensitive gyro feels the reaction to; zeros in free fall."""
+    gyro_preset: str = ""
+    """Name of the preset that ``gyro`` is, for files."""
+
+    def __post_init__(self) -> None:
+        """Check rate, duration, and the names of the sensors."""
+        positive("rate", self.rate, unit="Hz")
+        positive("duration", self.duration, unit="s")
+        count("seed", self.seed, least=0)
+        object.__setattr__(self, "sensors", tuple(self.sensors))
+        object.__setattr__(self, "gravity_f", tuple(array("gravity_f", self.gravity_f, (3,)).tolist()))
+        names = [sensor.name for sensor in self.sensors]
+        for name in names:
+            if names.count(name) > 1 or name.startswith("gyro"):
+                raise InputError(
+                    f"two sensors are named {name!r}, or it begins with 'gyro'; give each sensor a name of its own"
+                )
+
+    @property
+    def edges(self) -> Array:
+        """Nominal edges of the gyro's sample intervals (n + 1,), s, from 0."""
+        return np.arange(round(self.duration * self.rate) + 1) / self.rate
+
+
+def simulate(scenario: Scenario, seed: int | None = None, run: int = 0) -> ImuRecord:
+    """Return run number ``run`` of a scenario: the record that its sensors give, with the truth.
+
+    Each sensor draws from its own stream of (seed, run, name), so adding one changes nothing of the others. Without a seed, the scenario's
+    own is used. With sampling jitter the truth is that of the instants really sampled, the stamps those that the gyro tells; lost samples
+    are bridged (:func:`strapdown.gyro.bridge_dropped`).
+    """
+    seed = scenario.seed if seed is None else seed
+    spec, nominal = scenario.gyro, scenario.edges
+    edges, stamps = gyro.sampling(spec, nominal, generator(seed, run, "gyro sampling"))
+    force = None
+    if np.any(spec.g_sensitivity != 0.0):
+        middle = 0.5 * (edges[1:] + edges[:-1])
+        force = vectors.specific_force(scenario.motion, middle, gravity_f=scenario.gravity_f)
+    output = gyro.simulate(
+        spec, scenario.motion.increments(edges), edges, generator(seed, run, "gyro"), specific_force=force
+    )
+    increments, bias = output.increments, output.bias
+    if spec.drop_probability > 0.0:
+        lost = gyro.dropped(spec, len(increments), generator(seed, run, "gyro losses"))
+        increments, left = gyro.bridge_dropped(increments, stamps, lost)
+        edges, stamps, bias = edges[left], stamps[left], bias[left]
+    series = tuple(
+        sensor.observe(scenario.motion, nominal[0], nominal[-1], generator(seed, run, sensor.name))
+        for sensor in scenario.sensors
+    )
+    truth = Truth(attitude=scenario.motion.attitude(edges), bias=bias)
+    return ImuRecord(time=stamps, increments=increments, vectors=series, truth=truth)
+
+
+# ------------------------------------------------------------------------------------------------------------------------ files
+
+_MOTIONS: dict[str, tuple[type, Form]] = {
+    "coning": (motion.Coning, {"angle": tables.DEGREES, "frequency": tables.HERTZ}),
+    "spin-cone": (
+        motion.SpinCone,
+        {
+            "precession_rate": tables.DEGREES_PER_SECOND,
+            "spin_rate": tables.DEGREES_PER_SECOND,
+            "angle": tables.DEGREES,
+        },
+    ),
+    "constant-rate": (
+        motion.ConstantRate,
+        {"rate": tables.DEGREES_PER_SECOND, "initial_attitude": tables.PLAIN},
+    ),
+    "spin-rock": (
+        motion.SpinRock,
+        {
+            "rock_angle": tables.DEGREES,
+            "rock_frequency": tables.HERTZ,
+            "spin_rate": tables.DEGREES_PER_SECOND,
+            "rock_phase": tables.DEGREES,
+        },
+    ),
+    "slew": (
+        motion.Slew,
+        {
+            "rotation_vector": tables.DEGREES,
+            "duration": tables.SECONDS,
+            "start": tables.SECONDS,
+            "initial_attitude": tables.PLAIN,
+        },
+    ),
+    "torque-free": (
+        motion.TorqueFree,
+        {
+            "inertia": (("kg_m2", 1.0),),
+            "initial_rate": tables.DEGREES_PER_SECOND,
+            "initial_attitude": tables.PLAIN,
+        },
+    ),
+    "harmonic-rates": (
+        motion.HarmonicRates,
+        {"mean": tables.DEGREES_PER_SECOND, "initial_attitude": tables.PLAIN},
+    ),
+}
+"""Motions by their word in a file. Besides: "rest", "composed" (tables ``base`` and ``vibration``)."""
+
+_HARMONIC: Form = {"amplitude": tables.DEGREES_PER_SECOND, "frequency": tables.HERTZ, "phase": tables.DEGREES}
+_ORBIT: Form = {
+    "altitude": (("km", 1e3), ("m", 1.0)),
+    "inclination": tables.DEGREES,
+    "phase": tables.DEGREES,
+}
+
+
+def _faults(unit: tables.Choice) -> Form:
+    return {
+        "latency": tables.SECONDS,
+        "outages": tables.SECONDS,
+        "outlier_probability": tables.PLAIN,
+        "outlier_scale": tables.PLAIN,
+        "correlated_sigma": unit,
+        "correlation_time": tables.SECONDS,
+    }
+
+
+_NAMED: Form = {"name": tables.PLAIN, "rate": tables.HERTZ, "phase": tables.SECONDS, "kind": tables.PLAIN}
+_SENSORS: dict[str, tuple[type, Form, tables.Choice]] = {
+    "direction": (
+        vectors.VectorSensor,
+        {**_NAMED, "reference_f": tables.PLAIN, "sigma": tables.ARCSECONDS},
+        tables.ARCSECONDS,
+    ),
+    "attitude": (
+        vectors.AttitudeSensor,
+        {
+            "name": tables.PLAIN,
+            "rate": tables.HERTZ,
+            "phase": tables.SECONDS,
+            "boresight": tables.PLAIN,
+            "sigma_across": tables.ARCSECONDS,
+            "sigma_about": tables.ARCSECONDS,
+        },
+        tables.ARCSECONDS,
+    ),
+    "magnetometer": (
+        vectors.Magnetometer,
+        {
+            **_NAMED,
+            "field_f": tables.NANOTESLAS,
+            "sigma": tables.NANOTESLAS,
+            "hard_iron": tables.NANOTESLAS,
+            "soft_iron": tables.PLAIN,
+        },
+        tables.NANOTESLAS,
+    ),
+    "accelerometer": (
+        vectors.Accelerometer,
+        {
+            **_NAMED,
+            "sigma": tables.METRES_PER_SECOND_SQUARED,
+            "bias": tables.METRES_PER_SECOND_SQUARED,
+            "gravity_f": tables.METRES_PER_SECOND_SQUARED,
+            "lever_arm_b": tables.METRES,
+        },
+        tables.METRES_PER_SECOND_SQUARED,
+    ),
+    "heading-pair": (
+        vectors.HeadingPair,
+        {
+            "name": tables.PLAIN,
+            "rate": tables.HERTZ,
+            "phase": tables.SECONDS,
+            "sigma": tables.METRES,
+            "baseline_b": tables.METRES,
+        },
+        tables.METRES,
+    ),
+}
+"""Sensors by their word in a file: class, keys, unit of the correlated noise. A magnetometer takes a table ``orbit`` for a field."""
+
+_TOP = ("name", "description", "seed", "rate_hz", "duration_s", "gravity_f_m_per_s2", "motion", "gyro", "sensors")
+
+
+def load_scenario(name_or_path: str | os.PathLike[str]) -> Scenario:
+    """Return a built-in scenario by name, or the one in a TOML file.
+
+    Raises
+    ------
+    InputError
+        If there is neither, or the file has an unknown key (the nearest known one is named), a missing one, or is no TOML.
+    """
+    text = os.fspath(name_or_path)
+    path = Path(text)
+    if path.suffix != ".toml" and not path.is_file():
+        path = _BUILTIN / f"{one_of('scenario', text, SCENARIOS)}.toml"
+    try:
+        content = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(
+            f"{path} does not exist; give a TOML file, or a built-in name: {', '.join(SCENARIOS)}"
+        ) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read ({error}); give a TOML file") from None
+    return scenario_from_toml(content, place=path.name)
+
+
+def scenario_from_toml(text: str, place: str = "scenario") -> Scenario:
+    """Return the scenario that a TOML text tells."""
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{place} is no TOML ({error})") from None
+    known_keys(place, table, _TOP)
+    for key in ("rate_hz", "duration_s", "motion"):
+        if key not in table:
+            raise InputError(f"{place}: {key} is missing; add it")
+    preset, spec = _read_gyro(_table(table.get("gyro", {}), f"{place}: gyro"), f"{place}: gyro")
+    sensors = table.get("sensors", [])
+    if not isinstance(sensors, list):
+        raise InputError(f"{place}: sensors is one table; write [[sensors]] with two brackets")
+    return Scenario(
+        name=str(table.get("name", "")),
+        description=str(table.get("description", "")),
+        seed=table.get("seed", 0),
+        rate=table["rate_hz"],
+        duration=table["duration_s"],
+        gravity_f=table.get("gravity_f_m_per_s2", vectors.GRAVITY_F),
+        motion=_read_motion(_table(table["motion"], f"{place}: motion"), f"{place}: motion"),
+        gyro=spec,
+        gyro_preset=preset,
+        sensors=tuple(_read_sensor(entry, f"{place}: sensors[{i}]") for i, entry in enumerate(sensors)),
+    )
+
+
+def _table(content: Any, place: str) -> dict[str, Any]:
+    if not isinstance(content, Mapping):
+        raise InputError(f"{place} is {content!r}; it must be a table")
+    return dict(content)
+
+
+def _word(table: dict[str, Any], place: str, choices: Any) -> str:
+    if "type" not in table:
+        raise InputError(f"{place}: type is missing; add one of {', '.join(choices)}")
+    return one_of(f"{place}: type", table.pop("type"), choices)
+
+
+def _read_motion(table: dict[str, Any], place: str) -> Motion:
+    word = _word(table, place, [*_MOTIONS, "rest", "composed"])
+    if word == "rest":
+        known_keys(place, table, ("initial_attitude",))
+        return motion.rest(**table)
+    if word == "composed":
+        known_keys(place, table, ("base", "vibration"))
+        parts = {
+            key: _read_motion(_table(table.get(key), f"{place}: {key}"), f"{place}: {key}")
+            for key in ("base", "vibration")
+        }
+        return motion.Composed(**parts)
+    kind, form = _MOTIONS[word]
+    more: dict[str, Any] = {}
+    if kind is motion.HarmonicRates:
+        entries = enumerate(table.pop("harmonics", []))
+        more["harmonics"] = tuple(
+            tables.build(motion.Harmonic, h, _HARMONIC, f"{place}: harmonics[{i}]") for i, h in entries
+        )
+    return tables.build(kind, table, form, place, **more)  # type: ignore[no-any-return]
+
+
+def _write_motion(body: Motion) -> dict[str, Any]:
+    if isinstance(body, motion.Composed):
+        return {"type": "composed", "base": _write_motion(body.base), "vibration": _write_motion(body.vibration)}
+    for word, (kind, form) in _MOTIONS.items():
+        if type(body) is kind:
+            table = {"type": word, **tables.encode(body, form)}
+            if isinstance(body, motion.HarmonicRates):
+                table["harmonics"] = [tables.encode(h, _HARMONIC) for h in body.harmonics]
+            return table
+    raise InputError(f"a motion of class {type(body).__name__} has no form in a file; keep it in Python")
+
+
+def _read_gyro(table: dict[str, Any], place: str) -> tuple[str, GyroSpec]:
+    name = table.pop("preset", "")
+    if not name:
+        return "", gyro.from_table(table, place)
+    from strapdown import datasheets
+
+    known_keys(place, table, {**tables.keys(gyro.FORM), "preset": None})
+    spec = datasheets.preset(name).spec
+    if not table:
+        return name, spec
+    import dataclasses
+
+    return "", dataclasses.replace(spec, **tables.decode(table, gyro.FORM, place))
+
+
+def _read_sensor(entry: Any, place: str) -> Sensor:
+    table = _table(entry, place)
+    word = _word(table, place, _SENSORS)
+    kind, form, unit = _SENSORS[word]
+    orbit = table.pop("orbit", None) if word == "magnetometer" else None
+    faults = _faults(unit)
+    known_keys(place, table, {**tables.keys(form), **tables.keys(faults)})
+    amiss = {key: table.pop(key) for key in list(table) if key in tables.keys(faults)}
+    more: dict[str, Any] = {"faults": vectors.Faults(**tables.decode(amiss, faults, place))}
+    if orbit is not None:
+        orbit_place = f"{place}: orbit"
+        more["field_f"] = tables.build(CircularOrbit, _table(orbit, orbit_place), _ORBIT, orbit_place).magnetic_field
+    return tables.build(kind, table, form, place, **more)  # type: ignore[no-any-return]
+
+
+def _write_sensor(sensor: Any) -> dict[str, Any]:
+    word = next((word for word, (kind, _, _) in _SENSORS.items() if type(sensor) is kind), None)
+    if word is None:
+        raise InputError(f"a sensor of class {type(sensor).__name__} has no form in a file; keep it in Python")
+    _, form, unit = _SENSORS[word]
+    if getattr(sensor, "acceleration_f", None) is not None:
+        raise InputError(f"{sensor.name}: acceleration_f is a function, which has no form in a file; keep it in Python")
+    field = getattr(sensor, "field_f", None)
+    if not callable(field):
+        return {"type": word, **tables.encode(sensor, form), **tables.encode(sensor.faults, _faults(unit))}
+    orbit = getattr(field, "__self__", None)
+    if not isinstance(orbit, CircularOrbit):
+        raise InputError(
+            f"{sensor.name}: field_f is a function of its own, which has no form in a file; keep it in Python"
+        )
+    rest = {name: choice for name, choice in form.items() if name != "field_f"}
+    table = {"type": word, **tables.encode(sensor, rest), **tables.encode(sensor.faults, _faults(unit))}
+    return {**table, "orbit": tables.encode(orbit, _ORBIT)}
+
+
+def scenario_to_table(scenario: Scenario) -> dict[str, Any]:
+    """Return a scenario as the table that its TOML file holds."""
+    table: dict[str, Any] = {}
+    for key in ("name", "description"):
+        if getattr(scenario, key):
+            table[key] = getattr(scenario, key)
+    table.update(seed=scenario.seed, rate_hz=scenario.rate, duration_s=scenario.duration)
+    if scenario.gravity_f != tuple(vectors.GRAVITY_F):
+        table["gravity_f_m_per_s2"] = list(scenario.gravity_f)
+    table["motion"] = _write_motion(scenario.motion)
+    table["gyro"] = {"preset": scenario.gyro_preset} if scenario.gyro_preset else gyro.to_table(scenario.gyro)
+    table["sensors"] = [_write_sensor(sensor) for sensor in scenario.sensors]
+    return table
+
+
+def scenario_to_toml(scenario: Scenario) -> str:
+    """Return a scenario as TOML; reading it gives the same scenario to the last bit."""
+    import tomli_w
+
+    return tomli_w.dumps(scenario_to_table(scenario))
+
+
+@functools.cache
+def builtin_rows() -> tuple[dict[str, object], ...]:
+    """Return one row a built-in scenario for printing: name, description, duration s, rate Hz, motion, gyro, sensors."""
+    rows = []
+    for name in SCENARIOS:
+        table = tomllib.loads((_BUILTIN / f"{name}.toml").read_text(encoding="utf-8"))
+        rows.append(
+            {
+                "name": name,
+                "description": table["description"],
+                "duration_s": table["duration_s"],
+                "rate_hz": table["rate_hz"],
+                "motion": table["motion"]["type"],
+                "gyro": table["gyro"].get("preset", "own figures"),
+                "sensors": ", ".join(sensor["name"] for sensor in table.get("sensors", [])),
+            }
+        )
+    return tuple(rows)

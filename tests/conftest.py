@@ -1,0 +1,45 @@
+"""Options and fixtures that several test files use."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+BROAD = Path(__file__).resolve().parents[1] / ".." / "shared" / "data" / "broad"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--slow", action="store_true", help="run the statistical studies too, which take minutes")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if config.getoption("--slow"):
+        return
+    skip = pytest.mark.skip(reason="a statistical study of minutes; run it with --slow")
+    for item in items:
+        if "slow" in item.keywords:
+            item.add_marker(skip)
+
+
+@pytest.fixture(scope="session")
+def broad() -> Path:
+    """Folder of the BROAD trials."""
+    if not any(BROAD.glob("*.hdf5")):
+        pytest.skip(f"no BROAD trials in {BROAD}; see doi 10.3390/data6070072 for them")
+    return BROAD.resolve()
+
+
+@pytest.fixture(scope="session")
+def rotation_vectors() -> Callable[..., np.ndarray]:
+    """Rotation vectors (n, 3) of random direction, their angles log-uniform between two bounds."""
+
+    def draw(n: int, smallest: float = 1e-12, largest: float = np.pi, seed: int = 7) -> np.ndarray:
+        random = np.random.default_rng(seed)
+        direction = random.standard_normal((n, 3))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        return direction * np.exp(random.uniform(np.log(smallest), np.log(largest), (n, 1)))
+
+    return draw

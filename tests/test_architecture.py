@@ -1,0 +1,250 @@
+"""The house: imports run downwards, faces stay on the top floor, and what is heavy loads when it is first needed."""
+
+from __future__ import annotations
+
+import ast
+import graphlib
+import subprocess
+import sys
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+import strapdown
+
+PACKAGE = Path(strapdown.__file__).parent
+
+FLOORS: tuple[tuple[str, ...], ...] = (
+    # 0 mathematics, and what everything stands on
+    ("checks", "files", "units", "tables", "randomness", "quaternion", "kinematics", "kernels"),
+    # 1 models
+    ("motion", "coning", "flicker", "gyro", "datasheets", "orbit", "vectors", "allan", "wahba"),
+    # 2 data
+    ("records", "recordings", "recordfiles", "scenarios"),
+    # 3 estimators
+    ("mekf", "smoother", "family", "ahrs"),
+    # 4 analysis
+    ("consistency", "montecarlo", "coning_study", "tuning"),
+    # 5 faces
+    ("plots", "report", "cli"),
+)
+"""Modules and sub-packages of ``strapdown`` by floor, from the ground up. An import may go down or stay on its floor, never up."""
+
+STRANGERS = (("motion", "coning"),)
+"""Pairs that never import each other: the closed-form truth and the integrator, so that neither can hide the other's fault."""
+
+DRAWING = ("plots", "report")
+PRINTING = ("cli",)
+MACHINES = ("kernels.machine", "kernels.lanes")
+"""Kernel modules that know of compilers; all others are plain Python."""
+
+
+def floor(unit: str) -> int:
+    for k, units in enumerate(FLOORS):
+        if unit in units:
+            return k
+    pytest.fail(
+        f"strapdown/{unit} stands on no floor; add it to FLOORS in {__file__} after shared/design/architecture.md"
+    )
+
+
+@cache
+def sources() -> dict[str, ast.Module]:
+    """Parsed source of every module by its name without ``strapdown.``; the package itself is ``""``."""
+    parsed = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        parts = path.relative_to(PACKAGE).with_suffix("").parts
+        parsed[".".join(part for part in parts if part != "__init__")] = ast.parse(
+            path.read_text(encoding="utf-8"), str(path)
+        )
+    return parsed
+
+
+def only_for_types(node: ast.AST) -> bool:
+    return isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+
+
+def imports(tree: ast.AST, *, lazy: bool = True) -> Iterator[str]:
+    """Full names that a module imports, without those for type checking alone; ``lazy``: those inside functions too."""
+    for node in ast.iter_child_nodes(tree):
+        if only_for_types(node):
+            continue
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"line {node.lineno}: import by the full name, not relatively"
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif lazy or not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            yield from imports(node, lazy=lazy)
+
+
+def internal(name: str) -> str | None:
+    """The module of the package that an imported name belongs to, dotted and without ``strapdown.``; None: from outside."""
+    first, _, rest = name.partition(".")
+    if first != "strapdown":
+        return None
+    while rest not in sources():
+        rest = rest.rpartition(".")[0]
+    return rest
+
+
+def unit(module: str) -> str:
+    return module.partition(".")[0]
+
+
+def test_every_module_stands_on_a_floor():
+    for module in sources():
+        if module:
+            floor(unit(module))
+
+
+def test_no_module_is_listed_twice():
+    listed = [name for units in FLOORS for name in units]
+    assert len(set(listed)) == len(listed)
+
+
+@pytest.mark.parametrize("module", sources())
+def test_imports_run_downwards(module):
+    for name in imports(sources()[module]):
+        other = internal(name)
+        if other is None or not other or unit(other) == unit(module):
+            continue
+        assert module, f"strapdown/__init__.py imports {other}; the front door loads nothing"
+        assert floor(unit(other)) <= floor(unit(module)), f"{module} imports {other}, which stands on a higher floor"
+
+
+def test_no_circle_of_imports():
+    graph: dict[str, set[str]] = {}
+    for module, tree in sources().items():
+        if module:
+            others = {unit(other) for name in imports(tree) if (other := internal(name))}
+            graph.setdefault(unit(module), set()).update(others - {unit(module)})
+    graphlib.TopologicalSorter(graph).prepare()  # raises CycleError and names the circle
+
+
+@pytest.mark.parametrize(("one", "other"), STRANGERS)
+def test_strangers_never_meet(one, other):
+    for module, tree in sources().items():
+        seen = {unit(found) for name in imports(tree) if (found := internal(name))}
+        if unit(module) in (one, other):
+            assert not seen & ({one, other} - {unit(module)}), f"{module} imports its stranger"
+
+
+def top_names(tree: ast.AST) -> set[str]:
+    return {name.partition(".")[0] for name in imports(tree)}
+
+
+@pytest.mark.parametrize("module", sources())
+def test_only_the_drawing_modules_import_matplotlib(module):
+    if unit(module) not in DRAWING:
+        assert not top_names(sources()[module]) & {"matplotlib", "mpl_toolkits"}
+
+
+@pytest.mark.parametrize("module", sources())
+def test_only_the_command_line_prints(module):
+    if unit(module) in PRINTING:
+        return
+    tree = sources()[module]
+    assert not top_names(tree) & {"rich", "typer", "click", "logging"}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            call = ast.unparse(node.func)
+            assert call != "print", f"{module} line {node.lineno} prints"
+            assert not call.startswith(("sys.stdout", "sys.stderr")), f"{module} line {node.lineno} prints"
+
+
+@pytest.mark.parametrize("module", [name for name in sources() if unit(name) == "kernels"])
+def test_kernels_are_plain_python(module):
+    """They import one another, by name, and nothing but ``math`` and NumPy's number types; the machine knows numba, when asked."""
+    tree = sources()[module]
+    for name in imports(tree):
+        other = internal(name)
+        assert other is None or unit(other) == "kernels", f"{module} imports {other}"
+    if module in MACHINES:
+        return
+    assert top_names(tree) <= {"__future__", "math", "numpy", "strapdown"}
+    for name in imports(tree):
+        other = internal(name)
+        assert other not in MACHINES, f"{module} imports {other}; kernels do not know what compiles them"
+        assert other is None or name != f"strapdown.{other}", (
+            f"{module} imports the module {name}; import its functions by name"
+        )
+
+
+def test_the_machine_loads_its_compiler_when_asked():
+    outside = {name.partition(".")[0] for name in imports(sources()["kernels.machine"], lazy=False)}
+    assert not outside & {"numba", "llvmlite"}
+
+
+@pytest.mark.parametrize("module", sources())
+def test_global_random_numbers_are_not_used(module):
+    """Randomness is an argument."""
+    for node in ast.walk(sources()[module]):
+        if isinstance(node, ast.Attribute) and ast.unparse(node.value) in ("np.random", "numpy.random"):
+            known = (
+                "default_rng",
+                "Generator",
+                "BitGenerator",
+                "SeedSequence",
+                "PCG64",
+                "PCG64DXSM",
+                "Philox",
+                "SFC64",
+            )
+            assert node.attr in known, f"{module} line {node.lineno}: {ast.unparse(node)}"
+        if isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("default_rng", "SeedSequence")):
+            assert node.args or node.keywords, f"{module} line {node.lineno}: {ast.unparse(node)} without a seed"
+    assert "random" not in top_names(sources()[module])
+
+
+def loaded_by(code: str) -> set[str]:
+    """Top-level modules in memory after running some code in a new process."""
+    script = (
+        f"import sys\n{code}\nsys.stderr.write('\\n' + ' '.join(sorted({{m.partition('.')[0] for m in sys.modules}})))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 0, done.stderr
+    return set(done.stderr.splitlines()[-1].split())
+
+
+def test_import_strapdown_is_quick():
+    assert not loaded_by("import strapdown") & {
+        "numba",
+        "llvmlite",
+        "matplotlib",
+        "scipy",
+        "h5py",
+        "numpy",
+        "filterpy",
+        "rich",
+    }
+
+
+HELP = """
+from strapdown import cli
+sys.argv = ["strapdown", {!r}]
+try:
+    cli.main()
+except SystemExit as end:
+    assert not end.code
+"""
+
+EACH = """
+import importlib
+for name in {!r}:
+    importlib.import_module("strapdown." + name)
+    assert not {{"numba", "matplotlib"}} & set(sys.modules), name
+"""
+
+
+@pytest.mark.parametrize("option", ["--help", "--version"])
+def test_help_loads_neither_compiler_nor_plots(option):
+    assert not loaded_by(HELP.format(option)) & {"numba", "llvmlite", "matplotlib", "scipy", "h5py", "filterpy"}
+
+
+def test_modules_load_neither_compiler_nor_plots():
+    """All but the drawing ones, in one process: numba and matplotlib come when first needed."""
+    names = sorted(name for name in sources() if name and unit(name) not in DRAWING)
+    assert not loaded_by(EACH.format(names)) & {"numba", "llvmlite", "matplotlib"}

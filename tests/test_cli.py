@@ -1,0 +1,407 @@
+"""The command line: what it writes, what it says, and how it refuses."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+import strapdown
+from strapdown import cli, recordings
+from strapdown.coning_study import ALGORITHMS
+from strapdown.records import read_estimate
+
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.fixture
+def run(monkeypatch, capsys, tmp_path):
+    """Run ``strapdown ARGUMENTS`` in an empty folder; return exit status, standard output and standard error."""
+    monkeypatch.chdir(tmp_path)
+
+    def command(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["strapdown", *map(str, arguments)])
+        try:
+            cli.main()
+            status = 0
+        except SystemExit as end:
+            status = end.code or 0
+        said = capsys.readouterr()
+        return status, said.out, said.err
+
+    return command
+
+
+def one_line(text: str) -> str:
+    """The text with the frames and line breaks of a usage error taken out."""
+    return " ".join(text.replace("│", " ").split())
+
+
+# ---------------------------------------------------------------------------------------------------- the whole
+
+
+def test_version(run):
+    assert run("--version") == (0, f"strapdown {strapdown.__version__}\n", "")
+
+
+def test_help_names_the_commands(run):
+    status, said, _ = run("--help")
+    assert status == 0
+    for command in ("coning", "estimate"):
+        assert command in said
+        assert run(command, "--help")[0] == 0
+
+
+def test_the_installed_script_is_this_one():
+    script = Path(sys.executable).with_name("strapdown")
+    if not script.exists():
+        pytest.skip("strapdown is not installed beside this Python; pip install -e .")
+    done = subprocess.run([script, "--version"], capture_output=True, text=True, timeout=60, check=False)
+    assert done.stdout == f"strapdown {strapdown.__version__}\n"
+
+
+def test_unknown_commands_and_options_end_with_status_2(run, tmp_path):
+    for arguments in (("conning",), ("coning", "--angel", "1"), ("coning", "--runs", "many"), ("estimate",)):
+        status, _, error = run(*arguments)
+        assert status == 2
+        assert error.strip()
+    assert not list(tmp_path.iterdir())
+
+
+def test_ctrl_c_ends_with_status_130(run, monkeypatch, tmp_path):
+    from strapdown import coning_study
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(coning_study, "run", interrupted)
+    status, _, error = run("coning")
+    assert status == 130
+    assert "Traceback" not in error
+    assert not list(tmp_path.iterdir())
+
+
+# ---------------------------------------------------------------------------------------------------- coning
+
+
+SMALL = ("--runs", 3, "--duration", 24, "--seed", 5)
+
+SCENARIO_KEYS = {"angle_deg", "frequency_hz", "rate_hz", "duration_s", "runs", "seed"}
+INTEGRATION_KEYS = {"algorithm", "samples", "drift_deg_per_hour", "predicted_deg_per_hour"}
+FILTER_KEYS = {
+    "integration",
+    "runs",
+    "attitude_rms_arcsec",
+    "bias_rms_deg_per_hour",
+    "bias_mean_deg_per_hour",
+    "anees",
+    "anees_bounds",
+    "nis",
+    "nis_bounds",
+    "consistent",
+}
+
+
+@pytest.fixture(scope="module")
+def coning(tmp_path_factory) -> tuple[Path, dict, str]:
+    """One small study: its folder, its JSON and what was printed."""
+    out = tmp_path_factory.mktemp("coning") / "results"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["strapdown", "coning", *map(str, SMALL), "--out", str(out)])
+        with cli.console.capture() as said, pytest.raises(SystemExit) as end:
+            cli.main()
+    assert not end.value.code
+    return out, json.loads((out / "coning.json").read_text()), said.get()
+
+
+def test_coning_json_has_the_keys_that_others_read(coning):
+    """Exactly those of issue A at the top, those at least below: more may come, none may go."""
+    _, study, _ = coning
+    assert set(study) == {"scenario", "integration", "filter"}
+    assert set(study["scenario"]) >= SCENARIO_KEYS
+    assert all(set(row) >= INTEGRATION_KEYS for row in study["integration"])
+    assert all(set(row) >= FILTER_KEYS for row in study["filter"])
+    assert [row["algorithm"] for row in study["integration"]] == list(ALGORITHMS)
+    assert [row["integration"] for row in study["filter"]] == list(ALGORITHMS)
+
+
+def test_coning_json_holds_sound_values(coning):
+    _, study, _ = coning
+    scenario = study["scenario"]
+    assert (scenario["runs"], scenario["seed"], scenario["duration_s"]) == (3, 5, 24.0)
+    assert scenario["angle_deg"] == pytest.approx(0.7, rel=1e-12)
+    for row in study["integration"]:
+        assert type(row["samples"]) is int
+    for row in study["filter"]:
+        assert type(row["consistent"]) is bool
+        assert row["runs"] == 3
+        assert row["attitude_rms_arcsec"] > 0.0
+        assert row["bias_rms_deg_per_hour"] > 0.0
+        assert len(row["bias_mean_deg_per_hour"]) == 3
+        for name in ("anees", "nis"):
+            low, high = row[f"{name}_bounds"]
+            assert 0.0 < low < 1.0 < high
+            assert row[name] > 0.0
+
+
+def test_coning_shows_what_it_is_for(coning):
+    """The uncorrected integration drifts as predicted; the filter takes that for a bias of the other sign, and fails for it."""
+    _, study, _ = coning
+    drift = {row["algorithm"]: row for row in study["integration"]}
+    outcome = {row["integration"]: row for row in study["filter"]}
+    measured, predicted = (drift["one-sample"][k] for k in ("drift_deg_per_hour", "predicted_deg_per_hour"))
+    assert measured == pytest.approx(predicted, rel=0.02)
+    # ½ sin²β ω (1 − sin λ/λ) at β = 0.7°, ω = 2π 10 rad/s, λ = 2π/10, by hand
+    beta, omega, lam = np.deg2rad(0.7), 20.0 * np.pi, 0.2 * np.pi
+    by_hand = -0.5 * np.sin(beta) ** 2 * omega * (1.0 - np.sin(lam) / lam)
+    assert predicted == pytest.approx(np.rad2deg(by_hand) * 3600.0, rel=1e-9)
+    assert abs(drift["four-sample"]["drift_deg_per_hour"]) < 0.01 * abs(measured)
+    assert not outcome["one-sample"]["consistent"]
+    assert outcome["matched-4-11"]["consistent"]
+    assert outcome["one-sample"]["bias_rms_deg_per_hour"] > 2.0 * outcome["four-sample"]["bias_rms_deg_per_hour"]
+
+
+def test_coning_writes_figures_and_says_where(coning):
+    out, _, said = coning
+    written = {path.name for path in out.iterdir()}
+    assert "coning.json" in written
+    assert len(written) >= 4
+    for path in out.iterdir():
+        assert path.name in said
+        if path.suffix == ".png":
+            assert path.read_bytes().startswith(PNG)
+    assert "FAIL" in said
+    assert "pass" in said
+
+
+def test_coning_is_the_same_for_the_same_seed(run, coning, tmp_path):
+    status, _, _ = run("coning", *SMALL, "--out", tmp_path / "again")
+    assert status == 0
+    assert json.loads((tmp_path / "again" / "coning.json").read_text()) == coning[1]
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_short_study_warns_of_nothing(run, tmp_path):
+    assert run("coning", "--runs", 1, "--duration", 12, "--out", tmp_path / "short")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--runs", 0), "runs is 0; it must be a whole number of 1 or more"),
+        (("--runs", -3), "runs is -3"),
+        (("--seed", -1), "seed is -1; it must be a whole number of 0 or more"),
+        (("--angle", 0), "angle is 0; it must be greater than zero"),
+        (("--angle", 200), "angle is 3.49"),
+        (("--angle", "nan"), "angle is nan; it must be a finite number"),
+        (("--frequency", -1), "frequency is -1"),
+        (("--rate", 0), "rate is 0"),
+        (("--rate", "inf"), "rate is inf"),
+        (("--duration", -5), "duration is -5"),
+    ],
+)
+def test_bad_options_end_with_one_clear_line_and_nothing_written(run, tmp_path, options, words):
+    status, said, error = run("coning", *options, "--out", tmp_path / "results")
+    assert status == 2
+    assert said == ""
+    assert error.startswith("error: ")
+    assert words in error
+    assert error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_output_folder_that_cannot_be_is_said_before_the_work(run, monkeypatch, tmp_path):
+    from strapdown import coning_study
+
+    monkeypatch.setattr(coning_study, "run", lambda *_, **__: pytest.fail("computed before the folder was looked at"))
+    (tmp_path / "results").write_text("a file")
+    status, _, error = run("coning", *SMALL, "--out", tmp_path / "results")
+    assert status == 2
+    assert error.startswith("error: ")
+    assert "results" in error
+
+
+# ---------------------------------------------------------------------------------------------------- estimate
+
+
+def walk(n: int = 800, rate: float = 100.0) -> np.ndarray:
+    """Columns time, gx … mz of a unit at rest for two seconds, then yawing at 20 °/s about the vertical."""
+    time = np.arange(n) / rate
+    yaw = np.deg2rad(20.0) * np.maximum(time - 2.0, 0.0)
+    speed = np.where(time >= 2.0, np.deg2rad(20.0), 0.0)
+    zero = np.zeros(n)
+    # The body frame yawed by ψ from East-North-Up sees North at (sin ψ, cos ψ).
+    return np.stack(
+        [time, zero, zero, speed, zero, zero, zero + 9.81, 20.0 * np.sin(yaw), 20.0 * np.cos(yaw), zero - 40.0], -1
+    )
+
+
+def write_csv(path: Path, columns: np.ndarray, header: str) -> Path:
+    np.savetxt(path, columns, delimiter=",", header=header, comments="", fmt="%.9g")
+    return path
+
+
+UNITS = "time,gx [rad/s],gy,gz,ax [m/s2],ay,az,mx,my,mz"
+BARE = "time,gx,gy,gz,ax,ay,az,mx,my,mz"
+
+
+def yaw_of(attitude: np.ndarray) -> np.ndarray:
+    w, x, y, z = np.moveaxis(attitude, -1, 0)
+    return np.unwrap(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+
+
+def test_estimate_on_csv(run, tmp_path):
+    columns = walk()
+    status, said, error = run("estimate", write_csv(tmp_path / "walk.csv", columns, UNITS), "--out", tmp_path / "out")
+    assert (status, error) == (0, "")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"estimate.h5", "estimate.png"}
+    assert "walk.csv" in said
+    estimate = read_estimate(tmp_path / "out" / "estimate.h5")
+    np.testing.assert_allclose(estimate.time, columns[:, 0], atol=1e-9)
+    wanted = np.deg2rad(20.0) * np.maximum(columns[:, 0] - 2.0, 0.0)
+    np.testing.assert_allclose(yaw_of(estimate.attitude), wanted, atol=np.deg2rad(0.3))
+    assert estimate.covariance is None
+    with h5py.File(tmp_path / "out" / "estimate.h5") as file:
+        assert file.attrs["source"] == "walk.csv"
+        assert "scalar first" in file.attrs["conventions"]
+        assert "East-North-Up" in file.attrs["fixed_frame"]
+        assert file["bias"].attrs["unit"] == "rad/s"
+        assert file.attrs["parameter.reference_rate"] > 0.0
+
+
+def test_estimate_takes_units_by_option(run, tmp_path):
+    columns = walk()
+    columns[:, 0] *= 1e3
+    columns[:, 1:4] = np.rad2deg(columns[:, 1:4])
+    columns[:, 4:7] /= 9.80665
+    path = write_csv(tmp_path / "walk.csv", columns, BARE)
+    options = ("--gyro-unit", "deg/s", "--accelerometer-unit", "g", "--time-unit", "ms", "--full-covariance")
+    status, _, error = run("estimate", path, "--out", tmp_path / "out", *options)
+    assert (status, error) == (0, "")
+    estimate = read_estimate(tmp_path / "out" / "estimate.h5")
+    assert estimate.time[-1] == pytest.approx(7.99)
+    assert yaw_of(estimate.attitude)[-1] == pytest.approx(np.deg2rad(20.0 * 5.99), abs=np.deg2rad(0.3))
+    assert estimate.covariance.shape == (800, 6, 6)
+
+
+def test_estimate_without_a_magnetometer(run, tmp_path):
+    path = write_csv(tmp_path / "walk.csv", walk()[:, :7], UNITS.removesuffix(",mx,my,mz"))
+    assert run("estimate", path, "--out", tmp_path / "out")[0] == 0
+    assert read_estimate(tmp_path / "out" / "estimate.h5").attitude.shape == (800, 4)
+
+
+def test_estimate_tells_of_missing_samples(run, tmp_path):
+    columns = walk()
+    columns[500:507, 4:7] = np.nan
+    _, said, _ = run("estimate", write_csv(tmp_path / "walk.csv", columns, UNITS), "--out", tmp_path / "out")
+    assert "7 samples of the accelerometer" in said
+
+
+def test_estimate_on_broad(run, broad, tmp_path):
+    path = broad / "11_undisturbed_slow_translation_B.hdf5"
+    status, said, error = run("estimate", path, "--out", tmp_path / "out")
+    assert (status, error) == (0, "")
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {
+        "estimate.h5",
+        "estimate.png",
+        "errors.json",
+        "errors.png",
+    }
+    errors = json.loads((tmp_path / "out" / "errors.json").read_text())
+    assert errors["source"] == path.name
+    assert 0.3 < errors["total_rmse_deg"] < 6.0
+    assert errors["heading_rmse_deg"] <= errors["total_rmse_deg"]
+    assert errors["inclination_rmse_deg"] <= errors["total_rmse_deg"]
+    assert f"{errors['total_rmse_deg']:.2f}" in said
+
+
+def bad_csv(folder: Path, case: str) -> Path:
+    columns, header = walk(300), UNITS
+    path = folder / f"{case}.csv"
+    if case == "undeclared":
+        header = BARE
+    elif case == "unsorted":
+        columns[[10, 11]] = columns[[11, 10]]
+    elif case == "nan":
+        columns[7, 2] = np.nan
+    elif case == "short":
+        columns = columns[:50]
+    write_csv(path, columns, header)
+    if case == "truncated":
+        content = path.read_bytes()
+        path.write_bytes(content[: content.rfind(b",")])
+    return path
+
+
+@pytest.mark.parametrize(
+    ("case", "words"),
+    [
+        (
+            "undeclared",
+            "does not say the unit of its gyro columns; declare it in the header, as in gx [rad/s], or by option",
+        ),
+        ("unsorted", "time[11] goes back to 0.1 s after 0.11 s; sort the stamps"),
+        ("nan", "rate[7, 1] is nan"),
+        ("short", "lasts 0.49 s; the start needs at least 1 s"),
+        ("truncated", "data row 300 has 9 fields, the header 10; the file is truncated"),
+    ],
+    ids=["undeclared", "unsorted", "nan", "short", "truncated"],
+)
+def test_bad_recordings_end_with_one_clear_line_and_nothing_written(run, tmp_path, case, words):
+    status, said, error = run("estimate", bad_csv(tmp_path, case), "--out", tmp_path / "out")
+    assert status == 2
+    assert said == ""
+    assert error.startswith("error: ")
+    assert f"{case}.csv" in error
+    assert words in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_recording_and_an_unknown_unit_are_refused(run, tmp_path):
+    status, _, error = run("estimate", tmp_path / "none.csv")
+    assert (status, "none.csv does not exist; check the path" in error) == (2, True)
+    path = write_csv(tmp_path / "walk.csv", walk(300), BARE)
+    status, _, error = run("estimate", path, "--gyro-unit", "deg/sec", "--accelerometer-unit", "g")
+    assert (status, "did you mean 'deg/s'?" in error) == (2, True)
+    assert [p.name for p in tmp_path.iterdir()] == ["walk.csv"]
+
+
+def test_a_name_in_brackets_is_said_as_it_is(run, tmp_path):
+    """Square brackets are mark-up to rich; in a file's name they are letters."""
+    good = write_csv(tmp_path / "walk [red] [x].csv", walk(300), UNITS)
+    status, said, _ = run("estimate", good, "--out", tmp_path / "out")
+    assert status == 0
+    assert "walk [red] [x].csv: " in said
+    status, _, error = run("estimate", tmp_path / "none [bold].csv")
+    assert status == 2
+    assert "none [bold].csv does not exist" in error
+    status, _, error = run("estimate", "none [/b].csv")
+    assert status == 2
+    assert "none [/b].csv does not exist" in error
+
+
+def test_nothing_is_written_where_there_is_nothing_to_judge(run, tmp_path):
+    """Truth without a sample of movement is bad input like any other: said first, with nothing left behind."""
+    columns = walk()
+    with h5py.File(tmp_path / "still.hdf5", "w") as file:
+        file.attrs["sampling_rate"] = 100.0
+        file["imu_gyr"], file["imu_acc"], file["imu_mag"] = columns[:, 1:4], columns[:, 4:7], columns[:, 7:]
+        file["opt_quat"] = np.tile([1.0, 0.0, 0.0, 0.0], (len(columns), 1))
+        file["movement"] = np.zeros(len(columns), bool)
+    status, _, error = run("estimate", tmp_path / "still.hdf5", "--out", tmp_path / "out")
+    assert status == 2
+    assert "no sample to judge" in error
+    assert not (tmp_path / "out").exists()
+
+
+def test_units_in_the_help_are_those_that_are_known(run):
+    _, said, _ = run("estimate", "--help")
+    text = one_line(said)
+    for unit in (*recordings.RATE_UNITS, *recordings.FORCE_UNITS, *recordings.TIME_UNITS):
+        assert unit in text

@@ -1,0 +1,104 @@
+"""Files appear whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+
+from strapdown.files import write_json, written_beside
+
+
+def names(folder) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_the_target_appears_only_at_the_end(tmp_path):
+    target = tmp_path / "new" / "folder" / "result.png"
+    with written_beside(target) as temporary:
+        assert temporary.parent == target.parent
+        assert temporary.suffix == ".png"
+        assert temporary != target
+        temporary.write_text("whole")
+        assert not target.exists()
+    assert target.read_text() == "whole"
+    assert names(target.parent) == ["result.png"]
+
+
+class Killed(BaseException):
+    """Not an Exception, like KeyboardInterrupt."""
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, Killed])
+def test_an_interrupted_write_leaves_the_old_file_and_no_temporary(tmp_path, error):
+    target = tmp_path / "result.json"
+    target.write_text("old")
+
+    def interrupted() -> None:
+        with written_beside(target) as temporary:
+            temporary.write_text("half of the n")
+            raise error
+
+    with pytest.raises(error):
+        interrupted()
+    assert target.read_text() == "old"
+    assert names(tmp_path) == ["result.json"]
+
+
+def test_a_failed_first_write_leaves_nothing(tmp_path):
+    def failing() -> None:
+        with written_beside(tmp_path / "result.json") as temporary:
+            temporary.write_text("half")
+            raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        failing()
+    assert names(tmp_path) == []
+
+
+def test_a_writer_that_removes_or_replaces_the_temporary_is_served(tmp_path):
+    """h5py truncates, matplotlib reopens; some writers rename over what they were given."""
+    target = tmp_path / "result.txt"
+    with written_beside(target) as temporary:
+        other = tmp_path / "other"
+        other.write_text("from elsewhere")
+        other.replace(temporary)
+    assert target.read_text() == "from elsewhere"
+    assert names(tmp_path) == ["result.txt"]
+
+
+def test_two_writers_at_once_do_not_meet(tmp_path):
+    target = tmp_path / "result.txt"
+    with written_beside(target) as first, written_beside(target) as second:
+        assert first != second
+        first.write_text("first")
+        second.write_text("second")
+    assert target.read_text() == "first"  # whose block ended last
+    assert names(tmp_path) == ["result.txt"]
+
+
+def test_written_files_are_readable_by_others(tmp_path):
+    write_json(tmp_path / "result.json", {})
+    assert (tmp_path / "result.json").stat().st_mode & 0o044 == 0o044
+
+
+def test_write_json(tmp_path):
+    content = {"angle_deg": 0.1, "runs": [1, 2], "name": "Größe °/h"}
+    write_json(tmp_path / "result.json", content)
+    text = (tmp_path / "result.json").read_text(encoding="utf-8")
+    assert json.loads(text) == content
+    assert text.endswith("}\n")
+
+
+@pytest.mark.parametrize("bad", [{"x": math.nan}, {"x": [math.inf]}, {"x": object()}])
+def test_what_json_cannot_tell_is_refused_and_nothing_is_touched(tmp_path, bad):
+    target = tmp_path / "result.json"
+    target.write_text("old")
+    with pytest.raises((ValueError, TypeError)):
+        write_json(target, bad)
+    assert target.read_text() == "old"
+    assert names(tmp_path) == ["result.json"]
+    with pytest.raises((ValueError, TypeError)):
+        write_json(tmp_path / "folder" / "result.json", bad)
+    assert names(tmp_path) == ["result.json"]

@@ -1,0 +1,224 @@
+"""Rates and Jacobians. The numbered equations have their own file; here: shapes, round trips, and the Jacobians against mpmath."""
+
+from __future__ import annotations
+
+import mpmath as mp
+import numpy as np
+import pytest
+
+from strapdown import kinematics, quaternion
+from strapdown.checks import InputError
+
+SHAPES = [(), (1,), (5,), (2, 3)]
+EPS = np.finfo(float).eps
+
+
+def random(shape: tuple[int, ...], last: int, seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).standard_normal((*shape, last))
+
+
+# ---------------------------------------------------------------------------------------------------- rates
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_rates_and_derivatives_are_inverse(shape):
+    q, w = quaternion.normalize(random(shape, 4, 1)), random(shape, 3, 2)
+    body = kinematics.body_quaternion_derivative(q, w)
+    fixed = kinematics.fixed_quaternion_derivative(q, w)
+    assert body.shape == fixed.shape == (*shape, 4)
+    np.testing.assert_allclose(kinematics.body_rate(q, body), w, atol=1e-14)
+    np.testing.assert_allclose(kinematics.fixed_rate(q, fixed), w, atol=1e-14)
+    np.testing.assert_allclose(kinematics.body_to_fixed_rate(q, w), kinematics.fixed_rate(q, body), atol=1e-14)
+    np.testing.assert_allclose(kinematics.fixed_to_body_rate(q, w), kinematics.body_rate(q, fixed), atol=1e-14)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_skew_is_the_cross_product(shape):
+    a, b = random(shape, 3, 3), random(shape, 3, 4)
+    np.testing.assert_allclose((kinematics.skew(a) @ b[..., None])[..., 0], np.cross(a, b), atol=4 * EPS)
+    np.testing.assert_array_equal(kinematics.skew(a), -np.swapaxes(kinematics.skew(a), -1, -2))
+
+
+# ---------------------------------------------------------------------------------------------------- Jacobians
+
+
+def mp_skew(v):
+    x, y, z = v
+    return mp.matrix([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
+def mp_jacobian(phi: np.ndarray) -> np.ndarray:
+    """J_r from its power series Σ (−[φ])ᵏ/(k+1)!, summed in 60 digits: no closed form, no join."""
+    with mp.workdps(60):
+        step = -mp_skew([mp.mpf(float(c)) for c in phi])
+        term = total = mp.eye(3)
+        for k in range(1, 90):
+            term = term * step / (k + 1)
+            total = total + term
+        return np.array([[float(total[i, j]) for j in range(3)] for i in range(3)])
+
+
+def mp_inverse_jacobian(phi: np.ndarray) -> np.ndarray:
+    with mp.workdps(60):
+        step = -mp_skew([mp.mpf(float(c)) for c in phi])
+        term = total = mp.eye(3)
+        for k in range(1, 120):
+            term = term * step / (k + 1)
+            total = total + term
+        inverse = total**-1
+        return np.array([[float(inverse[i, j]) for j in range(3)] for i in range(3)])
+
+
+CASES = {
+    "right": (kinematics.right_jacobian, mp_jacobian),
+    "inverse": (kinematics.inverse_right_jacobian, mp_inverse_jacobian),
+}
+
+
+@pytest.mark.parametrize("which", CASES)
+def test_jacobian_is_good_to_four_ulp_over_all_angles(which, rotation_vectors):
+    """Relative to the matrix; and its skew part, all that is left of a small angle, relative to itself."""
+    function, oracle = CASES[which]
+    for phi in np.concatenate([rotation_vectors(110), rotation_vectors(30, 1.0, np.pi, seed=8)]):
+        actual, wanted = function(phi), oracle(phi)
+        error = actual - wanted
+        size = np.abs(wanted).max()
+        assert np.abs(error).max() <= 4 * EPS * size
+        skew, skew_error = (0.5 * (m - m.T) for m in (wanted, error))
+        # where the symmetric part is large its rounding enters the off-diagonal entries too
+        symmetric = np.abs(wanted + wanted.T)[~np.eye(3, dtype=bool)].max()
+        assert np.abs(skew_error).max() <= 4 * EPS * (np.abs(skew).max() + 0.5 * symmetric)
+
+
+@pytest.mark.parametrize("which", CASES)
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_coefficients_are_good_to_four_ulp(which, axis):
+    """About one axis the entries are the coefficients themselves: sin θ/θ, (1 − cos θ)/θ; (θ/2) cot(θ/2), θ/2. And θ − sin θ alone."""
+    function, oracle = CASES[which]
+    j, k = (axis + 1) % 3, (axis + 2) % 3
+    for angle in np.exp(np.random.default_rng(axis).uniform(np.log(1e-12), np.log(np.pi), 60)):
+        phi = angle * np.eye(3)[axis]
+        actual, wanted = function(phi), oracle(phi)
+        assert abs(actual[j, k] - wanted[j, k]) <= 4 * EPS * abs(wanted[j, k])
+        assert actual[j, k] == -actual[k, j]
+        assert abs(actual[j, j] - wanted[j, j]) <= 4 * EPS
+        assert actual[axis, axis] == 1.0
+
+
+@pytest.mark.parametrize("which", CASES)
+def test_quadratic_coefficient_keeps_its_digits(which):
+    """Off-diagonal entries of [φ]² stand alone where the skew part vanishes: with φ = (a, a, 0), entry (0, 1) is a² × the coefficient."""
+    function, _ = CASES[which]
+    with mp.workdps(60):
+        for angle in np.exp(np.random.default_rng(4).uniform(np.log(1e-6), np.log(np.pi), 80)):
+            a = float(angle / np.sqrt(2.0))
+            theta = mp.sqrt(2) * mp.mpf(a)
+            third = (theta - mp.sin(theta)) / theta**3
+            inverse = (1 - theta / 2 * mp.cot(theta / 2)) / theta**2
+            wanted = float(mp.mpf(a) ** 2 * (third if which == "right" else inverse))
+            actual = function([a, a, 0.0])[0, 1]
+            assert abs(actual - wanted) <= 4 * EPS * abs(wanted)
+
+
+@pytest.mark.parametrize("which", CASES)
+def test_series_and_closed_form_meet_without_a_step(which):
+    function, oracle = CASES[which]
+    direction = np.array([0.48, 0.6, 0.64])
+    for angle in 2.0 * (1.0 + np.array([-1e-3, -1e-9, -EPS, 0.0, EPS, 1e-9, 1e-3])):
+        wanted = oracle(angle * direction)
+        assert np.abs(function(angle * direction) - wanted).max() <= 4 * EPS * np.abs(wanted).max()
+
+
+@pytest.mark.parametrize("angle", [1e-9, 1e-3, 0.5, 2.0, 3.0, 5.0])
+def test_definition_exp_of_a_sum(angle):
+    """exp(φ + δ) = exp(φ) ⊗ exp(J_r(φ) δ): the derivative of Log(exp(−φ) ⊗ exp(φ + δ)) at δ = 0, by 60-digit differences."""
+    phi = angle * np.array([0.36, -0.48, 0.8])
+
+    def exp(v):
+        theta = mp.sqrt(sum(c * c for c in v))
+        s = mp.sin(theta / 2) / theta
+        return [mp.cos(theta / 2), *(s * c for c in v)]
+
+    def times(p, q):
+        a, b, c, d = p
+        w, x, y, z = q
+        return [
+            a * w - b * x - c * y - d * z,
+            a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x,
+            a * z + b * y - c * x + d * w,
+        ]
+
+    J = np.empty((3, 3))
+    with mp.workdps(60):
+        exact = [mp.mpf(float(c)) for c in phi]
+        back = exp([-c for c in exact])
+        h = mp.mpf(10) ** -25
+        for k in range(3):
+            columns = []
+            for sign in (1, -1):
+                moved = [c + (sign * h if i == k else 0) for i, c in enumerate(exact)]
+                difference = times(back, exp(moved))
+                columns.append([2 * c / difference[0] for c in difference[1:]])  # the log, to third order in h
+            J[:, k] = [float((a - b) / (2 * h)) for a, b in zip(*columns, strict=True)]
+    np.testing.assert_allclose(kinematics.right_jacobian(phi), J, rtol=0.0, atol=4 * EPS)
+
+
+def test_body_rate_is_the_jacobian_times_the_derivative_of_the_rotation_vector(rotation_vectors):
+    """w_b = J_r(φ) φ̇ against equation (17) with q̇ from central differences of exp; and the Bortz equation back."""
+    phi, speed = rotation_vectors(40, 0.01, 3.0), random((40,), 3, 9)
+    h = 1e-5
+    points = [quaternion.exp(phi + m * h * speed) for m in (-2, -1, 1, 2)]
+    q_dot = (points[0] - 8.0 * points[1] + 8.0 * points[2] - points[3]) / (12.0 * h)
+    w_b = kinematics.body_rate(quaternion.exp(phi), q_dot)
+    np.testing.assert_allclose((kinematics.right_jacobian(phi) @ speed[..., None])[..., 0], w_b, atol=1e-9)
+    np.testing.assert_allclose((kinematics.inverse_right_jacobian(phi) @ w_b[..., None])[..., 0], speed, atol=5e-9)
+
+
+def test_both_jacobians_are_inverse(rotation_vectors):
+    phi = np.concatenate([rotation_vectors(60), rotation_vectors(40, 3.0, 5.5)])
+    product = kinematics.right_jacobian(phi) @ kinematics.inverse_right_jacobian(phi)
+    np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=2e-14)
+
+
+def test_transpose_is_the_left_jacobian(rotation_vectors):
+    """J_l(φ) = J_r(−φ) = J_r(φ)ᵀ = R(φ) J_r(φ)."""
+    phi = rotation_vectors(60)
+    J = kinematics.right_jacobian(phi)
+    np.testing.assert_allclose(kinematics.right_jacobian(-phi), np.swapaxes(J, -1, -2), atol=2 * EPS)
+    np.testing.assert_allclose(quaternion.to_matrix(quaternion.exp(phi)) @ J, np.swapaxes(J, -1, -2), atol=8 * EPS)
+
+
+@pytest.mark.parametrize("function", [kinematics.right_jacobian, kinematics.inverse_right_jacobian])
+@pytest.mark.parametrize("shape", [*SHAPES, (0,)])
+def test_batch_shapes(function, shape):
+    phi = random(shape, 3, 5)
+    J = function(phi)
+    assert J.shape == (*shape, 3, 3)
+    for index in np.ndindex(shape):
+        np.testing.assert_array_equal(J[index], function(phi[index]))
+    np.testing.assert_array_equal(function(np.zeros((*shape, 3))), np.broadcast_to(np.eye(3), J.shape))
+
+
+@pytest.mark.parametrize("angle", [2.0 * np.pi, 7.0])
+def test_inverse_jacobian_beyond_a_whole_turn_is_refused(angle):
+    """J_r is singular there; what comes back is 1e16 or the Jacobian of another rotation vector."""
+    with pytest.raises(InputError, match="rotation_vector"):
+        kinematics.inverse_right_jacobian([[0.1, 0.0, 0.0], [0.0, angle, 0.0]])
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: kinematics.body_quaternion_derivative(quaternion.IDENTITY, [1.0, 2.0]), "w_b has shape"),
+        (lambda: kinematics.fixed_quaternion_derivative(quaternion.IDENTITY, [1.0, np.nan, 0.0]), r"w_f\[1\] is nan"),
+        (lambda: kinematics.fixed_rate(np.zeros(4), quaternion.IDENTITY), "zero quaternion"),
+        (lambda: kinematics.body_to_fixed_rate([1.0, 1.0, 0.0, 0.0], np.zeros(3)), "norm 1.414"),
+        (lambda: kinematics.right_jacobian([[1.0, 0.0, np.inf]]), r"rotation_vector\[0, 2\] is inf"),
+        (lambda: kinematics.inverse_right_jacobian([1.0, 0.0]), "rotation_vector has shape"),
+        (lambda: kinematics.skew([1.0]), "v has shape"),
+    ],
+)
+def test_bad_input_is_named(call, words):
+    with pytest.raises(InputError, match=words):
+        call()

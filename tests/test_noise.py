@@ -1,0 +1,186 @@
+"""Random numbers of the kernels: known answers, one source on two machines, and the normals' distribution."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from strapdown.kernels import noise
+from strapdown.kernels.machine import compiled
+
+WORD = np.uint64
+ALL = WORD(0xFFFFFFFFFFFFFFFF)
+
+
+@pytest.fixture(autouse=True)
+def _words_wrap():
+    with np.errstate(over="ignore"):
+        yield
+
+
+def normals(number, count, first=11):
+    """Return standard normals of one stream."""
+    state, words = np.empty((2, 4), WORD), np.empty((2, 1 << 14), WORD)
+    compiled(noise.seed_stream)(WORD(first), WORD(22), WORD(number), state)
+    out, block = np.empty(count), np.empty(1 << 15)
+    fill = compiled(noise.fill_normals)
+    for begin in range(0, count, len(block)):
+        fill(state, words, block)
+        part = out[begin : begin + len(block)]
+        part[:] = block[: len(part)]
+    return out
+
+
+@pytest.mark.parametrize(
+    ("key", "counter", "wanted"),
+    [
+        ((0, 0), (0, 0), (0xC2B6E3A8C2C69865, 0x6F81ED42F350084D)),
+        ((2**64 - 1,) * 2, (2**64 - 1,) * 2, (0xE02CB7C4D95D277A, 0xD06633D0893B8B68)),
+        (
+            (0xA4093822299F31D0, 0x082EFA98EC4E6C89),
+            (0x243F6A8885A308D3, 0x13198A2E03707344),
+            (0x263C7D30BB0F0AF1, 0x56BE8361D3311526),
+        ),
+    ],
+)
+def test_threefry_gives_the_known_answers_of_random123(key, counter, wanted):
+    got = noise.threefry(*map(WORD, key), *map(WORD, counter))
+    assert tuple(int(word) for word in got) == wanted
+
+
+def plain_xoshiro(state, count):
+    """Return words of xoshiro256++ by Python's own integers, after the reference of Blackman and Vigna."""
+    mask = (1 << 64) - 1
+
+    def rotl(x, k):
+        return ((x << k) | (x >> (64 - k))) & mask
+
+    s, words = list(state), []
+    for _ in range(count):
+        words.append((rotl((s[0] + s[3]) & mask, 23) + s[0]) & mask)
+        t = (s[1] << 17) & mask
+        s[2] ^= s[0]
+        s[3] ^= s[1]
+        s[1] ^= s[2]
+        s[0] ^= s[3]
+        s[2] ^= t
+        s[3] = rotl(s[3], 45)
+    return words
+
+
+def test_xoshiro_gives_the_known_answers():
+    # First words from the state (1, 2, 3, 4), as published with the generators of the rand crate and of Boost.
+    known = [41943041, 58720359, 3588806011781223, 3591011842654386, 9228616714210784205, 9973669472204895162]
+    assert plain_xoshiro((1, 2, 3, 4), 6) == known
+    state, got = tuple(map(WORD, (1, 2, 3, 4))), []
+    for _ in range(500):
+        word, *state = noise.next_word(*state)
+        got.append(int(word))
+    assert got == plain_xoshiro((1, 2, 3, 4), 500)
+
+
+def test_plain_python_and_compiled_agree():
+    plain_state, words, plain = np.empty((2, 4), WORD), np.empty((2, 100), WORD), np.empty(200)
+    noise.seed_stream(WORD(5), WORD(6), WORD(7), plain_state)
+    fast_state = np.empty((2, 4), WORD)
+    compiled(noise.seed_stream)(WORD(5), WORD(6), WORD(7), fast_state)
+    assert np.array_equal(plain_state, fast_state)
+    noise.fill_normals(plain_state, words, plain)
+    fast = np.empty(200)
+    compiled(noise.fill_normals)(fast_state, words, fast)
+    np.testing.assert_allclose(fast, plain, rtol=0.0, atol=2e-15)
+    assert np.array_equal(plain_state, fast_state)
+
+
+def test_logarithm_and_normals_are_those_of_libm():
+    rng = np.random.default_rng(3)
+    uniforms = np.concatenate(
+        [10.0 ** rng.uniform(-15.0, 0.0, 500), 1.0 - 10.0 ** rng.uniform(-15.0, -1.0, 500), [1.0, 2.0**-52]]
+    )
+    for u in uniforms:
+        assert noise.minus_two_log(u) == pytest.approx(-2.0 * math.log(u), rel=1e-15, abs=1e-30)
+    for word0, word1 in rng.integers(0, 2**64, (500, 2), dtype=WORD):
+        u = 1.0 - (int(word0) >> 12) * 2.0**-52
+        angle = 0.5 * math.pi * (((int(word1) << 2) % 2**64 >> 12) * 2.0**-52 - 0.5)
+        sine, cosine = math.sin(angle), math.cos(angle) * (-1.0 if int(word1) >> 63 else 1.0)
+        radius = math.sqrt(-2.0 * math.log(u))
+        wanted = (cosine, sine) if int(word1) >> 62 & 1 else (sine, cosine)
+        assert noise.normal_pair(word0, word1) == pytest.approx(
+            [radius * part for part in wanted], rel=4e-15, abs=1e-16
+        )
+
+
+def test_extreme_words_give_finite_normals():
+    words = [WORD(0), ALL, WORD(1), WORD(1 << 63)]
+    pairs = [noise.normal_pair(a, b) for a in words for b in words]
+    assert np.all(np.isfinite(pairs))
+    assert np.max(np.abs(pairs)) < 8.5
+
+
+@pytest.fixture(scope="module")
+def sample():
+    return normals(0, 4_000_000)
+
+
+def test_moments(sample):
+    n = len(sample)
+    # Standard deviation of the mean of x^k is √((E x^2k − (E x^k)²)/n).
+    even = {0: 1.0, 2: 1.0, 4: 3.0, 6: 15.0, 8: 105.0, 10: 945.0, 12: 10395.0, 14: 135135.0, 16: 2027025.0}
+    for k in range(1, 9):
+        expected = even.get(k, 0.0)
+        score = (np.mean(sample**k) - expected) / math.sqrt((even[2 * k] - expected**2) / n)
+        assert abs(score) < 4.0, (k, score)
+
+
+def test_distribution_by_kolmogorov_and_smirnov(sample):
+    for part in np.split(sample[:1_000_000], 10):
+        assert stats.kstest(part, "norm").pvalue > 1e-4
+    assert stats.kstest(sample, "norm").pvalue > 1e-3
+
+
+@pytest.mark.parametrize("edge", [3.0, 4.0, 4.5, 5.0])
+def test_tails(sample, edge):
+    for count, probability in (
+        (np.sum(sample > edge), stats.norm.sf(edge)),
+        (np.sum(sample < -edge), stats.norm.sf(edge)),
+    ):
+        low, high = stats.binom.ppf([5e-5, 1.0 - 5e-5], len(sample), probability)
+        assert low <= count <= high
+
+
+@pytest.mark.slow
+def test_tails_to_six_sigma():
+    counts, total = np.zeros(3), 0
+    for number in range(100):
+        part = np.abs(normals(number, 1 << 24))
+        counts += [np.sum(part > edge) for edge in (5.0, 5.5, 6.0)]
+        total += len(part)
+    for count, edge in zip(counts, (5.0, 5.5, 6.0), strict=True):
+        low, high = stats.binom.ppf([5e-4, 1.0 - 5e-4], total, 2.0 * stats.norm.sf(edge))
+        assert low <= count <= high
+
+
+def test_successive_normals_and_the_two_of_a_pair_are_independent(sample):
+    n = 1 << 15  # a block: first half sines or cosines, second half their partners
+    blocks = sample[: len(sample) // n * n].reshape(-1, n)
+    first, second = blocks[:, : n // 2].ravel(), blocks[:, n // 2 :].ravel()
+    pairs = [(first, second), (first**2, second**2), (np.abs(first), second)]
+    pairs += [(sample[:-lag], sample[lag:]) for lag in (1, 2, 3, 7, n // 2)]
+    pairs += [(sample[:-lag] ** 2, sample[lag:] ** 2) for lag in (1, 2, n // 2)]
+    for a, b in pairs:
+        assert abs(np.corrcoef(a, b)[0, 1]) * math.sqrt(len(a)) < 4.0
+
+
+def test_octants_are_even(sample):
+    n = 1 << 15
+    blocks = sample[: len(sample) // n * n].reshape(-1, n)
+    angle = np.arctan2(blocks[:, : n // 2], blocks[:, n // 2 :]).ravel()
+    counts = np.histogram(angle, bins=64, range=(-math.pi, math.pi))[0]
+    assert 1e-3 < stats.chisquare(counts).pvalue < 0.999
+
+
+def test_streams_of_different_names_are_uncorrelated():
+    streams = np.array([normals(number, 100_000) for number in range(8)] + [normals(0, 100_000, first=12)])
+    correlation = np.corrcoef(streams) - np.eye(9)
+    assert np.max(np.abs(correlation)) * math.sqrt(100_000) < 4.5

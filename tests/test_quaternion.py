@@ -1,0 +1,289 @@
+"""Quaternion algebra: its axioms over batch shapes, and values against mpmath, SciPy and 2×2 complex matrices."""
+
+from __future__ import annotations
+
+import mpmath
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from strapdown import quaternion
+from strapdown.checks import InputError
+
+SHAPES = [(), (1,), (5,), (2, 3), (0,)]
+EPS = np.finfo(float).eps
+
+
+def random_quaternions(shape: tuple[int, ...], seed: int = 1) -> np.ndarray:
+    q = np.random.default_rng(seed).standard_normal((*shape, 4))
+    return q / np.linalg.norm(q, axis=-1, keepdims=True)
+
+
+def random_vectors(shape: tuple[int, ...], seed: int = 2) -> np.ndarray:
+    return np.random.default_rng(seed).standard_normal((*shape, 3))
+
+
+def complex_matrix(q: np.ndarray) -> np.ndarray:
+    """The quaternions as 2×2 complex matrices: i, j, k are −i times the Pauli matrices, and ⊗ is the product of matrices."""
+    w, x, y, z = np.moveaxis(np.asarray(q), -1, 0)
+    return np.stack([np.stack([w - 1j * z, -y - 1j * x], -1), np.stack([y - 1j * x, w + 1j * z], -1)], -2)
+
+
+def close(actual: np.ndarray, wanted: np.ndarray, ulps: float = 8.0) -> None:
+    np.testing.assert_allclose(actual, wanted, rtol=0.0, atol=ulps * EPS)
+
+
+# ---------------------------------------------------------------------------------------------------- the algebra
+
+
+def test_unit_products_are_hamiltons():
+    one, i, j, k = np.eye(4)
+    for p, q, product in ((i, j, k), (j, k, i), (k, i, j), (j, i, -k), (k, j, -i), (i, k, -j)):
+        np.testing.assert_array_equal(quaternion.multiply(p, q), product)
+    for unit in (i, j, k):
+        np.testing.assert_array_equal(quaternion.multiply(unit, unit), -one)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_product_is_that_of_complex_matrices(shape):
+    p, q = 3.0 * random_quaternions(shape), 0.2 * random_quaternions(shape, 5)
+    close(complex_matrix(quaternion.multiply(p, q)), complex_matrix(p) @ complex_matrix(q))
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_group_axioms(shape):
+    p, q, r = (random_quaternions(shape, seed) for seed in (1, 2, 3))
+    multiply = quaternion.multiply
+    close(multiply(multiply(p, q), r), multiply(p, multiply(q, r)))
+    np.testing.assert_array_equal(multiply(p, quaternion.IDENTITY), p)
+    np.testing.assert_array_equal(multiply(quaternion.IDENTITY, p), p)
+    one = np.broadcast_to(quaternion.IDENTITY, p.shape)
+    close(multiply(p, quaternion.inverse(p)), one)
+    close(multiply(quaternion.inverse(p), p), one)
+    close(quaternion.conjugate(multiply(p, q)), multiply(quaternion.conjugate(q), quaternion.conjugate(p)))
+    close(np.linalg.norm(multiply(p, q), axis=-1), np.ones(shape))
+
+
+@pytest.mark.parametrize("norm", [1e-100, 1e-3, 0.5, 2.0, 1e5, 1e100])
+def test_inverse_divides_by_the_squared_norm(norm):
+    q = norm * random_quaternions((6,))
+    close(quaternion.multiply(q, quaternion.inverse(q)), np.broadcast_to(quaternion.IDENTITY, (6, 4)))
+    np.testing.assert_allclose(np.linalg.norm(quaternion.inverse(q), axis=-1), 1.0 / norm, rtol=4 * EPS)
+
+
+def test_leading_axes_broadcast():
+    p, q = random_quaternions((2, 1)), random_quaternions((3,), 4)
+    product = quaternion.multiply(p, q)
+    assert product.shape == (2, 3, 4)
+    np.testing.assert_array_equal(product[1, 2], quaternion.multiply(p[1, 0], q[2]))
+    assert quaternion.rotate(p, random_vectors((3,))).shape == (2, 3, 3)
+    assert quaternion.rotate(p[0, 0], random_vectors(())).shape == (3,)
+    assert quaternion.angle_between(p, q).shape == (2, 3)
+
+
+def test_identity_cannot_be_written_to():
+    with pytest.raises(ValueError, match="read-only"):
+        quaternion.IDENTITY[0] = 2.0
+
+
+def test_normalize():
+    q = random_quaternions((4,))
+    close(quaternion.normalize(np.array([[1e-3], [2.0], [1.0], [1e9]]) * q), q)
+
+
+# ---------------------------------------------------------------------------------------------------- rotation
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_rotate_is_the_sandwich_product_and_the_matrix(shape):
+    q, v = random_quaternions(shape), random_vectors(shape)
+    pure = np.concatenate([np.zeros((*shape, 1)), v], -1)
+    sandwich = quaternion.multiply(quaternion.multiply(q, pure), quaternion.conjugate(q))
+    close(sandwich[..., 0], np.zeros(shape))
+    close(quaternion.rotate(q, v), sandwich[..., 1:], 16)
+    close(quaternion.rotate(q, v), (quaternion.to_matrix(q) @ v[..., None])[..., 0], 16)
+    close(quaternion.rotate(quaternion.conjugate(q), quaternion.rotate(q, v)), v, 16)
+
+
+def test_quarter_turns():
+    # A body yawed by +90° in a fixed frame: its x axis points along the fixed y axis.
+    half = np.sqrt(0.5)
+    close(quaternion.rotate([half, 0.0, 0.0, half], [1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]))
+    close(quaternion.rotate([half, half, 0.0, 0.0], [0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
+    close(quaternion.rotate([half, 0.0, half, 0.0], [0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]))
+
+
+def test_rotating_by_a_tiny_angle_loses_no_digits(rotation_vectors):
+    phi = rotation_vectors(50, 1e-12, 1e-6)
+    v = random_vectors((50,))
+    moved = quaternion.rotate(quaternion.exp(phi), v) - v
+    # v + φ × v to second order, and each of the sums rounds at the size of v
+    np.testing.assert_allclose(moved, np.cross(phi, v), rtol=0.0, atol=3 * EPS * 4 + 1e-12)
+
+
+@pytest.mark.parametrize("shape", SHAPES[:4])
+def test_matrix_and_rotation_agree_with_scipy(shape):
+    q = random_quaternions(shape)
+    flat = q.reshape(-1, 4)
+    theirs = Rotation.from_quat(flat[:, [1, 2, 3, 0]])
+    close(quaternion.to_matrix(q).reshape(-1, 3, 3), theirs.as_matrix())
+    v = random_vectors(shape).reshape(-1, 3)
+    close(quaternion.rotate(flat, v), theirs.apply(v), 16)
+    close(quaternion.to_rotation(flat).as_matrix(), theirs.as_matrix())
+    back = quaternion.from_rotation(theirs)
+    close(np.abs(np.sum(back * flat, -1)), np.ones(len(flat)))
+    close(quaternion.from_rotation(quaternion.to_rotation(flat[0])), flat[0])
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_matrix_round_trip(shape):
+    q = random_quaternions(shape)
+    back = quaternion.from_matrix(quaternion.to_matrix(q))
+    assert np.all(back[..., 0] >= 0.0)
+    close(back, np.where(q[..., :1] < 0.0, -q, q))
+
+
+def test_from_matrix_at_half_turns_and_near_each_axis():
+    """Where one branch of Shepperd's method gives way to the next, and where the scalar part vanishes."""
+    cases = [np.eye(4)[k] for k in range(4)]
+    cases += [np.eye(4)[k] + s * np.eye(4)[m] for k in range(4) for m in range(4) if k != m for s in (1.0, 1e-8, -1e-9)]
+    cases += [np.array([1.0, 1.0, 1.0, 1.0]), np.array([0.0, 1.0, 1.0, 1.0]), np.array([1e-17, 0.6, -0.8, 0.0])]
+    q = quaternion.normalize(np.array(cases))
+    back = quaternion.from_matrix(quaternion.to_matrix(q))
+    close(np.abs(np.sum(back * q, axis=-1)), np.ones(len(q)), 4)
+    close(quaternion.to_matrix(back), quaternion.to_matrix(q))
+
+
+# ---------------------------------------------------------------------------------------------------- exp and log
+
+
+def mp_exp(phi: np.ndarray) -> list[mpmath.mpf]:
+    x = [mpmath.mpf(float(c)) for c in phi]
+    angle = mpmath.sqrt(sum(c * c for c in x))
+    s = mpmath.sin(angle / 2) / angle if angle else mpmath.mpf("0.5")
+    return [mpmath.cos(angle / 2), *(s * c for c in x)]
+
+
+def mp_log(q: np.ndarray) -> list[mpmath.mpf]:
+    w, *u = (mpmath.mpf(float(c)) for c in q)
+    norm = mpmath.sqrt(sum(c * c for c in u))
+    sign = -1 if w < 0 else 1
+    factor = 2 * mpmath.atan2(norm, abs(w)) / norm if norm else mpmath.mpf(2)
+    return [sign * factor * c for c in u]
+
+
+def test_exp_against_mpmath_over_all_angles(rotation_vectors):
+    phi = np.concatenate([rotation_vectors(150), rotation_vectors(50, 1e-200, 1e-12), rotation_vectors(30, 3.0, 50.0)])
+    with mpmath.workdps(60):
+        wanted = np.array([[float(c) for c in mp_exp(row)] for row in phi])
+    actual = quaternion.exp(phi)
+    angle = np.linalg.norm(phi, axis=-1)
+    size = np.maximum(1.0, angle)  # an angle above 1 rad is itself rounded at more than EPS
+    assert np.all(np.abs(actual[:, 0] - wanted[:, 0]) <= 2 * EPS * size)
+    vector = np.linalg.norm(actual[:, 1:] - wanted[:, 1:], axis=1)
+    small = angle < np.pi
+    assert np.all(vector[small] <= 4 * EPS * np.linalg.norm(wanted[small, 1:], axis=1))
+    assert np.all(vector[~small] <= 2 * EPS * size[~small])
+    np.testing.assert_allclose(np.linalg.norm(actual, axis=-1), 1.0, atol=4 * EPS)
+
+
+def test_log_against_mpmath_over_all_angles(rotation_vectors):
+    q = quaternion.exp(np.concatenate([rotation_vectors(150), rotation_vectors(50, 1e-200, 1e-12)]))
+    with mpmath.workdps(60):
+        wanted = np.array([[float(c) for c in mp_log(row)] for row in q])
+    assert np.all(np.linalg.norm(quaternion.log(q) - wanted, axis=1) <= 4 * EPS * np.linalg.norm(wanted, axis=1))
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_exp_and_log_are_inverse(shape, rotation_vectors):
+    phi = rotation_vectors(64, 1e-12, 3.1)[: max(1, int(np.prod(shape)))]
+    phi = phi[: int(np.prod(shape))].reshape(*shape, 3)
+    q = quaternion.exp(phi)
+    assert q.shape == (*shape, 4)
+    np.testing.assert_allclose(quaternion.log(q), phi, rtol=16 * EPS, atol=0.0)
+    np.testing.assert_allclose(quaternion.log(-q), phi, rtol=16 * EPS, atol=0.0)
+
+
+def test_log_takes_the_shorter_way_round():
+    axis = np.array([0.0, 0.6, 0.8])
+    close(quaternion.log(quaternion.exp((2.0 * np.pi - 0.1) * axis)), -0.1 * axis, 16)
+    # at half a turn both ways are as short; the angle is what counts
+    for q in (np.array([0.0, 0.0, 0.6, 0.8]), np.array([0.0, 0.0, -0.6, -0.8])):
+        close(np.linalg.norm(quaternion.log(q)), np.array(np.pi), 4)
+        close(np.abs(np.sum(quaternion.exp(quaternion.log(q)) * q)), np.array(1.0), 4)
+
+
+def test_zero_rotation():
+    np.testing.assert_array_equal(quaternion.exp(np.zeros(3)), quaternion.IDENTITY)
+    np.testing.assert_array_equal(quaternion.log(quaternion.IDENTITY), np.zeros(3))
+    np.testing.assert_array_equal(quaternion.log(-quaternion.IDENTITY), np.zeros(3))
+
+
+def test_exp_of_parallel_vectors_adds(rotation_vectors):
+    phi = rotation_vectors(40, 1e-9, 1.5)
+    product = quaternion.multiply(quaternion.exp(0.3 * phi), quaternion.exp(0.7 * phi))
+    close(product, quaternion.exp(phi))
+
+
+def test_angle_between(rotation_vectors):
+    phi = rotation_vectors(80, 1e-12, 3.1)
+    p = random_quaternions((80,))
+    angle = np.linalg.norm(phi, axis=1)
+    q = quaternion.multiply(p, quaternion.exp(phi))
+    np.testing.assert_allclose(quaternion.angle_between(p, q), angle, rtol=1e-14, atol=4 * EPS)
+    np.testing.assert_allclose(quaternion.angle_between(q, -p), angle, rtol=1e-14, atol=4 * EPS)
+    np.testing.assert_allclose(
+        quaternion.angle_between(p, q),
+        (quaternion.to_rotation(p).inv() * quaternion.to_rotation(q)).magnitude(),
+        atol=1e-14,
+    )
+
+
+# ---------------------------------------------------------------------------------------------------- bad input
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: quaternion.multiply([1.0, 0.0, 0.0], quaternion.IDENTITY), ("p has shape (3,)", "(..., 4)")),
+        (lambda: quaternion.multiply(quaternion.IDENTITY, [[1.0, np.nan, 0.0, 0.0]]), ("q[0, 1] is nan",)),
+        (lambda: quaternion.rotate([1.0, 0.1, 0.0, 0.0], [1.0, 0.0, 0.0]), ("q has norm 1.00498", "normalise")),
+        (lambda: quaternion.rotate(quaternion.IDENTITY, [1.0, 0.0]), ("v has shape (2,)",)),
+        (lambda: quaternion.log([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 2.0]]), ("q[1] has norm 2",)),
+        (lambda: quaternion.exp([np.inf, 0.0, 0.0]), ("rotation_vector[0] is inf",)),
+        (lambda: quaternion.inverse(np.zeros(4)), ("zero quaternion",)),
+        (lambda: quaternion.normalize([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]]), ("q[1]", "zero quaternion")),
+        (lambda: quaternion.to_matrix([2.0, 0.0, 0.0, 0.0]), ("q has norm 2",)),
+        (lambda: quaternion.to_rotation([2.0, 0.0, 0.0, 0.0]), ("q has norm 2",)),
+        (lambda: quaternion.from_matrix(1.01 * np.eye(3)), ("not orthogonal", "0.0201")),
+        (lambda: quaternion.from_matrix(np.diag([1.0, 1.0, -1.0])), ("reflection", "signs of its axes")),
+        (lambda: quaternion.from_matrix(np.eye(4)), ("matrix has shape (4, 4)",)),
+        (lambda: quaternion.angle_between([2.0, 0.0, 0.0, 0.0], quaternion.IDENTITY), ("p has norm 2",)),
+    ],
+)
+def test_bad_input_is_named(call, words):
+    with pytest.raises(InputError) as caught:
+        call()
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_inputs_are_not_changed():
+    q, v = random_quaternions((3,)), random_vectors((3,))
+    before = q.copy(), v.copy()
+    for function in (
+        quaternion.conjugate,
+        quaternion.inverse,
+        quaternion.normalize,
+        quaternion.log,
+        quaternion.to_matrix,
+    ):
+        function(q)
+    quaternion.rotate(q, v)
+    np.testing.assert_array_equal(q, before[0])
+    np.testing.assert_array_equal(v, before[1])
+
+
+def test_single_precision_quaternions_are_normalised():
+    q = random_quaternions((20,)).astype(np.float32)
+    close(np.linalg.det(quaternion.to_matrix(q)), np.ones(20))

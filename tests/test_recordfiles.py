@@ -1,0 +1,183 @@
+"""Records in HDF5 and CSV: read back equal, described, and refused where they are not what they should be."""
+
+import dataclasses
+
+import h5py
+import numpy as np
+import pytest
+
+import strapdown
+from strapdown import recordfiles, scenarios, vectors
+from strapdown.checks import InputError
+from strapdown.recordfiles import export_csv, import_csv, read_record, read_record_file, write_record
+from strapdown.records import ImuRecord
+
+FAULTS = vectors.Faults(latency=0.05, outages=[(0.5, 0.7)])
+
+
+@pytest.fixture(scope="module")
+def made():
+    base = dataclasses.replace(scenarios.load_scenario("low-orbit"), duration=6.0, gyro_preset="")
+    more = (
+        vectors.AttitudeSensor(name="tracker / α", sigma_across=1e-4, sigma_about=3e-4, rate=2.0, faults=FAULTS),
+        vectors.Accelerometer(name="force", sigma=0.01, rate=3.0, kind="vector"),
+        vectors.HeadingPair(name="gnss", baseline_b=[1.0, 0.0, 0.0], sigma=0.01, rate=1.0),
+        vectors.VectorSensor(name="rare", reference_f=[1.0, 0.0, 0.0], sigma=0.01, rate=0.01),
+    )
+    scenario = dataclasses.replace(base, sensors=base.sensors + more)
+    return scenario, scenarios.simulate(scenario, 3, 1)
+
+
+def assert_equal(a, b):
+    assert np.array_equal(a.time, b.time)
+    assert np.array_equal(a.increments, b.increments)
+    assert (a.truth is None) == (b.truth is None)
+    if a.truth is not None:
+        assert np.array_equal(a.truth.attitude, b.truth.attitude)
+        assert np.array_equal(a.truth.bias, b.truth.bias)
+    assert len(a.vectors) == len(b.vectors)
+    for x, y in zip(a.vectors, b.vectors, strict=True):
+        assert (x.sensor, x.kind) == (y.sensor, y.kind)
+        for name in ("time", "vector_b", "reference_f", "sigma", "attitude", "sigma_axes", "arrival"):
+            p, q = getattr(x, name), getattr(y, name)
+            assert (p is None) == (q is None), name
+            assert p is None or np.array_equal(p, q, equal_nan=True), (x.sensor, name)
+
+
+def test_hdf5_reads_back_equal_with_all_that_it_tells(made, tmp_path):
+    scenario, record = made
+    path = tmp_path / "deep" / "record.h5"
+    text = scenarios.scenario_to_toml(scenario)
+    write_record(
+        path,
+        record,
+        gyro_spec=scenario.gyro,
+        scenario=text,
+        seed=3,
+        run=1,
+        attributes={"place": "bench", "weight": 2.5},
+    )
+    back = read_record_file(path)
+    assert_equal(back.record, record)
+    assert_equal(read_record(path), record)
+    assert back.gyro == scenario.gyro
+    assert (back.seed, back.run, back.version) == (3, 1, strapdown.__version__)
+    assert back.attributes == {"place": "bench", "weight": 2.5}
+    again = scenarios.simulate(scenarios.scenario_from_toml(back.scenario), back.seed, back.run)
+    assert_equal(again, record)
+
+
+def test_hdf5_describes_itself(made, tmp_path):
+    path = tmp_path / "record.h5"
+    write_record(path, made[1], gyro_spec=made[0].gyro)
+    with h5py.File(path) as file:
+        assert "scalar first" in file.attrs["conventions"]
+        datasets = []
+        file.visititems(lambda name, node: datasets.append(node) if isinstance(node, h5py.Dataset) else None)
+        assert len(datasets) > 20
+        assert all(node.attrs["unit"] for node in datasets)
+
+
+def test_a_bare_record_needs_no_extras(tmp_path):
+    bare = ImuRecord(time=[0.0, 1.0, 3.0], increments=[[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    write_record(tmp_path / "bare.h5", bare)
+    back = read_record_file(tmp_path / "bare.h5")
+    assert_equal(back.record, bare)
+    assert back.gyro is None
+    assert back.seed is None
+    export_csv(tmp_path / "bare.csv", bare)
+    assert_equal(import_csv(tmp_path / "bare.csv"), bare)
+
+
+def test_csv_reads_back_equal(made, tmp_path):
+    written = export_csv(tmp_path / "record.csv", made[1])
+    assert len(written) == 1 + len(made[1].vectors)
+    record = made[1]
+    # A constant reference of an empty series is the one thing that CSV cannot tell.
+    kept = dataclasses.replace(record, vectors=tuple(s for s in record.vectors if len(s.time)))
+    back = import_csv(written[0])
+    assert_equal(dataclasses.replace(back, vectors=tuple(s for s in back.vectors if len(s.time))), kept)
+
+
+def test_foreign_and_damaged_hdf5_is_refused(made, tmp_path):
+    path = tmp_path / "record.h5"
+    with pytest.raises(InputError, match="does not exist"):
+        read_record(path)
+    write_record(path, made[1])
+    whole = path.read_bytes()
+    for share in (0.0, 0.01, 0.3, 0.6, 0.9, 0.999):
+        path.write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(InputError, match="cannot be read"):
+            read_record(path)
+    path.write_text("time,x\n1,2\n")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_record(path)
+    with h5py.File(path, "w") as file:
+        file["time"] = [1.0]
+    with pytest.raises(InputError, match="HDF5 of another program"):
+        read_record(path)
+    with h5py.File(path, "w") as file:
+        file.attrs["kind"] = "strapdown estimate"
+    with pytest.raises(InputError, match="a strapdown estimate, not a strapdown record"):
+        read_record(path)
+    for change, message in (({"format": 2}, "layout 2"), ({"format": None}, "cannot be read")):
+        path.write_bytes(whole)
+        with h5py.File(path, "r+") as file:
+            for name, value in change.items():
+                if value is None:
+                    del file.attrs[name]
+                else:
+                    file.attrs[name] = value
+        with pytest.raises(InputError, match=message):
+            read_record(path)
+    path.write_bytes(whole)
+    with h5py.File(path, "r+") as file:
+        del file["increments"]
+    with pytest.raises(InputError, match="cannot be read"):
+        read_record(path)
+    path.write_bytes(whole)
+    with h5py.File(path, "r+") as file:
+        file["truth/attitude"][3] = 5.0
+    with pytest.raises(InputError, match="norm"):
+        read_record(path)
+
+
+def test_a_failed_write_leaves_the_old_file(made, tmp_path):
+    path = tmp_path / "record.h5"
+    write_record(path, made[1])
+    before = path.read_bytes()
+    with pytest.raises(TypeError):
+        write_record(path, made[1], attributes={"thing": object()})
+    with pytest.raises(InputError, match="choose another name"):
+        write_record(path, made[1], attributes={"seed": 3})
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["record.h5"]
+
+
+def test_foreign_and_damaged_csv_is_refused(made, tmp_path):
+    path = tmp_path / "record.csv"
+    with pytest.raises(InputError, match="does not exist"):
+        import_csv(path)
+    export_csv(path, made[1])
+    lines = path.read_text().splitlines()
+    for content, message in (
+        ("", "does not begin"),
+        ("a,b\n1,2\n", "does not begin"),
+        ("\n".join([lines[0], "time_s,x", "1,2"]), "columns"),
+        ("\n".join([*lines[:5], lines[5][:40]]), "line 6"),
+        ("\n".join([*lines[:4], lines[4].replace(lines[4].split(",")[2], "abc")]), "line 5"),
+        ("\n".join(["# strapdown vectors {}", *lines[1:]]), "no record"),
+        ("\n".join(lines[:3]), "at least 2"),
+    ):
+        path.write_text(content)
+        with pytest.raises(InputError, match=message):
+            import_csv(path)
+    path.write_bytes(b"\xff\xfe\x00\x01")
+    with pytest.raises(InputError, match="cannot be read"):
+        import_csv(path)
+    export_csv(path, made[1])
+    beside = tmp_path / "record-vectors-1.csv"
+    beside.write_text(beside.read_text().replace('"magnetometer"', "magnetometer"))
+    with pytest.raises(InputError, match="no vector series"):
+        import_csv(path)
+    assert recordfiles.KIND == "strapdown record"

@@ -1,0 +1,294 @@
+"""Reading recordings: CSV and BROAD HDF5, their units, and clear words where a file is not what it should be."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+
+from strapdown import recordings
+from strapdown.checks import InputError
+from strapdown.recordings import Recording, read
+
+HEADER = "time,gx [rad/s],gy,gz,ax [m/s2],ay,az"
+ROWS = ("0.00,0.1,0.2,0.3,1,2,9", "0.01,0.4,0.5,0.6,3,4,8", "0.02,0.7,0.8,0.9,5,6,7")
+
+
+@pytest.fixture
+def csv(tmp_path):
+    """Write a CSV file of a header and rows and return its path."""
+
+    def write(header: str = HEADER, rows: tuple[str, ...] | list[str] = ROWS, name: str = "walk.csv"):
+        path = tmp_path / name
+        path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
+        return path
+
+    return write
+
+
+def refused(path, *words: str, **options) -> None:
+    with pytest.raises(InputError) as caught:
+        read(path, **options)
+    for word in (path.name, *words):
+        assert word in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+# ---------------------------------------------------------------------------------------------------- CSV: what is read
+
+
+def test_columns_are_read(csv):
+    recording = read(csv())
+    assert recording.source == "walk.csv"
+    np.testing.assert_array_equal(recording.time, [0.0, 0.01, 0.02])
+    np.testing.assert_array_equal(recording.rate, [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [0.7, 0.8, 0.9]])
+    np.testing.assert_array_equal(recording.specific_force, [[1, 2, 9], [3, 4, 8], [5, 6, 7]])
+    assert recording.magnetic_field is recording.true_attitude is recording.movement is None
+
+
+def test_columns_in_any_order_with_others_between_comments_and_blank_lines(csv):
+    header = "# logged by hand\n\n az [g], AY ,ax,temperature, mz,my,mx, gz [rad/s],gy,gx,Time"
+    recording = read(
+        csv(header, ["9,2,1,21.5,30,20,10,0.3,0.2,0.1,0", "", "# a pause", "8,4,3,21.6,3,2,1,0.6,0.5,0.4,1"])
+    )
+    np.testing.assert_array_equal(recording.rate[0], [0.1, 0.2, 0.3])
+    np.testing.assert_allclose(recording.specific_force[0], np.array([1, 2, 9]) * 9.80665, rtol=1e-15)
+    np.testing.assert_array_equal(recording.magnetic_field, [[10, 20, 30], [1, 2, 3]])
+
+
+def test_a_byte_order_mark_and_windows_line_ends_are_read(tmp_path):
+    path = tmp_path / "excel.csv"
+    path.write_bytes(b"\xef\xbb\xbf" + "\r\n".join([HEADER, *ROWS, ""]).encode())
+    assert len(read(path).time) == 3
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("rad/s", 1.0), ("deg/s", np.pi / 180.0), ("°/s", np.pi / 180.0)])
+def test_gyro_unit_of_the_header(csv, unit, factor):
+    recording = read(csv(f"time,gx [{unit}],gy,gz,ax [m/s2],ay,az"))
+    np.testing.assert_allclose(recording.rate[1], np.array([0.4, 0.5, 0.6]) * factor, rtol=1e-15)
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("m/s2", 1.0), ("m/s²", 1.0), ("m/s^2", 1.0), ("g", 9.80665)])
+def test_accelerometer_unit_of_the_header(csv, unit, factor):
+    recording = read(csv(f"time,gx [rad/s],gy,gz,ax [{unit}],ay [{unit}],az"))
+    np.testing.assert_allclose(recording.specific_force[1], np.array([3, 4, 8]) * factor, rtol=1e-15)
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("s", 1.0), ("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9)])
+def test_time_unit_by_header_and_by_option(csv, unit, factor):
+    wanted = np.array([0.0, 0.01, 0.02]) * factor
+    np.testing.assert_allclose(read(csv(HEADER.replace("time", f"time [{unit}]"))).time, wanted, rtol=1e-15)
+    np.testing.assert_allclose(read(csv(), units={"time": unit}).time, wanted, rtol=1e-15)
+
+
+def test_units_by_option(csv):
+    recording = read(csv("time,gx,gy,gz,ax,ay,az"), units={"gyro": "deg/s", "accelerometer": "g"})
+    np.testing.assert_allclose(recording.rate[0], np.deg2rad([0.1, 0.2, 0.3]), rtol=1e-15)
+    np.testing.assert_allclose(recording.specific_force[0], np.array([1, 2, 9]) * 9.80665, rtol=1e-15)
+    # saying again what the header says is no contradiction
+    np.testing.assert_array_equal(read(csv(), units={"gyro": "rad/s"}).rate[0], [0.1, 0.2, 0.3])
+
+
+def test_empty_fields_of_accelerometer_and_magnetometer_are_missing_samples(csv):
+    recording = read(csv(HEADER + ",mx,my,mz", ["0,1,2,3,,,,4,5,6", "1,1,2,3,4,5,6,,nan,"]))
+    assert np.isnan(recording.specific_force[0]).all()
+    assert np.isnan(recording.magnetic_field[1]).all()
+    np.testing.assert_array_equal(recording.specific_force[1], [4, 5, 6])
+
+
+# ---------------------------------------------------------------------------------------------------- CSV: what is refused
+
+
+def test_undeclared_units_are_refused_not_guessed(csv):
+    refused(csv("time,gx,gy,gz,ax [m/s2],ay,az"), "does not say the unit of its gyro", "gx [rad/s]", "rad/s or deg/s")
+    refused(csv("time,gx [rad/s],gy,gz,ax,ay,az"), "unit of its accelerometer", "ax [m/s2]", "m/s2 or g")
+
+
+def test_unknown_units_are_refused(csv):
+    refused(csv(HEADER.replace("rad/s", "deg/sec")), "unit of the gyro 'deg/sec'", "did you mean 'deg/s'")
+    refused(csv(HEADER.replace("m/s2", "ft/s2")), "unit of the accelerometer 'ft/s2' is not known")
+    refused(csv("time,gx,gy,gz,ax [m/s2],ay,az"), "unit of the gyro 'mrad'", units={"gyro": "mrad"})
+    refused(csv(), "unit of the time 'min'", units={"time": "min"})
+
+
+def test_contradicting_units_are_refused(csv):
+    refused(csv("time,gx [rad/s],gy [deg/s],gz,ax [g],ay,az"), "column gy is in deg/s", "rad/s", "same unit")
+    refused(csv(), "the header says rad/s", "the option deg/s", "drop one", units={"gyro": "deg/s"})
+
+
+def test_units_of_an_unknown_sensor_are_refused(csv):
+    refused_here = csv("time,gx,gy,gz,ax [g],ay,az")
+    with pytest.raises(InputError, match=r"'gyros' is not known.*'gyro'"):
+        read(refused_here, units={"gyros": "deg/s"})
+
+
+def test_missing_and_doubled_columns_are_refused(csv):
+    refused(csv("time,gx [rad/s],gy,ax [g],ay,az", ["0,1,2,3,4,5"]), "lacks gz", "it has: time, gx, gy, ax, ay, az")
+    refused(csv("gx [rad/s],gy,gz,ax [g],ay,az", ["0,1,2,3,4,5"]), "lacks time")
+    refused(csv("time;gx;gy;gz;ax;ay;az", ["0;1;2;3;4;5;6"]), "lacks time, gx")
+    refused(csv("time,gx [rad/s],gy,gz,ax [g],ay,az,GX"), "column 'gx' twice")
+
+
+def test_half_a_magnetometer_is_refused(csv):
+    """Two of three columns are a slip of the pen, and a heading that nobody measures is a quiet way to fail."""
+    refused(csv(HEADER + ",mx,my", [row + ",1,2" for row in ROWS]), "lacks mz")
+
+
+def test_truncated_rows_are_refused(csv):
+    refused(csv(rows=[ROWS[0], "0.01,0.4,0.5,0.6,3"]), "data row 2 has 5 fields, the header 7", "truncated")
+    refused(csv(rows=[ROWS[0] + ",8"]), "data row 1 has 8 fields")
+
+
+@pytest.mark.parametrize("bad", ["fast", "0x1f", "1,5", "1.2.3", "--1"])
+def test_what_is_no_number_is_refused(csv, bad):
+    refused(csv(rows=[ROWS[0], f'0.01,0.4,"{bad}",0.6,3,4,8']), "data row 2, column gy", repr(bad), "not a number")
+
+
+@pytest.mark.parametrize("bad", ["nan", "", "inf", "-Infinity"])
+def test_a_gyro_without_a_value_is_refused(csv, bad):
+    refused(csv(rows=[ROWS[0], f"0.01,0.4,{bad},0.6,3,4,8"]), "rate[1, 1] is", "remove or interpolate")
+
+
+def test_infinite_accelerations_are_refused(csv):
+    refused(csv(rows=[ROWS[0], "0.01,0.4,0.5,0.6,3,inf,8"]), "specific_force[1, 1] is inf")
+
+
+def test_stamps_out_of_order_are_refused(csv):
+    refused(csv(rows=[ROWS[0], ROWS[2], ROWS[1]]), "time[2] goes back to 0.01 s", "sort")
+    refused(csv(rows=[ROWS[0], ROWS[1], ROWS[1]]), "time[2] repeats 0.01 s", "drop repeated")
+    refused(csv(rows=[ROWS[0], ",0,0,0,0,0,9"]), "time[1] is nan")
+
+
+def test_empty_files_are_refused(csv, tmp_path):
+    empty = tmp_path / "empty.csv"
+    empty.write_text("")
+    refused(empty, "is empty", "time,gx")
+    refused(csv(rows=[]), "no data rows")
+    refused(csv(rows=ROWS[:1]), "time has 1 stamps")
+
+
+def test_what_is_no_text_or_no_file_is_refused(tmp_path):
+    binary = tmp_path / "binary.csv"
+    binary.write_bytes(bytes(range(256)) * 8)
+    folder = tmp_path / "folder.csv"
+    folder.mkdir()
+    refused(binary)
+    refused(folder)
+    refused(tmp_path / "none.csv", "does not exist")
+    other = tmp_path / "walk.mat"
+    other.write_text("")
+    refused(other, "suffix '.mat'", ".csv")
+
+
+# ---------------------------------------------------------------------------------------------------- HDF5
+
+
+@pytest.fixture
+def hdf5(tmp_path):
+    """Write a file in the layout of BROAD, some of it changed or (None) left out, and return its path."""
+
+    def write(name: str = "trial.hdf5", **changes):
+        random = np.random.default_rng(1)
+        content = {
+            "imu_gyr": random.standard_normal((50, 3)),
+            "imu_acc": random.standard_normal((50, 3)),
+            "imu_mag": random.standard_normal((50, 3)),
+            "opt_quat": np.tile([1.0, 0.0, 0.0, 0.0], (50, 1)),
+            "movement": np.arange(50) > 20,
+            "sampling_rate": 250.0,
+        } | changes
+        path = tmp_path / name
+        with h5py.File(path, "w") as file:
+            for key, value in content.items():
+                if key == "sampling_rate" and value is not None:
+                    file.attrs[key] = value
+                elif value is not None:
+                    file.create_dataset(key, data=value, compression="gzip")
+        return path
+
+    return write
+
+
+def test_broad_layout_is_read(hdf5):
+    path = hdf5()
+    recording = read(path)
+    np.testing.assert_allclose(recording.time, np.arange(50) / 250.0, rtol=1e-15)
+    with h5py.File(path) as file:
+        np.testing.assert_array_equal(recording.rate, file["imu_gyr"][:])
+        np.testing.assert_array_equal(recording.specific_force, file["imu_acc"][:])
+        np.testing.assert_array_equal(recording.magnetic_field, file["imu_mag"][:])
+    assert recording.movement.dtype == bool
+    assert recording.movement.sum() == 29
+    assert read(hdf5("short.h5", imu_mag=None, opt_quat=None, movement=None)).magnetic_field is None
+
+
+def test_missing_datasets_are_named(hdf5):
+    refused(hdf5(imu_gyr=None), "lacks imu_gyr", "imu_acc")
+    refused(hdf5(imu_gyr=None, sampling_rate=None), "lacks imu_gyr, the attribute sampling_rate")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.6, 0.95])
+def test_truncated_hdf5_is_refused(hdf5, share):
+    path = hdf5()
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    refused(path, "truncated")
+
+
+def test_text_named_hdf5_is_refused(tmp_path):
+    path = tmp_path / "walk.h5"
+    path.write_text("time,gx")
+    refused(path, "cannot be read as HDF5", "of another kind")
+
+
+def test_bad_values_in_hdf5_are_refused(hdf5):
+    bad = np.zeros((50, 3))
+    bad[7, 2] = np.nan
+    refused(hdf5(imu_gyr=bad), "rate[7, 2] is nan")
+    refused(hdf5(imu_acc=np.zeros((49, 3))), "specific_force has shape (49, 3), wanted (50, 3)")
+    refused(hdf5(opt_quat=np.zeros((50, 3))), "true_attitude has shape")
+    refused(hdf5(movement=np.ones(49, bool)), "movement has shape (49,)")
+
+
+@pytest.mark.parametrize("rate", [0.0, -100.0, np.nan])
+def test_a_sampling_rate_that_is_none_is_refused(hdf5, rate):
+    refused(hdf5(sampling_rate=rate), "sampling_rate is")
+
+
+def test_units_for_hdf5_are_refused(hdf5):
+    """Its layout says the units; an option that does nothing would be believed."""
+    with pytest.raises(InputError, match="unit"):
+        read(hdf5(), units={"gyro": "deg/s"})
+
+
+def test_broad_trial(broad):
+    recording = read(broad / "07_undisturbed_fast_rotation_B.hdf5")
+    assert abs(1.0 / np.median(np.diff(recording.time)) - 285.714) < 0.01
+    rest = recording.specific_force[:200].mean(axis=0)
+    assert abs(np.linalg.norm(rest) - 9.81) < 0.05
+    assert recording.movement.any()
+    assert not recording.movement[0]
+
+
+# ---------------------------------------------------------------------------------------------------- the recording
+
+
+def test_since():
+    recording = Recording(
+        source="x",
+        time=np.arange(5.0),
+        rate=np.arange(15.0).reshape(5, 3),
+        specific_force=np.ones((5, 3)),
+        movement=np.array([0, 0, 1, 1, 1], bool),
+    )
+    later = recording.since(2)
+    np.testing.assert_array_equal(later.time, [2.0, 3.0, 4.0])
+    np.testing.assert_array_equal(later.rate, recording.rate[2:])
+    assert later.movement.all()
+    assert later.magnetic_field is None
+
+
+def test_every_unit_has_a_factor():
+    assert recordings.RATE_UNITS["deg/s"] == np.pi / 180.0
+    assert recordings.FORCE_UNITS["g"] == 9.80665
+    assert recordings.TIME_UNITS == {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}

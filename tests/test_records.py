@@ -1,0 +1,256 @@
+"""The IMU record and the estimate: checks, compressing, cutting, and the estimate's file."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import h5py
+import numpy as np
+import pytest
+
+import strapdown
+from strapdown import coning, quaternion
+from strapdown.checks import InputError
+from strapdown.records import (
+    CONVENTIONS,
+    Estimate,
+    ImuRecord,
+    Innovations,
+    Truth,
+    compress,
+    cut,
+    read_estimate,
+    write_estimate,
+)
+from strapdown.vectors import VectorMeasurements
+
+
+def random_attitudes(n: int, seed: int = 1) -> np.ndarray:
+    return quaternion.normalize(np.random.default_rng(seed).standard_normal((n, 4)))
+
+
+def series(name: str, time: np.ndarray, **changes) -> VectorMeasurements:
+    vectors = np.random.default_rng(2).standard_normal((len(time), 3))
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    given = {"kind": "direction", "vector_b": vectors, "reference_f": np.array([0.0, 0.0, 1.0]), "sigma": 0.01}
+    return VectorMeasurements(sensor=name, time=time, **(given | changes))
+
+
+def record(n: int = 12) -> ImuRecord:
+    random = np.random.default_rng(3)
+    time = np.cumsum(np.r_[5.0, 0.5 + random.random(n)])
+    return ImuRecord(
+        time=time,
+        increments=0.1 * random.standard_normal((n, 3)),
+        vectors=(series("star tracker", time[::2]), series("sun sensor", time[1:-1] + 0.1)),
+        truth=Truth(attitude=random_attitudes(n + 1), bias=random.standard_normal((n + 1, 3))),
+    )
+
+
+# ---------------------------------------------------------------------------------------------------- the record
+
+
+def test_rates_are_increments_over_intervals():
+    r = record()
+    np.testing.assert_allclose(r.rates * np.diff(r.time)[:, None], r.increments, rtol=1e-15)
+
+
+def test_records_are_frozen_and_lists_are_welcome():
+    r = ImuRecord(time=[0, 1, 2], increments=[[0, 0, 1], [0, 0, 2]], vectors=[])
+    assert r.increments.dtype == np.float64
+    assert r.vectors == ()
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        r.time = np.arange(3.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"time": [0.0]}, "time has 1 stamps; at least 2"),
+        ({"time": [0.0, 2.0, 1.0]}, r"time\[2\] goes back"),
+        ({"time": [0.0, 1.0, 1.0]}, r"time\[2\] repeats"),
+        ({"increments": np.zeros((3, 3))}, r"increments has shape \(3, 3\), wanted \(2, 3\)"),
+        ({"increments": [[0, 0, 0], [0, np.nan, 0]]}, r"increments\[1, 1\] is nan"),
+        ({"vectors": (series("sun", np.arange(2.0)), series("sun", np.arange(2.0)))}, "two series of one name"),
+        ({"truth": Truth(attitude=random_attitudes(2), bias=np.zeros((3, 3)))}, r"truth.attitude has shape \(2, 4\)"),
+        (
+            {"truth": Truth(attitude=2.0 * random_attitudes(3), bias=np.zeros((3, 3)))},
+            r"truth.attitude\[0\] has norm 2",
+        ),
+        ({"truth": Truth(attitude=random_attitudes(3), bias=np.zeros(3))}, r"truth.bias has shape \(3,\)"),
+    ],
+)
+def test_bad_records_are_refused(changes, words):
+    given = {"time": [0.0, 1.0, 2.0], "increments": np.zeros((2, 3))} | changes
+    with pytest.raises(InputError, match=words):
+        ImuRecord(**given)
+
+
+# ---------------------------------------------------------------------------------------------------- compressing
+
+
+@pytest.mark.parametrize("name", ["one-sample", "two-sample", "three-sample", "four-sample"])
+def test_compress(name):
+    algorithm = coning.ALGORITHMS[name]
+    r = record(13)
+    n, kept = algorithm.samples, 13 // algorithm.samples
+    small = compress(r, algorithm)
+    np.testing.assert_array_equal(small.time, r.time[: kept * n + 1 : n])
+    np.testing.assert_array_equal(small.truth.attitude, r.truth.attitude[: kept * n + 1 : n])
+    np.testing.assert_array_equal(small.truth.bias, r.truth.bias[: kept * n + 1 : n])
+    assert small.increments.shape == (kept, 3)
+    assert small.vectors == r.vectors
+    if n == 2:  # the two-sample algorithm, written out
+        first, second = r.increments[0:26:2][:kept], r.increments[1:26:2][:kept]
+        np.testing.assert_allclose(small.increments, first + second + 2.0 / 3.0 * np.cross(first, second), atol=1e-16)
+
+
+def test_compress_refuses_a_record_shorter_than_a_step():
+    with pytest.raises(InputError, match="record has 3 intervals; four-sample needs at least 4"):
+        compress(record(3), coning.ALGORITHMS["four-sample"])
+
+
+# ---------------------------------------------------------------------------------------------------- cutting
+
+
+@pytest.mark.parametrize("middle", [1, 5, 11])
+def test_parts_make_up_the_whole(middle):
+    r = record()
+    parts = cut(r, 0, middle), cut(r, middle, 12)
+    np.testing.assert_array_equal(np.concatenate([p.increments for p in parts]), r.increments)
+    assert parts[0].time[-1] == parts[1].time[0] == r.time[middle]
+    np.testing.assert_array_equal(parts[1].truth.attitude, r.truth.attitude[middle:])
+    np.testing.assert_array_equal(parts[0].truth.bias, r.truth.bias[: middle + 1])
+    for k, whole in enumerate(r.vectors):
+        for field in ("time", "vector_b", "sigma"):
+            joined = np.concatenate([getattr(p.vectors[k], field) for p in parts])
+            np.testing.assert_array_equal(joined, getattr(whole, field))
+        # a measurement at the cut belongs to the part that it ends, at the very start to the first
+        assert np.all(parts[1].vectors[k].time > r.time[middle])
+
+
+def test_cut_keeps_what_belongs_to_each_sample():
+    """References that change, times of arrival: a row of each belongs to a measurement."""
+    r = record()
+    time = r.time[::2]
+    moving = np.random.default_rng(4).standard_normal((len(time), 3))
+    sensor = series("planet", time, reference_f=moving, arrival=time + 0.2)
+    part = cut(dataclasses.replace(r, vectors=(sensor,)), 4, 12).vectors[0]
+    inside = time > r.time[4]
+    np.testing.assert_array_equal(part.time, time[inside])
+    np.testing.assert_allclose(part.reference_f, (moving / np.linalg.norm(moving, axis=1)[:, None])[inside], rtol=1e-15)
+    np.testing.assert_array_equal(part.arrival, (time + 0.2)[inside])
+
+
+@pytest.mark.parametrize(("first", "last"), [(-1, 5), (3, 3), (5, 3), (0, 13)])
+def test_cut_refuses_edges_that_are_not_there(first, last):
+    with pytest.raises(InputError, match=r"cut from edge .* with edges 0 to 12; choose 0 ≤ first < last"):
+        cut(record(), first, last)
+
+
+# ---------------------------------------------------------------------------------------------------- the estimate's file
+
+
+def estimate(full: bool = False) -> Estimate:
+    random = np.random.default_rng(5)
+    P = random.standard_normal((7, 6, 6))
+    P = P @ np.swapaxes(P, 1, 2)
+    return Estimate(
+        time=np.cumsum(random.random(7)),
+        attitude=random_attitudes(7),
+        bias=random.standard_normal((7, 3)),
+        variance=np.diagonal(P, axis1=1, axis2=2).copy(),
+        covariance=P if full else None,
+        innovations={
+            "star tracker": Innovations(time=np.arange(4.0), whitened=random.standard_normal((4, 2))),
+            "magnetometer": Innovations(time=np.empty(0), whitened=np.empty((0, 1))),
+        },
+        skipped={"star tracker": 3, "magnetometer": 0},
+    )
+
+
+@pytest.mark.parametrize("full", [False, True])
+def test_estimate_round_trip_is_exact(tmp_path, full):
+    written = estimate(full)
+    write_estimate(tmp_path / "new folder" / "estimate.h5", written, {"source": "test"})
+    read = read_estimate(tmp_path / "new folder" / "estimate.h5")
+    for name in ("time", "attitude", "bias", "variance"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(written, name))
+    if full:
+        np.testing.assert_array_equal(read.covariance, written.covariance)
+    else:
+        assert read.covariance is None
+    assert dict(read.skipped) == dict(written.skipped)
+    assert set(read.innovations) == set(written.innovations)
+    for sensor, innovations in written.innovations.items():
+        np.testing.assert_array_equal(read.innovations[sensor].time, innovations.time)
+        np.testing.assert_array_equal(read.innovations[sensor].whitened, innovations.whitened)
+    assert [path.name for path in (tmp_path / "new folder").iterdir()] == ["estimate.h5"]
+
+
+def test_estimate_file_tells_units_conventions_and_attributes(tmp_path):
+    write_estimate(tmp_path / "estimate.h5", estimate(full=True), {"source": "test", "parameter.sigma": 0.5})
+    with h5py.File(tmp_path / "estimate.h5") as file:
+        assert file.attrs["conventions"] == CONVENTIONS
+        assert file.attrs["version"] == strapdown.__version__
+        assert (file.attrs["source"], file.attrs["parameter.sigma"]) == ("test", 0.5)
+        units = {name: file[name].attrs["unit"] for name in ("time", "attitude", "bias", "variance", "covariance")}
+    assert units["time"] == "s"
+    assert units["bias"] == "rad/s"
+    assert all(units.values())
+
+
+def test_sensor_names_with_a_slash_survive(tmp_path):
+    """In HDF5 a slash parts group names."""
+    sensor = Innovations(time=np.arange(2.0), whitened=np.ones((2, 1)))
+    written = dataclasses.replace(estimate(), innovations={"GPS/heading": sensor}, skipped={"GPS/heading": 1})
+    write_estimate(tmp_path / "estimate.h5", written)
+    read = read_estimate(tmp_path / "estimate.h5")
+    assert set(read.innovations) == {"GPS/heading"}
+    assert dict(read.skipped) == {"GPS/heading": 1}
+
+
+def test_sigma_and_nis():
+    e = estimate()
+    np.testing.assert_allclose(e.sigma**2, e.variance, rtol=1e-15)
+    i = e.innovations["star tracker"]
+    np.testing.assert_allclose(i.nis, i.whitened[:, 0] ** 2 + i.whitened[:, 1] ** 2, rtol=1e-15)
+    assert e.innovations["magnetometer"].nis.shape == (0,)
+
+
+def test_a_write_that_fails_leaves_the_old_file(tmp_path):
+    path = tmp_path / "estimate.h5"
+    write_estimate(path, estimate())
+    before = path.read_bytes()
+    with pytest.raises(TypeError):
+        write_estimate(path, estimate(full=True), {"source": object()})
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["estimate.h5"]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 0.98])
+def test_truncated_files_are_refused(tmp_path, share):
+    path = tmp_path / "estimate.h5"
+    write_estimate(path, estimate(full=True))
+    content = path.read_bytes()
+    path.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(InputError, match=r"estimate\.h5 .*truncated"):
+        read_estimate(path)
+
+
+def test_foreign_files_are_refused(tmp_path):
+    text, other, half = (tmp_path / name for name in ("text.h5", "other.h5", "half.h5"))
+    text.write_text("time,gx\n0,1\n")
+    with h5py.File(other, "w") as file:
+        file["imu_gyr"] = np.zeros((3, 3))
+    with h5py.File(half, "w") as file:
+        file.attrs["kind"] = "strapdown estimate"
+        file["time"] = np.arange(3.0)
+    with pytest.raises(InputError, match=r"text\.h5 cannot be read as HDF5"):
+        read_estimate(text)
+    with pytest.raises(InputError, match=r"other\.h5 is not a strapdown estimate"):
+        read_estimate(other)
+    with pytest.raises(InputError, match=r"half\.h5 .*attitude"):
+        read_estimate(half)
+    with pytest.raises(InputError, match=r"none\.h5 does not exist; check the path"):
+        read_estimate(tmp_path / "none.h5")

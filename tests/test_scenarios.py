@@ -1,0 +1,238 @@
+"""Scenarios: the built-in ones, files and their errors, and streams that do not disturb each other."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from strapdown import motion, orbit, scenarios, vectors
+from strapdown.checks import InputError
+from strapdown.gyro import GyroSpec
+from strapdown.scenarios import (
+    SCENARIOS,
+    Scenario,
+    load_scenario,
+    scenario_from_toml,
+    scenario_to_table,
+    scenario_to_toml,
+    simulate,
+)
+
+FIRST = "rate_hz = 10.0\nduration_s = 2.0\n"
+REST = FIRST + '[motion]\ntype = "rest"\n'
+
+
+def same(a, b):
+    """Whether two records are the same to the last bit."""
+    pairs = [
+        (a.time, b.time),
+        (a.increments, b.increments),
+        (a.truth.attitude, b.truth.attitude),
+        (a.truth.bias, b.truth.bias),
+    ]
+    for x, y in zip(a.vectors, b.vectors, strict=True):
+        pairs += [(x.time, y.time), (x.references_f, y.references_f), (x.sigma, y.sigma)]
+        pairs += [(np.nan_to_num(x.vector_b), np.nan_to_num(y.vector_b))]
+    return all(np.array_equal(x, y) for x, y in pairs)
+
+
+def test_the_built_in_ones_are_those_asked_for():
+    assert set(SCENARIOS) == {
+        "coning",
+        "rest",
+        "spin",
+        "slew-vibration",
+        "tumbling-satellite",
+        "low-orbit",
+        "hand-held",
+    }
+    rows = scenarios.builtin_rows()
+    assert [row["name"] for row in rows] == list(SCENARIOS)
+    assert all(row["description"] for row in rows)
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_built_in_scenarios_simulate_and_survive_a_file(name, tmp_path):
+    short = dataclasses.replace(load_scenario(name), duration=4.0)
+    path = tmp_path / "own.toml"
+    path.write_text(scenario_to_toml(short), encoding="utf-8")
+    read = load_scenario(path)
+    assert scenario_to_table(read) == scenario_to_table(short)
+    record = simulate(short)
+    assert same(record, simulate(read))
+    assert len(record.increments) == round(4.0 * short.rate)
+    np.testing.assert_array_equal(record.truth.attitude, short.motion.attitude(record.time))
+    assert not same(record, simulate(short, seed=99))
+    assert not same(record, simulate(short, run=1))
+
+
+MOTIONS = [
+    motion.Coning(angle=0.1234, frequency=3.3),
+    motion.SpinCone(precession_rate=0.3, spin_rate=0.7, angle=0.11),
+    motion.ConstantRate(rate=[0.1, 0.2, 0.3], initial_attitude=[0.6, 0.8, 0.0, 0.0]),
+    motion.SpinRock(rock_angle=0.1, rock_frequency=2.0, spin_rate=1.0, rock_phase=0.3),
+    motion.Slew(rotation_vector=[0.1, 1.0, 2.0], duration=7.0, start=1.0),
+    motion.TorqueFree(inertia=[1.0, 2.0, 3.0], initial_rate=[0.1, 1.0, 0.1]),
+    motion.HarmonicRates(
+        harmonics=[motion.Harmonic(amplitude=[0.1, 0.0, 0.2], frequency=0.3, phase=0.1)], mean=[0.0, 0.1, 0.0]
+    ),
+    motion.Composed(
+        base=motion.Slew(rotation_vector=[0.0, 1.0, 0.0], duration=3.0),
+        vibration=motion.Coning(angle=0.01, frequency=30.0),
+    ),
+    motion.rest(),
+]
+FAULTS = vectors.Faults(
+    latency=0.1,
+    outages=[(1.0, 1.3)],
+    outlier_probability=0.1,
+    outlier_scale=7.0,
+    correlated_sigma=1e-5,
+    correlation_time=3.0,
+)
+SENSORS = (
+    vectors.VectorSensor(name="star", reference_f=[1.0, 2.0, 3.0], sigma=1.1e-4, rate=3.0, phase=0.1, faults=FAULTS),
+    vectors.VectorSensor(name="level", reference_f=[1.0, 0.2, 0.3], sigma=1.1e-4, rate=3.0, kind="heading"),
+    vectors.AttitudeSensor(name="tracker", sigma_across=1e-4, sigma_about=3e-4, rate=2.0, boresight="y"),
+    vectors.Magnetometer(
+        name="mag",
+        field_f=[2e-5, 1e-6, 3e-5],
+        sigma=1e-7,
+        rate=3.0,
+        kind="vector",
+        hard_iron=[1e-7, 0.0, 2e-7],
+        soft_iron=0.01 * np.eye(3),
+    ),
+    vectors.Magnetometer(
+        name="dipole", field_f=orbit.CircularOrbit(altitude=6e5, inclination=0.9).magnetic_field, sigma=1e-7, rate=3.0
+    ),
+    vectors.Accelerometer(
+        name="acc", sigma=0.01, rate=5.0, lever_arm_b=[0.1, 0.2, 0.3], bias=[0.01, 0.0, 0.0], faults=FAULTS
+    ),
+    vectors.HeadingPair(name="gnss", baseline_b=[1.0, 0.5, 0.0], sigma=0.01, rate=1.0),
+)
+
+
+@pytest.mark.parametrize("body", MOTIONS, ids=lambda body: type(body).__name__)
+def test_every_motion_and_sensor_survives_a_file(body):
+    whole = Scenario(
+        motion=body,
+        gyro=GyroSpec(angle_random_walk=1e-4, bias_instability=1e-6, turn_on_bias=[1e-5, 0.0, 2e-5]),
+        sensors=SENSORS,
+        rate=50.0,
+        duration=3.0,
+        name="x",
+        seed=5,
+        gravity_f=(0.0, 0.0, -1.62),
+    )
+    read = scenario_from_toml(scenario_to_toml(whole))
+    assert scenario_to_table(read) == scenario_to_table(whole)
+    assert read.motion == body
+    assert read.gyro == whole.gyro
+    assert same(simulate(whole), simulate(read))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[motoin]\n", "did you mean 'motion'"),
+        (FIRST, "motion is missing"),
+        ("duration_s = 1.0\n[motion]\ntype='rest'", "rate_hz is missing"),
+        (FIRST + "[motion]\nangle_deg = 1.0", "type is missing"),
+        (FIRST + "motion = 3", "must be a table"),
+        (FIRST + "[motion]\ntype = 'conning'", "did you mean 'coning'"),
+        (FIRST + "[motion]\ntype = 'coning'\nangle_degree = 1.0", "did you mean 'angle_deg'"),
+        (FIRST + "[motion]\ntype = 'coning'\nangle_deg = 1.0", "frequency_hz is missing"),
+        (FIRST + "[motion]\ntype = 'coning'\nangle_deg = '1'\nfrequency_hz=1.0", "must be a number"),
+        (FIRST + "[motion]\ntype = 'composed'\nbase = {type='rest'}", "vibration"),
+        (REST + "[gyro]\npreset = 'stim30'", "did you mean 'stim300'"),
+        (REST + "[gyro]\npreset = 'stim300'\nscale_factor_pmp = 3.0", "did you mean 'scale_factor_ppm'"),
+        (REST + "[[sensors]]\ntype='direction'\nsgma_arcsec=1.0", "did you mean 'sigma_arcsec'"),
+        (REST + "[[sensors]]\ntype='direction'\nname='a'\nsigma_arcsec=1.0\nrate_hz=1.0", "reference_f is missing"),
+        (REST + "[[sensors]]\ntype='direction'\nlatancy_s=1.0", "did you mean 'latency_s'"),
+        (REST + "[[sensors]]\ntype='magnetometer'\norbit={altitude=3}", "did you mean 'altitude_"),
+        (REST + "[sensors]\ntype='direction'", "two brackets"),
+        (FIRST.replace("10.0", "-1.0") + "[motion]\ntype='rest'", "rate is -1"),
+        ("rate_hz = = 3", "no TOML"),
+    ],
+)
+def test_wrong_files_are_refused_with_the_nearest_key(text, message):
+    with pytest.raises(InputError, match=message):
+        scenario_from_toml(text)
+
+
+def test_missing_files_and_names(tmp_path):
+    with pytest.raises(InputError, match="did you mean 'coning'"):
+        load_scenario("conning")
+    with pytest.raises(InputError, match="does not exist"):
+        load_scenario(tmp_path / "none.toml")
+    (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match="cannot be read"):
+        load_scenario(tmp_path / "bytes.toml")
+
+
+def test_what_has_no_form_in_a_file_is_refused():
+    base = scenario_from_toml(REST)
+    for change in (
+        {"motion": motion.waypoints([0.0, 1.0, 3.0], np.tile([1.0, 0.0, 0.0, 0.0], (3, 1)))},
+        {"sensors": (vectors.Magnetometer(name="m", field_f=lambda t: np.ones((len(t), 3)), sigma=1.0, rate=1.0),)},
+        {
+            "sensors": (
+                vectors.Accelerometer(name="a", acceleration_f=lambda t: np.ones((len(t), 3)), sigma=1.0, rate=1.0),
+            )
+        },
+    ):
+        with pytest.raises(InputError, match="no form in a file"):
+            scenario_to_toml(dataclasses.replace(base, **change))
+
+
+def test_a_preset_may_be_changed_in_a_file():
+    plain = scenario_from_toml(REST + "[gyro]\npreset = 'stim300'")
+    changed = scenario_from_toml(REST + "[gyro]\npreset = 'stim300'\nrange_deg_per_s = 100.0")
+    assert plain.gyro_preset == "stim300"
+    assert changed.gyro == dataclasses.replace(plain.gyro, range=np.deg2rad(100.0))
+    assert scenario_from_toml(scenario_to_toml(changed)).gyro == changed.gyro
+
+
+def test_adding_a_sensor_changes_no_other_stream():
+    spec = GyroSpec(angle_random_walk=1e-4, rate_random_walk=1e-5, bias_instability=1e-6)
+    base = Scenario(motion=MOTIONS[0], gyro=spec, sensors=SENSORS[:2], rate=50.0, duration=3.0)
+    alone, more = simulate(base, 3, 7), simulate(dataclasses.replace(base, sensors=SENSORS), 3, 7)
+    assert np.array_equal(alone.increments, more.increments)
+    for a, b in zip(alone.vectors, more.vectors[:2], strict=True):
+        assert np.array_equal(a.vector_b, b.vector_b)
+    twins = tuple(dataclasses.replace(SENSORS[1], name=name) for name in ("one", "other"))
+    one, other = simulate(dataclasses.replace(base, sensors=twins), 3, 7).vectors
+    assert not np.any(one.vector_b == other.vector_b)
+    with pytest.raises(InputError, match="two sensors"):
+        dataclasses.replace(base, sensors=(SENSORS[0], SENSORS[0]))
+
+
+def test_jitter_tells_the_truth_where_it_sampled_and_losses_are_bridged():
+    spec = GyroSpec(sampling_jitter=1e-3, timestamp_offset=0.5, drop_probability=0.2)
+    fast = motion.ConstantRate(rate=[0.0, 0.0, 3.0])
+    base = Scenario(
+        motion=fast, gyro=dataclasses.replace(spec, drop_probability=0.0), sensors=(), rate=50.0, duration=20.0
+    )
+    record = simulate(base, 1)
+    np.testing.assert_allclose(record.time, base.edges + 0.5)
+    sampled = 2.0 * np.unwrap(np.arctan2(record.truth.attitude[:, 3], record.truth.attitude[:, 0]), period=np.pi) / 3.0
+    assert np.std(sampled - base.edges) == pytest.approx(1e-3, rel=0.1)
+    np.testing.assert_allclose(np.diff(sampled) * 3.0, record.increments[:, 2], atol=1e-9)
+    lossy = simulate(dataclasses.replace(base, gyro=spec), 1)
+    assert len(lossy.increments) == pytest.approx(800, abs=60)
+    np.testing.assert_allclose(lossy.rates[:, 2], 3.0, atol=1.0)
+    assert set(lossy.time) <= set(record.time)
+    left = np.searchsorted(record.time, lossy.time)
+    np.testing.assert_array_equal(lossy.truth.attitude, record.truth.attitude[left])
+    steady = simulate(dataclasses.replace(base, gyro=GyroSpec(drop_probability=0.2)), 1)
+    np.testing.assert_allclose(steady.rates[:, 2], 3.0, rtol=1e-12)
+
+
+def test_a_g_sensitive_gyro_feels_gravity_and_not_in_free_fall():
+    spec = GyroSpec(g_sensitivity=1e-4 * np.eye(3))
+    base = Scenario(motion=motion.rest(), gyro=spec, sensors=(), rate=10.0, duration=1.0)
+    np.testing.assert_allclose(
+        simulate(base, 1).rates, np.tile([0.0, 0.0, 9.80665e-4], (10, 1)), rtol=1e-12, atol=1e-18
+    )
+    assert not np.any(simulate(dataclasses.replace(base, gravity_f=(0.0, 0.0, 0.0)), 1).rates)

@@ -1,0 +1,64 @@
+"""Every script in sims/ runs small, by itself, in an empty folder, and returns a frozen result.
+
+A script may define ``SMALL``, keyword arguments that make its ``main`` quick; without it ``main`` runs as it is. Each gets a new process,
+as a reader would give it, and so many seconds.
+"""
+
+from __future__ import annotations
+
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+SIMS = sorted((ROOT / "sims").glob("*.py"))
+SECONDS = 60
+
+RUN = """
+import dataclasses, importlib.util, sys
+import matplotlib
+matplotlib.use("Agg")
+spec = importlib.util.spec_from_file_location("sim", sys.argv[1])
+sim = sys.modules["sim"] = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(sim)
+result = sim.main(**getattr(sim, "SMALL", {}))
+assert dataclasses.is_dataclass(result), f"main returns {type(result).__name__}, not a dataclass"
+assert type(result).__dataclass_params__.frozen, f"{type(result).__name__} is not frozen"
+"""
+
+
+def test_there_are_sims():
+    assert SIMS
+
+
+@pytest.mark.parametrize("path", SIMS, ids=lambda path: path.stem)
+def test_sim_is_a_script_with_a_main(path):
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    assert ast.get_docstring(tree), "say in the docstring which question it answers and how to run it"
+    mains = [node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == "main"]
+    assert len(mains) == 1
+    guards = [ast.unparse(node.test) for node in tree.body if isinstance(node, ast.If)]
+    assert "__name__ == '__main__'" in guards, "let the file run by itself"
+
+
+@pytest.mark.parametrize("path", SIMS, ids=lambda path: path.stem)
+def test_sim_runs_small(path, tmp_path):
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", RUN, path],
+            cwd=tmp_path,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=SECONDS,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        pytest.fail(f"sims/{path.name} took more than {SECONDS} s; define SMALL there, arguments that make main quick")
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert "Warning" not in done.stderr, done.stderr[-3000:]

@@ -1,0 +1,804 @@
+"""Smoother: equal to the linear one, to its fixed-side twin and to least squares; consistent; never worse than the filter."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+
+import filterpy.common
+import filterpy.kalman
+import mpmath
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from strapdown import coning, consistency, kinematics, mekf, motion, quaternion, records, smoother
+from strapdown.checks import InputError
+from strapdown.kernels import smoother_loop, smoother_step
+from strapdown.kernels.machine import compiled
+from strapdown.kernels.series import LARGEST_ANGLE
+from strapdown.mekf import ProcessNoise
+from strapdown.records import Estimate, ImuRecord, Truth
+from strapdown.vectors import VectorMeasurements, triad
+
+DOWN, NORTH, STAR = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]), np.array([0.6, 0.48, 0.64])
+
+
+# ------------------------------------------------------------------------------------------------------------------ simulation
+
+
+NOISE = ProcessNoise(angle_random_walk=2e-3, rate_random_walk=3e-4)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Case:
+    """A body, a gyro and sensors, each (kind, reference, sigma, interval, phase) or with an array of times."""
+
+    motion: motion.Motion
+    sensors: tuple
+    duration: float = 20.0
+    rate: float = 50.0
+    noise: ProcessNoise = NOISE
+    attitude_sigma: float = 0.03
+    bias_sigma: float = 3e-3
+    integration: str | None = None
+
+
+def measure(name, kind, reference, sigma, time, attitude, rng) -> VectorMeasurements:
+    exact = quaternion.rotate(quaternion.conjugate(attitude), reference)
+    z = exact + sigma * rng.standard_normal((len(time), 3))
+    if kind != "vector":
+        z /= np.linalg.norm(z, axis=1, keepdims=True)
+    return VectorMeasurements(
+        sensor=name, kind=kind, time=time, vector_b=z, reference_f=reference, sigma=np.full(len(time), sigma)
+    )
+
+
+def simulate(case: Case, rng: np.random.Generator, edges: np.ndarray | None = None) -> ImuRecord:
+    edges = np.arange(round(case.duration * case.rate) + 1) / case.rate if edges is None else edges
+    dt = np.diff(edges)[:, None]
+    n = len(dt)
+    sv, su = case.noise.angle_random_walk, case.noise.rate_random_walk
+    bias = case.bias_sigma * rng.standard_normal(3) + np.vstack(
+        [np.zeros(3), np.cumsum(su * np.sqrt(dt) * rng.standard_normal((n, 3)), axis=0)]
+    )
+    noise = np.sqrt(sv**2 * dt + su**2 * dt**3 / 12.0) * rng.standard_normal((n, 3))
+    increments = case.motion.increments(edges) + 0.5 * dt * (bias[1:] + bias[:-1]) + noise
+    series = []
+    for i, (kind, reference, sigma, times) in enumerate(case.sensors):
+        time = np.arange(times[1], edges[-1], times[0]) if isinstance(times, tuple) else np.asarray(times)
+        series.append(measure(f"{kind} {i}", kind, reference, sigma, time, case.motion.attitude(time), rng))
+    return ImuRecord(
+        time=edges,
+        increments=increments,
+        vectors=tuple(series),
+        truth=Truth(attitude=case.motion.attitude(edges), bias=bias),
+    )
+
+
+def believed(case: Case, rng: np.random.Generator) -> tuple[ImuRecord, mekf.State]:
+    record = simulate(case, rng)
+    error = rng.standard_normal(6) * np.repeat([case.attitude_sigma, case.bias_sigma], 3)
+    initial = mekf.initial_state(
+        quaternion.multiply(record.truth.attitude[0], quaternion.exp(-error[:3])),
+        attitude_sigma=case.attitude_sigma,
+        bias_sigma=case.bias_sigma,
+        bias=record.truth.bias[0] - error[3:],
+    )
+    if case.integration:
+        record = records.compress(record, coning.ALGORITHMS[case.integration])
+    return record, initial
+
+
+SWAY = motion.HarmonicRates(
+    harmonics=(
+        motion.Harmonic(amplitude=(0.5, 0.2, -0.3), frequency=0.21),
+        motion.Harmonic(amplitude=(-0.2, 0.4, 0.3), frequency=0.37),
+    )
+)
+TURN = motion.ConstantRate(rate=(0.3, -0.5, 0.8))
+CASES = {
+    "directions": Case(
+        motion=SWAY, sensors=(("direction", DOWN, 0.02, (0.2, 0.2)), ("direction", NORTH, 0.04, (0.5, 0.5)))
+    ),
+    "one direction, turning": Case(motion=TURN, sensors=(("direction", STAR, 0.02, (0.1, 0.1)),)),
+    "vectors": Case(
+        motion=SWAY,
+        sensors=(("vector", 9.81 * DOWN, 0.2, (0.2, 0.2)), ("vector", 5e-5 * STAR, 2e-6, (0.4, 0.1))),
+    ),
+    "heading": Case(motion=SWAY, sensors=(("direction", DOWN, 0.01, (0.2, 0.2)), ("heading", NORTH, 0.02, (0.3, 0.3)))),
+    "asynchronous": Case(
+        motion=SWAY,
+        sensors=(
+            ("direction", DOWN, 0.02, (0.1337, 0.071)),
+            ("direction", STAR, 0.04, np.sort(np.random.default_rng(5).uniform(0.0, 20.0, 40))),
+            ("heading", NORTH, 0.05, (1.01, 0.77)),
+        ),
+    ),
+    "coning": Case(
+        motion=motion.Coning(angle=math.radians(2.0), frequency=3.0),
+        sensors=(("direction", DOWN, 0.02, (0.24, 0.24)), ("direction", NORTH, 0.02, (0.24, 0.24))),
+        rate=200.0,
+        integration="four-sample",
+    ),
+    "rest": Case(
+        motion=motion.rest(), sensors=(("direction", DOWN, 0.02, (0.2, 0.2)), ("direction", NORTH, 0.05, (1.0, 1.0)))
+    ),
+}
+
+
+def errors(estimate: Estimate, record: ImuRecord) -> np.ndarray:
+    return consistency.errors(estimate.attitude, estimate.bias, record.truth.attitude, record.truth.bias)
+
+
+# ---------------------------------------------------------------------------------------------------------- slow plain reference
+
+
+def transition(w: np.ndarray, dt: float, noise: ProcessNoise) -> tuple[np.ndarray, np.ndarray]:
+    """Φ and Q of the body-side error by Van Loan's matrix exponential."""
+    F = np.zeros((6, 6))
+    F[:3, :3], F[:3, 3:] = -kinematics.skew(w), -np.eye(3)
+    G = np.diag(np.repeat([noise.angle_random_walk, noise.rate_random_walk], 3))
+    return filterpy.common.van_loan_discretization(F, G, dt)
+
+
+def left_jacobian(phi: np.ndarray) -> np.ndarray:
+    return kinematics.right_jacobian(-phi)
+
+
+def side(q: np.ndarray) -> np.ndarray:
+    """The matrix that takes a body-side error state to the fixed-side one, q_true = exp(δ_f) ⊗ q."""
+    T = np.eye(6)
+    T[:3, :3] = quaternion.to_matrix(q)
+    return T
+
+
+def on_attitude(J: np.ndarray) -> np.ndarray:
+    G = np.eye(6)
+    G[:3, :3] = J
+    return G
+
+
+def fixed_side_smoother(record: ImuRecord, noise: ProcessNoise, initial: mekf.State) -> Estimate:
+    """Filter and textbook smoother with the *fixed-side* error, by matrices.
+
+    A correction there is a left product and its Jacobians are left ones. So it agrees with the body-side smoother only if both carry
+    their covariances from one tangent space to the next, and rightly.
+    """
+    events = sorted(
+        (
+            (series.time[i], s, i)
+            for s, series in enumerate(record.vectors)
+            for i in np.flatnonzero(series.time <= record.time[-1])
+        ),
+        key=lambda event: event[:2],
+    )
+    stops = np.unique(np.concatenate([record.time, [event[0] for event in events]]))
+    q, b, P = initial.attitude, initial.bias, side(initial.attitude) @ initial.covariance @ side(initial.attitude).T
+    filtered, steps, at_edge = [], [], []
+    for j, now in enumerate(stops):
+        if j > 0:
+            k = int(np.searchsorted(record.time, now, side="left")) - 1
+            w = record.increments[k] / (record.time[k + 1] - record.time[k]) - b
+            dt = now - stops[j - 1]
+            after = quaternion.normalize(quaternion.multiply(q, quaternion.exp(w * dt)))
+            F, Q = transition(w, dt, noise)
+            F, Q = side(after) @ F @ side(q).T, side(after) @ Q @ side(after).T
+            q, P = after, F @ P @ F.T + Q
+            steps.append((q, b, P, F))
+        while events and events[0][0] == now:
+            _, s, i = events.pop(0)
+            series = record.vectors[s]
+            r = series.reference_f / np.linalg.norm(series.reference_f)
+            sigma = series.sigma[i] / np.linalg.norm(series.reference_f)
+            z = quaternion.rotate(q, series.vector_b[i])  # in the fixed frame
+            H = np.zeros((1 if series.kind == "heading" else 2, 6))
+            if series.kind == "heading":
+                H[0, 2] = 1.0
+                y = np.array([math.atan2(z[0] * r[1] - z[1] * r[0], z[0] * r[0] + z[1] * r[1])])
+            else:
+                u, v, _ = triad(r)
+                H[0, :3], H[1, :3] = -v, u
+                y = np.array([u @ z, v @ z]) / np.linalg.norm(series.reference_f)
+            K = P @ H.T @ np.linalg.inv(H @ P @ H.T + sigma**2 * np.eye(len(H)))
+            x = K @ y
+            P = (np.eye(6) - K @ H) @ P @ (np.eye(6) - K @ H).T + sigma**2 * K @ K.T
+            q, b = quaternion.multiply(quaternion.exp(x[:3]), q), b + x[3:]
+            G = on_attitude(left_jacobian(x[:3]))
+            P = G @ P @ G.T
+        filtered.append((q, b, P))
+        at_edge.append(now in record.time)
+    rows = [filtered[-1]]
+    for (q, b, P), (q_pred, b_pred, P_pred, F) in zip(filtered[-2::-1], steps[::-1], strict=True):
+        q_next, b_next, P_next = rows[-1]
+        a = quaternion.log(quaternion.multiply(q_next, quaternion.conjugate(q_pred)))
+        G = np.linalg.inv(on_attitude(left_jacobian(a)))
+        C = np.linalg.solve(P_pred, F @ P).T
+        x = C @ np.concatenate([a, b_next - b_pred])
+        after = P + C @ (G @ P_next @ G.T - P_pred) @ C.T
+        G = on_attitude(left_jacobian(x[:3]))
+        rows.append((quaternion.multiply(quaternion.exp(x[:3]), q), b + x[3:], G @ after @ G.T))
+    kept = [row for row, edge in zip(rows[::-1], at_edge, strict=True) if edge]
+    covariance = np.array([side(q).T @ P @ side(q) for q, _, P in kept])
+    return Estimate(
+        time=record.time,
+        attitude=np.array([q for q, _, _ in kept]),
+        bias=np.array([b for _, b, _ in kept]),
+        variance=np.diagonal(covariance, axis1=1, axis2=2),
+        covariance=covariance,
+    )
+
+
+def assert_same(one: Estimate, other: Estimate, tolerance: float) -> None:
+    """Difference of the states in units of their σ, and of the covariances scaled to correlations, within the tolerance."""
+    error = consistency.errors(one.attitude, one.bias, other.attitude, other.bias)
+    assert np.max(np.abs(error) / one.sigma) < tolerance
+    scale = one.sigma[:, :, None] * one.sigma[:, None, :]
+    assert np.max(np.abs(one.covariance - other.covariance) / scale) < tolerance
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_equals_the_fixed_side_reference(name: str) -> None:
+    # A wide prior and a wrong start, so that corrections are tenths of a radian and a missing Jacobian shows in the first digits.
+    case = dataclasses.replace(CASES[name], duration=4.0, attitude_sigma=0.2, bias_sigma=0.02)
+    record, initial = believed(case, np.random.default_rng(11))
+    one = smoother.run(record, case.noise, initial, full_covariance=True)
+    assert_same(one, fixed_side_smoother(record, case.noise, initial), 1e-8)
+
+
+# --------------------------------------------------------------------------------------------------------------- linear and oracles
+
+
+def test_single_axis_equals_filterpy() -> None:
+    # Turns about the fixed z axis with headings measured are exactly linear: angle and bias of one axis.
+    rng = np.random.default_rng(3)
+    n, sigma = 400, 0.01
+    noise = ProcessNoise(angle_random_walk=3e-3, rate_random_walk=1e-3)
+    time = np.concatenate([[0.0], np.cumsum(rng.uniform(0.01, 0.05, n))])
+    dt = np.diff(time)
+    angle = 0.3 * rng.standard_normal(n) * dt
+    turned = np.concatenate([[0.0], np.cumsum(angle)])
+    picked = np.arange(4, n + 1, 4)
+    heading = turned[picked] + 0.05 + sigma * rng.standard_normal(len(picked))
+    series = VectorMeasurements(
+        sensor="compass",
+        kind="heading",
+        time=time[picked],
+        vector_b=np.stack([np.cos(heading), -np.sin(heading), np.zeros(len(picked))], axis=-1),
+        reference_f=NORTH,
+        sigma=np.full(len(picked), sigma),
+    )
+    record = ImuRecord(time=time, increments=np.outer(angle, DOWN), vectors=(series,))
+    initial = mekf.initial_state(quaternion.IDENTITY, attitude_sigma=0.1, bias_sigma=0.01)
+    estimate = smoother.run(record, noise, initial, full_covariance=True)
+
+    kalman = filterpy.kalman.KalmanFilter(dim_x=2, dim_z=1)  # of the deviation from the summed increments, and the bias
+    kalman.x, kalman.P = np.zeros(2), np.diag([0.01, 1e-4])
+    kalman.H, kalman.R = np.array([[1.0, 0.0]]), np.array([[sigma**2]])
+    xs, Ps, Fs, Qs = [kalman.x], [kalman.P], [np.eye(2)], [np.zeros((2, 2))]
+    for k in range(n):
+        kalman.F = np.array([[1.0, -dt[k]], [0.0, 1.0]])
+        kalman.Q = noise.angle_random_walk**2 * np.diag([dt[k], 0.0]) + noise.rate_random_walk**2 * np.array(
+            [[dt[k] ** 3 / 3.0, -(dt[k] ** 2) / 2.0], [-(dt[k] ** 2) / 2.0, dt[k]]]
+        )
+        kalman.predict()
+        if k + 1 in picked:
+            kalman.update(heading[np.searchsorted(picked, k + 1)] - turned[k + 1])
+        for kept, value in zip((xs, Ps, Fs, Qs), (kalman.x, kalman.P, kalman.F, kalman.Q), strict=True):
+            kept.append(np.array(value))
+    x, P, _, _ = kalman.rts_smoother(np.array(xs), np.array(Ps), Fs, Qs)
+    found = 2.0 * np.arctan2(estimate.attitude[:, 3], estimate.attitude[:, 0]) - turned
+    np.testing.assert_allclose(found, x[:, 0], rtol=0, atol=1e-9 * 0.05)
+    np.testing.assert_allclose(estimate.bias[:, 2], x[:, 1], rtol=0, atol=1e-9 * 0.01)
+    axis = estimate.covariance[:, 2::3, 2::3]
+    np.testing.assert_allclose(axis, P, rtol=1e-9, atol=0)
+
+
+def least_squares_estimate(record: ImuRecord, noise: ProcessNoise, initial: mekf.State, guess: Estimate) -> np.ndarray:
+    """The whole trajectory that minimises prior, gyro and measurement residuals: its error state (n + 1, 6) from ``guess``."""
+    edges = len(record.time)
+    prior = np.linalg.inv(np.linalg.cholesky(initial.covariance))
+    dt = np.diff(record.time)
+    whitening = []
+    for increment, step in zip(record.increments, dt, strict=True):
+        _, Q = transition(increment / step - initial.bias, step, noise)
+        whitening.append(np.linalg.inv(np.linalg.cholesky(Q)))
+    rows = [(s, np.searchsorted(record.time, s.time), triad(s.reference_f)[:2]) for s in record.vectors]
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        x = x.reshape(edges, 6)
+        q, b = quaternion.multiply(guess.attitude, quaternion.exp(x[:, :3])), guess.bias + x[:, 3:]
+        start = np.concatenate(
+            [
+                quaternion.log(quaternion.multiply(quaternion.conjugate(initial.attitude), q[0])),
+                b[0] - initial.bias,
+            ]
+        )
+        predicted = quaternion.multiply(q[:-1], quaternion.exp(record.increments - b[:-1] * dt[:, None]))
+        step = np.concatenate(
+            [quaternion.log(quaternion.multiply(quaternion.conjugate(predicted), q[1:])), np.diff(b, axis=0)], axis=1
+        )
+        parts = [prior @ start, np.einsum("kij,kj->ki", whitening, step).ravel()]
+        for series, at, across in rows:
+            parts.append(((quaternion.rotate(q[at], series.vector_b) @ across.T) / series.sigma[:, None]).ravel())
+        return np.concatenate(parts)
+
+    scale = np.tile(np.sqrt(np.diag(initial.covariance)), edges)
+    solution = least_squares(
+        residuals, np.zeros(6 * edges), x_scale=scale, xtol=1e-15, ftol=1e-15, gtol=1e-15, jac="3-point"
+    )
+    return solution.x.reshape(edges, 6)
+
+
+def test_equals_least_squares_to_first_order() -> None:
+    # All errors scaled down by ten: the distance to the optimum, in units of σ, falls by ten. So the difference is of second order.
+    distances = []
+    for scale in (1.0, 0.1):
+        case = Case(
+            motion=TURN,
+            sensors=(
+                ("direction", DOWN, 0.05 * scale, (0.2, 0.2)),
+                ("direction", STAR, 0.05 * scale, (0.4, 0.4)),
+            ),
+            duration=1.6,
+            rate=5.0,
+            noise=ProcessNoise(angle_random_walk=0.05 * scale, rate_random_walk=0.05 * scale),
+            attitude_sigma=0.1 * scale,
+            bias_sigma=0.1 * scale,
+        )
+        edges = np.arange(9) * 0.2
+        times = {0.2: edges[1:-1], 0.4: edges[2:-1:2]}
+        case = dataclasses.replace(case, sensors=tuple((*s[:3], times[s[3][0]]) for s in case.sensors))
+        rng = np.random.default_rng(8)
+        record = simulate(case, rng, edges)
+        error = rng.standard_normal(6) * 0.1 * scale
+        initial = mekf.initial_state(
+            quaternion.multiply(record.truth.attitude[0], quaternion.exp(-error[:3])),
+            attitude_sigma=case.attitude_sigma,
+            bias_sigma=case.bias_sigma,
+            bias=record.truth.bias[0] - error[3:],
+        )
+        estimate = smoother.run(record, case.noise, initial)
+        distances.append(np.max(np.abs(least_squares_estimate(record, case.noise, initial, estimate)) / estimate.sigma))
+    assert distances[0] < 0.2
+    assert 5.0 < distances[0] / distances[1] < 20.0
+
+
+# --------------------------------------------------------------------------------------------------------------------- consistency
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_consistent_and_better_than_the_filter(name: str) -> None:
+    case, runs, rng = CASES[name], 100, np.random.default_rng(2024)
+    nees, squares = [], []
+    for _ in range(runs):
+        record, initial = believed(case, rng)
+        smoothed = smoother.run(record, case.noise, initial, full_covariance=True)
+        filtered = mekf.run(record, case.noise, initial)
+        epochs = np.linspace(0, len(record.time) - 1, 6).astype(int)
+        e = errors(smoothed, record)
+        P = smoothed.covariance
+        nees.append(
+            [
+                consistency.nees(e, P)[epochs],
+                consistency.nees(e[:, :3], P[:, :3, :3])[epochs],
+                consistency.nees(e[:, 3:], P[:, 3:, 3:])[epochs],
+            ]
+        )
+        squares.append([e**2 / filtered.variance, errors(filtered, record) ** 2 / filtered.variance])
+    mean = np.mean(nees, axis=0)
+    for values, degrees in zip(mean, (6, 3, 3), strict=True):
+        verdict = consistency.Verdict(mean=values / degrees, degrees=degrees, runs=runs, probability=0.999)
+        assert verdict.consistent, (values / degrees, verdict.simultaneous_bounds)
+    smoothed_square, filtered_square = np.mean(squares, axis=(0, 2, 3))
+    assert smoothed_square < 0.8 * filtered_square
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_consistent_over_many_runs(name: str) -> None:
+    case, runs, rng = CASES[name], 2000, np.random.default_rng(99)
+    nees = []
+    for _ in range(runs):
+        record, initial = believed(case, rng)
+        smoothed = smoother.run(record, case.noise, initial, full_covariance=True)
+        epochs = np.linspace(0, len(record.time) - 1, 6).astype(int)
+        nees.append(consistency.nees(errors(smoothed, record)[epochs], smoothed.covariance[epochs]))
+    verdict = consistency.Verdict(mean=np.mean(nees, axis=0) / 6.0, degrees=6, runs=runs, probability=0.99)
+    assert verdict.consistent, (verdict.mean, verdict.simultaneous_bounds)
+
+
+@pytest.mark.parametrize(("wrong", "above"), [(0.5, True), (2.0, False)])
+def test_a_wrong_gyro_model_is_outside(wrong: float, above: bool) -> None:
+    case, rng = CASES["directions"], np.random.default_rng(4)
+    noise = ProcessNoise(
+        angle_random_walk=wrong * case.noise.angle_random_walk, rate_random_walk=wrong * case.noise.rate_random_walk
+    )
+    nees = []
+    for _ in range(60):
+        record, initial = believed(case, rng)
+        middle = len(record.time) // 2
+        estimate = smoother.run(record, noise, initial, full_covariance=True)
+        nees.append(consistency.nees(errors(estimate, record)[middle], estimate.covariance[middle]))
+    low, high = consistency.mean_bounds(6, 60)
+    mean = np.mean(nees) / 6.0
+    assert mean > high if above else mean < low
+
+
+# ----------------------------------------------------------------------------------------------------------- never worse, the ends
+
+
+def scaled(case: Case, factor: float) -> Case:
+    """All errors by one factor smaller: the smaller, the more linear."""
+    noise = ProcessNoise(
+        angle_random_walk=factor * case.noise.angle_random_walk, rate_random_walk=factor * case.noise.rate_random_walk
+    )
+    return dataclasses.replace(
+        case,
+        noise=noise,
+        sensors=tuple((kind, reference, factor * sigma, times) for kind, reference, sigma, times in case.sensors),
+        attitude_sigma=factor * case.attitude_sigma,
+        bias_sigma=factor * case.bias_sigma,
+    )
+
+
+@pytest.mark.parametrize(("factor", "curvature"), [(1.0, 1e-5), (1e-3, 1e-10)])
+@pytest.mark.parametrize("name", CASES)
+def test_never_worse_than_the_filter(name: str, factor: float, curvature: float) -> None:
+    case = scaled(CASES[name], factor)
+    record, initial = believed(case, np.random.default_rng(7))
+    smoothed = smoother.run(record, case.noise, initial, full_covariance=True)
+    filtered = mekf.run(record, case.noise, initial, full_covariance=True)
+    # In one tangent space, P_filter − P_smoothed is positive semi-definite: no direction of the state is worse. But for the curvature of
+    # the rotations, of second order in the corrections: two moves of a tangent space are not quite one.
+    moved = quaternion.log(quaternion.multiply(quaternion.conjugate(filtered.attitude), smoothed.attitude))
+    G = np.tile(np.eye(6), (len(moved), 1, 1))
+    G[:, :3, :3] = kinematics.inverse_right_jacobian(moved)
+    carried = G @ smoothed.covariance @ np.swapaxes(G, 1, 2)
+    factor_inverse = np.linalg.inv(np.linalg.cholesky(filtered.covariance))
+    shares = np.linalg.eigvalsh(factor_inverse @ carried @ np.swapaxes(factor_inverse, 1, 2))
+    assert shares.max() < 1.0 + curvature
+    assert shares.min() > 0.0
+    if factor < 1.0:  # else the axes themselves turn, by the angle of the correction
+        early = record.time < 0.9 * record.time[-1]
+        assert np.all(smoothed.variance <= filtered.variance * (1.0 + 1e-12))
+        assert np.all(smoothed.variance[early] < filtered.variance[early])
+
+
+def test_last_state_is_the_filters() -> None:
+    case = CASES["asynchronous"]
+    record, initial = believed(case, np.random.default_rng(7))
+    smoothed = smoother.run(record, case.noise, initial, full_covariance=True)
+    filtered = mekf.run(record, case.noise, initial, full_covariance=True)
+    for name in ("attitude", "bias", "variance", "covariance"):
+        np.testing.assert_array_equal(getattr(smoothed, name)[-1], getattr(filtered, name)[-1])
+    np.testing.assert_array_equal(smoothed.time, filtered.time)
+    assert smoothed.skipped == filtered.skipped
+    for sensor, innovations in filtered.innovations.items():
+        np.testing.assert_array_equal(smoothed.innovations[sensor].whitened, innovations.whitened)
+        np.testing.assert_array_equal(smoothed.innovations[sensor].time, innovations.time)
+
+
+def test_without_measurements_it_is_the_filter() -> None:
+    case = dataclasses.replace(CASES["directions"], sensors=())
+    record, initial = believed(case, np.random.default_rng(7))
+    smoothed = smoother.run(record, case.noise, initial, full_covariance=True)
+    assert_same(smoothed, mekf.run(record, case.noise, initial, full_covariance=True), 1e-8)
+
+
+def exact_record(case: Case) -> ImuRecord:
+    """Noise-free data of a body at constant rate, which is the filter's own model, with a constant bias."""
+    silent = ProcessNoise(angle_random_walk=1e-300, rate_random_walk=0.0)
+    sensors = tuple((kind, reference, 0.0, times) for kind, reference, _, times in case.sensors)
+    quiet = simulate(dataclasses.replace(case, motion=TURN, noise=silent, sensors=sensors), np.random.default_rng(1))
+    sigma = [s[2] for s in case.sensors]
+    vectors = tuple(
+        dataclasses.replace(series, sigma=np.full(len(series.time), value))
+        for series, value in zip(quiet.vectors, sigma, strict=True)
+    )
+    return dataclasses.replace(quiet, vectors=vectors)
+
+
+def test_no_noise_no_error() -> None:
+    case = CASES["asynchronous"]
+    record = exact_record(case)
+    exact = mekf.initial_state(record.truth.attitude[0], attitude_sigma=0.1, bias_sigma=0.01, bias=record.truth.bias[0])
+    assert np.max(np.abs(errors(smoother.run(record, case.noise, exact), record))) < 1e-12
+
+
+def test_a_wrong_start_is_mended_to_its_very_beginning() -> None:
+    # Without noise in data or gyro model and with a wide prior, what is left of an initial error is what the measurements' σ lets pass.
+    case = dataclasses.replace(CASES["directions"], noise=ProcessNoise(angle_random_walk=1e-9, rate_random_walk=0.0))
+    record = exact_record(case)
+    wrong = mekf.initial_state(
+        quaternion.multiply(record.truth.attitude[0], quaternion.exp(np.array([1e-4, -2e-4, 3e-4]))),
+        attitude_sigma=1.0,
+        bias_sigma=1.0,
+        bias=record.truth.bias[0] + np.array([2e-5, -1e-5, 3e-5]),
+    )
+    estimate = smoother.run(record, case.noise, wrong)
+    before = errors(mekf.run(record, case.noise, wrong), record)[0]
+    assert np.all(np.abs(errors(estimate, record)[0]) < 1e-3 * np.abs(before))
+
+
+# ------------------------------------------------------------------------------------------------------------------- invariances
+
+
+def test_frames_are_a_matter_of_choice() -> None:
+    case = CASES["asynchronous"]
+    record, initial = believed(case, np.random.default_rng(12))
+    plain = smoother.run(record, case.noise, initial, full_covariance=True)
+    p = quaternion.normalize([0.3, -0.5, 0.7, 0.2])
+    back = quaternion.conjugate(p)
+    directions = tuple(s for s in record.vectors if s.kind != "heading")  # a heading knows which axis is vertical
+    record = dataclasses.replace(record, vectors=directions)
+    plain = smoother.run(record, case.noise, initial, full_covariance=True)
+    other_fixed = dataclasses.replace(
+        record,
+        vectors=tuple(dataclasses.replace(s, reference_f=quaternion.rotate(p, s.reference_f)) for s in directions),
+    )
+    start = dataclasses.replace(initial, attitude=quaternion.multiply(p, initial.attitude))
+    found = smoother.run(other_fixed, case.noise, start, full_covariance=True)
+    found = dataclasses.replace(found, attitude=quaternion.multiply(back, found.attitude))
+    assert_same(found, plain, 1e-9)
+    other_body = dataclasses.replace(
+        record,
+        increments=quaternion.rotate(back, record.increments),
+        vectors=tuple(dataclasses.replace(s, vector_b=quaternion.rotate(back, s.vector_b)) for s in directions),
+        truth=None,
+    )
+    start = dataclasses.replace(
+        initial, attitude=quaternion.multiply(initial.attitude, p), bias=quaternion.rotate(back, initial.bias)
+    )
+    found = smoother.run(other_body, case.noise, start, full_covariance=True)
+    T = np.kron(np.eye(2), quaternion.to_matrix(p))
+    covariance = T @ found.covariance @ T.T
+    found = dataclasses.replace(
+        found,
+        attitude=quaternion.multiply(found.attitude, back),
+        bias=quaternion.rotate(p, found.bias),
+        covariance=covariance,
+        variance=np.diagonal(covariance, axis1=1, axis2=2),
+    )
+    assert_same(found, plain, 1e-9)
+
+
+def test_large_turns_are_taken_in_sub_steps() -> None:
+    case = dataclasses.replace(
+        CASES["directions"],
+        motion=motion.ConstantRate(rate=(1.5, -2.0, 3.0)),
+        rate=2.0,
+        duration=10.0,
+        sensors=(("direction", DOWN, 0.02, (0.7, 0.33)), ("direction", STAR, 0.03, (0.5, 0.5))),
+    )
+    record, initial = believed(case, np.random.default_rng(12))
+    assert np.all(np.linalg.norm(record.increments, axis=1) > 1.5)
+    parts = 8
+    fine = np.interp(np.arange(parts * (len(record.time) - 1) + 1) / parts, np.arange(len(record.time)), record.time)
+    split = ImuRecord(time=fine, increments=np.repeat(record.increments / parts, parts, axis=0), vectors=record.vectors)
+    coarse = smoother.run(record, case.noise, initial, full_covariance=True)
+    fine = smoother.run(split, case.noise, initial, full_covariance=True)
+    every = {name: getattr(fine, name)[::parts] for name in ("time", "attitude", "bias", "variance", "covariance")}
+    assert_same(coarse, dataclasses.replace(fine, **every), 1e-9)
+
+
+def test_a_measurement_that_tells_nothing_changes_nothing() -> None:
+    # It splits intervals, so the segments are others.
+    case = CASES["directions"]
+    record, initial = believed(case, np.random.default_rng(13))
+    plain = smoother.run(record, case.noise, initial, full_covariance=True)
+    rng = np.random.default_rng(0)
+    time = np.sort(np.concatenate([rng.uniform(0.0, 20.0, 300), record.time[10:20], [0.0, 20.0]]))
+    blind = VectorMeasurements(
+        sensor="blind",
+        kind="direction",
+        time=time,
+        vector_b=np.tile(DOWN, (len(time), 1)),
+        reference_f=DOWN,
+        sigma=np.full(len(time), 1e8),
+    )
+    record = dataclasses.replace(record, vectors=(*record.vectors, blind))
+    assert_same(smoother.run(record, case.noise, initial, full_covariance=True), plain, 1e-8)
+
+
+def test_a_start_half_way_round_is_survived() -> None:
+    # Corrections beyond the range of the kernels' polynomials: no NaN, unit quaternions, right after the filter has converged.
+    case = dataclasses.replace(CASES["directions"], attitude_sigma=1.5)
+    record, _ = believed(case, np.random.default_rng(21))
+    for angle in (0.6, 1.5, 2.5, 3.1):
+        turn = quaternion.exp(angle * np.array([0.48, 0.6, 0.64]))
+        initial = mekf.initial_state(
+            quaternion.multiply(record.truth.attitude[0], turn), attitude_sigma=1.5, bias_sigma=0.01
+        )
+        estimate = smoother.run(record, case.noise, initial, full_covariance=True)
+        assert np.max(np.abs(np.linalg.norm(estimate.attitude, axis=1) - 1.0)) < 1e-12
+        assert (
+            np.linalg.eigvalsh(estimate.covariance / np.einsum("ki,kj->kij", estimate.sigma, estimate.sigma)).min()
+            > 0.0
+        )
+        if angle < 2.0:
+            late = record.time > 10.0
+            assert np.all(np.abs(errors(estimate, record)[late]) < 8.0 * estimate.sigma[late])
+
+
+# ---------------------------------------------------------------------------------------------------------------------- fixed lag
+
+
+@pytest.mark.parametrize("lag", [20.0, 1e6])
+def test_a_lag_as_long_as_the_record_is_the_fixed_interval(lag: float) -> None:
+    case = CASES["asynchronous"]
+    record, initial = believed(case, np.random.default_rng(9))
+    whole = smoother.run(record, case.noise, initial, full_covariance=True)
+    lagged = smoother.run_fixed_lag(record, case.noise, initial, lag=lag, full_covariance=True)
+    for name in ("attitude", "bias", "variance", "covariance"):
+        np.testing.assert_array_equal(getattr(lagged, name), getattr(whole, name))
+
+
+def test_no_lag_is_the_filter() -> None:
+    case = CASES["asynchronous"]
+    record, initial = believed(case, np.random.default_rng(9))
+    filtered = mekf.run(record, case.noise, initial, full_covariance=True)
+    lagged = smoother.run_fixed_lag(record, case.noise, initial, lag=0.0, full_covariance=True)
+    for name in ("attitude", "bias", "variance", "covariance"):
+        np.testing.assert_array_equal(getattr(lagged, name), getattr(filtered, name))
+
+
+@pytest.mark.parametrize("lag", [0.02, 0.3, 1.999, 2.0])
+def test_fixed_lag_is_the_smoother_of_what_was_known(lag: float) -> None:
+    case = CASES["asynchronous"]
+    record, initial = believed(case, np.random.default_rng(9))
+    lagged = smoother.run_fixed_lag(record, case.noise, initial, lag=lag, full_covariance=True)
+    steps = math.floor(lag * case.rate + 1e-6)
+    # Among them edges where t + lag falls short of an edge by rounding only.
+    short = (
+        np.flatnonzero(record.time[:-steps] + lag < record.time[steps:]) if steps == round(lag * case.rate, 6) else []
+    )
+    for k in (0, 1, 250, 901, len(record.time) - 1, *short[:2]):
+        last = min(k + steps, len(record.time) - 1)
+        known = smoother.run(records.cut(record, 0, last), case.noise, initial, full_covariance=True) if last else None
+        if known is not None:
+            np.testing.assert_allclose(lagged.attitude[k], known.attitude[k], rtol=0, atol=1e-15)
+            np.testing.assert_allclose(lagged.covariance[k], known.covariance[k], rtol=1e-12, atol=1e-25)
+
+
+def test_more_lag_more_certain() -> None:
+    case = CASES["directions"]
+    record, initial = believed(case, np.random.default_rng(9))
+    variances = [smoother.run_fixed_lag(record, case.noise, initial, lag=lag).variance for lag in (0.0, 0.5, 2.0, 30.0)]
+    middle = len(record.time) // 2
+    for less, more in itertools.pairwise(variances):
+        assert np.all(more[middle] < less[middle])
+
+
+def test_a_negative_lag_is_refused() -> None:
+    case = CASES["rest"]
+    record, initial = believed(case, np.random.default_rng(9))
+    with pytest.raises(InputError, match="lag is -1 s; it must not be negative"):
+        smoother.run_fixed_lag(record, case.noise, initial, lag=-1.0)
+
+
+# ------------------------------------------------------------------------------------------------------------------------ kernels
+
+
+def angles(rng: np.random.Generator) -> np.ndarray:
+    return np.concatenate(
+        [
+            [0.0],
+            10.0 ** rng.uniform(-12, math.log10(math.pi), 60),
+            [(1.0 - 1e-9) * LARGEST_ANGLE, (1.0 + 1e-9) * LARGEST_ANGLE, 3.14],
+        ]
+    )
+
+
+def test_rotation_kernels_at_any_angle() -> None:
+    rng = np.random.default_rng(0)
+    for angle in angles(rng):
+        phi = angle * quaternion.normalize(np.append(rng.standard_normal(3), 0.0))[:3]
+        q = quaternion.exp(phi)
+        for sign in (1.0, -1.0):
+            found = smoother_step.logarithm(tuple(sign * q))
+            np.testing.assert_allclose(found, phi, rtol=0, atol=4e-15 * angle if angle < 3.0 else 1e-13)
+        np.testing.assert_allclose(
+            np.reshape(smoother_step.inverse_right_jacobian(tuple(phi)), (3, 3)),
+            kinematics.inverse_right_jacobian(phi),
+            rtol=0,
+            atol=1e-14,
+        )
+        start = quaternion.normalize(rng.standard_normal(4))
+        moved, J = smoother_step.moved(tuple(start), tuple(phi))
+        np.testing.assert_allclose(moved, quaternion.multiply(start, q), rtol=0, atol=1e-15)
+        np.testing.assert_allclose(np.reshape(J, (3, 3)), kinematics.right_jacobian(phi), rtol=0, atol=1e-14)
+
+
+def blocks(P: np.ndarray) -> tuple:
+    upper = np.triu_indices(3)
+    return tuple(P[:3, :3][upper]), tuple(P[:3, 3:].ravel()), tuple(P[3:, 3:][upper])
+
+
+def random_covariance(rng: np.random.Generator, decades: float = 1.0) -> np.ndarray:
+    turn, _ = np.linalg.qr(rng.standard_normal((6, 6)))
+    scale = np.diag(np.repeat([1e-2, 1e-4], 3))
+    return scale @ (turn * 10.0 ** rng.uniform(-decades, 0.0, 6)) @ turn.T @ scale
+
+
+def test_noise_share() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        P = random_covariance(rng)
+        q11, q12 = random_covariance(rng)[:3, :3] * 1e-2, 1e-7 * rng.standard_normal((3, 3))
+        Q = np.block([[q11, q12], [q12.T, 1e-10 * np.eye(3)]])
+        M = smoother_step.noise_share(*blocks(P), blocks(Q)[0], tuple(q12.ravel()), 1e-10)
+        found = np.block(
+            [[np.reshape(M[0], (3, 3)), np.reshape(M[1], (3, 3))], [np.reshape(M[2], (3, 3)), np.reshape(M[3], (3, 3))]]
+        )
+        expected = Q @ np.linalg.inv(P)
+        scale = np.repeat([1.0, 1e-2], 3)
+        np.testing.assert_allclose(
+            found / np.outer(scale, 1 / scale), expected / np.outer(scale, 1 / scale), rtol=0, atol=1e-11
+        )
+
+
+@pytest.mark.parametrize("decades", [2.0, 8.0, 12.0])
+def test_one_step_keeps_its_digits_where_the_covariance_is_ill_conditioned(decades: float) -> None:
+    # Against the textbook's gain in 60 digits. The predicted and the smoothed attitude agree, so that no Jacobian takes part.
+    rng = np.random.default_rng(6)
+    dt, sv, su = 0.01, 1e-5, 1e-8
+    noise = ProcessNoise(angle_random_walk=sv, rate_random_walk=su)
+    turn = np.array([0.01, -0.02, 0.03])
+    F, Q = mekf.transition_and_noise(turn, dt, noise)
+    q = tuple(quaternion.normalize(rng.standard_normal(4)))
+    next_q = tuple(quaternion.multiply(q, quaternion.exp(turn)))
+    worst_textbook = 0.0
+    for _ in range(5):
+        P = random_covariance(rng, decades)
+        P_next = 0.25 * (F @ P @ F.T + Q)
+        _, _, A, B, C = smoother_step.smooth(
+            q, (0.0, 0.0, 0.0), *blocks(P), tuple(turn), dt, sv**2, su**2, next_q, (0.0, 0.0, 0.0), *blocks(P_next)
+        )
+        found = mekf.covariance_matrices(np.array([*A, *B, *C]))
+        with mpmath.workdps(60):
+            p, f, r, n = (mpmath.matrix(m.tolist()) for m in (P, F, Q, P_next))
+            predicted = f * p * f.T + r
+            gain = p * f.T * predicted**-1
+            exact = p + gain * (n - predicted) * gain.T
+            expected = np.array(exact.tolist(), dtype=float)
+        scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+        assert np.max(np.abs(found - expected) / scale) < 1e-10
+        gain = P @ F.T @ np.linalg.inv(F @ P @ F.T + Q)
+        plain = P + gain @ (P_next - F @ P @ F.T - Q) @ gain.T
+        worst_textbook = max(worst_textbook, np.max(np.abs(plain - expected) / scale))
+        assert np.linalg.eigvalsh(found / scale)[0] > 0.0
+    assert decades < 12.0 or worst_textbook > 1e-8  # what the other form is for
+
+
+def test_plain_python_equals_compiled() -> None:
+    case = dataclasses.replace(CASES["asynchronous"], duration=2.0)
+    record, initial = believed(case, np.random.default_rng(9))
+    _, segments, starts = smoother._filtered(record, case.noise, initial)
+    results = []
+    for back in (smoother_loop.smooth_back, compiled(smoother_loop.smooth_back)):
+        out = [np.empty((len(record.time), size)) for size in (4, 3, 6, 21)]
+        first, last = np.array([0]), np.array([len(record.time) - 1])
+        back(segments, starts, first, last, case.noise.angle_random_walk**2, case.noise.rate_random_walk**2, *out)
+        results.append(out)
+    for plain, fast in zip(*results, strict=True):
+        np.testing.assert_allclose(plain, fast, rtol=1e-9, atol=1e-12 * np.abs(fast).max())
+
+
+def test_edges_are_found_exactly() -> None:
+    # Events on edges, a rounding error beside them, and between; turns that need sub-steps.
+    rng = np.random.default_rng(17)
+    time = np.cumsum(rng.uniform(0.05, 0.15, 60))
+    beside = np.concatenate(
+        [time[3:9], np.nextafter(time[10:15], 0.0), np.nextafter(time[20:25], 99.0), rng.uniform(1.0, 5.0, 30)]
+    )
+    stamps = np.unique(beside)
+    series = measure("a", "direction", DOWN, 0.02, stamps, np.tile(quaternion.IDENTITY, (len(stamps), 1)), rng)
+    record = ImuRecord(time=time, increments=rng.uniform(-1.0, 1.0, (59, 3)), vectors=(series,))
+    noise = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-5)
+    initial = mekf.initial_state(quaternion.IDENTITY, attitude_sigma=0.1, bias_sigma=0.01)
+    _, segments, starts = smoother._filtered(record, noise, initial)
+    filtered = mekf.run(record, noise, initial, full_covariance=True)
+    np.testing.assert_array_equal(segments[starts, 4:8], filtered.attitude)
+    np.testing.assert_array_equal(mekf.covariance_matrices(segments[starts, 11:]), filtered.covariance)

@@ -1,0 +1,318 @@
+"""Vector sensors against the definition of what each measures, their faults, and the series they give."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from strapdown import motion, orbit, quaternion, vectors
+from strapdown.checks import InputError
+from strapdown.randomness import generator
+from strapdown.vectors import (
+    Accelerometer,
+    AttitudeSensor,
+    Faults,
+    HeadingPair,
+    Magnetometer,
+    VectorMeasurements,
+    VectorSensor,
+    specific_force,
+    star_directions,
+    triad,
+)
+
+CONE = motion.Coning(angle=0.3, frequency=0.7)
+FIELD = np.array([2e-5, 1e-5, -4e-5])
+
+
+def rotation(body, time):
+    """Return the rotation from body to fixed frame by SciPy."""
+    return Rotation.from_quat(np.roll(body.attitude(time), -1, axis=-1))
+
+
+def observe(sensor, body=CONE, end=50.0, seed=1):
+    return sensor.observe(body, 0.0, end, generator(seed, 0, sensor.name))
+
+
+EVERY = [
+    VectorSensor(name="star", reference_f=[1.0, 2.0, 3.0], sigma=1e-3, rate=4.0),
+    VectorSensor(name="level", reference_f=[1.0, 2.0, 0.0], sigma=1e-3, rate=4.0, kind="heading"),
+    AttitudeSensor(name="tracker", sigma_across=1e-4, sigma_about=1e-3, rate=4.0),
+    Magnetometer(name="magnetometer", field_f=FIELD, sigma=1e-7, rate=4.0),
+    Magnetometer(name="compass", field_f=FIELD, sigma=1e-7, rate=4.0, kind="heading"),
+    Magnetometer(name="whole field", field_f=FIELD, sigma=1e-7, rate=4.0, kind="vector"),
+    Magnetometer(name="orbiting", field_f=orbit.CircularOrbit().magnetic_field, sigma=1e-7, rate=4.0),
+    Accelerometer(name="vertical", sigma=0.01, rate=4.0),
+    Accelerometer(name="whole force", sigma=0.01, rate=4.0, kind="vector"),
+    HeadingPair(name="antennas", baseline_b=[2.0, 0.0, 0.0], sigma=0.01, rate=4.0),
+]
+
+
+@pytest.mark.parametrize("sensor", EVERY, ids=lambda sensor: sensor.name)
+def test_without_noise_a_sensor_tells_its_reference_in_body_axes(sensor):
+    quiet = {"sigma_across": 0.0, "sigma_about": 0.0} if isinstance(sensor, AttitudeSensor) else {"sigma": 0.0}
+    series = observe(dataclasses.replace(sensor, **quiet))
+    assert len(series.time) == 200
+    turn = rotation(CONE, series.time)
+    if series.kind == "attitude":
+        assert np.max(quaternion.angle_between(series.attitude, CONE.attitude(series.time))) < 1e-7
+    elif sensor.name == "antennas":
+        seen, wanted = series.references_f, turn.apply(series.vector_b) * [1.0, 1.0, 0.0]
+        np.testing.assert_allclose(seen, wanted / np.linalg.norm(wanted, axis=1, keepdims=True), atol=1e-12)
+    else:
+        scale = np.linalg.norm(series.references_f, axis=1, keepdims=True)
+        np.testing.assert_allclose(turn.apply(series.vector_b) / scale, series.references_f / scale, atol=1e-12)
+
+
+@pytest.mark.parametrize("sensor", EVERY, ids=lambda sensor: sensor.name)
+def test_noise_has_the_sigma_that_the_series_tells(sensor):
+    series = observe(sensor, body=motion.rest(), end=5000.0)
+    n = len(series.time)
+    if series.kind == "attitude":
+        score = quaternion.log(series.attitude) / series.sigma_axes
+    elif series.kind == "vector":
+        score = (series.vector_b - series.references_f) / series.sigma[:, None]
+    elif series.kind == "heading":
+        a, b = series.vector_b, series.references_f
+        turn = np.arctan2(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1])
+        score = (turn / series.sigma)[:, None]
+    else:
+        rows = [triad(r)[:2] @ z for r, z in zip(series.references_f, series.vector_b, strict=True)]
+        score = np.array(rows) / series.sigma[:, None]
+    assert score.shape[1] == vectors.KINDS[series.kind]
+    for column in score.T:
+        assert abs(column.mean()) < 4.5 / math.sqrt(n)
+        assert abs(column.var() - 1.0) < 4.5 * math.sqrt(2.0 / n) + 1e-3
+    correlation = np.atleast_2d(np.corrcoef(score.T)) - np.eye(score.shape[1])
+    assert np.max(np.abs(correlation)) < 4.5 / math.sqrt(n)
+
+
+@pytest.mark.parametrize("sensor", EVERY, ids=lambda sensor: sensor.name)
+def test_outages_and_latency_change_no_other_sample(sensor):
+    whole = observe(sensor)
+    faults = Faults(latency=0.3, outages=[(10.0, 20.0), (30.0, 30.1)])
+    part = observe(dataclasses.replace(sensor, faults=faults))
+    kept = ~(((whole.time >= 10.0) & (whole.time <= 20.0)) | (np.abs(whole.time - 30.0) < 0.01))
+    assert np.array_equal(part.time, whole.time[kept])
+    for name in ("vector_b", "sigma", "attitude", "sigma_axes", "references_f"):
+        if getattr(whole, name) is not None:
+            np.testing.assert_array_equal(getattr(part, name), getattr(whole, name)[kept])
+    np.testing.assert_allclose(part.arrival, part.time + 0.3)
+    assert whole.arrival is None
+
+
+def test_rates_and_phases():
+    sensor = VectorSensor(name="s", reference_f=[1.0, 0.0, 0.0], sigma=0.0, rate=4.0)
+    np.testing.assert_allclose(sensor.times(10.0, 11.0), [10.25, 10.5, 10.75, 11.0])
+    np.testing.assert_allclose(dataclasses.replace(sensor, phase=0.1).times(10.0, 11.0), [10.1, 10.35, 10.6, 10.85])
+    assert len(sensor.times(0.0, 0.2)) == 0
+    assert len(observe(sensor, end=0.2).time) == 0
+    assert len(dataclasses.replace(sensor, rate=3.0).times(0.0, 1e4)) == 30_000
+
+
+def test_outliers_are_a_contaminated_normal():
+    sensor = Magnetometer(name="m", field_f=FIELD, sigma=1e-7, rate=10.0, kind="vector")
+    clean = observe(sensor, motion.rest(), 5000.0)
+    struck = observe(
+        dataclasses.replace(sensor, faults=Faults(outlier_probability=0.1, outlier_scale=20.0)), motion.rest(), 5000.0
+    )
+    noise, before = struck.vector_b - FIELD, clean.vector_b - FIELD
+    outliers = np.any(np.abs(noise - before) > 1e-12, axis=1)
+    assert np.mean(outliers) == pytest.approx(0.1, abs=4.5 * math.sqrt(0.09 / 50_000))
+    np.testing.assert_allclose(noise[outliers], 20.0 * before[outliers], rtol=1e-6)
+    assert np.var(noise) / 1e-14 == pytest.approx(0.9 + 0.1 * 400.0, rel=0.05)
+
+
+def test_correlated_noise_is_a_stationary_first_order_process():
+    faults = Faults(correlated_sigma=3e-7, correlation_time=5.0)
+    series = [
+        Magnetometer(name="m", field_f=FIELD, sigma=0.0, rate=1.0, kind="vector", faults=faults).observe(
+            motion.rest(), 0.0, 20.0, generator(1, run, "m")
+        )
+        for run in range(800)
+    ]
+    noise = np.array([s.vector_b - FIELD for s in series]).transpose(1, 0, 2).reshape(20, -1)
+    assert np.all(np.abs(np.mean(noise**2, axis=1) / 9e-14 - 1.0) < 5.0 * math.sqrt(2.0 / 2400))
+    for lag in (1, 5, 10):
+        assert np.mean(noise[0] * noise[lag]) / 9e-14 == pytest.approx(math.exp(-lag / 5.0), abs=5.0 / math.sqrt(2400))
+
+
+def test_hard_and_soft_iron():
+    soft, hard = np.array([[0.1, 0.02, 0.0], [0.0, -0.05, 0.03], [0.01, 0.0, 0.2]]), np.array([1e-6, -2e-6, 3e-6])
+    sensor = Magnetometer(name="m", field_f=FIELD, sigma=0.0, rate=4.0, kind="vector", hard_iron=hard, soft_iron=soft)
+    series = observe(sensor)
+    true = rotation(CONE, series.time).inv().apply(FIELD)
+    np.testing.assert_allclose(series.vector_b, true @ (np.eye(3) + soft).T + hard, rtol=1e-10)
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        CONE,
+        motion.SpinCone(precession_rate=2.0, spin_rate=1.0, angle=0.4),
+        motion.TorqueFree(inertia=[1.0, 2.0, 3.0], initial_rate=[0.3, 2.0, 0.1]),
+    ],
+    ids=lambda body: type(body).__name__,
+)
+def test_specific_force_at_a_lever_arm_is_the_second_derivative_of_the_position(body):
+    arm, time, step = np.array([0.4, -0.2, 0.7]), np.linspace(0.5, 7.0, 40), 1e-3
+    pushed = lambda t: np.stack([np.sin(t), 0.0 * t, t], axis=-1)  # noqa: E731
+
+    def place(t):
+        return rotation(body, t).apply(arm)
+
+    # Fourth-order central difference of the place of the arm's end, in the fixed frame.
+    weights = np.array([-1.0, 16.0, -30.0, 16.0, -1.0]) / 12.0
+    moved = sum(w * place(time + k * step) for w, k in zip(weights, range(-2, 3), strict=True)) / step**2
+    wanted = rotation(body, time).inv().apply(moved + pushed(time) - np.array(vectors.GRAVITY_F))
+    got = specific_force(body, time, lever_arm_b=arm, acceleration_f=pushed)
+    np.testing.assert_allclose(got, wanted, atol=2e-8)
+
+
+def test_an_accelerometer_off_the_centre_errs_by_the_acceleration():
+    spin = motion.ConstantRate(rate=[0.0, 0.0, 2.0])
+    sensor = Accelerometer(name="a", sigma=0.0, rate=5.0, lever_arm_b=[0.5, 0.0, 0.0])
+    series = observe(sensor, spin)
+    tilt = math.atan2(4.0 * 0.5, 9.80665)  # centripetal over gravity
+    angle = np.arccos(series.vector_b @ [0.0, 0.0, 1.0])
+    np.testing.assert_allclose(angle, tilt, rtol=1e-9)
+    assert np.all(series.vector_b[:, 0] < 0.0)
+    biased = observe(Accelerometer(name="a", sigma=0.0, rate=5.0, bias=[0.1, 0.0, 0.0], kind="vector"), motion.rest())
+    np.testing.assert_allclose(biased.vector_b, np.tile([0.1, 0.0, 9.80665], (250, 1)), atol=1e-12)
+
+
+def test_star_directions_see_several_stars_at_the_same_times():
+    stars = star_directions("tracker", np.eye(3), sigma=1e-4, rate=2.0, faults=Faults(outages=[(3.0, 4.0)]))
+    series = [observe(star) for star in stars]
+    assert [s.sensor for s in series] == ["tracker 1", "tracker 2", "tracker 3"]
+    assert all(np.array_equal(s.time, series[0].time) for s in series)
+    assert not np.array_equal(series[0].vector_b, series[1].vector_b)
+
+
+def test_an_attitude_sensor_is_coarse_about_its_boresight():
+    series = observe(AttitudeSensor(name="t", sigma_across=1e-4, sigma_about=2e-3, rate=10.0, boresight="x"), end=500.0)
+    error = quaternion.log(quaternion.multiply(quaternion.conjugate(CONE.attitude(series.time)), series.attitude))
+    np.testing.assert_allclose(error.std(axis=0), [2e-3, 1e-4, 1e-4], rtol=0.06)
+
+
+# ------------------------------------------------------------------------------------------------------------------ the series
+
+
+def test_taken_takes_all_that_belongs_to_a_sample():
+    faults = Faults(latency=0.1)
+    for sensor in (EVERY[0], EVERY[2], EVERY[6], EVERY[9]):
+        series = observe(dataclasses.replace(sensor, faults=faults))
+        which = np.arange(200) % 3 == 0
+        part = series.taken(which)
+        for name in ("time", "vector_b", "sigma", "attitude", "sigma_axes", "arrival", "references_f"):
+            if getattr(series, name) is not None:
+                np.testing.assert_array_equal(getattr(part, name), getattr(series, name)[which])
+        assert len(series.taken(slice(5, 9)).time) == 4
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"kind": "directoin"}, "did you mean 'direction'"),
+        ({"time": [0.0, 2.0, 1.0]}, "goes back"),
+        ({"vector_b": np.ones((3, 3))}, r"vector_b\[0\] has length"),
+        ({"vector_b": np.eye(3)[:2]}, "shape"),
+        ({"sigma": [1.0, -1.0, 1.0]}, r"sigma\[1\]"),
+        ({"reference_f": [0.0, 0.0, 0.0]}, "zero vector"),
+        ({"reference_f": [[1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]}, r"reference_f\[1\] is the zero"),
+        ({"reference_f": np.ones((2, 3))}, "shape"),
+        ({"kind": "heading", "reference_f": [0.0, 0.0, 1.0]}, "vertical"),
+        ({"arrival": [0.0, 0.5, 3.0]}, r"arrival\[1\]"),
+        ({"kind": "attitude"}, "needs attitude"),
+        ({"sigma_axes": [1.0, 1.0, 1.0]}, "belong to kind 'attitude'"),
+    ],
+)
+def test_bad_series_are_refused(change, message):
+    good = {
+        "sensor": "s",
+        "kind": "direction",
+        "time": [0.0, 1.0, 2.0],
+        "vector_b": np.eye(3),
+        "reference_f": [1.0, 0.0, 0.0],
+        "sigma": 0.1,
+    }
+    VectorMeasurements(**good)
+    with pytest.raises(InputError, match=message):
+        VectorMeasurements(**{**good, **change})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"rate": 0.0}, "rate"),
+        ({"sigma": -1.0}, "sigma"),
+        ({"reference_f": [0.0, 0.0, 0.0]}, "reference_f"),
+        ({"kind": "attitude"}, "kind"),
+    ],
+)
+def test_bad_sensors_are_refused(change, message):
+    with pytest.raises(InputError, match=message):
+        VectorSensor(**{"name": "s", "reference_f": [1.0, 0.0, 0.0], "sigma": 0.1, "rate": 1.0, **change})
+    for field, value in (
+        ("outages", [(2.0, 1.0)]),
+        ("outlier_probability", 1.5),
+        ("correlation_time", 0.0),
+        ("latency", -1.0),
+    ):
+        with pytest.raises(InputError, match=field):
+            Faults(**{field: value})
+
+
+def test_triads_are_right_handed():
+    for reference in np.vstack([np.eye(3), -np.eye(3), np.random.default_rng(1).normal(size=(50, 3))]):
+        rows = triad(reference)
+        np.testing.assert_allclose(rows @ rows.T, np.eye(3), atol=1e-15)
+        assert np.linalg.det(rows) == pytest.approx(1.0)
+        np.testing.assert_allclose(rows[2], reference / np.linalg.norm(reference), atol=1e-15)
+
+
+# ------------------------------------------------------------------------------------------------------------------- the orbit
+
+
+def test_the_orbit_obeys_newton():
+    path, time, step = orbit.CircularOrbit(inclination=1.2, phase=0.5), np.linspace(0.0, 6000.0, 50), 1.0
+    pull = (path.position(time + step) - 2.0 * path.position(time) + path.position(time - step)) / step**2
+    r = path.position(time)
+    np.testing.assert_allclose(pull, -orbit.EARTH_GRAVITATION * r / path.radius**3, atol=1e-5)
+    assert np.degrees(np.arccos(np.cross(r[0], r[1])[2] / np.linalg.norm(np.cross(r[0], r[1])))) == pytest.approx(
+        np.degrees(1.2)
+    )
+    assert 5600.0 < 2.0 * np.pi / path.rate < 5700.0
+
+
+def test_the_dipole_has_no_divergence_and_no_curl_and_points_north_at_the_equator():
+    rng, h = np.random.default_rng(2), 100.0
+    for r in rng.normal(size=(10, 3)) * 4e6 + np.array([5e6, 0.0, 0.0]):
+        jacobian = np.stack(
+            [(orbit.dipole_field(r + e) - orbit.dipole_field(r - e)) / (2.0 * h) for e in h * np.eye(3)], axis=1
+        )
+        scale = np.max(np.abs(jacobian))
+        assert abs(np.trace(jacobian)) < 1e-6 * scale
+        np.testing.assert_allclose(jacobian, jacobian.T, atol=1e-6 * scale)
+    np.testing.assert_allclose(orbit.dipole_field([orbit.EARTH_RADIUS, 0.0, 0.0]), [0.0, 0.0, 2.98e-5], atol=1e-12)
+    np.testing.assert_allclose(orbit.dipole_field([0.0, 0.0, orbit.EARTH_RADIUS]), [0.0, 0.0, -5.96e-5], atol=1e-12)
+
+
+@pytest.mark.parametrize("phase", [0.0, 2.0, -3.0])
+@pytest.mark.parametrize("sun", [[1.0, 0.0, 0.0], [0.3, -0.9, 0.5], [-1.0, 2.0, 0.0]])
+def test_eclipses_are_where_the_earth_hides_the_sun(sun, phase):
+    path = orbit.CircularOrbit(inclination=1.0, phase=phase)
+    windows = path.eclipses(sun, 100.0, 15_000.0)
+    time = np.linspace(100.0, 15_000.0, 20_001)
+    r, s = path.position(time), np.array(sun) / np.linalg.norm(sun)
+    along = r @ s
+    hidden = (along < 0.0) & (np.linalg.norm(r - along[:, None] * s, axis=1) < orbit.EARTH_RADIUS)
+    told = np.any([(time >= a) & (time <= b) for a, b in windows], axis=0)
+    assert np.sum(told != hidden) <= 2 * len(windows)
+    assert len(windows) == 0 if sun[1] == -0.9 else 2 <= len(windows) <= 4
+
+
+def test_an_orbit_along_the_terminator_has_no_eclipse():
+    assert orbit.CircularOrbit(inclination=np.pi / 2).eclipses([0.0, 1.0, 0.0], 0.0, 1e4) == ()
