@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from strapdown import coning, montecarlo, plots
-from strapdown.coning_study import Drift, FilterOutcome, measured_drift
+from strapdown.coning_study import Drift, FilterOutcome, measured_drift, predicted_drift
 from strapdown.gyro import GyroSpec
 from strapdown.mekf import ProcessNoise
 from strapdown.motion import Coning
@@ -58,7 +58,7 @@ def main(*, runs: int = 100, duration: float = 240.0, seed: int = 1, out: Path |
             algorithm=algorithm.name,
             samples=algorithm.samples,
             measured=measured_drift(motion, rate, algorithm),
-            predicted=coning.predicted_coning_drift(algorithm, motion.angle, motion.frequency, 1.0 / rate),
+            predicted=predicted_drift(motion, rate, algorithm),
         )
         for algorithm in algorithms
     )

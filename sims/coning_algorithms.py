@@ -28,6 +28,8 @@ from strapdown.files import write_json, written_beside
 from strapdown.units import DEGREE
 
 DIGITS = 50
+SMALL = {"quick": True}
+"""Arguments of a run that only shows that the script works."""
 OWN = ("matched-2-8", "matched-4-11", "matched-1-4-4", "matched-1-8-8")
 PUBLISHED = tuple(name for name in ALGORITHMS if name not in OWN and "-rate-" not in name)
 ROUNDING = 2.0**-52
@@ -613,8 +615,8 @@ def draw(result: Result, folder: Path) -> list[Path]:
     return paths
 
 
-def main(output: str | Path | None = None, *, quick: bool = False, seed: int = 1) -> Result:
-    """Answer the question; with ``output``, write the figures and ``coning.json`` into that folder."""
+def main(*, out: str | Path | None = None, quick: bool = False, seed: int = 1) -> Result:
+    """Answer the question; with ``out``, write the figures and ``coning.json`` into that folder."""
     degrees = (1.0, 20.0) if quick else (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 20.0, 30.0, 45.0)
     ratios = (0.1, 0.5) if quick else (0.01, 0.03, 0.1, 0.2, 0.3, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 1.0)
     comparison = compare([d * DEGREE for d in degrees], ratios)
@@ -633,8 +635,8 @@ def main(output: str | Path | None = None, *, quick: bool = False, seed: int = 1
         ),
         manoeuvres=manoeuvres(3 if quick else 60, seed),
     )
-    if output is not None:
-        folder = Path(output)
+    if out is not None:
+        folder = Path(out)
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / "coning.json", asdict(result))
         draw(result, folder)

@@ -56,7 +56,7 @@ class AhrsParameters:
 
 
 def quiet_span(recording: Recording) -> slice:
-    """Return the samples of the first quiet second: the first in which the rate varies no more than twice as much as in the quietest.
+    """Return the samples of the first quiet second: the first whose rate is no more than twice as restless as in the quietest.
 
     Raises
     ------
@@ -69,8 +69,10 @@ def quiet_span(recording: Recording) -> slice:
             f"{recording.source} lasts {recording.time[-1] - recording.time[0]:.3g} s; the start needs at least {QUIET_SPAN:g} s of samples"
         )
     blocks = len(recording.time) // length
-    spread = recording.rate[: blocks * length].reshape(blocks, length, 3).std(axis=1).sum(axis=1)
-    first = int(np.argmax(spread <= 2.0 * spread.min()))
+    rate = recording.rate[: blocks * length].reshape(blocks, length, 3)
+    # The mean counts beside the spread, so that a steady turn is not taken for rest; half of it may be bias.
+    restless = np.linalg.norm(rate.std(axis=1), axis=1) + 0.5 * np.linalg.norm(rate.mean(axis=1), axis=1)
+    first = int(np.argmax(restless <= 2.0 * restless.min()))
     return slice(first * length, (first + 1) * length)
 
 

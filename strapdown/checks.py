@@ -96,7 +96,10 @@ def finite(name: str, value: float | str, *, unit: str = "") -> float:
 
 def count(name: str, value: int, *, least: int = 1) -> int:
     """Return ``value`` as a whole number of at least ``least``."""
-    if isinstance(value, bool) or int(value) != value or value < least:
+    whole = (
+        isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool) and np.isfinite(value)
+    )
+    if not whole or int(value) != value or value < least:
         raise InputError(f"{name} is {value!r}; it must be a whole number of {least} or more")
     return int(value)
 
@@ -140,8 +143,11 @@ def increasing(name: str, time: ArrayLike, *, least: int = 1) -> Array:
 def covariance(name: str, value: ArrayLike, size: int) -> Array:
     """Return ``value`` as a symmetric positive-definite matrix (size, size)."""
     matrix = array(name, value, (size, size))
-    if not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0.0):
-        i, j = _first(~np.isclose(matrix, matrix.T, rtol=1e-9, atol=0.0))
+    # A computed covariance is symmetric to rounding of its diagonal, not of each small entry.
+    size_of = np.sqrt(np.abs(np.diag(matrix)))
+    lopsided = np.abs(matrix - matrix.T) > 1e-9 * np.outer(size_of, size_of)
+    if lopsided.any():
+        i, j = _first(lopsided)
         raise InputError(
             f"{name} is not symmetric: [{i}, {j}] is {matrix[i, j]:g} but [{j}, {i}] is {matrix[j, i]:g}; use ½(P + Pᵀ)"
         )

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from strapdown import coning, montecarlo, quaternion
-from strapdown.checks import Array, count, positive
+from strapdown.checks import Array, InputError, count, non_negative, positive
 from strapdown.gyro import GyroSpec
 from strapdown.mekf import ProcessNoise
 from strapdown.montecarlo import FilterSetup, Statistics
@@ -80,8 +80,11 @@ class ConingParameters:
             "bias_sigma",
         ):
             positive(name, getattr(self, name))
+        non_negative("rate_random_walk", self.rate_random_walk)
         count("runs", self.runs)
         count("seed", self.seed, least=0)
+        if not 0.0 < self.probability < 1.0:
+            raise InputError(f"probability is {self.probability}; it must lie between 0 and 1")
 
     @property
     def samples(self) -> int:
@@ -134,7 +137,10 @@ class FilterOutcome:
 
     @property
     def consistent(self) -> bool:
-        """Whether NEES of the state, of the attitude and of the bias and the NIS all lie inside their bounds."""
+        """Whether NEES of the state, of the attitude and of the bias and the NIS all lie inside their bounds.
+
+        Four tests: a right filter passes all of them with at least 1 − 4 (1 − ``probability``).
+        """
         low, high = self.statistics.nis_bounds(self.probability)
         nees = all(
             self.statistics.verdict(self.epochs, subset, self.probability).consistent
@@ -220,6 +226,18 @@ class ConingStudy:
         }
 
 
+def predicted_drift(motion: Coning, rate: float, algorithm: coning.Algorithm) -> float:
+    """Return the drift that theory predicts, rad/s along the cone's axis.
+
+    Of one sample a step exactly; else the whole power series in λ = ω/rate of the part in β² where it converges (λ ≤ 1), and its leading
+    term ``−c_M β² ω λ^{2M}`` beyond. What is left out is the floor in β⁴ of rotation-vector forms.
+    """
+    ratio = 2.0 * np.pi * motion.frequency / rate
+    if algorithm.name == "one-sample" or ratio > 1.0:
+        return coning.predicted_coning_drift(algorithm, motion.angle, motion.frequency, 1.0 / rate)
+    return motion.angle**2 * 2.0 * np.pi * motion.frequency * coning.small_angle_drift(algorithm, ratio)
+
+
 def measured_drift(motion: Coning, rate: float, algorithm: coning.Algorithm, steps: int = 60_000) -> float:
     """Return the drift of noise-free integration against the closed form, rad/s along the cone's axis: estimated minus true.
 
@@ -247,7 +265,7 @@ def run(parameters: ConingParameters, *, progress: Callable[[int], None] | None 
             algorithm=algorithm.name,
             samples=algorithm.samples,
             measured=measured_drift(motion, parameters.rate, algorithm),
-            predicted=coning.predicted_coning_drift(algorithm, motion.angle, motion.frequency, 1.0 / parameters.rate),
+            predicted=predicted_drift(motion, parameters.rate, algorithm),
         )
         for algorithm in algorithms
     )

@@ -82,7 +82,7 @@ class Verdict:
     def outside(self) -> int:
         """Number of epochs outside the simultaneous bounds."""
         low, high = self.simultaneous_bounds
-        return int(np.sum((self.mean < low) | (self.mean > high)))
+        return int(np.sum(~((self.mean >= low) & (self.mean <= high))))  # NaN is outside
 
     @property
     def consistent(self) -> bool:
@@ -124,6 +124,9 @@ def reference_errors(attitude: ArrayLike, reference: ArrayLike) -> ReferenceErro
     q = array("attitude", attitude, ("n", 4))
     r = array("reference", reference, (len(q), 4), allow_nan=True)
     known = np.isfinite(r).all(axis=1)
+    zero = known & (np.linalg.norm(r, axis=1) == 0.0)
+    if zero.any():
+        raise InputError(f"reference[{int(np.argmax(zero))}] is the zero quaternion; mark missing rows as NaN")
     d = quaternion.multiply(q[known], quaternion.conjugate(quaternion.normalize(r[known])))
     w, x, y, z = np.moveaxis(d, -1, 0)
     results = np.full((3, len(q)), np.nan)

@@ -48,5 +48,6 @@ def usable_folder(name: str, folder: str | os.PathLike[str]) -> None:
 
 def write_json(path: str | os.PathLike[str], content: Any) -> None:
     """Write ``content`` as indented JSON; NaN and infinities are refused because JSON has no word for them."""
+    text = json.dumps(content, indent=2, allow_nan=False) + "\n"  # before any folder is made
     with written_beside(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8")

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import quaternion
-from strapdown.checks import Array, array
+from strapdown.checks import Array, InputError, array
 
 
 def _pure(v: Array) -> Array:
@@ -107,6 +107,10 @@ def inverse_right_jacobian(rotation_vector: ArrayLike) -> Array:
     """
     phi = array("rotation_vector", rotation_vector, (..., 3))
     theta = np.linalg.norm(phi, axis=-1)
+    if np.any(theta >= 2.0 * math.pi):
+        raise InputError(
+            f"rotation_vector has length {np.max(theta):.6g} rad; J_r is singular at 2π: take log(exp(φ)) first"
+        )
     x, safe = theta * theta, np.maximum(theta, math.sqrt(_JOIN))
     factor = _joined(x, _INVERSE, (1.0 - 0.5 * safe / np.tan(0.5 * safe)) / safe**2)
     cross = skew(phi)

@@ -22,7 +22,12 @@ from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.records import Estimate, ImuRecord, Innovations
 from strapdown.vectors import KINDS, VectorMeasurements, triad
 
-_KIND_CODES = {"direction": filter_loop.DIRECTION, "vector": filter_loop.VECTOR, "heading": filter_loop.HEADING}
+_KIND_CODES = {
+    "direction": filter_loop.DIRECTION,
+    "vector": filter_loop.VECTOR,
+    "heading": filter_loop.HEADING,
+    "attitude": filter_loop.ATTITUDE,
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +82,8 @@ _ROWS = np.array([*_UPPER[0], *np.repeat(range(3), 3), *(3 + np.array(_UPPER[0])
 _COLUMNS = np.array([*_UPPER[1], *(3 + np.tile(range(3), 3)), *(3 + np.array(_UPPER[1]))])
 
 
-def _pack(state: State) -> Array:
+def pack(state: State) -> Array:
+    """Return a state as the kernels' 28 numbers: q, b, and P in blocks."""
     return np.concatenate([state.attitude, state.bias, state.covariance[_ROWS, _COLUMNS]])
 
 
@@ -94,11 +100,20 @@ class Schedule:
     """Measurements of all sensors in one order of time, as the kernel takes them. Those at one time keep the order of the sensors."""
 
     time: Array
+    """Times (events,), s."""
     kind: np.ndarray
+    """Codes of :mod:`strapdown.kernels.filter_loop` (events,)."""
     vector_b: Array
+    """Measured vectors over the length of their references (events, 3); of an attitude its three variances."""
     variance: Array
+    """Variance of each component of the vector (events,)."""
+    sensor: np.ndarray
+    """Index of the sensor (events,)."""
     reference: np.ndarray
+    """Row of ``triads`` (events,)."""
     triads: Array
+    """Right-handed frames (u, v, r) by rows about the references r (rows, 9), one a sensor or one a measurement; of an attitude the
+    measured quaternion."""
     sensors: tuple[str, ...]
     kinds: tuple[str, ...]
     skipped: dict[str, int]
@@ -106,47 +121,64 @@ class Schedule:
 
 def schedule(vectors: tuple[VectorMeasurements, ...], start: float, end: float) -> Schedule:
     """Return the measurements inside [start, end] in order of time; missing (NaN) ones and those outside are counted as skipped."""
-    skipped, parts = {}, []
-    for i, series in enumerate(vectors):
-        if not np.all(series.sigma > 0.0):
-            k = int(np.argmin(series.sigma > 0.0))
-            raise InputError(f"{series.sensor}: sigma[{k}] is 0 rad; a filter needs a noise greater than zero")
-        inside = slice(*np.searchsorted(series.time, [start, np.nextafter(end, np.inf)]))
-        time, value, variance = series.time[inside], series.vector_b[inside], series.sigma[inside] ** 2
-        if series.kind == "vector":
-            # A vector is taken over the length of its reference, so that the kernel sees unit references only.
-            length = float(np.linalg.norm(series.reference_f))
-            value, variance = value / length, variance / length**2
-        if not np.isfinite(value).all():
-            known = np.isfinite(value).all(axis=1)
-            time, value, variance = time[known], value[known], variance[known]
-        skipped[series.sensor] = len(series.time) - len(time)
-        parts.append((time, value, variance, np.full(len(time), i), np.full(len(time), _KIND_CODES[series.kind])))
-    if not parts:
-        parts.append((np.empty(0), np.empty((0, 3)), np.empty(0), np.empty(0, np.int64), np.empty(0, np.int64)))
-    columns = parts[0] if len(parts) == 1 else [np.concatenate(column) for column in zip(*parts, strict=True)]
-    if len(parts) > 1:
-        order = np.argsort(columns[0], kind="stable")
-        columns = [column[order] for column in columns]
-    time, value, variance, reference, kind = columns
+    parts = [_scheduled(series, start, end) for series in vectors]
+    rows = np.cumsum([0, *(len(frames) for *_, frames in parts)])
+    columns = [
+        (time, value, variance, np.full(len(time), i), frame + rows[i], np.full(len(time), _KIND_CODES[series.kind]))
+        for i, (series, (time, value, variance, frame, _)) in enumerate(zip(vectors, parts, strict=True))
+    ]
+    if not columns:
+        none = np.empty(0, np.int64)
+        columns.append((np.empty(0), np.empty((0, 3)), np.empty(0), none, none, none))
+    joined = columns[0] if len(columns) == 1 else [np.concatenate(column) for column in zip(*columns, strict=True)]
+    if len(columns) > 1:
+        order = np.argsort(joined[0], kind="stable")
+        joined = [column[order] for column in joined]
+    time, value, variance, sensor, reference, kind = joined
     return Schedule(
         time=time,
         kind=kind,
         vector_b=np.ascontiguousarray(value),
         variance=variance,
+        sensor=sensor,
         reference=reference,
-        triads=np.array([triad(s.reference_f).ravel() for s in vectors]).reshape(-1, 9),
-        sensors=tuple(s.sensor for s in vectors),
-        kinds=tuple(s.kind for s in vectors),
-        skipped=skipped,
+        triads=np.concatenate([frames for *_, frames in parts]) if parts else np.empty((0, 9)),
+        sensors=tuple(series.sensor for series in vectors),
+        kinds=tuple(series.kind for series in vectors),
+        skipped={s.sensor: len(s.time) - len(part[0]) for s, part in zip(vectors, parts, strict=True)},
     )
+
+
+def _scheduled(series: VectorMeasurements, start: float, end: float) -> tuple[Array, Array, Array, np.ndarray, Array]:
+    """Return the usable measurements of one series: times, values, variances, rows of frames, frames (rows, 9)."""
+    if not np.all(series.sigma > 0.0):
+        k = int(np.argmin(series.sigma > 0.0))
+        raise InputError(f"{series.sensor}: sigma[{k}] is 0 rad; a filter needs a noise greater than zero")
+    inside = slice(*np.searchsorted(series.time, [start, np.nextafter(end, np.inf)]))
+    used = series if inside == slice(0, len(series.time)) else series.taken(inside)
+    content = used.vector_b if used.attitude is None else used.attitude
+    if not np.isfinite(content).all():
+        used = used.taken(np.isfinite(content).all(axis=1))
+    if used.attitude is not None:
+        assert used.sigma_axes is not None
+        frames = np.zeros((len(used.time), 9))
+        frames[:, :4] = used.attitude
+        return used.time, used.sigma_axes**2, used.sigma**2, np.arange(len(used.time)), frames
+    moving = used.reference_f.ndim == 2
+    frame = np.arange(len(used.time)) if moving else np.zeros(len(used.time), np.int64)
+    value, variance = used.vector_b, used.sigma**2
+    if used.kind == "vector":
+        # A vector is taken over the length of its reference, so that the kernel sees unit references only.
+        length = np.linalg.norm(used.reference_f, axis=-1)
+        value, variance = value / (length[:, None] if moving else length), variance / length**2
+    return used.time, value, variance, frame, triad(used.reference_f).reshape(-1, 9)
 
 
 def innovations_by_sensor(events: Schedule, rows: Array) -> dict[str, Innovations]:
     """Return what the kernel wrote of each event, e and its variance for each degree of freedom, sorted by sensor and whitened."""
     result = {}
     for i, (sensor, kind) in enumerate(zip(events.sensors, events.kinds, strict=True)):
-        mine = slice(None) if len(events.sensors) == 1 else events.reference == i
+        mine = slice(None) if len(events.sensors) == 1 else events.sensor == i
         values = rows[mine, : 2 * KINDS[kind]]
         result[sensor] = Innovations(time=events.time[mine], whitened=values[:, 0::2] / np.sqrt(values[:, 1::2]))
     return result
@@ -176,22 +208,42 @@ def run(
     -------
     Estimate
     """
-    estimate, _ = run_on(record, process_noise, initial, every=every, full_covariance=full_covariance)
-    return estimate
+    return run_on(record, process_noise, initial, every=every, full_covariance=full_covariance)[0]
 
 
 def run_on(
     record: ImuRecord, process_noise: ProcessNoise, initial: State, *, every: int = 1, full_covariance: bool = False
 ) -> tuple[Estimate, State]:
     """Run the filter and return the end state too, from which the next part of a record goes on, bit for bit."""
-    count("every", every)
     events = schedule(record.vectors, record.time[0], record.time[-1])
+    estimate, end, _ = run_events(
+        record, events, process_noise, initial, every=every, full_covariance=full_covariance, segments=0
+    )
+    return estimate, State(attitude=end[:4], bias=end[4:7], covariance=covariance_matrices(end[7:]))
+
+
+def run_events(
+    record: ImuRecord,
+    events: Schedule,
+    process_noise: ProcessNoise,
+    initial: State,
+    *,
+    every: int,
+    full_covariance: bool,
+    segments: int,
+) -> tuple[Estimate, Array, Array]:
+    """Run the kernel over scheduled events; return the estimate, the packed end state (28,), and up to ``segments`` predicted segments.
+
+    A segment (32,) is what a smoother needs of one prediction: dt, increment (3), packed state (28) that it starts from.
+    """
+    count("every", every)
     rows = (len(record.increments)) // every + 1
-    state = _pack(initial)
+    state = pack(initial)
     attitude, bias, variance = np.empty((rows, 4)), np.empty((rows, 3)), np.empty((rows, 6))
     blocks = np.empty((rows if full_covariance else 0, 21))
-    innovation = np.empty((len(events.time), 6))
-    compiled(filter_loop.run_filter)(
+    innovation = np.empty((len(events.time), max([4, *(2 * KINDS[kind] for kind in events.kinds)])))
+    stored = np.empty((segments, 32))
+    number = compiled(filter_loop.run_filter)(
         record.time,
         np.ascontiguousarray(record.increments),
         process_noise.angle_random_walk**2,
@@ -209,7 +261,7 @@ def run_on(
         variance,
         blocks,
         innovation,
-        np.empty((0, 32)),
+        stored,
     )
     estimate = Estimate(
         time=record.time[::every],
@@ -220,8 +272,7 @@ def run_on(
         innovations=innovations_by_sensor(events, innovation),
         skipped=events.skipped,
     )
-    end = State(attitude=state[:4], bias=state[4:7], covariance=covariance_matrices(state[7:]))
-    return estimate, end
+    return estimate, state, stored[:number]
 
 
 class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
@@ -271,12 +322,22 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
 
     def update_heading(self, vector_b: ArrayLike, reference_f: ArrayLike, sigma: float) -> None:
         """Update with the heading of a measured vector's horizontal part: one degree of freedom, ``sigma`` rad."""
-        R = quaternion.to_matrix(self.attitude)
-        error = filter_loop.heading_error(tuple(R.ravel()), array("vector_b", vector_b, (3,)), reference_f)
-        H = np.concatenate([R[2], np.zeros(3)])[None, :]
+        R, z = quaternion.to_matrix(self.attitude), array("vector_b", vector_b, (3,))
+        m = R @ z
+        error = filter_loop.heading_error(tuple(R.ravel()), z, reference_f)
+        H = np.zeros((1, 6))
+        H[0, :3] = np.array([*(-m[2] * m[:2] / (m[:2] @ m[:2])), 1.0]) @ R
         self._correct(np.array([error]), H, positive("sigma", sigma, unit="rad"))
 
-    def _correct(self, residual: Array, H: Array, sigma: float) -> None:
+    def update_attitude(self, attitude: ArrayLike, sigma: ArrayLike) -> None:
+        """Update with a measured attitude q_fb (4,): three degrees of freedom, ``sigma`` rad about each body axis, or one for all."""
+        measured = unit_quaternions("attitude", array("attitude", attitude, (4,)))
+        residual = quaternion.log(quaternion.multiply(quaternion.conjugate(self.attitude), measured))
+        H = np.eye(3, 6)
+        spread = np.array([positive("sigma", value, unit="rad") for value in np.broadcast_to(sigma, 3)])
+        self._correct(residual, H, spread)
+
+    def _correct(self, residual: Array, H: Array, sigma: float | Array) -> None:
         self.dim_z = len(residual)
         zero = np.zeros(len(residual))
         super().update(residual, HJacobian=lambda x: H, Hx=lambda x: zero, R=np.eye(len(residual)) * sigma**2)

@@ -92,7 +92,7 @@ def exp(rotation_vector: ArrayLike) -> Array:
 def log(q: ArrayLike) -> Array:
     """Return the rotation vector (..., 3), rad, of unit quaternions; the shorter way round, |φ| ≤ π.
 
-    ``q`` and ``−q`` are the same attitude and give the same vector.
+    ``q`` and ``−q`` are the same attitude and give the same vector; at half a turn exactly (w = 0) both ±φ are right.
     """
     value = unit_quaternions("q", q)
     w, u = value[..., :1], value[..., 1:]

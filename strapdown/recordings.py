@@ -164,11 +164,17 @@ def read_csv(path: str | os.PathLike[str], *, units: Mapping[str, str] | None = 
 
     return Recording(
         source=file.name,
-        time=values[:, names.index("time")] * factors["time"],
+        time=_seconds(values[:, names.index("time")], factors["time"]),
         rate=columns("gyro"),
         specific_force=columns("accelerometer") if present["accelerometer"] else None,
         magnetic_field=columns("magnetometer") if present["magnetometer"] else None,
     )
+
+
+def _seconds(stamps: Array, factor: float) -> Array:
+    """Return time stamps in s; those of a clock that counts from 1970 are told from the first one on, or they would lose digits."""
+    origin = stamps[0] if abs(stamps[0] * factor) > 1e8 else 0.0
+    return np.asarray((stamps - origin) * factor)
 
 
 def _header(source: str, header: list[str]) -> tuple[list[str], dict[str, str]]:

@@ -110,11 +110,7 @@ def cut(record: ImuRecord, first: int, last: int) -> ImuRecord:
         inside = (series.time > t0) & (series.time <= t1)
         if first == 0:
             inside |= series.time == t0
-        vectors.append(
-            dataclasses.replace(
-                series, time=series.time[inside], vector_b=series.vector_b[inside], sigma=series.sigma[inside]
-            )
-        )
+        vectors.append(series.taken(inside))
     edges = slice(first, last + 1)
     truth = (
         None if record.truth is None else Truth(attitude=record.truth.attitude[edges], bias=record.truth.bias[edges])
@@ -189,8 +185,9 @@ def write_estimate(
             value = getattr(estimate, name)
             if value is not None:
                 file.create_dataset(name, data=value, compression="gzip", shuffle=True).attrs["unit"] = unit
-        for sensor, innovations in estimate.innovations.items():
-            group = file.create_group(f"innovations/{sensor}")
+        for number, (sensor, innovations) in enumerate(estimate.innovations.items()):
+            group = file.create_group(f"innovations/{number}")
+            group.attrs["sensor"] = sensor  # not the group's name: a slash in it would part groups
             group.create_dataset("time", data=innovations.time, compression="gzip").attrs["unit"] = "s"
             group.create_dataset("whitened", data=innovations.whitened, compression="gzip").attrs["unit"] = "1"
             group.attrs["skipped"] = estimate.skipped.get(sensor, 0)
@@ -222,7 +219,7 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
                 raise InputError(
                     f"{path} is not a strapdown estimate; pass the estimate.h5 that `strapdown estimate` writes"
                 )
-            group = file.get("innovations", {})
+            groups = file["innovations"].values() if "innovations" in file else ()
             return Estimate(
                 time=file["time"][:],
                 attitude=file["attitude"][:],
@@ -230,10 +227,10 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
                 variance=file["variance"][:],
                 covariance=file["covariance"][:] if "covariance" in file else None,
                 innovations={
-                    name: Innovations(time=part["time"][:], whitened=part["whitened"][:])
-                    for name, part in group.items()
+                    part.attrs["sensor"]: Innovations(time=part["time"][:], whitened=part["whitened"][:])
+                    for part in groups
                 },
-                skipped={name: int(part.attrs["skipped"]) for name, part in group.items()},
+                skipped={part.attrs["sensor"]: int(part.attrs["skipped"]) for part in groups},
             )
     except FileNotFoundError:
         raise InputError(f"{path} does not exist; check the path") from None

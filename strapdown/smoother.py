@@ -12,12 +12,11 @@ import numpy as np
 
 from strapdown import mekf
 from strapdown.checks import Array, non_negative
-from strapdown.kernels import filter_loop, smoother_loop
+from strapdown.kernels import smoother_loop
 from strapdown.kernels.machine import compiled
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.mekf import ProcessNoise, State
-from strapdown.records import Estimate, ImuRecord, Innovations
-from strapdown.vectors import KINDS
+from strapdown.records import Estimate, ImuRecord
 
 STAMP_TOLERANCE = 1e-6
 """Of the mean gyro interval: an edge that lies beyond t + lag by no more is taken for one at t + lag."""
@@ -100,46 +99,28 @@ def _filtered(record: ImuRecord, process_noise: ProcessNoise, initial: State) ->
     """Run the filter and keep its segments; return its estimate, the segments with the end state, and the segment of each edge."""
     events = mekf.schedule(record.vectors, record.time[0], record.time[-1])
     rows = len(record.time)
-    state = mekf._pack(initial)
-    innovation = np.empty((len(events.time), 6))
-    segments = np.empty((_most_segments(record, len(events.time)) + 1, 32))
-    number = compiled(filter_loop.run_filter)(
-        record.time,
-        np.ascontiguousarray(record.increments),
-        process_noise.angle_random_walk**2,
-        process_noise.rate_random_walk**2,
-        events.time,
-        events.kind,
-        events.vector_b,
-        events.variance,
-        events.reference,
-        events.triads,
-        state,
-        rows,
-        np.empty((1, 4)),
-        np.empty((1, 3)),
-        np.empty((1, 6)),
-        np.empty((0, 21)),
-        innovation,
-        segments,
+    forward, state, stored = mekf.run_events(
+        record,
+        events,
+        process_noise,
+        initial,
+        every=rows,
+        full_covariance=False,
+        segments=_most_segments(record, len(events.time)),
     )
+    number = len(stored)
+    segments = np.concatenate([stored, np.empty((1, 32))])
     segments[number, :4] = 0.0
     segments[number, 4:] = state
     starts = np.empty(rows, np.int64)
     compiled(smoother_loop.locate_edges)(record.time, events.time, segments, number, starts)
-    innovations = {}
-    for i, (sensor, kind) in enumerate(zip(events.sensors, events.kinds, strict=True)):
-        values = innovation[events.reference == i, : 2 * KINDS[kind]]
-        innovations[sensor] = Innovations(
-            time=events.time[events.reference == i], whitened=values[:, 0::2] / np.sqrt(values[:, 1::2])
-        )
     end = segments[number, 4:]
     last = Estimate(
         time=record.time[-1:],
         attitude=end[None, :4],
         bias=end[None, 4:7],
         variance=mekf.covariance_matrices(end[7:]).diagonal()[None],
-        innovations=innovations,
+        innovations=forward.innovations,
         skipped=events.skipped,
     )
     return last, segments, starts

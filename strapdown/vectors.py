@@ -183,12 +183,16 @@ def _unit(vector: Array) -> Array:
     return np.asarray(vector / np.linalg.norm(vector, axis=-1, keepdims=True))
 
 
-def triad(reference_f: Array) -> Array:
-    """Return unit vectors (u, v, r) as rows (3, 3), right-handed (u × v = r), r along ``reference_f``."""
-    r = _direction("reference_f", reference_f)
-    u = np.cross(np.eye(3)[np.argmin(np.abs(r))], r)
-    u /= np.linalg.norm(u)
-    return np.stack([u, np.cross(r, u), r])
+def triad(reference_f: ArrayLike) -> Array:
+    """Return unit vectors (u, v, r) as rows (..., 3, 3), right-handed (u × v = r), r along ``reference_f`` (..., 3)."""
+    given = array("reference_f", reference_f, (..., 3))
+    length = np.linalg.norm(given, axis=-1, keepdims=True)
+    if np.any(length == 0.0):
+        raise InputError("reference_f is the zero vector, which has no direction")
+    r = given / length
+    u = np.cross(np.eye(3)[np.argmin(np.abs(r), axis=-1)], r)
+    u /= np.linalg.norm(u, axis=-1, keepdims=True)
+    return np.stack([u, np.cross(r, u), r], axis=-2)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -166,17 +166,26 @@ def test_start_is_triad_of_the_quiet_second():
 def test_quiet_span_is_the_first_quiet_second():
     plain = recording()
     assert ahrs.quiet_span(plain) == slice(0, round(RATE))
-    # moving at first: shake the first second and a half
+    # moving at first: shake most of the first second; the body rests in the second one
     shaken = plain.rate.copy()
-    shaken[: round(1.5 * RATE)] += np.sin(np.arange(round(1.5 * RATE)))[:, None]
+    shaken[: round(0.9 * RATE)] += np.sin(np.arange(round(0.9 * RATE)))[:, None]
     later = dataclasses.replace(
         recording(noise=0.1), rate=shaken + 1e-4 * np.random.default_rng(2).standard_normal(shaken.shape)
     )
     span = ahrs.quiet_span(later)
-    assert span.start >= 1.5 * RATE
+    assert span == slice(round(RATE), 2 * round(RATE))
     result = ahrs.estimate(later)
     assert result.recording.time[0] == later.time[span.start]
     assert len(result.estimate.time) == len(result.recording.time)
+
+
+def test_a_steady_turn_is_not_rest():
+    """Its rate varies no more than at rest, but its vertical and its field turn: here from the second second on."""
+    plain = recording(6.0)
+    turning = np.zeros_like(plain.rate)
+    turning[: 3 * round(RATE), 2] = 1.0
+    steady = dataclasses.replace(plain, rate=turning + 1e-4 * np.random.default_rng(3).standard_normal(turning.shape))
+    assert ahrs.quiet_span(steady).start == 3 * round(RATE)
 
 
 def test_too_short_a_recording_is_refused():

@@ -53,6 +53,35 @@ def with_vector_series(record):
     return replace(record, vectors=(*record.vectors, series))
 
 
+def with_attitude_series(record):
+    """Add whole attitudes (three degrees of freedom), their noise different about each body axis."""
+    time = np.linspace(0.033, record.time[-1] - 0.01, 37)
+    index = np.searchsorted(record.time, time)
+    sigma = np.array([1e-3, 2e-3, 5e-3])
+    error = sigma * generator(4, 0, "tracker").standard_normal((len(time), 3))
+    measured = quaternion.multiply(record.truth.attitude[index], quaternion.exp(error))
+    series = VectorMeasurements(sensor="tracker", kind="attitude", time=time, attitude=measured, sigma_axes=sigma)
+    return replace(record, vectors=(*record.vectors, series))
+
+
+def with_moving_reference(record):
+    """Add directions to something that moves in the fixed frame, each with its own reference."""
+    time = np.linspace(0.02, record.time[-1] - 0.02, 53)
+    index = np.searchsorted(record.time, time)
+    reference = np.stack([np.cos(time), np.sin(time), 0.2 * np.ones_like(time)], axis=-1)
+    reference /= np.linalg.norm(reference, axis=1, keepdims=True)
+    seen = quaternion.rotate(quaternion.conjugate(record.truth.attitude[index]), reference)
+    series = VectorMeasurements(
+        sensor="planet",
+        kind="direction",
+        time=time,
+        vector_b=seen,
+        reference_f=reference,
+        sigma=np.full(len(time), 1e-3),
+    )
+    return replace(record, vectors=(*record.vectors, series))
+
+
 def stepped(record, initial, saver=None):
     """Run the step-by-step face over a record, splitting intervals at the measurements: a plain loop of its own."""
     f = StepFilter(NOISE, initial)
@@ -68,8 +97,11 @@ def stepped(record, initial, saver=None):
                 f.predict(delta * ((t - now) / whole), t - now)
                 now = t
             series = record.vectors[i]
-            update = {"direction": f.update_direction, "vector": f.update_vector, "heading": f.update_heading}
-            update[series.kind](series.vector_b[j], series.reference_f, series.sigma[j])
+            if series.kind == "attitude":
+                f.update_attitude(series.attitude[j], series.sigma_axes[j])
+            else:
+                update = {"direction": f.update_direction, "vector": f.update_vector, "heading": f.update_heading}
+                update[series.kind](series.vector_b[j], series.references_f[j], series.sigma[j])
             if history is not None:
                 history.save()
         if end > now:
@@ -82,6 +114,7 @@ def stepped(record, initial, saver=None):
 def test_both_faces_are_one_filter(fast):
     body_motion = motion.ConstantRate(rate=(80.0, -60.0, 70.0)) if fast else None  # 1.2 rad a sample: sub-steps
     record = with_vector_series(simulate(scenario(body_motion, duration=4.0), 1))
+    record = with_moving_reference(with_attitude_series(record))
     initial = off(record)
     whole = mekf.run(record, NOISE, initial, full_covariance=True)
     (attitude, bias, P), _ = stepped(record, initial)
@@ -110,7 +143,7 @@ def test_innovations_agree_with_the_step_face():
 
 @pytest.mark.parametrize("at", [1, 333, 799])
 def test_a_split_run_is_the_whole_run_to_the_bit(at):
-    record = with_vector_series(simulate(scenario(), 1))
+    record = with_moving_reference(with_attitude_series(with_vector_series(simulate(scenario(), 1))))
     whole, end = mekf.run_on(record, NOISE, off(record), full_covariance=True)
     first, middle = mekf.run_on(records.cut(record, 0, at), NOISE, off(record), full_covariance=True)
     second, last = mekf.run_on(records.cut(record, at, len(record.increments)), NOISE, middle, full_covariance=True)
@@ -261,6 +294,47 @@ def test_two_orthogonal_equal_directions_and_a_diffuse_prior():
     initial = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e3, bias_sigma=1.0)
     after = mekf.run(record, NOISE, initial, full_covariance=True).covariance[0, :3, :3]
     assert np.allclose(after, sigma**2 * np.diag([1.0, 1.0, 0.5]), rtol=1e-9, atol=1e-9 * sigma**2)
+
+
+def test_an_attitude_and_a_diffuse_prior_is_the_attitude():
+    """The measured attitude, with its covariance carried to the estimate's tangent space; its NIS has three degrees of freedom."""
+    sigma = np.array([1e-3, 2e-3, 3e-3])
+    measured = quaternion.exp([0.3, -0.2, 0.5])
+    series = VectorMeasurements(sensor="t", kind="attitude", time=[0.0], attitude=[measured], sigma_axes=sigma)
+    record = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=(series,))
+    start = quaternion.multiply(measured, quaternion.exp([1e-3, 1e-3, -1e-3]))
+    initial = initial_state(start, attitude_sigma=1e2, bias_sigma=1.0)
+    result = mekf.run(record, NOISE, initial, full_covariance=True)
+    assert quaternion.angle_between(result.attitude[0], measured) < 1e-10
+    assert np.allclose(result.covariance[0, :3, :3], np.diag(sigma**2), rtol=2e-3, atol=1e-8)
+    assert result.innovations["t"].whitened.shape == (1, 3)
+
+
+def test_the_heading_of_an_inclined_vector_shifts_with_tilt():
+    """Its row is the derivative of the heading by a small turn about each body axis."""
+    from strapdown.kernels.filter_loop import heading_error
+    from strapdown.kernels.filter_step import heading_row
+
+    q = quaternion.exp([0.4, -0.3, 0.8])
+    reference = np.array([0.3, 0.9, -1.2])
+    z = quaternion.rotate(quaternion.conjugate(q), reference)
+    R = tuple(quaternion.to_matrix(q).ravel())
+    h = heading_row(R, tuple(z))
+    for axis in np.eye(3) * 1e-6:
+        seen = quaternion.rotate(quaternion.conjugate(quaternion.multiply(q, quaternion.exp(axis))), reference)
+        assert heading_error(R, tuple(seen), tuple(reference)) == pytest.approx(np.dot(h, axis), abs=1e-11)
+
+
+def test_a_correction_of_more_than_a_radian_keeps_the_norm():
+    measured = quaternion.exp([3.0, 0.3, -0.2])
+    series = VectorMeasurements(
+        sensor="t", kind="attitude", time=[0.0], attitude=[measured], sigma_axes=np.full(3, 1e-3)
+    )
+    record = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=(series,))
+    initial = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=3.0, bias_sigma=1.0)
+    estimate, end = mekf.run_on(record, NOISE, initial)
+    assert abs(np.linalg.norm(estimate.attitude[0]) - 1.0) < 1e-14
+    assert np.linalg.norm(end.attitude) == pytest.approx(1.0, abs=1e-14)
 
 
 def test_a_long_outage_grows_the_covariance_as_the_closed_form_says():

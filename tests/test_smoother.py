@@ -195,7 +195,8 @@ def fixed_side_smoother(record: ImuRecord, noise: ProcessNoise, initial: mekf.St
             z = quaternion.rotate(q, series.vector_b[i])  # in the fixed frame
             H = np.zeros((1 if series.kind == "heading" else 2, 6))
             if series.kind == "heading":
-                H[0, 2] = 1.0
+                level = z[:2] @ z[:2]  # tilt shifts the heading of a vector that is not level
+                H[0, :3] = -z[2] * z[0] / level, -z[2] * z[1] / level, 1.0
                 y = np.array([math.atan2(z[0] * r[1] - z[1] * r[0], z[0] * r[0] + z[1] * r[1])])
             else:
                 u, v, _ = triad(r)

@@ -83,6 +83,7 @@ def integrate(
     if truth is not None:
         reference = truth[:: chosen.samples][: len(attitude)]
         known = np.isfinite(reference).all(axis=1)
+    if truth is not None and known.any():
         error = np.degrees(quaternion.angle_between(quaternion.normalize(reference[known]), attitude[known]))
         console.print(f"Error against the file's attitude: at the end {error[-1]:.4g}°, at most {error.max():.4g}°.")
     written(out)

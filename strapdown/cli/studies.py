@@ -45,8 +45,10 @@ def coning(
         drift.add_row(
             row["algorithm"],
             str(row["samples"]),
-            f"{row['drift_deg_per_hour']:.4g}",
-            f"{row['predicted_deg_per_hour']:.4g}",
+            *(
+                f"{row[key]:.4g}" if abs(row[key]) > 1e-6 else "rounding"
+                for key in ("drift_deg_per_hour", "predicted_deg_per_hour")
+            ),
         )
     console.print(drift)
     verdicts = table(

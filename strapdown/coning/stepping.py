@@ -38,7 +38,7 @@ def integrate(
     frame : {"body", "fixed"}
         Of the increments: body rates, equation (17), or rates in the fixed frame, equation (3).
     """
-    from strapdown.kernels.integration import BLOCK, accumulate_quaternions, accumulate_vectors
+    from strapdown.kernels.integration import WORK, accumulate_quaternions, accumulate_vectors
     from strapdown.kernels.machine import compiled
 
     table = named(algorithm)
@@ -52,11 +52,11 @@ def integrate(
         samples = -samples
         initial = quaternion.conjugate(initial)
     attitude = np.empty((len(samples) // table.samples + 1, 4))
-    work = np.empty((4, BLOCK))
+    work = np.empty(WORK)
     if table.solver in _VECTOR_SOLVERS:
-        compiled(accumulate_vectors)(_vectors(samples, table).reshape(-1), initial, *work, attitude.reshape(-1))
+        compiled(accumulate_vectors)(_vectors(samples, table).reshape(-1), initial, work, attitude.reshape(-1))
     else:
-        compiled(accumulate_quaternions)(_steps(samples, table).reshape(-1), initial, *work, attitude.reshape(-1))
+        compiled(accumulate_quaternions)(_steps(samples, table).reshape(-1), initial, work, attitude.reshape(-1))
     return quaternion.conjugate(attitude) if frame == "fixed" else attitude
 
 

@@ -57,10 +57,10 @@ def steady_gains(record: ImuRecord, process_noise: ProcessNoise, initial: State)
 
 def _steady_gains(record: ImuRecord, events: Schedule, process_noise: ProcessNoise, initial: State) -> Gains:
     duration = float(record.time[-1] - record.time[0])
-    number = np.bincount(events.reference, minlength=len(events.sensors))
+    number = np.bincount(events.sensor, minlength=len(events.sensors))
     if not number.any():
         return Gains(attitude=np.zeros(len(number)), bias=np.zeros(len(number)))
-    information = np.bincount(events.reference, weights=1.0 / events.variance, minlength=len(number)) / duration
+    information = np.bincount(events.sensor, weights=1.0 / events.variance, minlength=len(number)) / duration
     interval = duration / np.maximum(number, 1)
     longest = float(interval[number > 0].max())
     initial_sigma = np.sqrt(np.diag(initial.covariance) / duration)

@@ -14,8 +14,7 @@ from strapdown import mekf
 from strapdown.checks import Array, InputError, count
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.mekf import Schedule
-from strapdown.records import Estimate, ImuRecord, Innovations
-from strapdown.vectors import KINDS
+from strapdown.records import Estimate, ImuRecord
 
 _UPPER = np.triu_indices(3)
 
@@ -96,18 +95,12 @@ def packed(attitude: Array, bias: Array, covariance: Array) -> Array:
 def estimate(events: Schedule, steps: Steps, states: Array, innovation: Array, full_covariance: bool) -> Estimate:
     """Return the estimate of packed states (m, 28), body side, and innovations (events, 6): e₁, s₁, e₂, s₂, e₃, s₃."""
     covariance = mekf.covariance_matrices(states[:, 7:])
-    innovations = {}
-    for i, (sensor, kind) in enumerate(zip(events.sensors, events.kinds, strict=True)):
-        values = innovation[events.reference == i, : 2 * KINDS[kind]]
-        innovations[sensor] = Innovations(
-            time=events.time[events.reference == i], whitened=values[:, 0::2] / np.sqrt(values[:, 1::2])
-        )
     return Estimate(
         time=steps.time,
         attitude=states[:, :4],
         bias=states[:, 4:7],
         variance=np.diagonal(covariance, axis1=1, axis2=2).copy(),
         covariance=covariance if full_covariance else None,
-        innovations=innovations,
+        innovations=mekf.innovations_by_sensor(events, innovation),
         skipped=events.skipped,
     )

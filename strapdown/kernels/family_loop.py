@@ -22,7 +22,7 @@ from strapdown.kernels.family_step import (
     to_geometric,
 )
 from strapdown.kernels.filter_loop import HEADING, VECTOR, heading_error, store_state, vector_at
-from strapdown.kernels.filter_step import predict
+from strapdown.kernels.filter_step import heading_row, predict
 from strapdown.kernels.rotation import rotation_matrix
 
 FIXED_SIDE = 0
@@ -106,7 +106,7 @@ def run_extended(
             u = (triads[t, 0], triads[t, 1], triads[t, 2])
             v = (triads[t, 3], triads[t, 4], triads[t, 5])
             z_f = matrix_times_vector(R, z)
-            h1 = (0.0, 0.0, 1.0) if heading else negated(v)
+            h1 = matrix_times_vector(R, heading_row(R, z)) if heading else negated(v)
             h2 = u
             y1 = heading_error(R, z, r) if heading else dot(u, z_f)
             if variant == GEOMETRIC:

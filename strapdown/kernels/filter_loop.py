@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from strapdown.kernels.algebra import dot, matrix_times_vector, scale, transpose_times_vector
-from strapdown.kernels.filter_step import predict, update_direction, update_heading
+from strapdown.kernels.filter_step import heading_row, predict, update_attitude, update_direction, update_heading
 from strapdown.kernels.rotation import rotation_matrix
 from strapdown.kernels.series import LARGEST_ANGLE
 
@@ -15,6 +15,9 @@ VECTOR = 1
 """Kind of an event: a whole vector over the length of its reference, three degrees of freedom."""
 HEADING = 2
 """Kind of an event: a body vector of which only the heading of its horizontal part is used, one degree of freedom."""
+ATTITUDE = 3
+"""Kind of an event: a whole attitude, three degrees of freedom. Its frame holds the quaternion in its first four numbers, its value the
+three variances."""
 
 
 def vector_at(array, k):
@@ -113,7 +116,12 @@ def run_filter(
             R = rotation_matrix(q)
             z = vector_at(event_value, e)
             t = event_reference[e]
-            if event_kind[e] != HEADING:
+            if event_kind[e] == ATTITUDE:
+                measured = (triads[t, 0], triads[t, 1], triads[t, 2], triads[t, 3])
+                q, b, A, B, C, e1, s1, e2, s2, e3, s3 = update_attitude(q, b, A, B, C, measured, z)
+                innovation_out[e, 4] = e3
+                innovation_out[e, 5] = s3
+            elif event_kind[e] != HEADING:
                 u = (triads[t, 0], triads[t, 1], triads[t, 2])
                 v = (triads[t, 3], triads[t, 4], triads[t, 5])
                 if event_kind[e] == VECTOR:
@@ -124,7 +132,7 @@ def run_filter(
                 q, b, A, B, C, e1, s1, e2, s2 = update_direction(q, b, A, B, C, R, u, v, z, event_variance[e])
             else:
                 error = heading_error(R, z, (triads[t, 6], triads[t, 7], triads[t, 8]))
-                q, b, A, B, C, e1, s1 = update_heading(q, b, A, B, C, R, error, event_variance[e])
+                q, b, A, B, C, e1, s1 = update_heading(q, b, A, B, C, heading_row(R, z), error, event_variance[e])
                 e2, s2 = 0.0, 1.0
             innovation_out[e, 0] = e1
             innovation_out[e, 1] = s1

@@ -16,6 +16,7 @@ from strapdown.kernels.algebra import (
     combine,
     dot,
     full,
+    matrix_times_vector,
     minus_outer,
     multiply,
     multiply_add,
@@ -28,7 +29,7 @@ from strapdown.kernels.algebra import (
     transpose,
     transpose_times_vector,
 )
-from strapdown.kernels.rotation import right_jacobian, turned
+from strapdown.kernels.rotation import logarithm, quaternion_multiply, right_jacobian, turned, unit
 from strapdown.kernels.series import fifth, fourth, second, sinc, third
 
 SHORT_FORM = 1000.0
@@ -128,8 +129,11 @@ def reset(q, A, B, correction):
     conservative or optimistic by second-order terms, and differs from its fixed-side twin.
     """
     G = right_jacobian(correction)
+    q = turned(q, correction)
+    if dot(correction, correction) > 1.0:
+        q = unit(q)  # the polynomials of so large a turn leave the norm
     return (
-        turned(q, correction),
+        q,
         times_transpose_upper(multiply(G, full(A)), G),
         multiply(G, B),
     )
@@ -183,11 +187,34 @@ def update_direction(q, b, A, B, C, R, u, v, z, variance):
     return q, b, A, B, C, e1, s1, e2, s2
 
 
-def update_heading(q, b, A, B, C, R, error, variance):
-    """Update with a heading error (rad, about the fixed z axis, true minus estimated), one degree of freedom.
+def heading_row(R, z):
+    """Return h of the heading of the horizontal part of a vector ``z`` (body): the turn δθ of the body shifts it by h · δθ.
 
-    ``h`` is the fixed z axis in the body frame: a turn δθ of the body turns the heading by h · δθ.
+    With m = R z, a turn δφ in fixed axes shifts the heading by ``δφ_z − m_z (m_x δφ_x + m_y δφ_y)/(m_x² + m_y²)``: only of a level vector
+    is it the turn about the vertical alone.
     """
-    correction, b, A, B, C, s = update_row(b, A, B, C, (R[6], R[7], R[8]), error, variance)
+    m = matrix_times_vector(R, z)
+    tilt = -m[2] / (m[0] * m[0] + m[1] * m[1])
+    return transpose_times_vector(R, (tilt * m[0], tilt * m[1], 1.0))
+
+
+def update_attitude(q, b, A, B, C, measured, variance):
+    """Update with a measured attitude q_fb: three degrees of freedom, ``variance`` (3,) about the body axes, rad².
+
+    The residual is Log(q⁻¹ ⊗ measured), the error state itself. Scalar machine only: it needs an arctangent.
+    """
+    y = logarithm(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), measured))
+    first, b, A, B, C, s1 = update_row(b, A, B, C, (1.0, 0.0, 0.0), y[0], variance[0])
+    e2 = y[1] - first[1]
+    second, b, A, B, C, s2 = update_row(b, A, B, C, (0.0, 1.0, 0.0), e2, variance[1])
+    e3 = y[2] - first[2] - second[2]
+    third_part, b, A, B, C, s3 = update_row(b, A, B, C, (0.0, 0.0, 1.0), e3, variance[2])
+    q, A, B = reset(q, A, B, add(first, add(second, third_part)))
+    return q, b, A, B, C, y[0], s1, e2, s2, e3, s3
+
+
+def update_heading(q, b, A, B, C, h, error, variance):
+    """Update with a heading error (rad, about the fixed z axis, true minus estimated) of row ``h``, one degree of freedom."""
+    correction, b, A, B, C, s = update_row(b, A, B, C, h, error, variance)
     q, A, B = reset(q, A, B, correction)
     return q, b, A, B, C, error, s

@@ -1,26 +1,53 @@
 """Record loops of gyro integration: increments to rotation vectors, rotation vectors and step quaternions to attitude.
 
 One accumulator serves every algorithm. Arrays are preallocated by the caller; where speed counts they are flat (``a.reshape(-1)``).
+
+A product of quaternions waits for the one before it, about 16 cycles, in which the machine could do some three hundred multiplications.
+So a block is cut into ``WIDTH`` segments of equal length that advance together, one a lane, each from the identity; the attitudes at
+their starts are the products of the segments' ends; and each lane's products are turned by its start. A step costs one product more,
+the rounding is that of one chain (as many products lie between the first attitude and any other, but for the blocks' eight), and no
+lane's order of operations depends on the machine.
 """
 
 from __future__ import annotations
 
+import math
+
 from strapdown.kernels.algebra import add, combine, cross, dot
+from strapdown.kernels.lane_values import (
+    WIDTH,
+    everywhere,
+    load,
+    load_quadruples,
+    load_triples,
+    spread,
+    store,
+    store_quadruples,
+)
 from strapdown.kernels.rotation import exponential, quaternion_multiply, renormalized
 from strapdown.kernels.series import LARGEST_ANGLE
 
-BLOCK = 192
-"""Steps between two renormalisations of the running attitude: its norm is then still within 192 roundings of one."""
+SEGMENT = 64
+"""Steps of a lane in a block, at most."""
+
+BLOCK = WIDTH * SEGMENT
+"""Steps of a block, which ends in a renormalisation of the running attitude: its norm is then still within as many roundings of one."""
+
+FEWEST = 4 * WIDTH
+"""Fewer steps than this are left to one chain."""
+
+WORK = 4 * (BLOCK + WIDTH)
+"""Numbers of work space: the lanes' products and their starts."""
 
 _LARGEST_SQUARE = LARGEST_ANGLE * LARGEST_ANGLE
 
 
 def large_exponential(phi):
-    """Return exp(φ) of any rotation vector: halved until the series holds, then squared as often."""
+    """Return exp(φ) of any rotation vector: halved until the series holds, then squared as often; NaN if |φ|² is not finite."""
     halvings = 0
     s = 1.0
     x = dot(phi, phi)
-    while x > _LARGEST_SQUARE:
+    while _LARGEST_SQUARE < x < math.inf:
         x *= 0.25
         s *= 0.5
         halvings += 1
@@ -30,121 +57,108 @@ def large_exponential(phi):
     return q
 
 
-def accumulate_vectors(vectors, initial, w, x, y, z, attitude):
+def accumulate_vectors(vectors, initial, work, attitude):
     """Write q_fb after each step into ``attitude`` (m + 1, 4) from the body rotation vectors (m, 3) of the steps.
 
-    Block by block: the exponentials, which vectorise; the chain of products, which cannot, and takes most of the time; the rows,
-    renormalised by one Newton step each, off the chain. The chain itself is renormalised once a block.
-
-    The arrays are flat and cut to the block, so that the compiler knows strides and lengths; w, x, y, z (``BLOCK``) are work.
+    The arrays are flat; ``work`` has ``WORK`` numbers. A rotation vector that is not finite makes every later row NaN.
     """
     q = (initial[0], initial[1], initial[2], initial[3])
     attitude[0], attitude[1], attitude[2], attitude[3] = q
     m = len(vectors) // 3
-    for start in range(0, m, BLOCK):
-        end = min(start + BLOCK, m)
-        exponentials(vectors[3 * start : 3 * end], w[: end - start], x, y, z)
-        q = products(q, w[: end - start], x, y, z)
-        rows(w[: end - start], x, y, z, attitude[4 * start + 4 : 4 * end + 4])
+    start = 0
+    while m - start >= FEWEST:
+        length = min(SEGMENT, (m - start) // WIDTH)
+        multiply_exponentials(vectors, start, length, work)
+        q = turn_segments(q, start, length, work, attitude)
+        start += WIDTH * length
+    for k in range(start, m):
+        q = quaternion_multiply(q, large_exponential((vectors[3 * k], vectors[3 * k + 1], vectors[3 * k + 2])))
+        write_row(attitude, k + 1, q)
 
 
-def accumulate_quaternions(steps, initial, w, x, y, z, attitude):
+def accumulate_quaternions(steps, initial, work, attitude):
     """Write q_fb after each step into ``attitude`` (m + 1, 4) from the step quaternions (m, 4); otherwise as accumulate_vectors."""
     q = (initial[0], initial[1], initial[2], initial[3])
     attitude[0], attitude[1], attitude[2], attitude[3] = q
     m = len(steps) // 4
-    for start in range(0, m, BLOCK):
-        end = min(start + BLOCK, m)
-        columns(steps[4 * start : 4 * end], w[: end - start], x, y, z)
-        q = products(q, w[: end - start], x, y, z)
-        rows(w[: end - start], x, y, z, attitude[4 * start + 4 : 4 * end + 4])
+    start = 0
+    while m - start >= FEWEST:
+        length = min(SEGMENT, (m - start) // WIDTH)
+        multiply_quaternions(steps, start, length, work)
+        q = turn_segments(q, start, length, work, attitude)
+        start += WIDTH * length
+    for k in range(start, m):
+        q = quaternion_multiply(q, (steps[4 * k], steps[4 * k + 1], steps[4 * k + 2], steps[4 * k + 3]))
+        write_row(attitude, k + 1, q)
 
 
-def exponentials(vectors, w, x, y, z):
-    """Write exp(φ) of a block of rotation vectors."""
-    large = 0
-    for k in range(len(w)):
-        phi = (vectors[3 * k], vectors[3 * k + 1], vectors[3 * k + 2])
-        large += 1 if dot(phi, phi) > _LARGEST_SQUARE else 0
-        q = exponential(phi)
-        w[k] = q[0]
-        x[k] = q[1]
-        y[k] = q[2]
-        z[k] = q[3]
-    if large:
-        for k in range(len(w)):
-            w[k], x[k], y[k], z[k] = large_exponential((vectors[3 * k], vectors[3 * k + 1], vectors[3 * k + 2]))
+def write_row(attitude, k, q):
+    """Write one row, renormalised by one Newton step, off the chain of products."""
+    row = renormalized(q)
+    attitude[4 * k] = row[0]
+    attitude[4 * k + 1] = row[1]
+    attitude[4 * k + 2] = row[2]
+    attitude[4 * k + 3] = row[3]
 
 
-def columns(steps, w, x, y, z):
-    """Write a block of quaternions by component."""
-    for k in range(len(w)):
-        w[k] = steps[4 * k]
-        x[k] = steps[4 * k + 1]
-        y[k] = steps[4 * k + 2]
-        z[k] = steps[4 * k + 3]
+def multiply_exponentials(vectors, start, length, work):
+    """Write the running products of exp(φ) in each lane's segment; lane i begins at row ``start`` + i ``length``."""
+    p = (spread(1.0), spread(0.0), spread(0.0), spread(0.0))
+    for k in range(length):
+        phi = load_triples(vectors, 3 * (start + k), 3 * length)
+        if everywhere(dot(phi, phi) <= _LARGEST_SQUARE):
+            p = quaternion_multiply(p, exponential(phi))
+        else:
+            for i in range(WIDTH):
+                row = 3 * (start + k + i * length)
+                q = large_exponential((vectors[row], vectors[row + 1], vectors[row + 2]))
+                write_lane(work, 4 * BLOCK, i, q)
+            p = quaternion_multiply(p, load_lanes(work, 4 * BLOCK))
+        store_lanes(work, 4 * WIDTH * k, p)
 
 
-def products(q, w, x, y, z):
-    """Replace each step of a block by the product of q and all steps up to it; return the last, renormalised.
+def multiply_quaternions(steps, start, length, work):
+    """Write the running products in each lane's segment; lane i begins at row ``start`` + i ``length``."""
+    p = (spread(1.0), spread(0.0), spread(0.0), spread(0.0))
+    for k in range(length):
+        p = quaternion_multiply(p, load_quadruples(steps, 4 * (start + k), 4 * length))
+        store_lanes(work, 4 * WIDTH * k, p)
 
-    A product waits for the one before it, about 16 cycles. So the block is cut in three: three chains run at once, and the second and
-    the third are then multiplied by the ends of those before them, which vectorises.
-    """
-    third = len(w) // 3
-    middle = (1.0, 0.0, 0.0, 0.0)
-    late = (1.0, 0.0, 0.0, 0.0)
-    for k in range(third):
-        i = k + third
-        j = i + third
-        q = quaternion_multiply(q, (w[k], x[k], y[k], z[k]))
-        middle = quaternion_multiply(middle, (w[i], x[i], y[i], z[i]))
-        late = quaternion_multiply(late, (w[j], x[j], y[j], z[j]))
-        w[k] = q[0]
-        x[k] = q[1]
-        y[k] = q[2]
-        z[k] = q[3]
-        w[i] = middle[0]
-        x[i] = middle[1]
-        y[i] = middle[2]
-        z[i] = middle[3]
-        w[j] = late[0]
-        x[j] = late[1]
-        y[j] = late[2]
-        z[j] = late[3]
-    middle = quaternion_multiply(q, middle)
-    multiply_block(q, w[third : 2 * third], x[third : 2 * third], y[third : 2 * third], z[third : 2 * third])
-    multiply_block(
-        middle, w[2 * third : 3 * third], x[2 * third : 3 * third], y[2 * third : 3 * third], z[2 * third : 3 * third]
-    )
-    q = quaternion_multiply(middle, late)
-    for k in range(3 * third, len(w)):
-        q = quaternion_multiply(q, (w[k], x[k], y[k], z[k]))
-        w[k] = q[0]
-        x[k] = q[1]
-        y[k] = q[2]
-        z[k] = q[3]
+
+def turn_segments(q, start, length, work, attitude):
+    """Write the rows of a block: q times the segments before, times the lane's product, renormalised; return the last, renormalised."""
+    ends = 4 * WIDTH * (length - 1)
+    for i in range(WIDTH):
+        write_lane(work, 4 * BLOCK, i, q)
+        q = quaternion_multiply(
+            q, (work[ends + i], work[ends + WIDTH + i], work[ends + 2 * WIDTH + i], work[ends + 3 * WIDTH + i])
+        )
+    starts = load_lanes(work, 4 * BLOCK)
+    for k in range(length):
+        rows = renormalized(quaternion_multiply(starts, load_lanes(work, 4 * WIDTH * k)))
+        store_quadruples(attitude, 4 * (start + k + 1), 4 * length, rows)
     return renormalized(q)
 
 
-def multiply_block(q, w, x, y, z):
-    """Replace each quaternion of a block by q times it."""
-    for k in range(len(w)):
-        p = quaternion_multiply(q, (w[k], x[k], y[k], z[k]))
-        w[k] = p[0]
-        x[k] = p[1]
-        y[k] = p[2]
-        z[k] = p[3]
+def write_lane(work, place, i, q):
+    """Write a quaternion into lane i of the four values at ``place``."""
+    work[place + i] = q[0]
+    work[place + WIDTH + i] = q[1]
+    work[place + 2 * WIDTH + i] = q[2]
+    work[place + 3 * WIDTH + i] = q[3]
 
 
-def rows(w, x, y, z, attitude):
-    """Write a block of quaternions by row, renormalised."""
-    for k in range(len(w)):
-        q = renormalized((w[k], x[k], y[k], z[k]))
-        attitude[4 * k] = q[0]
-        attitude[4 * k + 1] = q[1]
-        attitude[4 * k + 2] = q[2]
-        attitude[4 * k + 3] = q[3]
+def load_lanes(work, place):
+    """Return the quaternions of all lanes at ``place``."""
+    return load(work, place), load(work, place + WIDTH), load(work, place + 2 * WIDTH), load(work, place + 3 * WIDTH)
+
+
+def store_lanes(work, place, q):
+    """Write the quaternions of all lanes to ``place``."""
+    store(work, place, q[0])
+    store(work, place + WIDTH, q[1])
+    store(work, place + 2 * WIDTH, q[2])
+    store(work, place + 3 * WIDTH, q[3])
 
 
 def compressed_vectors(increments, coefficients, samples, vectors):

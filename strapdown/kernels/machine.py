@@ -56,6 +56,10 @@ def helper(function: FunctionType) -> Any:
     """Return ``function`` compiled for use inside another kernel, always inlined: a call costs more than a 3-vector's work."""
     import numba
 
+    if function.__module__ == f"{PACKAGE}.lane_values":
+        from strapdown.kernels.lanes import INTRINSICS
+
+        return INTRINSICS[function.__name__]
     return numba.njit(forceinline=True, **_options())(_twin(function))
 
 
@@ -81,7 +85,7 @@ def compiled(function: Callable[..., Any]) -> Any:
 
 
 def describe() -> dict[str, str]:
-    """Return what the kernels run on: CPU, numba, LLVM and threads, for `strapdown info` and benchmark headings."""
+    """Return what the kernels run on: CPU, numba and LLVM, for `strapdown info` and benchmark headings."""
     import llvmlite.binding
     import numba
 

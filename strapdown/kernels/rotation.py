@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from strapdown.kernels.algebra import dot, skew_polynomial
+import math
+
+from strapdown.kernels.algebra import dot, skew_polynomial, square_root
 from strapdown.kernels.series import cosine, second, sinc, third
 
 
@@ -39,6 +41,22 @@ def renormalized(q):
     """Return q scaled by (3 − |q|²)/2, the Newton step of :func:`turned` on its own."""
     n = 1.5 - 0.5 * (q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     return (n * q[0], n * q[1], n * q[2], n * q[3])
+
+
+def unit(q):
+    """Return q over its norm."""
+    n = 1.0 / square_root(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    return (n * q[0], n * q[1], n * q[2], n * q[3])
+
+
+def logarithm(q):
+    """Return the rotation vector of a unit quaternion, the shorter way round. Scalar machine only."""
+    sine = square_root(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    # Below that its square would underflow, and the angle is twice the vector part.
+    factor = 2.0 if sine < 1e-150 else 2.0 * math.atan2(sine, abs(q[0])) / sine
+    if q[0] < 0.0:
+        factor = -factor
+    return (factor * q[1], factor * q[2], factor * q[3])
 
 
 def rotation_matrix(q):

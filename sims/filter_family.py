@@ -1,0 +1,272 @@
+"""Which attitude filter? Convergence and consistency of the family, from small and from large initial errors.
+
+One tumbling body, a MEMS gyro, and three cases:
+
+- ``small``: two directions, the initial error 1° an axis, drawn from the filter's own prior;
+- ``large``: the same, the initial error 60° to 150° about any axis;
+- ``one direction``: as large, with one constant reference only. The turn about it can never be observed. The error shown is the angle
+  between the true and the estimated reference in the body; the NEES tells whether a filter knows what it cannot know.
+
+All filters run on the same records and start from the same states. Run it:
+``python sims/filter_family.py --out filter-family-results`` (some minutes, nearly all of them the unscented filter's).
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from strapdown import consistency, family, mekf, plots, quaternion
+from strapdown.checks import Array
+from strapdown.gyro import GyroSpec
+from strapdown.mekf import ProcessNoise
+from strapdown.motion import Harmonic, HarmonicRates
+from strapdown.randomness import generator
+from strapdown.scenarios import Scenario, simulate
+from strapdown.units import DEGREE, DEGREE_PER_HOUR, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
+from strapdown.vectors import VectorSensor
+
+CASES = ("small", "large", "one direction")
+CONVERGED = 3.0 * DEGREE
+"""An attitude error below which a run counts as converged, rad."""
+
+SUN = np.array([0.0, 0.6, 0.8])
+FIELD = np.array([0.8, 0.0, -0.6])
+BIAS_SIGMA = 20.0 * DEGREE_PER_HOUR
+SMALL_SIGMA = 1.0 * DEGREE
+LARGE = (60.0 * DEGREE, 150.0 * DEGREE)
+LARGE_SIGMA = np.sqrt((LARGE[0] ** 2 + LARGE[0] * LARGE[1] + LARGE[1] ** 2) / 9.0)
+"""rad an axis: the second moment of angles uniform between the two, about any axis."""
+
+
+SMALL = {"runs": 6, "unscented_runs": 1, "duration": 20.0}
+"""Arguments of a run that only shows that the script works."""
+
+COLOURS = {
+    "mekf": plots.BLUE,
+    "fixed-side": plots.BLACK,
+    "right-invariant": plots.VERMILION,
+    "two-frame": plots.ORANGE,
+    "geometric": plots.SKY,
+    "usque": plots.PURPLE,
+    "mahony": plots.GREEN,
+}
+DASHES = {"fixed-side": (0, (2, 3)), "two-frame": (0, (4, 3))}
+"""Filters that nearly always lie on another's line."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """One filter in one case."""
+
+    case: str
+    filter: str
+    time: Array
+    """Epochs (m,), s."""
+    error: Array
+    """Attitude error of each run (runs, m), rad."""
+    nees: Array
+    """NEES of all six states of each run (runs, m), per degree of freedom."""
+
+    @property
+    def runs(self) -> int:
+        """Number of independent runs."""
+        return len(self.error)
+
+    @property
+    def converged(self) -> float:
+        """Fraction of the runs that end converged."""
+        return float(np.mean(self.error[:, -1] < CONVERGED))
+
+    @property
+    def convergence_time(self) -> float:
+        """Time after which nine tenths of the runs are converged and stay so, s; infinite if never."""
+        below = np.quantile(self.error, 0.9, axis=0) < CONVERGED
+        if not below[-1]:
+            return float("inf")
+        return float(self.time[len(below) - int(np.argmin(below[::-1])) if not below.all() else 0])
+
+    @property
+    def final_rms(self) -> float:
+        """Root mean square error of attitude at the end, rad."""
+        return float(np.sqrt(np.mean(self.error[:, -1] ** 2)))
+
+    @property
+    def anees(self) -> Array:
+        """Mean NEES over the runs (m,), 1 for a right filter."""
+        return np.asarray(self.nees.mean(axis=0))
+
+    @property
+    def consistent(self) -> bool:
+        """Whether the ANEES lies within its two-sided 99 % bounds at five epochs of the second half together."""
+        epochs = np.linspace(len(self.time) // 2, len(self.time) - 1, 5).astype(int)
+        return consistency.Verdict(mean=self.anees[epochs], degrees=6, runs=self.runs, probability=0.99).consistent
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """What the study found."""
+
+    outcomes: tuple[Outcome, ...]
+    figures: tuple[Path, ...]
+
+    def outcome(self, case: str, name: str) -> Outcome:
+        """Return the outcome of one filter in one case."""
+        return next(o for o in self.outcomes if (o.case, o.filter) == (case, name))
+
+
+def scenario(case: str, duration: float) -> Scenario:
+    """Return the body, the gyro and the sensors of one case."""
+    sun = VectorSensor(name="sun", reference_f=SUN, sigma=1.0 * DEGREE, rate=1.0)
+    field = VectorSensor(name="field", reference_f=FIELD, sigma=2.0 * DEGREE, rate=1.0, phase=0.45)
+    return Scenario(
+        motion=HarmonicRates(
+            mean=(1.0 * DEGREE, -2.0 * DEGREE, 3.0 * DEGREE),
+            harmonics=(Harmonic(amplitude=(4.0 * DEGREE, 2.0 * DEGREE, 0.0), frequency=0.02, phase=0.3),),
+        ),
+        gyro=GyroSpec(
+            angle_random_walk=0.3 * DEGREE_PER_ROOT_HOUR, rate_random_walk=20.0 * DEGREE_PER_HOUR_PER_ROOT_HOUR
+        ),
+        sensors=(sun,) if case == "one direction" else (sun, field),
+        rate=5.0,
+        duration=duration,
+    )
+
+
+def initial_state(case: str, attitude: Array, bias: Array, random: np.random.Generator) -> mekf.State:
+    """Return the state that a run starts from: the truth, off by an error of the case's kind."""
+    axis = random.standard_normal(3)
+    if case == "small":
+        sigma, turn = SMALL_SIGMA, SMALL_SIGMA * axis
+    else:
+        sigma, turn = float(LARGE_SIGMA), random.uniform(*LARGE) * axis / np.linalg.norm(axis)
+    return mekf.initial_state(
+        quaternion.multiply(attitude, quaternion.exp(-turn)),
+        attitude_sigma=sigma,
+        bias_sigma=BIAS_SIGMA,
+        bias=bias - BIAS_SIGMA * random.standard_normal(3),
+    )
+
+
+def study(
+    case: str, names: Sequence[str], *, runs: int, unscented_runs: int, duration: float, seed: int
+) -> list[Outcome]:
+    """Return the outcomes of the named filters in one case, from independent runs."""
+    what = scenario(case, duration)
+    belief = ProcessNoise(angle_random_walk=what.gyro.angle_random_walk, rate_random_walk=what.gyro.rate_random_walk)
+    every = int(what.rate)  # once a second
+    errors: dict[str, list[Array]] = {name: [] for name in names}
+    nees: dict[str, list[Array]] = {name: [] for name in names}
+    for run in range(runs):
+        record = simulate(what, seed, run)
+        assert record.truth is not None
+        truth = record.truth
+        initial = initial_state(case, truth.attitude[0], truth.bias[0], generator(seed, run, "initial error"))
+        for name in names:
+            if name == "usque" and run >= unscented_runs:
+                continue
+            estimate = family.run(name, record, belief, initial, every=every, full_covariance=True)
+            e = consistency.errors(estimate.attitude, estimate.bias, truth.attitude[::every], truth.bias[::every])
+            nees[name].append(consistency.nees(e, estimate.covariance) / 6.0)
+            errors[name].append(
+                _pointing_error(estimate.attitude, truth.attitude[::every])
+                if case == "one direction"
+                else np.linalg.norm(e[:, :3], axis=1)
+            )
+    time = record.time[::every]
+    return [
+        Outcome(case=case, filter=name, time=time, error=np.array(errors[name]), nees=np.array(nees[name]))
+        for name in names
+    ]
+
+
+def _pointing_error(attitude: Array, truth: Array) -> Array:
+    """Return the angle between the estimated and the true direction of the sun in the body (m,), rad."""
+    estimated, true = (quaternion.rotate(quaternion.conjugate(q), SUN) for q in (attitude, truth))
+    return np.asarray(np.arctan2(np.linalg.norm(np.cross(estimated, true), axis=-1), np.sum(estimated * true, axis=-1)))
+
+
+def draw(outcomes: Sequence[Outcome], path: Path) -> Path:
+    """Draw error and ANEES over time, one column a case, and write the figure."""
+    cases = list(dict.fromkeys(o.case for o in outcomes))
+    figure, grid = plots.new_figure(2, len(cases), size=(4.3 * len(cases), 6.6), squeeze=False, sharex=True)
+    titles = {
+        "small": "start 1° an axis off",
+        "large": "start 60° to 150° off",
+        "one direction": "60° to 150°, one direction only",
+    }
+    for column, case in enumerate(cases):
+        top, bottom = grid[:, column]
+        mine = [o for o in outcomes if o.case == case]
+        for o in mine:
+            style: dict[str, Any] = {"color": COLOURS[o.filter], "label": o.filter, "linewidth": 1.4}
+            if o.filter in DASHES:
+                style.update(linestyle=DASHES[o.filter], zorder=3)
+            top.plot(o.time, np.quantile(o.error, 0.9, axis=0) / DEGREE, **style)
+            bottom.plot(o.time, o.anees, **style)
+        most = max(o.runs for o in mine)
+        low, high = consistency.mean_bounds(6, most)
+        bottom.axhspan(low, high, color="0.85", zorder=0, label=f"99 % bounds of {most} runs")
+        top.axhline(CONVERGED / DEGREE, color="0.6", linewidth=0.8, linestyle=":")
+        top.set(yscale="log", title=titles[case])
+        bottom.set(yscale="linear" if case == "small" else "log", xlabel="time, s")
+    grid[0, 0].set_ylabel("attitude error, 90th percentile, °")
+    grid[1, 0].set_ylabel("ANEES / 6")
+    figure.legend(*grid[1, 0].get_legend_handles_labels(), loc="outside lower center", ncols=8)
+    return plots.save(figure, path)
+
+
+def table(result: Result) -> str:
+    """Return the figures as text."""
+    lines = [
+        f"{'case':14s} {'filter':16s} {'runs':>5s} {'converged':>9s} {'in, s':>7s} {'final RMS, °':>12s} "
+        f"{'ANEES/6 at 10 s':>15s} {'at the end':>10s}  99 %"
+    ]
+    for o in result.outcomes:
+        early = int(np.searchsorted(o.time, 10.0))
+        lines.append(
+            f"{o.case:14s} {o.filter:16s} {o.runs:5d} {100.0 * o.converged:7.0f} % {o.convergence_time:7.0f} "
+            f"{o.final_rms / DEGREE:12.3f} {o.anees[early]:15.3g} {o.anees[-1]:10.3g}  "
+            f"{'inside' if o.consistent else 'outside'}"
+        )
+    return "\n".join(lines)
+
+
+def main(
+    *,
+    runs: int = 100,
+    unscented_runs: int = 40,
+    duration: float = 300.0,
+    cases: Sequence[str] = CASES,
+    filters: Sequence[str] = tuple(family.FILTERS),
+    seed: int = 1,
+    out: Path | None = None,
+) -> Result:
+    """Compare the filters; ``duration`` in s. The figure and the table are written to ``out`` if it is given."""
+    outcomes = tuple(
+        outcome
+        for case in cases
+        for outcome in study(
+            case, filters, runs=runs, unscented_runs=min(runs, unscented_runs), duration=duration, seed=seed
+        )
+    )
+    if out is None:
+        return Result(outcomes=outcomes, figures=())
+    out.mkdir(parents=True, exist_ok=True)
+    result = Result(outcomes=outcomes, figures=(draw(outcomes, out / "filter_family.png"),))
+    (out / "filter_family.txt").write_text(table(result) + "\n", encoding="utf-8")
+    return result
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("filter-family-results"))
+    parser.add_argument("--runs", type=int, default=100)
+    parser.add_argument("--unscented-runs", type=int, default=40)
+    parser.add_argument("--seed", type=int, default=1)
+    print(table(main(**vars(parser.parse_args()))))

@@ -1,0 +1,215 @@
+"""What should a filter do about flicker, which no random walk represents? Four filters on the gyros of the presets, at rest.
+
+For each preset and run, a record at the gyro's natural rate with vector measurements once a second goes through
+
+``own``
+    the MEKF with the gyro's angle and rate random walk alone, blind to flicker;
+``bound``
+    the MEKF with the spectral bound of :func:`strapdown.gyro.process_noise` at :func:`strapdown.gyro.best_bandwidth`;
+``matched``
+    the MEKF with :func:`strapdown.gyro.matched_process_noise`;
+``augmented``
+    a linear Kalman filter, one an axis, with the sixteen states of :class:`strapdown.flicker.Shaping` beside the attitude and the drift.
+
+and ``control`` is the MEKF of ``own`` on the same gyro without flicker. Told is the NEES of the attitude over its three degrees of freedom,
+averaged over runs and late epochs (1 if the covariance is right), with the scatter of that mean over the runs, and the rms error.
+
+Run ``python sims/flicker_in_filter.py [FIGURE]`` (some minutes).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from strapdown import consistency, datasheets, files, flicker, gyro, mekf, motion, quaternion
+from strapdown.randomness import generator
+from strapdown.scenarios import Scenario, simulate
+from strapdown.units import ARCSECOND
+from strapdown.vectors import VectorSensor
+
+FILTERS = ("control", "own", "bound", "matched", "augmented")
+
+SIGMA = {
+    "consumer MEMS": 3600.0,
+    "industrial MEMS": 360.0,
+    "tactical MEMS": 60.0,
+    "fibre-optic": 10.0,
+    "navigation, ring laser": 2.0,
+}
+"""Noise of the vector measurements that go with a grade of gyro, arcsec."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """Of one preset: by filter, mean NEES over 3, its scatter, and rms attitude error (rad)."""
+
+    preset: str
+    anees: dict[str, float]
+    scatter: dict[str, float]
+    rms: dict[str, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """All presets."""
+
+    outcomes: tuple[Outcome, ...]
+    runs: int
+    duration: float
+
+
+def main(presets=tuple(datasheets.PRESETS), runs=40, duration=600.0, seed=1, rate=None, figure=None):
+    """Judge the filters on each preset; ``rate`` (Hz) in place of the natural one makes it quicker.
+
+    Returns
+    -------
+    Result
+    """
+    outcomes = tuple(judge(datasheets.preset(name), runs, duration, seed, rate) for name in presets)
+    result = Result(outcomes=outcomes, runs=runs, duration=duration)
+    if figure is not None:
+        from matplotlib.figure import Figure
+
+        page = Figure(figsize=(9.0, 4.5), layout="constrained")
+        draw(result, ax=page.subplots())
+        with files.written_beside(figure) as path:
+            page.savefig(path, dpi=140)
+    return result
+
+
+def judge(preset, runs, duration, seed, rate=None):
+    """Return the outcome of one preset."""
+    sigma = SIGMA[preset.grade] * ARCSECOND
+    # No deterministic errors: this is about the noise. The three directions give each axis two looks a second.
+    names = ("angle_random_walk", "rate_random_walk", "bias_instability", "turn_on_bias_sigma")
+    spec = gyro.GyroSpec(**{name: getattr(preset.spec, name) for name in names})
+    density = 0.5 * sigma**2
+    noises = {"own": gyro.process_noise(dataclasses.replace(spec, bias_instability=0.0))}
+    noises["control"] = noises["own"]
+    noises["bound"] = gyro.process_noise(spec, bandwidth=gyro.best_bandwidth(spec, density))
+    noises["matched"] = gyro.matched_process_noise(spec, density)
+    scenario = Scenario(
+        motion=motion.rest(),
+        gyro=spec,
+        sensors=tuple(
+            VectorSensor(name=f"direction {i}", reference_f=row, sigma=sigma, rate=1.0)
+            for i, row in enumerate(np.eye(3))
+        ),
+        rate=preset.rate if rate is None else rate,
+        duration=duration,
+    )
+    without = dataclasses.replace(scenario, gyro=dataclasses.replace(spec, bias_instability=0.0))
+    samples = len(scenario.edges) - 1
+    every = round(scenario.rate)
+    shaping = flicker.shaping(samples)
+    start = 10.0 * sigma
+    bias_sigma = float(np.hypot(spec.turn_on_bias_sigma, spec.bias_instability * np.sqrt(shaping.variance)))
+    collected = {name: [] for name in FILTERS}
+    for run in range(runs):
+        offset = start * generator(seed, run, "start").standard_normal(3)
+        for name in FILTERS[:-1]:
+            record = simulate(without if name == "control" else scenario, seed, run)
+            q0 = quaternion.exp(-offset)
+            initial = mekf.initial_state(q0, attitude_sigma=start, bias_sigma=bias_sigma)
+            noise = mekf.ProcessNoise(**noises[name])
+            estimate = mekf.run(record, noise, initial, every=every, full_covariance=True)
+            truth = record.truth
+            error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude[::every], truth.bias[::every])[
+                :, :3
+            ]
+            collected[name].append((consistency.nees(error, estimate.covariance[:, :3, :3]), np.sum(error**2, axis=1)))
+        angle = np.concatenate([np.zeros((1, 3)), np.cumsum(record.increments, axis=0)])[::every]
+        looks = np.array([_look(record.vectors, axis) for axis in range(3)]).T
+        error, variance = augmented(angle, looks, spec, shaping, every, 1.0 / scenario.rate, density, start)
+        collected["augmented"].append((np.sum(error**2 / variance[:, None], axis=1), np.sum(error**2, axis=1)))
+    late = slice(len(estimate.time) // 3, None)
+    nees = {name: np.array([pair[0][late].mean() / 3.0 for pair in pairs]) for name, pairs in collected.items()}
+    squares = {name: np.mean([pair[1][late].mean() for pair in pairs]) for name, pairs in collected.items()}
+    return Outcome(
+        preset=preset.name,
+        anees={name: float(values.mean()) for name, values in nees.items()},
+        scatter={name: float(values.std(ddof=1) / np.sqrt(runs)) for name, values in nees.items()},
+        rms={name: float(np.sqrt(value)) for name, value in squares.items()},
+    )
+
+
+def _look(vectors, axis):
+    """Return the angle about one axis that the two directions across it show, at rest in the fixed frame, to first order."""
+    second, third = (axis + 1) % 3, (axis + 2) % 3
+    # A small turn δ about ``axis`` shows in body components: e_second moves by −δ along e_third, e_third by +δ along e_second.
+    return 0.5 * (vectors[third].vector_b[:, second] - vectors[second].vector_b[:, third])
+
+
+def augmented(angle, looks, spec, shaping, every, dt, variance, start):
+    """Return errors (m + 1, 3) and variance (m + 1,) of a Kalman filter with flicker states, one an axis at rest, all three at once.
+
+    States: error angle, drift (turn-on bias and random walk), flicker states. ``angle`` (m + 1, 3) is the integrated gyro output, ``looks``
+    (m, 3) the measured angles, both of an axis that truly rests at 0.
+    """
+    n = 2 + len(shaping.gains)
+    # One sample: angle error grows by the drift and the flicker of the interval.
+    F, Q = np.eye(n), np.zeros((n, n))
+    F[2:, 2:] = np.diag(shaping.poles)
+    F[0, 1] = dt
+    drive = np.concatenate([[spec.bias_instability * shaping.gains.sum() * dt, 0.0], np.ones(n - 2)])
+    F[0, 2:] = spec.bias_instability * dt * shaping.gains * shaping.poles
+    Q += np.outer(drive, drive)
+    Q[0, 0] += spec.angle_random_walk**2 * dt + spec.rate_random_walk**2 * dt**3 / 3.0
+    Q[0, 1] += 0.5 * spec.rate_random_walk**2 * dt**2
+    Q[1, 0] = Q[0, 1]
+    Q[1, 1] += spec.rate_random_walk**2 * dt
+    whole, total = np.eye(n), np.zeros((n, n))
+    for _ in range(every):
+        total = F @ total @ F.T + Q
+        whole = F @ whole
+    P = np.zeros((n, n))
+    P[0, 0], P[1, 1] = start**2, spec.turn_on_bias_sigma**2
+    P[2:, 2:] = shaping.covariance
+    x = np.zeros((n, 3))
+    H = np.eye(n)[0]
+    errors, variances = [x[0].copy()], [P[0, 0]]
+    for gained, look in zip(angle[1:], looks, strict=True):
+        x, P = whole @ x, whole @ P @ whole.T + total
+        # The gyro's integrated angle less the true one (none, at rest) is the error angle: measured by the look.
+        gain = P @ H / (P[0, 0] + variance)
+        x = x + np.outer(gain, (gained - look) - x[0])
+        P = P - np.outer(gain, H @ P)
+        P = 0.5 * (P + P.T)
+        errors.append(x[0] - gained)
+        variances.append(P[0, 0])
+    return np.array(errors), np.array(variances)
+
+
+def draw(result, *, ax=None):
+    """Draw the mean NEES of each filter by preset; return the matplotlib axes."""
+    if ax is None:
+        from matplotlib import pyplot
+
+        ax = pyplot.subplots()[1]
+    place = np.arange(len(result.outcomes))
+    for number, name in enumerate(FILTERS):
+        value = np.array([outcome.anees[name] for outcome in result.outcomes])
+        bar = 2.58 * np.array([outcome.scatter[name] for outcome in result.outcomes])
+        ax.errorbar(place + 0.15 * (number - 2.0), value, bar, fmt="o", ms=5, capsize=3, label=name)
+    ax.axhline(1.0, color="k", lw=0.8)
+    ax.set_xticks(place, [outcome.preset for outcome in result.outcomes])
+    ax.set_ylabel("mean NEES of the attitude / 3")
+    ax.set_title(f"{result.runs} runs of {result.duration:g} s; bars: 99 %")
+    ax.grid(visible=True, which="both", axis="y", lw=0.3)
+    ax.legend()
+    return ax
+
+
+if __name__ == "__main__":
+    where = Path(sys.argv[1] if len(sys.argv) > 1 else "flicker.png")
+    for outcome in main(figure=where).outcomes:
+        told = ", ".join(
+            f"{name} {outcome.anees[name]:.3f} ± {outcome.scatter[name]:.3f} ({outcome.rms[name] / ARCSECOND:.3g}″)"
+            for name in FILTERS
+        )
+        print(f"{outcome.preset:12s} {told}")

@@ -1,0 +1,142 @@
+"""Does a simulated gyro have the noise that its specification says? One preset, its spectrum and its parts over time.
+
+Run ``python sims/simulate_imu.py [FIGURE]``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from strapdown import datasheets, files, gyro, units
+from strapdown.randomness import generator
+
+PARTS = {
+    "angle random walk": "angle_random_walk",
+    "flicker": "bias_instability",
+    "rate random walk": "rate_random_walk",
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """A record at rest: spectra by part and whole, theory beside them, and the bias over time."""
+
+    preset: str
+    frequency: np.ndarray
+    """Middle of the bands (m,), Hz."""
+    spectra: dict[str, np.ndarray]
+    """Two-sided PSD of the mean rate by part and ``"whole"``, (rad/s)²/Hz, averaged over axes and bands."""
+    theory: dict[str, np.ndarray]
+    worst: dict[str, float]
+    """Largest departure from theory, in standard deviations of the estimate."""
+    time: np.ndarray
+    bias: np.ndarray
+    """Bias of the three axes, less its turn-on part, rad/s."""
+
+
+def main(preset="stim300", samples=1 << 20, rate=100.0, seed=1, figure=None):
+    """Simulate a preset at rest and compare spectra; ``figure`` is where to draw.
+
+    Returns
+    -------
+    Result
+    """
+    whole = dataclasses.replace(datasheets.preset(preset).spec, g_sensitivity=np.zeros((3, 3)), turn_on_bias_sigma=0.0)
+    edges = np.arange(samples + 1) / rate
+    outputs = {}
+    for name, fields in {**{part: (field,) for part, field in PARTS.items()}, "whole": tuple(PARTS.values())}.items():
+        spec = gyro.GyroSpec(**{field: getattr(whole, field) for field in fields})
+        outputs[name] = gyro.simulate(spec, np.zeros((samples, 3)), edges, generator(seed, 0, "gyro"))
+    frequency, counts, spectra = None, None, {}
+    for name, output in outputs.items():
+        frequency, counts, spectra[name] = spectrum(output.rates, rate)
+    lines = np.fft.rfftfreq(samples, 1.0 / rate)[1:]
+    x = np.pi * lines / rate
+    theory = {
+        "angle random walk": np.full_like(x, whole.angle_random_walk**2),
+        "flicker": whole.bias_instability**2 / (2.0 * np.pi * lines),
+        # Of means over the sample interval, aliases and all: σ_u² dt² (2 + cos 2x)/(12 sin² x).
+        "rate random walk": whole.rate_random_walk**2 / rate**2 * (2.0 + np.cos(2.0 * x)) / (12.0 * np.sin(x) ** 2),
+    }
+    theory = {name: in_bands(np.concatenate([[0.0], values]))[2] for name, values in theory.items()}
+    theory["whole"] = sum(theory.values())
+    worst = {name: float(np.max(np.abs(spectra[name] / theory[name] - 1.0) * np.sqrt(counts))) for name in theory}
+    thin = slice(None, None, max(1, samples // 4000))
+    result = Result(
+        preset=preset,
+        frequency=frequency,
+        spectra=spectra,
+        theory=theory,
+        worst=worst,
+        time=edges[thin],
+        bias=outputs["whole"].bias[thin],
+    )
+    if figure is not None:
+        from matplotlib.figure import Figure
+
+        page = Figure(figsize=(11.0, 4.5), layout="constrained")
+        left, right = page.subplots(1, 2)
+        draw_spectra(result, ax=left)
+        draw_bias(result, ax=right)
+        with files.written_beside(figure) as path:
+            page.savefig(path, dpi=140)
+    return result
+
+
+def spectrum(rates, rate):
+    """Return bands, independent values in each, and the PSD averaged over axes and bands; a half sine as window.
+
+    The half sine leaks as f⁻⁴, which a spectrum of f⁻² needs; of three neighbouring lines two count as independent.
+    """
+    n = len(rates)
+    window = np.sin(np.pi * (np.arange(n) + 0.5) / n)[:, None]
+    power = np.mean(np.abs(np.fft.rfft(rates * window, axis=0)) ** 2, axis=1) / (np.sum(window**2) * rate)
+    middle, counts, values = in_bands(power)
+    return middle * rate / n, 2.0 * counts, values
+
+
+def in_bands(lines):
+    """Return the middle (in lines), the number of lines, and the mean of logarithmic bands of the lines of a spectrum."""
+    edges = np.unique(np.geomspace(4, len(lines) - 1, 60).astype(int))
+    counts = np.diff(edges)
+    values = np.array([lines[a:b].mean() for a, b in itertools.pairwise(edges)])
+    return np.sqrt(edges[:-1] * np.maximum(edges[1:] - 1.0, edges[:-1])), counts, values
+
+
+def draw_spectra(result, *, ax):
+    """Draw the spectra over their theory; return the axes."""
+    scale = units.DEGREE_PER_HOUR**2
+    for number, (name, values) in enumerate(result.spectra.items()):
+        ax.loglog(result.frequency, values / scale, f"C{number}o", ms=3, label=f"{name}, simulated")
+        ax.loglog(result.frequency, result.theory[name] / scale, f"C{number}-", lw=1.0)
+    ax.set_xlabel("frequency (Hz)")
+    ax.set_ylabel("two-sided PSD ((°/h)²/Hz)")
+    ax.set_title(f"{result.preset} at rest (lines: theory)")
+    ax.grid(visible=True, which="both", lw=0.3)
+    ax.legend(fontsize=8)
+    return ax
+
+
+def draw_bias(result, *, ax):
+    """Draw the drifting bias of the three axes; return the axes."""
+    for axis, values in zip("xyz", result.bias.T, strict=True):
+        ax.plot(result.time, values / units.DEGREE_PER_HOUR, lw=0.7, label=axis)
+    ax.set_xlabel("time (s)")
+    ax.set_ylabel("bias less its turn-on part (°/h)")
+    ax.grid(visible=True, lw=0.3)
+    ax.legend(fontsize=8)
+    return ax
+
+
+if __name__ == "__main__":
+    where = Path(sys.argv[1] if len(sys.argv) > 1 else "simulate-imu.png")
+    outcome = main(figure=where)
+    for part, score in outcome.worst.items():
+        print(f"{part:18s} largest departure from theory {score:.2f} standard deviations")
+    print(f"figure: {where}")

@@ -1,0 +1,325 @@
+"""The machine vector behind :mod:`strapdown.kernels.lane_values`: a numba type for eight (or any power of two) scalars in one value.
+
+``Lanes(float64, 8)`` is LLVM's ``<8 x double>``. Arithmetic, comparisons and square roots act lane by lane, each lane rounded as a scalar
+is; a float or integer beside lanes is spread over them. LLVM cuts the vector to the width of the machine, down to single scalars, so that
+there is no other code for a machine without vectors, and a lane has the same bits on each that has fused multiply-add.
+"""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Callable
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.typeconv import Conversion
+from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.extending import intrinsic, lower_builtin, lower_cast, models, register_model
+
+from strapdown.kernels.lane_values import WIDTH
+
+_ELEMENTS = {
+    types.float64: ir.DoubleType(),
+    types.float32: ir.FloatType(),
+    types.int64: ir.IntType(64),
+    types.uint64: ir.IntType(64),
+    types.uint32: ir.IntType(32),
+    types.boolean: ir.IntType(1),
+}
+_BYTES = {types.float64: 8, types.float32: 4, types.int64: 8, types.uint64: 8, types.uint32: 4}
+_INDEX = ir.IntType(32)
+
+
+class Lanes(types.Type):
+    """``count`` scalars of one type in one value."""
+
+    def __init__(self, dtype: types.Type, count: int) -> None:
+        self.dtype = dtype
+        self.count = count
+        super().__init__(f"Lanes({dtype}, {count})")
+
+    def can_convert_from(self, typingctx: Any, other: types.Type) -> Any:
+        """A number becomes lanes by being spread."""
+        return Conversion.safe if _is_number(other) else None
+
+    def unify(self, typingctx: Any, other: types.Type) -> Any:
+        """A variable that is a number here and lanes there is lanes."""
+        return self if _is_number(other) else None
+
+
+@register_model(Lanes)
+class _LanesModel(models.PrimitiveModel):  # type: ignore[misc]
+    def __init__(self, manager: Any, lanes: Lanes) -> None:
+        super().__init__(manager, lanes, _vector(lanes))
+
+
+def _is_number(numba_type: types.Type) -> bool:
+    return isinstance(numba_type, types.Float | types.Integer)
+
+
+def _vector(lanes: Lanes) -> ir.VectorType:
+    return ir.VectorType(_ELEMENTS[lanes.dtype], lanes.count)
+
+
+def _picked(builder: Any, a: Any, b: Any, places: list[int]) -> Any:
+    """Return the elements at ``places`` of a followed by b."""
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_INDEX, len(places)), places))
+
+
+def _spread(builder: Any, scalar: Any, vector: ir.VectorType) -> Any:
+    empty = ir.Constant(vector, ir.Undefined)
+    first = builder.insert_element(empty, scalar, ir.Constant(_INDEX, 0))
+    return _picked(builder, first, empty, [0] * vector.count)
+
+
+@lower_cast(types.Float, Lanes)
+@lower_cast(types.Integer, Lanes)
+def _number_to_lanes(context: Any, builder: Any, source: Any, target: Any, value: Any) -> Any:
+    if source != target.dtype:
+        value = context.cast(builder, value, source, target.dtype)
+    return _spread(builder, value, _vector(target))
+
+
+# ------------------------------------------------------------------------------------------------ operators
+
+
+def _lanes_among(arguments: tuple[types.Type, ...]) -> Lanes | None:
+    """Return the one type of lanes among the arguments, None if there is none or something foreign beside it."""
+    found = {a for a in arguments if isinstance(a, Lanes)}
+    others = [a for a in arguments if not isinstance(a, Lanes)]
+    return found.pop() if len(found) == 1 and all(map(_is_number, others)) else None
+
+
+def _define(operation: Callable[..., Any], count: int, emit: Callable[..., Any], *, compares: bool = False) -> None:
+    """Teach numba ``operation`` on lanes; ``emit(builder, dtype, *vectors)`` writes its instruction."""
+
+    @infer_global(operation)
+    class Template(AbstractTemplate):  # type: ignore[misc]
+        def generic(self, arguments: tuple[types.Type, ...], keywords: Any) -> Any:
+            lanes = _lanes_among(arguments) if len(arguments) == count else None
+            if lanes is None:
+                return None
+            return signature(Lanes(types.boolean, lanes.count) if compares else lanes, *[lanes] * count)
+
+    @lower_builtin(operation, *[Lanes] * count)
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        return emit(builder, sig.args[0].dtype, *arguments)
+
+
+def _arithmetic(float_instruction: str | None, integer_instruction: str | None) -> Callable[..., Any]:
+    def emit(builder: Any, dtype: types.Type, *vectors: Any) -> Any:
+        name = float_instruction if isinstance(dtype, types.Float) else integer_instruction
+        if name is None:
+            raise NotImplementedError(f"no such operation on lanes of {dtype}")
+        return getattr(builder, name)(*vectors)
+
+    return emit
+
+
+def _comparison(sign: str) -> Callable[..., Any]:
+    def emit(builder: Any, dtype: types.Type, a: Any, b: Any) -> Any:
+        if isinstance(dtype, types.Float):
+            # NaN differs from everything and compares with nothing, as in Python.
+            return (builder.fcmp_unordered if sign == "!=" else builder.fcmp_ordered)(sign, a, b)
+        return (builder.icmp_signed if getattr(dtype, "signed", False) else builder.icmp_unsigned)(sign, a, b)
+
+    return emit
+
+
+def _square_root(builder: Any, dtype: types.Type, x: Any) -> Any:
+    name = f"llvm.sqrt.v{x.type.count}f{8 * _BYTES[dtype]}"
+    return builder.call(cgutils.get_or_insert_function(builder.module, ir.FunctionType(x.type, [x.type]), name), [x])
+
+
+for _operator, _instructions in {
+    operator.add: ("fadd", "add"),
+    operator.sub: ("fsub", "sub"),
+    operator.mul: ("fmul", "mul"),
+    operator.truediv: ("fdiv", None),
+    operator.and_: (None, "and_"),
+    operator.or_: (None, "or_"),
+    operator.xor: (None, "xor"),
+    operator.lshift: (None, "shl"),
+    operator.rshift: (None, "lshr"),
+}.items():
+    _define(_operator, 2, _arithmetic(*_instructions))
+_define(operator.neg, 1, _arithmetic("fneg", "neg"))
+_define(math.sqrt, 1, _square_root)
+for _operator, _sign in {
+    operator.lt: "<",
+    operator.le: "<=",
+    operator.gt: ">",
+    operator.ge: ">=",
+    operator.eq: "==",
+    operator.ne: "!=",
+}.items():
+    _define(_operator, 2, _comparison(_sign), compares=True)
+
+
+# ------------------------------------------------------------------------------------------------ memory and choice
+
+
+def _pointer(context: Any, builder: Any, array_type: Any, array: Any, index: Any, vector: ir.VectorType) -> Any:
+    data = context.make_array(array_type)(context, builder, array).data
+    return builder.bitcast(builder.gep(data, [index]), vector.as_pointer())
+
+
+def _read(context: Any, builder: Any, array_type: Any, array: Any, index: Any, vector: ir.VectorType) -> Any:
+    instruction = builder.load(_pointer(context, builder, array_type, array, index, vector))
+    instruction.align = _BYTES[array_type.dtype]  # an array starts at any multiple of its element's size
+    return instruction
+
+
+def _write(context: Any, builder: Any, array_type: Any, array: Any, index: Any, value: Any) -> None:
+    builder.store(value, _pointer(context, builder, array_type, array, index, value.type)).align = _BYTES[array_type.dtype]
+
+
+def _row(builder: Any, start: Any, stride: Any, i: int, shift: int = 0) -> Any:
+    along = builder.mul(stride, ir.Constant(stride.type, i))
+    return builder.add(builder.add(start, along), ir.Constant(start.type, shift))
+
+
+def _joined(builder: Any, parts: list[Any]) -> Any:
+    """Return vectors of one length, a power of two of them, one after the other."""
+    while len(parts) > 1:
+        length = 2 * parts[0].type.count
+        parts = [_picked(builder, a, b, list(range(length))) for a, b in zip(parts[::2], parts[1::2], strict=True)]
+    return parts[0]
+
+
+def _columns(builder: Any, rows: list[Any], count: int) -> list[Any]:
+    """Return the first ``count`` columns of eight rows of four."""
+    low, high = _joined(builder, rows[:4]), _joined(builder, rows[4:])
+    return [_picked(builder, low, high, [4 * i + c for i in range(WIDTH)]) for c in range(count)]
+
+
+def _tuple_of(dtype: types.Type, count: int) -> Any:
+    return types.UniTuple(Lanes(dtype, WIDTH), count)
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def load(typingctx: Any, array: Any, start: Any) -> Any:
+    """Lower :func:`lane_values.load`."""
+    lanes = Lanes(array.dtype, WIDTH)
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        return _read(context, builder, array, *arguments, _vector(lanes))
+
+    return lanes(array, types.intp), lower
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def load_triples(typingctx: Any, array: Any, start: Any, stride: Any) -> Any:
+    """Lower :func:`lane_values.load_triples`: rows of four, the last from one element before it, so that none ends outside the array."""
+    result = _tuple_of(array.dtype, 3)
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        data, first, step = arguments
+        four = ir.VectorType(_ELEMENTS[array.dtype], 4)
+        rows = [
+            _read(context, builder, array, data, _row(builder, first, step, i, 0 if i < WIDTH - 1 else -1), four)
+            for i in range(WIDTH)
+        ]
+        rows[-1] = _picked(builder, rows[-1], rows[-1], [1, 2, 3, 3])
+        return context.make_tuple(builder, result, _columns(builder, rows, 3))
+
+    return result(array, types.intp, types.intp), lower
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def load_quadruples(typingctx: Any, array: Any, start: Any, stride: Any) -> Any:
+    """Lower :func:`lane_values.load_quadruples`."""
+    result = _tuple_of(array.dtype, 4)
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        data, first, step = arguments
+        four = ir.VectorType(_ELEMENTS[array.dtype], 4)
+        rows = [_read(context, builder, array, data, _row(builder, first, step, i), four) for i in range(WIDTH)]
+        return context.make_tuple(builder, result, _columns(builder, rows, 4))
+
+    return result(array, types.intp, types.intp), lower
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def store(typingctx: Any, array: Any, start: Any, value: Any) -> Any:
+    """Lower :func:`lane_values.store`."""
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        _write(context, builder, array, *arguments)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, Lanes(array.dtype, WIDTH)), lower
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def store_quadruples(typingctx: Any, array: Any, start: Any, stride: Any, q: Any) -> Any:
+    """Lower :func:`lane_values.store_quadruples`."""
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        data, first, step, packed = arguments
+        w, x, y, z = cgutils.unpack_tuple(builder, packed)
+        pairs = [
+            [_picked(builder, a, b, [i for k in range(odd, WIDTH, 2) for i in (k, k + WIDTH)]) for a, b in ((w, x), (y, z))]
+            for odd in (0, 1)
+        ]
+        for i in range(WIDTH):
+            place = i - i % 2
+            row = _picked(builder, *pairs[i % 2], [place, place + 1, place + WIDTH, place + 1 + WIDTH])
+            _write(context, builder, array, data, _row(builder, first, step, i), row)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, types.intp, _tuple_of(array.dtype, 4)), lower
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def spread(typingctx: Any, x: Any) -> Any:
+    """Lower :func:`lane_values.spread`."""
+    lanes = Lanes(x, WIDTH)
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        return _spread(builder, arguments[0], _vector(lanes))
+
+    return lanes(x), lower
+
+
+def _counted(nature: str) -> Callable[..., Any]:
+    """Return the lowering of a condition over lanes to one bit; a plain condition stays as it is."""
+
+    def decide(typingctx: Any, condition: Any) -> Any:
+        def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+            mask = arguments[0]
+            if not isinstance(condition, Lanes):
+                return mask
+            bits = builder.bitcast(mask, ir.IntType(condition.count))
+            if nature == "every":
+                return builder.icmp_unsigned("==", bits, ir.Constant(bits.type, (1 << condition.count) - 1))
+            return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
+
+        return types.boolean(condition), lower
+
+    return decide
+
+
+everywhere = intrinsic(_counted("every"))
+anywhere = intrinsic(_counted("any"))
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def chosen(typingctx: Any, condition: Any, a: Any, b: Any) -> Any:
+    """Lower :func:`lane_values.chosen`."""
+    result = _lanes_among(tuple(t for t in (a, b) if isinstance(t, Lanes))) or typingctx.unify_types(a, b)
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        return builder.select(*arguments)
+
+    return result(condition, result, result), lower
+
+
+INTRINSICS = {
+    f.__name__: f
+    for f in (load, load_triples, load_quadruples, store, store_quadruples, spread, chosen)
+} | {"everywhere": everywhere, "anywhere": anywhere}
+"""What stands for each function of :mod:`strapdown.kernels.lane_values` in compiled code."""
