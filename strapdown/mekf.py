@@ -124,16 +124,25 @@ def schedule(vectors: tuple[VectorMeasurements, ...], start: float, end: float) 
     parts = [_scheduled(series, start, end) for series in vectors]
     rows = np.cumsum([0, *(len(frames) for *_, frames in parts)])
     columns = [
-        (time, value, variance, np.full(len(time), i), frame + rows[i], np.full(len(time), _KIND_CODES[series.kind]))
+        (
+            time,
+            value,
+            variance,
+            np.full(len(time), i, np.uint8),
+            frame + np.int32(rows[i]),
+            np.full(len(time), _KIND_CODES[series.kind], np.uint8),
+        )
         for i, (series, (time, value, variance, frame, _)) in enumerate(zip(vectors, parts, strict=True))
     ]
     if not columns:
-        none = np.empty(0, np.int64)
-        columns.append((np.empty(0), np.empty((0, 3)), np.empty(0), none, none, none))
+        none = np.empty(0, np.uint8)
+        columns.append((np.empty(0), np.empty((0, 3)), np.empty(0), none, np.empty(0, np.int32), none))
     joined = columns[0] if len(columns) == 1 else [np.concatenate(column) for column in zip(*columns, strict=True)]
     if len(columns) > 1:
-        order = np.argsort(joined[0], kind="stable")
-        joined = [column[order] for column in joined]
+        bounds = np.cumsum([0, *(len(column[0]) for column in columns)])
+        order = np.empty(bounds[-1], np.int64)
+        compiled(filter_loop.merge_order)(joined[0], bounds[:-1].copy(), bounds[1:], order)
+        joined = [np.take(column, order, axis=0) for column in joined]
     time, value, variance, sensor, reference, kind = joined
     return Schedule(
         time=time,
@@ -163,9 +172,9 @@ def _scheduled(series: VectorMeasurements, start: float, end: float) -> tuple[Ar
         assert used.sigma_axes is not None
         frames = np.zeros((len(used.time), 9))
         frames[:, :4] = used.attitude
-        return used.time, used.sigma_axes**2, used.sigma**2, np.arange(len(used.time)), frames
+        return used.time, used.sigma_axes**2, used.sigma**2, np.arange(len(used.time), dtype=np.int32), frames
     moving = used.reference_f.ndim == 2
-    frame = np.arange(len(used.time)) if moving else np.zeros(len(used.time), np.int64)
+    frame = np.arange(len(used.time), dtype=np.int32) if moving else np.zeros(len(used.time), np.int32)
     value, variance = used.vector_b, used.sigma**2
     if used.kind == "vector":
         # A vector is taken over the length of its reference, so that the kernel sees unit references only.
@@ -175,12 +184,12 @@ def _scheduled(series: VectorMeasurements, start: float, end: float) -> tuple[Ar
 
 
 def innovations_by_sensor(events: Schedule, rows: Array) -> dict[str, Innovations]:
-    """Return what the kernel wrote of each event, e and its variance for each degree of freedom, sorted by sensor and whitened."""
+    """Return what a kernel wrote of each event, e₁, s₁, e₂, s₂, …, by sensor, as many as each has degrees of freedom."""
     result = {}
     for i, (sensor, kind) in enumerate(zip(events.sensors, events.kinds, strict=True)):
         mine = slice(None) if len(events.sensors) == 1 else events.sensor == i
-        values = rows[mine, : 2 * KINDS[kind]]
-        result[sensor] = Innovations(time=events.time[mine], whitened=values[:, 0::2] / np.sqrt(values[:, 1::2]))
+        filled = rows[mine, : 2 * KINDS[kind]]
+        result[sensor] = Innovations(time=events.time[mine], innovation=filled[:, 0::2], variance=filled[:, 1::2])
     return result
 
 

@@ -270,5 +270,5 @@ def _filtered(record: ImuRecord, setup: FilterSetup, seed: int, number: int, epo
         # A measurement on a bin's edge belongs to the bin that it ends.
         place = np.clip(np.searchsorted(bins, innovations.time, side="left") - 1, 0, nis_bins - 1)
         nis += np.bincount(place, weights=innovations.nis, minlength=nis_bins)
-        degrees += np.bincount(place, minlength=nis_bins) * innovations.whitened.shape[1]
+        degrees += np.bincount(place, minlength=nis_bins) * innovations.innovation.shape[1]
     return _Run(error=error, variance=estimate.variance, nees=nees, nis_sum=nis, nis_degrees=degrees)

@@ -126,13 +126,21 @@ class Innovations:
 
     time: Array
     """Times of the measurements used (m,), s."""
-    whitened: Array
-    """Independent innovations, each over its own standard deviation (m, dof)."""
+    innovation: Array
+    """Independent innovations (m, dof): each less what the ones before it in its row predict; rad, or the sensor's unit over the length
+    of its reference."""
+    variance: Array
+    """What the filter takes their variances for (m, dof)."""
+
+    @property
+    def whitened(self) -> Array:
+        """Innovations over their own standard deviations (m, dof): independent standard normals if the filter is right."""
+        return np.asarray(self.innovation / np.sqrt(self.variance))
 
     @property
     def nis(self) -> Array:
-        """Normalised innovation squared (m,), χ² with ``whitened.shape[1]`` degrees of freedom if the filter is right."""
-        return np.asarray(np.sum(self.whitened**2, axis=1))
+        """Normalised innovation squared (m,), χ² with as many degrees of freedom as columns if the filter is right."""
+        return np.asarray(np.sum(self.innovation**2 / self.variance, axis=1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,7 +197,12 @@ def write_estimate(
             group = file.create_group(f"innovations/{number}")
             group.attrs["sensor"] = sensor  # not the group's name: a slash in it would part groups
             group.create_dataset("time", data=innovations.time, compression="gzip").attrs["unit"] = "s"
-            group.create_dataset("whitened", data=innovations.whitened, compression="gzip").attrs["unit"] = "1"
+            group.create_dataset("innovation", data=innovations.innovation, compression="gzip").attrs["unit"] = (
+                "rad, or relative"
+            )
+            group.create_dataset("variance", data=innovations.variance, compression="gzip").attrs["unit"] = (
+                "unit of innovation^2"
+            )
             group.attrs["skipped"] = estimate.skipped.get(sensor, 0)
 
 
@@ -227,7 +240,9 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
                 variance=file["variance"][:],
                 covariance=file["covariance"][:] if "covariance" in file else None,
                 innovations={
-                    part.attrs["sensor"]: Innovations(time=part["time"][:], whitened=part["whitened"][:])
+                    part.attrs["sensor"]: Innovations(
+                        time=part["time"][:], innovation=part["innovation"][:], variance=part["variance"][:]
+                    )
                     for part in groups
                 },
                 skipped={part.attrs["sensor"]: int(part.attrs["skipped"]) for part in groups},

@@ -162,8 +162,10 @@ def estimate(full: bool = False) -> Estimate:
         variance=np.diagonal(P, axis1=1, axis2=2).copy(),
         covariance=P if full else None,
         innovations={
-            "star tracker": Innovations(time=np.arange(4.0), whitened=random.standard_normal((4, 2))),
-            "magnetometer": Innovations(time=np.empty(0), whitened=np.empty((0, 1))),
+            "star tracker": Innovations(
+                time=np.arange(4.0), innovation=random.standard_normal((4, 2)), variance=1.0 + random.random((4, 2))
+            ),
+            "magnetometer": Innovations(time=np.empty(0), innovation=np.empty((0, 1)), variance=np.empty((0, 1))),
         },
         skipped={"star tracker": 3, "magnetometer": 0},
     )
@@ -202,7 +204,7 @@ def test_estimate_file_tells_units_conventions_and_attributes(tmp_path):
 
 def test_sensor_names_with_a_slash_survive(tmp_path):
     """In HDF5 a slash parts group names."""
-    sensor = Innovations(time=np.arange(2.0), whitened=np.ones((2, 1)))
+    sensor = Innovations(time=np.arange(2.0), innovation=np.ones((2, 1)), variance=np.ones((2, 1)))
     written = dataclasses.replace(estimate(), innovations={"GPS/heading": sensor}, skipped={"GPS/heading": 1})
     write_estimate(tmp_path / "estimate.h5", written)
     read = read_estimate(tmp_path / "estimate.h5")

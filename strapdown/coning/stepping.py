@@ -16,6 +16,7 @@ from strapdown.coning import coefficients as exact
 from strapdown.coning.algorithms import Algorithm, named
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
+_UNTURNED = np.array(IDENTITY)
 _VECTOR_SOLVERS = ("compressed", "pairs")
 
 
@@ -43,20 +44,25 @@ def integrate(
 
     table = named(algorithm)
     checks.one_of("frame", frame, ("body", "fixed"))
-    initial = checks.unit_quaternions("initial_attitude", initial_attitude)
+    initial = _UNTURNED if initial_attitude is IDENTITY else checks.unit_quaternions("initial_attitude", initial_attitude)
     if initial.shape != (4,):
         raise InputError(f"initial_attitude has shape {initial.shape}, wanted (4,); pass one quaternion")
-    samples = _increments(increments)
+    late = table.window == 1 and _is_plain(increments)
+    samples = np.asarray(increments) if late else _increments(increments)
     if frame == "fixed":
         # The conjugate of equation (3) is equation (17) for q* and −w.
         samples = -samples
         initial = quaternion.conjugate(initial)
-    attitude = np.empty((len(samples) // table.samples + 1, 4))
-    work = np.empty(WORK)
+    attitude = _cache_lines(4 * (len(samples) // table.samples + 1)).reshape(-1, 4)
+    work = _cache_lines(WORK)
     if table.solver in _VECTOR_SOLVERS:
         compiled(accumulate_vectors)(_vectors(samples, table).reshape(-1), initial, work, attitude.reshape(-1))
     else:
         compiled(accumulate_quaternions)(_steps(samples, table).reshape(-1), initial, work, attitude.reshape(-1))
+    if late and not math.isfinite(attitude[-1, 0]):
+        # What is not finite makes all attitudes after it NaN, so that finding it here costs nothing.
+        _increments(increments)
+        raise InputError("increments holds a rotation vector of more than 1e150 rad; check its unit")
     return quaternion.conjugate(attitude) if frame == "fixed" else attitude
 
 
@@ -130,6 +136,25 @@ def time_per_sample(algorithm: str | Algorithm, samples: int = 20_160, repeats: 
         integrate(increments, table)
         best = min(best, time.perf_counter() - start)
     return best / samples
+
+
+def _is_plain(increments: ArrayLike) -> bool:
+    """Return whether kernels can take the increments as they are, but for their values."""
+    return (
+        isinstance(increments, np.ndarray)
+        and increments.dtype == np.float64
+        and increments.ndim == 2
+        and increments.shape[1] == 3
+        and increments.flags.c_contiguous
+    )
+
+
+def _cache_lines(count: int) -> Array:
+    """Return an empty array that begins at a cache line: rows and machine vectors then cross none."""
+    line = 8
+    array = np.empty(count + line)
+    first = -(array.__array_interface__["data"][0] // array.itemsize) % line
+    return array[first : first + count]
 
 
 def _increments(increments: ArrayLike) -> Array:

@@ -31,6 +31,20 @@ def heading_error(R, z, reference):
     return math.atan2(x * reference[1] - y * reference[0], x * reference[0] + y * reference[1])
 
 
+def merge_order(time, heads, ends, order):
+    """Write the order that sorts several series, each sorted, joined one after the other; at one time the earlier series comes first.
+
+    ``heads`` and ``ends`` bound each series in ``time``; ``heads`` is used up.
+    """
+    for k in range(len(order)):
+        best = -1
+        for s in range(len(heads)):
+            if heads[s] < ends[s] and (best < 0 or time[heads[s]] < time[heads[best]]):
+                best = s
+        order[k] = heads[best]
+        heads[best] += 1
+
+
 def store_state(out, q, b, A, B, C):
     """Write (q, b, A, B, C) to 28 numbers."""
     for i in range(4):
@@ -75,8 +89,9 @@ def run_filter(
 
     The interval from ``edges[k]`` to ``edges[k + 1]`` is split at the times of the events inside it. ``state`` holds (q, b, A, B, C) as
     28 numbers and is left at the end state, so a run may be continued. Row j of the outputs is the state after ``every · j`` intervals;
-    ``covariance_out`` (blocks A, B, C as 21 numbers) may be empty. ``innovation_out`` gets e₁, s₁, e₂, s₂, e₃, s₃ of each event:
-    independent innovations and their variances, as many as it has degrees of freedom. ``segment_out`` (segments, 32), which may be
+    ``covariance_out`` (blocks A, B, C as 21 numbers) may be empty. ``innovation_out`` (events, 4 or 6) gets
+    e₁, s₁, e₂, s₂, e₃, s₃ of each event: independent innovations and their variances, as many as it has degrees of freedom.
+    ``segment_out`` (segments, 32), which may be
     empty, gets what a smoother needs of each predicted segment: its dt, its increment (3) and the state (28) that it starts from.
     Returns the number of segments stored.
     """
@@ -106,7 +121,9 @@ def run_filter(
                 dt = longest
                 stop = now + dt
                 due = False
-            part = scale(dt / whole, theta)
+            part = theta
+            if dt < whole:
+                part = scale(dt / whole, theta)
             if segments < len(segment_out):
                 store_segment(segment_out, segments, dt, part, q, b, A, B, C)
                 segments += 1

@@ -16,7 +16,8 @@ import math
 from strapdown.kernels.algebra import add, combine, cross, dot
 from strapdown.kernels.lane_values import (
     WIDTH,
-    everywhere,
+    anywhere,
+    chosen,
     load,
     load_quadruples,
     load_triples,
@@ -104,16 +105,25 @@ def write_row(attitude, k, q):
 def multiply_exponentials(vectors, start, length, work):
     """Write the running products of exp(φ) in each lane's segment; lane i begins at row ``start`` + i ``length``."""
     p = (spread(1.0), spread(0.0), spread(0.0), spread(0.0))
+    largest = spread(0.0)
     for k in range(length):
         phi = load_triples(vectors, 3 * (start + k), 3 * length)
-        if everywhere(dot(phi, phi) <= _LARGEST_SQUARE):
-            p = quaternion_multiply(p, exponential(phi))
-        else:
-            for i in range(WIDTH):
-                row = 3 * (start + k + i * length)
-                q = large_exponential((vectors[row], vectors[row + 1], vectors[row + 2]))
-                write_lane(work, 4 * BLOCK, i, q)
-            p = quaternion_multiply(p, load_lanes(work, 4 * BLOCK))
+        x = dot(phi, phi)
+        largest = chosen(x > largest, x, largest)
+        p = quaternion_multiply(p, exponential(phi))
+        store_lanes(work, 4 * WIDTH * k, p)
+    if anywhere(largest > _LARGEST_SQUARE):
+        multiply_large_exponentials(vectors, start, length, work)
+
+
+def multiply_large_exponentials(vectors, start, length, work):
+    """Do what multiply_exponentials does for rotation vectors of any size."""
+    p = (spread(1.0), spread(0.0), spread(0.0), spread(0.0))
+    for k in range(length):
+        for i in range(WIDTH):
+            row = 3 * (start + k + i * length)
+            write_lane(work, 4 * BLOCK, i, large_exponential((vectors[row], vectors[row + 1], vectors[row + 2])))
+        p = quaternion_multiply(p, load_lanes(work, 4 * BLOCK))
         store_lanes(work, 4 * WIDTH * k, p)
 
 

@@ -174,7 +174,9 @@ def _read(context: Any, builder: Any, array_type: Any, array: Any, index: Any, v
 
 
 def _write(context: Any, builder: Any, array_type: Any, array: Any, index: Any, value: Any) -> None:
-    builder.store(value, _pointer(context, builder, array_type, array, index, value.type)).align = _BYTES[array_type.dtype]
+    builder.store(value, _pointer(context, builder, array_type, array, index, value.type)).align = _BYTES[
+        array_type.dtype
+    ]
 
 
 def _row(builder: Any, start: Any, stride: Any, i: int, shift: int = 0) -> Any:
@@ -182,18 +184,22 @@ def _row(builder: Any, start: Any, stride: Any, i: int, shift: int = 0) -> Any:
     return builder.add(builder.add(start, along), ir.Constant(start.type, shift))
 
 
-def _joined(builder: Any, parts: list[Any]) -> Any:
-    """Return vectors of one length, a power of two of them, one after the other."""
-    while len(parts) > 1:
-        length = 2 * parts[0].type.count
-        parts = [_picked(builder, a, b, list(range(length))) for a, b in zip(parts[::2], parts[1::2], strict=True)]
-    return parts[0]
-
-
 def _columns(builder: Any, rows: list[Any], count: int) -> list[Any]:
-    """Return the first ``count`` columns of eight rows of four."""
-    low, high = _joined(builder, rows[:4]), _joined(builder, rows[4:])
-    return [_picked(builder, low, high, [4 * i + c for i in range(WIDTH)]) for c in range(count)]
+    """Return the first ``count`` columns of eight rows of four.
+
+    Row i is joined with row i + 4, which a load does by itself, and neighbours are interleaved, half the machine's vector at a time:
+    fewer trips through the one port that shuffles than picking each column from all rows.
+    """
+    wide = [_picked(builder, rows[i], rows[i + 4], list(range(8))) for i in range(4)]
+    columns = []
+    for c in range(count):
+        odd = c % 2
+        low, high = (
+            _picked(builder, a, b, [k + odd + side for k in range(0, WIDTH, 2) for side in (0, WIDTH)])
+            for a, b in (wide[:2], wide[2:])
+        )
+        columns.append(_picked(builder, low, high, [c - odd + k for k in (0, 1, 8, 9, 4, 5, 12, 13)]))
+    return columns
 
 
 def _tuple_of(dtype: types.Type, count: int) -> Any:
@@ -262,13 +268,21 @@ def store_quadruples(typingctx: Any, array: Any, start: Any, stride: Any, q: Any
         data, first, step, packed = arguments
         w, x, y, z = cgutils.unpack_tuple(builder, packed)
         pairs = [
-            [_picked(builder, a, b, [i for k in range(odd, WIDTH, 2) for i in (k, k + WIDTH)]) for a, b in ((w, x), (y, z))]
+            [
+                _picked(builder, a, b, [i for k in range(odd, WIDTH, 2) for i in (k, k + WIDTH)])
+                for a, b in ((w, x), (y, z))
+            ]
             for odd in (0, 1)
         ]
-        for i in range(WIDTH):
+        for i in range(WIDTH // 2):
+            # Rows i and i + 4 in one shuffle; storing a half needs none.
             place = i - i % 2
-            row = _picked(builder, *pairs[i % 2], [place, place + 1, place + WIDTH, place + 1 + WIDTH])
-            _write(context, builder, array, data, _row(builder, first, step, i), row)
+            wide = _picked(
+                builder, *pairs[i % 2], [k + j for j in (place, place + 4) for k in (0, 1, WIDTH, WIDTH + 1)]
+            )
+            for half in (0, 4):
+                row = _picked(builder, wide, wide, list(range(half, half + 4)))
+                _write(context, builder, array, data, _row(builder, first, step, i + half), row)
         return context.get_dummy_value()
 
     return types.void(array, types.intp, types.intp, _tuple_of(array.dtype, 4)), lower
@@ -318,8 +332,8 @@ def chosen(typingctx: Any, condition: Any, a: Any, b: Any) -> Any:
     return result(condition, result, result), lower
 
 
-INTRINSICS = {
-    f.__name__: f
-    for f in (load, load_triples, load_quadruples, store, store_quadruples, spread, chosen)
-} | {"everywhere": everywhere, "anywhere": anywhere}
+INTRINSICS = {f.__name__: f for f in (load, load_triples, load_quadruples, store, store_quadruples, spread, chosen)} | {
+    "everywhere": everywhere,
+    "anywhere": anywhere,
+}
 """What stands for each function of :mod:`strapdown.kernels.lane_values` in compiled code."""
