@@ -5,7 +5,7 @@ step; so δq ⊗ R_z(ωT) is one fixed rotation, applied again and again. Its an
 axis and the true one is half the greatest periodic error. Both are worked out here with mpmath, to 50 digits, with the step written a
 second time and in another way than in the package: a drift of 1e-30 is shown as readily as one of 1e-3.
 
-Run it: ``python sims/coning_algorithms.py --output coning-results`` (about two minutes; ``--quick`` for a coarse grid).
+Run it: ``python sims/coning_algorithms.py --out results/coning_algorithms`` (about two minutes; ``--quick`` for a coarse grid).
 """
 
 from __future__ import annotations
@@ -671,8 +671,8 @@ def table(result: Result) -> str:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--output", default="coning-results")
+    parser.add_argument("--out", type=Path, default=Path("results/coning_algorithms"))
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
-    print(table(main(arguments.output, quick=arguments.quick, seed=arguments.seed)))
+    print(table(main(out=arguments.out, quick=arguments.quick, seed=arguments.seed)))

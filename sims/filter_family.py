@@ -265,7 +265,7 @@ def main(
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("filter-family-results"))
+    parser.add_argument("--out", type=Path, default=Path("results/filter_family"))
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--unscented-runs", type=int, default=40)
     parser.add_argument("--seed", type=int, default=1)

@@ -63,7 +63,11 @@ class Result:
     duration: float
 
 
-def main(presets=tuple(datasheets.PRESETS), runs=40, duration=600.0, seed=1, rate=None, figure=None):
+SMALL = {"presets": ("stim300",), "runs": 2, "duration": 60.0, "rate": 50.0}
+"""Arguments of a run that only shows that the script works."""
+
+
+def main(*, presets=tuple(datasheets.PRESETS), runs=40, duration=600.0, seed=1, rate=None, out=None):
     """Judge the filters on each preset; ``rate`` (Hz) in place of the natural one makes it quicker.
 
     Returns
@@ -72,12 +76,12 @@ def main(presets=tuple(datasheets.PRESETS), runs=40, duration=600.0, seed=1, rat
     """
     outcomes = tuple(judge(datasheets.preset(name), runs, duration, seed, rate) for name in presets)
     result = Result(outcomes=outcomes, runs=runs, duration=duration)
-    if figure is not None:
+    if out is not None:
         from matplotlib.figure import Figure
 
         page = Figure(figsize=(9.0, 4.5), layout="constrained")
         draw(result, ax=page.subplots())
-        with files.written_beside(figure) as path:
+        with files.written_beside(out / "flicker.png") as path:
             page.savefig(path, dpi=140)
     return result
 
@@ -206,8 +210,8 @@ def draw(result, *, ax=None):
 
 
 if __name__ == "__main__":
-    where = Path(sys.argv[1] if len(sys.argv) > 1 else "flicker.png")
-    for outcome in main(figure=where).outcomes:
+    where = Path(sys.argv[1] if len(sys.argv) > 1 else "results/flicker")
+    for outcome in main(out=where).outcomes:
         told = ", ".join(
             f"{name} {outcome.anees[name]:.3f} ± {outcome.scatter[name]:.3f} ({outcome.rms[name] / ARCSECOND:.3g}″)"
             for name in FILTERS

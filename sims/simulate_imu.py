@@ -40,8 +40,12 @@ class Result:
     """Bias of the three axes, less its turn-on part, rad/s."""
 
 
-def main(preset="stim300", samples=1 << 20, rate=100.0, seed=1, figure=None):
-    """Simulate a preset at rest and compare spectra; ``figure`` is where to draw.
+SMALL = {"samples": 1 << 14}
+"""Arguments of a run that only shows that the script works."""
+
+
+def main(*, preset="stim300", samples=1 << 20, rate=100.0, seed=1, out=None):
+    """Simulate a preset at rest and compare spectra; ``out`` is the folder to draw into.
 
     Returns
     -------
@@ -77,14 +81,14 @@ def main(preset="stim300", samples=1 << 20, rate=100.0, seed=1, figure=None):
         time=edges[thin],
         bias=outputs["whole"].bias[thin],
     )
-    if figure is not None:
+    if out is not None:
         from matplotlib.figure import Figure
 
         page = Figure(figsize=(11.0, 4.5), layout="constrained")
         left, right = page.subplots(1, 2)
         draw_spectra(result, ax=left)
         draw_bias(result, ax=right)
-        with files.written_beside(figure) as path:
+        with files.written_beside(out / "simulate_imu.png") as path:
             page.savefig(path, dpi=140)
     return result
 
@@ -135,8 +139,8 @@ def draw_bias(result, *, ax):
 
 
 if __name__ == "__main__":
-    where = Path(sys.argv[1] if len(sys.argv) > 1 else "simulate-imu.png")
-    outcome = main(figure=where)
+    where = Path(sys.argv[1] if len(sys.argv) > 1 else "results/simulate_imu")
+    outcome = main(out=where)
     for part, score in outcome.worst.items():
         print(f"{part:18s} largest departure from theory {score:.2f} standard deviations")
     print(f"figure: {where}")

@@ -184,7 +184,7 @@ def test_renormalisation_does_not_hide_a_fault():
     steps[5] *= 1.001
     attitude = np.empty((11, 4))
     compiled(kernels.accumulate_quaternions)(
-        steps.reshape(-1), np.array([1.0, 0.0, 0.0, 0.0]), *np.empty((4, kernels.BLOCK)), attitude.reshape(-1)
+        steps.reshape(-1), np.array([1.0, 0.0, 0.0, 0.0]), np.empty(kernels.WORK), attitude.reshape(-1)
     )
     assert np.all(np.abs(np.linalg.norm(attitude[6:], axis=1) - 1.0) > 1e-7)
     assert np.all(attitude[:6, 0] == 1.0)
@@ -196,7 +196,7 @@ def test_the_running_product_is_renormalised():
     attitude = np.empty((20_001, 4))
     initial = np.array([1.0, 0.0, 0.0, 0.0])
     compiled(kernels.accumulate_quaternions)(
-        steps.reshape(-1), initial, *np.empty((4, kernels.BLOCK)), attitude.reshape(-1)
+        steps.reshape(-1), initial, np.empty(kernels.WORK), attitude.reshape(-1)
     )
     assert np.abs(np.linalg.norm(attitude, axis=1) - 1.0).max() < 1e-12
 

@@ -10,7 +10,7 @@ from sims import coning_algorithms as sim
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
     folder = tmp_path_factory.mktemp("coning")
-    return sim.main(folder, quick=True), folder
+    return sim.main(out=folder, quick=True), folder
 
 
 def test_it_writes_its_figures_and_numbers(result):

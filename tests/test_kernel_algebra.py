@@ -165,8 +165,23 @@ def stacked(result) -> np.ndarray:
     return np.stack(result, -1) if isinstance(result, tuple) else np.asarray(result)
 
 
+SCALAR_ONLY = {"unit", "logarithm"}
+"""Kernels with a square root or an arctangent: not for arrays as scalars."""
+
+
+def test_unit_and_logarithm_against_the_public_algebra(rotation_vectors):
+    from strapdown import quaternion
+
+    for phi in rotation_vectors(200):
+        q = quaternion.exp(phi)
+        for sign in (1.0, -1.0):
+            assert np.allclose(rotation.logarithm(tuple(sign * q)), quaternion.log(q), rtol=8 * EPS, atol=0.0)
+        assert np.allclose(rotation.unit(tuple(3.0 * q)), q, rtol=0.0, atol=2 * EPS)
+    assert rotation.logarithm((1.0, 0.0, 0.0, 0.0)) == (0.0, 0.0, 0.0)
+
+
 def test_every_kernel_is_here():
-    here = {function.__name__ for function, _, _ in KERNELS.values()} | {"square_root"}
+    here = {function.__name__ for function, _, _ in KERNELS.values()} | {"square_root"} | SCALAR_ONLY
     for module in (algebra, rotation):
         own = {name for name, f in vars(module).items() if callable(f) and f.__module__ == module.__name__}
         assert own <= here, f"add {own - here} to KERNELS"
