@@ -14,8 +14,9 @@ Error state of the filter
 Units
     SI and radians inside. Degrees, °/h, °/√h and arcseconds appear at the rim only, with the unit in the name.
 
-Modules, from the ground up: ``quaternion``, ``kinematics`` (mathematics); ``motion``, ``coning``, ``gyro``, ``vectors``
-(models); ``records`` (data); ``mekf`` (estimator); ``consistency``, ``montecarlo`` (analysis); ``plots``, ``cli`` (faces).
+Modules, from the ground up: ``quaternion``, ``kinematics``, ``kernels`` (mathematics); ``motion``, ``coning``, ``gyro``,
+``vectors``, ``allan``, ``wahba`` (models); ``records``, ``recordings``, ``scenarios`` (data); ``mekf``, ``ahrs``, ``smoother``,
+``family`` (estimators); ``consistency``, ``montecarlo``, ``coning_study`` (analysis); ``plots``, ``cli`` (faces).
 """
 
 __version__ = "0.1.0"

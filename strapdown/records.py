@@ -6,9 +6,10 @@ interval; attitude, bias and covariance are values at the edges. So nobody need 
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -177,49 +178,54 @@ _ESTIMATE_UNITS = {
 }
 
 
-def write_estimate(
-    path: str | os.PathLike[str], estimate: Estimate, attributes: Mapping[str, Any] | None = None
-) -> None:
-    """Write an estimate to HDF5, units and conventions as attributes; the file appears whole or not at all."""
+@contextlib.contextmanager
+def _result_file(path: str | os.PathLike[str], kind: str, attributes: Mapping[str, Any] | None) -> Iterator[Any]:
+    """Yield an HDF5 file that says what it is; it appears whole or not at all."""
     import h5py
 
     with written_beside(path) as temporary, h5py.File(temporary, "w") as file:
-        file.attrs["kind"] = "strapdown estimate"
+        file.attrs["kind"] = f"strapdown {kind}"
         file.attrs["version"] = strapdown.__version__
         file.attrs["conventions"] = CONVENTIONS
         for name, value in (attributes or {}).items():
             file.attrs[name] = value
+        yield file
+
+
+def _put(group: Any, name: str, value: Array, unit: str) -> None:
+    group.create_dataset(name, data=value, compression="gzip", shuffle=True).attrs["unit"] = unit
+
+
+def write_estimate(
+    path: str | os.PathLike[str], estimate: Estimate, attributes: Mapping[str, Any] | None = None
+) -> None:
+    """Write an estimate to HDF5, units and conventions as attributes; the file appears whole or not at all."""
+    with _result_file(path, "estimate", attributes) as file:
         for name, unit in _ESTIMATE_UNITS.items():
             value = getattr(estimate, name)
             if value is not None:
-                file.create_dataset(name, data=value, compression="gzip", shuffle=True).attrs["unit"] = unit
+                _put(file, name, value, unit)
         for number, (sensor, innovations) in enumerate(estimate.innovations.items()):
             group = file.create_group(f"innovations/{number}")
             group.attrs["sensor"] = sensor  # not the group's name: a slash in it would part groups
-            group.create_dataset("time", data=innovations.time, compression="gzip").attrs["unit"] = "s"
-            group.create_dataset("innovation", data=innovations.innovation, compression="gzip").attrs["unit"] = (
-                "rad, or relative"
-            )
-            group.create_dataset("variance", data=innovations.variance, compression="gzip").attrs["unit"] = (
-                "unit of innovation^2"
-            )
             group.attrs["skipped"] = estimate.skipped.get(sensor, 0)
+            _put(group, "time", innovations.time, "s")
+            _put(
+                group,
+                "innovation",
+                innovations.innovation,
+                "rad, or the sensor's unit over the length of its reference",
+            )
+            _put(group, "variance", innovations.variance, "the square of the innovation's")
 
 
 def write_attitude(
     path: str | os.PathLike[str], time: Array, attitude: Array, attributes: Mapping[str, Any] | None = None
 ) -> None:
     """Write times (n,), s, and attitudes q_fb (n, 4) to HDF5; the file appears whole or not at all."""
-    import h5py
-
-    with written_beside(path) as temporary, h5py.File(temporary, "w") as file:
-        file.attrs["kind"] = "strapdown attitude"
-        file.attrs["version"] = strapdown.__version__
-        file.attrs["conventions"] = CONVENTIONS
-        for name, value in (attributes or {}).items():
-            file.attrs[name] = value
-        file.create_dataset("time", data=time, compression="gzip").attrs["unit"] = "s"
-        file.create_dataset("attitude", data=attitude, compression="gzip", shuffle=True).attrs["unit"] = "1"
+    with _result_file(path, "attitude", attributes) as file:
+        _put(file, "time", time, "s")
+        _put(file, "attitude", attitude, "1")
 
 
 def read_estimate(path: str | os.PathLike[str]) -> Estimate:
