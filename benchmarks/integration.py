@@ -1,6 +1,7 @@
 """Attitude from gyro increments: this package beside numpy-quaternion, ahrs and SciPy, in one run, ratios printed.
 
-Run it: ``python benchmarks/integration.py [--json FILE] [--samples N]``. Every figure is the least of several runs, in ns a sample.
+Run it: ``python benchmarks/integration.py [--json FILE] [--samples N]``. Every figure is the least processor time of several runs, in ns a
+sample.
 A peer that is not installed is left out and named.
 """
 
@@ -27,13 +28,13 @@ INTERVAL = 0.01
 
 
 def least_time(function: Callable[[], object], seconds: float) -> float:
-    """Return the least time of one call, s, over as many calls as fit in ``seconds``, two at least."""
+    """Return the least processor time of one call, s, over as many calls as fit in ``seconds``, two at least."""
     function()
     best, spent = math.inf, 0.0
     while spent < seconds or best == math.inf:
-        start = time.perf_counter()
+        start = time.process_time()
         function()
-        elapsed = time.perf_counter() - start
+        elapsed = time.process_time() - start
         best, spent = min(best, elapsed), spent + elapsed
     return best
 
@@ -78,10 +79,10 @@ def measure(samples: int, seconds: float) -> dict:
     increments = 1e-2 * np.random.default_rng(0).standard_normal((samples, 3))
     cached = np.ascontiguousarray(increments[:IN_CACHE])
     attitude = np.empty((len(cached) + 1, 4))
-    work = np.empty((4, kernels.BLOCK))
+    work = np.empty(kernels.WORK)
     initial = np.array([1.0, 0.0, 0.0, 0.0])
     accumulate = compiled(kernels.accumulate_vectors)
-    kernel = least_time(lambda: accumulate(cached.reshape(-1), initial, *work, attitude.reshape(-1)), seconds) / len(
+    kernel = least_time(lambda: accumulate(cached.reshape(-1), initial, work, attitude.reshape(-1)), seconds) / len(
         cached
     )
     own = {

@@ -83,9 +83,11 @@ def non_negative(name: str, value: float, *, unit: str = "") -> float:
     return number
 
 
-def finite(name: str, value: float | str, *, unit: str = "") -> float:
+def finite(name: str, value: float, *, unit: str = "") -> float:
     """Return ``value`` as a finite float."""
     try:
+        if isinstance(value, str):  # "60" in a file is a slip, not a number
+            raise ValueError
         number = float(value)
     except (TypeError, ValueError):
         raise InputError(f"{name} is {value!r}; it must be one number{_unit(unit, ' in ')}") from None

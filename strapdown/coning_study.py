@@ -81,6 +81,8 @@ class ConingParameters:
         ):
             positive(name, getattr(self, name))
         non_negative("rate_random_walk", self.rate_random_walk)
+        if self.angle >= 0.5 * np.pi:
+            raise InputError(f"angle is {self.angle:g} rad; a cone's half-angle is below a right angle")
         count("runs", self.runs)
         count("seed", self.seed, least=0)
         if not 0.0 < self.probability < 1.0:
@@ -122,7 +124,7 @@ class Drift:
     measured: float
     """Of a long noise-free run against the closed form."""
     predicted: float
-    """By the formula."""
+    """By the formula; NaN where it does not serve."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -218,7 +220,7 @@ class ConingStudy:
                     "algorithm": drift.algorithm,
                     "samples": drift.samples,
                     "drift_deg_per_hour": drift.measured / DEGREE_PER_HOUR,
-                    "predicted_deg_per_hour": drift.predicted / DEGREE_PER_HOUR,
+                    "predicted_deg_per_hour": None if np.isnan(drift.predicted) else drift.predicted / DEGREE_PER_HOUR,
                 }
                 for drift in self.drifts
             ],
@@ -229,12 +231,14 @@ class ConingStudy:
 def predicted_drift(motion: Coning, rate: float, algorithm: coning.Algorithm) -> float:
     """Return the drift that theory predicts, rad/s along the cone's axis.
 
-    Of one sample a step exactly; else the whole power series in λ = ω/rate of the part in β² where it converges (λ ≤ 1), and its leading
-    term ``−c_M β² ω λ^{2M}`` beyond. What is left out is the floor in β⁴ of rotation-vector forms.
+    Of one sample a step exactly; else the whole power series of the part in β², which begins with ``−c_M β² ω λ^{2M}``, λ = ω/rate.
+    What is left out is the floor in β⁴ of rotation-vector forms. NaN where the series does not serve, λ > 1.
     """
     ratio = 2.0 * np.pi * motion.frequency / rate
-    if algorithm.name == "one-sample" or ratio > 1.0:
+    if algorithm.name == "one-sample":
         return coning.predicted_coning_drift(algorithm, motion.angle, motion.frequency, 1.0 / rate)
+    if ratio > 1.0:
+        return float("nan")
     return motion.angle**2 * 2.0 * np.pi * motion.frequency * coning.small_angle_drift(algorithm, ratio)
 
 

@@ -46,6 +46,19 @@ def usable_folder(name: str, folder: str | os.PathLike[str]) -> None:
         raise InputError(f"{name} is {folder}, but {place} may not be written; choose another folder")
 
 
+def output_file(
+    name: str, path: str | os.PathLike[str], suffixes: tuple[str, ...], *sources: str | os.PathLike[str]
+) -> None:
+    """Refuse an output file of another kind than its suffix says, or one that would replace a file that is read."""
+    target = Path(path)
+    if target.suffix.lower() not in suffixes:
+        raise InputError(f"{name} is {target}, but what is written is {' or '.join(suffixes)}; choose such a suffix")
+    for source in sources:
+        if target.exists() and Path(source).exists() and target.samefile(source):
+            raise InputError(f"{name} is {target}, the very file that is read; choose another name")
+    usable_folder(name, target.parent)
+
+
 def write_json(path: str | os.PathLike[str], content: Any) -> None:
     """Write ``content`` as indented JSON; NaN and infinities are refused because JSON has no word for them."""
     text = json.dumps(content, indent=2, allow_nan=False) + "\n"  # before any folder is made

@@ -106,6 +106,10 @@ def read_broad(path: str | os.PathLike[str]) -> Recording:
     name = Path(path).name
     try:
         with h5py.File(path, "r") as file:
+            if file.attrs.get("kind") == recordfiles.KIND:
+                raise InputError(
+                    f"{name} is a simulated record, not a recording; integrate it (`strapdown integrate`) or filter it with mekf.run"
+                )
             missing = [key for key in ("imu_gyr",) if key not in file]
             if "sampling_rate" not in file.attrs:
                 missing.append("the attribute sampling_rate")
@@ -269,6 +273,16 @@ class GyroSamples:
     """"rate" or "increments"."""
 
 
+GAP = 5.0
+"""An interval between stamps of more than this many usual ones is a gap."""
+
+
+def gaps(time: Array) -> list[tuple[float, float]]:
+    """Return (begin, length) of every gap between stamps, s: what the body did there, no sample tells."""
+    steps = np.diff(time)
+    return [(float(time[k]), float(steps[k])) for k in np.flatnonzero(steps > GAP * np.median(steps))]
+
+
 EVEN = 1e-3
 """Largest relative departure of a sample interval from their mean that still counts as even."""
 
@@ -298,7 +312,13 @@ def read_gyro(
         return GyroSamples(
             values=columns * factor, sample_interval=1.0 / positive("rate", rate, unit="Hz"), kind="rate"
         )
+    if rate is not None:
+        raise InputError(f"{file.name} tells its own rate; drop the option rate")
     if recordfiles.is_record(file):
+        if given:
+            raise InputError(
+                f"{file.name} is a record, whose layout says its units; drop the option for {', '.join(given)}"
+            )
         record = recordfiles.read_record(file)
         return GyroSamples(values=record.increments, sample_interval=_even(file.name, record.time), kind="increments")
     recording = read(file, units=given)

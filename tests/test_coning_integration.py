@@ -190,14 +190,78 @@ def test_renormalisation_does_not_hide_a_fault():
     assert np.all(attitude[:6, 0] == 1.0)
 
 
+def test_a_fault_inside_a_block_shows_to_its_end():
+    steps = np.tile([1.0, 0.0, 0.0, 0.0], (2 * kernels.BLOCK, 1))
+    steps[20] *= 1.001
+    attitude = np.empty((len(steps) + 1, 4))
+    initial = np.array([1.0, 0.0, 0.0, 0.0])
+    compiled(kernels.accumulate_quaternions)(steps.reshape(-1), initial, np.empty(kernels.WORK), attitude.reshape(-1))
+    error = np.abs(np.linalg.norm(attitude, axis=1) - 1.0)
+    assert np.all(error[:21] == 0.0)
+    assert np.all(error[21 : kernels.BLOCK + 1] > 1e-7)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_constant_rate_is_off_by_a_few_roundings_of_its_total_angle(seed):
+    # The same step gives the same rounding in every segment; it adds up with the angle, as the rounding of the step itself does.
+    increment = 10.0 ** -(1 + seed / 2) * np.random.default_rng(seed).uniform(-1.0, 1.0, 3)
+    n = 100_000
+    attitude = coning.integrate(np.broadcast_to(increment, (n, 3)))
+    with mp.workdps(40):
+        exactly = [mp.mpf(x) for x in increment]
+        angle = mp.sqrt(sum(x * x for x in exactly))
+        half = n * angle / 2
+        true = np.array([mp.cos(half), *(mp.sin(half) * x / angle for x in exactly)], dtype=float)
+    error = angle_errors(attitude[-1], true)
+    assert error < 4 * math.sqrt(n) * 2.0**-53 + 8 * 2.0**-54 * n * float(angle)
+
+
+@pytest.mark.parametrize("n", [7, 40, kernels.BLOCK, kernels.BLOCK + 1, 3 * kernels.BLOCK + 77])
+@pytest.mark.parametrize("size", [0.01, 0.5])
+def test_plain_python_blocks_equal_the_compiled_ones(n, size):
+    generator = np.random.default_rng(n)
+    vectors = size * generator.standard_normal((n, 3))
+    steps = quaternion.exp(vectors)
+    initial = quaternion.exp(generator.standard_normal(3))
+    for kernel, rows in ((kernels.accumulate_vectors, vectors), (kernels.accumulate_quaternions, steps)):
+        plain, fast = np.zeros((2, n + 1, 4))
+        kernel(rows.reshape(-1), initial, np.empty(kernels.WORK), plain.reshape(-1))
+        compiled(kernel)(rows.reshape(-1), initial, np.empty(kernels.WORK), fast.reshape(-1))
+        np.testing.assert_allclose(fast, plain, rtol=0.0, atol=4e-16 * math.sqrt(n))
+        assert np.abs(np.linalg.norm(fast, axis=1) - 1.0).max() <= 4e-16
+
+
+@pytest.mark.parametrize("n", [1, 33, 1000])
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_values_that_are_not_finite_are_named(n, bad):
+    for place in {0, n // 2, n - 1}:
+        increments = 0.01 * np.random.default_rng(n).standard_normal((n, 3))
+        increments[place, 1] = bad
+        with pytest.raises(InputError, match=rf"increments\[{place}, 1\] is -?(nan|inf); remove"):
+            coning.integrate(increments)
+    with pytest.raises(InputError, match="more than 1e150 rad"):
+        coning.integrate(np.full((n, 3), 1e200))
+
+
+def test_the_record_and_the_attitude_are_left_alone():
+    increments = 0.01 * np.random.default_rng(1).standard_normal((700, 3))
+    kept = increments.copy()
+    first = coning.integrate(increments)
+    again = first.copy()
+    coning.integrate(-increments)
+    np.testing.assert_array_equal(increments, kept)
+    np.testing.assert_array_equal(first, again)
+    # Neither layout nor type of the array matters.
+    np.testing.assert_array_equal(coning.integrate(np.asfortranarray(increments)), first)
+    np.testing.assert_array_equal(coning.integrate(increments.tolist()), first)
+
+
 def test_the_running_product_is_renormalised():
     # Steps a little too long, as rounding might leave them, do not add up: without renormalisation 20,000 of them make 2e-5.
     steps = np.tile([1.0 + 1e-9, 0.0, 0.0, 0.0], (20_000, 1))
     attitude = np.empty((20_001, 4))
     initial = np.array([1.0, 0.0, 0.0, 0.0])
-    compiled(kernels.accumulate_quaternions)(
-        steps.reshape(-1), initial, np.empty(kernels.WORK), attitude.reshape(-1)
-    )
+    compiled(kernels.accumulate_quaternions)(steps.reshape(-1), initial, np.empty(kernels.WORK), attitude.reshape(-1))
     assert np.abs(np.linalg.norm(attitude, axis=1) - 1.0).max() < 1e-12
 
 
@@ -291,7 +355,9 @@ def test_increment_algorithms_take_rates_by_the_eight_point_quadrature():
     assert angle_errors(estimate, true).max() < 1e-3 * angle_errors(trapezoid, true).max()
 
 
-@pytest.mark.parametrize("length", [0, 1, 2, 5, 191, 192, 193, 1000])
+@pytest.mark.parametrize(
+    "length", [0, 1, 2, 5, 31, 32, 33, 39, kernels.BLOCK - 1, kernels.BLOCK, kernels.BLOCK + 1, 1000]
+)
 def test_blocks_join(length):
     increments = 0.4 * np.random.default_rng(length).standard_normal((length, 3))
     attitude = coning.integrate(increments)

@@ -53,6 +53,9 @@ def main() -> None:
     except InputError as error:
         errors.print(f"error: {error}", soft_wrap=True)
         sys.exit(2)
+    except OSError as error:
+        errors.print(f"error: {error}; check the path and the space left", soft_wrap=True)
+        sys.exit(2)
     except KeyboardInterrupt:
         errors.print("interrupted")
         sys.exit(130)

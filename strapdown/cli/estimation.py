@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from strapdown.cli.terminal import app, console, table, written
+from strapdown.cli.terminal import app, console, show, table, written
 
 
 @app.command()
@@ -26,7 +26,9 @@ def estimate(
     time_unit: Annotated[str | None, typer.Option(help="Unit of a CSV file's time: s, ms, us or ns.")] = None,
     gyro: Annotated[
         Path | None,
-        typer.Option(help="TOML with a [gyro] table, as `strapdown allan` writes it: the filter believes its noise."),
+        typer.Option(
+            help="TOML with a table named gyro, as `strapdown allan` writes it: the filter believes its noise."
+        ),
     ] = None,
     full_covariance: Annotated[
         bool, typer.Option(help="Write whole 6 x 6 covariances, not only their diagonals.")
@@ -55,13 +57,18 @@ def estimate(
     figures = {"estimate.png": plots.estimate_overview(result.estimate, title=used.source)}
     if errors_found is not None:
         figures["errors.png"] = plots.recording_errors(used.time, errors_found, used.movement)
+    frame = (
+        "East-North-Up, magnetic North"
+        if used.magnetic_field is not None
+        else "z up, heading arbitrary (no magnetometer)"
+    )
     paths = [out / "estimate.h5"]
     write_estimate(
         paths[0],
         result.estimate,
         {
             "source": used.source,
-            "fixed_frame": "East-North-Up, magnetic North",
+            "fixed_frame": frame,
             **{f"parameter.{name}": value for name, value in vars(parameters).items()},
         },
     )
@@ -69,6 +76,9 @@ def estimate(
         f"{used.source}: {len(used.time)} samples over {used.time[-1] - used.time[0]:.1f} s, started in the quiet second "
         f"from {used.time[0]:.2f} s."
     )
+    console.print(f"Fixed frame: {frame}.")
+    for begin, length in recordings.gaps(used.time):
+        console.print(f"Gap of {length:.3g} s after {begin:.3f} s: the turn across it is a guess, whatever σ says.")
     for sensor, number in result.estimate.skipped.items():
         if number:
             console.print(f"{number} samples of the {sensor} are missing and were skipped.")
@@ -77,5 +87,5 @@ def estimate(
         write_json(paths[-1], {"source": used.source, **{f"{name}_rmse_deg": value for name, value in rms.items()}})
         rows = table("RMS error over the movement phase, degrees", *rms, left=0)
         rows.add_row(*(f"{value:.2f}" for value in rms.values()))
-        console.print(rows)
+        show(rows)
     written(*paths, *(plots.save(figure, out / name) for name, figure in figures.items()))

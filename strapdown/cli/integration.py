@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from strapdown.cli.terminal import app, console, progress_bar, table, written
+from strapdown.cli.terminal import app, console, progress_bar, show, table, written
 
 
 @app.command()
@@ -37,7 +37,7 @@ def algorithms(
                 cells.append(f"{coning.time_per_sample(str(row['name'])) * 1e9:.1f}")
             listing.add_row(*cells)
             advance(1)
-    console.print(listing)
+    show(listing)
     console.print(
         "Increments cost nothing where the gyro gives them; from rate samples (…-rate-K: K samples form one increment) an oscillation "
         "shows too small by a part in (ωh)^K, and the drift order falls with it. matched-… are this package's own.\n"
@@ -59,8 +59,11 @@ def integrate(
     import numpy as np
 
     from strapdown import coning, quaternion, recordfiles, recordings, records
+    from strapdown.files import output_file
 
+    output_file("out", out, (".h5", ".hdf5"), recording)
     chosen = coning.named(algorithm)
+    gaps: list[tuple[float, float]] = []
     with progress_bar("reading, integrating, writing", 3) as advance:
         if recordfiles.is_record(recording):
             record = recordfiles.read_record(recording)
@@ -69,6 +72,7 @@ def integrate(
         else:
             given = {"gyro": gyro_unit, "time": time_unit}
             source = recordings.read(recording, units={name: unit for name, unit in given.items() if unit})
+            gaps = recordings.gaps(source.time)
             time, increments, truth = source.time, recordings.increments(source), source.true_attitude
         advance(1)
         start = quaternion.IDENTITY
@@ -86,6 +90,8 @@ def integrate(
     if truth is not None and known.any():
         error = np.degrees(quaternion.angle_between(quaternion.normalize(reference[known]), attitude[known]))
         console.print(f"Error against the file's attitude: at the end {error[-1]:.4g}°, at most {error.max():.4g}°.")
+    for begin, length in gaps:
+        console.print(f"Gap of {length:.3g} s after {begin:.3f} s: the turn across it is a guess.")
     written(out)
 
 
@@ -113,7 +119,7 @@ def coning_budget(
     )
     for name in budget.algorithms:
         listing.add_row(name, *(f"{budget.drift(name, r) / DEGREE_PER_HOUR:.4g}" for r in rate))
-    console.print(listing)
+    show(listing)
     if json is not None:
         rows = [
             {

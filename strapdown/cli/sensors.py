@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from strapdown.cli.terminal import app, console, progress_bar, table, written
+from strapdown.cli.terminal import app, console, progress_bar, show, table, written
 
 
 @app.command()
@@ -19,7 +19,7 @@ def scenarios() -> None:
     listing = table("Built-in scenarios: `strapdown simulate NAME`", "name", "s", "Hz", "gyro")
     for row in rows:
         listing.add_row(str(row["name"]), f"{row['duration_s']:g}", f"{row['rate_hz']:g}", str(row["gyro"]))
-    console.print(listing)
+    show(listing)
     for row in rows:
         console.print(f"{row['name']}: {row['description']}")
 
@@ -37,6 +37,7 @@ def simulate(
     """Simulate a scenario: a record with its truth."""
     from strapdown import recordfiles
     from strapdown import scenarios as catalogue
+    from strapdown.files import output_file
 
     chosen = catalogue.load_scenario(scenario)
     toml = catalogue.scenario_to_toml(chosen)
@@ -45,6 +46,7 @@ def simulate(
         return
     used = chosen.seed if seed is None else seed
     target = out or Path(f"{chosen.name or Path(scenario).stem}.h5")
+    output_file("out", target, (".h5", ".hdf5", ".csv"), scenario)
     with progress_bar("simulating, writing", 2) as advance:
         record = catalogue.simulate(chosen, used, run)
         advance(1)
@@ -72,7 +74,9 @@ def allan(
     rate: Annotated[float | None, typer.Option(help="Samples a second, Hz; for NPY.")] = None,
     gyro_unit: Annotated[str | None, typer.Option(help="Unit of a CSV or NPY file's gyro: rad/s or deg/s.")] = None,
     time_unit: Annotated[str | None, typer.Option(help="Unit of a CSV file's time: s, ms, us or ns.")] = None,
-    robust: Annotated[bool, typer.Option(help="Deviation by medians, which stands outliers.")] = False,
+    robust: Annotated[
+        bool, typer.Option(help="Draw the deviation by medians, which stands outliers; the fit stays as it is.")
+    ] = False,
     out: Annotated[Path, typer.Option(help="Folder for gyro.toml, allan.json and the figure.")] = Path("allan-results"),
 ) -> None:
     """Identify a gyro's noise from a recording at rest: Allan deviation, fitted coefficients, specification as TOML."""
@@ -113,7 +117,7 @@ def allan(
             lower,
             f"{row['upper']:.4g}",
         )
-    console.print(listing)
+    show(listing)
     console.print("Of a term not seen in this record, the last column bounds what it could hide.")
     for axis, probability in enumerate(fit.misfit_probability):
         if probability < 1e-3:

@@ -7,7 +7,13 @@ from typing import Annotated
 
 import typer
 
-from strapdown.cli.terminal import app, console, progress_bar, table, verdict, written
+from strapdown.cli.terminal import app, console, progress_bar, show, table, verdict, written
+
+
+def _drift(value: float | None) -> str:
+    if value is None:
+        return "no formula"
+    return f"{value:.4g}" if abs(value) > 1e-6 else "rounding"
 
 
 @app.command()
@@ -38,6 +44,8 @@ def coning(
         f"Coning of {angle:g}° at {frequency:g} Hz, gyro sampled at {rate:g} Hz ({rate / frequency:.3g} samples a cycle); "
         f"{runs} runs of {scenario['duration_s']:g} s, seed {seed}.\n"
     )
+    if scenario["duration_s"] != duration:
+        console.print(f"Runs are {scenario['duration_s']:g} s long, not {duration:g}: whole epochs of whole steps.\n")
     drift = table(
         "Drift of the integration, °/h about the cone's axis", "algorithm", "samples", "measured", "predicted"
     )
@@ -45,12 +53,9 @@ def coning(
         drift.add_row(
             row["algorithm"],
             str(row["samples"]),
-            *(
-                f"{row[key]:.4g}" if abs(row[key]) > 1e-6 else "rounding"
-                for key in ("drift_deg_per_hour", "predicted_deg_per_hour")
-            ),
+            *(_drift(row[key]) for key in ("drift_deg_per_hour", "predicted_deg_per_hour")),
         )
-    console.print(drift)
+    show(drift)
     verdicts = table(
         "The same noisy filter on each: RMS error / what the filter says of itself",
         "integration",
@@ -73,7 +78,7 @@ def coning(
             f"{row['nis']:.4f}",
             verdict(row["consistent"]),
         )
-    console.print(verdicts)
+    show(verdicts)
     low, high = summary["filter"][0]["anees_bias_bounds"]
     nis_low, nis_high = summary["filter"][0]["nis_bounds"]
     console.print(

@@ -52,6 +52,15 @@ def table(title: str, *columns: str, left: int = 1) -> Table:
     return result
 
 
+def show(rows: Table) -> None:
+    """Print a table whole: on a narrow terminal its lines run over rather than lose their ends."""
+    width, console.width = console.width, 1000
+    try:
+        console.print(rows, crop=False)
+    finally:
+        console.width = width
+
+
 def verdict(good: bool) -> Text:
     """Return "pass" or "FAIL", coloured where the terminal can."""
     return Text("pass", style="green") if good else Text("FAIL", style="red")

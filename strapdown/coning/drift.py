@@ -168,7 +168,7 @@ def read_vibration(path: str | os.PathLike[str]) -> tuple[VibrationLine, ...]:
         if len(row) != len(names):
             raise InputError(f"{file.name}: data row {k + 1} has {len(row)} fields, the header {len(names)}")
         cell = {
-            name: checks.finite(f"{file.name}: data row {k + 1}, {name}", field)
+            name: _number(f"{file.name}: data row {k + 1}, {name}", field)
             for name, field in zip(names, row, strict=True)
         }
         across = cell.get("angle_across_deg")
@@ -183,3 +183,10 @@ def read_vibration(path: str | os.PathLike[str]) -> tuple[VibrationLine, ...]:
     if not lines:
         raise InputError(f"{file.name} has a header but no lines")
     return tuple(lines)
+
+
+def _number(name: str, field: str) -> float:
+    try:
+        return checks.finite(name, float(field))
+    except ValueError:
+        raise InputError(f"{name} is {field!r}, not a finite number") from None

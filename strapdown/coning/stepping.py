@@ -14,6 +14,16 @@ from strapdown import checks, quaternion
 from strapdown.checks import Array, InputError
 from strapdown.coning import coefficients as exact
 from strapdown.coning.algorithms import Algorithm, named
+from strapdown.kernels import integration_polynomial as kernels
+from strapdown.kernels.integration import (
+    WORK,
+    accumulate_quaternions,
+    accumulate_vectors,
+    compressed_vectors,
+    one_sample_vectors,
+    pair_vectors,
+)
+from strapdown.kernels.machine import compiled
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 _UNTURNED = np.array(IDENTITY)
@@ -39,12 +49,11 @@ def integrate(
     frame : {"body", "fixed"}
         Of the increments: body rates, equation (17), or rates in the fixed frame, equation (3).
     """
-    from strapdown.kernels.integration import WORK, accumulate_quaternions, accumulate_vectors
-    from strapdown.kernels.machine import compiled
-
     table = named(algorithm)
     checks.one_of("frame", frame, ("body", "fixed"))
-    initial = _UNTURNED if initial_attitude is IDENTITY else checks.unit_quaternions("initial_attitude", initial_attitude)
+    initial = (
+        _UNTURNED if initial_attitude is IDENTITY else checks.unit_quaternions("initial_attitude", initial_attitude)
+    )
     if initial.shape != (4,):
         raise InputError(f"initial_attitude has shape {initial.shape}, wanted (4,); pass one quaternion")
     late = table.window == 1 and _is_plain(increments)
@@ -53,14 +62,14 @@ def integrate(
         # The conjugate of equation (3) is equation (17) for q* and −w.
         samples = -samples
         initial = quaternion.conjugate(initial)
-    attitude = _cache_lines(4 * (len(samples) // table.samples + 1)).reshape(-1, 4)
-    work = _cache_lines(WORK)
+    attitude = _empty_rows(len(samples) // table.samples + 1)
+    work = np.empty(WORK)
     if table.solver in _VECTOR_SOLVERS:
         compiled(accumulate_vectors)(_vectors(samples, table).reshape(-1), initial, work, attitude.reshape(-1))
     else:
         compiled(accumulate_quaternions)(_steps(samples, table).reshape(-1), initial, work, attitude.reshape(-1))
-    if late and not math.isfinite(attitude[-1, 0]):
-        # What is not finite makes all attitudes after it NaN, so that finding it here costs nothing.
+    if not math.isfinite(attitude[-1, 0]):
+        # What is not finite makes all attitudes after it NaN, so that plain arrays need no search before.
         _increments(increments)
         raise InputError("increments holds a rotation vector of more than 1e150 rad; check its unit")
     return quaternion.conjugate(attitude) if frame == "fixed" else attitude
@@ -149,12 +158,12 @@ def _is_plain(increments: ArrayLike) -> bool:
     )
 
 
-def _cache_lines(count: int) -> Array:
-    """Return an empty array that begins at a cache line: rows and machine vectors then cross none."""
+def _empty_rows(count: int) -> Array:
+    """Return an empty array (count, 4) that begins at a cache line, so that no row crosses one."""
     line = 8
-    array = np.empty(count + line)
+    array = np.empty(4 * count + line)
     first = -(array.__array_interface__["data"][0] // array.itemsize) % line
-    return array[first : first + count]
+    return array[first : first + 4 * count].reshape(count, 4)
 
 
 def _increments(increments: ArrayLike) -> Array:
@@ -162,9 +171,6 @@ def _increments(increments: ArrayLike) -> Array:
 
 
 def _vectors(increments: Array, table: Algorithm) -> Array:
-    from strapdown.kernels.integration import compressed_vectors, one_sample_vectors, pair_vectors
-    from strapdown.kernels.machine import compiled
-
     if table.window == 1:
         return increments
     vectors = np.empty((len(increments) // table.samples, 3))
@@ -183,9 +189,6 @@ def _vectors(increments: Array, table: Algorithm) -> Array:
 
 
 def _steps(increments: Array, table: Algorithm) -> Array:
-    from strapdown.kernels import integration_polynomial as kernels
-    from strapdown.kernels.machine import compiled
-
     steps = np.empty((len(increments) // table.samples, 4))
     if table.solver == "polynomial":
         # A record shorter than the window is fitted whole, by a polynomial of lower degree, and without the correction.
@@ -222,8 +225,6 @@ def _fits(window: int) -> Array:
 
 @functools.cache
 def _scheme(solver: str, samples: int) -> tuple[Array, int]:
-    from strapdown.kernels import integration_polynomial as kernels
-
     numbers = {
         "magnus-4": kernels.MAGNUS_4,
         "magnus-6": kernels.MAGNUS_6,

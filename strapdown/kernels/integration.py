@@ -28,7 +28,7 @@ from strapdown.kernels.lane_values import (
 from strapdown.kernels.rotation import exponential, quaternion_multiply, renormalized
 from strapdown.kernels.series import LARGEST_ANGLE
 
-SEGMENT = 64
+SEGMENT = 48
 """Steps of a lane in a block, at most."""
 
 BLOCK = WIDTH * SEGMENT
@@ -37,8 +37,8 @@ BLOCK = WIDTH * SEGMENT
 FEWEST = 4 * WIDTH
 """Fewer steps than this are left to one chain."""
 
-WORK = 4 * (BLOCK + WIDTH)
-"""Numbers of work space: the lanes' products and their starts."""
+WORK = 4 * (BLOCK + WIDTH) + WIDTH
+"""Numbers of work space: the lanes' products and their starts, and room to begin at a cache line."""
 
 _LARGEST_SQUARE = LARGEST_ANGLE * LARGEST_ANGLE
 
@@ -65,6 +65,7 @@ def accumulate_vectors(vectors, initial, work, attitude):
     """
     q = (initial[0], initial[1], initial[2], initial[3])
     attitude[0], attitude[1], attitude[2], attitude[3] = q
+    work = from_cache_line(work)
     m = len(vectors) // 3
     start = 0
     while m - start >= FEWEST:
@@ -81,6 +82,7 @@ def accumulate_quaternions(steps, initial, work, attitude):
     """Write q_fb after each step into ``attitude`` (m + 1, 4) from the step quaternions (m, 4); otherwise as accumulate_vectors."""
     q = (initial[0], initial[1], initial[2], initial[3])
     attitude[0], attitude[1], attitude[2], attitude[3] = q
+    work = from_cache_line(work)
     m = len(steps) // 4
     start = 0
     while m - start >= FEWEST:
@@ -91,6 +93,11 @@ def accumulate_quaternions(steps, initial, work, attitude):
     for k in range(start, m):
         q = quaternion_multiply(q, (steps[4 * k], steps[4 * k + 1], steps[4 * k + 2], steps[4 * k + 3]))
         write_row(attitude, k + 1, q)
+
+
+def from_cache_line(work):
+    """Return what of the work space begins at a cache line, which vectors then do not cross: a fifth of the time."""
+    return work[-(work.ctypes.data // 8) % WIDTH :]
 
 
 def write_row(attitude, k, q):

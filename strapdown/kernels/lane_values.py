@@ -52,14 +52,16 @@ def spread(x):
 
 def everywhere(condition):
     """Return whether the condition holds in all lanes."""
-    return bool(np.all(condition))
+    return condition if isinstance(condition, bool) else bool(np.all(condition))
 
 
 def anywhere(condition):
     """Return whether the condition holds in any lane."""
-    return bool(np.any(condition))
+    return condition if isinstance(condition, bool) else bool(np.any(condition))
 
 
 def chosen(condition, a, b):
     """Return a in the lanes where the condition holds, b in the others."""
+    if isinstance(condition, bool):
+        return a if condition else b
     return np.where(condition, a, b)

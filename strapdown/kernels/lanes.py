@@ -33,7 +33,7 @@ _BYTES = {types.float64: 8, types.float32: 4, types.int64: 8, types.uint64: 8, t
 _INDEX = ir.IntType(32)
 
 
-class Lanes(types.Type):
+class Lanes(types.Type):  # type: ignore[misc]
     """``count`` scalars of one type in one value."""
 
     def __init__(self, dtype: types.Type, count: int) -> None:
@@ -75,8 +75,8 @@ def _spread(builder: Any, scalar: Any, vector: ir.VectorType) -> Any:
     return _picked(builder, first, empty, [0] * vector.count)
 
 
-@lower_cast(types.Float, Lanes)
-@lower_cast(types.Integer, Lanes)
+@lower_cast(types.Float, Lanes)  # type: ignore[untyped-decorator]
+@lower_cast(types.Integer, Lanes)  # type: ignore[untyped-decorator]
 def _number_to_lanes(context: Any, builder: Any, source: Any, target: Any, value: Any) -> Any:
     if source != target.dtype:
         value = context.cast(builder, value, source, target.dtype)
@@ -104,7 +104,7 @@ def _define(operation: Callable[..., Any], count: int, emit: Callable[..., Any],
                 return None
             return signature(Lanes(types.boolean, lanes.count) if compares else lanes, *[lanes] * count)
 
-    @lower_builtin(operation, *[Lanes] * count)
+    @lower_builtin(operation, *[Lanes] * count)  # type: ignore[untyped-decorator]
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
         return emit(builder, sig.args[0].dtype, *arguments)
 
@@ -212,7 +212,8 @@ def load(typingctx: Any, array: Any, start: Any) -> Any:
     lanes = Lanes(array.dtype, WIDTH)
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        return _read(context, builder, array, *arguments, _vector(lanes))
+        data, first = arguments
+        return _read(context, builder, array, data, first, _vector(lanes))
 
     return lanes(array, types.intp), lower
 
@@ -274,15 +275,11 @@ def store_quadruples(typingctx: Any, array: Any, start: Any, stride: Any, q: Any
             ]
             for odd in (0, 1)
         ]
-        for i in range(WIDTH // 2):
-            # Rows i and i + 4 in one shuffle; storing a half needs none.
+        for i in range(WIDTH):
+            wx, yz = pairs[i % 2]
             place = i - i % 2
-            wide = _picked(
-                builder, *pairs[i % 2], [k + j for j in (place, place + 4) for k in (0, 1, WIDTH, WIDTH + 1)]
-            )
-            for half in (0, 4):
-                row = _picked(builder, wide, wide, list(range(half, half + 4)))
-                _write(context, builder, array, data, _row(builder, first, step, i + half), row)
+            row = _picked(builder, wx, yz, [place, place + 1, place + WIDTH, place + WIDTH + 1])
+            _write(context, builder, array, data, _row(builder, first, step, i), row)
         return context.get_dummy_value()
 
     return types.void(array, types.intp, types.intp, _tuple_of(array.dtype, 4)), lower

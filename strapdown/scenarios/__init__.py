@@ -31,6 +31,10 @@ SCENARIOS: tuple[str, ...] = tuple(sorted(path.stem for path in _BUILTIN.glob("*
 """Names of the built-in scenarios."""
 
 
+MOST_SAMPLES = 1e9
+"""Gyro samples that a simulated record may have: beyond it none fits into memory."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
     """What is simulated."""
@@ -55,6 +59,11 @@ class Scenario:
         """Check rate, duration, and the names of the sensors."""
         positive("rate", self.rate, unit="Hz")
         positive("duration", self.duration, unit="s")
+        if self.duration * self.rate > MOST_SAMPLES:
+            raise InputError(
+                f"{self.duration:g} s at {self.rate:g} Hz are {self.duration * self.rate:.3g} gyro samples, more than {MOST_SAMPLES:.0e}; "
+                "shorten the run or lower the rate"
+            )
         count("seed", self.seed, least=0)
         object.__setattr__(self, "sensors", tuple(self.sensors))
         object.__setattr__(self, "gravity_f", tuple(array("gravity_f", self.gravity_f, (3,)).tolist()))
