@@ -113,7 +113,7 @@ def _arithmetic(float_instruction: str | None, integer_instruction: str | None) 
     def emit(builder: Any, dtype: types.Type, *vectors: Any) -> Any:
         name = float_instruction if isinstance(dtype, types.Float) else integer_instruction
         if name is None:
-            raise NotImplementedError(f"no such operation on lanes of {dtype}")
+            raise TypeError(f"no such operation on lanes of {dtype}")
         return getattr(builder, name)(*vectors)
 
     return emit
