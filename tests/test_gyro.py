@@ -620,7 +620,7 @@ def judged(outcome):
 
 def test_filters_on_presets_with_flicker(tmp_path):
     result = flicker_in_filter.main(
-        ("mpu-9250", "adis16470", "stim300"), runs=24, duration=300.0, rate=20.0, figure=tmp_path / "f.png"
+        presets=("mpu-9250", "adis16470", "stim300"), runs=24, duration=300.0, rate=20.0, out=tmp_path
     )
     for outcome in result.outcomes:
         judged(outcome)
@@ -632,12 +632,12 @@ def test_filters_on_presets_with_flicker(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", datasheets.PRESETS)
 def test_filters_on_presets_at_their_natural_rates(name):
-    judged(flicker_in_filter.main((name,), runs=60, duration=600.0).outcomes[0])
+    judged(flicker_in_filter.main(presets=(name,), runs=60, duration=600.0).outcomes[0])
 
 
 def test_the_sim_finds_the_spectra_of_its_specification(tmp_path):
-    result = simulate_imu.main(samples=1 << 16, figure=tmp_path / "s.png")
-    assert (tmp_path / "s.png").stat().st_size > 10_000
+    result = simulate_imu.main(samples=1 << 16, out=tmp_path)
+    assert (tmp_path / "simulate_imu.png").stat().st_size > 10_000
     assert set(result.worst) == {"angle random walk", "flicker", "rate random walk", "whole"}
     # The largest of 50 bands, some of few lines whose χ² is skew.
     assert all(1.0 < score < 5.0 for score in result.worst.values())
