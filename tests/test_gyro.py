@@ -626,7 +626,7 @@ def test_filters_on_presets_with_flicker(tmp_path):
         judged(outcome)
     blind = result.outcomes[0]
     assert blind.anees["own"] > 1.0 + 3.0 * blind.scatter["own"]
-    assert (tmp_path / "f.png").stat().st_size > 10_000
+    assert (tmp_path / "flicker.png").stat().st_size > 10_000
 
 
 @pytest.mark.slow
