@@ -20,7 +20,7 @@ from strapdown import gyro
 from strapdown.checks import Array, InputError
 from strapdown.files import written_beside
 from strapdown.gyro import GyroSpec
-from strapdown.records import CONVENTIONS, ImuRecord, Truth
+from strapdown.records import CONVENTIONS, ImuRecord, Truth, put, result_file
 from strapdown.vectors import KINDS, VectorMeasurements
 
 KIND = "strapdown record"
@@ -83,13 +83,10 @@ def write_record(
     attributes : mapping, optional
         Further attributes of the file.
     """
-    import h5py
-
     for name in attributes or {}:
         if name in _RESERVED:
             raise InputError(f"attributes holds {name!r}, which the file has already; choose another name")
-    with written_beside(path) as temporary, h5py.File(temporary, "w") as file:
-        file.attrs.update(kind=KIND, format=FORMAT, version=strapdown.__version__, conventions=CONVENTIONS)
+    with result_file(path, "record", {"format": FORMAT}) as file:
         if gyro_spec is not None:
             file.attrs["gyro"] = json.dumps(gyro.to_table(gyro_spec))
         if scenario:
@@ -97,8 +94,8 @@ def write_record(
         for name, value in {"seed": seed, "run": run, **(attributes or {})}.items():
             if value is not None:
                 file.attrs[name] = value
-        _put(file, "time", record.time, "s", "edges of the sample intervals, one more than there are increments")
-        _put(
+        put(file, "time", record.time, "s", "edges of the sample intervals, one more than there are increments")
+        put(
             file,
             "increments",
             record.increments,
@@ -111,20 +108,10 @@ def write_record(
             for name, unit in _SERIES.items():
                 value = getattr(series, name)
                 if value is not None and not (series.kind == "attitude" and name in ("vector_b", "sigma")):
-                    _put(group, name, value, unit)
+                    put(group, name, value, unit)
         if record.truth is not None:
-            _put(file, "truth/attitude", record.truth.attitude, "1", "q_fb at the edges")
-            _put(file, "truth/bias", record.truth.bias, "rad/s", "gyro bias at the edges, body axes")
-
-
-def _put(group: Any, name: str, value: Array, unit: str, meaning: str = "") -> None:
-    large = value.size > 256
-    dataset = group.create_dataset(
-        name, data=value, **({"compression": "gzip", "compression_opts": 1, "shuffle": True} if large else {})
-    )
-    dataset.attrs["unit"] = unit
-    if meaning:
-        dataset.attrs["meaning"] = meaning
+            put(file, "truth/attitude", record.truth.attitude, "1", "q_fb at the edges")
+            put(file, "truth/bias", record.truth.bias, "rad/s", "gyro bias at the edges, body axes")
 
 
 def is_record(path: str | os.PathLike[str]) -> bool:

@@ -179,7 +179,7 @@ _ESTIMATE_UNITS = {
 
 
 @contextlib.contextmanager
-def _result_file(path: str | os.PathLike[str], kind: str, attributes: Mapping[str, Any] | None) -> Iterator[Any]:
+def result_file(path: str | os.PathLike[str], kind: str, attributes: Mapping[str, Any] | None) -> Iterator[Any]:
     """Yield an HDF5 file that says what it is; it appears whole or not at all."""
     import h5py
 
@@ -192,40 +192,47 @@ def _result_file(path: str | os.PathLike[str], kind: str, attributes: Mapping[st
         yield file
 
 
-def _put(group: Any, name: str, value: Array, unit: str) -> None:
-    group.create_dataset(name, data=value, compression="gzip", shuffle=True).attrs["unit"] = unit
+def put(group: Any, name: str, value: Array, unit: str, meaning: str = "") -> None:
+    """Write an array with its unit, and what it means where the name does not say, as attributes; compressed unless it is small."""
+    large = value.size > 256
+    dataset = group.create_dataset(
+        name, data=value, **({"compression": "gzip", "compression_opts": 1, "shuffle": True} if large else {})
+    )
+    dataset.attrs["unit"] = unit
+    if meaning:
+        dataset.attrs["meaning"] = meaning
 
 
 def write_estimate(
     path: str | os.PathLike[str], estimate: Estimate, attributes: Mapping[str, Any] | None = None
 ) -> None:
     """Write an estimate to HDF5, units and conventions as attributes; the file appears whole or not at all."""
-    with _result_file(path, "estimate", attributes) as file:
+    with result_file(path, "estimate", attributes) as file:
         for name, unit in _ESTIMATE_UNITS.items():
             value = getattr(estimate, name)
             if value is not None:
-                _put(file, name, value, unit)
+                put(file, name, value, unit)
         for number, (sensor, innovations) in enumerate(estimate.innovations.items()):
             group = file.create_group(f"innovations/{number}")
             group.attrs["sensor"] = sensor  # not the group's name: a slash in it would part groups
             group.attrs["skipped"] = estimate.skipped.get(sensor, 0)
-            _put(group, "time", innovations.time, "s")
-            _put(
+            put(group, "time", innovations.time, "s")
+            put(
                 group,
                 "innovation",
                 innovations.innovation,
                 "rad, or the sensor's unit over the length of its reference",
             )
-            _put(group, "variance", innovations.variance, "the square of the innovation's")
+            put(group, "variance", innovations.variance, "the square of the innovation's")
 
 
 def write_attitude(
     path: str | os.PathLike[str], time: Array, attitude: Array, attributes: Mapping[str, Any] | None = None
 ) -> None:
     """Write times (n,), s, and attitudes q_fb (n, 4) to HDF5; the file appears whole or not at all."""
-    with _result_file(path, "attitude", attributes) as file:
-        _put(file, "time", time, "s")
-        _put(file, "attitude", attitude, "1")
+    with result_file(path, "attitude", attributes) as file:
+        put(file, "time", time, "s")
+        put(file, "attitude", attitude, "1")
 
 
 def read_estimate(path: str | os.PathLike[str]) -> Estimate:
