@@ -7,7 +7,7 @@ chunks are merged in their order, so the statistics do not depend on the number 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -183,10 +183,9 @@ def run(
     with ThreadPoolExecutor(threads or os.cpu_count()) as pool:
         try:
             for numbers, results in zip(chunks, _in_order(pool, one_chunk, chunks), strict=True):
-                for setup_sums, part in zip(sums, map(list, zip(*results, strict=True)), strict=True):
+                for setup_sums, kept, part in zip(sums, examples, zip(*results, strict=True), strict=True):
                     _merge(setup_sums, part)
-                for kept, of_setup in zip(examples, zip(*results, strict=True), strict=True):
-                    kept.extend(of_setup[: EXAMPLES - len(kept)])
+                    kept.extend(part[: EXAMPLES - len(kept)])
                 if progress is not None:
                     progress(len(numbers))
         except BaseException:  # Ctrl-C too: drop what has not started
@@ -221,7 +220,7 @@ def _in_order(
         futures[k] = None  # type: ignore[call-overload]  # the sums are merged: let the runs go
 
 
-def _merge(sums: list[Array], part: list[_Run]) -> None:
+def _merge(sums: list[Array], part: Sequence[_Run]) -> None:
     totals = [
         np.sum([run.error for run in part], axis=0),
         np.sum([run.error**2 for run in part], axis=0),
@@ -243,9 +242,7 @@ def _one_run(
 def _filtered(record: ImuRecord, setup: FilterSetup, seed: int, number: int, epochs: int, nis_bins: int) -> _Run:
     believed = compress(record, setup.integration)
     if setup.measurement_sigma_factor != 1.0:
-        vectors = tuple(
-            replace(series, sigma=setup.measurement_sigma_factor * series.sigma) for series in record.vectors
-        )
+        vectors = tuple(series.noise_scaled(setup.measurement_sigma_factor) for series in record.vectors)
         believed = replace(believed, vectors=vectors)
     every = len(believed.increments) // epochs
     estimate = mekf.run(

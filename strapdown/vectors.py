@@ -159,6 +159,12 @@ class VectorMeasurements:
             changed["reference_f"] = self.reference_f[which]
         return dataclasses.replace(self, **changed)
 
+    def noise_scaled(self, factor: float) -> VectorMeasurements:
+        """Return the same samples with all their standard deviations multiplied by ``factor``."""
+        if self.sigma_axes is not None:
+            return dataclasses.replace(self, sigma_axes=factor * self.sigma_axes)
+        return dataclasses.replace(self, sigma=factor * self.sigma)
+
 
 def _need_unit(name: str, vector: Array) -> None:
     norm = np.linalg.norm(vector, axis=-1)

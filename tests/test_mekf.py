@@ -310,6 +310,16 @@ def test_an_attitude_and_a_diffuse_prior_is_the_attitude():
     assert result.innovations["t"].whitened.shape == (1, 3)
 
 
+def test_scaled_noise_reaches_every_kind():
+    record = with_attitude_series(with_vector_series(simulate(scenario(duration=2.0), 1)))
+    believed = replace(record, vectors=tuple(series.noise_scaled(3.0) for series in record.vectors))
+    plain, scaled = mekf.schedule(record.vectors, 0.0, 2.0), mekf.schedule(believed.vectors, 0.0, 2.0)
+    attitude = plain.kind == mekf.filter_loop.ATTITUDE
+    assert np.allclose(scaled.variance, 9.0 * plain.variance, rtol=1e-14)
+    assert np.allclose(scaled.vector_b[attitude], 9.0 * plain.vector_b[attitude], rtol=1e-14)
+    assert np.array_equal(scaled.vector_b[~attitude], plain.vector_b[~attitude])
+
+
 def test_the_heading_of_an_inclined_vector_shifts_with_tilt():
     """Its row is the derivative of the heading by a small turn about each body axis."""
     from strapdown.kernels.filter_loop import heading_error
