@@ -82,9 +82,9 @@ _ROWS = np.array([*_UPPER[0], *np.repeat(range(3), 3), *(3 + np.array(_UPPER[0])
 _COLUMNS = np.array([*_UPPER[1], *(3 + np.tile(range(3), 3)), *(3 + np.array(_UPPER[1]))])
 
 
-def pack(state: State) -> Array:
+def pack(attitude: Array, bias: Array, covariance: Array) -> Array:
     """Return a state as the kernels' 28 numbers: q, b, and P in blocks."""
-    return np.concatenate([state.attitude, state.bias, state.covariance[_ROWS, _COLUMNS]])
+    return np.concatenate([attitude, bias, covariance[_ROWS, _COLUMNS]])
 
 
 def covariance_matrices(blocks: Array) -> Array:
@@ -243,15 +243,16 @@ def run_events(
 ) -> tuple[Estimate, Array, Array]:
     """Run the kernel over scheduled events; return the estimate, the packed end state (28,), and up to ``segments`` predicted segments.
 
-    A segment (32,) is what a smoother needs of one prediction: dt, increment (3), packed state (28) that it starts from.
+    A segment (32,) is what a smoother needs of one prediction: dt, increment (3), packed state (28) that it starts from. Where any are
+    asked for, one row more follows them: the end state, from which nothing is predicted (dt and increment 0).
     """
     count("every", every)
     rows = (len(record.increments)) // every + 1
-    state = pack(initial)
+    state = pack(initial.attitude, initial.bias, initial.covariance)
     attitude, bias, variance = np.empty((rows, 4)), np.empty((rows, 3)), np.empty((rows, 6))
     blocks = np.empty((rows if full_covariance else 0, 21))
     innovation = np.empty((len(events.time), max([4, *(2 * KINDS[kind] for kind in events.kinds)])))
-    stored = np.empty((segments, 32))
+    stored = np.empty((segments + 1 if segments else 0, 32))
     number = compiled(filter_loop.run_filter)(
         record.time,
         np.ascontiguousarray(record.increments),
@@ -270,8 +271,11 @@ def run_events(
         variance,
         blocks,
         innovation,
-        stored,
+        stored[:segments],
     )
+    if segments:
+        stored[number, :4] = 0.0
+        stored[number, 4:] = state
     estimate = Estimate(
         time=record.time[::every],
         attitude=attitude,
@@ -281,7 +285,7 @@ def run_events(
         innovations=innovations_by_sensor(events, innovation),
         skipped=events.skipped,
     )
-    return estimate, state, stored[:number]
+    return estimate, state, stored[: number + 1]
 
 
 class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]

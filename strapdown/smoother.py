@@ -98,29 +98,15 @@ def _most_segments(record: ImuRecord, events: int) -> int:
 def _filtered(record: ImuRecord, process_noise: ProcessNoise, initial: State) -> tuple[Estimate, Array, np.ndarray]:
     """Run the filter and keep its segments; return its estimate, the segments with the end state, and the segment of each edge."""
     events = mekf.schedule(record.vectors, record.time[0], record.time[-1])
-    rows = len(record.time)
-    forward, state, stored = mekf.run_events(
+    forward, _, segments = mekf.run_events(
         record,
         events,
         process_noise,
         initial,
-        every=rows,
+        every=len(record.time),
         full_covariance=False,
         segments=_most_segments(record, len(events.time)),
     )
-    number = len(stored)
-    segments = np.concatenate([stored, np.empty((1, 32))])
-    segments[number, :4] = 0.0
-    segments[number, 4:] = state
-    starts = np.empty(rows, np.int64)
-    compiled(smoother_loop.locate_edges)(record.time, events.time, segments, number, starts)
-    end = segments[number, 4:]
-    last = Estimate(
-        time=record.time[-1:],
-        attitude=end[None, :4],
-        bias=end[None, 4:7],
-        variance=mekf.covariance_matrices(end[7:]).diagonal()[None],
-        innovations=forward.innovations,
-        skipped=events.skipped,
-    )
-    return last, segments, starts
+    starts = np.empty(len(record.time), np.int64)
+    compiled(smoother_loop.locate_edges)(record.time, events.time, segments, len(segments) - 1, starts)
+    return forward, segments, starts

@@ -434,7 +434,7 @@ def test_plain_python_equals_compiled(variant):
     gains = complementary.steady_gains(record, BELIEF, initial)
     given_events = (events.kind, events.vector_b, events.variance, events.reference, events.triads)
     walk = (steps.dt, steps.increment, steps.event, steps.row, 1e-8, 1e-12, *given_events)
-    state = stepping.packed(initial.attitude, initial.bias, initial.covariance)
+    state = mekf.pack(initial.attitude, initial.bias, initial.covariance)
     results = []
     for function in (family_loop.run_extended, compiled(family_loop.run_extended)):
         states, innovation = np.zeros((len(steps.time), 28)), np.zeros((len(events.time), 6))

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from strapdown import mekf
 from strapdown.checks import Array, array
 from strapdown.family import stepping
 from strapdown.kernels import family_complementary
@@ -110,7 +111,7 @@ def run(
         events.triads,
         array("gains.attitude", chosen.attitude, (sensors,)),
         array("gains.bias", chosen.bias, (sensors,)),
-        stepping.packed(initial.attitude, initial.bias, initial.covariance),
+        mekf.pack(initial.attitude, initial.bias, initial.covariance),
         states,
         innovation,
     )

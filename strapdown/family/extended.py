@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from strapdown import mekf
 from strapdown.family import stepping
 from strapdown.kernels import family_loop
 from strapdown.kernels.machine import compiled
@@ -78,7 +79,7 @@ def _run(
         events.variance,
         events.reference,
         events.triads,
-        stepping.packed(initial.attitude, initial.bias, initial.covariance),
+        mekf.pack(initial.attitude, initial.bias, initial.covariance),
         states,
         innovation,
     )

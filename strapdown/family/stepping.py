@@ -86,12 +86,6 @@ def events_and_steps(record: ImuRecord, every: int) -> tuple[Schedule, Steps]:
     return events, steps
 
 
-def packed(attitude: Array, bias: Array, covariance: Array) -> Array:
-    """Return a state as 28 numbers: q, b and the blocks A = P_θθ (upper), B = P_θb, C = P_bb (upper)."""
-    A, B, C = covariance[:3, :3], covariance[:3, 3:], covariance[3:, 3:]
-    return np.concatenate([attitude, bias, A[_UPPER], B.ravel(), C[_UPPER]])
-
-
 def estimate(events: Schedule, steps: Steps, states: Array, innovation: Array, full_covariance: bool) -> Estimate:
     """Return the estimate of packed states (m, 28), body side, and innovations (events, 6): e₁, s₁, e₂, s₂, e₃, s₃."""
     covariance = mekf.covariance_matrices(states[:, 7:])

@@ -74,7 +74,7 @@ def run(
         if event >= 0:
             q, b, P, innovation[event] = _update(points, q, b, P, events, event)
         if row >= 0:
-            states[row] = stepping.packed(q, b, P)
+            states[row] = mekf.pack(q, b, P)
     return stepping.estimate(events, steps, states, innovation, full_covariance)
 
 
