@@ -42,10 +42,8 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -592,13 +590,4 @@ def read_spec(path: str | os.PathLike[str]) -> GyroSpec:
     InputError
         If the file is missing, no TOML, has no such table, or a key that no gyro has.
     """
-    try:
-        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist; check the path") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is no TOML ({error})") from None
-    table = content.get("gyro")
-    if not isinstance(table, dict):
-        raise InputError(f"{path} has no table [gyro]; `strapdown allan` writes one")
-    return from_table(table, f"{path}: gyro")
+    return from_table(tables.read(path, "gyro", "`strapdown allan`"), f"{path}: gyro")

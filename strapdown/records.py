@@ -204,14 +204,28 @@ def put(group: Any, name: str, value: Array, unit: str, meaning: str = "") -> No
 
 
 def write_estimate(
-    path: str | os.PathLike[str], estimate: Estimate, attributes: Mapping[str, Any] | None = None
+    path: str | os.PathLike[str],
+    estimate: Estimate,
+    attributes: Mapping[str, Any] | None = None,
+    *,
+    truth: Truth | None = None,
 ) -> None:
-    """Write an estimate to HDF5, units and conventions as attributes; the file appears whole or not at all."""
+    """Write an estimate to HDF5, units and conventions as attributes; the file appears whole or not at all.
+
+    ``truth`` is that at the times of the estimate, where a simulation knows it, so that the file can be judged by itself.
+    """
+    if truth is not None and len(truth.attitude) != len(estimate.time):
+        raise InputError(
+            f"truth has {len(truth.attitude)} rows and the estimate {len(estimate.time)}; take the truth at the estimate's times"
+        )
     with result_file(path, "estimate", attributes) as file:
         for name, unit in _ESTIMATE_UNITS.items():
             value = getattr(estimate, name)
             if value is not None:
                 put(file, name, value, unit)
+        if truth is not None:
+            put(file, "truth/attitude", truth.attitude, "1")
+            put(file, "truth/bias", truth.bias, "rad/s")
         for number, (sensor, innovations) in enumerate(estimate.innovations.items()):
             group = file.create_group(f"innovations/{number}")
             group.attrs["sensor"] = sensor  # not the group's name: a slash in it would part groups
@@ -235,8 +249,9 @@ def write_attitude(
         put(file, "attitude", attitude, "1")
 
 
-def read_estimate(path: str | os.PathLike[str]) -> Estimate:
-    """Read an estimate written by :func:`write_estimate`."""
+@contextlib.contextmanager
+def _estimate_file(path: str | os.PathLike[str]) -> Iterator[Any]:
+    """Yield an estimate's HDF5 file, read only; what is wrong with it is told in one line."""
     import h5py
 
     try:
@@ -245,22 +260,36 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
                 raise InputError(
                     f"{path} is not a strapdown estimate; pass the estimate.h5 that `strapdown estimate` writes"
                 )
-            groups = file["innovations"].values() if "innovations" in file else ()
-            return Estimate(
-                time=file["time"][:],
-                attitude=file["attitude"][:],
-                bias=file["bias"][:],
-                variance=file["variance"][:],
-                covariance=file["covariance"][:] if "covariance" in file else None,
-                innovations={
-                    part.attrs["sensor"]: Innovations(
-                        time=part["time"][:], innovation=part["innovation"][:], variance=part["variance"][:]
-                    )
-                    for part in groups
-                },
-                skipped={part.attrs["sensor"]: int(part.attrs["skipped"]) for part in groups},
-            )
+            yield file
     except FileNotFoundError:
         raise InputError(f"{path} does not exist; check the path") from None
     except (OSError, KeyError) as error:
         raise InputError(f"{path} cannot be read as HDF5 ({error}); the file is truncated or of another kind") from None
+
+
+def read_truth(path: str | os.PathLike[str]) -> Truth | None:
+    """Read the truth that :func:`write_estimate` was given, at the times of the estimate; None if it was given none."""
+    with _estimate_file(path) as file:
+        if "truth" not in file:
+            return None
+        return Truth(attitude=file["truth/attitude"][:], bias=file["truth/bias"][:])
+
+
+def read_estimate(path: str | os.PathLike[str]) -> Estimate:
+    """Read an estimate written by :func:`write_estimate`."""
+    with _estimate_file(path) as file:
+        groups = file["innovations"].values() if "innovations" in file else ()
+        return Estimate(
+            time=file["time"][:],
+            attitude=file["attitude"][:],
+            bias=file["bias"][:],
+            variance=file["variance"][:],
+            covariance=file["covariance"][:] if "covariance" in file else None,
+            innovations={
+                part.attrs["sensor"]: Innovations(
+                    time=part["time"][:], innovation=part["innovation"][:], variance=part["variance"][:]
+                )
+                for part in groups
+            },
+            skipped={part.attrs["sensor"]: int(part.attrs["skipped"]) for part in groups},
+        )

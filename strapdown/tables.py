@@ -8,7 +8,10 @@ written in the last, which is SI.
 from __future__ import annotations
 
 import dataclasses
+import os
+import tomllib
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -126,3 +129,23 @@ def build(kind: type, table: Mapping[str, Any], form: Form, place: str, **more: 
             key = f"{field.name}_{choice[0][0]}" if choice[0][0] else field.name
             raise InputError(f"{place}: {key} is missing; add it")
     return kind(**values)
+
+
+def read(path: str | os.PathLike[str], name: str, writer: str) -> dict[str, Any]:
+    """Return the table ``[name]`` of a TOML file; ``writer`` says what writes such a file.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, no TOML, or has no such table.
+    """
+    try:
+        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist; check the path") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is no TOML ({error})") from None
+    table = content.get(name)
+    if not isinstance(table, dict):
+        raise InputError(f"{path} has no table [{name}]; {writer} writes one")
+    return table

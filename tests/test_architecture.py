@@ -24,9 +24,9 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     # 2 data
     ("records", "recordings", "recordfiles", "scenarios"),
     # 3 estimators
-    ("mekf", "smoother", "family", "ahrs"),
+    ("mekf", "robustness", "setup", "smoother", "family", "augmented", "bank", "ahrs"),
     # 4 analysis
-    ("consistency", "montecarlo", "coning_study", "tuning"),
+    ("consistency", "covariance", "montecarlo", "coning_study", "diagnosis", "doctor", "tuning"),
     # 5 faces
     ("plots", "report", "cli"),
 )

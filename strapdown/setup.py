@@ -1,0 +1,220 @@
+"""How a filter is set up: what it believes of the gyro and of each sensor, where it starts, what integrates the gyro.
+
+One object for the command line, the Monte Carlo and the tuning. As a file it is the table ``[filter]`` of a TOML document, units in the
+names of its keys; a setup read back is equal to the last bit.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from strapdown import coning, gyro, mekf, tables, units
+from strapdown.checks import Array, InputError, finite, known_keys, one_of, positive
+from strapdown.gyro import GyroSpec
+from strapdown.mekf import ProcessNoise
+from strapdown.records import Estimate, ImuRecord, compress
+from strapdown.scenarios import Scenario, simulate
+from strapdown.vectors import VectorMeasurements
+
+ATTITUDE_SIGMA = 1.0 * units.DEGREE
+"""Standard deviation of the initial attitude error where nobody says, each axis, rad."""
+LEAST_BIAS_SIGMA = 0.1 * units.DEGREE_PER_HOUR
+"""Standard deviation of the initial bias error of a gyro whose specification tells of no bias, rad/s."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilterSetup:
+    """What the filter believes, where it starts, what integrates the gyro."""
+
+    process_noise: ProcessNoise
+    attitude_sigma: float = ATTITUDE_SIGMA
+    """Standard deviation of the initial attitude error, each axis, rad; a Monte Carlo draws the true error from it."""
+    bias_sigma: float
+    """Standard deviation of the initial bias error, each axis, rad/s; a Monte Carlo draws the true error from it."""
+    integration: coning.Algorithm = field(default_factory=lambda: coning.ALGORITHMS["one-sample"])
+    """Coning algorithm that turns its N gyro samples into one filter step."""
+    measurement_sigma_factor: float = 1.0
+    """What the filter takes each sensor's σ for, as a multiple of the record's."""
+    sigma: Mapping[str, float] = field(default_factory=dict)
+    """σ that the filter believes of a sensor instead of the record's, by its name: rad, or of whole vectors the unit of their reference.
+    Of a series whose σ varies it is the root mean square, and the ratios stay."""
+
+    def __post_init__(self) -> None:
+        """Check every number."""
+        positive("attitude_sigma", self.attitude_sigma, unit="rad")
+        positive("bias_sigma", self.bias_sigma, unit="rad/s")
+        positive("measurement_sigma_factor", self.measurement_sigma_factor)
+        believed_sigma = {str(name): float(positive(f"sigma[{name!r}]", s)) for name, s in self.sigma.items()}
+        object.__setattr__(self, "sigma", believed_sigma)
+
+
+def matched(scenario: Scenario, *, attitude_sigma: float = ATTITUDE_SIGMA) -> FilterSetup:
+    """Return what a right filter believes of a scenario: the noise of its gyro, and of its sensors what they say of themselves."""
+    return matched_to_record(scenario.gyro, simulate(scenario), attitude_sigma=attitude_sigma)
+
+
+def matched_to_record(spec: GyroSpec, record: ImuRecord, *, attitude_sigma: float = ATTITUDE_SIGMA) -> FilterSetup:
+    """Return what a right filter believes of a record of a gyro of this specification.
+
+    Flicker, which no random walk is, is matched in the attitude at the record's rate and quality of measurements
+    (:func:`strapdown.gyro.matched_process_noise`); without measurements it is bounded over the record's length. Errors that the filter
+    has no state for (scale factor, misalignment, quantisation, hard iron) are not covered.
+    """
+    noise = _noise(spec, record)
+    walk = np.max(np.square(spec.bias_instability) * np.log(1e3)) / np.pi  # flicker over three decades of time
+    stationary = np.where(
+        np.isfinite(spec.markov_correlation_time),
+        0.5
+        * np.square(spec.markov_noise)
+        * np.where(np.isfinite(spec.markov_correlation_time), spec.markov_correlation_time, 0.0),
+        0.0,
+    )
+    spread = np.max(np.square(spec.turn_on_bias) + np.square(spec.turn_on_bias_sigma) + stationary) + walk
+    return FilterSetup(
+        process_noise=ProcessNoise(**noise),
+        attitude_sigma=attitude_sigma,
+        bias_sigma=float(max(np.sqrt(spread), LEAST_BIAS_SIGMA)),
+    )
+
+
+def _noise(spec: GyroSpec, record: ImuRecord) -> dict[str, float]:
+    if not np.any(np.asarray(spec.bias_instability) > 0.0):
+        noise = gyro.process_noise(spec)
+    else:
+        density = measurement_density(record)
+        if np.isfinite(density):
+            noise = gyro.matched_process_noise(spec, density)
+        else:
+            noise = gyro.process_noise(spec, bandwidth=2.0 * np.pi / float(record.time[-1] - record.time[0]))
+    if noise["angle_random_walk"] == 0.0:
+        raise InputError(
+            "the gyro's specification has no angle random walk, and a filter must believe one greater than zero; "
+            "give it, or a filter setup of your own"
+        )
+    return noise
+
+
+def measurement_density(record: ImuRecord) -> float:
+    """Return the variance of a measurement about an axis times the interval between measurements, rad² s, over all sensors and axes.
+
+    A direction tells of two axes of three, a heading of one; infinite where there is no measurement.
+    """
+    information = sum(_information(series) for series in record.vectors)
+    length = float(record.time[-1] - record.time[0])
+    return length / information if information > 0.0 else float("inf")
+
+
+def _information(series: VectorMeasurements) -> float:
+    """Return Σ 1/σ² about an axis, the mean over the three axes, 1/rad²."""
+    if series.attitude is not None:
+        assert series.sigma_axes is not None
+        return float(np.sum(series.sigma_axes**-2.0)) / 3.0
+    seen = np.isfinite(series.vector_b).all(axis=1)
+    length = np.linalg.norm(series.references_f, axis=1) if series.kind == "vector" else np.ones(len(series.time))
+    share = 1.0 / 3.0 if series.kind == "heading" else 2.0 / 3.0
+    return share * float(np.sum((length[seen] / series.sigma[seen]) ** 2))
+
+
+def believed(record: ImuRecord, setup: FilterSetup) -> ImuRecord:
+    """Return the record as the filter of this setup takes it: at the rate of its integration algorithm, each σ as it believes it."""
+    names = [series.sensor for series in record.vectors]
+    for name in setup.sigma:
+        one_of("sigma: sensor", name, names)
+    used = (
+        record
+        if setup.integration.samples == 1 and setup.integration.name == "one-sample"
+        else compress(record, setup.integration)
+    )
+    if setup.measurement_sigma_factor == 1.0 and not setup.sigma:
+        return used
+    return replace(used, vectors=tuple(_believed(series, setup) for series in record.vectors))
+
+
+def _believed(series: VectorMeasurements, setup: FilterSetup) -> VectorMeasurements:
+    factor = setup.measurement_sigma_factor
+    if series.sensor in setup.sigma:
+        own = float(np.sqrt(np.mean(series.sigma**2))) if len(series.time) else 0.0
+        if own == 0.0:
+            if series.attitude is not None:
+                return replace(series, sigma_axes=np.full(3, factor * setup.sigma[series.sensor]))
+            return replace(series, sigma=np.full(len(series.time), factor * setup.sigma[series.sensor]))
+        factor *= setup.sigma[series.sensor] / own
+    return series if factor == 1.0 else series.noise_scaled(factor)
+
+
+def run(record: ImuRecord, setup: FilterSetup, initial: mekf.State, **options: Any) -> Estimate:
+    """Run the filter of this setup over a record; ``options`` are those of :func:`strapdown.mekf.run`."""
+    return mekf.run(believed(record, setup), setup.process_noise, initial, **options)
+
+
+def initial_state(
+    setup: FilterSetup, attitude: Array, bias: Array | tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> mekf.State:
+    """Return the state that the filter starts from: this attitude and bias, and the setup's σ of both."""
+    return mekf.initial_state(attitude, bias=bias, attitude_sigma=setup.attitude_sigma, bias_sigma=setup.bias_sigma)
+
+
+_NOISE_FORM: tables.Form = {name: gyro.FORM[name] for name in ("angle_random_walk", "rate_random_walk")}
+_FORM: tables.Form = {
+    "attitude_sigma": tables.DEGREES,
+    "bias_sigma": tables.DEGREES_PER_HOUR,
+    "measurement_sigma_factor": tables.RATIO,
+}
+_PARTS = ("integration", "sigma")
+
+
+def to_table(setup: FilterSetup) -> dict[str, Any]:
+    """Return a setup as the table that its file holds."""
+    table = {**tables.encode(setup.process_noise, _NOISE_FORM), **tables.encode(setup, _FORM)}
+    table["integration"] = setup.integration.name
+    if setup.sigma:
+        table["sigma"] = dict(setup.sigma)
+    return table
+
+
+def from_table(table: Mapping[str, Any], place: str = "filter") -> FilterSetup:
+    """Return the setup that a table tells; unknown keys are refused with the nearest known one."""
+    known_keys(place, table, {*tables.keys(_NOISE_FORM), *tables.keys(_FORM), *_PARTS})
+    own = tables.keys(_NOISE_FORM)
+    parts: dict[str, Any] = {}
+    if "integration" in table:
+        name = one_of(f"{place}: integration", table["integration"], coning.ALGORITHMS)
+        parts["integration"] = coning.ALGORITHMS[name]
+    if "sigma" in table:
+        if not isinstance(table["sigma"], Mapping):
+            raise InputError(
+                f"{place}: sigma is {table['sigma']!r}; it must be a table of numbers by sensor, [filter.sigma]"
+            )
+        parts["sigma"] = {name: finite(f"{place}: sigma: {name}", value) for name, value in table["sigma"].items()}
+    return tables.build(  # type: ignore[no-any-return]
+        FilterSetup,
+        {key: value for key, value in table.items() if key not in own and key not in _PARTS},
+        _FORM,
+        place,
+        process_noise=tables.build(ProcessNoise, {k: v for k, v in table.items() if k in own}, _NOISE_FORM, place),
+        **parts,
+    )
+
+
+def to_toml(setup: FilterSetup) -> str:
+    """Return a setup as TOML with the table ``[filter]``."""
+    import tomli_w
+
+    note = "# sigma: rad, or of a sensor that measures whole vectors the unit of its reference\n" if setup.sigma else ""
+    return note + tomli_w.dumps({"filter": to_table(setup)})
+
+
+def read_setup(path: str | os.PathLike[str]) -> FilterSetup:
+    """Read the table ``[filter]`` of a TOML file, such as ``strapdown tune`` writes; other tables are left alone.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, no TOML, has no such table, or a key that no filter has.
+    """
+    return from_table(tables.read(path, "filter", "`strapdown tune`"), f"{path}: filter")

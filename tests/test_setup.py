@@ -1,0 +1,153 @@
+"""Filter setups: what a right filter believes of a scenario, and their files."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from strapdown import coning, consistency, mekf, quaternion, records, scenarios, setup, units
+from strapdown.checks import InputError
+from strapdown.gyro import GyroSpec
+from strapdown.randomness import generator
+from strapdown.setup import FilterSetup
+
+SETUP = FilterSetup(
+    process_noise=mekf.ProcessNoise(angle_random_walk=1.234567e-5, rate_random_walk=3.3e-8),
+    attitude_sigma=0.0123,
+    bias_sigma=4.5e-6,
+    integration=coning.ALGORITHMS["four-sample"],
+    measurement_sigma_factor=1.25,
+    sigma={"star 1": 1.7e-4, "sun": 2e-3},
+)
+
+
+def scenario(**changes):
+    chosen = scenarios.load_scenario("coning")
+    return dataclasses.replace(chosen, **changes)
+
+
+def test_a_setup_goes_through_its_file_to_the_last_bit(tmp_path):
+    path = tmp_path / "filter.toml"
+    path.write_text(setup.to_toml(SETUP), encoding="utf-8")
+    assert setup.read_setup(path) == SETUP
+
+
+@pytest.mark.parametrize(
+    ("table", "complaint"),
+    [
+        ({"bias_sigma_deg_per_hour": 1.0}, "angle_random_walk_deg_per_sqrt_hour is missing"),
+        ({"angle_random_walk_deg_per_sqrt_hour": 0.1, "rate_random_walk_rad_per_s_per_sqrt_s": 0.0}, "bias_sigma"),
+        ({"angle_random_walk_deg_per_hour": 0.1}, "angle_random_walk_deg_per_sqrt_hour"),
+        ({"integration": "four"}, "four-sample"),
+        ({"sigma": 3.0}, "table of numbers by sensor"),
+        ({"sigma": {"star": "big"}}, "sigma: star"),
+    ],
+)
+def test_a_bad_table_is_refused_by_name(table, complaint):
+    with pytest.raises(InputError, match=complaint):
+        setup.from_table(table)
+
+
+@pytest.mark.parametrize("change", [{"attitude_sigma": 0.0}, {"bias_sigma": -1.0}, {"sigma": {"star": 0.0}}])
+def test_no_sigma_may_be_zero(change):
+    with pytest.raises(InputError, match="greater than zero"):
+        dataclasses.replace(SETUP, **change)
+
+
+def test_a_file_without_the_table_says_what_writes_one(tmp_path):
+    path = tmp_path / "gyro.toml"
+    path.write_text("[gyro]\n")
+    with pytest.raises(InputError, match=r"no table \[filter\]"):
+        setup.read_setup(path)
+
+
+def test_matched_takes_the_gyro_at_its_word():
+    spec = GyroSpec(angle_random_walk=2e-5, rate_random_walk=1e-8, turn_on_bias_sigma=3e-5)
+    chosen = setup.matched(scenario(gyro=spec))
+    assert chosen.process_noise == mekf.ProcessNoise(angle_random_walk=2e-5, rate_random_walk=1e-8)
+    assert chosen.bias_sigma == pytest.approx(3e-5)
+
+
+def test_a_gauss_markov_bias_starts_from_its_stationary_spread():
+    spec = GyroSpec(angle_random_walk=2e-5, markov_noise=1e-6, markov_correlation_time=800.0)
+    assert setup.matched(scenario(gyro=spec)).bias_sigma == pytest.approx(1e-6 * np.sqrt(400.0))
+
+
+def test_flicker_raises_both_noises():
+    spec = GyroSpec(angle_random_walk=2e-5, bias_instability=5.0 * units.DEGREE_PER_HOUR)
+    noise = setup.matched(scenario(gyro=spec)).process_noise
+    assert noise.angle_random_walk > 2e-5
+    assert noise.rate_random_walk > 0.0
+    blind = setup.matched(scenario(gyro=spec, sensors=())).process_noise
+    assert blind.rate_random_walk < noise.rate_random_walk  # bounded over the whole record
+
+
+def test_a_gyro_without_noise_is_refused():
+    with pytest.raises(InputError, match="angle random walk"):
+        setup.matched(scenario(gyro=GyroSpec()))
+
+
+def test_measurement_density_counts_what_each_kind_tells():
+    record = scenarios.simulate(scenario())
+    sigma = record.vectors[0].sigma[0]
+    number = sum(len(series.time) for series in record.vectors)
+    expected = (record.time[-1] - record.time[0]) * sigma**2 / (number * 2.0 / 3.0)
+    assert setup.measurement_density(record) == pytest.approx(expected)
+    assert setup.measurement_density(dataclasses.replace(record, vectors=())) == np.inf
+
+
+def test_believed_replaces_sigmas_by_name_and_keeps_ratios():
+    record = scenarios.simulate(scenario())
+    first, *rest = record.vectors
+    uneven = dataclasses.replace(first, sigma=np.linspace(1.0, 2.0, len(first.time)) * 1e-3)
+    record = dataclasses.replace(record, vectors=(uneven, *rest))
+    one = dataclasses.replace(SETUP, sigma={first.sensor: 5e-4}, measurement_sigma_factor=1.0)
+    taken = setup.believed(record, one).vectors
+    assert np.sqrt(np.mean(taken[0].sigma ** 2)) == pytest.approx(5e-4)
+    np.testing.assert_allclose(taken[0].sigma / taken[0].sigma[0], uneven.sigma / uneven.sigma[0])
+    assert taken[1] is rest[0]
+    with pytest.raises(InputError, match="star 1"):
+        setup.believed(record, dataclasses.replace(one, sigma={"star one": 1e-3}))
+
+
+def test_the_matched_filter_of_a_scenario_is_consistent():
+    # A gyro of noise alone: the errors of shape that presets have too are nothing that the filter has states for.
+    noise = GyroSpec(angle_random_walk=5e-5, rate_random_walk=1e-6, turn_on_bias_sigma=1e-4)
+    chosen = scenario(gyro=noise, gyro_preset="", duration=30.0)
+    believes = setup.matched(chosen)
+    believes = dataclasses.replace(believes, integration=coning.ALGORITHMS["four-sample"])
+    runs, last = 60, []
+    for run in range(runs):
+        record = scenarios.simulate(chosen, 11, run)
+        draw = generator(11, run, "initial error").standard_normal(6)
+        start = setup.initial_state(
+            believes,
+            quaternion.multiply(record.truth.attitude[0], quaternion.exp(-believes.attitude_sigma * draw[:3])),
+            record.truth.bias[0] - believes.bias_sigma * draw[3:],
+        )
+        estimate = setup.run(record, believes, start, full_covariance=True)
+        error = consistency.errors(
+            estimate.attitude[-1], estimate.bias[-1], record.truth.attitude[-1], record.truth.bias[-1]
+        )
+        last.append(consistency.nees(error, estimate.covariance[-1]))
+    low, high = consistency.mean_bounds(6, runs, 0.99)
+    assert low <= np.mean(last) / 6.0 <= high
+
+
+def test_truth_travels_in_the_estimate_file(tmp_path):
+    record = scenarios.simulate(scenario(duration=5.0))
+    believes = setup.matched(scenario())
+    estimate = setup.run(record, believes, setup.initial_state(believes, record.truth.attitude[0]))
+    records.write_estimate(tmp_path / "with.h5", estimate, truth=record.truth)
+    records.write_estimate(tmp_path / "without.h5", estimate)
+    truth = records.read_truth(tmp_path / "with.h5")
+    np.testing.assert_array_equal(truth.attitude, record.truth.attitude)
+    np.testing.assert_array_equal(truth.bias, record.truth.bias)
+    assert records.read_truth(tmp_path / "without.h5") is None
+    np.testing.assert_array_equal(records.read_estimate(tmp_path / "with.h5").attitude, estimate.attitude)
+    short = records.Truth(attitude=record.truth.attitude[:-1], bias=record.truth.bias[:-1])
+    with pytest.raises(InputError, match="rows"):
+        records.write_estimate(tmp_path / "bad.h5", estimate, truth=short)
+    assert not (tmp_path / "bad.h5").exists()
