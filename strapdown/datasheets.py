@@ -138,6 +138,8 @@ class Preset:
     grade: str
     document: str
     """The sheet that the stated figures are from."""
+    checked: str
+    """How the stated figures were held against that sheet."""
     rate: float
     """A sample rate at which it is commonly run, Hz."""
     stated: Mapping[str, str]
@@ -152,11 +154,29 @@ class Preset:
 
 
 def _preset(
-    name: str, title: str, grade: str, document: str, rate: float, stated: dict[str, str], assumed: dict[str, str]
+    name: str,
+    title: str,
+    grade: str,
+    document: str,
+    checked: str,
+    rate: float,
+    stated: dict[str, str],
+    assumed: dict[str, str],
 ) -> tuple[str, Preset]:
     return name, Preset(
-        name=name, title=title, grade=grade, document=document, rate=rate, stated=stated, assumed=assumed
+        name=name,
+        title=title,
+        grade=grade,
+        document=document,
+        checked=checked,
+        rate=rate,
+        stated=stated,
+        assumed=assumed,
     )
+
+
+SHEET = "against the sheet"
+QUOTED = "against others who quote the sheet, and agree"
 
 
 PRESETS: dict[str, Preset] = dict(
@@ -165,7 +185,8 @@ PRESETS: dict[str, Preset] = dict(
             "mpu-9250",
             "InvenSense MPU-9250, ±250 °/s",
             "consumer MEMS",
-            "InvenSense PS-MPU-9250A-01, Product Specification, gyroscope specifications",
+            "InvenSense PS-MPU-9250A-01 rev. 1.0, Product Specification, table 1",
+            SHEET,
             200.0,
             {"arw": "0.01 deg/s/sqrt(Hz)", "range": "250 deg/s"},
             {
@@ -180,6 +201,7 @@ PRESETS: dict[str, Preset] = dict(
             "Bosch Sensortec BMI088, ±2000 °/s",
             "consumer MEMS",
             "Bosch Sensortec BST-BMI088-DS001, gyroscope specification",
+            QUOTED,
             400.0,
             {"arw": "0.014 deg/s/sqrt(Hz)", "range": "2000 deg/s"},
             {"bias_instability": "4 deg/h", "rrw": "30 deg/h/sqrt(h)", "turn_on_bias": "0.5 deg/s"},
@@ -189,6 +211,7 @@ PRESETS: dict[str, Preset] = dict(
             "Analog Devices ADIS16470",
             "industrial MEMS",
             "Analog Devices ADIS16470 Data Sheet Rev. C, features and specifications",
+            SHEET,
             500.0,
             {"arw": "0.008 deg/s/sqrt(Hz)", "bias_instability": "8 deg/h", "range": "2000 deg/s"},
             {"rrw": "30 deg/h/sqrt(h)", "turn_on_bias": "0.1 deg/s"},
@@ -198,6 +221,7 @@ PRESETS: dict[str, Preset] = dict(
             "Analog Devices ADIS16467-1",
             "industrial MEMS",
             "Analog Devices ADIS16467 Data Sheet, features",
+            SHEET,
             500.0,
             {
                 "arw": "0.15 deg/sqrt(h)",
@@ -212,6 +236,7 @@ PRESETS: dict[str, Preset] = dict(
             "Sensonor STIM300",
             "tactical MEMS",
             "Sensonor TS1524 rev. 9, STIM300 Datasheet",
+            SHEET,
             500.0,
             {
                 "arw": "0.15 deg/sqrt(h)",
@@ -228,33 +253,39 @@ PRESETS: dict[str, Preset] = dict(
             "Honeywell HG4930CA51",
             "tactical MEMS",
             "Honeywell HG4930 Inertial Measurement Unit data sheet, model CA51",
+            QUOTED,
             600.0,
-            {"arw": "0.04 deg/sqrt(h)", "bias_instability": "0.25 deg/h"},
-            {"rrw": "0.5 deg/h/sqrt(h)", "turn_on_bias": "7 deg/h", "range": "200 deg/s"},
+            {
+                "arw": "0.04 deg/sqrt(h)",
+                "bias_instability": "0.25 deg/h",
+                "turn_on_bias": "7 deg/h",
+                "range": "200 deg/s",
+            },
+            {"rrw": "0.5 deg/h/sqrt(h)"},
         ),
         _preset(
             "dsp-1760",
             "KVH DSP-1760",
             "fibre-optic",
             "KVH 54-0924 Rev. A, DSP-1760 Technical Manual, product specifications",
+            QUOTED,
             1000.0,
             {"arw": "0.012 deg/sqrt(h)", "bias_instability": "0.05 deg/h", "range": "490 deg/s"},
             {"rrw": "0.05 deg/h/sqrt(h)", "turn_on_bias": "2 deg/h"},
         ),
         _preset(
-            "gg1320an",
-            "Honeywell GG1320AN digital ring laser gyro",
+            "hg9900",
+            "Honeywell HG9900, ring laser gyros GG1320AN",
             "navigation, ring laser",
-            "Honeywell GG1320AN Digital Laser Gyro product sheet",
-            400.0,
-            {"arw": "0.0035 deg/sqrt(h)"},
+            "Honeywell N61-1638-000-000, HG9900 Inertial Measurement Unit brochure",
+            QUOTED,
+            300.0,
+            {"arw": "0.002 deg/sqrt(h)", "turn_on_bias": "0.0035 deg/h", "scale_factor": "5 ppm"},
             {
                 "bias_instability": "0.002 deg/h",
                 "rrw": "0.001 deg/h/sqrt(h)",
-                "turn_on_bias": "0.0035 deg/h",
                 "angle_resolution": "1 arcsec",
-                "scale_factor": "5 ppm",
-                "range": "900 deg/s",
+                "range": "400 deg/s",
             },
         ),
     ]

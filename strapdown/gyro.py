@@ -30,7 +30,7 @@ adis16467-1  1.013            1.361      0.966           1.040    1.037
 stim300      1.003            1.025      0.985           1.007    1.005
 hg4930       1.057            1.210      0.983           1.045    1.044
 dsp-1760     1.020            1.074      0.982           1.020    1.018
-gg1320an     1.013            1.014      1.011           1.013    1.014
+hg9900       1.003            1.009      1.001           1.007    1.009
 ===========  ===============  =========  ==============  =======  =========
 
 So: match it, or bound it where too small a covariance is not to be risked. The rms error is within 1.2 % of the augmented filter's.
