@@ -45,6 +45,7 @@ def main(*, samples: int = 1 << 19, sample_interval: float = 0.01, seed: int = 1
     fit = allan.fit_noise(record.increments, sample_interval, kind="increments")
     figures = []
     if out is not None:
+        out = Path(out)
         curves = allan.curves_by_axis(fit, deviation)
         figures.append(plots.save(plots.allan_overview(deviation, fit, curves), out / "allan.png"))
     truth = {term: float(np.max(getattr(TRUTH, term))) for term in allan.TERMS}

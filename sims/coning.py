@@ -85,6 +85,7 @@ def main(*, runs: int = 100, duration: float = 240.0, seed: int = 1, out: Path |
     # 7. The pictures.
     figures = []
     if out is not None:
+        out = Path(out)
         figure, ax = plots.new_figure(size=(7.0, 4.2))
         plots.drift_by_algorithm(drifts, ax)
         figures.append(plots.save(figure, out / "drift.png"))

@@ -257,6 +257,7 @@ def main(
     )
     if out is None:
         return Result(outcomes=outcomes, figures=())
+    out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     result = Result(outcomes=outcomes, figures=(draw(outcomes, out / "filter_family.png"),))
     (out / "filter_family.txt").write_text(table(result) + "\n", encoding="utf-8")

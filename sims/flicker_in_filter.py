@@ -77,6 +77,7 @@ def main(*, presets=tuple(datasheets.PRESETS), runs=40, duration=600.0, seed=1, 
     outcomes = tuple(judge(datasheets.preset(name), runs, duration, seed, rate) for name in presets)
     result = Result(outcomes=outcomes, runs=runs, duration=duration)
     if out is not None:
+        out = Path(out)
         from matplotlib.figure import Figure
 
         page = Figure(figsize=(9.0, 4.5), layout="constrained")

@@ -82,6 +82,7 @@ def main(*, preset="stim300", samples=1 << 20, rate=100.0, seed=1, out=None):
         bias=outputs["whole"].bias[thin],
     )
     if out is not None:
+        out = Path(out)
         from matplotlib.figure import Figure
 
         page = Figure(figsize=(11.0, 4.5), layout="constrained")
