@@ -1,0 +1,103 @@
+"""The coning study: drift by algorithm, and what it does to the filter."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from strapdown.coning_study import ConingStudy, Drift, FilterOutcome
+from strapdown.plots.estimates import errors_in_envelope
+from strapdown.plots.statistics import nees_over_time, nis_over_time
+from strapdown.plots.style import BLACK, SKY, axes_or_new, new_figure, save
+from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR
+
+
+def drift_by_algorithm(drifts: Sequence[Drift], ax: Axes | None = None) -> Axes:
+    """Draw the size of each algorithm's drift, measured and predicted, °/h on a log axis."""
+    ax = axes_or_new(ax)
+    places = np.arange(len(drifts))
+    measured = [abs(drift.measured) / DEGREE_PER_HOUR for drift in drifts]
+    predicted = [abs(drift.predicted) / DEGREE_PER_HOUR for drift in drifts]
+    ax.bar(places, measured, width=0.55, color=SKY, label="measured against the closed form")
+    ax.hlines(predicted, places - 0.36, places + 0.36, color=BLACK, linewidth=2, label="predicted by the formula")
+    rounding = 1e-6  # °/h: below it a drift is rounding of the run that measures it
+    for place, value, line in zip(places, measured, predicted, strict=True):
+        text = f"{value:.3g}" if value > rounding else "rounding"
+        ax.annotate(
+            text,
+            (place, max(value, np.nan_to_num(line), rounding)),
+            xytext=(0, 5),
+            textcoords="offset points",
+            ha="center",
+        )
+    ax.set_yscale("log")
+    shown = [x for x in (*measured, *predicted) if x > rounding]
+    ax.set_ylim(min(shown, default=rounding) / 4.0, max(shown, default=1.0) * 8.0)
+    ax.set_xticks(places, [drift.algorithm for drift in drifts])
+    ax.grid(visible=False, axis="x")
+    ax.set_ylabel("drift, °/h")
+    ax.legend(loc="upper right", frameon=False)
+    return ax
+
+
+def coning_errors(outcomes: Sequence[FilterOutcome]) -> Figure:
+    """Draw, for each integration algorithm, the errors about the cone's axis inside the filter's ±3σ: attitude above, bias below."""
+    figure, axes = new_figure(2, len(outcomes), size=(3.1 * len(outcomes), 5.2), sharex=True, squeeze=False)
+    for j, outcome in enumerate(outcomes):
+        s = outcome.statistics
+        for ax, state, unit in ((axes[0, j], 2, ARCSECOND), (axes[1, j], 5, DEGREE_PER_HOUR)):
+            errors_in_envelope(s.time, s.example_error[:, :, state] / unit, s.sigma[:, state] / unit, ax)
+        axes[0, j].set_title(f"{outcome.integration}: {'consistent' if outcome.consistent else 'NOT consistent'}")
+        late = s.sigma[len(s.time) // 10 :]
+        axes[0, j].set_ylim(-1.3 * 3.0 * late[:, 2].max() / ARCSECOND, 1.3 * 3.0 * late[:, 2].max() / ARCSECOND)
+        top = max(1.6 * 3.0 * late[:, 5].max(), 1.25 * float(np.abs(s.example_error[:, len(s.time) // 10 :, 5]).max()))
+        axes[1, j].set_ylim(-top / DEGREE_PER_HOUR, top / DEGREE_PER_HOUR)
+        axes[0, j].set_xlabel("")
+    axes[0, 0].set_ylabel("attitude error, arcsec")
+    axes[1, 0].set_ylabel("bias error, °/h")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
+    figure.suptitle(
+        "Errors about the cone's axis. Commutation error is a constant rate: the filter takes it for gyro bias."
+    )
+    return figure
+
+
+def coning_consistency(outcomes: Sequence[FilterOutcome]) -> Figure:
+    """Draw NEES of attitude and of bias and NIS over time for each integration algorithm, with the bounds of a right filter."""
+    figure, axes = new_figure(1, 3, size=(12.0, 4.2))
+    named = [(outcome.integration, outcome.statistics) for outcome in outcomes]
+    first = outcomes[0]
+    for ax, subset in zip(axes[:2], ("attitude", "bias"), strict=True):
+        nees_over_time(named, first.statistics.verdict(first.epochs, subset, first.probability).bounds, subset, ax)
+    low, high = axes[0].get_ylim()
+    axes[0].set_ylim(min(0.3, low), max(3.0, min(high, 30.0)))
+    nis_over_time(named, axes[2], probability=first.probability)
+    for ax, subset in zip(axes[:2], ("attitude", "bias"), strict=True):
+        passed = sum(o.statistics.verdict(o.epochs, subset, o.probability).consistent for o in outcomes)
+        ax.set_title(f"{subset.capitalize()}: {passed} of {len(outcomes)} pass at the judged epochs")
+    axes[2].set_title("Innovations")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
+    return figure
+
+
+def draw_coning_study(study: ConingStudy, folder: str | os.PathLike[str]) -> list[Path]:
+    """Write the figures of the coning study to a folder and return their paths."""
+    figure, ax = new_figure(size=(7.0, 4.2))
+    drift_by_algorithm(study.drifts, ax)
+    p = study.parameters
+    ax.set_title(
+        f"Coning {p.angle / DEGREE:g}° at {p.frequency:g} Hz, gyro at {p.rate:g} Hz ({p.rate / p.frequency:.3g} samples a cycle)"
+    )
+    target = Path(folder)
+    return [
+        save(figure, target / "drift.png"),
+        save(coning_errors(study.outcomes), target / "errors.png"),
+        save(coning_consistency(study.outcomes), target / "consistency.png"),
+    ]

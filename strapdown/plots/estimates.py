@@ -1,0 +1,76 @@
+"""One estimate over time: attitude, bias, σ, errors."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from strapdown import quaternion
+from strapdown.checks import Array
+from strapdown.consistency import ReferenceErrors
+from strapdown.plots.style import AXES, BLACK, BLUE, CYCLE, SKY, VERMILION, axes_or_new, new_figure
+from strapdown.records import Estimate
+from strapdown.units import DEGREE
+
+
+def errors_in_envelope(time: Array, error: Array, sigma: Array, ax: Axes | None = None) -> Axes:
+    """Draw errors (runs, m) over time inside ±3σ of the filter's own (m,); both in the unit of the axis that the caller labels."""
+    ax = axes_or_new(ax)
+    ax.fill_between(time, -3.0 * sigma, 3.0 * sigma, color=SKY, alpha=0.35, linewidth=0, label="±3σ of the filter")
+    ax.axhline(0.0, color=BLACK, linewidth=0.6)
+    for k, one in enumerate(error):
+        ax.plot(time, one, color=VERMILION, linewidth=0.8, alpha=0.8, label=f"{len(error)} runs" if k == 0 else None)
+    ax.set_xlabel("time, s")
+    return ax
+
+
+def estimate_overview(estimate: Estimate, *, title: str = "") -> Figure:
+    """Draw the attitude as roll, pitch and yaw, the gyro bias, and their standard deviations over time."""
+    figure, axes = new_figure(3, 1, size=(9.0, 7.5), sharex=True)
+    euler = quaternion.to_rotation(estimate.attitude).as_euler("ZYX", degrees=True)[:, ::-1]
+    for k, name in enumerate(("roll", "pitch", "yaw")):
+        # Breaks where the angle wraps, so that no line crosses the whole plot.
+        angle = np.where(np.abs(np.diff(euler[:, k], prepend=euler[0, k])) > 180.0, np.nan, euler[:, k])
+        axes[0].plot(estimate.time, angle, color=CYCLE[k], linewidth=0.9, label=name)
+    sigma = estimate.sigma
+    for k, name in enumerate(AXES):
+        bias, spread = estimate.bias[:, k] / DEGREE, 3.0 * sigma[:, 3 + k] / DEGREE
+        axes[1].fill_between(estimate.time, bias - spread, bias + spread, color=CYCLE[k], alpha=0.18, linewidth=0)
+        axes[1].plot(estimate.time, bias, color=CYCLE[k], linewidth=1.0, label=f"{name}, ±3σ")
+    axes[2].plot(estimate.time, np.linalg.norm(sigma[:, :3], axis=1) / DEGREE, color=BLACK, linewidth=1.0)
+    settled = slice(len(estimate.time) // 10, None)
+    reach = np.abs(estimate.bias[settled]).max() + 3.0 * sigma[settled, 3:].max()
+    axes[1].set_ylim(-1.2 * reach / DEGREE, 1.2 * reach / DEGREE)
+    axes[0].set_ylabel("attitude, °")
+    axes[1].set_ylabel("gyro bias, °/s")
+    axes[2].set_ylabel("attitude σ, all axes, °")
+    axes[2].set_ylim(bottom=0.0)
+    axes[2].set_xlabel("time, s")
+    for ax in axes[:2]:
+        ax.legend(loc="upper right", ncols=3, frameon=False)
+    axes[0].set_title(title)
+    return figure
+
+
+def recording_errors(time: Array, errors: ReferenceErrors, movement: np.ndarray | None = None) -> Figure:
+    """Draw total, heading and inclination errors against a reference over time, the movement phase shaded."""
+    figure, ax = new_figure(size=(9.0, 4.0))
+    mask = np.zeros(len(time), int) if movement is None else movement.astype(int)
+    inside = np.flatnonzero(np.diff(np.concatenate([[0], mask, [0]])))
+    for k, (first, last) in enumerate(inside.reshape(-1, 2)):
+        ax.axvspan(
+            time[first],
+            time[last - 1],
+            color=BLACK,
+            alpha=0.07,
+            linewidth=0,
+            label="movement (judged)" if k == 0 else None,
+        )
+    for name, color in (("total", BLACK), ("heading", BLUE), ("inclination", VERMILION)):
+        ax.plot(time, getattr(errors, name) / DEGREE, color=color, linewidth=0.9, label=name)
+    ax.set_ylim(bottom=0.0)
+    ax.set_xlabel("time, s")
+    ax.set_ylabel("error, °")
+    ax.legend(loc="upper left", ncols=4, frameon=False)
+    return figure
