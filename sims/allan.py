@@ -1,27 +1,42 @@
 """What noises does a gyro at rest have? Simulate a record, draw its Allan deviation, fit the coefficients, compare with the truth.
 
-The round trip of the gyro specification: what is put into the simulator must come back, within its interval. ``python sims/allan.py``.
+The round trip of the gyro specification: what is put into the simulator must come back, within its interval. ``python sims/allan.py``;
+``--study`` repeats it over 400 axes for records of several lengths and gyros of several random walks (two minutes) and counts how often
+the intervals hold the truth, and how large the errors are beside those expected.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from strapdown import allan, gyro, plots, units
+from strapdown.checks import Array
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
 
 TRUTH = GyroSpec(
-    quantization=0.35 * units.ARCSECOND,
+    quantization=0.3 * units.ARCSECOND,
     angle_random_walk=0.1 * units.DEGREE_PER_ROOT_HOUR,
     bias_instability=3.0 * units.DEGREE_PER_HOUR,
     rate_random_walk=60.0 * units.DEGREE_PER_HOUR_PER_ROOT_HOUR,
 )
 """A fibre-optic or good MEMS gyro, alike on all axes."""
+
+CASES = {
+    "5 min": (1 << 15, {}),
+    "22 min": (1 << 17, {}),
+    "87 min": (1 << 19, {}),
+    "22 min, weak K": (1 << 17, {"rate_random_walk": 20.0 * units.DEGREE_PER_HOUR_PER_ROOT_HOUR}),
+    "22 min, strong K": (1 << 17, {"rate_random_walk": 180.0 * units.DEGREE_PER_HOUR_PER_ROOT_HOUR}),
+    "22 min, strong B": (1 << 17, {"bias_instability": 10.0 * units.DEGREE_PER_HOUR}),
+}
+"""Records of the study: samples at 100 Hz, and what differs from the truth above."""
 
 SMALL = {"samples": 1 << 15}
 """Arguments of a run that only shows that the script works."""
@@ -37,33 +52,110 @@ class Result:
     figures: tuple[Path, ...]
 
 
-def main(*, samples: int = 1 << 19, sample_interval: float = 0.01, seed: int = 1, out: Path | None = None) -> Result:
-    """Simulate a gyro at rest, identify it, and draw it into ``out`` if that is given."""
+@dataclass(frozen=True, kw_only=True)
+class Study:
+    """Many fits of one gyro, by axis and term."""
+
+    truth: dict[str, float]
+    covered: Array
+    """Whether the interval holds the truth (axes, terms)."""
+    supported: Array
+    estimate: Array
+    """NaN where not supported."""
+    expected: dict[str, float]
+    """Standard errors by :func:`strapdown.allan.expected_errors`, of the terms that are there."""
+    misfit_probability: Array
+
+    def relative_rms(self, term: str) -> float:
+        """Return the rms error over the truth, of the fits that support the term."""
+        error = self.estimate[:, allan.TERMS.index(term)] / self.truth[term] - 1.0
+        return float(np.sqrt(np.nanmean(error**2)))
+
+
+def coefficients(spec: GyroSpec) -> dict[str, float]:
+    """Return the coefficients of a gyro whose axes are alike."""
+    return {term: float(np.max(getattr(spec, term))) for term in allan.TERMS}
+
+
+def rest_increments(spec: GyroSpec, samples: int, sample_interval: float, seed: int, run: int = 0) -> Array:
+    """Return what such a gyro measures at rest (samples, 3), rad."""
     edges = np.arange(samples + 1) * sample_interval
-    record = gyro.simulate(TRUTH, np.zeros((samples, 3)), edges, generator(seed, 0, "gyro"))
-    deviation = allan.allan_deviation(record.increments, sample_interval, kind="increments")
-    fit = allan.fit_noise(record.increments, sample_interval, kind="increments")
+    return gyro.simulate(spec, np.zeros((samples, 3)), edges, generator(seed, run, "gyro")).increments
+
+
+def main(
+    *, samples: int = 1 << 19, sample_interval: float = 0.01, seed: int = 1, out: str | Path | None = None
+) -> Result:
+    """Simulate a gyro at rest, identify it, and draw it into ``out`` if that is given."""
+    increments = rest_increments(TRUTH, samples, sample_interval, seed)
+    deviation = allan.allan_deviation(increments, sample_interval, kind="increments")
+    fit = allan.fit_noise(increments, sample_interval, kind="increments")
     figures = []
     if out is not None:
-        out = Path(out)
         curves = allan.curves_by_axis(fit, deviation)
-        figures.append(plots.save(plots.allan_overview(deviation, fit, curves), out / "allan.png"))
-    truth = {term: float(np.max(getattr(TRUTH, term))) for term in allan.TERMS}
-    return Result(truth=truth, deviation=deviation, fit=fit, figures=tuple(figures))
+        figures.append(plots.save(plots.allan_overview(deviation, fit, curves), Path(out) / "allan.png"))
+    return Result(truth=coefficients(TRUTH), deviation=deviation, fit=fit, figures=tuple(figures))
+
+
+def study(spec: GyroSpec, *, samples: int, runs: int, sample_interval: float = 0.01, seed: int = 1) -> Study:
+    """Simulate and fit ``runs`` records of three axes each."""
+    truth = coefficients(spec)
+    wanted = np.array(list(truth.values()))
+    fits = [
+        allan.fit_noise(rest_increments(spec, samples, sample_interval, seed, run), sample_interval, kind="increments")
+        for run in range(runs)
+    ]
+    lower, upper = np.concatenate([f.lower for f in fits]), np.concatenate([f.upper for f in fits])
+    return Study(
+        truth=truth,
+        covered=(lower <= wanted) & (wanted <= upper),
+        supported=np.concatenate([f.supported for f in fits]),
+        estimate=np.concatenate([f.estimate for f in fits]),
+        expected=allan.expected_errors(truth, samples, sample_interval),
+        misfit_probability=np.concatenate([f.misfit_probability for f in fits]),
+    )
+
+
+def case(name: str, runs: int) -> Study:
+    """Return the study of one of :data:`CASES`."""
+    samples, changes = CASES[name]
+    return study(dataclasses.replace(TRUTH, **changes), samples=samples, runs=runs)
+
+
+def lines(name: str, result: Study) -> list[str]:
+    """Return the study as a table."""
+    rows = [f"{name}: {len(result.covered)} axes"]
+    for i, term in enumerate(allan.TERMS):
+        if result.truth[term] > 0.0:
+            rows.append(
+                f"  {term:20s} covered {100 * result.covered[:, i].mean():5.1f} %   seen {100 * result.supported[:, i].mean():5.1f} %   "
+                f"rms error {100 * result.relative_rms(term):5.1f} %, expected {100 * result.expected[term] / result.truth[term]:5.1f} %"
+            )
+    return rows
+
+
+def print_fit(fit: allan.NoiseFit, truth: Mapping[str, float]) -> None:
+    """Print the intervals beside the truth."""
+    for row in allan.table(fit):
+        term = str(row["term"])
+        interval = (
+            f"{row['lower']:.4g} to {row['upper']:.4g}" if row["supported"] else f"not seen, below {row['upper']:.4g}"
+        )
+        print(
+            f"{'xyz'[row['axis']]} {term:20s} {interval:28s} {row['unit']:10s} truth {truth[term] / allan.UNITS[term][1]:.4g}"
+        )
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("results/allan"))
+    parser.add_argument("--study", action="store_true", help="count how often the intervals hold the truth")
     arguments = parser.parse_args()
-    result = main(seed=arguments.seed, out=arguments.out)
-    for row in allan.table(result.fit):
-        term = str(row["term"])
-        interval = (
-            f"{row['lower']:.4g} to {row['upper']:.4g}" if row["supported"] else f"not seen, below {row['upper']:.4g}"
-        )
-        print(
-            f"{'xyz'[row['axis']]} {term:20s} {interval:28s} {row['unit']:10s} truth {result.truth[term] / allan.UNITS[term][1]:.4g}"
-        )
-    print("figures:", *result.figures)
+    if arguments.study:
+        for each in CASES:
+            print(*lines(each, case(each, 134)), sep="\n", flush=True)
+    else:
+        found = main(seed=arguments.seed, out=arguments.out)
+        print_fit(found.fit, found.truth)
+        print("figures:", *found.figures)

@@ -308,7 +308,7 @@ def read_gyro(
                 f"{file.name} cannot be read as an array ({error}); the file is truncated or of another kind"
             ) from None
         factor = RATE_UNITS[one_of(f"{file.name}: unit of the gyro", given["gyro"], RATE_UNITS)]
-        columns = array(file.name, values if values.ndim == 2 else np.reshape(values, (-1, 1)), ("n", "axes"))
+        columns = array(file.name, np.reshape(values, (-1, 1)) if np.ndim(values) == 1 else values, ("n", "axes"))
         return GyroSamples(
             values=columns * factor, sample_interval=1.0 / positive("rate", rate, unit="Hz"), kind="rate"
         )

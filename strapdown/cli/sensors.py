@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from strapdown.cli.terminal import app, console, progress_bar, show, table, written
+
+if TYPE_CHECKING:
+    from strapdown import allan as identification
 
 
 @app.command()
@@ -74,6 +77,10 @@ def allan(
     rate: Annotated[float | None, typer.Option(help="Samples a second, Hz; for NPY.")] = None,
     gyro_unit: Annotated[str | None, typer.Option(help="Unit of a CSV or NPY file's gyro: rad/s or deg/s.")] = None,
     time_unit: Annotated[str | None, typer.Option(help="Unit of a CSV file's time: s, ms, us or ns.")] = None,
+    highest_frequency: Annotated[
+        float | None,
+        typer.Option(help="Hz; the fit leaves out what lies above: a low-pass filter's shape, vibration."),
+    ] = None,
     robust: Annotated[
         bool, typer.Option(help="Draw the deviation by medians, which stands outliers; the fit stays as it is.")
     ] = False,
@@ -82,28 +89,37 @@ def allan(
     """Identify a gyro's noise from a recording at rest: Allan deviation, fitted coefficients, specification as TOML."""
     import math
 
-    import tomli_w
-
     from strapdown import allan as identification
-    from strapdown import gyro, plots, recordings
+    from strapdown import plots, recordings
+    from strapdown.checks import InputError
     from strapdown.files import usable_folder, write_json, written_beside
 
     given = {"gyro": gyro_unit, "time": time_unit}
     usable_folder("out", out)
+    if recording.is_dir():
+        raise InputError(f"{recording} is a folder; name a file")
     source = recordings.read_gyro(recording, rate=rate, units={name: unit for name, unit in given.items() if unit})
-    with progress_bar("deviation, fit, figure", 3) as advance:
-        deviation = identification.allan_deviation(
-            source.values, source.sample_interval, kind=source.kind, estimator="robust" if robust else "overlapping"
+    if source.values.shape[1] not in (1, 3):
+        raise InputError(
+            f"{recording.name} has {source.values.shape[1]} columns; a gyro has three axes, or pass one column, (n,) or (n, 1)"
         )
-        advance(1)
-        fit = identification.fit_noise(source.values, source.sample_interval, kind=source.kind)
-        advance(1)
-        figure = plots.allan_overview(deviation, fit, identification.curves_by_axis(fit, deviation))
-        advance(1)
+    try:
+        with progress_bar("fit, deviation, figure", 3) as advance:
+            fit = identification.fit_noise(
+                source.values, source.sample_interval, kind=source.kind, highest_frequency=highest_frequency
+            )
+            advance(1)
+            deviation = identification.allan_deviation(
+                source.values, source.sample_interval, kind=source.kind, estimator="robust" if robust else "overlapping"
+            )
+            advance(1)
+            figure = plots.allan_overview(deviation, fit, identification.curves_by_axis(fit, deviation))
+            advance(1)
+    except InputError as error:
+        raise InputError(f"{recording.name}: {error}") from None
     hours = len(source.values) * source.sample_interval / 3600.0
-    console.print(
-        f"{recording.name}: {len(source.values)} samples at {1.0 / source.sample_interval:g} Hz, {hours:.3g} h."
-    )
+    length = f"{len(source.values)} samples at {1.0 / source.sample_interval:.6g} Hz, {hours:.3g} h"
+    console.print(f"{recording.name}: {length}.", highlight=False)
     rows = identification.table(fit)
     listing = table("Noise coefficients with 95 % intervals", "axis", "term", "unit", "estimate", "from", "to", left=3)
     for row in rows:
@@ -119,26 +135,81 @@ def allan(
         )
     show(listing)
     console.print("Of a term not seen in this record, the last column bounds what it could hide.")
-    for axis, probability in enumerate(fit.misfit_probability):
-        if probability < 1e-3:
-            console.print(
-                f"axis {'xyz'[axis]}: the record holds something that no such noise explains (probability {probability:.1g}): "
-                "motion, a vibration line, a filter, outliers. Do not believe its intervals."
-            )
-    parameters: dict[str, Any] = dict(identification.to_gyro_parameters(fit))
-    spec = gyro.GyroSpec(**parameters)
+    warnings = [
+        f"axis {'xyz'[axis]} holds more than such noises: {what} (probability {max(probability, 1e-99):.0e})"
+        for axis, (probability, what) in enumerate(zip(fit.misfit_probability, fit.misfit, strict=True))
+        if probability < identification.MISFIT_PROBABILITY
+    ]
     with written_beside(out / "gyro.toml") as temporary:
-        temporary.write_text(tomli_w.dumps({"gyro": gyro.to_table(spec)}), encoding="utf-8")
+        temporary.write_text(_specification(fit, f"{recording.name}, {length}", warnings), encoding="utf-8")
     number = lambda value: None if isinstance(value, float) and not math.isfinite(value) else value  # noqa: E731
     write_json(
         out / "allan.json",
         {
             "source": recording.name,
             "sample_interval_s": source.sample_interval,
+            "level": fit.level,
             "coefficients": [{key: number(value) for key, value in row.items()} for row in rows],
             "misfit_probability": [float(p) for p in fit.misfit_probability],
+            "misfit": list(fit.misfit),
+            "estimator": deviation.estimator,
             "tau_s": [float(tau) for tau in deviation.taus],
             "deviation_rad_per_s": [[number(float(x)) for x in axis] for axis in deviation.deviation],
         },
     )
     written(out / "gyro.toml", out / "allan.json", plots.save(figure, out / "allan.png"))
+    for warning in warnings:
+        console.print(f"warning: {warning}", highlight=False)
+    if warnings:
+        console.print("Cut the recording to where the gyro rests, or leave a filter's band out by --highest-frequency.")
+        console.print(f"warning: {_DISBELIEF}.", highlight=False)
+
+
+_DISBELIEF = "do not believe these intervals, nor gyro.toml"
+
+
+def _specification(fit: identification.NoiseFit, source: str, warnings: list[str]) -> str:
+    """Return the text of gyro.toml: the terms seen, and in comments the bounds of those not seen, and the warnings."""
+    import numpy as np
+    import tomli_w
+
+    from strapdown import allan as identification
+    from strapdown import gyro
+
+    rounded: dict[str, Any] = {}  # six digits of the unit that is written: an estimate has no more
+    for term, value in identification.to_gyro_parameters(fit).items():
+        factor = gyro.FORM[term][0][1]
+        rounded[term] = np.array([float(f"{x / factor:.6g}") * factor for x in np.atleast_1d(value)]).reshape(
+            np.shape(value)
+        )
+    spec = gyro.GyroSpec(**rounded)
+    lines = [f"Gyro noise by `strapdown allan` from {source}."]
+    lines += [f"WARNING: {warning}." for warning in warnings]
+    if warnings:
+        lines.append(f"WARNING: {_DISBELIEF}.")
+    text = _commented(lines) + "\n" + tomli_w.dumps({"gyro": gyro.to_table(spec)})
+    partly, wholly = [], []
+    for term, bound in identification.upper_bounds(fit).items():
+        suffix, factor = gyro.FORM[term][0]
+        values = [bound] if isinstance(bound, float) else list(bound)
+        seen = fit.supported[:, fit.terms.index(term)]
+        if seen.any():
+            told = ", ".join(f"{'xyz'[k]} below {values[k] / factor:.4g}" for k in range(len(values)) if not seen[k])
+            partly.append(f"{term}_{suffix}: 0 where not seen, {told}.")
+        else:
+            shown = ", ".join(f"{value / factor:.4g}" for value in values)
+            wholly.append(f"{term}_{suffix} = {shown if len(values) == 1 else f'[{shown}]'}")
+    if partly or wholly:
+        text += "\n" + _commented(
+            [
+                f"Not seen in the record, so left out; the upper ends of their {100 * fit.level:g} % intervals:",
+                *partly,
+                *wholly,
+            ]
+        )
+    return text
+
+
+def _commented(lines: list[str]) -> str:
+    """Return lines as comments of TOML, which may hold no control characters; a file's name may."""
+    return "".join(f"# {''.join(c if c.isprintable() else '?' for c in line)}\n" for line in lines)

@@ -21,18 +21,19 @@ def accumulate(rate, mean, phase):
         phase[k + 1] = high + low
 
 
-def second_difference_squares(phase, multiples, lanes, squares):
-    """Fill squares with Σ (x[k + 2m] − 2 x[k + m] + x[k])² over all k, for each m of multiples; ``lanes`` is scratch.
+def second_difference_squares(phase, multiples, lanes, carries, squares):
+    """Fill squares with Σ (x[k + 2m] − 2 x[k + m] + x[k])² over all k, for each m of multiples.
 
-    The record is passed once in stretches that stay in the cache while every m works on them. Every lane sums every len(lanes)-th
-    square of a stretch, so that the inner loop has no order to keep and runs at vector width; the stretches are summed with
-    compensation (Kahan). The rounding error stays at a few units in the last place for any length.
+    ``lanes`` and ``carries``, one a multiple, are scratch. The record is passed once in stretches that stay in the cache while every m
+    works on them. Every lane sums every len(lanes)-th square of a stretch, so that the inner loop has no order to keep and runs at
+    vector width; the stretches are summed with compensation (Kahan). The rounding error stays at a few units in the last place for any
+    length.
     """
     width = lanes.shape[0]
     stretch = 32 * width
-    carries = [0.0 for _ in multiples]
     for j in range(multiples.shape[0]):
         squares[j] = 0.0
+        carries[j] = 0.0
     for first in range(0, phase.shape[0], stretch):
         for j in range(multiples.shape[0]):
             m = multiples[j]
