@@ -49,7 +49,7 @@ SMALL = {"runs": 6, "unscented_runs": 1, "duration": 20.0}
 
 COLOURS = {
     "mekf": plots.BLUE,
-    "fixed-side": plots.BLACK,
+    "fixed-side": plots.ink(),
     "right-invariant": plots.VERMILION,
     "two-frame": plots.ORANGE,
     "geometric": plots.SKY,

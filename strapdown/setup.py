@@ -22,7 +22,9 @@ from strapdown.scenarios import Scenario, simulate
 from strapdown.vectors import VectorMeasurements
 
 ATTITUDE_SIGMA = 1.0 * units.DEGREE
-"""Standard deviation of the initial attitude error where nobody says, each axis, rad."""
+"""Standard deviation of the initial attitude error where nobody says, each axis, rad; less where the sensors are very fine."""
+LINEAR_SHARE = 0.2
+"""The second-order error of a first measurement, half the square of the initial error, may be about this share of half its σ."""
 LEAST_BIAS_SIGMA = 0.1 * units.DEGREE_PER_HOUR
 """Standard deviation of the initial bias error of a gyro whose specification tells of no bias, rad/s."""
 
@@ -53,17 +55,19 @@ class FilterSetup:
         object.__setattr__(self, "sigma", believed_sigma)
 
 
-def matched(scenario: Scenario, *, attitude_sigma: float = ATTITUDE_SIGMA) -> FilterSetup:
+def matched(scenario: Scenario, *, attitude_sigma: float | None = None) -> FilterSetup:
     """Return what a right filter believes of a scenario: the noise of its gyro, and of its sensors what they say of themselves."""
     return matched_to_record(scenario.gyro, simulate(scenario), attitude_sigma=attitude_sigma)
 
 
-def matched_to_record(spec: GyroSpec, record: ImuRecord, *, attitude_sigma: float = ATTITUDE_SIGMA) -> FilterSetup:
+def matched_to_record(spec: GyroSpec, record: ImuRecord, *, attitude_sigma: float | None = None) -> FilterSetup:
     """Return what a right filter believes of a record of a gyro of this specification.
 
     Flicker, which no random walk is, is matched in the attitude at the record's rate and quality of measurements
     (:func:`strapdown.gyro.matched_process_noise`); without measurements it is bounded over the record's length. Errors that the filter
-    has no state for (scale factor, misalignment, quantisation, hard iron) are not covered.
+    has no state for (scale factor, misalignment, quantisation, hard iron) are not covered. Without ``attitude_sigma``, rad, the start is
+    known to 1°, or so much better that the first measurement of the finest sensor is still linear in its error: an extended filter's
+    covariance is not to be believed beyond that.
     """
     noise = _noise(spec, record)
     walk = np.max(np.square(spec.bias_instability) * np.log(1e3)) / np.pi  # flicker over three decades of time
@@ -77,9 +81,21 @@ def matched_to_record(spec: GyroSpec, record: ImuRecord, *, attitude_sigma: floa
     spread = np.max(np.square(spec.turn_on_bias) + np.square(spec.turn_on_bias_sigma) + stationary) + walk
     return FilterSetup(
         process_noise=ProcessNoise(**noise),
-        attitude_sigma=attitude_sigma,
+        attitude_sigma=_linear_sigma(record) if attitude_sigma is None else attitude_sigma,
         bias_sigma=float(max(np.sqrt(spread), LEAST_BIAS_SIGMA)),
     )
+
+
+def _linear_sigma(record: ImuRecord) -> float:
+    finest = min((_finest(series) for series in record.vectors if len(series.time)), default=np.inf)
+    return float(min(ATTITUDE_SIGMA, np.sqrt(LINEAR_SHARE * finest))) if finest > 0.0 else ATTITUDE_SIGMA
+
+
+def _finest(series: VectorMeasurements) -> float:
+    """Return the least σ of a series, rad."""
+    if series.kind == "vector":
+        return float(np.min(series.sigma / np.linalg.norm(series.references_f, axis=1)))
+    return float(np.min(series.sigma if series.sigma_axes is None else series.sigma_axes))
 
 
 def _noise(spec: GyroSpec, record: ImuRecord) -> dict[str, float]:

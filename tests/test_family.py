@@ -605,9 +605,6 @@ def test_bad_input_is_refused():
     attitude = VectorMeasurements(
         sensor="tracker", kind="attitude", time=[0.1], attitude=[[1.0, 0.0, 0.0, 0.0]], sigma_axes=[1e-4] * 3
     )
-    moving = VectorMeasurements(
-        sensor="field", kind="direction", time=[0.1], vector_b=[[1.0, 0, 0]], reference_f=[[1.0, 0, 0]], sigma=0.1
-    )
     exact = VectorMeasurements(
         sensor="sun", kind="direction", time=[0.1], vector_b=[[1.0, 0, 0]], reference_f=[1.0, 0, 0], sigma=0.0
     )
@@ -616,7 +613,6 @@ def test_bad_input_is_refused():
             family.run(name, record, BELIEF, initial, every=0)
         for series, message in (
             (attitude, r"tracker.*attitude"),
-            (moving, "field: reference_f"),
             (exact, "sun: sigma"),
         ):
             wrong = ImuRecord(time=record.time, increments=record.increments, vectors=(series,))
@@ -624,9 +620,26 @@ def test_bad_input_is_refused():
                 family.run(name, wrong, BELIEF, initial)
     with pytest.raises(InputError, match="6"):
         unscented.run(record, BELIEF, initial, points=JulierSigmaPoints(3, kappa=0.0))
+    moving = VectorMeasurements(
+        sensor="field", kind="direction", time=[0.1], vector_b=[[1.0, 0, 0]], reference_f=[[1.0, 0, 0]], sigma=0.1
+    )
+    with pytest.raises(InputError, match="field: reference_f"):
+        family.run("mahony", dataclasses.replace(record, vectors=(moving,)), BELIEF, initial)
     gains = complementary.Gains(attitude=np.zeros(2), bias=np.zeros(2))
     with pytest.raises(InputError, match=r"gains\.attitude"):
         complementary.run(record, BELIEF, initial, gains=gains)
+
+
+@pytest.mark.parametrize("name", [name for name in family.FILTERS if name != "mahony"])
+def test_a_reference_for_each_measurement_is_taken_as_it_is(name):
+    rng = np.random.default_rng(22)
+    record = simulated(rng, intervals=20, measurements=5)
+    initial = started(record, rng, attitude_sigma=0.1, bias_sigma=1e-3)
+    each = tuple(dataclasses.replace(series, reference_f=series.references_f.copy()) for series in record.vectors)
+    one = family.run(name, record, BELIEF, initial)
+    other = family.run(name, dataclasses.replace(record, vectors=each), BELIEF, initial)
+    assert np.allclose(one.attitude, other.attitude, rtol=0.0, atol=1e-12)
+    assert np.allclose(one.bias, other.bias, rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", family.FILTERS)

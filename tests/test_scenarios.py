@@ -44,6 +44,7 @@ def test_the_built_in_ones_are_those_asked_for():
         "slew-vibration",
         "tumbling-satellite",
         "low-orbit",
+        "magnetometer-only",
         "hand-held",
     }
     rows = scenarios.builtin_rows()

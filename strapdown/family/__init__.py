@@ -74,7 +74,7 @@ def run(
     name : str
         One of :data:`FILTERS`.
     record : ImuRecord
-        Measurements are directions, vectors or headings, each series with one constant reference (``mekf`` takes what it takes).
+        Measurements are directions, vectors or headings (``mekf`` takes what it takes); of ``mahony`` with one constant reference a series.
     process_noise : ProcessNoise
     initial : State
         State at the first edge, body side.

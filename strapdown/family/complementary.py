@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from strapdown import mekf
-from strapdown.checks import Array, array
+from strapdown.checks import Array, InputError, array
 from strapdown.family import stepping
 from strapdown.kernels import family_complementary
 from strapdown.kernels.machine import compiled
@@ -93,6 +93,12 @@ def run(
     gains : Gains, optional
         Default: :func:`steady_gains`.
     """
+    for series in record.vectors:
+        if series.reference_f.ndim > 1:  # the gains are one a reference
+            raise InputError(
+                f"{series.sensor}: reference_f has shape {series.reference_f.shape}; this filter takes one reference (3,) a series; "
+                "use mekf.run"
+            )
     events, steps = stepping.events_and_steps(record, every)
     chosen = _steady_gains(record, events, process_noise, initial) if gains is None else gains
     sensors = len(events.sensors)

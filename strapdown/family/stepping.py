@@ -44,7 +44,7 @@ def events_and_steps(record: ImuRecord, every: int) -> tuple[Schedule, Steps]:
     Parameters
     ----------
     record : ImuRecord
-        Measurements of the kinds :data:`MEASUREMENTS`, each series with one reference.
+        Measurements of the kinds :data:`MEASUREMENTS`.
     every : int
         Keep the state at every ``every``-th edge, the first included.
     """
@@ -53,11 +53,6 @@ def events_and_steps(record: ImuRecord, every: int) -> tuple[Schedule, Steps]:
         if series.kind not in MEASUREMENTS:
             raise InputError(
                 f"{series.sensor}: the family's filters take {', '.join(MEASUREMENTS)}, not {series.kind!r}; use mekf.run"
-            )
-        if series.reference_f.ndim > 1:
-            raise InputError(
-                f"{series.sensor}: reference_f has shape {series.reference_f.shape}; the family's filters take one reference (3,) "
-                "a series; use mekf.run"
             )
     edges = record.time
     events = mekf.schedule(record.vectors, edges[0], edges[-1])

@@ -11,7 +11,6 @@ from strapdown.allan import AllanDeviation, NoiseFit
 from strapdown.checks import Array
 from strapdown.plots.style import (
     AXES,
-    BLACK,
     BLUE,
     GREEN,
     ORANGE,
@@ -20,6 +19,7 @@ from strapdown.plots.style import (
     VERMILION,
     YELLOW,
     axes_or_new,
+    ink,
     new_figure,
 )
 from strapdown.units import DEGREE_PER_HOUR
@@ -36,7 +36,7 @@ def allan_axis(
         deviation.taus, *band, color=SKY, alpha=0.5, linewidth=0, label=f"{100 * deviation.level:.0f} % band"
     )
     ax.loglog(deviation.taus, deviation.deviation[axis] / scale, "o", color=BLUE, markersize=2.5, label="measured")
-    ax.loglog(deviation.taus, curves["total"] / scale, color=BLACK, linewidth=1.4, label="fit")
+    ax.loglog(deviation.taus, curves["total"] / scale, color=ink(), linewidth=1.4, label="fit")
     colors = dict(zip(fit.terms, (PURPLE, VERMILION, GREEN, ORANGE, YELLOW), strict=False))
     for i, term in enumerate(fit.terms):
         if fit.supported[axis, i]:
@@ -63,6 +63,8 @@ def allan_overview(deviation: AllanDeviation, fit: NoiseFit, curves: Sequence[Ma
         ax = allan_axis(deviation, fit, curves[axis], axis, axes[0, axis])
         ax.set_title(AXES[axis])
         ax.set_ylabel("Allan deviation, °/h" if axis == 0 else "")
+    drawn = deviation.deviation[deviation.deviation > 0.0] / DEGREE_PER_HOUR
+    axes[0, 0].set_ylim(0.2 * drawn.min(), 3.0 * drawn.max())  # shared: the last axis alone would cut the others off
     handles = {label: handle for ax in axes[0] for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, frameon=False)
     return figure

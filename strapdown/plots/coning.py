@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from strapdown.coning_study import ConingStudy, Drift, FilterOutcome
 from strapdown.plots.estimates import errors_in_envelope
 from strapdown.plots.statistics import nees_over_time, nis_over_time
-from strapdown.plots.style import BLACK, SKY, axes_or_new, new_figure, save
+from strapdown.plots.style import SKY, axes_or_new, ink, new_figure, save
 from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR
 
 
@@ -24,7 +24,7 @@ def drift_by_algorithm(drifts: Sequence[Drift], ax: Axes | None = None) -> Axes:
     measured = [abs(drift.measured) / DEGREE_PER_HOUR for drift in drifts]
     predicted = [abs(drift.predicted) / DEGREE_PER_HOUR for drift in drifts]
     ax.bar(places, measured, width=0.55, color=SKY, label="measured against the closed form")
-    ax.hlines(predicted, places - 0.36, places + 0.36, color=BLACK, linewidth=2, label="predicted by the formula")
+    ax.hlines(predicted, places - 0.36, places + 0.36, color=ink(), linewidth=2, label="predicted by the formula")
     rounding = 1e-6  # °/h: below it a drift is rounding of the run that measures it
     for place, value, line in zip(places, measured, predicted, strict=True):
         text = f"{value:.3g}" if value > rounding else "rounding"

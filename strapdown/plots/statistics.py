@@ -1,15 +1,19 @@
-"""Error statistics over many runs and over one record."""
+"""Error statistics over many runs."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.patches import Ellipse
 
+from strapdown.checks import Array
 from strapdown.consistency import mean_bounds
 from strapdown.montecarlo import Statistics
-from strapdown.plots.style import BLACK, axes_or_new, layered
+from strapdown.montecarlo.statistics import COVERED
+from strapdown.plots.style import AXES, CYCLE, SKY, VERMILION, angle_unit, axes_or_new, ink, layered, rate_unit
 
 
 def nees_over_time(
@@ -18,7 +22,7 @@ def nees_over_time(
     """Draw the ANEES of a ``subset`` ("state", "attitude", "bias") at each epoch with its bounds, on a log axis."""
     ax = axes_or_new(ax)
     column = ("state", "attitude", "bias").index(subset)
-    ax.axhspan(*bounds, color=BLACK, alpha=0.12, linewidth=0, label="bounds of a right filter")
+    ax.axhspan(*bounds, color=ink(), alpha=0.12, linewidth=0, label="bounds of a right filter")
     for k, (name, statistics) in enumerate(named):
         ax.plot(statistics.time, statistics.anees[:, column], label=name, **layered(k, len(named)))
     ax.set_yscale("log")
@@ -38,8 +42,121 @@ def nis_over_time(
     first = named[0][1]
     typical = round(float(np.median(first.nis_degrees[first.nis_degrees > 0]) * first.runs))
     ax.axhspan(
-        *mean_bounds(1, typical, probability), color=BLACK, alpha=0.12, linewidth=0, label="bounds of a right filter"
+        *mean_bounds(1, typical, probability), color=ink(), alpha=0.12, linewidth=0, label="bounds of a right filter"
     )
     ax.set_xlabel("time, s")
     ax.set_ylabel("NIS per degree of freedom")
+    return ax
+
+
+STATES = tuple(f"{what} {axis}" for what in ("attitude", "bias") for axis in AXES)
+"""Names of the six states of the error (δθ, δb)."""
+
+
+def state_unit(state: int, value: Array) -> tuple[str, float]:
+    """Return the unit that an error of this size of a state (0 to 5) is read in."""
+    return angle_unit(value) if state < 3 else rate_unit(value)
+
+
+def fan(statistics: Statistics, state: int, ax: Axes | None = None) -> Axes:
+    """Draw, over time, what share of the runs has |error| of a ``state`` (0 to 5) below each line, beside what the filter expects.
+
+    Bands: the runs, 50, 90 and 99 %. Lines: the same shares of a normal error of the filter's own σ.
+    """
+    ax = axes_or_new(ax)
+    shares = ((0.99, 2.5758), (0.9, 1.6449), (0.5, 0.6745))
+    settled = max(1, len(statistics.time) // 20)
+    quantiles = [statistics.error_quantile(share)[:, state] for share, _ in shares]
+    unit, size = state_unit(state, quantiles[0][settled:])
+    for k, ((share, normal), quantile) in enumerate(zip(shares, quantiles, strict=True)):
+        ax.fill_between(
+            statistics.time,
+            0.0,
+            quantile / size,
+            color=SKY,
+            alpha=(0.25, 0.45, 0.7)[k],
+            linewidth=0,
+            label=f"{100 * share:g} % of the runs",
+        )
+        ax.plot(
+            statistics.time,
+            normal * statistics.sigma[:, state] / size,
+            color=VERMILION,
+            linewidth=(0.8, 1.1, 1.4)[k],
+            linestyle=(":", "--", "-")[k],
+            label=f"{100 * share:g} % as the filter expects",
+        )
+    top = max(float(np.nanmax(quantiles[0][settled:])), 2.6 * float(statistics.sigma[settled:, state].max()))
+    ax.set_ylim(0.0, 1.5 * top / size)
+    ax.set_xlabel("time, s")
+    ax.set_ylabel(f"|error| of {STATES[state]}, {unit}")
+    ax.legend(loc="upper right", ncols=2)
+    return ax
+
+
+def coverage_by_state(statistics: Statistics, epoch: int = -1, ax: Axes | None = None) -> Axes:
+    """Draw what share of the runs lies inside 1, 2 and 3 σ at one epoch, by state, with the 99 % binomial bounds of a right filter."""
+    from scipy.stats import binom
+
+    ax = axes_or_new(ax)
+    runs = int(statistics.finite[epoch])
+    for k, expected in enumerate(COVERED):
+        low, high = binom.ppf([0.005, 0.995], runs, expected) / runs
+        ax.axhspan(100 * low, 100 * high, color=CYCLE[k], alpha=0.2, linewidth=0)
+        ax.plot(
+            range(6),
+            100 * statistics.covered[epoch, :, k],
+            "o",
+            color=CYCLE[k],
+            label=f"inside {k + 1} σ; band: {100 * expected:.1f} % of a right filter",
+        )
+    ax.set_xticks(range(6), STATES, rotation=20)
+    ax.grid(visible=False, axis="x")
+    ax.set_ylim(0.0, 104.0)
+    ax.set_ylabel(f"share of {runs} runs, %")
+    ax.legend(loc="lower left")
+    return ax
+
+
+def covariance_ellipses(
+    claimed: Array, found: Array, pair: tuple[int, int] = (0, 1), ax: Axes | None = None, *, probability: float = 0.95
+) -> Axes:
+    """Draw the ellipse of two states that the filter claims to hold ``probability`` of the errors, and that of the errors themselves.
+
+    ``claimed`` and ``found`` are covariances (6, 6) at one epoch: mean P, and mean e eᵀ over the runs.
+    """
+    from scipy.stats import chi2
+
+    ax = axes_or_new(ax)
+    i, j = pair
+    largest = np.sqrt(max(claimed[i, i], found[i, i])), np.sqrt(max(claimed[j, j], found[j, j]))
+    (unit_i, size_i), (unit_j, size_j) = (
+        state_unit(s, 3.0 * np.array([x])) for s, x in zip(pair, largest, strict=True)
+    )
+    scale = np.array([size_i, size_j])
+    reach = float(np.sqrt(chi2.ppf(probability, 2)))
+    styles: tuple[tuple[str, Array, dict[str, Any]], ...] = (
+        ("the filter's own", claimed, {"edgecolor": VERMILION, "linewidth": 2.0}),
+        ("of the errors", found, {"edgecolor": ink(), "linewidth": 1.2, "linestyle": "--"}),
+    )
+    for name, matrix, style in styles:
+        P = matrix[np.ix_(pair, pair)] / np.outer(scale, scale)
+        value, vector = np.linalg.eigh(P)
+        ax.add_patch(
+            Ellipse(
+                (0.0, 0.0),
+                *(2.0 * reach * np.sqrt(np.maximum(value, 0.0))),
+                angle=float(np.degrees(np.arctan2(vector[1, 0], vector[0, 0]))),
+                facecolor="none",
+                label=name,
+                **style,
+            )
+        )
+    spread = 1.25 * reach * np.array(largest) / scale
+    ax.set_xlim(-spread[0], spread[0])
+    ax.set_ylim(-spread[1], 1.35 * spread[1])
+    ax.set_xlabel(f"error of {STATES[i]}, {unit_i}")
+    ax.set_ylabel(f"error of {STATES[j]}, {unit_j}")
+    ax.set_title(f"{100 * probability:g} % ellipses")
+    ax.legend(loc="upper right", ncols=2)
     return ax

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import matplotlib
+import numpy as np
 from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from strapdown.checks import Array, one_of
 from strapdown.files import written_beside
+from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR
 
-BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, YELLOW, BLACK = (
+BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, YELLOW = (
     "#0072B2",
     "#E69F00",
     "#009E73",
@@ -21,7 +26,6 @@ BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, YELLOW, BLACK = (
     "#CC79A7",
     "#56B4E9",
     "#F0E442",
-    "#000000",
 )
 CYCLE = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, SKY)
 AXES = ("x", "y", "z")
@@ -39,6 +43,37 @@ STYLE: Any = {
     "font.size": 9.5,
     "axes.prop_cycle": cycler(color=CYCLE),
 }
+
+
+_DARK, _LIGHT = "#16181d", "#e4e6eb"
+THEMES: dict[str, Any] = {
+    "light": {},
+    "dark": {
+        "figure.facecolor": _DARK,
+        "axes.facecolor": _DARK,
+        "savefig.facecolor": _DARK,
+        "text.color": _LIGHT,
+        "axes.labelcolor": _LIGHT,
+        "axes.edgecolor": _LIGHT,
+        "xtick.color": _LIGHT,
+        "ytick.color": _LIGHT,
+        "grid.color": _LIGHT,
+    },
+}
+"""Settings by which a theme differs from the plain one."""
+
+
+@contextlib.contextmanager
+def theme(name: str) -> Iterator[None]:
+    """Draw what is drawn inside in the theme "light" or "dark"."""
+    one_of("theme", name, THEMES)
+    with matplotlib.rc_context({**STYLE, **THEMES[name]}):
+        yield
+
+
+def ink() -> str:
+    """Return the colour of lines and bands that are neither data nor background: black, or light on a dark ground."""
+    return str(matplotlib.rcParams["text.color"])
 
 
 def new_figure(
@@ -65,3 +100,15 @@ def axes_or_new(ax: Axes | None) -> Axes:
 def layered(k: int, number: int) -> dict[str, Any]:
     """Return the style of line k of several that may lie on each other: the later, the thinner, so that all show."""
     return {"color": CYCLE[k % len(CYCLE)], "linewidth": 1.0 + 0.8 * (number - 1 - k)}
+
+
+def angle_unit(value: Array) -> tuple[str, float]:
+    """Return the name and size of the unit in which angles of this size (rad) are read best."""
+    typical = float(np.nanmax(np.abs(value), initial=0.0))
+    return ("arcsec", ARCSECOND) if typical < 0.05 * DEGREE else ("°", DEGREE)
+
+
+def rate_unit(value: Array) -> tuple[str, float]:
+    """Return the name and size of the unit in which rates of this size (rad/s) are read best."""
+    typical = float(np.nanmax(np.abs(value), initial=0.0))
+    return ("°/h", DEGREE_PER_HOUR) if typical < 0.1 * DEGREE else ("°/s", DEGREE)

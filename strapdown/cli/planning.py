@@ -1,0 +1,191 @@
+"""Planning: what a filter will achieve, before anything is simulated."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from strapdown.cli.terminal import app, console, progress_bar, show, table, written
+
+
+def _named(option: str, values: list[str] | None) -> dict[str, float]:
+    """Return the numbers of options NAME=VALUE."""
+    from strapdown.checks import InputError, finite
+
+    found = {}
+    for text in values or []:
+        name, equals, number = text.rpartition("=")
+        if not equals or not name:
+            raise InputError(f"{option} is {text!r}; give NAME=VALUE, such as 'magnetometer=50'")
+        try:
+            found[name] = finite(f"{option}: {name}", float(number))
+        except ValueError:
+            raise InputError(f"{option}: {name}: {number!r} is no number; give NAME=VALUE") from None
+    return found
+
+
+def _in_own_units(biases: dict[str, float], sensors: Any) -> dict[str, float]:
+    """Return sensor biases in the unit of each sensor's σ, of numbers in nT, m/s² or arcsec."""
+    from strapdown.units import ARCSECOND
+    from strapdown.vectors import Accelerometer, Magnetometer
+
+    sizes = {sensor.name: {Magnetometer: 1e-9, Accelerometer: 1.0}.get(type(sensor), ARCSECOND) for sensor in sensors}
+    return {name: value * sizes.get(name, 1.0) for name, value in biases.items()}
+
+
+@app.command()
+def covariance(
+    scenario: Annotated[str, typer.Argument(help="Name of a built-in scenario, or a TOML file.")],
+    filter_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--filter", help="TOML with a table named filter; without it the filter that matches the scenario."
+        ),
+    ] = None,
+    scale_factor: Annotated[float, typer.Option(help="Consider gyro scale factors of this 1σ, ppm.")] = 0.0,
+    misalignment: Annotated[float, typer.Option(help="Consider gyro misalignments of this 1σ, mrad.")] = 0.0,
+    g_sensitivity: Annotated[float, typer.Option(help="Consider gyro g-sensitivities of this 1σ, °/h/g.")] = 0.0,
+    sensor_bias: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Consider a sensor's bias of this 1σ on each axis, NAME=VALUE: nT, m/s², or arcsec. Repeatable."
+        ),
+    ] = None,
+    mounting: Annotated[
+        list[str] | None,
+        typer.Option(help="Consider a sensor turned on the body by this 1σ about each axis, NAME=ARCSEC. Repeatable."),
+    ] = None,
+    time_offset: Annotated[
+        list[str] | None, typer.Option(help="Consider a sensor that measures late by this 1σ, NAME=MS. Repeatable.")
+    ] = None,
+    attitude_sigma: Annotated[
+        float | None, typer.Option(help="Actual 1σ of the initial attitude, each axis, degrees; else the filter's.")
+    ] = None,
+    bias_sigma: Annotated[
+        float | None, typer.Option(help="Actual 1σ of the initial bias, each axis, °/h; else the filter's.")
+    ] = None,
+    epochs: Annotated[int, typer.Option(help="Epochs over the scenario's time.")] = 100,
+    out: Annotated[Path, typer.Option(help="Folder for covariance.json and the figure.")] = Path("covariance-results"),
+) -> None:
+    """Predict a filter's errors and their budget by source, in one pass without noise."""
+    from strapdown import covariance as analysis
+    from strapdown import setup
+    from strapdown.files import usable_folder, write_json
+    from strapdown.scenarios import load_scenario
+    from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR, STANDARD_GRAVITY
+
+    chosen = load_scenario(scenario)
+    usable_folder("out", out)
+    considered = analysis.Consider(
+        scale_factor=1e-6 * scale_factor,
+        misalignment=1e-3 * misalignment,
+        g_sensitivity=g_sensitivity * DEGREE_PER_HOUR / STANDARD_GRAVITY,
+        sensor_bias=_in_own_units(_named("sensor_bias", sensor_bias), chosen.sensors),
+        mounting={name: value * ARCSECOND for name, value in _named("mounting", mounting).items()},
+        time_offset={name: 1e-3 * value for name, value in _named("time_offset", time_offset).items()},
+    )
+    belief = setup.read_setup(filter_file) if filter_file else setup.matched(chosen)
+    with progress_bar("covariance analysis", 1) as advance:
+        found = analysis.analyse(
+            chosen,
+            belief,
+            consider=considered,
+            initial_attitude_sigma=None if attitude_sigma is None else attitude_sigma * DEGREE,
+            initial_bias_sigma=None if bias_sigma is None else bias_sigma * DEGREE_PER_HOUR,
+            epochs=epochs,
+        )
+        advance(1)
+    name = chosen.name or Path(scenario).stem
+    _tell(name, found, belief.integration.name, matched=filter_file is None)
+    write_json(out / "covariance.json", _summary(name, found))
+    from strapdown import plots
+
+    title = f"{name}: predicted errors, without a Monte Carlo"
+    figure = plots.save(plots.error_budget(found, title=title), out / "budget.png")
+    written(out / "covariance.json", figure)
+
+
+def _tell(name: str, found: Any, integration: str, *, matched: bool) -> None:
+    import numpy as np
+
+    from strapdown.plots.style import angle_unit, rate_unit
+    from strapdown.units import DEGREE
+
+    rms, sigma = found.rms[-1], found.filter_sigma[-1]
+    unit, size = angle_unit(np.concatenate([rms[:3], sigma[:3]]))
+    rate_name, rate = rate_unit(np.concatenate([rms[3:], sigma[3:]]))
+    belief = "the filter that matches it" if matched else "the filter given"
+    console.print(f"{name}, {belief}, integration {integration}; errors at {found.time[-1]:g} s, RMS of an axis.\n")
+    rows = table("Error budget", "source", "kind", f"attitude\n{unit}", f"bias\n{rate_name}", left=2)
+    budget = sorted(found.budget(), key=lambda row: -row[2])
+    for source, kind, attitude, bias in budget:
+        rows.add_row(source, kind, f"{attitude / size:.3g}", f"{bias / rate:.3g}")
+
+    def mean(values: Any) -> float:
+        return float(np.sqrt(np.mean(np.square(values))))
+
+    rows.add_section()
+    rows.add_row("actual error", "all", f"{mean(rms[:3]) / size:.3g}", f"{mean(rms[3:]) / rate:.3g}")
+    rows.add_row("the filter's own σ", "", f"{mean(sigma[:3]) / size:.3g}", f"{mean(sigma[3:]) / rate:.3g}")
+    show(rows)
+    console.print(
+        "random: squares add. fixed: the same in every run, adds as an error. considered: 1σ of an error that neither the scenario nor the "
+        "filter knows of.\n"
+    )
+    state, attitude, bias = found.expected_nees[-1]
+    nis = ", ".join(f"{sensor} {value:.3g}" for sensor, value in found.expected_nis.items())
+    console.print(
+        f"Expected NEES per state: {state:.3g} (attitude {attitude:.3g}, bias {bias:.3g}); NIS: {nis or 'none'}."
+    )
+    if max(attitude, bias) > 1.1:
+        worst = "bias" if bias > attitude else "attitude"
+        console.print(
+            f"The filter will be too sure of its {worst}: its errors are {np.sqrt(max(attitude, bias)):.3g} times what it says."
+        )
+    elif min(attitude, bias) < 0.9:
+        console.print("The filter will be more modest than it need be.")
+    else:
+        console.print("The filter will be as good as it says.")
+    if found.left_out:
+        console.print(f"Left out: {', '.join(found.left_out)}.")
+    for one in found.beyond_linear:
+        console.print(f"Beyond linear: {one}; take a Monte Carlo (`strapdown montecarlo`).")
+    largest = float(np.max(rms[:3]))
+    if largest > 10.0 * DEGREE:
+        console.print(f"Beyond linear: the attitude error itself, {largest / DEGREE:.3g}°.")
+    console.print("")
+
+
+def _summary(name: str, found: Any) -> dict[str, Any]:
+    """Return the analysis for JSON, units in the key names."""
+    import numpy as np
+
+    from strapdown.units import ARCSECOND, DEGREE_PER_HOUR
+
+    units = np.array([ARCSECOND] * 3 + [DEGREE_PER_HOUR] * 3)
+
+    def parts(values: Any) -> dict[str, Any]:
+        shown = values / units
+        return {"attitude_arcsec": shown[..., :3].tolist(), "bias_deg_per_hour": shown[..., 3:].tolist()}
+
+    return {
+        "scenario": name,
+        "time_s": found.time.tolist(),
+        "rms": parts(found.rms),
+        "filter_sigma": parts(found.filter_sigma),
+        "mean_error": parts(found.mean_error),
+        "expected_nees_per_state": dict(
+            zip(("state", "attitude", "bias"), found.expected_nees.T.tolist(), strict=True)
+        ),
+        "expected_nis": dict(found.expected_nis),
+        "random": {
+            source: parts(np.sqrt(np.maximum(np.diagonal(found.contributions[:, k], axis1=1, axis2=2), 0.0)))
+            for k, source in enumerate(found.sources)
+        },
+        "fixed": {source: parts(found.fixed_errors[:, k]) for k, source in enumerate(found.fixed)},
+        "considered": {source: parts(found.considered_errors[:, k]) for k, source in enumerate(found.considered)},
+        "left_out": list(found.left_out),
+        "beyond_linear": list(found.beyond_linear),
+    }

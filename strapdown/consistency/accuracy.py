@@ -1,0 +1,134 @@
+"""How large the errors are: against a reference, against the Cramér–Rao bound, when they have settled, how they are distributed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from strapdown import quaternion
+from strapdown.checks import Array, InputError, array, count, increasing, positive
+from strapdown.consistency.bounds import mean_bounds, tail
+
+
+@dataclass(frozen=True, kw_only=True)
+class Efficiency:
+    """RMS error over independent runs against the square root of the posterior Cramér–Rao bound, at each epoch."""
+
+    ratio: Array
+    """RMSE/√PCRB (epochs,): 1 for an efficient filter, and more for any other."""
+    bounds: tuple[float, float]
+    """Two-sided bounds of the ratio of an efficient filter of normal errors at one epoch."""
+    probability: float
+
+
+def efficiency(error: ArrayLike, bound: ArrayLike, probability: float = 0.99) -> Efficiency:
+    """Return RMSE/√PCRB of one state's errors (runs, epochs) of which ``bound`` (epochs,) is the least possible variance.
+
+    The bound is the Riccati recursion along the true trajectory.
+    """
+    e = array("error", error, ("runs", "epochs"))
+    least = array("bound", bound, (e.shape[1],))
+    count("the number of runs", len(e))
+    if np.any(least <= 0.0):
+        raise InputError(f"bound[{int(np.argmax(least <= 0.0))}] is not greater than zero; it is a variance")
+    low, high = mean_bounds(1, len(e), probability)
+    return Efficiency(
+        ratio=np.sqrt(np.mean(e * e, axis=0) / least),
+        bounds=(math.sqrt(low), math.sqrt(high)),
+        probability=probability,
+    )
+
+
+def convergence_time(time: ArrayLike, magnitude: ArrayLike, threshold: float) -> float:
+    """Return the first time, s, from which on ``magnitude`` (n,) stays at or below ``threshold`` to the end; NaN if it never does.
+
+    Of an error, of its RMS over runs, or of a σ, in the unit of the threshold.
+    """
+    stamps = increasing("time", time)
+    size = array("magnitude", magnitude, (len(stamps),))
+    above = np.flatnonzero(np.abs(size) > positive("threshold", threshold))
+    first = int(above[-1]) + 1 if len(above) else 0
+    return float(stamps[first]) if first < len(stamps) else math.nan
+
+
+@dataclass(frozen=True, kw_only=True)
+class Distribution:
+    """The empirical distribution of error magnitudes."""
+
+    values: Array
+    """Sorted (n,)."""
+    probability: Array
+    """Fraction of the errors at or below each (n,)."""
+
+    def quantile(self, fraction: float) -> float:
+        """Return the error that ``fraction`` of all do not exceed: 0.5 is the median, 0.95 the 95 % error."""
+        return float(np.quantile(self.values, fraction, method="inverted_cdf"))
+
+    def quantile_interval(self, fraction: float, confidence: float = 0.95) -> tuple[float, float]:
+        """Return an interval that holds the true quantile with at least ``confidence``; the errors must be independent."""
+        from scipy.stats import binom
+
+        outside = tail(confidence)
+        n = len(self.values)
+        low, high = int(binom.ppf(outside, n, fraction)) - 1, int(binom.ppf(1.0 - outside, n, fraction))
+        return (
+            -math.inf if low < 0 else float(self.values[low]),
+            math.inf if high >= n else float(self.values[high]),
+        )
+
+
+def distribution(error: ArrayLike) -> Distribution:
+    """Return the distribution of errors (n,); NaN, where there is no reference, is left out."""
+    given = np.asarray(error, np.float64).ravel()
+    values = np.sort(given[np.isfinite(given)])
+    count("the number of errors", len(values))
+    return Distribution(values=values, probability=np.arange(1, len(values) + 1) / len(values))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReferenceErrors:
+    """Errors of an estimated attitude against a reference, as the BROAD benchmark tells them, rad; NaN where there is no reference."""
+
+    total: Array
+    """Angle of the whole rotation between both (n,)."""
+    heading: Array
+    """Its part about the vertical (n,)."""
+    inclination: Array
+    """What is left: the angle between the vertical of both (n,)."""
+
+    def rms(self, movement: np.ndarray | None = None) -> dict[str, float]:
+        """Return the RMS of each error, rad, over the samples with a reference, and only those of the ``movement`` mask if given."""
+        judged = np.isfinite(self.total) if movement is None else np.isfinite(self.total) & movement
+        if not judged.any():
+            raise InputError(
+                "no sample to judge has a valid reference attitude; check the movement mask and the reference"
+            )
+        return {
+            name: float(np.sqrt(np.mean(getattr(self, name)[judged] ** 2)))
+            for name in ("total", "heading", "inclination")
+        }
+
+
+def reference_errors(attitude: ArrayLike, reference: ArrayLike) -> ReferenceErrors:
+    """Return the errors of q_fb (n, 4) against a reference (n, 4) whose fixed frame has its z axis vertical.
+
+    With ``d = q_est ⊗ q_ref⁻¹`` in the fixed frame: total 2 acos |d_w|, heading 2 atan |d_z / d_w|, inclination
+    2 acos √(d_w² + d_z²) (Laidig, Caruso, Cereatti & Seel 2021, section 4.1), in forms that keep digits when errors are small. Rows of
+    NaN in the reference give NaN.
+    """
+    q = array("attitude", attitude, ("n", 4))
+    r = array("reference", reference, (len(q), 4), allow_nan=True)
+    known = np.isfinite(r).all(axis=1)
+    zero = known & (np.linalg.norm(r, axis=1) == 0.0)
+    if zero.any():
+        raise InputError(f"reference[{int(np.argmax(zero))}] is the zero quaternion; mark missing rows as NaN")
+    d = quaternion.multiply(q[known], quaternion.conjugate(quaternion.normalize(r[known])))
+    w, x, y, z = np.moveaxis(d, -1, 0)
+    results = np.full((3, len(q)), np.nan)
+    results[0, known] = 2.0 * np.arctan2(np.sqrt(x * x + y * y + z * z), np.abs(w))
+    results[1, known] = 2.0 * np.arctan2(np.abs(z), np.abs(w))
+    results[2, known] = 2.0 * np.arctan2(np.hypot(x, y), np.hypot(w, z))
+    return ReferenceErrors(total=results[0], heading=results[1], inclination=results[2])

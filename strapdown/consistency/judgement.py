@@ -1,0 +1,367 @@
+"""The verdict: is the filter as good as it says? In words, with the evidence, at one stated probability of a false alarm.
+
+Every statistic gives a p-value, exact or nearly so, and Holm's procedure (1979) takes them together: whatever their dependence, the
+probability that a right filter is called wrong by any of them is at most 1 − ``probability``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from strapdown.checks import Array, InputError, unit_quaternions
+from strapdown.consistency.bounds import (
+    mean_bounds,
+    mean_p_value,
+    tail,
+)
+from strapdown.consistency.manifold import SUBSETS, errors, nees
+from strapdown.consistency.timeaverage import time_average
+from strapdown.consistency.whiteness import (
+    anderson_darling,
+    cross_correlation_p_value,
+    ljung_box,
+    mean_innovation_p_value,
+)
+from strapdown.records import Estimate, Truth
+
+Answer = Literal["consistent", "not consistent", "cannot tell"]
+
+LEAST_SAMPLES = 50
+"""Fewer innovations of one sensor are not judged for whiteness, normality and mean."""
+
+RESOLUTION = 1.5
+"""A filter that passes is "consistent" if a σ wrong by this factor would have been seen; else nobody can tell."""
+
+_TOO_SURE, _TOO_MODEST = "too sure of itself (optimistic)", "too modest (pessimistic)"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """One statistic against what it is of a right filter."""
+
+    name: str
+    """"NIS", "whiteness", "normality", "mean innovation", "cross-correlation", "NEES at the end", "time-averaged NEES", …"""
+    of: str
+    """The sensor, or the subset of the states."""
+    value: float
+    low: float = math.nan
+    """Two-sided bounds of the value by itself, NaN where there is none."""
+    high: float = math.nan
+    p_value: float
+    """Probability that a right filter shows as much or more."""
+    samples: float
+    """Samples that it rests on; effective ones where they are correlated."""
+    degrees: int = 1
+    """Degrees of freedom of one sample."""
+    rejected: bool = False
+    """Whether it contradicts the filter after all findings are taken together (Holm)."""
+    means: str = ""
+    """What it says if it is rejected."""
+
+    @property
+    def is_ratio(self) -> bool:
+        """Whether the value is that of a χ² per degree of freedom: its root is the factor by which σ is too small."""
+        return self.name in _RATIOS
+
+
+_RATIOS = ("NIS", "NEES at the end", "time-averaged NEES", "ANEES")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Judgement:
+    """A verdict with its evidence."""
+
+    verdict: Answer
+    reason: str
+    """One sentence."""
+    findings: tuple[Finding, ...]
+    limits: tuple[str, ...]
+    """What this evidence cannot show."""
+    probability: float
+    """Probability that a right filter is not called wrong, at least."""
+
+    @property
+    def words(self) -> str:
+        """The verdict and what contradicts the filter, for people."""
+        lines = [f"{self.verdict}: {self.reason}"]
+        lines += [f"  - {finding.means}" for finding in self.findings if finding.rejected]
+        return "\n".join(lines)
+
+    def summary(self) -> dict[str, Any]:
+        """Return everything as plain values for JSON; what is not a number is None."""
+        plain = lambda x: None if isinstance(x, float) and not math.isfinite(x) else x  # noqa: E731
+        return {
+            "verdict": self.verdict,
+            "reason": self.reason,
+            "probability": self.probability,
+            "findings": [
+                {
+                    **{name: plain(value) for name, value in vars(one).items()},
+                    "means": one.means if one.rejected else "",
+                }
+                for one in self.findings
+            ],
+            "limits": list(self.limits),
+        }
+
+
+def judge(estimate: Estimate, truth: Truth | None = None, *, probability: float = 0.99) -> Judgement:
+    """Return the verdict on one run.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        With innovations; with whole covariances if there is a truth.
+    truth : Truth, optional
+        Attitude and bias at the estimate's own times. Without it only the innovations are judged.
+    probability : float
+        Of all tests together: a right filter is called wrong with at most 1 − ``probability``.
+    """
+    tail(probability)
+    findings: list[Finding] = []
+    limits: list[str] = []
+    for sensor, innovations in estimate.innovations.items():
+        used = innovations.used
+        findings += _of_sensor(sensor, innovations.whitened[used], innovations.nis[used], probability)
+        if innovations.refused:
+            limits.append(f"{innovations.refused} measurements of {sensor} that the gate refused are left out")
+    findings += _of_pairs(estimate)
+    if truth is None:
+        limits.append(
+            "without a truth only the innovations are judged: they do not show an attitude error that all sensors share, "
+            "nor a bias error that the start hides, such as commutation of coning"
+        )
+    else:
+        findings += _of_errors(estimate, truth, probability, limits)
+    return concluded(findings, limits, probability)
+
+
+def _of_sensor(sensor: str, white: Array, nis: Array, probability: float) -> list[Finding]:
+    samples, degrees = white.shape
+    if samples == 0:
+        return []
+    mean = float(nis.mean() / degrees)
+    low, high = mean_bounds(degrees, samples, probability)
+    findings = [
+        Finding(
+            name="NIS",
+            of=sensor,
+            value=mean,
+            low=low,
+            high=high,
+            p_value=mean_p_value(mean, degrees, samples),
+            samples=samples,
+            degrees=degrees,
+            means=innovation_words(sensor, mean),
+        )
+    ]
+    if samples < LEAST_SAMPLES:
+        return findings
+    statistic, number, p = ljung_box(white)
+    findings.append(
+        Finding(
+            name="whiteness",
+            of=sensor,
+            value=statistic / number,
+            p_value=p,
+            samples=samples,
+            means=f"innovations of {sensor} are correlated in time: they hold what the filter could have known",
+        )
+    )
+    statistic, p = anderson_darling(white)
+    findings.append(
+        Finding(
+            name="normality",
+            of=sensor,
+            value=statistic,
+            p_value=p,
+            samples=samples,
+            means=f"innovations of {sensor} are not normal: outliers, or noise that is not what the filter takes it for",
+        )
+    )
+    mean_vector, p = mean_innovation_p_value(white)
+    findings.append(
+        Finding(
+            name="mean innovation",
+            of=sensor,
+            value=float(np.linalg.norm(mean_vector)),
+            p_value=p,
+            samples=samples,
+            means=f"the mean innovation of {sensor} is not zero ({np.linalg.norm(mean_vector):.3g} σ)",
+        )
+    )
+    return findings
+
+
+def innovation_words(sensor: str, mean: float) -> str:
+    """Say what a NIS per degree of freedom means."""
+    return f"innovations of {sensor} are {math.sqrt(mean):.3g} times what the filter says (NIS {mean:.4g} per degree of freedom)"
+
+
+def _of_pairs(estimate: Estimate) -> list[Finding]:
+    found = []
+    names = list(estimate.innovations)
+    for i, one in enumerate(names):
+        for other in names[i + 1 :]:
+            a, b = estimate.innovations[one], estimate.innovations[other]
+            if min(int(a.used.sum()), int(b.used.sum())) < LEAST_SAMPLES:
+                continue
+            correlation, pairs, p = cross_correlation_p_value(
+                a.time[a.used], a.whitened[a.used], b.time[b.used], b.whitened[b.used]
+            )
+            if math.isnan(p):
+                continue
+            found.append(
+                Finding(
+                    name="cross-correlation",
+                    of=f"{one} and {other}",
+                    value=float(np.max(np.abs(correlation))),
+                    p_value=p,
+                    samples=pairs,
+                    means=f"innovations of {one} and {other} are correlated: they share an error that the filter does not know of",
+                )
+            )
+    return found
+
+
+def _of_errors(estimate: Estimate, truth: Truth, probability: float, limits: list[str]) -> list[Finding]:
+    m = len(estimate.time)
+    attitude = unit_quaternions("truth.attitude", truth.attitude)
+    if attitude.shape != (m, 4) or np.shape(truth.bias) != (m, 3):
+        raise InputError(
+            f"truth has {len(attitude)} attitudes and {len(np.atleast_1d(truth.bias))} biases, the estimate {m} times; "
+            "give the truth at the estimate's own times"
+        )
+    e = errors(estimate.attitude, estimate.bias, attitude, truth.bias)
+    if estimate.covariance is None:
+        limits.append(
+            "the estimate holds variances only, so errors are judged axis by axis at the end; keep whole covariances"
+        )
+        ratio = float(np.max(e[-1] ** 2 / estimate.variance[-1]))
+        p = min(1.0, 6.0 * min(mean_p_value(float(x), 1, 1) for x in e[-1] ** 2 / estimate.variance[-1]))
+        worst = int(np.argmax(e[-1] ** 2 / estimate.variance[-1]))
+        name = state_name(worst)
+        return [
+            Finding(
+                name="error at the end",
+                of=name,
+                value=math.sqrt(ratio),
+                p_value=p,
+                samples=1,
+                means=f"the {name} error at the end is {math.sqrt(ratio):.3g} σ",
+            )
+        ]
+    found = []
+    for subset, states in SUBSETS.items():
+        value = float(nees(e[-1], estimate.covariance[-1], states)) / len(states)
+        low, high = mean_bounds(len(states), 1, probability)
+        found.append(
+            Finding(
+                name="NEES at the end",
+                of=subset,
+                value=value,
+                low=low,
+                high=high,
+                p_value=mean_p_value(value, len(states), 1),
+                samples=1,
+                degrees=len(states),
+                means=error_words(f"the {subset} error at the end", value),
+            )
+        )
+        if m < 20:
+            continue
+        average = time_average(e, estimate.covariance, states, probability)
+        if not average.reliable:
+            limits.append(
+                f"the {subset} error changes too slowly for this run to average over: {average.effective:.3g} effective samples"
+            )
+            continue
+        low, high = average.bounds
+        found.append(
+            Finding(
+                name="time-averaged NEES",
+                of=subset,
+                value=average.mean,
+                low=low,
+                high=high,
+                p_value=average.p_value,
+                samples=average.effective,
+                degrees=len(states),
+                means=error_words(f"the {subset} error over the run", average.mean),
+            )
+        )
+    return found
+
+
+def error_words(what: str, ratio: float) -> str:
+    """Say what a NEES per state means."""
+    if ratio >= 1.0:
+        return f"{what} is {math.sqrt(ratio):.3g} times what the filter says (NEES {ratio:.4g} per state)"
+    return f"{what} is smaller than the filter says (NEES {ratio:.4g} per state)"
+
+
+def concluded(findings: list[Finding], limits: list[str], probability: float) -> Judgement:
+    """Return the verdict that findings lead to, all taken together."""
+    marked = holm(findings, 1.0 - probability)
+    rejected = [finding for finding in marked if finding.rejected]
+    verdict: Answer
+    if rejected:
+        verdict = "not consistent"
+        ratios = [finding.value > 1.0 for finding in rejected if finding.is_ratio]
+        leaning = (
+            "not as it says of itself"
+            if not ratios
+            else _TOO_SURE
+            if all(ratios)
+            else _TOO_MODEST
+            if not any(ratios)
+            else "too sure in part and too modest in part"
+        )
+        reason = f"the filter is {leaning}; {len(rejected)} of {len(marked)} tests contradict it"
+    elif not marked:
+        verdict, reason = "cannot tell", "there is nothing to judge: no innovation, and no truth"
+    elif (seen := resolution(marked, probability)) > RESOLUTION:
+        verdict = "cannot tell"
+        reason = (
+            f"none of {len(marked)} tests contradicts the filter, but a σ wrong by a factor of {seen:.2g} would not be seen either: "
+            "too few samples"
+        )
+    else:
+        verdict = "consistent"
+        reason = f"none of {len(marked)} tests contradicts the filter; a σ wrong by a factor of {seen:.3g} would have been seen"
+    return Judgement(
+        verdict=verdict, reason=reason, findings=tuple(marked), limits=tuple(limits), probability=probability
+    )
+
+
+def resolution(findings: Iterable[Finding], probability: float) -> float:
+    """Return the factor on σ that the sharpest of the findings tells from 1: the root of the ratio of its bounds, Bonferroni and all."""
+    marked = list(findings)
+    within = 1.0 - (1.0 - probability) / max(len(marked), 1)
+    factors = [math.inf]
+    for finding in marked:
+        if finding.is_ratio and finding.samples > 1:
+            low, high = mean_bounds(finding.degrees, finding.samples, within)
+            factors.append(math.sqrt(high / low))
+    return min(factors)
+
+
+def holm(findings: Iterable[Finding], error: float) -> list[Finding]:
+    """Return the findings with those marked that Holm's step-down procedure rejects at a family-wise error of ``error``."""
+    marked = list(findings)
+    order = sorted(range(len(marked)), key=lambda k: marked[k].p_value)
+    for rank, k in enumerate(order):
+        if not marked[k].p_value <= error / (len(marked) - rank):
+            break
+        marked[k] = replace(marked[k], rejected=True)
+    return marked
+
+
+def state_name(state: int) -> str:
+    """Return "attitude x" … "bias z" of the number of an error state."""
+    return f"{('attitude', 'bias')[state // 3]} {'xyz'[state % 3]}"

@@ -1,0 +1,72 @@
+"""The error of an estimate on the manifold of attitudes, and its normalised square."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from strapdown import quaternion
+from strapdown.checks import Array, InputError, array, unit_quaternions
+
+SUBSETS: dict[str, tuple[int, ...]] = {
+    "state": (0, 1, 2, 3, 4, 5),
+    "attitude": (0, 1, 2),
+    "bias": (3, 4, 5),
+}
+"""Subsets of the error state by name. Any other is a tuple of indices; of errors in the fixed frame (:func:`fixed_frame`) 2 is the
+heading and (0, 1) the inclination where the fixed z axis is vertical."""
+
+
+def errors(attitude: ArrayLike, bias: ArrayLike, true_attitude: ArrayLike, true_bias: ArrayLike) -> Array:
+    """Return the error state e = (Log(q_est⁻¹ ⊗ q_true), b_true − b_est) (..., 6): rad in the body frame, rad/s."""
+    estimate = quaternion.multiply(quaternion.conjugate(attitude), true_attitude)
+    return np.concatenate([quaternion.log(estimate), np.asarray(true_bias) - np.asarray(bias)], axis=-1)
+
+
+def fixed_frame(error: ArrayLike, covariance: ArrayLike, attitude: ArrayLike) -> tuple[Array, Array]:
+    """Return errors (..., 6) and covariances (..., 6, 6) with the attitude part in fixed axes; the bias stays in body axes.
+
+    ``q_true = exp(δθ_f) ⊗ q_est`` with ``δθ_f = R_fb δθ_b``: a rotation of coordinates, so the NEES of all six states or of the attitude is
+    the same in both frames; that of a part of the attitude is not.
+    """
+    e = array("error", error, (..., 6))
+    P = array("covariance", covariance, (..., 6, 6))
+    T = np.zeros(P.shape)
+    T[..., :3, :3] = quaternion.to_matrix(unit_quaternions("attitude", attitude))
+    T[..., [3, 4, 5], [3, 4, 5]] = 1.0
+    return (T @ e[..., None])[..., 0], T @ P @ np.swapaxes(T, -1, -2)
+
+
+def whitened(error: ArrayLike, covariance: ArrayLike) -> Array:
+    """Return L⁻¹ e (..., n) with P = L Lᵀ: independent standard normals if the covariance is right.
+
+    The first k components are those of the marginal of the first k states.
+    """
+    e = array("error", error, (..., "n"))
+    P = array("covariance", covariance, (..., e.shape[-1], e.shape[-1]))
+    try:
+        factor = np.linalg.cholesky(P)
+    except np.linalg.LinAlgError:
+        least = np.linalg.eigvalsh(P)[..., 0]
+        place = [int(i) for i in np.unravel_index(np.argmin(least), least.shape)]
+        raise InputError(
+            f"covariance{place or ''} is not positive definite (least eigenvalue {least.min():.3g})"
+        ) from None
+    return np.asarray(np.linalg.solve(factor, e[..., None])[..., 0])
+
+
+def nees(error: ArrayLike, covariance: ArrayLike, states: tuple[int, ...] | None = None) -> Array:
+    """Return the normalised estimation error squared eᵀ P⁻¹ e (...,), χ² with as many degrees of freedom as states.
+
+    ``error`` (..., n), ``covariance`` (..., n, n). ``states`` picks a subset (:data:`SUBSETS` or any indices), whose marginal covariance
+    is the block of P; all if not given.
+    """
+    if states is not None:
+        pick = list(states)
+        e = array("error", error, (..., "n"))
+        if not pick or len(set(pick)) < len(pick) or not all(0 <= k < e.shape[-1] for k in pick):
+            raise InputError(f"states is {states}; give different indices from 0 to {e.shape[-1] - 1}")
+        P = array("covariance", covariance, (..., e.shape[-1], e.shape[-1]))
+        error, covariance = e[..., pick], P[..., pick, :][..., pick]
+    white = whitened(error, covariance)
+    return np.asarray(np.sum(white * white, axis=-1))

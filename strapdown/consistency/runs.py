@@ -1,0 +1,198 @@
+"""The verdict on independent runs, from the sums over them that a Monte Carlo keeps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from strapdown.checks import Array
+from strapdown.consistency.bounds import (
+    Coverage,
+    Verdict,
+    log_mean_bounds,
+    log_mean_p_value,
+    mean_bounds,
+    mean_p_value,
+    tail,
+)
+from strapdown.consistency.judgement import Finding, Judgement, concluded, error_words, innovation_words, state_name
+from strapdown.consistency.manifold import SUBSETS
+
+
+class RunStatistics(Protocol):
+    """What :func:`judge_runs` wants of the statistics of a Monte Carlo: sums over independent runs at each epoch."""
+
+    @property
+    def runs(self) -> int:
+        """Number of independent runs."""
+
+    @property
+    def finite(self) -> NDArray[np.int64]:
+        """Runs whose errors and covariance are finite, by epoch (m,)."""
+
+    @property
+    def error_sum(self) -> Array:
+        """Σ e (m, 6)."""
+
+    @property
+    def error_product_sum(self) -> Array:
+        """Σ e eᵀ (m, 6, 6)."""
+
+    @property
+    def log_nees_sum(self) -> Array:
+        """Σ ln NEES of all six states, attitude, bias (m, 3)."""
+
+    @property
+    def coverage(self) -> NDArray[np.int64]:
+        """Runs with |e| within 1, 2, 3 σ (m, 6, 3)."""
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of the sensors (s,)."""
+
+    @property
+    def sensor_nis_sum(self) -> Array:
+        """Σ NIS by sensor and span of time (s, k)."""
+
+    @property
+    def sensor_degrees(self) -> NDArray[np.int64]:
+        """Their degrees of freedom (s, k)."""
+
+    def verdict(self, epochs: NDArray[Any], subset: str = "state", probability: float = 0.99) -> Verdict:
+        """Return the verdict on the NEES of a subset at epochs of these indices."""
+
+
+EPOCHS = 20
+"""Epochs at which a Monte Carlo is judged: more of them cost power, because their errors are correlated and are taken as if not."""
+
+
+def judge_runs(
+    statistics: RunStatistics, *, epochs: Iterable[int] | None = None, probability: float = 0.99
+) -> Judgement:
+    """Return the verdict on independent runs.
+
+    Parameters
+    ----------
+    statistics : RunStatistics
+        Of :mod:`strapdown.montecarlo`.
+    epochs : iterable of int, optional
+        Indices of the epochs that errors are judged at; if not given 20 evenly spread ones, the first, where all is prior, left out.
+    probability : float
+        Of all tests together.
+    """
+    tail(probability)
+    last = len(statistics.finite) - 1
+    chosen = (
+        np.unique(np.linspace(max(1, last // EPOCHS), last, min(EPOCHS, last)).astype(int))
+        if epochs is None
+        else np.array(list(epochs), int)
+    )
+    runs = statistics.runs
+    failed = int(runs - np.min(statistics.finite[chosen]))
+    findings = []
+    for column, (subset, states) in enumerate(SUBSETS.items()):
+        verdict = statistics.verdict(chosen, subset, probability)
+        extreme = np.abs(np.log(np.clip(verdict.mean, 1e-300, 1e300)))
+        value = float(verdict.mean[int(np.argmax(extreme))])
+        low, high = verdict.simultaneous_bounds
+        findings.append(
+            Finding(
+                name="ANEES",
+                of=subset,
+                value=value,
+                low=low,
+                high=high,
+                p_value=verdict.p_value,
+                samples=runs,
+                degrees=len(states),
+                means=error_words(f"the {subset} error at its worst epoch", value)
+                if failed == 0
+                else f"{failed} of {runs} runs failed: their {subset} error or covariance is not finite",
+            )
+        )
+        if failed == 0:
+            findings.append(_log_nees(statistics, chosen, column, subset, probability))
+    if failed == 0 and runs >= 3:
+        findings += [_mean_error(statistics, chosen), _run_coverage(statistics, chosen, probability)]
+    for row, sensor in enumerate(statistics.sensors):
+        degrees = float(np.sum(statistics.sensor_degrees[row]))
+        if degrees < 1.0:
+            continue
+        mean = float(np.sum(statistics.sensor_nis_sum[row]) / degrees)
+        low, high = mean_bounds(1, degrees, probability)
+        findings.append(
+            Finding(
+                name="NIS",
+                of=sensor,
+                value=mean,
+                low=low,
+                high=high,
+                p_value=mean_p_value(mean, 1, degrees),
+                samples=degrees,
+                means=innovation_words(sensor, mean),
+            )
+        )
+    return concluded(findings, [], probability)
+
+
+def _log_nees(statistics: RunStatistics, epochs: np.ndarray, column: int, subset: str, probability: float) -> Finding:
+    runs, degrees = statistics.runs, len(SUBSETS[subset])
+    means = statistics.log_nees_sum[epochs, column] / runs
+    p = np.array([log_mean_p_value(float(mean), degrees, runs) for mean in means])
+    worst = int(np.argmin(p))
+    low, high = log_mean_bounds(degrees, runs, 1.0 - (1.0 - probability) / len(epochs))
+    return Finding(
+        name="log-NEES",
+        of=subset,
+        value=float(means[worst]),
+        low=low,
+        high=high,
+        p_value=min(1.0, len(epochs) * float(p[worst])),
+        samples=runs,
+        degrees=degrees,
+        means=f"the mean of ln NEES of the {subset} at its worst epoch is {means[worst]:.4g}, outside {low:.4g} to {high:.4g}",
+    )
+
+
+def _mean_error(statistics: RunStatistics, epochs: np.ndarray) -> Finding:
+    """Return whether any state's mean error over the runs is other than zero: Student's t, the worst of all epochs and states."""
+    from scipy.special import stdtr
+
+    runs = statistics.runs
+    mean = statistics.error_sum[epochs] / runs
+    square = np.diagonal(statistics.error_product_sum[epochs], axis1=1, axis2=2) / runs
+    t = np.abs(mean) / np.sqrt(np.maximum(square - mean**2, 1e-300) / (runs - 1))
+    name = state_name(int(np.argmax(t.max(axis=0))))
+    return Finding(
+        name="mean error",
+        of=name,
+        value=float(t.max()),
+        p_value=min(1.0, t.size * 2.0 * float(stdtr(runs - 1, -t.max()))),
+        samples=runs,
+        means=f"the mean {name} error over the runs is not zero ({t.max():.3g} of its standard errors): it does not average out",
+    )
+
+
+def _run_coverage(statistics: RunStatistics, epochs: np.ndarray, probability: float) -> Finding:
+    """Return whether the errors of any state lie within 1, 2 or 3 σ too often or too seldom, the worst of all epochs and states."""
+    inside = statistics.coverage[epochs] / statistics.runs
+    p = np.array(
+        [
+            [Coverage(samples=statistics.runs, inside=state, probability=probability).p_values for state in epoch]
+            for epoch in inside
+        ]
+    )
+    _, state, k = np.unravel_index(int(np.argmin(p)), p.shape)
+    name = state_name(int(state))
+    value = float(inside.reshape(-1)[int(np.argmin(p))])
+    return Finding(
+        name="coverage",
+        of=name,
+        value=value,
+        p_value=min(1.0, p.size * float(p.min())),
+        samples=statistics.runs,
+        means=f"{100.0 * value:.3g} % of the {name} errors lie within {int(k) + 1} σ at the worst epoch",
+    )

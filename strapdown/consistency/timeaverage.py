@@ -1,0 +1,106 @@
+"""Averages over the time of one run. Errors at different epochs of one run are correlated, so they count for fewer than they are.
+
+The error of a right filter is a Gauss–Markov process: ``e_{k+1} = (I − K H) Φ e_k + noise``. Whitened by the filter's own covariance it
+is a vector autoregression of first order, z_{k+1} = A z_k + …, of covariance I, and the correlation of |z_k|² with |z_{k+τ}|² is ‖A^τ‖²/n.
+That gives the variance of the average, and with it the number of independent samples that would have the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from strapdown.checks import InputError, array
+from strapdown.consistency.bounds import mean_bounds, mean_p_value, tail
+from strapdown.consistency.manifold import whitened
+
+LEAST_EFFECTIVE = 50.0
+"""Below this many effective samples the correlation is not known well enough from the run itself for bounds that hold."""
+
+MOST_EPOCHS = 4000
+
+
+@dataclass(frozen=True, kw_only=True)
+class TimeAverage:
+    """NEES averaged over the epochs of one run, per degree of freedom."""
+
+    mean: float
+    """1 for a right filter."""
+    degrees: int
+    epochs: int
+    effective: float
+    """Independent epochs that would tell as much."""
+    probability: float
+
+    @property
+    def reliable(self) -> bool:
+        """Whether the run is long against the correlation of its errors; if not, the bounds do not hold."""
+        return self.effective >= LEAST_EFFECTIVE
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Two-sided bounds of the mean."""
+        return mean_bounds(self.degrees, max(self.effective, 1.0), self.probability)
+
+    @property
+    def p_value(self) -> float:
+        """Two-sided p-value of the mean."""
+        return mean_p_value(self.mean, self.degrees, max(self.effective, 1.0))
+
+
+def time_average(
+    error: ArrayLike, covariance: ArrayLike, states: tuple[int, ...] | None = None, probability: float = 0.99
+) -> TimeAverage:
+    """Return the NEES averaged over the epochs of one run, with as many effective samples as its correlation leaves.
+
+    Parameters
+    ----------
+    error : array (epochs, n)
+        Error states at even epochs.
+    covariance : array (epochs, n, n)
+    states : tuple of int, optional
+        Subset that is judged; all are used to learn the correlation, because no subset is a Markov process by itself.
+    probability : float
+        Of the bounds.
+    """
+    tail(probability)
+    e = array("error", error, ("epochs", "n"))
+    P = array("covariance", covariance, (len(e), e.shape[1], e.shape[1]))
+    n = e.shape[1]
+    chosen = list(range(n)) if states is None else list(states)
+    if len(e) < 2 * n + 2:
+        raise InputError(f"{len(e)} epochs are too few for a time average of {n} states; keep more of the run")
+    stride = -(-len(e) // MOST_EPOCHS)
+    order = [*chosen, *(k for k in range(n) if k not in chosen)]
+    white = whitened(e[::stride][:, order], P[::stride][:, order][:, :, order])
+    mine = white[:, : len(chosen)]
+    return TimeAverage(
+        mean=float(np.mean(np.sum(mine * mine, axis=1)) / len(chosen)),
+        degrees=len(chosen),
+        epochs=len(white),
+        effective=effective_samples(white, len(chosen)),
+        probability=probability,
+    )
+
+
+def effective_samples(white: ArrayLike, first: int | None = None) -> float:
+    """Return how many independent samples would average |z|² of the first components as well as this series (m, n) of them does.
+
+    ``m/(1 + 2 Σ_τ (1 − τ/m) ‖(A^τ)_first‖²/first)``, A by least squares.
+    """
+    z = array("white", white, ("m", "n"))
+    m, n = z.shape
+    k = n if first is None else first
+    A = np.linalg.lstsq(z[:-1], z[1:], rcond=None)[0].T
+    # Least squares makes the memory of a series of known mean too short by 2/m of itself (Kendall 1954).
+    A = A * (1.0 + 2.0 / m)
+    power, total = np.eye(n), 0.0
+    for tau in range(1, m):
+        power = A @ power
+        share = float(np.sum(power[:k, :k] ** 2)) / k
+        total += (1.0 - tau / m) * min(share, 1.0)
+        if share < 1e-6:
+            break
+    return float(max(1.0, m / (1.0 + 2.0 * total)))

@@ -1,0 +1,707 @@
+"""Covariance analysis: what a filter will achieve on a scenario, and which source of error makes how much of it, without a Monte Carlo.
+
+One pass along the true trajectory. The filter's own covariance gives its gains; the actual error, linear about the truth, goes through
+the same gains source by source (Maybeck 1979, section 6.8; Gelb 1974, section 7.2):
+
+- white and coloured noise, and the initial error, give a covariance each. They add up. For a matched filter the sum is its own P, which
+  linearised at the truth is also the posterior Cramér–Rao bound; for a mismatched one it is not, and the expected NEES tells by how much;
+- errors that are the same in every run of the scenario (its scale factor, its hard iron, what the integration of the gyro leaves) give a
+  mean error each;
+- errors that the scenario leaves out may be *considered*: a standard deviation each, a contribution each (:class:`Consider`).
+
+Gates, robust updates and everything else that depends on the data are not part of it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from strapdown import coning, flicker, gyro, kinematics, quaternion, vectors
+from strapdown.checks import Array, InputError, count, known_keys, non_negative
+from strapdown.gyro import GyroSpec
+from strapdown.kernels import covariance_loop
+from strapdown.kernels.machine import compiled
+from strapdown.mekf import covariance_matrices
+from strapdown.randomness import generator
+from strapdown.records import ImuRecord
+from strapdown.scenarios import Scenario
+from strapdown.setup import FilterSetup, believed, matched
+from strapdown.units import DEGREE
+from strapdown.vectors import VectorMeasurements
+
+AXES = ("x", "y", "z")
+
+LEAST_ERROR = 1e-12
+"""What is smaller in every step and measurement is rounding, rad."""
+LARGEST_LINEAR = 0.15
+"""Errors of attitude or direction above this, rad, are told to be beyond linear: their squares are a tenth of them."""
+
+
+def _no_sensors() -> dict[str, float]:
+    return {}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Consider:
+    """Errors that neither the scenario nor the filter knows of: one standard deviation each, independent on every axis."""
+
+    scale_factor: float = 0.0
+    """Of the gyro's three scale factors, dimensionless."""
+    misalignment: float = 0.0
+    """Of the six off-diagonal entries of the gyro's error matrix, rad."""
+    g_sensitivity: float = 0.0
+    """Of the nine entries of the gyro's g-sensitivity, rad/s per m/s²."""
+    sensor_bias: Mapping[str, float] = field(default_factory=_no_sensors)
+    """Of a constant on each component, body axes, by sensor, in the unit of its own σ: hard iron, T; of a direction rad."""
+    mounting: Mapping[str, float] = field(default_factory=_no_sensors)
+    """Of a rotation of the sensor on the body about each axis, rad, by sensor."""
+    time_offset: Mapping[str, float] = field(default_factory=_no_sensors)
+    """Of the time by which a sensor measures later than its stamps tell, s, by sensor."""
+
+    def __post_init__(self) -> None:
+        """Check every number."""
+        non_negative("scale_factor", self.scale_factor)
+        non_negative("misalignment", self.misalignment, unit="rad")
+        non_negative("g_sensitivity", self.g_sensitivity, unit="rad/s per m/s²")
+        for name in ("sensor_bias", "mounting", "time_offset"):
+            values = getattr(self, name)
+            if not isinstance(values, Mapping):
+                raise InputError(f"{name} is {values!r}; give a number for each sensor by its name")
+            checked = {str(sensor): non_negative(f"{name}[{sensor!r}]", value) for sensor, value in values.items()}
+            object.__setattr__(self, name, checked)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Analysis:
+    """What the filter will do, predicted: the error state e = (δθ, δb), rad in the body frame and rad/s."""
+
+    time: Array
+    """Epochs (m,), s."""
+    filter_covariance: Array
+    """P as the filter reports it (m, 6, 6)."""
+    sources: tuple[str, ...]
+    """Names of the sources of random error."""
+    contributions: Array
+    """What each makes of the covariance of the actual error (m, s, 6, 6)."""
+    fixed: tuple[str, ...]
+    """Names of the errors that are the same in every run."""
+    fixed_errors: Array
+    """The mean error that each makes (m, f, 6)."""
+    considered: tuple[str, ...]
+    """Names of the considered errors."""
+    considered_errors: Array
+    """The error that each makes at one standard deviation (m, c, 6)."""
+    expected_nis: Mapping[str, float]
+    """Mean NIS per degree of freedom over the whole time, by sensor; 1 for a right filter."""
+    left_out: tuple[str, ...]
+    """Errors of the scenario that the analysis leaves out."""
+    beyond_linear: tuple[str, ...]
+    """What is too large for an analysis that is linear about the truth, in words: take a Monte Carlo there."""
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of the actual error (m, 6, 6), what is considered included."""
+        return np.asarray(
+            self.contributions.sum(axis=1) + np.einsum("mci,mcj->mij", self.considered_errors, self.considered_errors)
+        )
+
+    @property
+    def mean_error(self) -> Array:
+        """Mean of the actual error (m, 6)."""
+        return np.asarray(self.fixed_errors.sum(axis=1))
+
+    @property
+    def second_moment(self) -> Array:
+        """E[e eᵀ] of the actual error (m, 6, 6)."""
+        mean = self.mean_error
+        return np.asarray(self.covariance + mean[:, :, None] * mean[:, None, :])
+
+    @property
+    def rms(self) -> Array:
+        """Root mean square of the actual error (m, 6): rad, rad/s."""
+        return np.sqrt(np.diagonal(self.second_moment, axis1=1, axis2=2))
+
+    @property
+    def filter_sigma(self) -> Array:
+        """What the filter says of its error (m, 6): rad, rad/s."""
+        return np.sqrt(np.diagonal(self.filter_covariance, axis1=1, axis2=2))
+
+    @property
+    def expected_nees(self) -> Array:
+        """Mean NEES per state (m, 3) of all six states, of the attitude, of the bias: tr(P⁻¹ E[e eᵀ])/n; 1 for a right filter."""
+        M, P = self.second_moment, self.filter_covariance
+        parts = (slice(0, 6), slice(0, 3), slice(3, 6))
+        return np.stack(
+            [
+                np.trace(np.linalg.solve(P[:, part, part], M[:, part, part]), axis1=1, axis2=2)
+                / M[0, part, part].shape[0]
+                for part in parts
+            ],
+            axis=-1,
+        )
+
+    def budget(self, epoch: int = -1) -> list[tuple[str, str, float, float]]:
+        """Return one row a source at an epoch: name, kind, RMS error of an attitude axis (rad) and of a bias axis (rad/s).
+
+        Kinds are "random", "fixed" and "considered"; parts of one considered error (its axes) are taken together. Squares of all rows but
+        the fixed ones add up; those add as errors.
+        """
+        rows: dict[tuple[str, str], Array] = {}
+        for name, block in zip(self.sources, self.contributions[epoch], strict=True):
+            rows[name, "random"] = np.diag(block)
+        for name, error in zip(self.fixed, self.fixed_errors[epoch], strict=True):
+            rows[name, "fixed"] = error**2
+        for name, error in zip(self.considered, self.considered_errors[epoch], strict=True):
+            key = (name.partition(",")[0], "considered")
+            rows[key] = rows.get(key, np.zeros(6)) + error**2
+        return [
+            (name, kind, float(np.sqrt(np.mean(squares[:3]))), float(np.sqrt(np.mean(squares[3:]))))
+            for (name, kind), squares in rows.items()
+        ]
+
+
+# ------------------------------------------------------------------------------------------------------------- the trajectory
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Rows:
+    """Scalar rows of one sensor's measurements, in the order of time."""
+
+    time: Array
+    h: Array
+    """(r, 3)."""
+    noise: Array
+    """How the sensor's noise, in the unit of its own σ, comes into the row (r, 3)."""
+    filter_variance: Array
+    variance: Array
+    error: Array
+    """Innovation at the truth without noise (r,): what the sensor's fixed errors make."""
+    moving: Array
+    """What a second of lateness makes of the row through the change of the reference (r,)."""
+
+
+def _exact(sensor: Any) -> Any:
+    """Return the sensor without any noise."""
+    zero = {name: 0.0 for name in ("sigma", "sigma_across", "sigma_about") if hasattr(sensor, name)}
+    faults = dataclasses.replace(sensor.faults, correlated_sigma=0.0, outlier_probability=0.0)
+    return dataclasses.replace(sensor, **zero, faults=faults)
+
+
+def _rows(
+    sensor: Any, exact: VectorMeasurements, own: VectorMeasurements, held: VectorMeasurements, motion: Any
+) -> _Rows:
+    """Return the rows of a series: ``exact`` without noise, ``own`` with the sensor's σ, ``held`` with that of the filter."""
+    time = exact.time
+    m = len(time)
+    attitude = np.asarray(motion.attitude(time)).reshape(m, 4)
+    faults = sensor.faults
+    more = 1.0 - faults.outlier_probability + faults.outlier_probability * faults.outlier_scale**2
+    moving = np.zeros((m, 1))
+    if own.attitude is not None:
+        assert own.sigma_axes is not None
+        assert held.sigma_axes is not None
+        assert exact.attitude is not None
+        h = noise = np.broadcast_to(np.eye(3), (m, 3, 3))
+        variance, filter_variance = own.sigma_axes**2, held.sigma_axes**2
+        error = quaternion.log(quaternion.multiply(quaternion.conjugate(attitude), exact.attitude)).reshape(m, 3)
+        return _flat(time, h, noise, filter_variance, variance * more, error, np.zeros((m, 3)))
+    R = quaternion.to_matrix(attitude)
+    reference = np.array(exact.references_f)
+    length = np.linalg.norm(reference, axis=1) if own.kind == "vector" else np.ones(m)
+    sigma, filter_sigma = own.sigma / length, held.sigma / length
+    scale = np.divide(sigma, sensor.sigma, out=np.zeros(m), where=sensor.sigma > 0.0)
+    if own.kind == "heading":
+        z_f = np.einsum("mij,mj->mi", R, exact.vector_b)
+        level = np.hypot(z_f[:, 0], z_f[:, 1])
+        tilt = -z_f[:, 2] / level**2
+        h = np.einsum("mij,mi->mj", R, np.stack([tilt * z_f[:, 0], tilt * z_f[:, 1], np.ones(m)], axis=1))[:, None]
+        across = np.stack([z_f[:, 1], -z_f[:, 0], np.zeros(m)], axis=1) / level[:, None]
+        # The noise of a heading pair is that of its line in the fixed frame.
+        own_axes = -across if isinstance(sensor, vectors.HeadingPair) else np.einsum("mij,mi->mj", R, across)
+        noise = own_axes[:, None]
+        cosine = z_f[:, 0] * reference[:, 0] + z_f[:, 1] * reference[:, 1]
+        error = np.arctan2(z_f[:, 0] * reference[:, 1] - z_f[:, 1] * reference[:, 0], cosine)[:, None]
+        noise, sigma, filter_sigma = noise * scale[:, None, None], sigma[:, None], filter_sigma[:, None]
+        return _flat(time, h, noise, filter_sigma**2, sigma**2 * more, error, moving)
+    frame = np.broadcast_to(vectors.triad(reference), (m, 3, 3))
+    basis = frame @ R
+    h = np.stack([-basis[:, 1], basis[:, 0]], axis=1)
+    z = exact.vector_b / length[:, None]
+    error = np.einsum("mij,mj->mi", basis[:, :2], z)
+    if m > 1 and exact.reference_f.ndim == 2:
+        unit = reference / np.linalg.norm(reference, axis=1, keepdims=True)
+        moving = np.einsum("mij,mj->mi", frame[:, :2], np.gradient(unit, time, axis=0))
+    else:
+        moving = np.zeros((m, 2))
+    two = np.ones((1, 2))
+    noise = basis[:, :2] * scale[:, None, None]
+    return _flat(time, h, noise, filter_sigma[:, None] ** 2 * two, sigma[:, None] ** 2 * more * two, error, moving)
+
+
+def _flat(
+    time: Array, h: Array, noise: Array, filter_variance: Array, variance: Array, error: Array, moving: Array
+) -> _Rows:
+    rows = h.shape[1]
+    return _Rows(
+        time=np.repeat(time, rows),
+        h=h.reshape(-1, 3),
+        noise=noise.reshape(-1, 3),
+        filter_variance=filter_variance.ravel(),
+        variance=variance.ravel(),
+        error=error.ravel(),
+        moving=moving.ravel(),
+    )
+
+
+def _all_rows(scenario: Scenario, setup: FilterSetup) -> list[_Rows]:
+    start, end = scenario.edges[0], scenario.edges[-1]
+    exact, own = [], []
+    for sensor in scenario.sensors:
+        kinds = (
+            vectors.VectorSensor,
+            vectors.AttitudeSensor,
+            vectors.Magnetometer,
+            vectors.Accelerometer,
+            vectors.HeadingPair,
+        )
+        if not isinstance(sensor, kinds):
+            raise InputError(
+                f"{sensor.name} is a {type(sensor).__name__}, whose noise the analysis does not know; leave it out"
+            )
+        random = generator(scenario.seed, 0, sensor.name)
+        own.append(sensor.observe(scenario.motion, start, end, random))
+        exact.append(_exact(sensor).observe(scenario.motion, start, end, random))
+    step = dataclasses.replace(setup, integration=coning.ALGORITHMS["one-sample"])
+    record = ImuRecord(time=np.array([start, end]), increments=np.zeros((1, 3)), vectors=tuple(own))
+    held = believed(record, step).vectors
+    for series in held:
+        if not np.all(series.sigma > 0.0):
+            raise InputError(
+                f"{series.sensor}: sigma is 0; a filter needs a noise greater than zero: give the sensor one, or [filter.sigma]"
+            )
+    return [_rows(s, e, o, b, scenario.motion) for s, e, o, b in zip(scenario.sensors, exact, own, held, strict=True)]
+
+
+# ------------------------------------------------------------------------------------------------------------------- errors
+
+
+_FIXED_PARTS = {
+    "scale factor": ("scale_factor",),
+    "asymmetry": ("asymmetry",),
+    "misalignment": ("misalignment",),
+    "g-sensitivity": ("g_sensitivity",),
+    "bandwidth": ("bandwidth", "damping"),
+    "range": ("range",),
+}
+"""Errors of a gyro that are the same in every run, by name, and the fields of the specification that make them."""
+
+
+def _fixed_rates(scenario: Scenario) -> dict[str, Array]:
+    """Return errors of the measured rate that are the same in every run, by name, over each gyro interval (n, 3), rad/s."""
+    spec, edges, motion = scenario.gyro, scenario.edges, scenario.motion
+    true = motion.increments(edges)
+    dt = np.diff(edges)[:, None]
+    rates: dict[str, Array] = {}
+    for part, fields in _FIXED_PARTS.items():
+        kept = {name: getattr(spec, name) for name in fields}
+        if all(np.all(np.isinf(value)) or not np.any(value) for name, value in kept.items() if name != "damping"):
+            continue
+        force = None
+        if part == "g-sensitivity":
+            force = vectors.specific_force(motion, 0.5 * (edges[1:] + edges[:-1]), gravity_f=scenario.gravity_f)
+        random = generator(scenario.seed, 0, "gyro")
+        output = gyro.simulate(GyroSpec(**kept), true, edges, random, specific_force=force)
+        error = (output.increments - true) / dt
+        if np.abs(error).max() > 0.0:
+            rates[f"gyro {part}"] = error
+    return rates
+
+
+def _integration_rate(scenario: Scenario, setup: FilterSetup, stamps: Array, attitude: Array, phi: Array) -> Array:
+    """Return the rate error (segments, 3), rad/s, of taking each step of the integration algorithm for a turn at constant rate.
+
+    It holds what the algorithm leaves of coning, and that a measurement inside a step meets a share of the step's turn. Inside a step the
+    error ``e(t) = Log(exp(−share φ) ⊗ q_true(t))`` from the step's start is exact; the rate is the one that drives it so.
+    """
+    n = setup.integration.samples
+    edges = scenario.edges
+    steps = (len(edges) - 1) // n
+    turns = coning.rotation_vectors(scenario.motion.increments(edges[: steps * n + 1]), setup.integration)
+    begins = edges[: steps * n + 1 : n]
+    step = np.clip(np.searchsorted(begins, stamps[1:], side="left") - 1, 0, steps - 1)  # of the segment that ends there
+    first = np.searchsorted(stamps, begins[:-1])[step]
+    length = np.diff(begins)[step]
+    share = (stamps[1:] - begins[step]) / length
+    true = quaternion.multiply(quaternion.conjugate(attitude[first]), attitude[1:])
+    error = quaternion.log(quaternion.multiply(quaternion.exp(-share[:, None] * turns[step]), true))
+    error[stamps[1:] > begins[-1]] = 0.0
+    before = np.concatenate([np.zeros((1, 3)), error[:-1]])
+    before[stamps[:-1] <= begins[step]] = 0.0
+    carried = quaternion.rotate(quaternion.exp(-phi), before)
+    driven = np.einsum("sij,sj->si", kinematics.inverse_right_jacobian(phi), error - carried)
+    return np.asarray(-driven / np.diff(stamps)[:, None])
+
+
+def _left_out(scenario: Scenario, setup: FilterSetup) -> tuple[str, ...]:
+    spec = scenario.gyro
+    names = (
+        "quantization",
+        "rate_resolution",
+        "sampling_jitter",
+        "timestamp_error",
+        "timestamp_offset",
+        "drop_probability",
+    )
+    found = [f"gyro {name.replace('_', ' ')}" for name in names if np.any(np.asarray(getattr(spec, name)) > 0.0)]
+    if np.any(spec.temperature_coefficient != 0.0):
+        found.append("gyro temperature coefficient")
+    found += [name for name in ("gate", "robust") if getattr(setup, name, None) is not None]
+    return tuple(found)
+
+
+def _beyond_linear(names: list[str], sensor_of: np.ndarray, error: Array, attitude_sigma: float) -> tuple[str, ...]:
+    found = []
+    if attitude_sigma > LARGEST_LINEAR:
+        found.append(f"initial attitude, 1σ {attitude_sigma / DEGREE:.3g}°")
+    for i, name in enumerate(names):
+        largest = float(np.abs(error[sensor_of == i]).max(initial=0.0))
+        if largest > LARGEST_LINEAR:
+            found.append(f"{name} (fixed), up to {largest / DEGREE:.3g}°")
+    return tuple(found)
+
+
+def _axes(value: Any) -> Array:
+    return np.broadcast_to(np.asarray(value, np.float64), 3).copy()
+
+
+def _diagonal(attitude_sigma: float, bias_sigma: float) -> Array:
+    """Return the 21 numbers of a diagonal covariance."""
+    block = np.zeros(21)
+    block[[0, 3, 5]] = attitude_sigma**2
+    block[[15, 18, 20]] = bias_sigma**2
+    return block
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Path:
+    """The trajectory cut at every gyro edge and every measurement, and the rows of all sensors in order."""
+
+    stamps: Array
+    """Stations (n + 1,), s."""
+    attitude: Array
+    dt: Array
+    """Of the segments between them (n,), s."""
+    phi: Array
+    """True turns (n, 3), rad."""
+    interval: np.ndarray
+    """Gyro interval that each lies in (n,)."""
+    rows: dict[str, Array]
+    """Fields of :class:`_Rows`, sensors together."""
+    sensor: np.ndarray
+    """Of each row."""
+    kept: np.ndarray
+    """Gyro edges at the epochs."""
+
+    @property
+    def new_sample(self) -> np.ndarray:
+        """Whether a segment is the first of its gyro interval (n,), but for the very first."""
+        return np.concatenate([[False], np.diff(self.interval) > 0])
+
+    @property
+    def row_bounds(self) -> np.ndarray:
+        """Rows of each station (n + 2,)."""
+        first = np.searchsorted(self.rows["time"], self.stamps, side="left")
+        return np.concatenate([first, [len(self.rows["time"])]])
+
+
+def _path(scenario: Scenario, setup: FilterSetup, epochs: int) -> _Path:
+    edges = scenario.edges
+    steps = (len(edges) - 1) // setup.integration.samples
+    if steps < count("epochs", epochs):
+        raise InputError(
+            f"{steps} filter steps are fewer than {epochs} epochs; take fewer epochs, or a longer scenario"
+        )
+    parts = _all_rows(scenario, setup)
+    fields = [entry.name for entry in dataclasses.fields(_Rows)]
+    empty = {name: np.empty((0, 3) if name in ("h", "noise") else 0) for name in fields}
+    joined = {name: np.concatenate([empty[name], *(getattr(part, name) for part in parts)]) for name in fields}
+    order = np.argsort(joined["time"], kind="stable")
+    stamps = np.union1d(edges, joined["time"])
+    attitude = scenario.motion.attitude(stamps)
+    every = steps // epochs * setup.integration.samples
+    return _Path(
+        stamps=stamps,
+        attitude=attitude,
+        dt=np.diff(stamps),
+        phi=quaternion.log(quaternion.multiply(quaternion.conjugate(attitude[:-1]), attitude[1:])),
+        interval=np.clip(np.searchsorted(edges, stamps[:-1], side="right") - 1, 0, len(edges) - 2),
+        rows={name: np.ascontiguousarray(value[order]) for name, value in joined.items()},
+        sensor=np.repeat(np.arange(len(parts)), [len(part.time) for part in parts])[order],
+        kept=np.arange(0, steps * setup.integration.samples + 1, every),
+    )
+
+
+class _Random:
+    """Sources of random error, as the kernel takes them; the filter itself comes first."""
+
+    def __init__(self, setup: FilterSetup) -> None:
+        noise = setup.process_noise
+        self.names = ["filter"]
+        self.angle = [np.full(3, noise.angle_random_walk**2)]
+        self.rate = [np.full(3, noise.rate_random_walk**2)]
+        self.sensor = [-2]
+        self.blocks = [_diagonal(setup.attitude_sigma, setup.bias_sigma)]
+        self.shapes: list[tuple[int, Array, Array, Array, Array]] = []
+        """Source, amplitude (3,), gains, poles, X g of a coloured bias."""
+        self.coloured: list[tuple[int, int, float, float]] = []
+        """Source, sensor, σ, correlation time of a coloured noise."""
+
+    def add(self, name: str, *, angle: Any = 0.0, rate: Any = 0.0, sensor: int = -1, block: Array | None = None) -> int:
+        """Add a source: white densities of rate and bias, or the rows of a sensor, or a covariance at the start."""
+        self.names.append(name)
+        self.angle.append(_axes(angle))
+        self.rate.append(_axes(rate))
+        self.sensor.append(sensor)
+        self.blocks.append(np.zeros(21) if block is None else block)
+        return len(self.names) - 1
+
+    def add_gyro(self, spec: GyroSpec, sample_interval: float, samples: int) -> None:
+        """Add the noises of a gyro."""
+        markov, tau = _axes(spec.markov_noise), spec.markov_correlation_time
+        walk = _axes(spec.rate_random_walk) ** 2 + (0.0 if np.isfinite(tau) else markov**2)
+        if np.any(_axes(spec.angle_random_walk) > 0.0):
+            self.add("angle random walk", angle=_axes(spec.angle_random_walk) ** 2)
+        if np.any(walk > 0.0):
+            self.add("rate random walk", rate=walk)
+        instability = _axes(spec.bias_instability)
+        if np.any(instability > 0.0):
+            shaping = flicker.shaping(samples)
+            projected = shaping.covariance @ shaping.gains
+            self.shapes.append((self.add("flicker"), instability, shaping.gains, shaping.poles, projected))
+        if np.isfinite(tau) and np.any(markov > 0.0):
+            pole = np.array([np.exp(-sample_interval / tau)])
+            self.shapes.append(
+                (self.add("Gauss–Markov bias"), markov * np.sqrt(0.5 * tau), np.ones(1), pole, np.ones(1))
+            )
+
+    def add_sensor(self, number: int, sensor: Any) -> None:
+        """Add the noises of a sensor."""
+        self.add(sensor.name, sensor=number)
+        faults = sensor.faults
+        if faults.correlated_sigma > 0.0:
+            source = self.add(f"{sensor.name}, correlated")
+            self.coloured.append((source, number, faults.correlated_sigma, faults.correlation_time))
+
+    def shaping(self) -> tuple[Array, Array, Array, Array, Array, np.ndarray]:
+        """Return amplitudes, gains, poles, X g, cross-covariances at the start, and sources, of all coloured biases.
+
+        The filter starts from a bias that is off by its prior from the *whole* true bias, so that what it calls its error holds −f.
+        """
+        number, most = len(self.shapes), max([1, *(len(gains) for _, _, gains, _, _ in self.shapes)])
+        table = np.zeros((3, number, most))
+        amplitudes, cross = np.zeros((number, 3)), np.zeros((number, 6, 3, most))
+        for c, (source, amplitude, gains, poles, projected) in enumerate(self.shapes):
+            n = len(gains)
+            table[:, c, :n] = gains, poles, projected
+            amplitudes[c] = amplitude
+            for a in range(3):
+                cross[c, 3 + a, a, :n] = -(amplitude[a] ** 2) * projected
+            self.blocks[source][[15, 18, 20]] = amplitude**2 * (gains @ projected)
+        sources = np.array([source for source, *_ in self.shapes], np.int64)
+        return amplitudes, table[0], table[1], table[2], cross, sources
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Column:
+    """An error without noise: a rate error in each segment (n, 3), an error in each row (r,), a bias that grows (3,)."""
+
+    name: str
+    rate: Array | None = None
+    rows: Array | None = None
+    ramp: Array = field(default_factory=lambda: np.zeros(3))
+
+
+def _fixed_columns(scenario: Scenario, setup: FilterSetup, path: _Path) -> list[_Column]:
+    """Return the errors that are the same in every run."""
+    columns = [_Column(name=name, rate=value[path.interval]) for name, value in _fixed_rates(scenario).items()]
+    integration = _integration_rate(scenario, setup, path.stamps, path.attitude, path.phi)
+    if np.abs(integration * path.dt[:, None]).max() > LEAST_ERROR:
+        columns.append(_Column(name=f"integration ({setup.integration.name})", rate=integration))
+    if np.any(_axes(scenario.gyro.rate_ramp) != 0.0):
+        columns.append(_Column(name="rate ramp", ramp=_axes(scenario.gyro.rate_ramp)))
+    for i, sensor in enumerate(scenario.sensors):
+        mine = np.where(path.sensor == i, path.rows["error"], 0.0)
+        if np.abs(mine).max(initial=0.0) > LEAST_ERROR:
+            columns.append(_Column(name=f"{sensor.name} (fixed)", rows=mine))
+    return columns
+
+
+def _considered_columns(scenario: Scenario, consider: Consider, path: _Path) -> list[_Column]:
+    """Return the considered errors at one standard deviation, one column an independent parameter."""
+    columns: list[_Column] = []
+    unit = np.eye(3)
+    turn_rate = path.phi / path.dt[:, None]
+    if consider.scale_factor > 0.0:
+        for i in range(3):
+            rate = consider.scale_factor * turn_rate[:, [i]] * unit[i]
+            columns.append(_Column(name=f"scale factor, {AXES[i]}", rate=rate))
+    pairs = [(i, j) for i in range(3) for j in range(3)]
+    if consider.misalignment > 0.0:
+        for i, j in (pair for pair in pairs if pair[0] != pair[1]):
+            rate = consider.misalignment * turn_rate[:, [j]] * unit[i]
+            columns.append(_Column(name=f"misalignment, {AXES[i]} of {AXES[j]}", rate=rate))
+    if consider.g_sensitivity > 0.0:
+        middle = 0.5 * (path.stamps[1:] + path.stamps[:-1])
+        force = vectors.specific_force(scenario.motion, middle, gravity_f=scenario.gravity_f)
+        for i, j in pairs:
+            rate = consider.g_sensitivity * force[:, [j]] * unit[i]
+            columns.append(_Column(name=f"g-sensitivity, {AXES[i]} of {AXES[j]}", rate=rate))
+    names = [sensor.name for sensor in scenario.sensors]
+    rows = path.rows
+    for what, of_axis, sizes in (
+        ("bias", rows["noise"], consider.sensor_bias),
+        ("mounting", rows["h"], consider.mounting),
+    ):
+        for name, size in sizes.items():
+            mine = path.sensor == names.index(name)
+            columns += [
+                _Column(name=f"{name} {what}, {AXES[i]}", rows=np.where(mine, size * of_axis[:, i], 0.0))
+                for i in range(3)
+            ]
+    for name, size in consider.time_offset.items():
+        late = np.einsum("ri,ri->r", rows["h"], scenario.motion.body_rate(rows["time"])) + rows["moving"]
+        mine = path.sensor == names.index(name)
+        columns.append(_Column(name=f"{name} time offset", rows=np.where(mine, size * late, 0.0)))
+    return columns
+
+
+# ------------------------------------------------------------------------------------------------------------------ analysis
+
+
+def analyse(
+    scenario: Scenario,
+    setup: FilterSetup | None = None,
+    *,
+    consider: Consider | None = None,
+    initial_attitude_sigma: float | None = None,
+    initial_bias_sigma: float | None = None,
+    epochs: int = 100,
+) -> Analysis:
+    """Return the predicted errors of a filter on a scenario, from one pass without noise.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    setup : FilterSetup
+        What the filter believes; None: what a right one does (:func:`strapdown.setup.matched`).
+    consider : Consider
+        Errors besides those of the scenario.
+    initial_attitude_sigma, initial_bias_sigma : float
+        Actual standard deviations of the initial errors, rad and rad/s, where they are not what the filter believes.
+    epochs : int
+        Intervals between the epochs of the result; they end on filter steps, as those of :func:`strapdown.montecarlo.run` do.
+
+    Raises
+    ------
+    InputError
+        If a considered sensor is not in the scenario, a sensor is of a class of its own, or its noise is zero.
+    """
+    setup = matched(scenario) if setup is None else setup
+    consider = Consider() if consider is None else consider
+    names = [sensor.name for sensor in scenario.sensors]
+    for part in ("sensor_bias", "mounting", "time_offset"):
+        known_keys(f"consider: {part}", getattr(consider, part), names)
+    for name in consider.sensor_bias:
+        if isinstance(scenario.sensors[names.index(name)], vectors.HeadingPair):
+            raise InputError(f"consider: sensor_bias of {name}: a heading pair has none; consider its mounting")
+    edges = scenario.edges
+    attitude_sigma = setup.attitude_sigma if initial_attitude_sigma is None else initial_attitude_sigma
+    bias_sigma = setup.bias_sigma if initial_bias_sigma is None else initial_bias_sigma
+    non_negative("initial_attitude_sigma", attitude_sigma, unit="rad")
+    non_negative("initial_bias_sigma", bias_sigma, unit="rad/s")
+    path = _path(scenario, setup, epochs)
+    rows = path.rows
+
+    random = _Random(setup)
+    random.add("initial attitude", block=_diagonal(attitude_sigma, 0.0))
+    random.add("initial bias", block=_diagonal(0.0, bias_sigma))
+    random.add_gyro(scenario.gyro, float(edges[1] - edges[0]), len(edges) - 1)
+    for i, sensor in enumerate(scenario.sensors):
+        random.add_sensor(i, sensor)
+    amplitudes, gains, poles, projected, cross, shape_sources = random.shaping()
+    coloured = random.coloured
+
+    fixed = _fixed_columns(scenario, setup, path)
+    columns = [*fixed, *_considered_columns(scenario, consider, path)]
+    with_rate = [k for k, column in enumerate(columns) if column.rate is not None]
+    place = np.full(len(columns), -1)
+    place[with_rate] = np.arange(len(with_rate))
+    column_rate = np.zeros((len(path.dt), len(with_rate), 3))
+    row_error = np.zeros((len(rows["time"]), len(columns)))
+    for k, column in enumerate(columns):
+        if column.rate is not None:
+            column_rate[:, place[k]] = column.rate
+        if column.rows is not None:
+            row_error[:, k] = column.rows
+
+    stations = np.searchsorted(path.stamps, edges[path.kept])
+    out = np.empty((len(stations), len(random.names), 21))
+    columns_out = np.empty((len(stations), len(columns), 6))
+    nis = np.zeros((len(names), 2))
+    compiled(covariance_loop.run_covariance)(
+        path.dt,
+        np.ascontiguousarray(path.phi),
+        path.new_sample,
+        path.row_bounds,
+        rows["h"],
+        rows["noise"],
+        rows["filter_variance"],
+        rows["variance"],
+        path.sensor,
+        rows["time"],
+        row_error,
+        np.array(random.angle),
+        np.array(random.rate),
+        np.array(random.sensor),
+        np.array(random.blocks),
+        amplitudes,
+        gains,
+        poles,
+        projected,
+        cross,
+        shape_sources,
+        np.array([number for _, number, _, _ in coloured], np.int64),
+        np.array([sigma for _, _, sigma, _ in coloured], np.float64),
+        np.array([tau for *_, tau in coloured], np.float64),
+        np.zeros((len(coloured), 6, 3)),
+        np.array([source for source, *_ in coloured], np.int64),
+        np.full(len(coloured), path.stamps[0]),
+        column_rate,
+        place,
+        np.array([column.ramp for column in columns]).reshape(-1, 3),
+        len(fixed),
+        np.zeros((len(columns), 6)),
+        stations,
+        out,
+        columns_out,
+        nis,
+    )
+    whole = covariance_matrices(out)
+    return Analysis(
+        time=edges[path.kept],
+        filter_covariance=whole[:, 0],
+        sources=tuple(random.names[1:]),
+        contributions=whole[:, 1:],
+        fixed=tuple(column.name for column in fixed),
+        fixed_errors=columns_out[:, : len(fixed)],
+        considered=tuple(column.name for column in columns[len(fixed) :]),
+        considered_errors=columns_out[:, len(fixed) :],
+        expected_nis={name: float(total / seen) for name, (total, seen) in zip(names, nis, strict=True) if seen > 0.0},
+        left_out=_left_out(scenario, setup),
+        beyond_linear=_beyond_linear(names, path.sensor, rows["error"], attitude_sigma),
+    )

@@ -1,0 +1,135 @@
+"""Innovations of one record: their size, their shape, their memory."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import MaxNLocator
+
+from strapdown.checks import Array
+from strapdown.consistency import Autocorrelation, Distribution, QuantilePairs
+from strapdown.plots.decimation import decimated
+from strapdown.plots.style import AXES, BLUE, CYCLE, ORANGE, SKY, VERMILION, angle_unit, axes_or_new, ink
+from strapdown.records import Innovations
+
+HISTOGRAM_REACH = 5.0
+"""Histograms of whitened innovations go so many σ to both sides; what lies beyond is counted in the legend."""
+
+
+def innovation_histogram(whitened: Array, ax: Axes | None = None) -> Axes:
+    """Draw the histogram of whitened innovations (n, dof), all components together, over the standard normal that they ought to be."""
+    ax = axes_or_new(ax)
+    z = whitened[np.isfinite(whitened)]
+    number = int(np.clip(np.sqrt(len(z)), 12, 80))
+    edges = np.linspace(-HISTOGRAM_REACH, HISTOGRAM_REACH, number + 1)
+    ax.hist(
+        np.clip(z, -HISTOGRAM_REACH, HISTOGRAM_REACH),
+        bins=edges.tolist(),
+        density=True,
+        color=SKY,
+        edgecolor="none",
+        label=f"{len(z)} innovations",
+    )
+    x = np.linspace(-HISTOGRAM_REACH, HISTOGRAM_REACH, 401)
+    ax.plot(x, np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi), color=ink(), linewidth=1.4, label="standard normal")
+    beyond = int(np.sum(np.abs(z) > HISTOGRAM_REACH))
+    if beyond:
+        ax.plot([], [], " ", label=f"{beyond} beyond {HISTOGRAM_REACH:g} σ, in the outermost bins")
+    ax.set_xlabel("innovation over its own σ")
+    ax.set_ylabel("density")
+    ax.set_ylim(0.0, 1.35 * ax.get_ylim()[1])
+    ax.legend(loc="upper right")
+    return ax
+
+
+def innovation_quantiles(pairs: QuantilePairs, ax: Axes | None = None) -> Axes:
+    """Draw sorted whitened innovations over the quantiles of the standard normal, with the band of each by itself."""
+    ax = axes_or_new(ax)
+    ax.fill_between(
+        pairs.theoretical,
+        pairs.low,
+        pairs.high,
+        color=ink(),
+        alpha=0.12,
+        linewidth=0,
+        label=f"{100 * pairs.probability:g} % of a right filter",
+    )
+    ends = np.array([pairs.theoretical[0], pairs.theoretical[-1]])
+    ax.plot(ends, ends, color=ink(), linewidth=0.8)
+    ax.plot(pairs.theoretical, pairs.observed, ".", color=BLUE, markersize=3, label="innovations")
+    ax.set_xlabel("quantile of the standard normal")
+    ax.set_ylabel("innovation over its own σ")
+    ax.legend(loc="upper left")
+    return ax
+
+
+def innovation_autocorrelation(result: Autocorrelation, ax: Axes | None = None) -> Axes:
+    """Draw the autocorrelation of each component with the bounds of one lag and of all lags together."""
+    ax = axes_or_new(ax)
+    lags, number = result.lags, result.values.shape[1]
+    width = 0.7 / number
+    for k in range(number):
+        places = lags + (k - 0.5 * (number - 1)) * width
+        ax.bar(
+            places,
+            result.values[:, k],
+            width=width,
+            color=CYCLE[k % len(CYCLE)],
+            label=AXES[k] if number > 1 else "innovations",
+        )
+    percent = f"{100 * result.probability:g} %"
+    for bounds, style, name in (
+        (result.bounds, ":", f"{percent}, each lag"),
+        (result.simultaneous_bounds, "--", f"{percent}, all lags together"),
+    ):
+        for sign in (1.0, -1.0):
+            ax.plot(lags, sign * bounds, style, color=ink(), linewidth=1.0, label=name if sign > 0 else None)
+    ax.axhline(0.0, color=ink(), linewidth=0.6)
+    top = max(1.6 * float(result.simultaneous_bounds.max()), 1.25 * float(np.abs(result.values).max()))
+    ax.set_ylim(-top, 1.5 * top)
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.set_xlabel("lag, measurements")
+    ax.set_ylabel("autocorrelation")
+    ax.legend(loc="upper right", ncols=2)
+    return ax
+
+
+def nis_over_record(
+    innovations: Innovations, bounds: tuple[float, float], ax: Axes | None = None, *, window: int = 50
+) -> Axes:
+    """Draw the NIS of one sensor per degree of freedom over time, its running mean, and the ``bounds`` of one measurement."""
+    ax = axes_or_new(ax)
+    degrees = innovations.innovation.shape[1]
+    value = innovations.nis / degrees
+    ax.axhspan(*bounds, color=ink(), alpha=0.12, linewidth=0, label="99 % of a right filter's")
+    few, low = decimated(innovations.time, np.maximum(value, 1e-4))
+    ax.plot(few, low, ".", color=SKY, markersize=2.5, label="one measurement")
+    if len(value) >= 2 * window:
+        mean = np.convolve(value, np.full(window, 1.0 / window), mode="valid")
+        middle = innovations.time[window // 2 : window // 2 + len(mean)]
+        ax.plot(*decimated(middle, mean), color=VERMILION, linewidth=1.2, label=f"mean of {window}")
+    ax.axhline(1.0, color=ink(), linewidth=0.6)
+    ax.set_yscale("log")
+    ax.set_ylim(0.3 * min(bounds[0], float(np.quantile(value, 0.01)) + 1e-4), 30.0 * max(bounds[1], float(value.max())))
+    ax.set_xlabel("time, s")
+    ax.set_ylabel("NIS per degree of freedom")
+    ax.legend(loc="upper right", ncols=3)
+    return ax
+
+
+def error_distribution(distribution: Distribution, ax: Axes | None = None, *, label: str = "attitude error") -> Axes:
+    """Draw the share of errors (rad) at or below each size, with the median and the 95 % error marked."""
+    ax = axes_or_new(ax)
+    unit, size = angle_unit(np.array([distribution.quantile(0.99)]))
+    ax.plot(*decimated(distribution.values / size, 100.0 * distribution.probability), color=BLUE, label=label)
+    for share, color in ((0.5, ORANGE), (0.95, VERMILION)):
+        at = distribution.quantile(share) / size
+        ax.plot([at, at, 0.0], [0.0, 100 * share, 100 * share], ":", color=color, linewidth=1.2)
+        ax.annotate(
+            f"{100 * share:g} %: {at:.3g} {unit}", (at, 100 * share), xytext=(6, -12), textcoords="offset points"
+        )
+    ax.set_xlim(0.0, 1.15 * distribution.quantile(0.999) / size)
+    ax.set_ylim(0.0, 102.0)
+    ax.set_xlabel(f"{label}, {unit}")
+    ax.set_ylabel("share of the time, %")
+    return ax

@@ -1,0 +1,124 @@
+"""Tuning: the likelihood along each parameter, the filter before and after on held-out data, searches from many starts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, NullFormatter
+
+from strapdown.plots.style import BLUE, CYCLE, SKY, VERMILION, axes_or_new, ink, new_figure
+from strapdown.tuning import Comparison, Slices, Tuning
+from strapdown.tuning.parameters import Unit
+
+TALLEST = 15.0
+"""Slices are drawn up to this 2 Δℓ."""
+
+
+def likelihood_slice(slices: Slices, tuning: Tuning, number: int, unit: Unit, ax: Axes | None = None) -> Axes:
+    """Draw twice the fall of the log likelihood along one parameter, with its interval and where it was before."""
+    ax = axes_or_new(ax)
+    one = tuning.parameters[number]
+    values = slices.values[number] / unit.factor
+    ax.semilogx(values, slices.fallen[number], color=BLUE, linewidth=1.4)
+    ax.axhline(3.84, color=ink(), linewidth=0.6, linestyle=":")
+    lower, upper = max(one.lower / unit.factor, values[0]), min(one.upper / unit.factor, values[-1])
+    ax.axvspan(
+        lower, upper, color=SKY, alpha=0.3, linewidth=0, label="95 % interval" if one.identified else "below the bound"
+    )
+    ax.axvline(one.value / unit.factor, color=BLUE, linewidth=0.8, label="tuned")
+    before = one.start / unit.factor
+    if values[0] <= before <= values[-1]:
+        ax.axvline(before, color=VERMILION, linewidth=1.0, linestyle="--", label="before")
+    else:
+        side = "left" if before < values[0] else "right"
+        ax.annotate(
+            f"before: {before:.3g}",
+            (0.02 if side == "left" else 0.98, 0.9),
+            xycoords="axes fraction",
+            ha=side,
+            color=VERMILION,
+        )
+    ax.set_xlim(values[0], values[-1])
+    if values[-1] < 10.0 * values[0]:
+        ax.xaxis.set_major_locator(MaxNLocator(4))
+        ax.xaxis.set_major_formatter(lambda value, _: f"{value:.4g}")
+    ax.xaxis.set_minor_formatter(NullFormatter())
+    ax.set_ylim(0.0, TALLEST)
+    ax.set_title(one.name)
+    ax.set_xlabel(unit.name)
+    return ax
+
+
+def likelihood_slices(slices: Slices, tuning: Tuning, units: Sequence[Unit]) -> Figure:
+    """Draw the slices of all parameters side by side."""
+    number = len(tuning.parameters)
+    columns = min(number, 4)
+    rows = -(-number // columns)
+    figure, axes = new_figure(rows, columns, size=(1.0 + 3.0 * columns, 0.7 + 2.7 * rows), squeeze=False, sharey=True)
+    for k, ax in enumerate(axes.ravel()):
+        if k >= number:
+            ax.set_visible(False)
+            continue
+        likelihood_slice(slices, tuning, k, units[k], ax)
+        if k % columns == 0:
+            ax.set_ylabel("fall of 2 log likelihood")
+    found = {
+        label: handle for ax in axes.ravel() for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(found.values(), found.keys(), loc="outside lower center", ncols=4, frameon=False)
+    return figure
+
+
+def before_and_after(comparison: Comparison, *, title: str = "") -> Figure:
+    """Draw the NIS of the held-out innovations over time, before and after, with the bounds of a right filter in each span."""
+    from strapdown.consistency import mean_bounds
+
+    figure, ax = new_figure(size=(9.0, 4.0))
+    for (name, one), color in zip(
+        (("before", comparison.before), ("after", comparison.after)), (VERMILION, BLUE), strict=True
+    ):
+        there = one.nis_degrees > 0
+        ax.plot(
+            one.nis_time[there],
+            one.nis_course[there],
+            ".-",
+            color=color,
+            linewidth=1.0,
+            label=f"{name}: mean {one.nis:.3g}",
+        )
+    degrees = comparison.after.nis_degrees
+    typical = max(1, round(float(np.median(degrees[degrees > 0]))))
+    ax.axhspan(
+        *mean_bounds(1, typical, 0.99), color=ink(), alpha=0.12, linewidth=0, label="99 % of a right filter, each span"
+    )
+    seen = np.concatenate([one.nis_course[one.nis_degrees > 0] for one in (comparison.before, comparison.after)])
+    if seen.max() > 5.0 or seen.min() < 0.2:
+        ax.set_yscale("log")
+    ax.set_xlabel("time, s")
+    ax.set_ylabel("NIS per degree of freedom")
+    ax.set_title(title)
+    ax.legend(loc="upper center", ncols=3, bbox_to_anchor=(0.5, -0.16), frameon=False)
+    return figure
+
+
+def searches(
+    tuning: Tuning, first: int, second: int, units: Sequence[Unit], ax: Axes | None = None, *, label: bool = True
+) -> Axes:
+    """Draw where each search began and ended in the plane of two parameters."""
+    ax = axes_or_new(ax)
+    pairs = [(first, units[first]), (second, units[second])]
+    begin = [np.exp(tuning.starts[:, j]) / unit.factor for j, unit in pairs]
+    end = [np.exp(tuning.optima[:, j]) / unit.factor for j, unit in pairs]
+    for k in range(len(tuning.starts)):
+        ax.plot([begin[0][k], end[0][k]], [begin[1][k], end[1][k]], color=CYCLE[0], linewidth=0.5, alpha=0.5)
+    ax.plot(*begin, "o", color=VERMILION, markersize=3.5, label="starts" if label else None)
+    ax.plot(*end, "o", color=BLUE, markersize=6, label="ends" if label else None)
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    ax.set_xlabel(f"{tuning.parameters[first].name}, {units[first].name}")
+    ax.set_ylabel(f"{tuning.parameters[second].name}, {units[second].name}")
+    ax.legend()
+    return ax

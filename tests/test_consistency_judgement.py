@@ -1,0 +1,287 @@
+"""The verdict: what it says, what it rests on, and its exit status."""
+
+import json
+import math
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from strapdown import cli, consistency, montecarlo, motion, records, scenarios, setup, vectors
+from strapdown.checks import InputError
+from strapdown.consistency.judgement import Finding, holm, resolution
+from strapdown.gyro import GyroSpec
+from strapdown.montecarlo import campaign
+from strapdown.records import Estimate, Innovations, Truth
+
+
+def estimate(scale=1.0, samples=400, seed=0, *, bias_error=0.0, covariance=True, correlated=False):
+    """An estimate whose innovations and errors are drawn as a right filter's, its innovations times a factor."""
+    random = np.random.default_rng(seed)
+    variance = np.array([1e-6] * 3 + [1e-10] * 3)
+    epochs = 200
+    truth = Truth(attitude=np.tile([1.0, 0.0, 0.0, 0.0], (epochs, 1)), bias=np.zeros((epochs, 3)))
+    error = np.sqrt(variance) * random.standard_normal((epochs, 6))
+    half = 0.5 * error[:, :3]
+    attitude = np.concatenate([np.ones((epochs, 1)), -half], axis=1)
+    attitude /= np.linalg.norm(attitude, axis=1, keepdims=True)
+    white = random.standard_normal((2, samples, 2))
+    if correlated:
+        white[1] = 0.8 * white[0] + 0.6 * white[1]
+    time = np.arange(samples) * 0.5
+    result = Estimate(
+        time=np.arange(epochs) * 1.0,
+        attitude=attitude,
+        bias=-error[:, 3:] - bias_error * np.array([0.0, 0.0, 1e-5]),
+        variance=np.tile(variance, (epochs, 1)),
+        covariance=np.tile(np.diag(variance), (epochs, 1, 1)) if covariance else None,
+        innovations={
+            name: Innovations(time=time, innovation=scale * 1e-3 * white[k], variance=np.full((samples, 2), 1e-6))
+            for k, name in enumerate(("star 1", "star 2"))
+        },
+    )
+    return result, truth
+
+
+def test_a_right_filter_is_consistent():
+    judgement = consistency.judge(*estimate())
+    assert judgement.verdict == "consistent"
+    assert not any(finding.rejected for finding in judgement.findings)
+    assert {finding.name for finding in judgement.findings} == {
+        "NIS",
+        "whiteness",
+        "normality",
+        "mean innovation",
+        "cross-correlation",
+        "NEES at the end",
+        "time-averaged NEES",
+    }
+    assert "would have been seen" in judgement.words
+
+
+@pytest.mark.parametrize(("scale", "leaning"), [(1.3, "optimistic"), (0.75, "pessimistic")])
+def test_a_wrong_noise_is_named_with_its_direction(scale, leaning):
+    judgement = consistency.judge(*estimate(scale))
+    assert judgement.verdict == "not consistent"
+    assert leaning in judgement.reason
+    wrong = [finding for finding in judgement.findings if finding.rejected]
+    assert [(finding.name, finding.of) for finding in wrong] == [("NIS", "star 1"), ("NIS", "star 2")]
+    assert math.sqrt(wrong[0].value) == pytest.approx(scale, rel=0.05)
+    assert "star 1" in judgement.words
+
+
+def test_a_bias_error_shows_in_the_errors_alone():
+    judgement = consistency.judge(*estimate(bias_error=10.0))
+    rejected = {(finding.name, finding.of) for finding in judgement.findings if finding.rejected}
+    assert ("NEES at the end", "bias") in rejected
+    assert ("NEES at the end", "attitude") not in rejected
+    assert not any(name == "NIS" for name, _ in rejected)
+    blind = consistency.judge(estimate(bias_error=10.0)[0])
+    assert blind.verdict == "consistent"
+    assert "bias error that the start hides" in blind.limits[0]  # and it says what it cannot show
+
+
+def test_sensors_that_share_an_error_are_told():
+    judgement = consistency.judge(estimate(correlated=True)[0])
+    assert [(f.name, f.of) for f in judgement.findings if f.rejected] == [("cross-correlation", "star 1 and star 2")]
+
+
+def test_variances_alone_judge_the_end_by_axes():
+    good = consistency.judge(*estimate(covariance=False))
+    assert good.verdict == "consistent"
+    assert any("variances only" in limit for limit in good.limits)
+    bad = consistency.judge(*estimate(covariance=False, bias_error=10.0))
+    assert [(f.name, f.of) for f in bad.findings if f.rejected] == [("error at the end", "bias z")]
+
+
+def test_too_little_cannot_tell():
+    nothing = replace(estimate()[0], innovations={})
+    assert consistency.judge(nothing).verdict == "cannot tell"
+    few = consistency.judge(estimate(samples=8)[0])
+    assert few.verdict == "cannot tell"
+    assert "too few samples" in few.reason
+    assert consistency.judge(estimate(scale=20.0, samples=8)[0]).verdict == "not consistent"  # gross needs few
+
+
+def test_refused_measurements_are_left_out():
+    result, _ = estimate()
+    weight = np.ones(400)
+    weight[::20] = 0.0
+    struck = replace(result.innovations["star 1"], weight=weight)
+    struck.innovation[::20] *= 30.0
+    judgement = consistency.judge(replace(result, innovations={"star 1": struck}))
+    assert judgement.verdict == "consistent"
+    assert any("20 measurements of star 1" in limit for limit in judgement.limits)
+
+
+def test_a_truth_at_other_times_is_refused():
+    result, truth = estimate()
+    with pytest.raises(InputError, match="own times"):
+        consistency.judge(result, Truth(attitude=truth.attitude[:5], bias=truth.bias[:5]))
+
+
+def test_holm_steps_down():
+    findings = [
+        Finding(name="NIS", of=str(k), value=1.0, p_value=p, samples=10) for k, p in enumerate((0.02, 0.01, 0.04))
+    ]
+    assert [f.rejected for f in holm(findings, 0.05)] == [True, True, True]  # 0.01 ≤ 0.05/3, 0.02 ≤ 0.05/2, 0.04 ≤ 0.05
+    findings = [
+        Finding(name="NIS", of=str(k), value=1.0, p_value=p, samples=10) for k, p in enumerate((0.03, 0.01, 0.04))
+    ]
+    assert [f.rejected for f in holm(findings, 0.05)] == [False, True, False]
+
+
+def test_resolution_is_the_factor_that_bounds_leave():
+    finding = Finding(name="NIS", of="star", value=1.0, p_value=0.5, samples=200, degrees=2)
+    low, high = consistency.mean_bounds(2, 200, 0.99)
+    assert resolution([finding], 0.99) == pytest.approx(math.sqrt(high / low))
+    assert resolution([], 0.99) == math.inf
+
+
+def test_the_summary_is_plain():
+    told = json.loads(json.dumps(consistency.judge(*estimate(1.3)).summary(), allow_nan=False))
+    assert told["verdict"] == "not consistent"
+    assert told["findings"][0]["name"] == "NIS"
+    assert told["findings"][1]["low"] is None
+
+
+# ------------------------------------------------------------------------------------------------------------ independent runs
+
+
+def scenario():
+    return scenarios.Scenario(
+        motion=motion.rest(),
+        gyro=GyroSpec(angle_random_walk=1e-4, rate_random_walk=1e-6),
+        sensors=(
+            vectors.VectorSensor(name="star 1", reference_f=np.array([1.0, 0.0, 0.0]), sigma=1e-3, rate=1.0),
+            vectors.VectorSensor(name="star 2", reference_f=np.array([0.0, 1.0, 1.0]), sigma=1e-3, rate=1.0),
+        ),
+        rate=10.0,
+        duration=40.0,
+        name="rest",
+    )
+
+
+@pytest.fixture(scope="module")
+def plan():
+    believed = setup.FilterSetup(
+        process_noise=setup.ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6),
+        attitude_sigma=2e-3,
+        bias_sigma=1e-4,
+    )
+    return montecarlo.Plan(scenario=scenario(), setup=believed, seed=3, epochs=20, nis_bins=10)
+
+
+def statistics_of(plan, **changes):
+    believed = replace(plan.setup, **changes)
+    return montecarlo.run(plan.scenario, (believed,), runs=200, seed=3, epochs=20, nis_bins=10)[0]
+
+
+def test_right_runs_are_consistent_and_wrong_ones_are_told(plan):
+    good = consistency.judge_runs(statistics_of(plan))
+    assert good.verdict == "consistent"
+    assert {f.name for f in good.findings} == {"ANEES", "log-NEES", "mean error", "coverage", "NIS"}
+    assert {f.of for f in good.findings if f.name == "NIS"} == {"star 1", "star 2"}
+    sure = consistency.judge_runs(statistics_of(plan, measurement_sigma_factor=0.8))
+    assert sure.verdict == "not consistent"
+    assert "optimistic" in sure.reason
+    names = {f.name for f in sure.findings if f.rejected}
+    assert {"ANEES", "log-NEES", "NIS", "coverage"} <= names
+    assert "mean error" not in names
+    modest = consistency.judge_runs(statistics_of(plan, measurement_sigma_factor=1.3))
+    assert "pessimistic" in modest.reason
+
+
+def test_few_runs_cannot_tell(plan):
+    few = montecarlo.run(plan.scenario, (plan.setup,), runs=2, seed=3, epochs=20, nis_bins=10)[0]
+    starved = replace(few, sensor_degrees=0 * few.sensor_degrees)
+    assert consistency.judge_runs(starved).verdict == "cannot tell"
+
+
+def test_a_mean_error_is_told(plan):
+    good = statistics_of(plan)
+    shift = 0.5 * good.rms_error[:, 5]
+    square = good.error_product_sum.copy()
+    square[:, 5, 5] += good.runs * shift**2
+    moved = good.error_sum.copy()
+    moved[:, 5] += good.runs * shift
+    judged = consistency.judge_runs(replace(good, error_sum=moved, error_product_sum=square))
+    assert [(f.name, f.of) for f in judged.findings if f.rejected] == [("mean error", "bias z")]
+
+
+def test_runs_that_failed_are_not_consistent(plan):
+    good = statistics_of(plan)
+    finite = good.finite.copy()
+    finite[-1] -= 1
+    judged = consistency.judge_runs(replace(good, finite=finite))
+    assert judged.verdict == "not consistent"
+    assert "1 of 200 runs failed" in judged.words
+
+
+# ---------------------------------------------------------------------------------------------------------------- the command
+
+
+@pytest.fixture
+def run(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+
+    def command(*arguments):
+        monkeypatch.setattr(sys, "argv", ["strapdown", *map(str, arguments)])
+        try:
+            cli.main()
+            status = 0
+        except SystemExit as end:
+            status = end.code or 0
+        said = capsys.readouterr()
+        return status, said.out, said.err
+
+    return command
+
+
+@pytest.mark.parametrize(
+    ("made", "status", "verdict"),
+    [
+        ({}, 0, "consistent: none"),
+        ({"scale": 1.3}, 1, "not consistent: "),
+        ({"samples": 8}, 2, "cannot tell: "),
+    ],
+)
+def test_check_ends_with_the_status_of_the_verdict(run, tmp_path, made, status, verdict):
+    result, _ = estimate(**made)
+    records.write_estimate("estimate.h5", result)
+    ended, said, _ = run("check", "estimate.h5", "--json", "check.json")
+    assert ended == status
+    assert verdict in said
+    told = json.loads((tmp_path / "check.json").read_text())
+    assert said.splitlines()[-1].startswith("Written")
+    assert verdict.startswith(told["verdict"])
+
+
+def test_check_uses_the_truth_in_the_file(run):
+    result, truth = estimate(bias_error=10.0)
+    records.write_estimate("estimate.h5", result, truth=truth)
+    status, said, _ = run("check", "estimate.h5")
+    assert status == 1
+    assert "with its truth" in said
+
+
+def test_check_judges_a_campaign(run, plan, tmp_path):
+    campaign.run(plan, tmp_path / "runs.h5", runs=60)
+    status, said, _ = run("check", "runs.h5", "--json", "check.json")
+    assert status == 0, said
+    assert "60 of 60 runs" in said
+    assert json.loads((tmp_path / "check.json").read_text())["kind"] == "strapdown montecarlo"
+
+
+def test_check_refuses_what_it_cannot_judge(run, tmp_path):
+    status, said, wrong = run("check", "absent.h5")
+    assert (status, said) == (2, "")
+    assert wrong == "error: absent.h5 does not exist; check the path\n"
+    (tmp_path / "text.h5").write_text("no HDF5")
+    assert "cannot be read as HDF5" in run("check", "text.h5")[2]
+    records.write_attitude("attitude.h5", np.arange(2.0), np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)))
+    status, _, wrong = run("check", "attitude.h5")
+    assert status == 2
+    assert "is a strapdown attitude" in wrong
+    assert "go together" in run("check", "attitude.h5", "--record", "r.h5")[2]

@@ -1,0 +1,148 @@
+"""False alarms: of filters that are right, every statistic refuses as many as it says, to a binomial error."""
+
+import numpy as np
+import pytest
+
+from benchmarks import power
+from strapdown import consistency, mekf, motion, quaternion, scenarios, setup, units, vectors
+from strapdown.gyro import GyroSpec
+from strapdown.randomness import generator
+from strapdown.records import Truth
+
+
+def within_binomial(p_values, sigmas):
+    """Assert that 5 and 1 % of the p-values lie below 0.05 and 0.01; return what did."""
+    n = len(p_values)
+    for nominal in (0.05, 0.01):
+        share = np.mean(p_values < nominal)
+        assert abs(share - nominal) < sigmas * np.sqrt(nominal * (1.0 - nominal) / n), (nominal, share)
+
+
+SINGLE = (
+    "NEES at the end",
+    "time-averaged NEES",
+    "NIS",
+    "whiteness",
+    "normality",
+    "mean innovation",
+    "cross-correlation",
+)
+
+
+@pytest.fixture(scope="module")
+def few():
+    return power.single_run_p_values(power.linear_filters(800, 500, np.random.default_rng(1)))
+
+
+@pytest.mark.parametrize("statistic", SINGLE)
+def test_statistics_of_one_run(few, statistic):
+    within_binomial(few[statistic], 4.0)
+
+
+def test_ljung_box_has_its_size():
+    """4 to 6 % at a nominal 5 %."""
+    random = np.random.default_rng(2)
+    for samples, components in ((300, 2), (1000, 1)):
+        refused = [consistency.ljung_box(random.standard_normal((samples, components)))[2] < 0.05 for _ in range(4000)]
+        assert 0.04 < np.mean(refused) < 0.06
+
+
+@pytest.mark.parametrize(("runs", "n", "groups"), [(50, 6, 3000), (20, 3, 3000)])
+def test_statistics_of_many_runs(runs, n, groups):
+    white = np.random.default_rng(3).standard_normal((groups, runs, n))
+    for name, p in power.many_run_p_values(white).items():
+        share = np.mean(p < 0.01)
+        assert abs(share - 0.01) < 4.0 * np.sqrt(0.01 * 0.99 * (1.0 / groups + 1.0 / 20_000)), (name, share)
+        share = np.mean(p < 0.05)
+        assert abs(share - 0.05) < 4.0 * np.sqrt(0.05 * 0.95 * (1.0 / groups + 1.0 / 20_000)), (name, share)
+
+
+def test_autocorrelation_bounds_hold():
+    random = np.random.default_rng(4)
+    outside, jointly = 0, 0
+    for _ in range(2000):
+        found = consistency.autocorrelation(random.standard_normal((500, 1)), 10, 0.95)
+        outside += np.sum(np.abs(found.values[:, 0]) > found.bounds)
+        jointly += np.any(np.abs(found.values[:, 0]) > found.simultaneous_bounds)
+    assert abs(outside / 20_000 - 0.05) < 0.007
+    assert abs(jointly / 2000 - 0.05) < 0.02
+
+
+def test_coverage_bounds_hold_what_they_attain():
+    random = np.random.default_rng(5)
+    for probability in (0.95, 0.99):
+        found = [consistency.coverage(random.standard_normal(400), 1.0, probability) for _ in range(2000)]
+        (low, high), attained = found[0].bounds.T, found[0].attained
+        inside = np.mean([(one.inside >= low - 1e-12) & (one.inside <= high + 1e-12) for one in found], axis=0)
+        assert np.all(np.abs(inside - attained) < 4.0 * np.sqrt(attained * (1.0 - attained) / 2000) + 1e-3)
+        assert np.all(attained >= probability)
+
+
+@pytest.mark.slow
+def test_ten_thousand_right_filters():
+    """The measure of all bounds: within three binomial standard errors of nominal."""
+    p_values = power.single_run_p_values(power.linear_filters(10_000, 500, np.random.default_rng(7)))
+    for statistic in SINGLE:
+        within_binomial(p_values[statistic], 3.0)
+    ends = [power.linear_filters(100_000, 60, np.random.default_rng([8, k]), every=60) for k in range(5)]
+    white = np.concatenate(
+        [consistency.whitened(e.error[:, -1], np.broadcast_to(e.covariance[-1], (100_000, 2, 2))) for e in ends]
+    )
+    for name, p in power.many_run_p_values(white.reshape(10_000, 50, 2)).items():
+        simulated = name in ("non-credibility", "inclination")  # whose bounds have a binomial error of their own
+        within_binomial(p, 3.0 * np.sqrt(1.5) if simulated else 3.0)
+
+
+def right_run(seed):
+    """Estimate and truth of one right filter on a slow spin with two stars."""
+    scenario = scenarios.Scenario(
+        motion=motion.SpinRock(
+            rock_angle=10.0 * units.DEGREE, rock_frequency=0.1, spin_rate=5.0 * units.DEGREE, rock_phase=0.0
+        ),
+        gyro=GyroSpec(angle_random_walk=0.3 * units.DEGREE_PER_ROOT_HOUR, rate_random_walk=1e-6),
+        sensors=(
+            vectors.VectorSensor(name="star 1", reference_f=np.array([1.0, 0.0, 0.0]), sigma=1e-4, rate=2.0),
+            vectors.VectorSensor(name="star 2", reference_f=np.array([0.0, 1.0, 1.0]), sigma=1e-4, rate=2.0),
+        ),
+        rate=10.0,
+        duration=300.0,
+    )
+    record = scenarios.simulate(scenario, seed=seed)
+    believed = setup.FilterSetup(
+        process_noise=mekf.ProcessNoise(angle_random_walk=0.3 * units.DEGREE_PER_ROOT_HOUR, rate_random_walk=1e-6),
+        attitude_sigma=1e-3,
+        bias_sigma=1e-5,
+    )
+    draw = generator(seed, 0, "initial error").standard_normal(6)
+    start = setup.initial_state(
+        believed,
+        quaternion.multiply(record.truth.attitude[0], quaternion.exp(-1e-3 * draw[:3])),
+        record.truth.bias[0] - 1e-5 * draw[3:],
+    )
+    estimate = setup.run(record, believed, start, every=5, full_covariance=True)
+    return estimate, Truth(attitude=record.truth.attitude[::5], bias=record.truth.bias[::5])
+
+
+def refused(seeds, probability):
+    """How many right runs are called not consistent, and how often each finding alone is below 1 %."""
+    wrong, alone = 0, {}
+    for seed in seeds:
+        judgement = consistency.judge(*right_run(seed), probability=probability)
+        wrong += judgement.verdict == "not consistent"
+        for finding in judgement.findings:
+            alone.setdefault((finding.name, finding.of), []).append(finding.p_value)
+    return wrong, alone
+
+
+def test_the_real_filter_is_seldom_called_wrong():
+    wrong, _ = refused(range(12), 0.99)
+    assert wrong <= 2
+
+
+@pytest.mark.slow
+def test_the_real_filter_a_thousand_times():
+    wrong, alone = refused(range(1000), 0.95)
+    assert wrong <= 50 + 3 * np.sqrt(1000 * 0.05 * 0.95)
+    assert wrong >= 10  # Holm is conservative, not idle
+    for p_values in alone.values():
+        within_binomial(np.array(p_values), 3.5)

@@ -1,0 +1,385 @@
+"""Each statistic against a closed form, scipy, or a slow plain reference."""
+
+import math
+
+import mpmath
+import numpy as np
+import pytest
+import scipy.integrate
+import scipy.linalg
+import scipy.signal
+import scipy.stats
+
+from strapdown import consistency, quaternion
+from strapdown.checks import InputError
+from strapdown.consistency import bounds, ensemble, timeaverage, whiteness
+
+
+def random_covariances(generator, shape, n=6):
+    root = generator.normal(size=(*shape, n, n)) + 2.0 * np.eye(n)
+    return root @ np.swapaxes(root, -1, -2)
+
+
+# ------------------------------------------------------------------------------------------------------------------ manifold
+
+
+def test_fixed_frame_rotates_the_attitude_error_and_leaves_the_nees():
+    generator = np.random.default_rng(0)
+    q = quaternion.normalize(generator.normal(size=(7, 4)))
+    delta = 1e-3 * generator.normal(size=(7, 3))
+    true = quaternion.multiply(q, quaternion.exp(delta))
+    e = consistency.errors(q, np.zeros((7, 3)), true, np.ones((7, 3)))
+    P = random_covariances(generator, (7,))
+    fixed, P_fixed = consistency.fixed_frame(e, P, q)
+    assert np.allclose(quaternion.multiply(quaternion.exp(fixed[:, :3]), q), true, atol=1e-12)
+    assert np.allclose(fixed[:, 3:], 1.0)
+    for states in (None, (0, 1, 2), (3, 4, 5)):
+        assert np.allclose(consistency.nees(fixed, P_fixed, states), consistency.nees(e, P, states), rtol=1e-9)
+    assert not np.allclose(consistency.nees(fixed, P_fixed, (2,)), consistency.nees(e, P, (2,)), rtol=1e-3)
+
+
+def test_nees_of_a_subset_takes_the_marginal_covariance():
+    generator = np.random.default_rng(1)
+    P = random_covariances(generator, (3, 4))
+    e = generator.normal(size=(3, 4, 6))
+    states = (5, 0, 2)
+    block = P[..., list(states), :][..., list(states)]
+    expected = np.einsum("...i,...ij,...j", e[..., list(states)], np.linalg.inv(block), e[..., list(states)])
+    assert np.allclose(consistency.nees(e, P, states), expected)
+    for name in ("state", "attitude", "bias"):
+        assert consistency.nees(e, P, consistency.SUBSETS[name]).shape == (3, 4)
+
+
+@pytest.mark.parametrize("states", [(), (0, 0), (6,), (-1,)])
+def test_nees_refuses_subsets_that_are_none(states):
+    with pytest.raises(InputError, match="states"):
+        consistency.nees(np.zeros(6), np.eye(6), states)
+
+
+def test_whitened_errors_begin_with_those_of_the_marginal():
+    generator = np.random.default_rng(2)
+    P = random_covariances(generator, (5,))
+    e = generator.normal(size=(5, 6))
+    white = consistency.whitened(e, P)
+    assert np.allclose(np.sum(white[:, :3] ** 2, axis=1), consistency.nees(e[:, :3], P[:, :3, :3]))
+
+
+# -------------------------------------------------------------------------------------------------------------------- bounds
+
+
+def test_p_value_and_bounds_agree():
+    for degrees, samples in ((6, 50), (3, 1), (2, 1234.5)):
+        for probability in (0.95, 0.99):
+            for end in consistency.mean_bounds(degrees, samples, probability):
+                assert consistency.mean_p_value(end, degrees, samples) == pytest.approx(1.0 - probability, rel=1e-6)
+    assert consistency.mean_p_value(math.inf, 6, 10) == 0.0
+    assert consistency.mean_p_value(math.nan, 6, 10) == 0.0
+
+
+@pytest.mark.parametrize("degrees", [1, 2, 3, 6])
+def test_log_moments_are_those_of_log_chi_square(degrees):
+    mean, variance = consistency.log_moments(degrees)
+    with mpmath.workdps(30):
+        assert mean == pytest.approx(float(mpmath.digamma(degrees / mpmath.mpf(2)) + mpmath.log(2)), rel=1e-14)
+        assert variance == pytest.approx(float(mpmath.psi(1, degrees / mpmath.mpf(2))), rel=1e-14)
+    density = scipy.stats.chi2(degrees)
+    grid = np.linspace(-60.0, 6.0, 200_001)
+    weight = density.pdf(np.exp(grid)) * np.exp(grid) * (grid[1] - grid[0])
+    assert np.sum(weight * grid) == pytest.approx(mean, abs=1e-6)
+    assert np.sum(weight * (grid - mean) ** 2) == pytest.approx(variance, rel=1e-6)
+
+
+def test_log_moments_of_a_whole_state():
+    mean, variance = consistency.log_moments(6)  # ψ(3) = 3/2 − γ, ψ′(3) = π²/6 − 5/4
+    assert mean == pytest.approx(1.5 - 0.5772156649015329 + math.log(2.0), abs=1e-14)
+    assert variance == pytest.approx(math.pi**2 / 6.0 - 1.25, abs=1e-14)
+
+
+@pytest.mark.parametrize("degrees", [1, 2, 3, 6])
+def test_the_distribution_of_one_log_is_the_log_of_chi_square(degrees):
+    for x in (-12.0, -4.0, -1.0, 0.5, 1.5, 2.5, 3.5):
+        expected = scipy.stats.chi2.cdf(math.exp(x), degrees)
+        assert bounds.log_mean_distribution(x, degrees, 1) == pytest.approx(expected, abs=1e-10)
+
+
+def test_the_mean_of_two_logs_by_convolution():
+    """P(½ (ln a + ln b) ≤ x) = E P(a ≤ e^{2x}/b)."""
+    for degrees in (2, 6):
+        law = scipy.stats.chi2(degrees)
+        for x in (-0.5, 1.0, 2.0):
+            expected = scipy.integrate.quad(
+                lambda b, x=x, law=law: law.cdf(math.exp(2.0 * x) / b) * law.pdf(b), 0.0, 80.0
+            )
+            assert bounds.log_mean_distribution(x, degrees, 2) == pytest.approx(expected[0], abs=1e-7)
+
+
+@pytest.mark.parametrize(("degrees", "samples"), [(1, 1), (6, 1), (6, 50), (3, 1000)])
+def test_log_mean_bounds_hold_their_tails(degrees, samples):
+    for probability in (0.95, 0.99):
+        low, high = consistency.log_mean_bounds(degrees, samples, probability)
+        assert bounds.log_mean_distribution(low, degrees, samples) == pytest.approx(0.5 * (1 - probability), rel=1e-6)
+        assert 1.0 - bounds.log_mean_distribution(high, degrees, samples) == pytest.approx(
+            0.5 * (1 - probability), rel=1e-6
+        )
+        for end in (low, high):
+            assert consistency.log_mean_p_value(end, degrees, samples) == pytest.approx(1.0 - probability, rel=1e-5)
+    if samples == 1000:  # nearly normal
+        mean, variance = consistency.log_moments(degrees)
+        assert low == pytest.approx(mean - 2.5758 * math.sqrt(variance / samples), rel=2e-3)
+
+
+def test_coverage_bounds_are_binomial():
+    found = consistency.coverage(np.array([0.5, -1.5, 2.5, 3.5]), 1.0, 0.95)
+    assert np.allclose(found.inside, [0.25, 0.5, 0.75])
+    assert np.allclose(found.expected, [0.682689492, 0.954499736, 0.997300204])
+    many = consistency.Coverage(samples=1000, inside=np.array([0.68, 0.95, 0.99]), probability=0.99)
+    for k in range(3):
+        low, high = np.round(many.bounds[k] * 1000)
+        law = scipy.stats.binom(1000, many.expected[k])
+        assert law.cdf(low - 1) <= 0.005 < law.cdf(low)
+        assert law.sf(high) <= 0.005 < law.sf(high - 1)
+        assert many.attained[k] == pytest.approx(law.cdf(high) - law.cdf(low - 1))
+    assert np.all(many.attained >= 0.99)
+    assert many.p_values[0] > 0.5
+    assert many.p_values[2] < 0.001  # 10 of 1000 beyond 3 σ instead of 2.7
+
+
+def test_coverage_takes_each_error_by_its_own_sigma():
+    found = consistency.coverage(np.array([1.0, 1.0, 1.0]), np.array([0.1, 0.6, 1.1]))
+    assert np.allclose(found.inside, [1 / 3, 2 / 3, 2 / 3])
+
+
+@pytest.mark.parametrize("sigma", [0.0, -1.0])
+def test_coverage_refuses_a_sigma_that_is_none(sigma):
+    with pytest.raises(InputError, match=r"sigma\[0\]"):
+        consistency.coverage(np.ones(2), sigma)
+
+
+# ------------------------------------------------------------------------------------------------------------------ ensemble
+
+
+def test_credibility_indices_by_the_definition():
+    generator = np.random.default_rng(3)
+    P = random_covariances(generator, (), 3)
+    e = generator.multivariate_normal(np.zeros(3), 2.0 * P, size=40)
+    actual = sum(np.outer(x, x) for x in e) / 40
+    ratios = [10.0 * math.log10((x @ np.linalg.inv(P) @ x) / (x @ np.linalg.inv(actual) @ x)) for x in e]
+    found = consistency.credibility(e, np.broadcast_to(P, (40, 3, 3)))
+    assert found.non_credibility == pytest.approx(np.mean(np.abs(ratios)))
+    assert found.inclination == pytest.approx(np.mean(ratios))
+    assert found.leaning == "optimistic"
+    assert found.anees == pytest.approx(np.mean([x @ np.linalg.inv(P) @ x for x in e]) / 3)
+    assert found.log_nees == pytest.approx(np.mean([math.log(x @ np.linalg.inv(P) @ x) for x in e]))
+
+
+@pytest.mark.parametrize(("factor", "decibel", "leaning"), [(4.0, 6.02, "optimistic"), (0.25, -6.02, "pessimistic")])
+def test_inclination_is_the_factor_in_decibel(factor, decibel, leaning):
+    e = math.sqrt(factor) * np.random.default_rng(4).standard_normal((20_000, 6))
+    white = consistency.credibility(e, np.broadcast_to(np.eye(6), (20_000, 6, 6)))
+    assert white.inclination == pytest.approx(decibel, abs=0.1)
+    assert white.non_credibility == pytest.approx(abs(decibel), abs=0.1)
+    ensemble_of_100 = consistency.credibility(e[:100], np.broadcast_to(np.eye(6), (100, 6, 6)))
+    assert ensemble_of_100.leaning == leaning
+    assert ensemble_of_100.non_credibility > ensemble_of_100.non_credibility_bound
+
+
+def test_a_right_ensemble_lies_inside_all_its_bounds():
+    generator = np.random.default_rng(5)
+    P = random_covariances(generator, (100,))
+    e = (np.linalg.cholesky(P) @ generator.standard_normal((100, 6, 1)))[..., 0]
+    found = consistency.credibility(e, P)
+    assert found.leaning == "credible"
+    assert found.anees_bounds[0] < found.anees < found.anees_bounds[1]
+    assert found.log_nees_bounds[0] < found.log_nees < found.log_nees_bounds[1]
+    assert found.non_credibility < found.non_credibility_bound
+    assert min(found.p_values.values()) > 0.01
+
+
+# ----------------------------------------------------------------------------------------------------------------- whiteness
+
+
+def test_autocorrelation_by_the_sum():
+    z = np.random.default_rng(6).standard_normal((200, 2))
+    found = consistency.autocorrelation(z, 5)
+    for lag in range(1, 6):
+        for k in range(2):
+            expected = sum(z[i + lag, k] * z[i, k] for i in range(200 - lag)) / sum(z[:, k] ** 2)
+            assert found.values[lag - 1, k] == pytest.approx(expected)
+    assert found.bounds[0] == pytest.approx(2.5758 * math.sqrt(199 / (200 * 202)), rel=1e-4)
+    assert np.all(found.simultaneous_bounds > found.bounds)
+
+
+def test_ljung_box_of_one_component_is_the_textbook_one():
+    z = np.random.default_rng(7).standard_normal(300)
+    r = [np.sum(z[lag:] * z[:-lag]) / np.sum(z * z) for lag in range(1, 7)]
+    expected = 300 * 302 * sum(x * x / (300 - lag) for lag, x in enumerate(r, start=1))
+    statistic, degrees, p = consistency.ljung_box(z, 6)
+    assert statistic == pytest.approx(expected)
+    assert degrees == 6
+    assert p == pytest.approx(scipy.stats.chi2.sf(expected, 6))
+
+
+def test_ljung_box_of_several_components_is_hoskings():
+    z = np.random.default_rng(8).standard_normal((150, 3)) @ np.array(
+        [[1.0, 0.4, 0.0], [0.0, 2.0, 0.1], [0.0, 0.0, 0.3]]
+    )
+    C = [z[lag:].T @ z[: 150 - lag] / 150 for lag in range(5)]
+    inverse = np.linalg.inv(C[0])
+    expected = sum(np.trace(C[lag].T @ inverse @ C[lag] @ inverse) / (150 - lag) for lag in range(1, 5))
+    statistic, degrees, _ = consistency.ljung_box(z, 4)
+    assert statistic == pytest.approx(150 * (150 + 2 / 3) * expected)
+    assert degrees == 36
+
+
+def test_whiteness_sees_what_is_correlated_and_not_what_is_large():
+    generator = np.random.default_rng(9)
+    white = 5.0 * generator.standard_normal((600, 2))
+    coloured = scipy.signal.lfilter([1.0], [1.0, -0.3], generator.standard_normal((600, 2)), axis=0)
+    assert consistency.ljung_box(white)[2] > 0.01
+    assert consistency.ljung_box(coloured)[2] < 1e-6
+
+
+def test_anderson_darling_by_the_sum():
+    x = np.sort(np.random.default_rng(10).standard_normal(250) + 3.0)
+    u = scipy.stats.norm.cdf((x - x.mean()) / x.std(ddof=1))
+    total = sum((2 * i + 1) * (math.log(u[i]) + math.log1p(-u[249 - i])) for i in range(250))
+    statistic, _ = consistency.anderson_darling(x)
+    assert statistic == pytest.approx((-250 - total / 250) * (1.0 + 0.75 / 250 + 2.25 / 250**2), rel=1e-9)
+
+
+@pytest.mark.parametrize(("critical", "p"), [(0.631, 0.10), (0.752, 0.05), (0.873, 0.025), (1.035, 0.01), (0.341, 0.5)])
+def test_anderson_darling_p_values_are_the_tables(critical, p):
+    """D'Agostino & Stephens (1986), table 4.7: upper tail of A²*."""
+    values = np.random.default_rng(11).standard_normal((400, 200))
+    pairs = sorted(whiteness.anderson_darling(x) for x in values)
+    near = min(pairs, key=lambda pair: abs(pair[0] - critical))
+    assert near[1] == pytest.approx(p, rel=0.12)
+
+
+def test_normality_sees_outliers():
+    generator = np.random.default_rng(12)
+    x = generator.standard_normal((500, 2))
+    x[::50] *= 8.0
+    assert consistency.anderson_darling(x)[1] < 1e-6
+    with pytest.raises(InputError, match="do not vary"):
+        consistency.anderson_darling(np.ones(20))
+
+
+def test_quantile_pairs_are_order_statistics_in_their_band():
+    x = np.random.default_rng(13).standard_normal((5000, 2))
+    found = consistency.quantile_pairs(x)
+    assert len(found.observed) <= 2100
+    assert found.observed[0] == x.min()
+    assert found.observed[-1] == x.max()
+    inside = np.mean((found.observed >= found.low) & (found.observed <= found.high))
+    assert inside > 0.9
+    small = consistency.quantile_pairs(x[:20, 0])
+    expected = scipy.stats.norm.ppf(scipy.stats.beta.ppf(0.005, 1, 20))
+    assert small.low[0] == pytest.approx(expected)
+    assert small.theoretical[0] == pytest.approx(scipy.stats.norm.ppf(0.5 / 20))
+
+
+def test_mean_innovation_is_hotellings():
+    z = np.random.default_rng(14).standard_normal((40, 1)) + 0.4
+    mean, p = consistency.mean_innovation_p_value(z)
+    assert mean[0] == pytest.approx(z.mean())
+    assert p == pytest.approx(scipy.stats.ttest_1samp(z[:, 0], 0.0).pvalue)  # T² of one component is t²
+    shifted = np.random.default_rng(15).standard_normal((400, 3)) + np.array([0.0, 0.3, 0.0])
+    assert consistency.mean_innovation_p_value(shifted)[1] < 1e-4
+
+
+def test_cross_correlation_pairs_by_time():
+    generator = np.random.default_rng(16)
+    a, b = generator.standard_normal((300, 2)), generator.standard_normal((300, 1))
+    time = np.arange(300.0)
+    correlation, pairs, p = consistency.cross_correlation_p_value(time, a, time, b)
+    assert pairs == 300
+    assert p > 0.01
+    assert correlation[0, 0] == pytest.approx(
+        np.sum(a[:, 0] * b[:, 0]) / math.sqrt(np.sum(a[:, 0] ** 2) * np.sum(b**2))
+    )
+    shared = b + 0.5 * a[:, :1]
+    assert consistency.cross_correlation_p_value(time, a, time + 0.25, shared)[2] < 1e-6  # later, but before the next
+    assert consistency.cross_correlation_p_value(time, a, time - 0.25, shared)[2] > 0.01  # the next one's neighbour
+    _, pairs, _ = consistency.cross_correlation_p_value(time, a, time[::3] + 0.5, b[::3])
+    assert pairs == 100
+    _, pairs, p = consistency.cross_correlation_p_value(time[:5], a[:5], time, b)
+    assert pairs == 5
+    assert math.isnan(p)
+
+
+# --------------------------------------------------------------------------------------------------------------- time average
+
+
+def test_effective_samples_of_an_autoregression_are_known():
+    """Of z with correlation ρ^τ, |z|² has ρ^{2τ}: N (1 − ρ²)/(1 + ρ²) of them count."""
+    generator = np.random.default_rng(17)
+    for rho in (0.0, 0.6, 0.9):
+        drive = math.sqrt(1.0 - rho**2) * generator.standard_normal((20_000, 3))
+        z = scipy.signal.lfilter([1.0], [1.0, -rho], drive, axis=0)
+        expected = 20_000 * (1.0 - rho**2) / (1.0 + rho**2)
+        assert timeaverage.effective_samples(z) == pytest.approx(expected, rel=0.06)
+
+
+def test_effective_samples_of_part_of_a_markov_process():
+    """The first component is no Markov process: its correlation is known from the whole matrix."""
+    A = np.array([[0.3, 0.5], [0.0, 0.98]])
+    P = scipy.linalg.solve_discrete_lyapunov(A, np.eye(2))
+    generator = np.random.default_rng(18)
+    z = np.zeros((40_000, 2))
+    for k in range(1, len(z)):
+        z[k] = A @ z[k - 1] + generator.standard_normal(2)
+    power, total = np.eye(2), 0.0
+    for _ in range(1000):
+        power = A @ power
+        total += ((power @ P)[0, 0] / P[0, 0]) ** 2
+    white = consistency.whitened(z, np.broadcast_to(P, (len(z), 2, 2)))
+    assert timeaverage.effective_samples(white, 1) == pytest.approx(40_000 / (1.0 + 2.0 * total), rel=0.1)
+
+
+def test_time_average_of_a_short_run_says_that_it_is_not_reliable():
+    walk = np.cumsum(np.random.default_rng(19).standard_normal((60, 2)), axis=0)
+    found = consistency.time_average(walk, np.broadcast_to(30.0 * np.eye(2), (60, 2, 2)))
+    assert not found.reliable
+    assert found.bounds[0] < found.mean < found.bounds[1]
+    with pytest.raises(InputError, match="too few"):
+        consistency.time_average(walk[:4], np.broadcast_to(np.eye(2), (4, 2, 2)))
+
+
+# ------------------------------------------------------------------------------------------------------------------ accuracy
+
+
+def test_efficiency_of_an_efficient_filter_is_one():
+    error = np.random.default_rng(20).standard_normal((2000, 5)) * np.array([1.0, 2.0, 3.0, 4.0, 5.0])
+    found = consistency.efficiency(error, np.array([1.0, 4.0, 9.0, 16.0, 25.0]))
+    assert np.all((found.ratio > found.bounds[0]) & (found.ratio < found.bounds[1]))
+    assert consistency.efficiency(error, np.ones(5)).ratio[4] == pytest.approx(5.0, rel=0.1)
+    with pytest.raises(InputError, match=r"bound\[1\]"):
+        consistency.efficiency(error, np.array([1.0, 0.0, 1.0, 1.0, 1.0]))
+
+
+def test_convergence_time_is_that_of_the_last_excursion():
+    time = np.arange(6.0)
+    assert consistency.convergence_time(time, [5.0, 1.0, 3.0, 1.0, -1.0, 0.5], 1.0) == 3.0
+    assert consistency.convergence_time(time, np.zeros(6), 1.0) == 0.0
+    assert math.isnan(consistency.convergence_time(time, [0, 0, 0, 0, 0, 2.0], 1.0))
+
+
+def test_distribution_and_its_quantiles():
+    found = consistency.distribution([3.0, np.nan, 1.0, 2.0, 4.0])
+    assert np.array_equal(found.values, [1.0, 2.0, 3.0, 4.0])
+    assert np.allclose(found.probability, [0.25, 0.5, 0.75, 1.0])
+    assert found.quantile(0.5) == 2.0
+    many = np.random.default_rng(21).exponential(size=(400, 100))
+    held = 0
+    for sample in many:
+        low, high = consistency.distribution(sample).quantile_interval(0.5)
+        held += low <= math.log(2.0) <= high
+    assert 0.93 < held / 400 <= 1.0
+
+
+def test_non_credibility_needs_more_runs_than_states():
+    with pytest.raises(InputError, match="7 or more"):
+        consistency.credibility(np.ones((6, 6)), np.broadcast_to(np.eye(6), (6, 6, 6)))
+    index, inclination = ensemble.credibility_indices(np.random.default_rng(22).standard_normal((4, 10, 2)))
+    assert index.shape == inclination.shape == (4,)

@@ -1,0 +1,630 @@
+"""Covariance analysis: against the filter itself, a Lyapunov equation, experiments without noise, and Monte Carlo."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
+
+from strapdown import cli, coning, consistency, covariance, mekf, montecarlo, motion, quaternion, setup, vectors
+from strapdown.checks import InputError
+from strapdown.covariance import Consider
+from strapdown.gyro import GyroSpec
+from strapdown.kernels import covariance_loop
+from strapdown.mekf import ProcessNoise
+from strapdown.scenarios import Scenario, load_scenario, simulate
+from strapdown.setup import FilterSetup
+from strapdown.units import ARCSECOND, DEGREE
+from strapdown.vectors import Faults
+
+TUMBLE = motion.HarmonicRates(
+    mean=(0.02, -0.03, 0.05),
+    harmonics=(motion.Harmonic(amplitude=(0.1, 0.05, 0.0), frequency=0.05, phase=0.3),),
+)
+FIELD = np.array([2e-5, 0.0, -4e-5])
+BELIEF = FilterSetup(
+    process_noise=ProcessNoise(angle_random_walk=3e-5, rate_random_walk=1.5e-6), attitude_sigma=2e-3, bias_sigma=2e-5
+)
+
+
+def turning(t):
+    """A field that turns."""
+    return 4e-5 * np.stack([np.cos(0.01 * t), np.sin(0.01 * t), 0.5 * np.ones_like(t)], axis=-1)
+
+
+def everything(duration=120.0):
+    """Every source of error that the analysis knows, all kinds of sensors."""
+    return Scenario(
+        motion=TUMBLE,
+        gyro=GyroSpec(
+            angle_random_walk=np.array([1e-5, 3e-5, 6e-5]),
+            rate_random_walk=np.array([2e-6, 0.5e-6, 1e-6]),
+            markov_noise=3e-6,
+            markov_correlation_time=20.0,
+            bias_instability=5e-6,
+            rate_ramp=np.array([1e-7, 0.0, 0.0]),
+            asymmetry=np.array([1e-4, 0.0, 0.0]),
+        ),
+        sensors=(
+            vectors.AttitudeSensor(
+                name="tracker",
+                sigma_across=1e-4,
+                sigma_about=1e-3,
+                rate=0.5,
+                faults=Faults(outlier_probability=0.05, outlier_scale=4.0),
+            ),
+            vectors.VectorSensor(
+                name="sun",
+                reference_f=np.array([1.0, 0.0, 0.2]),
+                sigma=2e-4,
+                rate=1.0,
+                phase=0.13,
+                faults=Faults(correlated_sigma=3e-4, correlation_time=15.0, outages=((40.0, 60.0),)),
+            ),
+            vectors.Magnetometer(
+                name="mag",
+                field_f=turning,
+                sigma=1e-8,
+                rate=2.0,
+                kind="vector",
+                phase=0.31,
+                hard_iron=np.array([1e-8, 0.0, -5e-9]),
+            ),
+            vectors.Magnetometer(
+                name="compass",
+                field_f=FIELD,
+                sigma=1e-8,
+                rate=1.0,
+                kind="heading",
+                phase=0.71,
+                faults=Faults(correlated_sigma=1e-8, correlation_time=5.0),
+            ),
+            vectors.HeadingPair(
+                name="gnss",
+                baseline_b=np.array([1.0, 0.2, 0.0]),
+                sigma=1e-3,
+                rate=1.0,
+                phase=0.5,
+                faults=Faults(correlated_sigma=1e-3, correlation_time=5.0),
+            ),
+        ),
+        rate=10.0,
+        duration=duration,
+    )
+
+
+def white(name, duration, **gyro):
+    """A built-in scenario whose gyro has white noise and a walking bias only: what a right filter is right about."""
+    scenario = load_scenario(name)
+    spec = GyroSpec(
+        angle_random_walk=float(np.max(scenario.gyro.angle_random_walk)),
+        rate_random_walk=max(float(np.max(scenario.gyro.rate_random_walk)), 1e-8),
+        turn_on_bias_sigma=5e-5,
+        **gyro,
+    )
+    sensors = tuple(
+        dataclasses.replace(sensor, hard_iron=np.zeros(3)) if hasattr(sensor, "hard_iron") else sensor
+        for sensor in scenario.sensors
+    )
+    return dataclasses.replace(scenario, gyro=spec, gyro_preset="", sensors=sensors, duration=duration)
+
+
+# -------------------------------------------------------------------------------------------------------------- exact relations
+
+
+@pytest.mark.parametrize("name", ["spin", "tumbling-satellite", "magnetometer-only", "slew-vibration"])
+def test_the_budget_of_a_matched_filter_adds_up_to_its_own_covariance(name):
+    scenario = white(name, min(load_scenario(name).duration, 60.0))
+    belief = setup.matched(scenario)
+    found = covariance.analyse(scenario, belief, epochs=5)
+    assert np.allclose(found.covariance, found.filter_covariance, rtol=1e-7, atol=1e-24)
+    assert np.allclose(found.filter_covariance, np.swapaxes(found.filter_covariance, 1, 2))
+    random = found.contributions.sum(axis=1)
+    assert np.allclose(random, found.filter_covariance, rtol=1e-7, atol=1e-24)
+    for value in found.expected_nis.values():
+        assert value == pytest.approx(1.0, abs=1e-4)
+    names = {name for name, *_ in found.budget()}
+    assert {"angle random walk", "initial attitude", "initial bias"} <= names
+
+
+def quiet(scenario, believed_sigma):
+    """The scenario without noise, and the filter that believes there is some."""
+    sensors = []
+    for sensor in scenario.sensors:
+        small = {name: 1e-12 for name in ("sigma", "sigma_across", "sigma_about") if hasattr(sensor, name)}
+        if hasattr(sensor, "field_f"):
+            small["sigma"] = 1e-19
+        sensors.append(dataclasses.replace(sensor, **small))
+    return dataclasses.replace(scenario, sensors=tuple(sensors)), dataclasses.replace(BELIEF, sigma=believed_sigma)
+
+
+def run_quiet(record, belief, every):
+    initial = setup.initial_state(belief, record.truth.attitude[0], record.truth.bias[0])
+    estimate = setup.run(record, belief, initial, every=every, full_covariance=True)
+    truth = setup.believed(record, belief).truth
+    return estimate, consistency.errors(estimate.attitude, estimate.bias, truth.attitude[::every], truth.bias[::every])
+
+
+def plain_sensors():
+    return (
+        vectors.VectorSensor(name="sun", reference_f=np.array([1.0, 0.0, 0.2]), sigma=2e-4, rate=1.0, phase=0.13),
+        vectors.Magnetometer(name="mag", field_f=turning, sigma=1e-8, rate=2.0, phase=0.31),
+        vectors.Magnetometer(name="compass", field_f=FIELD, sigma=1e-8, rate=1.0, kind="heading", phase=0.71),
+        vectors.AttitudeSensor(name="tracker", sigma_across=1e-4, sigma_about=1e-3, rate=0.25),
+    )
+
+
+SIGMA = {"sun": 3e-4, "mag": 5e-4, "compass": 1e-3, "tracker": 1e-3}
+
+
+def still_scenario(**gyro):
+    return Scenario(motion=TUMBLE, gyro=GyroSpec(**gyro), sensors=plain_sensors(), rate=10.0, duration=60.0)
+
+
+@pytest.mark.parametrize("integration", ["one-sample", "two-sample"])
+def test_the_filters_covariance_is_that_of_the_filter(integration):
+    scenario, belief = quiet(still_scenario(), SIGMA)
+    belief = dataclasses.replace(belief, integration=coning.ALGORITHMS[integration])
+    record = simulate(scenario)
+    estimate, _ = run_quiet(record, belief, every=30)
+    found = covariance.analyse(scenario, belief, epochs=600 // belief.integration.samples // 30)
+    assert np.array_equal(found.time, estimate.time)
+    scale = estimate.sigma[:, :, None] * estimate.sigma[:, None, :]
+    assert np.abs((found.filter_covariance - estimate.covariance) / scale).max() < 1e-3  # steps of two samples, for one
+
+
+def test_a_coloured_bias_that_never_changes_is_nothing_but_initial_bias():
+    """The filter starts from the whole true bias less its own prior error, so a drift that stands still leaves no error at all."""
+    sigma, tau = 1e-4, 1e18
+    scenario = still_scenario(markov_noise=sigma * np.sqrt(2.0 / tau), markov_correlation_time=tau)
+    found = covariance.analyse(scenario, BELIEF, epochs=10)
+    block = found.contributions[:, found.sources.index("Gauss–Markov bias")]
+    reach = np.concatenate([np.full(3, sigma * 60.0), np.full(3, sigma)])
+    assert np.abs(block / np.outer(reach, reach)).max() < 1e-12
+
+
+def test_correlated_noise_runs_from_white_to_a_constant():
+    scenario, size = still_scenario(), 3e-4
+    for tau in (1e-6, 1e18):
+        faults = Faults(correlated_sigma=size, correlation_time=tau)
+        sensors = (dataclasses.replace(scenario.sensors[0], faults=faults), *scenario.sensors[1:])
+        found = covariance.analyse(
+            dataclasses.replace(scenario, sensors=sensors),
+            BELIEF,
+            consider=Consider(sensor_bias={"sun": size}),
+            epochs=5,
+        )
+        coloured = found.contributions[:, found.sources.index("sun, correlated")]
+        white_noise = found.contributions[:, found.sources.index("sun")] * (size / scenario.sensors[0].sigma) ** 2
+        constant = np.einsum("mci,mcj->mij", found.considered_errors, found.considered_errors)
+        assert np.allclose(coloured, white_noise if tau < 1.0 else constant, rtol=1e-6, atol=1e-24)
+
+
+def test_a_wrong_gain_obeys_the_lyapunov_equation():
+    """At rest with an attitude once a step everything is constant: P by the Riccati equation, the actual covariance by Lyapunov's."""
+    dt, true_sigma, held_sigma = 1.0, 3e-4, 1e-3
+    true, held = (2e-5, 3e-7), (6e-5, 1e-7)
+    scenario = Scenario(
+        motion=motion.rest(),
+        gyro=GyroSpec(angle_random_walk=true[0], rate_random_walk=true[1]),
+        sensors=(
+            vectors.AttitudeSensor(name="tracker", sigma_across=true_sigma, sigma_about=true_sigma, rate=1.0 / dt),
+        ),
+        rate=1.0 / dt,
+        duration=6000.0,
+    )
+    belief = FilterSetup(
+        process_noise=ProcessNoise(angle_random_walk=held[0], rate_random_walk=held[1]),
+        attitude_sigma=1e-3,
+        bias_sigma=1e-5,
+        sigma={"tracker": held_sigma},
+    )
+    found = covariance.analyse(scenario, belief, epochs=10)
+    F, H = np.array([[1.0, -dt], [0.0, 1.0]]), np.array([[1.0, 0.0]])
+
+    def noise(v, u):
+        return np.array([[v**2 * dt + u**2 * dt**3 / 3, -(u**2) * dt**2 / 2], [-(u**2) * dt**2 / 2, u**2 * dt]])
+
+    prior = solve_discrete_are(F.T, H.T, noise(*held), [[held_sigma**2]])
+    gain = prior @ H.T / (prior[0, 0] + held_sigma**2)
+    keep = np.eye(2) - gain @ H
+    actual = solve_discrete_lyapunov(keep @ F, keep @ noise(*true) @ keep.T + gain @ gain.T * true_sigma**2)
+    for axis in range(3):
+        pick = np.ix_([axis, 3 + axis], [axis, 3 + axis])
+        assert np.allclose(found.filter_covariance[-1][pick], keep @ prior, rtol=1e-7)
+        assert np.allclose(found.covariance[-1][pick], actual, rtol=1e-7)
+    ratio = np.trace(np.linalg.solve(keep @ prior, actual)) / 2.0
+    assert np.allclose(found.expected_nees[-1, 0], ratio)
+    assert found.expected_nis["tracker"] == pytest.approx(
+        (H @ (F @ actual @ F.T + noise(*true)) @ H.T + true_sigma**2)[0, 0] / (prior[0, 0] + held_sigma**2), rel=0.01
+    )
+
+
+def test_the_source_runs_uncompiled(monkeypatch):
+    scenario = everything(duration=12.0)
+    fast = covariance.analyse(scenario, BELIEF, consider=Consider(scale_factor=1e-4), epochs=3)
+    monkeypatch.setattr(covariance, "compiled", lambda function: function)
+    slow = covariance.analyse(scenario, BELIEF, consider=Consider(scale_factor=1e-4), epochs=3)
+    assert np.allclose(slow.contributions, fast.contributions, rtol=1e-9, atol=1e-24)
+    assert np.allclose(slow.considered_errors, fast.considered_errors, rtol=1e-9, atol=1e-18)
+    assert covariance_loop.run_covariance is not None
+
+
+# ----------------------------------------------------------------------------------------------------- errors without noise
+
+
+def rotated(record, name, epsilon):
+    """The record of a sensor that is turned on the body by a rotation vector: it tells of an attitude q exp(ε)."""
+    turn = quaternion.exp(np.asarray(epsilon))
+    series = []
+    for one in record.vectors:
+        changed = one
+        if one.sensor == name and one.attitude is not None:
+            changed = dataclasses.replace(one, attitude=quaternion.multiply(one.attitude, turn))
+        elif one.sensor == name:
+            changed = dataclasses.replace(one, vector_b=quaternion.rotate(quaternion.conjugate(turn), one.vector_b))
+        series.append(changed)
+    return dataclasses.replace(record, vectors=tuple(series))
+
+
+def late(scenario, name, seconds):
+    """The record of a sensor that measures later than its stamps tell."""
+    shifted = []
+    for sensor in scenario.sensors:
+        if sensor.name == name:
+            shifted.append(dataclasses.replace(sensor, phase=sensor.phase + seconds))
+        else:
+            shifted.append(sensor)
+    record = simulate(dataclasses.replace(scenario, sensors=tuple(shifted)))
+    named = {one.sensor: one for one in simulate(scenario).vectors}
+    series = tuple(
+        dataclasses.replace(
+            one,
+            time=named[one.sensor].time[: len(one.time)],
+            reference_f=named[one.sensor].reference_f[: len(one.time)]
+            if one.reference_f.ndim == 2
+            else one.reference_f,
+        )
+        for one in record.vectors
+    )
+    return dataclasses.replace(record, vectors=series)
+
+
+def considered(name, size):
+    """Cases: what is considered, which axis of it, and the record in which it is so."""
+    base, belief = quiet(still_scenario(), SIGMA)
+    if name == "scale factor, y":
+        record = simulate(quiet(still_scenario(scale_factor=np.array([0.0, size, 0.0])), SIGMA)[0])
+        return base, belief, Consider(scale_factor=size), record
+    if name == "misalignment, x of z":
+        M = np.zeros((3, 3))
+        M[0, 2] = size
+        return base, belief, Consider(misalignment=size), simulate(quiet(still_scenario(misalignment=M), SIGMA)[0])
+    if name == "g-sensitivity, z of y":
+        G = np.zeros((3, 3))
+        G[2, 1] = size
+        return base, belief, Consider(g_sensitivity=size), simulate(quiet(still_scenario(g_sensitivity=G), SIGMA)[0])
+    sensor, what = name.split(" ", 1)
+    if what == "bias, x":
+        iron = tuple(
+            dataclasses.replace(one, hard_iron=np.array([size, 0.0, 0.0])) if one.name == sensor else one
+            for one in base.sensors
+        )
+        record = simulate(dataclasses.replace(base, sensors=iron))
+        # The unit of the consideration is that of the sensor's own σ, which the quiet one has too.
+        return base, belief, Consider(sensor_bias={sensor: size}), record
+    if what == "mounting, y":
+        return base, belief, Consider(mounting={sensor: size}), rotated(simulate(base), sensor, [0.0, size, 0.0])
+    assert what == "time offset"
+    return base, belief, Consider(time_offset={sensor: size}), late(base, sensor, size)
+
+
+CASES = {
+    "scale factor, y": 1e-4,
+    "misalignment, x of z": 1e-4,
+    "g-sensitivity, z of y": 1e-7,
+    "mag bias, x": 1e-8,
+    "compass bias, x": 1e-8,
+    "sun mounting, y": 1e-4,
+    "compass mounting, y": 1e-4,
+    "tracker mounting, y": 1e-4,
+    "sun time offset": 1e-3,
+    "mag time offset": 1e-3,
+    "compass time offset": 1e-3,
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_considered_error_makes_what_it_makes(name):
+    base, belief, consider, record = considered(name, CASES[name])
+    _, error = run_quiet(record, belief, every=60)
+    found = covariance.analyse(base, belief, consider=consider, epochs=10)
+    predicted = found.considered_errors[:, found.considered.index(name)]
+    scale = np.concatenate([np.full(3, np.abs(predicted[:, :3]).max()), np.full(3, np.abs(predicted[:, 3:]).max())])
+    assert np.abs((error - found.mean_error - predicted)[1:] / scale).max() < 0.02
+    assert np.allclose(found.covariance - found.contributions.sum(axis=1), np.einsum(
+        "mci,mcj->mij", found.considered_errors, found.considered_errors), atol=1e-22)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "gyro"),
+    [
+        ("gyro scale factor", {"scale_factor": np.array([1e-4, -2e-4, 3e-4])}),
+        ("gyro asymmetry", {"asymmetry": np.array([3e-4, 0.0, 0.0])}),
+        ("gyro bandwidth", {"bandwidth": 2.0}),
+        ("rate ramp", {"rate_ramp": np.array([1e-7, 0.0, -1e-7])}),
+    ],
+)
+def test_an_error_of_the_scenario_makes_what_it_makes(name, gyro):
+    scenario, belief = quiet(still_scenario(**gyro), SIGMA)
+    _, error = run_quiet(simulate(scenario), belief, every=60)
+    found = covariance.analyse(scenario, belief, epochs=10)
+    assert name in found.fixed
+    scale = np.concatenate([np.full(3, np.abs(error[:, :3]).max()), np.full(3, np.abs(error[:, 3:]).max())])
+    assert np.abs((error - found.mean_error) / scale).max() < 0.02
+
+
+def test_coning_shows_as_the_bias_that_the_formula_tells():
+    angle, frequency, rate = 0.7 * DEGREE, 10.0, 100.0
+    scenario = Scenario(
+        motion=motion.Coning(angle=angle, frequency=frequency),
+        gyro=GyroSpec(angle_random_walk=2e-5, rate_random_walk=1e-8),
+        sensors=tuple(
+            vectors.VectorSensor(name=f"star {k}", reference_f=np.eye(3)[k], sigma=1e-4, rate=1.0) for k in range(2)
+        ),
+        rate=rate,
+        duration=400.0,
+    )
+    for name in ("one-sample", "two-sample"):
+        algorithm = coning.ALGORITHMS[name]
+        belief = dataclasses.replace(setup.matched(scenario), integration=algorithm, bias_sigma=1e-3)
+        found = covariance.analyse(scenario, belief, epochs=4)
+        increments = scenario.motion.increments(
+            np.arange(1001) / rate
+        )  # a hundred cycles: the body is back where it was
+        turned = np.array([1.0, 0.0, 0.0, 0.0])
+        for turn in quaternion.exp(coning.rotation_vectors(increments, algorithm)):
+            turned = quaternion.multiply(turned, turn)
+        drift = quaternion.log(turned)[2] / 10.0
+        assert found.fixed == (f"integration ({name})",)
+        assert found.mean_error[-1, 5] == pytest.approx(-drift, rel=0.005)  # the filter takes the drift for bias
+
+
+# ------------------------------------------------------------------------------------------------------------- Monte Carlo
+
+
+def monte_carlo(scenario, belief, runs, epochs, seed=3):
+    """Errors and NEES of independent runs: (runs, epochs + 1, 6), (runs, epochs + 1)."""
+    steps = (len(scenario.edges) - 1) // belief.integration.samples
+    every = steps // epochs
+    errors, nees = [], []
+    for run in range(runs):
+        record = simulate(scenario, seed, run)
+        used = setup.believed(record, belief)
+        estimate = mekf.run(
+            used,
+            belief.process_noise,
+            montecarlo.start(record, belief, seed, run),
+            every=every,
+            full_covariance=True,
+        )
+        e = consistency.errors(estimate.attitude, estimate.bias, used.truth.attitude[::every], used.truth.bias[::every])
+        errors.append(e)
+        nees.append(consistency.nees(e, estimate.covariance))
+    return np.array(errors), np.array(nees)
+
+
+def check_monte_carlo(scenario, belief, *, runs, epochs, probability=0.99):
+    found = covariance.analyse(scenario, belief, epochs=epochs)
+    errors, nees = monte_carlo(scenario, belief, runs, epochs)
+    number = len(found.time) - 1
+    C, mean, P = found.covariance, found.mean_error, found.filter_covariance
+    each = 1.0 - (1.0 - probability) / number
+    from scipy.stats import chi2, norm
+
+    low, high = consistency.mean_bounds(6, runs, each)
+    for k in range(1, number + 1):
+        away = errors[:, k] - mean[k]
+        ratio = consistency.nees(away, np.broadcast_to(C[k], (runs, 6, 6))).mean() / 6.0
+        assert low < ratio < high, f"actual covariance at {found.time[k]} s: {ratio:.3f}, {low:.3f} to {high:.3f}"
+        average = away.mean(axis=0)
+        assert runs * average @ np.linalg.solve(C[k], average) < chi2.ppf(each, 6)
+        # NEES with the filter's own P is a quadratic form of a known Gaussian.
+        shape = np.linalg.solve(P[k], C[k])
+        shift = np.linalg.solve(P[k], mean[k])
+        deviation = np.sqrt((2.0 * np.trace(shape @ shape) + 4.0 * shift @ C[k] @ shift) / runs) / 6.0
+        limit = norm.ppf(0.5 + 0.5 * each) * deviation
+        assert abs(nees[:, k].mean() / 6.0 - found.expected_nees[k, 0]) < limit
+    return found, errors
+
+
+def test_every_source_together_agrees_with_monte_carlo():
+    check_monte_carlo(everything(), BELIEF, runs=150, epochs=6)
+
+
+def quarter(belief):
+    noise = belief.process_noise
+    half = ProcessNoise(angle_random_walk=0.5 * noise.angle_random_walk, rate_random_walk=0.5 * noise.rate_random_walk)
+    return dataclasses.replace(belief, process_noise=half)
+
+
+def test_a_filter_that_believes_a_quarter_of_the_process_noise_agrees_too():
+    scenario = dataclasses.replace(white("spin", 120.0, scale_factor=np.array([0.0, 0.0, 1e-6])), rate=20.0)
+    found, _ = check_monte_carlo(scenario, quarter(setup.matched(scenario)), runs=150, epochs=5)
+    assert found.expected_nees[-1, 0] > 1.5  # the mismatch is one to see
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["spin", "tumbling-satellite", "coning", "low-orbit", "magnetometer-only"])
+@pytest.mark.parametrize("change", [lambda belief: belief, quarter], ids=["matched", "Q/4"])
+def test_the_built_in_scenarios_agree_with_monte_carlo(name, change):
+    scenario = load_scenario(name)
+    scenario = dataclasses.replace(scenario, duration=min(scenario.duration, 600.0))
+    belief = change(setup.matched(scenario, attitude_sigma=0.2 * DEGREE))
+    check_monte_carlo(scenario, belief, runs=400, epochs=10)
+
+
+def bound_ratio(scenario, runs, epochs):
+    """RMSE over the root of the posterior Cramér–Rao bound, all states and epochs, each in units of its own bound."""
+    # Steps of four samples leave nothing of the coning, but take a star in the middle of one for one in a steady turn.
+    algorithm = "four-sample" if scenario.name == "coning" else "one-sample"
+    belief = dataclasses.replace(
+        setup.matched(scenario, attitude_sigma=0.1 * DEGREE), integration=coning.ALGORITHMS[algorithm]
+    )
+    found = covariance.analyse(scenario, belief, epochs=epochs)
+    errors, _ = monte_carlo(scenario, belief, runs, epochs)
+    white_errors = errors[:, 1:] / found.filter_sigma[1:]
+    return float(np.sqrt(np.mean(white_errors**2)))
+
+
+WELL_CONDITIONED = ["coning", "tumbling-satellite", "spin", "slew-vibration"]
+
+
+@pytest.mark.parametrize("name", WELL_CONDITIONED)
+def test_the_filter_is_near_the_bound(name):
+    # Errors of one run are correlated over epochs: some 60 · 12 of the 60 · 30 are independent.
+    assert 0.90 < bound_ratio(white(name, 20.0), runs=60, epochs=5) < 1.10
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WELL_CONDITIONED)
+def test_the_filter_is_within_three_percent_of_the_bound(name):
+    scenario = white(name, min(load_scenario(name).duration, 120.0))
+    assert 0.97 < bound_ratio(scenario, runs=1000, epochs=10) < 1.03
+
+
+# ------------------------------------------------------------------------------------------------------------------- the rim
+
+
+def test_initial_errors_may_differ_from_what_the_filter_believes():
+    scenario = white("spin", 30.0)
+    belief = setup.matched(scenario)
+    right = covariance.analyse(scenario, belief, epochs=3)
+    wrong = covariance.analyse(
+        scenario, belief, epochs=3, initial_attitude_sigma=2.0 * belief.attitude_sigma, initial_bias_sigma=0.0
+    )
+    one, two = right.sources.index("initial attitude"), right.sources.index("initial bias")
+    assert np.allclose(wrong.contributions[:, one], 4.0 * right.contributions[:, one])
+    assert np.all(wrong.contributions[:, two] == 0.0)
+    assert np.array_equal(wrong.filter_covariance, right.filter_covariance)
+
+
+def test_what_is_left_out_or_beyond_linear_is_told():
+    scenario = dataclasses.replace(load_scenario("hand-held"), duration=4.0)
+    found = covariance.analyse(scenario, epochs=2)
+    assert found.left_out == ("gyro rate resolution",)
+    assert any("accelerometer" in one for one in found.beyond_linear)
+    wide = covariance.analyse(white("spin", 10.0), setup.matched(white("spin", 10.0), attitude_sigma=0.5), epochs=2)
+    assert any("initial attitude" in one for one in wide.beyond_linear)
+    assert covariance.analyse(white("spin", 10.0), epochs=2).beyond_linear == ()
+
+
+def test_what_makes_no_sense_is_refused():
+    scenario = white("spin", 10.0)
+    with pytest.raises(InputError, match="did you mean 'star'"):
+        covariance.analyse(scenario, consider=Consider(mounting={"stars": 1e-3}))
+    with pytest.raises(InputError, match="epochs"):
+        covariance.analyse(scenario, epochs=100_000)
+    with pytest.raises(InputError, match="scale_factor"):
+        Consider(scale_factor=-1.0)
+    with pytest.raises(InputError, match="time_offset"):
+        Consider(time_offset=0.1)
+    with pytest.raises(InputError, match="heading pair"):
+        covariance.analyse(everything(20.0), BELIEF, consider=Consider(sensor_bias={"gnss": 1.0}), epochs=2)
+    perfect = dataclasses.replace(
+        scenario, sensors=(vectors.VectorSensor(name="sun", reference_f=np.eye(3)[0], sigma=0.0, rate=1.0),)
+    )
+    with pytest.raises(InputError, match="sun: sigma"):
+        covariance.analyse(perfect, BELIEF, epochs=2)
+
+    class Own:
+        name = "own"
+
+        def observe(self, *_):
+            raise AssertionError
+
+    with pytest.raises(InputError, match="own is a Own"):
+        covariance.analyse(dataclasses.replace(scenario, sensors=(Own(),)), BELIEF, epochs=2)
+
+
+def test_a_scenario_without_sensors_is_dead_reckoning():
+    spec = GyroSpec(angle_random_walk=1e-4, rate_random_walk=1e-7)
+    scenario = Scenario(motion=motion.rest(), gyro=spec, sensors=(), rate=10.0, duration=100.0)
+    found = covariance.analyse(scenario, dataclasses.replace(BELIEF, process_noise=ProcessNoise(
+        angle_random_walk=1e-4, rate_random_walk=1e-7)), epochs=1)  # fmt: skip
+    t = 100.0
+    expected = 2e-3**2 + (2e-5 * t) ** 2 + 1e-8 * t + 1e-14 * t**3 / 3.0
+    assert np.allclose(np.diag(found.covariance[-1])[:3], expected, rtol=1e-9)
+    assert found.rms[-1, 0] / ARCSECOND == pytest.approx(np.sqrt(expected) / ARCSECOND)
+
+
+# ------------------------------------------------------------------------------------------------------- the command line
+
+
+@pytest.fixture
+def command(monkeypatch, capsys, tmp_path):
+    """Run ``strapdown ARGUMENTS`` in an empty folder; return exit status, standard output and standard error."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        monkeypatch.setattr("sys.argv", ["strapdown", *map(str, arguments)])
+        try:
+            cli.main()
+            status = 0
+        except SystemExit as end:
+            status = end.code or 0
+        said = capsys.readouterr()
+        return status, said.out, said.err
+
+    return call
+
+
+def test_the_command_tells_a_budget_and_writes_it(command, tmp_path):
+    status, said, _ = command("covariance", "spin", "--epochs", 10, "--misalignment", 0.1, "--time-offset", "star=2")
+    assert status == 0
+    for word in ("angle random walk", "gyro scale factor", "misalignment", "star time offset", "the filter's own σ"):
+        assert word in said
+    assert "too sure of its bias" in " ".join(said.split())
+    found = json.loads((tmp_path / "covariance-results" / "covariance.json").read_text(encoding="utf-8"))
+    assert len(found["time_s"]) == 11
+    direct = covariance.analyse(
+        load_scenario("spin"), consider=Consider(misalignment=1e-4, time_offset={"star": 2e-3}), epochs=10
+    )
+    assert np.allclose(np.array(found["rms"]["attitude_arcsec"]) * ARCSECOND, direct.rms[:, :3])
+    assert np.allclose(found["expected_nees_per_state"]["bias"], direct.expected_nees[:, 2])
+    assert (tmp_path / "covariance-results" / "budget.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_command_takes_a_filter_and_units(command, tmp_path):
+    belief = setup.matched(load_scenario("low-orbit"))
+    (tmp_path / "filter.toml").write_text(setup.to_toml(belief), encoding="utf-8")
+    arguments = ("low-orbit", "--filter", "filter.toml", "--epochs", 5, "--sensor-bias", "magnetometer=100")
+    status, said, _ = command("covariance", *arguments, "--attitude-sigma", 2, "--bias-sigma", 30)
+    assert status == 0
+    assert "the filter given" in said
+    found = json.loads((tmp_path / "covariance-results" / "covariance.json").read_text(encoding="utf-8"))
+    direct = covariance.analyse(
+        load_scenario("low-orbit"),
+        belief,
+        consider=Consider(sensor_bias={"magnetometer": 100e-9}),
+        initial_attitude_sigma=2.0 * DEGREE,
+        initial_bias_sigma=30.0 * DEGREE / 3600.0,
+        epochs=5,
+    )
+    assert np.allclose(found["rms"]["attitude_arcsec"], direct.rms[:, :3] / ARCSECOND)
+    assert found["rms"]["attitude_arcsec"][0][0] == pytest.approx(7200.0)
+
+
+def test_the_command_refuses_in_one_line(command):
+    for arguments, word in (
+        (("spin", "--time-offset", "star"), "NAME=VALUE"),
+        (("spin", "--mounting", "sta=3"), "did you mean 'star'"),
+        (("spin", "--scale-factor", "-1"), "scale_factor"),
+        (("nowhere",), "nowhere"),
+    ):
+        status, said, refused = command("covariance", *arguments, "--epochs", 4)
+        assert word in " ".join((said + refused).split())
+        assert status == 2
