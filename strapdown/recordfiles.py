@@ -53,7 +53,8 @@ _SERIES = {
     "reference_f": "1 (kind vector: the unit of sigma)",
     "sigma": "rad (kind vector: the unit of the vector)",
     "attitude": "1",
-    "sigma_axes": "rad",
+    "sigma_axes": "rad (kind vector: the unit of the vector)",
+    "covariance": "the square of sigma's",
     "arrival": "s",
 }
 _RESERVED = ("kind", "format", "version", "conventions", "gyro", "scenario", "seed", "run")
@@ -214,6 +215,8 @@ def export_csv(path: str | os.PathLike[str], record: ImuRecord) -> tuple[Path, .
         np.concatenate(columns, axis=1),
     )
     for number, series in enumerate(record.vectors):
+        if series.anisotropic:
+            raise InputError(f"{series.sensor}: CSV has no columns for sigma_axes or covariance; write HDF5")
         beside = target.with_name(f"{target.stem}-vectors-{number}.csv")
         if series.kind == "attitude" and series.attitude is not None and series.sigma_axes is not None:
             names, columns = _ATTITUDE_COLUMNS, [series.time[:, None], series.attitude, series.sigma_axes]

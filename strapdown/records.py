@@ -132,6 +132,18 @@ class Innovations:
     of its reference."""
     variance: Array
     """What the filter takes their variances for (m, dof)."""
+    weight: Array | None = None
+    """Weight that each measurement was taken in with (m,): 1 whole, 0 refused by a gate, between them a robust update's; None: all 1."""
+
+    @property
+    def used(self) -> np.ndarray:
+        """Which measurements were not refused (m,)."""
+        return np.ones(len(self.time), bool) if self.weight is None else np.asarray(self.weight > 0.0)
+
+    @property
+    def refused(self) -> int:
+        """How many measurements were refused."""
+        return int(np.sum(~self.used))
 
     @property
     def whitened(self) -> Array:
@@ -142,6 +154,42 @@ class Innovations:
     def nis(self) -> Array:
         """Normalised innovation squared (m,), χ² with as many degrees of freedom as columns if the filter is right."""
         return np.asarray(np.sum(self.innovation**2 / self.variance, axis=1))
+
+
+EVENT_KINDS = ("recovery", "divergence", "gap")
+"""Kinds of :class:`Event`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Event:
+    """Something in a run that whoever uses the estimate must hear of."""
+
+    kind: str
+    """One of :data:`EVENT_KINDS`: a filter that refused good measurements started anew; the running NIS left its bounds; the gyro was
+    silent for much longer than its interval."""
+    start: float
+    """When it began, s."""
+    end: float
+    """When it was over, s: the filter's recovery, the return of the NIS (or the end of the record), the next gyro sample."""
+    sensor: str = ""
+    """Sensor concerned, if it is one."""
+    value: float = 0.0
+    """Of a recovery the refusals in a row, of a divergence the greatest mean NIS per degree of freedom, of a gap its length over the usual
+    interval."""
+
+    def __str__(self) -> str:
+        """Say it in one line."""
+        if self.kind == "recovery":
+            return (
+                f"Recovered at {self.end:.6g} s: {self.value:.0f} measurements of {self.sensor} in a row were refused and agreed with each "
+                f"other from {self.start:.6g} s on; what the filter said in between is wrong."
+            )
+        if self.kind == "divergence":
+            return (
+                f"The mean NIS left its bounds from {self.start:.6g} s to {self.end:.6g} s, up to {self.value:.3g} per degree of freedom: "
+                "the model does not hold there."
+            )
+        return f"Gap of {self.end - self.start:.3g} s after {self.start:.6g} s: the turn across it is taken for one at constant rate."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,6 +210,13 @@ class Estimate:
     """Innovations by sensor."""
     skipped: Mapping[str, int] = field(default_factory=dict)
     """Measurements not used, by sensor: missing (NaN) ones and those outside the record's time."""
+    events: tuple[Event, ...] = ()
+    """What must be heard of the run, in order of time."""
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """Measurements refused by a gate, by sensor."""
+        return {sensor: innovations.refused for sensor, innovations in self.innovations.items()}
 
     @property
     def sigma(self) -> Array:
@@ -238,6 +293,10 @@ def write_estimate(
                 "rad, or the sensor's unit over the length of its reference",
             )
             put(group, "variance", innovations.variance, "the square of the innovation's")
+            if innovations.weight is not None:
+                put(group, "weight", innovations.weight, "1", "0: refused; 1: taken in whole")
+        for number, event in enumerate(estimate.events):
+            file.create_group(f"events/{number:06d}").attrs.update(vars(event))
 
 
 def write_attitude(
@@ -287,9 +346,44 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
             covariance=file["covariance"][:] if "covariance" in file else None,
             innovations={
                 part.attrs["sensor"]: Innovations(
-                    time=part["time"][:], innovation=part["innovation"][:], variance=part["variance"][:]
+                    time=part["time"][:],
+                    innovation=part["innovation"][:],
+                    variance=part["variance"][:],
+                    weight=part["weight"][:] if "weight" in part else None,
                 )
                 for part in groups
             },
             skipped={part.attrs["sensor"]: int(part.attrs["skipped"]) for part in groups},
+            events=tuple(
+                Event(
+                    kind=one.attrs["kind"],
+                    start=float(one.attrs["start"]),
+                    end=float(one.attrs["end"]),
+                    sensor=one.attrs["sensor"],
+                    value=float(one.attrs["value"]),
+                )
+                for one in (file["events"].values() if "events" in file else ())
+            ),
         )
+
+
+def read_attributes(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read what a result file of any kind says of its making: its kind, version, conventions, and all that the writer gave.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, no HDF5, or not of this package.
+    """
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            attributes = {name: value.item() if hasattr(value, "item") else value for name, value in file.attrs.items()}
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist; check the path") from None
+    except OSError as error:
+        raise InputError(f"{path} cannot be read as HDF5 ({error}); the file is truncated or of another kind") from None
+    if not str(attributes.get("kind", "")).startswith("strapdown "):
+        raise InputError(f"{path} is no result of strapdown; pass a file that one of its commands has written")
+    return attributes

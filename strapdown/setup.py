@@ -18,6 +18,7 @@ from strapdown.checks import Array, InputError, finite, known_keys, one_of, posi
 from strapdown.gyro import GyroSpec
 from strapdown.mekf import ProcessNoise
 from strapdown.records import Estimate, ImuRecord, compress
+from strapdown.robustness import Gate, Robust
 from strapdown.scenarios import Scenario, simulate
 from strapdown.vectors import VectorMeasurements
 
@@ -45,6 +46,10 @@ class FilterSetup:
     sigma: Mapping[str, float] = field(default_factory=dict)
     """σ that the filter believes of a sensor instead of the record's, by its name: rad, or of whole vectors the unit of their reference.
     Of a series whose σ varies it is the root mean square, and the ratios stay."""
+    gate: Gate | None = None
+    """Refuses measurements that no right filter would see, and recovers; None: all are taken."""
+    robust: Robust | None = None
+    """Weighs measurements by how far they lie off; None: all alike."""
 
     def __post_init__(self) -> None:
         """Check every number."""
@@ -165,7 +170,8 @@ def _believed(series: VectorMeasurements, setup: FilterSetup) -> VectorMeasureme
 
 def run(record: ImuRecord, setup: FilterSetup, initial: mekf.State, **options: Any) -> Estimate:
     """Run the filter of this setup over a record; ``options`` are those of :func:`strapdown.mekf.run`."""
-    return mekf.run(believed(record, setup), setup.process_noise, initial, **options)
+    chosen = {"gate": setup.gate, "robust": setup.robust, **options}
+    return mekf.run(believed(record, setup), setup.process_noise, initial, **chosen)
 
 
 def initial_state(
@@ -181,7 +187,21 @@ _FORM: tables.Form = {
     "bias_sigma": tables.DEGREES_PER_HOUR,
     "measurement_sigma_factor": tables.RATIO,
 }
-_PARTS = ("integration", "sigma")
+_GATE_FORM: tables.Form = {
+    "probability": tables.RATIO,
+    "recovery": tables.PLAIN,
+    "restart_attitude_sigma": tables.DEGREES,
+    "restart_bias_sigma": tables.DEGREES_PER_HOUR,
+}
+_ROBUST_FORM: tables.Form = {
+    "kind": tables.PLAIN,
+    "probability": tables.RATIO,
+    "degrees_of_freedom": tables.RATIO,
+    "iterations": tables.PLAIN,
+}
+_PARTS = ("integration", "sigma", "gate", "robust")
+NEVER = 0
+"""What stands in a file for the ``recovery`` of a gate that never recovers, as TOML has no word for nothing."""
 
 
 def to_table(setup: FilterSetup) -> dict[str, Any]:
@@ -190,6 +210,13 @@ def to_table(setup: FilterSetup) -> dict[str, Any]:
     table["integration"] = setup.integration.name
     if setup.sigma:
         table["sigma"] = dict(setup.sigma)
+    if setup.gate is not None:
+        known = {name: choice for name, choice in _GATE_FORM.items() if getattr(setup.gate, name) is not None}
+        table["gate"] = tables.encode(setup.gate, known)
+        if setup.gate.recovery is None:
+            table["gate"]["recovery"] = NEVER
+    if setup.robust is not None:
+        table["robust"] = tables.encode(setup.robust, _ROBUST_FORM)
     return table
 
 
@@ -202,11 +229,18 @@ def from_table(table: Mapping[str, Any], place: str = "filter") -> FilterSetup:
         name = one_of(f"{place}: integration", table["integration"], coning.ALGORITHMS)
         parts["integration"] = coning.ALGORITHMS[name]
     if "sigma" in table:
-        if not isinstance(table["sigma"], Mapping):
-            raise InputError(
-                f"{place}: sigma is {table['sigma']!r}; it must be a table of numbers by sensor, [filter.sigma]"
+        believed_sigma = _part(table, "sigma", place)
+        parts["sigma"] = {name: finite(f"{place}: sigma: {name}", value) for name, value in believed_sigma.items()}
+    if "gate" in table:
+        content = dict(_part(table, "gate", place))
+        if content.get("recovery") == NEVER:
+            parts["gate"] = tables.build(
+                Gate, {k: v for k, v in content.items() if k != "recovery"}, _GATE_FORM, f"{place}: gate", recovery=None
             )
-        parts["sigma"] = {name: finite(f"{place}: sigma: {name}", value) for name, value in table["sigma"].items()}
+        else:
+            parts["gate"] = tables.build(Gate, content, _GATE_FORM, f"{place}: gate")
+    if "robust" in table:
+        parts["robust"] = tables.build(Robust, _part(table, "robust", place), _ROBUST_FORM, f"{place}: robust")
     return tables.build(  # type: ignore[no-any-return]
         FilterSetup,
         {key: value for key, value in table.items() if key not in own and key not in _PARTS},
@@ -215,6 +249,12 @@ def from_table(table: Mapping[str, Any], place: str = "filter") -> FilterSetup:
         process_noise=tables.build(ProcessNoise, {k: v for k, v in table.items() if k in own}, _NOISE_FORM, place),
         **parts,
     )
+
+
+def _part(table: Mapping[str, Any], name: str, place: str) -> Mapping[str, Any]:
+    if not isinstance(table[name], Mapping):
+        raise InputError(f"{place}: {name} is {table[name]!r}; it must be a table, [{place}.{name}]")
+    return table[name]  # type: ignore[no-any-return]
 
 
 def to_toml(setup: FilterSetup) -> str:

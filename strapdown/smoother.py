@@ -11,18 +11,27 @@ from __future__ import annotations
 import numpy as np
 
 from strapdown import mekf
-from strapdown.checks import Array, non_negative
+from strapdown.checks import Array, InputError, non_negative
 from strapdown.kernels import smoother_loop
 from strapdown.kernels.machine import compiled
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.mekf import ProcessNoise, State
 from strapdown.records import Estimate, ImuRecord
+from strapdown.robustness import Gate, Robust
 
 STAMP_TOLERANCE = 1e-6
 """Of the mean gyro interval: an edge that lies beyond t + lag by no more is taken for one at t + lag."""
 
 
-def run(record: ImuRecord, process_noise: ProcessNoise, initial: State, *, full_covariance: bool = False) -> Estimate:
+def run(
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    initial: State,
+    *,
+    full_covariance: bool = False,
+    gate: Gate | None = None,
+    robust: Robust | None = None,
+) -> Estimate:
     """Return the fixed-interval smoother's estimate at every edge of a record.
 
     Parameters
@@ -33,6 +42,13 @@ def run(record: ImuRecord, process_noise: ProcessNoise, initial: State, *, full_
         State at the first edge before any measurement, as for :func:`strapdown.mekf.run`.
     full_covariance : bool
         Keep whole covariance matrices too.
+    gate, robust : optional
+        As for :func:`strapdown.mekf.run`: what the filter refused or weighed down, the smoother does not take up again.
+
+    Raises
+    ------
+    InputError
+        If the filter had to recover: the states before and after it are not one trajectory. The message says where to cut the record.
 
     Returns
     -------
@@ -40,24 +56,37 @@ def run(record: ImuRecord, process_noise: ProcessNoise, initial: State, *, full_
         Attitude, bias and variance are smoothed; those at the last edge are the filter's. The innovations are the filter's.
         Memory for the filter's states: 256 bytes a gyro interval and a measurement.
     """
-    return _smoothed(record, process_noise, initial, np.inf, full_covariance)
+    return _smoothed(record, process_noise, initial, np.inf, full_covariance, gate, robust)
 
 
 def run_fixed_lag(
-    record: ImuRecord, process_noise: ProcessNoise, initial: State, *, lag: float, full_covariance: bool = False
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    initial: State,
+    *,
+    lag: float,
+    full_covariance: bool = False,
+    gate: Gate | None = None,
+    robust: Robust | None = None,
 ) -> Estimate:
     """Return the fixed-lag smoother's estimate: at each edge t, what the measurements up to the last edge at or before t + lag tell.
 
     Exact: equal to :func:`run` on the record cut there. Work grows with the number of gyro intervals in ``lag``: one backward step each
     for every edge. ``lag`` in s; 0 is the filter, the length of the record or more is :func:`run`.
     """
-    return _smoothed(record, process_noise, initial, non_negative("lag", lag, unit="s"), full_covariance)
+    return _smoothed(record, process_noise, initial, non_negative("lag", lag, unit="s"), full_covariance, gate, robust)
 
 
 def _smoothed(
-    record: ImuRecord, process_noise: ProcessNoise, initial: State, lag: float, full_covariance: bool
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    initial: State,
+    lag: float,
+    full_covariance: bool,
+    gate: Gate | None,
+    robust: Robust | None,
 ) -> Estimate:
-    forward, segments, starts = _filtered(record, process_noise, initial)
+    forward, segments, starts = _filtered(record, process_noise, initial, gate, robust)
     edges = len(record.time)
     slack = STAMP_TOLERANCE * (record.time[-1] - record.time[0]) / (edges - 1)
     until = np.searchsorted(record.time, record.time + (lag + slack), side="right") - 1
@@ -85,6 +114,7 @@ def _smoothed(
         covariance=mekf.covariance_matrices(blocks) if full_covariance else None,
         innovations=forward.innovations,
         skipped=forward.skipped,
+        events=forward.events,
     )
 
 
@@ -95,9 +125,15 @@ def _most_segments(record: ImuRecord, events: int) -> int:
     return len(record.increments) + events + int(np.sum(np.floor(np.sqrt(large) / LARGEST_ANGLE) + 1.0))
 
 
-def _filtered(record: ImuRecord, process_noise: ProcessNoise, initial: State) -> tuple[Estimate, Array, np.ndarray]:
+def _filtered(
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    initial: State,
+    gate: Gate | None = None,
+    robust: Robust | None = None,
+) -> tuple[Estimate, Array, np.ndarray]:
     """Run the filter and keep its segments; return its estimate, the segments with the end state, and the segment of each edge."""
-    events = mekf.schedule(record.vectors, record.time[0], record.time[-1])
+    events = mekf.schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True)
     forward, _, segments = mekf.run_events(
         record,
         events,
@@ -106,7 +142,15 @@ def _filtered(record: ImuRecord, process_noise: ProcessNoise, initial: State) ->
         every=len(record.time),
         full_covariance=False,
         segments=_most_segments(record, len(events.time)),
+        gate=gate,
+        robust=robust,
     )
+    for event in forward.events:
+        if event.kind == "recovery":
+            raise InputError(
+                f"the filter lost its way and recovered at {event.end:.9g} s, where the trajectory breaks; smooth the parts before "
+                f"and after {event.start:.9g} s on their own (strapdown.records.cut)"
+            )
     starts = np.empty(len(record.time), np.int64)
     compiled(smoother_loop.locate_edges)(record.time, events.time, segments, len(segments) - 1, starts)
     return forward, segments, starts

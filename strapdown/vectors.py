@@ -71,12 +71,16 @@ class VectorMeasurements:
     """Measured vectors (m, 3), body frame; of unit length but for kind ``"vector"``; rows of NaN are missing samples. For kind
     ``"attitude"`` there are none and this is filled with NaN."""
     sigma: Array = field(default_factory=lambda: np.zeros(1))
-    """Noise of each component (across the direction: rad; of a vector: its unit), (m,); a scalar is spread over all samples. For kind
-    ``"attitude"`` the root mean square of ``sigma_axes``."""
+    """Noise of each component (across the direction: rad; of a vector: its unit), (m,); a scalar is spread over all samples. Where
+    ``sigma_axes`` or ``covariance`` are given, their root mean square."""
     attitude: Array | None = None
     """Measured q_fb (m, 4) for kind ``"attitude"``, with the error on the body side."""
     sigma_axes: Array | None = None
-    """Noise about each body axis (m, 3), rad, for kind ``"attitude"``; (3,) is spread over all samples."""
+    """Noise of each body axis (m, 3), in the unit of sigma; (3,) is spread over all samples. Kind ``"attitude"`` needs it, or
+    ``covariance``; of a direction the part across it counts."""
+    covariance: Array | None = None
+    """Covariance of the noise in body axes (m, 3, 3), the square of the unit of sigma; (3, 3) is spread over all samples. Of a direction
+    the part across it counts; a heading has none."""
     arrival: Array | None = None
     """When each sample arrives (m,), s, not before its time; None: at once."""
 
@@ -86,36 +90,23 @@ class VectorMeasurements:
         time = increasing(f"{self.sensor}: time", self.time, least=0) if len(self.time) else np.empty(0)
         m = len(time)
         store: dict[str, Any] = {"time": time}
-        if self.kind == "attitude":
-            if self.attitude is None or self.sigma_axes is None:
+        attitude = self.kind == "attitude"
+        if attitude:
+            if self.attitude is None or (self.sigma_axes is None and self.covariance is None):
                 raise InputError(
                     f"{self.sensor}: a series of kind 'attitude' needs attitude (m, 4) and sigma_axes (m, 3)"
                 )
             given = array(f"{self.sensor}: attitude", self.attitude, (m, 4))
             store["attitude"] = unit_quaternions(f"{self.sensor}: attitude", given)
-            axes = np.broadcast_to(np.asarray(self.sigma_axes, np.float64), (m, 3))
-            store["sigma_axes"] = array(f"{self.sensor}: sigma_axes", axes, (m, 3))
-            if np.any(axes < 0.0):
-                raise InputError(f"{self.sensor}: sigma_axes has a negative entry; give standard deviations in rad")
             store["vector_b"] = np.full((m, 3), np.nan)
-            sigma = np.sqrt(np.mean(axes**2, axis=1))
         else:
-            if self.attitude is not None or self.sigma_axes is not None:
-                raise InputError(f"{self.sensor}: attitude and sigma_axes belong to kind 'attitude', not {self.kind!r}")
+            if self.attitude is not None:
+                raise InputError(f"{self.sensor}: attitude belongs to kind 'attitude', not {self.kind!r}")
             vector = array(f"{self.sensor}: vector_b", self.vector_b, (m, 3), allow_nan=True)
             if self.kind != "vector":
                 _need_unit(f"{self.sensor}: vector_b", vector)
             store["vector_b"] = vector
-            sigma = (
-                np.broadcast_to(self.sigma, time.shape)
-                if np.ndim(self.sigma) == 0 or len(self.sigma) != m
-                else self.sigma
-            )
-        sigma = array(f"{self.sensor}: sigma", sigma, (m,))
-        if np.any(sigma < 0.0):
-            k = int(np.argmax(sigma < 0.0))
-            raise InputError(f"{self.sensor}: sigma[{k}] is {sigma[k]:g}; it must not be negative")
-        store["sigma"] = sigma
+        store.update(self._noise(m))
         store["reference_f"] = self._reference(m)
         if self.arrival is not None:
             arrival = array(f"{self.sensor}: arrival", self.arrival, (m,))
@@ -125,6 +116,42 @@ class VectorMeasurements:
             store["arrival"] = arrival
         for name, value in store.items():
             object.__setattr__(self, name, value)
+
+    def _noise(self, m: int) -> dict[str, Array]:
+        """Return sigma (m,), and with them sigma_axes (m, 3) and covariance (m, 3, 3) as far as they are given."""
+        found: dict[str, Array] = {}
+        axes: Array | None = None
+        if self.kind == "heading" and not (self.sigma_axes is None and self.covariance is None):
+            raise InputError(f"{self.sensor}: a heading has one sigma; sigma_axes and covariance belong to other kinds")
+        if self.sigma_axes is not None:
+            axes = array(
+                f"{self.sensor}: sigma_axes", np.broadcast_to(np.asarray(self.sigma_axes, np.float64), (m, 3)), (m, 3)
+            )
+            if np.any(axes < 0.0):
+                raise InputError(f"{self.sensor}: sigma_axes has a negative entry; give standard deviations")
+            found["sigma_axes"] = axes
+        if self.covariance is not None:
+            found["covariance"] = whole = _covariances(f"{self.sensor}: covariance", self.covariance, m)
+            diagonal = np.sqrt(np.einsum("kii->ki", whole))
+            if axes is not None and not np.allclose(axes, diagonal, rtol=1e-12, atol=0.0):
+                raise InputError(f"{self.sensor}: sigma_axes and covariance contradict each other; give one of them")
+            axes = diagonal
+            if self.kind == "attitude":
+                found["sigma_axes"] = axes
+        own = np.broadcast_to(self.sigma, (m,)) if np.ndim(self.sigma) == 0 or len(self.sigma) != m else self.sigma
+        sigma = array(f"{self.sensor}: sigma", own, (m,))
+        if np.any(sigma < 0.0):
+            k = int(np.argmax(sigma < 0.0))
+            raise InputError(f"{self.sensor}: sigma[{k}] is {sigma[k]:g}; it must not be negative")
+        if axes is not None:
+            mean = np.sqrt(np.mean(axes**2, axis=1))
+            if self.kind != "attitude" and np.any(sigma) and not np.allclose(sigma, mean, rtol=1e-12, atol=0.0):
+                raise InputError(
+                    f"{self.sensor}: sigma contradicts sigma_axes or covariance; leave it out, it is their root mean square"
+                )
+            sigma = mean
+        found["sigma"] = sigma
+        return found
 
     def _reference(self, m: int) -> Array:
         name = f"{self.sensor}: reference_f"
@@ -151,7 +178,8 @@ class VectorMeasurements:
 
     def taken(self, which: Any) -> VectorMeasurements:
         """Return the samples that a mask (m,), slice or array of indices picks, with all that belongs to them."""
-        rows = {name: getattr(self, name) for name in ("time", "sigma", "sigma_axes", "attitude", "arrival")}
+        names = ("time", "sigma", "sigma_axes", "covariance", "attitude", "arrival")
+        rows = {name: getattr(self, name) for name in names}
         changed = {name: value[which] for name, value in rows.items() if value is not None}
         if self.kind != "attitude":
             changed["vector_b"] = self.vector_b[which]
@@ -161,9 +189,42 @@ class VectorMeasurements:
 
     def noise_scaled(self, factor: float) -> VectorMeasurements:
         """Return the same samples with all their standard deviations multiplied by ``factor``."""
+        changed: dict[str, Any] = {"sigma": factor * self.sigma}
         if self.sigma_axes is not None:
-            return dataclasses.replace(self, sigma_axes=factor * self.sigma_axes)
-        return dataclasses.replace(self, sigma=factor * self.sigma)
+            changed["sigma_axes"] = factor * self.sigma_axes
+        if self.covariance is not None:
+            changed["covariance"] = factor**2 * self.covariance
+        return dataclasses.replace(self, **changed)
+
+    @property
+    def anisotropic(self) -> bool:
+        """Whether its noise is not told by one sigma a sample; of an attitude, not by one an axis."""
+        return self.covariance is not None or (self.kind != "attitude" and self.sigma_axes is not None)
+
+    @property
+    def covariances(self) -> Array:
+        """Covariance of the noise of every sample in body axes (m, 3, 3); of a heading its variance stands on the diagonal."""
+        if self.covariance is not None:
+            return self.covariance
+        if self.sigma_axes is not None:
+            return np.asarray(self.sigma_axes[:, :, None] ** 2 * np.eye(3))
+        return np.asarray(self.sigma[:, None, None] ** 2 * np.eye(3))
+
+
+def _covariances(name: str, value: ArrayLike, m: int) -> Array:
+    """Return covariances (m, 3, 3), symmetric and with no negative eigenvalue; (3, 3) is spread over all."""
+    given = np.asarray(value, np.float64)
+    whole = array(name, np.broadcast_to(given, (m, 3, 3)) if given.shape == (3, 3) else given, (m, 3, 3))
+    one = whole[:1] if given.shape == (3, 3) else whole
+    size = np.einsum("kii->k", np.abs(one))[:, None, None]
+    lopsided = np.any(np.abs(one - np.swapaxes(one, 1, 2)) > 1e-12 * size, axis=(1, 2))
+    if lopsided.any():
+        raise InputError(f"{name}[{int(np.argmax(lopsided))}] is not symmetric; use ½(C + Cᵀ)")
+    least = np.linalg.eigvalsh(one)[:, 0] if len(one) else np.zeros(0)
+    if np.any(least < -1e-12 * size.ravel()):
+        k = int(np.argmin(least))
+        raise InputError(f"{name}[{k}] has the eigenvalue {least[k]:.3g}; a covariance has none below zero")
+    return whole
 
 
 def _need_unit(name: str, vector: Array) -> None:
@@ -317,13 +378,15 @@ class VectorSensor:
         time = self.times(start, end)
         white, correlated = self.faults.noise(time, generator)
         noisy = _body(motion, time, self.reference_f) + self.sigma * white + correlated
+        # The noise of a heading is that across the direction over its horizontal part.
+        level = float(np.hypot(self.reference_f[0], self.reference_f[1])) if self.kind == "heading" else 1.0
         series = VectorMeasurements(
             sensor=self.name,
             kind=self.kind,
             time=time,
             vector_b=_unit(noisy),
             reference_f=self.reference_f,
-            sigma=np.full(len(time), self.sigma),
+            sigma=np.full(len(time), self.sigma / level),
         )
         return self.faults.heard(series)
 

@@ -11,6 +11,7 @@ from strapdown import coning, consistency, mekf, quaternion, records, scenarios,
 from strapdown.checks import InputError
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
+from strapdown.robustness import Gate, Robust
 from strapdown.setup import FilterSetup
 
 SETUP = FilterSetup(
@@ -28,10 +29,35 @@ def scenario(**changes):
     return dataclasses.replace(chosen, **changes)
 
 
-def test_a_setup_goes_through_its_file_to_the_last_bit(tmp_path):
+@pytest.mark.parametrize(
+    "change",
+    [
+        {},
+        {"gate": Gate()},
+        {"gate": Gate(probability=0.99, recovery=None, restart_attitude_sigma=0.3, restart_bias_sigma=1e-5)},
+        {"robust": Robust()},
+        {"robust": Robust(kind="huber", probability=0.9, iterations=3), "gate": Gate(recovery=7)},
+    ],
+)
+def test_a_setup_goes_through_its_file_to_the_last_bit(tmp_path, change):
     path = tmp_path / "filter.toml"
-    path.write_text(setup.to_toml(SETUP), encoding="utf-8")
-    assert setup.read_setup(path) == SETUP
+    whole = dataclasses.replace(SETUP, **change)
+    path.write_text(setup.to_toml(whole), encoding="utf-8")
+    assert setup.read_setup(path) == whole
+
+
+def test_the_gate_of_a_setup_is_that_of_its_filter():
+    record = scenarios.simulate(scenario(duration=10.0))
+    first, *rest = record.vectors
+    vector = first.vector_b.copy()
+    vector[-3] = -vector[-3]
+    record = dataclasses.replace(record, vectors=(dataclasses.replace(first, vector_b=vector), *rest))
+    believes = setup.matched(scenario())
+    start = setup.initial_state(believes, record.truth.attitude[0], record.truth.bias[0])
+    gated = dataclasses.replace(believes, gate=Gate())
+    assert setup.run(record, gated, start).refused[first.sensor] == 1
+    assert setup.run(record, gated, start, gate=None).refused[first.sensor] == 0
+    assert setup.run(record, believes, start).refused[first.sensor] == 0
 
 
 @pytest.mark.parametrize(
@@ -41,8 +67,11 @@ def test_a_setup_goes_through_its_file_to_the_last_bit(tmp_path):
         ({"angle_random_walk_deg_per_sqrt_hour": 0.1, "rate_random_walk_rad_per_s_per_sqrt_s": 0.0}, "bias_sigma"),
         ({"angle_random_walk_deg_per_hour": 0.1}, "angle_random_walk_deg_per_sqrt_hour"),
         ({"integration": "four"}, "four-sample"),
-        ({"sigma": 3.0}, "table of numbers by sensor"),
+        ({"sigma": 3.0}, "must be a table"),
         ({"sigma": {"star": "big"}}, "sigma: star"),
+        ({"gate": 0.99}, "must be a table"),
+        ({"gate": {"probabilty_ratio": 0.9}}, "probability_ratio"),
+        ({"robust": {"kind": "hubr"}}, "huber"),
     ],
 )
 def test_a_bad_table_is_refused_by_name(table, complaint):

@@ -226,7 +226,7 @@ def test_taken_takes_all_that_belongs_to_a_sample():
         ({"kind": "heading", "reference_f": [0.0, 0.0, 1.0]}, "vertical"),
         ({"arrival": [0.0, 0.5, 3.0]}, r"arrival\[1\]"),
         ({"kind": "attitude"}, "needs attitude"),
-        ({"sigma_axes": [1.0, 1.0, 1.0]}, "belong to kind 'attitude'"),
+        ({"sigma_axes": [1.0, 1.0, 1.0]}, "contradicts sigma_axes"),
     ],
 )
 def test_bad_series_are_refused(change, message):

@@ -1,20 +1,33 @@
-"""The filter on a recording."""
+"""The filter on a recording, or on a simulated record."""
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from strapdown.cli.terminal import app, console, show, table, written
 
+if TYPE_CHECKING:
+    from strapdown.mekf import State
+    from strapdown.recordfiles import RecordFile
+    from strapdown.records import Estimate, ImuRecord
+    from strapdown.setup import FilterSetup
+
+RECORD_ONLY = ("filter", "gate", "robust", "attitude", "from_truth", "every")
+"""Options that go with a record of `strapdown simulate`."""
+
 
 @app.command()
 def estimate(
     recording: Annotated[
-        Path, typer.Argument(help="BROAD HDF5 file, or CSV with time, gx, gy, gz, ax, ay, az[, mx, my, mz].")
+        Path,
+        typer.Argument(
+            help="BROAD HDF5 file, CSV with time, gx, gy, gz, ax, ay, az[, mx, my, mz], or record of `strapdown simulate` (HDF5)."
+        ),
     ],
     out: Annotated[Path, typer.Option(help="Folder for estimate.h5, errors.json and the figures.")] = Path(
         "estimate-results"
@@ -31,23 +44,232 @@ def estimate(
         ),
     ] = None,
     full_covariance: Annotated[
-        bool, typer.Option(help="Write whole 6 x 6 covariances, not only their diagonals.")
+        bool | None,
+        typer.Option(
+            "--full-covariance/--variances",
+            help="Write whole 6 x 6 covariances, or only their diagonals; a record's estimate has whole ones unless told.",
+        ),
+    ] = None,
+    filter_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--filter", help="Record: TOML with a table named filter; without it the filter that matches the record."
+        ),
+    ] = None,
+    gate: Annotated[
+        float | None,
+        typer.Option(help="Record: refuse measurements beyond this quantile (0.999) of chi-squared, and recover."),
+    ] = None,
+    robust: Annotated[
+        str | None, typer.Option(help="Record: weigh measurements by how far they lie off: huber or student.")
+    ] = None,
+    attitude: Annotated[
+        str | None,
+        typer.Option(help="Record: initial attitude body to fixed, w,x,y,z; without it from the first measurements."),
+    ] = None,
+    from_truth: Annotated[
+        bool, typer.Option("--from-truth", help="Record: start at the truth, off by errors drawn from the filter's σ.")
     ] = False,
+    every: Annotated[int, typer.Option(help="Record: keep each so-manieth step of the filter.")] = 1,
 ) -> None:
-    """Estimate attitude and gyro bias from a recording: accelerometer as the vertical, magnetometer as the heading."""
+    """Estimate attitude and gyro bias from a recording (accelerometer as vertical, magnetometer as heading) or a simulated record."""
+    from strapdown.checks import InputError
+    from strapdown.files import usable_folder
+    from strapdown.recordfiles import is_record
+
+    usable_folder("out", out)
+    given = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
+    units = {name: unit for name, unit in given.items() if unit}
+    if is_record(recording):
+        for name in units:
+            raise InputError(f"--{name}-unit goes with a CSV file; the record {recording} tells its units itself")
+        _estimate_record(
+            recording, out, gyro, filter_file, gate, robust, attitude, from_truth, every, full_covariance is not False
+        )
+        return
+    options = dict(
+        zip(
+            RECORD_ONLY,
+            (filter_file, gate, robust, attitude, from_truth or None, None if every == 1 else every),
+            strict=True,
+        )
+    )
+    for name, value in options.items():
+        if value is not None:
+            raise InputError(
+                f"--{name.replace('_', '-')} goes with a record of `strapdown simulate`; {recording} is none"
+            )
+    _estimate_recording(recording, out, units, gyro, bool(full_covariance))
+
+
+def _estimate_record(
+    path: Path,
+    out: Path,
+    gyro: Path | None,
+    filter_file: Path | None,
+    gate: float | None,
+    robust: str | None,
+    attitude: str | None,
+    from_truth: bool,
+    every: int,
+    full_covariance: bool,
+) -> None:
+    """Run the filter over a record, tell and write what it made of it."""
+    import numpy as np
+
+    from strapdown import plots, setup
+    from strapdown.checks import InputError, count
+    from strapdown.files import write_json
+    from strapdown.recordfiles import read_record_file
+    from strapdown.records import Truth, write_estimate
+    from strapdown.robustness import Gate, Robust
+
+    count("every", every)
+    if gyro is not None and filter_file is not None:
+        raise InputError("--gyro and --filter both tell the filter's belief of the gyro; give one of them")
+    held = read_record_file(path)
+    chosen = _setup(path, held, gyro, filter_file)
+    options: dict[str, Any] = {
+        "gate": None if gate is None else Gate(probability=gate),
+        "robust": None if robust is None else Robust(kind=robust),  # type: ignore[arg-type]
+    }
+    options = {name: value for name, value in options.items() if value is not None}
+    believed = setup.believed(held.record, chosen)
+    initial, words = _initial(believed, held, chosen, attitude, from_truth)
+    result = setup.run(held.record, chosen, initial, every=every, full_covariance=full_covariance, **options)
+    truth = None
+    if believed.truth is not None:
+        truth = Truth(attitude=believed.truth.attitude[::every], bias=believed.truth.bias[::every])
+    length = held.record.time[-1] - held.record.time[0]
+    console.print(
+        f"{path.name}: {len(held.record.increments)} gyro samples over {length:.6g} s, "
+        f"{', '.join(f'{len(s.time)} of {s.sensor}' for s in held.record.vectors) or 'no measurements'}. {words}"
+    )
+    _tell(result)
+    paths = [out / "estimate.h5"]
+    attributes: dict[str, Any] = {"source": str(path), "filter": setup.to_toml(chosen)}
+    attributes |= {name: str(dataclasses.asdict(value)) for name, value in options.items()}
+    write_estimate(paths[0], result, attributes, truth=truth)
+    figures = {"estimate.png": plots.estimate_overview(result, title=path.name)}
+    if truth is not None:
+        figures["errors.png"] = plots.error_overview(result, truth, title=path.name)
+        paths.append(out / "errors.json")
+        found = _errors(result, truth)
+        write_json(paths[-1], {"source": str(path), **found})
+        line = (
+            f"Second half: attitude error RMS {found['attitude_rms_deg']:.4g}° (σ {found['attitude_sigma_deg']:.4g}°), bias error RMS "
+            f"{found['bias_rms_deg_per_h']:.4g} °/h (σ {found['bias_sigma_deg_per_h']:.4g} °/h)"
+        )
+        if "nees_per_state" in found:
+            line += f"; mean NEES per state {found['nees_per_state']:.3g} (right: about 1)"
+        console.print(line + ".")
+    seen = {s: i for s, i in result.innovations.items() if np.sum(i.used)}
+    if seen:
+        each = ", ".join(f"{np.mean(i.nis[i.used]) / i.innovation.shape[1]:.3g} {s}" for s, i in seen.items())
+        console.print(f"Mean NIS per degree of freedom (right: 1): {each}. `strapdown check {paths[0]}` judges them.")
+    written(*paths, *(plots.save(figure, out / name) for name, figure in figures.items()))
+
+
+def _setup(path: Path, held: RecordFile, gyro: Path | None, filter_file: Path | None) -> FilterSetup:
+    """Return the filter: of a file, or matched to the gyro's specification and what the sensors say of themselves."""
+    from strapdown import setup
+    from strapdown.checks import InputError
+    from strapdown.gyro import read_spec
+
+    if filter_file is not None:
+        return setup.read_setup(filter_file)
+    spec = held.gyro if gyro is None else read_spec(gyro)
+    if spec is None:
+        raise InputError(f"{path} does not tell the gyro's specification; give --gyro or --filter, a TOML file")
+    return setup.matched_to_record(spec, held.record)
+
+
+def _initial(
+    record: ImuRecord, held: RecordFile, chosen: FilterSetup, attitude: str | None, from_truth: bool
+) -> tuple[State, str]:
+    """Return the initial state and how it came about."""
+    import numpy as np
+
+    from strapdown import mekf, quaternion, setup
+    from strapdown.checks import InputError
+    from strapdown.randomness import generator
+    from strapdown.units import DEGREE
+
+    if attitude is not None and from_truth:
+        raise InputError("--attitude and --from-truth both tell the start; give one of them")
+    if attitude is not None:
+        try:
+            q = np.array([float(part) for part in attitude.split(",")])
+        except ValueError:
+            raise InputError(f"--attitude is {attitude!r}; give four numbers w,x,y,z") from None
+        if q.shape != (4,) or np.linalg.norm(q) == 0.0:
+            raise InputError(f"--attitude is {attitude!r}; give four numbers w,x,y,z, not all zero")
+        return setup.initial_state(chosen, q / np.linalg.norm(q)), "Started from the attitude given."
+    if from_truth:
+        if record.truth is None:
+            raise InputError("--from-truth needs a record with the truth; this one has none")
+        draw = generator(held.seed or 0, held.run or 0, "initial error").standard_normal(6)
+        q = quaternion.multiply(record.truth.attitude[0], quaternion.exp(-chosen.attitude_sigma * draw[:3]))
+        bias = record.truth.bias[0] - chosen.bias_sigma * draw[3:]
+        return setup.initial_state(chosen, q, bias), "Started from the truth, off by errors drawn from the filter's σ."
+    try:
+        state = mekf.first_state(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
+    except InputError as error:
+        raise InputError(f"{error} by --attitude, or --from-truth") from None
+    sigma = float(np.sqrt(np.trace(state.covariance[:3, :3]) / 3.0)) / DEGREE
+    return state, f"Started from the first measurements, σ {sigma:.3g}° an axis."
+
+
+def _tell(result: Estimate) -> None:
+    """Say what was not used, and what happened."""
+    for sensor, number in result.skipped.items():
+        if number:
+            console.print(f"{number} samples of the {sensor} are missing or outside the record and were skipped.")
+    for sensor, number in result.refused.items():
+        if number:
+            share = number / len(result.innovations[sensor].time)
+            console.print(f"{number} samples of the {sensor} ({share:.2%}) were refused by the gate.")
+    for event in result.events:
+        console.print(str(event))
+
+
+def _errors(result: Estimate, truth: Any) -> dict[str, float]:
+    """Return errors and consistency over the second half, degrees and degrees an hour."""
+    import numpy as np
+
+    from strapdown import consistency
+    from strapdown.units import DEGREE, DEGREE_PER_HOUR
+
+    half = slice(len(result.time) // 2, None)
+    error = consistency.errors(result.attitude[half], result.bias[half], truth.attitude[half], truth.bias[half])
+    total = np.sqrt(np.mean(np.sum(error.reshape(-1, 2, 3) ** 2, axis=2), axis=0))
+    sigma = np.sqrt(np.mean(np.sum(result.variance[half].reshape(-1, 2, 3), axis=2), axis=0))
+    found = {
+        "attitude_rms_deg": float(total[0]) / DEGREE,
+        "attitude_sigma_deg": float(sigma[0]) / DEGREE,
+        "bias_rms_deg_per_h": float(total[1]) / DEGREE_PER_HOUR,
+        "bias_sigma_deg_per_h": float(sigma[1]) / DEGREE_PER_HOUR,
+    }
+    if result.covariance is not None:
+        found["nees_per_state"] = float(np.mean(consistency.nees(error, result.covariance[half]))) / 6.0
+    return found
+
+
+def _estimate_recording(
+    recording: Path, out: Path, units: dict[str, str], gyro: Path | None, full_covariance: bool
+) -> None:
+    """Run the filter over a recording: accelerometer as the vertical, magnetometer as the heading."""
     from strapdown import ahrs, plots, recordings
     from strapdown.consistency import reference_errors
-    from strapdown.files import usable_folder, write_json
+    from strapdown.files import write_json
     from strapdown.gyro import process_noise, read_spec
     from strapdown.records import write_estimate
     from strapdown.units import DEGREE
 
-    given = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
-    source = recordings.read(recording, units={name: unit for name, unit in given.items() if unit})
+    source = recordings.read(recording, units=units)
     parameters = ahrs.AhrsParameters()
     if gyro is not None:
         parameters = replace(parameters, **process_noise(read_spec(gyro)))
-    usable_folder("out", out)
     result = ahrs.estimate(source, parameters, full_covariance=full_covariance)
     used = result.recording
     errors_found = None

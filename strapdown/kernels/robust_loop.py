@@ -1,0 +1,246 @@
+"""The filter over one whole record with all its options: any noise, a gate that recovers, robust weights.
+
+:func:`strapdown.kernels.filter_loop.run_filter` is the same filter without them, and faster. The state lives in rows of an array: row 0
+the filter, row 1 the challenger beside it while there is one, so that both go through one piece of code.
+"""
+
+from __future__ import annotations
+
+import math
+
+from strapdown.kernels.algebra import dot, scale
+from strapdown.kernels.filter_loop import DIRECTION, HEADING, store_segment, store_state, vector_at
+from strapdown.kernels.filter_step import predict
+from strapdown.kernels.robust_step import ACCEPTED, PASSED_OVER, REFUSED, take_in
+from strapdown.kernels.series import LARGEST_ANGLE
+
+WIDE_PASSES = 20
+"""Linearisations of one update at most, of a challenger and of a filter that has recovered."""
+
+
+def state_at(rows, i):
+    """Return (q, b, A, B, C) of row i of packed states."""
+    s = rows[i]
+    return (
+        (s[0], s[1], s[2], s[3]),
+        (s[4], s[5], s[6]),
+        (s[7], s[8], s[9], s[10], s[11], s[12]),
+        (s[13], s[14], s[15], s[16], s[17], s[18], s[19], s[20], s[21]),
+        (s[22], s[23], s[24], s[25], s[26], s[27]),
+    )
+
+
+def six_at(array, k):
+    """Return row k of an (n, 6) array as a 6-tuple."""
+    return (array[k, 0], array[k, 1], array[k, 2], array[k, 3], array[k, 4], array[k, 5])
+
+
+def start_challenger(states, attitude_variance, bias_variance):
+    """Write row 1: the filter's state, as uncertain as a fresh start; ``bias_variance`` (3,) is added to that of the bias."""
+    for i in range(28):
+        states[1, i] = states[0, i]
+    for i in range(7, 22):
+        states[1, i] = 0.0
+    for i in (7, 10, 12):
+        states[1, i] = attitude_variance
+    states[1, 22] += bias_variance[0]
+    states[1, 25] += bias_variance[1]
+    states[1, 27] += bias_variance[2]
+
+
+def run_robust(
+    edges,
+    increments,
+    angle_variance,
+    rate_variance,
+    event_time,
+    event_kind,
+    event_sensor,
+    event_value,
+    event_noise,
+    event_reference,
+    triads,
+    thresholds,
+    robust,
+    robust_parameters,
+    robust_passes,
+    recovery,
+    restart_attitude_variance,
+    restart_bias_variance,
+    refused,
+    states,
+    every,
+    attitude_out,
+    bias_out,
+    variance_out,
+    covariance_out,
+    innovation_out,
+    weight_out,
+    recovery_out,
+    segment_out,
+):
+    """Run the filter over a record as :func:`strapdown.kernels.filter_loop.run_filter` does, with options.
+
+    ``event_noise`` (events, 6) is the covariance of each measurement in body axes; ``thresholds`` (3,) the largest NIS accepted of 1, 2, 3
+    degrees of freedom; ``robust`` 0 or a kind of :mod:`strapdown.kernels.robust_step` with ``robust_parameters`` (3, 2), a row for each
+    number of degrees of freedom; ``recovery`` the refusals in a row that lead to it, 0: none. ``refused`` (sensors,) counts refusals in a
+    row and starts at zero. ``states`` (2, 28) holds the initial state in row 0 and is left at the end state.
+
+    ``weight_out`` (events,) gets the weight of each measurement, 0 where it was refused; ``recovery_out`` (rows, 4) time, sensor, time of
+    the challenger's start and refusals in a row of each recovery.
+    Returns the numbers of segments and of recoveries.
+    """
+    n = len(increments)
+    running = 1
+    passes = 1
+    hits = 0
+    misses = 0
+    since = 0.0
+    recoveries = 0
+    events = len(event_time)
+    e = 0
+    k = -1
+    now = edges[0]
+    end = now
+    whole = 1.0
+    longest = 1.0
+    theta = (0.0, 0.0, 0.0)
+    countdown = 0
+    row = 0
+    segments = 0
+    while k < n:
+        due = e < events and event_time[e] <= end
+        stop = event_time[e] if due else end
+        dt = stop - now
+        if dt > 0.0:
+            if dt > longest:
+                dt = longest
+                stop = now + dt
+                due = False
+            part = theta
+            if dt < whole:
+                part = scale(dt / whole, theta)
+            for i in range(running):
+                q, b, A, B, C = state_at(states, i)
+                if i == 0 and segments < len(segment_out):
+                    store_segment(segment_out, segments, dt, part, q, b, A, B, C)
+                    segments += 1
+                q, A, B, C = predict(q, b, A, B, C, part, dt, angle_variance, rate_variance)
+                store_state(states[i], q, b, A, B, C)
+            now = stop
+        if due:
+            kind = event_kind[e]
+            sensor = event_sensor[e]
+            degrees = 3
+            if kind == HEADING:
+                degrees = 1
+            elif kind == DIRECTION:
+                degrees = 2
+            t = event_reference[e]
+            frame = (
+                triads[t, 0],
+                triads[t, 1],
+                triads[t, 2],
+                triads[t, 3],
+                triads[t, 4],
+                triads[t, 5],
+                triads[t, 6],
+                triads[t, 7],
+                triads[t, 8],
+            )
+            challenged = PASSED_OVER
+            i = 0
+            while i < running:
+                q, b, A, B, C = state_at(states, i)
+                outcome, w, q, b, A, B, C, e1, s1, e2, s2, e3, s3 = take_in(
+                    q,
+                    b,
+                    A,
+                    B,
+                    C,
+                    kind,
+                    vector_at(event_value, e),
+                    frame,
+                    six_at(event_noise, e),
+                    passes if i == 0 else WIDE_PASSES,
+                    thresholds[degrees - 1],
+                    robust,
+                    robust_parameters[degrees - 1, 0],
+                    robust_parameters[degrees - 1, 1],
+                    robust_passes,
+                )
+                if i == 0:
+                    weight_out[e] = w
+                    innovation_out[e, 0] = e1
+                    innovation_out[e, 1] = s1
+                    innovation_out[e, 2] = e2
+                    innovation_out[e, 3] = s2
+                    innovation_out[e, 4] = e3
+                    innovation_out[e, 5] = s3
+                    if outcome == ACCEPTED:
+                        refused[sensor] = 0
+                    elif outcome == REFUSED:
+                        refused[sensor] += 1
+                        if recovery > 0 and running == 1:
+                            start_challenger(states, restart_attitude_variance, restart_bias_variance)
+                            running = 2
+                            hits = 0
+                            misses = 0
+                            since = now
+                else:
+                    challenged = outcome
+                if outcome == ACCEPTED:
+                    store_state(states[i], q, b, A, B, C)
+                i += 1
+            if running == 2:
+                if challenged == REFUSED:
+                    misses += 1
+                elif challenged == ACCEPTED and refused[sensor] > 0:
+                    hits += 1
+                trusted = True
+                for s in range(len(refused)):
+                    if refused[s] > 0:
+                        trusted = False
+                if trusted or misses > hits:
+                    running = 1
+                elif refused[sensor] >= recovery and hits >= recovery:
+                    recovery_out[recoveries, 0] = now
+                    recovery_out[recoveries, 1] = sensor
+                    recovery_out[recoveries, 2] = since
+                    recovery_out[recoveries, 3] = refused[sensor]
+                    recoveries += 1
+                    for j in range(28):
+                        states[0, j] = states[1, j]
+                    for s in range(len(refused)):
+                        refused[s] = 0
+                    running = 1
+                    passes = WIDE_PASSES
+            e += 1
+        if now >= end and (e == events or event_time[e] > end):
+            if countdown == 0:
+                countdown = every
+                for j in range(4):
+                    attitude_out[row, j] = states[0, j]
+                for j in range(3):
+                    bias_out[row, j] = states[0, 4 + j]
+                variance_out[row, 0] = states[0, 7]
+                variance_out[row, 1] = states[0, 10]
+                variance_out[row, 2] = states[0, 12]
+                variance_out[row, 3] = states[0, 22]
+                variance_out[row, 4] = states[0, 25]
+                variance_out[row, 5] = states[0, 27]
+                if row < len(covariance_out):
+                    for j in range(21):
+                        covariance_out[row, j] = states[0, 7 + j]
+                row += 1
+            countdown -= 1
+            k += 1
+            if k < n:
+                end = edges[k + 1]
+                whole = end - now
+                theta = vector_at(increments, k)
+                squared = dot(theta, theta)
+                longest = whole
+                if squared > LARGEST_ANGLE * LARGEST_ANGLE:
+                    longest = whole * (LARGEST_ANGLE / math.sqrt(squared))
+    return segments, recoveries

@@ -1,0 +1,389 @@
+"""Options of the filter: the step face and the compiled face agree on each of them, kind by kind, schedule by schedule."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from strapdown import consistency, mekf, motion, quaternion, recordfiles
+from strapdown.checks import InputError
+from strapdown.gyro import GyroSpec
+from strapdown.mekf import ProcessNoise, StepFilter, initial_state
+from strapdown.randomness import generator
+from strapdown.records import ImuRecord
+from strapdown.robustness import Gate, Robust
+from strapdown.scenarios import Scenario, simulate
+from strapdown.vectors import Accelerometer, AttitudeSensor, Faults, VectorMeasurements, VectorSensor
+
+NOISE = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)
+OUTLIERS = Faults(outlier_probability=0.1, outlier_scale=10.0)
+
+
+def sensors(faults=OUTLIERS, rate=10.0):
+    """One sensor a kind; a second direction and a heading, so that the attitude is known with each of them."""
+    return {
+        "direction": (
+            VectorSensor(name="a", reference_f=np.array([1.0, 0.2, 0.0]), sigma=1e-3, rate=rate, faults=faults),
+            VectorSensor(name="b", reference_f=np.array([0.0, 1.0, 1.0]), sigma=2e-3, rate=rate, faults=faults),
+        ),
+        "vector": (
+            Accelerometer(name="force", sigma=0.05, rate=rate, kind="vector", faults=faults),
+            VectorSensor(name="b", reference_f=np.array([0.0, 1.0, 1.0]), sigma=2e-3, rate=rate, faults=faults),
+        ),
+        "heading": (
+            VectorSensor(
+                name="north",
+                reference_f=np.array([0.0, 1.0, -1.0]),
+                sigma=5e-3,
+                rate=rate,
+                kind="heading",
+                faults=faults,
+            ),
+            VectorSensor(name="a", reference_f=np.array([0.3, 0.1, 1.0]), sigma=1e-3, rate=rate, faults=faults),
+        ),
+        "attitude": (AttitudeSensor(name="tracker", sigma_across=1e-3, sigma_about=5e-3, rate=rate, faults=faults),),
+    }
+
+
+def scenario(chosen, duration=4.0, angle=0.3, frequency=0.3):
+    return Scenario(
+        motion=motion.Coning(angle=angle, frequency=frequency),
+        gyro=GyroSpec(angle_random_walk=1e-4, rate_random_walk=1e-5, turn_on_bias=np.array([1e-3, -2e-3, 5e-4])),
+        sensors=chosen,
+        rate=50.0,
+        duration=duration,
+    )
+
+
+SCHEDULES = {
+    "at one time": lambda chosen: chosen,
+    "asynchronous": lambda chosen: tuple(
+        replace(s, rate=s.rate * (1.0 + 0.37 * k), phase=0.0123 * (k + 1)) for k, s in enumerate(chosen)
+    ),
+}
+
+
+def anisotropic(record, whole, run=0):
+    """The record with noise of a full covariance, or per axis and changing from sample to sample, and the noise itself to match."""
+    factor = np.linalg.cholesky([[1.0, 0.6, -0.3], [0.6, 2.0, 0.5], [-0.3, 0.5, 1.5]])
+    draw = generator(11, run, "anisotropic")
+    series = []
+    for s in record.vectors:
+        if s.kind == "heading":
+            series.append(s)
+            continue
+        m = len(s.time)
+        size = (s.sigma_axes[:, :1] if s.kind == "attitude" else s.sigma[:, None]) * 3.0
+        axes = size * np.array([1.0, 2.0, 0.5]) * (1.0 + 0.5 * np.sin(np.arange(m)))[:, None]
+        added = size[:, :, None] ** 2 * (factor @ factor.T) if whole else axes[:, :, None] ** 2 * np.eye(3)
+        noise = np.einsum("kij,kj->ki", np.linalg.cholesky(added), draw.standard_normal((m, 3)))
+        covariance = s.covariances + added
+        told = {"covariance": covariance} if whole else {"sigma_axes": np.sqrt(np.einsum("kii->ki", covariance))}
+        if s.kind == "attitude":
+            told = {"sigma_axes": None, **told}
+            changed = replace(s, attitude=quaternion.multiply(s.attitude, quaternion.exp(noise)), **told)
+        else:
+            value = s.vector_b + noise
+            if s.kind == "direction":
+                value /= np.linalg.norm(value, axis=1, keepdims=True)
+            changed = replace(s, vector_b=value, sigma=0.0, **told)
+        series.append(changed)
+    return replace(record, vectors=tuple(series))
+
+
+OPTIONS = {
+    "plain": ({}, None),
+    "gate": ({"gate": Gate()}, None),
+    "Huber": ({"robust": Robust(kind="huber")}, None),
+    "Student": ({"robust": Robust(kind="student")}, None),
+    "gate, Student": (
+        {"gate": Gate(probability=0.9999), "robust": Robust(kind="student", degrees_of_freedom=3.0)},
+        None,
+    ),
+    "per axis": ({}, False),
+    "covariance": ({}, True),
+    "covariance, gate, Huber": ({"gate": Gate(), "robust": Robust(kind="huber")}, True),
+}
+
+
+def stepped(record, initial, look_back=0.0, arrivals=None, **options):
+    """Run the step face over a record in a plain loop; ``arrivals`` (series, sample): when each measurement is handed over."""
+    f = StepFilter(NOISE, initial, time=record.time[0], look_back=look_back, **options)
+    events = sorted(
+        (arrivals[i][k] if arrivals else t, t, i, k) for i, s in enumerate(record.vectors) for k, t in enumerate(s.time)
+    )
+    out, results = [], []
+
+    def give(series, k, time):
+        noise = {"covariance": series.covariances[k]} if series.kind != "heading" else {"sigma": series.sigma[k]}
+        common = {"sensor": series.sensor, "time": time, **noise}
+        if series.kind == "attitude":
+            results.append(f.update_attitude(series.attitude[k], **common))
+        else:
+            update = {"direction": f.update_direction, "vector": f.update_vector, "heading": f.update_heading}
+            results.append(update[series.kind](series.vector_b[k], series.references_f[k], **common))
+
+    for n, delta in enumerate(record.increments):
+        now, end = record.time[n], record.time[n + 1]
+        whole = end - now
+        while events and events[0][0] <= end:
+            handed, t, i, k = events.pop(0)
+            if handed > now:
+                f.predict(delta * ((handed - now) / whole), handed - now)
+                now = handed
+            f.time = now  # sums of intervals are the stamps but for rounding
+            give(record.vectors[i], k, None if t == handed else t)
+        if end > now:
+            f.predict(delta * ((end - now) / whole), end - now)
+        f.time = end
+        out.append((f.attitude, f.bias, f.P))
+    return f, [np.array(x) for x in zip(*out, strict=True)], results
+
+
+def assert_same(estimate, attitude, bias, P, tolerance=1e-10):
+    d = np.sqrt(np.einsum("kii->ki", P))
+    assert np.max(quaternion.angle_between(attitude, estimate.attitude[1:])) < tolerance
+    assert np.abs(bias - estimate.bias[1:]).max() < tolerance
+    assert np.abs((P - estimate.covariance[1:]) / (d[:, :, None] * d[:, None, :])).max() < tolerance
+
+
+def near(record, error=(5e-3, -5e-3, 4e-3), sigma=1e-2):
+    attitude = quaternion.multiply(record.truth.attitude[0], quaternion.exp(error))
+    return initial_state(attitude, attitude_sigma=sigma, bias_sigma=3e-3)
+
+
+@pytest.mark.parametrize("schedule", SCHEDULES)
+@pytest.mark.parametrize("kind", sensors())
+@pytest.mark.parametrize("option", OPTIONS)
+def test_both_faces_are_one_filter(option, kind, schedule):
+    given, whole = OPTIONS[option]
+    record = simulate(scenario(SCHEDULES[schedule](sensors()[kind]), duration=3.0), 5)
+    if whole is not None:
+        record = anisotropic(record, whole)
+    result = mekf.run(record, NOISE, near(record), full_covariance=True, **given)
+    f, (attitude, bias, P), taken = stepped(record, near(record), **given)
+    assert_same(result, attitude, bias, P)
+    assert sum(f.refused.values()) == sum(result.refused.values()) == len(taken) - sum(taken)
+    if "gate" in given:
+        assert sum(f.refused.values()) > 0  # the outliers
+
+
+def consistency_of(kind, schedule, option, runs, sigma_factor=1.0):
+    """Verdict on the attitude at four epochs over independent runs, and of all states."""
+    given, whole = OPTIONS[option]
+    nees = []
+    for run in range(runs):
+        record = simulate(scenario(SCHEDULES[schedule](sensors(Faults())[kind]), duration=4.0), 21, run)
+        if whole is not None:
+            record = anisotropic(record, whole, run)
+        draw = generator(22, run, "initial error").standard_normal(6) * ([1e-2] * 3 + [1e-3] * 3)
+        attitude = quaternion.multiply(record.truth.attitude[0], quaternion.exp(-draw[:3]))
+        start = initial_state(attitude, attitude_sigma=1e-2, bias_sigma=1e-3, bias=record.truth.bias[0] - draw[3:])
+        believed = replace(record, vectors=tuple(s.noise_scaled(sigma_factor) for s in record.vectors))
+        result = mekf.run(believed, NOISE, start, every=50, full_covariance=True, **given)
+        truth = record.truth
+        e = consistency.errors(result.attitude, result.bias, truth.attitude[::50], truth.bias[::50])[1:]
+        P = result.covariance[1:]
+        nees.append([consistency.nees(e[:, :3], P[:, :3, :3]) / 3.0, consistency.nees(e, P) / 6.0])
+    mean = np.mean(nees, axis=0)
+    return [
+        consistency.Verdict(mean=mean[k], degrees=degrees, runs=runs, probability=0.99)
+        for k, degrees in enumerate((3, 6))
+    ]
+
+
+@pytest.mark.parametrize("schedule", SCHEDULES)
+@pytest.mark.parametrize("kind", sensors())
+@pytest.mark.parametrize("runs", [20, pytest.param(400, marks=pytest.mark.slow)])
+def test_every_option_is_consistent_and_a_broken_one_is_not(kind, schedule, runs):
+    for option in ("plain", "gate", "Huber", "per axis", "covariance", "covariance, gate, Huber"):
+        for verdict in consistency_of(kind, schedule, option, runs):
+            assert verdict.consistent, (option, verdict.mean, verdict.simultaneous_bounds)
+    for option in ("plain", "covariance"):
+        for factor in (0.5, 3.0):
+            broken, _ = consistency_of(kind, schedule, option, runs, sigma_factor=factor)
+            assert not broken.consistent, (option, factor, broken.mean)
+
+
+@pytest.mark.parametrize("kind", sensors())
+@pytest.mark.parametrize("whole", [None, True], ids=["scalar", "covariance"])
+def test_both_faces_recover_alike(kind, whole):
+    record = simulate(scenario(sensors(Faults())[kind], duration=4.0), 5)
+    if whole:
+        record = anisotropic(record, whole)
+    lost = near(record, error=(1.5, -0.9, 2.0))
+    options = {"gate": Gate(recovery=5), "robust": Robust()}
+    result = mekf.run(record, NOISE, lost, full_covariance=True, **options)
+    f, (attitude, bias, P), _ = stepped(record, lost, **options)
+    assert_same(result, attitude, bias, P, 1e-9)  # a diffuse prior leaves fewer digits
+    assert [event.kind for event in result.events] == ["recovery"]
+    for mine, other in zip(f.events, result.events, strict=True):
+        assert mine.sensor == other.sensor
+        assert (mine.start, mine.end, mine.value) == pytest.approx((other.start, other.end, other.value))
+
+
+@pytest.mark.parametrize("option", ["plain", "gate, Student", "lost"])
+def test_late_measurements_equal_the_filter_that_had_them_in_order(option):
+    """Each sensor with its own latency, which vary; the order of arrival is not that of time."""
+    record = simulate(scenario(SCHEDULES["asynchronous"](sensors()["direction"]), duration=2.0), 5)
+    given, start = OPTIONS["gate, Student"][0], near(record)
+    if option == "plain":
+        given = {}
+    elif option == "lost":
+        given, start = {"gate": Gate(recovery=4)}, near(record, error=(1.0, 0.5, -1.0))
+    draw = generator(3, 0, "latency")
+    arrivals = [s.time + draw.uniform(0.0, 0.2, len(s.time)) for s in record.vectors]
+    end = record.time[-1]
+    kept = [arrival <= end for arrival in arrivals]
+    record = replace(record, vectors=tuple(s.taken(k) for s, k in zip(record.vectors, kept, strict=True)))
+    arrivals = [arrival[k] for arrival, k in zip(arrivals, kept, strict=True)]
+    ordered, (attitude, bias, P), _ = stepped(record, start, **given)
+    late, (attitude_late, bias_late, P_late), _ = stepped(record, start, look_back=0.25, arrivals=arrivals, **given)
+    assert late.late == 0
+    assert late.refused == ordered.refused
+    assert [event.kind for event in late.events] == [event.kind for event in ordered.events]
+    d = np.sqrt(np.diag(P[-1]))
+    assert quaternion.angle_between(attitude_late[-1], attitude[-1]) < 1e-12
+    assert np.abs(bias_late[-1] - bias[-1]).max() < 1e-12
+    assert np.abs((P_late[-1] - P[-1]) / np.outer(d, d)).max() < 1e-12
+    assert not np.allclose(attitude_late[20], attitude[20], rtol=0.0, atol=1e-12)  # before they came, it did not know
+    estimate = mekf.run(record, NOISE, start, full_covariance=True, **given)
+    assert quaternion.angle_between(estimate.attitude[-1], attitude_late[-1]) < 1e-10
+
+
+def test_what_comes_later_than_the_look_back_is_refused_and_counted():
+    record = simulate(scenario(sensors(Faults())["direction"], duration=1.0), 5)
+    f, _, taken = stepped(
+        record, near(record), look_back=0.05, arrivals=[np.minimum(s.time + 0.1, 1.0) for s in record.vectors]
+    )
+    assert f.late == sum(not one for one in taken)
+    assert f.late == 2 * 9  # the last of each comes at once
+    with pytest.raises(InputError, match="predict up to it first"):
+        f.update_direction([1.0, 0.0, 0.0], [1.0, 0.0, 0.0], 1e-3, time=2.0)
+
+
+def test_a_repeated_gyro_sample_changes_nothing_and_is_counted():
+    record = simulate(scenario((), duration=0.1), 5)
+    f = StepFilter(NOISE, near(record))
+    f.predict(record.increments[0], 0.02)
+    attitude, P = f.attitude.copy(), f.P.copy()
+    f.predict(record.increments[0], 0.0)
+    assert f.repeated == 1
+    assert np.array_equal(f.attitude, attitude)
+    assert np.array_equal(f.P, P)
+
+
+def test_a_gap_of_the_gyro_is_told_and_grows_the_covariance_as_the_closed_form_says():
+    dt, T = 0.02, 40.0
+    edges = np.concatenate([dt * np.arange(51), 1.0 + T + dt * np.arange(50)])
+    record = ImuRecord(time=edges, increments=np.zeros((100, 3)))
+    start = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-3, bias_sigma=1e-4)
+    estimate = mekf.run(record, NOISE, start, full_covariance=True)
+    (event,) = estimate.events
+    assert (event.kind, event.start, event.end) == ("gap", 1.0, 1.0 + T)
+    assert event.value == pytest.approx(T / dt)
+    assert "40 s after 1 s" in str(event)
+    after = estimate.covariance[51]
+    v, u, time = NOISE.angle_random_walk**2, NOISE.rate_random_walk**2, 1.0 + T
+    assert after[0, 0] == pytest.approx(1e-6 + 1e-8 * time**2 + v * time + u * time**3 / 3.0, rel=1e-10)
+    assert after[3, 3] == pytest.approx(1e-8 + u * time, rel=1e-10)
+
+
+def test_an_outage_of_all_measurements_grows_the_covariance_and_ends_consistent():
+    chosen = tuple(replace(s, faults=Faults(outages=((1.0, 3.0),))) for s in sensors()["direction"])
+    record = simulate(scenario(chosen, duration=4.0), 5)
+    estimate = mekf.run(record, NOISE, near(record), gate=Gate(probability=0.9999))
+    assert not sum(estimate.refused.values())
+    growth = estimate.variance[149, 3:] - estimate.variance[50, 3:]
+    assert np.allclose(growth, NOISE.rate_random_walk**2 * (estimate.time[149] - estimate.time[50]), rtol=1e-9)
+
+
+def test_a_constant_covariance_is_one_for_each_sample():
+    record = simulate(scenario(sensors(Faults())["vector"], duration=1.0), 5)
+    C = np.array([[4.0, 1.0, 0.0], [1.0, 2.0, 0.5], [0.0, 0.5, 1.0]]) * 1e-3
+    force, other = record.vectors
+    once = replace(force, sigma=0.0, covariance=C)
+    each = replace(force, sigma=0.0, covariance=np.tile(C, (len(force.time), 1, 1)))
+    assert np.allclose(once.sigma, np.sqrt(np.trace(C) / 3.0))
+    results = [
+        mekf.run(replace(record, vectors=(s, other)), NOISE, near(record), full_covariance=True) for s in (once, each)
+    ]
+    assert np.array_equal(results[0].covariance, results[1].covariance)
+    turned = mekf.run(
+        replace(record, vectors=(once.noise_scaled(2.0), other)), NOISE, near(record), full_covariance=True
+    )
+    assert np.trace(turned.covariance[-1]) > np.trace(results[0].covariance[-1])
+
+
+def test_a_covariance_proportional_to_one_is_a_sigma():
+    record = simulate(scenario(SCHEDULES["asynchronous"](sensors(Faults())["vector"]), duration=1.0), 5)
+    told = tuple(replace(s, sigma=0.0, covariance=s.sigma[0] ** 2 * np.eye(3)) for s in record.vectors)
+    one = mekf.run(record, NOISE, near(record), full_covariance=True)
+    other = mekf.run(replace(record, vectors=told), NOISE, near(record), full_covariance=True)
+    assert_same(one, other.attitude[1:], other.bias[1:], other.covariance[1:], 1e-12)
+
+
+def test_correlated_noise_is_decorrelated_exactly():
+    """One vector and a diffuse prior about one axis: the information matrix of the textbook, (Hᵀ C⁻¹ H + P⁻¹)⁻¹."""
+    r = np.array([0.0, 0.0, 9.81])
+    C = np.array([[4.0, 1.0, -1.5], [1.0, 2.0, 0.5], [-1.5, 0.5, 2.0]]) * 1e-2
+    series = VectorMeasurements(
+        sensor="f", kind="vector", time=[0.0], vector_b=[r + np.array([0.05, -0.08, 0.1])], reference_f=r, covariance=C
+    )
+    record = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=(series,))
+    start = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.1, bias_sigma=1e-3)
+    result = mekf.run(record, NOISE, start, full_covariance=True)
+    H = np.array([[0.0, -r[2], 0.0], [r[2], 0.0, 0.0], [0.0, 0.0, 0.0]])  # z = r + [r] δθ
+    P = np.linalg.inv(H.T @ np.linalg.solve(C, H) + np.eye(3) / 0.01)
+    x = P @ H.T @ np.linalg.solve(C, np.array([0.05, -0.08, 0.1]))
+    assert np.allclose(quaternion.log(result.attitude[0]), x, rtol=1e-9, atol=1e-12)
+    nis = np.array([0.05, -0.08, 0.1]) @ np.linalg.solve(H @ H.T * 0.01 + C, np.array([0.05, -0.08, 0.1]))
+    assert result.innovations["f"].nis[0] == pytest.approx(nis, rel=1e-12)
+    from strapdown import kinematics
+
+    J = kinematics.right_jacobian(x)
+    assert np.allclose(result.covariance[0][:3, :3], J @ P @ J.T, rtol=1e-9, atol=1e-15)
+
+
+BAD = {
+    "not symmetric": ({"covariance": np.array([[1.0, 0.5, 0], [0, 1, 0], [0, 0, 1]])}, "not symmetric"),
+    "indefinite": ({"covariance": np.diag([1.0, 1.0, -1.0])}, "eigenvalue"),
+    "both": ({"covariance": np.eye(3), "sigma_axes": [1.0, 1.0, 2.0]}, "contradict"),
+    "sigma too": ({"covariance": np.eye(3), "sigma": 3.0}, "contradicts"),
+    "of a heading": ({"covariance": np.eye(3), "kind": "heading"}, "one sigma"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_noise_is_named(case):
+    given, words = BAD[case]
+    base = {"sensor": "s", "kind": "direction", "time": [0.0], "vector_b": [[1.0, 0, 0]], "reference_f": [1.0, 0, 0]}
+    with pytest.raises(InputError, match=words):
+        VectorMeasurements(**{**base, **given})
+
+
+def test_noise_that_is_no_noise_is_refused_by_the_filter():
+    base = {"sensor": "s", "kind": "direction", "time": [0.5], "vector_b": [[1.0, 0, 0]], "reference_f": [1.0, 0, 0]}
+    start = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.1, bias_sigma=1e-3)
+    for noise, words in (
+        ({"sigma_axes": [1.0, 0.0, 1.0]}, "sigma_axes"),
+        ({"covariance": np.diag([1.0, 1.0, 0.0])}, "singular"),
+    ):
+        series = VectorMeasurements(**base, **noise)
+        record = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=(series,))
+        with pytest.raises(InputError, match=words):
+            mekf.run(record, NOISE, start)
+        with pytest.raises(InputError, match="one sigma a sample"):
+            mekf.schedule(record.vectors, 0.0, 1.0)
+
+
+@pytest.mark.parametrize("whole", [False, True], ids=["per axis", "covariance"])
+def test_anisotropic_noise_goes_through_a_record_file(tmp_path, whole):
+    record = anisotropic(simulate(scenario(sensors()["vector"], duration=1.0), 5), whole)
+    recordfiles.write_record(tmp_path / "r.h5", record)
+    back = recordfiles.read_record(tmp_path / "r.h5")
+    for series, other in zip(record.vectors, back.vectors, strict=True):
+        assert np.array_equal(series.covariances, other.covariances)
+        assert np.array_equal(series.sigma, other.sigma)
+    with pytest.raises(InputError, match="write HDF5"):
+        recordfiles.export_csv(tmp_path / "r.csv", record)
