@@ -1,0 +1,74 @@
+"""The multiplicative extended Kalman filter with optional states, declared as blocks, in square-root form.
+
+Attitude and gyro bias as in :mod:`strapdown.mekf`, and beside them what the blocks say::
+
+    blocks = (
+        augmented.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01),
+        augmented.VectorBias(sensor="magnetometer", bias_sigma=10e-6, unit="T"),
+    )
+    estimate = augmented.run(record, process_noise, initial, blocks)
+    estimate.blocks["magnetometer bias"].values
+
+Without blocks it is the filter of :mod:`strapdown.mekf`, number for number.
+
+The covariance is held as a triangular factor, ``P = S Sᵀ``: the prediction brings the noise into the triangle by Householder reflections, a
+measurement enters by Carlson's row update (Bierman 1977, chapters V to VII). So P is symmetric and positive definite by construction, and
+the digits are those of standard deviations, not of variances: states of which some stay as the prior says (a scale factor that no turn
+has shown) while others are measured 1e9 times better live in one matrix, where the plain filter's two fixed blocks of three need no more
+than Joseph's form. The states that change stand first in the triangle and the constant ones last, so those cost the prediction nothing
+but their share of the attitude. Against the plain filter, prediction and two directions, that costs a factor of 2.6 with no block, 3.4
+with hard iron (9 states), 4.9 with the gyro's scale (15), 8 with both and a coloured noise (21). The smoother costs 3 to 5 times its own
+filter.
+
+A filter that starts tenths of a radian off, as one does whose heading hard iron has turned, is linearised at the wrong place and believes
+too much for good; :func:`recentred` starts it anew where the smoother puts it.
+
+Modules: ``blocks`` what can be declared, ``model`` blocks as arrays, ``filtering`` the compiled filter, ``stepping`` the step-by-step one,
+``smoothing`` the smoother, ``observing`` the observability report.
+"""
+
+from __future__ import annotations
+
+from strapdown.augmented.blocks import (
+    Block,
+    Effect,
+    GaussMarkov,
+    GeneralBlock,
+    GyroGaussMarkov,
+    GyroScale,
+    Interval,
+    LinearBlock,
+    VectorBias,
+    VectorScale,
+    View,
+)
+from strapdown.augmented.filtering import AugmentedEstimate, BlockEstimate, run, run_on
+from strapdown.augmented.model import AugmentedState, initial_state
+from strapdown.augmented.observing import Observability, observability
+from strapdown.augmented.smoothing import recentred, smooth
+from strapdown.augmented.stepping import StepFilter
+
+__all__ = [
+    "AugmentedEstimate",
+    "AugmentedState",
+    "Block",
+    "BlockEstimate",
+    "Effect",
+    "GaussMarkov",
+    "GeneralBlock",
+    "GyroGaussMarkov",
+    "GyroScale",
+    "Interval",
+    "LinearBlock",
+    "Observability",
+    "StepFilter",
+    "VectorBias",
+    "VectorScale",
+    "View",
+    "initial_state",
+    "observability",
+    "recentred",
+    "run",
+    "run_on",
+    "smooth",
+]

@@ -1,0 +1,366 @@
+"""Optional states as blocks: what each is, how it changes, and how it enters the gyro and the sensors.
+
+A :class:`LinearBlock` is told by arrays, and the compiled filter runs on those alone: it need not know the block. A :class:`GeneralBlock`
+is told by functions of the rate, the attitude and the time, and runs step by step in Python. A new block subclasses one of them and
+overrides what it has; everything else is "no effect".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from strapdown.checks import Array, InputError, array, non_negative, one_of, positive
+
+AXES = ("x", "y", "z")
+ENTRIES = tuple(a if a == b else f"{a}{b}" for a in AXES for b in AXES)
+"""Entries of a matrix by rows: x, xy, xz, yx, y, …"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Effect:
+    """How the states c of a block enter one sensor: it measures ``(I + Σ c U) R_fbᵀ (r + Σ c d) + Σ c a``.
+
+    a and d are in the unit of the sensor's references (of directions and headings: the length of the reference is 1). Of a sensor of whole
+    attitudes ``Σ c a`` is the rotation vector from the body's axes to the sensor's, rad, and nothing else is taken.
+    """
+
+    offset_b: Array | None = None
+    """a of each state (size, 3), body axes."""
+    offset_f: Array | None = None
+    """d of each state (size, 3), fixed axes."""
+    scale: Array | None = None
+    """U of each state (size, 3, 3)."""
+    carried: bool = False
+    """Whether d is known only relative to the estimated attitude, and goes along when that is corrected: right for a noise that is alike in
+    all directions. Firm in the fixed frame, an estimate of the noise would seem to show the attitude, which it does not: turn both, and
+    every measurement and the noise's own law stay as they are. (A filter whose linearisation breaks such a symmetry finds information
+    where there is none: Huang, Mourikis & Roumeliotis 2010.)"""
+
+
+class _Block:
+    """What every block has."""
+
+    name: str
+    """Its name, which no other block has."""
+    components: tuple[str, ...]
+    """Name of each state."""
+    units: tuple[str, ...]
+    """Unit of each state."""
+    sigma: Array
+    """Standard deviation of each state at the start (size,), above zero; all are expected to be zero then."""
+
+    @property
+    def size(self) -> int:
+        """Number of states."""
+        return len(self.components)
+
+
+class LinearBlock(_Block):
+    """A block of states that change each by itself, ``ċ = −λ c + √q w``, and enter linearly. Transition and noise are exact over any dt."""
+
+    @property
+    def decay(self) -> Array:
+        """λ of each state (size,), 1/s; 0: it stays."""
+        return np.zeros(self.size)
+
+    @property
+    def density(self) -> Array:
+        """PSD q of each state's driving noise (size,), unit²/s."""
+        return np.zeros(self.size)
+
+    @property
+    def gyro_offset(self) -> Array:
+        """Vectors e by state (size, 3): the gyro measures ``(I + Σ c T) w_b + b + Σ c e + n``."""
+        return np.zeros((self.size, 3))
+
+    @property
+    def gyro_scale(self) -> Array:
+        """Matrices T by state (size, 3, 3)."""
+        return np.zeros((self.size, 3, 3))
+
+    @property
+    def effects(self) -> Mapping[str, Effect]:
+        """Effect on each sensor, by its name."""
+        return {}
+
+    def transition(self, dt: float) -> Array:
+        """Return Φ (size, size) over dt, s."""
+        return np.diag(np.exp(-self.decay * dt))
+
+    def process_noise(self, dt: float) -> Array:
+        """Return Q (size, size) over dt, s."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            time = np.where(self.decay > 0.0, -0.5 * np.expm1(-2.0 * self.decay * dt) / self.decay, dt)
+        return np.diag(self.density * time)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Interval:
+    """A step of the filter: what a :class:`GeneralBlock` may ask for."""
+
+    time: float
+    """Begin, s."""
+    dt: float
+    """s."""
+    attitude: Array
+    """Estimated q_fb at the begin (4,)."""
+    rate: Array
+    """Estimated body rate (3,), rad/s."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """A measurement as the filter expects it: what a :class:`GeneralBlock` may ask for."""
+
+    sensor: str
+    time: float
+    attitude: Array
+    """Estimated q_fb (4,)."""
+    rate: Array
+    """Estimated body rate (3,) over the step before, rad/s."""
+    expected_b: Array
+    """R_fbᵀ r (3,), body axes, in the unit of the reference."""
+
+
+class GeneralBlock(_Block):
+    """A block told by functions: a latency, whose effect goes by the rate; a motion, whose change goes by the attitude.
+
+    It has no effect on kinds ``"heading"`` and ``"attitude"``. How its effects change with the attitude *error* is neglected: they are
+    small beside the measurement.
+    """
+
+    def propagate(self, values: Array, interval: Interval) -> tuple[Array, Array, Array, Array]:
+        """Return values (size,) after an interval, Φ (size, size), ∂values/∂δθ (size, 3), and Q (size, size)."""
+        return values, np.eye(self.size), np.zeros((self.size, 3)), np.zeros((self.size, self.size))
+
+    def gyro(self, values: Array, interval: Interval) -> tuple[Array, Array]:
+        """Return what is added to the measured rate (3,), rad/s, and its derivatives (size, 3); taken constant over the interval."""
+        return np.zeros(3), np.zeros((self.size, 3))
+
+    def measured(self, values: Array, view: View) -> tuple[Array, Array] | None:
+        """Return what is added to a sensor's vector (3,), body axes, and its derivatives (size, 3); None: nothing."""
+        return None
+
+
+Block = LinearBlock | GeneralBlock
+
+
+def _spread(name: str, value: float | Array, unit: str, size: int = 3) -> Array:
+    spread = np.broadcast_to(np.asarray(value, np.float64), (size,)).copy() if np.ndim(value) < 2 else value
+    return np.array([positive(f"{name}[{k}]", one, unit=unit) for k, one in enumerate(array(name, spread, (size,)))])
+
+
+@dataclass(frozen=True, kw_only=True)
+class GyroScale(LinearBlock):
+    """Scale factors and misalignments of the gyro: all nine of M in ``w_meas = (I + M) w_b + b + n``, constant."""
+
+    scale_sigma: float
+    """Of each scale factor, dimensionless."""
+    misalignment_sigma: float
+    """Of each misalignment, rad."""
+    name: str = "gyro scale"
+
+    def __post_init__(self) -> None:
+        """Check both."""
+        positive(f"{self.name}: scale_sigma", self.scale_sigma)
+        positive(f"{self.name}: misalignment_sigma", self.misalignment_sigma, unit="rad")
+
+    @property
+    def components(self) -> tuple[str, ...]:  # type: ignore[override]
+        """M by rows: x, y, z are the scale factors; xy is how much of the rate about y shows on axis x."""
+        return ENTRIES
+
+    @property
+    def units(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Dimensionless, rad."""
+        return tuple("1" if entry in AXES else "rad" for entry in ENTRIES)
+
+    @property
+    def sigma(self) -> Array:  # type: ignore[override]
+        """Both as given."""
+        return np.array([self.scale_sigma if entry in AXES else self.misalignment_sigma for entry in ENTRIES])
+
+    @property
+    def gyro_scale(self) -> Array:
+        """One entry of M a state."""
+        return np.eye(9).reshape(9, 3, 3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GyroGaussMarkov(LinearBlock):
+    """A second gyro bias that forgets: first-order Gauss–Markov, stationary. Several of different times together cover flicker."""
+
+    bias_sigma: float | Array
+    """Stationary standard deviation, rad/s, one or one an axis."""
+    correlation_time: float
+    """s"""
+    name: str = "gyro drift"
+    components: tuple[str, ...] = AXES
+    units: tuple[str, ...] = ("rad/s",) * 3
+
+    def __post_init__(self) -> None:
+        """Check both."""
+        object.__setattr__(self, "bias_sigma", _spread(f"{self.name}: bias_sigma", self.bias_sigma, "rad/s"))
+        positive(f"{self.name}: correlation_time", self.correlation_time, unit="s")
+
+    @property
+    def sigma(self) -> Array:  # type: ignore[override]
+        """The stationary one."""
+        return np.asarray(self.bias_sigma)
+
+    @property
+    def decay(self) -> Array:
+        """1/τ."""
+        return np.full(3, 1.0 / self.correlation_time)
+
+    @property
+    def density(self) -> Array:
+        """2σ²/τ."""
+        return 2.0 * self.sigma**2 / self.correlation_time
+
+    @property
+    def gyro_offset(self) -> Array:
+        """One axis a state."""
+        return np.eye(3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class VectorBias(LinearBlock):
+    """A constant bias of a vector sensor in body axes: hard iron, accelerometer bias."""
+
+    sensor: str
+    bias_sigma: float | Array
+    """In the unit of the sensor's reference (1 is its length for directions and headings), one or one an axis."""
+    rate_random_walk: float = 0.0
+    """Of each component, unit/√s."""
+    unit: str = "1"
+    """For words and tables."""
+    name: str = ""
+    components: tuple[str, ...] = AXES
+
+    def __post_init__(self) -> None:
+        """Check all."""
+        object.__setattr__(self, "name", self.name or f"{self.sensor} bias")
+        object.__setattr__(self, "bias_sigma", _spread(f"{self.name}: bias_sigma", self.bias_sigma, self.unit))
+        non_negative(f"{self.name}: rate_random_walk", self.rate_random_walk)
+
+    @property
+    def units(self) -> tuple[str, ...]:  # type: ignore[override]
+        """As told."""
+        return (self.unit,) * 3
+
+    @property
+    def sigma(self) -> Array:  # type: ignore[override]
+        """As given."""
+        return np.asarray(self.bias_sigma)
+
+    @property
+    def density(self) -> Array:
+        """The square of the random walk."""
+        return np.full(3, self.rate_random_walk**2)
+
+    @property
+    def effects(self) -> Mapping[str, Effect]:
+        """One axis a state."""
+        return {self.sensor: Effect(offset_b=np.eye(3))}
+
+
+@dataclass(frozen=True, kw_only=True)
+class VectorScale(LinearBlock):
+    """Scale factors and misalignments of a vector sensor: all nine of S in ``m_b = (I + S) R_fbᵀ r``, constant: soft iron."""
+
+    sensor: str
+    scale_sigma: float
+    """Of each entry of S, dimensionless."""
+    name: str = ""
+    units: tuple[str, ...] = ("1",) * 9
+
+    def __post_init__(self) -> None:
+        """Check the deviation."""
+        object.__setattr__(self, "name", self.name or f"{self.sensor} scale")
+        positive(f"{self.name}: scale_sigma", self.scale_sigma)
+
+    @property
+    def components(self) -> tuple[str, ...]:  # type: ignore[override]
+        """S by rows."""
+        return ENTRIES
+
+    @property
+    def sigma(self) -> Array:  # type: ignore[override]
+        """As given."""
+        return np.full(9, self.scale_sigma)
+
+    @property
+    def effects(self) -> Mapping[str, Effect]:
+        """One entry of S a state."""
+        return {self.sensor: Effect(scale=np.eye(9).reshape(9, 3, 3))}
+
+
+@dataclass(frozen=True, kw_only=True)
+class GaussMarkov(LinearBlock):
+    """First-order coloured noise on a vector sensor, stationary: the acceleration of a moving hand on an accelerometer."""
+
+    sensor: str
+    noise_sigma: float | Array
+    """Stationary standard deviation in the unit of the sensor's reference, one or one an axis."""
+    correlation_time: float
+    """s"""
+    frame: Literal["body", "fixed"] = "body"
+    """Axes in which it is correlated: an acceleration keeps its direction in the fixed frame while the body turns. There it must be alike
+    in all directions."""
+    unit: str = "1"
+    name: str = ""
+    components: tuple[str, ...] = field(default=AXES)
+
+    def __post_init__(self) -> None:
+        """Check all."""
+        object.__setattr__(self, "name", self.name or f"{self.sensor} disturbance")
+        object.__setattr__(self, "noise_sigma", _spread(f"{self.name}: noise_sigma", self.noise_sigma, self.unit))
+        positive(f"{self.name}: correlation_time", self.correlation_time, unit="s")
+        one_of(f"{self.name}: frame", self.frame, ("body", "fixed"))
+        if self.frame == "fixed" and len(set(self.sigma)) > 1:
+            raise InputError(f"{self.name}: noise_sigma differs by axis; in fixed axes give one for all")
+
+    @property
+    def units(self) -> tuple[str, ...]:  # type: ignore[override]
+        """As told."""
+        return (self.unit,) * 3
+
+    @property
+    def sigma(self) -> Array:  # type: ignore[override]
+        """The stationary one."""
+        return np.asarray(self.noise_sigma)
+
+    @property
+    def decay(self) -> Array:
+        """1/τ."""
+        return np.full(3, 1.0 / self.correlation_time)
+
+    @property
+    def density(self) -> Array:
+        """2σ²/τ."""
+        return 2.0 * self.sigma**2 / self.correlation_time
+
+    @property
+    def effects(self) -> Mapping[str, Effect]:
+        """One axis a state."""
+        axes = np.eye(3)
+        return {self.sensor: Effect(offset_b=axes) if self.frame == "body" else Effect(offset_f=axes, carried=True)}
+
+
+def check(blocks: tuple[Block, ...]) -> None:
+    """Refuse blocks that do not say what they are, and two of one name."""
+    names: list[str] = []
+    for block in blocks:
+        if not isinstance(block, LinearBlock | GeneralBlock):
+            raise InputError(f"{block!r} is no block; subclass LinearBlock or GeneralBlock of strapdown.augmented")
+        if block.name in names:
+            raise InputError(f"two blocks are named {block.name!r}; give each a name of its own")
+        names.append(block.name)
+        if len(block.units) != block.size:
+            raise InputError(f"{block.name}: {len(block.units)} units for {block.size} components; give one each")
+        _spread(f"{block.name}: sigma", block.sigma, "", block.size)

@@ -1,0 +1,197 @@
+"""Blocks as the arrays that the kernels take, and the states in both orders.
+
+For whoever looks from outside the order is attitude, bias, then the blocks as given. In the kernels the states that change come before the
+constant ones, which then cost the prediction next to nothing (:mod:`strapdown.kernels.augmented_factor`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from strapdown import mekf
+from strapdown.augmented.blocks import Block, Effect, GeneralBlock, LinearBlock, check
+from strapdown.checks import Array, InputError, array, covariance, one_of, unit_quaternions
+from strapdown.kernels.augmented_step import CARRIED, FIXED, NOISE_NODES, OFFSET, SCALE
+
+MOST_DECAY = 0.5
+"""Of λ dt in one step: a step back is well conditioned. For states that enter the gyro a tenth, where Gauss's rule is exact."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AugmentedState:
+    """Attitude, bias, the values of the blocks, and the covariance of their error."""
+
+    attitude: Array
+    """q_fb (4,)."""
+    bias: Array
+    """Gyro bias (3,), rad/s."""
+    values: Array
+    """States of the blocks (m,), one block after the other."""
+    covariance: Array
+    """P (6 + m, 6 + m) of (δθ, δb, δc)."""
+    factor: Array | None = None
+    """A root R of it, ``P = Rᵀ R``, where there is one already: a filter's, which may hold what P itself has no digits for."""
+
+    def __post_init__(self) -> None:
+        """Check shapes, the norm and positive definiteness."""
+        object.__setattr__(self, "attitude", unit_quaternions("attitude", array("attitude", self.attitude, (4,))))
+        object.__setattr__(self, "bias", array("bias", self.bias, (3,)))
+        values = array("values", self.values, ("m",))
+        object.__setattr__(self, "values", values)
+        size = 6 + len(values)
+        if self.factor is None:
+            object.__setattr__(self, "covariance", covariance("covariance", self.covariance, size))
+            return
+        root, P = array("factor", self.factor, (size, size)), array("covariance", self.covariance, (size, size))
+        sigma = np.linalg.norm(root, axis=0)
+        if not np.all(sigma > 0.0) or np.any(np.abs(root.T @ root - P) > 1e-9 * np.outer(sigma, sigma)):
+            raise InputError("factor is no root of covariance; leave it out")
+
+
+def initial_state(initial: mekf.State, blocks: Sequence[Block]) -> AugmentedState:
+    """Return a state whose blocks are zero, with errors of their own sigma independent of attitude and bias."""
+    blocks = tuple(blocks)
+    check(blocks)
+    size = sum(block.size for block in blocks)
+    P = np.zeros((6 + size, 6 + size))
+    P[:6, :6] = initial.covariance
+    P[6:, 6:] = np.diag(np.concatenate([np.empty(0), *(np.asarray(block.sigma) ** 2 for block in blocks)]))
+    return AugmentedState(attitude=initial.attitude, bias=initial.bias, values=np.zeros(size), covariance=P)
+
+
+def begin(initial: mekf.State | AugmentedState, blocks: tuple[Block, ...]) -> AugmentedState:
+    """Return the state to start from, whichever was given."""
+    check(blocks)
+    if isinstance(initial, mekf.State):
+        return initial_state(initial, blocks)
+    size = sum(block.size for block in blocks)
+    if len(initial.values) != size:
+        raise InputError(f"initial has {len(initial.values)} block states, the blocks {size}; make it by initial_state")
+    return initial
+
+
+@dataclass(frozen=True, kw_only=True)
+class Model:
+    """Linear blocks as arrays, in the kernels' order."""
+
+    order: np.ndarray
+    """Which state from outside each of the kernels' block states is (m,)."""
+    decay: Array
+    density: Array
+    changing: int
+    """How many come first that decay or are driven."""
+    limit: float
+    """Longest step, s."""
+    gyro: Array
+    gyro_use: np.ndarray
+    sensors: Array
+    sensor_use: np.ndarray
+
+    @property
+    def states(self) -> int:
+        """Number of block states."""
+        return len(self.order)
+
+    @property
+    def noise_rows(self) -> int:
+        """Number of rows of noise of a step."""
+        driven = self.density > 0.0
+        rows = np.where(self.gyro_use & OFFSET, NOISE_NODES, 1)
+        return 6 + int(np.sum(rows[driven]))
+
+    @property
+    def whole_order(self) -> np.ndarray:
+        """Which state from outside each of the kernels' states is (6 + m,)."""
+        return np.concatenate([np.arange(6), 6 + self.order])
+
+
+def _stack(blocks: Sequence[Block], name: str, shape: tuple[int, ...]) -> Array:
+    parts = [np.empty((0, *shape))]
+    for block in blocks:
+        if isinstance(block, LinearBlock):
+            parts.append(array(f"{block.name}: {name}", getattr(block, name), (block.size, *shape)))
+        else:
+            parts.append(np.zeros((block.size, *shape)))
+    return np.concatenate(parts)
+
+
+def assemble(blocks: tuple[Block, ...], kinds: Mapping[str, str]) -> Model:
+    """Return the model of blocks for the sensors named, whose kinds are given; general blocks stand there without effect."""
+    decay, density = _stack(blocks, "decay", ()), _stack(blocks, "density", ())
+    for name, values in (("decay", decay), ("density", density)):
+        if np.any(values < 0.0):
+            raise InputError(f"{name} of block state {int(np.argmax(values < 0.0))} is negative; give zero or more")
+    gyro = np.concatenate(
+        [_stack(blocks, "gyro_offset", (3,)), _stack(blocks, "gyro_scale", (3, 3)).reshape(-1, 9)], axis=1
+    )
+    sensors = np.zeros((len(kinds), len(decay), 15))
+    carried = np.zeros((len(kinds), len(decay)), bool)
+    names = list(kinds)
+    first = 0
+    for block in blocks:
+        effects = block.effects if isinstance(block, LinearBlock) else {}
+        for sensor, effect in effects.items():
+            one_of(f"{block.name}: sensor", sensor, names)
+            if kinds[sensor] == "attitude" and (effect.offset_f is not None or effect.scale is not None):
+                raise InputError(
+                    f"{block.name}: {sensor} gives whole attitudes, which have an offset_b only; drop the rest"
+                )
+            place = names.index(sensor), slice(first, first + block.size)
+            sensors[place] = _numbers(block, effect)
+            carried[place] = effect.carried
+        first += block.size
+    moves = (decay > 0.0) | (density > 0.0)
+    order = np.argsort(~moves, kind="stable")
+    gyro_use = _uses(gyro[:, :3], gyro[:, 3:])
+    sensor_use = _uses(sensors[..., :3], sensors[..., 6:], sensors[..., 3:6])
+    sensor_use += CARRIED * (carried & (sensor_use & FIXED > 0))
+    fastest = float(np.max(decay * np.where(gyro_use & OFFSET, 5.0, 1.0), initial=0.0))
+    return Model(
+        order=order,
+        decay=decay[order],
+        density=density[order],
+        changing=int(np.sum(moves)),
+        limit=MOST_DECAY / fastest if fastest > 0.0 else np.inf,
+        gyro=np.ascontiguousarray(gyro[order]),
+        gyro_use=gyro_use[order],
+        sensors=np.ascontiguousarray(sensors[:, order]),
+        sensor_use=np.ascontiguousarray(sensor_use[:, order]),
+    )
+
+
+def _numbers(block: Block, effect: Effect) -> Array:
+    """Return an effect as rows (size, 15)."""
+    rows = np.zeros((block.size, 15))
+    for name, place, shape in (("offset_b", 0, (3,)), ("offset_f", 3, (3,)), ("scale", 6, (3, 3))):
+        value = getattr(effect, name)
+        if value is not None:
+            given = array(f"{block.name}: {name}", value, (block.size, *shape)).reshape(block.size, -1)
+            rows[:, place : place + given.shape[1]] = given
+    return rows
+
+
+def _uses(offset: Array, scale: Array, fixed: Array | None = None) -> np.ndarray:
+    bits = OFFSET * np.any(offset != 0.0, axis=-1) + SCALE * np.any(scale != 0.0, axis=-1)
+    if fixed is not None:
+        bits = bits + FIXED * np.any(fixed != 0.0, axis=-1)
+    return np.asarray(bits, np.int64)
+
+
+def triangle(state: AugmentedState, model: Model) -> Array:
+    """Return F, lower triangular, with ``P = Fᵀ F`` in the kernels' order."""
+    order = model.whole_order
+    if state.factor is None:
+        P = state.covariance[np.ix_(order, order)]
+        return np.ascontiguousarray(np.linalg.cholesky(P[::-1, ::-1])[::-1, ::-1].T)
+    root = state.factor[:, order]
+    if not np.array_equal(root, np.tril(root)):
+        root = np.asarray(np.linalg.qr(root[:, ::-1], mode="r"))[::-1, ::-1]
+    return np.ascontiguousarray(root)
+
+
+def general(blocks: Sequence[Block]) -> bool:
+    """Return whether any block needs the step-by-step face."""
+    return any(isinstance(block, GeneralBlock) for block in blocks)

@@ -1,0 +1,173 @@
+"""What a record shows of each state: rank, singular values, and the weakest directions in words."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from strapdown import mekf, quaternion
+from strapdown.augmented import model as modelling
+from strapdown.augmented.blocks import AXES, Block
+from strapdown.augmented.model import AugmentedState
+from strapdown.augmented.smoothing import smooth
+from strapdown.checks import Array, positive
+from strapdown.mekf import ProcessNoise
+from strapdown.records import ImuRecord
+
+NAMED = 0.25
+"""A state is named in a direction if its share is at least so much of the greatest."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observability:
+    """What the measurements of a record tell of the state at its start, in units of what was known before.
+
+    With the prior covariance ``P₀ = S Sᵀ`` and the covariance P of the same state after the whole record, the measurements' own
+    information is ``O = Sᵀ (P⁻¹ − P₀⁻¹) S``: the observability Gramian, linearised along the estimate, with process noise taken into
+    account and every state counted in its own prior σ, so that rad, T and ppm can be compared. A singular value s of
+    ``√O`` is dimensionless: along its direction the record leaves ``1/√(1 + s²)`` of the prior σ.
+    """
+
+    states: tuple[str, ...]
+    """Name of each state (n)."""
+    units: tuple[str, ...]
+    prior_sigma: Array
+    """Standard deviations before the record (n,), in ``units``."""
+    start_sigma: Array
+    """Those of the same state, at the first edge, after all measurements (n,)."""
+    final_sigma: Array
+    """Those at the last edge (n,)."""
+    singular_values: Array
+    """Dimensionless, the greatest first (n,)."""
+    directions: Array
+    """Unit directions in the space of states over their prior σ, one a row (n, n), in the order of the singular values."""
+    threshold: float
+    """Singular value from which on a direction counts as observed."""
+
+    @property
+    def rank(self) -> int:
+        """Number of observed directions."""
+        return int(np.sum(self.singular_values >= self.threshold))
+
+    @property
+    def unobserved(self) -> Array:
+        """Share of each state that lies in directions not observed (n,): 0 all observed, 1 nothing is."""
+        return np.asarray(np.sqrt(np.sum(self.directions[self.rank :] ** 2, axis=0)))
+
+    def words(self, k: int) -> str:
+        """Say direction k: states and their shares, each in its prior σ."""
+        direction = self.directions[k]
+        large = np.flatnonzero(np.abs(direction) >= NAMED * np.max(np.abs(direction)))
+        large = large[np.argsort(-np.abs(direction[large]), kind="stable")]
+        sign = np.sign(direction[large[0]])
+        parts = [f"{sign * direction[i]:+.2f} {self.states[i]}" for i in large]
+        return " ".join(parts).removeprefix("+")
+
+    def weakest(self, number: int = 3) -> tuple[str, ...]:
+        """Say the weakest directions, the weakest first, each with its singular value."""
+        places = range(len(self.states) - 1, max(len(self.states) - 1 - number, -1), -1)
+        return tuple(f"{self.singular_values[k]:.3g}: {self.words(k)}" for k in places)
+
+    def __str__(self) -> str:
+        """Say all of it."""
+        n = len(self.states)
+        width = max(len(f"{state}, {unit}") for state, unit in zip(self.states, self.units, strict=True))
+        lines = [f"{self.rank} of {n} directions are observed (singular value {self.threshold:g} or more)", ""]
+        lines.append(
+            f"{'state':{width}s} {'prior σ':>11s} {'start/prior':>11s} {'final/prior':>11s} {'unobserved':>10s}"
+        )
+        for i in range(n):
+            lines.append(
+                f"{f'{self.states[i]}, {self.units[i]}':{width}s} {self.prior_sigma[i]:11.3g} "
+                f"{self.start_sigma[i] / self.prior_sigma[i]:11.3g} {self.final_sigma[i] / self.prior_sigma[i]:11.3g} "
+                f"{self.unobserved[i]:10.2f}"
+            )
+        lines += ["", "singular value: direction, each state in its prior σ"]
+        lines += [f"{self.singular_values[k]:14.3g}: {self.words(k)}" for k in range(n - 1, -1, -1)]
+        return "\n".join(lines)
+
+
+def state_names(blocks: Sequence[Block]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return name and unit of every state: attitude, bias, blocks."""
+    names = [f"attitude {axis}" for axis in AXES] + [f"gyro bias {axis}" for axis in AXES]
+    units = ["rad"] * 3 + ["rad/s"] * 3
+    for block in blocks:
+        names += [f"{block.name} {component}" for component in block.components]
+        units += block.units
+    return tuple(names), tuple(units)
+
+
+def observability(
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    initial: mekf.State | AugmentedState,
+    blocks: Sequence[Block] = (),
+    *,
+    threshold: float = 1.0,
+) -> Observability:
+    """Return what a record shows of each state of the filter with these blocks.
+
+    The same record and belief as for :func:`strapdown.augmented.run`; the model is linearised along the smoothed attitude, with no
+    calibration errors. A direction counts as observed from ``threshold`` on: at 1, the record tells as much of it as the prior. Singular
+    values are good to about 1e7; a state that forgets (:class:`strapdown.augmented.GaussMarkov`) is judged by what the record tells of
+    its first value.
+    """
+    blocks = tuple(blocks)
+    positive("threshold", threshold)
+    state = modelling.begin(initial, blocks)
+    where = smooth(record, process_noise, state, blocks)
+    fixed = without_errors(record, where.attitude)
+    begin = dataclasses.replace(state, attitude=where.attitude[0], bias=np.zeros(3), values=np.zeros(len(state.values)))
+    whole = smooth(fixed, process_noise, begin, blocks, full_covariance=True)
+    assert whole.whole_covariance is not None
+    P = whole.whole_covariance[0]
+    sigma = np.sqrt(np.diag(state.covariance))
+    value, vector = np.linalg.eigh(state.covariance / np.outer(sigma, sigma))
+    # The symmetric root of the correlation turns the states as little as can be: none where the prior is diagonal.
+    root, inverse = (vector * np.sqrt(value)) @ vector.T, (vector / np.sqrt(value)) @ vector.T
+    left, direction = np.linalg.eigh(inverse @ (P / np.outer(sigma, sigma)) @ inverse)
+    left = np.clip(left, 1e-15, 1.0)
+    directions = (root @ direction).T
+    names, units = state_names(blocks)
+    return Observability(
+        states=names,
+        units=units,
+        prior_sigma=sigma,
+        start_sigma=np.sqrt(np.diag(P)),
+        final_sigma=np.sqrt(np.diag(whole.whole_covariance[-1])),
+        singular_values=np.sqrt(1.0 / left - 1.0),
+        directions=directions / np.linalg.norm(directions, axis=1, keepdims=True),
+        threshold=threshold,
+    )
+
+
+def without_errors(record: ImuRecord, attitude: Array) -> ImuRecord:
+    """Return what ideal sensors would give of a body with these attitudes at the edges (n + 1, 4), turning at constant rate between them.
+
+    A filter started on it stays on it, whatever it believes, so its covariance is linearised along one trajectory: linearised along an
+    estimate that each measurement moves, it would find information in directions that nothing shows.
+    """
+    turns = quaternion.log(quaternion.multiply(quaternion.conjugate(attitude[:-1]), attitude[1:]))
+    series = []
+    for whole in record.vectors:
+        s = whole.taken((whole.time >= record.time[0]) & (whole.time <= record.time[-1]))
+        k = np.clip(np.searchsorted(record.time, s.time, side="left") - 1, 0, len(turns) - 1)
+        share = (s.time - record.time[k]) / (record.time[k + 1] - record.time[k])
+        q = quaternion.multiply(attitude[k], quaternion.exp(share[:, None] * turns[k]))
+        inverse = quaternion.conjugate(q)
+        if s.attitude is not None:
+            series.append(dataclasses.replace(s, attitude=quaternion.normalize(q)))
+            continue
+        exact_f = s.references_f
+        if s.kind == "heading":
+            # Of its reference only the heading counts; how far it is from level is the measurement's.
+            seen_f = quaternion.rotate(q, s.vector_b)
+            level = np.linalg.norm(exact_f[:, :2], axis=1, keepdims=True)
+            size = np.linalg.norm(seen_f[:, :2], axis=1, keepdims=True)
+            exact_f = np.concatenate([exact_f[:, :2] / level * size, seen_f[:, 2:]], axis=1)
+        exact_b = np.where(np.isfinite(s.vector_b), quaternion.rotate(inverse, exact_f), np.nan)
+        series.append(dataclasses.replace(s, vector_b=exact_b))
+    return ImuRecord(time=record.time, increments=turns, vectors=tuple(series))

@@ -1,0 +1,290 @@
+"""The MEKF with optional states over one whole record, forward and back. Compiled by :func:`strapdown.kernels.machine.compiled`."""
+
+from __future__ import annotations
+
+from strapdown.kernels.algebra import dot
+from strapdown.kernels.augmented_factor import covariances, take_row, triangularise, variances
+from strapdown.kernels.augmented_step import (
+    carry,
+    carry_back,
+    decorrelate,
+    fill_noise,
+    fill_rows,
+    longest_step,
+    move,
+    turn_rows,
+)
+from strapdown.kernels.filter_loop import ATTITUDE, vector_at
+from strapdown.kernels.rotation import logarithm, quaternion_multiply, right_jacobian, rotation_matrix, turned, unit
+from strapdown.kernels.smoother_step import inverse_right_jacobian, moved
+
+
+def store_segment(out, k, dt, part, q, x, F, size):
+    """Write row k of the segments: dt, increment (3), attitude (4), x, and the rows of the triangle."""
+    out[k, 0] = dt
+    out[k, 1], out[k, 2], out[k, 3] = part
+    out[k, 4], out[k, 5], out[k, 6], out[k, 7] = q
+    place = 8
+    for i in range(len(x)):
+        out[k, place + i] = x[i]
+    place += len(x)
+    for j in range(size):
+        for i in range(j + 1):
+            out[k, place + i] = F[j, i]
+        place += j + 1
+
+
+def load_segment(segments, k, x, F, size):
+    """Read x and the triangle of row k; return the attitude."""
+    place = 8
+    for i in range(len(x)):
+        x[i] = segments[k, place + i]
+    place += len(x)
+    for j in range(size):
+        for i in range(j + 1):
+            F[j, i] = segments[k, place + i]
+        for i in range(j + 1, size):
+            F[j, i] = 0.0
+        place += j + 1
+    return (segments[k, 4], segments[k, 5], segments[k, 6], segments[k, 7])
+
+
+def run_augmented(
+    edges,
+    increments,
+    angle_variance,
+    rate_variance,
+    decay,
+    density,
+    changing,
+    limit,
+    gyro,
+    gyro_use,
+    sensors,
+    sensor_use,
+    event_time,
+    event_kind,
+    event_value,
+    event_variance,
+    event_noise,
+    event_length,
+    event_sensor,
+    event_reference,
+    triads,
+    attitude,
+    x,
+    F,
+    scratch,
+    every,
+    attitude_out,
+    x_out,
+    variance_out,
+    covariance_out,
+    innovation_out,
+    segment_out,
+):
+    """Run the filter over a record; the splitting of intervals is that of :func:`strapdown.kernels.filter_loop.run_filter`.
+
+    ``attitude`` (4,), ``x`` and the triangle at the top of ``F`` hold the state and are left at the end state; the rest of F takes the rows
+    of noise. ``scratch`` holds arrays (states, 3), (states,), (3, size), (3,), (3,), (3, 3), (size,) and one as wide as F. ``limit``
+    bounds a step by the states that decay. ``event_noise``, ``covariance_out`` and ``segment_out`` may be empty.
+    Returns the number of segments stored.
+    """
+    size = len(x) + 3
+    noisy = 6 + changing
+    q = (attitude[0], attitude[1], attitude[2], attitude[3])
+    coupling, factor, H, y, spread, basis, correction, work = scratch
+    events = len(event_time)
+    e = 0
+    k = -1  # the interval before the first edge has no length; its end takes the events at the first edge
+    now = edges[0]
+    end = now
+    whole = 1.0
+    longest = 1.0
+    theta = (0.0, 0.0, 0.0)
+    countdown = 0
+    row = 0
+    segments = 0
+    while k < len(increments):
+        due = e < events and event_time[e] <= end
+        stop = event_time[e] if due else end
+        dt = stop - now
+        if dt > 0.0:
+            if dt > longest:
+                dt = longest
+                stop = now + dt
+                due = False
+            part = theta
+            if dt < whole:
+                share = dt / whole
+                part = (share * theta[0], share * theta[1], share * theta[2])
+            if segments < len(segment_out):
+                store_segment(segment_out, segments, dt, part, q, x, F, size)
+                segments += 1
+            q, phi11, phi12, rate, D = move(q, x, dt, part, decay, gyro, gyro_use, coupling, factor)
+            carry(F, 0, size, phi11, phi12, coupling, factor, gyro_use, changing)
+            rows = fill_noise(F, size, size, dt, rate, D, angle_variance, rate_variance, decay, density, gyro, gyro_use)
+            triangularise(F, noisy, 3, size, rows, 0, 0, work)
+            now = stop
+        if due:
+            t = event_reference[e]
+            frame = (
+                triads[t, 0],
+                triads[t, 1],
+                triads[t, 2],
+                triads[t, 3],
+                triads[t, 4],
+                triads[t, 5],
+                triads[t, 6],
+                triads[t, 7],
+                triads[t, 8],
+            )
+            z = vector_at(event_value, e)
+            R = rotation_matrix(q)
+            s = event_sensor[e]
+            rows = fill_rows(q, R, x, event_kind[e], z, frame, event_length[e], s, sensors, sensor_use, H, y, basis)
+            for r in range(rows):
+                spread[r] = event_value[e, r] if event_kind[e] == ATTITUDE else event_variance[e]
+            if len(event_noise) > 0:
+                decorrelate(H, y, rows, basis, event_noise, e, spread)
+            for i in range(size):
+                correction[i] = 0.0
+            for r in range(rows):
+                error = y[r]
+                for i in range(size):
+                    error -= H[r, i] * correction[i]  # what the rows before it have corrected
+                s2 = take_row(F, size, H, r, spread[r], work)
+                for i in range(size):
+                    correction[i] += error / s2 * work[i]
+                innovation_out[e, 2 * r] = error
+                innovation_out[e, 2 * r + 1] = s2
+            a = (correction[0], correction[1], correction[2])
+            q = turned(q, a)
+            if dot(a, a) > 1.0:
+                q = unit(q)
+            for i in range(len(x)):
+                x[i] += correction[3 + i]
+            turn_rows(F, size, right_jacobian(a))
+            triangularise(F, 3, 3, size, size, 0, 0, work)
+            e += 1
+        if now >= end and (e == events or event_time[e] > end):
+            if countdown == 0:
+                countdown = every
+                attitude_out[row, 0], attitude_out[row, 1], attitude_out[row, 2], attitude_out[row, 3] = q
+                for i in range(len(x)):
+                    x_out[row, i] = x[i]
+                variances(F, size, variance_out, row)
+                if row < len(covariance_out):
+                    covariances(F, size, covariance_out, row)
+                row += 1
+            countdown -= 1
+            k += 1
+            if k < len(increments):
+                end = edges[k + 1]
+                whole = end - now
+                theta = vector_at(increments, k)
+                longest = longest_step(whole, theta, limit)
+    attitude[0], attitude[1], attitude[2], attitude[3] = q
+    return segments
+
+
+def smooth_augmented(
+    segments,
+    starts,
+    angle_variance,
+    rate_variance,
+    decay,
+    density,
+    changing,
+    gyro,
+    gyro_use,
+    x,
+    F,
+    later_x,
+    later_F,
+    noise,
+    scratch,
+    attitude_out,
+    x_out,
+    variance_out,
+    covariance_out,
+):
+    """Run the Rauch–Tung–Striebel smoother back over the stored segments, on the manifold and on factors.
+
+    A step back estimates the step's own noise w from what came later and takes it off. With the prediction's own reflections
+    ``[Φ S, Nᵀ] Θ = [S⁻, 0]`` and ``[0, I] Θ = [Y, Z]``, later knowledge of the predicted error δ says ``w = Y S⁻⁻¹ δ`` and leaves w the
+    covariance ``Z Zᵀ`` (Bierman 1983 does it one noise at a time). So ``δ_before = Φ⁻¹ (δ − Nᵀ w)``, and the covariance is a sum of two
+    squares: no difference is formed, and what has no noise is not touched. As in :mod:`strapdown.kernels.smoother_step`, the later factor
+    is carried to the tangent space at the predicted attitude before the step, and the result to that at the smoothed one after it.
+
+    ``F`` (size + p, size + p) and ``later_F`` (size + p + 1, size) hold triangle and rows of noise, ``noise`` (p, size) a copy of the
+    latter; ``scratch`` holds arrays (states, 3), (states,), (p, size) and one as wide as F.
+    """
+    size = len(x) + 3
+    noisy = 6 + changing
+    coupling, factor, gain, work = scratch
+    k = len(starts) - 1
+    j = starts[k]
+    later_q = load_segment(segments, j, later_x, later_F, size)
+    while True:
+        if j == starts[k]:
+            attitude_out[k, 0], attitude_out[k, 1], attitude_out[k, 2], attitude_out[k, 3] = later_q
+            for i in range(len(x)):
+                x_out[k, i] = later_x[i]
+            variances(later_F, size, variance_out, k)
+            if k < len(covariance_out):
+                covariances(later_F, size, covariance_out, k)
+            if k == 0:
+                break
+            k -= 1
+        j -= 1
+        q = load_segment(segments, j, x, F, size)
+        dt = segments[j, 0]
+        part = (segments[j, 1], segments[j, 2], segments[j, 3])
+        predicted, phi11, phi12, rate, D = move(q, x, dt, part, decay, gyro, gyro_use, coupling, factor)
+        carry(F, 0, size, phi11, phi12, coupling, factor, gyro_use, changing)
+        rows = fill_noise(F, size, size, dt, rate, D, angle_variance, rate_variance, decay, density, gyro, gyro_use)
+        p = rows - size
+        for r in range(p):
+            for i in range(size):
+                noise[r, i] = F[size + r, i]
+        for r in range(size + p):
+            for i in range(size, size + p):
+                F[r, i] = 1.0 if r == i else 0.0
+        triangularise(F, noisy, 3, size, rows, size, rows, work)
+        # From the tangent space at the smoothed attitude to that at the predicted one: exp(a) ⊗ exp(ε) = exp(a + J_r(a)⁻¹ ε).
+        inverse = (predicted[0], -predicted[1], -predicted[2], -predicted[3])
+        a = logarithm(quaternion_multiply(inverse, later_q))
+        turn_rows(later_F, size, inverse_right_jacobian(a))
+        # The difference itself goes through the step as one row more.
+        later_F[rows, 0], later_F[rows, 1], later_F[rows, 2] = a
+        for i in range(len(x)):
+            later_F[rows, 3 + i] = later_x[i] - x[i]
+        for w in range(p):
+            for c in range(size):
+                total = F[c, size + w]
+                for i in range(c):
+                    total -= gain[w, i] * F[c, i]
+                gain[w, c] = total / F[c, c]
+        for r in range(p):
+            for i in range(size):
+                later_F[size + r, i] = 0.0
+            for w in range(p):
+                for i in range(noisy):
+                    later_F[size + r, i] += F[size + r, size + w] * noise[w, i]
+        for r in range(rows + 1):
+            if r < size or r == rows:
+                for w in range(p):
+                    total = 0.0
+                    for i in range(size):
+                        total += gain[w, i] * later_F[r, i]
+                    work[w] = total
+                for w in range(p):
+                    for i in range(noisy):
+                        later_F[r, i] -= work[w] * noise[w, i]
+        carry_back(later_F, 0, rows + 1, phi11, phi12, coupling, factor, gyro_use, changing)
+        later_q, J = moved(q, (later_F[rows, 0], later_F[rows, 1], later_F[rows, 2]))
+        for i in range(len(x)):
+            later_x[i] = segments[j, 8 + i] + later_F[rows, 3 + i]
+        turn_rows(later_F, rows, J)
+        triangularise(later_F, noisy, noisy, size, rows, 0, 0, work)

@@ -1,0 +1,446 @@
+"""The MEKF with optional states, one step at a time: scalars and tuples for the attitude, arrays for the rest.
+
+State: attitude ``q_fb``; ``x`` = (b, c): gyro bias and optional states c; factor ``F`` of the covariance of (δθ, δb, δc)
+(:mod:`strapdown.kernels.augmented_factor`). The optional states are told by arrays, so that no kernel knows what they are:
+
+- each decays at its own rate and is driven by its own white noise, ``ċ = −λ c + √q w``: ``decay`` λ, ``density`` q. Those that change come
+  first, those with neither come last.
+- the gyro measures ``(I + Σ c T) w + b + Σ c e + n``: ``gyro`` (states, 12) holds e (3) and T (9, by rows), ``gyro_use`` the bits
+  :data:`OFFSET` and :data:`SCALE`.
+- a sensor measures ``(I + Σ c U) R_fbᵀ (r + Σ c d) + Σ c a + v``: ``sensors`` (sensors, states, 15) holds a (3, body), d (3, fixed) and
+  U (9), ``sensor_use`` the bits :data:`OFFSET`, :data:`FIXED` and :data:`SCALE`. With :data:`CARRIED` besides, d is not firm in the
+  fixed frame but goes along when the estimated attitude is corrected: the derivative with respect to the attitude leaves it out.
+
+All but the square roots is plain arithmetic, so that the same functions serve the step-by-step face.
+"""
+
+from __future__ import annotations
+
+import math
+
+from strapdown.kernels.algebra import (
+    add,
+    add_matrices,
+    combine,
+    cross,
+    dot,
+    matrix_times_vector,
+    multiply,
+    scale,
+    skew_polynomial,
+    subtract,
+    symmetric_times_vector,
+    transpose_times_vector,
+)
+from strapdown.kernels.filter_loop import ATTITUDE, DIRECTION, HEADING, heading_error
+from strapdown.kernels.filter_step import process_noise, transition
+from strapdown.kernels.rotation import logarithm, quaternion_multiply, turned
+from strapdown.kernels.series import LARGEST_ANGLE, second, sinc
+from strapdown.kernels.smoother_step import moved
+
+OFFSET = 1
+SCALE = 2
+FIXED = 4
+CARRIED = 8
+
+NOISE_NODES = 3
+"""Rows of noise of a state that enters the gyro: its own white noise at so many instants of a step stands for the whole of it."""
+
+IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+
+# Gauss–Legendre on [0, 1], five and three nodes.
+_FIVE = (math.sqrt(5.0 - 2.0 * math.sqrt(10.0 / 7.0)) / 3.0, math.sqrt(5.0 + 2.0 * math.sqrt(10.0 / 7.0)) / 3.0)
+NODES = (0.5 - 0.5 * _FIVE[1], 0.5 - 0.5 * _FIVE[0], 0.5, 0.5 + 0.5 * _FIVE[0], 0.5 + 0.5 * _FIVE[1])
+_WEIGHT = ((322.0 - 13.0 * math.sqrt(70.0)) / 1800.0, (322.0 + 13.0 * math.sqrt(70.0)) / 1800.0)
+WEIGHTS = (_WEIGHT[0], _WEIGHT[1], 128.0 / 450.0, _WEIGHT[1], _WEIGHT[0])
+THREE_NODES = (0.5 - 0.5 * math.sqrt(0.6), 0.5, 0.5 + 0.5 * math.sqrt(0.6))
+THREE_WEIGHTS = (5.0 / 18.0, 8.0 / 18.0, 5.0 / 18.0)
+
+
+def inverse(A):
+    """Return the inverse of a 3×3 matrix."""
+    c0 = A[4] * A[8] - A[5] * A[7]
+    c1 = A[5] * A[6] - A[3] * A[8]
+    c2 = A[3] * A[7] - A[4] * A[6]
+    d = 1.0 / (A[0] * c0 + A[1] * c1 + A[2] * c2)
+    return (
+        d * c0,
+        d * (A[2] * A[7] - A[1] * A[8]),
+        d * (A[1] * A[5] - A[2] * A[4]),
+        d * c1,
+        d * (A[0] * A[8] - A[2] * A[6]),
+        d * (A[2] * A[3] - A[0] * A[5]),
+        d * c2,
+        d * (A[1] * A[6] - A[0] * A[7]),
+        d * (A[0] * A[4] - A[1] * A[3]),
+    )
+
+
+def turned_back(rate, u, v):
+    """Return exp(−[ω] u) v: what an attitude error becomes while the body turns at the rate ω for the time u."""
+    phi = scale(u, rate)
+    y = dot(phi, phi)
+    return matrix_times_vector(skew_polynomial(1.0, -sinc(y), second(y), phi), v)
+
+
+def response(rate, u, decay, v):
+    """Return ``∫₀ᵘ exp(−[ω](u − s)) v e^{−λs} ds``: the attitude error that a decaying rate error v makes in the time u.
+
+    Gauss's rule of five nodes: to rounding for |ω| u ≤ 1/3 and λ u ≤ 1/2.
+    """
+    total = (0.0, 0.0, 0.0)
+    for i in range(5):
+        s = u * NODES[i]
+        total = add(total, scale(u * WEIGHTS[i] * math.exp(-decay * s), turned_back(rate, u - s, v)))
+    return total
+
+
+def longest_step(dt, theta, limit):
+    """Return the longest step within an interval: what the polynomials bear of a turn, and ``limit`` for states that decay."""
+    longest = dt
+    squared = dot(theta, theta)
+    if squared > LARGEST_ANGLE * LARGEST_ANGLE:
+        longest = dt * (LARGEST_ANGLE / math.sqrt(squared))
+    return min(longest, limit)
+
+
+def move(q, x, dt, part, decay, gyro, gyro_use, coupling, factor):
+    """Move attitude and optional states over an increment ``part``; return q, Φ11, Φ12 and the rate.
+
+    Leaves in ``coupling`` (states, 3) the attitude's share of each optional state, Φ_θc, and in ``factor`` their own e^{−λ dt}.
+    With M = Σ c T the turn is ``φ = (I + M)⁻¹ (Δθ − b dt − Σ e ∫c dt)``, and its error ``−(I + M)⁻¹ (δb + Σ e δc + Σ T ω δc)`` a second.
+    """
+    r = combine(1.0, part, -dt, (x[0], x[1], x[2]))
+    M = IDENTITY
+    scaled = False
+    for k in range(len(decay)):
+        factor[k] = math.exp(-decay[k] * dt)
+        if gyro_use[k] & OFFSET:
+            mean = -math.expm1(-decay[k] * dt) / decay[k] if decay[k] > 0.0 else dt
+            r = combine(1.0, r, -mean * x[3 + k], (gyro[k, 0], gyro[k, 1], gyro[k, 2]))
+        if gyro_use[k] & SCALE:
+            scaled = True
+            c = x[3 + k]
+            M = add_matrices(
+                M,
+                (
+                    c * gyro[k, 3],
+                    c * gyro[k, 4],
+                    c * gyro[k, 5],
+                    c * gyro[k, 6],
+                    c * gyro[k, 7],
+                    c * gyro[k, 8],
+                    c * gyro[k, 9],
+                    c * gyro[k, 10],
+                    c * gyro[k, 11],
+                ),
+            )
+    D = inverse(M) if scaled else IDENTITY
+    phi = matrix_times_vector(D, r) if scaled else r
+    phi11, phi12 = transition(phi, dt)
+    if scaled:
+        phi12 = multiply(phi12, D)
+    rate = scale(1.0 / dt, phi)
+    for k in range(len(decay)):
+        column = (0.0, 0.0, 0.0)
+        if gyro_use[k] & OFFSET:
+            e = (gyro[k, 0], gyro[k, 1], gyro[k, 2])
+            if decay[k] > 0.0:
+                column = scale(-1.0, response(rate, dt, decay[k], matrix_times_vector(D, e)))
+            else:
+                column = matrix_times_vector(phi12, e)
+        if gyro_use[k] & SCALE:
+            told = (
+                gyro[k, 3] * rate[0] + gyro[k, 4] * rate[1] + gyro[k, 5] * rate[2],
+                gyro[k, 6] * rate[0] + gyro[k, 7] * rate[1] + gyro[k, 8] * rate[2],
+                gyro[k, 9] * rate[0] + gyro[k, 10] * rate[1] + gyro[k, 11] * rate[2],
+            )
+            column = add(column, matrix_times_vector(phi12, told))
+        coupling[k, 0], coupling[k, 1], coupling[k, 2] = column
+        x[3 + k] *= factor[k]
+    return turned(q, phi), phi11, phi12, rate, D
+
+
+def fill_noise(F, first, columns, dt, rate, D, angle_variance, rate_variance, decay, density, gyro, gyro_use):
+    """Write the rows of noise of a step, N with ``Q = Nᵀ N``, from row ``first`` of F on, ``columns`` wide; return the row after them.
+
+    Attitude and bias have the exact Q of :func:`strapdown.kernels.filter_step.process_noise` (the white noise of the gyro is told after
+    its scale factor), factored as one upper triangle. A state that enters the gyro has its noise at Gauss's three nodes of the step.
+    """
+    q11, q12, q22 = process_noise(scale(dt, rate), dt, angle_variance, rate_variance)
+    root = math.sqrt(q22)
+    inverse_root = 1.0 / root if root > 0.0 else 0.0
+    for r in range(6):
+        for i in range(columns):
+            F[first + r, i] = 0.0
+    a = (
+        inverse_root * q12[0],
+        inverse_root * q12[3],
+        inverse_root * q12[6],
+        inverse_root * q12[1],
+        inverse_root * q12[4],
+        inverse_root * q12[7],
+        inverse_root * q12[2],
+        inverse_root * q12[5],
+        inverse_root * q12[8],
+    )
+    c00 = q11[0] - a[0] * a[0] - a[3] * a[3] - a[6] * a[6]
+    c01 = q11[1] - a[0] * a[1] - a[3] * a[4] - a[6] * a[7]
+    c02 = q11[2] - a[0] * a[2] - a[3] * a[5] - a[6] * a[8]
+    c11 = q11[3] - a[1] * a[1] - a[4] * a[4] - a[7] * a[7]
+    c12 = q11[4] - a[1] * a[2] - a[4] * a[5] - a[7] * a[8]
+    c22 = q11[5] - a[2] * a[2] - a[5] * a[5] - a[8] * a[8]
+    u22 = math.sqrt(c22)
+    u12 = c12 / u22
+    u02 = c02 / u22
+    u11 = math.sqrt(c11 - u12 * u12)
+    u01 = (c01 - u02 * u12) / u11
+    F[first, 0] = math.sqrt(c00 - u01 * u01 - u02 * u02)
+    F[first + 1, 0], F[first + 1, 1] = u01, u11
+    F[first + 2, 0], F[first + 2, 1], F[first + 2, 2] = u02, u12, u22
+    for i in range(3):
+        for j in range(3):
+            F[first + 3 + i, j] = a[3 * i + j]
+        F[first + 3 + i, 3 + i] = root
+    row = first + 6
+    for k in range(len(decay)):
+        if density[k] > 0.0:
+            rows = NOISE_NODES if gyro_use[k] & OFFSET else 1
+            for r in range(rows):
+                for i in range(columns):
+                    F[row + r, i] = 0.0
+                if rows == 1:
+                    mean = -0.5 * math.expm1(-2.0 * decay[k] * dt) / decay[k] if decay[k] > 0.0 else dt
+                    F[row, 6 + k] = math.sqrt(mean * density[k])
+                else:
+                    left = dt * (1.0 - THREE_NODES[r])
+                    size = math.sqrt(THREE_WEIGHTS[r] * dt * density[k])
+                    e = matrix_times_vector(D, (gyro[k, 0], gyro[k, 1], gyro[k, 2]))
+                    t = scale(-size, response(rate, left, decay[k], e))
+                    F[row + r, 0], F[row + r, 1], F[row + r, 2] = t
+                    F[row + r, 6 + k] = size * math.exp(-decay[k] * left)
+            row += rows
+    return row
+
+
+def carry(F, first, end, phi11, phi12, coupling, factor, gyro_use, changing):
+    """Carry rows of F over a step: each is a column of S, so ``S ← Φ S``."""
+    for j in range(first, end):
+        t = matrix_times_vector(phi11, (F[j, 0], F[j, 1], F[j, 2]))
+        if j >= 3:
+            t = add(t, matrix_times_vector(phi12, (F[j, 3], F[j, 4], F[j, 5])))
+        for k in range(len(factor)):
+            f = F[j, 6 + k]
+            if f != 0.0:
+                if gyro_use[k] != 0:
+                    t = (t[0] + coupling[k, 0] * f, t[1] + coupling[k, 1] * f, t[2] + coupling[k, 2] * f)
+                if k < changing:
+                    F[j, 6 + k] = factor[k] * f
+        F[j, 0], F[j, 1], F[j, 2] = t
+
+
+def carry_back(F, first, end, phi11, phi12, coupling, factor, gyro_use, changing):
+    """Undo :func:`carry`: rows by ``Φ⁻¹``."""
+    for j in range(first, end):
+        t = subtract((F[j, 0], F[j, 1], F[j, 2]), matrix_times_vector(phi12, (F[j, 3], F[j, 4], F[j, 5])))
+        for k in range(len(factor)):
+            f = F[j, 6 + k]
+            if f != 0.0:
+                if k < changing:
+                    f = f / factor[k]
+                    F[j, 6 + k] = f
+                if gyro_use[k] != 0:
+                    t = (t[0] - coupling[k, 0] * f, t[1] - coupling[k, 1] * f, t[2] - coupling[k, 2] * f)
+        F[j, 0], F[j, 1], F[j, 2] = transpose_times_vector(phi11, t)
+
+
+def turn_rows(F, end, G):
+    """Carry the attitude's columns of rows 0 to ``end`` to another tangent space: ``S_θ ← G S_θ``."""
+    for j in range(end):
+        F[j, 0], F[j, 1], F[j, 2] = matrix_times_vector(G, (F[j, 0], F[j, 1], F[j, 2]))
+
+
+def matrix_at(array, s, k):
+    """Return the 3×3 matrix that ends row (s, k) of an array (…, …, 15)."""
+    return (
+        array[s, k, 6],
+        array[s, k, 7],
+        array[s, k, 8],
+        array[s, k, 9],
+        array[s, k, 10],
+        array[s, k, 11],
+        array[s, k, 12],
+        array[s, k, 13],
+        array[s, k, 14],
+    )
+
+
+def across(d):
+    """Return unit vectors t1, t2 with t1 × t2 = d of a unit vector d."""
+    x, y, z = abs(d[0]), abs(d[1]), abs(d[2])
+    e = (1.0, 0.0, 0.0)
+    if y < x and y <= z:
+        e = (0.0, 1.0, 0.0)
+    elif z < x:
+        e = (0.0, 0.0, 1.0)
+    t = cross(e, d)
+    t = scale(1.0 / math.sqrt(dot(t, t)), t)
+    return t, cross(d, t)
+
+
+def put_row(H, row, h):
+    """Write the attitude's part of a row."""
+    H[row, 0], H[row, 1], H[row, 2] = h
+
+
+def fill_rows(q, R, x, kind, z, frame, length, s, sensors, sensor_use, H, y, basis):
+    """Write the rows of one measurement, ``y = H δx + noise``, and return how many: 2 direction, 3 vector, 1 heading, 3 attitude.
+
+    ``frame`` is the row of the schedule's frames as a 9-tuple, ``z`` the measured vector and ``length`` what it was divided by.
+    ``sensor_use`` may be all zero: then the rows are those of the plain filter. ``basis`` (3, 3) gets the body axes that the rows
+    measure along.
+    """
+    states = len(x) - 3
+    for i in range(3):
+        for j in range(H.shape[1]):
+            H[i, j] = 0.0
+        for j in range(3):
+            basis[i, j] = 1.0 if i == j else 0.0
+    offset = (0.0, 0.0, 0.0)
+    fixed = (0.0, 0.0, 0.0)
+    carried = (0.0, 0.0, 0.0)
+    M = IDENTITY
+    coupled = False
+    for k in range(states):
+        use = sensor_use[s, k]
+        if use != 0:
+            coupled = True
+            c = x[3 + k]
+            if use & OFFSET:
+                offset = combine(1.0, offset, c / length, (sensors[s, k, 0], sensors[s, k, 1], sensors[s, k, 2]))
+            if use & FIXED:
+                d = (sensors[s, k, 3], sensors[s, k, 4], sensors[s, k, 5])
+                if use & CARRIED:
+                    carried = combine(1.0, carried, c / length, d)
+                else:
+                    fixed = combine(1.0, fixed, c / length, d)
+            if use & SCALE:
+                U = matrix_at(sensors, s, k)
+                M = add_matrices(
+                    M,
+                    (c * U[0], c * U[1], c * U[2], c * U[3], c * U[4], c * U[5], c * U[6], c * U[7], c * U[8]),
+                )
+    if kind == ATTITUDE:
+        # The offset is a rotation vector between the sensor's axes and the body's.
+        predicted, J = moved(q, offset)
+        inverted = (predicted[0], -predicted[1], -predicted[2], -predicted[3])
+        t = logarithm(quaternion_multiply(inverted, (frame[0], frame[1], frame[2], frame[3])))
+        y[0], y[1], y[2] = t
+        for j in range(3):
+            column = turned_column(offset, j)
+            H[0, j], H[1, j], H[2, j] = column
+        for k in range(states):
+            if sensor_use[s, k] & OFFSET:
+                t = matrix_times_vector(J, (sensors[s, k, 0], sensors[s, k, 1], sensors[s, k, 2]))
+                H[0, 6 + k], H[1, 6 + k], H[2, 6 + k] = t
+        return 3
+    r = (frame[6], frame[7], frame[8])
+    if kind == HEADING:
+        D = inverse(M) if coupled else IDENTITY
+        clean = matrix_times_vector(D, subtract(z, offset))
+        p = subtract(matrix_times_vector(R, clean), carried)
+        m = subtract(p, fixed)
+        level = 1.0 / (m[0] * m[0] + m[1] * m[1])
+        g = (-level * m[1], level * m[0], 0.0)
+        put_row(H, 0, transpose_times_vector(R, cross(p, g)))
+        y[0] = heading_error(IDENTITY, m, r)
+        for k in range(states):
+            use = sensor_use[s, k]
+            if use != 0:
+                e = (sensors[s, k, 0], sensors[s, k, 1], sensors[s, k, 2])
+                if use & SCALE:
+                    e = add(e, matrix_times_vector(matrix_at(sensors, s, k), clean))
+                e = matrix_times_vector(R, matrix_times_vector(D, e))
+                H[0, 6 + k] = -dot(g, add(e, (sensors[s, k, 3], sensors[s, k, 4], sensors[s, k, 5])))
+        return 1
+    u = transpose_times_vector(R, (frame[0], frame[1], frame[2]))
+    v = transpose_times_vector(R, (frame[3], frame[4], frame[5]))
+    rows = 2 if kind == DIRECTION else 3
+    third = transpose_times_vector(R, r)
+    if not coupled:
+        put_row(basis, 0, u)
+        put_row(basis, 1, v)
+        put_row(basis, 2, third)
+        put_row(H, 0, scale(-1.0, v))
+        put_row(H, 1, u)
+        y[0], y[1] = dot(u, z), dot(v, z)
+        if rows == 3:
+            y[2] = dot(third, z) - 1.0
+        return rows
+    turnable = transpose_times_vector(R, add(r, fixed))
+    seen = add(turnable, transpose_times_vector(R, carried))
+    m = add(matrix_times_vector(M, seen), offset)
+    shrink = 1.0
+    if rows == 2:
+        shrink = 1.0 / math.sqrt(dot(m, m))
+        u, v = across(scale(shrink, m))
+    residual = z if rows == 2 else subtract(z, m)
+    for i in range(rows):
+        t = u if i == 0 else (v if i == 1 else third)
+        y[i] = dot(t, residual)
+        put_row(basis, i, t)
+        # ∂m/∂δθ = (I + M) [R_fbᵀ (r + d)], and t · (A × δθ) = (t × A) · δθ
+        put_row(H, i, scale(shrink, cross(transpose_times_vector(M, t), turnable)))
+        for k in range(states):
+            use = sensor_use[s, k]
+            if use != 0:
+                e = (sensors[s, k, 0], sensors[s, k, 1], sensors[s, k, 2])
+                if use & FIXED:
+                    d = transpose_times_vector(R, (sensors[s, k, 3], sensors[s, k, 4], sensors[s, k, 5]))
+                    e = add(e, matrix_times_vector(M, d))
+                e = scale(1.0 / length, e)
+                if use & SCALE:
+                    e = add(e, matrix_times_vector(matrix_at(sensors, s, k), seen))
+                H[i, 6 + k] = shrink * dot(t, e)
+    return rows
+
+
+def decorrelate(H, y, rows, basis, noise, e, spread):
+    """Make the rows of a measurement independent, whose noise in body axes has the upper triangle noise[e]; write their variances.
+
+    With ``T C Tᵀ = L D Lᵀ`` for the rows' axes T, the rows ``L⁻¹ H`` have noise of variances D.
+    """
+    C = (noise[e, 0], noise[e, 1], noise[e, 2], noise[e, 3], noise[e, 4], noise[e, 5])
+    t0 = (basis[0, 0], basis[0, 1], basis[0, 2])
+    t1 = (basis[1, 0], basis[1, 1], basis[1, 2])
+    t2 = (basis[2, 0], basis[2, 1], basis[2, 2])
+    c0 = symmetric_times_vector(C, t0)
+    spread[0] = dot(t0, c0)
+    if rows > 1:
+        l10 = dot(t1, c0) / spread[0]
+        c1 = symmetric_times_vector(C, t1)
+        spread[1] = dot(t1, c1) - l10 * l10 * spread[0]
+        subtract_row(H, y, 1, 0, l10)
+        if rows > 2:
+            l20 = dot(t2, c0) / spread[0]
+            l21 = (dot(t2, c1) - l20 * l10 * spread[0]) / spread[1]
+            spread[2] = dot(t2, symmetric_times_vector(C, t2)) - l20 * l20 * spread[0] - l21 * l21 * spread[1]
+            subtract_row(H, y, 2, 0, l20)
+            subtract_row(H, y, 2, 1, l21)
+
+
+def subtract_row(H, y, row, other, factor):
+    """Subtract a multiple of another row."""
+    y[row] -= factor * y[other]
+    for j in range(H.shape[1]):
+        H[row, j] -= factor * H[other, j]
+
+
+def turned_column(phi, j):
+    """Return column j of exp(−[φ]), any angle: what a body-side error is behind a further turn φ."""
+    inverted, _ = moved((1.0, 0.0, 0.0, 0.0), (-phi[0], -phi[1], -phi[2]))
+    w, v = inverted[0], (inverted[1], inverted[2], inverted[3])
+    e = (1.0 if j == 0 else 0.0, 1.0 if j == 1 else 0.0, 1.0 if j == 2 else 0.0)
+    # R e = e + 2 w v × e + 2 v × (v × e)
+    once = cross(v, e)
+    return add(e, scale(2.0, add(scale(w, once), cross(v, once))))

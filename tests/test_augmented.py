@@ -1,0 +1,924 @@
+"""Optional states: the plain filter without them, one filter on both faces, exact models, sharp measurements, foreign blocks, bad input."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import filterpy.common
+import mpmath
+import numpy as np
+import pytest
+
+from strapdown import augmented, consistency, kinematics, mekf, motion, quaternion, records, smoother
+from strapdown.augmented.blocks import Block
+from strapdown.checks import InputError
+from strapdown.kernels import augmented_factor, augmented_step
+from strapdown.kernels.machine import compiled
+from strapdown.mekf import ProcessNoise
+from strapdown.records import ImuRecord
+from strapdown.vectors import VectorMeasurements
+
+NOISE = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-4)
+SWAY = motion.HarmonicRates(
+    harmonics=(
+        motion.Harmonic(amplitude=(0.9, 0.4, -0.6), frequency=0.21),
+        motion.Harmonic(amplitude=(-0.4, 0.8, 0.5), frequency=0.37),
+    )
+)
+FIELD = np.array([0.0, 2e-5, -4e-5])
+UP = np.array([0.0, 0.0, 9.81])
+
+
+def seen(body_motion, time, reference) -> np.ndarray:
+    return quaternion.rotate(quaternion.conjugate(body_motion.attitude(time)), reference)
+
+
+def record_of(body_motion=SWAY, duration=4.0, rate=50.0, seed=1, anisotropic=False) -> ImuRecord:
+    """A record with every kind of measurement, at times of their own."""
+    rng = np.random.default_rng(seed)
+    edges = np.arange(round(duration * rate) + 1) / rate
+    dt = np.diff(edges)[:, None]
+    increments = body_motion.increments(edges) + 1e-3 * np.sqrt(dt) * rng.standard_normal((len(dt), 3))
+
+    def times(interval, phase):
+        return np.arange(phase, duration, interval)
+
+    def unit(v):
+        return v / np.linalg.norm(v, axis=1, keepdims=True)
+
+    t = times(0.11, 0.013)
+    mag = seen(body_motion, t, FIELD) + 5e-7 * rng.standard_normal((len(t), 3)) + np.array([3e-6, -2e-6, 1e-6])
+    how = {"covariance": 2.5e-13 * np.array([[2.0, 0.5, 0.0], [0.5, 1.0, 0.2], [0.0, 0.2, 0.7]])}
+    series = [
+        VectorMeasurements(
+            sensor="mag",
+            kind="vector",
+            time=t,
+            vector_b=mag,
+            reference_f=FIELD,
+            **(how if anisotropic else {"sigma": np.full(len(t), 5e-7)}),
+        )
+    ]
+    t = times(0.07, 0.05)
+    force = seen(body_motion, t, UP) + 0.05 * rng.standard_normal((len(t), 3))
+    series.append(
+        VectorMeasurements(
+            sensor="force", kind="direction", time=t, vector_b=unit(force), reference_f=UP, sigma=np.full(len(t), 5e-3)
+        )
+    )
+    t = times(0.31, 0.17)
+    star = seen(body_motion, t, np.array([0.6, 0.64, 0.48])) + 2e-2 * rng.standard_normal((len(t), 3))
+    series.append(
+        VectorMeasurements(
+            sensor="compass",
+            kind="heading",
+            time=t,
+            vector_b=unit(star),
+            reference_f=np.array([0.6, 0.64, 0.48]),
+            sigma=np.full(len(t), 3e-2),
+        )
+    )
+    t = times(0.43, 0.2)
+    sigma = np.array([2e-3, 3e-3, 9e-3])
+    measured = quaternion.multiply(body_motion.attitude(t), quaternion.exp(sigma * rng.standard_normal((len(t), 3))))
+    series.append(VectorMeasurements(sensor="tracker", kind="attitude", time=t, attitude=measured, sigma_axes=sigma))
+    t = times(0.23, 0.11)
+    moving = np.stack([np.cos(t), np.sin(t), 0.5 + 0.1 * t], axis=-1)
+    seen_moving = quaternion.rotate(quaternion.conjugate(body_motion.attitude(t)), moving)
+    series.append(
+        VectorMeasurements(
+            sensor="beacon",
+            kind="vector",
+            time=t,
+            vector_b=seen_moving,
+            reference_f=moving,
+            sigma=np.full(len(t), 0.02),
+        )
+    )
+    return ImuRecord(time=edges, increments=increments, vectors=tuple(series))
+
+
+def start(body_motion=SWAY, error=(0.02, -0.01, 0.015)) -> mekf.State:
+    attitude = quaternion.multiply(body_motion.attitude(np.array(0.0)), quaternion.exp(error))
+    return mekf.initial_state(attitude, attitude_sigma=0.03, bias_sigma=3e-3)
+
+
+@dataclasses.dataclass(frozen=True)
+class ReferenceError(augmented.LinearBlock):
+    """A block that the package does not have: the field's direction is off in fixed axes, the same for two sensors."""
+
+    name: str = "field"
+    components: tuple[str, ...] = ("east", "up")
+    units: tuple[str, ...] = ("T", "T")
+
+    @property
+    def sigma(self):
+        return np.array([2e-6, 3e-6])
+
+    @property
+    def density(self):
+        return np.array([1e-14, 0.0])
+
+    @property
+    def effects(self):
+        return {
+            "mag": augmented.Effect(offset_f=np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])),
+            "compass": augmented.Effect(offset_f=1e4 * np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])),
+        }
+
+
+@dataclasses.dataclass(frozen=True)
+class Mounting(augmented.LinearBlock):
+    """The tracker's axes are turned a little against the body's."""
+
+    name: str = "mounting"
+    components: tuple[str, ...] = ("x", "y", "z")
+    units: tuple[str, ...] = ("rad",) * 3
+
+    @property
+    def sigma(self):
+        return np.full(3, 0.05)
+
+    @property
+    def effects(self):
+        return {"tracker": augmented.Effect(offset_b=np.eye(3))}
+
+
+OPTIONS: dict[str, tuple[Block, ...]] = {
+    "none": (),
+    "gyro scale": (augmented.GyroScale(scale_sigma=0.02, misalignment_sigma=0.01),),
+    "gyro drift": (augmented.GyroGaussMarkov(bias_sigma=np.array([3e-3, 4e-3, 5e-3]), correlation_time=1.5),),
+    "hard iron": (augmented.VectorBias(sensor="mag", bias_sigma=5e-6, unit="T"),),
+    "hard iron that walks": (augmented.VectorBias(sensor="mag", bias_sigma=5e-6, rate_random_walk=1e-7, unit="T"),),
+    "soft iron": (augmented.VectorScale(sensor="mag", scale_sigma=0.05),),
+    "bias of a direction": (augmented.VectorBias(sensor="force", bias_sigma=0.05),),
+    "bias and scale of a heading": (
+        augmented.VectorBias(sensor="compass", bias_sigma=0.05),
+        augmented.VectorScale(sensor="compass", scale_sigma=0.05),
+    ),
+    "acceleration in body axes": (augmented.GaussMarkov(sensor="force", noise_sigma=0.1, correlation_time=0.7),),
+    "acceleration in fixed axes": (
+        augmented.GaussMarkov(sensor="force", noise_sigma=0.1, correlation_time=0.2, frame="fixed"),
+    ),
+    "two frames": (
+        augmented.GaussMarkov(sensor="mag", noise_sigma=4e-6, correlation_time=0.7, frame="fixed", unit="T"),
+        augmented.VectorScale(sensor="mag", scale_sigma=0.05),
+    ),
+    "a carried offset of a heading": (
+        augmented.GaussMarkov(sensor="compass", noise_sigma=0.1, correlation_time=0.7, frame="fixed"),
+        augmented.VectorScale(sensor="compass", scale_sigma=0.05),
+    ),
+    "a foreign block": (ReferenceError(),),
+    "mounting": (Mounting(),),
+    "all": (
+        augmented.VectorBias(sensor="mag", bias_sigma=5e-6, unit="T"),
+        augmented.GyroScale(scale_sigma=0.02, misalignment_sigma=0.01),
+        augmented.GaussMarkov(sensor="force", noise_sigma=0.1, correlation_time=0.7),
+        augmented.GyroGaussMarkov(bias_sigma=3e-3, correlation_time=20.0),
+    ),
+}
+
+
+def scaled(P: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    return P / (sigma[..., :, None] * sigma[..., None, :])
+
+
+# ------------------------------------------------------------------------------------------------------- without blocks: the plain filter
+
+
+FAST = motion.ConstantRate(rate=(30.0, -20.0, 25.0))
+
+
+@pytest.mark.parametrize("body_motion", [SWAY, FAST], ids=["sway", "44 rad/s"])
+@pytest.mark.parametrize("anisotropic", [False, True])
+def test_without_blocks_it_is_the_plain_filter(body_motion, anisotropic):
+    record, initial = record_of(body_motion, anisotropic=anisotropic), start(body_motion)
+    one = mekf.run(record, NOISE, initial, every=3, full_covariance=True)
+    other = augmented.run(record, NOISE, initial, every=3, full_covariance=True)
+    assert np.array_equal(one.time, other.time)
+    error = consistency.errors(one.attitude, one.bias, other.attitude, other.bias)
+    assert np.max(np.abs(error) / one.sigma) < 5e-12
+    assert np.max(np.abs(scaled(one.covariance - other.covariance, one.sigma))) < 5e-12
+    assert dict(one.skipped) == dict(other.skipped)
+    for name, innovations in one.innovations.items():
+        np.testing.assert_allclose(other.innovations[name].nis, innovations.nis, rtol=1e-9, atol=1e-12)
+        if not anisotropic:
+            np.testing.assert_allclose(other.innovations[name].whitened, innovations.whitened, rtol=0, atol=1e-11)
+
+
+def test_without_blocks_the_smoother_is_the_plain_smoother():
+    record, initial = record_of(), start(error=(0.2, -0.3, 0.1))
+    initial = dataclasses.replace(initial, covariance=100.0 * initial.covariance)
+    one = smoother.run(record, NOISE, initial, full_covariance=True)
+    other = augmented.smooth(record, NOISE, initial, full_covariance=True)
+    error = consistency.errors(one.attitude, one.bias, other.attitude, other.bias)
+    assert np.max(np.abs(error) / one.sigma) < 1e-8
+    assert np.max(np.abs(scaled(one.covariance - other.covariance, one.sigma))) < 1e-8
+
+
+# ------------------------------------------------------------------------------------------------------------------------ two faces
+
+
+@pytest.mark.parametrize("option", OPTIONS)
+def test_both_faces_are_one_filter(option):
+    record, initial, blocks = record_of(duration=2.0, anisotropic=option == "all"), start(), OPTIONS[option]
+    whole = augmented.run(record, NOISE, initial, blocks, full_covariance=True)
+    state = augmented.initial_state(initial, blocks)
+    step, end = augmented.stepping.run_on(record, NOISE, state, blocks, full_covariance=True)
+    sigma = np.sqrt(np.einsum("kii->ki", whole.whole_covariance))
+    values = {name: block.values for name, block in step.blocks.items()}
+    assert np.max(np.abs(whole.errors(step.attitude, step.bias, values)) / sigma) < 1e-10
+    assert np.max(np.abs(scaled(whole.whole_covariance - step.whole_covariance, sigma))) < 1e-10
+    for name, innovations in whole.innovations.items():
+        np.testing.assert_allclose(step.innovations[name].whitened, innovations.whitened, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(end.covariance, step.whole_covariance[-1], rtol=1e-9, atol=1e-30)
+
+
+# -------------------------------------------------------------------------------------------------------------------- exact models
+
+
+def face_at(blocks: tuple[Block, ...], values=None, body_motion=SWAY) -> augmented.StepFilter:
+    """The step-by-step face at an attitude with a bias, its blocks at random values."""
+    state = augmented.initial_state(start(body_motion), blocks)
+    if values is None:
+        values = np.sqrt(np.diag(state.covariance)[6:]) * np.random.default_rng(4).standard_normal(len(state.values))
+    return augmented.StepFilter(
+        NOISE, dataclasses.replace(state, values=values, bias=np.array([2e-3, -1e-3, 4e-3])), blocks
+    )
+
+
+GYRO_OPTIONS = {
+    "gyro scale": (*OPTIONS["gyro scale"], *OPTIONS["hard iron that walks"]),
+    "gyro drift": OPTIONS["gyro drift"],
+    "all": OPTIONS["all"],
+}
+
+
+@pytest.mark.parametrize("option", GYRO_OPTIONS)
+def test_the_turn_is_what_the_gyro_model_says(option):
+    """Turn by (I + M)⁻¹ of what the gyro tells less bias and drift, the drift averaged over the step."""
+    blocks = GYRO_OPTIONS[option]
+    face = face_at(blocks)
+    part, dt = np.array([0.1, -0.2, 0.15]), 0.05
+    M, drift, first = np.zeros((3, 3)), np.zeros(3), 0
+    for block in blocks:
+        values = face.values[first : first + block.size]
+        first += block.size
+        if isinstance(block, augmented.GyroScale):
+            M = values.reshape(3, 3)
+        if isinstance(block, augmented.GyroGaussMarkov):
+            tau = block.correlation_time
+            drift = values * tau * (1.0 - math.exp(-dt / tau))
+    turn = np.linalg.solve(np.eye(3) + M, part - face.bias * dt - drift)
+    expected = quaternion.multiply(face.attitude, quaternion.exp(turn))
+    face.predict(part, dt)
+    assert quaternion.angle_between(face.attitude, expected) < 1e-15
+
+
+@pytest.mark.parametrize("option", GYRO_OPTIONS)
+def test_the_transition_is_the_derivative_of_the_turn(option):
+    """Φ at random values of all states, scale factors and all, against differences of the propagation itself."""
+    blocks = GYRO_OPTIONS[option]
+    part, dt = np.array([0.1, -0.2, 0.15]), 0.05
+    face = face_at(blocks)
+    n, before = len(face.x), face.state()
+    sigma = np.sqrt(np.diag(face.P))
+    face.predict(part, dt)
+
+    def after(column: int, step: float) -> np.ndarray:
+        error = np.zeros(n)
+        error[column] = step
+        moved = augmented.AugmentedState(
+            attitude=quaternion.multiply(before.attitude, quaternion.exp(error[:3])),
+            bias=before.bias + error[3:6],
+            values=before.values + error[6:],
+            covariance=before.covariance,
+        )
+        other = augmented.StepFilter(NOISE, moved, blocks)
+        other.predict(part, dt)
+        turn = quaternion.log(quaternion.multiply(quaternion.conjugate(face.attitude), other.attitude))
+        return np.concatenate([turn, other.bias - face.bias, other.values - face.values])
+
+    h = 1e-3 * sigma
+    numeric = np.stack([(after(k, h[k]) - after(k, -h[k])) / (2.0 * h[k]) for k in range(n)], axis=-1)
+    # The turn takes a drift by its mean over the step; Φ knows that it decays meanwhile.
+    drifts = [k for k, name in enumerate(augmented.observing.state_names(blocks)[0]) if name.startswith("gyro drift")]
+    tolerance = np.full(n, 1e-11)
+    tolerance[drifts] = 2e-7
+    assert np.all(np.abs((face.F - numeric) * sigma) < tolerance)
+
+
+@pytest.mark.parametrize("turn", [1e-6, 1e-3, 0.05, 0.3])
+@pytest.mark.parametrize("option", [*GYRO_OPTIONS, "acceleration in body axes"])
+def test_transition_and_noise_are_those_of_van_loan(option, turn):
+    blocks = {**OPTIONS, **GYRO_OPTIONS}[option]
+    m, dt = sum(block.size for block in blocks), 0.02
+    face = face_at(blocks, np.zeros(m))
+    w = np.array([0.6, -0.64, 0.48]) * turn / dt
+    face.predict((w + face.bias) * dt, dt)
+    A, G = np.zeros((6 + m, 6 + m)), np.zeros((6 + m, 6 + m))
+    A[:3, :3], A[:3, 3:6] = -kinematics.skew(w), -np.eye(3)
+    G[:6, :6] = np.diag(np.repeat([NOISE.angle_random_walk, NOISE.rate_random_walk], 3))
+    first = 6
+    for block in blocks:
+        own = slice(first, first + block.size)
+        np.testing.assert_allclose(block.transition(dt), face.F[own, own], rtol=1e-14)
+        np.testing.assert_allclose(block.process_noise(dt), face.Q[own, own], rtol=1e-9)
+        A[own, own], G[own, own] = np.diag(-block.decay), np.diag(np.sqrt(block.density))
+        A[:3, own] = -(block.gyro_offset + block.gyro_scale @ w).T
+        first += block.size
+    F, Q = filterpy.common.van_loan_discretization(A, G, dt)
+    sigma = np.sqrt(np.maximum(np.diag(Q), 1e-20))
+    state = np.sqrt(np.diag(face.P))
+    np.testing.assert_allclose(face.F * state, F * state, rtol=0, atol=1e-13)
+    # Three nodes for the noise of a state in the gyro: exact to the sixth order of the turn.
+    tolerance = 1e-10 + (1e-3 * turn**4 if option in ("gyro drift", "all") else 0.0)
+    assert np.max(np.abs(scaled(face.Q - Q, sigma))) < tolerance
+
+
+def measured(kind: str, sensor: str, q, values: dict, reference, estimated):
+    """What an ideal sensor with these effects gives: a model of its own. What is carried is known relative to the estimated attitude."""
+    offset = values.get((sensor, "offset_b"), np.zeros(3))
+    fixed = values.get((sensor, "offset_f"), np.zeros(3))
+    S = np.eye(3) + values.get((sensor, "scale"), np.zeros((3, 3)))
+    if kind == "attitude":
+        return quaternion.multiply(q, quaternion.exp(offset))
+    carried = values.get((sensor, "carried"), np.zeros(3))
+    field_b = quaternion.rotate(quaternion.conjugate(q), reference + fixed)
+    vector = S @ (field_b + quaternion.rotate(quaternion.conjugate(estimated), carried)) + offset
+    return vector / np.linalg.norm(vector) if kind == "direction" else vector
+
+
+SENSORS = {
+    "mag": ("vector", FIELD),
+    "force": ("direction", UP / 9.81),
+    "compass": ("heading", np.array([0.6, 0.64, 0.48])),
+    "tracker": ("attitude", None),
+}
+
+
+def effects_of(blocks: tuple[Block, ...], values: np.ndarray) -> dict:
+    found: dict = {}
+    first = 0
+    for block in blocks:
+        own = values[first : first + block.size]
+        first += block.size
+        for sensor, effect in block.effects.items():
+            for name in ("offset_b", "offset_f", "scale"):
+                rows = getattr(effect, name)
+                if rows is not None:
+                    key = (sensor, "carried" if name == "offset_f" and effect.carried else name)
+                    found[key] = found.get(key, 0.0) + np.tensordot(own, rows, axes=1)
+    return found
+
+
+@pytest.mark.parametrize("option", [name for name in OPTIONS if name not in ("none", "gyro scale", "gyro drift")])
+def test_rows_are_the_derivative_of_what_sensors_give(option):
+    """H of each kind, at random values of the states, against differences of an independent model of the sensor."""
+    blocks = OPTIONS[option]
+    named = {sensor for block in blocks for sensor in block.effects}
+    face = face_at(blocks)
+    n, sigma = len(face.x), np.sqrt(np.diag(face.P))
+    values = effects_of(blocks, face.values)
+    for sensor in named:
+        kind, reference = SENSORS[sensor]
+
+        def residual(q, effects, sensor=sensor, kind=kind, reference=reference):
+            return rows_at(face, sensor, kind, reference, measured(kind, sensor, q, effects, reference, face.attitude))
+
+        rows, zero = residual(face.attitude, values)
+        np.testing.assert_allclose(zero, 0.0, atol=1e-14)
+        numeric = np.empty_like(rows)
+        for k in range(n):
+            sides = []
+            for h in (1e-4 * sigma[k], -1e-4 * sigma[k]):
+                error = np.zeros(n)
+                error[k] = h
+                q = quaternion.multiply(face.attitude, quaternion.exp(error[:3]))
+                sides.append(residual(q, effects_of(blocks, face.values + error[6:]))[1])
+            numeric[:, k] = (sides[0] - sides[1]) / (2e-4 * sigma[k])
+        np.testing.assert_allclose(rows * sigma, numeric * sigma, rtol=0, atol=1e-8 * np.max(np.abs(rows * sigma)))
+        assert np.any(rows[:, 6:] != 0.0)
+
+
+def rows_at(face, sensor, kind, reference, z):
+    """Return H and y that the kernel makes of a measurement at the face's estimate."""
+    H, y, basis = np.empty((3, len(face.x))), np.empty(3), np.empty((3, 3))
+    model = face._model(sensor)
+    length = np.linalg.norm(reference) if kind == "vector" else 1.0
+    attitude = kind == "attitude"
+    frame = (*z, 0.0, 0.0, 0.0, 0.0, 0.0) if attitude else tuple(augmented.stepping.triad(reference).ravel())
+    count = augmented_step.fill_rows(
+        tuple(face.attitude),
+        tuple(quaternion.to_matrix(face.attitude).ravel()),
+        np.array([*face.bias, *face.values]),
+        augmented.stepping.KIND_CODES[kind],
+        (0.0, 0.0, 0.0) if attitude else tuple(z / length),
+        frame,
+        length,
+        0,
+        model.sensors,
+        model.sensor_use,
+        H,
+        y,
+        basis,
+    )
+    return H[:count], y[:count]
+
+
+# ------------------------------------------------------------------------------------------------- square root: sharp, diffuse, long
+
+
+def test_two_directions_and_a_diffuse_prior_give_the_closed_form():
+    """σ² diag(1, 1, ½): each axis is shown by the direction across it, the third by both."""
+    sigma = 1e-6
+    series = tuple(
+        VectorMeasurements(
+            sensor=name,
+            kind="direction",
+            time=np.array([0.0]),
+            vector_b=[axis],
+            reference_f=axis,
+            sigma=np.array([sigma]),
+        )
+        for name, axis in (("x", np.array([1.0, 0.0, 0.0])), ("y", np.array([0.0, 1.0, 0.0])))
+    )
+    record = ImuRecord(time=np.array([0.0, 1.0]), increments=np.zeros((1, 3)), vectors=series)
+    initial = mekf.initial_state(quaternion.IDENTITY, attitude_sigma=1e3, bias_sigma=1.0)
+    blocks = (augmented.GyroScale(scale_sigma=1.0, misalignment_sigma=1.0),)
+    P = augmented.run(record, NOISE, initial, blocks, full_covariance=True).whole_covariance[0]
+    np.testing.assert_allclose(P[:3, :3], sigma**2 * np.diag([1.0, 1.0, 0.5]), rtol=1e-12, atol=1e-12 * sigma**2)
+    np.testing.assert_allclose(P[3:, 3:], np.eye(12), rtol=1e-14, atol=1e-14)
+
+
+@pytest.mark.parametrize("sharpness", [1e-9, 1e-6, 1e-3, 1.0, 1e3])
+def test_the_factor_keeps_its_digits_however_sharp_the_measurement(sharpness):
+    """Predictions and rows of random directions in nine states over ten decades, against 60 digits."""
+    rng = np.random.default_rng(7)
+    n, noisy, p = 9, 6, 6
+    prior = np.geomspace(1e-5, 1e5, n)[rng.permutation(n)]
+    F = np.zeros((n + p, n))
+    F[:n] = np.diag(prior)
+    gain, work = np.empty(n), np.empty(n)
+    with mpmath.workdps(60):
+        P = mpmath.diag([mpmath.mpf(s) ** 2 for s in prior])
+        for _ in range(6):
+            phi = np.eye(n)
+            phi[:3] += 0.1 * rng.standard_normal((3, n)) * prior[:3, None] / prior
+            noise = np.zeros((p, n))
+            noise[:, :noisy] = 1e-3 * rng.standard_normal((p, noisy)) * prior[:noisy]
+            F[:n] = F[:n] @ phi.T
+            F[n:] = noise
+            augmented_factor.triangularise(F, noisy, 3, n, n + p, 0, 0, work)
+            P = mpmath.matrix(phi) * P * mpmath.matrix(phi).T + mpmath.matrix(noise).T * mpmath.matrix(noise)
+            for _ in range(4):
+                H = rng.standard_normal((1, n)) / prior
+                s = augmented_factor.take_row(F, n, H, 0, sharpness**2, gain)
+                h = mpmath.matrix(H)
+                exact = (h * P * h.T)[0] + mpmath.mpf(sharpness) ** 2
+                K = P * h.T / exact
+                assert abs(s / exact - 1) < 1e-7
+                P = P - K * (h * P)
+        exact = np.array(P.tolist(), np.float64)
+    assert np.array_equal(F[:n], np.tril(F[:n]))
+    found = F[:n].T @ F[:n]
+    sigma = np.sqrt(np.diag(exact))
+    assert np.max(np.abs(scaled(found - exact, sigma))) < 1e-7
+    assert np.all(np.diag(F[:n]) != 0.0)
+
+
+@pytest.mark.parametrize("sharpness", [1e-9, 1.0, 1e3])
+def test_the_covariance_stays_positive_definite(sharpness):
+    """Ten thousand predictions and updates whose σ is so many times the prior's."""
+    rng = np.random.default_rng(3)
+    edges = np.arange(10001) / 100.0
+    sensors = []
+    for name, r in (("mag", FIELD / np.linalg.norm(FIELD)), ("force", UP / 9.81)):
+        z = seen(SWAY, edges[1:], r)
+        sensors.append(
+            VectorMeasurements(
+                sensor=name,
+                kind="vector",
+                time=edges[1:],
+                vector_b=z,
+                reference_f=r,
+                sigma=np.full(10000, 0.03 * sharpness),
+            )
+        )
+    increments = SWAY.increments(edges) + 1e-4 * rng.standard_normal((10000, 3)) * (sharpness > 1.0)
+    record = ImuRecord(time=edges, increments=increments, vectors=tuple(sensors))
+    estimate, end = augmented.run_on(
+        record, NOISE, start(error=(0.0, 0.0, 0.0)), OPTIONS["all"], every=100, full_covariance=True
+    )
+    P = estimate.whole_covariance
+    assert np.array_equal(P, np.swapaxes(P, 1, 2))
+    # Of a correlation matrix eigenvalues below 1e-16 are rounding; the factor holds their roots to 1e-16.
+    correlation = scaled(P, np.sqrt(np.einsum("kii->ki", P)))
+    assert np.linalg.eigvalsh(correlation).min() > -1e-14
+    least = np.linalg.svd(end.factor / np.linalg.norm(end.factor, axis=0), compute_uv=False)[-1]
+    assert least > 1e-12
+
+
+@pytest.mark.parametrize("option", ["all", "a foreign block"])
+def test_a_split_run_is_the_whole_run_to_the_bit(option):
+    record, blocks = record_of(), OPTIONS[option]
+    whole, end = augmented.run_on(record, NOISE, start(), blocks, full_covariance=True)
+    first, middle = augmented.run_on(records.cut(record, 0, 77), NOISE, start(), blocks, full_covariance=True)
+    rest = records.cut(record, 77, len(record.increments))
+    second, last = augmented.run_on(rest, NOISE, middle, blocks, full_covariance=True)
+    for name in ("attitude", "bias", "variance", "whole_covariance"):
+        joined = np.concatenate([getattr(first, name)[:-1], getattr(second, name)])
+        assert np.array_equal(joined, getattr(whole, name)), name
+    assert np.array_equal(last.factor, end.factor)
+    # Without the factor, from the covariance alone, the same to rounding.
+    bare = dataclasses.replace(middle, factor=None)
+    again = augmented.run(rest, NOISE, bare, blocks)
+    np.testing.assert_allclose(again.bias, second.bias, rtol=0, atol=1e-9 * np.max(second.sigma))
+
+
+# ------------------------------------------------------------------------------------------------------------------------- smoother
+
+
+def reference_smoother(record, initial, blocks):
+    """The textbook smoother on whole matrices, over what the step-by-step face passed through."""
+    face = augmented.StepFilter(NOISE, initial, blocks)
+    series = {(t, i): (s, j) for i, s in enumerate(record.vectors) for j, t in enumerate(s.time)}
+    stops = np.unique(np.concatenate([record.time, [t for t, _ in series]]))
+    filtered, steps, at_edge, n = [], [], [], len(face.x)
+    for j, now in enumerate(stops):
+        if j > 0:
+            k = int(np.searchsorted(record.time, now)) - 1
+            dt = now - stops[j - 1]
+            face.predict(record.increments[k] * (dt / (record.time[k + 1] - record.time[k])), dt)
+            steps.append((face.attitude, face.bias, face.values.copy(), face.P.copy(), face.F.copy()))
+        for t, i in sorted(series):
+            if t == now:
+                s, row = series[t, i]
+                if s.kind == "attitude":
+                    face.update_attitude(s.attitude[row], s.sigma_axes[row], s.sensor)
+                else:
+                    update = getattr(face, f"update_{s.kind}")
+                    update(s.vector_b[row], s.references_f[row], s.sigma[row], s.sensor)
+        filtered.append((face.attitude, face.bias, face.values.copy(), face.P.copy()))
+        at_edge.append(now in record.time)
+    rows = [filtered[-1]]
+    for (q, b, c, P), (q_minus, b_minus, c_minus, P_minus, F) in zip(filtered[-2::-1], steps[::-1], strict=True):
+        q_next, b_next, c_next, P_next = rows[-1]
+        a = quaternion.log(quaternion.multiply(quaternion.conjugate(q_minus), q_next))
+        J = np.eye(n)
+        J[:3, :3] = np.linalg.inv(kinematics.right_jacobian(a))
+        scale = np.sqrt(np.diag(P_minus))
+        C = np.linalg.solve(scaled(P_minus, scale), (F @ P) / scale[:, None]).T / scale
+        x = C @ np.concatenate([a, b_next - b_minus, c_next - c_minus])
+        after = P + C @ (J @ P_next @ J.T - P_minus) @ C.T
+        J[:3, :3] = kinematics.right_jacobian(x[:3])
+        turned = quaternion.multiply(q, quaternion.exp(x[:3]))
+        rows.append((turned, b + x[3:6], c + x[6:], J @ after @ J.T))
+    kept = [row for row, edge in zip(rows[::-1], at_edge, strict=True) if edge]
+    return [np.array(column) for column in zip(*kept, strict=True)]
+
+
+@pytest.mark.parametrize(
+    "option", ["gyro scale", "gyro drift", "two frames", "hard iron that walks", "mounting", "all"]
+)
+def test_the_smoother_is_the_textbook_one(option):
+    record, blocks = record_of(duration=1.5, rate=25.0), OPTIONS[option]
+    # A wrong start, so that corrections are tenths of a radian and a missing Jacobian shows.
+    initial = start(error=(0.2, -0.1, 0.15))
+    initial = dataclasses.replace(initial, covariance=np.diag([0.04] * 3 + [1e-5] * 3))
+    one = augmented.smooth(record, NOISE, initial, blocks, full_covariance=True)
+    q, b, c, P = reference_smoother(record, initial, blocks)
+    sigma = np.sqrt(np.einsum("kii->ki", one.whole_covariance))
+    values = dict(zip(one.blocks, np.split(c, np.cumsum([block.size for block in blocks])[:-1], axis=1), strict=True))
+    assert np.max(np.abs(one.errors(q, b, values)) / sigma) < 1e-8
+    assert np.max(np.abs(scaled(one.whole_covariance - P, sigma))) < 1e-8
+
+
+@pytest.mark.parametrize("option", [name for name in OPTIONS if name != "none"])
+def test_the_smoother_is_never_worse_than_the_filter(option):
+    record, blocks = record_of(), OPTIONS[option]
+    ahead = augmented.run(record, NOISE, start(), blocks, full_covariance=True)
+    both = augmented.smooth(record, NOISE, start(), blocks, full_covariance=True)
+    sigma = np.sqrt(np.einsum("kii->ki", ahead.whole_covariance))
+    # By the whole matrix, but for the turn of the tangent space, which is of second order.
+    gained = np.linalg.eigvalsh(scaled(ahead.whole_covariance - both.whole_covariance, sigma))
+    assert gained.min() > -2e-2 * np.max(sigma[:, :3])
+    for name, block in both.blocks.items():
+        assert np.all(block.sigma <= ahead.blocks[name].sigma * (1.0 + 1e-9))
+    assert np.all(both.sigma <= ahead.sigma * (1.0 + 1e-3))
+    assert np.all(both.sigma[:100] < ahead.sigma[:100])
+    np.testing.assert_allclose(both.whole_covariance[-1], ahead.whole_covariance[-1], rtol=1e-12, atol=1e-30)
+    # What does not change is one number over the whole record.
+    for block in blocks:
+        still = (block.decay == 0.0) & (block.density == 0.0)
+        found = both.blocks[block.name]
+        assert (
+            np.max(np.abs(found.values[:, still] - found.values[-1, still]) / found.sigma[:, still], initial=0.0) < 1e-9
+        )
+
+
+def test_a_gap_of_many_correlation_times_does_no_harm():
+    """What a coloured noise was before the gap says nothing of what it is after it; the steps within are bounded."""
+    record = record_of()
+    time = np.where(np.arange(len(record.time)) > 100, record.time + 60.0, record.time)
+    later = tuple(
+        dataclasses.replace(s, time=np.where(s.time > 2.0, s.time + 60.0, s.time)).taken(np.abs(s.time - 2.01) > 0.011)
+        for s in record.vectors[:3]
+    )
+    record = ImuRecord(time=time, increments=record.increments, vectors=later)
+    blocks = (augmented.GaussMarkov(sensor="force", noise_sigma=0.1, correlation_time=0.2),)
+    ahead = augmented.run(record, NOISE, start(), blocks)
+    both = augmented.smooth(record, NOISE, start(), blocks)
+    assert ahead.blocks["force disturbance"].sigma[101] == pytest.approx(0.1, rel=1e-6)
+    assert np.all(np.isfinite(both.variance))
+    assert np.all(both.sigma <= ahead.sigma * (1.0 + 1e-3))
+    assert [event.kind for event in ahead.events] == ["gap"]
+
+
+# -------------------------------------------------------------------------------------------------------- blocks told by functions
+
+
+class AsGeneral(augmented.GeneralBlock):
+    """A linear block told by functions instead of by arrays."""
+
+    def __init__(self, block: augmented.LinearBlock) -> None:
+        self.block, self.name, self.components = block, block.name, block.components
+        self.units, self.sigma = block.units, block.sigma
+
+    def propagate(self, values, interval):
+        transition = self.block.transition(interval.dt)
+        return transition @ values, transition, np.zeros((self.size, 3)), self.block.process_noise(interval.dt)
+
+    def gyro(self, values, interval):
+        return values @ self.block.gyro_offset, self.block.gyro_offset
+
+    def measured(self, values, view):
+        effect = self.block.effects.get(view.sensor)
+        return None if effect is None else (values @ effect.offset_b, effect.offset_b)
+
+
+@dataclasses.dataclass(frozen=True)
+class SecondBias(augmented.LinearBlock):
+    """One more constant gyro bias, on one axis."""
+
+    name: str = "second bias"
+    components: tuple[str, ...] = ("y",)
+    units: tuple[str, ...] = ("rad/s",)
+
+    @property
+    def sigma(self):
+        return np.array([2e-3])
+
+    @property
+    def gyro_offset(self):
+        return np.array([[0.0, 1.0, 0.0]])
+
+
+@pytest.mark.parametrize(
+    "option", ["hard iron that walks", "bias of a direction", "acceleration in body axes", "second bias"]
+)
+def test_a_block_told_by_functions_is_the_same_block(option):
+    linear = {**OPTIONS, "second bias": (SecondBias(),)}[option]
+    record = record_of(duration=1.5)
+    others = (augmented.GyroScale(scale_sigma=0.02, misalignment_sigma=0.01),)
+    one = augmented.run(record, NOISE, start(), (*linear, *others), full_covariance=True)
+    told = tuple(AsGeneral(block) for block in linear)
+    other = augmented.run(record, NOISE, start(), (*told, *others), full_covariance=True)
+    sigma = np.sqrt(np.einsum("kii->ki", one.whole_covariance))
+    values = {name: block.values for name, block in other.blocks.items()}
+    assert np.max(np.abs(one.errors(other.attitude, other.bias, values)) / sigma) < 1e-9
+    assert np.max(np.abs(scaled(one.whole_covariance - other.whole_covariance, sigma))) < 1e-9
+
+
+class Latency(augmented.GeneralBlock):
+    """A sensor's stamps are late by τ: it shows where the body was, ``exp([ω] τ) R_fbᵀ r ≈ r_b + τ ω × r_b``."""
+
+    name, components, units, sigma = "latency", ("mag",), ("s",), np.array([0.05])
+
+    def measured(self, values, view):
+        if view.sensor != "mag":
+            return None
+        swept = np.cross(view.rate, view.expected_b)
+        return values[0] * swept, swept[None]
+
+
+def test_a_foreign_block_finds_a_latency():
+    """Declared here and unknown to the package: it goes by the rate, so it runs on the step-by-step face."""
+    rng = np.random.default_rng(2)
+    edges = np.arange(801) / 50.0
+    series = []
+    for name, r, late in (("mag", FIELD / np.linalg.norm(FIELD), 0.03), ("force", UP / 9.81, 0.0)):
+        z = seen(SWAY, edges[1::2] - late, r) + 3e-3 * rng.standard_normal((400, 3))
+        z /= np.linalg.norm(z, axis=1, keepdims=True)
+        series.append(
+            VectorMeasurements(
+                sensor=name, kind="direction", time=edges[1::2], vector_b=z, reference_f=r, sigma=np.full(400, 3e-3)
+            )
+        )
+    record = ImuRecord(time=edges, increments=SWAY.increments(edges), vectors=tuple(series))
+    found = augmented.run(record, NOISE, start(), (Latency(),)).blocks["latency"]
+    assert found.sigma[-1, 0] < 1e-3
+    assert abs(found.values[-1, 0] - 0.03) < 4.0 * found.sigma[-1, 0]
+
+
+class Velocity(augmented.GeneralBlock):
+    """Velocity in fixed axes, from a specific force that is constant in the body: it changes with the attitude."""
+
+    name, components, units, sigma = "velocity", ("x", "y", "z"), ("m/s",) * 3, np.full(3, 0.1)
+    force_b = np.array([1.0, -2.0, 9.0])
+
+    def propagate(self, values, interval):
+        R = quaternion.to_matrix(interval.attitude)
+        after = values + R @ self.force_b * interval.dt
+        return after, np.eye(3), -R @ kinematics.skew(self.force_b) * interval.dt, np.zeros((3, 3))
+
+
+def test_a_foreign_block_may_change_with_the_attitude():
+    face = augmented.StepFilter(NOISE, start(), (Velocity(),))
+    before = face.state()
+    turned = augmented.StepFilter(
+        NOISE,
+        dataclasses.replace(before, attitude=quaternion.multiply(before.attitude, quaternion.exp([0.0, 1e-6, 0.0]))),
+        (Velocity(),),
+    )
+    for one in (face, turned):
+        one.predict([0.01, 0.02, -0.01], 0.1)
+    np.testing.assert_allclose((turned.values - face.values) / 1e-6, face.F[6:, 1], rtol=1e-5)
+    assert np.all(face.P[6:, :3] != 0.0)
+    assert face.time == 0.1
+
+
+# ------------------------------------------------------------------------------------------------------------------- observability
+
+
+def plain_record(body_motion, duration=20.0):
+    edges = np.arange(round(duration * 50.0) + 1) / 50.0
+    rng = np.random.default_rng(8)
+    series = []
+    for name, r, sigma, offset in (
+        ("mag", FIELD, 5e-7, np.array([4e-6, -6e-6, 2e-6])),
+        ("force", UP, 0.05, np.zeros(3)),
+    ):
+        z = seen(body_motion, edges[1::5], r) + offset + sigma * rng.standard_normal((len(edges[1::5]), 3))
+        series.append(
+            VectorMeasurements(
+                sensor=name, kind="vector", time=edges[1::5], vector_b=z, reference_f=r, sigma=np.full(len(z), sigma)
+            )
+        )
+    increments = body_motion.increments(edges) + 1e-3 * np.sqrt(0.02) * rng.standard_normal((len(edges) - 1, 3))
+    return ImuRecord(time=edges, increments=increments, vectors=tuple(series))
+
+
+HAND = motion.HarmonicRates(
+    harmonics=(
+        motion.Harmonic(amplitude=(1.2, 0.2, -0.3), frequency=0.21),
+        motion.Harmonic(amplitude=(-0.3, 1.1, 0.4), frequency=0.37),
+        motion.Harmonic(amplitude=(0.3, -0.2, 1.3), frequency=0.29, phase=1.0),
+    )
+)
+
+
+def test_hard_iron_needs_a_turn():
+    """Still, the field's horizontal part and the heading are one; turned about, all is told."""
+    blocks = (augmented.VectorBias(sensor="mag", bias_sigma=1e-5, unit="T"),)
+    initial = mekf.initial_state(quaternion.IDENTITY, attitude_sigma=0.3, bias_sigma=5e-3)
+    still = augmented.observability(plain_record(motion.rest()), NOISE, initial, blocks)
+    assert still.rank == 8
+    assert still.singular_values[-1] < 0.5
+    # Heading and what is east in the body: a heading δψ moves the field of 20 µT by 20 µT δψ.
+    expected = np.zeros(9)
+    expected[[2, 6]] = np.array([1.0 / 0.3, -2e-5 / 1e-5]) / np.hypot(1.0 / 0.3, 2e-5 / 1e-5)
+    assert abs(still.directions[-1] @ expected) > 0.99
+    assert "attitude z" in still.weakest(1)[0]
+    assert "mag bias x" in still.weakest(1)[0]
+    turned = augmented.observability(plain_record(HAND), NOISE, initial, blocks)
+    assert turned.rank == 9
+    assert np.all(turned.unobserved == 0.0)
+    assert np.all(turned.start_sigma[6:] < 0.1 * turned.prior_sigma[6:])
+    assert "9 of 9 directions" in str(turned)
+
+
+def test_a_gyro_scale_needs_a_turn_about_each_axis():
+    blocks = (augmented.GyroScale(scale_sigma=0.02, misalignment_sigma=0.02),)
+    initial = start()
+    ranks = {}
+    for name, body in (
+        ("still", motion.rest()),
+        ("about z", motion.HarmonicRates(harmonics=(motion.Harmonic(amplitude=(0.0, 0.0, 1.5), frequency=0.2),))),
+        ("about all", HAND),
+    ):
+        found = augmented.observability(plain_record(body), NOISE, initial, blocks)
+        ranks[name] = found.rank
+        if name == "about z":
+            seen_states = np.flatnonzero(found.unobserved < 0.5)
+            names = [found.states[k] for k in seen_states]
+            assert names[6:] == ["gyro scale xz", "gyro scale yz", "gyro scale z"]
+    assert ranks == {"still": 6, "about z": 9, "about all": 15}
+
+
+def test_singular_values_are_those_of_the_stacked_rows():
+    """Without process noise the information is a plain sum of squares: rows of a direction over σ, in prior σ."""
+    edges = np.array([0.0, 1.0])
+    r = np.array([0.0, 0.0, 1.0])
+    series = VectorMeasurements(
+        sensor="star", kind="direction", time=np.array([0.0]), vector_b=[r], reference_f=r, sigma=np.array([0.01])
+    )
+    record = ImuRecord(time=edges, increments=np.zeros((1, 3)), vectors=(series,))
+    initial = mekf.initial_state(quaternion.IDENTITY, attitude_sigma=[0.2, 0.1, 0.3], bias_sigma=1e-3)
+    blocks = (augmented.VectorBias(sensor="star", bias_sigma=0.05),)
+    found = augmented.observability(record, NOISE, initial, blocks)
+    # Across z, the measured (x, y) is (−δθ_y + c_x, δθ_x + c_y).
+    rows = np.zeros((2, 9))
+    rows[0, 1], rows[0, 6], rows[1, 0], rows[1, 7] = -0.1, 0.05, 0.2, 0.05
+    expected = np.linalg.svd(rows / 0.01, compute_uv=False)
+    np.testing.assert_allclose(found.singular_values[:2], expected, rtol=1e-9)
+    np.testing.assert_allclose(found.singular_values[2:], 0.0, atol=1e-6)
+    assert found.rank == 2
+
+
+def test_observability_takes_every_kind_of_measurement():
+    found = augmented.observability(record_of(anisotropic=True), NOISE, start(), OPTIONS["all"])
+    assert len(found.states) == len(found.units) == len(found.singular_values) == 24
+    assert np.all(found.start_sigma <= found.prior_sigma * (1.0 + 1e-9))
+
+
+# ----------------------------------------------------------------------------------------------------------------------- bad input
+
+
+@dataclasses.dataclass(frozen=True)
+class Wrong(augmented.LinearBlock):
+    name: str = "wrong"
+    components: tuple[str, ...] = ("a",)
+    units: tuple[str, ...] = ("1",)
+    sigma: float = 1.0
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: augmented.GyroScale(scale_sigma=0.0, misalignment_sigma=0.1), "scale_sigma is 0"),
+        (lambda: augmented.VectorBias(sensor="mag", bias_sigma=[1.0, -1.0, 1.0]), r"bias_sigma\[1\] is -1"),
+        (lambda: augmented.GaussMarkov(sensor="mag", noise_sigma=1.0, correlation_time=-1.0), "correlation_time is -1 s"),
+        (
+            lambda: augmented.GaussMarkov(sensor="mag", noise_sigma=1.0, correlation_time=1.0, frame="bodi"),
+            "did you mean 'body'",
+        ),
+        (lambda: augmented.run(record_of(), NOISE, start(), (augmented.VectorBias(sensor="mga", bias_sigma=1.0),)), "'mag'"),
+        (lambda: augmented.run(record_of(), NOISE, start(), OPTIONS["hard iron"] * 2), "two blocks are named 'mag bias'"),
+        (lambda: augmented.run(record_of(), NOISE, start(), ("mag",)), "is no block"),
+        (
+            lambda: augmented.run(record_of(), NOISE, start(), (augmented.VectorScale(sensor="tracker", scale_sigma=0.1),)),
+            "whole attitudes",
+        ),
+        (
+            lambda: augmented.run(
+                record_of(), NOISE, augmented.initial_state(start(), OPTIONS["hard iron"]), OPTIONS["gyro scale"]
+            ),
+            "initial has 3 block states, the blocks 9",
+        ),
+        (lambda: augmented.smooth(record_of(), NOISE, start(), (Latency(),)), "linear blocks only, not latency"),
+        (lambda: augmented.run(record_of(), NOISE, start(), (Wrong(sigma=np.zeros(1)),)), r"sigma\[0\] is 0"),
+        (lambda: augmented.run(record_of(), NOISE, start(), (Wrong(units=(), sigma=np.ones(1)),)), "0 units for 1"),
+        (
+            lambda: augmented.GaussMarkov(sensor="mag", noise_sigma=[1.0, 2.0, 1.0], correlation_time=1.0, frame="fixed"),
+            "differs by axis",
+        ),
+        (lambda: augmented.run(record_of(), NOISE, start(), every=0), "every is 0"),
+        (lambda: augmented.observability(record_of(), NOISE, start(), threshold=0.0), "threshold is 0"),
+        (
+            lambda: augmented.run(record_of(), NOISE, start(), OPTIONS["hard iron"]).errors(np.zeros(4), np.zeros(3)),
+            "true_values tells",
+        ),
+    ],
+)  # fmt: skip
+def test_bad_input_is_refused_with_the_remedy(make, words):
+    with pytest.raises(InputError, match=words):
+        make()
+
+
+def test_the_kernels_are_compiled_once_for_all_blocks():
+    """The kernels see arrays only: whatever the blocks, one compiled version each."""
+    from strapdown.kernels import augmented_loop
+
+    for option in ("none", "all", "a foreign block"):
+        augmented.smooth(record_of(duration=0.5), NOISE, start(), OPTIONS[option])
+    assert len(compiled(augmented_loop.run_augmented).signatures) <= 2  # times written to, or read-only
+    assert len(compiled(augmented_loop.smooth_augmented).signatures) == 1
+
+
+def test_a_start_that_is_moved_takes_its_covariance_along():
+    """The prior's tangent space turns with the start, by the right Jacobian of the move; nothing else of it changes."""
+    initial = start(error=(0.5, -0.4, 0.3))
+    initial = dataclasses.replace(initial, covariance=np.diag([0.01, 0.09, 0.25, 1e-5, 1e-5, 1e-5]))
+    blocks = OPTIONS["hard iron"]
+    before = augmented.initial_state(initial, blocks)
+    after = augmented.recentred(record_of(), NOISE, initial, blocks, passes=1)
+    smoothed = augmented.smooth(record_of(), NOISE, initial, blocks)
+    assert np.array_equal(after.attitude, smoothed.attitude[0])
+    assert np.array_equal(after.values, smoothed.blocks["mag bias"].values[0])
+    move = quaternion.log(quaternion.multiply(quaternion.conjugate(before.attitude), after.attitude))
+    assert np.linalg.norm(move) > 0.3
+    J = np.eye(9)
+    J[:3, :3] = kinematics.right_jacobian(move)
+    np.testing.assert_allclose(after.covariance, J @ before.covariance @ J.T, rtol=1e-12, atol=1e-20)

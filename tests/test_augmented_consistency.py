@@ -1,0 +1,305 @@
+"""Monte Carlo of the filter with optional states: its covariance is to be believed with each block, and not with the block left out."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+
+import numpy as np
+import pytest
+
+from strapdown import augmented, consistency, gyro, mekf, motion, quaternion
+from strapdown.mekf import ProcessNoise
+from strapdown.randomness import generator
+from strapdown.records import ImuRecord
+from strapdown.scenarios import Scenario, simulate
+from strapdown.vectors import Accelerometer, Faults, Magnetometer, VectorMeasurements
+
+HAND = motion.HarmonicRates(
+    harmonics=(
+        motion.Harmonic(amplitude=(1.2, 0.2, -0.3), frequency=0.21),
+        motion.Harmonic(amplitude=(-0.3, 1.1, 0.4), frequency=0.37),
+        motion.Harmonic(amplitude=(0.3, -0.2, 1.3), frequency=0.29, phase=1.0),
+    )
+)
+FIELD = np.array([0.0, 2e-5, -4e-5])
+ATTITUDE_SIGMA, BIAS_SIGMA = 0.02, 3e-3
+ARW, RRW = 1e-3, 1e-4
+
+SCALE = augmented.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01)
+IRON = augmented.VectorBias(sensor="mag", bias_sigma=5e-6, unit="T")
+SOFT = augmented.VectorScale(sensor="mag", scale_sigma=0.02)
+SWAY = augmented.GaussMarkov(sensor="acc", noise_sigma=0.4, correlation_time=1.0, unit="m/s²")
+DRIFT = augmented.GyroGaussMarkov(bias_sigma=4e-3, correlation_time=5.0)
+
+CASES = {
+    "gyro scale": (SCALE,),
+    "hard iron": (IRON,),
+    "soft iron": (SOFT,),
+    "acceleration": (SWAY,),
+    "gyro drift": (DRIFT,),
+    "all": (SCALE, IRON, SWAY),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """One record, what it starts from, and the truth of the blocks at every edge."""
+
+    record: object
+    initial: mekf.State
+    noise: ProcessNoise
+    truth: dict
+
+
+def simulated(case: str, seed: int, run: int, duration: float) -> Run:
+    """Draw the truth of the blocks from their own prior, and what the package's own sensors make of it."""
+    blocks = CASES[case]
+    rng = generator(seed, run, "truth")
+    truth = {block.name: block.sigma * rng.standard_normal(block.size) for block in blocks}
+    M = truth[SCALE.name].reshape(3, 3) if SCALE in blocks else np.zeros((3, 3))
+    drifts = DRIFT in blocks
+    turn_on = BIAS_SIGMA * rng.standard_normal(3)
+    spec = gyro.GyroSpec(
+        angle_random_walk=ARW,
+        rate_random_walk=0.0 if drifts else RRW,
+        turn_on_bias=turn_on,
+        scale_factor=np.diag(M).copy(),
+        misalignment=M - np.diag(np.diag(M)),
+        markov_noise=np.sqrt(2.0 / DRIFT.correlation_time) * 4e-3 if drifts else 0.0,
+        markov_correlation_time=DRIFT.correlation_time if drifts else np.inf,
+    )
+    scenario = Scenario(
+        motion=HAND,
+        gyro=spec,
+        sensors=(
+            Magnetometer(
+                name="mag",
+                field_f=FIELD,
+                sigma=5e-7,
+                rate=10.0,
+                kind="vector",
+                hard_iron=truth[IRON.name] if IRON in blocks else np.zeros(3),
+                soft_iron=truth[SOFT.name].reshape(3, 3) if SOFT in blocks else np.zeros((3, 3)),
+            ),
+            Accelerometer(
+                name="acc",
+                sigma=0.05,
+                rate=25.0,
+                phase=0.013,
+                kind="vector",
+                faults=Faults(correlated_sigma=0.4, correlation_time=1.0) if SWAY in blocks else Faults(),
+            ),
+        ),
+        rate=50.0,
+        duration=duration,
+    )
+    record = simulate(scenario, seed, run)
+    if SWAY in blocks:
+        truth[SWAY.name] = None
+    if drifts:
+        truth[DRIFT.name] = record.truth.bias - turn_on
+    error = rng.standard_normal(6) * np.repeat([ATTITUDE_SIGMA, BIAS_SIGMA], 3)
+    initial = mekf.initial_state(
+        quaternion.multiply(record.truth.attitude[0], quaternion.exp(-error[:3])),
+        attitude_sigma=ATTITUDE_SIGMA,
+        bias_sigma=BIAS_SIGMA,
+        bias=(turn_on if drifts else record.truth.bias[0]) - error[3:],
+    )
+    noise = ProcessNoise(angle_random_walk=ARW, rate_random_walk=0.0 if drifts else RRW)
+    return Run(record=record, initial=initial, noise=noise, truth=truth)
+
+
+@cache
+def runs(case: str, number: int, duration: float, seed: int = 11) -> tuple[Run, ...]:
+    return tuple(simulated(case, seed, k, duration) for k in range(number))
+
+
+def judged(case: str, blocks, number: int, duration: float, *, smoothed=False, known=None, seed=11):
+    """Return the verdict on all states whose truth is told at an instant, at five epochs of the second half.
+
+    Of an acceleration the package's simulator tells no truth, so it is left out of the error, and its own covariance with it.
+    """
+    epochs = None
+    values = []
+    for one in runs(case, number, duration, seed):
+        face = augmented.smooth if smoothed else augmented.run
+        estimate = face(one.record, one.noise, one.initial, blocks, full_covariance=True)
+        if epochs is None:
+            epochs = np.linspace(0.4, 0.95, 5) * (len(estimate.time) - 1)
+            epochs = epochs.astype(int)
+        true_bias = one.record.truth.bias
+        if case == "gyro drift":
+            true_bias = true_bias - one.truth[DRIFT.name]
+        told = {block.name: one.truth[block.name] for block in blocks if block is not SWAY}
+        if any(block is SWAY or block.name == SWAY.name for block in blocks):
+            told[SWAY.name] = np.zeros(3)
+        error = estimate.errors(one.record.truth.attitude, true_bias, told)[epochs]
+        P = estimate.whole_covariance[epochs]
+        names = augmented.observing.state_names(blocks)[0]
+        kept = [k for k, name in enumerate(names) if not name.startswith(SWAY.name)]
+        values.append(consistency.nees(error[:, kept], P[:, kept][:, :, kept]))
+    mean = np.mean(values, axis=0) / len(kept)
+    return consistency.Verdict(mean=mean, degrees=len(kept), runs=number, probability=0.99)
+
+
+@pytest.mark.parametrize("smoothed", [False, True], ids=["filter", "smoother"])
+@pytest.mark.parametrize("case", CASES)
+def test_the_covariance_is_to_be_believed(case, smoothed):
+    verdict = judged(case, CASES[case], 40, 12.0, smoothed=smoothed)
+    assert verdict.consistent, (verdict.mean, verdict.simultaneous_bounds)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("smoothed", [False, True], ids=["filter", "smoother"])
+@pytest.mark.parametrize("case", CASES)
+def test_the_covariance_is_to_be_believed_in_many_runs(case, smoothed):
+    verdict = judged(case, CASES[case], 600, 40.0, smoothed=smoothed, seed=12)
+    assert verdict.consistent, (verdict.mean, verdict.simultaneous_bounds)
+
+
+@pytest.mark.parametrize("case", [name for name in CASES if name != "all"])
+def test_it_is_not_with_the_block_left_out(case):
+    verdict = judged(case, (), 40, 12.0)
+    assert verdict.outside == 5
+    assert np.all(verdict.mean > 1.5)
+
+
+BROKEN = {
+    "a prior too narrow": ("gyro scale", augmented.GyroScale(scale_sigma=0.002, misalignment_sigma=0.002)),
+    "the wrong sign": ("hard iron", None),
+    "a correlation too short": ("acceleration", dataclasses.replace(SWAY, correlation_time=0.1)),
+    "a drift too small": ("gyro drift", dataclasses.replace(DRIFT, bias_sigma=1e-3)),
+    "rows for columns": ("soft iron", None),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class WrongSign(augmented.LinearBlock):
+    name: str = IRON.name
+    components: tuple[str, ...] = ("x", "y", "z")
+    units: tuple[str, ...] = ("T",) * 3
+
+    @property
+    def sigma(self):
+        return IRON.sigma
+
+    @property
+    def effects(self):
+        return {"mag": augmented.Effect(offset_b=-np.eye(3))}
+
+
+@dataclasses.dataclass(frozen=True)
+class Transposed(augmented.LinearBlock):
+    name: str = SOFT.name
+    components: tuple[str, ...] = SOFT.components
+    units: tuple[str, ...] = SOFT.units
+
+    @property
+    def sigma(self):
+        return SOFT.sigma
+
+    @property
+    def effects(self):
+        return {"mag": augmented.Effect(scale=np.swapaxes(np.eye(9).reshape(9, 3, 3), 1, 2))}
+
+
+@pytest.mark.parametrize("how", BROKEN)
+def test_it_is_not_with_the_block_broken(how):
+    case, block = BROKEN[how]
+    if block is None:
+        block = WrongSign() if case == "hard iron" else Transposed()
+    assert not judged(case, (block,), 40, 12.0).consistent
+
+
+@pytest.mark.parametrize("case", ["gyro scale", "hard iron", "soft iron", "all"])
+def test_calibration_is_found(case):
+    """After a while of turning, what the simulated sensors have is found to a fraction of what was known before."""
+    one = simulated(case, 21, 0, 60.0)
+    estimate = augmented.run(one.record, one.noise, one.initial, CASES[case])
+    for block in CASES[case]:
+        if block is SWAY:
+            continue
+        found = estimate.blocks[block.name]
+        error = one.truth[block.name] - found.values[-1]
+        assert np.all(np.abs(error) < 4.0 * found.sigma[-1])
+        assert np.all(found.sigma[-1] < 0.25 * block.sigma)
+        assert np.linalg.norm(error) < 0.25 * np.linalg.norm(one.truth[block.name])
+
+
+def swaying(seed: int, sigma: float, tau: float, duration: float = 60.0):
+    """A record simulated here: a Gauss–Markov specific force in fixed axes, and what it was at each second edge but the first."""
+    rng = generator(seed, 0, "sway")
+    edges = np.arange(round(50.0 * duration) + 1) / 50.0
+    phi = np.exp(-0.04 / tau)
+    time = edges[2::2]
+    sway = sigma * rng.standard_normal((len(time), 3))
+    for k in range(1, len(time)):
+        sway[k] = phi * sway[k - 1] + np.sqrt(1.0 - phi**2) * sway[k]
+    up = np.array([0.0, 0.0, 9.81])
+    back = quaternion.conjugate(HAND.attitude(time))
+    series = []
+    for name, reference, noise, extra in (("acc", up, 0.05, sway), ("mag", FIELD, 5e-7, np.zeros(3))):
+        z = quaternion.rotate(back, reference + extra) + noise * rng.standard_normal(sway.shape)
+        series.append(
+            VectorMeasurements(
+                sensor=name,
+                kind="vector",
+                time=time,
+                vector_b=z,
+                reference_f=reference,
+                sigma=np.full(len(time), noise),
+            )
+        )
+    increments = HAND.increments(edges) + ARW * np.sqrt(0.02) * rng.standard_normal((len(edges) - 1, 3))
+    block = augmented.GaussMarkov(sensor="acc", noise_sigma=sigma, correlation_time=tau, frame="fixed", unit="m/s²")
+    return ImuRecord(time=edges, increments=increments, vectors=tuple(series)), sway, block
+
+
+def test_an_acceleration_is_followed():
+    record, sway, block = swaying(5, 0.5, 0.8)
+    initial = mekf.initial_state(HAND.attitude(np.array(0.0)), attitude_sigma=0.01, bias_sigma=1e-3)
+    noise = ProcessNoise(angle_random_walk=ARW, rate_random_walk=0.0)
+    found = augmented.run(record, noise, initial, (block,), every=2).blocks["acc disturbance"]
+    error = sway - found.values[1:]
+    late = slice(200, None)
+    assert np.sqrt(np.mean(error[late] ** 2)) < 0.2
+    assert 0.7 < np.mean((error[late] / found.sigma[1:][late]) ** 2) < 1.4
+
+
+@pytest.mark.parametrize("sigma", [0.5, 5.0])
+def test_an_acceleration_shows_no_heading(sigma):
+    """Turn body and acceleration about the vertical together: nothing changes. The variance of the heading only grows."""
+    record, _, block = swaying(6, sigma, 0.8)
+    record = dataclasses.replace(record, vectors=record.vectors[:1])
+    initial = mekf.initial_state(HAND.attitude(np.array(0.0)), attitude_sigma=0.01, bias_sigma=1e-6)
+    noise = ProcessNoise(angle_random_walk=ARW, rate_random_walk=0.0)
+    estimate = augmented.run(record, noise, initial, (block,), every=50, full_covariance=True)
+    vertical = quaternion.rotate(quaternion.conjugate(estimate.attitude), [0.0, 0.0, 1.0])
+    heading = np.einsum("ki,kij,kj->k", vertical, estimate.covariance[:, :3, :3], vertical)
+    expected = 0.01**2 + ARW**2 * estimate.time
+    np.testing.assert_allclose(heading, expected, rtol=0.05)
+
+
+def test_a_start_off_by_tenths_of_a_radian_is_moved_to_where_it_belongs():
+    """A heading that hard iron has turned: linearised there, the filter believes too much for good; started anew, it is right."""
+    number, sigma = 25, np.repeat([0.4, 3e-3], 3)
+    first, anew = [], []
+    for k in range(number):
+        one = simulated("hard iron", 31, k, 12.0)
+        error = sigma * generator(31, k, "start").standard_normal(6)
+        state = mekf.initial_state(
+            quaternion.multiply(one.record.truth.attitude[0], quaternion.exp(-error[:3])),
+            attitude_sigma=0.4,
+            bias_sigma=BIAS_SIGMA,
+            bias=one.record.truth.bias[0] - error[3:],
+        )
+        block = (dataclasses.replace(IRON, bias_sigma=2e-5),)
+        better = augmented.recentred(one.record, one.noise, state, block)
+        for start, kept in ((augmented.initial_state(state, block), first), (better, anew)):
+            estimate = augmented.run(one.record, one.noise, start, block, every=600, full_covariance=True)
+            e = estimate.errors(one.record.truth.attitude[::600], one.record.truth.bias[::600], one.truth)[-1]
+            kept.append(consistency.nees(e, estimate.whole_covariance[-1]) / 9.0)
+    low, high = consistency.mean_bounds(9, number)
+    assert low < np.mean(anew) < high
+    assert np.mean(first) > 2.0 * high
