@@ -15,18 +15,29 @@ from numba.core.errors import TypingError
 
 from strapdown.kernels import integration, lane_values, machine, rotation, series
 from strapdown.kernels.algebra import square_root
-from strapdown.kernels.filter_step import predict
+from strapdown.kernels.filter_step import predict, update_direction
+from strapdown.kernels.lane_angles import arctangent, inverse_root, rotation_vector
 from strapdown.kernels.lane_values import (
     WIDTH,
     anywhere,
+    bits_of,
     chosen,
     everywhere,
+    flush_tiny,
+    lanes_of,
     load,
+    load_like,
     load_quadruples,
     load_triples,
+    narrowed,
+    number_of_bits,
+    number_where,
+    restore_mode,
     spread,
     store,
+    store_like,
     store_quadruples,
+    total,
 )
 from strapdown.kernels.rotation import rotation_matrix
 
@@ -188,6 +199,105 @@ def test_every_lane_function_has_its_machine_form():
     assert set(INTRINSICS) == functions
 
 
+@pytest.mark.parametrize("width", [1, 2, 8, 16])
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_any_number_of_lanes(width, dtype):
+    def apply(pattern, a, doubles, words, out, counts):
+        like = lanes_of(pattern)
+        mode = flush_tiny(like)
+        n = len(like)
+        x = load_like(a, 1, like)
+        y = load_like(doubles, 1, like)
+        store_like(out, 0, x)
+        store_like(out, n, narrowed(y, like))
+        store_like(out, 2 * n, like - 3.0)
+        store_like(words, 0, bits_of(y))
+        store_like(out, 3 * n, number_of_bits(load_like(words, 0, like)))
+        counts[0] = n
+        counts[1] = number_where(x > 0.0)
+        restore_mode(mode)
+        return total(x)
+
+    a, doubles = RANDOM.standard_normal(width + 1).astype(dtype), RANDOM.standard_normal(width + 1)
+    results = []
+    for function in (kernel(apply), apply):
+        out, words, counts = np.empty(4 * width), np.empty(width, np.uint64), np.empty(2, np.int64)
+        summed = function((dtype(0.0),) * width, a, doubles, words, out, counts)
+        results.append(np.concatenate([out, words.view(np.float64), counts, [summed]]))
+        assert counts[0] == width
+        assert counts[1] == np.sum(a[1:] > 0.0)
+        np.testing.assert_array_equal(out[:width], a[1:])
+        np.testing.assert_array_equal(out[width : 2 * width], doubles[1:].astype(dtype))
+        np.testing.assert_array_equal(out[2 * width : 3 * width], -3.0)
+        np.testing.assert_array_equal(out[3 * width :], doubles[1:])
+        assert summed == pytest.approx(a[1:].sum(), abs=1e-5)
+    np.testing.assert_array_equal(*results)
+
+
+def test_tiny_numbers_are_flushed_in_single_precision_alone():
+    def apply(pattern, a, out):
+        like = lanes_of(pattern)
+        mode = flush_tiny(like)
+        store_like(out, 0, load_like(a, 0, like) * 0.5)
+        restore_mode(mode)
+
+    for dtype in (np.float64, np.float32):
+        tiny = np.finfo(dtype).tiny
+        a, out = np.full(8, tiny, dtype), np.empty(8, dtype)
+        kernel(apply)((dtype(0.0),) * 8, a, out)
+        flushed = dtype is np.float32 and platform.machine() in ("x86_64", "AMD64")
+        np.testing.assert_array_equal(out, 0.0 if flushed else 0.5 * tiny)
+        assert np.float32(np.finfo(np.float32).tiny) * np.float32(0.5) > 0.0  # the mode is as it was
+
+
+def angles(y, x, out):
+    store(out, 0, arctangent(load(y, 0), load(x, 0)))
+
+
+def vectors_of(q, out):
+    v = rotation_vector((load(q, 0), load(q, 8), load(q, 16), load(q, 24)))
+    store(out, 0, v[0])
+    store(out, 8, v[1])
+    store(out, 16, v[2])
+
+
+def inverse_roots(x, out):
+    store(out, 0, inverse_root(load(x, 0)))
+
+
+def test_angles_over_lanes():
+    fast = kernel(angles)
+    out = np.empty(WIDTH)
+    size = 10.0 ** RANDOM.uniform(-12.0, 12.0, (200, 2, WIDTH))
+    points = size * RANDOM.choice([-1.0, 1.0], size.shape)
+    points[0] = [[0.0, 0.0, 1.0, -1.0, 1.0, -1.0, 0.0, 1.0], [0.0, 1.0, 0.0, 0.0, 1.0, 1.0, -1.0, -1.0]]
+    for y, x in points:
+        fast(y, x, out)
+        np.testing.assert_allclose(out, np.arctan2(y, x), rtol=4e-16, atol=0.0)
+        angles(y, x, out)
+        np.testing.assert_allclose(out, np.arctan2(y, x), rtol=4e-16, atol=0.0)
+
+
+def test_rotation_vectors_over_lanes():
+    fast, out = kernel(vectors_of), np.empty((3, WIDTH))
+    for exponent in range(-20, 1):
+        phi = RANDOM.standard_normal((3, WIDTH))
+        phi *= np.minimum(10.0**exponent, 3.1 / np.linalg.norm(phi, axis=0))
+        angle = np.linalg.norm(phi, axis=0)
+        q = np.concatenate([[np.cos(0.5 * angle)], np.sinc(0.5 * angle / np.pi) * 0.5 * phi])
+        q[:, ::2] *= -1.0
+        fast(q.reshape(-1), out.reshape(-1))
+        np.testing.assert_allclose(out, phi, rtol=2e-15, atol=0.0)
+
+
+def test_inverse_roots_over_lanes():
+    fast, out = kernel(inverse_roots), np.empty(WIDTH)
+    for _ in range(100):
+        x = 10.0 ** RANDOM.uniform(-29.0, 29.0, WIDTH)
+        fast(x, out)
+        np.testing.assert_allclose(out, 1.0 / np.sqrt(x), rtol=5e-16)
+
+
 # ---------------------------------------------------------------------------------------------------- kernels over lanes
 
 
@@ -257,6 +367,145 @@ def test_the_filters_prediction_over_lanes():
             q, A, B, C = step(*run, tuple(phi[:, i]), *noise)
             slow = np.r_[q, state[4:7, i], A, B, C]
             np.testing.assert_allclose(fast[:, i], slow, rtol=1e-12, atol=1e-15 * np.abs(slow[7:]).max())
+
+
+def run_of(rows, like):
+    """Return (q, b, A, B, C) of so many runs, from 28 rows of them."""
+    n = len(like)
+    return (
+        (
+            load_like(rows, 0, like),
+            load_like(rows, n, like),
+            load_like(rows, 2 * n, like),
+            load_like(rows, 3 * n, like),
+        ),
+        (load_like(rows, 4 * n, like), load_like(rows, 5 * n, like), load_like(rows, 6 * n, like)),
+        (
+            load_like(rows, 7 * n, like),
+            load_like(rows, 8 * n, like),
+            load_like(rows, 9 * n, like),
+            load_like(rows, 10 * n, like),
+            load_like(rows, 11 * n, like),
+            load_like(rows, 12 * n, like),
+        ),
+        (
+            load_like(rows, 13 * n, like),
+            load_like(rows, 14 * n, like),
+            load_like(rows, 15 * n, like),
+            load_like(rows, 16 * n, like),
+            load_like(rows, 17 * n, like),
+            load_like(rows, 18 * n, like),
+            load_like(rows, 19 * n, like),
+            load_like(rows, 20 * n, like),
+            load_like(rows, 21 * n, like),
+        ),
+        (
+            load_like(rows, 22 * n, like),
+            load_like(rows, 23 * n, like),
+            load_like(rows, 24 * n, like),
+            load_like(rows, 25 * n, like),
+            load_like(rows, 26 * n, like),
+            load_like(rows, 27 * n, like),
+        ),
+    )
+
+
+run_of.__module__ = "strapdown.kernels.probe"  # so that kernels of this file may call it
+
+
+def stepped(pattern, rows, inputs, variance, out):
+    """Predict and update so many runs once; ``inputs`` are 6 rows: increments and measured directions of the z axis."""
+    like = lanes_of(pattern)
+    n = len(like)
+    q, b, A, B, C = run_of(rows, like)
+    turn = (load_like(inputs, 0, like), load_like(inputs, n, like), load_like(inputs, 2 * n, like))
+    q, A, B, C = predict(q, b, A, B, C, turn, 0.01, 1e-8, 1e-12)
+    z = (load_like(inputs, 3 * n, like), load_like(inputs, 4 * n, like), load_like(inputs, 5 * n, like))
+    q, b, A, B, C, e1, s1, e2, s2 = update_direction(
+        q, b, A, B, C, rotation_matrix(q), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), z, variance
+    )
+    for i in range(4):
+        store_like(out, i * n, q[i])
+    for i in range(3):
+        store_like(out, (4 + i) * n, b[i])
+    for i in range(6):
+        store_like(out, (7 + i) * n, A[i])
+        store_like(out, (22 + i) * n, C[i])
+    for i in range(9):
+        store_like(out, (13 + i) * n, B[i])
+    store_like(out, 28 * n, e1)
+    store_like(out, 29 * n, s1)
+    store_like(out, 30 * n, e2)
+    store_like(out, 31 * n, s2)
+
+
+def stepped_scalars(rows, inputs, variance, out):
+    """Do the same for one run of plain floats."""
+    A = (rows[7], rows[8], rows[9], rows[10], rows[11], rows[12])
+    B = (rows[13], rows[14], rows[15], rows[16], rows[17], rows[18], rows[19], rows[20], rows[21])
+    C = (rows[22], rows[23], rows[24], rows[25], rows[26], rows[27])
+    b = (rows[4], rows[5], rows[6])
+    q = (rows[0], rows[1], rows[2], rows[3])
+    q, A, B, C = predict(q, b, A, B, C, (inputs[0], inputs[1], inputs[2]), 0.01, 1e-8, 1e-12)
+    q, b, A, B, C, e1, s1, e2, s2 = update_direction(
+        q,
+        b,
+        A,
+        B,
+        C,
+        rotation_matrix(q),
+        (1.0, 0.0, 0.0),
+        (0.0, 1.0, 0.0),
+        (inputs[3], inputs[4], inputs[5]),
+        variance,
+    )
+    for i in range(4):
+        out[i] = q[i]
+    for i in range(3):
+        out[4 + i] = b[i]
+    for i in range(6):
+        out[7 + i] = A[i]
+        out[22 + i] = C[i]
+    for i in range(9):
+        out[13 + i] = B[i]
+    out[28], out[29], out[30], out[31] = e1, s1, e2, s2
+
+
+def in_lanes(step, rows, inputs, variance, width):
+    """Return the step of all runs (runs, 32), ``width`` at a time."""
+    parts = []
+    for first in range(0, len(rows), width):
+        group = slice(first, first + width)
+        out = np.empty((32, width))
+        step((0.0,) * width, rows[group].T.ravel(), inputs[group].T.ravel(), variance, out.reshape(-1))
+        parts.append(out.T)
+    return np.concatenate(parts)
+
+
+def test_a_run_has_the_same_bits_whatever_its_neighbours_and_on_the_scalar_machine():
+    """Neighbours that take both rows at once, one after the other, or need the precise form or a large reset, in every mixture."""
+    runs = 48
+    rows = np.concatenate([states().T.reshape(STATE, WIDTH).T for _ in range(runs // WIDTH)])
+    scale = 10.0 ** RANDOM.uniform(-3.0, 2.0, runs)
+    rows[:, 7:] *= scale[:, None]
+    inputs = np.concatenate([0.05 * RANDOM.standard_normal((runs, 3)), RANDOM.standard_normal((runs, 3))], axis=1)
+    variance = 1e-4
+    over_lanes, scalar = kernel(stepped), kernel(stepped_scalars)
+    alone = np.empty((runs, 32))
+    for row, value, out in zip(rows, inputs, alone, strict=True):
+        scalar(row, value, variance, out)
+    variances = alone[:, [29, 31]]
+    together = variances.sum(axis=1) < 1000.0 * variance
+    assert 8 < np.sum(together) < runs - 8  # both forms are met
+    for width in (1, 8):
+        np.testing.assert_array_equal(in_lanes(over_lanes, rows, inputs, variance, width), alone)
+    for _ in range(5):
+        order = RANDOM.permutation(runs)
+        np.testing.assert_array_equal(in_lanes(over_lanes, rows[order], inputs[order], variance, WIDTH), alone[order])
+    plain = np.empty(32)
+    for row, value, fast in zip(rows[:8], inputs[:8], alone[:8], strict=True):
+        stepped_scalars(row, value, variance, plain)
+        np.testing.assert_allclose(fast, plain, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize(

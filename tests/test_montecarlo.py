@@ -119,7 +119,7 @@ def test_statistics_do_not_depend_on_threads(threads, chunk):
     one = montecarlo.run(SCENARIO, (setup(),), runs=12, seed=1, threads=1, chunk=10)[0]
     other = montecarlo.run(SCENARIO, (setup(),), runs=12, seed=1, threads=threads, chunk=chunk)[0]
     assert np.array_equal(one.example_error, other.example_error)
-    for name in ("error_sum", "variance_sum", "nees_sum", "nis_sum"):
+    for name in ("error_sum", "covariance_sum", "nees_sum", "nis_sum"):
         exact = chunk == 10
         a, b = getattr(one, name), getattr(other, name)
         assert np.array_equal(a, b) if exact else np.allclose(a, b, rtol=1e-12, atol=1e-12 * np.abs(a).max()), name

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from strapdown.kernels import noise
+from strapdown.kernels import montecarlo_run, noise
 from strapdown.kernels.machine import compiled
 
 WORD = np.uint64
@@ -170,6 +170,96 @@ def test_successive_normals_and_the_two_of_a_pair_are_independent(sample):
     pairs += [(sample[:-lag] ** 2, sample[lag:] ** 2) for lag in (1, 2, n // 2)]
     for a, b in pairs:
         assert abs(np.corrcoef(a, b)[0, 1]) * math.sqrt(len(a)) < 4.0
+
+
+# ------------------------------------------------------------------------------------------------ normals of the lanes
+
+
+def lane_normals(runs, count, width=8, real=np.float64, key=(5, 6)):
+    """Return normals (runs, count) of the lanes' streams of these runs."""
+    pattern = (real(0.0),) * width
+    out = np.empty((len(runs), count))
+    for first in range(0, len(runs), width):
+        numbers = np.zeros(width, WORD)
+        part = runs[first : first + width]
+        numbers[: len(part)] = part
+        rows = np.empty((count, width))
+        compiled(montecarlo_run.fill_pairs)(pattern, WORD(key[0]), WORD(key[1]), numbers, rows.reshape(-1))
+        out[first : first + width] = rows.T[: len(part)]
+    return out
+
+
+@pytest.fixture(scope="module")
+def lane_sample():
+    return lane_normals(np.arange(64), 1 << 16)
+
+
+def test_lane_normals_have_the_same_bits_in_any_lane_and_precision():
+    runs = np.arange(1000, 1020)
+    eight = lane_normals(runs, 2000)
+    np.testing.assert_array_equal(lane_normals(runs[::-1], 2000)[::-1], eight)
+    np.testing.assert_array_equal(lane_normals(runs, 2000, width=1), eight)
+    np.testing.assert_array_equal(lane_normals(runs, 2000, width=16, real=np.float32), eight)
+    with np.errstate(over="ignore"):
+        state = noise.stream_state(WORD(5), WORD(6), WORD(1003))
+        for k in range(100):
+            word, *state = noise.next_word(*state)
+            pair = noise.single_normals(word, 0.0)
+            np.testing.assert_allclose(pair, eight[3, 2 * k : 2 * k + 2], rtol=2e-6, atol=1e-7)
+
+
+def test_lane_normals_are_those_of_libm():
+    words = np.random.default_rng(4).integers(0, 2**64, 3000, dtype=WORD)
+    words[:4] = [0, ALL, WORD(1) << WORD(63), WORD(1) << WORD(23)]
+    a, b = np.transpose([noise.single_normals(word, 0.0) for word in words])
+    u = 1.0 - (words >> WORD(24)).astype(float) * 2.0**-40
+    angle = 0.5 * math.pi * (((words & WORD(0x3FFFFF)).astype(float) + 0.5) * 2.0**-22 - 0.5)
+    radius = np.sqrt(-2.0 * np.log(u))
+    sine, cosine = radius * np.sin(angle), radius * np.cos(angle) * np.where(words >> WORD(23) & WORD(1), -1.0, 1.0)
+    swap = (words >> WORD(22) & WORD(1)).astype(bool)
+    np.testing.assert_allclose(a, np.where(swap, cosine, sine), rtol=3e-7, atol=3e-7)
+    np.testing.assert_allclose(b, np.where(swap, sine, cosine), rtol=3e-7, atol=3e-7)
+    assert np.abs([a, b]).max() < 7.5
+
+
+def test_moments_and_distribution_of_lane_normals(lane_sample):
+    x = lane_sample.ravel()
+    even = {0: 1.0, 2: 1.0, 4: 3.0, 6: 15.0, 8: 105.0, 10: 945.0, 12: 10395.0, 14: 135135.0, 16: 2027025.0}
+    for k in range(1, 9):
+        expected = even.get(k, 0.0)
+        score = (np.mean(x**k) - expected) / math.sqrt((even[2 * k] - expected**2) / len(x))
+        assert abs(score) < 4.0, (k, score)
+    assert stats.kstest(x, "norm").pvalue > 1e-3
+    for edge in (3.0, 4.0, 4.5, 5.0):
+        for count in (np.sum(x > edge), np.sum(x < -edge)):
+            low, high = stats.binom.ppf([5e-5, 1.0 - 5e-5], len(x), stats.norm.sf(edge))
+            assert low <= count <= high
+
+
+def test_lanes_and_runs_are_independent(lane_sample):
+    n = lane_sample.shape[1]
+    correlation = np.corrcoef(lane_sample) - np.eye(64)
+    assert np.abs(correlation).max() * math.sqrt(n) < 5.0
+    squares = np.corrcoef(lane_sample**2) - np.eye(64)
+    assert np.abs(squares).max() * math.sqrt(n) < 5.0
+    x = lane_sample.ravel()
+    for lag in (1, 2, 3, 4, 7):
+        assert abs(np.corrcoef(x[:-lag], x[lag:])[0, 1]) * math.sqrt(len(x)) < 4.0
+        assert abs(np.corrcoef(x[:-lag] ** 2, x[lag:] ** 2)[0, 1]) * math.sqrt(len(x)) < 4.0
+    other = lane_normals(np.arange(8), n, key=(5, 7))
+    assert np.abs(np.corrcoef(other, lane_sample[:8])[:8, 8:]).max() * math.sqrt(n) < 4.5
+
+
+@pytest.mark.slow
+def test_tails_of_lane_normals_to_six_sigma():
+    counts, total = np.zeros(3), 0
+    for first in range(0, 1600, 16):
+        part = np.abs(lane_normals(np.arange(first, first + 16), 1 << 20))
+        counts += [np.sum(part > edge) for edge in (5.0, 5.5, 6.0)]
+        total += part.size
+    for count, edge in zip(counts, (5.0, 5.5, 6.0), strict=True):
+        low, high = stats.binom.ppf([5e-4, 1.0 - 5e-4], total, 2.0 * stats.norm.sf(edge))
+        assert low <= count <= high
 
 
 def test_octants_are_even(sample):

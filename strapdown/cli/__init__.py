@@ -8,8 +8,18 @@
     ``algorithms``, ``integrate``, ``coning-budget``
 ``estimation``
     ``estimate``
+``campaigns``
+    ``montecarlo``
+``judgement``
+    ``check``, ``doctor``
+``planning``
+    ``covariance``
+``reporting``
+    ``report``
 ``sensors``
     ``simulate``, ``scenarios``, ``allan``
+``tuning``
+    ``tune``
 """
 
 from __future__ import annotations
@@ -20,7 +30,7 @@ from typing import Annotated
 import typer
 
 from strapdown.checks import InputError
-from strapdown.cli import estimation, integration, sensors, studies  # noqa: F401  (each registers its commands)
+from strapdown.cli import campaigns, estimation, integration, judgement, planning, reporting, sensors, studies, tuning  # noqa: F401  (each registers its commands)
 from strapdown.cli.terminal import app, console, errors
 
 

@@ -9,7 +9,16 @@ from typing import Any
 import typer
 from rich import box
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 from rich.text import Text
 
@@ -24,13 +33,35 @@ console = Console(markup=False, highlight=False)
 errors = Console(stderr=True, markup=False, highlight=False)
 
 
+def rate_text(speed: float) -> str:
+    """Return a rate in three digits or whole ones."""
+    return f"{speed:.0f}" if speed >= 100.0 else f"{speed:.3g}"
+
+
+class _Rate(ProgressColumn):
+    """Units a second."""
+
+    def __init__(self, unit: str) -> None:
+        super().__init__()
+        self._unit = unit
+
+    def render(self, task: Task) -> Text:
+        """Return the rate of the last while, or of the whole where it is finished."""
+        speed = task.finished_speed or task.speed
+        return Text("" if speed is None else f"{rate_text(speed)} {self._unit}")
+
+
 @contextmanager
-def progress_bar(what: str, total: int) -> Iterator[Any]:
-    """Yield a function that advances a bar by so many units; on standard error, and only on a terminal."""
+def progress_bar(what: str, total: int, *, rate: str = "") -> Iterator[Any]:
+    """Yield a function that advances a bar by so many units; on standard error, and only on a terminal.
+
+    With ``rate``, its unit, the bar tells how many units a second are done.
+    """
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
+        *([_Rate(rate)] if rate else []),
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),

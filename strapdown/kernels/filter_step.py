@@ -5,6 +5,9 @@ State: attitude ``q_fb``, gyro bias ``b`` (rad/s) and the covariance ``P`` of th
 
 A measurement of any kind enters as scalar rows ``y = h · δθ + noise``. Rows of one measurement share a correction: each row's innovation
 takes off what the rows before it corrected, and the attitude is moved, and the covariance reset, once at the end.
+
+Every function takes floats or lanes (:mod:`strapdown.kernels.lane_values`). Where runs in one group of lanes want different forms of a
+formula, both are computed and chosen lane by lane, so that a run's bits do not depend on its neighbours.
 """
 
 from __future__ import annotations
@@ -29,6 +32,7 @@ from strapdown.kernels.algebra import (
     transpose,
     transpose_times_vector,
 )
+from strapdown.kernels.lane_values import anywhere, chosen, everywhere
 from strapdown.kernels.rotation import logarithm, quaternion_multiply, right_jacobian, turned, unit
 from strapdown.kernels.series import fifth, fourth, second, sinc, third
 
@@ -93,6 +97,32 @@ def predict(q, b, A, B, C, delta_theta, dt, angle_variance, rate_variance):
     )
 
 
+def chosen_triple(condition, a, b):
+    """Return the 3-vector a in the lanes where the condition holds, b in the others."""
+    return (chosen(condition, a[0], b[0]), chosen(condition, a[1], b[1]), chosen(condition, a[2], b[2]))
+
+
+def chosen_quadruple(condition, a, b):
+    """Return the quaternion a in the lanes where the condition holds, b in the others."""
+    x, y, z = chosen_triple(condition, (a[1], a[2], a[3]), (b[1], b[2], b[3]))
+    return (chosen(condition, a[0], b[0]), x, y, z)
+
+
+def chosen_symmetric(condition, S, T):
+    """Return the symmetric matrix S in the lanes where the condition holds, T in the others."""
+    s0, s1, s2 = chosen_triple(condition, (S[0], S[1], S[2]), (T[0], T[1], T[2]))
+    s3, s4, s5 = chosen_triple(condition, (S[3], S[4], S[5]), (T[3], T[4], T[5]))
+    return (s0, s1, s2, s3, s4, s5)
+
+
+def chosen_matrix(condition, S, T):
+    """Return the matrix S in the lanes where the condition holds, T in the others."""
+    a = chosen_triple(condition, (S[0], S[1], S[2]), (T[0], T[1], T[2]))
+    b = chosen_triple(condition, (S[3], S[4], S[5]), (T[3], T[4], T[5]))
+    c = chosen_triple(condition, (S[6], S[7], S[8]), (T[6], T[7], T[8]))
+    return (a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2])
+
+
 def update_row(b, A, B, C, h, innovation, variance):
     """Take in one scalar row ``innovation = h · δθ + v``, Var v = ``variance``.
 
@@ -108,10 +138,11 @@ def update_row(b, A, B, C, h, innovation, variance):
     kb = scale(inverse, pb)
     A = symmetric_minus_outer(A, ka, pa)
     B = minus_outer(B, ka, pb)
-    if s > SHORT_FORM * variance:
+    precise = s > SHORT_FORM * variance
+    if anywhere(precise):
         d = combine(1.0, symmetric_times_vector(A, h), -variance, ka)
-        A = symmetric_minus_outer(A, d, ka)
-        B = minus_outer(B, d, kb)
+        A = chosen_symmetric(precise, symmetric_minus_outer(A, d, ka), A)
+        B = chosen_matrix(precise, minus_outer(B, d, kb), B)
     return (
         scale(innovation, ka),
         combine(1.0, b, innovation, kb),
@@ -130,8 +161,9 @@ def reset(q, A, B, correction):
     """
     G = right_jacobian(correction)
     q = turned(q, correction)
-    if dot(correction, correction) > 1.0:
-        q = unit(q)  # the polynomials of so large a turn leave the norm
+    large = dot(correction, correction) > 1.0
+    if anywhere(large):
+        q = chosen_quadruple(large, unit(q), q)  # the polynomials of so large a turn leave the norm
     return (
         q,
         times_transpose_upper(multiply(G, full(A)), G),
@@ -150,41 +182,71 @@ def direction_rows(R, u, v, z):
     return (-vb[0], -vb[1], -vb[2]), dot(ub, z), ub, dot(vb, z)
 
 
+def rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, s1, s12, s22):
+    """Take in two rows by the inverse of their 2×2 covariance (s1, s12, s22): one division in the chain of dependence instead of two.
+
+    Returns the correction, b, A, B, C, the second row's innovation freed of the first with its variance, and the NIS.
+    """
+    inverse = 1.0 / (s1 * s22 - s12 * s12)
+    i11, i12, i22 = s22 * inverse, -s12 * inverse, s1 * inverse
+    pb1 = transpose_times_vector(B, h1)
+    pb2 = transpose_times_vector(B, h2)
+    ka1 = combine(i11, pa1, i12, pa2)
+    ka2 = combine(i12, pa1, i22, pa2)
+    kb1 = combine(i11, pb1, i12, pb2)
+    kb2 = combine(i12, pb1, i22, pb2)
+    correction = combine(e1, ka1, y2, ka2)
+    b = add(b, combine(e1, kb1, y2, kb2))
+    A = symmetric_minus_outer(symmetric_minus_outer(A, ka1, pa1), ka2, pa2)
+    B = minus_outer(minus_outer(B, ka1, pb1), ka2, pb2)
+    C = symmetric_minus_outer(symmetric_minus_outer(C, kb1, pb1), kb2, pb2)
+    nis = e1 * (i11 * e1 + i12 * y2) + y2 * (i12 * e1 + i22 * y2)
+    return correction, b, A, B, C, y2 - s12 / s1 * e1, 1.0 / i22, nis
+
+
+def row_after_row(b, A, B, C, h1, e1, h2, y2, variance):
+    """Take in two rows one after the other, each by :func:`update_row`; return what :func:`rows_at_once` does."""
+    first, b, A, B, C, s1 = update_row(b, A, B, C, h1, e1, variance)
+    e2 = y2 - dot(h2, first)  # what the first row has corrected is taken off the second
+    second, b, A, B, C, s2 = update_row(b, A, B, C, h2, e2, variance)
+    return add(first, second), b, A, B, C, e2, s2, e1 * e1 / s1 + e2 * e2 / s2
+
+
 def update_direction(q, b, A, B, C, R, u, v, z, variance):
     """Update with a unit direction, two degrees of freedom; return (q, b, A, B, C) and both innovations with their variances.
 
     ``R`` is the matrix of q, ``variance`` that of each component, rad². The innovations are independent: the NIS is e₁²/s₁ + e₂²/s₂.
     """
+    q, b, A, B, C, e1, s1, e2, s2, _ = update_direction_and_judge(q, b, A, B, C, R, u, v, z, variance)
+    return q, b, A, B, C, e1, s1, e2, s2
+
+
+def update_direction_and_judge(q, b, A, B, C, R, u, v, z, variance):
+    """Do as :func:`update_direction` and return the NIS too; who needs only that saves the divisions of the innovations."""
     h1, e1, h2, y2 = direction_rows(R, u, v, z)
     pa1 = symmetric_times_vector(A, h1)
     pa2 = symmetric_times_vector(A, h2)
     s1 = dot(h1, pa1) + variance
     s12 = dot(h1, pa2)
     s22 = dot(h2, pa2) + variance
-    if s1 + s22 < SHORT_FORM * variance:
-        # Both rows at once: one division in the chain of dependence instead of two.
-        inverse = 1.0 / (s1 * s22 - s12 * s12)
-        i11, i12, i22 = s22 * inverse, -s12 * inverse, s1 * inverse
-        pb1 = transpose_times_vector(B, h1)
-        pb2 = transpose_times_vector(B, h2)
-        ka1 = combine(i11, pa1, i12, pa2)
-        ka2 = combine(i12, pa1, i22, pa2)
-        kb1 = combine(i11, pb1, i12, pb2)
-        kb2 = combine(i12, pb1, i22, pb2)
-        correction = combine(e1, ka1, y2, ka2)
-        b = add(b, combine(e1, kb1, y2, kb2))
-        A = symmetric_minus_outer(symmetric_minus_outer(A, ka1, pa1), ka2, pa2)
-        B = minus_outer(minus_outer(B, ka1, pb1), ka2, pb2)
-        C = symmetric_minus_outer(symmetric_minus_outer(C, kb1, pb1), kb2, pb2)
-        e2 = y2 - s12 / s1 * e1
-        s2 = 1.0 / i22
+    together = s1 + s22 < SHORT_FORM * variance
+    if everywhere(together):
+        correction, b, A, B, C, e2, s2, nis = rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, s1, s12, s22)
+    elif anywhere(together):
+        at_once = rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, s1, s12, s22)
+        one_by_one = row_after_row(b, A, B, C, h1, e1, h2, y2, variance)
+        correction = chosen_triple(together, at_once[0], one_by_one[0])
+        b = chosen_triple(together, at_once[1], one_by_one[1])
+        A = chosen_symmetric(together, at_once[2], one_by_one[2])
+        B = chosen_matrix(together, at_once[3], one_by_one[3])
+        C = chosen_symmetric(together, at_once[4], one_by_one[4])
+        e2 = chosen(together, at_once[5], one_by_one[5])
+        s2 = chosen(together, at_once[6], one_by_one[6])
+        nis = chosen(together, at_once[7], one_by_one[7])
     else:
-        first, b, A, B, C, s1 = update_row(b, A, B, C, h1, e1, variance)
-        e2 = y2 - dot(h2, first)  # what the first row has corrected is taken off the second
-        second, b, A, B, C, s2 = update_row(b, A, B, C, h2, e2, variance)
-        correction = add(first, second)
+        correction, b, A, B, C, e2, s2, nis = row_after_row(b, A, B, C, h1, e1, h2, y2, variance)
     q, A, B = reset(q, A, B, correction)
-    return q, b, A, B, C, e1, s1, e2, s2
+    return q, b, A, B, C, e1, s1, e2, s2, nis
 
 
 def heading_row(R, z):
@@ -198,12 +260,8 @@ def heading_row(R, z):
     return transpose_times_vector(R, (tilt * m[0], tilt * m[1], 1.0))
 
 
-def update_attitude(q, b, A, B, C, measured, variance):
-    """Update with a measured attitude q_fb: three degrees of freedom, ``variance`` (3,) about the body axes, rad².
-
-    The residual is Log(q⁻¹ ⊗ measured), the error state itself. Scalar machine only: it needs an arctangent.
-    """
-    y = logarithm(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), measured))
+def update_residual(q, b, A, B, C, y, variance):
+    """Update with a measured error ``y`` of the attitude itself (3,), rad, body axes, of ``variance`` (3,) about the body axes, rad²."""
     first, b, A, B, C, s1 = update_row(b, A, B, C, (1.0, 0.0, 0.0), y[0], variance[0])
     e2 = y[1] - first[1]
     second, b, A, B, C, s2 = update_row(b, A, B, C, (0.0, 1.0, 0.0), e2, variance[1])
@@ -211,6 +269,16 @@ def update_attitude(q, b, A, B, C, measured, variance):
     third_part, b, A, B, C, s3 = update_row(b, A, B, C, (0.0, 0.0, 1.0), e3, variance[2])
     q, A, B = reset(q, A, B, add(first, add(second, third_part)))
     return q, b, A, B, C, y[0], s1, e2, s2, e3, s3
+
+
+def update_attitude(q, b, A, B, C, measured, variance):
+    """Update with a measured attitude q_fb: three degrees of freedom, ``variance`` (3,) about the body axes, rad².
+
+    The residual is Log(q⁻¹ ⊗ measured), the error state itself. Scalar machine only: lanes take their own logarithm
+    (:func:`strapdown.kernels.lane_angles.rotation_vector`) and :func:`update_residual`.
+    """
+    y = logarithm(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), measured))
+    return update_residual(q, b, A, B, C, y, variance)
 
 
 def update_heading(q, b, A, B, C, h, error, variance):

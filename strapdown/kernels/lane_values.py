@@ -1,8 +1,12 @@
-"""Lanes: eight scalars in one value, so that one call of a kernel advances eight runs, or eight stretches of one record.
+"""Lanes: several scalars in one value, so that one call of a kernel advances eight runs, or eight stretches of one record.
 
 A kernel reads and writes lanes by the functions below and computes with them by the same arithmetic as with floats. As plain Python they
 work on NumPy arrays of ``WIDTH``; compiled, :mod:`strapdown.kernels.lanes` puts machine vectors in their place. Nothing is checked:
 the caller answers for every row being inside its array. Arrays are flat and contiguous.
+
+``WIDTH`` is the number of lanes where nothing else is said. A kernel for any number of them takes a ``pattern``, a tuple of as many
+floats: :func:`lanes_of` makes zeros of its count and type, and ``like`` such a value :func:`load_like` and the rest fill theirs. One lane
+is a scalar.
 
 There is no ``if`` on lanes; a kernel that must choose asks :func:`everywhere` or :func:`anywhere`, and :func:`chosen` lane by lane. These
 three take plain conditions and floats too.
@@ -45,6 +49,60 @@ def store_quadruples(array, start, stride, q):
         array[row : row + 4] = [q[0][i], q[1][i], q[2][i], q[3][i]]
 
 
+def lanes_of(pattern):
+    """Return zero in as many lanes as ``pattern``, a tuple of floats, has entries, and of their type."""
+    return np.zeros(len(pattern), np.asarray(pattern).dtype)
+
+
+def load_like(array, start, like):
+    """Return as many elements of ``array`` from ``start`` on as ``like`` has lanes; their type is the array's."""
+    return array[start : start + len(like)].copy()
+
+
+def store_like(array, start, value):
+    """Write lanes of any number to ``array[start : …]``, converted to the precision of the array."""
+    array[start : start + len(value)] = value
+
+
+def narrowed(x, like):
+    """Return doubles in the precision of ``like``."""
+    return np.asarray(x, np.asarray(like).dtype)[()]
+
+
+def total(x):
+    """Return the sum over the lanes, the upper half added to the lower until one is left: one order on every machine."""
+    while len(x) > 1:
+        x = x[: len(x) // 2] + x[len(x) // 2 :]
+    return x[0]
+
+
+def number_where(condition):
+    """Return in how many lanes the condition holds."""
+    return int(np.sum(condition))
+
+
+def bits_of(x):
+    """Return the bits of doubles as words of 64."""
+    return np.float64(x).view(np.uint64)
+
+
+def number_of_bits(word):
+    """Return the doubles with these bits."""
+    return np.uint64(word).view(np.float64)
+
+
+def flush_tiny(like):
+    """Have the machine take numbers below the smallest normal one for zero, if ``like`` is single precision; return the mode before.
+
+    They are met in covariances of small angles in single precision, each costs a hundred additions, and none counts.
+    """
+    return 0
+
+
+def restore_mode(mode):
+    """Undo :func:`flush_tiny`."""
+
+
 def spread(x):
     """Return a float in every lane."""
     return np.full(WIDTH, x)
@@ -52,16 +110,16 @@ def spread(x):
 
 def everywhere(condition):
     """Return whether the condition holds in all lanes."""
-    return condition if isinstance(condition, bool) else bool(np.all(condition))
+    return bool(np.all(condition))
 
 
 def anywhere(condition):
     """Return whether the condition holds in any lane."""
-    return condition if isinstance(condition, bool) else bool(np.any(condition))
+    return bool(np.any(condition))
 
 
 def chosen(condition, a, b):
     """Return a in the lanes where the condition holds, b in the others."""
-    if isinstance(condition, bool):
+    if isinstance(condition, bool | np.bool_):
         return a if condition else b
     return np.where(condition, a, b)

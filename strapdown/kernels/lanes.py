@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import operator
+import platform
 from collections.abc import Callable
 from typing import Any
 
@@ -159,6 +160,17 @@ for _operator, _sign in {
     _define(_operator, 2, _comparison(_sign), compares=True)
 
 
+@infer_global(len)
+class _LengthTemplate(AbstractTemplate):  # type: ignore[misc]
+    def generic(self, arguments: tuple[types.Type, ...], keywords: Any) -> Any:
+        return signature(types.intp, *arguments) if isinstance(arguments[0], Lanes) else None
+
+
+@lower_builtin(len, Lanes)  # type: ignore[untyped-decorator]
+def _length(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+    return context.get_constant(types.intp, sig.args[0].count)
+
+
 # ------------------------------------------------------------------------------------------------ memory and choice
 
 
@@ -285,6 +297,166 @@ def store_quadruples(typingctx: Any, array: Any, start: Any, stride: Any, q: Any
     return types.void(array, types.intp, types.intp, _tuple_of(array.dtype, 4)), lower
 
 
+def _converted(builder: Any, value: Any, source: Any, target: Any) -> Any:
+    """Return floats (lanes or scalar) in another precision."""
+    if source == target:
+        return value
+    kind = _vector(target) if isinstance(target, Lanes) else _ELEMENTS[target]
+    narrower = getattr(target, "dtype", target) == types.float32
+    return (builder.fptrunc if narrower else builder.fpext)(value, kind)
+
+
+def _like(dtype: types.Type, pattern: Any) -> Any:
+    """Return ``dtype`` in as many lanes as ``pattern`` has, a scalar beside a scalar."""
+    return Lanes(dtype, pattern.count) if isinstance(pattern, Lanes) else dtype
+
+
+def _align_stack(builder: Any) -> None:
+    """Have the stack aligned to lines of the cache: spilled vectors that lie across two cost more than the arithmetic.
+
+    A function is aligned as the strictest of its variables, so one is made, and shown to an empty piece of assembly that keeps it.
+    """
+    place = cgutils.alloca_once(builder, ir.ArrayType(ir.IntType(8), 64))
+    place.align = 64
+    builder.asm(ir.FunctionType(ir.VoidType(), [place.type]), "", "r", [place], side_effect=True)
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def lanes_of(typingctx: Any, pattern: Any) -> Any:
+    """Lower :func:`lane_values.lanes_of`."""
+    lanes = Lanes(pattern.dtype, pattern.count)
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        _align_stack(builder)
+        return ir.Constant(_vector(lanes), [0.0] * lanes.count)
+
+    return lanes(pattern), lower
+
+
+_TO_ZERO = 0x8040
+"""Bits of the x86 control word: results and operands below the smallest normal number are zero."""
+
+
+def _control(builder: Any, instruction: str, place: Any) -> None:
+    pointer = ir.IntType(8).as_pointer()
+    function = ir.FunctionType(ir.VoidType(), [pointer])
+    name = f"llvm.x86.sse.{instruction}"
+    builder.call(cgutils.get_or_insert_function(builder.module, function, name), [builder.bitcast(place, pointer)])
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def flush_tiny(typingctx: Any, like: Any) -> Any:
+    """Lower :func:`lane_values.flush_tiny`; on x86 only."""
+    wanted = like.dtype == types.float32 and platform.machine() in ("x86_64", "AMD64")
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        if not wanted:
+            return context.get_constant(types.int32, 0)
+        place = cgutils.alloca_once(builder, ir.IntType(32))
+        _control(builder, "stmxcsr", place)
+        mode = builder.load(place)
+        builder.store(builder.or_(mode, ir.Constant(mode.type, _TO_ZERO)), place)
+        _control(builder, "ldmxcsr", place)
+        return mode
+
+    return types.int32(like), lower
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def restore_mode(typingctx: Any, mode: Any) -> Any:
+    """Lower :func:`lane_values.restore_mode`; a mode of 0 was never read."""
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        if platform.machine() in ("x86_64", "AMD64"):
+            before = arguments[0]
+            with builder.if_then(builder.icmp_unsigned("!=", before, ir.Constant(before.type, 0))):
+                place = cgutils.alloca_once(builder, ir.IntType(32))
+                builder.store(before, place)
+                _control(builder, "ldmxcsr", place)
+        return context.get_dummy_value()
+
+    return types.void(types.int32), lower
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def load_like(typingctx: Any, array: Any, start: Any, like: Any) -> Any:
+    """Lower :func:`lane_values.load_like`."""
+    lanes = Lanes(array.dtype, like.count)
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        return _read(context, builder, array, arguments[0], arguments[1], _vector(lanes))
+
+    return lanes(array, types.intp, like), lower
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def store_like(typingctx: Any, array: Any, start: Any, value: Any) -> Any:
+    """Lower :func:`lane_values.store_like`."""
+    target = Lanes(array.dtype, value.count)
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        data, first, lanes = arguments
+        _write(context, builder, array, data, first, _converted(builder, lanes, value, target))
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, value), lower
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def narrowed(typingctx: Any, x: Any, like: Any) -> Any:
+    """Lower :func:`lane_values.narrowed`."""
+    result = _like(like.dtype if isinstance(like, Lanes) else like, x)
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        return _converted(builder, arguments[0], x, result)
+
+    return result(x, like), lower
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def total(typingctx: Any, x: Any) -> Any:
+    """Lower :func:`lane_values.total`: the upper half is added to the lower until one is left."""
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        value = arguments[0]
+        n = x.count
+        while n > 1:
+            n //= 2
+            value = builder.fadd(*(_picked(builder, value, value, list(range(k, k + n))) for k in (0, n)))
+        return builder.extract_element(value, ir.Constant(_INDEX, 0))
+
+    return x.dtype(x), lower
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def number_where(typingctx: Any, condition: Any) -> Any:
+    """Lower :func:`lane_values.number_where`."""
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        bits = builder.bitcast(arguments[0], ir.IntType(condition.count))
+        return builder.zext(builder.ctpop(bits), ir.IntType(64))
+
+    return types.int64(condition), lower
+
+
+def _reinterpreted(dtype: types.Type) -> Callable[..., Any]:
+    """Return the lowering that reads the same bits as ``dtype``."""
+
+    def reinterpret(typingctx: Any, x: Any) -> Any:
+        result = _like(dtype, x)
+
+        def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+            return builder.bitcast(arguments[0], context.get_value_type(result))
+
+        return result(x), lower
+
+    return reinterpret
+
+
+bits_of = intrinsic(_reinterpreted(types.uint64))
+number_of_bits = intrinsic(_reinterpreted(types.float64))
+
+
 @intrinsic  # type: ignore[untyped-decorator]
 def spread(typingctx: Any, x: Any) -> Any:
     """Lower :func:`lane_values.spread`."""
@@ -329,8 +501,24 @@ def chosen(typingctx: Any, condition: Any, a: Any, b: Any) -> Any:
     return result(condition, result, result), lower
 
 
-INTRINSICS = {f.__name__: f for f in (load, load_triples, load_quadruples, store, store_quadruples, spread, chosen)} | {
-    "everywhere": everywhere,
-    "anywhere": anywhere,
-}
+INTRINSICS = {
+    f.__name__: f
+    for f in (
+        load,
+        load_triples,
+        load_quadruples,
+        store,
+        store_quadruples,
+        lanes_of,
+        flush_tiny,
+        restore_mode,
+        load_like,
+        store_like,
+        narrowed,
+        total,
+        number_where,
+        spread,
+        chosen,
+    )
+} | {"everywhere": everywhere, "anywhere": anywhere, "bits_of": bits_of, "number_of_bits": number_of_bits}
 """What stands for each function of :mod:`strapdown.kernels.lane_values` in compiled code."""

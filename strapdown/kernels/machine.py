@@ -46,9 +46,12 @@ def _twin(function: FunctionType) -> FunctionType:
     return twin
 
 
-def _options() -> dict[str, Any]:
+def _options(function: FunctionType) -> dict[str, Any]:
     # Only 'contract' (fused multiply-add): full fastmath silently breaks isnan and isfinite.
-    return {"fastmath": {"contract"}, "error_model": "numpy", "nogil": True}
+    # A module that says BORROWS_ARRAYS neither makes nor returns arrays, and has them not counted: in a hot loop that costs more than
+    # the arithmetic.
+    counted = not function.__globals__.get("BORROWS_ARRAYS", False)
+    return {"fastmath": {"contract"}, "error_model": "numpy", "nogil": True, "_nrt": counted}
 
 
 @functools.cache
@@ -60,7 +63,7 @@ def helper(function: FunctionType) -> Any:
         from strapdown.kernels.lanes import INTRINSICS
 
         return INTRINSICS[function.__name__]
-    return numba.njit(forceinline=True, **_options())(_twin(function))
+    return numba.njit(forceinline=True, **_options(function))(_twin(function))
 
 
 @functools.cache
@@ -78,10 +81,20 @@ def compiled(function: Callable[..., Any]) -> Any:
 
     if not _is_kernel(function):
         raise TypeError(f"{function!r} does not live in {PACKAGE}; move it there before compiling it")
-    dispatcher = numba.njit(**_options())(_twin(function))  # type: ignore[arg-type]
+    dispatcher = numba.njit(**_options(function))(_twin(function))  # type: ignore[arg-type]
     with contextlib.suppress(RuntimeError):  # no writable place for a cache: compile in every process
         dispatcher._cache = KernelCache(dispatcher.py_func)
     return dispatcher
+
+
+def has_vectors() -> bool:
+    """Return whether the machine has vectors of doubles with fused multiply-add: where not, lanes are taken one at a time."""
+    from numba.core.codegen import get_host_cpu_features
+
+    features = set(get_host_cpu_features().split(","))
+    if platform.machine() in ("x86_64", "AMD64"):
+        return {"+avx2", "+fma"} <= features
+    return platform.machine() in ("aarch64", "arm64")
 
 
 def describe() -> dict[str, str]:
@@ -94,4 +107,5 @@ def describe() -> dict[str, str]:
         "cpu": llvmlite.binding.get_host_cpu_name(),
         "numba": numba.__version__,
         "llvm": ".".join(str(part) for part in llvmlite.binding.llvm_version_info),
+        "lanes": "8 runs at once in float64, 16 in float32" if has_vectors() else "1 run at once: no vectors",
     }

@@ -1,0 +1,194 @@
+"""A Monte Carlo against theory: a right filter passes, and a mismatched one fails by as much as its mismatch says.
+
+A body at rest, a gyro with white and random-walk noise, an attitude sensor once a second. The filter believes too much or too little of
+its noises by a known factor. Then the covariance of its true errors is known too: it goes by the filter's own gains, but with the true
+noises (Joseph's form). From both follow the mean NEES and NIS at every moment, before any run. ``python sims/campaign.py``
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from strapdown import consistency, montecarlo, motion, plots
+from strapdown.gyro import GyroSpec
+from strapdown.mekf import ProcessNoise
+from strapdown.montecarlo import FilterSetup, Plan, Statistics
+from strapdown.plots import style
+from strapdown.scenarios import Scenario
+from strapdown.units import ARCSECOND, DEGREE_PER_HOUR, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
+from strapdown.vectors import AttitudeSensor
+
+SMALL = {"runs": 40, "machine": "scalar"}
+"""Arguments of a run that only shows that the script works."""
+
+GYRO = GyroSpec(angle_random_walk=0.15 * DEGREE_PER_ROOT_HOUR, rate_random_walk=20.0 * DEGREE_PER_HOUR_PER_ROOT_HOUR)
+SIGMA = 40.0 * ARCSECOND
+"""Noise of the attitude sensor about each axis, rad."""
+INTERVAL = 1.0
+"""Seconds from one attitude to the next."""
+SCENARIO = Scenario(
+    name="rest-mismatched",
+    motion=motion.rest(),
+    gyro=GYRO,
+    sensors=(AttitudeSensor(name="star tracker", sigma_across=SIGMA, sigma_about=SIGMA, rate=1.0 / INTERVAL),),
+    rate=10.0,
+    duration=300.0,
+)
+RIGHT = FilterSetup(
+    process_noise=ProcessNoise(
+        angle_random_walk=float(GYRO.angle_random_walk), rate_random_walk=float(GYRO.rate_random_walk)
+    ),
+    attitude_sigma=200.0 * ARCSECOND,
+    bias_sigma=20.0 * DEGREE_PER_HOUR,
+)
+FACTORS: dict[str, tuple[float, float]] = {
+    "right": (1.0, 1.0),
+    "Q x 4": (4.0, 1.0),
+    "Q / 4": (0.25, 1.0),
+    "R x 4": (1.0, 4.0),
+    "R / 4": (1.0, 0.25),
+}
+"""What the filter takes process noise Q and measurement noise R for, as multiples of the true ones."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prediction:
+    """What theory says of one axis at each epoch, the start included."""
+
+    covariance: np.ndarray
+    """What the filter believes (m, 2, 2): attitude, bias."""
+    true_covariance: np.ndarray
+    """The covariance of its true errors (m, 2, 2)."""
+    nis: np.ndarray
+    """Mean NIS of each measurement, per degree of freedom (measurements,)."""
+
+    def anees(self, subset: str) -> np.ndarray:
+        """Return the mean NEES of a subset per state (m,): tr(P⁻¹ Σ) over the number of states."""
+        return self._eigenvalues(subset).mean(axis=1)
+
+    def standard_error(self, subset: str, runs: int) -> np.ndarray:
+        """Return the standard error of a Monte Carlo's ANEES over three axes (m,): eᵀP⁻¹e has the variance 2 tr((P⁻¹ Σ)²)."""
+        values = self._eigenvalues(subset)
+        return np.sqrt(2.0 * np.sum(values**2, axis=1) / (3.0 * runs)) / values.shape[1]
+
+    def _eigenvalues(self, subset: str) -> np.ndarray:
+        rows = {"state": slice(0, 2), "attitude": slice(0, 1), "bias": slice(1, 2)}[subset]
+        P, S = self.covariance[:, rows, rows], self.true_covariance[:, rows, rows]
+        return np.real(np.linalg.eigvals(np.linalg.solve(P, S)))
+
+
+def predict(factor_q: float, factor_r: float, epochs: int) -> Prediction:
+    """Return what theory says of a filter that believes ``factor_q`` times Q and ``factor_r`` times R, at rest, one axis by itself."""
+    T, white, walk = INTERVAL, float(GYRO.angle_random_walk) ** 2, float(GYRO.rate_random_walk) ** 2
+    phi = np.array([[1.0, -T], [0.0, 1.0]])
+    Q = np.array([[white * T + walk * T**3 / 3.0, -walk * T**2 / 2.0], [-walk * T**2 / 2.0, walk * T]])
+    R, H = SIGMA**2, np.array([[1.0, 0.0]])
+    P = np.diag([RIGHT.attitude_sigma**2, RIGHT.bias_sigma**2])
+    S = P.copy()
+    believed, true, nis = [P], [S], []
+    for _ in range(round(SCENARIO.duration / T)):
+        P = phi @ P @ phi.T + factor_q * Q
+        S = phi @ S @ phi.T + Q
+        innovation = float(P[0, 0] + factor_r * R)
+        nis.append((S[0, 0] + R) / innovation)
+        K = P @ H.T / innovation
+        left = np.eye(2) - K @ H
+        P = left @ P @ left.T + factor_r * R * (K @ K.T)
+        S = left @ S @ left.T + R * (K @ K.T)
+        believed.append(P)
+        true.append(S)
+    every = slice(None, None, round(SCENARIO.duration / T) // epochs)
+    return Prediction(covariance=np.array(believed)[every], true_covariance=np.array(true)[every], nis=np.array(nis))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """Monte Carlo and theory of each mismatch."""
+
+    statistics: dict[str, Statistics]
+    predictions: dict[str, Prediction]
+    machine: str
+    figures: tuple[Path, ...]
+
+
+def plan(factor_q: float, factor_r: float, seed: int) -> Plan:
+    """Return the plan of a filter that believes ``factor_q`` times Q and ``factor_r`` times R."""
+    root = float(np.sqrt(factor_q))
+    noise = ProcessNoise(
+        angle_random_walk=root * RIGHT.process_noise.angle_random_walk,
+        rate_random_walk=root * RIGHT.process_noise.rate_random_walk,
+    )
+    setup = replace(RIGHT, process_noise=noise, measurement_sigma_factor=float(np.sqrt(factor_r)))
+    return Plan(scenario=SCENARIO, setup=setup, seed=seed, epochs=100, nis_bins=round(SCENARIO.duration / INTERVAL))
+
+
+def main(*, runs: int = 4000, seed: int = 1, machine: str = "auto", out: Path | str | None = None) -> Result:
+    """Run each mismatch and compare it with its prediction. Figures are written to ``out`` if it is given."""
+    plans = {name: plan(*factors, seed) for name, factors in FACTORS.items()}
+    statistics = {name: montecarlo.run_plan(one, runs=runs, machine=machine) for name, one in plans.items()}
+    predictions = {name: predict(*factors, plans[name].epochs) for name, factors in FACTORS.items()}
+    figures = []
+    if out is not None:
+        figures.append(plots.save(draw(statistics, predictions, runs), Path(out) / "mismatch.png"))
+    return Result(
+        statistics=statistics,
+        predictions=predictions,
+        machine=str(montecarlo.choose(plans["right"], machine)),
+        figures=tuple(figures),
+    )
+
+
+def draw(statistics: dict[str, Statistics], predictions: dict[str, Prediction], runs: int) -> Any:
+    """Draw NEES of attitude and bias and NIS over time, found and predicted."""
+    figure, axes = plots.new_figure(1, 3, size=(12.0, 4.6))
+    for ax, subset in zip(axes, ("attitude", "bias", None), strict=True):
+        low, high = consistency.mean_bounds(3, runs)
+        ax.axhspan(low, high, color=style.ink(), alpha=0.15, linewidth=0, label="99 % bounds of a right filter")
+        for k, name in enumerate(FACTORS):
+            found, told = statistics[name], predictions[name]
+            if subset is None:
+                ax.plot(found.nis_time[::3], found.nis[::3], ".", markersize=3, color=style.CYCLE[k], label=name)
+                ax.plot(found.nis_time, told.nis, color=style.CYCLE[k], linewidth=1.0)
+            else:
+                column = ("state", "attitude", "bias").index(subset)
+                ax.plot(found.time, found.anees[:, column], ".", markersize=3, color=style.CYCLE[k], label=name)
+                ax.plot(found.time, told.anees(subset), color=style.CYCLE[k], linewidth=1.0)
+        ax.set_yscale("log")
+        ax.set_yticks([0.25, 0.5, 1.0, 2.0, 4.0], ["¼", "½", "1", "2", "4"])
+        ax.minorticks_off()
+        ax.set_ylim(0.2, 5.0)
+        ax.set_xlabel("time, s")
+        ax.set_title("NIS" if subset is None else f"NEES of the {subset}")
+    axes[0].set_ylabel("mean per degree of freedom")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=6, frameon=False)
+    figure.suptitle(
+        f"Filters that believe Q or R times a factor: {runs} runs (dots) and theory, tr(P⁻¹Σ) along the filter's own gains (lines)"
+    )
+    return figure
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=4000)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--out", type=Path, default=Path("results/campaign"))
+    arguments = parser.parse_args()
+    result = main(runs=arguments.runs, seed=arguments.seed, out=arguments.out)
+    print(
+        f"{arguments.runs} runs of each, machine: {result.machine}. At the end, per degree of freedom, found (predicted):"
+    )
+    for name, found in result.statistics.items():
+        told = result.predictions[name]
+        parts = [
+            f"{subset} {found.anees[-1, k]:.3f} ({told.anees(subset)[-1]:.3f})"
+            for k, subset in ((1, "attitude"), (2, "bias"))
+        ]
+        verdict = "consistent" if montecarlo.summary(found)["consistent"] else "NOT consistent"
+        print(f"{name:6s} NEES of {', '.join(parts)}, NIS {found.nis[-1]:.3f} ({told.nis[-1]:.3f}): {verdict}")
+    print("figures:", *result.figures)

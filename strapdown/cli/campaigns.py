@@ -1,0 +1,290 @@
+"""Monte Carlo campaigns."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from strapdown.cli.terminal import app, console, progress_bar, rate_text, show, table, verdict, written
+
+if TYPE_CHECKING:
+    from strapdown.montecarlo import Plan
+    from strapdown.montecarlo.campaign import Campaign
+
+_RUNS = 1000
+_CAMPAIGN_SUFFIXES = (".h5", ".hdf5")
+
+
+@app.command()
+def montecarlo(
+    scenario: Annotated[
+        str,
+        typer.Argument(help="Name of a built-in scenario, a TOML file, or the HDF5 file of a campaign: its own plan."),
+    ],
+    runs: Annotated[int | None, typer.Option(help="Runs; 1000, or what a resumed file wants.")] = None,
+    filter_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--filter", help="TOML with a table named filter; without it the filter that matches the scenario."
+        ),
+    ] = None,
+    dispersions: Annotated[
+        Path | None,
+        typer.Option(
+            help="TOML with a table named dispersions: initial errors and gyro parameters that differ from run to run."
+        ),
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed; the scenario's own if not given.")] = None,
+    threads: Annotated[int | None, typer.Option(help="Threads; one a core if not given.")] = None,
+    float32: Annotated[bool, typer.Option("--float32", help="Compute in single precision, where lanes serve.")] = False,
+    machine: Annotated[str, typer.Option(help="lanes, scalar, or auto: the lanes wherever they serve.")] = "auto",
+    chunk: Annotated[
+        int | None, typer.Option(help="Runs between merges and writes; the machine's if not given.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="HDF5 file; NAME-montecarlo.h5 if not given.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the file, if it exists.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Begin anew although the file exists.")] = False,
+    workers: Annotated[
+        int | None, typer.Option(help="Compute in so many processes instead of threads (needs Dask).")
+    ] = None,
+    cluster: Annotated[
+        str | None, typer.Option(help="Compute on the Dask scheduler at this address, tcp://HOST:8786.")
+    ] = None,
+    replay: Annotated[
+        int | None, typer.Option(help="Compute this one run again and write it in full detail: record and estimate.")
+    ] = None,
+) -> None:
+    """Run a scenario many times through a filter; tell whether the filter may be believed."""
+    from strapdown import montecarlo as engine
+    from strapdown.checks import InputError
+    from strapdown.files import output_file, write_json
+    from strapdown.montecarlo import campaign as campaigns
+
+    source = Path(scenario)
+    held = campaigns.read(source) if source.suffix.lower() in _CAMPAIGN_SUFFIXES else None
+    if held is None:
+        plan = _plan(scenario, filter_file, dispersions, seed, float32)
+        target = out or Path(f"{plan.scenario.name or source.stem}-montecarlo.h5")
+    else:
+        given = {"--filter": filter_file, "--dispersions": dispersions, "--seed": seed, "--float32": float32 or None}
+        for name, value in given.items():
+            if value is not None:
+                raise InputError(f"{name} is given, but {source} tells its own; leave it out, or name a scenario")
+        plan, target = held.plan, out or source
+        machine = held.machine if machine == "auto" else machine
+    output_file("out", target, _CAMPAIGN_SUFFIXES)
+    if replay is not None:
+        _replay(plan, replay, machine, target)
+        return
+    if held is not None and target == source and not (resume or overwrite):
+        _tell(held)
+        return
+    if runs is None:
+        runs = campaigns.read(target).runs if resume and target.exists() else _RUNS
+    if workers is not None and cluster is not None:
+        raise InputError("--workers and --cluster exclude each other: a cluster has workers of its own")
+    choice = engine.choose(plan, machine)
+    engine.in_threads(threads)  # so that a wrong number is found now
+    console.print(
+        f"{plan.scenario.name or source.stem}: {runs} runs, seed {plan.seed}, machine: {choice}.", soft_wrap=True
+    )
+    with contextlib.ExitStack() as stack:
+        hands = None
+        if workers is not None or cluster is not None:
+            from strapdown.montecarlo.cluster import dask_client, on_dask
+
+            client = stack.enter_context(dask_client(workers=workers, address=cluster))
+            hands = on_dask(client)
+            console.print(f"Dask at {client.scheduler.address}: {sum(client.nthreads().values())} worker threads.")
+        stack.enter_context(_terminated_as_interrupted())
+        advance = stack.enter_context(progress_bar("runs", runs, rate="runs/s"))
+        try:
+            result = campaigns.run(
+                plan,
+                target,
+                runs=runs,
+                resume=resume,
+                overwrite=overwrite,
+                chunk=chunk,
+                machine=machine,
+                threads=threads,
+                workers=hands,
+                progress=advance,
+            )
+        except KeyboardInterrupt:
+            console.print(f"What is finished is in {target}; go on with --resume.", soft_wrap=True)
+            raise
+    _tell(result)
+    report = target.with_suffix(".json")
+    write_json(report, _report(result))
+    written(target, report)
+
+
+@contextlib.contextmanager
+def _terminated_as_interrupted() -> Iterator[None]:
+    """Take SIGTERM, which batch systems send before they kill, for Ctrl-C, so that what is finished is written."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _plan(scenario: str, filter_file: Path | None, dispersions: Path | None, seed: int | None, float32: bool) -> Plan:
+    from strapdown import montecarlo as engine
+    from strapdown import setup
+    from strapdown.scenarios import load_scenario
+
+    loaded = load_scenario(scenario)
+    filter_setup = setup.matched(loaded) if filter_file is None else setup.read_setup(filter_file)
+    return engine.Plan(
+        scenario=loaded,
+        setup=filter_setup,
+        seed=loaded.seed if seed is None else seed,
+        epochs=engine.whole_epochs(loaded, filter_setup),
+        dispersions=engine.Dispersions() if dispersions is None else engine.read_dispersions(dispersions),
+        precision="float32" if float32 else "float64",
+    )
+
+
+def _report(campaign: Campaign) -> dict[str, Any]:
+    from strapdown.montecarlo import summary
+
+    assert campaign.statistics is not None
+    return {
+        "plan": campaign.plan.to_table(),
+        "digest": campaign.plan.digest,
+        "machine": campaign.machine,
+        "lanes_do_not_serve": campaign.reason or None,
+        "chunk": campaign.chunk,
+        "version": campaign.version,
+        "seconds": campaign.seconds,
+        **summary(campaign.statistics),
+    }
+
+
+def _tell(campaign: Campaign) -> None:
+    from strapdown.checks import InputError
+    from strapdown.montecarlo import summary
+    from strapdown.montecarlo.verdicts import QUANTILES
+
+    if campaign.statistics is None:
+        raise InputError("no chunk of the campaign is finished; go on with it (--resume)")
+    if not campaign.finished:
+        console.print(f"{campaign.statistics.runs} of {campaign.runs} runs are finished.")
+    report = summary(campaign.statistics)
+    figure = lambda value: "-" if value is None else f"{value:.4g}" if value >= 1e3 else f"{value:.4f}"  # noqa: E731
+    rows = table(
+        "Per degree of freedom; 1 is a filter as good as it says", "", "mean", "least", "greatest", "from", "to", ""
+    )
+    for subset, part in report["nees"].items():
+        values = (part["anees"], part["least"], part["greatest"], *part["bounds"])
+        rows.add_row(f"NEES of the {subset}", *map(figure, values), verdict(part["consistent"]))
+    for part in report["nis"]:
+        name = f"NIS of {part['sensor']}"
+        rows.add_row(name, figure(part["nis"]), "", "", *map(figure, part["bounds"]), verdict(part["consistent"]))
+    show(rows)
+    refused = ", ".join(f"{part['refused']} of {part['sensor']}" for part in report["nis"] if part["refused"])
+    if refused:
+        console.print(f"The gate refused {refused}.")
+    last = report["last_epoch"]
+    errors = table(
+        f"Errors at {last['time_s']:g} s, worst axis; share of the judged ones inside kσ",
+        "",
+        "unit",
+        "RMS",
+        "filter's σ",
+        *(f"{100.0 * q:g} %" for q in QUANTILES),
+        "1σ",
+        "2σ",
+        "3σ",
+        left=2,
+    )
+    for name, unit, text in (("attitude", "arcsec", "arcsec"), ("bias", "deg_per_hour", "°/h")):
+        axis = _worst_axis(last[f"{name}_rms_error_{unit}"])
+        keys = ("rms_error", "sigma", *(f"error_quantile_{q:g}" for q in QUANTILES))
+        sizes = [last[f"{name}_{key}_{unit}"][axis] for key in keys]
+        large = name == "attitude" and (sizes[0] or 0.0) > 3600.0
+        if large:
+            sizes = [None if x is None else x / 3600.0 for x in sizes]
+        shares = ("-" if x is None else f"{100.0 * x:.2f} %" for x in report["coverage"][name])
+        errors.add_row(
+            f"{name} {'xyz'[axis]}", "°" if large else text, *("-" if x is None else f"{x:.4g}" for x in sizes), *shares
+        )
+    show(errors)
+    expected = ", ".join(f"{100.0 * share:.2f}" for share in report["coverage"]["expected"])
+    console.print(f"Of a right filter's errors {expected} % lie inside 1, 2, 3 σ.")
+    worst = ", ".join(
+        f"{part['run']} ({'failed' if part['largest_nees'] is None else format(part['largest_nees'], '.1f')})"
+        for part in report["worst_runs"][:5]
+    )
+    console.print(f"Worst runs, by their largest NEES of six states: {worst}. See one with --replay.", soft_wrap=True)
+    if report["failed_runs"]:
+        console.print(f"In {report['failed_runs']} runs the filter failed: no finite error or covariance.")
+    rate = f", {rate_text(campaign.statistics.runs / campaign.seconds)} runs/s" if campaign.seconds > 0.0 else ""
+    said = "may be believed" if report["consistent"] else "may NOT be believed"
+    console.print(
+        f"{report['runs']} runs, {campaign.seconds:.3g} s{rate}. The filter {said}: bounds that a right filter keeps all together "
+        f"with {100.0 * report['probability']:g} %, NEES at {report['epochs_judged']} epochs.",
+        soft_wrap=True,
+    )
+
+
+def _worst_axis(values: list[float | None]) -> int:
+    sizes = [float("inf") if x is None else x for x in values]
+    return sizes.index(max(sizes))
+
+
+def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
+    import json
+
+    import numpy as np
+
+    from strapdown import consistency, recordfiles
+    from strapdown import montecarlo as engine
+    from strapdown.records import Truth, write_estimate
+    from strapdown.scenarios import scenario_to_toml
+
+    choice = engine.choose(plan, machine)
+    again = engine.replay(plan, run, machine=machine)
+    truth = again.record.truth
+    assert truth is not None
+    # Of a filter that joins samples to steps some machines tell the record at the samples, some at the steps.
+    edges = slice(None, None, (len(again.record.time) - 1) // (len(again.estimate.time) - 1))
+    told = Truth(attitude=truth.attitude[edges], bias=truth.bias[edges])
+    table_of = plan.to_table()
+    attributes: dict[str, Any] = {
+        "scenario": scenario_to_toml(plan.scenario),
+        "seed": plan.seed,
+        "run": run,
+        "machine": choice.machine,
+        "filter": json.dumps(table_of["filter"]),
+        "dispersions": json.dumps(table_of["dispersions"]),
+    }
+    paths = [target.with_name(f"{target.stem}-run-{run}-{what}.h5") for what in ("record", "estimate")]
+    recordfiles.write_record(
+        paths[0],
+        again.record,
+        gyro_spec=None if plan.dispersions.of_the_gyro else plan.scenario.gyro,
+        scenario=attributes["scenario"],
+        seed=plan.seed,
+        run=run,
+        attributes={name: attributes[name] for name in ("machine", "dispersions")},
+    )
+    write_estimate(paths[1], again.estimate, attributes, truth=told)
+    estimate = again.estimate
+    error = consistency.errors(estimate.attitude, estimate.bias, told.attitude, told.bias)
+    assert estimate.covariance is not None
+    nees = consistency.nees(error, estimate.covariance)
+    step = int(np.argmax(nees))
+    console.print(
+        f"Run {run} of seed {plan.seed}, machine: {choice}. Its largest NEES is {nees[step]:.4g}, of six states, "
+        f"at {estimate.time[step]:g} s.",
+        soft_wrap=True,
+    )
+    written(*paths)

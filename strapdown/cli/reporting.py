@@ -1,0 +1,32 @@
+"""Reports of results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from strapdown.cli.terminal import app, console, progress_bar, written
+
+
+@app.command()
+def report(
+    result: Annotated[
+        Path, typer.Argument(help="HDF5 file that `strapdown estimate` or `strapdown montecarlo` wrote.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="The page, .html; beside the result, of its name, if not given.")
+    ] = None,
+    probability: Annotated[
+        float, typer.Option(help="That a right filter is not called wrong by any test, between 0 and 1.")
+    ] = 0.99,
+) -> None:
+    """Write a self-contained HTML page about a result: verdict in words, numbers, figures, how to reproduce it; the statistics as JSON."""
+    from strapdown import report as reports
+
+    with progress_bar("judging, drawing", 1) as advance:
+        done = reports.write(result, out, probability=probability)
+        advance(1)
+    console.print(f"{result.name}: {done.verdict}.", highlight=False)
+    written(done.page, done.statistics)

@@ -1,0 +1,378 @@
+"""A campaign and its file: a Monte Carlo that survives being killed, and goes on to the same bits.
+
+The file is HDF5 and whole at every moment: it is written beside and renamed over, so whoever opens it, during the campaign or after it was
+killed in the middle of writing, finds the statistics of the runs finished so far. It holds sums, not runs, so it does not grow with their
+number.
+
+What is merged is a left fold over whole chunks in the order of their runs, which is a function of (plan, machine, chunk) alone. What a file
+needs beyond the merged statistics to go on is in its group ``resume``: chunks that were finished before others in front of them,
+``resume/<first run>``, and, where the last chunk is short, the fold without it, ``resume/whole``. So a finished campaign can be extended,
+and has the bits of one that was as long from the start.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import platform
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import strapdown
+from strapdown import scenarios, setup
+from strapdown.checks import InputError, count
+from strapdown.montecarlo.engine import Chunks, Work, Workers, choose, in_threads, machine_named
+from strapdown.montecarlo.plan import Plan, from_table
+from strapdown.montecarlo.statistics import Statistics, merge
+from strapdown.records import CONVENTIONS, put
+
+KIND = "strapdown montecarlo"
+"""The attribute ``kind`` of a campaign's file."""
+FORMAT = 1
+"""Version of the layout; a reader refuses a newer one."""
+SHARE = 0.1
+"""Largest share of the time that is spent writing the file; chunks that finish faster are written several at a time."""
+
+_UNITS: dict[str, tuple[str, str]] = {
+    "time": ("s", "epochs"),
+    "finite": ("1", "runs whose error and covariance are finite numbers, by epoch"),
+    "error_sum": ("rad (columns 0-2), rad/s (columns 3-5)", "sum over runs of the error (dtheta, db)"),
+    "error_product_sum": ("rad^2, rad^2/s, (rad/s)^2", "sum over runs of error times its transpose"),
+    "covariance_sum": ("rad^2, rad^2/s, (rad/s)^2", "sum over runs of the filter's own covariance"),
+    "nees_sum": ("1", "sum over runs of the NEES of the state (6 degrees of freedom), the attitude (3), the bias (3)"),
+    "log_nees_sum": ("1", "sum over runs of the natural logarithm of the same"),
+    "coverage": ("1", "runs whose error lies inside 1, 2, 3 sigma, by epoch and state"),
+    "histogram": (
+        "1",
+        "runs by epoch, column (6 absolute errors, 3 NEES) and bin; see bins_per_octave and the exponents",
+    ),
+    "nis_edges": ("s", "edges of the spans of time of the NIS"),
+    "sensor_nis_sum": ("1", "sum over runs of the NIS, by sensor and span of time"),
+    "sensor_degrees": ("1", "sum over runs of its degrees of freedom"),
+    "sensor_refused": ("1", "measurements that the gate refused"),
+    "worst_run": ("1", "numbers of the worst runs"),
+    "worst_score": ("1", "their largest NEES of the state"),
+    "example_run": ("1", "numbers of the example runs"),
+    "example_error": ("rad (columns 0-2), rad/s (columns 3-5)", "errors of the example runs by epoch"),
+    "example_sigma": ("rad (columns 0-2), rad/s (columns 3-5)", "the filter's own standard deviations in them"),
+}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Campaign:
+    """A campaign as its file tells it."""
+
+    plan: Plan
+    machine: str
+    reason: str
+    """Why the lanes do not serve, if they do not."""
+    chunk: int
+    runs: int
+    """Runs wanted."""
+    statistics: Statistics | None
+    """Of the runs finished so far, in their order without a gap; None if there is none."""
+    version: str = strapdown.__version__
+    seconds: float = 0.0
+    """Time spent computing, s, over all resumptions."""
+
+    @property
+    def finished(self) -> bool:
+        """Whether all runs wanted are in the statistics."""
+        return self.statistics is not None and self.statistics.runs == self.runs
+
+
+@dataclass
+class _Progress:
+    """What is finished: the fold over whole chunks from the first on, and chunks finished early, by their first run."""
+
+    whole: Statistics | None
+    early: dict[int, Statistics]
+    chunk: int
+
+    @property
+    def merged(self) -> int:
+        """Runs in the fold."""
+        return 0 if self.whole is None else self.whole.runs
+
+    def take(self, first_run: int, part: Statistics) -> None:
+        """Take a finished chunk."""
+        self.early[first_run] = part
+        while self.merged in self.early and self.early[self.merged].runs == self.chunk:
+            first = self.merged
+            self.whole = self.early[first] if self.whole is None else merge(self.whole, self.early[first])
+            del self.early[first]
+
+    @property
+    def statistics(self) -> Statistics | None:
+        """Of all runs from the first on without a gap, a short last chunk with them."""
+        last = self.early.get(self.merged)
+        if last is None:
+            return self.whole
+        return last if self.whole is None else merge(self.whole, last)
+
+    def missing(self, runs: int) -> Chunks:
+        """Return the chunks that are left to compute, and forget a short one that is to be a longer one now."""
+        for first in [first for first, part in self.early.items() if part.runs != min(self.chunk, runs - first)]:
+            del self.early[first]
+        left = range(self.merged, runs, self.chunk)
+        return Chunks([first for first in left if first not in self.early] if self.early else left, runs, self.chunk)
+
+
+def run(
+    plan: Plan,
+    path: str | os.PathLike[str],
+    *,
+    runs: int,
+    resume: bool = False,
+    overwrite: bool = False,
+    chunk: int | None = None,
+    machine: str = "auto",
+    threads: int | None = None,
+    workers: Workers | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Campaign:
+    """Run a plan and keep what is finished in a file.
+
+    Parameters
+    ----------
+    plan : Plan
+    path : path
+        HDF5 file. Finished chunks are in it, or will be within a tenth of the time spent so far on the last one written; Ctrl-C writes all.
+    runs : int
+        Runs wanted; more than a file holds extends it.
+    resume : bool
+        Go on from the file if it exists; it must be of the same plan, machine, chunk and version.
+    overwrite : bool
+        Begin anew although the file exists.
+    chunk : int, optional
+        Runs between merges; default the file's, or the machine's.
+    machine, threads, workers
+        As of :func:`strapdown.montecarlo.run_plan`.
+    progress : callable, optional
+        Called with the number of runs just finished, first with those that the file held.
+
+    Raises
+    ------
+    InputError
+        If the file exists and is neither to be resumed nor overwritten, or is of another plan, or is no campaign.
+    """
+    target = Path(path)
+    count("runs", runs)
+    table = plan.to_table()
+    if target.exists() and not resume and not overwrite:
+        raise InputError(
+            f"{target} exists; go on with it (--resume), write over it (--overwrite), or choose another name (--out)"
+        )
+    chosen = choose(plan, machine)
+    stored = _stored(target) if resume and target.exists() else None
+    if stored is None:
+        size = machine_named(chosen.machine).CHUNK if chunk is None else count("chunk", chunk)
+        state, before = _Progress(None, {}, size), 0.0
+    else:
+        held, state = stored
+        size, before = held.chunk, held.seconds
+        _need_same(target, held, plan, chosen.machine, size if chunk is None else count("chunk", chunk), runs)
+    begun = time.perf_counter()
+
+    def campaign() -> Campaign:
+        return Campaign(
+            plan=plan,
+            machine=chosen.machine,
+            reason=chosen.reason,
+            chunk=size,
+            runs=runs,
+            statistics=state.statistics,
+            seconds=before + time.perf_counter() - begun,
+        )
+
+    missing = state.missing(runs)
+    if progress is not None and (done := runs - sum(n for _, n in missing)):
+        progress(done)
+    hands = in_threads(threads) if workers is None else workers
+    due, unwritten = 0.0, True  # the first time in any case, so that a file that cannot be written is found at once
+    _write(target, campaign(), state, table)
+    try:
+        for place, (part,) in hands(Work(plans=(plan,), machine=chosen.machine), missing):
+            state.take(missing[place][0], part)
+            unwritten = True
+            if progress is not None:
+                progress(missing[place][1])
+            if (now := time.perf_counter()) >= due:
+                _write(target, campaign(), state, table)
+                unwritten = False
+                due = time.perf_counter() + (time.perf_counter() - now) * (1.0 / SHARE - 1.0)
+    finally:
+        if unwritten:
+            _write(target, campaign(), state, table)
+    return campaign()
+
+
+def _need_same(target: Path, held: Campaign, plan: Plan, machine: str, chunk: int, runs: int) -> None:
+    """Refuse to go on with a file of another plan; name the first difference."""
+    given = {**_flat(plan.to_table()), "machine": machine, "chunk": chunk, "version": strapdown.__version__}
+    there = {**_flat(held.plan.to_table()), "machine": held.machine, "chunk": held.chunk, "version": held.version}
+    for name in sorted(given.keys() | there.keys()):
+        if given.get(name) != there.get(name):
+            raise InputError(
+                f"{target} is of another campaign: {name} is {there.get(name, 'not given')} there and {given.get(name, 'not given')} here; "
+                "give what it was begun with, or choose another file"
+            )
+    finished = 0 if held.statistics is None else held.statistics.runs
+    if runs < finished:
+        raise InputError(f"{target} holds {finished} runs already, more than the {runs} wanted; ask for more of them")
+
+
+def _flat(table: Mapping[str, Any], place: str = "") -> dict[str, Any]:
+    """Return nested tables and lists of tables as one, names joined by dots."""
+    result: dict[str, Any] = {}
+    for name, value in table.items():
+        inner = f"{place}{name}"
+        if isinstance(value, Mapping):
+            result.update(_flat(value, f"{inner}."))
+        elif isinstance(value, list) and value and all(isinstance(item, Mapping) for item in value):
+            result.update(_flat({str(i): item for i, item in enumerate(value)}, f"{inner}."))
+        else:
+            result[inner] = value
+    return result
+
+
+# -------------------------------------------------------------------------------------------------------------------------- file
+
+
+@contextlib.contextmanager
+def _replacing(path: Path) -> Iterator[Path]:
+    """Yield a temporary file that replaces ``path`` on success, safe on the disk before.
+
+    Its name is always the same, unlike that of :func:`strapdown.files.written_beside`: of many commits, killed at any moment, at most one
+    such file is left, and the next commit takes it.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.part")
+    try:
+        yield temporary
+        with temporary.open("rb") as written:
+            os.fsync(written.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _write(path: Path, campaign: Campaign, state: _Progress, table: Mapping[str, Any]) -> None:
+    import h5py
+    import numba
+
+    plan = campaign.plan
+    with _replacing(path) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs.update(
+            kind=KIND,
+            format=FORMAT,
+            version=campaign.version,
+            versions=json.dumps(
+                {
+                    "python": platform.python_version(),
+                    "numpy": np.__version__,
+                    "numba": numba.__version__,
+                    "h5py": h5py.__version__,
+                }
+            ),
+            conventions=CONVENTIONS,
+            scenario=scenarios.scenario_to_toml(plan.scenario),
+            filter=setup.to_toml(plan.setup),
+            plan=json.dumps(table, default=float),
+            digest=plan.digest,
+            seed=plan.seed,
+            machine=campaign.machine,
+            reason=campaign.reason,
+            precision=plan.precision,
+            chunk=campaign.chunk,
+            runs=campaign.runs,
+            finished_runs=0 if campaign.statistics is None else campaign.statistics.runs,
+            seconds=campaign.seconds,
+        )
+        if campaign.statistics is not None:
+            _put_statistics(file.create_group("statistics"), campaign.statistics)
+        if state.early and state.whole is not None and campaign.statistics is not state.whole:
+            _put_statistics(file.create_group("resume/whole"), state.whole)
+        for first_run, part in sorted(state.early.items()):
+            _put_statistics(file.create_group(f"resume/{first_run}"), part)
+
+
+def _put_statistics(group: Any, statistics: Statistics) -> None:
+    from strapdown.montecarlo.statistics import BINS_PER_OCTAVE, ERROR_EXPONENT, NEES_EXPONENT
+
+    group.attrs.update(
+        runs=statistics.runs,
+        sensors=json.dumps(statistics.sensors),
+        bins_per_octave=BINS_PER_OCTAVE,
+        first_error_exponent=ERROR_EXPONENT,
+        first_nees_exponent=NEES_EXPONENT,
+    )
+    for name, (unit, meaning) in _UNITS.items():
+        put(group, name, getattr(statistics, name), unit, meaning)
+
+
+def _statistics_of(group: Any) -> Statistics:
+    return Statistics(
+        runs=int(group.attrs["runs"]),
+        sensors=tuple(json.loads(group.attrs["sensors"])),
+        **{f.name: group[f.name][()] for f in fields(Statistics) if f.name not in ("runs", "sensors")},
+    )
+
+
+def read(path: str | os.PathLike[str]) -> Campaign:
+    """Read a campaign's file, finished or not.
+
+    Raises
+    ------
+    InputError
+        If it does not exist, is truncated, is of another kind, or was written by a newer version.
+    """
+    return _stored(Path(path))[0]
+
+
+def _stored(path: Path) -> tuple[Campaign, _Progress]:
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("kind") != KIND:
+                raise InputError(f"{path} is no Monte Carlo campaign; `strapdown montecarlo` writes one")
+            if file.attrs["format"] > FORMAT:
+                raise InputError(
+                    f"{path} has format {file.attrs['format']}, newer than this package knows; install strapdown {file.attrs['version']}"
+                )
+            campaign = Campaign(
+                plan=from_table(json.loads(file.attrs["plan"])),
+                machine=str(file.attrs["machine"]),
+                reason=str(file.attrs["reason"]),
+                chunk=int(file.attrs["chunk"]),
+                runs=int(file.attrs["runs"]),
+                statistics=_statistics_of(file["statistics"]) if "statistics" in file else None,
+                version=str(file.attrs["version"]),
+                seconds=float(file.attrs["seconds"]),
+            )
+            early = file.get("resume", {})
+            return campaign, _Progress(
+                _statistics_of(early["whole"]) if "whole" in early else _whole(campaign, early),
+                {int(name): _statistics_of(group) for name, group in early.items() if name != "whole"},
+                campaign.chunk,
+            )
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist; check the path") from None
+    except (OSError, KeyError) as error:
+        raise InputError(
+            f"{path} cannot be read as a campaign ({error}); the file is truncated or of another kind"
+        ) from None
+
+
+def _whole(campaign: Campaign, early: Mapping[str, Any]) -> Statistics | None:
+    """Return the fold over whole chunks where the file does not hold it by itself: the statistics, unless they are one short chunk."""
+    if campaign.statistics is None or "0" in early:
+        return None
+    return campaign.statistics

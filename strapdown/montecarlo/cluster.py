@@ -1,0 +1,124 @@
+"""Chunks on other processes and hosts, through Dask distributed (the extra ``cluster``).
+
+The same chunks give the same bits wherever they run; Dask gives a chunk that was lost with its worker to another one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib
+import pickle
+from collections.abc import Iterator
+from typing import Any
+
+import strapdown
+from strapdown.checks import InputError, count
+from strapdown.montecarlo.engine import Chunks, Parts, Window, Work, Workers
+
+CONNECT_SECONDS = 15
+
+
+@contextlib.contextmanager
+def dask_client(*, workers: int | None = None, address: str | None = None) -> Iterator[Any]:
+    """Yield a Dask client: of so many worker processes of this host, one thread each, or of the scheduler at an address.
+
+    Raises
+    ------
+    InputError
+        If Dask is not installed, or nothing answers at the address.
+    """
+    distributed = _distributed()
+    if address is not None:
+        if workers is not None:
+            raise InputError("workers and cluster exclude each other: the cluster has workers of its own; give one")
+        try:
+            client = distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
+        except (OSError, ValueError, TypeError) as error:
+            raise InputError(
+                f"no Dask scheduler answers at {address} ({error}); start one with `dask scheduler` and give its address, "
+                "tcp://HOST:8786"
+            ) from None
+        with client:
+            yield client
+        return
+    number = count("workers", 1 if workers is None else workers)
+    cluster = distributed.LocalCluster(
+        n_workers=number,
+        threads_per_worker=1,
+        processes=True,
+        memory_limit=0,
+        dashboard_address="127.0.0.1:0",  # the port that is free; there is no turning it off
+        silence_logs="ERROR",
+    )
+    with cluster, distributed.Client(cluster, set_as_default=False) as client:
+        yield client
+
+
+def on_dask(client: Any) -> Workers:
+    """Return workers that are those of a Dask client.
+
+    Workers may come and go meanwhile. A chunk is sent at most twice ahead for each thread there is.
+    """
+    distributed = _distributed()
+
+    def work_through(work: Work, chunks: Chunks) -> Iterator[tuple[int, Parts]]:
+        payload = distributed.protocol.pickle.dumps(work)  # by value where a class or function is the user's own
+        window = Window(len(chunks), 2 * max(1, sum(client.nthreads().values())))
+        places: dict[Any, int] = {}
+        finished = distributed.as_completed(loop=client.loop)
+        try:
+            while window.open:
+                while (place := window.begin()) is not None:
+                    future = client.submit(_chunk, payload, *chunks[place], pure=False)
+                    places[future] = place
+                    finished.add(future)
+                future = next(finished)
+                place = places.pop(future)
+                version, parts = _result(distributed, future, chunks[place])
+                if version != strapdown.__version__:
+                    raise InputError(
+                        f"a worker has strapdown {version}, this process {strapdown.__version__}; install the same everywhere"
+                    )
+                window.finish(place)
+                yield place, parts
+        finally:
+            client.cancel(list(places))
+
+    return work_through
+
+
+def _result(distributed: Any, future: Any, chunk: tuple[int, int]) -> tuple[str, Parts]:
+    runs = f"runs {chunk[0]} to {sum(chunk) - 1}"
+    try:
+        result: tuple[str, Parts] = future.result()
+    except distributed.KilledWorker:
+        raise InputError(
+            f"{runs} were lost with one worker after the other: they end where this chunk runs; look at their logs, memory first"
+        ) from None
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"a worker cannot compute {runs} ({error}); install strapdown {strapdown.__version__} there"
+        ) from None
+    return result
+
+
+def _chunk(payload: bytes, first_run: int, runs: int) -> tuple[str, Parts]:
+    """Compute a chunk where a worker is."""
+    return strapdown.__version__, _work(payload)(first_run, runs)
+
+
+@functools.lru_cache(maxsize=4)
+def _work(payload: bytes) -> Work:
+    """Return what was sent, one object for all its chunks, so that a machine prepares a plan once a worker."""
+    work: Work = pickle.loads(payload)
+    return work
+
+
+def _distributed() -> Any:
+    try:
+        return importlib.import_module("distributed")
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"workers and clusters need Dask, and {error.name} is not installed: pip install 'strapdown[cluster]'"
+        ) from None

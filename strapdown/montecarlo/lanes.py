@@ -1,0 +1,532 @@
+"""The lane machine: eight runs at once in double precision, sixteen in single, noise, sensors, filter and statistics compiled together.
+
+The motion, the times of the measurements and all that does not differ from run to run is worked out once a plan; a run is its noise. Runs
+are told by (seed, run, source) alone, and the filter is the scalar machine's own source, so run k has the same bits whatever the chunk, the
+number of lanes, the threads and the host (with fused multiply-add). The noise is that of the simulator in distribution, not in its
+numbers.
+
+Two things are simpler than in the simulator. With a coning algorithm of N samples the noise is drawn a filter step, exactly as the sum of
+N samples is distributed, and does not pass through the cross products, whose share is below the turn of a sample times the noise. Flicker
+is shaped at the filter's steps, not at the gyro's samples.
+
+In single precision the attitude has a grain of 6e-8 rad that the filter's steps add up to a random walk, so error and covariance are
+those of double precision where both are above some 1e-5 rad; :func:`supports` refuses plans with finer sensors.
+"""
+
+from __future__ import annotations
+
+import weakref
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from strapdown import flicker, mekf, quaternion, setup, vectors
+from strapdown.checks import Array, count
+from strapdown.gyro import GyroSpec
+from strapdown.kernels import gyro_errors, machine, montecarlo_run, montecarlo_statistics
+from strapdown.kernels.machine import compiled
+from strapdown.montecarlo.plan import Plan
+from strapdown.montecarlo.statistics import (
+    BINS,
+    ERROR_EXPONENT,
+    EXAMPLES,
+    NEES_EXPONENT,
+    Counts,
+    Replay,
+    Statistics,
+    first_bin,
+    worst,
+)
+from strapdown.randomness import generator
+from strapdown.records import Estimate, ImuRecord, Innovations, Truth, compress
+from strapdown.scenarios import Scenario, simulate
+from strapdown.vectors import Accelerometer, AttitudeSensor, Magnetometer, VectorMeasurements, VectorSensor
+
+NAME = "lanes"
+CHUNK = 200
+
+GROUP = 8
+"""Runs that are added up together: the same for every number of lanes."""
+LARGEST_START = 0.5
+"""rad; σ of the initial attitude error up to which its rotation is good to rounding."""
+FINEST_SINGLE = 2e-5
+"""rad; σ of the finest sensor that single precision serves."""
+
+_SOURCES = ("gyro", "gyro flicker", "gyro markov", "gyro turn-on", "initial error", "dispersions")
+_NOT_OF_THE_GYRO = {
+    "quantization": 0.0,
+    "rate_resolution": 0.0,
+    "bandwidth": np.inf,
+    "sampling_jitter": 0.0,
+    "timestamp_error": 0.0,
+    "timestamp_offset": 0.0,
+    "drop_probability": 0.0,
+}
+_SENSORS = (VectorSensor, Magnetometer, Accelerometer, AttitudeSensor)
+
+
+def supports(plan: Plan) -> str | None:
+    """Return why the lanes cannot compute a plan; None if they can."""
+    return next(_reasons(plan), None)
+
+
+def _reasons(plan: Plan) -> Iterator[str]:
+    spec = plan.scenario.gyro
+    for name, none in _NOT_OF_THE_GYRO.items():
+        if np.any(np.asarray(getattr(spec, name)) != none):
+            yield f"the gyro's {name} is not among the lanes' terms"
+    for sensor in plan.scenario.sensors:
+        if type(sensor) not in _SENSORS:
+            yield f"{sensor.name}: a sensor of class {type(sensor).__name__} is not among the lanes' terms"
+        elif sensor.faults.latency > 0.0:  # type: ignore[attr-defined]
+            yield f"{sensor.name}: latency is not among the lanes' terms"
+    for option in ("gate", "robust"):
+        if getattr(plan.setup, option, None) is not None:
+            yield f"the filter's {option} option is not among the lanes' terms"
+    if _start_sigma(plan)[0] > LARGEST_START:
+        yield f"the initial attitude error's sigma is above {LARGEST_START} rad"
+    if plan.setup.integration.samples > 1 and plan.dispersions.of_the_gyro:
+        yield "gyro parameters that differ from run to run need one gyro sample a filter step"
+    prepared = _prepared(plan)
+    if prepared.saturates:
+        yield "the gyro's range is near what the motion asks for, and saturation is not among the lanes' terms"
+    if plan.precision == "float32" and prepared.finest < FINEST_SINGLE:
+        yield f"float32 serves sensors of {FINEST_SINGLE:g} rad or coarser, and one has {prepared.finest:.2g} rad"
+
+
+def _start_sigma(plan: Plan) -> tuple[float, float]:
+    given = plan.dispersions
+    return (
+        plan.setup.attitude_sigma if given.attitude_sigma is None else given.attitude_sigma,
+        plan.setup.bias_sigma if given.bias_sigma is None else given.bias_sigma,
+    )
+
+
+# ---------------------------------------------------------------------------------------------- what all runs share
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Prepared:
+    """What all runs of a plan share, as the kernels take it."""
+
+    shared: tuple[Any, ...]
+    """Arguments of :func:`strapdown.kernels.montecarlo_run.advance` from the edges to the outliers."""
+    record: ImuRecord
+    """The filter's steps without any noise; its series tell nominal σ."""
+    events: mekf.Schedule
+    truth: Array
+    """True attitudes at the epochs (m, 4)."""
+    degrees: Counts
+    """Degrees of freedom of one run by sensor and span of time (s, k)."""
+    keys: np.ndarray
+    saturates: bool
+    finest: float
+
+
+_PREPARED: weakref.WeakKeyDictionary[Plan, _Prepared] = weakref.WeakKeyDictionary()
+
+
+def _prepared(plan: Plan) -> _Prepared:
+    prepared = _PREPARED.get(plan)
+    if prepared is None:
+        prepared = _prepare(plan)
+        _PREPARED[plan] = prepared
+    return prepared
+
+
+def _quiet(spec: GyroSpec) -> GyroSpec:
+    """Return the gyro without what differs from run to run."""
+    none = (
+        "angle_random_walk",
+        "rate_random_walk",
+        "bias_instability",
+        "markov_noise",
+        "turn_on_bias_sigma",
+    )
+    silent: dict[str, Any] = dict.fromkeys(none, 0.0)
+    return replace(spec, **silent, range=np.inf)
+
+
+def _prepare(plan: Plan) -> _Prepared:
+    scenario, algorithm = plan.scenario, plan.setup.integration
+    spec = scenario.gyro
+    quiet = simulate(replace(scenario, gyro=_quiet(spec), sensors=()), plan.seed, 0)
+    turns = np.ascontiguousarray(scenario.motion.increments(scenario.edges))
+    dt = 1.0 / scenario.rate
+    assert quiet.truth is not None
+    rate_sigma = (
+        np.sqrt(np.square(spec.angle_random_walk) / dt)
+        + np.asarray(spec.turn_on_bias_sigma)
+        + np.sqrt(np.square(spec.rate_random_walk) * scenario.duration)
+        + 5.0 * np.asarray(spec.bias_instability)
+        + plan.dispersions.turn_on_bias_sigma
+    )
+    steps = quiet if algorithm.name == "one-sample" else compress(quiet, algorithm)
+    n = algorithm.samples
+    real = tuple(_nominal(sensor, scenario, plan.seed) for sensor in scenario.sensors)
+    record = replace(steps, vectors=real)
+    believed = setup.believed(replace(quiet, vectors=real), plan.setup)
+    events = mekf.schedule(believed.vectors, float(record.time[0]), float(record.time[-1]))
+    values = [_exact(sensor, scenario, series) for sensor, series in zip(scenario.sensors, real, strict=True)]
+    shared = (
+        np.ascontiguousarray(record.time),
+        np.ascontiguousarray(record.increments),
+        np.ascontiguousarray(turns.reshape(-1, n, 3).sum(axis=1)),
+        np.ascontiguousarray(quiet.truth.bias[::n]),
+        np.ascontiguousarray(quiet.truth.attitude[0]),
+        *_gyro_terms(plan, n * dt, len(record.increments)),
+        np.array(
+            [
+                *_start_sigma(plan),
+                *plan.dispersions.attitude_error,
+                *plan.dispersions.bias_error,
+                plan.setup.attitude_sigma**2,
+                plan.setup.bias_sigma**2,
+            ]
+        ),
+        np.array([plan.setup.process_noise.angle_random_walk, plan.setup.process_noise.rate_random_walk]) ** 2,
+        *_event_terms(plan, events, values),
+        plan.every,
+    )
+    place = np.clip(np.searchsorted(plan.nis_edges, events.time, side="left") - 1, 0, plan.nis_bins - 1)
+    degrees = np.zeros((len(plan.sensors), plan.nis_bins), np.int64)
+    np.add.at(degrees, (events.sensor, place), np.array([vectors.KINDS[kind] for kind in events.kinds])[events.sensor])
+    prepared = _Prepared(
+        shared=shared,
+        record=record,
+        events=events,
+        truth=np.ascontiguousarray(quiet.truth.attitude[:: n * plan.every]),
+        degrees=degrees,
+        keys=_keys(plan),
+        saturates=bool(np.any(np.abs(turns) / dt + 10.0 * rate_sigma > spec.range)),
+        finest=float(np.sqrt(min(events.variance, default=1.0))),
+    )
+    return prepared
+
+
+def _keys(plan: Plan) -> np.ndarray:
+    """Return two words a source, of the seed and the source's name."""
+    names = [*_SOURCES, *(word for sensor in plan.sensors for word in (f"sensor {sensor}", f"faults of {sensor}"))]
+    return np.array(
+        [
+            np.random.SeedSequence(plan.seed, spawn_key=(zlib.crc32(name.encode()),)).generate_state(2, np.uint64)
+            for name in names
+        ]
+    )
+
+
+def _gyro_terms(plan: Plan, dt: float, steps: int) -> tuple[Any, ...]:
+    """Return what the kernel wants of the gyro: terms, noise a step, flicker, dispersions."""
+    spec, given = plan.scenario.gyro, plan.dispersions
+    axes = [
+        np.broadcast_to(value, 3)
+        for value in (spec.angle_random_walk, spec.rate_random_walk, spec.markov_noise, spec.bias_instability)
+    ]
+    white, walk, markov, instability = axes
+    tau = spec.markov_correlation_time
+    decay, variance, mean, remainder = gyro_errors.markov_step(dt, tau)
+    gyro = np.array(
+        [
+            np.sqrt(white**2 * dt + walk**2 * dt**3 / 12.0 + markov**2 * remainder),
+            walk * np.sqrt(dt),
+            np.full(3, decay),
+            markov * np.sqrt(variance),
+            np.full(3, mean),
+            markov * np.sqrt(0.5 * tau) if np.isfinite(tau) else np.zeros(3),
+            np.hypot(np.broadcast_to(spec.turn_on_bias_sigma, 3), given.turn_on_bias_sigma),
+            instability,
+        ]
+    )
+    shaping = flicker.shaping(steps)
+    real = np.float32 if plan.precision == "float32" else np.float64
+    flickers = bool(np.any(instability > 0.0))
+    covariance = shaping.covariance
+    scale = np.sqrt(np.diag(covariance))
+    factor = scale[:, None] * np.linalg.cholesky(covariance / np.outer(scale, scale))
+    dispersion = np.full((3, 3), given.misalignment_sigma)
+    np.fill_diagonal(dispersion, given.scale_factor_sigma)
+    terms = np.array([np.any(walk > 0.0), np.any(markov > 0.0), flickers, np.any(dispersion > 0.0)])
+    return (
+        terms,
+        gyro.astype(real),
+        shaping.poles.astype(real),
+        shaping.gains.astype(real),
+        factor if flickers else np.empty((0, flicker.STATES)),
+        dispersion,
+    )
+
+
+def _nominal(sensor: Any, scenario: Scenario, seed: int) -> VectorMeasurements:
+    """Return the series of a sensor in some run: its times, kind, references and nominal σ are those of all runs."""
+    series = sensor.observe(scenario.motion, scenario.edges[0], scenario.edges[-1], generator(seed, 0, sensor.name))
+    return series  # type: ignore[no-any-return]
+
+
+def _exact(sensor: Any, scenario: Scenario, series: VectorMeasurements) -> tuple[Array, Array, Array]:
+    """Return the values of a sensor without noise (m, 4), its true σ (m, 3), and the scale of its noise (m,), as the filter takes them.
+
+    Vectors are taken over the length of their references, an attitude as a quaternion.
+    """
+    silent = replace(sensor.faults, outlier_probability=0.0, correlated_sigma=0.0)
+    changes: dict[str, Any] = {"faults": silent}
+    if isinstance(sensor, AttitudeSensor):
+        changes.update(sigma_across=0.0, sigma_about=0.0)
+    else:
+        changes.update(sigma=0.0)
+        if not isinstance(sensor, VectorSensor):
+            changes.update(kind="vector")
+    exact = replace(sensor, **changes).observe(
+        scenario.motion, scenario.edges[0], scenario.edges[-1], generator(0, 0, sensor.name)
+    )
+    m = len(series.time)
+    if series.attitude is not None:
+        assert exact.attitude is not None
+        return exact.attitude, np.broadcast_to(sensor.sigma_axes, (m, 3)), np.ones(m)
+    length = np.linalg.norm(exact.references_f, axis=1)
+    values = np.concatenate([exact.vector_b / length[:, None], np.zeros((m, 1))], axis=1)
+    return values, np.repeat(sensor.sigma / length[:, None], 3, axis=1), 1.0 / length
+
+
+def _event_terms(plan: Plan, events: mekf.Schedule, values: list[tuple[Array, Array, Array]]) -> tuple[Any, ...]:
+    """Return what the kernel wants of the measurements and sensors."""
+    m = len(events.time)
+    exact, sigma = np.zeros((m, 4)), np.zeros((m, 3))
+    decay, share, number = np.zeros(m), np.zeros(m), np.zeros(m, np.int64)
+    variance = np.repeat(events.variance[:, None], 3, axis=1)
+    sensors = plan.scenario.sensors
+    struck, scale = np.zeros(len(sensors), np.uint64), np.ones(len(sensors))
+    for i, (sensor, (value, deviation, length)) in enumerate(zip(sensors, values, strict=True)):
+        faults: vectors.Faults = sensor.faults  # type: ignore[attr-defined]
+        mine = np.flatnonzero(events.sensor == i)
+        assert len(mine) == len(value)
+        exact[mine], sigma[mine], number[mine] = value, deviation, np.arange(len(mine))
+        if events.kinds[i] == "attitude":
+            variance[mine] = events.vector_b[mine]
+        if faults.outlier_probability > 0.0:
+            struck[i] = min(int(faults.outlier_probability * 2.0**64), 2**64 - 1)
+            scale[i] = faults.outlier_scale
+        if faults.correlated_sigma > 0.0 and len(mine):
+            decay[mine[1:]] = np.exp(-np.diff(events.time[mine]) / faults.correlation_time)
+            share[mine] = faults.correlated_sigma * length * np.sqrt(1.0 - decay[mine] ** 2)
+    place = np.clip(np.searchsorted(plan.nis_edges, events.time, side="left") - 1, 0, plan.nis_bins - 1)
+    return (
+        events.time,
+        events.kind,
+        events.sensor.astype(np.int64),
+        place.astype(np.int64),
+        exact,
+        sigma,
+        variance,
+        decay,
+        share,
+        number,
+        events.reference,
+        events.triads,
+        struck,
+        scale,
+    )
+
+
+# ---------------------------------------------------------------------------------------------- running
+
+
+def width_of(precision: str) -> int:
+    """Return how many runs go at once on this machine: 8 or 16, or 1 where it has no vectors."""
+    if not machine.has_vectors():
+        return 1
+    return 16 if precision == "float32" else 8
+
+
+class _Group:
+    """Memory of so many runs at once, and the call that advances them."""
+
+    def __init__(self, plan: Plan, width: int, *, every: int | None = None, detail: bool = False) -> None:
+        self.prepared = _prepared(plan)
+        self.width = width
+        single = plan.precision == "float32"
+        real: Any = np.float32 if single else np.float64
+        self.pattern = tuple(real(0.0) for _ in range(width))
+        *self.shared, self.every = self.prepared.shared
+        if every is not None:
+            self.every = every
+        steps, events, sensors = len(self.prepared.record.increments), len(self.prepared.events.time), len(plan.sensors)
+        self.epochs = steps // self.every + 1
+        self.places = sensors * plan.nis_bins
+        self.streams = np.empty(4 * len(self.prepared.keys) * width, np.uint64)
+        self.memory = np.empty(montecarlo_run.memory(sensors) * width, real)
+        self.kept = np.empty(self.epochs * montecarlo_run.KEPT * width)
+        self.nis = np.zeros(self.places * width, real)
+        # Without detail the kernel is compiled without it, and saves the divisions of the innovations.
+        self.increments = np.empty(3 * steps * width) if detail else None
+        self.values = np.empty(4 * events * width) if detail else None
+        self.innovations = np.empty(6 * events * width) if detail else None
+
+    def advance(self, first: int) -> None:
+        """Run the runs from number ``first`` on."""
+        self.nis[:] = 0.0
+        compiled(montecarlo_run.advance)(
+            self.pattern,
+            np.arange(first, first + self.width, dtype=np.uint64),
+            self.prepared.keys,
+            *self.shared,
+            self.every,
+            self.streams,
+            self.memory,
+            self.kept,
+            self.nis,
+            self.increments,
+            self.values,
+            self.innovations,
+        )
+
+
+def run_chunk(plan: Plan, first_run: int, runs: int, *, width: int | None = None) -> Statistics:
+    """Return the statistics of runs ``first_run`` to ``first_run + runs − 1``; ``width`` runs go at once, the default is the machine's."""
+    lanes = width_of(plan.precision) if width is None else width
+    group = _Group(plan, lanes)
+    m, s = plan.epochs + 1, len(plan.sensors)
+    sums = np.zeros((m, montecarlo_statistics.SUMS))
+    finite = np.zeros(m, np.int64)
+    coverage, histogram = np.zeros((m, 6, 3), np.int64), np.zeros((m, 9, BINS), np.int64)
+    nis = np.zeros(group.places)
+    scratch, score = np.zeros(9 * GROUP, np.uint64), np.zeros(GROUP)
+    bins = [np.array([0, BINS - 1], np.uint64) + np.uint64(first_bin(e)) for e in (ERROR_EXPONENT, NEES_EXPONENT)]
+    scores = np.empty(-(-runs // GROUP) * GROUP)
+    kept = group.kept if lanes >= GROUP else np.empty(m * montecarlo_run.KEPT * GROUP)
+    group_nis = np.zeros((group.places, max(lanes, GROUP)))
+    examples = []
+    for start in range(0, runs, max(lanes, GROUP)):
+        if lanes >= GROUP:
+            group.advance(first_run + start)
+            group_nis[:] = group.nis.reshape(-1, lanes)
+        else:
+            for lane in range(0, GROUP, lanes):
+                group.advance(first_run + start + lane)
+                kept.reshape(-1, GROUP)[:, lane : lane + lanes] = group.kept.reshape(-1, lanes)
+                group_nis[:, lane : lane + lanes] = group.nis.reshape(-1, lanes)
+        for column in range(0, max(lanes, GROUP), GROUP):
+            place = start + column
+            valid = (np.arange(place, place + GROUP) < runs).astype(np.float64)
+            if not valid.any():
+                break
+            compiled(montecarlo_statistics.accumulate)(
+                (0.0,) * GROUP,
+                kept,
+                max(lanes, GROUP),
+                column,
+                valid,
+                group.prepared.truth,
+                *bins,
+                finite,
+                sums,
+                coverage,
+                histogram,
+                scratch,
+                score,
+            )
+            scores[place : place + GROUP] = score
+            nis += _total(np.where(valid > 0.0, group_nis[:, column : column + GROUP], 0.0))
+        if first_run + start < EXAMPLES:
+            own = kept.reshape(m, montecarlo_run.KEPT, -1)
+            examples += [
+                (first_run + start + k, *_example(own[:, :, k], group.prepared.truth))
+                for k in range(min(EXAMPLES - first_run - start, runs - start, own.shape[2]))
+            ]
+    numbers = np.arange(first_run, first_run + runs)
+    worst_run, worst_score = worst(numbers, scores[:runs])
+    return Statistics(
+        time=plan.time,
+        runs=runs,
+        finite=finite,
+        error_sum=sums[:, :6],
+        error_product_sum=mekf.covariance_matrices(sums[:, 6:27]),
+        covariance_sum=mekf.covariance_matrices(sums[:, 27:48]),
+        nees_sum=sums[:, 48:51],
+        log_nees_sum=sums[:, 51:54],
+        coverage=coverage,
+        histogram=histogram,
+        nis_edges=plan.nis_edges,
+        sensors=plan.sensors,
+        sensor_nis_sum=nis.reshape(s, plan.nis_bins),
+        sensor_degrees=runs * group.prepared.degrees,
+        sensor_refused=np.zeros((s, plan.nis_bins), np.int64),
+        worst_run=worst_run,
+        worst_score=worst_score,
+        example_run=np.array([number for number, *_ in examples], np.int64),
+        example_error=np.array([error for _, error, _ in examples]).reshape(-1, m, 6),
+        example_sigma=np.array([sigma for *_, sigma in examples]).reshape(-1, m, 6),
+    )
+
+
+def _total(lanes: Array) -> Array:
+    """Return the sum over the last axis, in the order of :func:`strapdown.kernels.lane_values.total`."""
+    while lanes.shape[-1] > 1:
+        half = lanes.shape[-1] // 2
+        lanes = lanes[..., :half] + lanes[..., half:]
+    return lanes[..., 0]
+
+
+def _example(kept: Array, truth: Array) -> tuple[Array, Array]:
+    """Return error and σ (m, 6) of one run's kept numbers (m, KEPT)."""
+    error = quaternion.log(quaternion.multiply(quaternion.conjugate(kept[:, :4]), truth))
+    diagonal = kept[:, [7, 10, 12, 22, 25, 27]]
+    return np.concatenate([error, kept[:, 28:31] - kept[:, 4:7]], axis=1), np.sqrt(diagonal)
+
+
+def replay(plan: Plan, run: int, *, width: int = 1) -> Replay:
+    """Return one run in full detail, bitwise what it is among the others.
+
+    The record is at the filter's steps: an increment is what the coning algorithm makes of its gyro samples.
+    """
+    number = count("run", run, least=0)
+    group = _Group(plan, width, every=1, detail=True)
+    group.advance(number)
+    prepared = group.prepared
+    assert group.increments is not None
+    assert group.values is not None
+    assert group.innovations is not None
+    kept = np.ascontiguousarray(group.kept.reshape(group.epochs, montecarlo_run.KEPT, width)[:, :, 0])
+    assert prepared.record.truth is not None
+    truth = Truth(attitude=prepared.record.truth.attitude, bias=kept[:, 28:31])
+    events = prepared.events
+    values = group.values.reshape(-1, 4, width)[:, :, 0]
+    record = replace(
+        prepared.record,
+        increments=np.ascontiguousarray(group.increments.reshape(-1, 3, width)[:, :, 0]),
+        vectors=tuple(
+            _measured(series, values[events.sensor == i]) for i, series in enumerate(prepared.record.vectors)
+        ),
+        truth=truth,
+    )
+    covariance = mekf.covariance_matrices(kept[:, 7:28])
+    rows = group.innovations.reshape(-1, 6, width)[:, :, 0]
+    estimate = Estimate(
+        time=record.time,
+        attitude=kept[:, :4],
+        bias=kept[:, 4:7],
+        variance=kept[:, [7, 10, 12, 22, 25, 27]],
+        covariance=covariance,
+        innovations={
+            name: Innovations(
+                time=events.time[events.sensor == i],
+                innovation=rows[events.sensor == i, : 2 * vectors.KINDS[kind] : 2],
+                variance=rows[events.sensor == i, 1 : 2 * vectors.KINDS[kind] : 2],
+            )
+            for i, (name, kind) in enumerate(zip(events.sensors, events.kinds, strict=True))
+        },
+        skipped=events.skipped,
+    )
+    initial = mekf.State(attitude=kept[0, :4], bias=kept[0, 4:7], covariance=covariance[0])
+    return Replay(record=record, initial=initial, estimate=estimate)
+
+
+def _measured(series: VectorMeasurements, values: Array) -> VectorMeasurements:
+    """Return a series with the values of one run (m, 4), as the kernel took them."""
+    if series.attitude is not None:
+        return replace(series, attitude=quaternion.normalize(values))
+    if series.kind == "vector":
+        return replace(series, vector_b=values[:, 1:] * np.linalg.norm(series.references_f, axis=1)[:, None])
+    return replace(series, vector_b=values[:, 1:] / np.linalg.norm(values[:, 1:], axis=1)[:, None])

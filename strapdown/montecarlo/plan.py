@@ -1,0 +1,188 @@
+"""What a Monte Carlo campaign computes: scenario, filter, seed, what differs from run to run, where statistics are taken."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from strapdown import scenarios, setup, tables
+from strapdown.checks import Array, InputError, array, count, non_negative, one_of
+from strapdown.scenarios import Scenario
+from strapdown.setup import FilterSetup
+
+PRECISIONS = ("float64", "float32")
+
+
+def _zeros() -> Array:
+    return np.zeros(3)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Dispersions:
+    """What differs from run to run besides the noise; normal, independent axes. The default: initial errors from the filter's prior."""
+
+    attitude_sigma: float | None = None
+    """σ of the initial attitude error, each axis, rad; None: the filter's own, so that a right filter is consistent."""
+    bias_sigma: float | None = None
+    """σ of the initial bias error, each axis, rad/s; None: the filter's own."""
+    attitude_error: Array = field(default_factory=_zeros)
+    """Fixed part of the initial attitude error δθ (3,), rad, body axes, in all runs."""
+    bias_error: Array = field(default_factory=_zeros)
+    """Fixed part of the initial bias error δb (3,), rad/s, in all runs."""
+    scale_factor_sigma: float = 0.0
+    """σ of a scale-factor error of each gyro axis, on top of the scenario's."""
+    misalignment_sigma: float = 0.0
+    """σ of each of the six misalignments of the gyro, rad, on top of the scenario's."""
+    turn_on_bias_sigma: float = 0.0
+    """σ of a turn-on bias of each gyro axis, rad/s, on top of the scenario's. The filter starts from the true bias less its initial error,
+    so this tests the bias that it meets, not the one it starts with."""
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        for name, unit in (("attitude_sigma", "rad"), ("bias_sigma", "rad/s")):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, non_negative(f"dispersions: {name}", getattr(self, name), unit=unit))
+        for name in ("attitude_error", "bias_error"):
+            object.__setattr__(self, name, array(f"dispersions: {name}", getattr(self, name), (3,)))
+        for name, unit in (("scale_factor_sigma", ""), ("misalignment_sigma", "rad"), ("turn_on_bias_sigma", "rad/s")):
+            object.__setattr__(self, name, non_negative(f"dispersions: {name}", getattr(self, name), unit=unit))
+
+    @property
+    def of_the_gyro(self) -> bool:
+        """Whether the gyro's parameters differ from run to run."""
+        return max(self.scale_factor_sigma, self.misalignment_sigma, self.turn_on_bias_sigma) > 0.0
+
+    def to_table(self) -> dict[str, Any]:
+        """Return what differs from the default as the table that a file holds, units in the keys."""
+        return tables.encode(self, {n: choice for n, choice in _FORM.items() if getattr(self, n) is not None})
+
+
+_FORM: tables.Form = {
+    "attitude_sigma": tables.DEGREES,
+    "bias_sigma": tables.DEGREES_PER_HOUR,
+    "attitude_error": tables.DEGREES,
+    "bias_error": tables.DEGREES_PER_HOUR,
+    "scale_factor_sigma": tables.PPM,
+    "misalignment_sigma": tables.MILLIRADIANS,
+    "turn_on_bias_sigma": tables.DEGREES_PER_HOUR,
+}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Plan:
+    """All that decides what run number k of a campaign is, and where its statistics are taken.
+
+    Filter and truth are told apart: a ``setup`` that differs from :func:`strapdown.setup.matched` of the scenario is a mismatched filter.
+    Outages, outliers and correlated noise are the scenario's sensors'. A plan is compared and hashed by identity, so a machine may keep
+    what it derives from one in a ``weakref.WeakKeyDictionary``.
+    """
+
+    scenario: Scenario
+    setup: FilterSetup
+    seed: int = 0
+    epochs: int = 100
+    """Equally spaced epochs, besides the start, at which errors are taken; each ends on a whole filter step."""
+    nis_bins: int = 100
+    """Equal spans of time over which NIS is summed."""
+    dispersions: Dispersions = field(default_factory=Dispersions)
+    precision: str = "float64"
+    """In what the filter and the noise are computed: "float64", or "float32" on a machine that has it."""
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        for name, least in (("seed", 0), ("epochs", 1), ("nis_bins", 1)):
+            object.__setattr__(self, name, count(name, getattr(self, name), least=least))
+        one_of("precision", self.precision, PRECISIONS)
+        if self.samples % (self.epochs * self.setup.integration.samples):
+            raise InputError(
+                f"{self.samples} gyro samples cannot be cut into {self.epochs} epochs of whole {self.setup.integration.name} steps; choose "
+                f"a duration whose sample count is a multiple of {self.epochs * self.setup.integration.samples}, or other epochs"
+            )
+
+    @property
+    def samples(self) -> int:
+        """Gyro samples in a run (nominally: a scenario may lose some)."""
+        return round(self.scenario.duration * self.scenario.rate)
+
+    @property
+    def every(self) -> int:
+        """Filter steps from one epoch to the next."""
+        return self.samples // (self.epochs * self.setup.integration.samples)
+
+    @property
+    def time(self) -> Array:
+        """Epochs (m,), m = epochs + 1, s, the start included."""
+        return np.linspace(0.0, self.samples / self.scenario.rate, self.epochs + 1)
+
+    @property
+    def nis_edges(self) -> Array:
+        """Edges of the spans of time over which NIS is summed (nis_bins + 1,), s. A measurement on an edge belongs to the span it ends."""
+        return np.linspace(0.0, self.samples / self.scenario.rate, self.nis_bins + 1)
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of the sensors, in the scenario's order."""
+        return tuple(sensor.name for sensor in self.scenario.sensors)
+
+    def to_table(self) -> dict[str, Any]:
+        """Return the plan as a table of texts and numbers, by which plans are compared and from which :func:`from_table` makes it anew."""
+        return {
+            "scenario": scenarios.scenario_to_table(self.scenario),
+            "filter": setup.to_table(self.setup),
+            "seed": self.seed,
+            "epochs": self.epochs,
+            "nis_bins": self.nis_bins,
+            "dispersions": self.dispersions.to_table(),
+            "precision": self.precision,
+        }
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of :meth:`to_table`."""
+        text = json.dumps(self.to_table(), sort_keys=True, allow_nan=False, default=float)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+def from_table(table: Mapping[str, Any]) -> Plan:
+    """Return the plan that :meth:`Plan.to_table` tells."""
+    import tomli_w
+
+    return Plan(
+        scenario=scenarios.scenario_from_toml(tomli_w.dumps(dict(table["scenario"]))),
+        setup=setup.from_table(table["filter"]),
+        dispersions=tables.build(Dispersions, table["dispersions"], _FORM, "dispersions"),
+        **{name: table[name] for name in ("seed", "epochs", "nis_bins", "precision")},
+    )
+
+
+def read_dispersions(path: str | os.PathLike[str]) -> Dispersions:
+    """Read the table ``[dispersions]`` of a TOML file; other tables are left alone."""
+    try:
+        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist; check the path") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is no TOML ({error})") from None
+    table = content.get("dispersions")
+    if not isinstance(table, dict):
+        raise InputError(f"{path} has no table [dispersions]; its keys are {', '.join(tables.keys(_FORM))}")
+    return tables.build(Dispersions, table, _FORM, f"{path}: dispersions")  # type: ignore[no-any-return]
+
+
+def whole_epochs(scenario: Scenario, filter_setup: FilterSetup, most: int = 100) -> int:
+    """Return the largest number of epochs, at most ``most``, that cut the scenario into whole filter steps."""
+    samples, step = round(scenario.duration * scenario.rate), filter_setup.integration.samples
+    if samples % step:
+        raise InputError(
+            f"{samples} gyro samples are no whole number of {filter_setup.integration.name} steps of {step}; choose a duration or rate "
+            f"that gives a multiple of {step}"
+        )
+    return max(n for n in range(1, most + 1) if (samples // step) % n == 0)

@@ -1,0 +1,281 @@
+"""The scalar machine: any scenario, any filter, one run after the other through the simulator and the compiled filter."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import weakref
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from strapdown import consistency, mekf, quaternion, setup
+from strapdown.checks import Array, InputError, count
+from strapdown.gyro import GyroSpec
+from strapdown.montecarlo.plan import Dispersions, Plan
+from strapdown.montecarlo.statistics import (
+    BINS,
+    ERROR_EXPONENT,
+    EXAMPLES,
+    NEES_EXPONENT,
+    Replay,
+    Statistics,
+    bin_of,
+    worst,
+)
+from strapdown.motion import Motion
+from strapdown.randomness import generator
+from strapdown.records import Estimate, ImuRecord
+from strapdown.scenarios import Scenario, simulate
+from strapdown.setup import FilterSetup
+
+NAME = "scalar"
+CHUNK = 10
+
+_TINY = float(np.finfo(np.float64).tiny)
+_OFF_DIAGONAL = ~np.eye(3, dtype=bool)
+
+
+def supports(plan: Plan) -> str | None:
+    """Return why this machine cannot compute a plan; None if it can."""
+    return None if plan.precision == "float64" else f"the scalar machine computes in float64, not {plan.precision}"
+
+
+def start(
+    record: ImuRecord, filter_setup: FilterSetup, seed: int, run: int, dispersions: Dispersions | None = None
+) -> mekf.State:
+    """Return the initial state of one run: the truth, off by errors drawn from the filter's own prior, or as the dispersions say."""
+    if record.truth is None:
+        raise InputError("record has no truth to start from; simulate one, or give an initial state to mekf.run")
+    given = Dispersions() if dispersions is None else dispersions
+    draw = generator(seed, run, "initial error").standard_normal(6)
+    attitude_sigma = filter_setup.attitude_sigma if given.attitude_sigma is None else given.attitude_sigma
+    bias_sigma = filter_setup.bias_sigma if given.bias_sigma is None else given.bias_sigma
+    # What is added is negated, not subtracted, so that an error of no fixed part is the same to the bit.
+    delta_theta = -attitude_sigma * draw[:3] - given.attitude_error
+    return setup.initial_state(
+        filter_setup,
+        quaternion.multiply(record.truth.attitude[0], quaternion.exp(delta_theta)),
+        record.truth.bias[0] - bias_sigma * draw[3:] - given.bias_error,
+    )
+
+
+def dispersed(spec: GyroSpec, dispersions: Dispersions, seed: int, run: int) -> GyroSpec:
+    """Return the gyro of one run: three scale factors, six misalignments row by row and three turn-on biases drawn, in this order."""
+    if not dispersions.of_the_gyro:
+        return spec
+    draw = generator(seed, run, "dispersions").standard_normal(12)
+    misalignment = spec.misalignment.copy()
+    misalignment[_OFF_DIAGONAL] += dispersions.misalignment_sigma * draw[3:9]
+    return replace(
+        spec,
+        scale_factor=spec.scale_factor + dispersions.scale_factor_sigma * draw[:3],
+        misalignment=misalignment,
+        turn_on_bias=spec.turn_on_bias + dispersions.turn_on_bias_sigma * draw[9:],
+    )
+
+
+def record_of(plan: Plan, run: int) -> ImuRecord:
+    """Return what the sensors give in one run of a plan."""
+    remembered = _SCENARIOS.get(plan)
+    if remembered is None:
+        remembered = replace(plan.scenario, motion=_Remembered(plan.scenario.motion))
+        _SCENARIOS[plan] = remembered
+    spec = dispersed(remembered.gyro, plan.dispersions, plan.seed, run)
+    return simulate(replace(remembered, gyro=spec), plan.seed, run)
+
+
+class _Remembered:
+    """A motion that remembers what it was asked last: all runs ask it the same, and a closed form may cost more than the filter."""
+
+    _MOST = 32
+
+    def __init__(self, motion: Motion) -> None:
+        self._motion = motion
+        self._known: OrderedDict[tuple[str, tuple[int, ...], bytes], Array] = OrderedDict()
+        if hasattr(motion, "breaks"):
+            self.breaks = motion.breaks
+
+    def _answer(self, what: str, time: ArrayLike) -> Array:
+        times = np.asarray(time, dtype=np.float64, order="C")
+        key = (what, times.shape, hashlib.blake2b(times.data, digest_size=16).digest())
+        answer = self._known.get(key)
+        if answer is None:
+            answer = np.array(getattr(self._motion, what)(times))
+            answer.flags.writeable = False  # it is everyone's
+            self._known[key] = answer
+            if len(self._known) > self._MOST:  # times that are never asked again, of a jittered clock
+                with contextlib.suppress(KeyError):
+                    self._known.popitem(last=False)
+        return answer
+
+    def attitude(self, time: ArrayLike) -> Array:
+        return self._answer("attitude", time)
+
+    def body_rate(self, time: ArrayLike) -> Array:
+        return self._answer("body_rate", time)
+
+    def fixed_rate(self, time: ArrayLike) -> Array:
+        return self._answer("fixed_rate", time)
+
+    def body_angular_acceleration(self, time: ArrayLike) -> Array:
+        return self._answer("body_angular_acceleration", time)
+
+    def increments(self, edges: ArrayLike) -> Array:
+        return self._answer("increments", edges)
+
+
+_SCENARIOS: weakref.WeakKeyDictionary[Plan, Scenario] = weakref.WeakKeyDictionary()
+
+
+def replay(plan: Plan, run: int) -> Replay:
+    """Return one run of a plan in full detail."""
+    number = count("run", run, least=0)
+    record = record_of(plan, number)
+    initial = start(record, plan.setup, plan.seed, number, plan.dispersions)
+    return Replay(
+        record=record, initial=initial, estimate=setup.run(record, plan.setup, initial, every=1, full_covariance=True)
+    )
+
+
+def run_chunk(plan: Plan, first_run: int, runs: int) -> Statistics:
+    """Return the statistics of runs ``first_run`` to ``first_run + runs − 1``."""
+    return run_chunks((plan,), first_run, runs)[0]
+
+
+def run_chunks(plans: Sequence[Plan], first_run: int, runs: int) -> tuple[Statistics, ...]:
+    """Return the statistics of several plans that differ in the filter alone; each run is simulated once and given to all filters."""
+    one = plans[0]
+    sums = [Sums(plan, runs) for plan in plans]
+    for run in range(first_run, first_run + runs):
+        record = record_of(one, run)
+        for part in sums:
+            part.add(run, record)
+    return tuple(part.statistics for part in sums)
+
+
+class Sums:
+    """Statistics of one plan in the making, run by run."""
+
+    def __init__(self, plan: Plan, runs: int) -> None:
+        m, s = plan.epochs + 1, len(plan.sensors)
+        self.plan = plan
+        self.runs = runs
+        self.time, self.nis_edges = plan.time, plan.nis_edges
+        self.finite = np.zeros(m, np.int64)
+        self.error = np.zeros((m, 6))
+        self.product, self.covariance = np.zeros((m, 6, 6)), np.zeros((m, 6, 6))
+        self.nees, self.log_nees = np.zeros((m, 3)), np.zeros((m, 3))
+        self.coverage = np.zeros((m, 6, 3), np.int64)
+        self.histogram = np.zeros((m, 9, BINS), np.int64)
+        self.nis = np.zeros((s, plan.nis_bins))
+        self.degrees, self.refused = np.zeros((s, plan.nis_bins), np.int64), np.zeros((s, plan.nis_bins), np.int64)
+        self.scores: list[tuple[int, float]] = []
+        self.examples: list[tuple[int, Array, Array]] = []
+
+    def add(self, run: int, record: ImuRecord) -> None:
+        """Filter one run and add what comes of it."""
+        plan = self.plan
+        initial = start(record, plan.setup, plan.seed, run, plan.dispersions)
+        # A record that has lost samples has its epochs at no fixed step, so all steps are kept and the epochs picked.
+        regular = len(record.increments) == plan.samples
+        every = plan.every if regular else 1
+        estimate = setup.run(record, plan.setup, initial, every=every, full_covariance=True)
+        assert record.truth is not None
+        assert estimate.covariance is not None
+        n = plan.setup.integration.samples
+        rows = slice(None) if regular else _at_epochs(estimate.time, self.time)
+        edges = np.arange(len(estimate.time))[rows] * (n * every)
+        P = estimate.covariance[rows]
+        told = np.isfinite(estimate.attitude[rows]).all(axis=1) & np.isfinite(estimate.bias[rows]).all(axis=1)
+        error = np.full((len(P), 6), np.nan)
+        error[told] = consistency.errors(
+            estimate.attitude[rows][told],
+            estimate.bias[rows][told],
+            record.truth.attitude[edges[told]],
+            record.truth.bias[edges[told]],
+        )
+        self._add_errors(run, error, P)
+        self._add_innovations(estimate)
+
+    def _add_errors(self, run: int, error: Array, P: Array) -> None:
+        with np.errstate(invalid="ignore"):  # a filter that failed has anything there
+            sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+        nees = np.stack([_nees(error[:, a:b], P[:, a:b, a:b]) for a, b in ((0, 6), (0, 3), (3, 6))], axis=1)
+        good = np.isfinite(nees).all(axis=1) & np.isfinite(error).all(axis=1) & np.isfinite(P).all(axis=(1, 2))
+        m = np.flatnonzero(good)
+        e, squares = error[m], nees[m]
+        self.finite[m] += 1
+        self.error[m] += e
+        self.product[m] += e[:, :, None] * e[:, None, :]
+        self.covariance[m] += P[m]
+        self.nees[m] += squares
+        self.log_nees[m] += np.log(np.maximum(squares, _TINY))
+        self.coverage[m] += np.abs(e)[:, :, None] <= sigma[m][:, :, None] * np.array([1.0, 2.0, 3.0])
+        bins = np.concatenate([bin_of(np.abs(e), ERROR_EXPONENT), bin_of(squares, NEES_EXPONENT)], axis=1)
+        self.histogram[m[:, None], np.arange(9), bins] += 1
+        self.scores.append((run, float(nees[:, 0].max()) if good.all() else np.inf))
+        if run < EXAMPLES:
+            self.examples.append((run, error, sigma))
+
+    def _add_innovations(self, estimate: Estimate) -> None:
+        bins = self.plan.nis_bins
+        for i, sensor in enumerate(self.plan.sensors):
+            innovations = estimate.innovations[sensor]
+            place = np.clip(np.searchsorted(self.nis_edges, innovations.time, side="left") - 1, 0, bins - 1)
+            used = innovations.used
+            self.nis[i] += np.bincount(place[used], weights=innovations.nis[used], minlength=bins)
+            self.degrees[i] += np.bincount(place[used], minlength=bins) * innovations.innovation.shape[1]
+            self.refused[i] += np.bincount(place[~used], minlength=bins)
+
+    @property
+    def statistics(self) -> Statistics:
+        """What the runs added so far make."""
+        run, score = (np.array(column) for column in zip(*self.scores, strict=True))
+        worst_run, worst_score = worst(run.astype(np.int64), score.astype(np.float64))
+        m = len(self.time)
+        kept: Any = list(zip(*self.examples, strict=True)) or [(), np.empty((0, m, 6)), np.empty((0, m, 6))]
+        return Statistics(
+            time=self.time,
+            runs=self.runs,
+            finite=self.finite,
+            error_sum=self.error,
+            error_product_sum=self.product,
+            covariance_sum=self.covariance,
+            nees_sum=self.nees,
+            log_nees_sum=self.log_nees,
+            coverage=self.coverage,
+            histogram=self.histogram,
+            nis_edges=self.nis_edges,
+            sensors=self.plan.sensors,
+            sensor_nis_sum=self.nis,
+            sensor_degrees=self.degrees,
+            sensor_refused=self.refused,
+            worst_run=worst_run,
+            worst_score=worst_score,
+            example_run=np.array(kept[0], np.int64),
+            example_error=np.array(kept[1]),
+            example_sigma=np.array(kept[2]),
+        )
+
+
+def _at_epochs(time: Array, epochs: Array) -> np.ndarray:
+    """Return the last step not after each epoch, or the first; the tolerance is a millionth of the mean step."""
+    slack = 1e-6 * (time[-1] - time[0]) / max(len(time) - 1, 1)
+    return np.asarray(np.maximum(np.searchsorted(time, epochs + slack, side="right") - 1, 0))
+
+
+def _nees(error: Array, P: Array) -> Array:
+    """Return the NEES at each epoch, NaN where P is not positive definite."""
+    try:
+        return consistency.nees(error, P)
+    except InputError:
+        result = np.full(len(error), np.nan)
+        for k, (e, p) in enumerate(zip(error, P, strict=True)):
+            if np.isfinite(e).all() and np.isfinite(p).all() and np.linalg.eigvalsh(p)[0] > 0.0:
+                result[k] = consistency.nees(e, p)
+        return result

@@ -1,0 +1,291 @@
+"""Statistics over independent runs, of a size that does not depend on their number, and their merging.
+
+What a machine must return
+--------------------------
+A *machine* is a module of this package with
+
+``NAME``, ``CHUNK``
+    Its name in files and tables; runs a chunk where nobody says.
+``supports(plan) -> str | None``
+    None if it computes every term of the plan, else the reason why not, as a phrase ("the gyro's flicker is not among its terms").
+``run_chunk(plan, first_run, runs) -> Statistics``
+    Runs ``first_run`` … ``first_run + runs − 1`` of the plan.
+``replay(plan, run) -> Replay``
+    One run in full detail, bitwise the same.
+
+Run k of a plan must be the same to the bit whatever the chunk that holds it, the threads, the width of vectors or the host; and the sums
+of a chunk are taken over its runs in the order of their numbers (or in any other order that depends on ``first_run`` and ``runs`` alone).
+Both have to be free to run in several threads at a time.
+
+With m = epochs + 1 epochs at the filter steps 0, every, 2·every, … (``plan.every``; after the update with measurements at that very
+time), error e = (δθ, δb) of :func:`strapdown.consistency.errors` and the filter's P there, the fields of :class:`Statistics` are
+
+- ``time``, ``nis_edges``, ``sensors``: ``plan.time``, ``plan.nis_edges``, ``plan.sensors``; ``runs``: the number of runs asked for;
+- ``finite`` (m,): runs whose e, P and three NEES are finite there (P positive definite). Others add nothing to any sum of that epoch;
+- ``error_sum`` Σ e (m, 6), ``error_product_sum`` Σ e eᵀ (m, 6, 6), ``covariance_sum`` Σ P (m, 6, 6), symmetric;
+- ``nees_sum``, ``log_nees_sum`` (m, 3): Σ and Σ log of the NEES of all six states, of the attitude, of the bias (by the marginal blocks
+  of P); not divided by the degrees of freedom. A NEES of 0 (the start of a run without error) adds log of the smallest normal number;
+- ``coverage`` (m, 6, 3): runs with |e_i| ≤ k √P_ii, k = 1, 2, 3;
+- ``histogram`` (m, 9, BINS): columns 0–5 count |e_i| in bin ``bin_of(|e_i|, ERROR_EXPONENT)``, columns 6–8 the three NEES in bin
+  ``bin_of(nees, NEES_EXPONENT)``. :func:`bin_of` is a shift of the double's bits, so no machine needs a logarithm;
+- ``sensor_nis_sum`` (s, k), ``sensor_degrees`` (s, k), ``sensor_refused`` (s, k): by sensor and span of time, Σ of the NIS of the
+  measurements used, of their degrees of freedom, and the number that the filter's gate refused. The NIS of refused ones is left out;
+- ``worst_run``, ``worst_score`` (w,), w = min(WORST, runs): the runs of the largest score, the largest first, of equal ones the lower
+  number first. A run's score is the largest NEES of the state over the epochs; infinite where the run was not finite at some epoch;
+- ``example_run`` (x,), ``example_error``, ``example_sigma`` (x, m, 6): the runs of the chunk with numbers below EXAMPLES, in order; errors
+  as they are, finite or not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from strapdown import consistency, mekf
+from strapdown.checks import Array, InputError
+from strapdown.consistency import Verdict
+from strapdown.records import Estimate, ImuRecord
+
+Counts = NDArray[np.int64]
+
+EXAMPLES = 8
+"""Runs of which whole error histories are kept, for pictures: those numbered below it."""
+WORST = 10
+"""Worst runs that are kept by number."""
+
+BINS_PER_OCTAVE = 8
+"""Bins of a histogram from a number to its double, equally wide among themselves: 12.5 to 6.7 % of the value."""
+OCTAVES = 43
+BINS = BINS_PER_OCTAVE * OCTAVES
+ERROR_EXPONENT = -40
+"""Bins of errors begin at 2⁻⁴⁰ (9.1e-13 rad or rad/s) and end at 8; what lies outside is counted in the first and last."""
+NEES_EXPONENT = -16
+"""Bins of the NEES begin at 2⁻¹⁶ and end at 2²⁷."""
+SHIFT = 49
+"""The bits of a double shifted right by so much are exponent and three digits of the mantissa: its bin, but for a constant."""
+
+COVERED = (0.6826894921370859, 0.9544997361036416, 0.9973002039367398)
+"""What share of a right filter's errors lies inside 1, 2, 3 σ."""
+
+SUBSETS: dict[str, tuple[int, int]] = {"state": (0, 6), "attitude": (1, 3), "bias": (2, 3)}
+"""Column of the NEES and degrees of freedom, by what is judged."""
+
+
+def first_bin(exponent: int) -> int:
+    """Return what is taken off the shifted bits of a double: the number of the bin that begins at 2 to ``exponent``."""
+    return (1023 + exponent) * BINS_PER_OCTAVE
+
+
+def bin_of(value: ArrayLike, exponent: int) -> Counts:
+    """Return the bins of non-negative numbers: ``(bits >> SHIFT) − first_bin(exponent)``, clipped to 0 … BINS − 1."""
+    bits = np.array(value, dtype=np.float64, order="C").view(np.int64)
+    return np.asarray(np.clip((bits >> SHIFT) - first_bin(exponent), 0, BINS - 1))
+
+
+def bin_edges(exponent: int) -> Array:
+    """Return the edges of the bins (BINS + 1,)."""
+    octave, part = np.divmod(np.arange(BINS + 1), BINS_PER_OCTAVE)
+    return np.asarray(np.ldexp(1.0 + part / BINS_PER_OCTAVE, exponent + octave))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Replay:
+    """One run in full detail."""
+
+    record: ImuRecord
+    """What the sensors gave, with the truth."""
+    initial: mekf.State
+    """Where the filter started."""
+    estimate: Estimate
+    """What the filter made of it, at every step, with whole covariances."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Statistics:
+    """Sums over independent runs at each epoch. The head of this module defines each field.
+
+    Errors are e = (δθ, δb): rad in the body frame, rad/s.
+    """
+
+    time: Array
+    runs: int
+    finite: Counts
+    error_sum: Array
+    error_product_sum: Array
+    covariance_sum: Array
+    nees_sum: Array
+    log_nees_sum: Array
+    coverage: Counts
+    histogram: Counts
+    nis_edges: Array
+    sensors: tuple[str, ...]
+    sensor_nis_sum: Array
+    sensor_degrees: Counts
+    sensor_refused: Counts
+    worst_run: Counts
+    worst_score: Array
+    example_run: Counts
+    example_error: Array
+    example_sigma: Array
+
+    @property
+    def failed(self) -> int:
+        """Runs that were not finite at some epoch, at the least."""
+        return int(self.runs - self.finite.min())
+
+    @property
+    def error_square_sum(self) -> Array:
+        """Σ e² (m, 6)."""
+        return np.diagonal(self.error_product_sum, axis1=1, axis2=2)
+
+    @property
+    def mean_error(self) -> Array:
+        """Mean error at each epoch (m, 6)."""
+        return _divided(self.error_sum, self.finite[:, None])
+
+    @property
+    def mean_square_error(self) -> Array:
+        """Mean of e eᵀ at each epoch (m, 6, 6), which P claims to be."""
+        return _divided(self.error_product_sum, self.finite[:, None, None])
+
+    @property
+    def rms_error(self) -> Array:
+        """Root mean square error at each epoch (m, 6)."""
+        return np.sqrt(np.diagonal(self.mean_square_error, axis1=1, axis2=2))
+
+    @property
+    def covariance(self) -> Array:
+        """The filter's own covariance, mean over runs (m, 6, 6)."""
+        return _divided(self.covariance_sum, self.finite[:, None, None])
+
+    @property
+    def sigma(self) -> Array:
+        """The filter's own standard deviation, root mean over runs (m, 6)."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+
+    @property
+    def anees(self) -> Array:
+        """NEES averaged over runs and states (m, 3): of all six states, attitude, bias; 1 for a right filter."""
+        return _divided(self.nees_sum, self.finite[:, None] * np.array([6.0, 3.0, 3.0]))
+
+    @property
+    def covered(self) -> Array:
+        """Share of the runs whose error lies inside 1, 2, 3 σ (m, 6, 3); :data:`COVERED` for a right filter."""
+        return _divided(self.coverage, self.finite[:, None, None])
+
+    @property
+    def nis_time(self) -> Array:
+        """Middles of the NIS's spans of time (k,), s."""
+        return 0.5 * (self.nis_edges[1:] + self.nis_edges[:-1])
+
+    @property
+    def nis_sum(self) -> Array:
+        """Σ over runs and sensors of the NIS in each span of time (k,)."""
+        return np.asarray(self.sensor_nis_sum.sum(axis=0))
+
+    @property
+    def nis_degrees(self) -> Array:
+        """Degrees of freedom in each span of time of one run, mean over runs (k,)."""
+        return np.asarray(self.sensor_degrees.sum(axis=0) / self.runs)
+
+    @property
+    def nis(self) -> Array:
+        """NIS per degree of freedom, averaged over runs and each span of time (k,); 1 for a right filter, NaN where none was measured."""
+        return _divided(self.nis_sum, self.sensor_degrees.sum(axis=0))
+
+    @property
+    def mean_nis(self) -> float:
+        """NIS per degree of freedom over the whole time and all runs; innovations of a right filter are white, so no epochs are needed."""
+        return float(_divided(self.nis_sum.sum(), self.sensor_degrees.sum()))
+
+    @property
+    def sensor_nis(self) -> Array:
+        """NIS per degree of freedom of each sensor over the whole time and all runs (s,)."""
+        return _divided(self.sensor_nis_sum.sum(axis=1), self.sensor_degrees.sum(axis=1))
+
+    def nis_bounds(self, probability: float = 0.99, sensor: str | None = None) -> tuple[float, float]:
+        """Return two-sided bounds of :attr:`mean_nis`, or of that of one sensor."""
+        rows = slice(None) if sensor is None else self.sensors.index(sensor)
+        return consistency.mean_bounds(1, int(self.sensor_degrees[rows].sum()), probability)
+
+    def verdict(self, epochs: NDArray[Any], subset: str = "state", probability: float = 0.99) -> Verdict:
+        """Return the two-sided χ² verdict on ``subset`` ("state", "attitude" or "bias") at the epochs of the given indices.
+
+        An epoch at which some run was not finite counts as infinite: no filter that fails is consistent.
+        """
+        column, degrees = SUBSETS[subset]
+        mean = np.where(self.finite == self.runs, self.anees[:, column], np.inf)[epochs]
+        return Verdict(mean=mean, degrees=degrees, runs=self.runs, probability=probability)
+
+    def error_quantile(self, probability: float) -> Array:
+        """Return the quantile of |e| at each epoch (m, 6), from the histogram: off by less than half a bin, 6 %, mostly far less."""
+        return _quantile(self.histogram[:, :6], probability, bin_edges(ERROR_EXPONENT))
+
+    def nees_quantile(self, probability: float) -> Array:
+        """Return the quantile of the NEES of state, attitude and bias at each epoch (m, 3)."""
+        return _quantile(self.histogram[:, 6:], probability, bin_edges(NEES_EXPONENT))
+
+
+def _divided(total: Any, number: Any) -> Array:
+    """Return total / number, NaN where the number is 0."""
+    number = np.broadcast_to(np.asarray(number, np.float64), np.shape(total))
+    return np.asarray(np.divide(total, number, out=np.full(np.shape(total), np.nan), where=number > 0.0))
+
+
+def _quantile(histogram: Counts, probability: float, edges: Array) -> Array:
+    """Return quantiles along the last axis, the counts spread evenly over their bins; NaN where there are none."""
+    if not 0.0 <= probability <= 1.0:
+        raise InputError(f"probability is {probability}; it must lie between 0 and 1")
+    before = np.concatenate([np.zeros((*histogram.shape[:-1], 1)), np.cumsum(histogram, axis=-1)], axis=-1)
+    total = before[..., -1]
+    wanted = probability * total
+    # The bin in which the wanted number is reached: the first whose end is not short of it, and that holds any.
+    place = np.argmax((before[..., 1:] >= wanted[..., None]) & (histogram > 0), axis=-1)
+    start = np.take_along_axis(before, place[..., None], axis=-1)[..., 0]
+    held = np.take_along_axis(histogram, place[..., None], axis=-1)[..., 0]
+    share = np.clip((wanted - start) / np.maximum(held, 1), 0.0, 1.0)
+    value = edges[place] + share * (edges[place + 1] - edges[place])
+    return np.asarray(np.where(total > 0, value, np.nan))
+
+
+_SAME = ("time", "nis_edges", "sensors")
+_WORST = ("worst_run", "worst_score")
+_EXAMPLES = ("example_run", "example_error", "example_sigma")
+
+
+def merge(a: Statistics, b: Statistics) -> Statistics:
+    """Return the statistics of the runs of both. Sums are added, so the order of merging tells in the last bits."""
+    for name in _SAME:
+        if not np.array_equal(getattr(a, name), getattr(b, name)):
+            raise InputError(f"statistics of different {name} cannot be merged; they are of different plans")
+    merged: dict[str, Any] = {name: getattr(a, name) for name in _SAME}
+    merged.update(zip(_WORST, worst(*(np.concatenate([getattr(a, n), getattr(b, n)]) for n in _WORST)), strict=True))
+    first = np.argsort(np.concatenate([a.example_run, b.example_run]), kind="stable")[:EXAMPLES]
+    merged.update({name: np.concatenate([getattr(a, name), getattr(b, name)])[first] for name in _EXAMPLES})
+    for field in fields(Statistics):
+        if field.name not in merged:
+            merged[field.name] = getattr(a, field.name) + getattr(b, field.name)
+    return Statistics(**merged)
+
+
+def merge_all(parts: Sequence[Statistics]) -> Statistics:
+    """Return the statistics of all parts, merged from the first to the last."""
+    total, *rest = parts
+    for part in rest:
+        total = merge(total, part)
+    return total
+
+
+def worst(run: Counts, score: Array) -> tuple[Counts, Array]:
+    """Return the WORST runs and their scores, the largest first, of equal ones the lower number first."""
+    order = np.lexsort((run, -score))[:WORST]
+    return run[order], score[order]
+
+
+def judged_epochs(epochs: int, most: int = 20) -> Counts:
+    """Return the indices of at most ``most`` equally spaced epochs, the start left out: there the error is drawn, not estimated."""
+    return np.unique(np.linspace(max(1, epochs // most), epochs, min(most, epochs)).astype(np.int64))

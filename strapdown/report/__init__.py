@@ -1,0 +1,74 @@
+"""Reports: one self-contained HTML page for a result file. The verdict in words first, then numbers, figures and provenance.
+
+``page``
+    HTML, figures and interactive charts on one page without network. The charts are drawn by uPlot (MIT licence), bundled in ``uplot/``.
+``estimates``
+    The page of one estimate.
+``campaigns``
+    The page of a Monte Carlo.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from strapdown import records
+from strapdown.checks import InputError
+from strapdown.files import write_json, written_beside
+from strapdown.report import campaigns, estimates
+
+_WRITERS: dict[str, Callable[[Path, float], tuple[str, dict[str, Any]]]] = {
+    "strapdown estimate": estimates.report,
+    "strapdown montecarlo": campaigns.report,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """A written report."""
+
+    page: Path
+    statistics: Path
+    """The same statistics as JSON."""
+    verdict: str
+
+
+def write(
+    result: str | os.PathLike[str], out: str | os.PathLike[str] | None = None, *, probability: float = 0.99
+) -> Report:
+    """Write the report of a result file, and its statistics as JSON beside it; each appears whole or not at all.
+
+    Parameters
+    ----------
+    result : path
+        HDF5 file of an estimate or a Monte Carlo.
+    out : path, optional
+        The page; ``result`` with the suffix .html if not given.
+    probability : float
+        That a right filter is not called wrong by any test.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, truncated, or of another kind.
+    """
+    source = Path(result)
+    target = source.with_suffix(".html") if out is None else Path(out)
+    if target.suffix.lower() not in (".html", ".htm"):
+        raise InputError(f"out is {target}; a report is an .html file")
+    kind = records.read_attributes(source)["kind"]
+    if kind not in _WRITERS:
+        known = ", ".join(name.removeprefix("strapdown ") for name in _WRITERS)
+        raise InputError(f"{source} holds: {kind.removeprefix('strapdown ')}; reports are written of: {known}")
+    content, statistics = _WRITERS[kind](source, probability)
+    beside = target.with_suffix(".json")
+    if beside.exists() and beside.samefile(source):
+        raise InputError(f"{beside} would replace the result itself; choose another name for the page")
+    with written_beside(target) as temporary:
+        temporary.write_text(content, encoding="utf-8")
+    write_json(beside, statistics)
+    return Report(page=target, statistics=beside, verdict=str(statistics["judgement"]["verdict"]))

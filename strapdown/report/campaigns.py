@@ -1,0 +1,167 @@
+"""The page of a Monte Carlo, finished or not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from strapdown import consistency, plots, records
+from strapdown.checks import InputError
+from strapdown.montecarlo import campaign
+from strapdown.montecarlo.statistics import SUBSETS, Statistics
+from strapdown.plots.statistics import STATES, state_unit
+from strapdown.report import findings, page
+
+
+def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
+    """Return the page and the statistics of a campaign's file."""
+    attributes = records.read_attributes(path)
+    held = campaign.read(path)
+    statistics = held.statistics
+    if statistics is None:
+        raise InputError(f"{path} holds no finished run yet; let the campaign go on (--resume) and report then")
+    judgement = consistency.judge_runs(statistics, probability=probability)
+    name = held.plan.scenario.name or "a scenario"
+    unfinished = "" if held.finished else f"; not finished: {statistics.runs} of {held.runs} runs"
+    content = page.page(
+        f"Monte Carlo: {name}",
+        f"{statistics.runs} runs of {held.plan.scenario.duration:g} s, seed {held.plan.seed}, {len(statistics.time) - 1} epochs, machine: "
+        f"{held.machine}{unfinished}; strapdown {held.version}",
+        findings.verdict(judgement),
+        _numbers(statistics),
+        findings.evidence(judgement),
+        page.section(
+            "Over time",
+            page.figure(
+                lambda: _consistency(statistics, probability),
+                "ANEES of attitude and bias, and NIS, with the bounds of a right filter",
+            ),
+            page.figure(
+                lambda: _fans(statistics),
+                "Errors of the runs: what share lies below each band, and what the filter expects",
+            ),
+        ),
+        page.section(
+            "At the end",
+            page.figure(
+                lambda: _end(statistics),
+                "σ-coverage by state, and the covariance of the errors beside the filter's own",
+            ),
+        ),
+        _worst(statistics, path),
+        page.section(
+            "How it was made",
+            page.provenance({k: v for k, v in attributes.items() if k not in ("plan", "conventions")}),
+        ),
+    )
+    return content, {
+        "source": path.name,
+        "judgement": judgement.summary(),
+        "runs": statistics.runs,
+        "failed_runs": statistics.failed,
+        "time_s": statistics.time.tolist(),
+        "anees": {subset: statistics.anees[:, k].tolist() for k, subset in enumerate(SUBSETS)},
+        "rms_error_si": statistics.rms_error.tolist(),
+        "sigma_si": statistics.sigma.tolist(),
+        "nis_by_sensor": dict(zip(statistics.sensors, _plain(statistics.sensor_nis), strict=True)),
+        "worst_runs": statistics.worst_run.tolist(),
+    }
+
+
+def _plain(values: Any) -> list[float | None]:
+    return [float(x) if np.isfinite(x) else None for x in values]
+
+
+def _numbers(statistics: Statistics) -> str:
+    rows = []
+    for k, name in enumerate(STATES):
+        unit, size = state_unit(k, 3.0 * statistics.sigma[-1:, k])
+        quantiles = [page.number(float(statistics.error_quantile(share)[-1, k] / size), 3) for share in (0.5, 0.95)]
+        rows.append(
+            (
+                f"{name}, {unit}",
+                page.number(float(statistics.sigma[-1, k] / size)),
+                page.number(float(statistics.rms_error[-1, k] / size)),
+                page.number(float(statistics.mean_error[-1, k] / size), 3),
+                *quantiles,
+                *(f"{100 * share:.1f}" for share in statistics.covered[-1, k]),
+            )
+        )
+    head = (
+        "at the end",
+        "σ of the filter",
+        "RMS error",
+        "mean error",
+        "median |error|",
+        "95 %",
+        "in 1σ, %",
+        "in 2σ, %",
+        "in 3σ, %",
+    )
+    nis = [
+        (name, page.number(float(value)), *(f"{bound:.4f}" for bound in statistics.nis_bounds(0.99, name)))
+        for name, value, degrees in zip(
+            statistics.sensors, statistics.sensor_nis, statistics.sensor_degrees, strict=True
+        )
+        if degrees.sum() > 0
+    ]
+    parts = [page.table(head, rows, numbers=8)]
+    if nis:
+        parts.append(page.table(("sensor", "NIS per degree of freedom", "from", "to (99 %)"), nis, numbers=3))
+    if statistics.failed:
+        parts.append(
+            page.paragraph(
+                f"{statistics.failed} runs failed: their error or covariance was no finite number at some epoch."
+            )
+        )
+    return page.section("Key numbers", *parts)
+
+
+def _consistency(statistics: Statistics, probability: float) -> Figure:
+    figure, axes = plots.new_figure(1, 3, size=(12.0, 4.0))
+    for ax, subset in zip(axes, ("attitude", "bias"), strict=False):
+        bounds = consistency.mean_bounds(3, statistics.runs, probability)
+        plots.nees_over_time([("all runs", statistics)], bounds, subset, ax)
+        low, high = np.nanmin(statistics.anees), np.nanmax(statistics.anees)
+        ax.set_ylim(min(0.5, 0.8 * float(low)), max(2.0, 1.3 * float(high)))
+        ax.legend(loc="upper right")
+    if statistics.sensor_degrees.sum() > 0:
+        plots.nis_over_time([("all runs", statistics)], axes[2], probability=probability)
+        axes[2].legend(loc="upper right")
+    else:
+        axes[2].set_visible(False)
+    return figure
+
+
+def _fans(statistics: Statistics) -> Figure:
+    figure, axes = plots.new_figure(2, 3, size=(13.0, 7.0))
+    for state, ax in enumerate(axes.ravel()):
+        plots.fan(statistics, state, ax)
+        ax.get_legend().remove()
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=3)
+    return figure
+
+
+def _end(statistics: Statistics) -> Figure:
+    figure, axes = plots.new_figure(1, 3, size=(13.0, 4.4))
+    plots.coverage_by_state(statistics, -1, axes[0])
+    for ax, pair in zip(axes[1:], ((0, 1), (0, 3)), strict=True):
+        plots.covariance_ellipses(statistics.covariance[-1], statistics.mean_square_error[-1], pair, ax)
+    return figure
+
+
+def _worst(statistics: Statistics, path: Path) -> str:
+    rows = [
+        (str(run), page.number(float(score)))
+        for run, score in zip(statistics.worst_run, statistics.worst_score, strict=True)
+    ]
+    return page.section(
+        "Worst runs",
+        page.table(("run", "largest NEES of the state (6 degrees of freedom)"), rows, numbers=2),
+        page.paragraph("Each can be re-created alone, in full detail and to the bit, by its number:"),
+        page.code(f"strapdown montecarlo --replay {int(statistics.worst_run[0])} --out {path.name}"),
+    )

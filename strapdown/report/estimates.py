@@ -1,0 +1,208 @@
+"""The page of one estimate, with or without truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from strapdown import consistency, plots, quaternion, records
+from strapdown.plots.style import AXES, angle_unit, rate_unit
+from strapdown.records import Estimate, Innovations, Truth
+from strapdown.report import findings, page
+from strapdown.units import DEGREE
+
+_COLOURS = ("--a", "--b", "--c")
+
+
+def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
+    """Return the page and the statistics of an estimate's file."""
+    attributes = records.read_attributes(path)
+    estimate = records.read_estimate(path)
+    truth = records.read_truth(path)
+    judgement = consistency.judge(estimate, truth, probability=probability)
+    span = estimate.time[-1] - estimate.time[0]
+    used = sum(len(one.time) for one in estimate.innovations.values())
+    content = page.page(
+        f"Estimate: {path.name}",
+        f"{len(estimate.time)} states over {span:g} s, {used} measurements of {len(estimate.innovations)} sensors, "
+        f"{'with' if truth is not None else 'without'} truth; strapdown {attributes.get('version', '')}",
+        findings.verdict(judgement),
+        *(
+            [page.section("What happened", *[page.paragraph(str(event)) for event in estimate.events])]
+            if estimate.events
+            else []
+        ),
+        _numbers(estimate, truth),
+        findings.evidence(judgement),
+        _over_time(estimate, truth),
+        *[_sensor(name, one, probability) for name, one in estimate.innovations.items()],
+        _path(estimate, truth),
+        page.section(
+            "How it was made",
+            page.provenance(attributes),
+            page.paragraph("Judge it again:"),
+            page.code(f"strapdown check {path.name}\nstrapdown report {path.name}"),
+        ),
+    )
+    return content, {
+        "source": path.name,
+        "judgement": judgement.summary(),
+        "key_numbers": _key_numbers(estimate, truth),
+    }
+
+
+def _key_numbers(estimate: Estimate, truth: Truth | None) -> dict[str, Any]:
+    numbers: dict[str, Any] = {
+        "states": len(estimate.time),
+        "duration_s": float(estimate.time[-1] - estimate.time[0]),
+        "final_attitude_sigma_rad": estimate.sigma[-1, :3].tolist(),
+        "final_bias_rad_per_s": estimate.bias[-1].tolist(),
+        "final_bias_sigma_rad_per_s": estimate.sigma[-1, 3:].tolist(),
+        "measurements": {name: len(one.time) for name, one in estimate.innovations.items()},
+        "skipped": dict(estimate.skipped),
+        "refused": estimate.refused,
+    }
+    if truth is not None:
+        error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)
+        half = len(error) // 2
+        numbers["rms_attitude_error_second_half_rad"] = np.sqrt(np.mean(error[half:, :3] ** 2, axis=0)).tolist()
+        numbers["rms_bias_error_second_half_rad_per_s"] = np.sqrt(np.mean(error[half:, 3:] ** 2, axis=0)).tolist()
+    return numbers
+
+
+def _numbers(estimate: Estimate, truth: Truth | None) -> str:
+    half = len(estimate.time) // 2
+    sigma = np.sqrt(np.mean(estimate.variance[half:], axis=0))
+    rows = []
+    error = None
+    if truth is not None:
+        error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)[half:]
+    for what, states, unit_of in (("attitude", slice(0, 3), angle_unit), ("gyro bias", slice(3, 6), rate_unit)):
+        unit, size = unit_of(3.0 * sigma[states])
+        for axis, name in enumerate(AXES):
+            k = states.start + axis
+            row = [f"{what} {name}, {unit}", page.number(float(sigma[k] / size))]
+            if error is not None:
+                row += [
+                    page.number(float(np.sqrt(np.mean(error[:, k] ** 2)) / size)),
+                    page.number(float(np.mean(error[:, k]) / size)),
+                    page.number(float(np.abs(error[:, k]).max() / size)),
+                ]
+            rows.append(row)
+    head = [
+        "second half of the run",
+        "σ of the filter",
+        *(["RMS error", "mean error", "largest"] if error is not None else []),
+    ]
+    parts = [page.table(head, rows, numbers=len(head) - 1)]
+    sensors = [
+        (
+            name,
+            len(one.time),
+            estimate.skipped.get(name, 0),
+            one.refused,
+            page.number(float(one.nis.sum() / one.innovation.size)),
+        )
+        for name, one in estimate.innovations.items()
+        if len(one.time)
+    ]
+    if sensors:
+        head = [
+            "sensor",
+            "measurements",
+            "not used: missing or outside",
+            "refused by the gate",
+            "NIS per degree of freedom",
+        ]
+        parts.append(page.table(head, sensors, numbers=4))
+    return page.section("Key numbers", *parts)
+
+
+def _over_time(estimate: Estimate, truth: Truth | None) -> str:
+    sigma = estimate.sigma
+    charts = []
+    figure = ""
+    settled = slice(len(estimate.time) // 20, None)
+    if truth is not None:
+        error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)
+        for what, states, unit_of in (
+            ("Attitude error", slice(0, 3), angle_unit),
+            ("Bias error", slice(3, 6), rate_unit),
+        ):
+            unit, size = unit_of(3.0 * sigma[settled, states])
+            bound = 3.0 * sigma[:, states].max(axis=1) / size
+            series = (
+                page.Series(label="+3σ, largest axis", value=bound, colour="--line", band=True),
+                page.Series(label="−3σ", value=-bound, colour="--line", band=True),
+                *(
+                    page.Series(label=AXES[k], value=error[:, states.start + k] / size, colour=_COLOURS[k])
+                    for k in range(3)
+                ),
+            )
+            reach = 1.3 * max(float(bound[settled].max()), float(np.abs(error[settled, states]).max() / size))
+            charts.append(
+                page.chart(
+                    page.Chart(title=what, unit=unit, time=estimate.time, series=series, bands=((0, 1),), reach=reach)
+                )
+            )
+        figure = page.figure(
+            lambda: plots.error_overview(estimate, truth),
+            "Errors against the truth inside the filter's own ±3σ, body frame",
+        )
+    else:
+        euler = quaternion.to_rotation(estimate.attitude).as_euler("ZYX", degrees=True)[:, ::-1]
+        series = tuple(
+            page.Series(label=name, value=euler[:, k], colour=_COLOURS[k])
+            for k, name in enumerate(("roll", "pitch", "yaw"))
+        )
+        charts.append(page.chart(page.Chart(title="Attitude", unit="°", time=estimate.time, series=series)))
+        unit, size = rate_unit(3.0 * sigma[settled, 3:])
+        series = tuple(
+            page.Series(label=AXES[k], value=estimate.bias[:, k] / size, colour=_COLOURS[k]) for k in range(3)
+        )
+        charts.append(page.chart(page.Chart(title="Gyro bias", unit=unit, time=estimate.time, series=series)))
+        spread = np.linalg.norm(sigma[:, :3], axis=1) / DEGREE
+        series = (page.Series(label="σ, all axes", value=spread),)
+        charts.append(page.chart(page.Chart(title="Attitude σ", unit="°", time=estimate.time, series=series)))
+        figure = page.figure(lambda: plots.estimate_overview(estimate), "Attitude, gyro bias in ±3σ, attitude σ")
+    return page.section("Over time", *charts, figure)
+
+
+def _sensor(name: str, innovations: Innovations, probability: float) -> str:
+    if len(innovations.time) < 8:
+        return page.section(
+            f"Innovations of {name}", page.paragraph(f"{len(innovations.time)} measurements are too few to draw.")
+        )
+    white = innovations.whitened
+
+    def draw() -> Figure:
+        figure, axes = plots.new_figure(2, 2, size=(10.5, 7.0))
+        plots.innovation_histogram(white, axes[0, 0])
+        plots.innovation_quantiles(consistency.quantile_pairs(white, probability), axes[0, 1])
+        plots.innovation_autocorrelation(consistency.autocorrelation(white, probability=probability), axes[1, 0])
+        plots.nis_over_record(innovations, consistency.mean_bounds(white.shape[1], 1, 0.99), axes[1, 1])
+        return figure
+
+    caption = f"Innovations of {name} over their own σ: distribution, quantiles, autocorrelation, NIS over time"
+    return page.section(f"Innovations of {name}", page.figure(draw, caption))
+
+
+def _path(estimate: Estimate, truth: Truth | None) -> str:
+    true = None if truth is None else truth.attitude
+    parts = [
+        page.figure(lambda: plots.sphere_figure(estimate.attitude, true), "Path of the body z axis in the fixed frame")
+    ]
+    if true is not None:
+        error = consistency.errors(estimate.attitude, estimate.bias, true, estimate.bias)
+        angle = consistency.distribution(np.linalg.norm(error[:, :3], axis=1))
+
+        def draw() -> Figure:
+            figure, ax = plots.new_figure(size=(6.5, 4.2))
+            plots.error_distribution(angle, ax)
+            return figure
+
+        parts.append(page.figure(draw, "Share of the time at which the whole attitude error is at or below each size"))
+    return page.section("Attitude", *parts)

@@ -1,0 +1,190 @@
+"""One HTML page that needs nothing else: no network, no files beside it. Figures in a light and a dark version, charts to zoom into."""
+
+from __future__ import annotations
+
+import base64
+import html
+import importlib.resources
+import io
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from strapdown.checks import Array
+from strapdown.plots import style
+
+CHART_POINTS = 6000
+"""Most times of an interactive chart; of longer series the extremes of each span."""
+_DOTS_PER_INCH = 120
+
+
+@dataclass(frozen=True, kw_only=True)
+class Series:
+    """One line of a chart."""
+
+    label: str
+    value: Array
+    """(n,), in the chart's unit."""
+    colour: str = "--a"
+    """A colour of page.css."""
+    band: bool = False
+    """Drawn thin and dashed, as an edge of a band."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Chart:
+    """An interactive time series."""
+
+    title: str
+    unit: str
+    time: Array
+    series: tuple[Series, ...]
+    bands: tuple[tuple[int, int], ...] = ()
+    """Pairs (upper, lower) of series, counted from 0, with the space between them filled."""
+    reach: float | None = None
+    """The vertical axis shows ±reach at first; None: everything."""
+
+
+def text(content: Any) -> str:
+    """Return text safe inside HTML."""
+    return html.escape(str(content))
+
+
+def section(title: str, *parts: str) -> str:
+    """Return a headed section."""
+    return f"<section><h2>{text(title)}</h2>\n" + "\n".join(parts) + "</section>\n"
+
+
+def paragraph(content: str, *, faint: bool = False) -> str:
+    """Return a paragraph of plain text."""
+    return f"<p{' class=faint' if faint else ''}>{text(content)}</p>"
+
+
+def code(content: str) -> str:
+    """Return preformatted text."""
+    return f"<pre>{text(content)}</pre>"
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[Any]], *, numbers: int = 0, marked: Sequence[bool] = ()) -> str:
+    """Return a table; the last ``numbers`` columns are set to the right, the first cell of ``marked`` rows stands out."""
+    plain = len(head) - numbers
+    heads = [f"<th{' class=number' if j >= plain else ''}>{text(cell)}</th>" for j, cell in enumerate(head)]
+    lines = ["<tr>" + "".join(heads) + "</tr>"]
+    for k, row in enumerate(rows):
+        cells = []
+        for j, cell in enumerate(row):
+            kind = (
+                ' class="number"'
+                if j >= plain
+                else ' class="rejected"'
+                if j == 0 and k < len(marked) and marked[k]
+                else ""
+            )
+            cells.append(f"<td{kind}>{text(cell)}</td>")
+        lines.append("<tr>" + "".join(cells) + "</tr>")
+    return '<div class="scroll"><table>' + "\n".join(lines) + "</table></div>"
+
+
+def number(value: float, digits: int = 4) -> str:
+    """Return a number for people; nothing for NaN."""
+    return "" if math.isnan(value) else f"{value:.{digits}g}"
+
+
+def figure(draw: Callable[[], Figure], caption: str) -> str:
+    """Return a figure, drawn once in each theme; the page shows the one that the reader's device prefers."""
+    light, dark = (_image(draw, theme) for theme in ("light", "dark"))
+    return (
+        f'<figure><picture><source media="(prefers-color-scheme: dark)" srcset="{dark}"><img src="{light}" alt="{text(caption)}"></picture>'
+        f"<figcaption>{text(caption)}</figcaption></figure>"
+    )
+
+
+def _image(draw: Callable[[], Figure], theme: str) -> str:
+    with style.theme(theme):
+        buffer = io.BytesIO()
+        draw().savefig(buffer, format="png", dpi=_DOTS_PER_INCH)
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+
+
+def chart(one: Chart) -> str:
+    """Return the place of an interactive chart with its data."""
+    values = np.stack([series.value for series in one.series])
+    rows = extreme_rows(values)
+    data = [_numbers(one.time[rows]), *(_numbers(row) for row in values[:, rows])]
+    content = {
+        "unit": one.unit,
+        "series": [{"label": s.label, "colour": s.colour, "band": s.band} for s in one.series],
+        "bands": [[1 + upper, 1 + lower] for upper, lower in one.bands],
+        "range": None if one.reach is None else [-one.reach, one.reach],
+        "data": data,
+    }
+    plain = json.dumps(content, allow_nan=False).replace("</", "<\\/")
+    note = "" if len(rows) == len(one.time) else f" ({len(rows)} of {len(one.time)} times, extremes kept)"
+    return (
+        f'<div class="chart"><h3>{text(one.title + note)}</h3><div class="plot"></div>'
+        f'<script type="application/json">{plain}</script></div>'
+    )
+
+
+def extreme_rows(values: Array, most: int = CHART_POINTS) -> np.ndarray:
+    """Return at most about ``most`` indices of series (k, n) that hold the least and largest of each series in each span."""
+    k, n = values.shape
+    if n <= most:
+        return np.arange(n)
+    step = math.ceil(2 * k * n / most)
+    starts = np.arange(0, n, step)
+    padded = np.full((k, len(starts) * step), np.nan)
+    padded[:, :n] = values
+    spans = padded.reshape(k, len(starts), step)
+    missing = np.isnan(spans)
+    low = np.where(missing, np.inf, spans).argmin(axis=2) + starts
+    high = np.where(missing, -np.inf, spans).argmax(axis=2) + starts
+    return np.unique(np.concatenate([low.ravel(), high.ravel(), [0, n - 1]]))
+
+
+def _numbers(values: Array) -> list[float | None]:
+    return [float(f"{x:.7g}") if math.isfinite(x) else None for x in values.tolist()]
+
+
+def verdict(answer: str, reason: str, details: Sequence[str] = ()) -> str:
+    """Return the verdict box: the answer, why, and what contradicts it."""
+    kind = {"consistent": "consistent", "not consistent": "not"}.get(answer, "cannot")
+    items = "".join(f"<li>{text(detail)}</li>" for detail in details)
+    listing = f"<ul>{items}</ul>" if items else ""
+    return f'<div class="verdict {kind}"><strong>{text(answer.capitalize())}.</strong> {text(reason)}{listing}</div>'
+
+
+def page(title: str, subtitle: str, *parts: str) -> str:
+    """Return the whole page."""
+    read = lambda name: (importlib.resources.files("strapdown.report") / name).read_text(encoding="utf-8")  # noqa: E731
+    scripts = ""
+    if any('class="chart"' in part for part in parts):
+        library = read("uplot/uPlot.iife.min.js").replace("</script", "<\\/script")
+        scripts = f"<script>{library}</script>\n<script>{read('charts.js')}</script>\n"
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{text(title)}</title>\n"
+        '<link rel="icon" href="data:,">\n'
+        f"<style>{read('uplot/uPlot.min.css')}\n{read('page.css')}</style></head>\n<body>\n"
+        f'<header><h1>{text(title)}</h1><p class="faint">{text(subtitle)}</p></header>\n'
+        + "\n".join(parts)
+        + f"\n{scripts}</body></html>\n"
+    )
+
+
+def provenance(attributes: Mapping[str, Any]) -> str:
+    """Return what a result file says of its making: short entries as a table, long ones (a scenario's TOML) in full."""
+    short: list[tuple[str, str]] = []
+    long: list[tuple[str, str]] = []
+    for name, value in attributes.items():
+        content = str(value.decode() if isinstance(value, bytes) else value)
+        (long if "\n" in content or len(content) > 160 else short).append((name.replace("_", " "), content))
+    parts = [table(("what", "value"), short)] if short else []
+    parts += [f"<p>{text(name)}</p>" + code(content) for name, content in long]
+    return "\n".join(parts)

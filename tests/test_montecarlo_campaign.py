@@ -1,0 +1,476 @@
+"""Campaigns and their files: killed, interrupted, resumed, extended, and refused where they do not fit."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import fields, replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from strapdown import cli, consistency, montecarlo, recordfiles, records, scenarios
+from strapdown import setup as setups
+from strapdown.checks import InputError
+from strapdown.montecarlo import campaign, engine, scalar, statistics
+
+SCENARIO = replace(scenarios.load_scenario("spin"), duration=2.4)
+SETUP = setups.matched(SCENARIO)
+PLAN = montecarlo.Plan(scenario=SCENARIO, setup=SETUP, seed=4, epochs=6, nis_bins=5)
+CHUNK = 8
+
+
+def go(path, runs, plan=PLAN, **options):
+    return campaign.run(plan, path, **{"runs": runs, "machine": "scalar", "chunk": CHUNK, "threads": 2, **options})
+
+
+def straight(runs, chunk=CHUNK):
+    return montecarlo.run_plan(PLAN, runs=runs, chunk=chunk, threads=1, machine="scalar")
+
+
+def assert_same(a, b):
+    for field in fields(statistics.Statistics):
+        assert np.array_equal(getattr(a, field.name), getattr(b, field.name)), field.name
+
+
+def one_by_one(order, stop_after):
+    """Workers that finish the chunks in the given order and are interrupted after so many; they list what they did."""
+    done = []
+
+    def workers(work, chunks):
+        for place in [place for place in order if place < len(chunks)][:stop_after]:
+            done.append(chunks[place])
+            yield place, work(*chunks[place])
+        raise KeyboardInterrupt
+
+    return workers, done
+
+
+# ------------------------------------------------------------------------------------------------------------ the file
+
+
+def test_the_file_holds_what_a_plain_run_gives(tmp_path):
+    path = tmp_path / "deeper" / "c.h5"
+    told = []
+    result = go(path, 21, progress=told.append)
+    assert result.finished
+    assert sum(told) == 21
+    assert_same(result.statistics, straight(21))
+    held = campaign.read(path)
+    assert_same(held.statistics, result.statistics)
+    assert held.plan.digest == PLAN.digest
+    assert (held.machine, held.chunk, held.runs, held.finished) == ("scalar", CHUNK, 21, True)
+    assert list(tmp_path.rglob("*")) == [path.parent, path]
+
+
+def test_the_file_describes_itself(tmp_path):
+    path = tmp_path / "c.h5"
+    go(path, 21)
+    with h5py.File(path) as file:
+        assert file.attrs["kind"] == "strapdown montecarlo"
+        assert (
+            scenarios.scenario_to_toml(scenarios.scenario_from_toml(file.attrs["scenario"])) == file.attrs["scenario"]
+        )
+        assert "[filter]" in file.attrs["filter"]
+        assert file.attrs["finished_runs"] == 21
+        assert {"python", "numpy", "numba", "h5py"} == set(json.loads(file.attrs["versions"]))
+        assert "quaternions Hamilton" in file.attrs["conventions"]
+        for dataset in file["statistics"].values():
+            assert dataset.attrs["unit"]
+            assert dataset.attrs["meaning"]
+        names = {field.name for field in fields(statistics.Statistics)} - {"runs", "sensors"}
+        assert set(file["statistics"]) == names
+
+
+@pytest.mark.parametrize("end", [8, 13, 21, 24])
+def test_a_campaign_can_be_extended_to_the_same_bits(tmp_path, end):
+    """From ends on whole chunks and on short ones."""
+    path = tmp_path / "c.h5"
+    go(path, 5)
+    go(path, end, resume=True, chunk=None)
+    result = go(path, 30, resume=True)
+    assert_same(result.statistics, straight(30))
+    assert_same(campaign.read(path).statistics, straight(30))
+
+
+def test_resuming_a_finished_campaign_computes_nothing(tmp_path):
+    path = tmp_path / "c.h5"
+    first = go(path, 21)
+    told = []
+
+    def idle(work, chunks):
+        assert not chunks
+        return iter(())
+
+    again = go(path, 21, resume=True, workers=idle, progress=told.append)
+    assert told == [21]
+    assert_same(first.statistics, again.statistics)
+    assert again.seconds >= first.seconds
+
+
+@pytest.mark.parametrize(
+    ("order", "stop"), [([0, 1, 2, 3], 2), ([3, 1, 2, 0], 1), ([3, 1, 2, 0], 3), ([2, 0, 3, 1], 2)]
+)
+def test_finished_chunks_are_never_computed_again(tmp_path, order, stop):
+    """Interrupted with chunks finished in any order: the file has all of them, resuming computes the others alone."""
+    path = tmp_path / "c.h5"
+    workers, done = one_by_one(order, stop)
+    with pytest.raises(KeyboardInterrupt):
+        go(path, 29, workers=workers)
+    held = campaign.read(path)
+    in_front = 0
+    while (in_front * CHUNK, min(CHUNK, 29 - in_front * CHUNK)) in done:
+        in_front += 1
+    assert (0 if held.statistics is None else held.statistics.runs) == min(29, in_front * CHUNK)
+    assert not held.finished
+    computed = []
+
+    def noting(work, chunks):
+        computed.extend(chunks)
+        return engine.in_threads(1)(work, chunks)
+
+    result = go(path, 29, resume=True, workers=noting)
+    assert not set(computed) & set(done)
+    assert len(computed) + len(done) == 4
+    assert_same(result.statistics, straight(29))
+
+
+def test_writing_takes_a_small_share_of_the_time(tmp_path, monkeypatch):
+    written = []
+    original = campaign._write
+
+    def slow(*arguments):
+        written.append(time.perf_counter())
+        time.sleep(0.05)
+        original(*arguments)
+
+    monkeypatch.setattr(campaign, "_write", slow)
+    begun = time.perf_counter()
+    go(tmp_path / "c.h5", 300, chunk=2)
+    elapsed = time.perf_counter() - begun
+    assert 2 <= len(written) <= 3 + elapsed / 0.5
+    assert campaign.read(tmp_path / "c.h5").finished
+
+
+# ------------------------------------------------------------------------------------------------------------ killed
+
+
+def _child(path, runs, die_at):
+    """Run a campaign in a forked process; with ``die_at`` it kills itself in the middle of writing its n-th dataset."""
+    if die_at:
+        written = [0]
+        original = campaign.put
+
+        def put(*arguments):
+            written[0] += 1
+            if written[0] == die_at:
+                os.kill(os.getpid(), signal.SIGKILL)
+            original(*arguments)
+
+        campaign.put = put
+    original_chunks = scalar.run_chunks
+
+    def unhurried(*arguments):  # so that even a fast machine is killed twice before it is through
+        time.sleep(0.02)
+        return original_chunks(*arguments)
+
+    scalar.run_chunks = unhurried
+    go(path, runs, resume=True, threads=1)
+
+
+def _killed(path, runs, *, after=None, die_at=0):
+    """Start such a process, kill it after so many seconds if it has not finished; return whether it was killed."""
+    child = multiprocessing.get_context("fork").Process(target=_child, args=(path, runs, die_at))
+    child.start()
+    child.join(after)
+    if child.is_alive():
+        os.kill(child.pid, signal.SIGKILL)
+    child.join()
+    return child.exitcode == -signal.SIGKILL
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_killed_at_random_moments_a_campaign_goes_on_to_the_same_bits(tmp_path):
+    scalar.run_chunk(PLAN, 0, 1)  # compiled before the children fork
+    path = tmp_path / "c.h5"
+    runs, kills, total, folds = 120, 0, None, {}
+    for first, number in engine.chunks_of(runs, CHUNK):
+        part = scalar.run_chunk(PLAN, first, number)
+        total = part if total is None else statistics.merge(total, part)
+        folds[total.runs] = total
+    random = np.random.default_rng(8)
+    for _ in range(60):
+        if not _killed(path, runs, after=random.uniform(0.02, 0.15)):
+            break
+        kills += 1
+        if path.exists():
+            held = campaign.read(path)  # whole at every moment
+            if held.statistics is not None:
+                assert_same(held.statistics, folds[held.statistics.runs])
+    _killed(path, runs)
+    assert kills >= 2
+    assert_same(campaign.read(path).statistics, total)
+    assert [p.name for p in tmp_path.iterdir()] == ["c.h5"]  # nothing of the killed ones is left
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+@pytest.mark.parametrize("die_at", [1, 5, 18, 19, 31])
+def test_killed_in_the_middle_of_writing_the_file_is_the_one_before(tmp_path, die_at):
+    scalar.run_chunk(PLAN, 0, 1)
+    path = tmp_path / "c.h5"
+    go(path, 16)
+    before = path.read_bytes()
+    assert _killed(path, 24, die_at=die_at)
+    if die_at <= 18:  # the first writing of the resumed campaign
+        assert path.read_bytes() == before
+    assert campaign.read(path).statistics.runs >= 16
+    assert_same(go(path, 24, resume=True).statistics, straight(24))
+
+
+# ------------------------------------------------------------------------------------------------------------ refused
+
+
+def _forged(path, name, value):
+    with h5py.File(path, "r+") as file:
+        file.attrs[name] = value
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"plan": replace(PLAN, seed=5)}, "seed is 4 there and 5 here"),
+        ({"plan": replace(PLAN, nis_bins=4)}, "nis_bins is 5 there and 4 here"),
+        ({"plan": replace(PLAN, setup=replace(SETUP, attitude_sigma=0.1))}, "filter.attitude_sigma_deg is"),
+        ({"plan": replace(PLAN, scenario=replace(SCENARIO, duration=4.8))}, "scenario.duration_s is 2.4 there and 4.8"),
+        (
+            {"plan": replace(PLAN, scenario=replace(SCENARIO, sensors=SCENARIO.sensors[:1]))},
+            r"scenario.sensors.1.\S+ is \S+ there and not given here",
+        ),
+        (
+            {"plan": replace(PLAN, dispersions=montecarlo.Dispersions(scale_factor_sigma=1e-4))},
+            "dispersions.scale_factor_sigma_ppm is not given there and 100",
+        ),
+        ({"chunk": 9}, "chunk is 8 there and 9 here"),
+        ({"runs": 20}, "holds 21 runs already"),
+        ({"runs": 0}, "runs is 0"),
+    ],
+)
+def test_a_file_of_another_campaign_is_refused_and_left_as_it_is(tmp_path, changes, message):
+    path = tmp_path / "c.h5"
+    go(path, 21)
+    before = path.read_bytes()
+    options = {"runs": 30, "plan": PLAN, **changes}
+    with pytest.raises(InputError, match=message):
+        go(path, resume=True, **options)
+    assert path.read_bytes() == before
+
+
+def test_a_file_of_another_version_or_format_is_refused(tmp_path):
+    path = tmp_path / "c.h5"
+    go(path, 8)
+    _forged(path, "version", "0.0.1")
+    with pytest.raises(InputError, match=r"version is 0\.0\.1 there"):
+        go(path, 16, resume=True)
+    _forged(path, "format", 99)
+    with pytest.raises(InputError, match="format 99, newer"):
+        campaign.read(path)
+
+
+def test_an_existing_file_is_not_written_over_by_mistake(tmp_path):
+    path = tmp_path / "c.h5"
+    path.write_text("the only copy of my thesis")
+    with pytest.raises(InputError, match="--resume"):
+        go(path, 8)
+    assert path.read_text() == "the only copy of my thesis"
+    with pytest.raises(InputError, match="cannot be read as a campaign"):
+        go(path, 8, resume=True)
+    assert path.read_text() == "the only copy of my thesis"
+    assert go(path, 8, overwrite=True).finished
+
+
+def test_files_that_are_no_campaign_are_refused(tmp_path):
+    path = tmp_path / "c.h5"
+    with pytest.raises(InputError, match="does not exist"):
+        campaign.read(path)
+    go(path, 8)
+    whole = path.read_bytes()
+    for share in (0.1, 0.5, 0.99):
+        path.write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(InputError, match="truncated"):
+            campaign.read(path)
+    records.write_attitude(path, np.arange(2.0), np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)))
+    with pytest.raises(InputError, match="no Monte Carlo campaign"):
+        campaign.read(path)
+
+
+def test_a_plan_without_a_form_in_a_file_is_refused_before_anything_is_computed(tmp_path):
+    class Own:
+        def __getattr__(self, name):
+            return getattr(SCENARIO.motion, name)
+
+    with pytest.raises(InputError, match="has no form in a file"):
+        go(tmp_path / "c.h5", 8, plan=replace(PLAN, scenario=replace(SCENARIO, motion=Own())))
+    assert not list(tmp_path.iterdir())
+
+
+# ------------------------------------------------------------------------------------------------------------ the command
+
+
+@pytest.fixture
+def command(monkeypatch, capsys, tmp_path):
+    """Run ``strapdown montecarlo ARGUMENTS`` in an empty folder; return exit status, standard output and standard error."""
+    monkeypatch.chdir(tmp_path)
+    Path("short.toml").write_text(scenarios.scenario_to_toml(replace(SCENARIO, name="short")), encoding="utf-8")
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["strapdown", "montecarlo", *map(str, arguments)])
+        try:
+            cli.main()
+            status = 0
+        except SystemExit as end:
+            status = end.code or 0
+        said = capsys.readouterr()
+        return status, said.out, said.err
+
+    return run
+
+
+SCALAR = ("--machine", "scalar")
+
+
+def test_the_command_computes_tells_and_writes(command):
+    status, said, error = command("short.toml", "--runs", 30, "--seed", 4, *SCALAR)
+    assert (status, error) == (0, "")
+    assert "short: 30 runs, seed 4, machine: scalar." in said
+    for words in ("NEES of the attitude", "NIS of sun sensor", "NIS of star", "Worst runs", "runs/s", "believed"):
+        assert words in said
+    report = json.loads(Path("short-montecarlo.json").read_text())
+    held = campaign.read("short-montecarlo.h5")
+    assert report["runs"] == 30
+    assert report["digest"] == held.plan.digest
+    assert report["nees"]["attitude"]["anees"] == pytest.approx(held.statistics.anees[4:, 1].mean(), rel=0.2)
+    expected = montecarlo.summary(held.statistics)
+    assert {name: report[name] for name in expected} == json.loads(json.dumps(expected))
+    assert held.plan.seed == 4
+    assert held.plan.epochs == 80
+
+
+def test_the_command_resumes_extends_and_shows(command):
+    assert command("short.toml", "--runs", 20, *SCALAR)[0] == 0
+    status, _, error = command("short.toml", "--runs", 20, *SCALAR)
+    assert status == 2
+    assert "--resume" in error
+    assert "--overwrite" in error
+    assert command("short.toml", "--runs", 30, "--resume", *SCALAR)[0] == 0
+    status, said, _ = command("short-montecarlo.h5")
+    assert status == 0
+    assert "30 runs" in said
+    assert command("short-montecarlo.h5", "--runs", 35, "--resume")[0] == 0
+    assert campaign.read("short-montecarlo.h5").statistics.runs == 35
+    status, _, error = command("short-montecarlo.h5", "--seed", 3, "--resume")
+    assert status == 2
+    assert "--seed" in error
+
+
+def test_the_command_takes_a_filter_and_dispersions_of_ones_own(command):
+    Path("f.toml").write_text(setups.to_toml(replace(SETUP, measurement_sigma_factor=0.5)))
+    Path("d.toml").write_text("[dispersions]\nattitude_error_deg = [0.0, 0.0, 5.0]\nattitude_sigma_deg = 0.0\n")
+    status, said, _ = command("short.toml", "--runs", 40, "--filter", "f.toml", "--dispersions", "d.toml", *SCALAR)
+    assert status == 0
+    assert "may NOT be believed" in said
+    held = campaign.read("short-montecarlo.h5")
+    assert held.plan.setup.measurement_sigma_factor == 0.5
+    assert np.allclose(held.statistics.mean_error[0, :3], np.deg2rad([0.0, 0.0, 5.0]), atol=1e-12)
+
+
+@pytest.mark.parametrize("machine", ["scalar", pytest.param("lanes", marks=pytest.mark.slow)])
+def test_a_replay_is_the_run_of_the_campaign_to_the_bit(command, machine):
+    assert command("short.toml", "--runs", 12, "--machine", machine)[0] == 0
+    held = campaign.read("short-montecarlo.h5")
+    status, said, _ = command("short-montecarlo.h5", "--replay", 5)
+    assert status == 0
+    assert "Run 5 of seed 1" in said
+    estimate = records.read_estimate("short-montecarlo-run-5-estimate.h5")
+    record = recordfiles.read_record("short-montecarlo-run-5-record.h5")
+    step = (len(estimate.time) - 1) // held.plan.epochs
+    rows = slice(None, None, step)
+    error = consistency.errors(
+        estimate.attitude[rows], estimate.bias[rows], record.truth.attitude[rows], record.truth.bias[rows]
+    )
+    assert np.array_equal(error, held.statistics.example_error[5])
+    assert np.array_equal(np.sqrt(estimate.variance[rows]), held.statistics.example_sigma[5])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("short.toml", "--runs", 0), "runs is 0"),
+        (("sort",), "scenario 'sort' is not known"),
+        (("none.toml",), "none.toml does not exist"),
+        (("none.h5",), "none.h5 does not exist"),
+        (("short.toml", "--runs", 4, "--out", "x.csv"), "choose such a suffix"),
+        (("short.toml", "--runs", 4, "--filter", "short.toml"), r"no table \[filter\]"),
+        (("short.toml", "--runs", 4, "--threads", 0), "threads is 0"),
+        (("short.toml", "--runs", 4, "--replay", -1), "run is -1"),
+        (("short.toml", "--runs", 4, "--workers", 1, "--cluster", "tcp://localhost:1"), "exclude each other"),
+        (("short.toml", "--runs", 4, "--machine", "gpu"), "machine 'gpu'"),
+    ],
+)
+def test_the_command_refuses(command, arguments, message, tmp_path):
+    status, _, error = command(*arguments)
+    assert status == 2
+    assert re.search(message, " ".join(error.split())), error
+    assert [path.name for path in tmp_path.iterdir()] == ["short.toml"]
+
+
+@pytest.mark.parametrize("how", ["Ctrl-C", "SIGTERM"])
+def test_interrupted_it_keeps_what_is_finished_and_says_so(command, monkeypatch, how):
+    original, done = scalar.run_chunks, []
+
+    def interrupted(plans, first_run, runs):
+        done.append(first_run)
+        if len(done) > 2:
+            if how == "Ctrl-C":
+                raise KeyboardInterrupt
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(30.0)
+        return original(plans, first_run, runs)
+
+    before = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(scalar, "run_chunks", interrupted)
+    status, said, _ = command("short.toml", "--runs", 60, "--threads", 1, *SCALAR)
+    assert status == 130
+    assert "go on with --resume" in said
+    assert signal.getsignal(signal.SIGTERM) == before
+    assert campaign.read("short-montecarlo.h5").statistics.runs == 20
+
+
+@pytest.mark.slow
+def test_the_installed_command_killed_again_and_again(tmp_path):
+    script = Path(sys.executable).with_name("strapdown")
+    arguments = [script, "montecarlo", "spin", "--runs", "60", "--machine", "scalar", "--chunk", "3", "--resume"]
+    random = np.random.default_rng(5)
+    kills = 0
+    for _ in range(40):
+        child = subprocess.Popen(arguments, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            status = child.wait(timeout=random.uniform(1.0, 12.0))
+        except subprocess.TimeoutExpired:
+            child.send_signal(random.choice([signal.SIGKILL, signal.SIGKILL, signal.SIGINT, signal.SIGTERM]))
+            child.wait()
+            kills += 1
+        else:
+            assert status == 0
+            break
+    assert kills >= 2
+    held = campaign.read(tmp_path / "spin-montecarlo.h5")
+    assert held.finished
+    assert_same(held.statistics, montecarlo.run_plan(held.plan, runs=60, chunk=3, machine="scalar"))

@@ -1,0 +1,178 @@
+"""Chunks on Dask: the bits of one process, whoever computes them and whoever is killed meanwhile."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+import strapdown
+from strapdown import cli, montecarlo, scenarios
+from strapdown import setup as setups
+from strapdown.checks import InputError
+from strapdown.montecarlo import cluster, engine, statistics
+
+distributed = pytest.importorskip(
+    "distributed", reason="the extra `cluster` is not installed: pip install '.[cluster]'"
+)
+
+SCENARIO = replace(scenarios.load_scenario("spin"), duration=2.4)
+PLAN = montecarlo.Plan(scenario=SCENARIO, setup=setups.matched(SCENARIO), seed=4, epochs=6, nis_bins=5)
+
+
+def assert_same(a, b):
+    for field in fields(statistics.Statistics):
+        assert np.array_equal(getattr(a, field.name), getattr(b, field.name)), field.name
+
+
+def alone(runs, chunk, plan=PLAN):
+    return montecarlo.run_plan(plan, runs=runs, chunk=chunk, threads=1, machine="scalar")
+
+
+@pytest.fixture(scope="module")
+def client():
+    """A scheduler and two workers in this process."""
+    with (
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None, silence_logs="ERROR"
+        ) as local,
+        distributed.Client(local, set_as_default=False) as here,
+    ):
+        yield here
+
+
+def test_dask_gives_the_bits_of_one_process(client):
+    told = []
+    found = montecarlo.run_plan(
+        PLAN, runs=43, chunk=4, machine="scalar", workers=cluster.on_dask(client), progress=told.append
+    )
+    assert sum(told) == 43
+    assert_same(found, alone(43, 4))
+
+
+def test_a_plan_is_unpacked_once_a_worker(client):
+    cluster._work.cache_clear()
+    montecarlo.run_plan(PLAN, runs=30, chunk=2, machine="scalar", workers=cluster.on_dask(client))
+    assert cluster._work.cache_info().misses <= 2  # two workers may begin at one moment
+
+
+def test_scenarios_of_ones_own_go_to_the_workers_too(client):
+    class Wobble:
+        def __getattr__(self, name):
+            if name.startswith("__"):
+                raise AttributeError(name)
+            return getattr(SCENARIO.motion, name)
+
+    one = replace(PLAN, scenario=replace(SCENARIO, motion=Wobble()))
+    found = montecarlo.run_plan(one, runs=6, chunk=2, machine="scalar", workers=cluster.on_dask(client))
+    assert_same(found, alone(6, 2))
+
+
+def test_an_error_on_a_worker_comes_out(client):
+    class Broken(engine.Work):
+        def __call__(self, first_run, runs):
+            raise InputError(f"runs from {first_run} cannot be computed")
+
+    with pytest.raises(InputError, match="cannot be computed"):
+        list(cluster.on_dask(client)(Broken(plans=(PLAN,), machine="scalar"), engine.chunks_of(8, 2)))
+
+
+def test_a_worker_of_another_version_is_refused(client, monkeypatch):
+    monkeypatch.setattr(cluster, "_chunk", lambda payload, first, runs: ("0.0.1", ()))
+    with pytest.raises(InputError, match=r"a worker has strapdown 0\.0\.1"):
+        montecarlo.run_plan(PLAN, runs=4, chunk=2, machine="scalar", workers=cluster.on_dask(client))
+
+
+def test_without_the_extra_the_remedy_is_told(monkeypatch, capsys, tmp_path):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r"pip install 'strapdown\[cluster\]'"), cluster.dask_client(workers=2):
+        pass
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["strapdown", "montecarlo", "spin", "--workers", "2", "--machine", "scalar"])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == 2
+    assert "strapdown[cluster]" in capsys.readouterr().err.replace("\n", "")
+    assert not list(tmp_path.iterdir())
+
+
+def test_bad_clusters_are_refused(monkeypatch):
+    monkeypatch.setattr(cluster, "CONNECT_SECONDS", 1)
+    for options, message in (
+        ({"address": "tcp://127.0.0.1:9"}, r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"),
+        ({"address": "nonsense://x"}, "no Dask scheduler answers at nonsense://x"),
+        ({"address": "tcp://127.0.0.1:9", "workers": 1}, "exclude each other"),
+        ({"workers": 0}, "workers is 0"),
+    ):
+        with pytest.raises(InputError, match=message), cluster.dask_client(**options):
+            pass
+
+
+def test_dask_is_not_imported_without_its_option():
+    script = (
+        "import sys\nfrom strapdown import cli\nfrom strapdown.montecarlo import campaign, cluster\n"
+        "assert not {'dask', 'distributed'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True, timeout=120)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("workers", "machine"), [(1, "scalar"), (2, "scalar"), (3, "scalar"), (2, "lanes")])
+def test_worker_processes_give_the_bits_of_one_process(workers, machine):
+    with cluster.dask_client(workers=workers) as client:
+        found = montecarlo.run_plan(PLAN, runs=60, chunk=4, machine=machine, workers=cluster.on_dask(client))
+    assert_same(found, montecarlo.run_plan(PLAN, runs=60, chunk=4, threads=1, machine=machine))
+
+
+@pytest.mark.slow
+def test_a_killed_worker_costs_only_its_chunk(tmp_path):
+    """Two worker processes without a nurse; one is killed by its pid in the middle, the campaign ends in the same bits."""
+    longer = replace(SCENARIO, duration=60.0)
+    plan = montecarlo.Plan(scenario=longer, setup=setups.matched(longer), seed=4, epochs=6, nis_bins=5)
+    address, workers = tmp_path / "scheduler.json", []
+    dask = [sys.executable, "-m", "dask"]
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": tmp_path}
+    scheduler = subprocess.Popen(
+        [*dask, "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", address],
+        **quiet,
+    )
+    try:
+        workers = [
+            subprocess.Popen(
+                [*dask, "worker", "--scheduler-file", address, "--no-nanny", "--nthreads", "1", "--no-dashboard"],
+                **quiet,
+            )
+            for _ in range(2)
+        ]
+        with distributed.Client(scheduler_file=address, timeout=60, set_as_default=False) as here:
+            here.wait_for_workers(2, timeout=60)
+            where = here.scheduler.address
+        computed, killed = [], []
+
+        def progress(runs):
+            computed.append(runs)
+            if len(computed) == 10:
+                os.kill(workers[0].pid, signal.SIGKILL)
+                killed.append(time.monotonic())
+
+        with cluster.dask_client(address=where) as here:
+            assert len(here.nthreads()) == 2
+            found = montecarlo.run_plan(
+                plan, runs=160, chunk=4, machine="scalar", workers=cluster.on_dask(here), progress=progress
+            )
+            assert len(here.nthreads()) == 1
+        assert killed
+        assert workers[0].wait(timeout=10) == -signal.SIGKILL
+        assert len(computed) == 40  # every chunk came once
+    finally:
+        for process in (*workers, scheduler):
+            process.kill()
+            process.wait()
+    assert_same(found, alone(160, 4, plan))
+    assert strapdown.__version__

@@ -1,0 +1,290 @@
+"""The lane machine of the Monte Carlo: the same runs whatever the chunks and lanes, the right distributions, against the scalar machine."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from strapdown import coning, motion, setup, vectors
+from strapdown.consistency import errors, nees
+from strapdown.gyro import GyroSpec
+from strapdown.mekf import ProcessNoise
+from strapdown.montecarlo import lanes, scalar
+from strapdown.montecarlo.plan import Dispersions, Plan
+from strapdown.montecarlo.statistics import Statistics
+from strapdown.scenarios import Scenario
+from strapdown.setup import FilterSetup
+
+ARW, RRW = 1e-4, 1e-5
+NOISE = ProcessNoise(angle_random_walk=ARW, rate_random_walk=RRW)
+UP = vectors.VectorSensor(name="up", reference_f=[0.1, 0.2, 1.0], sigma=0.01, rate=10.0)
+NORTH = vectors.VectorSensor(name="north", reference_f=[1.0, 0.0, 0.0], sigma=0.02, rate=7.0, phase=0.033)
+SCENARIO = Scenario(
+    motion=motion.SpinCone(angle=0.4, precession_rate=0.5, spin_rate=-0.8),
+    gyro=GyroSpec(angle_random_walk=ARW, rate_random_walk=RRW, turn_on_bias_sigma=1e-3),
+    sensors=(UP, NORTH),
+    rate=50.0,
+    duration=8.0,
+)
+SETUP = FilterSetup(process_noise=NOISE, attitude_sigma=0.03, bias_sigma=1e-3)
+PLAN = Plan(scenario=SCENARIO, setup=SETUP, seed=5, epochs=20, nis_bins=8)
+SUMS = [name for name in Statistics.__dataclass_fields__ if name not in ("time", "runs", "nis_edges", "sensors")]
+
+
+def same(a: Statistics, b: Statistics) -> None:
+    for name in SUMS:
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+
+
+@pytest.fixture(scope="module")
+def many() -> Statistics:
+    return lanes.run_chunk(PLAN, 0, 1600)
+
+
+# ----------------------------------------------------------------------------------------------------- the same runs
+
+
+def test_a_run_is_the_same_in_any_chunk():
+    """Scores are of one run each, and of sums those that are exact."""
+    whole = lanes.run_chunk(PLAN, 0, 37)
+    parts = [lanes.run_chunk(PLAN, first, n) for first, n in ((0, 1), (1, 20), (21, 8), (29, 8))]
+    assert sum(part.finite for part in parts).tolist() == whole.finite.tolist()
+    for name in ("coverage", "histogram", "sensor_degrees"):
+        np.testing.assert_array_equal(sum(getattr(part, name) for part in parts), getattr(whole, name))
+    for name in ("error_sum", "error_product_sum", "covariance_sum", "nees_sum", "sensor_nis_sum"):
+        total = sum(getattr(part, name) for part in parts)
+        np.testing.assert_allclose(total, getattr(whole, name), rtol=1e-11, atol=1e-13 * np.abs(total).max())
+    scores = {n: s for part in parts for n, s in zip(part.worst_run, part.worst_score, strict=True)}
+    assert all(scores[n] == s for n, s in zip(whole.worst_run, whole.worst_score, strict=True))
+    np.testing.assert_array_equal(np.concatenate([part.example_error for part in parts[:2]]), whole.example_error)
+
+
+def test_one_lane_is_eight_bit_for_bit_in_the_replay():
+    chunk = lanes.run_chunk(PLAN, 3, 1)
+    replay = lanes.replay(PLAN, 3)
+    estimate, truth = replay.estimate, replay.record.truth
+    assert truth is not None
+    np.testing.assert_array_equal(chunk.example_error[0, :, 3:], (truth.bias - estimate.bias)[:: PLAN.every])
+    np.testing.assert_array_equal(chunk.example_sigma[0], np.sqrt(estimate.variance)[:: PLAN.every])
+    np.testing.assert_array_equal(chunk.covariance_sum, estimate.covariance[:: PLAN.every])
+    e = errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)[:: PLAN.every]
+    np.testing.assert_allclose(chunk.error_sum, e, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(chunk.nees_sum[:, 0], nees(e, estimate.covariance[:: PLAN.every]), rtol=1e-8)
+    nis = np.array([innovations.nis.sum() for innovations in estimate.innovations.values()])
+    np.testing.assert_allclose(chunk.sensor_nis_sum.sum(axis=1), nis, rtol=1e-9)
+
+
+def test_the_scalar_filter_makes_the_same_of_the_replayed_record():
+    """What the lanes' filter did is what mekf.run does with the same measurements: truth from another loop."""
+    replay = lanes.replay(PLAN, 11)
+    estimate = setup.run(replay.record, SETUP, replay.initial, full_covariance=True)
+    np.testing.assert_allclose(estimate.attitude, replay.estimate.attitude, atol=2e-15)
+    np.testing.assert_allclose(estimate.bias, replay.estimate.bias, atol=1e-16)
+    np.testing.assert_allclose(estimate.variance, replay.estimate.variance, rtol=1e-11)
+    for name, innovations in estimate.innovations.items():
+        np.testing.assert_allclose(innovations.innovation, replay.estimate.innovations[name].innovation, atol=1e-14)
+        np.testing.assert_allclose(innovations.variance, replay.estimate.innovations[name].variance, rtol=1e-11)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [1, 2, 16])
+def test_any_number_of_lanes_gives_the_same_bits(width):
+    same(lanes.run_chunk(PLAN, 2, 21, width=width), lanes.run_chunk(PLAN, 2, 21))
+
+
+def test_the_machine_without_vectors_takes_one_lane(monkeypatch):
+    monkeypatch.setattr(lanes.machine, "has_vectors", lambda: False)
+    assert lanes.width_of("float64") == lanes.width_of("float32") == 1
+
+
+# ----------------------------------------------------------------------------------------------------- the right distributions
+
+
+def test_a_right_filter_is_consistent(many):
+    assert (many.finite == 1600).all()
+    for column, degrees in ((0, 6), (1, 3), (2, 3)):
+        total = many.nees_sum[::4, column]
+        p = stats.chi2.cdf(total, 1600 * degrees)
+        assert (p > 1e-4).all()
+        assert (p < 1.0 - 1e-4).all()
+    low, high = many.nis_bounds(0.9999)
+    assert low < many.mean_nis < high
+    score = many.mean_error / (many.sigma / math.sqrt(1600))
+    assert np.abs(score).max() < 4.6
+    np.testing.assert_allclose(many.covered, np.array([0.6827, 0.9545, 0.9973]) * np.ones((21, 6, 1)), atol=0.05)
+
+
+def test_initial_errors_are_the_priors(many):
+    start = many.mean_square_error[0]
+    expected = np.diag([0.03**2] * 3 + [1e-3**2] * 3)
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    assert np.abs((start - expected) / scale).max() < 4.5 * math.sqrt(2.0 / 1600)
+
+
+def test_statistics_are_those_of_the_scalar_machine(many):
+    few = scalar.run_chunk(PLAN, 0, 60)
+    np.testing.assert_allclose(many.sigma, few.sigma, rtol=2e-3)
+    ratio = few.rms_error[::5] / many.rms_error[::5]
+    assert np.abs(ratio - 1.0).max() < 4.5 / math.sqrt(2.0 * 60)
+    np.testing.assert_array_equal(60 * many.sensor_degrees, 1600 * few.sensor_degrees)
+
+
+def test_a_wrong_filter_shows_as_theory_says():
+    """Without gyro noise, motion or process noise the NEES of a prior k times too small is k² times the degrees of freedom."""
+    plan = replace(PLAN, dispersions=Dispersions(attitude_sigma=0.06, bias_sigma=2e-3))
+    s = lanes.run_chunk(plan, 0, 400)
+    assert s.anees[0, 0] == pytest.approx(4.0, rel=0.12)
+    assert not s.verdict(np.arange(0, 4)).consistent
+
+
+def test_fixed_errors_and_dispersions():
+    fixed = Dispersions(
+        attitude_sigma=0.0, bias_sigma=0.0, attitude_error=[0.01, -0.02, 0.03], bias_error=[1e-3, 0.0, -1e-3]
+    )
+    s = lanes.run_chunk(replace(PLAN, dispersions=fixed), 0, 8)
+    np.testing.assert_allclose(s.mean_error[0], [0.01, -0.02, 0.03, 1e-3, 0.0, -1e-3], rtol=1e-9, atol=1e-15)
+    # Without sensors and gyro noise an error matrix M turns the attitude by M ∫w dt.
+    plain = replace(SCENARIO, gyro=GyroSpec(), sensors=(), motion=motion.ConstantRate(rate=[0.3, 0.0, 0.0]))
+    given = Dispersions(attitude_sigma=0.0, bias_sigma=0.0, scale_factor_sigma=1e-3, misalignment_sigma=2e-3)
+    s = lanes.run_chunk(Plan(scenario=plain, setup=SETUP, epochs=20, dispersions=given), 0, 800)
+    # Along the axis of turning the error grows with the angle; across it comes round: |∫ R dt| = 2 sin(θ/2)/θ of that.
+    angle = 0.3 * 8.0
+    across = 2e-3 * 2.0 * math.sin(0.5 * angle)
+    expected = [1e-3 * angle, across / math.sqrt(2.0) * math.sqrt(2.0), across]
+    np.testing.assert_allclose(s.rms_error[-1, :3], expected, rtol=4.5 / math.sqrt(1600))
+
+
+@pytest.mark.parametrize(
+    ("spec", "exact"),
+    [
+        # Variance of the angle and of the bias after t: closed forms.
+        (GyroSpec(angle_random_walk=1e-3), lambda t: (1e-6 * t, 0.0)),
+        (GyroSpec(rate_random_walk=1e-3), lambda t: (1e-6 * t**3 / 3.0, 1e-6 * t)),
+        (
+            GyroSpec(markov_noise=1e-3, markov_correlation_time=2.0),
+            lambda t: (2.0e-6 * 2.0 * (t - 2.0 * (1.0 - math.exp(-t / 2.0))), 1e-6),
+        ),
+        (GyroSpec(turn_on_bias_sigma=1e-3), lambda t: (1e-6 * t * t, 1e-6)),
+    ],
+)
+def test_gyro_noise_has_its_closed_form(spec, exact):
+    """A filter that starts right, told nothing and measuring nothing, has the gyro's errors: angle and bias, at rest."""
+    still = replace(SCENARIO, gyro=spec, sensors=(), motion=motion.rest())
+    given = Dispersions(attitude_sigma=0.0, bias_sigma=0.0)
+    plan = Plan(scenario=still, setup=SETUP, epochs=20, dispersions=given)
+    group = lanes._Group(plan, 8)
+    angle, bias = [], []
+    for first in range(0, 1200, 8):
+        group.advance(first)
+        kept = group.kept.reshape(21, 31, 8)[-1]
+        # The filter's bias stays where it started, at the true one; so the angle is that of the drift since, and the start's share.
+        start = group.kept.reshape(21, 31, 8)[0, 28:31]
+        turned = 2.0 * np.arcsin(kept[1:4])
+        angle.append(turned + start * 8.0)
+        bias.append(kept[28:31].copy())
+    angle_variance, bias_variance = exact(8.0)
+    n = 3 * 1200
+    assert np.mean(np.square(angle)) == pytest.approx(angle_variance, rel=4.5 * math.sqrt(2.0 / n))
+    assert np.mean(np.square(bias)) == pytest.approx(bias_variance, rel=4.5 * math.sqrt(2.0 / n), abs=1e-30)
+
+
+def test_flicker_is_the_simulators():
+    spec = GyroSpec(bias_instability=1e-3)
+    plan = Plan(scenario=replace(SCENARIO, gyro=spec, sensors=(), motion=motion.rest()), setup=SETUP, epochs=20)
+    group = lanes._Group(plan, 8, every=1)
+    bias = []
+    for first in range(0, 400, 8):
+        group.advance(first)
+        bias.append(group.kept.reshape(-1, 31, 8)[:, 28:31].copy())
+    b = np.stack(bias, axis=1).reshape(len(bias[0]), -1)
+    slow = np.stack([scalar.record_of(plan, k).truth.bias for k in range(60)], axis=1).reshape(len(b), -1)
+    for lag in (0, 1, 10, 100):
+        got, wanted = (np.mean((x[lag:] - x[: len(x) - lag]) ** 2) if lag else np.mean(x**2) for x in (b, slow))
+        assert got == pytest.approx(wanted, rel=0.12 if lag else 0.25)
+
+
+# ----------------------------------------------------------------------------------------------------- all kinds of sensors
+
+SENSORS = {
+    "vector": vectors.Magnetometer(
+        name="field", field_f=[2e-5, 1e-6, -4e-5], sigma=5e-7, rate=10.0, kind="vector", hard_iron=[1e-8, 0.0, 0.0]
+    ),
+    "heading": vectors.Magnetometer(name="compass", field_f=[2e-5, 1e-6, -4e-5], sigma=2e-7, rate=10.0, kind="heading"),
+    "attitude": vectors.AttitudeSensor(name="tracker", sigma_across=1e-3, sigma_about=5e-3, rate=5.0),
+    "accelerometer": vectors.Accelerometer(name="up", sigma=0.1, rate=10.0),
+    "outliers": replace(UP, faults=vectors.Faults(outlier_probability=0.1, outlier_scale=5.0, outages=((2.0, 3.0),))),
+    "correlated": replace(UP, faults=vectors.Faults(correlated_sigma=0.02, correlation_time=0.5)),
+}
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_every_sensor_is_that_of_the_scalar_machine(name):
+    """Innovations of both machines have the same mean square, by sensor; and the replayed run is what the scalar filter makes of it."""
+    sensor = SENSORS[name]
+    plan = Plan(scenario=replace(SCENARIO, sensors=(sensor, NORTH)), setup=SETUP, seed=9, epochs=20, nis_bins=8)
+    assert lanes.supports(plan) is None
+    fast, slow = lanes.run_chunk(plan, 0, 240), scalar.run_chunk(plan, 0, 60)
+    np.testing.assert_array_equal(fast.sensor_degrees, 4 * slow.sensor_degrees)
+    np.testing.assert_allclose(fast.sensor_nis, slow.sensor_nis, rtol=0.15 if name == "correlated" else 0.08)
+    replay = lanes.replay(plan, 2)
+    estimate = setup.run(replay.record, SETUP, replay.initial, full_covariance=True)
+    np.testing.assert_allclose(estimate.attitude, replay.estimate.attitude, atol=1e-13)
+    np.testing.assert_allclose(estimate.variance, replay.estimate.variance, rtol=1e-9)
+    innovations = replay.estimate.innovations[sensor.name]
+    np.testing.assert_allclose(estimate.innovations[sensor.name].whitened, innovations.whitened, atol=1e-9)
+
+
+def test_coning_algorithms_and_substeps():
+    fast = replace(SCENARIO, rate=400.0, motion=motion.Coning(angle=0.05, frequency=20.0))
+    four = replace(SETUP, integration=coning.ALGORITHMS["four-sample"])
+    plan = Plan(scenario=fast, setup=four, seed=2, epochs=20, nis_bins=8)
+    s = lanes.run_chunk(plan, 0, 400)
+    assert abs(s.anees[-1, 0] - 1.0) < 4.5 * math.sqrt(2.0 / (6 * 400))
+    spun = replace(SCENARIO, motion=motion.ConstantRate(rate=[0.0, 0.0, 60.0]))  # 1.2 rad a sample
+    s = lanes.run_chunk(replace(PLAN, scenario=spun), 0, 400)
+    assert abs(s.anees[-1, 0] - 1.0) < 4.5 * math.sqrt(2.0 / (6 * 400))
+
+
+# ----------------------------------------------------------------------------------------------------- single precision
+
+
+def test_single_precision_agrees_with_double(many):
+    """Both see the same noise, so runs agree one by one: to a few thousandths of a σ, far below the scatter of any campaign."""
+    single = replace(PLAN, precision="float32")
+    s = lanes.run_chunk(single, 0, 1600)
+    np.testing.assert_allclose(s.sigma, many.sigma, rtol=2e-4)
+    assert (np.abs(s.example_error - many.example_error) / many.sigma).max() < 0.02
+    np.testing.assert_allclose(s.anees, many.anees, atol=5e-3)
+    assert s.mean_nis == pytest.approx(many.mean_nis, rel=1e-3)
+
+
+# ----------------------------------------------------------------------------------------------------- what is not served
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"gyro": GyroSpec(quantization=1e-6)}, "quantization"),
+        ({"gyro": GyroSpec(bandwidth=20.0)}, "bandwidth"),
+        ({"gyro": GyroSpec(range=0.3)}, "range"),
+        ({"sensors": (replace(UP, faults=vectors.Faults(latency=0.1)),)}, "latency"),
+        (
+            {"sensors": (vectors.HeadingPair(name="pair", baseline_b=[1.0, 0.0, 0.0], sigma=0.01, rate=1.0),)},
+            "HeadingPair",
+        ),
+    ],
+)
+def test_reasons(changes, words):
+    reason = lanes.supports(replace(PLAN, scenario=replace(SCENARIO, **changes)))
+    assert reason is not None
+    assert words in reason
+
+
+def test_more_reasons():
+    assert "initial attitude" in (lanes.supports(replace(PLAN, setup=replace(SETUP, attitude_sigma=1.0))) or "")
+    sharp = replace(PLAN, scenario=replace(SCENARIO, sensors=(replace(UP, sigma=1e-5),)), precision="float32")
+    assert "float32" in (lanes.supports(sharp) or "")
+    assert lanes.supports(replace(sharp, precision="float64")) is None
+    assert lanes.supports(replace(PLAN, scenario=replace(SCENARIO, gyro=GyroSpec(range=100.0)))) is None

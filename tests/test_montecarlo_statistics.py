@@ -1,0 +1,573 @@
+"""Plans, mergeable statistics, and the engine that merges them: definitions held against plain reference code."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+import tracemalloc
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from strapdown import consistency, mekf, montecarlo, quaternion, scenarios
+from strapdown import setup as setups
+from strapdown.checks import InputError
+from strapdown.montecarlo import campaign, engine, plan, scalar, statistics
+from strapdown.montecarlo.statistics import BINS, ERROR_EXPONENT, NEES_EXPONENT, bin_edges, bin_of
+
+SCENARIO = replace(scenarios.load_scenario("spin"), duration=2.4)
+SETUP = setups.matched(SCENARIO)
+
+
+def planned(**changes):
+    given = {"scenario": SCENARIO, "setup": SETUP, "seed": 4, "epochs": 6, "nis_bins": 5}
+    return montecarlo.Plan(**{**given, **changes})
+
+
+PLAN = planned()
+
+
+def same(a, b, names=None):
+    """Names of the fields in which two statistics differ in any bit."""
+    names = names or [field.name for field in fields(statistics.Statistics)]
+    return [name for name in names if not np.array_equal(getattr(a, name), getattr(b, name))]
+
+
+# ------------------------------------------------------------------------------------------------------------ histogram
+
+
+@pytest.mark.parametrize("exponent", [ERROR_EXPONENT, NEES_EXPONENT])
+def test_bins_are_those_of_their_edges(exponent):
+    edges = bin_edges(exponent)
+    assert len(edges) == BINS + 1
+    assert edges[0] == 2.0**exponent
+    assert np.all(np.diff(edges) > 0.0)
+    assert np.diff(edges).max() / edges[np.argmax(np.diff(edges))] <= 0.125
+    random = np.random.default_rng(1)
+    values = np.exp(random.uniform(np.log(edges[0]), np.log(edges[-1]), 5000))
+    assert np.array_equal(bin_of(values, exponent), np.searchsorted(edges, values, side="right") - 1)
+    assert np.array_equal(bin_of(edges[:-1], exponent), np.arange(BINS))
+    assert np.array_equal(bin_of(np.nextafter(edges[1:], 0.0), exponent), np.arange(BINS))
+    assert bin_of(1.0, exponent) == -8 * exponent
+    assert bin_of(np.array([0.0, 5e-324, edges[-1], 1e300]), exponent).tolist() == [0, 0, BINS - 1, BINS - 1]
+
+
+@pytest.mark.parametrize("probability", [0.01, 0.1, 0.5, 0.9, 0.99, 0.999])
+def test_quantiles_are_those_of_the_sample(probability):
+    random = np.random.default_rng(2)
+    error = 1e-4 * np.abs(random.standard_normal(20000))
+    nees = random.chisquare(6.0, 20000)
+    histogram = np.zeros((1, 9, BINS), np.int64)
+    for column in range(9):
+        exponent = ERROR_EXPONENT if column < 6 else NEES_EXPONENT
+        histogram[0, column] = np.bincount(bin_of(error if column < 6 else nees, exponent), minlength=BINS)
+    total = replace(scalar.run_chunk(PLAN, 0, 1), histogram=histogram)
+    for found, sample in ((total.error_quantile(probability), error), (total.nees_quantile(probability), nees)):
+        # Between the edges of the bin that holds it, and in the midst of the sample far closer.
+        assert np.all(np.abs(found / np.quantile(sample, probability) - 1.0) < (0.03 if probability > 0.05 else 0.07))
+
+
+def test_quantiles_at_the_ends():
+    one = scalar.run_chunk(PLAN, 0, 20)
+    least, most = one.error_quantile(0.0), one.error_quantile(1.0)
+    assert np.all(least <= most)
+    assert np.all(most >= one.rms_error)
+    empty = replace(one, histogram=np.zeros_like(one.histogram))
+    assert np.isnan(empty.error_quantile(0.5)).all()
+    with pytest.raises(InputError, match="between 0 and 1"):
+        one.error_quantile(1.5)
+
+
+# ------------------------------------------------------------------------------------------------------------ sums
+
+
+def test_every_sum_is_what_its_definition_says():
+    """Against runs taken one by one through simulator and filter, added up in plain loops."""
+    runs, first = 4, 6
+    total = scalar.run_chunk(PLAN, first, runs)
+    m = PLAN.epochs + 1
+    error, product, covariance = np.zeros((m, 6)), np.zeros((m, 6, 6)), np.zeros((m, 6, 6))
+    nees, logs = np.zeros((m, 3)), np.zeros((m, 3))
+    coverage, histogram = np.zeros((m, 6, 3), int), np.zeros((m, 9, BINS), int)
+    nis, degrees = np.zeros((2, PLAN.nis_bins)), np.zeros((2, PLAN.nis_bins), int)
+    score, kept = {}, {}
+    for run in range(first, first + runs):
+        record = scenarios.simulate(SCENARIO, PLAN.seed, run)
+        initial = montecarlo.start(record, SETUP, PLAN.seed, run)
+        estimate = mekf.run(record, SETUP.process_noise, initial, full_covariance=True)
+        peak = 0.0
+        for k in range(m):
+            step = k * 240 // PLAN.epochs
+            q, b, P = estimate.attitude[step], estimate.bias[step], estimate.covariance[step]
+            e = np.empty(6)
+            e[:3] = quaternion.log(quaternion.multiply(quaternion.conjugate(q), record.truth.attitude[step]))
+            e[3:] = record.truth.bias[step] - b
+            error[k] += e
+            product[k] += np.outer(e, e)
+            covariance[k] += P
+            for c, (a, z) in enumerate(((0, 6), (0, 3), (3, 6))):
+                value = e[a:z] @ np.linalg.inv(P[a:z, a:z]) @ e[a:z]
+                nees[k, c] += value
+                logs[k, c] += math.log(value)
+                histogram[k, 6 + c, np.searchsorted(bin_edges(NEES_EXPONENT), value, side="right") - 1] += 1
+                peak = max(peak, value) if c == 0 else peak
+            for i in range(6):
+                histogram[k, i, np.searchsorted(bin_edges(ERROR_EXPONENT), abs(e[i]), side="right") - 1] += 1
+                for j in range(3):
+                    coverage[k, i, j] += abs(e[i]) <= (j + 1) * math.sqrt(P[i, i])
+            kept[run, k] = e, np.sqrt(np.diag(P))
+        score[run] = peak
+        for i, name in enumerate(PLAN.sensors):
+            seen = estimate.innovations[name]
+            for t, value in zip(seen.time, seen.nis, strict=True):
+                span = max(0, math.ceil(t / 2.4 * PLAN.nis_bins - 1e-9) - 1)  # one on an edge belongs to what it ends
+                nis[i, span] += value
+                degrees[i, span] += 2
+    close = {"error_sum": error, "error_product_sum": product, "covariance_sum": covariance}
+    for name, expected in close.items():
+        scale = np.abs(expected).max(axis=0)
+        assert np.all(np.abs(getattr(total, name) - expected) <= 1e-9 * scale), name
+    assert np.allclose(total.nees_sum, nees, rtol=1e-8)
+    assert np.allclose(total.log_nees_sum, logs, rtol=1e-8, atol=1e-8)
+    assert np.array_equal(total.coverage, coverage)
+    assert np.array_equal(total.histogram, histogram)
+    assert np.allclose(total.sensor_nis_sum, nis, rtol=1e-10)
+    assert np.array_equal(total.sensor_degrees, degrees)
+    assert total.finite.tolist() == [runs] * m
+    assert total.worst_run.tolist() == sorted(score, key=score.get, reverse=True)
+    assert np.allclose(total.worst_score, sorted(score.values(), reverse=True), rtol=1e-8)
+    assert total.example_run.tolist() == [6, 7]  # of runs 6 to 9 those below 8
+    for x, run in enumerate((6, 7)):
+        for k in range(m):
+            e, sigma = kept[run, k]
+            assert np.allclose(total.example_error[x, k], e, rtol=1e-9, atol=1e-13)
+            assert np.allclose(total.example_sigma[x, k], sigma, rtol=1e-9)
+
+
+def test_a_measurement_on_an_edge_belongs_to_the_span_that_it_ends():
+    """The sun sensor measures at 1 s and 2 s; the spans end there."""
+    two = planned(scenario=replace(SCENARIO, duration=2.0), epochs=4, nis_bins=2)
+    assert two.nis_edges.tolist() == [0.0, 1.0, 2.0]
+    assert scalar.run_chunk(two, 0, 1).sensor_degrees[0].tolist() == [2, 2]
+
+
+def test_coverage_counts_errors_inside_one_two_three_sigma_their_ends_too():
+    sums = scalar.Sums(PLAN, 1)
+    P = np.tile(np.diag([1.0, 4.0, 0.25, 1.0, 1.0, 1.0]), (7, 1, 1))
+    z = np.array([0.0, 0.999, 1.0, 1.001, -2.0, 2.999, 3.001])
+    error = z[:, None] * np.sqrt(np.diagonal(P[0]))
+    sums._add_errors(0, error, P)
+    inside = np.array([[1, 1, 1], [1, 1, 1], [1, 1, 1], [0, 1, 1], [0, 1, 1], [0, 0, 1], [0, 0, 0]])
+    assert np.array_equal(sums.coverage, np.repeat(inside[:, None, :], 6, axis=1))
+
+
+def test_merging_parts_is_the_whole():
+    whole = scalar.run_chunk(PLAN, 0, 12)
+    parts = [scalar.run_chunk(PLAN, first, runs) for first, runs in ((0, 5), (5, 1), (6, 6))]
+    merged = montecarlo.merge_all(parts)
+    exact = ["runs", "finite", "coverage", "histogram", "sensor_degrees", "sensor_refused", "time", "sensors"]
+    exact += ["worst_run", "worst_score", "example_run", "example_error", "example_sigma"]
+    assert not same(whole, merged, exact)
+    other = montecarlo.merge(parts[0], montecarlo.merge(parts[1], parts[2]))
+    for name in ("error_sum", "error_product_sum", "covariance_sum", "nees_sum", "log_nees_sum", "sensor_nis_sum"):
+        a = getattr(whole, name)
+        assert np.allclose(a, getattr(merged, name), rtol=1e-12, atol=1e-12 * np.abs(a).max()), name
+        assert np.allclose(a, getattr(other, name), rtol=1e-12, atol=1e-12 * np.abs(a).max()), name
+
+
+def test_worst_runs_are_the_largest_and_of_equal_ones_the_first():
+    run, score = statistics.worst(np.arange(30), np.array([1.0, 7.0, 7.0] * 10))
+    assert run.tolist() == [1, 2, 4, 5, 7, 8, 10, 11, 13, 14]
+    assert score.tolist() == [7.0] * 10
+    run, score = statistics.worst(np.array([9, 3]), np.array([np.inf, np.inf]))
+    assert run.tolist() == [3, 9]
+
+
+def test_statistics_of_different_plans_are_not_merged():
+    with pytest.raises(InputError, match="different time"):
+        montecarlo.merge(scalar.run_chunk(PLAN, 0, 1), scalar.run_chunk(planned(epochs=3), 0, 1))
+
+
+def test_a_run_that_fails_is_counted_told_and_left_out(monkeypatch):
+    """One run of five turns to NaN half way: sums go on without it, the verdict does not."""
+    original = setups.run
+
+    def failing(record, setup, initial, **options):
+        estimate = original(record, setup, initial, **options)
+        if initial.attitude[0] == chosen[0]:
+            estimate.attitude[3:] = np.nan
+            estimate.covariance[5:] = -estimate.covariance[5:]
+        return estimate
+
+    record = scenarios.simulate(SCENARIO, PLAN.seed, 2)
+    chosen = montecarlo.start(record, SETUP, PLAN.seed, 2).attitude
+    good = montecarlo.merge(scalar.run_chunk(PLAN, 0, 2), scalar.run_chunk(PLAN, 3, 2))
+    monkeypatch.setattr(setups, "run", failing)
+    total = scalar.run_chunk(PLAN, 0, 5)
+    assert total.finite.tolist() == [5, 5, 5, 4, 4, 4, 4]
+    assert total.failed == 1
+    assert np.isfinite(total.anees).all()
+    assert np.allclose(total.nees_sum[3:], good.nees_sum[3:], rtol=1e-12)
+    assert total.worst_run[0] == 2
+    assert np.isinf(total.worst_score[0])
+    verdict = total.verdict(np.arange(7))
+    assert np.isinf(verdict.mean[3:]).all()
+    assert not verdict.consistent
+    told = montecarlo.summary(total)
+    assert told["failed_runs"] == 1
+    assert not told["consistent"]
+    assert told["worst_runs"][0] == {"run": 2, "largest_nees": None}
+    early = montecarlo.summary(total, epochs=np.array([1, 2]))  # before it failed
+    assert all(part["consistent"] for part in (*early["nees"].values(), *early["nis"]))
+    assert not early["consistent"]
+
+
+def test_measurements_that_a_gate_refuses_are_counted_apart(monkeypatch):
+    original = setups.run
+
+    def gated(record, setup, initial, **options):
+        estimate = original(record, setup, initial, **options)
+        star = estimate.innovations["star"]
+        weight = np.ones(len(star.time))
+        weight[0] = 0.0
+        return replace(estimate, innovations={**estimate.innovations, "star": replace(star, weight=weight)})
+
+    plain = scalar.run_chunk(PLAN, 0, 3)
+    monkeypatch.setattr(setups, "run", gated)
+    total = scalar.run_chunk(PLAN, 0, 3)
+    # One star a run, at 2 s: the fifth span.
+    assert plain.sensor_degrees[1].tolist() == [0, 0, 0, 0, 6]
+    assert total.sensor_degrees[1].tolist() == [0, 0, 0, 0, 0]
+    assert total.sensor_refused.tolist() == [[0, 0, 0, 0, 0], [0, 0, 0, 0, 3]]
+    assert total.sensor_nis_sum[1].sum() == 0.0
+    assert np.array_equal(total.sensor_nis_sum[0], plain.sensor_nis_sum[0])
+
+
+def test_summary_of_a_right_filter_and_of_a_wrong_one():
+    perfect = replace(SCENARIO, gyro=replace(SCENARIO.gyro, scale_factor=np.zeros(3)))
+    right = montecarlo.run_plan(planned(scenario=perfect), runs=200, machine="scalar")
+    told = montecarlo.summary(right)
+    assert told["consistent"]
+    assert [part["sensor"] for part in told["nis"]] == ["sun sensor", "star"]
+    for share, expected in zip(told["coverage"]["attitude"], told["coverage"]["expected"], strict=True):
+        assert abs(share - expected) < 4.0 * np.sqrt(expected * (1.0 - expected) / 200)  # 3 axes, correlated epochs
+    wrong = montecarlo.run_plan(
+        planned(scenario=perfect, setup=replace(SETUP, measurement_sigma_factor=0.5)), runs=200, machine="scalar"
+    )
+    assert not montecarlo.summary(wrong)["consistent"]
+
+
+def test_summary_bounds_hold_for_all_tests_together():
+    """The level of each of the five tests, spent over its epochs, adds up to what is asked for."""
+    told = montecarlo.summary(scalar.run_chunk(PLAN, 0, 3), epochs=np.array([2, 4]), probability=0.95)
+    single = 1.0 - 0.05 / 5.0
+    low, high = scipy.stats.chi2.ppf([0.25 * (1.0 - single), 1.0 - 0.25 * (1.0 - single)], 9) / 9.0
+    assert np.allclose(told["nees"]["bias"]["bounds"], [low, high], rtol=1e-12)
+    low, high = scipy.stats.chi2.ppf([0.5 * (1.0 - single), 1.0 - 0.5 * (1.0 - single)], 6) / 6.0
+    assert np.allclose(told["nis"][1]["bounds"], [low, high], rtol=1e-12)
+
+
+# ------------------------------------------------------------------------------------------------------------ plans
+
+
+DISPERSED = montecarlo.Dispersions(
+    attitude_sigma=0.01,
+    attitude_error=np.array([0.1, 0.0, -0.2]),
+    scale_factor_sigma=1e-4,
+    misalignment_sigma=2e-4,
+    turn_on_bias_sigma=1e-5,
+)
+
+
+def test_a_plan_goes_through_its_table_and_back():
+    for one in (PLAN, planned(dispersions=DISPERSED, seed=9), planned(setup=replace(SETUP, sigma={"star": 1e-3}))):
+        again = plan.from_table(one.to_table())
+        assert again.to_table() == one.to_table()
+        assert again.digest == one.digest
+        assert not same(scalar.run_chunk(one, 0, 2), scalar.run_chunk(again, 0, 2))
+
+
+def test_every_part_of_a_plan_tells_in_its_digest():
+    others = [
+        planned(seed=5),
+        planned(epochs=3),
+        planned(nis_bins=4),
+        planned(precision="float32"),
+        planned(dispersions=DISPERSED),
+        planned(setup=replace(SETUP, bias_sigma=2.0 * SETUP.bias_sigma)),
+        planned(scenario=replace(SCENARIO, duration=4.8)),
+    ]
+    digests = {one.digest for one in (PLAN, *others)}
+    assert len(digests) == len(others) + 1
+    assert planned().digest == PLAN.digest
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"epochs": 7}, "multiple of 7"),
+        ({"epochs": 0}, "epochs is 0"),
+        ({"seed": -1}, "seed is -1"),
+        ({"precision": "float16"}, "precision 'float16'"),
+    ],
+)
+def test_bad_plans_are_refused(changes, message):
+    with pytest.raises(InputError, match=message):
+        planned(**changes)
+
+
+def test_bad_dispersions_are_refused(tmp_path):
+    with pytest.raises(InputError, match="scale_factor_sigma is -1"):
+        montecarlo.Dispersions(scale_factor_sigma=-1.0)
+    with pytest.raises(InputError, match="does not exist"):
+        montecarlo.read_dispersions(tmp_path / "none.toml")
+    path = tmp_path / "d.toml"
+    path.write_text("[dispersion]\n")
+    with pytest.raises(InputError, match=r"no table \[dispersions\]"):
+        montecarlo.read_dispersions(path)
+    path.write_text("[dispersions]\nscale_factor_sigma_pm = 3\n")
+    with pytest.raises(InputError, match="scale_factor_sigma_ppm"):
+        montecarlo.read_dispersions(path)
+    path.write_text("[dispersions]\nscale_factor_sigma_ppm = 300.0\nattitude_error_deg = [0.0, 0.0, 20.0]\n")
+    found = montecarlo.read_dispersions(path)
+    assert found.scale_factor_sigma == pytest.approx(3e-4, rel=1e-15)
+    assert found.attitude_error[2] == pytest.approx(math.radians(20.0))
+
+
+def test_whole_epochs_cut_into_whole_steps():
+    four = replace(SETUP, integration=__import__("strapdown").coning.ALGORITHMS["four-sample"])
+    assert montecarlo.whole_epochs(SCENARIO, SETUP) == 80
+    assert montecarlo.whole_epochs(SCENARIO, four) == 60
+    with pytest.raises(InputError, match="whole number of four-sample steps"):
+        montecarlo.whole_epochs(replace(SCENARIO, duration=2.41), four)
+
+
+def test_gyro_dispersions_have_their_sigma_and_their_place():
+    gyros = [scalar.dispersed(SCENARIO.gyro, DISPERSED, 3, run) for run in range(500)]
+    off = ~np.eye(3, dtype=bool)
+    draws = {
+        1e-4: np.array([g.scale_factor - SCENARIO.gyro.scale_factor for g in gyros]),
+        2e-4: np.array([(g.misalignment - SCENARIO.gyro.misalignment)[off] for g in gyros]),
+        1e-5: np.array([g.turn_on_bias for g in gyros]),
+    }
+    together = np.concatenate([values / sigma for sigma, values in draws.items()], axis=1)
+    assert np.abs(together.mean(axis=0)).max() < 4.0 / np.sqrt(500)
+    assert np.abs(together.var(axis=0) - 1.0).max() < 4.0 * np.sqrt(2.0 / 500)
+    correlation = np.corrcoef(together.T) - np.eye(12)
+    assert np.abs(correlation).max() < 4.5 / np.sqrt(500)
+    assert all(np.all(np.diag(g.misalignment) == 0.0) for g in gyros)
+    assert scalar.dispersed(SCENARIO.gyro, montecarlo.Dispersions(), 3, 1) is SCENARIO.gyro
+
+
+def test_a_dispersed_gyro_is_the_one_that_is_simulated():
+    only = montecarlo.Dispersions(scale_factor_sigma=1e-3)
+    record = scalar.record_of(planned(dispersions=only), 5)
+    plain = scenarios.simulate(SCENARIO, PLAN.seed, 5)
+    spec = scalar.dispersed(SCENARIO.gyro, only, PLAN.seed, 5)
+    turned = (record.increments - plain.increments).sum(axis=0) / np.deg2rad(60.0 * 2.4)
+    assert turned[2] == pytest.approx(spec.scale_factor[2] - SCENARIO.gyro.scale_factor[2], rel=1e-6)
+
+
+def test_initial_errors_are_as_dispersed():
+    """e at the start is the fixed part plus σ times the draw, to first order of the angle."""
+    given = montecarlo.Dispersions(
+        attitude_sigma=0.0, bias_sigma=1e-3, attitude_error=np.array([0.3, -0.2, 0.1]), bias_error=np.full(3, 5e-3)
+    )
+    total = montecarlo.run_plan(planned(dispersions=given), runs=200, machine="scalar")
+    assert np.allclose(total.mean_error[0, :3], given.attitude_error, atol=1e-12)
+    assert np.all(np.abs(total.mean_error[0, 3:] - 5e-3) < 4.0 * 1e-3 / np.sqrt(200))
+    spread = np.diagonal(total.mean_square_error[0])[3:] - total.mean_error[0, 3:] ** 2
+    assert np.all(np.abs(spread / 1e-6 - 1.0) < 4.5 * np.sqrt(2.0 / 200))
+
+
+# ------------------------------------------------------------------------------------------------------------ engine
+
+COUNTED = ["runs", "finite", "coverage", "histogram", "sensor_degrees", "worst_run", "worst_score", "example_error"]
+
+
+@pytest.mark.parametrize("chunk", [1, 7, 1000])
+def test_runs_are_the_same_to_the_bit_in_chunks_of_any_size(chunk):
+    """Every run tells in the counts, and the worst and the first ones in all their bits."""
+    one = montecarlo.run_plan(PLAN, runs=60, chunk=10, threads=1, machine="scalar")
+    other = montecarlo.run_plan(PLAN, runs=60, chunk=chunk, threads=2, machine="scalar")
+    assert not same(one, other, COUNTED)
+    assert np.allclose(one.nees_sum, other.nees_sum, rtol=1e-12)
+
+
+def test_statistics_are_the_same_to_the_bit_on_any_number_of_threads():
+    one = montecarlo.run_plan(PLAN, runs=45, chunk=4, threads=1, machine="scalar")
+    for threads in (2, 5):
+        assert not same(one, montecarlo.run_plan(PLAN, runs=45, chunk=4, threads=threads, machine="scalar"))
+
+
+@pytest.mark.slow
+def test_on_lanes_too_runs_are_the_same_to_the_bit_in_chunks_of_any_size():
+    one = montecarlo.run_plan(PLAN, runs=60, chunk=8, threads=1, machine="lanes")
+    for chunk, threads in ((1, 2), (7, 1), (8, 2), (1000, 2)):
+        other = montecarlo.run_plan(PLAN, runs=60, chunk=chunk, threads=threads, machine="lanes")
+        assert not same(one, other, COUNTED if chunk != 8 else None)
+        assert np.allclose(one.nees_sum, other.nees_sum, rtol=1e-12)
+
+
+def test_several_filters_see_the_same_sensors():
+    """Each as if it were alone, on machines of its own and simulated once for all."""
+    setups_ = (SETUP, replace(SETUP, measurement_sigma_factor=2.0))
+    options = {"runs": 12, "seed": 4, "epochs": 6, "nis_bins": 5}
+    together = montecarlo.run(SCENARIO, setups_, **options)
+    for one, found in zip(setups_, together, strict=True):
+        assert not same(found, montecarlo.run_plan(planned(setup=one), runs=12, machine="scalar"))
+
+
+def test_memory_does_not_grow_with_the_runs():
+    def peak(runs):
+        tracemalloc.start()
+        montecarlo.run_plan(PLAN, runs=runs, chunk=2, threads=2, machine="scalar")
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return most
+
+    peak(4)
+    assert peak(48) < 1.2 * peak(16)
+
+
+def test_chunks_are_not_listed():
+    many = engine.chunks_of(10**9 + 3, 10)
+    assert len(many) == 10**8 + 1
+    assert (many[0], many[1], many[10**8]) == ((0, 10), (10, 10), (10**9, 3))
+    assert list(engine.chunks_of(21, 8)) == [(0, 8), (8, 8), (16, 5)]
+    assert isinstance(campaign._Progress(None, {}, 10).missing(10**9).firsts, range)
+
+
+def test_no_chunk_is_begun_far_ahead_of_the_first_unfinished_one():
+    random = np.random.default_rng(3)
+    window = engine.Window(200, 3)
+    running, begun, finished = [], [], set()
+    while window.open:
+        while (place := window.begin()) is not None:
+            running.append(place)
+            begun.append(place)
+        assert len(running) <= 3
+        first = min(set(range(201)) - finished)
+        assert max(begun) <= first + 3 * engine.AHEAD
+        slow = [place for place in running if place % 50 == 0 and len(running) > 1]
+        done = random.choice([place for place in running if place not in slow])
+        running.remove(done)
+        finished.add(done)
+        window.finish(done)
+    assert begun == list(range(200))
+
+
+def test_chunks_that_finish_out_of_order_are_merged_in_order():
+    one = montecarlo.run_plan(PLAN, runs=30, chunk=5, threads=1, machine="scalar")
+
+    def backwards(work, chunks):
+        for place in reversed(range(len(chunks))):
+            yield place, work(*chunks[place])
+
+    assert not same(one, montecarlo.run_plan(PLAN, runs=30, chunk=5, machine="scalar", workers=backwards))
+
+
+def test_an_error_in_a_thread_comes_out_and_ends_the_others():
+    calls = []
+
+    def work(first, runs):
+        calls.append(first)
+        if first == 20:
+            raise InputError("no such thing")
+        time.sleep(0.01)
+        return ()
+
+    with pytest.raises(InputError, match="no such thing"):
+        list(engine.in_threads(2)(work, engine.chunks_of(10000, 10)))
+    time.sleep(0.1)
+    assert len(calls) < 20
+
+
+def test_nobody_waits_for_a_running_chunk_when_stopped():
+    begun = threading.Event()
+
+    def work(first, runs):
+        begun.set()
+        if first:
+            time.sleep(30.0)
+        return ()
+
+    stopped = time.monotonic()
+    finished = engine.in_threads(2)(work, engine.chunks_of(100, 10))
+    next(finished)
+    finished.close()
+    assert time.monotonic() - stopped < 5.0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"runs": 0}, "runs is 0"),
+        ({"runs": 1.5}, "runs is 1.5"),
+        ({"runs": 1, "chunk": 0}, "chunk is 0"),
+        ({"runs": 1, "threads": 0}, "threads is 0"),
+        ({"runs": 1, "machine": "lane"}, "did you mean 'lanes'"),
+    ],
+)
+def test_bad_numbers_are_refused(options, message):
+    with pytest.raises(InputError, match=message):
+        montecarlo.run_plan(PLAN, **options)
+
+
+def test_the_machine_is_chosen_by_the_plan_and_told():
+    rough = planned(scenario=replace(SCENARIO, gyro=replace(SCENARIO.gyro, quantization=1e-6)))
+    chosen = montecarlo.choose(rough)
+    assert chosen.machine == "scalar"
+    assert "quantization" in str(chosen)
+    assert montecarlo.choose(PLAN, "scalar").machine == "scalar"
+    with pytest.raises(InputError, match=r"lanes: .*quantization"):
+        montecarlo.choose(rough, "lanes")
+    with pytest.raises(InputError, match=r"scalar: .*float64"):
+        montecarlo.choose(planned(precision="float32"), "scalar")
+
+
+# ------------------------------------------------------------------------------------------------------------ replay
+
+
+def test_a_replayed_run_is_the_same_to_the_bit():
+    total = scalar.run_chunk(PLAN, 0, 8)
+    for run in (0, 5):
+        again = montecarlo.replay(PLAN, run, machine="scalar")
+        edges = np.arange(0, 241, 40)
+        truth = again.record.truth
+        estimate = again.estimate
+        e = consistency.errors(estimate.attitude[edges], estimate.bias[edges], truth.attitude[edges], truth.bias[edges])
+        assert np.array_equal(e, total.example_error[run])
+        assert np.array_equal(np.sqrt(estimate.variance[edges]), total.example_sigma[run])
+
+
+def test_lost_samples_and_jitter_go_through_too():
+    """Epochs stay at their times, whatever samples were lost before them."""
+    spec = replace(SCENARIO.gyro, drop_probability=0.2, sampling_jitter=1e-4)
+    one = planned(scenario=replace(SCENARIO, gyro=spec))
+    total = scalar.run_chunk(one, 0, 5)
+    assert total.finite.tolist() == [5] * 7
+    again = montecarlo.replay(one, 3, machine="scalar")
+    assert len(again.record.increments) < 240
+    rows = np.searchsorted(again.estimate.time, one.time + 1e-6, side="right") - 1
+    truth = again.record.truth
+    e = consistency.errors(
+        again.estimate.attitude[rows], again.estimate.bias[rows], truth.attitude[rows], truth.bias[rows]
+    )
+    assert np.array_equal(e, total.example_error[3])
+
+
+def test_what_the_motion_is_remembered_to_say_is_what_it_says():
+    remembered = scalar._Remembered(SCENARIO.motion)
+    for times in (np.linspace(0.0, 1.0, 7), np.linspace(0.0, 1.0, 8), 0.25, np.linspace(0.0, 1.0, 7)):
+        for what in ("attitude", "body_rate", "fixed_rate", "body_angular_acceleration"):
+            assert np.array_equal(getattr(remembered, what)(times), getattr(SCENARIO.motion, what)(times))
+    assert np.array_equal(remembered.increments([0.0, 0.1]), SCENARIO.motion.increments([0.0, 0.1]))
+    for k in range(100):
+        remembered.attitude(float(k))
+    assert len(remembered._known) <= 33
+    with pytest.raises(ValueError, match="read-only"):
+        remembered.attitude(99.0)[0] = 1.0

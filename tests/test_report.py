@@ -1,0 +1,190 @@
+"""Reports: self-contained pages whose words, numbers and figures are those of the result."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from strapdown import cli, coning, gyro, montecarlo, records, report, scenarios, setup
+from strapdown.checks import InputError
+from strapdown.montecarlo import campaign
+from strapdown.report import page
+
+CHROMIUM = next(
+    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
+)
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    spec = gyro.GyroSpec(angle_random_walk=5e-5, rate_random_walk=1e-6, turn_on_bias_sigma=1e-4)
+    return dataclasses.replace(scenarios.load_scenario("coning"), gyro=spec, gyro_preset="", duration=60.0)
+
+
+@pytest.fixture(scope="module")
+def filter_setup(scenario):
+    return dataclasses.replace(setup.matched(scenario), integration=coning.ALGORITHMS["four-sample"])
+
+
+def estimate_of(scenario, chosen):
+    record = scenarios.simulate(scenario, 3)
+    start = setup.initial_state(chosen, record.truth.attitude[0], record.truth.bias[0])
+    estimate = setup.run(record, chosen, start, full_covariance=True)
+    return estimate, records.compress(record, chosen.integration).truth
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, scenario, filter_setup):
+    """Results: an estimate with truth, one without, one of a filter that is wrong, a campaign."""
+    where = tmp_path_factory.mktemp("results")
+    estimate, truth = estimate_of(scenario, filter_setup)
+    records.write_estimate(
+        where / "right.h5", estimate, {"command": "a <b> & c", "scenario": "x = 1\ny = 2"}, truth=truth
+    )
+    records.write_estimate(where / "blind.h5", estimate)
+    wrong, truth = estimate_of(scenario, dataclasses.replace(filter_setup, measurement_sigma_factor=0.3))
+    records.write_estimate(where / "wrong.h5", wrong, truth=truth)
+    plan = montecarlo.Plan(
+        scenario=dataclasses.replace(scenario, duration=20.0), setup=filter_setup, epochs=25, nis_bins=20
+    )
+    campaign.run(plan, where / "campaign.h5", runs=16)
+    for name in ("right", "blind", "wrong", "campaign"):
+        report.write(where / f"{name}.h5")
+    return where
+
+
+def body(path):
+    return path.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", ["right", "blind", "wrong", "campaign"])
+def test_a_page_needs_nothing_else(folder, name):
+    content = body(folder / f"{name}.html")
+    assert not re.search(
+        r"""(src|href|srcset)\s*=\s*["']?(?!data:)[a-z/]""", re.sub(r"<script>.*?</script>", "", content, flags=re.S)
+    )
+    assert "@import" not in content
+    assert content.count("<figure>") == content.count('prefers-color-scheme: dark)" srcset')
+
+
+@pytest.mark.parametrize(("name", "verdict"), [("right", "consistent"), ("wrong", "not consistent")])
+def test_the_verdict_is_the_first_word_and_in_the_json(folder, name, verdict):
+    content = re.sub(r"<(script|style)[ >].*?</\1>", "", body(folder / f"{name}.html"), flags=re.S)
+    assert f"<strong>{verdict.capitalize()}.</strong>" in content.split("<h2>")[0]
+    statistics = json.loads((folder / f"{name}.json").read_text())
+    assert statistics["judgement"]["verdict"] == verdict
+
+
+def test_numbers_are_those_of_the_estimate(folder):
+    estimate, truth = records.read_estimate(folder / "right.h5"), records.read_truth(folder / "right.h5")
+    numbers = json.loads((folder / "right.json").read_text())["key_numbers"]
+    half = len(estimate.time) // 2
+    bias_error = np.sqrt(np.mean((truth.bias[half:] - estimate.bias[half:]) ** 2, axis=0))
+    np.testing.assert_allclose(numbers["rms_bias_error_second_half_rad_per_s"], bias_error, rtol=1e-12)
+    assert numbers["states"] == len(estimate.time)
+
+
+def test_charts_hold_every_extreme(folder):
+    content = body(folder / "right.html")
+    charts = [
+        json.loads(text.replace("<\\/", "</"))
+        for text in re.findall(r'<script type="application/json">(.*?)</script>', content, re.S)
+    ]
+    assert [chart["unit"] for chart in charts] == ["arcsec", "°/h"]
+    estimate, truth = records.read_estimate(folder / "right.h5"), records.read_truth(folder / "right.h5")
+    error = (truth.bias - estimate.bias) * 180.0 / np.pi * 3600.0
+    for axis in range(3):
+        drawn = np.array(charts[1]["data"][3 + axis])
+        assert drawn.max() == pytest.approx(error[:, axis].max(), rel=1e-6)
+        assert drawn.min() == pytest.approx(error[:, axis].min(), rel=1e-6)
+
+
+def test_what_a_file_says_of_itself_cannot_break_the_page(folder):
+    content = body(folder / "right.html")
+    assert "a &lt;b&gt; &amp; c" in content
+    assert "<pre>x = 1\ny = 2</pre>" in content
+
+
+def test_without_truth_the_page_says_what_it_cannot_show(folder):
+    assert "without a truth only the innovations are judged" in body(folder / "blind.html")
+
+
+def test_the_campaign_page_tells_how_to_replay_its_worst_run(folder):
+    statistics = json.loads((folder / "campaign.json").read_text())
+    assert f"--replay {statistics['worst_runs'][0]}" in body(folder / "campaign.html")
+
+
+def test_gaps_become_null_not_nan():
+    chart = page.Chart(
+        title="t", unit="u", time=np.arange(3.0), series=(page.Series(label="a", value=np.array([1.0, np.nan, 2.0])),)
+    )
+    assert "NaN" not in page.chart(chart)
+    assert "null" in page.chart(chart)
+
+
+def test_bad_input_is_refused_before_anything_is_written(folder, tmp_path):
+    (tmp_path / "cut.h5").write_bytes((folder / "right.h5").read_bytes()[:2000])
+    for path, complaint in (
+        (tmp_path / "none.h5", "does not exist"),
+        (tmp_path / "cut.h5", "truncated"),
+        (__file__, "HDF5"),
+    ):
+        with pytest.raises(InputError, match=complaint):
+            report.write(path, tmp_path / "page.html")
+    with pytest.raises(InputError, match=r"\.html"):
+        report.write(folder / "right.h5", tmp_path / "page.pdf")
+    assert [path.name for path in tmp_path.iterdir()] == ["cut.h5"]
+
+
+def test_the_command_says_the_verdict_and_where_the_page_is(folder, tmp_path):
+    result = CliRunner().invoke(cli.app, ["report", str(folder / "wrong.h5"), "-o", str(tmp_path / "out.html")])
+    assert result.exit_code == 0, result.output
+    assert "not consistent" in result.output
+    assert (tmp_path / "out.html").exists()
+    assert (tmp_path / "out.json").exists()
+
+
+PROBE = """<script>window.addEventListener("load", () => setTimeout(() => {
+document.title = JSON.stringify({charts: document.querySelectorAll(".uplot canvas").length,
+hidden: [...document.images].filter((i) => i.naturalWidth === 0 || i.getBoundingClientRect().width < 100).length,
+images: document.images.length, overflow: document.documentElement.scrollWidth - window.innerWidth});}, 300));
+window.onerror = (message) => { document.body.dataset.error = message; };</script></head>"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine; install it to see the pages in a browser")
+@pytest.mark.parametrize("width", [390, 1280])
+@pytest.mark.parametrize("name", ["right", "campaign"])
+def test_a_browser_shows_figures_and_charts(folder, tmp_path, name, width):
+    probe = tmp_path / "probe.html"
+    probe.write_text(body(folder / f"{name}.html").replace("</head>", PROBE, 1), encoding="utf-8")
+    options = [
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-background-networking",
+        "--disable-component-update",
+    ]
+    options += [
+        "--disable-sync",
+        "--no-first-run",
+        f"--user-data-dir={tmp_path / 'profile'}",
+        "--enable-logging=stderr",
+    ]
+    shown = subprocess.run(
+        [str(CHROMIUM), *options, f"--window-size={width},900", "--virtual-time-budget=4000", "--dump-dom", probe.as_uri()],
+        capture_output=True, text=True, timeout=120, check=True,
+    )  # fmt: skip
+    assert "data-error" not in shown.stdout[: shown.stdout.index("<style>") + 10] + shown.stdout[-3000:]
+    assert ":CONSOLE" not in shown.stderr, shown.stderr
+    found = json.loads(re.search(r"<title>(\{.*?\})</title>", shown.stdout).group(1).replace("&quot;", '"'))
+    assert found["hidden"] == 0
+    assert found["images"] >= 3
+    assert found["overflow"] <= 0
+    assert found["charts"] == (2 if name == "right" else 0)
