@@ -20,6 +20,10 @@ Colours are those of Okabe and Ito, told apart by every kind of colour vision. :
     The coning study.
 ``allan``
     Allan deviations with their fit.
+``budget``
+    Predicted errors by source.
+``tuning``
+    Likelihood slices, and the statistics before and after.
 """
 
 from strapdown.plots.allan import allan_axis, allan_overview

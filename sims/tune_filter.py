@@ -1,0 +1,141 @@
+"""Does tuning find the truth from parameters wrong by 30 either way? One simulated record, many searches, and a look at held-out data.
+
+Run ``python sims/tune_filter.py [FOLDER]``.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from strapdown import gyro, motion, scenarios, setup, tuning, units, vectors
+from strapdown.tuning import Comparison, Plan, Tuning
+
+FREE = ("gyro.arw", "gyro.rrw", "star 1.sigma", "star 2.sigma")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """Two tunings of one record, from values too large and too small."""
+
+    truth: dict[str, float]
+    """Right values, SI."""
+    too_large: Tuning
+    too_small: Tuning
+    plan: Plan
+    """Standard errors foretold before there was a record."""
+    held_out: Comparison
+    """The filter that was too sure, before and after, on the end of the record."""
+    record: scenarios.ImuRecord
+
+
+SMALL = {"duration": 300.0, "starts": 4}
+"""Arguments of a run that only shows that the script works."""
+
+
+def main(*, duration=1800.0, rate=20.0, wrong=30.0, starts=20, seed=1, out=None):
+    """Tune from ``wrong`` times and a ``wrong``-th of the right values, each search from random starts as far off again.
+
+    Returns
+    -------
+    Result
+    """
+    scenario = scenarios.Scenario(
+        motion=motion.SpinRock(rock_angle=0.3, rock_frequency=0.05, spin_rate=0.02),
+        gyro=gyro.GyroSpec(
+            angle_random_walk=0.15 * units.DEGREE_PER_ROOT_HOUR,
+            rate_random_walk=20.0 * units.DEGREE_PER_HOUR_PER_ROOT_HOUR,
+            turn_on_bias_sigma=10.0 * units.DEGREE_PER_HOUR,
+        ),
+        sensors=(
+            vectors.VectorSensor(
+                name="star 1", reference_f=np.array([1.0, 0.0, 0.0]), sigma=20.0 * units.ARCSECOND, rate=1.0
+            ),
+            vectors.VectorSensor(
+                name="star 2", reference_f=np.array([0.0, 1.0, 1.0]), sigma=60.0 * units.ARCSECOND, rate=2.0
+            ),
+        ),
+        rate=rate,
+        duration=duration,
+    )
+    right = setup.matched(scenario, attitude_sigma=0.1 * units.DEGREE)
+    foretold = tuning.plan(scenario, right, FREE, lengths=[0.7 * duration], seed=seed)
+    record = scenarios.simulate(scenario, seed)
+    whole = tuning.record_case(record, right, seed=seed)
+    (train,), test = tuning.split([whole], 0.3)
+    truth = tuning.values_of(right, FREE, [record])
+    tuned, before = {}, {}
+    for name, factor in (("too large", wrong), ("too small", 1.0 / wrong)):
+        before[name] = tuning.with_values(right, {key: factor * value for key, value in truth.items()})
+        objective = tuning.likelihood([train], before[name], FREE)
+        tuned[name] = tuning.fit(objective, starts=starts, factor=wrong, seed=seed, threads=2)
+    result = Result(
+        truth=truth,
+        too_large=tuned["too large"],
+        too_small=tuned["too small"],
+        plan=foretold,
+        held_out=tuning.compare(test, before["too small"], tuned["too small"].setup),
+        record=record,
+    )
+    if out is not None:
+        draw(result, Path(out), tuning.likelihood([train], before["too small"], FREE))
+    return result
+
+
+def draw(result, folder, objective):
+    """Write the figures: searches, slices, values against the truth, held-out innovations."""
+    from strapdown import plots
+    from strapdown.plots import tuning as drawing
+
+    shown = [tuning.unit_of(name, [result.record]) for name in FREE]
+    figure, (left, right) = plots.new_figure(1, 2, size=(11.0, 4.6))
+    for number, one in enumerate((result.too_large, result.too_small)):
+        drawing.searches(one, 0, 1, shown, left, label=number == 0)
+    left.set_title(f"{2 * len(result.too_large.starts)} searches")
+    values(result, right)
+    plots.save(figure, folder / "tune_filter.png")
+    plots.save(
+        drawing.likelihood_slices(tuning.slices(objective, result.too_small), result.too_small, shown),
+        folder / "tune_filter-likelihood.png",
+    )
+    plots.save(
+        drawing.before_and_after(result.held_out, title="Held-out innovations, from a filter 30 times too sure"),
+        folder / "tune_filter-heldout.png",
+    )
+
+
+def values(result, ax):
+    """Draw tuned values over the truth with their intervals, beside what was foretold."""
+    place = np.arange(len(FREE))
+    for shift, one, name in ((-0.12, result.too_large, "from 30 times"), (0.12, result.too_small, "from a 30th")):
+        ratio = np.array([[p.value, p.lower, p.upper] for p in one.parameters]).T / np.array(
+            list(result.truth.values())
+        )
+        ax.errorbar(
+            place + shift, ratio[0], (ratio[0] - ratio[1], ratio[2] - ratio[0]), fmt="o", ms=4, capsize=3, label=name
+        )
+    half = 1.96 * result.plan.errors[0]
+    ax.bar(
+        place, np.exp(half) - np.exp(-half), bottom=np.exp(-half), width=0.6, alpha=0.2, label="foretold, 95 % about 1"
+    )
+    ax.axhline(1.0, lw=0.8, color="k")
+    ax.set_xticks(place, FREE)
+    ax.set_ylabel("tuned value over the right one")
+    ax.set_yscale("log")
+    ticks = (0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.5)
+    ax.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+    ax.set_yticks([], minor=True)
+    ax.legend()
+
+
+if __name__ == "__main__":
+    found = main(out=Path(sys.argv[1] if len(sys.argv) > 1 else "results/tune_filter"))
+    for start, one in (("30 times", found.too_large), ("a 30th", found.too_small)):
+        print(f"from {start}: {one.agreeing} of {len(one.starts)} searches agree")
+        for parameter, (name, value) in zip(one.parameters, found.truth.items(), strict=True):
+            ratio = np.array([parameter.value, parameter.lower, parameter.upper]) / value
+            print(f"  {name:14s} {ratio[0]:.3f} of the truth, 95 % {ratio[1]:.3f} to {ratio[2]:.3f}: {parameter.note}")
+    print(f"held out, NIS before {found.held_out.before.nis:.4g}, after {found.held_out.after.nis:.4g}")

@@ -1,0 +1,378 @@
+"""Tuning a filter from data."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from strapdown.cli.terminal import app, console, progress_bar, show, table, written
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from strapdown.gyro import GyroSpec
+    from strapdown.records import ImuRecord
+    from strapdown.setup import FilterSetup
+    from strapdown.tuning import Case, Comparison, Plan, Tuning
+
+
+WORSE = 1.05
+"""An attitude error on the data held out that has grown by more than this is told."""
+
+
+@app.command()
+def tune(
+    records: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Records (HDF5 of `strapdown simulate`) or recordings (BROAD HDF5, CSV), all of one unit; with --plan one record, or the "
+            "name or TOML file of a scenario."
+        ),
+    ],
+    free: Annotated[
+        str | None,
+        typer.Option(
+            help="Parameters to tune, with commas: gyro.arw, gyro.rrw, SENSOR.sigma, initial.attitude, initial.bias; or filter.scale "
+            "alone. If not given the gyro's two and every sensor's."
+        ),
+    ] = None,
+    filter_file: Annotated[
+        Path | None,
+        typer.Option("--filter", help="TOML with a table named filter to start from; else what the records tell."),
+    ] = None,
+    integration: Annotated[
+        str | None, typer.Option(help="Integration algorithm (`strapdown algorithms`); the filter's if not given.")
+    ] = None,
+    truth: Annotated[
+        bool, typer.Option("--truth", help="Tune by the errors against the truth, and how well the filter knows them.")
+    ] = False,
+    rmse: Annotated[
+        bool,
+        typer.Option(
+            "--rmse", help="Tune by the RMS attitude error against the truth; then all σ alike by innovations."
+        ),
+    ] = False,
+    holdout: Annotated[
+        float | None, typer.Option(help="Share of the data held out, to judge the filter before and after on.")
+    ] = None,
+    holdout_by: Annotated[
+        str, typer.Option(help="Hold out the end of each record (time), or whole ones (record).")
+    ] = "time",
+    prior: Annotated[
+        str | None,
+        typer.Option(help="Weak prior of the gyro's noise: TOML of `strapdown allan`, or the name of a preset."),
+    ] = None,
+    prior_factor: Annotated[float, typer.Option(help="One standard deviation of the prior is a factor of this.")] = 3.0,
+    spacing: Annotated[
+        float,
+        typer.Option(
+            help="Take a sensor's samples so many seconds apart, the weight of all on them: disturbances last."
+        ),
+    ] = 0.0,
+    starts: Annotated[int, typer.Option(help="Searches: one from the filter, the others from random starts.")] = 4,
+    factor: Annotated[float, typer.Option(help="Random starts are off by up to this factor, either way.")] = 30.0,
+    seed: Annotated[int, typer.Option(help="Of the random starts.")] = 0,
+    threads: Annotated[int | None, typer.Option(help="Threads; one a core if not given.")] = None,
+    plan: Annotated[
+        bool, typer.Option("--plan", help="Tell how well records will tell each parameter, before there are any.")
+    ] = False,
+    length: Annotated[
+        str | None,
+        typer.Option(help="For --plan: lengths of a record, s, with commas; that of the scenario if not given."),
+    ] = None,
+    gyro_unit: Annotated[str | None, typer.Option(help="Unit of a CSV file's gyro: rad/s or deg/s.")] = None,
+    accelerometer_unit: Annotated[
+        str | None, typer.Option(help="Unit of a CSV file's accelerometer: m/s2 or g.")
+    ] = None,
+    time_unit: Annotated[str | None, typer.Option(help="Unit of a CSV file's time: s, ms, us or ns.")] = None,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="TOML for --filter of other commands; JSON and figures go beside it.")
+    ] = Path("filter.toml"),
+) -> None:
+    """Tune the filter by maximum likelihood, and tell how sure each parameter is."""
+    import os
+
+    from strapdown import coning, tuning
+    from strapdown.checks import InputError, count, one_of
+    from strapdown.files import output_file
+    from strapdown.setup import read_setup
+
+    workers = count("threads", threads if threads is not None else os.cpu_count() or 1)
+    chosen = read_setup(filter_file) if filter_file is not None else None
+    algorithm = None
+    if integration is not None:
+        algorithm = coning.ALGORITHMS[one_of("integration", integration, coning.ALGORITHMS)]
+    names = None if free is None else [name.strip() for name in free.split(",") if name.strip()]
+    if plan:
+        _plan(records, chosen, algorithm, names, length, workers)
+        return
+    if length is not None:
+        raise InputError("--length is for --plan; the records' own length is taken")
+    output_file("out", out, (".toml",), *records, *([filter_file] if filter_file is not None else []))
+    units = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
+    cases, believed = _cases(records, chosen, {name: unit for name, unit in units.items() if unit})
+    if algorithm is not None:
+        believed = replace(believed, integration=algorithm)
+    train, held = (tuple(cases), ()) if holdout is None else tuning.split(cases, holdout, _by(holdout_by))
+    wanted = names or list(tuning.default_names([case.record for case in cases]))
+    objective: Any
+    if truth or rmse:
+        if spacing > 0.0:
+            raise InputError("--spacing thins innovations; against a truth there are none to thin, leave it away")
+        objective = tuning.error_objective(
+            train, believed, wanted, measure="rmse" if rmse else "likelihood", threads=workers
+        )
+    else:
+        objective = tuning.likelihood(train, believed, wanted, spacing=spacing)
+    priors = {} if prior is None else _priors(prior, prior_factor, train[0].record, wanted)
+    with progress_bar("searches, intervals", starts + len(wanted)) as advance:
+        result = tuning.fit(
+            objective,
+            priors=priors,
+            starts=starts,
+            factor=factor,
+            seed=seed,
+            threads=1 if truth or rmse else workers,
+            progress=advance,
+        )
+    if rmse:
+        # The size of the error leaves a common scale open; the innovations tell it.
+        scaled = tuning.fit(tuning.likelihood(train, result.setup, ["filter.scale"]), starts=2, threads=workers)
+        result = tuning.rescaled(result, scaled["filter.scale"].value)
+    comparison = tuning.compare(held, believed, result.setup, threads=workers) if held else None
+    _tell(result, [case.record for case in cases])
+    if comparison is not None:
+        _tell_comparison(comparison, truth=bool(truth or rmse))
+    _write(out, result, objective, comparison, cases, records)
+
+
+def _by(text: str) -> Any:
+    from strapdown.checks import one_of
+
+    return one_of("holdout-by", text, ("time", "record"))
+
+
+def _cases(paths: Sequence[Path], chosen: FilterSetup | None, units: dict[str, str]) -> tuple[list[Case], FilterSetup]:
+    """Return the records to tune on, and the filter to start from."""
+    from strapdown import recordfiles, recordings, tuning
+    from strapdown.checks import InputError
+    from strapdown.setup import matched_to_record
+
+    cases: list[Case] = []
+    for path in paths:
+        if recordfiles.is_record(path):
+            file = recordfiles.read_record_file(path)
+            if chosen is None:
+                if file.gyro is None:
+                    raise InputError(
+                        f"{path} does not tell its gyro; give a filter to start from, --filter filter.toml"
+                    )
+                chosen = matched_to_record(file.gyro, file.record)
+            cases.append(tuning.record_case(file.record, chosen, name=path.name))
+        else:
+            recording = recordings.read(path, units=units)
+            chosen = chosen or tuning.recording_setup()
+            cases.append(tuning.recording_case(recording))
+    assert chosen is not None
+    return cases, chosen
+
+
+def _priors(source: str, factor: float, record: ImuRecord, names: Sequence[str]) -> dict[str, Any]:
+    from strapdown import datasheets, tuning
+    from strapdown.gyro import read_spec
+
+    spec: GyroSpec = read_spec(source) if Path(source).suffix == ".toml" else datasheets.preset(source).spec
+    return {
+        name: prior for name, prior in tuning.priors_from_gyro(spec, record, factor=factor).items() if name in names
+    }
+
+
+def _figure(value: float) -> str:
+    return f"{value:.3g}" if math.isfinite(value) else "∞"
+
+
+def _tell(result: Tuning, records: Sequence[ImuRecord]) -> None:
+    from strapdown.tuning import unit_of
+
+    rows = table("Tuned, with 95 % intervals", "parameter", "unit", "before", "after", "from", "to", "", left=2)
+    for one in result.parameters:
+        unit = unit_of(one.name, records)
+        told = [value / unit.factor for value in (one.start, one.value, one.lower, one.upper)]
+        bounded = f"not identified: < {_figure(told[3])} at 95 %" if math.isfinite(one.upper) else "not identified"
+        note = one.note if one.identified or "prior" in one.note else bounded
+        rows.add_row(one.name, unit.name, *(_figure(value) for value in told), note)
+    show(rows)
+    console.print(
+        f"{result.agreeing} of {len(result.starts)} searches ended at the best point; gain {result.before - result.after:.4g} nats."
+    )
+    if not all(one.identified for one in result.parameters):
+        console.print(
+            "What is not identified has only a bound: these records are too short to say more. The filter takes the mean below it; --prior "
+            "holds it to what is known."
+        )
+    if result.misfit and result.parameters[0].name == "filter.scale":
+        console.print(
+            "The innovations are not those of any such filter: disturbances last over many samples, or change. A common scale leaves the "
+            "estimates as they are; it makes σ right on the whole, not at each time."
+        )
+    elif result.misfit:
+        console.print(
+            "The innovations are not those of any such filter: disturbances last over many samples, or change. The most likely filter may "
+            "follow them and estimate worse. Tune filter.scale alone, or against a truth (--truth, --rmse), or try --spacing."
+        )
+
+
+def _tell_comparison(comparison: Comparison, *, truth: bool) -> None:
+    from strapdown.units import DEGREE
+
+    listing = table(
+        "On the data held out", "filter", "log likelihood", "NIS", "bounds", "ANEES", "attitude RMS, °", "verdict"
+    )
+    for name, one in (("before", comparison.before), ("after", comparison.after)):
+        verdicts = [judgement.verdict for judgement in one.judgements]
+        told = (
+            verdicts[0] if len(set(verdicts)) == 1 else f"{verdicts.count('consistent')} of {len(verdicts)} consistent"
+        )
+        listing.add_row(
+            name,
+            f"{one.log_likelihood:.4f}",
+            f"{one.nis:.3f}",
+            f"{one.nis_bounds[0]:.3f} to {one.nis_bounds[1]:.3f}",
+            _figure(one.anees) if math.isfinite(one.anees) else "-",
+            _figure(one.attitude_rms / DEGREE) if math.isfinite(one.attitude_rms) else "-",
+            told,
+        )
+    show(listing)
+    for judgement in comparison.after.judgements[:1]:
+        console.print("After: " + judgement.words, soft_wrap=True)
+    if not comparison.better and not truth:
+        console.print("On the data held out the tuned filter is less likely than the one before: keep that one.")
+    elif comparison.after.attitude_rms > WORSE * comparison.before.attitude_rms:
+        console.print("On the data held out the attitude error has grown: keep the filter before.")
+
+
+def _write(
+    out: Path,
+    result: Tuning,
+    objective: Any,
+    comparison: Comparison | None,
+    cases: Sequence[Case],
+    paths: Sequence[Path],
+) -> None:
+    from strapdown import plots, tuning
+    from strapdown.files import write_json, written_beside
+    from strapdown.plots import tuning as drawing
+    from strapdown.setup import to_toml
+
+    with written_beside(out) as temporary:
+        temporary.write_text(to_toml(result.setup), encoding="utf-8")
+    report = out.with_suffix(".json")
+    write_json(report, _report(result, comparison, paths))
+    records = [case.record for case in cases]
+    units = [tuning.unit_of(name, records) for name in objective.names]
+    figures = {
+        out.with_name(f"{out.stem}-likelihood.png"): drawing.likelihood_slices(
+            tuning.slices(objective, result), result, units
+        )
+    }
+    if comparison is not None:
+        figures[out.with_name(f"{out.stem}-heldout.png")] = drawing.before_and_after(
+            comparison, title="Held-out innovations of the first record"
+        )
+    written(out, report, *(plots.save(figure, path) for path, figure in figures.items()))
+
+
+def _report(result: Tuning, comparison: Comparison | None, paths: Sequence[Path]) -> dict[str, Any]:
+    number = lambda value: None if isinstance(value, float) and not math.isfinite(value) else value  # noqa: E731
+    content: dict[str, Any] = {
+        "records": [path.name for path in paths],
+        "parameters": [{key: number(value) for key, value in vars(one).items()} for one in result.parameters],
+        "units": "SI: rad, s, and the units of whole vectors",
+        "minus_log_likelihood": {"before": result.before, "after": result.after},
+        "searches": {"number": len(result.starts), "at_the_best_point": result.agreeing},
+        "innovations_fit": not result.misfit,
+    }
+    if comparison is not None:
+        content["held_out"] = {
+            name: {
+                "log_likelihood_per_innovation": one.log_likelihood,
+                "nis_per_degree": one.nis,
+                "nis_bounds": list(one.nis_bounds),
+                "anees_per_state": number(one.anees),
+                "attitude_rms_rad": number(one.attitude_rms),
+                "judgements": [judgement.summary() for judgement in one.judgements],
+            }
+            for name, one in (("before", comparison.before), ("after", comparison.after))
+        }
+    return content
+
+
+def _plan(
+    records: Sequence[Path],
+    chosen: FilterSetup | None,
+    algorithm: Any,
+    names: list[str] | None,
+    length: str | None,
+    threads: int,
+) -> None:
+    from strapdown import recordfiles, scenarios, setup, tuning
+    from strapdown.checks import InputError
+
+    if len(records) != 1:
+        raise InputError(f"--plan takes one record or scenario; {len(records)} are given")
+    source: Any
+    path = records[0]
+    if recordfiles.is_record(path):
+        file = recordfiles.read_record_file(path)
+        source, example = file.record, file.record
+        if chosen is None and file.gyro is None:
+            raise InputError(f"{path} does not tell its gyro; give the filter to plan with, --filter filter.toml")
+        believed = chosen or setup.matched_to_record(file.gyro, file.record)  # type: ignore[arg-type]
+        whole = float(file.record.time[-1] - file.record.time[0])
+    else:
+        source = scenarios.load_scenario(path)
+        believed = chosen or setup.matched(source)
+        example = scenarios.simulate(source)
+        whole = source.duration
+    if algorithm is not None:
+        believed = replace(believed, integration=algorithm)
+    lengths = [whole] if length is None else _numbers(length)
+    wanted = names or list(tuning.default_names([example]))
+    with progress_bar("simulated records", 4) as advance:
+        found = tuning.plan(source, believed, wanted, lengths=lengths, threads=threads, progress=advance)
+    _tell_plan(found, [example])
+
+
+def _numbers(text: str) -> list[float]:
+    from strapdown.checks import InputError
+
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise InputError(f"--length is {text!r}; it must be seconds with commas, as in 600,1800") from None
+
+
+def _tell_plan(found: Plan, records: Sequence[ImuRecord]) -> None:
+    from strapdown.tuning import unit_of
+
+    columns = [f"{length:g} s" for length in found.lengths]
+    listing = table(
+        "Least standard error, as a factor (Cramér–Rao)", "parameter", "unit", "value", *columns, "10 % needs", left=2
+    )
+    for j, name in enumerate(found.names):
+        unit = unit_of(name, records)
+        listing.add_row(
+            name,
+            unit.name,
+            _figure(found.values[j] / unit.factor),
+            *(f"× {math.exp(error):.3f}" if error < 2.0 else "nothing" for error in found.errors[:, j]),
+            f"{found.needed()[j]:.3g} s",
+        )
+    show(listing)
+    console.print(
+        "Above about × 1.5 a record gives a bound rather than a value. The last column lets information grow as at the end."
+    )

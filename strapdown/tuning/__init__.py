@@ -1,0 +1,76 @@
+"""Tuning a filter from data: maximum likelihood, how sure one may be of each parameter, and proof on data held out.
+
+``innovations``
+    Of the filter's innovations, with score and information, eight sets of parameters a pass.
+``errors``
+    Of the errors against a truth.
+``fitting``
+    The search from several starts, intervals, what is identified and what is not.
+``parameters``
+    Names, values in a filter setup, priors.
+``starting``
+    Where the filter starts on a record.
+``planning``
+    The Cramér–Rao bound before there is a record.
+``holding``
+    What is held out, and the filter before and after on it.
+
+>>> objective = tuning.likelihood([tuning.record_case(record, chosen)], chosen, ["gyro.arw", "star.sigma"])  # doctest: +SKIP
+>>> result = tuning.fit(objective)  # doctest: +SKIP
+>>> result["gyro.arw"].value, result.setup  # doctest: +SKIP
+
+The likelihood is right for a filter that is right but for its parameters: it gives white innovations. Disturbances that last over many
+samples break it, and the most likely filter may then follow them (:attr:`strapdown.tuning.Tuning.misfit` says so). On such records tune
+``filter.scale`` alone, which leaves the estimates as they are and sets their σ, or against a truth.
+"""
+
+from strapdown.tuning.errors import ErrorObjective, error_objective
+from strapdown.tuning.fitting import Estimated, Slices, Tuning, fit, rescaled, search, slices
+from strapdown.tuning.holding import Comparison, Performance, compare, performance, split
+from strapdown.tuning.innovations import Case, Derivatives, Likelihood, likelihood, thinned
+from strapdown.tuning.parameters import (
+    Prior,
+    default_names,
+    known_names,
+    priors_from_gyro,
+    unit_of,
+    values_of,
+    with_values,
+)
+from strapdown.tuning.planning import Plan, plan, simulated_again
+from strapdown.tuning.starting import record_case, recording_case, recording_setup
+
+__all__ = [
+    "Case",
+    "Comparison",
+    "Derivatives",
+    "ErrorObjective",
+    "Estimated",
+    "Likelihood",
+    "Performance",
+    "Plan",
+    "Prior",
+    "Slices",
+    "Tuning",
+    "compare",
+    "default_names",
+    "error_objective",
+    "fit",
+    "known_names",
+    "likelihood",
+    "performance",
+    "plan",
+    "priors_from_gyro",
+    "record_case",
+    "recording_case",
+    "recording_setup",
+    "rescaled",
+    "search",
+    "simulated_again",
+    "slices",
+    "split",
+    "thinned",
+    "unit_of",
+    "values_of",
+    "with_values",
+]

@@ -1,0 +1,463 @@
+"""The most likely parameters, from several starts, and how sure one may be of each.
+
+The search is Fisher's scoring, damped (Levenberg–Marquardt) and confined to steps of a factor e² in each parameter. Where the data pin
+a parameter well, its interval is that of the information; where they do not, it comes from the profile likelihood, which knows what a
+parabola does not: that zero may be as likely as the best value. Then only a bound is told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+
+from strapdown.checks import Array, InputError, count, known_keys, positive
+from strapdown.setup import FilterSetup
+from strapdown.tuning.innovations import Derivatives
+from strapdown.tuning.parameters import RRW, SCALE, Prior, with_values
+
+LONGEST_STEP = 2.0
+"""Of a log parameter in one step of the search."""
+REACH = 16.0
+"""How far a log parameter may go from where it starts."""
+WELL_KNOWN = 0.1
+"""Standard error of a log parameter below which the likelihood is a parabola to much better than the error itself."""
+TWO_SIDED = 3.841458820694124
+"""95 % quantile of χ² with one degree of freedom: a profile 2 Δℓ below it is inside the interval."""
+ONE_SIDED = 2.705543454095404
+"""90 % quantile: the bound that is passed on one side with 5 %, and the test against zero, where half the probability is a point
+(Self & Liang 1987)."""
+NEGLIGIBLE = 1e-3
+"""A gain of the log likelihood that nobody can tell from none."""
+
+
+MISFIT = 1.6
+"""Sandwich error over that of the information beyond which the innovations are not what the filter takes them for."""
+
+
+class Objective(Protocol):
+    """What is minimised: minus a log likelihood, or what stands for one."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free parameters."""
+
+    @property
+    def start(self) -> Array:
+        """Logarithms of their first values."""
+
+    @property
+    def composite(self) -> bool:
+        """Whether its curvature is no information, so that errors come from the scatter of its gradient."""
+
+    def derivatives(self, point: Array) -> Derivatives:
+        """Return value, gradient and information at a point."""
+
+    def minus_log(self, points: Array) -> Array:
+        """Return the value at several points (k, p)."""
+
+    def setup(self, point: Array) -> FilterSetup:
+        """Return the filter setup of a point."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Local:
+    """Value, gradient and information of an objective, prior and all, at one point."""
+
+    value: float
+    score: Array
+    information: Array
+    derivatives: Derivatives
+
+
+@dataclass(frozen=True, kw_only=True)
+class Optimum:
+    """Where one search ended."""
+
+    start: Array
+    point: Array
+    local: Local
+    steps: int
+    converged: bool
+
+
+def local_at(objective: Objective, point: Array, priors: Mapping[str, Prior]) -> Local:
+    """Return the objective with its priors at a point."""
+    found = objective.derivatives(point)
+    value, score, information = float(found.value.sum()), found.score.sum(axis=0), found.information.copy()
+    for j, name in enumerate(objective.names):
+        if name in priors:
+            prior = priors[name]
+            away = (point[j] - np.log(prior.value)) / prior.spread
+            value += 0.5 * away**2
+            score[j] += away / prior.spread
+            information[j, j] += prior.spread**-2
+    return Local(value=value, score=score, information=information, derivatives=found)
+
+
+def search(
+    objective: Objective,
+    start: Array,
+    priors: Mapping[str, Prior] | None = None,
+    *,
+    fixed: Sequence[int] = (),
+    steps: int = 200,
+) -> Optimum:
+    """Return the minimum that is reached from ``start``; parameters of the indices ``fixed`` stay where they are."""
+    known = dict(priors or {})
+    x = np.array(start, float)
+    moving = np.array([j not in fixed for j in range(len(x))], bool)
+    low, high = objective.start - REACH, objective.start + REACH
+    here = local_at(objective, x, known)
+    damping = 1e-3
+    for number in range(steps):
+        # What falls towards zero gains no more than half its gradient: below some size it is as good as there.
+        settled = (here.score > 0.0) & (here.score < NEGLIGIBLE) & (np.diag(here.information) < 0.1)
+        active = moving & ~settled & ~((x <= low) & (here.score > 0.0)) & ~((x >= high) & (here.score < 0.0))
+        if not active.any():
+            return Optimum(start=np.array(start), point=x, local=here, steps=number, converged=True)
+        g, F = here.score[active], here.information[np.ix_(active, active)]
+        scale = np.sqrt(np.maximum(np.diag(F), 1e-12))
+        unit = F / np.outer(scale, scale)
+        while True:
+            delta = np.zeros(len(x))
+            delta[active] = -np.linalg.solve(unit + damping * np.eye(len(g)), g / scale) / scale
+            delta *= min(1.0, LONGEST_STEP / float(np.max(np.abs(delta))))
+            trial = np.clip(x + delta, low, high)
+            trial[~moving] = x[~moving]
+            gain = -float(here.score[active] @ delta[active])
+            if gain < 1e-7 and np.abs(delta).max() < 0.05:
+                return Optimum(start=np.array(start), point=x, local=here, steps=number, converged=True)
+            there = local_at(objective, trial, known)
+            if there.value <= here.value:
+                break
+            damping = max(10.0 * damping, 1e-3)
+            if damping > 1e12:
+                return Optimum(start=np.array(start), point=x, local=here, steps=number, converged=False)
+        x, here, damping = trial, there, max(0.1 * damping, 1e-9)
+    return Optimum(start=np.array(start), point=x, local=here, steps=steps, converged=False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimated:
+    """One parameter and what is known of it; SI."""
+
+    name: str
+    start: float
+    value: float
+    """The value put into the filter: the most likely one; where the data leave zero open, the mean over the profile likelihood."""
+    most_likely: float
+    lower: float
+    """Lower end of the 95 % interval; zero where only a bound is known."""
+    upper: float
+    """Upper end of the 95 % interval; infinite where nothing bounds it."""
+    standard_error: float
+    """Of the logarithm, by the information, or by the sandwich where :attr:`Tuning.misfit` or against a truth."""
+    identified: bool
+    """Whether zero is refuted at 95 %, and an upper end found."""
+    note: str
+    """What to make of it, in words."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tuning:
+    """The outcome of a tuning."""
+
+    parameters: tuple[Estimated, ...]
+    setup: FilterSetup
+    """The filter with the tuned values."""
+    point: Array
+    """Logarithms of the tuned values (p,)."""
+    before: float
+    """Minus the log likelihood (with priors, without its constant) at the start."""
+    after: float
+    """The same at the most likely point."""
+    covariance: Array
+    """Of the logarithms, by the information (p, p)."""
+    starts: Array
+    """The points searched from (k, p)."""
+    optima: Array
+    """Where each search ended (k, p)."""
+    optima_values: Array
+    """Minus the log likelihood there (k,)."""
+    misfit: bool
+    """Whether the gradient scatters over the record by more than the information allows: the innovations are not white, or not of the
+    variance that any such filter gives them, and the most likely filter need not be the best one."""
+    agreeing: int
+    """Searches that ended within a thousandth of a log likelihood of the best."""
+
+    def __getitem__(self, name: str) -> Estimated:
+        """Return the parameter of that name."""
+        known_keys("tuning", [name], [one.name for one in self.parameters])
+        return next(one for one in self.parameters if one.name == name)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Known:
+    lower: float
+    upper: float
+    mean: float
+    identified: bool
+    slices: tuple[Array, Array] | None = field(default=None)
+
+
+def random_starts(point: Array, number: int, factor: float, generator: np.random.Generator) -> Array:
+    """Return the point and ``number − 1`` more (number, p), each parameter off by a log-uniform factor from 1/factor to factor."""
+    spread = np.log(factor)
+    off = generator.uniform(-spread, spread, (count("starts", number) - 1, len(point)))
+    return np.concatenate([point[None], point + off])
+
+
+def fit(
+    objective: Objective,
+    *,
+    priors: Mapping[str, Prior] | None = None,
+    starts: int = 4,
+    factor: float = 30.0,
+    seed: int = 0,
+    threads: int = 1,
+    intervals: bool = True,
+    progress: Callable[[int], None] | None = None,
+) -> Tuning:
+    """Return the most likely parameters with their intervals.
+
+    Parameters
+    ----------
+    objective : Likelihood
+        Innovations (:func:`strapdown.tuning.likelihood`) or errors (:func:`strapdown.tuning.error_likelihood`).
+    priors : mapping, optional
+        What is known before, by name; then the most likely point is that of likelihood and prior together.
+    starts, factor, seed : int, float, int
+        The first search begins at the setup's own values, the others off by random factors of up to ``factor`` either way.
+    threads : int
+        Searches at once.
+    intervals : bool
+        Whether to follow the profile likelihood where a parameter is not well known.
+    progress : callable, optional
+        Called with the number of searches just finished, and again for each parameter's interval.
+    """
+    known = dict(priors or {})
+    known_keys("priors", known, objective.names)
+    if not factor > 1.0:
+        raise InputError(f"factor is {factor}; random starts need one greater than 1")
+    told = progress or (lambda done: None)
+    points = random_starts(objective.start, starts, factor, np.random.default_rng(seed))
+
+    def one(point: Array) -> Optimum:
+        result = search(objective, point, known)
+        told(1)
+        return result
+
+    with ThreadPoolExecutor(threads) as pool:
+        optima = list(pool.map(one, points))
+    best = min(optima, key=lambda optimum: optimum.local.value)
+    if not best.converged:
+        raise InputError(
+            "the search did not settle in 200 steps; free fewer parameters, or give priors for those that the record cannot tell"
+        )
+    covariance, robust = covariances(best.local)
+    curvature, sandwich = np.sqrt(np.diag(covariance)), np.sqrt(np.diag(robust))
+    misfit = bool(np.any(sandwich > MISFIT * curvature))
+    # A likelihood whose curvature promises too much falls too fast by the square of that.
+    swollen = (
+        np.maximum(sandwich / curvature, 0.0 if objective.composite else 1.0)
+        if misfit or objective.composite
+        else np.ones(len(best.point))
+    )
+    error = swollen * curvature
+
+    def interval(j: int) -> _Known:
+        loose = not error[j] < WELL_KNOWN
+        result = (
+            _profiled(objective, best, j, known, float(error[j]), float(swollen[j]) ** 2)
+            if loose and intervals
+            else _wald(best, j, float(error[j]))
+        )
+        told(1)
+        return result
+
+    with ThreadPoolExecutor(threads) as pool:
+        ranges = list(pool.map(interval, range(len(points[0]))))
+    point = best.point.copy()
+    loose = [j for j in range(len(ranges)) if not ranges[j].identified]
+    if loose:
+        point[loose] = np.log([ranges[j].mean for j in loose])
+        point = search(objective, point, known, fixed=loose).point
+    estimated = tuple(
+        Estimated(
+            name=name,
+            start=float(np.exp(objective.start[j])),
+            value=float(np.exp(point[j])),
+            most_likely=float(np.exp(best.point[j])) if _above_nothing(best, j) else 0.0,
+            lower=ranges[j].lower,
+            upper=ranges[j].upper,
+            standard_error=float(error[j]),
+            identified=ranges[j].identified,
+            note=_note(
+                name, ranges[j], float(error[j]), best.local, j, known, doubtful=misfit and not objective.composite
+            ),
+        )
+        for j, name in enumerate(objective.names)
+    )
+    return Tuning(
+        parameters=estimated,
+        setup=objective.setup(point),
+        point=point,
+        before=local_at(objective, objective.start, known).value,
+        after=best.local.value,
+        covariance=covariance,
+        misfit=misfit and not objective.composite,
+        starts=points,
+        optima=np.array([optimum.point for optimum in optima]),
+        optima_values=np.array([optimum.local.value for optimum in optima]),
+        agreeing=sum(1 for optimum in optima if optimum.local.value < best.local.value + NEGLIGIBLE),
+    )
+
+
+def rescaled(tuning: Tuning, factor: float) -> Tuning:
+    """Return a tuning with all that its filter believes scaled alike: what the size of the attitude error leaves open.
+
+    ``factor`` is that of ``filter.scale``, tuned by the innovations of the filter that has the smallest errors.
+    """
+    positive("factor", factor)
+    names = ("value", "most_likely", "lower", "upper")
+    return replace(
+        tuning,
+        parameters=tuple(
+            replace(one, **{name: factor * getattr(one, name) for name in names}) for one in tuning.parameters
+        ),
+        setup=with_values(tuning.setup, {SCALE: factor}),
+        point=tuning.point + np.log(factor),
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Slices:
+    """The likelihood along each parameter, the others at their most likely values."""
+
+    names: tuple[str, ...]
+    values: Array
+    """Of the parameter (p, k), SI."""
+    fallen: Array
+    """2 Δℓ: by how much twice the log likelihood lies below its best (p, k)."""
+
+
+def slices(objective: Objective, tuning: Tuning, *, number: int = 24) -> Slices:
+    """Return slices of the objective through the tuned point, over somewhat more than each interval; priors are left out."""
+    values, fallen = [], []
+    for j, one in enumerate(tuning.parameters):
+        width = 2.5 * min(max(one.standard_error, 1e-3), 1.0)
+        top = one.upper if np.isfinite(one.upper) else one.value * np.exp(width)
+        ends = np.log([max(min(one.lower, one.value), one.value * np.exp(-2.0 * width), 1e-300), max(top, one.value)])
+        ends += np.array([-0.3, 0.3]) * max(float(np.ptp(ends)), 1e-3)
+        points = np.tile(tuning.point, (number, 1))
+        points[:, j] = np.linspace(ends[0], ends[1], number)
+        found = objective.minus_log(np.concatenate([tuning.point[None], points]))
+        values.append(np.exp(points[:, j]))
+        fallen.append(2.0 * (found[1:] - min(found[0], found[1:].min())))
+    return Slices(names=objective.names, values=np.array(values), fallen=np.array(fallen))
+
+
+def covariances(local: Local) -> tuple[Array, Array]:
+    """Return the covariance of the log parameters by the information, and by the sandwich F⁻¹ J F⁻¹.
+
+    J is the scatter of the gradient over parts of the records (White 1982; parts long against the innovations' correlation make it hold
+    for innovations that are not white). Where there is no information the variance is infinite, to a large number.
+    """
+    F = local.information
+    scale = np.sqrt(np.maximum(np.diag(F), 1e-10))
+    inverse = np.linalg.pinv(F / np.outer(scale, scale), rcond=1e-10, hermitian=True) / np.outer(scale, scale)
+    parts = local.derivatives.score
+    scatter = (parts - parts.mean(axis=0)).T @ (parts - parts.mean(axis=0)) * (len(parts) / max(len(parts) - 1, 1))
+    return inverse, inverse @ scatter @ inverse
+
+
+def _above_nothing(best: Optimum, j: int) -> bool:
+    return not (0.0 < best.local.score[j] < NEGLIGIBLE and best.local.information[j, j] < 0.1)
+
+
+def _wald(best: Optimum, j: int, error: float) -> _Known:
+    half = float(np.clip(np.nan_to_num(np.sqrt(TWO_SIDED) * error, nan=REACH), 0.0, REACH))
+    value = float(np.exp(best.point[j]))
+    return _Known(
+        lower=float(value * np.exp(-half)),
+        upper=float(value * np.exp(half)),
+        mean=value,
+        identified=bool(error < WELL_KNOWN),
+    )
+
+
+def _profiled(
+    objective: Objective, best: Optimum, j: int, priors: Mapping[str, Prior], error: float, swollen: float
+) -> _Known:
+    """Follow the profile likelihood of parameter j to where it has fallen enough on either side.
+
+    ``swollen`` is how many times too fast it falls.
+    """
+    from scipy.optimize import brentq
+
+    centre = best.point[j]
+    warm = best.point.copy()
+    seen: dict[float, float] = {centre: 0.0}
+
+    def fallen(x: float) -> float:
+        """2 Δℓ of the profile at log value x."""
+        if x not in seen:
+            warm[j] = x
+            found = search(objective, warm, priors, fixed=[j], steps=50)
+            warm[:] = found.point
+            seen[x] = 2.0 * (found.local.value - best.local.value) / swollen
+        return seen[x]
+
+    nothing = -np.inf if objective.names[j] == RRW else centre - 7.0
+    at_zero = fallen(nothing) if objective.names[j] not in priors else np.inf
+    warm[:] = best.point
+    refuted = at_zero > ONE_SIDED
+    level = TWO_SIDED if refuted else ONE_SIDED
+    step = float(np.clip(np.nan_to_num(2.0 * error, nan=2.0), 0.3, 2.0))
+
+    def crossing(direction: float) -> float | None:
+        near, far = centre, centre
+        while fallen(far) < level:
+            near, far = far, far + direction * step
+            if far > objective.start[j] + REACH or far < centre - REACH:
+                return None
+        return float(brentq(lambda x: fallen(x) - level, near, far, xtol=0.005))
+
+    top = crossing(1.0)
+    warm[:] = best.point
+    bottom = crossing(-1.0) if at_zero > level else None
+    upper = float(np.exp(top)) if top is not None else np.inf
+    lower = float(np.exp(bottom)) if bottom is not None else 0.0
+    value = float(np.exp(centre))
+    identified = refuted and top is not None
+    if not identified and top is not None:
+        # Mean of σ under the profile likelihood, every σ of zero or more alike: between nothing and the bound, never either.
+        warm[:] = best.point
+        grid = np.linspace(0.0, 1.6 * upper, 17)
+        with np.errstate(divide="ignore"):
+            logs = np.log(grid)
+        weight = np.array([np.exp(-0.5 * max(fallen(x if k else nothing), 0.0)) for k, x in enumerate(logs)])
+        value = float(np.sum(grid * weight) / np.sum(weight))
+    return _Known(lower=lower, upper=upper, mean=value, identified=identified)
+
+
+def _note(
+    name: str, found: _Known, error: float, local: Local, j: int, priors: Mapping[str, Prior], *, doubtful: bool
+) -> str:
+    if name in priors:
+        share = 1.0 - priors[name].spread ** -2 / local.information[j, j]
+        if share < 0.5:
+            return "the prior says so, this record adds little"
+    if not found.identified:
+        if not np.isfinite(found.upper):
+            return "not identified: these records say nothing of it"
+        return f"not identified: < {found.upper:.2g} at 95 %; these records are too short to say more"
+    if doubtful and name != SCALE:
+        return "in doubt: the innovations are not those of such a filter"
+    if found.lower == 0.0 or found.upper > 4.0 * found.lower:
+        return "identified, but poorly"
+    return "identified" if error < WELL_KNOWN else "identified roughly"

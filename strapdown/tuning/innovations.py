@@ -1,0 +1,367 @@
+"""The likelihood of filter parameters from the filter's own innovations, with its score and information.
+
+The filter turns a record into independent innovations e with variances s, so its likelihood is ``Π N(e; 0, s)`` (prediction-error
+decomposition; Schweppe 1965, Harvey 1989 section 3.4). Parameters are told by the logarithms of their values.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from strapdown import mekf, setup
+from strapdown.checks import Array, InputError, count
+from strapdown.kernels import tuning_loop
+from strapdown.kernels.lane_values import WIDTH
+from strapdown.kernels.machine import compiled
+from strapdown.mekf import State
+from strapdown.records import ImuRecord
+from strapdown.setup import FilterSetup
+from strapdown.tuning.parameters import (
+    ARW,
+    INITIAL_ATTITUDE,
+    INITIAL_BIAS,
+    RRW,
+    SCALE,
+    SIGMA,
+    checked_names,
+    values_of,
+    with_values,
+)
+from strapdown.vectors import VectorMeasurements
+
+STEP = 2.0**-15
+"""Step of a log-parameter for derivatives: the difference is wrong by half of it relative to the curvature, 1.5e-5."""
+MOST = WIDTH - 1
+"""Derivatives that one pass over a record gives."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """A record to tune on, and where the filter starts on it."""
+
+    record: ImuRecord
+    initial: State
+    """State at the first edge; its covariance is the setup's where the initial σ are tuned."""
+    name: str = ""
+    first: float = -np.inf
+    """Innovations from this time on count for tuning, s."""
+    last: float = np.inf
+    """Innovations up to this time count for tuning, s; what comes later is held out."""
+    true_attitude: Array | None = None
+    """q_fb at the edges (n + 1, 4) where the record itself has no truth, from a reference system; rows of NaN are not known."""
+    judged: np.ndarray | None = None
+    """Edges at which errors against it count (n + 1,), bool; None: all."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Derivatives:
+    """Minus the log likelihood, without its constant, and its derivatives by the log parameters, part by part."""
+
+    value: Array
+    """(parts,)"""
+    score: Array
+    """Its gradient (parts, p)."""
+    information: Array
+    """Fisher's information from the sensitivities of the innovations (p, p), summed over the parts."""
+    outer: Array
+    """Σ g gᵀ over the measurements (p, p), g the gradient of each."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Prepared:
+    """A record as the kernel takes it."""
+
+    time: Array
+    increments: Array
+    events: mekf.Schedule
+    state: Array
+    cuts: Array
+    used: np.ndarray
+    """Which parts count (parts,), bool."""
+    sensors: tuple[str, ...]
+    true_attitude: Array | None
+    """(edges, 4)"""
+    true_bias: Array | None
+    """(edges, 3)"""
+    judged: np.ndarray
+    """Edges where the truth is known and counts for tuning (edges,), bool."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Likelihood:
+    """Minus the log likelihood of the innovations of several records under one set of parameters.
+
+    Built by :func:`likelihood`. A *point* is the vector of the logarithms of the free parameters; −∞ is a value of zero.
+    """
+
+    names: tuple[str, ...]
+    chosen: FilterSetup
+    """The setup that the fixed parameters are taken from."""
+    start: Array
+    """Logarithms of the free parameters in that setup (p,)."""
+    prepared: tuple[_Prepared, ...] = field(repr=False)
+    threads: int = 1
+
+    def point(self, values: Mapping[str, float]) -> Array:
+        """Return the point of these values by name."""
+        with np.errstate(divide="ignore"):
+            return np.log([values[name] for name in self.names])
+
+    def values(self, point: Array) -> dict[str, float]:
+        """Return the values of a point by name, SI."""
+        return {name: float(np.exp(x)) for name, x in zip(self.names, point, strict=True)}
+
+    def setup(self, point: Array) -> FilterSetup:
+        """Return the setup of a point."""
+        return with_values(self.chosen, self.values(point))
+
+    def minus_log(self, points: Array) -> Array:
+        """Return minus the log likelihood, without its constant, at several points (k, p): (k,)."""
+        rows = np.atleast_2d(points)
+        blocks = [rows[first : first + WIDTH] for first in range(0, len(rows), WIDTH)]
+        jobs = [(case, block) for block in blocks for case in self.prepared]
+        results = self.each(lambda job: self._pass(*job)["minus_log"][job[0].used].sum(axis=0)[: len(job[1])], jobs)
+        sums = [np.sum(results[k : k + len(self.prepared)], axis=0) for k in range(0, len(jobs), len(self.prepared))]
+        return np.concatenate(sums)
+
+    def by_part(self, point: Array) -> list[tuple[Array, Array]]:
+        """Return for each record minus the log likelihood and Σ e²/s of every part, at one point."""
+
+        def one(case: _Prepared) -> tuple[Array, Array]:
+            found = self._pass(case, point[None])
+            return found["minus_log"][:, 0], found["squares"][:, 0]
+
+        return self.each(one, self.prepared)
+
+    def derivatives(self, point: Array) -> Derivatives:
+        """Return the likelihood and its derivatives at a point; one pass over each record for up to seven parameters."""
+        p = len(self.names)
+        blocks = [tuple(range(p))] if p <= MOST else _pairs_of_groups(p)
+        jobs = [(case, block) for case in self.prepared for block in blocks]
+        results = self.each(lambda job: self._differences(job[0], point, job[1]), jobs)
+        values, scores = [], []
+        information, outer = np.zeros((p, p)), np.zeros((p, p))
+        for k, case in enumerate(self.prepared):
+            score, matrices = np.zeros((int(case.used.sum()), p)), np.zeros((2, p, p))
+            for block, (_, part_score, part_information, part_outer) in zip(
+                blocks, results[k * len(blocks) : (k + 1) * len(blocks)], strict=True
+            ):
+                score[:, block] = part_score
+                matrices[:, np.array(block)[:, None], block] = part_information, part_outer
+            values.append(results[k * len(blocks)][0])
+            scores.append(score)
+            information += matrices[0]
+            outer += matrices[1]
+        return Derivatives(
+            value=np.concatenate(values), score=np.concatenate(scores), information=information, outer=outer
+        )
+
+    @property
+    def composite(self) -> bool:
+        """Whether the curvature is no information; that of innovations is."""
+        return False
+
+    def each(self, work: Callable[[Any], Any], jobs: Sequence[Any]) -> list[Any]:
+        """Return ``work`` of every job, spread over the threads."""
+        if self.threads == 1 or len(jobs) == 1:
+            return [work(job) for job in jobs]
+        with ThreadPoolExecutor(self.threads) as pool:
+            return list(pool.map(work, jobs))
+
+    def _differences(self, case: _Prepared, point: Array, block: tuple[int, ...]) -> tuple[Array, ...]:
+        rows = np.tile(point, (1 + len(block), 1))
+        for row, j in enumerate(block):
+            rows[row + 1, j] += STEP
+        found = self._pass(case, rows, free=len(block))
+        whole = [lower + np.tril(lower, -1).transpose(0, 2, 1) for lower in (found["information"], found["outer"])]
+        used = case.used
+        return found["minus_log"][used, 0], found["score"][used], *(part[used].sum(axis=0) for part in whole)
+
+    def states(self, number: int, points: Array, epochs: np.ndarray) -> Array:
+        """Return the filter's states (epochs, 28, k) on record ``number`` at edges ``epochs``, at up to eight points (k, p)."""
+        return self._pass(self.prepared[number], points, epochs=epochs)["states"][:, :, : len(points)]
+
+    def _pass(
+        self, case: _Prepared, points: Array, *, free: int = 0, epochs: np.ndarray | None = None
+    ) -> dict[str, Array]:
+        """Run up to eight points over one record."""
+        rows = np.concatenate([points, np.repeat(points[:1], WIDTH - len(points), axis=0)])
+        lane = {name: np.exp(rows[:, j]) for j, name in enumerate(self.names)}
+        base = dict(zip(self.names, np.exp(self.start), strict=True))
+        noise = self.chosen.process_noise
+        all_of = lane.get(SCALE, np.ones(WIDTH))
+        white = lane.get(ARW, np.full(WIDTH, noise.angle_random_walk) * all_of) ** 2
+        walk = lane.get(RRW, np.full(WIDTH, noise.rate_random_walk) * all_of) ** 2
+        factors = np.array(
+            [
+                (lane[f"{sensor}{SIGMA}"] / base[f"{sensor}{SIGMA}"]) ** 2 if f"{sensor}{SIGMA}" in lane else all_of**2
+                for sensor in case.sensors
+            ]
+        )
+        state = np.repeat(case.state[:, None], WIDTH, axis=1)
+        angle = lane[INITIAL_ATTITUDE] / base[INITIAL_ATTITUDE] if INITIAL_ATTITUDE in lane else all_of
+        bias = lane[INITIAL_BIAS] / base[INITIAL_BIAS] if INITIAL_BIAS in lane else all_of
+        state[7:13] *= angle**2
+        state[13:22] *= angle * bias
+        state[22:] *= bias**2
+        parts = len(case.cuts) + 1
+        kept = np.empty(0, np.int64) if epochs is None else np.asarray(epochs, np.int64)
+        out = {
+            "minus_log": np.zeros((parts, WIDTH)),
+            "squares": np.zeros((parts, WIDTH)),
+            "score": np.zeros((parts, free)),
+            "information": np.zeros((parts, free, free)),
+            "outer": np.zeros((parts, free, free)),
+            "states": np.empty((len(kept), 28, WIDTH)),
+        }
+        compiled(tuning_loop.run_parameters)(
+            case.time,
+            case.increments,
+            np.concatenate([white, walk]),
+            case.events.time,
+            case.events.kind,
+            case.events.vector_b,
+            case.events.variance,
+            case.events.sensor,
+            factors.ravel(),
+            case.events.reference,
+            case.events.triads,
+            state.ravel(),
+            case.cuts,
+            free,
+            STEP,
+            out["minus_log"].reshape(-1),
+            out["squares"].reshape(-1),
+            out["score"],
+            out["information"],
+            out["outer"],
+            kept,
+            out["states"].reshape(-1),
+            np.empty(12 * WIDTH),
+            np.empty(6 * WIDTH),
+            np.empty(4 * WIDTH),
+        )
+        return out
+
+
+def _pairs_of_groups(p: int) -> list[tuple[int, ...]]:
+    """Return blocks of at most six parameters such that every two share one: each pair of groups of three."""
+    groups = [range(first, min(first + 3, p)) for first in range(0, p, 3)]
+    return [(*a, *b) for a, b in itertools.combinations(groups, 2)]
+
+
+def likelihood(
+    cases: Sequence[Case],
+    chosen: FilterSetup,
+    free: Sequence[str],
+    *,
+    spacing: float = 0.0,
+    parts: int = 20,
+    threads: int = 1,
+) -> Likelihood:
+    """Return the likelihood of the free parameters on these records.
+
+    Parameters
+    ----------
+    cases : sequence of Case
+    chosen : FilterSetup
+        Where the free parameters start, and what the fixed ones are; gates and robust weights of it are not applied.
+    free : sequence of str
+        Names of :mod:`strapdown.tuning.parameters`.
+    spacing : float
+        Measurements of a sensor nearer to each other than this, s, are left out, and those kept weigh as much as all: what disturbs them
+        may last, and only innovations that are white have this likelihood (:func:`thinned`).
+    parts : int
+        Spans of time of each record whose gradients are kept apart.
+    threads : int
+        Records, or points, that are worked on at once.
+    """
+    if not cases:
+        raise InputError("there is no record to tune on; give one")
+    records = [case.record for case in cases]
+    names = checked_names(free, records)
+    values = values_of(chosen, names, records)
+    for name, value in values.items():
+        if value <= 0.0:
+            raise InputError(f"{name} starts from {value:g}; it must start from a number greater than zero")
+    started = with_values(chosen, values)
+    prepared = tuple(_prepare(case, started, names, count("parts", parts), spacing) for case in cases)
+    return Likelihood(
+        names=names, chosen=started, start=np.log(list(values.values())), prepared=prepared, threads=threads
+    )
+
+
+def thinned(series: VectorMeasurements, spacing: float) -> VectorMeasurements:
+    """Return the measurements of a series that lie at least ``spacing`` s apart, their σ lowered so that they weigh as much as all did.
+
+    A disturbance that lasts over n samples makes them worth one; a filter that takes them for independent needs a σ larger by √n. Thinned
+    to where disturbances are independent, that σ can be estimated; the filter then uses it on every sample.
+    """
+    usable = np.flatnonzero(
+        np.isfinite(series.attitude if series.attitude is not None else series.vector_b).all(axis=1)
+    )
+    # A hair less, so that stamps on a grid of the very spacing are kept.
+    kept, due = [], -np.inf
+    for k in usable:
+        if series.time[k] >= due:
+            kept.append(k)
+            due = series.time[k] + spacing * (1.0 - 1e-6)
+    if len(kept) == len(series.time):
+        return series
+    return series.taken(np.array(kept, np.int64)).noise_scaled(float(np.sqrt(len(kept) / max(len(usable), 1))))
+
+
+def _prepare(case: Case, chosen: FilterSetup, names: tuple[str, ...], parts: int, spacing: float) -> _Prepared:
+    sensors = [series.sensor for series in case.record.vectors]
+    own = {name: value for name, value in chosen.sigma.items() if name in sensors}
+    record = setup.believed(case.record, replace(chosen, sigma=own))
+    if spacing > 0.0:
+        record = replace(record, vectors=tuple(thinned(series, spacing) for series in record.vectors))
+    start, end = float(record.time[0]), float(record.time[-1])
+    events = mekf.schedule(record.vectors, start, end)
+    first, last = max(case.first, start), min(case.last, end)
+    inside = (events.time >= first) & (events.time <= last)
+    if not inside.any():
+        raise InputError(
+            f"{case.name or 'record'} has no measurement between {first:g} and {last:g} s; tuning needs vector measurements"
+        )
+    inner = list(np.linspace(first, last, parts + 1)[1:-1])
+    before = [np.nextafter(case.first, -np.inf)] if case.first > start else []
+    after = [case.last] if case.last < end else []
+    used = np.ones(len(inner) + 1 + len(before) + len(after), bool)
+    if before:
+        used[0] = False
+    if after:
+        used[-1] = False
+    covariance = case.initial.covariance
+    if {INITIAL_ATTITUDE, INITIAL_BIAS} & set(names):
+        covariance = np.diag(np.repeat([chosen.attitude_sigma**2, chosen.bias_sigma**2], 3))
+    attitude, bias = case.true_attitude, None
+    every = chosen.integration.samples
+    if record.truth is not None:
+        attitude, bias = record.truth.attitude, record.truth.bias
+    elif attitude is not None:
+        attitude = attitude[::every][: len(record.time)]
+    judged = (record.time >= first) & (record.time <= last)
+    if case.judged is not None:
+        judged &= case.judged[::every][: len(record.time)]
+    if attitude is not None:
+        judged &= np.isfinite(attitude).all(axis=1)
+    return _Prepared(
+        true_attitude=attitude,
+        true_bias=bias,
+        judged=judged,
+        time=record.time,
+        increments=np.ascontiguousarray(record.increments),
+        events=events,
+        state=mekf.pack(case.initial.attitude, case.initial.bias, covariance),
+        cuts=np.array([*before, *inner, *after]),
+        used=used,
+        sensors=events.sensors,
+    )

@@ -1,0 +1,54 @@
+"""Where the filter starts on a record that is tuned on."""
+
+from __future__ import annotations
+
+from strapdown import ahrs, mekf, quaternion, setup
+from strapdown.ahrs import AhrsParameters
+from strapdown.checks import InputError
+from strapdown.randomness import generator
+from strapdown.recordings import Recording
+from strapdown.records import ImuRecord
+from strapdown.setup import FilterSetup
+from strapdown.tuning.innovations import Case
+
+
+def recording_setup(parameters: AhrsParameters | None = None) -> FilterSetup:
+    """Return the setup of the filter that :func:`strapdown.ahrs.estimate` runs."""
+    chosen = parameters or AhrsParameters()
+    noise = mekf.ProcessNoise(angle_random_walk=chosen.angle_random_walk, rate_random_walk=chosen.rate_random_walk)
+    return FilterSetup(process_noise=noise, attitude_sigma=chosen.attitude_sigma, bias_sigma=chosen.bias_sigma)
+
+
+def recording_case(recording: Recording, parameters: AhrsParameters | None = None) -> Case:
+    """Return a recording as :func:`strapdown.ahrs.estimate` filters it: from its first quiet second on, the reference beside it."""
+    chosen = parameters or AhrsParameters()
+    if recording.specific_force is None:
+        raise InputError(f"{recording.source} has no accelerometer, which shows the vertical; add columns ax, ay, az")
+    span = ahrs.quiet_span(recording)
+    used = recording.since(span.start)
+    quiet = slice(0, span.stop - span.start)
+    return Case(
+        record=ahrs.imu_record(used, quiet, chosen),
+        initial=ahrs.start(used, quiet, chosen),
+        name=used.source,
+        true_attitude=used.true_attitude,
+        judged=used.movement,
+    )
+
+
+def record_case(record: ImuRecord, chosen: FilterSetup, *, name: str = "", seed: int | None = None) -> Case:
+    """Return a record with where the filter starts on it: from its first measurements, or off its truth by errors drawn with ``seed``.
+
+    Without a seed the attitude is that of the first measurements (:func:`strapdown.mekf.first_state`), and the bias zero; a setup whose
+    initial σ are large against the measurements forgets both at once.
+    """
+    if seed is not None and record.truth is not None:
+        draw = generator(seed, 0, "initial error").standard_normal(6)
+        attitude = quaternion.multiply(record.truth.attitude[0], quaternion.exp(-chosen.attitude_sigma * draw[:3]))
+        bias = record.truth.bias[0] - chosen.bias_sigma * draw[3:]
+        return Case(record=record, initial=setup.initial_state(chosen, attitude, bias), name=name)
+    try:
+        first = mekf.first_state(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
+    except InputError as error:
+        raise InputError(f"{name or 'record'}: {error}") from None
+    return Case(record=record, initial=setup.initial_state(chosen, first.attitude), name=name)

@@ -1,0 +1,691 @@
+"""Tuning: the likelihood and its derivatives against independent filters, the search, what is identified, what is held out."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import mpmath
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+from strapdown import gyro, motion, quaternion, scenarios, setup, tuning, units, vectors
+from strapdown.checks import InputError
+from strapdown.mekf import ProcessNoise
+from strapdown.records import ImuRecord, Truth
+from strapdown.setup import FilterSetup
+from strapdown.tuning import fitting, innovations
+from strapdown.tuning.parameters import own_sigma
+from strapdown.vectors import VectorMeasurements
+
+ARW, RRW = 1e-4, 3e-6
+
+
+def scenario(duration: float = 200.0, rate: float = 4.0, **changes) -> scenarios.Scenario:
+    stars = ((1.0, 0.0, 0.0, 1e-4), (0.0, 1.0, 1.0, 2e-4))
+    return scenarios.Scenario(
+        motion=motion.ConstantRate(rate=np.array([0.01, 0.02, 0.05])),
+        gyro=gyro.GyroSpec(angle_random_walk=ARW, rate_random_walk=changes.pop("walk", RRW), turn_on_bias_sigma=1e-4),
+        sensors=tuple(
+            vectors.VectorSensor(name=f"star {i + 1}", reference_f=np.array(star[:3]), sigma=star[3], rate=1.0)
+            for i, star in enumerate(stars)
+        ),
+        rate=rate,
+        duration=duration,
+        **changes,
+    )
+
+
+BELIEVED = FilterSetup(
+    process_noise=ProcessNoise(angle_random_walk=ARW, rate_random_walk=RRW), attitude_sigma=1e-3, bias_sigma=1e-4
+)
+FREE = ("gyro.arw", "gyro.rrw", "star 1.sigma", "star 2.sigma")
+
+
+def case(seed: int = 0, **changes) -> tuning.Case:
+    return tuning.record_case(scenarios.simulate(scenario(**changes), seed), BELIEVED, seed=seed)
+
+
+def every_kind(seed: int = 0) -> ImuRecord:
+    """A record that turns fast enough for sub-steps, with one series of each kind, samples missing and at odd times."""
+    body = motion.ConstantRate(rate=np.array([0.4, -0.7, 1.1]))
+    random = np.random.default_rng(seed)
+    edges = np.cumsum(np.concatenate([[0.0], random.uniform(0.2, 0.6, 120)]))
+    output = gyro.simulate(
+        gyro.GyroSpec(angle_random_walk=1e-3, rate_random_walk=1e-4), body.increments(edges), edges, random
+    )
+    span = (float(edges[0]), float(edges[-1]))
+    sensors = (
+        vectors.VectorSensor(name="sun", reference_f=np.array([0.0, 0.6, 0.8]), sigma=1e-2, rate=1.3),
+        vectors.Accelerometer(name="up", sigma=0.2, rate=1.0, kind="vector"),
+        vectors.Magnetometer(name="north", field_f=np.array([2e-5, 1e-5, -3e-5]), sigma=1e-6, rate=0.7, kind="heading"),
+        vectors.AttitudeSensor(name="tracker", sigma_across=5e-3, sigma_about=2e-2, rate=0.5),
+    )
+    series = [sensor.observe(body, *span, random) for sensor in sensors]
+    gaps = series[0].vector_b.copy()
+    gaps[3:5] = np.nan
+    series[0] = dataclasses.replace(series[0], vector_b=gaps)
+    truth = Truth(attitude=body.attitude(edges), bias=output.bias)
+    return ImuRecord(time=edges, increments=output.increments, vectors=tuple(series), truth=truth)
+
+
+KINDS = FilterSetup(
+    process_noise=ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-4), attitude_sigma=0.3, bias_sigma=1e-2
+)
+ALL = (
+    "gyro.arw",
+    "gyro.rrw",
+    "sun.sigma",
+    "up.sigma",
+    "north.sigma",
+    "tracker.sigma",
+    "initial.attitude",
+    "initial.bias",
+)
+
+
+def plain(record: ImuRecord, chosen: FilterSetup, attitude: np.ndarray, bias: np.ndarray) -> float:
+    """Minus the log likelihood, without its constant, by one ordinary run of the filter."""
+    estimate = setup.run(record, chosen, setup.initial_state(chosen, attitude, bias))
+    return sum(
+        float(0.5 * np.sum(np.log(one.variance) + one.innovation**2 / one.variance))
+        for one in estimate.innovations.values()
+    )
+
+
+# ------------------------------------------------------------------------------------------------------ likelihood
+
+
+def test_every_lane_is_the_filter_itself():
+    record = every_kind()
+    start = tuning.record_case(record, KINDS, seed=3)
+    objective = tuning.likelihood([start], KINDS, ALL)
+    points = objective.start + np.random.default_rng(1).uniform(-1.5, 1.5, (11, len(ALL)))
+    expected = [plain(record, objective.setup(point), start.initial.attitude, start.initial.bias) for point in points]
+    np.testing.assert_allclose(objective.minus_log(points), expected, rtol=1e-10)
+
+
+def test_several_records_add_up_on_any_number_of_threads():
+    cases = [case(seed) for seed in range(3)]
+    alone = [tuning.likelihood([one], BELIEVED, FREE) for one in cases]
+    together = tuning.likelihood(cases, BELIEVED, FREE, threads=2)
+    point = together.start + 0.1
+    assert together.minus_log(point)[0] == pytest.approx(sum(one.minus_log(point)[0] for one in alone), rel=1e-13)
+    sums = [one.derivatives(point) for one in alone]
+    found = together.derivatives(point)
+    # The last bit of the point is another, and differences make much of it.
+    np.testing.assert_allclose(found.score.sum(axis=0), sum(one.score.sum(axis=0) for one in sums), rtol=1e-5)
+    np.testing.assert_allclose(found.information, sum(one.information for one in sums), rtol=1e-5, atol=1e-5)
+
+
+def axis_records(n: int = 40, sigma: float = 1e-6) -> tuple[ImuRecord, np.ndarray, np.ndarray]:
+    """A body at rest to within microradians, its whole attitude measured: three axes apart, linear to 1e-6. Gyro and measured angles."""
+    random = np.random.default_rng(4)
+    dt = 0.5
+    increments = 3e-7 * random.standard_normal((n, 3))
+    angles = np.cumsum(increments, axis=0) + sigma * random.standard_normal((n, 3))
+    series = VectorMeasurements(
+        sensor="tracker",
+        kind="attitude",
+        time=dt * np.arange(1, n + 1),
+        attitude=quaternion.exp(angles),
+        sigma_axes=np.full(3, sigma),
+    )
+    return ImuRecord(time=dt * np.arange(n + 1), increments=increments, vectors=(series,)), increments, angles
+
+
+def linear_likelihood(white, walk, sigma, first, drift, increments, angles, dt=0.5):
+    """Minus the log likelihood of a plain Kalman filter of (angle, bias), one axis after the other, in any arithmetic."""
+    total = 0
+    for axis in range(3):
+        angle, bias = 0, 0
+        p11, p12, p22 = first**2, 0 * first, drift**2
+        for k in range(len(increments)):
+            angle = angle + float(increments[k, axis]) - dt * bias
+            p11, p12, p22 = (
+                p11 - 2 * dt * p12 + dt**2 * p22 + white**2 * dt + walk**2 * dt**3 / 3,
+                p12 - dt * p22 - walk**2 * dt**2 / 2,
+                p22 + walk**2 * dt,
+            )
+            e, s = float(angles[k, axis]) - angle, p11 + sigma**2
+            total = total + (mpmath.log(s) + e * e / s) / 2
+            gain, drive = p11 / s, p12 / s
+            angle, bias = angle + gain * e, bias + drive * e
+            p11, p12, p22 = p11 - gain * p11, p12 - gain * p12, p22 - drive * p12
+    return total
+
+
+def test_in_the_linear_case_it_is_the_kalman_filter_with_its_derivatives_to_many_digits():
+    record, increments, angles = axis_records()
+    chosen = FilterSetup(
+        process_noise=ProcessNoise(angle_random_walk=8e-7, rate_random_walk=2e-7), attitude_sigma=2e-6, bias_sigma=1e-6
+    )
+    names = ("gyro.arw", "gyro.rrw", "tracker.sigma", "initial.attitude", "initial.bias")
+    start = tuning.Case(record=record, initial=setup.initial_state(chosen, np.array([1.0, 0.0, 0.0, 0.0])))
+    objective = tuning.likelihood([start], chosen, names)
+    found = objective.derivatives(objective.start)
+    with mpmath.workdps(40):
+        values = [mpmath.mpf(float(x)) for x in objective.start]
+
+        def exact(*logs):
+            return linear_likelihood(*(mpmath.exp(x) for x in logs), increments, angles)
+
+        assert found.value.sum() == pytest.approx(float(exact(*values)), rel=1e-8)
+        for j in range(len(names)):
+            order = tuple(1 if k == j else 0 for k in range(len(names)))
+            # The difference is wrong by half a step of the curvature, which is of the size of the information.
+            expected = float(mpmath.diff(exact, tuple(values), order))
+            assert found.score.sum(axis=0)[j] == pytest.approx(
+                expected, abs=2.0 * innovations.STEP * max(found.information[j, j], abs(expected), 1.0)
+            )
+
+
+def differences(value, point, step=1e-3):
+    """Gradient by central differences of fourth order."""
+    rows = []
+    for j in range(len(point)):
+        unit = step * np.eye(len(point))[j]
+        f = [value(point + k * unit) for k in (-2, -1, 1, 2)]
+        rows.append((f[0] - 8.0 * f[1] + 8.0 * f[2] - f[3]) / (12.0 * step))
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("free", [ALL, ALL[:3], ("filter.scale",)], ids=["eight", "three", "scale"])
+def test_the_gradient_is_that_of_the_likelihood(free):
+    start = tuning.record_case(every_kind(), KINDS, seed=3)
+    objective = tuning.likelihood([start], KINDS, free, parts=5)
+    point = objective.start + 0.2
+    found = objective.derivatives(point)
+    expected = differences(lambda x: objective.minus_log(x)[0], point)
+    np.testing.assert_allclose(
+        found.score.sum(axis=0), expected, atol=2.0 * innovations.STEP * np.abs(found.information).max() + 1e-6
+    )
+    assert found.value.sum() == pytest.approx(objective.minus_log(point)[0], rel=1e-13)
+    assert np.linalg.eigvalsh(found.information).min() >= -1e-9
+    np.testing.assert_allclose(found.information, found.information.T)
+
+
+def test_pairs_of_parameters_from_several_passes_are_those_of_one():
+    start = tuning.record_case(every_kind(), KINDS, seed=3)
+    whole = tuning.likelihood([start], KINDS, ALL)
+    few = tuning.likelihood([start], KINDS, ALL[2:6])
+    many = whole.derivatives(whole.start)
+    one = few.derivatives(few.start)
+    np.testing.assert_allclose(many.information[2:6, 2:6], one.information, rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(many.outer[2:6, 2:6], one.outer, rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(many.score[:, 2:6], one.score, atol=1e-6)
+
+
+def test_the_information_is_the_scatter_of_the_score():
+    """At the truth E g gᵀ = F, over independent records, and per measurement inside a record."""
+    scores, information, outer = [], [], []
+    for seed in range(120):
+        objective = tuning.likelihood([case(seed, duration=100.0)], BELIEVED, FREE)
+        found = objective.derivatives(objective.start)
+        scores.append(found.score.sum(axis=0))
+        information.append(found.information)
+        outer.append(found.outer)
+    F, J = np.mean(information, axis=0), np.cov(np.array(scores).T)
+    size = np.sqrt(np.outer(np.diag(F), np.diag(F)))
+    np.testing.assert_allclose(J / size, F / size, atol=0.45)
+    np.testing.assert_allclose(np.diag(J), np.diag(F), rtol=0.45)
+    np.testing.assert_allclose(np.diag(np.mean(outer, axis=0)), np.diag(F), rtol=0.12)
+    assert np.all(np.abs(np.mean(scores, axis=0)) < 3.5 * np.sqrt(np.diag(F) / len(scores)))
+
+
+def test_a_common_scale_leaves_the_estimates_and_multiplies_the_variances():
+    start = tuning.record_case(every_kind(), KINDS, seed=3)
+    objective = tuning.likelihood([start], KINDS, ["filter.scale"])
+    chosen = objective.setup(np.log([2.0]))
+    one = setup.run(start.record, KINDS, start.initial)
+    two = setup.run(start.record, chosen, setup.initial_state(chosen, start.initial.attitude, start.initial.bias))
+    np.testing.assert_allclose(two.attitude, one.attitude, atol=1e-9)
+    np.testing.assert_allclose(two.variance, 4.0 * one.variance, rtol=1e-6)
+    # Correlations between attitude and bias at the start are scaled along.
+    size = np.array([0.3, 0.3, 0.3, 1e-2, 1e-2, 1e-2])
+    P = np.outer(size, size) * (np.eye(6) + 0.8 * np.eye(6, k=3) + 0.8 * np.eye(6, k=-3))
+    tied = dataclasses.replace(start, initial=dataclasses.replace(start.initial, covariance=P))
+    wide = dataclasses.replace(start.initial, covariance=4.0 * P)
+    whole = setup.run(start.record, chosen, wide)
+    expected = sum(0.5 * np.sum(np.log(i.variance) + i.innovation**2 / i.variance) for i in whole.innovations.values())
+    found = tuning.likelihood([tied], KINDS, ["filter.scale"]).minus_log(np.log([[2.0]]))[0]
+    assert found == pytest.approx(expected, rel=1e-10)
+    squares = sum(float(innovation.nis.sum()) for innovation in one.innovations.values())
+    number = sum(innovation.innovation.size for innovation in one.innovations.values())
+    # Closed form of the best scale: the root of the mean of e²/s.
+    best = tuning.fit(objective, starts=3)["filter.scale"]
+    assert best.most_likely == pytest.approx(np.sqrt(squares / number), rel=1e-5)
+
+
+def test_thinned_measurements_weigh_as_much_as_all():
+    series = every_kind().vectors[0]
+    thin = tuning.thinned(series, 3.0)
+    assert np.all(np.diff(thin.time) >= 3.0 - 1e-5)
+    usable = np.isfinite(series.vector_b).all(axis=1)
+    assert np.sum(thin.sigma**-2.0) == pytest.approx(np.sum(series.sigma[usable] ** -2.0))
+    assert np.isfinite(thin.vector_b).all()
+    assert tuning.thinned(thin, 0.1) is thin
+
+
+def test_thinning_finds_the_sigma_that_disturbances_which_last_ask_for():
+    """Each error lasts ten samples: independent once in ten, so the right σ of every sample is √10 times that of one."""
+    chosen = scenario(duration=600.0, rate=2.0)
+    record = scenarios.simulate(chosen, 5)
+    random = np.random.default_rng(5)
+    time = np.arange(1, 1200) * 0.5
+    body = chosen.motion.attitude(time)
+    series = []
+    for name, reference in (("star 1", [1.0, 0.0, 0.0]), ("star 2", [0.0, 1.0, 0.0])):
+        error = np.repeat(1e-3 * random.standard_normal((120, 3)), 10, axis=0)[: len(time)]
+        seen = quaternion.rotate(quaternion.conjugate(body), np.array(reference)) + error
+        series.append(
+            VectorMeasurements(
+                sensor=name,
+                kind="direction",
+                time=time,
+                vector_b=seen / np.linalg.norm(seen, axis=1, keepdims=True),
+                reference_f=np.array(reference),
+                sigma=np.full(len(time), 1e-3),
+            )
+        )
+    record = dataclasses.replace(record, vectors=tuple(series))
+    start = tuning.record_case(record, BELIEVED, seed=1)
+    sparse = tuning.fit(tuning.likelihood([start], BELIEVED, ["star 1.sigma", "star 2.sigma"], spacing=5.0), starts=1)
+    for one in sparse.parameters:
+        assert one.value == pytest.approx(1e-3 * np.sqrt(10.0), rel=0.2)
+        assert one.lower < 1e-3 * np.sqrt(10.0) < one.upper
+    blind = tuning.fit(tuning.likelihood([start], BELIEVED, ["gyro.arw", "star 1.sigma", "star 2.sigma"]), starts=2)
+    assert blind.misfit
+    assert not sparse.misfit
+
+
+# ------------------------------------------------------------------------------------------------------ the search
+
+
+@pytest.mark.parametrize("wrong", [30.0, 1.0 / 30.0])
+def test_from_thirty_times_wrong_twenty_starts_find_one_optimum(wrong):
+    one = case(duration=600.0)
+    values = tuning.values_of(BELIEVED, FREE, [one.record])
+    off = tuning.with_values(BELIEVED, {name: wrong * value for name, value in values.items()})
+    found = tuning.fit(tuning.likelihood([one], off, FREE), starts=20, intervals=False, threads=2)
+    assert found.agreeing == 20
+    assert np.ptp(found.optima, axis=0).max() < 1e-2
+    for parameter in found.parameters:
+        assert abs(np.log(parameter.value / values[parameter.name])) < 4.0 * parameter.standard_error
+        assert parameter.start == pytest.approx(wrong * values[parameter.name])
+    assert found.after < found.before
+
+
+def white_noise(n: int, seed: int = 3) -> tuple[tuning.Case, np.ndarray]:
+    """A direction seen n times by a body whose attitude is as good as known: innovations are the noise itself, two a time."""
+    random = np.random.default_rng(seed)
+    noise = 1e-3 * random.standard_normal((n, 2))
+    seen = np.column_stack([noise, np.sqrt(1.0 - np.sum(noise**2, axis=1))])
+    series = VectorMeasurements(
+        sensor="star",
+        kind="direction",
+        time=np.arange(1.0, n + 1.0),
+        vector_b=seen,
+        reference_f=np.array([0.0, 0.0, 1.0]),
+        sigma=np.full(n, 2e-3),
+    )
+    record = ImuRecord(time=np.arange(n + 1.0), increments=np.zeros((n, 3)), vectors=(series,))
+    return tuning.Case(record=record, initial=setup.initial_state(SURE, np.array([1.0, 0.0, 0.0, 0.0]))), noise
+
+
+SURE = FilterSetup(
+    process_noise=ProcessNoise(angle_random_walk=1e-9, rate_random_walk=0.0), attitude_sigma=1e-9, bias_sigma=1e-12
+)
+
+
+@pytest.mark.parametrize("n", [6, 4000])
+def test_white_noise_has_the_closed_form_answer(n):
+    """σ̂² is the mean square; 2 Δℓ = m (r − 1 − ln r), r = σ̂²/σ², m squares; F of ln σ is 2 m."""
+    one, noise = white_noise(n)
+    found = tuning.fit(tuning.likelihood([one], SURE, ["star.sigma"]), starts=2)["star.sigma"]
+    m, best = noise.size, np.sqrt(np.mean(noise**2))
+    assert found.most_likely == pytest.approx(best, rel=1e-4)
+    assert found.standard_error == pytest.approx(1.0 / np.sqrt(2.0 * m), rel=1e-3)
+
+    def fallen(log_ratio):
+        r = np.exp(-2.0 * log_ratio)
+        return m * (r - 1.0 - np.log(r)) - 3.841459
+
+    ends = [best * np.exp(brentq(fallen, *bracket)) for bracket in ((-3.0, 0.0), (0.0, 3.0))]
+    # Well known, the parabola's ends stand for those of the profile.
+    np.testing.assert_allclose([found.lower, found.upper], ends, rtol=0.003 if n == 6 else 0.002)
+    assert found.identified
+
+
+def test_what_a_record_cannot_tell_has_a_bound_and_no_confident_value():
+    """A bias that is constant: σ_u has no value, only a bound, and the filter gets a moderate one below it."""
+    bounds = []
+    for seed in range(6):
+        objective = tuning.likelihood([case(seed, walk=0.0, duration=300.0)], BELIEVED, FREE)
+        found = tuning.fit(objective, starts=2)
+        one = found["gyro.rrw"]
+        if not one.identified:
+            bounds.append(one.upper)
+            assert one.lower == 0.0
+            assert 0.2 * one.upper < one.value < one.upper
+            assert "not identified: <" in one.note
+            # The others are the most likely ones beside the value that is used, not beside zero.
+            slope, size = objective.derivatives(found.point).score.sum(axis=0), 1.0 / np.sqrt(np.diag(found.covariance))
+            assert np.all(np.abs(slope[[0, 2, 3]]) < 0.02 * size[[0, 2, 3]])
+            assert found.setup.process_noise.rate_random_walk == pytest.approx(one.value)
+        assert found["gyro.arw"].identified
+    assert len(bounds) >= 4
+    assert max(bounds) < 20.0 * RRW
+
+
+def test_a_parameter_that_nothing_depends_on_is_told_so():
+    """A sensor at a single instant: its σ is not bounded by any amount of searching."""
+    one = case(duration=100.0)
+    star = one.record.vectors[0]
+    alone = dataclasses.replace(star, sensor="flash").taken(slice(50, 51))
+    record = dataclasses.replace(one.record, vectors=(*one.record.vectors, alone))
+    objective = tuning.likelihood([dataclasses.replace(one, record=record)], BELIEVED, ["gyro.arw", "flash.sigma"])
+    found = tuning.fit(objective, starts=1)["flash.sigma"]
+    assert not found.identified or found.upper / max(found.lower, 1e-9) > 4.0
+    assert np.isfinite(found.value)
+
+
+def test_priors_hold_what_the_data_leave_open_and_yield_where_they_speak():
+    one = case(3, walk=0.0, duration=300.0)
+    objective = tuning.likelihood([one], BELIEVED, FREE)
+    prior = {"gyro.rrw": tuning.Prior(value=1e-7, factor=3.0), "gyro.arw": tuning.Prior(value=2.0 * ARW, factor=3.0)}
+    found = tuning.fit(objective, priors=prior, starts=2)
+    assert found["gyro.rrw"].most_likely == pytest.approx(1e-7, rel=0.3)
+    assert found["gyro.rrw"].lower > 0.0
+    assert "prior" in found["gyro.rrw"].note
+    assert found["gyro.arw"].value == pytest.approx(tuning.fit(objective, starts=1)["gyro.arw"].value, rel=0.03)
+    # The closed form of two parabolas: a very narrow prior is the answer.
+    narrow = {"gyro.arw": tuning.Prior(value=2.0 * ARW, factor=1.0001)}
+    assert tuning.fit(objective, priors=narrow, starts=1)["gyro.arw"].value == pytest.approx(2.0 * ARW, rel=1e-3)
+
+
+def test_priors_from_a_specification_match_its_noise():
+    spec = gyro.GyroSpec(angle_random_walk=2e-5, rate_random_walk=1e-8)
+    record = scenarios.simulate(scenario())
+    found = tuning.priors_from_gyro(spec, record, factor=2.0)
+    assert found == {
+        "gyro.arw": tuning.Prior(value=2e-5, factor=2.0),
+        "gyro.rrw": tuning.Prior(value=1e-8, factor=2.0),
+    }
+    assert set(tuning.priors_from_gyro(gyro.GyroSpec(angle_random_walk=2e-5), record)) == {"gyro.arw"}
+    flicker = dataclasses.replace(spec, bias_instability=2e-5)
+    assert tuning.priors_from_gyro(flicker, record)["gyro.rrw"].value > 1e-8
+
+
+def test_the_tuned_setup_is_what_it_says_and_goes_through_its_file(tmp_path):
+    one = case()
+    off = tuning.with_values(BELIEVED, {"gyro.arw": 3.0 * ARW})
+    found = tuning.fit(tuning.likelihood([one], off, ["gyro.arw", "star 2.sigma", "initial.bias"]), starts=1)
+    assert found.setup.process_noise.angle_random_walk == pytest.approx(found["gyro.arw"].value)
+    assert found.setup.process_noise.rate_random_walk == RRW
+    assert found.setup.sigma == {"star 2": pytest.approx(found["star 2.sigma"].value)}
+    assert found.setup.bias_sigma == pytest.approx(found["initial.bias"].value)
+    path = tmp_path / "filter.toml"
+    path.write_text(setup.to_toml(found.setup), encoding="utf-8")
+    assert setup.read_setup(path) == found.setup
+    # The filter of the file is the filter that was judged.
+    assert plain(one.record, found.setup, one.initial.attitude, one.initial.bias) == pytest.approx(
+        found.after, abs=0.02
+    )
+
+
+def test_a_factor_on_every_sigma_of_the_setup_is_kept_apart():
+    factor = dataclasses.replace(BELIEVED, measurement_sigma_factor=3.0)
+    one = case()
+    assert tuning.values_of(factor, ["star 1.sigma"], [one.record])["star 1.sigma"] == pytest.approx(3e-4)
+    a = tuning.fit(tuning.likelihood([one], factor, FREE), starts=1, intervals=False)
+    b = tuning.fit(tuning.likelihood([one], BELIEVED, FREE), starts=1, intervals=False)
+    assert a["star 1.sigma"].value == pytest.approx(b["star 1.sigma"].value, rel=1e-3)
+    assert a.setup.sigma["star 1"] * 3.0 == pytest.approx(a["star 1.sigma"].value)
+
+
+# ------------------------------------------------------------------------------------------- against a truth, held out
+
+
+@pytest.mark.parametrize("measure", ["likelihood", "rmse"])
+def test_the_gradient_against_a_truth_is_that_of_its_value(measure):
+    objective = tuning.error_objective([case(1), case(2)], BELIEVED, FREE, measure=measure)
+    point = objective.start + np.array([0.3, 0.5, -0.2, 0.1])
+    found = objective.derivatives(point)
+    expected = differences(lambda x: objective.minus_log(x)[0], point)
+    np.testing.assert_allclose(
+        found.score.sum(axis=0), expected, atol=3.0 * innovations.STEP * np.abs(found.information).max() + 1e-5
+    )
+
+
+def test_the_likelihood_of_the_errors_is_that_of_a_normal_vector():
+    from scipy.stats import multivariate_normal
+
+    from strapdown import consistency
+
+    one = case(1)
+    objective = tuning.error_objective([one], BELIEVED, FREE)
+    epochs = objective.epochs[0]
+    estimate = setup.run(one.record, BELIEVED, one.initial, full_covariance=True)
+    truth = one.record.truth
+    error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)[epochs]
+    expected = -sum(
+        multivariate_normal(np.zeros(6), P, allow_singular=True).logpdf(e)
+        for e, P in zip(error, estimate.covariance[epochs], strict=True)
+    )
+    constant = 0.5 * 6 * len(epochs) * np.log(2.0 * np.pi)
+    assert objective.derivatives(objective.start).value.sum() + constant == pytest.approx(expected, rel=1e-6)
+
+
+def test_the_size_of_the_error_does_not_know_a_common_scale():
+    objective = tuning.error_objective([case(1)], BELIEVED, ["filter.scale"], measure="rmse")
+    values = objective.minus_log(objective.start + np.array([[-1.0], [0.0], [1.0]]))
+    np.testing.assert_allclose(values, values[1], rtol=1e-7)
+
+
+def test_the_smallest_error_then_the_scale_of_the_innovations_make_a_filter():
+    """σ_v ten times too small: the RMS finds the ratio to the stars' σ, the innovations then the size of both."""
+    cases = [case(seed) for seed in range(3)]
+    off = tuning.with_values(BELIEVED, {"gyro.arw": 0.1 * ARW, "gyro.rrw": 10.0 * RRW})
+    smallest = tuning.fit(
+        tuning.error_objective(cases, off, ["gyro.arw", "gyro.rrw"], measure="rmse"), starts=1, intervals=False
+    )
+    scale = tuning.fit(tuning.likelihood(cases, smallest.setup, ["filter.scale"]), starts=1)["filter.scale"].value
+    found = tuning.rescaled(smallest, scale)
+    assert found["gyro.arw"].value == pytest.approx(scale * smallest["gyro.arw"].value)
+    assert found.setup.process_noise.angle_random_walk == pytest.approx(found["gyro.arw"].value)
+    compared = tuning.compare([case(seed) for seed in range(10, 14)], off, found.setup)
+    assert compared.after.attitude_rms < compared.before.attitude_rms
+    assert compared.after.nis == pytest.approx(1.0, abs=0.1)
+
+
+def test_against_a_truth_wrong_parameters_come_back():
+    cases = [case(seed) for seed in range(4)]
+    off = tuning.with_values(BELIEVED, {"gyro.arw": 10.0 * ARW, "star 1.sigma": 3e-5})
+    found = tuning.fit(
+        tuning.error_objective(cases, off, ["gyro.arw", "star 1.sigma"]), starts=2, factor=3.0, intervals=False
+    )
+    for name, true in (("gyro.arw", ARW), ("star 1.sigma", 1e-4)):
+        assert abs(np.log(found[name].value / true)) < max(4.0 * found[name].standard_error, 0.2)
+        assert found[name].standard_error < 0.4
+    held = [case(seed) for seed in range(10, 14)]
+    compared = tuning.compare(held, off, found.setup)
+    assert abs(compared.after.anees - 1.0) < 0.35
+    assert compared.after.attitude_rms < compared.before.attitude_rms
+
+
+def test_a_reference_attitude_beside_the_record_serves_as_truth():
+    one = case(1)
+    truth = one.record.truth
+    reference = truth.attitude.copy()
+    reference[:50] = np.nan
+    bare = dataclasses.replace(
+        one,
+        record=dataclasses.replace(one.record, truth=None),
+        true_attitude=reference,
+        judged=truth.attitude[:, 0] < 2.0,
+    )
+    objective = tuning.error_objective([bare], BELIEVED, FREE)
+    assert objective.epochs[0].min() >= 50
+    assert np.isfinite(objective.derivatives(objective.start).value).all()
+    compared = tuning.compare([bare], BELIEVED, BELIEVED)
+    assert np.isnan(compared.after.anees)
+    assert 0.0 < compared.after.attitude_rms < 1e-3
+    with pytest.raises(InputError, match="has no truth"):
+        tuning.error_objective([dataclasses.replace(bare, true_attitude=None)], BELIEVED, FREE)
+
+
+def test_a_split_by_time_tunes_on_the_beginning_and_judges_the_end():
+    one = case(1, duration=300.0)
+    (train,), (test,) = tuning.split([one], 0.25)
+    assert train.last == pytest.approx(225.0)
+    assert test.first > train.last
+    whole, early, late = (tuning.likelihood([part], BELIEVED, FREE) for part in (one, train, test))
+    point = whole.start + 0.3
+    assert early.minus_log(point)[0] + late.minus_log(point)[0] == pytest.approx(whole.minus_log(point)[0], rel=1e-12)
+    off = tuning.with_values(BELIEVED, {"gyro.arw": 10.0 * ARW, "star 2.sigma": 1e-3})
+    found = tuning.fit(tuning.likelihood([train], off, FREE), starts=1)
+    compared = tuning.compare([test], off, found.setup)
+    assert compared.better
+    low, high = compared.after.nis_bounds
+    assert low < compared.after.nis < high
+    assert not low < compared.before.nis < high
+    # The mean log likelihood is that of the very innovations held out.
+    number = sum(2 * int(np.sum(series.time > train.last)) for series in one.record.vectors)
+    expected = -tuning.likelihood([test], found.setup, FREE).minus_log(found.point)[0] / number - 0.5 * np.log(
+        2 * np.pi
+    )
+    assert compared.after.log_likelihood == pytest.approx(expected, rel=1e-9)
+    assert compared.after.judgements[0].verdict in ("consistent", "cannot tell")
+
+
+def test_a_split_by_record_holds_out_whole_ones():
+    cases = [case(seed, duration=50.0) for seed in range(5)]
+    train, test = tuning.split(cases, 0.4, "record")
+    assert (len(train), len(test)) == (3, 2)
+    with pytest.raises(InputError, match="leaves none"):
+        tuning.split(cases[:1], 0.4, "record")
+    with pytest.raises(InputError, match="between 0 and 1"):
+        tuning.split(cases, 1.0)
+
+
+# ------------------------------------------------------------------------------------------------------ where it starts
+
+
+def off_truth(record: ImuRecord, chosen: FilterSetup) -> float:
+    found = tuning.record_case(dataclasses.replace(record, truth=None), chosen).initial.attitude
+    return float(quaternion.angle_between(found, record.truth.attitude[0]))
+
+
+def test_the_first_measurements_show_where_it_starts():
+    assert off_truth(scenarios.simulate(scenario(), 1), BELIEVED) < 2e-3
+    record = every_kind()
+    by_attitude = dataclasses.replace(record, vectors=record.vectors[3:])
+    assert off_truth(by_attitude, KINDS) < 0.1
+    body = motion.ConstantRate(
+        rate=np.array([0.1, 0.2, -0.1]), initial_attitude=quaternion.exp(np.array([0.3, 0.2, 2.0]))
+    )
+    level = scenarios.Scenario(
+        motion=body,
+        gyro=gyro.GyroSpec(angle_random_walk=1e-5),
+        sensors=(
+            vectors.Accelerometer(name="up", sigma=1e-4, rate=2.0),
+            vectors.Magnetometer(
+                name="north", field_f=np.array([2e-5, 1e-5, -3e-5]), sigma=1e-9, rate=2.0, kind="heading"
+            ),
+        ),
+        rate=20.0,
+        duration=10.0,
+    )
+    assert off_truth(scenarios.simulate(level), BELIEVED) < 2e-3
+    blind = dataclasses.replace(record, vectors=record.vectors[:1], truth=None)
+    with pytest.raises(InputError, match="the first measurements do not give the attitude"):
+        tuning.record_case(blind, KINDS)
+
+
+# ------------------------------------------------------------------------------------------------------ planning
+
+
+def test_a_plan_foretells_the_standard_errors():
+    chosen = scenario(duration=600.0)
+    planned = tuning.plan(chosen, BELIEVED, FREE, lengths=[600.0, 150.0], records=3)
+    assert planned.lengths.tolist() == [150.0, 600.0]
+    found = tuning.fit(tuning.likelihood([case(9, duration=600.0)], BELIEVED, FREE), starts=1, intervals=False)
+    np.testing.assert_allclose(planned.errors[1], [one.standard_error for one in found.parameters], rtol=0.35)
+    np.testing.assert_allclose((planned.errors[0] / planned.errors[1])[[0, 2, 3]], 2.0, rtol=0.1)
+    assert planned.errors[0, 1] > 2.0 * planned.errors[1, 1]  # a slow noise needs time to show at all
+    np.testing.assert_allclose(planned.needed(planned.errors[1] / 2.0), 2400.0)
+    np.testing.assert_allclose(planned.values, [ARW, RRW, 1e-4, 2e-4])
+    # Along the motion of a record that exists it is the same.
+    again = tuning.plan(scenarios.simulate(chosen, 2), BELIEVED, FREE, lengths=[600.0], records=3)
+    np.testing.assert_allclose(again.errors[0], planned.errors[1], rtol=0.2)
+    with pytest.raises(InputError, match="lasts 600 s"):
+        tuning.plan(scenarios.simulate(chosen, 2), BELIEVED, FREE, lengths=[700.0])
+
+
+def test_a_record_simulated_again_is_one_that_the_filter_is_right_for():
+    record = every_kind()
+    squares, number = 0.0, 0
+    for seed in range(6):
+        again = tuning.simulated_again(record, KINDS, np.random.default_rng(seed))
+        one = tuning.record_case(again, KINDS, seed=seed)
+        estimate = setup.run(again, KINDS, one.initial)
+        squares += sum(float(innovation.nis.sum()) for innovation in estimate.innovations.values())
+        number += sum(innovation.innovation.size for innovation in estimate.innovations.values())
+    assert squares / number == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / number))
+
+
+def test_the_gyro_of_a_record_simulated_again_has_the_noise_of_its_setup():
+    """White noise, and of a bias that walks what its mean over an interval differs from that of its ends."""
+    record = axis_records(4000)[0]
+    for white, walk in ((1e-4, 0.0), (1e-9, 1e-3)):
+        noise = ProcessNoise(angle_random_walk=white, rate_random_walk=walk)
+        chosen = FilterSetup(process_noise=noise, attitude_sigma=1e-3, bias_sigma=1e-2)
+        again = tuning.simulated_again(record, chosen, np.random.default_rng(2))
+        bias = again.truth.bias
+        rest = again.increments - record.increments - 0.5 * (bias[1:] + bias[:-1]) * 0.5
+        assert np.mean(rest**2) == pytest.approx(white**2 * 0.5 + walk**2 * 0.5**3 / 12.0, rel=0.04)
+        assert np.mean(np.diff(bias, axis=0) ** 2) == pytest.approx(walk**2 * 0.5, rel=0.04)
+        series = again.vectors[0]
+        error = quaternion.log(quaternion.multiply(quaternion.conjugate(again.truth.attitude[1:]), series.attitude))
+        assert np.std(error) == pytest.approx(1e-6, rel=0.04)
+
+
+# ------------------------------------------------------------------------------------------------------ bad input
+
+
+@pytest.mark.parametrize(
+    ("free", "complaint"),
+    [
+        ([], "no parameter"),
+        (["gyro.awr"], "did you mean 'gyro.arw'"),
+        (["gyro.arw", "gyro.arw"], "twice"),
+        (["star 3.sigma"], "star 1.sigma"),
+        (["filter.scale", "gyro.arw"], "alone"),
+    ],
+)
+def test_bad_names_are_refused(free, complaint):
+    with pytest.raises(InputError, match=complaint):
+        tuning.likelihood([case()], BELIEVED, free)
+
+
+def test_other_bad_input_is_refused():
+    one = case()
+    with pytest.raises(InputError, match="no record"):
+        tuning.likelihood([], BELIEVED, FREE)
+    constant = dataclasses.replace(BELIEVED, process_noise=ProcessNoise(angle_random_walk=ARW, rate_random_walk=0.0))
+    with pytest.raises(InputError, match=r"gyro.rrw starts from 0"):
+        tuning.likelihood([one], constant, FREE)
+    with pytest.raises(InputError, match="no measurement between"):
+        tuning.likelihood([dataclasses.replace(one, first=1e6)], BELIEVED, FREE)
+    with pytest.raises(InputError, match="greater than 1"):
+        tuning.Prior(value=1.0, factor=1.0)
+    with pytest.raises(InputError, match="priors"):
+        tuning.fit(tuning.likelihood([one], BELIEVED, FREE), priors={"gyro.arv": tuning.Prior(value=1.0, factor=2.0)})
+    silent = dataclasses.replace(one.record.vectors[0], sigma=np.zeros(1))
+    record = dataclasses.replace(one.record, vectors=(silent, *one.record.vectors[1:]))
+    with pytest.raises(InputError, match="sigma is 0"):
+        tuning.values_of(BELIEVED, ["star 1.sigma"], [record])
+    assert own_sigma("star 2.sigma", [record]) == pytest.approx(2e-4)
+    assert tuning.unit_of("star 1.sigma", [record]).factor == units.ARCSECOND
+    assert fitting.random_starts(np.zeros(2), 3, 30.0, np.random.default_rng(0)).shape == (3, 2)

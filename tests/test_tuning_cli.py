@@ -1,0 +1,151 @@
+"""``strapdown tune`` as its users run it: files in, table and files out, mistakes told in one line."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+
+import numpy as np
+import pytest
+
+from strapdown import cli, gyro, motion, recordfiles, scenarios, setup, tuning, vectors
+from strapdown.setup import FilterSetup
+
+SCENARIO = scenarios.Scenario(
+    name="two stars",
+    motion=motion.ConstantRate(rate=np.array([0.01, 0.02, 0.05])),
+    gyro=gyro.GyroSpec(angle_random_walk=1e-4, rate_random_walk=3e-6, turn_on_bias_sigma=1e-5),
+    sensors=(
+        vectors.VectorSensor(name="sun", reference_f=np.array([1.0, 0.0, 0.0]), sigma=1e-4, rate=1.0),
+        vectors.VectorSensor(name="star", reference_f=np.array([0.0, 1.0, 1.0]), sigma=2e-4, rate=1.0),
+    ),
+    rate=4.0,
+    duration=300.0,
+)
+
+
+def run(monkeypatch, capsys, *arguments: object) -> tuple[int, str, str]:
+    monkeypatch.setattr(sys, "argv", ["strapdown", *map(str, arguments)])
+    status = 0
+    try:
+        cli.main()
+    except SystemExit as end:
+        status = int(end.code or 0)
+    told = capsys.readouterr()
+    return status, told.out, told.err
+
+
+@pytest.fixture
+def record(tmp_path):
+    path = tmp_path / "sat.h5"
+    recordfiles.write_record(path, scenarios.simulate(SCENARIO, 1), gyro_spec=SCENARIO.gyro)
+    return path
+
+
+@pytest.fixture
+def wrong(tmp_path):
+    """A filter wrong by ten."""
+    path = tmp_path / "wrong.toml"
+    believed = setup.matched(SCENARIO)
+    values = {"gyro.arw": 1e-3, "gyro.rrw": 3e-7, "sun.sigma": 1e-5, "star.sigma": 2e-3}
+    path.write_text(setup.to_toml(tuning.with_values(believed, values)), encoding="utf-8")
+    return path
+
+
+def test_tune_writes_the_filter_the_report_and_the_figures(monkeypatch, capsys, tmp_path, record, wrong):
+    out = tmp_path / "results" / "tuned.toml"
+    status, said, complaint = run(
+        monkeypatch, capsys, "tune", record, "--filter", wrong, "--holdout", 0.3, "--starts", 3, "-o", out
+    )
+    assert status == 0, complaint
+    assert "3 of 3 searches" in said
+    assert "On the data held out" in said
+    found = setup.read_setup(out)
+    assert isinstance(found, FilterSetup)
+    assert found.process_noise.angle_random_walk == pytest.approx(1e-4, rel=0.3)
+    assert found.sigma["star"] == pytest.approx(2e-4, rel=0.2)
+    content = json.loads(out.with_suffix(".json").read_text())
+    assert [one["name"] for one in content["parameters"]] == ["gyro.arw", "gyro.rrw", "sun.sigma", "star.sigma"]
+    assert content["innovations_fit"]
+    held = content["held_out"]
+    assert held["after"]["log_likelihood_per_innovation"] > held["before"]["log_likelihood_per_innovation"]
+    low, high = held["after"]["nis_bounds"]
+    assert low < held["after"]["nis_per_degree"] < high
+    for name in ("tuned-likelihood.png", "tuned-heldout.png"):
+        assert (out.parent / name).stat().st_size > 10_000
+
+
+def test_tune_against_the_truth_and_with_a_prior(monkeypatch, capsys, tmp_path, record, wrong):
+    out = tmp_path / "tuned.toml"
+    status, said, complaint = run(
+        monkeypatch, capsys, "tune", record, "--truth", "--free", "gyro.arw,star.sigma", "--starts", 1, "-o", out
+    )
+    assert status == 0, complaint
+    assert "gyro.arw" in said
+    assert set(setup.read_setup(out).sigma) == {"star"}
+    spec = tmp_path / "gyro.toml"
+    spec.write_text("[gyro]\nangle_random_walk_rad_per_sqrt_s = 1e-4\nrate_random_walk_rad_per_s_per_sqrt_s = 3e-6\n")
+    status, _, complaint = run(
+        monkeypatch, capsys, "tune", record, "--filter", wrong, "--prior", spec, "--prior-factor", 1.01, "-o", out
+    )
+    assert status == 0, complaint
+    assert setup.read_setup(out).process_noise.rate_random_walk == pytest.approx(3e-6, rel=0.03)
+
+
+def test_tune_by_the_size_of_the_error(monkeypatch, capsys, tmp_path, record, wrong):
+    out = tmp_path / "tuned.toml"
+    options = ("--filter", wrong, "--rmse", "--free", "gyro.arw,gyro.rrw", "--starts", 1, "--holdout", 0.4)
+    status, _, complaint = run(monkeypatch, capsys, "tune", record, *options, "-o", out)
+    assert status == 0, complaint
+    found = json.loads(out.with_suffix(".json").read_text())
+    held = found["held_out"]
+    assert held["after"]["attitude_rms_rad"] < held["before"]["attitude_rms_rad"]
+    assert setup.read_setup(out).measurement_sigma_factor != 1.0
+    told = {one["name"]: one["value"] for one in found["parameters"]}
+    assert setup.read_setup(out).process_noise.angle_random_walk == pytest.approx(told["gyro.arw"])
+
+
+def test_plan_tells_how_long_a_record_is_needed(monkeypatch, capsys, tmp_path, record):
+    status, said, complaint = run(monkeypatch, capsys, "tune", "--plan", record, "--length", "100,300")
+    assert status == 0, complaint
+    assert "100 s" in said
+    assert "10 % needs" in said
+    assert "star.sigma" in said
+    path = tmp_path / "two.toml"
+    path.write_text(scenarios.scenario_to_toml(dataclasses.replace(SCENARIO, duration=60.0)), encoding="utf-8")
+    status, said, complaint = run(monkeypatch, capsys, "tune", "--plan", path, "--free", "gyro.arw,sun.sigma")
+    assert status == 0, complaint
+    assert "60 s" in said
+    assert not (tmp_path / "filter.toml").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (("--free", "gyro.awr"), "did you mean 'gyro.arw'"),
+        (("--length", "100"), "--length is for --plan"),
+        (("--holdout", "1.5"), "between 0 and 1"),
+        (("--holdout", "0.3", "--holdout-by", "week"), "holdout-by 'week'"),
+        (("--out", "filter.json"), ".toml"),
+        (("--truth", "--spacing", "1"), "leave it away"),
+        (("--prior", "no-such-gyro"), "no-such-gyro"),
+        (("--integration", "five"), "five"),
+        (("--plan", "--length", "100;300"), "seconds with commas"),
+    ],
+)
+def test_mistakes_are_told_in_one_line(monkeypatch, capsys, tmp_path, record, arguments, complaint):
+    monkeypatch.chdir(tmp_path)
+    status, _, said = run(monkeypatch, capsys, "tune", record, *arguments)
+    assert status == 2
+    assert complaint in said.replace("\n", " ")
+    assert not (tmp_path / "filter.toml").exists()
+
+
+def test_a_record_that_does_not_tell_its_gyro_needs_a_filter(monkeypatch, capsys, tmp_path):
+    bare = tmp_path / "bare.h5"
+    recordfiles.write_record(bare, scenarios.simulate(SCENARIO, 1))
+    for more in ((), ("--plan",)):
+        status, _, said = run(monkeypatch, capsys, "tune", bare, *more, "-o", tmp_path / "f.toml")
+        assert status == 2
+        assert "--filter" in said
