@@ -11,6 +11,7 @@ from filterpy.kalman import KalmanFilter
 
 from strapdown import coning, consistency, gyro, mekf, motion, quaternion, records, vectors
 from strapdown.checks import InputError
+from strapdown.kernels import filter_loop
 from strapdown.mekf import ProcessNoise, StepFilter, initial_state
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Truth
@@ -314,7 +315,7 @@ def test_scaled_noise_reaches_every_kind():
     record = with_attitude_series(with_vector_series(simulate(scenario(duration=2.0), 1)))
     believed = replace(record, vectors=tuple(series.noise_scaled(3.0) for series in record.vectors))
     plain, scaled = mekf.schedule(record.vectors, 0.0, 2.0), mekf.schedule(believed.vectors, 0.0, 2.0)
-    attitude = plain.kind == mekf.filter_loop.ATTITUDE
+    attitude = plain.kind == filter_loop.ATTITUDE
     assert np.allclose(scaled.variance, 9.0 * plain.variance, rtol=1e-14)
     assert np.allclose(scaled.vector_b[attitude], 9.0 * plain.vector_b[attitude], rtol=1e-14)
     assert np.array_equal(scaled.vector_b[~attitude], plain.vector_b[~attitude])

@@ -1,0 +1,180 @@
+"""What the filter holds: process noise, state, where it starts, and the packing of a state for the kernels."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from strapdown import quaternion, wahba
+from strapdown.checks import Array, InputError, array, covariance, non_negative, positive, unit_quaternions
+from strapdown.records import ImuRecord
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProcessNoise:
+    """What the filter believes of the gyro."""
+
+    angle_random_walk: float
+    """σ_v, rad/√s; greater than zero."""
+    rate_random_walk: float
+    """σ_u, rad/s/√s; zero is a constant bias."""
+
+    def __post_init__(self) -> None:
+        """Check both."""
+        positive("angle_random_walk", self.angle_random_walk, unit="rad/√s")
+        non_negative("rate_random_walk", self.rate_random_walk, unit="rad/s/√s")
+
+
+@dataclass(frozen=True, kw_only=True)
+class State:
+    """Attitude, bias and the covariance of their error."""
+
+    attitude: Array
+    """q_fb (4,)."""
+    bias: Array
+    """Gyro bias (3,), rad/s."""
+    covariance: Array
+    """P (6, 6) of (δθ, δb): rad², rad²/s, (rad/s)²."""
+
+    def __post_init__(self) -> None:
+        """Check shapes, the norm and positive definiteness."""
+        object.__setattr__(self, "attitude", unit_quaternions("attitude", array("attitude", self.attitude, (4,))))
+        object.__setattr__(self, "bias", array("bias", self.bias, (3,)))
+        object.__setattr__(self, "covariance", covariance("covariance", self.covariance, 6))
+
+
+def initial_state(
+    attitude: ArrayLike, *, attitude_sigma: ArrayLike, bias_sigma: ArrayLike, bias: ArrayLike = (0.0, 0.0, 0.0)
+) -> State:
+    """Return a state with independent errors: ``attitude_sigma`` rad and ``bias_sigma`` rad/s, scalars or one an axis."""
+    sigma = np.concatenate([np.broadcast_to(attitude_sigma, 3), np.broadcast_to(bias_sigma, 3)]).astype(np.float64)
+    if not np.all(sigma > 0.0):
+        k = int(np.argmin(sigma > 0.0))
+        raise InputError(
+            f"{'attitude' if k < 3 else 'bias'}_sigma[{k % 3}] is {sigma[k]:g}; it must be greater than zero"
+        )
+    return State(attitude=np.asarray(attitude), bias=np.asarray(bias), covariance=np.diag(sigma**2))
+
+
+FIRST_SETS = 10
+"""Sets of first measurements that a start is tried from, one after the other, should one hold an outlier."""
+VERTICAL = math.radians(1.0)
+"""A reference so near the fixed z axis is the vertical, rad."""
+ONCE = 10.0
+"""The start is believed so many times less than the measurements it is made from, for the filter takes them in again."""
+
+
+def first_state(
+    record: ImuRecord, process_noise: ProcessNoise, *, bias_sigma: float, bias: ArrayLike = (0.0, 0.0, 0.0)
+) -> State:
+    """Return a state at the first edge from the first measurements: a measured attitude, or by Wahba's problem two directions or more.
+
+    Each is taken back to the first edge by the gyro. Its noise grows on the way by that of the gyro and of the bias; the attitude's σ is
+    ``ONCE`` times what all of that leaves, so that these measurements, which the filter takes in again, count once.
+
+    Parameters
+    ----------
+    record : ImuRecord
+    process_noise : ProcessNoise
+    bias_sigma : float
+        Standard deviation of the bias error, each axis, rad/s.
+    bias : array_like (3,)
+        Gyro bias, rad/s.
+
+    Raises
+    ------
+    InputError
+        If no measurement gives the attitude: fewer than two directions, all on one line, or none that fit together.
+    """
+    positive("bias_sigma", bias_sigma, unit="rad/s")
+    b = array("bias", bias, (3,))
+    problem = "the record holds no measurement that gives an attitude"
+    for k in range(FIRST_SETS):
+        try:
+            attitude, P = _attitude_of_set(record, process_noise, b, bias_sigma, k)
+        except InputError as error:
+            problem = problem if k else str(error)
+            continue
+        whole = np.zeros((6, 6))
+        whole[:3, :3] = ONCE**2 * P
+        whole[3:, 3:] = bias_sigma**2 * np.eye(3)
+        return State(attitude=attitude, bias=b, covariance=whole)
+    raise InputError(f"the first measurements do not give the attitude: {problem}; give the initial attitude")
+
+
+def _attitude_of_set(
+    record: ImuRecord, process_noise: ProcessNoise, bias: Array, bias_sigma: float, k: int
+) -> tuple[Array, Array]:
+    """Return attitude and covariance at the first edge from the k-th usable measurement of each sensor."""
+    body, fixed, sigmas, headings = [], [], [], []
+    for series in record.vectors:
+        content = series.vector_b if series.attitude is None else series.attitude
+        inside = (series.time >= record.time[0]) & (series.time <= record.time[-1]) & np.isfinite(content).all(axis=1)
+        if np.sum(inside) <= k:
+            continue
+        one = series.taken(np.flatnonzero(inside)[k : k + 1])
+        turn = _turn_until(record, bias, float(one.time[0]))
+        span = one.time[0] - record.time[0]
+        grown = process_noise.angle_random_walk**2 * span + (bias_sigma * span) ** 2
+        if one.attitude is not None:
+            attitude = quaternion.multiply(one.attitude[0], quaternion.conjugate(turn))
+            R = quaternion.to_matrix(turn)
+            return attitude, R @ one.covariances[0] @ R.T + grown * np.eye(3)
+        reference = one.references_f[0]
+        length = float(np.linalg.norm(reference))
+        body.append(quaternion.rotate(turn, one.vector_b[0] / np.linalg.norm(one.vector_b[0])))
+        fixed.append(reference / length)
+        scale = length if one.kind == "vector" else 1.0
+        sigmas.append(float(np.hypot(one.sigma[0] / scale, np.sqrt(grown))))
+        if one.kind == "heading":
+            headings.append((body.pop(), fixed.pop(), sigmas.pop()))
+    if len(body) == 1 and headings and abs(fixed[0][2]) > np.cos(VERTICAL):
+        # Beside the vertical a heading is a direction: the horizontal part of its vector.
+        seen, reference, sigma = headings[0]
+        body.append(seen - body[0] * (seen @ body[0]))
+        fixed.append(reference - fixed[0] * (reference @ fixed[0]))
+        sigmas.append(sigma)
+    if len(body) < 2:
+        raise InputError(
+            f"two directions are needed, or the vertical and a heading, and it has {len(body)} of directions "
+            f"and {len(headings)} of headings"
+        )
+    solution = wahba.solve(np.array(body), np.array(fixed), np.array(sigmas))
+    return solution.attitude, solution.covariance
+
+
+def _turn_until(record: ImuRecord, bias: Array, time: float) -> Array:
+    """Return the turn q from the first edge to a time, by the gyro."""
+    k = int(np.searchsorted(record.time, time, side="right")) - 1
+    dt = np.diff(record.time[: k + 2])
+    steps = record.increments[: k + 1] - bias * dt[:, None]
+    if k < len(record.increments):
+        # The last interval is entered only so far.
+        steps[k] *= (time - record.time[k]) / dt[k]
+    turns = quaternion.exp(steps)
+    while len(turns) > 1:  # pairs of neighbours
+        odd = turns[len(turns) // 2 * 2 :]
+        turns = np.concatenate([quaternion.multiply(turns[0 : len(turns) - len(odd) : 2], turns[1::2]), odd])
+    return quaternion.normalize(turns[0])
+
+
+# Blocks of P as the kernels hold them: rows and columns of A = P_θθ (upper), B = P_θb, C = P_bb (upper).
+_UPPER = ((0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2))
+_ROWS = np.array([*_UPPER[0], *np.repeat(range(3), 3), *(3 + np.array(_UPPER[0]))])
+_COLUMNS = np.array([*_UPPER[1], *(3 + np.tile(range(3), 3)), *(3 + np.array(_UPPER[1]))])
+
+
+def pack(attitude: Array, bias: Array, covariance: Array) -> Array:
+    """Return a state as the kernels' 28 numbers: q, b, and P in blocks."""
+    return np.concatenate([attitude, bias, covariance[_ROWS, _COLUMNS]])
+
+
+def covariance_matrices(blocks: Array) -> Array:
+    """Return whole matrices P (..., 6, 6) of the kernels' 21 numbers (..., 21)."""
+    P = np.empty((*blocks.shape[:-1], 6, 6))
+    P[..., _ROWS, _COLUMNS] = blocks
+    P[..., _COLUMNS, _ROWS] = blocks
+    return P
