@@ -1,0 +1,186 @@
+"""Verdicts: whether a filter may be believed, and which conventions a recording follows."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.text import Text
+
+from strapdown.cli.terminal import app, console, show, table, written
+
+if TYPE_CHECKING:
+    from strapdown.consistency import Judgement
+
+CONSISTENT, NOT, CANNOT_TELL = 0, 1, 2
+"""Exit status of a verdict. Bad input ends with 2 too, and an error on standard error."""
+
+
+@app.command()
+def check(
+    result: Annotated[
+        Path, typer.Argument(help="estimate.h5 of `strapdown estimate`, or the HDF5 file of `strapdown montecarlo`.")
+    ],
+    probability: Annotated[
+        float, typer.Option(help="A right filter is not called wrong with at least this, all tests together.")
+    ] = 0.99,
+    record: Annotated[
+        Path | None, typer.Option(help="Record that an estimate was made from: with --filter, likely causes are named.")
+    ] = None,
+    filter_file: Annotated[
+        Path | None, typer.Option("--filter", help="TOML with the table named filter that the estimate was made with.")
+    ] = None,
+    json: Annotated[Path | None, typer.Option("--json", help="File for all statistics.")] = None,
+) -> None:
+    """Tell whether the filter may be believed: exit status 0 consistent, 1 not, 2 cannot tell (or bad input)."""
+    from strapdown import consistency, records
+    from strapdown.checks import InputError
+    from strapdown.files import output_file, write_json
+
+    sources = [path for path in (result, record, filter_file) if path is not None]
+    if json is not None:
+        output_file("json", json, (".json",), *sources)
+    if (record is None) != (filter_file is None):
+        raise InputError("--record and --filter go together: both are needed to look for causes")
+    kind = _kind(result)
+    content: dict[str, Any] = {"source": result.name, "kind": kind}
+    if kind == "strapdown montecarlo":
+        from strapdown.montecarlo import campaign
+
+        if record is not None:
+            raise InputError("--record and --filter go with an estimate; of a Monte Carlo replay a run first")
+        held = campaign.read(result)
+        if held.statistics is None:
+            raise InputError(f"{result} holds no finished run yet; resume it with `strapdown montecarlo --resume`")
+        console.print(f"{result.name}: {held.statistics.runs} of {held.runs} runs, machine {held.machine}.")
+        judgement = consistency.judge_runs(held.statistics, probability=probability)
+    elif kind == "strapdown estimate":
+        estimate = records.read_estimate(result)
+        truth = records.read_truth(result)
+        console.print(
+            f"{result.name}: {len(estimate.time)} epochs over {estimate.time[-1] - estimate.time[0]:.6g} s, "
+            f"{sum(len(one.time) for one in estimate.innovations.values())} measurements, "
+            f"{'no truth' if truth is None else 'with its truth'}."
+        )
+        judgement = consistency.judge(estimate, truth, probability=probability)
+    else:
+        raise InputError(
+            f"{result} is {f'a {kind}' if kind else 'HDF5 of another program'}; pass what `strapdown estimate` or "
+            "`strapdown montecarlo` wrote"
+        )
+    content.update(judgement.summary())
+    _show(judgement)
+    if record is not None and filter_file is not None:
+        content["diagnosis"] = _diagnosed(result, record, filter_file, probability)
+    if json is not None:
+        write_json(json, content)
+        written(json)
+    raise typer.Exit({"consistent": CONSISTENT, "not consistent": NOT}.get(judgement.verdict, CANNOT_TELL))
+
+
+def _kind(path: Path) -> str:
+    """Return what a result file says it is; empty if it does not."""
+    import h5py
+
+    from strapdown.checks import InputError
+
+    if not path.is_file():
+        raise InputError(f"{path} does not exist; check the path")
+    try:
+        with h5py.File(path, "r") as file:
+            return str(file.attrs.get("kind", ""))
+    except OSError as error:
+        raise InputError(f"{path} cannot be read as HDF5 ({error}); the file is truncated or of another kind") from None
+
+
+def _show(judgement: Judgement) -> None:
+    rows = table(
+        "Statistics of the filter against what they are of a right one",
+        "statistic",
+        "of",
+        "value",
+        f"{100.0 * judgement.probability:g} % bounds",
+        "p-value",
+        "samples",
+        "",
+        left=2,
+    )
+    for one in judgement.findings:
+        bounds = f"{one.low:.4g} to {one.high:.4g}" if math.isfinite(one.low) else ""
+        mark = Text("FAIL", style="red") if one.rejected else Text("pass", style="green")
+        rows.add_row(one.name, one.of, f"{one.value:.4g}", bounds, f"{one.p_value:.2g}", f"{one.samples:.4g}", mark)
+    if judgement.findings:
+        show(rows)
+        console.print(
+            "Each p-value is that of its statistic alone; pass and FAIL take all together "
+            f"(a right filter fails with at most {100.0 * (1.0 - judgement.probability):.2g} %). NIS and NEES are per degree of freedom.",
+            soft_wrap=True,
+        )
+    for limit in judgement.limits:
+        console.print(f"Note: {limit}.", soft_wrap=True)
+    console.print(judgement.words, soft_wrap=True)
+
+
+def _diagnosed(result: Path, record: Path, filter_file: Path, probability: float) -> dict[str, Any]:
+    import numpy as np
+
+    from strapdown import diagnosis, mekf, recordfiles, records
+    from strapdown.setup import read_setup
+
+    estimate = records.read_estimate(result)
+    P = np.diag(estimate.variance[0]) if estimate.covariance is None else estimate.covariance[0]
+    initial = mekf.State(attitude=estimate.attitude[0], bias=estimate.bias[0], covariance=P)
+    found = diagnosis.diagnose(
+        recordfiles.read_record(record), read_setup(filter_file), initial, probability=probability
+    )
+    rows = table("Causes by what they would explain", "cause", "of", "gain", "ln p", "", left=2)
+    for cause in found.considered[:8]:
+        mark = Text("likely", style="red") if cause in found.causes else Text("no")
+        rows.add_row(cause.name, cause.of, f"{cause.gain:.4g}", f"{cause.log_p:.4g}", mark)
+    show(rows)
+    console.print(found.words, soft_wrap=True)
+    return found.summary()
+
+
+@app.command()
+def doctor(
+    recording: Annotated[
+        Path, typer.Argument(help="BROAD HDF5 file, or CSV with time, gx, gy, gz[, ax, ay, az[, mx, my, mz]].")
+    ],
+    gyro_unit: Annotated[str | None, typer.Option(help="Unit of a CSV file's gyro: rad/s or deg/s.")] = None,
+    accelerometer_unit: Annotated[
+        str | None, typer.Option(help="Unit of a CSV file's accelerometer: m/s2 or g.")
+    ] = None,
+    time_unit: Annotated[str | None, typer.Option(help="Unit of a CSV file's time: s, ms, us or ns.")] = None,
+    json: Annotated[Path | None, typer.Option("--json", help="File for the explanations and their scores.")] = None,
+) -> None:
+    """Tell which conventions a recording follows, by trying the others: exit status 0 as told, 1 wrong, 2 cannot tell."""
+    from strapdown import doctor as conventions
+    from strapdown import recordings
+    from strapdown.files import output_file, write_json
+
+    if json is not None:
+        output_file("json", json, (".json",), recording)
+    given = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
+    source = recordings.read(recording, units={name: unit for name, unit in given.items() if unit})
+    found = conventions.examine(source)
+    if found.candidates:
+        names = list(found.candidates[0].misfit)
+        rows = table(
+            "Explanations: score (log-likelihood) and misfit, 0 perfect, 1 unrelated, 2 opposite",
+            "explanation",
+            "score",
+            *names,
+        )
+        for one in found.candidates[:8]:
+            rows.add_row(one.words, f"{one.score:.1f}", *(f"{one.misfit[name]:.3f}" for name in names))
+        show(rows)
+    for note in found.notes:
+        console.print(f"Note: {note}.", soft_wrap=True)
+    console.print(f"{found.source}: {found.words}", soft_wrap=True)
+    if json is not None:
+        write_json(json, found.summary())
+        written(json)
+    raise typer.Exit({"as told": CONSISTENT, "wrong convention": NOT}.get(found.verdict, CANNOT_TELL))

@@ -1,0 +1,78 @@
+"""A cause with its evidence, and a diagnosis."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from strapdown.checks import Array
+from strapdown.consistency import Judgement
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cause:
+    """One hypothesis with the θ that fits best."""
+
+    name: str
+    """What is wrong: "R too small", "R too large", "Q too small", "Q too large", "outliers", "time offset", "hard iron", "body-fixed bias",
+    "misalignment", "scale factor", "initial attitude", "initial bias", "commutation", "wrong convention"."""
+    of: str
+    """Of what: a sensor, "gyro", …"""
+    estimate: Array
+    """θ (k,)."""
+    standard_error: Array
+    """Of θ (k,); NaN where there is none."""
+    unit: str
+    gain: float
+    """Twice the log-likelihood gained."""
+    log_p: float
+    """Natural logarithm of the probability that a right filter gains as much."""
+    words: str
+    """What it says, with its size."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Diagnosis:
+    """Likely causes, the likeliest first, and the evidence."""
+
+    causes: tuple[Cause, ...]
+    """Those that are significant, all hypotheses taken together. After the first, others may only mirror it: correct it and look again."""
+    considered: tuple[Cause, ...]
+    """All hypotheses, by rank."""
+    judgement: Judgement
+    """What the statistics say of the filter as it is."""
+    probability: float
+    """Probability that no cause is named of a right filter, at least."""
+
+    @property
+    def words(self) -> str:
+        """The causes, for people."""
+        if not self.causes:
+            return "No cause among those considered is significant."
+        lines = [f"Likeliest cause: {self.causes[0].words}"]
+        lines += [f"  then, unless it mirrors the first: {cause.words}" for cause in self.causes[1:4]]
+        return "\n".join(lines)
+
+    def summary(self) -> dict[str, Any]:
+        """Return everything as plain values for JSON."""
+        number = lambda x: float(x) if math.isfinite(x) else None  # noqa: E731
+
+        def row(cause: Cause) -> dict[str, Any]:
+            return {
+                "name": cause.name,
+                "of": cause.of,
+                "estimate": [number(x) for x in cause.estimate],
+                "standard_error": [number(x) for x in cause.standard_error],
+                "unit": cause.unit,
+                "gain": number(cause.gain),
+                "log_p": number(cause.log_p),
+                "words": cause.words,
+                "significant": cause in self.causes,
+            }
+
+        return {
+            "probability": self.probability,
+            "causes": [row(cause) for cause in self.considered],
+            "judgement": self.judgement.summary(),
+        }

@@ -1,0 +1,246 @@
+"""What may be wrong: each hypothesis as a change of the record or of the filter's beliefs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import cast
+
+import numpy as np
+
+from strapdown import mekf, quaternion
+from strapdown.checks import Array
+from strapdown.diagnosis.causes import Cause
+from strapdown.diagnosis.likelihood import Hypothesis, Model, Run, log_p, run
+from strapdown.doctor import ATTITUDE_READINGS, AXES, axes_words
+from strapdown.vectors import VectorMeasurements
+
+
+def shown(theta: Array, factor: float = 1.0) -> str:
+    """Return numbers in brackets, three digits each."""
+    return "[" + ", ".join(f"{x * factor:.3g}" for x in theta) + "]"
+
+
+def mean_hypotheses(model: Model) -> Iterator[Hypothesis]:
+    """Yield what shifts innovations."""
+    record = model.record
+    interval = float(np.median(np.diff(record.time)))
+    seen = [series for series in record.vectors if len(series.time)]
+    for series in seen:
+        yield _time_offset(series.sensor, (series.sensor,), interval)
+        if series.kind != "attitude":
+            yield _body_fixed(series)
+        if len(seen) > 1 or series.kind == "attitude":
+            yield _misalignment(series)
+    if len(seen) > 1:
+        yield _time_offset("gyro", tuple(series.sensor for series in seen), interval)
+    yield Hypothesis(
+        name="scale factor",
+        of="gyro",
+        unit="1",
+        steps=np.full(3, 1e-5),
+        limit=0.2,
+        apply=lambda m, theta: replace(m, record=replace(m.record, increments=m.record.increments / (1.0 + theta))),
+        words=lambda theta, _: f"the gyro's scale factor is off by {shown(theta, 1e6)} ppm",
+    )
+    for part, unit, rows in (("attitude", "rad", slice(0, 3)), ("bias", "rad/s", slice(3, 6))):
+        sigma = np.sqrt(np.diag(model.initial.covariance)[rows])
+        yield Hypothesis(
+            name=f"initial {part}",
+            of="start",
+            unit=unit,
+            steps=1e-3 * sigma,
+            limit=np.pi,
+            apply=lambda m, theta, part=part: replace(m, initial=_moved(m.initial, part, theta)),  # type: ignore[misc]
+            words=lambda theta, _, part=part, unit=unit, sigma=sigma: (  # type: ignore[misc]
+                f"the {part} at the start was off by {shown(theta)} {unit}, {np.max(np.abs(theta / sigma)):.3g} times its σ: "
+                "the initial covariance is too small"
+            ),
+        )
+
+
+def _moved(state: mekf.State, part: str, theta: Array) -> mekf.State:
+    if part == "attitude":
+        return replace(state, attitude=quaternion.normalize(quaternion.multiply(state.attitude, quaternion.exp(theta))))
+    return replace(state, bias=state.bias + theta)
+
+
+def _time_offset(of: str, sensors: tuple[str, ...], interval: float) -> Hypothesis:
+    sign = -1.0 if of == "gyro" else 1.0  # a gyro whose stamps are late is the other sensors' being early
+
+    def apply(model: Model, theta: Array) -> Model:
+        for sensor in sensors:
+            model = model.with_series(sensor, lambda s: replace(s, time=s.time - sign * float(theta[0]), arrival=None))
+        return model
+
+    return Hypothesis(
+        name="time offset",
+        of=of,
+        unit="s",
+        steps=np.array([0.02 * interval]),
+        limit=2.0,
+        apply=apply,
+        words=lambda theta, spread: (
+            f"the time stamps of {of} are {abs(theta[0]):.4g} ± {spread[0]:.2g} s too {'late' if theta[0] > 0.0 else 'early'}"
+        ),
+    )
+
+
+def _body_fixed(series: VectorMeasurements) -> Hypothesis:
+    magnetic = "mag" in series.sensor.lower()
+
+    def change(old: VectorMeasurements, theta: Array) -> VectorMeasurements:
+        if old.kind == "vector":
+            length = np.linalg.norm(old.references_f, axis=1, keepdims=True)
+            return replace(old, vector_b=old.vector_b - theta * length)
+        # The noise is scaled as the vectors are, or taking off the direction itself would look like less noise.
+        length = np.linalg.norm(old.vector_b - theta, axis=1, keepdims=True)
+        moved = replace(old, vector_b=(old.vector_b - theta) / length)
+        return moved.noise_scaled(float(np.nanmean(1.0 / length)))
+
+    name = "hard iron" if magnetic else "body-fixed bias"
+    return Hypothesis(
+        name=name,
+        of=series.sensor,
+        unit="1 (length of the reference)",
+        steps=np.full(3, 1e-5),
+        limit=0.5,
+        apply=lambda model, theta: model.with_series(series.sensor, lambda s: change(s, theta)),
+        words=lambda theta, _: (
+            f"{series.sensor} has {'a hard iron' if magnetic else 'a constant error in body axes'} of {shown(theta)} times its reference"
+        ),
+    )
+
+
+def _misalignment(series: VectorMeasurements) -> Hypothesis:
+    def change(old: VectorMeasurements, theta: Array) -> VectorMeasurements:
+        turn = quaternion.exp(theta)
+        if old.attitude is not None:
+            return replace(
+                old,
+                attitude=quaternion.normalize(quaternion.multiply(old.attitude, quaternion.conjugate(turn))),
+            )
+        return replace(old, vector_b=old.vector_b @ quaternion.to_matrix(turn).T)  # rows of NaN pass
+
+    return Hypothesis(
+        name="misalignment",
+        of=series.sensor,
+        unit="rad",
+        steps=np.full(3, 1e-5),
+        limit=0.35,
+        apply=lambda model, theta: model.with_series(series.sensor, lambda s: change(s, theta)),
+        words=lambda theta, _: f"{series.sensor} is turned in the body by {shown(-theta, 1e3)} mrad",
+    )
+
+
+def noise_hypotheses(model: Model) -> Iterator[Hypothesis]:
+    """Yield what scales them."""
+
+    def factor(theta: Array) -> float:
+        return float(np.exp(theta[0]))
+
+    for series in model.record.vectors:
+        if len(series.time) == 0:
+            continue
+        name = series.sensor
+        yield Hypothesis(
+            name="R",
+            of=name,
+            unit="ln of the factor on σ",
+            steps=np.array([0.1]),
+            limit=6.0,
+            apply=lambda m, theta, name=name: m.with_series(name, lambda s: s.noise_scaled(factor(theta))),  # type: ignore[misc]
+            words=lambda theta, _, name=name: (
+                f"the noise of {name} is {factor(theta):.3g} times what the filter believes"
+            ),  # type: ignore[misc]
+        )
+    for term, words in (
+        ("angle_random_walk", "angle random walk"),
+        ("rate_random_walk", "rate random walk of the bias"),
+    ):
+        if getattr(model.noise, term) > 0.0:
+            yield Hypothesis(
+                name="Q",
+                of=words,
+                unit="ln of the factor on σ",
+                steps=np.array([0.2]),
+                limit=6.0,
+                apply=lambda m, theta, term=term: replace(  # type: ignore[misc]
+                    m, noise=replace(m.noise, **{term: getattr(m.noise, term) * factor(theta)})
+                ),
+                words=lambda theta, _, words=words: (  # type: ignore[misc]
+                    f"the gyro's {words} is {factor(theta):.3g} times what the filter believes"
+                ),
+            )
+
+
+MOST_OUTLIERS = 0.25
+
+
+def outliers(sensor: str, white: Array) -> Cause:
+    """Return how much better a mixture of two normals explains the innovations: the contaminated normal of Tukey (1960), by EM.
+
+    At least three times the noise and at most a quarter of the samples, or it would be a larger noise.
+    """
+    square, degrees = np.sum(white**2, axis=1), white.shape[1]
+    share, spread = 0.02, 25.0
+    gain = 0.0
+    for _ in range(60):
+        # Log of the outliers' density over that of the others.
+        ratio = 0.5 * square * (1.0 - 1.0 / spread) - 0.5 * degrees * math.log(spread)
+        log_odds = ratio + math.log(share) - math.log1p(-share)
+        belongs = np.where(log_odds > 0.0, 1.0, np.exp(np.minimum(log_odds, 0.0))) / (1.0 + np.exp(-np.abs(log_odds)))
+        share = float(np.clip(belongs.mean(), 1e-4, MOST_OUTLIERS))
+        spread = float(max(np.sum(belongs * square) / max(degrees * belongs.sum(), 1e-12), 9.0))
+    ratio = 0.5 * square * (1.0 - 1.0 / spread) - 0.5 * degrees * math.log(spread)
+    gain = 2.0 * float(np.sum(np.logaddexp(math.log1p(-share), ratio + math.log(share))))
+    return Cause(
+        name="outliers",
+        of=sensor,
+        estimate=np.array([share, math.sqrt(spread)]),
+        standard_error=np.full(2, np.nan),
+        unit="fraction, factor on σ",
+        gain=gain,
+        log_p=log_p(gain, 2),
+        words=f"{100.0 * share:.2g} % of the measurements of {sensor} are outliers of {math.sqrt(spread):.3g} σ",
+    )
+
+
+def conventions(model: Model, base: Run) -> list[Cause]:
+    """Return what each discrete change of axes, units or quaternion convention gains."""
+    trials: list[tuple[str, str, Model]] = []
+    for matrix in AXES[1:]:
+        turned = replace(model, record=replace(model.record, increments=model.record.increments @ matrix.T))
+        trials.append(("gyro", f"axes should be read as ({axes_words(matrix)})", turned))
+    for factor, unit in ((180.0 / np.pi, "57.3 times more"), (np.pi / 180.0, "57.3 times less")):
+        scaled = replace(model, record=replace(model.record, increments=model.record.increments * factor))
+        trials.append(("gyro", f"turns {unit} than it says (rad for deg?)", scaled))
+    for series in model.record.vectors:
+        name = series.sensor
+        if series.attitude is not None:
+            for words, change in ATTITUDE_READINGS.items():
+                other = model.with_series(name, lambda s, c=change: replace(s, attitude=c(cast(Array, s.attitude))))  # type: ignore[misc]
+                trials.append((name, f"its quaternions are {words}", other))
+            continue
+        for matrix in AXES[1:]:
+            other = model.with_series(name, lambda s, M=matrix: replace(s, vector_b=s.vector_b @ M.T))  # type: ignore[misc]
+            trials.append((name, f"axes should be read as ({axes_words(matrix)})", other))
+    causes = []
+    penalty = math.log(len(trials))
+    for of, words, changed in trials:
+        gain = run(changed).gain_over(base)
+        causes.append(
+            Cause(
+                name="wrong convention",
+                of=of,
+                estimate=np.empty(0),
+                standard_error=np.empty(0),
+                unit="",
+                gain=gain,
+                log_p=min(0.0, log_p(gain, 1) + penalty),
+                words=f"{of}: {words}",
+            )
+        )
+    causes.sort(key=lambda cause: -cause.gain)
+    return causes[:3]

@@ -1,0 +1,172 @@
+"""The likelihood of a record under a hypothesis, and the parameters at which it is largest."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from strapdown import mekf
+from strapdown.checks import Array
+from strapdown.diagnosis.causes import Cause
+from strapdown.mekf import ProcessNoise
+from strapdown.records import ImuRecord
+from strapdown.vectors import VectorMeasurements
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Model:
+    """A record with what the filter believes of it: what a run needs."""
+
+    record: ImuRecord
+    noise: ProcessNoise
+    initial: mekf.State
+
+    def with_series(self, sensor: str, change: Callable[[VectorMeasurements], VectorMeasurements]) -> Model:
+        """Return the model with one sensor's series changed."""
+        vectors = tuple(change(series) if series.sensor == sensor else series for series in self.record.vectors)
+        return replace(self, record=replace(self.record, vectors=vectors))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Run:
+    """Innovations of one run, in the order of the record's measurements whether or not they were used; NaN where not."""
+
+    white: Array
+    log_variance: Array
+
+    def gain_over(self, other: Run) -> float:
+        """Twice the log-likelihood gained over another run, on the measurements that both used."""
+        own, theirs = self.white**2 + self.log_variance, other.white**2 + other.log_variance
+        return float(np.nansum(theirs - own))
+
+    def closer_than(self, other: Run) -> float:
+        """The same, of what shifts innovations and leaves their variances: a change of the data is no gain in their density."""
+        return float(np.nansum(other.white**2 - self.white**2))
+
+
+def run(model: Model) -> Run:
+    """Return the innovations of a model's filter."""
+    estimate = mekf.run(model.record, model.noise, model.initial, every=len(model.record.increments))
+    white, log_variance = [], []
+    for series in model.record.vectors:
+        innovations = estimate.innovations[series.sensor]
+        content = series.vector_b if series.attitude is None else series.attitude
+        used = (series.time >= model.record.time[0]) & (series.time <= model.record.time[-1])
+        used &= np.isfinite(content).all(axis=1)
+        rows = np.full((len(series.time), innovations.innovation.shape[1]), np.nan)
+        logs = rows.copy()
+        rows[used], logs[used] = innovations.whitened, np.log(innovations.variance)
+        white.append(rows.ravel())
+        log_variance.append(logs.ravel())
+    return Run(white=np.concatenate(white), log_variance=np.concatenate(log_variance))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Hypothesis:
+    """A family of models with parameters θ, θ = 0 being the filter as it is."""
+
+    name: str
+    of: str
+    unit: str
+    steps: Array
+    """Differences by which derivatives are taken (k,)."""
+    limit: float
+    """Largest |θ| that is sensible."""
+    apply: Callable[[Model, Array], Model] = field(repr=False)
+    words: Callable[[Array, Array], str] = field(repr=False)
+
+
+def log_p(gain: float, degrees: int) -> float:
+    """Return the natural logarithm of the upper tail of χ²."""
+    from scipy.stats import chi2
+
+    if gain <= 0.0 or not math.isfinite(gain):
+        return 0.0
+    if gain > 1e3:  # the tail's leading terms, where the function underflows
+        half = 0.5 * gain
+        return -half + (0.5 * degrees - 1.0) * math.log(half) - math.lgamma(0.5 * degrees)
+    return float(chi2.logsf(gain, degrees))
+
+
+def by_mean(model: Model, base: Run, hypothesis: Hypothesis) -> Cause:
+    """Return the best θ by Gauss–Newton on the whitened innovations."""
+    k = len(hypothesis.steps)
+    prior = (3.0 / hypothesis.limit) ** 2  # keeps where it is what hardly shows
+    theta, current, gain = np.zeros(k), base, 0.0
+    spread = np.full(k, np.nan)
+    for iteration in range(4):
+        columns = []
+        for j, step in enumerate(hypothesis.steps):
+            shifted = run(hypothesis.apply(model, theta + step * np.eye(k)[j]))
+            columns.append((shifted.white - current.white) / step)
+        J = np.stack(columns, axis=1)
+        common = np.isfinite(J).all(axis=1) & np.isfinite(current.white)
+        J, z = J[common], current.white[common]
+        information = J.T @ J + np.eye(k) * prior
+        move = -np.linalg.solve(information, J.T @ z + prior * theta)
+        if iteration == 0:
+            spread = np.sqrt(np.diag(np.linalg.inv(information)))
+        promised = float(move @ information @ move)
+        for _ in range(5):
+            there = np.clip(theta + move, -hypothesis.limit, hypothesis.limit)
+            trial = run(hypothesis.apply(model, there))
+            better = trial.closer_than(base)
+            if better > gain or promised < 4.0:
+                break
+            move = 0.4 * move
+        rise = better - gain
+        if rise <= 0.0:
+            break
+        theta, current, gain = there, trial, better
+        if rise < 0.5 or gain < 3.0:
+            break
+    return Cause(
+        name=hypothesis.name,
+        of=hypothesis.of,
+        estimate=theta,
+        standard_error=spread,
+        unit=hypothesis.unit,
+        gain=gain,
+        log_p=log_p(gain, k),
+        words=hypothesis.words(theta, spread),
+    )
+
+
+def by_variance(model: Model, base: Run, hypothesis: Hypothesis) -> Cause:
+    """Return the best factor by parabolas through three points."""
+    step = float(hypothesis.steps[0])
+    known: dict[float, float] = {0.0: 0.0}
+
+    def gain(x: float) -> float:
+        if x not in known:
+            known[x] = run(hypothesis.apply(model, np.array([x]))).gain_over(base)
+        return known[x]
+
+    x, spread = 0.0, math.nan
+    for _ in range(12):
+        low, middle, high = gain(x - step), gain(x), gain(x + step)
+        slope, curvature = (high - low) / (2.0 * step), (high - 2.0 * middle + low) / step**2
+        if curvature < 0.0:
+            spread = math.sqrt(-2.0 / curvature)
+            move = -slope / curvature
+        else:
+            move = math.copysign(1.0, slope)
+        move = min(max(move, -1.0), 1.0)
+        if abs(move) < 0.3 * (spread if math.isfinite(spread) else 0.1) or abs(x + move) > hypothesis.limit:
+            break
+        x += move
+    x = max(known, key=lambda point: known[point])
+    best = known[x]
+    return Cause(
+        name=f"{hypothesis.name} too {'small' if x > 0.0 else 'large'}",
+        of=hypothesis.of,
+        estimate=np.array([x]),
+        standard_error=np.array([spread]),
+        unit=hypothesis.unit,
+        gain=best,
+        log_p=log_p(best, 1),
+        words=hypothesis.words(np.array([x]), np.array([spread])),
+    )

@@ -1,0 +1,221 @@
+"""Recordings with one convention broken: the doctor names it; whole ones it calls as told; poor ones it does not call wrong."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+
+from strapdown import cli, doctor, motion, quaternion, recordings, vectors
+from strapdown.checks import InputError
+from strapdown.doctor import AXES, FRAMES
+from strapdown.recordings import Recording
+
+EAST_NORTH_UP_FIELD = np.array([0.0, 18e-6, -45e-6])
+
+
+def simulated(seed: int = 0, *, duration: float = 60.0, amplitude: float = 1.0, reference: bool = True) -> Recording:
+    """A hand-held motion with the noise and the bias of a consumer sensor, and accelerations of a hand."""
+    random = np.random.default_rng(seed)
+    waves = [
+        motion.Harmonic(amplitude=amplitude * random.uniform(-1.5, 1.5, 3), frequency=f, phase=random.uniform(0.0, 6.0))
+        for f in (0.13, 0.29, 0.53)
+    ]
+    start = quaternion.normalize(random.standard_normal(4))
+    body = motion.HarmonicRates(harmonics=waves, initial_attitude=start)
+    time = np.arange(round(duration * 100.0)) / 100.0
+    shake = [random.uniform(0.5, 3.0, 3), random.uniform(0.5, 2.0, 3)]
+
+    def acceleration(t: np.ndarray) -> np.ndarray:
+        return shake[0] * np.sin(2.0 * np.pi * shake[1] * t[:, None])
+
+    force = vectors.specific_force(body, time, acceleration_f=acceleration)
+    field = quaternion.rotate(quaternion.conjugate(body.attitude(time)), EAST_NORTH_UP_FIELD)
+    return Recording(
+        source="simulated",
+        time=time,
+        rate=body.body_rate(time) + 0.01 + 0.01 * random.standard_normal((len(time), 3)),
+        specific_force=force + 0.05 * random.standard_normal(force.shape),
+        magnetic_field=field + 5e-7 * random.standard_normal(field.shape),
+        true_attitude=body.attitude(time) if reference else None,
+    )
+
+
+def read_as(matrix: np.ndarray) -> str:
+    """What the doctor says of a sensor whose axes were changed by ``matrix``: the inverse brings them back."""
+    if np.array_equal(matrix, -np.eye(3)):
+        return "are inverted"
+    return f"should be read as ({doctor.axes_words(matrix.T)})"
+
+
+def conjugated(q: np.ndarray) -> np.ndarray:
+    return q * np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def broken(recording: Recording, seed: int) -> dict[str, tuple[Recording, str]]:
+    """One mistake each, with what must be said."""
+    random = np.random.default_rng([seed, 1])
+    gyro, force, field, unit = (AXES[k] for k in random.integers(1, len(AXES), 4))
+    assert recording.specific_force is not None
+    assert recording.magnetic_field is not None
+    f, m, w = recording.specific_force, recording.magnetic_field, recording.rate
+    cases = {
+        "gyro axes": (replace(recording, rate=w @ gyro.T), f"axes of the gyro {read_as(gyro)}"),
+        "gyro sign": (replace(recording, rate=-w), "axes of the gyro are inverted"),
+        "gyro too large": (replace(recording, rate=w * 180.0 / np.pi), "57.3 times too large"),
+        "gyro too small": (replace(recording, rate=w * np.pi / 180.0), "57.3 times too small"),
+        "force in g": (replace(recording, specific_force=f / 9.80665), "9.81 times too small"),
+        "force twice": (replace(recording, specific_force=f * 9.80665), "9.81 times too large"),
+        "force axes": (replace(recording, specific_force=f @ force.T), f"axes of the accelerometer {read_as(force)}"),
+        "field axes": (replace(recording, magnetic_field=m @ field.T), f"axes of the magnetometer {read_as(field)}"),
+    }
+    if recording.true_attitude is not None:
+        q = recording.true_attitude
+        cases |= {
+            "force inverted": (replace(recording, specific_force=-f), "axes of the accelerometer are inverted"),
+            "conjugated": (replace(recording, true_attitude=conjugated(q)), "quaternions are conjugated"),
+            "scalar last": (replace(recording, true_attitude=np.roll(q, -1, axis=1)), "quaternions are scalar-last"),
+            "both": (
+                replace(recording, true_attitude=np.roll(conjugated(q), -1, axis=1)),
+                "quaternions are scalar-last and conjugated",
+            ),
+            "whole unit": (
+                replace(recording, rate=w @ unit.T, specific_force=f @ unit.T, magnetic_field=m @ unit.T),
+                f"axes of the whole unit {read_as(unit)}",
+            ),
+        }
+        for frame in ("North-East-Down", "North-West-Up"):
+            to_frame = quaternion.from_matrix(FRAMES[frame].T)
+            known = np.isfinite(q).all(axis=1)
+            other = np.full(q.shape, np.nan)
+            other[known] = quaternion.multiply(to_frame, q[known])
+            cases[frame] = (replace(recording, true_attitude=other), f"fixed frame is {frame}")
+    return cases
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 10))])
+@pytest.mark.parametrize("reference", [True, False], ids=["reference", "sensors alone"])
+def test_one_mistake_in_a_simulated_recording_is_named(seed, reference):
+    recording = simulated(seed, reference=reference)
+    assert doctor.examine(recording).verdict == "as told"
+    for name, (wrong, words) in broken(recording, seed).items():
+        found = doctor.examine(wrong)
+        assert found.verdict == "wrong convention", name
+        # Without a reference a sensor inverted as a whole fits as well, and is told beside.
+        assert words in " ".join([found.reason, *(() if reference else found.notes)]), (name, found.reason)
+
+
+def test_one_mistake_in_a_broad_trial_is_named(broad):
+    for k, path in enumerate(sorted(broad.glob("*.hdf5"))[:1]):
+        recording = recordings.read(path)
+        assert doctor.examine(recording).verdict == "as told", path.name
+        for name, (wrong, words) in broken(recording, k).items():
+            found = doctor.examine(wrong)
+            assert words in found.reason, (path.name, name, found.reason)
+
+
+@pytest.mark.slow
+def test_one_mistake_in_all_broad_trials_with_reference_and_without(broad):
+    for k, path in enumerate(sorted(broad.glob("*.hdf5"))):
+        whole = recordings.read(path)
+        for recording in (whole, replace(whole, true_attitude=None)):
+            plain = doctor.examine(recording)
+            assert plain.verdict == "as told" or (recording is not whole and plain.verdict == "cannot tell")
+            for name, (wrong, words) in broken(recording, k).items():
+                found = doctor.examine(wrong)
+                if recording is not whole and found.verdict == "cannot tell":
+                    continue  # the unit is hardly turned there
+                assert words in " ".join([found.reason, *found.notes]), (path.name, name, found.reason)
+
+
+def test_two_mistakes_are_named_together():
+    recording = simulated(4)
+    wrong = replace(recording, true_attitude=conjugated(recording.true_attitude), rate=recording.rate * 180.0 / np.pi)
+    found = doctor.examine(wrong)
+    assert "conjugated" in found.reason
+    assert "57.3 times too large" in found.reason
+
+
+def test_the_gyro_and_the_accelerometer_alone():
+    recording = replace(simulated(5, reference=False), magnetic_field=None)
+    assert doctor.examine(recording).verdict == "as told"
+    found = doctor.examine(replace(recording, rate=-recording.rate))
+    assert found.reason.startswith("axes of the gyro are inverted")
+    swapped = replace(recording, rate=recording.rate[:, [1, 0, 2]])
+    found = doctor.examine(swapped)
+    assert found.verdict == "wrong convention"
+    assert "should be read as (y, x, z)" in " ".join([found.reason, *found.notes])
+    assert any("which of the two" in note for note in found.notes)
+
+
+def test_a_recording_that_does_not_turn_cannot_tell():
+    for reference in (True, False):
+        found = doctor.examine(simulated(6, amplitude=1e-4, reference=reference))
+        assert found.verdict == "cannot tell"
+
+
+def test_noise_is_no_convention():
+    recording = simulated(7)
+    random = np.random.default_rng(0)
+    other = quaternion.normalize(random.standard_normal(recording.true_attitude.shape))
+    found = doctor.examine(replace(recording, true_attitude=other))
+    assert found.verdict == "cannot tell"
+    assert "no explanation tried fits" in found.reason
+
+
+def test_missing_rows_are_left_out():
+    recording = simulated(8)
+    holes = {
+        name: np.where(np.arange(len(recording.time))[:, None] % 5 == k, np.nan, getattr(recording, name))
+        for k, name in enumerate(("specific_force", "magnetic_field", "true_attitude"))
+    }
+    for name, (wrong, words) in broken(replace(recording, **holes), 8).items():
+        assert words in doctor.examine(wrong).reason, name
+
+
+def test_a_gyro_alone_is_refused():
+    bare = replace(simulated(0, duration=2.0, reference=False), specific_force=None, magnetic_field=None)
+    with pytest.raises(InputError, match="gyro alone"):
+        doctor.examine(bare)
+
+
+def test_a_force_in_no_unit_is_noted():
+    recording = simulated(9)
+    found = doctor.examine(replace(recording, specific_force=recording.specific_force / 3.0))
+    assert any("fits neither" in note for note in found.notes)
+
+
+def test_all_axes_are_signed_permutations_the_identity_first():
+    assert np.array_equal(AXES[0], np.eye(3))
+    assert len({matrix.tobytes() for matrix in AXES}) == 48
+    assert all(np.array_equal(matrix @ matrix.T, np.eye(3)) for matrix in AXES)
+    assert doctor.axes_words(np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])) == "y, −x, z"
+
+
+# ---------------------------------------------------------------------------------------------------------------- the command
+
+
+@pytest.mark.parametrize(
+    ("mistake", "status", "verdict"), [(None, 0, "as told"), ("conjugated", 1, "wrong convention")]
+)
+def test_doctor_ends_with_the_status_of_the_verdict(monkeypatch, capsys, tmp_path, mistake, status, verdict):
+    recording = simulated(1, duration=30.0)
+    if mistake:
+        recording = broken(recording, 1)[mistake][0]
+    monkeypatch.chdir(tmp_path)
+    with h5py.File("trial.hdf5", "w") as file:
+        file.attrs["sampling_rate"] = 100.0
+        file["imu_gyr"], file["imu_acc"] = recording.rate, recording.specific_force
+        file["imu_mag"], file["opt_quat"] = recording.magnetic_field, recording.true_attitude
+    monkeypatch.setattr(sys, "argv", ["strapdown", "doctor", "trial.hdf5", "--json", "doctor.json"])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert (ended.value.code or 0) == status
+    assert f"trial.hdf5: {verdict}: " in capsys.readouterr().out
+    told = json.loads((tmp_path / "doctor.json").read_text())
+    assert told["verdict"] == verdict
+    assert told["candidates"][0]["score"] >= told["candidates"][1]["score"]
