@@ -7,6 +7,7 @@ names of its keys; a setup read back is equal to the last bit.
 from __future__ import annotations
 
 import os
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -89,6 +90,40 @@ def matched_to_record(spec: GyroSpec, record: ImuRecord, *, attitude_sigma: floa
         attitude_sigma=_linear_sigma(record) if attitude_sigma is None else attitude_sigma,
         bias_sigma=float(max(np.sqrt(spread), LEAST_BIAS_SIGMA)),
     )
+
+
+def not_covered(spec: GyroSpec, sensors: tuple[Any, ...] = ()) -> tuple[str, ...]:
+    """Return, in words, the errors of a gyro and of sensors that a filter of attitude and bias has no state for.
+
+    Where there is any, a filter that believes the noise alone is too sure of itself; :mod:`strapdown.augmented` has states for most.
+    """
+    found = []
+    largest = {
+        name: float(np.max(np.abs(getattr(spec, name)))) for name in ("scale_factor", "asymmetry", "misalignment")
+    }
+    words = {"scale_factor": ("scale factor", 1e-6, "ppm"), "asymmetry": ("asymmetry", 1e-6, "ppm")}
+    words["misalignment"] = ("misalignment", 1e-3, "mrad")
+    for name, (what, size, unit) in words.items():
+        if largest[name] > 0.0:
+            found.append(f"the gyro's {what} of {largest[name] / size:.3g} {unit}")
+    if np.any(np.asarray(spec.bias_instability) > 0.0):
+        instability = float(np.max(spec.bias_instability)) / units.DEGREE_PER_HOUR
+        found.append(f"the gyro's flicker of {instability:.3g} °/h, covered in the attitude but not in the bias")
+    if np.any(np.asarray(spec.g_sensitivity) != 0.0):
+        found.append("the gyro's sensitivity to acceleration")
+    if float(np.max(spec.quantization)) > 0.0 or float(np.max(spec.rate_resolution)) > 0.0:
+        found.append("the gyro's quantisation")
+    for sensor in sensors:
+        if np.any(np.asarray(getattr(sensor, "hard_iron", 0.0)) != 0.0):
+            found.append(f"the hard iron of the {sensor.name}")
+        if np.any(np.asarray(getattr(sensor, "lever_arm_b", 0.0)) != 0.0):
+            found.append(f"the accelerations that the {sensor.name} feels at its lever arm")
+        faults = getattr(sensor, "faults", None)
+        if faults is not None and getattr(faults, "correlated_sigma", 0.0) > 0.0:
+            found.append(f"the correlated noise of the {sensor.name}")
+        if faults is not None and getattr(faults, "outlier_probability", 0.0) > 0.0:
+            found.append(f"the outliers of the {sensor.name}")
+    return tuple(found)
 
 
 def _linear_sigma(record: ImuRecord) -> float:
@@ -263,6 +298,17 @@ def to_toml(setup: FilterSetup) -> str:
 
     note = "# sigma: rad, or of a sensor that measures whole vectors the unit of its reference\n" if setup.sigma else ""
     return note + tomli_w.dumps({"filter": to_table(setup)})
+
+
+def from_toml(text: str, place: str = "filter") -> FilterSetup:
+    """Return the setup in the table ``[filter]`` of a TOML text, such as :func:`to_toml` gives."""
+    try:
+        table = tomllib.loads(text).get("filter")
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{place} is no TOML ({error})") from None
+    if not isinstance(table, dict):
+        raise InputError(f"{place} has no table [filter]")
+    return from_table(table, place)
 
 
 def read_setup(path: str | os.PathLike[str]) -> FilterSetup:

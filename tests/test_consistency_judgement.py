@@ -284,4 +284,4 @@ def test_check_refuses_what_it_cannot_judge(run, tmp_path):
     status, _, wrong = run("check", "attitude.h5")
     assert status == 2
     assert "is a strapdown attitude" in wrong
-    assert "go together" in run("check", "attitude.h5", "--record", "r.h5")[2]
+    assert "--filter goes with --record" in run("check", "attitude.h5", "--filter", "f.toml")[2]

@@ -46,6 +46,7 @@ def test_the_built_in_ones_are_those_asked_for():
         "low-orbit",
         "magnetometer-only",
         "hand-held",
+        "two-stars",
     }
     rows = scenarios.builtin_rows()
     assert [row["name"] for row in rows] == list(SCENARIOS)

@@ -180,3 +180,16 @@ def test_truth_travels_in_the_estimate_file(tmp_path):
     with pytest.raises(InputError, match="rows"):
         records.write_estimate(tmp_path / "bad.h5", estimate, truth=short)
     assert not (tmp_path / "bad.h5").exists()
+
+
+def test_what_the_filter_has_no_state_for_is_told_in_words():
+    clean = scenarios.load_scenario("two-stars")
+    assert setup.not_covered(clean.gyro, clean.sensors) == ()
+    orbit = scenarios.load_scenario("low-orbit")
+    words = " and ".join(setup.not_covered(orbit.gyro, orbit.sensors))
+    for part in ("misalignment", "flicker of 2 °/h", "hard iron of the magnetometer"):
+        assert part in words
+    held = scenarios.load_scenario("hand-held")
+    words = " and ".join(setup.not_covered(held.gyro, held.sensors))
+    for part in ("quantisation", "lever arm", "correlated noise of the magnetometer"):
+        assert part in words

@@ -172,6 +172,7 @@ def _tell(campaign: Campaign) -> None:
     from strapdown.checks import InputError
     from strapdown.montecarlo import summary
     from strapdown.montecarlo.verdicts import QUANTILES
+    from strapdown.setup import not_covered
 
     if campaign.statistics is None:
         raise InputError("no chunk of the campaign is finished; go on with it (--resume)")
@@ -233,6 +234,9 @@ def _tell(campaign: Campaign) -> None:
         f"with {100.0 * report['probability']:g} %, NEES at {report['epochs_judged']} epochs.",
         soft_wrap=True,
     )
+    missing = not_covered(campaign.plan.scenario.gyro, campaign.plan.scenario.sensors)
+    if missing and not report["consistent"]:
+        console.print(f"A filter of attitude and bias has no state for {', '.join(missing)}.", soft_wrap=True)
 
 
 def _worst_axis(values: list[float | None]) -> int:

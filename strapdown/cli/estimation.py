@@ -129,14 +129,13 @@ def _estimate_record(
         raise InputError("--gyro and --filter both tell the filter's belief of the gyro; give one of them")
     held = read_record_file(path)
     chosen = _setup(path, held, gyro, filter_file)
-    options: dict[str, Any] = {
-        "gate": None if gate is None else Gate(probability=gate),
-        "robust": None if robust is None else Robust(kind=robust),  # type: ignore[arg-type]
-    }
-    options = {name: value for name, value in options.items() if value is not None}
+    if gate is not None:
+        chosen = dataclasses.replace(chosen, gate=Gate(probability=gate))
+    if robust is not None:
+        chosen = dataclasses.replace(chosen, robust=Robust(kind=robust))  # type: ignore[arg-type]
     believed = setup.believed(held.record, chosen)
     initial, words = _initial(believed, held, chosen, attitude, from_truth)
-    result = setup.run(held.record, chosen, initial, every=every, full_covariance=full_covariance, **options)
+    result = setup.run(held.record, chosen, initial, every=every, full_covariance=full_covariance)
     truth = None
     if believed.truth is not None:
         truth = Truth(attitude=believed.truth.attitude[::every], bias=believed.truth.bias[::every])
@@ -147,8 +146,7 @@ def _estimate_record(
     )
     _tell(result)
     paths = [out / "estimate.h5"]
-    attributes: dict[str, Any] = {"source": str(path), "filter": setup.to_toml(chosen)}
-    attributes |= {name: str(dataclasses.asdict(value)) for name, value in options.items()}
+    attributes = {"source": str(path), "filter": setup.to_toml(chosen)}
     write_estimate(paths[0], result, attributes, truth=truth)
     figures = {"estimate.png": plots.estimate_overview(result, title=path.name)}
     if truth is not None:

@@ -27,10 +27,14 @@ def check(
         float, typer.Option(help="A right filter is not called wrong with at least this, all tests together.")
     ] = 0.99,
     record: Annotated[
-        Path | None, typer.Option(help="Record that an estimate was made from: with --filter, likely causes are named.")
+        Path | None, typer.Option(help="Record that an estimate was made from: with it, likely causes are named.")
     ] = None,
     filter_file: Annotated[
-        Path | None, typer.Option("--filter", help="TOML with the table named filter that the estimate was made with.")
+        Path | None,
+        typer.Option(
+            "--filter",
+            help="TOML with the table named filter that the estimate was made with; if it does not tell itself.",
+        ),
     ] = None,
     json: Annotated[Path | None, typer.Option("--json", help="File for all statistics.")] = None,
 ) -> None:
@@ -42,8 +46,8 @@ def check(
     sources = [path for path in (result, record, filter_file) if path is not None]
     if json is not None:
         output_file("json", json, (".json",), *sources)
-    if (record is None) != (filter_file is None):
-        raise InputError("--record and --filter go together: both are needed to look for causes")
+    if record is None and filter_file is not None:
+        raise InputError("--filter goes with --record: the record is needed to look for causes")
     kind = _kind(result)
     content: dict[str, Any] = {"source": result.name, "kind": kind}
     if kind == "strapdown montecarlo":
@@ -72,7 +76,7 @@ def check(
         )
     content.update(judgement.summary())
     _show(judgement)
-    if record is not None and filter_file is not None:
+    if record is not None:
         content["diagnosis"] = _diagnosed(result, record, filter_file, probability)
     if json is not None:
         write_json(json, content)
@@ -123,18 +127,24 @@ def _show(judgement: Judgement) -> None:
     console.print(judgement.words, soft_wrap=True)
 
 
-def _diagnosed(result: Path, record: Path, filter_file: Path, probability: float) -> dict[str, Any]:
+def _diagnosed(result: Path, record: Path, filter_file: Path | None, probability: float) -> dict[str, Any]:
     import numpy as np
 
-    from strapdown import diagnosis, mekf, recordfiles, records
-    from strapdown.setup import read_setup
+    from strapdown import diagnosis, mekf, recordfiles, records, setup
+    from strapdown.checks import InputError
+
+    if filter_file is not None:
+        chosen = setup.read_setup(filter_file)
+    else:
+        told = records.read_attributes(result).get("filter")
+        if told is None:
+            raise InputError(f"{result} does not tell its filter; give --filter, a TOML file with the table [filter]")
+        chosen = setup.from_toml(str(told), f"{result}: filter")
 
     estimate = records.read_estimate(result)
     P = np.diag(estimate.variance[0]) if estimate.covariance is None else estimate.covariance[0]
     initial = mekf.State(attitude=estimate.attitude[0], bias=estimate.bias[0], covariance=P)
-    found = diagnosis.diagnose(
-        recordfiles.read_record(record), read_setup(filter_file), initial, probability=probability
-    )
+    found = diagnosis.diagnose(recordfiles.read_record(record), chosen, initial, probability=probability)
     rows = table("Causes by what they would explain", "cause", "of", "gain", "ln p", "", left=2)
     for cause in found.considered[:8]:
         mark = Text("likely", style="red") if cause in found.causes else Text("no")

@@ -24,6 +24,9 @@ MOST_POINTS = 20_000
 NARROW = 0.35
 """A path that stays so near its mean is drawn by itself, without the sphere, which would be all that is seen."""
 
+LEAST_REACH = 1e-6
+"""Half the width of the figure of an axis that stands still."""
+
 
 def body_axis_path(attitude: Array, axis: int = 2) -> Array:
     """Return where a body axis (0, 1, 2: x, y, z) points in the fixed frame (n, 3), unit vectors, of attitudes q_fb (n, 4)."""
@@ -75,7 +78,7 @@ def sphere_figure(estimated: Array, true: Array | None = None, axis: int = 2) ->
             few = path[:: -(-len(path) // MOST_POINTS)]
             ax.plot(few[:, 0], few[:, 1], few[:, 2], color=color, linewidth=width, label=name)
         mean = paths[0][1].mean(axis=0)
-        reach = float(np.abs(paths[0][1] - mean).max())
+        reach = max(float(np.abs(paths[0][1] - mean).max()), LEAST_REACH)
         narrow = reach < NARROW
         if not narrow:
             _wire(ax)

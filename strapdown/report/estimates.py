@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from strapdown import consistency, plots, quaternion, records
+from strapdown.plots.sphere import body_axis_path
 from strapdown.plots.style import AXES, angle_unit, rate_unit
 from strapdown.records import Estimate, Innovations, Truth
 from strapdown.report import findings, page
@@ -192,9 +193,11 @@ def _sensor(name: str, innovations: Innovations, probability: float) -> str:
 
 def _path(estimate: Estimate, truth: Truth | None) -> str:
     true = None if truth is None else truth.attitude
-    parts = [
-        page.figure(lambda: plots.sphere_figure(estimate.attitude, true), "Path of the body z axis in the fixed frame")
-    ]
+    # The axis that moves the most: about its own axis a spinning body shows nothing.
+    spread = [float(np.ptp(body_axis_path(estimate.attitude, k), axis=0).max()) for k in range(3)]
+    axis = int(np.argmax(spread))
+    caption = f"Path of the body {AXES[axis]} axis in the fixed frame"
+    parts = [page.figure(lambda: plots.sphere_figure(estimate.attitude, true, axis), caption)]
     if true is not None:
         error = consistency.errors(estimate.attitude, estimate.bias, true, estimate.bias)
         angle = consistency.distribution(np.linalg.norm(error[:, :3], axis=1))
