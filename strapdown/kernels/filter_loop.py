@@ -45,6 +45,28 @@ def merge_order(time, heads, ends, order):
         heads[best] += 1
 
 
+def gather_events(order, time, value, variance, sensor, reference, kind, out):
+    """Write the columns of all events in the given order to ``out``, a tuple of arrays like them."""
+    for e in range(len(order)):
+        k = order[e]
+        out[0][e] = time[k]
+        out[1][e, 0], out[1][e, 1], out[1][e, 2] = value[k, 0], value[k, 1], value[k, 2]
+        out[2][e] = variance[k]
+        out[3][e] = sensor[k]
+        out[4][e] = reference[k]
+        out[5][e] = kind[k]
+
+
+def part_by_sensor(sensor, time, rows, heads, time_out, rows_out):
+    """Write times and rows of events one sensor after the other; ``heads`` tells where each begins, and is used up."""
+    for e in range(len(sensor)):
+        k = heads[sensor[e]]
+        heads[sensor[e]] = k + 1
+        time_out[k] = time[e]
+        for j in range(rows.shape[1]):
+            rows_out[k, j] = rows[e, j]
+
+
 def store_state(out, q, b, A, B, C):
     """Write (q, b, A, B, C) to 28 numbers."""
     for i in range(4):

@@ -91,7 +91,10 @@ def schedule(
         bounds = np.cumsum([0, *(len(column[0]) for column in columns)])
         order = np.empty(bounds[-1], np.int64)
         compiled(filter_loop.merge_order)(joined[0], bounds[:-1].copy(), bounds[1:], order)
-        joined = [np.take(column, order, axis=0) for column in joined]
+        first = [np.ascontiguousarray(column) for column in joined[:6]]
+        sorted_columns = tuple(np.empty_like(column) for column in first)
+        compiled(filter_loop.gather_events)(order, *first, sorted_columns)
+        joined = [*sorted_columns, *(np.take(column, order, axis=0) for column in joined[6:])]
     time, value, variance, sensor, reference, kind, *noise = joined
     return Schedule(
         time=time,
@@ -192,14 +195,21 @@ def _need_noise(series: VectorMeasurements) -> None:
 
 def innovations_by_sensor(events: Schedule, rows: Array, weight: Array | None = None) -> dict[str, Innovations]:
     """Return what a kernel wrote of each event, e₁, s₁, e₂, s₂, …, by sensor, as many as each has degrees of freedom."""
+    if len(events.sensors) == 1:
+        time, parted = events.time, rows
+        bounds = np.array([0, len(rows)])
+    else:
+        bounds = np.concatenate([[0], np.cumsum(np.bincount(events.sensor, minlength=len(events.sensors)))])
+        time, parted = np.empty_like(events.time), np.empty_like(rows)
+        compiled(filter_loop.part_by_sensor)(events.sensor, events.time, rows, bounds[:-1].copy(), time, parted)
     result = {}
     for i, (sensor, kind) in enumerate(zip(events.sensors, events.kinds, strict=True)):
-        mine = slice(None) if len(events.sensors) == 1 else events.sensor == i
-        filled = rows[mine, : 2 * KINDS[kind]]
+        mine = slice(bounds[i], bounds[i + 1])
+        filled = parted[mine, : 2 * KINDS[kind]]
         result[sensor] = Innovations(
-            time=events.time[mine],
+            time=time[mine],
             innovation=filled[:, 0::2],
             variance=filled[:, 1::2],
-            weight=None if weight is None else weight[mine],
+            weight=None if weight is None else weight if len(events.sensors) == 1 else weight[events.sensor == i],
         )
     return result
