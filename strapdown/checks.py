@@ -96,11 +96,19 @@ def finite(name: str, value: float, *, unit: str = "") -> float:
     return number
 
 
+MOST_COUNTED = 2.0**63
+"""Whole numbers stay below it, so that they fit into any array."""
+
+
 def count(name: str, value: int, *, least: int = 1) -> int:
     """Return ``value`` as a whole number of at least ``least``."""
     whole = (
-        isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool) and np.isfinite(value)
+        isinstance(value, (int, float, np.integer, np.floating))
+        and not isinstance(value, bool)
+        and abs(value) < MOST_COUNTED  # NaN and infinity are not
     )
+    if whole is False and isinstance(value, int) and not isinstance(value, bool):
+        raise InputError(f"{name} is {value}; it must be a whole number of {least} or more, and below 2^63")
     if not whole or int(value) != value or value < least:
         raise InputError(f"{name} is {value!r}; it must be a whole number of {least} or more")
     return int(value)

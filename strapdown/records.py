@@ -337,6 +337,10 @@ def read_truth(path: str | os.PathLike[str]) -> Truth | None:
 def read_estimate(path: str | os.PathLike[str]) -> Estimate:
     """Read an estimate written by :func:`write_estimate`."""
     with _estimate_file(path) as file:
+        rows = len(increasing(f"{path}: time", file["time"][:]))
+        for name, width in (("attitude", (4,)), ("bias", (3,)), ("variance", (6,)), ("covariance", (6, 6))):
+            if name in file:
+                array(f"{path}: {name}", file[name][:], (rows, *width))
         groups = file["innovations"].values() if "innovations" in file else ()
         return Estimate(
             time=file["time"][:],

@@ -78,6 +78,11 @@ def montecarlo(
         plan, target = held.plan, out or source
         machine = held.machine if machine == "auto" else machine
     output_file("out", target, _CAMPAIGN_SUFFIXES)
+    if resume and overwrite:
+        raise InputError("--resume and --overwrite exclude each other: go on with the file, or start it anew")
+    told = target.with_suffix(".json")
+    if replay is None and told.exists() and not target.exists() and not overwrite:
+        raise InputError(f"{told} exists and would be replaced; move it, choose another --out, or give --overwrite")
     if replay is not None:
         _replay(plan, replay, machine, target)
         return

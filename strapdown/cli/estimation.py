@@ -74,10 +74,17 @@ def estimate(
 ) -> None:
     """Estimate attitude and gyro bias from a recording (accelerometer as vertical, magnetometer as heading) or a simulated record."""
     from strapdown.checks import InputError
-    from strapdown.files import usable_folder
+    from strapdown.files import output_file, usable_folder
     from strapdown.recordfiles import is_record
 
     usable_folder("out", out)
+    for name in ("estimate.h5", "errors.json"):
+        output_file(
+            "out",
+            out / name,
+            (Path(name).suffix,),
+            *(path for path in (recording, gyro, filter_file) if path is not None),
+        )
     given = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
     units = {name: unit for name, unit in given.items() if unit}
     if is_record(recording):
@@ -146,7 +153,10 @@ def _estimate_record(
     )
     _tell(result)
     paths = [out / "estimate.h5"]
-    attributes = {"source": str(path), "filter": setup.to_toml(chosen)}
+    attributes: dict[str, Any] = {"source": str(path), "filter": setup.to_toml(chosen), "start": words}
+    if held.scenario:
+        attributes["scenario"] = held.scenario
+    attributes |= {name: value for name, value in (("seed", held.seed), ("run", held.run)) if value is not None}
     write_estimate(paths[0], result, attributes, truth=truth)
     figures = {"estimate.png": plots.estimate_overview(result, title=path.name)}
     if truth is not None:

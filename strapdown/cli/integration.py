@@ -106,9 +106,11 @@ def coning_budget(
 ) -> None:
     """Tell the drift that an angular vibration spectrum leaves, for each algorithm and sample rate."""
     from strapdown import coning
-    from strapdown.files import write_json
+    from strapdown.files import output_file, write_json
     from strapdown.units import DEGREE_PER_HOUR
 
+    if json is not None:
+        output_file("json", json, (".json",), psd)
     lines = coning.read_vibration(psd)
     chosen = {"algorithms": tuple(algorithm)} if algorithm else {}
     budget = coning.ConingBudget(lines=lines, sample_rates=tuple(rate), **chosen)

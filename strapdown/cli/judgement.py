@@ -142,9 +142,14 @@ def _diagnosed(result: Path, record: Path, filter_file: Path | None, probability
         chosen = setup.from_toml(str(told), f"{result}: filter")
 
     estimate = records.read_estimate(result)
+    source = recordfiles.read_record(record)
+    unknown = sorted(set(estimate.innovations) - {series.sensor for series in source.vectors})
+    if unknown or not np.isin(estimate.time, source.time).all():
+        what = f"has no sensor {unknown[0]!r}" if unknown else "has other stamps"
+        raise InputError(f"{record} {what}; {result} was made from another record")
     P = np.diag(estimate.variance[0]) if estimate.covariance is None else estimate.covariance[0]
     initial = mekf.State(attitude=estimate.attitude[0], bias=estimate.bias[0], covariance=P)
-    found = diagnosis.diagnose(recordfiles.read_record(record), chosen, initial, probability=probability)
+    found = diagnosis.diagnose(source, chosen, initial, probability=probability)
     rows = table("Causes by what they would explain", "cause", "of", "gain", "ln p", "", left=2)
     for cause in found.considered[:8]:
         mark = Text("likely", style="red") if cause in found.causes else Text("no")

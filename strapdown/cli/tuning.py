@@ -97,7 +97,7 @@ def tune(
     import os
 
     from strapdown import coning, tuning
-    from strapdown.checks import InputError, count, one_of
+    from strapdown.checks import InputError, count, non_negative, one_of
     from strapdown.files import output_file
     from strapdown.setup import read_setup
 
@@ -112,6 +112,15 @@ def tune(
         return
     if length is not None:
         raise InputError("--length is for --plan; the records' own length is taken")
+    count("seed", seed, least=0)
+    non_negative("spacing", spacing, unit="s")
+    same = [
+        path
+        for k, path in enumerate(records)
+        if path.exists() and any(path.samefile(other) for other in records[:k] if other.exists())
+    ]
+    if same:
+        raise InputError(f"{same[0]} is given twice; a record counts once")
     output_file("out", out, (".toml",), *records, *([filter_file] if filter_file is not None else []))
     units = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
     cases, believed = _cases(records, chosen, {name: unit for name, unit in units.items() if unit})

@@ -19,6 +19,13 @@ heading and (0, 1) the inclination where the fixed z axis is vertical."""
 
 def errors(attitude: ArrayLike, bias: ArrayLike, true_attitude: ArrayLike, true_bias: ArrayLike) -> Array:
     """Return the error state e = (Log(q_est⁻¹ ⊗ q_true), b_true − b_est) (..., 6): rad in the body frame, rad/s."""
+    rows = [np.shape(value)[:-1] for value in (attitude, bias, true_attitude, true_bias)]
+    try:
+        np.broadcast_shapes(*rows)
+    except ValueError:
+        raise InputError(
+            f"attitude, bias, true_attitude and true_bias have {', '.join(map(str, rows))} rows; give all at the same times"
+        ) from None
     estimate = quaternion.multiply(quaternion.conjugate(attitude), true_attitude)
     return np.concatenate([quaternion.log(estimate), np.asarray(true_bias) - np.asarray(bias)], axis=-1)
 

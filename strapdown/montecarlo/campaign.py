@@ -64,6 +64,19 @@ _UNITS: dict[str, tuple[str, str]] = {
 }
 
 
+_BY_EPOCH = (
+    "finite",
+    "error_sum",
+    "error_product_sum",
+    "covariance_sum",
+    "nees_sum",
+    "log_nees_sum",
+    "coverage",
+    "histogram",
+)
+"""What has one row an epoch; all are sums over runs whose numbers are finite."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Campaign:
     """A campaign as its file tells it."""
@@ -318,11 +331,14 @@ def _put_statistics(group: Any, statistics: Statistics) -> None:
 
 
 def _statistics_of(group: Any) -> Statistics:
-    return Statistics(
-        runs=int(group.attrs["runs"]),
-        sensors=tuple(json.loads(group.attrs["sensors"])),
-        **{f.name: group[f.name][()] for f in fields(Statistics) if f.name not in ("runs", "sensors")},
-    )
+    arrays = {f.name: group[f.name][()] for f in fields(Statistics) if f.name not in ("runs", "sensors")}
+    for name in _BY_EPOCH:
+        if len(arrays[name]) != len(arrays["time"]) or not np.isfinite(arrays[name]).all():
+            raise InputError(
+                f"{group.file.filename}: {name} has {len(arrays[name])} rows for {len(arrays['time'])} epochs, or is not finite; "
+                "the file is damaged: run the campaign anew"
+            )
+    return Statistics(runs=int(group.attrs["runs"]), sensors=tuple(json.loads(group.attrs["sensors"])), **arrays)
 
 
 def read(path: str | os.PathLike[str]) -> Campaign:

@@ -112,7 +112,8 @@ def coverage_by_state(statistics: Statistics, epoch: int = -1, ax: Axes | None =
         )
     ax.set_xticks(range(6), STATES, rotation=20)
     ax.grid(visible=False, axis="x")
-    ax.set_ylim(0.0, 104.0)
+    ax.set_ylim(-38.0, 104.0)  # room for the legend below the points
+    ax.set_yticks(range(0, 101, 20))
     ax.set_ylabel(f"share of {runs} runs, %")
     ax.legend(loc="lower left")
     return ax

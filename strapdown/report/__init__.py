@@ -65,9 +65,7 @@ def write(
         known = ", ".join(name.removeprefix("strapdown ") for name in _WRITERS)
         raise InputError(f"{source} holds: {kind.removeprefix('strapdown ')}; reports are written of: {known}")
     content, statistics = _WRITERS[kind](source, probability)
-    beside = target.with_suffix(".json")
-    if beside.exists() and beside.samefile(source):
-        raise InputError(f"{beside} would replace the result itself; choose another name for the page")
+    beside = target.with_suffix(".report.json")  # not .json alone, which other commands write beside their results
     with written_beside(target) as temporary:
         temporary.write_text(content, encoding="utf-8")
     write_json(beside, statistics)

@@ -149,7 +149,10 @@ def _fans(statistics: Statistics) -> Figure:
 def _end(statistics: Statistics) -> Figure:
     figure, axes = plots.new_figure(1, 3, size=(13.0, 4.4))
     plots.coverage_by_state(statistics, -1, axes[0])
-    for ax, pair in zip(axes[1:], ((0, 1), (0, 3)), strict=True):
+    # The bias axis that is claimed worst, beside the attitude about it.
+    ratio = np.diag(statistics.mean_square_error[-1]) / np.diag(statistics.covariance[-1])
+    worst = int(np.argmax(np.abs(np.log(np.maximum(ratio[3:], 1e-300)))))
+    for ax, pair in zip(axes[1:], ((0, 1), (worst, 3 + worst)), strict=True):
         plots.covariance_ellipses(statistics.covariance[-1], statistics.mean_square_error[-1], pair, ax)
     return figure
 
@@ -163,5 +166,5 @@ def _worst(statistics: Statistics, path: Path) -> str:
         "Worst runs",
         page.table(("run", "largest NEES of the state (6 degrees of freedom)"), rows, numbers=2),
         page.paragraph("Each can be re-created alone, in full detail and to the bit, by its number:"),
-        page.code(f"strapdown montecarlo --replay {int(statistics.worst_run[0])} --out {path.name}"),
+        page.code(f"strapdown montecarlo {path.name} --replay {int(statistics.worst_run[0])}"),
     )

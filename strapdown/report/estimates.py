@@ -134,21 +134,27 @@ def _over_time(estimate: Estimate, truth: Truth | None) -> str:
             ("Bias error", slice(3, 6), rate_unit),
         ):
             unit, size = unit_of(3.0 * sigma[settled, states])
-            bound = 3.0 * sigma[:, states].max(axis=1) / size
-            series = (
-                page.Series(label="+3σ, largest axis", value=bound, colour="--line", band=True),
-                page.Series(label="−3σ", value=-bound, colour="--line", band=True),
-                *(
-                    page.Series(label=AXES[k], value=error[:, states.start + k] / size, colour=_COLOURS[k])
-                    for k in range(3)
-                ),
-            )
-            reach = 1.3 * max(float(bound[settled].max()), float(np.abs(error[settled, states]).max() / size))
-            charts.append(
-                page.chart(
-                    page.Chart(title=what, unit=unit, time=estimate.time, series=series, bands=((0, 1),), reach=reach)
+            for k, axis in enumerate(AXES):
+                state = states.start + k
+                bound, value = 3.0 * sigma[:, state] / size, error[:, state] / size
+                series: tuple[page.Series, ...] = (
+                    page.Series(label="+3σ", value=bound, colour="--faint", band=True),
+                    page.Series(label="−3σ", value=-bound, colour="--faint", band=True),
+                    page.Series(label=f"{what.lower()} {axis}", value=value, colour=_COLOURS[k]),
                 )
-            )
+                reach = 1.3 * max(float(bound[settled].max()), float(np.abs(value[settled]).max()))
+                charts.append(
+                    page.chart(
+                        page.Chart(
+                            title=f"{what} {axis}",
+                            unit=f"{what.lower()} {axis}, {unit}",
+                            time=estimate.time,
+                            series=series,
+                            bands=((0, 1),),
+                            reach=reach,
+                        )
+                    )
+                )
         figure = page.figure(
             lambda: plots.error_overview(estimate, truth),
             "Errors against the truth inside the filter's own ±3σ, body frame",
@@ -159,15 +165,19 @@ def _over_time(estimate: Estimate, truth: Truth | None) -> str:
             page.Series(label=name, value=euler[:, k], colour=_COLOURS[k])
             for k, name in enumerate(("roll", "pitch", "yaw"))
         )
-        charts.append(page.chart(page.Chart(title="Attitude", unit="°", time=estimate.time, series=series)))
+        charts.append(page.chart(page.Chart(title="Attitude", unit="attitude, °", time=estimate.time, series=series)))
         unit, size = rate_unit(3.0 * sigma[settled, 3:])
         series = tuple(
             page.Series(label=AXES[k], value=estimate.bias[:, k] / size, colour=_COLOURS[k]) for k in range(3)
         )
-        charts.append(page.chart(page.Chart(title="Gyro bias", unit=unit, time=estimate.time, series=series)))
+        charts.append(
+            page.chart(page.Chart(title="Gyro bias", unit=f"gyro bias, {unit}", time=estimate.time, series=series))
+        )
         spread = np.linalg.norm(sigma[:, :3], axis=1) / DEGREE
         series = (page.Series(label="σ, all axes", value=spread),)
-        charts.append(page.chart(page.Chart(title="Attitude σ", unit="°", time=estimate.time, series=series)))
+        charts.append(
+            page.chart(page.Chart(title="Attitude σ", unit="attitude σ, °", time=estimate.time, series=series))
+        )
         figure = page.figure(lambda: plots.estimate_overview(estimate), "Attitude, gyro bias in ±3σ, attitude σ")
     return page.section("Over time", *charts, figure)
 

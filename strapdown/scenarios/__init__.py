@@ -65,6 +65,10 @@ class Scenario:
                 "shorten the run or lower the rate"
             )
         count("seed", self.seed, least=0)
+        if any(mark in self.name for mark in "/\\\0\n") or self.name.startswith("."):
+            raise InputError(
+                f"name is {self.name!r}; files are called after it: leave out slashes, line breaks and leading dots"
+            )
         object.__setattr__(self, "sensors", tuple(self.sensors))
         object.__setattr__(self, "gravity_f", tuple(array("gravity_f", self.gravity_f, (3,)).tolist()))
         names = [sensor.name for sensor in self.sensors]
