@@ -32,6 +32,14 @@ def written_beside(path: str | os.PathLike[str]) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def existing_file(path: str | os.PathLike[str]) -> None:
+    """Refuse an input that is not there, or is a folder, before a library says so in its own words."""
+    if Path(path).is_dir():
+        raise InputError(f"{path} is a folder; name the file in it")
+    if not Path(path).exists():
+        raise InputError(f"{path} does not exist; check the path")
+
+
 def usable_folder(name: str, folder: str | os.PathLike[str]) -> None:
     """Refuse a folder that results cannot go to, before they are computed: one below a file, or that may not be written.
 

@@ -18,7 +18,7 @@ import numpy as np
 import strapdown
 from strapdown import gyro
 from strapdown.checks import Array, InputError
-from strapdown.files import written_beside
+from strapdown.files import existing_file, written_beside
 from strapdown.gyro import GyroSpec
 from strapdown.records import CONVENTIONS, ImuRecord, Truth, put, result_file
 from strapdown.vectors import KINDS, VectorMeasurements
@@ -141,8 +141,7 @@ def read_record_file(path: str | os.PathLike[str]) -> RecordFile:
     """
     import h5py
 
-    if not Path(path).is_file():
-        raise InputError(f"{path} does not exist; check the path")
+    existing_file(path)
     try:
         with h5py.File(path, "r") as file:
             kind = file.attrs.get("kind")

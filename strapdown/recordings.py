@@ -18,6 +18,7 @@ import numpy as np
 
 from strapdown import recordfiles
 from strapdown.checks import Array, InputError, array, increasing, known_keys, one_of, positive
+from strapdown.files import existing_file
 from strapdown.units import DEGREE, STANDARD_GRAVITY
 
 RATE_UNITS = {"rad/s": 1.0, "deg/s": DEGREE}
@@ -86,8 +87,7 @@ def read(path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None
         If the file is missing, truncated, of another layout, or its units are unknown or undeclared.
     """
     file = Path(path)
-    if not file.exists():
-        raise InputError(f"{file} does not exist; check the path")
+    existing_file(file)
     if file.suffix.lower() in (".hdf5", ".h5"):
         if units:
             raise InputError(
@@ -108,7 +108,7 @@ def read_broad(path: str | os.PathLike[str]) -> Recording:
         with h5py.File(path, "r") as file:
             if file.attrs.get("kind") == recordfiles.KIND:
                 raise InputError(
-                    f"{name} is a simulated record, not a recording; integrate it (`strapdown integrate`) or filter it with mekf.run"
+                    f"{name} is a simulated record, no recording; integrate it (`strapdown integrate`) or filter it (`strapdown estimate`)"
                 )
             missing = [key for key in ("imu_gyr",) if key not in file]
             if "sampling_rate" not in file.attrs:
@@ -295,8 +295,7 @@ def read_gyro(
     An array tells neither its rate nor its unit: give ``rate`` in Hz and ``units={"gyro": ...}``. Samples must lie at even intervals.
     """
     file = Path(path)
-    if not file.exists():
-        raise InputError(f"{file} does not exist; check the path")
+    existing_file(file)
     given = dict(units or {})
     if file.suffix.lower() == ".npy":
         if rate is None or "gyro" not in given:

@@ -18,7 +18,7 @@ import numpy as np
 import strapdown
 from strapdown import coning
 from strapdown.checks import Array, InputError, array, increasing, unit_quaternions
-from strapdown.files import written_beside
+from strapdown.files import existing_file, written_beside
 from strapdown.vectors import VectorMeasurements
 
 CONVENTIONS = (
@@ -313,6 +313,7 @@ def _estimate_file(path: str | os.PathLike[str]) -> Iterator[Any]:
     """Yield an estimate's HDF5 file, read only; what is wrong with it is told in one line."""
     import h5py
 
+    existing_file(path)
     try:
         with h5py.File(path, "r") as file:
             if file.attrs.get("kind") != "strapdown estimate":
@@ -320,8 +321,6 @@ def _estimate_file(path: str | os.PathLike[str]) -> Iterator[Any]:
                     f"{path} is not a strapdown estimate; pass the estimate.h5 that `strapdown estimate` writes"
                 )
             yield file
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist; check the path") from None
     except (OSError, KeyError) as error:
         raise InputError(f"{path} cannot be read as HDF5 ({error}); the file is truncated or of another kind") from None
 
@@ -381,11 +380,10 @@ def read_attributes(path: str | os.PathLike[str]) -> dict[str, Any]:
     """
     import h5py
 
+    existing_file(path)
     try:
         with h5py.File(path, "r") as file:
             attributes = {name: value.item() if hasattr(value, "item") else value for name, value in file.attrs.items()}
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist; check the path") from None
     except OSError as error:
         raise InputError(f"{path} cannot be read as HDF5 ({error}); the file is truncated or of another kind") from None
     if not str(attributes.get("kind", "")).startswith("strapdown "):

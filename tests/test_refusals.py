@@ -145,3 +145,10 @@ def test_errors_are_taken_at_the_same_times(folder):
     estimate = records.read_estimate(folder / "run" / "estimate.h5")
     with pytest.raises(InputError, match="same times"):
         consistency.errors(estimate.attitude, estimate.bias, estimate.attitude[:-1], estimate.bias[:-1])
+
+
+@pytest.mark.parametrize("command", ["check", "report", "estimate", "integrate", "doctor", "tune", "allan"])
+def test_a_folder_for_a_file_is_told_in_one_line(tmp_path, command):
+    (tmp_path / "d.h5").mkdir()
+    said = refused([command, tmp_path / "d.h5", *(["--algorithm", "one-sample"] if command == "integrate" else [])])
+    assert said.startswith(f"{tmp_path / 'd.h5'} is a folder; name ")

@@ -89,9 +89,9 @@ def _kind(path: Path) -> str:
     import h5py
 
     from strapdown.checks import InputError
+    from strapdown.files import existing_file
 
-    if not path.is_file():
-        raise InputError(f"{path} does not exist; check the path")
+    existing_file(path)
     try:
         with h5py.File(path, "r") as file:
             return str(file.attrs.get("kind", ""))

@@ -27,6 +27,7 @@ import numpy as np
 import strapdown
 from strapdown import scenarios, setup
 from strapdown.checks import InputError, count
+from strapdown.files import existing_file
 from strapdown.montecarlo.engine import Chunks, Work, Workers, choose, in_threads, machine_named
 from strapdown.montecarlo.plan import Plan, from_table
 from strapdown.montecarlo.statistics import Statistics, merge
@@ -355,6 +356,7 @@ def read(path: str | os.PathLike[str]) -> Campaign:
 def _stored(path: Path) -> tuple[Campaign, _Progress]:
     import h5py
 
+    existing_file(path)
     try:
         with h5py.File(path, "r") as file:
             if file.attrs.get("kind") != KIND:
@@ -379,8 +381,6 @@ def _stored(path: Path) -> tuple[Campaign, _Progress]:
                 {int(name): _statistics_of(group) for name, group in early.items() if name != "whole"},
                 campaign.chunk,
             )
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist; check the path") from None
     except (OSError, KeyError) as error:
         raise InputError(
             f"{path} cannot be read as a campaign ({error}); the file is truncated or of another kind"

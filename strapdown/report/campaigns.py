@@ -130,6 +130,8 @@ def _consistency(statistics: Statistics, probability: float) -> Figure:
         ax.legend(loc="upper right")
     if statistics.sensor_degrees.sum() > 0:
         plots.nis_over_time([("all runs", statistics)], axes[2], probability=probability)
+        low, high = axes[2].get_ylim()
+        axes[2].set_ylim(low, high + 0.3 * (high - low))  # room for the legend
         axes[2].legend(loc="upper right")
     else:
         axes[2].set_visible(False)

@@ -23,7 +23,7 @@
             label: one.label,
             stroke: colour(one.colour),
             width: one.band ? 1 : 1.5,
-            dash: one.band ? [4, 4] : [],
+            dash: [],
             value: shown,
           })),
         ],
