@@ -121,6 +121,36 @@ def test_the_campaign_page_tells_how_to_replay_its_worst_run(folder):
     assert f"campaign.h5 --replay {statistics['worst_runs'][0]}" in body(folder / "campaign.html")
 
 
+def test_a_tuning_is_reported_from_its_json(folder, scenario, tmp_path):
+    (tmp_path / "scenario.toml").write_text(scenarios.scenario_to_toml(scenario), encoding="utf-8")
+    for command in (
+        ["simulate", str(tmp_path / "scenario.toml"), "--out", str(tmp_path / "record.h5")],
+        [
+            "tune",
+            str(tmp_path / "record.h5"),
+            "--free",
+            "star 1.sigma",
+            "--holdout",
+            "0.3",
+            "-o",
+            str(tmp_path / "filter.toml"),
+        ],
+        ["report", str(tmp_path / "filter.json")],
+    ):
+        result = CliRunner().invoke(cli.app, command)
+        assert result.exit_code == 0, result.output
+    content = body(tmp_path / "filter.html")
+    tuned = json.loads((tmp_path / "filter.json").read_text())
+    (parameter,) = tuned["parameters"]
+    for value in (parameter["value"], parameter["lower"], parameter["upper"]):
+        assert f"{value:.4g}" in content
+    assert tuned["held_out"]["after"]["judgements"][0]["verdict"].capitalize() in content.split("<h2>")[0]
+    assert content.count("data:image/png") == 2
+    assert "[filter]" in content
+    with pytest.raises(InputError, match="not what `strapdown tune` writes"):
+        report.write(folder / "right.report.json", tmp_path / "page.html")
+
+
 def test_gaps_become_null_not_nan():
     chart = page.Chart(
         title="t", unit="u", time=np.arange(3.0), series=(page.Series(label="a", value=np.array([1.0, np.nan, 2.0])),)

@@ -13,7 +13,7 @@ from strapdown.cli.terminal import app, console, progress_bar, written
 @app.command()
 def report(
     result: Annotated[
-        Path, typer.Argument(help="HDF5 file that `strapdown estimate` or `strapdown montecarlo` wrote.")
+        Path, typer.Argument(help="HDF5 file of `strapdown estimate` or `montecarlo`, or the JSON of `strapdown tune`.")
     ],
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="The page, .html; beside the result, of its name, if not given.")

@@ -6,6 +6,8 @@
     The page of one estimate.
 ``campaigns``
     The page of a Monte Carlo.
+``tunings``
+    The page of a tuning.
 """
 
 from __future__ import annotations
@@ -19,11 +21,12 @@ from typing import Any
 from strapdown import records
 from strapdown.checks import InputError
 from strapdown.files import write_json, written_beside
-from strapdown.report import campaigns, estimates
+from strapdown.report import campaigns, estimates, tunings
 
 _WRITERS: dict[str, Callable[[Path, float], tuple[str, dict[str, Any]]]] = {
     "strapdown estimate": estimates.report,
     "strapdown montecarlo": campaigns.report,
+    "strapdown tuning": tunings.report,
 }
 
 
@@ -45,7 +48,7 @@ def write(
     Parameters
     ----------
     result : path
-        HDF5 file of an estimate or a Monte Carlo.
+        HDF5 file of an estimate or a Monte Carlo, or the JSON of a tuning.
     out : path, optional
         The page; ``result`` with the suffix .html if not given.
     probability : float
@@ -60,7 +63,7 @@ def write(
     target = source.with_suffix(".html") if out is None else Path(out)
     if target.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"out is {target}; a report is an .html file")
-    kind = records.read_attributes(source)["kind"]
+    kind = "strapdown tuning" if source.suffix.lower() == ".json" else records.read_attributes(source)["kind"]
     if kind not in _WRITERS:
         known = ", ".join(name.removeprefix("strapdown ") for name in _WRITERS)
         raise InputError(f"{source} holds: {kind.removeprefix('strapdown ')}; reports are written of: {known}")

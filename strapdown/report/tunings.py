@@ -1,0 +1,131 @@
+"""The page of a tuning: what `strapdown tune` wrote, parameters with their intervals, and the proof on data held out."""
+
+from __future__ import annotations
+
+import base64
+import json
+from pathlib import Path
+from typing import Any
+
+from strapdown.checks import InputError
+from strapdown.files import existing_file
+from strapdown.report import page
+
+_NEEDED = ("records", "parameters", "units", "minus_log_likelihood", "searches")
+
+
+def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
+    """Return the page and the statistics of a tuning's JSON; ``probability`` is that of the tuning's own verdicts, and not used."""
+    content = read(path)
+    held = content.get("held_out")
+    verdict = _verdict(held)
+    told = path.with_suffix(".toml")
+    parts = [
+        page.verdict(*verdict),
+        page.section("Parameters", *_parameters(content)),
+    ]
+    if held:
+        parts.append(page.section("On the data held out", *_held_out(held)))
+    parts += [_image(path.with_name(f"{path.stem}-{name}.png"), caption) for name, caption in _FIGURES]
+    making = [page.provenance({"records": ", ".join(content["records"]), "units of the JSON": content["units"]})]
+    if told.exists():
+        making += [page.paragraph(f"The filter, {told.name}:"), page.code(told.read_text(encoding="utf-8"))]
+    making += [page.paragraph("Use it:"), page.code(f"strapdown estimate RECORD.h5 --filter {told.name}")]
+    parts.append(page.section("How it was made", *making))
+    searches = content["searches"]
+    subtitle = (
+        f"{len(content['parameters'])} parameters from {len(content['records'])} records; {searches['at_the_best_point']} of "
+        f"{searches['number']} searches ended at the best point"
+    )
+    html = page.page(f"Tuning: {path.name}", subtitle, *parts)
+    return html, {"source": path.name, "judgement": {"verdict": verdict[0], "reason": verdict[1]}, "tuning": content}
+
+
+_FIGURES = (
+    ("likelihood", "Likelihood along each parameter, with its interval"),
+    ("heldout", "Statistics on the data held out, before and after"),
+)
+
+
+def read(path: Path) -> dict[str, Any]:
+    """Read the JSON of a tuning.
+
+    Raises
+    ------
+    InputError
+        If it is missing, no JSON, or not written by `strapdown tune`.
+    """
+    existing_file(path)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} is no JSON ({error}); the file is truncated or of another kind") from None
+    missing = [key for key in _NEEDED if not isinstance(content, dict) or key not in content]
+    if missing:
+        raise InputError(f"{path} has no {missing[0]!r}: it is not what `strapdown tune` writes beside its filter.toml")
+    return content  # type: ignore[no-any-return]
+
+
+def _verdict(held: Any) -> tuple[str, str, list[str]]:
+    """Return the verdict on the tuned filter on held-out data: the worst of its judgements."""
+    if not held:
+        return "cannot tell", "no data were held out to prove it on; tune with --holdout", []
+    after = held["after"]["judgements"]
+    worst = max(after, key=lambda one: ("consistent", "cannot tell", "not consistent").index(one["verdict"]))
+    details = [finding["means"] for one in after for finding in one["findings"] if finding["rejected"]]
+    gain = held["after"]["log_likelihood_per_innovation"] - held["before"]["log_likelihood_per_innovation"]
+    if gain < 0.0:
+        details.append("on the data held out the filter before was more likely: keep that one")
+    return worst["verdict"], f"{worst['reason']}, on data that the tuning has not seen", details
+
+
+def _parameters(content: dict[str, Any]) -> list[str]:
+    rows = [
+        (
+            one["name"],
+            one["note"],
+            *(
+                page.number(one[key] if one[key] is not None else float("nan"))
+                for key in ("start", "value", "lower", "upper")
+            ),
+        )
+        for one in content["parameters"]
+    ]
+    marked = [not one["identified"] for one in content["parameters"]]
+    likelihood = content["minus_log_likelihood"]
+    gain = likelihood["before"] - likelihood["after"]
+    return [
+        page.table(
+            ("parameter", "what the data tell", "before", "after", "from", "to (95 %)"), rows, numbers=4, marked=marked
+        ),
+        page.paragraph(f"Units: {content['units']}. The likelihood rose by {gain:.4g} nats.", faint=True),
+    ]
+
+
+def _held_out(held: dict[str, Any]) -> list[str]:
+    rows = []
+    for name in ("before", "after"):
+        one = held[name]
+        low, high = one["nis_bounds"]
+        extra = [one.get(key) for key in ("anees_per_state", "attitude_rms_rad")]
+        rows.append(
+            (
+                name,
+                page.number(one["log_likelihood_per_innovation"], 6),
+                page.number(one["nis_per_degree"]),
+                f"{low:.4f} to {high:.4f}",
+                *(page.number(float("nan") if value is None else value) for value in extra),
+            )
+        )
+    head = ("filter", "log likelihood an innovation", "NIS", "99 % bounds", "ANEES per state", "attitude RMS, rad")
+    return [page.table(head, rows, numbers=5)]
+
+
+def _image(path: Path, caption: str) -> str:
+    """Return a figure that the tuning drew beside its result; nothing where it is gone."""
+    if not path.exists():
+        return ""
+    data = base64.b64encode(path.read_bytes()).decode()
+    return page.section(
+        caption, f'<figure><img src="data:image/png;base64,{data}" alt="{page.text(caption)}"></figure>'
+    )
