@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from strapdown import cli, consistency, mekf, records, scenarios, setup
+from strapdown import cli, consistency, records, scenarios
 from strapdown.checks import InputError, count
 
 
@@ -133,12 +133,10 @@ def test_the_filter_that_the_estimate_tells_is_enough_to_seek_causes(folder):
     assert "Causes by what they would explain" in result.output
 
 
-def test_an_estimate_keeps_more_than_its_start(short):
-    record = scenarios.simulate(short)
-    believes = setup.matched(short)
-    start = setup.initial_state(believes, record.truth.attitude[0])
-    with pytest.raises(InputError, match="every is 5000"):
-        mekf.run(record, believes.process_noise, start, every=5000)
+def test_an_estimate_keeps_more_than_its_start(folder, tmp_path):
+    said = refused(["estimate", folder / "record.h5", "--every", 5000, "--out", tmp_path / "run"])
+    assert "every is 5000, more than the 2000 filter steps" in said
+    assert not (tmp_path / "run").exists()
 
 
 def test_errors_are_taken_at_the_same_times(folder):

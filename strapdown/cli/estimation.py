@@ -141,6 +141,10 @@ def _estimate_record(
     if robust is not None:
         chosen = dataclasses.replace(chosen, robust=Robust(kind=robust))  # type: ignore[arg-type]
     believed = setup.believed(held.record, chosen)
+    if every > len(believed.increments):
+        raise InputError(
+            f"every is {every}, more than the {len(believed.increments)} filter steps of the record; only the start would be kept"
+        )
     initial, words = _initial(believed, held, chosen, attitude, from_truth)
     result = setup.run(held.record, chosen, initial, every=every, full_covariance=full_covariance)
     truth = None
