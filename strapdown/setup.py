@@ -319,4 +319,4 @@ def read_setup(path: str | os.PathLike[str]) -> FilterSetup:
     InputError
         If the file is missing, no TOML, has no such table, or a key that no filter has.
     """
-    return from_table(tables.read(path, "filter", "`strapdown tune`"), f"{path}: filter")
+    return from_table(tables.read(path, "filter", "`strapdown tune` writes one"), f"{path}: filter")

@@ -131,8 +131,8 @@ def build(kind: type, table: Mapping[str, Any], form: Form, place: str, **more: 
     return kind(**values)
 
 
-def read(path: str | os.PathLike[str], name: str, writer: str) -> dict[str, Any]:
-    """Return the table ``[name]`` of a TOML file; ``writer`` says what writes such a file.
+def read(path: str | os.PathLike[str], name: str, remedy: str) -> dict[str, Any]:
+    """Return the table ``[name]`` of a TOML file; ``remedy`` says what to do where there is none.
 
     Raises
     ------
@@ -147,5 +147,5 @@ def read(path: str | os.PathLike[str], name: str, writer: str) -> dict[str, Any]
         raise InputError(f"{path} is no TOML ({error})") from None
     table = content.get(name)
     if not isinstance(table, dict):
-        raise InputError(f"{path} has no table [{name}]; {writer} writes one")
+        raise InputError(f"{path} has no table [{name}]; {remedy}")
     return table

@@ -5,10 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -165,15 +163,7 @@ def from_table(table: Mapping[str, Any]) -> Plan:
 
 def read_dispersions(path: str | os.PathLike[str]) -> Dispersions:
     """Read the table ``[dispersions]`` of a TOML file; other tables are left alone."""
-    try:
-        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist; check the path") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is no TOML ({error})") from None
-    table = content.get("dispersions")
-    if not isinstance(table, dict):
-        raise InputError(f"{path} has no table [dispersions]; its keys are {', '.join(tables.keys(_FORM))}")
+    table = tables.read(path, "dispersions", f"its keys are {', '.join(tables.keys(_FORM))}")
     return tables.build(Dispersions, table, _FORM, f"{path}: dispersions")  # type: ignore[no-any-return]
 
 
