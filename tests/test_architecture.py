@@ -37,7 +37,7 @@ STRANGERS = (("motion", "coning"),)
 
 DRAWING = ("plots", "report")
 PRINTING = ("cli",)
-MACHINES = ("kernels.machine", "kernels.lanes")
+MACHINES = ("kernels.machine", "kernels.lanes", "kernels.packed")
 """Kernel modules that know of compilers; all others are plain Python."""
 
 
@@ -246,6 +246,9 @@ def test_help_loads_neither_compiler_nor_plots(option):
 
 def test_modules_load_neither_compiler_nor_plots():
     """All but the drawing ones, in one process: numba and matplotlib come when first needed."""
-    extends_the_compiler = {"kernels.lanes"}  # loaded by kernels.machine alone, when a kernel is compiled over lanes
+    extends_the_compiler = {
+        "kernels.lanes",
+        "kernels.packed",
+    }  # loaded by kernels.machine alone, when a kernel is compiled over lanes
     names = sorted(n for n in sources() if n and unit(n) not in DRAWING and n not in extends_the_compiler)
     assert not loaded_by(EACH.format(names)) & {"numba", "llvmlite", "matplotlib"}

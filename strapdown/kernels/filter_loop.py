@@ -139,13 +139,15 @@ def run_filter(
         stop = event_time[e] if due else end
         dt = stop - now
         if dt > 0.0:
-            if dt > longest:
-                dt = longest
-                stop = now + dt
-                due = False
             part = theta
-            if dt < whole:
-                part = scale(dt / whole, theta)
+            # Most often a whole interval: a branch that is foretold costs less than a choice between values, which waits for both.
+            if dt != longest or dt != whole:
+                if dt > longest:
+                    dt = longest
+                    stop = now + dt
+                    due = False
+                if dt < whole:
+                    part = scale(dt / whole, theta)
             if segments < len(segment_out):
                 store_segment(segment_out, segments, dt, part, q, b, A, B, C)
                 segments += 1

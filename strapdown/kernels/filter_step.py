@@ -187,21 +187,24 @@ def rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, s1, s12, s22):
 
     Returns the correction, b, A, B, C, the second row's innovation freed of the first with its variance, and the NIS.
     """
-    inverse = 1.0 / (s1 * s22 - s12 * s12)
-    i11, i12, i22 = s22 * inverse, -s12 * inverse, s1 * inverse
+    determinant = s1 * s22 - s12 * s12
+    inverse = 1.0 / determinant
     pb1 = transpose_times_vector(B, h1)
     pb2 = transpose_times_vector(B, h2)
-    ka1 = combine(i11, pa1, i12, pa2)
-    ka2 = combine(i12, pa1, i22, pa2)
-    kb1 = combine(i11, pb1, i12, pb2)
-    kb2 = combine(i12, pb1, i22, pb2)
-    correction = combine(e1, ka1, y2, ka2)
-    b = add(b, combine(e1, kb1, y2, kb2))
+    # The correction, on which all that follows waits, is ready but for the scale before the division ends.
+    w1 = s22 * e1 - s12 * y2
+    w2 = s1 * y2 - s12 * e1
+    correction = scale(inverse, combine(w1, pa1, w2, pa2))
+    b = add(b, scale(inverse, combine(w1, pb1, w2, pb2)))
+    ka1 = scale(inverse, combine(s22, pa1, -s12, pa2))
+    ka2 = scale(inverse, combine(-s12, pa1, s1, pa2))
+    kb1 = scale(inverse, combine(s22, pb1, -s12, pb2))
+    kb2 = scale(inverse, combine(-s12, pb1, s1, pb2))
     A = symmetric_minus_outer(symmetric_minus_outer(A, ka1, pa1), ka2, pa2)
     B = minus_outer(minus_outer(B, ka1, pb1), ka2, pb2)
     C = symmetric_minus_outer(symmetric_minus_outer(C, kb1, pb1), kb2, pb2)
-    nis = e1 * (i11 * e1 + i12 * y2) + y2 * (i12 * e1 + i22 * y2)
-    return correction, b, A, B, C, y2 - s12 / s1 * e1, 1.0 / i22, nis
+    nis = inverse * (e1 * w1 + y2 * w2)
+    return correction, b, A, B, C, y2 - s12 / s1 * e1, determinant / s1, nis
 
 
 def row_after_row(b, A, B, C, h1, e1, h2, y2, variance):

@@ -63,7 +63,13 @@ def helper(function: FunctionType) -> Any:
         from strapdown.kernels.lanes import INTRINSICS
 
         return INTRINSICS[function.__name__]
-    return numba.njit(forceinline=True, **_options(function))(_twin(function))
+    plain = numba.njit(forceinline=True, **_options(function))(_twin(function))
+    if function.__module__ == f"{PACKAGE}.algebra":
+        from strapdown.kernels.packed import PACKED, packed
+
+        if function.__name__ in PACKED:
+            return packed(function.__name__, plain)
+    return plain
 
 
 @functools.cache

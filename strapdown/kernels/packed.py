@@ -1,0 +1,133 @@
+"""Products of 3×3 matrices in machine vectors, for one run at a time.
+
+A matrix stays a tuple of nine numbers to whoever reads the source. Compiled for doubles, a few functions of
+:mod:`strapdown.kernels.algebra` work on its rows as vectors: a row of the result is a sum of rows, each times one number, so nine
+instructions do what else takes 27. LLVM sees that a number taken out of a vector only to be put back at its place need not move, so
+products in a row stay in vectors. The order of operations is that of the source: bits are those of each lane of
+:mod:`strapdown.kernels.lanes`.
+
+Only what was measured to gain is here: products with vectors, symmetric products and symmetric rank-one terms lose in moving numbers
+about what they gain.
+"""
+
+# ruff: noqa: PLW0108 - numba wants functions here, not what they call
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numba
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic, overload
+
+_ROW = ir.VectorType(ir.DoubleType(), 4)
+"""Three numbers and a spare."""
+_INDEX = ir.IntType(32)
+_NOWHERE = ir.Constant(_ROW, ir.Undefined)
+_FUSED = ("contract",)
+_OPTIONS = {"forceinline": True, "fastmath": {"contract"}, "error_model": "numpy", "nogil": True}
+
+
+def _row(builder: Any, numbers: Any) -> Any:
+    vector = _NOWHERE
+    for place, number in enumerate(numbers):
+        vector = builder.insert_element(vector, number, ir.Constant(_INDEX, place))
+    return vector
+
+
+def _rows(builder: Any, matrix: Any) -> list[Any]:
+    return [_row(builder, matrix[3 * i : 3 * i + 3]) for i in range(3)]
+
+
+def _numbers(builder: Any, rows: Any) -> list[Any]:
+    return [builder.extract_element(row, ir.Constant(_INDEX, place)) for row in rows for place in range(3)]
+
+
+def _times(builder: Any, number: Any, row: Any) -> Any:
+    spread = builder.shuffle_vector(_row(builder, [number]), _NOWHERE, ir.Constant(ir.VectorType(_INDEX, 4), [0] * 4))
+    return builder.fmul(spread, row, flags=_FUSED)
+
+
+def _multiply(builder: Any, left: Any, right: Any) -> list[Any]:
+    """Emit :func:`strapdown.kernels.algebra.multiply`."""
+    rows = _rows(builder, right)
+    result = []
+    for i in range(3):
+        first, second, third = (_times(builder, left[3 * i + k], rows[k]) for k in range(3))
+        result.append(builder.fadd(builder.fadd(first, second, flags=_FUSED), third, flags=_FUSED))
+    return _numbers(builder, result)
+
+
+def _multiply_add(builder: Any, left: Any, right: Any, addend: Any) -> list[Any]:
+    """Emit :func:`strapdown.kernels.algebra.multiply_add`."""
+    rows, result = _rows(builder, right), _rows(builder, addend)
+    for i in range(3):
+        for k in (2, 1, 0):
+            result[i] = builder.fadd(_times(builder, left[3 * i + k], rows[k]), result[i], flags=_FUSED)
+    return _numbers(builder, result)
+
+
+def _minus_outer(builder: Any, matrix: Any, left: Any, right: Any) -> list[Any]:
+    """Emit :func:`strapdown.kernels.algebra.minus_outer`."""
+    row = _row(builder, right)
+    rows = _rows(builder, matrix)
+    return _numbers(builder, [builder.fsub(rows[i], _times(builder, left[i], row), flags=_FUSED) for i in range(3)])
+
+
+_EMIT: dict[str, tuple[Callable[..., list[Any]], tuple[int, ...]]] = {
+    "multiply": (_multiply, (9, 9)),
+    "multiply_add": (_multiply_add, (9, 9, 9)),
+    "minus_outer": (_minus_outer, (9, 3, 3)),
+}
+"""By name of a function of :mod:`strapdown.kernels.algebra`: what emits it, and how many numbers each argument has."""
+
+PACKED = frozenset(_EMIT)
+
+
+def _doubles(count: int) -> types.UniTuple:
+    return types.UniTuple(types.float64, count)
+
+
+def packed(name: str, plain: Any) -> Any:
+    """Return the function of this name as kernels call it: in vectors where all is doubles, else ``plain``, its compiled source."""
+    emit, counts = _EMIT[name]
+    wanted = tuple(map(_doubles, counts))
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        unpacked = [
+            [builder.extract_value(argument, i) for i in range(count)]
+            for argument, count in zip(arguments, counts, strict=True)
+        ]
+        return context.make_tuple(builder, signature.return_type, emit(builder, *unpacked))
+
+    # numba wants the number of arguments spelled out.
+    if len(counts) == 2:
+
+        @intrinsic  # type: ignore[untyped-decorator]
+        def in_vectors_of_two(typing: Any, a: Any, b: Any) -> Any:
+            return _doubles(9)(*wanted), generate
+
+        def of_two(a, b):  # type: ignore[no-untyped-def]
+            raise NotImplementedError
+
+        @overload(of_two, jit_options=_OPTIONS)  # type: ignore[untyped-decorator]
+        def choose_of_two(a, b):  # type: ignore[no-untyped-def]
+            return (lambda a, b: in_vectors_of_two(a, b)) if (a, b) == wanted else (lambda a, b: plain(a, b))
+
+        return numba.njit(**_OPTIONS)(lambda a, b: of_two(a, b))
+
+    @intrinsic  # type: ignore[untyped-decorator]
+    def in_vectors_of_three(typing: Any, a: Any, b: Any, c: Any) -> Any:
+        return _doubles(9)(*wanted), generate
+
+    def of_three(a, b, c):  # type: ignore[no-untyped-def]
+        raise NotImplementedError
+
+    @overload(of_three, jit_options=_OPTIONS)  # type: ignore[untyped-decorator]
+    def choose_of_three(a, b, c):  # type: ignore[no-untyped-def]
+        return (
+            (lambda a, b, c: in_vectors_of_three(a, b, c)) if (a, b, c) == wanted else (lambda a, b, c: plain(a, b, c))
+        )
+
+    return numba.njit(**_OPTIONS)(lambda a, b, c: of_three(a, b, c))
