@@ -31,40 +31,23 @@ def heading_error(R, z, reference):
     return math.atan2(x * reference[1] - y * reference[0], x * reference[0] + y * reference[1])
 
 
-def merge_order(time, heads, ends, order):
-    """Write the order that sorts several series, each sorted, joined one after the other; at one time the earlier series comes first.
+def merge_order(time, heads, ends, row, series):
+    """Merge several series, each sorted, that stand one after the other in ``time``; at one time the earlier series comes first.
 
-    ``heads`` and ``ends`` bound each series in ``time``; ``heads`` is used up.
+    Writes for each event in order of time the row where it stands and the number of its series. ``heads`` and ``ends`` bound each series;
+    ``heads`` is used up.
     """
-    for k in range(len(order)):
+    for e in range(len(row)):
         best = -1
+        earliest = math.inf
         for s in range(len(heads)):
-            if heads[s] < ends[s] and (best < 0 or time[heads[s]] < time[heads[best]]):
+            k = heads[s]
+            if k < ends[s] and time[k] < earliest:
                 best = s
-        order[k] = heads[best]
+                earliest = time[k]
+        row[e] = heads[best]
+        series[e] = best
         heads[best] += 1
-
-
-def gather_events(order, time, value, variance, sensor, reference, kind, out):
-    """Write the columns of all events in the given order to ``out``, a tuple of arrays like them."""
-    for e in range(len(order)):
-        k = order[e]
-        out[0][e] = time[k]
-        out[1][e, 0], out[1][e, 1], out[1][e, 2] = value[k, 0], value[k, 1], value[k, 2]
-        out[2][e] = variance[k]
-        out[3][e] = sensor[k]
-        out[4][e] = reference[k]
-        out[5][e] = kind[k]
-
-
-def part_by_sensor(sensor, time, rows, heads, time_out, rows_out):
-    """Write times and rows of events one sensor after the other; ``heads`` tells where each begins, and is used up."""
-    for e in range(len(sensor)):
-        k = heads[sensor[e]]
-        heads[sensor[e]] = k + 1
-        time_out[k] = time[e]
-        for j in range(rows.shape[1]):
-            rows_out[k, j] = rows[e, j]
 
 
 def store_state(out, q, b, A, B, C):
@@ -92,11 +75,14 @@ def run_filter(
     increments,
     angle_variance,
     rate_variance,
-    event_time,
-    event_kind,
-    event_value,
-    event_variance,
-    event_reference,
+    event_row,
+    event_series,
+    time,
+    value,
+    variance,
+    bounds,
+    kinds,
+    frames,
     triads,
     state,
     every,
@@ -107,12 +93,17 @@ def run_filter(
     innovation_out,
     segment_out,
 ):
-    """Run the filter over a record; events are sorted by time and lie between the first and the last edge.
+    """Run the filter over a record; events lie between the first and the last edge.
+
+    The events stand in ``time``, ``value`` and ``variance`` one series after the other, between ``bounds``; the e-th in time stands at
+    ``event_row[e]`` and is of series ``event_series[e]``, whose kind is in ``kinds`` and whose frames are in ``triads`` (frames: row of the
+    first, and how many rows on the next).
 
     The interval from ``edges[k]`` to ``edges[k + 1]`` is split at the times of the events inside it. ``state`` holds (q, b, A, B, C) as
     28 numbers and is left at the end state, so a run may be continued. Row j of the outputs is the state after ``every · j`` intervals;
-    ``covariance_out`` (blocks A, B, C as 21 numbers) may be empty. ``innovation_out`` (events, 4 or 6) gets
-    e₁, s₁, e₂, s₂, e₃, s₃ of each event: independent innovations and their variances, as many as it has degrees of freedom.
+    ``covariance_out`` (blocks A, B, C as 21 numbers) may be empty. Row for row as the events stand, ``innovation_out``
+    (events, 4 or 6) gets e₁, s₁, e₂, s₂, e₃, s₃: independent innovations and their variances, as many as it has degrees of
+    freedom.
     ``segment_out`` (segments, 32), which may be
     empty, gets what a smoother needs of each predicted segment: its dt, its increment (3) and the state (28) that it starts from.
     Returns the number of segments stored.
@@ -122,7 +113,7 @@ def run_filter(
     A = (state[7], state[8], state[9], state[10], state[11], state[12])
     B = (state[13], state[14], state[15], state[16], state[17], state[18], state[19], state[20], state[21])
     C = (state[22], state[23], state[24], state[25], state[26], state[27])
-    events = len(event_time)
+    events = len(event_row)
     e = 0
     k = -1  # the interval before the first edge has no length; its end takes the events at the first edge
     now = edges[0]
@@ -135,8 +126,8 @@ def run_filter(
     segments = 0
     # One pass predicts to the next event or edge, takes in the event, and closes the interval, each where there is one.
     while k < len(increments):
-        due = e < events and event_time[e] <= end
-        stop = event_time[e] if due else end
+        due = e < events and time[event_row[e]] <= end
+        stop = time[event_row[e]] if due else end
         dt = stop - now
         if dt > 0.0:
             part = theta
@@ -155,32 +146,35 @@ def run_filter(
             now = stop
         if due:
             R = rotation_matrix(q)
-            z = vector_at(event_value, e)
-            t = event_reference[e]
-            if event_kind[e] == ATTITUDE:
+            at = event_row[e]
+            series = event_series[e]
+            kind = kinds[series]
+            t = frames[series, 0] + frames[series, 1] * (at - bounds[series])
+            z = vector_at(value, at)
+            if kind == ATTITUDE:
                 measured = (triads[t, 0], triads[t, 1], triads[t, 2], triads[t, 3])
                 q, b, A, B, C, e1, s1, e2, s2, e3, s3 = update_attitude(q, b, A, B, C, measured, z)
-                innovation_out[e, 4] = e3
-                innovation_out[e, 5] = s3
-            elif event_kind[e] != HEADING:
+                innovation_out[at, 4] = e3
+                innovation_out[at, 5] = s3
+            elif kind != HEADING:
                 u = (triads[t, 0], triads[t, 1], triads[t, 2])
                 v = (triads[t, 3], triads[t, 4], triads[t, 5])
-                if event_kind[e] == VECTOR:
+                if kind == VECTOR:
                     # Its length says nothing of the attitude, but belongs to the innovation.
                     r = (triads[t, 6], triads[t, 7], triads[t, 8])
-                    innovation_out[e, 4] = dot(transpose_times_vector(R, r), z) - 1.0
-                    innovation_out[e, 5] = event_variance[e]
-                q, b, A, B, C, e1, s1, e2, s2 = update_direction(q, b, A, B, C, R, u, v, z, event_variance[e])
+                    innovation_out[at, 4] = dot(transpose_times_vector(R, r), z) - 1.0
+                    innovation_out[at, 5] = variance[at]
+                q, b, A, B, C, e1, s1, e2, s2 = update_direction(q, b, A, B, C, R, u, v, z, variance[at])
             else:
                 error = heading_error(R, z, (triads[t, 6], triads[t, 7], triads[t, 8]))
-                q, b, A, B, C, e1, s1 = update_heading(q, b, A, B, C, heading_row(R, z), error, event_variance[e])
+                q, b, A, B, C, e1, s1 = update_heading(q, b, A, B, C, heading_row(R, z), error, variance[at])
                 e2, s2 = 0.0, 1.0
-            innovation_out[e, 0] = e1
-            innovation_out[e, 1] = s1
-            innovation_out[e, 2] = e2
-            innovation_out[e, 3] = s2
+            innovation_out[at, 0] = e1
+            innovation_out[at, 1] = s1
+            innovation_out[at, 2] = e2
+            innovation_out[at, 3] = s2
             e += 1
-        if now >= end and (e == events or event_time[e] > end):
+        if now >= end and (e == events or time[event_row[e]] > end):
             if countdown == 0:
                 countdown = every
                 attitude_out[row, 0], attitude_out[row, 1], attitude_out[row, 2], attitude_out[row, 3] = q

@@ -128,7 +128,7 @@ def run_events(
     blocks = np.empty((rows if full_covariance else 0, 21))
     plain = gate is None and robust is None and events.noise is None
     width = max([4, *(2 * KINDS[kind] for kind in events.kinds)]) if plain else 6
-    innovation = np.empty((len(events.time), width))
+    innovation = np.empty((len(events.row), width))
     stored = np.empty((segments + 1 if segments else 0, 32))
     weight, recoveries = None, np.empty((0, 4))
     if plain:
@@ -137,11 +137,14 @@ def run_events(
             np.ascontiguousarray(record.increments),
             process_noise.angle_random_walk**2,
             process_noise.rate_random_walk**2,
-            events.time,
-            events.kind,
-            events.vector_b,
-            events.variance,
-            events.reference,
+            events.row,
+            events.sensor,
+            events.standing_time,
+            events.standing_vector_b,
+            events.standing_variance,
+            events.bounds,
+            events.codes,
+            events.frames,
             events.triads,
             state,
             every,
@@ -154,9 +157,9 @@ def run_events(
         )
     else:
         options = _KernelOptions.of(gate, robust, initial)
-        weight = np.empty(len(events.time))
+        weight = np.empty(len(events.row))
         # A recovery takes at least two refusals.
-        recoveries = np.empty((len(events.time) // 2, 4))
+        recoveries = np.empty((len(events.row) // 2, 4))
         number, recovered = compiled(robust_loop.run_robust)(
             record.time,
             np.ascontiguousarray(record.increments),
@@ -194,14 +197,15 @@ def run_events(
         stored[number, 4:] = state
     told = [*gaps(record.time), *_recovery_events(recoveries, events.sensors)]
     if monitor is not None:
-        told += monitor.watch(*_nis_in_order(events, innovation, weight, gate))
+        in_order = innovation[events.row] if plain else innovation
+        told += monitor.watch(*_nis_in_order(events, in_order, weight, gate))
     estimate = Estimate(
         time=record.time[::every],
         attitude=attitude,
         bias=bias,
         variance=variance,
         covariance=covariance_matrices(blocks) if full_covariance else None,
-        innovations=innovations_by_sensor(events, innovation, weight),
+        innovations=innovations_by_sensor(events, innovation, weight, parted=plain),
         skipped=events.skipped,
         events=tuple(sorted(told, key=lambda event: event.start)),
     )

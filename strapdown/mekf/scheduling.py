@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -22,28 +23,71 @@ _KIND_CODES = {
 
 @dataclass(frozen=True, kw_only=True)
 class Schedule:
-    """Measurements of all sensors in one order of time, as the kernel takes them. Those at one time keep the order of the sensors."""
+    """Measurements of all sensors and their order of time. Those at one time keep the order of the sensors.
 
-    time: Array
-    """Times (events,), s."""
-    kind: np.ndarray
-    """Codes of :mod:`strapdown.kernels.filter_loop` (events,)."""
-    vector_b: Array
+    What was measured stands as it came, one sensor after the other, and is not moved: ``row`` tells where the event next in time stands.
+    The columns in order of time are made when they are asked for.
+    """
+
+    standing_time: Array
+    """Times (events,), s, one sensor after the other."""
+    standing_vector_b: Array
     """Measured vectors over the length of their references (events, 3); of an attitude its three variances."""
-    variance: Array
+    standing_variance: Array
     """Variance of each component of the vector (events,)."""
+    standing_noise: Array | None = None
+    """Upper triangles of the covariances in body axes (events, 6), over the squared lengths of the references, if any is anisotropic."""
+    row: np.ndarray
+    """Where each event stands, in order of time (events,)."""
     sensor: np.ndarray
-    """Index of the sensor (events,)."""
-    reference: np.ndarray
-    """Row of ``triads`` (events,)."""
+    """Index of the sensor of each event, in order of time (events,)."""
+    bounds: np.ndarray
+    """Where each sensor's events begin, and the last ones end (sensors + 1,)."""
+    codes: np.ndarray
+    """Code of :mod:`strapdown.kernels.filter_loop` of each sensor (sensors,)."""
+    frames: np.ndarray
+    """Row of ``triads`` of each sensor's first event, and how many rows on that of each next lies, 0 or 1 (sensors, 2)."""
     triads: Array
     """Right-handed frames (u, v, r) by rows about the references r (rows, 9), one a sensor or one a measurement; of an attitude the
     measured quaternion."""
     sensors: tuple[str, ...]
     kinds: tuple[str, ...]
     skipped: dict[str, int]
-    noise: Array | None = None
-    """Upper triangles of the covariances in body axes (events, 6), over the squared lengths of the references, if any is anisotropic."""
+
+    @cached_property
+    def time(self) -> Array:
+        """Times in order (events,), s."""
+        return self._ordered(self.standing_time)
+
+    @cached_property
+    def vector_b(self) -> Array:
+        """Measured vectors in order of time (events, 3)."""
+        return self._ordered(self.standing_vector_b)
+
+    @cached_property
+    def variance(self) -> Array:
+        """Variances in order of time (events,)."""
+        return self._ordered(self.standing_variance)
+
+    @cached_property
+    def noise(self) -> Array | None:
+        """Upper triangles of the covariances in order of time (events, 6), if any is anisotropic."""
+        return None if self.standing_noise is None else self._ordered(self.standing_noise)
+
+    @cached_property
+    def kind(self) -> np.ndarray:
+        """Codes in order of time (events,)."""
+        return np.asarray(self.codes[self.sensor])
+
+    @cached_property
+    def reference(self) -> np.ndarray:
+        """Row of ``triads`` of each event in order of time (events,)."""
+        first, step = self.frames.T
+        rows = first[self.sensor] + step[self.sensor] * (self.row - self.bounds[self.sensor])
+        return np.asarray(rows, dtype=np.int32)
+
+    def _ordered(self, column: Array) -> Array:
+        return column if len(self.sensors) < 2 else np.take(column, self.row, axis=0)
 
     @property
     def body_noise(self) -> Array:
@@ -70,45 +114,37 @@ def schedule(
                 f"{series.sensor}: this filter takes one sigma a sample, not sigma_axes or covariance; use mekf.run, or give sigma"
             )
     parts = [_scheduled(series, start, end) for series in vectors]
-    rows = np.cumsum([0, *(len(part.frames) for part in parts)])
-    columns = [
-        (
-            part.time,
-            part.value,
-            part.variance,
-            np.full(len(part.time), i, np.uint8),
-            part.frame + np.int32(rows[i]),
-            np.full(len(part.time), _KIND_CODES[series.kind], np.uint8),
-            *((part.noise,) if any(s.anisotropic for s in vectors) else ()),
-        )
-        for i, (series, part) in enumerate(zip(vectors, parts, strict=True))
-    ]
-    if not columns:
-        none = np.empty(0, np.uint8)
-        columns.append((np.empty(0), np.empty((0, 3)), np.empty(0), none, np.empty(0, np.int32), none))
-    joined = columns[0] if len(columns) == 1 else [np.concatenate(column) for column in zip(*columns, strict=True)]
-    if len(columns) > 1:
-        bounds = np.cumsum([0, *(len(column[0]) for column in columns)])
-        order = np.empty(bounds[-1], np.int64)
-        compiled(filter_loop.merge_order)(joined[0], bounds[:-1].copy(), bounds[1:], order)
-        first = [np.ascontiguousarray(column) for column in joined[:6]]
-        sorted_columns = tuple(np.empty_like(column) for column in first)
-        compiled(filter_loop.gather_events)(order, *first, sorted_columns)
-        joined = [*sorted_columns, *(np.take(column, order, axis=0) for column in joined[6:])]
-    time, value, variance, sensor, reference, kind, *noise = joined
+    bounds = np.cumsum([0, *(len(part.time) for part in parts)])
+    number = int(bounds[-1])
+    time = _joined([part.time for part in parts], (0,))
+    row, sensor = np.arange(number, dtype=np.uint32), np.zeros(number, np.uint8)
+    if len(parts) > 1:
+        compiled(filter_loop.merge_order)(time, bounds[:-1].copy(), bounds[1:], row, sensor)
+    first_frames = np.cumsum([0, *(len(part.frames) for part in parts[:-1])])
     return Schedule(
-        time=time,
-        kind=kind,
-        vector_b=np.ascontiguousarray(value),
-        variance=variance,
+        standing_time=time,
+        standing_vector_b=_joined([part.value for part in parts], (0, 3)),
+        standing_variance=_joined([part.variance for part in parts], (0,)),
+        standing_noise=_joined([part.noise for part in parts], (0, 6)) if any(s.anisotropic for s in vectors) else None,
+        row=row,
         sensor=sensor,
-        reference=reference,
-        triads=np.concatenate([part.frames for part in parts]) if parts else np.empty((0, 9)),
+        bounds=bounds,
+        codes=np.array([_KIND_CODES[series.kind] for series in vectors], np.uint8),
+        frames=np.array(
+            [(first, part.moving) for first, part in zip(first_frames, parts, strict=False)], np.int64
+        ).reshape(-1, 2),
+        triads=_joined([part.frames for part in parts], (0, 9)),
         sensors=tuple(series.sensor for series in vectors),
         kinds=tuple(series.kind for series in vectors),
         skipped={s.sensor: len(s.time) - len(part.time) for s, part in zip(vectors, parts, strict=True)},
-        noise=noise[0] if noise else None,
     )
+
+
+def _joined(columns: list[Array], empty: tuple[int, ...]) -> Array:
+    """Return the columns one after the other, contiguous; a single one is not copied."""
+    if len(columns) == 1:
+        return np.ascontiguousarray(columns[0])
+    return np.concatenate(columns) if columns else np.empty(empty)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,8 +154,8 @@ class _Part:
     time: Array
     value: Array
     variance: Array
-    frame: np.ndarray
-    """Rows of ``frames``."""
+    moving: bool
+    """Whether each measurement has a frame of its own."""
     frames: Array
     """(rows, 9)."""
     series: VectorMeasurements
@@ -149,12 +185,11 @@ def _scheduled(series: VectorMeasurements, start: float, end: float) -> _Part:
             time=used.time,
             value=used.sigma_axes**2,
             variance=used.sigma**2,
-            frame=np.arange(len(used.time), dtype=np.int32),
+            moving=True,
             frames=frames,
             series=used,
         )
     moving = used.reference_f.ndim == 2
-    frame = np.arange(len(used.time), dtype=np.int32) if moving else np.zeros(len(used.time), np.int32)
     value, variance = used.vector_b, used.sigma**2
     length: Array | float = 1.0
     if used.kind == "vector":
@@ -165,7 +200,7 @@ def _scheduled(series: VectorMeasurements, start: float, end: float) -> _Part:
         time=used.time,
         value=value,
         variance=variance,
-        frame=frame,
+        moving=moving,
         frames=triad(used.reference_f).reshape(-1, 9),
         series=used,
         length=length,
@@ -193,23 +228,27 @@ def _need_noise(series: VectorMeasurements) -> None:
             )
 
 
-def innovations_by_sensor(events: Schedule, rows: Array, weight: Array | None = None) -> dict[str, Innovations]:
-    """Return what a kernel wrote of each event, e₁, s₁, e₂, s₂, …, by sensor, as many as each has degrees of freedom."""
-    if len(events.sensors) == 1:
-        time, parted = events.time, rows
-        bounds = np.array([0, len(rows)])
-    else:
-        bounds = np.concatenate([[0], np.cumsum(np.bincount(events.sensor, minlength=len(events.sensors)))])
-        time, parted = np.empty_like(events.time), np.empty_like(rows)
-        compiled(filter_loop.part_by_sensor)(events.sensor, events.time, rows, bounds[:-1].copy(), time, parted)
+def innovations_by_sensor(
+    events: Schedule, rows: Array, weight: Array | None = None, *, parted: bool = False
+) -> dict[str, Innovations]:
+    """Return what a kernel wrote of each event, e₁, s₁, e₂, s₂, …, by sensor, as many as each has degrees of freedom.
+
+    The rows are in order of time, or at ``events.row`` if ``parted`` already; the weights in order of time.
+    """
+    if len(events.sensors) > 1 and not parted:
+        ordered, rows = rows, np.empty_like(rows)
+        rows[events.row] = ordered
+    if len(events.sensors) > 1 and weight is not None:
+        ordered, weight = weight, np.empty_like(weight)
+        weight[events.row] = ordered
     result = {}
     for i, (sensor, kind) in enumerate(zip(events.sensors, events.kinds, strict=True)):
-        mine = slice(bounds[i], bounds[i + 1])
-        filled = parted[mine, : 2 * KINDS[kind]]
+        mine = slice(events.bounds[i], events.bounds[i + 1])
+        filled = rows[mine, : 2 * KINDS[kind]]
         result[sensor] = Innovations(
-            time=time[mine],
+            time=events.standing_time[mine],
             innovation=filled[:, 0::2],
             variance=filled[:, 1::2],
-            weight=None if weight is None else weight if len(events.sensors) == 1 else weight[events.sensor == i],
+            weight=None if weight is None else weight[mine],
         )
     return result
