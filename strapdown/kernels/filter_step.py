@@ -33,7 +33,13 @@ from strapdown.kernels.algebra import (
     transpose_times_vector,
 )
 from strapdown.kernels.lane_values import anywhere, chosen, everywhere
-from strapdown.kernels.rotation import logarithm, quaternion_multiply, right_jacobian, turned, unit
+from strapdown.kernels.rotation import (
+    logarithm,
+    quaternion_multiply,
+    right_jacobian,
+    turned,
+    unit,
+)
 from strapdown.kernels.series import fifth, fourth, second, sinc, third
 
 SHORT_FORM = 1000.0
@@ -91,7 +97,9 @@ def predict(q, b, A, B, C, delta_theta, dt, angle_variance, rate_variance):
     theta_theta = multiply_add(phi11, full(A), multiply(phi12, transpose(B)))
     return (
         turned(q, phi),
-        times_transpose_upper_add(theta_theta, phi11, times_transpose_upper_add(theta_bias, phi12, q11)),
+        times_transpose_upper_add(
+            theta_theta, phi11, times_transpose_upper_add(theta_bias, phi12, q11)
+        ),
         add_matrices(theta_bias, q12),
         add_to_diagonal(C, q22),
     )
@@ -99,7 +107,11 @@ def predict(q, b, A, B, C, delta_theta, dt, angle_variance, rate_variance):
 
 def chosen_triple(condition, a, b):
     """Return the 3-vector a in the lanes where the condition holds, b in the others."""
-    return (chosen(condition, a[0], b[0]), chosen(condition, a[1], b[1]), chosen(condition, a[2], b[2]))
+    return (
+        chosen(condition, a[0], b[0]),
+        chosen(condition, a[1], b[1]),
+        chosen(condition, a[2], b[2]),
+    )
 
 
 def chosen_quadruple(condition, a, b):
@@ -163,7 +175,9 @@ def reset(q, A, B, correction):
     q = turned(q, correction)
     large = dot(correction, correction) > 1.0
     if anywhere(large):
-        q = chosen_quadruple(large, unit(q), q)  # the polynomials of so large a turn leave the norm
+        q = chosen_quadruple(
+            large, unit(q), q
+        )  # the polynomials of so large a turn leave the norm
     return (
         q,
         times_transpose_upper(multiply(G, full(A)), G),
@@ -183,28 +197,30 @@ def direction_rows(R, u, v, z):
 
 
 def rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, s1, s12, s22):
-    """Take in two rows by the inverse of their 2×2 covariance (s1, s12, s22): one division in the chain of dependence instead of two.
+    """Take in two rows of covariance (s1, s12, s22), the second freed of the first: the divisions do not wait for each other.
 
     Returns the correction, b, A, B, C, the second row's innovation freed of the first with its variance, and the NIS.
     """
     determinant = s1 * s22 - s12 * s12
+    inverse1 = 1.0 / s1
     inverse = 1.0 / determinant
+    share = inverse1 * s12
+    e2 = y2 - share * e1
+    pa2 = combine(1.0, pa2, -share, pa1)
     pb1 = transpose_times_vector(B, h1)
-    pb2 = transpose_times_vector(B, h2)
-    # The correction, on which all that follows waits, is ready but for the scale before the division ends.
-    w1 = s22 * e1 - s12 * y2
-    w2 = s1 * y2 - s12 * e1
-    correction = scale(inverse, combine(w1, pa1, w2, pa2))
-    b = add(b, scale(inverse, combine(w1, pb1, w2, pb2)))
-    ka1 = scale(inverse, combine(s22, pa1, -s12, pa2))
-    ka2 = scale(inverse, combine(-s12, pa1, s1, pa2))
-    kb1 = scale(inverse, combine(s22, pb1, -s12, pb2))
-    kb2 = scale(inverse, combine(-s12, pb1, s1, pb2))
+    pb2 = combine(1.0, transpose_times_vector(B, h2), -share, pb1)
+    # The correction, on which all that follows waits, comes straight from the divisions, not by way of the gains.
+    g1 = inverse1 * e1
+    g2 = inverse * (s1 * e2)
+    correction = combine(g1, pa1, g2, pa2)
+    b = add(b, combine(g1, pb1, g2, pb2))
+    inverse2 = inverse * s1
+    ka1, ka2 = scale(inverse1, pa1), scale(inverse2, pa2)
+    kb1, kb2 = scale(inverse1, pb1), scale(inverse2, pb2)
     A = symmetric_minus_outer(symmetric_minus_outer(A, ka1, pa1), ka2, pa2)
     B = minus_outer(minus_outer(B, ka1, pb1), ka2, pb2)
     C = symmetric_minus_outer(symmetric_minus_outer(C, kb1, pb1), kb2, pb2)
-    nis = inverse * (e1 * w1 + y2 * w2)
-    return correction, b, A, B, C, y2 - s12 / s1 * e1, determinant / s1, nis
+    return correction, b, A, B, C, e2, inverse1 * determinant, g1 * e1 + g2 * e2
 
 
 def row_after_row(b, A, B, C, h1, e1, h2, y2, variance):
@@ -220,7 +236,9 @@ def update_direction(q, b, A, B, C, R, u, v, z, variance):
 
     ``R`` is the matrix of q, ``variance`` that of each component, rad². The innovations are independent: the NIS is e₁²/s₁ + e₂²/s₂.
     """
-    q, b, A, B, C, e1, s1, e2, s2, _ = update_direction_and_judge(q, b, A, B, C, R, u, v, z, variance)
+    q, b, A, B, C, e1, s1, e2, s2, _ = update_direction_and_judge(
+        q, b, A, B, C, R, u, v, z, variance
+    )
     return q, b, A, B, C, e1, s1, e2, s2
 
 
@@ -234,7 +252,9 @@ def update_direction_and_judge(q, b, A, B, C, R, u, v, z, variance):
     s22 = dot(h2, pa2) + variance
     together = s1 + s22 < SHORT_FORM * variance
     if everywhere(together):
-        correction, b, A, B, C, e2, s2, nis = rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, s1, s12, s22)
+        correction, b, A, B, C, e2, s2, nis = rows_at_once(
+            b, A, B, C, pa1, pa2, h1, e1, h2, y2, s1, s12, s22
+        )
     elif anywhere(together):
         at_once = rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, s1, s12, s22)
         one_by_one = row_after_row(b, A, B, C, h1, e1, h2, y2, variance)
@@ -247,7 +267,9 @@ def update_direction_and_judge(q, b, A, B, C, R, u, v, z, variance):
         s2 = chosen(together, at_once[6], one_by_one[6])
         nis = chosen(together, at_once[7], one_by_one[7])
     else:
-        correction, b, A, B, C, e2, s2, nis = row_after_row(b, A, B, C, h1, e1, h2, y2, variance)
+        correction, b, A, B, C, e2, s2, nis = row_after_row(
+            b, A, B, C, h1, e1, h2, y2, variance
+        )
     q, A, B = reset(q, A, B, correction)
     return q, b, A, B, C, e1, s1, e2, s2, nis
 
@@ -269,7 +291,9 @@ def update_residual(q, b, A, B, C, y, variance):
     e2 = y[1] - first[1]
     second, b, A, B, C, s2 = update_row(b, A, B, C, (0.0, 1.0, 0.0), e2, variance[1])
     e3 = y[2] - first[2] - second[2]
-    third_part, b, A, B, C, s3 = update_row(b, A, B, C, (0.0, 0.0, 1.0), e3, variance[2])
+    third_part, b, A, B, C, s3 = update_row(
+        b, A, B, C, (0.0, 0.0, 1.0), e3, variance[2]
+    )
     q, A, B = reset(q, A, B, add(first, add(second, third_part)))
     return q, b, A, B, C, y[0], s1, e2, s2, e3, s3
 

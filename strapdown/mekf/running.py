@@ -240,6 +240,8 @@ class _KernelOptions:
 def gaps(time: Array, factor: float = GAP_FACTOR) -> list[Event]:
     """Return the gyro intervals that are more than ``factor`` times as long as the median interval, as events."""
     steps = np.diff(time)
+    if np.max(steps, initial=0.0) <= factor * np.min(steps, initial=np.inf):
+        return []  # the median need not be sought
     usual = float(np.median(steps))
     return [
         Event(kind="gap", start=float(time[k]), end=float(time[k + 1]), value=float(steps[k] / usual))
