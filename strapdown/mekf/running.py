@@ -9,6 +9,7 @@ import numpy as np
 from strapdown.checks import Array, count
 from strapdown.kernels import filter_loop, robust_loop, robust_step
 from strapdown.kernels.machine import compiled
+from strapdown.mekf.memory import side_by_side
 from strapdown.mekf.scheduling import Schedule, innovations_by_sensor, schedule
 from strapdown.mekf.states import ProcessNoise, State, covariance_matrices, pack
 from strapdown.records import Estimate, Event, ImuRecord
@@ -124,11 +125,10 @@ def run_events(
     states = np.empty((2, 28))
     state = states[0]
     state[:] = pack(initial.attitude, initial.bias, initial.covariance)
-    attitude, bias, variance = np.empty((rows, 4)), np.empty((rows, 3)), np.empty((rows, 6))
-    blocks = np.empty((rows if full_covariance else 0, 21))
     plain = gate is None and robust is None and events.noise is None
     width = max([4, *(2 * KINDS[kind] for kind in events.kinds)]) if plain else 6
-    innovation = np.empty((len(events.row), width))
+    shapes = (rows, 4), (rows, 3), (rows, 6), (rows if full_covariance else 0, 21), (len(events.row), width)
+    attitude, bias, variance, blocks, innovation = side_by_side(*((shape, float) for shape in shapes))
     stored = np.empty((segments + 1 if segments else 0, 32))
     weight, recoveries = None, np.empty((0, 4))
     if plain:

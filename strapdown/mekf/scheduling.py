@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,6 +11,7 @@ import numpy as np
 from strapdown.checks import Array, InputError
 from strapdown.kernels import filter_loop
 from strapdown.kernels.machine import compiled
+from strapdown.mekf.memory import side_by_side
 from strapdown.records import Innovations
 from strapdown.vectors import KINDS, VectorMeasurements, triad
 
@@ -115,16 +117,27 @@ def schedule(
             )
     parts = [_scheduled(series, start, end) for series in vectors]
     bounds = np.cumsum([0, *(len(part.time) for part in parts)])
+    places = [slice(begin, beyond) for begin, beyond in itertools.pairwise(bounds)]
     number = int(bounds[-1])
-    time = _joined([part.time for part in parts], (0,))
-    row, sensor = np.arange(number, dtype=np.uint32), np.zeros(number, np.uint8)
-    if len(parts) > 1:
+    standing = ((number,), float), ((number, 3), float)
+    common = ((number,), float), ((number,), np.uint32), ((number,), np.uint8)
+    if len(parts) == 1:
+        time, value = np.ascontiguousarray(parts[0].time), np.ascontiguousarray(parts[0].value)
+        variance, row, sensor = side_by_side(*common)
+        row[:] = np.arange(number, dtype=np.uint32)
+        sensor[:] = 0
+    else:
+        time, value, variance, row, sensor = side_by_side(*standing, *common)
+        for part, mine in zip(parts, places, strict=True):
+            time[mine], value[mine] = part.time, part.value
         compiled(filter_loop.merge_order)(time, bounds[:-1].copy(), bounds[1:], row, sensor)
+    for part, mine in zip(parts, places, strict=True):
+        np.square(part.sigma, out=variance[mine])
     first_frames = np.cumsum([0, *(len(part.frames) for part in parts[:-1])])
     return Schedule(
         standing_time=time,
-        standing_vector_b=_joined([part.value for part in parts], (0, 3)),
-        standing_variance=_joined([part.variance for part in parts], (0,)),
+        standing_vector_b=value,
+        standing_variance=variance,
         standing_noise=_joined([part.noise for part in parts], (0, 6)) if any(s.anisotropic for s in vectors) else None,
         row=row,
         sensor=sensor,
@@ -153,7 +166,7 @@ class _Part:
 
     time: Array
     value: Array
-    variance: Array
+    sigma: Array
     moving: bool
     """Whether each measurement has a frame of its own."""
     frames: Array
@@ -175,7 +188,8 @@ def _scheduled(series: VectorMeasurements, start: float, end: float) -> _Part:
     inside = slice(*np.searchsorted(series.time, [start, np.nextafter(end, np.inf)]))
     used = series if inside == slice(0, len(series.time)) else series.taken(inside)
     content = used.vector_b if used.attitude is None else used.attitude
-    if not np.isfinite(content).all():
+    # One number that is not finite makes their sum so; a sum takes no memory.
+    if not np.isfinite(np.sum(content)):
         used = used.taken(np.isfinite(content).all(axis=1))
     if used.attitude is not None:
         assert used.sigma_axes is not None
@@ -184,22 +198,22 @@ def _scheduled(series: VectorMeasurements, start: float, end: float) -> _Part:
         return _Part(
             time=used.time,
             value=used.sigma_axes**2,
-            variance=used.sigma**2,
+            sigma=used.sigma,
             moving=True,
             frames=frames,
             series=used,
         )
     moving = used.reference_f.ndim == 2
-    value, variance = used.vector_b, used.sigma**2
+    value, sigma = used.vector_b, used.sigma
     length: Array | float = 1.0
     if used.kind == "vector":
         # A vector is taken over the length of its reference, so that the kernel sees unit references only.
         length = np.asarray(np.linalg.norm(used.reference_f, axis=-1))
-        value, variance = value / (length[:, None] if moving else length), variance / length**2
+        value, sigma = value / (length[:, None] if moving else length), sigma / length
     return _Part(
         time=used.time,
         value=value,
-        variance=variance,
+        sigma=sigma,
         moving=moving,
         frames=triad(used.reference_f).reshape(-1, 9),
         series=used,
