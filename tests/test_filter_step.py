@@ -209,3 +209,36 @@ def test_plain_python_and_compiled_are_one():
     fast = compiled(filter_step.predict)(*arguments)
     for one, other in zip(plain, fast, strict=True):
         assert np.allclose(one, other, rtol=1e-13, atol=1e-16 * np.abs(other).max())
+
+
+@pytest.mark.parametrize("angle", [1.0, 2.0, np.pi, 6.0, 20.0])
+def test_a_far_turn_is_the_exponential_and_its_jacobian(angle):
+    phi = angle * np.array([0.48, -0.6, 0.64])
+    q, J = filter_step.far_turn(tuple(phi))
+    wanted = quaternion.exp(phi)
+    assert np.allclose(q, wanted * np.sign(np.dot(q, wanted)), rtol=0.0, atol=1e-13)
+    assert np.allclose(np.reshape(J, (3, 3)), kinematics.right_jacobian(phi), rtol=0.0, atol=1e-13)
+
+
+@pytest.mark.parametrize("angle", [0.9, 1.1, 3.0, 12.0])
+def test_a_reset_of_any_size_is_a_rotation_of_the_covariance(angle):
+    """Either side of where the polynomials give way; A and B against J_r in NumPy, q of norm one."""
+    rng = np.random.default_rng(3)
+    M = rng.standard_normal((6, 6))
+    P = M @ M.T
+    c = angle * np.array([-0.64, 0.6, 0.48])
+    q = quaternion.normalize(rng.standard_normal(4))
+    moved, A, B = filter_step.reset(tuple(q), tuple(P[np.triu_indices(3)]), tuple(P[:3, 3:].ravel()), tuple(c))
+    G = kinematics.right_jacobian(c)
+    assert np.linalg.norm(moved) == pytest.approx(1.0, abs=1e-13 if angle > 1.0 else 1e-9)
+    assert abs(abs(np.dot(moved, quaternion.multiply(q, quaternion.exp(c)))) - 1.0) < 1e-9
+    assert np.allclose(A, (G @ P[:3, :3] @ G.T)[np.triu_indices(3)], rtol=0.0, atol=1e-8)
+    assert np.allclose(np.reshape(B, (3, 3)), G @ P[:3, 3:], rtol=0.0, atol=1e-8)
+
+
+def test_a_vertical_vector_has_no_heading():
+    R = tuple(quaternion.to_matrix(quaternion.exp(np.array([0.3, -0.2, 0.9]))).ravel())
+    up = R[6:]
+    assert filter_step.heading_row(R, up) == (0.0, 0.0, 0.0)
+    aside = np.array(up) + 1e-6 * np.array(R[:3])
+    assert np.linalg.norm(filter_step.heading_row(R, tuple(aside))) > 1e5

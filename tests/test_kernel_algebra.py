@@ -97,6 +97,11 @@ KERNELS: dict[str, tuple[Callable, tuple[int, ...], Callable]] = {
     "transpose": (algebra.transpose, (M,), lambda A: flat(swapped(matrix(A)))),
     "full": (algebra.full, (U,), lambda s: flat(symmetric(s))),
     "add_matrices": (algebra.add_matrices, (M, M), lambda A, B: flat(matrix(A) + matrix(B))),
+    "combine_matrices": (
+        algebra.combine_matrices,
+        (S, M, S, M),
+        lambda s, A, t, B: flat(scalar(scalar(s)) * matrix(A) + scalar(scalar(t)) * matrix(B)),
+    ),
     "add_to_diagonal": (
         algebra.add_to_diagonal,
         (U, S),

@@ -126,6 +126,12 @@ def add_matrices(A, B):
     )
 
 
+def combine_matrices(s, A, t, B):
+    """Return s A + t B of scalars and 9-tuples."""
+    a, b, c = combine(s, A[:3], t, B[:3]), combine(s, A[3:6], t, B[3:6]), combine(s, A[6:], t, B[6:])
+    return (a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2])
+
+
 def add_to_diagonal(S, d):
     """Return S + d I of a symmetric matrix."""
     return (S[0] + d, S[1], S[2], S[3] + d, S[4], S[5] + d)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from strapdown.kernels.algebra import dot, matrix_times_vector, scale, transpose_times_vector
+from strapdown.kernels.algebra import combine, dot, matrix_times_vector, scale, transpose_times_vector
 from strapdown.kernels.filter_step import heading_row, predict, update_attitude, update_direction, update_heading
 from strapdown.kernels.rotation import rotation_matrix
 from strapdown.kernels.series import LARGEST_ANGLE
@@ -18,6 +18,10 @@ HEADING = 2
 ATTITUDE = 3
 """Kind of an event: a whole attitude, three degrees of freedom. Its frame holds the quaternion in its first four numbers, its value the
 three variances."""
+
+
+MOST_TURN = 1e6
+"""rad: a step whose bias turns the body by more is of a filter that is lost, and is not cut into sub-steps."""
 
 
 def vector_at(array, k):
@@ -119,7 +123,6 @@ def run_filter(
     now = edges[0]
     end = now
     whole = 1.0
-    longest = 1.0
     theta = (0.0, 0.0, 0.0)
     countdown = 0
     row = 0
@@ -131,14 +134,20 @@ def run_filter(
         dt = stop - now
         if dt > 0.0:
             part = theta
+            turn = combine(1.0, theta, -dt, b)
+            squared = dot(turn, turn)
             # Most often a whole interval: a branch that is foretold costs less than a choice between values, which waits for both.
-            if dt != longest or dt != whole:
-                if dt > longest:
-                    dt = longest
+            if dt != whole or squared > LARGEST_ANGLE * LARGEST_ANGLE:
+                part = scale(dt / whole, theta)
+                turn = combine(1.0, part, -dt, b)
+                squared = dot(turn, turn)
+                # Beyond the range of the polynomials, sub-steps: at constant rate they compose exactly, so this is the same model.
+                if LARGEST_ANGLE * LARGEST_ANGLE < squared < MOST_TURN * MOST_TURN:
+                    share = LARGEST_ANGLE / math.sqrt(squared)
+                    dt = share * dt
+                    part = scale(share, part)
                     stop = now + dt
                     due = False
-                if dt < whole:
-                    part = scale(dt / whole, theta)
             if segments < len(segment_out):
                 store_segment(segment_out, segments, dt, part, q, b, A, B, C)
                 segments += 1
@@ -194,10 +203,5 @@ def run_filter(
                 end = edges[k + 1]
                 whole = end - now
                 theta = vector_at(increments, k)
-                # Beyond the range of the polynomials, sub-steps: at constant rate they compose exactly, so this is the same model.
-                squared = dot(theta, theta)
-                longest = whole
-                if squared > LARGEST_ANGLE * LARGEST_ANGLE:
-                    longest = whole * (LARGEST_ANGLE / math.sqrt(squared))
     store_state(state, q, b, A, B, C)
     return segments

@@ -17,6 +17,7 @@ from strapdown.kernels.algebra import (
     add_matrices,
     add_to_diagonal,
     combine,
+    combine_matrices,
     dot,
     full,
     matrix_times_vector,
@@ -34,9 +35,11 @@ from strapdown.kernels.algebra import (
 )
 from strapdown.kernels.lane_values import anywhere, chosen, everywhere
 from strapdown.kernels.rotation import (
+    exponential,
     logarithm,
     quaternion_multiply,
     right_jacobian,
+    rotation_matrix,
     turned,
     unit,
 )
@@ -44,6 +47,10 @@ from strapdown.kernels.series import fifth, fourth, second, sinc, third
 
 SHORT_FORM = 1000.0
 """Where an innovation's variance is less than this many times the measurement's, the short form loses no more than three digits."""
+
+
+VERTICAL = 1e-24
+"""Squared horizontal part of a vector below which it has no heading: a picoradian from the vertical, if it is of length one."""
 
 
 def transition(phi, dt):
@@ -97,9 +104,7 @@ def predict(q, b, A, B, C, delta_theta, dt, angle_variance, rate_variance):
     theta_theta = multiply_add(phi11, full(A), multiply(phi12, transpose(B)))
     return (
         turned(q, phi),
-        times_transpose_upper_add(
-            theta_theta, phi11, times_transpose_upper_add(theta_bias, phi12, q11)
-        ),
+        times_transpose_upper_add(theta_theta, phi11, times_transpose_upper_add(theta_bias, phi12, q11)),
         add_matrices(theta_bias, q12),
         add_to_diagonal(C, q22),
     )
@@ -172,17 +177,33 @@ def reset(q, A, B, correction):
     conservative or optimistic by second-order terms, and differs from its fixed-side twin.
     """
     G = right_jacobian(correction)
-    q = turned(q, correction)
+    moved = turned(q, correction)
     large = dot(correction, correction) > 1.0
     if anywhere(large):
-        q = chosen_quadruple(
-            large, unit(q), q
-        )  # the polynomials of so large a turn leave the norm
+        far, J = far_turn(correction)
+        moved = chosen_quadruple(large, unit(quaternion_multiply(q, far)), moved)
+        G = chosen_matrix(large, J, G)
     return (
-        q,
+        moved,
         times_transpose_upper(multiply(G, full(A)), G),
         multiply(G, B),
     )
+
+
+def far_turn(phi):
+    """Return exp(φ) and J_r(φ) of a turn beyond the range of the polynomials, from a 64th of it by doubling.
+
+    ``J_r(2φ) = ½ (I + exp(−[φ])) J_r(φ)``. Good to rounding up to 20 rad: a correction of more than half a turn says only that the filter
+    is lost, but its Jacobian must stay one, of norm one at most, for the covariance to stay finite.
+    """
+    part = scale(0.015625, phi)
+    q = exponential(part)
+    J = right_jacobian(part)
+    for _ in range(6):
+        E = transpose(rotation_matrix(q))
+        J = combine_matrices(0.5, J, 0.5, multiply(E, J))
+        q = quaternion_multiply(q, q)
+    return q, J
 
 
 def direction_rows(R, u, v, z):
@@ -236,9 +257,7 @@ def update_direction(q, b, A, B, C, R, u, v, z, variance):
 
     ``R`` is the matrix of q, ``variance`` that of each component, rad². The innovations are independent: the NIS is e₁²/s₁ + e₂²/s₂.
     """
-    q, b, A, B, C, e1, s1, e2, s2, _ = update_direction_and_judge(
-        q, b, A, B, C, R, u, v, z, variance
-    )
+    q, b, A, B, C, e1, s1, e2, s2, _ = update_direction_and_judge(q, b, A, B, C, R, u, v, z, variance)
     return q, b, A, B, C, e1, s1, e2, s2
 
 
@@ -252,9 +271,7 @@ def update_direction_and_judge(q, b, A, B, C, R, u, v, z, variance):
     s22 = dot(h2, pa2) + variance
     together = s1 + s22 < SHORT_FORM * variance
     if everywhere(together):
-        correction, b, A, B, C, e2, s2, nis = rows_at_once(
-            b, A, B, C, pa1, pa2, h1, e1, h2, y2, s1, s12, s22
-        )
+        correction, b, A, B, C, e2, s2, nis = rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, s1, s12, s22)
     elif anywhere(together):
         at_once = rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, s1, s12, s22)
         one_by_one = row_after_row(b, A, B, C, h1, e1, h2, y2, variance)
@@ -267,9 +284,7 @@ def update_direction_and_judge(q, b, A, B, C, R, u, v, z, variance):
         s2 = chosen(together, at_once[6], one_by_one[6])
         nis = chosen(together, at_once[7], one_by_one[7])
     else:
-        correction, b, A, B, C, e2, s2, nis = row_after_row(
-            b, A, B, C, h1, e1, h2, y2, variance
-        )
+        correction, b, A, B, C, e2, s2, nis = row_after_row(b, A, B, C, h1, e1, h2, y2, variance)
     q, A, B = reset(q, A, B, correction)
     return q, b, A, B, C, e1, s1, e2, s2, nis
 
@@ -278,11 +293,14 @@ def heading_row(R, z):
     """Return h of the heading of the horizontal part of a vector ``z`` (body): the turn δθ of the body shifts it by h · δθ.
 
     With m = R z, a turn δφ in fixed axes shifts the heading by ``δφ_z − m_z (m_x δφ_x + m_y δφ_y)/(m_x² + m_y²)``: only of a level vector
-    is it the turn about the vertical alone.
+    is it the turn about the vertical alone. A vertical vector has no heading, and its row is zero: nothing is learnt from it.
     """
     m = matrix_times_vector(R, z)
-    tilt = -m[2] / (m[0] * m[0] + m[1] * m[1])
-    return transpose_times_vector(R, (tilt * m[0], tilt * m[1], 1.0))
+    level = m[0] * m[0] + m[1] * m[1]
+    has_heading = level > VERTICAL
+    tilt = -m[2] / chosen(has_heading, level, 1.0)
+    whole = chosen(has_heading, level - level + 1.0, 0.0)
+    return transpose_times_vector(R, (whole * (tilt * m[0]), whole * (tilt * m[1]), whole))
 
 
 def update_residual(q, b, A, B, C, y, variance):
@@ -291,9 +309,7 @@ def update_residual(q, b, A, B, C, y, variance):
     e2 = y[1] - first[1]
     second, b, A, B, C, s2 = update_row(b, A, B, C, (0.0, 1.0, 0.0), e2, variance[1])
     e3 = y[2] - first[2] - second[2]
-    third_part, b, A, B, C, s3 = update_row(
-        b, A, B, C, (0.0, 0.0, 1.0), e3, variance[2]
-    )
+    third_part, b, A, B, C, s3 = update_row(b, A, B, C, (0.0, 0.0, 1.0), e3, variance[2])
     q, A, B = reset(q, A, B, add(first, add(second, third_part)))
     return q, b, A, B, C, y[0], s1, e2, s2, e3, s3
 

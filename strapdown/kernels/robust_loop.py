@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 
-from strapdown.kernels.algebra import dot, scale
-from strapdown.kernels.filter_loop import DIRECTION, HEADING, store_segment, store_state, vector_at
+from strapdown.kernels.algebra import combine, dot, scale
+from strapdown.kernels.filter_loop import DIRECTION, HEADING, MOST_TURN, store_segment, store_state, vector_at
 from strapdown.kernels.filter_step import predict
 from strapdown.kernels.robust_step import ACCEPTED, PASSED_OVER, REFUSED, take_in
 from strapdown.kernels.series import LARGEST_ANGLE
@@ -103,7 +103,6 @@ def run_robust(
     now = edges[0]
     end = now
     whole = 1.0
-    longest = 1.0
     theta = (0.0, 0.0, 0.0)
     countdown = 0
     row = 0
@@ -113,13 +112,20 @@ def run_robust(
         stop = event_time[e] if due else end
         dt = stop - now
         if dt > 0.0:
-            if dt > longest:
-                dt = longest
-                stop = now + dt
-                due = False
             part = theta
             if dt < whole:
                 part = scale(dt / whole, theta)
+            # Sub-steps as in filter_loop; all states that run go the same ones.
+            squared = 0.0
+            for i in range(running):
+                turn = combine(1.0, part, -dt, (states[i, 4], states[i, 5], states[i, 6]))
+                squared = max(squared, dot(turn, turn))
+            if LARGEST_ANGLE * LARGEST_ANGLE < squared < MOST_TURN * MOST_TURN:
+                share = LARGEST_ANGLE / math.sqrt(squared)
+                dt = share * dt
+                part = scale(share, part)
+                stop = now + dt
+                due = False
             for i in range(running):
                 q, b, A, B, C = state_at(states, i)
                 if i == 0 and segments < len(segment_out):
@@ -239,8 +245,4 @@ def run_robust(
                 end = edges[k + 1]
                 whole = end - now
                 theta = vector_at(increments, k)
-                squared = dot(theta, theta)
-                longest = whole
-                if squared > LARGEST_ANGLE * LARGEST_ANGLE:
-                    longest = whole * (LARGEST_ANGLE / math.sqrt(squared))
     return segments, recoveries
