@@ -248,7 +248,7 @@ def draw(result: Result, path: Path) -> Path:
         for k, name in enumerate(names):
             ax.plot(result.time, error[:, k], color=colours[k], linewidth=0.9, label=name)
         settled = result.time >= 0.08 * result.time[-1]
-        limit = 1.6 * max(envelope[settled].max(), np.abs(error[settled]).max())
+        limit = (1.6 if len(names) == 3 else 2.4) * max(envelope[settled].max(), np.abs(error[settled]).max())
         ax.set(title=label, ylim=(-limit, limit))
         ax.axhline(0.0, color="black", linewidth=0.5)
     for ax in grid[1]:

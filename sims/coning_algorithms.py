@@ -527,9 +527,16 @@ def draw_floor(result: Curves, ax: Any) -> None:
 def draw_costs(costs: Sequence[Cost], ax: Any) -> None:
     """Draw the drift beside the time a sample, and the Pareto front."""
     front = [c for c in costs if not any(o.nanoseconds < c.nanoseconds and o.drift < c.drift for o in costs)]
-    ax.loglog([c.nanoseconds for c in costs], [c.drift for c in costs], "o", color="0.7", ms=4)
+    ax.loglog([c.nanoseconds for c in costs], [c.drift for c in costs], "o", color="0.7", ms=4, label="others")
     front.sort(key=lambda c: c.nanoseconds)
-    ax.loglog([c.nanoseconds for c in front], [c.drift for c in front], "o-", color="C0", ms=5)
+    ax.loglog(
+        [c.nanoseconds for c in front],
+        [c.drift for c in front],
+        "o-",
+        color="C0",
+        ms=5,
+        label="none is both faster and better",
+    )
     labelled: list[Cost] = []
     for c in front:  # labels that would lie on one another are left out
         if all(abs(math.log10(c.drift / o.drift)) > 0.7 for o in labelled):
@@ -540,10 +547,11 @@ def draw_costs(costs: Sequence[Cost], ax: Any) -> None:
     ax.set_xlim(left=1.0)
     ax.set(xlabel="time a sample, ns", ylabel="drift / ω", title="cost beside error")
     ax.grid(alpha=0.3)
+    ax.legend(fontsize=8, loc="lower left")
 
 
 def draw_comparison(comparison: Comparison, own: str, axes: Any) -> None:
-    """Draw own error over the least published one, on the grid: below zero the own is better; hatched, it is at rounding."""
+    """Draw own error over the least published one, on the grid: below zero the own is better. Dot: at rounding; cross: worse."""
     angles, ratios = np.asarray(comparison.angles) / DEGREE, np.asarray(comparison.ratios)
     for ax, table, what in zip(axes, (comparison.drift, comparison.periodic), ("drift", "periodic error"), strict=True):
         mine = np.abs(np.array(table[own]))
@@ -552,12 +560,12 @@ def draw_comparison(comparison: Comparison, own: str, axes: Any) -> None:
         ratio = np.log10(np.maximum(mine, 1e-300) / np.maximum(best, 1e-300))
         image = ax.imshow(ratio, cmap="RdBu_r", vmin=-6, vmax=6, origin="lower", aspect="auto")
         for i, j in np.argwhere(mine < rounding):
-            ax.text(j, i, "·", ha="center", va="center", fontsize=12)
+            ax.text(j, i, "·", ha="center", va="center", fontsize=16, color="0.65")
         for i, j in np.argwhere((mine >= best) & (mine >= rounding)):
             ax.text(j, i, "×", ha="center", va="center", fontsize=9)
         ax.set_xticks(range(len(ratios)), [f"{r:g}" for r in ratios], fontsize=7)
         ax.set_yticks(range(len(angles)), [f"{a:g}" for a in angles], fontsize=7)
-        ax.set(xlabel="λ", ylabel="β, °", title=f"{own}: {what}")
+        ax.set(xlabel="frequency ratio λ", ylabel="cone half-angle β, °", title=f"{own}: {what} (dots: at rounding)")
         ax.figure.colorbar(image, ax=ax, label="log₁₀ (own / least published)")
 
 
@@ -565,13 +573,13 @@ def draw_manoeuvres(result: ManoeuvreError, ax: Any) -> None:
     """Draw the errors on random manoeuvres against their frequency ratio: all published in grey, the best of them and the own in colour."""
     ratios = np.asarray(result.ratios)
     published = np.array([result.errors[name] for name in PUBLISHED])
-    for errors in published:
-        ax.loglog(ratios, errors, ".", color="0.85", ms=3)
+    for k, errors in enumerate(published):
+        ax.loglog(ratios, errors, ".", color="0.75", ms=3, label=None if k else "published, each")
     ax.loglog(ratios, published.min(axis=0), "v", color="C3", ms=5, label="least of all published")
     for k, name in enumerate(OWN):
         ax.loglog(ratios, result.errors[name], "o", color=f"C{k}" if k < 3 else "k", ms=3, label=name)
     ax.set(
-        xlabel="λ of the highest frequency",
+        xlabel="frequency ratio λ of the highest frequency",
         ylabel="greatest attitude error, rad",
         title="random manoeuvres, 840 samples",
     )

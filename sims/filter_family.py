@@ -51,12 +51,12 @@ COLOURS = {
     "mekf": plots.BLUE,
     "fixed-side": plots.ink(),
     "right-invariant": plots.VERMILION,
-    "two-frame": plots.ORANGE,
+    "two-frame": plots.ink(),
     "geometric": plots.SKY,
     "usque": plots.PURPLE,
     "mahony": plots.GREEN,
 }
-DASHES = {"fixed-side": (0, (2, 3)), "two-frame": (0, (4, 3))}
+DASHES = {"fixed-side": (0, (2, 3)), "two-frame": (0, (5, 2, 1, 2))}
 """Filters that nearly always lie on another's line."""
 
 
@@ -85,11 +85,8 @@ class Outcome:
 
     @property
     def convergence_time(self) -> float:
-        """Time after which nine tenths of the runs are converged and stay so, s; infinite if never."""
-        below = np.quantile(self.error, 0.9, axis=0) < CONVERGED
-        if not below[-1]:
-            return float("inf")
-        return float(self.time[len(below) - int(np.argmin(below[::-1])) if not below.all() else 0])
+        """Time after which nine tenths of the runs are converged and stay so, s; NaN if never."""
+        return consistency.convergence_time(self.time, np.quantile(self.error, 0.9, axis=0), CONVERGED)
 
     @property
     def final_rms(self) -> float:
@@ -176,7 +173,7 @@ def study(
             errors[name].append(
                 _pointing_error(estimate.attitude, truth.attitude[::every])
                 if case == "one direction"
-                else np.linalg.norm(e[:, :3], axis=1)
+                else quaternion.angle_between(truth.attitude[::every], estimate.attitude)
             )
     time = record.time[::every]
     return [
@@ -203,21 +200,23 @@ def draw(outcomes: Sequence[Outcome], path: Path) -> Path:
     for column, case in enumerate(cases):
         top, bottom = grid[:, column]
         mine = [o for o in outcomes if o.case == case]
+        most = max(o.runs for o in mine)
         for o in mine:
-            style: dict[str, Any] = {"color": COLOURS[o.filter], "label": o.filter, "linewidth": 1.4}
+            fewer = f", {o.runs} {'run' if o.runs == 1 else 'runs'}" if o.runs < most else ""
+            style: dict[str, Any] = {"color": COLOURS[o.filter], "label": o.filter + fewer, "linewidth": 1.4}
             if o.filter in DASHES:
-                style.update(linestyle=DASHES[o.filter], zorder=3)
+                style.update(linestyle=DASHES[o.filter], zorder=3, linewidth=1.1)
             top.plot(o.time, np.quantile(o.error, 0.9, axis=0) / DEGREE, **style)
             bottom.plot(o.time, o.anees, **style)
-        most = max(o.runs for o in mine)
         low, high = consistency.mean_bounds(6, most)
         bottom.axhspan(low, high, color="0.85", zorder=0, label=f"99 % bounds of {most} runs")
-        top.axhline(CONVERGED / DEGREE, color="0.6", linewidth=0.8, linestyle=":")
+        top.axhline(CONVERGED / DEGREE, color="0.5", linewidth=0.8, linestyle=":")
+        bottom.plot([], [], color="0.5", linewidth=0.8, linestyle=":", label=f"{CONVERGED / DEGREE:g}°: converged")
         top.set(yscale="log", title=titles[case])
         bottom.set(yscale="linear" if case == "small" else "log", xlabel="time, s")
     grid[0, 0].set_ylabel("attitude error, 90th percentile, °")
     grid[1, 0].set_ylabel("ANEES / 6")
-    figure.legend(*grid[1, 0].get_legend_handles_labels(), loc="outside lower center", ncols=8)
+    figure.legend(*grid[1, 0].get_legend_handles_labels(), loc="outside lower center", ncols=9, fontsize="small")
     return plots.save(figure, path)
 
 
@@ -228,9 +227,10 @@ def table(result: Result) -> str:
         f"{'ANEES/6 at 10 s':>15s} {'at the end':>10s}  99 %"
     ]
     for o in result.outcomes:
+        within = f"{o.convergence_time:.0f}" if np.isfinite(o.convergence_time) else "never"
         early = int(np.searchsorted(o.time, 10.0))
         lines.append(
-            f"{o.case:14s} {o.filter:16s} {o.runs:5d} {100.0 * o.converged:7.0f} % {o.convergence_time:7.0f} "
+            f"{o.case:14s} {o.filter:16s} {o.runs:5d} {100.0 * o.converged:7.0f} % {within:>7s} "
             f"{o.final_rms / DEGREE:12.3f} {o.anees[early]:15.3g} {o.anees[-1]:10.3g}  "
             f"{'inside' if o.consistent else 'outside'}"
         )

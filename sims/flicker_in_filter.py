@@ -14,7 +14,7 @@ For each preset and run, a record at the gyro's natural rate with vector measure
 and ``control`` is the MEKF of ``own`` on the same gyro without flicker. Told is the NEES of the attitude over its three degrees of freedom,
 averaged over runs and late epochs (1 if the covariance is right), with the scatter of that mean over the runs, and the rms error.
 
-Run ``python sims/flicker_in_filter.py [FIGURE]`` (some minutes).
+Run ``python sims/flicker_in_filter.py [FOLDER]`` (some minutes).
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from pathlib import Path
 
 import numpy as np
 
-from strapdown import consistency, datasheets, files, flicker, gyro, mekf, motion, quaternion
+from strapdown import consistency, datasheets, flicker, gyro, mekf, motion, plots, quaternion
+from strapdown.plots import style
 from strapdown.randomness import generator
 from strapdown.scenarios import Scenario, simulate
 from strapdown.units import ARCSECOND
@@ -77,13 +78,9 @@ def main(*, presets=tuple(datasheets.PRESETS), runs=40, duration=600.0, seed=1, 
     outcomes = tuple(judge(datasheets.preset(name), runs, duration, seed, rate) for name in presets)
     result = Result(outcomes=outcomes, runs=runs, duration=duration)
     if out is not None:
-        out = Path(out)
-        from matplotlib.figure import Figure
-
-        page = Figure(figsize=(9.0, 4.5), layout="constrained")
-        draw(result, ax=page.subplots())
-        with files.written_beside(out / "flicker.png") as path:
-            page.savefig(path, dpi=140)
+        page, ax = plots.new_figure(size=(9.0, 4.5))
+        draw(result, ax=ax)
+        plots.save(page, Path(out) / "flicker.png")
     return result
 
 
@@ -192,20 +189,20 @@ def augmented(angle, looks, spec, shaping, every, dt, variance, start):
 
 def draw(result, *, ax=None):
     """Draw the mean NEES of each filter by preset; return the matplotlib axes."""
-    if ax is None:
-        from matplotlib import pyplot
-
-        ax = pyplot.subplots()[1]
+    ax = plots.new_figure(size=(9.0, 4.5))[1] if ax is None else ax
     place = np.arange(len(result.outcomes))
     for number, name in enumerate(FILTERS):
         value = np.array([outcome.anees[name] for outcome in result.outcomes])
         bar = 2.58 * np.array([outcome.scatter[name] for outcome in result.outcomes])
-        ax.errorbar(place + 0.15 * (number - 2.0), value, bar, fmt="o", ms=5, capsize=3, label=name)
+        label = {"control": "control: a gyro without flicker", "own": "own: blind to flicker"}.get(name, name)
+        ax.errorbar(
+            place + 0.15 * (number - 2.0), value, bar, fmt="o", ms=5, capsize=3, color=style.CYCLE[number], label=label
+        )
     ax.axhline(1.0, color="k", lw=0.8)
+    ax.set_xlim(-0.5, len(place) - 0.5)
     ax.set_xticks(place, [outcome.preset for outcome in result.outcomes])
-    ax.set_ylabel("mean NEES of the attitude / 3")
+    ax.set_ylabel("mean NEES of the attitude / 3 (1: right)")
     ax.set_title(f"{result.runs} runs of {result.duration:g} s; bars: 99 %")
-    ax.grid(visible=True, which="both", axis="y", lw=0.3)
     ax.legend()
     return ax
 

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from strapdown import datasheets, files, gyro, units
+from strapdown import datasheets, gyro, plots, units
+from strapdown.plots import style
 from strapdown.randomness import generator
 
 PARTS = {
@@ -82,15 +83,10 @@ def main(*, preset="stim300", samples=1 << 20, rate=100.0, seed=1, out=None):
         bias=outputs["whole"].bias[thin],
     )
     if out is not None:
-        out = Path(out)
-        from matplotlib.figure import Figure
-
-        page = Figure(figsize=(11.0, 4.5), layout="constrained")
-        left, right = page.subplots(1, 2)
-        draw_spectra(result, ax=left)
-        draw_bias(result, ax=right)
-        with files.written_beside(out / "simulate_imu.png") as path:
-            page.savefig(path, dpi=140)
+        page, axes = plots.new_figure(1, 2, size=(11.0, 4.5))
+        draw_spectra(result, ax=axes[0])
+        draw_bias(result, ax=axes[1])
+        plots.save(page, Path(out) / "simulate_imu.png")
     return result
 
 
@@ -118,24 +114,31 @@ def draw_spectra(result, *, ax):
     """Draw the spectra over their theory; return the axes."""
     scale = units.DEGREE_PER_HOUR**2
     for number, (name, values) in enumerate(result.spectra.items()):
-        ax.loglog(result.frequency, values / scale, f"C{number}o", ms=3, label=f"{name}, simulated")
-        ax.loglog(result.frequency, result.theory[name] / scale, f"C{number}-", lw=1.0)
-    ax.set_xlabel("frequency (Hz)")
-    ax.set_ylabel("two-sided PSD ((°/h)²/Hz)")
+        rings = (
+            {"ms": 6, "mfc": "none"} if name == "whole" else {"ms": 3}
+        )  # around the points of what makes nearly all of it
+        colour = style.CYCLE[number]
+        ax.loglog(result.frequency, values / scale, "o", color=colour, label=f"{name}, simulated", **rings)
+        ax.loglog(result.frequency, result.theory[name] / scale, "-", color=colour, lw=1.0)
+    ax.set_xlabel("frequency, Hz")
+    ax.set_ylabel("two-sided PSD, (°/h)²/Hz")
     ax.set_title(f"{result.preset} at rest (lines: theory)")
-    ax.grid(visible=True, which="both", lw=0.3)
-    ax.legend(fontsize=8)
+    ax.legend()
     return ax
 
 
 def draw_bias(result, *, ax):
-    """Draw the drifting bias of the three axes; return the axes."""
-    for axis, values in zip("xyz", result.bias.T, strict=True):
-        ax.plot(result.time, values / units.DEGREE_PER_HOUR, lw=0.7, label=axis)
-    ax.set_xlabel("time (s)")
-    ax.set_ylabel("bias less its turn-on part (°/h)")
-    ax.grid(visible=True, lw=0.3)
-    ax.legend(fontsize=8)
+    """Draw the drifting bias of the three axes, each in a band of its own; return the axes."""
+    bias = result.bias / units.DEGREE_PER_HOUR
+    band = 2.2 * np.abs(bias).max()
+    for number, (axis, values) in enumerate(zip("xyz", bias.T, strict=True)):
+        ax.axhline(-number * band, color="0.5", lw=0.6)
+        ax.plot(result.time, values - number * band, color=style.CYCLE[number], lw=0.7, label=axis)
+    ax.set_xlabel("time, s")
+    ax.set_ylabel("bias less its turn-on part, °/h")
+    ax.set_ylim(-2.6 * band, 0.8 * band)
+    ax.set_title(f"x about 0, y and z {band:.2g} °/h lower each")
+    ax.legend(ncols=3, loc="upper right")
     return ax
 
 

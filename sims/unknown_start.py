@@ -71,11 +71,8 @@ class Outcome:
 
     @property
     def convergence(self) -> Array:
-        """Time of each run after which its error stays below one degree (runs,), s; infinite if it does not."""
-        above = self.error >= CONVERGED
-        last = above.shape[1] - 1 - np.argmax(above[:, ::-1], axis=1)
-        after = np.append(self.time, np.inf)
-        return np.where(above.any(axis=1), after[np.minimum(last + 1, len(self.time))], self.time[0])
+        """Time of each run after which its error stays below one degree (runs,), s; NaN if it does not."""
+        return np.array([consistency.convergence_time(self.time, error, CONVERGED) for error in self.error])
 
     @property
     def anees(self) -> Array:
@@ -133,7 +130,7 @@ def study(name: str, *, runs: int, duration: float, seed: int) -> Outcome:
             became_one.append(0.0)
         truth = record.truth
         e = consistency.errors(estimate.attitude, estimate.bias, truth.attitude[rows], truth.bias[rows])
-        errors.append(np.linalg.norm(e[:, :3], axis=1))
+        errors.append(quaternion.angle_between(truth.attitude[rows], estimate.attitude))
         nees.append(consistency.nees(e, estimate.covariance) / 6.0)
         first = rows[0]
     return Outcome(
@@ -151,7 +148,12 @@ def draw(outcomes: Sequence[Outcome], path: Path) -> Path:
     for o in outcomes:
         hours = o.time / 3600.0
         line: dict[str, Any] = {"color": COLOURS.get(o.filter, style.ORANGE), "linewidth": 1.5}
-        left.plot(hours, np.quantile(o.error, 0.5, axis=0) / DEGREE, label=f"{o.filter}, {o.runs} runs", **line)
+        left.plot(
+            hours,
+            np.quantile(o.error, 0.5, axis=0) / DEGREE,
+            label=f"{o.filter}, {o.runs} {'run' if o.runs == 1 else 'runs'}",
+            **line,
+        )
         left.plot(hours, np.quantile(o.error, 0.95, axis=0) / DEGREE, linestyle=(0, (3, 2)), **line)
         middle.plot(hours, o.anees, **line)
         if o.filter.startswith("bank"):
@@ -180,10 +182,10 @@ def table(result: Result) -> str:
         told = [float(o.anees[min(int(np.searchsorted(o.time, t)), len(o.time) - 1)]) for t in (360.0, 900.0, 3600.0)]
         low, high = o.bounds
         quantiles = [hours[min(int(np.ceil(p * o.runs)) - 1, o.runs - 1)] for p in (0.5, 0.95, 1.0)]
+        within = [f"{time:.3f}" if np.isfinite(time) else "never" for time in quantiles]
         lines.append(
-            f"{o.filter:16s} {o.runs:5d} {100.0 * np.mean(np.isfinite(hours)):7.0f} % {quantiles[0]:16.3f} "
-            f"{quantiles[1]:7.3f} {quantiles[2]:7.3f} {told[0]:14.3g} {told[1]:9.3g} {told[2]:9.3g} {o.anees[-1]:9.3g}  "
-            f"{low:.3f} to {high:.3f}"
+            f"{o.filter:16s} {o.runs:5d} {100.0 * np.mean(np.isfinite(hours)):7.0f} % {within[0]:>16s} {within[1]:>7s} "
+            f"{within[2]:>7s} {told[0]:14.3g} {told[1]:9.3g} {told[2]:9.3g} {o.anees[-1]:9.3g}  {low:.3f} to {high:.3f}"
         )
     return "\n".join(lines)
 

@@ -38,8 +38,20 @@ AXES = ("x", "y", "z")
 
 LEAST_ERROR = 1e-12
 """What is smaller in every step and measurement is rounding, rad."""
+LARGEST_SIZE = 1e12
+"""No considered or initial error is larger, in the units of :class:`Consider`: its square would leave the range of doubles."""
 LARGEST_LINEAR = 0.15
 """Errors of attitude or direction above this, rad, are told to be beyond linear: their squares are a tenth of them."""
+
+
+def _size(name: str, value: float, *, unit: str = "") -> float:
+    """Return the size of an error: zero or more, and not beyond all that is."""
+    size = non_negative(name, value, unit=unit)
+    if size > LARGEST_SIZE:
+        raise InputError(
+            f"{name} is {size:g}{f' {unit}' if unit else ''}; no error is larger than {LARGEST_SIZE:g}: check its unit"
+        )
+    return size
 
 
 def _no_sensors() -> dict[str, float]:
@@ -65,14 +77,14 @@ class Consider:
 
     def __post_init__(self) -> None:
         """Check every number."""
-        non_negative("scale_factor", self.scale_factor)
-        non_negative("misalignment", self.misalignment, unit="rad")
-        non_negative("g_sensitivity", self.g_sensitivity, unit="rad/s per m/s²")
+        _size("scale_factor", self.scale_factor)
+        _size("misalignment", self.misalignment, unit="rad")
+        _size("g_sensitivity", self.g_sensitivity, unit="rad/s per m/s²")
         for name in ("sensor_bias", "mounting", "time_offset"):
             values = getattr(self, name)
             if not isinstance(values, Mapping):
                 raise InputError(f"{name} is {values!r}; give a number for each sensor by its name")
-            checked = {str(sensor): non_negative(f"{name}[{sensor!r}]", value) for sensor, value in values.items()}
+            checked = {str(sensor): _size(f"{name}[{sensor!r}]", value) for sensor, value in values.items()}
             object.__setattr__(self, name, checked)
 
 
@@ -364,15 +376,21 @@ def _left_out(scenario: Scenario, setup: FilterSetup) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _beyond_linear(names: list[str], sensor_of: np.ndarray, error: Array, attitude_sigma: float) -> tuple[str, ...]:
+def _beyond_linear(attitude_sigma: float, columns: list[_Column], consider: Consider) -> list[str]:
+    """Return what goes into the analysis and is too large for it, in words."""
     found = []
     if attitude_sigma > LARGEST_LINEAR:
         found.append(f"initial attitude, 1σ {attitude_sigma / DEGREE:.3g}°")
-    for i, name in enumerate(names):
-        largest = float(np.abs(error[sensor_of == i]).max(initial=0.0))
-        if largest > LARGEST_LINEAR:
-            found.append(f"{name} (fixed), up to {largest / DEGREE:.3g}°")
-    return tuple(found)
+    if consider.scale_factor > LARGEST_LINEAR:
+        found.append(f"scale factor, 1σ {100.0 * consider.scale_factor:.3g} %")
+    if consider.misalignment > LARGEST_LINEAR:
+        found.append(f"misalignment, 1σ {consider.misalignment / DEGREE:.3g}°")
+    largest: dict[str, float] = {}
+    for column in columns:
+        if column.rows is not None:
+            name = column.name.partition(",")[0]  # of the parts of one considered error, its axes, the largest
+            largest[name] = max(largest.get(name, 0.0), float(np.abs(column.rows).max(initial=0.0)))
+    return found + [f"{name}, up to {size / DEGREE:.3g}°" for name, size in largest.items() if size > LARGEST_LINEAR]
 
 
 def _axes(value: Any) -> Array:
@@ -609,7 +627,7 @@ def analyse(
     Raises
     ------
     InputError
-        If a considered sensor is not in the scenario, a sensor is of a class of its own, or its noise is zero.
+        If a considered sensor is not in the scenario or late by more than that lasts, or a sensor is of its own class or without noise.
     """
     setup = matched(scenario) if setup is None else setup
     consider = Consider() if consider is None else consider
@@ -619,11 +637,17 @@ def analyse(
     for name in consider.sensor_bias:
         if isinstance(scenario.sensors[names.index(name)], vectors.HeadingPair):
             raise InputError(f"consider: sensor_bias of {name}: a heading pair has none; consider its mounting")
+    for name, offset in consider.time_offset.items():
+        if offset >= scenario.duration:
+            raise InputError(
+                f"consider: time_offset of {name} is {offset:g} s, and the scenario lasts {scenario.duration:g} s; nothing is measured "
+                "outside of it: give seconds of this scenario"
+            )
     edges = scenario.edges
     attitude_sigma = setup.attitude_sigma if initial_attitude_sigma is None else initial_attitude_sigma
     bias_sigma = setup.bias_sigma if initial_bias_sigma is None else initial_bias_sigma
-    non_negative("initial_attitude_sigma", attitude_sigma, unit="rad")
-    non_negative("initial_bias_sigma", bias_sigma, unit="rad/s")
+    _size("initial_attitude_sigma", attitude_sigma, unit="rad")
+    _size("initial_bias_sigma", bias_sigma, unit="rad/s")
     path = _path(scenario, setup, epochs)
     rows = path.rows
 
@@ -692,7 +716,7 @@ def analyse(
         nis,
     )
     whole = covariance_matrices(out)
-    return Analysis(
+    found = Analysis(
         time=edges[path.kept],
         filter_covariance=whole[:, 0],
         sources=tuple(random.names[1:]),
@@ -703,5 +727,11 @@ def analyse(
         considered_errors=columns_out[:, len(fixed) :],
         expected_nis={name: float(total / seen) for name, (total, seen) in zip(names, nis, strict=True) if seen > 0.0},
         left_out=_left_out(scenario, setup),
-        beyond_linear=_beyond_linear(names, path.sensor, rows["error"], attitude_sigma),
+        beyond_linear=(),
     )
+    beyond = _beyond_linear(attitude_sigma, columns, consider)
+    errors = found.rms[:, :3].max(axis=1)
+    epoch = int(np.argmax(errors))
+    if errors[epoch] > LARGEST_LINEAR:
+        beyond.append(f"the attitude error itself, {errors[epoch] / DEGREE:.3g}° at {found.time[epoch]:.6g} s")
+    return dataclasses.replace(found, beyond_linear=tuple(beyond))

@@ -19,24 +19,6 @@ from strapdown.records import read_estimate
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
-@pytest.fixture
-def run(monkeypatch, capsys, tmp_path):
-    """Run ``strapdown ARGUMENTS`` in an empty folder; return exit status, standard output and standard error."""
-    monkeypatch.chdir(tmp_path)
-
-    def command(*arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["strapdown", *map(str, arguments)])
-        try:
-            cli.main()
-            status = 0
-        except SystemExit as end:
-            status = end.code or 0
-        said = capsys.readouterr()
-        return status, said.out, said.err
-
-    return command
-
-
 def one_line(text: str) -> str:
     """The text with the frames and line breaks of a usage error taken out."""
     return " ".join(text.replace("│", " ").split())
@@ -224,6 +206,47 @@ def test_an_output_folder_that_cannot_be_is_said_before_the_work(run, monkeypatc
     assert status == 2
     assert error.startswith("error: ")
     assert "results" in error
+
+
+# ---------------------------------------------------------------------------------------------------- simulate
+
+
+EXACT = """
+rate_hz = 10.0
+duration_s = 3.0
+
+[motion]
+type = "constant-rate"
+rate_deg_per_s = [0.0, 0.0, 1.0]
+
+[gyro]
+angle_random_walk_deg_per_sqrt_hour = 0.1
+
+[[sensors]]
+type = "direction"
+name = "star"
+reference_f = [1.0, 0.0, 0.0]
+sigma_arcsec = STAR
+rate_hz = 1.0
+
+[[sensors]]
+type = "attitude"
+name = "tracker"
+sigma_across_arcsec = 5.0
+sigma_about_arcsec = TRACKER
+rate_hz = 1.0
+"""
+
+
+@pytest.mark.parametrize(("star", "tracker", "warned"), [(20, 0, ["tracker"]), (0, 5, ["star"]), (20, 5, [])])
+def test_simulate_warns_of_sensors_that_no_filter_can_use(run, tmp_path, star, tracker, warned):
+    text = EXACT.replace("STAR", f"{star}.0").replace("TRACKER", f"{tracker}.0")
+    (tmp_path / "exact.toml").write_text(text, encoding="utf-8")
+    status, said, error = run("simulate", "exact.toml")
+    assert status == 0, error
+    assert [line.split(":")[1].strip() for line in said.splitlines() if line.startswith("warning")] == warned
+    if warned:
+        assert "its sigma is zero, which no filter can use" in said
 
 
 # ---------------------------------------------------------------------------------------------------- estimate

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 
-from strapdown import cli, coning, consistency, covariance, mekf, montecarlo, motion, quaternion, setup, vectors
+from strapdown import coning, consistency, covariance, mekf, montecarlo, motion, quaternion, setup, vectors
 from strapdown.checks import InputError
 from strapdown.covariance import Consider
 from strapdown.gyro import GyroSpec
@@ -522,12 +522,39 @@ def test_what_is_left_out_or_beyond_linear_is_told():
     assert covariance.analyse(white("spin", 10.0), epochs=2).beyond_linear == ()
 
 
+def test_what_is_considered_too_large_is_told():
+    scenario = white("spin", 10.0)
+    for considered, word in (
+        (Consider(scale_factor=0.2), "scale factor, 1σ 20 %"),
+        (Consider(misalignment=0.2), "misalignment, 1σ 11.5°"),
+        (Consider(mounting={"star": 0.2}), "star mounting, up to"),
+        (Consider(time_offset={"star": 5.0}), "star time offset, up to"),
+    ):
+        assert any(word in one for one in covariance.analyse(scenario, consider=considered, epochs=2).beyond_linear)
+    small = Consider(scale_factor=1e-4, misalignment=1e-4, mounting={"star": 1e-4}, time_offset={"star": 1e-4})
+    assert covariance.analyse(scenario, consider=small, epochs=2).beyond_linear == ()
+
+
+def test_an_attitude_error_beyond_linear_is_told_with_its_time():
+    """A gyro alone: the initial bias turns the attitude away in proportion to time."""
+    scenario = dataclasses.replace(load_scenario("rest"), duration=100.0)
+    belief = dataclasses.replace(setup.matched(scenario, attitude_sigma=1e-3), bias_sigma=1e-2)
+    found = covariance.analyse(scenario, belief, epochs=4)
+    assert found.beyond_linear == (f"the attitude error itself, {found.rms[-1, :3].max() / DEGREE:.3g}° at 100 s",)
+    assert found.rms[-1, 0] == pytest.approx(1.0, rel=0.01)
+    short = covariance.analyse(dataclasses.replace(scenario, duration=10.0), belief, epochs=4)
+    assert short.beyond_linear == ()
+
+
 def test_what_makes_no_sense_is_refused():
     scenario = white("spin", 10.0)
     with pytest.raises(InputError, match="did you mean 'star'"):
         covariance.analyse(scenario, consider=Consider(mounting={"stars": 1e-3}))
     with pytest.raises(InputError, match="epochs"):
         covariance.analyse(scenario, epochs=100_000)
+    for offset in (10.0, 1e9):
+        with pytest.raises(InputError, match=r"time_offset of star is .* the scenario lasts 10 s"):
+            covariance.analyse(scenario, consider=Consider(time_offset={"star": offset}))
     with pytest.raises(InputError, match="scale_factor"):
         Consider(scale_factor=-1.0)
     with pytest.raises(InputError, match="time_offset"):
@@ -564,26 +591,8 @@ def test_a_scenario_without_sensors_is_dead_reckoning():
 # ------------------------------------------------------------------------------------------------------- the command line
 
 
-@pytest.fixture
-def command(monkeypatch, capsys, tmp_path):
-    """Run ``strapdown ARGUMENTS`` in an empty folder; return exit status, standard output and standard error."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments):
-        monkeypatch.setattr("sys.argv", ["strapdown", *map(str, arguments)])
-        try:
-            cli.main()
-            status = 0
-        except SystemExit as end:
-            status = end.code or 0
-        said = capsys.readouterr()
-        return status, said.out, said.err
-
-    return call
-
-
-def test_the_command_tells_a_budget_and_writes_it(command, tmp_path):
-    status, said, _ = command("covariance", "spin", "--epochs", 10, "--misalignment", 0.1, "--time-offset", "star=2")
+def test_the_command_tells_a_budget_and_writes_it(run, tmp_path):
+    status, said, _ = run("covariance", "spin", "--epochs", 10, "--misalignment", 0.1, "--time-offset", "star=2")
     assert status == 0
     for word in ("angle random walk", "gyro scale factor", "misalignment", "star time offset", "the filter's own σ"):
         assert word in said
@@ -598,11 +607,11 @@ def test_the_command_tells_a_budget_and_writes_it(command, tmp_path):
     assert (tmp_path / "covariance-results" / "budget.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_command_takes_a_filter_and_units(command, tmp_path):
+def test_the_command_takes_a_filter_and_units(run, tmp_path):
     belief = setup.matched(load_scenario("low-orbit"))
     (tmp_path / "filter.toml").write_text(setup.to_toml(belief), encoding="utf-8")
     arguments = ("low-orbit", "--filter", "filter.toml", "--epochs", 5, "--sensor-bias", "magnetometer=100")
-    status, said, _ = command("covariance", *arguments, "--attitude-sigma", 2, "--bias-sigma", 30)
+    status, said, _ = run("covariance", *arguments, "--attitude-sigma", 2, "--bias-sigma", 30)
     assert status == 0
     assert "the filter given" in said
     found = json.loads((tmp_path / "covariance-results" / "covariance.json").read_text(encoding="utf-8"))
@@ -618,13 +627,24 @@ def test_the_command_takes_a_filter_and_units(command, tmp_path):
     assert found["rms"]["attitude_arcsec"][0][0] == pytest.approx(7200.0)
 
 
-def test_the_command_refuses_in_one_line(command):
+def test_the_command_gives_no_verdict_beyond_the_linear_range(run):
+    status, said, _ = run("covariance", "rest", "--epochs", 4)
+    assert status == 0
+    assert "as good as it says" in said
+    assert "linear about the truth, cannot tell whether the filter will be as good as it says" in said
+    assert "The filter will be" not in said
+    assert "Beyond linear: the attitude error itself" in said
+    _, said, _ = run("covariance", "two-stars", "--epochs", 4)
+    assert "The filter will be as good as it says." in said
+
+
+def test_the_command_refuses_in_one_line(run):
     for arguments, word in (
         (("spin", "--time-offset", "star"), "NAME=VALUE"),
         (("spin", "--mounting", "sta=3"), "did you mean 'star'"),
         (("spin", "--scale-factor", "-1"), "scale_factor"),
         (("nowhere",), "nowhere"),
     ):
-        status, said, refused = command("covariance", *arguments, "--epochs", 4)
+        status, said, refused = run("covariance", *arguments, "--epochs", 4)
         assert word in " ".join((said + refused).split())
         assert status == 2

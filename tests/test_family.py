@@ -7,6 +7,7 @@ import importlib.util
 import sys
 from pathlib import Path
 
+import mpmath
 import numpy as np
 import pytest
 from filterpy.common import van_loan_discretization
@@ -15,13 +16,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm, solve_discrete_are
+from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from strapdown import consistency, family, kinematics, mekf, motion, quaternion
 from strapdown.checks import InputError
 from strapdown.consistency import Verdict
 from strapdown.family import complementary, extended, stepping, unscented
-from strapdown.kernels import family_complementary, family_loop, family_step
+from strapdown.kernels import family_complementary, family_loop, family_step, family_turns
 from strapdown.kernels.machine import compiled
 from strapdown.records import ImuRecord, Truth
 from strapdown.units import DEGREE
@@ -274,22 +276,35 @@ def test_two_frame_propagation_is_that_of_its_linear_system(angle):
     np.testing.assert_allclose(matrix_of(A, B, C), transition @ P @ transition.T + Q, rtol=1e-12, atol=1e-12)
 
 
-def test_geometric_error_is_what_its_shear_says():
-    """η = b_true − exp(−[δθ]) b against the linear map of (δθ, δb), by finite differences; and there and back."""
+@pytest.mark.parametrize("size", [0.1, 1.0, 1.8])
+def test_geometric_update_is_what_its_error_says(size):
+    """η = b_true − exp(−[δθ]) b: the covariance goes there by finite differences at b, and comes back at b⁺ = exp(−[a]) b + c_η."""
     rng = np.random.default_rng(8)
-    b = rng.standard_normal(3)
+    b, a, c = rng.standard_normal(3), rng.standard_normal(3), rng.standard_normal(3)
+    a *= size / np.linalg.norm(a)
     M = rng.standard_normal((6, 6))
     P = M @ M.T
     h = 1e-6
-    numeric = np.zeros((6, 6))
-    for j, e in enumerate(np.eye(6)):
-        ends = [np.concatenate([s * e[:3], b + s * e[3:] - expm(-kinematics.skew(s * e[:3])) @ b]) for s in (h, -h)]
-        numeric[:, j] = (ends[0] - ends[1]) / (2.0 * h)
+
+    def to_eta(bias):
+        numeric = np.zeros((6, 6))
+        for j, e in enumerate(np.eye(6)):
+            ends = [
+                np.concatenate([s * e[:3], bias + s * e[3:] - expm(-kinematics.skew(s * e[:3])) @ bias])
+                for s in (h, -h)
+            ]
+            numeric[:, j] = (ends[0] - ends[1]) / (2.0 * h)
+        return numeric
+
+    q = quaternion.exp(rng.standard_normal(3))
     A, B, C = blocks_of(P)
-    sheared = family_step.to_geometric(tuple(b), A, B, C)
-    np.testing.assert_allclose(matrix_of(A, *sheared), numeric @ P @ numeric.T, rtol=1e-7, atol=1e-7)
-    back = family_step.from_geometric(tuple(b), A, *sheared)
-    np.testing.assert_allclose(matrix_of(A, *back), P, rtol=1e-12, atol=1e-12)
+    moved_q, moved_b, B, C = family_step.close_geometric(tuple(q), tuple(b), A, B, C, tuple(a), tuple(c))
+    eta = (to_eta(b) @ np.concatenate([a, c]))[3:]
+    wanted = expm(-kinematics.skew(a)) @ b + eta
+    np.testing.assert_allclose(moved_b, wanted, rtol=0.0, atol=1e-8)
+    np.testing.assert_allclose(moved_q, quaternion.multiply(q, quaternion.exp(a)), rtol=0.0, atol=1e-12)
+    G = np.linalg.solve(to_eta(wanted), to_eta(b))
+    np.testing.assert_allclose(matrix_of(A, B, C), G @ P @ G.T, rtol=1e-7, atol=1e-7)
 
 
 def test_invariant_filters_never_see_what_one_reference_hides():
@@ -591,6 +606,138 @@ def test_converges_from_large_errors(name, degrees, left):
     error = quaternion.angle_between(estimate.attitude, record.truth.attitude) / DEGREE
     np.testing.assert_allclose(error[0], degrees, rtol=1e-9)
     assert error[-1] < left
+
+
+# ------------------------------------------------------------------------------------------------------------- wild starts
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-3, 0.33333, 0.33334, 1.0, np.pi, 2.0 * np.pi, 50.0, 1e4])
+def test_coefficients_of_a_turn_of_any_size(angle):
+    """Against the series and closed forms in forty digits; either side of where polynomials give way to closed forms."""
+    with mpmath.workdps(60):
+        t = mpmath.mpf(angle) ** 2
+        t = mpmath.sqrt(mpmath.mpf(float(t)))  # of the squared angle as a double
+
+        def alternating(first):
+            return mpmath.nsum(lambda k: (-1) ** k * t ** (2 * k) / mpmath.factorial(2 * k + first), [0, mpmath.inf])
+
+        if angle <= 1.0:
+            wanted = [alternating(1), alternating(2), alternating(3), alternating(4), 2 * alternating(5)]
+        else:
+            third = (t - mpmath.sin(t)) / t**3
+            wanted = [mpmath.sin(t) / t, (1 - mpmath.cos(t)) / t**2, third, (t**2 / 2 - 1 + mpmath.cos(t)) / t**4]
+            wanted.append((mpmath.mpf(1) / 3 - 2 * third) / t**2)
+        wanted = [float(one) for one in wanted]
+    got = family_turns.turn_coefficients(angle * angle)
+    np.testing.assert_allclose(got, wanted, rtol=1e-12, atol=1e-15)
+
+
+@pytest.mark.parametrize("angle", [1e-6, 0.2, 0.5, 2.0, np.pi, 9.0])
+def test_propagation_over_any_turn_is_that_of_its_linear_system(angle):
+    """Φ and Q against Van Loan's discretisation of δθ̇ = −[ω] δθ − δb, q against SciPy's rotations."""
+    rng = np.random.default_rng(31)
+    dt, phi = 0.7, angle * np.array([0.6, -0.64, 0.48])
+    M = rng.standard_normal((6, 6))
+    P = M @ M.T
+    F = np.zeros((6, 6))
+    F[:3, :3], F[:3, 3:] = -kinematics.skew(phi / dt), -np.eye(3)
+    transition, Q = van_loan_discretization(F, np.diag([0.7] * 3 + [0.9] * 3), dt)
+    q, b = quaternion.exp(rng.standard_normal(3)), rng.standard_normal(3)
+    moved, A, B, C = family_step.predict_body_side(
+        tuple(q), tuple(b), *blocks_of(P), tuple(phi + b * dt), dt, 0.49, 0.81
+    )
+    np.testing.assert_allclose(matrix_of(A, B, C), transition @ P @ transition.T + Q, rtol=0.0, atol=1e-11)
+    wanted = Rotation.from_quat(q, scalar_first=True) * Rotation.from_rotvec(phi)
+    assert (Rotation.from_quat(moved, scalar_first=True).inv() * wanted).magnitude() < 1e-12
+    J = family_turns.right_jacobian_of_any_turn(tuple(phi))
+    np.testing.assert_allclose(np.reshape(J, (3, 3)), -transition[:3, 3:] / dt, rtol=0.0, atol=1e-12)
+
+
+def test_the_largest_correction_is_where_the_geometric_bias_begins_to_grow():
+    theta = family_step.LARGEST_CORRECTION
+    assert brentq(lambda x: x - 2.0 * np.sin(x), 1.0, 3.0, xtol=1e-15) == pytest.approx(theta, abs=1e-14)
+    b = np.array([0.0, 1.0, 0.0])
+    for angle, grows in ((0.5, False), (theta - 1e-6, False), (theta + 1e-6, True), (3.0, True)):
+        a = np.array([angle, 0.0, 0.0])
+        size = np.linalg.norm(expm(-kinematics.skew(a)) @ b - np.cross(b, a))
+        assert (size > 1.0) == grows
+    nothing = (0.0,) * 6, (0.0,) * 9, (0.0,) * 6
+    q, moved, _, _ = family_step.close_geometric(
+        (1.0, 0.0, 0.0, 0.0), tuple(b), *nothing, (3.0, 0.0, 0.0), (0.0, 0.0, 6.0)
+    )
+    np.testing.assert_allclose(q, quaternion.exp([theta, 0.0, 0.0]), atol=1e-14)
+    a = np.array([theta, 0.0, 0.0])
+    np.testing.assert_allclose(
+        moved, expm(-kinematics.skew(a)) @ b - np.cross(b, a) + [0.0, 0.0, 2.0 * theta], atol=1e-12
+    )
+
+
+def wild(seed, intervals):
+    """A record and a start from anywhere: errors up to 180°, covariances from far too small to far too large, good and bad sensors."""
+    rng = np.random.default_rng([32, seed])
+    kinds = (("direction",), ("direction", "vector"), ("direction", "vector", "heading"), ("heading",))[seed % 4]
+    record = simulated(
+        rng,
+        intervals=intervals,
+        kinds=kinds,
+        measurements=intervals // 2,
+        dt=10.0 ** rng.uniform(-1.0, 1.0),
+        sigma=10.0 ** rng.uniform(-5.0, -1.0),
+    )
+    axis = rng.standard_normal(3)
+    turn = (np.pi - 10.0 ** rng.uniform(-8.0, 0.4)) * axis / np.linalg.norm(axis)
+    initial = mekf.initial_state(
+        quaternion.multiply(record.truth.attitude[0], quaternion.exp(turn)),
+        attitude_sigma=10.0 ** rng.uniform(-3.0, 1.0),
+        bias_sigma=10.0 ** rng.uniform(-6.0, 0.0),
+    )
+    return record, initial
+
+
+def assert_sound(estimate):
+    """Unit quaternions, finite biases, covariances finite and positive definite."""
+    np.testing.assert_allclose(np.linalg.norm(estimate.attitude, axis=1), 1.0, rtol=0.0, atol=1e-12)
+    assert np.isfinite(estimate.bias).all()
+    sigma = np.sqrt(estimate.variance)
+    assert np.isfinite(sigma).all()
+    assert np.linalg.eigvalsh(estimate.covariance / (sigma[:, :, None] * sigma[:, None, :])).min() > -1e-9
+
+
+@pytest.mark.parametrize("name", family.FILTERS)
+def test_every_filter_stays_finite_from_any_start(name):
+    for seed in range(8 if name == "usque" else 100):
+        record, initial = wild(seed, 60 if name == "usque" else 300)
+        assert_sound(family.run(name, record, BELIEF, initial, full_covariance=True))
+
+
+@pytest.mark.parametrize("seed", [35, 163, 375, 483])
+def test_the_geometric_filter_stays_finite_where_its_bias_would_run_away(seed):
+    """Starts from which the bias grows without end if corrections are taken in at any length."""
+    record, initial = wild(seed, 2000)
+    assert_sound(family.run("geometric", record, BELIEF, initial, full_covariance=True))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", family.FILTERS)
+def test_every_filter_stays_finite_from_thousands_of_starts(name):
+    for seed in range(100, 300 if name == "usque" else 3000):
+        record, initial = wild(seed, 60 if name == "usque" else 2000)
+        assert_sound(family.run(name, record, BELIEF, initial, full_covariance=True))
+
+
+@pytest.mark.parametrize("name", family.FILTERS)
+def test_a_heading_seen_straight_up_says_nothing(name):
+    """The start takes the measured vector to the vertical exactly: it has no heading, and the filter waits for the next."""
+    series = VectorMeasurements(
+        sensor="compass", kind="heading", time=[0.5], vector_b=[[0.0, 0.0, 1.0]], reference_f=[1.0, 0.0, 0.0], sigma=0.1
+    )
+    record = ImuRecord(time=np.array([0.0, 1.0]), increments=np.zeros((1, 3)), vectors=(series,))
+    initial = mekf.initial_state([1.0, 0.0, 0.0, 0.0], attitude_sigma=1.0, bias_sigma=0.1)
+    estimate = family.run(name, record, BELIEF, initial, full_covariance=True)
+    assert_sound(estimate)
+    if name in EXTENDED:
+        np.testing.assert_allclose(estimate.attitude[-1], initial.attitude, atol=1e-15)
+        assert np.all(np.diff(estimate.variance[:, :3], axis=0) >= 0.0)
 
 
 # --------------------------------------------------------------------------------------------------------------- bad input

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import shutil
 
 import h5py
@@ -12,6 +13,7 @@ from typer.testing import CliRunner
 
 from strapdown import cli, consistency, records, scenarios
 from strapdown.checks import InputError, count
+from strapdown.cli.terminal import scenario_named
 
 
 @pytest.fixture(scope="module")
@@ -150,3 +152,217 @@ def test_a_folder_for_a_file_is_told_in_one_line(tmp_path, command):
     (tmp_path / "d.h5").mkdir()
     said = refused([command, tmp_path / "d.h5", *(["--algorithm", "one-sample"] if command == "integrate" else [])])
     assert said.startswith(f"{tmp_path / 'd.h5'} is a folder; name ")
+
+
+# ------------------------------------------------------------------------------------------------ what cannot be written
+
+FOLDERS = {
+    "coning": (
+        ["coning", "--runs", 2, "--duration", 12],
+        ("coning.json", "drift.png", "errors.png", "consistency.png"),
+    ),
+    "allan": (
+        ["allan", "gyro.npy", "--rate", 100, "--gyro-unit", "rad/s"],
+        ("gyro.toml", "allan.json", "allan.png"),
+    ),
+    "covariance": (["covariance", "short.toml", "--epochs", 2], ("covariance.json", "budget.png")),
+}
+"""Commands that write to a folder, and the files that they write there."""
+FILES = {
+    "simulate": (["simulate", "short.toml", "--out"], "x.h5", ()),
+    "simulate as CSV": (["simulate", "short.toml", "--out"], "x.csv", ("x-vectors-0.csv", "x-vectors-1.csv")),
+    "integrate": (["integrate", "record.h5", "--out"], "x.h5", ()),
+    "coning-budget": (["coning-budget", "--psd", "lines.csv", "--rate", 100, "--json"], "x.json", ()),
+    "check": (["check", "run/estimate.h5", "--json"], "x.json", ()),
+    "doctor": (["doctor", "unit.csv", "--json"], "x.json", ()),
+    "montecarlo": (["montecarlo", "short.toml", "--runs", 8, "--overwrite", "--out"], "x.h5", ("x.json",)),
+    "montecarlo replay": (
+        ["montecarlo", "short.toml", "--replay", 3, "--out"],
+        "x.h5",
+        ("x-run-3-record.h5", "x-run-3-estimate.h5"),
+    ),
+    "report": (["report", "run/estimate.h5", "--out"], "x.html", ("x.report.json",)),
+}
+"""Commands that write a file, its name, and what goes beside it."""
+OF_OTHERS = {"estimate", "tune"}
+"""Commands whose own tests hold them to this."""
+
+
+@pytest.fixture
+def there(folder, monkeypatch):
+    """The folder of results, with a recording and a spectrum in it, to be in."""
+    monkeypatch.chdir(folder)
+    if not (folder / "gyro.npy").exists():
+        rng = np.random.default_rng(3)
+        np.save(folder / "gyro.npy", 1e-4 * rng.standard_normal((2000, 3)))
+        (folder / "lines.csv").write_text("frequency_hz,angle_deg\n10,0.1\n", encoding="utf-8")
+        columns = np.hstack([np.arange(400)[:, None] / 100.0, rng.standard_normal((400, 6))])
+        header = "time [s],gx [rad/s],gy,gz,ax [m/s2],ay,az"
+        np.savetxt(folder / "unit.csv", columns, delimiter=",", header=header, comments="")
+    return folder
+
+
+def refused_at_once(command):
+    """Return what a command says in refusing, and hold it to having told and made nothing before."""
+    result = CliRunner().invoke(cli.app, [str(part) for part in command])
+    assert isinstance(result.exception, InputError), (result.exception, result.output)
+    assert result.output == ""
+    return str(result.exception)
+
+
+def test_every_command_that_writes_is_held_to_it():
+    import typer.main
+
+    group = typer.main.get_command(cli.app)
+    writing = {
+        name
+        for name, command in group.commands.items()
+        if {"--out", "--json"} & {flag for one in command.params for flag in one.opts}
+    }
+    assert writing == set(FOLDERS) | {name for name in FILES if " " not in name} | OF_OTHERS
+
+
+@pytest.mark.parametrize(("name", "file"), [(name, file) for name, (_, files) in FOLDERS.items() for file in files])
+def test_a_folder_in_the_place_of_a_result_is_told_before_the_work(there, tmp_path, name, file):
+    (tmp_path / file).mkdir()
+    said = refused_at_once([*FOLDERS[name][0], "--out", tmp_path])
+    assert f"{tmp_path / file} is a folder" in said
+    assert [path.name for path in tmp_path.iterdir()] == [file]
+
+
+@pytest.mark.parametrize(
+    ("name", "file"), [(name, file) for name, (_, *files) in FILES.items() for file in (files[0], *files[1])]
+)
+def test_a_folder_in_the_place_of_a_file_is_told_before_the_work(there, tmp_path, name, file):
+    command, target, _ = FILES[name]
+    if (name, file) == ("montecarlo replay", target):
+        return  # names the campaign, which a replay leaves as it is
+    (tmp_path / file).mkdir()
+    said = refused_at_once([*command, tmp_path / target])
+    assert f"{tmp_path / file} is a folder" in said
+    assert [path.name for path in tmp_path.iterdir()] == [file]
+
+
+@pytest.mark.parametrize("name", [*FOLDERS, *FILES])
+@pytest.mark.parametrize("place", ["below a file", "not to be written"])
+def test_a_place_that_cannot_be_written_is_told_before_the_work(there, tmp_path, monkeypatch, name, place):
+    command, target = (FILES[name][0], FILES[name][1]) if name in FILES else ([*FOLDERS[name][0], "--out"], "")
+    if place == "below a file":
+        (tmp_path / "a").write_text("")
+        said = refused_at_once([*command, tmp_path / "a" / "b" / target])
+        assert f"{tmp_path / 'a'} is a file" in said
+    else:  # told by the system, whoever runs the tests
+        monkeypatch.setattr("os.access", lambda path, mode, **_: not mode & os.W_OK)
+        said = refused_at_once([*command, tmp_path / "b" / target])
+        assert f"{tmp_path} may not be written" in said
+        assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["coning", "simulate", "coning-budget"])
+def test_missing_folders_above_a_result_are_made(there, tmp_path, name):
+    command, target = (FILES[name][0], FILES[name][1]) if name in FILES else ([*FOLDERS[name][0], "--out"], "coning")
+    result = CliRunner().invoke(cli.app, [str(part) for part in (*command, tmp_path / "new" / "newer" / target)])
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "new" / "newer" / target).exists()
+
+
+# ------------------------------------------------------------------------------------------------ numbers that nothing can be
+
+
+@pytest.mark.parametrize("command", ["simulate", "montecarlo", "covariance"])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("sigma_arcsec = 20.0", "sigma_arcsec = 1e300"), r"sensors[0].sigma_arcsec is 1e+300"),
+        (("0.1,", "-1e200,"), r"motion.rate_deg_per_s[0] is -1e+200"),
+        (
+            ("angle_random_walk_deg_per_sqrt_hour = 0.15", "angle_random_walk_deg_per_sqrt_hour = 1e200"),
+            "gyro.angle_random_walk",
+        ),
+        (("duration_s = 20.0", "duration_s = 0.001"), "less than one gyro sample"),
+        (("rate_hz = 1.0", "rate_hz = 1e9"), "star 1 would measure 2e+10 times"),
+    ],
+)
+def test_scenarios_of_impossible_numbers_are_told_by_their_keys(folder, tmp_path, monkeypatch, command, change, words):
+    monkeypatch.chdir(tmp_path)
+    text = (folder / "short.toml").read_text(encoding="utf-8")
+    assert change[0] in text
+    (tmp_path / "bad.toml").write_text(text.replace(*change, 1), encoding="utf-8")
+    said = refused_at_once([command, "bad.toml"])
+    assert said.startswith("bad.toml: ")
+    assert words in said
+    assert [path.name for path in tmp_path.iterdir()] == ["bad.toml"]
+
+
+def test_every_built_in_scenario_is_possible():
+    for name in scenarios.SCENARIOS:
+        assert scenario_named(name).name == name
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--scale-factor", "1e300"), "scale_factor is 1e+294; no error is larger"),
+        (("--g-sensitivity", "1e300"), "g_sensitivity is"),
+        (("--bias-sigma", "1e300"), "initial_bias_sigma is"),
+        (("--attitude-sigma", "1e200"), "initial_attitude_sigma is"),
+        (("--sensor-bias", "star 1=1e300"), "sensor_bias['star 1'] is"),
+        (("--sensor-bias", "star 1=inf"), "sensor_bias"),
+        (("--mounting", "star 1=1", "--mounting", "star 1=2"), "mounting: star 1 is given twice"),
+        (("--time-offset", "star 1=1e9"), "time_offset of star 1 is 1e+06 s, and the scenario lasts 20 s"),
+    ],
+)
+def test_covariance_refuses_errors_that_nothing_has(there, tmp_path, options, words):
+    said = refused_at_once(["covariance", "short.toml", "--epochs", 2, *options, "--out", tmp_path / "new"])
+    assert words in said
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("rate", "factor", "words"),
+    [
+        (1e300, 1.0, "1e+300 Hz is no rate of a gyro"),
+        (1e-300, 1.0, "1e-300 Hz is no rate of a gyro"),
+        (100.0, 1e300, "which no gyro measures; check its unit"),
+    ],
+)
+def test_allan_refuses_what_no_gyro_measures(tmp_path, rate, factor, words):
+    np.save(tmp_path / "gyro.npy", factor * np.random.default_rng(3).uniform(0.1, 1.0, (100, 3)))
+    command = ["allan", tmp_path / "gyro.npy", "--gyro-unit", "rad/s", "--rate", rate, "--out", tmp_path / "out"]
+    assert words in refused_at_once(command)
+
+
+@pytest.mark.parametrize("options", [("--frequency", "1e300"), ("--rate", "1e-5"), ("--rate", "0.9")])
+def test_coning_refuses_what_no_algorithm_follows(tmp_path, options):
+    said = refused_at_once(["coning", "--runs", 2, *options, "--out", tmp_path / "out"])
+    assert "no algorithm follows it" in said
+
+
+def test_a_budget_of_no_vibration_is_refused(folder, tmp_path):
+    assert "is no text" in refused(["coning-budget", "--psd", folder / "record.h5", "--rate", 100])
+    assert "is a folder" in refused(["coning-budget", "--psd", tmp_path, "--rate", 100])
+    (tmp_path / "lines.csv").write_text("frequency_hz,angle_deg\n10,90\n", encoding="utf-8")
+    assert "an amplitude of 90°" in refused(["coning-budget", "--psd", tmp_path / "lines.csv", "--rate", 100])
+
+
+def test_integration_tells_of_samples_that_fill_no_step(there, tmp_path):
+    rows = "".join(f"{k / 100.0},0.1,0.2,0.3\n" for k in range(8))
+    (tmp_path / "short.csv").write_text("time [s],gx [rad/s],gy,gz\n" + rows, encoding="utf-8")
+    out = ["--out", str(tmp_path / "attitude.h5")]
+    said = refused_at_once(["integrate", tmp_path / "short.csv", "--algorithm", "eight-sample", *out])
+    assert "holds 7 gyro samples, fewer than the 8 of one step of eight-sample" in said
+    assert not (tmp_path / "attitude.h5").exists()
+    result = CliRunner().invoke(cli.app, ["integrate", str(tmp_path / "short.csv"), *out])
+    assert result.exit_code == 0, result.output
+    assert "The last 3 of them do not fill a step of 4 and are left out." in result.output
+    assert "units itself" in refused(["integrate", "record.h5", "--gyro-unit", "rad/s", *out])
+
+
+def test_want_of_memory_ends_with_one_line(run, monkeypatch):
+    def wanting(*_: object) -> None:
+        raise MemoryError("Unable to allocate 149. GiB")
+
+    monkeypatch.setattr(scenarios, "simulate", wanting)
+    status, said, error = run("simulate", "two-stars")
+    assert (status, said) == (2, "")
+    assert error == "error: not enough memory (Unable to allocate 149. GiB); shorten the record, or lower the rates\n"

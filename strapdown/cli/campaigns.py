@@ -10,7 +10,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from strapdown.cli.terminal import app, console, progress_bar, rate_text, show, table, verdict, written
+from strapdown.cli.terminal import (
+    app,
+    console,
+    progress_bar,
+    rate_text,
+    scenario_named,
+    show,
+    table,
+    verdict,
+    writable,
+    written,
+)
 
 if TYPE_CHECKING:
     from strapdown.montecarlo import Plan
@@ -62,7 +73,7 @@ def montecarlo(
     """Run a scenario many times through a filter; tell whether the filter may be believed."""
     from strapdown import montecarlo as engine
     from strapdown.checks import InputError
-    from strapdown.files import output_file, write_json
+    from strapdown.files import write_json
     from strapdown.montecarlo import campaign as campaigns
 
     source = Path(scenario)
@@ -77,13 +88,15 @@ def montecarlo(
                 raise InputError(f"{name} is given, but {source} tells its own; leave it out, or name a scenario")
         plan, target = held.plan, out or source
         machine = held.machine if machine == "auto" else machine
-    output_file("out", target, _CAMPAIGN_SUFFIXES)
+    writable("out", target, suffixes=_CAMPAIGN_SUFFIXES)
     if resume and overwrite:
         raise InputError("--resume and --overwrite exclude each other: go on with the file, or start it anew")
     told = target.with_suffix(".json")
     if replay is None and told.exists() and not target.exists() and not overwrite:
         raise InputError(f"{told} exists and would be replaced; move it, choose another --out, or give --overwrite")
+    writable("out", told)
     if replay is not None:
+        writable("out", *_replayed(target, replay))
         _replay(plan, replay, machine, target)
         return
     if held is not None and target == source and not (resume or overwrite):
@@ -143,9 +156,8 @@ def _terminated_as_interrupted() -> Iterator[None]:
 def _plan(scenario: str, filter_file: Path | None, dispersions: Path | None, seed: int | None, float32: bool) -> Plan:
     from strapdown import montecarlo as engine
     from strapdown import setup
-    from strapdown.scenarios import load_scenario
 
-    loaded = load_scenario(scenario)
+    loaded = scenario_named(scenario)
     filter_setup = setup.matched(loaded) if filter_file is None else setup.read_setup(filter_file)
     return engine.Plan(
         scenario=loaded,
@@ -249,6 +261,11 @@ def _worst_axis(values: list[float | None]) -> int:
     return sizes.index(max(sizes))
 
 
+def _replayed(target: Path, run: int) -> list[Path]:
+    """Return the files that a run computed again goes to: its record and its estimate."""
+    return [target.with_name(f"{target.stem}-run-{run}-{what}.h5") for what in ("record", "estimate")]
+
+
 def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
     import json
 
@@ -275,7 +292,7 @@ def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
         "filter": json.dumps(table_of["filter"]),
         "dispersions": json.dumps(table_of["dispersions"]),
     }
-    paths = [target.with_name(f"{target.stem}-run-{run}-{what}.h5") for what in ("record", "estimate")]
+    paths = _replayed(target, run)
     recordfiles.write_record(
         paths[0],
         again.record,

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from strapdown.cli.terminal import app, console, progress_bar, show, table, written
+from strapdown.cli.terminal import app, console, progress_bar, show, table, writable, written
 
 
 @app.command()
@@ -59,22 +60,29 @@ def integrate(
     import numpy as np
 
     from strapdown import coning, quaternion, recordfiles, recordings, records
-    from strapdown.files import output_file
+    from strapdown.checks import InputError
 
-    output_file("out", out, (".h5", ".hdf5"), recording)
+    writable("out", out, suffixes=(".h5", ".hdf5"), sources=(recording,))
     chosen = coning.named(algorithm)
+    units = {name: unit for name, unit in (("gyro", gyro_unit), ("time", time_unit)) if unit}
     gaps: list[tuple[float, float]] = []
     with progress_bar("reading, integrating, writing", 3) as advance:
         if recordfiles.is_record(recording):
+            for name in units:
+                raise InputError(f"--{name}-unit goes with a CSV file; the record {recording} tells its units itself")
             record = recordfiles.read_record(recording)
             time, increments = record.time, record.increments
             truth = None if record.truth is None else record.truth.attitude
         else:
-            given = {"gyro": gyro_unit, "time": time_unit}
-            source = recordings.read(recording, units={name: unit for name, unit in given.items() if unit})
+            source = recordings.read(recording, units=units)
             gaps = recordings.gaps(source.time)
             time, increments, truth = source.time, recordings.increments(source), source.true_attitude
         advance(1)
+        if len(increments) < chosen.samples:
+            raise InputError(
+                f"{recording.name} holds {len(increments)} gyro samples, fewer than the {chosen.samples} of one step of {chosen.name}; "
+                "choose another algorithm or a longer recording"
+            )
         start = quaternion.IDENTITY
         if truth is not None and np.isfinite(truth[0]).all():
             start = truth[0]
@@ -84,6 +92,11 @@ def integrate(
         records.write_attitude(out, time, attitude, {"source": recording.name, "algorithm": chosen.name})
         advance(1)
     console.print(f"{recording.name}: {len(increments)} samples over {time[-1] - time[0]:.6g} s with {chosen.name}.")
+    left = len(increments) % chosen.samples
+    if left:
+        console.print(
+            f"The last {left} of them do not fill a step of {chosen.samples} and are left out.", soft_wrap=True
+        )
     if truth is not None:
         reference = truth[:: chosen.samples][: len(attitude)]
         known = np.isfinite(reference).all(axis=1)
@@ -93,6 +106,9 @@ def integrate(
     for begin, length in gaps:
         console.print(f"Gap of {length:.3g} s after {begin:.3f} s: the turn across it is a guess.")
     written(out)
+
+
+_RIGHT_ANGLE = 0.5 * math.pi
 
 
 @app.command("coning-budget")
@@ -106,12 +122,22 @@ def coning_budget(
 ) -> None:
     """Tell the drift that an angular vibration spectrum leaves, for each algorithm and sample rate."""
     from strapdown import coning
-    from strapdown.files import output_file, write_json
-    from strapdown.units import DEGREE_PER_HOUR
+    from strapdown.checks import InputError
+    from strapdown.files import existing_file, write_json
+    from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
     if json is not None:
-        output_file("json", json, (".json",), psd)
-    lines = coning.read_vibration(psd)
+        writable("json", json, suffixes=(".json",), sources=(psd,))
+    existing_file(psd)
+    try:
+        lines = coning.read_vibration(psd)
+    except UnicodeDecodeError:
+        raise InputError(f"{psd} is no text; give a CSV of vibration lines") from None
+    largest = max(max(line.angle, line.angle_across or 0.0) for line in lines)
+    if largest >= _RIGHT_ANGLE:
+        raise InputError(
+            f"{psd} holds an amplitude of {largest / DEGREE:.4g}°; that of a vibration is below 90°: check the unit"
+        )
     chosen = {"algorithms": tuple(algorithm)} if algorithm else {}
     budget = coning.ConingBudget(lines=lines, sample_rates=tuple(rate), **chosen)
     listing = table(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.text import Text
 
-from strapdown.cli.terminal import app, console, show, table, written
+from strapdown.cli.terminal import app, console, show, table, writable, written
 
 if TYPE_CHECKING:
     from strapdown.consistency import Judgement
@@ -41,11 +41,10 @@ def check(
     """Tell whether the filter may be believed: exit status 0 consistent, 1 not, 2 cannot tell (or bad input)."""
     from strapdown import consistency, records
     from strapdown.checks import InputError
-    from strapdown.files import output_file, write_json
+    from strapdown.files import write_json
 
-    sources = [path for path in (result, record, filter_file) if path is not None]
     if json is not None:
-        output_file("json", json, (".json",), *sources)
+        writable("json", json, suffixes=(".json",), sources=(result, record, filter_file))
     if record is None and filter_file is not None:
         raise InputError("--filter goes with --record: the record is needed to look for causes")
     kind = _kind(result)
@@ -174,10 +173,10 @@ def doctor(
     """Tell which conventions a recording follows, by trying the others: exit status 0 as told, 1 wrong, 2 cannot tell."""
     from strapdown import doctor as conventions
     from strapdown import recordings
-    from strapdown.files import output_file, write_json
+    from strapdown.files import write_json
 
     if json is not None:
-        output_file("json", json, (".json",), recording)
+        writable("json", json, suffixes=(".json",), sources=(recording,))
     given = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
     source = recordings.read(recording, units={name: unit for name, unit in given.items() if unit})
     found = conventions.examine(source)

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from strapdown.cli.terminal import app, console, progress_bar, show, table, written
+from strapdown.cli.terminal import app, console, progress_bar, scenario_named, show, table, writable, written
 
 
 def _named(option: str, values: list[str] | None) -> dict[str, float]:
@@ -20,9 +20,12 @@ def _named(option: str, values: list[str] | None) -> dict[str, float]:
         if not equals or not name:
             raise InputError(f"{option} is {text!r}; give NAME=VALUE, such as 'magnetometer=50'")
         try:
-            found[name] = finite(f"{option}: {name}", float(number))
+            value = finite(f"{option}: {name}", float(number))
         except ValueError:
             raise InputError(f"{option}: {name}: {number!r} is no number; give NAME=VALUE") from None
+        if name in found:
+            raise InputError(f"{option}: {name} is given twice; give it once")
+        found[name] = value
     return found
 
 
@@ -73,11 +76,11 @@ def covariance(
     from strapdown import covariance as analysis
     from strapdown import setup
     from strapdown.files import usable_folder, write_json
-    from strapdown.scenarios import load_scenario
     from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR, STANDARD_GRAVITY
 
-    chosen = load_scenario(scenario)
+    chosen = scenario_named(scenario)
     usable_folder("out", out)
+    writable("out", out / "covariance.json", out / "budget.png", sources=(scenario, filter_file))
     considered = analysis.Consider(
         scale_factor=1e-6 * scale_factor,
         misalignment=1e-3 * misalignment,
@@ -110,6 +113,7 @@ def covariance(
 def _tell(name: str, found: Any, integration: str, *, matched: bool) -> None:
     import numpy as np
 
+    from strapdown.covariance import LARGEST_LINEAR
     from strapdown.plots.style import angle_unit, rate_unit
     from strapdown.units import DEGREE
 
@@ -117,7 +121,10 @@ def _tell(name: str, found: Any, integration: str, *, matched: bool) -> None:
     unit, size = angle_unit(np.concatenate([rms[:3], sigma[:3]]))
     rate_name, rate = rate_unit(np.concatenate([rms[3:], sigma[3:]]))
     belief = "the filter that matches it" if matched else "the filter given"
-    console.print(f"{name}, {belief}, integration {integration}; errors at {found.time[-1]:g} s, RMS of an axis.\n")
+    console.print(
+        f"{name}, {belief}, integration {integration}; errors at {found.time[-1]:g} s, RMS of an axis.\n",
+        soft_wrap=True,
+    )
     rows = table("Error budget", "source", "kind", f"attitude\n{unit}", f"bias\n{rate_name}", left=2)
     budget = sorted(found.budget(), key=lambda row: -row[2])
     for source, kind, attitude, bias in budget:
@@ -132,29 +139,36 @@ def _tell(name: str, found: Any, integration: str, *, matched: bool) -> None:
     show(rows)
     console.print(
         "random: squares add. fixed: the same in every run, adds as an error. considered: 1σ of an error that neither the scenario nor the "
-        "filter knows of.\n"
+        "filter knows of.\n",
+        soft_wrap=True,
     )
     state, attitude, bias = found.expected_nees[-1]
     nis = ", ".join(f"{sensor} {value:.3g}" for sensor, value in found.expected_nis.items())
     console.print(
-        f"Expected NEES per state: {state:.3g} (attitude {attitude:.3g}, bias {bias:.3g}); NIS: {nis or 'none'}."
+        f"Expected NEES per state: {state:.3g} (attitude {attitude:.3g}, bias {bias:.3g}); NIS: {nis or 'none'}.",
+        soft_wrap=True,
     )
-    if max(attitude, bias) > 1.1:
+    largest = float(np.max(np.concatenate([rms[:3], sigma[:3]])))
+    if largest > LARGEST_LINEAR:
+        console.print(
+            f"With an attitude error of {largest / DEGREE:.3g}° the analysis, linear about the truth, cannot tell whether the filter "
+            "will be as good as it says.",
+            soft_wrap=True,
+        )
+    elif max(attitude, bias) > 1.1:
         worst = "bias" if bias > attitude else "attitude"
         console.print(
-            f"The filter will be too sure of its {worst}: its errors are {np.sqrt(max(attitude, bias)):.3g} times what it says."
+            f"The filter will be too sure of its {worst}: its errors are {np.sqrt(max(attitude, bias)):.3g} times what it says.",
+            soft_wrap=True,
         )
     elif min(attitude, bias) < 0.9:
         console.print("The filter will be more modest than it need be.")
     else:
         console.print("The filter will be as good as it says.")
     if found.left_out:
-        console.print(f"Left out: {', '.join(found.left_out)}.")
+        console.print(f"Left out: {', '.join(found.left_out)}.", soft_wrap=True)
     for one in found.beyond_linear:
-        console.print(f"Beyond linear: {one}; take a Monte Carlo (`strapdown montecarlo`).")
-    largest = float(np.max(rms[:3]))
-    if largest > 10.0 * DEGREE:
-        console.print(f"Beyond linear: the attitude error itself, {largest / DEGREE:.3g}°.")
+        console.print(f"Beyond linear: {one}; take a Monte Carlo (`strapdown montecarlo`).", soft_wrap=True)
     console.print("")
 
 

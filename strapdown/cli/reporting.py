@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from strapdown.cli.terminal import app, console, progress_bar, written
+from strapdown.cli.terminal import app, console, progress_bar, writable, written
 
 
 @app.command()
@@ -25,6 +25,8 @@ def report(
     """Write a self-contained HTML page about a result: verdict in words, numbers, figures, how to reproduce it; the statistics as JSON."""
     from strapdown import report as reports
 
+    page = result.with_suffix(".html") if out is None else out
+    writable("out", page, page.with_suffix(".report.json"), sources=(result,))
     with progress_bar("judging, drawing", 1) as advance:
         done = reports.write(result, out, probability=probability)
         advance(1)

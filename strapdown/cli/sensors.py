@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from strapdown.cli.terminal import app, console, progress_bar, show, table, written
+from strapdown.cli.terminal import app, console, progress_bar, scenario_named, show, table, writable, written
 
 if TYPE_CHECKING:
     from strapdown import allan as identification
@@ -40,16 +40,17 @@ def simulate(
     """Simulate a scenario: a record with its truth."""
     from strapdown import recordfiles
     from strapdown import scenarios as catalogue
-    from strapdown.files import output_file
 
-    chosen = catalogue.load_scenario(scenario)
+    chosen = scenario_named(scenario)
     toml = catalogue.scenario_to_toml(chosen)
     if show:
         console.print(toml, soft_wrap=True)
         return
     used = chosen.seed if seed is None else seed
     target = out or Path(f"{chosen.name or Path(scenario).stem}.h5")
-    output_file("out", target, (".h5", ".hdf5", ".csv"), scenario)
+    writable("out", target, suffixes=(".h5", ".hdf5", ".csv"), sources=(scenario,))
+    beside = [target.with_name(f"{target.stem}-vectors-{number}.csv") for number in range(len(chosen.sensors))]
+    writable("out", *(beside if target.suffix.lower() == ".csv" else ()))
     with progress_bar("simulating, writing", 2) as advance:
         record = catalogue.simulate(chosen, used, run)
         advance(1)
@@ -66,6 +67,13 @@ def simulate(
     )
     for series in record.vectors:
         console.print(f"  {series.sensor}: {len(series.time)} measurements ({series.kind})")
+        sigma = series.sigma if series.sigma_axes is None else series.sigma_axes
+        if series.covariance is None and (sigma == 0.0).any():
+            console.print(
+                f"warning: {series.sensor}: its sigma is zero, which no filter can use; give it noise in the scenario, or tell the filter "
+                "another in [filter.sigma]",
+                soft_wrap=True,
+            )
     written(*paths)
 
 
@@ -89,6 +97,8 @@ def allan(
     """Identify a gyro's noise from a recording at rest: Allan deviation, fitted coefficients, specification as TOML."""
     import math
 
+    import numpy as np
+
     from strapdown import allan as identification
     from strapdown import plots, recordings
     from strapdown.checks import InputError
@@ -96,12 +106,20 @@ def allan(
 
     given = {"gyro": gyro_unit, "time": time_unit}
     usable_folder("out", out)
+    writable("out", *(out / name for name in ("gyro.toml", "allan.json", "allan.png")), sources=(recording,))
     if recording.is_dir():
         raise InputError(f"{recording} is a folder; name a file")
     source = recordings.read_gyro(recording, rate=rate, units={name: unit for name, unit in given.items() if unit})
     if source.values.shape[1] not in (1, 3):
         raise InputError(
             f"{recording.name} has {source.values.shape[1]} columns; a gyro has three axes, or pass one column, (n,) or (n, 1)"
+        )
+    largest = float(np.abs(source.values).max(initial=0.0))
+    if largest > _LARGEST_RATE:
+        raise InputError(f"{recording.name} holds {largest:g} rad/s, which no gyro measures; check its unit")
+    if not 1.0 / _LARGEST_RATE <= source.sample_interval <= _LARGEST_RATE:
+        raise InputError(
+            f"{recording.name}: {1.0 / source.sample_interval:g} Hz is no rate of a gyro; check it and its unit"
         )
     try:
         with progress_bar("fit, deviation, figure", 3) as advance:
@@ -165,6 +183,8 @@ def allan(
         console.print(f"warning: {_DISBELIEF}.", highlight=False)
 
 
+_LARGEST_RATE = 1e12
+"""rad/s and Hz: far beyond any gyro, and far from where the fit's squares overflow."""
 _DISBELIEF = "do not believe these intervals, nor gyro.toml"
 
 

@@ -7,7 +7,10 @@ from typing import Annotated
 
 import typer
 
-from strapdown.cli.terminal import app, console, progress_bar, show, table, verdict, written
+from strapdown.cli.terminal import app, console, progress_bar, show, table, verdict, writable, written
+
+LEAST_SAMPLES_A_CYCLE = 0.1
+"""With fewer a step holds more than ten turns of the cone, and nothing of the study means anything."""
 
 
 def _drift(value: float | None) -> str:
@@ -28,13 +31,20 @@ def coning(
 ) -> None:
     """Study coning: the drift of each integration algorithm, and what a filter makes of it."""
     from strapdown import coning_study
+    from strapdown.checks import InputError
     from strapdown.files import usable_folder, write_json
     from strapdown.units import DEGREE
 
     parameters = coning_study.ConingParameters(
         angle=angle * DEGREE, frequency=frequency, rate=rate, duration=duration, runs=runs, seed=seed
     )
+    if rate < LEAST_SAMPLES_A_CYCLE * frequency:
+        raise InputError(
+            f"rate is {rate:g} Hz, {rate / frequency:.3g} samples of a cone's cycle at {frequency:g} Hz; no algorithm follows it: "
+            f"raise the rate, to {LEAST_SAMPLES_A_CYCLE:g} samples a cycle at least"
+        )
     usable_folder("out", out)
+    writable("out", *(out / name for name in ("coning.json", "drift.png", "errors.png", "consistency.png")))
     with progress_bar("Monte Carlo runs", runs) as advance:
         study = coning_study.run(parameters, progress=advance)
     summary = study.summary()

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import typer
 from rich import box
@@ -21,6 +22,14 @@ from rich.progress import (
 )
 from rich.table import Table
 from rich.text import Text
+
+if TYPE_CHECKING:
+    from strapdown.scenarios import Scenario
+
+LARGEST_NUMBER = 1e30
+"""No number of a scenario is larger in any unit that its file may use; beyond it squares and products leave the range of doubles."""
+MOST_MEASUREMENTS = 1e8
+"""Of one sensor in a scenario: more do not fit into memory."""
 
 app = typer.Typer(
     help="Strapdown gyro attitude estimation: simulate, estimate, judge.",
@@ -95,6 +104,67 @@ def show(rows: Table) -> None:
 def verdict(good: bool) -> Text:
     """Return "pass" or "FAIL", coloured where the terminal can."""
     return Text("pass", style="green") if good else Text("FAIL", style="red")
+
+
+def scenario_named(name: str) -> Scenario:
+    """Return the scenario of a name or a TOML file whose numbers can be computed with, not only read.
+
+    Refused are numbers beyond :data:`LARGEST_NUMBER`, a duration shorter than one gyro sample, and more measurements of a sensor than
+    :data:`MOST_MEASUREMENTS`: each would end deep inside, as an infinity or for want of memory.
+    """
+    import tomllib
+
+    from strapdown.checks import InputError
+    from strapdown.scenarios import load_scenario, scenario_to_toml
+
+    chosen = load_scenario(name)
+    for key, number in _numbers("", tomllib.loads(scenario_to_toml(chosen))):
+        if LARGEST_NUMBER < abs(number) < float("inf"):  # infinite is what never happens, such as a time without end
+            raise InputError(f"{name}: {key} is {number:g}, which no such thing can be; check it and its unit")
+    if chosen.duration * chosen.rate < 1.0:
+        raise InputError(
+            f"{name}: {chosen.duration:g} s at {chosen.rate:g} Hz are less than one gyro sample; lengthen the run or raise the rate"
+        )
+    for sensor in chosen.sensors:
+        measurements = chosen.duration * getattr(sensor, "rate", 0.0)
+        if measurements > MOST_MEASUREMENTS:
+            raise InputError(
+                f"{name}: {sensor.name} would measure {measurements:.3g} times, more than {MOST_MEASUREMENTS:.0e}; lower its rate or "
+                "shorten the run"
+            )
+    return chosen
+
+
+def _numbers(place: str, content: Any) -> Iterator[tuple[str, float]]:
+    """Yield the numbers in a table of TOML with their places."""
+    if isinstance(content, dict):
+        for key, value in content.items():
+            yield from _numbers(f"{place}.{key}" if place else key, value)
+    elif isinstance(content, list):
+        for k, value in enumerate(content):
+            yield from _numbers(f"{place}[{k}]", value)
+    elif isinstance(content, (int, float)) and not isinstance(content, bool):
+        yield place, float(content)
+
+
+def writable(
+    option: str, *targets: Path, suffixes: tuple[str, ...] = (), sources: tuple[Path | str | None, ...] = ()
+) -> None:
+    """Refuse files that a command is going to write but cannot, before it computes what goes into them.
+
+    A folder of that name stands in the way, the folder that they go to may not be written or lies below a file, the suffix is none of
+    ``suffixes`` (where given), or a target is one of the ``sources`` that are read.
+    """
+    from strapdown.checks import InputError
+    from strapdown.files import output_file
+
+    for target in targets:
+        if target.is_dir():
+            raise InputError(
+                f"{option}: {target} is a folder, and a file of that name is to be written; choose another"
+            )
+        read = [source for source in sources if source is not None]
+        output_file(option, target, suffixes or (target.suffix.lower(),), *read)
 
 
 def written(*paths: Any) -> None:

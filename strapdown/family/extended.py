@@ -16,6 +16,12 @@ geometric        [[I, 0], [[b⁺ − b], I]]             exp(−[a]) b + c
 
 with c the linear correction of the filter's own bias error, and [·] the skew matrix. The geometric filter leaves the covariance of (δθ, η)
 alone, η = δb − [b] δθ; that is its G in (δθ, δb).
+
+All stay finite from any start, however far off and however wrong its covariance, and P positive definite to rounding: turns and
+corrections of any size go through closed forms (:mod:`strapdown.kernels.family_turns`), a row of a measurement is taken in by Joseph's
+form, and a heading whose vector is estimated to be vertical is passed over. The geometric filter needs one bound more, which the paper
+does not have: its bias grows across corrections beyond 1.8955 rad, so a longer one is shortened to that
+(:data:`strapdown.kernels.family_step.LARGEST_CORRECTION`).
 """
 
 from __future__ import annotations

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from strapdown import mekf, quaternion
 from strapdown.checks import Array, InputError
 from strapdown.family import stepping
+from strapdown.kernels.family_turns import process_noise_over_any_turn
 from strapdown.kernels.filter_loop import HEADING, VECTOR, heading_error
 from strapdown.kernels.rotation import quaternion_multiply
 from strapdown.mekf import ProcessNoise, Schedule, State
@@ -96,9 +97,17 @@ def _predict(
     sigma, attitudes = _spread(points, q, b, P)
     attitudes = _product(attitudes, quaternion.exp(increment - dt * sigma[:, 3:]))
     sigma[:, :3] = quaternion_to_rodrigues(_product(attitudes[0] * _CONJUGATE, attitudes))
-    _, noise = mekf.transition_and_noise(increment - dt * b, dt, process_noise)
+    noise = _process_noise(increment - dt * b, dt, process_noise)
     mean, covariance = unscented_transform(sigma, points.Wm, points.Wc, noise)
     return _moved(attitudes[0], mean), mean[3:], 0.5 * (covariance + covariance.T)
+
+
+def _process_noise(phi: Array, dt: float, process_noise: ProcessNoise) -> Array:
+    """Return Q (6, 6) over a turn φ (3,) of any size."""
+    q11, q12, q22 = process_noise_over_any_turn(
+        tuple(phi.tolist()), dt, process_noise.angle_random_walk**2, process_noise.rate_random_walk**2
+    )
+    return mekf.covariance_matrices(np.array([*q11, *q12, q22, 0.0, 0.0, q22, 0.0, q22]))
 
 
 def _moved(q: Array, mean: Array) -> Array:

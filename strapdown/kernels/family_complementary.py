@@ -14,9 +14,9 @@ from strapdown.kernels.algebra import (
     transpose_times_vector,
 )
 from strapdown.kernels.family_loop import state_at
-from strapdown.kernels.family_step import congruent, negated
+from strapdown.kernels.family_step import congruent, negated, predict_body_side
+from strapdown.kernels.family_turns import right_jacobian_of_any_turn, turned_by_any
 from strapdown.kernels.filter_loop import HEADING, VECTOR, heading_error, store_state, vector_at
-from strapdown.kernels.filter_step import predict, reset
 from strapdown.kernels.rotation import rotation_matrix
 
 
@@ -92,7 +92,7 @@ def run_complementary(
     q, b, A, B, C = state_at(state)
     for k in range(len(dt)):
         if dt[k] > 0.0:
-            q, A, B, C = predict(q, b, A, B, C, vector_at(increment, k), dt[k], angle_variance, rate_variance)
+            q, A, B, C = predict_body_side(q, b, A, B, C, vector_at(increment, k), dt[k], angle_variance, rate_variance)
         e = event[k]
         if e >= 0:
             R = rotation_matrix(q)
@@ -129,6 +129,9 @@ def run_complementary(
             kappa = bias_gain[t]
             A, B, C = corrected_covariance(A, B, C, M, g, kappa, variance)
             b = (b[0] + kappa * turn[0], b[1] + kappa * turn[1], b[2] + kappa * turn[2])
-            q, A, B = reset(q, A, B, scale(g, turn))
+            correction = scale(g, turn)
+            G = right_jacobian_of_any_turn(correction)
+            q = turned_by_any(q, correction)
+            A, B = congruent(G, A), multiply(G, B)
         if row[k] >= 0:
             store_state(state_out[row[k]], q, b, A, B, C)

@@ -14,21 +14,23 @@ from strapdown.kernels.family_step import (
     close_geometric,
     close_right_invariant,
     close_two_frame,
-    from_geometric,
     negated,
+    predict_body_side,
     predict_fixed_side,
     predict_two_frame,
     take_row,
-    to_geometric,
 )
 from strapdown.kernels.filter_loop import HEADING, VECTOR, heading_error, store_state, vector_at
-from strapdown.kernels.filter_step import heading_row, predict
+from strapdown.kernels.filter_step import heading_row
 from strapdown.kernels.rotation import rotation_matrix
 
 FIXED_SIDE = 0
 RIGHT_INVARIANT = 1
 TWO_FRAME = 2
 GEOMETRIC = 3
+
+VERTICAL = 1e-24
+"""Squared horizontal part of a vector, a picoradian from the vertical, below which it has no heading."""
 
 
 def state_at(state):
@@ -90,7 +92,7 @@ def run_extended(
         if dt[k] > 0.0:
             theta = vector_at(increment, k)
             if variant == GEOMETRIC:
-                q, A, B, C = predict(q, b, A, B, C, theta, dt[k], angle_variance, rate_variance)
+                q, A, B, C = predict_body_side(q, b, A, B, C, theta, dt[k], angle_variance, rate_variance)
             elif variant == TWO_FRAME:
                 q, A, B, C = predict_two_frame(q, b, A, B, C, theta, dt[k], angle_variance, rate_variance)
             else:
@@ -106,13 +108,16 @@ def run_extended(
             u = (triads[t, 0], triads[t, 1], triads[t, 2])
             v = (triads[t, 3], triads[t, 4], triads[t, 5])
             z_f = matrix_times_vector(R, z)
-            h1 = matrix_times_vector(R, heading_row(R, z)) if heading else negated(v)
+            h1 = negated(v)
             h2 = u
-            y1 = heading_error(R, z, r) if heading else dot(u, z_f)
+            y1 = dot(u, z_f)
+            if heading:
+                h1, y1 = (0.0, 0.0, 0.0), 0.0
+                if z_f[0] * z_f[0] + z_f[1] * z_f[1] > VERTICAL:
+                    h1, y1 = matrix_times_vector(R, heading_row(R, z)), heading_error(R, z, r)
             if variant == GEOMETRIC:
                 h1 = transpose_times_vector(R, h1)
                 h2 = transpose_times_vector(R, h2)
-                B, C = to_geometric(b, A, B, C)
             a = (0.0, 0.0, 0.0)
             c = (0.0, 0.0, 0.0)
             a, c, A, B, C, e1, s1 = take_row(a, c, A, B, C, h1, y1, event_variance[e])
@@ -126,8 +131,7 @@ def run_extended(
             elif variant == TWO_FRAME:
                 q, b = close_two_frame(q, b, a, c)
             else:
-                q, b = close_geometric(q, b, a, c)
-                B, C = from_geometric(b, A, B, C)
+                q, b, B, C = close_geometric(q, b, A, B, C, a, c)
             innovation_out[e, 0], innovation_out[e, 1] = e1, s1
             innovation_out[e, 2], innovation_out[e, 3] = e2, s2
             if event_kind[e] == VECTOR:
