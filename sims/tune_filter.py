@@ -102,7 +102,7 @@ def draw(result, folder, objective):
         folder / "tune_filter-likelihood.png",
     )
     plots.save(
-        drawing.before_and_after(result.held_out, title="Held-out innovations, from a filter 30 times too sure"),
+        drawing.before_and_after(result.held_out, title="On what was held out, from a filter 30 times too sure"),
         folder / "tune_filter-heldout.png",
     )
 

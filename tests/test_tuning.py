@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from strapdown import gyro, motion, quaternion, scenarios, setup, tuning, units, vectors
+from strapdown import consistency, gyro, motion, quaternion, scenarios, setup, tuning, units, vectors
 from strapdown.checks import InputError
 from strapdown.mekf import ProcessNoise
 from strapdown.records import ImuRecord, Truth
@@ -390,6 +390,18 @@ def test_a_parameter_that_nothing_depends_on_is_told_so():
     assert np.isfinite(found.value)
 
 
+def test_no_information_is_no_certainty():
+    none = np.diag([4.0, 0.0, 1e-14])
+    derivatives = innovations.Derivatives(
+        value=np.zeros(20), score=np.random.default_rng(0).standard_normal((20, 3)), information=none, outer=none
+    )
+    local = fitting.Local(value=0.0, score=np.zeros(3), information=none, derivatives=derivatives)
+    inverse, sandwich = fitting.covariances(local)
+    assert inverse[0, 0] == pytest.approx(0.25)
+    assert np.all(np.diag(inverse)[1:] > 1e9)
+    assert np.all(np.diag(sandwich)[1:] > 1e9)
+
+
 def test_priors_hold_what_the_data_leave_open_and_yield_where_they_speak():
     one = case(3, walk=0.0, duration=300.0)
     objective = tuning.likelihood([one], BELIEVED, FREE)
@@ -460,8 +472,6 @@ def test_the_gradient_against_a_truth_is_that_of_its_value(measure):
 
 def test_the_likelihood_of_the_errors_is_that_of_a_normal_vector():
     from scipy.stats import multivariate_normal
-
-    from strapdown import consistency
 
     one = case(1)
     objective = tuning.error_objective([one], BELIEVED, FREE)
@@ -689,3 +699,38 @@ def test_other_bad_input_is_refused():
     assert own_sigma("star 2.sigma", [record]) == pytest.approx(2e-4)
     assert tuning.unit_of("star 1.sigma", [record]).factor == units.ARCSECOND
     assert fitting.random_starts(np.zeros(2), 3, 30.0, np.random.default_rng(0)).shape == (3, 2)
+
+
+# ------------------------------------------------------------------------------------------------------ figures
+
+
+def test_before_and_after_are_drawn_for_nis_and_for_nees_where_there_is_a_truth():
+    from strapdown.plots import tuning as drawing
+
+    one = case(1, duration=300.0)
+    off = tuning.with_values(BELIEVED, {"gyro.arw": 10.0 * ARW, "star 2.sigma": 1e-3})
+    compared = tuning.compare([one], off, BELIEVED)
+    nees = {course.of: course for course in compared.after.nees}
+    assert set(nees) == {"attitude", "bias"}
+    # Spans of even length: their mean, weighted alike, is that of all epochs.
+    mean = (np.nanmean(nees["attitude"].mean) + np.nanmean(nees["bias"].mean)) / 2.0
+    estimate = setup.run(one.record, BELIEVED, one.initial, full_covariance=True)
+    error = consistency.errors(estimate.attitude, estimate.bias, one.record.truth.attitude, one.record.truth.bias)
+    expected = [
+        np.mean(consistency.nees(error, estimate.covariance, consistency.SUBSETS[of])) / 3.0
+        for of in ("attitude", "bias")
+    ]
+    assert mean == pytest.approx(np.mean(expected), rel=0.02)
+    low, high = nees["attitude"].bounds
+    assert low < 1.0 < high
+    assert compared.before.nees[1].mean.mean() < 0.5 * compared.after.nees[1].mean.mean()
+    figure = drawing.before_and_after(compared, title="both")
+    assert [ax.get_ylabel().split(",")[0] for ax in figure.axes] == [
+        "NIS per degree of freedom",
+        "NEES of the attitude",
+        "NEES of the bias",
+    ]
+    bare = dataclasses.replace(one, record=dataclasses.replace(one.record, truth=None))
+    assert len(drawing.before_and_after(tuning.compare([bare], off, BELIEVED)).axes) == 1
+    beside = dataclasses.replace(bare, true_attitude=one.record.truth.attitude)
+    assert [course.of for course in tuning.compare([beside], off, BELIEVED).after.nees] == ["attitude"]

@@ -17,9 +17,13 @@ if TYPE_CHECKING:
     from strapdown.gyro import GyroSpec
     from strapdown.records import ImuRecord
     from strapdown.setup import FilterSetup
-    from strapdown.tuning import Case, Comparison, Plan, Tuning
+    from strapdown.tuning import Case, Comparison, Performance, Plan, TunedGate, Tuning, Unmodelled
 
 
+GATED = ("gate.probability", "outliers.share", "outliers.scale")
+"""Names of parameters that ask for a model of outliers."""
+MOST_EXAMINED = 4
+"""Records that are looked at for what the tuned filter leaves unexplained."""
 WORSE = 1.05
 """An attitude error on the data held out that has grown by more than this is told."""
 
@@ -36,8 +40,8 @@ def tune(
     free: Annotated[
         str | None,
         typer.Option(
-            help="Parameters to tune, with commas: gyro.arw, gyro.rrw, SENSOR.sigma, initial.attitude, initial.bias; or filter.scale "
-            "alone. If not given the gyro's two and every sensor's."
+            help="Parameters to tune, with commas: gyro.arw, gyro.rrw, SENSOR.sigma, initial.attitude, initial.bias, "
+            "gate.probability (as --gate); or filter.scale alone. If not given the gyro's two and every sensor's."
         ),
     ] = None,
     filter_file: Annotated[
@@ -54,6 +58,20 @@ def tune(
         bool,
         typer.Option(
             "--rmse", help="Tune by the RMS attitude error against the truth; then all σ alike by innovations."
+        ),
+    ] = False,
+    credibility: Annotated[
+        bool,
+        typer.Option(
+            "--credibility",
+            help="Tune until the filter may be believed: the whole distribution of NIS, and whiteness; with --truth that of NEES.",
+        ),
+    ] = False,
+    gate: Annotated[
+        bool,
+        typer.Option(
+            "--gate",
+            help="Model outliers too, their share and scale, and set the filter's gate where an outlier is the likelier explanation.",
         ),
     ] = False,
     holdout: Annotated[
@@ -123,15 +141,33 @@ def tune(
         raise InputError(f"{same[0]} is given twice; a record counts once")
     output_file("out", out, (".toml",), *records, *([filter_file] if filter_file is not None else []))
     units = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
-    cases, believed = _cases(records, chosen, {name: unit for name, unit in units.items() if unit})
+    cases, believed, gyros = _cases(records, chosen, {name: unit for name, unit in units.items() if unit})
     if algorithm is not None:
         believed = replace(believed, integration=algorithm)
     train, held = (tuple(cases), ()) if holdout is None else tuning.split(cases, holdout, _by(holdout_by))
-    wanted = names or list(tuning.default_names([case.record for case in cases]))
+    gate = gate or any(name in GATED for name in names or [])
+    wanted = [name for name in names or [] if name not in GATED]
+    wanted = wanted or list(tuning.default_names([case.record for case in cases]))
+    if chosen is None or any(name.startswith(("gyro.", "filter.")) for name in wanted):
+        tuning.one_gyro(gyros)
     objective: Any
-    if truth or rmse:
-        if spacing > 0.0:
-            raise InputError("--spacing thins innovations; against a truth there are none to thin, leave it away")
+    if rmse and credibility:
+        raise InputError(
+            "--rmse and --credibility ask for different filters: small errors, or believable ones; give one of them"
+        )
+    if spacing > 0.0 and (truth or rmse or credibility):
+        raise InputError(
+            "--spacing thins the innovations of the likelihood; against a truth, or for credibility, there are none to thin: leave it away"
+        )
+    if gate and (truth or rmse or credibility or spacing > 0.0):
+        raise InputError(
+            "--gate needs the likelihood of all innovations: leave --truth, --rmse, --credibility and --spacing away"
+        )
+    if gate:
+        objective = tuning.contaminated_likelihood(train, believed, wanted)
+    elif credibility:
+        objective = tuning.credibility_objective(train, believed, wanted, truth=truth, threads=workers)
+    elif truth or rmse:
         objective = tuning.error_objective(
             train, believed, wanted, measure="rmse" if rmse else "likelihood", threads=workers
         )
@@ -145,18 +181,37 @@ def tune(
             starts=starts,
             factor=factor,
             seed=seed,
-            threads=1 if truth or rmse else workers,
+            threads=1 if truth or rmse or credibility else workers,
             progress=advance,
         )
     if rmse:
         # The size of the error leaves a common scale open; the innovations tell it.
         scaled = tuning.fit(tuning.likelihood(train, result.setup, ["filter.scale"]), starts=2, threads=workers)
         result = tuning.rescaled(result, scaled["filter.scale"].value)
+    found = tuning.tuned_gate(objective, result) if gate else None
+    if found is not None and found.gate is not None:
+        result = replace(result, setup=replace(result.setup, gate=found.gate))
     comparison = tuning.compare(held, believed, result.setup, threads=workers) if held else None
-    _tell(result, [case.record for case in cases])
+    if comparison is not None and gate:
+        likely = tuning.log_likelihood(held, objective, result)
+        comparison = replace(comparison, after=replace(comparison.after, log_likelihood=likely))
+    with progress_bar("what is left unexplained", min(len(train), MOST_EXAMINED)) as advance:
+        examined = []
+        for case in train[:MOST_EXAMINED]:
+            examined.append(tuning.unmodelled(case, result.setup))
+            advance(1)
+    worst = max(examined, key=lambda one: (one.moves_with_the_rate, one.suspected, len(one.failed)))
+    result = tuning.doubted(result, worst)
+    _tell(result, [case.record for case in cases], credible=credibility)
+    if found is not None:
+        _tell_gate(found)
+    for sentence in worst.words:
+        console.print(sentence, soft_wrap=True)
     if comparison is not None:
-        _tell_comparison(comparison, truth=bool(truth or rmse))
-    _write(out, result, objective, comparison, cases, records)
+        _tell_comparison(comparison, truth=bool(truth or rmse or credibility))
+    objective_name = "credibility" if credibility else "rmse" if rmse else "likelihood"
+    of = objective_name + (" of the errors" if truth else "")
+    _write(out, result, objective, comparison, cases, records, of=of, examined=examined, gate=found)
 
 
 def _by(text: str) -> Any:
@@ -165,13 +220,16 @@ def _by(text: str) -> Any:
     return one_of("holdout-by", text, ("time", "record"))
 
 
-def _cases(paths: Sequence[Path], chosen: FilterSetup | None, units: dict[str, str]) -> tuple[list[Case], FilterSetup]:
-    """Return the records to tune on, and the filter to start from."""
+def _cases(
+    paths: Sequence[Path], chosen: FilterSetup | None, units: dict[str, str]
+) -> tuple[list[Case], FilterSetup, dict[str, GyroSpec]]:
+    """Return the records to tune on, the filter to start from, and the gyros of the records that tell theirs."""
     from strapdown import recordfiles, recordings, tuning
     from strapdown.checks import InputError
     from strapdown.setup import matched_to_record
 
     cases: list[Case] = []
+    gyros: dict[str, GyroSpec] = {}
     for path in paths:
         if recordfiles.is_record(path):
             file = recordfiles.read_record_file(path)
@@ -181,13 +239,15 @@ def _cases(paths: Sequence[Path], chosen: FilterSetup | None, units: dict[str, s
                         f"{path} does not tell its gyro; give a filter to start from, --filter filter.toml"
                     )
                 chosen = matched_to_record(file.gyro, file.record)
+            if file.gyro is not None:
+                gyros[str(path)] = file.gyro
             cases.append(tuning.record_case(file.record, chosen, name=path.name))
         else:
             recording = recordings.read(path, units=units)
             chosen = chosen or tuning.recording_setup()
             cases.append(tuning.recording_case(recording))
     assert chosen is not None
-    return cases, chosen
+    return cases, chosen, gyros
 
 
 def _priors(source: str, factor: float, record: ImuRecord, names: Sequence[str]) -> dict[str, Any]:
@@ -204,7 +264,7 @@ def _figure(value: float) -> str:
     return f"{value:.3g}" if math.isfinite(value) else "∞"
 
 
-def _tell(result: Tuning, records: Sequence[ImuRecord]) -> None:
+def _tell(result: Tuning, records: Sequence[ImuRecord], *, credible: bool) -> None:
     from strapdown.tuning import unit_of
 
     rows = table("Tuned, with 95 % intervals", "parameter", "unit", "before", "after", "from", "to", "", left=2)
@@ -215,8 +275,10 @@ def _tell(result: Tuning, records: Sequence[ImuRecord]) -> None:
         note = one.note if one.identified or "prior" in one.note else bounded
         rows.add_row(one.name, unit.name, *(_figure(value) for value in told), note)
     show(rows)
+    gain = result.before - result.after
     console.print(
-        f"{result.agreeing} of {len(result.starts)} searches ended at the best point; gain {result.before - result.after:.4g} nats."
+        f"{result.agreeing} of {len(result.starts)} searches ended at the best point; "
+        + (f"half Neyman's statistic fell by {gain:.4g}." if credible else f"gain {gain:.4g} nats.")
     )
     if not all(one.identified for one in result.parameters):
         console.print(
@@ -235,6 +297,28 @@ def _tell(result: Tuning, records: Sequence[ImuRecord]) -> None:
         )
 
 
+def _tell_gate(found: TunedGate) -> None:
+    if found.gate is None:
+        why = "no outliers" if not found.share.identified else "noise of two sizes rather than outliers"
+        console.print(f"The records show {why}; the filter's gate is left as it was.")
+        return
+    thresholds = ", ".join(f"{value:.1f} of {name}" for name, value in found.thresholds.items())
+    console.print(
+        f"An outlier is the likelier explanation of a NIS above {thresholds}. The gate lets {100.0 * found.probability:.4g} % of right "
+        f"measurements pass (95 %: {100.0 * found.lower:.4g} to {100.0 * found.upper:.4g}).",
+        soft_wrap=True,
+    )
+
+
+def _anees(one: Performance) -> str:
+    """Return the ANEES as a table tells it: of attitude and bias, or where only the attitude is known of that."""
+    import numpy as np
+
+    if math.isfinite(one.anees):
+        return _figure(one.anees)
+    return f"{_figure(float(np.nanmean(one.nees[0].mean)))} (attitude)" if one.nees else "-"
+
+
 def _tell_comparison(comparison: Comparison, *, truth: bool) -> None:
     from strapdown.units import DEGREE
 
@@ -251,7 +335,7 @@ def _tell_comparison(comparison: Comparison, *, truth: bool) -> None:
             f"{one.log_likelihood:.4f}",
             f"{one.nis:.3f}",
             f"{one.nis_bounds[0]:.3f} to {one.nis_bounds[1]:.3f}",
-            _figure(one.anees) if math.isfinite(one.anees) else "-",
+            _anees(one),
             _figure(one.attitude_rms / DEGREE) if math.isfinite(one.attitude_rms) else "-",
             told,
         )
@@ -271,6 +355,10 @@ def _write(
     comparison: Comparison | None,
     cases: Sequence[Case],
     paths: Sequence[Path],
+    *,
+    of: str,
+    examined: Sequence[Unmodelled],
+    gate: TunedGate | None,
 ) -> None:
     from strapdown import plots, tuning
     from strapdown.files import write_json, written_beside
@@ -280,7 +368,7 @@ def _write(
     with written_beside(out) as temporary:
         temporary.write_text(to_toml(result.setup), encoding="utf-8")
     report = out.with_suffix(".json")
-    write_json(report, _report(result, comparison, paths))
+    write_json(report, _report(result, comparison, paths, of, examined, gate))
     records = [case.record for case in cases]
     units = [tuning.unit_of(name, records) for name in objective.names]
     figures = {
@@ -290,21 +378,38 @@ def _write(
     }
     if comparison is not None:
         figures[out.with_name(f"{out.stem}-heldout.png")] = drawing.before_and_after(
-            comparison, title="Held-out innovations of the first record"
+            comparison, title="The first record, on what was held out"
         )
     written(out, report, *(plots.save(figure, path) for path, figure in figures.items()))
 
 
-def _report(result: Tuning, comparison: Comparison | None, paths: Sequence[Path]) -> dict[str, Any]:
+def _report(
+    result: Tuning,
+    comparison: Comparison | None,
+    paths: Sequence[Path],
+    of: str,
+    examined: Sequence[Unmodelled],
+    gate: TunedGate | None,
+) -> dict[str, Any]:
+    import numpy as np
+
     number = lambda value: None if isinstance(value, float) and not math.isfinite(value) else value  # noqa: E731
     content: dict[str, Any] = {
         "records": [path.name for path in paths],
         "parameters": [{key: number(value) for key, value in vars(one).items()} for one in result.parameters],
         "units": "SI: rad, s, and the units of whole vectors",
-        "minus_log_likelihood": {"before": result.before, "after": result.after},
+        "objective": {"name": of, "before": result.before, "after": result.after},
         "searches": {"number": len(result.starts), "at_the_best_point": result.agreeing},
         "innovations_fit": not result.misfit,
+        "unmodelled": [one.summary() for one in examined],
     }
+    if gate is not None:
+        content["gate"] = {
+            "probability": number(gate.probability),
+            "lower": number(gate.lower),
+            "upper": number(gate.upper),
+            "thresholds": gate.thresholds,
+        }
     if comparison is not None:
         content["held_out"] = {
             name: {
@@ -313,6 +418,7 @@ def _report(result: Tuning, comparison: Comparison | None, paths: Sequence[Path]
                 "nis_bounds": list(one.nis_bounds),
                 "anees_per_state": number(one.anees),
                 "attitude_rms_rad": number(one.attitude_rms),
+                "nees_per_state": {course.of: number(float(np.nanmean(course.mean))) for course in one.nees},
                 "judgements": [judgement.summary() for judgement in one.judgements],
             }
             for name, one in (("before", comparison.before), ("after", comparison.after))

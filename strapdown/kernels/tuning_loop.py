@@ -177,6 +177,7 @@ def run_parameters(
     outer,
     epochs,
     state_out,
+    innovations,
     rows,
     found,
     work,
@@ -188,7 +189,8 @@ def run_parameters(
     is part c of the record: ``minus_log`` (parts × WIDTH) gets Σ ½ (log s + e²/s) of its innovations, ``squares`` (parts × WIDTH)
     Σ e²/s, and ``score`` (parts, free), ``information`` and ``outer`` (parts, free, free), lower triangles, the derivatives of lane 0 by
     the ``free`` parameters that lanes 1, 2, … have moved by ``step``. ``state_out`` (epochs × 28 × WIDTH) gets the states at the edges
-    ``epochs``. ``rows`` (12 WIDTH), ``found`` (6 WIDTH) and ``work`` (4 WIDTH) are work space.
+    ``epochs``. ``innovations`` (events × 6 × WIDTH, or nothing) gets e and s of each measurement, one row after the other. ``rows``
+    (12 WIDTH), ``found`` (6 WIDTH) and ``work`` (4 WIDTH) are work space.
     """
     q, b, A, B, C = load_state(state, 0)
     angle_variance = load(noise, 0)
@@ -248,6 +250,10 @@ def run_parameters(
                     product *= s
                 minus_log[WIDTH * part_of_record + i] += 0.5 * (math.log(product) + total)
                 squares[WIDTH * part_of_record + i] += total
+            if len(innovations) > 0:
+                start = 6 * WIDTH * e
+                for i in range(2 * WIDTH * taking):
+                    innovations[start + i] = found[i]
             if free > 0:
                 add_derivatives(
                     found,

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullFormatter
 
+from strapdown.checks import Array
 from strapdown.plots.style import BLUE, CYCLE, SKY, VERMILION, axes_or_new, ink, new_figure
 from strapdown.tuning import Comparison, Slices, Tuning
 from strapdown.tuning.parameters import Unit
@@ -23,7 +24,8 @@ def likelihood_slice(slices: Slices, tuning: Tuning, number: int, unit: Unit, ax
     one = tuning.parameters[number]
     values = slices.values[number] / unit.factor
     ax.semilogx(values, slices.fallen[number], color=BLUE, linewidth=1.4)
-    ax.axhline(3.84, color=ink(), linewidth=0.6, linestyle=":")
+    if not tuning.composite:
+        ax.axhline(3.84, color=ink(), linewidth=0.6, linestyle=":")
     lower, upper = max(one.lower / unit.factor, values[0]), min(one.upper / unit.factor, values[-1])
     ax.axvspan(
         lower, upper, color=SKY, alpha=0.3, linewidth=0, label="95 % interval" if one.identified else "below the bound"
@@ -64,7 +66,7 @@ def likelihood_slices(slices: Slices, tuning: Tuning, units: Sequence[Unit]) -> 
             continue
         likelihood_slice(slices, tuning, k, units[k], ax)
         if k % columns == 0:
-            ax.set_ylabel("fall of 2 log likelihood")
+            ax.set_ylabel("rise of twice the objective" if tuning.composite else "fall of 2 log likelihood")
     found = {
         label: handle for ax in axes.ravel() for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
     }
@@ -73,35 +75,47 @@ def likelihood_slices(slices: Slices, tuning: Tuning, units: Sequence[Unit]) -> 
 
 
 def before_and_after(comparison: Comparison, *, title: str = "") -> Figure:
-    """Draw the NIS of the held-out innovations over time, before and after, with the bounds of a right filter in each span."""
+    """Draw NIS, and NEES where there is a truth, on the data held out over time, before and after, with the bounds of a right filter."""
     from strapdown.consistency import mean_bounds
 
-    figure, ax = new_figure(size=(9.0, 4.0))
-    for (name, one), color in zip(
-        (("before", comparison.before), ("after", comparison.after)), (VERMILION, BLUE), strict=True
-    ):
-        there = one.nis_degrees > 0
-        ax.plot(
-            one.nis_time[there],
-            one.nis_course[there],
-            ".-",
-            color=color,
-            linewidth=1.0,
-            label=f"{name}: mean {one.nis:.3g}",
-        )
+    both = (("before", comparison.before, VERMILION), ("after", comparison.after, BLUE))
+    sets = [one.of for one in comparison.after.nees]
+    figure, axes = new_figure(1 + len(sets), 1, size=(9.0, 4.0 + 2.4 * len(sets)), squeeze=False, sharex=len(sets) > 0)
     degrees = comparison.after.nis_degrees
     typical = max(1, round(float(np.median(degrees[degrees > 0]))))
-    ax.axhspan(
-        *mean_bounds(1, typical, 0.99), color=ink(), alpha=0.12, linewidth=0, label="99 % of a right filter, each span"
-    )
-    seen = np.concatenate([one.nis_course[one.nis_degrees > 0] for one in (comparison.before, comparison.after)])
+    courses = [
+        (name, color, one.nis, one.nis_time, np.where(one.nis_degrees > 0, one.nis_course, np.nan))
+        for name, one, color in both
+    ]
+    _course(axes[0, 0], courses, mean_bounds(1, typical, 0.99), "NIS per degree of freedom")
+    for number, of in enumerate(sets):
+        pairs = [(name, color, one.nees[number]) for name, one, color in both]
+        courses = [(name, color, float(np.nanmean(one.mean)), one.time, one.mean) for name, color, one in pairs]
+        _course(axes[number + 1, 0], courses, comparison.after.nees[number].bounds, f"NEES of the {of}, per state")
+    figure.suptitle(title)
+    axes[-1, 0].set_xlabel("time, s")
+    return figure
+
+
+def _course(
+    ax: Axes,
+    courses: Sequence[tuple[str, str, float, Array, Array]],
+    bounds: tuple[float, float],
+    label: str,
+) -> None:
+    """Draw means over spans of time, that should be 1, of the filter before and after."""
+    for name, color, mean, time, values in courses:
+        there = np.isfinite(values)
+        ax.plot(time[there], values[there], ".-", color=color, linewidth=1.0, label=f"{name}: mean {mean:.3g}")
+    ax.axhspan(*bounds, color=ink(), alpha=0.12, linewidth=0, label="99 % of a right filter, each span")
+    seen = np.concatenate([values[np.isfinite(values)] for *_, values in courses])
     if seen.max() > 5.0 or seen.min() < 0.2:
         ax.set_yscale("log")
-    ax.set_xlabel("time, s")
-    ax.set_ylabel("NIS per degree of freedom")
-    ax.set_title(title)
-    ax.legend(loc="upper center", ncols=3, bbox_to_anchor=(0.5, -0.16), frameon=False)
-    return figure
+        ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        ax.yaxis.set_minor_formatter(NullFormatter())
+    ax.axhline(1.0, color=ink(), linewidth=0.6, linestyle=":")
+    ax.set_ylabel(label)
+    ax.legend(loc="lower left", ncols=3, bbox_to_anchor=(0.0, 1.0), frameon=False)
 
 
 def searches(

@@ -11,7 +11,7 @@ from strapdown.checks import InputError
 from strapdown.files import existing_file
 from strapdown.report import page
 
-_NEEDED = ("records", "parameters", "units", "minus_log_likelihood", "searches")
+_NEEDED = ("records", "parameters", "units", "objective", "searches")
 
 
 def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
@@ -92,14 +92,30 @@ def _parameters(content: dict[str, Any]) -> list[str]:
         for one in content["parameters"]
     ]
     marked = [not one["identified"] for one in content["parameters"]]
-    likelihood = content["minus_log_likelihood"]
-    gain = likelihood["before"] - likelihood["after"]
+    objective = content["objective"]
+    gain = objective["before"] - objective["after"]
+    told = f"The {objective['name']} rose by {gain:.4g} nats."
+    if objective["name"] not in ("likelihood", "likelihood of the errors"):
+        told = f"Tuned by {objective['name']}; what was minimised fell by {gain:.4g}."
     return [
         page.table(
             ("parameter", "what the data tell", "before", "after", "from", "to (95 %)"), rows, numbers=4, marked=marked
         ),
-        page.paragraph(f"Units: {content['units']}. The likelihood rose by {gain:.4g} nats.", faint=True),
+        page.paragraph(f"Units: {content['units']}. {told}", faint=True),
+        *_gate(content.get("gate")),
+        *(page.paragraph(words) for one in content.get("unmodelled", []) for words in one["words"]),
     ]
+
+
+def _gate(found: Any) -> list[str]:
+    if not found or found["probability"] is None:
+        return []
+    thresholds = ", ".join(f"{value:.3g} of {name}" for name, value in found["thresholds"].items())
+    words = (
+        f"The gate lets {100.0 * found['probability']:.4g} % of right measurements pass (95 %: {100.0 * found['lower']:.4g} to "
+        f"{100.0 * found['upper']:.4g}): an outlier is the likelier explanation of a NIS above {thresholds}."
+    )
+    return [page.paragraph(words)]
 
 
 def _held_out(held: dict[str, Any]) -> list[str]:

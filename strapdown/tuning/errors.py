@@ -58,12 +58,12 @@ class ErrorObjective:
     def derivatives(self, point: Array) -> Derivatives:
         """Return value, gradient and curvature at a point."""
         rows = np.concatenate([point[None], point + STEP * np.eye(len(point))])
-        found = self.base.each(lambda number: self._errors(number, rows), range(len(self.epochs)))
+        found = self.base.each(lambda number: self.errors_of(number, rows), range(len(self.epochs)))
         error = np.concatenate([e for e, _ in found])
         P = np.concatenate([covariance for _, covariance in found])
         return self._squares(error) if self.measure == "rmse" else self._likelihood(error, P)
 
-    def _errors(self, number: int, rows: Array) -> tuple[Array, Array]:
+    def errors_of(self, number: int, rows: Array) -> tuple[Array, Array]:
         """Return errors (m, lanes, n) and covariances (m, lanes, n, n) of one record; n is 3 where the true bias is not known."""
         case, epochs = self.base.prepared[number], self.epochs[number]
         states = np.moveaxis(self.base.states(number, rows, epochs), 1, 2)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -30,6 +30,8 @@ TWO_SIDED = 3.841458820694124
 ONE_SIDED = 2.705543454095404
 """90 % quantile: the bound that is passed on one side with 5 %, and the test against zero, where half the probability is a point
 (Self & Liang 1987)."""
+LEAST_INFORMATION = 1e-10
+"""Of a log parameter; less is none."""
 NEGLIGIBLE = 1e-3
 """A gain of the log likelihood that nobody can tell from none."""
 
@@ -61,6 +63,28 @@ class Objective(Protocol):
 
     def setup(self, point: Array) -> FilterSetup:
         """Return the filter setup of a point."""
+
+
+@runtime_checkable
+class Curved(Protocol):
+    """An objective whose curvature at its best point is to be taken by itself, as the search's is not good enough for errors."""
+
+    def curvature(self, point: Array) -> Array:
+        """Return the second derivatives at a point (p, p)."""
+
+
+@runtime_checkable
+class Bounded(Protocol):
+    """An objective whose parameters have bounds of their own."""
+
+    @property
+    def limits(self) -> tuple[Array, Array]:
+        """Least and largest logarithm of each parameter (p,), (p,)."""
+
+
+def limits_of(objective: Objective) -> tuple[Array, Array]:
+    """Return the least and the largest logarithm of each parameter that a search looks at."""
+    return objective.limits if isinstance(objective, Bounded) else (objective.start - REACH, objective.start + REACH)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,9 +134,9 @@ def search(
     known = dict(priors or {})
     x = np.array(start, float)
     moving = np.array([j not in fixed for j in range(len(x))], bool)
-    low, high = objective.start - REACH, objective.start + REACH
+    low, high = limits_of(objective)
     here = local_at(objective, x, known)
-    damping = 1e-3
+    damping, stretch = 1e-3, 1.0
     for number in range(steps):
         # What falls towards zero gains no more than half its gradient: below some size it is as good as there.
         settled = (here.score > 0.0) & (here.score < NEGLIGIBLE) & (np.diag(here.information) < 0.1)
@@ -124,8 +148,9 @@ def search(
         unit = F / np.outer(scale, scale)
         while True:
             delta = np.zeros(len(x))
-            delta[active] = -np.linalg.solve(unit + damping * np.eye(len(g)), g / scale) / scale
-            delta *= min(1.0, LONGEST_STEP / float(np.max(np.abs(delta))))
+            delta[active] = -stretch * np.linalg.solve(unit + damping * np.eye(len(g)), g / scale) / scale
+            shortened = min(1.0, LONGEST_STEP / float(np.max(np.abs(delta))))
+            delta *= shortened
             trial = np.clip(x + delta, low, high)
             trial[~moving] = x[~moving]
             gain = -float(here.score[active] @ delta[active])
@@ -134,9 +159,15 @@ def search(
             there = local_at(objective, trial, known)
             if there.value <= here.value:
                 break
-            damping = max(10.0 * damping, 1e-3)
+            damping, stretch = max(10.0 * damping, 1e-3), 1.0
             if damping > 1e12:
                 return Optimum(start=np.array(start), point=x, local=here, steps=number, converged=False)
+        if shortened == 1.0 and not objective.composite:
+            # Where the information is more than the curvature, as of innovations that no such filter has, steps are too short.
+            bend = 2.0 * (gain - (here.value - there.value))
+            stretch = float(
+                np.clip(stretch * (np.clip(gain / bend, 0.5, 4.0) if bend > 0.25 * gain else 4.0), 1.0, 64.0)
+            )
         x, here, damping = trial, there, max(0.1 * damping, 1e-9)
     return Optimum(start=np.array(start), point=x, local=here, steps=steps, converged=False)
 
@@ -188,6 +219,8 @@ class Tuning:
     variance that any such filter gives them, and the most likely filter need not be the best one."""
     agreeing: int
     """Searches that ended within a thousandth of a log likelihood of the best."""
+    composite: bool = False
+    """Whether what was minimised is no likelihood, so that intervals come from the scatter of its gradient (sandwich)."""
 
     def __getitem__(self, name: str) -> Estimated:
         """Return the parameter of that name."""
@@ -244,7 +277,7 @@ def fit(
     if not factor > 1.0:
         raise InputError(f"factor is {factor}; random starts need one greater than 1")
     told = progress or (lambda done: None)
-    points = random_starts(objective.start, starts, factor, np.random.default_rng(seed))
+    points = np.clip(random_starts(objective.start, starts, factor, np.random.default_rng(seed)), *limits_of(objective))
 
     def one(point: Array) -> Optimum:
         result = search(objective, point, known)
@@ -258,7 +291,7 @@ def fit(
         raise InputError(
             "the search did not settle in 200 steps; free fewer parameters, or give priors for those that the record cannot tell"
         )
-    covariance, robust = covariances(best.local)
+    covariance, robust = covariances(_curved(objective, best))
     curvature, sandwich = np.sqrt(np.diag(covariance)), np.sqrt(np.diag(robust))
     misfit = bool(np.any(sandwich > MISFIT * curvature))
     # A likelihood whose curvature promises too much falls too fast by the square of that.
@@ -310,11 +343,22 @@ def fit(
         after=best.local.value,
         covariance=covariance,
         misfit=misfit and not objective.composite,
+        composite=objective.composite,
         starts=points,
         optima=np.array([optimum.point for optimum in optima]),
         optima_values=np.array([optimum.local.value for optimum in optima]),
         agreeing=sum(1 for optimum in optima if optimum.local.value < best.local.value + NEGLIGIBLE),
     )
+
+
+def _curved(objective: Objective, best: Optimum) -> Local:
+    """Return the best point with the objective's own curvature, where it has one and the point is a minimum by it."""
+    if not isinstance(objective, Curved):
+        return best.local
+    own = (
+        objective.curvature(best.point) + best.local.information - best.local.derivatives.information
+    )  # and the priors'
+    return replace(best.local, information=own) if np.linalg.eigvalsh(own)[0] > 0.0 else best.local
 
 
 def rescaled(tuning: Tuning, factor: float) -> Tuning:
@@ -367,8 +411,9 @@ def covariances(local: Local) -> tuple[Array, Array]:
     J is the scatter of the gradient over parts of the records (White 1982; parts long against the innovations' correlation make it hold
     for innovations that are not white). Where there is no information the variance is infinite, to a large number.
     """
-    F = local.information
-    scale = np.sqrt(np.maximum(np.diag(F), 1e-10))
+    # A parameter that nothing depends on has no row to invert; a pseudo-inverse would make its variance zero.
+    F = local.information + np.diag(np.maximum(LEAST_INFORMATION - np.diag(local.information), 0.0))
+    scale = np.sqrt(np.diag(F))
     inverse = np.linalg.pinv(F / np.outer(scale, scale), rcond=1e-10, hermitian=True) / np.outer(scale, scale)
     parts = local.derivatives.score
     scatter = (parts - parts.mean(axis=0)).T @ (parts - parts.mean(axis=0)) * (len(parts) / max(len(parts) - 1, 1))

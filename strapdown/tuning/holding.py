@@ -19,6 +19,8 @@ from strapdown.tuning.innovations import Case
 By = Literal["time", "record"]
 MOST_ROWS = 20_000
 """States that are kept of one record to judge."""
+LEAST_ERRORS = 100
+"""Errors against a truth below which their course is not told."""
 
 
 def split(cases: Sequence[Case], share: float, by: By = "time") -> tuple[tuple[Case, ...], tuple[Case, ...]]:
@@ -52,11 +54,30 @@ def split(cases: Sequence[Case], share: float, by: By = "time") -> tuple[tuple[C
 
 
 @dataclass(frozen=True, kw_only=True)
+class NeesCourse:
+    """NEES of one set of states over the time of a record."""
+
+    of: str
+    """"attitude" or "bias"."""
+    time: Array
+    """Middle of spans of time (k,), s."""
+    mean: Array
+    """Mean NEES per state in each (k,); NaN where no truth is known."""
+    effective: float
+    """Independent errors that a span's mean rests on, in effect: errors of one run are alike for a while."""
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Two-sided 99 % bounds of a right filter in each span."""
+        return mean_bounds(3, max(self.effective, 1.0), 0.99)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Performance:
     """One filter on held-out data."""
 
     log_likelihood: float
-    """Of all its innovations, in nats an innovation."""
+    """Of all its innovations, in nats an innovation; what a gate refused is left out."""
     nis: float
     """Mean NIS per degree of freedom; 1 for a right filter."""
     nis_bounds: tuple[float, float]
@@ -73,6 +94,8 @@ class Performance:
     """Mean NIS per degree of freedom in each (k,)."""
     nis_degrees: Array
     """Degrees of freedom in each (k,)."""
+    nees: tuple[NeesCourse, ...] = ()
+    """NEES over the time of the first record, of the attitude and of the bias as far as their truth is known."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,13 +125,15 @@ def performance(cases: Sequence[Case], chosen: FilterSetup, *, bins: int = 40) -
     total, number, squares = 0.0, 0, 0.0
     nees, error_squares, judgements = [], [], []
     course = (np.empty(0), np.empty(0), np.empty(0))
+    nees_courses: tuple[NeesCourse, ...] = ()
     for place, case in enumerate(cases):
         estimate, truth, attitude = _judged(case, chosen)
         innovations = estimate.innovations.values()
         for one in innovations:
-            total -= 0.5 * float(np.sum(np.log(2.0 * np.pi * one.variance) + one.innovation**2 / one.variance))
-            number += one.innovation.size
-            squares += float(one.nis.sum())
+            e, s = one.innovation[one.used], one.variance[one.used]
+            total -= 0.5 * float(np.sum(np.log(2.0 * np.pi * s) + e**2 / s))
+            number += e.size
+            squares += float(one.nis[one.used].sum())
         if truth is not None:
             error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)
             assert estimate.covariance is not None
@@ -120,6 +145,7 @@ def performance(cases: Sequence[Case], chosen: FilterSetup, *, bins: int = 40) -
         judgements.append(consistency.judge(estimate, truth))
         if place == 0:
             course = _course(list(innovations), bins)
+            nees_courses = _nees_courses(estimate, truth, attitude, bins)
     return Performance(
         log_likelihood=total / number,
         nis=squares / number,
@@ -130,6 +156,7 @@ def performance(cases: Sequence[Case], chosen: FilterSetup, *, bins: int = 40) -
         nis_time=course[0],
         nis_course=course[1],
         nis_degrees=course[2],
+        nees=nees_courses,
     )
 
 
@@ -141,7 +168,9 @@ def _judged(case: Case, chosen: FilterSetup) -> tuple[Estimate, Truth | None, Ar
     reference = case.true_attitude
     every = 1 if reference is not None else max(1, len(record.increments) // MOST_ROWS)
     initial = setup.initial_state(used, case.initial.attitude, case.initial.bias)
-    estimate = setup.run(case.record, used, initial, every=every, full_covariance=record.truth is not None)
+    estimate = setup.run(
+        case.record, used, initial, every=every, full_covariance=record.truth is not None or reference is not None
+    )
     inside = (estimate.time >= case.first) & (estimate.time <= case.last)
     covariance = None if estimate.covariance is None else estimate.covariance[inside]
     part = replace(
@@ -168,17 +197,52 @@ def _judged(case: Case, chosen: FilterSetup) -> tuple[Estimate, Truth | None, Ar
 def _within(innovations: Innovations, case: Case) -> Innovations:
     inside = (innovations.time >= case.first) & (innovations.time <= case.last)
     return Innovations(
-        time=innovations.time[inside], innovation=innovations.innovation[inside], variance=innovations.variance[inside]
+        time=innovations.time[inside],
+        innovation=innovations.innovation[inside],
+        variance=innovations.variance[inside],
+        weight=None if innovations.weight is None else innovations.weight[inside],
     )
 
 
 def _course(innovations: Sequence[Innovations], bins: int) -> tuple[Array, Array, Array]:
-    time = np.concatenate([one.time for one in innovations])
+    time = np.concatenate([one.time[one.used] for one in innovations])
     edges = np.linspace(time.min(), time.max() + 1e-9, bins + 1)
     sums, degrees = np.zeros(bins), np.zeros(bins)
     for one in innovations:
-        place = np.clip(np.searchsorted(edges, one.time, side="right") - 1, 0, bins - 1)
-        sums += np.bincount(place, one.nis, bins)
+        place = np.clip(np.searchsorted(edges, one.time[one.used], side="right") - 1, 0, bins - 1)
+        sums += np.bincount(place, one.nis[one.used], bins)
         degrees += np.bincount(place, minlength=bins) * float(one.innovation.shape[1])
     with np.errstate(invalid="ignore", divide="ignore"):
         return 0.5 * (edges[1:] + edges[:-1]), sums / degrees, degrees
+
+
+def _nees_courses(
+    estimate: Estimate, truth: Truth | None, reference: Array | None, bins: int
+) -> tuple[NeesCourse, ...]:
+    if truth is None and reference is None:
+        return ()
+    attitude = truth.attitude if truth is not None else reference
+    assert attitude is not None
+    assert estimate.covariance is not None
+    known = np.isfinite(attitude).all(axis=1)
+    if int(known.sum()) < LEAST_ERRORS:
+        return ()
+    bias = estimate.bias if truth is None else truth.bias
+    error = consistency.errors(estimate.attitude[known], estimate.bias[known], attitude[known], bias[known])
+    time, P = estimate.time[known], estimate.covariance[known]
+    edges = np.linspace(time[0], time[-1] + 1e-9, bins + 1)
+    place = np.clip(np.searchsorted(edges, time, side="right") - 1, 0, bins - 1)
+    number = np.bincount(place, minlength=bins)
+    found = []
+    for name in ("attitude", "bias") if truth is not None else ("attitude",):
+        states = consistency.SUBSETS[name]
+        # The memory of all states is learnt together where the bias is known too.
+        whole = slice(0, 6 if truth is not None else 3)
+        own = states if truth is not None else None
+        average = consistency.time_average(error[:, whole], P[:, whole, whole], own)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            mean = np.bincount(place, consistency.nees(error, P, states), bins) / (len(states) * number)
+        found.append(
+            NeesCourse(of=name, time=0.5 * (edges[1:] + edges[:-1]), mean=mean, effective=average.effective / bins)
+        )
+    return tuple(found)

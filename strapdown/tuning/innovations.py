@@ -74,7 +74,7 @@ class Derivatives:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Prepared:
+class Prepared:
     """A record as the kernel takes it."""
 
     time: Array
@@ -105,7 +105,7 @@ class Likelihood:
     """The setup that the fixed parameters are taken from."""
     start: Array
     """Logarithms of the free parameters in that setup (p,)."""
-    prepared: tuple[_Prepared, ...] = field(repr=False)
+    prepared: tuple[Prepared, ...] = field(repr=False)
     threads: int = 1
 
     def point(self, values: Mapping[str, float]) -> Array:
@@ -133,7 +133,7 @@ class Likelihood:
     def by_part(self, point: Array) -> list[tuple[Array, Array]]:
         """Return for each record minus the log likelihood and Σ e²/s of every part, at one point."""
 
-        def one(case: _Prepared) -> tuple[Array, Array]:
+        def one(case: Prepared) -> tuple[Array, Array]:
             found = self._pass(case, point[None])
             return found["minus_log"][:, 0], found["squares"][:, 0]
 
@@ -174,7 +174,7 @@ class Likelihood:
         with ThreadPoolExecutor(self.threads) as pool:
             return list(pool.map(work, jobs))
 
-    def _differences(self, case: _Prepared, point: Array, block: tuple[int, ...]) -> tuple[Array, ...]:
+    def _differences(self, case: Prepared, point: Array, block: tuple[int, ...]) -> tuple[Array, ...]:
         rows = np.tile(point, (1 + len(block), 1))
         for row, j in enumerate(block):
             rows[row + 1, j] += STEP
@@ -187,10 +187,16 @@ class Likelihood:
         """Return the filter's states (epochs, 28, k) on record ``number`` at edges ``epochs``, at up to eight points (k, p)."""
         return self._pass(self.prepared[number], points, epochs=epochs)["states"][:, :, : len(points)]
 
-    def _pass(
-        self, case: _Prepared, points: Array, *, free: int = 0, epochs: np.ndarray | None = None
-    ) -> dict[str, Array]:
-        """Run up to eight points over one record."""
+    def innovations(self, number: int, points: Array) -> tuple[Array, Array]:
+        """Return innovations and variances (events, 3, k) of record ``number`` at up to eight points (k, p), rows a measurement lacks 0."""
+        found = self._pass(self.prepared[number], points, innovations=True)["innovations"]
+        return found[:, :, 0, : len(points)], found[:, :, 1, : len(points)]
+
+    def lanes(self, case: Prepared, points: Array) -> dict[str, Array]:
+        """Return what a kernel takes of up to eight points (k, p), flat: ``noise``, ``factors`` of the sensors' variances, ``state``.
+
+        The first point fills the lanes that are left.
+        """
         rows = np.concatenate([points, np.repeat(points[:1], WIDTH - len(points), axis=0)])
         lane = {name: np.exp(rows[:, j]) for j, name in enumerate(self.names)}
         base = dict(zip(self.names, np.exp(self.start), strict=True))
@@ -210,6 +216,19 @@ class Likelihood:
         state[7:13] *= angle**2
         state[13:22] *= angle * bias
         state[22:] *= bias**2
+        return {"noise": np.concatenate([white, walk]), "factors": factors.ravel(), "state": state.ravel()}
+
+    def _pass(
+        self,
+        case: Prepared,
+        points: Array,
+        *,
+        free: int = 0,
+        epochs: np.ndarray | None = None,
+        innovations: bool = False,
+    ) -> dict[str, Array]:
+        """Run up to eight points over one record."""
+        lane = self.lanes(case, points)
         parts = len(case.cuts) + 1
         kept = np.empty(0, np.int64) if epochs is None else np.asarray(epochs, np.int64)
         out = {
@@ -219,20 +238,21 @@ class Likelihood:
             "information": np.zeros((parts, free, free)),
             "outer": np.zeros((parts, free, free)),
             "states": np.empty((len(kept), 28, WIDTH)),
+            "innovations": np.zeros((len(case.events.time) if innovations else 0, 3, 2, WIDTH)),
         }
         compiled(tuning_loop.run_parameters)(
             case.time,
             case.increments,
-            np.concatenate([white, walk]),
+            lane["noise"],
             case.events.time,
             case.events.kind,
             case.events.vector_b,
             case.events.variance,
             case.events.sensor,
-            factors.ravel(),
+            lane["factors"],
             case.events.reference,
             case.events.triads,
-            state.ravel(),
+            lane["state"],
             case.cuts,
             free,
             STEP,
@@ -243,6 +263,7 @@ class Likelihood:
             out["outer"],
             kept,
             out["states"].reshape(-1),
+            out["innovations"].reshape(-1),
             np.empty(12 * WIDTH),
             np.empty(6 * WIDTH),
             np.empty(4 * WIDTH),
@@ -317,7 +338,7 @@ def thinned(series: VectorMeasurements, spacing: float) -> VectorMeasurements:
     return series.taken(np.array(kept, np.int64)).noise_scaled(float(np.sqrt(len(kept) / max(len(usable), 1))))
 
 
-def _prepare(case: Case, chosen: FilterSetup, names: tuple[str, ...], parts: int, spacing: float) -> _Prepared:
+def _prepare(case: Case, chosen: FilterSetup, names: tuple[str, ...], parts: int, spacing: float) -> Prepared:
     sensors = [series.sensor for series in case.record.vectors]
     own = {name: value for name, value in chosen.sigma.items() if name in sensors}
     record = setup.believed(case.record, replace(chosen, sigma=own))
@@ -353,7 +374,7 @@ def _prepare(case: Case, chosen: FilterSetup, names: tuple[str, ...], parts: int
         judged &= case.judged[::every][: len(record.time)]
     if attitude is not None:
         judged &= np.isfinite(attitude).all(axis=1)
-    return _Prepared(
+    return Prepared(
         true_attitude=attitude,
         true_bias=bias,
         judged=judged,

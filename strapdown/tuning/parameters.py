@@ -1,4 +1,9 @@
-"""What may be tuned: names of parameters, their values in a filter setup, and setups with other values."""
+"""What may be tuned: names of parameters, their values in a filter setup, and setups with other values.
+
+The gyro's two noises are shared by its axes, as the filter believes one σ_v and one σ_u: only isotropic noise is the same seen from a body
+that turns within a step, and has the closed form of :func:`strapdown.kernels.filter_step.process_noise`. Of a sensor whose σ differs by
+axis one factor on all of them is tuned; their ratios are the record's.
+"""
 
 from __future__ import annotations
 
@@ -25,6 +30,12 @@ INITIAL_BIAS = "initial.bias"
 SCALE = "filter.scale"
 """A factor on every σ that the filter believes, gyro, sensors and initial state alike; to be tuned alone. It leaves the estimates as they
 are and sets their covariance."""
+OUTLIER_SHARE = "outliers.share"
+"""Share of the measurements that are outliers (:mod:`strapdown.tuning.outliers`)."""
+OUTLIER_SCALE = "outliers.scale"
+"""Their noise over that of the others."""
+GATE = "gate.probability"
+"""Probability that the gate lets a right measurement pass: what share and scale of the outliers make it."""
 SIGMA = ".sigma"
 """What the name of a sensor's σ ends with."""
 
@@ -45,6 +56,8 @@ _UNITS = {
     INITIAL_ATTITUDE: Unit(name="°", factor=units.DEGREE),
     INITIAL_BIAS: Unit(name="°/h", factor=units.DEGREE_PER_HOUR),
     SCALE: Unit(name="1", factor=1.0),
+    OUTLIER_SHARE: Unit(name="%", factor=0.01),
+    OUTLIER_SCALE: Unit(name="1", factor=1.0),
 }
 
 

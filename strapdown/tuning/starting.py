@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+import numpy as np
+
 from strapdown import ahrs, mekf, quaternion, setup
 from strapdown.ahrs import AhrsParameters
 from strapdown.checks import InputError
+from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
 from strapdown.recordings import Recording
 from strapdown.records import ImuRecord
@@ -52,3 +57,32 @@ def record_case(record: ImuRecord, chosen: FilterSetup, *, name: str = "", seed:
     except InputError as error:
         raise InputError(f"{name or 'record'}: {error}") from None
     return Case(record=record, initial=setup.initial_state(chosen, first.attitude), name=name)
+
+
+NOISES = (
+    "angle_random_walk",
+    "rate_random_walk",
+    "bias_instability",
+    "markov_noise",
+    "markov_correlation_time",
+    "quantization",
+    "rate_resolution",
+)
+"""What of a gyro's specification its two tuned noises stand for."""
+
+
+def one_gyro(specs: Mapping[str, GyroSpec]) -> None:
+    """Refuse records, by name, whose gyros are of different noise: one set of parameters would fit none of them.
+
+    Turn-on bias, scale factor and misalignment may differ, as they do from one gyro of a kind to the next.
+    """
+    names = list(specs)
+    for name in names[1:]:
+        for field in NOISES:
+            first, other = (np.broadcast_to(getattr(specs[one], field), (3,)) for one in (names[0], name))
+            if not np.allclose(first, other, rtol=1e-9, atol=0.0):
+                k = int(np.argmax(first != other))
+                raise InputError(
+                    f"{name} was recorded with another gyro than {names[0]}: {field} is {other[k]:.4g} and {first[k]:.4g} (SI); one filter "
+                    "fits records of one kind of gyro, so tune each kind by itself"
+                )

@@ -1,0 +1,292 @@
+"""Outliers in the measurements, and the gate that suits them, by maximum likelihood.
+
+A gate's threshold cannot be tuned by the likelihood of what passes it: the narrower the gate, the likelier what is left. So outliers are
+modelled: with probability ε (``outliers.share``) the noise of a measurement is κ times as large (``outliers.scale``; Tukey's contaminated
+normal, 1960). Each innovation is then a mixture of two normals, and share and scale are estimated with the filter's other parameters, which
+so no longer answer for the outliers. The filter of this likelihood makes each update both ways and goes on with mean and covariance of the
+mixture (:func:`strapdown.kernels.tuning_outliers.run_contaminated`). Share and scale are those of all sensors together.
+
+The gate refuses where an outlier has become the likelier explanation (Bayes): with d rows and κ′ the ratio of σ of the innovations,
+
+    NIS > 2 (ln((1 − ε)/ε) + d ln κ′)/(1 − 1/κ′²).
+
+The information is the sum of the outer products of each measurement's gradient (Berndt, Hall, Hall & Hausman 1974).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from strapdown.checks import Array, InputError, positive
+from strapdown.kernels import tuning_outliers
+from strapdown.kernels.lane_values import WIDTH
+from strapdown.kernels.machine import compiled
+from strapdown.robustness import Gate
+from strapdown.setup import FilterSetup
+from strapdown.tuning.fitting import REACH, Estimated, Tuning
+from strapdown.tuning.innovations import MOST, STEP, Case, Derivatives, Likelihood, Prepared, likelihood
+from strapdown.tuning.parameters import OUTLIER_SCALE, OUTLIER_SHARE
+from strapdown.vectors import KINDS
+
+SHARE, SCALE = 0.02, 5.0
+"""Where the search for share and scale starts."""
+SHARES = (1e-4, 0.4)
+"""Shares that are searched: what is more frequent is no outlier."""
+SCALES = (2.0, 100.0)
+"""Scales that are searched: what is hardly wider is none either."""
+MOST_REFUSED = 0.25
+"""A share above which what is called outliers is a second size of the noise, and nothing to refuse."""
+LEAST_REFUSED = 1e-9
+"""Share of right measurements that any gate refuses."""
+OWN = (OUTLIER_SHARE, OUTLIER_SCALE)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContaminatedLikelihood:
+    """Minus the log likelihood of records of which some measurements are outliers; built by :func:`contaminated_likelihood`.
+
+    The last two parameters are the outliers' share and scale.
+    """
+
+    base: Likelihood
+    first: tuple[float, float]
+    """Share and scale that the search starts from."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free parameters."""
+        return (*self.base.names, *OWN)
+
+    @property
+    def start(self) -> Array:
+        """Logarithms of their first values."""
+        return np.concatenate([self.base.start, np.log(self.first)])
+
+    @property
+    def composite(self) -> bool:
+        """Whether the curvature is no information; that of a mixture is."""
+        return False
+
+    @property
+    def limits(self) -> tuple[Array, Array]:
+        """Least and largest logarithm of each parameter (p,), (p,)."""
+        low, high = self.base.start - REACH, self.base.start + REACH
+        own = np.log([SHARES, SCALES])
+        return np.concatenate([low, own[:, 0]]), np.concatenate([high, own[:, 1]])
+
+    def setup(self, point: Array) -> FilterSetup:
+        """Return the setup of a point, its gate as it was."""
+        return self.base.setup(point[:-2])
+
+    def minus_log(self, points: Array) -> Array:
+        """Return minus the log likelihood, without its constant, at several points (k, p): (k,)."""
+        rows = np.atleast_2d(points)
+        blocks = [rows[first : first + WIDTH] for first in range(0, len(rows), WIDTH)]
+        jobs = [(case, block) for block in blocks for case in self.base.prepared]
+        found = self.base.each(lambda job: self._pass(*job)["minus_log"][job[0].used].sum(axis=0)[: len(job[1])], jobs)
+        many = len(self.base.prepared)
+        return np.concatenate([np.sum(found[k : k + many], axis=0) for k in range(0, len(jobs), many)])
+
+    def derivatives(self, point: Array) -> Derivatives:
+        """Return the likelihood and its derivatives at a point."""
+        p = len(point)
+        rows = np.concatenate([point[None], point + STEP * np.eye(p)])
+        found = self.base.each(lambda case: (case.used, self._pass(case, rows, free=p)), self.base.prepared)
+        outer = sum((one["outer"][used].sum(axis=0) for used, one in found), np.zeros((p, p)))
+        outer = outer + np.tril(outer, -1).T
+        return Derivatives(
+            value=np.concatenate([one["minus_log"][used, 0] for used, one in found]),
+            score=np.concatenate([one["score"][used] for used, one in found]),
+            information=outer,
+            outer=outer,
+        )
+
+    def probabilities(self, point: Array) -> tuple[Array, ...]:
+        """Return for each record, in order of its measurements, the probability that each is an outlier (events,)."""
+        return tuple(self._pass(case, point[None])["probability"][:, 0] for case in self.base.prepared)
+
+    def _pass(self, case: Prepared, points: Array, *, free: int = 0) -> dict[str, Array]:
+        lane = self.base.lanes(case, points[:, :-2])
+        rows = np.concatenate([points, np.repeat(points[:1], WIDTH - len(points), axis=0)])
+        share = np.minimum(np.exp(rows[:, -2]), 0.9)  # beyond the search, for its differences and profiles
+        spread = np.exp(2.0 * rows[:, -1])
+        parts = len(case.cuts) + 1
+        out = {
+            "minus_log": np.zeros((parts, WIDTH)),
+            "score": np.zeros((parts, free)),
+            "outer": np.zeros((parts, free, free)),
+            "probability": np.zeros((len(case.events.time), 2)),
+        }
+        compiled(tuning_outliers.run_contaminated)(
+            case.time,
+            case.increments,
+            lane["noise"],
+            case.events.time,
+            case.events.kind,
+            case.events.vector_b,
+            case.events.variance,
+            case.events.sensor,
+            lane["factors"],
+            case.events.reference,
+            case.events.triads,
+            np.concatenate([share, spread]),
+            lane["state"],
+            case.cuts,
+            free,
+            STEP,
+            out["minus_log"].reshape(-1),
+            out["score"],
+            out["outer"],
+            out["probability"],
+            np.empty(12 * WIDTH),
+            np.empty(4 * WIDTH),
+            np.empty(WIDTH),
+        )
+        return out
+
+
+def contaminated_likelihood(
+    cases: Sequence[Case],
+    chosen: FilterSetup,
+    free: Sequence[str],
+    *,
+    share: float = SHARE,
+    scale: float = SCALE,
+    threads: int = 1,
+) -> ContaminatedLikelihood:
+    """Return the likelihood of the free parameters and of the outliers' share and scale, which are always free.
+
+    Parameters
+    ----------
+    cases : sequence of Case
+    chosen : FilterSetup
+        Where the free parameters start, and what the fixed ones are.
+    free : sequence of str
+        Names of :mod:`strapdown.tuning.parameters`, at most five.
+    share, scale : float
+        Where the search starts: the share of outliers, and their noise over that of the others.
+    threads : int
+        Records, or points, that are worked on at once.
+    """
+    for name, value, (least, most) in (("share", share, SHARES), ("scale", scale, SCALES)):
+        if not least <= positive(name, value) <= most:
+            raise InputError(f"{name} of the outliers is {value:g}; it must lie between {least:g} and {most:g}")
+    base = likelihood(cases, chosen, free, threads=threads)
+    if len(base.names) + 2 > MOST:
+        raise InputError(f"{len(base.names)} parameters are free; beside outliers at most {MOST - 2} can be")
+    return ContaminatedLikelihood(base=base, first=(share, scale))
+
+
+@dataclass(frozen=True, kw_only=True)
+class TunedGate:
+    """The gate that suits the outliers of the records."""
+
+    gate: Gate | None
+    """None where the records show no outliers, or so many that they are none: then there is nothing to refuse."""
+    probability: float
+    """That a right measurement passes; NaN where there is no gate, and so its interval."""
+    lower: float
+    """Lower end of its 95 % interval."""
+    upper: float
+    """Upper end."""
+    thresholds: dict[str, float]
+    """The NIS from which on an outlier is likelier, by sensor; the filter has one probability for all, the mean over measurements."""
+    share: Estimated
+    scale: Estimated
+
+
+def tuned_gate(objective: ContaminatedLikelihood, tuning: Tuning, *, draws: int = 2000) -> TunedGate:
+    """Return the gate at the Bayes threshold, its interval from that of share and scale.
+
+    The gate is the setup's own, or the default one, with another probability.
+    """
+    share, scale = tuning[OUTLIER_SHARE], tuning[OUTLIER_SCALE]
+    seen = _seen(objective, tuning.point[:-2])
+    best, thresholds = _probability(seen, np.array([[share.value, scale.value]]))
+    told = {name: float(value[0]) for name, value in thresholds.items()}
+    if not share.identified or share.value > MOST_REFUSED:
+        return TunedGate(
+            gate=None, probability=math.nan, lower=math.nan, upper=math.nan, thresholds={}, share=share, scale=scale
+        )
+    # Errors by the sandwich where the tuning took those.
+    swollen = np.array([one.standard_error for one in (share, scale)]) / np.sqrt(np.diag(tuning.covariance)[-2:])
+    covariance = tuning.covariance[-2:, -2:] * swollen[:, None] * swollen
+    normal = np.random.default_rng(0).standard_normal((draws, 2)) @ np.linalg.cholesky(covariance).T
+    tried = np.exp(np.log([share.value, scale.value]) + normal)
+    tried = np.column_stack([np.minimum(tried[:, 0], SHARES[1]), np.maximum(tried[:, 1], 1.01)])
+    lower, upper = np.quantile(_probability(seen, tried)[0], [0.025, 0.975])
+    return TunedGate(
+        gate=replace(tuning.setup.gate or Gate(), probability=float(best[0])),
+        probability=float(best[0]),
+        lower=float(lower),
+        upper=float(upper),
+        thresholds=told,
+        share=share,
+        scale=scale,
+    )
+
+
+def log_likelihood(cases: Sequence[Case], tuned: ContaminatedLikelihood, result: Tuning) -> float:
+    """Return the log likelihood of cases under the tuned filter and its outliers, in nats an innovation, as on data held out."""
+    share, scale = result[OUTLIER_SHARE].value, result[OUTLIER_SCALE].value
+    other = contaminated_likelihood(
+        cases,
+        result.setup,
+        tuned.base.names,
+        share=float(np.clip(share, *SHARES)),
+        scale=float(np.clip(scale, *SCALES)),
+    )
+    number = 0
+    for case in other.base.prepared:
+        counted = case.used[np.searchsorted(case.cuts, case.events.time, side="left")]
+        degrees = np.array([KINDS[kind] for kind in case.events.kinds])[case.events.sensor]
+        number += int(degrees[counted].sum())
+    return float(-other.minus_log(other.start)[0] / number - 0.5 * np.log(2.0 * np.pi))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Seen:
+    """How one sensor's measurements look to the filter."""
+
+    degrees: int
+    number: int
+    noise: float
+    """Mean share of the measurement's own noise in the variance of its innovation."""
+
+
+def _seen(objective: ContaminatedLikelihood, point: Array) -> dict[str, _Seen]:
+    base = objective.base
+    sums: dict[str, tuple[int, int, float]] = {}
+    for number, case in enumerate(base.prepared):
+        _, variance = base.innovations(number, point[None])
+        factors = base.lanes(case, point[None])["factors"].reshape(-1, WIDTH)[:, 0]
+        part = np.searchsorted(case.cuts, case.events.time, side="left")
+        for sensor, (name, kind) in enumerate(zip(case.events.sensors, case.events.kinds, strict=True)):
+            mine = (case.events.sensor == sensor) & case.used[part]
+            if not mine.any():
+                continue
+            rows = min(KINDS[kind], 2) if kind != "attitude" else 3
+            own = case.events.vector_b[mine] if kind == "attitude" else np.tile(case.events.variance[mine], (3, 1)).T
+            share = factors[sensor] * own[:, :rows] / variance[mine, :rows, 0]
+            degrees, count, total = sums.get(name, (KINDS[kind], 0, 0.0))
+            sums[name] = degrees, count + int(mine.sum()), total + float(share.mean(axis=1).sum())
+    return {name: _Seen(degrees=d, number=count, noise=total / count) for name, (d, count, total) in sums.items()}
+
+
+def _probability(seen: dict[str, _Seen], tried: Array) -> tuple[Array, dict[str, Array]]:
+    """Return for each share and scale (k, 2) the probability that a right measurement passes, and the thresholds of the sensors."""
+    from scipy.special import chdtrc
+
+    share, scale = tried.T
+    thresholds, refused, total = {}, np.zeros(len(tried)), 0
+    for name, one in seen.items():
+        wider = 1.0 + (scale**2 - 1.0) * one.noise
+        odds = np.log1p(-share) - np.log(share) + 0.5 * one.degrees * np.log(wider)
+        thresholds[name] = np.maximum(2.0 * odds / (1.0 - 1.0 / wider), 0.0)
+        refused += one.number * np.log(np.maximum(chdtrc(one.degrees, thresholds[name]), LEAST_REFUSED))
+        total += one.number
+    return 1.0 - np.exp(refused / total), thresholds

@@ -1,0 +1,253 @@
+"""What the tuned filter leaves unexplained: whether the data it was tuned on contradict it still, and an error that moves with the rate.
+
+Tuning gives every parameter its most likely value, right model or wrong. A gyro's scale-factor error moves its bias with the rate, so the
+walk of the bias is made as large as that takes; it looks identified, and the innovations look white. Then the question is not whether
+they are, but what explains them better. The scale factor θ of each axis is tried by one step of Gauss–Newton on the whitened innovations,
+which is Rao's score test (1948): at the tuned walk, and at smaller ones beside it, as a filter would have that knows the scale factor.
+Its gain is twice the log-likelihood over the tuned filter's, χ² of three degrees of freedom where θ is zero.
+
+The rate that θ multiplies is the gyro's own less the bias, over ``WINDOW`` measurements: its noise must not explain itself. A prior of
+``PLAUSIBLE`` keeps out what rates too small to tell would say.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from strapdown import diagnosis, mekf, setup
+from strapdown.checks import Array
+from strapdown.consistency import Judgement
+from strapdown.consistency.bounds import tail
+from strapdown.consistency.judgement import concluded
+from strapdown.diagnosis import Cause
+from strapdown.diagnosis.likelihood import Model, log_p, run
+from strapdown.mekf import ProcessNoise
+from strapdown.records import Estimate, ImuRecord, cut
+from strapdown.setup import FilterSetup
+from strapdown.tuning.fitting import Tuning
+from strapdown.tuning.holding import performance
+from strapdown.tuning.innovations import Case
+from strapdown.tuning.parameters import RRW
+
+LEVELS = (1.0, 0.2, 0.04)
+"""Multiples of the tuned walk of the bias beside which a scale factor is tried."""
+PLAUSIBLE = 0.01
+"""Standard deviation of a scale factor before the data are seen."""
+WINDOW = 4
+"""Measurements that the rate is averaged over."""
+STEP = 1e-4
+"""Of a scale factor, for differences."""
+MOST_TOLD = 2
+"""Failed tests that are told by themselves."""
+SHAPES = ("whiteness", "normality", "mean innovation", "cross-correlation")
+"""Tests of innovations that no tuning of σ makes pass."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScaleFactor:
+    """A gyro's scale factor as an explanation of what the tuned filter puts down to noise."""
+
+    value: Array
+    """θ of each axis (3,): the gyro tells 1 + θ of the rate."""
+    standard_error: Array
+    """(3,)"""
+    gain: float
+    """Twice the log-likelihood gained over the tuned filter."""
+    p_value: float
+    """Probability that a filter that is right gains as much, over all levels tried."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unmodelled:
+    """What the data that a filter was tuned on say against it."""
+
+    record: str
+    """Name of the record."""
+    judgement: Judgement
+    """Of the tuned filter, on what it was tuned on; with a truth its errors too."""
+    scale_factor: ScaleFactor
+    causes: tuple[Cause, ...] = ()
+    """Likely causes, where the innovations are not of the right shape."""
+    probability: float
+
+    @property
+    def moves_with_the_rate(self) -> bool:
+        """Whether a scale factor explains the innovations better than the noise of the gyro does, and than any other cause."""
+        other = max((cause.gain for cause in self.causes), default=0.0)
+        return self.scale_factor.p_value < 1.0 - self.probability and self.scale_factor.gain > other
+
+    @property
+    def failed(self) -> tuple[str, ...]:
+        """What is wrong after tuning, in words, one a test; a filter that is too modest has no error that it does not know of."""
+        return tuple(
+            one.means for one in self.judgement.findings if one.rejected and not (one.is_ratio and one.value < 1.0)
+        )
+
+    @property
+    def suspected(self) -> bool:
+        """Whether an error that the filter has no state for is likely."""
+        return self.moves_with_the_rate or bool(self.failed)
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """Sentences for people; none if nothing is suspected."""
+        if not self.suspected:
+            return ()
+        told = [
+            f"After tuning, {self.record or 'the record'} still holds what no σ explains: an error that the filter has no state for."
+        ]
+        if self.moves_with_the_rate:
+            one = self.scale_factor
+            sizes = ", ".join(
+                f"{1e6 * x:.0f} ± {1e6 * e:.0f}" for x, e in zip(one.value, one.standard_error, strict=True)
+            )
+            told.append(
+                f"A scale factor of the gyro of [{sizes}] ppm explains the innovations better than its noise does (gain {one.gain:.3g}, "
+                f"p = {one.p_value:.1g}): the tuned noise of the gyro stands for it. Calibrate it, or estimate with a state for it."
+            )
+        told += [f"{what[0].upper()}{what[1:]}." for what in self.failed[:MOST_TOLD]]
+        if len(self.failed) > MOST_TOLD:
+            told.append(
+                f"And {len(self.failed) - MOST_TOLD} more of {len(self.judgement.findings)} tests contradict the tuned filter."
+            )
+        if self.causes:
+            told.append(f"Likeliest cause: {self.causes[0].words}.")
+        return tuple(told)
+
+    def summary(self) -> dict[str, Any]:
+        """Return everything as plain values for JSON."""
+        return {
+            "record": self.record,
+            "suspected": self.suspected,
+            "words": list(self.words),
+            "moves_with_the_rate": self.moves_with_the_rate,
+            "scale_factor": {
+                "value": [float(x) for x in self.scale_factor.value],
+                "standard_error": [float(x) for x in self.scale_factor.standard_error],
+                "gain": self.scale_factor.gain,
+                "p_value": self.scale_factor.p_value,
+            },
+            "causes": [cause.words for cause in self.causes],
+            "judgement": self.judgement.summary(),
+        }
+
+
+def unmodelled(case: Case, chosen: FilterSetup, *, probability: float = 0.99) -> Unmodelled:
+    """Return what the part of a record that a filter was tuned on says against the tuned filter.
+
+    Parameters
+    ----------
+    case : Case
+        What it was tuned on; what is held out is left out.
+    chosen : FilterSetup
+        The tuned filter.
+    probability : float
+        Of the judgement, and of the scale factor: a right filter is suspected by either with at most one less this.
+
+    Notes
+    -----
+    The filter is run some twenty times; where the innovations are not of the right shape some hundred times more, for their causes.
+    """
+    tail(probability)
+    judgement = performance([case], chosen).judgements[0]
+    record = seen(case)
+    own = [series.sensor for series in record.vectors]
+    used = replace(chosen, sigma={name: value for name, value in chosen.sigma.items() if name in own})
+    initial = setup.initial_state(used, case.initial.attitude, case.initial.bias)
+    if used.gate is not None:
+        # What passes a gate has lost its tails, and keeps the outliers that are like the rest: neither is news.
+        kept = tuple(one for one in judgement.findings if one.name not in ("NIS", "normality"))
+        judgement = concluded([replace(one, rejected=False) for one in kept], list(judgement.limits), probability)
+        record = accepted(record, setup.run(record, used, initial, every=len(record.increments)))
+    causes: tuple[Cause, ...] = ()
+    if any(finding.rejected and finding.name in SHAPES for finding in judgement.findings):
+        causes = diagnosis.diagnose(record, used, initial, probability=probability).causes
+    return Unmodelled(
+        record=case.name,
+        judgement=judgement,
+        scale_factor=scale_factor(setup.believed(record, used), used.process_noise, initial),
+        causes=causes,
+        probability=probability,
+    )
+
+
+def seen(case: Case) -> ImuRecord:
+    """Return the part of a case's record up to where it counts for tuning."""
+    time = case.record.time
+    last = int(np.searchsorted(time, case.last, side="right")) - 1
+    return case.record if last >= len(time) - 1 else cut(case.record, 0, max(last, 1))
+
+
+def accepted(record: ImuRecord, estimate: Estimate) -> ImuRecord:
+    """Return a record without the measurements that the gate of an estimate refused."""
+    kept = []
+    for series in record.vectors:
+        found = estimate.innovations[series.sensor]
+        kept.append(series.taken(~np.isin(series.time, found.time[~found.used])))
+    return replace(record, vectors=tuple(kept))
+
+
+def scale_factor(record: ImuRecord, noise: ProcessNoise, initial: mekf.State) -> ScaleFactor:
+    """Return the scale factor of the gyro that explains most beside a filter of this noise, or of less walk of the bias.
+
+    ``record`` as the filter takes it (:func:`strapdown.setup.believed`).
+    """
+    rate_angle = turns(record, noise, initial)
+    levels = LEVELS if noise.rate_random_walk > 0.0 else LEVELS[:1]
+    tuned = run(Model(record=record, noise=noise, initial=initial))
+    found: list[tuple[float, Array, Array]] = []
+    for level in levels:
+        less = replace(noise, rate_random_walk=level * noise.rate_random_walk)
+        model = Model(record=record, noise=less, initial=initial)
+
+        def moved(theta: Array, model: Model = model) -> Model:
+            return replace(model, record=replace(record, increments=record.increments - rate_angle * theta))
+
+        base = tuned if level == 1.0 else run(model)
+        J = np.stack([(run(moved(step)).white - base.white) / STEP for step in STEP * np.eye(3)], axis=1)
+        known = np.isfinite(J).all(axis=1) & np.isfinite(base.white)
+        information = J[known].T @ J[known] + np.eye(3) / PLAUSIBLE**2
+        theta = np.asarray(-np.linalg.solve(information, J[known].T @ base.white[known]), np.float64)
+        spread = np.asarray(np.sqrt(np.diag(np.linalg.inv(information))), np.float64)
+        # What less walk alone gains, where the walk was not tuned, is not the scale factor's.
+        better = max(base.gain_over(tuned), 0.0)
+        gain = run(moved(theta)).gain_over(tuned) - better - float(np.sum((theta / PLAUSIBLE) ** 2))
+        found.append((gain, theta, spread))
+    gain, theta, spread = max(found, key=lambda one: one[0])
+    return ScaleFactor(
+        value=theta,
+        standard_error=spread,
+        gain=gain,
+        p_value=min(1.0, len(levels) * math.exp(log_p(gain, 3))),
+    )
+
+
+def turns(record: ImuRecord, noise: ProcessNoise, initial: mekf.State) -> Array:
+    """Return by how much the body turned in each gyro interval (n, 3), rad, averaged over ``WINDOW`` measurements and freed of the bias."""
+    estimate = mekf.run(record, noise, initial)
+    dt = np.diff(record.time)[:, None]
+    free = record.increments / dt - 0.5 * (estimate.bias[1:] + estimate.bias[:-1])
+    stamps = np.unique(np.concatenate([series.time for series in record.vectors]))
+    interval = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
+    half = max(2, round(0.5 * WINDOW * interval / float(np.median(dt))))
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(free, axis=0)])
+    index = np.arange(len(free))
+    low, high = np.maximum(index - half, 0), np.minimum(index + half + 1, len(free))
+    return np.asarray((total[high] - total[low]) / (high - low)[:, None] * dt)
+
+
+def doubted(tuning: Tuning, found: Unmodelled) -> Tuning:
+    """Return the tuning with a note of doubt on the walk of the bias where a scale factor explains the innovations better."""
+    if not found.moves_with_the_rate:
+        return tuning
+    doubt = "in doubt: may stand for a scale factor of the gyro"
+    return replace(
+        tuning,
+        parameters=tuple(
+            replace(one, note=doubt) if one.name == RRW and one.identified else one for one in tuning.parameters
+        ),
+    )

@@ -1,0 +1,242 @@
+"""What the tuned filter leaves unexplained: a scale factor that the gyro's noise stands for, gyros of two kinds in one tuning."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from strapdown import cli, motion, recordfiles, scenarios, setup, tuning, vectors
+from strapdown.checks import InputError
+from strapdown.diagnosis import Cause
+from strapdown.gyro import GyroSpec
+from strapdown.report import tunings
+from strapdown.robustness import Gate
+from strapdown.tuning import suspicion
+
+SPEC = GyroSpec(angle_random_walk=3e-5, rate_random_walk=2e-7, turn_on_bias_sigma=1e-5)
+
+
+def scenario(scale_factor: float = 0.0, duration: float = 900.0) -> scenarios.Scenario:
+    """A body that rocks slowly: its rate changes sign every 100 s."""
+    return scenarios.Scenario(
+        motion=motion.SpinRock(rock_angle=0.3, rock_frequency=0.005, spin_rate=0.02),
+        gyro=dataclasses.replace(SPEC, scale_factor=np.full(3, scale_factor)),
+        sensors=(
+            vectors.VectorSensor(name="star 1", reference_f=np.array([1.0, 0.0, 0.0]), sigma=1e-4, rate=1.0),
+            vectors.VectorSensor(name="star 2", reference_f=np.array([0.0, 1.0, 1.0]), sigma=2e-4, rate=1.0),
+        ),
+        rate=10.0,
+        duration=duration,
+    )
+
+
+def tuned(seed: int, scale_factor: float = 0.0) -> tuple[tuning.Case, tuning.Tuning]:
+    chosen = scenario(scale_factor)
+    believed = setup.matched(chosen)
+    one = tuning.record_case(scenarios.simulate(chosen, seed), believed, name=f"record {seed}", seed=seed)
+    names = tuning.default_names([one.record])
+    return one, tuning.fit(tuning.likelihood([one], believed, names), starts=1)
+
+
+def test_a_scale_factor_that_the_walk_of_the_bias_stands_for_is_found_with_its_size():
+    told = 0
+    for seed in (1, 2):
+        one, result = tuned(seed, 1e-3)
+        bare = dataclasses.replace(one, record=dataclasses.replace(one.record, truth=None))
+        found = tuning.unmodelled(bare, result.setup)
+        assert found.moves_with_the_rate
+        size = found.scale_factor
+        assert np.all(np.abs(size.value - 1e-3) < 4.0 * size.standard_error)
+        assert np.all(size.standard_error[:2] < 4e-4)
+        assert any("scale factor of the gyro" in words for words in found.words)
+        notes = {parameter.name: parameter.note for parameter in tuning.doubted(result, found).parameters}
+        told += "in doubt" in notes["gyro.rrw"]
+        assert not any("in doubt" in note for name, note in notes.items() if name != "gyro.rrw")
+        assert json.dumps(found.summary())
+    assert told >= 1  # where the walk is called identified it is put in doubt
+
+
+def test_of_right_filters_hardly_one_is_suspected():
+    suspected, gains = 0, []
+    for seed in range(10, 14):
+        one, result = tuned(seed)
+        found = tuning.unmodelled(one, result.setup)
+        suspected += found.suspected
+        gains.append(found.scale_factor.gain)
+        if not found.suspected:
+            assert found.words == ()
+            assert tuning.doubted(result, found) is result
+    assert suspected <= 1
+    assert np.mean(gains) < 6.0  # the largest of three χ² of three degrees of freedom, all but the same
+
+
+def test_the_p_value_is_that_of_three_degrees_of_freedom_at_each_level():
+    one, result = tuned(1, 1e-3)
+    found = suspicion.scale_factor(setup.believed(one.record, result.setup), result.setup.process_noise, one.initial)
+    assert found.p_value == pytest.approx(3.0 * chi2.sf(found.gain, 3), rel=1e-9)
+
+
+def test_the_turns_are_those_of_the_body_without_its_bias():
+    one, result = tuned(4)
+    initial = setup.initial_state(result.setup, one.initial.attitude, one.initial.bias)
+    found = suspicion.turns(one.record, result.setup.process_noise, initial)
+    exact = scenario().motion.increments(one.record.time)
+    late = slice(2000, -100)
+    assert np.std(found[late] - exact[late], axis=0).max() < 0.15 * np.std(exact, axis=0).max()
+    # Averaged over four measurements the noise is a sixth of that of a single sample.
+    assert np.std((found - exact)[late]) < 0.3 * np.std((one.record.increments - exact)[late])
+
+
+def test_the_turns_leave_out_a_large_bias():
+    chosen = dataclasses.replace(scenario(), gyro=dataclasses.replace(SPEC, turn_on_bias=np.full(3, 1e-2)))
+    believed = dataclasses.replace(setup.matched(chosen), bias_sigma=1e-2)
+    one = tuning.record_case(scenarios.simulate(chosen, 1), believed, seed=1)
+    found = suspicion.turns(one.record, believed.process_noise, one.initial)
+    excess = (found - chosen.motion.increments(one.record.time))[2000:-100] * 10.0
+    assert np.abs(excess.mean(axis=0)).max() < 2e-4
+
+
+def test_the_noise_of_a_body_at_rest_explains_nothing():
+    """All that its rate tells is the gyro's noise, and taking off all of it would help; no scale factor is so large."""
+    still = dataclasses.replace(
+        scenario(),
+        motion=motion.ConstantRate(rate=np.zeros(3)),
+        gyro=dataclasses.replace(SPEC, angle_random_walk=1e-4, rate_random_walk=2e-5),
+    )
+    believed = setup.matched(still)
+    for seed in range(3):
+        one = tuning.record_case(scenarios.simulate(still, seed), believed, seed=seed)
+        found = suspicion.scale_factor(one.record, believed.process_noise, one.initial)
+        assert found.p_value > 0.05
+        assert np.abs(found.value).max() < 5.0 * suspicion.PLAUSIBLE
+
+
+def test_a_walk_that_was_left_too_large_is_no_scale_factor():
+    one, result = tuned(4)
+    large = tuning.with_values(result.setup, {"gyro.rrw": 2e-6})
+    found = suspicion.scale_factor(one.record, large.process_noise, one.initial)
+    assert found.p_value > 0.05
+
+
+def test_what_the_gate_refuses_is_left_out():
+    faults = vectors.Faults(outlier_probability=0.05)
+    chosen = dataclasses.replace(
+        scenario(), sensors=tuple(dataclasses.replace(sensor, faults=faults) for sensor in scenario().sensors)
+    )
+    believed = dataclasses.replace(setup.matched(chosen), gate=Gate(probability=0.999))
+    suspected = 0
+    for seed in range(2):
+        one = tuning.record_case(scenarios.simulate(chosen, seed), believed, seed=seed)
+        found = tuning.unmodelled(one, believed)
+        assert not {finding.name for finding in found.judgement.findings} & {"NIS", "normality"}
+        suspected += found.suspected
+    assert suspected <= 1  # of two
+    estimate = setup.run(one.record, believed, one.initial)
+    left = suspicion.accepted(one.record, estimate)
+    for series, before in zip(left.vectors, one.record.vectors, strict=True):
+        assert len(series.time) == len(before.time) - estimate.innovations[series.sensor].refused
+        assert 0.02 < estimate.innovations[series.sensor].refused / len(before.time) < 0.06
+
+
+def test_a_cause_that_explains_more_goes_first():
+    one, result = tuned(1, 1e-3)
+    found = tuning.unmodelled(one, result.setup)
+    assert found.moves_with_the_rate
+    cause = Cause(
+        name="hard iron",
+        of="star 1",
+        estimate=np.zeros(3),
+        standard_error=np.zeros(3),
+        unit="1",
+        gain=found.scale_factor.gain + 1.0,
+        log_p=-100.0,
+        words="star 1 has a hard iron",
+    )
+    assert not dataclasses.replace(found, causes=(cause,)).moves_with_the_rate
+    assert dataclasses.replace(found, causes=(dataclasses.replace(cause, gain=1.0),)).moves_with_the_rate
+
+
+def test_what_is_held_out_is_left_out():
+    one, _ = tuned(1)
+    (train,), _ = tuning.split([one], 0.4)
+    assert suspicion.seen(train).time[-1] == pytest.approx(540.0)
+    assert suspicion.seen(one) is one.record
+
+
+def test_a_hard_iron_is_named_where_the_innovations_are_not_white():
+    chosen = scenarios.load_scenario("low-orbit")
+    believed = setup.matched(chosen)
+    one = tuning.record_case(scenarios.simulate(dataclasses.replace(chosen, duration=1200.0), 5), believed, seed=5)
+    found = tuning.unmodelled(one, believed)
+    assert found.causes
+    assert found.causes[0].name == "hard iron"
+    assert not found.moves_with_the_rate
+    assert any("Likeliest cause" in words for words in found.words)
+
+
+# ------------------------------------------------------------------------------------------------ gyros of two kinds
+
+
+def test_records_of_one_kind_of_gyro_are_taken():
+    other = dataclasses.replace(SPEC, turn_on_bias_sigma=1e-3, scale_factor=np.full(3, 1e-3))
+    tuning.one_gyro({"a": SPEC, "b": other, "c": dataclasses.replace(SPEC, angle_random_walk=np.full(3, 3e-5))})
+    tuning.one_gyro({})
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"angle_random_walk": 6e-5}, "angle_random_walk is 6e-05 and 3e-05"),
+        ({"rate_random_walk": np.array([2e-7, 2e-7, 3e-7])}, "rate_random_walk is 3e-07 and 2e-07"),
+        ({"bias_instability": 1e-6}, "bias_instability is 1e-06 and 0"),
+        ({"markov_noise": 1e-7, "markov_correlation_time": 100.0}, "markov_noise is 1e-07 and 0"),
+    ],
+)
+def test_records_of_two_kinds_are_refused(change, complaint):
+    with pytest.raises(InputError, match=complaint):
+        tuning.one_gyro({"a.h5": SPEC, "b.h5": dataclasses.replace(SPEC, **change)})
+
+
+# -------------------------------------------------------------------------------------------------- the command line
+
+
+def run(monkeypatch, capsys, *arguments: object) -> tuple[int, str, str]:
+    monkeypatch.setattr(sys, "argv", ["strapdown", *map(str, arguments)])
+    status = 0
+    try:
+        cli.main()
+    except SystemExit as end:
+        status = int(end.code or 0)
+    told = capsys.readouterr()
+    return status, told.out, told.err
+
+
+def test_the_command_tells_of_it_and_refuses_two_kinds(monkeypatch, capsys, tmp_path):
+    first, second, out = tmp_path / "a.h5", tmp_path / "b.h5", tmp_path / "tuned.toml"
+    chosen = scenario(1e-3)
+    recordfiles.write_record(first, scenarios.simulate(chosen, 2), gyro_spec=chosen.gyro)
+    status, said, complaint = run(monkeypatch, capsys, "tune", first, "--starts", 1, "-o", out)
+    assert status == 0, complaint
+    assert "scale factor of the gyro" in said
+    assert "in doubt" in said
+    (told,) = json.loads(out.with_suffix(".json").read_text())["unmodelled"]
+    assert told["moves_with_the_rate"]
+    np.testing.assert_allclose(told["scale_factor"]["value"][:2], 1e-3, atol=1e-3)
+    page, _ = tunings.report(out.with_suffix(".json"), 0.99)
+    assert "A scale factor of the gyro" in page
+    other = dataclasses.replace(chosen.gyro, angle_random_walk=6e-5)
+    brief = dataclasses.replace(chosen, gyro=other, duration=60.0)
+    recordfiles.write_record(second, scenarios.simulate(brief, 1), gyro_spec=other)
+    status, _, complaint = run(monkeypatch, capsys, "tune", first, second, "-o", tmp_path / "none.toml")
+    assert status == 2
+    assert "recorded with another gyro" in complaint.replace("\n", " ")
+    assert not (tmp_path / "none.toml").exists()
+    # Where the gyro is given and only a sensor is free, it does no harm.
+    options = ("--filter", out, "--free", "star 1.sigma", "--starts", 1, "-o", tmp_path / "sensor.toml")
+    status, _, complaint = run(monkeypatch, capsys, "tune", first, second, *options)
+    assert status == 0, complaint
