@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import os
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from strapdown import coning, gyro, mekf, tables, units
+from strapdown import coning, gyro, mekf, quaternion, tables, units, vectors
+from strapdown.augmented import matching
+from strapdown.augmented import states as optional
+from strapdown.augmented.states import States
 from strapdown.checks import Array, InputError, finite, known_keys, one_of, positive
 from strapdown.gyro import GyroSpec
 from strapdown.mekf import ProcessNoise
@@ -27,6 +30,12 @@ ATTITUDE_SIGMA = 1.0 * units.DEGREE
 """Standard deviation of the initial attitude error where nobody says, each axis, rad; less where the sensors are very fine."""
 LINEAR_SHARE = 0.2
 """The second-order error of a first measurement, half the square of the initial error, may be about this share of half its σ."""
+COMMUTATION_SHARE = 0.1
+"""Of what the record's white noise leaves of a constant rate: a drift of one-sample integration above it calls for a better algorithm."""
+BETTER = "matched-1-8-8"
+"""The integration algorithm that is then taken: one that keeps the rate of the samples."""
+LEAST_SAMPLES = 32
+"""Gyro samples below which nothing is said of commutation."""
 LEAST_BIAS_SIGMA = 0.1 * units.DEGREE_PER_HOUR
 """Standard deviation of the initial bias error of a gyro whose specification tells of no bias, rad/s."""
 
@@ -51,9 +60,13 @@ class FilterSetup:
     """Refuses measurements that no right filter would see, and recovers; None: all are taken."""
     robust: Robust | None = None
     """Weighs measurements by how far they lie off; None: all alike."""
+    states: States | None = None
+    """Optional states beside attitude and bias; None: none. With drifts among them, the bias of the filter is the whole of it."""
 
     def __post_init__(self) -> None:
         """Check every number."""
+        if self.states is not None and not isinstance(self.states, States):
+            raise InputError(f"states is {self.states!r}; it must be augmented.States, or None")
         positive("attitude_sigma", self.attitude_sigma, unit="rad")
         positive("bias_sigma", self.bias_sigma, unit="rad/s")
         positive("measurement_sigma_factor", self.measurement_sigma_factor)
@@ -61,12 +74,30 @@ class FilterSetup:
         object.__setattr__(self, "sigma", believed_sigma)
 
 
-def matched(scenario: Scenario, *, attitude_sigma: float | None = None) -> FilterSetup:
-    """Return what a right filter believes of a scenario: the noise of its gyro, and of its sensors what they say of themselves."""
-    return matched_to_record(scenario.gyro, simulate(scenario), attitude_sigma=attitude_sigma)
+def matched(scenario: Scenario, *, attitude_sigma: float | None = None, states: bool = False) -> FilterSetup:
+    """Return what a right filter believes of a scenario: the noise of its gyro, and of its sensors what they say of themselves.
+
+    With ``states`` it has the optional states that the scenario's errors call for, as :func:`matched_to_record` says.
+    """
+    return matched_to_record(
+        scenario.gyro,
+        simulate(scenario),
+        attitude_sigma=attitude_sigma,
+        states=states,
+        sensors=scenario.sensors,
+        gravity_f=scenario.gravity_f,
+    )
 
 
-def matched_to_record(spec: GyroSpec, record: ImuRecord, *, attitude_sigma: float | None = None) -> FilterSetup:
+def matched_to_record(
+    spec: GyroSpec,
+    record: ImuRecord,
+    *,
+    attitude_sigma: float | None = None,
+    states: bool = False,
+    sensors: Sequence[Any] = (),
+    gravity_f: Sequence[float] = vectors.GRAVITY_F,
+) -> FilterSetup:
     """Return what a right filter believes of a record of a gyro of this specification.
 
     Flicker, which no random walk is, is matched in the attitude at the record's rate and quality of measurements
@@ -74,8 +105,13 @@ def matched_to_record(spec: GyroSpec, record: ImuRecord, *, attitude_sigma: floa
     has no state for (scale factor, misalignment, quantisation, hard iron) are not covered. Without ``attitude_sigma``, rad, the start is
     known to 1°, or so much better that the first measurement of the finest sensor is still linear in its error: an extended filter's
     covariance is not to be believed beyond that.
+
+    With ``states`` the filter has a state for each such error that the specification, or one of ``sensors``, tells of (scale factor,
+    misalignment, sensitivity to the force of ``gravity_f``, flicker and Gauss–Markov drift, hard iron, a sensor's bias, correlated noise,
+    lever arm): taken for one draw of a normal distribution whose σ is the error's size. What remains uncovered :func:`not_covered` tells.
+    Of a motion whose commutation one-sample integration would feel, it then takes a better algorithm of the same rate: measurements between
+    the edges of longer steps would be taken for what a turn at constant rate makes there.
     """
-    noise = _noise(spec, record)
     walk = np.max(np.square(spec.bias_instability) * np.log(1e3)) / np.pi  # flicker over three decades of time
     stationary = np.where(
         np.isfinite(spec.markov_correlation_time),
@@ -85,41 +121,90 @@ def matched_to_record(spec: GyroSpec, record: ImuRecord, *, attitude_sigma: floa
         0.0,
     )
     spread = np.max(np.square(spec.turn_on_bias) + np.square(spec.turn_on_bias_sigma) + stationary) + walk
+    more: dict[str, Any] = {}
+    if states:
+        found = matching.matched(spec, record, sensors, np.asarray(gravity_f), measurement_density(record))
+        noise = _noise_beside_states(spec, found.white)
+        more["states"] = found.states
+        if _commutes_badly(record, noise["angle_random_walk"]):
+            more["integration"] = coning.ALGORITHMS[BETTER]
+    else:
+        noise = _noise(spec, record)
     return FilterSetup(
         process_noise=ProcessNoise(**noise),
         attitude_sigma=_linear_sigma(record) if attitude_sigma is None else attitude_sigma,
         bias_sigma=float(max(np.sqrt(spread), LEAST_BIAS_SIGMA)),
+        **more,
     )
 
 
-def not_covered(spec: GyroSpec, sensors: tuple[Any, ...] = ()) -> tuple[str, ...]:
-    """Return, in words, the errors of a gyro and of sensors that a filter of attitude and bias has no state for.
+def _noise_beside_states(spec: GyroSpec, white: float) -> dict[str, float]:
+    """Return the two noises of a filter that has drifts as states, ``white`` being the PSD of what of them is too quick, rad²/s."""
+    walk = np.max(np.square(spec.rate_random_walk))
+    if not np.isfinite(spec.markov_correlation_time):
+        walk = np.max(np.square(spec.rate_random_walk) + np.square(spec.markov_noise))
+    noise = {
+        "angle_random_walk": float(np.sqrt(np.max(np.square(spec.angle_random_walk)) + white)),
+        "rate_random_walk": float(np.sqrt(walk)),
+    }
+    _need_white(noise)
+    return noise
 
-    Where there is any, a filter that believes the noise alone is too sure of itself; :mod:`strapdown.augmented` has states for most.
+
+def _commutes_badly(record: ImuRecord, white: float) -> bool:
+    """Return whether a turn at constant rate over each sample drifts by more than the record can leave unnoticed."""
+    better = coning.ALGORITHMS[BETTER]
+    if len(record.increments) < LEAST_SAMPLES:
+        return False
+    one = coning.integrate(record.increments, coning.ALGORITHMS["one-sample"])[-1]
+    other = coning.integrate(record.increments, better)[-1]
+    length = float(record.time[-1] - record.time[0])
+    drift = float(np.linalg.norm(quaternion.log(quaternion.multiply(quaternion.conjugate(one), other)))) / length
+    return bool(drift > COMMUTATION_SHARE * white / np.sqrt(length))
+
+
+def not_covered(
+    spec: GyroSpec,
+    sensors: tuple[Any, ...] = (),
+    states: States | None = None,
+    *,
+    gravity_f: Sequence[float] = vectors.GRAVITY_F,
+) -> tuple[str, ...]:
+    """Return, in words, the errors of a gyro and of sensors that a filter of attitude and bias, and of ``states``, has no state for.
+
+    Where there is any, a filter that believes the noise alone is too sure of itself; :func:`matched` has states for most, if told to.
     """
     found = []
+    known = set() if states is None else set(states.names)
     largest = {
         name: float(np.max(np.abs(getattr(spec, name)))) for name in ("scale_factor", "asymmetry", "misalignment")
     }
     words = {"scale_factor": ("scale factor", 1e-6, "ppm"), "asymmetry": ("asymmetry", 1e-6, "ppm")}
     words["misalignment"] = ("misalignment", 1e-3, "mrad")
+    covering = {"scale_factor": "gyro.scale", "misalignment": "gyro.misalignment"}
     for name, (what, size, unit) in words.items():
-        if largest[name] > 0.0:
+        if largest[name] > 0.0 and covering.get(name) not in known:
             found.append(f"the gyro's {what} of {largest[name] / size:.3g} {unit}")
-    if np.any(np.asarray(spec.bias_instability) > 0.0):
+    if np.any(np.asarray(spec.bias_instability) > 0.0) and "gyro.drift" not in known:
         instability = float(np.max(spec.bias_instability)) / units.DEGREE_PER_HOUR
         found.append(f"the gyro's flicker of {instability:.3g} °/h, covered in the attitude but not in the bias")
-    if np.any(np.asarray(spec.g_sensitivity) != 0.0):
+    felt = np.any(np.asarray(spec.g_sensitivity) != 0.0) and np.any(np.asarray(gravity_f) != 0.0)
+    if felt and "gyro.force" not in known:
         found.append("the gyro's sensitivity to acceleration")
     if float(np.max(spec.quantization)) > 0.0 or float(np.max(spec.rate_resolution)) > 0.0:
         found.append("the gyro's quantisation")
     for sensor in sensors:
-        if np.any(np.asarray(getattr(sensor, "hard_iron", 0.0)) != 0.0):
+        if np.any(np.asarray(getattr(sensor, "hard_iron", 0.0)) != 0.0) and f"{sensor.name}.bias" not in known:
             found.append(f"the hard iron of the {sensor.name}")
-        if np.any(np.asarray(getattr(sensor, "lever_arm_b", 0.0)) != 0.0):
+        if np.any(np.asarray(getattr(sensor, "soft_iron", 0.0)) != 0.0):
+            found.append(f"the soft iron of the {sensor.name}")
+        if np.any(np.asarray(getattr(sensor, "bias", 0.0)) != 0.0) and f"{sensor.name}.bias" not in known:
+            found.append(f"the bias of the {sensor.name}")
+        if np.any(np.asarray(getattr(sensor, "lever_arm_b", 0.0)) != 0.0) and f"{sensor.name}.lever" not in known:
             found.append(f"the accelerations that the {sensor.name} feels at its lever arm")
         faults = getattr(sensor, "faults", None)
-        if faults is not None and getattr(faults, "correlated_sigma", 0.0) > 0.0:
+        correlated = faults is not None and getattr(faults, "correlated_sigma", 0.0) > 0.0
+        if correlated and f"{sensor.name}.correlated" not in known:
             found.append(f"the correlated noise of the {sensor.name}")
         if faults is not None and getattr(faults, "outlier_probability", 0.0) > 0.0:
             found.append(f"the outliers of the {sensor.name}")
@@ -147,12 +232,16 @@ def _noise(spec: GyroSpec, record: ImuRecord) -> dict[str, float]:
             noise = gyro.matched_process_noise(spec, density)
         else:
             noise = gyro.process_noise(spec, bandwidth=2.0 * np.pi / float(record.time[-1] - record.time[0]))
+    _need_white(noise)
+    return noise
+
+
+def _need_white(noise: Mapping[str, float]) -> None:
     if noise["angle_random_walk"] == 0.0:
         raise InputError(
             "the gyro's specification has no angle random walk, and a filter must believe one greater than zero; "
             "give it, or a filter setup of your own"
         )
-    return noise
 
 
 def measurement_density(record: ImuRecord) -> float:
@@ -204,8 +293,14 @@ def _believed(series: VectorMeasurements, setup: FilterSetup) -> VectorMeasureme
 
 
 def run(record: ImuRecord, setup: FilterSetup, initial: mekf.State, **options: Any) -> Estimate:
-    """Run the filter of this setup over a record; ``options`` are those of :func:`strapdown.mekf.run`."""
+    """Run the filter of this setup over a record; ``options`` are those of :func:`strapdown.mekf.run`.
+
+    With optional states the estimate is one of :class:`strapdown.augmented.AugmentedEstimate`, which tells of them too; its gate must not
+    recover.
+    """
     chosen = {"gate": setup.gate, "robust": setup.robust, **options}
+    if setup.states is not None:
+        return optional.run(believed(record, setup), setup.process_noise, initial, setup.states, **chosen)
     return mekf.run(believed(record, setup), setup.process_noise, initial, **chosen)
 
 
@@ -234,7 +329,7 @@ _ROBUST_FORM: tables.Form = {
     "degrees_of_freedom": tables.RATIO,
     "iterations": tables.PLAIN,
 }
-_PARTS = ("integration", "sigma", "gate", "robust")
+_PARTS = ("integration", "sigma", "gate", "robust", "states")
 NEVER = 0
 """What stands in a file for the ``recovery`` of a gate that never recovers, as TOML has no word for nothing."""
 
@@ -252,6 +347,8 @@ def to_table(setup: FilterSetup) -> dict[str, Any]:
             table["gate"]["recovery"] = NEVER
     if setup.robust is not None:
         table["robust"] = tables.encode(setup.robust, _ROBUST_FORM)
+    if setup.states is not None:
+        table["states"] = optional.to_table(setup.states)
     return table
 
 
@@ -276,6 +373,8 @@ def from_table(table: Mapping[str, Any], place: str = "filter") -> FilterSetup:
             parts["gate"] = tables.build(Gate, content, _GATE_FORM, f"{place}: gate")
     if "robust" in table:
         parts["robust"] = tables.build(Robust, _part(table, "robust", place), _ROBUST_FORM, f"{place}: robust")
+    if "states" in table:
+        parts["states"] = optional.from_table(_part(table, "states", place), f"{place}: states")
     return tables.build(  # type: ignore[no-any-return]
         FilterSetup,
         {key: value for key, value in table.items() if key not in own and key not in _PARTS},
@@ -296,7 +395,8 @@ def to_toml(setup: FilterSetup) -> str:
     """Return a setup as TOML with the table ``[filter]``."""
     import tomli_w
 
-    note = "# sigma: rad, or of a sensor that measures whole vectors the unit of its reference\n" if setup.sigma else ""
+    told = setup.sigma or (setup.states is not None and setup.states.sensors)
+    note = "# sigma of sensors: rad, or of one that measures whole vectors the unit of its reference\n" if told else ""
     return note + tomli_w.dumps({"filter": to_table(setup)})
 
 

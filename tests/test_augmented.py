@@ -420,6 +420,7 @@ def rows_at(face, sensor, kind, reference, z):
         0,
         model.sensors,
         model.sensor_use,
+        (0.0,) * 9,
         H,
         y,
         basis,

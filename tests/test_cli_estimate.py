@@ -1,5 +1,6 @@
 """`strapdown estimate` on a simulated record, as a user types it."""
 
+import dataclasses
 import json
 import sys
 
@@ -7,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
-from strapdown import cli, coning, mekf, motion, quaternion, records, setup
+from strapdown import cli, coning, consistency, mekf, motion, quaternion, records, scenarios, setup
 from strapdown.checks import InputError
 from strapdown.gyro import GyroSpec
 from strapdown.mekf import ProcessNoise
@@ -170,3 +171,99 @@ def test_faults_do_not_hide_that_a_start_is_missing():
     )
     with pytest.raises(InputError, match="0 of directions"):
         mekf.first_state(simulate(made(blind), 1), NOISE, bias_sigma=1e-3)
+
+
+# ---------------------------------------------------------------------------------------------------- optional states, one direction
+
+
+@pytest.fixture
+def spinning(tmp_path):
+    scenario = scenarios.load_scenario("spin")
+    path = tmp_path / "spin.h5"
+    toml = scenarios.scenario_to_toml(scenario)
+    write_record(path, simulate(scenario, 3), gyro_spec=scenario.gyro, scenario=toml, seed=3, run=0)
+    return path
+
+
+def test_states_that_the_errors_call_for(run, spinning, tmp_path):
+    status, said, error = run(
+        "estimate", spinning, "--out", tmp_path / "out", "--states", "--from-truth", "--every", 100
+    )
+    assert (status, error) == (0, "")
+    assert "Optional states: gyro.scale." in said
+    assert "ppm" in said
+    assert "Still without" not in said
+    states = json.loads((tmp_path / "out" / "states.json").read_text())
+    assert states["gyro scale"]["components"] == ["z"]
+    assert states["gyro scale"]["first_sigma"] == pytest.approx([1e-4])
+    assert states["gyro scale"]["sigma"][0] < 0.7e-4
+    with h5py.File(tmp_path / "out" / "estimate.h5") as file:
+        told = setup.from_toml(file.attrs["filter"])
+    assert told == setup.matched_to_record(
+        scenarios.load_scenario("spin").gyro, simulate(scenarios.load_scenario("spin"), 3), states=True
+    )
+    status, _, _ = run("check", tmp_path / "out" / "estimate.h5")
+    assert status == 0
+    status, _, _ = run("report", tmp_path / "out" / "estimate.h5")
+    assert status == 0
+    (tmp_path / "filter.toml").write_text(setup.to_toml(told))
+    options = ("--filter", tmp_path / "filter.toml", "--from-truth", "--every", 100)
+    status, _, error = run("estimate", spinning, "--out", tmp_path / "again", *options)
+    assert (status, error) == (0, "")
+    one, other = (read_estimate(tmp_path / name / "estimate.h5") for name in ("out", "again"))
+    assert np.array_equal(one.attitude, other.attitude)
+    assert np.array_equal(one.covariance, other.covariance)
+
+
+def test_states_of_a_record_that_tells_no_scenario_and_a_gate(run, record, tmp_path):
+    status, said, error = run("estimate", record, "--out", tmp_path / "out", "--states", "--gate", 0.999)
+    assert (status, error) == (0, "")
+    assert "does not tell its scenario" in said
+    assert "the filter has none" in said
+    assert not (tmp_path / "out" / "states.json").exists()
+
+
+def test_a_gate_with_states_says_that_it_does_not_recover(run, spinning, tmp_path):
+    status, said, error = run(
+        "estimate", spinning, "--out", tmp_path / "out", "--states", "--gate", 0.999, "--every", 100
+    )
+    assert (status, error) == (0, "")
+    assert "does not recover" in said
+    assert read_estimate(tmp_path / "out" / "estimate.h5").innovations["star"].weight is not None
+
+
+def test_states_are_refused_where_they_make_no_sense(run, spinning, tmp_path):
+    (tmp_path / "filter.toml").write_text(setup.to_toml(setup.matched(scenarios.load_scenario("spin"))))
+    (tmp_path / "rec.csv").write_text("")
+    cases = (
+        ((spinning, "--state", "gyro.scael"), "did you mean 'gyro.scale'"),
+        ((spinning, "--filter", tmp_path / "filter.toml", "--states"), "leave --states and --state out"),
+        ((tmp_path / "rec.csv", "--states"), "goes with a record"),
+    )
+    for arguments, words in cases:
+        status, _, error = run("estimate", *arguments, "--out", tmp_path / "out")
+        assert status == 2
+        assert words in error
+    assert not (tmp_path / "out").exists()
+
+
+def test_one_direction_that_turns_starts_by_a_bank(run, tmp_path):
+    scenario = dataclasses.replace(scenarios.load_scenario("magnetometer-only"), duration=2400.0)
+    path = tmp_path / "alone.h5"
+    whole = simulate(scenario, 1)
+    write_record(path, whole, gyro_spec=scenario.gyro, scenario=scenarios.scenario_to_toml(scenario), seed=1, run=0)
+    status, said, error = run("estimate", path, "--out", tmp_path / "out")
+    assert (status, error) == (0, "")
+    assert "96 hypotheses about it became one at" in said
+    assert "the estimate begins there" in said
+    estimate = read_estimate(tmp_path / "out" / "estimate.h5")
+    assert 300.0 < estimate.time[0] < 2000.0
+    assert estimate.time[-1] == whole.time[-1]
+    k = np.searchsorted(whole.time, estimate.time)
+    truth = whole.truth.attitude[k]
+    error = consistency.errors(estimate.attitude, estimate.bias, truth, whole.truth.bias[k])
+    assert consistency.nees(error, estimate.covariance)[[0, -1]].max() / 6.0 < 3.0
+    with h5py.File(tmp_path / "out" / "estimate.h5") as file:
+        assert np.array_equal(file["truth/attitude"][:], truth)
+    status, _, _ = run("check", tmp_path / "out" / "estimate.h5")
+    assert status in (0, 2)

@@ -193,3 +193,29 @@ def test_what_the_filter_has_no_state_for_is_told_in_words():
     words = " and ".join(setup.not_covered(held.gyro, held.sensors))
     for part in ("quantisation", "lever arm", "correlated noise of the magnetometer"):
         assert part in words
+
+
+def test_with_states_there_is_less_that_is_not_covered():
+    for name in ("spin", "low-orbit", "coning", "tumbling-satellite"):
+        chosen = scenarios.load_scenario(name)
+        believes = setup.matched(chosen, states=True)
+        assert setup.not_covered(chosen.gyro, chosen.sensors)
+        assert setup.not_covered(chosen.gyro, chosen.sensors, believes.states, gravity_f=chosen.gravity_f) == ()
+    held = scenarios.load_scenario("hand-held")
+    part = setup.matched(held, states=True).states.chosen(("gyro.drift", "accelerometer.lever"))
+    words = " and ".join(setup.not_covered(held.gyro, held.sensors, part))
+    assert "correlated noise of the magnetometer" in words
+    assert "lever arm" not in words
+    assert "flicker" not in words
+
+
+def test_an_estimate_of_a_setup_with_states_tells_of_them():
+    chosen = dataclasses.replace(scenarios.load_scenario("spin"), duration=30.0)
+    believes = setup.matched(chosen, states=True)
+    record = scenarios.simulate(chosen)
+    start = setup.initial_state(believes, record.truth.attitude[0], record.truth.bias[0])
+    estimate = setup.run(record, believes, start, every=10, full_covariance=True)
+    assert estimate.covariance.shape == (301, 6, 6)
+    assert list(estimate.blocks) == ["gyro scale"]
+    plain = setup.run(record, dataclasses.replace(believes, states=None), start, every=10)
+    assert np.all(estimate.variance[-1, 5] > 2.0 * plain.variance[-1, 5])

@@ -23,8 +23,12 @@ filter.
 A filter that starts tenths of a radian off, as one does whose heading hard iron has turned, is linearised at the wrong place and believes
 too much for good; :func:`recentred` starts it anew where the smoother puts it.
 
+A filter setup (:mod:`strapdown.setup`) holds such states as :class:`States`, in a file and as ``setup.matched(scenario, states=True)``
+chooses them.
+
 Modules: ``blocks`` what can be declared, ``model`` blocks as arrays, ``filtering`` the compiled filter, ``stepping`` the step-by-step one,
-``smoothing`` the smoother, ``observing`` the observability report.
+``smoothing`` the smoother, ``observing`` the observability report, ``turning`` rate and angular acceleration for lever arms, ``states``
+what a setup holds, ``matching`` which of them a specification calls for.
 """
 
 from __future__ import annotations
@@ -34,9 +38,11 @@ from strapdown.augmented.blocks import (
     Effect,
     GaussMarkov,
     GeneralBlock,
+    GyroForce,
     GyroGaussMarkov,
     GyroScale,
     Interval,
+    LeverArm,
     LinearBlock,
     VectorBias,
     VectorScale,
@@ -46,6 +52,7 @@ from strapdown.augmented.filtering import AugmentedEstimate, BlockEstimate, run,
 from strapdown.augmented.model import AugmentedState, initial_state
 from strapdown.augmented.observing import Observability, observability
 from strapdown.augmented.smoothing import recentred, smooth
+from strapdown.augmented.states import SensorStates, States
 from strapdown.augmented.stepping import StepFilter
 
 __all__ = [
@@ -56,11 +63,15 @@ __all__ = [
     "Effect",
     "GaussMarkov",
     "GeneralBlock",
+    "GyroForce",
     "GyroGaussMarkov",
     "GyroScale",
     "Interval",
+    "LeverArm",
     "LinearBlock",
     "Observability",
+    "SensorStates",
+    "States",
     "StepFilter",
     "VectorBias",
     "VectorScale",

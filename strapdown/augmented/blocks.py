@@ -14,6 +14,8 @@ from typing import Literal
 import numpy as np
 
 from strapdown.checks import Array, InputError, array, non_negative, one_of, positive
+from strapdown.units import STANDARD_GRAVITY
+from strapdown.vectors import GRAVITY_F
 
 AXES = ("x", "y", "z")
 ENTRIES = tuple(a if a == b else f"{a}{b}" for a in AXES for b in AXES)
@@ -34,6 +36,13 @@ class Effect:
     """d of each state (size, 3), fixed axes."""
     scale: Array | None = None
     """U of each state (size, 3, 3)."""
+    lever: Array | None = None
+    """a′ of each state (size, 3), body axes, in place of a: ``a = ([ẇ] + [w]²) a′``, the acceleration of a point of the body that lies a′
+    from the centre of turning, over the strength of what is measured. Of directions and whole vectors only."""
+    varying: bool = False
+    """Of a direction or heading: whether a and d are fixed in the sensor's own unit while the strength of what it measures changes, as
+    the earth's field does along an orbit. Its σ, which is its noise over that strength, tells how; c is then over the strength at the root
+    mean square σ."""
     carried: bool = False
     """Whether d is known only relative to the estimated attitude, and goes along when that is corrected: right for a noise that is alike in
     all directions. Firm in the fixed frame, an estimate of the noise would seem to show the attitude, which it does not: turn both, and
@@ -81,6 +90,16 @@ class LinearBlock(_Block):
     def gyro_scale(self) -> Array:
         """Matrices T by state (size, 3, 3)."""
         return np.zeros((self.size, 3, 3))
+
+    @property
+    def gyro_force(self) -> Array:
+        """Matrices G by state (size, 3, 3): ``Σ c G R_fbᵀ f`` is added to the measured rate, f being :attr:`force_f`."""
+        return np.zeros((self.size, 3, 3))
+
+    @property
+    def force_f(self) -> Array:
+        """Specific force of a body held at rest (3,), m/s², fixed axes; zero: the block has nothing to do with it."""
+        return np.zeros(3)
 
     @property
     def effects(self) -> Mapping[str, Effect]:
@@ -154,40 +173,127 @@ def _spread(name: str, value: float | Array, unit: str, size: int = 3) -> Array:
     return np.array([positive(f"{name}[{k}]", one, unit=unit) for k, one in enumerate(array(name, spread, (size,)))])
 
 
+def _matrix(name: str, diagonal: float | Array, off_diagonal: float | Array, units: tuple[str, str]) -> Array:
+    """Return standard deviations of the entries of a matrix (3, 3), of which zeros are no states; all zero is refused."""
+    for what, value in zip(units, (diagonal, off_diagonal), strict=True):
+        if np.ndim(value) == 0:
+            positive(f"{name}: {what}", value)  # type: ignore[arg-type]
+    whole = np.zeros((3, 3))
+    on = np.eye(3, dtype=bool)
+    axes = array(f"{name}: {units[0]}", np.broadcast_to(np.asarray(diagonal, np.float64), (3,)), (3,))
+    across = array(f"{name}: {units[1]}", np.broadcast_to(np.asarray(off_diagonal, np.float64), (3, 3)), (3, 3))
+    whole[on] = axes
+    whole[~on] = across[~on]
+    if np.ndim(off_diagonal) == 2 and np.any(np.diag(across) != 0.0):
+        raise InputError(f"{name}: {units[1]} has entries on its diagonal; give those as {units[0]}")
+    if np.any(whole < 0.0):
+        i, j = np.argwhere(whole < 0.0)[0]
+        raise InputError(f"{name}: the sigma of {ENTRIES[3 * i + j]} is {whole[i, j]:g}; it must not be negative")
+    if not whole.any():
+        raise InputError(f"{name}: {units[0]} and {units[1]} are both 0; give one of them, or leave the block out")
+    return whole
+
+
 @dataclass(frozen=True, kw_only=True)
 class GyroScale(LinearBlock):
-    """Scale factors and misalignments of the gyro: all nine of M in ``w_meas = (I + M) w_b + b + n``, constant."""
+    """Scale factors and misalignments of the gyro: the entries of M in ``w_meas = (I + M) w_b + b + n``, constant.
 
-    scale_sigma: float
-    """Of each scale factor, dimensionless."""
-    misalignment_sigma: float
-    """Of each misalignment, rad."""
+    Entries of an array whose σ is 0 are taken for exact and are no states.
+    """
+
+    scale_sigma: float | Array
+    """Of each scale factor, dimensionless, one or one an axis (3,)."""
+    misalignment_sigma: float | Array
+    """Of each misalignment, rad, one or one an entry (3, 3) with zeros on the diagonal."""
     name: str = "gyro scale"
 
     def __post_init__(self) -> None:
         """Check both."""
-        positive(f"{self.name}: scale_sigma", self.scale_sigma)
-        positive(f"{self.name}: misalignment_sigma", self.misalignment_sigma, unit="rad")
+        self._sigmas()
+
+    def _sigmas(self) -> Array:
+        return _matrix(self.name, self.scale_sigma, self.misalignment_sigma, ("scale_sigma", "misalignment_sigma"))
+
+    @property
+    def _entries(self) -> np.ndarray:
+        return np.flatnonzero(self._sigmas().ravel())
 
     @property
     def components(self) -> tuple[str, ...]:  # type: ignore[override]
         """M by rows: x, y, z are the scale factors; xy is how much of the rate about y shows on axis x."""
-        return ENTRIES
+        return tuple(ENTRIES[k] for k in self._entries)
 
     @property
     def units(self) -> tuple[str, ...]:  # type: ignore[override]
         """Dimensionless, rad."""
-        return tuple("1" if entry in AXES else "rad" for entry in ENTRIES)
+        return tuple("1" if entry in AXES else "rad" for entry in self.components)
 
     @property
     def sigma(self) -> Array:  # type: ignore[override]
         """Both as given."""
-        return np.array([self.scale_sigma if entry in AXES else self.misalignment_sigma for entry in ENTRIES])
+        return np.asarray(self._sigmas().ravel()[self._entries])
 
     @property
     def gyro_scale(self) -> Array:
         """One entry of M a state."""
-        return np.eye(9).reshape(9, 3, 3)
+        return np.asarray(np.eye(9)[self._entries].reshape(-1, 3, 3))
+
+
+@dataclass(frozen=True, kw_only=True)
+class GyroForce(LinearBlock):
+    """Sensitivity of the gyro to specific force: the entries of G in ``w_meas = w_b + b + G f_b + n``, constant.
+
+    The force is that of a body held up, the reaction to gravity alone, ``f_b = −R_fbᵀ g_f``. Entries whose σ is 0 are no states.
+    """
+
+    along_sigma: float | Array
+    """Of each diagonal entry, rad/s per m/s², one or one an axis."""
+    across_sigma: float | Array = field(default_factory=lambda: np.zeros((3, 3)))
+    """Of each off-diagonal entry, rad/s per m/s², one or one an entry (3, 3) with zeros on the diagonal."""
+    gravity_f: Array = field(default_factory=lambda: np.array(GRAVITY_F))
+    """Acceleration of gravity (3,), m/s², fixed axes."""
+    name: str = "gyro force"
+
+    def __post_init__(self) -> None:
+        """Check all."""
+        self._sigmas()
+        object.__setattr__(self, "gravity_f", array(f"{self.name}: gravity_f", self.gravity_f, (3,)))
+        if not np.any(self.gravity_f):
+            raise InputError(
+                f"{self.name}: gravity_f is zero, and a body in free fall feels no force; leave the block out"
+            )
+
+    def _sigmas(self) -> Array:
+        return _matrix(self.name, self.along_sigma, self.across_sigma, ("along_sigma", "across_sigma"))
+
+    @property
+    def _entries(self) -> np.ndarray:
+        return np.flatnonzero(self._sigmas().ravel())
+
+    @property
+    def components(self) -> tuple[str, ...]:  # type: ignore[override]
+        """G by rows: xy is the bias about x that a force along y makes."""
+        return tuple(ENTRIES[k] for k in self._entries)
+
+    @property
+    def units(self) -> tuple[str, ...]:  # type: ignore[override]
+        """All alike."""
+        return ("rad s/m",) * self.size
+
+    @property
+    def sigma(self) -> Array:  # type: ignore[override]
+        """Both as given."""
+        return np.asarray(self._sigmas().ravel()[self._entries])
+
+    @property
+    def gyro_force(self) -> Array:
+        """One entry of G a state."""
+        return np.asarray(np.eye(9)[self._entries].reshape(-1, 3, 3))
+
+    @property
+    def force_f(self) -> Array:
+        """The reaction to gravity."""
+        return -np.asarray(self.gravity_f)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -237,6 +343,8 @@ class VectorBias(LinearBlock):
     """In the unit of the sensor's reference (1 is its length for directions and headings), one or one an axis."""
     rate_random_walk: float = 0.0
     """Of each component, unit/√s."""
+    varying: bool = False
+    """As :attr:`Effect.varying`."""
     unit: str = "1"
     """For words and tables."""
     name: str = ""
@@ -266,7 +374,58 @@ class VectorBias(LinearBlock):
     @property
     def effects(self) -> Mapping[str, Effect]:
         """One axis a state."""
-        return {self.sensor: Effect(offset_b=np.eye(3))}
+        return {self.sensor: Effect(offset_b=np.eye(3), varying=self.varying)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeverArm(LinearBlock):
+    """The place of an accelerometer on the body, from the point that does not accelerate: ``f_b = −R_fbᵀ g + ([ẇ] + [w]²) r``, constant.
+
+    Rate and angular acceleration are those of the gyro (:func:`strapdown.augmented.turning.turning`), whose noise becomes noise of the
+    sensor. Components whose σ is 0 are no states.
+    """
+
+    sensor: str
+    arm_sigma: float | Array
+    """Of each component of r, m, one or one an axis."""
+    strength: float = STANDARD_GRAVITY
+    """Specific force over which the sensor's vector is told, m/s²: 1 where it gives whole vectors in m/s²."""
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        """Check all."""
+        object.__setattr__(self, "name", self.name or f"{self.sensor} lever arm")
+        positive(f"{self.name}: strength", self.strength, unit="m/s²")
+        spread = array(f"{self.name}: arm_sigma", np.broadcast_to(np.asarray(self.arm_sigma, np.float64), (3,)), (3,))
+        for k, one in enumerate(spread):
+            non_negative(f"{self.name}: arm_sigma[{k}]", one, unit="m")
+        if not spread.any():
+            raise InputError(f"{self.name}: arm_sigma is 0; give one above zero, or leave the block out")
+        object.__setattr__(self, "arm_sigma", spread.copy())
+
+    @property
+    def _axes(self) -> np.ndarray:
+        return np.flatnonzero(self.arm_sigma)
+
+    @property
+    def components(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Those whose σ is above zero."""
+        return tuple(AXES[k] for k in self._axes)
+
+    @property
+    def units(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Metres."""
+        return ("m",) * self.size
+
+    @property
+    def sigma(self) -> Array:  # type: ignore[override]
+        """As given."""
+        return np.asarray(np.asarray(self.arm_sigma)[self._axes])
+
+    @property
+    def effects(self) -> Mapping[str, Effect]:
+        """One axis a state."""
+        return {self.sensor: Effect(lever=np.eye(3)[self._axes] / self.strength)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -312,6 +471,8 @@ class GaussMarkov(LinearBlock):
     frame: Literal["body", "fixed"] = "body"
     """Axes in which it is correlated: an acceleration keeps its direction in the fixed frame while the body turns. There it must be alike
     in all directions."""
+    varying: bool = False
+    """As :attr:`Effect.varying`."""
     unit: str = "1"
     name: str = ""
     components: tuple[str, ...] = field(default=AXES)
@@ -349,7 +510,9 @@ class GaussMarkov(LinearBlock):
     def effects(self) -> Mapping[str, Effect]:
         """One axis a state."""
         axes = np.eye(3)
-        return {self.sensor: Effect(offset_b=axes) if self.frame == "body" else Effect(offset_f=axes, carried=True)}
+        if self.frame == "body":
+            return {self.sensor: Effect(offset_b=axes, varying=self.varying)}
+        return {self.sensor: Effect(offset_f=axes, carried=True, varying=self.varying)}
 
 
 def check(blocks: tuple[Block, ...]) -> None:

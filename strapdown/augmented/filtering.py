@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,13 +12,16 @@ from strapdown import mekf, quaternion
 from strapdown.augmented import model as modelling
 from strapdown.augmented.blocks import Block
 from strapdown.augmented.model import AugmentedState, Model
+from strapdown.augmented.turning import turning
 from strapdown.checks import Array, InputError, count
-from strapdown.kernels import augmented_loop
+from strapdown.kernels import augmented_loop, robust_step
+from strapdown.kernels.augmented_step import OFFSET
 from strapdown.kernels.machine import compiled
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.mekf import ProcessNoise, Schedule
 from strapdown.records import Estimate, ImuRecord
-from strapdown.vectors import KINDS
+from strapdown.robustness import Gate, Robust
+from strapdown.vectors import KINDS, VectorMeasurements
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +50,13 @@ class AugmentedEstimate(Estimate):
     whole_covariance: Array | None = None
     """P (m, n, n) of (δθ, δb, δc), the blocks in their order, if it was asked for; ``covariance`` is its part (m, 6, 6)."""
 
+    whole_bias: Array | None = None
+    """Gyro bias and all that blocks add to it, ``b + Σ c e`` (m, 3), rad/s, if it was asked for."""
+    whole_bias_variance: Array | None = None
+    """Diagonal of the covariance of attitude and whole bias (m, 6)."""
+    whole_bias_covariance: Array | None = None
+    """That covariance (m, 6, 6)."""
+
     def errors(
         self, true_attitude: ArrayLike, true_bias: ArrayLike, true_values: Mapping[str, ArrayLike] | None = None
     ) -> Array:
@@ -71,11 +81,13 @@ def run(
     *,
     every: int = 1,
     full_covariance: bool = False,
+    gate: Gate | None = None,
+    robust: Robust | None = None,
 ) -> AugmentedEstimate:
     """Run the filter over a whole record.
 
-    Intervals are split at the measurements as by :func:`strapdown.mekf.run`. Linear blocks run compiled; with a general one among them the
-    run goes step by step in Python, some thousand times slower.
+    Intervals are split at the measurements as by :func:`strapdown.mekf.run`, and missing measurements (NaN) are counted as skipped. Linear
+    blocks run compiled; with a general one among them the run goes step by step in Python, some thousand times slower.
 
     Parameters
     ----------
@@ -88,8 +100,21 @@ def run(
         Keep the state at every ``every``-th edge, the first included.
     full_covariance : bool
         Keep whole covariance matrices too.
+    gate : Gate, optional
+        Refuse measurements that no right filter would see. It must have ``recovery=None``: a challenger that starts anew knows of no block.
+    robust : Robust, optional
+        Weigh measurements by how far they lie off.
     """
-    return run_on(record, process_noise, initial, blocks, every=every, full_covariance=full_covariance)[0]
+    return run_on(
+        record,
+        process_noise,
+        initial,
+        blocks,
+        every=every,
+        full_covariance=full_covariance,
+        gate=gate,
+        robust=robust,
+    )[0]
 
 
 def run_on(
@@ -100,19 +125,51 @@ def run_on(
     *,
     every: int = 1,
     full_covariance: bool = False,
+    gate: Gate | None = None,
+    robust: Robust | None = None,
 ) -> tuple[AugmentedEstimate, AugmentedState]:
     """Run the filter and return the end state too, from which the next part of a record goes on, bit for bit."""
     blocks = tuple(blocks)
     state = modelling.begin(initial, blocks)
     count("every", every)
+    check_gate(gate)
     if modelling.general(blocks):
         from strapdown.augmented import stepping
 
+        if gate is not None or robust is not None:
+            raise InputError(
+                "gate and robust run compiled, with linear blocks only; leave them out, or the general blocks"
+            )
         return stepping.run_on(record, process_noise, state, blocks, every=every, full_covariance=full_covariance)
-    events = mekf.schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True)
-    model = modelling.assemble(blocks, dict(zip(events.sensors, events.kinds, strict=True)))
-    estimate, end, _ = run_events(record, events, model, process_noise, state, blocks, every, full_covariance, 0)
+    events, model = prepared(record, blocks)
+    estimate, end, _ = run_events(
+        record,
+        events,
+        model,
+        process_noise,
+        state,
+        blocks,
+        every=every,
+        full_covariance=full_covariance,
+        gate=gate,
+        robust=robust,
+    )
     return estimate, end
+
+
+def check_gate(gate: Gate | None) -> None:
+    """Refuse a gate that recovers."""
+    if gate is not None and gate.recovery is not None:
+        raise InputError(
+            f"gate: recovery is {gate.recovery}, and a filter with optional states cannot recover: a challenger that starts anew would "
+            "know nothing of them; give recovery=None (in a file recovery = 0), or leave the states out"
+        )
+
+
+def prepared(record: ImuRecord, blocks: tuple[Block, ...]) -> tuple[Schedule, Model]:
+    """Return a record's measurements in order of time, and the blocks as arrays."""
+    events = mekf.schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True)
+    return events, modelling.assemble(blocks, dict(zip(events.sensors, events.kinds, strict=True)))
 
 
 def run_events(
@@ -122,18 +179,29 @@ def run_events(
     process_noise: ProcessNoise,
     state: AugmentedState,
     blocks: tuple[Block, ...],
-    every: int,
-    full_covariance: bool,
-    segments: int,
+    *,
+    every: int = 1,
+    full_covariance: bool = False,
+    segments: int = 0,
+    gate: Gate | None = None,
+    robust: Robust | None = None,
+    whole_bias: bool = False,
 ) -> tuple[AugmentedEstimate, AugmentedState, Array]:
-    """Run the kernel over scheduled events; return the estimate, the end state, and up to ``segments`` segments with the end state."""
+    """Run the kernel over scheduled events; return the estimate, the end state, and up to ``segments`` segments with the end state.
+
+    With ``whole_bias`` the estimate tells the whole bias, and ``full_covariance`` is about that instead of all states.
+    """
+    check_gate(gate)
     size, width = 6 + model.states, 6 + model.states + model.noise_rows
     rows = len(record.increments) // every + 1
     attitude, x, F = start_arrays(model, state, width, size)
     attitude_out, x_out = np.empty((rows, 4)), np.empty((rows, size - 3))
     variance = np.empty((rows, size))
-    P = np.empty((rows if full_covariance else 0, size, size))
+    P = np.empty((rows if full_covariance and not whole_bias else 0, size, size))
+    told = np.empty((rows if whole_bias else 0, 6))
+    told_covariance = np.empty((rows if whole_bias and full_covariance else 0, 6, 6))
     innovation = np.empty((len(events.time), max([2, *(2 * KINDS[kind] for kind in events.kinds)])))
+    weight = np.empty(0 if gate is None and robust is None else len(events.time))
     stored = np.empty((segments + 1 if segments else 0, 8 + size - 3 + size * (size + 1) // 2))
     number = compiled(augmented_loop.run_augmented)(
         record.time,
@@ -148,15 +216,21 @@ def run_events(
         model.gyro_use,
         model.sensors,
         model.sensor_use,
+        tuple(model.force_f.tolist()),
         events.time,
         events.kind,
         events.vector_b,
         events.variance,
         np.empty((0, 6)) if events.noise is None else events.noise,
-        lengths(record, events),
+        lengths(record, events, model),
         events.sensor,
         events.reference,
+        _turns(record, events, model),
         events.triads,
+        np.full(3, np.inf) if gate is None else gate.thresholds,
+        0 if robust is None else {"huber": robust_step.HUBER, "student": robust_step.STUDENT}[robust.kind],
+        np.ones((3, 2)) if robust is None else robust.parameters,
+        0 if robust is None else robust.iterations,
         attitude,
         x,
         F,
@@ -169,13 +243,18 @@ def run_events(
             np.empty((3, 3)),
             np.empty(size),
             np.empty(width),
+            np.empty((3, size)),
+            np.empty((6, 6)),
         ),
         every,
         attitude_out,
         x_out,
         variance,
         P,
+        told,
+        told_covariance,
         innovation,
+        weight,
         stored[:segments],
     )
     if segments:
@@ -191,10 +270,18 @@ def run_events(
         attitude_out,
         x_out,
         variance,
-        P if full_covariance else None,
-        mekf.innovations_by_sensor(events, innovation),
+        P if len(P) else None,
+        mekf.innovations_by_sensor(events, innovation, weight if len(weight) or gate or robust else None),
         events.skipped,
     )
+    if whole_bias:
+        offsets = model.gyro[:, :3] * (model.gyro_use & OFFSET > 0)[:, None]
+        estimate = replace(
+            estimate,
+            whole_bias=x_out[:, :3] + x_out[:, 3:] @ offsets,
+            whole_bias_variance=told,
+            whole_bias_covariance=told_covariance if full_covariance else None,
+        )
     back = np.argsort(model.whole_order)
     root = F[:size, :size][:, back]
     end = AugmentedState(
@@ -207,6 +294,15 @@ def run_events(
     return estimate, end, stored[: number + 1]
 
 
+def _turns(record: ImuRecord, events: Schedule, model: Model) -> Array:
+    """Return rate, angular acceleration and the variances of the latter's axes at the events (events, 9); none without a lever arm."""
+    if not model.levers.any():
+        return np.empty((0, 9))
+    turns, variance = turning(record, events.time)
+    levered = model.levers[events.sensor]
+    return np.concatenate([turns, np.where(levered[:, None], variance, 0.0)], axis=1)
+
+
 def start_arrays(model: Model, state: AugmentedState, width: int, columns: int) -> tuple[Array, Array, Array]:
     """Return a state as the kernels take it: attitude (4,), x = (b, c), and F (width, columns) with the triangle at its top."""
     size = 6 + model.states
@@ -216,15 +312,39 @@ def start_arrays(model: Model, state: AugmentedState, width: int, columns: int) 
     return state.attitude.copy(), x, F
 
 
-def lengths(record: ImuRecord, events: Schedule) -> Array:
-    """Return what each event's vector was divided by (events,): the length of its reference for kind ``"vector"``, else 1."""
+def lengths(record: ImuRecord, events: Schedule, model: Model) -> Array:
+    """Return what each event's effects are divided by (events,).
+
+    For kind ``"vector"`` that is the length of its reference; for a direction or heading with an effect that is fixed in the sensor's unit
+    the strength of what is measured over that at the root mean square σ; else 1.
+    """
     result = np.ones(len(events.time))
     for i, series in enumerate(record.vectors):
+        if series.kind != "vector" and series.sensor not in model.varying:
+            continue
+        mine = events.sensor == i
+        which = np.searchsorted(series.time, events.time[mine])
         if series.kind == "vector":
-            mine = events.sensor == i
-            which = np.searchsorted(series.time, events.time[mine])
             result[mine] = np.linalg.norm(series.references_f[which], axis=1)
+        else:
+            result[mine] = strength(series)[which]
     return result
+
+
+def strength(series: VectorMeasurements) -> Array:
+    """Return the strength of what a direction or heading measures (m,), over that at its root mean square σ.
+
+    Its σ is the sensor's own noise over the strength, of a heading over the level part of it.
+    """
+    level = np.ones(len(series.time))
+    if series.kind == "heading":
+        level = np.linalg.norm(series.references_f[:, :2], axis=1)
+    weight = series.sigma * level
+    if np.any(weight <= 0.0):
+        raise InputError(
+            f"{series.sensor}: sigma is 0, which does not tell how strong what it measures is; give it, or varying=False"
+        )
+    return np.asarray(np.sqrt(np.mean(weight**2)) / weight)
 
 
 def packed(

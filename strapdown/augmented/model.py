@@ -14,7 +14,7 @@ import numpy as np
 from strapdown import mekf
 from strapdown.augmented.blocks import Block, Effect, GeneralBlock, LinearBlock, check
 from strapdown.checks import Array, InputError, array, covariance, one_of, unit_quaternions
-from strapdown.kernels.augmented_step import CARRIED, FIXED, NOISE_NODES, OFFSET, SCALE
+from strapdown.kernels.augmented_step import CARRIED, FIXED, FORCE, LEVER, NOISE_NODES, OFFSET, SCALE
 
 MOST_DECAY = 0.5
 """Of λ dt in one step: a step back is well conditioned. For states that enter the gyro a tenth, where Gauss's rule is exact."""
@@ -89,6 +89,15 @@ class Model:
     gyro_use: np.ndarray
     sensors: Array
     sensor_use: np.ndarray
+    force_f: Array
+    """Specific force that states of the gyro are about (3,), m/s²; zero: none is."""
+    varying: frozenset[str] = frozenset()
+    """Sensors whose effects are fixed in the sensor's own unit."""
+
+    @property
+    def levers(self) -> np.ndarray:
+        """Which sensors have a lever arm among the states (sensors,), bool."""
+        return np.asarray((self.sensor_use & LEVER > 0).any(axis=1))
 
     @property
     def states(self) -> int:
@@ -124,11 +133,12 @@ def assemble(blocks: tuple[Block, ...], kinds: Mapping[str, str]) -> Model:
     for name, values in (("decay", decay), ("density", density)):
         if np.any(values < 0.0):
             raise InputError(f"{name} of block state {int(np.argmax(values < 0.0))} is negative; give zero or more")
-    gyro = np.concatenate(
-        [_stack(blocks, "gyro_offset", (3,)), _stack(blocks, "gyro_scale", (3, 3)).reshape(-1, 9)], axis=1
-    )
+    scales, forces = (_stack(blocks, name, (3, 3)).reshape(-1, 9) for name in ("gyro_scale", "gyro_force"))
+    gyro = np.concatenate([_stack(blocks, "gyro_offset", (3,)), scales + forces], axis=1)
+    force_f = _force(blocks, np.any(scales != 0.0, axis=1) & np.any(forces != 0.0, axis=1))
     sensors = np.zeros((len(kinds), len(decay), 15))
-    carried = np.zeros((len(kinds), len(decay)), bool)
+    carried, levered = np.zeros((2, len(kinds), len(decay)), bool)
+    varying = set()
     names = list(kinds)
     first = 0
     for block in blocks:
@@ -139,14 +149,19 @@ def assemble(blocks: tuple[Block, ...], kinds: Mapping[str, str]) -> Model:
                 raise InputError(
                     f"{block.name}: {sensor} gives whole attitudes, which have an offset_b only; drop the rest"
                 )
+            _check_lever(block, sensor, kinds[sensor], effect)
             place = names.index(sensor), slice(first, first + block.size)
             sensors[place] = _numbers(block, effect)
             carried[place] = effect.carried
+            levered[place] = effect.lever is not None
+            if effect.varying and kinds[sensor] in ("direction", "heading"):
+                varying.add(sensor)
         first += block.size
     moves = (decay > 0.0) | (density > 0.0)
     order = np.argsort(~moves, kind="stable")
-    gyro_use = _uses(gyro[:, :3], gyro[:, 3:])
+    gyro_use = _uses(gyro[:, :3], scales) + FORCE * np.any(forces != 0.0, axis=1)
     sensor_use = _uses(sensors[..., :3], sensors[..., 6:], sensors[..., 3:6])
+    sensor_use += (LEVER - OFFSET) * (levered & (sensor_use & OFFSET > 0))
     sensor_use += CARRIED * (carried & (sensor_use & FIXED > 0))
     fastest = float(np.max(decay * np.where(gyro_use & OFFSET, 5.0, 1.0), initial=0.0))
     return Model(
@@ -159,13 +174,44 @@ def assemble(blocks: tuple[Block, ...], kinds: Mapping[str, str]) -> Model:
         gyro_use=gyro_use[order],
         sensors=np.ascontiguousarray(sensors[:, order]),
         sensor_use=np.ascontiguousarray(sensor_use[:, order]),
+        force_f=force_f,
+        varying=frozenset(varying),
     )
+
+
+def _force(blocks: tuple[Block, ...], both: np.ndarray) -> Array:
+    """Return the specific force that the blocks are about, one for all."""
+    if both.any():
+        raise InputError(f"block state {int(np.argmax(both))} has a gyro_scale and a gyro_force; make two states of it")
+    known = [np.asarray(b.force_f, np.float64) for b in blocks if isinstance(b, LinearBlock) and np.any(b.force_f)]
+    for one in known[1:]:
+        if not np.array_equal(one, known[0]):
+            raise InputError(
+                f"two blocks tell forces {known[0].tolist()} and {one.tolist()}; give both the same gravity_f"
+            )
+    return array("force_f", known[0], (3,)) if known else np.zeros(3)
+
+
+def _check_lever(block: Block, sensor: str, kind: str, effect: Effect) -> None:
+    if effect.lever is None:
+        return
+    if kind not in ("direction", "vector"):
+        raise InputError(
+            f"{block.name}: {sensor} is of kind {kind!r}, which a lever arm does not touch; leave the block out"
+        )
+    if effect.offset_b is not None or effect.offset_f is not None or effect.scale is not None:
+        raise InputError(f"{block.name}: a lever arm has no other effect beside it; make two blocks of it")
 
 
 def _numbers(block: Block, effect: Effect) -> Array:
     """Return an effect as rows (size, 15)."""
     rows = np.zeros((block.size, 15))
-    for name, place, shape in (("offset_b", 0, (3,)), ("offset_f", 3, (3,)), ("scale", 6, (3, 3))):
+    for name, place, shape in (
+        ("offset_b", 0, (3,)),
+        ("lever", 0, (3,)),
+        ("offset_f", 3, (3,)),
+        ("scale", 6, (3, 3)),
+    ):
         value = getattr(effect, name)
         if value is not None:
             given = array(f"{block.name}: {name}", value, (block.size, *shape)).reshape(block.size, -1)

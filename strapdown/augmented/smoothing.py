@@ -17,6 +17,7 @@ from strapdown.kernels import augmented_loop, smoother_loop
 from strapdown.kernels.machine import compiled
 from strapdown.mekf import ProcessNoise
 from strapdown.records import ImuRecord
+from strapdown.robustness import Gate, Robust
 
 
 def recentred(
@@ -58,22 +59,32 @@ def smooth(
     blocks: Sequence[Block] = (),
     *,
     full_covariance: bool = False,
+    gate: Gate | None = None,
+    robust: Robust | None = None,
 ) -> AugmentedEstimate:
     """Return the smoother's estimate at every edge (Rauch, Tung & Striebel 1965, on the manifold and on triangular factors).
 
-    Innovations are the filter's. Linear blocks only. Memory: 8 (n (n + 1)/2 + n + 5) bytes for each gyro interval and measurement, n
-    states: 1.7 kB at n = 18.
+    Innovations are the filter's; ``gate`` and ``robust`` are as for :func:`strapdown.augmented.run`. Linear blocks only. Memory:
+    8 (n (n + 1)/2 + n + 5) bytes for each gyro interval and measurement, n states: 1.7 kB at n = 18.
     """
     blocks = tuple(blocks)
     state = modelling.begin(initial, blocks)
     if modelling.general(blocks):
         names = [block.name for block in blocks if modelling.general((block,))]
         raise InputError(f"the smoother takes linear blocks only, not {', '.join(names)}; leave it out")
-    events = mekf.schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True)
-    model = modelling.assemble(blocks, dict(zip(events.sensors, events.kinds, strict=True)))
+    events, model = filtering.prepared(record, blocks)
     segments = filtering.most_segments(record, model, len(events.time))
     forward, _, stored = filtering.run_events(
-        record, events, model, process_noise, state, blocks, len(record.time), False, segments
+        record,
+        events,
+        model,
+        process_noise,
+        state,
+        blocks,
+        every=len(record.time),
+        segments=segments,
+        gate=gate,
+        robust=robust,
     )
     edges, size, noise = len(record.time), 6 + model.states, model.noise_rows
     starts = np.empty(edges, np.int64)
@@ -90,6 +101,7 @@ def smooth(
         model.changing,
         model.gyro,
         model.gyro_use,
+        tuple(model.force_f.tolist()),
         np.empty(size - 3),
         np.empty((size + noise, size + noise)),
         np.empty(size - 3),

@@ -77,6 +77,10 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             kinds[sensor] = self.kinds.get(sensor, "vector")
             model = modelling.assemble(self.blocks, kinds)
             here = [list(kinds).index(sensor)]
+            if model.levers.any() or model.varying:
+                raise InputError(
+                    "lever arms, and effects on a strength that varies, run compiled only; use augmented.run with linear blocks"
+                )
             self._models[sensor] = _outside_order(model, here)
         return self._models[sensor]
 
@@ -97,7 +101,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         coupling, factor = np.empty((m + 1, 3)), np.empty(m + 1)
         decay, density = np.append(model.decay, 0.0), np.append(model.density, 0.0)
         attitude, phi11, phi12, rate, D = augmented_step.move(
-            tuple(self.attitude), x, dt, tuple(part), decay, gyro, use, coupling, factor
+            tuple(self.attitude), x, dt, tuple(part), decay, gyro, use, tuple(model.force_f), coupling, factor
         )
         columns = np.eye(6 + m)
         augmented_step.carry(columns, 0, 6 + m, phi11, phi12, coupling[:m], factor[:m], use[:m], m)
@@ -192,7 +196,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         R = tuple(quaternion.to_matrix(self.attitude).ravel())
         code = KIND_CODES[kind]
         count = augmented_step.fill_rows(
-            tuple(self.attitude), R, x, code, z, frame, length, 0, sensors, use, H, y, basis
+            tuple(self.attitude), R, x, code, z, frame, length, 0, sensors, use, (0.0,) * 9, H, y, basis
         )
         self._correct(y[:count].copy(), H[:count, : 6 + m].copy(), (basis @ noise @ basis.T)[:count, :count])
 

@@ -66,6 +66,9 @@ def main() -> None:
     except OSError as error:
         errors.print(f"error: {error}; check the path and the space left", soft_wrap=True)
         sys.exit(2)
+    except MemoryError as error:
+        errors.print(f"error: not enough memory ({error}); shorten the record, or lower the rates", soft_wrap=True)
+        sys.exit(2)
     except KeyboardInterrupt:
         errors.print("interrupted")
         sys.exit(130)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from strapdown.records import Estimate, ImuRecord
     from strapdown.setup import FilterSetup
 
-RECORD_ONLY = ("filter", "gate", "robust", "attitude", "from_truth", "every")
+RECORD_ONLY = ("filter", "gate", "robust", "states", "state", "attitude", "from_truth", "every")
 """Options that go with a record of `strapdown simulate`."""
 
 
@@ -63,6 +63,17 @@ def estimate(
     robust: Annotated[
         str | None, typer.Option(help="Record: weigh measurements by how far they lie off: huber or student.")
     ] = None,
+    states: Annotated[
+        bool,
+        typer.Option(
+            "--states",
+            help="Record: with a state for each error that gyro and sensors are specified with: scale, misalignment, drift, hard iron, …",
+        ),
+    ] = False,
+    state: Annotated[
+        list[str] | None,
+        typer.Option(help="Record: only this one of those states, such as gyro.scale or SENSOR.bias; may be repeated."),
+    ] = None,
     attitude: Annotated[
         str | None,
         typer.Option(help="Record: initial attitude body to fixed, w,x,y,z; without it from the first measurements."),
@@ -91,13 +102,32 @@ def estimate(
         for name in units:
             raise InputError(f"--{name}-unit goes with a CSV file; the record {recording} tells its units itself")
         _estimate_record(
-            recording, out, gyro, filter_file, gate, robust, attitude, from_truth, every, full_covariance is not False
+            recording,
+            out,
+            gyro,
+            filter_file,
+            gate,
+            robust,
+            tuple(state or ()) if states or state else None,
+            attitude,
+            from_truth,
+            every,
+            full_covariance is not False,
         )
         return
     options = dict(
         zip(
             RECORD_ONLY,
-            (filter_file, gate, robust, attitude, from_truth or None, None if every == 1 else every),
+            (
+                filter_file,
+                gate,
+                robust,
+                states or None,
+                state or None,
+                attitude,
+                from_truth or None,
+                None if every == 1 else every,
+            ),
             strict=True,
         )
     )
@@ -116,6 +146,7 @@ def _estimate_record(
     filter_file: Path | None,
     gate: float | None,
     robust: str | None,
+    states: tuple[str, ...] | None,
     attitude: str | None,
     from_truth: bool,
     every: int,
@@ -124,7 +155,8 @@ def _estimate_record(
     """Run the filter over a record, tell and write what it made of it."""
     import numpy as np
 
-    from strapdown import plots, setup
+    from strapdown import plots, records, setup
+    from strapdown.augmented import AugmentedEstimate
     from strapdown.checks import InputError, count
     from strapdown.files import write_json
     from strapdown.recordfiles import read_record_file
@@ -135,9 +167,11 @@ def _estimate_record(
     if gyro is not None and filter_file is not None:
         raise InputError("--gyro and --filter both tell the filter's belief of the gyro; give one of them")
     held = read_record_file(path)
-    chosen = _setup(path, held, gyro, filter_file)
+    chosen, remarks = _setup(path, held, gyro, filter_file, states)
     if gate is not None:
-        chosen = dataclasses.replace(chosen, gate=Gate(probability=gate))
+        # A challenger that starts anew would know nothing of optional states.
+        own = Gate(probability=gate) if chosen.states is None else Gate(probability=gate, recovery=None)
+        chosen = dataclasses.replace(chosen, gate=own)
     if robust is not None:
         chosen = dataclasses.replace(chosen, robust=Robust(kind=robust))  # type: ignore[arg-type]
     believed = setup.believed(held.record, chosen)
@@ -145,8 +179,16 @@ def _estimate_record(
         raise InputError(
             f"every is {every}, more than the {len(believed.increments)} filter steps of the record; only the start would be kept"
         )
-    initial, words = _initial(believed, held, chosen, attitude, from_truth)
-    result = setup.run(held.record, chosen, initial, every=every, full_covariance=full_covariance)
+    initial, words, first = _initial(believed, held, chosen, attitude, from_truth)
+    used = held.record
+    if first > 0:
+        used = records.cut(used, first * chosen.integration.samples, len(used.increments))
+        believed = records.cut(believed, first, len(believed.increments))
+        if every > len(believed.increments):
+            raise InputError(
+                f"every is {every}, and {len(believed.increments)} filter steps are left from the start on"
+            )
+    result = setup.run(used, chosen, initial, every=every, full_covariance=full_covariance)
     truth = None
     if believed.truth is not None:
         truth = Truth(attitude=believed.truth.attitude[::every], bias=believed.truth.bias[::every])
@@ -155,6 +197,10 @@ def _estimate_record(
         f"{path.name}: {len(held.record.increments)} gyro samples over {length:.6g} s, "
         f"{', '.join(f'{len(s.time)} of {s.sensor}' for s in held.record.vectors) or 'no measurements'}. {words}"
     )
+    for remark in remarks:
+        console.print(remark, soft_wrap=True)
+    if gate is not None and chosen.states is not None:
+        console.print("With optional states the gate refuses, but does not recover a lost attitude.")
     _tell(result)
     paths = [out / "estimate.h5"]
     attributes: dict[str, Any] = {"source": str(path), "filter": setup.to_toml(chosen), "start": words}
@@ -162,6 +208,9 @@ def _estimate_record(
         attributes["scenario"] = held.scenario
     attributes |= {name: value for name, value in (("seed", held.seed), ("run", held.run)) if value is not None}
     write_estimate(paths[0], result, attributes, truth=truth)
+    if isinstance(result, AugmentedEstimate) and result.blocks:
+        paths.append(out / "states.json")
+        write_json(paths[-1], {"source": str(path), **_tell_states(result)})
     figures = {"estimate.png": plots.estimate_overview(result, title=path.name)}
     if truth is not None:
         figures["errors.png"] = plots.error_overview(result, truth, title=path.name)
@@ -182,24 +231,94 @@ def _estimate_record(
     written(*paths, *(plots.save(figure, out / name) for name, figure in figures.items()))
 
 
-def _setup(path: Path, held: RecordFile, gyro: Path | None, filter_file: Path | None) -> FilterSetup:
-    """Return the filter: of a file, or matched to the gyro's specification and what the sensors say of themselves."""
+def _setup(
+    path: Path, held: RecordFile, gyro: Path | None, filter_file: Path | None, states: tuple[str, ...] | None
+) -> tuple[FilterSetup, list[str]]:
+    """Return the filter, and what to say of it: of a file, or matched to the gyro's specification and what the sensors say of themselves.
+
+    ``states`` None: of attitude and bias alone; empty: with all states that the specified errors call for.
+    """
     from strapdown import setup
+    from strapdown.augmented import States
     from strapdown.checks import InputError
     from strapdown.gyro import read_spec
+    from strapdown.scenarios import scenario_from_toml
 
     if filter_file is not None:
-        return setup.read_setup(filter_file)
+        if states is not None:
+            raise InputError(
+                "--filter tells the filter's states itself, in [filter.states]; leave --states and --state out"
+            )
+        return setup.read_setup(filter_file), []
     spec = held.gyro if gyro is None else read_spec(gyro)
     if spec is None:
         raise InputError(f"{path} does not tell the gyro's specification; give --gyro or --filter, a TOML file")
-    return setup.matched_to_record(spec, held.record)
+    if states is None:
+        return setup.matched_to_record(spec, held.record), []
+    if not held.scenario:
+        chosen = setup.matched_to_record(spec, held.record, states=True)
+        remarks = [
+            f"{path.name} does not tell its scenario, so the errors of its sensors are not known: no state for them."
+        ]
+        missing = setup.not_covered(spec, (), chosen.states)
+    else:
+        scenario = scenario_from_toml(held.scenario, f"{path}: scenario")
+        chosen = setup.matched_to_record(
+            spec, held.record, states=True, sensors=scenario.sensors, gravity_f=scenario.gravity_f
+        )
+        remarks = []
+    optional = chosen.states or States()
+    if states:
+        optional = optional.chosen(states)
+    chosen = dataclasses.replace(chosen, states=optional)
+    if held.scenario:
+        missing = setup.not_covered(spec, scenario.sensors, optional, gravity_f=scenario.gravity_f)
+    if not optional.names:
+        remarks.append("No error is specified that would call for an optional state; the filter has none.")
+        chosen = dataclasses.replace(chosen, states=None)
+    else:
+        remarks.append(f"Optional states: {', '.join(optional.names)}.")
+    if missing:
+        remarks.append(f"Still without a state: {', '.join(missing)}.")
+    return chosen, remarks
+
+
+_STATE_UNITS = {
+    "gyro scale": {"1": ("ppm", 1e-6), "rad": ("mrad", 1e-3)},
+    "gyro drift": {"rad/s": ("°/h", 0.0)},
+    "gyro force": {"rad s/m": ("°/h/g", 0.0)},
+}
+
+
+def _tell_states(result: Any) -> dict[str, Any]:
+    """Show the optional states at the end, and return them for JSON."""
+    from strapdown.units import DEGREE_PER_HOUR, STANDARD_GRAVITY
+
+    rows = table("Optional states at the end", "state", "", "unit", "value", "σ", "σ at the start", left=3)
+    found: dict[str, Any] = {}
+    for name, block in result.blocks.items():
+        found[name] = {
+            "components": list(block.components),
+            "units": list(block.units),
+            "values": block.values[-1].tolist(),
+            "sigma": block.sigma[-1].tolist(),
+            "first_sigma": block.sigma[0].tolist(),
+        }
+        for k, (component, unit) in enumerate(zip(block.components, block.units, strict=True)):
+            kind = " ".join(name.split()[:2])
+            word, size = _STATE_UNITS.get(kind, {}).get(unit, (unit, 1.0))
+            if size == 0.0:
+                size = DEGREE_PER_HOUR / (STANDARD_GRAVITY if kind == "gyro force" else 1.0)
+            values = (block.values[-1, k], block.sigma[-1, k], block.sigma[0, k])
+            rows.add_row(name, component, word, *(f"{value / size:.4g}" for value in values))
+    show(rows)
+    return found
 
 
 def _initial(
     record: ImuRecord, held: RecordFile, chosen: FilterSetup, attitude: str | None, from_truth: bool
-) -> tuple[State, str]:
-    """Return the initial state and how it came about."""
+) -> tuple[State, str, int]:
+    """Return the initial state, how it came about, and the filter's edge that it stands at."""
     import numpy as np
 
     from strapdown import mekf, quaternion, setup
@@ -216,20 +335,60 @@ def _initial(
             raise InputError(f"--attitude is {attitude!r}; give four numbers w,x,y,z") from None
         if q.shape != (4,) or np.linalg.norm(q) == 0.0:
             raise InputError(f"--attitude is {attitude!r}; give four numbers w,x,y,z, not all zero")
-        return setup.initial_state(chosen, q / np.linalg.norm(q)), "Started from the attitude given."
+        return setup.initial_state(chosen, q / np.linalg.norm(q)), "Started from the attitude given.", 0
     if from_truth:
         if record.truth is None:
             raise InputError("--from-truth needs a record with the truth; this one has none")
         draw = generator(held.seed or 0, held.run or 0, "initial error").standard_normal(6)
         q = quaternion.multiply(record.truth.attitude[0], quaternion.exp(-chosen.attitude_sigma * draw[:3]))
         bias = record.truth.bias[0] - chosen.bias_sigma * draw[3:]
-        return setup.initial_state(chosen, q, bias), "Started from the truth, off by errors drawn from the filter's σ."
+        words = "Started from the truth, off by errors drawn from the filter's σ."
+        return setup.initial_state(chosen, q, bias), words, 0
     try:
         state = mekf.first_state(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
     except InputError as error:
-        raise InputError(f"{error} by --attitude, or --from-truth") from None
+        return _banked(record, chosen, str(error))
     sigma = float(np.sqrt(np.trace(state.covariance[:3, :3]) / 3.0)) / DEGREE
-    return state, f"Started from the first measurements, σ {sigma:.3g}° an axis."
+    return state, f"Started from the first measurements, σ {sigma:.3g}° an axis.", 0
+
+
+def _banked(record: ImuRecord, chosen: FilterSetup, problem: str) -> tuple[State, str, int]:
+    """Return the state that a bank of hypotheses finds, where the first measurements do not give the attitude."""
+    import numpy as np
+
+    from strapdown import bank, mekf
+    from strapdown.checks import InputError
+    from strapdown.units import DEGREE
+
+    problem = problem.removesuffix("; give the initial attitude")
+    try:
+        found = bank.run(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
+    except InputError as error:
+        raise InputError(
+            f"{problem}, nor does a bank of hypotheses ({error}); give --attitude, or --from-truth"
+        ) from None
+    if not found.converged:
+        raise InputError(
+            f"{problem}, nor does a bank of hypotheses: {found.reason}; or give --attitude, or --from-truth"
+        )
+    edge = int(np.searchsorted(record.time, found.became_one))
+    if edge >= len(record.increments):
+        raise InputError(
+            f"{problem}, and a bank of hypotheses found it only at the end; record longer, or give --attitude"
+        )
+    row = int(np.searchsorted(found.estimate.time, found.became_one))
+    assert found.estimate.covariance is not None
+    state = mekf.State(
+        attitude=found.estimate.attitude[row],
+        bias=found.estimate.bias[row],
+        covariance=found.estimate.covariance[row],
+    )
+    sigma = float(np.sqrt(np.trace(state.covariance[:3, :3]) / 3.0)) / DEGREE
+    words = (
+        f"One direction at a time does not give the attitude at once: {len(found.angles)} hypotheses about it became one at "
+        f"{found.became_one:.6g} s, σ {sigma:.3g}° an axis; the estimate begins there."
+    )
+    return state, words, edge
 
 
 def _tell(result: Estimate) -> None:

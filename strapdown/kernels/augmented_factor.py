@@ -114,3 +114,35 @@ def covariances(F, size, out, row):
                 total += F[j, a] * F[j, b]
             out[row, a, b] = total
             out[row, b, a] = total
+
+
+def whole_bias(F, size, gyro, gyro_use, mark, variance_out, covariance_out, row, work):
+    """Write variances (6,), and the covariance (6, 6) where there is room for it, of attitude and *whole* gyro bias to a row.
+
+    The whole bias is ``b + Σ c e`` over the states that are an offset of the gyro, those with the bit ``mark``; what else the gyro gets
+    wrong, by its scale or by the specific force, is none. ``work`` (6, 6) is scratch.
+    """
+    for a in range(6):
+        for b in range(6):
+            work[a, b] = 0.0
+    for j in range(size):
+        x = F[j, 3]
+        y = F[j, 4]
+        z = F[j, 5]
+        for k in range(len(gyro_use)):
+            if gyro_use[k] & mark:
+                f = F[j, 6 + k]
+                x += gyro[k, 0] * f
+                y += gyro[k, 1] * f
+                z += gyro[k, 2] * f
+        t = (F[j, 0], F[j, 1], F[j, 2], x, y, z)
+        for a in range(6):
+            for b in range(a, 6):
+                work[a, b] += t[a] * t[b]
+    for a in range(6):
+        variance_out[row, a] = work[a, a]
+    if row < len(covariance_out):
+        for a in range(6):
+            for b in range(a, 6):
+                covariance_out[row, a, b] = work[a, b]
+                covariance_out[row, b, a] = work[a, b]

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 from strapdown.kernels.algebra import dot
-from strapdown.kernels.augmented_factor import covariances, take_row, triangularise, variances
+from strapdown.kernels.augmented_factor import covariances, take_row, triangularise, variances, whole_bias
 from strapdown.kernels.augmented_step import (
+    OFFSET,
+    arm_noise,
     carry,
     carry_back,
     decorrelate,
@@ -13,8 +17,11 @@ from strapdown.kernels.augmented_step import (
     longest_step,
     move,
     turn_rows,
+    turning_matrix,
 )
-from strapdown.kernels.filter_loop import ATTITUDE, vector_at
+from strapdown.kernels.filter_loop import ATTITUDE, DIRECTION, vector_at
+from strapdown.kernels.robust_loop import six_at
+from strapdown.kernels.robust_step import behind, innovation_factors, robust_weight
 from strapdown.kernels.rotation import logarithm, quaternion_multiply, right_jacobian, rotation_matrix, turned, unit
 from strapdown.kernels.smoother_step import inverse_right_jacobian, moved
 
@@ -49,6 +56,32 @@ def load_segment(segments, k, x, F, size):
     return (segments[k, 4], segments[k, 5], segments[k, 6], segments[k, 7])
 
 
+X = (1.0, 0.0, 0.0)
+Y = (0.0, 1.0, 0.0)
+Z = (0.0, 0.0, 1.0)
+
+
+def predicted_rows(F, size, H, rows, work):
+    """Return the upper triangle of H P Hᵀ as a 6-tuple, rows that are not there as zeros; ``work`` (3, size) is scratch."""
+    for r in range(3):
+        for j in range(size):
+            total = 0.0
+            if r < rows:
+                for i in range(j + 1):
+                    total += F[j, i] * H[r, i]
+            work[r, j] = total
+    s00 = s01 = s02 = s11 = s12 = s22 = 0.0
+    for j in range(size):
+        a, b, c = work[0, j], work[1, j], work[2, j]
+        s00 += a * a
+        s01 += a * b
+        s02 += a * c
+        s11 += b * b
+        s12 += b * c
+        s22 += c * c
+    return (s00, s01, s02, s11, s12, s22)
+
+
 def run_augmented(
     edges,
     increments,
@@ -62,6 +95,7 @@ def run_augmented(
     gyro_use,
     sensors,
     sensor_use,
+    force_f,
     event_time,
     event_kind,
     event_value,
@@ -70,7 +104,12 @@ def run_augmented(
     event_length,
     event_sensor,
     event_reference,
+    event_turning,
     triads,
+    thresholds,
+    robust,
+    robust_parameters,
+    robust_passes,
     attitude,
     x,
     F,
@@ -80,20 +119,27 @@ def run_augmented(
     x_out,
     variance_out,
     covariance_out,
+    whole_variance_out,
+    whole_covariance_out,
     innovation_out,
+    weight_out,
     segment_out,
 ):
     """Run the filter over a record; the splitting of intervals is that of :func:`strapdown.kernels.filter_loop.run_filter`.
 
     ``attitude`` (4,), ``x`` and the triangle at the top of ``F`` hold the state and are left at the end state; the rest of F takes the rows
-    of noise. ``scratch`` holds arrays (states, 3), (states,), (3, size), (3,), (3,), (3, 3), (size,) and one as wide as F. ``limit``
-    bounds a step by the states that decay. ``event_noise``, ``covariance_out`` and ``segment_out`` may be empty.
+    of noise. ``scratch`` holds arrays (states, 3), (states,), (3, size), (3,), (3,), (3, 3), (size,), one as wide as F, (3, size) and
+    (6, 6). ``limit`` bounds a step by the states that decay. ``event_turning`` (events, 9) has the measured rate and the angular
+    acceleration of each event, and the variances of the latter's axes, 0 for sensors without a lever arm. It may be empty, as
+    ``event_noise``, the two covariances, ``whole_variance_out`` and ``segment_out`` may. ``thresholds`` (3,), ``robust`` and its parameters
+    are those of :func:`strapdown.kernels.robust_loop.run_robust`; they are looked at where ``weight_out`` (events,) is not empty, and each
+    innovation then has the variance of the nominal noise.
     Returns the number of segments stored.
     """
     size = len(x) + 3
     noisy = 6 + changing
     q = (attitude[0], attitude[1], attitude[2], attitude[3])
-    coupling, factor, H, y, spread, basis, correction, work = scratch
+    coupling, factor, H, y, spread, basis, correction, work, seen, six = scratch
     events = len(event_time)
     e = 0
     k = -1  # the interval before the first edge has no length; its end takes the events at the first edge
@@ -121,7 +167,7 @@ def run_augmented(
             if segments < len(segment_out):
                 store_segment(segment_out, segments, dt, part, q, x, F, size)
                 segments += 1
-            q, phi11, phi12, rate, D = move(q, x, dt, part, decay, gyro, gyro_use, coupling, factor)
+            q, phi11, phi12, rate, D = move(q, x, dt, part, decay, gyro, gyro_use, force_f, coupling, factor)
             carry(F, 0, size, phi11, phi12, coupling, factor, gyro_use, changing)
             rows = fill_noise(F, size, size, dt, rate, D, angle_variance, rate_variance, decay, density, gyro, gyro_use)
             triangularise(F, noisy, 3, size, rows, 0, 0, work)
@@ -142,30 +188,79 @@ def run_augmented(
             z = vector_at(event_value, e)
             R = rotation_matrix(q)
             s = event_sensor[e]
-            rows = fill_rows(q, R, x, event_kind[e], z, frame, event_length[e], s, sensors, sensor_use, H, y, basis)
+            kind = event_kind[e]
+            W = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+            if len(event_turning) > 0:
+                turn = (event_turning[e, 0] - x[0], event_turning[e, 1] - x[1], event_turning[e, 2] - x[2])
+                W = turning_matrix(turn, (event_turning[e, 3], event_turning[e, 4], event_turning[e, 5]))
+            rows = fill_rows(q, R, x, kind, z, frame, event_length[e], s, sensors, sensor_use, W, H, y, basis)
             for r in range(rows):
-                spread[r] = event_value[e, r] if event_kind[e] == ATTITUDE else event_variance[e]
-            if len(event_noise) > 0:
-                decorrelate(H, y, rows, basis, event_noise, e, spread)
-            for i in range(size):
-                correction[i] = 0.0
-            for r in range(rows):
-                error = y[r]
+                spread[r] = event_value[e, r] if kind == ATTITUDE else event_variance[e]
+                if kind == DIRECTION:
+                    spread[r] *= basis[r, 0] ** 2 + basis[r, 1] ** 2 + basis[r, 2] ** 2
+            levered = len(event_turning) > 0 and event_turning[e, 6] > 0.0
+            if levered or len(event_noise) > 0:
+                C = (event_variance[e], 0.0, 0.0, event_variance[e], 0.0, event_variance[e])
+                if len(event_noise) > 0:
+                    C = six_at(event_noise, e)
+                if levered:
+                    noise = (event_turning[e, 6], event_turning[e, 7], event_turning[e, 8])
+                    C = arm_noise(x, s, sensors, sensor_use, event_length[e], noise, C)
+                decorrelate(H, y, rows, basis, C, spread)
+            accepted = True
+            if len(weight_out) > 0:
+                variance = (spread[0], spread[1] if rows > 1 else 1.0, spread[2] if rows > 2 else 1.0)
+                error3 = (y[0], y[1] if rows > 1 else 0.0, y[2] if rows > 2 else 0.0)
+                A = predicted_rows(F, size, H, rows, seen)
+                factors = innovation_factors(A, X, Y, Z, variance)
+                e1 = error3[0]
+                e2 = error3[1] - factors[0] * e1
+                e3 = error3[2] - factors[1] * e1 - factors[2] * e2
+                threshold = thresholds[rows - 1]
+                accepted = e1 * e1 * factors[3] + e2 * e2 * factors[4] + e3 * e3 * factors[5] <= threshold
+                if threshold < math.inf and behind(kind, R, z, frame):
+                    accepted = False
+                weight = 0.0
+                if accepted:
+                    weight = 1.0
+                    if robust > 0:
+                        parameter = robust_parameters[rows - 1, 0]
+                        numerator = robust_parameters[rows - 1, 1]
+                        weight = robust_weight(
+                            robust, parameter, numerator, robust_passes, A, X, Y, Z, error3, variance
+                        )
+                        for r in range(rows):
+                            spread[r] /= weight
+                weight_out[e] = weight
+                innovation_out[e, 0] = e1
+                innovation_out[e, 1] = 1.0 / factors[3]
+                if rows > 1:
+                    innovation_out[e, 2] = e2
+                    innovation_out[e, 3] = 1.0 / factors[4]
+                if rows > 2:
+                    innovation_out[e, 4] = e3
+                    innovation_out[e, 5] = 1.0 / factors[5]
+            if accepted:
                 for i in range(size):
-                    error -= H[r, i] * correction[i]  # what the rows before it have corrected
-                s2 = take_row(F, size, H, r, spread[r], work)
-                for i in range(size):
-                    correction[i] += error / s2 * work[i]
-                innovation_out[e, 2 * r] = error
-                innovation_out[e, 2 * r + 1] = s2
-            a = (correction[0], correction[1], correction[2])
-            q = turned(q, a)
-            if dot(a, a) > 1.0:
-                q = unit(q)
-            for i in range(len(x)):
-                x[i] += correction[3 + i]
-            turn_rows(F, size, right_jacobian(a))
-            triangularise(F, 3, 3, size, size, 0, 0, work)
+                    correction[i] = 0.0
+                for r in range(rows):
+                    error = y[r]
+                    for i in range(size):
+                        error -= H[r, i] * correction[i]  # what the rows before it have corrected
+                    s2 = take_row(F, size, H, r, spread[r], work)
+                    for i in range(size):
+                        correction[i] += error / s2 * work[i]
+                    if len(weight_out) == 0:
+                        innovation_out[e, 2 * r] = error
+                        innovation_out[e, 2 * r + 1] = s2
+                a = (correction[0], correction[1], correction[2])
+                q = turned(q, a)
+                if dot(a, a) > 1.0:
+                    q = unit(q)
+                for i in range(len(x)):
+                    x[i] += correction[3 + i]
+                turn_rows(F, size, right_jacobian(a))
+                triangularise(F, 3, 3, size, size, 0, 0, work)
             e += 1
         if now >= end and (e == events or event_time[e] > end):
             if countdown == 0:
@@ -176,6 +271,8 @@ def run_augmented(
                 variances(F, size, variance_out, row)
                 if row < len(covariance_out):
                     covariances(F, size, covariance_out, row)
+                if row < len(whole_variance_out):
+                    whole_bias(F, size, gyro, gyro_use, OFFSET, whole_variance_out, whole_covariance_out, row, six)
                 row += 1
             countdown -= 1
             k += 1
@@ -198,6 +295,7 @@ def smooth_augmented(
     changing,
     gyro,
     gyro_use,
+    force_f,
     x,
     F,
     later_x,
@@ -241,7 +339,7 @@ def smooth_augmented(
         q = load_segment(segments, j, x, F, size)
         dt = segments[j, 0]
         part = (segments[j, 1], segments[j, 2], segments[j, 3])
-        predicted, phi11, phi12, rate, D = move(q, x, dt, part, decay, gyro, gyro_use, coupling, factor)
+        predicted, phi11, phi12, rate, D = move(q, x, dt, part, decay, gyro, gyro_use, force_f, coupling, factor)
         carry(F, 0, size, phi11, phi12, coupling, factor, gyro_use, changing)
         rows = fill_noise(F, size, size, dt, rate, D, angle_variance, rate_variance, decay, density, gyro, gyro_use)
         p = rows - size

@@ -5,11 +5,12 @@ State: attitude ``q_fb``; ``x`` = (b, c): gyro bias and optional states c; facto
 
 - each decays at its own rate and is driven by its own white noise, ``ċ = −λ c + √q w``: ``decay`` λ, ``density`` q. Those that change come
   first, those with neither come last.
-- the gyro measures ``(I + Σ c T) w + b + Σ c e + n``: ``gyro`` (states, 12) holds e (3) and T (9, by rows), ``gyro_use`` the bits
-  :data:`OFFSET` and :data:`SCALE`.
+- the gyro measures ``(I + Σ c T) w + b + Σ c e + Σ c G R_fbᵀ f + n``, f the specific force of a body at rest, fixed frame: ``gyro``
+  (states, 12) holds e (3) and T or G (9, by rows), ``gyro_use`` the bits :data:`OFFSET`, :data:`SCALE` and :data:`FORCE`.
 - a sensor measures ``(I + Σ c U) R_fbᵀ (r + Σ c d) + Σ c a + v``: ``sensors`` (sensors, states, 15) holds a (3, body), d (3, fixed) and
   U (9), ``sensor_use`` the bits :data:`OFFSET`, :data:`FIXED` and :data:`SCALE`. With :data:`CARRIED` besides, d is not firm in the
   fixed frame but goes along when the estimated attitude is corrected: the derivative with respect to the attitude leaves it out.
+  With :data:`LEVER` in place of OFFSET the offset is W a, ``W = [ẇ] + [w]²``: the acceleration at an arm a from the centre of turning.
 
 All but the square roots is plain arithmetic, so that the same functions serve the step-by-step face.
 """
@@ -34,7 +35,7 @@ from strapdown.kernels.algebra import (
 )
 from strapdown.kernels.filter_loop import ATTITUDE, DIRECTION, HEADING, heading_error
 from strapdown.kernels.filter_step import process_noise, transition
-from strapdown.kernels.rotation import logarithm, quaternion_multiply, turned
+from strapdown.kernels.rotation import logarithm, quaternion_multiply, rotation_matrix, turned
 from strapdown.kernels.series import LARGEST_ANGLE, second, sinc
 from strapdown.kernels.smoother_step import moved
 
@@ -42,6 +43,8 @@ OFFSET = 1
 SCALE = 2
 FIXED = 4
 CARRIED = 8
+FORCE = 16
+LEVER = 32
 
 NOISE_NODES = 3
 """Rows of noise of a state that enters the gyro: its own white noise at so many instants of a step stands for the whole of it."""
@@ -104,20 +107,53 @@ def longest_step(dt, theta, limit):
     return min(longest, limit)
 
 
-def move(q, x, dt, part, decay, gyro, gyro_use, coupling, factor):
+def gyro_matrix_times(gyro, k, v):
+    """Return T v of a state's matrix T."""
+    return (
+        gyro[k, 3] * v[0] + gyro[k, 4] * v[1] + gyro[k, 5] * v[2],
+        gyro[k, 6] * v[0] + gyro[k, 7] * v[1] + gyro[k, 8] * v[2],
+        gyro[k, 9] * v[0] + gyro[k, 10] * v[1] + gyro[k, 11] * v[2],
+    )
+
+
+def turning_matrix(rate, acceleration):
+    """Return W = [ẇ] + [w]², by which a lever arm becomes an acceleration, body axes."""
+    x, y, z = rate
+    a, b, c = acceleration
+    return (
+        -(y * y + z * z),
+        x * y - c,
+        x * z + b,
+        x * y + c,
+        -(x * x + z * z),
+        y * z - a,
+        x * z - b,
+        y * z + a,
+        -(x * x + y * y),
+    )
+
+
+def move(q, x, dt, part, decay, gyro, gyro_use, force_f, coupling, factor):
     """Move attitude and optional states over an increment ``part``; return q, Φ11, Φ12 and the rate.
 
     Leaves in ``coupling`` (states, 3) the attitude's share of each optional state, Φ_θc, and in ``factor`` their own e^{−λ dt}.
     With M = Σ c T the turn is ``φ = (I + M)⁻¹ (Δθ − b dt − Σ e ∫c dt)``, and its error ``−(I + M)⁻¹ (δb + Σ e δc + Σ T ω δc)`` a second.
+    The specific force is taken at the middle of the step; how it changes with the attitude *error* is neglected, as it is small beside
+    the bias that it makes.
     """
     r = combine(1.0, part, -dt, (x[0], x[1], x[2]))
     M = IDENTITY
     scaled = False
+    force = (0.0, 0.0, 0.0)
+    if dot(force_f, force_f) > 0.0:
+        force = transpose_times_vector(rotation_matrix(turned(q, scale(0.5, r))), force_f)
     for k in range(len(decay)):
         factor[k] = math.exp(-decay[k] * dt)
         if gyro_use[k] & OFFSET:
             mean = -math.expm1(-decay[k] * dt) / decay[k] if decay[k] > 0.0 else dt
             r = combine(1.0, r, -mean * x[3 + k], (gyro[k, 0], gyro[k, 1], gyro[k, 2]))
+        if gyro_use[k] & FORCE:
+            r = combine(1.0, r, -dt * x[3 + k], gyro_matrix_times(gyro, k, force))
         if gyro_use[k] & SCALE:
             scaled = True
             c = x[3 + k]
@@ -150,12 +186,9 @@ def move(q, x, dt, part, decay, gyro, gyro_use, coupling, factor):
             else:
                 column = matrix_times_vector(phi12, e)
         if gyro_use[k] & SCALE:
-            told = (
-                gyro[k, 3] * rate[0] + gyro[k, 4] * rate[1] + gyro[k, 5] * rate[2],
-                gyro[k, 6] * rate[0] + gyro[k, 7] * rate[1] + gyro[k, 8] * rate[2],
-                gyro[k, 9] * rate[0] + gyro[k, 10] * rate[1] + gyro[k, 11] * rate[2],
-            )
-            column = add(column, matrix_times_vector(phi12, told))
+            column = add(column, matrix_times_vector(phi12, gyro_matrix_times(gyro, k, rate)))
+        if gyro_use[k] & FORCE:
+            column = add(column, matrix_times_vector(phi12, gyro_matrix_times(gyro, k, force)))
         coupling[k, 0], coupling[k, 1], coupling[k, 2] = column
         x[3 + k] *= factor[k]
     return turned(q, phi), phi11, phi12, rate, D
@@ -293,12 +326,21 @@ def put_row(H, row, h):
     H[row, 0], H[row, 1], H[row, 2] = h
 
 
-def fill_rows(q, R, x, kind, z, frame, length, s, sensors, sensor_use, H, y, basis):
+def offset_of(sensors, sensor_use, s, k, W):
+    """Return how state k shifts the vector of sensor s, body axes."""
+    a = (sensors[s, k, 0], sensors[s, k, 1], sensors[s, k, 2])
+    if sensor_use[s, k] & LEVER:
+        a = matrix_times_vector(W, a)
+    return a
+
+
+def fill_rows(q, R, x, kind, z, frame, length, s, sensors, sensor_use, W, H, y, basis):
     """Write the rows of one measurement, ``y = H δx + noise``, and return how many: 2 direction, 3 vector, 1 heading, 3 attitude.
 
-    ``frame`` is the row of the schedule's frames as a 9-tuple, ``z`` the measured vector and ``length`` what it was divided by.
+    ``frame`` is the row of the schedule's frames as a 9-tuple, ``z`` the measured vector and ``length`` what it was divided by, or of a
+    direction or heading the strength of what is measured. ``W`` is the :func:`turning_matrix` of the instant, for lever arms.
     ``sensor_use`` may be all zero: then the rows are those of the plain filter. ``basis`` (3, 3) gets the body axes that the rows
-    measure along.
+    measure along; of a direction that its states make longer or shorter, over that length: so its noise is, too.
     """
     states = len(x) - 3
     for i in range(3):
@@ -316,8 +358,8 @@ def fill_rows(q, R, x, kind, z, frame, length, s, sensors, sensor_use, H, y, bas
         if use != 0:
             coupled = True
             c = x[3 + k]
-            if use & OFFSET:
-                offset = combine(1.0, offset, c / length, (sensors[s, k, 0], sensors[s, k, 1], sensors[s, k, 2]))
+            if use & (OFFSET | LEVER):
+                offset = combine(1.0, offset, c / length, offset_of(sensors, sensor_use, s, k, W))
             if use & FIXED:
                 d = (sensors[s, k, 3], sensors[s, k, 4], sensors[s, k, 5])
                 if use & CARRIED:
@@ -350,18 +392,25 @@ def fill_rows(q, R, x, kind, z, frame, length, s, sensors, sensor_use, H, y, bas
         clean = matrix_times_vector(D, subtract(z, offset))
         p = subtract(matrix_times_vector(R, clean), carried)
         m = subtract(p, fixed)
+        y[0] = heading_error(IDENTITY, m, r)
+        if coupled:
+            # Derivatives where the heading is what is expected: those at the measured one go by its noise, which the offsets would follow.
+            stretch = math.sqrt((m[0] * m[0] + m[1] * m[1]) / (r[0] * r[0] + r[1] * r[1]))
+            m = (stretch * r[0], stretch * r[1], m[2])
+            p = add(m, fixed)
+            clean = transpose_times_vector(R, add(p, carried))
         level = 1.0 / (m[0] * m[0] + m[1] * m[1])
         g = (-level * m[1], level * m[0], 0.0)
         put_row(H, 0, transpose_times_vector(R, cross(p, g)))
-        y[0] = heading_error(IDENTITY, m, r)
         for k in range(states):
             use = sensor_use[s, k]
             if use != 0:
-                e = (sensors[s, k, 0], sensors[s, k, 1], sensors[s, k, 2])
+                e = scale(1.0 / length, offset_of(sensors, sensor_use, s, k, W))
+                d = scale(1.0 / length, (sensors[s, k, 3], sensors[s, k, 4], sensors[s, k, 5]))
                 if use & SCALE:
                     e = add(e, matrix_times_vector(matrix_at(sensors, s, k), clean))
                 e = matrix_times_vector(R, matrix_times_vector(D, e))
-                H[0, 6 + k] = -dot(g, add(e, (sensors[s, k, 3], sensors[s, k, 4], sensors[s, k, 5])))
+                H[0, 6 + k] = -dot(g, add(e, d))
         return 1
     u = transpose_times_vector(R, (frame[0], frame[1], frame[2]))
     v = transpose_times_vector(R, (frame[3], frame[4], frame[5]))
@@ -388,13 +437,13 @@ def fill_rows(q, R, x, kind, z, frame, length, s, sensors, sensor_use, H, y, bas
     for i in range(rows):
         t = u if i == 0 else (v if i == 1 else third)
         y[i] = dot(t, residual)
-        put_row(basis, i, t)
+        put_row(basis, i, scale(shrink, t))
         # ∂m/∂δθ = (I + M) [R_fbᵀ (r + d)], and t · (A × δθ) = (t × A) · δθ
         put_row(H, i, scale(shrink, cross(transpose_times_vector(M, t), turnable)))
         for k in range(states):
             use = sensor_use[s, k]
             if use != 0:
-                e = (sensors[s, k, 0], sensors[s, k, 1], sensors[s, k, 2])
+                e = offset_of(sensors, sensor_use, s, k, W)
                 if use & FIXED:
                     d = transpose_times_vector(R, (sensors[s, k, 3], sensors[s, k, 4], sensors[s, k, 5]))
                     e = add(e, matrix_times_vector(M, d))
@@ -405,12 +454,27 @@ def fill_rows(q, R, x, kind, z, frame, length, s, sensors, sensor_use, H, y, bas
     return rows
 
 
-def decorrelate(H, y, rows, basis, noise, e, spread):
-    """Make the rows of a measurement independent, whose noise in body axes has the upper triangle noise[e]; write their variances.
+def arm_noise(x, s, sensors, sensor_use, length, variance, C):
+    """Return C and what the gyro's angular acceleration, of these variances about the axes, adds to it: ``[r] diag(variance) [r]ᵀ``."""
+    r = (0.0, 0.0, 0.0)
+    for k in range(len(x) - 3):
+        if sensor_use[s, k] & LEVER:
+            r = combine(1.0, r, x[3 + k] / length, (sensors[s, k, 0], sensors[s, k, 1], sensors[s, k, 2]))
+    return (
+        C[0] + r[2] * r[2] * variance[1] + r[1] * r[1] * variance[2],
+        C[1] - r[0] * r[1] * variance[2],
+        C[2] - r[0] * r[2] * variance[1],
+        C[3] + r[2] * r[2] * variance[0] + r[0] * r[0] * variance[2],
+        C[4] - r[1] * r[2] * variance[0],
+        C[5] + r[1] * r[1] * variance[0] + r[0] * r[0] * variance[1],
+    )
+
+
+def decorrelate(H, y, rows, basis, C, spread):
+    """Make the rows of a measurement independent, whose noise in body axes has the covariance C (6-tuple); write their variances.
 
     With ``T C Tᵀ = L D Lᵀ`` for the rows' axes T, the rows ``L⁻¹ H`` have noise of variances D.
     """
-    C = (noise[e, 0], noise[e, 1], noise[e, 2], noise[e, 3], noise[e, 4], noise[e, 5])
     t0 = (basis[0, 0], basis[0, 1], basis[0, 2])
     t1 = (basis[1, 0], basis[1, 1], basis[1, 2])
     t2 = (basis[2, 0], basis[2, 1], basis[2, 2])

@@ -5,6 +5,7 @@ A scenario is a TOML file, units in the names of its keys; the built-in ones (``
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import os
 import tomllib
@@ -112,6 +113,31 @@ def simulate(scenario: Scenario, seed: int | None = None, run: int = 0) -> ImuRe
     )
     truth = Truth(attitude=scenario.motion.attitude(edges), bias=bias)
     return ImuRecord(time=stamps, increments=increments, vectors=series, truth=truth)
+
+
+def drawn(scenario: Scenario, seed: int, run: int = 0) -> Scenario:
+    """Return the scenario with another individual of its gyro and sensors: each fixed error times a standard normal.
+
+    The fixed errors (scale factor, misalignment, sensitivity to acceleration, hard iron, a sensor's bias, lever arm) are taken for standard
+    deviations, entry by entry, as a datasheet tells them. A filter with a state for each (``setup.matched(scenario, states=True)``) is
+    right on average over such individuals; on one whose errors all have one size and sign only nearly.
+    """
+    draw = generator(seed, run, "individual")
+
+    def each(errors: Array) -> Array:
+        return np.asarray(np.asarray(errors) * draw.standard_normal(np.shape(errors)))
+
+    errors: dict[str, Any] = {name: each(getattr(scenario.gyro, name)) for name in _FIXED_OF_THE_GYRO}
+    spec = dataclasses.replace(scenario.gyro, **errors)
+    sensors = []
+    for sensor in scenario.sensors:
+        own: dict[str, Any] = {name: each(getattr(sensor, name)) for name in _FIXED_OF_SENSORS if hasattr(sensor, name)}
+        sensors.append(dataclasses.replace(sensor, **own))  # type: ignore[type-var]
+    return dataclasses.replace(scenario, gyro=spec, gyro_preset="", sensors=tuple(sensors))
+
+
+_FIXED_OF_THE_GYRO = ("scale_factor", "misalignment", "g_sensitivity")
+_FIXED_OF_SENSORS = ("hard_iron", "bias", "lever_arm_b")
 
 
 # ------------------------------------------------------------------------------------------------------------------------ files
@@ -347,8 +373,6 @@ def _read_gyro(table: dict[str, Any], place: str) -> tuple[str, GyroSpec]:
     spec = datasheets.preset(name).spec
     if not table:
         return name, spec
-    import dataclasses
-
     return "", dataclasses.replace(spec, **tables.decode(table, gyro.FORM, place))
 
 

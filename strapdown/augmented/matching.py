@@ -1,0 +1,164 @@
+"""Which optional states the errors that a specification tells of call for, and with what σ."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from strapdown import flicker
+from strapdown.augmented.filtering import strength
+from strapdown.augmented.states import Entries, SensorStates, States
+from strapdown.checks import Array
+from strapdown.gyro import GyroSpec
+from strapdown.records import ImuRecord
+from strapdown.vectors import VectorMeasurements
+
+DECADE = 10.0
+"""Ratio of the time constants of neighbouring drifts: their sum follows 1/f within 6 %."""
+QUICK = 0.3
+"""A drift is a state if its time constant is at least this part of the filter's own."""
+UNSEEN = 1e4
+"""Part of the record's length that the quickest drift lasts where nothing is measured."""
+LEAST_STEPS = 10.0
+"""Gyro intervals that the quickest drift lasts at least."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Matched:
+    """States for a record, and what beside them changes."""
+
+    states: States
+    white: float
+    """PSD that the gyro's white noise gains by flicker too quick for a state, rad²/s."""
+
+
+def matched(spec: GyroSpec, record: ImuRecord, sensors: Sequence[Any], gravity_f: Array, density: float) -> Matched:
+    """Return the states that the specified errors of a gyro and of sensors call for on a record.
+
+    Each error is taken for one draw from a normal distribution whose σ is its size, entry by entry; one of zero is no state. Of flicker,
+    parts a decade apart from the record's length down to what the measurements can follow are states (their sum is 1/f within 6 %), what is
+    quicker is white noise of the attitude and a σ of the bias that is told.
+
+    Parameters
+    ----------
+    spec : GyroSpec
+    record : ImuRecord
+    sensors : sequence of sensors
+        Those of the scenario (:mod:`strapdown.vectors`); series of the record without one have no states.
+    gravity_f : (3,)
+        m/s².
+    density : float
+        Variance about an axis of a measurement times the interval between measurements, rad² s; infinite without any.
+    """
+    drift_sigma, drift_time, fast, white = _drifts(spec, record, density)
+    force = np.abs(spec.g_sensitivity) if np.any(gravity_f) else np.zeros((3, 3))
+    series = {one.sensor: one for one in record.vectors}
+    found = {}
+    for sensor in sensors:
+        if sensor.name in series and len(series[sensor.name].time):
+            states = _of_sensor(sensor, series[sensor.name])
+            if states != SensorStates():
+                found[sensor.name] = states
+    return Matched(
+        states=States(
+            gyro_scale_sigma=_entries(np.abs(spec.scale_factor)),
+            gyro_misalignment_sigma=_entries(np.abs(spec.misalignment)),
+            gyro_force_sigma=_entries(np.diag(force)),
+            gyro_cross_force_sigma=_entries(force - np.diag(np.diag(force))),
+            gyro_drift_sigma=drift_sigma,
+            gyro_drift_time=drift_time,
+            gyro_fast_bias_sigma=fast,
+            gravity_f=tuple(gravity_f) if np.any(gravity_f) else States().gravity_f,
+            sensors=found,
+        ),
+        white=white,
+    )
+
+
+def _entries(values: Array) -> Entries:
+    """Return entries as they are told: 0 where there is none."""
+    return (
+        tuple(map(tuple, values.tolist()))
+        if values.ndim == 2 and values.any()
+        else (tuple(values.tolist()) if values.any() else 0.0)
+    )
+
+
+def _drifts(
+    spec: GyroSpec, record: ImuRecord, density: float
+) -> tuple[tuple[float, ...], tuple[float, ...], float, float]:
+    """Return σ and time constants of Gauss–Markov drifts, the σ of what is quicker, rad/s, and its PSD, rad²/s."""
+    sigma, time, fast, white = [], [], 0.0, 0.0
+    if np.isfinite(spec.markov_correlation_time) and np.any(np.asarray(spec.markov_noise) > 0.0):
+        driven = float(np.max(spec.markov_noise))
+        sigma.append(driven * float(np.sqrt(0.5 * spec.markov_correlation_time)))
+        time.append(float(spec.markov_correlation_time))
+    instability = float(np.max(spec.bias_instability))
+    if instability > 0.0:
+        length = float(record.time[-1] - record.time[0])
+        step = length / len(record.increments)
+        follows = QUICK / bandwidth(spec, density) if np.isfinite(density) else length / UNSEEN
+        shortest = max(follows, LEAST_STEPS * step)
+        number = max(1, int(np.floor(np.log10(length / shortest))) + 1)
+        times = length / DECADE ** np.arange(number)
+        each = instability * float(np.sqrt(np.log(DECADE) / np.pi))
+        sigma += [each] * number
+        time += times.tolist()
+        white = 2.0 * each**2 * float(times[-1]) / (DECADE - 1.0)
+        fast = float(np.sqrt(_quicker(len(record.increments), step, instability, each, np.asarray(times))))
+    return tuple(sigma), tuple(time), fast, white
+
+
+def bandwidth(spec: GyroSpec, density: float) -> float:
+    """Return about how quickly the filter follows, rad/s: ``σ_v/√r`` of white noise, or where it is more the ω of ``r ω³ = B²/2``."""
+    white = float(np.max(spec.angle_random_walk))
+    instability = float(np.max(spec.bias_instability))
+    return float(max(white / np.sqrt(density), (0.5 * instability**2 / density) ** (1.0 / 3.0)))
+
+
+def _quicker(samples: int, step: float, instability: float, each: float, times: Array) -> float:
+    """Return the variance of the simulated flicker at an edge less that of the drifts, over what is quicker than they, (rad/s)²."""
+    lowest = step / (2.0 * np.pi * float(times[-1]) * np.sqrt(DECADE))
+    f = np.geomspace(min(lowest, 0.1), 0.5, 4000)
+    # At an edge it is the mean of the intervals' values on either side.
+    whole = instability**2 * flicker.shaping(samples).spectrum(f) * np.cos(np.pi * f) ** 2
+    w = 2.0 * np.pi * f[:, None] / step
+    held = np.sum(2.0 * each**2 * times / (1.0 + (w * times) ** 2), axis=1) / step
+    return float(max(2.0 * np.trapezoid(whole - held, f), 0.0))
+
+
+def _of_sensor(sensor: Any, series: VectorMeasurements) -> SensorStates:
+    """Return the states that one sensor calls for."""
+    own = float(sensor.sigma) if hasattr(sensor, "sigma") else 0.0
+    over, varying = 1.0, False
+    if series.kind in ("direction", "heading") and own > 0.0 and hasattr(sensor, "field_f"):
+        # The sensor's noise over the field's strength is what the series tells.
+        level = np.linalg.norm(series.references_f[:, :2], axis=1) if series.kind == "heading" else 1.0
+        over = float(np.sqrt(np.mean((series.sigma * level) ** 2))) / own
+        varying = bool(np.ptp(strength(series)) > 1e-9)
+    elif series.kind == "direction" and hasattr(sensor, "gravity_f"):
+        over = 1.0 / float(np.linalg.norm(sensor.gravity_f))
+    constant = getattr(sensor, "hard_iron", getattr(sensor, "bias", np.zeros(3)))
+    size = np.abs(np.asarray(constant, np.float64)) * over
+    faults = getattr(sensor, "faults", None)
+    coloured = float(getattr(faults, "correlated_sigma", 0.0)) * over
+    arm = np.abs(np.asarray(getattr(sensor, "lever_arm_b", np.zeros(3)), np.float64))
+    if series.kind == "attitude":
+        arm = np.zeros(3)
+    return SensorStates(
+        bias_sigma=_all_axes(size),
+        correlated_sigma=coloured,
+        correlation_time=float(faults.correlation_time) if faults is not None and coloured > 0.0 else 0.0,
+        varying=varying and (coloured > 0.0 or bool(size.any())),
+        lever_arm_sigma=_entries(arm),
+    )
+
+
+def _all_axes(size: Array) -> Entries:
+    """Return σ of each axis, those without an error as small beside the others as it makes no difference."""
+    if not size.any():
+        return 0.0
+    return tuple(np.where(size > 0.0, size, 1e-6 * float(size.max())).tolist())

@@ -1,0 +1,394 @@
+"""Optional states as part of a filter's setup: what is declared, as a table of a file, and as blocks of the filter on a record."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from strapdown import mekf, tables, units
+from strapdown.augmented import filtering
+from strapdown.augmented import model as modelling
+from strapdown.augmented.blocks import (
+    Block,
+    GaussMarkov,
+    GyroForce,
+    GyroGaussMarkov,
+    GyroScale,
+    LeverArm,
+    VectorBias,
+)
+from strapdown.augmented.filtering import AugmentedEstimate
+from strapdown.augmented.model import AugmentedState
+from strapdown.checks import Array, InputError, array, known_keys, non_negative, one_of, positive
+from strapdown.mekf import ProcessNoise
+from strapdown.records import ImuRecord
+from strapdown.robustness import Gate, Monitor, Robust
+from strapdown.vectors import GRAVITY_F, KINDS
+
+Entries = float | tuple[float, ...] | tuple[tuple[float, ...], ...]
+"""A standard deviation: one for all axes or entries, or one each; 0: no state."""
+
+
+def _entries(name: str, value: Any, shape: tuple[int, ...], unit: str) -> Entries:
+    """Return a number, or nested tuples of an array of this shape; none is negative."""
+    if np.ndim(value) == 0:
+        return non_negative(name, value, unit=unit)
+    values = array(name, value, shape)
+    if np.any(values < 0.0):
+        index = tuple(int(i) for i in np.argwhere(values < 0.0)[0])
+        raise InputError(f"{name}{list(index)} is {values[index]:g} {unit}; it must not be negative")
+    told: Any = values.tolist()
+    return tuple(tuple(row) if isinstance(row, list) else row for row in told)
+
+
+def _any(value: Entries) -> bool:
+    return bool(np.any(np.asarray(value) > 0.0))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorStates:
+    """Optional states of one sensor; what is 0 is no state."""
+
+    bias_sigma: Entries = 0.0
+    """σ of a constant bias in body axes, hard iron for one, one or one an axis: rad, or of whole vectors the unit of their reference."""
+    correlated_sigma: float = 0.0
+    """Stationary σ of each component of a first-order Gauss–Markov noise, in the unit of ``bias_sigma``."""
+    correlation_time: float = 0.0
+    """Its time constant, s; above zero where ``correlated_sigma`` is."""
+    frame: Literal["body", "fixed"] = "body"
+    """Axes in which it is correlated."""
+    varying: bool = False
+    """Of a direction or heading: bias and correlated noise are fixed in the sensor's own unit and the strength of what it measures changes,
+    as that of the earth's field along an orbit; the σ above are over the strength at the root mean square σ of the series."""
+    lever_arm_sigma: Entries = 0.0
+    """σ of the place of an accelerometer from the point that does not accelerate, body axes, one or one an axis, m."""
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        object.__setattr__(self, "bias_sigma", _entries("bias_sigma", self.bias_sigma, (3,), ""))
+        object.__setattr__(self, "lever_arm_sigma", _entries("lever_arm_sigma", self.lever_arm_sigma, (3,), "m"))
+        non_negative("correlated_sigma", self.correlated_sigma)
+        non_negative("correlation_time", self.correlation_time, unit="s")
+        if (self.correlated_sigma > 0.0) != (self.correlation_time > 0.0):
+            raise InputError(
+                f"correlated_sigma is {self.correlated_sigma:g} and correlation_time {self.correlation_time:g} s; "
+                "give both above zero, or neither"
+            )
+        one_of("frame", self.frame, ("body", "fixed"))
+        if np.ndim(self.bias_sigma) and _any(self.bias_sigma) and 0.0 in np.asarray(self.bias_sigma):
+            raise InputError(f"bias_sigma is {self.bias_sigma}; give every axis one above zero, or leave it out")
+        if not isinstance(self.varying, bool):
+            raise InputError(f"varying is {self.varying!r}; it must be true or false")
+
+    def blocks(self, sensor: str, kind: str, gravity: float) -> tuple[Block, ...]:
+        """Return them as blocks of a sensor of this kind; ``gravity``, m/s², is what a direction's specific force is over."""
+        one_of(f"{sensor}: kind", kind, KINDS)
+        found: list[Block] = []
+        if _any(self.bias_sigma):
+            found.append(VectorBias(sensor=sensor, bias_sigma=np.asarray(self.bias_sigma), varying=self.varying))
+        if _any(self.lever_arm_sigma):
+            strength = 1.0 if kind == "vector" else gravity
+            found.append(LeverArm(sensor=sensor, arm_sigma=np.asarray(self.lever_arm_sigma), strength=strength))
+        if self.correlated_sigma > 0.0:
+            found.append(
+                GaussMarkov(
+                    sensor=sensor,
+                    noise_sigma=self.correlated_sigma,
+                    correlation_time=self.correlation_time,
+                    frame=self.frame,
+                    varying=self.varying,
+                )
+            )
+        return tuple(found)
+
+
+@dataclass(frozen=True, kw_only=True)
+class States:
+    """Optional states of a filter beside attitude and bias, by the standard deviation that each starts with; what is 0 is no state."""
+
+    gyro_scale_sigma: Entries = 0.0
+    """σ of the gyro's scale factors, dimensionless, one or one an axis."""
+    gyro_misalignment_sigma: Entries = 0.0
+    """σ of its misalignments, rad, one or one an entry (3, 3) with zeros on the diagonal."""
+    gyro_force_sigma: Entries = 0.0
+    """σ of its sensitivity to specific force along the same axis, rad/s per m/s², one or one an axis."""
+    gyro_cross_force_sigma: Entries = 0.0
+    """σ of that across axes, rad/s per m/s², one or one an entry (3, 3) with zeros on the diagonal."""
+    gyro_drift_sigma: tuple[float, ...] = ()
+    """Stationary σ of Gauss–Markov parts of the gyro's bias, rad/s; several with times a decade apart are flicker."""
+    gyro_drift_time: tuple[float, ...] = ()
+    """Their time constants, s."""
+    gyro_fast_bias_sigma: float = 0.0
+    """σ of what of the gyro's bias changes too quickly to be estimated, rad/s: no state, but part of what is told of the bias."""
+    gravity_f: tuple[float, ...] = GRAVITY_F
+    """Acceleration of gravity, m/s², fixed axes: what the gyro's sensitivity and lever arms are about."""
+    sensors: Mapping[str, SensorStates] = field(default_factory=dict)
+    """Those of sensors, by name."""
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        for name, shape, unit in (
+            ("gyro_scale_sigma", (3,), ""),
+            ("gyro_misalignment_sigma", (3, 3), "rad"),
+            ("gyro_force_sigma", (3,), "rad s/m"),
+            ("gyro_cross_force_sigma", (3, 3), "rad s/m"),
+        ):
+            object.__setattr__(self, name, _entries(name, getattr(self, name), shape, unit))
+        for name, unit in (("gyro_drift_sigma", "rad/s"), ("gyro_drift_time", "s")):
+            values = tuple(float(v) for v in np.atleast_1d(array(name, np.atleast_1d(getattr(self, name)), ("k",))))
+            object.__setattr__(self, name, tuple(positive(f"{name}[{k}]", v, unit=unit) for k, v in enumerate(values)))
+        if len(self.gyro_drift_sigma) != len(self.gyro_drift_time):
+            raise InputError(
+                f"gyro_drift_sigma has {len(self.gyro_drift_sigma)} entries and gyro_drift_time {len(self.gyro_drift_time)}; "
+                "give each part of the drift one of both"
+            )
+        non_negative("gyro_fast_bias_sigma", self.gyro_fast_bias_sigma, unit="rad/s")
+        object.__setattr__(self, "gravity_f", tuple(array("gravity_f", self.gravity_f, (3,)).tolist()))
+        object.__setattr__(self, "sensors", dict(self.sensors))
+        for name, one in self.sensors.items():
+            if not isinstance(one, SensorStates):
+                raise InputError(f"sensors[{name!r}] is {one!r}; it must be SensorStates")
+        self.gyro_blocks()
+
+    @property
+    def gravity(self) -> float:
+        """Length of ``gravity_f``, m/s²."""
+        return float(np.linalg.norm(self.gravity_f))
+
+    def gyro_blocks(self) -> tuple[Block, ...]:
+        """Return the blocks of the gyro."""
+        found: list[Block] = []
+        if _any(self.gyro_scale_sigma) or _any(self.gyro_misalignment_sigma):
+            scale, misalignment = _spread(self.gyro_scale_sigma, self.gyro_misalignment_sigma)
+            found.append(GyroScale(scale_sigma=scale, misalignment_sigma=misalignment))
+        if _any(self.gyro_force_sigma) or _any(self.gyro_cross_force_sigma):
+            along, across = _spread(self.gyro_force_sigma, self.gyro_cross_force_sigma)
+            found.append(GyroForce(along_sigma=along, across_sigma=across, gravity_f=np.array(self.gravity_f)))
+        for sigma, time in zip(self.gyro_drift_sigma, self.gyro_drift_time, strict=True):
+            found.append(GyroGaussMarkov(bias_sigma=sigma, correlation_time=time, name=f"gyro drift {time:g} s"))
+        return tuple(found)
+
+    def blocks(self, kinds: Mapping[str, str]) -> tuple[Block, ...]:
+        """Return all as blocks of a filter on sensors of these kinds, by name."""
+        found = list(self.gyro_blocks())
+        for name, one in self.sensors.items():
+            known = one_of("states: sensor", name, kinds)
+            found += one.blocks(known, kinds[known], self.gravity)
+        return tuple(found)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What is declared, in the words by which :func:`chosen` takes it."""
+        gyro = (
+            ("gyro.scale", _any(self.gyro_scale_sigma)),
+            ("gyro.misalignment", _any(self.gyro_misalignment_sigma)),
+            ("gyro.force", _any(self.gyro_force_sigma) or _any(self.gyro_cross_force_sigma)),
+            ("gyro.drift", bool(self.gyro_drift_sigma)),
+        )
+        found = [name for name, there in gyro if there]
+        for sensor, one in self.sensors.items():
+            parts = (
+                ("bias", _any(one.bias_sigma)),
+                ("lever", _any(one.lever_arm_sigma)),
+                ("correlated", one.correlated_sigma > 0.0),
+            )
+            found += [f"{sensor}.{part}" for part, there in parts if there]
+        return tuple(found)
+
+    def chosen(self, names: tuple[str, ...]) -> States:
+        """Return those of these names only (:attr:`names`), the others taken for none."""
+        for name in names:
+            if not self.names:
+                raise InputError(f"states: {name!r} is asked for, and there is none to choose from")
+            one_of("states: name", name, self.names)
+        kept = replace(
+            self,
+            gyro_scale_sigma=self.gyro_scale_sigma if "gyro.scale" in names else 0.0,
+            gyro_misalignment_sigma=self.gyro_misalignment_sigma if "gyro.misalignment" in names else 0.0,
+            gyro_force_sigma=self.gyro_force_sigma if "gyro.force" in names else 0.0,
+            gyro_cross_force_sigma=self.gyro_cross_force_sigma if "gyro.force" in names else 0.0,
+            gyro_drift_sigma=self.gyro_drift_sigma if "gyro.drift" in names else (),
+            gyro_drift_time=self.gyro_drift_time if "gyro.drift" in names else (),
+            gyro_fast_bias_sigma=self.gyro_fast_bias_sigma if "gyro.drift" in names else 0.0,
+        )
+        sensors = {}
+        for sensor, one in self.sensors.items():
+            correlated = f"{sensor}.correlated" in names
+            part = replace(
+                one,
+                bias_sigma=one.bias_sigma if f"{sensor}.bias" in names else 0.0,
+                lever_arm_sigma=one.lever_arm_sigma if f"{sensor}.lever" in names else 0.0,
+                correlated_sigma=one.correlated_sigma if correlated else 0.0,
+                correlation_time=one.correlation_time if correlated else 0.0,
+            )
+            if part.blocks(sensor, "direction", 1.0):
+                sensors[sensor] = part
+        return replace(kept, sensors=sensors)
+
+
+def _spread(diagonal: Entries, off_diagonal: Entries) -> tuple[Array, Array]:
+    """Return σ of a matrix's diagonal (3,) and of what is off it (3, 3), zeros on the diagonal of that."""
+    on = np.broadcast_to(np.asarray(diagonal, np.float64), (3,)).copy()
+    off = np.broadcast_to(np.asarray(off_diagonal, np.float64), (3, 3)).copy()
+    if np.ndim(off_diagonal) == 0:
+        np.fill_diagonal(off, 0.0)
+    return on, off
+
+
+def initial_state(initial: mekf.State, blocks: tuple[Block, ...]) -> AugmentedState:
+    """Return the state to start from where ``initial`` tells of the *whole* bias, the blocks' part of it included.
+
+    Its error is what ``initial`` says, whatever the parts are: of the bias ``b = β − Σ c e`` the covariance follows, so that a drift that
+    is large beside a well-known bias is known only together with it.
+    """
+    plain = modelling.initial_state(initial, blocks)
+    size = len(plain.covariance)
+    turn = np.eye(size)
+    first = 6
+    for block in blocks:
+        turn[3:6, first : first + block.size] = -np.asarray(getattr(block, "gyro_offset", np.zeros((block.size, 3)))).T
+        first += block.size
+    sigma = np.sqrt(np.diag(plain.covariance))
+    root = (turn @ (sigma[:, None] * np.linalg.cholesky(plain.covariance / np.outer(sigma, sigma)))).T
+    return AugmentedState(
+        attitude=plain.attitude, bias=plain.bias, values=plain.values, covariance=root.T @ root, factor=root
+    )
+
+
+def run(
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    initial: mekf.State | AugmentedState,
+    states: States,
+    *,
+    every: int = 1,
+    full_covariance: bool = False,
+    gate: Gate | None = None,
+    robust: Robust | None = None,
+    monitor: Monitor | None = None,
+) -> AugmentedEstimate:
+    """Run the filter with these states; its estimate tells of the attitude and the whole gyro bias, drifts included, and of the blocks.
+
+    ``initial`` of class :class:`strapdown.mekf.State` tells of the whole bias. Options are those of :func:`strapdown.mekf.run`.
+    """
+    filtering.check_gate(gate)
+    blocks = states.blocks({series.sensor: series.kind for series in record.vectors})
+    state = initial_state(initial, blocks) if isinstance(initial, mekf.State) else initial
+    state = modelling.begin(state, blocks)
+    events, model = filtering.prepared(record, blocks)
+    found, _, _ = filtering.run_events(
+        record,
+        events,
+        model,
+        process_noise,
+        state,
+        blocks,
+        every=every,
+        full_covariance=full_covariance,
+        gate=gate,
+        robust=robust,
+        whole_bias=True,
+    )
+    assert found.whole_bias is not None
+    assert found.whole_bias_variance is not None
+    fast = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]) * states.gyro_fast_bias_sigma**2
+    told = found.events
+    if monitor is not None:
+        told = tuple(sorted([*told, *_watched(found, monitor, gate)], key=lambda event: event.start))
+    covariance = found.whole_bias_covariance
+    return replace(
+        found,
+        bias=found.whole_bias,
+        variance=found.whole_bias_variance + fast,
+        covariance=None if covariance is None else covariance + np.diag(fast),
+        events=told,
+    )
+
+
+def _watched(found: AugmentedEstimate, monitor: Monitor, gate: Gate | None) -> list[Any]:
+    """Return what a monitor says of all innovations in order of time."""
+    parts = [one for one in found.innovations.values() if len(one.time)]
+    if not parts:
+        return []
+    time = np.concatenate([one.time for one in parts])
+    degrees = np.concatenate([np.full(len(one.time), one.innovation.shape[1]) for one in parts])
+    nis = np.concatenate([one.nis for one in parts])
+    if gate is not None:
+        used = np.concatenate([one.used for one in parts])
+        nis = np.where(used, nis, gate.thresholds[degrees - 1])
+    order = np.argsort(time, kind="stable")
+    return list(monitor.watch(time[order], nis[order], degrees[order]))
+
+
+# ------------------------------------------------------------------------------------------------------------------------- files
+
+_FORCE: tables.Choice = (
+    ("deg_per_hour_per_g", units.DEGREE_PER_HOUR / units.STANDARD_GRAVITY),
+    ("rad_s_per_m", 1.0),
+)
+FORM: tables.Form = {
+    "gyro_scale_sigma": tables.PPM,
+    "gyro_misalignment_sigma": tables.MILLIRADIANS,
+    "gyro_force_sigma": _FORCE,
+    "gyro_cross_force_sigma": _FORCE,
+    "gyro_drift_sigma": tables.DEGREES_PER_HOUR,
+    "gyro_drift_time": tables.SECONDS,
+    "gyro_fast_bias_sigma": tables.DEGREES_PER_HOUR,
+    "gravity_f": tables.METRES_PER_SECOND_SQUARED,
+}
+"""Keys of the states of the gyro in files."""
+SENSOR_FORM: tables.Form = {
+    "bias_sigma": tables.PLAIN,
+    "correlated_sigma": tables.PLAIN,
+    "correlation_time": tables.SECONDS,
+    "frame": tables.PLAIN,
+    "varying": tables.PLAIN,
+    "lever_arm_sigma": tables.METRES,
+}
+"""Keys of the states of a sensor: its σ in rad, or of whole vectors in the unit of their reference."""
+
+
+def to_table(states: States) -> dict[str, Any]:
+    """Return states as the table that a file holds, units in the keys; exact both ways."""
+    table = tables.encode(states, FORM)
+    if states.sensors:
+        table["sensors"] = {name: tables.encode(one, SENSOR_FORM) for name, one in states.sensors.items()}
+    return table
+
+
+def from_table(table: Mapping[str, Any], place: str = "states") -> States:
+    """Return the states that a table tells; unknown keys are refused with the nearest known one."""
+    known_keys(place, table, {*tables.keys(FORM), "sensors"})
+    sensors = table.get("sensors", {})
+    if not isinstance(sensors, Mapping):
+        raise InputError(f"{place}: sensors is {sensors!r}; it must be a table of tables, [{place}.sensors.NAME]")
+    told = {}
+    for name, content in sensors.items():
+        where = f"{place}: sensors: {name}"
+        if not isinstance(content, Mapping):
+            raise InputError(f"{where} is {content!r}; it must be a table, [{place}.sensors.{name}]")
+        told[name] = _placed(where, SensorStates, _plain(where, content), SENSOR_FORM)
+    own = {key: value for key, value in table.items() if key != "sensors"}
+    return _placed(place, States, own, FORM, sensors=told)  # type: ignore[no-any-return]
+
+
+def _plain(place: str, content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a table whose bool goes through as one; tables take bools for slips."""
+    known_keys(place, content, tables.keys(SENSOR_FORM))
+    if "varying" in content and not isinstance(content["varying"], bool):
+        raise InputError(f"{place}: varying is {content['varying']!r}; it must be true or false")
+    return dict(content)
+
+
+def _placed(place: str, kind: Any, table: dict[str, Any], form: tables.Form, **more: Any) -> Any:
+    """Build from a table; what is refused names the place."""
+    if "varying" in table:
+        more["varying"] = table.pop("varying")
+    try:
+        return tables.build(kind, table, form, place, **more)
+    except InputError as error:
+        text = str(error)
+        raise InputError(text if text.startswith(place) else f"{place}: {text}") from None

@@ -1,0 +1,101 @@
+"""Rate and angular acceleration of the body from the gyro's own samples: what an accelerometer off the centre of turning feels."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+
+from strapdown.checks import Array, InputError
+from strapdown.records import ImuRecord
+
+ORDERS = (3, 5, 7)
+"""Of the polynomial fitted to the rate over a window; its slope at the middle is the angular acceleration (Savitzky & Golay 1964)."""
+WINDOWS = (5, 7, 9, 11, 13, 17, 21, 25, 31, 37, 45, 53, 61)
+"""Windows tried, samples."""
+MOST = 20000
+"""Samples by which order and window are chosen."""
+LASTING = 4.0
+"""What bends within the window lasts, and counts so many times as much as noise that does not."""
+LEAST = 100
+"""Samples that tell noise from motion."""
+UNEVEN = 0.01
+"""Of the mean interval: how much the gyro's intervals may differ."""
+
+
+def turning(record: ImuRecord, time: Array) -> tuple[Array, Array]:
+    """Return measured rate and angular acceleration at times (m, 6), rad/s and rad/s², and the variances of the latter's axes (m, 3).
+
+    The slope of a polynomial over a window of samples trades the gyro's noise, ``σ √Σ h²`` for weights h, against what the motion bends
+    within the window. That is seen from how the slope differs from that over half the window, which a motion bends sixteen times less or
+    better, less what noise alone would make; the order and window of the least sum are taken. σ is that of the rates' fifth differences,
+    in which a smooth motion is nothing: ``σ² = E(Δ⁵)²/252``.
+
+    Parameters
+    ----------
+    record : ImuRecord
+        Its gyro intervals must be alike.
+    time : (m,)
+        s, inside the record.
+    """
+    from scipy.signal import savgol_coeffs, savgol_filter
+
+    dt = np.diff(record.time)
+    mean = float(dt.mean())
+    k = int(np.argmax(np.abs(dt - mean)))
+    if abs(dt[k] - mean) > UNEVEN * mean:
+        raise InputError(
+            f"a lever arm needs gyro intervals that are alike, and that from {record.time[k]:.9g} s is {dt[k]:.6g} s, "
+            f"the mean {mean:.6g} s; cut the record, or leave the lever arm out"
+        )
+    if len(dt) < LEAST:
+        raise InputError(
+            f"a lever arm needs {LEAST} gyro samples or more, to tell noise from motion; the record has {len(dt)}"
+        )
+    rates = record.rates
+    windows = [window for window in WINDOWS if window <= len(dt)]
+    white = np.mean(np.diff(rates, 5, axis=0) ** 2, axis=0) / 252.0
+
+    def weights(order: int, window: int) -> Array:
+        padded = np.zeros(windows[-1])
+        half = (windows[-1] - window) // 2
+        padded[half : half + window] = savgol_coeffs(window, order, deriv=1, delta=mean, use="dot")
+        return padded
+
+    @functools.cache
+    def slope(order: int, window: int, samples: int) -> Array:
+        return np.asarray(savgol_filter(rates[:samples], window, order, deriv=1, delta=mean, axis=0))
+
+    tried = [(order, window) for order in ORDERS for window in windows if window >= order + 2]
+    noises, bends = [], []
+    for order, window in tried:
+        half = max(order + 2, window // 4 * 2 + 1)
+        apart = float(np.sum((weights(order, window) - weights(order, half)) ** 2))
+        bent = np.mean((slope(order, window, MOST) - slope(order, half, MOST)) ** 2, axis=0) - white * apart
+        noises.append(white * float(np.sum(weights(order, window) ** 2)))
+        bends.append(np.maximum(bent, 0.0))
+    best = int(np.argmin(np.sum(np.array(noises) + LASTING * np.array(bends), axis=1)))
+    acceleration = slope(*tried[best], len(dt)).copy()
+    # A sample is the mean over its interval, f + f″ dt²/24.
+    acceleration[1:-1] -= np.diff(acceleration, 2, axis=0) / 24.0
+    smooth = np.asarray(savgol_filter(rates, ORDERS[0] + 2, ORDERS[0], axis=0))
+    # The cubic through the four nearest middles: a straight line would cut the crests of what swings within some ten samples.
+    place = np.clip((time - 0.5 * (record.time[0] + record.time[1])) / mean, 0.0, len(dt) - 1.0)
+    k = np.clip(np.floor(place).astype(np.int64), 1, len(dt) - 3)
+    s = place - k
+    nodes = np.stack(
+        [
+            -s * (s - 1.0) * (s - 2.0) / 6.0,
+            (s + 1.0) * (s - 1.0) * (s - 2.0) / 2.0,
+            -(s + 1.0) * s * (s - 2.0) / 2.0,
+            (s + 1.0) * s * (s - 1.0) / 6.0,
+        ],
+        axis=1,
+    )
+    near = k[:, None] + np.arange(-1, 3)
+    found = [np.einsum("mj,mja->ma", nodes, series[near]) for series in (smooth, acceleration)]
+    h = weights(*tried[best])
+    lags = np.array([h[lag:] @ h[: len(h) - lag] for lag in range(4)]) / (h @ h)
+    alike = lags[np.abs(np.subtract.outer(np.arange(4), np.arange(4)))]
+    left = np.einsum("mi,ij,mj->m", nodes, alike, nodes)
+    return np.concatenate(found, axis=1), noises[best] * left[:, None] + bends[best]

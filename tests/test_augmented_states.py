@@ -1,0 +1,517 @@
+"""Optional states of a filter setup: their files, the blocks they become, gates and robust weights, the whole bias; refusals."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from strapdown import augmented, consistency, kinematics, mekf, motion, quaternion, scenarios, setup, vectors
+from strapdown.augmented import SensorStates, States, filtering, matching, turning
+from strapdown.augmented import states as optional
+from strapdown.checks import InputError
+from strapdown.gyro import GyroSpec
+from strapdown.mekf import ProcessNoise
+from strapdown.randomness import generator
+from strapdown.records import ImuRecord, Truth
+from strapdown.robustness import Gate, Monitor, Robust
+from strapdown.scenarios import Scenario
+from strapdown.setup import FilterSetup
+from strapdown.vectors import VectorMeasurements
+
+NOISE = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-5)
+SWAY = motion.HarmonicRates(
+    harmonics=(
+        motion.Harmonic(amplitude=(1.2, 0.2, -0.3), frequency=0.21),
+        motion.Harmonic(amplitude=(-0.3, 1.1, 0.4), frequency=0.37),
+        motion.Harmonic(amplitude=(0.3, -0.2, 1.3), frequency=0.29, phase=1.0),
+    )
+)
+WHOLE = States(
+    gyro_scale_sigma=(1e-3, 0.0, 1.23456789e-4),
+    gyro_misalignment_sigma=((0.0, 1e-3, 0.0), (0.0, 0.0, 2e-3), (1.7e-4, 0.0, 0.0)),
+    gyro_force_sigma=4.9e-7,
+    gyro_cross_force_sigma=((0.0, 1e-7, 0.0), (0.0, 0.0, 0.0), (0.0, 3.3e-7, 0.0)),
+    gyro_drift_sigma=(1e-6, 2.2e-6),
+    gyro_drift_time=(60.0, 6.1),
+    gyro_fast_bias_sigma=3.3e-7,
+    gravity_f=(0.0, 0.1, -9.8),
+    sensors={
+        "mag": SensorStates(bias_sigma=(1e-3, 2e-3, 3.14e-3), varying=True),
+        "acc": SensorStates(
+            correlated_sigma=0.05, correlation_time=0.7, frame="fixed", lever_arm_sigma=(0.0, 0.1, 0.3)
+        ),
+    },
+)
+
+
+def simulated(seed=3, duration=20.0, kind="vector", outlier_probability=0.0, **gyro) -> ImuRecord:
+    scenario = Scenario(
+        motion=SWAY,
+        gyro=GyroSpec(angle_random_walk=1e-3, rate_random_walk=1e-5, **gyro),
+        sensors=(
+            vectors.Magnetometer(
+                name="mag",
+                field_f=np.array([0.0, 2e-5, -4e-5]),
+                sigma=5e-7,
+                rate=10.0,
+                kind=kind,
+                hard_iron=np.array([2e-6, -3e-6, 1e-6]),
+                faults=vectors.Faults(outlier_probability=outlier_probability, outlier_scale=15.0),
+            ),
+            vectors.Accelerometer(name="acc", sigma=0.05, rate=25.0, phase=0.013, kind=kind),
+        ),
+        rate=50.0,
+        duration=duration,
+    )
+    return scenarios.simulate(scenario, seed)
+
+
+def begun(record, attitude_sigma=0.02, bias_sigma=3e-3, seed=1) -> mekf.State:
+    draw = np.random.default_rng(seed).standard_normal(6)
+    return mekf.initial_state(
+        quaternion.multiply(record.truth.attitude[0], quaternion.exp(-attitude_sigma * draw[:3])),
+        attitude_sigma=attitude_sigma,
+        bias_sigma=bias_sigma,
+        bias=record.truth.bias[0] - bias_sigma * draw[3:],
+    )
+
+
+# ------------------------------------------------------------------------------------------------------------------------ files
+
+
+def test_states_go_through_their_file_to_the_last_bit(tmp_path):
+    whole = FilterSetup(process_noise=NOISE, bias_sigma=1e-5, states=WHOLE, sigma={"mag": 1e-6})
+    path = tmp_path / "filter.toml"
+    path.write_text(setup.to_toml(whole), encoding="utf-8")
+    assert setup.read_setup(path) == whole
+    text = path.read_text()
+    for key in ("gyro_scale_sigma_ppm", "gyro_drift_time_s", "lever_arm_sigma_m", "[filter.states.sensors.mag]"):
+        assert key in text
+    rng = np.random.default_rng(4)
+    for _ in range(50):
+        states = States(
+            gyro_scale_sigma=tuple(10.0 ** rng.uniform(-6, -2, 3)),
+            gyro_drift_sigma=10.0 ** rng.uniform(-8, -3, 2),
+            gyro_drift_time=10.0 ** rng.uniform(0, 4, 2),
+            gyro_force_sigma=10.0 ** rng.uniform(-9, -5),
+        )
+        assert optional.from_table(optional.to_table(states)) == states
+    assert setup.from_toml(
+        setup.to_toml(setup.matched(scenarios.load_scenario("hand-held"), states=True))
+    ) == setup.matched(scenarios.load_scenario("hand-held"), states=True)
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"gyro_scale_sigma_pmm": 1.0}, "did you mean 'gyro_scale_sigma_ppm'"),
+        ({"gyro_scale_sigma_ppm": [1.0, 2.0]}, r"gyro_scale_sigma has shape \(2,\)"),
+        ({"gyro_scale_sigma_ppm": -5.0}, "must not be negative"),
+        ({"gyro_misalignment_sigma_mrad": [[1.0, 0, 0], [0, 0, 0], [0, 0, 0]]}, "entries on its diagonal"),
+        ({"gyro_drift_sigma_deg_per_hour": [1.0]}, "1 entries and gyro_drift_time 0"),
+        ({"gyro_drift_sigma_deg_per_hour": [1.0], "gyro_drift_time_s": [0.0]}, r"gyro_drift_time\[0\] is 0 s"),
+        ({"gyro_force_sigma_deg_per_hour_per_g": 1.0, "gravity_f_m_per_s2": [0, 0, 0]}, "free fall"),
+        ({"sensors": 3}, "must be a table of tables"),
+        ({"sensors": {"mag": 3}}, r"sensors: mag is 3; it must be a table"),
+        ({"sensors": {"mag": {"bias_sigm": 1.0}}}, "did you mean 'bias_sigma'"),
+        ({"sensors": {"mag": {"bias_sigma": [1.0, 0.0, 1.0]}}}, "give every axis one above zero"),
+        ({"sensors": {"mag": {"correlated_sigma": 1.0}}}, "give both above zero"),
+        (
+            {"sensors": {"mag": {"correlated_sigma": 1.0, "correlation_time_s": 1.0, "frame": "bodi"}}},
+            "did you mean 'body'",
+        ),
+        ({"sensors": {"mag": {"varying": 1}}}, "varying is 1; it must be true or false"),
+    ],
+)
+def test_bad_tables_are_refused_with_their_place(table, words):
+    with pytest.raises(InputError, match=words) as caught:
+        optional.from_table(table, "f.toml: filter: states")
+    assert str(caught.value).startswith("f.toml: filter: states")
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: FilterSetup(process_noise=NOISE, bias_sigma=1e-5, states={}), "it must be augmented.States"),
+        (lambda: States(sensors={"mag": {}}), "must be SensorStates"),
+        (lambda: setup.run(simulated(), chosen(States(sensors={"map": SensorStates(bias_sigma=1.0)})), None), "'mag'"),
+        (lambda: run(simulated(), chosen(WHOLE, gate=Gate())), "recovery is 10, and a filter with optional states cannot"),
+        (lambda: WHOLE.chosen(("gyro.scael",)), "did you mean 'gyro.scale'"),
+        (lambda: States().chosen(("gyro.scale",)), "there is none to choose from"),
+        (lambda: run(uneven(), chosen(States(sensors={"acc": SensorStates(lever_arm_sigma=0.1)}))), "intervals that are alike"),
+        (lambda: run(simulated(duration=1.0), chosen(States(sensors={"acc": SensorStates(lever_arm_sigma=0.1)}))), "needs 100"),
+        (lambda: augmented.LeverArm(sensor="acc", arm_sigma=0.0), "arm_sigma is 0"),
+        (lambda: augmented.LeverArm(sensor="acc", arm_sigma=[0.1, -1.0, 0.0]), r"arm_sigma\[1\] is -1 m"),
+        (lambda: augmented.GyroForce(along_sigma=0.0), "along_sigma is 0"),
+        (
+            lambda: augmented.GyroScale(scale_sigma=np.zeros(3), misalignment_sigma=np.zeros((3, 3))),
+            "scale_sigma and misalignment_sigma are both 0",
+        ),
+    ],
+)  # fmt: skip
+def test_bad_input_is_refused_with_the_remedy(make, words):
+    with pytest.raises(InputError, match=words):
+        make()
+
+
+def chosen(states, **more) -> FilterSetup:
+    return FilterSetup(process_noise=NOISE, attitude_sigma=0.02, bias_sigma=3e-3, states=states, **more)
+
+
+def run(record, believes, **options):
+    return setup.run(record, believes, begun(record), **options)
+
+
+def uneven() -> ImuRecord:
+    record = simulated()
+    kept = np.r_[0:500, 501 : len(record.time)]
+    increments = np.add.reduceat(record.increments, kept[:-1], axis=0)
+    truth = Truth(attitude=record.truth.attitude[kept], bias=record.truth.bias[kept])
+    return ImuRecord(time=record.time[kept], increments=increments, vectors=record.vectors, truth=truth)
+
+
+# ---------------------------------------------------------------------------------------------- without states: the plain filter
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"gate": Gate(probability=0.99, recovery=None)},
+        {"robust": Robust()},
+        {"robust": Robust(kind="huber"), "gate": Gate(recovery=None)},
+        {"gate": Gate(recovery=None), "monitor": Monitor(window=20, probability=0.9)},
+    ],
+    ids=["plain", "gate", "student", "huber and gate", "gate and monitor"],
+)
+@pytest.mark.parametrize("kind", ["vector", "direction"])
+def test_without_states_it_is_the_plain_filter_gates_and_all(kind, options):
+    record = missing(simulated(kind=kind, outlier_probability=0.1))
+    initial = begun(record)
+    one = mekf.run(record, NOISE, initial, every=7, full_covariance=True, **options)
+    other = optional.run(record, NOISE, initial, States(), every=7, full_covariance=True, **options)
+    np.testing.assert_allclose(other.attitude, one.attitude, atol=1e-12)
+    np.testing.assert_allclose(other.bias, one.bias, atol=1e-13)
+    np.testing.assert_allclose(other.variance, one.variance, rtol=1e-10)
+    np.testing.assert_allclose(other.covariance, one.covariance, rtol=1e-8, atol=1e-10 * np.max(one.covariance))
+    assert [(event.kind, event.start, event.end) for event in other.events] == [
+        (event.kind, event.start, event.end) for event in one.events
+    ]
+    assert ("monitor" in options) == bool(one.events)
+    assert other.skipped == one.skipped == {"mag": 7, "acc": 0}
+    assert other.refused == one.refused
+    if "gate" in options:
+        assert sum(one.refused.values()) > 10
+    for sensor, innovations in one.innovations.items():
+        found = other.innovations[sensor]
+        np.testing.assert_allclose(found.innovation, innovations.innovation, atol=1e-10)
+        np.testing.assert_allclose(found.variance, innovations.variance, rtol=1e-9)
+        if innovations.weight is not None:
+            np.testing.assert_allclose(found.weight, innovations.weight, atol=1e-9)
+
+
+def missing(record):
+    first, *rest = record.vectors
+    vector = first.vector_b.copy()
+    vector[20:27] = np.nan
+    return dataclasses.replace(record, vectors=(dataclasses.replace(first, vector_b=vector), *rest))
+
+
+def test_a_gate_keeps_outliers_from_the_states():
+    record = simulated(outlier_probability=0.05, duration=60.0)
+    states = States(sensors={"mag": SensorStates(bias_sigma=3e-6)})
+    plain, gated, robust = (
+        run(record, chosen(states, **options)) for options in ({}, {"gate": Gate(recovery=None)}, {"robust": Robust()})
+    )
+    true = np.array([2e-6, -3e-6, 1e-6])
+    errors = [np.linalg.norm(one.blocks["mag bias"].values[-1] - true) for one in (plain, gated, robust)]
+    struck = len(record.vectors[0].time) * 0.05
+    assert 0.5 * struck < gated.refused["mag"] < 1.6 * struck
+    assert gated.refused["acc"] < 10
+    for one, error in ((gated, errors[1]), (robust, errors[2])):
+        assert error < errors[0]
+        assert error < 4.0 * np.linalg.norm(one.blocks["mag bias"].sigma[-1])
+        used = one.innovations["mag"]
+        nis = used.nis[used.weight > 0.5].mean() / 3.0
+        assert 0.85 < nis < 1.1
+    assert plain.innovations["mag"].nis.mean() / 3.0 > 3.0
+
+
+def test_the_gate_of_a_vector_lets_pass_as_many_as_it_says():
+    record = simulated(duration=120.0, seed=8)
+    states = States(sensors={"mag": SensorStates(bias_sigma=3e-6)})
+    estimate = run(record, chosen(states, gate=Gate(probability=0.9, recovery=None)))
+    for innovations in estimate.innovations.values():
+        assert abs(innovations.refused / len(innovations.time) - 0.1) < 4.0 * np.sqrt(0.09 / len(innovations.time))
+
+
+# -------------------------------------------------------------------------------------------------------------------- the whole bias
+
+
+def test_the_whole_bias_is_that_of_all_states():
+    record = simulated(markov_noise=1e-3, markov_correlation_time=8.0)
+    states = States(gyro_drift_sigma=(2e-3, 1e-3), gyro_drift_time=(8.0, 1.5), gyro_fast_bias_sigma=1e-4)
+    initial = begun(record)
+    told = optional.run(record, NOISE, initial, states, every=50, full_covariance=True)
+    blocks = states.blocks({"mag": "vector", "acc": "vector"})
+    begin = optional.initial_state(initial, blocks)
+    whole = augmented.run(record, NOISE, begin, blocks, every=50, full_covariance=True)
+    sum_of = np.zeros((6, 12))
+    sum_of[:6, :6] = np.eye(6)
+    sum_of[3:, 6:9] = sum_of[3:, 9:] = np.eye(3)
+    expected = sum_of @ whole.whole_covariance @ sum_of.T
+    expected[:, [3, 4, 5], [3, 4, 5]] += 1e-8
+    np.testing.assert_allclose(told.covariance, expected, rtol=1e-9, atol=1e-18)
+    np.testing.assert_allclose(told.variance, np.einsum("kii->ki", expected), rtol=1e-11)
+    np.testing.assert_allclose(
+        told.bias, whole.bias + sum(one.values for one in whole.blocks.values()), rtol=0, atol=1e-15
+    )
+    # The start is what it says of the whole bias, whatever the parts are.
+    at_start = sum_of @ begin.covariance @ sum_of.T
+    np.testing.assert_allclose(at_start, initial.covariance, rtol=1e-9, atol=1e-18)
+    np.testing.assert_allclose(begin.covariance[6:, 6:], np.diag(np.repeat([2e-3, 1e-3], 3) ** 2), rtol=1e-12)
+    assert begin.covariance[3, 6] == pytest.approx(-4e-6)
+
+
+# ------------------------------------------------------------------------------------------------------------- the gyro and force
+
+
+def test_force_is_what_the_simulated_gyro_feels():
+    """Exact increments and a perfect model: with the true G the filter stays on the truth, with its negative it does not."""
+    G = np.array([[2e-4, 1e-4, 0.0], [0.0, -3e-4, 0.0], [0.0, 2e-4, 1e-4]])
+    edges = np.arange(20 * 200 + 1) / 200.0
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    force = vectors.specific_force(SWAY, middle)
+    increments = SWAY.increments(edges) + (force @ G.T) / 200.0
+    record = ImuRecord(time=edges, increments=increments)
+    block = augmented.GyroForce(along_sigma=1e-3, across_sigma=1e-3)
+    noise = ProcessNoise(angle_random_walk=1e-9, rate_random_walk=0.0)
+    plain = mekf.initial_state(SWAY.attitude(np.array(0.0)), attitude_sigma=1e-6, bias_sigma=1e-9)
+    start = augmented.initial_state(plain, (block,))
+    truth = SWAY.attitude(edges)
+    for sign, least, most in ((1.0, 0.0, 2e-4), (-1.0, 1e-2, 1.0)):
+        begin = dataclasses.replace(start, values=sign * G.ravel())
+        estimate = augmented.run(record, noise, begin, (block,))
+        off = np.max(quaternion.angle_between(estimate.attitude, truth))
+        assert least <= off < most
+
+
+def test_force_s_transition_is_the_derivative():
+    rng = np.random.default_rng(2)
+    block = augmented.GyroForce(along_sigma=1e-3, across_sigma=1e-3)
+    initial = mekf.initial_state(quaternion.normalize(rng.standard_normal(4)), attitude_sigma=0.1, bias_sigma=0.01)
+    values = 1e-3 * rng.standard_normal(9)
+
+    def moved(values):
+        state = dataclasses.replace(augmented.initial_state(initial, (block,)), values=values)
+        face = augmented.StepFilter(NOISE, state, (block,))
+        face.predict(np.array([0.02, -0.03, 0.01]), 0.05)
+        return face
+
+    face = moved(values)
+    for k in range(9):
+        ahead, back = (moved(values + sign * 1e-5 * np.eye(9)[k]) for sign in (1.0, -1.0))
+        numeric = quaternion.log(quaternion.multiply(quaternion.conjugate(back.attitude), ahead.attitude)) / 2e-5
+        np.testing.assert_allclose(face.F[:3, 6 + k], numeric, rtol=0, atol=1e-5 * np.max(np.abs(numeric)) + 1e-9)
+
+
+def test_faces_agree_with_force_and_gyro_scale_of_some_axes():
+    record = simulated(duration=3.0)
+    scale = augmented.GyroScale(scale_sigma=np.array([0.0, 0.0, 0.01]), misalignment_sigma=np.zeros((3, 3)))
+    force = augmented.GyroForce(along_sigma=np.array([1e-3, 0.0, 2e-3]))
+    blocks = (scale, force, augmented.VectorBias(sensor="mag", bias_sigma=3e-6))
+    assert [block.components for block in blocks[:2]] == [("z",), ("x", "z")]
+    one = augmented.run(record, NOISE, begun(record), blocks, full_covariance=True)
+    from strapdown.augmented import stepping
+
+    other, _ = stepping.run_on(
+        record, NOISE, augmented.initial_state(begun(record), blocks), blocks, full_covariance=True
+    )
+    np.testing.assert_allclose(one.attitude, other.attitude, atol=1e-11)
+    sigma = np.sqrt(np.einsum("kii->ki", one.whole_covariance))
+    scaled = (one.whole_covariance - other.whole_covariance) / (sigma[:, :, None] * sigma[:, None, :])
+    assert np.max(np.abs(scaled)) < 1e-8
+    smoothed = augmented.smooth(record, NOISE, begun(record), blocks, full_covariance=True)
+    np.testing.assert_allclose(smoothed.whole_covariance[-1], one.whole_covariance[-1], rtol=1e-8, atol=1e-16)
+
+
+# ------------------------------------------------------------------------------------------------------------------- sensors
+
+
+def test_rate_and_angular_acceleration_are_those_of_the_motion():
+    edges = np.arange(0.0, 30.0, 0.005)
+    rng = np.random.default_rng(5)
+    exact = SWAY.increments(edges)
+    time = np.linspace(1.0, 28.0, 400)
+    for white in (1e-7, 1e-4, 1e-3):
+        record = ImuRecord(time=edges, increments=exact + white * np.sqrt(0.005) * rng.standard_normal(exact.shape))
+        found, variance = turning.turning(record, time)
+        error = found[:, 3:] - SWAY.body_angular_acceleration(time)
+        assert np.max(np.abs(found[:, :3] - SWAY.body_rate(time))) < 6.0 * white / np.sqrt(0.005) + 1e-4
+        ratio = np.mean(error**2 / variance)
+        assert 0.5 < ratio < 2.0 or np.max(np.abs(error)) < 1e-3
+
+
+@pytest.mark.parametrize("kind", ["vector", "direction"])
+def test_a_lever_arm_is_found(kind):
+    arm = np.array([0.2, -0.1, 0.3])
+    scenario = Scenario(
+        motion=SWAY,
+        gyro=GyroSpec(angle_random_walk=1e-4, rate_random_walk=1e-6),
+        sensors=(
+            vectors.Magnetometer(name="mag", field_f=np.array([2e-5, 0.0, -4e-5]), sigma=2e-7, rate=20.0),
+            vectors.Accelerometer(name="acc", sigma=0.02, rate=50.0, kind=kind, lever_arm_b=arm),
+        ),
+        rate=200.0,
+        duration=20.0,
+    )
+    believes = setup.matched(scenario, states=True)
+    ratios = []
+    for seed in range(6):
+        record = scenarios.simulate(scenario, seed)
+        estimate = setup.run(record, believes, begun(record, 0.01, 1e-4, seed))
+        block = estimate.blocks["acc lever arm"]
+        assert block.units == ("m", "m", "m")
+        assert np.all(block.sigma[-1] < 0.01)
+        ratios.append(np.mean(((block.values[-1] - arm) / block.sigma[-1]) ** 2))
+        nis = estimate.innovations["acc"].nis.mean() / estimate.innovations["acc"].innovation.shape[1]
+        assert 0.9 < nis < 1.1
+    assert 0.3 < np.mean(ratios) < 2.2
+
+
+def test_hard_iron_in_a_field_that_changes_is_found_in_its_own_unit():
+    """Its share of a direction changes with the field's strength: told so, the filter is right, and else not."""
+    scenario = dataclasses.replace(scenarios.load_scenario("low-orbit"), duration=4000.0)
+    iron = np.array([2e-6, -1.5e-6, 1e-6])
+    sensors = tuple(dataclasses.replace(s, hard_iron=iron) if s.name == "magnetometer" else s for s in scenario.sensors)
+    scenario = dataclasses.replace(scenario, sensors=sensors)
+    believes = setup.matched(scenario, states=True)
+    own = believes.states.sensors["magnetometer"]
+    assert own.varying
+    record = scenarios.simulate(scenario, 5)
+    series = record.vectors[1]
+    field = 1e-7 / series.sigma
+    assert np.ptp(field) > 5e-6
+    assert np.asarray(own.bias_sigma) == pytest.approx(np.abs(iron) * np.sqrt(np.mean(field**-2.0)))
+    firm = dataclasses.replace(
+        believes,
+        states=dataclasses.replace(believes.states, sensors={"magnetometer": dataclasses.replace(own, varying=False)}),
+    )
+    right, wrong = (setup.run(record, which, begun(record, 0.01, 1e-3)) for which in (believes, firm))
+    nis = [one.innovations["magnetometer"].nis[300:].mean() / 2.0 for one in (right, wrong)]
+    assert abs(nis[0] - 1.0) < 0.08
+    assert nis[1] > 1.3
+    error = right.blocks["magnetometer bias"].values[-1] / np.sqrt(np.mean(field**-2.0)) - iron
+    assert np.all(np.abs(error) < 1e-7)
+
+
+def test_a_direction_that_its_states_make_longer_has_the_less_noise():
+    """Of a sensor that normalises its vector, noise across it is over the length of what it really sees."""
+    strong = augmented.VectorBias(sensor="a", bias_sigma=1e-9)
+    series = VectorMeasurements(
+        sensor="a",
+        kind="direction",
+        time=np.array([0.0]),
+        vector_b=np.array([[1.0, 0.0, 0.0]]),
+        reference_f=np.array([1.0, 0.0, 0.0]),
+        sigma=np.array([1e-3]),
+    )
+    record = ImuRecord(time=np.array([0.0, 1.0]), increments=np.zeros((1, 3)), vectors=(series,))
+    start = augmented.initial_state(mekf.initial_state([1.0, 0, 0, 0], attitude_sigma=1e-9, bias_sigma=1e-9), (strong,))
+    for along in (0.0, 1.0, 3.0):
+        state = dataclasses.replace(start, values=np.array([along, 0.0, 0.0]))
+        found = augmented.run(record, NOISE, state, (strong,)).innovations["a"]
+        np.testing.assert_allclose(found.variance, 1e-6 / (1.0 + along) ** 2, rtol=1e-6)
+
+
+def test_the_strength_of_a_heading_s_field_leaves_its_level_part_out():
+    level = np.array([0.3, 0.6, 0.9])
+    reference = np.stack([level, np.zeros(3), -np.sqrt(1.0 - level**2)], axis=1)
+    field = np.array([2.0, 5.0, 3.0])
+    series = VectorMeasurements(
+        sensor="m",
+        kind="heading",
+        time=np.arange(3.0),
+        vector_b=reference,
+        reference_f=reference,
+        sigma=0.1 / (field * level),
+    )
+    np.testing.assert_allclose(filtering.strength(series) / field, filtering.strength(series)[0] / field[0], rtol=1e-12)
+
+
+# ------------------------------------------------------------------------------------------------------------------ what is matched
+
+
+def test_drifts_a_decade_apart_are_flicker():
+    """Their spectrum is 1/f to a few hundredths between the slowest and the quickest, and what is quicker is the rest."""
+    times = 1000.0 / matching.DECADE ** np.arange(6)
+    each = np.sqrt(np.log(matching.DECADE) / np.pi)
+    w = np.geomspace(3.0 / times[0], 0.3 / times[-1], 300)
+    held = np.sum(2.0 * each**2 * times / (1.0 + (w[:, None] * times) ** 2), axis=1)
+    np.testing.assert_allclose(held * w, 1.0, atol=0.12)
+    assert np.mean(held * w) == pytest.approx(1.0, abs=0.03)
+
+
+def test_what_a_specification_tells_is_matched_entry_by_entry():
+    scenario = scenarios.load_scenario("spin")
+    chosen = setup.matched(scenario, states=True)
+    assert chosen.states == States(gyro_scale_sigma=tuple(scenario.gyro.scale_factor))
+    assert chosen.states.gyro_scale_sigma[2] == pytest.approx(1e-4)
+    assert chosen.process_noise == setup.matched(scenario).process_noise
+    markov = GyroSpec(angle_random_walk=1e-5, markov_noise=1e-6, markov_correlation_time=50.0)
+    found = setup.matched(dataclasses.replace(scenario, gyro=markov), states=True)
+    assert found.states.gyro_drift_time == (50.0,)
+    assert found.states.gyro_drift_sigma[0] == pytest.approx(1e-6 * 5.0)
+    assert found.process_noise.rate_random_walk == 0.0
+    falling = setup.matched(scenarios.load_scenario("tumbling-satellite"), states=True)
+    assert "gyro.force" not in falling.states.names
+
+
+def test_a_motion_that_commutes_badly_gets_a_better_integration():
+    assert setup.matched(scenarios.load_scenario("coning"), states=True).integration.name == setup.BETTER
+    assert setup.matched(scenarios.load_scenario("spin"), states=True).integration.name == "one-sample"
+
+
+def test_individuals_are_drawn_with_the_told_errors_for_sigma():
+    scenario = scenarios.load_scenario("low-orbit")
+    drawn = [scenarios.drawn(scenario, 7, k) for k in range(300)]
+    irons = np.array([one.sensors[1].hard_iron for one in drawn])
+    np.testing.assert_allclose(np.std(irons, axis=0), np.abs(scenario.sensors[1].hard_iron), rtol=0.15)
+    matrices = np.array([one.gyro.misalignment for one in drawn])
+    assert np.all(np.diagonal(matrices, axis1=1, axis2=2) == 0.0)
+    np.testing.assert_allclose(np.std(matrices, axis=0), scenario.gyro.misalignment, rtol=0.2)
+    again = scenarios.drawn(scenario, 7, 0)
+    assert np.array_equal(again.sensors[1].hard_iron, irons[0])
+
+
+def test_chosen_states_are_those_named():
+    part = WHOLE.chosen(("gyro.drift", "acc.lever"))
+    assert part.names == ("gyro.drift", "acc.lever")
+    assert part.gyro_fast_bias_sigma == WHOLE.gyro_fast_bias_sigma
+    assert WHOLE.chosen(WHOLE.names) == WHOLE
+    assert WHOLE.names == (
+        "gyro.scale", "gyro.misalignment", "gyro.force", "gyro.drift", "mag.bias", "acc.lever", "acc.correlated",
+    )  # fmt: skip
+
+
+def test_an_estimate_with_states_is_judged_like_any_other(tmp_path):
+    from strapdown.records import read_estimate, write_estimate
+
+    scenario = scenarios.load_scenario("spin")
+    believes = setup.matched(scenario, states=True)
+    record = scenarios.simulate(scenarios.drawn(scenario, 2), 2)
+    draw = generator(2, 0, "start").standard_normal(6)
+    initial = setup.initial_state(
+        believes,
+        quaternion.multiply(record.truth.attitude[0], quaternion.exp(-believes.attitude_sigma * draw[:3])),
+        record.truth.bias[0] - believes.bias_sigma * draw[3:],
+    )
+    estimate = setup.run(record, believes, initial, full_covariance=True)
+    write_estimate(tmp_path / "e.h5", estimate, {})
+    again = read_estimate(tmp_path / "e.h5")
+    truth = Truth(attitude=record.truth.attitude, bias=record.truth.bias)
+    assert consistency.judge(again, truth).verdict == "consistent"
+    assert np.array_equal(again.covariance, estimate.covariance)
+    assert kinematics.skew(estimate.bias[0]).shape == (3, 3)
