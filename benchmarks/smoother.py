@@ -93,7 +93,7 @@ def measure(samples: int, seconds: float) -> dict:
             "filter": lambda one=one: mekf.run(one, noise, initial),
             "smoother": lambda one=one: smoother.run(one, noise, initial),
         }
-        if spacing == 1 and not absent:
+        if not absent:  # it takes the vectors of every sample in any case
             gyr, acc, mag = (np.ascontiguousarray(x) for x in (data[0], 9.81 * data[1], 50.0 * data[2]))
             functions["vqf"] = lambda gyr=gyr, acc=acc, mag=mag: vqf.offlineVQF(gyr, acc, mag, INTERVAL)
         best = least_times(functions, seconds)
@@ -123,9 +123,10 @@ def main(arguments: list[str] | None = None) -> dict:
             f"{figures['smoother_over_filter']:.2f} times the filter (wanted: {WANTED['filter']:g} at most)"
         )
         if "vqf_ns" in figures:
+            told = f"wanted: {WANTED['vqf']:g} at least" if SPACING[name] == 1 else "with vectors at every sample"
             print(
                 f"{'vqf.offlineVQF':30s} {figures['vqf_ns']:.1f} ns a sample: {figures['vqf_over_smoother']:.2f} times the "
-                f"smoother (wanted: {WANTED['vqf']:g} at least)"
+                f"smoother ({told})"
             )
     print(f"fixed lag of 100 samples       {result['fixed_lag_of_100_samples_ns']:.0f} ns a sample")
     for name in result["absent"]:

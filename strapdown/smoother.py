@@ -13,6 +13,7 @@ import numpy as np
 from strapdown import mekf
 from strapdown.checks import Array, InputError, non_negative
 from strapdown.kernels import smoother_loop
+from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.machine import compiled
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.mekf import ProcessNoise, State
@@ -21,6 +22,9 @@ from strapdown.robustness import Gate, Robust
 
 STAMP_TOLERANCE = 1e-6
 """Of the mean gyro interval: an edge that lies beyond t + lag by no more is taken for one at t + lag."""
+
+MOST_GROUPS = 4096
+"""Groups of segments of which the fixed-lag smoother keeps the gains, 5 kB each; where a lag takes more, it computes them anew."""
 
 
 def run(
@@ -72,7 +76,7 @@ def run_fixed_lag(
     """Return the fixed-lag smoother's estimate: at each edge t, what the measurements up to the last edge at or before t + lag tell.
 
     Exact: equal to :func:`run` on the record cut there. Work grows with the number of gyro intervals in ``lag``: one backward step each
-    for every edge. ``lag`` in s; 0 is the filter, the length of the record or more is :func:`run`.
+    for every edge, though the gains are computed once. ``lag`` in s; 0 is the filter, the length of the record or more is :func:`run`.
     """
     return _smoothed(record, process_noise, initial, non_negative("lag", lag, unit="s"), full_covariance, gate, robust)
 
@@ -94,13 +98,17 @@ def _smoothed(
     whole = int(np.searchsorted(until, edges - 1))
     attitude, bias, variance = np.empty((edges, 4)), np.empty((edges, 3)), np.empty((edges, 6))
     blocks = np.empty((edges if full_covariance else 0, 21))
+    first, last = np.arange(whole + 1), until[: whole + 1]
+    # One pass needs three groups at a time; of several, each shares nearly all with the next.
+    groups = 3 if whole == 0 else int(np.max(starts[last] - starts[first])) // WIDTH + 3
     compiled(smoother_loop.smooth_back)(
-        segments,
+        segments.reshape(-1),
         starts,
-        np.arange(whole + 1),
-        until[: whole + 1],
+        first,
+        last,
         process_noise.angle_random_walk**2,
         process_noise.rate_random_walk**2,
+        np.empty(smoother_loop.work_size(min(groups, MOST_GROUPS))),
         attitude,
         bias,
         variance,
@@ -153,4 +161,6 @@ def _filtered(
             )
     starts = np.empty(len(record.time), np.int64)
     compiled(smoother_loop.locate_edges)(record.time, events.time, segments, len(segments) - 1, starts)
+    if len(segments) < smoother_loop.FEWEST_ROWS:
+        segments = np.concatenate([segments, np.tile(segments[-1], (smoother_loop.FEWEST_ROWS - len(segments), 1))])
     return forward, segments, starts

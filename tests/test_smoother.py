@@ -663,6 +663,17 @@ def test_fixed_lag_is_the_smoother_of_what_was_known(lag: float) -> None:
             np.testing.assert_allclose(lagged.covariance[k], known.covariance[k], rtol=1e-12, atol=1e-25)
 
 
+def test_gains_kept_or_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    case = CASES["asynchronous"]
+    record, initial = believed(case, np.random.default_rng(10))
+    kept = smoother.run_fixed_lag(record, case.noise, initial, lag=0.7, full_covariance=True)
+    for groups in range(3, 10):  # too few for each pass, for some, for none
+        monkeypatch.setattr(smoother, "MOST_GROUPS", groups)
+        anew = smoother.run_fixed_lag(record, case.noise, initial, lag=0.7, full_covariance=True)
+        for name in ("attitude", "bias", "variance", "covariance"):
+            np.testing.assert_array_equal(getattr(kept, name), getattr(anew, name))
+
+
 def test_more_lag_more_certain() -> None:
     case = CASES["directions"]
     record, initial = believed(case, np.random.default_rng(9))
@@ -723,6 +734,110 @@ def random_covariance(rng: np.random.Generator, decades: float = 1.0) -> np.ndar
     return scale @ (turn * 10.0 ** rng.uniform(-decades, 0.0, 6)) @ turn.T @ scale
 
 
+def test_composed_rotations_at_any_angle() -> None:
+    # Both lengths of the series on both sides of their bounds; the oracle in 40 digits.
+    rng = np.random.default_rng(1)
+    sizes = np.concatenate(
+        [angles(rng), (1.0 - 1e-6) * np.array([0.005, 0.01]), (1.0 + 1e-6) * np.array([0.005, 0.01])]
+    )
+    axes = rng.standard_normal((2 * len(sizes), 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    for (one, first), (other, second) in zip(
+        zip(sizes, axes, strict=False), zip(rng.permutation(sizes), axes[len(sizes) :], strict=True), strict=True
+    ):
+        with mpmath.workdps(40):
+            halves = [mpmath.mpf(float(angle)) / 2 for angle in (one, other)]
+            u, v = (mpmath.matrix(axis.tolist()) for axis in (first, second))
+            u, v = u / mpmath.norm(u), v / mpmath.norm(v)
+            c, d = (mpmath.cos(half) for half in halves)
+            s, t = (mpmath.sin(half) for half in halves)
+            cross = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
+            w = c * d - s * t * sum(u[i] * v[i] for i in range(3))
+            vector = mpmath.matrix([s * d * u[i] + c * t * v[i] + s * t * cross[i] for i in range(3)])
+            size = mpmath.norm(vector)
+            angle = 2 * mpmath.atan2(size, abs(w))
+            expected = [float(mpmath.sign(w) * angle * x / size) if size else 0.0 for x in vector]
+            r = (float(c), *(float(s * x) for x in u))
+            phi = [float(2 * halves[1] * x) for x in v]
+        if angle < 3.1:  # else its sign hangs on the rounding of the arguments
+            found = smoother_step.composed(r, tuple(phi))
+            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15 * (one + other))
+
+
+def test_noise_seen_from_the_start_of_a_step() -> None:
+    rng = np.random.default_rng(2)
+    noise = ProcessNoise(angle_random_walk=2e-3, rate_random_walk=3e-2)
+    sizes = angles(rng)
+    for angle in sizes[sizes <= LARGEST_ANGLE]:
+        turn = angle * quaternion.normalize(np.append(rng.standard_normal(3), 0.0))[:3]
+        dt = 10.0 ** rng.uniform(-3, 1)
+        F, Q = mekf.transition_and_noise(turn, dt, noise)
+        back = np.linalg.inv(F)
+        expected = back @ Q @ back.T
+        q11, q12, q22 = smoother_step.step_noise(tuple(turn), dt, noise.angle_random_walk**2, noise.rate_random_walk**2)
+        bias = np.array([q22, 0.0, 0.0, q22, 0.0, q22])
+        found = mekf.covariance_matrices(np.array([*q11, *q12, *bias]))
+        scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+        np.testing.assert_allclose(found / scale, expected / scale, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("decades", [0.0, 3.0, 8.0])
+def test_gain_and_what_it_leaves(decades: float) -> None:
+    # The textbook's P Φᵀ P⁻⁻¹ and P − G P⁻ Gᵀ in 60 digits, over a prior that spans so many decades.
+    rng = np.random.default_rng(3)
+    dt, sv, su = 0.05, 1e-4, 1e-5
+    noise = ProcessNoise(angle_random_walk=sv, rate_random_walk=su)
+    for _ in range(5):
+        turn = 0.1 * rng.standard_normal(3)
+        F, Q = mekf.transition_and_noise(turn, dt, noise)
+        P = random_covariance(rng, decades)
+        q11, q12, q22 = smoother_step.step_noise(tuple(turn), dt, sv**2, su**2)
+        N = smoother_step.kept_share(*blocks(P), q11, q12, q22)
+        tt, tb, bt, bb = (np.reshape(block, (3, 3)) for block in smoother_step.gain(N, tuple(turn), dt))
+        found = np.block([[tt, tb], [bt, bb]])
+        upper, across, lower = smoother_step.left_noise(N, q11, q12, q22)
+        left = mekf.covariance_matrices(np.array([*upper, *across, *lower]))
+        with mpmath.workdps(60):
+            p, f, r = (mpmath.matrix(m.tolist()) for m in (P, F, Q))
+            predicted = f * p * f.T + r
+            gain = p * f.T * predicted**-1
+            exact = p - gain * predicted * gain.T
+            expected, expected_left = (np.array(m.tolist(), dtype=float) for m in (gain, exact))
+        unit = np.repeat([1.0, 1e-2], 3)
+        np.testing.assert_allclose(found * unit / unit[:, None], expected * unit / unit[:, None], rtol=0, atol=1e-11)
+        scale = np.sqrt(np.outer(np.diag(expected_left), np.diag(expected_left)))
+        np.testing.assert_allclose(left / scale, expected_left / scale, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize("intervals", [*range(1, 20), 31, 32, 33])
+def test_any_number_of_segments(intervals: int) -> None:
+    # Segments are taken in groups of eight, the last of which may be smaller.
+    case = dataclasses.replace(CASES["directions"], attitude_sigma=0.2, bias_sigma=0.02, duration=1.0)
+    case = dataclasses.replace(
+        case, sensors=(("direction", DOWN, 0.02, (0.06, 0.02)), ("direction", STAR, 0.04, (0.11, 0.07)))
+    )
+    record, initial = believed(case, np.random.default_rng(intervals))
+    record = records.cut(record, 0, intervals)
+    one = smoother.run(record, case.noise, initial, full_covariance=True)
+    assert_same(one, fixed_side_smoother(record, case.noise, initial), 1e-8)
+
+
+@pytest.mark.parametrize("angle", [0.3, 0.4, 0.6])
+def test_corrections_beyond_the_series(angle: float) -> None:
+    # So large that the smoothed state lies outside of the range of the polynomials about the filtered one: both forms in one record.
+    case = dataclasses.replace(CASES["directions"], attitude_sigma=0.3, bias_sigma=0.02, duration=2.0)
+    record, _ = believed(case, np.random.default_rng(5))
+    turn = quaternion.exp(angle * np.array([0.48, 0.6, 0.64]))
+    initial = mekf.initial_state(
+        quaternion.multiply(record.truth.attitude[0], turn), attitude_sigma=0.3, bias_sigma=0.02
+    )
+    one = smoother.run(record, case.noise, initial, full_covariance=True)
+    filtered = mekf.run(record, case.noise, initial)
+    moved = quaternion.log(quaternion.multiply(quaternion.conjugate(filtered.attitude), one.attitude))
+    assert (np.linalg.norm(moved, axis=1).max() > LARGEST_ANGLE) == (angle > 0.35)
+    assert_same(one, fixed_side_smoother(record, case.noise, initial), 1e-8)
+
+
 def test_noise_share() -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
@@ -781,7 +896,9 @@ def test_plain_python_equals_compiled() -> None:
     for back in (smoother_loop.smooth_back, compiled(smoother_loop.smooth_back)):
         out = [np.empty((len(record.time), size)) for size in (4, 3, 6, 21)]
         first, last = np.array([0]), np.array([len(record.time) - 1])
-        back(segments, starts, first, last, case.noise.angle_random_walk**2, case.noise.rate_random_walk**2, *out)
+        work = np.empty(smoother_loop.work_size(3))
+        variances = (case.noise.angle_random_walk**2, case.noise.rate_random_walk**2)
+        back(segments.reshape(-1), starts, first, last, *variances, work, *out)
         results.append(out)
     for plain, fast in zip(*results, strict=True):
         np.testing.assert_allclose(plain, fast, rtol=1e-9, atol=1e-12 * np.abs(fast).max())

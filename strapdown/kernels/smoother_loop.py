@@ -1,8 +1,94 @@
-"""The smoother over whole records: backward passes over the segments that the filter stored."""
+"""The smoother over whole records: backward passes over the segments that the filter stored.
+
+A pass takes the segments in groups of ``WIDTH``, counted from the end of the record. What depends on the filter alone is computed for a
+group at once, a segment a lane, and left as rows of matrices (``prepare_…``), which the chain then reads segment by segment: one row in a
+machine vector, times a number spread over it. Two chains run in step, the covariances a group behind the errors, because each covariance
+wants the Jacobians at both errors of its segment, which are again taken for a group at once (:func:`fold_jacobians`); neither chain waits
+for the other, and one works while the other waits for itself. The group that comes next is prepared in four parts between their links.
+
+Passes that overlap, those of a fixed lag, share the prepared groups.
+"""
 
 from __future__ import annotations
 
-from strapdown.kernels.smoother_step import smooth
+from strapdown.kernels.algebra import dot, multiply, times_transpose_upper
+from strapdown.kernels.lane_values import (
+    WIDTH,
+    anywhere,
+    chosen,
+    lanes_of,
+    load,
+    load_quadruples,
+    spread,
+    store,
+)
+from strapdown.kernels.rotation import quaternion_multiply, right_jacobian, turned
+from strapdown.kernels.series import LARGEST_ANGLE
+from strapdown.kernels.smoother_step import (
+    composed,
+    gain,
+    inverse_right_jacobian,
+    kept_share,
+    left_noise,
+    moved,
+    near_inverse_right_jacobian,
+    step_noise,
+)
+
+ROW = 32
+"""Numbers of a stored segment: dt, increment (3), state (28)."""
+
+# Places in a prepared group. Of each segment first ``MATRICES`` numbers: the columns of G, six numbers each, without gaps (36 and 4 more),
+# and the upper triangle of D by rows (21 and 3 more). Read as a vector, a column of G ends in two lanes of the next, and row i of D begins
+# with i lanes of the row before: lanes of which no use is made. Then, a lane a segment, what the updates at its end did.
+MATRICES = 64
+NOISE = 40
+TURN = MATRICES * WIDTH
+"""The quaternion from the predicted attitude to that of the next segment."""
+MOVED = TURN + 4 * WIDTH
+"""1 where anything was measured there, 0 where nothing was: then the turn is rounding, and (a, d) = (ε, β)."""
+BIAS_STEP = MOVED + WIDTH
+ATTITUDE = BIAS_STEP + 3 * WIDTH
+BIAS = ATTITUDE + 4 * WIDTH
+GROUP = BIAS + 3 * WIDTH
+"""Numbers of a prepared group."""
+
+# Places in the work space.
+COLUMNS = 0
+"""G and D of the group in preparation, a lane a segment."""
+SHARE = COLUMNS + MATRICES * WIDTH
+"""Its N and Q̄."""
+STEP = SHARE + 52 * WIDTH
+"""Its dt and turns."""
+ERRORS = STEP + 4 * WIDTH
+"""Smoothed errors (ε, β) of two groups in turn, a row of eight for each segment, and one for the state that the group ends in."""
+SEEN = ERRORS + 2 * (WIDTH + 1) * WIDTH
+"""(a, d) of a group's segments, a row of eight each."""
+JACOBIAN = SEEN + WIDTH * WIDTH
+FOLDED = JACOBIAN + 9 * WIDTH
+"""The first three columns of each G J, as they lie in the group, and where they end."""
+FOLDED_ROW = 24
+COVARIANCE = FOLDED + FOLDED_ROW * WIDTH
+"""P_s of a group's segments and of the state that it ends in: six rows of eight each, of which only the upper triangle holds."""
+COVARIANCE_ROW = 48
+SMOOTHED = COVARIANCE + COVARIANCE_ROW * (WIDTH + 1)
+"""A group's smoothed states in lanes: attitude, bias, A, B."""
+GROUPS = SMOOTHED + 22 * WIDTH
+"""From here on prepared groups, one after the other, the first again after the last."""
+
+FEWEST_ROWS = WIDTH + 1
+"""Rows that the array of segments must have; any that follow the end state are not looked at."""
+
+_NOTHING = 1e-30
+_LARGEST_SQUARE = LARGEST_ANGLE * LARGEST_ANGLE
+_NOT_NEGATIVE = 2**62 - 1
+_LANE = WIDTH - 1
+# An index and one of these: the same index, and the compiler sees that it is not negative, which it otherwise tests at each number read.
+
+
+def work_size(groups):
+    """Return the numbers of work space for so many prepared groups, with room to begin at a cache line."""
+    return GROUPS + GROUP * groups + WIDTH
 
 
 def locate_edges(edges, event_time, segments, number, starts_out):
@@ -29,53 +115,443 @@ def locate_edges(edges, event_time, segments, number, starts_out):
     return k
 
 
-def smooth_back(
-    segments, starts, first, last, angle_variance, rate_variance, attitude_out, bias_out, variance_out, covariance_out
-):
-    """Run backward passes: pass p goes from the filtered state at edge ``last[p]`` to edge ``first[p]`` and writes every row on its way.
+def store_triple(work, place, v):
+    """Write the lanes of three components."""
+    store(work, place, v[0])
+    store(work, place + WIDTH, v[1])
+    store(work, place + 2 * WIDTH, v[2])
 
-    ``segments`` is the filter's (dt, increment, state at its start), with one row more that holds the end state; ``starts[k]`` is the row
-    that starts at edge k. Where passes overlap, the later pass stands.
+
+def load_triple(work, place):
+    """Return the lanes of three components."""
+    return (load(work, place), load(work, place + WIDTH), load(work, place + 2 * WIDTH))
+
+
+def store_columns(work, place, M):
+    """Write a 3×3 block of G, its columns six numbers apart."""
+    store_triple(work, place, (M[0], M[3], M[6]))
+    store_triple(work, place + 6 * WIDTH, (M[1], M[4], M[7]))
+    store_triple(work, place + 12 * WIDTH, (M[2], M[5], M[8]))
+
+
+def store_matrix(work, place, M):
+    """Write the lanes of a 9-tuple."""
+    store_triple(work, place, (M[0], M[1], M[2]))
+    store_triple(work, place + 3 * WIDTH, (M[3], M[4], M[5]))
+    store_triple(work, place + 6 * WIDTH, (M[6], M[7], M[8]))
+
+
+def load_matrix(work, place):
+    """Return the lanes of a 9-tuple."""
+    a, b, c = load_triple(work, place)
+    d, e, f = load_triple(work, place + 3 * WIDTH)
+    g, h, i = load_triple(work, place + 6 * WIDTH)
+    return (a, b, c, d, e, f, g, h, i)
+
+
+def prepare_turns(segments, start, work, group):
+    """Write the states of the eight segments from ``segments[start]`` on and what the updates at their ends did; keep dt and turn."""
+    w = WIDTH
+    dt, x, y, z = load_quadruples(segments, start, ROW)
+    b0, b1, b2, _ = load_quadruples(segments, start + 8, ROW)
+    next_b0, next_b1, next_b2, _ = load_quadruples(segments, start + ROW + 8, ROW)
+    store_triple(work, group + BIAS, (b0, b1, b2))
+    step_b = (next_b0 - b0, next_b1 - b1, next_b2 - b2)
+    store_triple(work, group + BIAS_STEP, step_b)
+    phi = (x - dt * b0, y - dt * b1, z - dt * b2)
+    store(work, STEP, dt)
+    store_triple(work, STEP + w, phi)
+    q = load_quadruples(segments, start + 4, ROW)
+    store(work, group + ATTITUDE, q[0])
+    store_triple(work, group + ATTITUDE + w, (q[1], q[2], q[3]))
+    p = turned(q, phi)
+    r = quaternion_multiply((p[0], -p[1], -p[2], -p[3]), load_quadruples(segments, start + ROW + 4, ROW))
+    store(work, group + TURN, r[0])
+    store_triple(work, group + TURN + w, (r[1], r[2], r[3]))
+    turn = r[1] * r[1] + r[2] * r[2] + r[3] * r[3]
+    step = dot(step_b, step_b)
+    seen = (
+        chosen(step > 0.0, spread(1.0), turn) > _NOTHING
+    )  # without an update the bias stays to the bit, the attitude to rounding
+    store(work, group + MOVED, chosen(seen, spread(1.0), spread(0.0)))
+
+
+def prepare_shares(segments, start, work, angle_variance, rate_variance):
+    """Keep N and Q̄ of the segments of :func:`prepare_turns`."""
+    w = WIDTH
+    dt = load(work, STEP)
+    phi = load_triple(work, STEP + w)
+    _, _, _, a0 = load_quadruples(segments, start + 8, ROW)
+    a1, a2, a3, a4 = load_quadruples(segments, start + 12, ROW)
+    a5, c0, c1, c2 = load_quadruples(segments, start + 16, ROW)
+    c3, c4, c5, c6 = load_quadruples(segments, start + 20, ROW)
+    c7, c8, d0, d1 = load_quadruples(segments, start + 24, ROW)
+    d2, d3, d4, d5 = load_quadruples(segments, start + 28, ROW)
+    q11, q12, q22 = step_noise(phi, dt, angle_variance, rate_variance)
+    n_tt, n_tb, n_bt, n_bb = kept_share(
+        (a0, a1, a2, a3, a4, a5),
+        (c0, c1, c2, c3, c4, c5, c6, c7, c8),
+        (d0, d1, d2, d3, d4, d5),
+        q11,
+        q12,
+        q22,
+    )
+    store_matrix(work, SHARE, n_tt)
+    store_matrix(work, SHARE + 9 * w, n_tb)
+    store_matrix(work, SHARE + 18 * w, n_bt)
+    store_matrix(work, SHARE + 27 * w, n_bb)
+    store_triple(work, SHARE + 36 * w, (q11[0], q11[1], q11[2]))
+    store_triple(work, SHARE + 39 * w, (q11[3], q11[4], q11[5]))
+    store_matrix(work, SHARE + 42 * w, q12)
+    store(work, SHARE + 51 * w, q22)
+
+
+def prepare_gains(work):
+    """Keep G and D of the segments of :func:`prepare_shares`, a lane a segment."""
+    w = WIDTH
+    N = (
+        load_matrix(work, SHARE),
+        load_matrix(work, SHARE + 9 * w),
+        load_matrix(work, SHARE + 18 * w),
+        load_matrix(work, SHARE + 27 * w),
+    )
+    q0, q1, q2 = load_triple(work, SHARE + 36 * w)
+    q3, q4, q5 = load_triple(work, SHARE + 39 * w)
+    d_tt, d_tb, d_bb = left_noise(
+        N, (q0, q1, q2, q3, q4, q5), load_matrix(work, SHARE + 42 * w), load(work, SHARE + 51 * w)
+    )
+    d = COLUMNS + NOISE * w
+    store_triple(work, d, (d_tt[0], d_tt[1], d_tt[2]))
+    store_triple(work, d + 3 * w, (d_tb[0], d_tb[1], d_tb[2]))
+    store_triple(work, d + 6 * w, (d_tt[3], d_tt[4], d_tb[3]))
+    store_triple(work, d + 9 * w, (d_tb[4], d_tb[5], d_tt[5]))
+    store_triple(work, d + 12 * w, (d_tb[6], d_tb[7], d_tb[8]))
+    store_triple(work, d + 15 * w, (d_bb[0], d_bb[1], d_bb[2]))
+    store_triple(work, d + 18 * w, (d_bb[3], d_bb[4], d_bb[5]))
+    g_tt, g_tb, g_bt, g_bb = gain(N, load_triple(work, STEP + w), load(work, STEP))
+    store_columns(work, COLUMNS, g_tt)
+    store_columns(work, COLUMNS + 3 * w, g_bt)
+    store_columns(work, COLUMNS + 18 * w, g_tb)
+    store_columns(work, COLUMNS + 21 * w, g_bb)
+
+
+def prepare_rows(work, group):
+    """Write the matrices of :func:`prepare_gains` a row a segment, eight numbers of four segments at a time."""
+    for k in range(MATRICES // WIDTH):
+        for i in range(0, WIDTH, 4):
+            one, two, three, four = load_quadruples(work, COLUMNS + WIDTH * WIDTH * k + i, WIDTH)
+            s = group + MATRICES * i + WIDTH * k
+            store(work, s, one)
+            store(work, s + MATRICES, two)
+            store(work, s + 2 * MATRICES, three)
+            store(work, s + 3 * MATRICES, four)
+
+
+def times_columns(work, places, columns):
+    """Return the sum of six columns, each times the number at its place."""
+    a, b, c, d, e, f = places
+    return (work[a] * columns[0] + work[b] * columns[1] + work[c] * columns[2]) + (
+        work[d] * columns[3] + work[e] * columns[4] + work[f] * columns[5]
+    )
+
+
+def load_columns(work, first, last):
+    """Return the six columns of a gain, three from each place."""
+    return (
+        load(work, first),
+        load(work, first + 6),
+        load(work, first + 12),
+        load(work, last),
+        load(work, last + 6),
+        load(work, last + 12),
+    )
+
+
+def carry_error(work, group, errors, i):
+    """Take the smoothed error from the end of segment i of a group to its start: (ε, β) ← G (a, d)."""
+    w = WIDTH
+    i &= _LANE
+    group &= _NOT_NEGATIVE
+    errors &= _NOT_NEGATIVE
+    columns = load_columns(work, group + MATRICES * i, group + MATRICES * i + 18)
+    e = errors + w * i + w
+    r = group + TURN + i
+    if work[group + MOVED + i] != 0.0:
+        a = composed(
+            (work[r], work[r + w], work[r + 2 * w], work[r + 3 * w]),
+            (work[e], work[e + 1], work[e + 2]),
+        )
+        b = group + BIAS_STEP + i
+        s = SEEN + w * i
+        work[s], work[s + 1], work[s + 2] = a
+        work[s + 3] = work[b] + work[e + 3]
+        work[s + 4] = work[b + w] + work[e + 4]
+        work[s + 5] = work[b + 2 * w] + work[e + 5]
+        store(work, e - w, times_columns(work, (s, s + 1, s + 2, s + 3, s + 4, s + 5), columns))
+    else:
+        store(work, e - w, times_columns(work, (e, e + 1, e + 2, e + 3, e + 4, e + 5), columns))
+
+
+def fold_jacobians(work, group, errors):
+    """Write the first three columns of G J for a group, J = J_r(a)⁻¹ J_r(ε) with ε the error at the end of each segment."""
+    w = WIDTH
+    group &= _NOT_NEGATIVE
+    seen = load(work, group + MOVED) > 0.5
+    if anywhere(seen):
+        e0, e1, e2, _ = load_quadruples(work, errors + w, w)
+        a0, a1, a2, _ = load_quadruples(work, SEEN, w)
+        e = (e0, e1, e2)
+        a = (chosen(seen, a0, e0), chosen(seen, a1, e1), chosen(seen, a2, e2))
+        if anywhere(dot(e, e) > _LARGEST_SQUARE) or anywhere(dot(a, a) > _LARGEST_SQUARE):
+            for i in range(WIDTH):
+                s = errors + w + w * i
+                _, J = moved((1.0, 0.0, 0.0, 0.0), (work[s], work[s + 1], work[s + 2]))
+                if work[group + MOVED + i] != 0.0:
+                    s = SEEN + w * i
+                J = multiply(inverse_right_jacobian((work[s], work[s + 1], work[s + 2])), J)
+                for c in range(9):
+                    work[JACOBIAN + w * c + i] = J[c]
+        else:
+            J = multiply(near_inverse_right_jacobian(a), right_jacobian(e))
+            store_triple(work, JACOBIAN, (J[0], J[1], J[2]))
+            store_triple(work, JACOBIAN + 3 * w, (J[3], J[4], J[5]))
+            store_triple(work, JACOBIAN + 6 * w, (J[6], J[7], J[8]))
+        for i in range(WIDTH):
+            g = group + MATRICES * i
+            x, y, z = load(work, g), load(work, g + 6), load(work, g + 12)
+            f = FOLDED + FOLDED_ROW * i
+            for c in range(3):
+                j = JACOBIAN + w * c + i
+                store(work, f + 6 * c, work[j] * x + work[j + 3 * w] * y + work[j + 6 * w] * z)
+    else:
+        for i in range(WIDTH):
+            g = group + MATRICES * i
+            f = FOLDED + FOLDED_ROW * i
+            store(work, f, load(work, g))
+            store(work, f + 8, load(work, g + 8))
+            store(work, f + 16, load(work, g + 16))
+
+
+def row_times(work, f, g, z, start):
+    """Return ``start`` plus the sum of six rows z, times the numbers of one row of the gain, three from column to column at f and at g."""
+    return (work[f] * z[0] + (work[f + 6] * z[1] + (work[f + 12] * z[2] + start))) + (
+        work[g] * z[3] + work[g + 6] * z[4] + work[g + 12] * z[5]
+    )
+
+
+def carry_covariance(work, group, i):
+    """Take the smoothed covariance from the end of segment i of a group to its start: P_s ← (G J) P_s (G J)ᵀ + D."""
+    i &= _LANE
+    g = (group & _NOT_NEGATIVE) + MATRICES * i
+    f = FOLDED + FOLDED_ROW * i
+    p = COVARIANCE + COVARIANCE_ROW * i + COVARIANCE_ROW
+    d = g + NOISE
+    g += 18
+    columns = load_columns(work, f, g)
+    # Rows of P_s (G J)ᵀ, of which P_s is read from its upper triangle.
+    z = (
+        times_columns(work, (p, p + 1, p + 2, p + 3, p + 4, p + 5), columns),
+        times_columns(work, (p + 1, p + 9, p + 10, p + 11, p + 12, p + 13), columns),
+        times_columns(work, (p + 2, p + 10, p + 18, p + 19, p + 20, p + 21), columns),
+        times_columns(work, (p + 3, p + 11, p + 19, p + 27, p + 28, p + 29), columns),
+        times_columns(work, (p + 4, p + 12, p + 20, p + 28, p + 36, p + 37), columns),
+        times_columns(work, (p + 5, p + 13, p + 21, p + 29, p + 37, p + 45), columns),
+    )
+    p -= COVARIANCE_ROW
+    store(work, p, row_times(work, f, g, z, load(work, d)))
+    store(work, p + 8, row_times(work, f + 1, g + 1, z, load(work, d + 5)))
+    store(work, p + 16, row_times(work, f + 2, g + 2, z, load(work, d + 9)))
+    store(work, p + 24, row_times(work, f + 3, g + 3, z, load(work, d + 12)))
+    store(work, p + 32, row_times(work, f + 4, g + 4, z, load(work, d + 14)))
+    store(work, p + 40, row_times(work, f + 5, g + 5, z, load(work, d + 15)))
+
+
+def move_states(work, group, errors, whole):
+    """Write a group's smoothed states: each filtered one moved by its error, the covariance carried to the new tangent space.
+
+    B only where the ``whole`` covariance is wanted; C stays as it is.
     """
+    w = WIDTH
+    group &= _NOT_NEGATIVE
+    e0, e1, e2, beta0 = load_quadruples(work, errors, w)
+    beta1, beta2, _, _ = load_quadruples(work, errors + 4, w)
+    b0, b1, b2 = load_triple(work, group + BIAS)
+    t = SMOOTHED
+    store_triple(work, t + 4 * w, (b0 + beta0, b1 + beta1, b2 + beta2))
+    e = (e0, e1, e2)
+    if anywhere(dot(e, e) > _LARGEST_SQUARE):
+        for i in range(WIDTH):
+            u = group + ATTITUDE + i
+            s = errors + w * i
+            q, J = moved((work[u], work[u + w], work[u + 2 * w], work[u + 3 * w]), (work[s], work[s + 1], work[s + 2]))
+            for c in range(4):
+                work[t + w * c + i] = q[c]
+            for c in range(9):
+                work[JACOBIAN + w * c + i] = J[c]
+        j0, j1, j2 = load_triple(work, JACOBIAN)
+        j3, j4, j5 = load_triple(work, JACOBIAN + 3 * w)
+        j6, j7, j8 = load_triple(work, JACOBIAN + 6 * w)
+        J = (j0, j1, j2, j3, j4, j5, j6, j7, j8)
+    else:
+        x, y, z = load_triple(work, group + ATTITUDE + w)
+        q = turned((load(work, group + ATTITUDE), x, y, z), e)
+        store(work, t, q[0])
+        store_triple(work, t + w, (q[1], q[2], q[3]))
+        J = right_jacobian(e)
+    a0, a1, a2, c0 = load_quadruples(work, COVARIANCE, COVARIANCE_ROW)
+    a3, a4, c3, c4 = load_quadruples(work, COVARIANCE + 9, COVARIANCE_ROW)
+    a5, c6, c7, c8 = load_quadruples(work, COVARIANCE + 18, COVARIANCE_ROW)
+    A = times_transpose_upper(multiply(J, (a0, a1, a2, a1, a3, a4, a2, a4, a5)), J)
+    store_triple(work, t + 7 * w, (A[0], A[1], A[2]))
+    store_triple(work, t + 10 * w, (A[3], A[4], A[5]))
+    if whole:
+        c1, c2, _, _ = load_quadruples(work, COVARIANCE + 4, COVARIANCE_ROW)
+        c5, _, _, _ = load_quadruples(work, COVARIANCE + 13, COVARIANCE_ROW)
+        B = multiply(J, (c0, c1, c2, c3, c4, c5, c6, c7, c8))
+        store_triple(work, t + 13 * w, (B[0], B[1], B[2]))
+        store_triple(work, t + 16 * w, (B[3], B[4], B[5]))
+        store_triple(work, t + 19 * w, (B[6], B[7], B[8]))
+
+
+def write_smoothed(work, i, k, attitude_out, bias_out, variance_out, covariance_out):
+    """Write the smoothed state of segment i of a group to row k of the outputs."""
+    i &= _LANE
+    w = WIDTH
+    s = SMOOTHED + i
+    attitude_out[k, 0], attitude_out[k, 1] = work[s], work[s + w]
+    attitude_out[k, 2], attitude_out[k, 3] = work[s + 2 * w], work[s + 3 * w]
+    bias_out[k, 0], bias_out[k, 1], bias_out[k, 2] = work[s + 4 * w], work[s + 5 * w], work[s + 6 * w]
+    a = s + 7 * w
+    c = COVARIANCE + COVARIANCE_ROW * i + 27
+    variance_out[k, 0], variance_out[k, 1], variance_out[k, 2] = work[a], work[a + 3 * w], work[a + 5 * w]
+    variance_out[k, 3], variance_out[k, 4], variance_out[k, 5] = work[c], work[c + 9], work[c + 18]
+    if k < len(covariance_out):
+        for n in range(15):
+            covariance_out[k, n] = work[a + w * n]
+        covariance_out[k, 15], covariance_out[k, 16], covariance_out[k, 17] = work[c], work[c + 1], work[c + 2]
+        covariance_out[k, 18], covariance_out[k, 19], covariance_out[k, 20] = work[c + 9], work[c + 10], work[c + 18]
+
+
+def write_filtered(segments, s, k, attitude_out, bias_out, variance_out, covariance_out):
+    """Write the filtered state at ``segments[s]`` to row k of the outputs."""
+    for i in range(4):
+        attitude_out[k, i] = segments[s + i]
+    for i in range(3):
+        bias_out[k, i] = segments[s + 4 + i]
+    variance_out[k, 0], variance_out[k, 1], variance_out[k, 2] = segments[s + 7], segments[s + 10], segments[s + 12]
+    variance_out[k, 3], variance_out[k, 4], variance_out[k, 5] = segments[s + 22], segments[s + 25], segments[s + 27]
+    if k < len(covariance_out):
+        for i in range(21):
+            covariance_out[k, i] = segments[s + 7 + i]
+
+
+def start_covariance(work, p, segments, s):
+    """Write the upper triangle of the filtered covariance at ``segments[s]`` to rows of eight."""
+    work[p], work[p + 1], work[p + 2] = segments[s], segments[s + 1], segments[s + 2]
+    work[p + 9], work[p + 10], work[p + 18] = segments[s + 3], segments[s + 4], segments[s + 5]
+    for i in range(3):
+        for j in range(3):
+            work[p + 8 * i + 3 + j] = segments[s + 6 + 3 * i + j]
+    work[p + 27], work[p + 28], work[p + 29] = segments[s + 15], segments[s + 16], segments[s + 17]
+    work[p + 36], work[p + 37], work[p + 45] = segments[s + 18], segments[s + 19], segments[s + 20]
+
+
+def smooth_back(
+    segments,
+    starts,
+    first,
+    last,
+    angle_variance,
+    rate_variance,
+    work,
+    attitude_out,
+    bias_out,
+    variance_out,
+    covariance_out,
+):
+    """Run backward passes: pass p goes from the filtered state at edge ``last[p]`` to edge ``first[p]``; neither falls from pass to pass.
+
+    It writes the edges from its first to the next pass's first, the last pass all from its first on. ``segments`` holds the filter's rows
+    (dt, increment, state at its start), flat, the last one the end state, ``FEWEST_ROWS`` at least; ``starts[k]`` is the row that starts
+    at edge k. ``work`` has room for three prepared groups or more (:func:`work_size`); each is prepared once if all that a pass meets fit.
+    """
+    w = WIDTH
+    # From a cache line on, which vectors then do not cross. Not in a function, which may return no part of an array.
+    work = work[-(work.ctypes.data // 8) % WIDTH :]
+    lanes_of((0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    for i in range(GROUPS):
+        work[i] = 0.0
+    room = (len(work) - GROUPS) // GROUP
+    # Group t ends t groups before this row; the last begins with row 0, however many it shares with the one before.
+    end = len(segments) // ROW - 1
+    fresh, stale = 0, 0  # groups fresh … stale − 1 are prepared
     for p in range(len(first)):
-        k = last[p]
-        j = starts[k]
-        row = segments[j]
-        q = (row[4], row[5], row[6], row[7])
-        b = (row[8], row[9], row[10])
-        A = (row[11], row[12], row[13], row[14], row[15], row[16])
-        B = (row[17], row[18], row[19], row[20], row[21], row[22], row[23], row[24], row[25])
-        C = (row[26], row[27], row[28], row[29], row[30], row[31])
-        while True:
-            if j == starts[k]:
-                attitude_out[k, 0], attitude_out[k, 1], attitude_out[k, 2], attitude_out[k, 3] = q
-                bias_out[k, 0], bias_out[k, 1], bias_out[k, 2] = b
-                variance_out[k, 0], variance_out[k, 1], variance_out[k, 2] = A[0], A[3], A[5]
-                variance_out[k, 3], variance_out[k, 4], variance_out[k, 5] = C[0], C[3], C[5]
-                if k < len(covariance_out):
+        j = starts[last[p]]
+        k = first[p + 1] - 1 if p + 1 < len(first) else last[p]
+        if k == last[p]:
+            write_filtered(segments, ROW * j + 4, k, attitude_out, bias_out, variance_out, covariance_out)
+            k -= 1
+        if k < first[p]:
+            continue
+        top = (end - j) // w
+        bottom = (end - 1 - starts[first[p]]) // w
+        if top > stale or bottom + 1 - top > room:
+            fresh, stale = top, top
+        missing = max(fresh - top, 0)
+        count, group, place = 0, GROUPS, GROUPS
+        # Each turn prepares one group at most: the first turns what came newly into reach, the later ones what the errors will meet next.
+        for n in range(top - missing, bottom + 3):
+            group_before, group = group, place
+            ready = n if n >= top else fresh - 1
+            place = GROUPS + GROUP * (ready % room)
+            if n < top:
+                fresh -= 1
+                stale = min(stale, fresh + room)
+            elif stale <= n <= bottom:
+                stale = n + 1
+                fresh = max(fresh, stale - room)
+            else:
+                ready = -1
+            start = ROW * max(end - w * (ready + 1), 0)
+            # The errors of group t, the covariances of the one before.
+            t = n - 1
+            count_before = count
+            count = min(j, end - w * t) - max(end - w * (t + 1), 0) if top <= t <= bottom else 0
+            errors = ERRORS + (w + 1) * w * (t & 1)
+            errors_before = ERRORS + (w + 1) * w * (1 - (t & 1))
+            if t == top:
+                for i in range(w + 1):
+                    store(work, errors + w * i, spread(0.0))
+            elif t > top:
+                store(work, errors + w * count, load(work, errors_before))
+                p_end = COVARIANCE + COVARIANCE_ROW * count_before
+                if t == top + 1:
+                    start_covariance(work, p_end, segments, ROW * j + 11)
+                else:
                     for i in range(6):
-                        covariance_out[k, i] = A[i]
-                        covariance_out[k, 15 + i] = C[i]
-                    for i in range(9):
-                        covariance_out[k, 6 + i] = B[i]
-                if k == first[p]:
-                    break
-                k -= 1
-            j -= 1
-            row = segments[j]
-            q, b, A, B, C = smooth(
-                (row[4], row[5], row[6], row[7]),
-                (row[8], row[9], row[10]),
-                (row[11], row[12], row[13], row[14], row[15], row[16]),
-                (row[17], row[18], row[19], row[20], row[21], row[22], row[23], row[24], row[25]),
-                (row[26], row[27], row[28], row[29], row[30], row[31]),
-                (row[1], row[2], row[3]),
-                row[0],
-                angle_variance,
-                rate_variance,
-                q,
-                b,
-                A,
-                B,
-                C,
-            )
+                        store(work, p_end + w * i, load(work, COVARIANCE + w * i))
+            for part in range(4):
+                if ready >= 0:
+                    if part == 0:
+                        prepare_turns(segments, start, work, place)
+                    elif part == 1:
+                        prepare_shares(segments, start, work, angle_variance, rate_variance)
+                    elif part == 2:
+                        prepare_gains(work)
+                    else:
+                        prepare_rows(work, place)
+                for m in range(2):
+                    i = w - 1 - 2 * part - m
+                    if i < count:
+                        carry_error(work, group, errors, i)
+                    if i < count_before:
+                        carry_covariance(work, group_before, i)
+            if t > top:
+                begin = max(end - w * t, 0)
+                if starts[k] >= begin:
+                    move_states(work, group_before, errors_before, len(covariance_out) > 0)
+                    while k >= first[p] and starts[k] >= begin:
+                        write_smoothed(work, starts[k] - begin, k, attitude_out, bias_out, variance_out, covariance_out)
+                        k -= 1
+            if top <= t <= bottom:
+                fold_jacobians(work, group, errors)

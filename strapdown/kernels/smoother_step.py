@@ -1,12 +1,17 @@
 """One step of the fixed-interval smoother backward in time, on tuples: Rauch–Tung–Striebel on the manifold.
 
-State and error as in :mod:`strapdown.kernels.filter_step`. Each covariance lives in the tangent space at its own attitude, so the
-smoothed one of the later time is carried to the predicted attitude before the step, and the result to the smoothed attitude after it.
+State and error as in :mod:`strapdown.kernels.filter_step`. What is smoothed is the *error* of the filtered state, (ε, β) = (Log(q⁻¹ ⊗ q_s),
+b_s − b), with its covariance in the tangent space at the filtered attitude. So all that depends on the filter alone, the gain G and the
+covariance D below, can be computed for many segments at once, and the recursion proper is ``(ε, β) ← G (a, d)``, ``P_s ← (G J) P_s (G J)ᵀ
++ D``. Here (a, d) is the smoothed error at the end of the segment seen from the *predicted* state: with r what the filter's updates there
+turned the attitude by and δb what they added to the bias, ``a = Log(r ⊗ exp(ε))``, ``d = δb + β``, and J = J_r(a)⁻¹ J_r(ε) carries the
+tangent space along: exp(a) ⊗ exp(η) = exp(a + J_r(a)⁻¹ η). Where nothing was measured, a = ε and J = I.
 
-With ``P⁻ = Φ P Φᵀ + Q`` the smoother's gain ``P Φᵀ P⁻⁻¹`` is written ``Φ⁻¹ N``, ``N = I − M``, ``M = Q P⁻⁻¹``. This is the same
-number, but its rounding error is that of M, which is small where P⁻ is ill-conditioned (a diffuse start, one sharp measurement), and
-the gain's own would be rounding times the condition number. The covariance follows without a difference of covariances:
-``P + C (P_s − P⁻) Cᵀ = Φ⁻¹ {N P_s Nᵀ + N Q} Φ⁻ᵀ``, a sum of two positive parts, for ``N Q = (Q⁻¹ + (Φ P Φᵀ)⁻¹)⁻¹``.
+**The gain.** With ``P⁻ = Φ P Φᵀ + Q`` the textbook's is ``P Φᵀ P⁻⁻¹``. With the noise seen from the start of the segment, ``Q̄ = Φ⁻¹ Q Φ⁻ᵀ``
+(which is the Q of a step back in time), it is ``G = N Φ⁻¹``, ``N = I − M``, ``M = Q̄ (P + Q̄)⁻¹``. This is the same number, but nothing is
+predicted, and its rounding error is that of M, which is small where P is ill-conditioned (a diffuse start, one sharp measurement), and the
+textbook's own would be rounding times the condition number. The covariance follows without a difference of covariances:
+``P + G (P_s − P⁻) Gᵀ = G P_s Gᵀ + D``, a sum of two positive parts, for ``D = N Q̄ = (Q̄⁻¹ + P⁻¹)⁻¹``.
 """
 
 from __future__ import annotations
@@ -15,6 +20,8 @@ import math
 
 from strapdown.kernels.algebra import (
     add,
+    add_matrices,
+    add_to_diagonal,
     combine,
     dot,
     full,
@@ -27,17 +34,18 @@ from strapdown.kernels.algebra import (
     times_transpose_upper,
     times_transpose_upper_add,
     transpose,
-    transpose_times_vector,
 )
-from strapdown.kernels.filter_step import predict, process_noise, transition
+from strapdown.kernels.filter_step import process_noise, transition
 from strapdown.kernels.rotation import quaternion_multiply, right_jacobian, turned
-from strapdown.kernels.series import LARGEST_ANGLE, polynomial
+from strapdown.kernels.series import LARGEST_ANGLE, cosine, polynomial, sinc
 
 _A = tuple(math.comb(2 * k, k) / (4.0**k * (2 * k + 1)) for k in range(12))
 _A0, _A1, _A2, _A3, _A4, _A5, _A6, _A7, _A8, _A9, _A10, _A11 = _A
 # |B_2k| / (2k)! for k = 1 … 6, with the Bernoulli numbers 1/6, 1/30, 1/42, 1/30, 5/66, 691/2730.
 _I0, _I1, _I2 = 1.0 / 12.0, 1.0 / 720.0, 1.0 / 30240.0
 _I3, _I4, _I5 = 1.0 / 1209600.0, 1.0 / 47900160.0, 691.0 / 1307674368000.0
+_SHORT = 1e-4
+"""rad²: where two angles are not larger than its root, four terms of the series of their composition are good to rounding."""
 _SINE_SQUARED = math.sin(0.5 * LARGEST_ANGLE) ** 2
 
 
@@ -59,15 +67,18 @@ def logarithm(q):
     return scale(math.copysign(2.0 * half, q[0]), v)
 
 
+def near_inverse_right_jacobian(phi):
+    """Return :func:`inverse_right_jacobian` for θ ≤ ``LARGEST_ANGLE``, of floats or lanes."""
+    return skew_polynomial(1.0, 0.5, polynomial(dot(phi, phi), _I0, _I1, _I2, _I3, _I4, _I5), phi)
+
+
 def inverse_right_jacobian(phi):
     """Return ``J_r(φ)⁻¹ = I + ½ [φ] + (1 − (θ/2) cot(θ/2))/θ² [φ]²``, θ = |φ| ≤ π."""
     x = dot(phi, phi)
     if x <= LARGEST_ANGLE * LARGEST_ANGLE:
-        quadratic = polynomial(x, _I0, _I1, _I2, _I3, _I4, _I5)
-    else:
-        half = 0.5 * math.sqrt(x)
-        quadratic = (1.0 - half / math.tan(half)) / x
-    return skew_polynomial(1.0, 0.5, quadratic, phi)
+        return near_inverse_right_jacobian(phi)
+    half = 0.5 * math.sqrt(x)
+    return skew_polynomial(1.0, 0.5, (1.0 - half / math.tan(half)) / x, phi)
 
 
 def moved(q, phi):
@@ -81,16 +92,48 @@ def moved(q, phi):
     return q, skew_polynomial(1.0, -2.0 * s * s / x, (theta - math.sin(theta)) / (theta * x), phi)
 
 
+def composed(r, phi):
+    """Return the rotation vector of r ⊗ exp(φ), r a unit quaternion, any angles. The chain of all smoothed states hangs on it.
+
+    The product is summed so that the series of φ come in last, and for small angles, which are the rule, with the terms that count.
+    """
+    u = (
+        r[0] * phi[0] + (r[2] * phi[2] - r[3] * phi[1]),
+        r[0] * phi[1] + (r[3] * phi[0] - r[1] * phi[2]),
+        r[0] * phi[2] + (r[1] * phi[1] - r[2] * phi[0]),
+    )
+    x = dot(phi, phi)
+    if x < _SHORT and r[1] * r[1] + r[2] * r[2] + r[3] * r[3] < 0.25 * _SHORT and r[0] > 0.0:
+        y = 0.25 * x
+        c = 1.0 + y * (y * (1.0 / 24.0) - 0.5)
+        h = 0.5 + y * (y * (1.0 / 240.0) - 1.0 / 12.0)
+        v = (c * r[1] + h * u[0], c * r[2] + h * u[1], c * r[3] + h * u[2])
+        z = dot(v, v)
+        return scale((2.0 + 2.0 * _A1 * z) + (z * z) * (2.0 * _A2 + 2.0 * _A3 * z), v)
+    if x <= LARGEST_ANGLE * LARGEST_ANGLE:
+        c = cosine(0.25 * x)
+        h = 0.5 * sinc(0.25 * x)
+    else:
+        theta = math.sqrt(x)
+        c = math.cos(0.5 * theta)
+        h = math.sin(0.5 * theta) / theta
+    w = r[1] * phi[0] + r[2] * phi[1] + r[3] * phi[2]
+    return logarithm((c * r[0] - h * w, c * r[1] + h * u[0], c * r[2] + h * u[1], c * r[3] + h * u[2]))
+
+
 def factored(S):
-    """Return S = L D Lᵀ of a symmetric positive-definite matrix, as (l10, l20, l21, 1/d0, 1/d1, 1/d2)."""
+    """Return S = L D Lᵀ of a symmetric positive-definite matrix, as (l10, l20, l21, 1/d0, 1/d1, 1/d2).
+
+    Eliminated without fractions (Bareiss 1968), so that no division waits for another: the differences, and with them the rounding, are
+    those of the elimination by rows times the pivots before.
+    """
+    m11 = S[0] * S[3] - S[1] * S[1]
+    m21 = S[0] * S[4] - S[1] * S[2]
+    m22 = S[0] * S[5] - S[2] * S[2]
     i0 = 1.0 / S[0]
-    l10 = S[1] * i0
-    l20 = S[2] * i0
-    i1 = 1.0 / (S[3] - l10 * S[1])
-    m21 = S[4] - l10 * S[2]
-    l21 = m21 * i1
-    i2 = 1.0 / (S[5] - l20 * S[2] - l21 * m21)
-    return (l10, l20, l21, i0, i1, i2)
+    j1 = 1.0 / m11
+    i2 = (S[0] * m11) / (m11 * m22 - m21 * m21)
+    return (S[1] * i0, S[2] * i0, m21 * j1, i0, S[0] * j1, i2)
 
 
 def solved(F, v):
@@ -110,24 +153,31 @@ def divided(X, F):
     return (a0, a1, a2, b0, b1, b2, c0, c1, c2)
 
 
-def subtract_matrices(A, B):
-    """Return A − B of two 9-tuples."""
+def minus_product(S, A, B):
+    """Return S − A B of 9-tuples, summed so that every product fuses with a subtraction."""
     return (
-        A[0] - B[0],
-        A[1] - B[1],
-        A[2] - B[2],
-        A[3] - B[3],
-        A[4] - B[4],
-        A[5] - B[5],
-        A[6] - B[6],
-        A[7] - B[7],
-        A[8] - B[8],
+        ((S[0] - A[0] * B[0]) - A[1] * B[3]) - A[2] * B[6],
+        ((S[1] - A[0] * B[1]) - A[1] * B[4]) - A[2] * B[7],
+        ((S[2] - A[0] * B[2]) - A[1] * B[5]) - A[2] * B[8],
+        ((S[3] - A[3] * B[0]) - A[4] * B[3]) - A[5] * B[6],
+        ((S[4] - A[3] * B[1]) - A[4] * B[4]) - A[5] * B[7],
+        ((S[5] - A[3] * B[2]) - A[4] * B[5]) - A[5] * B[8],
+        ((S[6] - A[6] * B[0]) - A[7] * B[3]) - A[8] * B[6],
+        ((S[7] - A[6] * B[1]) - A[7] * B[4]) - A[8] * B[7],
+        ((S[8] - A[6] * B[2]) - A[7] * B[5]) - A[8] * B[8],
     )
 
 
-def subtract_symmetric(S, T):
-    """Return S − T of two symmetric matrices."""
-    return (S[0] - T[0], S[1] - T[1], S[2] - T[2], S[3] - T[3], S[4] - T[4], S[5] - T[5])
+def minus_times_transpose_upper(S, A, B):
+    """Return the upper triangle of S − A Bᵀ, known to be symmetric."""
+    return (
+        ((S[0] - A[0] * B[0]) - A[1] * B[1]) - A[2] * B[2],
+        ((S[1] - A[0] * B[3]) - A[1] * B[4]) - A[2] * B[5],
+        ((S[2] - A[0] * B[6]) - A[1] * B[7]) - A[2] * B[8],
+        ((S[3] - A[3] * B[3]) - A[4] * B[4]) - A[5] * B[5],
+        ((S[4] - A[3] * B[6]) - A[4] * B[7]) - A[5] * B[8],
+        ((S[5] - A[6] * B[6]) - A[7] * B[7]) - A[8] * B[8],
+    )
 
 
 def scale_matrix(s, A):
@@ -136,35 +186,21 @@ def scale_matrix(s, A):
 
 
 def noise_share(A, B, C, q11, q12, q22):
-    """Return the blocks of ``M = Q P⁻⁻¹`` (θθ, θb, bθ, bb): how much of the predicted uncertainty the last step's noise brought.
+    """Return the blocks of ``M = Q W⁻¹`` (θθ, θb, bθ, bb): how much of the uncertainty W = P + Q the noise brought.
 
-    P⁻ is (A, B, C). Eliminates the attitude block first: ``P⁻⁻¹`` by the Schur complement ``C − Bᵀ A⁻¹ B``, both 3×3 factored.
+    W is (A, B, C). Eliminates the attitude block first: ``W⁻¹`` by the Schur complement ``C − Bᵀ A⁻¹ B``, both 3×3 factored.
     """
     bt = transpose(B)
     F = factored(A)
     K = divided(bt, F)  # Bᵀ A⁻¹
-    G = factored(subtract_symmetric(C, times_transpose_upper(K, bt)))
+    G = factored(minus_times_transpose_upper(C, K, bt))
     kt = transpose(K)
     full11 = full(q11)
     q21 = transpose(q12)
-    theta_bias = divided(subtract_matrices(q12, multiply(full11, kt)), G)
-    theta_theta = subtract_matrices(divided(full11, F), multiply(theta_bias, K))
-    remainder = multiply(q21, kt)
-    bias_bias = divided(
-        (
-            q22 - remainder[0],
-            -remainder[1],
-            -remainder[2],
-            -remainder[3],
-            q22 - remainder[4],
-            -remainder[5],
-            -remainder[6],
-            -remainder[7],
-            q22 - remainder[8],
-        ),
-        G,
-    )
-    bias_theta = subtract_matrices(divided(q21, F), multiply(bias_bias, K))
+    theta_bias = divided(minus_product(q12, full11, kt), G)
+    theta_theta = minus_product(divided(full11, F), theta_bias, K)
+    bias_bias = divided(minus_product((q22, 0.0, 0.0, 0.0, q22, 0.0, 0.0, 0.0, q22), q21, kt), G)
+    bias_theta = minus_product(divided(q21, F), bias_bias, K)
     return theta_theta, theta_bias, bias_theta, bias_bias
 
 
@@ -173,53 +209,66 @@ def identity_minus(A):
     return (1.0 - A[0], -A[1], -A[2], -A[3], 1.0 - A[4], -A[5], -A[6], -A[7], 1.0 - A[8])
 
 
-def smooth(q, b, A, B, C, delta_theta, dt, angle_variance, rate_variance, next_q, next_b, next_A, next_B, next_C):
-    """Return the smoothed state at the start of a segment.
-
-    (q, b, A, B, C) is the filtered state there, ``delta_theta`` and ``dt`` the increment from it, and (next_q, …) the *smoothed* state at
-    the end of the segment. The prediction is computed anew, as the filter did it.
-    """
-    phi = combine(1.0, delta_theta, -dt, b)
-    phi11, phi12 = transition(phi, dt)
-    q11, q12, q22 = process_noise(phi, dt, angle_variance, rate_variance)
-    predicted, A, B, C = predict(q, b, A, B, C, delta_theta, dt, angle_variance, rate_variance)
-    inverse = (predicted[0], -predicted[1], -predicted[2], -predicted[3])
-    # From the tangent space at the smoothed attitude to that at the predicted one: exp(a) ⊗ exp(ε) = exp(a + J_r(a)⁻¹ ε).
-    a = logarithm(quaternion_multiply(inverse, next_q))
-    d = subtract(next_b, b)
-    J = inverse_right_jacobian(a)
-    later_A = full(times_transpose_upper(multiply(J, full(next_A)), J))
-    later_B = multiply(J, next_B)
-    # M holds what of the correction is left to the noise of this step; N = I − M is what goes back to its start.
-    m_tt, m_tb, m_bt, m_bb = noise_share(A, B, C, q11, q12, q22)
-    n_tt = identity_minus(m_tt)
-    n_bb = identity_minus(m_bb)
-    n_tb = scale_matrix(-1.0, m_tb)
-    n_bt = scale_matrix(-1.0, m_bt)
-    theta = add(matrix_times_vector(n_tt, a), matrix_times_vector(n_tb, d))
-    bias = add(matrix_times_vector(n_bt, a), matrix_times_vector(n_bb, d))
-    bt = transpose(later_B)
-    y_tt = multiply_add(n_tt, later_A, multiply(n_tb, bt))
-    y_tb = multiply_add(n_tt, later_B, multiply(n_tb, full(next_C)))
-    y_bt = multiply_add(n_bt, later_A, multiply(n_bb, bt))
-    y_bb = multiply_add(n_bt, later_B, multiply(n_bb, full(next_C)))
-    # N P_s Nᵀ + N Q, in the tangent space at the predicted attitude
-    nq_tt = times_transpose_upper_add(n_tt, full(q11), times_transpose_upper(n_tb, q12))
-    nq_tb = multiply_add(n_tt, q12, scale_matrix(q22, n_tb))
-    nq_bb = times_transpose_upper_add(n_bt, transpose(q12), scale_upper(q22, n_bb))
-    A = times_transpose_upper_add(y_tt, n_tt, times_transpose_upper_add(y_tb, n_tb, nq_tt))
-    B = multiply_add(y_tt, transpose(n_bt), multiply_add(y_tb, transpose(n_bb), nq_tb))
-    C = times_transpose_upper_add(y_bt, n_bt, times_transpose_upper_add(y_bb, n_bb, nq_bb))
-    # Back by Φ⁻¹ = [[Φ11ᵀ, −Φ11ᵀ Φ12], [0, I]], then to the tangent space at the smoothed attitude.
-    correction = transpose_times_vector(phi11, subtract(theta, matrix_times_vector(phi12, bias)))
-    minus12 = scale_matrix(-1.0, phi12)
-    X = multiply_add(minus12, full(C), B)
-    inner = times_transpose_upper_add(minus12, B, times_transpose_upper_add(X, minus12, A))
-    q, J = moved(q, correction)
-    R = multiply(J, transpose(phi11))
-    return q, add(b, bias), times_transpose_upper(multiply(R, full(inner)), R), multiply(R, X), C
-
-
 def scale_upper(s, A):
     """Return s times the upper triangle of a 9-tuple."""
     return (s * A[0], s * A[1], s * A[2], s * A[4], s * A[5], s * A[8])
+
+
+def step_noise(phi, dt, angle_variance, rate_variance):
+    """Return Q̄ = Φ⁻¹ Q Φ⁻ᵀ over a turn φ = ω dt (Q̄11, Q̄12, diagonal of Q̄22): the process noise of the same turn back in time."""
+    return process_noise(scale(-1.0, phi), -dt, -angle_variance, -rate_variance)
+
+
+def kept_share(A, B, C, q11, q12, q22):
+    """Return the blocks of N = I − M, M = Q̄ (P + Q̄)⁻¹: what of a correction goes back to the state (A, B, C), not to the noise Q̄."""
+    W11 = (A[0] + q11[0], A[1] + q11[1], A[2] + q11[2], A[3] + q11[3], A[4] + q11[4], A[5] + q11[5])
+    m_tt, m_tb, m_bt, m_bb = noise_share(W11, add_matrices(B, q12), add_to_diagonal(C, q22), q11, q12, q22)
+    return identity_minus(m_tt), scale_matrix(-1.0, m_tb), scale_matrix(-1.0, m_bt), identity_minus(m_bb)
+
+
+def gain(N, phi, dt):
+    """Return the blocks of G = N Φ⁻¹ (θθ, θb, bθ, bb) over a turn φ = ω dt; Φ⁻¹ is the transition back in time."""
+    n_tt, n_tb, n_bt, n_bb = N
+    r, s = transition(scale(-1.0, phi), -dt)
+    return multiply(n_tt, r), multiply_add(n_tt, s, n_tb), multiply(n_bt, r), multiply_add(n_bt, s, n_bb)
+
+
+def left_noise(N, q11, q12, q22):
+    """Return D = N Q̄ (upper triangle, θb, upper triangle)."""
+    n_tt, n_tb, n_bt, n_bb = N
+    return (
+        times_transpose_upper_add(n_tt, full(q11), times_transpose_upper(n_tb, q12)),
+        multiply_add(n_tt, q12, scale_matrix(q22, n_tb)),
+        times_transpose_upper_add(n_bt, transpose(q12), scale_upper(q22, n_bb)),
+    )
+
+
+def smooth(q, b, A, B, C, delta_theta, dt, angle_variance, rate_variance, next_q, next_b, next_A, next_B, next_C):
+    """Return the smoothed state at the start of a segment: one step as a whole, what :mod:`strapdown.kernels.smoother_loop` does in parts.
+
+    (q, b, A, B, C) is the filtered state there, ``delta_theta`` and ``dt`` the increment from it, and (next_q, …) the *smoothed* state at
+    the end of the segment. Each covariance lives in the tangent space at its own attitude.
+    """
+    phi = combine(1.0, delta_theta, -dt, b)
+    q11, q12, q22 = step_noise(phi, dt, angle_variance, rate_variance)
+    N = kept_share(A, B, C, q11, q12, q22)
+    g_tt, g_tb, g_bt, g_bb = gain(N, phi, dt)
+    d_tt, d_tb, d_bb = left_noise(N, q11, q12, q22)
+    p = turned(q, phi)
+    a = logarithm(quaternion_multiply((p[0], -p[1], -p[2], -p[3]), next_q))
+    d = subtract(next_b, b)
+    J = inverse_right_jacobian(a)
+    theta = add(matrix_times_vector(g_tt, a), matrix_times_vector(g_tb, d))
+    bias = add(matrix_times_vector(g_bt, a), matrix_times_vector(g_bb, d))
+    g_tt = multiply(g_tt, J)
+    g_bt = multiply(g_bt, J)
+    bt = transpose(next_B)
+    y_tt = multiply_add(g_tt, full(next_A), multiply(g_tb, bt))
+    y_tb = multiply_add(g_tt, next_B, multiply(g_tb, full(next_C)))
+    y_bt = multiply_add(g_bt, full(next_A), multiply(g_bb, bt))
+    y_bb = multiply_add(g_bt, next_B, multiply(g_bb, full(next_C)))
+    A = times_transpose_upper_add(y_tt, g_tt, times_transpose_upper_add(y_tb, g_tb, d_tt))
+    B = multiply_add(y_tt, transpose(g_bt), multiply_add(y_tb, transpose(g_bb), d_tb))
+    C = times_transpose_upper_add(y_bt, g_bt, times_transpose_upper_add(y_bb, g_bb, d_bb))
+    q, J = moved(q, theta)
+    return q, add(b, bias), times_transpose_upper(multiply(J, full(A)), J), multiply(J, B), C
