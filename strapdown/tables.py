@@ -128,7 +128,19 @@ def build(kind: type, table: Mapping[str, Any], form: Form, place: str, **more: 
             choice = form.get(field.name, PLAIN)
             key = f"{field.name}_{choice[0][0]}" if choice[0][0] else field.name
             raise InputError(f"{place}: {key} is missing; add it")
-    return kind(**values)
+    try:
+        return kind(**values)
+    except InputError as error:
+        raise InputError(_with_typed(str(error), table, form, place)) from None
+
+
+def _with_typed(text: str, table: Mapping[str, Any], form: Form, place: str) -> str:
+    """Return what is said of a field with the key and the number that the file has, where the unit there is another than SI."""
+    said = text.split(" is ", 1)[0]
+    for key, (name, factor) in keys(form).items():
+        if key in table and factor != 1.0 and said.endswith((name, f"{name}[0]", f"{name}[1]", f"{name}[2]")):
+            return f"{text} ({place}: {key} = {table[key]!r})"
+    return text
 
 
 def read(path: str | os.PathLike[str], name: str, remedy: str) -> dict[str, Any]:

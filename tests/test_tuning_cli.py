@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from strapdown import cli, gyro, motion, recordfiles, scenarios, setup, tuning, vectors
+from strapdown.checks import InputError
 from strapdown.setup import FilterSetup
 
 SCENARIO = scenarios.Scenario(
@@ -149,3 +150,43 @@ def test_a_record_that_does_not_tell_its_gyro_needs_a_filter(monkeypatch, capsys
         status, _, said = run(monkeypatch, capsys, "tune", bare, *more, "-o", tmp_path / "f.toml")
         assert status == 2
         assert "--filter" in said
+
+
+@pytest.fixture
+def scaled(tmp_path):
+    """A record whose gyro has a scale factor, which its scenario tells."""
+    scenario = dataclasses.replace(SCENARIO, gyro=dataclasses.replace(SCENARIO.gyro, scale_factor=np.full(3, 2e-3)))
+    path = tmp_path / "scaled.h5"
+    record = scenarios.simulate(scenario, 2)
+    recordfiles.write_record(path, record, gyro_spec=scenario.gyro, scenario=scenarios.scenario_to_toml(scenario))
+    return path
+
+
+def test_tune_gives_the_filter_states_for_what_the_record_specifies(monkeypatch, capsys, tmp_path, scaled):
+    out = tmp_path / "states.toml"
+    status, said, complaint = run(
+        monkeypatch, capsys, "tune", scaled, "--states", "--free", "gyro.arw,gyro.scale_sigma", "--starts", 1, "-o", out
+    )
+    assert status == 0, complaint
+    assert "Optional states: gyro.scale" in said
+    found = setup.read_setup(out)
+    assert found.states is not None
+    assert found.process_noise.angle_random_walk == pytest.approx(1e-4, rel=0.5)
+    names = [one["name"] for one in json.loads(out.with_suffix(".json").read_text())["parameters"]]
+    assert names == ["gyro.arw", "gyro.scale_sigma"]
+
+
+@pytest.mark.parametrize("option", [("--truth",), ("--credibility",), ("--gate",), ("--spacing", 2.0), ("--plan",)])
+def test_optional_states_are_tuned_by_the_plain_likelihood_alone(monkeypatch, capsys, tmp_path, scaled, option):
+    out = tmp_path / "states.toml"
+    status, _, complaint = run(monkeypatch, capsys, "tune", scaled, "--states", *option, "-o", out)
+    assert status != 0
+    assert "optional states" in complaint
+    assert not out.exists()
+
+
+def test_the_plain_likelihood_refuses_a_filter_with_states(scaled):
+    file = recordfiles.read_record_file(scaled)
+    chosen = setup.matched_to_record(file.gyro, file.record, states=True)
+    with pytest.raises(InputError, match=r"extended\.likelihood"):
+        tuning.likelihood([tuning.record_case(file.record, chosen)], chosen, ["gyro.arw"])

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from strapdown.records import ImuRecord
     from strapdown.setup import FilterSetup
     from strapdown.tuning import Case, Comparison, Performance, Plan, TunedGate, Tuning, Unmodelled
+    from strapdown.tuning.parameters import Unit
 
 
 GATED = ("gate.probability", "outliers.share", "outliers.scale")
@@ -74,6 +75,14 @@ def tune(
             help="Model outliers too, their share and scale, and set the filter's gate where an outlier is the likelier explanation.",
         ),
     ] = False,
+    states: Annotated[
+        bool,
+        typer.Option(
+            "--states",
+            help="Give the filter the optional states that the record's specified errors call for; --free may name their sizes too, such "
+            "as gyro.scale_sigma, SENSOR.correlated_sigma, SENSOR.correlation_time.",
+        ),
+    ] = False,
     holdout: Annotated[
         float | None, typer.Option(help="Share of the data held out, to judge the filter before and after on.")
     ] = None,
@@ -125,6 +134,10 @@ def tune(
     if integration is not None:
         algorithm = coning.ALGORITHMS[one_of("integration", integration, coning.ALGORITHMS)]
     names = None if free is None else [name.strip() for name in free.split(",") if name.strip()]
+    if states and chosen is not None:
+        raise InputError("--filter tells the filter's states itself, in [filter.states]; leave --states out")
+    if plan and (states or (chosen is not None and chosen.states is not None)):
+        raise InputError("--plan knows no optional states; leave --states away, and [filter.states] out of the filter")
     if plan:
         _plan(records, chosen, algorithm, names, length, workers)
         return
@@ -141,7 +154,9 @@ def tune(
         raise InputError(f"{same[0]} is given twice; a record counts once")
     output_file("out", out, (".toml",), *records, *([filter_file] if filter_file is not None else []))
     units = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
-    cases, believed, gyros = _cases(records, chosen, {name: unit for name, unit in units.items() if unit})
+    cases, believed, gyros = _cases(
+        records, chosen, {name: unit for name, unit in units.items() if unit}, states=states
+    )
     if algorithm is not None:
         believed = replace(believed, integration=algorithm)
     train, held = (tuple(cases), ()) if holdout is None else tuning.split(cases, holdout, _by(holdout_by))
@@ -163,7 +178,16 @@ def tune(
         raise InputError(
             "--gate needs the likelihood of all innovations: leave --truth, --rmse, --credibility and --spacing away"
         )
-    if gate:
+    if believed.states is not None and (gate or truth or rmse or credibility or spacing > 0.0):
+        raise InputError(
+            "a filter with optional states is tuned by the likelihood of all innovations: leave --gate, --truth, --rmse, --credibility and "
+            "--spacing away"
+        )
+    if believed.states is not None:
+        from strapdown.tuning import extended
+
+        objective = extended.likelihood(train, believed, wanted, threads=workers)
+    elif gate:
         objective = tuning.contaminated_likelihood(train, believed, wanted)
     elif credibility:
         objective = tuning.credibility_objective(train, believed, wanted, truth=truth, threads=workers)
@@ -181,7 +205,7 @@ def tune(
             starts=starts,
             factor=factor,
             seed=seed,
-            threads=1 if truth or rmse or credibility else workers,
+            threads=1 if truth or rmse or credibility or believed.states is not None else workers,
             progress=advance,
         )
     if rmse:
@@ -195,17 +219,20 @@ def tune(
     if comparison is not None and gate:
         likely = tuning.log_likelihood(held, objective, result)
         comparison = replace(comparison, after=replace(comparison.after, log_likelihood=likely))
-    with progress_bar("what is left unexplained", min(len(train), MOST_EXAMINED)) as advance:
-        examined = []
-        for case in train[:MOST_EXAMINED]:
+    # What is looked for is what optional states are there for.
+    suspects = train[:MOST_EXAMINED] if believed.states is None else ()
+    examined = []
+    with progress_bar("what is left unexplained", len(suspects)) as advance:
+        for case in suspects:
             examined.append(tuning.unmodelled(case, result.setup))
             advance(1)
-    worst = max(examined, key=lambda one: (one.moves_with_the_rate, one.suspected, len(one.failed)))
-    result = tuning.doubted(result, worst)
+    worst = max(examined, key=lambda one: (one.moves_with_the_rate, one.suspected, len(one.failed)), default=None)
+    if worst is not None:
+        result = tuning.doubted(result, worst)
     _tell(result, [case.record for case in cases], credible=credibility)
     if found is not None:
         _tell_gate(found)
-    for sentence in worst.words:
+    for sentence in () if worst is None else worst.words:
         console.print(sentence, soft_wrap=True)
     if comparison is not None:
         _tell_comparison(comparison, truth=bool(truth or rmse or credibility))
@@ -221,12 +248,12 @@ def _by(text: str) -> Any:
 
 
 def _cases(
-    paths: Sequence[Path], chosen: FilterSetup | None, units: dict[str, str]
+    paths: Sequence[Path], chosen: FilterSetup | None, units: dict[str, str], *, states: bool
 ) -> tuple[list[Case], FilterSetup, dict[str, GyroSpec]]:
     """Return the records to tune on, the filter to start from, and the gyros of the records that tell theirs."""
     from strapdown import recordfiles, recordings, tuning
     from strapdown.checks import InputError
-    from strapdown.setup import matched_to_record
+    from strapdown.cli.filters import filter_for
 
     cases: list[Case] = []
     gyros: dict[str, GyroSpec] = {}
@@ -238,11 +265,15 @@ def _cases(
                     raise InputError(
                         f"{path} does not tell its gyro; give a filter to start from, --filter filter.toml"
                     )
-                chosen = matched_to_record(file.gyro, file.record)
+                chosen, remarks = filter_for(path, file, None, None, () if states else None)
+                for remark in remarks:
+                    console.print(remark)
             if file.gyro is not None:
                 gyros[str(path)] = file.gyro
             cases.append(tuning.record_case(file.record, chosen, name=path.name))
         else:
+            if states:
+                raise InputError(f"{path} is a recording, which specifies no errors; --states is for simulated records")
             recording = recordings.read(path, units=units)
             chosen = chosen or tuning.recording_setup()
             cases.append(tuning.recording_case(recording))
@@ -260,16 +291,22 @@ def _priors(source: str, factor: float, record: ImuRecord, names: Sequence[str])
     }
 
 
+def _unit_of(name: str, records: Sequence[ImuRecord]) -> Unit:
+    """Return the unit that a parameter is printed in, of the filter or of its optional states."""
+    from strapdown import tuning
+    from strapdown.tuning import extended
+
+    return tuning.unit_of(name, records) if name in tuning.known_names(records) else extended.unit_of(name)
+
+
 def _figure(value: float) -> str:
     return f"{value:.3g}" if math.isfinite(value) else "∞"
 
 
 def _tell(result: Tuning, records: Sequence[ImuRecord], *, credible: bool) -> None:
-    from strapdown.tuning import unit_of
-
     rows = table("Tuned, with 95 % intervals", "parameter", "unit", "before", "after", "from", "to", "", left=2)
     for one in result.parameters:
-        unit = unit_of(one.name, records)
+        unit = _unit_of(one.name, records)
         told = [value / unit.factor for value in (one.start, one.value, one.lower, one.upper)]
         bounded = f"not identified: < {_figure(told[3])} at 95 %" if math.isfinite(one.upper) else "not identified"
         note = one.note if one.identified or "prior" in one.note else bounded
@@ -370,7 +407,7 @@ def _write(
     report = out.with_suffix(".json")
     write_json(report, _report(result, comparison, paths, of, examined, gate))
     records = [case.record for case in cases]
-    units = [tuning.unit_of(name, records) for name in objective.names]
+    units = [_unit_of(name, records) for name in objective.names]
     figures = {
         out.with_name(f"{out.stem}-likelihood.png"): drawing.likelihood_slices(
             tuning.slices(objective, result), result, units
@@ -472,14 +509,12 @@ def _numbers(text: str) -> list[float]:
 
 
 def _tell_plan(found: Plan, records: Sequence[ImuRecord]) -> None:
-    from strapdown.tuning import unit_of
-
     columns = [f"{length:g} s" for length in found.lengths]
     listing = table(
         "Least standard error, as a factor (Cramér–Rao)", "parameter", "unit", "value", *columns, "10 % needs", left=2
     )
     for j, name in enumerate(found.names):
-        unit = unit_of(name, records)
+        unit = _unit_of(name, records)
         listing.add_row(
             name,
             unit.name,

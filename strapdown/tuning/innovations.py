@@ -306,6 +306,10 @@ def likelihood(
     if not cases:
         raise InputError("there is no record to tune on; give one")
     records = [case.record for case in cases]
+    if chosen.states is not None:
+        raise InputError(
+            "the setup has optional states, which this likelihood knows nothing of; use tuning.extended.likelihood"
+        )
     names = checked_names(free, records)
     values = values_of(chosen, names, records)
     for name, value in values.items():
