@@ -329,10 +329,12 @@ class Faults:
 
 def sample_times(rate: float, phase: float, start: float, end: float) -> Array:
     """Return the measurement times in (start, end], s: the first after ``phase``, or after one interval if that is 0."""
-    first = start + (phase if phase > 0.0 else 1.0 / rate)
+    first, skipped = (start + phase, 0) if phase > 0.0 else (start, 1)
     # The tolerance of a millionth of an interval keeps the last one when end falls on it but for rounding.
-    number = int(np.floor((finite("end", end) - first) * rate + 1e-6)) + 1
-    return np.minimum(first + np.arange(max(number, 0)) / rate, end)
+    number = int(np.floor((finite("end", end) - first) * rate + 1e-6)) + 1 - skipped
+    # Whole numbers over the rate, as the gyro's edges are: where rates are multiples the times are equal to the last bit, and a filter
+    # has no step of a rounding error to take.
+    return np.minimum(first + np.arange(skipped, max(number, 0) + skipped) / rate, end)
 
 
 def _check_sampling(name: str, sigma: float, unit: str, rate: float, phase: float) -> None:

@@ -24,7 +24,9 @@ from strapdown.kernels.lane_values import (
     chosen,
     everywhere,
     flush_tiny,
+    halves,
     lanes_of,
+    leading_zeros,
     load,
     load_like,
     load_quadruples,
@@ -33,6 +35,7 @@ from strapdown.kernels.lane_values import (
     number_of_bits,
     number_where,
     restore_mode,
+    signed_number,
     spread,
     store,
     store_like,
@@ -232,6 +235,34 @@ def test_any_number_of_lanes(width, dtype):
         np.testing.assert_array_equal(out[3 * width :], doubles[1:])
         assert summed == pytest.approx(a[1:].sum(), abs=1e-5)
     np.testing.assert_array_equal(*results)
+
+
+@pytest.mark.parametrize("width", [1, 4, 16])
+def test_words_of_thirty_two_bits(width):
+    def apply(pattern, words, singles, out):
+        like = lanes_of(pattern)
+        n = len(like)
+        low, high = halves(load_like(words, 0, like), load_like(words, n, like))
+        store_like(out, 0, low)
+        store_like(out, 2 * n, high)
+        store_like(out, 4 * n, leading_zeros(low))
+        store_like(out, 6 * n, bits_of(signed_number(high)))
+        x = load_like(singles, 0, like)
+        store_like(out, 8 * n, bits_of(x))
+        store_like(singles, n, number_of_bits(bits_of(x)))
+
+    words = RANDOM.integers(0, 2**64, 2 * width, dtype=np.uint64) >> RANDOM.integers(0, 64, 2 * width, dtype=np.uint64)
+    words[0] = 0
+    value = RANDOM.standard_normal(width).astype(np.float32)
+    low, high = (words & np.uint64(2**32 - 1)).astype(np.uint32), (words >> np.uint64(32)).astype(np.uint32)
+    zeros = [32 - int(word).bit_length() for word in low]
+    signed = [np.float32(int(word) - (1 << 32 if word >> np.uint32(31) else 0)) for word in high]
+    wanted = np.concatenate([low, high, zeros, np.array(signed).view(np.uint32), value.view(np.uint32)])
+    for function in (kernel(apply), apply):
+        singles, out = np.concatenate([value, 0.0 * value]), np.empty(9 * width, np.uint32)
+        function((np.float32(0.0),) * width, words, singles, out)
+        np.testing.assert_array_equal(out, wanted)
+        np.testing.assert_array_equal(singles[width:], value)
 
 
 def test_tiny_numbers_are_flushed_in_single_precision_alone():

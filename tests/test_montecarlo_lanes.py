@@ -53,7 +53,7 @@ def test_a_run_is_the_same_in_any_chunk():
     assert sum(part.finite for part in parts).tolist() == whole.finite.tolist()
     for name in ("coverage", "histogram", "sensor_degrees"):
         np.testing.assert_array_equal(sum(getattr(part, name) for part in parts), getattr(whole, name))
-    for name in ("error_sum", "error_product_sum", "covariance_sum", "nees_sum", "sensor_nis_sum"):
+    for name in ("error_sum", "error_product_sum", "covariance_sum", "nees_sum", "log_nees_sum", "sensor_nis_sum"):
         total = sum(getattr(part, name) for part in parts)
         np.testing.assert_allclose(total, getattr(whole, name), rtol=1e-11, atol=1e-13 * np.abs(total).max())
     scores = {n: s for part in parts for n, s in zip(part.worst_run, part.worst_score, strict=True)}
@@ -71,7 +71,11 @@ def test_one_lane_is_eight_bit_for_bit_in_the_replay():
     np.testing.assert_array_equal(chunk.covariance_sum, estimate.covariance[:: PLAN.every])
     e = errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)[:: PLAN.every]
     np.testing.assert_allclose(chunk.error_sum, e, rtol=1e-9, atol=1e-15)
-    np.testing.assert_allclose(chunk.nees_sum[:, 0], nees(e, estimate.covariance[:: PLAN.every]), rtol=1e-8)
+    P = estimate.covariance[:: PLAN.every]
+    for column, part in enumerate((slice(0, 6), slice(0, 3), slice(3, 6))):
+        wanted = nees(e[:, part], P[:, part, part])
+        np.testing.assert_allclose(chunk.nees_sum[:, column], wanted, rtol=1e-8)
+        np.testing.assert_allclose(chunk.log_nees_sum[:, column], np.log(wanted), atol=1e-8)
     nis = np.array([innovations.nis.sum() for innovations in estimate.innovations.values()])
     np.testing.assert_allclose(chunk.sensor_nis_sum.sum(axis=1), nis, rtol=1e-9)
 
@@ -190,6 +194,25 @@ def test_gyro_noise_has_its_closed_form(spec, exact):
     assert np.mean(np.square(bias)) == pytest.approx(bias_variance, rel=4.5 * math.sqrt(2.0 / n), abs=1e-30)
 
 
+def test_the_noises_of_a_run_are_independent():
+    """White noise and walk of the gyro's three axes and the noise of a sensor, each of the right size: no two share their normals."""
+    field = vectors.Magnetometer(name="field", field_f=[1.0, 0.0, 0.0], sigma=0.01, rate=50.0, kind="vector")
+    spec = GyroSpec(angle_random_walk=1e-3, rate_random_walk=1e-3)
+    still = replace(SCENARIO, gyro=spec, sensors=(field,), motion=motion.rest())
+    plan = Plan(scenario=still, setup=SETUP, seed=4, epochs=20)
+    columns = []
+    for run in range(6):
+        record = lanes.replay(plan, run).record
+        assert record.truth is not None
+        bias, dt = record.truth.bias, 1.0 / still.rate
+        white = (record.increments - 0.5 * dt * (bias[1:] + bias[:-1])) / math.sqrt(1e-6 * (dt + dt**3 / 12.0))
+        walk = np.diff(bias, axis=0) / (1e-3 * math.sqrt(dt))
+        noise = (record.vectors[0].vector_b - [1.0, 0.0, 0.0]) / 0.01
+        columns.append(np.hstack([white, walk, noise]))
+    x = np.concatenate(columns)
+    np.testing.assert_allclose(x.T @ x / len(x), np.eye(9), atol=4.5 * math.sqrt(2.0 / len(x)))
+
+
 def test_flicker_is_the_simulators():
     spec = GyroSpec(bias_instability=1e-3)
     plan = Plan(scenario=replace(SCENARIO, gyro=spec, sensors=(), motion=motion.rest()), setup=SETUP, epochs=20)
@@ -225,8 +248,8 @@ def test_every_sensor_is_that_of_the_scalar_machine(name):
     sensor = SENSORS[name]
     plan = Plan(scenario=replace(SCENARIO, sensors=(sensor, NORTH)), setup=SETUP, seed=9, epochs=20, nis_bins=8)
     assert lanes.supports(plan) is None
-    fast, slow = lanes.run_chunk(plan, 0, 240), scalar.run_chunk(plan, 0, 60)
-    np.testing.assert_array_equal(fast.sensor_degrees, 4 * slow.sensor_degrees)
+    fast, slow = lanes.run_chunk(plan, 0, 2400), scalar.run_chunk(plan, 0, 60)
+    np.testing.assert_array_equal(fast.sensor_degrees, 40 * slow.sensor_degrees)
     np.testing.assert_allclose(fast.sensor_nis, slow.sensor_nis, rtol=0.15 if name == "correlated" else 0.08)
     replay = lanes.replay(plan, 2)
     estimate = setup.run(replay.record, SETUP, replay.initial, full_covariance=True)
@@ -243,8 +266,12 @@ def test_coning_algorithms_and_substeps():
     s = lanes.run_chunk(plan, 0, 400)
     assert abs(s.anees[-1, 0] - 1.0) < 4.5 * math.sqrt(2.0 / (6 * 400))
     spun = replace(SCENARIO, motion=motion.ConstantRate(rate=[0.0, 0.0, 60.0]))  # 1.2 rad a sample
-    s = lanes.run_chunk(replace(PLAN, scenario=spun), 0, 400)
+    plan = replace(PLAN, scenario=spun)
+    s = lanes.run_chunk(plan, 0, 400)
     assert abs(s.anees[-1, 0] - 1.0) < 4.5 * math.sqrt(2.0 / (6 * 400))
+    replay = lanes.replay(plan, 0)
+    estimate = setup.run(replay.record, SETUP, replay.initial)
+    np.testing.assert_allclose(estimate.attitude, replay.estimate.attitude, atol=1e-12)
 
 
 # ----------------------------------------------------------------------------------------------------- single precision

@@ -1,12 +1,14 @@
 """Random numbers of the kernels: known answers, one source on two machines, and the normals' distribution."""
 
 import math
+import re
 
 import numpy as np
 import pytest
 from scipy import stats
 
 from strapdown.kernels import montecarlo_run, noise
+from strapdown.kernels.lane_values import halves
 from strapdown.kernels.machine import compiled
 
 WORD = np.uint64
@@ -184,7 +186,7 @@ def lane_normals(runs, count, width=8, real=np.float64, key=(5, 6)):
         part = runs[first : first + width]
         numbers[: len(part)] = part
         rows = np.empty((count, width))
-        compiled(montecarlo_run.fill_pairs)(pattern, WORD(key[0]), WORD(key[1]), numbers, rows.reshape(-1))
+        compiled(montecarlo_run.fill_with_normals)(pattern, WORD(key[0]), WORD(key[1]), numbers, rows.reshape(-1))
         out[first : first + width] = rows.T[: len(part)]
     return out
 
@@ -200,26 +202,47 @@ def test_lane_normals_have_the_same_bits_in_any_lane_and_precision():
     np.testing.assert_array_equal(lane_normals(runs[::-1], 2000)[::-1], eight)
     np.testing.assert_array_equal(lane_normals(runs, 2000, width=1), eight)
     np.testing.assert_array_equal(lane_normals(runs, 2000, width=16, real=np.float32), eight)
-    with np.errstate(over="ignore"):
-        state = noise.stream_state(WORD(5), WORD(6), WORD(1003))
-        for k in range(100):
-            word, *state = noise.next_word(*state)
-            pair = noise.single_normals(word, 0.0)
-            np.testing.assert_allclose(pair, eight[3, 2 * k : 2 * k + 2], rtol=2e-6, atol=1e-7)
+    state = tuple(int(word) for word in noise.stream_state(WORD(5), WORD(6), WORD(1003)))
+    words = np.array(plain_xoshiro(state, 1000), WORD).reshape(-1, 2)
+    wanted = np.stack(libm_normals(words), axis=1)  # of each two words both first normals, then both second ones
+    np.testing.assert_allclose(eight[3].reshape(-1, 2, 2), wanted, rtol=3e-7, atol=3e-7)
+
+
+def libm_normals(words):
+    """Return two normals of each word of 64 by libm in double precision: the lower half tells the radius, the upper the angle."""
+    low, high = (words & WORD(0xFFFFFFFF)).astype(np.int64), (words >> WORD(32)).astype(np.int64)
+    # Evenly spread over (0, 1]: the middle of what 32 leading binary digits leave open; of numbers below 2^-16 there are 48 digits.
+    u = (low + 0.5 * 2.0 ** -(32 - np.frexp(low.astype(float))[1])) * 2.0**-32
+    u = np.where(low < 1 << 16, ((low << 16) | (high & 0xFFFF) | 1) * 2.0**-48, u)
+    signed = np.where(high >= 1 << 31, high - (1 << 32), high)
+    angle = 0.5 * math.pi * (signed + 0.5) * 2.0**-31
+    radius = np.sqrt(-2.0 * np.log(u))
+    return radius * np.sin(angle), radius * np.cos(angle) * np.where(high & 1, -1.0, 1.0)
 
 
 def test_lane_normals_are_those_of_libm():
-    words = np.random.default_rng(4).integers(0, 2**64, 3000, dtype=WORD)
-    words[:4] = [0, ALL, WORD(1) << WORD(63), WORD(1) << WORD(23)]
-    a, b = np.transpose([noise.single_normals(word, 0.0) for word in words])
-    u = 1.0 - (words >> WORD(24)).astype(float) * 2.0**-40
-    angle = 0.5 * math.pi * (((words & WORD(0x3FFFFF)).astype(float) + 0.5) * 2.0**-22 - 0.5)
-    radius = np.sqrt(-2.0 * np.log(u))
-    sine, cosine = radius * np.sin(angle), radius * np.cos(angle) * np.where(words >> WORD(23) & WORD(1), -1.0, 1.0)
-    swap = (words >> WORD(22) & WORD(1)).astype(bool)
-    np.testing.assert_allclose(a, np.where(swap, cosine, sine), rtol=3e-7, atol=3e-7)
-    np.testing.assert_allclose(b, np.where(swap, sine, cosine), rtol=3e-7, atol=3e-7)
-    assert np.abs([a, b]).max() < 7.5
+    words = np.random.default_rng(4).integers(0, 2**64, 6000, dtype=WORD)
+    words[:6] = [0, ALL, WORD(1) << WORD(63), WORD(1) << WORD(31), 0xFFFFFFFF, ALL - WORD(0xFFFFFFFF)]
+    words[6:1000] &= ~WORD(0xFFFF0000)  # the long radii
+    words[1000:2000] |= WORD(0xFFFFFF00)  # the short ones
+    single = [noise.single_normals(*(half[0] for half in halves(word, WORD(0)))) for word in words]
+    for got, wanted in zip(np.transpose(single), libm_normals(words), strict=True):
+        np.testing.assert_allclose(got, wanted, rtol=3e-7, atol=3e-7)
+    longest = noise.single_normals(np.uint32(0), np.uint32(0))
+    assert np.hypot(*longest) == pytest.approx(math.sqrt(2.0 * 48.0 * math.log(2.0)), rel=1e-6)
+
+
+def test_the_series_of_the_normals_are_as_good_as_they_say():
+    d, w = -0.5 * np.linspace(1e-9, 1.0, 20_001), np.linspace(0.0, 1.0, 20_001)[:-1]
+    angle = 0.5 * np.pi * np.sqrt(w)
+    for letter, x, exact, error in (
+        ("R", d, -2.0 * np.log1p(d) / d, 2.4e-8),
+        ("P", w, 0.5 * np.pi * np.sinc(0.5 * np.sqrt(w)), 5.4e-9),
+        ("Q", w, np.cos(angle) / (1.0 - w), 1.2e-9),
+    ):
+        coefficients = [value for name, value in sorted(vars(noise).items()) if re.fullmatch(f"_{letter}[0-9]", name)]
+        series = np.polynomial.polynomial.polyval(x, coefficients)
+        assert 0.9 * error < np.abs(series / exact - 1.0).max() < error
 
 
 def test_moments_and_distribution_of_lane_normals(lane_sample):

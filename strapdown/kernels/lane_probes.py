@@ -6,7 +6,7 @@ import numpy as np
 
 from strapdown.kernels.filter_step import predict, update_direction_and_judge
 from strapdown.kernels.lane_values import flush_tiny, lanes_of, load_like, restore_mode, store_like
-from strapdown.kernels.montecarlo_run import next_pair
+from strapdown.kernels.montecarlo_run import next_four
 from strapdown.kernels.noise import stream_state
 from strapdown.kernels.rotation import rotation_matrix
 
@@ -42,10 +42,10 @@ def normals(pattern, numbers, out):
     like = lanes_of(pattern)
     n = len(like)
     s0, s1, s2, s3 = stream_state(np.uint64(1), np.uint64(2), load_like(numbers, 0, like))
-    for at in range(0, len(out), 2 * n):
-        x, y, s0, s1, s2, s3 = next_pair(s0, s1, s2, s3, like)
+    for at in range(0, len(out), 4 * n):
+        x, y, s0, s1, s2, s3 = next_four(s0, s1, s2, s3)
         store_like(out, at, x)
-        store_like(out, at + n, y)
+        store_like(out, at + 2 * n, y)
 
 
 def steps(pattern, state, inputs, number):

@@ -82,13 +82,31 @@ def number_where(condition):
 
 
 def bits_of(x):
-    """Return the bits of doubles as words of 64."""
-    return np.float64(x).view(np.uint64)
+    """Return the bits of doubles as words of 64, of singles as words of 32."""
+    x = np.asarray(x)
+    return x.view(np.uint32)[()] if x.dtype == np.float32 else np.float64(x).view(np.uint64)
 
 
 def number_of_bits(word):
-    """Return the doubles with these bits."""
-    return np.uint64(word).view(np.float64)
+    """Return the doubles with these bits, of words of 32 the singles."""
+    word = np.asarray(word)
+    return word.view(np.float32)[()] if word.dtype == np.uint32 else np.uint64(word).view(np.float64)
+
+
+def halves(a, b):
+    """Return the lower and the upper halves of words of 64, those of a followed by those of b, as words of 32."""
+    both = np.concatenate([np.atleast_1d(a), np.atleast_1d(b)])
+    return both.astype(np.uint32), (both >> np.uint64(32)).astype(np.uint32)
+
+
+def leading_zeros(word):
+    """Return how many zeros words of 32 begin with."""
+    return (32 - np.frexp(np.float64(word))[1]).astype(np.uint32)
+
+
+def signed_number(word):
+    """Return the singles nearest to words of 32 that are read as whole numbers with a sign."""
+    return np.asarray(word).view(np.int32).astype(np.float32)
 
 
 def flush_tiny(like):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import operator
 import platform
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -439,11 +440,11 @@ def number_where(typingctx: Any, condition: Any) -> Any:
     return types.int64(condition), lower
 
 
-def _reinterpreted(dtype: types.Type) -> Callable[..., Any]:
-    """Return the lowering that reads the same bits as ``dtype``."""
+def _reinterpreted(wide: types.Type, narrow: types.Type) -> Callable[..., Any]:
+    """Return the lowering that reads the same bits as ``wide``, those of 32 bits as ``narrow``."""
 
     def reinterpret(typingctx: Any, x: Any) -> Any:
-        result = _like(dtype, x)
+        result = _like(narrow if _BYTES[getattr(x, "dtype", x)] == _BYTES[narrow] else wide, x)
 
         def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
             return builder.bitcast(arguments[0], context.get_value_type(result))
@@ -453,8 +454,49 @@ def _reinterpreted(dtype: types.Type) -> Callable[..., Any]:
     return reinterpret
 
 
-bits_of = intrinsic(_reinterpreted(types.uint64))
-number_of_bits = intrinsic(_reinterpreted(types.float64))
+bits_of = intrinsic(_reinterpreted(types.uint64, types.uint32))
+number_of_bits = intrinsic(_reinterpreted(types.float64, types.float32))
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def halves(typingctx: Any, a: Any, b: Any) -> Any:
+    """Lower :func:`lane_values.halves`."""
+    half = Lanes(types.uint32, 2 * a.count)
+    result = types.UniTuple(half, 2)
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        first, second = (builder.bitcast(word, _vector(half)) for word in arguments)
+        lower_first = (0, 1) if sys.byteorder == "little" else (1, 0)
+        places = [list(range(begin, 2 * half.count, 2)) for begin in lower_first]
+        return context.make_tuple(builder, result, [_picked(builder, first, second, k) for k in places])
+
+    return result(a, b), lower
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def leading_zeros(typingctx: Any, word: Any) -> Any:
+    """Lower :func:`lane_values.leading_zeros`."""
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        (value,), bit = arguments, ir.IntType(1)
+        function = ir.FunctionType(value.type, [value.type, bit])
+        name = f"llvm.ctlz.v{word.count}i{8 * _BYTES[word.dtype]}"
+        return builder.call(
+            cgutils.get_or_insert_function(builder.module, function, name), [value, ir.Constant(bit, 0)]
+        )
+
+    return word(word), lower
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def signed_number(typingctx: Any, word: Any) -> Any:
+    """Lower :func:`lane_values.signed_number`."""
+    result = Lanes(types.float32, word.count)
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        return builder.sitofp(arguments[0], _vector(result))
+
+    return result(word), lower
 
 
 @intrinsic  # type: ignore[untyped-decorator]
@@ -496,9 +538,22 @@ def chosen(typingctx: Any, condition: Any, a: Any, b: Any) -> Any:
     result = _lanes_among(tuple(t for t in (a, b) if isinstance(t, Lanes))) or typingctx.unify_types(a, b)
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
-        return builder.select(*arguments)
+        condition, *values = arguments
+        if isinstance(result, Lanes) and isinstance(result.dtype, types.Float):
+            # Else LLVM takes an operation that both values end in after the choice, and a product that was to fuse with it is rounded by
+            # itself: a run's bits would depend on its neighbours.
+            values = [_fenced(builder, value) for value in values]
+        return builder.select(condition, *values)
 
     return result(condition, result, result), lower
+
+
+def _fenced(builder: Any, value: Any) -> Any:
+    """Return a value that no operation is moved into or out of."""
+    kind = value.type
+    name = f"llvm.arithmetic.fence.v{kind.count}{'f64' if isinstance(kind.element, ir.DoubleType) else 'f32'}"
+    function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(kind, [kind]), name)
+    return builder.call(function, [value])
 
 
 INTRINSICS = {
@@ -519,6 +574,9 @@ INTRINSICS = {
         number_where,
         spread,
         chosen,
+        halves,
+        leading_zeros,
+        signed_number,
     )
 } | {"everywhere": everywhere, "anywhere": anywhere, "bits_of": bits_of, "number_of_bits": number_of_bits}
 """What stands for each function of :mod:`strapdown.kernels.lane_values` in compiled code."""

@@ -10,8 +10,6 @@ Lanes in memory lie one after the other, so place p of a flat array begins at ``
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from strapdown.kernels.algebra import (
@@ -32,10 +30,18 @@ from strapdown.kernels.filter_step import (
     update_residual,
 )
 from strapdown.kernels.lane_angles import arctangent, inverse_root, rotation_vector
-from strapdown.kernels.lane_values import chosen, flush_tiny, lanes_of, load_like, restore_mode, store_like
+from strapdown.kernels.lane_values import (
+    chosen,
+    flush_tiny,
+    halves,
+    lanes_of,
+    load_like,
+    narrowed,
+    restore_mode,
+    store_like,
+)
 from strapdown.kernels.noise import next_word, single_normals, stream_state
 from strapdown.kernels.rotation import exponential, quaternion_multiply, rotation_matrix, unit
-from strapdown.kernels.series import LARGEST_ANGLE
 
 BORROWS_ARRAYS = True
 """See :mod:`strapdown.kernels.machine`."""
@@ -47,10 +53,14 @@ STATES = 16
 """States of the flicker of an axis."""
 
 # Places in the memory of a group of runs.
-_WALK, _MARKOV, _TURN_ON, _FLICKER, _BEFORE, _MATRIX, _STATES = 0, 3, 6, 9, 12, 15, 24
+_WALK, _MARKOV, _TURN_ON, _BEFORE, _MATRIX, _STATES = 0, 3, 6, 9, 12, 21
 _SENSORS = _STATES + 3 * STATES
-_OF_A_SENSOR = 4
-"""A spare normal and the correlated noise (3)."""
+_OF_A_SENSOR = 3
+"""The correlated noise."""
+
+TRIPLES = 32
+AHEAD = 3 * TRIPLES
+"""Normals that a source has drawn ahead: a loop of their own is faster than a few at a time between the filter's steps."""
 
 KEPT = 31
 """Numbers kept at an epoch: q (4), b (3), P in blocks (21), true bias (3)."""
@@ -103,61 +113,76 @@ def store_triple(memory, place, like, v):
     store_like(memory, (place + 2) * n, v[2])
 
 
-def next_pair(s0, s1, s2, s3, like):
-    """Return two normals and the state of the streams after them."""
-    word, s0, s1, s2, s3 = next_word(s0, s1, s2, s3)
-    x, y = single_normals(word, like)
+def next_four(s0, s1, s2, s3):
+    """Return four normals, as two values of twice the lanes, and the state of the streams after them."""
+    word0, s0, s1, s2, s3 = next_word(s0, s1, s2, s3)
+    word1, s0, s1, s2, s3 = next_word(s0, s1, s2, s3)
+    low, high = halves(word0, word1)
+    x, y = single_normals(low, high)
     return x, y, s0, s1, s2, s3
 
 
-def three_pairs(streams, source, like):
-    """Return two 3-vectors of normals from the streams of a source."""
-    place = 4 * source * len(like)
+def refill(streams, source, ahead, count, like):
+    """Draw the next normals of a source, ``count`` of them, a multiple of four."""
+    n = len(like)
+    place = 4 * source * n
+    begin = AHEAD * source * n
     s0, s1, s2, s3 = stored_stream(streams, place, like)
-    x0, y0, s0, s1, s2, s3 = next_pair(s0, s1, s2, s3, like)
-    x1, y1, s0, s1, s2, s3 = next_pair(s0, s1, s2, s3, like)
-    x2, y2, s0, s1, s2, s3 = next_pair(s0, s1, s2, s3, like)
+    for at in range(begin, begin + count * n, 4 * n):
+        x, y, s0, s1, s2, s3 = next_four(s0, s1, s2, s3)
+        store_like(ahead, at, x)
+        store_like(ahead, at + 2 * n, y)
     store_stream(streams, place, like, s0, s1, s2, s3)
-    return (x0, x1, x2), (y0, y1, y2)
 
 
-def normal_triple(streams, source, memory, spare, saved, like):
-    """Return a 3-vector of normals; every second time, when ``saved``, one of them is the spare of the time before."""
-    place = 4 * source * len(like)
-    s0, s1, s2, s3 = stored_stream(streams, place, like)
-    x, y, s0, s1, s2, s3 = next_pair(s0, s1, s2, s3, like)
-    if saved:
-        z = load_like(memory, spare * len(like), like)
-    else:
-        z, kept, s0, s1, s2, s3 = next_pair(s0, s1, s2, s3, like)
-        store_like(memory, spare * len(like), kept)
-    store_stream(streams, place, like, s0, s1, s2, s3)
-    return (x, y, z)
+def drawn(ahead, source, index, like):
+    """Return the normal of a source at a place among those drawn ahead."""
+    return narrowed(load_like(ahead, (AHEAD * source + index) * len(like), like), like)
 
 
-def fill_pairs(pattern, k0, k1, numbers, out):
-    """Fill out (flat, an even number of places) with the normals of the streams of these runs under the key (k0, k1)."""
+def drawn_triple(ahead, source, index, like):
+    """Return three neighbouring normals."""
+    return (
+        drawn(ahead, source, index, like),
+        drawn(ahead, source, index + 1, like),
+        drawn(ahead, source, index + 2, like),
+    )
+
+
+def normal_triple(streams, source, ahead, number, like):
+    """Return the 3-vector of normals of this number, from 0 on, of a source; they are asked for one after the other."""
+    turn = number & (TRIPLES - 1)
+    if turn == 0:
+        refill(streams, source, ahead, AHEAD, like)
+    return drawn_triple(ahead, source, 3 * turn, like)
+
+
+def fill_with_normals(pattern, k0, k1, numbers, out):
+    """Fill out (flat, places a multiple of four) with the normals of the streams of these runs under the key (k0, k1)."""
     like = lanes_of(pattern)
     n = len(like)
     s0, s1, s2, s3 = stream_state(k0, k1, load_like(numbers, 0, like))
-    for at in range(0, len(out), 2 * n):
-        x, y, s0, s1, s2, s3 = next_pair(s0, s1, s2, s3, like)
+    for at in range(0, len(out), 4 * n):
+        x, y, s0, s1, s2, s3 = next_four(s0, s1, s2, s3)
         store_like(out, at, x)
-        store_like(out, at + n, y)
+        store_like(out, at + 2 * n, y)
 
 
-def start_streams(keys, numbers, streams, like):
-    """Fill the states of all streams of the runs of these numbers; ``keys`` (sources, 2)."""
+def start_streams(keys, numbers, streams, ahead, like):
+    """Fill the states of all streams of the runs of these numbers, ``keys`` (sources, 2), and draw what a run starts with."""
     number = load_like(numbers, 0, like)
     for source in range(len(keys)):
         s0, s1, s2, s3 = stream_state(keys[source, 0], keys[source, 1], number)
         store_stream(streams, 4 * source * len(like), like, s0, s1, s2, s3)
+    for source in (FLICKER, TURN_ON, START, DISPERSIONS):
+        refill(streams, source, ahead, 3 * STATES, like)
 
 
-def start_gyro(gyro, poles_start, dispersion, streams, memory, like):
+def start_gyro(gyro, poles_start, dispersion, ahead, memory, like):
     """Draw what a run's gyro starts with: turn-on bias, Markov bias, flicker states, error matrix."""
     n = len(like)
-    x, y = three_pairs(streams, TURN_ON, like)
+    x = drawn_triple(ahead, TURN_ON, 0, like)
+    y = drawn_triple(ahead, TURN_ON, 3, like)
     for i in range(3):
         store_like(memory, (_WALK + i) * n, lanes_zero(like))
     store_triple(
@@ -175,18 +200,16 @@ def start_gyro(gyro, poles_start, dispersion, streams, memory, like):
     for i in range(3 * STATES):
         store_like(memory, (_STATES + i) * n, lanes_zero(like))
     if len(poles_start) > 0:
-        place = 4 * FLICKER * n
-        s0, s1, s2, s3 = stored_stream(streams, place, like)
         for axis in range(3):
             for j in range(0, STATES, 2):
-                x0, x1, s0, s1, s2, s3 = next_pair(s0, s1, s2, s3, like)
+                x0 = drawn(ahead, FLICKER, axis * STATES + j, like)
+                x1 = drawn(ahead, FLICKER, axis * STATES + j + 1, like)
                 for i in range(j, STATES):
                     at = (_STATES + axis * STATES + i) * n
                     state = load_like(memory, at, like) + poles_start[i, j] * x0
                     store_like(memory, at, state + poles_start[i, j + 1] * x1)
-        store_stream(streams, place, like, s0, s1, s2, s3)
     for row in range(3):
-        x, y = three_pairs(streams, DISPERSIONS, like)
+        x = drawn_triple(ahead, DISPERSIONS, 3 * row, like)
         store_triple(
             memory,
             _MATRIX + 3 * row,
@@ -227,7 +250,7 @@ def flicker_value(gains, memory, axis, like):
     return value
 
 
-def drift_step(terms, gyro, poles, gains, k, dt, true_increment, memory, streams, like):
+def drift_step(terms, gyro, poles, gains, k, dt, true_increment, memory, streams, ahead, like):
     """Draw interval k of the gyro; return the bias at its start and what the noise adds to its increment.
 
     The bias is without its part common to all runs. ``terms`` tells which noises there are: (walk, Markov, flicker, matrix).
@@ -236,7 +259,8 @@ def drift_step(terms, gyro, poles, gains, k, dt, true_increment, memory, streams
     turn_on = triple(memory, _TURN_ON, like)
     bias = add(walk, turn_on)
     if terms[0]:
-        steps, white = three_pairs(streams, GYRO, like)
+        white = normal_triple(streams, GYRO, ahead, 2 * k, like)
+        steps = normal_triple(streams, GYRO, ahead, 2 * k + 1, like)
         after = (
             walk[0] + gyro[WALK_SIGMA, 0] * steps[0],
             walk[1] + gyro[WALK_SIGMA, 1] * steps[1],
@@ -245,12 +269,12 @@ def drift_step(terms, gyro, poles, gains, k, dt, true_increment, memory, streams
         store_triple(memory, _WALK, like, after)
         drift = combine(dt, turn_on, 0.5 * dt, add(walk, after))
     else:
-        white = normal_triple(streams, GYRO, memory, _WALK, k % 2 == 1, like)
+        white = normal_triple(streams, GYRO, ahead, k, like)
         bias = turn_on
         drift = scale(dt, turn_on)
     if terms[1]:
         g = triple(memory, _MARKOV, like)
-        x, _ = three_pairs(streams, MARKOV, like)
+        x = normal_triple(streams, MARKOV, ahead, k, like)
         after = (
             gyro[MARKOV_DECAY, 0] * g[0] + gyro[MARKOV_SIGMA, 0] * x[0],
             gyro[MARKOV_DECAY, 1] * g[1] + gyro[MARKOV_SIGMA, 1] * x[1],
@@ -268,7 +292,7 @@ def drift_step(terms, gyro, poles, gains, k, dt, true_increment, memory, streams
             for axis in range(3):
                 value = gyro[FLICKER_SIZE, axis] * flicker_value(gains, memory, axis, like)
                 store_like(memory, (_BEFORE + axis) * len(like), value)
-        x = normal_triple(streams, FLICKER, memory, _FLICKER, k % 2 == 1, like)
+        x = normal_triple(streams, FLICKER, ahead, k, like)
         before = triple(memory, _BEFORE, like)
         now = (
             gyro[FLICKER_SIZE, 0] * flicker_step(poles, gains, memory, 0, x[0], like),
@@ -293,11 +317,11 @@ def drift_step(terms, gyro, poles, gains, k, dt, true_increment, memory, streams
     return bias, drift
 
 
-def sensor_noise(sensor, sigma, decay, share, struck_below, outlier_scale, saved, first, memory, streams, like):
-    """Return the noise of one measurement: white, of ``sigma`` by component, outliers and correlated noise."""
+def sensor_noise(sensor, sigma, decay, share, struck_below, outlier_scale, number, memory, streams, ahead, like):
+    """Return the noise of a sensor's measurement of this number: white, of ``sigma`` by component, outliers and correlated noise."""
     mine = _SENSORS + _OF_A_SENSOR * sensor
     source = SENSORS + 2 * sensor
-    white = normal_triple(streams, source, memory, mine, saved, like)
+    white = normal_triple(streams, source, ahead, number, like)
     noise = (sigma[0] * white[0], sigma[1] * white[1], sigma[2] * white[2])
     if struck_below > np.uint64(0) or share > 0.0:
         place = 4 * (source + 1) * len(like)
@@ -305,15 +329,14 @@ def sensor_noise(sensor, sigma, decay, share, struck_below, outlier_scale, saved
         word, s0, s1, s2, s3 = next_word(s0, s1, s2, s3)
         larger = chosen(word < struck_below, like - like + outlier_scale, 1.0)
         noise = (larger * noise[0], larger * noise[1], larger * noise[2])
-        if share > 0.0:
-            x, y, s0, s1, s2, s3 = next_pair(s0, s1, s2, s3, like)
-            z, _, s0, s1, s2, s3 = next_pair(s0, s1, s2, s3, like)
-            drive = (share * x, share * y, share * z)
-            if not first:
-                drive = combine(decay, triple(memory, mine + 1, like), 1.0, drive)
-            store_triple(memory, mine + 1, like, drive)
-            noise = add(noise, drive)
         store_stream(streams, place, like, s0, s1, s2, s3)
+        if share > 0.0:
+            refill(streams, source + 1, ahead, 4, like)
+            drive = scale(share, drawn_triple(ahead, source + 1, 0, like))
+            if number > 0:
+                drive = combine(decay, triple(memory, mine, like), 1.0, drive)
+            store_triple(memory, mine, like, drive)
+            noise = add(noise, drive)
     return noise
 
 
@@ -344,6 +367,7 @@ def advance(
     numbers,
     keys,
     edges,
+    substeps,
     increments,
     true_increments,
     true_bias,
@@ -372,6 +396,7 @@ def advance(
     outlier_scale,
     every,
     streams,
+    ahead,
     memory,
     kept,
     nis,
@@ -389,6 +414,9 @@ def advance(
     keys : array of words (sources, 2)
     edges : array (n + 1,)
         Edges of the filter's steps, s.
+    substeps : array (n,)
+        The longest time that the filter may predict over at once in each step, s. Beyond the range of the polynomials a step is made of
+        several: at constant rate they compose exactly, so this is the same model.
     increments, true_increments : array (n, 3)
         What the gyro gives without any error that differs from run to run, and the true turns, rad.
     true_bias : array (n + 1, 3)
@@ -412,9 +440,9 @@ def advance(
         Word below which a measurement is an outlier; 0 for none.
     every : int
         Steps from one kept epoch to the next.
-    streams, memory, kept, nis : arrays
-        Flat: states of the streams, places of :func:`memory`, :data:`KEPT` numbers an epoch, NIS by sensor and span of time. ``nis`` is
-        added to.
+    streams, ahead, memory, kept, nis : arrays
+        Flat: states of the streams, :data:`AHEAD` normals a source (singles), places of :func:`memory`, :data:`KEPT` numbers an epoch,
+        NIS by sensor and span of time. ``nis`` is added to.
     increments_out, values_out, innovations_out : arrays
         Flat, 3 an interval, 4 and 6 an event, or None: what the sensors gave, and e₁, s₁, e₂, s₂, e₃, s₃.
     """
@@ -425,8 +453,8 @@ def advance(
     events = len(event_time)
     steps = len(increments)
     bins = len(nis) // (n * max(len(struck_below), 1))
-    start_streams(keys, numbers, streams, like)
-    start_gyro(gyro, poles_start, dispersion, streams, memory, like)
+    start_streams(keys, numbers, streams, ahead, like)
+    start_gyro(gyro, poles_start, dispersion, ahead, memory, like)
     q = (one, like, like, like)
     b = (like, like, like)
     A = (start[8] * one, like, like, start[8] * one, like, start[8] * one)
@@ -464,10 +492,10 @@ def advance(
                     event_share[e],
                     struck_below[sensor],
                     outlier_scale[sensor],
-                    event_count[e] % 2 == 1,
-                    event_count[e] == 0,
+                    event_count[e],
                     memory,
                     streams,
+                    ahead,
                     like,
                 )
                 exact = (event_exact[e, 0], event_exact[e, 1], event_exact[e, 2])
@@ -530,18 +558,15 @@ def advance(
         whole = edges[i + 1] - edges[i]
         true_increment = (true_increments[i, 0], true_increments[i, 1], true_increments[i, 2])
         given = (increments[i, 0], increments[i, 1], increments[i, 2])
-        bias, drift = drift_step(terms, gyro, poles, gains, k + 1, whole, true_increment, memory, streams, like)
+        bias, drift = drift_step(terms, gyro, poles, gains, k + 1, whole, true_increment, memory, streams, ahead, like)
         theta = add(given, drift)
         bias = add((true_bias[k + 1, 0], true_bias[k + 1, 1], true_bias[k + 1, 2]), bias)
-        # Beyond the range of the polynomials, sub-steps: at constant rate they compose exactly, so this is the same model.
-        squared = dot(given, given)
-        longest = whole
-        if squared > LARGEST_ANGLE * LARGEST_ANGLE:
-            longest = whole * (LARGEST_ANGLE / math.sqrt(squared))
+        longest = substeps[i]
         if increments_out is not None and k + 1 < steps:
             store_triple(increments_out, 3 * (k + 1), like, theta)
         if k < 0:
-            x, y = three_pairs(streams, START, like)
+            x = drawn_triple(ahead, START, 0, like)
+            y = drawn_triple(ahead, START, 3, like)
             error = combine(start[0], x, 1.0, (start[2], start[3], start[4]))
             initial = (first_attitude[0], first_attitude[1], first_attitude[2], first_attitude[3])
             q = unit(quaternion_multiply(initial, exponential((-error[0], -error[1], -error[2]))))

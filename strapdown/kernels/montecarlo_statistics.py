@@ -1,7 +1,7 @@
 """Sums over the runs of a Monte Carlo, eight runs at a time, in double precision: what :mod:`strapdown.montecarlo.statistics` defines.
 
-Eight runs are added up in one order whatever computed them (:func:`strapdown.kernels.lane_values.total`), and groups of eight follow each
-other in the order of their runs, so the sums have the same bits on every machine and for every number of lanes.
+Every eighth run goes into the same lane of a sum, in the order of the runs, and the lanes are added up at the end of a chunk in one order
+(:func:`strapdown.kernels.lane_values.total`), so the sums have the same bits on every machine and for every number of lanes.
 """
 
 from __future__ import annotations
@@ -15,22 +15,25 @@ from strapdown.kernels.lane_values import (
     chosen,
     lanes_of,
     load_like,
+    number_of_bits,
     number_where,
     store_like,
-    total,
 )
 from strapdown.kernels.montecarlo_run import KEPT
-from strapdown.kernels.noise import minus_two_log
 from strapdown.kernels.rotation import quaternion_multiply
 
 BORROWS_ARRAYS = True
 """See :mod:`strapdown.kernels.machine`."""
 
-SUMS = 6 + 21 + 21 + 3 + 3
-"""Numbers summed at an epoch: e, e eᵀ and P (upper triangles in blocks θθ, θb, bb), NEES and log NEES of state, attitude, bias."""
-_PRODUCT, _COVARIANCE, _NEES, _LOG_NEES = 6, 27, 48, 51
+SUMS = 6 + 21 + 21 + 3 + 6
+"""Numbers summed at an epoch: e, e eᵀ and P (upper triangles in blocks θθ, θb, bb), the NEES of state, attitude, bias, and the product of
+each NEES over the runs, whose logarithm is the sum of logarithms: a number from 1 to 2, and the powers of two that it lacks."""
+_PRODUCT, _COVARIANCE, _NEES, NEES_PRODUCT = 6, 27, 48, 51
 
 _TINY = 2.2250738585072014e-308
+_UNIT, _INTEGER, _MANTISSA = np.uint64(0x3FF0000000000000), np.uint64(0x4330000000000000), np.uint64((1 << 52) - 1)
+_S52 = np.uint64(52)
+_EXPONENT_BIAS = 4503599627370496.0 + 1023.0
 _INFINITE = float("inf")
 _LARGEST = 1.7976931348623157e308
 
@@ -93,7 +96,8 @@ def bin_numbers(x, first, last):
 
 def add_up(sums, row, place, good, x):
     """Add the good lanes of x to a number of an epoch."""
-    sums[row, place] += total(chosen(good, x, 0.0))
+    at = (row * SUMS + place) * len(x)
+    store_like(sums, at, load_like(sums, at, x) + chosen(good, x, 0.0))
 
 
 def accumulate(
@@ -112,7 +116,8 @@ def accumulate(
         True attitudes.
     error_bins, nees_bins : array of words (2,)
         First and last of the shifted bits.
-    finite, sums, coverage, histogram : arrays (m,), (m, SUMS), (m, 6, 3), (m, 9, bins)
+    finite, sums, coverage, histogram : arrays (m,), (m · SUMS · 8,), (m, 6, 3), (m, 9, bins)
+        ``sums`` by lane, from zeros on, the products of NEES from ones.
     scratch : array of words (9 · 8,)
     score : array (8,)
         Largest NEES of each run; infinite if one was not finite.
@@ -227,9 +232,14 @@ def add_outer(sums, row, place, good, a, b):
 
 
 def add_nees(sums, row, column, good, x):
-    """Add a NEES and its logarithm."""
+    """Add a NEES, and multiply their product by it."""
     add_up(sums, row, _NEES + column, good, x)
-    add_up(sums, row, _LOG_NEES + column, good, -0.5 * minus_two_log(chosen(x > _TINY, x, _TINY)))
+    n = len(x)
+    at = (row * SUMS + NEES_PRODUCT + 2 * column) * n
+    bits = bits_of(load_like(sums, at, x) * chosen(good, chosen(x > _TINY, x, _TINY), 1.0))
+    store_like(sums, at, number_of_bits((bits & _MANTISSA) | _UNIT))
+    binades = number_of_bits((bits >> _S52) | _INTEGER) - _EXPONENT_BIAS
+    store_like(sums, at + n, load_like(sums, at + n, x) + binades)
 
 
 def add_coverage(coverage, row, i, good, e, variance):

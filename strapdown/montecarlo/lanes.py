@@ -15,9 +15,11 @@ those of double precision where both are above some 1e-5 rad; :func:`supports` r
 
 from __future__ import annotations
 
+import functools
+import math
 import weakref
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,6 +30,8 @@ from strapdown.checks import Array, count
 from strapdown.gyro import GyroSpec
 from strapdown.kernels import gyro_errors, machine, montecarlo_run, montecarlo_statistics
 from strapdown.kernels.machine import compiled
+from strapdown.kernels.noise import minus_two_log
+from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.montecarlo.plan import Plan
 from strapdown.montecarlo.statistics import (
     BINS,
@@ -83,7 +87,7 @@ def _reasons(plan: Plan) -> Iterator[str]:
             yield f"{sensor.name}: a sensor of class {type(sensor).__name__} is not among the lanes' terms"
         elif sensor.faults.latency > 0.0:  # type: ignore[attr-defined]
             yield f"{sensor.name}: latency is not among the lanes' terms"
-    for option in ("gate", "robust"):
+    for option in ("gate", "robust", "states"):
         if getattr(plan.setup, option, None) is not None:
             yield f"the filter's {option} option is not among the lanes' terms"
     if _start_sigma(plan)[0] > LARGEST_START:
@@ -166,16 +170,18 @@ def _prepare(plan: Plan) -> _Prepared:
     )
     steps = quiet if algorithm.name == "one-sample" else compress(quiet, algorithm)
     n = algorithm.samples
-    real = tuple(_nominal(sensor, scenario, plan.seed) for sensor in scenario.sensors)
-    record = replace(steps, vectors=real)
-    believed = setup.believed(replace(quiet, vectors=real), plan.setup)
+    series = tuple(_nominal(sensor, scenario, plan.seed) for sensor in scenario.sensors)
+    record = replace(steps, vectors=series)
+    believed = setup.believed(replace(quiet, vectors=series), plan.setup)
     events = mekf.schedule(believed.vectors, float(record.time[0]), float(record.time[-1]))
-    values = [_exact(sensor, scenario, series) for sensor, series in zip(scenario.sensors, real, strict=True)]
+    values = [_exact(sensor, scenario, own) for sensor, own in zip(scenario.sensors, series, strict=True)]
+    real = _real(plan)
     shared = (
         np.ascontiguousarray(record.time),
-        np.ascontiguousarray(record.increments),
-        np.ascontiguousarray(turns.reshape(-1, n, 3).sum(axis=1)),
-        np.ascontiguousarray(quiet.truth.bias[::n]),
+        _substeps(record),
+        np.ascontiguousarray(record.increments, real),
+        np.ascontiguousarray(turns.reshape(-1, n, 3).sum(axis=1), real),
+        np.ascontiguousarray(quiet.truth.bias[::n], real),
         np.ascontiguousarray(quiet.truth.attitude[0]),
         *_gyro_terms(plan, n * dt, len(record.increments)),
         np.array(
@@ -205,6 +211,17 @@ def _prepare(plan: Plan) -> _Prepared:
         finest=float(np.sqrt(min(events.variance, default=1.0))),
     )
     return prepared
+
+
+def _substeps(record: ImuRecord) -> Array:
+    """Return the longest time over which the polynomials of the filter hold in each step of a record (n,), s: at most the step."""
+    angle = np.linalg.norm(record.increments, axis=1)
+    return np.asarray(np.diff(record.time) * np.minimum(1.0, LARGEST_ANGLE / np.maximum(angle, LARGEST_ANGLE)))
+
+
+def _real(plan: Plan) -> Any:
+    """Return the type of the runs' numbers. What all runs share is given in it too: to narrow a number a step costs more than to use it."""
+    return np.float32 if plan.precision == "float32" else np.float64
 
 
 def _keys(plan: Plan) -> np.ndarray:
@@ -241,7 +258,7 @@ def _gyro_terms(plan: Plan, dt: float, steps: int) -> tuple[Any, ...]:
         ]
     )
     shaping = flicker.shaping(steps)
-    real = np.float32 if plan.precision == "float32" else np.float64
+    real = _real(plan)
     flickers = bool(np.any(instability > 0.0))
     covariance = shaping.covariance
     scale = np.sqrt(np.diag(covariance))
@@ -312,19 +329,20 @@ def _event_terms(plan: Plan, events: mekf.Schedule, values: list[tuple[Array, Ar
             decay[mine[1:]] = np.exp(-np.diff(events.time[mine]) / faults.correlation_time)
             share[mine] = faults.correlated_sigma * length * np.sqrt(1.0 - decay[mine] ** 2)
     place = np.clip(np.searchsorted(plan.nis_edges, events.time, side="left") - 1, 0, plan.nis_bins - 1)
+    real = _real(plan)
     return (
         events.time,
         events.kind,
         events.sensor.astype(np.int64),
         place.astype(np.int64),
-        exact,
-        sigma,
-        variance,
-        decay,
-        share,
+        exact.astype(real),
+        sigma.astype(real),
+        variance.astype(real),
+        decay.astype(real),
+        share.astype(real),
         number,
         events.reference,
-        events.triads,
+        events.triads.astype(real),
         struck,
         scale,
     )
@@ -335,9 +353,15 @@ def _event_terms(plan: Plan, events: mekf.Schedule, values: list[tuple[Array, Ar
 
 def width_of(precision: str) -> int:
     """Return how many runs go at once on this machine: 8 or 16, or 1 where it has no vectors."""
-    if not machine.has_vectors():
+    if not _answered(machine.has_vectors):
         return 1
     return 16 if precision == "float32" else 8
+
+
+@functools.cache
+def _answered(question: Callable[[], bool]) -> bool:
+    """Return the answer of the first time: the machine stays what it is, and to ask it takes as long as some thousand steps."""
+    return question()
 
 
 class _Group:
@@ -346,8 +370,7 @@ class _Group:
     def __init__(self, plan: Plan, width: int, *, every: int | None = None, detail: bool = False) -> None:
         self.prepared = _prepared(plan)
         self.width = width
-        single = plan.precision == "float32"
-        real: Any = np.float32 if single else np.float64
+        real = _real(plan)
         self.pattern = tuple(real(0.0) for _ in range(width))
         *self.shared, self.every = self.prepared.shared
         if every is not None:
@@ -356,6 +379,7 @@ class _Group:
         self.epochs = steps // self.every + 1
         self.places = sensors * plan.nis_bins
         self.streams = np.empty(4 * len(self.prepared.keys) * width, np.uint64)
+        self.ahead = np.empty(len(self.prepared.keys) * montecarlo_run.AHEAD * width, np.float32)
         self.memory = np.empty(montecarlo_run.memory(sensors) * width, real)
         self.kept = np.empty(self.epochs * montecarlo_run.KEPT * width)
         self.nis = np.zeros(self.places * width, real)
@@ -374,6 +398,7 @@ class _Group:
             *self.shared,
             self.every,
             self.streams,
+            self.ahead,
             self.memory,
             self.kept,
             self.nis,
@@ -388,47 +413,46 @@ def run_chunk(plan: Plan, first_run: int, runs: int, *, width: int | None = None
     lanes = width_of(plan.precision) if width is None else width
     group = _Group(plan, lanes)
     m, s = plan.epochs + 1, len(plan.sensors)
-    sums = np.zeros((m, montecarlo_statistics.SUMS))
+    sums = np.zeros((m, montecarlo_statistics.SUMS, GROUP))
+    sums[:, montecarlo_statistics.NEES_PRODUCT :: 2] = 1.0
     finite = np.zeros(m, np.int64)
     coverage, histogram = np.zeros((m, 6, 3), np.int64), np.zeros((m, 9, BINS), np.int64)
-    nis = np.zeros(group.places)
+    nis = np.zeros((group.places, GROUP))
     scratch, score = np.zeros(9 * GROUP, np.uint64), np.zeros(GROUP)
     bins = [np.array([0, BINS - 1], np.uint64) + np.uint64(first_bin(e)) for e in (ERROR_EXPONENT, NEES_EXPONENT)]
     scores = np.empty(-(-runs // GROUP) * GROUP)
+    at_once = max(lanes, GROUP)
     kept = group.kept if lanes >= GROUP else np.empty(m * montecarlo_run.KEPT * GROUP)
-    group_nis = np.zeros((group.places, max(lanes, GROUP)))
+    group_nis = np.empty((group.places, GROUP)) if lanes < GROUP else group.nis.reshape(-1, lanes)
+    valid, pattern = np.ones(GROUP), (0.0,) * GROUP
     examples = []
-    for start in range(0, runs, max(lanes, GROUP)):
-        if lanes >= GROUP:
-            group.advance(first_run + start)
-            group_nis[:] = group.nis.reshape(-1, lanes)
-        else:
-            for lane in range(0, GROUP, lanes):
-                group.advance(first_run + start + lane)
+    for start in range(0, runs, at_once):
+        for lane in range(0, at_once, lanes):
+            group.advance(first_run + start + lane)
+            if lanes < GROUP:
                 kept.reshape(-1, GROUP)[:, lane : lane + lanes] = group.kept.reshape(-1, lanes)
                 group_nis[:, lane : lane + lanes] = group.nis.reshape(-1, lanes)
-        for column in range(0, max(lanes, GROUP), GROUP):
+        for column in range(0, min(at_once, runs - start), GROUP):
             place = start + column
-            valid = (np.arange(place, place + GROUP) < runs).astype(np.float64)
-            if not valid.any():
-                break
+            valid[runs - place :] = 0.0
             compiled(montecarlo_statistics.accumulate)(
-                (0.0,) * GROUP,
+                pattern,
                 kept,
-                max(lanes, GROUP),
+                at_once,
                 column,
                 valid,
                 group.prepared.truth,
                 *bins,
                 finite,
-                sums,
+                sums.reshape(-1),
                 coverage,
                 histogram,
                 scratch,
                 score,
             )
             scores[place : place + GROUP] = score
-            nis += _total(np.where(valid > 0.0, group_nis[:, column : column + GROUP], 0.0))
+            counted = min(GROUP, runs - place)
+            nis[:, :counted] += group_nis[:, column : column + counted]
         if first_run + start < EXAMPLES:
             own = kept.reshape(m, montecarlo_run.KEPT, -1)
             examples += [
@@ -437,20 +461,22 @@ def run_chunk(plan: Plan, first_run: int, runs: int, *, width: int | None = None
             ]
     numbers = np.arange(first_run, first_run + runs)
     worst_run, worst_score = worst(numbers, scores[:runs])
+    products, binades = (sums[:, montecarlo_statistics.NEES_PRODUCT + k :: 2] for k in (0, 1))
+    total = _total(sums)
     return Statistics(
         time=plan.time,
         runs=runs,
         finite=finite,
-        error_sum=sums[:, :6],
-        error_product_sum=mekf.covariance_matrices(sums[:, 6:27]),
-        covariance_sum=mekf.covariance_matrices(sums[:, 27:48]),
-        nees_sum=sums[:, 48:51],
-        log_nees_sum=sums[:, 51:54],
+        error_sum=total[:, :6],
+        error_product_sum=mekf.covariance_matrices(total[:, 6:27]),
+        covariance_sum=mekf.covariance_matrices(total[:, 27:48]),
+        nees_sum=total[:, 48:51],
+        log_nees_sum=_total(binades * math.log(2.0) - 0.5 * minus_two_log(products)),
         coverage=coverage,
         histogram=histogram,
         nis_edges=plan.nis_edges,
         sensors=plan.sensors,
-        sensor_nis_sum=nis.reshape(s, plan.nis_bins),
+        sensor_nis_sum=_total(nis).reshape(s, plan.nis_bins),
         sensor_degrees=runs * group.prepared.degrees,
         sensor_refused=np.zeros((s, plan.nis_bins), np.int64),
         worst_run=worst_run,
@@ -463,10 +489,11 @@ def run_chunk(plan: Plan, first_run: int, runs: int, *, width: int | None = None
 
 def _total(lanes: Array) -> Array:
     """Return the sum over the last axis, in the order of :func:`strapdown.kernels.lane_values.total`."""
-    while lanes.shape[-1] > 1:
-        half = lanes.shape[-1] // 2
-        lanes = lanes[..., :half] + lanes[..., half:]
-    return lanes[..., 0]
+    first = np.ascontiguousarray(np.moveaxis(lanes, -1, 0))
+    while len(first) > 1:
+        half = len(first) // 2
+        first = first[:half] + first[half:]
+    return np.asarray(first[0])
 
 
 def _example(kept: Array, truth: Array) -> tuple[Array, Array]:
