@@ -57,6 +57,10 @@ def montecarlo(
     chunk: Annotated[
         int | None, typer.Option(help="Runs between merges and writes; the machine's if not given.")
     ] = None,
+    states: Annotated[
+        bool,
+        typer.Option("--states", help="Give the filter a state for each error that the scenario specifies; slower."),
+    ] = False,
     out: Annotated[Path | None, typer.Option(help="HDF5 file; NAME-montecarlo.h5 if not given.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the file, if it exists.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Begin anew although the file exists.")] = False,
@@ -79,10 +83,16 @@ def montecarlo(
     source = Path(scenario)
     held = campaigns.read(source) if source.suffix.lower() in _CAMPAIGN_SUFFIXES else None
     if held is None:
-        plan = _plan(scenario, filter_file, dispersions, seed, float32)
+        plan = _plan(scenario, filter_file, dispersions, seed, float32, states)
         target = out or Path(f"{plan.scenario.name or source.stem}-montecarlo.h5")
     else:
-        given = {"--filter": filter_file, "--dispersions": dispersions, "--seed": seed, "--float32": float32 or None}
+        given = {
+            "--filter": filter_file,
+            "--dispersions": dispersions,
+            "--seed": seed,
+            "--float32": float32 or None,
+            "--states": states or None,
+        }
         for name, value in given.items():
             if value is not None:
                 raise InputError(f"{name} is given, but {source} tells its own; leave it out, or name a scenario")
@@ -153,12 +163,22 @@ def _terminated_as_interrupted() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def _plan(scenario: str, filter_file: Path | None, dispersions: Path | None, seed: int | None, float32: bool) -> Plan:
+def _plan(
+    scenario: str,
+    filter_file: Path | None,
+    dispersions: Path | None,
+    seed: int | None,
+    float32: bool,
+    states: bool,
+) -> Plan:
     from strapdown import montecarlo as engine
     from strapdown import setup
+    from strapdown.checks import InputError
 
+    if states and filter_file is not None:
+        raise InputError("--filter tells the filter's states itself, in [filter.states]; leave --states out")
     loaded = scenario_named(scenario)
-    filter_setup = setup.matched(loaded) if filter_file is None else setup.read_setup(filter_file)
+    filter_setup = setup.matched(loaded, states=states) if filter_file is None else setup.read_setup(filter_file)
     return engine.Plan(
         scenario=loaded,
         setup=filter_setup,
@@ -251,9 +271,12 @@ def _tell(campaign: Campaign) -> None:
         f"with {100.0 * report['probability']:g} %, NEES at {report['epochs_judged']} epochs.",
         soft_wrap=True,
     )
-    missing = not_covered(campaign.plan.scenario.gyro, campaign.plan.scenario.sensors)
+    plan = campaign.plan
+    missing = not_covered(
+        plan.scenario.gyro, plan.scenario.sensors, plan.setup.states, gravity_f=plan.scenario.gravity_f
+    )
     if missing and not report["consistent"]:
-        console.print(f"A filter of attitude and bias has no state for {', '.join(missing)}.", soft_wrap=True)
+        console.print(f"The filter has no state for {', '.join(missing)}.", soft_wrap=True)
 
 
 def _worst_axis(values: list[float | None]) -> int:

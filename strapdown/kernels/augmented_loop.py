@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from strapdown.kernels.algebra import dot
+from strapdown.kernels.algebra import combine, dot, scale
 from strapdown.kernels.augmented_factor import covariances, take_row, triangularise, variances, whole_bias
 from strapdown.kernels.augmented_step import (
     OFFSET,
@@ -146,7 +146,6 @@ def run_augmented(
     now = edges[0]
     end = now
     whole = 1.0
-    longest = 1.0
     theta = (0.0, 0.0, 0.0)
     countdown = 0
     row = 0
@@ -156,14 +155,18 @@ def run_augmented(
         stop = event_time[e] if due else end
         dt = stop - now
         if dt > 0.0:
-            if dt > longest:
-                dt = longest
-                stop = now + dt
-                due = False
             part = theta
             if dt < whole:
-                share = dt / whole
-                part = (share * theta[0], share * theta[1], share * theta[2])
+                part = scale(dt / whole, theta)
+            # Cut where filter_loop cuts, and where the states decay too far.
+            turn = combine(1.0, part, -dt, (x[0], x[1], x[2]))
+            longest = longest_step(dt, turn, limit)
+            if longest < dt:
+                share = longest / dt
+                dt = longest
+                part = scale(share, part)
+                stop = now + dt
+                due = False
             if segments < len(segment_out):
                 store_segment(segment_out, segments, dt, part, q, x, F, size)
                 segments += 1
@@ -280,7 +283,6 @@ def run_augmented(
                 end = edges[k + 1]
                 whole = end - now
                 theta = vector_at(increments, k)
-                longest = longest_step(whole, theta, limit)
     attitude[0], attitude[1], attitude[2], attitude[3] = q
     return segments
 

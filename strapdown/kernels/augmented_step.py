@@ -33,7 +33,7 @@ from strapdown.kernels.algebra import (
     symmetric_times_vector,
     transpose_times_vector,
 )
-from strapdown.kernels.filter_loop import ATTITUDE, DIRECTION, HEADING, heading_error
+from strapdown.kernels.filter_loop import ATTITUDE, DIRECTION, HEADING, MOST_TURN, heading_error
 from strapdown.kernels.filter_step import process_noise, transition
 from strapdown.kernels.rotation import logarithm, quaternion_multiply, rotation_matrix, turned
 from strapdown.kernels.series import LARGEST_ANGLE, second, sinc
@@ -102,7 +102,7 @@ def longest_step(dt, theta, limit):
     """Return the longest step within an interval: what the polynomials bear of a turn, and ``limit`` for states that decay."""
     longest = dt
     squared = dot(theta, theta)
-    if squared > LARGEST_ANGLE * LARGEST_ANGLE:
+    if LARGEST_ANGLE * LARGEST_ANGLE < squared < MOST_TURN * MOST_TURN:
         longest = dt * (LARGEST_ANGLE / math.sqrt(squared))
     return min(longest, limit)
 
