@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from strapdown.cli.filters import filter_for
-from strapdown.cli.terminal import app, console, show, table, written
+from strapdown.cli.terminal import app, console, show, table, writable, written
 
 if TYPE_CHECKING:
     from strapdown.mekf import State
@@ -86,17 +86,12 @@ def estimate(
 ) -> None:
     """Estimate attitude and gyro bias from a recording (accelerometer as vertical, magnetometer as heading) or a simulated record."""
     from strapdown.checks import InputError
-    from strapdown.files import output_file, usable_folder
+    from strapdown.files import usable_folder
     from strapdown.recordfiles import is_record
 
     usable_folder("out", out)
-    for name in ("estimate.h5", "errors.json"):
-        output_file(
-            "out",
-            out / name,
-            (Path(name).suffix,),
-            *(path for path in (recording, gyro, filter_file) if path is not None),
-        )
+    names = ("estimate.h5", "errors.json", "states.json", "estimate.png", "errors.png")
+    writable("out", *(out / name for name in names), sources=(recording, gyro, filter_file))
     given = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
     units = {name: unit for name, unit in given.items() if unit}
     if is_record(recording):

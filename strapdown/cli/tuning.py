@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from strapdown.cli.terminal import app, console, progress_bar, show, table, written
+from strapdown.cli.terminal import app, console, progress_bar, show, table, writable, written
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 GATED = ("gate.probability", "outliers.share", "outliers.scale")
 """Names of parameters that ask for a model of outliers."""
+FIGURES = ("likelihood", "heldout")
+"""Figures that are drawn beside the filter, by the ends of their names."""
 MOST_EXAMINED = 4
 """Records that are looked at for what the tuned filter leaves unexplained."""
 WORSE = 1.05
@@ -125,7 +127,6 @@ def tune(
 
     from strapdown import coning, tuning
     from strapdown.checks import InputError, count, non_negative, one_of
-    from strapdown.files import output_file
     from strapdown.setup import read_setup
 
     workers = count("threads", threads if threads is not None else os.cpu_count() or 1)
@@ -152,7 +153,11 @@ def tune(
     ]
     if same:
         raise InputError(f"{same[0]} is given twice; a record counts once")
-    output_file("out", out, (".toml",), *records, *([filter_file] if filter_file is not None else []))
+    sources = (*records, filter_file)
+    writable("out", out, suffixes=(".toml",), sources=sources)
+    writable(
+        "out", out.with_suffix(".json"), *(out.with_name(f"{out.stem}-{name}.png") for name in FIGURES), sources=sources
+    )
     units = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
     cases, believed, gyros = _cases(
         records, chosen, {name: unit for name, unit in units.items() if unit}, states=states
