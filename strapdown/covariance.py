@@ -292,6 +292,10 @@ def _all_rows(scenario: Scenario, setup: FilterSetup) -> list[_Rows]:
     record = ImuRecord(time=np.array([start, end]), increments=np.zeros((1, 3)), vectors=tuple(own))
     held = believed(record, step).vectors
     for series in held:
+        if series.anisotropic:
+            raise InputError(
+                f"{series.sensor}: the analysis takes one sigma of a {series.kind}, not one an axis; give one number in [filter.sigma]"
+            )
         if not np.all(series.sigma > 0.0):
             raise InputError(
                 f"{series.sensor}: sigma is 0; a filter needs a noise greater than zero: give the sensor one, or [filter.sigma]"

@@ -18,7 +18,7 @@ from strapdown import coning, gyro, mekf, quaternion, tables, units, vectors
 from strapdown.augmented import matching
 from strapdown.augmented import states as optional
 from strapdown.augmented.states import States
-from strapdown.checks import Array, InputError, finite, known_keys, one_of, positive
+from strapdown.checks import Array, InputError, known_keys, one_of, positive
 from strapdown.gyro import GyroSpec
 from strapdown.mekf import ProcessNoise
 from strapdown.records import Estimate, ImuRecord, compress
@@ -40,6 +40,20 @@ LEAST_BIAS_SIGMA = 0.1 * units.DEGREE_PER_HOUR
 """Standard deviation of the initial bias error of a gyro whose specification tells of no bias, rad/s."""
 
 
+Sigma = float | tuple[float, float, float]
+"""σ of a sensor: one number, or one about (of whole vectors along) each body axis x, y, z."""
+
+
+def _sigma(name: str, value: Any) -> Sigma:
+    """Return one number above zero, or three."""
+    if not isinstance(value, (list, tuple)) and not (isinstance(value, np.ndarray) and value.ndim):
+        return positive(name, value)
+    if len(value) != 3:
+        raise InputError(f"{name} has {len(value)} numbers; give one, or three of the body axes x, y, z")
+    x, y, z = (positive(f"{name}: {axis}", one) for axis, one in zip("xyz", value, strict=True))
+    return x, y, z
+
+
 @dataclass(frozen=True, kw_only=True)
 class FilterSetup:
     """What the filter believes, where it starts, what integrates the gyro."""
@@ -53,9 +67,10 @@ class FilterSetup:
     """Coning algorithm that turns its N gyro samples into one filter step."""
     measurement_sigma_factor: float = 1.0
     """What the filter takes each sensor's σ for, as a multiple of the record's."""
-    sigma: Mapping[str, float] = field(default_factory=dict)
+    sigma: Mapping[str, Sigma] = field(default_factory=dict)
     """σ that the filter believes of a sensor instead of the record's, by its name: rad, or of whole vectors the unit of their reference.
-    Of a series whose σ varies it is the root mean square, and the ratios stay."""
+    One number, or three of the body axes x, y, z (of a direction the part across it counts; a heading has one). Of a series whose σ varies
+    it is the root mean square, and the ratios stay; with three, those between samples, not those between axes."""
     gate: Gate | None = None
     """Refuses measurements that no right filter would see, and recovers; None: all are taken."""
     robust: Robust | None = None
@@ -70,7 +85,7 @@ class FilterSetup:
         positive("attitude_sigma", self.attitude_sigma, unit="rad")
         positive("bias_sigma", self.bias_sigma, unit="rad/s")
         positive("measurement_sigma_factor", self.measurement_sigma_factor)
-        believed_sigma = {str(name): float(positive(f"sigma[{name!r}]", s)) for name, s in self.sigma.items()}
+        believed_sigma = {str(name): _sigma(f"sigma[{name!r}]", s) for name, s in self.sigma.items()}
         object.__setattr__(self, "sigma", believed_sigma)
 
 
@@ -283,13 +298,31 @@ def believed(record: ImuRecord, setup: FilterSetup) -> ImuRecord:
 def _believed(series: VectorMeasurements, setup: FilterSetup) -> VectorMeasurements:
     factor = setup.measurement_sigma_factor
     if series.sensor in setup.sigma:
+        told = setup.sigma[series.sensor]
+        if isinstance(told, tuple):
+            return _by_axis(series, told, factor)
         own = float(np.sqrt(np.mean(series.sigma**2))) if len(series.time) else 0.0
         if own == 0.0:
             if series.attitude is not None:
-                return replace(series, sigma_axes=np.full(3, factor * setup.sigma[series.sensor]))
-            return replace(series, sigma=np.full(len(series.time), factor * setup.sigma[series.sensor]))
-        factor *= setup.sigma[series.sensor] / own
+                return replace(series, sigma_axes=np.full(3, factor * told))
+            return replace(series, sigma=np.full(len(series.time), factor * told))
+        factor *= told / own
     return series if factor == 1.0 else series.noise_scaled(factor)
+
+
+def _by_axis(series: VectorMeasurements, told: tuple[float, float, float], factor: float) -> VectorMeasurements:
+    """Return the series with a σ of its own about each body axis; from sample to sample they vary as its own does."""
+    if series.kind == "heading":
+        raise InputError(
+            f"sigma: {series.sensor} is {told}, three numbers, and a heading has one degree of freedom; give one number"
+        )
+    m = len(series.time)
+    own = float(np.sqrt(np.mean(series.sigma**2))) if m else 0.0
+    level = series.sigma / own if own > 0.0 else np.ones(m)
+    # The root mean square over the axes is made from them.
+    return replace(
+        series, sigma=np.zeros(m), sigma_axes=factor * level[:, None] * np.asarray(told)[None], covariance=None
+    )
 
 
 def run(record: ImuRecord, setup: FilterSetup, initial: mekf.State, **options: Any) -> Estimate:
@@ -339,7 +372,7 @@ def to_table(setup: FilterSetup) -> dict[str, Any]:
     table = {**tables.encode(setup.process_noise, _NOISE_FORM), **tables.encode(setup, _FORM)}
     table["integration"] = setup.integration.name
     if setup.sigma:
-        table["sigma"] = dict(setup.sigma)
+        table["sigma"] = {name: list(s) if isinstance(s, tuple) else s for name, s in setup.sigma.items()}
     if setup.gate is not None:
         known = {name: choice for name, choice in _GATE_FORM.items() if getattr(setup.gate, name) is not None}
         table["gate"] = tables.encode(setup.gate, known)
@@ -362,7 +395,7 @@ def from_table(table: Mapping[str, Any], place: str = "filter") -> FilterSetup:
         parts["integration"] = coning.ALGORITHMS[name]
     if "sigma" in table:
         believed_sigma = _part(table, "sigma", place)
-        parts["sigma"] = {name: finite(f"{place}: sigma: {name}", value) for name, value in believed_sigma.items()}
+        parts["sigma"] = {name: _sigma(f"{place}: sigma: {name}", value) for name, value in believed_sigma.items()}
     if "gate" in table:
         content = dict(_part(table, "gate", place))
         if content.get("recovery") == NEVER:

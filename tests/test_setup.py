@@ -33,6 +33,7 @@ def scenario(**changes):
     "change",
     [
         {},
+        {"sigma": {"star": (1.7e-4, 1.0 / 3.0e4, 2.1e-5), "sun": 2e-3}},
         {"gate": Gate()},
         {"gate": Gate(probability=0.99, recovery=None, restart_attitude_sigma=0.3, restart_bias_sigma=1e-5)},
         {"robust": Robust()},
@@ -69,6 +70,8 @@ def test_the_gate_of_a_setup_is_that_of_its_filter():
         ({"integration": "four"}, "four-sample"),
         ({"sigma": 3.0}, "must be a table"),
         ({"sigma": {"star": "big"}}, "sigma: star"),
+        ({"sigma": {"star": [1e-4, 1e-4]}}, "sigma: star has 2 numbers; give one, or three"),
+        ({"sigma": {"star": [1e-4, 1e-4, "1e-4"]}}, "sigma: star: z is '1e-4'"),
         ({"gate": 0.99}, "must be a table"),
         ({"gate": {"probabilty_ratio": 0.9}}, "probability_ratio"),
         ({"robust": {"kind": "hubr"}}, "huber"),
@@ -79,7 +82,10 @@ def test_a_bad_table_is_refused_by_name(table, complaint):
         setup.from_table(table)
 
 
-@pytest.mark.parametrize("change", [{"attitude_sigma": 0.0}, {"bias_sigma": -1.0}, {"sigma": {"star": 0.0}}])
+@pytest.mark.parametrize(
+    "change",
+    [{"attitude_sigma": 0.0}, {"bias_sigma": -1.0}, {"sigma": {"star": 0.0}}, {"sigma": {"star": (1e-4, 0.0, 1e-4)}}],
+)
 def test_no_sigma_may_be_zero(change):
     with pytest.raises(InputError, match="greater than zero"):
         dataclasses.replace(SETUP, **change)

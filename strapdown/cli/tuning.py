@@ -44,7 +44,8 @@ def tune(
         str | None,
         typer.Option(
             help="Parameters to tune, with commas: gyro.arw, gyro.rrw, SENSOR.sigma, initial.attitude, initial.bias, "
-            "gate.probability (as --gate); or filter.scale alone. If not given the gyro's two and every sensor's."
+            "gate.probability (as --gate); SENSOR.sigma.x, .y, .z (about one body axis); or filter.scale alone. If not given the "
+            "gyro's two and every sensor's."
         ),
     ] = None,
     filter_file: Annotated[
@@ -188,7 +189,13 @@ def tune(
             "a filter with optional states is tuned by the likelihood of all innovations: leave --gate, --truth, --rmse, --credibility and "
             "--spacing away"
         )
-    if believed.states is not None:
+    by_axis = any(tuning.axis_of(name) for name in wanted)
+    if by_axis and (gate or truth or rmse or credibility or spacing > 0.0):
+        raise InputError(
+            "a sigma of one axis is tuned by the likelihood of all innovations: leave --gate, --truth, --rmse, --credibility and --spacing "
+            "away"
+        )
+    if believed.states is not None or by_axis:
         from strapdown.tuning import extended
 
         objective = extended.likelihood(train, believed, wanted, threads=workers)
@@ -210,7 +217,7 @@ def tune(
             starts=starts,
             factor=factor,
             seed=seed,
-            threads=1 if truth or rmse or credibility or believed.states is not None else workers,
+            threads=1 if truth or rmse or credibility or believed.states is not None or by_axis else workers,
             progress=advance,
         )
     if rmse:
@@ -224,8 +231,8 @@ def tune(
     if comparison is not None and gate:
         likely = tuning.log_likelihood(held, objective, result)
         comparison = replace(comparison, after=replace(comparison.after, log_likelihood=likely))
-    # What is looked for is what optional states are there for.
-    suspects = train[:MOST_EXAMINED] if believed.states is None else ()
+    # What is looked for is what optional states are there for, and by filters that take one σ a sample.
+    suspects = train[:MOST_EXAMINED] if believed.states is None and not _differs_by_axis(train, result.setup) else ()
     examined = []
     with progress_bar("what is left unexplained", len(suspects)) as advance:
         for case in suspects:
@@ -244,6 +251,15 @@ def tune(
     objective_name = "credibility" if credibility else "rmse" if rmse else "likelihood"
     of = objective_name + (" of the errors" if truth else "")
     _write(out, result, objective, comparison, cases, records, of=of, examined=examined, gate=found)
+
+
+def _differs_by_axis(cases: Sequence[Case], chosen: FilterSetup) -> bool:
+    """Return whether the filter believes a noise of a direction or whole vector that differs by axis."""
+    series = [one for case in cases for one in case.record.vectors]
+    return any(
+        one.anisotropic or (one.kind != "attitude" and isinstance(chosen.sigma.get(one.sensor), tuple))
+        for one in series
+    )
 
 
 def _by(text: str) -> Any:
@@ -301,7 +317,8 @@ def _unit_of(name: str, records: Sequence[ImuRecord]) -> Unit:
     from strapdown import tuning
     from strapdown.tuning import extended
 
-    return tuning.unit_of(name, records) if name in tuning.known_names(records) else extended.unit_of(name)
+    plain = name in tuning.known_names(records) or tuning.axis_of(name) is not None
+    return tuning.unit_of(name, records) if plain else extended.unit_of(name)
 
 
 def _figure(value: float) -> str:

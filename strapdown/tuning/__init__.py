@@ -45,6 +45,8 @@ from strapdown.tuning.outliers import (
 )
 from strapdown.tuning.parameters import (
     Prior,
+    axis_names,
+    axis_of,
     default_names,
     known_names,
     priors_from_gyro,
@@ -74,6 +76,8 @@ __all__ = [
     "TunedGate",
     "Tuning",
     "Unmodelled",
+    "axis_names",
+    "axis_of",
     "compare",
     "contaminated_likelihood",
     "credibility_objective",

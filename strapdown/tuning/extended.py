@@ -1,5 +1,8 @@
 """The likelihood of a filter with optional states: their priors, drifts and coloured noises tuned beside the gyro's and the sensors' noise.
 
+It has the σ of each body axis of a sensor too, with optional states or without: ``SENSOR.sigma.x``, ``.y``, ``.z``
+(:mod:`strapdown.tuning.parameters`).
+
 The same sum over the innovations as in :mod:`strapdown.tuning.innovations`, of the filter that :func:`strapdown.setup.run` runs. Its
 score and information come from one run more a parameter, off by :data:`STEP`; the curvature at the best point, from which standard errors
 come, is the observed one, by central differences of the score. :func:`strapdown.tuning.fit` takes it like any other objective:
@@ -24,6 +27,7 @@ from strapdown import setup, units
 from strapdown.augmented.states import Entries, SensorStates, States
 from strapdown.checks import Array, InputError, count, one_of
 from strapdown.mekf import State
+from strapdown.records import ImuRecord
 from strapdown.setup import FilterSetup
 from strapdown.tuning import parameters
 from strapdown.tuning.innovations import STEP, Case, Derivatives
@@ -140,8 +144,9 @@ class ExtendedLikelihood:
 
     def setup(self, point: Array) -> FilterSetup:
         """Return the setup of a point."""
-        assert self.chosen.states is not None
         values = {name: float(np.exp(x)) for name, x in zip(self.names, point, strict=True)}
+        if self.chosen.states is None:
+            return parameters.with_values(self.chosen, values)
         own = set(state_names(self.chosen.states))
         plain = {name: value for name, value in values.items() if name not in own}
         result = parameters.with_values(self.chosen, plain) if plain else self.chosen
@@ -215,6 +220,8 @@ class ExtendedLikelihood:
     def _run(self, chosen: FilterSetup, case: Case) -> tuple[Array, Array, np.ndarray, np.ndarray]:
         own = [series.sensor for series in case.record.vectors]
         used = replace(chosen, sigma={name: value for name, value in chosen.sigma.items() if name in own})
+        # The filter of optional states has the innovations of measurements whose noise differs by axis, with none too.
+        used = replace(used, states=States() if used.states is None else used.states)
         initial = case.initial
         if {INITIAL_ATTITUDE, INITIAL_BIAS} & set(self.names):
             initial = setup.initial_state(used, case.initial.attitude, case.initial.bias)
@@ -254,10 +261,12 @@ def likelihood(
     cases : sequence of Case
         Their initial states tell of the whole bias, as those of :func:`strapdown.tuning.record_case` do.
     chosen : FilterSetup
-        With ``states``: where the free parameters start, and what the fixed ones are; its gate and robust weights are not applied.
+        Where the free parameters start, and what the fixed ones are; its gate and robust weights are not applied. With ``states``, or
+        without where a σ of one axis is free.
     free : sequence of str
-        Names of :mod:`strapdown.tuning.parameters` but ``filter.scale``, and of :func:`state_names`, such as ``gyro.scale_sigma``,
-        ``gyro.drift_time``, ``SENSOR.bias_sigma``, ``SENSOR.correlated_sigma``, ``SENSOR.correlation_time``.
+        Names of :mod:`strapdown.tuning.parameters` but ``filter.scale``, those of single axes (``SENSOR.sigma.x``) too, and of
+        :func:`state_names`, such as ``gyro.scale_sigma``, ``gyro.drift_time``, ``SENSOR.bias_sigma``, ``SENSOR.correlated_sigma``,
+        ``SENSOR.correlation_time``.
     parts : int
         Spans of time of each record whose gradients are kept apart.
     threads : int
@@ -265,21 +274,24 @@ def likelihood(
     """
     if not cases:
         raise InputError("there is no record to tune on; give one")
-    if chosen.states is None:
+    records = [case.record for case in cases]
+    _check_axes(free, records)
+    if chosen.states is None and not any(parameters.axis_of(name) for name in free):
         raise InputError(
             "the setup has no optional states; give it some (setup.matched(…, states=True)), or use tuning.likelihood"
         )
-    records = [case.record for case in cases]
-    own = state_names(chosen.states)
-    plain = [name for name in parameters.known_names(records) if name != SCALE]
+    own = () if chosen.states is None else state_names(chosen.states)
+    plain = [name for name in parameters.known_names(records) if name != SCALE] + list(parameters.axis_names(records))
     if not free:
         raise InputError(f"free names no parameter; give some of {', '.join([*plain, *own])}")
     for name in free:
         one_of("free: parameter", name, [*plain, *own])
         if list(free).count(name) > 1:
             raise InputError(f"free names {name} twice; once is enough")
+    chosen = parameters.by_axis(chosen, free, records)
     values = parameters.values_of(chosen, [name for name in free if name in plain], records)
-    values |= {name: value_of(chosen.states, name) for name in free if name not in plain}
+    if chosen.states is not None:
+        values |= {name: value_of(chosen.states, name) for name in free if name not in plain}
     for name, value in values.items():
         if value <= 0.0:
             raise InputError(f"{name} starts from {value:g}; it must start from a number greater than zero")
@@ -297,12 +309,22 @@ def likelihood(
     )
 
 
+def _check_axes(free: Sequence[str], records: Sequence[ImuRecord]) -> None:
+    """Refuse a σ of one axis of a heading, and one beside that of all axes."""
+    headings = {series.sensor for record in records for series in record.vectors if series.kind == "heading"}
+    for name in free:
+        part = parameters.axis_of(name)
+        if part is not None and part[0] in headings:
+            raise InputError(f"free: {name}: a heading has one degree of freedom; give {part[0]}{parameters.SIGMA}")
+        if part is not None and f"{part[0]}{parameters.SIGMA}" in free:
+            raise InputError(f"free: {name} is part of {part[0]}{parameters.SIGMA}; give that, or the axes")
+
+
 def _check_case(case: Case, chosen: FilterSetup) -> None:
     """Refuse a record that has nothing to tune on, or lacks a sensor that the states are of."""
-    assert chosen.states is not None
     what = case.name or "record"
     names = [series.sensor for series in case.record.vectors]
-    for sensor in chosen.states.sensors:
+    for sensor in () if chosen.states is None else chosen.states.sensors:
         one_of(f"{what}: sensor of the states", sensor, names)
     first, last = max(case.first, case.record.time[0]), min(case.last, case.record.time[-1])
     seen = sum(int(np.sum((series.time >= first) & (series.time <= last))) for series in case.record.vectors)

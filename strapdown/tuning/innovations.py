@@ -346,6 +346,12 @@ def _prepare(case: Case, chosen: FilterSetup, names: tuple[str, ...], parts: int
     sensors = [series.sensor for series in case.record.vectors]
     own = {name: value for name, value in chosen.sigma.items() if name in sensors}
     record = setup.believed(case.record, replace(chosen, sigma=own))
+    for series in record.vectors:
+        if series.anisotropic:
+            raise InputError(
+                f"{series.sensor}: this likelihood takes one sigma a sample, not sigma_axes or covariance; free {series.sensor}.sigma.x, "
+                ".y and .z in tuning.extended.likelihood, or give one number in [filter.sigma]"
+            )
     if spacing > 0.0:
         record = replace(record, vectors=tuple(thinned(series, spacing) for series in record.vectors))
     start, end = float(record.time[0]), float(record.time[-1])

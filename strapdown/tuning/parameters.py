@@ -1,8 +1,11 @@
 """What may be tuned: names of parameters, their values in a filter setup, and setups with other values.
 
 The gyro's two noises are shared by its axes, as the filter believes one σ_v and one σ_u: only isotropic noise is the same seen from a body
-that turns within a step, and has the closed form of :func:`strapdown.kernels.filter_step.process_noise`. Of a sensor whose σ differs by
-axis one factor on all of them is tuned; their ratios are the record's.
+that turns within a step, and has the closed form of :func:`strapdown.kernels.filter_step.process_noise`.
+
+``SENSOR.sigma`` is one factor on the σ of all axes, as their root mean square; their ratios are the setup's or the record's.
+``SENSOR.sigma.x``, ``.y`` and ``.z`` are the σ about (of whole vectors along) each body axis on its own, of any sensor but a heading; the
+likelihood of :mod:`strapdown.tuning.extended` has them. There are no such names of the gyro, for the reason above.
 """
 
 from __future__ import annotations
@@ -13,11 +16,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from strapdown import gyro, setup, units
-from strapdown.checks import InputError, one_of, positive
+from strapdown.checks import Array, InputError, one_of, positive
 from strapdown.gyro import GyroSpec
 from strapdown.mekf import ProcessNoise
 from strapdown.records import ImuRecord
-from strapdown.setup import FilterSetup
+from strapdown.setup import FilterSetup, Sigma
 
 ARW = "gyro.arw"
 """σ_v, rad/√s."""
@@ -38,6 +41,9 @@ GATE = "gate.probability"
 """Probability that the gate lets a right measurement pass: what share and scale of the outliers make it."""
 SIGMA = ".sigma"
 """What the name of a sensor's σ ends with."""
+
+AXES = tuple(f"{SIGMA}.{axis}" for axis in "xyz")
+"""What the names of a sensor's σ of one body axis end with."""
 
 OWN = (ARW, RRW, INITIAL_ATTITUDE, INITIAL_BIAS, SCALE)
 
@@ -67,6 +73,22 @@ def known_names(records: Sequence[ImuRecord]) -> tuple[str, ...]:
     return (*OWN, *(f"{sensor}{SIGMA}" for sensor in sensors))
 
 
+def axis_of(name: str) -> tuple[str, int] | None:
+    """Return the sensor and the axis that a name such as ``star.sigma.x`` is of; None of another name."""
+    for axis, ending in enumerate(AXES):
+        if name.endswith(ending) and name != ending:
+            return name.removesuffix(ending), axis
+    return None
+
+
+def axis_names(records: Sequence[ImuRecord]) -> tuple[str, ...]:
+    """Return the names of the σ of single body axes: of every sensor but headings, which have one degree of freedom."""
+    series = [one for record in records for one in record.vectors if len(one.time)]
+    headings = {one.sensor for one in series if one.kind == "heading"}
+    sensors = dict.fromkeys(one.sensor for one in series if one.sensor not in headings)
+    return tuple(f"{sensor}{axis}" for sensor in sensors for axis in AXES)
+
+
 def default_names(records: Sequence[ImuRecord]) -> tuple[str, ...]:
     """Return what is tuned if nobody says: the gyro's two noises and the σ of every sensor."""
     return tuple(name for name in known_names(records) if not name.startswith("initial.") and name != SCALE)
@@ -77,6 +99,10 @@ def checked_names(free: Sequence[str], records: Sequence[ImuRecord]) -> tuple[st
     if not free:
         raise InputError("free names no parameter; give some of " + ", ".join(known_names(records)))
     for name in free:
+        if axis_of(name) is not None and name not in known_names(records):
+            raise InputError(
+                f"free: {name} is a sigma of one axis, which this objective does not tune; use tuning.extended.likelihood"
+            )
         one_of("free: parameter", name, known_names(records))
         if list(free).count(name) > 1:
             raise InputError(f"free names {name} twice; once is enough")
@@ -89,6 +115,9 @@ def unit_of(name: str, records: Sequence[ImuRecord]) -> Unit:
     """Return the unit that a parameter is printed in."""
     if name in _UNITS:
         return _UNITS[name]
+    part = axis_of(name)
+    if part is not None:
+        name = f"{part[0]}{SIGMA}"
     sensor = name.removesuffix(SIGMA)
     kinds = [series.kind for record in records for series in record.vectors if series.sensor == sensor]
     if kinds and kinds[0] == "vector":
@@ -105,6 +134,40 @@ def own_sigma(name: str, records: Sequence[ImuRecord]) -> float:
     return float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else 0.0
 
 
+def own_axes(sensor: str, records: Sequence[ImuRecord]) -> Array:
+    """Return the root mean square of the σ that the records tell of each body axis of a sensor (3,), over all of its measurements."""
+    squares = []
+    for series in (one for record in records for one in record.vectors if one.sensor == sensor):
+        if series.sigma_axes is not None:
+            squares.append(np.square(series.sigma_axes))
+        elif series.covariance is not None:
+            squares.append(np.einsum("kii->ki", series.covariance))
+        else:
+            squares.append(np.repeat(np.square(series.sigma)[:, None], 3, axis=1))
+    return np.asarray(np.sqrt(np.mean(np.concatenate(squares), axis=0))) if squares else np.zeros(3)
+
+
+def by_axis(chosen: FilterSetup, names: Sequence[str], records: Sequence[ImuRecord]) -> FilterSetup:
+    """Return the setup with three σ for each sensor that ``names`` has one axis of: those that it, or the records, say at present."""
+    sigma = dict(chosen.sigma)
+    for sensor in dict.fromkeys(part[0] for part in map(axis_of, names) if part is not None):
+        told = sigma.get(sensor)
+        if isinstance(told, tuple):
+            continue
+        own = own_axes(sensor, records)
+        size = float(np.sqrt(np.mean(own**2)))
+        if told is None and size == 0.0:
+            raise InputError(f"{sensor}: the records say that its sigma is 0; give one to start from in [filter.sigma]")
+        x, y, z = (own if told is None else told * (own / size if size > 0.0 else np.ones(3))).tolist()
+        sigma[sensor] = x, y, z
+    return replace(chosen, sigma=sigma)
+
+
+def _size(sigma: Sigma) -> float:
+    """Return one σ, or the root mean square of three."""
+    return float(np.sqrt(np.mean(np.square(sigma)))) if isinstance(sigma, tuple) else sigma
+
+
 def values_of(chosen: FilterSetup, names: Sequence[str], records: Sequence[ImuRecord]) -> dict[str, float]:
     """Return the values that a setup gives the parameters."""
     found = {
@@ -117,8 +180,14 @@ def values_of(chosen: FilterSetup, names: Sequence[str], records: Sequence[ImuRe
     for name in names:
         if name in found:
             continue
+        part = axis_of(name)
+        if part is not None:
+            axes = by_axis(chosen, [name], records).sigma[part[0]]
+            assert isinstance(axes, tuple)
+            found[name] = axes[part[1]] * chosen.measurement_sigma_factor
+            continue
         sensor = name.removesuffix(SIGMA)
-        own = chosen.sigma.get(sensor, own_sigma(name, records)) * chosen.measurement_sigma_factor
+        own = _size(chosen.sigma.get(sensor, own_sigma(name, records))) * chosen.measurement_sigma_factor
         if own == 0.0:
             raise InputError(f"{sensor}: the records say that its sigma is 0; give one to start from in [filter.sigma]")
         found[name] = own
@@ -126,7 +195,10 @@ def values_of(chosen: FilterSetup, names: Sequence[str], records: Sequence[ImuRe
 
 
 def with_values(chosen: FilterSetup, values: Mapping[str, float]) -> FilterSetup:
-    """Return the setup with other values of these parameters; a σ is set with the setup's factor taken off."""
+    """Return the setup with other values of these parameters; a σ is set with the setup's factor taken off.
+
+    ``SENSOR.sigma`` keeps the ratios of three; ``SENSOR.sigma.x`` and the like need three in the setup (:func:`by_axis`).
+    """
     if SCALE in values:
         return _scaled(chosen, values[SCALE])
     noise = ProcessNoise(
@@ -136,7 +208,7 @@ def with_values(chosen: FilterSetup, values: Mapping[str, float]) -> FilterSetup
     sigma = dict(chosen.sigma)
     for name, value in values.items():
         if name not in OWN:
-            sigma[name.removesuffix(SIGMA)] = value / chosen.measurement_sigma_factor
+            _set(sigma, name, value / chosen.measurement_sigma_factor)
     return replace(
         chosen,
         process_noise=noise,
@@ -144,6 +216,26 @@ def with_values(chosen: FilterSetup, values: Mapping[str, float]) -> FilterSetup
         bias_sigma=values.get(INITIAL_BIAS, chosen.bias_sigma),
         sigma=sigma,
     )
+
+
+def _set(sigma: dict[str, Sigma], name: str, value: float) -> None:
+    """Set one σ, all three in their ratios, or that of one axis."""
+    part = axis_of(name)
+    if part is None:
+        sensor = name.removesuffix(SIGMA)
+        told = sigma.get(sensor)
+        if isinstance(told, tuple):
+            x, y, z = (value * one / _size(told) for one in told)
+            sigma[sensor] = x, y, z
+        else:
+            sigma[sensor] = value
+        return
+    sensor, axis = part
+    told = sigma.get(sensor)
+    if not isinstance(told, tuple):
+        raise InputError(f"{name}: the setup has no three sigmas of {sensor}; make them with tuning.parameters.by_axis")
+    x, y, z = (value if k == axis else one for k, one in enumerate(told))
+    sigma[sensor] = x, y, z
 
 
 def _scaled(chosen: FilterSetup, factor: float) -> FilterSetup:

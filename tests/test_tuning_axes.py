@@ -1,0 +1,291 @@
+"""A sensor's σ of each body axis: what the filter believes of it, who refuses it, and that tuning recovers it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+
+import numpy as np
+import pytest
+
+from strapdown import (
+    cli,
+    covariance,
+    gyro,
+    montecarlo,
+    motion,
+    quaternion,
+    recordfiles,
+    scenarios,
+    setup,
+    tuning,
+    units,
+    vectors,
+)
+from strapdown.checks import InputError
+from strapdown.montecarlo import lanes
+from strapdown.montecarlo.scalar import start
+from strapdown.scenarios import Scenario
+from strapdown.tuning import extended, parameters
+
+ARCSEC = units.ARCSECOND
+STAR = np.array([10.0, 10.0, 60.0]) * ARCSEC
+AXES = ("star.sigma.x", "star.sigma.y", "star.sigma.z")
+FIELD = np.array([0.0, 2e-5, -4e-5])
+SWAY = motion.HarmonicRates(
+    harmonics=(
+        motion.Harmonic(amplitude=(0.8, 0.2, -0.3), frequency=0.21),
+        motion.Harmonic(amplitude=(-0.3, 0.7, 0.4), frequency=0.37),
+    )
+)
+
+
+def tracked(duration=120.0) -> Scenario:
+    """Return a star tracker, coarse about z, beside a gyro that is worth about as much."""
+    return Scenario(
+        motion=motion.rest(),
+        gyro=gyro.GyroSpec(angle_random_walk=3e-5, rate_random_walk=1e-6, turn_on_bias_sigma=1e-5),
+        sensors=(vectors.AttitudeSensor(name="star", sigma_across=STAR[0], sigma_about=STAR[2], rate=5.0),),
+        rate=20.0,
+        duration=duration,
+    )
+
+
+def swaying(kind="vector", duration=40.0) -> Scenario:
+    return Scenario(
+        motion=SWAY,
+        gyro=gyro.GyroSpec(angle_random_walk=1e-3, rate_random_walk=1e-4, turn_on_bias_sigma=3e-3),
+        sensors=(
+            vectors.Magnetometer(name="mag", field_f=FIELD, sigma=5e-7, rate=10.0, kind=kind),
+            vectors.Accelerometer(name="acc", sigma=0.05, rate=10.0, kind="vector"),
+        ),
+        rate=20.0,
+        duration=duration,
+    )
+
+
+def case_of(scenario, chosen, seed) -> tuning.Case:
+    record = scenarios.simulate(scenario, seed)
+    return tuning.Case(record=record, initial=start(record, chosen, seed, 0), name=f"seed {seed}")
+
+
+# -------------------------------------------------------------------------------------------------------------- what is believed
+
+
+def test_believed_gives_a_series_three_and_keeps_its_course():
+    record = scenarios.simulate(swaying(duration=2.0), 1)
+    course = np.linspace(1.0, 2.0, len(record.vectors[0].time))
+    varying = dataclasses.replace(record.vectors[0], sigma=course * 1e-7)
+    record = dataclasses.replace(record, vectors=(varying, record.vectors[1]))
+    chosen = dataclasses.replace(
+        setup.matched(swaying(duration=2.0)), sigma={"mag": (1e-7, 2e-7, 3e-7)}, measurement_sigma_factor=2.0
+    )
+    mag, acc = setup.believed(record, chosen).vectors
+    np.testing.assert_allclose(np.sqrt(np.mean(mag.sigma_axes**2, axis=0)), [2e-7, 4e-7, 6e-7], rtol=1e-14)
+    np.testing.assert_allclose(mag.sigma_axes / mag.sigma_axes[0], (course / course[0])[:, None] * np.ones(3))
+    np.testing.assert_allclose(mag.sigma, np.sqrt(np.mean(mag.sigma_axes**2, axis=1)))
+    assert mag.anisotropic
+    np.testing.assert_allclose(acc.sigma, 0.1)
+    assert not acc.anisotropic
+
+
+def test_believed_replaces_the_axes_of_an_attitude_and_any_covariance():
+    record = scenarios.simulate(tracked(5.0), 1)
+    whole = dataclasses.replace(record.vectors[0], sigma_axes=None, covariance=np.diag(STAR**2) + 1e-10)
+    chosen = dataclasses.replace(setup.matched(tracked(5.0)), sigma={"star": (3e-5, 1e-5, 2e-5)})
+    for series in (record.vectors[0], whole):
+        (star,) = setup.believed(dataclasses.replace(record, vectors=(series,)), chosen).vectors
+        np.testing.assert_allclose(star.sigma_axes, np.tile([3e-5, 1e-5, 2e-5], (len(star.time), 1)))
+        assert star.covariance is None
+
+
+def test_of_a_record_without_sigma_it_is_what_is_told():
+    record = scenarios.simulate(tracked(5.0), 1)
+    silent = dataclasses.replace(record.vectors[0], sigma_axes=np.zeros(3))
+    chosen = dataclasses.replace(setup.matched(tracked(5.0)), sigma={"star": (3e-5, 1e-5, 2e-5)})
+    (star,) = setup.believed(dataclasses.replace(record, vectors=(silent,)), chosen).vectors
+    np.testing.assert_array_equal(star.sigma_axes[0], [3e-5, 1e-5, 2e-5])
+
+
+def test_three_equal_ones_are_one():
+    scenario = swaying(duration=5.0)
+    record = scenarios.simulate(scenario, 2)
+    chosen = setup.matched(scenario)
+    initial = setup.initial_state(chosen, record.truth.attitude[0], record.truth.bias[0])
+    one = setup.run(record, dataclasses.replace(chosen, sigma={"mag": 6e-7}), initial)
+    three = setup.run(record, dataclasses.replace(chosen, sigma={"mag": (6e-7,) * 3}), initial)
+    np.testing.assert_allclose(three.bias, one.bias, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(three.variance, one.variance, rtol=1e-9)
+
+
+def test_a_heading_has_one():
+    scenario = swaying("heading", 5.0)
+    record = scenarios.simulate(scenario, 1)
+    chosen = setup.matched(scenario)
+    with pytest.raises(InputError, match=r"mag is .*three numbers, and a heading has one degree of freedom; give one"):
+        setup.believed(record, dataclasses.replace(chosen, sigma={"mag": (0.1, 0.1, 0.1)}))
+    case = case_of(scenario, chosen, 1)
+    with pytest.raises(InputError, match=r"mag\.sigma\.x: a heading has one degree of freedom; give mag\.sigma"):
+        extended.likelihood([case], chosen, ["mag.sigma.x"])
+    assert not any(name.startswith("mag") for name in tuning.axis_names([record]))
+
+
+def test_the_monte_carlo_takes_three_of_an_attitude_in_lanes_and_others_on_the_scalar_machine():
+    told = {"star": (3e-5, 6e-5, 1.5e-4)}
+    chosen = dataclasses.replace(setup.matched(tracked(20.0)), sigma=told)
+    plan = montecarlo.Plan(scenario=tracked(20.0), setup=chosen, epochs=4)
+    assert lanes.supports(plan) is None
+    by_lanes, scalar = (montecarlo.run_plan(plan, runs=8, machine=name) for name in ("lanes", "scalar"))
+    np.testing.assert_allclose(by_lanes.sigma, scalar.sigma, rtol=1e-3)
+    chosen = dataclasses.replace(setup.matched(swaying()), sigma={"mag": (5e-7, 1e-6, 5e-7)})
+    reason = lanes.supports(montecarlo.Plan(scenario=swaying(), setup=chosen, epochs=4))
+    assert reason == "mag: a sigma of its own for each axis is not among the lanes' terms"
+
+
+# ----------------------------------------------------------------------------------------------------------- names and values
+
+
+def test_names_start_from_the_present_sigma():
+    record = scenarios.simulate(tracked(5.0), 1)
+    chosen = setup.matched(tracked(5.0))
+    assert tuning.axis_names([record]) == AXES
+    assert tuning.default_names([record]) == ("gyro.arw", "gyro.rrw", "star.sigma")
+    values = tuning.values_of(chosen, AXES, [record])
+    np.testing.assert_allclose([values[name] for name in AXES], STAR)
+    size = tuning.values_of(chosen, ["star.sigma"], [record])["star.sigma"]
+    assert size == pytest.approx(np.sqrt(np.mean(STAR**2)))
+    # One number stands for all axes in the record's ratios; three are themselves; the setup's factor is on both.
+    twice = dataclasses.replace(chosen, sigma={"star": 2.0 * size}, measurement_sigma_factor=3.0)
+    assert list(tuning.values_of(twice, AXES, [record]).values()) == pytest.approx(6.0 * STAR)
+    three = dataclasses.replace(twice, sigma={"star": (1e-5, 2e-5, 3e-5)})
+    assert list(tuning.values_of(three, AXES, [record]).values()) == pytest.approx([3e-5, 6e-5, 9e-5])
+    changed = tuning.with_values(three, {"star.sigma.y": 3e-5})
+    assert changed.sigma["star"] == pytest.approx((1e-5, 1e-5, 3e-5))
+    changed = tuning.with_values(three, {"star.sigma": 6.0 * np.sqrt(14.0 / 3.0) * 1e-5})
+    assert changed.sigma["star"] == pytest.approx((2e-5, 4e-5, 6e-5))
+    with pytest.raises(InputError, match="no three sigmas of star"):
+        tuning.with_values(chosen, {"star.sigma.y": 3e-5})
+    assert tuning.unit_of("star.sigma.x", [record]).name == "arcsec"
+    assert tuning.axis_of("star.sigma") is None
+    filled = parameters.by_axis(chosen, ["star.sigma.z"], [record])
+    assert setup.from_toml(setup.to_toml(filled)) == filled
+
+
+def test_the_plain_likelihood_and_the_analysis_refuse_what_they_cannot_take():
+    scenario = swaying(duration=5.0)
+    chosen = setup.matched(scenario)
+    case = case_of(scenario, chosen, 1)
+    with pytest.raises(InputError, match=r"acc.sigma.x is a sigma of one axis.*use tuning.extended.likelihood"):
+        tuning.likelihood([case], chosen, ["acc.sigma.x"])
+    with pytest.raises(InputError, match=r"acc.sigma.y is part of acc.sigma; give that, or the axes"):
+        extended.likelihood([case], chosen, ["acc.sigma", "acc.sigma.y"])
+    with pytest.raises(InputError, match=r"did you mean 'acc.sigma.x'"):
+        extended.likelihood([case], chosen, ["axc.sigma.x"])
+    three = dataclasses.replace(chosen, sigma={"acc": (0.05, 0.05, 0.1)})
+    with pytest.raises(InputError, match=r"acc: this likelihood takes one sigma a sample.*free acc\.sigma\.x"):
+        tuning.likelihood([case], three, ["gyro.arw"])
+    with pytest.raises(InputError, match="acc: the analysis takes one sigma of a vector, not one an axis"):
+        covariance.analyse(scenario, three)
+
+
+def test_of_an_attitude_one_factor_on_three_is_the_same_in_both_likelihoods():
+    chosen = setup.matched(tracked(20.0))
+    three = dataclasses.replace(chosen, sigma={"star": (5e-5, 1e-4, 2e-4)})
+    case = case_of(tracked(20.0), chosen, 1)
+    plain = tuning.likelihood([case], three, ["gyro.arw", "star.sigma"])
+    other = extended.likelihood([case], three, ["gyro.arw", *AXES])
+    for log_factor in (0.0, 0.4):
+        one = plain.minus_log(plain.start + np.array([0.3, log_factor]))
+        two = other.minus_log(other.start + np.array([0.3, log_factor, log_factor, log_factor]))
+        np.testing.assert_allclose(two, one, rtol=1e-9)
+
+
+# ------------------------------------------------------------------------------------------------------------------ recovered
+
+
+def recovered(scenario, truth, free, seed, **measured) -> np.ndarray:
+    """Return the errors of the log σ over their standard errors, from a start wrong by 3 either way."""
+    chosen = setup.matched(scenario)
+    case = case_of(scenario, chosen, seed)
+    if measured:
+        record = dataclasses.replace(case.record, **measured)
+        case = dataclasses.replace(case, record=record)
+    sensor = parameters.axis_of(free[-1])[0]
+    off = dataclasses.replace(chosen, sigma={sensor: tuple(truth * np.array([3.0, 1.0 / 3.0, 3.0]))})
+    objective = extended.likelihood([case], off, free)
+    found = tuning.fit(objective, starts=1, intervals=False)
+    assert found.setup.states is None
+    assert isinstance(found.setup.sigma[sensor], tuple)
+    by_name = [found[f"{sensor}.sigma.{axis}"] for axis in "xyz"]
+    assert [one.value for one in by_name] == pytest.approx(list(found.setup.sigma[sensor]))
+    errors = [one.standard_error for one in by_name]
+    np.testing.assert_array_less(errors, 0.2)
+    return np.log(np.array(found.setup.sigma[sensor]) / truth) / errors
+
+
+def test_a_star_tracker_is_recovered_within_its_intervals():
+    ratios = np.array([recovered(tracked(), STAR, ["gyro.arw", *AXES], seed) for seed in range(6)])
+    assert np.mean(np.abs(ratios) < 1.96) >= 0.75, ratios
+    assert 0.2 < np.mean(ratios**2) < 2.5, ratios
+
+
+@pytest.mark.slow
+def test_a_star_tracker_is_recovered_within_its_intervals_over_many_seeds():
+    ratios = np.array([recovered(tracked(), STAR, ["gyro.arw", *AXES], seed) for seed in range(60)])
+    assert 0.90 < np.mean(np.abs(ratios) < 1.96) <= 0.99, ratios
+    assert 0.7 < np.mean(ratios**2) < 1.4, ratios
+
+
+@pytest.mark.parametrize("kind", ["vector", "direction"])
+def test_a_magnetometer_is_recovered_though_its_axes_mix_in_every_innovation(kind):
+    scenario = swaying(kind)
+    truth = np.array([3e-7, 6e-7, 1.5e-6]) / (1.0 if kind == "vector" else np.linalg.norm(FIELD))
+    ratios = []
+    for seed in range(3):
+        mag, acc = scenarios.simulate(scenario, seed).vectors
+        exact = scenario.motion.attitude(mag.time)
+        size = FIELD if kind == "vector" else FIELD / np.linalg.norm(FIELD)
+        vector = quaternion.rotate(quaternion.conjugate(exact), np.broadcast_to(size, (len(mag.time), 3)))
+        vector = vector + truth * np.random.default_rng(seed).standard_normal(vector.shape)
+        if kind == "direction":
+            vector /= np.linalg.norm(vector, axis=1, keepdims=True)
+        noisy = dataclasses.replace(mag, vector_b=vector)
+        free = ["mag.sigma.x", "mag.sigma.y", "mag.sigma.z"]
+        ratios.append(recovered(scenario, truth, free, seed, vectors=(noisy, acc)))
+    assert np.max(np.abs(ratios)) < 2.9, ratios
+    assert np.mean(np.square(ratios)) < 2.5, ratios
+
+
+# ------------------------------------------------------------------------------------------------------------------- command
+
+
+def run(monkeypatch, capsys, *arguments: object) -> tuple[int, str, str]:
+    monkeypatch.setattr(sys, "argv", ["strapdown", *map(str, arguments)])
+    status = 0
+    try:
+        cli.main()
+    except SystemExit as end:
+        status = int(end.code or 0)
+    told = capsys.readouterr()
+    return status, told.out, told.err
+
+
+def test_the_command_tunes_the_axes_of_a_record(monkeypatch, capsys, tmp_path):
+    path, out, first = tmp_path / "star.h5", tmp_path / "tuned.toml", tmp_path / "first.toml"
+    scenario = tracked(60.0)
+    recordfiles.write_record(path, scenarios.simulate(scenario, 4), gyro_spec=scenario.gyro)
+    off = dataclasses.replace(setup.matched(scenario), sigma={"star": tuple(3.0 * STAR)})
+    first.write_text(setup.to_toml(off), encoding="utf-8")
+    command = ("tune", path, "--filter", first, "--free", ",".join(AXES), "--starts", 1, "-o", out)
+    status, said, complaint = run(monkeypatch, capsys, *command, "--holdout", 0.3)
+    assert status == 0, complaint
+    assert "star.sigma.z" in said
+    found = setup.read_setup(out)
+    assert found.states is None
+    np.testing.assert_allclose(found.sigma["star"], STAR, rtol=0.4)
+    assert [one["name"] for one in json.loads(out.with_suffix(".json").read_text())["parameters"]] == list(AXES)
+    for more, words in ((("--truth",), "leave --gate, --truth"), (("--plan",), "which this objective does not tune")):
+        status, _, complaint = run(monkeypatch, capsys, *command, *more)
+        assert status == 2
+        assert words in " ".join(complaint.split())
