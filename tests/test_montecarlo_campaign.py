@@ -380,6 +380,18 @@ def test_the_command_resumes_extends_and_shows(command):
     assert "--seed" in error
 
 
+def test_the_command_gives_the_filter_states_where_asked(command, tmp_path):
+    status, said, error = command("short.toml", "--runs", 2, "--states")
+    assert status == 0, error
+    assert "states option is not among the lanes' terms" in said
+    held = campaign.read(tmp_path / "short-montecarlo.h5")
+    assert held.plan.setup.states is not None
+    assert held.plan.setup.states.names == ("gyro.scale",)
+    status, _, error = command("short.toml", "--runs", 2, "--states", "--filter", "any.toml")
+    assert status != 0
+    assert "leave --states out" in error
+
+
 def test_the_command_takes_a_filter_and_dispersions_of_ones_own(command):
     Path("f.toml").write_text(setups.to_toml(replace(SETUP, measurement_sigma_factor=0.5)))
     Path("d.toml").write_text("[dispersions]\nattitude_error_deg = [0.0, 0.0, 5.0]\nattitude_sigma_deg = 0.0\n")
