@@ -39,7 +39,7 @@ from strapdown import consistency
 from strapdown.checks import Array, InputError
 from strapdown.setup import FilterSetup
 from strapdown.tuning.errors import ErrorObjective, error_objective
-from strapdown.tuning.innovations import MOST, STEP, Case, Derivatives, Likelihood, likelihood
+from strapdown.tuning.innovations import MOST, STEP, Case, Composite, Derivatives, likelihood
 from strapdown.vectors import KINDS
 
 ORDER = 4
@@ -124,31 +124,11 @@ def _usual_log(degrees: int) -> float:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CredibilityObjective:
+class CredibilityObjective(Composite):
     """How far NIS, or NEES, are from what they are of a right filter; built by :func:`credibility_objective`."""
 
-    base: Likelihood
     errors: ErrorObjective | None = None
     """Where the errors against a truth are judged; None: innovations."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the free parameters."""
-        return self.base.names
-
-    @property
-    def start(self) -> Array:
-        """Logarithms of their first values."""
-        return self.base.start
-
-    @property
-    def composite(self) -> bool:
-        """Whether the curvature is no information."""
-        return True
-
-    def setup(self, point: Array) -> FilterSetup:
-        """Return the setup of a point."""
-        return self.base.setup(point)
 
     def minus_log(self, points: Array) -> Array:
         """Return half the statistic at several points (k, p): (k,)."""
