@@ -6,6 +6,7 @@ import math
 
 from strapdown.kernels.algebra import combine, dot, matrix_times_vector, scale, transpose_times_vector
 from strapdown.kernels.filter_step import heading_row, predict, update_attitude, update_direction, update_heading
+from strapdown.kernels.lane_values import element
 from strapdown.kernels.rotation import rotation_matrix
 from strapdown.kernels.series import LARGEST_ANGLE
 
@@ -35,23 +36,36 @@ def heading_error(R, z, reference):
     return math.atan2(x * reference[1] - y * reference[0], x * reference[0] + y * reference[1])
 
 
-def merge_order(time, heads, ends, row, series):
+def merge_order(time, heads, ends, ordered, row, series):
     """Merge several series, each sorted, that stand one after the other in ``time``; at one time the earlier series comes first.
 
-    Writes for each event in order of time the row where it stands and the number of its series. ``heads`` and ``ends`` bound each series;
-    ``heads`` is used up.
+    Writes for each event in order of time when and where it stands and the number of its series. ``heads`` and ``ends`` bound each
+    series; ``heads`` is used up.
     """
     for e in range(len(row)):
-        best = -1
+        best = 0
         earliest = math.inf
         for s in range(len(heads)):
             k = heads[s]
             if k < ends[s] and time[k] < earliest:
                 best = s
                 earliest = time[k]
+        ordered[e] = earliest
         row[e] = heads[best]
         series[e] = best
         heads[best] += 1
+
+
+def common_order(time, number, ordered, row, series):
+    """Write what :func:`merge_order` does for ``number`` series that share the times ``time``."""
+    count = len(time)
+    e = 0
+    for k in range(count):
+        for s in range(number):
+            ordered[e] = time[k]
+            row[e] = s * count + k
+            series[e] = s
+            e += 1
 
 
 def store_state(out, q, b, A, B, C):
@@ -79,11 +93,12 @@ def run_filter(
     increments,
     angle_variance,
     rate_variance,
+    time,
     event_row,
     event_series,
-    time,
     value,
-    variance,
+    sigma,
+    places,
     bounds,
     kinds,
     frames,
@@ -99,13 +114,14 @@ def run_filter(
 ):
     """Run the filter over a record; events lie between the first and the last edge.
 
-    The events stand in ``time``, ``value`` and ``variance`` one series after the other, between ``bounds``; the e-th in time stands at
-    ``event_row[e]`` and is of series ``event_series[e]``, whose kind is in ``kinds`` and whose frames are in ``triads`` (frames: row of the
-    first, and how many rows on the next).
+    The e-th event, at ``time[e]``, is of series ``event_series[e]`` and stands at ``event_row[e]``, counted over all series one after
+    the other, of which ``bounds`` tells where each begins. Its three numbers are ``value[places[s, 0] + 3 · row]`` and the next two, its
+    σ is ``sigma[places[s, 1] + row]``: only the first series need lie in these arrays, each stays where it was measured. The kind of a
+    series is in ``kinds`` and its frames are in ``triads`` (frames: row of the first, and how many rows on the next).
 
     The interval from ``edges[k]`` to ``edges[k + 1]`` is split at the times of the events inside it. ``state`` holds (q, b, A, B, C) as
     28 numbers and is left at the end state, so a run may be continued. Row j of the outputs is the state after ``every · j`` intervals;
-    ``covariance_out`` (blocks A, B, C as 21 numbers) may be empty. Row for row as the events stand, ``innovation_out``
+    ``covariance_out`` (blocks A, B, C as 21 numbers) may be empty. One series after the other, ``innovation_out``
     (events, 4 or 6) gets e₁, s₁, e₂, s₂, e₃, s₃: independent innovations and their variances, as many as it has degrees of
     freedom.
     ``segment_out`` (segments, 32), which may be
@@ -129,8 +145,8 @@ def run_filter(
     segments = 0
     # One pass predicts to the next event or edge, takes in the event, and closes the interval, each where there is one.
     while k < len(increments):
-        due = e < events and time[event_row[e]] <= end
-        stop = time[event_row[e]] if due else end
+        due = e < events and time[e] <= end
+        stop = time[e] if due else end
         dt = stop - now
         if dt > 0.0:
             part = theta
@@ -159,7 +175,10 @@ def run_filter(
             series = event_series[e]
             kind = kinds[series]
             t = frames[series, 0] + frames[series, 1] * (at - bounds[series])
-            z = vector_at(value, at)
+            here = places[series, 0] + 3 * at
+            z = (element(value, here), element(value, here + 1), element(value, here + 2))
+            deviation = element(sigma, places[series, 1] + at)
+            variance = deviation * deviation
             if kind == ATTITUDE:
                 measured = (triads[t, 0], triads[t, 1], triads[t, 2], triads[t, 3])
                 q, b, A, B, C, e1, s1, e2, s2, e3, s3 = update_attitude(q, b, A, B, C, measured, z)
@@ -172,18 +191,18 @@ def run_filter(
                     # Its length says nothing of the attitude, but belongs to the innovation.
                     r = (triads[t, 6], triads[t, 7], triads[t, 8])
                     innovation_out[at, 4] = dot(transpose_times_vector(R, r), z) - 1.0
-                    innovation_out[at, 5] = variance[at]
-                q, b, A, B, C, e1, s1, e2, s2 = update_direction(q, b, A, B, C, R, u, v, z, variance[at])
+                    innovation_out[at, 5] = variance
+                q, b, A, B, C, e1, s1, e2, s2 = update_direction(q, b, A, B, C, R, u, v, z, variance)
             else:
                 error = heading_error(R, z, (triads[t, 6], triads[t, 7], triads[t, 8]))
-                q, b, A, B, C, e1, s1 = update_heading(q, b, A, B, C, heading_row(R, z), error, variance[at])
+                q, b, A, B, C, e1, s1 = update_heading(q, b, A, B, C, heading_row(R, z), error, variance)
                 e2, s2 = 0.0, 1.0
             innovation_out[at, 0] = e1
             innovation_out[at, 1] = s1
             innovation_out[at, 2] = e2
             innovation_out[at, 3] = s2
             e += 1
-        if now >= end and (e == events or time[event_row[e]] > end):
+        if now >= end and (e == events or time[e] > end):
             if countdown == 0:
                 countdown = every
                 attitude_out[row, 0], attitude_out[row, 1], attitude_out[row, 2], attitude_out[row, 3] = q

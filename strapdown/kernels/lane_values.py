@@ -59,6 +59,11 @@ def load_like(array, start, like):
     return array[start : start + len(like)].copy()
 
 
+def element(array, place):
+    """Return ``array[place]``; compiled, a place outside the array is one of the memory before or behind it, and not from its end."""
+    return array[place]
+
+
 def store_like(array, start, value):
     """Write lanes of any number to ``array[start : …]``, converted to the precision of the array."""
     array[start : start + len(value)] = value

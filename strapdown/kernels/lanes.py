@@ -391,6 +391,17 @@ def load_like(typingctx: Any, array: Any, start: Any, like: Any) -> Any:
 
 
 @intrinsic  # type: ignore[untyped-decorator]
+def element(typingctx: Any, array: Any, place: Any) -> Any:
+    """Lower :func:`lane_values.element`."""
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        data = context.make_array(array)(context, builder, arguments[0]).data
+        return builder.load(builder.gep(data, [arguments[1]]))
+
+    return array.dtype(array, types.intp), lower
+
+
+@intrinsic  # type: ignore[untyped-decorator]
 def store_like(typingctx: Any, array: Any, start: Any, value: Any) -> Any:
     """Lower :func:`lane_values.store_like`."""
     target = Lanes(array.dtype, value.count)
@@ -568,6 +579,7 @@ INTRINSICS = {
         flush_tiny,
         restore_mode,
         load_like,
+        element,
         store_like,
         narrowed,
         total,

@@ -10,7 +10,7 @@ from strapdown.checks import Array, count
 from strapdown.kernels import filter_loop, robust_loop, robust_step
 from strapdown.kernels.machine import compiled
 from strapdown.mekf.memory import side_by_side
-from strapdown.mekf.scheduling import Schedule, innovations_by_sensor, schedule
+from strapdown.mekf.scheduling import Schedule, innovations_by_sensor, places, schedule
 from strapdown.mekf.states import ProcessNoise, State, covariance_matrices, pack
 from strapdown.records import Estimate, Event, ImuRecord
 from strapdown.robustness import Gate, Monitor, Robust
@@ -127,21 +127,26 @@ def run_events(
     state[:] = pack(initial.attitude, initial.bias, initial.covariance)
     plain = gate is None and robust is None and events.noise is None
     width = max([4, *(2 * KINDS[kind] for kind in events.kinds)]) if plain else 6
-    shapes = (rows, 4), (rows, 3), (rows, 6), (rows if full_covariance else 0, 21), (len(events.row), width)
+    number_of_events = int(events.bounds[-1])
+    shapes = (rows, 4), (rows, 3), (rows, 6), (rows if full_covariance else 0, 21), (number_of_events, width)
     attitude, bias, variance, blocks, innovation = side_by_side(*((shape, float) for shape in shapes))
-    stored = np.empty((segments + 1 if segments else 0, 32))
+    (stored,) = side_by_side(((segments + 1 if segments else 0, 32), float))
     weight, recoveries = None, np.empty((0, 4))
     if plain:
+        columns = [places(column) for column in (events.series_vector_b, events.series_sigma)]
         number = compiled(filter_loop.run_filter)(
             record.time,
             np.ascontiguousarray(record.increments),
             process_noise.angle_random_walk**2,
             process_noise.rate_random_walk**2,
+            events.time,
             events.row,
             events.sensor,
-            events.standing_time,
-            events.standing_vector_b,
-            events.standing_variance,
+            *(first for first, _ in columns),
+            np.stack(
+                [starts - width * events.bounds[:-1] for (_, starts), width in zip(columns, (3, 1), strict=True)],
+                axis=1,
+            ),
             events.bounds,
             events.codes,
             events.frames,
@@ -157,9 +162,9 @@ def run_events(
         )
     else:
         options = _KernelOptions.of(gate, robust, initial)
-        weight = np.empty(len(events.row))
+        weight = np.empty(number_of_events)
         # A recovery takes at least two refusals.
-        recoveries = np.empty((len(events.row) // 2, 4))
+        recoveries = np.empty((number_of_events // 2, 4))
         number, recovered = compiled(robust_loop.run_robust)(
             record.time,
             np.ascontiguousarray(record.increments),

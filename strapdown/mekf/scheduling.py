@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -27,24 +27,20 @@ _KIND_CODES = {
 class Schedule:
     """Measurements of all sensors and their order of time. Those at one time keep the order of the sensors.
 
-    What was measured stands as it came, one sensor after the other, and is not moved: ``row`` tells where the event next in time stands.
-    The columns in order of time are made when they are asked for.
+    What was measured stays where it came from, series by series. The columns of all in order of time are made when they are asked for.
     """
 
-    standing_time: Array
-    """Times (events,), s, one sensor after the other."""
-    standing_vector_b: Array
-    """Measured vectors over the length of their references (events, 3); of an attitude its three variances."""
-    standing_variance: Array
-    """Variance of each component of the vector (events,)."""
+    series_time: tuple[Array, ...]
+    """Times (m,) of each sensor, s."""
+    series_vector_b: tuple[Array, ...]
+    """Measured vectors over the length of their references (m, 3) of each sensor; of an attitude its three variances."""
+    series_sigma: tuple[Array, ...]
+    """σ of each component of the vector (m,) of each sensor."""
     standing_noise: Array | None = None
-    """Upper triangles of the covariances in body axes (events, 6), over the squared lengths of the references, if any is anisotropic."""
-    row: np.ndarray
-    """Where each event stands, in order of time (events,)."""
-    sensor: np.ndarray
-    """Index of the sensor of each event, in order of time (events,)."""
+    """Upper triangles of the covariances in body axes (events, 6), over the squared lengths of the references, one sensor after the
+    other, if any is anisotropic."""
     bounds: np.ndarray
-    """Where each sensor's events begin, and the last ones end (sensors + 1,)."""
+    """Where each sensor's events begin, and the last ones end, if they stand one sensor after the other (sensors + 1,)."""
     codes: np.ndarray
     """Code of :mod:`strapdown.kernels.filter_loop` of each sensor (sensors,)."""
     frames: np.ndarray
@@ -57,19 +53,42 @@ class Schedule:
     skipped: dict[str, int]
 
     @cached_property
+    def order(self) -> tuple[Array, np.ndarray, np.ndarray]:
+        """Of each event in order of time (events,): its time, its row where one sensor comes after the other, and its sensor."""
+        number = int(self.bounds[-1])
+        time, row, sensor = side_by_side(((number,), float), ((number,), np.uint32), ((number,), np.uint8))
+        first, *others = self.series_time or (np.empty(0),)
+        if all(np.array_equal(first, other) for other in others):
+            compiled(filter_loop.common_order)(first, len(self.sensors), time, row, sensor)
+        else:
+            standing = np.concatenate(self.series_time)
+            compiled(filter_loop.merge_order)(standing, self.bounds[:-1].copy(), self.bounds[1:], time, row, sensor)
+        return time, row, sensor
+
+    @property
     def time(self) -> Array:
         """Times in order (events,), s."""
-        return self._ordered(self.standing_time)
+        return self.order[0]
+
+    @property
+    def row(self) -> np.ndarray:
+        """Row of each event, one sensor after the other, in order of time (events,)."""
+        return self.order[1]
+
+    @property
+    def sensor(self) -> np.ndarray:
+        """Index of the sensor of each event, in order of time (events,)."""
+        return self.order[2]
 
     @cached_property
     def vector_b(self) -> Array:
         """Measured vectors in order of time (events, 3)."""
-        return self._ordered(self.standing_vector_b)
+        return self._ordered(_joined(self.series_vector_b, (0, 3)))
 
     @cached_property
     def variance(self) -> Array:
         """Variances in order of time (events,)."""
-        return self._ordered(self.standing_variance)
+        return self._ordered(_joined(self.series_sigma, (0,)) ** 2)
 
     @cached_property
     def noise(self) -> Array | None:
@@ -117,30 +136,12 @@ def schedule(
             )
     parts = [_scheduled(series, start, end) for series in vectors]
     bounds = np.cumsum([0, *(len(part.time) for part in parts)])
-    places = [slice(begin, beyond) for begin, beyond in itertools.pairwise(bounds)]
-    number = int(bounds[-1])
-    standing = ((number,), float), ((number, 3), float)
-    common = ((number,), float), ((number,), np.uint32), ((number,), np.uint8)
-    if len(parts) == 1:
-        time, value = np.ascontiguousarray(parts[0].time), np.ascontiguousarray(parts[0].value)
-        variance, row, sensor = side_by_side(*common)
-        row[:] = np.arange(number, dtype=np.uint32)
-        sensor[:] = 0
-    else:
-        time, value, variance, row, sensor = side_by_side(*standing, *common)
-        for part, mine in zip(parts, places, strict=True):
-            time[mine], value[mine] = part.time, part.value
-        compiled(filter_loop.merge_order)(time, bounds[:-1].copy(), bounds[1:], row, sensor)
-    for part, mine in zip(parts, places, strict=True):
-        np.square(part.sigma, out=variance[mine])
     first_frames = np.cumsum([0, *(len(part.frames) for part in parts[:-1])])
     return Schedule(
-        standing_time=time,
-        standing_vector_b=value,
-        standing_variance=variance,
+        series_time=tuple(np.require(part.time, float, ("C", "A")) for part in parts),
+        series_vector_b=tuple(np.require(part.value, float, ("C", "A")) for part in parts),
+        series_sigma=tuple(np.require(part.sigma, float, ("C", "A")) for part in parts),
         standing_noise=_joined([part.noise for part in parts], (0, 6)) if any(s.anisotropic for s in vectors) else None,
-        row=row,
-        sensor=sensor,
         bounds=bounds,
         codes=np.array([_KIND_CODES[series.kind] for series in vectors], np.uint8),
         frames=np.array(
@@ -153,7 +154,18 @@ def schedule(
     )
 
 
-def _joined(columns: list[Array], empty: tuple[int, ...]) -> Array:
+def places(columns: Sequence[Array]) -> tuple[Array, np.ndarray]:
+    """Return the first of several arrays, flat, and where each begins, counted from its first number.
+
+    A kernel reads them so by :func:`strapdown.kernels.lane_values.element`: one array stands for as many as there are sensors.
+    """
+    if not columns:
+        return np.empty(0), np.empty(0, np.int64)
+    addresses = np.array([column.ctypes.data for column in columns], np.int64)
+    return columns[0].reshape(-1), (addresses - addresses[0]) // columns[0].itemsize
+
+
+def _joined(columns: Sequence[Array], empty: tuple[int, ...]) -> Array:
     """Return the columns one after the other, contiguous; a single one is not copied."""
     if len(columns) == 1:
         return np.ascontiguousarray(columns[0])
@@ -260,7 +272,7 @@ def innovations_by_sensor(
         mine = slice(events.bounds[i], events.bounds[i + 1])
         filled = rows[mine, : 2 * KINDS[kind]]
         result[sensor] = Innovations(
-            time=events.standing_time[mine],
+            time=events.series_time[i],
             innovation=filled[:, 0::2],
             variance=filled[:, 1::2],
             weight=None if weight is None else weight[mine],
