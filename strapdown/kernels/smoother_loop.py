@@ -5,13 +5,11 @@ group at once, a segment a lane, and left as rows of matrices (``prepare_…``),
 machine vector, times a number spread over it. Two chains run in step, the covariances a group behind the errors, because each covariance
 wants the Jacobians at both errors of its segment, which are again taken for a group at once (:func:`fold_jacobians`); neither chain waits
 for the other, and one works while the other waits for itself. The group that comes next is prepared in four parts between their links.
-
-Passes that overlap, those of a fixed lag, share the prepared groups.
 """
 
 from __future__ import annotations
 
-from strapdown.kernels.algebra import dot, multiply, times_transpose_upper
+from strapdown.kernels.algebra import dot, multiply, scale, times_transpose_upper
 from strapdown.kernels.lane_values import (
     WIDTH,
     anywhere,
@@ -25,6 +23,8 @@ from strapdown.kernels.lane_values import (
 from strapdown.kernels.rotation import quaternion_multiply, right_jacobian, turned
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.kernels.smoother_step import (
+    SHORT,
+    arcsine_series,
     composed,
     gain,
     inverse_right_jacobian,
@@ -39,23 +39,24 @@ ROW = 32
 """Numbers of a stored segment: dt, increment (3), state (28)."""
 
 # Places in a prepared group. Of each segment first ``MATRICES`` numbers: the columns of G, six numbers each, without gaps (36 and 4 more),
-# and the upper triangle of D by rows (21 and 3 more). Read as a vector, a column of G ends in two lanes of the next, and row i of D begins
-# with i lanes of the row before: lanes of which no use is made. Then, a lane a segment, what the updates at its end did.
-MATRICES = 64
+# the upper triangle of D by rows (21 and 3 more), and what the updates at its end did (13 and 3 more). Read as a vector, a column of G ends
+# in two lanes of the next, and row i of D begins with i lanes of the row before: lanes of which no use is made. Then, a lane a segment,
+# whether anything was measured there, and the filtered state at its start.
+MATRICES = 80
 NOISE = 40
-TURN = MATRICES * WIDTH
-"""The quaternion from the predicted attitude to that of the next segment."""
-MOVED = TURN + 4 * WIDTH
-"""1 where anything was measured there, 0 where nothing was: then the turn is rounding, and (a, d) = (ε, β)."""
-BIAS_STEP = MOVED + WIDTH
-ATTITUDE = BIAS_STEP + 3 * WIDTH
+TURN = 64
+"""(−r3, r0, r1, r2, r3) of the quaternion r from the predicted attitude to that of the next segment, the three numbers that the bias is
+stepped by, and (r2, −r1, r0, r3, −r2): the columns of r0 I + [r1, r2, r3] are three of each five."""
+MOVED = MATRICES * WIDTH
+"""0 where nothing was measured: then the turn is rounding, and (a, d) = (ε, β). 1 where the turn is short, 2 where it is not."""
+ATTITUDE = MOVED + WIDTH
 BIAS = ATTITUDE + 4 * WIDTH
 GROUP = BIAS + 3 * WIDTH
 """Numbers of a prepared group."""
 
 # Places in the work space.
 COLUMNS = 0
-"""G and D of the group in preparation, a lane a segment."""
+"""G, D and turns of the group in preparation, a lane a segment."""
 SHARE = COLUMNS + MATRICES * WIDTH
 """Its N and Q̄."""
 STEP = SHARE + 52 * WIDTH
@@ -63,8 +64,11 @@ STEP = SHARE + 52 * WIDTH
 ERRORS = STEP + 4 * WIDTH
 """Smoothed errors (ε, β) of two groups in turn, a row of eight for each segment, and one for the state that the group ends in."""
 SEEN = ERRORS + 2 * (WIDTH + 1) * WIDTH
-"""(a, d) of a group's segments, a row of eight each."""
-JACOBIAN = SEEN + WIDTH * WIDTH
+"""Of a group's segments a, but for a factor that stands in ``FACTOR``, a row of eight each."""
+STEPPED = SEEN + WIDTH * WIDTH
+"""Three numbers and d, a row of eight."""
+FACTOR = STEPPED + WIDTH
+JACOBIAN = FACTOR + WIDTH
 FOLDED = JACOBIAN + 9 * WIDTH
 """The first three columns of each G J, as they lie in the group, and where they end."""
 FOLDED_ROW = 24
@@ -74,7 +78,10 @@ COVARIANCE_ROW = 48
 SMOOTHED = COVARIANCE + COVARIANCE_ROW * (WIDTH + 1)
 """A group's smoothed states in lanes: attitude, bias, A, B."""
 GROUPS = SMOOTHED + 22 * WIDTH
-"""From here on prepared groups, one after the other, the first again after the last."""
+"""From here on the group in preparation, that of the errors, and that of the covariances, in turn."""
+_ROOM = 3
+WORK_SIZE = GROUPS + GROUP * _ROOM + WIDTH
+"""Numbers of work space, with room to begin at a cache line."""
 
 FEWEST_ROWS = WIDTH + 1
 """Rows that the array of segments must have; any that follow the end state are not looked at."""
@@ -84,11 +91,6 @@ _LARGEST_SQUARE = LARGEST_ANGLE * LARGEST_ANGLE
 _NOT_NEGATIVE = 2**62 - 1
 _LANE = WIDTH - 1
 # An index and one of these: the same index, and the compiler sees that it is not negative, which it otherwise tests at each number read.
-
-
-def work_size(groups):
-    """Return the numbers of work space for so many prepared groups, with room to begin at a cache line."""
-    return GROUPS + GROUP * groups + WIDTH
 
 
 def locate_edges(edges, event_time, segments, number, starts_out):
@@ -157,7 +159,6 @@ def prepare_turns(segments, start, work, group):
     next_b0, next_b1, next_b2, _ = load_quadruples(segments, start + ROW + 8, ROW)
     store_triple(work, group + BIAS, (b0, b1, b2))
     step_b = (next_b0 - b0, next_b1 - b1, next_b2 - b2)
-    store_triple(work, group + BIAS_STEP, step_b)
     phi = (x - dt * b0, y - dt * b1, z - dt * b2)
     store(work, STEP, dt)
     store_triple(work, STEP + w, phi)
@@ -166,14 +167,23 @@ def prepare_turns(segments, start, work, group):
     store_triple(work, group + ATTITUDE + w, (q[1], q[2], q[3]))
     p = turned(q, phi)
     r = quaternion_multiply((p[0], -p[1], -p[2], -p[3]), load_quadruples(segments, start + ROW + 4, ROW))
-    store(work, group + TURN, r[0])
-    store_triple(work, group + TURN + w, (r[1], r[2], r[3]))
-    turn = r[1] * r[1] + r[2] * r[2] + r[3] * r[3]
-    step = dot(step_b, step_b)
-    seen = (
-        chosen(step > 0.0, spread(1.0), turn) > _NOTHING
-    )  # without an update the bias stays to the bit, the attitude to rounding
-    store(work, group + MOVED, chosen(seen, spread(1.0), spread(0.0)))
+    squared = r[1] * r[1] + r[2] * r[2] + r[3] * r[3]
+    # Without an update the bias stays to the bit, the attitude to rounding.
+    seen = chosen(dot(step_b, step_b) > 0.0, spread(1.0), squared) > _NOTHING
+    if anywhere(seen):
+        t = COLUMNS + TURN * w
+        store(work, t, -r[3])
+        store(work, t + w, r[0])
+        store_triple(work, t + 2 * w, (r[1], r[2], r[3]))
+        store_triple(work, t + 5 * w, step_b)
+        store_triple(work, t + 8 * w, (r[2], -r[1], r[0]))
+        store(work, t + 11 * w, r[3])
+        store(work, t + 12 * w, -r[2])
+        near = chosen(r[0] > 0.0, squared, spread(1.0)) < 0.25 * SHORT
+        how = chosen(near, spread(1.0), spread(2.0))
+        store(work, group + MOVED, chosen(seen, how, spread(0.0)))
+    else:
+        store(work, group + MOVED, spread(0.0))
 
 
 def prepare_shares(segments, start, work, angle_variance, rate_variance):
@@ -237,7 +247,9 @@ def prepare_gains(work):
 
 def prepare_rows(work, group):
     """Write the matrices of :func:`prepare_gains` a row a segment, eight numbers of four segments at a time."""
-    for k in range(MATRICES // WIDTH):
+    group &= _NOT_NEGATIVE
+    blocks = MATRICES // WIDTH if anywhere(load(work, group + MOVED) > 0.5) else TURN // WIDTH
+    for k in range(blocks):
         for i in range(0, WIDTH, 4):
             one, two, three, four = load_quadruples(work, COLUMNS + WIDTH * WIDTH * k + i, WIDTH)
             s = group + MATRICES * i + WIDTH * k
@@ -268,28 +280,48 @@ def load_columns(work, first, last):
 
 
 def carry_error(work, group, errors, i):
-    """Take the smoothed error from the end of segment i of a group to its start: (ε, β) ← G (a, d)."""
+    """Take the smoothed error from the end of segment i of a group to its start: (ε, β) ← G (a, d).
+
+    The chain of all smoothed states hangs on it. For small angles, which are the rule, a = f v with v = sin(|a|/2) a/|a|, and f follows
+    from the cosine, while v is already multiplied by G.
+    """
     w = WIDTH
     i &= _LANE
     group &= _NOT_NEGATIVE
     errors &= _NOT_NEGATIVE
-    columns = load_columns(work, group + MATRICES * i, group + MATRICES * i + 18)
+    c0, c1, c2, c3, c4, c5 = load_columns(work, group + MATRICES * i, group + MATRICES * i + 18)
     e = errors + w * i + w
-    r = group + TURN + i
-    if work[group + MOVED + i] != 0.0:
-        a = composed(
-            (work[r], work[r + w], work[r + 2 * w], work[r + 3 * w]),
-            (work[e], work[e + 1], work[e + 2]),
-        )
-        b = group + BIAS_STEP + i
+    moved_there = work[group + MOVED + i]
+    if moved_there != 0.0:
+        t = group + MATRICES * i + TURN
         s = SEEN + w * i
-        work[s], work[s + 1], work[s + 2] = a
-        work[s + 3] = work[b] + work[e + 3]
-        work[s + 4] = work[b + w] + work[e + 4]
-        work[s + 5] = work[b + 2 * w] + work[e + 5]
-        store(work, e - w, times_columns(work, (s, s + 1, s + 2, s + 3, s + 4, s + 5), columns))
+        d = STEPPED
+        x = work[e] * work[e] + work[e + 1] * work[e + 1] + work[e + 2] * work[e + 2]
+        turn = load(work, t + 2)
+        store(work, d, turn + load(work, e))
+        if moved_there < 1.5 and x < SHORT:
+            # The product r ⊗ exp(ε), with its series to the fourth term. z, the squared sine, needs no more digits than 1 − w² has.
+            c = 1.0 + x * (x * (1.0 / 384.0) - 0.125)
+            h = 0.5 + x * (x * (1.0 / 3840.0) - 1.0 / 48.0)
+            u = work[e] * load(work, t + 10) + work[e + 1] * load(work, t) + work[e + 2] * load(work, t + 8)
+            store(work, s, c * turn + h * u)
+            cosine = c * work[t + 1] - h * (
+                work[t + 2] * work[e] + work[t + 3] * work[e + 1] + work[t + 4] * work[e + 2]
+            )
+            factor = arcsine_series(1.0 - cosine * cosine)
+        else:
+            a = composed(
+                (work[t + 1], work[t + 2], work[t + 3], work[t + 4]),
+                (work[e], work[e + 1], work[e + 2]),
+            )
+            work[s], work[s + 1], work[s + 2] = a
+            factor = 1.0
+        work[FACTOR + i] = factor
+        seen = work[s] * c0 + work[s + 1] * c1 + work[s + 2] * c2
+        stepped = work[d + 3] * c3 + work[d + 4] * c4 + work[d + 5] * c5
+        store(work, e - w, factor * seen + stepped)
     else:
-        store(work, e - w, times_columns(work, (e, e + 1, e + 2, e + 3, e + 4, e + 5), columns))
+        store(work, e - w, times_columns(work, (e, e + 1, e + 2, e + 3, e + 4, e + 5), (c0, c1, c2, c3, c4, c5)))
 
 
 def fold_jacobians(work, group, errors):
@@ -300,15 +332,19 @@ def fold_jacobians(work, group, errors):
     if anywhere(seen):
         e0, e1, e2, _ = load_quadruples(work, errors + w, w)
         a0, a1, a2, _ = load_quadruples(work, SEEN, w)
+        a0, a1, a2 = scale(load(work, FACTOR), (a0, a1, a2))
         e = (e0, e1, e2)
         a = (chosen(seen, a0, e0), chosen(seen, a1, e1), chosen(seen, a2, e2))
         if anywhere(dot(e, e) > _LARGEST_SQUARE) or anywhere(dot(a, a) > _LARGEST_SQUARE):
             for i in range(WIDTH):
                 s = errors + w + w * i
-                _, J = moved((1.0, 0.0, 0.0, 0.0), (work[s], work[s + 1], work[s + 2]))
+                e = (work[s], work[s + 1], work[s + 2])
+                _, J = moved((1.0, 0.0, 0.0, 0.0), e)
+                a = e
                 if work[group + MOVED + i] != 0.0:
                     s = SEEN + w * i
-                J = multiply(inverse_right_jacobian((work[s], work[s + 1], work[s + 2])), J)
+                    a = scale(work[FACTOR + i], (work[s], work[s + 1], work[s + 2]))
+                J = multiply(inverse_right_jacobian(a), J)
                 for c in range(9):
                     work[JACOBIAN + w * c + i] = J[c]
         else:
@@ -334,7 +370,7 @@ def fold_jacobians(work, group, errors):
 
 def row_times(work, f, g, z, start):
     """Return ``start`` plus the sum of six rows z, times the numbers of one row of the gain, three from column to column at f and at g."""
-    return (work[f] * z[0] + (work[f + 6] * z[1] + (work[f + 12] * z[2] + start))) + (
+    return (start + work[f] * z[0] + work[f + 6] * z[1] + work[f + 12] * z[2]) + (
         work[g] * z[3] + work[g + 6] * z[4] + work[g + 12] * z[5]
     )
 
@@ -416,6 +452,7 @@ def move_states(work, group, errors, whole):
 def write_smoothed(work, i, k, attitude_out, bias_out, variance_out, covariance_out):
     """Write the smoothed state of segment i of a group to row k of the outputs."""
     i &= _LANE
+    k &= _NOT_NEGATIVE
     w = WIDTH
     s = SMOOTHED + i
     attitude_out[k, 0], attitude_out[k, 1] = work[s], work[s + w]
@@ -460,7 +497,6 @@ def smooth_back(
     segments,
     starts,
     first,
-    last,
     angle_variance,
     rate_variance,
     work,
@@ -469,11 +505,10 @@ def smooth_back(
     variance_out,
     covariance_out,
 ):
-    """Run backward passes: pass p goes from the filtered state at edge ``last[p]`` to edge ``first[p]``; neither falls from pass to pass.
+    """Go back from the filtered state at the last edge to edge ``first``, and write all between.
 
-    It writes the edges from its first to the next pass's first, the last pass all from its first on. ``segments`` holds the filter's rows
-    (dt, increment, state at its start), flat, the last one the end state, ``FEWEST_ROWS`` at least; ``starts[k]`` is the row that starts
-    at edge k. ``work`` has room for three prepared groups or more (:func:`work_size`); each is prepared once if all that a pass meets fit.
+    ``segments`` holds the filter's rows (dt, increment, state at its start), flat, the last one the end state, ``FEWEST_ROWS`` at least;
+    ``starts[k]`` is the row that starts at edge k. ``work`` has room for ``WORK_SIZE``.
     """
     w = WIDTH
     # From a cache line on, which vectors then do not cross. Not in a function, which may return no part of an array.
@@ -481,77 +516,60 @@ def smooth_back(
     lanes_of((0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
     for i in range(GROUPS):
         work[i] = 0.0
-    room = (len(work) - GROUPS) // GROUP
+    k = len(starts) - 1
+    j = starts[k]
+    write_filtered(segments, ROW * j + 4, k, attitude_out, bias_out, variance_out, covariance_out)
+    k -= 1
+    if k < first:
+        return
     # Group t ends t groups before this row; the last begins with row 0, however many it shares with the one before.
     end = len(segments) // ROW - 1
-    fresh, stale = 0, 0  # groups fresh … stale − 1 are prepared
-    for p in range(len(first)):
-        j = starts[last[p]]
-        k = first[p + 1] - 1 if p + 1 < len(first) else last[p]
-        if k == last[p]:
-            write_filtered(segments, ROW * j + 4, k, attitude_out, bias_out, variance_out, covariance_out)
-            k -= 1
-        if k < first[p]:
-            continue
-        top = (end - j) // w
-        bottom = (end - 1 - starts[first[p]]) // w
-        if top > stale or bottom + 1 - top > room:
-            fresh, stale = top, top
-        missing = max(fresh - top, 0)
-        count, group, place = 0, GROUPS, GROUPS
-        # Each turn prepares one group at most: the first turns what came newly into reach, the later ones what the errors will meet next.
-        for n in range(top - missing, bottom + 3):
-            group_before, group = group, place
-            ready = n if n >= top else fresh - 1
-            place = GROUPS + GROUP * (ready % room)
-            if n < top:
-                fresh -= 1
-                stale = min(stale, fresh + room)
-            elif stale <= n <= bottom:
-                stale = n + 1
-                fresh = max(fresh, stale - room)
+    top = (end - j) // w
+    bottom = (end - 1 - starts[first]) // w
+    count, group, place = 0, GROUPS, GROUPS
+    # Each turn prepares a group, takes the errors over the one before, and the covariances over the one before that.
+    for n in range(top, bottom + 3):
+        group_before, group = group, place
+        place = GROUPS + GROUP * (n % _ROOM)
+        start = ROW * max(end - w * (n + 1), 0)
+        t = n - 1
+        count_before = count
+        count = min(j, end - w * t) - max(end - w * (t + 1), 0) if top <= t <= bottom else 0
+        errors = ERRORS + (w + 1) * w * (t & 1)
+        errors_before = ERRORS + (w + 1) * w * (1 - (t & 1))
+        if t == top:
+            for i in range(w + 1):
+                store(work, errors + w * i, spread(0.0))
+        elif t > top:
+            store(work, errors + w * count, load(work, errors_before))
+            p_end = COVARIANCE + COVARIANCE_ROW * count_before
+            if t == top + 1:
+                start_covariance(work, p_end, segments, ROW * j + 11)
             else:
-                ready = -1
-            start = ROW * max(end - w * (ready + 1), 0)
-            # The errors of group t, the covariances of the one before.
-            t = n - 1
-            count_before = count
-            count = min(j, end - w * t) - max(end - w * (t + 1), 0) if top <= t <= bottom else 0
-            errors = ERRORS + (w + 1) * w * (t & 1)
-            errors_before = ERRORS + (w + 1) * w * (1 - (t & 1))
-            if t == top:
-                for i in range(w + 1):
-                    store(work, errors + w * i, spread(0.0))
-            elif t > top:
-                store(work, errors + w * count, load(work, errors_before))
-                p_end = COVARIANCE + COVARIANCE_ROW * count_before
-                if t == top + 1:
-                    start_covariance(work, p_end, segments, ROW * j + 11)
+                for i in range(6):
+                    store(work, p_end + w * i, load(work, COVARIANCE + w * i))
+        for part in range(4):
+            if n <= bottom:
+                if part == 0:
+                    prepare_turns(segments, start, work, place)
+                elif part == 1:
+                    prepare_shares(segments, start, work, angle_variance, rate_variance)
+                elif part == 2:
+                    prepare_gains(work)
                 else:
-                    for i in range(6):
-                        store(work, p_end + w * i, load(work, COVARIANCE + w * i))
-            for part in range(4):
-                if ready >= 0:
-                    if part == 0:
-                        prepare_turns(segments, start, work, place)
-                    elif part == 1:
-                        prepare_shares(segments, start, work, angle_variance, rate_variance)
-                    elif part == 2:
-                        prepare_gains(work)
-                    else:
-                        prepare_rows(work, place)
-                for m in range(2):
-                    i = w - 1 - 2 * part - m
-                    if i < count:
-                        carry_error(work, group, errors, i)
-                    if i < count_before:
-                        carry_covariance(work, group_before, i)
-            if t > top:
-                begin = max(end - w * t, 0)
-                if starts[k] >= begin:
-                    move_states(work, group_before, errors_before, len(covariance_out) > 0)
-                    while k >= first[p] and starts[k] >= begin:
-                        write_smoothed(work, starts[k] - begin, k, attitude_out, bias_out, variance_out, covariance_out)
-                        k -= 1
-            if top <= t <= bottom:
-                fold_jacobians(work, group, errors)
+                    prepare_rows(work, place)
+            for m in range(2):
+                i = w - 1 - 2 * part - m
+                if i < count:
+                    carry_error(work, group, errors, i)
+                if i < count_before:
+                    carry_covariance(work, group_before, i)
+        if t > top:
+            begin = max(end - w * t, 0)
+            if starts[k] >= begin:
+                move_states(work, group_before, errors_before, len(covariance_out) > 0)
+                while k >= first and starts[k] >= begin:
+                    write_smoothed(work, starts[k] - begin, k, attitude_out, bias_out, variance_out, covariance_out)
+                    k -= 1
+        if top <= t <= bottom:
+            fold_jacobians(work, group, errors)

@@ -44,7 +44,7 @@ _A0, _A1, _A2, _A3, _A4, _A5, _A6, _A7, _A8, _A9, _A10, _A11 = _A
 # |B_2k| / (2k)! for k = 1 … 6, with the Bernoulli numbers 1/6, 1/30, 1/42, 1/30, 5/66, 691/2730.
 _I0, _I1, _I2 = 1.0 / 12.0, 1.0 / 720.0, 1.0 / 30240.0
 _I3, _I4, _I5 = 1.0 / 1209600.0, 1.0 / 47900160.0, 691.0 / 1307674368000.0
-_SHORT = 1e-4
+SHORT = 1e-4
 """rad²: where two angles are not larger than its root, four terms of the series of their composition are good to rounding."""
 _SINE_SQUARED = math.sin(0.5 * LARGEST_ANGLE) ** 2
 
@@ -53,6 +53,11 @@ def arcsine(x):
     """Return asin s / s at s = √x, x ≤ sin²(``LARGEST_ANGLE``/2)."""
     xxx = x * x * x
     return polynomial(x, _A0, _A1, _A2, _A3, _A4, _A5) + xxx * xxx * polynomial(x, _A6, _A7, _A8, _A9, _A10, _A11)
+
+
+def arcsine_series(x):
+    """Return 2 asin s / s at s = √x to the fourth term: good to rounding for x ≤ ``SHORT``."""
+    return (2.0 + 2.0 * _A1 * x) + (x * x) * (2.0 * _A2 + 2.0 * _A3 * x)
 
 
 def logarithm(q):
@@ -93,23 +98,13 @@ def moved(q, phi):
 
 
 def composed(r, phi):
-    """Return the rotation vector of r ⊗ exp(φ), r a unit quaternion, any angles. The chain of all smoothed states hangs on it.
-
-    The product is summed so that the series of φ come in last, and for small angles, which are the rule, with the terms that count.
-    """
+    """Return the rotation vector of r ⊗ exp(φ), r a unit quaternion, any angles."""
     u = (
         r[0] * phi[0] + (r[2] * phi[2] - r[3] * phi[1]),
         r[0] * phi[1] + (r[3] * phi[0] - r[1] * phi[2]),
         r[0] * phi[2] + (r[1] * phi[1] - r[2] * phi[0]),
     )
     x = dot(phi, phi)
-    if x < _SHORT and r[1] * r[1] + r[2] * r[2] + r[3] * r[3] < 0.25 * _SHORT and r[0] > 0.0:
-        y = 0.25 * x
-        c = 1.0 + y * (y * (1.0 / 24.0) - 0.5)
-        h = 0.5 + y * (y * (1.0 / 240.0) - 1.0 / 12.0)
-        v = (c * r[1] + h * u[0], c * r[2] + h * u[1], c * r[3] + h * u[2])
-        z = dot(v, v)
-        return scale((2.0 + 2.0 * _A1 * z) + (z * z) * (2.0 * _A2 + 2.0 * _A3 * z), v)
     if x <= LARGEST_ANGLE * LARGEST_ANGLE:
         c = cosine(0.25 * x)
         h = 0.5 * sinc(0.25 * x)
