@@ -66,6 +66,7 @@ def integrate(
     chosen = coning.named(algorithm)
     units = {name: unit for name, unit in (("gyro", gyro_unit), ("time", time_unit)) if unit}
     gaps: list[tuple[float, float]] = []
+    words = ""
     with progress_bar("reading, integrating, writing", 3) as advance:
         if recordfiles.is_record(recording):
             for name in units:
@@ -75,7 +76,7 @@ def integrate(
             truth = None if record.truth is None else record.truth.attitude
         else:
             source = recordings.read(recording, units=units)
-            gaps = recordings.gaps(source.time)
+            gaps, words = recordings.gaps(source.time), source.left_out_words
             time, increments, truth = source.time, recordings.increments(source), source.true_attitude
         advance(1)
         if len(increments) < chosen.samples:
@@ -86,7 +87,7 @@ def integrate(
         start = quaternion.IDENTITY
         if truth is not None and np.isfinite(truth[0]).all():
             start = truth[0]
-        attitude = coning.integrate(increments, chosen, start)
+        attitude = coning.integrate(increments, chosen, start, edges=time)
         time = time[: len(attitude) * chosen.samples : chosen.samples]
         advance(1)
         records.write_attitude(out, time, attitude, {"source": recording.name, "algorithm": chosen.name})
@@ -105,6 +106,8 @@ def integrate(
         console.print(f"Error against the file's attitude: at the end {error[-1]:.4g}°, at most {error.max():.4g}°.")
     for begin, length in gaps:
         console.print(f"Gap of {length:.3g} s after {begin:.3f} s: the turn across it is a guess.")
+    if words:
+        console.print(words, soft_wrap=True)
     written(out)
 
 

@@ -8,13 +8,14 @@ import time
 from fractions import Fraction
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from strapdown import checks, quaternion
 from strapdown.checks import Array, InputError
 from strapdown.coning import coefficients as exact
 from strapdown.coning.algorithms import Algorithm, named
 from strapdown.kernels import integration_polynomial as kernels
+from strapdown.kernels import integration_uneven
 from strapdown.kernels.integration import (
     WORK,
     accumulate_quaternions,
@@ -29,6 +30,14 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0)
 _UNTURNED = np.array(IDENTITY)
 _VECTOR_SOLVERS = ("compressed", "pairs")
 
+EVEN = 1e-3
+"""Largest departure of an interval from the mean of its window, relative, with which the intervals still count as equal: stamps in
+microseconds leave as much at a kilohertz."""
+GAP = 4.0
+"""No polynomial is laid across an interval that is so many times as long, or as short, as the one it is for."""
+LOPSIDED = 4
+"""On one side of an interval its polynomial goes through at most so many increments more than on the other, where they are uneven."""
+
 
 def integrate(
     increments: ArrayLike,
@@ -36,6 +45,7 @@ def integrate(
     initial_attitude: ArrayLike = IDENTITY,
     *,
     frame: str = "body",
+    edges: ArrayLike | None = None,
 ) -> Array:
     """Return attitude q_fb at the step edges, (n // N + 1, 4), the first row being the initial attitude.
 
@@ -48,6 +58,8 @@ def integrate(
     initial_attitude : array_like, (4,)
     frame : {"body", "fixed"}
         Of the increments: body rates, equation (17), or rates in the fixed frame, equation (3).
+    edges : array_like, (n + 1,), optional
+        Times of the edges of the sample intervals, as :func:`rotation_vectors` takes them; without them the intervals are taken for equal.
     """
     table = named(algorithm)
     checks.one_of("frame", frame, ("body", "fixed"))
@@ -64,10 +76,17 @@ def integrate(
         initial = quaternion.conjugate(initial)
     attitude = _empty_rows(len(samples) // table.samples + 1)
     work = np.empty(WORK)
+    uneven, corrected = _uneven(samples, edges, table)
     if table.solver in _VECTOR_SOLVERS:
-        compiled(accumulate_vectors)(_vectors(samples, table).reshape(-1), initial, work, attitude.reshape(-1))
+        vectors = _vectors(samples, table)
+        if len(uneven):
+            vectors[uneven] = quaternion.log(corrected)
+        compiled(accumulate_vectors)(vectors.reshape(-1), initial, work, attitude.reshape(-1))
     else:
-        compiled(accumulate_quaternions)(_steps(samples, table).reshape(-1), initial, work, attitude.reshape(-1))
+        steps = _steps(samples, table)
+        if len(uneven):
+            steps[uneven] = corrected
+        compiled(accumulate_quaternions)(steps.reshape(-1), initial, work, attitude.reshape(-1))
     if not math.isfinite(attitude[-1, 0]):
         # What is not finite makes all attitudes after it NaN, so that plain arrays need no search before.
         _increments(increments)
@@ -121,17 +140,29 @@ def increments_from_rates(rates: ArrayLike, sample_interval: float, points: int 
     return np.asarray(increments * interval)
 
 
-def rotation_vectors(increments: ArrayLike, algorithm: str | Algorithm = "one-sample") -> Array:
+def rotation_vectors(
+    increments: ArrayLike, algorithm: str | Algorithm = "one-sample", *, edges: ArrayLike | None = None
+) -> Array:
     """Return the body rotation vector of each step, (n // N, 3) rad, from gyro increments (n, 3) rad; a rest of n % N is left out.
+
+    The coefficients of every algorithm are made for intervals of equal length. With ``edges`` (n + 1,), the times of their edges, a step
+    in whose window the intervals are not equal is taken by the polynomial solver instead: the quaternion equation on the rate polynomial
+    through the increments of the window, of whatever lengths its intervals are. An interval that is a gap among its neighbours is a turn at
+    constant rate. Stamps are taken at their word: where they are coarser than the sampling was (milliseconds at 300 Hz), give none.
 
     The solvers that work on quaternions give the logarithm of their step, of length at most π.
     """
     table = named(algorithm)
     samples = _increments(increments)
+    uneven, corrected = _uneven(samples, edges, table)
     if table.solver in _VECTOR_SOLVERS:
         vectors = _vectors(samples, table)
-        return vectors.copy() if vectors is samples else vectors
-    return quaternion.log(_steps(samples, table))
+        vectors = vectors.copy() if vectors is samples else vectors
+    else:
+        vectors = quaternion.log(_steps(samples, table))
+    if len(uneven):
+        vectors[uneven] = quaternion.log(corrected)
+    return vectors
 
 
 def time_per_sample(algorithm: str | Algorithm, samples: int = 20_160, repeats: int = 5) -> float:
@@ -204,6 +235,48 @@ def _steps(increments: Array, table: Algorithm) -> Array:
     weights, scheme = _scheme(table.solver, table.samples)
     compiled(kernels.scheme_steps)(increments, weights, scheme, steps)
     return steps
+
+
+def _uneven(increments: Array, edges: ArrayLike | None, table: Algorithm) -> tuple[NDArray[np.intp], Array]:
+    """Return the steps that have intervals of unequal length in their window, and their rotations as quaternions."""
+    none = np.empty(0, np.intp), np.empty((0, 4))
+    if edges is None:
+        return none
+    stamps = np.ascontiguousarray(checks.increasing("edges", edges, least=2))
+    if len(stamps) != len(increments) + 1:
+        raise InputError(
+            f"edges holds {len(stamps)} times and increments {len(increments)} rows; give the {len(increments) + 1} edges of the intervals"
+        )
+    window = min(table.window, len(increments))
+    lengths = np.diff(stamps)
+    if window == 1 or lengths.max() - lengths.min() <= EVEN * lengths.min():
+        return none
+    previous = table.previous if window == table.window else len(increments)
+    begin = np.arange(len(increments) // table.samples) * table.samples
+    start = np.clip(begin - previous, 0, len(increments) - window)
+    mean = (stamps[start + window] - stamps[start]) / window
+    apart = np.zeros(len(start))
+    for j in range(window):
+        apart = np.maximum(apart, np.abs(lengths[start + j] - mean))
+    chosen = np.flatnonzero(apart > EVEN * mean)
+    if len(chosen) == 0:
+        return none
+    steps = np.empty((len(chosen), 4))
+    compiled(integration_uneven.uneven_steps)(
+        increments,
+        stamps,
+        chosen,
+        table.samples,
+        previous,
+        window,
+        GAP,
+        LOPSIDED,
+        np.empty((integration_uneven.ROWS, window + 1)),
+        np.empty((4, window)),
+        np.empty((kernels.TERMS_PER_SAMPLE * window + kernels.EXTRA_TERMS, 4)),
+        steps,
+    )
+    return chosen, steps
 
 
 def _compressed_array(table: Algorithm, previous: int) -> Array:

@@ -31,8 +31,9 @@ def commutation_drift(record: ImuRecord, algorithm: coning.Algorithm) -> tuple[A
     if blocks < 2:
         raise InputError(f"record has {len(record.increments)} gyro samples, too few for {algorithm.name}")
     increments = record.increments[: blocks * n]
-    own = quaternion.exp(coning.rotation_vectors(increments, algorithm))
-    best = quaternion.exp(coning.rotation_vectors(increments, BETTER)).reshape(blocks, n, 4)
+    edges = record.time[: blocks * n + 1]
+    own = quaternion.exp(coning.rotation_vectors(increments, algorithm, edges=edges))
+    best = quaternion.exp(coning.rotation_vectors(increments, BETTER, edges=edges)).reshape(blocks, n, 4)
     turn = best[:, 0]
     for k in range(1, n):
         turn = quaternion.multiply(turn, best[:, k])

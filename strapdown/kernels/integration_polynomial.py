@@ -54,6 +54,11 @@ def fitted_rates(increments, first, fit, rates):
             rates[0, m] += fit[j, m] * x
             rates[1, m] += fit[j, m] * y
             rates[2, m] += fit[j, m] * z
+    return sized(rates, window)
+
+
+def sized(rates, window):
+    """Write the sums of the bounds of each power and all higher ones; return (bound of the rate over |s| ≤ ½, powers kept)."""
     bound = 0.0
     kept = 1
     power = 0.5 ** (window - 1)
