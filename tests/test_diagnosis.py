@@ -195,6 +195,34 @@ def test_a_right_filter_is_given_no_cause():
     assert [named(diagnosed(whole, seed)) for seed in range(12)] == [None] * 12
 
 
+SLOW_TURN = replace(
+    scenario(),
+    motion=motion.ConstantRate(rate=np.radians([0.02, -0.05, 0.1])),
+    gyro=GyroSpec(angle_random_walk=4e-5, rate_random_walk=8e-7),
+    sensors=tuple(
+        vectors.VectorSensor(name=name, reference_f=np.array(reference), sigma=2e-3, rate=1.0)
+        for name, reference in (("sun", [1.0, 0.0, 0.0]), ("star", [0.0, 0.6, 0.8]))
+    ),
+    rate=4.0,
+    duration=8000.0,
+)
+"""Two hours in orbit: the gyro's noise is a good part of its rate."""
+ORBITAL = setup.FilterSetup(
+    process_noise=mekf.ProcessNoise(angle_random_walk=4e-5, rate_random_walk=8e-7), attitude_sigma=0.01, bias_sigma=1e-3
+)
+
+
+def test_the_noise_of_a_gyro_is_not_taken_for_a_scale_factor():
+    """To scale the increments is to scale their noise too, and a filter with less noise has smaller innovations."""
+    for seed in range(2):
+        record = scenarios.simulate(SLOW_TURN, seed=seed)
+        found = diagnosis.diagnose(record, ORBITAL, start(record, ORBITAL, seed, 1e-3))
+        assert named(found) is None
+        (scale,) = (cause for cause in found.considered if cause.name == "scale factor")
+        assert np.all(np.abs(scale.estimate) < 3.0 * scale.standard_error)
+        assert scale.gain < 6.0
+
+
 @pytest.mark.slow
 def test_a_right_filter_is_given_no_cause_in_95_of_100():
     whole = Case("", "")

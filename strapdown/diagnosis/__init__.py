@@ -17,6 +17,8 @@ themselves, by a better integration algorithm, and held against the filter's own
     What it returns.
 ``hypotheses``, ``commutation``
     What may be wrong.
+``turning``
+    What a scale factor of the gyro multiplies.
 ``likelihood``
     How well a hypothesis explains the record.
 """

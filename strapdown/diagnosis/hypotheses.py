@@ -13,6 +13,7 @@ from strapdown import mekf, quaternion
 from strapdown.checks import Array
 from strapdown.diagnosis.causes import Cause
 from strapdown.diagnosis.likelihood import Hypothesis, Model, Run, log_p, run
+from strapdown.diagnosis.turning import PLAUSIBLE, turns
 from strapdown.doctor import ATTITUDE_READINGS, AXES, axes_words
 from strapdown.vectors import VectorMeasurements
 
@@ -35,13 +36,18 @@ def mean_hypotheses(model: Model) -> Iterator[Hypothesis]:
             yield _misalignment(series)
     if len(seen) > 1:
         yield _time_offset("gyro", tuple(series.sensor for series in seen), interval)
+    turned = turns(record, model.noise, model.initial)
     yield Hypothesis(
         name="scale factor",
         of="gyro",
         unit="1",
         steps=np.full(3, 1e-5),
         limit=0.2,
-        apply=lambda m, theta: replace(m, record=replace(m.record, increments=m.record.increments / (1.0 + theta))),
+        plausible=PLAUSIBLE,
+        # Not the increments over 1 + θ: that would take off their noise and their bias too.
+        apply=lambda m, theta: replace(
+            m, record=replace(m.record, increments=m.record.increments - turned * (theta / (1.0 + theta)))
+        ),
         words=lambda theta, _: f"the gyro's scale factor is off by {shown(theta, 1e6)} ppm",
     )
     for part, unit, rows in (("attitude", "rad", slice(0, 3)), ("bias", "rad/s", slice(3, 6))):

@@ -77,6 +77,8 @@ class Hypothesis:
     """Largest |θ| that is sensible."""
     apply: Callable[[Model, Array], Model] = field(repr=False)
     words: Callable[[Array, Array], str] = field(repr=False)
+    plausible: float | None = None
+    """Standard deviation of θ before the data are seen; None: a third of the limit."""
 
 
 def log_p(gain: float, degrees: int) -> float:
@@ -94,7 +96,7 @@ def log_p(gain: float, degrees: int) -> float:
 def by_mean(model: Model, base: Run, hypothesis: Hypothesis) -> Cause:
     """Return the best θ by Gauss–Newton on the whitened innovations."""
     k = len(hypothesis.steps)
-    prior = (3.0 / hypothesis.limit) ** 2  # keeps where it is what hardly shows
+    prior = (hypothesis.plausible or hypothesis.limit / 3.0) ** -2  # keeps where it is what hardly shows
     theta, current, gain = np.zeros(k), base, 0.0
     spread = np.full(k, np.nan)
     for iteration in range(4):

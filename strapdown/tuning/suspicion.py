@@ -6,8 +6,8 @@ they are, but what explains them better. The scale factor θ of each axis is tri
 which is Rao's score test (1948): at the tuned walk, and at smaller ones beside it, as a filter would have that knows the scale factor.
 Its gain is twice the log-likelihood over the tuned filter's, χ² of three degrees of freedom where θ is zero.
 
-The rate that θ multiplies is the gyro's own less the bias, over ``WINDOW`` measurements: its noise must not explain itself. A prior of
-``PLAUSIBLE`` keeps out what rates too small to tell would say.
+The rate that θ multiplies is the gyro's own less its bias and its noise (:func:`strapdown.diagnosis.turning.turns`), which must not
+explain itself. A prior of ``PLAUSIBLE`` keeps out what rates too small to tell would say.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from strapdown.consistency.bounds import tail
 from strapdown.consistency.judgement import concluded
 from strapdown.diagnosis import Cause
 from strapdown.diagnosis.likelihood import Model, log_p, run
+from strapdown.diagnosis.turning import PLAUSIBLE, turns
 from strapdown.mekf import ProcessNoise
 from strapdown.records import Estimate, ImuRecord, cut
 from strapdown.setup import FilterSetup
@@ -35,10 +36,6 @@ from strapdown.tuning.parameters import RRW
 
 LEVELS = (1.0, 0.2, 0.04)
 """Multiples of the tuned walk of the bias beside which a scale factor is tried."""
-PLAUSIBLE = 0.01
-"""Standard deviation of a scale factor before the data are seen."""
-WINDOW = 4
-"""Measurements that the rate is averaged over."""
 STEP = 1e-4
 """Of a scale factor, for differences."""
 MOST_TOLD = 2
@@ -224,20 +221,6 @@ def scale_factor(record: ImuRecord, noise: ProcessNoise, initial: mekf.State) ->
         gain=gain,
         p_value=min(1.0, len(levels) * math.exp(log_p(gain, 3))),
     )
-
-
-def turns(record: ImuRecord, noise: ProcessNoise, initial: mekf.State) -> Array:
-    """Return by how much the body turned in each gyro interval (n, 3), rad, averaged over ``WINDOW`` measurements and freed of the bias."""
-    estimate = mekf.run(record, noise, initial)
-    dt = np.diff(record.time)[:, None]
-    free = record.increments / dt - 0.5 * (estimate.bias[1:] + estimate.bias[:-1])
-    stamps = np.unique(np.concatenate([series.time for series in record.vectors]))
-    interval = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 0.0
-    half = max(2, round(0.5 * WINDOW * interval / float(np.median(dt))))
-    total = np.concatenate([np.zeros((1, 3)), np.cumsum(free, axis=0)])
-    index = np.arange(len(free))
-    low, high = np.maximum(index - half, 0), np.minimum(index + half + 1, len(free))
-    return np.asarray((total[high] - total[low]) / (high - low)[:, None] * dt)
 
 
 def doubted(tuning: Tuning, found: Unmodelled) -> Tuning:
