@@ -3,35 +3,16 @@
 from __future__ import annotations
 
 import json
-import sys
 import tomllib
 
 import numpy as np
 import pytest
 
-from strapdown import allan, cli, datasheets, gyro, units
+from strapdown import allan, datasheets, gyro, units
 from strapdown.randomness import generator
 
 NOISE = units.DEGREE_PER_ROOT_HOUR
 AT_100_HZ = ("--rate", 100, "--gyro-unit", "rad/s")
-
-
-@pytest.fixture
-def run(monkeypatch, capsys, tmp_path):
-    """Run ``strapdown ARGUMENTS`` in an empty folder; return exit status, standard output and standard error."""
-    monkeypatch.chdir(tmp_path)
-
-    def command(*arguments):
-        monkeypatch.setattr(sys, "argv", ["strapdown", *map(str, arguments)])
-        try:
-            cli.main()
-            status = 0
-        except SystemExit as end:
-            status = end.code or 0
-        said = capsys.readouterr()
-        return status, said.out, said.err
-
-    return command
 
 
 def white(samples=20_000, axes=3, seed=1):

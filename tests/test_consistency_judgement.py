@@ -2,13 +2,12 @@
 
 import json
 import math
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from strapdown import cli, consistency, montecarlo, motion, records, scenarios, setup, vectors
+from strapdown import consistency, montecarlo, motion, records, scenarios, setup, vectors
 from strapdown.checks import InputError
 from strapdown.consistency.judgement import Finding, holm, resolution
 from strapdown.gyro import GyroSpec
@@ -220,23 +219,6 @@ def test_runs_that_failed_are_not_consistent(plan):
 
 
 # ---------------------------------------------------------------------------------------------------------------- the command
-
-
-@pytest.fixture
-def run(monkeypatch, capsys, tmp_path):
-    monkeypatch.chdir(tmp_path)
-
-    def command(*arguments):
-        monkeypatch.setattr(sys, "argv", ["strapdown", *map(str, arguments)])
-        try:
-            cli.main()
-            status = 0
-        except SystemExit as end:
-            status = end.code or 0
-        said = capsys.readouterr()
-        return status, said.out, said.err
-
-    return command
 
 
 @pytest.mark.parametrize(

@@ -8,42 +8,19 @@ import mpmath
 import numpy as np
 import pytest
 from scipy.optimize import brentq
+from two_stars import ARW, BELIEVED, FREE, RRW, case, scenario
 
 from strapdown import consistency, gyro, motion, quaternion, scenarios, setup, tuning, units, vectors
 from strapdown.checks import InputError
+from strapdown.kernels import tuning_loop
+from strapdown.kernels.lane_values import WIDTH
+from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.mekf import ProcessNoise
 from strapdown.records import ImuRecord, Truth
 from strapdown.setup import FilterSetup
 from strapdown.tuning import fitting, innovations
 from strapdown.tuning.parameters import own_sigma
 from strapdown.vectors import VectorMeasurements
-
-ARW, RRW = 1e-4, 3e-6
-
-
-def scenario(duration: float = 200.0, rate: float = 4.0, **changes) -> scenarios.Scenario:
-    stars = ((1.0, 0.0, 0.0, 1e-4), (0.0, 1.0, 1.0, 2e-4))
-    return scenarios.Scenario(
-        motion=motion.ConstantRate(rate=np.array([0.01, 0.02, 0.05])),
-        gyro=gyro.GyroSpec(angle_random_walk=ARW, rate_random_walk=changes.pop("walk", RRW), turn_on_bias_sigma=1e-4),
-        sensors=tuple(
-            vectors.VectorSensor(name=f"star {i + 1}", reference_f=np.array(star[:3]), sigma=star[3], rate=1.0)
-            for i, star in enumerate(stars)
-        ),
-        rate=rate,
-        duration=duration,
-        **changes,
-    )
-
-
-BELIEVED = FilterSetup(
-    process_noise=ProcessNoise(angle_random_walk=ARW, rate_random_walk=RRW), attitude_sigma=1e-3, bias_sigma=1e-4
-)
-FREE = ("gyro.arw", "gyro.rrw", "star 1.sigma", "star 2.sigma")
-
-
-def case(seed: int = 0, **changes) -> tuning.Case:
-    return tuning.record_case(scenarios.simulate(scenario(**changes), seed), BELIEVED, seed=seed)
 
 
 def every_kind(seed: int = 0) -> ImuRecord:
@@ -103,6 +80,51 @@ def test_every_lane_is_the_filter_itself():
     points = objective.start + np.random.default_rng(1).uniform(-1.5, 1.5, (11, len(ALL)))
     expected = [plain(record, objective.setup(point), start.initial.attitude, start.initial.bias) for point in points]
     np.testing.assert_allclose(objective.minus_log(points), expected, rtol=1e-10)
+
+
+@pytest.mark.parametrize("bias_sigma", [1e-2, 3.0, 60.0], ids=["right", "wild", "wilder"])
+def test_a_start_that_makes_the_bias_wild_is_cut_into_sub_steps_as_by_the_filter(bias_sigma):
+    """A bias of tens of rad/s turns the body, step by step, beyond the range of the polynomials, though its gyro hardly turns."""
+    time = 0.3 * np.arange(21)
+    seen = np.concatenate([[0.1], time[2:]])
+    # The first attitude is nearly half a turn off: where little is known of the bias, the bias is blamed.
+    attitude = quaternion.exp(np.where(seen == 0.1, 2.8, 0.0)[:, None] * np.array([0.6, 0.0, 0.8]))
+    tracker = VectorMeasurements(
+        sensor="tracker", kind="attitude", time=seen, attitude=attitude, sigma_axes=np.full(3, 1e-2)
+    )
+    record = ImuRecord(time=time, increments=np.full((20, 3), 1e-3), vectors=(tracker,))
+    chosen = FilterSetup(
+        process_noise=ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-3),
+        attitude_sigma=1e-2,
+        bias_sigma=bias_sigma,
+    )
+    initial = setup.initial_state(chosen, np.array([1.0, 0.0, 0.0, 0.0]))
+    wild = np.abs(setup.run(record, chosen, initial).bias).max()
+    assert (wild * 0.3 > 10.0 * LARGEST_ANGLE) == (bias_sigma > 1.0)
+    objective = tuning.likelihood(
+        [tuning.Case(record=record, initial=initial)], chosen, ("gyro.arw", "tracker.sigma", "initial.bias")
+    )
+    points = objective.start + np.random.default_rng(1).uniform(-0.5, 0.5, (8, 3))
+    expected = [plain(record, objective.setup(point), initial.attitude, initial.bias) for point in points]
+    np.testing.assert_allclose(objective.minus_log(points), expected, rtol=1e-9)
+    # Outliers no larger than the others are none.
+    mixed = tuning.contaminated_likelihood([tuning.Case(record=record, initial=initial)], chosen, objective.names)
+    none = np.column_stack([points, np.full(8, np.log(0.05)), np.zeros(8)])
+    np.testing.assert_allclose(mixed.minus_log(none), expected, rtol=1e-9)
+
+
+def test_a_lane_that_no_sub_steps_mend_cuts_no_step_of_the_others():
+    room = np.empty(WIDTH)
+    theta, b = (0.1, 0.2, 0.0), np.zeros((3, WIDTH))
+    assert tuning_loop.calm_turn(tuple(b), 0.5) == pytest.approx((0.5 * LARGEST_ANGLE) ** 2)
+    assert tuning_loop.longest_step(theta, 0.5, tuple(b), room) == 0.5
+    b[1, 3], b[1, 5], b[1, 6] = 4.0, 1e9, np.nan
+    assert tuning_loop.calm_turn(tuple(b), 0.5) < 0.0
+    # The bias turns the fourth lane by 2 rad; two others are lost.
+    found = tuning_loop.longest_step(theta, 0.5, tuple(b), room)
+    assert found == pytest.approx(0.5 * LARGEST_ANGLE / np.hypot(0.1, 0.2 - 2.0))
+    b[1, 3] = 0.0
+    assert tuning_loop.longest_step(theta, 0.5, tuple(b), room) == 0.5
 
 
 def test_several_records_add_up_on_any_number_of_threads():

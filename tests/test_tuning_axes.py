@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import sys
 
 import numpy as np
 import pytest
 
 from strapdown import (
-    cli,
     covariance,
     gyro,
     montecarlo,
@@ -260,25 +258,14 @@ def test_a_magnetometer_is_recovered_though_its_axes_mix_in_every_innovation(kin
 # ------------------------------------------------------------------------------------------------------------------- command
 
 
-def run(monkeypatch, capsys, *arguments: object) -> tuple[int, str, str]:
-    monkeypatch.setattr(sys, "argv", ["strapdown", *map(str, arguments)])
-    status = 0
-    try:
-        cli.main()
-    except SystemExit as end:
-        status = int(end.code or 0)
-    told = capsys.readouterr()
-    return status, told.out, told.err
-
-
-def test_the_command_tunes_the_axes_of_a_record(monkeypatch, capsys, tmp_path):
+def test_the_command_tunes_the_axes_of_a_record(run, tmp_path):
     path, out, first = tmp_path / "star.h5", tmp_path / "tuned.toml", tmp_path / "first.toml"
     scenario = tracked(60.0)
     recordfiles.write_record(path, scenarios.simulate(scenario, 4), gyro_spec=scenario.gyro)
     off = dataclasses.replace(setup.matched(scenario), sigma={"star": tuple(3.0 * STAR)})
     first.write_text(setup.to_toml(off), encoding="utf-8")
     command = ("tune", path, "--filter", first, "--free", ",".join(AXES), "--starts", 1, "-o", out)
-    status, said, complaint = run(monkeypatch, capsys, *command, "--holdout", 0.3)
+    status, said, complaint = run(*command, "--holdout", 0.3)
     assert status == 0, complaint
     assert "star.sigma.z" in said
     found = setup.read_setup(out)
@@ -286,6 +273,6 @@ def test_the_command_tunes_the_axes_of_a_record(monkeypatch, capsys, tmp_path):
     np.testing.assert_allclose(found.sigma["star"], STAR, rtol=0.4)
     assert [one["name"] for one in json.loads(out.with_suffix(".json").read_text())["parameters"]] == list(AXES)
     for more, words in ((("--truth",), "leave --gate, --truth"), (("--plan",), "which this objective does not tune")):
-        status, _, complaint = run(monkeypatch, capsys, *command, *more)
+        status, _, complaint = run(*command, *more)
         assert status == 2
         assert words in " ".join(complaint.split())

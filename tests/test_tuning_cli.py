@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import sys
 
 import numpy as np
 import pytest
 
-from strapdown import cli, gyro, motion, recordfiles, scenarios, setup, tuning, vectors
+from strapdown import gyro, motion, recordfiles, scenarios, setup, tuning, vectors
 from strapdown.checks import InputError
 from strapdown.setup import FilterSetup
 
@@ -24,17 +23,6 @@ SCENARIO = scenarios.Scenario(
     rate=4.0,
     duration=300.0,
 )
-
-
-def run(monkeypatch, capsys, *arguments: object) -> tuple[int, str, str]:
-    monkeypatch.setattr(sys, "argv", ["strapdown", *map(str, arguments)])
-    status = 0
-    try:
-        cli.main()
-    except SystemExit as end:
-        status = int(end.code or 0)
-    told = capsys.readouterr()
-    return status, told.out, told.err
 
 
 @pytest.fixture
@@ -54,11 +42,9 @@ def wrong(tmp_path):
     return path
 
 
-def test_tune_writes_the_filter_the_report_and_the_figures(monkeypatch, capsys, tmp_path, record, wrong):
+def test_tune_writes_the_filter_the_report_and_the_figures(run, tmp_path, record, wrong):
     out = tmp_path / "results" / "tuned.toml"
-    status, said, complaint = run(
-        monkeypatch, capsys, "tune", record, "--filter", wrong, "--holdout", 0.3, "--starts", 3, "-o", out
-    )
+    status, said, complaint = run("tune", record, "--filter", wrong, "--holdout", 0.3, "--starts", 3, "-o", out)
     assert status == 0, complaint
     assert "3 of 3 searches" in said
     assert "On the data held out" in said
@@ -77,27 +63,23 @@ def test_tune_writes_the_filter_the_report_and_the_figures(monkeypatch, capsys, 
         assert (out.parent / name).stat().st_size > 10_000
 
 
-def test_tune_against_the_truth_and_with_a_prior(monkeypatch, capsys, tmp_path, record, wrong):
+def test_tune_against_the_truth_and_with_a_prior(run, tmp_path, record, wrong):
     out = tmp_path / "tuned.toml"
-    status, said, complaint = run(
-        monkeypatch, capsys, "tune", record, "--truth", "--free", "gyro.arw,star.sigma", "--starts", 1, "-o", out
-    )
+    status, said, complaint = run("tune", record, "--truth", "--free", "gyro.arw,star.sigma", "--starts", 1, "-o", out)
     assert status == 0, complaint
     assert "gyro.arw" in said
     assert set(setup.read_setup(out).sigma) == {"star"}
     spec = tmp_path / "gyro.toml"
     spec.write_text("[gyro]\nangle_random_walk_rad_per_sqrt_s = 1e-4\nrate_random_walk_rad_per_s_per_sqrt_s = 3e-6\n")
-    status, _, complaint = run(
-        monkeypatch, capsys, "tune", record, "--filter", wrong, "--prior", spec, "--prior-factor", 1.01, "-o", out
-    )
+    status, _, complaint = run("tune", record, "--filter", wrong, "--prior", spec, "--prior-factor", 1.01, "-o", out)
     assert status == 0, complaint
     assert setup.read_setup(out).process_noise.rate_random_walk == pytest.approx(3e-6, rel=0.03)
 
 
-def test_tune_by_the_size_of_the_error(monkeypatch, capsys, tmp_path, record, wrong):
+def test_tune_by_the_size_of_the_error(run, tmp_path, record, wrong):
     out = tmp_path / "tuned.toml"
     options = ("--filter", wrong, "--rmse", "--free", "gyro.arw,gyro.rrw", "--starts", 1, "--holdout", 0.4)
-    status, _, complaint = run(monkeypatch, capsys, "tune", record, *options, "-o", out)
+    status, _, complaint = run("tune", record, *options, "-o", out)
     assert status == 0, complaint
     found = json.loads(out.with_suffix(".json").read_text())
     held = found["held_out"]
@@ -107,15 +89,15 @@ def test_tune_by_the_size_of_the_error(monkeypatch, capsys, tmp_path, record, wr
     assert setup.read_setup(out).process_noise.angle_random_walk == pytest.approx(told["gyro.arw"])
 
 
-def test_plan_tells_how_long_a_record_is_needed(monkeypatch, capsys, tmp_path, record):
-    status, said, complaint = run(monkeypatch, capsys, "tune", "--plan", record, "--length", "100,300")
+def test_plan_tells_how_long_a_record_is_needed(run, tmp_path, record):
+    status, said, complaint = run("tune", "--plan", record, "--length", "100,300")
     assert status == 0, complaint
     assert "100 s" in said
     assert "10 % needs" in said
     assert "star.sigma" in said
     path = tmp_path / "two.toml"
     path.write_text(scenarios.scenario_to_toml(dataclasses.replace(SCENARIO, duration=60.0)), encoding="utf-8")
-    status, said, complaint = run(monkeypatch, capsys, "tune", "--plan", path, "--free", "gyro.arw,sun.sigma")
+    status, said, complaint = run("tune", "--plan", path, "--free", "gyro.arw,sun.sigma")
     assert status == 0, complaint
     assert "60 s" in said
     assert not (tmp_path / "filter.toml").exists()
@@ -135,19 +117,18 @@ def test_plan_tells_how_long_a_record_is_needed(monkeypatch, capsys, tmp_path, r
         (("--plan", "--length", "100;300"), "seconds with commas"),
     ],
 )
-def test_mistakes_are_told_in_one_line(monkeypatch, capsys, tmp_path, record, arguments, complaint):
-    monkeypatch.chdir(tmp_path)
-    status, _, said = run(monkeypatch, capsys, "tune", record, *arguments)
+def test_mistakes_are_told_in_one_line(run, tmp_path, record, arguments, complaint):
+    status, _, said = run("tune", record, *arguments)
     assert status == 2
     assert complaint in said.replace("\n", " ")
     assert not (tmp_path / "filter.toml").exists()
 
 
-def test_a_record_that_does_not_tell_its_gyro_needs_a_filter(monkeypatch, capsys, tmp_path):
+def test_a_record_that_does_not_tell_its_gyro_needs_a_filter(run, tmp_path):
     bare = tmp_path / "bare.h5"
     recordfiles.write_record(bare, scenarios.simulate(SCENARIO, 1))
     for more in ((), ("--plan",)):
-        status, _, said = run(monkeypatch, capsys, "tune", bare, *more, "-o", tmp_path / "f.toml")
+        status, _, said = run("tune", bare, *more, "-o", tmp_path / "f.toml")
         assert status == 2
         assert "--filter" in said
 
@@ -162,10 +143,10 @@ def scaled(tmp_path):
     return path
 
 
-def test_tune_gives_the_filter_states_for_what_the_record_specifies(monkeypatch, capsys, tmp_path, scaled):
+def test_tune_gives_the_filter_states_for_what_the_record_specifies(run, tmp_path, scaled):
     out = tmp_path / "states.toml"
     status, said, complaint = run(
-        monkeypatch, capsys, "tune", scaled, "--states", "--free", "gyro.arw,gyro.scale_sigma", "--starts", 1, "-o", out
+        "tune", scaled, "--states", "--free", "gyro.arw,gyro.scale_sigma", "--starts", 1, "-o", out
     )
     assert status == 0, complaint
     assert "Optional states: gyro.scale" in said
@@ -177,9 +158,9 @@ def test_tune_gives_the_filter_states_for_what_the_record_specifies(monkeypatch,
 
 
 @pytest.mark.parametrize("option", [("--truth",), ("--credibility",), ("--gate",), ("--spacing", 2.0), ("--plan",)])
-def test_optional_states_are_tuned_by_the_plain_likelihood_alone(monkeypatch, capsys, tmp_path, scaled, option):
+def test_optional_states_are_tuned_by_the_plain_likelihood_alone(run, tmp_path, scaled, option):
     out = tmp_path / "states.toml"
-    status, _, complaint = run(monkeypatch, capsys, "tune", scaled, "--states", *option, "-o", out)
+    status, _, complaint = run("tune", scaled, "--states", *option, "-o", out)
     assert status != 0
     assert "optional states" in complaint
     assert not out.exists()

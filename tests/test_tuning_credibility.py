@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import sys
 
 import numpy as np
 import pytest
 from scipy.special import eval_sh_legendre
 from scipy.stats import chi2, norm
+from two_stars import BELIEVED, FREE, TRUTH, WRONG, case, scenario
 
-from strapdown import cli, consistency, gyro, motion, recordfiles, scenarios, setup, tuning, vectors
+from strapdown import consistency, recordfiles, scenarios, setup, tuning
 from strapdown.checks import InputError
 from strapdown.mekf import ProcessNoise
 from strapdown.records import ImuRecord
@@ -19,35 +19,6 @@ from strapdown.setup import FilterSetup
 from strapdown.tuning import credibility
 from strapdown.tuning.credibility import ORDER, Sample, components_of, distance
 from strapdown.vectors import VectorMeasurements
-
-ARW, RRW = 1e-4, 3e-6
-FREE = ("gyro.arw", "gyro.rrw", "star 1.sigma", "star 2.sigma")
-BELIEVED = FilterSetup(
-    process_noise=ProcessNoise(angle_random_walk=ARW, rate_random_walk=RRW), attitude_sigma=1e-3, bias_sigma=1e-4
-)
-WRONG = {"gyro.arw": 3.0 * ARW, "gyro.rrw": 3.0 * RRW, "star 1.sigma": 3e-5, "star 2.sigma": 6e-4}
-TRUTH = np.array([ARW, RRW, 1e-4, 2e-4])
-
-
-def scenario(duration: float = 200.0, outliers: float = 0.0) -> scenarios.Scenario:
-    faults = vectors.Faults(outlier_probability=outliers, outlier_scale=10.0)
-    stars = ((1.0, 0.0, 0.0, 1e-4), (0.0, 1.0, 1.0, 2e-4))
-    return scenarios.Scenario(
-        motion=motion.ConstantRate(rate=np.array([0.01, 0.02, 0.05])),
-        gyro=gyro.GyroSpec(angle_random_walk=ARW, rate_random_walk=RRW, turn_on_bias_sigma=1e-4),
-        sensors=tuple(
-            vectors.VectorSensor(
-                name=f"star {i + 1}", reference_f=np.array(star[:3]), sigma=star[3], rate=1.0, faults=faults
-            )
-            for i, star in enumerate(stars)
-        ),
-        rate=4.0,
-        duration=duration,
-    )
-
-
-def case(seed: int = 0, **changes: float) -> tuning.Case:
-    return tuning.record_case(scenarios.simulate(scenario(**changes), seed), BELIEVED, seed=seed)
 
 
 def wrong() -> FilterSetup:
@@ -359,27 +330,14 @@ def test_bad_input_is_refused():
 # -------------------------------------------------------------------------------------------------- the command line
 
 
-def run(monkeypatch, capsys, *arguments: object) -> tuple[int, str, str]:
-    monkeypatch.setattr(sys, "argv", ["strapdown", *map(str, arguments)])
-    status = 0
-    try:
-        cli.main()
-    except SystemExit as end:
-        status = int(end.code or 0)
-    told = capsys.readouterr()
-    return status, told.out, told.err
-
-
 @pytest.mark.parametrize("truth", [False, True])
-def test_tune_by_credibility(monkeypatch, capsys, tmp_path, truth):
+def test_tune_by_credibility(run, tmp_path, truth):
     path, out = tmp_path / "sat.h5", tmp_path / "tuned.toml"
     recordfiles.write_record(path, scenarios.simulate(scenario(400.0), 1), gyro_spec=scenario().gyro)
     start = tmp_path / "wrong.toml"
     start.write_text(setup.to_toml(wrong()), encoding="utf-8")
     more = ("--truth", "--free", "star 1.sigma") if truth else ("--holdout", 0.3)
-    status, said, complaint = run(
-        monkeypatch, capsys, "tune", path, "--filter", start, "--credibility", *more, "--starts", 2, "-o", out
-    )
+    status, said, complaint = run("tune", path, "--filter", start, "--credibility", *more, "--starts", 2, "-o", out)
     assert status == 0, complaint
     assert "half Neyman's statistic" in said
     content = json.loads(out.with_suffix(".json").read_text())
@@ -398,10 +356,10 @@ def test_tune_by_credibility(monkeypatch, capsys, tmp_path, truth):
         (("--credibility", "--spacing", "1"), "leave it away"),
     ],
 )
-def test_mistakes_are_told_in_one_line(monkeypatch, capsys, tmp_path, arguments, complaint):
+def test_mistakes_are_told_in_one_line(run, tmp_path, arguments, complaint):
     path = tmp_path / "sat.h5"
     recordfiles.write_record(path, scenarios.simulate(scenario(60.0), 1), gyro_spec=scenario().gyro)
-    status, _, said = run(monkeypatch, capsys, "tune", path, *arguments, "-o", tmp_path / "f.toml")
+    status, _, said = run("tune", path, *arguments, "-o", tmp_path / "f.toml")
     assert status == 2
     assert complaint in said.replace("\n", " ")
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import sys
 
 import numpy as np
 import pytest
+import two_stars
 from scipy.stats import chi2, norm
+from two_stars import BELIEVED, FREE, TRUTH, WRONG
 
-from strapdown import cli, gyro, motion, quaternion, recordfiles, scenarios, setup, tuning, vectors
+from strapdown import gyro, motion, quaternion, recordfiles, scenarios, setup, tuning, vectors
 from strapdown.checks import InputError
 from strapdown.mekf import ProcessNoise
 from strapdown.records import ImuRecord
@@ -20,34 +21,13 @@ from strapdown.setup import FilterSetup
 from strapdown.tuning import innovations, outliers
 from strapdown.vectors import VectorMeasurements
 
-ARW, RRW = 1e-4, 3e-6
-BELIEVED = FilterSetup(
-    process_noise=ProcessNoise(angle_random_walk=ARW, rate_random_walk=RRW), attitude_sigma=1e-3, bias_sigma=1e-4
-)
-FREE = ("gyro.arw", "gyro.rrw", "star 1.sigma", "star 2.sigma")
-TRUTH = np.array([ARW, RRW, 1e-4, 2e-4])
-WRONG = dict(zip(FREE, TRUTH * np.array([3.0, 3.0, 0.3, 3.0]), strict=True))
-
 
 def scenario(duration: float = 200.0, share: float = 0.05) -> scenarios.Scenario:
-    faults = vectors.Faults(outlier_probability=share, outlier_scale=10.0)
-    stars = ((1.0, 0.0, 0.0, 1e-4), (0.0, 1.0, 1.0, 2e-4))
-    return scenarios.Scenario(
-        motion=motion.ConstantRate(rate=np.array([0.01, 0.02, 0.05])),
-        gyro=gyro.GyroSpec(angle_random_walk=ARW, rate_random_walk=RRW, turn_on_bias_sigma=1e-4),
-        sensors=tuple(
-            vectors.VectorSensor(
-                name=f"star {i + 1}", reference_f=np.array(star[:3]), sigma=star[3], rate=1.0, faults=faults
-            )
-            for i, star in enumerate(stars)
-        ),
-        rate=4.0,
-        duration=duration,
-    )
+    return two_stars.scenario(duration, outliers=share)
 
 
 def case(seed: int = 0, duration: float = 200.0, share: float = 0.05) -> tuning.Case:
-    return tuning.record_case(scenarios.simulate(scenario(duration, share), seed), BELIEVED, seed=seed)
+    return two_stars.case(seed, duration, outliers=share)
 
 
 # --------------------------------------------------------------------------------------------------- the likelihood
@@ -357,22 +337,11 @@ def test_bad_input_is_refused():
 # -------------------------------------------------------------------------------------------------- the command line
 
 
-def run(monkeypatch, capsys, *arguments: object) -> tuple[int, str, str]:
-    monkeypatch.setattr(sys, "argv", ["strapdown", *map(str, arguments)])
-    status = 0
-    try:
-        cli.main()
-    except SystemExit as end:
-        status = int(end.code or 0)
-    told = capsys.readouterr()
-    return status, told.out, told.err
-
-
-def test_tune_with_a_gate_writes_it_into_the_filter(monkeypatch, capsys, tmp_path):
+def test_tune_with_a_gate_writes_it_into_the_filter(run, tmp_path):
     path, out = tmp_path / "sat.h5", tmp_path / "tuned.toml"
     recordfiles.write_record(path, scenarios.simulate(scenario(300.0), 1), gyro_spec=scenario().gyro)
     options = ("--free", "gate.probability,star 1.sigma,star 2.sigma", "--holdout", 0.3, "--starts", 1)
-    status, said, complaint = run(monkeypatch, capsys, "tune", path, *options, "-o", out)
+    status, said, complaint = run("tune", path, *options, "-o", out)
     assert status == 0, complaint
     assert "outliers.share" in said
     assert "An outlier is the likelier explanation" in said
@@ -390,9 +359,9 @@ def test_tune_with_a_gate_writes_it_into_the_filter(monkeypatch, capsys, tmp_pat
 
 
 @pytest.mark.parametrize("other", ["--truth", "--rmse", "--credibility"])
-def test_a_gate_needs_all_innovations(monkeypatch, capsys, tmp_path, other):
+def test_a_gate_needs_all_innovations(run, tmp_path, other):
     path = tmp_path / "sat.h5"
     recordfiles.write_record(path, scenarios.simulate(scenario(60.0), 1), gyro_spec=scenario().gyro)
-    status, _, complaint = run(monkeypatch, capsys, "tune", path, "--gate", other, "-o", tmp_path / "f.toml")
+    status, _, complaint = run("tune", path, "--gate", other, "-o", tmp_path / "f.toml")
     assert status == 2
     assert "likelihood of all innovations" in complaint.replace("\n", " ")

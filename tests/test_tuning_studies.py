@@ -6,16 +6,14 @@ import dataclasses
 
 import numpy as np
 import pytest
+from two_stars import BELIEVED, FREE, scenario
 
-from strapdown import coning, consistency, covariance, gyro, montecarlo, motion, scenarios, setup, tuning, vectors
+from strapdown import coning, consistency, covariance, gyro, montecarlo, scenarios, setup, tuning, vectors
 from strapdown.ahrs import AhrsParameters
 from strapdown.consistency import reference_errors
-from strapdown.mekf import ProcessNoise
 from strapdown.recordings import read
 from strapdown.setup import FilterSetup
 from strapdown.units import DEGREE
-
-FREE = ("gyro.arw", "gyro.rrw", "star 1.sigma", "star 2.sigma")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,20 +35,9 @@ class Study:
 
 def study(walk: float, duration: float, seeds: int) -> Study:
     truth = np.array([1e-4, walk, 1e-4, 2e-4])
-    chosen = scenarios.Scenario(
-        motion=motion.ConstantRate(rate=np.array([0.01, 0.02, 0.05])),
-        gyro=gyro.GyroSpec(angle_random_walk=truth[0], rate_random_walk=walk, turn_on_bias_sigma=1e-4),
-        sensors=(
-            vectors.VectorSensor(name="star 1", reference_f=np.array([1.0, 0.0, 0.0]), sigma=truth[2], rate=1.0),
-            vectors.VectorSensor(name="star 2", reference_f=np.array([0.0, 1.0, 1.0]), sigma=truth[3], rate=1.0),
-        ),
-        rate=4.0,
-        duration=duration,
-    )
-    right = FilterSetup(
-        process_noise=ProcessNoise(angle_random_walk=truth[0], rate_random_walk=walk),
-        attitude_sigma=1e-3,
-        bias_sigma=1e-4,
+    chosen = scenario(duration, walk=walk)
+    right = dataclasses.replace(
+        BELIEVED, process_noise=dataclasses.replace(BELIEVED.process_noise, rate_random_walk=walk)
     )
     wrong = tuning.with_values(right, dict(zip(FREE, truth * np.array([3.0, 3.0, 0.3, 3.0]), strict=True)))
     information, rows = [], []
@@ -208,22 +195,9 @@ def tuned_from_thirty_times_wrong(chosen: scenarios.Scenario, records: int) -> t
     return wrong, tuning.fit(tuning.likelihood(train, wrong, free), starts=2).setup
 
 
-def two_stars() -> scenarios.Scenario:
-    return scenarios.Scenario(
-        motion=motion.ConstantRate(rate=np.array([0.01, 0.02, 0.05])),
-        gyro=gyro.GyroSpec(angle_random_walk=1e-4, rate_random_walk=3e-6, turn_on_bias_sigma=1e-4),
-        sensors=(
-            vectors.VectorSensor(name="star 1", reference_f=np.array([1.0, 0.0, 0.0]), sigma=1e-4, rate=1.0),
-            vectors.VectorSensor(name="star 2", reference_f=np.array([0.0, 1.0, 1.0]), sigma=2e-4, rate=1.0),
-        ),
-        rate=4.0,
-        duration=600.0,
-    )
-
-
 def test_tuned_from_thirty_times_wrong_the_errors_reach_their_bound():
     """Issue G: RMSE/√PCRB ≤ 1.03, predicted; and what 150 runs have agrees with the prediction."""
-    chosen = two_stars()
+    chosen = scenario(600.0)
     wrong, tuned = tuned_from_thirty_times_wrong(chosen, 1)
     assert np.min(efficiencies(chosen, wrong)) > 1.2
     predicted = efficiencies(chosen, tuned)

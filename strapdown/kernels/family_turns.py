@@ -4,6 +4,9 @@ The polynomials of :mod:`strapdown.kernels.series` are made for gyro increments.
 correction of radians, or a step whose bias, wrong for a while, turns the body several times. Polynomials run away there, and what should
 be a rotation no longer is: covariances grow without bound until nothing is finite. Closed forms are rotations at any angle; below
 ``LARGEST_ANGLE``, where they would lose their digits, the polynomials serve.
+
+:func:`strapdown.kernels.filter_step.far_turn` has exponential and Jacobian of such a turn too, for lanes, which have neither sines nor
+branches: by doubling, to 20 rad. Noise over a step wants more coefficients than those, and at any angle.
 """
 
 from __future__ import annotations

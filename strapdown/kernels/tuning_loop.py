@@ -9,13 +9,16 @@ from __future__ import annotations
 
 import math
 
-from strapdown.kernels.algebra import add, dot, matrix_times_vector, scale, transpose_times_vector
-from strapdown.kernels.filter_loop import ATTITUDE, HEADING, VECTOR, vector_at
+from strapdown.kernels.algebra import add, combine, dot, matrix_times_vector, scale, transpose_times_vector
+from strapdown.kernels.filter_loop import ATTITUDE, HEADING, MOST_TURN, VECTOR, vector_at
 from strapdown.kernels.filter_step import direction_rows, heading_row, predict, reset, update_row
 from strapdown.kernels.lane_angles import arctangent, rotation_vector
-from strapdown.kernels.lane_values import WIDTH, load, spread, store
+from strapdown.kernels.lane_values import WIDTH, load, spread, store, total
 from strapdown.kernels.rotation import quaternion_multiply, rotation_matrix
 from strapdown.kernels.series import LARGEST_ANGLE
+
+HALF_RANGE = 0.25 * LARGEST_ANGLE * LARGEST_ANGLE
+"""The square of half the turn that the polynomials bear."""
 
 
 def load_state(array, start):
@@ -71,6 +74,38 @@ def store_lanes(array, start, q, b, A, B, C):
         store(array, s + (22 + i) * w, C[i])
     for i in range(9):
         store(array, s + (13 + i) * w, B[i])
+
+
+def longest_interval(edges):
+    """Return the length of the longest interval between edges."""
+    longest = 0.0
+    for k in range(len(edges) - 1):
+        longest = max(longest, edges[k + 1] - edges[k])
+    return longest
+
+
+def calm_turn(b, dt):
+    """Return the square of a gyro increment, over ``dt`` at most, up to which the turn of every lane is in the range of the polynomials.
+
+    Increment and bias may each turn by half of that range. Where the bias of a lane turns by more, no increment will do: −1.
+    """
+    # The sum over the lanes is no less than the largest, and NaN is not below anything.
+    return HALF_RANGE if total(dot(b, b)) * (dt * dt) < HALF_RANGE else -1.0
+
+
+def longest_step(theta, whole, b, room):
+    """Return the longest step in an interval of increment ``theta`` and length ``whole`` that turns no lane too far.
+
+    A turn beyond the range of the polynomials, in any lane, is cut into sub-steps of all: at constant rate they compose exactly. A lane
+    that is lost, of a turn above ``MOST_TURN``, is left out. ``room`` (WIDTH) is work space.
+    """
+    turn = combine(1.0, theta, -whole, b)
+    store(room, 0, dot(turn, turn))
+    squared = LARGEST_ANGLE * LARGEST_ANGLE
+    for i in range(WIDTH):
+        if squared < room[i] < MOST_TURN * MOST_TURN:
+            squared = room[i]
+    return whole * (LARGEST_ANGLE / math.sqrt(squared))
 
 
 def put_row(rows, k, h, y):
@@ -201,7 +236,8 @@ def run_parameters(
     now = edges[0]
     end = now
     whole = 1.0
-    longest = 1.0
+    span = longest_interval(edges)
+    calm = calm_turn(b, span)
     theta = (0.0, 0.0, 0.0)
     part_of_record = 0
     kept = 0
@@ -210,10 +246,12 @@ def run_parameters(
         stop = event_time[e] if due else end
         dt = stop - now
         if dt > 0.0:
-            if dt > longest:
-                dt = longest
-                stop = now + dt
-                due = False
+            if dot(theta, theta) > calm:
+                longest = longest_step(theta, whole, b, work)
+                if dt > longest:
+                    dt = longest
+                    stop = now + dt
+                    due = False
             part = theta
             if dt < whole:
                 part = scale(dt / whole, theta)
@@ -237,19 +275,20 @@ def run_parameters(
                 store(found, 2 * WIDTH * r, innovation)
                 store(found, 2 * WIDTH * r + WIDTH, s)
             q, A, B = reset(q, A, B, correction)
+            calm = calm_turn(b, span)
             if kind == VECTOR:
                 store(found, 4 * WIDTH, load(rows, 8 * WIDTH))
                 store(found, 5 * WIDTH, event_variance[e] * factor)
                 taking = 3
             for i in range(WIDTH):
                 product = 1.0
-                total = 0.0
+                deviance = 0.0
                 for r in range(taking):
                     s = found[2 * WIDTH * r + WIDTH + i]
-                    total += found[2 * WIDTH * r + i] * found[2 * WIDTH * r + i] / s
+                    deviance += found[2 * WIDTH * r + i] * found[2 * WIDTH * r + i] / s
                     product *= s
-                minus_log[WIDTH * part_of_record + i] += 0.5 * (math.log(product) + total)
-                squares[WIDTH * part_of_record + i] += total
+                minus_log[WIDTH * part_of_record + i] += 0.5 * (math.log(product) + deviance)
+                squares[WIDTH * part_of_record + i] += deviance
             if len(innovations) > 0:
                 start = 6 * WIDTH * e
                 for i in range(2 * WIDTH * taking):
@@ -275,8 +314,4 @@ def run_parameters(
                 end = edges[k + 1]
                 whole = end - now
                 theta = vector_at(increments, k)
-                squared = dot(theta, theta)
-                longest = whole
-                if squared > LARGEST_ANGLE * LARGEST_ANGLE:
-                    longest = whole * (LARGEST_ANGLE / math.sqrt(squared))
     store_lanes(state, 0, q, b, A, B, C)

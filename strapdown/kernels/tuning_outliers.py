@@ -14,8 +14,7 @@ from strapdown.kernels.algebra import add, dot, scale, subtract
 from strapdown.kernels.filter_loop import ATTITUDE, VECTOR, vector_at
 from strapdown.kernels.filter_step import predict, reset, update_row
 from strapdown.kernels.lane_values import WIDTH, load, spread, store
-from strapdown.kernels.series import LARGEST_ANGLE
-from strapdown.kernels.tuning_loop import load_state, measured_rows
+from strapdown.kernels.tuning_loop import calm_turn, load_state, longest_interval, longest_step, measured_rows
 
 
 def row_at(rows, r):
@@ -139,7 +138,8 @@ def run_contaminated(
     now = edges[0]
     end = now
     whole = 1.0
-    longest = 1.0
+    span = longest_interval(edges)
+    calm = calm_turn(b, span)
     theta = (0.0, 0.0, 0.0)
     part_of_record = 0
     while k < len(increments):
@@ -147,10 +147,12 @@ def run_contaminated(
         stop = event_time[e] if due else end
         dt = stop - now
         if dt > 0.0:
-            if dt > longest:
-                dt = longest
-                stop = now + dt
-                due = False
+            if dot(theta, theta) > calm:
+                longest = longest_step(theta, whole, b, work)
+                if dt > longest:
+                    dt = longest
+                    stop = now + dt
+                    due = False
             part = theta
             if dt < whole:
                 part = scale(dt / whole, theta)
@@ -194,6 +196,7 @@ def run_contaminated(
             C = between_symmetric(w, C0, C1, b0, b1)
             b = between(w, b0, b1)
             q, A, B = reset(q, A, B, between(w, turn, other))
+            calm = calm_turn(b, span)
             e += 1
         if now >= end and (e == events or event_time[e] > end):
             k += 1
@@ -201,7 +204,3 @@ def run_contaminated(
                 end = edges[k + 1]
                 whole = end - now
                 theta = vector_at(increments, k)
-                squared = dot(theta, theta)
-                longest = whole
-                if squared > LARGEST_ANGLE * LARGEST_ANGLE:
-                    longest = whole * (LARGEST_ANGLE / math.sqrt(squared))

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from strapdown import setup, units
-from strapdown.augmented.states import Entries, SensorStates, States
+from strapdown.augmented.states import VELOCITY, Entries, SensorStates, States
 from strapdown.checks import Array, InputError, count, one_of
 from strapdown.mekf import State
 from strapdown.records import ImuRecord
@@ -49,6 +49,7 @@ SENSOR = {
     "correlated_sigma": "correlated_sigma",
     "correlation_time": "correlation_time",
     "lever_sigma": "lever_arm_sigma",
+    **{name: name for name in VELOCITY},
 }
 """Parameters of a sensor's states by what follows its name and a dot, and the fields of :class:`strapdown.augmented.SensorStates`."""
 LARGEST_SCALE = 0.1
@@ -89,6 +90,7 @@ def unit_of(name: str) -> Unit:
         "gyro.drift_time": Unit(name="s", factor=1.0),
         "correlation_time": Unit(name="s", factor=1.0),
         "lever_sigma": Unit(name="m", factor=1.0),
+        **{name: Unit(name=unit, factor=1.0) for name, unit in VELOCITY.items()},
     }
     return told.get(name, told.get(name.rpartition(".")[2], Unit(name="rad, or the vector's unit", factor=1.0)))
 

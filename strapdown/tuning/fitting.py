@@ -149,7 +149,7 @@ def search(
         while True:
             delta = np.zeros(len(x))
             delta[active] = -stretch * np.linalg.solve(unit + damping * np.eye(len(g)), g / scale) / scale
-            shortened = min(1.0, LONGEST_STEP / float(np.max(np.abs(delta))))
+            shortened = LONGEST_STEP / max(LONGEST_STEP, float(np.max(np.abs(delta))))
             delta *= shortened
             trial = np.clip(x + delta, low, high)
             trial[~moving] = x[~moving]
