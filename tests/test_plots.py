@@ -9,8 +9,22 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
 
-from strapdown import coning, consistency, gyro, montecarlo, motion, plots, quaternion, records, scenarios, setup, units
+from strapdown import (
+    coning,
+    consistency,
+    covariance,
+    gyro,
+    montecarlo,
+    motion,
+    plots,
+    quaternion,
+    records,
+    scenarios,
+    setup,
+    units,
+)
 from strapdown.checks import InputError
+from strapdown.coning_study import Drift
 from strapdown.plots import style
 from strapdown.plots.sphere import body_axis_path
 
@@ -114,6 +128,42 @@ def test_errors_are_drawn_in_the_unit_of_their_label(run):
         assert unit in ax.get_ylabel()
         drawn = ax.lines[-1].get_ydata()
         assert np.abs(drawn).max() == pytest.approx(np.abs(error[:, 3 * column]).max() / size)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_budget_that_starts_without_error_shows_what_comes_after(scenario, tmp_path):
+    found = covariance.analyse(
+        dataclasses.replace(scenario, duration=2.0), initial_attitude_sigma=0.0, initial_bias_sigma=0.0, epochs=4
+    )
+    assert not found.rms[0].any()
+    figure = plots.error_budget(found)
+    plots.save(figure, tmp_path / "budget.png")
+    named = {text.get_text() for text in figure.legends[0].get_texts()}
+    assert {"angle random walk", "star 1"} <= named
+    for ax in figure.axes[2:]:
+        tops = [np.max(part.get_paths()[0].vertices, axis=0) for part in ax.collections if part.get_paths()]
+        assert max(top[1] for top in tops) == pytest.approx(100.0)  # the shares of later epochs are all that there is
+    line = figure.axes[0].lines[0].get_ydata()
+    assert np.isnan(line[0])
+    assert np.all(line[1:] > 0.0)
+
+
+@pytest.mark.filterwarnings("error")
+def test_drifts_that_are_rounding_are_told_and_not_drawn(tmp_path):
+    size = units.DEGREE_PER_HOUR
+    drifts = [
+        Drift(algorithm="one-sample", samples=1, measured=-62.0 * size, predicted=-60.0 * size),
+        Drift(algorithm="exact", samples=1, measured=0.0, predicted=0.0),
+        Drift(algorithm="without formula", samples=4, measured=1e-9 * size, predicted=np.nan),
+    ]
+    for given in (drifts, drifts[1:]):
+        ax = plots.drift_by_algorithm(given)
+        plots.save(ax.figure, tmp_path / "drift.png")
+        low, high = ax.get_ylim()
+        said = [text for text in ax.texts if text.get_text() == "rounding"]
+        assert len(said) == 2
+        assert all(low <= text.xy[1] < high for text in said)
+        assert sum(np.isfinite(bar.get_height()) for bar in ax.patches) == len(given) - 2
 
 
 def test_the_ellipse_holds_its_share():

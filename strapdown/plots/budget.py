@@ -29,7 +29,9 @@ def error_budget(analysis: Analysis, *, title: str = "") -> Figure:
         sigma = np.sqrt(np.mean(analysis.filter_sigma[:, part] ** 2, axis=1))
         # The unit is that of the settled filter: its start is the prior, orders above.
         unit, size = (angle_unit if column == 0 else rate_unit)(rms[len(rms) // 2 :])
-        top.semilogy(analysis.time, rms / size, color=VERMILION, linewidth=2.4, label="actual RMS")
+        top.semilogy(
+            analysis.time, np.where(rms > 0.0, rms / size, np.nan), color=VERMILION, linewidth=2.4, label="actual RMS"
+        )
         top.semilogy(analysis.time, sigma / size, color=BLUE, linewidth=1.2, label="the filter's own σ")
         top.set_ylabel(f"{'attitude' if column == 0 else 'bias'}, one axis, {unit}")
         shown = {name: share[name] for name in names}
@@ -53,12 +55,16 @@ def error_budget(analysis: Analysis, *, title: str = "") -> Figure:
 
 
 def _largest(share: Array) -> float:
-    return float(share.max(initial=0.0))
+    return float(np.fmax.reduce(share, initial=0.0))
 
 
 def _shares(analysis: Analysis, part: slice) -> dict[str, Array]:
-    """Return the share (m,) of each source in the mean square error; errors of every run are one share, for they add as errors."""
+    """Return the share (m,) of each source in the mean square error; errors of every run are one share, for they add as errors.
+
+    NaN where there is no error to share.
+    """
     total = np.sum(analysis.rms[:, part] ** 2, axis=1)
+    total = np.where(total > 0.0, total, np.nan)
     share = {
         name: np.trace(analysis.contributions[:, k, part, part], axis1=1, axis2=2) / total
         for k, name in enumerate(analysis.sources)

@@ -16,28 +16,32 @@ from strapdown.plots.statistics import nees_over_time, nis_over_time
 from strapdown.plots.style import SKY, axes_or_new, ink, new_figure, save
 from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR
 
+_ROUNDING = 1e-6  # °/h: below it a drift is rounding of the run that measures it
+
 
 def drift_by_algorithm(drifts: Sequence[Drift], ax: Axes | None = None) -> Axes:
     """Draw the size of each algorithm's drift, measured and predicted, °/h on a log axis."""
     ax = axes_or_new(ax)
     places = np.arange(len(drifts))
-    measured = [abs(drift.measured) / DEGREE_PER_HOUR for drift in drifts]
-    predicted = [abs(drift.predicted) / DEGREE_PER_HOUR for drift in drifts]
-    ax.bar(places, measured, width=0.55, color=SKY, label="measured against the closed form")
-    ax.hlines(predicted, places - 0.36, places + 0.36, color=ink(), linewidth=2, label="predicted by the formula")
-    rounding = 1e-6  # °/h: below it a drift is rounding of the run that measures it
-    for place, value, line in zip(places, measured, predicted, strict=True):
-        text = f"{value:.3g}" if value > rounding else "rounding"
-        ax.annotate(
-            text,
-            (place, max(value, np.nan_to_num(line), rounding)),
-            xytext=(0, 5),
-            textcoords="offset points",
-            ha="center",
-        )
+    measured = np.array([abs(drift.measured) / DEGREE_PER_HOUR for drift in drifts])
+    predicted = np.array([abs(drift.predicted) / DEGREE_PER_HOUR for drift in drifts])
+    shown = [x for x in (*measured, *predicted) if x > _ROUNDING]
+    low, high = min(shown, default=_ROUNDING) / 4.0, max(shown, default=1.0) * 8.0
     ax.set_yscale("log")
-    shown = [x for x in (*measured, *predicted) if x > rounding]
-    ax.set_ylim(min(shown, default=rounding) / 4.0, max(shown, default=1.0) * 8.0)
+    ax.set(xlim=(-0.6, len(drifts) - 0.4), ylim=(low, high))
+    ax.bar(
+        places,
+        np.where(measured > _ROUNDING, measured, np.nan),
+        width=0.55,
+        color=SKY,
+        label="measured against the closed form",
+    )
+    lines = np.where(predicted > _ROUNDING, predicted, np.nan)
+    ax.hlines(lines, places - 0.36, places + 0.36, color=ink(), linewidth=2, label="predicted by the formula")
+    for place, value, line in zip(places, measured, lines, strict=True):
+        text = f"{value:.3g}" if value > _ROUNDING else "rounding"
+        top = max(value, np.nan_to_num(line), low)
+        ax.annotate(text, (place, top), xytext=(0, 5), textcoords="offset points", ha="center")
     ax.set_xticks(places, [drift.algorithm for drift in drifts])
     ax.grid(visible=False, axis="x")
     ax.set_ylabel("drift, °/h")
