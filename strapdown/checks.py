@@ -7,6 +7,7 @@ the value, the place (name and index) and the remedy. Kernels check nothing.
 from __future__ import annotations
 
 import difflib
+import reprlib
 from collections.abc import Iterable, Sequence
 from types import EllipsisType
 
@@ -34,6 +35,30 @@ def _first(mask: NDArray[np.bool_]) -> tuple[np.intp, ...]:
     return tuple(np.argwhere(mask)[0]) if mask.ndim else ()
 
 
+_NO_NUMBERS = {"b": "True or False", "S": "text", "U": "text", "c": "complex numbers", "M": "dates", "m": "time spans"}
+"""What NumPy would turn into floats though it is none, by the kind of its dtype."""
+
+
+def _truth_value(value: object) -> bool:
+    """Return whether a value is True or False, or a sequence that holds one."""
+    if isinstance(value, (list, tuple)):
+        return any(_truth_value(one) for one in value)
+    return isinstance(value, (bool, np.bool_))
+
+
+def numbers(name: str, value: ArrayLike) -> Array:
+    """Return ``value`` as a float64 array of any shape; what is no number, though NumPy would make it one, is refused."""
+    try:
+        given = np.asarray(value)
+        held = "True or False" if _truth_value(value) else _NO_NUMBERS.get(given.dtype.kind, "")
+        result = given if held else np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} is not an array of numbers ({error}); pass floats") from None
+    if held:
+        raise InputError(f"{name} is not an array of numbers (it holds {held}); pass floats")
+    return result
+
+
 def array(name: str, value: ArrayLike, shape: Sequence[int | str | EllipsisType], *, allow_nan: bool = False) -> Array:
     """Return ``value`` as a finite float64 array of the given shape.
 
@@ -47,10 +72,7 @@ def array(name: str, value: ArrayLike, shape: Sequence[int | str | EllipsisType]
     allow_nan : bool
         Let NaN through (it marks missing samples); infinities never pass.
     """
-    try:
-        result = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name} is not an array of numbers ({error}); pass floats") from None
+    result = numbers(name, value)
     tail = list(shape[1:]) if shape and shape[0] is ... else list(shape)
     wanted = "(" + ", ".join("..." if s is ... else str(s) for s in shape) + ("," if len(shape) == 1 else "") + ")"
     free = bool(shape) and shape[0] is ...
@@ -86,7 +108,8 @@ def non_negative(name: str, value: float, *, unit: str = "") -> float:
 def finite(name: str, value: float, *, unit: str = "") -> float:
     """Return ``value`` as a finite float."""
     try:
-        if isinstance(value, str):  # "60" in a file is a slip, not a number
+        given = np.asarray(value)
+        if given.ndim or given.dtype.kind in _NO_NUMBERS:  # "60" in a file is a slip, not a number; so is True
             raise ValueError
         number = float(value)
     except (TypeError, ValueError):
@@ -184,6 +207,12 @@ def one_of(name: str, value: str, choices: Iterable[str]) -> str:
     near = difflib.get_close_matches(str(value), known, n=1)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     raise InputError(f"{name} {value!r} is not known{hint} (known: {', '.join(known)})")
+
+
+def instance(name: str, value: object, wanted: type, remedy: str) -> None:
+    """Refuse a value that is not of a class; ``remedy`` says how to come by one."""
+    if not isinstance(value, wanted):
+        raise InputError(f"{name} is {reprlib.repr(value)}, not of class {wanted.__name__}; {remedy}")
 
 
 def known_keys(place: str, given: Iterable[str], known: Iterable[str]) -> None:

@@ -198,7 +198,15 @@ def export_csv(path: str | os.PathLike[str], record: ImuRecord) -> tuple[Path, .
     ``path`` holds one row an edge: its time, the increment of the interval that ends there (none in the first row), and the truth if there
     is one. Each vector series goes to ``STEM-vectors-N.csv`` beside it. The first line of each is a comment that tells what it is; then
     come the names of the columns, with their units.
+
+    Raises
+    ------
+    InputError
+        If a sensor's noise differs by body axis, which CSV has no columns for; then nothing is written.
     """
+    for series in record.vectors:
+        if series.anisotropic:
+            raise InputError(f"{series.sensor}: CSV has no columns for sigma_axes or covariance; write HDF5")
     target = Path(path)
     first = np.full((1, 3), np.nan)
     columns = [record.time[:, None], np.concatenate([first, record.increments])]
@@ -214,8 +222,6 @@ def export_csv(path: str | os.PathLike[str], record: ImuRecord) -> tuple[Path, .
         np.concatenate(columns, axis=1),
     )
     for number, series in enumerate(record.vectors):
-        if series.anisotropic:
-            raise InputError(f"{series.sensor}: CSV has no columns for sigma_axes or covariance; write HDF5")
         beside = target.with_name(f"{target.stem}-vectors-{number}.csv")
         if series.kind == "attitude" and series.attitude is not None and series.sigma_axes is not None:
             names, columns = _ATTITUDE_COLUMNS, [series.time[:, None], series.attitude, series.sigma_axes]
@@ -243,10 +249,13 @@ def _write_csv(path: Path, comment: str, names: tuple[str, ...], rows: Array) ->
 def import_csv(path: str | os.PathLike[str]) -> ImuRecord:
     """Read what :func:`export_csv` wrote, with the vector series beside the file.
 
+    Measurements of NaN are missing ones. An increment has no such rows: what the body turned over an interval without one nobody knows,
+    and whoever made the file must say where the next increment begins. Left out, a row joins its interval to the next.
+
     Raises
     ------
     InputError
-        If the file is missing, is not such a file, or a row is cut short or holds no number (its line is named).
+        If the file is missing, is not such a file, or a row is cut short, holds no number or no increment (its line is named).
     """
     target = Path(path)
     comment, names, rows = _read_csv(target)
@@ -255,6 +264,12 @@ def import_csv(path: str | os.PathLike[str]) -> ImuRecord:
     if names not in (_GYRO_COLUMNS, _GYRO_COLUMNS + _TRUTH_COLUMNS):
         raise InputError(
             f"{target} has the columns {', '.join(names)}; wanted {', '.join(_GYRO_COLUMNS)} and perhaps {', '.join(_TRUTH_COLUMNS)}"
+        )
+    lost = np.argwhere(np.isnan(rows[1:, 1:4]))
+    if len(lost):
+        row, column = lost[0]
+        raise InputError(
+            f"{target}, line {row + 4}: {names[column + 1]} is nan; leave the row out and give the next one the turn over both intervals"
         )
     truth = Truth(attitude=rows[:, 4:8], bias=rows[:, 8:11]) if len(names) > 4 else None
     series: list[VectorMeasurements] = []

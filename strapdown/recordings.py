@@ -10,7 +10,7 @@ import csv
 import io
 import os
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +49,12 @@ class Recording:
     """Reference q_fb (n, 4), fixed frame East-North-Up with magnetic North; rows of NaN are missing."""
     movement: np.ndarray | None = None
     """Samples that errors are judged over (n,), bool."""
+    missing_gyro: Array = field(default_factory=lambda: np.empty(0))
+    """Stamps of the file's rows without a gyro sample (k,), s. They are left out as a whole: the intervals on both sides are one, the turn
+    over it is taken from the samples at its ends, and a filter's covariance grows over all of it."""
+    repeated: Array = field(default_factory=lambda: np.empty(0))
+    """Stamps of the file's rows that say the same as the row before, stamp and all (k,), s: they are left out. The same stamp with other
+    values is refused, for two samples at one time have no interval between them."""
 
     def __post_init__(self) -> None:
         """Check shapes, order and values."""
@@ -60,6 +66,8 @@ class Recording:
             value = getattr(self, name)
             if value is not None:
                 object.__setattr__(self, name, array(f"{self.source}: {name}", value, (n, width), allow_nan=True))
+        for name in ("missing_gyro", "repeated"):
+            object.__setattr__(self, name, array(f"{self.source}: {name}", getattr(self, name), ("k",)))
         if self.movement is not None and np.shape(self.movement) != (n,):
             raise InputError(f"{self.source}: movement has shape {np.shape(self.movement)}, wanted ({n},)")
 
@@ -68,7 +76,24 @@ class Recording:
         rows = slice(first, None)
         fields = ("time", "rate", "specific_force", "magnetic_field", "true_attitude", "movement")
         parts: dict[str, Any] = {n: None if getattr(self, n) is None else getattr(self, n)[rows] for n in fields}
-        return replace(self, **parts)
+        begin = parts["time"][0]
+        missing, repeated = (stamps[stamps > begin] for stamps in (self.missing_gyro, self.repeated))
+        return replace(self, missing_gyro=missing, repeated=repeated, **parts)
+
+    @property
+    def left_out_words(self) -> str:
+        """What is to be said of rows that were left out; nothing where there are none."""
+        words = []
+        if len(self.missing_gyro):
+            words.append(
+                f"{len(self.missing_gyro)} rows without a gyro sample, the first at {self.missing_gyro[0]:.3f} s, were left out: the "
+                "turn across them is taken from the samples beside them."
+            )
+        if len(self.repeated):
+            words.append(
+                f"{len(self.repeated)} rows that repeat the row before, the first at {self.repeated[0]:.3f} s, were left out."
+            )
+        return " ".join(words)
 
 
 def read(path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> Recording:
@@ -119,7 +144,7 @@ def read_broad(path: str | os.PathLike[str]) -> Recording:
                 )
             rate = file["imu_gyr"][:]
             sampling = positive(f"{name}: sampling_rate", file.attrs["sampling_rate"], unit="Hz")
-            return Recording(
+            return _with_gyro(
                 source=name,
                 time=np.arange(len(rate)) / sampling,
                 rate=rate,
@@ -137,7 +162,8 @@ def read_csv(path: str | os.PathLike[str], *, units: Mapping[str, str] | None = 
 
     A header may declare units in brackets, ``gx [deg/s]``; ``units`` ("time", "gyro", "accelerometer") declares them for files that do
     not. A gyro or accelerometer without a unit is refused rather than guessed: a factor of 57.3 or 9.81 is the commonest mistake there
-    is. Time is in s unless declared otherwise. Empty fields of the accelerometer and the magnetometer are missing samples.
+    is. Time is in s unless declared otherwise. Empty fields of the accelerometer and the magnetometer are missing samples; rows with an
+    empty field of the gyro are left out, and told in ``missing_gyro``, as are rows that repeat the row before, in ``repeated``.
     """
     file = Path(path)
     known_keys("units", units or {}, ("time", "gyro", "accelerometer"))
@@ -166,13 +192,39 @@ def read_csv(path: str | os.PathLike[str], *, units: Mapping[str, str] | None = 
     def columns(group: str) -> Array:
         return values[:, [names.index(name) for name in _COLUMNS[group]]] * factors[group]
 
-    return Recording(
+    return _with_gyro(
         source=file.name,
         time=_seconds(values[:, names.index("time")], factors["time"]),
         rate=columns("gyro"),
         specific_force=columns("accelerometer") if present["accelerometer"] else None,
         magnetic_field=columns("magnetometer") if present["magnetometer"] else None,
     )
+
+
+def _with_gyro(*, source: str, time: Array, rate: Array, **columns: Any) -> Recording:
+    """Return a recording of the rows that have a gyro sample and do not repeat the row before; the stamps of the others go along."""
+    same = np.diff(time) == 0.0
+    for column in (rate, *columns.values()):
+        if np.shape(column)[:1] != time.shape:
+            continue  # not there, or not of this length, which is refused below
+        rows = np.asarray(column).reshape(len(time), -1).astype(np.float64)
+        same &= np.all((rows[1:] == rows[:-1]) | (np.isnan(rows[1:]) & np.isnan(rows[:-1])), axis=1)
+    if same.any():
+        new = np.concatenate([[True], ~same])
+        columns = {name: None if column is None else column[new] for name, column in columns.items()}
+        columns["repeated"] = time[~new]
+        time, rate = time[new], rate[new]
+    known = np.asarray(~np.isnan(rate).any(axis=1))
+    if known.all():
+        return Recording(source=source, time=time, rate=rate, **columns)
+    if np.sum(known) < 2:
+        raise InputError(
+            f"{source}: {np.sum(known)} of {len(known)} rows have a gyro sample about each axis; at least 2 are needed"
+        )
+    stamps = increasing(f"{source}: time", time)
+    gone = stamps[~known]
+    kept = {n: c if c is None or n == "repeated" else c[known] for n, c in columns.items()}
+    return Recording(source=source, time=stamps[known], rate=rate[known], missing_gyro=gone, **kept)
 
 
 def _seconds(stamps: Array, factor: float) -> Array:
@@ -186,8 +238,8 @@ def _header(source: str, header: list[str]) -> tuple[list[str], dict[str, str]]:
     names: list[str] = []
     declared: dict[str, str] = {}
     groups = {name: group for group, members in _COLUMNS.items() for name in members} | {"time": "time"}
-    for field in header:
-        name, bracket, rest = field.strip().partition("[")
+    for cell in header:
+        name, bracket, rest = cell.strip().partition("[")
         name = name.strip().lower()
         if name in names:
             raise InputError(f"{source}: the header names the column {name!r} twice; rename or drop one")

@@ -17,7 +17,7 @@ import numpy as np
 
 import strapdown
 from strapdown import coning
-from strapdown.checks import Array, InputError, array, increasing, unit_quaternions
+from strapdown.checks import Array, InputError, array, increasing, instance, unit_quaternions
 from strapdown.files import existing_file, written_beside
 from strapdown.vectors import VectorMeasurements
 
@@ -25,6 +25,9 @@ CONVENTIONS = (
     "quaternions Hamilton, scalar first, body to fixed frame: v_f = q v_b q^-1; error state (dtheta, db): "
     "q_true = q exp(dtheta), db = b_true - b; SI units and radians"
 )
+
+LARGEST_BIAS = 1e6
+"""rad/s: no gyro has such a bias; an estimate that tells of one is of a filter that was lost, or damaged."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +58,11 @@ class ImuRecord:
         increments = array("increments", self.increments, (len(time) - 1, 3))
         object.__setattr__(self, "time", time)
         object.__setattr__(self, "increments", increments)
+        if isinstance(self.vectors, VectorMeasurements):
+            raise InputError(f"vectors is the series {self.vectors.sensor} by itself; give a tuple of them, (series,)")
         object.__setattr__(self, "vectors", tuple(self.vectors))
+        for k, series in enumerate(self.vectors):
+            instance(f"vectors[{k}]", series, VectorMeasurements, "give vectors.VectorMeasurements, a series each")
         names = [series.sensor for series in self.vectors]
         if len(set(names)) < len(names):
             raise InputError(f"vectors holds two series of one name among {names}; give each sensor its own")
@@ -74,16 +81,18 @@ class ImuRecord:
         return np.asarray(self.increments / np.diff(self.time)[:, None])
 
 
-def compress(record: ImuRecord, algorithm: coning.Algorithm) -> ImuRecord:
+def compress(record: ImuRecord, algorithm: str | coning.Algorithm) -> ImuRecord:
     """Return the record at the rate of an N-sample coning algorithm: each N increments become one rotation vector.
 
     The rotation vector stands for the increment of the longer interval: with commutation corrected, a filter may take it for a turn
-    at constant rate. Intervals left over at the end are dropped.
+    at constant rate. Where sample intervals differ in length the correction is that of their lengths, and across a gap there is none
+    (:func:`strapdown.coning.rotation_vectors`). Intervals left over at the end are dropped.
     """
-    n = algorithm.samples
+    table = coning.named(algorithm)
+    n = table.samples
     kept = len(record.increments) // n * n
     if kept == 0:
-        raise InputError(f"record has {len(record.increments)} intervals; {algorithm.name} needs at least {n}")
+        raise InputError(f"record has {len(record.increments)} intervals; {table.name} needs at least {n}")
     every = slice(0, kept + 1, n)
     truth = (
         None if record.truth is None else Truth(attitude=record.truth.attitude[every], bias=record.truth.bias[every])
@@ -91,7 +100,7 @@ def compress(record: ImuRecord, algorithm: coning.Algorithm) -> ImuRecord:
     return dataclasses.replace(
         record,
         time=record.time[every],
-        increments=coning.rotation_vectors(record.increments[:kept], algorithm),
+        increments=coning.rotation_vectors(record.increments[:kept], table, edges=record.time[: kept + 1]),
         truth=truth,
     )
 
@@ -156,7 +165,7 @@ class Innovations:
         return np.asarray(np.sum(self.innovation**2 / self.variance, axis=1))
 
 
-EVENT_KINDS = ("recovery", "divergence", "gap")
+EVENT_KINDS = ("recovery", "lock-out", "divergence", "gap")
 """Kinds of :class:`Event`."""
 
 
@@ -165,17 +174,18 @@ class Event:
     """Something in a run that whoever uses the estimate must hear of."""
 
     kind: str
-    """One of :data:`EVENT_KINDS`: a filter that refused good measurements started anew; the running NIS left its bounds; the gyro was
-    silent for much longer than its interval."""
+    """One of :data:`EVENT_KINDS`: a filter that refused good measurements started anew; a gate refused a sensor more often than it took
+    it in; the running NIS left its bounds; the gyro was silent for much longer than its interval."""
     start: float
     """When it began, s."""
     end: float
-    """When it was over, s: the filter's recovery, the return of the NIS (or the end of the record), the next gyro sample."""
+    """When it was over, s: the filter's recovery, the last refusal, the return of the NIS (or the end of the record), the next gyro
+    sample."""
     sensor: str = ""
     """Sensor concerned, if it is one."""
     value: float = 0.0
-    """Of a recovery the refusals in a row, of a divergence the greatest mean NIS per degree of freedom, of a gap its length over the usual
-    interval."""
+    """Of a recovery the refusals in a row, of a lock-out the refusals, of a divergence the greatest mean NIS per degree of freedom, of a
+    gap its length over the usual interval."""
 
     def __str__(self) -> str:
         """Say it in one line."""
@@ -183,6 +193,11 @@ class Event:
             return (
                 f"Recovered at {self.end:.6g} s: {self.value:.0f} measurements of {self.sensor} in a row were refused and agreed with each "
                 f"other from {self.start:.6g} s on; what the filter said in between is wrong."
+            )
+        if self.kind == "lock-out":
+            return (
+                f"Locked out from {self.start:.6g} s to {self.end:.6g} s: {self.value:.0f} measurements of {self.sensor} were refused, "
+                "more than were taken in, and no restart could follow them: the sensor, its sigma or the filter is wrong there."
             )
         if self.kind == "divergence":
             return (
@@ -321,41 +336,92 @@ def _estimate_file(path: str | os.PathLike[str]) -> Iterator[Any]:
                     f"{path} is not a strapdown estimate; pass the estimate.h5 that `strapdown estimate` writes"
                 )
             yield file
-    except (OSError, KeyError) as error:
+    except InputError:
+        raise
+    except (OSError, KeyError, RuntimeError, TypeError, ValueError) as error:
         raise InputError(f"{path} cannot be read as HDF5 ({error}); the file is truncated or of another kind") from None
 
 
+def _numbers(group: Any, name: str, shape: tuple[int | str, ...]) -> Array:
+    """Return an array of a file as :func:`strapdown.checks.array` lets it pass."""
+    place = _place(group, name)
+    if not hasattr(group[name], "dtype"):
+        raise InputError(f"{place} is a group and not an array; the file is damaged, make it again")
+    return array(place, group[name][()], shape)
+
+
+def _place(group: Any, name: str) -> str:
+    return f"{group.file.filename}: {f'{group.name}/{name}'.lstrip('/')}"
+
+
+def _above_zero(place: str, variance: Array) -> Array:
+    """Return variances, none of them zero or less."""
+    if np.any(variance <= 0.0):
+        index = tuple(int(i) for i in np.argwhere(variance <= 0.0)[0])
+        raise InputError(
+            f"{place}{list(index)} is {variance[index]:g}, and a variance is greater than zero; the file is damaged, or a sensor had no "
+            "noise: give each a sigma above zero and make the estimate again"
+        )
+    return variance
+
+
+def _biases(group: Any, name: str, rows: int) -> Array:
+    """Return gyro biases (rows, 3) that a gyro may have."""
+    value = _numbers(group, name, (rows, 3))
+    if np.any(np.abs(value) > LARGEST_BIAS):
+        index = tuple(int(i) for i in np.argwhere(np.abs(value) > LARGEST_BIAS)[0])
+        raise InputError(
+            f"{_place(group, name)}{list(index)} is {value[index]:g} rad/s, the bias of no gyro; the file is damaged or its filter was "
+            "lost: make the estimate again, and look at its start and the gyro's unit"
+        )
+    return value
+
+
+def _attitudes(group: Any, name: str, rows: int) -> Array:
+    """Return attitudes (rows, 4) as they stand, of norm one."""
+    value = _numbers(group, name, (rows, 4))
+    unit_quaternions(_place(group, name), value)
+    return value
+
+
 def read_truth(path: str | os.PathLike[str]) -> Truth | None:
-    """Read the truth that :func:`write_estimate` was given, at the times of the estimate; None if it was given none."""
+    """Read the truth that :func:`write_estimate` was given, at the times of the estimate; None if it was given none.
+
+    Raises
+    ------
+    InputError
+        As :func:`read_estimate` does.
+    """
     with _estimate_file(path) as file:
         if "truth" not in file:
             return None
-        return Truth(attitude=file["truth/attitude"][:], bias=file["truth/bias"][:])
+        rows = len(_numbers(file, "time", ("n",)))
+        return Truth(attitude=_attitudes(file, "truth/attitude", rows), bias=_biases(file, "truth/bias", rows))
 
 
 def read_estimate(path: str | os.PathLike[str]) -> Estimate:
-    """Read an estimate written by :func:`write_estimate`."""
+    """Read an estimate written by :func:`write_estimate`.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, truncated, no HDF5 or another kind of file, or holds what no filter estimates: shapes that do not fit each
+        other, times that go back, quaternions of another norm than one, variances of zero or less, biases above ``LARGEST_BIAS``.
+    """
     with _estimate_file(path) as file:
-        rows = len(increasing(f"{path}: time", file["time"][:]))
-        for name, width in (("attitude", (4,)), ("bias", (3,)), ("variance", (6,)), ("covariance", (6, 6))):
-            if name in file:
-                array(f"{path}: {name}", file[name][:], (rows, *width))
+        time = increasing(_place(file, "time"), _numbers(file, "time", ("n",)))
+        rows = len(time)
+        covariance = _numbers(file, "covariance", (rows, 6, 6)) if "covariance" in file else None
+        if covariance is not None:
+            _above_zero(f"{_place(file, 'covariance')}, diagonal", np.diagonal(covariance, axis1=1, axis2=2))
         groups = file["innovations"].values() if "innovations" in file else ()
         return Estimate(
-            time=file["time"][:],
-            attitude=file["attitude"][:],
-            bias=file["bias"][:],
-            variance=file["variance"][:],
-            covariance=file["covariance"][:] if "covariance" in file else None,
-            innovations={
-                part.attrs["sensor"]: Innovations(
-                    time=part["time"][:],
-                    innovation=part["innovation"][:],
-                    variance=part["variance"][:],
-                    weight=part["weight"][:] if "weight" in part else None,
-                )
-                for part in groups
-            },
+            time=time,
+            attitude=_attitudes(file, "attitude", rows),
+            bias=_biases(file, "bias", rows),
+            variance=_above_zero(_place(file, "variance"), _numbers(file, "variance", (rows, 6))),
+            covariance=covariance,
+            innovations={part.attrs["sensor"]: _innovations(part) for part in groups},
             skipped={part.attrs["sensor"]: int(part.attrs["skipped"]) for part in groups},
             events=tuple(
                 Event(
@@ -368,6 +434,18 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
                 for one in (file["events"].values() if "events" in file else ())
             ),
         )
+
+
+def _innovations(part: Any) -> Innovations:
+    """Return the innovations of one sensor's group."""
+    number = len(_numbers(part, "time", ("m",)))
+    innovation = _numbers(part, "innovation", (number, "degrees of freedom"))
+    return Innovations(
+        time=_numbers(part, "time", (number,)),
+        innovation=innovation,
+        variance=_above_zero(_place(part, "variance"), _numbers(part, "variance", innovation.shape)),
+        weight=_numbers(part, "weight", (number,)) if "weight" in part else None,
+    )
 
 
 def read_attributes(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -8,7 +8,7 @@
 :class:`Monitor`
     A running mean of the normalised innovation squared, whose excursions are reported with their times.
 
-They are options of :func:`strapdown.mekf.run` and of :class:`strapdown.mekf.StepFilter`.
+They are options of :func:`strapdown.mekf.run` and of :class:`strapdown.mekf.StepFilter`, and of their like in :mod:`strapdown.augmented`.
 """
 
 from __future__ import annotations
@@ -21,12 +21,16 @@ from typing import Literal
 
 import numpy as np
 
-from strapdown import quaternion
+from strapdown import kinematics, quaternion
 from strapdown.checks import Array, InputError, count, finite, one_of, positive
 from strapdown.records import Event
 
 UNIFORM_SIGMA = math.pi / math.sqrt(3.0)
 """Standard deviation of an angle that is uniform over the whole turn, rad."""
+
+
+LOCK_OUT = 10
+"""A gate without recovery tells when a sensor was refused more often than taken in by more than this."""
 
 
 def _probability(name: str, value: float) -> None:
@@ -39,10 +43,22 @@ class Gate:
     """Refuse a measurement whose NIS no right filter would show, and recover from a state in which good ones are refused.
 
     At the first refusal a challenger is started from the filter's own state made as uncertain as a fresh start: attitude independent of the
-    bias with ``restart_attitude_sigma``, bias variance plus that of ``restart_bias_sigma``. It takes in all that follows, and is dropped as
-    soon as no sensor is being refused any more, or when it refuses more than it accepts. When one sensor has been refused ``recovery``
-    times in a row and the challenger has accepted as many of the measurements that the filter refused, these agree with each other and not
-    with the filter: the challenger takes over, and the estimate holds an event that says so.
+    bias with ``restart_attitude_sigma``, bias variance plus that of ``restart_bias_sigma``, and optional states at their prior, independent
+    of both: whatever led the filter astray has gone into them too. It takes in all that follows, and is dropped as soon as no sensor is
+    being refused any more. When one sensor has been refused ``recovery`` times in a row and the challenger has accepted as many of the
+    measurements that the filter refused, these agree with each other and not with the filter: the challenger takes over, and the estimate
+    holds an event that says so.
+
+    A challenger fails when it refuses three measurements in a row, or more than 1 + half of those that it accepts; the next starts with σ
+    three times as wide. It is made three times as wide itself, as if it had started so, when its bias moves far for its start (the squares
+    over the first variances beyond the median of χ²₃) or the NIS of what it accepts adds up to more than three standard deviations above
+    the degrees of freedom. σ of the attitude grows up to uniform, that of the bias up to 3⁷ times the first, of which only refusals are
+    counted; then the first comes again. A takeover makes the next one wider too, until the filter has accepted ``5 recovery`` measurements:
+    only then has it helped. The process noise stays what it is. The turn between two measurements that a bias unknown by so much leaves
+    must stay well below a radian.
+
+    Whether or not that helps, the estimate holds an event of kind ``"lock-out"`` for each stretch in which a sensor was refused more often
+    than taken in by more than ``recovery`` (without recovery, ten); a recovery within twice that number tells of it instead.
     """
 
     probability: float = 0.999
@@ -53,7 +69,8 @@ class Gate:
     restart_attitude_sigma: float = UNIFORM_SIGMA
     """Standard deviation of the challenger's initial attitude error, rad."""
     restart_bias_sigma: float | None = None
-    """Standard deviation added to the challenger's bias error, rad/s; None: that of the initial state, each axis its own."""
+    """Standard deviation added to the first challenger's bias error, rad/s; None: that of the initial state, each axis its own, of a record
+    filtered in parts the state that the first part started from."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -71,11 +88,30 @@ class Gate:
 
         return np.asarray(chdtri([1.0, 2.0, 3.0], 1.0 - self.probability))
 
+    @property
+    def lock_out_limit(self) -> int:
+        """A sensor refused more often than taken in by more than this is told."""
+        return self.recovery or LOCK_OUT
+
     def restart_bias_variance(self, initial: Array) -> Array:
-        """Return what is added to the variance of the challenger's bias (3,), (rad/s)², of a filter with this initial P (6, 6)."""
+        """Return what is added to the variance of the first challenger's bias (3,), (rad/s)², of a filter with this initial P (6, 6)."""
         if self.restart_bias_sigma is None:
             return np.diag(initial)[3:].copy()
         return np.full(3, self.restart_bias_sigma**2)
+
+
+@dataclass(frozen=True, kw_only=True)
+class GateMemory:
+    """What a gate remembers at the end of a part of a record, for the next part to go on from."""
+
+    restart_bias_variance: Array
+    """What the first challenger's bias variance grows by where the gate does not say (3,), (rad/s)²."""
+    challenger: Array
+    """The challenger's state as the kernels pack it (28,)."""
+    counts: Array
+    """Whether there is a challenger, how it does, and how wide the next one starts, as :mod:`strapdown.kernels.robust_loop` holds them."""
+    standing: dict[str, Array]
+    """Refusals of each sensor, as held there."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -207,32 +243,37 @@ WIDE_PASSES = 20
 """Linearisations of one update at most, of a challenger and of a filter that has recovered."""
 _RELINEARIZED = 0.05
 """rad; an iterated update is linearised anew until its correction is smaller."""
+_SETTLED = 1e-4
+"""rad; the same of an attitude that is hardly known."""
 _UNKNOWN = 1.0
-"""rad²; with more attitude variance than this in all, an update that fails is tried again from elsewhere."""
+"""rad²; with more attitude variance than this in all it is hardly known, and an update that fails is tried again from elsewhere."""
 _TURN_ASIDE = 2.0 * math.pi / 3.0
 
 _ONE_AXIS = 5.0
 """The least certain axis stands alone if its variance is so many times the sum of the others'."""
 _UNKNOWN_TILT = 4.0
 """rad²; with more variance of the tilt than this a heading tells nothing."""
+_OPPOSITE = -0.9
+"""Cosine; an axis seen so far from where it was says nothing of the shortest turn there."""
 
 Rows = tuple[Array, Array, Array, float, float]
-"""Residual (d,), H (d, 3) of the attitude error, covariance (d, d); of a direction or vector the angle θ from the predicted one, rad, and
+"""Residual (d,), H (d, k) of the first k states, covariance (d, d); of a direction or vector the angle θ from the predicted one, rad, and
 θ over the length of its part across (of other kinds 0 and 1)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Linearised:
-    """A measurement as seen from the attitude that an update is linearised at."""
+    """A measurement as seen from the state that an update is linearised at: its attitude, or with optional states all of it."""
 
     attitude: Array
     """q_fb (4,)."""
     covariance: Array
-    """The prior's P (6, 6), moved there."""
+    """The prior's P (n, n), moved there."""
     prior: Array
-    """Where the prior's mean lies, seen from there (3,), rad."""
+    """Where the prior's mean lies, seen from there (k,): of the attitude, rad, k = 3, or of all n states."""
     residual: Array
     H: Array
+    """(d, k)."""
     noise: Array
     """Covariance of the residual (d, d)."""
     angle: float = 0.0
@@ -248,7 +289,8 @@ class Linearised:
     @property
     def predicted(self) -> Array:
         """H P Hᵀ (d, d)."""
-        return np.asarray(self.H @ self.covariance[:3, :3] @ self.H.T)
+        k = len(self.prior)
+        return np.asarray(self.H @ self.covariance[:k, :k] @ self.H.T)
 
     @property
     def nis(self) -> float:
@@ -279,17 +321,27 @@ class Linearised:
 
 
 def linearise(
-    rows: Callable[[Array], Rows], attitude: Array, covariance: Array, passes: int, threshold: float
+    rows: Callable[..., Rows],
+    attitude: Array,
+    covariance: Array,
+    passes: int,
+    threshold: float,
+    others: Array | None = None,
 ) -> Linearised:
-    """Return a measurement seen from the attitude that its update leads to, by at most ``passes`` linearisations; one is the plain filter.
+    """Return a measurement seen from the state that its update leads to, by at most ``passes`` linearisations; one is the plain filter.
 
-    The method is that of :func:`strapdown.kernels.robust_step.take_in`, which tells its reasons.
+    ``rows`` tells the measurement at an attitude; where ``others`` (n − 3,) are given, the bias and the optional states, at an attitude and
+    those. The method is that of :func:`strapdown.kernels.robust_step.take_in`, which tells its reasons.
     """
+    size, k = len(covariance), 3 if others is None else len(covariance)
     first = quaternion.to_matrix(attitude)
-    now, P, prior = attitude, covariance, np.zeros(3)
+    start = np.empty(0) if others is None else others
+    now, now_others, P, prior = attitude, start, covariance, np.zeros(k)
+    unknown = np.trace(covariance[:3, :3]) >= _UNKNOWN
+    tolerance = _SETTLED if unknown else _RELINEARIZED
     done, trials = 1, 0
     while True:
-        residual, H, noise, angle, far = rows(now)
+        residual, H, noise, angle, far = rows(now) if others is None else rows(now, now_others)
         seen = Linearised(attitude=now, covariance=P, prior=prior, residual=residual, H=H, noise=noise, angle=angle)
         if passes == 1:
             return seen
@@ -298,21 +350,62 @@ def linearise(
         lower = lower / np.diag(lower)
         stretch = np.array([far, far, 1.0])[: len(residual)]
         from_afar = lower @ (stretch * np.linalg.solve(lower, residual)) - H @ prior
-        step = prior + P[:3, :3] @ H.T @ np.linalg.solve(seen.predicted + noise, from_afar)
-        converged = bool(step @ step < _RELINEARIZED**2)
+        step = prior + P[:k, :k] @ H.T @ np.linalg.solve(seen.predicted + noise, from_afar)
+        on_rows = np.linalg.solve(lower, H[:, 6:] @ step[6:])
+        converged = bool(step[:3] @ step[:3] + on_rows @ on_rows < tolerance**2)
         if converged or done >= passes:
             seen = replace(seen, converged=converged)
-            if seen.acceptable(threshold) or trials == 2 or np.trace(covariance[:3, :3]) < _UNKNOWN:
+            if seen.acceptable(threshold) or trials == 2 or not unknown:
                 return seen
             trials += 1
-            done, now = 0, attitude
-            step = math.copysign(_TURN_ASIDE, trials - 1.5) * _least_certain(covariance)
-        now = quaternion.normalize(quaternion.multiply(now, quaternion.exp(step)))
-        turn = np.eye(6)
-        turn[:3, :3] = quaternion.to_matrix(now).T @ first
-        P = turn @ covariance @ turn.T
-        prior = _turn_back(quaternion.multiply(quaternion.conjugate(now), attitude), P)
+            done, now, now_others, step = 0, attitude, start, np.zeros(k)
+            step[:3] = math.copysign(_TURN_ASIDE, trials - 1.5) * _least_certain(covariance)
+        now = quaternion.normalize(quaternion.multiply(now, quaternion.exp(step[:3])))
+        now_others = now_others + step[3:]
+        if others is None:
+            P, prior = seen_from(quaternion.multiply(quaternion.conjugate(attitude), now), covariance)
+        else:
+            turn = np.eye(size)
+            turn[:3, :3] = _carried(quaternion.to_matrix(now).T @ first, covariance)
+            P = turn @ covariance @ turn.T
+            back = _turn_back(quaternion.multiply(quaternion.conjugate(now), attitude), P)
+            prior = np.concatenate([back, start - now_others])
         done += 1
+
+
+def _carried(there: Array, covariance: Array) -> Array:
+    """Return the turn (3, 3) of a covariance (:func:`strapdown.kernels.robust_step.carried`)."""
+    A = covariance[:3, :3]
+    axis = _least_certain(covariance)
+    largest = float(axis @ A @ axis)
+    moved = there @ axis
+    cosine = float(axis @ moved)
+    if largest < _ONE_AXIS * (np.trace(A) - largest) or cosine < _OPPOSITE:
+        return there
+    v = kinematics.skew(np.cross(axis, moved))
+    return np.asarray(np.eye(3) + v + v @ v / (1.0 + cosine))
+
+
+def seen_from(q: Array, covariance: Array) -> tuple[Array, Array]:
+    """Return the P (6, 6) of a prior at the attitude that lies the turn q from its mean, and where the mean lies seen from there (3,), rad.
+
+    The method is that of :func:`strapdown.kernels.robust_step.seen_from`, which tells its reasons.
+    """
+    A = covariance[:3, :3]
+    axis = _least_certain(covariance)
+    largest = float(axis @ A @ axis)
+    turn, tilt = 0.0, quaternion.log(q)
+    if largest > _ONE_AXIS * (np.trace(A) - largest):
+        turn = 2.0 * math.atan2(float(axis @ q[1:]), float(q[0]))
+        tilt = quaternion.log(quaternion.multiply(quaternion.exp(-turn * axis), q))
+        turn = (turn + math.pi) % (2.0 * math.pi) - math.pi
+    else:
+        axis = np.zeros(3)
+    halfway = quaternion.to_matrix(quaternion.exp(-0.5 * tilt))
+    whole = halfway @ halfway @ axis
+    G = np.eye(len(covariance))
+    G[:3, :3] = halfway + np.outer(whole - halfway @ axis, axis)
+    return G @ covariance @ G.T, -turn * whole - tilt
 
 
 def tilt_unknown(attitude: Array, covariance: Array) -> bool:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from strapdown import units
-from strapdown.checks import Array, InputError, known_keys
+from strapdown.checks import Array, InputError, known_keys, numbers
 
 Choice = tuple[tuple[str, float], ...]
 """Suffixes of the key and their factors to SI."""
@@ -111,8 +111,8 @@ def _number(content: Any, factor: float, choice: Choice, place: str) -> Any:
     if np.ndim(content) == 0:
         return float(content) * factor if choice != PLAIN else content
     try:
-        return np.asarray(content, np.float64) * factor
-    except ValueError:
+        return numbers(place, content) * factor
+    except InputError:
         raise InputError(f"{place} is {content!r}; it must be a list of numbers, rows of one length") from None
 
 

@@ -24,6 +24,7 @@ from strapdown.checks import (
     finite,
     increasing,
     non_negative,
+    numbers,
     one_of,
     positive,
     unit_quaternions,
@@ -57,7 +58,12 @@ class Sensor(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class VectorMeasurements:
-    """A series of measurements of one sensor."""
+    """A series of measurements of one sensor.
+
+    A sample with a NaN in ``vector_b``, or in ``attitude``, is missing: filters skip and count it. What else belongs to it may be NaN too:
+    in place of its σ and covariance then stands the mean square of the others', of its reference another's, of its arrival its time, so
+    that nothing computed over the series is touched by it.
+    """
 
     sensor: str
     """Name of the sensor."""
@@ -68,16 +74,16 @@ class VectorMeasurements:
     """What is measured, in the fixed frame: a unit direction (3,), or (m, 3) if it changes; for kind ``"vector"`` with its length. Not used
     for kind ``"attitude"``."""
     vector_b: Array = field(default_factory=lambda: np.empty((0, 3)))
-    """Measured vectors (m, 3), body frame; of unit length but for kind ``"vector"``; rows of NaN are missing samples. For kind
-    ``"attitude"`` there are none and this is filled with NaN."""
+    """Measured vectors (m, 3), body frame; of unit length but for kind ``"vector"``. For kind ``"attitude"`` there are none and this is
+    filled with NaN."""
     sigma: Array = field(default_factory=lambda: np.zeros(1))
-    """Noise of each component (across the direction: rad; of a vector: its unit), (m,); a scalar is spread over all samples. Where
-    ``sigma_axes`` or ``covariance`` are given, their root mean square."""
+    """Noise of each component (across the direction: rad; of a vector: its unit; of an attitude about each body axis: rad), (m,); a scalar
+    is spread over all samples. Where ``sigma_axes`` or ``covariance`` are given, their root mean square."""
     attitude: Array | None = None
     """Measured q_fb (m, 4) for kind ``"attitude"``, with the error on the body side."""
     sigma_axes: Array | None = None
-    """Noise of each body axis (m, 3), in the unit of sigma; (3,) is spread over all samples. Kind ``"attitude"`` needs it, or
-    ``covariance``; of a direction the part across it counts."""
+    """Noise of each body axis (m, 3), in the unit of sigma; (3,) is spread over all samples. Of a direction the part across it counts. A
+    series of kind ``"attitude"`` always has it, from whatever its noise was told by."""
     covariance: Array | None = None
     """Covariance of the noise in body axes (m, 3, 3), the square of the unit of sigma; (3, 3) is spread over all samples. Of a direction
     the part across it counts; a heading has none."""
@@ -87,29 +93,34 @@ class VectorMeasurements:
     def __post_init__(self) -> None:
         """Check every field."""
         one_of(f"{self.sensor}: kind", self.kind, KINDS)
-        time = increasing(f"{self.sensor}: time", self.time, least=0) if len(self.time) else np.empty(0)
+        time = increasing(f"{self.sensor}: time", self.time, least=0)
         m = len(time)
         store: dict[str, Any] = {"time": time}
-        attitude = self.kind == "attitude"
-        if attitude:
-            if self.attitude is None or (self.sigma_axes is None and self.covariance is None):
-                raise InputError(
-                    f"{self.sensor}: a series of kind 'attitude' needs attitude (m, 4) and sigma_axes (m, 3)"
-                )
-            given = array(f"{self.sensor}: attitude", self.attitude, (m, 4))
-            store["attitude"] = unit_quaternions(f"{self.sensor}: attitude", given)
+        if self.kind == "attitude":
+            if self.attitude is None:
+                raise InputError(f"{self.sensor}: a series of kind 'attitude' needs attitude (m, 4)")
+            name = f"{self.sensor}: attitude"
+            given = array(name, self.attitude, (m, 4), allow_nan=True)
+            missing = _missing(given)
+            if missing.any():
+                whole = unit_quaternions(name, np.where(missing[:, None], quaternion.IDENTITY, given))
+                store["attitude"] = np.where(missing[:, None], given, whole)
+            else:
+                store["attitude"] = unit_quaternions(name, given)
             store["vector_b"] = np.full((m, 3), np.nan)
         else:
             if self.attitude is not None:
                 raise InputError(f"{self.sensor}: attitude belongs to kind 'attitude', not {self.kind!r}")
             vector = array(f"{self.sensor}: vector_b", self.vector_b, (m, 3), allow_nan=True)
             if self.kind != "vector":
-                _need_unit(f"{self.sensor}: vector_b", vector)
+                need_unit(f"{self.sensor}: vector_b", vector)
+            missing = _missing(vector)
             store["vector_b"] = vector
-        store.update(self._noise(m))
-        store["reference_f"] = self._reference(m)
+        store.update(self._noise(m, missing))
+        store["reference_f"] = self._reference(m, missing)
         if self.arrival is not None:
-            arrival = array(f"{self.sensor}: arrival", self.arrival, (m,))
+            arrival = array(f"{self.sensor}: arrival", self.arrival, (m,), allow_nan=True)
+            arrival = _of_known(f"{self.sensor}: arrival", arrival, missing, time)
             if np.any(arrival < time):
                 k = int(np.argmax(arrival < time))
                 raise InputError(f"{self.sensor}: arrival[{k}] is {arrival[k]:.9g} s, before its time {time[k]:.9g} s")
@@ -117,47 +128,72 @@ class VectorMeasurements:
         for name, value in store.items():
             object.__setattr__(self, name, value)
 
-    def _noise(self, m: int) -> dict[str, Array]:
+    def _noise(self, m: int, missing: np.ndarray) -> dict[str, Array]:
         """Return sigma (m,), and with them sigma_axes (m, 3) and covariance (m, 3, 3) as far as they are given."""
         found: dict[str, Array] = {}
         axes: Array | None = None
         if self.kind == "heading" and not (self.sigma_axes is None and self.covariance is None):
             raise InputError(f"{self.sensor}: a heading has one sigma; sigma_axes and covariance belong to other kinds")
         if self.sigma_axes is not None:
-            axes = array(
-                f"{self.sensor}: sigma_axes", np.broadcast_to(np.asarray(self.sigma_axes, np.float64), (m, 3)), (m, 3)
-            )
+            axes = _of_known(f"{self.sensor}: sigma_axes", self._given_axes(m), missing, _root_mean_square)
             if np.any(axes < 0.0):
                 raise InputError(f"{self.sensor}: sigma_axes has a negative entry; give standard deviations")
             found["sigma_axes"] = axes
+        known: Any = ~missing if missing.any() else slice(None)
         if self.covariance is not None:
-            found["covariance"] = whole = _covariances(f"{self.sensor}: covariance", self.covariance, m)
+            found["covariance"] = whole = _covariances(f"{self.sensor}: covariance", self.covariance, m, missing)
             diagonal = np.sqrt(np.einsum("kii->ki", whole))
-            if axes is not None and not np.allclose(axes, diagonal, rtol=1e-12, atol=0.0):
+            if axes is not None and not np.allclose(axes[known], diagonal[known], rtol=1e-12, atol=0.0):
                 raise InputError(f"{self.sensor}: sigma_axes and covariance contradict each other; give one of them")
             axes = diagonal
             if self.kind == "attitude":
                 found["sigma_axes"] = axes
-        own = np.broadcast_to(self.sigma, (m,)) if np.ndim(self.sigma) == 0 or len(self.sigma) != m else self.sigma
-        sigma = array(f"{self.sensor}: sigma", own, (m,))
+        given = self._given_sigma(m)
+        told = np.any(numbers("sigma", self.sigma) != 0.0)  # of an empty series too
+        if axes is None and self.kind == "attitude" and not told:
+            raise InputError(
+                f"{self.sensor}: a series of kind 'attitude' needs its noise: sigma (m,), sigma_axes (m, 3) or covariance (m, 3, 3)"
+            )
+        sigma = _of_known(f"{self.sensor}: sigma", given, missing, _root_mean_square)
         if np.any(sigma < 0.0):
             k = int(np.argmax(sigma < 0.0))
             raise InputError(f"{self.sensor}: sigma[{k}] is {sigma[k]:g}; it must not be negative")
         if axes is not None:
             mean = np.sqrt(np.mean(axes**2, axis=1))
-            if self.kind != "attitude" and np.any(sigma) and not np.allclose(sigma, mean, rtol=1e-12, atol=0.0):
+            if self.kind != "attitude" and told and not np.allclose(sigma[known], mean[known], rtol=1e-12, atol=0.0):
                 raise InputError(
                     f"{self.sensor}: sigma contradicts sigma_axes or covariance; leave it out, it is their root mean square"
                 )
             sigma = mean
+        elif self.kind == "attitude":
+            found["sigma_axes"] = np.repeat(sigma[:, None], 3, axis=1)
         found["sigma"] = sigma
         return found
 
-    def _reference(self, m: int) -> Array:
+    def _given_sigma(self, m: int) -> Array:
+        """Return σ of each sample (m,) as it was given, a single one spread over all."""
+        given = numbers(f"{self.sensor}: sigma", self.sigma)
+        if given.shape not in ((), (1,), (m,)):
+            by_axis = "" if self.kind == "heading" else ", and one a body axis as sigma_axes"
+            raise InputError(
+                f"{self.sensor}: sigma has shape {given.shape} for {m} samples; give one number, or one a sample{by_axis}"
+            )
+        return array(f"{self.sensor}: sigma", np.broadcast_to(given, (m,)), (m,), allow_nan=True)
+
+    def _given_axes(self, m: int) -> Array:
+        """Return σ of each body axis (m, 3) as it was given, one of all samples spread over them."""
+        given = numbers(f"{self.sensor}: sigma_axes", self.sigma_axes)  # type: ignore[arg-type]
+        if given.shape not in ((), (3,), (1, 3), (m, 3)):
+            raise InputError(
+                f"{self.sensor}: sigma_axes has shape {given.shape} for {m} samples; give one number a body axis (3,), or (m, 3)"
+            )
+        return array(f"{self.sensor}: sigma_axes", np.broadcast_to(given, (m, 3)), (m, 3), allow_nan=True)
+
+    def _reference(self, m: int, missing: np.ndarray) -> Array:
         name = f"{self.sensor}: reference_f"
-        reference = np.asarray(self.reference_f, np.float64)
+        reference = numbers(name, self.reference_f)
         if reference.ndim == 2:
-            reference = array(name, reference, (m, 3))
+            reference = _of_known(name, array(name, reference, (m, 3), allow_nan=True), missing, _first_or_level)
             if self.kind != "vector":
                 length = np.linalg.norm(reference, axis=1, keepdims=True)
                 if np.any(length == 0.0):
@@ -166,9 +202,7 @@ class VectorMeasurements:
         else:
             reference = array(name, reference, (3,)) if self.kind == "vector" else _direction(name, reference)
         if self.kind == "heading":
-            level = np.atleast_1d(np.hypot(reference[..., 0], reference[..., 1]))
-            if np.any(level < 1e-3):
-                raise InputError(f"{name} is vertical and shows no heading; give one with a horizontal part")
+            need_level(name, reference)
         return reference
 
     @property
@@ -211,11 +245,51 @@ class VectorMeasurements:
         return np.asarray(self.sigma[:, None, None] ** 2 * np.eye(3))
 
 
-def _covariances(name: str, value: ArrayLike, m: int) -> Array:
+def _missing(value: Array) -> np.ndarray:
+    """Return which rows (m,) hold a NaN; one makes the sum so, which is the quicker to tell that there is none."""
+    if np.isnan(np.sum(value)):
+        return np.asarray(np.isnan(value).any(axis=1))
+    return np.zeros(len(value), bool)
+
+
+def _of_known(name: str, value: Array, missing: np.ndarray, stand_in: Array | Callable[[Array], ArrayLike]) -> Array:
+    """Return what belongs to each sample (m, ...), where it is NaN of a missing one (m,) with ``stand_in`` for it.
+
+    That is an array as long, or a function of what is known of the others.
+    """
+    if not np.isnan(np.sum(value)):
+        return value
+    lost = np.isnan(value.reshape(len(value), -1)).any(axis=1)
+    if np.any(lost & ~missing):
+        k = int(np.argmax(lost & ~missing))
+        raise InputError(
+            f"{name}[{k}] is nan beside a measured value; give it, or mark the sample as missing by NaN in the value itself"
+        )
+    filled = value.copy()
+    filled[lost] = stand_in(value[~lost]) if callable(stand_in) else stand_in[lost]
+    return filled
+
+
+def _root_mean_square(known: Array) -> Array:
+    return np.asarray(np.sqrt(np.mean(known**2, axis=0)) if len(known) else np.ones(known.shape[1:]))
+
+
+def _mean_covariance(known: Array) -> Array:
+    return np.asarray(np.mean(known, axis=0) if len(known) else np.eye(3))
+
+
+def _first_or_level(known: Array) -> Array:
+    return np.asarray(known[0] if len(known) else (1.0, 0.0, 0.0))
+
+
+def _covariances(name: str, value: ArrayLike, m: int, missing: np.ndarray) -> Array:
     """Return covariances (m, 3, 3), symmetric and with no negative eigenvalue; (3, 3) is spread over all."""
-    given = np.asarray(value, np.float64)
-    whole = array(name, np.broadcast_to(given, (m, 3, 3)) if given.shape == (3, 3) else given, (m, 3, 3))
-    one = whole[:1] if given.shape == (3, 3) else whole
+    given = numbers(name, value)
+    if given.shape == (3, 3):
+        one = array(name, given, (3, 3))[None]
+        whole = np.broadcast_to(one, (m, 3, 3))
+    else:
+        one = whole = _of_known(name, array(name, given, (m, 3, 3), allow_nan=True), missing, _mean_covariance)
     size = np.einsum("kii->k", np.abs(one))[:, None, None]
     lopsided = np.any(np.abs(one - np.swapaxes(one, 1, 2)) > 1e-12 * size, axis=(1, 2))
     if lopsided.any():
@@ -227,14 +301,30 @@ def _covariances(name: str, value: ArrayLike, m: int) -> Array:
     return whole
 
 
-def _need_unit(name: str, vector: Array) -> None:
+UNIT_TOLERANCE = 1e-6
+"""A measured direction whose length is off by more than this is taken for a mistake, not for rounding."""
+LEAST_LEVEL = 1e-3
+"""A unit reference with a horizontal part below this shows no heading."""
+
+
+def need_unit(name: str, vector: Array) -> None:
+    """Refuse measured vectors (..., 3) that are not of unit length; those with NaN pass, they are missing."""
     norm = np.linalg.norm(vector, axis=-1)
-    bad = np.abs(norm - 1.0) > 1e-6
+    bad = np.abs(norm - 1.0) > UNIT_TOLERANCE
     if np.any(bad):
         k = int(np.argmax(bad))
+        place = f"{name}[{k}]" if bad.ndim else name
         raise InputError(
-            f"{name}[{k}] has length {norm[k]:.6g}; divide each vector by its length (missing ones are NaN)"
+            f"{place} has length {np.ravel(norm)[k]:.6g}; divide each vector by its length (missing ones are NaN)"
         )
+
+
+def need_level(name: str, reference: Array) -> None:
+    """Refuse unit references (..., 3) of a heading that are vertical."""
+    level = np.hypot(reference[..., 0], reference[..., 1])
+    if np.any(level < LEAST_LEVEL):
+        place = f"{name}[{int(np.argmax(level < LEAST_LEVEL))}]" if level.ndim else name
+        raise InputError(f"{place} is vertical and shows no heading; give one with a horizontal part")
 
 
 def _direction(name: str, value: ArrayLike) -> Array:

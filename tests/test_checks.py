@@ -49,6 +49,15 @@ def test_array_passes_what_fits():
         (["one", "two"], ("n",), ("x is not an array of numbers",)),
         ([[1.0, 2.0], [3.0]], ("n", 2), ("x is not an array of numbers",)),
         ({"a": 1}, ("n",), ("x is not an array of numbers",)),
+        (True, (), ("x is not an array of numbers", "True or False", "pass floats")),
+        ([True, 1.0, 0.0], (3,), ("x is not an array of numbers", "True or False")),
+        ([[1.0, 2.0], (3.0, np.bool_(False))], (2, 2), ("True or False",)),
+        (np.array([True, False]), (2,), ("True or False",)),
+        ([np.array([True])], (1, 1), ("True or False",)),
+        (["1.0", "2.0"], (2,), ("x is not an array of numbers", "text")),
+        (np.array([b"1.0"]), (1,), ("text",)),
+        ([1.0 + 2.0j, 3.0], (2,), ("x is not an array of numbers", "complex")),
+        (np.array(["2026-01-01"], dtype="datetime64[s]"), (1,), ("dates",)),
     ],
 )
 def test_array_names_what_does_not_fit(value, shape, words):
@@ -70,8 +79,16 @@ def test_numbers_pass():
     assert isinstance(checks.positive("x", 2), float)
 
 
+NO_NUMBERS = (
+    *(np.nan, np.inf, -np.inf, 1.0 + 0.0j, np.complex128(1.0)),
+    *(None, "fast", "60", b"60", np.datetime64("2026-01-01"), {}),
+    *(True, np.bool_(True), np.array(True)),
+    *([1.0, 2.0], [True], np.array([True]), np.array([1.0])),
+)
+
+
 @pytest.mark.parametrize("check", [checks.positive, checks.non_negative, checks.finite])
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, None, "fast", [1.0, 2.0]])
+@pytest.mark.parametrize("value", NO_NUMBERS)
 def test_what_is_no_finite_number_is_refused(check, value):
     refused(lambda: check("rate", value, unit="Hz"), "rate is", "number in Hz")
 
@@ -96,7 +113,7 @@ def test_counts():
     assert checks.count("seed", 0, least=0) == 0
 
 
-@pytest.mark.parametrize("value", [0, -1, 2.5, True, "4", "many", None, np.nan, np.inf])
+@pytest.mark.parametrize("value", [0, -1, 2.5, True, np.bool_(True), np.array(True), "4", "many", None, np.nan, np.inf])
 def test_what_is_no_count_is_refused(value):
     refused(lambda: checks.count("runs", value), "runs is", "whole number of 1 or more")
 

@@ -350,8 +350,11 @@ def bad_csv(folder: Path, case: str) -> Path:
         header = BARE
     elif case == "unsorted":
         columns[[10, 11]] = columns[[11, 10]]
-    elif case == "nan":
-        columns[7, 2] = np.nan
+    elif case == "infinite":
+        columns[7, 2] = np.inf
+    elif case == "repeated":
+        columns[7, 0] = columns[6, 0]
+        columns[7, 1] += 0.1
     elif case == "short":
         columns = columns[:50]
     write_csv(path, columns, header)
@@ -369,11 +372,12 @@ def bad_csv(folder: Path, case: str) -> Path:
             "does not say the unit of its gyro columns; declare it in the header, as in gx [rad/s], or by option",
         ),
         ("unsorted", "time[11] goes back to 0.1 s after 0.11 s; sort the stamps"),
-        ("nan", "rate[7, 1] is nan"),
+        ("infinite", "rate[7, 1] is inf"),
+        ("repeated", "time[7] repeats 0.06 s after 0.06 s; sort the stamps and drop repeated ones"),
         ("short", "lasts 0.49 s; the start needs at least 1 s"),
         ("truncated", "data row 300 has 9 fields, the header 10; the file is truncated"),
     ],
-    ids=["undeclared", "unsorted", "nan", "short", "truncated"],
+    ids=["undeclared", "unsorted", "infinite", "repeated", "short", "truncated"],
 )
 def test_bad_recordings_end_with_one_clear_line_and_nothing_written(run, tmp_path, case, words):
     status, said, error = run("estimate", bad_csv(tmp_path, case), "--out", tmp_path / "out")

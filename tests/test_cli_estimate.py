@@ -2,13 +2,12 @@
 
 import dataclasses
 import json
-import sys
 
 import h5py
 import numpy as np
 import pytest
 
-from strapdown import cli, coning, consistency, mekf, motion, quaternion, records, scenarios, setup
+from strapdown import coning, consistency, mekf, motion, quaternion, records, scenarios, setup
 from strapdown.checks import InputError
 from strapdown.gyro import GyroSpec
 from strapdown.mekf import ProcessNoise
@@ -37,17 +36,13 @@ def made(sensors=STARS, duration=6.0):
 
 
 @pytest.fixture
-def run(monkeypatch, capsys):
+def run(run, monkeypatch):
+    """Run ``strapdown ARGUMENTS`` as the fixture of all tests does, its words on one line."""
+    monkeypatch.setenv("COLUMNS", "1000")
+
     def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["strapdown", *(str(a) for a in arguments)])
-        monkeypatch.setenv("COLUMNS", "1000")
-        try:
-            cli.main()
-            status = 0
-        except SystemExit as stop:
-            status = stop.code or 0
-        said = capsys.readouterr()
-        return status, " ".join(said.out.split()), said.err
+        status, said, complaint = run(*arguments)
+        return status, " ".join(said.split()), complaint
 
     return call
 
@@ -223,13 +218,18 @@ def test_states_of_a_record_that_tells_no_scenario_and_a_gate(run, record, tmp_p
     assert not (tmp_path / "out" / "states.json").exists()
 
 
-def test_a_gate_with_states_says_that_it_does_not_recover(run, spinning, tmp_path):
-    status, said, error = run(
-        "estimate", spinning, "--out", tmp_path / "out", "--states", "--gate", 0.999, "--every", 100
-    )
+def test_a_lost_filter_with_states_recovers(run, spinning, tmp_path):
+    told = ("--states", "--gate", 0.999, "--every", 100)
+    status, said, error = run("estimate", spinning, "--out", tmp_path / "right", *told)
     assert (status, error) == (0, "")
-    assert "does not recover" in said
-    assert read_estimate(tmp_path / "out" / "estimate.h5").innovations["star"].weight is not None
+    assert "Recovered at" not in said
+    status, said, error = run("estimate", spinning, "--out", tmp_path / "lost", *told, "--attitude", "0,0,1,0.1")
+    assert (status, error) == (0, "")
+    assert "Recovered at" in said
+    one, other = (read_estimate(tmp_path / name / "estimate.h5") for name in ("right", "lost"))
+    assert one.innovations["star"].weight is not None
+    assert [event.kind for event in other.events] == ["recovery"]
+    assert quaternion.angle_between(one.attitude[-1], other.attitude[-1]) < 0.01
 
 
 def test_states_are_refused_where_they_make_no_sense(run, spinning, tmp_path):

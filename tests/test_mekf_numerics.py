@@ -2,13 +2,16 @@
 
 from dataclasses import replace
 
+import mpmath
 import numpy as np
 import pytest
 
-from strapdown import mekf, motion, quaternion
+from strapdown import augmented, mekf, motion, quaternion, smoother
+from strapdown.checks import InputError
 from strapdown.gyro import GyroSpec
 from strapdown.kernels import filter_loop
-from strapdown.mekf import ProcessNoise, initial_state
+from strapdown.kernels.filter_loop import CHECKED
+from strapdown.mekf import ProcessNoise, StepFilter, initial_state
 from strapdown.records import ImuRecord
 from strapdown.robustness import Gate
 from strapdown.scenarios import Scenario, simulate
@@ -37,13 +40,15 @@ def sharp_record(sigma, steps=400):
     return ImuRecord(time=time, increments=body.increments(time), vectors=tuple(series)), body.attitude(time)
 
 
-@pytest.mark.parametrize("exponent", range(-7, 4))
-@pytest.mark.parametrize("gate", [None, Gate(probability=1.0 - 1e-12)], ids=["plain", "options"])
-def test_positive_definite_over_ten_decades_of_noise_over_the_prior(exponent, gate):
-    """σ from 1e-7 to 1e3 of the prior's, both loops, at every step: the range that the Joseph row form holds.
+OPTIONS = Gate(probability=1.0 - 1e-12)
+DECADES = [(exponent, gate) for exponent in range(-9, 4) for gate in (None, OPTIONS) if gate is None or exponent >= -7]
+"""Of σ over the prior's. With options the covariance is kept as it is, and below 1e-7 a row of h·P·h + σ² loses σ² altogether."""
+NAMES = [f"1e{exponent}-{'plain' if gate is None else 'options'}" for exponent, gate in DECADES]
 
-    Below, a row of h·P·h + σ² loses σ² altogether (1e-14 is near the rounding of P); the augmented filter's square-root form is for that.
-    """
+
+@pytest.mark.parametrize(("exponent", "gate"), DECADES, ids=NAMES)
+def test_positive_definite_over_twelve_decades_of_noise_over_the_prior(exponent, gate):
+    """σ from 1e-9 to 1e3 of the prior's, both loops, at every step."""
     record, truth = sharp_record(10.0**exponent)
     start = initial_state(
         quaternion.multiply(truth[0], quaternion.exp([1e-9, 0, 0])), attitude_sigma=1.0, bias_sigma=0.1
@@ -54,10 +59,9 @@ def test_positive_definite_over_ten_decades_of_noise_over_the_prior(exponent, ga
     assert np.max(quaternion.angle_between(result.attitude, truth)) < 1e-6
 
 
-@pytest.mark.parametrize("exponent", range(-7, 4))
-@pytest.mark.parametrize("gate", [None, Gate(probability=1.0 - 1e-12)], ids=["plain", "options"])
+@pytest.mark.parametrize(("exponent", "gate"), DECADES, ids=NAMES)
 def test_the_covariance_is_that_of_the_information_form(exponent, gate):
-    """(I/σ₀² + Σ (I − r rᵀ)/σ²)⁻¹ of three directions at one time: right to the rounding that the ratio leaves, 1e-16 (σ₀/σ)²."""
+    """(I/σ₀² + Σ (I − r rᵀ)/σ²)⁻¹ of three directions at one time: with options to the rounding that the ratio leaves, 1e-16 (σ₀/σ)²."""
     sigma = 10.0**exponent
     references = np.array([[1.0, 0.0, 0.0], [0.0, 0.6, 0.8], [0.6, -0.8, 0.0]])
     series = tuple(
@@ -70,12 +74,149 @@ def test_the_covariance_is_that_of_the_information_form(exponent, gate):
     information = np.eye(3) + sum(np.eye(3) - np.outer(r, r) for r in references) / sigma**2
     expected = np.linalg.inv(information)
     d = np.sqrt(np.diag(expected))
-    assert np.abs((P - expected) / np.outer(d, d)).max() < max(1e-9, 10.0 * 2.2e-16 / sigma**2)
+    left = 1e-9 if gate is None else max(1e-9, 10.0 * 2.2e-16 / sigma**2)
+    assert np.abs((P - expected) / np.outer(d, d)).max() < left
 
 
-@pytest.mark.parametrize(("parts", "steps"), [(1, 100_000), pytest.param(20, 500_000, marks=pytest.mark.slow)])
+def reference_variances(record, noise, prior):
+    """Variances (m, 6) of a body that does not turn and whose errors are zero, by the covariance's recursion in 60 digits."""
+    mp = mpmath.mp
+    with mpmath.workdps(60):
+        P = mp.diag([mp.mpf(float(x)) ** 2 for x in prior])
+        v, u = mp.mpf(noise.angle_random_walk) ** 2, mp.mpf(noise.rate_random_walk) ** 2
+        rows = []
+        for k, now in enumerate(record.time):
+            if k:
+                dt = mp.mpf(float(now)) - mp.mpf(float(record.time[k - 1]))
+                step = mp.eye(6)
+                Q = mp.zeros(6, 6)
+                for i in range(3):
+                    step[i, 3 + i] = -dt
+                    Q[i, i] = v * dt + u * dt**3 / 3
+                    Q[i, 3 + i] = Q[3 + i, i] = -u * dt**2 / 2
+                    Q[3 + i, 3 + i] = u * dt
+                P = step * P * step.T + Q
+            for series in record.vectors:
+                for at in np.flatnonzero(series.time == now):
+                    r = mp.matrix([mp.mpf(float(x)) for x in series.references_f[at]])
+                    H = mp.zeros(3, 6)
+                    for (i, j), x in {
+                        (0, 1): -r[2],
+                        (0, 2): r[1],
+                        (1, 0): r[2],
+                        (1, 2): -r[0],
+                        (2, 0): -r[1],
+                        (2, 1): r[0],
+                    }.items():
+                        H[i, j] = x
+                    across = mp.qr(mp.matrix([[r[0], 1, 0], [r[1], 0, 1], [r[2], 1, 1]]))[0][:, 1:]
+                    H = across.T * H  # two directions across r: along it nothing is measured
+                    S = H * P * H.T + mp.mpf(float(series.sigma[at])) ** 2 * mp.eye(2)
+                    P = P - P * H.T * mp.inverse(S) * H * P
+                    P = (P + P.T) / 2
+            rows.append([float(P[i, i]) for i in range(6)])
+        return np.array(rows)
+
+
+@pytest.mark.parametrize("noise", [(1e-12, 0.0), (1e-12, 1e-14), (1e-4, 1e-5)], ids=["no drift", "little", "usual"])
+@pytest.mark.parametrize("sigma", [1e-9, 1e-6, 1e-3])
+@pytest.mark.parametrize("sensors", [1, 3])
+def test_no_digit_is_lost_where_the_covariance_holds_none(sensors, sigma, noise):
+    """Random directions, one or three at a time, against 60 digits: after one of them σ about it is still the prior's, 1e9 times more."""
+    generator = np.random.default_rng(7)
+    time = np.concatenate([0.1 * np.arange(31), [1000.0, 1000.1]])  # an outage after which attitude and bias are one
+    series = []
+    for k in range(sensors):
+        r = generator.standard_normal(3)
+        r /= np.linalg.norm(r)
+        at = time[[0, 10, 20, 32]] if k == 0 else time[[0, 10]]
+        series.append(
+            VectorMeasurements(
+                sensor=f"s{k}", kind="direction", time=at, vector_b=np.tile(r, (len(at), 1)), reference_f=r, sigma=sigma
+            )
+        )
+    record = ImuRecord(time=time, increments=np.zeros((len(time) - 1, 3)), vectors=tuple(series))
+    process = ProcessNoise(angle_random_walk=noise[0], rate_random_walk=noise[1])
+    start = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1.0, bias_sigma=0.1)
+    estimate = mekf.run(record, process, start, full_covariance=True)
+    expected = reference_variances(record, process, [1.0] * 3 + [0.1] * 3)
+    assert np.max(np.abs(estimate.variance / expected - 1.0)) < 1e-6
+    assert least_eigenvalue(estimate.covariance) > 0.0
+    thinned = mekf.run(record, process, start, every=7)
+    assert np.max(np.abs(thinned.variance / expected[::7] - 1.0)) < 1e-6
+
+
+def test_an_outage_that_makes_attitude_and_bias_one_leaves_the_covariance_definite():
+    """After 1e7 s the attitude's error is the bias's, to 1e-18 of its variance; a measurement then tells both."""
+    time = np.concatenate([[0.0, 1.0], 1e7 + np.arange(3.0)])
+    series = tuple(
+        VectorMeasurements(
+            sensor=name, kind="direction", time=time[[0, 3]], vector_b=np.tile(r, (2, 1)), reference_f=r, sigma=1e-3
+        )
+        for name, r in (("x", [1.0, 0.0, 0.0]), ("y", [0.0, 0.6, 0.8]))
+    )
+    process = ProcessNoise(angle_random_walk=1e-12, rate_random_walk=0.0)
+    start = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1.0, bias_sigma=0.1)
+    for end in (3, 5):  # before and after the measurements end the outage
+        mine = tuple(s.taken(np.flatnonzero(s.time <= time[end - 1])) for s in series)
+        record = ImuRecord(time=time[:end], increments=np.zeros((end - 1, 3)), vectors=mine)
+        estimate = mekf.run(record, process, start, full_covariance=True)
+        assert least_eigenvalue(estimate.covariance) > 0.0
+        expected = reference_variances(record, process, [1.0] * 3 + [0.1] * 3)
+        assert np.max(np.abs(estimate.variance / expected - 1.0)) < 1e-6
+
+
+def test_factors_are_carried_through_large_corrections():
+    """A start a third of a radian off and sharp directions: the covariance's reset is that of the step face."""
+    record, truth = sharp_record(1e-5, steps=6)
+    off = quaternion.multiply(truth[0], quaternion.exp([0.3, -0.2, 0.1]))
+    start = initial_state(off, attitude_sigma=0.5, bias_sigma=0.01)
+    estimate = mekf.run(record, NOISE, start)
+    f = StepFilter(NOISE, start)
+    for k, now in enumerate(record.time[1:]):
+        f.predict(record.increments[k], now - record.time[k])
+        for s in record.vectors:
+            for at in np.flatnonzero(s.time == now):
+                f.update_direction(s.vector_b[at], s.references_f[at], float(s.sigma[at]))
+        assert np.max(quaternion.angle_between(f.attitude, estimate.attitude[k + 1])) < 1e-9
+        assert np.allclose(np.diag(f.P), estimate.variance[k + 1], rtol=1e-5)
+
+
+def test_a_stretch_in_factors_is_the_filter_itself():
+    """One sharp direction in a record of many: up to the stretch bit for bit as without it, after it as the step face to its rounding."""
+    record, _ = sharp_record(1e-2, steps=CHECKED + 500)
+    at_step = CHECKED + 200
+    middle = float(record.time[at_step])
+    body = motion.ConstantRate(rate=(0.3, -0.5, 0.4))
+    seen = quaternion.rotate(quaternion.conjugate(body.attitude(middle)), np.array([0.0, 0.0, 1.0]))
+    sharp = VectorMeasurements(
+        sensor="sharp", kind="direction", time=[middle], vector_b=[seen], reference_f=[0.0, 0.0, 1.0], sigma=1e-9
+    )
+    whole = replace(record, vectors=(*record.vectors, sharp))
+    start = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.1, bias_sigma=0.01)
+    without, estimate = mekf.run(record, NOISE, start), mekf.run(whole, NOISE, start, full_covariance=True)
+    assert np.array_equal(estimate.attitude[: CHECKED + 1], without.attitude[: CHECKED + 1])
+    assert np.allclose(estimate.attitude[:at_step], without.attitude[:at_step], rtol=0.0, atol=1e-14)
+    assert np.allclose(estimate.variance[:at_step], without.variance[:at_step], rtol=1e-11, atol=0.0)
+    spread = np.linalg.eigvalsh(estimate.covariance[at_step, :3, :3])
+    assert spread[0] < 1e-6 * spread[2]
+    f = StepFilter(NOISE, start)
+    series = {k: s for s in whole.vectors for k in [(s.sensor, float(t)) for t in s.time]}
+    for k, now in enumerate(record.time):
+        if k:
+            f.predict(record.increments[k - 1], now - record.time[k - 1])
+        for s in whole.vectors:
+            if (s.sensor, float(now)) in series:
+                at = int(np.searchsorted(s.time, now))
+                f.update_direction(s.vector_b[at], s.references_f[at], float(s.sigma[at]))
+        if k in (at_step - 1, at_step + 20, at_step + 300):
+            assert np.max(quaternion.angle_between(f.attitude, estimate.attitude[k])) < 1e-9
+            assert np.allclose(np.diag(f.P), estimate.variance[k], rtol=1e-4)
+
+
+@pytest.mark.parametrize(("parts", "steps"), [(1, 100_000), pytest.param(500, 2_000_000, marks=pytest.mark.slow)])
 def test_positive_definite_and_steady_over_a_long_run(parts, steps):
-    """1e5 steps, or 1e7: the covariance repeats itself period by period to rounding, and the quaternion keeps its norm."""
+    """1e5 steps, or 1e9 (five minutes): the covariance repeats itself period by period to rounding, and the quaternion keeps its norm."""
     body = motion.ConstantRate(rate=(0.0, 0.0, 2.0 * np.pi / 10.0))
     time = 0.1 * np.arange(steps + 1)
     series = tuple(
@@ -133,6 +274,10 @@ def run_plain(record, start, dtype):
         *outputs,
         np.empty((len(events.row), 6), dtype),
         np.empty((0, 32), dtype),
+        np.inf,  # the run goes on where digits are lost
+        -np.inf,
+        np.empty(28, dtype),
+        np.empty((7, 6), dtype),
     )
     return outputs
 
@@ -172,3 +317,18 @@ def test_single_precision_is_good_to_a_hundredth_of_a_sigma():
     _, _, right, _ = run_plain(sharp, start, np.float64)
     at = np.searchsorted(record.time, sharp.vectors[0].time)
     assert np.max(np.abs(broken[at, :3] / right[at, :3] - 1.0)) > 0.1
+
+
+def test_the_smoother_refuses_what_has_no_digits_left_and_names_who_takes_it():
+    """Directions to a nanoradian at a start known to a radian, and little noise: the smoother's own covariance would be rounding alone."""
+    record, truth = sharp_record(1e-9, steps=30)
+    process = ProcessNoise(angle_random_walk=1e-12, rate_random_walk=1e-14)
+    start = initial_state(truth[0], attitude_sigma=1.0, bias_sigma=0.1)
+    with pytest.raises(InputError, match=r"after 0 s the covariance loses its digits.*augmented\.smooth"):
+        smoother.run(record, process, start)
+    whole = augmented.smooth(record, process, start)
+    assert np.max(quaternion.angle_between(whole.attitude, truth)) < 1e-8
+    assert np.all(whole.variance > 0.0)
+    usual, truth = sharp_record(1e-6, steps=30)  # an arc second or better from a start as bad is smoothed as ever
+    smoothed = smoother.run(usual, NOISE, start)
+    assert np.max(quaternion.angle_between(smoothed.attitude, truth)) < 1e-6

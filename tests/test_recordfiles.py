@@ -99,6 +99,15 @@ def test_csv_reads_back_equal(made, tmp_path):
     assert_equal(dataclasses.replace(back, vectors=tuple(s for s in back.vectors if len(s.time))), kept)
 
 
+def test_what_csv_cannot_hold_is_refused_before_anything_is_written(made, tmp_path):
+    *others, last = (series for series in made[1].vectors if series.kind == "direction")
+    uneven = dataclasses.replace(last, sigma=np.zeros(len(last.time)), sigma_axes=np.array([1e-3, 2e-3, 3e-3]))
+    record = dataclasses.replace(made[1], vectors=(*others, uneven))
+    with pytest.raises(InputError, match=f"{last.sensor}: CSV has no columns for sigma_axes or covariance; write HDF5"):
+        export_csv(tmp_path / "record.csv", record)
+    assert not list(tmp_path.iterdir())
+
+
 def test_foreign_and_damaged_hdf5_is_refused(made, tmp_path):
     path = tmp_path / "record.h5"
     with pytest.raises(InputError, match="does not exist"):
@@ -181,3 +190,29 @@ def test_foreign_and_damaged_csv_is_refused(made, tmp_path):
     with pytest.raises(InputError, match="no vector series"):
         import_csv(path)
     assert recordfiles.KIND == "strapdown record"
+
+
+def test_a_row_without_an_increment_is_named_with_what_to_do(tmp_path):
+    path = tmp_path / "record.csv"
+    export_csv(path, ImuRecord(time=np.arange(5.0), increments=np.arange(12.0).reshape(4, 3)))
+    lines = path.read_text().splitlines()
+    cells = lines[4].split(",")
+    path.write_text("\n".join([*lines[:4], ",".join([*cells[:2], "nan", cells[3]]), *lines[5:]]))
+    with pytest.raises(InputError, match="line 5: increment_y_rad is nan; leave the row out"):
+        import_csv(path)
+    path.write_text("\n".join([*lines[:4], *lines[5:]]))
+    np.testing.assert_array_equal(import_csv(path).time, [0.0, 1.0, 3.0, 4.0])
+
+
+def test_missing_samples_of_every_kind_go_through_both_files(made, tmp_path):
+    record = made[1]
+    holed = []
+    for series in record.vectors:
+        name = "vector_b" if series.attitude is None else "attitude"
+        value = getattr(series, name).copy()
+        value[1:2] = np.nan
+        holed.append(dataclasses.replace(series, **{name: value}))
+    record = dataclasses.replace(record, vectors=tuple(s for s in holed if len(s.time)))
+    write_record(tmp_path / "record.h5", record)
+    assert_equal(read_record(tmp_path / "record.h5"), record)
+    assert_equal(import_csv(export_csv(tmp_path / "record.csv", record)[0]), record)

@@ -5,10 +5,13 @@ from __future__ import annotations
 import h5py
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
-from strapdown import recordings
+from strapdown import mekf, recordings
 from strapdown.checks import InputError
+from strapdown.cli import app
 from strapdown.recordings import Recording, read
+from strapdown.records import ImuRecord
 
 HEADER = "time,gx [rad/s],gy,gz,ax [m/s2],ay,az"
 ROWS = ("0.00,0.1,0.2,0.3,1,2,9", "0.01,0.4,0.5,0.6,3,4,8", "0.02,0.7,0.8,0.9,5,6,7")
@@ -144,9 +147,71 @@ def test_what_is_no_number_is_refused(csv, bad):
     refused(csv(rows=[ROWS[0], f'0.01,0.4,"{bad}",0.6,3,4,8']), "data row 2, column gy", repr(bad), "not a number")
 
 
-@pytest.mark.parametrize("bad", ["nan", "", "inf", "-Infinity"])
-def test_a_gyro_without_a_value_is_refused(csv, bad):
+@pytest.mark.parametrize("bad", ["inf", "-Infinity"])
+def test_an_infinite_rate_is_refused(csv, bad):
     refused(csv(rows=[ROWS[0], f"0.01,0.4,{bad},0.6,3,4,8"]), "rate[1, 1] is", "remove or interpolate")
+
+
+@pytest.mark.parametrize("bad", ["nan", "", " "])
+def test_rows_without_a_gyro_sample_are_left_out_and_told(csv, bad):
+    """What the turn across them is nobody knows: the intervals beside one are joined, and a filter's covariance grows over all of it."""
+    rows = [f"{0.01 * k:.2f},{0.1 * k},0,0,{k},2,9" for k in range(8)]
+    for k in (0, 3, 4):
+        rows[k] = f"{0.01 * k:.2f},{0.1 * k},{bad},0,{k},2,9"
+    recording = read(csv(rows=rows))
+    np.testing.assert_array_equal(recording.time, [0.01, 0.02, 0.05, 0.06, 0.07])
+    np.testing.assert_allclose(recording.specific_force[:, 0], [1, 2, 5, 6, 7])
+    np.testing.assert_array_equal(recording.missing_gyro, [0.0, 0.03, 0.04])
+    np.testing.assert_array_equal(recording.since(1).missing_gyro, [0.03, 0.04])
+    # The trapezoid over the joined interval; of a rate that changes evenly it is right.
+    np.testing.assert_allclose(recordings.increments(recording)[1, 0], 0.5 * (0.2 + 0.5) * 0.03, rtol=1e-14)
+    assert recording.left_out_words.startswith("3 rows without a gyro sample, the first at 0.000 s, were left out")
+    assert read(csv()).left_out_words == ""
+    growth = mekf.run(
+        ImuRecord(time=recording.time, increments=recordings.increments(recording)),
+        mekf.ProcessNoise(angle_random_walk=1e-3, rate_random_walk=0.0),
+        mekf.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-6, bias_sigma=1e-9),
+    ).variance[:, 0]
+    np.testing.assert_allclose(np.diff(growth), 1e-6 * np.diff(recording.time), rtol=1e-6)
+
+
+def test_rows_that_repeat_the_row_before_are_left_out_and_told(csv):
+    """A logger that writes a row twice; the same stamp with another sample is refused, and named."""
+    rows = [f"{0.01 * k:.2f},{0.1 * k},0,0,{k},2,9" for k in range(6)]
+    once = read(csv(rows=rows))
+    twice = read(csv(rows=[*rows[:3], rows[2], rows[2], *rows[3:], rows[5]]))
+    np.testing.assert_array_equal(twice.time, once.time)
+    np.testing.assert_array_equal(twice.rate, once.rate)
+    np.testing.assert_array_equal(twice.specific_force, once.specific_force)
+    np.testing.assert_array_equal(twice.repeated, [0.02, 0.02, 0.05])
+    np.testing.assert_array_equal(twice.since(3).repeated, [0.05])
+    assert twice.left_out_words == "3 rows that repeat the row before, the first at 0.020 s, were left out."
+    assert once.left_out_words == ""
+    missing = rows[2].replace("0.2,0,0", ",0,0")
+    both = read(csv(rows=[*rows[:2], missing, missing, *rows[3:]]))
+    np.testing.assert_array_equal(both.repeated, [0.02])
+    np.testing.assert_array_equal(both.missing_gyro, [0.02])
+    with pytest.raises(InputError, match=r"time\[3\] repeats 0.02 s after 0.02 s"):
+        read(csv(rows=[*rows[:3], rows[2].replace("0.2,0,0", "0.3,0,0"), *rows[3:]]))
+
+
+def test_a_file_of_hardly_a_gyro_sample_is_refused(csv):
+    refused(csv(rows=[ROWS[0], "0.01,0.4,,0.6,3,4,8"]), "1 of 2 rows have a gyro sample about each axis", "at least 2")
+    refused(csv(rows=[ROWS[0], "0.02,,0,0,0,0,9", "0.01,1,0,0,0,0,9", ROWS[2]]), "time[2] goes back to 0.01 s")
+
+
+def test_what_is_missing_is_told_where_a_recording_is_used(csv, tmp_path):
+    rows = [f"{0.01 * k:.2f},{'' if k in (150, 151) else 0.0},0,0,0,0,9.8" for k in range(300)]
+    path = csv(rows=rows)
+    for command in (
+        ["estimate", str(path), "--out", str(tmp_path / "e")],
+        ["integrate", str(path), "--out", str(tmp_path / "i.h5")],
+    ):
+        result = CliRunner().invoke(app, command)
+        assert result.exit_code == 0, result.output
+        assert "2 rows without a gyro sample, the first at 1.500 s, were left out" in " ".join(result.output.split())
+    with pytest.raises(InputError, match=r"the interval after 1.49 s is 0.03 s"):
+        recordings.read_gyro(path)
 
 
 def test_infinite_accelerations_are_refused(csv):
@@ -155,7 +220,8 @@ def test_infinite_accelerations_are_refused(csv):
 
 def test_stamps_out_of_order_are_refused(csv):
     refused(csv(rows=[ROWS[0], ROWS[2], ROWS[1]]), "time[2] goes back to 0.01 s", "sort")
-    refused(csv(rows=[ROWS[0], ROWS[1], ROWS[1]]), "time[2] repeats 0.01 s", "drop repeated")
+    other = ",".join([ROWS[1].partition(",")[0], *["0.5"] * 6])
+    refused(csv(rows=[ROWS[0], ROWS[1], other]), "time[2] repeats 0.01 s", "drop repeated")
     refused(csv(rows=[ROWS[0], ",0,0,0,0,0,9"]), "time[1] is nan")
 
 
@@ -244,7 +310,9 @@ def test_text_named_hdf5_is_refused(tmp_path):
 def test_bad_values_in_hdf5_are_refused(hdf5):
     bad = np.zeros((50, 3))
     bad[7, 2] = np.nan
-    refused(hdf5(imu_gyr=bad), "rate[7, 2] is nan")
+    np.testing.assert_allclose(read(hdf5(imu_gyr=bad)).missing_gyro, [7 / 250.0])
+    bad[7, 2] = np.inf
+    refused(hdf5(imu_gyr=bad), "rate[7, 2] is inf")
     refused(hdf5(imu_acc=np.zeros((49, 3))), "specific_force has shape (49, 3), wanted (50, 3)")
     refused(hdf5(opt_quat=np.zeros((50, 3))), "true_attitude has shape")
     refused(hdf5(movement=np.ones(49, bool)), "movement has shape (49,)")

@@ -20,6 +20,7 @@ from strapdown.records import (
     compress,
     cut,
     read_estimate,
+    read_truth,
     write_estimate,
 )
 from strapdown.vectors import VectorMeasurements
@@ -100,9 +101,10 @@ def test_compress(name):
     np.testing.assert_array_equal(small.truth.bias, r.truth.bias[: kept * n + 1 : n])
     assert small.increments.shape == (kept, 3)
     assert small.vectors == r.vectors
-    if n == 2:  # the two-sample algorithm, written out
+    if n == 2:  # the two-sample algorithm, written out; of unequal intervals, tests/test_coning_uneven.py tells
+        even = compress(dataclasses.replace(r, time=5.0 + np.arange(14.0)), algorithm)
         first, second = r.increments[0:26:2][:kept], r.increments[1:26:2][:kept]
-        np.testing.assert_allclose(small.increments, first + second + 2.0 / 3.0 * np.cross(first, second), atol=1e-16)
+        np.testing.assert_allclose(even.increments, first + second + 2.0 / 3.0 * np.cross(first, second), atol=1e-16)
 
 
 def test_compress_refuses_a_record_shorter_than_a_step():
@@ -256,3 +258,44 @@ def test_foreign_files_are_refused(tmp_path):
         read_estimate(half)
     with pytest.raises(InputError, match=r"none\.h5 does not exist; check the path"):
         read_estimate(tmp_path / "none.h5")
+
+
+@pytest.mark.parametrize(
+    ("name", "damage", "words"),
+    [
+        (
+            "variance",
+            lambda x: np.where(np.arange(6) == 4, 0.0, x),
+            r"variance\[0, 4\] is 0, and a variance is greater than zero",
+        ),
+        ("variance", lambda x: -x, r"variance\[0, 0\] is -.*make the estimate again"),
+        ("covariance", lambda x: -x, r"covariance, diagonal\[0, 0\] is -"),
+        ("innovations/0/variance", lambda x: x - 1e3, r"innovations/0/variance\[0, 0\] is -.*give each a sigma"),
+        ("innovations/0/variance", lambda x: x[:, :1], r"innovations/0/variance has shape"),
+        ("innovations/0/time", lambda x: x[1:], r"innovations/0/innovation has shape"),
+        ("bias", lambda x: x + 1e200, r"bias\[0, 0\] is 1e\+200 rad/s, the bias of no gyro.*unit"),
+        ("bias", lambda x: x[:, 0], r"bias has shape"),
+        ("bias", lambda x: np.array(["1.0"] * 7, dtype="S3"), r"bias "),
+        ("attitude", lambda x: 2.0 * x, r"attitude\[0\] has norm 2"),
+        ("attitude", lambda x: None, r"attitude is a group and not an array; .*make it again"),
+        ("time", lambda x: None, r"time is a group and not an array"),
+        ("time", lambda x: 1.0, r"time has shape \(\)"),
+        ("innovations/0/innovation", lambda x: None, r"innovations/0/innovation is a group"),
+        ("truth/bias", lambda x: -1e200 + x, r"truth/bias\[0, 0\] is -1e\+200 rad/s"),
+        ("truth/attitude", lambda x: x[1:], r"truth/attitude has shape"),
+        ("truth/attitude", lambda x: None, r"truth/attitude is a group"),
+    ],
+)
+def test_what_no_filter_estimates_is_refused(tmp_path, name, damage, words):
+    path = tmp_path / "estimate.h5"
+    written = estimate(full=True)
+    write_estimate(path, written, truth=Truth(attitude=random_attitudes(7), bias=np.zeros((7, 3))))
+    with h5py.File(path, "r+") as file:
+        value = damage(file[name][:])
+        del file[name]
+        if value is None:
+            file.create_group(name)
+        else:
+            file[name] = value
+    with pytest.raises(InputError, match=f"^{path}.*{words}"):
+        (read_truth if name.startswith("truth") else read_estimate)(path)

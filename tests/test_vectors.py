@@ -243,6 +243,126 @@ def test_bad_series_are_refused(change, message):
         VectorMeasurements(**{**good, **change})
 
 
+GOOD = {
+    "sensor": "s",
+    "kind": "direction",
+    "time": [0.0, 1.0, 2.0, 3.0, 4.0],
+    "vector_b": np.vstack([np.eye(3), np.eye(3)[:2]]),
+    "reference_f": [1.0, 0.0, 0.0],
+    "sigma": 0.1,
+}
+ATTITUDES = {
+    **GOOD,
+    "kind": "attitude",
+    "vector_b": np.empty((0, 3)),
+    "attitude": np.tile([1.0, 0.0, 0.0, 0.0], (5, 1)),
+}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"sigma": [0.1, 0.1]}, r"s: sigma has shape \(2,\) for 5 samples; give one number, or one a sample"),
+        ({"sigma": [0.1, 0.1, 0.2]}, r"s: sigma has shape \(3,\) .* as sigma_axes"),
+        ({"sigma": 0.1 * np.ones((5, 3))}, r"s: sigma has shape \(5, 3\)"),
+        ({"sigma": "0.1"}, "s: sigma is not an array of numbers"),
+        ({"sigma": 0.0, "sigma_axes": [0.1, 0.1]}, r"s: sigma_axes has shape \(2,\) .* one number a body axis"),
+        ({"sigma": 0.0, "covariance": np.eye(2)}, r"s: covariance has shape \(2, 2\)"),
+        ({"time": 0.5}, r"s: time has shape \(\)"),
+        ({"time": None}, "s: time"),
+        ({"kind": "attitude", "attitude": None}, "needs attitude"),
+        ({**ATTITUDES, "sigma": 0.0}, r"needs its noise: sigma \(m,\), sigma_axes \(m, 3\) or covariance \(m, 3, 3\)"),
+        ({**ATTITUDES, "attitude": 2.0 * ATTITUDES["attitude"]}, r"s: attitude\[0\] has norm 2"),
+        ({"sigma": np.nan}, r"s: sigma\[0\] is nan beside a measured value; give it, or mark the sample as missing"),
+        ({"sigma": [0.1, 0.1, 0.1, np.nan, 0.1]}, r"s: sigma\[3\] is nan beside a measured value"),
+        ({"sigma": [0.1, 0.1, 0.1, np.inf, 0.1]}, r"s: sigma\[3\] is inf"),
+        ({"sigma": 0.0, "sigma_axes": np.diag([1.0] * 5)[:, :3] * np.nan}, r"s: sigma_axes\[0\] is nan"),
+        ({"sigma": 0.0, "covariance": np.full((5, 3, 3), np.nan)}, r"s: covariance\[0\] is nan beside"),
+        ({"sigma": 0.0, "covariance": np.full((3, 3), np.nan)}, r"s: covariance\[0, 0\] is nan"),
+        ({"reference_f": np.vstack([np.eye(3), np.full((2, 3), np.nan)])}, r"s: reference_f\[3\] is nan beside"),
+        ({"arrival": [0.0, 1.0, np.nan, 3.0, 4.0]}, r"s: arrival\[2\] is nan beside"),
+    ],
+)
+def test_what_does_not_fit_the_samples_is_named(change, message):
+    VectorMeasurements(**GOOD)
+    with pytest.raises(InputError, match=message):
+        VectorMeasurements(**{**GOOD, **change})
+
+
+def test_one_sigma_of_an_attitude_is_that_about_each_axis():
+    one = VectorMeasurements(**{**ATTITUDES, "sigma": 0.01})
+    np.testing.assert_array_equal(one.sigma_axes, np.full((5, 3), 0.01))
+    np.testing.assert_array_equal(one.sigma, np.full(5, 0.01))
+    each = 0.01 * np.arange(1.0, 6.0)
+    varying = VectorMeasurements(**{**ATTITUDES, "sigma": each})
+    np.testing.assert_array_equal(varying.covariances, each[:, None, None] ** 2 * np.eye(3))
+    np.testing.assert_allclose(varying.noise_scaled(3.0).sigma_axes[:, 1], 3.0 * each, rtol=1e-15)
+    empty = {"time": [], "attitude": np.empty((0, 4))}
+    assert VectorMeasurements(**{**ATTITUDES, **empty}).sigma_axes.shape == (0, 3)
+
+
+def missing(kind, *, also):
+    """A series of five samples of which two are missing, and what belongs to these too."""
+    gone, value = np.array([False, True, False, False, True]), GOOD["vector_b"].copy()
+    holes = np.where(gone, np.nan, 1.0)
+    given = {**(ATTITUDES if kind == "attitude" else GOOD), "kind": kind}
+    if kind == "attitude":
+        given["attitude"] = ATTITUDES["attitude"] * np.stack([np.ones(5), holes, np.ones(5), np.ones(5)], axis=1)
+    else:
+        value[:, 2] *= holes
+        given["vector_b"] = value
+    noise = 0.1 * np.arange(1.0, 6.0)
+    given["sigma"] = noise
+    if also in ("sigma", "everything") or kind == "heading":
+        given["sigma"] = noise * (holes if also else 1.0)
+    if also in ("sigma_axes", "covariance") and kind != "heading":
+        axes = noise[:, None] * [1.0, 2.0, 3.0]
+        axes[gone, 1] = np.nan
+        given["sigma"] = np.zeros(5)
+        given[also] = axes if also == "sigma_axes" else axes[:, :, None] ** 2 * np.eye(3)
+    if also == "everything":
+        given["reference_f"] = np.array([[0.6, 0.8, 0.0]] * 5) * holes[:, None]
+        given["arrival"] = given["time"] + 0.1 * holes
+    return gone, given
+
+
+@pytest.mark.parametrize("also", ["", "sigma", "sigma_axes", "covariance", "everything"])
+@pytest.mark.parametrize("kind", vectors.KINDS)
+def test_what_belongs_to_a_missing_sample_may_be_missing_too(kind, also):
+    gone, given = missing(kind, also=also)
+    series = VectorMeasurements(**given)
+    content = series.attitude if kind == "attitude" else series.vector_b
+    np.testing.assert_array_equal(np.isnan(content).any(axis=1), gone)
+    known = series.taken(~gone)
+    assert np.isfinite(series.sigma).all()
+    assert np.isfinite(series.covariances).all()
+    assert np.isfinite(series.references_f).all()
+    # The stand-ins are those of which the mean square is that of the others, so that nothing computed of it moves.
+    if also:
+        np.testing.assert_allclose(np.mean(series.sigma**2), np.mean(known.sigma**2), rtol=1e-14)
+        np.testing.assert_allclose(series.covariances.mean(axis=0), known.covariances.mean(axis=0), rtol=1e-14)
+    for name in ("time", "sigma", "references_f"):
+        np.testing.assert_array_equal(getattr(series, name)[~gone], getattr(known, name))
+    if also == "everything":
+        np.testing.assert_array_equal(series.arrival[gone], series.time[gone])
+    # Made again from what it has become it stays so.
+    again = dataclasses.replace(series)
+    np.testing.assert_array_equal(again.sigma, series.sigma)
+
+
+@pytest.mark.parametrize("kind", vectors.KINDS)
+def test_a_series_may_be_missing_altogether(kind):
+    empty = {
+        name: np.full(np.shape(value), np.nan) for name, value in GOOD.items() if name in ("vector_b", "reference_f")
+    }
+    given = {**GOOD, **empty, "kind": kind, "sigma": np.full(5, np.nan), "reference_f": np.full((5, 3), np.nan)}
+    if kind == "attitude":
+        given = {**given, "vector_b": np.empty((0, 3)), "attitude": np.full((5, 4), np.nan)}
+    series = VectorMeasurements(**given)
+    assert np.isfinite(series.sigma).all()
+    assert np.isfinite(series.references_f).all()
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

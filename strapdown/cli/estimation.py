@@ -165,9 +165,7 @@ def _estimate_record(
     held = read_record_file(path)
     chosen, remarks = filter_for(path, held, gyro, filter_file, states)
     if gate is not None:
-        # A challenger that starts anew would know nothing of optional states.
-        own = Gate(probability=gate) if chosen.states is None else Gate(probability=gate, recovery=None)
-        chosen = dataclasses.replace(chosen, gate=own)
+        chosen = dataclasses.replace(chosen, gate=Gate(probability=gate))
     if robust is not None:
         chosen = dataclasses.replace(chosen, robust=Robust(kind=robust))  # type: ignore[arg-type]
     believed = setup.believed(held.record, chosen)
@@ -195,8 +193,6 @@ def _estimate_record(
     )
     for remark in remarks:
         console.print(remark, soft_wrap=True)
-    if gate is not None and chosen.states is not None:
-        console.print("With optional states the gate refuses, but does not recover a lost attitude.")
     _tell(result)
     paths = [out / "estimate.h5"]
     attributes: dict[str, Any] = {"source": str(path), "filter": setup.to_toml(chosen), "start": words}
@@ -416,6 +412,8 @@ def _estimate_recording(
     console.print(f"Fixed frame: {frame}.")
     for begin, length in recordings.gaps(used.time):
         console.print(f"Gap of {length:.3g} s after {begin:.3f} s: the turn across it is a guess, whatever σ says.")
+    if used.left_out_words:
+        console.print(used.left_out_words, soft_wrap=True)
     for sensor, number in result.estimate.skipped.items():
         if number:
             console.print(f"{number} samples of the {sensor} are missing and were skipped.")

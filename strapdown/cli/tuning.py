@@ -297,6 +297,8 @@ def _cases(
                 raise InputError(f"{path} is a recording, which specifies no errors; --states is for simulated records")
             recording = recordings.read(path, units=units)
             chosen = chosen or tuning.recording_setup()
+            if recording.left_out_words:
+                console.print(recording.left_out_words, soft_wrap=True)
             cases.append(tuning.recording_case(recording))
     assert chosen is not None
     return cases, chosen, gyros

@@ -5,7 +5,14 @@ from __future__ import annotations
 import math
 
 from strapdown.kernels.algebra import combine, dot, matrix_times_vector, scale, transpose_times_vector
-from strapdown.kernels.filter_step import heading_row, predict, update_attitude, update_direction, update_heading
+from strapdown.kernels.filter_step import (
+    heading_row,
+    predict,
+    shows_heading,
+    update_attitude,
+    update_direction,
+    update_heading,
+)
 from strapdown.kernels.lane_values import element
 from strapdown.kernels.rotation import rotation_matrix
 from strapdown.kernels.series import LARGEST_ANGLE
@@ -20,9 +27,47 @@ ATTITUDE = 3
 """Kind of an event: a whole attitude, three degrees of freedom. Its frame holds the quaternion in its first four numbers, its value the
 three variances."""
 
-
+CALLED = ("run_stretch", "least_share")
+"""Not inlined where other kernels use them."""
 MOST_TURN = 1e6
 """rad: a step whose bias turns the body by more is of a filter that is lost, and is not cut into sub-steps."""
+
+
+CHECKED = 1024
+"""Intervals from one look at that to the next."""
+
+
+def least_share(state, work):
+    """Return the least part that is left of any state's variance when the states after it are known; 1 of a state without variance.
+
+    It is the square of the diagonal of the covariance's triangular factor over the variance, and falls to the rounding of a double, or
+    below zero, where the covariance has lost its digits. ``state`` holds (q, b, A, B, C), ``work`` (7, 6) is scratch.
+    """
+    k = 0
+    for i in range(3):
+        for j in range(i, 3):
+            work[i, j] = state[7 + k]
+            work[3 + i, 3 + j] = state[22 + k]
+            k += 1
+        for j in range(3):
+            work[i, 3 + j] = state[13 + 3 * i + j]
+    for j in range(6):
+        work[6, j] = work[j, j]
+    least = 1.0
+    for j in range(5, -1, -1):
+        pivot = work[j, j]
+        if work[6, j] == 0.0:
+            continue
+        share = pivot / work[6, j]
+        if not share >= least:
+            least = share
+        if not share > 0.0:
+            return share
+        for i in range(j):
+            factor = work[i, j] / pivot
+            for c in range(i, j):
+                work[i, c] -= factor * work[c, j]
+    return least
 
 
 def vector_at(array, k):
@@ -59,13 +104,14 @@ def merge_order(time, heads, ends, ordered, row, series):
 def common_order(time, number, ordered, row, series):
     """Write what :func:`merge_order` does for ``number`` series that share the times ``time``."""
     count = len(time)
-    e = 0
-    for k in range(count):
-        for s in range(number):
+    for s in range(number):
+        e = s
+        first = s * count
+        for k in range(count):
             ordered[e] = time[k]
-            row[e] = s * count + k
+            row[e] = first + k
             series[e] = s
-            e += 1
+            e += number
 
 
 def store_state(out, q, b, A, B, C):
@@ -88,7 +134,7 @@ def store_segment(out, k, dt, part, q, b, A, B, C):
     store_state(out[k, 4:], q, b, A, B, C)
 
 
-def run_filter(
+def run_stretch(
     edges,
     increments,
     angle_variance,
@@ -111,22 +157,12 @@ def run_filter(
     covariance_out,
     innovation_out,
     segment_out,
+    sharp,
 ):
-    """Run the filter over a record; events lie between the first and the last edge.
+    """Run the filter over a stretch of a record: see :func:`run_filter`, of which the arguments are parts.
 
-    The e-th event, at ``time[e]``, is of series ``event_series[e]`` and stands at ``event_row[e]``, counted over all series one after
-    the other, of which ``bounds`` tells where each begins. Its three numbers are ``value[places[s, 0] + 3 · row]`` and the next two, its
-    σ is ``sigma[places[s, 1] + row]``: only the first series need lie in these arrays, each stays where it was measured. The kind of a
-    series is in ``kinds`` and its frames are in ``triads`` (frames: row of the first, and how many rows on the next).
-
-    The interval from ``edges[k]`` to ``edges[k + 1]`` is split at the times of the events inside it. ``state`` holds (q, b, A, B, C) as
-    28 numbers and is left at the end state, so a run may be continued. Row j of the outputs is the state after ``every · j`` intervals;
-    ``covariance_out`` (blocks A, B, C as 21 numbers) may be empty. One series after the other, ``innovation_out``
-    (events, 4 or 6) gets e₁, s₁, e₂, s₂, e₃, s₃: independent innovations and their variances, as many as it has degrees of
-    freedom.
-    ``segment_out`` (segments, 32), which may be
-    empty, gets what a smoother needs of each predicted segment: its dt, its increment (3) and the state (28) that it starts from.
-    Returns the number of segments stored.
+    Returns the numbers of segments stored and of events taken, and whether it ended before the stretch does, after a measurement whose
+    innovation has more than ``sharp`` times its own variance.
     """
     q = (state[0], state[1], state[2], state[3])
     b = (state[4], state[5], state[6])
@@ -184,6 +220,8 @@ def run_filter(
                 q, b, A, B, C, e1, s1, e2, s2, e3, s3 = update_attitude(q, b, A, B, C, measured, z)
                 innovation_out[at, 4] = e3
                 innovation_out[at, 5] = s3
+                if s1 > sharp * z[0] or s2 > sharp * z[1] or s3 > sharp * z[2]:
+                    return segments, e, True
             elif kind != HEADING:
                 u = (triads[t, 0], triads[t, 1], triads[t, 2])
                 v = (triads[t, 3], triads[t, 4], triads[t, 5])
@@ -193,10 +231,15 @@ def run_filter(
                     innovation_out[at, 4] = dot(transpose_times_vector(R, r), z) - 1.0
                     innovation_out[at, 5] = variance
                 q, b, A, B, C, e1, s1, e2, s2 = update_direction(q, b, A, B, C, R, u, v, z, variance)
+                if s1 + s2 > sharp * variance:
+                    return segments, e, True
             else:
-                error = heading_error(R, z, (triads[t, 6], triads[t, 7], triads[t, 8]))
-                q, b, A, B, C, e1, s1 = update_heading(q, b, A, B, C, heading_row(R, z), error, variance)
-                e2, s2 = 0.0, 1.0
+                e1, s1, e2, s2 = math.nan, 0.0, 0.0, 1.0
+                if shows_heading(R, z):
+                    error = heading_error(R, z, (triads[t, 6], triads[t, 7], triads[t, 8]))
+                    q, b, A, B, C, e1, s1 = update_heading(q, b, A, B, C, heading_row(R, z), error, variance)
+                if s1 > sharp * variance:
+                    return segments, e, True
             innovation_out[at, 0] = e1
             innovation_out[at, 1] = s1
             innovation_out[at, 2] = e2
@@ -223,4 +266,101 @@ def run_filter(
                 whole = end - now
                 theta = vector_at(increments, k)
     store_state(state, q, b, A, B, C)
-    return segments
+    return segments, e, False
+
+
+def run_filter(
+    edges,
+    increments,
+    angle_variance,
+    rate_variance,
+    time,
+    event_row,
+    event_series,
+    value,
+    sigma,
+    places,
+    bounds,
+    kinds,
+    frames,
+    triads,
+    state,
+    every,
+    attitude_out,
+    bias_out,
+    variance_out,
+    covariance_out,
+    innovation_out,
+    segment_out,
+    sharp,
+    least,
+    stretch_state,
+    work,
+):
+    """Run the filter over a record; events lie between the first and the last edge.
+
+    The e-th event, at ``time[e]``, is of series ``event_series[e]`` and stands at ``event_row[e]``, counted over all series one after
+    the other, of which ``bounds`` tells where each begins. Its three numbers are ``value[places[s, 0] + 3 · row]`` and the next two, its
+    σ is ``sigma[places[s, 1] + row]``: only the first series need lie in these arrays, each stays where it was measured. The kind of a
+    series is in ``kinds`` and its frames are in ``triads`` (frames: row of the first, and how many rows on the next).
+
+    The interval from ``edges[k]`` to ``edges[k + 1]`` is split at the times of the events inside it. ``state`` holds (q, b, A, B, C) as
+    28 numbers and is left at the end state, so a run may be continued. Row j of the outputs is the state after ``every · j`` intervals;
+    ``covariance_out`` (blocks A, B, C as 21 numbers) may be empty. One series after the other, ``innovation_out``
+    (events, 4 or 6) gets e₁, s₁, e₂, s₂, e₃, s₃: independent innovations and their variances, as many as it has degrees of
+    freedom.
+    ``segment_out`` (segments, 32), which may be
+    empty, gets what a smoother needs of each predicted segment: its dt, its increment (3) and the state (28) that it starts from.
+    ``stretch_state`` (28,) and ``work`` (7, 6) are scratch.
+
+    Returns the number of segments stored, and −1 and 0. Where the covariance would lose its digits, by a measurement of which the
+    innovation has more than ``sharp`` times its own variance or bit by bit until :func:`least_share` is below ``least``, the run ends,
+    ``state`` is left as it was when it had enough at last, at a row of the outputs, and that row and the number of events up to there are
+    returned: :func:`strapdown.kernels.factored_loop.run_factored` can go on from there.
+    """
+    if not least_share(state, work) >= least:
+        return 0, 0, 0
+    stretch = every * ((CHECKED + every - 1) // every)
+    segments = 0
+    row = 0
+    event = 0
+    begin = 0
+    while True:
+        end = min(begin + stretch, len(increments))
+        for i in range(28):
+            stretch_state[i] = state[i]
+        number, taken, too_sharp = run_stretch(
+            edges[begin : end + 1],
+            increments[begin:end],
+            angle_variance,
+            rate_variance,
+            time[event:],
+            event_row[event:],
+            event_series[event:],
+            value,
+            sigma,
+            places,
+            bounds,
+            kinds,
+            frames,
+            triads,
+            stretch_state,
+            every,
+            attitude_out[row:],
+            bias_out[row:],
+            variance_out[row:],
+            covariance_out[row:],
+            innovation_out,
+            segment_out[segments:],
+            sharp,
+        )
+        if too_sharp or not least_share(stretch_state, work) >= least:
+            return segments, row, event
+        for i in range(28):
+            state[i] = stretch_state[i]
+        segments += number
+        event += taken
+        begin = end
+        row = end // every
+        if end == len(increments):
+            return segments, -1, 0

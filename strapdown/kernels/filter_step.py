@@ -303,6 +303,12 @@ def heading_row(R, z):
     return transpose_times_vector(R, (whole * (tilt * m[0]), whole * (tilt * m[1]), whole))
 
 
+def shows_heading(R, z):
+    """Return whether a vector ``z`` (body) is not vertical; scalar machine only."""
+    x, y, _ = matrix_times_vector(R, z)
+    return x * x + y * y > VERTICAL
+
+
 def update_residual(q, b, A, B, C, y, variance):
     """Update with a measured error ``y`` of the attitude itself (3,), rad, body axes, of ``variance`` (3,) about the body axes, rad²."""
     first, b, A, B, C, s1 = update_row(b, A, B, C, (1.0, 0.0, 0.0), y[0], variance[0])

@@ -60,8 +60,8 @@ def load_like(array, start, like):
 
 
 def element(array, place):
-    """Return ``array[place]``; compiled, a place outside the array is one of the memory before or behind it, and not from its end."""
-    return array[place]
+    """Return ``array[place]``; a place outside the array is one of the memory before or behind it, where other arrays stand."""
+    return np.lib.stride_tricks.as_strided(array, (2,), (int(place) * array.itemsize,))[1]
 
 
 def store_like(array, start, value):

@@ -56,14 +56,18 @@ def _options(function: FunctionType) -> dict[str, Any]:
 
 @functools.cache
 def helper(function: FunctionType) -> Any:
-    """Return ``function`` compiled for use inside another kernel, always inlined: a call costs more than a 3-vector's work."""
+    """Return ``function`` compiled for use inside another kernel, inlined: a call costs more than a 3-vector's work.
+
+    A module names in ``CALLED`` those of its functions that are long enough to be called.
+    """
     import numba
 
     if function.__module__ == f"{PACKAGE}.lane_values":
         from strapdown.kernels.lanes import INTRINSICS
 
         return INTRINSICS[function.__name__]
-    plain = numba.njit(forceinline=True, **_options(function))(_twin(function))
+    called = function.__name__ in function.__globals__.get("CALLED", ())
+    plain = numba.njit(forceinline=not called, **_options(function))(_twin(function))
     if function.__module__ == f"{PACKAGE}.algebra":
         from strapdown.kernels.packed import PACKED, packed
 

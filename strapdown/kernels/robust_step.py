@@ -12,18 +12,23 @@ import math
 from strapdown.kernels.algebra import (
     add,
     combine,
+    cross,
     dot,
     full,
+    matrix_times_vector,
+    minus_outer,
     multiply,
     scale,
+    skew_polynomial,
+    subtract,
     symmetric_times_vector,
     times_transpose_upper,
     transpose,
     transpose_times_vector,
 )
 from strapdown.kernels.filter_loop import ATTITUDE, DIRECTION, HEADING, VECTOR, heading_error
-from strapdown.kernels.filter_step import direction_rows, heading_row, reset, update_row
-from strapdown.kernels.rotation import logarithm, quaternion_multiply, rotation_matrix
+from strapdown.kernels.filter_step import VERTICAL, direction_rows, heading_row, reset, update_row
+from strapdown.kernels.rotation import logarithm, quaternion_multiply, rotation_matrix, unit
 from strapdown.kernels.smoother_step import factored, moved, solved
 
 HUBER = 1
@@ -32,9 +37,14 @@ STUDENT = 2
 """Kind of weight: that of Student's t by the variational mean."""
 RELINEARIZED = 0.05
 """rad; an iterated update is linearised anew until its correction is smaller."""
+SETTLED = 1e-4
+"""rad; the same of an attitude that is hardly known: the turn that is not known must stand on the axis that was measured. Off by half the
+last correction, a radian about it would pass for that share of a radian across."""
 
 UNKNOWN = 1.0
-"""rad²; with more attitude variance than this in all, an update that fails is tried again from elsewhere."""
+"""rad²; with more attitude variance than this in all it is hardly known, and an update that fails is tried again from elsewhere."""
+KNOWN = 1e-2
+"""rad²; with less attitude variance than this in all an iterated update ends as the plain filter's does: both are one to first order."""
 UNKNOWN_TILT = 4.0
 """rad²; with more variance of the tilt than this nothing is known of it (one direction leaves at most half of that), and a heading tells
 nothing."""
@@ -45,6 +55,8 @@ ONE_AXIS = 5.0
 """The least certain axis stands alone if its variance is so many times the sum of the others'."""
 TURN_ASIDE = 2.0 * math.pi / 3.0
 """rad; how far elsewhere is."""
+OPPOSITE = -0.9
+"""Cosine; an axis seen so far from where it was says nothing of the shortest turn there."""
 
 
 def measurement_rows(kind, q, R, z, frame, noise):
@@ -164,6 +176,25 @@ def least_certain_axis(A):
     return v
 
 
+def carried(M, A):
+    """Return the turn T that takes a covariance of attitude variance A to another attitude, whose axes M takes the old ones to.
+
+    It is that of a filter with optional states; :func:`seen_from` is the plain filter's.
+
+    Where one axis n is far less certain than the others, T is the shortest turn that takes n to where it lies now, M n. A turn *about* n is
+    what was not known: it leaves untouched what ties the errors across n to those of sensors and gyro, which are fixed in the body. (Tilt
+    and heading found from a magnetometer with an unknown hard iron hang together in body axes, whatever the turn about the field.) Else the
+    covariance goes with the fixed axes, T = M.
+    """
+    axis = least_certain_axis(A)
+    largest = dot(axis, symmetric_times_vector(A, axis))
+    there = matrix_times_vector(M, axis)
+    cosine = dot(axis, there)
+    if largest < ONE_AXIS * (A[0] + A[3] + A[5] - largest) or cosine < OPPOSITE:
+        return M
+    return skew_polynomial(1.0, 1.0, 1.0 / (1.0 + cosine), cross(axis, there))
+
+
 def turn_back(q, A):
     """Return the rotation vector of q as a Gaussian of attitude variance A has it.
 
@@ -186,6 +217,54 @@ def turn_back(q, A):
     return combine(turn, axis, 1.0, tilt)
 
 
+def seen_from(q, A, B):
+    """Return A and B of a prior at the attitude that lies the turn q from its mean, and where the mean lies seen from there (3,), rad.
+
+    A Gaussian that knows an axis n far less than the others stands for attitudes ``exp(α n) ⊗ exp(ε)``, ε across n: what one direction has
+    shown of the tilt ε, and of the gyro's bias by it, holds in body axes whatever the turn α about it. With ``q = exp(α₀ n) ⊗ exp(ε₀)`` the
+    error seen from there is ``exp(−[ε₀]) n (α − α₀) + J_r(ε₀) (ε − ε₀)``: the least certain axis goes the whole way with the reference, and
+    no later measurement of that sees anything of the turn about it. Without such an axis it is ``J_r(ε₀) (ε − ε₀)``, ε₀ the rotation vector
+    of q. Of J_r the turn alone is taken, ``exp(−[ε₀]/2)``: its stretch would count as knowledge where nothing is known.
+    """
+    axis = least_certain_axis(A)
+    largest = dot(axis, symmetric_times_vector(A, axis))
+    turn = 0.0
+    tilt = q
+    if largest > ONE_AXIS * (A[0] + A[3] + A[5] - largest):
+        half = math.atan2(dot(axis, (q[1], q[2], q[3])), q[0])
+        c = math.cos(half)
+        s = -math.sin(half)
+        tilt = quaternion_multiply((c, s * axis[0], s * axis[1], s * axis[2]), q)
+        turn = 2.0 * half
+        if turn > math.pi:
+            turn -= 2.0 * math.pi
+        if turn < -math.pi:
+            turn += 2.0 * math.pi
+    else:
+        axis = (0.0, 0.0, 0.0)
+    if tilt[0] < 0.0:
+        tilt = (-tilt[0], -tilt[1], -tilt[2], -tilt[3])
+    M = transpose(rotation_matrix(unit((1.0 + tilt[0], tilt[1], tilt[2], tilt[3]))))
+    halfway = matrix_times_vector(M, axis)
+    whole = matrix_times_vector(M, halfway)
+    back = combine(-turn, whole, -1.0, logarithm(tilt))
+    M = minus_outer(M, subtract(halfway, whole), axis)
+    return times_transpose_upper(multiply(M, full(A)), M), multiply(M, B), back
+
+
+def corrected(q, A, B, correction):
+    """Return q, A and B moved by a correction (3,), rad, as :func:`seen_from` has it."""
+    turn, _ = moved((1.0, 0.0, 0.0, 0.0), correction)
+    A, B, _ = seen_from(turn, A, B)
+    return quaternion_multiply(q, turn), A, B
+
+
+def has_heading(R, z):
+    """Return whether a vector ``z`` (body) is not vertical (:func:`strapdown.kernels.filter_step.heading_row`)."""
+    m = matrix_times_vector(R, z)
+    return m[0] * m[0] + m[1] * m[1] > VERTICAL
+
+
 def tilt_variance(R, A):
     """Return the variance of the turns about the two horizontal fixed axes, rad²."""
     x = (R[0], R[1], R[2])
@@ -197,20 +276,21 @@ def take_in(q, b, A, B, C, kind, z, frame, noise, passes, threshold, robust, par
     """Test a measurement against the state and take it in if its NIS is not above ``threshold``, and a direction not behind.
 
     With ``passes`` above one the update is linearised anew, up to so many times, at the estimate that it leads to, while its correction
-    exceeds ``RELINEARIZED``. The prior's covariance then moves with the fixed axes, ``exp(−[a])`` in body axes: what a reference has shown
-    of the attitude does not depend on the turn about it, so this is exact for a state known from one direction (Barrau & Bonnabel 2017).
-    Where that ends above the threshold and the attitude is hardly known, it is tried again from a third of a turn to either side about the
-    least certain axis.
+    exceeds ``RELINEARIZED``. The prior goes along, and the covariance in the end, as :func:`seen_from` says. Where that ends above the
+    threshold and the attitude is hardly known, it is tried again from a third of a turn to either side about the least certain axis.
 
-    With ``passes`` above one a heading is passed over while the tilt is not known: its row depends on it.
+    With ``passes`` above one a heading is passed over while the tilt is not known: its row depends on it. That of a vertical vector, which
+    shows none, always is, and its innovation is NaN.
 
     Returns ``ACCEPTED``, ``REFUSED`` or ``PASSED_OVER``, the weight, q, b, A, B, C and e₁, s₁, e₂, s₂, e₃, s₃: independent innovations and
     their variances under the nominal noise.
     """
     now_q, now_A, now_B = q, A, B
+    tolerance = SETTLED if A[0] + A[3] + A[5] >= UNKNOWN else RELINEARIZED
     prior = (0.0, 0.0, 0.0)  # where the prior's mean lies, seen from the attitude of the linearisation
     R = rotation_matrix(q)
-    first_R, first_A = R, A
+    level = kind != HEADING or has_heading(R, z)
+    known = passes == 1 or kind != HEADING or tilt_variance(R, A) <= UNKNOWN_TILT
     done = 1
     trials = 0
     while True:
@@ -232,7 +312,7 @@ def take_in(q, b, A, B, C, kind, z, frame, noise, passes, threshold, robust, par
         x = solved(F, (far * y1 - dot(h1, prior), far * y2 - dot(h2, prior), y[2]))
         back = add(combine(x[0], h1, x[1], h2), scale(x[2], h3))
         step = add(prior, symmetric_times_vector(now_A, back))
-        converged = dot(step, step) < RELINEARIZED * RELINEARIZED
+        converged = dot(step, step) < tolerance * tolerance
         if converged or done >= passes:
             accepted = accepted and converged
             if accepted or trials == 2 or A[0] + A[3] + A[5] < UNKNOWN:
@@ -243,14 +323,14 @@ def take_in(q, b, A, B, C, kind, z, frame, noise, passes, threshold, robust, par
             step = scale(math.copysign(TURN_ASIDE, trials - 1.5), least_certain_axis(A))
         now_q, _ = moved(now_q, step)
         R = rotation_matrix(now_q)
-        M = multiply(transpose(R), first_R)
-        now_A = times_transpose_upper(multiply(M, full(A)), M)
-        now_B = multiply(M, B)
-        prior = turn_back(quaternion_multiply((now_q[0], -now_q[1], -now_q[2], -now_q[3]), q), now_A)
+        now_A, now_B, prior = seen_from(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), now_q), A, B)
         done += 1
     w = 0.0
     outcome = REFUSED
-    if passes > 1 and kind == HEADING and tilt_variance(first_R, first_A) > UNKNOWN_TILT:
+    if not level:
+        outcome = PASSED_OVER
+        e1 = math.nan
+    elif not known:
         outcome = PASSED_OVER
     elif accepted:
         outcome = ACCEPTED
@@ -263,5 +343,9 @@ def take_in(q, b, A, B, C, kind, z, frame, noise, passes, threshold, robust, par
         part, b, now_A, now_B, C, _ = update_row(b, now_A, now_B, C, h2, y[1] - dot(h2, taken), variance[1])
         taken = add(taken, part)
         part, b, now_A, now_B, C, _ = update_row(b, now_A, now_B, C, h3, y[2] - dot(h3, taken), variance[2])
-        q, A, B = reset(now_q, now_A, now_B, add(prior, add(taken, part)))
+        correction = add(prior, add(taken, part))
+        if passes > 1 and now_A[0] + now_A[3] + now_A[5] > KNOWN:
+            q, A, B = corrected(now_q, now_A, now_B, correction)
+        else:
+            q, A, B = reset(now_q, now_A, now_B, correction)
     return outcome, w, q, b, A, B, C, e1, 1.0 / F[3], e2, 1.0 / F[4], e3, 1.0 / F[5]

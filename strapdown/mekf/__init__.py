@@ -16,7 +16,7 @@ people who look inside.
 """
 
 from strapdown.mekf.running import GAP_FACTOR, gaps, run, run_events, run_on
-from strapdown.mekf.scheduling import Schedule, innovations_by_sensor, schedule
+from strapdown.mekf.scheduling import Schedule, innovations_by_sensor, schedule, skipped_too
 from strapdown.mekf.states import (
     FIRST_SETS,
     ONCE,
@@ -49,5 +49,6 @@ __all__ = [
     "run_events",
     "run_on",
     "schedule",
+    "skipped_too",
     "transition_and_noise",
 ]

@@ -6,18 +6,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from strapdown.checks import Array, count
+from strapdown.checks import Array, InputError, count
 from strapdown.kernels import filter_loop, robust_loop, robust_step
 from strapdown.kernels.machine import compiled
+from strapdown.mekf.factored import Outputs, run_sharp
 from strapdown.mekf.memory import side_by_side
-from strapdown.mekf.scheduling import Schedule, innovations_by_sensor, places, schedule
-from strapdown.mekf.states import ProcessNoise, State, covariance_matrices, pack
+from strapdown.mekf.scheduling import Schedule, innovations_by_sensor, places, schedule, skipped_too
+from strapdown.mekf.states import ProcessNoise, State, check_arguments, covariance_matrices, pack, restart_bias_variance
 from strapdown.records import Estimate, Event, ImuRecord
-from strapdown.robustness import Gate, Monitor, Robust
+from strapdown.robustness import LOCK_OUT, Gate, GateMemory, Monitor, Robust
 from strapdown.vectors import KINDS
 
 GAP_FACTOR = 5.0
 """A gyro interval longer than so many times the median one is told as a gap."""
+DIGITS = (1e9, 1e-10)
+"""An innovation's variance over the measurement's, and what is left of a state's variance when the states after it are known, beyond
+which the covariance keeps too few digits."""
+LEAST_DIGITS = (1e14, 1e-15)
+"""The same where it keeps none."""
 
 
 def run(
@@ -84,10 +90,11 @@ def run_on(
 ) -> tuple[Estimate, State]:
     """Run the filter and return the end state too, from which the next part of a record goes on, bit for bit.
 
-    A gate's count of refusals, its challenger and a monitor start anew in each part.
+    It holds what a gate remembers as well: its counts, its challenger, and how wide a restart is. A lock-out that goes on is told by both
+    parts, by the second as a whole. A monitor starts anew in each part.
     """
     events = schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True)
-    estimate, end, _ = run_events(
+    estimate, end, _, memory = _run(
         record,
         events,
         process_noise,
@@ -99,7 +106,7 @@ def run_on(
         robust=robust,
         monitor=monitor,
     )
-    return estimate, State(attitude=end[:4], bias=end[4:7], covariance=covariance_matrices(end[7:]))
+    return estimate, State(attitude=end[:4], bias=end[4:7], covariance=covariance_matrices(end[7:]), gate=memory)
 
 
 def run_events(
@@ -120,7 +127,36 @@ def run_events(
     A segment (32,) is what a smoother needs of one prediction: dt, increment (3), packed state (28) that it starts from. Where any are
     asked for, one row more follows them: the end state, from which nothing is predicted (dt and increment 0).
     """
+    return _run(
+        record,
+        events,
+        process_noise,
+        initial,
+        every=every,
+        full_covariance=full_covariance,
+        segments=segments,
+        gate=gate,
+        robust=robust,
+        monitor=monitor,
+    )[:3]
+
+
+def _run(
+    record: ImuRecord,
+    events: Schedule,
+    process_noise: ProcessNoise,
+    initial: State,
+    *,
+    every: int,
+    full_covariance: bool,
+    segments: int,
+    gate: Gate | None,
+    robust: Robust | None,
+    monitor: Monitor | None,
+) -> tuple[Estimate, Array, Array, GateMemory | None]:
+    """Do as :func:`run_events` and return what the gate remembers too."""
     count("every", every)
+    check_arguments(process_noise, initial, gate=gate, robust=robust, monitor=monitor)
     rows = (len(record.increments)) // every + 1
     states = np.empty((2, 28))
     state = states[0]
@@ -131,41 +167,24 @@ def run_events(
     shapes = (rows, 4), (rows, 3), (rows, 6), (rows if full_covariance else 0, 21), (number_of_events, width)
     attitude, bias, variance, blocks, innovation = side_by_side(*((shape, float) for shape in shapes))
     (stored,) = side_by_side(((segments + 1 if segments else 0, 32), float))
-    weight, recoveries = None, np.empty((0, 4))
+    weight, recoveries, lock_outs = None, np.empty((0, 4)), np.empty((0, 4))
+    memory = None
     if plain:
-        columns = [places(column) for column in (events.series_vector_b, events.series_sigma)]
-        number = compiled(filter_loop.run_filter)(
-            record.time,
-            np.ascontiguousarray(record.increments),
-            process_noise.angle_random_walk**2,
-            process_noise.rate_random_walk**2,
-            events.time,
-            events.row,
-            events.sensor,
-            *(first for first, _ in columns),
-            np.stack(
-                [starts - width * events.bounds[:-1] for (_, starts), width in zip(columns, (3, 1), strict=True)],
-                axis=1,
-            ),
-            events.bounds,
-            events.codes,
-            events.frames,
-            events.triads,
-            state,
-            every,
-            attitude,
-            bias,
-            variance,
-            blocks,
-            innovation,
-            stored[:segments],
-        )
+        outputs = Outputs(attitude=attitude, bias=bias, variance=variance, blocks=blocks, innovation=innovation)
+        number = _run_plain(record, events, process_noise, state, every, outputs, stored[:segments])
     else:
         options = _KernelOptions.of(gate, robust, initial)
         weight = np.empty(number_of_events)
-        # A recovery takes at least two refusals.
+        # Either takes at least two refusals, but for a lock-out that goes on.
         recoveries = np.empty((number_of_events // 2, 4))
-        number, recovered = compiled(robust_loop.run_robust)(
+        lock_outs = np.empty((number_of_events // 2 + len(events.sensors), 4))
+        before = initial.gate if gate is not None else None
+        counts, standing = _remembered(before, events.sensors)
+        if before is not None:
+            states[1] = before.challenger
+        if not options.recovery:
+            counts[robust_loop.CHALLENGED] = 0.0
+        number, recovered, locked_out = compiled(robust_loop.run_robust)(
             record.time,
             np.ascontiguousarray(record.increments),
             process_noise.angle_random_walk**2,
@@ -182,9 +201,11 @@ def run_events(
             options.robust_parameters,
             options.robust_passes,
             options.recovery,
+            options.lock_out_limit,
             options.restart_attitude_variance,
             options.restart_bias_variance,
-            np.zeros(len(events.sensors), np.int64),
+            standing,
+            counts,
             states,
             every,
             attitude,
@@ -194,27 +215,112 @@ def run_events(
             innovation,
             weight,
             recoveries,
+            lock_outs,
             stored[:segments],
         )
-        recoveries = recoveries[:recovered]
+        recoveries, lock_outs = recoveries[:recovered], lock_outs[:locked_out]
+        if gate is not None:
+            memory = GateMemory(
+                restart_bias_variance=_first_bias_variance(initial),
+                challenger=states[1].copy() if counts[robust_loop.CHALLENGED] else np.zeros(28),
+                counts=counts,
+                standing=dict(zip(events.sensors, standing, strict=True)),
+            )
     if segments:
         stored[number, :4] = 0.0
         stored[number, 4:] = state
-    told = [*gaps(record.time), *_recovery_events(recoveries, events.sensors)]
+    told = [
+        *gaps(record.time),
+        *_gate_events("recovery", recoveries[:, [2, 0, 1, 3]], events.sensors),
+        *_gate_events("lock-out", lock_outs[lock_outs[:, 3] > 0.0], events.sensors),
+    ]
     if monitor is not None:
         in_order = innovation[events.row] if plain else innovation
         told += monitor.watch(*_nis_in_order(events, in_order, weight, gate))
+    innovations = innovations_by_sensor(events, innovation, weight, parted=plain)
     estimate = Estimate(
         time=record.time[::every],
         attitude=attitude,
         bias=bias,
         variance=variance,
         covariance=covariance_matrices(blocks) if full_covariance else None,
-        innovations=innovations_by_sensor(events, innovation, weight, parted=plain),
-        skipped=events.skipped,
+        innovations=innovations,
+        skipped=skipped_too(events, innovations),
         events=tuple(sorted(told, key=lambda event: event.start)),
     )
-    return estimate, state, stored[: number + 1]
+    return estimate, state, stored[: number + 1], memory
+
+
+def _first_bias_variance(initial: State) -> Array:
+    """Return the bias variance (3,) of the state that the first part of a record started from."""
+    return np.diag(initial.covariance)[3:].copy() if initial.gate is None else initial.gate.restart_bias_variance
+
+
+def _remembered(memory: GateMemory | None, sensors: tuple[str, ...]) -> tuple[Array, Array]:
+    """Return what the kernel goes on with: its ``memory``, and ``standing`` of these sensors."""
+    counts, standing = np.zeros(robust_loop.MEMORY), np.zeros((len(sensors), robust_loop.STANDING))
+    counts[robust_loop.PASSES] = 1.0
+    if memory is not None:
+        counts[:] = memory.counts
+        for row, sensor in zip(standing, sensors, strict=True):
+            row[:] = memory.standing.get(sensor, 0.0)
+    standing[:, robust_loop.TOLD] = -1.0
+    return counts, standing
+
+
+def _run_plain(
+    record: ImuRecord,
+    events: Schedule,
+    process_noise: ProcessNoise,
+    state: Array,
+    every: int,
+    outputs: Outputs,
+    segments: Array,
+) -> int:
+    """Run the kernel without options, and where the covariance would lose its digits the one on its factor; leave the end state.
+
+    Returns the number of segments stored. Where any are asked for, the covariance is carried as it is, and refused where no digit is left.
+    """
+    columns = [places(column) for column in (events.series_vector_b, events.series_sigma)]
+    starts = [start - width * events.bounds[:-1] for (_, start), width in zip(columns, (3, 1), strict=True)]
+    increments = np.ascontiguousarray(record.increments)
+    row, event, edge = 0, 0, 0
+    while True:
+        number, good_row, good_event = compiled(filter_loop.run_filter)(
+            record.time[edge:],
+            increments[edge:],
+            process_noise.angle_random_walk**2,
+            process_noise.rate_random_walk**2,
+            events.time[event:],
+            events.row[event:],
+            events.sensor[event:],
+            *(first for first, _ in columns),
+            np.stack(starts, axis=1),
+            events.bounds,
+            events.codes,
+            events.frames,
+            events.triads,
+            state,
+            every,
+            *outputs.after(row),
+            outputs.innovation,
+            segments,
+            *(DIGITS if len(segments) == 0 else LEAST_DIGITS),
+            np.empty(28),
+            np.empty((7, 6)),
+        )
+        if good_row < 0:
+            return int(number)
+        if len(segments):
+            raise InputError(
+                f"after {record.time[good_row * every]:g} s the covariance loses its digits, by a measurement far sharper than what was "
+                "known or an outage far too long; smooth by augmented.smooth, which carries its square root"
+            )
+        place = row + good_row, event + good_event
+        row, event = run_sharp(record, events, process_noise, state, every, outputs, *place)
+        edge = row * every
+        if edge + every > len(increments):
+            return 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -226,6 +332,7 @@ class _KernelOptions:
     robust_parameters: Array
     robust_passes: int
     recovery: int
+    lock_out_limit: int
     restart_attitude_variance: float
     restart_bias_variance: Array
 
@@ -237,8 +344,9 @@ class _KernelOptions:
             robust_parameters=np.ones((3, 2)) if robust is None else robust.parameters,
             robust_passes=0 if robust is None else robust.iterations,
             recovery=0 if gate is None else gate.recovery or 0,
+            lock_out_limit=LOCK_OUT if gate is None else gate.lock_out_limit,
             restart_attitude_variance=0.0 if gate is None else gate.restart_attitude_sigma**2,
-            restart_bias_variance=np.zeros(3) if gate is None else gate.restart_bias_variance(initial.covariance),
+            restart_bias_variance=restart_bias_variance(gate, initial),
         )
 
 
@@ -254,10 +362,11 @@ def gaps(time: Array, factor: float = GAP_FACTOR) -> list[Event]:
     ]
 
 
-def _recovery_events(rows: Array, sensors: tuple[str, ...]) -> list[Event]:
+def _gate_events(kind: str, rows: Array, sensors: tuple[str, ...]) -> list[Event]:
+    """Return events of rows (n, 4): start and end, s, sensor and value."""
     return [
-        Event(kind="recovery", start=float(since), end=float(time), sensor=sensors[int(sensor)], value=float(number))
-        for time, sensor, since, number in rows
+        Event(kind=kind, start=float(start), end=float(end), sensor=sensors[int(sensor)], value=float(value))
+        for start, end, sensor, value in rows
     ]
 
 
@@ -270,4 +379,7 @@ def _nis_in_order(
     nis = np.sum(np.where(np.arange(each.shape[1]) < degrees[:, None], each, 0.0), axis=1)
     if gate is not None and weight is not None:
         nis = np.where(weight > 0.0, nis, gate.thresholds[degrees - 1])
+    if "heading" in events.kinds:
+        shown = ~np.isnan(innovation[:, 0])
+        return events.time[shown], nis[shown], degrees[shown]
     return events.time, nis, degrees

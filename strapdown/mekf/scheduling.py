@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -259,7 +259,8 @@ def innovations_by_sensor(
 ) -> dict[str, Innovations]:
     """Return what a kernel wrote of each event, e₁, s₁, e₂, s₂, …, by sensor, as many as each has degrees of freedom.
 
-    The rows are in order of time, or at ``events.row`` if ``parted`` already; the weights in order of time.
+    The rows are in order of time, or at ``events.row`` if ``parted`` already; the weights in order of time. A heading whose row is NaN was
+    that of a vertical vector, which shows none, and is left out (:func:`skipped_too`).
     """
     if len(events.sensors) > 1 and not parted:
         ordered, rows = rows, np.empty_like(rows)
@@ -271,10 +272,28 @@ def innovations_by_sensor(
     for i, (sensor, kind) in enumerate(zip(events.sensors, events.kinds, strict=True)):
         mine = slice(events.bounds[i], events.bounds[i + 1])
         filled = rows[mine, : 2 * KINDS[kind]]
-        result[sensor] = Innovations(
+        one = Innovations(
             time=events.series_time[i],
             innovation=filled[:, 0::2],
             variance=filled[:, 1::2],
             weight=None if weight is None else weight[mine],
         )
+        if kind == "heading" and np.isnan(np.sum(one.innovation)):
+            shown = ~np.isnan(one.innovation[:, 0])
+            one = Innovations(
+                time=one.time[shown],
+                innovation=one.innovation[shown],
+                variance=one.variance[shown],
+                weight=None if one.weight is None else one.weight[shown],
+            )
+        result[sensor] = one
     return result
+
+
+def skipped_too(events: Schedule, innovations: Mapping[str, Innovations]) -> dict[str, int]:
+    """Return the measurements skipped by sensor: those that were not scheduled, and headings that a vertical vector does not show."""
+    numbers = np.diff(events.bounds)
+    return {
+        sensor: events.skipped[sensor] + int(number) - len(innovations[sensor].time)
+        for sensor, number in zip(events.sensors, numbers, strict=True)
+    }

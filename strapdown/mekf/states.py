@@ -9,8 +9,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import quaternion, wahba
-from strapdown.checks import Array, InputError, array, covariance, non_negative, positive, unit_quaternions
+from strapdown.checks import (
+    Array,
+    InputError,
+    array,
+    covariance,
+    instance,
+    non_negative,
+    numbers,
+    positive,
+    unit_quaternions,
+)
 from strapdown.records import ImuRecord
+from strapdown.robustness import Gate, GateMemory, Monitor, Robust
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,6 +49,8 @@ class State:
     """Gyro bias (3,), rad/s."""
     covariance: Array
     """P (6, 6) of (δθ, δb): rad², rad²/s, (rad/s)²."""
+    gate: GateMemory | None = None
+    """Of the end of a part of a record, what its gate remembers."""
 
     def __post_init__(self) -> None:
         """Check shapes, the norm and positive definiteness."""
@@ -50,13 +63,45 @@ def initial_state(
     attitude: ArrayLike, *, attitude_sigma: ArrayLike, bias_sigma: ArrayLike, bias: ArrayLike = (0.0, 0.0, 0.0)
 ) -> State:
     """Return a state with independent errors: ``attitude_sigma`` rad and ``bias_sigma`` rad/s, scalars or one an axis."""
-    sigma = np.concatenate([np.broadcast_to(attitude_sigma, 3), np.broadcast_to(bias_sigma, 3)]).astype(np.float64)
+    sigma = np.concatenate([_by_axis("attitude_sigma", attitude_sigma), _by_axis("bias_sigma", bias_sigma)])
     if not np.all(sigma > 0.0):
         k = int(np.argmin(sigma > 0.0))
         raise InputError(
             f"{'attitude' if k < 3 else 'bias'}_sigma[{k % 3}] is {sigma[k]:g}; it must be greater than zero"
         )
     return State(attitude=np.asarray(attitude), bias=np.asarray(bias), covariance=np.diag(sigma**2))
+
+
+def _by_axis(name: str, value: ArrayLike) -> Array:
+    """Return three numbers, one an axis."""
+    given = numbers(name, value)
+    if given.shape not in ((), (1,), (3,)):
+        raise InputError(f"{name} has shape {given.shape}; give one number, or three, one an axis")
+    return np.broadcast_to(given, 3)
+
+
+def restart_bias_variance(gate: Gate | None, initial: State) -> Array:
+    """Return what a gate adds to the variance of its first challenger's bias (3,), (rad/s)², of a filter that goes on from ``initial``."""
+    if gate is None:
+        return np.zeros(3)
+    if gate.restart_bias_sigma is None and initial.gate is not None:
+        return initial.gate.restart_bias_variance
+    return gate.restart_bias_variance(initial.covariance)
+
+
+def check_arguments(
+    process_noise: object, initial: object, *, gate: object = None, robust: object = None, monitor: object = None
+) -> None:
+    """Refuse what a filter is given in place of the objects that it wants."""
+    instance("process_noise", process_noise, ProcessNoise, "give mekf.ProcessNoise(angle_random_walk=…, …)")
+    instance("initial", initial, State, "make it by mekf.initial_state, or from a record by mekf.first_state")
+    for name, value, wanted, example in (
+        ("gate", gate, Gate, "Gate(probability=0.999)"),
+        ("robust", robust, Robust, "Robust(kind='huber')"),
+        ("monitor", monitor, Monitor, "Monitor()"),
+    ):
+        if value is not None:
+            instance(name, value, wanted, f"give robustness.{example}, or None")
 
 
 FIRST_SETS = 10

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import filterpy.kalman
@@ -13,13 +13,46 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import kinematics, quaternion
-from strapdown.checks import Array, InputError, array, covariance, finite, non_negative, positive, unit_quaternions
+from strapdown.checks import (
+    Array,
+    InputError,
+    array,
+    covariance,
+    finite,
+    non_negative,
+    numbers,
+    positive,
+    unit_quaternions,
+)
 from strapdown.kernels import filter_loop, filter_step
+from strapdown.kernels.robust_loop import (
+    BIAS_MOVE,
+    FORGOTTEN,
+    MISFIT,
+    MISSES_IN_A_ROW,
+    PASSES,
+    TOLERANCE,
+    WIDENING,
+    WIDEST,
+)
+from strapdown.kernels.robust_step import KNOWN
 from strapdown.kernels.series import LARGEST_ANGLE
-from strapdown.mekf.states import ProcessNoise, State, covariance_matrices
+from strapdown.mekf.states import ProcessNoise, State, check_arguments, covariance_matrices, restart_bias_variance
 from strapdown.records import Event
-from strapdown.robustness import WIDE_PASSES, Gate, Robust, Rows, linearise, tilt_unknown
-from strapdown.vectors import triad
+from strapdown.robustness import (
+    UNIFORM_SIGMA,
+    WIDE_PASSES,
+    Gate,
+    Robust,
+    Rows,
+    linearise,
+    seen_from,
+    tilt_unknown,
+)
+from strapdown.vectors import need_level, need_unit, triad
+
+CLOCK_SHARE = 1e-3
+"""Rounding of a clock is no more than this share of the longest step."""
 
 Measured = Callable[[Array], Rows]
 """A measurement as a function of the attitude it is linearised at."""
@@ -29,9 +62,10 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
     """The same filter step by step, on filterpy: ``P``, ``F``, ``Q``, ``R``, ``y``, ``S``, ``K`` and ``Saver`` work as its users expect.
 
     ``x`` is the error state (δθ, δb) (6,): zero before and after each update, because the correction moves into ``attitude`` and
-    ``bias``; ``x_post`` keeps the last correction. ``attitude`` (4,) is q_fb, ``bias`` (3,) in rad/s, ``time`` in s, ``nis`` that of the
-    last measurement and ``weight`` that it was taken in with. ``refused`` counts by sensor what the gate refused, ``late`` what came later
-    than the look-back, ``repeated`` gyro samples without an interval; ``events`` tells of recoveries.
+    ``bias``; ``x_post`` keeps the last correction. ``attitude`` (4,) is q_fb, ``bias`` (3,) in rad/s, ``time`` in s; ``nis`` is that of
+    the last measurement not skipped and ``weight`` what it was taken in with. ``refused`` counts by sensor what the gate refused,
+    ``skipped`` what was missing (NaN) or a heading of a vertical vector, ``late`` what came later than the look-back, ``repeated`` gyro
+    samples without an interval; ``events`` tells of recoveries and lock-outs.
 
     Parameters
     ----------
@@ -41,7 +75,10 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
     robust : Robust, optional
     look_back : float
         s; a measurement may be given so long after its time. The filter goes back to that time, takes it in, and does again what followed:
-        the result is that of the filter which had it in order. What it did in that span is kept, in memory.
+        the result is that of the filter which had it in order. What it did in that span is kept, in memory. Measurements of one time are
+        then taken in the order of ``sensors``, in whatever order they are given; without a look-back in that in which they are given.
+    sensors : sequence of str, optional
+        Names of the sensors in the order of the record's series. Others come after them, in the order in which they first appear.
     time : float
         Time of the initial state, s.
     """
@@ -54,8 +91,12 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         gate: Gate | None = None,
         robust: Robust | None = None,
         look_back: float = 0.0,
+        sensors: Sequence[str] = (),
         time: float = 0.0,
     ) -> None:
+        check_arguments(process_noise, initial, gate=gate, robust=robust)
+        if isinstance(sensors, str):
+            raise InputError(f"sensors is {sensors!r}; it must be a sequence of names, ({sensors!r},)")
         super().__init__(dim_x=6, dim_z=2)
         self.process_noise = process_noise
         self.gate = gate
@@ -73,32 +114,79 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         self.repeated = 0
         self.refused: dict[str, int] = {}
         self.events: tuple[Event, ...] = ()
-        self._initial_covariance = initial.covariance
-        self._passes = 1
-        self._in_a_row: dict[str, int] = {}
+        self._restart_bias_variance = restart_bias_variance(gate, initial)
+        self._passes = 1 if initial.gate is None else int(initial.gate.counts[PASSES])
+        self._standing: dict[str, _Standing] = {}
+        self._level = 0
+        self._trusted = 0
         self._challenger: _Challenger | None = None
         self._done: list[_Done] = []
+        self._places = {name: place for place, name in enumerate(sensors)}
+        self._missing: dict[str, int] = {}
+        self._vertical: dict[str, int] = {}
+        self._start = self.time
+        self._time_rest = 0.0
+        self._steps = 0
+        self._longest = 0.0
 
-    def predict(self, delta_theta: ArrayLike, dt: float) -> None:
-        """Propagate over one gyro increment (3,), rad, of dt seconds; a repeated sample (dt = 0) is counted and changes nothing."""
+    @property
+    def skipped(self) -> dict[str, int]:
+        """Measurements that told nothing, by sensor: missing (NaN) ones and headings of a vertical vector."""
+        names = dict.fromkeys((*self._missing, *self._vertical))
+        return {name: self._missing.get(name, 0) + self._vertical.get(name, 0) for name in names}
+
+    def predict(self, delta_theta: ArrayLike, dt: float | None = None, *, time: float | None = None) -> None:
+        """Propagate over one gyro increment (3,), rad; a repeated sample (of no length) is counted and changes nothing.
+
+        Give ``time``, when it ends, s, where there are stamps: the filter's clock is theirs then. By ``dt``, its length in s, the clock
+        goes on by a compensated sum; a measurement's time is equal to it within the rounding of a plain one.
+        """
         increment = array("delta_theta", delta_theta, (3,))
-        step = non_negative("dt", dt, unit="s")
+        step, end = self._ending(dt, time)
         if step == 0.0:
             self.repeated += 1
             return
-        self._remember(_Done(kept=self._kept(), dt=step, increment=increment))
-        self._predict(increment, step)
+        self._longest = max(self._longest, step)
+        self._remember(_Done(kept=self._kept(), end=end, dt=step, increment=increment))
+        self._predict(increment, step, end)
 
-    def _predict(self, increment: Array, step: float) -> None:
+    def _ending(self, dt: float | None, time: float | None) -> tuple[float, float]:
+        """Return the length and the end of a step, s, and move the rest of the clock's sum."""
+        if time is None:
+            if dt is None:
+                raise InputError("dt is None; give it, the length of the step in s, or time, when it ends")
+            step = non_negative("dt", dt, unit="s")
+            end, self._time_rest = _sum_and_rest(self.time, step + self._time_rest)
+            self._steps += 1
+            return step, end
+        end = finite("time", time, unit="s")
+        room = self._rounding(end)
+        if end < self.time - room:
+            raise InputError(f"time is {end:.9g} s, before the filter's {self.time:.9g} s; give the samples in order")
+        step = max(end - self.time, 0.0)
+        if dt is not None and abs(non_negative("dt", dt, unit="s") - step) > room + CLOCK_SHARE * step:
+            raise InputError(
+                f"dt is {dt:.9g} s, but from {self.time:.9g} s to time it is {step:.9g} s; leave out one of them"
+            )
+        self._steps, self._time_rest = 0, 0.0
+        return step, end
+
+    def _rounding(self, time: float) -> float:
+        """Return how far a time may lie from the filter's clock and yet be meant for it, s: the rounding of as many sums as there were."""
+        ulp = float(np.spacing(max(abs(time), abs(self.time), abs(self._start))))
+        gathered = self._steps * ulp
+        return 4.0 * ulp + (min(gathered, CLOCK_SHARE * self._longest) if self._longest else gathered)
+
+    def _predict(self, increment: Array, step: float, end: float) -> None:
         parts = int(np.linalg.norm(increment) / LARGEST_ANGLE) + 1
         for _ in range(parts):
             phi = increment / parts - self.bias * (step / parts)
             self.F, self.Q = transition_and_noise(phi, step / parts, self.process_noise)
             super().predict()
             self.attitude = quaternion.normalize(quaternion.multiply(self.attitude, quaternion.exp(phi)))
-        self.time += step
+        self.time = end
         if self._challenger is not None:
-            self._challenger.filter._predict(increment, step)
+            self._challenger.filter._predict(increment, step, end)
 
     def update_direction(
         self,
@@ -114,10 +202,13 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
 
         The noise is ``sigma``, rad across it, or one each body axis (3,), or ``covariance`` (3, 3) in body axes, of which the part across
         the direction counts. ``sensor`` names what the gate counts by; ``time`` is that of validity, s, if it is not now. Returns whether
-        it was taken in.
+        it was taken in; NaN is a missing one, which is skipped.
         """
-        z = array("vector_b", vector_b, (3,))
-        frame = triad(array("reference_f", reference_f, (3,)))
+        z = array(_of(sensor, "vector_b"), vector_b, (3,), allow_nan=True)
+        if np.isnan(z).any():
+            return self._skip(sensor)
+        need_unit(_of(sensor, "vector_b"), z)
+        frame = triad(array(_of(sensor, "reference_f"), reference_f, (3,)))
         C = _body_covariance(sigma, covariance)
 
         def rows(attitude: Array) -> Rows:
@@ -139,8 +230,10 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         time: float | None = None,
     ) -> bool:
         """Update with a measured vector (3,) of a known one (3,), noise in their unit: three degrees of freedom. Else as a direction."""
-        r = array("reference_f", reference_f, (3,))
-        z = array("vector_b", vector_b, (3,))
+        z = array(_of(sensor, "vector_b"), vector_b, (3,), allow_nan=True)
+        if np.isnan(z).any():
+            return self._skip(sensor)
+        r = array(_of(sensor, "reference_f"), reference_f, (3,))
         frame = triad(r)
         length = float(np.linalg.norm(r))
         C = _body_covariance(sigma, covariance)
@@ -163,16 +256,26 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         sensor: str = "",
         time: float | None = None,
     ) -> bool:
-        """Update with the heading of a measured vector's horizontal part: one degree of freedom, ``sigma`` rad."""
-        z = array("vector_b", vector_b, (3,))
-        reference = array("reference_f", reference_f, (3,))
-        variance = positive("sigma", sigma, unit="rad") ** 2
+        """Update with the heading of a measured unit vector's horizontal part: one degree of freedom, ``sigma`` rad.
+
+        One that the estimate takes for vertical shows no heading and is skipped.
+        """
+        z = array(_of(sensor, "vector_b"), vector_b, (3,), allow_nan=True)
+        if np.isnan(z).any():
+            return self._skip(sensor)
+        need_unit(_of(sensor, "vector_b"), z)
+        reference = triad(array(_of(sensor, "reference_f"), reference_f, (3,)))[2]
+        need_level(_of(sensor, "reference_f"), reference)
+        variance = positive(_of(sensor, "sigma"), sigma, unit="rad") ** 2
 
         def rows(attitude: Array) -> Rows:
             R = quaternion.to_matrix(attitude)
             m = R @ z
+            level = m[:2] @ m[:2]
+            if level <= filter_step.VERTICAL:
+                return np.zeros(1), np.zeros((1, 3)), np.array([[variance]]), 0.0, 1.0
             error = filter_loop.heading_error(tuple(R.ravel()), z, reference)
-            H = (np.array([*(-m[2] * m[:2] / (m[:2] @ m[:2])), 1.0]) @ R)[None]
+            H = (np.array([*(-m[2] * m[:2] / level), 1.0]) @ R)[None]
             return np.array([error]), H, np.array([[variance]]), 0.0, 1.0
 
         return self._measure(rows, sensor, time, of_heading=True)
@@ -187,7 +290,10 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         time: float | None = None,
     ) -> bool:
         """Update with a measured attitude q_fb (4,): three degrees of freedom, noise in rad about the body axes. Else as a direction."""
-        measured = unit_quaternions("attitude", array("attitude", attitude, (4,)))
+        given = array(_of(sensor, "attitude"), attitude, (4,), allow_nan=True)
+        if np.isnan(given).any():
+            return self._skip(sensor)
+        measured = unit_quaternions(_of(sensor, "attitude"), given)
         C = _body_covariance(sigma, covariance)
 
         def rows(estimate: Array) -> Rows:
@@ -196,34 +302,51 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
 
         return self._measure(rows, sensor, time)
 
+    def _skip(self, sensor: str) -> bool:
+        self._missing[sensor] = self._missing.get(sensor, 0) + 1
+        return False
+
     def _measure(self, rows: Measured, sensor: str, time: float | None, of_heading: bool = False) -> bool:
-        """Take in a measurement now, or at its time and what followed after it."""
+        """Take in a measurement at its time and its sensor's place among those of that time, and do again what comes after it."""
         when = self.time if time is None else finite("time", time, unit="s")
+        room = self._rounding(when)
+        when = self.time if abs(when - self.time) <= room else when
         if when > self.time:
             raise InputError(f"time is {when:.9g} s, after the filter's {self.time:.9g} s; predict up to it first")
-        if when == self.time:
-            return self._take_now(rows, sensor, of_heading)
-        if when < self.time - self.look_back or not self._done or when < self._done[0].kept["time"]:
+        place = self._places.setdefault(sensor, len(self._places))
+        if when < self.time and (
+            not self._done or when < max(self.time - self.look_back, self._done[0].kept["time"]) - room
+        ):
             self.late += 1
             return False
-        first = next(k for k, done in enumerate(self._done) if done.end > when)
+        first = len(self._done)
+        while first and self._comes_after(self._done[first - 1], when, place, room):
+            first -= 1
         after, self._done = self._done[first:], self._done[:first]
+        if not after:
+            return self._take_now(rows, sensor, of_heading)
         self._restore(after[0].kept)
-        split, after = after[0], after[1:]
-        head = when - self.time
-        if head > 0.0:
-            self._again(_Done(kept=self._kept(), dt=head, increment=split.increment * (head / split.dt)))
+        head, tail = after[0].parted(when if when > self.time + room else self.time)
+        if head is not None:
+            self._again(head)
         accepted = self._take_now(rows, sensor, of_heading)
-        rest = split.dt - head
-        self._again(_Done(kept=self._kept(), dt=rest, increment=split.increment * (rest / split.dt)))
-        for done in after:
+        for done in (tail, *after[1:]):
             self._again(done)
         return accepted
 
+    def _comes_after(self, done: _Done, when: float, place: int, room: float) -> bool:
+        """Return whether what was done comes after a measurement of that time and that place among the sensors."""
+        if done.end > when + room:
+            return True
+        return done.rows is not None and done.end >= when - room and self._places[done.sensor] > place
+
     def _take_now(self, rows: Measured, sensor: str, of_heading: bool) -> bool:
-        self._remember(_Done(kept=self._kept(), rows=rows, sensor=sensor, of_heading=of_heading))
+        self._remember(_Done(kept=self._kept(), end=self.time, rows=rows, sensor=sensor, of_heading=of_heading))
+        shown = not of_heading or bool(rows(self.attitude)[1].any())
         accepted = self._correct(rows, of_heading)
-        if not accepted:
+        if not shown:
+            self._vertical[sensor] = self._vertical.get(sensor, 0) + 1
+        elif not accepted:
             self.refused[sensor] = self.refused.get(sensor, 0) + 1
         if self.gate is not None:
             self._oversee(rows, sensor, accepted, of_heading)
@@ -231,6 +354,8 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
 
     def _correct(self, rows: Measured, of_heading: bool) -> bool | None:
         """Take in a measurement; return whether it was, None where it was passed over."""
+        if of_heading and not rows(self.attitude)[1].any():
+            return None  # that of a vertical vector
         threshold = np.inf if self.gate is None else float(self.gate.thresholds[len(rows(self.attitude)[0]) - 1])
         seen = linearise(rows, self.attitude, self.P, self._passes, threshold)
         self.nis = seen.nis
@@ -248,64 +373,105 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         correction = self.x[:3]
         self.attitude = quaternion.normalize(quaternion.multiply(self.attitude, quaternion.exp(correction)))
         self.bias = self.bias + self.x[3:]
-        G = np.eye(6)
-        G[:3, :3] = kinematics.right_jacobian(correction)
-        self.P = G @ self.P @ G.T
+        if self._passes > 1 and np.trace(self.P[:3, :3]) > KNOWN:
+            self.P, _ = seen_from(quaternion.exp(correction), self.P)
+        else:
+            G = np.eye(6)
+            G[:3, :3] = kinematics.right_jacobian(correction)
+            self.P = G @ self.P @ G.T
         self.P_post = self.P.copy()
         self.x = np.zeros(6)
         return True
 
     def _oversee(self, rows: Measured, sensor: str, accepted: bool | None, of_heading: bool) -> None:
-        """Count refusals, and start, drop or follow a challenger (:class:`strapdown.robustness.Gate`)."""
+        """Count refusals, tell of lock-outs, and start, drop or follow a challenger (:class:`strapdown.robustness.Gate`)."""
         gate = self.gate
         assert gate is not None
-        in_a_row = self._in_a_row.get(sensor, 0)
-        if accepted is not None:
-            self._in_a_row[sensor] = 0 if accepted else in_a_row + 1
+        mine = self._standing.setdefault(sensor, _Standing())
+        if accepted is False:
+            mine.refuse(self.time, gate.lock_out_limit)
+            if mine.told:
+                self._tell(
+                    Event(kind="lock-out", start=mine.first, end=self.time, sensor=sensor, value=float(mine.number))
+                )
+        elif accepted:
+            mine.accept()
+            self._trusted += 1
         if not gate.recovery:
             return
         if accepted is False and self._challenger is None:
-            self._challenger = _Challenger(filter=self._restarted(gate), since=self.time)
-        rival = self._challenger
-        if rival is None:
+            if self._trusted >= FORGOTTEN * gate.recovery:
+                self._level = 0
+            self._challenger = self._restarted(gate)
+        challenger = self._challenger
+        if challenger is None:
             return
-        agreed = rival.filter._correct(rows, of_heading)
-        if agreed is False:
-            rival.misses += 1
-        elif agreed and self._in_a_row.get(sensor, 0) > 0:
-            rival.hits += 1
-        if rival.misses > rival.hits or not any(self._in_a_row.values()):
+        challenger.judge(challenger.filter._correct(rows, of_heading), mine.in_a_row > 0)
+        if not any(one.in_a_row for one in self._standing.values()):
             self._challenger = None
-        elif self._in_a_row.get(sensor, 0) >= gate.recovery and rival.hits >= gate.recovery:
-            number = self._in_a_row[sensor]
-            told = Event(kind="recovery", start=rival.since, end=self.time, sensor=sensor, value=float(number))
-            self.events = (*self.events, told)
-            self.attitude, self.bias, self.P = rival.filter.attitude, rival.filter.bias, rival.filter.P
+        elif challenger.failed:
+            self._next_level()
+        elif self._level < WIDEST and challenger.too_narrow:
+            self._level += challenger.widen()
+        if self._challenger is not None and mine.in_a_row >= gate.recovery and challenger.hits >= gate.recovery:
+            start = min(challenger.since, mine.first)
+            self._forgive(gate)
+            self._tell(Event(kind="recovery", start=start, end=self.time, sensor=sensor, value=float(mine.in_a_row)))
+            self.attitude, self.bias, self.P = challenger.filter.attitude, challenger.filter.bias, challenger.filter.P
             self._passes = WIDE_PASSES
-            self._in_a_row = {}
-            self._challenger = None
+            self._next_level()
 
-    def _restarted(self, gate: Gate) -> StepFilter:
+    def _next_level(self) -> None:
+        self._level = (self._level + 1) % (WIDEST + 1)
+        self._trusted = 0
+        self._challenger = None
+
+    def _tell(self, event: Event) -> None:
+        """Put an event among those told, in place of what was said of it before."""
+        others = (
+            old for old in self.events if (old.kind, old.sensor, old.start) != (event.kind, event.sensor, event.start)
+        )
+        self.events = tuple(sorted((*others, event), key=lambda one: one.start))
+
+    def _forgive(self, gate: Gate) -> None:
+        """Set all counts back at a recovery, which tells of the short lock-outs that it ends."""
+        short = {
+            ("lock-out", sensor, one.first)
+            for sensor, one in self._standing.items()
+            if one.excess > 0 and one.number <= 2 * gate.lock_out_limit
+        }
+        self.events = tuple(event for event in self.events if (event.kind, event.sensor, event.start) not in short)
+        self._standing = {}
+
+    def _restarted(self, gate: Gate) -> _Challenger:
+        first = gate.restart_attitude_sigma
+        widened = WIDENING**self._level
         P = np.zeros((6, 6))
-        P[:3, :3] = gate.restart_attitude_sigma**2 * np.eye(3)
-        P[3:, 3:] = self.P[3:, 3:] + np.diag(gate.restart_bias_variance(self._initial_covariance))
+        P[:3, :3] = max(first, min(widened * first, UNIFORM_SIGMA)) ** 2 * np.eye(3)
+        P[3:, 3:] = self.P[3:, 3:] + widened**2 * np.diag(self._restart_bias_variance)
         state = State(attitude=self.attitude, bias=self.bias, covariance=P)
         rival = StepFilter(self.process_noise, state, gate=gate, robust=self.robust, time=self.time)
         rival._passes = WIDE_PASSES
-        return rival
+        return _Challenger(
+            filter=rival,
+            since=self.time,
+            bias=rival.bias,
+            bias_variance=np.diag(P)[3:].copy(),
+        )
 
     def _remember(self, done: _Done) -> None:
         """Keep what is done for as long as a measurement may still come in before it."""
         if self.look_back == 0.0:
             return
         self._done.append(done)
-        while self._done[0].end < self.time - self.look_back:
+        oldest = self.time - self.look_back - self._rounding(self.time)
+        while self._done[0].end < oldest:
             del self._done[0]
 
     def _again(self, done: _Done) -> None:
         if done.rows is None:
-            self._remember(_Done(kept=self._kept(), dt=done.dt, increment=done.increment))
-            self._predict(done.increment, done.dt)
+            self._remember(_Done(kept=self._kept(), end=done.end, dt=done.dt, increment=done.increment))
+            self._predict(done.increment, done.dt, done.end)
         else:
             self._take_now(done.rows, done.sensor, done.of_heading)
 
@@ -320,9 +486,12 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             "bias": self.bias,
             "P": self.P.copy(),
             "refused": dict(self.refused),
+            "_vertical": dict(self._vertical),
             "events": self.events,
             "_passes": self._passes,
-            "_in_a_row": dict(self._in_a_row),
+            "_standing": copy.deepcopy(self._standing),
+            "_level": self._level,
+            "_trusted": self._trusted,
             "_challenger": None if rival is None else copy.deepcopy(rival),
         }
 
@@ -336,16 +505,22 @@ class _Done:
     """A prediction, or a measurement, that the step face took in, with what it was before."""
 
     kept: dict[str, Any]
+    end: float
+    """Time after it, s."""
     dt: float = 0.0
     increment: Array = field(default_factory=lambda: np.zeros(3))
     rows: Measured | None = None
     sensor: str = ""
     of_heading: bool = False
 
-    @property
-    def end(self) -> float:
-        """Time after it, s."""
-        return float(self.kept["time"]) + self.dt
+    def parted(self, time: float) -> tuple[_Done | None, _Done]:
+        """Return a prediction as its parts before and after a time; whole, and None before it, where it begins then or is none."""
+        begin = float(self.kept["time"])
+        if self.rows is not None or time <= begin:
+            return None, self
+        share = (time - begin) / (self.end - begin)
+        head = replace(self, end=time, dt=share * self.dt, increment=share * self.increment)
+        return head, replace(self, dt=self.dt - head.dt, increment=self.increment - head.increment)
 
 
 @dataclass(kw_only=True)
@@ -354,8 +529,94 @@ class _Challenger:
 
     filter: StepFilter
     since: float
+    bias: Array
+    """Its bias when it started (3,), rad/s."""
+    bias_variance: Array
+    """The variance of it then (3,)."""
     hits: int = 0
     misses: int = 0
+    missed: int = 0
+    """Refusals in a row."""
+    nis: float = 0.0
+    degrees: int = 0
+
+    def judge(self, agreed: bool | None, refused: bool) -> None:
+        """Count a measurement that it took in, or did not, and the filter's own refusal of it."""
+        if agreed is False:
+            self.misses += 1
+            self.missed += 1
+        elif agreed:
+            self.missed = 0
+            self.hits += refused
+            self.nis += self.filter.nis
+            self.degrees += self.filter.dim_z
+
+    @property
+    def failed(self) -> bool:
+        """Whether it refuses too many."""
+        return self.misses > TOLERANCE + 0.5 * self.hits or self.missed >= MISSES_IN_A_ROW
+
+    @property
+    def too_narrow(self) -> bool:
+        """Whether its bias has moved too far from its start, or what it accepts fits too ill."""
+        move = float(np.sum((self.filter.bias - self.bias) ** 2 / self.bias_variance))
+        return move > BIAS_MOVE or self.nis > self.degrees + MISFIT * math.sqrt(2.0 * self.degrees)
+
+    def widen(self) -> bool:
+        """Take part of what was believed of the bias at the start back out (:func:`strapdown.kernels.robust_loop.widen`), if it can be."""
+        mine = self.filter
+        P = mine.P
+        if np.any(np.diag(P)[3:] > 1.05 * self.bias_variance):
+            return False
+        information = (1.0 - 1.0 / WIDENING**2) / self.bias_variance
+        gain = P[:, 3:] @ np.linalg.inv(P[3:, 3:] - np.diag(1.0 / information))
+        correction = gain @ (self.bias - mine.bias)
+        mine.attitude = quaternion.normalize(quaternion.multiply(mine.attitude, quaternion.exp(correction[:3])))
+        mine.bias = mine.bias + correction[3:]
+        mine.P, _ = seen_from(quaternion.exp(correction[:3]), P - gain @ P[3:, :])
+        self.bias_variance = WIDENING**2 * self.bias_variance
+        self.nis, self.degrees = 0.0, 0
+        return True
+
+
+@dataclass(kw_only=True)
+class _Standing:
+    """What became of a sensor's measurements of late."""
+
+    in_a_row: int = 0
+    """Refusals in a row."""
+    excess: int = 0
+    """Refusals less acceptances, between zero and twice the gate's limit."""
+    number: int = 0
+    """Refusals since the excess was zero."""
+    first: float = 0.0
+    """Time of the first of them, s."""
+    told: bool = False
+    """Whether they are a lock-out."""
+
+    def refuse(self, time: float, limit: int) -> None:
+        self.in_a_row += 1
+        if self.excess == 0:
+            self.number, self.first, self.told = 0, time, False
+        self.excess = min(self.excess + 1, 2 * limit)
+        self.number += 1
+        self.told = self.told or self.excess > limit
+
+    def accept(self) -> None:
+        self.in_a_row = 0
+        self.excess = max(self.excess - 1, 0)
+
+
+def _of(sensor: str, name: str) -> str:
+    """Return what a value is called in messages."""
+    return f"{sensor}: {name}" if sensor else name
+
+
+def _sum_and_rest(a: float, b: float) -> tuple[float, float]:
+    """Return the sum and what it lacks by rounding (Knuth 1998, theorem 4.2.2B)."""
+    total = a + b
+    b_in_it = total - a
+    return total, (a - (total - b_in_it)) + (b - b_in_it)
 
 
 def _body_covariance(sigma: ArrayLike | None, covariance_b: ArrayLike | None) -> Array:
@@ -364,7 +625,12 @@ def _body_covariance(sigma: ArrayLike | None, covariance_b: ArrayLike | None) ->
         raise InputError("give either sigma or covariance: the noise of the measurement")
     if sigma is None:
         return covariance("covariance", np.asarray(covariance_b), 3)
-    spread = np.array([positive("sigma", value) for value in np.broadcast_to(np.asarray(sigma, np.float64), 3)])
+    given = numbers("sigma", sigma)
+    if given.shape not in ((), (1,), (3,)):
+        raise InputError(
+            f"sigma has shape {given.shape}; give one number, three of the body axes, or a covariance (3, 3) as covariance"
+        )
+    spread = np.array([positive("sigma", float(value)) for value in np.broadcast_to(given, 3)])
     return np.diag(spread**2)
 
 

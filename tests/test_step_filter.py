@@ -1,0 +1,397 @@
+"""The step face where it is used live: late and simultaneous measurements, its clock, missing samples, and what it refuses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from strapdown import mekf, motion, quaternion, records
+from strapdown.checks import InputError
+from strapdown.gyro import GyroSpec
+from strapdown.mekf import ProcessNoise, StepFilter, initial_state
+from strapdown.randomness import generator
+from strapdown.records import ImuRecord
+from strapdown.robustness import Gate, Monitor, Robust
+from strapdown.scenarios import Scenario, simulate
+from strapdown.vectors import AttitudeSensor, Faults, VectorMeasurements, VectorSensor
+
+NOISE = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)
+IDENTITY = (1.0, 0.0, 0.0, 0.0)
+X, Y, UP = np.eye(3)
+
+
+def start(sigma=0.1):
+    return initial_state(IDENTITY, attitude_sigma=sigma, bias_sigma=1e-3)
+
+
+# -------------------------------------------------------------------------------------------------- late, and at one time
+
+OUTLIERS = Faults(outlier_probability=0.1)
+
+
+def record_of(duration=2.0):
+    """Sensors of three kinds, all at the same ten stamps a second."""
+    scenario = Scenario(
+        motion=motion.Coning(angle=0.3, frequency=0.3),
+        gyro=GyroSpec(angle_random_walk=1e-4, rate_random_walk=1e-5, turn_on_bias=np.array([1e-3, -2e-3, 5e-4])),
+        sensors=(
+            VectorSensor(name="a", reference_f=[1.0, 0.2, 0.0], sigma=1e-3, rate=10.0, faults=OUTLIERS),
+            VectorSensor(name="north", reference_f=[0.0, 1.0, -1.0], sigma=5e-3, rate=10.0, kind="heading"),
+            AttitudeSensor(name="tracker", sigma_across=1e-2, sigma_about=5e-2, rate=10.0),
+            VectorSensor(name="b", reference_f=[0.0, 1.0, 1.0], sigma=2e-3, rate=10.0, faults=OUTLIERS),
+        ),
+        rate=50.0,
+        duration=duration,
+    )
+    return simulate(scenario, 5)
+
+
+def handed_over(record, initial, arrivals, **options):
+    """Run the step face over a record; ``arrivals`` (series, sample) says when each measurement is handed over."""
+    f = StepFilter(NOISE, initial, time=record.time[0], **options)
+    queue = sorted((arrivals[i][k], i, k) for i, s in enumerate(record.vectors) for k in range(len(s.time)))
+    kinds = {"direction": f.update_direction, "heading": f.update_heading}
+    for n, delta in enumerate(record.increments):
+        now, end = record.time[n], record.time[n + 1]
+        whole = end - now
+        while queue and queue[0][0] <= end:
+            handed, i, k = queue.pop(0)
+            if handed > now:
+                f.predict(delta * ((handed - now) / whole), time=handed)
+                now = handed
+            s = record.vectors[i]
+            if s.kind == "attitude":
+                f.update_attitude(s.attitude[k], s.sigma_axes[k], sensor=s.sensor, time=s.time[k])
+            else:
+                kinds[s.kind](s.vector_b[k], s.references_f[k], s.sigma[k], sensor=s.sensor, time=s.time[k])
+        if end > now:
+            f.predict(delta * ((end - now) / whole), time=end)
+    return f
+
+
+OPTIONS = {
+    "plain": {},
+    "gate, Student": {"gate": Gate(probability=0.9999), "robust": Robust(degrees_of_freedom=3.0)},
+    "lost": {"gate": Gate(recovery=4)},
+}
+
+
+@pytest.mark.parametrize("latency", ["the first sensor", "all of them, each its own", "reversed"])
+@pytest.mark.parametrize("option", OPTIONS)
+def test_late_measurements_at_common_stamps_equal_the_filter_in_order(option, latency):
+    record, given = record_of(), OPTIONS[option]
+    error = (1.0, 0.5, -1.0) if option == "lost" else (0.05, -0.06, 0.07)
+    attitude = quaternion.multiply(record.truth.attitude[0], quaternion.exp(error))
+    initial = initial_state(attitude, attitude_sigma=0.1 if option != "lost" else 1e-2, bias_sigma=3e-3)
+    end, draw = record.time[-1], generator(3, 0, "latency")
+    at_once = [s.time for s in record.vectors]
+    if latency == "the first sensor":
+        arrivals = [at_once[0] + 0.11, *at_once[1:]]
+    elif latency == "reversed":
+        arrivals = [time + 0.01 * (3 - i) for i, time in enumerate(at_once)]
+    else:
+        arrivals = [time + draw.uniform(0.0, 0.2, len(time)) for time in at_once]
+    arrivals = [np.minimum(arrival, end) for arrival in arrivals]
+    ordered = handed_over(record, initial, at_once, **given)
+    late = handed_over(record, initial, arrivals, look_back=0.25, sensors=[s.sensor for s in record.vectors], **given)
+    assert late.late == 0
+    assert late.refused == ordered.refused
+    assert late.time == ordered.time == record.time[-1]
+    d = np.sqrt(np.diag(ordered.P))
+    assert quaternion.angle_between(late.attitude, ordered.attitude) < 1e-12
+    assert np.abs(late.bias - ordered.bias).max() < 1e-12
+    assert np.abs((late.P - ordered.P) / np.outer(d, d)).max() < 1e-12
+    assert [event.kind for event in late.events] == [event.kind for event in ordered.events]
+    estimate = mekf.run(record, NOISE, initial, **given)
+    assert quaternion.angle_between(estimate.attitude[-1], late.attitude) < 1e-10
+
+
+def both_ways(look_back, sensors=()):
+    """Two measurements of one time, given in this order and in the other; the last state of each."""
+    found = []
+    for order in ((0, 1), (1, 0)):
+        f = StepFilter(NOISE, start(0.3), look_back=look_back, sensors=sensors)
+        f.predict([0.0, 0.0, 0.1], time=1.0)
+        f.update_direction(UP, UP, 1e-2, sensor="first")
+        f.update_direction(X, X, 1e-2, sensor="second")
+        f.predict([0.0, 0.0, 0.1], time=2.0)
+        given = (("first", UP, quaternion.exp([0.1, 0.2, 0.0])), ("second", X, quaternion.exp([0.0, 0.2, 0.2])))
+        for sensor, reference, off in (given[k] for k in order):
+            f.update_direction(quaternion.rotate(off, reference), reference, 1e-2, sensor=sensor)
+        found.append(f.attitude)
+    return quaternion.angle_between(*found)
+
+
+def test_with_a_look_back_measurements_of_one_time_are_taken_in_the_order_of_the_sensors():
+    assert both_ways(0.5) < 1e-15  # that of their first appearance
+    assert both_ways(0.5, sensors=("second", "first")) < 1e-15
+    assert both_ways(0.0) > 1e-6  # nothing is kept: as they come
+    with pytest.raises(InputError, match=r"sensors is 'first'; it must be a sequence"):
+        StepFilter(NOISE, start(), sensors="first")
+
+
+# ------------------------------------------------------------------------------------------------------------------ the clock
+
+
+@pytest.mark.parametrize("look_back", [0.0, 0.35])
+@pytest.mark.parametrize("clock", ["times", "quotient", "sum"])
+@pytest.mark.parametrize(("begin", "dt"), [(0.0, 0.1), (-1.0, 0.1), (1.7e9, 0.01), (0.0, 1.0 / 3.0)])
+def test_a_measurement_of_now_is_of_now_however_the_user_counts(begin, dt, clock, look_back):
+    f = StepFilter(NOISE, start(), time=begin, look_back=look_back)
+    told = begin
+    for k in range(1, 41):
+        f.predict([0.0, 0.0, 0.01], dt)
+        told = told + dt if clock == "sum" else begin + (k * dt if clock == "times" else k / round(1.0 / dt, 9))
+        assert f.update_direction(X, X, 0.1, time=told), k
+    assert f.late == 0
+    assert f.time == pytest.approx(begin + 40 * dt, abs=8.0 * np.spacing(abs(begin) + 40 * dt))
+
+
+def test_what_is_not_of_now_is_told_apart():
+    f = StepFilter(NOISE, start())
+    for _ in range(1000):
+        f.predict(np.zeros(3), 0.01)
+    with pytest.raises(InputError, match=r"time is 10.0000001 s, after the filter's 10 s; predict up to it first"):
+        f.update_direction(X, X, 0.1, time=10.0 + 1e-7)
+    assert not f.update_direction(X, X, 0.1, time=10.0 - 1e-7)
+    assert f.late == 1
+
+
+def test_a_measurement_at_the_edge_of_the_look_back_is_not_lost_to_rounding():
+    f = StepFilter(NOISE, start(), look_back=0.3)
+    for k in range(1, 101):
+        f.predict(np.zeros(3), 0.1)
+        if k >= 3:
+            assert f.update_direction(X, X, 0.1, time=0.1 * (k - 3)), k
+    assert not f.update_direction(X, X, 0.1, time=9.6)
+    assert f.late == 1
+
+
+def test_the_clock_of_given_stamps_is_theirs():
+    stamps = 1.7e9 + np.cumsum(generator(1, 0, "stamps").uniform(0.005, 0.015, 200))
+    f, other = StepFilter(NOISE, start(), time=1.7e9), StepFilter(NOISE, start(), time=1.7e9)
+    for k, t in enumerate(stamps):
+        f.predict([0.0, 0.0, 1e-3], time=t)
+        other.predict([0.0, 0.0, 1e-3], t - (stamps[k - 1] if k else 1.7e9), time=t)
+        assert f.time == other.time == t
+        assert f.update_direction(X, X, 0.1, time=t)
+        other.update_direction(X, X, 0.1)
+    assert np.array_equal(f.P, other.P)
+    f.predict([0.0, 0.0, 1e-3], time=stamps[-1])
+    assert f.repeated == 1
+
+
+def test_a_long_sum_of_steps_stays_the_time():
+    f, told = StepFilter(NOISE, start(), time=100.0), 100.0
+    f._predict = lambda increment, step, end: setattr(f, "time", end)
+    for _ in range(100_000):
+        f.predict(np.zeros(3), 0.01)
+        told += 0.01
+    assert f.time == pytest.approx(1100.0, abs=5e-13)
+    assert abs(told - 1100.0) > 1e-10
+    assert f.update_direction(X, X, 0.1, time=told)  # of a user who sums plainly
+    assert f.update_direction(X, X, 0.1, time=1100.0)
+    assert not f.update_direction(X, X, 0.1, time=1100.0 - 1e-4)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({}, "dt is None; give it"),
+        ({"time": 0.5}, r"time is 0.5 s, before the filter's 1 s"),
+        ({"dt": 0.2, "time": 1.1}, r"dt is 0.2 s, but from 1 s to time it is 0.1 s"),
+        ({"dt": -0.1}, "dt is -0.1 s; it must not be negative"),
+        ({"dt": 0.1, "delta_theta": [0.0, np.nan, 0.0]}, r"delta_theta\[1\] is nan"),
+    ],
+)
+def test_steps_that_contradict_the_clock_are_refused(arguments, message):
+    f = StepFilter(NOISE, start(), time=1.0)
+    with pytest.raises(InputError, match=message):
+        f.predict(**{"delta_theta": np.zeros(3), **arguments})
+    assert f.time == 1.0
+
+
+# ----------------------------------------------------------------------------------------- what the record refuses or skips
+
+
+def refusal(make):
+    with pytest.raises(InputError) as caught:
+        make()
+    return str(caught.value)
+
+
+REFUSED = {
+    "a direction of another length": ("direction", 9.8 * UP, UP, "has length 9.8; divide each vector by its length"),
+    "a heading of another length": ("heading", 1.5 * X, X, "has length 1.5; divide each vector by its length"),
+    "a heading of the vertical": ("heading", X, UP, "is vertical and shows no heading"),
+    "a nearly vertical one": ("heading", X, [1e-3, 0.0, 9.8], "is vertical and shows no heading"),
+    "a direction to nowhere": ("direction", X, np.zeros(3), "zero vector"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_the_step_face_refuses_what_the_record_refuses(case):
+    kind, value, reference, words = REFUSED[case]
+    f = StepFilter(NOISE, start())
+    update = f.update_direction if kind == "direction" else f.update_heading
+    series = {"sensor": "s", "kind": kind, "time": [0.0], "vector_b": [value], "reference_f": reference, "sigma": 0.1}
+    whole = refusal(lambda: VectorMeasurements(**series))
+    step = refusal(lambda: update(value, reference, 0.1, sensor="s"))
+    assert words in whole
+    assert words in step
+    assert step.startswith("s: ") or "zero" in words
+    assert np.array_equal(f.P, start().covariance)
+
+
+def test_a_reference_of_any_length_will_do_for_a_heading():
+    f, other = StepFilter(NOISE, start()), StepFilter(NOISE, start())
+    f.update_heading(X, [9.8, 0.1, 0.0], 0.1)
+    other.update_heading(X, np.array([9.8, 0.1, 0.0]) / np.hypot(9.8, 0.1), 0.1)
+    assert np.allclose(f.attitude, other.attitude, rtol=0.0, atol=1e-15)
+
+
+VERTICAL_OPTIONS = [{}, {"gate": Gate(recovery=2)}, {"robust": Robust()}]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    "options", [{}, {"gate": Gate(recovery=2)}, {"robust": Robust()}], ids=["plain", "gate", "robust"]
+)
+def test_a_vertical_measured_heading_is_skipped_and_counted(options):
+    f = StepFilter(NOISE, start(), look_back=1.0, **options)
+    for k in range(1, 6):
+        f.predict(np.zeros(3), time=0.1 * k)
+        assert not f.update_heading(UP, X, 0.1, sensor="north")
+    before, attitude = f.P.copy(), f.attitude.copy()
+    assert f.skipped == {"north": 5}
+    assert f.refused == {}
+    assert f.events == ()
+    # What is done again is counted once.
+    assert f.update_direction(X, X, 1e3, sensor="late", time=0.25)
+    assert f.skipped == {"north": 5}
+    assert np.allclose(f.P, before, rtol=1e-6, atol=0.0)
+    assert quaternion.angle_between(f.attitude, attitude) < 1e-12
+    assert f.update_heading(X, X, 0.1, sensor="north")
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("options", VERTICAL_OPTIONS, ids=["plain", "gate", "robust"])
+def test_both_faces_skip_a_vertical_heading_alike(options):
+    """One heading in two is measured of a vertical vector; the run is that of the record without them, and says how many."""
+    time = 0.1 * np.arange(1.0, 9.0)
+    vertical = np.arange(8) % 2 == 0
+    seen = np.where(vertical[:, None], UP, X)
+    north = VectorMeasurements(sensor="north", kind="heading", time=time, vector_b=seen, reference_f=X, sigma=0.1)
+    up = VectorMeasurements(sensor="up", kind="direction", time=time, vector_b=[UP] * 8, reference_f=UP, sigma=0.1)
+    edges = ImuRecord(time=np.linspace(0.0, 1.0, 11), increments=np.zeros((10, 3)), vectors=(north, up))
+    rest = replace(edges, vectors=(north.taken(~vertical), up))
+    both, without = (
+        mekf.run(r, NOISE, start(), full_covariance=True, monitor=Monitor(window=2), **options) for r in (edges, rest)
+    )
+    assert both.skipped == {"north": 4, "up": 0}
+    assert both.refused == {"north": 0, "up": 0}
+    assert both.events == without.events
+    assert np.array_equal(both.innovations["north"].time, time[~vertical])
+    assert np.array_equal(both.innovations["north"].nis, without.innovations["north"].nis)
+    assert np.array_equal(both.covariance, without.covariance)
+    f = StepFilter(NOISE, start(), **options)
+    for k, t in enumerate(time):
+        f.predict(np.zeros(3), time=t)
+        f.update_heading(seen[k], X, 0.1, sensor="north")
+        f.update_direction(UP, UP, 0.1, sensor="up")
+    assert f.skipped == {"north": 4}
+    assert np.allclose(f.P, both.covariance[8], rtol=1e-10, atol=1e-18)
+
+
+NAN = np.full(3, np.nan)
+
+
+@pytest.mark.parametrize("kind", ["direction", "vector", "heading", "attitude"])
+def test_a_missing_sample_is_skipped_and_counted(kind):
+    f = StepFilter(NOISE, start(), look_back=1.0)
+    f.predict(np.zeros(3), time=0.5)
+    P, noise = f.P.copy(), np.nan
+    for value in (NAN, [0.0, np.nan, 1.0]):
+        if kind == "attitude":
+            taken = f.update_attitude([*value, 1.0], noise, sensor="s")
+        else:
+            taken = getattr(f, f"update_{kind}")(value, NAN, noise, sensor="s")
+        assert taken is False
+    assert f.skipped == {"s": 2}
+    assert f.refused == {}
+    assert np.array_equal(f.P, P)
+    for bad in (lambda: f.update_direction([np.inf, 0.0, 0.0], X, 0.1), lambda: f.update_direction(X, X, np.nan)):
+        refusal(bad)
+
+
+def test_missing_attitudes_are_counted_and_leave_the_others_as_they_are():
+    """Rows of NaN, with whatever else is unknown of them, and the record without these rows."""
+    record = record_of(1.0)
+    tracker = record.vectors[2]
+    gone = np.zeros(len(tracker.time), bool)
+    gone[[0, 3, 4, 9]] = True
+    measured, axes = tracker.attitude.copy(), tracker.sigma_axes.copy()
+    measured[gone, 2], axes[gone, 1] = np.nan, np.nan
+    holed = replace(tracker, attitude=measured, sigma_axes=axes)
+    others = (record.vectors[0], record.vectors[3])
+    initial = initial_state(record.truth.attitude[0], attitude_sigma=0.01, bias_sigma=3e-3)
+    runs = [
+        mekf.run(replace(record, vectors=(*others, one)), NOISE, initial, full_covariance=True)
+        for one in (holed, tracker.taken(~gone))
+    ]
+    assert runs[0].skipped == {"a": 0, "b": 0, "tracker": 4}
+    assert np.array_equal(runs[0].covariance, runs[1].covariance)
+    assert np.array_equal(runs[0].attitude, runs[1].attitude)
+    found = mekf.first_state(replace(record, vectors=(holed,)), NOISE, bias_sigma=1e-3)
+    assert quaternion.angle_between(found.attitude, record.truth.attitude[0]) < 0.2
+
+
+# ------------------------------------------------------------------------------------------------------------ what is no argument
+
+SERIES = VectorMeasurements(sensor="s", kind="direction", time=[0.5], vector_b=[X], reference_f=X, sigma=0.1)
+RECORD = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=(SERIES,))
+
+WRONG = {
+    "gate by its probability": (lambda: mekf.run(RECORD, NOISE, start(), gate=0.999), "gate is 0.999, .*Gate"),
+    "robust by its name": (lambda: mekf.run(RECORD, NOISE, start(), robust="huber"), "robust is 'huber', .*Robust"),
+    "monitor switched on": (lambda: mekf.run(RECORD, NOISE, start(), monitor=True), "monitor is True, .*Monitor"),
+    "no start": (lambda: mekf.run(RECORD, NOISE, None), "initial is None, .*initial_state"),
+    "noise as a number": (lambda: mekf.run(RECORD, 1e-4, start()), "process_noise is 0.0001, .*ProcessNoise"),
+    "gate, stepping": (lambda: StepFilter(NOISE, start(), gate=0.999), "gate is 0.999"),
+    "robust, stepping": (lambda: StepFilter(NOISE, start(), robust="huber"), "robust is 'huber'"),
+    "no start, stepping": (lambda: StepFilter(NOISE, None), "initial is None"),
+    "two sigmas": (
+        lambda: initial_state(IDENTITY, attitude_sigma=[1.0, 2.0], bias_sigma=1.0),
+        r"attitude_sigma has shape \(2,\); give one number, or three",
+    ),
+    "two bias sigmas": (
+        lambda: initial_state(IDENTITY, attitude_sigma=1.0, bias_sigma=[1.0, 2.0]),
+        r"bias_sigma has shape \(2,\)",
+    ),
+    "sigma in words": (lambda: initial_state(IDENTITY, attitude_sigma="1°", bias_sigma=1.0), "attitude_sigma is not"),
+    "sigma (2,)": (lambda: StepFilter(NOISE, start()).update_direction(X, X, [0.1, 0.1]), r"sigma has shape \(2,\)"),
+    "sigma (3, 3)": (lambda: StepFilter(NOISE, start()).update_direction(X, X, np.eye(3)), "as covariance"),
+    "a bare series": (lambda: ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=SERIES), r"\(series,\)"),
+    "no series": (lambda: ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=(X,)), r"vectors\[0\] is"),
+    "an unknown algorithm": (lambda: records.compress(RECORD, "two-samples"), "did you mean 'two-sample'"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_what_is_no_argument_is_named(case):
+    make, words = WRONG[case]
+    with pytest.raises(InputError, match=words):
+        make()
+
+
+def test_an_algorithm_goes_by_its_name():
+    record = record_of(1.0)
+    from strapdown import coning
+
+    one = records.compress(record, "two-sample")
+    other = records.compress(record, coning.ALGORITHMS["two-sample"])
+    assert np.array_equal(one.increments, other.increments)
+
+
+def test_a_monitor_is_taken():
+    assert mekf.run(RECORD, NOISE, start(), monitor=Monitor()).events == ()
