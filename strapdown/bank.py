@@ -12,18 +12,20 @@ would have settled on some attitude and been sure of it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import mekf, quaternion, records, vectors
 from strapdown.checks import Array, InputError, array, count, positive
-from strapdown.kernels import bank_loop, filter_loop
+from strapdown.kernels import bank_loop, filter_loop, robust_step
 from strapdown.kernels.machine import compiled
 from strapdown.mekf import ProcessNoise, Schedule, State, covariance_matrices, pack
-from strapdown.records import Estimate, ImuRecord, Innovations
+from strapdown.records import Estimate, Event, ImuRecord, Innovations
+from strapdown.robustness import Gate, Monitor, Robust
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
+from strapdown.vectors import VectorMeasurements
 
 HYPOTHESES = 96
 """Hypotheses on the circle where nobody says: 3.75° apart. Fewer find the attitude as soon, but are some too sure of it:
@@ -32,6 +34,9 @@ LEAST_WEIGHT = 1e-6
 """A hypothesis of less than this part of the heaviest one's weight is dropped."""
 LARGEST_SHARE = 0.15
 """Hypotheses are one Gaussian when less than this part of its covariance lies between them."""
+WARY = (10.0, 10.0, 5.0, 5.0, 3.0, 3.0, 2.0, 2.0)
+"""Where outliers are reckoned with, the σ of the first directions is taken so many times as large: until a few agree nothing tells which of
+them lie off, and one that is believed too early has all that follow refused."""
 CONSTANT = 1.0 * DEGREE
 """References that turn by less than this over a record count as constant, rad."""
 
@@ -75,10 +80,14 @@ def run(
     every: int = 1,
     least_weight: float = LEAST_WEIGHT,
     largest_share: float = LARGEST_SHARE,
+    gate: Gate | None = None,
+    robust: Robust | None = None,
+    monitor: Monitor | None = None,
 ) -> BankEstimate:
     """Estimate attitude and gyro bias from an unknown start.
 
-    Measurements before the first direction (or vector, or attitude) are left out and counted as skipped.
+    Measurements before the first direction (or vector, or attitude) are left out and counted as skipped. Until the hypotheses are one, a
+    noise that differs by body axis (``sigma_axes``, ``covariance``) is taken for its largest σ about every axis; then it is what it is.
 
     Parameters
     ----------
@@ -97,6 +106,18 @@ def run(
         Hypotheses of less than this part of the heaviest one's weight are dropped.
     largest_share : float
         The hypotheses are one when less than this part of the covariance lies between them.
+    gate : Gate, optional
+        Each hypothesis refuses what no right filter would see; what it refuses counts against it as if it lay at the threshold. When
+        most of them have refused ``recovery`` measurements in a row, the bank starts anew from the first of these, and an event says so.
+        Once the hypotheses are one, it is the gate of :func:`strapdown.mekf.run`.
+    robust : Robust, optional
+        Each hypothesis weighs measurements by how far they lie off, and hypotheses are weighed by likelihoods with heavier tails. Alone it
+        cannot recover where the first measurements mislead it: give a gate too.
+    monitor : Monitor, optional
+        Report when the running NIS leaves its bounds, once the hypotheses are one.
+
+    With a gate or a robust update the first directions, which nothing can vouch for yet, are given ``WARY`` times their σ: the estimate is
+    too modest until there have been so many.
 
     Raises
     ------
@@ -108,47 +129,80 @@ def run(
     for name, value in (("least_weight", least_weight), ("largest_share", largest_share)):
         if not 0.0 < value < 1.0:
             raise InputError(f"{name} is {value:g}; it must lie between 0 and 1")
-    events = mekf.schedule(record.vectors, record.time[0], record.time[-1])
+    coarse = tuple(_isotropic(series) for series in record.vectors)
+    events = mekf.schedule(coarse, record.time[0], record.time[-1])
+    doubted = gate is not None or robust is not None
+    recovery = None if gate is None else gate.recovery
+    told = mekf.gaps(record.time)
     first = _first_direction(events)
-    states, angles = start(record, events, first, hypotheses, bias=bias, bias_sigma=bias_sigma)
-    began = float(events.time[first])
-    kept = np.arange(0, len(record.time), every)
-    kept = kept[record.time[kept] >= began]
-    if len(kept) == 0:
-        raise InputError(
-            f"the first direction comes at {began:.6g} s, after the last kept edge; keep more edges or give a longer record"
+    while True:
+        vector_b, variance = _wary(events, first) if doubted else (events.vector_b, events.variance)
+        sigma_factor = WARY[0] if doubted else 1.0
+        states, angles = start(
+            record, events, first, hypotheses, bias=bias, bias_sigma=bias_sigma, sigma_factor=sigma_factor
         )
-    number = len(states)
-    attitude, estimated_bias = np.empty((len(kept), 4)), np.empty((len(kept), 3))
-    blocks, weights = np.empty((len(kept), 21)), np.empty((len(kept), number))
-    innovation = np.empty((len(events.time), 6))
-    rows, at, used = compiled(bank_loop.run_bank)(
-        record.time,
-        np.ascontiguousarray(record.increments),
-        process_noise.angle_random_walk**2,
-        process_noise.rate_random_walk**2,
-        events.time,
-        events.kind,
-        events.vector_b,
-        events.variance,
-        events.reference,
-        events.triads,
-        states,
-        np.zeros(number),
-        began,
-        first + 1,
-        every,
-        least_weight,
-        largest_share,
-        np.empty(number),
-        np.empty(12),
-        np.empty(28),
-        attitude,
-        estimated_bias,
-        blocks,
-        weights,
-        innovation,
-    )
+        began = float(events.time[first])
+        kept = np.arange(0, len(record.time), every)
+        kept = kept[record.time[kept] >= began]
+        if len(kept) == 0:
+            raise InputError(
+                f"the first direction comes at {began:.6g} s, after the last kept edge; keep more edges or give a longer record"
+            )
+        number = len(states)
+        attitude, estimated_bias = np.empty((len(kept), 4)), np.empty((len(kept), 3))
+        blocks, weights = np.empty((len(kept), 21)), np.empty((len(kept), number))
+        innovation, share = np.empty((len(events.time), 6)), np.empty(len(events.time))
+        rows, at, used = compiled(bank_loop.run_bank)(
+            record.time,
+            np.ascontiguousarray(record.increments),
+            process_noise.angle_random_walk**2,
+            process_noise.rate_random_walk**2,
+            events.time,
+            events.kind,
+            vector_b,
+            variance,
+            events.reference,
+            events.triads,
+            states,
+            np.zeros(number),
+            began,
+            first + 1,
+            every,
+            least_weight,
+            largest_share,
+            np.empty(number),
+            np.empty(12),
+            np.empty(28),
+            attitude,
+            estimated_bias,
+            blocks,
+            weights,
+            innovation,
+            np.full(3, np.inf) if gate is None else gate.thresholds,
+            0 if robust is None else {"huber": robust_step.HUBER, "student": robust_step.STUDENT}[robust.kind],
+            np.ones((3, 2)) if robust is None else robust.parameters,
+            0 if robust is None else robust.iterations,
+            recovery or 0,
+            share,
+        )
+        if at != bank_loop.LOST:
+            break
+        assert recovery is not None
+        # What came before is not to be believed: the circle is that of the first refused direction.
+        again = used + np.flatnonzero(events.kind[used:] != filter_loop.HEADING)[:1]
+        if len(again) == 0 or events.time[again[0]] > record.time[::every][-1]:
+            recovery = None  # too late for another start
+            continue
+        told.append(
+            Event(
+                kind="recovery",
+                start=float(events.time[used]),
+                end=float(events.time[used + recovery - 1]),
+                sensor=events.sensors[events.sensor[used]],
+                value=float(recovery),
+            )
+        )
+        first = int(again[0])
     P = covariance_matrices(blocks[:rows])
     taken = np.arange(first + 1, used)
     skipped = {
@@ -161,13 +215,21 @@ def run(
         bias=estimated_bias[:rows],
         variance=np.ascontiguousarray(np.diagonal(P, axis1=1, axis2=2)),
         covariance=P,
-        innovations=_innovations(events, taken, innovation),
+        innovations=_innovations(events, taken, innovation, share if doubted else None),
         skipped=skipped,
+        events=tuple(sorted(told, key=lambda event: event.start)),
     )
     if 0 <= at < len(record.time) - 1:
         one = State(attitude=attitude[rows - 1], bias=estimated_bias[rows - 1], covariance=P[-1])
         rest = records.cut(record, at, len(record.time) - 1)
-        after = mekf.run(rest, process_noise, one, every=every, full_covariance=True)
+        # The bank has taken in what was measured at the first edge, which a cut leaves with a record's first part.
+        rest = replace(rest, vectors=tuple(series.taken(series.time > record.time[at]) for series in rest.vectors))
+        if gate is not None and gate.restart_bias_sigma is None:
+            # A restart is from as little as this one was, not from what the bank has learnt.
+            gate = replace(gate, restart_bias_sigma=float(np.max(bias_sigma)))
+        after = mekf.run(
+            rest, process_noise, one, every=every, full_covariance=True, gate=gate, robust=robust, monitor=monitor
+        )
         estimate = _joined(estimate, after)
     return BankEstimate(
         estimate=estimate,
@@ -187,11 +249,12 @@ def start(
     *,
     bias: ArrayLike = (0.0, 0.0, 0.0),
     bias_sigma: ArrayLike,
+    sigma_factor: float = 1.0,
 ) -> tuple[Array, Array]:
     """Return the hypotheses (h, 28), packed, that event ``first``, a direction, leaves open, and their angles on the circle (h,), rad.
 
-    Across the direction each has the measurement's covariance. About it each has a standard deviation of half the spacing: of Gaussians
-    spread so, the sum is uniform over the circle to 1.5 %. A measured attitude leaves a single hypothesis.
+    Across the direction each has the measurement's covariance, its σ times ``sigma_factor``. About it each has a standard deviation of
+    half the spacing: of Gaussians spread so, the sum is uniform over the circle to 1.5 %. A measured attitude leaves a single hypothesis.
     """
     spread = np.broadcast_to(bias_sigma, 3).astype(np.float64)
     for k, value in enumerate(spread):
@@ -201,13 +264,14 @@ def start(
     given = array("bias", bias, (3,))
     frame = events.triads[events.reference[first]]
     if events.kind[first] == filter_loop.ATTITUDE:
-        P[:3, :3] = np.diag(events.vector_b[first])
+        P[:3, :3] = np.diag(sigma_factor**2 * events.vector_b[first])
         return pack(frame[:4], given, P)[None, :].copy(), np.zeros(1)
     z = events.vector_b[first] / np.linalg.norm(events.vector_b[first])
     # Any attitude that maps z on the reference: the one that takes a triad about it to a triad about the reference.
     q = quaternion.from_matrix(frame.reshape(3, 3).T @ vectors.triad(z))
     angles = 2.0 * np.pi * np.arange(hypotheses) / hypotheses
-    P[:3, :3] = events.variance[first] * (np.eye(3) - np.outer(z, z)) + (np.pi / hypotheses) ** 2 * np.outer(z, z)
+    variance = sigma_factor**2 * events.variance[first]
+    P[:3, :3] = variance * (np.eye(3) - np.outer(z, z)) + (np.pi / hypotheses) ** 2 * np.outer(z, z)
     circle = quaternion.multiply(q, quaternion.exp(angles[:, None] * z))
     return np.array([pack(attitude, given, P) for attitude in circle]), angles
 
@@ -222,13 +286,40 @@ def _first_direction(events: Schedule) -> int:
     return int(more[0])
 
 
-def _innovations(events: Schedule, taken: np.ndarray, rows: Array) -> dict[str, Innovations]:
+def _isotropic(series: VectorMeasurements) -> VectorMeasurements:
+    """Return the series with one σ a sample, the largest about any axis, if it has more than one."""
+    if not series.anisotropic:
+        return series
+    largest = np.sqrt(np.linalg.eigvalsh(series.covariances)[..., -1])
+    if series.attitude is not None:
+        axes = np.repeat(largest[:, None], 3, axis=1)
+        return replace(series, sigma=largest, sigma_axes=axes, covariance=None)
+    return replace(series, sigma=largest, sigma_axes=None, covariance=None)
+
+
+def _wary(events: Schedule, first: int) -> tuple[Array, Array]:
+    """Return values and variances of the events with those of the first directions, from event ``first`` on, made larger by ``WARY``."""
+    value, variance = np.array(events.vector_b), np.array(events.variance)
+    places = first + np.flatnonzero(events.kind[first:] != filter_loop.HEADING)[: len(WARY)]
+    for place, factor in zip(places.tolist(), WARY, strict=False):
+        variance[place] *= factor**2
+        if events.kind[place] == filter_loop.ATTITUDE:  # whose value is its three variances
+            value[place] *= factor**2
+    return value, variance
+
+
+def _innovations(events: Schedule, taken: np.ndarray, rows: Array, weight: Array | None) -> dict[str, Innovations]:
     """Return the innovations e₁, s₁, e₂, s₂, … of the events taken, by sensor, as many as each has degrees of freedom."""
     result = {}
     for i, (sensor, kind) in enumerate(zip(events.sensors, events.kinds, strict=True)):
         mine = taken[events.sensor[taken] == i]
         filled = rows[mine, : 2 * vectors.KINDS[kind]]
-        result[sensor] = Innovations(time=events.time[mine], innovation=filled[:, 0::2], variance=filled[:, 1::2])
+        result[sensor] = Innovations(
+            time=events.time[mine],
+            innovation=filled[:, 0::2],
+            variance=filled[:, 1::2],
+            weight=None if weight is None else weight[mine],
+        )
     return result
 
 
@@ -243,6 +334,7 @@ def _joined(first: Estimate, last: Estimate) -> Estimate:
             time=np.concatenate([one.time, other.time]),
             innovation=np.concatenate([one.innovation, other.innovation]),
             variance=np.concatenate([one.variance, other.variance]),
+            weight=None if one.weight is None or other.weight is None else np.concatenate([one.weight, other.weight]),
         )
     return Estimate(
         time=np.concatenate([first.time, last.time[1:]]),
@@ -252,6 +344,11 @@ def _joined(first: Estimate, last: Estimate) -> Estimate:
         covariance=np.concatenate([first.covariance, last.covariance[1:]]),
         innovations=innovations,
         skipped=first.skipped,
+        events=tuple(
+            sorted(
+                [*first.events, *(event for event in last.events if event.kind != "gap")], key=lambda event: event.start
+            )
+        ),
     )
 
 

@@ -13,13 +13,17 @@ from strapdown import bank, consistency, kinematics, mekf, quaternion, records, 
 from strapdown.checks import InputError
 from strapdown.kernels import bank_loop
 from strapdown.kernels.machine import compiled
+from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.mekf import ProcessNoise
 from strapdown.motion import ConstantRate
 from strapdown.records import ImuRecord
+from strapdown.robustness import Gate, Monitor, Robust
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
-from strapdown.vectors import VectorMeasurements
+from strapdown.vectors import Faults, VectorMeasurements
 
 QUIET = ProcessNoise(angle_random_walk=1e-7, rate_random_walk=1e-10)
+WITHOUT = (np.full(3, np.inf), 0, np.ones((3, 2)), 0, 0)
+"""The kernel's arguments for no gate and no robust update."""
 
 
 def series(name, time, vector_b, reference_f, sigma, kind="direction"):
@@ -177,7 +181,7 @@ def test_for_small_errors_it_is_the_plain_filter():
     done = bank_loop.run_bank(
         record.time, record.increments, QUIET.angle_random_walk**2, QUIET.rate_random_walk**2, events.time, events.kind,
         events.vector_b, events.variance, events.reference, events.triads, two, np.zeros(2), 0.0, 0, 1, 1e-6, -1.0,
-        np.empty(2), np.empty(12), np.empty(28), *out, innovation,
+        np.empty(2), np.empty(12), np.empty(28), *out, innovation, *WITHOUT, np.empty(len(events.time)),
     )  # fmt: skip
     assert done == (rows, -1, len(events.time))
     assert quaternion.angle_between(out[0], plain.attitude).max() < 1e-8  # 1e-4 of σ: the reset's second order
@@ -186,6 +190,32 @@ def test_for_small_errors_it_is_the_plain_filter():
     scale = plain.sigma[:, :, None] * plain.sigma[:, None, :]
     assert np.abs((P - plain.covariance) / scale).max() < 1e-3
     assert np.allclose(out[3], 0.5)
+
+
+@pytest.mark.parametrize("bias_sigma", [1e-2, 3.0, 60.0], ids=["right", "wild", "wilder"])
+def test_a_hypothesis_whose_bias_is_wild_is_cut_into_sub_steps_as_the_filter(bias_sigma):
+    """A bias of tens of rad/s turns the body, step by step, beyond the range of the polynomials, though its gyro hardly turns."""
+    time = 0.3 * np.arange(21)
+    seen = np.concatenate([[0.05, 0.1], time[2:]])
+    # The second attitude is nearly half a turn off: where little is known of the bias, the bias is blamed.
+    attitude = quaternion.exp(np.where(seen == 0.1, 2.8, 0.0)[:, None] * np.array([0.6, 0.0, 0.8]))
+    tracker = VectorMeasurements(
+        sensor="tracker", kind="attitude", time=seen, attitude=attitude, sigma_axes=np.full(3, 1e-2)
+    )
+    record = ImuRecord(time=time, increments=np.full((20, 3), 1e-3), vectors=(tracker,))
+    noise = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-3)
+    found = bank.run(record, noise, bias_sigma=bias_sigma, every=20)  # one hypothesis, told at the end of the record
+    start = mekf.initial_state(attitude[0], attitude_sigma=1e-2, bias_sigma=bias_sigma)
+    increments = record.increments.copy()
+    increments[0] *= 0.25 / 0.3
+    rest = ImuRecord(
+        time=np.concatenate([seen[:1], time[1:]]), increments=increments, vectors=(tracker.taken(seen > seen[0]),)
+    )
+    plain = mekf.run(rest, noise, start, full_covariance=True)
+    assert (np.abs(plain.bias).max() * 0.3 > 10.0 * LARGEST_ANGLE) == (bias_sigma > 1.0)
+    np.testing.assert_allclose(found.estimate.innovations["tracker"].nis, plain.innovations["tracker"].nis, rtol=1e-7)
+    np.testing.assert_allclose(found.estimate.bias[-1], plain.bias[-1], rtol=1e-7, atol=1e-12)
+    np.testing.assert_allclose(found.estimate.covariance[-1], plain.covariance[-1], rtol=1e-7, atol=1e-15)
 
 
 def test_weights_are_the_densities_of_the_measurement():
@@ -199,7 +229,7 @@ def test_weights_are_the_densities_of_the_measurement():
     compiled(bank_loop.run_bank)(
         record.time, record.increments, 1e-14, 0.0, events.time, events.kind, events.vector_b, events.variance,
         events.reference, events.triads, states, np.zeros(2), 0.0, 0, 1, 1e-6, -1.0, np.empty(2), np.empty(12),
-        np.empty(28), *out, np.empty((1, 6)),
+        np.empty(28), *out, np.empty((1, 6)), *WITHOUT, np.empty(1),
     )  # fmt: skip
     z = events.vector_b[0]
     densities = [
@@ -350,6 +380,166 @@ def test_with_full_geometry_it_agrees_with_wahba(phases):
         assert found.converged
 
 
+# ------------------------------------------------------------------------------------------------------------ wrong measurements
+
+OPTIONS = {
+    "gate": {"gate": Gate()},
+    "Student": {"robust": Robust()},
+    "gate, Student": {"gate": Gate(probability=0.9999), "robust": Robust()},
+}
+
+
+def contaminated(probability):
+    """The magnetometer with so many outliers of ten σ."""
+    sensor = scenarios.load_scenario("magnetometer-only").sensors[0]
+    faults = Faults(outlier_probability=probability, outlier_scale=10.0)
+    return (dataclasses.replace(sensor, faults=faults),)
+
+
+def check_outliers(option, probability, runs):
+    nees, last = [], []
+    epochs = (200.0, 400.0, 800.0, 1490.0)
+    for run in range(runs):
+        record, belief = orbit(run, sensors=contaminated(probability))
+        found = bank.run(record, belief, every=10, **OPTIONS[option])
+        e, each = judged(found, record)
+        nees.append(each[[int(np.searchsorted(found.estimate.time, seconds)) for seconds in epochs]])
+        last.append(np.linalg.norm(e[-1, :3]))
+    mean = np.mean(nees, axis=0) / 6.0
+    low, high = consistency.mean_bounds(6, runs, 1.0 - 0.01 / len(epochs))
+    assert np.all(mean < high), (mean, high)
+    assert np.all(mean[1:] > low), (mean, low)
+    assert mean[0] > 0.8 * low  # some of its directions were taken for coarser than they are
+    assert np.max(nees) / 6.0 < 12.0
+    assert np.max(last) < 1.0 * DEGREE
+
+
+@pytest.mark.parametrize("probability", [0.0, 0.01, 0.05])
+@pytest.mark.parametrize("option", OPTIONS)
+def test_it_is_consistent_among_outliers(option, probability):
+    check_outliers(option, probability, 60)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("probability", [0.0, 0.01, 0.05])
+@pytest.mark.parametrize("option", OPTIONS)
+def test_it_is_consistent_among_outliers_over_many_runs(option, probability):
+    check_outliers(option, probability, 600)
+
+
+def test_without_a_gate_outliers_make_it_too_sure():
+    nees = []
+    for run in range(60):
+        record, belief = orbit(run, sensors=contaminated(0.05))
+        nees.append(judged(bank.run(record, belief, every=10), record)[1][40])
+    assert np.mean(nees) / 6.0 > 2.0
+
+
+@pytest.mark.parametrize("size", [10.0, 100.0, 1000.0])
+def test_a_wild_first_direction_does_not_mislead_it_for_good(size):
+    recovered = 0
+    for run in range(15):
+        record, belief = orbit(run)
+        one = record.vectors[0]
+        vector_b = np.array(one.vector_b)
+        vector_b[0] += size * one.sigma[0] * np.random.default_rng(run).standard_normal(3)
+        vector_b[0] /= np.linalg.norm(vector_b[0])
+        wild = dataclasses.replace(record, vectors=(dataclasses.replace(one, vector_b=vector_b),))
+        found = bank.run(wild, belief, every=10, gate=Gate(restart_bias_sigma=1e-4))
+        e, nees = judged(found, wild)
+        assert np.linalg.norm(e[-1, :3]) < 1.0 * DEGREE
+        assert nees[-1] < 30.0
+        for event in found.estimate.events:
+            assert (event.kind, event.sensor, event.value) == ("recovery", "magnetometer", 10.0)
+            if event.end < found.became_one:  # the bank's own: it is as if there had been nothing before
+                assert event.end - event.start == pytest.approx(90.0)
+                assert found.estimate.time[0] >= event.start
+                assert found.estimate.skipped["magnetometer"] == np.sum(one.time < event.start)
+                recovered += 1
+    assert (recovered > 10) == (size > 10.0)
+    assert (recovered > 0) == (size > 10.0)
+
+
+@pytest.mark.parametrize("option", OPTIONS)
+def test_compiled_and_plain_are_the_same_with_every_option(option):
+    record, belief = orbit(0, duration=150.0, sensors=contaminated(0.2))
+    fast = bank.run(record, belief, hypotheses=8, every=30, **OPTIONS[option])
+    slow_kernel = compiled
+    try:
+        bank.compiled = lambda function: function
+        slow = bank.run(record, belief, hypotheses=8, every=30, **OPTIONS[option])
+    finally:
+        bank.compiled = slow_kernel
+    assert np.allclose(fast.estimate.attitude, slow.estimate.attitude, atol=1e-9)
+    assert np.allclose(fast.weights, slow.weights, atol=1e-7)
+    for sensor, one in fast.estimate.innovations.items():
+        assert np.allclose(one.weight, slow.estimate.innovations[sensor].weight, atol=1e-9)
+        assert one.weight.min() < 0.5
+
+
+def test_gate_robust_and_monitor_go_on_once_it_is_one():
+    record, belief = orbit(3, sensors=contaminated(0.05))
+    gate, monitor = Gate(probability=0.9999), Monitor(window=10, probability=0.9)
+    found = bank.run(record, belief, every=10, gate=gate, robust=Robust(), monitor=monitor)
+    assert found.converged
+    k = int(np.searchsorted(found.estimate.time, found.became_one))
+    one = mekf.State(
+        attitude=found.estimate.attitude[k], bias=found.estimate.bias[k], covariance=found.estimate.covariance[k]
+    )
+    first = int(np.searchsorted(record.time, found.became_one))
+    rest = records.cut(record, first, len(record.time) - 1)
+    restart = Gate(probability=0.9999, restart_bias_sigma=20.0 * DEGREE_PER_HOUR)
+    plain = mekf.run(rest, belief, one, every=10, gate=restart, robust=Robust(), monitor=monitor)
+    assert np.array_equal(plain.attitude, found.estimate.attitude[k:])
+    assert plain.events
+    assert found.estimate.events[-len(plain.events) :] == plain.events
+    weight = found.estimate.innovations["magnetometer"].weight
+    assert np.array_equal(
+        weight[-len(plain.innovations["magnetometer"].weight) :], plain.innovations["magnetometer"].weight
+    )
+    assert found.estimate.refused["magnetometer"] > 0
+
+
+@pytest.mark.parametrize("robust", [Robust(), Robust(kind="huber")], ids=["Student", "Huber"])
+@pytest.mark.parametrize("kind", ["direction", "vector", "heading", "attitude"])
+def test_for_small_errors_its_weights_are_the_plain_filters(kind, robust):
+    """A bank of one hypothesis, its attitude measured first, and then measurements of one kind; it is told at the end of the record."""
+    random = np.random.default_rng(12)
+    time = np.arange(41.0)
+    at = time[1:]
+    first = VectorMeasurements(
+        sensor="tracker", kind="attitude", time=[0.5], attitude=[[1.0, 0.0, 0.0, 0.0]], sigma_axes=[3e-3] * 3
+    )
+    size = np.where(np.arange(40) % 5 == 2, 8e-3, 1e-3)[:, None]
+    noise = size * random.standard_normal((40, 3))
+    r = np.array([0.6, 0.0, 0.8])
+    if kind == "attitude":
+        second = VectorMeasurements(
+            sensor="second", kind=kind, time=at, attitude=quaternion.exp(noise), sigma_axes=np.full(3, 1e-3)
+        )
+    else:
+        seen = r + noise
+        if kind != "vector":
+            seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+        second = series("second", at, seen, r, 1e-3, kind)
+    record = ImuRecord(time=time, increments=np.zeros((40, 3)), vectors=(first, second))
+    noise_of_gyro = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6)
+    wary = bank.WARY
+    try:
+        bank.WARY = (1.0,)
+        found = bank.run(record, noise_of_gyro, bias_sigma=1e-4, robust=robust, every=40)
+    finally:
+        bank.WARY = wary
+    start = mekf.initial_state([1.0, 0.0, 0.0, 0.0], attitude_sigma=3e-3, bias_sigma=1e-4)
+    rest = ImuRecord(time=np.concatenate([[0.5], at]), increments=np.zeros((40, 3)), vectors=(second,))
+    plain = mekf.run(rest, noise_of_gyro, start, robust=robust)
+    assert len(found.estimate.time) == 1
+    weight, expected = (one.innovations["second"].weight for one in (found.estimate, plain))
+    assert expected.min() < 0.5
+    np.testing.assert_allclose(weight, expected, rtol=3e-3)
+    np.testing.assert_allclose(found.estimate.attitude[-1], plain.attitude[-1], atol=2e-5)
+
+
 # --------------------------------------------------------------------------------------------------------------------- the rim
 
 
@@ -387,6 +577,25 @@ def test_a_measured_attitude_needs_no_bank():
     assert np.allclose(found.estimate.sigma[0, :3], [1e-4, 1e-4, 1e-3])
 
 
+def test_a_measured_attitude_at_the_first_edge_counts_once():
+    time = np.arange(11.0)
+    tracker = VectorMeasurements(
+        sensor="tracker",
+        kind="attitude",
+        time=time,
+        attitude=np.tile([1.0, 0.0, 0.0, 0.0], (11, 1)),
+        sigma_axes=np.full(3, 1e-3),
+    )
+    record = ImuRecord(time=time, increments=np.zeros((10, 3)), vectors=(tracker,))
+    found = bank.run(record, QUIET, bias_sigma=1e-4)
+    assert found.became_one == 0.0
+    np.testing.assert_array_equal(found.estimate.innovations["tracker"].time, time[1:])
+    start = mekf.initial_state(tracker.attitude[0], attitude_sigma=1e-3, bias_sigma=1e-4)
+    rest = dataclasses.replace(record, vectors=(tracker.taken(time > 0.0),))
+    plain = mekf.run(rest, QUIET, start, full_covariance=True)
+    np.testing.assert_allclose(found.estimate.covariance, plain.covariance, rtol=1e-12)
+
+
 def test_it_starts_at_the_first_direction_and_counts_what_came_before():
     record, belief = orbit(7, duration=600.0)
     one = record.vectors[0]
@@ -419,6 +628,22 @@ def test_one_direction_between_edges_starts_there():
     assert quaternion.angle_between(found.estimate.attitude, truth)[1:].max() < 1e-4
 
 
+@pytest.mark.parametrize("duration", [60.0, 1500.0], ids=["many", "one"])
+def test_gaps_of_the_gyro_are_told_whether_hypotheses_were_many_or_one(duration):
+    record, belief = orbit(3, duration=duration)
+    edges = len(record.time)
+    early, late = edges // 3, edges - edges // 6
+    later = np.where(np.arange(edges) > early, 8.0, 0.0) + np.where(np.arange(edges) > late, 9.0, 0.0)
+    gaps = dataclasses.replace(record, time=record.time + later)
+    found = bank.run(gaps, belief, every=5)
+    assert found.converged == (duration > 60.0)
+    assert found.estimate.events == tuple(mekf.gaps(gaps.time))
+    assert [(one.start, one.end) for one in found.estimate.events] == [
+        (gaps.time[k], gaps.time[k + 1]) for k in (early, late)
+    ]
+    assert bank.run(record, belief, every=5).estimate.events == ()
+
+
 def test_what_makes_no_sense_is_refused():
     record, belief = orbit(8, duration=100.0)
     with pytest.raises(InputError, match="hypotheses"):
@@ -431,6 +656,57 @@ def test_what_makes_no_sense_is_refused():
         bank.run(dataclasses.replace(record, vectors=()), belief)
     with pytest.raises(InputError, match="kept edge"):
         bank.run(record, belief, every=200)
+
+
+@pytest.mark.parametrize(
+    ("kind", "noise"),
+    [
+        ("direction", "sigma_axes"),
+        ("direction", "covariance"),
+        ("vector", "sigma_axes"),
+        ("vector", "covariance"),
+        ("attitude", "covariance"),
+    ],
+)
+def test_noise_by_axis_is_its_largest_until_they_are_one_and_then_what_it_is(kind, noise):
+    q = quaternion.exp(np.array([0.3, -0.8, 0.5]))
+    record = still(q, np.eye(3)[:2], 1e-3, np.random.default_rng(2), seconds=40)
+    first, second = record.vectors
+    if kind == "attitude":
+        second = VectorMeasurements(
+            sensor="star 1", kind=kind, time=second.time, attitude=np.tile(q, (40, 1)), sigma_axes=np.full(3, 1e-3)
+        )
+    whole = np.array([[1.0, 0.2, 0.1], [0.2, 2.0, 0.4], [0.1, 0.4, 3.0]]) * 1e-6
+    told = {"sigma_axes": np.sqrt(np.diag(whole))} if noise == "sigma_axes" else {"covariance": whole}
+    largest = np.sqrt(np.linalg.eigvalsh(np.diag(np.diag(whole)) if noise == "sigma_axes" else whole)[-1])
+    zero = {"sigma_axes": None} if kind == "attitude" else {"sigma": np.zeros(40), "kind": kind}
+    uneven = dataclasses.replace(second, **{**zero, **told})
+    even = dataclasses.replace(
+        uneven,
+        covariance=None,
+        **(
+            {"sigma_axes": np.full(3, largest)}
+            if kind == "attitude"
+            else {"sigma_axes": None, "sigma": np.full(40, largest)}
+        ),
+    )
+    found = bank.run(dataclasses.replace(record, vectors=(first, uneven)), QUIET, bias_sigma=1e-6)
+    coarse = bank.run(dataclasses.replace(record, vectors=(first, even)), QUIET, bias_sigma=1e-6)
+    assert found.converged
+    assert found.became_one == coarse.became_one
+    rows = len(found.weights)
+    np.testing.assert_allclose(found.estimate.covariance[:rows], coarse.estimate.covariance[:rows], rtol=1e-9)
+    at = int(np.searchsorted(record.time, found.became_one))
+    one = mekf.State(
+        attitude=found.estimate.attitude[rows - 1],
+        bias=found.estimate.bias[rows - 1],
+        covariance=found.estimate.covariance[rows - 1],
+    )
+    series_left = tuple(s.taken(s.time > record.time[at]) for s in (first, uneven))
+    rest = dataclasses.replace(records.cut(record, at, 40), vectors=series_left)
+    plain = mekf.run(rest, QUIET, one, full_covariance=True)
+    np.testing.assert_array_equal(found.estimate.covariance[rows - 1 :], plain.covariance)
+    assert np.any(found.estimate.variance[-1, :3] < 0.9 * coarse.estimate.variance[-1, :3])
 
 
 def test_the_bias_is_found_from_twenty_degrees_an_hour():

@@ -8,6 +8,7 @@ import json
 import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
+from scipy.stats import norm
 
 from strapdown import coning, consistency, covariance, mekf, montecarlo, motion, quaternion, setup, vectors
 from strapdown.checks import InputError
@@ -467,33 +468,71 @@ def test_the_built_in_scenarios_agree_with_monte_carlo(name, change):
     check_monte_carlo(scenario, belief, runs=400, epochs=10)
 
 
-def bound_ratio(scenario, runs, epochs):
-    """RMSE over the root of the posterior Cramér–Rao bound, all states and epochs, each in units of its own bound."""
-    # Steps of four samples leave nothing of the coning, but take a star in the middle of one for one in a steady turn.
-    algorithm = "four-sample" if scenario.name == "coning" else "one-sample"
+WELL_CONDITIONED = {
+    "coning": "two-sample",
+    "tumbling-satellite": "one-sample",
+    "spin": "one-sample",
+    "slew-vibration": "two-sample",
+}
+"""Scenarios, and the integration that each asks for.
+
+Two of them vibrate. Samples taken one by one leave a drift of β²ωλ²/12 there, which is no error of the filter but ends in its bias:
+half a standard deviation after 40 s of slew-vibration. Two samples to a step leave an eightieth of it or less, and every star falls on
+the end of a step; in the middle of a step of four it would be taken for one in a steady turn, which vibration is not.
+"""
+
+
+def against_the_bound(name, algorithm, *, duration, runs, epochs):
+    """Return mean square errors over the posterior Cramér–Rao bound, and mean errors over its root, by epoch and state (epochs, 6)."""
+    scenario = white(name, min(load_scenario(name).duration, duration))
     belief = dataclasses.replace(
         setup.matched(scenario, attitude_sigma=0.1 * DEGREE), integration=coning.ALGORITHMS[algorithm]
     )
-    found = covariance.analyse(scenario, belief, epochs=epochs)
-    errors, _ = monte_carlo(scenario, belief, runs, epochs)
-    white_errors = errors[:, 1:] / found.filter_sigma[1:]
-    return float(np.sqrt(np.mean(white_errors**2)))
+    bound = covariance.analyse(scenario, belief, epochs=epochs).filter_sigma[1:]
+    found = montecarlo.run_plan(montecarlo.Plan(scenario=scenario, setup=belief, seed=3, epochs=epochs), runs=runs)
+    assert found.failed == 0
+    square = np.diagonal(found.mean_square_error, axis1=1, axis2=2)[1:] / bound**2
+    return square, found.mean_error[1:] / bound
 
 
-WELL_CONDITIONED = ["coning", "tumbling-satellite", "spin", "slew-vibration"]
+def beyond_the_bound(square, mean, runs):
+    """Return what cannot be chance, 1 in 100 over all that is asked: by state and epoch, and by state over the epochs together.
+
+    At one epoch runs are independent, so a mean square is χ² with as many degrees. One over several epochs is, however they are correlated,
+    no farther from 1 than one of a single epoch.
+    """
+    told = []
+    for what, value in (("mean square", square), ("mean square over time", square.mean(axis=0, keepdims=True))):
+        low, high = consistency.mean_bounds(1, runs, 1.0 - 0.01 / 3.0 / value.size)
+        told += [(what, int(k), int(i)) for k, i in np.argwhere((value < low) | (value > high))]
+    limit = norm.isf(0.5 * 0.01 / 3.0 / mean.size) / np.sqrt(runs)
+    return told + [("mean", int(k), int(i)) for k, i in np.argwhere(np.abs(mean) > limit)]
 
 
 @pytest.mark.parametrize("name", WELL_CONDITIONED)
-def test_the_filter_is_near_the_bound(name):
-    # Errors of one run are correlated over epochs: some 60 · 12 of the 60 · 30 are independent.
-    assert 0.90 < bound_ratio(white(name, 20.0), runs=60, epochs=5) < 1.10
+def test_every_state_is_as_near_the_bound_as_runs_can_tell(name):
+    runs = 4000
+    square, mean = against_the_bound(name, WELL_CONDITIONED[name], duration=20.0, runs=runs, epochs=5)
+    assert beyond_the_bound(square, mean, runs) == []
+
+
+def test_integration_that_neglects_commutation_is_seen_against_the_bound():
+    """The bias about the cone's axis, by its mean and by nothing else yet after 20 s."""
+    square, mean = against_the_bound("slew-vibration", "one-sample", duration=20.0, runs=1000, epochs=5)
+    told = beyond_the_bound(square, mean, 1000)
+    assert ("mean", 4, 5) in told
+    assert {(what, state) for what, _, state in told} == {("mean", 5)}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", WELL_CONDITIONED)
-def test_the_filter_is_within_three_percent_of_the_bound(name):
-    scenario = white(name, min(load_scenario(name).duration, 120.0))
-    assert 0.97 < bound_ratio(scenario, runs=1000, epochs=10) < 1.03
+def test_every_state_is_within_three_percent_of_the_bound_at_every_epoch(name):
+    runs = 20_000
+    square, mean = against_the_bound(name, WELL_CONDITIONED[name], duration=120.0, runs=runs, epochs=10)
+    ratio = np.sqrt(square)
+    assert ratio.min() > 0.97
+    assert ratio.max() < 1.03
+    assert beyond_the_bound(square, mean, runs) == []
 
 
 # ------------------------------------------------------------------------------------------------------------------- the rim

@@ -740,6 +740,19 @@ def test_a_heading_seen_straight_up_says_nothing(name):
         assert np.all(np.diff(estimate.variance[:, :3], axis=0) >= 0.0)
 
 
+@pytest.mark.parametrize("name", family.FILTERS)
+def test_a_gap_of_the_gyro_is_told(name):
+    rng = np.random.default_rng(23)
+    record = simulated(rng, intervals=20, measurements=5)
+    initial = started(record, rng, attitude_sigma=0.1, bias_sigma=1e-3)
+    longest = np.diff(record.time).max()
+    late = dataclasses.replace(record, time=record.time + np.where(np.arange(21) > 12, 30.0 * longest, 0.0))
+    (event,) = family.run(name, late, BELIEF, initial).events
+    assert (event.kind, event.start, event.end) == ("gap", late.time[12], late.time[13])
+    assert event == mekf.run(late, BELIEF, initial).events[0]
+    assert family.run(name, record, BELIEF, initial).events == ()
+
+
 # --------------------------------------------------------------------------------------------------------------- bad input
 
 
@@ -755,12 +768,14 @@ def test_bad_input_is_refused():
     exact = VectorMeasurements(
         sensor="sun", kind="direction", time=[0.1], vector_b=[[1.0, 0, 0]], reference_f=[1.0, 0, 0], sigma=0.0
     )
+    uneven = dataclasses.replace(exact, sigma_axes=[1e-3, 2e-3, 3e-3])
     for name in list(family.FILTERS)[1:]:
         with pytest.raises(InputError, match="every"):
             family.run(name, record, BELIEF, initial, every=0)
         for series, message in (
             (attitude, r"tracker.*attitude"),
             (exact, "sun: sigma"),
+            (uneven, "^sun: the family's filters take one sigma a sample.*give sigma alone, or use mekf.run"),
         ):
             wrong = ImuRecord(time=record.time, increments=record.increments, vectors=(series,))
             with pytest.raises(InputError, match=message):

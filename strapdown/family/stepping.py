@@ -14,7 +14,7 @@ from strapdown import mekf
 from strapdown.checks import Array, InputError, count
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.mekf import Schedule
-from strapdown.records import Estimate, ImuRecord
+from strapdown.records import Estimate, Event, ImuRecord
 
 _UPPER = np.triu_indices(3)
 
@@ -36,6 +36,8 @@ class Steps:
     """Row of the estimate that the state goes to, -1: none."""
     time: Array
     """Times of the rows (m,), s."""
+    gaps: tuple[Event, ...]
+    """Gaps of the gyro."""
 
 
 def events_and_steps(record: ImuRecord, every: int) -> tuple[Schedule, Steps]:
@@ -53,6 +55,11 @@ def events_and_steps(record: ImuRecord, every: int) -> tuple[Schedule, Steps]:
         if series.kind not in MEASUREMENTS:
             raise InputError(
                 f"{series.sensor}: the family's filters take {', '.join(MEASUREMENTS)}, not {series.kind!r}; use mekf.run"
+            )
+        if series.anisotropic:
+            raise InputError(
+                f"{series.sensor}: the family's filters take one sigma a sample, not sigma_axes or covariance; give sigma alone, or use "
+                "mekf.run"
             )
     edges = record.time
     events = mekf.schedule(record.vectors, edges[0], edges[-1])
@@ -77,6 +84,7 @@ def events_and_steps(record: ImuRecord, every: int) -> tuple[Schedule, Steps]:
         event=np.where(last, event[whole], -1),
         row=np.where(last, row[whole], -1),
         time=edges[::every],
+        gaps=tuple(mekf.gaps(edges)),
     )
     return events, steps
 
@@ -92,4 +100,5 @@ def estimate(events: Schedule, steps: Steps, states: Array, innovation: Array, f
         covariance=covariance if full_covariance else None,
         innovations=mekf.innovations_by_sensor(events, innovation),
         skipped=events.skipped,
+        events=steps.gaps,
     )

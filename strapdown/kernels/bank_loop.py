@@ -24,7 +24,7 @@ from strapdown.kernels.algebra import (
     times_transpose_upper,
     transpose_times_vector,
 )
-from strapdown.kernels.filter_loop import ATTITUDE, HEADING, VECTOR, heading_error, vector_at
+from strapdown.kernels.filter_loop import ATTITUDE, DIRECTION, HEADING, MOST_TURN, VECTOR, heading_error, vector_at
 from strapdown.kernels.filter_step import (
     direction_rows,
     heading_row,
@@ -33,6 +33,7 @@ from strapdown.kernels.filter_step import (
     update_heading,
     update_row,
 )
+from strapdown.kernels.robust_step import HUBER, STUDENT
 from strapdown.kernels.rotation import logarithm, quaternion_multiply, rotation_matrix, turned, unit
 from strapdown.kernels.series import LARGEST_ANGLE, second, sinc
 
@@ -40,6 +41,9 @@ PASSES = 5
 """Most Gauss–Newton passes of one update."""
 SETTLED = 1e-6
 """Square of a step, rad², below which no further pass is made: what it leaves is half of it."""
+NEVER = -1
+LOST = -2
+"""Instead of the edge at which hypotheses became one: they did not; most of them, by weight, refuse one measurement after the other."""
 
 
 def load_hypothesis(row):
@@ -89,6 +93,63 @@ def update_iterated(q, b, A, B, C, u, v, z, variance):
         if squared < SETTLED:
             break
     return q, b_new, A_new, B_new, C_new, e1, s1, e2, s2
+
+
+def taken_in(kind, q, b, A, B, C, z, frame, variance, weight):
+    """Update with one measurement of any kind, its variance divided by ``weight``.
+
+    ``frame`` is the row of the triads. Returns (q, b, A, B, C), the innovations with their variances (e₁, s₁, e₂, s₂, e₃, s₃), of a
+    measurement with fewer filled up by (0, 1), and the mean square of its residual after the update over its own variance:
+    rᵀR⁻¹r and tr R⁻¹HP⁺Hᵀ, R not divided.
+    """
+    e1, s1, e2, s2, e3, s3 = 0.0, 1.0, 0.0, 1.0, 0.0, 1.0
+    if kind == ATTITUDE:
+        measured = (frame[0], frame[1], frame[2], frame[3])
+        q, b, A, B, C, e1, s1, e2, s2, e3, s3 = update_attitude(q, b, A, B, C, measured, scale(1.0 / weight, z))
+        r = logarithm(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), measured))
+        distance = r[0] * r[0] / z[0] + r[1] * r[1] / z[1] + r[2] * r[2] / z[2]
+        spread = A[0] / z[0] + A[3] / z[1] + A[5] / z[2]
+    elif kind == HEADING:
+        level = (frame[6], frame[7], frame[8])
+        R = rotation_matrix(q)
+        h = heading_row(R, z)
+        error = heading_error(R, z, level)
+        q, b, A, B, C, e1, s1 = update_heading(q, b, A, B, C, h, error, variance / weight)
+        R = rotation_matrix(q)
+        h = heading_row(R, z)
+        left = heading_error(R, z, level)
+        distance = left * left / variance
+        spread = dot(h, symmetric_times_vector(A, h)) / variance
+    else:
+        u = (frame[0], frame[1], frame[2])
+        v = (frame[3], frame[4], frame[5])
+        q, b, A, B, C, e1, s1, e2, s2 = update_iterated(q, b, A, B, C, u, v, z, variance / weight)
+        R = rotation_matrix(q)
+        h1, y1, h2, y2 = direction_rows(R, u, v, z)
+        distance = (y1 * y1 + y2 * y2) / variance
+        spread = (dot(h1, symmetric_times_vector(A, h1)) + dot(h2, symmetric_times_vector(A, h2))) / variance
+        if kind == VECTOR:
+            # Its length says nothing of the attitude, but belongs to the innovation.
+            e3 = dot(transpose_times_vector(R, (frame[6], frame[7], frame[8])), z) - 1.0
+            s3 = variance / weight
+            distance += e3 * e3 / variance
+    return q, b, A, B, C, e1, s1, e2, s2, e3, s3, distance, spread
+
+
+def degrees_of_freedom(kind):
+    """Return how many a measurement of a kind has."""
+    if kind == HEADING:
+        return 1
+    return 2 if kind == DIRECTION else 3
+
+
+def heavy_tailed(robust, parameter, numerator, nis):
+    """Return what stands for the NIS in −2 log of the likelihood under a robust update: Huber's function, or that of Student's t."""
+    if robust == STUDENT:
+        return numerator * math.log(1.0 + nis / parameter)
+    if robust == HUBER and nis > parameter:
+        return 2.0 * math.sqrt(parameter * nis) - parameter
+    return nis
 
 
 def turn_quaternion(phi):
@@ -239,14 +300,23 @@ def run_bank(
     covariance_out,
     weight_out,
     innovation_out,
+    thresholds,
+    robust,
+    robust_parameters,
+    robust_passes,
+    recovery,
+    taken_out,
 ):
     """Run the hypotheses ``states`` (h, 28) from the time ``start`` until they are one Gaussian at a kept edge, or to the end.
 
     Event ``first`` is the first after those that made the hypotheses. Outputs begin with the first kept edge (a multiple of ``every``) not
     before ``start``; ``innovation_out`` (events, 6) gets the innovations of the heaviest hypothesis. They are one when one is left, or when
     the part of the attitude's and the bias's covariance that lies between them is below ``largest_share``; then ``states[0]`` is that
-    Gaussian. ``weight`` (h,), ``between`` (12,) and ``matched`` (28,) are room to work in. Returns the rows written, the edge at which they
-    became one (−1: never), and the number of the next event.
+    Gaussian. A hypothesis refuses what has a NIS above ``thresholds`` (by degrees of freedom, 3), and weighs the rest as
+    :func:`strapdown.kernels.robust_step.robust_weight` does (0: not at all); ``taken_out`` (events,) gets the weights of the heaviest
+    hypothesis. When hypotheses of more than half the weight have refused ``recovery`` measurements in a row (0: whatever they refuse), the
+    answer is ``LOST`` and the first of those. ``weight`` (h,), ``between`` (12,) and ``matched`` (28,) are room to work in. Returns the
+    rows written, the edge at which they became one (``NEVER``, ``LOST``), and the number of the next event.
     """
     number = len(log_weight)
     normalized_weights(log_weight, least_weight, weight)
@@ -256,18 +326,23 @@ def run_bank(
     now = start
     e = first
     row = 0
+    streak = 0
     while k < len(increments):
         end = edges[k + 1] if k >= 0 else edges[0]
         while now < end or (e < len(event_time) and event_time[e] <= end):
             due = e < len(event_time) and event_time[e] <= end
             dt = (event_time[e] if due else end) - now
             if dt > 0.0 and k >= 0:
-                # A turn beyond the range of the polynomials goes in sub-steps: at constant rate they compose exactly.
                 part = scale(dt / (end - edges[k]), vector_at(increments, k))
-                pieces = int(math.sqrt(dot(part, part)) / LARGEST_ANGLE) + 1
                 for i in range(number):
                     if weight[i] > 0.0:
                         q, b, A, B, C = load_hypothesis(states[i])
+                        # A turn beyond the range of the polynomials goes in sub-steps: at constant rate they compose exactly.
+                        turn = combine(1.0, part, -dt, b)
+                        squared = dot(turn, turn)
+                        pieces = 1
+                        if LARGEST_ANGLE * LARGEST_ANGLE < squared < MOST_TURN * MOST_TURN:
+                            pieces = int(math.sqrt(squared) / LARGEST_ANGLE) + 1
                         for _ in range(pieces):
                             q, A, B, C = predict(
                                 q, b, A, B, C, scale(1.0 / pieces, part), dt / pieces, angle_variance, rate_variance
@@ -280,37 +355,46 @@ def run_bank(
                     if weight[i] > weight[leader]:
                         leader = i
                 z = vector_at(event_value, e)
-                t = event_reference[e]
+                frame = triads[event_reference[e]]
+                kind = event_kind[e]
+                degrees = degrees_of_freedom(kind)
+                threshold = thresholds[degrees - 1]
+                parameter, numerator = robust_parameters[degrees - 1, 0], robust_parameters[degrees - 1, 1]
+                refusing = 0.0
                 for i in range(number):
                     if weight[i] > 0.0:
                         q, b, A, B, C = load_hypothesis(states[i])
-                        e1, s1, e2, s2, e3, s3 = 0.0, 1.0, 0.0, 1.0, 0.0, 1.0
-                        if event_kind[e] == ATTITUDE:
-                            measured = (triads[t, 0], triads[t, 1], triads[t, 2], triads[t, 3])
-                            q, b, A, B, C, e1, s1, e2, s2, e3, s3 = update_attitude(q, b, A, B, C, measured, z)
-                        elif event_kind[e] == HEADING:
-                            R = rotation_matrix(q)
-                            error = heading_error(R, z, (triads[t, 6], triads[t, 7], triads[t, 8]))
-                            h = heading_row(R, z)
-                            q, b, A, B, C, e1, s1 = update_heading(q, b, A, B, C, h, error, event_variance[e])
-                        else:
-                            u = (triads[t, 0], triads[t, 1], triads[t, 2])
-                            v = (triads[t, 3], triads[t, 4], triads[t, 5])
-                            q, b, A, B, C, e1, s1, e2, s2 = update_iterated(q, b, A, B, C, u, v, z, event_variance[e])
-                            if event_kind[e] == VECTOR:
-                                # Its length says nothing of the attitude, but belongs to the innovation.
-                                r = (triads[t, 6], triads[t, 7], triads[t, 8])
-                                e3 = dot(transpose_times_vector(rotation_matrix(q), r), z) - 1.0
-                                s3 = event_variance[e]
-                        store_hypothesis(states[i], q, b, A, B, C)
-                        log_weight[i] -= 0.5 * (
-                            e1 * e1 / s1 + e2 * e2 / s2 + e3 * e3 / s3 + math.log(s1) + math.log(s2) + math.log(s3)
-                        )
+                        done = taken_in(kind, q, b, A, B, C, z, frame, event_variance[e], 1.0)
+                        _, _, _, _, _, e1, s1, e2, s2, e3, s3, _, _ = done
+                        nis = e1 * e1 / s1 + e2 * e2 / s2 + e3 * e3 / s3
+                        share = 1.0
+                        if nis > threshold:
+                            share = 0.0
+                            refusing += weight[i]
+                        elif robust != 0:
+                            for _ in range(robust_passes):
+                                distance, spread = done[11], done[12]
+                                if robust == STUDENT:
+                                    share = numerator / (parameter + distance + spread)
+                                elif distance > parameter:
+                                    share = math.sqrt(parameter / distance)
+                                else:
+                                    share = 1.0
+                                done = taken_in(kind, q, b, A, B, C, z, frame, event_variance[e], share)
+                        if share > 0.0:
+                            store_hypothesis(states[i], done[0], done[1], done[2], done[3], done[4])
+                        # What a hypothesis refuses counts against it as if it lay at the threshold: else none would outlive an outlier.
+                        told = min(heavy_tailed(robust, parameter, numerator, nis), threshold)
+                        log_weight[i] -= 0.5 * (told + math.log(s1) + math.log(s2) + math.log(s3))
                         if i == leader:
                             innovation_out[e, 0], innovation_out[e, 1], innovation_out[e, 2] = e1, s1, e2
                             innovation_out[e, 3], innovation_out[e, 4], innovation_out[e, 5] = s2, e3, s3
+                            taken_out[e] = share
                 normalized_weights(log_weight, least_weight, weight)
                 e += 1
+                streak = streak + 1 if refusing > 0.5 else 0
+                if recovery > 0 and streak >= recovery:
+                    return row, LOST, e - streak
         if (k + 1) % every == 0:
             moment_match(states, weight, between, matched)
             for n in range(4):
@@ -330,4 +414,4 @@ def run_bank(
                     states[0, n] = matched[n]
                 return row, k + 1, e
         k += 1
-    return row, -1, e
+    return row, NEVER, e
