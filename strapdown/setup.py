@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import coning, gyro, mekf, quaternion, tables, units, vectors
-from strapdown.augmented import matching
+from strapdown import augmented, coning, gyro, mekf, quaternion, tables, units, vectors
+from strapdown.augmented import Observability, matching
 from strapdown.augmented import states as optional
 from strapdown.augmented.states import States
 from strapdown.checks import Array, InputError, known_keys, one_of, positive
@@ -172,7 +172,7 @@ def _commutes_badly(record: ImuRecord, white: float) -> bool:
     if len(record.increments) < LEAST_SAMPLES:
         return False
     one = coning.integrate(record.increments, coning.ALGORITHMS["one-sample"])[-1]
-    other = coning.integrate(record.increments, better)[-1]
+    other = coning.integrate(record.increments, better, edges=record.time)[-1]
     length = float(record.time[-1] - record.time[0])
     drift = float(np.linalg.norm(quaternion.log(quaternion.multiply(quaternion.conjugate(one), other)))) / length
     return bool(drift > COMMUTATION_SHARE * white / np.sqrt(length))
@@ -217,6 +217,8 @@ def not_covered(
             found.append(f"the bias of the {sensor.name}")
         if np.any(np.asarray(getattr(sensor, "lever_arm_b", 0.0)) != 0.0) and f"{sensor.name}.lever" not in known:
             found.append(f"the accelerations that the {sensor.name} feels at its lever arm")
+        if getattr(sensor, "acceleration_f", None) is not None and f"{sensor.name}.velocity" not in known:
+            found.append(f"the acceleration of the point that the {sensor.name} is at")
         faults = getattr(sensor, "faults", None)
         correlated = faults is not None and getattr(faults, "correlated_sigma", 0.0) > 0.0
         if correlated and f"{sensor.name}.correlated" not in known:
@@ -328,13 +330,21 @@ def _by_axis(series: VectorMeasurements, told: tuple[float, float, float], facto
 def run(record: ImuRecord, setup: FilterSetup, initial: mekf.State, **options: Any) -> Estimate:
     """Run the filter of this setup over a record; ``options`` are those of :func:`strapdown.mekf.run`.
 
-    With optional states the estimate is one of :class:`strapdown.augmented.AugmentedEstimate`, which tells of them too; its gate must not
-    recover.
+    With optional states the estimate is one of :class:`strapdown.augmented.AugmentedEstimate`, which tells of them too.
     """
     chosen = {"gate": setup.gate, "robust": setup.robust, **options}
     if setup.states is not None:
         return optional.run(believed(record, setup), setup.process_noise, initial, setup.states, **chosen)
     return mekf.run(believed(record, setup), setup.process_noise, initial, **chosen)
+
+
+def observability(record: ImuRecord, setup: FilterSetup, initial: mekf.State) -> Observability:
+    """Return what a record shows of each state of this setup's filter: see :func:`strapdown.augmented.observability`."""
+    told = believed(record, setup)
+    if setup.states is None:
+        return augmented.observability(told, setup.process_noise, initial)
+    blocks = setup.states.blocks({series.sensor: series.kind for series in told.vectors})
+    return augmented.observability(told, setup.process_noise, optional.initial_state(initial, blocks), blocks)
 
 
 def initial_state(

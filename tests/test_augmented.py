@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 
 import filterpy.common
@@ -12,6 +13,7 @@ import pytest
 
 from strapdown import augmented, consistency, kinematics, mekf, motion, quaternion, records, smoother
 from strapdown.augmented.blocks import Block
+from strapdown.augmented.observing import without_errors
 from strapdown.checks import InputError
 from strapdown.kernels import augmented_factor, augmented_step
 from strapdown.kernels.machine import compiled
@@ -836,6 +838,34 @@ def test_singular_values_are_those_of_the_stacked_rows():
     np.testing.assert_allclose(found.singular_values[:2], expected, rtol=1e-9)
     np.testing.assert_allclose(found.singular_values[2:], 0.0, atol=1e-6)
     assert found.rank == 2
+
+
+def test_what_is_left_along_each_direction_is_told_in_the_units_of_the_states():
+    """Its rows are independent errors that make up the covariance; along the weakest the prior is left, state by state."""
+    blocks = (augmented.VectorBias(sensor="mag", bias_sigma=1e-5, unit="T"),)
+    correlated = start().covariance * np.outer([3.0, 1.0, 2.0, 1.0, 1.0, 5.0], [3.0, 1.0, 2.0, 1.0, 1.0, 5.0])
+    correlated[0, 1] = correlated[1, 0] = 0.6 * np.sqrt(correlated[0, 0] * correlated[1, 1])
+    initial = dataclasses.replace(start(), covariance=correlated)
+    record = plain_record(motion.rest())
+    found = augmented.observability(record, NOISE, initial, blocks)
+    where = augmented.smooth(record, NOISE, initial, blocks)
+    begin = dataclasses.replace(initial, attitude=where.attitude[0], bias=np.zeros(3))
+    exact = without_errors(record, where.attitude)
+    whole = augmented.smooth(exact, NOISE, begin, blocks, full_covariance=True)
+    np.testing.assert_allclose(np.sqrt(np.diag(found.left.T @ found.left)), found.start_sigma, rtol=1e-6)
+    apart = np.outer(found.start_sigma, found.start_sigma)
+    np.testing.assert_allclose(found.left.T @ found.left / apart, whole.whole_covariance[0] / apart, atol=1e-6)
+    prior = initial.covariance
+    sizes = [one[:6] @ np.linalg.solve(prior, one[:6]) + np.sum((one[6:] / 1e-5) ** 2) for one in found.left]
+    np.testing.assert_allclose(sizes, 1.0 / (1.0 + found.singular_values**2), rtol=1e-6)
+    told = found.weakest(1)[0]
+    assert f"attitude z ({abs(found.left[-1, 2]):.2g} rad)" in told
+    assert found.words(8) in str(found)
+    written = json.loads(json.dumps(found.summary()))
+    assert written["rank"] == found.rank
+    assert [one["unit"] for one in written["states"]] == ["rad"] * 3 + ["rad/s"] * 3 + ["T"] * 3
+    assert written["directions"][-1]["one_sigma_left"]["mag bias x"] == found.left[-1, 6]
+    assert written["directions"][0]["singular_value"] == found.singular_values[0]
 
 
 def test_observability_takes_every_kind_of_measurement():

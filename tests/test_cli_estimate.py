@@ -210,6 +210,19 @@ def test_states_that_the_errors_call_for(run, spinning, tmp_path):
     assert np.array_equal(one.covariance, other.covariance)
 
 
+@pytest.mark.parametrize("states", [(), ("--states",)], ids=["plain", "states"])
+def test_what_a_record_shows_of_each_state(run, spinning, tmp_path, states):
+    status, said, _ = run("estimate", spinning, "--out", tmp_path / "out", "--observability", *states)
+    assert status == 0
+    assert "directions are observed" in said
+    told = json.loads((tmp_path / "out" / "observability.json").read_text())
+    names = [one["state"] for one in told["states"]]
+    assert len(names) == len(told["directions"]) >= (7 if states else 6)
+    assert told["rank"] == sum(one["singular_value"] >= told["threshold"] for one in told["directions"])
+    assert {one["unit"] for one in told["states"][:6]} == {"rad", "rad/s"}
+    assert set(told["directions"][0]["one_sigma_left"]) == set(names)
+
+
 def test_states_of_a_record_that_tells_no_scenario_and_a_gate(run, record, tmp_path):
     status, said, error = run("estimate", record, "--out", tmp_path / "out", "--states", "--gate", 0.999)
     assert (status, error) == (0, "")

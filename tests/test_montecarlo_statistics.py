@@ -429,8 +429,11 @@ def test_memory_does_not_grow_with_the_runs():
         tracemalloc.stop()
         return most
 
+    def least(runs):  # how two threads fall together moves one peak by a tenth
+        return min(peak(runs) for _ in range(3))
+
     peak(4)
-    assert peak(48) < 1.2 * peak(16)
+    assert least(48) < 1.2 * least(16)
 
 
 def test_chunks_are_not_listed():

@@ -20,6 +20,9 @@ but their share of the attitude. Against the plain filter, prediction and two di
 with hard iron (9 states), 4.9 with the gyro's scale (15), 8 with both and a coloured noise (21). The smoother costs 3 to 5 times its own
 filter.
 
+States may feed one another in chains (:mod:`strapdown.kernels.augmented_chain`), which shapes coloured noise of more than one pole: of the
+acceleration of a moving hand, whose velocity is bounded (:class:`BoundedVelocity`; 2.7 times a filter without a block).
+
 A filter that starts tenths of a radian off, as one does whose heading hard iron has turned, is linearised at the wrong place and believes
 too much for good; :func:`recentred` starts it anew where the smoother puts it.
 
@@ -35,6 +38,7 @@ from __future__ import annotations
 
 from strapdown.augmented.blocks import (
     Block,
+    BoundedVelocity,
     Effect,
     GaussMarkov,
     GeneralBlock,
@@ -60,6 +64,7 @@ __all__ = [
     "AugmentedState",
     "Block",
     "BlockEstimate",
+    "BoundedVelocity",
     "Effect",
     "GaussMarkov",
     "GeneralBlock",

@@ -13,11 +13,15 @@ from typing import Literal
 
 import numpy as np
 
+from strapdown import quaternion
 from strapdown.checks import Array, InputError, array, non_negative, one_of, positive
+from strapdown.kernels import augmented_chain
 from strapdown.units import STANDARD_GRAVITY
 from strapdown.vectors import GRAVITY_F
 
 AXES = ("x", "y", "z")
+MOST_CHAIN_DECAY = 0.2
+"""Of λ dt of a state in a chain in one step: its series and Gauss's rule are exact."""
 ENTRIES = tuple(a if a == b else f"{a}{b}" for a in AXES for b in AXES)
 """Entries of a matrix by rows: x, xy, xz, yx, y, …"""
 
@@ -67,9 +71,18 @@ class _Block:
         """Number of states."""
         return len(self.components)
 
+    @property
+    def covariance(self) -> Array:
+        """Covariance of the states at the start (size, size): of states that are independent then, their variances."""
+        return np.diag(np.asarray(self.sigma) ** 2)
+
 
 class LinearBlock(_Block):
-    """A block of states that change each by itself, ``ċ = −λ c + √q w``, and enter linearly. Transition and noise are exact over any dt."""
+    """A block of states that enter linearly and change each by itself, or in chains: ``ċₖ = −λₖ cₖ + gₖ cₖ₊₁ + √qₖ wₖ``.
+
+    Transition and noise are exact over any dt. A chain, of up to three states that do not enter the gyro, shapes the noise of its last one
+    by any real poles.
+    """
 
     @property
     def decay(self) -> Array:
@@ -79,6 +92,11 @@ class LinearBlock(_Block):
     @property
     def density(self) -> Array:
         """PSD q of each state's driving noise (size,), unit²/s."""
+        return np.zeros(self.size)
+
+    @property
+    def feed(self) -> Array:
+        """How the next state feeds each, g (size,), 1/s times unit over unit; 0: it does not."""
         return np.zeros(self.size)
 
     @property
@@ -108,13 +126,49 @@ class LinearBlock(_Block):
 
     def transition(self, dt: float) -> Array:
         """Return Φ (size, size) over dt, s."""
-        return np.diag(np.exp(-self.decay * dt))
+        return np.diag(np.exp(-self.decay * dt)) if not np.any(self.feed) else self._chained(dt)[0]
 
     def process_noise(self, dt: float) -> Array:
         """Return Q (size, size) over dt, s."""
+        if np.any(self.feed):
+            return self._chained(dt)[1]
         with np.errstate(invalid="ignore", divide="ignore"):
             time = np.where(self.decay > 0.0, -0.5 * np.expm1(-2.0 * self.decay * dt) / self.decay, dt)
         return np.diag(self.density * time)
+
+    def retold(self, values: Array, turn: Array) -> Array:
+        """Return values (m, size) when the attitude that they are told relative to is turned, in fixed axes, by quaternions (m, 4)."""
+        return values
+
+    def _chained(self, dt: float) -> tuple[Array, Array]:
+        """Return Φ and Q of states in chains: of a step short enough for the kernel's series, doubled as often as it takes."""
+        decay, density = np.asarray(self.decay, np.float64), np.asarray(self.density, np.float64)
+        chains = np.stack([np.asarray(self.feed, np.float64), density], axis=1)
+        doublings = max(0, int(np.ceil(np.log2(max(np.max(decay) * dt / MOST_CHAIN_DECAY, 1e-9)))))
+        h = dt / 2**doublings
+        phi, Q = np.zeros((2, self.size, self.size))
+        for k in range(self.size):
+            first = augmented_chain.chain_start(chains, k)
+            own = slice(first, k + 1)
+            far, near, itself, n20, n21, n22, n10, n11, n00 = augmented_chain.chain_step(decay, chains, k, first, h)
+            phi[own, k] = (far, near, itself)[first - k - 1 :]
+            N = np.array([[n00, 0.0, 0.0], [n10, n11, 0.0], [n20, n21, n22]])[:, first - k - 1 :]
+            Q[own, own] += density[k] * N.T @ N
+        for _ in range(doublings):
+            phi, Q = phi @ phi, phi @ Q @ phi.T + Q
+        return phi, Q
+
+
+def stationary_covariance(decay: Array, density: Array, feed: Array) -> Array:
+    """Return what chains of states settle at (n, n): ``A P + P Aᵀ + diag(q) = 0``, solved from the last state up, where all is a sum."""
+    n = len(decay)
+    P = np.zeros((n + 1, n + 1))
+    link = np.append(feed[:-1], 0.0)
+    for i in range(n - 1, -1, -1):
+        for j in range(n - 1, i - 1, -1):
+            drive = link[i] * P[i + 1, j] + link[j] * P[i, j + 1] + (density[i] if i == j else 0.0)
+            P[i, j] = P[j, i] = drive / (decay[i] + decay[j]) if drive != 0.0 else 0.0
+    return P[:n, :n]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -513,6 +567,127 @@ class GaussMarkov(LinearBlock):
         if self.frame == "body":
             return {self.sensor: Effect(offset_b=axes, varying=self.varying)}
         return {self.sensor: Effect(offset_f=axes, carried=True, varying=self.varying)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoundedVelocity(LinearBlock):
+    """What an accelerometer on a moving hand feels of the motion: an acceleration whose velocity is bounded, stationary, in fixed axes.
+
+    ``f_b = R_fbᵀ (a_f − g_f)`` with ``a = v̇``: on each axis ``v̇ = −v/τ_v + u``, ``u̇ = −u/τ_a + w``. The spectrum of a is that of
+    first-order coloured noise at high frequency and vanishes at zero, as that of every body does which stays about where it is; a part of
+    the noise that lasts would pass for tilt. With ``position_time`` the position is bounded too: ``ṗ = −p/τ_p + s``, ``ṡ = −s/τ_v + u``,
+    ``v = ṗ``.
+
+    The noise is alike in all directions. Of ``velocity_sigma``, ``acceleration_sigma`` and ``acceleration_time`` give two: with the rates
+    ``d₁ = λ_p λ_v + (λ_p + λ_v) λ_a`` of the three times, 1/τ, ``σ_a = σ_v √d₁`` (λ_p = 0 without a bounded position).
+    """
+
+    sensor: str
+    velocity_time: float
+    """τ_v, s: about how long a velocity lasts."""
+    velocity_sigma: float = 0.0
+    """Stationary σ of each component of v, m/s."""
+    acceleration_sigma: float = 0.0
+    """Stationary σ of each component of a, m/s²."""
+    acceleration_time: float = 0.0
+    """τ_a, s: about how long a push lasts."""
+    position_time: float = 0.0
+    """τ_p, s: about how long a displacement lasts; 0: the position is not bounded, and no state."""
+    strength: float = STANDARD_GRAVITY
+    """Specific force over which the sensor's vector is told, m/s²: 1 where it gives whole vectors in m/s²."""
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        """Check all, and work out the third of the three that are given by two."""
+        object.__setattr__(self, "name", self.name or f"{self.sensor} velocity")
+        positive(f"{self.name}: velocity_time", self.velocity_time, unit="s")
+        positive(f"{self.name}: strength", self.strength, unit="m/s²")
+        non_negative(f"{self.name}: position_time", self.position_time, unit="s")
+        three = {"velocity_sigma": "m/s", "acceleration_sigma": "m/s²", "acceleration_time": "s"}
+        values = [
+            non_negative(f"{self.name}: {field_name}", getattr(self, field_name), unit=unit)
+            for field_name, unit in three.items()
+        ]
+        velocity, acceleration, time = values
+        told = ", ".join(f"{name} {value:g} {three[name]}" for name, value in zip(three, values, strict=True))
+        if sum(value > 0.0 for value in values) < 2:
+            raise InputError(f"{self.name}: of {told} two must be above zero; the third follows from them")
+        slow, p = 1.0 / self.velocity_time, 1.0 / self.position_time if self.position_time > 0.0 else 0.0
+        if time == 0.0:
+            rate = ((acceleration / velocity) ** 2 - p * slow) / (p + slow)
+            if rate <= 0.0:
+                raise InputError(
+                    f"{self.name}: acceleration_sigma is {acceleration:g} m/s² beside a velocity_sigma of {velocity:g} m/s, less than "
+                    f"velocity_time and position_time alone make ({velocity * np.sqrt(p * slow):g} m/s²); give more, or longer times"
+                )
+            object.__setattr__(self, "acceleration_time", 1.0 / rate)
+            return
+        ratio = float(np.sqrt(p * slow + (p + slow) / time))
+        if acceleration == 0.0:
+            object.__setattr__(self, "acceleration_sigma", ratio * velocity)
+        elif velocity == 0.0:
+            object.__setattr__(self, "velocity_sigma", acceleration / ratio)
+        elif abs(acceleration / (ratio * velocity) - 1.0) > 1e-9:
+            raise InputError(f"{self.name}: {told} do not go together at these times; give two of them")
+
+    @property
+    def _rates(self) -> Array:
+        """1/τ of the states of one axis."""
+        times = (self.position_time, self.velocity_time, self.acceleration_time)
+        return 1.0 / np.array(times[0 if self.position_time > 0.0 else 1 :])
+
+    @property
+    def components(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Axis by axis: velocity v and the drive u; with a bounded position p, s and u, and the velocity is ``s − p/τ_p``."""
+        words = ("position", "velocity drive", "drive") if self.position_time > 0.0 else ("velocity", "drive")
+        return tuple(f"{word} {axis}" for axis in AXES for word in words)
+
+    @property
+    def units(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Each its own."""
+        return ("m", "m/s", "m/s²")[3 - len(self._rates) :] * 3
+
+    @property
+    def covariance(self) -> Array:
+        """The stationary one."""
+        return stationary_covariance(self.decay, self.density, self.feed)
+
+    @property
+    def sigma(self) -> Array:  # type: ignore[override]
+        """The stationary one."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def decay(self) -> Array:
+        """1/τ."""
+        return np.tile(self._rates, 3)
+
+    @property
+    def density(self) -> Array:
+        """``2 σ_v² (d₁ d₂ − d₀)`` of each drive, dᵢ the coefficients of ``∏ (s + 1/τ) = s³ + d₂ s² + d₁ s + d₀``."""
+        _, d2, d1, d0 = np.append(np.poly(-self._rates), np.zeros(3 - len(self._rates)))
+        one = np.zeros(len(self._rates))
+        one[-1] = 2.0 * self.velocity_sigma**2 * (d1 * d2 - d0)
+        return np.tile(one, 3)
+
+    @property
+    def feed(self) -> Array:
+        """1 within an axis."""
+        return np.tile(np.append(np.ones(len(self._rates) - 1), 0.0), 3)
+
+    @property
+    def effects(self) -> Mapping[str, Effect]:
+        """The acceleration, from the states of each axis."""
+        rates = self._rates
+        a = np.array([-rates[0], 1.0])
+        if len(rates) == 3:
+            a = np.array([rates[0] ** 2, -rates[0] - rates[1], 1.0])
+        return {self.sensor: Effect(offset_f=np.kron(np.eye(3), a[:, None]) / self.strength, carried=True)}
+
+    def retold(self, values: Array, turn: Array) -> Array:
+        """Turn the vectors that the states are."""
+        vectors = np.swapaxes(values.reshape(len(values), 3, -1), 1, 2)
+        return np.swapaxes(quaternion.rotate(turn[:, None], vectors), 1, 2).reshape(values.shape)
 
 
 def check(blocks: tuple[Block, ...]) -> None:

@@ -14,14 +14,36 @@ from strapdown.augmented.blocks import Block
 from strapdown.augmented.model import AugmentedState, Model
 from strapdown.augmented.turning import turning
 from strapdown.checks import Array, InputError, count
-from strapdown.kernels import augmented_loop, robust_step
+from strapdown.kernels import augmented_loop, augmented_robust, robust_loop, robust_step
+from strapdown.kernels.augmented_chain import LINKS
 from strapdown.kernels.augmented_step import OFFSET
 from strapdown.kernels.machine import compiled
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.mekf import ProcessNoise, Schedule
-from strapdown.records import Estimate, ImuRecord
-from strapdown.robustness import Gate, Robust
+from strapdown.mekf.scheduling import skipped_too
+from strapdown.records import Estimate, Event, ImuRecord
+from strapdown.robustness import LOCK_OUT, Gate, GateMemory, Robust
 from strapdown.vectors import KINDS, VectorMeasurements
+
+
+@dataclass(frozen=True, kw_only=True)
+class AugmentedGateMemory(GateMemory):
+    """What a gate remembers with optional states; ``challenger`` holds q, (b, c) and the factor of P in the kernels' order."""
+
+    start: float
+    """Time that the first part of the record began, s."""
+    values: Array
+    """What a challenger takes the blocks for at that time (m,)."""
+    covariance: Array
+    """The covariance of them (m, m)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartState(AugmentedState):
+    """State at the end of a part of a record."""
+
+    gate: AugmentedGateMemory | None = None
+    """What its gate remembers."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,7 +123,7 @@ def run(
     full_covariance : bool
         Keep whole covariance matrices too.
     gate : Gate, optional
-        Refuse measurements that no right filter would see. It must have ``recovery=None``: a challenger that starts anew knows of no block.
+        Refuse measurements that no right filter would see, and recover where they agree with each other; the blocks then start anew.
     robust : Robust, optional
         Weigh measurements by how far they lie off.
     """
@@ -128,19 +150,27 @@ def run_on(
     gate: Gate | None = None,
     robust: Robust | None = None,
 ) -> tuple[AugmentedEstimate, AugmentedState]:
-    """Run the filter and return the end state too, from which the next part of a record goes on, bit for bit."""
+    """Run the filter and return the end state too, from which the next part of a record goes on, bit for bit.
+
+    It holds what a gate remembers as well: its counts, its challenger, how wide a restart is, and the blocks' prior. A lock-out that goes
+    on is told by both parts, by the second as a whole. With a block told by functions a gate starts anew in each part.
+    """
     blocks = tuple(blocks)
     state = modelling.begin(initial, blocks)
     count("every", every)
-    check_gate(gate)
     if modelling.general(blocks):
         from strapdown.augmented import stepping
 
-        if gate is not None or robust is not None:
-            raise InputError(
-                "gate and robust run compiled, with linear blocks only; leave them out, or the general blocks"
-            )
-        return stepping.run_on(record, process_noise, state, blocks, every=every, full_covariance=full_covariance)
+        return stepping.run_on(
+            record,
+            process_noise,
+            state,
+            blocks,
+            every=every,
+            full_covariance=full_covariance,
+            gate=gate,
+            robust=robust,
+        )
     events, model = prepared(record, blocks)
     estimate, end, _ = run_events(
         record,
@@ -155,15 +185,6 @@ def run_on(
         robust=robust,
     )
     return estimate, end
-
-
-def check_gate(gate: Gate | None) -> None:
-    """Refuse a gate that recovers."""
-    if gate is not None and gate.recovery is not None:
-        raise InputError(
-            f"gate: recovery is {gate.recovery}, and a filter with optional states cannot recover: a challenger that starts anew would "
-            "know nothing of them; give recovery=None (in a file recovery = 0), or leave the states out"
-        )
 
 
 def prepared(record: ImuRecord, blocks: tuple[Block, ...]) -> tuple[Schedule, Model]:
@@ -191,8 +212,8 @@ def run_events(
 
     With ``whole_bias`` the estimate tells the whole bias, and ``full_covariance`` is about that instead of all states.
     """
-    check_gate(gate)
     size, width = 6 + model.states, 6 + model.states + model.noise_rows
+    plain = gate is None and robust is None
     rows = len(record.increments) // every + 1
     attitude, x, F = start_arrays(model, state, width, size)
     attitude_out, x_out = np.empty((rows, 4)), np.empty((rows, size - 3))
@@ -200,10 +221,10 @@ def run_events(
     P = np.empty((rows if full_covariance and not whole_bias else 0, size, size))
     told = np.empty((rows if whole_bias else 0, 6))
     told_covariance = np.empty((rows if whole_bias and full_covariance else 0, 6, 6))
-    innovation = np.empty((len(events.time), max([2, *(2 * KINDS[kind] for kind in events.kinds)])))
-    weight = np.empty(0 if gate is None and robust is None else len(events.time))
+    most = max([2, *(2 * KINDS[kind] for kind in events.kinds)]) if plain else 6
+    innovation, weight = np.empty((len(events.time), most)), None
     stored = np.empty((segments + 1 if segments else 0, 8 + size - 3 + size * (size + 1) // 2))
-    number = compiled(augmented_loop.run_augmented)(
+    believed = (
         record.time,
         np.ascontiguousarray(record.increments),
         process_noise.angle_random_walk**2,
@@ -217,51 +238,93 @@ def run_events(
         model.sensors,
         model.sensor_use,
         tuple(model.force_f.tolist()),
-        events.time,
-        events.kind,
-        events.vector_b,
-        events.variance,
-        np.empty((0, 6)) if events.noise is None else events.noise,
+        model.chains,
+        np.empty((len(model.chains), LINKS)),
+    )
+    measured = (
         lengths(record, events, model),
         events.sensor,
         events.reference,
         _turns(record, events, model),
         events.triads,
-        np.full(3, np.inf) if gate is None else gate.thresholds,
-        0 if robust is None else {"huber": robust_step.HUBER, "student": robust_step.STUDENT}[robust.kind],
-        np.ones((3, 2)) if robust is None else robust.parameters,
-        0 if robust is None else robust.iterations,
-        attitude,
-        x,
-        F,
-        (
-            np.empty((model.states, 3)),
-            np.empty(model.states),
-            np.empty((3, size)),
-            np.empty(3),
-            np.empty(3),
-            np.empty((3, 3)),
-            np.empty(size),
-            np.empty(width),
-            np.empty((3, size)),
-            np.empty((6, 6)),
-        ),
-        every,
-        attitude_out,
-        x_out,
-        variance,
-        P,
-        told,
-        told_covariance,
-        innovation,
-        weight,
-        stored[:segments],
     )
+    steps = np.empty((model.states, 3)), np.empty(model.states)
+    rows_of = np.empty((3, size)), np.empty(3), np.empty(3), np.empty((3, 3))
+    out = (every, attitude_out, x_out, variance, P, told, told_covariance, innovation)
+    recovered: tuple[Event, ...] = ()
+    locked_out: tuple[Event, ...] = ()
+    memory: AugmentedGateMemory | None = None
+    if plain:
+        number = compiled(augmented_loop.run_augmented)(
+            *believed,
+            events.time,
+            events.kind,
+            events.vector_b,
+            events.variance,
+            np.empty((0, 6)) if events.noise is None else events.noise,
+            *measured,
+            attitude,
+            x,
+            F,
+            (*steps, *rows_of, np.empty(size), np.empty(width), np.empty((6, 6))),
+            *out,
+            stored[:segments],
+        )
+    else:
+        weight = np.empty(len(events.time))
+        # Either takes at least two refusals, but for a lock-out that goes on.
+        recoveries = np.empty((len(events.time) // 2, 4))
+        lock_outs = np.empty((len(events.time) // 2 + len(events.sensors), 4))
+        attitudes, xs, Fs = (np.stack([one, one]) for one in (attitude, x, F))
+        before = getattr(state, "gate", None) if gate is not None else None
+        first = _first(state, blocks, float(record.time[0])) if before is None else before
+        counts, standing = _remembered(before, events.sensors)
+        if before is not None and before.counts[robust_loop.CHALLENGED]:
+            attitudes[1], xs[1] = before.challenger[:4], before.challenger[4 : 4 + len(x)]
+            Fs[1, :size, :size] = before.challenger[4 + len(x) :].reshape(size, size)
+        if gate is None or not gate.recovery:
+            counts[robust_loop.CHALLENGED] = 0.0
+        number, found, locked = compiled(augmented_robust.run_augmented_robust)(
+            *believed,
+            events.time,
+            events.kind,
+            events.vector_b,
+            events.body_noise,
+            *measured,
+            *_options(gate, robust, first, model),
+            standing,
+            counts,
+            attitudes,
+            xs,
+            Fs,
+            (*steps, np.empty(width), np.empty((6, 6))),
+            (*rows_of, *np.empty((2, 3, size)), *np.empty((2, size)), np.empty(size - 3), np.empty(width)),
+            np.empty((3 * model.states + 6, 3 + model.states)),
+            *out,
+            weight,
+            recoveries,
+            lock_outs,
+            stored[:segments],
+        )
+        attitude, x, F = attitudes[0], xs[0], Fs[0]
+        if gate is not None:
+            rival = np.concatenate([attitudes[1], xs[1], Fs[1, :size, :size].ravel()])
+            told_by_now = dict(zip(events.sensors, standing, strict=True))
+            memory = replace(first, challenger=rival, counts=counts, standing=told_by_now)
+        recovered = _told("recovery", recoveries[:found][:, [2, 0, 1, 3]], events.sensors)
+        lock_outs = lock_outs[:locked]
+        locked_out = _told("lock-out", lock_outs[lock_outs[:, 3] > 0.0], events.sensors)
     if segments:
+        for event in recovered:
+            raise InputError(
+                f"the filter lost its way and recovered at {event.end:.9g} s, where the trajectory breaks; smooth the parts before "
+                f"and after {event.start:.9g} s on their own (strapdown.records.cut)"
+            )
         stored[number, :4] = 0.0
         stored[number, 4:8] = attitude
         stored[number, 8 : 8 + len(x)] = x
         stored[number, 8 + len(x) :] = F[:size, :size][np.tril_indices(size)]
+    innovations = mekf.innovations_by_sensor(events, innovation, weight)
     estimate = packed(
         model,
         blocks,
@@ -271,8 +334,9 @@ def run_events(
         x_out,
         variance,
         P if len(P) else None,
-        mekf.innovations_by_sensor(events, innovation, weight if len(weight) or gate or robust else None),
-        events.skipped,
+        innovations,
+        skipped_too(events, innovations),
+        (*recovered, *locked_out),
     )
     if whole_bias:
         offsets = model.gyro[:, :3] * (model.gyro_use & OFFSET > 0)[:, None]
@@ -284,7 +348,8 @@ def run_events(
         )
     back = np.argsort(model.whole_order)
     root = F[:size, :size][:, back]
-    end = AugmentedState(
+    end = PartState(
+        gate=memory,
         attitude=attitude,
         bias=x[:3],
         values=x[3:][np.argsort(model.order)],
@@ -292,6 +357,73 @@ def run_events(
         factor=root,
     )
     return estimate, end, stored[: number + 1]
+
+
+def _told(kind: str, rows: Array, sensors: tuple[str, ...]) -> tuple[Event, ...]:
+    """Return events of rows (n, 4): start and end, s, sensor and value."""
+    return tuple(
+        Event(kind=kind, start=float(start), end=float(end), sensor=sensors[int(sensor)], value=float(value))
+        for start, end, sensor, value in rows
+    )
+
+
+def _options(gate: Gate | None, robust: Robust | None, first: AugmentedGateMemory, model: Model) -> tuple[object, ...]:
+    """Return a gate and a robust update as the kernel takes them."""
+    P = first.covariance[np.ix_(model.order, model.order)]
+    added = first.restart_bias_variance
+    if gate is not None and gate.restart_bias_sigma is not None:
+        added = np.full(3, gate.restart_bias_sigma**2)
+    return (
+        np.full(3, np.inf) if gate is None else gate.thresholds,
+        0 if robust is None else {"huber": robust_step.HUBER, "student": robust_step.STUDENT}[robust.kind],
+        np.ones((3, 2)) if robust is None else robust.parameters,
+        0 if robust is None else robust.iterations,
+        0 if gate is None else gate.recovery or 0,
+        LOCK_OUT if gate is None else gate.lock_out_limit,
+        0.0 if gate is None else gate.restart_attitude_sigma,
+        np.zeros(3) if gate is None else np.sqrt(added),
+        first.values[model.order],
+        np.ascontiguousarray(np.linalg.cholesky(P[::-1, ::-1])[::-1, ::-1].T),
+        first.start,
+    )
+
+
+def _first(state: AugmentedState, blocks: tuple[Block, ...], start: float) -> AugmentedGateMemory:
+    """Return what a gate knows at the start of a record."""
+    values, P = restart_states(state, blocks)
+    return AugmentedGateMemory(
+        restart_bias_variance=np.diag(state.covariance)[3:6].copy(),
+        challenger=np.empty(0),
+        counts=np.zeros(robust_loop.MEMORY),
+        standing={},
+        start=start,
+        values=values,
+        covariance=P,
+    )
+
+
+def _remembered(memory: AugmentedGateMemory | None, sensors: tuple[str, ...]) -> tuple[Array, Array]:
+    """Return what the kernel goes on with: its ``memory``, and ``standing`` of these sensors."""
+    counts, standing = np.zeros(robust_loop.MEMORY), np.zeros((len(sensors), robust_loop.STANDING))
+    counts[robust_loop.PASSES] = 1.0
+    if memory is not None:
+        counts[:] = memory.counts
+        for row, sensor in zip(standing, sensors, strict=True):
+            row[:] = memory.standing.get(sensor, 0.0)
+    standing[:, robust_loop.TOLD] = -1.0
+    return counts, standing
+
+
+def restart_states(state: AugmentedState, blocks: tuple[Block, ...]) -> tuple[Array, Array]:
+    """Return values (m,) and covariance (m, m) that the blocks of a challenger have at the start of the record.
+
+    They are those of the filter's own start, but each state at least as uncertain as its block says: a start that goes on from an earlier
+    part of a record may be what led the filter astray.
+    """
+    P = state.covariance[6:, 6:].copy()
+    least = np.concatenate([np.empty(0), *(np.asarray(block.sigma) ** 2 for block in blocks)])
+    P[np.diag_indices(len(P))] = np.maximum(np.diag(P), least)
+    return state.values, P
 
 
 def _turns(record: ImuRecord, events: Schedule, model: Model) -> Array:
@@ -358,6 +490,7 @@ def packed(
     P: Array | None,
     innovations: Mapping,  # type: ignore[type-arg]
     skipped: Mapping[str, int],
+    recovered: tuple[Event, ...] = (),
 ) -> AugmentedEstimate:
     """Return the estimate in the order of outside."""
     back = np.argsort(model.whole_order)
@@ -381,7 +514,7 @@ def packed(
         covariance=None if whole is None else whole[:, :6, :6],
         innovations=innovations,
         skipped=skipped,
-        events=tuple(mekf.gaps(edges)),
+        events=tuple(sorted([*mekf.gaps(edges), *recovered], key=lambda event: event.start)),
         blocks=found,
         whole_covariance=whole,
     )

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from strapdown import mekf
-from strapdown.augmented.blocks import Block, Effect, GeneralBlock, LinearBlock, check
+from strapdown.augmented.blocks import MOST_CHAIN_DECAY, Block, Effect, GeneralBlock, LinearBlock, check
 from strapdown.checks import Array, InputError, array, covariance, one_of, unit_quaternions
+from strapdown.kernels.augmented_chain import CHAIN, chain_start
 from strapdown.kernels.augmented_step import CARRIED, FIXED, FORCE, LEVER, NOISE_NODES, OFFSET, SCALE
 
 MOST_DECAY = 0.5
@@ -58,7 +59,11 @@ def initial_state(initial: mekf.State, blocks: Sequence[Block]) -> AugmentedStat
     size = sum(block.size for block in blocks)
     P = np.zeros((6 + size, 6 + size))
     P[:6, :6] = initial.covariance
-    P[6:, 6:] = np.diag(np.concatenate([np.empty(0), *(np.asarray(block.sigma) ** 2 for block in blocks)]))
+    first = 6
+    for block in blocks:
+        own = slice(first, first + block.size)
+        P[own, own] = block.covariance
+        first += block.size
     return AugmentedState(attitude=initial.attitude, bias=initial.bias, values=np.zeros(size), covariance=P)
 
 
@@ -81,8 +86,10 @@ class Model:
     """Which state from outside each of the kernels' block states is (m,)."""
     decay: Array
     density: Array
+    chains: Array
+    """How the next state feeds each, and the PSD that drives a chain, which is then not in ``density`` (m, 2); empty without chains."""
     changing: int
-    """How many come first that decay or are driven."""
+    """How many come first that decay, are driven or belong to a chain."""
     limit: float
     """Longest step, s."""
     gyro: Array
@@ -109,7 +116,8 @@ class Model:
         """Number of rows of noise of a step."""
         driven = self.density > 0.0
         rows = np.where(self.gyro_use & OFFSET, NOISE_NODES, 1)
-        return 6 + int(np.sum(rows[driven]))
+        chained = sum(int(k - chain_start(self.chains, k) + 1) for k in np.flatnonzero(self.chains[:, 1]))
+        return 6 + int(np.sum(rows[driven])) + chained
 
     @property
     def whole_order(self) -> np.ndarray:
@@ -157,17 +165,27 @@ def assemble(blocks: tuple[Block, ...], kinds: Mapping[str, str]) -> Model:
             if effect.varying and kinds[sensor] in ("direction", "heading"):
                 varying.add(sensor)
         first += block.size
-    moves = (decay > 0.0) | (density > 0.0)
+    feed = _feeds(blocks)
+    fed = np.append(False, feed != 0.0)[: len(feed)]
+    linked = (feed != 0.0) | fed
+    moves = (decay > 0.0) | (density > 0.0) | linked
     order = np.argsort(~moves, kind="stable")
     gyro_use = _uses(gyro[:, :3], scales) + FORCE * np.any(forces != 0.0, axis=1)
     sensor_use = _uses(sensors[..., :3], sensors[..., 6:], sensors[..., 3:6])
     sensor_use += (LEVER - OFFSET) * (levered & (sensor_use & OFFSET > 0))
     sensor_use += CARRIED * (carried & (sensor_use & FIXED > 0))
-    fastest = float(np.max(decay * np.where(gyro_use & OFFSET, 5.0, 1.0), initial=0.0))
+    if np.any(linked & (gyro_use != 0)):
+        raise InputError(
+            f"block state {int(np.argmax(linked & (gyro_use != 0)))} belongs to a chain and enters the gyro; give it a feed of 0, or no "
+            "effect on the gyro"
+        )
+    quickened = np.where(linked, MOST_DECAY / MOST_CHAIN_DECAY, np.where(gyro_use & OFFSET, 5.0, 1.0))
+    fastest = float(np.max(decay * quickened, initial=0.0))
     return Model(
         order=order,
         decay=decay[order],
-        density=density[order],
+        density=np.where(fed, 0.0, density)[order],
+        chains=np.stack([feed, np.where(fed, density, 0.0)], axis=1)[order] if linked.any() else np.empty((0, 2)),
         changing=int(np.sum(moves)),
         limit=MOST_DECAY / fastest if fastest > 0.0 else np.inf,
         gyro=np.ascontiguousarray(gyro[order]),
@@ -177,6 +195,23 @@ def assemble(blocks: tuple[Block, ...], kinds: Mapping[str, str]) -> Model:
         force_f=force_f,
         varying=frozenset(varying),
     )
+
+
+def _feeds(blocks: tuple[Block, ...]) -> Array:
+    """Return how the next state feeds each, of chains that stay within their block."""
+    feed = _stack(blocks, "feed", ())
+    first = 0
+    for block in blocks:
+        own = feed[first : first + block.size]
+        first += block.size
+        if block.size and own[-1] != 0.0:
+            raise InputError(
+                f"{block.name}: feed of the last state is {own[-1]:g}, and no state comes after it; give 0"
+            )
+        longest = max((k - chain_start(own[:, None], k) + 1 for k in range(block.size)), default=0)
+        if longest > CHAIN:
+            raise InputError(f"{block.name}: {longest} states feed one another; a chain has at most {CHAIN}")
+    return feed
 
 
 def _force(blocks: tuple[Block, ...], both: np.ndarray) -> Array:

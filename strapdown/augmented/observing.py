@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +29,8 @@ class Observability:
     With the prior covariance ``P₀ = S Sᵀ`` and the covariance P of the same state after the whole record, the measurements' own
     information is ``O = Sᵀ (P⁻¹ − P₀⁻¹) S``: the observability Gramian, linearised along the estimate, with process noise taken into
     account and every state counted in its own prior σ, so that rad, T and ppm can be compared. A singular value s of
-    ``√O`` is dimensionless: along its direction the record leaves ``1/√(1 + s²)`` of the prior σ.
+    ``√O`` is dimensionless: along its direction the record leaves ``1/√(1 + s²)`` of the prior σ. What that is in the units of the states
+    is told with it (``left``): the rows of ``left`` are independent errors of one σ each, ``leftᵀ left = P``.
     """
 
     states: tuple[str, ...]
@@ -44,6 +46,8 @@ class Observability:
     """Dimensionless, the greatest first (n,)."""
     directions: Array
     """Unit directions in the space of states over their prior σ, one a row (n, n), in the order of the singular values."""
+    left: Array
+    """What one σ left along each direction is of each state (n, n), in ``units``, a row a direction."""
     threshold: float
     """Singular value from which on a direction counts as observed."""
 
@@ -58,12 +62,14 @@ class Observability:
         return np.asarray(np.sqrt(np.sum(self.directions[self.rank :] ** 2, axis=0)))
 
     def words(self, k: int) -> str:
-        """Say direction k: states and their shares, each in its prior σ."""
+        """Say direction k: states and their shares, each in its prior σ, and what one σ left along it is of each in its unit."""
         direction = self.directions[k]
         large = np.flatnonzero(np.abs(direction) >= NAMED * np.max(np.abs(direction)))
         large = large[np.argsort(-np.abs(direction[large]), kind="stable")]
         sign = np.sign(direction[large[0]])
-        parts = [f"{sign * direction[i]:+.2f} {self.states[i]}" for i in large]
+        parts = [
+            f"{sign * direction[i]:+.2f} {self.states[i]} ({abs(self.left[k, i]):.2g} {self.units[i]})" for i in large
+        ]
         return " ".join(parts).removeprefix("+")
 
     def weakest(self, number: int = 3) -> tuple[str, ...]:
@@ -85,9 +91,36 @@ class Observability:
                 f"{self.start_sigma[i] / self.prior_sigma[i]:11.3g} {self.final_sigma[i] / self.prior_sigma[i]:11.3g} "
                 f"{self.unobserved[i]:10.2f}"
             )
-        lines += ["", "singular value: direction, each state in its prior σ"]
+        lines += ["", "singular value: direction, each state in its prior σ (and one σ of what is left)"]
         lines += [f"{self.singular_values[k]:14.3g}: {self.words(k)}" for k in range(n - 1, -1, -1)]
         return "\n".join(lines)
+
+    def summary(self) -> dict[str, Any]:
+        """Return all of it for JSON, in SI units."""
+        return {
+            "rank": self.rank,
+            "threshold": self.threshold,
+            "singular_value_unit": "prior sigma over sigma of the measurements",
+            "states": [
+                {
+                    "state": self.states[i],
+                    "unit": self.units[i],
+                    "prior_sigma": float(self.prior_sigma[i]),
+                    "start_sigma": float(self.start_sigma[i]),
+                    "final_sigma": float(self.final_sigma[i]),
+                    "unobserved": float(self.unobserved[i]),
+                }
+                for i in range(len(self.states))
+            ],
+            "directions": [
+                {
+                    "singular_value": float(self.singular_values[k]),
+                    "in_prior_sigma": dict(zip(self.states, self.directions[k].tolist(), strict=True)),
+                    "one_sigma_left": dict(zip(self.states, self.left[k].tolist(), strict=True)),
+                }
+                for k in range(len(self.states))
+            ],
+        }
 
 
 def state_names(blocks: Sequence[Block]) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -140,6 +173,7 @@ def observability(
         final_sigma=np.sqrt(np.diag(whole.whole_covariance[-1])),
         singular_values=np.sqrt(1.0 / left - 1.0),
         directions=directions / np.linalg.norm(directions, axis=1, keepdims=True),
+        left=directions * np.sqrt(left)[:, None] * sigma,
         threshold=threshold,
     )
 

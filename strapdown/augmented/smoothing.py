@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from strapdown import kinematics, mekf, quaternion
 from strapdown.augmented import filtering
 from strapdown.augmented import model as modelling
-from strapdown.augmented.blocks import Block
+from strapdown.augmented.blocks import Block, LinearBlock
 from strapdown.augmented.filtering import AugmentedEstimate
 from strapdown.augmented.model import AugmentedState
 from strapdown.checks import InputError, count
 from strapdown.kernels import augmented_loop, smoother_loop
+from strapdown.kernels.augmented_chain import LINKS
 from strapdown.kernels.machine import compiled
 from strapdown.mekf import ProcessNoise
 from strapdown.records import ImuRecord
@@ -102,6 +104,8 @@ def smooth(
         model.gyro,
         model.gyro_use,
         tuple(model.force_f.tolist()),
+        model.chains,
+        np.empty((len(model.chains), LINKS)),
         np.empty(size - 3),
         np.empty((size + noise, size + noise)),
         np.empty(size - 3),
@@ -113,7 +117,7 @@ def smooth(
         variance,
         P,
     )
-    return filtering.packed(
+    found = filtering.packed(
         model,
         blocks,
         record.time,
@@ -125,3 +129,11 @@ def smooth(
         forward.innovations,
         forward.skipped,
     )
+    # The way back leaves what is known relative to the attitude relative to the filter's.
+    turn = quaternion.multiply(attitude, quaternion.conjugate(stored[starts, 4:8]))
+    told = {
+        block.name: replace(found.blocks[block.name], values=block.retold(found.blocks[block.name].values, turn))
+        for block in blocks
+        if isinstance(block, LinearBlock)
+    }
+    return replace(found, blocks=told)

@@ -13,6 +13,7 @@ from strapdown.augmented import filtering
 from strapdown.augmented import model as modelling
 from strapdown.augmented.blocks import (
     Block,
+    BoundedVelocity,
     GaussMarkov,
     GyroForce,
     GyroGaussMarkov,
@@ -48,6 +49,16 @@ def _any(value: Entries) -> bool:
     return bool(np.any(np.asarray(value) > 0.0))
 
 
+VELOCITY = {
+    "velocity_time": "s",
+    "velocity_sigma": "m/s",
+    "acceleration_sigma": "m/s²",
+    "acceleration_time": "s",
+    "position_time": "s",
+}
+"""Fields of :class:`SensorStates` about a bounded velocity, and their units."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class SensorStates:
     """Optional states of one sensor; what is 0 is no state."""
@@ -65,6 +76,17 @@ class SensorStates:
     as that of the earth's field along an orbit; the σ above are over the strength at the root mean square σ of the series."""
     lever_arm_sigma: Entries = 0.0
     """σ of the place of an accelerometer from the point that does not accelerate, body axes, one or one an axis, m."""
+    velocity_time: float = 0.0
+    """Of an accelerometer on a moving hand, whose velocity is bounded (:class:`strapdown.augmented.BoundedVelocity`): how long a velocity
+    lasts, s. With it two of the next three."""
+    velocity_sigma: float = 0.0
+    """Stationary σ of each component of the velocity, m/s."""
+    acceleration_sigma: float = 0.0
+    """That of the acceleration, m/s²."""
+    acceleration_time: float = 0.0
+    """How long a push lasts, s."""
+    position_time: float = 0.0
+    """How long a displacement lasts, s; 0: the position is not bounded."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -82,6 +104,14 @@ class SensorStates:
             raise InputError(f"bias_sigma is {self.bias_sigma}; give every axis one above zero, or leave it out")
         if not isinstance(self.varying, bool):
             raise InputError(f"varying is {self.varying!r}; it must be true or false")
+        for name, unit in VELOCITY.items():
+            non_negative(name, getattr(self, name), unit=unit)
+        if any(getattr(self, name) > 0.0 for name in VELOCITY):
+            self._velocity("accelerometer", 1.0)
+
+    def _velocity(self, sensor: str, strength: float) -> BoundedVelocity:
+        told = {name: getattr(self, name) for name in VELOCITY}
+        return BoundedVelocity(sensor=sensor, strength=strength, **told)
 
     def blocks(self, sensor: str, kind: str, gravity: float) -> tuple[Block, ...]:
         """Return them as blocks of a sensor of this kind; ``gravity``, m/s², is what a direction's specific force is over."""
@@ -102,6 +132,9 @@ class SensorStates:
                     varying=self.varying,
                 )
             )
+        if self.velocity_time > 0.0:
+            one_of(f"{sensor}: velocity_time goes with an accelerometer; kind", kind, ("direction", "vector"))
+            found.append(self._velocity(sensor, 1.0 if kind == "vector" else gravity))
         return tuple(found)
 
 
@@ -194,6 +227,7 @@ class States:
                 ("bias", _any(one.bias_sigma)),
                 ("lever", _any(one.lever_arm_sigma)),
                 ("correlated", one.correlated_sigma > 0.0),
+                ("velocity", one.velocity_time > 0.0),
             )
             found += [f"{sensor}.{part}" for part, there in parts if there]
         return tuple(found)
@@ -224,6 +258,8 @@ class States:
                 correlated_sigma=one.correlated_sigma if correlated else 0.0,
                 correlation_time=one.correlation_time if correlated else 0.0,
             )
+            if f"{sensor}.velocity" not in names:
+                part = replace(part, **dict.fromkeys(VELOCITY, 0.0))  # type: ignore[arg-type]
             if part.blocks(sensor, "direction", 1.0):
                 sensors[sensor] = part
         return replace(kept, sensors=sensors)
@@ -274,7 +310,6 @@ def run(
 
     ``initial`` of class :class:`strapdown.mekf.State` tells of the whole bias. Options are those of :func:`strapdown.mekf.run`.
     """
-    filtering.check_gate(gate)
     blocks = states.blocks({series.sensor: series.kind for series in record.vectors})
     state = initial_state(initial, blocks) if isinstance(initial, mekf.State) else initial
     state = modelling.begin(state, blocks)
@@ -329,6 +364,7 @@ _FORCE: tables.Choice = (
     ("deg_per_hour_per_g", units.DEGREE_PER_HOUR / units.STANDARD_GRAVITY),
     ("rad_s_per_m", 1.0),
 )
+_SPEED: tables.Choice = (("m_per_s", 1.0),)
 FORM: tables.Form = {
     "gyro_scale_sigma": tables.PPM,
     "gyro_misalignment_sigma": tables.MILLIRADIANS,
@@ -347,6 +383,11 @@ SENSOR_FORM: tables.Form = {
     "frame": tables.PLAIN,
     "varying": tables.PLAIN,
     "lever_arm_sigma": tables.METRES,
+    "velocity_time": tables.SECONDS,
+    "velocity_sigma": _SPEED,
+    "acceleration_sigma": tables.METRES_PER_SECOND_SQUARED,
+    "acceleration_time": tables.SECONDS,
+    "position_time": tables.SECONDS,
 }
 """Keys of the states of a sensor: its σ in rad, or of whole vectors in the unit of their reference."""
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import filterpy.kalman
 import numpy as np
@@ -17,10 +19,31 @@ from strapdown.augmented.blocks import Block, GeneralBlock, Interval, View
 from strapdown.augmented.filtering import AugmentedEstimate
 from strapdown.augmented.model import AugmentedState
 from strapdown.checks import Array, InputError, array, covariance, positive, unit_quaternions
-from strapdown.kernels import augmented_step, filter_loop
+from strapdown.kernels import (
+    augmented_chain,
+    augmented_loop,
+    augmented_robust,
+    augmented_step,
+    filter_loop,
+    robust_step,
+)
+from strapdown.kernels.robust_loop import FORGOTTEN, WIDENING, WIDEST
 from strapdown.mekf import ProcessNoise
-from strapdown.records import ImuRecord
-from strapdown.vectors import triad
+from strapdown.mekf.scheduling import skipped_too
+from strapdown.mekf.stepping import _Challenger as _PlainChallenger
+from strapdown.mekf.stepping import _Standing
+from strapdown.records import Event, ImuRecord
+from strapdown.robustness import (
+    UNIFORM_SIGMA,
+    WIDE_PASSES,
+    Gate,
+    Linearised,
+    Robust,
+    Rows,
+    seen_from,
+    tilt_unknown,
+)
+from strapdown.vectors import KINDS, triad
 
 KIND_CODES = {
     "direction": filter_loop.DIRECTION,
@@ -28,22 +51,34 @@ KIND_CODES = {
     "heading": filter_loop.HEADING,
     "attitude": filter_loop.ATTITUDE,
 }
+TURNED = (filter_loop.DIRECTION, filter_loop.VECTOR)
+"""Kinds whose angle from what is predicted the kernels measure."""
 
 
 class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
     """The same filter with a whole covariance: ``P``, ``F``, ``Q``, ``R``, ``y``, ``S``, ``K``, ``Saver`` work as filterpy's users expect.
 
     ``x`` is the error state (δθ, δb, δc) (n,): zero before and after each update; ``x_post`` keeps the last correction. ``attitude`` (4,)
-    is q_fb, ``bias`` (3,) in rad/s, ``values`` (m,) those of the blocks one after the other. ``time`` counts from 0 unless set.
+    is q_fb, ``bias`` (3,) in rad/s, ``values`` (m,) those of the blocks one after the other. ``time`` counts from 0 unless set. ``nis`` is
+    that of the last measurement, ``weight`` what it was taken in with; ``refused`` counts by sensor what the gate refused, ``events`` tells
+    of recoveries and lock-outs. A heading that the estimate takes for vertical is passed over.
     """
 
     def __init__(
-        self, process_noise: ProcessNoise, initial: mekf.State | AugmentedState, blocks: Sequence[Block] = ()
+        self,
+        process_noise: ProcessNoise,
+        initial: mekf.State | AugmentedState,
+        blocks: Sequence[Block] = (),
+        *,
+        gate: Gate | None = None,
+        robust: Robust | None = None,
     ) -> None:
         state = modelling.begin(initial, tuple(blocks))
         size = 6 + len(state.values)
         super().__init__(dim_x=size, dim_z=2)
         self.process_noise = process_noise
+        self.gate = gate
+        self.robust = robust
         self.blocks = tuple(blocks)
         self.kinds: dict[str, str] = {}
         self.attitude: Array = state.attitude.copy()
@@ -57,18 +92,33 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         bounds = np.cumsum([0, *(block.size for block in self.blocks)])
         self._parts = [slice(a, b) for a, b in itertools.pairwise(bounds)]
         self._models: dict[str, modelling.Model] = {}
+        self.nis = 0.0
+        self.weight = 1.0
+        self.refused: dict[str, int] = {}
+        self.events: tuple[Event, ...] = ()
+        # What the blocks of a challenger know, carried along.
+        self._prior = filtering.restart_states(state, self.blocks)
+        self._restart_bias = np.zeros(3) if gate is None else gate.restart_bias_variance(state.covariance[:6, :6])
+        self._expected = self.y, np.eye(2)
+        self._passes = 1
+        self._standing: dict[str, _Standing] = {}
+        self._level = 0
+        self._trusted = 0
+        self._challenger: _Challenger | None = None
 
     def predict(self, delta_theta: ArrayLike, dt: float) -> None:
         """Propagate over one gyro increment (3,), rad, of dt seconds."""
         increment = array("delta_theta", delta_theta, (3,))
         left = positive("dt", dt, unit="s")
         model = self._model("")
-        longest = augmented_step.longest_step(left, tuple(increment), model.limit)
-        whole = left
         while left > 0.0:
-            step = min(longest, left)
-            self._step(increment * (step / whole), step, model)
-            left = left - step if left > longest else 0.0
+            running = [self] if self._challenger is None else [self, self._challenger.filter]
+            x = np.array([one.bias for one in running])
+            step = float(augmented_loop.longest_common_step(left, tuple(increment), x, len(x), model.limit))
+            part = increment * (step / left)
+            for one in running:
+                one._step(part, step, model)
+            increment, left = increment - part, left - step if step < left else 0.0
 
     def _model(self, sensor: str) -> modelling.Model:
         """Return the linear blocks as arrays, seen from one sensor."""
@@ -106,7 +156,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         columns = np.eye(6 + m)
         augmented_step.carry(columns, 0, 6 + m, phi11, phi12, coupling[:m], factor[:m], use[:m], m)
         N = np.zeros((6 + 3 * m, 6 + m))
-        augmented_step.fill_noise(
+        row = augmented_step.fill_noise(
             N,
             0,
             6 + m,
@@ -120,8 +170,15 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             gyro[:m],
             use[:m],
         )
+        links = np.empty((len(model.chains), augmented_chain.LINKS))
+        augmented_chain.link_chains(decay, model.chains, dt, links)
+        augmented_chain.feed_states(x, 3, links)
+        augmented_chain.carry_chains(columns, 0, 6 + m, links)
+        augmented_chain.fill_chain_noise(N, row, 6 + m, model.chains, links)
         self.F, self.Q = columns.T.copy(), N.T @ N
         self.values = x[3 : 3 + m]
+        if self.gate is not None and self.gate.recovery:
+            self._prior = self._carried_prior(interval)
         for block, where in zip(self.blocks, self._parts, strict=True):
             if isinstance(block, GeneralBlock):
                 own = slice(6 + where.start, 6 + where.stop)
@@ -132,92 +189,304 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         self.rate = np.array(rate)
         self.time += dt
 
-    def update_direction(self, vector_b: ArrayLike, reference_f: ArrayLike, sigma: ArrayLike, sensor: str = "") -> None:
+    def _carried_prior(self, interval: Interval) -> tuple[Array, Array]:
+        """Return values and covariance of the blocks' prior after an interval."""
+        values, P = self._prior
+        Phi, Q, moved = np.zeros_like(P), np.zeros_like(P), np.empty(len(values))
+        for block, where in zip(self.blocks, self._parts, strict=True):
+            own = where, where
+            if isinstance(block, GeneralBlock):
+                moved[where], Phi[own], _, Q[own] = block.propagate(values[where], interval)
+            else:
+                Phi[own], Q[own] = block.transition(interval.dt), block.process_noise(interval.dt)
+                moved[where] = Phi[own] @ values[where]
+        return moved, Phi @ P @ Phi.T + Q
+
+    def update_direction(self, vector_b: ArrayLike, reference_f: ArrayLike, sigma: ArrayLike, sensor: str = "") -> bool:
         """Update with a measured unit direction (3,) of a known one (3,): two degrees of freedom.
 
         ``sigma``, here and below: of each component, of each body axis (3,), or a covariance in body axes (3, 3), the square of the unit.
+        Returns whether it was taken in.
         """
-        self._update("direction", vector_b, reference_f, sigma, sensor)
+        return self._update("direction", vector_b, reference_f, sigma, sensor)
 
-    def update_vector(self, vector_b: ArrayLike, reference_f: ArrayLike, sigma: ArrayLike, sensor: str = "") -> None:
+    def update_vector(self, vector_b: ArrayLike, reference_f: ArrayLike, sigma: ArrayLike, sensor: str = "") -> bool:
         """Update with a measured vector (3,) of a known one (3,), in their unit: three degrees of freedom."""
-        self._update("vector", vector_b, reference_f, sigma, sensor)
+        return self._update("vector", vector_b, reference_f, sigma, sensor)
 
-    def update_heading(self, vector_b: ArrayLike, reference_f: ArrayLike, sigma: float, sensor: str = "") -> None:
+    def update_heading(self, vector_b: ArrayLike, reference_f: ArrayLike, sigma: float, sensor: str = "") -> bool:
         """Update with the heading of a measured vector's horizontal part: one degree of freedom, ``sigma`` rad."""
-        self._update("heading", vector_b, reference_f, positive("sigma", sigma, unit="rad"), sensor)
+        return self._update("heading", vector_b, reference_f, positive("sigma", sigma, unit="rad"), sensor)
 
-    def update_attitude(self, attitude: ArrayLike, sigma: ArrayLike, sensor: str = "") -> None:
+    def update_attitude(self, attitude: ArrayLike, sigma: ArrayLike, sensor: str = "") -> bool:
         """Update with a measured attitude q_fb (4,): three degrees of freedom."""
         measured = unit_quaternions("attitude", array("attitude", attitude, (4,)))
         frame = (*measured, 0.0, 0.0, 0.0, 0.0, 0.0)
-        self._rows("attitude", (0.0, 0.0, 0.0), frame, 1.0, _covariance(sigma), sensor, None)
+        return self._measure(
+            _Measured(kind="attitude", z=(0.0, 0.0, 0.0), frame=frame, noise=_covariance(sigma), sensor=sensor)
+        )
 
-    def _update(self, kind: str, vector_b: ArrayLike, reference_f: ArrayLike, sigma: ArrayLike, sensor: str) -> None:
+    def _update(self, kind: str, vector_b: ArrayLike, reference_f: ArrayLike, sigma: ArrayLike, sensor: str) -> bool:
         z, r = array("vector_b", vector_b, (3,)), array("reference_f", reference_f, (3,))
         length = float(np.linalg.norm(r)) if kind == "vector" else 1.0
-        noise = _covariance(sigma) / length**2
-        self._rows(kind, tuple(z / length), tuple(triad(r).ravel()), length, noise, sensor, r)
-
-    def _rows(
-        self,
-        kind: str,
-        z: tuple[float, ...],
-        frame: tuple[float, ...],
-        length: float,
-        noise: Array,
-        sensor: str,
-        reference: Array | None,
-    ) -> None:
-        if self.kinds.setdefault(sensor, kind) != kind:
-            raise InputError(
-                f"{sensor or 'the sensor'} gave kind {self.kinds[sensor]!r} before, now {kind!r}; name each sensor"
+        return self._measure(
+            _Measured(
+                kind=kind,
+                z=tuple(z / length),
+                frame=tuple(triad(r).ravel()),
+                length=length,
+                noise=_covariance(sigma) / length**2,
+                sensor=sensor,
+                reference=r,
             )
-        model, m = self._model(sensor), len(self.values)
+        )
+
+    def _measure(self, measured: _Measured) -> bool:
+        sensor = measured.sensor
+        if self.kinds.setdefault(sensor, measured.kind) != measured.kind:
+            raise InputError(
+                f"{sensor or 'the sensor'} gave kind {self.kinds[sensor]!r} before, now {measured.kind!r}; name each sensor"
+            )
+        shown = self._shows(measured)
+        accepted = self._correct(measured)
+        if shown and not accepted:
+            self.refused[sensor] = self.refused.get(sensor, 0) + 1
+        if self.gate is not None:
+            self._oversee(measured, accepted)
+        return bool(accepted)
+
+    def _rows(self, measured: _Measured, attitude: Array, others: Array) -> Rows:
+        """Return a measurement as seen from an attitude and (b, c) (3 + m,)."""
+        model, m = self._model(measured.sensor), len(self.values)
+        values = others[3:]
         sensors, use = np.zeros((1, m + 1, 15)), np.zeros((1, m + 1), np.int64)
         sensors[:, :m], use[:, :m] = model.sensors, model.sensor_use
         for block, where in zip(self.blocks, self._parts, strict=True):
-            if isinstance(block, GeneralBlock) and reference is not None:
-                expected = quaternion.rotate(quaternion.conjugate(self.attitude), reference)
-                view = View(sensor=sensor, time=self.time, attitude=self.attitude, rate=self.rate, expected_b=expected)
-                effect = block.measured(self.values[where], view)
+            if isinstance(block, GeneralBlock) and measured.reference is not None:
+                expected = quaternion.rotate(quaternion.conjugate(attitude), measured.reference)
+                view = View(
+                    sensor=measured.sensor, time=self.time, attitude=attitude, rate=self.rate, expected_b=expected
+                )
+                effect = block.measured(values[where], view)
                 if effect is not None:
-                    if kind == "heading":
+                    if measured.kind == "heading":
                         raise InputError(
-                            f"{block.name}: {sensor} is of kind 'heading', on which it has no effect; leave it out"
+                            f"{block.name}: {measured.sensor} is of kind 'heading', on which it has no effect; leave it out"
                         )
                     told, rows = effect
                     sensors[0, where, :3] = rows
                     use[0, where] = augmented_step.OFFSET
-                    sensors[0, m, :3] += told - self.values[where] @ rows
+                    sensors[0, m, :3] += told - values[where] @ rows
                     use[0, m] = augmented_step.OFFSET
         H, y, basis = np.empty((3, 7 + m)), np.empty(3), np.empty((3, 3))
-        x = np.array([*self.bias, *self.values, 1.0])
-        R = tuple(quaternion.to_matrix(self.attitude).ravel())
-        code = KIND_CODES[kind]
+        R = tuple(quaternion.to_matrix(attitude).ravel())
+        code = KIND_CODES[measured.kind]
+        z, x = measured.z, np.append(others, 1.0)
         count = augmented_step.fill_rows(
-            tuple(self.attitude), R, x, code, z, frame, length, 0, sensors, use, (0.0,) * 9, H, y, basis
+            tuple(attitude), R, x, code, z, measured.frame, measured.length, 0, sensors, use, (0.0,) * 9, H, y, basis
         )
-        self._correct(y[:count].copy(), H[:count, : 6 + m].copy(), (basis @ noise @ basis.T)[:count, :count])
+        far, along = augmented_robust.seen_from_afar(code, z, count, y, basis)
+        angle = math.atan2(float(np.hypot(y[0], y[1])), along) if code in TURNED else 0.0
+        noise = (basis @ measured.noise @ basis.T)[:count, :count]
+        return y[:count].copy(), H[:count, : 6 + m].copy(), noise, angle, far
 
-    def _correct(self, residual: Array, H: Array, noise: Array) -> None:
-        self.dim_z = len(residual)
-        zero = np.zeros(len(residual))
-        super().update(residual, HJacobian=lambda x: H, Hx=lambda x: zero, R=noise)
+    def _shows(self, measured: _Measured) -> bool:
+        """Return whether a measurement is not the heading of a vertical vector."""
+        R = tuple(quaternion.to_matrix(self.attitude).ravel())
+        return measured.kind != "heading" or bool(robust_step.has_heading(R, measured.z))
+
+    def _linearised(self, measured: _Measured, others: Array, threshold: float) -> Linearised:
+        """Return a measurement seen from the state that its update leads to: :func:`strapdown.robustness.linearise`, all states along."""
+        A = self.P[:3, :3]
+        unknown = np.trace(A) >= robust_step.UNKNOWN
+        tolerance = robust_step.SETTLED if unknown else robust_step.RELINEARIZED
+        now, now_others, P, prior = self.attitude, others, self.P, np.zeros(len(self.P))
+        done, trials = 1, 0
+        while True:
+            residual, H, noise, angle, far = self._rows(measured, now, now_others)
+            seen = Linearised(attitude=now, covariance=P, prior=prior, residual=residual, H=H, noise=noise, angle=angle)
+            if self._passes == 1:
+                return seen
+            # The arc replaces the chord in the rows made independent, the first two of them.
+            lower = np.linalg.cholesky(noise)
+            lower = lower / np.diag(lower)
+            stretch = np.array([far, far, 1.0])[: len(residual)]
+            from_afar = lower @ (stretch * np.linalg.solve(lower, residual)) - H @ prior
+            step = prior + P @ H.T @ np.linalg.solve(seen.predicted + noise, from_afar)
+            on_rows = np.linalg.solve(lower, H[:, 6:] @ step[6:])
+            converged = bool(step[:3] @ step[:3] + on_rows @ on_rows < tolerance**2)
+            if converged or done >= self._passes:
+                seen = dataclasses.replace(seen, converged=converged)
+                if seen.acceptable(threshold) or trials == 2 or not unknown:
+                    return seen
+                trials += 1
+                done, now, now_others, step = 0, self.attitude, others, np.zeros(len(P))
+                axis = np.array(robust_step.least_certain_axis(tuple(A[np.triu_indices(3)])))
+                step[:3] = math.copysign(robust_step.TURN_ASIDE, trials - 1.5) * axis
+            now = quaternion.normalize(quaternion.multiply(now, quaternion.exp(step[:3])))
+            now_others = now_others + step[3:]
+            P, back = seen_from(quaternion.multiply(quaternion.conjugate(self.attitude), now), self.P)
+            prior = np.concatenate([back, others - now_others])
+            done += 1
+
+    def _correct(self, measured: _Measured) -> bool | None:
+        """Take in a measurement; return whether it was, None where it was passed over."""
+        if not self._shows(measured):
+            self.weight = 0.0
+            self._expected = np.array([np.nan]), np.eye(1)
+            return None
+        others = np.concatenate([self.bias, self.values])
+        threshold = np.inf if self.gate is None else float(self.gate.thresholds[KINDS[measured.kind] - 1])
+        seen = self._linearised(measured, others, threshold)
+        self.nis = seen.nis
+        self.dim_z = len(seen.residual)
+        self._expected = seen.innovation, seen.predicted + seen.noise
+        unknown = self._passes > 1 and measured.kind == "heading" and tilt_unknown(self.attitude, self.P)
+        if unknown or not seen.acceptable(threshold):
+            self.weight = 0.0
+            self.y, self.S = self._expected
+            return None if unknown else False
+        self.weight = 1.0 if self.robust is None else seen.weight(self.robust)
+        self.attitude, self.P, self.x = seen.attitude, seen.covariance, seen.prior.copy()
+        H = seen.H
+        super().update(seen.residual, HJacobian=lambda x: H, Hx=lambda x: H @ x, R=seen.noise / self.weight)
         correction = self.x[:3]
         self.attitude = quaternion.normalize(quaternion.multiply(self.attitude, quaternion.exp(correction)))
-        self.bias = self.bias + self.x[3:6]
-        self.values = self.values + self.x[6:]
-        G = np.eye(len(self.x))
-        G[:3, :3] = kinematics.right_jacobian(correction)
-        self.P = G @ self.P @ G.T
+        others = others - seen.prior[3:] + self.x[3:]
+        self.bias, self.values = others[:3], others[3:]
+        if self._passes > 1 and np.trace(self.P[:3, :3]) > robust_step.KNOWN:
+            self.P, _ = seen_from(quaternion.exp(correction), self.P)
+        else:
+            G = np.eye(len(self.x))
+            G[:3, :3] = kinematics.right_jacobian(correction)
+            self.P = G @ self.P @ G.T
         self.P_post = self.P.copy()
         self.x = np.zeros(len(self.x))
+        return True
+
+    def _oversee(self, measured: _Measured, accepted: bool | None) -> None:
+        """Count refusals, tell of lock-outs, and start, drop or follow a challenger (:class:`strapdown.robustness.Gate`)."""
+        gate, sensor = self.gate, measured.sensor
+        assert gate is not None
+        mine = self._standing.setdefault(sensor, _Standing())
+        if accepted is False:
+            mine.refuse(self.time, gate.lock_out_limit)
+            if mine.told:
+                self._tell(
+                    Event(kind="lock-out", start=mine.first, end=self.time, sensor=sensor, value=float(mine.number))
+                )
+        elif accepted:
+            mine.accept()
+            self._trusted += 1
+        if not gate.recovery:
+            return
+        if accepted is False and self._challenger is None:
+            if self._trusted >= FORGOTTEN * gate.recovery:
+                self._level = 0
+            self._challenger = self._restarted(gate)
+        rival = self._challenger
+        if rival is None:
+            return
+        rival.judge(rival.filter._correct(measured), mine.in_a_row > 0)
+        if not any(one.in_a_row for one in self._standing.values()):
+            self._challenger = None
+        elif rival.failed:
+            self._next_level()
+        elif self._level < WIDEST and rival.too_narrow:
+            self._level += rival.widen()
+        if self._challenger is not None and mine.in_a_row >= gate.recovery and rival.hits >= gate.recovery:
+            start = min(rival.since, mine.first)
+            self._forgive(gate)
+            self._tell(Event(kind="recovery", start=start, end=self.time, sensor=sensor, value=float(mine.in_a_row)))
+            for name in ("attitude", "bias", "values", "P", "rate"):
+                setattr(self, name, getattr(rival.filter, name))
+            self._passes = WIDE_PASSES
+            self._next_level()
+
+    def _next_level(self) -> None:
+        self._level = (self._level + 1) % (WIDEST + 1)
+        self._trusted = 0
+        self._challenger = None
+
+    def _tell(self, event: Event) -> None:
+        """Put an event among those told, in place of what was said of it before."""
+        others = (
+            old for old in self.events if (old.kind, old.sensor, old.start) != (event.kind, event.sensor, event.start)
+        )
+        self.events = tuple(sorted((*others, event), key=lambda one: one.start))
+
+    def _forgive(self, gate: Gate) -> None:
+        """Set all counts back at a recovery, which tells of the short lock-outs that it ends."""
+        short = {
+            ("lock-out", sensor, one.first)
+            for sensor, one in self._standing.items()
+            if one.excess > 0 and one.number <= 2 * gate.lock_out_limit
+        }
+        self.events = tuple(event for event in self.events if (event.kind, event.sensor, event.start) not in short)
+        self._standing = {}
+
+    def _restarted(self, gate: Gate) -> _Challenger:
+        """Return a challenger as :func:`strapdown.kernels.augmented_robust.start_challenger` makes one."""
+        values, block = self._prior
+        first = gate.restart_attitude_sigma
+        widened = WIDENING**self._level
+        P = np.zeros_like(self.P)
+        P[:3, :3] = max(first, min(widened * first, UNIFORM_SIGMA)) ** 2 * np.eye(3)
+        P[3:6, 3:6] = self.P[3:6, 3:6] + widened**2 * np.diag(self._restart_bias)
+        P[6:, 6:] = block
+        state = AugmentedState(attitude=self.attitude, bias=self.bias, values=values, covariance=P)
+        rival = StepFilter(self.process_noise, state, self.blocks, gate=gate, robust=self.robust)
+        rival.time, rival.rate = self.time, self.rate
+        rival.kinds, rival._models = self.kinds, self._models
+        rival._passes = WIDE_PASSES
+        return _Challenger(filter=rival, since=self.time, bias=rival.bias, bias_variance=np.diag(P)[3:6].copy())
 
     def state(self) -> AugmentedState:
         """Return the present state."""
         P = 0.5 * (self.P + self.P.T)
         return AugmentedState(attitude=self.attitude, bias=self.bias, values=self.values, covariance=P)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Measured:
+    """A measurement as the kernels take it."""
+
+    kind: str
+    z: tuple[float, ...]
+    frame: tuple[float, ...]
+    length: float = 1.0
+    noise: Array
+    sensor: str
+    reference: Array | None = None
+
+
+@dataclass(kw_only=True)
+class _Challenger(_PlainChallenger):
+    """A filter beside the filter, and how it did."""
+
+    filter: StepFilter  # type: ignore[assignment]
+
+    def widen(self) -> bool:
+        """Take part of what was believed of the bias at the start back out, if it can be; the optional states go along."""
+        mine = self.filter
+        P = mine.P
+        if np.any(np.diag(P)[3:6] > 1.05 * self.bias_variance):
+            return False
+        correction = np.zeros(len(P))
+        for i in range(3, 6):
+            excess = P[i, i] - self.bias_variance[i - 3] / (1.0 - 1.0 / WIDENING**2)
+            if excess < 0.0:  # else the axes before it have left more than its start allows
+                gain = P[:, i] / excess
+                correction = correction + gain * (self.bias[i - 3] - mine.bias[i - 3] - correction[i])
+                P = P - np.outer(gain, P[i])
+        turn = quaternion.exp(correction[:3])
+        mine.attitude = quaternion.normalize(quaternion.multiply(mine.attitude, turn))
+        mine.bias = mine.bias + correction[3:6]
+        mine.values = mine.values + correction[6:]
+        mine.P, _ = seen_from(turn, P)
+        self.bias_variance = WIDENING**2 * self.bias_variance
+        self.nis, self.degrees = 0.0, 0
+        return True
 
 
 def _covariance(sigma: ArrayLike) -> Array:
@@ -235,15 +504,17 @@ def run_on(
     *,
     every: int = 1,
     full_covariance: bool = False,
+    gate: Gate | None = None,
+    robust: Robust | None = None,
 ) -> tuple[AugmentedEstimate, AugmentedState]:
     """Run a record through :class:`StepFilter`: what :func:`strapdown.augmented.run` does with general blocks."""
     events = mekf.schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True)
-    face = StepFilter(process_noise, initial, blocks)
+    face = StepFilter(process_noise, initial, blocks, gate=gate, robust=robust)
     face.time = float(record.time[0])
     face.kinds = dict(zip(events.sensors, events.kinds, strict=True))
     modelling.assemble(blocks, face.kinds)  # refuses effects on sensors that are not there
     size = 6 + len(initial.values)
-    innovation = np.empty((len(events.time), 6))
+    innovation, weight = np.empty((len(events.time), 6)), np.empty(len(events.time))
     rows, e, now = [], 0, record.time[0]
     for k in range(-1, len(record.increments)):
         end = record.time[k + 1]
@@ -253,6 +524,7 @@ def run_on(
                 face.predict(record.increments[k] * ((events.time[e] - now) / whole), events.time[e] - now)
                 now = events.time[e]
             _take(face, record, events, e, innovation[e])
+            weight[e] = face.weight
             e += 1
         if end > now:
             face.predict(
@@ -265,6 +537,7 @@ def run_on(
     plain = modelling.assemble(blocks, face.kinds)
     outside = dataclasses.replace(plain, order=np.arange(size - 6))
     x = np.concatenate([bias, values], axis=1)
+    innovations = mekf.innovations_by_sensor(events, innovation, None if gate is None and robust is None else weight)
     estimate = filtering.packed(
         outside,
         blocks,
@@ -274,8 +547,9 @@ def run_on(
         x,
         np.einsum("kii->ki", P),
         P if full_covariance else None,
-        mekf.innovations_by_sensor(events, innovation),
-        events.skipped,
+        innovations,
+        skipped_too(events, innovations),
+        face.events,
     )
     return estimate, face.state()
 
@@ -291,10 +565,11 @@ def _take(face: StepFilter, record: ImuRecord, events: mekf.Schedule, e: int, in
     else:
         update = face.update_direction if series.kind == "direction" else face.update_vector
         update(series.vector_b[j], series.references_f[j], series.covariances[j], series.sensor)
-    L = np.linalg.cholesky(face.S)
+    y, S = face._expected  # under the nominal noise, whatever the weight
+    L = np.linalg.cholesky(S)
     diagonal = np.diag(L)
-    n = len(face.y)
-    innovation[0 : 2 * n : 2] = np.linalg.solve(L / diagonal, face.y)
+    n = len(y)
+    innovation[0 : 2 * n : 2] = np.linalg.solve(L / diagonal, y)
     innovation[1 : 2 * n : 2] = diagonal**2
 
 
@@ -306,6 +581,7 @@ def _outside_order(model: modelling.Model, sensors: list[int]) -> modelling.Mode
         order=np.arange(len(back)),
         decay=model.decay[back],
         density=model.density[back],
+        chains=model.chains[back] if len(model.chains) else model.chains,
         gyro=model.gyro[back],
         gyro_use=model.gyro_use[back],
         sensors=model.sensors[sensors][:, back],

@@ -69,16 +69,23 @@ def turning(record: ImuRecord, time: Array) -> tuple[Array, Array]:
     tried = [(order, window) for order in ORDERS for window in windows if window >= order + 2]
     noises, bends = [], []
     for order, window in tried:
-        half = max(order + 2, window // 4 * 2 + 1)
+        half = _half(order, window)
         apart = float(np.sum((weights(order, window) - weights(order, half)) ** 2))
         bent = np.mean((slope(order, window, MOST) - slope(order, half, MOST)) ** 2, axis=0) - white * apart
         noises.append(white * float(np.sum(weights(order, window) ** 2)))
         bends.append(np.maximum(bent, 0.0))
     best = int(np.argmin(np.sum(np.array(noises) + LASTING * np.array(bends), axis=1)))
-    acceleration = slope(*tried[best], len(dt)).copy()
-    # A sample is the mean over its interval, f + f″ dt²/24.
-    acceleration[1:-1] -= np.diff(acceleration, 2, axis=0) / 24.0
+    order, window = tried[best]
+    acceleration = slope(order, window, len(dt))
+    h, sharper = weights(order, window), weights(order, _half(order, window))
+    lost = _lost(
+        acceleration, slope(order, _half(order, window), len(dt)), white * float(h @ h), white * float(h @ sharper)
+    )
+    acceleration = acceleration * lost
     smooth = np.asarray(savgol_filter(rates, ORDERS[0] + 2, ORDERS[0], axis=0))
+    # A sample is the mean over its interval, f + f″ dt²/24.
+    for series in (smooth, acceleration):
+        series[1:-1] -= np.diff(series, 2, axis=0) / 24.0
     # The cubic through the four nearest middles: a straight line would cut the crests of what swings within some ten samples.
     place = np.clip((time - 0.5 * (record.time[0] + record.time[1])) / mean, 0.0, len(dt) - 1.0)
     k = np.clip(np.floor(place).astype(np.int64), 1, len(dt) - 3)
@@ -94,8 +101,24 @@ def turning(record: ImuRecord, time: Array) -> tuple[Array, Array]:
     )
     near = k[:, None] + np.arange(-1, 3)
     found = [np.einsum("mj,mja->ma", nodes, series[near]) for series in (smooth, acceleration)]
-    h = weights(*tried[best])
     lags = np.array([h[lag:] @ h[: len(h) - lag] for lag in range(4)]) / (h @ h)
     alike = lags[np.abs(np.subtract.outer(np.arange(4), np.arange(4)))]
     left = np.einsum("mi,ij,mj->m", nodes, alike, nodes)
     return np.concatenate(found, axis=1), noises[best] * left[:, None] + bends[best]
+
+
+def _half(order: int, window: int) -> int:
+    """Return about half of an odd window, odd too and enough for a polynomial of this order."""
+    return max(order + 2, window // 4 * 2 + 1)
+
+
+def _lost(slope: Array, sharper: Array, own: Array, common: Array) -> Array:
+    """Return the factor of each axis (3,), 1 or more, by which slopes (n, 3) fall short of those over half the window: least squares.
+
+    What a window bends of a vibration is little of every sample, but alike in all of them, and a lever arm, which is constant, makes up for
+    it by its length. ``own`` is what the gyro's noise makes of the mean square of a slope, ``common`` of the mean product of both (3,).
+    """
+    power = np.mean(slope**2, axis=0) - own
+    seen = power > own  # of an axis that hardly turns nothing can be told
+    shared = np.mean(slope * sharper, axis=0) - common
+    return np.where(seen, np.maximum(shared / np.where(seen, power, 1.0), 1.0), 1.0)

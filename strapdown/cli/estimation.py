@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from strapdown.records import Estimate, ImuRecord
     from strapdown.setup import FilterSetup
 
-RECORD_ONLY = ("filter", "gate", "robust", "states", "state", "attitude", "from_truth", "every")
+RECORD_ONLY = ("filter", "gate", "robust", "states", "state", "attitude", "from_truth", "every", "observability")
 """Options that go with a record of `strapdown simulate`."""
 
 
@@ -83,6 +83,9 @@ def estimate(
         bool, typer.Option("--from-truth", help="Record: start at the truth, off by errors drawn from the filter's σ.")
     ] = False,
     every: Annotated[int, typer.Option(help="Record: keep each so-manieth step of the filter.")] = 1,
+    observability: Annotated[
+        bool, typer.Option("--observability", help="Record: tell what it shows of each state, optional ones included.")
+    ] = False,
 ) -> None:
     """Estimate attitude and gyro bias from a recording (accelerometer as vertical, magnetometer as heading) or a simulated record."""
     from strapdown.checks import InputError
@@ -90,7 +93,7 @@ def estimate(
     from strapdown.recordfiles import is_record
 
     usable_folder("out", out)
-    names = ("estimate.h5", "errors.json", "states.json", "estimate.png", "errors.png")
+    names = ("estimate.h5", "errors.json", "states.json", "observability.json", "estimate.png", "errors.png")
     writable("out", *(out / name for name in names), sources=(recording, gyro, filter_file))
     given = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
     units = {name: unit for name, unit in given.items() if unit}
@@ -109,6 +112,7 @@ def estimate(
             from_truth,
             every,
             full_covariance is not False,
+            observability,
         )
         return
     options = dict(
@@ -123,6 +127,7 @@ def estimate(
                 attitude,
                 from_truth or None,
                 None if every == 1 else every,
+                observability or None,
             ),
             strict=True,
         )
@@ -147,6 +152,7 @@ def _estimate_record(
     from_truth: bool,
     every: int,
     full_covariance: bool,
+    observability: bool,
 ) -> None:
     """Run the filter over a record, tell and write what it made of it."""
     import numpy as np
@@ -203,6 +209,11 @@ def _estimate_record(
     if isinstance(result, AugmentedEstimate) and result.blocks:
         paths.append(out / "states.json")
         write_json(paths[-1], {"source": str(path), **_tell_states(result)})
+    if observability:
+        shown = setup.observability(used, chosen, initial)
+        console.print(str(shown), soft_wrap=True, markup=False, highlight=False)
+        paths.append(out / "observability.json")
+        write_json(paths[-1], {"source": str(path), **shown.summary()})
     figures = {"estimate.png": plots.estimate_overview(result, title=path.name)}
     if truth is not None:
         figures["errors.png"] = plots.error_overview(result, truth, title=path.name)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
-
 from strapdown.kernels.algebra import combine, dot, scale
+from strapdown.kernels.augmented_chain import carry_chains_back, step_chains
 from strapdown.kernels.augmented_factor import covariances, take_row, triangularise, variances, whole_bias
 from strapdown.kernels.augmented_step import (
     OFFSET,
@@ -21,7 +20,6 @@ from strapdown.kernels.augmented_step import (
 )
 from strapdown.kernels.filter_loop import ATTITUDE, DIRECTION, vector_at
 from strapdown.kernels.robust_loop import six_at
-from strapdown.kernels.robust_step import behind, innovation_factors, robust_weight
 from strapdown.kernels.rotation import logarithm, quaternion_multiply, right_jacobian, rotation_matrix, turned, unit
 from strapdown.kernels.smoother_step import inverse_right_jacobian, moved
 
@@ -56,30 +54,60 @@ def load_segment(segments, k, x, F, size):
     return (segments[k, 4], segments[k, 5], segments[k, 6], segments[k, 7])
 
 
-X = (1.0, 0.0, 0.0)
-Y = (0.0, 1.0, 0.0)
-Z = (0.0, 0.0, 1.0)
+def frame_at(triads, t):
+    """Return row t of the schedule's frames as a 9-tuple."""
+    return (
+        triads[t, 0],
+        triads[t, 1],
+        triads[t, 2],
+        triads[t, 3],
+        triads[t, 4],
+        triads[t, 5],
+        triads[t, 6],
+        triads[t, 7],
+        triads[t, 8],
+    )
 
 
-def predicted_rows(F, size, H, rows, work):
-    """Return the upper triangle of H P Hᵀ as a 6-tuple, rows that are not there as zeros; ``work`` (3, size) is scratch."""
-    for r in range(3):
-        for j in range(size):
-            total = 0.0
-            if r < rows:
-                for i in range(j + 1):
-                    total += F[j, i] * H[r, i]
-            work[r, j] = total
-    s00 = s01 = s02 = s11 = s12 = s22 = 0.0
-    for j in range(size):
-        a, b, c = work[0, j], work[1, j], work[2, j]
-        s00 += a * a
-        s01 += a * b
-        s02 += a * c
-        s11 += b * b
-        s12 += b * c
-        s22 += c * c
-    return (s00, s01, s02, s11, s12, s22)
+def longest_common_step(dt, part, x, running, limit):
+    """Return the longest step within an interval for ``running`` rows of states: cut where filter_loop cuts, and where they decay."""
+    longest = dt
+    for i in range(running):
+        turn = combine(1.0, part, -dt, (x[i, 0], x[i, 1], x[i, 2]))
+        longest = min(longest, longest_step(dt, turn, limit))
+    return longest
+
+
+def advance(
+    q,
+    x,
+    F,
+    size,
+    noisy,
+    changing,
+    dt,
+    part,
+    angle_variance,
+    rate_variance,
+    decay,
+    density,
+    gyro,
+    gyro_use,
+    force_f,
+    chains,
+    links,
+    coupling,
+    factor,
+    work,
+):
+    """Propagate a state over an increment ``part``, ``x`` and ``F`` in place; return q."""
+    q, phi11, phi12, rate, D = move(q, x, dt, part, decay, gyro, gyro_use, force_f, coupling, factor)
+    carry(F, 0, size, phi11, phi12, coupling, factor, gyro_use, changing)
+    rows = fill_noise(F, size, size, dt, rate, D, angle_variance, rate_variance, decay, density, gyro, gyro_use)
+    if len(chains) > 0:
+        rows = step_chains(F, size, rows, x, dt, decay, chains, links)
+    triangularise(F, noisy, 3, size, rows, 0, 0, work)
+    return q
 
 
 def run_augmented(
@@ -96,6 +124,8 @@ def run_augmented(
     sensors,
     sensor_use,
     force_f,
+    chains,
+    links,
     event_time,
     event_kind,
     event_value,
@@ -106,10 +136,6 @@ def run_augmented(
     event_reference,
     event_turning,
     triads,
-    thresholds,
-    robust,
-    robust_parameters,
-    robust_passes,
     attitude,
     x,
     F,
@@ -122,24 +148,22 @@ def run_augmented(
     whole_variance_out,
     whole_covariance_out,
     innovation_out,
-    weight_out,
     segment_out,
 ):
     """Run the filter over a record; the splitting of intervals is that of :func:`strapdown.kernels.filter_loop.run_filter`.
 
     ``attitude`` (4,), ``x`` and the triangle at the top of ``F`` hold the state and are left at the end state; the rest of F takes the rows
-    of noise. ``scratch`` holds arrays (states, 3), (states,), (3, size), (3,), (3,), (3, 3), (size,), one as wide as F, (3, size) and
-    (6, 6). ``limit`` bounds a step by the states that decay. ``event_turning`` (events, 9) has the measured rate and the angular
-    acceleration of each event, and the variances of the latter's axes, 0 for sensors without a lever arm. It may be empty, as
-    ``event_noise``, the two covariances, ``whole_variance_out`` and ``segment_out`` may. ``thresholds`` (3,), ``robust`` and its parameters
-    are those of :func:`strapdown.kernels.robust_loop.run_robust`; they are looked at where ``weight_out`` (events,) is not empty, and each
-    innovation then has the variance of the nominal noise.
+    of noise. ``scratch`` holds arrays (states, 3), (states,), (3, size), (3,), (3,), (3, 3), (size,), one as wide as F and (6, 6).
+    ``limit`` bounds a step by the states that decay. ``chains`` and its scratch ``links`` are those of
+    :mod:`strapdown.kernels.augmented_chain`, empty where no state feeds another. ``event_turning`` (events, 9) has the measured rate and
+    the angular acceleration of each event, and the variances of the latter's axes, 0 for sensors without a lever arm. It may be empty, as
+    ``event_noise``, the two covariances, ``whole_variance_out`` and ``segment_out`` may.
     Returns the number of segments stored.
     """
     size = len(x) + 3
     noisy = 6 + changing
     q = (attitude[0], attitude[1], attitude[2], attitude[3])
-    coupling, factor, H, y, spread, basis, correction, work, seen, six = scratch
+    coupling, factor, H, y, spread, basis, correction, work, six = scratch
     events = len(event_time)
     e = 0
     k = -1  # the interval before the first edge has no length; its end takes the events at the first edge
@@ -170,24 +194,31 @@ def run_augmented(
             if segments < len(segment_out):
                 store_segment(segment_out, segments, dt, part, q, x, F, size)
                 segments += 1
-            q, phi11, phi12, rate, D = move(q, x, dt, part, decay, gyro, gyro_use, force_f, coupling, factor)
-            carry(F, 0, size, phi11, phi12, coupling, factor, gyro_use, changing)
-            rows = fill_noise(F, size, size, dt, rate, D, angle_variance, rate_variance, decay, density, gyro, gyro_use)
-            triangularise(F, noisy, 3, size, rows, 0, 0, work)
+            q = advance(
+                q,
+                x,
+                F,
+                size,
+                noisy,
+                changing,
+                dt,
+                part,
+                angle_variance,
+                rate_variance,
+                decay,
+                density,
+                gyro,
+                gyro_use,
+                force_f,
+                chains,
+                links,
+                coupling,
+                factor,
+                work,
+            )
             now = stop
         if due:
-            t = event_reference[e]
-            frame = (
-                triads[t, 0],
-                triads[t, 1],
-                triads[t, 2],
-                triads[t, 3],
-                triads[t, 4],
-                triads[t, 5],
-                triads[t, 6],
-                triads[t, 7],
-                triads[t, 8],
-            )
+            frame = frame_at(triads, event_reference[e])
             z = vector_at(event_value, e)
             R = rotation_matrix(q)
             s = event_sensor[e]
@@ -210,60 +241,25 @@ def run_augmented(
                     noise = (event_turning[e, 6], event_turning[e, 7], event_turning[e, 8])
                     C = arm_noise(x, s, sensors, sensor_use, event_length[e], noise, C)
                 decorrelate(H, y, rows, basis, C, spread)
-            accepted = True
-            if len(weight_out) > 0:
-                variance = (spread[0], spread[1] if rows > 1 else 1.0, spread[2] if rows > 2 else 1.0)
-                error3 = (y[0], y[1] if rows > 1 else 0.0, y[2] if rows > 2 else 0.0)
-                A = predicted_rows(F, size, H, rows, seen)
-                factors = innovation_factors(A, X, Y, Z, variance)
-                e1 = error3[0]
-                e2 = error3[1] - factors[0] * e1
-                e3 = error3[2] - factors[1] * e1 - factors[2] * e2
-                threshold = thresholds[rows - 1]
-                accepted = e1 * e1 * factors[3] + e2 * e2 * factors[4] + e3 * e3 * factors[5] <= threshold
-                if threshold < math.inf and behind(kind, R, z, frame):
-                    accepted = False
-                weight = 0.0
-                if accepted:
-                    weight = 1.0
-                    if robust > 0:
-                        parameter = robust_parameters[rows - 1, 0]
-                        numerator = robust_parameters[rows - 1, 1]
-                        weight = robust_weight(
-                            robust, parameter, numerator, robust_passes, A, X, Y, Z, error3, variance
-                        )
-                        for r in range(rows):
-                            spread[r] /= weight
-                weight_out[e] = weight
-                innovation_out[e, 0] = e1
-                innovation_out[e, 1] = 1.0 / factors[3]
-                if rows > 1:
-                    innovation_out[e, 2] = e2
-                    innovation_out[e, 3] = 1.0 / factors[4]
-                if rows > 2:
-                    innovation_out[e, 4] = e3
-                    innovation_out[e, 5] = 1.0 / factors[5]
-            if accepted:
+            for i in range(size):
+                correction[i] = 0.0
+            for r in range(rows):
+                error = y[r]
                 for i in range(size):
-                    correction[i] = 0.0
-                for r in range(rows):
-                    error = y[r]
-                    for i in range(size):
-                        error -= H[r, i] * correction[i]  # what the rows before it have corrected
-                    s2 = take_row(F, size, H, r, spread[r], work)
-                    for i in range(size):
-                        correction[i] += error / s2 * work[i]
-                    if len(weight_out) == 0:
-                        innovation_out[e, 2 * r] = error
-                        innovation_out[e, 2 * r + 1] = s2
-                a = (correction[0], correction[1], correction[2])
-                q = turned(q, a)
-                if dot(a, a) > 1.0:
-                    q = unit(q)
-                for i in range(len(x)):
-                    x[i] += correction[3 + i]
-                turn_rows(F, size, right_jacobian(a))
-                triangularise(F, 3, 3, size, size, 0, 0, work)
+                    error -= H[r, i] * correction[i]  # what the rows before it have corrected
+                s2 = take_row(F, size, H, r, spread[r], work)
+                for i in range(size):
+                    correction[i] += error / s2 * work[i]
+                innovation_out[e, 2 * r] = error
+                innovation_out[e, 2 * r + 1] = s2
+            a = (correction[0], correction[1], correction[2])
+            q = turned(q, a)
+            if dot(a, a) > 1.0:
+                q = unit(q)
+            for i in range(len(x)):
+                x[i] += correction[3 + i]
+            turn_rows(F, size, right_jacobian(a))
+            triangularise(F, 3, 3, size, size, 0, 0, work)
             e += 1
         if now >= end and (e == events or event_time[e] > end):
             if countdown == 0:
@@ -298,6 +294,8 @@ def smooth_augmented(
     gyro,
     gyro_use,
     force_f,
+    chains,
+    links,
     x,
     F,
     later_x,
@@ -344,6 +342,8 @@ def smooth_augmented(
         predicted, phi11, phi12, rate, D = move(q, x, dt, part, decay, gyro, gyro_use, force_f, coupling, factor)
         carry(F, 0, size, phi11, phi12, coupling, factor, gyro_use, changing)
         rows = fill_noise(F, size, size, dt, rate, D, angle_variance, rate_variance, decay, density, gyro, gyro_use)
+        if len(chains) > 0:
+            rows = step_chains(F, size, rows, x, dt, decay, chains, links)
         p = rows - size
         for r in range(p):
             for i in range(size):
@@ -382,6 +382,8 @@ def smooth_augmented(
                 for w in range(p):
                     for i in range(noisy):
                         later_F[r, i] -= work[w] * noise[w, i]
+        if len(chains) > 0:
+            carry_chains_back(later_F, 0, rows + 1, links)
         carry_back(later_F, 0, rows + 1, phi11, phi12, coupling, factor, gyro_use, changing)
         later_q, J = moved(q, (later_F[rows, 0], later_F[rows, 1], later_F[rows, 2]))
         for i in range(len(x)):

@@ -147,6 +147,9 @@ def widen(states, memory):
         pa = (B[i], B[3 + i], B[6 + i])
         pb = (P[i], P[3 + i], P[6 + i])
         inverse = 1.0 / (P[4 * i] - variance / (1.0 - 1.0 / (WIDENING * WIDENING)))
+        memory[FIRST_BIAS + 3 + i] = WIDENING * WIDENING * variance
+        if inverse >= 0.0:
+            continue  # the axes before it have left more than its start allows: it holds nothing back any more
         ka = scale(inverse, pa)
         kb = scale(inverse, pb)
         innovation = memory[FIRST_BIAS + i] - b[i]
@@ -155,7 +158,6 @@ def widen(states, memory):
         A = symmetric_minus_outer(A, ka, pa)
         B = minus_outer(B, ka, pb)
         C = symmetric_minus_outer(C, kb, pb)
-        memory[FIRST_BIAS + 3 + i] = WIDENING * WIDENING * variance
     q, A, B = corrected(q, A, B, turn)
     store_state(states[1], q, b, A, B, C)
     memory[LEVEL] += 1.0

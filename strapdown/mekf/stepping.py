@@ -568,12 +568,20 @@ class _Challenger:
         P = mine.P
         if np.any(np.diag(P)[3:] > 1.05 * self.bias_variance):
             return False
-        information = (1.0 - 1.0 / WIDENING**2) / self.bias_variance
-        gain = P[:, 3:] @ np.linalg.inv(P[3:, 3:] - np.diag(1.0 / information))
-        correction = gain @ (self.bias - mine.bias)
-        mine.attitude = quaternion.normalize(quaternion.multiply(mine.attitude, quaternion.exp(correction[:3])))
-        mine.bias = mine.bias + correction[3:]
-        mine.P, _ = seen_from(quaternion.exp(correction[:3]), P - gain @ P[3:, :])
+        P, turn, bias = P.copy(), np.zeros(3), mine.bias.copy()
+        for i in range(3):
+            column = P[:, 3 + i].copy()
+            spread = column[3 + i] - self.bias_variance[i] / (1.0 - 1.0 / WIDENING**2)
+            if spread >= 0.0:
+                continue  # the axes before it have left more than its start allows: it holds nothing back any more
+            gain = column / spread
+            innovation = self.bias[i] - bias[i]
+            turn, bias = turn + innovation * gain[:3], bias + innovation * gain[3:]
+            P -= np.outer(gain, column)
+        correction = quaternion.exp(turn)
+        mine.attitude = quaternion.normalize(quaternion.multiply(mine.attitude, correction))
+        mine.bias = bias
+        mine.P, _ = seen_from(correction, P)
         self.bias_variance = WIDENING**2 * self.bias_variance
         self.nis, self.degrees = 0.0, 0
         return True

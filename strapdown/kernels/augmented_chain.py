@@ -1,0 +1,181 @@
+"""Optional states in chains, each fed by the next: what shapes the white noise of a chain's last state by any real poles.
+
+``ċₖ = −λₖ cₖ + gₖ cₖ₊₁``, the last one of a chain driven by white noise of PSD q besides: ``decay`` λ, and ``chains`` (states, 2) with g
+and q. Chains have up to :data:`CHAIN` states and do not enter the gyro. :mod:`strapdown.kernels.augmented_step` lets each state decay by
+itself; what is here comes after it, as ``Φ = (I + U) diag(e^{−λ dt})`` with U strictly upper triangular. Triangular factors stay
+triangular, and where there is no chain nothing is called.
+
+Plain arithmetic on arrays, for both faces.
+"""
+
+from __future__ import annotations
+
+import math
+
+from strapdown.kernels.augmented_step import NODES, WEIGHTS
+
+CHAIN = 3
+"""Most states of a chain."""
+TERMS = 14
+"""Of the series of a chain's transition: to rounding for λ dt ≤ 1/5."""
+LINKS = 8
+"""Width of the scratch that a step's shares and root of noise are kept in."""
+
+
+def chain_start(chains, k):
+    """Return the first state of the chain that state k ends or belongs to."""
+    first = k
+    while first > 0 and chains[first - 1, 0] != 0.0:
+        first -= 1
+    return first
+
+
+def chain_step(decay, chains, k, first, dt):
+    """Return what state k of a chain makes in dt of the states k − 2, k − 1 and k, and a root of what unit white noise on it makes of them.
+
+    First its column of Φ, (φ_{k−2}, φ_{k−1}, φ_k), by the series of the exponential of the chain's matrix: equal poles, and those at zero,
+    are no special case. Then N with ``Q = Nᵀ N`` as (n20, n21, n22, n10, n11, n00), by rows from that of state k up, what is not there 0:
+    the same series at the nodes of Gauss's rule of five, exact to 4e-11 for λ dt ≤ 1/5.
+    """
+    own = -decay[k] * dt
+    middle, to_middle, far, to_far = 0.0, 0.0, 0.0, 0.0
+    if k - 1 >= first:
+        middle, to_middle = -decay[k - 1] * dt, chains[k - 1, 0] * dt
+    if k - 2 >= first:
+        far, to_far = -decay[k - 2] * dt, chains[k - 2, 0] * dt
+    a, b, c = 0.0, 0.0, 1.0
+    af, bf, cf = 0.0, 0.0, 1.0
+    a0, b0, c0, p0 = 0.0, 0.0, 1.0, 1.0
+    a1, b1, c1, p1 = 0.0, 0.0, 1.0, 1.0
+    a2, b2, c2, p2 = 0.0, 0.0, 1.0, 1.0
+    a3, b3, c3, p3 = 0.0, 0.0, 1.0, 1.0
+    a4, b4, c4, p4 = 0.0, 0.0, 1.0, 1.0
+    for i in range(1, TERMS + 1):
+        share = 1.0 / i
+        a = share * (to_far * b + far * a)
+        b = share * (to_middle * c + middle * b)
+        c = share * (own * c)
+        af, bf, cf = af + a, bf + b, cf + c
+        p0, p1, p2, p3, p4 = p0 * NODES[0], p1 * NODES[1], p2 * NODES[2], p3 * NODES[3], p4 * NODES[4]
+        a0, b0, c0 = a0 + p0 * a, b0 + p0 * b, c0 + p0 * c
+        a1, b1, c1 = a1 + p1 * a, b1 + p1 * b, c1 + p1 * c
+        a2, b2, c2 = a2 + p2 * a, b2 + p2 * b, c2 + p2 * c
+        a3, b3, c3 = a3 + p3 * a, b3 + p3 * b, c3 + p3 * c
+        a4, b4, c4 = a4 + p4 * a, b4 + p4 * b, c4 + p4 * c
+    w0, w1, w2 = dt * WEIGHTS[0], dt * WEIGHTS[1], dt * WEIGHTS[2]
+    q22 = w0 * (c0 * c0 + c4 * c4) + w1 * (c1 * c1 + c3 * c3) + w2 * c2 * c2
+    q12 = w0 * (b0 * c0 + b4 * c4) + w1 * (b1 * c1 + b3 * c3) + w2 * b2 * c2
+    q11 = w0 * (b0 * b0 + b4 * b4) + w1 * (b1 * b1 + b3 * b3) + w2 * b2 * b2
+    q02 = w0 * (a0 * c0 + a4 * c4) + w1 * (a1 * c1 + a3 * c3) + w2 * a2 * c2
+    q01 = w0 * (a0 * b0 + a4 * b4) + w1 * (a1 * b1 + a3 * b3) + w2 * a2 * b2
+    q00 = w0 * (a0 * a0 + a4 * a4) + w1 * (a1 * a1 + a3 * a3) + w2 * a2 * a2
+    n22 = math.sqrt(q22)
+    n21, n20 = q12 / n22, q02 / n22
+    n11 = n10 = n00 = 0.0
+    if k - 1 >= first:
+        n11 = math.sqrt(q11 - n21 * n21)
+        n10 = (q01 - n20 * n21) / n11
+    if k - 2 >= first:
+        n00 = math.sqrt(q00 - n20 * n20 - n10 * n10)
+    return af, bf, cf, n20, n21, n22, n10, n11, n00
+
+
+def alike(decay, chains, k, number):
+    """Return whether the so many states up to k are a chain of the same numbers as the chain of so many before them."""
+    begin = k - 2 * number + 1
+    if begin < 0 or chains[k - number, 0] != 0.0 or (begin > 0 and chains[begin - 1, 0] != 0.0):
+        return False
+    same = True
+    for i in range(k - number + 1, k + 1):
+        same = same and decay[i] == decay[i - number] and chains[i, 0] == chains[i - number, 0]
+    return same
+
+
+def link_chains(decay, chains, dt, links):
+    """Write for each state U's share of the next and of the next but one, and the root of its unit white noise, to ``links``."""
+    for k in range(len(chains)):
+        links[k, 0] = 0.0
+        links[k, 1] = 0.0
+        if k > 0 and chains[k - 1, 0] != 0.0:
+            first = chain_start(chains, k)
+            number = k - first + 1
+            if alike(decay, chains, k, number):
+                links[k - 1, 0] = links[k - 1 - number, 0]
+                if number > 2:
+                    links[k - 2, 1] = links[k - 2 - number, 1]
+                for i in range(2, 8):
+                    links[k, i] = links[k - number, i]
+            else:
+                far, near, own, n20, n21, n22, n10, n11, n00 = chain_step(decay, chains, k, first, dt)
+                links[k - 1, 0] = near / own
+                if number > 2:
+                    links[k - 2, 1] = far / own
+                links[k, 2], links[k, 3], links[k, 4], links[k, 5], links[k, 6], links[k, 7] = (
+                    n20,
+                    n21,
+                    n22,
+                    n10,
+                    n11,
+                    n00,
+                )
+
+
+def feed_states(values, first, links):
+    """Let each state that has decayed be fed; states stand in ``values`` from ``first`` on."""
+    for k in range(len(links)):
+        if links[k, 0] != 0.0:
+            values[first + k] += links[k, 0] * values[first + k + 1]
+            if links[k, 1] != 0.0:
+                values[first + k] += links[k, 1] * values[first + k + 2]
+
+
+def carry_chains(F, first, end, links):
+    """Let the columns of rows of F be fed likewise: ``S ← (I + U) S``."""
+    for k in range(len(links)):
+        if links[k, 0] != 0.0:
+            near, far = links[k, 0], links[k, 1]
+            for j in range(first, end):
+                F[j, 6 + k] += near * F[j, 7 + k]
+            if far != 0.0:
+                for j in range(first, end):
+                    F[j, 6 + k] += far * F[j, 8 + k]
+
+
+def carry_chains_back(F, first, end, links):
+    """Undo :func:`carry_chains`."""
+    for k in range(len(links) - 1, -1, -1):
+        if links[k, 0] != 0.0:
+            near, far = links[k, 0], links[k, 1]
+            for j in range(first, end):
+                F[j, 6 + k] -= near * F[j, 7 + k]
+            if far != 0.0:
+                for j in range(first, end):
+                    F[j, 6 + k] -= far * F[j, 8 + k]
+
+
+def fill_chain_noise(F, row, columns, chains, links):
+    """Write the rows of noise of driven chains from a row of F on, as :func:`strapdown.kernels.augmented_step.fill_noise` those before."""
+    for k in range(len(chains)):
+        if chains[k, 1] > 0.0:
+            number = k - chain_start(chains, k) + 1
+            size = math.sqrt(chains[k, 1])
+            for r in range(number):
+                for i in range(columns):
+                    F[row + r, i] = 0.0
+            F[row, 6 + k] = size * links[k, 4]
+            F[row, 5 + k] = size * links[k, 3]
+            F[row + 1, 5 + k] = size * links[k, 6]
+            if number > 2:
+                F[row, 4 + k] = size * links[k, 2]
+                F[row + 1, 4 + k] = size * links[k, 5]
+                F[row + 2, 4 + k] = size * links[k, 7]
+            row += number
+    return row
+
+
+def step_chains(F, size, row, x, dt, decay, chains, links):
+    """Take states, factor and rows of noise, which go on at ``row``, over a chain's part of a step; return the row after them."""
+    link_chains(decay, chains, dt, links)
+    feed_states(x, 3, links)
+    carry_chains(F, 0, size, links)
+    return fill_chain_noise(F, row, size, chains, links)

@@ -1,0 +1,811 @@
+"""A gate that recovers beside optional states: lock-in by a wrong start, a gap, a magnet; what a challenger knows; both faces; outliers."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from strapdown import augmented, consistency, mekf, montecarlo, motion, quaternion, records, setup
+from strapdown.augmented import SensorStates, States, filtering
+from strapdown.augmented import states as optional
+from strapdown.augmented.blocks import Block
+from strapdown.checks import InputError
+from strapdown.gyro import GyroSpec
+from strapdown.kernels import robust_loop, robust_step
+from strapdown.kernels.augmented_robust import start_challenger, widen
+from strapdown.mekf import ProcessNoise
+from strapdown.randomness import generator
+from strapdown.records import ImuRecord, Truth
+from strapdown.robustness import UNIFORM_SIGMA, WIDE_PASSES, Gate, Robust
+from strapdown.scenarios import Scenario
+from strapdown.setup import FilterSetup
+from strapdown.vectors import Accelerometer, Magnetometer, VectorMeasurements
+
+HAND = motion.HarmonicRates(
+    harmonics=(
+        motion.Harmonic(amplitude=(1.2, 0.2, -0.3), frequency=0.21),
+        motion.Harmonic(amplitude=(-0.3, 1.1, 0.4), frequency=0.37),
+        motion.Harmonic(amplitude=(0.3, -0.2, 1.3), frequency=0.29, phase=1.0),
+    )
+)
+NOISE = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-5)
+FIELD = np.array([0.0, 2e-5, -4e-5])
+UP = np.array([0.0, 0.0, 9.81])
+STAR = np.array([0.6, 0.64, 0.48])
+ATTITUDE_SIGMA, BIAS_SIGMA = 0.01, 3e-3
+
+IRON = augmented.VectorBias(sensor="mag", bias_sigma=1e-6, unit="T")
+SCALE = augmented.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01)
+SWAY = augmented.GaussMarkov(sensor="acc", noise_sigma=0.2, correlation_time=1.0, unit="m/s²")
+
+
+@dataclasses.dataclass(frozen=True)
+class Mounting(augmented.LinearBlock):
+    """The axes of a sensor of whole attitudes are turned from the body's by a constant small angle."""
+
+    name: str = "mounting"
+    components: tuple[str, ...] = ("x", "y", "z")
+    units: tuple[str, ...] = ("rad",) * 3
+
+    @property
+    def sigma(self):
+        return np.full(3, 0.02)
+
+    @property
+    def effects(self):
+        return {"tracker": augmented.Effect(offset_b=np.eye(3))}
+
+
+CASES: dict[str, tuple[tuple[str, ...], tuple[Block, ...]]] = {
+    "hard iron": (("mag", "acc"), (IRON,)),
+    "all": (("mag", "acc"), (IRON, SCALE, SWAY)),
+    "biased direction": (("mag direction", "star"), (augmented.VectorBias(sensor="mag direction", bias_sigma=0.02),)),
+    "biased heading": (("compass", "star"), (augmented.VectorBias(sensor="compass", bias_sigma=0.02),)),
+    "mounting": (("tracker", "star"), (Mounting(),)),
+}
+"""Which sensors measure, and the states."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Made:
+    """A record, what a right filter starts from, and the truth of the blocks."""
+
+    record: ImuRecord
+    initial: mekf.State
+    truth: dict
+
+
+def made(
+    case: str, run: int, duration: float = 12.0, rate: float = 10.0, magnet: float = 0.0, states: float = 1.0
+) -> Made:
+    """Draw the truth of the states from their prior, and what sensors make of it, each at times of its own.
+
+    ``magnet``: so long, in s, the hard iron is off by 3.3 standard deviations. ``states`` is the share of the states that there is.
+    """
+    sensors, blocks = CASES[case]
+    rng = generator(5, run, case)
+    truth = {block.name: states * block.sigma * rng.standard_normal(block.size) for block in blocks}
+    edges = np.arange(round(50 * duration) + 1) / 50.0
+    bias = BIAS_SIGMA * rng.standard_normal(3)
+    turn = HAND.increments(edges)
+    if SCALE.name in truth:
+        turn = turn + turn @ truth[SCALE.name].reshape(3, 3).T
+    turn = turn + 0.02 * bias + 1e-3 * np.sqrt(0.02) * rng.standard_normal(turn.shape)
+    series = tuple(
+        measured(name, np.arange(0.0123 * k, duration, 1.0 / rate), truth, rng, magnet)
+        for k, name in enumerate(sensors)
+    )
+    q = HAND.attitude(edges)
+    known = Truth(attitude=q, bias=np.broadcast_to(bias, (len(edges), 3)).copy())
+    error = rng.standard_normal(6) * np.repeat([ATTITUDE_SIGMA, BIAS_SIGMA], 3)
+    initial = mekf.initial_state(
+        quaternion.multiply(q[0], quaternion.exp(-error[:3])),
+        attitude_sigma=ATTITUDE_SIGMA,
+        bias_sigma=BIAS_SIGMA,
+        bias=bias - error[3:],
+    )
+    return Made(
+        record=ImuRecord(time=edges, increments=turn, vectors=series, truth=known), initial=initial, truth=truth
+    )
+
+
+def measured(name, time, truth, rng, magnet) -> VectorMeasurements:
+    def seen(reference):
+        return quaternion.rotate(quaternion.conjugate(HAND.attitude(time)), reference)
+
+    def white(sigma):
+        return sigma * rng.standard_normal((len(time), 3))
+
+    def told(kind, reference, value, sigma):
+        return VectorMeasurements(
+            sensor=name, kind=kind, time=time, vector_b=value, reference_f=reference, sigma=np.full(len(time), sigma)
+        )
+
+    if name == "mag":
+        off = truth[IRON.name] + np.where(time[:, None] < magnet, 3.3e-6 * np.array([0.6, -0.8, 0.0]), 0.0)
+        return told("vector", FIELD, seen(FIELD) + off + white(3e-7), 3e-7)
+    if name == "acc":
+        coloured = np.zeros((len(time), 3))
+        if np.any(truth.get(SWAY.name, 0.0)):
+            keep = np.exp(-np.diff(time, prepend=time[0]) / SWAY.correlation_time)
+            drive = white(0.2) * np.sqrt(1.0 - keep**2)[:, None]
+            coloured[0] = truth[SWAY.name]
+            for k in range(1, len(time)):
+                coloured[k] = keep[k] * coloured[k - 1] + drive[k]
+        return told("vector", UP, seen(UP) + coloured + white(0.05), 0.05)
+    if name == "mag direction":
+        value = seen(FIELD / np.linalg.norm(FIELD)) + truth[f"{name} bias"] + white(5e-3)
+        return told("direction", FIELD, unit(value), 5e-3)
+    if name == "compass":
+        # σ of a heading is the sensor's own noise over the level part of what it measures.
+        value = seen(STAR) + truth[f"{name} bias"] + white(5e-3)
+        return told("heading", STAR, unit(value), 5e-3 / np.hypot(*STAR[:2]))
+    if name == "star":
+        reference = np.array([0.3, -0.2, 1.0])
+        return told("direction", reference, unit(seen(unit(reference)) + white(3e-3)), 3e-3)
+    turned = quaternion.multiply(HAND.attitude(time), quaternion.exp(truth["mounting"]))
+    value = quaternion.multiply(turned, quaternion.exp(white(3e-3)))
+    return VectorMeasurements(
+        sensor=name, kind="attitude", time=time, attitude=value, sigma_axes=np.full((len(time), 3), 3e-3)
+    )
+
+
+def unit(v):
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def lost(state: mekf.State, run: int) -> mekf.State:
+    """The state turned by a quarter to half a turn about any axis, and as sure of itself as before."""
+    rng = generator(6, run, "lost")
+    turn = unit(rng.standard_normal(3)) * rng.uniform(0.5 * np.pi, np.pi)
+    return dataclasses.replace(state, attitude=quaternion.multiply(state.attitude, quaternion.exp(turn)))
+
+
+def without_gyro(given: Made, begin: float, end: float) -> Made:
+    """The gyro, and all else, is out for a while, in which the body turns on: over the gap no turn is measured."""
+    record = given.record
+    i, j = np.searchsorted(record.time, [begin - 1e-9, end - 1e-9])
+    kept = np.r_[0 : i + 1, j : len(record.time)]
+    increments = np.concatenate([record.increments[:i], np.zeros((1, 3)), record.increments[j:]])
+    series = tuple(s.taken(np.flatnonzero((s.time < begin) | (s.time > end))) for s in record.vectors)
+    truth = Truth(attitude=record.truth.attitude[kept], bias=record.truth.bias[kept])
+    cut = ImuRecord(time=record.time[kept], increments=increments, vectors=series, truth=truth)
+    return dataclasses.replace(given, record=cut)
+
+
+def recoveries(estimate):
+    return [event for event in estimate.events if event.kind == "recovery"]
+
+
+def judged(case: str, runs: int, make: Callable[[int], Made], after, since: float = 0.0, bias_sigma: float = 1e-5):
+    """Return of each run the recoveries, and ANEES of attitude, bias and blocks at times after the first that ends after ``since``.
+
+    ``bias_sigma`` is how far the bias has jumped. Of an acceleration no truth is told, and it is left out.
+    """
+    gate = Gate(restart_bias_sigma=bias_sigma)
+    blocks = CASES[case][1]
+    told, found = [], []
+    for run in range(runs):
+        one = make(run)
+        estimate = augmented.run(one.record, NOISE, one.initial, blocks, gate=gate, full_covariance=True)
+        told.append([event for event in recoveries(estimate) if event.end > since])
+        if not told[-1]:
+            continue
+        values = {block.name: np.zeros(3) if block is SWAY else one.truth[block.name] for block in blocks}
+        error = estimate.errors(one.record.truth.attitude, one.record.truth.bias, values)
+        last = 6 + sum(block.size for block in blocks if block is not SWAY)  # which comes last
+        rows = np.searchsorted(estimate.time, told[-1][0].end + np.asarray(after) - 1e-9)
+        parts = slice(0, 3), slice(3, 6), slice(6, last)
+        P = estimate.whole_covariance
+        found.append([[consistency.nees(error[k, s], P[k][s, s]) / len(error[k, s]) for s in parts] for k in rows])
+    return told, np.mean(found, axis=0)
+
+
+def assert_consistent(case: str, mean, runs: int) -> None:
+    size = sum(block.size for block in CASES[case][1] if block is not SWAY)
+    for part, degrees in enumerate((3, 3, size)):
+        low, high = consistency.mean_bounds(degrees, runs, 0.9999)
+        assert np.all((low < mean[:, part]) & (mean[:, part] < high)), (part, mean[:, part], low, high)
+
+
+RUNS = [40, pytest.param(400, marks=pytest.mark.slow)]
+
+
+# --------------------------------------------------------------------------------------------------------------------------- lock-in
+
+
+@pytest.mark.parametrize("runs", RUNS)
+@pytest.mark.parametrize("case", CASES)
+def test_a_lost_start_is_recovered_from_and_all_states_are_to_be_believed(case, runs):
+    def make(run):
+        one = made(case, run)
+        return dataclasses.replace(one, initial=lost(one.initial, run))
+
+    told, mean = judged(case, runs, make, (0.1, 1.0, 3.0, 8.0))
+    for events in told:
+        (event,) = events
+        assert event.start <= 0.1 + 1e-9
+        assert event.end <= 1.2 + 1e-9
+        assert event.value >= 10
+        assert event.sensor in CASES[case][0]
+        assert f"measurements of {event.sensor} in a row were refused" in str(event)
+    assert_consistent(case, mean, runs)
+
+
+@pytest.mark.parametrize("runs", RUNS)
+@pytest.mark.parametrize("case", ["hard iron", "all", "mounting"])
+def test_a_turn_in_a_gap_of_the_gyro_is_recovered_from(case, runs):
+    """20 s of calibration, then 2 s without a gyro: the attitude is off by up to half a turn, and all else is as it was."""
+    told, mean = judged(
+        case, runs, lambda run: without_gyro(made(case, run, 34.0), 20.0, 22.0), (0.1, 1.0, 3.0, 11.0), since=20.0
+    )
+    for events in told:
+        (event,) = events
+        assert 22.0 <= event.start <= 22.3
+        assert event.end <= 23.5
+    assert_consistent(case, mean, runs)
+
+
+@pytest.mark.parametrize("runs", RUNS)
+def test_a_state_that_was_led_astray_recovers_too(runs):
+    """A magnet is carried for 15 s and learnt as hard iron; taken away, that is off by 3.3 σ of the prior, and by 50 of its own."""
+    told, mean = judged(
+        "hard iron", runs, lambda run: made("hard iron", run, 27.0, magnet=15.0), (0.1, 1.0, 3.0, 10.0), since=15.0
+    )
+    for events in told:
+        (event,) = events
+        assert 14.9 < event.start < 15.2
+        assert event.sensor == "mag"
+    assert_consistent("hard iron", mean, runs)
+
+
+@pytest.mark.parametrize("runs", RUNS)
+def test_a_step_of_the_bias_is_recovered_from(runs):
+    """By 17 °/s (1 σ) on each axis after 12 s: the attitude is off when it shows, and the states, which it has drawn along, start anew."""
+
+    def make(run):
+        one = made("hard iron", run, 24.0)
+        step = 0.3 * generator(8, run, "step").standard_normal(3)
+        record = one.record
+        later = (record.time[1:] > 12.0)[:, None]
+        truth = Truth(attitude=record.truth.attitude, bias=record.truth.bias + (record.time >= 12.0)[:, None] * step)
+        stepped = dataclasses.replace(record, increments=record.increments + 0.02 * later * step, truth=truth)
+        return dataclasses.replace(one, record=stepped)
+
+    told, mean = judged("hard iron", runs, make, (0.1, 1.0, 3.0, 9.0), since=12.0, bias_sigma=0.3)
+    assert all(len(events) == 1 and events[0].start < 13.2 for events in told)
+    assert_consistent("hard iron", mean, runs)
+
+
+def test_by_default_a_challenger_doubts_the_bias_as_at_the_start():
+    """After a gap the bias is as it was; the default, which allows it to have changed, is on the safe side until it is learnt anew."""
+    gate = Gate()
+    P = np.diag([1.0, 1.0, 1.0, 1e-4, 2e-4, 3e-4, 5.0])
+    assert np.array_equal(gate.restart_bias_variance(P[:6, :6]), [1e-4, 2e-4, 3e-4])
+    _, mean = judged(
+        "hard iron",
+        20,
+        lambda run: without_gyro(made("hard iron", run, 32.0), 20.0, 22.0),
+        (0.1, 9.0),
+        20.0,
+        BIAS_SIGMA,
+    )
+    high = consistency.mean_bounds(3, 20, 0.9999)[1]
+    assert mean[0, 1] < 0.5
+    assert np.all(mean < high)
+
+
+def test_without_recovery_it_stays_lost():
+    one = made("hard iron", 1)
+    estimate = augmented.run(one.record, NOISE, lost(one.initial, 1), (IRON,), gate=Gate(recovery=None))
+    assert not recoveries(estimate)
+    told = {event.sensor: event for event in estimate.events}
+    assert set(told) == {"mag", "acc"}
+    for sensor, event in told.items():
+        assert event.kind == "lock-out"
+        assert event.start < 0.2
+        assert event.value == pytest.approx(estimate.refused[sensor], abs=3)
+    assert quaternion.angle_between(estimate.attitude[-1], one.record.truth.attitude[-1]) > 0.5
+    assert estimate.refused["mag"] > 100
+
+
+@pytest.mark.parametrize("runs", [20, pytest.param(200, marks=pytest.mark.slow)])
+def test_a_right_filter_never_starts_anew(runs):
+    """A tenth of the measurements 30 times as noisy: each starts a challenger, and none takes over."""
+    refused = total = 0
+    for run in range(runs):
+        one = made("hard iron", run, duration=30.0)
+        series = []
+        for k, s in enumerate(one.record.vectors):
+            rng = generator(7, run, f"outliers {k}")
+            struck = rng.random(len(s.time)) < 0.1
+            off = 30.0 * s.sigma[:, None] * rng.standard_normal((len(s.time), 3))
+            series.append(dataclasses.replace(s, vector_b=s.vector_b + struck[:, None] * off))
+            total += int(np.sum(struck))
+        record = dataclasses.replace(one.record, vectors=tuple(series))
+        estimate = augmented.run(record, NOISE, one.initial, (IRON,), gate=Gate())
+        assert not estimate.events
+        refused += sum(estimate.refused.values())
+    assert 0.9 < refused / total < 1.1
+
+
+# ---------------------------------------------------------------------------------------------------------- what a challenger knows
+
+
+def test_a_challenger_knows_what_the_prior_says_by_now():
+    """Means and covariance of one state that stays, one that walks, one that forgets, and two that hang together; at any age."""
+    decay, density = np.array([0.0, 0.0, 0.3, 0.5]), np.array([0.0, 4e-4, 0.05, 0.0])
+    rng = np.random.default_rng(3)
+    root = np.tril(rng.standard_normal((4, 4)))
+    values, age = rng.standard_normal(4), 1.7
+    size, bias_sigma = 10, np.array([0.3, 0.1, 0.2])
+    attitude, x, F = np.zeros((2, 4)), np.zeros((2, 7)), np.zeros((2, size, size))
+    attitude[0], x[0] = unit(rng.standard_normal(4)), rng.standard_normal(7)
+    F[0] = np.tril(rng.standard_normal((size, size)))
+    F[1] = np.nan
+    P = F[0].T @ F[0]
+    start_challenger(
+        attitude,
+        x,
+        F,
+        size,
+        1.8,
+        bias_sigma,
+        values,
+        root,
+        age,
+        decay,
+        density,
+        np.empty((0, 2)),
+        np.empty((18, 7)),
+        np.empty(size),
+    )
+    expected = np.zeros((size, size))
+    expected[:3, :3] = 1.8**2 * np.eye(3)
+    expected[3:6, 3:6] = P[3:6, 3:6] + np.diag(bias_sigma**2)
+    kept = np.exp(-decay * age)
+    time = np.where(decay > 0.0, (1.0 - kept**2) / np.where(decay > 0.0, 2.0 * decay, 1.0), age)
+    expected[6:, 6:] = kept[:, None] * (root.T @ root) * kept + np.diag(density * time)
+    np.testing.assert_allclose(F[1].T @ F[1], expected, rtol=1e-12, atol=1e-14)
+    assert np.array_equal(F[1], np.tril(F[1]))
+    assert np.array_equal(attitude[1], attitude[0])
+    assert np.array_equal(x[1, :3], x[0, :3])
+    np.testing.assert_allclose(x[1, 3:], kept * values, rtol=1e-14)
+    np.testing.assert_allclose(F[0].T @ F[0], P, rtol=1e-14)
+
+
+@pytest.mark.parametrize("age", [0.0, 0.03, 1.7, 300.0])
+def test_a_challenger_knows_what_the_prior_of_chains_says_by_now(age):
+    """States that feed one another, two and three in a chain, from a prior that is not stationary: the block's own Φ and Q."""
+    blocks = (
+        augmented.BoundedVelocity(sensor="acc", velocity_time=2.0, velocity_sigma=0.3, acceleration_sigma=1.5),
+        augmented.BoundedVelocity(
+            sensor="acc", velocity_time=2.0, velocity_sigma=0.3, acceleration_sigma=1.5, position_time=9.0, name="other"
+        ),
+    )
+    m = sum(block.size for block in blocks)
+    rng = np.random.default_rng(8)
+    root, values = np.tril(rng.standard_normal((m, m))), rng.standard_normal(m)
+    model = augmented.model.assemble(blocks, {"acc": "direction"})
+    assert np.array_equal(model.order, np.arange(m))
+    attitude, x, F = np.zeros((2, 4)), np.zeros((2, 3 + m)), np.zeros((2, 6 + m, 6 + m))
+    F[0] = np.eye(6 + m)
+    start_challenger(
+        attitude,
+        x,
+        F,
+        6 + m,
+        1.8,
+        np.ones(3),
+        values,
+        root,
+        age,
+        model.decay,
+        model.density,
+        model.chains,
+        np.empty((3 * m + 6, 3 + m)),
+        np.empty(6 + m),
+    )
+    Phi, Q = np.eye(m), np.zeros((m, m))
+    first = 0
+    for block in blocks:
+        own = slice(first, first + block.size)
+        if age > 0.0:
+            Phi[own, own], Q[own, own] = block.transition(age), block.process_noise(age)
+        first += block.size
+    np.testing.assert_allclose(x[1, 3:], Phi @ values, rtol=1e-9, atol=1e-12)
+    found = (F[1].T @ F[1])[6:, 6:]
+    np.testing.assert_allclose(found, Phi @ root.T @ root @ Phi.T + Q, rtol=1e-8, atol=1e-9)
+
+
+def challenger_of(P, bias, values):
+    """Rows of a challenger with covariance P, and its memory where its bias, which started at zero, has the σ of ``STARTED``."""
+    size = len(P)
+    attitude, x, F = np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)), np.zeros((2, size - 3)), np.zeros((2, size + 6, size))
+    F[1, :size] = np.linalg.cholesky(P[::-1, ::-1])[::-1, ::-1].T
+    x[1] = [*bias, *values]
+    memory = np.zeros(robust_loop.MEMORY)
+    memory[robust_loop.FIRST_BIAS + 3 : robust_loop.FIRST_BIAS + 6] = STARTED**2
+    return attitude, x, F, size, memory, np.empty(size), np.empty(size)
+
+
+STARTED = np.array([0.1, 0.2, 0.3])
+
+
+def test_a_challenger_that_is_widened_is_what_it_would_be_had_it_started_so():
+    """Attitude, bias and three states after five measurements, by information: the start's own is taken out but for a ninth of it."""
+    rng = np.random.default_rng(4)
+    H = rng.standard_normal((5, 9)) / np.array([0.3, 0.3, 0.3, *STARTED, 1.0, 1.0, 1.0])
+    z = rng.standard_normal(5)
+    start = np.array([1.8, 1.8, 1.8, *STARTED, 1.0, 2.0, 0.5])
+    wide = start * np.array([1.0, 1.0, 1.0, 3.0, 3.0, 3.0, 1.0, 1.0, 1.0])
+    P, expected = (np.linalg.inv(np.diag(sigma**-2.0) + H.T @ H) for sigma in (start, wide))
+    mean, there = P @ H.T @ z, expected @ H.T @ z
+    rows = challenger_of(P, mean[3:6], mean[6:])
+    attitude, x, F, _, memory, _, _ = rows
+    widen(*rows)
+    np.testing.assert_allclose(x[1], there[3:], rtol=1e-9, atol=1e-12)
+    turn = quaternion.exp(there[:3] - mean[:3])
+    np.testing.assert_allclose(attitude[1], turn, atol=1e-12)
+    upper = tuple(expected[:3, :3][np.triu_indices(3)])
+    G = np.eye(9)
+    G[:3, :3] = np.reshape(robust_step.seen_from(tuple(turn), upper, tuple(np.eye(3).ravel()))[1], (3, 3))
+    np.testing.assert_allclose(F[1].T @ F[1], G @ expected @ G.T, rtol=1e-8, atol=1e-12)
+    assert np.array_equal(F[1], np.tril(F[1]))
+    np.testing.assert_allclose(memory[robust_loop.FIRST_BIAS + 3 : robust_loop.FIRST_BIAS + 6], 9.0 * STARTED**2)
+    assert memory[robust_loop.LEVEL] == 1.0
+
+
+def test_widening_a_bias_whose_axes_hang_together_leaves_a_covariance():
+    """Of a filter's own bias, as uncertain as its start and correlated: more is known of the start than its diagonal says."""
+    P = np.eye(6)
+    P[3:, 3:] = np.outer(STARTED, STARTED) * (0.2 * np.eye(3) + 0.8)
+    rows = challenger_of(P, 0.5 * STARTED, ())
+    widen(*rows)
+    found = rows[2][1].T @ rows[2][1]
+    assert np.isfinite(found).all()
+    assert np.min(np.linalg.eigvalsh(found - P)) > -1e-12
+    assert np.all(np.diag(found)[3:] > np.diag(P)[3:])
+
+
+def test_a_start_that_is_surer_than_its_blocks_is_not_believed_by_a_challenger():
+    """A start that goes on from an earlier part: its values are kept, and what it knows of them is what the block says at least."""
+    one = made("hard iron", 2)
+    begun = augmented.initial_state(one.initial, (IRON,))
+    P = begun.covariance.copy()
+    P[6:, 6:] = np.diag([1e-8, 1e-8, 3e-6]) ** 2
+    P[6, 7] = P[7, 6] = 5e-17
+    values, found = filtering.restart_states(
+        dataclasses.replace(begun, values=np.array([1e-6, 2e-6, 3e-6]), covariance=P), (IRON,)
+    )
+    assert np.array_equal(values, [1e-6, 2e-6, 3e-6])
+    np.testing.assert_allclose(np.sqrt(np.diag(found)), [1e-6, 1e-6, 3e-6])
+    assert found[0, 1] == 5e-17
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_attitude_and_hard_iron_from_nothing_are_the_batch_solution(seed):
+    """An attitude of which nothing is known, a field with an unknown hard iron, then the vertical: as one least squares of both.
+
+    The turn about the field, of up to half a turn, is found last, and must leave alone what ties tilt and hard iron in the body.
+    """
+    from scipy.optimize import least_squares
+
+    rng = np.random.default_rng(seed)
+    true, guess = unit(rng.standard_normal(4)), unit(rng.standard_normal(4))
+    iron = 1e-6 * rng.standard_normal(3)
+    mag = quaternion.rotate(quaternion.conjugate(true), FIELD) + iron + 3e-7 * rng.standard_normal(3)
+    acc = quaternion.rotate(quaternion.conjugate(true), UP) + 0.05 * rng.standard_normal(3)
+    start = mekf.initial_state(guess, attitude_sigma=UNIFORM_SIGMA, bias_sigma=BIAS_SIGMA)
+    face = augmented.StepFilter(NOISE, start, (IRON,))
+    face._passes = WIDE_PASSES
+    assert face.update_vector(mag, FIELD, 3e-7, "mag")
+    assert face.update_vector(acc, UP, 0.05, "acc")
+
+    def residuals(p):
+        back = quaternion.conjugate(quaternion.multiply(true, quaternion.exp(p[:3])))
+        field = quaternion.rotate(back, FIELD) + 1e-6 * p[3:]
+        return np.concatenate([(mag - field) / 3e-7, (acc - quaternion.rotate(back, UP)) / 0.05, p[3:]])
+
+    found = least_squares(residuals, np.zeros(6), xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    best = quaternion.multiply(true, quaternion.exp(found.x[:3]))
+    P = np.linalg.inv(found.jac.T @ found.jac)
+    turn = quaternion.log(quaternion.multiply(quaternion.conjugate(face.attitude), best))
+    error = np.concatenate([turn, found.x[3:] - 1e6 * face.values])
+    assert np.max(np.abs(error) / np.sqrt(np.diag(P))) < 0.3
+    kept, unit_of = [0, 1, 2, 6, 7, 8], np.array([1.0, 1.0, 1.0, 1e-6, 1e-6, 1e-6])
+    mine = face.P[np.ix_(kept, kept)] / np.outer(unit_of, unit_of)
+    ratio = np.linalg.eigvals(np.linalg.solve(P, mine)).real
+    assert 0.7 < ratio.min() <= ratio.max() < 1.4
+
+
+def test_a_covariance_is_carried_by_the_shortest_turn_of_the_axis_that_is_not_known():
+    rng = np.random.default_rng(5)
+    for _ in range(100):
+        basis = quaternion.to_matrix(unit(rng.standard_normal(4)))
+        A = basis @ np.diag([4.0, 0.01, 0.03]) @ basis.T
+        upper = tuple(A[np.triu_indices(3)])
+        axis = basis[:, 0]
+        tilt = 0.4 * rng.standard_normal(3)
+        turn = quaternion.multiply(
+            quaternion.exp(rng.uniform(-3.0, 3.0) * axis), quaternion.exp(tilt - axis * (axis @ tilt))
+        )
+        M = quaternion.to_matrix(quaternion.conjugate(turn))
+        T = np.reshape(robust_step.carried(tuple(M.ravel()), upper), (3, 3))
+        np.testing.assert_allclose(T @ T.T, np.eye(3), atol=1e-12)
+        np.testing.assert_allclose(T @ axis, M @ axis, atol=1e-9)
+        # No turn is shorter: its own axis is across.
+        assert np.trace(T) == pytest.approx(1.0 + 2.0 * axis @ M @ axis, abs=1e-9)
+        alike = tuple((A + 5.0 * np.eye(3))[np.triu_indices(3)])
+        np.testing.assert_array_equal(robust_step.carried(tuple(M.ravel()), alike), M.ravel())
+
+
+# ------------------------------------------------------------------------------------------------------------------------- the faces
+
+
+def assert_same_events(one, other):
+    assert len(one.events) == len(other.events)
+    for a, b in zip(one.events, other.events, strict=True):
+        assert (a.kind, a.sensor) == (b.kind, b.sensor)
+        assert (a.start, a.end, a.value) == pytest.approx((b.start, b.end, b.value))
+
+
+@pytest.mark.parametrize("robust", [None, Robust(), Robust(kind="huber")], ids=["gate", "Student", "Huber"])
+@pytest.mark.parametrize("case", CASES)
+def test_without_blocks_it_is_the_plain_filter(case, robust):
+    """Every kind of sensor, from anywhere at all; what these sensors have besides is an error of both filters, which may keep them lost."""
+    for run in range(4):
+        one = made(case, run, duration=3.0)
+        given = {"gate": Gate(recovery=5), "robust": robust, "full_covariance": True}
+        start = lost(one.initial, run)
+        plain = mekf.run(one.record, NOISE, start, **given)
+        other = augmented.run(one.record, NOISE, start, (), **given)
+        assert plain.events  # it has recovered, or tells that it is locked out
+        assert_same_events(plain, other)
+        error = consistency.errors(other.attitude, other.bias, plain.attitude, plain.bias)
+        assert np.max(np.abs(error) / plain.sigma) < 1e-9
+        scale = plain.sigma[:, :, None] * plain.sigma[:, None, :]
+        assert np.max(np.abs(other.covariance - plain.covariance) / scale) < 1e-9
+        for sensor, innovations in plain.innovations.items():
+            np.testing.assert_allclose(other.innovations[sensor].weight, innovations.weight, atol=1e-9)
+            # Of what a lost filter refuses the linearisation may not settle.
+            used = innovations.weight > 0.0
+            np.testing.assert_allclose(other.innovations[sensor].variance[used], innovations.variance[used], rtol=1e-6)
+
+
+@pytest.mark.parametrize("robust", [None, Robust(), Robust(kind="huber")], ids=["gate", "Student", "Huber"])
+@pytest.mark.parametrize("case", CASES)
+def test_without_blocks_and_errors_of_theirs_it_is_the_plain_filter(case, robust):
+    """The same of sensors without such errors, of which both filters are right."""
+    for run in range(4):
+        one = made(case, run, duration=3.0, states=0.0)
+        given = {"gate": Gate(recovery=5), "robust": robust, "full_covariance": True}
+        start = lost(one.initial, run)
+        plain = mekf.run(one.record, NOISE, start, **given)
+        other = augmented.run(one.record, NOISE, start, (), **given)
+        assert recoveries(plain)
+        assert_same_events(plain, other)
+        error = consistency.errors(other.attitude, other.bias, plain.attitude, plain.bias)
+        assert np.max(np.abs(error) / plain.sigma) < 1e-9
+        scale = plain.sigma[:, :, None] * plain.sigma[:, None, :]
+        assert np.max(np.abs(other.covariance - plain.covariance) / scale) < 1e-9
+        for sensor, innovations in plain.innovations.items():
+            np.testing.assert_allclose(other.innovations[sensor].weight, innovations.weight, atol=1e-9)
+            np.testing.assert_allclose(other.innovations[sensor].variance, innovations.variance, rtol=1e-6)
+
+
+@pytest.mark.parametrize("gap", [False, True], ids=["lost start", "gap"])
+@pytest.mark.parametrize("at", [(7,), (20, 21), (40, 90), (5, 10, 15, 100)])
+def test_in_parts_a_gate_goes_on_as_in_one(at, gap):
+    """Cut before, within and after the time that a challenger runs: its state, all counts and the prior of states that change go on."""
+    one = made("hard iron", 3, duration=3.0)
+    given = {"gate": Gate(recovery=5), "full_covariance": True}
+    start = lost(one.initial, 3)
+    if gap:
+        one, start = without_gyro(made("hard iron", 3, duration=4.0), 1.5, 2.5), one.initial
+    whole, end = augmented.run_on(one.record, NOISE, start, (WALKING, HELD), **given)
+    (told,) = recoveries(whole)
+    state, found, events = start, [], []
+    for first, last in itertools.pairwise((0, *at, len(one.record.increments))):
+        part = records.cut(one.record, first, last)
+        estimate, state = augmented.run_on(part, NOISE, state, (WALKING, HELD), **given)
+        found.append(estimate.attitude[0 if first == 0 else 1 :])
+        events += recoveries(estimate)
+    assert events == [told]
+    assert np.array_equal(np.concatenate(found), whole.attitude)
+    assert np.array_equal(state.covariance, end.covariance)
+    assert np.array_equal(state.values, end.values)
+
+
+@pytest.mark.parametrize("recovery", [10, None])
+@pytest.mark.parametrize("blocks", [(), CASES["biased heading"][1]], ids=["plain", "states"])
+def test_the_heading_of_a_vertical_vector_is_passed_over(blocks, recovery):
+    """Both faces skip it, and do not refuse it; without states it is the plain filter again."""
+    one = made("biased heading", 1, duration=2.0)
+    compass, star = one.record.vectors
+    value = compass.vector_b.copy()
+    value[0] = [0.0, 0.0, 1.0]
+    record = dataclasses.replace(one.record, vectors=(dataclasses.replace(compass, vector_b=value), star))
+    start = dataclasses.replace(one.initial, attitude=np.array([1.0, 0.0, 0.0, 0.0]))
+    gate = Gate(recovery=recovery)
+    whole = augmented.run(record, NOISE, start, blocks, gate=gate)
+    step, _ = augmented.stepping.run_on(record, NOISE, augmented.initial_state(start, blocks), blocks, gate=gate)
+    assert whole.skipped == step.skipped == {"compass": 1, "star": 0}
+    assert whole.refused == step.refused
+    assert len(whole.innovations["compass"].time) == len(compass.time) - 1
+    assert np.isfinite(whole.attitude).all()
+    if not blocks:
+        assert mekf.run(record, NOISE, start, gate=gate).refused == whole.refused
+
+
+@dataclasses.dataclass(frozen=True)
+class IronByFunctions(augmented.GeneralBlock):
+    """Hard iron and a walk, told by functions."""
+
+    name: str = "mag bias"
+    components: tuple[str, ...] = ("x", "y", "z")
+    units: tuple[str, ...] = ("T",) * 3
+
+    @property
+    def sigma(self):
+        return np.full(3, 1e-6)
+
+    def measured(self, values, view):
+        return (values, np.eye(3)) if view.sensor == "mag" else None
+
+    def propagate(self, values, interval):
+        return values, np.eye(3), np.zeros((3, 3)), 1e-16 * interval.dt * np.eye(3)
+
+
+WALKING = augmented.VectorBias(sensor="mag", bias_sigma=1e-6, rate_random_walk=1e-8, unit="T")
+
+
+HELD = augmented.BoundedVelocity(
+    sensor="acc", velocity_time=2.0, velocity_sigma=0.1, acceleration_sigma=0.3, position_time=9.0, strength=1.0
+)
+FACES = {
+    **CASES,
+    "hard iron that walks": (("mag", "acc"), (WALKING,)),
+    "by functions": (("mag", "acc"), (WALKING,)),
+    "chains": (("mag", "acc"), (IRON, HELD)),
+}
+
+
+@pytest.mark.parametrize("case", FACES)
+def test_both_faces_recover_alike(case):
+    _, blocks = FACES[case]
+    general = case == "by functions"
+    one = made(case if case in CASES else "hard iron", 3, duration=1.6)
+    start = lost(one.initial, 3)
+    options = {"gate": Gate(recovery=5), "robust": Robust(), "full_covariance": True}
+    whole = augmented.run(one.record, NOISE, start, blocks, **options)
+    if general:
+        step = augmented.run(one.record, NOISE, start, (IronByFunctions(),), **options)
+    else:
+        state = augmented.initial_state(start, blocks)
+        step, _ = augmented.stepping.run_on(one.record, NOISE, state, blocks, **options)
+    assert recoveries(whole)
+    assert_same_events(whole, step)
+    sigma = np.sqrt(np.einsum("kii->ki", whole.whole_covariance))
+    values = {name: block.values for name, block in step.blocks.items()}
+    assert np.max(np.abs(whole.errors(step.attitude, step.bias, values)) / sigma) < 1e-9
+    scale = sigma[:, :, None] * sigma[:, None, :]
+    assert np.max(np.abs(whole.whole_covariance - step.whole_covariance) / scale) < 1e-9
+    assert whole.refused == step.refused
+    for name, innovations in whole.innovations.items():
+        np.testing.assert_allclose(step.innovations[name].weight, innovations.weight, atol=1e-9)
+        np.testing.assert_allclose(step.innovations[name].nis, innovations.nis, rtol=1e-7)
+
+
+def test_both_faces_widen_a_challenger_alike():
+    """The bias is off by thirty times what the gate allows it to have changed."""
+    one = made("hard iron", 3, duration=2.0)
+    start = dataclasses.replace(lost(one.initial, 3), bias=one.initial.bias + np.array([0.3, -0.2, 0.25]))
+    gate, blocks = Gate(recovery=5, restart_bias_sigma=1e-2), CASES["hard iron"][1]
+    whole, end = augmented.run_on(one.record, NOISE, start, blocks, gate=gate, full_covariance=True)
+    state = augmented.initial_state(start, blocks)
+    step, _ = augmented.stepping.run_on(one.record, NOISE, state, blocks, gate=gate, full_covariance=True)
+    assert end.gate.counts[robust_loop.LEVEL] > 1.0
+    assert recoveries(whole)
+    assert_same_events(whole, step)
+    sigma = np.sqrt(np.einsum("kii->ki", whole.whole_covariance))
+    values = {name: block.values for name, block in step.blocks.items()}
+    assert np.max(np.abs(whole.errors(step.attitude, step.bias, values)) / sigma) < 1e-8
+    scale = sigma[:, :, None] * sigma[:, None, :]
+    assert np.max(np.abs(whole.whole_covariance - step.whole_covariance) / scale) < 1e-8
+
+
+def test_the_step_face_says_what_it_took():
+    one = made("hard iron", 0, duration=1.0)
+    face = augmented.StepFilter(NOISE, one.initial, (IRON,), gate=Gate())
+    mag = one.record.vectors[0]
+    assert face.update_vector(mag.vector_b[0], FIELD, 3e-7, "mag")
+    assert (face.weight, face.refused) == (1.0, {})
+    kept = face.attitude.copy(), face.P.copy(), face.values.copy()
+    assert not face.update_vector(-mag.vector_b[0], FIELD, 3e-7, "mag")
+    assert (face.weight, face.refused) == (0.0, {"mag": 1})
+    assert face.nis > 1e3
+    for now, before in zip((face.attitude, face.P, face.values), kept, strict=True):
+        assert np.array_equal(now, before)
+
+
+def test_the_smoother_does_not_smooth_across_a_recovery():
+    one = made("hard iron", 0, duration=3.0)
+    with pytest.raises(InputError, match=r"recovered at .* s, where the trajectory breaks"):
+        augmented.smooth(one.record, NOISE, lost(one.initial, 0), (IRON,), gate=Gate())
+    smoothed = augmented.smooth(one.record, NOISE, one.initial, (IRON,), gate=Gate())
+    assert not smoothed.events
+    assert np.max(quaternion.angle_between(smoothed.attitude, one.record.truth.attitude)) < 0.05
+
+
+# ------------------------------------------------------------------------------------------------------------------------- setups
+
+
+def test_a_setup_with_states_and_a_gate_recovers_and_tells_the_whole_bias(tmp_path):
+    """Drifts beside the bias, and hard iron; the setup from its file. Events are in order of time, those of gaps among them."""
+    one = without_gyro(made("hard iron", 4, duration=20.0), 8.0, 8.5)
+    states = States(gyro_drift_sigma=(1e-4,), gyro_drift_time=(5.0,), sensors={"mag": SensorStates(bias_sigma=1e-6)})
+    believes = FilterSetup(
+        process_noise=NOISE, attitude_sigma=ATTITUDE_SIGMA, bias_sigma=BIAS_SIGMA, states=states, gate=Gate(recovery=7)
+    )
+    path = tmp_path / "filter.toml"
+    path.write_text(setup.to_toml(believes), encoding="utf-8")
+    assert "recovery = 7" in path.read_text(encoding="utf-8")
+    estimate = setup.run(one.record, setup.read_setup(path), lost(one.initial, 4), full_covariance=True)
+    first = recoveries(estimate)[0]
+    assert first.end < 1.0
+    assert first.value >= 7
+    assert [event.start for event in estimate.events] == sorted(event.start for event in estimate.events)
+    assert {"gap", "recovery"} == {event.kind for event in estimate.events}
+    error = consistency.errors(estimate.attitude, estimate.bias, one.record.truth.attitude, one.record.truth.bias)
+    assert np.all(np.abs(error[-1]) < 4.5 * estimate.sigma[-1])
+    iron = estimate.blocks["mag bias"]
+    assert np.all(np.abs(iron.values[-1] - one.truth[IRON.name]) < 4.5 * iron.sigma[-1])
+
+
+def test_a_lever_arm_recovers():
+    one = made("hard iron", 5, duration=6.0)
+    states = States(sensors={"mag": SensorStates(bias_sigma=1e-6), "acc": SensorStates(lever_arm_sigma=0.05)})
+    estimate = optional.run(one.record, NOISE, lost(one.initial, 5), states, gate=Gate(), full_covariance=True)
+    assert len(recoveries(estimate)) == 1
+    error = consistency.errors(estimate.attitude, estimate.bias, one.record.truth.attitude, one.record.truth.bias)
+    assert np.all(np.abs(error[-1]) < 4.5 * estimate.sigma[-1])
+    assert np.all(
+        np.abs(estimate.blocks["acc lever arm"].values[-1]) < 4.5 * estimate.blocks["acc lever arm"].sigma[-1]
+    )
+
+
+def test_a_campaign_of_lost_starts_with_states_ends_believed():
+    """A Monte Carlo gives the gate of a setup with states its records; starts a radian off on each axis, believed to 2°, all recover."""
+    scenario = Scenario(
+        motion=HAND,
+        gyro=GyroSpec(angle_random_walk=1e-3, rate_random_walk=1e-5),
+        sensors=(
+            Magnetometer(name="mag", field_f=FIELD, sigma=3e-7, rate=10.0, kind="vector"),
+            Accelerometer(name="acc", sigma=0.05, rate=10.0, kind="vector"),
+        ),
+        rate=50.0,
+        duration=6.0,
+    )
+    states = States(sensors={"mag": SensorStates(bias_sigma=1e-7)})
+    believes = FilterSetup(
+        process_noise=NOISE, attitude_sigma=0.03, bias_sigma=1e-4, states=states, gate=Gate(restart_bias_sigma=1e-5)
+    )
+    far = montecarlo.Dispersions(attitude_sigma=1.0)
+    gated, blind = montecarlo.run(
+        scenario,
+        (believes, dataclasses.replace(believes, gate=Gate(recovery=None))),
+        runs=12,
+        seed=3,
+        epochs=10,
+        dispersions=far,
+        threads=1,
+    )
+    assert np.max(gated.finite) == 12
+    low, high = consistency.mean_bounds(3, 12, 0.9999)
+    assert low < gated.anees[-1, 1] < high
+    assert blind.anees[-1, 1] > 100.0
