@@ -155,7 +155,7 @@ def run_on(
     It holds what a gate remembers as well: its counts, its challenger, how wide a restart is, and the blocks' prior. A lock-out that goes
     on is told by both parts, by the second as a whole. With a block told by functions a gate starts anew in each part.
     """
-    blocks = tuple(blocks)
+    blocks = modelling.as_blocks(blocks)
     state = modelling.begin(initial, blocks)
     count("every", every)
     if modelling.general(blocks):

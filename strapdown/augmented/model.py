@@ -52,9 +52,16 @@ class AugmentedState:
             raise InputError("factor is no root of covariance; leave it out")
 
 
+def as_blocks(blocks: Sequence[Block]) -> tuple[Block, ...]:
+    """Return the blocks as a tuple; one by itself is refused."""
+    if isinstance(blocks, LinearBlock | GeneralBlock):
+        raise InputError(f"blocks is the block {blocks.name} by itself; give a tuple of them, (block,)")
+    return tuple(blocks)
+
+
 def initial_state(initial: mekf.State, blocks: Sequence[Block]) -> AugmentedState:
     """Return a state whose blocks are zero, with errors of their own sigma independent of attitude and bias."""
-    blocks = tuple(blocks)
+    blocks = as_blocks(blocks)
     check(blocks)
     size = sum(block.size for block in blocks)
     P = np.zeros((6 + size, 6 + size))

@@ -148,7 +148,7 @@ def observability(
     values are good to about 1e7; a state that forgets (:class:`strapdown.augmented.GaussMarkov`) is judged by what the record tells of
     its first value.
     """
-    blocks = tuple(blocks)
+    blocks = modelling.as_blocks(blocks)
     positive("threshold", threshold)
     state = modelling.begin(initial, blocks)
     where = smooth(record, process_noise, state, blocks)

@@ -37,7 +37,7 @@ def recentred(
     and once for the estimate, which counts the prior too little by ``1/s²`` of its information, s the singular value of
     :func:`strapdown.augmented.observability`: for records that show a state much better than the prior.
     """
-    blocks = tuple(blocks)
+    blocks = modelling.as_blocks(blocks)
     state = modelling.begin(initial, blocks)
     for _ in range(count("passes", passes)):
         whole = smooth(record, process_noise, state, blocks)
@@ -69,7 +69,7 @@ def smooth(
     Innovations are the filter's; ``gate`` and ``robust`` are as for :func:`strapdown.augmented.run`. Linear blocks only. Memory:
     8 (n (n + 1)/2 + n + 5) bytes for each gyro interval and measurement, n states: 1.7 kB at n = 18.
     """
-    blocks = tuple(blocks)
+    blocks = modelling.as_blocks(blocks)
     state = modelling.begin(initial, blocks)
     if modelling.general(blocks):
         names = [block.name for block in blocks if modelling.general((block,))]

@@ -18,7 +18,7 @@ from strapdown.augmented import model as modelling
 from strapdown.augmented.blocks import Block, GeneralBlock, Interval, View
 from strapdown.augmented.filtering import AugmentedEstimate
 from strapdown.augmented.model import AugmentedState
-from strapdown.checks import Array, InputError, array, covariance, positive, unit_quaternions
+from strapdown.checks import Array, InputError, array, covariance, non_negative, positive, unit_quaternions
 from strapdown.kernels import (
     augmented_chain,
     augmented_loop,
@@ -43,7 +43,7 @@ from strapdown.robustness import (
     seen_from,
     tilt_unknown,
 )
-from strapdown.vectors import KINDS, triad
+from strapdown.vectors import KINDS, need_level, need_unit, triad
 
 KIND_CODES = {
     "direction": filter_loop.DIRECTION,
@@ -73,13 +73,14 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         gate: Gate | None = None,
         robust: Robust | None = None,
     ) -> None:
-        state = modelling.begin(initial, tuple(blocks))
+        blocks = modelling.as_blocks(blocks)
+        state = modelling.begin(initial, blocks)
         size = 6 + len(state.values)
         super().__init__(dim_x=size, dim_z=2)
         self.process_noise = process_noise
         self.gate = gate
         self.robust = robust
-        self.blocks = tuple(blocks)
+        self.blocks = blocks
         self.kinds: dict[str, str] = {}
         self.attitude: Array = state.attitude.copy()
         self.bias: Array = state.bias.copy()
@@ -95,6 +96,8 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         self.nis = 0.0
         self.weight = 1.0
         self.refused: dict[str, int] = {}
+        self.skipped: dict[str, int] = {}
+        self.repeated = 0
         self.events: tuple[Event, ...] = ()
         # What the blocks of a challenger know, carried along.
         self._prior = filtering.restart_states(state, self.blocks)
@@ -107,9 +110,12 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         self._challenger: _Challenger | None = None
 
     def predict(self, delta_theta: ArrayLike, dt: float) -> None:
-        """Propagate over one gyro increment (3,), rad, of dt seconds."""
+        """Propagate over one gyro increment (3,), rad, of dt seconds; a repeated sample (of no length) is counted and changes nothing."""
         increment = array("delta_theta", delta_theta, (3,))
-        left = positive("dt", dt, unit="s")
+        left = non_negative("dt", dt, unit="s")
+        if left == 0.0:
+            self.repeated += 1
+            return
         model = self._model("")
         while left > 0.0:
             running = [self] if self._challenger is None else [self, self._challenger.filter]
@@ -216,30 +222,46 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
 
     def update_heading(self, vector_b: ArrayLike, reference_f: ArrayLike, sigma: float, sensor: str = "") -> bool:
         """Update with the heading of a measured vector's horizontal part: one degree of freedom, ``sigma`` rad."""
-        return self._update("heading", vector_b, reference_f, positive("sigma", sigma, unit="rad"), sensor)
+        return self._update("heading", vector_b, reference_f, sigma, sensor)
 
     def update_attitude(self, attitude: ArrayLike, sigma: ArrayLike, sensor: str = "") -> bool:
         """Update with a measured attitude q_fb (4,): three degrees of freedom."""
-        measured = unit_quaternions("attitude", array("attitude", attitude, (4,)))
+        given = array("attitude", attitude, (4,), allow_nan=True)
+        if np.isnan(given).any():
+            return self._skip(sensor)
+        measured = unit_quaternions("attitude", given)
         frame = (*measured, 0.0, 0.0, 0.0, 0.0, 0.0)
         return self._measure(
             _Measured(kind="attitude", z=(0.0, 0.0, 0.0), frame=frame, noise=_covariance(sigma), sensor=sensor)
         )
 
     def _update(self, kind: str, vector_b: ArrayLike, reference_f: ArrayLike, sigma: ArrayLike, sensor: str) -> bool:
-        z, r = array("vector_b", vector_b, (3,)), array("reference_f", reference_f, (3,))
+        z = array("vector_b", vector_b, (3,), allow_nan=True)
+        if np.isnan(z).any():
+            return self._skip(sensor)
+        if kind != "vector":
+            need_unit("vector_b", z)
+        r = array("reference_f", reference_f, (3,))
+        frame = triad(r)
+        if kind == "heading":
+            need_level("reference_f", frame[2])
+            positive("sigma", sigma, unit="rad")  # type: ignore[arg-type]
         length = float(np.linalg.norm(r)) if kind == "vector" else 1.0
         return self._measure(
             _Measured(
                 kind=kind,
                 z=tuple(z / length),
-                frame=tuple(triad(r).ravel()),
+                frame=tuple(frame.ravel()),
                 length=length,
                 noise=_covariance(sigma) / length**2,
                 sensor=sensor,
                 reference=r,
             )
         )
+
+    def _skip(self, sensor: str) -> bool:
+        self.skipped[sensor] = self.skipped.get(sensor, 0) + 1
+        return False
 
     def _measure(self, measured: _Measured) -> bool:
         sensor = measured.sensor
@@ -249,7 +271,9 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             )
         shown = self._shows(measured)
         accepted = self._correct(measured)
-        if shown and not accepted:
+        if not shown:
+            self._skip(sensor)
+        elif not accepted:
             self.refused[sensor] = self.refused.get(sensor, 0) + 1
         if self.gate is not None:
             self._oversee(measured, accepted)
@@ -493,6 +517,8 @@ def _covariance(sigma: ArrayLike) -> Array:
     """Return the covariance (3, 3) of a noise told by one sigma, one an axis, or itself."""
     if np.ndim(sigma) == 2:
         return covariance("sigma", array("sigma", sigma, (3, 3)), 3)
+    if np.shape(sigma) not in ((), (3,)):
+        raise InputError(f"sigma has shape {np.shape(sigma)}; give one number, one an axis (3,) or a covariance (3, 3)")
     return np.diag([positive("sigma", value) ** 2 for value in np.broadcast_to(sigma, 3)])
 
 

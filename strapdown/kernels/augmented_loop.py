@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from strapdown.kernels.algebra import combine, dot, scale
 from strapdown.kernels.augmented_chain import carry_chains_back, step_chains
 from strapdown.kernels.augmented_factor import covariances, take_row, triangularise, variances, whole_bias
@@ -18,7 +20,7 @@ from strapdown.kernels.augmented_step import (
     turn_rows,
     turning_matrix,
 )
-from strapdown.kernels.filter_loop import ATTITUDE, DIRECTION, vector_at
+from strapdown.kernels.filter_loop import ATTITUDE, DIRECTION, HEADING, vector_at
 from strapdown.kernels.robust_loop import six_at
 from strapdown.kernels.rotation import logarithm, quaternion_multiply, right_jacobian, rotation_matrix, turned, unit
 from strapdown.kernels.smoother_step import inverse_right_jacobian, moved
@@ -252,6 +254,8 @@ def run_augmented(
                     correction[i] += error / s2 * work[i]
                 innovation_out[e, 2 * r] = error
                 innovation_out[e, 2 * r + 1] = s2
+            if kind == HEADING and H[0, 0] == 0.0 and H[0, 1] == 0.0 and H[0, 2] == 0.0:
+                innovation_out[e, 0] = math.nan  # of a vertical vector, which shows none: skipped
             a = (correction[0], correction[1], correction[2])
             q = turned(q, a)
             if dot(a, a) > 1.0:

@@ -34,7 +34,7 @@ from strapdown.kernels.algebra import (
     transpose_times_vector,
 )
 from strapdown.kernels.filter_loop import ATTITUDE, DIRECTION, HEADING, MOST_TURN, heading_error
-from strapdown.kernels.filter_step import process_noise, transition
+from strapdown.kernels.filter_step import VERTICAL, process_noise, transition
 from strapdown.kernels.rotation import logarithm, quaternion_multiply, rotation_matrix, turned
 from strapdown.kernels.series import LARGEST_ANGLE, second, sinc
 from strapdown.kernels.smoother_step import moved
@@ -392,6 +392,9 @@ def fill_rows(q, R, x, kind, z, frame, length, s, sensors, sensor_use, W, H, y, 
         clean = matrix_times_vector(D, subtract(z, offset))
         p = subtract(matrix_times_vector(R, clean), carried)
         m = subtract(p, fixed)
+        if m[0] * m[0] + m[1] * m[1] <= VERTICAL:
+            y[0] = 0.0  # a vertical vector shows no heading: its row is zero
+            return 1
         y[0] = heading_error(IDENTITY, m, r)
         if coupled:
             # Derivatives where the heading is what is expected: those at the measured one go by its noise, which the offsets would follow.
