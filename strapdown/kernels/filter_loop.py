@@ -104,12 +104,21 @@ def merge_order(time, heads, ends, ordered, row, series):
 def common_order(time, number, ordered, row, series):
     """Write what :func:`merge_order` does for ``number`` series that share the times ``time``."""
     count = len(time)
+    if number == 2:  # the commonest; written out, the loop goes in machine vectors and takes a third of the time
+        for k in range(count):
+            now = time[k]
+            ordered[2 * k] = now
+            ordered[2 * k + 1] = now
+            row[2 * k] = k
+            row[2 * k + 1] = count + k
+            series[2 * k] = 0
+            series[2 * k + 1] = 1
+        return
     for s in range(number):
         e = s
-        first = s * count
         for k in range(count):
             ordered[e] = time[k]
-            row[e] = first + k
+            row[e] = s * count + k
             series[e] = s
             e += number
 
