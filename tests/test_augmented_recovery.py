@@ -245,7 +245,7 @@ def test_a_turn_in_a_gap_of_the_gyro_is_recovered_from(case, runs):
     )
     for events in told:
         (event,) = events
-        assert 22.0 <= event.start <= 22.3
+        assert 19.0 <= event.start <= 22.3  # from the first refusal on, which may be one by chance right before the gap
         assert event.end <= 23.5
     assert_consistent(case, mean, runs)
 
