@@ -21,7 +21,7 @@ from typing import Literal
 
 import numpy as np
 
-from strapdown import kinematics, quaternion
+from strapdown import quaternion
 from strapdown.checks import Array, InputError, count, finite, one_of, positive
 from strapdown.records import Event
 
@@ -253,8 +253,6 @@ _ONE_AXIS = 5.0
 """The least certain axis stands alone if its variance is so many times the sum of the others'."""
 _UNKNOWN_TILT = 4.0
 """rad²; with more variance of the tilt than this a heading tells nothing."""
-_OPPOSITE = -0.9
-"""Cosine; an axis seen so far from where it was says nothing of the shortest turn there."""
 
 Rows = tuple[Array, Array, Array, float, float]
 """Residual (d,), H (d, k) of the first k states, covariance (d, d); of a direction or vector the angle θ from the predicted one, rad, and
@@ -326,22 +324,18 @@ def linearise(
     covariance: Array,
     passes: int,
     threshold: float,
-    others: Array | None = None,
 ) -> Linearised:
     """Return a measurement seen from the state that its update leads to, by at most ``passes`` linearisations; one is the plain filter.
 
-    ``rows`` tells the measurement at an attitude; where ``others`` (n − 3,) are given, the bias and the optional states, at an attitude and
-    those. The method is that of :func:`strapdown.kernels.robust_step.take_in`, which tells its reasons.
+    ``rows`` tells the measurement at an attitude. The method is that of :func:`strapdown.kernels.robust_step.take_in`, which tells its
+    reasons.
     """
-    size, k = len(covariance), 3 if others is None else len(covariance)
-    first = quaternion.to_matrix(attitude)
-    start = np.empty(0) if others is None else others
-    now, now_others, P, prior = attitude, start, covariance, np.zeros(k)
+    now, P, prior = attitude, covariance, np.zeros(3)
     unknown = np.trace(covariance[:3, :3]) >= _UNKNOWN
     tolerance = _SETTLED if unknown else _RELINEARIZED
     done, trials = 1, 0
     while True:
-        residual, H, noise, angle, far = rows(now) if others is None else rows(now, now_others)
+        residual, H, noise, angle, far = rows(now)
         seen = Linearised(attitude=now, covariance=P, prior=prior, residual=residual, H=H, noise=noise, angle=angle)
         if passes == 1:
             return seen
@@ -350,40 +344,18 @@ def linearise(
         lower = lower / np.diag(lower)
         stretch = np.array([far, far, 1.0])[: len(residual)]
         from_afar = lower @ (stretch * np.linalg.solve(lower, residual)) - H @ prior
-        step = prior + P[:k, :k] @ H.T @ np.linalg.solve(seen.predicted + noise, from_afar)
-        on_rows = np.linalg.solve(lower, H[:, 6:] @ step[6:])
-        converged = bool(step[:3] @ step[:3] + on_rows @ on_rows < tolerance**2)
+        step = prior + P[:3, :3] @ H.T @ np.linalg.solve(seen.predicted + noise, from_afar)
+        converged = bool(step @ step < tolerance**2)
         if converged or done >= passes:
             seen = replace(seen, converged=converged)
             if seen.acceptable(threshold) or trials == 2 or not unknown:
                 return seen
             trials += 1
-            done, now, now_others, step = 0, attitude, start, np.zeros(k)
-            step[:3] = math.copysign(_TURN_ASIDE, trials - 1.5) * _least_certain(covariance)
-        now = quaternion.normalize(quaternion.multiply(now, quaternion.exp(step[:3])))
-        now_others = now_others + step[3:]
-        if others is None:
-            P, prior = seen_from(quaternion.multiply(quaternion.conjugate(attitude), now), covariance)
-        else:
-            turn = np.eye(size)
-            turn[:3, :3] = _carried(quaternion.to_matrix(now).T @ first, covariance)
-            P = turn @ covariance @ turn.T
-            back = _turn_back(quaternion.multiply(quaternion.conjugate(now), attitude), P)
-            prior = np.concatenate([back, start - now_others])
+            done, now = 0, attitude
+            step = math.copysign(_TURN_ASIDE, trials - 1.5) * _least_certain(covariance)
+        now = quaternion.normalize(quaternion.multiply(now, quaternion.exp(step)))
+        P, prior = seen_from(quaternion.multiply(quaternion.conjugate(attitude), now), covariance)
         done += 1
-
-
-def _carried(there: Array, covariance: Array) -> Array:
-    """Return the turn (3, 3) of a covariance (:func:`strapdown.kernels.robust_step.carried`)."""
-    A = covariance[:3, :3]
-    axis = _least_certain(covariance)
-    largest = float(axis @ A @ axis)
-    moved = there @ axis
-    cosine = float(axis @ moved)
-    if largest < _ONE_AXIS * (np.trace(A) - largest) or cosine < _OPPOSITE:
-        return there
-    v = kinematics.skew(np.cross(axis, moved))
-    return np.asarray(np.eye(3) + v + v @ v / (1.0 + cosine))
 
 
 def seen_from(q: Array, covariance: Array) -> tuple[Array, Array]:
@@ -421,16 +393,3 @@ def _least_certain(covariance: Array) -> Array:
         v = covariance[:3, :3] @ v
         v /= np.linalg.norm(v)
     return v
-
-
-def _turn_back(q: Array, covariance: Array) -> Array:
-    """Return a rotation as seen by a Gaussian: its rotation vector, or about and across the one axis that is far less certain."""
-    axis = _least_certain(covariance)
-    A = covariance[:3, :3]
-    largest = float(axis @ A @ axis)
-    if largest < _ONE_AXIS * (np.trace(A) - largest):
-        return quaternion.log(q)
-    turn = 2.0 * math.atan2(float(axis @ q[1:]), float(q[0]))
-    tilt = quaternion.log(quaternion.multiply(quaternion.exp(-turn * axis), q))
-    turn = (turn + math.pi) % (2.0 * math.pi) - math.pi
-    return np.asarray(turn * axis + tilt)
