@@ -195,28 +195,6 @@ def carried(M, A):
     return skew_polynomial(1.0, 1.0, 1.0 / (1.0 + cosine), cross(axis, there))
 
 
-def turn_back(q, A):
-    """Return the rotation vector of q as a Gaussian of attitude variance A has it.
-
-    Where one axis n is far less certain than the others, that is α n + ε of ``q = exp(α n) ⊗ exp(ε)``, ε across n: of a state known across
-    an axis and not about it the tilt ε keeps its distribution whatever the turn; the rotation vector's part across the axis does not.
-    """
-    axis = least_certain_axis(A)
-    largest = dot(axis, symmetric_times_vector(A, axis))
-    if largest < ONE_AXIS * (A[0] + A[3] + A[5] - largest):
-        return logarithm(q)
-    half = math.atan2(dot(axis, (q[1], q[2], q[3])), q[0])
-    c = math.cos(half)
-    s = -math.sin(half)
-    tilt = logarithm(quaternion_multiply((c, s * axis[0], s * axis[1], s * axis[2]), q))
-    turn = 2.0 * half
-    if turn > math.pi:
-        turn -= 2.0 * math.pi
-    if turn < -math.pi:
-        turn += 2.0 * math.pi
-    return combine(turn, axis, 1.0, tilt)
-
-
 def seen_from(q, A, B):
     """Return A and B of a prior at the attitude that lies the turn q from its mean, and where the mean lies seen from there (3,), rad.
 
