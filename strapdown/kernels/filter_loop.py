@@ -325,7 +325,7 @@ def run_filter(
     Returns the number of segments stored, and −1 and 0. Where the covariance would lose its digits, by a measurement of which the
     innovation has more than ``sharp`` times its own variance or bit by bit until :func:`least_share` is below ``least``, the run ends,
     ``state`` is left as it was when it had enough at last, at a row of the outputs, and that row and the number of events up to there are
-    returned: :func:`strapdown.kernels.factored_loop.run_factored` can go on from there.
+    returned: :func:`strapdown.mekf.factored.run_sharp` goes on from there.
     """
     if not least_share(state, work) >= least:
         return 0, 0, 0

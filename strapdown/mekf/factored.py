@@ -12,14 +12,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from strapdown.checks import Array
-from strapdown.kernels import factored_loop
+from strapdown.kernels import augmented_loop
+from strapdown.kernels.augmented_chain import LINKS
 from strapdown.kernels.machine import compiled
 from strapdown.mekf.scheduling import Schedule
-from strapdown.mekf.states import ProcessNoise, covariance_matrices
+from strapdown.mekf.states import ProcessNoise, covariance_blocks, covariance_matrices
 from strapdown.records import ImuRecord
 
 FIRST_STRETCH = 64
 """Intervals taken in factors before the covariance is looked at again; each further stretch is twice as long."""
+SHRUNK = 1.0 - 1e-14
+"""Correlations are told times this: rounding could make the covariance of one nearer to 1 indefinite."""
 HEALTHY = 1e-7
 """What must be left of each variance when the states after it are known, for the covariance to be carried as it is again."""
 
@@ -56,17 +59,30 @@ def run_sharp(
     """
     increments = np.ascontiguousarray(record.increments)
     last = len(increments) // every
-    motion, F = state[:7].copy(), np.zeros((12, 6))
+    attitude, bias, F = state[:4].copy(), state[4:7].copy(), np.zeros((12, 6))
     F[:6] = triangle(covariance_matrices(state[7:]))
-    empty = np.empty(0)
-    scratch = (
-        np.empty(6),
-        np.empty((3, 6)),
-        np.empty(6),
-        empty,
-        np.empty((0, 3)),
+    none, unused = np.empty(0), np.empty(0, np.int64)
+    number = len(events.sensors)
+    # No state but attitude and bias: nothing decays or enters the gyro, a sensor, or another state.
+    model = (
+        none,
+        none,
+        0,
+        np.inf,
         np.empty((0, 12)),
-        empty.astype(np.int64),
+        unused,
+        np.empty((number, 0, 15)),
+        np.empty((number, 0), np.int64),
+    )
+    work = (
+        np.empty((0, 3)),
+        none,
+        np.empty((3, 6)),
+        np.empty(3),
+        np.empty(3),
+        np.empty((3, 3)),
+        np.empty(6),
+        np.empty(12),
     )
     stretch = max(1, FIRST_STRETCH // every)
     while True:
@@ -74,37 +90,58 @@ def run_sharp(
         begin, end = row * every, len(increments) if to_row == last else to_row * every
         beyond = int(np.searchsorted(events.time, record.time[end], side="right"))
         mine = slice(event, beyond)
-        written = np.zeros((beyond - event, outputs.innovation.shape[1]))
-        compiled(factored_loop.run_factored)(
+        whole = np.empty((to_row - row + 1 if len(outputs.blocks) else 0, 6, 6))
+        written = np.zeros((beyond - event, 6))
+        compiled(augmented_loop.run_augmented)(
             record.time[begin : end + 1],
             increments[begin:end],
             process_noise.angle_random_walk**2,
             process_noise.rate_random_walk**2,
+            *model,
+            (0.0, 0.0, 0.0),
+            np.empty((0, 2)),
+            np.empty((0, LINKS)),
             events.time[mine],
             events.kind[mine],
             events.vector_b[mine],
             events.variance[mine],
+            np.empty((0, 6)),
+            np.ones(beyond - event),
+            events.sensor[mine],
             events.reference[mine],
+            np.empty((0, 9)),
             events.triads,
-            motion,
+            attitude,
+            bias,
             F,
-            scratch,
+            (*work, np.empty((6, 6))),
             every,
-            *outputs.after(row),
+            outputs.attitude[row:],
+            outputs.bias[row:],
+            outputs.variance[row:],
+            whole,
+            np.empty((0, 6)),
+            np.empty((0, 6, 6)),
             written,
+            np.empty((0, 32)),
         )
-        outputs.innovation[events.row[mine]] = written
+        if len(whole):
+            outputs.blocks[row : to_row + 1] = told(whole)
+        outputs.innovation[events.row[mine]] = written[:, : outputs.innovation.shape[1]]
         row, event = to_row, beyond
         stretch *= 2
         variance = np.sum(F[:6] ** 2, axis=0)
         left = np.diag(F) ** 2
         if end == len(increments) or np.all(left >= HEALTHY * variance):
             break
-    state[:7] = motion
-    blocks = np.empty((1, 21))
-    factored_loop.store_covariance(F, blocks, 0)
-    state[7:] = blocks[0]
+    state[:4], state[4:7] = attitude, bias
+    state[7:] = told(F[:6].T @ F[:6])
     return row, event
+
+
+def told(P: Array) -> Array:
+    """Return the blocks of covariances (..., 6, 6)."""
+    return covariance_blocks(np.where(np.eye(6, dtype=bool), P, SHRUNK * P))
 
 
 def triangle(P: Array) -> Array:

@@ -214,7 +214,12 @@ _COLUMNS = np.array([*_UPPER[1], *(3 + np.tile(range(3), 3)), *(3 + np.array(_UP
 
 def pack(attitude: Array, bias: Array, covariance: Array) -> Array:
     """Return a state as the kernels' 28 numbers: q, b, and P in blocks."""
-    return np.concatenate([attitude, bias, covariance[_ROWS, _COLUMNS]])
+    return np.concatenate([attitude, bias, covariance_blocks(covariance)])
+
+
+def covariance_blocks(covariance: Array) -> Array:
+    """Return the kernels' 21 numbers (..., 21) of whole matrices P (..., 6, 6)."""
+    return np.asarray(covariance[..., _ROWS, _COLUMNS])
 
 
 def covariance_matrices(blocks: Array) -> Array:
