@@ -6,8 +6,10 @@ conventions and version. CSV holds the gyro in one file, and each vector series 
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -190,14 +192,15 @@ _VECTOR_COLUMNS = ("time_s", "x_b", "y_b", "z_b", "sigma", "x_f", "y_f", "z_f")
 _ATTITUDE_COLUMNS = ("time_s", "q_w", "q_x", "q_y", "q_z", "sigma_x_rad", "sigma_y_rad", "sigma_z_rad")
 _ARRIVAL = "arrival_s"
 _MARK = "# strapdown"
+_COUNTED = " vector series"
 
 
 def export_csv(path: str | os.PathLike[str], record: ImuRecord) -> tuple[Path, ...]:
     """Write a record as CSV, 17 digits a number, and return the files.
 
     ``path`` holds one row an edge: its time, the increment of the interval that ends there (none in the first row), and the truth if there
-    is one. Each vector series goes to ``STEM-vectors-N.csv`` beside it. The first line of each is a comment that tells what it is; then
-    come the names of the columns, with their units.
+    is one. Each vector series goes to ``STEM-vectors-N.csv`` beside it. The first line of each is a comment that tells what it is, of the
+    record how many series belong to it; then come the names of the columns, with their units. The record is written last.
 
     Raises
     ------
@@ -214,29 +217,27 @@ def export_csv(path: str | os.PathLike[str], record: ImuRecord) -> tuple[Path, .
     if record.truth is not None:
         columns += [record.truth.attitude, record.truth.bias]
         names += _TRUTH_COLUMNS
+    table = np.concatenate(columns, axis=1)
+    comment = f"{_MARK} record, version {strapdown.__version__}, {len(record.vectors)}{_COUNTED}; {CONVENTIONS}"
     written = [target]
-    _write_csv(
-        target,
-        f"{_MARK} record, version {strapdown.__version__}; {CONVENTIONS}",
-        names,
-        np.concatenate(columns, axis=1),
-    )
     for number, series in enumerate(record.vectors):
         beside = target.with_name(f"{target.stem}-vectors-{number}.csv")
+        own: tuple[str, ...]
         if series.kind == "attitude" and series.attitude is not None and series.sigma_axes is not None:
-            names, columns = _ATTITUDE_COLUMNS, [series.time[:, None], series.attitude, series.sigma_axes]
+            own, columns = _ATTITUDE_COLUMNS, [series.time[:, None], series.attitude, series.sigma_axes]
         else:
-            names, columns = (
+            own, columns = (
                 _VECTOR_COLUMNS,
                 [series.time[:, None], series.vector_b, series.sigma[:, None], series.references_f],
             )
         if series.arrival is not None:
-            names, columns = (*names, _ARRIVAL), [*columns, series.arrival[:, None]]
+            own, columns = (*own, _ARRIVAL), [*columns, series.arrival[:, None]]
         head = json.dumps(
             {"sensor": series.sensor, "kind": series.kind, "constant_reference": series.reference_f.ndim == 1}
         )
-        _write_csv(beside, f"{_MARK} vectors {head}", names, np.concatenate(columns, axis=1))
+        _write_csv(beside, f"{_MARK} vectors {head}", own, np.concatenate(columns, axis=1))
         written.append(beside)
+    _write_csv(target, comment, names, table)
     return tuple(written)
 
 
@@ -272,10 +273,28 @@ def import_csv(path: str | os.PathLike[str]) -> ImuRecord:
             f"{target}, line {row + 4}: {names[column + 1]} is nan; leave the row out and give the next one the turn over both intervals"
         )
     truth = Truth(attitude=rows[:, 4:8], bias=rows[:, 8:11]) if len(names) > 4 else None
-    series: list[VectorMeasurements] = []
-    while (beside := target.with_name(f"{target.stem}-vectors-{len(series)}.csv")).is_file():
-        series.append(_import_series(beside))
-    return ImuRecord(time=rows[:, 0], increments=rows[1:, 1:4], vectors=tuple(series), truth=truth)
+    series = tuple(_import_series(beside) for beside in _series_beside(target, comment))
+    return ImuRecord(time=rows[:, 0], increments=rows[1:, 1:4], vectors=series, truth=truth)
+
+
+def _series_beside(target: Path, comment: str) -> list[Path]:
+    """Return the files of vector series of a record: as many as it says; of one that says nothing, all that are numbered in turn."""
+
+    def named(number: int) -> Path:
+        return target.with_name(f"{target.stem}-vectors-{number}.csv")
+
+    told = re.search(rf", (\d+){_COUNTED};", comment)
+    if told is None:
+        return [
+            named(number) for number in itertools.takewhile(lambda number: named(number).is_file(), itertools.count())
+        ]
+    files = [named(number) for number in range(int(told[1]))]
+    for file in files:
+        if not file.is_file():
+            raise InputError(
+                f"{file} does not exist, one of {told[1]} vector series of {target.name}; put it beside the record"
+            )
+    return files
 
 
 def _import_series(path: Path) -> VectorMeasurements:

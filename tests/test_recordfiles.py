@@ -99,6 +99,22 @@ def test_csv_reads_back_equal(made, tmp_path):
     assert_equal(dataclasses.replace(back, vectors=tuple(s for s in back.vectors if len(s.time))), kept)
 
 
+def test_csv_reads_as_many_series_as_the_record_has(made, tmp_path):
+    """Not what an earlier, larger record of the same name left behind, and not fewer."""
+    fewer = dataclasses.replace(made[1], vectors=made[1].vectors[:1])
+    export_csv(tmp_path / "record.csv", made[1])
+    written = export_csv(tmp_path / "record.csv", fewer)
+    assert_equal(import_csv(written[0]), fewer)
+    written[1].unlink()
+    with pytest.raises(InputError, match=r"record-vectors-0.csv does not exist, one of 1 vector series of record.csv"):
+        import_csv(written[0])
+    # A file that does not say has what is numbered in turn.
+    first, rest = written[0].read_text().split("\n", 1)
+    written[0].write_text("# strapdown record\n" + rest)
+    assert "1 vector series" in first
+    assert import_csv(written[0]).vectors == ()
+
+
 def test_what_csv_cannot_hold_is_refused_before_anything_is_written(made, tmp_path):
     *others, last = (series for series in made[1].vectors if series.kind == "direction")
     uneven = dataclasses.replace(last, sigma=np.zeros(len(last.time)), sigma_axes=np.array([1e-3, 2e-3, 3e-3]))
