@@ -16,9 +16,10 @@ from strapdown.kernels import tuning_loop
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.mekf import ProcessNoise
+from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Truth
 from strapdown.setup import FilterSetup
-from strapdown.tuning import fitting, innovations
+from strapdown.tuning import fitting, innovations, planning
 from strapdown.tuning.parameters import own_sigma
 from strapdown.vectors import VectorMeasurements
 
@@ -636,6 +637,28 @@ def test_the_first_measurements_show_where_it_starts():
 
 
 # ------------------------------------------------------------------------------------------------------ planning
+
+
+def test_a_record_made_again_misses_what_the_record_misses():
+    time = 0.1 * np.arange(11)
+    directions = np.tile([0.0, 0.6, 0.8], (11, 1))
+    attitudes = np.tile([1.0, 0.0, 0.0, 0.0], (11, 1))
+    directions[3], attitudes[7] = np.nan, np.nan
+    record = ImuRecord(
+        time=time,
+        increments=np.zeros((10, 3)),
+        vectors=(
+            VectorMeasurements(
+                sensor="star", kind="direction", time=time, vector_b=directions, reference_f=[0.0, 0.6, 0.8], sigma=0.1
+            ),
+            VectorMeasurements(
+                sensor="camera", kind="attitude", time=time, attitude=attitudes, sigma_axes=[0.1, 0.2, 0.3]
+            ),
+        ),
+    )
+    star, camera = planning.simulated_again(record, BELIEVED, generator(1, 0, "again")).vectors
+    assert np.flatnonzero(np.isnan(star.vector_b).any(axis=1)).tolist() == [3]
+    assert np.flatnonzero(np.isnan(camera.attitude).any(axis=1)).tolist() == [7]
 
 
 def test_a_plan_foretells_the_standard_errors():

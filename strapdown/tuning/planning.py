@@ -153,7 +153,9 @@ def simulated_again(record: ImuRecord, chosen: FilterSetup, draw: np.random.Gene
         if one.attitude is not None:
             assert one.sigma_axes is not None
             error = one.sigma_axes * draw.standard_normal((len(q), 3))
-            series.append(replace(one, attitude=quaternion.multiply(q, quaternion.exp(error))))
+            measured = quaternion.multiply(q, quaternion.exp(error))
+            measured[~np.isfinite(one.attitude).all(axis=1)] = np.nan
+            series.append(replace(one, attitude=measured))
             continue
         exact = quaternion.rotate(
             quaternion.conjugate(q), _level(one.references_f) if one.kind == "heading" else one.references_f
