@@ -93,7 +93,7 @@ def calm_turn(b, dt):
     return HALF_RANGE if total(dot(b, b)) * (dt * dt) < HALF_RANGE else -1.0
 
 
-def longest_step(theta, whole, b, room):
+def longest_step_of_lanes(theta, whole, b, room):
     """Return the longest step in an interval of increment ``theta`` and length ``whole`` that turns no lane too far.
 
     A turn beyond the range of the polynomials, in any lane, is cut into sub-steps of all: at constant rate they compose exactly. A lane
@@ -247,7 +247,7 @@ def run_parameters(
         dt = stop - now
         if dt > 0.0:
             if dot(theta, theta) > calm:
-                longest = longest_step(theta, whole, b, work)
+                longest = longest_step_of_lanes(theta, whole, b, work)
                 if dt > longest:
                     dt = longest
                     stop = now + dt

@@ -14,7 +14,7 @@ from strapdown.kernels.algebra import add, dot, scale, subtract
 from strapdown.kernels.filter_loop import ATTITUDE, VECTOR, vector_at
 from strapdown.kernels.filter_step import predict, reset, update_row
 from strapdown.kernels.lane_values import WIDTH, load, spread, store
-from strapdown.kernels.tuning_loop import calm_turn, load_state, longest_interval, longest_step, measured_rows
+from strapdown.kernels.tuning_loop import calm_turn, load_state, longest_interval, longest_step_of_lanes, measured_rows
 
 
 def row_at(rows, r):
@@ -148,7 +148,7 @@ def run_contaminated(
         dt = stop - now
         if dt > 0.0:
             if dot(theta, theta) > calm:
-                longest = longest_step(theta, whole, b, work)
+                longest = longest_step_of_lanes(theta, whole, b, work)
                 if dt > longest:
                     dt = longest
                     stop = now + dt
