@@ -374,6 +374,68 @@ def test_one_interval_or_many_at_constant_rate_are_the_same():
     assert np.abs((one.covariance[-1] - fine.covariance[-1]) / np.outer(d, d)).max() < 1e-11
 
 
+def test_many_series_are_one_series_of_as_many_references():
+    """300 stars, each a series of its own, and the same as one series: a byte would not number them."""
+    stars = np.random.default_rng(4).standard_normal((300, 3))
+    stars /= np.linalg.norm(stars, axis=1, keepdims=True)
+    time = 0.01 * np.arange(301)
+    body = motion.ConstantRate(rate=(0.3, -0.5, 0.4))
+    seen = quaternion.rotate(quaternion.conjugate(body.attitude(time[1:])), stars)
+    each = tuple(
+        VectorMeasurements(
+            sensor=f"star {k}", kind="direction", time=[time[k + 1]], vector_b=[seen[k]], reference_f=star, sigma=1e-3
+        )
+        for k, star in enumerate(stars)
+    )
+    whole = VectorMeasurements(
+        sensor="stars", kind="direction", time=time[1:], vector_b=seen, reference_f=stars, sigma=1e-3
+    )
+    noise = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)
+    start = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.1, bias_sigma=0.1)
+    ran = [
+        mekf.run(ImuRecord(time=time, increments=body.increments(time), vectors=some), noise, start)
+        for some in (each, (whole,))
+    ]
+    np.testing.assert_array_equal(ran[0].attitude, ran[1].attitude)
+    np.testing.assert_array_equal(ran[0].variance, ran[1].variance)
+
+
+@pytest.mark.parametrize("dip", [0.1, 1.17])
+def test_a_start_from_vertical_and_heading_knows_what_the_tilt_does_to_the_heading(dip):
+    """By tan(dip) times as much, of a coarse accelerometer beside a sharp magnetometer: eᵀP⁻¹e about each axis and all three."""
+    reference = np.array([0.0, np.cos(dip), -np.sin(dip)])
+    tilt_sigma, heading_sigma = 0.02, 0.002
+    whole, about_vertical = [], []
+    for seed in range(400):
+        draw = np.random.default_rng(seed)
+        q = quaternion.normalize(draw.standard_normal(4))
+        up = quaternion.rotate(quaternion.conjugate(q), [0.0, 0.0, 1.0]) + tilt_sigma * draw.standard_normal(3)
+        turned = quaternion.rotate(quaternion.exp([0.0, 0.0, heading_sigma * draw.standard_normal()]), reference)
+        series = [
+            VectorMeasurements(sensor=name, kind=kind, time=[0.0], vector_b=[z], reference_f=r, sigma=sigma)
+            for name, kind, z, r, sigma in (
+                ("up", "direction", up / np.linalg.norm(up), [0.0, 0.0, 1.0], tilt_sigma),
+                ("north", "heading", quaternion.rotate(quaternion.conjugate(q), turned), reference, heading_sigma),
+            )
+        ]
+        record = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=tuple(series))
+        state = mekf.first_state(record, ProcessNoise(angle_random_walk=1e-6, rate_random_walk=0.0), bias_sigma=1e-3)
+        P = state.covariance[:3, :3] / mekf.ONCE**2
+        e = quaternion.log(quaternion.multiply(quaternion.conjugate(state.attitude), q))
+        vertical = quaternion.to_matrix(state.attitude)[2]
+        whole.append(e @ np.linalg.solve(P, e) / 3.0)
+        about_vertical.append((e @ vertical) ** 2 / (vertical @ P @ vertical))
+    assert 0.85 < np.mean(whole) < 1.15  # 99 % of 1200 degrees of freedom: 0.90 to 1.11
+    assert 0.8 < np.mean(about_vertical) < 1.2  # of 400: 0.83 to 1.19
+    level = VectorMeasurements(
+        sensor="north", kind="heading", time=[0.0], vector_b=[[0.0, 0.0, 1.0]], reference_f=reference, sigma=0.01
+    )
+    up = replace(level, sensor="up", kind="direction", reference_f=np.array([0.0, 0.0, 1.0]))
+    blind = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=(up, level))
+    with pytest.raises(InputError, match="do not give the attitude"):
+        mekf.first_state(blind, ProcessNoise(angle_random_walk=1e-6, rate_random_walk=0.0), bias_sigma=1e-3)
+
+
 def test_missing_and_outside_measurements_are_counted():
     record = simulate(scenario(sensors=SENSORS[:1]), 1)
     series = record.vectors[0]

@@ -56,7 +56,9 @@ class Schedule:
     def order(self) -> tuple[Array, np.ndarray, np.ndarray]:
         """Of each event in order of time (events,): its time, its row where one sensor comes after the other, and its sensor."""
         number = int(self.bounds[-1])
-        time, row, sensor = side_by_side(((number,), float), ((number,), np.uint32), ((number,), np.uint8))
+        # A byte for the sensor where it will do: the loops read it with each event.
+        narrow = np.uint8 if len(self.sensors) <= 256 else np.uint32
+        time, row, sensor = side_by_side(((number,), float), ((number,), np.uint32), ((number,), narrow))
         first, *others = self.series_time or (np.empty(0),)
         if all(np.array_equal(first, other) for other in others):
             compiled(filter_loop.common_order)(first, len(self.sensors), time, row, sensor)

@@ -20,6 +20,7 @@ from strapdown.checks import (
     positive,
     unit_quaternions,
 )
+from strapdown.kernels.filter_step import heading_row
 from strapdown.records import ImuRecord
 from strapdown.robustness import Gate, GateMemory, Monitor, Robust
 
@@ -179,9 +180,18 @@ def _attitude_of_set(
     if len(body) == 1 and headings and abs(fixed[0][2]) > np.cos(VERTICAL):
         # Beside the vertical a heading is a direction: the horizontal part of its vector.
         seen, reference, sigma = headings[0]
-        body.append(seen - body[0] * (seen @ body[0]))
-        fixed.append(reference - fixed[0] * (reference @ fixed[0]))
-        sigmas.append(sigma)
+        level = seen - body[0] * (seen @ body[0])
+        horizontal = reference - fixed[0] * (reference @ fixed[0])
+        attitude = wahba.solve(
+            np.array([*body, level]), np.array([*fixed, horizontal]), np.array([*sigmas, sigma])
+        ).attitude
+        # A tilt turns the heading with it, by the tangent of the dip, and the heading says nothing of the tilt.
+        R = quaternion.to_matrix(attitude)
+        row = np.array(heading_row(tuple(R.ravel()), tuple(seen)))
+        if not row.any():
+            raise InputError("the vector that should give the heading is vertical")
+        tilt = np.eye(3) - np.outer(R[2], R[2])
+        return attitude, np.asarray(np.linalg.inv(tilt / sigmas[0] ** 2 + np.outer(row, row) / sigma**2))
     if len(body) < 2:
         raise InputError(
             f"two directions are needed, or the vertical and a heading, and it has {len(body)} of directions "
