@@ -469,7 +469,7 @@ def _refuse_undetermined(name: str, vectors: Array, sigma: Array) -> None:
         widest = int(np.argmax(np.minimum(angle, np.pi - angle)))
         uncertainty = "without bound" if least[index] == 0.0 else f"{1.0 / least[index]:.3g} rad"
         raise InputError(
-            f"{_place(name, *index)}: the attitude is not determined, its worst known turn has a 1σ of "
+            f"{_place(name, *index)}: the attitude is not determined, the 1σ of its worst known turn is "
             f"{uncertainty}; of all pairs, directions {i[widest]} and {j[widest]} are furthest from one line, "
             f"{angle[widest] / DEGREE:.6g}° "
             "apart; add a direction away from that line, or give smaller sigmas (rad) if the noise is smaller"
