@@ -1,20 +1,31 @@
 """Which attitude filter? Convergence and consistency of the family, from small and from large initial errors.
 
-One tumbling body, a MEMS gyro, and three cases:
+One tumbling body, a MEMS gyro, and four cases:
 
 - ``small``: two directions, the initial error 1° an axis, drawn from the filter's own prior;
 - ``large``: the same, the initial error 60° to 150° about any axis;
 - ``one direction``: as large, with one constant reference only. The turn about it can never be observed. The error shown is the angle
   between the true and the estimated reference in the body; the NEES tells whether a filter knows what it cannot know.
+- ``tracker``: as large, with a star tracker that gives whole attitudes, ten times as coarse about its boresight as across it.
 
 All filters run on the same records and start from the same states. Run it:
-``python sims/filter_family.py --out filter-family-results`` (some minutes, nearly all of them the unscented filter's).
+``python sims/filter_family.py --out filter-family-results`` (some minutes, nearly all of them the unscented filter's). It prints a table
+and what the numbers say of each case, and writes both with the figure and ``filter_family.json``.
+
+Why they differ. While errors are small all Kalman filters carry the same Gaussian in other coordinates, and only the fixed gains of
+Mahony's filter cost accuracy: one number a sensor, which cannot weigh a tracker's axes either. From a large error, what the first direction
+hides is a turn about an axis that is fixed in the fixed frame; seen in body axes that axis moves by the correction. The invariant filters
+carry their covariance the whole way with it, the MEKF's reset half the way, the geometric filter not at all: in that order what they
+believe of the hidden turn is wrong, and slow to be unlearnt. Fixed gains never become too sure. Of the Kalman filters the unscented one is
+the quickest where one measurement tells all that can be known, and the slowest where two must agree on it. A start this poor wants another
+tool than any of them: ``wahba`` where the first measurements give the attitude, ``bank`` where not.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,15 +34,16 @@ import numpy as np
 
 from strapdown import consistency, family, mekf, plots, quaternion
 from strapdown.checks import Array
+from strapdown.files import write_json
 from strapdown.gyro import GyroSpec
 from strapdown.mekf import ProcessNoise
 from strapdown.motion import Harmonic, HarmonicRates
 from strapdown.randomness import generator
 from strapdown.scenarios import Scenario, simulate
 from strapdown.units import DEGREE, DEGREE_PER_HOUR, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
-from strapdown.vectors import VectorSensor
+from strapdown.vectors import AttitudeSensor, Sensor, VectorSensor
 
-CASES = ("small", "large", "one direction")
+CASES = ("small", "large", "one direction", "tracker")
 CONVERGED = 3.0 * DEGREE
 """An attitude error below which a run counts as converged, rad."""
 
@@ -99,6 +111,28 @@ class Outcome:
         return np.asarray(self.nees.mean(axis=0))
 
     @property
+    def anees_at_first(self) -> float:
+        """Mean NEES ten seconds after the start, when what the first corrections left behind still shows."""
+        return float(self.anees[min(int(np.searchsorted(self.time, 10.0)), len(self.time) - 1)])
+
+    def summary(self) -> dict[str, Any]:
+        """Return the numbers as plain values for JSON; what never happens is None."""
+        low, high = consistency.mean_bounds(6, self.runs)
+        within = self.convergence_time
+        return {
+            "case": self.case,
+            "filter": self.filter,
+            "runs": self.runs,
+            "converged": self.converged,
+            "convergence_time_s": within if np.isfinite(within) else None,
+            "final_rms_deg": self.final_rms / DEGREE,
+            "anees_at_10_s": self.anees_at_first,
+            "anees_at_end": float(self.anees[-1]),
+            "anees_bounds": [low, high],
+            "consistent": self.consistent,
+        }
+
+    @property
     def consistent(self) -> bool:
         """Whether the ANEES lies within its two-sided 99 % bounds at five epochs of the second half together."""
         epochs = np.linspace(len(self.time) // 2, len(self.time) - 1, 5).astype(int)
@@ -121,6 +155,8 @@ def scenario(case: str, duration: float) -> Scenario:
     """Return the body, the gyro and the sensors of one case."""
     sun = VectorSensor(name="sun", reference_f=SUN, sigma=1.0 * DEGREE, rate=1.0)
     field = VectorSensor(name="field", reference_f=FIELD, sigma=2.0 * DEGREE, rate=1.0, phase=0.45)
+    tracker = AttitudeSensor(name="tracker", sigma_across=0.2 * DEGREE, sigma_about=2.0 * DEGREE, rate=0.5)
+    alone: dict[str, tuple[Sensor, ...]] = {"one direction": (sun,), "tracker": (tracker,)}
     return Scenario(
         motion=HarmonicRates(
             mean=(1.0 * DEGREE, -2.0 * DEGREE, 3.0 * DEGREE),
@@ -129,7 +165,7 @@ def scenario(case: str, duration: float) -> Scenario:
         gyro=GyroSpec(
             angle_random_walk=0.3 * DEGREE_PER_ROOT_HOUR, rate_random_walk=20.0 * DEGREE_PER_HOUR_PER_ROOT_HOUR
         ),
-        sensors=(sun,) if case == "one direction" else (sun, field),
+        sensors=alone.get(case, (sun, field)),
         rate=5.0,
         duration=duration,
     )
@@ -191,11 +227,12 @@ def _pointing_error(attitude: Array, truth: Array) -> Array:
 def draw(outcomes: Sequence[Outcome], path: Path) -> Path:
     """Draw error and ANEES over time, one column a case, and write the figure."""
     cases = list(dict.fromkeys(o.case for o in outcomes))
-    figure, grid = plots.new_figure(2, len(cases), size=(4.3 * len(cases), 6.6), squeeze=False, sharex=True)
+    figure, grid = plots.new_figure(2, len(cases), size=(4.0 * len(cases), 6.6), squeeze=False, sharex=True)
     titles = {
         "small": "start 1° an axis off",
         "large": "start 60° to 150° off",
         "one direction": "60° to 150°, one direction only",
+        "tracker": "60° to 150°, star tracker",
     }
     for column, case in enumerate(cases):
         top, bottom = grid[:, column]
@@ -213,6 +250,13 @@ def draw(outcomes: Sequence[Outcome], path: Path) -> Path:
         top.axhline(CONVERGED / DEGREE, color="0.5", linewidth=0.8, linestyle=":")
         bottom.plot([], [], color="0.5", linewidth=0.8, linestyle=":", label=f"{CONVERGED / DEGREE:g}°: converged")
         top.set(yscale="log", title=titles[case])
+        least, greatest = top.get_ylim()
+        steps = (1.0, 2.0, 5.0) if greatest < 100.0 * least else (1.0,)
+        ticks = [
+            step * 10.0**decade for decade in range(-4, 4) for step in steps if least < step * 10.0**decade < greatest
+        ]
+        top.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+        top.tick_params(axis="y", which="minor", labelleft=False)
         bottom.set(yscale="linear" if case == "small" else "log", xlabel="time, s")
     grid[0, 0].set_ylabel("attitude error, 90th percentile, °")
     grid[1, 0].set_ylabel("ANEES / 6")
@@ -228,13 +272,56 @@ def table(result: Result) -> str:
     ]
     for o in result.outcomes:
         within = f"{o.convergence_time:.0f}" if np.isfinite(o.convergence_time) else "never"
-        early = int(np.searchsorted(o.time, 10.0))
         lines.append(
             f"{o.case:14s} {o.filter:16s} {o.runs:5d} {100.0 * o.converged:7.0f} % {within:>7s} "
-            f"{o.final_rms / DEGREE:12.3f} {o.anees[early]:15.3g} {o.anees[-1]:10.3g}  "
+            f"{o.final_rms / DEGREE:12.3f} {o.anees_at_first:15.3g} {o.anees[-1]:10.3g}  "
             f"{'inside' if o.consistent else 'outside'}"
         )
     return "\n".join(lines)
+
+
+def findings(result: Result) -> list[str]:
+    """Return what the numbers say of each case, of the runs that all filters have."""
+    lines = []
+    for case in dict.fromkeys(o.case for o in result.outcomes):
+        whole = [o for o in result.outcomes if o.case == case]
+        common = min(o.runs for o in whole)
+        mine = [dataclasses.replace(o, error=o.error[:common], nees=o.nees[:common]) for o in whole]
+        quick = [o for o in mine if np.isfinite(o.convergence_time)]
+        parts = [f"most accurate at the end: {_least(mine, lambda o: o.final_rms, lambda x: f'{x / DEGREE:.2f}°')}"]
+        if case != "small" and quick:
+            parts.insert(0, f"quickest to {CONVERGED / DEGREE:g}°: {_least(quick, _settling, lambda x: f'{x:.0f} s')}")
+        never = [o.filter for o in mine if o.converged < 0.9]
+        if never:
+            parts.append(f"not there in nine runs of ten: {', '.join(never)}")
+        right = [o.filter for o in whole if o.consistent]
+        said = "all" if len(right) == len(whole) else ", ".join(right) or "none"
+        parts.append(f"to be believed (ANEES inside its bounds in the second half): {said}")
+        wrong = sorted((o for o in whole if not o.consistent), key=_misjudged)
+        if wrong:
+            others = ", ".join(f"{o.filter} {_late_anees(o):.3g}" for o in wrong)
+            parts.append(f"the others by their mean ANEES/6 there: {others}")
+        lines.append(f"{case} ({common} {'run' if common == 1 else 'runs'}): {'; '.join(parts)}.")
+    return lines
+
+
+def _settling(outcome: Outcome) -> float:
+    return outcome.convergence_time
+
+
+def _late_anees(outcome: Outcome) -> float:
+    return float(np.mean(outcome.anees[len(outcome.time) // 2 :]))
+
+
+def _misjudged(outcome: Outcome) -> float:
+    """Return how far the mean ANEES of the second half is from one, either way."""
+    return float(abs(np.log(_late_anees(outcome))))
+
+
+def _least(outcomes: Sequence[Outcome], value: Callable[[Outcome], float], said: Callable[[float], str]) -> str:
+    """Return the filters of the least value, and those within five per cent of it."""
+    least = min(value(o) for o in outcomes)
+    return f"{', '.join(o.filter for o in outcomes if value(o) <= 1.05 * least)} ({said(least)})"
 
 
 def main(
@@ -247,7 +334,7 @@ def main(
     seed: int = 1,
     out: Path | None = None,
 ) -> Result:
-    """Compare the filters; ``duration`` in s. The figure and the table are written to ``out`` if it is given."""
+    """Compare the filters; ``duration`` in s. Figure, table, findings and JSON are written to ``out`` if it is given."""
     outcomes = tuple(
         outcome
         for case in cases
@@ -260,7 +347,17 @@ def main(
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     result = Result(outcomes=outcomes, figures=(draw(outcomes, out / "filter_family.png"),))
-    (out / "filter_family.txt").write_text(table(result) + "\n", encoding="utf-8")
+    (out / "filter_family.txt").write_text("\n".join([table(result), "", *findings(result)]) + "\n", encoding="utf-8")
+    write_json(
+        out / "filter_family.json",
+        {
+            "seed": seed,
+            "duration_s": duration,
+            "converged_deg": CONVERGED / DEGREE,
+            "outcomes": [outcome.summary() for outcome in outcomes],
+            "findings": findings(result),
+        },
+    )
     return result
 
 
@@ -270,4 +367,5 @@ if __name__ == "__main__":
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--unscented-runs", type=int, default=40)
     parser.add_argument("--seed", type=int, default=1)
-    print(table(main(**vars(parser.parse_args()))))
+    told = main(**vars(parser.parse_args()))
+    print("\n".join([table(told), "", *findings(told)]))

@@ -1,8 +1,8 @@
 """The family of attitude filters on one interface.
 
-They can be compared in one line::
+They can be compared in one line, which prints a table::
 
-    {name: family.run(name, record, process_noise, initial) for name in family.FILTERS}
+    print(family.compare(record, process_noise, initial))
 
 All of them estimate attitude and gyro bias from the same record, by the same schedule of measurements, with the same belief of the gyro,
 and report their covariance in the body-side convention of the package, (δθ, δb). They differ in how they define the error:
@@ -15,20 +15,29 @@ and report their covariance in the body-side convention of the package, (δθ, �
 - ``usque``: unscented, generalised Rodrigues parameters (Crassidis & Markley 2003);
 - ``mahony``: complementary, fixed gains (Mahony, Hamel & Pflimlin 2008).
 
-Modules: ``stepping`` the schedule of steps, ``extended`` the Kalman filters, ``unscented``, ``complementary``.
+Every filter takes directions, vectors, headings and attitudes with every form of noise (:mod:`strapdown.vectors`). Mahony's gains are
+one number a sensor, whatever the shape of its noise; the covariance that it reports is that of those gains under that noise.
+
+They run over whole records only. A comparison needs no other face: what is fed sample by sample in a product is the MEKF
+(:class:`strapdown.mekf.StepFilter`: late measurements, gates, sensors declared beforehand), and seven copies of that would be seven to
+keep equal. Who wants to look inside one step finds it as plain functions on tuples in :mod:`strapdown.kernels.family_step`.
+
+Modules: ``stepping`` the schedule of steps, ``extended`` the Kalman filters, ``unscented``, ``complementary``, ``comparison`` the table.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Protocol
 
 from strapdown import mekf
-from strapdown.checks import one_of
-from strapdown.family import complementary, extended, unscented
+from strapdown.checks import InputError, one_of
+from strapdown.family import complementary, extended, stepping, unscented
+from strapdown.family.comparison import Comparison
 from strapdown.mekf import ProcessNoise, State
-from strapdown.records import Estimate, ImuRecord
+from strapdown.records import Estimate, ImuRecord, Truth
 
-__all__ = ["FILTERS", "Filter", "run"]
+__all__ = ["FILTERS", "Comparison", "Filter", "compare", "run"]
 
 
 class Filter(Protocol):
@@ -74,7 +83,7 @@ def run(
     name : str
         One of :data:`FILTERS`.
     record : ImuRecord
-        Measurements are directions, vectors or headings (``mekf`` takes what it takes); of ``mahony`` with one constant reference a series.
+        With measurements of any kind and noise.
     process_noise : ProcessNoise
     initial : State
         State at the first edge, body side.
@@ -86,7 +95,42 @@ def run(
     Raises
     ------
     InputError
-        If the name is not known, or the record holds what the filter does not take.
+        If the name is not known, or an argument is not what it should be.
     """
     one_of("filter", name, FILTERS)
+    stepping.check(record, process_noise, initial)
     return FILTERS[name](record, process_noise, initial, every=every, full_covariance=full_covariance)
+
+
+def compare(
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    initial: State,
+    *,
+    filters: Iterable[str] = tuple(FILTERS),
+    every: int = 1,
+    full_covariance: bool = False,
+) -> Comparison:
+    """Run several filters of the family over one record; printed, the result is a table.
+
+    One record tells how filters differ on it, not which of them may be believed: for that :func:`strapdown.consistency.judge` an estimate,
+    or look at many runs (``sims/filter_family.py``).
+
+    Parameters
+    ----------
+    record, process_noise, initial, every, full_covariance
+        As :func:`run`. Of a record with truth the errors are told, of others the differences from the first filter.
+    filters : iterable of str
+        Default: all. The unscented filter takes some tenths of a millisecond a step, the others a microsecond.
+    """
+    names = [filters] if isinstance(filters, str) else list(filters)
+    if not names:
+        raise InputError(f"filters is empty; name at least one of {', '.join(FILTERS)}")
+    for name in names:
+        one_of("filter", name, FILTERS)
+    estimates = {
+        name: run(name, record, process_noise, initial, every=every, full_covariance=full_covariance) for name in names
+    }
+    truth = record.truth
+    kept = None if truth is None else Truth(attitude=truth.attitude[::every], bias=truth.bias[::every])
+    return Comparison(estimates=estimates, truth=kept)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from strapdown import mekf
-from strapdown.checks import Array, InputError, array
+from strapdown.checks import Array, array, instance
 from strapdown.family import stepping
 from strapdown.kernels import family_complementary
 from strapdown.kernels.machine import compiled
@@ -93,13 +93,10 @@ def run(
     gains : Gains, optional
         Default: :func:`steady_gains`.
     """
-    for series in record.vectors:
-        if series.reference_f.ndim > 1:  # the gains are one a reference
-            raise InputError(
-                f"{series.sensor}: reference_f has shape {series.reference_f.shape}; this filter takes one reference (3,) a series; "
-                "use mekf.run"
-            )
+    stepping.check(record, process_noise, initial)
     events, steps = stepping.events_and_steps(record, every)
+    if gains is not None:
+        instance("gains", gains, Gains, "give complementary.Gains(attitude=…, bias=…), or None")
     chosen = _steady_gains(record, events, process_noise, initial) if gains is None else gains
     sensors = len(events.sensors)
     states, innovation = np.empty((len(steps.time), 28)), np.empty((len(events.time), 6))
@@ -112,8 +109,9 @@ def run(
         process_noise.rate_random_walk**2,
         events.kind,
         events.vector_b,
-        events.variance,
+        events.body_noise,
         events.reference,
+        events.sensor,
         events.triads,
         array("gains.attitude", chosen.attitude, (sensors,)),
         array("gains.bias", chosen.bias, (sensors,)),

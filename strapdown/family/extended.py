@@ -19,8 +19,8 @@ alone, η = δb − [b] δθ; that is its G in (δθ, δb).
 
 All stay finite from any start, however far off and however wrong its covariance, and P positive definite to rounding: turns and
 corrections of any size go through closed forms (:mod:`strapdown.kernels.family_turns`), a row of a measurement is taken in by Joseph's
-form, and a heading whose vector is estimated to be vertical is passed over. The geometric filter needs one bound more, which the paper
-does not have: its bias grows across corrections beyond 1.8955 rad, so a longer one is shortened to that
+form, and a heading whose vector is estimated to be vertical is skipped and counted. The geometric filter needs one bound more, which the
+paper does not have: its bias grows across corrections beyond 1.8955 rad, so a longer one is shortened to that
 (:data:`strapdown.kernels.family_step.LARGEST_CORRECTION`).
 """
 
@@ -70,6 +70,7 @@ def geometric(
 def _run(
     variant: int, record: ImuRecord, process_noise: ProcessNoise, initial: State, every: int, full_covariance: bool
 ) -> Estimate:
+    stepping.check(record, process_noise, initial)
     events, steps = stepping.events_and_steps(record, every)
     states, innovation = np.empty((len(steps.time), 28)), np.empty((len(events.time), 6))
     compiled(family_loop.run_extended)(
@@ -82,7 +83,7 @@ def _run(
         process_noise.rate_random_walk**2,
         events.kind,
         events.vector_b,
-        events.variance,
+        events.body_noise,
         events.reference,
         events.triads,
         mekf.pack(initial.attitude, initial.bias, initial.covariance),

@@ -11,15 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from strapdown import mekf
-from strapdown.checks import Array, InputError, count
+from strapdown.checks import Array, count, instance
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.mekf import Schedule
+from strapdown.mekf.states import check_arguments
 from strapdown.records import Estimate, Event, ImuRecord
-
-_UPPER = np.triu_indices(3)
-
-MEASUREMENTS = ("direction", "vector", "heading")
-"""Kinds of measurement that every filter of the family takes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,40 +36,38 @@ class Steps:
     """Gaps of the gyro."""
 
 
+def check(record: object, process_noise: object, initial: object) -> None:
+    """Refuse what a filter is given in place of the objects that it wants."""
+    instance("record", record, ImuRecord, "make it by records.ImuRecord, or read one by recordfiles.read_record")
+    check_arguments(process_noise, initial)
+
+
 def events_and_steps(record: ImuRecord, every: int) -> tuple[Schedule, Steps]:
     """Return the measurements of a record in their order, and the steps that take a filter through it.
 
     Parameters
     ----------
     record : ImuRecord
-        Measurements of the kinds :data:`MEASUREMENTS`.
+        Measurements of any kind and noise.
     every : int
         Keep the state at every ``every``-th edge, the first included.
     """
     count("every", every)
-    for series in record.vectors:
-        if series.kind not in MEASUREMENTS:
-            raise InputError(
-                f"{series.sensor}: the family's filters take {', '.join(MEASUREMENTS)}, not {series.kind!r}; use mekf.run"
-            )
-        if series.anisotropic:
-            raise InputError(
-                f"{series.sensor}: the family's filters take one sigma a sample, not sigma_axes or covariance; give sigma alone, or use "
-                "mekf.run"
-            )
     edges = record.time
-    events = mekf.schedule(record.vectors, edges[0], edges[-1])
-    time = np.concatenate([events.time, edges])
-    is_edge = np.repeat([0, 1], [len(events.time), len(edges)])
-    order = np.lexsort((is_edge, time))  # at one time the events come first
-    index = np.concatenate([np.arange(len(events.time)), np.arange(len(edges))])[order]
-    is_edge = is_edge[order].astype(bool)
-    time = time[order]
+    events = mekf.schedule(record.vectors, edges[0], edges[-1], anisotropic=True)
+    # Both are in order already; at one time the events come first.
+    at_event = np.arange(len(events.time)) + np.searchsorted(edges, events.time, side="left")
+    at_edge = np.arange(len(edges)) + np.searchsorted(events.time, edges, side="right")
+    time = np.empty(len(at_event) + len(at_edge))
+    time[at_event], time[at_edge] = events.time, edges
+    event, row = np.full(len(time), -1), np.full(len(time), -1)
+    event[at_event] = np.arange(len(at_event))
+    row[at_edge[::every]] = np.arange(len(at_edge[::every]))
+    interval = np.empty(len(time), np.int64)
+    interval[at_event] = np.maximum(at_event - np.arange(len(at_event)) - 1, 0)
+    interval[at_edge] = np.maximum(np.arange(len(edges)) - 1, 0)
     dt = np.diff(time, prepend=edges[0])
-    interval = np.clip(np.searchsorted(edges, time, side="left") - 1, 0, None)
     increment = record.increments[interval] * (dt / np.diff(edges)[interval])[:, None]
-    event = np.where(is_edge, -1, index)
-    row = np.where(is_edge & (index % every == 0), index // every, -1)
     # Parts of a large turn end in steps that neither take in nor keep anything; the last part does.
     parts = (np.linalg.norm(increment, axis=1) / LARGEST_ANGLE).astype(np.int64) + 1
     whole = np.repeat(np.arange(len(dt)), parts)
@@ -92,13 +86,14 @@ def events_and_steps(record: ImuRecord, every: int) -> tuple[Schedule, Steps]:
 def estimate(events: Schedule, steps: Steps, states: Array, innovation: Array, full_covariance: bool) -> Estimate:
     """Return the estimate of packed states (m, 28), body side, and innovations (events, 6): e₁, s₁, e₂, s₂, e₃, s₃."""
     covariance = mekf.covariance_matrices(states[:, 7:])
+    innovations = mekf.innovations_by_sensor(events, innovation)
     return Estimate(
         time=steps.time,
         attitude=states[:, :4],
         bias=states[:, 4:7],
         variance=np.diagonal(covariance, axis1=1, axis2=2).copy(),
         covariance=covariance if full_covariance else None,
-        innovations=mekf.innovations_by_sensor(events, innovation),
-        skipped=events.skipped,
+        innovations=innovations,
+        skipped=mekf.skipped_too(events, innovations),
         events=steps.gaps,
     )

@@ -3,7 +3,9 @@
 The attitude error of each sigma point is three generalised Rodrigues parameters p about the central quaternion, body side,
 ``q_true = q ⊗ δq(p)``, scaled so that p is the rotation vector for small errors. Two points are not the paper's: the process noise is the
 exact one of :mod:`strapdown.mekf`, added after the propagation, where the paper adds half of a trapezoid before and half after; and a
-direction enters with all three components and noise σ² I (Shuster's trick), its innovation told as its two degrees of freedom.
+direction enters with all three components (Shuster's trick: along the direction goes the mean of the two variances across it), its
+innovation told as its two degrees of freedom. A measured attitude enters as its own three parameters about the central quaternion, linear
+in the state: no spread of the points, however wide, cuts it at half a turn.
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ from strapdown import mekf, quaternion
 from strapdown.checks import Array, InputError
 from strapdown.family import stepping
 from strapdown.kernels.family_turns import process_noise_over_any_turn
-from strapdown.kernels.filter_loop import HEADING, VECTOR, heading_error
+from strapdown.kernels.filter_loop import ATTITUDE, DIRECTION, HEADING, heading_error
+from strapdown.kernels.filter_step import shows_heading
 from strapdown.kernels.rotation import quaternion_multiply
 from strapdown.mekf import ProcessNoise, Schedule, State
 from strapdown.records import Estimate, ImuRecord
@@ -26,6 +29,8 @@ from strapdown.records import Estimate, ImuRecord
 _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
 _A = 1.0
 _F = 2.0 * (_A + 1.0)
+_WHOLE = [0, 1, 2, 1, 3, 4, 2, 4, 5]
+"""Places of a whole symmetric matrix in its upper triangle."""
 
 
 def rodrigues_to_quaternion(p: ArrayLike) -> Array:
@@ -52,7 +57,7 @@ def run(
     full_covariance: bool = False,
     points: Any = None,
 ) -> Estimate:
-    """Run the filter over a whole record, in NumPy: about 0.2 ms a step.
+    """Run the filter over a whole record, in NumPy: some tenths of a millisecond a step.
 
     Parameters
     ----------
@@ -63,17 +68,22 @@ def run(
         weights positive.
     """
     points = JulierSigmaPoints(6, kappa=1.0) if points is None else points
-    if points.n != 6:
-        raise InputError(f"points are of {points.n} states; USQUE has 6 (three of attitude, three of bias)")
+    if getattr(points, "n", None) != 6:
+        what = f"are of {points.n} states" if hasattr(points, "n") else f"is {points!r}"
+        raise InputError(
+            f"points {what}; give filterpy's sigma points of 6 states, three of attitude and three of bias"
+        )
+    stepping.check(record, process_noise, initial)
     events, steps = stepping.events_and_steps(record, every)
     q, b, P = initial.attitude, initial.bias, initial.covariance
     states, innovation = np.empty((len(steps.time), 28)), np.zeros((len(events.time), 6))
+    noise = events.body_noise[:, _WHOLE].reshape(-1, 3, 3)
     rows = zip(steps.dt, steps.increment, steps.event, steps.row, strict=True)
     for dt, increment, event, row in rows:
         if dt > 0.0:
             q, b, P = _predict(points, q, b, P, increment, dt, process_noise)
         if event >= 0:
-            q, b, P, innovation[event] = _update(points, q, b, P, events, event)
+            q, b, P, innovation[event] = _update(points, q, b, P, events, event, noise[event])
         if row >= 0:
             states[row] = mekf.pack(q, b, P)
     return stepping.estimate(events, steps, states, innovation, full_covariance)
@@ -115,23 +125,39 @@ def _moved(q: Array, mean: Array) -> Array:
 
 
 def _update(
-    points: Any, q: Array, b: Array, P: Array, events: Schedule, event: int
+    points: Any, q: Array, b: Array, P: Array, events: Schedule, event: int, noise: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Take in one measurement; return the innovations too, made independent, with their variances."""
+    """Take in one measurement of covariance ``noise`` (3, 3), body axes; return the innovations too, made independent, and their variances.
+
+    A heading that the central quaternion does not show is passed over, and its innovation is NaN.
+    """
+    kind, z = events.kind[event], events.vector_b[event]
+    frame = events.triads[events.reference[event]]
+    triad = frame.reshape(3, 3)
+    record = np.zeros(6)
+    record[1::2] = 1.0
+    if kind == HEADING and not shows_heading(quaternion.to_matrix(q).ravel(), z):
+        record[0] = np.nan
+        return q, b, P, record
     sigma, attitudes = _spread(points, q, b, P)
-    kind, z, variance = events.kind[event], events.vector_b[event], events.variance[event]
-    triad = events.triads[events.reference[event]].reshape(3, 3)
     if kind == HEADING:
         residuals = np.array([heading_error(R.ravel(), z, triad[2]) for R in quaternion.to_matrix(attitudes)])[:, None]
         # Angles near the central one, so that the cut at π parts no two points of one cloud by a whole turn.
         residuals = residuals[0] + (residuals - residuals[0] + np.pi) % (2.0 * np.pi) - np.pi
-        degrees = 1
+        degrees, noise = 1, noise[:1, :1]
+    elif kind == ATTITUDE:
+        residuals = quaternion_to_rodrigues(_product(q * _CONJUGATE, frame[:4])) - sigma[:, :3]
+        degrees = 3
     else:
         # Components along the predicted triad: the first two are across the direction, the third is along it.
         basis = quaternion.rotate(quaternion.conjugate(q), triad)
         residuals = (z - quaternion.rotate(quaternion.conjugate(attitudes), triad[2])) @ basis.T
-        degrees = 3 if kind == VECTOR else 2
-    mean, S = unscented_transform(residuals, points.Wm, points.Wc, variance * np.eye(residuals.shape[1]))
+        degrees, noise = 3, basis @ noise @ basis.T
+        if kind == DIRECTION:
+            degrees = 2
+            noise[2, :2] = noise[:2, 2] = 0.0
+            noise[2, 2] = 0.5 * (noise[0, 0] + noise[1, 1])
+    mean, S = unscented_transform(residuals, points.Wm, points.Wc, noise)
     prior = np.concatenate([np.zeros(3), b])
     cross = -(points.Wc[:, None] * (sigma - prior)).T @ (residuals - mean)
     gain = np.linalg.solve(S, cross.T).T
@@ -140,7 +166,5 @@ def _update(
     factor = np.linalg.cholesky(S)
     pivots = np.diag(factor)
     independent = pivots * np.linalg.solve(factor, mean)
-    record = np.zeros(6)
-    record[1::2] = 1.0
     record[0 : 2 * degrees : 2], record[1 : 2 * degrees : 2] = independent[:degrees], pivots[:degrees] ** 2
     return _moved(q, state), state[3:], 0.5 * (covariance + covariance.T), record

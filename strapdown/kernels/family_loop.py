@@ -6,7 +6,10 @@ takes in the event that it names, if any, then stores the output row that it nam
 
 from __future__ import annotations
 
-from strapdown.kernels.algebra import dot, matrix_times_vector, transpose, transpose_times_vector
+import math
+
+from strapdown.kernels.algebra import matrix_times_vector, transpose
+from strapdown.kernels.augmented_loop import frame_at
 from strapdown.kernels.family_step import (
     attitude_turned_axes,
     bias_turned_axes,
@@ -14,23 +17,21 @@ from strapdown.kernels.family_step import (
     close_geometric,
     close_right_invariant,
     close_two_frame,
-    negated,
     predict_body_side,
     predict_fixed_side,
     predict_two_frame,
     take_row,
 )
-from strapdown.kernels.filter_loop import HEADING, VECTOR, heading_error, store_state, vector_at
-from strapdown.kernels.filter_step import heading_row
+from strapdown.kernels.filter_loop import ATTITUDE, HEADING, VECTOR, store_state, vector_at
+from strapdown.kernels.filter_step import shows_heading
+from strapdown.kernels.robust_loop import six_at
+from strapdown.kernels.robust_step import independent_rows, measurement_rows
 from strapdown.kernels.rotation import rotation_matrix
 
 FIXED_SIDE = 0
 RIGHT_INVARIANT = 1
 TWO_FRAME = 2
 GEOMETRIC = 3
-
-VERTICAL = 1e-24
-"""Squared horizontal part of a vector, a picoradian from the vertical, below which it has no heading."""
 
 
 def state_at(state):
@@ -74,7 +75,7 @@ def run_extended(
     rate_variance,
     event_kind,
     event_value,
-    event_variance,
+    event_noise,
     event_reference,
     triads,
     state,
@@ -84,6 +85,7 @@ def run_extended(
     """Run one extended Kalman filter over the steps of a record.
 
     ``state`` (28 numbers: q, b, A, B, C, body side) is the initial state; ``state_out`` (rows, 28) gets the states, body side too;
+    ``event_noise`` (events, 6) holds the upper triangle of each measurement's covariance in body axes, of a heading its variance first.
     ``innovation_out`` (events, 6) gets e₁, s₁, e₂, s₂, e₃, s₃ of each event as :func:`strapdown.kernels.filter_loop.run_filter` does.
     """
     q, b, A, B, C = state_at(state)
@@ -101,29 +103,25 @@ def run_extended(
         if e >= 0:
             R = rotation_matrix(q)
             z = vector_at(event_value, e)
-            t = event_reference[e]
-            r = (triads[t, 6], triads[t, 7], triads[t, 8])
-            heading = event_kind[e] == HEADING
-            # With z_f = R z = r + r × δφ and the triad u × v = r of the reference: u · z_f = −v · δφ, v · z_f = u · δφ.
-            u = (triads[t, 0], triads[t, 1], triads[t, 2])
-            v = (triads[t, 3], triads[t, 4], triads[t, 5])
-            z_f = matrix_times_vector(R, z)
-            h1 = negated(v)
-            h2 = u
-            y1 = dot(u, z_f)
-            if heading:
-                h1, y1 = (0.0, 0.0, 0.0), 0.0
-                if z_f[0] * z_f[0] + z_f[1] * z_f[1] > VERTICAL:
-                    h1, y1 = matrix_times_vector(R, heading_row(R, z)), heading_error(R, z, r)
-            if variant == GEOMETRIC:
-                h1 = transpose_times_vector(R, h1)
-                h2 = transpose_times_vector(R, h2)
+            kind = event_kind[e]
             a = (0.0, 0.0, 0.0)
             c = (0.0, 0.0, 0.0)
-            a, c, A, B, C, e1, s1 = take_row(a, c, A, B, C, h1, y1, event_variance[e])
-            e2, s2 = 0.0, 1.0
-            if not heading:
-                a, c, A, B, C, e2, s2 = take_row(a, c, A, B, C, h2, dot(v, z_f), event_variance[e])
+            e1, s1, e2, s2, e3, s3 = math.nan, 0.0, 0.0, 1.0, 0.0, 1.0
+            if kind != HEADING or shows_heading(R, z):
+                h1, h2, h3, y1, y2, y3, noise = measurement_rows(
+                    kind, q, R, z, frame_at(triads, event_reference[e]), six_at(event_noise, e)
+                )
+                h1, h2, h3, y1, y2, y3, noise = independent_rows(h1, h2, h3, y1, y2, y3, noise)
+                if variant != GEOMETRIC:
+                    # A row h of the body side is R h in fixed axes, of a constant direction its triad, whatever the estimate.
+                    h1 = matrix_times_vector(R, h1)
+                    h2 = matrix_times_vector(R, h2)
+                    h3 = matrix_times_vector(R, h3)
+                a, c, A, B, C, e1, s1 = take_row(a, c, A, B, C, h1, y1, noise[0])
+                if kind != HEADING:
+                    a, c, A, B, C, e2, s2 = take_row(a, c, A, B, C, h2, y2, noise[1])
+                if kind in (VECTOR, ATTITUDE):
+                    a, c, A, B, C, e3, s3 = take_row(a, c, A, B, C, h3, y3, noise[2])
             if variant == FIXED_SIDE:
                 q, b, A, B = close_fixed_side(q, b, A, B, a, c)
             elif variant == RIGHT_INVARIANT:
@@ -134,8 +132,7 @@ def run_extended(
                 q, b, B, C = close_geometric(q, b, A, B, C, a, c)
             innovation_out[e, 0], innovation_out[e, 1] = e1, s1
             innovation_out[e, 2], innovation_out[e, 3] = e2, s2
-            if event_kind[e] == VECTOR:
-                innovation_out[e, 4], innovation_out[e, 5] = dot(r, z_f) - 1.0, event_variance[e]
+            innovation_out[e, 4], innovation_out[e, 5] = e3, s3
         if row[k] >= 0:
             A_b, B_b, C_b = to_body_side(variant, q, A, B, C)
             store_state(state_out[row[k]], q, b, A_b, B_b, C_b)
