@@ -16,13 +16,12 @@ from strapdown.kernels.algebra import (
     transpose,
     transpose_times_vector,
 )
-from strapdown.kernels.augmented_loop import frame_at
 from strapdown.kernels.family_loop import state_at
 from strapdown.kernels.family_step import congruent, negated, predict_body_side
 from strapdown.kernels.family_turns import right_jacobian_of_any_turn, turned_by_any
 from strapdown.kernels.filter_loop import ATTITUDE, HEADING, store_state, vector_at
 from strapdown.kernels.filter_step import shows_heading
-from strapdown.kernels.robust_loop import six_at
+from strapdown.kernels.robust_loop import frame_at, six_at
 from strapdown.kernels.robust_step import independent_rows, innovation_factors, measurement_rows
 from strapdown.kernels.rotation import quaternion_multiply, rotation_matrix
 

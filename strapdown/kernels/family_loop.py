@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 
 from strapdown.kernels.algebra import matrix_times_vector, transpose
-from strapdown.kernels.augmented_loop import frame_at
 from strapdown.kernels.family_step import (
     attitude_turned_axes,
     bias_turned_axes,
@@ -24,7 +23,7 @@ from strapdown.kernels.family_step import (
 )
 from strapdown.kernels.filter_loop import ATTITUDE, HEADING, VECTOR, store_state, vector_at
 from strapdown.kernels.filter_step import shows_heading
-from strapdown.kernels.robust_loop import six_at
+from strapdown.kernels.robust_loop import frame_at, six_at
 from strapdown.kernels.robust_step import independent_rows, measurement_rows
 from strapdown.kernels.rotation import rotation_matrix
 
