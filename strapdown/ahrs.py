@@ -1,18 +1,22 @@
 """Attitude and heading from a recording: accelerometer as the vertical, magnetometer as the heading only, one filter for both.
 
-The fixed frame is East-North-Up with magnetic North. The filter is :mod:`strapdown.mekf`; this module says what its measurements are.
+The fixed frame is East-North-Up with magnetic North. This module says what the filter's measurements are, where it starts and what it
+believes (:data:`MOTIONS`); the filter is that of :mod:`strapdown.setup`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from strapdown import mekf, wahba
+from strapdown import coning, mekf, quaternion, setup, wahba
+from strapdown.augmented import SensorStates, States
 from strapdown.checks import Array, InputError, non_negative, positive
 from strapdown.recordings import Recording, increments
 from strapdown.records import Estimate, ImuRecord
+from strapdown.setup import FilterSetup
 from strapdown.units import DEGREE
 from strapdown.vectors import VectorMeasurements
 
@@ -20,15 +24,22 @@ UP = np.array([0.0, 0.0, 1.0])
 NORTH = np.array([0.0, 1.0, 0.0])
 QUIET_SPAN = 1.0
 """Length of the quiet span that the filter starts from, s."""
+FIELD_SPAN = 0.2
+"""Over which the field, turned back by the gyro, must stand still for the magnetometer's latency, s."""
+MOST_LATENCY_SIGMA = 2e-3
+"""A latency of the magnetometer that is known no better is not used, s."""
+MOST_LATENCY = 0.05
+"""Nor is one beyond this, which is another error than a latency, s."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AhrsParameters:
-    """What the filter believes of a hand-held unit. The defaults are one set for consumer and industrial MEMS units on a moving hand.
+    """What the filter believes of the unit. The defaults are one set for consumer and industrial MEMS units on whatever moves.
 
     The noises are those of *independent* samples at ``reference_rate``, and are spread so that the weight a second does not depend on the
     recording's rate. They are much larger than the sensors' own noise, because what disturbs them, acceleration and iron, lasts over
-    many samples.
+    many samples. With ``velocity_sigma`` the acceleration has states (:class:`strapdown.augmented.BoundedVelocity`), and
+    ``specific_force_sigma`` is what is left beside it; :data:`HAND_HELD` is such a set.
     """
 
     angle_random_walk: float = 3e-3
@@ -36,7 +47,7 @@ class AhrsParameters:
     rate_random_walk: float = 1e-5
     """σ_u, rad/s/√s."""
     specific_force_sigma: float = 10.0
-    """Acceleration of the hand, each component, m/s²."""
+    """Acceleration that has no states, each component, m/s²."""
     heading_sigma: float = 5.0
     """Disturbance of the magnetic heading, rad."""
     field_strength_weight: float = 10.0
@@ -47,12 +58,118 @@ class AhrsParameters:
     """Error of the attitude at the start, each axis, rad."""
     bias_sigma: float = 0.5 * DEGREE
     """Gyro bias at the start, each axis, rad/s."""
+    rest_bias_sigma: float = 0.0
+    """How well the mean rate of the quiet second at the start tells the bias where the unit rests, each axis, rad/s; 0: it is not asked."""
+    velocity_sigma: float = 0.0
+    """Velocity of the hand, each component, m/s; 0: no states, all its acceleration is white."""
+    velocity_time: float = 0.3
+    """How long a velocity of the hand lasts, s."""
+    acceleration_time: float = 0.1
+    """How long a push of the hand lasts, s."""
+    gyro_scale_sigma: float = 0.0
+    """Each of the gyro's scale factors (1) and misalignments (rad); 0: no states."""
 
     def __post_init__(self) -> None:
         """Check every field."""
+        may_be_zero = (
+            "field_strength_weight",
+            "rate_random_walk",
+            "rest_bias_sigma",
+            "velocity_sigma",
+            "gyro_scale_sigma",
+        )
         for name in self.__dataclass_fields__:
-            check = non_negative if name in ("field_strength_weight", "rate_random_walk") else positive
+            check = non_negative if name in may_be_zero else positive
             check(name, getattr(self, name))
+
+    @property
+    def setup(self) -> FilterSetup:
+        """The filter of these beliefs."""
+        sensors = {}
+        if self.velocity_sigma > 0.0:
+            sensors["accelerometer"] = SensorStates(
+                velocity_sigma=self.velocity_sigma,
+                velocity_time=self.velocity_time,
+                acceleration_time=self.acceleration_time,
+            )
+        states = States(
+            gyro_scale_sigma=self.gyro_scale_sigma,
+            gyro_misalignment_sigma=self.gyro_scale_sigma,
+            sensors=sensors,
+        )
+        return FilterSetup(
+            process_noise=mekf.ProcessNoise(
+                angle_random_walk=self.angle_random_walk, rate_random_walk=self.rate_random_walk
+            ),
+            attitude_sigma=self.attitude_sigma,
+            bias_sigma=self.bias_sigma,
+            states=states if states.names else None,
+        )
+
+
+HAND_HELD = AhrsParameters(
+    specific_force_sigma=1.0,
+    rest_bias_sigma=0.05 * DEGREE,
+    velocity_sigma=0.5,
+    gyro_scale_sigma=2e-3,
+)
+"""A unit in the hand: its velocity is bounded, and of its gyro, whose turns are large, scale factors and misalignments are states."""
+MOTIONS = {"hand": HAND_HELD, "any": AhrsParameters()}
+"""What may move a unit, and what the filter then believes."""
+
+
+def aligned(recording: Recording, latency: float = 0.0, magnetometer: float = 0.0) -> Recording:
+    """Return a recording whose samples show what was at their time stamps.
+
+    They come ``latency``, s, after what they show, those of the magnetometer ``magnetometer`` more. A sensor's low-pass delays what it
+    shows by its group delay, and the sensors of one unit differ in it: a magnetometer 11 ms behind the gyro is 6° off at 500 °/s. Samples
+    are taken between their neighbours; the last ones are held.
+    """
+    non_negative("latency", latency, unit="s")
+    length = recording.time[-1] - recording.time[0]
+    moved: dict[str, Any] = {}
+    for name in ("rate", "specific_force", "magnetic_field"):
+        samples, late = getattr(recording, name), latency + (magnetometer if name == "magnetic_field" else 0.0)
+        if abs(late) >= length:
+            raise InputError(f"latency is {late:g} s, and {recording.source} lasts {length:.3g} s")
+        if late != 0.0 and samples is not None:
+            if (
+                name == "magnetic_field"
+            ):  # a field of zero is a missing sample, and nothing lies between it and the next
+                samples = np.where(np.any(samples != 0.0, axis=1, keepdims=True), samples, np.nan)
+            moved[name] = np.stack([np.interp(recording.time + late, recording.time, one) for one in samples.T], axis=1)
+    return replace(recording, **moved)
+
+
+def magnetometer_latency(recording: Recording) -> tuple[float, float]:
+    """Return how long after the gyro's the magnetometer's samples come, s, and the σ of that; (0, ∞) where nothing shows it.
+
+    Turned back by the gyro alone, the field m stands still over a fraction of a second. Samples that are late by τ are off by ``−τ ṁ``,
+    ``ṁ = −w × m``, and how that changes over :data:`FIELD_SPAN` is what is fitted, least squares without the farthest. A field that
+    turns with the body (hard iron) is in quadrature to it in a swing: it does not pass for latency, but a strong one hides some.
+    """
+    nothing = (0.0, np.inf)
+    lag = int(np.searchsorted(recording.time, recording.time[0] + FIELD_SPAN))
+    if recording.magnetic_field is None or len(recording.time) < 10 * lag:
+        return nothing
+    attitude = coning.integrate(increments(recording), coning.ALGORITHMS["one-sample"])
+    field = np.nan_to_num(recording.magnetic_field)
+    known = np.asarray(np.isfinite(recording.magnetic_field).all(axis=1))
+    still = quaternion.rotate(attitude, field)
+    late = quaternion.rotate(attitude, np.cross(recording.rate, field))
+    pairs = known[lag:] & known[:-lag]
+    change, wanted = (still[lag:] - still[:-lag])[pairs], (late[lag:] - late[:-lag])[pairs]
+    kept = np.full(len(change), True)
+    for _ in range(6):
+        information = float(np.sum(wanted[kept] ** 2))
+        if information == 0.0:
+            return nothing
+        latency = float(np.sum(change[kept] * wanted[kept])) / information
+        left = np.linalg.norm(change - latency * wanted, axis=1)
+        middle = float(np.median(left))
+        kept = left <= 2.5 * middle
+    # Of a normal residual with three components the median length is 1.54 σ; pairs that overlap are not independent.
+    return latency, middle / 1.54 * float(np.sqrt(lag / information))
 
 
 def quiet_span(recording: Recording) -> slice:
@@ -113,7 +230,10 @@ def imu_record(recording: Recording, quiet: slice, parameters: AhrsParameters) -
 
 
 def start(recording: Recording, quiet: slice, parameters: AhrsParameters) -> mekf.State:
-    """Return the state at the quiet samples: attitude by TRIAD from the mean vertical and field; any North without a magnetometer."""
+    """Return the state at the quiet samples: attitude by TRIAD from the mean vertical and field; any North without a magnetometer.
+
+    With ``rest_bias_sigma`` the bias is that of :func:`resting_bias`.
+    """
     assert recording.specific_force is not None
     up = _mean(recording.specific_force[quiet], recording.source, "accelerometer")
     sigma = np.full(3, parameters.attitude_sigma)
@@ -124,7 +244,39 @@ def start(recording: Recording, quiet: slice, parameters: AhrsParameters) -> mek
     else:
         field = _mean(recording.magnetic_field[quiet], recording.source, "magnetometer")
         attitude = wahba.from_vertical_and_heading(up, field)
-    return mekf.initial_state(attitude, attitude_sigma=sigma, bias_sigma=parameters.bias_sigma)
+    bias, bias_sigma = np.zeros(3), parameters.bias_sigma
+    if parameters.rest_bias_sigma > 0.0:
+        bias, bias_sigma = resting_bias(recording, quiet, parameters)
+    return mekf.initial_state(attitude, bias=bias, attitude_sigma=sigma, bias_sigma=bias_sigma)
+
+
+def resting_bias(recording: Recording, quiet: slice, parameters: AhrsParameters) -> tuple[Array, float]:
+    """Return the gyro bias (3,), rad/s, at quiet samples, and its σ: the mean rate weighed with the prior, zero and ``bias_sigma``.
+
+    The mean rate is the bias to within ``rest_bias_sigma`` and what the rate still changes from tenth to tenth of the samples, the hand's
+    turning. Where it is beyond any bias that the prior expects, and the vertical and the field turn as it says, it is a turn and no bias.
+    """
+    rate, prior = recording.rate[quiet], parameters.bias_sigma
+    mean = rate.mean(axis=0)
+    tenths = np.array([part.mean(axis=0) for part in np.array_split(rate, min(10, len(rate)))])
+    sigma = float(np.hypot(parameters.rest_bias_sigma, _norm(tenths.std(axis=0))))
+    if _norm(mean) > 3.0 * prior and _turns(recording, quiet, mean):
+        sigma = float(np.hypot(sigma, _norm(mean)))
+    share = prior**2 / (prior**2 + sigma**2)
+    return share * mean, float(np.sqrt(share)) * sigma
+
+
+def _turns(recording: Recording, quiet: slice, rate: Array) -> bool:
+    """Return whether vertical and field turn at more than half this rate from the first half of the samples to the second."""
+    expected, seen = [], []
+    for samples in (recording.specific_force, recording.magnetic_field):
+        known = np.empty((0, 3)) if samples is None else samples[quiet][np.isfinite(samples[quiet]).all(axis=1)]
+        if len(known) > 1:
+            first, second = (half.mean(axis=0) / _norm(known.mean(axis=0)) for half in np.array_split(known, 2))
+            seen.append(second - first)
+            expected.append(-0.5 * QUIET_SPAN * np.cross(rate, 0.5 * (first + second)))
+    e, s = np.ravel(expected), np.ravel(seen)
+    return bool(s @ e > 0.5 * (e @ e))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,25 +284,48 @@ class AhrsEstimate:
     """An estimate beside the samples that it was made from, one row for one row."""
 
     recording: Recording
-    """The recording from its first quiet second on."""
+    """The recording from its first quiet second on, its samples as the filter takes them."""
     estimate: Estimate
+    initial: mekf.State
+    """Where the filter started."""
+    magnetometer_latency: float = 0.0
+    """How much later than the gyro's the magnetometer's samples were taken for, s."""
 
 
 def estimate(
-    recording: Recording, parameters: AhrsParameters | None = None, *, full_covariance: bool = False
+    recording: Recording,
+    parameters: AhrsParameters = HAND_HELD,
+    *,
+    latency: float = 0.0,
+    full_covariance: bool = False,
+    smooth: bool = False,
 ) -> AhrsEstimate:
-    """Return attitude and gyro bias over a recording, at its time stamps from the first quiet second on."""
-    chosen = parameters or AhrsParameters()
+    """Return attitude and gyro bias over a recording, at its time stamps from the first quiet second on.
+
+    Parameters
+    ----------
+    recording : Recording
+    parameters : AhrsParameters
+    latency : float
+        How long after what they show the samples of gyro and accelerometer come, s: the group delay of the sensors. That of the
+        magnetometer beside the gyro is found by :func:`magnetometer_latency` where the recording shows it.
+    full_covariance : bool
+        Keep whole covariance matrices too.
+    smooth : bool
+        From all samples, by the fixed-interval smoother, instead of those up to each stamp.
+    """
     if recording.specific_force is None:
         raise InputError(f"{recording.source} has no accelerometer, which shows the vertical; add columns ax, ay, az")
     span = quiet_span(recording)
-    used = recording.since(span.start)
+    field_latency, sigma = magnetometer_latency(recording)
+    if not (sigma < MOST_LATENCY_SIGMA and 3.0 * sigma < abs(field_latency) < MOST_LATENCY):
+        field_latency = 0.0
+    used = aligned(recording, latency, field_latency).since(span.start)
     quiet = slice(0, span.stop - span.start)
-    noise = mekf.ProcessNoise(angle_random_walk=chosen.angle_random_walk, rate_random_walk=chosen.rate_random_walk)
-    result = mekf.run(
-        imu_record(used, quiet, chosen), noise, start(used, quiet, chosen), full_covariance=full_covariance
-    )
-    return AhrsEstimate(recording=used, estimate=result)
+    initial = start(used, quiet, parameters)
+    face = setup.smooth if smooth else setup.run
+    result = face(imu_record(used, quiet, parameters), parameters.setup, initial, full_covariance=full_covariance)
+    return AhrsEstimate(recording=used, estimate=result, initial=initial, magnetometer_latency=field_latency)
 
 
 def _mean(samples: Array, source: str, sensor: str) -> Array:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import augmented, coning, gyro, mekf, quaternion, tables, units, vectors
+from strapdown import augmented, coning, gyro, mekf, quaternion, smoother, tables, units, vectors
 from strapdown.augmented import Observability, matching
 from strapdown.augmented import states as optional
 from strapdown.augmented.states import States
@@ -38,7 +38,8 @@ LEAST_SAMPLES = 32
 """Gyro samples below which nothing is said of commutation."""
 LEAST_BIAS_SIGMA = 0.1 * units.DEGREE_PER_HOUR
 """Standard deviation of the initial bias error of a gyro whose specification tells of no bias, rad/s."""
-
+MOST_MEMORY = 8e9
+"""Bytes that the smoother may keep of the filter's way."""
 
 Sigma = float | tuple[float, float, float]
 """σ of a sensor: one number, or one about (of whole vectors along) each body axis x, y, z."""
@@ -336,6 +337,37 @@ def run(record: ImuRecord, setup: FilterSetup, initial: mekf.State, **options: A
     if setup.states is not None:
         return optional.run(believed(record, setup), setup.process_noise, initial, setup.states, **chosen)
     return mekf.run(believed(record, setup), setup.process_noise, initial, **chosen)
+
+
+def smooth(record: ImuRecord, setup: FilterSetup, initial: mekf.State, **options: Any) -> Estimate:
+    """Return the fixed-interval smoother's estimate of this setup; ``options`` are those of :func:`strapdown.smoother.run`.
+
+    Raises
+    ------
+    InputError
+        If the record is so long that what the way back needs of the way forth exceeds :data:`MOST_MEMORY`, or a gyro drift is among the
+        states.
+    """
+    chosen = {"gate": setup.gate, "robust": setup.robust, **options}
+    told = believed(record, setup)
+    blocks: tuple[augmented.Block, ...] = ()
+    if setup.states is not None:
+        if setup.states.gyro_drift_sigma:
+            raise InputError(
+                "the smoother does not tell a gyro drift as part of the whole bias; leave gyro.drift out, or do not smooth"
+            )
+        blocks = setup.states.blocks({series.sensor: series.kind for series in told.vectors})
+    n = 6 + sum(block.size for block in blocks)
+    segments = len(told.increments) + sum(len(series.time) for series in told.vectors)
+    need = 8 * (n * (n + 1) // 2 + n + 5) * segments
+    if need > MOST_MEMORY:
+        raise InputError(
+            f"smoothing {len(told.increments)} samples with {n} states takes {need / 1e9:.3g} GB, more than {MOST_MEMORY / 1e9:g}; cut the "
+            "record, or do not smooth"
+        )
+    if setup.states is None:
+        return smoother.run(told, setup.process_noise, initial, **chosen)
+    return augmented.smooth(told, setup.process_noise, initial, blocks, **chosen)
 
 
 def observability(record: ImuRecord, setup: FilterSetup, initial: mekf.State) -> Observability:

@@ -7,7 +7,8 @@ import h5py
 import numpy as np
 import pytest
 
-from strapdown import coning, consistency, mekf, motion, quaternion, records, scenarios, setup
+from sims import hand_held
+from strapdown import ahrs, coning, consistency, mekf, motion, quaternion, records, scenarios, setup
 from strapdown.checks import InputError
 from strapdown.gyro import GyroSpec
 from strapdown.mekf import ProcessNoise
@@ -280,3 +281,134 @@ def test_one_direction_that_turns_starts_by_a_bank(run, tmp_path):
         assert np.array_equal(file["truth/attitude"][:], truth)
     status, _, _ = run("check", tmp_path / "out" / "estimate.h5")
     assert status in (0, 2)
+
+
+# ---------------------------------------------------------------------------------------------------- smoothed
+
+
+def test_a_record_is_smoothed(run, record, tmp_path):
+    status, _, error = run("estimate", record, "--out", tmp_path / "out", "--smooth")
+    assert (status, error) == (0, "")
+    smoothed = read_estimate(tmp_path / "out" / "estimate.h5")
+    assert run("estimate", record, "--out", tmp_path / "plain")[0] == 0
+    plain = read_estimate(tmp_path / "plain" / "estimate.h5")
+    np.testing.assert_array_equal(smoothed.time, plain.time)
+    assert np.all(smoothed.variance <= plain.variance * (1.0 + 1e-9))
+    assert np.mean(smoothed.variance[:150]) < 0.5 * np.mean(plain.variance[:150])
+    found, before = (json.loads((tmp_path / name / "errors.json").read_text()) for name in ("out", "plain"))
+    assert found["attitude_sigma_deg"] < before["attitude_sigma_deg"]
+    assert 0.2 < found["nees_per_state"] < 3.0
+    with h5py.File(tmp_path / "out" / "estimate.h5") as file:
+        assert file.attrs["smoothed"]
+
+
+def test_smoothing_with_states_tells_of_them(run, tmp_path):
+    path = tmp_path / "record.h5"
+    scenario = dataclasses.replace(scenarios.load_scenario("spin"), duration=20.0)
+    write_record(path, simulate(scenario, 2), gyro_spec=scenario.gyro, scenario=scenarios.scenario_to_toml(scenario))
+    status, _, error = run("estimate", path, "--out", tmp_path / "out", "--smooth", "--state", "gyro.scale")
+    assert (status, error) == (0, "")
+    assert "gyro scale" in json.loads((tmp_path / "out" / "states.json").read_text())
+
+
+# ---------------------------------------------------------------------------------------------------- a recording of a hand
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """A simulated hand as CSV, its samples 5 ms late."""
+    one = hand_held.simulated(1, 0, 12.0)
+    one = dataclasses.replace(one, time=one.time + 0.005)
+    path = tmp_path / "hand.csv"
+    header = "time,gx [rad/s],gy,gz,ax [m/s2],ay,az,mx,my,mz"
+    np.savetxt(
+        path,
+        np.column_stack([one.time, one.rate, one.specific_force, one.magnetic_field]),
+        delimiter=",",
+        header=header,
+        comments="",
+    )
+    return path
+
+
+def off(folder, shift):
+    """RMS angle, °, beside the truth of a recording whose samples are 5 ms late, made good by ``shift`` s."""
+    estimate = read_estimate(folder / "estimate.h5")
+    truth = hand_held.simulated(1, 0, 12.0).true_attitude
+    at = np.interp(estimate.time - 0.005 + shift, np.arange(len(truth)) / hand_held.RATE, np.arange(len(truth)))
+    return np.rad2deg(
+        np.sqrt(np.mean(quaternion.angle_between(estimate.attitude, truth[np.round(at).astype(int)]) ** 2))
+    )
+
+
+def test_a_recording_is_taken_for_that_of_a_hand(run, recording, tmp_path):
+    status, said, error = run("estimate", recording, "--out", tmp_path / "out")
+    assert (status, error) == (0, "")
+    assert "Motion: of a hand, 0.5 m/s that last 0.3 s; σ is set for robustness and no verdict." in said
+    assert "°/s, from that second." in said
+    assert "later than what they show" not in said
+    with h5py.File(tmp_path / "out" / "estimate.h5") as file:
+        told = dict(file.attrs)
+    states = json.loads(told["states"])
+    assert states["accelerometer velocity"]["units"] == ["m/s", "m/s²"] * 3
+    assert len(states["gyro scale"]["values"]) == 9
+    assert (told["motion"], told["smoothed"], told["latency"]) == ("hand", False, 0.0)
+    assert setup.from_toml(told["filter"]) == ahrs.HAND_HELD.setup
+    assert off(tmp_path / "out", 0.0) < 1.5
+
+
+def test_any_motion_smoothing_and_latency(run, recording, tmp_path):
+    errors = {}
+    for name, options in {
+        "hand": (),
+        "any": ("--motion", "any"),
+        "smoothed": ("--smooth",),
+        "later": ("--latency", 5.0),
+    }.items():
+        status, said, error = run("estimate", recording, "--out", tmp_path / name, *options)
+        assert (status, error) == (0, ""), name
+        errors[name] = off(tmp_path / name, 0.005 if name == "later" else 0.0)
+        assert ("Samples are taken for 5 ms later than what they show." in said) == (name == "later")
+        assert ("Motion: any" in said) == (name == "any")
+    assert errors["smoothed"] < errors["hand"] < errors["any"]
+    assert abs(errors["later"] - errors["hand"]) < 0.3
+
+
+def test_a_hand_that_never_rests_is_told(run, recording, tmp_path):
+    lines = recording.read_text().splitlines()
+    moving = tmp_path / "moving.csv"
+    moving.write_text("\n".join([lines[0], *lines[800:]]) + "\n")
+    status, said, error = run("estimate", moving, "--out", tmp_path / "out")
+    assert (status, error) == (0, "")
+    assert "no second is quiet enough to show it, so the heading may drift at first." in said
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--motion", "hnd"), "did you mean 'hand'?"),
+        (("--latency", -1.0), "--latency is -1 ms"),
+        (("--latency", "nan"), "--latency is nan"),
+        (("--latency", 60000.0), "lasts"),
+        (("--gate", 0.999), "goes with a record"),
+    ],
+)
+def test_bad_options_of_a_recording_are_refused(run, recording, tmp_path, options, words):
+    status, _, error = run("estimate", recording, "--out", tmp_path / "out", *options)
+    assert status == 2
+    assert words in error, error
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--motion", "hand"), "--motion goes with a recording"),
+        (("--latency", 4.0), "--latency goes with a recording"),
+        (("--smooth", "--every", 2), "leave one of them out"),
+    ],
+)
+def test_options_of_a_recording_are_refused_with_a_record(run, record, tmp_path, options, words):
+    status, _, error = run("estimate", record, "--out", tmp_path / "out", *options)
+    assert status == 2
+    assert words in error, error

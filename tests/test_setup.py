@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from strapdown import coning, consistency, mekf, quaternion, records, scenarios, setup, units
+from strapdown import augmented, coning, consistency, mekf, quaternion, records, scenarios, setup, smoother, units
 from strapdown.checks import InputError
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
@@ -225,3 +225,40 @@ def test_an_estimate_of_a_setup_with_states_tells_of_them():
     assert list(estimate.blocks) == ["gyro scale"]
     plain = setup.run(record, dataclasses.replace(believes, states=None), start, every=10)
     assert np.all(estimate.variance[-1, 5] > 2.0 * plain.variance[-1, 5])
+
+
+# ---------------------------------------------------------------------------------------------------- smoothing
+
+
+@pytest.mark.parametrize("states", [False, True])
+def test_smoothing_by_a_setup_is_that_of_the_smoother(states):
+    chosen = scenarios.load_scenario("spin") if states else scenario(duration=10.0)
+    chosen = dataclasses.replace(chosen, duration=10.0)
+    record = scenarios.simulate(chosen, 3)
+    believes = setup.matched(chosen, states=states)
+    start = setup.initial_state(believes, record.truth.attitude[0])
+    found = setup.smooth(record, believes, start, full_covariance=True)
+    told = setup.believed(record, believes)
+    if states:
+        blocks = believes.states.blocks({series.sensor: series.kind for series in told.vectors})
+        same = augmented.smooth(told, believes.process_noise, start, blocks, full_covariance=True)
+        assert list(found.blocks) == [block.name for block in blocks]
+    else:
+        same = smoother.run(told, believes.process_noise, start, full_covariance=True)
+    np.testing.assert_array_equal(found.attitude, same.attitude)
+    np.testing.assert_array_equal(found.covariance, same.covariance)
+    plain = setup.run(record, believes, start)
+    assert np.all(found.variance <= plain.variance * (1.0 + 1e-9))
+
+
+def test_what_cannot_be_smoothed_is_refused(monkeypatch):
+    chosen = scenario(duration=10.0)
+    record = scenarios.simulate(chosen, 3)
+    believes = setup.matched(chosen)
+    start = setup.initial_state(believes, record.truth.attitude[0])
+    drifting = augmented.States(gyro_drift_sigma=(1e-5,), gyro_drift_time=(10.0,))
+    with pytest.raises(InputError, match="does not tell a gyro drift"):
+        setup.smooth(record, dataclasses.replace(believes, states=drifting), start)
+    monkeypatch.setattr(setup, "MOST_MEMORY", 1e5)
+    with pytest.raises(InputError, match=r"with 6 states takes .* GB, more than 0.0001; cut the record"):
+        setup.smooth(record, believes, start)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
     from strapdown.records import Estimate, ImuRecord
     from strapdown.setup import FilterSetup
 
+RECORDING_ONLY = ("motion", "latency")
+"""Options that go with a recording."""
 RECORD_ONLY = ("filter", "gate", "robust", "states", "state", "attitude", "from_truth", "every", "observability")
 """Options that go with a record of `strapdown simulate`."""
 
@@ -86,6 +89,23 @@ def estimate(
     observability: Annotated[
         bool, typer.Option("--observability", help="Record: tell what it shows of each state, optional ones included.")
     ] = False,
+    smooth: Annotated[
+        bool,
+        typer.Option("--smooth", help="From all samples, those after each time too, by the fixed-interval smoother."),
+    ] = False,
+    motion: Annotated[
+        str | None,
+        typer.Option(
+            help="Recording: what moves the unit: hand (if not given), of bounded velocity, with states for the gyro's scale; or any, "
+            "whose acceleration is white noise, without."
+        ),
+    ] = None,
+    latency: Annotated[
+        float | None,
+        typer.Option(
+            help="Recording: how long after what they show its gyro's samples come, ms: the delay of the sensor's low-pass."
+        ),
+    ] = None,
 ) -> None:
     """Estimate attitude and gyro bias from a recording (accelerometer as vertical, magnetometer as heading) or a simulated record."""
     from strapdown.checks import InputError
@@ -100,6 +120,9 @@ def estimate(
     if is_record(recording):
         for name in units:
             raise InputError(f"--{name}-unit goes with a CSV file; the record {recording} tells its units itself")
+        for name, text in zip(RECORDING_ONLY, (motion, latency), strict=True):
+            if text is not None:
+                raise InputError(f"--{name} goes with a recording; {recording} is a record of `strapdown simulate`")
         _estimate_record(
             recording,
             out,
@@ -113,6 +136,7 @@ def estimate(
             every,
             full_covariance is not False,
             observability,
+            smooth,
         )
         return
     options = dict(
@@ -137,7 +161,7 @@ def estimate(
             raise InputError(
                 f"--{name.replace('_', '-')} goes with a record of `strapdown simulate`; {recording} is none"
             )
-    _estimate_recording(recording, out, units, gyro, bool(full_covariance))
+    _estimate_recording(recording, out, units, gyro, bool(full_covariance), smooth, motion, latency)
 
 
 def _estimate_record(
@@ -153,6 +177,7 @@ def _estimate_record(
     every: int,
     full_covariance: bool,
     observability: bool,
+    smooth: bool,
 ) -> None:
     """Run the filter over a record, tell and write what it made of it."""
     import numpy as np
@@ -166,6 +191,8 @@ def _estimate_record(
     from strapdown.robustness import Gate, Robust
 
     count("every", every)
+    if smooth and every > 1:
+        raise InputError("--every keeps some steps of the filter, and the smoother gives all; leave one of them out")
     if gyro is not None and filter_file is not None:
         raise InputError("--gyro and --filter both tell the filter's belief of the gyro; give one of them")
     held = read_record_file(path)
@@ -188,7 +215,10 @@ def _estimate_record(
             raise InputError(
                 f"every is {every}, and {len(believed.increments)} filter steps are left from the start on"
             )
-    result = setup.run(used, chosen, initial, every=every, full_covariance=full_covariance)
+    if smooth:
+        result = setup.smooth(used, chosen, initial, full_covariance=full_covariance)
+    else:
+        result = setup.run(used, chosen, initial, every=every, full_covariance=full_covariance)
     truth = None
     if believed.truth is not None:
         truth = Truth(attitude=believed.truth.attitude[::every], bias=believed.truth.bias[::every])
@@ -202,6 +232,7 @@ def _estimate_record(
     _tell(result)
     paths = [out / "estimate.h5"]
     attributes: dict[str, Any] = {"source": str(path), "filter": setup.to_toml(chosen), "start": words}
+    attributes["smoothed"] = smooth
     if held.scenario:
         attributes["scenario"] = held.scenario
     attributes |= {name: value for name, value in (("seed", held.seed), ("run", held.run)) if value is not None}
@@ -241,20 +272,26 @@ _STATE_UNITS = {
 }
 
 
-def _tell_states(result: Any) -> dict[str, Any]:
-    """Show the optional states at the end, and return them for JSON."""
-    from strapdown.units import DEGREE_PER_HOUR, STANDARD_GRAVITY
-
-    rows = table("Optional states at the end", "state", "", "unit", "value", "σ", "σ at the start", left=3)
-    found: dict[str, Any] = {}
-    for name, block in result.blocks.items():
-        found[name] = {
+def _states(result: Any) -> dict[str, Any]:
+    """Return the optional states at the end."""
+    return {
+        name: {
             "components": list(block.components),
             "units": list(block.units),
             "values": block.values[-1].tolist(),
             "sigma": block.sigma[-1].tolist(),
             "first_sigma": block.sigma[0].tolist(),
         }
+        for name, block in result.blocks.items()
+    }
+
+
+def _tell_states(result: Any) -> dict[str, Any]:
+    """Show the optional states at the end, and return them for JSON."""
+    from strapdown.units import DEGREE_PER_HOUR, STANDARD_GRAVITY
+
+    rows = table("Optional states at the end", "state", "", "unit", "value", "σ", "σ at the start", left=3)
+    for name, block in result.blocks.items():
         for k, (component, unit) in enumerate(zip(block.components, block.units, strict=True)):
             kind = " ".join(name.split()[:2])
             word, size = _STATE_UNITS.get(kind, {}).get(unit, (unit, 1.0))
@@ -263,7 +300,7 @@ def _tell_states(result: Any) -> dict[str, Any]:
             values = (block.values[-1, k], block.sigma[-1, k], block.sigma[0, k])
             rows.add_row(name, component, word, *(f"{value / size:.4g}" for value in values))
     show(rows)
-    return found
+    return _states(result)
 
 
 def _initial(
@@ -378,27 +415,38 @@ def _errors(result: Estimate, truth: Any) -> dict[str, float]:
 
 
 def _estimate_recording(
-    recording: Path, out: Path, units: dict[str, str], gyro: Path | None, full_covariance: bool
+    recording: Path,
+    out: Path,
+    units: dict[str, str],
+    gyro: Path | None,
+    full_covariance: bool,
+    smooth: bool,
+    motion: str | None,
+    latency: float | None,
 ) -> None:
     """Run the filter over a recording: accelerometer as the vertical, magnetometer as the heading."""
-    from strapdown import ahrs, plots, recordings
+    from strapdown import ahrs, plots, recordings, setup
+    from strapdown.augmented import AugmentedEstimate
+    from strapdown.checks import non_negative, one_of
     from strapdown.consistency import reference_errors
     from strapdown.files import write_json
     from strapdown.gyro import process_noise, read_spec
     from strapdown.records import write_estimate
     from strapdown.units import DEGREE
 
+    moved_by = one_of("--motion", motion or "hand", ahrs.MOTIONS)
+    late = 1e-3 * non_negative("--latency", latency or 0.0, unit="ms")
     source = recordings.read(recording, units=units)
-    parameters = ahrs.AhrsParameters()
+    parameters = ahrs.MOTIONS[moved_by]
     if gyro is not None:
         parameters = replace(parameters, **process_noise(read_spec(gyro)))
-    result = ahrs.estimate(source, parameters, full_covariance=full_covariance)
-    used = result.recording
+    result = ahrs.estimate(source, parameters, latency=late, full_covariance=full_covariance, smooth=smooth)
+    used, found = result.recording, result.estimate
     errors_found = None
     if used.true_attitude is not None:
-        errors_found = reference_errors(result.estimate.attitude, used.true_attitude)
+        errors_found = reference_errors(found.attitude, used.true_attitude)
         rms = {name: value / DEGREE for name, value in errors_found.rms(used.movement).items()}
-    figures = {"estimate.png": plots.estimate_overview(result.estimate, title=used.source)}
+    figures = {"estimate.png": plots.estimate_overview(found, title=used.source)}
     if errors_found is not None:
         figures["errors.png"] = plots.recording_errors(used.time, errors_found, used.movement)
     frame = (
@@ -409,11 +457,17 @@ def _estimate_recording(
     paths = [out / "estimate.h5"]
     write_estimate(
         paths[0],
-        result.estimate,
+        found,
         {
             "source": used.source,
             "fixed_frame": frame,
+            "motion": moved_by,
+            "smoothed": smooth,
+            "filter": setup.to_toml(parameters.setup),
             **{f"parameter.{name}": value for name, value in vars(parameters).items()},
+            "latency": late,
+            "magnetometer_latency": result.magnetometer_latency,
+            "states": json.dumps(_states(found) if isinstance(found, AugmentedEstimate) else {}),
         },
     )
     console.print(
@@ -421,11 +475,19 @@ def _estimate_recording(
         f"from {used.time[0]:.2f} s."
     )
     console.print(f"Fixed frame: {frame}.")
+    console.print(_beliefs(moved_by, parameters, result), soft_wrap=True)
+    if late:
+        console.print(f"Samples are taken for {1e3 * late:g} ms later than what they show.")
+    if result.magnetometer_latency:
+        behind = 1e3 * result.magnetometer_latency
+        console.print(
+            f"The magnetometer's samples come {abs(behind):.1f} ms {'after' if behind > 0.0 else 'before'} the gyro's, which is made good."
+        )
     for begin, length in recordings.gaps(used.time):
         console.print(f"Gap of {length:.3g} s after {begin:.3f} s: the turn across it is a guess, whatever σ says.")
     if used.left_out_words:
         console.print(used.left_out_words, soft_wrap=True)
-    for sensor, number in result.estimate.skipped.items():
+    for sensor, number in found.skipped.items():
         if number:
             console.print(f"{number} samples of the {sensor} are missing and were skipped.")
     if errors_found is not None:
@@ -435,3 +497,22 @@ def _estimate_recording(
         rows.add_row(*(f"{value:.2f}" for value in rms.values()))
         show(rows)
     written(*paths, *(plots.save(figure, out / name) for name, figure in figures.items()))
+
+
+def _beliefs(moved_by: str, parameters: Any, result: Any) -> str:
+    """Return in words what the filter believes of a recording, and of the bias that it started from."""
+    import numpy as np
+
+    from strapdown.units import DEGREE
+
+    if moved_by == "any":
+        return "Motion: any, its acceleration taken for white noise; σ is set for robustness and no verdict."
+    bias, sigma = result.initial.bias / DEGREE, np.sqrt(result.initial.covariance[3, 3]) / DEGREE
+    words = (
+        f"Motion: of a hand, {parameters.velocity_sigma:g} m/s that last {parameters.velocity_time:g} s; σ is set for robustness and no "
+        "verdict. "
+        f"Gyro bias at the start: {', '.join(f'{value:.3g}' for value in bias)} °/s, σ {sigma:.2g} °/s"
+    )
+    if sigma > 0.5 * parameters.bias_sigma / DEGREE:
+        return f"{words}: no second is quiet enough to show it, so the heading may drift at first."
+    return f"{words}, from that second."
