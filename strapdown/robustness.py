@@ -23,9 +23,11 @@ import numpy as np
 
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, count, finite, one_of, positive
+from strapdown.kernels import robust_gate
+from strapdown.kernels.robust_step import ONE_AXIS, RELINEARIZED, SETTLED, TURN_ASIDE, UNKNOWN, UNKNOWN_TILT
 from strapdown.records import Event
 
-UNIFORM_SIGMA = math.pi / math.sqrt(3.0)
+UNIFORM_SIGMA = robust_gate.UNIFORM_SIGMA
 """Standard deviation of an angle that is uniform over the whole turn, rad."""
 
 
@@ -94,9 +96,9 @@ class Gate:
         return self.recovery or LOCK_OUT
 
     def restart_bias_variance(self, initial: Array) -> Array:
-        """Return what is added to the variance of the first challenger's bias (3,), (rad/s)², of a filter with this initial P (6, 6)."""
+        """Return what is added to the variance of the first challenger's bias (3,), (rad/s)², of a filter with this initial P (n, n)."""
         if self.restart_bias_sigma is None:
-            return np.diag(initial)[3:].copy()
+            return np.diag(initial)[3:6].copy()
         return np.full(3, self.restart_bias_sigma**2)
 
 
@@ -109,7 +111,7 @@ class GateMemory:
     challenger: Array
     """The challenger's state as the kernels pack it (28,)."""
     counts: Array
-    """Whether there is a challenger, how it does, and how wide the next one starts, as :mod:`strapdown.kernels.robust_loop` holds them."""
+    """Whether there is a challenger, how it does, and how wide the next one starts, as :mod:`strapdown.kernels.robust_gate` holds them."""
     standing: dict[str, Array]
     """Refusals of each sensor, as held there."""
 
@@ -239,21 +241,6 @@ class Monitor:
 
 # ------------------------------------------------------------------------- the same update as the kernels', in matrices, for the step face
 
-WIDE_PASSES = 20
-"""Linearisations of one update at most, of a challenger and of a filter that has recovered."""
-_RELINEARIZED = 0.05
-"""rad; an iterated update is linearised anew until its correction is smaller."""
-_SETTLED = 1e-4
-"""rad; the same of an attitude that is hardly known."""
-_UNKNOWN = 1.0
-"""rad²; with more attitude variance than this in all it is hardly known, and an update that fails is tried again from elsewhere."""
-_TURN_ASIDE = 2.0 * math.pi / 3.0
-
-_ONE_AXIS = 5.0
-"""The least certain axis stands alone if its variance is so many times the sum of the others'."""
-_UNKNOWN_TILT = 4.0
-"""rad²; with more variance of the tilt than this a heading tells nothing."""
-
 Rows = tuple[Array, Array, Array, float, float]
 """Residual (d,), H (d, k) of the first k states, covariance (d, d); of a direction or vector the angle θ from the predicted one, rad, and
 θ over the length of its part across (of other kinds 0 and 1)."""
@@ -331,14 +318,15 @@ def linearise(
     reasons.
     """
     now, P, prior = attitude, covariance, np.zeros(3)
-    unknown = np.trace(covariance[:3, :3]) >= _UNKNOWN
-    tolerance = _SETTLED if unknown else _RELINEARIZED
-    done, trials = 1, 0
+    unknown = np.trace(covariance[:3, :3]) >= UNKNOWN
+    tolerance = SETTLED if unknown else RELINEARIZED
+    done, trials, first = 1, 0, None
     while True:
         residual, H, noise, angle, far = rows(now)
         seen = Linearised(attitude=now, covariance=P, prior=prior, residual=residual, H=H, noise=noise, angle=angle)
         if passes == 1:
             return seen
+        first = first or seen
         # The arc replaces the chord in the rows made independent, the first two of them.
         lower = np.linalg.cholesky(noise)
         lower = lower / np.diag(lower)
@@ -347,12 +335,12 @@ def linearise(
         step = prior + P[:3, :3] @ H.T @ np.linalg.solve(seen.predicted + noise, from_afar)
         converged = bool(step @ step < tolerance**2)
         if converged or done >= passes:
-            seen = replace(seen, converged=converged)
+            seen = seen if converged else replace(first, converged=False)
             if seen.acceptable(threshold) or trials == 2 or not unknown:
                 return seen
             trials += 1
             done, now = 0, attitude
-            step = math.copysign(_TURN_ASIDE, trials - 1.5) * _least_certain(covariance)
+            step = math.copysign(TURN_ASIDE, trials - 1.5) * _least_certain(covariance)
         now = quaternion.normalize(quaternion.multiply(now, quaternion.exp(step)))
         P, prior = seen_from(quaternion.multiply(quaternion.conjugate(attitude), now), covariance)
         done += 1
@@ -367,7 +355,7 @@ def seen_from(q: Array, covariance: Array) -> tuple[Array, Array]:
     axis = _least_certain(covariance)
     largest = float(axis @ A @ axis)
     turn, tilt = 0.0, quaternion.log(q)
-    if largest > _ONE_AXIS * (np.trace(A) - largest):
+    if largest > ONE_AXIS * (np.trace(A) - largest):
         turn = 2.0 * math.atan2(float(axis @ q[1:]), float(q[0]))
         tilt = quaternion.log(quaternion.multiply(quaternion.exp(-turn * axis), q))
         turn = (turn + math.pi) % (2.0 * math.pi) - math.pi
@@ -383,7 +371,7 @@ def seen_from(q: Array, covariance: Array) -> tuple[Array, Array]:
 def tilt_unknown(attitude: Array, covariance: Array) -> bool:
     """Return whether the turns about the two horizontal fixed axes are so uncertain that a heading tells nothing."""
     R = quaternion.to_matrix(attitude)[:2]
-    return float(np.trace(R @ covariance[:3, :3] @ R.T)) > _UNKNOWN_TILT
+    return float(np.trace(R @ covariance[:3, :3] @ R.T)) > UNKNOWN_TILT
 
 
 def _least_certain(covariance: Array) -> Array:

@@ -145,6 +145,10 @@ def _triad(first_b: Array, second_b: Array, first_f: Array, second_f: Array) -> 
 # Any number of directions
 
 
+class InconsistentError(InputError):
+    """Directions whose angles differ between the frames by more than their noise explains."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Solution:
     """The attitude that minimises Wahba's loss, and how far it may be believed."""
@@ -447,7 +451,7 @@ def _refuse_inconsistent(b: Array, r: Array, sigma: Array) -> None:
         *index, k = np.unravel_index(int(np.argmax(excess)), excess.shape)
         here = (*index, k)
         allowed_here = float(np.broadcast_to(allowed, excess.shape)[here])
-        raise InputError(
+        raise InconsistentError(
             f"directions {i[k]} and {j[k]}{' of set ' + str([int(n) for n in index]) if index else ''} are "
             f"{np.broadcast_to(angle_b, excess.shape)[here] / DEGREE:.6g}° apart in the body frame but "
             f"{np.broadcast_to(angle_f, excess.shape)[here] / DEGREE:.6g}° in the fixed frame, where the noise allows a difference of "

@@ -261,6 +261,20 @@ def test_states_are_refused_where_they_make_no_sense(run, spinning, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_directions_that_contradict_each_other_start_nothing(run, tmp_path):
+    """A star taken for another: no bank makes a start of that, unless the filter has states for what sensors get wrong."""
+    whole = simulate(made(), 4)
+    first, *others = whole.vectors
+    wrong = dataclasses.replace(first, reference_f=np.array([0.6, 0.8, 0.0]))
+    path = tmp_path / "mixed.h5"
+    write_record(path, dataclasses.replace(whole, vectors=(wrong, *others)), gyro_spec=SPEC)
+    status, _, error = run("estimate", path, "--out", tmp_path / "out")
+    assert status == 2
+    assert "look for a mixed-up pair" in error
+    assert "--attitude" in error
+    assert not (tmp_path / "out").exists()
+
+
 def test_one_direction_that_turns_starts_by_a_bank(run, tmp_path):
     scenario = dataclasses.replace(scenarios.load_scenario("magnetometer-only"), duration=2400.0)
     path = tmp_path / "alone.h5"

@@ -9,6 +9,8 @@ from scipy.stats import binom, chi2
 from strapdown import consistency, mekf, motion, quaternion, records, robustness, smoother
 from strapdown.checks import InputError
 from strapdown.gyro import GyroSpec
+from strapdown.kernels import robust_gate, robust_loop
+from strapdown.kernels.robust_step import ACCEPTED, PASSED_OVER, REFUSED
 from strapdown.mekf import ProcessNoise, initial_state
 from strapdown.randomness import generator
 from strapdown.robustness import Gate, Monitor, Robust
@@ -272,10 +274,8 @@ def test_the_restart_is_as_wide_as_the_start_unless_told():
     start = started(record, 0, bias_sigma=0.02)
     lost = replace(start, attitude=quaternion.multiply(start.attitude, quaternion.exp([0.0, 1.57, 0.0])))
     _, end = mekf.run_on(records.cut(record, 0, 20), NOISE, lost, gate=Gate())
-    from strapdown.kernels import robust_loop
-
-    assert end.gate.counts[robust_loop.CHALLENGED] == 1.0
-    first = end.gate.counts[robust_loop.FIRST_BIAS + 3 : robust_loop.FIRST_BIAS + 6]
+    assert end.gate.counts[robust_gate.CHALLENGED] == 1.0
+    first = end.gate.counts[robust_gate.FIRST_BIAS + 3 : robust_gate.FIRST_BIAS + 6]
     assert np.all(first > 1.9 * 0.02**2)  # what the filter had left, and the restart's
 
 
@@ -326,9 +326,90 @@ def test_a_record_in_parts_recovers_as_the_whole_does(case):
     assert whole.events
 
 
+def test_a_record_in_single_intervals_recovers_as_the_whole_does():
+    """Most refusals that lead to the recovery are of earlier parts: that in which it comes holds one measurement, and tells of it."""
+    record = simulate(scenario(duration=3.0), 4)
+    start = started(record, 0)
+    start = replace(start, attitude=quaternion.multiply(start.attitude, quaternion.exp([0.0, 1.57, 0.0])))
+    in_turn = tuple(s.taken(np.arange(len(s.time)) % 2 == k) for k, s in enumerate(record.vectors))
+    record = replace(record, vectors=in_turn)
+    whole, end = mekf.run_on(record, NOISE, start, gate=Gate())
+    state, told = start, []
+    for k in range(len(record.increments)):
+        part, state = mekf.run_on(records.cut(record, k, k + 1), NOISE, state, gate=Gate())
+        told += [event for event in part.events if event.kind == "recovery"]
+        assert np.array_equal(part.attitude[1], whole.attitude[k + 1])
+    assert told == recoveries(whole) != []
+    assert np.array_equal(state.covariance, end.covariance)
+
+
+def judged(outcomes, recovery=3, limit=4):
+    """Rows of a gate with two sensors after outcomes (sensor, filter's, challenger's or None); verdicts, recoveries and lock-outs."""
+    memory, standing = np.zeros(robust_gate.MEMORY), np.zeros((2, robust_gate.STANDING))
+    standing[:, robust_gate.TOLD] = -1.0
+    lock_outs, told, found = np.zeros((9, 4)), 0, []
+    for k, (sensor, mine, other) in enumerate(outcomes):
+        told, begins = robust_gate.judge_filter(
+            mine, float(k), sensor, recovery, limit, standing, memory, lock_outs, told
+        )
+        if begins:
+            robust_gate.begin_challenge(memory, float(k), np.zeros(3), np.ones(3))
+        if memory[robust_gate.CHALLENGED]:
+            found.append(robust_gate.judge_challenger(other, 2.0, 2, sensor, standing, memory, np.zeros(3)))
+    return memory, standing, lock_outs[:told], found
+
+
+def test_the_rules_of_a_gate():
+    """Plain numbers: when a challenger is dropped, believed, wider; what is told; what a widening sets back."""
+    dropped, followed, narrow = robust_gate.DROPPED, robust_gate.FOLLOWED, robust_gate.TOO_NARROW
+    refused, both = (0, REFUSED, ACCEPTED), (0, REFUSED, REFUSED)
+    assert judged([refused, refused, (0, ACCEPTED, ACCEPTED)])[3] == [followed, followed, dropped]
+    assert judged([refused, (1, ACCEPTED, ACCEPTED)])[3] == [
+        followed,
+        followed,
+    ]  # of which the other sensor is none refused
+    memory, standing, lock_outs, found = judged([refused, both, both])
+    assert found == [followed, followed, dropped]  # two misses are more than 1 + half of one hit
+    assert (memory[robust_gate.LEVEL], memory[robust_gate.CHALLENGED]) == (1.0, 0.0)
+    assert judged([refused] * 6 + [both] * 3)[3][-2:] == [followed, dropped]  # three in a row
+    assert judged([refused] * 6 + [both] * 2 + [refused, both])[3][-1] == followed
+    assert judged([refused] * 3 + [(0, ACCEPTED, ACCEPTED)] * 2)[1][0, robust_gate.EXCESS] == 1.0
+    memory, standing, _, _ = judged([(0, REFUSED, PASSED_OVER)] * 4)
+    assert not robust_gate.is_believed(0, 3, standing, memory)
+    memory, standing, lock_outs, found = judged([(1, ACCEPTED, None)] * 14 + [refused, both, both, refused])
+    assert memory[robust_gate.LEVEL] == 1.0
+    for accepted, level in ((14, 1.0), (15, 0.0)):  # 5 × 3 accepted since
+        memory, _, _, _ = judged([refused, both, both] + [(1, ACCEPTED, ACCEPTED)] * accepted + [refused])
+        assert memory[robust_gate.LEVEL] == level
+    memory, standing, lock_outs, found = judged([refused] * 6)
+    assert [list(row) for row in lock_outs] == [[0.0, 5.0, 0.0, 6.0]]
+    assert robust_gate.is_believed(0, 3, standing, memory)
+    assert not robust_gate.is_believed(1, 3, standing, memory)
+    assert not robust_gate.is_believed(0, 7, standing, memory)
+    row = np.zeros(4)
+    memory[robust_gate.SINCE] = 2.0
+    robust_gate.recover(5.0, 0, 4, standing, memory, row, lock_outs)
+    assert list(row) == [5.0, 0.0, 0.0, 6.0]
+    assert lock_outs[0, 3] == 0.0
+    assert not standing[:, : robust_gate.TOLD].any()
+    assert memory[robust_gate.PASSES] == robust_gate.WIDE_PASSES
+    memory, standing, _, _ = judged([refused])
+    for nis, expected in ((2.0, followed), (40.0, narrow)):
+        assert robust_gate.judge_challenger(ACCEPTED, nis, 2, 0, standing, memory, np.zeros(3)) == expected
+    assert robust_gate.judge_challenger(ACCEPTED, 0.0, 99, 0, standing, memory, np.array([1.6, 0.0, 0.0])) == narrow
+    assert robust_gate.may_widen(np.full(3, 1.04), memory)
+    assert not robust_gate.may_widen([1.0, 1.06, 1.0], memory)
+    assert robust_gate.start_undone(0, 1.0, memory) == pytest.approx(-8.0)
+    assert robust_gate.start_undone(0, 1.2, memory) == 0.0
+    robust_gate.count_widening(memory)
+    assert np.array_equal(memory[robust_gate.FIRST_VARIANCE :], [9.0, 9.0, 9.0])
+    assert (memory[robust_gate.LEVEL], memory[robust_gate.NIS], memory[robust_gate.DEGREES]) == (1.0, 0.0, 0.0)
+    assert robust_gate.restart_attitude(0.1, memory) == pytest.approx(0.3)
+    assert robust_gate.restart_attitude(1.0, memory) == robustness.UNIFORM_SIGMA
+
+
 def test_a_widened_challenger_is_one_that_started_wider():
     """Of the information of all that it has seen, P⁻¹, that of its start counts a ninth: in matrices, without a gain."""
-    from strapdown.kernels import robust_loop
     from strapdown.mekf.states import covariance_matrices, pack
 
     rng = np.random.default_rng(3)
@@ -340,8 +421,8 @@ def test_a_widened_challenger_is_one_that_started_wider():
         bias, first = rng.standard_normal(3), 1e-7 * rng.standard_normal(3)
         states = np.zeros((2, 28))
         states[1] = pack(np.array([1.0, 0.0, 0.0, 0.0]), bias, P)
-        memory = np.zeros(robust_loop.MEMORY)
-        memory[robust_loop.FIRST_BIAS :] = [*(bias + first), *variance]
+        memory = np.zeros(robust_gate.MEMORY)
+        memory[robust_gate.FIRST_BIAS :] = [*(bias + first), *variance]
         robust_loop.widen(states, memory)
         expected = np.linalg.inv(seen + np.diag([0.0, 0.0, 0.0, *(1.0 / (9.0 * variance))]))
         # The mean solves P⁻¹ x = seen x̂ + start, of which the start's part shrinks too.
@@ -349,7 +430,7 @@ def test_a_widened_challenger_is_one_that_started_wider():
         assert np.allclose(covariance_matrices(states[1, 7:]), expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
         assert np.allclose(states[1, 4:7] - bias, mean[3:], rtol=1e-6, atol=1e-14)
         assert np.allclose(quaternion.log(states[1, :4]), mean[:3], rtol=1e-6, atol=1e-14)
-        assert np.allclose(memory[robust_loop.FIRST_BIAS + 3 :], 9.0 * variance)
+        assert np.allclose(memory[robust_gate.FIRST_BIAS + 3 :], 9.0 * variance)
 
 
 def test_a_prior_is_seen_from_elsewhere_as_its_turn_and_tilt_say():
@@ -610,8 +691,12 @@ def test_robust_smoothing_is_better_and_consistent():
 def test_the_smoother_does_not_smooth_across_a_recovery():
     record = simulate(scenario(duration=3.0), 3)
     lost = replace(started(record, 0), attitude=quaternion.multiply(record.truth.attitude[0], [0.0, 0.6, 0.8, 0.0]))
-    with pytest.raises(InputError, match=r"recovered at .* s, where the trajectory breaks"):
-        smoother.run(record, NOISE, lost, gate=Gate())
+    filtered, smoothed = (run(record, NOISE, lost, gate=Gate()) for run in (mekf.run, smoother.run))
+    (event,) = filtered.events
+    assert smoothed.events == (event,)
+    first = int(np.searchsorted(record.time, event.start))
+    assert np.allclose(smoothed.attitude[:first], filtered.attitude[:first], rtol=0.0, atol=1e-12)
+    assert np.all(np.abs(errors(smoothed, record)[first:]) < 5.0 * smoothed.sigma[first:])
 
 
 # ------------------------------------------------------------------------------------------------------------------------ the monitor

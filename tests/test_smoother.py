@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from strapdown import coning, consistency, kinematics, mekf, motion, quaternion, records, smoother
+from strapdown import augmented, coning, consistency, kinematics, mekf, motion, quaternion, records, smoother
 from strapdown.checks import InputError
 from strapdown.kernels import smoother_lag, smoother_loop, smoother_step
 from strapdown.kernels.machine import compiled
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.mekf import ProcessNoise
 from strapdown.records import Estimate, ImuRecord, Truth
+from strapdown.robustness import Gate
 from strapdown.vectors import VectorMeasurements, triad
 
 DOWN, NORTH, STAR = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]), np.array([0.6, 0.48, 0.64])
@@ -713,7 +714,8 @@ def test_fixed_lag_where_corrections_are_large(angle: float) -> None:
 def test_plain_python_equals_compiled_for_a_lag() -> None:
     case = dataclasses.replace(CASES["asynchronous"], duration=1.0)
     record, initial = believed(case, np.random.default_rng(9))
-    _, segments, starts = smoother._filtered(record, case.noise, initial)
+    _, event_time, segments = smoother._filtered(record, case.noise, initial)
+    starts = smoother._starts(record, event_time, segments)
     first = np.arange(len(record.time) - 12)
     results = []
     for back in (smoother_lag.smooth_lagged, compiled(smoother_lag.smooth_lagged)):
@@ -766,6 +768,265 @@ def test_a_negative_lag_is_refused() -> None:
     record, initial = believed(case, np.random.default_rng(9))
     with pytest.raises(InputError, match="lag is -1 s; it must not be negative"):
         smoother.run_fixed_lag(record, case.noise, initial, lag=-1.0)
+
+
+# ------------------------------------------------------------------------------------------------- recoveries, and lost digits
+
+GATE = Gate(recovery=5, restart_bias_sigma=3e-3)
+WELL_SEEN = dataclasses.replace(
+    CASES["directions"],
+    duration=5.0,
+    bias_sigma=3e-3,
+    sensors=(("direction", DOWN, 0.01, (0.1, 0.04)), ("direction", NORTH, 0.01, (0.1, 0.09))),
+)
+
+
+def far_off(seed: int, sensors: tuple = WELL_SEEN.sensors) -> tuple[ImuRecord, mekf.State]:
+    """A record, and a start off by an angle that it does not believe in."""
+    rng = np.random.default_rng([6, seed])
+    record, initial = believed(dataclasses.replace(WELL_SEEN, sensors=sensors), rng)
+    axis = quaternion.normalize(np.append(rng.standard_normal(3), 0.0))[:3]
+    turn = quaternion.exp(rng.uniform(0.5, 3.1) * axis)
+    return record, dataclasses.replace(initial, attitude=quaternion.multiply(record.truth.attitude[0], turn))
+
+
+def recovery_of(estimate: Estimate) -> records.Event:
+    found = [event for event in estimate.events if event.kind == "recovery"]
+    assert len(found) == 1
+    return found[0]
+
+
+def test_a_lost_stretch_is_told_by_what_was_measured_from_its_beginning_on() -> None:
+    record, initial = far_off(1)
+    filtered = mekf.run(record, NOISE, initial, gate=GATE, full_covariance=True)
+    smoothed = smoother.run(record, NOISE, initial, gate=GATE, full_covariance=True)
+    event = recovery_of(filtered)
+    assert smoothed.events == filtered.events
+    first, last = np.searchsorted(record.time, [event.start, event.end])
+    assert last - first > 10
+    assert np.min(np.max(np.abs(errors(filtered, record) / filtered.sigma)[first:last], axis=1)) > 10.0
+    assert np.max(np.abs(errors(smoothed, record) / smoothed.sigma)[first:]) < 5.0
+    # The smoother of a filter that starts there knowing nothing, linearised about the truth.
+    rest = records.cut(record, first, len(record.time) - 1)
+    fresh = mekf.initial_state(record.truth.attitude[first], attitude_sigma=2.0, bias_sigma=math.sqrt(2.0) * 3e-3)
+    known = smoother.run(rest, NOISE, fresh, full_covariance=True)
+    off = quaternion.log(quaternion.multiply(quaternion.conjugate(smoothed.attitude[first:]), known.attitude))
+    assert np.max(np.abs(off) / known.sigma[:, :3]) < 0.8
+    np.testing.assert_allclose(smoothed.sigma[first:], known.sigma, rtol=0.2)
+    # The end state is the filter's, and what came before the first refusal has not heard of what came after.
+    for name in ("attitude", "bias", "covariance"):
+        np.testing.assert_array_equal(getattr(smoothed, name)[-1], getattr(filtered, name)[-1])
+        np.testing.assert_allclose(getattr(smoothed, name)[0], getattr(filtered, name)[0], rtol=1e-9, atol=1e-15)
+
+
+def test_of_a_filter_that_is_lost_on_its_way_the_part_before_is_smoothed_too() -> None:
+    """A turn in a gap of the gyro's: the sensors are refused from there on."""
+    record, _ = far_off(2)
+    initial = mekf.initial_state(record.truth.attitude[0], attitude_sigma=0.03, bias_sigma=3e-3)
+    middle = 120
+    turn = quaternion.exp([0.0, 1.2, 0.7])
+    after = record.time >= record.time[middle]
+    moved = tuple(
+        dataclasses.replace(
+            s,
+            vector_b=np.where(
+                (s.time > record.time[middle])[:, None],
+                quaternion.rotate(quaternion.conjugate(turn), s.vector_b),
+                s.vector_b,
+            ),
+        )
+        for s in record.vectors
+    )
+    # After it the body's axes are others: q ⊗ turn, and the gyro's with them.
+    increments = record.increments.copy()
+    increments[middle:] = quaternion.rotate(quaternion.conjugate(turn), increments[middle:])
+    truth = Truth(
+        attitude=np.where(after[:, None], quaternion.multiply(record.truth.attitude, turn), record.truth.attitude),
+        bias=np.where(
+            after[:, None], quaternion.rotate(quaternion.conjugate(turn), record.truth.bias), record.truth.bias
+        ),
+    )
+    record = ImuRecord(time=record.time, increments=increments, vectors=moved, truth=truth)
+    both = smoother.run(record, NOISE, initial, gate=GATE, full_covariance=True)
+    event = recovery_of(both)
+    first = int(np.searchsorted(record.time, event.start))
+    assert middle <= first < middle + 8
+    off = np.abs(errors(both, record) / both.sigma)
+    assert np.max(off[:middle]) < 5.0
+    assert np.max(off[first:]) < 5.0
+    # Before it: the smoother of the record that ends with the first refusal, whose measurement was not taken in.
+    known = smoother.run(records.cut(record, 0, first - 1), NOISE, initial, gate=GATE, full_covariance=True)
+    assert_same(
+        known,
+        dataclasses.replace(
+            both, **{n: getattr(both, n)[:first] for n in ("attitude", "bias", "variance", "covariance")}
+        ),
+        1e-9,
+    )
+    ahead = mekf.run(record, NOISE, initial, gate=GATE)
+    assert np.all(both.sigma[20:middle] < ahead.sigma[20:middle])
+
+
+def test_what_lies_between_the_first_refusal_and_the_last_challenger_is_the_filters() -> None:
+    """Directions at random for a while, which no challenger can follow."""
+    record, initial = far_off(1)
+    rng = np.random.default_rng(1)
+    vectors = []
+    for s in record.vectors:
+        z = rng.standard_normal((len(s.time), 3))
+        z /= np.linalg.norm(z, axis=1, keepdims=True)
+        vectors.append(dataclasses.replace(s, vector_b=np.where((s.time < 0.6)[:, None], z, s.vector_b)))
+    record = dataclasses.replace(record, vectors=tuple(vectors))
+    filtered = mekf.run(record, NOISE, initial, gate=GATE, full_covariance=True)
+    smoothed = smoother.run(record, NOISE, initial, gate=GATE, full_covariance=True)
+    event = recovery_of(smoothed)
+    assert event.start < 0.1
+    between = (record.time > event.start) & (record.time < 0.6)
+    for name in ("attitude", "bias", "covariance"):
+        np.testing.assert_array_equal(getattr(smoothed, name)[between], getattr(filtered, name)[between])
+    after = record.time > 0.7
+    assert event.end > 0.8
+    assert np.max(np.abs(errors(smoothed, record) / smoothed.sigma)[after]) < 5.0
+
+
+def test_several_recoveries_and_a_record_in_parts() -> None:
+    """The second part begins while the filter is lost: what took over then begins with the part at the earliest."""
+    record, initial = far_off(1)
+    turn = quaternion.exp([0.3, -1.0, 0.5])
+    back = quaternion.conjugate(turn)
+    increments = record.increments.copy()
+    increments[120:] = quaternion.rotate(back, increments[120:])
+    vectors = tuple(
+        dataclasses.replace(
+            s, vector_b=np.where((s.time > record.time[120])[:, None], quaternion.rotate(back, s.vector_b), s.vector_b)
+        )
+        for s in record.vectors
+    )
+    later = (record.time >= record.time[120])[:, None]
+    truth = Truth(
+        attitude=np.where(later, quaternion.multiply(record.truth.attitude, turn), record.truth.attitude),
+        bias=np.where(later, quaternion.rotate(back, record.truth.bias), record.truth.bias),
+    )
+    twice = ImuRecord(time=record.time, increments=increments, vectors=vectors, truth=truth)
+    whole = smoother.run(twice, NOISE, initial, gate=GATE, full_covariance=True)
+    on_factors = augmented.smooth(twice, NOISE, initial, gate=GATE, full_covariance=True)
+    assert_same(whole, on_factors, 1e-9)
+    assert [event.kind for event in whole.events] == ["recovery", "recovery"]
+    first, second = np.searchsorted(record.time, [event.start for event in whole.events])
+    off = np.max(np.abs(errors(whole, twice) / whole.sigma), axis=1)
+    assert np.max(off[first:120]) < 5.0
+    assert np.max(off[second:]) < 5.0
+    middle = int(np.searchsorted(record.time, whole.events[0].end)) - 8
+    _, state = mekf.run_on(records.cut(twice, 0, middle), NOISE, initial, gate=GATE)
+    rest = records.cut(twice, middle, len(twice.time) - 1)
+    part = smoother.run(rest, NOISE, state, gate=GATE, full_covariance=True)
+    off = np.max(np.abs(errors(part, rest) / part.sigma), axis=1)
+    assert np.max(off[: 120 - middle]) < 5.0
+    assert part.events == whole.events
+
+
+ON_EDGES = tuple(
+    (kind, reference, sigma, np.arange(first, 250, 5) / 50.0)
+    for first, (kind, reference, sigma, _) in zip((2, 4), WELL_SEEN.sensors, strict=True)
+)
+
+
+@pytest.mark.parametrize(("lag", "sensors"), [(0.1, WELL_SEEN.sensors), (0.7, WELL_SEEN.sensors), (0.1, ON_EDGES)])
+def test_a_fixed_lag_knows_of_a_recovery_when_it_has_happened(lag: float, sensors: tuple) -> None:
+    record, initial = far_off(1, sensors)
+    lagged = smoother.run_fixed_lag(record, NOISE, initial, lag=lag, gate=GATE, full_covariance=True)
+    event = recovery_of(lagged)
+    first, last = np.searchsorted(record.time, [event.start, event.end])
+    steps = round(50 * lag)
+    for k in {0, 1, first, first + 5, last - steps - 1, last - steps, last - steps + 1, last - 1, last, last + 3, 240}:
+        if k < 0:
+            continue
+        part = records.cut(record, 0, min(k + steps, len(record.time) - 1))
+        known = smoother.run(part, NOISE, initial, gate=GATE, full_covariance=True)
+        assert (len(known.events) > 0) == (part.time[-1] >= event.end)
+        np.testing.assert_allclose(lagged.attitude[k], known.attitude[k], rtol=0, atol=1e-12)
+        np.testing.assert_allclose(lagged.variance[k], known.variance[k], rtol=1e-9)
+
+
+def nees_of_recoveries(runs: int) -> np.ndarray:
+    """In the middle of the lost stretch, at the recovery, and later (runs, 3)."""
+    nees = []
+    for run in range(runs):
+        record, initial = far_off(100 + run)
+        both = smoother.run(record, NOISE, initial, gate=GATE, full_covariance=True)
+        event = recovery_of(both)
+        first, last = np.searchsorted(record.time, [event.start, event.end])
+        rows = [(first + last) // 2, last, 200]
+        nees.append(consistency.nees(errors(both, record)[rows], both.covariance[rows]))
+    return np.array(nees)
+
+
+def test_lost_stretches_are_to_be_believed() -> None:
+    mean = nees_of_recoveries(40).mean(axis=0) / 6.0
+    low, high = consistency.mean_bounds(6, 40, 0.999)
+    assert np.all((low < mean) & (mean < high)), (mean, low, high)
+
+
+@pytest.mark.slow
+def test_lost_stretches_are_to_be_believed_over_many_runs() -> None:
+    nees = nees_of_recoveries(1000)
+    verdict = consistency.Verdict(mean=nees.mean(axis=0) / 6.0, degrees=6, runs=1000, probability=0.99)
+    assert verdict.consistent, (verdict.mean, verdict.simultaneous_bounds)
+
+
+def test_a_measurement_that_leaves_no_digits_is_smoothed_on_the_square_root() -> None:
+    """The last of three directions to a nanoradian, at a start known to a radian: each σ against the information summed in 60 digits.
+
+    The body rests and nothing drives it to speak of, so what is known of any edge is one constant state seen over and over.
+    """
+    sharp, first = 1e-9, (1.0, 0.1)
+    time = np.arange(13) * 0.25
+    references = np.array([[1.0, 0.0, 0.0], [0.0, 0.6, 0.8], [0.6, -0.8, 0.0]])
+    series = tuple(
+        VectorMeasurements(
+            sensor=f"s{k}",
+            kind="direction",
+            time=time[1 + k :: 3],
+            vector_b=np.tile(r, (4, 1)),
+            reference_f=r,
+            sigma=np.full(4, sharp),
+        )
+        for k, r in enumerate(references)
+    )
+    record = ImuRecord(time=time, increments=np.zeros((12, 3)), vectors=series)
+    initial = mekf.initial_state(quaternion.IDENTITY, attitude_sigma=first[0], bias_sigma=first[1])
+    noise = ProcessNoise(angle_random_walk=1e-18, rate_random_walk=0.0)
+    both = smoother.run(record, noise, initial, full_covariance=True)
+    with mpmath.workdps(60):
+        information = mpmath.diag([1 / mpmath.mpf(first[0]) ** 2] * 3 + [1 / mpmath.mpf(first[1]) ** 2] * 3)
+        for k, r in enumerate(references):
+            unit = mpmath.matrix(r.tolist()) / mpmath.norm(mpmath.matrix(r.tolist()))
+            across = mpmath.eye(3) - unit * unit.T  # uᵀu + vᵀv of the two rows across a direction
+            for t in time[1 + k :: 3]:
+                F = mpmath.zeros(3, 6)
+                for i in range(3):
+                    F[i, i], F[i, i + 3] = 1, -mpmath.mpf(float(t))
+                information += F.T * across * F / mpmath.mpf(sharp) ** 2
+        start = information**-1
+        for k in (0, 6, 12):
+            F = mpmath.eye(6)
+            for i in range(3):
+                F[i, i + 3] = -mpmath.mpf(float(time[k]))
+            P = F * start * F.T
+            sigma = [float(mpmath.sqrt(P[i, i])) for i in range(6)]
+            np.testing.assert_allclose(both.sigma[k], sigma, rtol=1e-6)
+            np.testing.assert_allclose(
+                both.covariance[k] / np.outer(sigma, sigma),
+                [[float(P[i, j] / mpmath.sqrt(P[i, i] * P[j, j])) for j in range(6)] for i in range(6)],
+                rtol=0,
+                atol=1e-6,
+            )
+    assert both.innovations["s0"].nis.max() < 1e-6
+    ahead = mekf.run(record, noise, initial, full_covariance=True)
+    np.testing.assert_allclose(both.sigma[-1], ahead.sigma[-1], rtol=1e-6)
+    lagged = smoother.run_fixed_lag(record, noise, initial, lag=1.0)
+    known = smoother.run(records.cut(record, 0, 6), noise, initial)
+    np.testing.assert_allclose(lagged.sigma[2], known.sigma[2], rtol=1e-9)
 
 
 # ------------------------------------------------------------------------------------------------------------------------ kernels
@@ -969,7 +1230,8 @@ def test_one_step_keeps_its_digits_where_the_covariance_is_ill_conditioned(decad
 def test_plain_python_equals_compiled() -> None:
     case = dataclasses.replace(CASES["asynchronous"], duration=2.0)
     record, initial = believed(case, np.random.default_rng(9))
-    _, segments, starts = smoother._filtered(record, case.noise, initial)
+    _, event_time, segments = smoother._filtered(record, case.noise, initial)
+    starts = smoother._starts(record, event_time, segments)
     results = []
     for back in (smoother_loop.smooth_back, compiled(smoother_loop.smooth_back)):
         out = [np.empty((len(record.time), size)) for size in (4, 3, 6, 21)]
@@ -993,7 +1255,8 @@ def test_edges_are_found_exactly() -> None:
     record = ImuRecord(time=time, increments=rng.uniform(-1.0, 1.0, (59, 3)), vectors=(series,))
     noise = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-5)
     initial = mekf.initial_state(quaternion.IDENTITY, attitude_sigma=0.1, bias_sigma=0.01)
-    _, segments, starts = smoother._filtered(record, noise, initial)
+    _, event_time, segments = smoother._filtered(record, noise, initial)
+    starts = smoother._starts(record, event_time, segments)
     filtered = mekf.run(record, noise, initial, full_covariance=True)
     np.testing.assert_array_equal(segments[starts, 4:8], filtered.attitude)
     np.testing.assert_array_equal(mekf.covariance_matrices(segments[starts, 11:]), filtered.covariance)

@@ -30,8 +30,9 @@ A filter setup (:mod:`strapdown.setup`) holds such states as :class:`States`, in
 chooses them.
 
 Modules: ``blocks`` what can be declared, ``model`` blocks as arrays, ``filtering`` the compiled filter, ``stepping`` the step-by-step one,
-``smoothing`` the smoother, ``observing`` the observability report, ``turning`` rate and angular acceleration for lever arms, ``states``
-what a setup holds, ``matching`` which of them a specification calls for.
+``smoothing`` the smoother, ``joining`` what it makes of recoveries, ``stepwise`` the one for blocks told by functions, ``observing`` the
+observability report, ``turning`` rate and angular acceleration for lever arms, ``states`` what a setup holds, ``matching`` which of them a
+specification calls for.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ from strapdown.augmented.blocks import (
 from strapdown.augmented.filtering import AugmentedEstimate, BlockEstimate, run, run_on
 from strapdown.augmented.model import AugmentedState, initial_state
 from strapdown.augmented.observing import Observability, observability
-from strapdown.augmented.smoothing import recentred, smooth
+from strapdown.augmented.smoothing import recentred, smooth, smooth_fixed_lag
 from strapdown.augmented.states import SensorStates, States
 from strapdown.augmented.stepping import StepFilter
 
@@ -87,4 +88,5 @@ __all__ = [
     "run",
     "run_on",
     "smooth",
+    "smooth_fixed_lag",
 ]

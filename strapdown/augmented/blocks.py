@@ -568,6 +568,10 @@ class GaussMarkov(LinearBlock):
             return {self.sensor: Effect(offset_b=axes, varying=self.varying)}
         return {self.sensor: Effect(offset_f=axes, carried=True, varying=self.varying)}
 
+    def retold(self, values: Array, turn: Array) -> Array:
+        """Turn the vector that the states are in fixed axes."""
+        return quaternion.rotate(turn, values) if self.frame == "fixed" else values
+
 
 @dataclass(frozen=True, kw_only=True)
 class BoundedVelocity(LinearBlock):

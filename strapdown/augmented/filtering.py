@@ -11,39 +11,22 @@ from numpy.typing import ArrayLike
 from strapdown import mekf, quaternion
 from strapdown.augmented import model as modelling
 from strapdown.augmented.blocks import Block
-from strapdown.augmented.model import AugmentedState, Model
+from strapdown.augmented.model import AugmentedGateMemory, AugmentedState, Model
 from strapdown.augmented.turning import turning
 from strapdown.checks import Array, InputError, count
-from strapdown.kernels import augmented_loop, augmented_robust, robust_loop, robust_step
+from strapdown.kernels import augmented_loop, augmented_robust
 from strapdown.kernels.augmented_chain import LINKS
 from strapdown.kernels.augmented_step import OFFSET
 from strapdown.kernels.machine import compiled
+from strapdown.kernels.robust_gate import CHALLENGED
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.mekf import ProcessNoise, Schedule
+from strapdown.mekf.judging import event_rows, gate_events, kernel_options, remembered
 from strapdown.mekf.scheduling import skipped_too
+from strapdown.mekf.states import first_bias_variance, restart_bias_variance
 from strapdown.records import Estimate, Event, ImuRecord
-from strapdown.robustness import LOCK_OUT, Gate, GateMemory, Robust
+from strapdown.robustness import Gate, Robust
 from strapdown.vectors import KINDS, VectorMeasurements
-
-
-@dataclass(frozen=True, kw_only=True)
-class AugmentedGateMemory(GateMemory):
-    """What a gate remembers with optional states; ``challenger`` holds q, (b, c) and the factor of P in the kernels' order."""
-
-    start: float
-    """Time that the first part of the record began, s."""
-    values: Array
-    """What a challenger takes the blocks for at that time (m,)."""
-    covariance: Array
-    """The covariance of them (m, m)."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class PartState(AugmentedState):
-    """State at the end of a part of a record."""
-
-    gate: AugmentedGateMemory | None = None
-    """What its gate remembers."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,8 +234,7 @@ def run_events(
     steps = np.empty((model.states, 3)), np.empty(model.states)
     rows_of = np.empty((3, size)), np.empty(3), np.empty(3), np.empty((3, 3))
     out = (every, attitude_out, x_out, variance, P, told, told_covariance, innovation)
-    recovered: tuple[Event, ...] = ()
-    locked_out: tuple[Event, ...] = ()
+    judged: list[Event] = []
     memory: AugmentedGateMemory | None = None
     if plain:
         number = compiled(augmented_loop.run_augmented)(
@@ -272,18 +254,14 @@ def run_events(
         )
     else:
         weight = np.empty(len(events.time))
-        # Either takes at least two refusals, but for a lock-out that goes on.
-        recoveries = np.empty((len(events.time) // 2, 4))
-        lock_outs = np.empty((len(events.time) // 2 + len(events.sensors), 4))
+        recoveries, lock_outs = event_rows(len(events.time), len(events.sensors))
         attitudes, xs, Fs = (np.stack([one, one]) for one in (attitude, x, F))
-        before = getattr(state, "gate", None) if gate is not None else None
-        first = _first(state, blocks, float(record.time[0])) if before is None else before
-        counts, standing = _remembered(before, events.sensors)
-        if before is not None and before.counts[robust_loop.CHALLENGED]:
-            attitudes[1], xs[1] = before.challenger[:4], before.challenger[4 : 4 + len(x)]
-            Fs[1, :size, :size] = before.challenger[4 + len(x) :].reshape(size, size)
-        if gate is None or not gate.recovery:
-            counts[robust_loop.CHALLENGED] = 0.0
+        counts, standing = remembered(gate, state.gate, events.sensors)
+        if state.gate is not None and counts[CHALLENGED]:
+            rival = state.gate.challenger
+            attitudes[1], xs[1] = rival[:4], rival[4 : 4 + len(x)]
+            Fs[1, :size, :size] = rival[4 + len(x) :].reshape(size, size)
+        first = state.gate or _first(state, blocks, float(record.time[0]))
         number, found, locked = compiled(augmented_robust.run_augmented_robust)(
             *believed,
             events.time,
@@ -291,7 +269,11 @@ def run_events(
             events.vector_b,
             events.body_noise,
             *measured,
-            *_options(gate, robust, first, model),
+            *kernel_options(gate, robust),
+            np.sqrt(restart_bias_variance(gate, state)),
+            first.values[model.order],
+            modelling.lower_root(first.covariance[np.ix_(model.order, model.order)]),
+            first.start,
             standing,
             counts,
             attitudes,
@@ -308,18 +290,14 @@ def run_events(
         )
         attitude, x, F = attitudes[0], xs[0], Fs[0]
         if gate is not None:
-            rival = np.concatenate([attitudes[1], xs[1], Fs[1, :size, :size].ravel()])
-            told_by_now = dict(zip(events.sensors, standing, strict=True))
-            memory = replace(first, challenger=rival, counts=counts, standing=told_by_now)
-        recovered = _told("recovery", recoveries[:found][:, [2, 0, 1, 3]], events.sensors)
-        lock_outs = lock_outs[:locked]
-        locked_out = _told("lock-out", lock_outs[lock_outs[:, 3] > 0.0], events.sensors)
-    if segments:
-        for event in recovered:
-            raise InputError(
-                f"the filter lost its way and recovered at {event.end:.9g} s, where the trajectory breaks; smooth the parts before "
-                f"and after {event.start:.9g} s on their own (strapdown.records.cut)"
+            memory = replace(
+                first,
+                challenger=np.concatenate([attitudes[1], xs[1], Fs[1, :size, :size].ravel()]),
+                counts=counts,
+                standing=dict(zip(events.sensors, standing, strict=True)),
             )
+        judged = gate_events(recoveries[:found], lock_outs[:locked], events.sensors)
+    if segments:
         stored[number, :4] = 0.0
         stored[number, 4:8] = attitude
         stored[number, 8 : 8 + len(x)] = x
@@ -336,7 +314,7 @@ def run_events(
         P if len(P) else None,
         innovations,
         skipped_too(events, innovations),
-        (*recovered, *locked_out),
+        judged,
     )
     if whole_bias:
         offsets = model.gyro[:, :3] * (model.gyro_use & OFFSET > 0)[:, None]
@@ -348,7 +326,7 @@ def run_events(
         )
     back = np.argsort(model.whole_order)
     root = F[:size, :size][:, back]
-    end = PartState(
+    end = AugmentedState(
         gate=memory,
         attitude=attitude,
         bias=x[:3],
@@ -359,59 +337,18 @@ def run_events(
     return estimate, end, stored[: number + 1]
 
 
-def _told(kind: str, rows: Array, sensors: tuple[str, ...]) -> tuple[Event, ...]:
-    """Return events of rows (n, 4): start and end, s, sensor and value."""
-    return tuple(
-        Event(kind=kind, start=float(start), end=float(end), sensor=sensors[int(sensor)], value=float(value))
-        for start, end, sensor, value in rows
-    )
-
-
-def _options(gate: Gate | None, robust: Robust | None, first: AugmentedGateMemory, model: Model) -> tuple[object, ...]:
-    """Return a gate and a robust update as the kernel takes them."""
-    P = first.covariance[np.ix_(model.order, model.order)]
-    added = first.restart_bias_variance
-    if gate is not None and gate.restart_bias_sigma is not None:
-        added = np.full(3, gate.restart_bias_sigma**2)
-    return (
-        np.full(3, np.inf) if gate is None else gate.thresholds,
-        0 if robust is None else {"huber": robust_step.HUBER, "student": robust_step.STUDENT}[robust.kind],
-        np.ones((3, 2)) if robust is None else robust.parameters,
-        0 if robust is None else robust.iterations,
-        0 if gate is None else gate.recovery or 0,
-        LOCK_OUT if gate is None else gate.lock_out_limit,
-        0.0 if gate is None else gate.restart_attitude_sigma,
-        np.zeros(3) if gate is None else np.sqrt(added),
-        first.values[model.order],
-        np.ascontiguousarray(np.linalg.cholesky(P[::-1, ::-1])[::-1, ::-1].T),
-        first.start,
-    )
-
-
 def _first(state: AugmentedState, blocks: tuple[Block, ...], start: float) -> AugmentedGateMemory:
     """Return what a gate knows at the start of a record."""
     values, P = restart_states(state, blocks)
     return AugmentedGateMemory(
-        restart_bias_variance=np.diag(state.covariance)[3:6].copy(),
+        restart_bias_variance=first_bias_variance(state),
         challenger=np.empty(0),
-        counts=np.zeros(robust_loop.MEMORY),
+        counts=np.empty(0),
         standing={},
         start=start,
         values=values,
         covariance=P,
     )
-
-
-def _remembered(memory: AugmentedGateMemory | None, sensors: tuple[str, ...]) -> tuple[Array, Array]:
-    """Return what the kernel goes on with: its ``memory``, and ``standing`` of these sensors."""
-    counts, standing = np.zeros(robust_loop.MEMORY), np.zeros((len(sensors), robust_loop.STANDING))
-    counts[robust_loop.PASSES] = 1.0
-    if memory is not None:
-        counts[:] = memory.counts
-        for row, sensor in zip(standing, sensors, strict=True):
-            row[:] = memory.standing.get(sensor, 0.0)
-    standing[:, robust_loop.TOLD] = -1.0
-    return counts, standing
 
 
 def restart_states(state: AugmentedState, blocks: tuple[Block, ...]) -> tuple[Array, Array]:
@@ -490,7 +427,7 @@ def packed(
     P: Array | None,
     innovations: Mapping,  # type: ignore[type-arg]
     skipped: Mapping[str, int],
-    recovered: tuple[Event, ...] = (),
+    told: Sequence[Event] = (),
 ) -> AugmentedEstimate:
     """Return the estimate in the order of outside."""
     back = np.argsort(model.whole_order)
@@ -514,7 +451,7 @@ def packed(
         covariance=None if whole is None else whole[:, :6, :6],
         innovations=innovations,
         skipped=skipped,
-        events=tuple(sorted([*mekf.gaps(edges), *recovered], key=lambda event: event.start)),
+        events=tuple(sorted([*mekf.gaps(edges), *told], key=lambda event: event.start)),
         blocks=found,
         whole_covariance=whole,
     )

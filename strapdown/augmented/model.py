@@ -16,9 +16,22 @@ from strapdown.augmented.blocks import MOST_CHAIN_DECAY, Block, Effect, GeneralB
 from strapdown.checks import Array, InputError, array, covariance, one_of, unit_quaternions
 from strapdown.kernels.augmented_chain import CHAIN, chain_start
 from strapdown.kernels.augmented_step import CARRIED, FIXED, FORCE, LEVER, NOISE_NODES, OFFSET, SCALE
+from strapdown.robustness import GateMemory
 
 MOST_DECAY = 0.5
 """Of λ dt in one step: a step back is well conditioned. For states that enter the gyro a tenth, where Gauss's rule is exact."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AugmentedGateMemory(GateMemory):
+    """What a gate remembers with optional states; ``challenger`` holds q, (b, c) and the factor of P in the kernels' order."""
+
+    start: float
+    """Time that the first part of the record began, s."""
+    values: Array
+    """What a challenger takes the blocks for at that time (m,)."""
+    covariance: Array
+    """The covariance of them (m, m)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +48,8 @@ class AugmentedState:
     """P (6 + m, 6 + m) of (δθ, δb, δc)."""
     factor: Array | None = None
     """A root R of it, ``P = Rᵀ R``, where there is one already: a filter's, which may hold what P itself has no digits for."""
+    gate: AugmentedGateMemory | None = None
+    """Of the end of a part of a record, what its gate remembers."""
 
     def __post_init__(self) -> None:
         """Check shapes, the norm and positive definiteness."""
@@ -268,12 +283,16 @@ def _uses(offset: Array, scale: Array, fixed: Array | None = None) -> np.ndarray
     return np.asarray(bits, np.int64)
 
 
+def lower_root(P: Array) -> Array:
+    """Return F, lower triangular, with ``P = Fᵀ F``."""
+    return np.ascontiguousarray(np.linalg.cholesky(P[::-1, ::-1])[::-1, ::-1].T)
+
+
 def triangle(state: AugmentedState, model: Model) -> Array:
     """Return F, lower triangular, with ``P = Fᵀ F`` in the kernels' order."""
     order = model.whole_order
     if state.factor is None:
-        P = state.covariance[np.ix_(order, order)]
-        return np.ascontiguousarray(np.linalg.cholesky(P[::-1, ::-1])[::-1, ::-1].T)
+        return lower_root(state.covariance[np.ix_(order, order)])
     root = state.factor[:, order]
     if not np.array_equal(root, np.tril(root)):
         root = np.asarray(np.linalg.qr(root[:, ::-1], mode="r"))[::-1, ::-1]

@@ -1,4 +1,4 @@
-"""The fixed-interval smoother with optional states: attitude, bias and blocks at each edge from all measurements of the record."""
+"""The smoother with optional states: attitude, bias and blocks at each edge from the measurements before and after it."""
 
 from __future__ import annotations
 
@@ -8,18 +8,23 @@ from dataclasses import replace
 import numpy as np
 
 from strapdown import kinematics, mekf, quaternion
-from strapdown.augmented import filtering
+from strapdown.augmented import filtering, joining
 from strapdown.augmented import model as modelling
 from strapdown.augmented.blocks import Block, LinearBlock
-from strapdown.augmented.filtering import AugmentedEstimate
-from strapdown.augmented.model import AugmentedState
-from strapdown.checks import InputError, count
-from strapdown.kernels import augmented_loop, smoother_loop
+from strapdown.augmented.filtering import AugmentedEstimate, BlockEstimate
+from strapdown.augmented.model import AugmentedGateMemory, AugmentedState, Model
+from strapdown.checks import Array, InputError, count, non_negative
+from strapdown.kernels import augmented_smoother
 from strapdown.kernels.augmented_chain import LINKS
 from strapdown.kernels.machine import compiled
 from strapdown.mekf import ProcessNoise
-from strapdown.records import ImuRecord
+from strapdown.records import Event, ImuRecord
 from strapdown.robustness import Gate, Robust
+
+MOST_CUT = 64
+"""Times the segments that a record takes by its increments: a filter that takes more is lost."""
+PASSES = 16
+"""Backward passes of a fixed-lag smoother that go together and share what depends on the filter alone."""
 
 
 def recentred(
@@ -64,59 +69,88 @@ def smooth(
     gate: Gate | None = None,
     robust: Robust | None = None,
 ) -> AugmentedEstimate:
-    """Return the smoother's estimate at every edge (Rauch, Tung & Striebel 1965, on the manifold and on triangular factors).
+    """Return the fixed-interval smoother's estimate at every edge (Rauch, Tung & Striebel 1965, on the manifold and on triangular factors).
 
-    Innovations are the filter's; ``gate`` and ``robust`` are as for :func:`strapdown.augmented.run`. Linear blocks only. Memory:
-    8 (n (n + 1)/2 + n + 5) bytes for each gyro interval and measurement, n states: 1.7 kB at n = 18.
+    Innovations and events are the filter's; ``gate`` and ``robust`` are as for :func:`strapdown.augmented.run`. Where the gate has
+    recovered, each trajectory is smoothed by itself, as :mod:`strapdown.smoother` says; with a lever arm, or a block told by functions, the
+    second begins only with the recovery, and from the first refusal to there the rows are the filter's own.
+
+    Linear blocks run compiled. Memory: 8 (n (n + 1)/2 + n + 5) bytes for each gyro interval and measurement, n states: 1.7 kB at n = 18.
+    With a block told by functions all goes in matrices in Python, some thousand times slower, and takes 40 n² bytes.
     """
+    return smoothed(record, process_noise, initial, blocks, np.inf, full_covariance, gate, robust)
+
+
+def smooth_fixed_lag(
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    initial: mekf.State | AugmentedState,
+    blocks: Sequence[Block] = (),
+    *,
+    lag: float,
+    full_covariance: bool = False,
+    gate: Gate | None = None,
+    robust: Robust | None = None,
+) -> AugmentedEstimate:
+    """Return the fixed-lag smoother's estimate: at each edge t, what the measurements up to the last edge at or before t + lag tell.
+
+    Exact: equal to :func:`smooth` on the record cut there. Work grows with the number of gyro intervals in ``lag``: for every edge one
+    backward step each, of half the time that the fixed interval's takes, for what depends on the filter alone is computed once for
+    :data:`PASSES` edges. ``lag`` in s; 0 is the filter, the length of the record or more is :func:`smooth`.
+    """
+    lag = non_negative("lag", lag, unit="s")
+    return smoothed(record, process_noise, initial, blocks, lag, full_covariance, gate, robust)
+
+
+def smoothed(
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    initial: mekf.State | AugmentedState,
+    blocks: Sequence[Block],
+    lag: float,
+    full_covariance: bool,
+    gate: Gate | None,
+    robust: Robust | None,
+) -> AugmentedEstimate:
+    """Return the smoother's estimate with a lag, s, infinite for the fixed interval."""
     blocks = modelling.as_blocks(blocks)
     state = modelling.begin(initial, blocks)
     if modelling.general(blocks):
-        names = [block.name for block in blocks if modelling.general((block,))]
-        raise InputError(f"the smoother takes linear blocks only, not {', '.join(names)}; leave it out")
-    events, model = filtering.prepared(record, blocks)
-    segments = filtering.most_segments(record, model, len(events.time))
-    forward, _, stored = filtering.run_events(
-        record,
-        events,
-        model,
-        process_noise,
-        state,
-        blocks,
-        every=len(record.time),
-        segments=segments,
-        gate=gate,
-        robust=robust,
-    )
-    edges, size, noise = len(record.time), 6 + model.states, model.noise_rows
-    starts = np.empty(edges, np.int64)
-    compiled(smoother_loop.locate_edges)(record.time, events.time, stored, len(stored) - 1, starts)
-    attitude, x, variance = np.empty((edges, 4)), np.empty((edges, size - 3)), np.empty((edges, size))
-    P = np.empty((edges if full_covariance else 0, size, size))
-    compiled(augmented_loop.smooth_augmented)(
-        stored,
-        starts,
-        process_noise.angle_random_walk**2,
-        process_noise.rate_random_walk**2,
-        model.decay,
-        model.density,
-        model.changing,
-        model.gyro,
-        model.gyro_use,
-        tuple(model.force_f.tolist()),
-        model.chains,
-        np.empty((len(model.chains), LINKS)),
-        np.empty(size - 3),
-        np.empty((size + noise, size + noise)),
-        np.empty(size - 3),
-        np.empty((size + noise + 1, size)),
-        np.empty((noise, size)),
-        (np.empty((model.states, 3)), np.empty(model.states), np.empty((noise, size)), np.empty(size + noise)),
-        attitude,
-        x,
-        variance,
-        P,
-    )
+        return _stepwise(record, process_noise, state, blocks, lag, full_covariance, gate, robust)
+    forward, model, event_time, segments = _filtered(record, process_noise, state, blocks, gate, robust)
+    breaks: list[joining.Break] = []
+    again: list[joining.Again] = []
+    recovered = joining.recoveries(forward.events)
+    if recovered:
+        assert gate is not None
+        breaks, again = _begun_again(
+            record,
+            process_noise,
+            None if model.levers.any() else state,
+            blocks,
+            recovered,
+            event_time,
+            segments,
+            gate,
+            robust,
+        )
+    edges, size = len(record.time), 6 + model.states
+    shapes = (edges, 4), (edges, size - 3), (edges, size), (edges if full_covariance else 0, size, size)
+    outputs = [np.empty(shape) for shape in shapes]
+    turn = np.empty((edges, 4))
+    until = joining.last_seen(record.time, lag)
+    first = joining.starts(joining.stops(record.time, breaks), event_time, segments)
+    for one in joining.trajectories(record.time, until, breaks, first, segments, again):
+        written = [np.empty((len(first) if len(out) else 0, *out.shape[1:])) for out in outputs] if breaks else outputs
+        for stretch in joining.climbing(one.last):
+            _go_back(model, process_noise, one, stretch, written)
+        if breaks:
+            for out, there in zip(outputs, written, strict=True):
+                if len(out):
+                    out[one.row] = there[one.edge]
+        filtered = one.segments[one.starts[one.edge], 4:8]
+        turn[one.row] = quaternion.multiply(outputs[0][one.row], quaternion.conjugate(filtered))
+    attitude, x, variance, P = outputs
     found = filtering.packed(
         model,
         blocks,
@@ -129,11 +163,182 @@ def smooth(
         forward.innovations,
         forward.skipped,
     )
-    # The way back leaves what is known relative to the attitude relative to the filter's.
-    turn = quaternion.multiply(attitude, quaternion.conjugate(stored[starts, 4:8]))
-    told = {
+    return replace(found, blocks=_retold(found, blocks, turn), events=forward.events)
+
+
+def _stepwise(
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    state: AugmentedState,
+    blocks: tuple[Block, ...],
+    lag: float,
+    full_covariance: bool,
+    gate: Gate | None,
+    robust: Robust | None,
+) -> AugmentedEstimate:
+    """Smooth with blocks told by functions."""
+    from strapdown.augmented import stepwise
+
+    forward, rows, filtered = stepwise.smooth(record, process_noise, state, blocks, lag, gate, robust)
+    attitude, x, P = (np.array([getattr(row, name) for row in rows]) for name in ("attitude", "others", "covariance"))
+    model = modelling.assemble(blocks, {series.sensor: series.kind for series in record.vectors})
+    found = filtering.packed(
+        replace(model, order=np.arange(model.states)),
+        blocks,
+        record.time,
+        1,
+        attitude,
+        x,
+        np.einsum("kii->ki", P),
+        P if full_covariance else None,
+        forward.innovations,
+        forward.skipped,
+    )
+    turn = quaternion.multiply(attitude, quaternion.conjugate(filtered))
+    return replace(found, blocks=_retold(found, blocks, turn), events=forward.events)
+
+
+def _retold(found: AugmentedEstimate, blocks: tuple[Block, ...], turn: Array) -> dict[str, BlockEstimate]:
+    """Return the blocks relative to the smoothed attitude: the way back leaves what is relative to one relative to the filter's."""
+    return {
         block.name: replace(found.blocks[block.name], values=block.retold(found.blocks[block.name].values, turn))
-        for block in blocks
         if isinstance(block, LinearBlock)
+        else found.blocks[block.name]
+        for block in blocks
     }
-    return replace(found, blocks=told)
+
+
+def _filtered(
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    state: AugmentedState,
+    blocks: tuple[Block, ...],
+    gate: Gate | None,
+    robust: Robust | None,
+) -> tuple[AugmentedEstimate, Model, Array, Array]:
+    """Run the filter and keep its segments; return its estimate, the model, the times of events, and the segments with the end state."""
+    events, model = filtering.prepared(record, blocks)
+    usual = most = filtering.most_segments(record, model, len(events.time))
+    while True:
+        # One more than it should take, which tells whether it took more.
+        forward, _, segments = filtering.run_events(
+            record,
+            events,
+            model,
+            process_noise,
+            state,
+            blocks,
+            every=len(record.time),
+            segments=most + 1,
+            gate=gate,
+            robust=robust,
+        )
+        if len(segments) - 1 <= most:
+            return forward, model, events.time, segments
+        # Steps are cut by the turn without the bias, which is known only when they are taken.
+        most *= 4
+        if most > MOST_CUT * usual:
+            raise InputError(
+                "the filter lost its way: by the bias that it found the body turns many times round in each gyro interval; "
+                "look at the record and the start with augmented.run first"
+            )
+
+
+def _begun_again(
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    state: AugmentedState | None,
+    blocks: tuple[Block, ...],
+    recovered: Sequence[Event],
+    event_time: Array,
+    segments: Array,
+    gate: Gate,
+    robust: Robust | None,
+) -> tuple[list[joining.Break], list[joining.Again]]:
+    """Return the breaks of a record, and what took over at each, from its start to the recovery.
+
+    Without the ``state`` at the start of the record a trajectory begins with the recovery.
+    """
+    breaks: list[joining.Break] = []
+    again: list[joining.Again] = []
+    begin = float(record.time[0])
+    for event in recovered:
+        memory: AugmentedGateMemory | None = None
+        if state is not None:
+            before = joining.part(record, begin, event.end)
+            _, state = filtering.run_on(
+                before, process_noise, state, blocks, every=len(before.time), gate=gate, robust=robust
+            )
+            memory = state.gate
+            begin = event.end
+        one = joining.break_of(event, memory, float(record.time[0]))
+        breaks.append(one)
+        if memory is None or one.since == one.end:
+            again.append(None)
+            continue
+        bias, variance, counts = joining.begun(gate, memory)
+        values, P = _aged(blocks, memory, one.since)
+        stop = joining.stops(record.time, [one])
+        lost = joining.starts(stop, event_time, segments)[np.searchsorted(stop, one.since)]
+        whole = np.diag(np.concatenate([variance, np.zeros(len(values))]))
+        whole[6:, 6:] = P
+        fresh = AugmentedState(
+            attitude=segments[lost, 4:8],
+            bias=bias,
+            values=values,
+            covariance=whole,
+            gate=replace(memory, counts=counts),
+        )
+        stretch = joining.part(record, one.since, one.end)
+        _, _, times, rows = _filtered(stretch, process_noise, fresh, blocks, replace(gate, recovery=None), robust)
+        again.append((rows, joining.starts(stretch.time, times, rows)))
+    return breaks, again
+
+
+def _aged(blocks: tuple[Block, ...], memory: AugmentedGateMemory, time: float) -> tuple[Array, Array]:
+    """Return values and covariance of the blocks' prior at a time."""
+    values, P, first = memory.values.copy(), memory.covariance, 0
+    transition, driven = np.eye(len(values)), np.zeros((len(values), len(values)))
+    for block in blocks:
+        own = slice(first, first + block.size)
+        if isinstance(block, LinearBlock):
+            transition[own, own] = block.transition(time - memory.start)
+            driven[own, own] = block.process_noise(time - memory.start)
+        first += block.size
+    return transition @ values, transition @ P @ transition.T + driven
+
+
+def _go_back(
+    model: Model, process_noise: ProcessNoise, trajectory: joining.Trajectory, stretch: slice, outputs: Sequence[Array]
+) -> None:
+    """Write a stretch of a trajectory's edges, each by a backward pass from the last edge that it sees, to the rows of stops."""
+    edge, last = trajectory.edge[stretch], trajectory.last[stretch]
+    # One pass for all that see the same.
+    ends = np.append(np.flatnonzero(np.diff(last)), len(last) - 1)
+    begins = np.append(0, ends[:-1] + 1)
+    size, noise, together = 6 + model.states, model.noise_rows, min(PASSES, len(ends))
+    compiled(augmented_smoother.smooth_augmented)(
+        trajectory.segments,
+        trajectory.starts,
+        edge[begins],
+        edge[ends],
+        last[ends],
+        process_noise.angle_random_walk**2,
+        process_noise.rate_random_walk**2,
+        model.decay,
+        model.density,
+        model.changing,
+        model.gyro,
+        model.gyro_use,
+        tuple(model.force_f.tolist()),
+        model.chains,
+        np.empty((len(model.chains), LINKS)),
+        np.empty(size - 3),
+        np.empty((size + noise, size + noise)),
+        tuple(np.empty((3, noise, size))),
+        (np.empty((model.states, 3)), np.empty(model.states), np.empty(size + noise)),
+        np.empty((together, 4)),
+        np.empty((together, size - 3)),
+        np.empty((together, size + noise + 1, size)),
+        *outputs,
+    )

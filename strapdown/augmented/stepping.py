@@ -27,22 +27,14 @@ from strapdown.kernels import (
     filter_loop,
     robust_step,
 )
-from strapdown.kernels.robust_loop import FORGOTTEN, WIDENING, WIDEST
+from strapdown.kernels.robust_gate import WIDE_PASSES
+from strapdown.kernels.robust_step import ACCEPTED, PASSED_OVER, REFUSED
 from strapdown.mekf import ProcessNoise
+from strapdown.mekf.judging import Judging
 from strapdown.mekf.scheduling import skipped_too
-from strapdown.mekf.stepping import _Challenger as _PlainChallenger
-from strapdown.mekf.stepping import _Standing
+from strapdown.mekf.states import restart_bias_variance
 from strapdown.records import Event, ImuRecord
-from strapdown.robustness import (
-    UNIFORM_SIGMA,
-    WIDE_PASSES,
-    Gate,
-    Linearised,
-    Robust,
-    Rows,
-    seen_from,
-    tilt_unknown,
-)
+from strapdown.robustness import Gate, Linearised, Robust, Rows, seen_from, tilt_unknown
 from strapdown.vectors import KINDS, need_level, need_unit, triad
 
 KIND_CODES = {
@@ -98,16 +90,17 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         self.refused: dict[str, int] = {}
         self.skipped: dict[str, int] = {}
         self.repeated = 0
-        self.events: tuple[Event, ...] = ()
         # What the blocks of a challenger know, carried along.
         self._prior = filtering.restart_states(state, self.blocks)
-        self._restart_bias = np.zeros(3) if gate is None else gate.restart_bias_variance(state.covariance[:6, :6])
+        self._restart_bias_variance = restart_bias_variance(gate, state)
         self._expected = self.y, np.eye(2)
-        self._passes = 1
-        self._standing: dict[str, _Standing] = {}
-        self._level = 0
-        self._trusted = 0
-        self._challenger: _Challenger | None = None
+        self._judging: Judging[StepFilter] = Judging(gate, state.gate)
+        self._passes = self._judging.passes
+
+    @property
+    def events(self) -> tuple[Event, ...]:
+        """Recoveries and lock-outs so far, in order of time."""
+        return self._judging.events
 
     def predict(self, delta_theta: ArrayLike, dt: float) -> None:
         """Propagate over one gyro increment (3,), rad, of dt seconds; a repeated sample (of no length) is counted and changes nothing."""
@@ -118,7 +111,8 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             return
         model = self._model("")
         while left > 0.0:
-            running = [self] if self._challenger is None else [self, self._challenger.filter]
+            rival = self._judging.challenger
+            running = [self] if rival is None else [self, rival]
             x = np.array([one.bias for one in running])
             step = float(augmented_loop.longest_common_step(left, tuple(increment), x, len(x), model.limit))
             part = increment * (step / left)
@@ -270,14 +264,13 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
                 f"{sensor or 'the sensor'} gave kind {self.kinds[sensor]!r} before, now {measured.kind!r}; name each sensor"
             )
         shown = self._shows(measured)
-        accepted = self._correct(measured)
+        outcome = self._correct(measured)
         if not shown:
             self._skip(sensor)
-        elif not accepted:
+        elif outcome != ACCEPTED:
             self.refused[sensor] = self.refused.get(sensor, 0) + 1
-        if self.gate is not None:
-            self._oversee(measured, accepted)
-        return bool(accepted)
+        self._judging.judge(self, sensor, outcome, lambda rival: rival._correct(measured))
+        return outcome == ACCEPTED
 
     def _rows(self, measured: _Measured, attitude: Array, others: Array) -> Rows:
         """Return a measurement as seen from an attitude and (b, c) (3 + m,)."""
@@ -325,12 +318,13 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         unknown = np.trace(A) >= robust_step.UNKNOWN
         tolerance = robust_step.SETTLED if unknown else robust_step.RELINEARIZED
         now, now_others, P, prior = self.attitude, others, self.P, np.zeros(len(self.P))
-        done, trials = 1, 0
+        done, trials, first = 1, 0, None
         while True:
             residual, H, noise, angle, far = self._rows(measured, now, now_others)
             seen = Linearised(attitude=now, covariance=P, prior=prior, residual=residual, H=H, noise=noise, angle=angle)
             if self._passes == 1:
                 return seen
+            first = first or seen
             # The arc replaces the chord in the rows made independent, the first two of them.
             lower = np.linalg.cholesky(noise)
             lower = lower / np.diag(lower)
@@ -340,7 +334,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             on_rows = np.linalg.solve(lower, H[:, 6:] @ step[6:])
             converged = bool(step[:3] @ step[:3] + on_rows @ on_rows < tolerance**2)
             if converged or done >= self._passes:
-                seen = dataclasses.replace(seen, converged=converged)
+                seen = seen if converged else dataclasses.replace(first, converged=False)
                 if seen.acceptable(threshold) or trials == 2 or not unknown:
                     return seen
                 trials += 1
@@ -353,12 +347,12 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             prior = np.concatenate([back, others - now_others])
             done += 1
 
-    def _correct(self, measured: _Measured) -> bool | None:
-        """Take in a measurement; return whether it was, None where it was passed over."""
+    def _correct(self, measured: _Measured) -> int:
+        """Take in a measurement; return ``ACCEPTED``, ``REFUSED`` or ``PASSED_OVER``."""
         if not self._shows(measured):
             self.weight = 0.0
             self._expected = np.array([np.nan]), np.eye(1)
-            return None
+            return PASSED_OVER
         others = np.concatenate([self.bias, self.values])
         threshold = np.inf if self.gate is None else float(self.gate.thresholds[KINDS[measured.kind] - 1])
         seen = self._linearised(measured, others, threshold)
@@ -369,15 +363,13 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         if unknown or not seen.acceptable(threshold):
             self.weight = 0.0
             self.y, self.S = self._expected
-            return None if unknown else False
+            return PASSED_OVER if unknown else REFUSED
         self.weight = 1.0 if self.robust is None else seen.weight(self.robust)
         self.attitude, self.P, self.x = seen.attitude, seen.covariance, seen.prior.copy()
         H = seen.H
         super().update(seen.residual, HJacobian=lambda x: H, Hx=lambda x: H @ x, R=seen.noise / self.weight)
         correction = self.x[:3]
-        self.attitude = quaternion.normalize(quaternion.multiply(self.attitude, quaternion.exp(correction)))
-        others = others - seen.prior[3:] + self.x[3:]
-        self.bias, self.values = others[:3], others[3:]
+        self._move(self.x - np.concatenate([np.zeros(3), seen.prior[3:]]))
         if self._passes > 1 and np.trace(self.P[:3, :3]) > robust_step.KNOWN:
             self.P, _ = seen_from(quaternion.exp(correction), self.P)
         else:
@@ -386,84 +378,28 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             self.P = G @ self.P @ G.T
         self.P_post = self.P.copy()
         self.x = np.zeros(len(self.x))
-        return True
+        return ACCEPTED
 
-    def _oversee(self, measured: _Measured, accepted: bool | None) -> None:
-        """Count refusals, tell of lock-outs, and start, drop or follow a challenger (:class:`strapdown.robustness.Gate`)."""
-        gate, sensor = self.gate, measured.sensor
-        assert gate is not None
-        mine = self._standing.setdefault(sensor, _Standing())
-        if accepted is False:
-            mine.refuse(self.time, gate.lock_out_limit)
-            if mine.told:
-                self._tell(
-                    Event(kind="lock-out", start=mine.first, end=self.time, sensor=sensor, value=float(mine.number))
-                )
-        elif accepted:
-            mine.accept()
-            self._trusted += 1
-        if not gate.recovery:
-            return
-        if accepted is False and self._challenger is None:
-            if self._trusted >= FORGOTTEN * gate.recovery:
-                self._level = 0
-            self._challenger = self._restarted(gate)
-        rival = self._challenger
-        if rival is None:
-            return
-        rival.judge(rival.filter._correct(measured), mine.in_a_row > 0)
-        if not any(one.in_a_row for one in self._standing.values()):
-            self._challenger = None
-        elif rival.failed:
-            self._next_level()
-        elif self._level < WIDEST and rival.too_narrow:
-            self._level += rival.widen()
-        if self._challenger is not None and mine.in_a_row >= gate.recovery and rival.hits >= gate.recovery:
-            start = min(rival.since, mine.first)
-            self._forgive(gate)
-            self._tell(Event(kind="recovery", start=start, end=self.time, sensor=sensor, value=float(mine.in_a_row)))
-            for name in ("attitude", "bias", "values", "P", "rate"):
-                setattr(self, name, getattr(rival.filter, name))
-            self._passes = WIDE_PASSES
-            self._next_level()
+    def _move(self, correction: Array) -> None:
+        self.attitude = quaternion.normalize(quaternion.multiply(self.attitude, quaternion.exp(correction[:3])))
+        self.bias, self.values = self.bias + correction[3:6], self.values + correction[6:]
 
-    def _next_level(self) -> None:
-        self._level = (self._level + 1) % (WIDEST + 1)
-        self._trusted = 0
-        self._challenger = None
-
-    def _tell(self, event: Event) -> None:
-        """Put an event among those told, in place of what was said of it before."""
-        others = (
-            old for old in self.events if (old.kind, old.sensor, old.start) != (event.kind, event.sensor, event.start)
-        )
-        self.events = tuple(sorted((*others, event), key=lambda one: one.start))
-
-    def _forgive(self, gate: Gate) -> None:
-        """Set all counts back at a recovery, which tells of the short lock-outs that it ends."""
-        short = {
-            ("lock-out", sensor, one.first)
-            for sensor, one in self._standing.items()
-            if one.excess > 0 and one.number <= 2 * gate.lock_out_limit
-        }
-        self.events = tuple(event for event in self.events if (event.kind, event.sensor, event.start) not in short)
-        self._standing = {}
-
-    def _restarted(self, gate: Gate) -> _Challenger:
-        """Return a challenger as :func:`strapdown.kernels.augmented_robust.start_challenger` makes one."""
+    def _restarted(self, attitude_sigma: float, bias_width: float) -> StepFilter:
         values, block = self._prior
-        first = gate.restart_attitude_sigma
-        widened = WIDENING**self._level
         P = np.zeros_like(self.P)
-        P[:3, :3] = max(first, min(widened * first, UNIFORM_SIGMA)) ** 2 * np.eye(3)
-        P[3:6, 3:6] = self.P[3:6, 3:6] + widened**2 * np.diag(self._restart_bias)
+        P[:3, :3] = attitude_sigma**2 * np.eye(3)
+        P[3:6, 3:6] = self.P[3:6, 3:6] + bias_width**2 * np.diag(self._restart_bias_variance)
         P[6:, 6:] = block
         state = AugmentedState(attitude=self.attitude, bias=self.bias, values=values, covariance=P)
-        rival = StepFilter(self.process_noise, state, self.blocks, gate=gate, robust=self.robust)
+        rival = StepFilter(self.process_noise, state, self.blocks, gate=self.gate, robust=self.robust)
         rival.time, rival.rate = self.time, self.rate
         rival.kinds, rival._models = self.kinds, self._models
         rival._passes = WIDE_PASSES
-        return _Challenger(filter=rival, since=self.time, bias=rival.bias, bias_variance=np.diag(P)[3:6].copy())
+        return rival
+
+    def _become(self, other: StepFilter) -> None:
+        for name in ("attitude", "bias", "values", "P", "rate"):
+            setattr(self, name, getattr(other, name))
 
     def state(self) -> AugmentedState:
         """Return the present state."""
@@ -482,35 +418,6 @@ class _Measured:
     noise: Array
     sensor: str
     reference: Array | None = None
-
-
-@dataclass(kw_only=True)
-class _Challenger(_PlainChallenger):
-    """A filter beside the filter, and how it did."""
-
-    filter: StepFilter  # type: ignore[assignment]
-
-    def widen(self) -> bool:
-        """Take part of what was believed of the bias at the start back out, if it can be; the optional states go along."""
-        mine = self.filter
-        P = mine.P
-        if np.any(np.diag(P)[3:6] > 1.05 * self.bias_variance):
-            return False
-        correction = np.zeros(len(P))
-        for i in range(3, 6):
-            excess = P[i, i] - self.bias_variance[i - 3] / (1.0 - 1.0 / WIDENING**2)
-            if excess < 0.0:  # else the axes before it have left more than its start allows
-                gain = P[:, i] / excess
-                correction = correction + gain * (self.bias[i - 3] - mine.bias[i - 3] - correction[i])
-                P = P - np.outer(gain, P[i])
-        turn = quaternion.exp(correction[:3])
-        mine.attitude = quaternion.normalize(quaternion.multiply(mine.attitude, turn))
-        mine.bias = mine.bias + correction[3:6]
-        mine.values = mine.values + correction[6:]
-        mine.P, _ = seen_from(turn, P)
-        self.bias_variance = WIDENING**2 * self.bias_variance
-        self.nis, self.degrees = 0.0, 0
-        return True
 
 
 def _covariance(sigma: ArrayLike) -> Array:
@@ -532,10 +439,14 @@ def run_on(
     full_covariance: bool = False,
     gate: Gate | None = None,
     robust: Robust | None = None,
+    face: StepFilter | None = None,
 ) -> tuple[AugmentedEstimate, AugmentedState]:
-    """Run a record through :class:`StepFilter`: what :func:`strapdown.augmented.run` does with general blocks."""
+    """Run a record through :class:`StepFilter`: what :func:`strapdown.augmented.run` does with general blocks.
+
+    ``face`` is the filter itself, where the caller has made it.
+    """
     events = mekf.schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True)
-    face = StepFilter(process_noise, initial, blocks, gate=gate, robust=robust)
+    face = StepFilter(process_noise, initial, blocks, gate=gate, robust=robust) if face is None else face
     face.time = float(record.time[0])
     face.kinds = dict(zip(events.sensors, events.kinds, strict=True))
     modelling.assemble(blocks, face.kinds)  # refuses effects on sensors that are not there

@@ -313,6 +313,7 @@ def _initial(
     from strapdown.checks import InputError
     from strapdown.randomness import generator
     from strapdown.units import DEGREE
+    from strapdown.wahba import InconsistentError
 
     if attitude is not None and from_truth:
         raise InputError("--attitude and --from-truth both tell the start; give one of them")
@@ -334,13 +335,22 @@ def _initial(
         return setup.initial_state(chosen, q, bias), words, 0
     try:
         state = mekf.first_state(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
+    except InconsistentError as error:
+        problem = str(error).removesuffix("; give the initial attitude")
+        # A sensor's own errors may be among the states, and then the filter can tell who is right.
+        if chosen.states is None:
+            raise InputError(
+                f"{problem}; if a sensor has a bias, give the filter its state (--states); or give --attitude, or --from-truth"
+            ) from None
+        return _banked(record, chosen, problem, f"{problem[:1].upper()}{problem[1:]}. So a bank took them one by one")
     except InputError as error:
-        return _banked(record, chosen, str(error))
+        problem = str(error).removesuffix("; give the initial attitude")
+        return _banked(record, chosen, problem, "One direction at a time does not give the attitude at once")
     sigma = float(np.sqrt(np.trace(state.covariance[:3, :3]) / 3.0)) / DEGREE
     return state, f"Started from the first measurements, σ {sigma:.3g}° an axis.", 0
 
 
-def _banked(record: ImuRecord, chosen: FilterSetup, problem: str) -> tuple[State, str, int]:
+def _banked(record: ImuRecord, chosen: FilterSetup, problem: str, why: str) -> tuple[State, str, int]:
     """Return the state that a bank of hypotheses finds, where the first measurements do not give the attitude."""
     import numpy as np
 
@@ -348,7 +358,6 @@ def _banked(record: ImuRecord, chosen: FilterSetup, problem: str) -> tuple[State
     from strapdown.checks import InputError
     from strapdown.units import DEGREE
 
-    problem = problem.removesuffix("; give the initial attitude")
     try:
         found = bank.run(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
     except InputError as error:
@@ -373,7 +382,7 @@ def _banked(record: ImuRecord, chosen: FilterSetup, problem: str) -> tuple[State
     )
     sigma = float(np.sqrt(np.trace(state.covariance[:3, :3]) / 3.0)) / DEGREE
     words = (
-        f"One direction at a time does not give the attitude at once: {len(found.angles)} hypotheses about it became one at "
+        f"{why}: {len(found.angles)} hypotheses about it became one at "
         f"{found.became_one:.6g} s, σ {sigma:.3g}° an axis; the estimate begins there."
     )
     return state, words, edge

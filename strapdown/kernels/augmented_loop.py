@@ -1,17 +1,16 @@
-"""The MEKF with optional states over one whole record, forward and back. Compiled by :func:`strapdown.kernels.machine.compiled`."""
+"""The MEKF with optional states over one whole record. Compiled by :func:`strapdown.kernels.machine.compiled`."""
 
 from __future__ import annotations
 
 import math
 
 from strapdown.kernels.algebra import combine, dot, scale
-from strapdown.kernels.augmented_chain import carry_chains_back, step_chains
+from strapdown.kernels.augmented_chain import step_chains
 from strapdown.kernels.augmented_factor import covariances, take_row, triangularise, variances, whole_bias
 from strapdown.kernels.augmented_step import (
     OFFSET,
     arm_noise,
     carry,
-    carry_back,
     decorrelate,
     fill_noise,
     fill_rows,
@@ -21,9 +20,11 @@ from strapdown.kernels.augmented_step import (
     turning_matrix,
 )
 from strapdown.kernels.filter_loop import ATTITUDE, DIRECTION, HEADING, vector_at
-from strapdown.kernels.robust_loop import six_at
-from strapdown.kernels.rotation import logarithm, quaternion_multiply, right_jacobian, rotation_matrix, turned, unit
-from strapdown.kernels.smoother_step import inverse_right_jacobian, moved
+from strapdown.kernels.robust_loop import frame_at, six_at
+from strapdown.kernels.rotation import right_jacobian, rotation_matrix, turned, unit
+
+BORROWS_ARRAYS = True
+"""See :mod:`strapdown.kernels.machine`."""
 
 
 def store_segment(out, k, dt, part, q, x, F, size):
@@ -41,34 +42,31 @@ def store_segment(out, k, dt, part, q, x, F, size):
         place += j + 1
 
 
-def load_segment(segments, k, x, F, size):
-    """Read x and the triangle of row k; return the attitude."""
-    place = 8
+def store_row(
+    q,
+    x,
+    F,
+    size,
+    gyro,
+    gyro_use,
+    row,
+    attitude_out,
+    x_out,
+    variance_out,
+    covariance_out,
+    whole_variance_out,
+    whole_covariance_out,
+    six,
+):
+    """Write a state to a row of the outputs, of covariances and of the whole bias where there is room; ``six`` (6, 6) is scratch."""
+    attitude_out[row, 0], attitude_out[row, 1], attitude_out[row, 2], attitude_out[row, 3] = q
     for i in range(len(x)):
-        x[i] = segments[k, place + i]
-    place += len(x)
-    for j in range(size):
-        for i in range(j + 1):
-            F[j, i] = segments[k, place + i]
-        for i in range(j + 1, size):
-            F[j, i] = 0.0
-        place += j + 1
-    return (segments[k, 4], segments[k, 5], segments[k, 6], segments[k, 7])
-
-
-def frame_at(triads, t):
-    """Return row t of the schedule's frames as a 9-tuple."""
-    return (
-        triads[t, 0],
-        triads[t, 1],
-        triads[t, 2],
-        triads[t, 3],
-        triads[t, 4],
-        triads[t, 5],
-        triads[t, 6],
-        triads[t, 7],
-        triads[t, 8],
-    )
+        x_out[row, i] = x[i]
+    variances(F, size, variance_out, row)
+    if row < len(covariance_out):
+        covariances(F, size, covariance_out, row)
+    if row < len(whole_variance_out):
+        whole_bias(F, size, gyro, gyro_use, OFFSET, whole_variance_out, whole_covariance_out, row, six)
 
 
 def longest_common_step(dt, part, x, running, limit):
@@ -268,14 +266,22 @@ def run_augmented(
         if now >= end and (e == events or event_time[e] > end):
             if countdown == 0:
                 countdown = every
-                attitude_out[row, 0], attitude_out[row, 1], attitude_out[row, 2], attitude_out[row, 3] = q
-                for i in range(len(x)):
-                    x_out[row, i] = x[i]
-                variances(F, size, variance_out, row)
-                if row < len(covariance_out):
-                    covariances(F, size, covariance_out, row)
-                if row < len(whole_variance_out):
-                    whole_bias(F, size, gyro, gyro_use, OFFSET, whole_variance_out, whole_covariance_out, row, six)
+                store_row(
+                    q,
+                    x,
+                    F,
+                    size,
+                    gyro,
+                    gyro_use,
+                    row,
+                    attitude_out,
+                    x_out,
+                    variance_out,
+                    covariance_out,
+                    whole_variance_out,
+                    whole_covariance_out,
+                    six,
+                )
                 row += 1
             countdown -= 1
             k += 1
@@ -285,112 +291,3 @@ def run_augmented(
                 theta = vector_at(increments, k)
     attitude[0], attitude[1], attitude[2], attitude[3] = q
     return segments
-
-
-def smooth_augmented(
-    segments,
-    starts,
-    angle_variance,
-    rate_variance,
-    decay,
-    density,
-    changing,
-    gyro,
-    gyro_use,
-    force_f,
-    chains,
-    links,
-    x,
-    F,
-    later_x,
-    later_F,
-    noise,
-    scratch,
-    attitude_out,
-    x_out,
-    variance_out,
-    covariance_out,
-):
-    """Run the Rauch–Tung–Striebel smoother back over the stored segments, on the manifold and on factors.
-
-    A step back estimates the step's own noise w from what came later and takes it off. With the prediction's own reflections
-    ``[Φ S, Nᵀ] Θ = [S⁻, 0]`` and ``[0, I] Θ = [Y, Z]``, later knowledge of the predicted error δ says ``w = Y S⁻⁻¹ δ`` and leaves w the
-    covariance ``Z Zᵀ`` (Bierman 1983 does it one noise at a time). So ``δ_before = Φ⁻¹ (δ − Nᵀ w)``, and the covariance is a sum of two
-    squares: no difference is formed, and what has no noise is not touched. As in :mod:`strapdown.kernels.smoother_step`, the later factor
-    is carried to the tangent space at the predicted attitude before the step, and the result to that at the smoothed one after it.
-
-    ``F`` (size + p, size + p) and ``later_F`` (size + p + 1, size) hold triangle and rows of noise, ``noise`` (p, size) a copy of the
-    latter; ``scratch`` holds arrays (states, 3), (states,), (p, size) and one as wide as F.
-    """
-    size = len(x) + 3
-    noisy = 6 + changing
-    coupling, factor, gain, work = scratch
-    k = len(starts) - 1
-    j = starts[k]
-    later_q = load_segment(segments, j, later_x, later_F, size)
-    while True:
-        if j == starts[k]:
-            attitude_out[k, 0], attitude_out[k, 1], attitude_out[k, 2], attitude_out[k, 3] = later_q
-            for i in range(len(x)):
-                x_out[k, i] = later_x[i]
-            variances(later_F, size, variance_out, k)
-            if k < len(covariance_out):
-                covariances(later_F, size, covariance_out, k)
-            if k == 0:
-                break
-            k -= 1
-        j -= 1
-        q = load_segment(segments, j, x, F, size)
-        dt = segments[j, 0]
-        part = (segments[j, 1], segments[j, 2], segments[j, 3])
-        predicted, phi11, phi12, rate, D = move(q, x, dt, part, decay, gyro, gyro_use, force_f, coupling, factor)
-        carry(F, 0, size, phi11, phi12, coupling, factor, gyro_use, changing)
-        rows = fill_noise(F, size, size, dt, rate, D, angle_variance, rate_variance, decay, density, gyro, gyro_use)
-        if len(chains) > 0:
-            rows = step_chains(F, size, rows, x, dt, decay, chains, links)
-        p = rows - size
-        for r in range(p):
-            for i in range(size):
-                noise[r, i] = F[size + r, i]
-        for r in range(size + p):
-            for i in range(size, size + p):
-                F[r, i] = 1.0 if r == i else 0.0
-        triangularise(F, noisy, 3, size, rows, size, rows, work)
-        # From the tangent space at the smoothed attitude to that at the predicted one: exp(a) ⊗ exp(ε) = exp(a + J_r(a)⁻¹ ε).
-        inverse = (predicted[0], -predicted[1], -predicted[2], -predicted[3])
-        a = logarithm(quaternion_multiply(inverse, later_q))
-        turn_rows(later_F, size, inverse_right_jacobian(a))
-        # The difference itself goes through the step as one row more.
-        later_F[rows, 0], later_F[rows, 1], later_F[rows, 2] = a
-        for i in range(len(x)):
-            later_F[rows, 3 + i] = later_x[i] - x[i]
-        for w in range(p):
-            for c in range(size):
-                total = F[c, size + w]
-                for i in range(c):
-                    total -= gain[w, i] * F[c, i]
-                gain[w, c] = total / F[c, c]
-        for r in range(p):
-            for i in range(size):
-                later_F[size + r, i] = 0.0
-            for w in range(p):
-                for i in range(noisy):
-                    later_F[size + r, i] += F[size + r, size + w] * noise[w, i]
-        for r in range(rows + 1):
-            if r < size or r == rows:
-                for w in range(p):
-                    total = 0.0
-                    for i in range(size):
-                        total += gain[w, i] * later_F[r, i]
-                    work[w] = total
-                for w in range(p):
-                    for i in range(noisy):
-                        later_F[r, i] -= work[w] * noise[w, i]
-        if len(chains) > 0:
-            carry_chains_back(later_F, 0, rows + 1, links)
-        carry_back(later_F, 0, rows + 1, phi11, phi12, coupling, factor, gyro_use, changing)
-        later_q, J = moved(q, (later_F[rows, 0], later_F[rows, 1], later_F[rows, 2]))
-        for i in range(len(x)):
-            later_x[i] = segments[j, 8 + i] + later_F[rows, 3 + i]
-        turn_rows(later_F, rows, J)
-        triangularise(later_F, noisy, noisy, size, rows, 0, 0, work)

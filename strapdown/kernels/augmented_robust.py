@@ -1,8 +1,9 @@
 """The filter with optional states over one whole record with all its options: any noise, a gate that recovers, robust weights.
 
 :func:`strapdown.kernels.augmented_loop.run_augmented` is the same filter without them, and faster; :mod:`strapdown.kernels.robust_loop` and
-:mod:`strapdown.kernels.robust_step` are the plain filter with them, whose reasons hold here too. The state lives in rows of arrays: row 0
-the filter, row 1 the challenger beside it while there is one, so that both go through one piece of code.
+:mod:`strapdown.kernels.robust_step` are the plain filter with them, whose reasons hold here too; what a gate makes of a measurement is in
+:mod:`strapdown.kernels.robust_gate`. The state lives in rows of arrays: row 0 the filter, row 1 the challenger beside it while there is
+one, so that both go through one piece of code.
 """
 
 from __future__ import annotations
@@ -22,11 +23,10 @@ from strapdown.kernels.algebra import (
     transpose_times_vector,
 )
 from strapdown.kernels.augmented_chain import chain_start, chain_step
-from strapdown.kernels.augmented_factor import covariances, take_row, triangularise, variances, whole_bias
-from strapdown.kernels.augmented_loop import advance, frame_at, longest_common_step, store_segment
+from strapdown.kernels.augmented_factor import take_row, triangularise
+from strapdown.kernels.augmented_loop import advance, longest_common_step, store_row, store_segment
 from strapdown.kernels.augmented_step import (
     IDENTITY,
-    OFFSET,
     arm_noise,
     decorrelate,
     fill_rows,
@@ -35,33 +35,25 @@ from strapdown.kernels.augmented_step import (
     turning_matrix,
 )
 from strapdown.kernels.filter_loop import ATTITUDE, DIRECTION, HEADING, vector_at
-from strapdown.kernels.robust_loop import (
-    BIAS_MOVE,
+from strapdown.kernels.robust_gate import (
     CHALLENGED,
-    DEGREES,
-    FIRST,
+    DROPPED,
     FIRST_BIAS,
-    FORGOTTEN,
-    HITS,
-    IN_A_ROW,
-    LEVEL,
-    MISFIT,
-    MISSED,
-    MISSES,
-    NIS,
     PASSES,
-    SINCE,
-    TRUSTED,
-    UNKNOWN_ATTITUDE,
+    TOO_NARROW,
     WIDE_PASSES,
-    WIDENING,
-    WIDEST,
-    count_acceptance,
-    count_refusal,
-    forgive,
-    has_failed,
-    six_at,
+    begin_challenge,
+    count_widening,
+    is_believed,
+    judge_challenger,
+    judge_filter,
+    may_widen,
+    recover,
+    restart_attitude,
+    restart_width,
+    start_undone,
 )
+from strapdown.kernels.robust_loop import frame_at, six_at
 from strapdown.kernels.robust_step import (
     ACCEPTED,
     KNOWN,
@@ -196,6 +188,8 @@ def take_in(
         first_H = turned_H
     tolerance = SETTLED if A[0] + A[3] + A[5] >= UNKNOWN else RELINEARIZED
     M = IDENTITY
+    first_error = (0.0, 0.0, 0.0)
+    first_factors = (0.0, 0.0, 0.0, 1.0, 1.0, 1.0)
     done = 1
     trials = 0
     while True:
@@ -234,6 +228,9 @@ def take_in(
             accepted = False
         if passes == 1:
             break
+        if done == 1 and trials == 0:
+            first_error = (e1, e2, e3)
+            first_factors = factors
         u = solved(factors, (far * y0 - p0, far * y1 - p1, y2 - p2))
         for j in range(size):
             step[j] = 0.0
@@ -254,6 +251,9 @@ def take_in(
         if converged or done >= passes:
             accepted = accepted and converged
             if accepted or trials == 2 or A[0] + A[3] + A[5] < UNKNOWN:
+                if not converged:
+                    e1, e2, e3 = first_error
+                    factors = first_factors
                 break
             trials += 1
             done = 0
@@ -376,20 +376,37 @@ def age_chains(x, fresh, decay, chains, age):
 
 
 def start_challenger(
-    attitude, x, F, size, attitude_sigma, bias_sigma, values, root, age, decay, density, chains, fresh, work
+    attitude,
+    x,
+    F,
+    size,
+    memory,
+    now,
+    attitude_sigma,
+    bias_sigma,
+    values,
+    root,
+    begun,
+    decay,
+    density,
+    chains,
+    fresh,
+    work,
 ):
     """Write row 1: the filter's attitude and bias, as uncertain as a fresh start, and the optional states as the prior has them by now.
 
     Whatever led the filter astray has gone into the optional states too, and what they are still worth cannot be told; their prior is
-    right all the same. It is ``values`` (m,) with the covariance ``rootᵀ root`` (m, m), ``age`` seconds old. ``bias_sigma`` (3,) is added
-    to the bias's. ``fresh`` (3 m + 6, 3 + m) is scratch.
+    right all the same. It is ``values`` (m,) with the covariance ``rootᵀ root`` (m, m), of the time ``begun``. ``bias_sigma`` (3,) is added
+    to the bias's. Attitude and bias are widened by how many challengers have been before it. ``fresh`` (3 m + 6, 3 + m) is scratch.
     """
+    age = now - begun
+    width = restart_width(memory)
     m = len(values)
     for r in range(3 * m + 6):
         for c in range(3 + m):
             fresh[r, c] = 0.0
     for r in range(3):
-        fresh[r, r] = bias_sigma[r]
+        fresh[r, r] = width * bias_sigma[r]
     for k in range(m):
         kept = math.exp(-decay[k] * age)
         if len(chains) > 0 and (chains[k, 0] != 0.0 or (k > 0 and chains[k - 1, 0] != 0.0)):
@@ -411,44 +428,24 @@ def start_challenger(
         for c in range(size):
             F[1, r, c] = 0.0
     for r in range(3):
-        F[1, r, r] = attitude_sigma
+        F[1, r, r] = restart_attitude(attitude_sigma, memory)
         x[1, r] = x[0, r]
     for r in range(3 + m):
         for c in range(r + 1):
             F[1, 3 + r, 3 + c] = fresh[r, c]
     for i in range(4):
         attitude[1, i] = attitude[0, i]
+    begin_challenge(memory, now, vector_at(x, 1), bias_variances(F[1], size))
 
 
-def begin_challenge(x, F, size, memory, now):
-    """Set what is counted of a challenger, in row 1, back at its start: :func:`strapdown.kernels.robust_loop.start_challenger`."""
-    memory[CHALLENGED] = 1.0
-    memory[HITS] = 0.0
-    memory[MISSES] = 0.0
-    memory[SINCE] = now
-    memory[MISSED] = 0.0
-    memory[NIS] = 0.0
-    memory[DEGREES] = 0.0
-    for i in range(3):
-        memory[FIRST_BIAS + i] = x[1, i]
-        memory[FIRST_BIAS + 3 + i] = bias_variance(F, size, i)
-
-
-def bias_variance(F, size, i):
-    """Return the variance of component i of the challenger's bias."""
-    total = 0.0
+def bias_variances(F, size):
+    """Return the variances of the bias (3,) of a factor's covariance."""
+    x = y = z = 0.0
     for j in range(size):
-        total += F[1, j, 3 + i] * F[1, j, 3 + i]
-    return total
-
-
-def too_narrow(x, memory):
-    """Return whether the challenger's bias has moved too far from its start, or what it accepts fits too ill."""
-    move = 0.0
-    for i in range(3):
-        step = x[1, i] - memory[FIRST_BIAS + i]
-        move += step * step / memory[FIRST_BIAS + 3 + i]
-    return move > BIAS_MOVE or memory[NIS] > memory[DEGREES] + MISFIT * math.sqrt(2.0 * memory[DEGREES])
+        x += F[j, 3] * F[j, 3]
+        y += F[j, 4] * F[j, 4]
+        z += F[j, 5] * F[j, 5]
+    return (x, y, z)
 
 
 def widen(attitude, x, F, size, memory, column, work):
@@ -457,20 +454,15 @@ def widen(attitude, x, F, size, memory, column, work):
     What is taken in has a negative variance, beyond that of the bias, and only adds to P: |1/s| P e (P e)ᵀ, a row more of the factor.
     ``column`` (size,) is scratch, and so is the row of F under the triangle.
     """
-    for i in range(3):
-        if bias_variance(F, size, i) > 1.05 * memory[FIRST_BIAS + 3 + i]:
-            return
+    if not may_widen(bias_variances(F[1], size), memory):
+        return
     turn = (0.0, 0.0, 0.0)
     for i in range(3):
-        variance = memory[FIRST_BIAS + 3 + i]
         for c in range(size):
             column[c] = 0.0
             for j in range(max(c, 3 + i), size):
                 column[c] += F[1, j, c] * F[1, j, 3 + i]
-        inverse = 1.0 / (column[3 + i] - variance / (1.0 - 1.0 / (WIDENING * WIDENING)))
-        memory[FIRST_BIAS + 3 + i] = WIDENING * WIDENING * variance
-        if inverse >= 0.0:
-            continue  # the axes before it have left more than its start allows: it holds nothing back any more
+        inverse = start_undone(i, column[3 + i], memory)
         share = inverse * (memory[FIRST_BIAS + i] - x[1, i])
         turn = combine(1.0, turn, share, (column[0], column[1], column[2]))
         for c in range(3, size):
@@ -483,11 +475,13 @@ def widen(attitude, x, F, size, memory, column, work):
     _, G, _ = seen_from(q, attitude_covariance(F[1], size), IDENTITY)
     turn_rows(F[1], size, G)
     triangularise(F[1], 3, 3, size, size, 0, 0, work)
-    q = quaternion_multiply((attitude[1, 0], attitude[1, 1], attitude[1, 2], attitude[1, 3]), q)
-    attitude[1, 0], attitude[1, 1], attitude[1, 2], attitude[1, 3] = q
-    memory[LEVEL] += 1.0
-    memory[NIS] = 0.0
-    memory[DEGREES] = 0.0
+    attitude[1, 0], attitude[1, 1], attitude[1, 2], attitude[1, 3] = quaternion_multiply(attitude_at(attitude, 1), q)
+    count_widening(memory)
+
+
+def attitude_at(attitude, i):
+    """Return row i as a 4-tuple."""
+    return (attitude[i, 0], attitude[i, 1], attitude[i, 2], attitude[i, 3])
 
 
 def run_augmented_robust(
@@ -592,7 +586,7 @@ def run_augmented_robust(
                 stop = now + dt
                 due = False
             for i in range(running):
-                q = (attitude[i, 0], attitude[i, 1], attitude[i, 2], attitude[i, 3])
+                q = attitude_at(attitude, i)
                 if i == 0 and segments < len(segment_out):
                     store_segment(segment_out, segments, dt, part, q, x[0], F[0], size)
                     segments += 1
@@ -632,11 +626,10 @@ def run_augmented_robust(
             if len(event_turning) > 0:
                 turning = six_at(event_turning, e)
                 arm = (event_turning[e, 6], event_turning[e, 7], event_turning[e, 8])
-            challenged = PASSED_OVER
             i = 0
             while i < running:
                 outcome, w, q, e1, s1, e2, s2, e3, s3 = take_in(
-                    (attitude[i, 0], attitude[i, 1], attitude[i, 2], attitude[i, 3]),
+                    attitude_at(attitude, i),
                     x[i],
                     F[i],
                     size,
@@ -667,101 +660,68 @@ def run_augmented_robust(
                     innovation_out[e, 3] = s2
                     innovation_out[e, 4] = e3
                     innovation_out[e, 5] = s3
-                    if outcome == ACCEPTED:
-                        count_acceptance(standing[sensor])
-                        memory[TRUSTED] += 1.0
-                    elif outcome == REFUSED:
-                        lock_outs = count_refusal(
-                            standing[sensor], now, sensor, lock_out_limit, lock_out_out, lock_outs
+                    lock_outs, challenge = judge_filter(
+                        outcome, now, sensor, recovery, lock_out_limit, standing, memory, lock_out_out, lock_outs
+                    )
+                    if challenge:
+                        start_challenger(
+                            attitude,
+                            x,
+                            F,
+                            size,
+                            memory,
+                            now,
+                            restart_attitude_sigma,
+                            restart_bias_sigma,
+                            restart_values,
+                            restart_root,
+                            restart_time,
+                            decay,
+                            density,
+                            chains,
+                            fresh,
+                            work,
                         )
-                        if recovery > 0 and running == 1:
-                            if memory[TRUSTED] >= FORGOTTEN * recovery:
-                                memory[LEVEL] = 0.0
-                            widened = WIDENING ** memory[LEVEL]
-                            start_challenger(
-                                attitude,
-                                x,
-                                F,
-                                size,
-                                max(
-                                    restart_attitude_sigma,
-                                    min(widened * restart_attitude_sigma, math.sqrt(UNKNOWN_ATTITUDE)),
-                                ),
-                                (
-                                    widened * restart_bias_sigma[0],
-                                    widened * restart_bias_sigma[1],
-                                    widened * restart_bias_sigma[2],
-                                ),
-                                restart_values,
-                                restart_root,
-                                now - restart_time,
-                                decay,
-                                density,
-                                chains,
-                                fresh,
-                                work,
-                            )
-                            begin_challenge(x, F, size, memory, now)
-                            running = 2
+                        running = 2
                 else:
-                    challenged = outcome
-                    if outcome == ACCEPTED:
-                        memory[NIS] += e1 * e1 / s1 + e2 * e2 / s2 + e3 * e3 / s3
-                        memory[DEGREES] += degrees
+                    nis = e1 * e1 / s1 + e2 * e2 / s2 + e3 * e3 / s3
+                    verdict = judge_challenger(outcome, nis, degrees, sensor, standing, memory, vector_at(x, 1))
+                    if verdict == DROPPED:
+                        running = 1
+                    elif verdict == TOO_NARROW:
+                        widen(attitude, x, F, size, memory, measuring[6], work)
+                    if verdict != DROPPED and is_believed(sensor, recovery, standing, memory):
+                        recover(now, sensor, lock_out_limit, standing, memory, recovery_out[recoveries], lock_out_out)
+                        recoveries += 1
+                        for j in range(4):
+                            attitude[0, j] = attitude[1, j]
+                        for j in range(size - 3):
+                            x[0, j] = x[1, j]
+                        for j in range(size):
+                            for c in range(size):
+                                F[0, j, c] = F[1, j, c]
+                        running = 1
                 i += 1
-            if running == 2:
-                in_a_row = standing[sensor, IN_A_ROW]
-                if challenged == REFUSED:
-                    memory[MISSES] += 1.0
-                    memory[MISSED] += 1.0
-                elif challenged == ACCEPTED:
-                    memory[MISSED] = 0.0
-                    if in_a_row > 0.0:
-                        memory[HITS] += 1.0
-                trusted = True
-                for s in range(len(standing)):
-                    if standing[s, IN_A_ROW] > 0.0:
-                        trusted = False
-                if trusted:
-                    running = 1
-                elif has_failed(memory):
-                    running = 1
-                    memory[LEVEL] = (memory[LEVEL] + 1.0) % (WIDEST + 1.0)
-                    memory[TRUSTED] = 0.0
-                elif memory[LEVEL] < WIDEST and too_narrow(x, memory):
-                    widen(attitude, x, F, size, memory, measuring[6], work)
-                if running == 2 and in_a_row >= recovery and memory[HITS] >= recovery:
-                    recovery_out[recoveries, 0] = now
-                    recovery_out[recoveries, 1] = sensor
-                    recovery_out[recoveries, 2] = min(memory[SINCE], standing[sensor, FIRST])
-                    recovery_out[recoveries, 3] = in_a_row
-                    recoveries += 1
-                    for j in range(4):
-                        attitude[0, j] = attitude[1, j]
-                    for j in range(size - 3):
-                        x[0, j] = x[1, j]
-                    for j in range(size):
-                        for c in range(size):
-                            F[0, j, c] = F[1, j, c]
-                    forgive(standing, lock_out_limit, lock_out_out)
-                    running = 1
-                    memory[LEVEL] = (memory[LEVEL] + 1.0) % (WIDEST + 1.0)
-                    memory[TRUSTED] = 0.0
-                    memory[PASSES] = WIDE_PASSES
-                memory[CHALLENGED] = running - 1.0
             e += 1
         if now >= end and (e == events or event_time[e] > end):
             if countdown == 0:
                 countdown = every
-                for j in range(4):
-                    attitude_out[row, j] = attitude[0, j]
-                for j in range(size - 3):
-                    x_out[row, j] = x[0, j]
-                variances(F[0], size, variance_out, row)
-                if row < len(covariance_out):
-                    covariances(F[0], size, covariance_out, row)
-                if row < len(whole_variance_out):
-                    whole_bias(F[0], size, gyro, gyro_use, OFFSET, whole_variance_out, whole_covariance_out, row, six)
+                store_row(
+                    attitude_at(attitude, 0),
+                    x[0],
+                    F[0],
+                    size,
+                    gyro,
+                    gyro_use,
+                    row,
+                    attitude_out,
+                    x_out,
+                    variance_out,
+                    covariance_out,
+                    whole_variance_out,
+                    whole_covariance_out,
+                    six,
+                )
                 row += 1
             countdown -= 1
             k += 1

@@ -1,7 +1,8 @@
 """The filter over one whole record with all its options: any noise, a gate that recovers, robust weights.
 
-:func:`strapdown.kernels.filter_loop.run_filter` is the same filter without them, and faster. The state lives in rows of an array: row 0
-the filter, row 1 the challenger beside it while there is one, so that both go through one piece of code.
+:func:`strapdown.kernels.filter_loop.run_filter` is the same filter without them, and faster; what a gate makes of a measurement is in
+:mod:`strapdown.kernels.robust_gate`. The state lives in rows of an array: row 0 the filter, row 1 the challenger beside it while there is
+one, so that both go through one piece of code.
 """
 
 from __future__ import annotations
@@ -11,63 +12,29 @@ import math
 from strapdown.kernels.algebra import combine, dot, full, minus_outer, scale, symmetric_minus_outer
 from strapdown.kernels.filter_loop import DIRECTION, HEADING, MOST_TURN, store_segment, store_state, vector_at
 from strapdown.kernels.filter_step import predict
-from strapdown.kernels.robust_step import ACCEPTED, PASSED_OVER, REFUSED, corrected, take_in
+from strapdown.kernels.robust_gate import (
+    CHALLENGED,
+    DROPPED,
+    FIRST_BIAS,
+    PASSES,
+    TOO_NARROW,
+    WIDE_PASSES,
+    begin_challenge,
+    count_widening,
+    is_believed,
+    judge_challenger,
+    judge_filter,
+    may_widen,
+    recover,
+    restart_attitude,
+    restart_width,
+    start_undone,
+)
+from strapdown.kernels.robust_step import ACCEPTED, corrected, take_in
 from strapdown.kernels.series import LARGEST_ANGLE
 
-WIDE_PASSES = 20
-"""Linearisations of one update at most, of a challenger and of a filter that has recovered."""
-WIDENING = 3.0
-"""Each challenger that fails makes the next one's σ so many times wider, and so is one made that was too narrow."""
-WIDEST = 7
-"""After so many widenings, to 2187 times the first σ, the next challenger is as narrow as the first."""
-UNKNOWN_ATTITUDE = math.pi * math.pi / 3.0
-"""Variance of an angle uniform over the whole turn, rad²: no widening of the attitude goes beyond."""
-BIAS_MOVE = 2.366
-"""Largest squared move of a challenger's bias over its first variance: the median of χ² of three degrees of freedom. One that moves
-farther is held back by its start, and is made wider; one wider than need be does no harm."""
-MISFIT = 3.0
-"""The NIS of what a challenger accepts may add up to so many standard deviations above the degrees of freedom, or it is made wider."""
-TOLERANCE = 1
-"""A challenger may refuse so many measurements, and half of those that it accepts, before it is dropped."""
-MISSES_IN_A_ROW = 3
-"""It is dropped when it refuses so many in a row."""
-FORGOTTEN = 5.0
-"""When the filter has accepted so many times ``recovery`` since a challenger failed or took over, the next is as narrow as the first."""
-
-# What a gate remembers, beside the challenger's state: columns of ``memory``, and of each sensor's row of ``standing``.
-CHALLENGED = 0
-"""Whether there is a challenger."""
-PASSES = 1
-"""Linearisations of an update of the filter."""
-LEVEL = 2
-"""How often the next challenger's σ is widened."""
-HITS = 3
-MISSES = 4
-SINCE = 5
-"""Start of the challenger, s."""
-NIS = 6
-DEGREES = 7
-"""The NIS of what it has accepted, added up, and the degrees of freedom."""
-MISSED = 8
-"""What it has refused in a row."""
-TRUSTED = 9
-"""What the filter has accepted since a challenger failed or took over."""
-FIRST_BIAS = 10
-"""Its bias then, three columns, and the variances of it, three more."""
-MEMORY = 16
-BIAS_VARIANCE = (22, 25, 27)
-"""Where a packed state has the variances of the bias."""
-IN_A_ROW = 0
-"""Refusals in a row."""
-EXCESS = 1
-"""Refusals less acceptances, between zero and twice the limit."""
-NUMBER = 2
-"""Refusals since the excess was zero, the time of the first and of the last of them, s."""
-FIRST = 3
-LAST = 4
-TOLD = 5
-"""Row of ``lock_out_out`` that tells of them, −1 while none does."""
-STANDING = 6
+BORROWS_ARRAYS = True
+"""See :mod:`strapdown.kernels.machine`."""
 
 
 def state_at(rows, i):
@@ -82,74 +49,61 @@ def state_at(rows, i):
     )
 
 
+def bias_at(states, i):
+    """Return the bias of row i."""
+    return (states[i, 4], states[i, 5], states[i, 6])
+
+
 def six_at(array, k):
     """Return row k of an (n, 6) array as a 6-tuple."""
     return (array[k, 0], array[k, 1], array[k, 2], array[k, 3], array[k, 4], array[k, 5])
 
 
-def start_challenger(states, memory, now, attitude_variance, bias_variance):
+def frame_at(triads, t):
+    """Return row t of the schedule's frames as a 9-tuple."""
+    return (
+        triads[t, 0],
+        triads[t, 1],
+        triads[t, 2],
+        triads[t, 3],
+        triads[t, 4],
+        triads[t, 5],
+        triads[t, 6],
+        triads[t, 7],
+        triads[t, 8],
+    )
+
+
+def start_challenger(states, memory, now, attitude_sigma, bias_variance):
     """Write row 1: the filter's state, as uncertain as a fresh start; ``bias_variance`` (3,) is added to that of the bias.
 
     Both are widened by how many challengers have been before it.
     """
-    widened = WIDENING ** (2.0 * memory[LEVEL])
+    sigma = restart_attitude(attitude_sigma, memory)
+    width = restart_width(memory)
     for i in range(28):
         states[1, i] = states[0, i]
     for i in range(7, 22):
         states[1, i] = 0.0
     for i in (7, 10, 12):
-        states[1, i] = max(attitude_variance, min(widened * attitude_variance, UNKNOWN_ATTITUDE))
-    states[1, 22] += widened * bias_variance[0]
-    states[1, 25] += widened * bias_variance[1]
-    states[1, 27] += widened * bias_variance[2]
-    memory[CHALLENGED] = 1.0
-    memory[HITS] = 0.0
-    memory[MISSES] = 0.0
-    memory[SINCE] = now
-    memory[MISSED] = 0.0
-    memory[NIS] = 0.0
-    memory[DEGREES] = 0.0
-    for i in range(3):
-        memory[FIRST_BIAS + i] = states[1, 4 + i]
-    memory[FIRST_BIAS + 3] = states[1, 22]
-    memory[FIRST_BIAS + 4] = states[1, 25]
-    memory[FIRST_BIAS + 5] = states[1, 27]
-
-
-def has_failed(memory):
-    """Return whether the challenger refuses too many."""
-    return memory[MISSES] > TOLERANCE + 0.5 * memory[HITS] or memory[MISSED] >= MISSES_IN_A_ROW
-
-
-def too_narrow(states, memory):
-    """Return whether the challenger's bias has moved too far from its start, or what it accepts fits too ill."""
-    move = 0.0
-    for i in range(3):
-        step = states[1, 4 + i] - memory[FIRST_BIAS + i]
-        move += step * step / memory[FIRST_BIAS + 3 + i]
-    return move > BIAS_MOVE or memory[NIS] > memory[DEGREES] + MISFIT * math.sqrt(2.0 * memory[DEGREES])
+        states[1, i] = sigma * sigma
+    states[1, 22] += width * width * bias_variance[0]
+    states[1, 25] += width * width * bias_variance[1]
+    states[1, 27] += width * width * bias_variance[2]
+    begin_challenge(memory, now, bias_at(states, 1), (states[1, 22], states[1, 25], states[1, 27]))
 
 
 def widen(states, memory):
-    """Make the challenger what it would be had its bias started with σ ``WIDENING`` times as wide; nothing that it has seen is lost.
-
-    The start is a measurement of the bias, of variance σ₀². Taken in again with the variance ``−σ₀²/(1 − 1/WIDENING²)``, it leaves one of
-    ``WIDENING² σ₀²``.
-    """
-    for i in range(3):
-        if states[1, BIAS_VARIANCE[i]] > 1.05 * memory[FIRST_BIAS + 3 + i]:
-            return
+    """Make the challenger what it would be had its bias started wider, if that holds it back."""
     q, b, A, B, C = state_at(states, 1)
+    if not may_widen((C[0], C[3], C[5]), memory):
+        return
     turn = (0.0, 0.0, 0.0)
     for i in range(3):
-        variance = memory[FIRST_BIAS + 3 + i]
         P = full(C)
         pa = (B[i], B[3 + i], B[6 + i])
         pb = (P[i], P[3 + i], P[6 + i])
-        inverse = 1.0 / (P[4 * i] - variance / (1.0 - 1.0 / (WIDENING * WIDENING)))
-        memory[FIRST_BIAS + 3 + i] = WIDENING * WIDENING * variance
-        if inverse >= 0.0:
-            continue  # the axes before it have left more than its start allows: it holds nothing back any more
+        inverse = start_undone(i, P[4 * i], memory)
         ka = scale(inverse, pa)
         kb = scale(inverse, pb)
         innovation = memory[FIRST_BIAS + i] - b[i]
@@ -160,47 +114,7 @@ def widen(states, memory):
         C = symmetric_minus_outer(C, kb, pb)
     q, A, B = corrected(q, A, B, turn)
     store_state(states[1], q, b, A, B, C)
-    memory[LEVEL] += 1.0
-    memory[NIS] = 0.0
-    memory[DEGREES] = 0.0
-
-
-def count_refusal(seat, now, sensor, limit, lock_outs, told):
-    """Count a refusal in a sensor's row ``seat`` of ``standing``; return the lock-outs told, one more if the excess passes ``limit``."""
-    seat[IN_A_ROW] += 1.0
-    if seat[EXCESS] == 0.0:
-        seat[NUMBER] = 0.0
-        seat[FIRST] = now
-        seat[TOLD] = -1.0
-    seat[EXCESS] = min(seat[EXCESS] + 1.0, 2.0 * limit)
-    seat[NUMBER] += 1.0
-    seat[LAST] = now
-    if seat[EXCESS] > limit and seat[TOLD] < 0.0:
-        seat[TOLD] = told
-        told += 1
-    if seat[TOLD] >= 0.0:
-        row = lock_outs[int(seat[TOLD])]
-        row[0] = seat[FIRST]
-        row[1] = now
-        row[2] = sensor
-        row[3] = seat[NUMBER]
-    return told
-
-
-def count_acceptance(seat):
-    """Count an acceptance in a sensor's row of ``standing``."""
-    seat[IN_A_ROW] = 0.0
-    seat[EXCESS] = max(seat[EXCESS] - 1.0, 0.0)
-
-
-def forgive(standing, limit, lock_outs):
-    """Set all counts back at a recovery, which tells of the short lock-outs that it ends: their number is set to zero."""
-    for s in range(len(standing)):
-        if standing[s, TOLD] >= 0.0 and standing[s, NUMBER] <= 2.0 * limit and standing[s, EXCESS] > 0.0:
-            lock_outs[int(standing[s, TOLD]), 3] = 0.0
-        for j in range(STANDING):
-            standing[s, j] = 0.0
-        standing[s, TOLD] = -1.0
+    count_widening(memory)
 
 
 def run_robust(
@@ -221,7 +135,7 @@ def run_robust(
     robust_passes,
     recovery,
     lock_out_limit,
-    restart_attitude_variance,
+    restart_attitude_sigma,
     restart_bias_variance,
     standing,
     memory,
@@ -278,7 +192,7 @@ def run_robust(
             # Sub-steps as in filter_loop; all states that run go the same ones.
             squared = 0.0
             for i in range(running):
-                turn = combine(1.0, part, -dt, (states[i, 4], states[i, 5], states[i, 6]))
+                turn = combine(1.0, part, -dt, bias_at(states, i))
                 squared = max(squared, dot(turn, turn))
             if LARGEST_ANGLE * LARGEST_ANGLE < squared < MOST_TURN * MOST_TURN:
                 share = LARGEST_ANGLE / math.sqrt(squared)
@@ -302,19 +216,6 @@ def run_robust(
                 degrees = 1
             elif kind == DIRECTION:
                 degrees = 2
-            t = event_reference[e]
-            frame = (
-                triads[t, 0],
-                triads[t, 1],
-                triads[t, 2],
-                triads[t, 3],
-                triads[t, 4],
-                triads[t, 5],
-                triads[t, 6],
-                triads[t, 7],
-                triads[t, 8],
-            )
-            challenged = PASSED_OVER
             i = 0
             while i < running:
                 q, b, A, B, C = state_at(states, i)
@@ -326,7 +227,7 @@ def run_robust(
                     C,
                     kind,
                     vector_at(event_value, e),
-                    frame,
+                    frame_at(triads, event_reference[e]),
                     six_at(event_noise, e),
                     int(memory[PASSES]) if i == 0 else WIDE_PASSES,
                     thresholds[degrees - 1],
@@ -335,6 +236,8 @@ def run_robust(
                     robust_parameters[degrees - 1, 1],
                     robust_passes,
                 )
+                if outcome == ACCEPTED:
+                    store_state(states[i], q, b, A, B, C)
                 if i == 0:
                     weight_out[e] = w
                     innovation_out[e, 0] = e1
@@ -343,61 +246,26 @@ def run_robust(
                     innovation_out[e, 3] = s2
                     innovation_out[e, 4] = e3
                     innovation_out[e, 5] = s3
-                    if outcome == ACCEPTED:
-                        count_acceptance(standing[sensor])
-                        memory[TRUSTED] += 1.0
-                    elif outcome == REFUSED:
-                        lock_outs = count_refusal(
-                            standing[sensor], now, sensor, lock_out_limit, lock_out_out, lock_outs
-                        )
-                        if recovery > 0 and running == 1:
-                            if memory[TRUSTED] >= FORGOTTEN * recovery:
-                                memory[LEVEL] = 0.0
-                            start_challenger(states, memory, now, restart_attitude_variance, restart_bias_variance)
-                            running = 2
+                    lock_outs, challenge = judge_filter(
+                        outcome, now, sensor, recovery, lock_out_limit, standing, memory, lock_out_out, lock_outs
+                    )
+                    if challenge:
+                        start_challenger(states, memory, now, restart_attitude_sigma, restart_bias_variance)
+                        running = 2
                 else:
-                    challenged = outcome
-                    if outcome == ACCEPTED:
-                        memory[NIS] += e1 * e1 / s1 + e2 * e2 / s2 + e3 * e3 / s3
-                        memory[DEGREES] += degrees
-                if outcome == ACCEPTED:
-                    store_state(states[i], q, b, A, B, C)
+                    nis = e1 * e1 / s1 + e2 * e2 / s2 + e3 * e3 / s3
+                    verdict = judge_challenger(outcome, nis, degrees, sensor, standing, memory, bias_at(states, 1))
+                    if verdict == DROPPED:
+                        running = 1
+                    elif verdict == TOO_NARROW:
+                        widen(states, memory)
+                    if verdict != DROPPED and is_believed(sensor, recovery, standing, memory):
+                        recover(now, sensor, lock_out_limit, standing, memory, recovery_out[recoveries], lock_out_out)
+                        recoveries += 1
+                        for j in range(28):
+                            states[0, j] = states[1, j]
+                        running = 1
                 i += 1
-            if running == 2:
-                in_a_row = standing[sensor, IN_A_ROW]
-                if challenged == REFUSED:
-                    memory[MISSES] += 1.0
-                    memory[MISSED] += 1.0
-                elif challenged == ACCEPTED:
-                    memory[MISSED] = 0.0
-                    if in_a_row > 0.0:
-                        memory[HITS] += 1.0
-                trusted = True
-                for s in range(len(standing)):
-                    if standing[s, IN_A_ROW] > 0.0:
-                        trusted = False
-                if trusted:
-                    running = 1
-                elif has_failed(memory):
-                    running = 1
-                    memory[LEVEL] = (memory[LEVEL] + 1.0) % (WIDEST + 1.0)
-                    memory[TRUSTED] = 0.0
-                elif memory[LEVEL] < WIDEST and too_narrow(states, memory):
-                    widen(states, memory)
-                if running == 2 and in_a_row >= recovery and memory[HITS] >= recovery:
-                    recovery_out[recoveries, 0] = now
-                    recovery_out[recoveries, 1] = sensor
-                    recovery_out[recoveries, 2] = min(memory[SINCE], standing[sensor, FIRST])
-                    recovery_out[recoveries, 3] = in_a_row
-                    recoveries += 1
-                    for j in range(28):
-                        states[0, j] = states[1, j]
-                    forgive(standing, lock_out_limit, lock_out_out)
-                    running = 1
-                    memory[LEVEL] = (memory[LEVEL] + 1.0) % (WIDEST + 1.0)
-                    memory[TRUSTED] = 0.0
-                    memory[PASSES] = WIDE_PASSES
-                memory[CHALLENGED] = running - 1.0
             e += 1
         if now >= end and (e == events or event_time[e] > end):
             if countdown == 0:

@@ -12,14 +12,12 @@ import math
 from strapdown.kernels.algebra import (
     add,
     combine,
-    cross,
     dot,
     full,
     matrix_times_vector,
     minus_outer,
     multiply,
     scale,
-    skew_polynomial,
     subtract,
     symmetric_times_vector,
     times_transpose_upper,
@@ -55,8 +53,6 @@ ONE_AXIS = 5.0
 """The least certain axis stands alone if its variance is so many times the sum of the others'."""
 TURN_ASIDE = 2.0 * math.pi / 3.0
 """rad; how far elsewhere is."""
-OPPOSITE = -0.9
-"""Cosine; an axis seen so far from where it was says nothing of the shortest turn there."""
 
 
 def measurement_rows(kind, q, R, z, frame, noise):
@@ -176,25 +172,6 @@ def least_certain_axis(A):
     return v
 
 
-def carried(M, A):
-    """Return the turn T that takes a covariance of attitude variance A to another attitude, whose axes M takes the old ones to.
-
-    It is that of a filter with optional states; :func:`seen_from` is the plain filter's.
-
-    Where one axis n is far less certain than the others, T is the shortest turn that takes n to where it lies now, M n. A turn *about* n is
-    what was not known: it leaves untouched what ties the errors across n to those of sensors and gyro, which are fixed in the body. (Tilt
-    and heading found from a magnetometer with an unknown hard iron hang together in body axes, whatever the turn about the field.) Else the
-    covariance goes with the fixed axes, T = M.
-    """
-    axis = least_certain_axis(A)
-    largest = dot(axis, symmetric_times_vector(A, axis))
-    there = matrix_times_vector(M, axis)
-    cosine = dot(axis, there)
-    if largest < ONE_AXIS * (A[0] + A[3] + A[5] - largest) or cosine < OPPOSITE:
-        return M
-    return skew_polynomial(1.0, 1.0, 1.0 / (1.0 + cosine), cross(axis, there))
-
-
 def seen_from(q, A, B):
     """Return A and B of a prior at the attitude that lies the turn q from its mean, and where the mean lies seen from there (3,), rad.
 
@@ -261,7 +238,7 @@ def take_in(q, b, A, B, C, kind, z, frame, noise, passes, threshold, robust, par
     shows none, always is, and its innovation is NaN.
 
     Returns ``ACCEPTED``, ``REFUSED`` or ``PASSED_OVER``, the weight, q, b, A, B, C and e₁, s₁, e₂, s₂, e₃, s₃: independent innovations and
-    their variances under the nominal noise.
+    their variances under the nominal noise, of the last linearisation; where these do not come to rest, of the first.
     """
     now_q, now_A, now_B = q, A, B
     tolerance = SETTLED if A[0] + A[3] + A[5] >= UNKNOWN else RELINEARIZED
@@ -269,6 +246,8 @@ def take_in(q, b, A, B, C, kind, z, frame, noise, passes, threshold, robust, par
     R = rotation_matrix(q)
     level = kind != HEADING or has_heading(R, z)
     known = passes == 1 or kind != HEADING or tilt_variance(R, A) <= UNKNOWN_TILT
+    first_e = (0.0, 0.0, 0.0)
+    first_F = (0.0, 0.0, 0.0, 1.0, 1.0, 1.0)
     done = 1
     trials = 0
     while True:
@@ -287,6 +266,9 @@ def take_in(q, b, A, B, C, kind, z, frame, noise, passes, threshold, robust, par
             accepted = False
         if passes == 1:
             break
+        if done == 1 and trials == 0:
+            first_e = (e1, e2, e3)
+            first_F = F
         x = solved(F, (far * y1 - dot(h1, prior), far * y2 - dot(h2, prior), y[2]))
         back = add(combine(x[0], h1, x[1], h2), scale(x[2], h3))
         step = add(prior, symmetric_times_vector(now_A, back))
@@ -294,6 +276,9 @@ def take_in(q, b, A, B, C, kind, z, frame, noise, passes, threshold, robust, par
         if converged or done >= passes:
             accepted = accepted and converged
             if accepted or trials == 2 or A[0] + A[3] + A[5] < UNKNOWN:
+                if not converged:
+                    e1, e2, e3 = first_e
+                    F = first_F
                 break
             trials += 1
             done = 0

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from strapdown.checks import Array, InputError, count
-from strapdown.kernels import filter_loop, robust_loop, robust_step
+from strapdown.kernels import filter_loop, robust_loop
 from strapdown.kernels.machine import compiled
+from strapdown.kernels.robust_gate import CHALLENGED
 from strapdown.mekf.factored import Outputs, run_sharp
+from strapdown.mekf.judging import event_rows, gate_events, kernel_options, remembered
 from strapdown.mekf.memory import side_by_side
 from strapdown.mekf.scheduling import Schedule, innovations_by_sensor, places, schedule, skipped_too
-from strapdown.mekf.states import ProcessNoise, State, check_arguments, covariance_matrices, pack, restart_bias_variance
+from strapdown.mekf.states import (
+    ProcessNoise,
+    State,
+    check_arguments,
+    covariance_matrices,
+    first_bias_variance,
+    pack,
+    restart_bias_variance,
+)
 from strapdown.records import Estimate, Event, ImuRecord
-from strapdown.robustness import LOCK_OUT, Gate, GateMemory, Monitor, Robust
+from strapdown.robustness import Gate, GateMemory, Monitor, Robust
 from strapdown.vectors import KINDS
 
 GAP_FACTOR = 5.0
@@ -24,6 +32,10 @@ DIGITS = (1e9, 1e-10)
 which the covariance keeps too few digits."""
 LEAST_DIGITS = (1e14, 1e-15)
 """The same where it keeps none."""
+
+
+class LostDigitsError(InputError):
+    """The covariance keeps no digit, and what asked for its segments must take them from its square root."""
 
 
 def run(
@@ -173,17 +185,11 @@ def _run(
         outputs = Outputs(attitude=attitude, bias=bias, variance=variance, blocks=blocks, innovation=innovation)
         number = _run_plain(record, events, process_noise, state, every, outputs, stored[:segments])
     else:
-        options = _KernelOptions.of(gate, robust, initial)
         weight = np.empty(number_of_events)
-        # Either takes at least two refusals, but for a lock-out that goes on.
-        recoveries = np.empty((number_of_events // 2, 4))
-        lock_outs = np.empty((number_of_events // 2 + len(events.sensors), 4))
-        before = initial.gate if gate is not None else None
-        counts, standing = _remembered(before, events.sensors)
-        if before is not None:
-            states[1] = before.challenger
-        if not options.recovery:
-            counts[robust_loop.CHALLENGED] = 0.0
+        recoveries, lock_outs = event_rows(number_of_events, len(events.sensors))
+        counts, standing = remembered(gate, initial.gate, events.sensors)
+        if initial.gate is not None:
+            states[1] = initial.gate.challenger
         number, recovered, locked_out = compiled(robust_loop.run_robust)(
             record.time,
             np.ascontiguousarray(record.increments),
@@ -196,14 +202,8 @@ def _run(
             events.body_noise,
             events.reference,
             events.triads,
-            options.thresholds,
-            options.robust,
-            options.robust_parameters,
-            options.robust_passes,
-            options.recovery,
-            options.lock_out_limit,
-            options.restart_attitude_variance,
-            options.restart_bias_variance,
+            *kernel_options(gate, robust),
+            restart_bias_variance(gate, initial),
             standing,
             counts,
             states,
@@ -221,8 +221,8 @@ def _run(
         recoveries, lock_outs = recoveries[:recovered], lock_outs[:locked_out]
         if gate is not None:
             memory = GateMemory(
-                restart_bias_variance=_first_bias_variance(initial),
-                challenger=states[1].copy() if counts[robust_loop.CHALLENGED] else np.zeros(28),
+                restart_bias_variance=first_bias_variance(initial),
+                challenger=states[1].copy() if counts[CHALLENGED] else np.zeros(28),
                 counts=counts,
                 standing=dict(zip(events.sensors, standing, strict=True)),
             )
@@ -231,8 +231,7 @@ def _run(
         stored[number, 4:] = state
     told = [
         *gaps(record.time),
-        *_gate_events("recovery", recoveries[:, [2, 0, 1, 3]], events.sensors),
-        *_gate_events("lock-out", lock_outs[lock_outs[:, 3] > 0.0], events.sensors),
+        *gate_events(recoveries, lock_outs, events.sensors),
     ]
     if monitor is not None:
         in_order = innovation[events.row] if plain else innovation
@@ -249,23 +248,6 @@ def _run(
         events=tuple(sorted(told, key=lambda event: event.start)),
     )
     return estimate, state, stored[: number + 1], memory
-
-
-def _first_bias_variance(initial: State) -> Array:
-    """Return the bias variance (3,) of the state that the first part of a record started from."""
-    return np.diag(initial.covariance)[3:].copy() if initial.gate is None else initial.gate.restart_bias_variance
-
-
-def _remembered(memory: GateMemory | None, sensors: tuple[str, ...]) -> tuple[Array, Array]:
-    """Return what the kernel goes on with: its ``memory``, and ``standing`` of these sensors."""
-    counts, standing = np.zeros(robust_loop.MEMORY), np.zeros((len(sensors), robust_loop.STANDING))
-    counts[robust_loop.PASSES] = 1.0
-    if memory is not None:
-        counts[:] = memory.counts
-        for row, sensor in zip(standing, sensors, strict=True):
-            row[:] = memory.standing.get(sensor, 0.0)
-    standing[:, robust_loop.TOLD] = -1.0
-    return counts, standing
 
 
 def _run_plain(
@@ -312,7 +294,7 @@ def _run_plain(
         if good_row < 0:
             return int(number)
         if len(segments):
-            raise InputError(
+            raise LostDigitsError(
                 f"after {record.time[good_row * every]:g} s the covariance loses its digits, by a measurement far sharper than what was "
                 "known or an outage far too long; smooth by augmented.smooth, which carries its square root"
             )
@@ -321,33 +303,6 @@ def _run_plain(
         edge = row * every
         if edge + every > len(increments):
             return 0
-
-
-@dataclass(frozen=True, kw_only=True)
-class _KernelOptions:
-    """A gate and a robust update as the kernel takes them."""
-
-    thresholds: Array
-    robust: int
-    robust_parameters: Array
-    robust_passes: int
-    recovery: int
-    lock_out_limit: int
-    restart_attitude_variance: float
-    restart_bias_variance: Array
-
-    @classmethod
-    def of(cls, gate: Gate | None, robust: Robust | None, initial: State) -> _KernelOptions:
-        return cls(
-            thresholds=np.full(3, np.inf) if gate is None else gate.thresholds,
-            robust=0 if robust is None else {"huber": robust_step.HUBER, "student": robust_step.STUDENT}[robust.kind],
-            robust_parameters=np.ones((3, 2)) if robust is None else robust.parameters,
-            robust_passes=0 if robust is None else robust.iterations,
-            recovery=0 if gate is None else gate.recovery or 0,
-            lock_out_limit=LOCK_OUT if gate is None else gate.lock_out_limit,
-            restart_attitude_variance=0.0 if gate is None else gate.restart_attitude_sigma**2,
-            restart_bias_variance=restart_bias_variance(gate, initial),
-        )
 
 
 def gaps(time: Array, factor: float = GAP_FACTOR) -> list[Event]:
@@ -359,14 +314,6 @@ def gaps(time: Array, factor: float = GAP_FACTOR) -> list[Event]:
     return [
         Event(kind="gap", start=float(time[k]), end=float(time[k + 1]), value=float(steps[k] / usual))
         for k in np.flatnonzero(steps > factor * usual)
-    ]
-
-
-def _gate_events(kind: str, rows: Array, sensors: tuple[str, ...]) -> list[Event]:
-    """Return events of rows (n, 4): start and end, s, sensor and value."""
-    return [
-        Event(kind=kind, start=float(start), end=float(end), sensor=sensors[int(sensor)], value=float(value))
-        for start, end, sensor, value in rows
     ]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -81,7 +82,24 @@ def _by_axis(name: str, value: ArrayLike) -> Array:
     return np.broadcast_to(given, 3)
 
 
-def restart_bias_variance(gate: Gate | None, initial: State) -> Array:
+class Initial(Protocol):
+    """A state that a filter starts from, with optional states or without."""
+
+    @property
+    def covariance(self) -> Array:
+        """P (n, n) of (δθ, δb, …)."""
+
+    @property
+    def gate(self) -> GateMemory | None:
+        """Of the end of a part of a record, what its gate remembers."""
+
+
+def first_bias_variance(initial: Initial) -> Array:
+    """Return the bias variance (3,) of the state that the first part of a record started from."""
+    return np.diag(initial.covariance)[3:6].copy() if initial.gate is None else initial.gate.restart_bias_variance
+
+
+def restart_bias_variance(gate: Gate | None, initial: Initial) -> Array:
     """Return what a gate adds to the variance of its first challenger's bias (3,), (rad/s)², of a filter that goes on from ``initial``."""
     if gate is None:
         return np.zeros(3)
@@ -133,22 +151,24 @@ def first_state(
     Raises
     ------
     InputError
-        If no measurement gives the attitude: fewer than two directions, all on one line, or none that fit together.
+        If no measurement gives the attitude: fewer than two directions, or all on one line.
+    InconsistentError
+        Of :mod:`strapdown.wahba`: if directions do not fit together.
     """
     positive("bias_sigma", bias_sigma, unit="rad/s")
     b = array("bias", bias, (3,))
-    problem = "the record holds no measurement that gives an attitude"
+    problem = InputError("the record holds no measurement that gives an attitude")
     for k in range(FIRST_SETS):
         try:
             attitude, P = _attitude_of_set(record, process_noise, b, bias_sigma, k)
         except InputError as error:
-            problem = problem if k else str(error)
+            problem = problem if k else error
             continue
         whole = np.zeros((6, 6))
         whole[:3, :3] = ONCE**2 * P
         whole[3:, 3:] = bias_sigma**2 * np.eye(3)
         return State(attitude=attitude, bias=b, covariance=whole)
-    raise InputError(f"the first measurements do not give the attitude: {problem}; give the initial attitude")
+    raise type(problem)(f"the first measurements do not give the attitude: {problem}; give the initial attitude")
 
 
 def _attitude_of_set(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -25,30 +24,13 @@ from strapdown.checks import (
     unit_quaternions,
 )
 from strapdown.kernels import filter_loop, filter_step
-from strapdown.kernels.robust_loop import (
-    BIAS_MOVE,
-    FORGOTTEN,
-    MISFIT,
-    MISSES_IN_A_ROW,
-    PASSES,
-    TOLERANCE,
-    WIDENING,
-    WIDEST,
-)
-from strapdown.kernels.robust_step import KNOWN
+from strapdown.kernels.robust_gate import WIDE_PASSES
+from strapdown.kernels.robust_step import ACCEPTED, KNOWN, PASSED_OVER, REFUSED
 from strapdown.kernels.series import LARGEST_ANGLE
+from strapdown.mekf.judging import Judging
 from strapdown.mekf.states import ProcessNoise, State, check_arguments, covariance_matrices, restart_bias_variance
 from strapdown.records import Event
-from strapdown.robustness import (
-    UNIFORM_SIGMA,
-    WIDE_PASSES,
-    Gate,
-    Robust,
-    Rows,
-    linearise,
-    seen_from,
-    tilt_unknown,
-)
+from strapdown.robustness import Gate, Robust, Rows, linearise, seen_from, tilt_unknown
 from strapdown.vectors import need_level, need_unit, triad
 
 CLOCK_SHARE = 1e-3
@@ -113,13 +95,9 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         self.late = 0
         self.repeated = 0
         self.refused: dict[str, int] = {}
-        self.events: tuple[Event, ...] = ()
         self._restart_bias_variance = restart_bias_variance(gate, initial)
-        self._passes = 1 if initial.gate is None else int(initial.gate.counts[PASSES])
-        self._standing: dict[str, _Standing] = {}
-        self._level = 0
-        self._trusted = 0
-        self._challenger: _Challenger | None = None
+        self._judging: Judging[StepFilter] = Judging(gate, initial.gate)
+        self._passes = self._judging.passes
         self._done: list[_Done] = []
         self._places = {name: place for place, name in enumerate(sensors)}
         self._missing: dict[str, int] = {}
@@ -128,6 +106,11 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         self._time_rest = 0.0
         self._steps = 0
         self._longest = 0.0
+
+    @property
+    def events(self) -> tuple[Event, ...]:
+        """Recoveries and lock-outs so far, in order of time."""
+        return self._judging.events
 
     @property
     def skipped(self) -> dict[str, int]:
@@ -185,8 +168,8 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             super().predict()
             self.attitude = quaternion.normalize(quaternion.multiply(self.attitude, quaternion.exp(phi)))
         self.time = end
-        if self._challenger is not None:
-            self._challenger.filter._predict(increment, step, end)
+        if self._judging.challenger is not None:
+            self._judging.challenger._predict(increment, step, end)
 
     def update_direction(
         self,
@@ -343,19 +326,18 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
     def _take_now(self, rows: Measured, sensor: str, of_heading: bool) -> bool:
         self._remember(_Done(kept=self._kept(), end=self.time, rows=rows, sensor=sensor, of_heading=of_heading))
         shown = not of_heading or bool(rows(self.attitude)[1].any())
-        accepted = self._correct(rows, of_heading)
+        outcome = self._correct(rows, of_heading)
         if not shown:
             self._vertical[sensor] = self._vertical.get(sensor, 0) + 1
-        elif not accepted:
+        elif outcome != ACCEPTED:
             self.refused[sensor] = self.refused.get(sensor, 0) + 1
-        if self.gate is not None:
-            self._oversee(rows, sensor, accepted, of_heading)
-        return bool(accepted)
+        self._judging.judge(self, sensor, outcome, lambda rival: rival._correct(rows, of_heading))
+        return outcome == ACCEPTED
 
-    def _correct(self, rows: Measured, of_heading: bool) -> bool | None:
-        """Take in a measurement; return whether it was, None where it was passed over."""
+    def _correct(self, rows: Measured, of_heading: bool) -> int:
+        """Take in a measurement; return ``ACCEPTED``, ``REFUSED`` or ``PASSED_OVER``."""
         if of_heading and not rows(self.attitude)[1].any():
-            return None  # that of a vertical vector
+            return PASSED_OVER  # that of a vertical vector
         threshold = np.inf if self.gate is None else float(self.gate.thresholds[len(rows(self.attitude)[0]) - 1])
         seen = linearise(rows, self.attitude, self.P, self._passes, threshold)
         self.nis = seen.nis
@@ -364,15 +346,14 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         if unknown or not seen.acceptable(threshold):
             self.weight = 0.0
             self.y, self.S = seen.innovation, seen.predicted + seen.noise
-            return None if unknown else False
+            return PASSED_OVER if unknown else REFUSED
         self.weight = 1.0 if self.robust is None else seen.weight(self.robust)
         self.attitude, self.P = seen.attitude, seen.covariance
         self.x = np.array([*seen.prior, 0.0, 0.0, 0.0])
         H = np.hstack([seen.H, np.zeros((self.dim_z, 3))])
         super().update(seen.residual, HJacobian=lambda x: H, Hx=lambda x: H @ x, R=seen.noise / self.weight)
         correction = self.x[:3]
-        self.attitude = quaternion.normalize(quaternion.multiply(self.attitude, quaternion.exp(correction)))
-        self.bias = self.bias + self.x[3:]
+        self._move(self.x)
         if self._passes > 1 and np.trace(self.P[:3, :3]) > KNOWN:
             self.P, _ = seen_from(quaternion.exp(correction), self.P)
         else:
@@ -381,83 +362,23 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             self.P = G @ self.P @ G.T
         self.P_post = self.P.copy()
         self.x = np.zeros(6)
-        return True
+        return ACCEPTED
 
-    def _oversee(self, rows: Measured, sensor: str, accepted: bool | None, of_heading: bool) -> None:
-        """Count refusals, tell of lock-outs, and start, drop or follow a challenger (:class:`strapdown.robustness.Gate`)."""
-        gate = self.gate
-        assert gate is not None
-        mine = self._standing.setdefault(sensor, _Standing())
-        if accepted is False:
-            mine.refuse(self.time, gate.lock_out_limit)
-            if mine.told:
-                self._tell(
-                    Event(kind="lock-out", start=mine.first, end=self.time, sensor=sensor, value=float(mine.number))
-                )
-        elif accepted:
-            mine.accept()
-            self._trusted += 1
-        if not gate.recovery:
-            return
-        if accepted is False and self._challenger is None:
-            if self._trusted >= FORGOTTEN * gate.recovery:
-                self._level = 0
-            self._challenger = self._restarted(gate)
-        challenger = self._challenger
-        if challenger is None:
-            return
-        challenger.judge(challenger.filter._correct(rows, of_heading), mine.in_a_row > 0)
-        if not any(one.in_a_row for one in self._standing.values()):
-            self._challenger = None
-        elif challenger.failed:
-            self._next_level()
-        elif self._level < WIDEST and challenger.too_narrow:
-            self._level += challenger.widen()
-        if self._challenger is not None and mine.in_a_row >= gate.recovery and challenger.hits >= gate.recovery:
-            start = min(challenger.since, mine.first)
-            self._forgive(gate)
-            self._tell(Event(kind="recovery", start=start, end=self.time, sensor=sensor, value=float(mine.in_a_row)))
-            self.attitude, self.bias, self.P = challenger.filter.attitude, challenger.filter.bias, challenger.filter.P
-            self._passes = WIDE_PASSES
-            self._next_level()
+    def _move(self, correction: Array) -> None:
+        self.attitude = quaternion.normalize(quaternion.multiply(self.attitude, quaternion.exp(correction[:3])))
+        self.bias = self.bias + correction[3:]
 
-    def _next_level(self) -> None:
-        self._level = (self._level + 1) % (WIDEST + 1)
-        self._trusted = 0
-        self._challenger = None
-
-    def _tell(self, event: Event) -> None:
-        """Put an event among those told, in place of what was said of it before."""
-        others = (
-            old for old in self.events if (old.kind, old.sensor, old.start) != (event.kind, event.sensor, event.start)
-        )
-        self.events = tuple(sorted((*others, event), key=lambda one: one.start))
-
-    def _forgive(self, gate: Gate) -> None:
-        """Set all counts back at a recovery, which tells of the short lock-outs that it ends."""
-        short = {
-            ("lock-out", sensor, one.first)
-            for sensor, one in self._standing.items()
-            if one.excess > 0 and one.number <= 2 * gate.lock_out_limit
-        }
-        self.events = tuple(event for event in self.events if (event.kind, event.sensor, event.start) not in short)
-        self._standing = {}
-
-    def _restarted(self, gate: Gate) -> _Challenger:
-        first = gate.restart_attitude_sigma
-        widened = WIDENING**self._level
+    def _restarted(self, attitude_sigma: float, bias_width: float) -> StepFilter:
         P = np.zeros((6, 6))
-        P[:3, :3] = max(first, min(widened * first, UNIFORM_SIGMA)) ** 2 * np.eye(3)
-        P[3:, 3:] = self.P[3:, 3:] + widened**2 * np.diag(self._restart_bias_variance)
+        P[:3, :3] = attitude_sigma**2 * np.eye(3)
+        P[3:, 3:] = self.P[3:, 3:] + bias_width**2 * np.diag(self._restart_bias_variance)
         state = State(attitude=self.attitude, bias=self.bias, covariance=P)
-        rival = StepFilter(self.process_noise, state, gate=gate, robust=self.robust, time=self.time)
+        rival = StepFilter(self.process_noise, state, gate=self.gate, robust=self.robust, time=self.time)
         rival._passes = WIDE_PASSES
-        return _Challenger(
-            filter=rival,
-            since=self.time,
-            bias=rival.bias,
-            bias_variance=np.diag(P)[3:].copy(),
-        )
+        return rival
+
+    def _become(self, other: StepFilter) -> None:
+        self.attitude, self.bias, self.P = other.attitude, other.bias, other.P
 
     def _remember(self, done: _Done) -> None:
         """Keep what is done for as long as a measurement may still come in before it."""
@@ -479,7 +400,6 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         """Return what must come back when the filter goes back to this moment; nothing where it never does."""
         if self.look_back == 0.0:
             return {}
-        rival = self._challenger
         return {
             "time": self.time,
             "attitude": self.attitude,
@@ -487,12 +407,8 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             "P": self.P.copy(),
             "refused": dict(self.refused),
             "_vertical": dict(self._vertical),
-            "events": self.events,
             "_passes": self._passes,
-            "_standing": copy.deepcopy(self._standing),
-            "_level": self._level,
-            "_trusted": self._trusted,
-            "_challenger": None if rival is None else copy.deepcopy(rival),
+            "_judging": self._judging.copied(),
         }
 
     def _restore(self, kept: dict[str, Any]) -> None:
@@ -521,98 +437,6 @@ class _Done:
         share = (time - begin) / (self.end - begin)
         head = replace(self, end=time, dt=share * self.dt, increment=share * self.increment)
         return head, replace(self, dt=self.dt - head.dt, increment=self.increment - head.increment)
-
-
-@dataclass(kw_only=True)
-class _Challenger:
-    """A filter beside the filter, and how it did."""
-
-    filter: StepFilter
-    since: float
-    bias: Array
-    """Its bias when it started (3,), rad/s."""
-    bias_variance: Array
-    """The variance of it then (3,)."""
-    hits: int = 0
-    misses: int = 0
-    missed: int = 0
-    """Refusals in a row."""
-    nis: float = 0.0
-    degrees: int = 0
-
-    def judge(self, agreed: bool | None, refused: bool) -> None:
-        """Count a measurement that it took in, or did not, and the filter's own refusal of it."""
-        if agreed is False:
-            self.misses += 1
-            self.missed += 1
-        elif agreed:
-            self.missed = 0
-            self.hits += refused
-            self.nis += self.filter.nis
-            self.degrees += self.filter.dim_z
-
-    @property
-    def failed(self) -> bool:
-        """Whether it refuses too many."""
-        return self.misses > TOLERANCE + 0.5 * self.hits or self.missed >= MISSES_IN_A_ROW
-
-    @property
-    def too_narrow(self) -> bool:
-        """Whether its bias has moved too far from its start, or what it accepts fits too ill."""
-        move = float(np.sum((self.filter.bias - self.bias) ** 2 / self.bias_variance))
-        return move > BIAS_MOVE or self.nis > self.degrees + MISFIT * math.sqrt(2.0 * self.degrees)
-
-    def widen(self) -> bool:
-        """Take part of what was believed of the bias at the start back out (:func:`strapdown.kernels.robust_loop.widen`), if it can be."""
-        mine = self.filter
-        P = mine.P
-        if np.any(np.diag(P)[3:] > 1.05 * self.bias_variance):
-            return False
-        P, turn, bias = P.copy(), np.zeros(3), mine.bias.copy()
-        for i in range(3):
-            column = P[:, 3 + i].copy()
-            spread = column[3 + i] - self.bias_variance[i] / (1.0 - 1.0 / WIDENING**2)
-            if spread >= 0.0:
-                continue  # the axes before it have left more than its start allows: it holds nothing back any more
-            gain = column / spread
-            innovation = self.bias[i] - bias[i]
-            turn, bias = turn + innovation * gain[:3], bias + innovation * gain[3:]
-            P -= np.outer(gain, column)
-        correction = quaternion.exp(turn)
-        mine.attitude = quaternion.normalize(quaternion.multiply(mine.attitude, correction))
-        mine.bias = bias
-        mine.P, _ = seen_from(correction, P)
-        self.bias_variance = WIDENING**2 * self.bias_variance
-        self.nis, self.degrees = 0.0, 0
-        return True
-
-
-@dataclass(kw_only=True)
-class _Standing:
-    """What became of a sensor's measurements of late."""
-
-    in_a_row: int = 0
-    """Refusals in a row."""
-    excess: int = 0
-    """Refusals less acceptances, between zero and twice the gate's limit."""
-    number: int = 0
-    """Refusals since the excess was zero."""
-    first: float = 0.0
-    """Time of the first of them, s."""
-    told: bool = False
-    """Whether they are a lock-out."""
-
-    def refuse(self, time: float, limit: int) -> None:
-        self.in_a_row += 1
-        if self.excess == 0:
-            self.number, self.first, self.told = 0, time, False
-        self.excess = min(self.excess + 1, 2 * limit)
-        self.number += 1
-        self.told = self.told or self.excess > limit
-
-    def accept(self) -> None:
-        self.in_a_row = 0
-        self.excess = max(self.excess - 1, 0)
 
 
 def _of(sensor: str, name: str) -> str:

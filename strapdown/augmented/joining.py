@@ -1,0 +1,164 @@
+"""Smoothing where a gate has recovered: trajectories, each of measurements of its own, and which of them tells which edge.
+
+At a recovery the filter's state makes way for a challenger's, which knows nothing of what the filter took in before. So the states
+before and after are two trajectories, and no information crosses from one to the other. The first ends with the first refusal of those that
+led to the recovery; what it said after that was wrong. The second begins where the challenger did, before it took over: with the
+challenger's start at that time the filter is run again up to the recovery, so that the smoother has what the challenger passed through.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from strapdown.checks import Array
+from strapdown.kernels.machine import compiled
+from strapdown.kernels.robust_gate import CHALLENGED, FIRST_BIAS, LEVEL, PASSES, SINCE, WIDE_PASSES, WIDENING
+from strapdown.kernels.smoother_loop import locate_edges
+from strapdown.records import Event, ImuRecord
+from strapdown.robustness import UNIFORM_SIGMA, Gate, GateMemory
+
+STAMP_TOLERANCE = 1e-6
+"""Of the mean gyro interval: an edge that lies beyond t + lag by no more is taken for one at t + lag."""
+
+
+def last_seen(time: Array, lag: float) -> np.ndarray:
+    """Return for each edge the number of the last one at or before it and ``lag``, s."""
+    slack = STAMP_TOLERANCE * (time[-1] - time[0]) / (len(time) - 1)
+    if time[0] + lag + slack >= time[-1]:
+        return np.full(len(time), len(time) - 1)
+    return np.asarray(np.searchsorted(time, time + (lag + slack), side="right") - 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Break:
+    """A recovery as a smoother takes it; times in s."""
+
+    start: float
+    """First refusal: where the trajectory before it ends."""
+    since: float
+    """Where the trajectory after it begins."""
+    end: float
+    """Recovery."""
+
+
+def recoveries(events: Sequence[Event]) -> list[Event]:
+    """Return the recoveries among events, in order of time."""
+    return sorted((event for event in events if event.kind == "recovery"), key=lambda event: event.end)
+
+
+def part(record: ImuRecord, begin: float, end: float) -> ImuRecord:
+    """Return the record between two times, with the measurements from ``begin`` on and before ``end``.
+
+    The others are missing rather than gone, for what is told of a series as a whole.
+    """
+    inside = (record.time > begin) & (record.time < end)
+    time = np.concatenate([[begin], record.time[inside], [end]])
+    k = np.searchsorted(record.time, time[1:], side="left") - 1
+    share = np.diff(time) / np.diff(record.time)[k]
+    vectors = []
+    for series in record.vectors:
+        kept = (series.time >= begin) & (series.time < end)
+        if series.attitude is None:
+            vectors.append(replace(series, vector_b=np.where(kept[:, None], series.vector_b, np.nan)))
+        else:
+            vectors.append(replace(series, attitude=np.where(kept[:, None], series.attitude, np.nan)))
+    return ImuRecord(time=time, increments=share[:, None] * record.increments[k], vectors=tuple(vectors))
+
+
+def break_of(event: Event, memory: GateMemory | None, begin: float) -> Break:
+    """Return a recovery as a break, not before the record's ``begin``.
+
+    ``memory`` is what the gate remembers just before, None where nobody knows what took over.
+    """
+    since = event.end
+    if memory is not None and memory.counts[CHALLENGED]:
+        since = min(since, max(begin, float(memory.counts[SINCE])))
+    return Break(start=max(begin, event.start), since=since, end=event.end)
+
+
+def begun(gate: Gate, memory: GateMemory) -> tuple[Array, Array, Array]:
+    """Return bias (3,) and variances of attitude and bias (6,) that a challenger started from, as wide as it has become; and its counts."""
+    widened = WIDENING ** memory.counts[LEVEL] * gate.restart_attitude_sigma
+    sigma = max(gate.restart_attitude_sigma, min(widened, UNIFORM_SIGMA))
+    bias, variance = memory.counts[FIRST_BIAS : FIRST_BIAS + 3], memory.counts[FIRST_BIAS + 3 : FIRST_BIAS + 6]
+    counts = memory.counts.copy()
+    counts[CHALLENGED], counts[PASSES] = 0.0, WIDE_PASSES
+    return bias.copy(), np.concatenate([np.full(3, sigma**2), variance]), counts
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trajectory:
+    """Segments that a smoother goes back over, and what of them it writes."""
+
+    segments: np.ndarray
+    """Rows as the filter stores them, from that of the first stop on."""
+    starts: np.ndarray
+    """Number of the row that starts at each stop, −1 where there is none."""
+    edge: np.ndarray
+    """Stops to write, in order."""
+    last: np.ndarray
+    """Of each the stop from which on nothing is known."""
+    row: np.ndarray
+    """Of each the edge of the record that it is."""
+
+
+def stops(time: Array, breaks: Sequence[Break]) -> Array:
+    """Return the edges (n,) and the times of breaks."""
+    return np.unique(np.concatenate([time, *([one.start, one.since, one.end] for one in breaks)]))
+
+
+def starts(time: Array, event_time: Array, segments: Array) -> np.ndarray:
+    """Return the number of the segment that starts at each time; the last row of segments is the end state."""
+    found = np.empty(len(time), np.int64)
+    compiled(locate_edges)(time, event_time, segments, len(segments) - 1, found)
+    return found
+
+
+Again = tuple[Array, np.ndarray] | None
+"""Segments of a trajectory from its ``since`` to its ``end``, and the number of that which starts at each stop between; None: none."""
+
+
+def trajectories(
+    time: Array,
+    until: np.ndarray,
+    breaks: Sequence[Break],
+    first: np.ndarray,
+    segments: np.ndarray,
+    again: Sequence[Again],
+) -> list[Trajectory]:
+    """Return the trajectories of a record with these edges, each of which sees the record up to the edge ``until``.
+
+    ``segments`` are the filter's, ``first`` tells which of them starts at each stop, and ``again`` those of each break.
+    """
+    stop = stops(time, breaks)
+    place = np.searchsorted(stop, time)
+    since, end = ([-np.inf, *(getattr(one, name) for one in breaks)] for name in ("since", "end"))
+    newest = np.searchsorted(end, time[until], side="right") - 1
+    own = np.minimum(np.searchsorted(since, time, side="right") - 1, newest)
+    lost = np.array([*(one.start for one in breaks), np.inf])[own]
+    last = np.where(own == newest, place[until], np.where(time <= lost, np.searchsorted(stop, lost), place))
+    found = []
+    for k in range(len(breaks) + 1):
+        mine = np.flatnonzero(own == k)
+        begin = int(np.searchsorted(stop, breaks[k - 1].end)) if k > 0 else 0
+        after = first[np.searchsorted(stop, breaks[k].end)] + 1 if k < len(breaks) else len(segments)
+        rows, at = segments[first[begin] : after], first - first[begin]
+        at[:begin] = -1
+        ran = again[k - 1] if k > 0 else None
+        if ran is not None:
+            before, early = ran
+            at[begin:] += len(before) - 1
+            at[begin - len(early) + 1 : begin] = early[:-1]
+            rows = np.concatenate([before[:-1], rows])
+        found.append(Trajectory(segments=rows, starts=at, edge=place[mine], last=last[mine], row=mine))
+    return found
+
+
+def climbing(last: np.ndarray) -> list[slice]:
+    """Return the stretches in which numbers do not fall."""
+    bounds = [0, *(np.flatnonzero(np.diff(last) < 0) + 1), len(last)]
+    return [slice(a, b) for a, b in itertools.pairwise(bounds) if b > a]

@@ -1,0 +1,634 @@
+"""The smoother with optional states: one least-squares problem for each kind of block, fixed lag, recoveries, blocks told by functions."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import scipy.linalg
+
+from strapdown import augmented, consistency, kinematics, mekf, motion, quaternion, records
+from strapdown.augmented import filtering, joining, smoothing
+from strapdown.augmented.turning import turning
+from strapdown.checks import InputError
+from strapdown.mekf import ProcessNoise
+from strapdown.records import ImuRecord
+from strapdown.robustness import Gate
+from strapdown.vectors import VectorMeasurements
+
+UP, FIELD = np.array([0.0, 0.0, 9.81]), np.array([0.0, 0.6, -0.8])
+
+
+# --------------------------------------------------------------------------------------------- one least-squares problem over the record
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Small:
+    """A short record of a body that turns, and what is believed at its start."""
+
+    record: ImuRecord
+    noise: ProcessNoise
+    initial: augmented.AugmentedState
+    blocks: tuple
+
+
+def stacked(blocks, name, shape):
+    return np.concatenate([np.empty((0, *shape)), *(getattr(block, name) for block in blocks)])
+
+
+def effects_on(blocks, sensor):
+    """a, d, U and lever a′ of all states on a sensor."""
+    parts = []
+    for block in blocks:
+        effect = block.effects.get(sensor, augmented.Effect())
+        parts.append(
+            [
+                np.zeros((block.size, *shape)) if value is None else value
+                for value, shape in (
+                    (effect.offset_b, (3,)),
+                    (effect.offset_f, (3,)),
+                    (effect.scale, (3, 3)),
+                    (effect.lever, (3,)),
+                )
+            ]
+        )
+    return [np.concatenate(part) for part in zip(*parts, strict=True)]
+
+
+def turns_of(blocks, increments, dt, q, b, c):
+    """The body's turns over intervals by the gyro's model (n, 3), its rate held."""
+    T, e = stacked(blocks, "gyro_scale", (3, 3)), stacked(blocks, "gyro_offset", (3,))
+    G, decay = stacked(blocks, "gyro_force", (3, 3)), stacked(blocks, "decay", ())
+    force_f = sum((block.force_f for block in blocks), np.zeros(3))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean = np.where(decay > 0.0, -np.expm1(-decay * dt) / decay, dt)
+    felt = quaternion.rotate(
+        quaternion.conjugate(quaternion.multiply(q, quaternion.exp(0.5 * (increments - b * dt)))), force_f
+    )
+    left = increments - b * dt - (mean * c) @ e - dt * np.einsum("nk,kij,nj->ni", c, G, felt)
+    return np.linalg.solve(np.eye(3) + np.einsum("nk,kij->nij", c, T), left[..., None])[..., 0]
+
+
+def transition_of(blocks, dt):
+    return scipy.linalg.block_diag(*(block.transition(dt) for block in blocks))
+
+
+def driven(blocks, noise, w, dt):
+    """Q of (δθ, δb, δc) over an interval of rate w, by Van Loan."""
+    m = sum(block.size for block in blocks)
+    A, D = np.zeros((6 + m, 6 + m)), np.zeros((6 + m, 6 + m))
+    A[:3, :3], A[:3, 3:6] = -kinematics.skew(w), -np.eye(3)
+    A[:3, 6:] = -stacked(blocks, "gyro_offset", (3,)).T
+    A[6:, 6:] = np.diag(-stacked(blocks, "decay", ())) + np.diag(stacked(blocks, "feed", ())[:-1], 1) if m else 0.0
+    D[:3, :3], D[3:6, 3:6] = noise.angle_random_walk**2 * np.eye(3), noise.rate_random_walk**2 * np.eye(3)
+    D[6:, 6:] = np.diag(stacked(blocks, "density", ()))
+    whole = scipy.linalg.expm(np.block([[-A, D], [np.zeros_like(A), A.T]]) * dt)
+    n = 6 + m
+    return whole[n:, n:].T @ whole[:n, n:]
+
+
+def root_inverse(P):
+    """A whitening matrix of a covariance, of which some states may have none: those are held fast."""
+    sigma = np.sqrt(np.diag(P))
+    scale = np.where(sigma > 0.0, sigma, 1e-9)
+    return (
+        np.linalg.inv(np.linalg.cholesky(P / np.outer(scale, scale) + np.diag(np.where(sigma > 0.0, 0.0, 1.0)))) / scale
+    )
+
+
+def predicted_vectors(blocks, series, q, c, W):
+    a, d, U, lever = effects_on(blocks, series.sensor)
+    r = series.reference_f + np.einsum("mk,ki->mi", c, d)
+    seen = quaternion.rotate(quaternion.conjugate(q), r)
+    seen = seen + np.einsum("mk,kij,mj->mi", c, U, seen) + c @ a
+    return seen + np.einsum("mij,kj,mk->mi", W, lever, c)
+
+
+def turning_matrices(blocks, record, series):
+    """W of a lever arm at each measurement, by the gyro."""
+    if not any(effect.lever is not None for block in blocks for effect in block.effects.values()):
+        return np.zeros((len(series.time), 3, 3))
+    turns, _ = turning(record, series.time)
+    w = kinematics.skew(turns[:, :3])
+    return kinematics.skew(turns[:, 3:]) + w @ w
+
+
+def optimum(small: Small, guess: np.ndarray, q0: np.ndarray):
+    """The trajectory of least squares: attitudes (n + 1, 4), biases and values (n + 1, 3 + m), from a first guess."""
+    record, blocks, initial = small.record, small.blocks, small.initial
+    edges, n = len(record.time), guess.shape[1]
+    dt = float(record.time[1] - record.time[0])
+    prior = root_inverse(initial.covariance)
+    phi = transition_of(blocks, dt)
+    whitening = np.array([root_inverse(driven(blocks, small.noise, one / dt, dt)) for one in record.increments])
+    told = [(s, np.searchsorted(record.time, s.time), turning_matrices(blocks, record, s)) for s in record.vectors]
+
+    def residuals(x):
+        q, b, c = quaternion.multiply(q0, quaternion.exp(x[:, :3])), x[:, 3:6], x[:, 6:]
+        off = quaternion.log(quaternion.multiply(quaternion.conjugate(initial.attitude), q[0]))
+        there = quaternion.multiply(
+            q[:-1], quaternion.exp(turns_of(blocks, record.increments, dt, q[:-1], b[:-1], c[:-1]))
+        )
+        step = quaternion.log(quaternion.multiply(quaternion.conjugate(there), q[1:]))
+        step = np.concatenate([step, np.diff(b, axis=0), c[1:] - c[:-1] @ phi.T], axis=1)
+        parts = [
+            prior @ np.concatenate([off, b[0] - initial.bias, c[0] - initial.values]),
+            np.einsum("nij,nj->ni", whitening, step).ravel(),
+        ]
+        for series, at, W in told:
+            miss = series.vector_b - predicted_vectors(blocks, series, q[at], c[at], W)
+            parts.append((miss / series.sigma[:, None]).ravel())
+        return np.concatenate(parts)
+
+    # Gauss–Newton. An edge meets its neighbours only: the columns of every third one are differenced together.
+    owner = [np.zeros(n, int), *(np.full(n, k) for k in range(edges - 1)), *(np.repeat(at, 3) for _, at, _ in told)]
+    later = [np.zeros(n, int), *(np.full(n, k + 1) for k in range(edges - 1)), *owner[edges:]]
+    owner, later = np.concatenate(owner), np.concatenate(later)
+    x = guess.copy()
+    x[:, :3] = 0.0
+    h = 1e-4 * np.sqrt(np.diag(initial.covariance))
+    for _ in range(12):
+        now = residuals(x)
+        J = np.zeros((len(owner), edges, n))
+        for group in range(3):
+            mine = np.arange(group, edges, 3)
+            seen = np.where(owner % 3 == group, owner, later)
+            hit = (owner % 3 == group) | (later % 3 == group)
+            for i in range(n):
+                step = np.zeros_like(x)
+                step[mine, i] = h[i]
+                J[hit, seen[hit], i] = ((residuals(x + step) - residuals(x - step)) / (2.0 * h[i]))[hit]
+        move = np.linalg.lstsq(J.reshape(len(owner), -1) * np.tile(h, edges), -now, rcond=None)[0]
+        move = move.reshape(edges, n) * h
+        x = x + move
+        if np.max(np.abs(move) / h) < 0.1:
+            break
+    return quaternion.multiply(q0, quaternion.exp(x[:, :3])), x[:, 3:]
+
+
+RATE = np.array([0.6, -0.9, 1.2])
+
+
+def small_record(blocks, scale, *, seed=3, steps=8, dt=0.1, late=False) -> Small:
+    """A record that the model makes, errors of attitude and sensors ``scale`` times tenths; ``late``: the field is seen at the end only."""
+    rng = np.random.default_rng(seed)
+    noise = ProcessNoise(angle_random_walk=0.01 * scale, rate_random_walk=0.003 * scale)
+    initial = mekf.initial_state(quaternion.IDENTITY, attitude_sigma=0.1 * scale, bias_sigma=0.02 * scale)
+    initial = augmented.initial_state(initial, blocks)
+    time, m = dt * np.arange(steps + 1), len(initial.values)
+    b = 0.02 * scale * rng.standard_normal(3)
+    c, q = np.empty((steps + 1, m)), np.empty((steps + 1, 4))
+    P = initial.covariance[6:, 6:]
+    c[0], q[0] = np.linalg.cholesky(P) @ rng.standard_normal(m), quaternion.normalize(rng.standard_normal(4))
+    increments, phi = np.empty((steps, 3)), transition_of(blocks, dt)
+    for k in range(steps):
+        turn = RATE * dt * (1.0 + 0.3 * np.sin(2.0 * time[k]))
+        increments[k] = turn
+        for _ in range(20):  # what the model turns into this
+            increments[k] += turn - turns_of(blocks, increments[k : k + 1], dt, q[k : k + 1], b[None], c[k : k + 1])[0]
+        increments[k] += noise.angle_random_walk * math.sqrt(dt) * rng.standard_normal(3)
+        q[k + 1] = quaternion.multiply(q[k], quaternion.exp(turn))
+        value, vector = np.linalg.eigh(driven(blocks, noise, turn / dt, dt)[6:, 6:])
+        c[k + 1] = phi @ c[k] + vector @ (np.sqrt(np.maximum(value, 0.0)) * rng.standard_normal(m))
+    bare = ImuRecord(time=time, increments=increments)
+    series = []
+    for name, reference, sigma, at in (
+        ("acc", UP, 0.2 * scale, np.arange(1, steps + 1)),
+        ("mag", FIELD, 0.02 * scale, np.array([steps]) if late else np.arange(2, steps + 1, 2)),
+    ):
+        one = VectorMeasurements(
+            sensor=name,
+            kind="vector",
+            time=time[at],
+            vector_b=np.zeros((len(at), 3)),
+            reference_f=reference,
+            sigma=np.full(len(at), sigma),
+        )
+        z = predicted_vectors(blocks, one, q[at], c[at], turning_matrices(blocks, bare, one))
+        series.append(dataclasses.replace(one, vector_b=z + sigma * rng.standard_normal(z.shape)))
+    start = quaternion.multiply(q[0], quaternion.exp(0.1 * scale * np.array([1.0, -0.7, 0.5])))
+    return Small(
+        record=dataclasses.replace(bare, vectors=tuple(series)),
+        noise=noise,
+        initial=dataclasses.replace(initial, attitude=start),
+        blocks=blocks,
+    )
+
+
+KINDS = {
+    "gyro scale": lambda f: augmented.GyroScale(scale_sigma=0.02 * f, misalignment_sigma=0.01 * f),
+    "gyro force": lambda f: augmented.GyroForce(along_sigma=2e-3 * f, across_sigma=1e-3 * f * (1.0 - np.eye(3))),
+    "gyro drift": lambda f: augmented.GyroGaussMarkov(bias_sigma=0.02 * f, correlation_time=0.7),
+    "bias": lambda f: augmented.VectorBias(sensor="acc", bias_sigma=0.5 * f),
+    "scale": lambda f: augmented.VectorScale(sensor="acc", scale_sigma=0.03 * f),
+    "coloured, body axes": lambda f: augmented.GaussMarkov(sensor="acc", noise_sigma=1.5 * f, correlation_time=0.7),
+    "lever arm": lambda f: augmented.LeverArm(sensor="acc", arm_sigma=0.2 * f, strength=1.0),
+}
+CARRIED = {
+    "coloured, fixed axes": augmented.GaussMarkov(sensor="acc", noise_sigma=3.0, correlation_time=0.7, frame="fixed"),
+    "velocity": augmented.BoundedVelocity(
+        sensor="acc", velocity_time=0.5, velocity_sigma=0.7, acceleration_time=0.3, strength=1.0
+    ),
+    "position": augmented.BoundedVelocity(
+        sensor="acc", velocity_time=0.5, velocity_sigma=0.7, acceleration_time=0.3, position_time=1.0, strength=1.0
+    ),
+}
+
+
+def distance_to_the_optimum(small: Small) -> np.ndarray:
+    """Of attitude, bias and values at the edges (n + 1, 6 + m), over the smoother's σ."""
+    found = augmented.smooth(small.record, small.noise, small.initial, small.blocks, full_covariance=True)
+    values = np.concatenate([block.values for block in found.blocks.values()], axis=1)
+    guess = np.concatenate([np.zeros_like(found.bias), found.bias, values], axis=1)
+    q, rest = optimum(small, guess, found.attitude)
+    off = quaternion.log(quaternion.multiply(quaternion.conjugate(found.attitude), q))
+    off = np.concatenate([off, rest - guess[:, 3:]], axis=1)
+    return np.abs(off) / np.sqrt(np.einsum("kii->ki", found.whole_covariance))
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "lever arm"])
+def test_the_smoother_is_least_squares_to_first_order(kind):
+    """Of the whole trajectory, prior and gyro noise and measurements together, by Gauss–Newton."""
+    assert np.max(distance_to_the_optimum(small_record((KINDS[kind](0.01),), 0.01, steps=6))) < 0.02
+
+
+@pytest.mark.slow
+def test_the_smoother_is_least_squares_with_a_lever_arm():
+    """Rates and angular accelerations are those that the filter takes from the gyro, which wants a hundred samples."""
+    assert np.max(distance_to_the_optimum(small_record((KINDS["lever arm"](0.01),), 0.01, steps=100, dt=0.03))) < 0.02
+
+
+@pytest.mark.parametrize("kind", CARRIED)
+def test_what_is_carried_is_told_relative_to_the_smoothed_attitude(kind):
+    """Values of several σ of their sensor, of a body whose heading is found only at the end: the smoother turns all that came before.
+
+    There the filter itself corrects the attitude after it has taken in the accelerometer, and its values stay behind by that turn times
+    their size: the last edge is not looked at.
+    """
+    off = distance_to_the_optimum(small_record((CARRIED[kind],), 0.01, late=True))
+    assert np.max(off[:, :6]) < 0.02
+    assert np.max(off[:-1, 6:]) < 0.1
+
+
+# ---------------------------------------------------------------------------------------------------------------------- fixed lag
+
+NOISE = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-4)
+IRON = augmented.VectorBias(sensor="mag", bias_sigma=0.05, rate_random_walk=1e-3)
+SWAY = augmented.GaussMarkov(sensor="acc", noise_sigma=0.3, correlation_time=0.4, frame="fixed")
+SCALE = augmented.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01)
+MOVED = augmented.BoundedVelocity(
+    sensor="acc", velocity_time=0.3, velocity_sigma=0.1, acceleration_time=0.1, strength=1.0
+)
+BLOCKS = {"none": (), "iron, scale and sway": (IRON, SCALE, SWAY), "velocity": (MOVED, IRON)}
+BODY = motion.HarmonicRates(
+    harmonics=(
+        motion.Harmonic(amplitude=(0.9, 0.4, -0.6), frequency=0.21),
+        motion.Harmonic(amplitude=(-0.4, 0.8, 0.5), frequency=0.37),
+    )
+)
+
+
+def swaying(duration=2.0, seed=1, start_error=(0.05, -0.02, 0.03)):
+    """A record of a swaying body, sensors at times of their own, some on edges and an event just beside one; and what is believed."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(round(50 * duration) + 1) / 50.0
+    turns = BODY.increments(time) + 1e-3 * math.sqrt(0.02) * rng.standard_normal((len(time) - 1, 3))
+    series = []
+    for name, reference, sigma, at in (
+        ("acc", UP, 0.05, np.arange(0.013, duration, 0.11)),
+        ("mag", FIELD, 0.02, np.nextafter(time[5::10], np.where(np.arange(len(time[5::10])) % 3 == 0, 9.0, 0.0))),
+    ):
+        seen = quaternion.rotate(quaternion.conjugate(BODY.attitude(at)), reference)
+        seen = seen + sigma * rng.standard_normal(seen.shape)
+        series.append(
+            VectorMeasurements(
+                sensor=name, kind="vector", time=at, vector_b=seen, reference_f=reference, sigma=np.full(len(at), sigma)
+            )
+        )
+    attitude = quaternion.multiply(BODY.attitude(np.array(0.0)), quaternion.exp(start_error))
+    truth = records.Truth(attitude=BODY.attitude(time), bias=np.zeros((len(time), 3)))
+    record = ImuRecord(time=time, increments=turns, vectors=tuple(series), truth=truth)
+    return record, mekf.initial_state(attitude, attitude_sigma=0.05, bias_sigma=3e-3)
+
+
+def difference(one, other, k=slice(None), j=slice(None)):
+    """Largest difference of rows k of one estimate and j of another, in σ, and of covariances scaled to correlations."""
+    sigma = np.sqrt(np.einsum("...ii->...i", other.whole_covariance[j]))
+    off = quaternion.log(quaternion.multiply(quaternion.conjugate(one.attitude[k]), other.attitude[j]))
+    parts = [off, one.bias[k] - other.bias[j]]
+    parts += [block.values[k] - other.blocks[name].values[j] for name, block in one.blocks.items()]
+    P = (one.whole_covariance[k] - other.whole_covariance[j]) / (sigma[..., :, None] * sigma[..., None, :])
+    return max(np.max(np.abs(np.concatenate(parts, axis=-1)) / sigma), np.max(np.abs(P)))
+
+
+@pytest.mark.parametrize("blocks", BLOCKS.values(), ids=BLOCKS)
+@pytest.mark.parametrize("lag", [0.0, 0.1, 0.5])
+def test_a_fixed_lag_is_the_smoother_of_what_was_known(blocks, lag):
+    record, initial = swaying()
+    lagged = augmented.smooth_fixed_lag(record, NOISE, initial, blocks, lag=lag, full_covariance=True)
+    for k in (0, 1, 4, 5, 6, 31, 62, 99, 100):
+        last = min(k + round(50 * lag), len(record.time) - 1)
+        if last:
+            known = augmented.smooth(records.cut(record, 0, last), NOISE, initial, blocks, full_covariance=True)
+            assert difference(lagged, known, k, k) < 1e-10
+
+
+def test_no_lag_is_the_filter_and_a_long_one_the_fixed_interval():
+    record, initial = swaying()
+    blocks = BLOCKS["iron, scale and sway"]
+    ahead = augmented.run(record, NOISE, initial, blocks, full_covariance=True)
+    none = augmented.smooth_fixed_lag(record, NOISE, initial, blocks, lag=0.0, full_covariance=True)
+    both = augmented.smooth(record, NOISE, initial, blocks, full_covariance=True)
+    long = augmented.smooth_fixed_lag(record, NOISE, initial, blocks, lag=2.0, full_covariance=True)
+    assert difference(none, ahead) < 1e-12
+    assert difference(long, both) < 1e-12
+    half = augmented.smooth_fixed_lag(record, NOISE, initial, blocks, lag=0.5)
+    for name in ("acc disturbance", "mag bias"):
+        assert np.all(half.blocks[name].sigma <= ahead.blocks[name].sigma * (1.0 + 1e-3))
+        assert np.all(half.blocks[name].sigma >= both.blocks[name].sigma * (1.0 - 1e-3))
+    with pytest.raises(InputError, match="lag is -1 s; it must not be negative"):
+        augmented.smooth_fixed_lag(record, NOISE, initial, blocks, lag=-1.0)
+
+
+@pytest.mark.parametrize("passes", [1, 3, 7, 200])
+def test_any_number_of_passes_go_together(passes, monkeypatch):
+    record, initial = swaying()
+    whole = augmented.smooth_fixed_lag(record, NOISE, initial, (IRON,), lag=0.3, full_covariance=True)
+    monkeypatch.setattr(smoothing, "PASSES", passes)
+    other = augmented.smooth_fixed_lag(record, NOISE, initial, (IRON,), lag=0.3, full_covariance=True)
+    assert difference(whole, other) < 1e-12
+
+
+def test_a_bias_that_turns_more_than_the_increments_say_loses_no_segments():
+    """A still gyro with a large bias: steps are cut by the turn without the bias, and are more than the increments tell."""
+    rng = np.random.default_rng(5)
+    time = np.arange(21.0)
+    z = np.tile([0.0, 0.0, 1.0], (20, 1)) + 0.02 * rng.standard_normal((20, 3))
+    series = VectorMeasurements(
+        sensor="mag", kind="vector", time=time[1:], vector_b=z, reference_f=[0.0, 0.0, 1.0], sigma=np.full(20, 0.02)
+    )
+    start = mekf.State(
+        attitude=quaternion.IDENTITY, bias=np.array([0.0, 0.0, 3.0]), covariance=np.diag([1e-4] * 3 + [1e-12] * 3)
+    )
+    noise = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-5)
+    found = []
+    for parts in (1, 10):
+        edges = np.arange(20 * parts + 1) / parts
+        record = ImuRecord(time=edges, increments=np.zeros((20 * parts, 3)), vectors=(series,))
+        found.append(augmented.smooth(record, noise, start, (IRON,), full_covariance=True))
+    assert difference(found[0], found[1], slice(None), slice(None, None, 10)) < 1e-6
+
+
+# ------------------------------------------------------------------------------------------------------- blocks told by functions
+
+
+class Told(augmented.GeneralBlock):
+    """A linear block told by functions."""
+
+    def __init__(self, block) -> None:
+        self.block, self.name, self.components = block, block.name, block.components
+        self.units, self.sigma = block.units, block.sigma
+
+    def propagate(self, values, interval):
+        transition = self.block.transition(interval.dt)
+        return transition @ values, transition, np.zeros((self.size, 3)), self.block.process_noise(interval.dt)
+
+    def measured(self, values, view):
+        effect = self.block.effects.get(view.sensor)
+        return None if effect is None else (values @ effect.offset_b, effect.offset_b)
+
+
+@pytest.mark.parametrize("lag", [60.0, 0.2])
+def test_a_block_told_by_functions_is_smoothed_as_the_same_block_told_by_arrays(lag):
+    record, initial = swaying(1.0, start_error=(0.2, -0.1, 0.15))
+    body = augmented.GaussMarkov(sensor="acc", noise_sigma=0.3, correlation_time=0.4, name="body")
+    found = [
+        augmented.smooth_fixed_lag(record, NOISE, initial, (*blocks, SCALE, SWAY), lag=lag, full_covariance=True)
+        for blocks in ((IRON, body), (Told(IRON), Told(body)))
+    ]
+    assert difference(*found) < 1e-10
+    assert found[0].innovations["mag"].nis == pytest.approx(found[1].innovations["mag"].nis, rel=1e-8)
+
+
+class Latency(augmented.GeneralBlock):
+    """A sensor's stamps are late by τ: it shows where the body was, ``exp([ω] τ) R_fbᵀ r ≈ r_b + τ ω × r_b``."""
+
+    name, components, units, sigma = "latency", ("mag",), ("s",), np.array([0.02])
+
+    def measured(self, values, view):
+        if view.sensor != "mag":
+            return None
+        swept = np.cross(view.rate, view.expected_b)
+        return values[0] * swept, swept[None]
+
+
+def latencies(runs: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """NEES of all states at three edges over runs (runs, 3), and the mean squares of smoother and filter over the filter's variances."""
+    nees, squares = [], []
+    for run in range(runs):
+        rng = np.random.default_rng([seed, run])
+        record, initial = swaying(2.0, [seed, run], 0.05 * rng.standard_normal(3))
+        late = 0.02 * rng.standard_normal()
+        bias = 3e-3 * rng.standard_normal(3)
+        acc, mag = record.vectors
+        exact = quaternion.rotate(quaternion.conjugate(BODY.attitude(mag.time)), FIELD)
+        before = quaternion.rotate(quaternion.conjugate(BODY.attitude(mag.time - late)), FIELD)
+        mag = dataclasses.replace(mag, vector_b=mag.vector_b + before - exact)
+        record = dataclasses.replace(record, increments=record.increments + 0.02 * bias, vectors=(acc, mag))
+        noise = dataclasses.replace(NOISE, rate_random_walk=1e-7)
+        both = augmented.smooth(record, noise, initial, (Latency(),), full_covariance=True)
+        ahead = augmented.run(record, noise, initial, (Latency(),))
+        truth = record.truth.attitude, np.tile(bias, (len(record.time), 1)), {"latency": np.array([late])}
+        e = both.errors(*truth)
+        rows = [0, 50, 90]
+        nees.append(consistency.nees(e[rows], both.whole_covariance[rows]))
+        variance = np.concatenate([ahead.variance, ahead.blocks["latency"].variance], axis=1)
+        squares.append([np.mean(x**2 / variance) for x in (e, ahead.errors(*truth))])
+    return np.array(nees), np.mean(squares, axis=0)
+
+
+def test_a_latency_is_smoothed_to_be_believed():
+    nees, (smoothed, filtered) = latencies(8, 7)
+    low, high = consistency.mean_bounds(7, 8, 0.999)
+    assert np.all((low < nees.mean(axis=0) / 7.0) & (nees.mean(axis=0) / 7.0 < high)), nees.mean(axis=0) / 7.0
+    assert smoothed < 0.8 * filtered
+
+
+@pytest.mark.slow
+def test_a_latency_is_smoothed_to_be_believed_over_many_runs():
+    nees, _ = latencies(200, 8)
+    verdict = consistency.Verdict(mean=nees.mean(axis=0) / 7.0, degrees=7, runs=200, probability=0.99)
+    assert verdict.consistent, (verdict.mean, verdict.simultaneous_bounds)
+
+
+# --------------------------------------------------------------------------------------------------------------------- recoveries
+
+
+def lost_start(seed: int, duration: float = 2.5, blocks=(IRON,)):
+    """A record of a body with constant hard iron, the truth of it, and a start radians off that believes to be within 3°."""
+    rng = np.random.default_rng([3, seed])
+    record, initial = swaying(duration, [4, seed])
+    iron = 0.05 * rng.standard_normal(3)
+    acc, mag = record.vectors
+    record = dataclasses.replace(record, vectors=(acc, dataclasses.replace(mag, vector_b=mag.vector_b + iron)))
+    axis = quaternion.normalize(np.append(rng.standard_normal(3), 0.0))[:3]
+    attitude = quaternion.multiply(record.truth.attitude[0], quaternion.exp(rng.uniform(0.8, 3.1) * axis))
+    return record, iron, dataclasses.replace(initial, attitude=attitude)
+
+
+STILL = augmented.VectorBias(sensor="mag", bias_sigma=0.05)
+GATE = Gate(recovery=4, restart_bias_sigma=3e-3)
+
+
+def recovery_of(estimate):
+    found = [event for event in estimate.events if event.kind == "recovery"]
+    assert len(found) == 1
+    return found[0]
+
+
+def test_a_part_of_a_record_between_any_two_times():
+    record, _ = swaying()
+    mag = record.vectors[1]
+    begin, end = float(mag.time[2]), float(mag.time[7])
+    middle = 0.5 * (record.time[40] + record.time[41])
+    one, other = joining.part(record, begin, middle), joining.part(record, middle, end)
+    assert (one.time[0], one.time[-1], other.time[-1]) == (begin, middle, end)
+    edges = np.cumsum(np.vstack([np.zeros(3), record.increments]), axis=0)
+    turned = [np.interp([begin, middle, end], record.time, edges[:, i]) for i in range(3)]
+    whole = np.array([one.increments.sum(axis=0), other.increments.sum(axis=0)])
+    np.testing.assert_allclose(whole.T, np.diff(turned), rtol=0, atol=1e-15)
+    seen = [np.flatnonzero(~np.isnan(p.vectors[1].vector_b[:, 0])).tolist() for p in (one, other)]
+    assert seen == [[2, 3, 4, 5, 6][: len(seen[0])], [2, 3, 4, 5, 6][len(seen[0]) :]]
+    assert len(one.vectors[1].time) == len(mag.time)
+
+
+def test_what_is_smoothed_of_a_recovery_and_what_is_not():
+    record, iron, initial = lost_start(1)
+    ahead = augmented.run(record, NOISE, initial, (STILL,), gate=GATE, full_covariance=True)
+    both = augmented.smooth(record, NOISE, initial, (STILL,), gate=GATE, full_covariance=True)
+    event = recovery_of(ahead)
+    assert both.events == ahead.events
+    assert both.innovations["mag"].weight == pytest.approx(ahead.innovations["mag"].weight)
+    first, last = np.searchsorted(record.time, [event.start, event.end])
+    assert last - first > 10
+    truth = record.truth.attitude, record.truth.bias, {"mag bias": iron}
+    off = np.abs(both.errors(*truth)) / np.sqrt(np.einsum("kii->ki", both.whole_covariance))
+    wrong = np.abs(ahead.errors(*truth)) / np.sqrt(np.einsum("kii->ki", ahead.whole_covariance))
+    assert np.min(np.max(wrong[first:last], axis=1)) > 10.0  # what the filter said in between is wrong
+    assert np.max(off[first:]) < 5.0
+    assert np.all(both.sigma[last:] <= ahead.sigma[last:] * (1.0 + 1e-2))
+    # What came before the first refusal knows nothing of what came after it.
+    assert difference(both, ahead, 0, 0) < 1e-10
+    assert difference(both, ahead, -1, -1) < 1e-10
+
+
+def test_a_trajectory_begins_with_its_challenger():
+    """From its start on it is the smoother of a filter that starts there knowing nothing, whatever the challenger went through."""
+    record, _, initial = lost_start(2)
+    both = augmented.smooth(record, NOISE, initial, (STILL,), gate=GATE, full_covariance=True)
+    first = int(np.searchsorted(record.time, recovery_of(both).start)) + 1
+    rest = records.cut(record, first, len(record.time) - 1)
+    near = quaternion.multiply(record.truth.attitude[first], quaternion.exp([0.02, 0.01, -0.03]))
+    fresh = mekf.initial_state(near, attitude_sigma=2.0, bias_sigma=math.sqrt(2.0) * 3e-3)
+    known = augmented.smooth(rest, NOISE, fresh, (STILL,), full_covariance=True)
+    off = quaternion.log(quaternion.multiply(quaternion.conjugate(both.attitude[first:]), known.attitude))
+    assert np.max(np.abs(off) / known.sigma[:, :3]) < 0.6
+    np.testing.assert_allclose(both.sigma[first:], known.sigma, rtol=0.25)
+
+
+def test_the_prior_of_the_blocks_ages_as_the_filter_has_it():
+    """What a new trajectory starts from: against the filter over a record without measurements."""
+    blocks = (IRON, SWAY, MOVED)
+    record, initial = swaying()
+    begun = augmented.initial_state(initial, blocks)
+    values = np.arange(1.0, len(begun.values) + 1.0) * np.sqrt(np.diag(begun.covariance)[6:])
+    P = begun.covariance + np.diag(np.append(np.zeros(6), np.diag(begun.covariance)[6:]))
+    begun = dataclasses.replace(begun, values=values, covariance=P)
+    bare = dataclasses.replace(
+        record,
+        vectors=tuple(dataclasses.replace(s, vector_b=np.full_like(s.vector_b, np.nan)) for s in record.vectors),
+    )
+    ahead = augmented.run(bare, NOISE, begun, blocks, full_covariance=True)
+    memory = filtering._first(begun, blocks, 3.0)
+    aged, covariance = smoothing._aged(blocks, memory, 5.0)
+    sigma = np.sqrt(np.diag(ahead.whole_covariance[-1])[6:])
+    found = np.concatenate([block.values[-1] for block in ahead.blocks.values()])
+    np.testing.assert_allclose(aged / sigma, found / sigma, rtol=0, atol=1e-8)
+    scale = np.outer(sigma, sigma)
+    np.testing.assert_allclose(covariance / scale, ahead.whole_covariance[-1][6:, 6:] / scale, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("lag", [0.1, 0.6])
+def test_a_fixed_lag_knows_of_a_recovery_when_it_has_happened(lag):
+    record, _, initial = lost_start(1)
+    lagged = augmented.smooth_fixed_lag(record, NOISE, initial, (STILL,), lag=lag, gate=GATE, full_covariance=True)
+    event = recovery_of(lagged)
+    first, last = np.searchsorted(record.time, [event.start, event.end])
+    steps = round(50 * lag)
+    for k in {0, 1, first, first + 5, last - steps - 1, last - steps, last - steps + 1, last - 1, last, last + 3}:
+        if k < 0:
+            continue
+        known = augmented.smooth(
+            records.cut(record, 0, min(k + steps, len(record.time) - 1)),
+            NOISE,
+            initial,
+            (STILL,),
+            gate=GATE,
+            full_covariance=True,
+        )
+        assert difference(lagged, known, k, k) < 1e-8, (k, first, last)
+
+
+def recovered(runs: int) -> np.ndarray:
+    """NEES of all states over runs: in the middle of the stretch in which the filter was lost, at its recovery, and later (runs, 3)."""
+    nees = []
+    for run in range(runs):
+        record, iron, initial = lost_start(100 + run)
+        both = augmented.smooth(record, NOISE, initial, (STILL,), gate=GATE, full_covariance=True)
+        event = recovery_of(both)
+        first, last = np.searchsorted(record.time, [event.start, event.end])
+        rows = [(first + last) // 2, last, 110]
+        e = both.errors(record.truth.attitude, record.truth.bias, {"mag bias": iron})
+        nees.append(consistency.nees(e[rows], both.whole_covariance[rows]))
+    return np.array(nees)
+
+
+def test_a_lost_stretch_is_smoothed_to_be_believed():
+    mean = recovered(16).mean(axis=0) / 9.0
+    low, high = consistency.mean_bounds(9, 16, 0.999)
+    assert np.all((low < mean) & (mean < high)), (mean, low, high)
+
+
+@pytest.mark.slow
+def test_a_lost_stretch_is_smoothed_to_be_believed_over_many_runs():
+    nees = recovered(300)
+    verdict = consistency.Verdict(mean=nees.mean(axis=0) / 9.0, degrees=9, runs=300, probability=0.99)
+    assert verdict.consistent, (verdict.mean, verdict.simultaneous_bounds)
+
+
+def test_with_a_block_told_by_functions_a_trajectory_begins_with_the_recovery():
+    record, _, initial = lost_start(1, 1.5)
+    told = (Told(STILL),)
+    ahead = augmented.run(record, NOISE, initial, told, gate=GATE, full_covariance=True)
+    both = augmented.smooth(record, NOISE, initial, told, gate=GATE, full_covariance=True)
+    event = recovery_of(both)
+    first, last = np.searchsorted(record.time, [event.start, event.end])
+    assert difference(both, ahead, slice(first + 1, last), slice(first + 1, last)) < 1e-12
+    arrays = augmented.smooth(record, NOISE, initial, (STILL,), gate=GATE, full_covariance=True)
+    assert difference(both, arrays, slice(last, None), slice(last, None)) < 1e-7
+
+
+def test_lock_outs_are_told():
+    """A sensor that is refused over and over with no way to follow it: the event is the smoother's too."""
+    record, _, initial = lost_start(1)
+    acc, mag = record.vectors
+    away = dataclasses.replace(mag, vector_b=-mag.vector_b)
+    record = dataclasses.replace(record, vectors=(acc, away))
+    start = dataclasses.replace(initial, attitude=record.truth.attitude[0])
+    gate = Gate(recovery=None)
+    ahead = augmented.run(record, NOISE, start, (STILL,), gate=gate)
+    both = augmented.smooth(record, NOISE, start, (STILL,), gate=gate)
+    assert [event.kind for event in ahead.events] == ["lock-out"]
+    assert both.events == ahead.events
