@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,7 +18,7 @@ import numpy as np
 import strapdown
 from strapdown import coning
 from strapdown.checks import Array, InputError, array, increasing, instance, unit_quaternions
-from strapdown.files import existing_file, written_beside
+from strapdown.files import existing_file, whole_hdf5, written_beside
 from strapdown.vectors import VectorMeasurements
 
 CONVENTIONS = (
@@ -28,6 +28,10 @@ CONVENTIONS = (
 
 LARGEST_BIAS = 1e6
 """rad/s: no gyro has such a bias; an estimate that tells of one is of a filter that was lost, or damaged."""
+
+
+LARGEST_TURN = 1e6
+"""rad: nothing turns so far in one sample interval, nor does a filter cut such a turn into steps."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +46,11 @@ class Truth:
 
 @dataclass(frozen=True, kw_only=True)
 class ImuRecord:
-    """Gyro increments and vector measurements over one run."""
+    """Gyro increments and vector measurements over one run.
+
+    Arrays of floats are taken as they are and not copied, for a long record fills much of the memory: whoever goes on writing to a buffer
+    gives a copy of it.
+    """
 
     time: Array
     """Edges of the sample intervals (n + 1,), s, strictly increasing."""
@@ -56,10 +64,18 @@ class ImuRecord:
         """Check shapes, order and finiteness."""
         time = increasing("time", self.time, least=2)
         increments = array("increments", self.increments, (len(time) - 1, 3))
+        for index in (np.argmax(increments), np.argmin(increments)):
+            row, axis = (int(i) for i in np.unravel_index(index, increments.shape))
+            if abs(increments[row, axis]) > LARGEST_TURN:
+                raise InputError(
+                    f"increments[{row}, {axis}] is {increments[row, axis]:g} rad in {time[row + 1] - time[row]:g} s, and nothing turns so "
+                    "far between two samples; check the unit, or remove it"
+                )
         object.__setattr__(self, "time", time)
         object.__setattr__(self, "increments", increments)
         if isinstance(self.vectors, VectorMeasurements):
             raise InputError(f"vectors is the series {self.vectors.sensor} by itself; give a tuple of them, (series,)")
+        instance("vectors", self.vectors, Iterable, "give a tuple of series, empty for none")
         object.__setattr__(self, "vectors", tuple(self.vectors))
         for k, series in enumerate(self.vectors):
             instance(f"vectors[{k}]", series, VectorMeasurements, "give vectors.VectorMeasurements, a series each")
@@ -165,7 +181,7 @@ class Innovations:
         return np.asarray(np.sum(self.innovation**2 / self.variance, axis=1))
 
 
-EVENT_KINDS = ("recovery", "lock-out", "divergence", "gap")
+EVENT_KINDS = ("recovery", "hypotheses", "lock-out", "divergence", "gap")
 """Kinds of :class:`Event`."""
 
 
@@ -174,18 +190,19 @@ class Event:
     """Something in a run that whoever uses the estimate must hear of."""
 
     kind: str
-    """One of :data:`EVENT_KINDS`: a filter that refused good measurements started anew; a gate refused a sensor more often than it took
-    it in; the running NIS left its bounds; the gyro was silent for much longer than its interval."""
+    """One of :data:`EVENT_KINDS`: a filter that refused good measurements started anew; hypotheses stood in for it while a turn was
+    open; a gate refused a sensor more often than it took it in; the running NIS left its bounds; the gyro was silent for much longer
+    than its interval."""
     start: float
     """When it began, s."""
     end: float
-    """When it was over, s: the filter's recovery, the last refusal, the return of the NIS (or the end of the record), the next gyro
-    sample."""
+    """When it was over, s: the filter's recovery, the hypotheses becoming one, the last refusal, the return of the NIS (or the end of the
+    record), the next gyro sample."""
     sensor: str = ""
     """Sensor concerned, if it is one."""
     value: float = 0.0
-    """Of a recovery the refusals in a row, of a lock-out the refusals, of a divergence the greatest mean NIS per degree of freedom, of a
-    gap its length over the usual interval."""
+    """Of a recovery the refusals in a row, of hypotheses the number left (0 if they became one), of a lock-out the refusals, of a
+    divergence the greatest mean NIS per degree of freedom, of a gap its length over the usual interval."""
 
     def __str__(self) -> str:
         """Say it in one line."""
@@ -193,6 +210,12 @@ class Event:
             return (
                 f"Recovered at {self.end:.6g} s: {self.value:.0f} measurements of {self.sensor} in a row were refused and agreed with each "
                 f"other from {self.start:.6g} s on; what the filter said in between is wrong."
+            )
+        if self.kind == "hypotheses":
+            end = f"{self.value:.0f} of them were left at the end of the record" if self.value else "then they were one"
+            return (
+                f"From {self.start:.6g} s to {self.end:.6g} s hypotheses stood in for the filter, because {self.sensor} left a turn open: "
+                f"{end}."
             )
         if self.kind == "lock-out":
             return (
@@ -251,9 +274,7 @@ _ESTIMATE_UNITS = {
 @contextlib.contextmanager
 def result_file(path: str | os.PathLike[str], kind: str, attributes: Mapping[str, Any] | None) -> Iterator[Any]:
     """Yield an HDF5 file that says what it is; it appears whole or not at all."""
-    import h5py
-
-    with written_beside(path) as temporary, h5py.File(temporary, "w") as file:
+    with written_beside(path) as temporary, whole_hdf5(temporary) as file:
         file.attrs["kind"] = f"strapdown {kind}"
         file.attrs["version"] = strapdown.__version__
         file.attrs["conventions"] = CONVENTIONS

@@ -24,6 +24,8 @@ from strapdown.vectors import Faults, VectorMeasurements
 QUIET = ProcessNoise(angle_random_walk=1e-7, rate_random_walk=1e-10)
 WITHOUT = (np.full(3, np.inf), 0, np.ones((3, 2)), 0, 0)
 """The kernel's arguments for no gate and no robust update."""
+ALL = (np.empty(0, np.int64), np.array([2]), 0.0)
+"""Its arguments for two hypotheses, and no further sets."""
 
 
 def series(name, time, vector_b, reference_f, sigma, kind="direction"):
@@ -180,7 +182,7 @@ def test_for_small_errors_it_is_the_plain_filter():
     out[3] = np.empty((rows, 2))
     done = bank_loop.run_bank(
         record.time, record.increments, QUIET.angle_random_walk**2, QUIET.rate_random_walk**2, events.time, events.kind,
-        events.vector_b, events.variance, events.reference, events.triads, two, np.zeros(2), 0.0, 0, 1, 1e-6, -1.0,
+        events.vector_b, events.variance, events.reference, events.triads, two, np.zeros(2), 0.0, 0, *ALL, 1, 1e-6, -1.0,
         np.empty(2), np.empty(12), np.empty(28), *out, innovation, *WITHOUT, np.empty(len(events.time)),
     )  # fmt: skip
     assert done == (rows, -1, len(events.time))
@@ -228,7 +230,7 @@ def test_weights_are_the_densities_of_the_measurement():
     out = [np.empty((2, n)) for n in (4, 3, 21, 2)]
     compiled(bank_loop.run_bank)(
         record.time, record.increments, 1e-14, 0.0, events.time, events.kind, events.vector_b, events.variance,
-        events.reference, events.triads, states, np.zeros(2), 0.0, 0, 1, 1e-6, -1.0, np.empty(2), np.empty(12),
+        events.reference, events.triads, states, np.zeros(2), 0.0, 0, *ALL, 1, 1e-6, -1.0, np.empty(2), np.empty(12),
         np.empty(28), *out, np.empty((1, 6)), *WITHOUT, np.empty(1),
     )  # fmt: skip
     z = events.vector_b[0]
@@ -396,21 +398,21 @@ def contaminated(probability):
     return (dataclasses.replace(sensor, faults=faults),)
 
 
-def check_outliers(option, probability, runs):
+def check_outliers(option, probability, runs, seed=11):
+    """Two directions do not tell which of them lies off, three hardly: it is modest until there are more."""
     nees, last = [], []
-    epochs = (200.0, 400.0, 800.0, 1490.0)
+    epochs = (20.0, 30.0, 60.0, 100.0, 200.0, 400.0, 800.0, 1490.0)
     for run in range(runs):
-        record, belief = orbit(run, sensors=contaminated(probability))
+        record, belief = orbit(run, seed=seed, sensors=contaminated(probability))
         found = bank.run(record, belief, every=10, **OPTIONS[option])
         e, each = judged(found, record)
         nees.append(each[[int(np.searchsorted(found.estimate.time, seconds)) for seconds in epochs]])
         last.append(np.linalg.norm(e[-1, :3]))
     mean = np.mean(nees, axis=0) / 6.0
-    low, high = consistency.mean_bounds(6, runs, 1.0 - 0.01 / len(epochs))
-    assert np.all(mean < high), (mean, high)
-    assert np.all(mean[1:] > low), (mean, low)
-    assert mean[0] > 0.8 * low  # some of its directions were taken for coarser than they are
-    assert np.max(nees) / 6.0 < 12.0
+    low, high = consistency.mean_bounds(6, runs, 1.0 - 0.01 / 4.0)
+    assert np.all(mean[1:] < high), (mean, high)
+    assert np.all(mean > low * np.array([0.7, 0.94, 0.96, 1.0, 1.0, 1.0, 1.0, 1.0])), (mean, low)
+    assert np.max(np.array(nees)[:, 2:]) / 6.0 < 12.0
     assert np.max(last) < 1.0 * DEGREE
 
 
@@ -421,10 +423,11 @@ def test_it_is_consistent_among_outliers(option, probability):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("seed", [11, 12])
 @pytest.mark.parametrize("probability", [0.0, 0.01, 0.05])
 @pytest.mark.parametrize("option", OPTIONS)
-def test_it_is_consistent_among_outliers_over_many_runs(option, probability):
-    check_outliers(option, probability, 600)
+def test_it_is_consistent_among_outliers_over_many_runs(option, probability, seed):
+    check_outliers(option, probability, 600, seed)
 
 
 def test_without_a_gate_outliers_make_it_too_sure():
@@ -435,18 +438,59 @@ def test_without_a_gate_outliers_make_it_too_sure():
     assert np.mean(nees) / 6.0 > 2.0
 
 
-@pytest.mark.parametrize("size", [10.0, 100.0, 1000.0])
-def test_a_wild_first_direction_does_not_mislead_it_for_good(size):
+def wild(record, number, size, seed):
+    """The record with its first directions off by so many σ in each axis."""
+    one = record.vectors[0]
+    vector_b = np.array(one.vector_b)
+    vector_b[:number] += size * one.sigma[0] * np.random.default_rng(seed).standard_normal((number, 3))
+    vector_b[:number] /= np.linalg.norm(vector_b[:number], axis=1, keepdims=True)
+    return dataclasses.replace(record, vectors=(dataclasses.replace(one, vector_b=vector_b),))
+
+
+@pytest.mark.parametrize("option", OPTIONS)
+@pytest.mark.parametrize(("number", "size"), [(1, 10.0), (1, 30.0), (1, 1000.0), (2, 30.0), (3, 1000.0)])
+def test_wild_first_directions_do_not_mislead_it(number, size, option):
+    """It used to take a recovery where one lay far off, and some that lay 38 σ off were believed."""
+    nees = []
+    for run in range(12):
+        record, belief = orbit(run)
+        found = bank.run(wild(record, number, size, run), belief, every=10, **OPTIONS[option])
+        assert not found.estimate.events
+        assert not found.estimate.skipped["magnetometer"]
+        e, each = judged(found, record)
+        assert np.linalg.norm(e[-1, :3]) < 1.0 * DEGREE
+        nees.append(each[[int(np.searchsorted(found.estimate.time, seconds)) for seconds in (80.0, 200.0, 1490.0)]])
+    low, high = consistency.mean_bounds(6, 12, 0.999)
+    assert np.all((low < np.mean(nees, axis=0) / 6.0) & (np.mean(nees, axis=0) / 6.0 < high))
+
+
+def test_a_wild_first_attitude_is_no_attitude_yet():
+    """One hypothesis is not believed before a second attitude has been measured, which tells that one of them lies off."""
+    time = np.arange(11.0)
+    random = np.random.default_rng(4)
+    attitude = quaternion.exp(1e-3 * random.standard_normal((11, 3)))
+    attitude[0] = quaternion.exp(np.array([0.3, -0.5, 0.8]))
+    tracker = VectorMeasurements(
+        sensor="tracker", kind="attitude", time=time, attitude=attitude, sigma_axes=np.full(3, 1e-3)
+    )
+    record = ImuRecord(time=time, increments=np.zeros((10, 3)), vectors=(tracker,))
+    found = bank.run(record, QUIET, bias_sigma=1e-4, gate=Gate())
+    assert not found.estimate.events
+    assert 2.0 <= found.became_one <= 3.0
+    assert quaternion.angle_between(found.estimate.attitude[3:], np.array([1.0, 0.0, 0.0, 0.0])).max() < 5e-3
+    right = bank.run(dataclasses.replace(record, vectors=(tracker.taken(time > 0.0),)), QUIET, bias_sigma=1e-4)
+    assert np.all(np.abs(found.estimate.sigma[-1] / right.estimate.sigma[-1] - 1.0) < 0.01)
+
+
+@pytest.mark.parametrize("size", [100.0, 1000.0])
+def test_from_more_wild_directions_than_it_doubts_it_recovers(size):
+    """From the first that it refuses; whether that is the first right one, or the bias is wrong, it cannot know, and doubts both."""
     recovered = 0
     for run in range(15):
         record, belief = orbit(run)
-        one = record.vectors[0]
-        vector_b = np.array(one.vector_b)
-        vector_b[0] += size * one.sigma[0] * np.random.default_rng(run).standard_normal(3)
-        vector_b[0] /= np.linalg.norm(vector_b[0])
-        wild = dataclasses.replace(record, vectors=(dataclasses.replace(one, vector_b=vector_b),))
-        found = bank.run(wild, belief, every=10, gate=Gate(restart_bias_sigma=1e-4))
-        e, nees = judged(found, wild)
+        number = bank.DOUBTED + 1
+        found = bank.run(wild(record, number, size, run), belief, every=10, gate=Gate(restart_bias_sigma=1e-4))
+        e, nees = judged(found, record)
         assert np.linalg.norm(e[-1, :3]) < 1.0 * DEGREE
         assert nees[-1] < 30.0
         for event in found.estimate.events:
@@ -454,10 +498,9 @@ def test_a_wild_first_direction_does_not_mislead_it_for_good(size):
             if event.end < found.became_one:  # the bank's own: it is as if there had been nothing before
                 assert event.end - event.start == pytest.approx(90.0)
                 assert found.estimate.time[0] >= event.start
-                assert found.estimate.skipped["magnetometer"] == np.sum(one.time < event.start)
+                assert found.estimate.skipped["magnetometer"] == np.sum(record.vectors[0].time < event.start)
                 recovered += 1
-    assert (recovered > 10) == (size > 10.0)
-    assert (recovered > 0) == (size > 10.0)
+    assert recovered > 10
 
 
 @pytest.mark.parametrize("option", OPTIONS)
@@ -502,7 +545,7 @@ def test_gate_robust_and_monitor_go_on_once_it_is_one():
 
 @pytest.mark.parametrize("robust", [Robust(), Robust(kind="huber")], ids=["Student", "Huber"])
 @pytest.mark.parametrize("kind", ["direction", "vector", "heading", "attitude"])
-def test_for_small_errors_its_weights_are_the_plain_filters(kind, robust):
+def test_for_small_errors_its_weights_are_the_plain_filters(kind, robust, monkeypatch):
     """A bank of one hypothesis, its attitude measured first, and then measurements of one kind; it is told at the end of the record."""
     random = np.random.default_rng(12)
     time = np.arange(41.0)
@@ -524,12 +567,8 @@ def test_for_small_errors_its_weights_are_the_plain_filters(kind, robust):
         second = series("second", at, seen, r, 1e-3, kind)
     record = ImuRecord(time=time, increments=np.zeros((40, 3)), vectors=(first, second))
     noise_of_gyro = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6)
-    wary = bank.WARY
-    try:
-        bank.WARY = (1.0,)
-        found = bank.run(record, noise_of_gyro, bias_sigma=1e-4, robust=robust, every=40)
-    finally:
-        bank.WARY = wary
+    monkeypatch.setattr(bank, "DOUBT", 1e-30)
+    found = bank.run(record, noise_of_gyro, bias_sigma=1e-4, robust=robust, every=40)
     start = mekf.initial_state([1.0, 0.0, 0.0, 0.0], attitude_sigma=3e-3, bias_sigma=1e-4)
     rest = ImuRecord(time=np.concatenate([[0.5], at]), increments=np.zeros((40, 3)), vectors=(second,))
     plain = mekf.run(rest, noise_of_gyro, start, robust=robust)

@@ -253,12 +253,11 @@ def share_between(total, part):
 
 
 def normalized_weights(log_weight, least, weight):
-    """Write the weights, those below ``least`` as 0 for good; return how many are left."""
+    """Write the weights, those below ``least`` as 0 for good; return what was taken from each logarithm, so that the largest is 0."""
     best = -math.inf
     for i in range(len(log_weight)):
         best = max(best, log_weight[i])
     total = 0.0
-    left = 0
     for i in range(len(log_weight)):
         relative = math.exp(log_weight[i] - best)
         if relative < least:
@@ -266,12 +265,11 @@ def normalized_weights(log_weight, least, weight):
             relative = 0.0
         else:
             log_weight[i] -= best
-            left += 1
         weight[i] = relative
         total += relative
     for i in range(len(log_weight)):
         weight[i] /= total
-    return left
+    return best
 
 
 def run_bank(
@@ -289,6 +287,9 @@ def run_bank(
     log_weight,
     start,
     first,
+    later,
+    sets,
+    charge,
     every,
     least_weight,
     largest_share,
@@ -310,16 +311,28 @@ def run_bank(
     """Run the hypotheses ``states`` (h, 28) from the time ``start`` until they are one Gaussian at a kept edge, or to the end.
 
     Event ``first`` is the first after those that made the hypotheses. Outputs begin with the first kept edge (a multiple of ``every``) not
-    before ``start``; ``innovation_out`` (events, 6) gets the innovations of the heaviest hypothesis. They are one when one is left, or when
-    the part of the attitude's and the bias's covariance that lies between them is below ``largest_share``; then ``states[0]`` is that
-    Gaussian. A hypothesis refuses what has a NIS above ``thresholds`` (by degrees of freedom, 3), and weighs the rest as
-    :func:`strapdown.kernels.robust_step.robust_weight` does (0: not at all); ``taken_out`` (events,) gets the weights of the heaviest
-    hypothesis. When hypotheses of more than half the weight have refused ``recovery`` measurements in a row (0: whatever they refuse), the
-    answer is ``LOST`` and the first of those. ``weight`` (h,), ``between`` (12,) and ``matched`` (28,) are room to work in. Returns the
-    rows written, the edge at which they became one (``NEVER``, ``LOST``), and the number of the next event.
+    before ``start``; ``weight_out`` may have no rows, ``innovation_out`` (events, 6) gets the innovations of the heaviest hypothesis. They
+    are one when one is left, or when the part of the attitude's and the bias's covariance that lies between them is below
+    ``largest_share``; then ``states[0]`` is that Gaussian. A hypothesis refuses what has a NIS above ``thresholds`` (by degrees of freedom,
+    3), and weighs the rest as :func:`strapdown.kernels.robust_step.robust_weight` does (0: not at all); ``taken_out`` (events,) gets the
+    weights of the heaviest hypothesis. When hypotheses of more than half the weight have refused ``recovery`` measurements in a row (0:
+    whatever they refuse), the answer is ``LOST`` and the first of those. ``weight`` (h,), ``between`` (12,) and ``matched`` (28,) are room
+    to work in; the first is left at the last weights. Returns the rows written, the edge at which they became one (``NEVER``, ``LOST``),
+    and the number of the next event.
+
+    There may be further sets of hypotheses, of no weight at first: what the events ``later`` leave open, each on its own. ``sets`` has
+    where they begin, and the number of all. A set is given, at its event, the weight that those before would have had they refused all
+    directions until then at a NIS of ``charge``: the first ones may lie off, and nothing else tells which. Hypotheses are not one before
+    the first of these.
     """
     number = len(log_weight)
     normalized_weights(log_weight, least_weight, weight)
+    started = 0
+    refused = 0.0  # logarithm of the weight of having refused all
+    for i in range(number):
+        if weight[i] > 0.0:
+            refused += math.exp(log_weight[i])
+    refused = math.log(refused)
     k = -1
     while edges[k + 1] < start:
         k += 1
@@ -361,6 +374,7 @@ def run_bank(
                 threshold = thresholds[degrees - 1]
                 parameter, numerator = robust_parameters[degrees - 1, 0], robust_parameters[degrees - 1, 1]
                 refusing = 0.0
+                height = 0.0
                 for i in range(number):
                     if weight[i] > 0.0:
                         q, b, A, B, C = load_hypothesis(states[i])
@@ -387,10 +401,17 @@ def run_bank(
                         told = min(heavy_tailed(robust, parameter, numerator, nis), threshold)
                         log_weight[i] -= 0.5 * (told + math.log(s1) + math.log(s2) + math.log(s3))
                         if i == leader:
+                            height = math.log(s1) + math.log(s2) + math.log(s3)
                             innovation_out[e, 0], innovation_out[e, 1], innovation_out[e, 2] = e1, s1, e2
                             innovation_out[e, 3], innovation_out[e, 4], innovation_out[e, 5] = s2, e3, s3
                             taken_out[e] = share
-                normalized_weights(log_weight, least_weight, weight)
+                refused -= 0.5 * (height + (1.0 if kind == HEADING else charge))
+                if started < len(later) and e == later[started]:
+                    members = sets[started + 1] - sets[started]
+                    for i in range(sets[started], sets[started + 1]):
+                        log_weight[i] = refused - math.log(members)
+                    started += 1
+                refused -= normalized_weights(log_weight, least_weight, weight)
                 e += 1
                 streak = streak + 1 if refusing > 0.5 else 0
                 if recovery > 0 and streak >= recovery:
@@ -405,11 +426,12 @@ def run_bank(
                 covariance_out[row, n] = matched[7 + n]
             left = 0
             for i in range(number):
-                weight_out[row, i] = weight[i]
+                if row < len(weight_out):
+                    weight_out[row, i] = weight[i]
                 left += weight[i] > 0.0
             row += 1
             apart = max(share_between(matched[7:13], between[:6]), share_between(matched[22:28], between[6:]))
-            if left == 1 or apart < largest_share:
+            if (started > 0 or len(later) == 0) and (left == 1 or apart < largest_share):
                 for n in range(28):
                     states[0, n] = matched[n]
                 return row, k + 1, e
