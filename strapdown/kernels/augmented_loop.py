@@ -20,8 +20,9 @@ from strapdown.kernels.augmented_step import (
     turning_matrix,
 )
 from strapdown.kernels.filter_loop import ATTITUDE, DIRECTION, HEADING, vector_at
+from strapdown.kernels.filter_step import far_turn
 from strapdown.kernels.robust_loop import frame_at, six_at
-from strapdown.kernels.rotation import right_jacobian, rotation_matrix, turned, unit
+from strapdown.kernels.rotation import quaternion_multiply, right_jacobian, rotation_matrix, turned, unit
 
 BORROWS_ARRAYS = True
 """See :mod:`strapdown.kernels.machine`."""
@@ -255,12 +256,15 @@ def run_augmented(
             if kind == HEADING and H[0, 0] == 0.0 and H[0, 1] == 0.0 and H[0, 2] == 0.0:
                 innovation_out[e, 0] = math.nan  # of a vertical vector, which shows none: skipped
             a = (correction[0], correction[1], correction[2])
-            q = turned(q, a)
             if dot(a, a) > 1.0:
-                q = unit(q)
+                far, G = far_turn(a)
+                q = unit(quaternion_multiply(q, far))
+            else:
+                G = right_jacobian(a)
+                q = turned(q, a)
             for i in range(len(x)):
                 x[i] += correction[3 + i]
-            turn_rows(F, size, right_jacobian(a))
+            turn_rows(F, size, G)
             triangularise(F, 3, 3, size, size, 0, 0, work)
             e += 1
         if now >= end and (e == events or event_time[e] > end):
