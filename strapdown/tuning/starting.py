@@ -18,15 +18,16 @@ from strapdown.tuning.innovations import Case
 
 
 def recording_setup(parameters: AhrsParameters | None = None) -> FilterSetup:
-    """Return the setup of the filter that :func:`strapdown.ahrs.estimate` runs."""
-    chosen = parameters or AhrsParameters()
-    noise = mekf.ProcessNoise(angle_random_walk=chosen.angle_random_walk, rate_random_walk=chosen.rate_random_walk)
-    return FilterSetup(process_noise=noise, attitude_sigma=chosen.attitude_sigma, bias_sigma=chosen.bias_sigma)
+    """Return the setup of the filter that :func:`strapdown.ahrs.estimate` runs, of ``ahrs.MOTIONS["any"]`` if not told."""
+    return (parameters or ahrs.MOTIONS["any"]).setup
 
 
 def recording_case(recording: Recording, parameters: AhrsParameters | None = None) -> Case:
-    """Return a recording as :func:`strapdown.ahrs.estimate` filters it: from its first quiet second on, the reference beside it."""
-    chosen = parameters or AhrsParameters()
+    """Return a recording as :func:`strapdown.ahrs.estimate` filters it: from its first quiet second on, the reference beside it.
+
+    By ``ahrs.MOTIONS["any"]`` if not told, and without what is made good of the delays between sensors.
+    """
+    chosen = parameters or ahrs.MOTIONS["any"]
     if recording.specific_force is None:
         raise InputError(f"{recording.source} has no accelerometer, which shows the vertical; add columns ax, ay, az")
     span = ahrs.quiet_span(recording)
