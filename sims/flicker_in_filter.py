@@ -14,13 +14,13 @@ For each preset and run, a record at the gyro's natural rate with vector measure
 and ``control`` is the MEKF of ``own`` on the same gyro without flicker. Told is the NEES of the attitude over its three degrees of freedom,
 averaged over runs and late epochs (1 if the covariance is right), with the scatter of that mean over the runs, and the rms error.
 
-Run ``python sims/flicker_in_filter.py [FOLDER]`` (some minutes).
+Run ``python sims/flicker_in_filter.py [--out FOLDER]`` (some minutes).
 """
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -208,8 +208,11 @@ def draw(result, *, ax=None):
 
 
 if __name__ == "__main__":
-    where = Path(sys.argv[1] if len(sys.argv) > 1 else "results/flicker")
-    for outcome in main(out=where).outcomes:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("results/flicker"))
+    parser.add_argument("--runs", type=int, default=40)
+    parser.add_argument("--seed", type=int, default=1)
+    for outcome in main(**vars(parser.parse_args())).outcomes:
         told = ", ".join(
             f"{name} {outcome.anees[name]:.3f} ± {outcome.scatter[name]:.3f} ({outcome.rms[name] / ARCSECOND:.3g}″)"
             for name in FILTERS

@@ -1,13 +1,13 @@
 """Does a simulated gyro have the noise that its specification says? One preset, its spectrum and its parts over time.
 
-Run ``python sims/simulate_imu.py [FIGURE]``.
+Run ``python sims/simulate_imu.py [--out FOLDER]``.
 """
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import itertools
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -143,8 +143,12 @@ def draw_bias(result, *, ax):
 
 
 if __name__ == "__main__":
-    where = Path(sys.argv[1] if len(sys.argv) > 1 else "results/simulate_imu")
-    outcome = main(out=where)
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("results/simulate_imu"))
+    parser.add_argument("--preset", default="stim300", help="name of a gyro's data sheet")
+    parser.add_argument("--seed", type=int, default=1)
+    arguments = parser.parse_args()
+    outcome = main(**vars(arguments))
     for part, score in outcome.worst.items():
         print(f"{part:18s} largest departure from theory {score:.2f} standard deviations")
-    print(f"figure: {where}")
+    print(f"figure: {arguments.out}")

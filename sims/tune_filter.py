@@ -1,11 +1,11 @@
 """Does tuning find the truth from parameters wrong by 30 either way? One simulated record, many searches, and a look at held-out data.
 
-Run ``python sims/tune_filter.py [FOLDER]``.
+Run ``python sims/tune_filter.py [--out FOLDER]``.
 """
 
 from __future__ import annotations
 
-import sys
+import argparse
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -132,7 +132,11 @@ def values(result, ax):
 
 
 if __name__ == "__main__":
-    found = main(out=Path(sys.argv[1] if len(sys.argv) > 1 else "results/tune_filter"))
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("results/tune_filter"))
+    parser.add_argument("--starts", type=int, default=20, help="searches, each from a random start")
+    parser.add_argument("--seed", type=int, default=1)
+    found = main(**vars(parser.parse_args()))
     for start, one in (("30 times", found.too_large), ("a 30th", found.too_small)):
         print(f"from {start}: {one.agreeing} of {len(one.starts)} searches agree")
         for parameter, (name, value) in zip(one.parameters, found.truth.items(), strict=True):

@@ -46,12 +46,31 @@ def _truth_value(value: object) -> bool:
     return isinstance(value, (bool, np.bool_))
 
 
-def numbers(name: str, value: ArrayLike) -> Array:
-    """Return ``value`` as a float64 array of any shape; what is no number, though NumPy would make it one, is refused."""
+def _unmasked(name: str, value: ArrayLike, allow_nan: bool) -> ArrayLike:
+    """Return a masked array without its mask, what is masked NaN or refused: NumPy would take what lies under the mask for data."""
+    if isinstance(value, (list, tuple)) and any(isinstance(one, np.ma.MaskedArray) for one in value):
+        value = np.ma.array(value)
+    if not isinstance(value, np.ma.MaskedArray):
+        return value
+    mask = np.ma.getmaskarray(value)
+    if not mask.any():
+        return np.asarray(value)
+    if not allow_nan:
+        raise InputError(f"{_place(name, _first(mask))} is masked; remove or interpolate such samples first")
+    return np.asarray(np.ma.filled(value.astype(np.float64), np.nan))
+
+
+def numbers(name: str, value: ArrayLike, *, allow_nan: bool = False) -> Array:
+    """Return ``value`` as a float64 array of any shape; what is no number, though NumPy would make it one, is refused.
+
+    What a masked array masks becomes NaN where ``allow_nan`` lets it, and is refused where not.
+    """
     try:
-        given = np.asarray(value)
+        given = np.asarray(_unmasked(name, value, allow_nan))
         held = "True or False" if _truth_value(value) else _NO_NUMBERS.get(given.dtype.kind, "")
         result = given if held else np.asarray(given, dtype=np.float64)
+    except InputError:
+        raise
     except (TypeError, ValueError) as error:
         raise InputError(f"{name} is not an array of numbers ({error}); pass floats") from None
     if held:
@@ -70,9 +89,9 @@ def array(name: str, value: ArrayLike, shape: Sequence[int | str | EllipsisType]
     shape : sequence
         One entry an axis: an ``int`` is exact, a ``str`` names a free length, a leading ``...`` any leading axes.
     allow_nan : bool
-        Let NaN through (it marks missing samples); infinities never pass.
+        Let NaN through (it marks missing samples, and so does a mask); infinities never pass.
     """
-    result = numbers(name, value)
+    result = numbers(name, value, allow_nan=allow_nan)
     tail = list(shape[1:]) if shape and shape[0] is ... else list(shape)
     wanted = "(" + ", ".join("..." if s is ... else str(s) for s in shape) + ("," if len(shape) == 1 else "") + ")"
     free = bool(shape) and shape[0] is ...
@@ -204,7 +223,7 @@ def one_of(name: str, value: str, choices: Iterable[str]) -> str:
     known = list(choices)
     if value in known:
         return value
-    near = difflib.get_close_matches(str(value), known, n=1)
+    near = difflib.get_close_matches(str(value), known, n=1) or [name for name in known if value and str(value) in name]
     hint = f"; did you mean {near[0]!r}?" if near else ""
     raise InputError(f"{name} {value!r} is not known{hint} (known: {', '.join(known)})")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import os
 import tempfile
@@ -30,6 +31,20 @@ def written_beside(path: str | os.PathLike[str]) -> Iterator[Path]:
         os.replace(temporary, target)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def whole_hdf5(path: str | os.PathLike[str]) -> Iterator[Any]:
+    """Yield an HDF5 file in memory; at the end its bytes go to ``path`` as those of any file.
+
+    A disk that is full is then an ordinary OSError: HDF5 itself, stopped in the middle of a write, ends the whole program when it closes.
+    """
+    import h5py
+
+    content = io.BytesIO()
+    with h5py.File(content, "w") as file:
+        yield file
+    Path(path).write_bytes(content.getbuffer())
 
 
 def existing_file(path: str | os.PathLike[str]) -> None:

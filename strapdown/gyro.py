@@ -579,7 +579,7 @@ def to_table(spec: GyroSpec) -> dict[str, Any]:
 
 def from_table(table: Mapping[str, Any], place: str = "gyro") -> GyroSpec:
     """Return the specification told by a table with units in the key names; unknown keys are refused with the nearest known one."""
-    return GyroSpec(**tables.decode(table, FORM, place))
+    return tables.build(GyroSpec, table, FORM, place)  # type: ignore[no-any-return]
 
 
 def read_spec(path: str | os.PathLike[str]) -> GyroSpec:

@@ -118,33 +118,45 @@ def write_record(
 
 
 def is_record(path: str | os.PathLike[str]) -> bool:
-    """Return whether a file is an HDF5 file that says it holds a record of :func:`write_record`; its content is not checked."""
+    """Return whether a file says that :func:`write_record` or :func:`export_csv` wrote it; its content is not checked."""
     import h5py
 
     try:
+        if _is_csv(path):
+            return True
         with h5py.File(path, "r") as file:
             return bool(file.attrs.get("kind") == KIND)
     except OSError:
         return False
 
 
+def _is_csv(path: str | os.PathLike[str]) -> bool:
+    """Return whether a file begins as the record of :func:`export_csv` does."""
+    mark = f"{_MARK} record".encode()
+    with open(path, "rb") as file:
+        return file.read(len(mark)) == mark
+
+
 def read_record(path: str | os.PathLike[str]) -> ImuRecord:
-    """Read the record of a file written by :func:`write_record`."""
+    """Read the record of a file written by :func:`write_record` or :func:`export_csv`."""
     return read_record_file(path).record
 
 
 def read_record_file(path: str | os.PathLike[str]) -> RecordFile:
-    """Read a file written by :func:`write_record` with all that it tells.
+    """Read a file written by :func:`write_record` or :func:`export_csv` with all that it tells.
 
     Raises
     ------
     InputError
-        If the file is missing, truncated, no HDF5, another kind of file, or of a newer layout.
+        If the file is missing, truncated, another kind of file, of a newer layout, or its units or conventions are not those of
+        :func:`write_record`.
     """
     import h5py
 
     existing_file(path)
     try:
+        if _is_csv(path):
+            return _read_csv_record(Path(path))
         with h5py.File(path, "r") as file:
             kind = file.attrs.get("kind")
             if kind != KIND:
@@ -155,11 +167,19 @@ def read_record_file(path: str | os.PathLike[str]) -> RecordFile:
                 raise InputError(
                     f"{path} has layout {int(file.attrs['format'])}, this version ({strapdown.__version__}) reads up to {FORMAT}; update it"
                 )
+            told = file.attrs.get("conventions", CONVENTIONS)
+            if told != CONVENTIONS:
+                raise InputError(
+                    f"{path} follows other conventions ({told}); convert it to those of this package: {CONVENTIONS}"
+                )
             group = file.get("vectors", {})
             series = tuple(_series(group[str(number)]) for number in range(len(group)))
-            truth = Truth(attitude=file["truth/attitude"][:], bias=file["truth/bias"][:]) if "truth" in file else None
+            truth = None
+            if "truth" in file:
+                truth = Truth(attitude=_values(file, "truth/attitude", "1"), bias=_values(file, "truth/bias", "rad/s"))
+            time, increments = _values(file, "time", "s"), _values(file, "increments", "rad")
             return RecordFile(
-                record=ImuRecord(time=file["time"][:], increments=file["increments"][:], vectors=series, truth=truth),
+                record=ImuRecord(time=time, increments=increments, vectors=series, truth=truth),
                 gyro=gyro.from_table(json.loads(file.attrs["gyro"]), f"{path}: gyro") if "gyro" in file.attrs else None,
                 scenario=file.attrs.get("scenario", ""),
                 seed=int(file.attrs["seed"]) if "seed" in file.attrs else None,
@@ -179,8 +199,24 @@ def read_record_file(path: str | os.PathLike[str]) -> RecordFile:
         ) from None
 
 
+def _values(group: Any, name: str, unit: str) -> Array:
+    """Return an array of a file, whose attribute ``unit``, where there is one, must be the one that it is read in."""
+    told = group[name].attrs.get("unit", unit)
+    told = told.decode() if isinstance(told, bytes) else told
+    if told != unit:
+        raise InputError(
+            f"{group.file.filename}: {f'{group.name}/{name}'.lstrip('/')} is in {told!r}, and read in {unit!r}; convert it"
+        )
+    return np.asarray(group[name][:])
+
+
 def _series(group: Any) -> VectorMeasurements:
-    fields = {name: group[name][:] for name in _SERIES if name in group}
+    fields = {name: _values(group, name, unit) for name, unit in _SERIES.items() if name in group}
+    if group.attrs["kind"] != "attitude" and not fields.keys() & {"sigma", "sigma_axes", "covariance"}:
+        raise InputError(
+            f"{group.file.filename}: {group.name.lstrip('/')} ({group.attrs['sensor']}) lacks sigma; give each measurement its standard "
+            "deviation"
+        )
     return VectorMeasurements(sensor=group.attrs["sensor"], kind=group.attrs["kind"], **fields)
 
 
@@ -192,15 +228,24 @@ _VECTOR_COLUMNS = ("time_s", "x_b", "y_b", "z_b", "sigma", "x_f", "y_f", "z_f")
 _ATTITUDE_COLUMNS = ("time_s", "q_w", "q_x", "q_y", "q_z", "sigma_x_rad", "sigma_y_rad", "sigma_z_rad")
 _ARRIVAL = "arrival_s"
 _MARK = "# strapdown"
-_COUNTED = " vector series"
+_COUNTED, _MADE = " vector series", "; made by "
 
 
-def export_csv(path: str | os.PathLike[str], record: ImuRecord) -> tuple[Path, ...]:
-    """Write a record as CSV, 17 digits a number, and return the files.
+def export_csv(
+    path: str | os.PathLike[str],
+    record: ImuRecord,
+    *,
+    gyro_spec: GyroSpec | None = None,
+    scenario: str = "",
+    seed: int | None = None,
+    run: int | None = None,
+) -> tuple[Path, ...]:
+    """Write a record as CSV, 17 digits a number, and return the files; how it was made as :func:`write_record` is told it.
 
     ``path`` holds one row an edge: its time, the increment of the interval that ends there (none in the first row), and the truth if there
-    is one. Each vector series goes to ``STEM-vectors-N.csv`` beside it. The first line of each is a comment that tells what it is, of the
-    record how many series belong to it; then come the names of the columns, with their units. The record is written last.
+    is one. Each vector series goes to ``STEM-vectors-N.csv`` beside it. The first line of each is a comment that tells what it is, the
+    time of its last row, and of the record how many series belong to it; then come the names of the columns, with their units. The record
+    is written last. Series that an earlier record of the same name had more are removed.
 
     Raises
     ------
@@ -218,10 +263,20 @@ def export_csv(path: str | os.PathLike[str], record: ImuRecord) -> tuple[Path, .
         columns += [record.truth.attitude, record.truth.bias]
         names += _TRUTH_COLUMNS
     table = np.concatenate(columns, axis=1)
-    comment = f"{_MARK} record, version {strapdown.__version__}, {len(record.vectors)}{_COUNTED}; {CONVENTIONS}"
+    comment = (
+        f"{_MARK} record, version {strapdown.__version__}, to {record.time[-1]:.17g} s, {len(record.vectors)}{_COUNTED}; "
+        f"{CONVENTIONS}"
+    )
+    made: dict[str, Any] = {
+        "gyro": None if gyro_spec is None else gyro.to_table(gyro_spec),
+        "scenario": scenario or None,
+    }
+    made = {name: value for name, value in {**made, "seed": seed, "run": run}.items() if value is not None}
+    if made:
+        comment += f"{_MADE}{json.dumps(made)}"
     written = [target]
     for number, series in enumerate(record.vectors):
-        beside = target.with_name(f"{target.stem}-vectors-{number}.csv")
+        beside = _series_file(target, number)
         own: tuple[str, ...]
         if series.kind == "attitude" and series.attitude is not None and series.sigma_axes is not None:
             own, columns = _ATTITUDE_COLUMNS, [series.time[:, None], series.attitude, series.sigma_axes]
@@ -233,12 +288,26 @@ def export_csv(path: str | os.PathLike[str], record: ImuRecord) -> tuple[Path, .
         if series.arrival is not None:
             own, columns = (*own, _ARRIVAL), [*columns, series.arrival[:, None]]
         head = json.dumps(
-            {"sensor": series.sensor, "kind": series.kind, "constant_reference": series.reference_f.ndim == 1}
+            {
+                "sensor": series.sensor,
+                "kind": series.kind,
+                "constant_reference": series.reference_f.ndim == 1,
+                "last_time_s": series.time[-1] if len(series.time) else None,
+            }
         )
         _write_csv(beside, f"{_MARK} vectors {head}", own, np.concatenate(columns, axis=1))
         written.append(beside)
     _write_csv(target, comment, names, table)
+    for number in itertools.count(len(record.vectors)):
+        stale = _series_file(target, number)
+        if not stale.is_file() or not stale.read_bytes().startswith(f"{_MARK} vectors ".encode()):
+            break
+        stale.unlink()
     return tuple(written)
+
+
+def _series_file(target: Path, number: int) -> Path:
+    return target.with_name(f"{target.stem}-vectors-{number}.csv")
 
 
 def _write_csv(path: Path, comment: str, names: tuple[str, ...], rows: Array) -> None:
@@ -256,9 +325,13 @@ def import_csv(path: str | os.PathLike[str]) -> ImuRecord:
     Raises
     ------
     InputError
-        If the file is missing, is not such a file, or a row is cut short, holds no number or no increment (its line is named).
+        If the file is missing, is not such a file, does not go to the time that it tells of, or a row is cut short, holds no number or no
+        increment (its line is named).
     """
-    target = Path(path)
+    return _read_csv_record(Path(path)).record
+
+
+def _read_csv_record(target: Path) -> RecordFile:
     comment, names, rows = _read_csv(target)
     if not comment.startswith(f"{_MARK} record"):
         raise InputError(f"{target} does not begin with '{_MARK} record'; it is no record that export_csv wrote")
@@ -266,6 +339,7 @@ def import_csv(path: str | os.PathLike[str]) -> ImuRecord:
         raise InputError(
             f"{target} has the columns {', '.join(names)}; wanted {', '.join(_GYRO_COLUMNS)} and perhaps {', '.join(_TRUTH_COLUMNS)}"
         )
+    comment, _, made = comment.partition(_MADE)
     lost = np.argwhere(np.isnan(rows[1:, 1:4]))
     if len(lost):
         row, column = lost[0]
@@ -274,21 +348,37 @@ def import_csv(path: str | os.PathLike[str]) -> ImuRecord:
         )
     truth = Truth(attitude=rows[:, 4:8], bias=rows[:, 8:11]) if len(names) > 4 else None
     series = tuple(_import_series(beside) for beside in _series_beside(target, comment))
-    return ImuRecord(time=rows[:, 0], increments=rows[1:, 1:4], vectors=series, truth=truth)
+    record = ImuRecord(time=rows[:, 0], increments=rows[1:, 1:4], vectors=series, truth=truth)
+    told = re.search(r", to (\S+) s,", comment)
+    _need_end(target, rows, float(told[1]) if told else rows[-1, 0])
+    if not made:
+        return RecordFile(record=record)
+    try:
+        own = json.loads(made)
+        spec = own.pop("gyro", None)
+        return RecordFile(record=record, gyro=None if spec is None else gyro.from_table(spec, f"{target}: gyro"), **own)
+    except (json.JSONDecodeError, TypeError, AttributeError) as error:
+        raise InputError(
+            f"{target}, line 1: how it was made cannot be read ({error}); take '{_MADE.strip()} …' away"
+        ) from None
+
+
+def _need_end(path: Path, rows: Array, told: float | None) -> None:
+    """Refuse a file that ends at another time than it tells, None of one without rows: at the end of a line, a cut is not to be seen."""
+    ends = rows[-1, 0] if len(rows) else None
+    if ends != told:
+        raise InputError(
+            f"{path} ends at {ends} s, its first line says {told} s; it was cut or added to: take it whole, or change the time there if "
+            "the rows are meant"
+        )
 
 
 def _series_beside(target: Path, comment: str) -> list[Path]:
     """Return the files of vector series of a record: as many as it says; of one that says nothing, all that are numbered in turn."""
-
-    def named(number: int) -> Path:
-        return target.with_name(f"{target.stem}-vectors-{number}.csv")
-
     told = re.search(rf", (\d+){_COUNTED};", comment)
     if told is None:
-        return [
-            named(number) for number in itertools.takewhile(lambda number: named(number).is_file(), itertools.count())
-        ]
-    files = [named(number) for number in range(int(told[1]))]
+        return list(itertools.takewhile(Path.is_file, (_series_file(target, number) for number in itertools.count())))
+    files = [_series_file(target, number) for number in range(int(told[1]))]
     for file in files:
         if not file.is_file():
             raise InputError(
@@ -312,6 +402,8 @@ def _import_series(path: Path) -> VectorMeasurements:
         constant = bool(head["constant_reference"])
     except (ValueError, KeyError, TypeError):
         raise InputError(f"{path} is no vector series that export_csv wrote; check its first two lines") from None
+    if "last_time_s" in head:
+        _need_end(path, rows, head["last_time_s"])
     if attitude:
         own.update(attitude=rows[:, 1:5], sigma_axes=rows[:, 5:8])
     else:

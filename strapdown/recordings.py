@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import os
+import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -65,7 +66,12 @@ class Recording:
         for name, width in (("specific_force", 3), ("magnetic_field", 3), ("true_attitude", 4)):
             value = getattr(self, name)
             if value is not None:
-                object.__setattr__(self, name, array(f"{self.source}: {name}", value, (n, width), allow_nan=True))
+                value = array(f"{self.source}: {name}", value, (n, width), allow_nan=True)
+                if name != "true_attitude" and not np.any(value[~np.isnan(value)]) and not np.isnan(value).all():
+                    raise InputError(
+                        f"{self.source}: {name} is 0 in every row, as where there is no such sensor; leave its columns out"
+                    )
+                object.__setattr__(self, name, value)
         for name in ("missing_gyro", "repeated"):
             object.__setattr__(self, name, array(f"{self.source}: {name}", getattr(self, name), ("k",)))
         if self.movement is not None and np.shape(self.movement) != (n,):
@@ -131,7 +137,10 @@ def read_broad(path: str | os.PathLike[str]) -> Recording:
     name = Path(path).name
     try:
         with h5py.File(path, "r") as file:
-            if file.attrs.get("kind") == recordfiles.KIND:
+            kind = str(file.attrs.get("kind", ""))
+            if kind.startswith("strapdown ") and kind != recordfiles.KIND:
+                raise InputError(f"{name} is a {kind}, a result and no recording; give what it was made from")
+            if kind == recordfiles.KIND:
                 raise InputError(
                     f"{name} is a simulated record, no recording; integrate it (`strapdown integrate`) or filter it (`strapdown estimate`)"
                 )
@@ -171,6 +180,10 @@ def read_csv(path: str | os.PathLike[str], *, units: Mapping[str, str] | None = 
         stream = io.StringIO(file.read_text(encoding="utf-8-sig"), newline="")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{file.name} cannot be read as text ({error}); pass a CSV file in UTF-8") from None
+    if recordfiles.is_record(file):
+        raise InputError(
+            f"{file.name} is a simulated record, no recording; integrate it (`strapdown integrate`) or filter it (`strapdown estimate`)"
+        )
     with stream:
         rows = csv.reader(line for line in stream if line.strip() and not line.lstrip().startswith("#"))
         header = next(rows, None)
@@ -185,7 +198,9 @@ def read_csv(path: str | os.PathLike[str], *, units: Mapping[str, str] | None = 
         ]
         missing = [name for name in dict.fromkeys(needed) if name not in names]
         if missing:
-            raise InputError(f"{file.name}: the header lacks {', '.join(missing)} (it has: {', '.join(names)})")
+            other = next((mark for mark in (";", "\t", "|") if any(mark in name for name in names)), "")
+            words = f"; its columns are parted by {other!r}: write commas, and points in the decimals" if other else ""
+            raise InputError(f"{file.name}: the header lacks {', '.join(missing)} (it has: {', '.join(names)}){words}")
         values = _numbers(file.name, rows, len(names), header)
     factors = _factors(file.name, {group for group, there in present.items() if there}, declared, units or {})
 
@@ -258,9 +273,13 @@ def _numbers(source: str, rows: csv.reader, width: int, header: list[str]) -> Ar
     result: list[list[float]] = []
     for k, row in enumerate(rows):  # type: ignore[var-annotated,arg-type]
         if len(row) != width:
-            raise InputError(
-                f"{source}: data row {k + 1} has {len(row)} fields, the header {width}; the file is truncated or damaged there"
+            decimals = width < len(row) and all(re.fullmatch(r"\s*-?\d+(e-?\d+)?\s*", part) for part in row)
+            words = (
+                "its decimals seem to have commas: write points"
+                if decimals
+                else "the file is truncated or damaged there"
             )
+            raise InputError(f"{source}: data row {k + 1} has {len(row)} fields, the header {width}; {words}")
         try:
             result.append([float(field) if field.strip() else np.nan for field in row])
         except ValueError:

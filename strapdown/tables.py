@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -128,19 +129,23 @@ def build(kind: type, table: Mapping[str, Any], form: Form, place: str, **more: 
             choice = form.get(field.name, PLAIN)
             key = f"{field.name}_{choice[0][0]}" if choice[0][0] else field.name
             raise InputError(f"{place}: {key} is missing; add it")
+    return made(kind, values, table, form, place)
+
+
+def made(make: Callable[..., Any], values: Mapping[str, Any], table: Mapping[str, Any], form: Form, place: str) -> Any:
+    """Return ``make(**values)``; what is refused is told with its place in the file, and the key and the number that stand there."""
     try:
-        return kind(**values)
+        return make(**values)
     except InputError as error:
         raise InputError(_with_typed(str(error), table, form, place)) from None
 
 
 def _with_typed(text: str, table: Mapping[str, Any], form: Form, place: str) -> str:
-    """Return what is said of a field with the key and the number that the file has, where the unit there is another than SI."""
-    said = text.split(" is ", 1)[0]
-    for key, (name, factor) in keys(form).items():
-        if key in table and factor != 1.0 and said.endswith((name, f"{name}[0]", f"{name}[1]", f"{name}[2]")):
+    said = re.sub(r"\[[\d, ]*\]$", "", text.split(" is ", 1)[0])
+    for key, (name, _) in keys(form).items():
+        if key in table and said.endswith(name):
             return f"{text} ({place}: {key} = {table[key]!r})"
-    return text
+    return text if text.startswith(place.split(":", 1)[0]) else f"{place}: {text}"
 
 
 def read(path: str | os.PathLike[str], name: str, remedy: str) -> dict[str, Any]:
@@ -152,7 +157,7 @@ def read(path: str | os.PathLike[str], name: str, remedy: str) -> dict[str, Any]
         If the file is missing, no TOML, or has no such table.
     """
     try:
-        content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        content = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise InputError(f"{path} does not exist; check the path") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

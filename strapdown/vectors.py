@@ -23,6 +23,7 @@ from strapdown.checks import (
     array,
     finite,
     increasing,
+    instance,
     non_negative,
     numbers,
     one_of,
@@ -63,6 +64,8 @@ class VectorMeasurements:
     A sample with a NaN in ``vector_b``, or in ``attitude``, is missing: filters skip and count it. What else belongs to it may be NaN too:
     in place of its σ and covariance then stands the mean square of the others', of its reference another's, of its arrival its time, so
     that nothing computed over the series is touched by it.
+
+    Arrays of floats are taken as they are and not copied: whoever goes on writing to a buffer gives a copy of it.
     """
 
     sensor: str
@@ -92,6 +95,7 @@ class VectorMeasurements:
 
     def __post_init__(self) -> None:
         """Check every field."""
+        instance("sensor", self.sensor, str, "give the series the name of its sensor")
         one_of(f"{self.sensor}: kind", self.kind, KINDS)
         time = increasing(f"{self.sensor}: time", self.time, least=0)
         m = len(time)
@@ -149,7 +153,7 @@ class VectorMeasurements:
             if self.kind == "attitude":
                 found["sigma_axes"] = axes
         given = self._given_sigma(m)
-        told = np.any(numbers("sigma", self.sigma) != 0.0)  # of an empty series too
+        told = np.any(numbers("sigma", self.sigma, allow_nan=True) != 0.0)  # of an empty series too
         if axes is None and self.kind == "attitude" and not told:
             raise InputError(
                 f"{self.sensor}: a series of kind 'attitude' needs its noise: sigma (m,), sigma_axes (m, 3) or covariance (m, 3, 3)"
@@ -158,6 +162,10 @@ class VectorMeasurements:
         if np.any(sigma < 0.0):
             k = int(np.argmax(sigma < 0.0))
             raise InputError(f"{self.sensor}: sigma[{k}] is {sigma[k]:g}; it must not be negative")
+        vanishing = (sigma > 0.0) & (sigma**2 < np.finfo(np.float64).tiny)
+        if vanishing.any():
+            k = int(np.argmax(vanishing))
+            raise InputError(f"{self.sensor}: sigma[{k}] is {sigma[k]:g}, and its square is no number; check its unit")
         if axes is not None:
             mean = np.sqrt(np.mean(axes**2, axis=1))
             if self.kind != "attitude" and told and not np.allclose(sigma[known], mean[known], rtol=1e-12, atol=0.0):
@@ -172,7 +180,7 @@ class VectorMeasurements:
 
     def _given_sigma(self, m: int) -> Array:
         """Return σ of each sample (m,) as it was given, a single one spread over all."""
-        given = numbers(f"{self.sensor}: sigma", self.sigma)
+        given = numbers(f"{self.sensor}: sigma", self.sigma, allow_nan=True)
         if given.shape not in ((), (1,), (m,)):
             by_axis = "" if self.kind == "heading" else ", and one a body axis as sigma_axes"
             raise InputError(
@@ -182,7 +190,7 @@ class VectorMeasurements:
 
     def _given_axes(self, m: int) -> Array:
         """Return σ of each body axis (m, 3) as it was given, one of all samples spread over them."""
-        given = numbers(f"{self.sensor}: sigma_axes", self.sigma_axes)  # type: ignore[arg-type]
+        given = numbers(f"{self.sensor}: sigma_axes", self.sigma_axes, allow_nan=True)  # type: ignore[arg-type]
         if given.shape not in ((), (3,), (1, 3), (m, 3)):
             raise InputError(
                 f"{self.sensor}: sigma_axes has shape {given.shape} for {m} samples; give one number a body axis (3,), or (m, 3)"
@@ -565,6 +573,12 @@ class Magnetometer:
         one_of(f"{self.name}: kind", self.kind, ("direction", "heading", "vector"))
         if not callable(self.field_f):
             object.__setattr__(self, "field_f", array(f"{self.name}: field_f", self.field_f, (3,)))
+            seen = self.field_f[:2] if self.kind == "heading" else self.field_f
+            if not np.any(seen):
+                part = "level part of field_f" if self.kind == "heading" else "field_f"
+                raise InputError(
+                    f"{self.name}: {part} is zero, which has no direction; give the field where the body is"
+                )
         object.__setattr__(self, "hard_iron", array(f"{self.name}: hard_iron", self.hard_iron, (3,)))
         object.__setattr__(self, "soft_iron", array(f"{self.name}: soft_iron", self.soft_iron, (3, 3)))
 

@@ -64,6 +64,25 @@ def test_array_names_what_does_not_fit(value, shape, words):
     refused(lambda: checks.array("x", value, shape), *words)
 
 
+MASKED = np.ma.masked_array([[1, 2], [3, 4], [5, 6]], mask=[[False, False], [False, True], [True, False]])
+
+
+@pytest.mark.parametrize("value", [MASKED, MASKED.astype(float), list(MASKED)])
+def test_what_lies_under_a_mask_is_no_data(value):
+    refused(lambda: checks.array("x", value, ("n", 2)), "x[1, 1] is masked", "remove or interpolate")
+    refused(lambda: checks.numbers("x", value), "x[1, 1] is masked")
+    if value is MASKED:
+        found = checks.array("x", value, ("n", 2), allow_nan=True)
+        np.testing.assert_array_equal(found, [[1.0, 2.0], [3.0, np.nan], [np.nan, 6.0]])
+        assert type(found) is np.ndarray
+
+
+def test_a_mask_that_masks_nothing_is_no_matter():
+    found = checks.array("x", np.ma.masked_array([1.0, 2.0], mask=False), (2,))
+    assert type(found) is np.ndarray
+    np.testing.assert_array_equal(found, [1.0, 2.0])
+
+
 def test_nan_may_mark_missing_samples_but_infinity_never_passes():
     np.testing.assert_array_equal(checks.array("x", [np.nan, 1.0], (2,), allow_nan=True), [np.nan, 1.0])
     refused(lambda: checks.array("x", [np.nan, np.inf], (2,), allow_nan=True), "x[1] is inf")

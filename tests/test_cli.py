@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -66,6 +67,29 @@ def test_ctrl_c_ends_with_status_130(run, monkeypatch, tmp_path):
     assert status == 130
     assert "Traceback" not in error
     assert not list(tmp_path.iterdir())
+
+
+def test_a_fault_of_the_program_is_no_verdict(run, monkeypatch):
+    """Status 1 of a raw traceback would be "not consistent" of `check`."""
+    from strapdown.cli import judgement
+
+    def broken(*_: object) -> str:
+        raise ZeroDivisionError("a fault")
+
+    monkeypatch.setattr(judgement, "_kind", broken)
+    status, said, error = run("check", "estimate.h5")
+    assert (status, said) == (70, "")
+    assert "ZeroDivisionError: a fault" in error.splitlines()
+    assert error.splitlines()[0].startswith("Traceback")
+    assert error.splitlines()[-1].startswith(f"error: a fault of strapdown {strapdown.__version__} itself")
+
+
+def test_an_output_that_cannot_hold_every_letter_gets_question_marks():
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    command = [sys.executable, "-c", "from strapdown import cli; cli.main()", "algorithms", "--no-time"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, env=environment)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "drift under small coning is ?C ?? ? (?h)^n" in done.stdout
 
 
 # ---------------------------------------------------------------------------------------------------- coning
@@ -178,8 +202,8 @@ def test_a_short_study_warns_of_nothing(run, tmp_path):
         (("--runs", 0), "runs is 0; it must be a whole number of 1 or more"),
         (("--runs", -3), "runs is -3"),
         (("--seed", -1), "seed is -1; it must be a whole number of 0 or more"),
-        (("--angle", 0), "angle is 0; it must be greater than zero"),
-        (("--angle", 200), "angle is 3.49"),
+        (("--angle", 0), "--angle is 0 degrees; it must be greater than zero"),
+        (("--angle", 200), "--angle is 200 degrees; a cone's half-angle is below"),
         (("--angle", "nan"), "angle is nan; it must be a finite number"),
         (("--frequency", -1), "frequency is -1"),
         (("--rate", 0), "rate is 0"),

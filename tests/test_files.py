@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import subprocess
+import sys
 
 import pytest
 
@@ -102,3 +104,31 @@ def test_what_json_cannot_tell_is_refused_and_nothing_is_touched(tmp_path, bad):
     with pytest.raises((ValueError, TypeError)):
         write_json(tmp_path / "folder" / "result.json", bad)
     assert names(tmp_path) == ["result.json"]
+
+
+FULL = """
+import resource, signal, sys
+import numpy as np
+from strapdown.recordfiles import write_record
+from strapdown.records import ImuRecord
+
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # so that a write beyond the limit fails as one on a full disk does
+resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
+increments = np.random.default_rng(1).standard_normal((20_000, 3))
+try:
+    write_record(sys.argv[1], ImuRecord(time=np.arange(20_001.0), increments=increments))
+except OSError as error:
+    print("told:", error)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit of the size of files there")
+def test_a_full_disk_is_an_ordinary_error_of_hdf5_too(tmp_path):
+    """HDF5 that is stopped in the middle of a file ends the process as it closes it."""
+    (tmp_path / "record.h5").write_text("old")
+    command = [sys.executable, "-c", FULL, str(tmp_path / "record.h5")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("told: [Errno 27]")
+    assert (tmp_path / "record.h5").read_text() == "old"
+    assert names(tmp_path) == ["record.h5"]

@@ -25,6 +25,7 @@ from strapdown import (
 )
 from strapdown.checks import InputError
 from strapdown.coning_study import Drift
+from strapdown.montecarlo.statistics import BINS_PER_OCTAVE
 from strapdown.plots import style
 from strapdown.plots.sphere import body_axis_path
 
@@ -237,3 +238,27 @@ def test_angle_units_are_those_that_are_read_best():
 def test_wrapped_quaternions_do_not_matter_to_the_path():
     q = quaternion.exp(np.array([[0.1, 0.2, 0.3]]))
     np.testing.assert_allclose(body_axis_path(q), body_axis_path(-q), atol=1e-15)
+
+
+def test_axes_beside_each_other_are_in_one_unit(statistics):
+    """Of three attitude errors of which one is large none is told in arcseconds."""
+    histogram = statistics.histogram.copy()
+    for state in (2, 5):
+        histogram[:, state] = np.roll(histogram[:, state], 12 * BINS_PER_OCTAVE, axis=-1)
+    uneven = dataclasses.replace(statistics, histogram=histogram)
+    quantile = uneven.error_quantile(0.99)[-1]
+    assert quantile[2] > 1e3 * statistics.error_quantile(0.99)[-1, 2]
+    for first in (0, 3):
+        labels = {plots.fan(uneven, first + k).get_ylabel().rsplit(", ")[-1] for k in range(3)}
+        assert len(labels) == 1
+    P = np.diag([1e-5, 1e-5, 1e-1, 1e-7, 1e-7, 1e-2]) ** 2
+    ax = plots.covariance_ellipses(P, P, (0, 2))
+    assert ax.get_xlabel().endswith(", °")
+    assert ax.get_ylabel().endswith(", °")
+
+
+def test_a_name_that_the_font_lacks_makes_no_noise(tmp_path, recwarn):
+    figure, ax = plots.new_figure()
+    ax.set_title("記録.h5")
+    plots.save(figure, tmp_path / "x.png")
+    assert not recwarn.list

@@ -232,3 +232,77 @@ def test_missing_samples_of_every_kind_go_through_both_files(made, tmp_path):
     write_record(tmp_path / "record.h5", record)
     assert_equal(read_record(tmp_path / "record.h5"), record)
     assert_equal(import_csv(export_csv(tmp_path / "record.csv", record)[0]), record)
+
+
+def test_csv_cut_at_the_end_of_a_line_is_refused(made, tmp_path):
+    written = export_csv(tmp_path / "record.csv", made[1])
+    empty = next(k for k, series in enumerate(made[1].vectors) if not len(series.time))
+    assert import_csv(written[0]).vectors[empty].time.shape == (0,)
+    for path in written[:2]:
+        whole = path.read_text()
+        lines = whole.splitlines()
+        for cut in (lines[:-1], lines[:-2], [*lines, lines[-1].replace(lines[-1].split(",")[0], "1e3", 1)]):
+            path.write_text("\n".join(cut) + "\n")
+            with pytest.raises(InputError, match=rf"{path.name} ends at .* s, its first line says .* s; it was cut or"):
+                import_csv(written[0])
+        path.write_text(whole)
+    lines = written[1].read_text().splitlines()
+    written[1].write_text("\n".join(lines[:2]) + "\n")
+    with pytest.raises(InputError, match=r"record-vectors-0.csv ends at None s"):
+        import_csv(written[0])
+
+
+def test_csv_leaves_no_series_of_an_earlier_record(made, tmp_path):
+    earlier = export_csv(tmp_path / "record.csv", made[1])
+    other = tmp_path / f"record-vectors-{len(made[1].vectors)}.csv"
+    other.write_text("of another program\n")
+    fewer = dataclasses.replace(made[1], vectors=made[1].vectors[:1])
+    assert export_csv(tmp_path / "record.csv", fewer) == earlier[:2]
+    assert sorted(tmp_path.iterdir()) == sorted([*earlier[:2], other])
+
+
+def test_csv_tells_how_it_was_made_as_hdf5_does(made, tmp_path):
+    scenario, record = made
+    told = {"gyro_spec": scenario.gyro, "scenario": scenarios.scenario_to_toml(scenario), "seed": 3, "run": 1}
+    path = export_csv(tmp_path / "record.csv", record, **told)[0]
+    back = read_record_file(path)
+    assert recordfiles.is_record(path)
+    assert_equal(read_record(path), import_csv(path))
+    assert (back.gyro, back.scenario, back.seed, back.run) == tuple(told.values())
+    first, rest = path.read_text().split("\n", 1)
+    path.write_text(first.replace('"seed"', '"sead"') + "\n" + rest)
+    with pytest.raises(InputError, match="line 1: how it was made cannot be read"):
+        read_record_file(path)
+    export_csv(path, record)
+    bare = read_record_file(path)
+    assert (bare.gyro, bare.scenario, bare.seed, bare.run) == (None, "", None, None)
+
+
+@pytest.mark.parametrize(
+    ("where", "name", "value", "words"),
+    [
+        ("increments", "unit", "deg", r"increments is in 'deg', and read in 'rad'; convert it"),
+        ("truth/bias", "unit", b"deg/h", r"truth/bias is in 'deg/h', and read in 'rad/s'"),
+        ("vectors/0/time", "unit", "ms", r"vectors/0/time is in 'ms', and read in 's'"),
+        ("/", "conventions", "quaternions scalar last", r"follows other conventions \(quaternions scalar last\)"),
+    ],
+)
+def test_units_and_conventions_that_contradict_are_refused(made, tmp_path, where, name, value, words):
+    path = tmp_path / "record.h5"
+    write_record(path, made[1])
+    with h5py.File(path, "r+") as file:
+        file[where].attrs[name] = value
+    with pytest.raises(InputError, match=words):
+        read_record(path)
+    with h5py.File(path, "r+") as file:
+        del file[where].attrs[name]
+    assert_equal(read_record(path), made[1])
+
+
+def test_a_series_without_sigma_is_told_so(made, tmp_path):
+    path = tmp_path / "record.h5"
+    write_record(path, made[1])
+    with h5py.File(path, "r+") as file:
+        del file["vectors/0/sigma"]
+    with pytest.raises(InputError, match=r"vectors/0 \(.*\) lacks sigma; give each"):
+        read_record(path)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from strapdown import mekf, recordings
+from strapdown import mekf, recordfiles, recordings
 from strapdown.checks import InputError
 from strapdown.cli import app
 from strapdown.recordings import Recording, read
@@ -130,6 +130,34 @@ def test_missing_and_doubled_columns_are_refused(csv):
     refused(csv("gx [rad/s],gy,gz,ax [g],ay,az", ["0,1,2,3,4,5"]), "lacks time")
     refused(csv("time;gx;gy;gz;ax;ay;az", ["0;1;2;3;4;5;6"]), "lacks time, gx")
     refused(csv("time,gx [rad/s],gy,gz,ax [g],ay,az,GX"), "column 'gx' twice")
+
+
+def test_other_separators_and_decimal_commas_are_told(csv):
+    for mark in (";", "\t"):
+        path = csv(HEADER.replace(",", mark), [row.replace(",", mark) for row in ROWS])
+        refused(path, "the header lacks", f"parted by {mark!r}: write commas")
+    commas = "0,00,0,1,0,2,0,3,1,0,2,0,9,8"
+    refused(csv(rows=[commas]), "data row 1 has 14 fields, the header 7", "decimals seem to have commas: write points")
+    refused(csv(rows=[ROWS[0] + ",1.5"]), "8 fields", "truncated or damaged")
+
+
+@pytest.mark.parametrize(("columns", "name"), [("ax [m/s2],ay,az", "specific_force"), ("mx,my,mz", "magnetic_field")])
+def test_a_sensor_of_zeros_is_told(csv, columns, name):
+    rows = [f"{k / 100},0.1,0.2,0.3,0,0,{'' if k == 1 else 0}" for k in range(3)]
+    refused(csv(f"time,gx [rad/s],gy,gz,{columns}", rows), f"{name} is 0 in every row", "leave its columns out")
+    read(csv(f"time,gx [rad/s],gy,gz,{columns}", [*rows, "1,1,1,1,0,0,1"]))
+    read(csv(f"time,gx [rad/s],gy,gz,{columns}", [f"{k / 100},0.1,0.2,0.3,,," for k in range(3)]))
+
+
+def test_a_result_is_no_recording(tmp_path):
+    with h5py.File(tmp_path / "estimate.h5", "w") as file:
+        file.attrs["kind"] = "strapdown estimate"
+    refused(tmp_path / "estimate.h5", "is a strapdown estimate, a result and no recording; give what it was made from")
+
+
+def test_a_simulated_record_in_csv_is_no_recording(tmp_path):
+    recordfiles.export_csv(tmp_path / "x.csv", ImuRecord(time=[0.0, 1.0], increments=[[0.0, 0.1, 0.2]]))
+    refused(tmp_path / "x.csv", "is a simulated record, no recording; integrate it")
 
 
 def test_half_a_magnetometer_is_refused(csv):

@@ -299,3 +299,22 @@ def test_what_no_filter_estimates_is_refused(tmp_path, name, damage, words):
             file[name] = value
     with pytest.raises(InputError, match=f"^{path}.*{words}"):
         (read_truth if name.startswith("truth") else read_estimate)(path)
+
+
+def test_a_turn_that_nothing_makes_is_told_by_its_place():
+    """Deep inside it would end as an attitude of NaN."""
+    increments = np.zeros((4, 3))
+    increments[2, 1] = -1e10
+    with pytest.raises(InputError, match=r"increments\[2, 1\] is -1e\+10 rad in 0.5 s, and nothing turns so far"):
+        ImuRecord(time=0.5 * np.arange(5), increments=increments)
+
+
+def test_vectors_that_are_none_are_told():
+    with pytest.raises(InputError, match=r"vectors is None.*give a tuple of series, empty for none"):
+        ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=None)
+
+
+def test_masked_increments_are_refused_by_their_place():
+    increments = np.ma.masked_array(np.full((4, 3), 7.0), mask=np.eye(4, 3) > 0.0)
+    with pytest.raises(InputError, match=r"increments\[0, 0\] is masked"):
+        ImuRecord(time=np.arange(5.0), increments=increments)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 import shutil
 
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from strapdown import cli, consistency, records, scenarios
+from strapdown import augmented, cli, consistency, recordfiles, records, scenarios, setup
 from strapdown.checks import InputError, count
 from strapdown.cli.terminal import scenario_named
 
@@ -83,6 +84,29 @@ def test_counts_too_large_are_refused_by_name(value):
         count("seed", value)
 
 
+def test_a_tuning_does_not_replace_what_no_tuning_wrote(folder, tmp_path):
+    """The filter that is written where no name is given may be one by hand."""
+    (tmp_path / "filter.toml").write_text("# by hand\n[filter]\n")
+    command = ["tune", folder / "record.h5", "--out", tmp_path / "filter.toml"]
+    assert "filter.toml exists and is not what `strapdown tune` writes" in refused(command)
+    (tmp_path / "filter.json").write_text('{"mine": 1}')
+    assert "filter.toml exists and is not what `strapdown tune` writes" in refused(command)
+    (tmp_path / "filter.toml").unlink()
+    assert "filter.json exists and is not what `strapdown tune` writes" in refused(command)
+    assert (tmp_path / "filter.json").read_text() == '{"mine": 1}'
+
+
+@pytest.mark.parametrize("command", [["simulate", "short.toml"], ["integrate", "record.h5"]])
+@pytest.mark.parametrize(("name", "content"), [("data.csv", b"time,gx,gy,gz\n"), ("data.h5", b"\x89HDF of others")])
+def test_a_command_does_not_replace_what_others_wrote(there, tmp_path, command, name, content):
+    (tmp_path / name).write_bytes(content)
+    if command[0] == "integrate" and name == "data.csv":
+        return  # refused by its suffix
+    said = refused_at_once([*command, "--out", tmp_path / name])
+    assert f"{name} exists and is not what `strapdown {command[0]}` writes; move it, or choose another --out" in said
+    assert (tmp_path / name).read_bytes() == content
+
+
 def test_tuning_refuses_a_negative_seed_and_a_record_twice(folder):
     record = folder / "record.h5"
     assert "seed is -1" in refused(["tune", record, "--seed", -1])
@@ -135,6 +159,48 @@ def test_the_filter_that_the_estimate_tells_is_enough_to_seek_causes(folder):
     assert "Causes by what they would explain" in result.output
 
 
+def test_no_cause_is_named_of_a_filter_that_the_search_does_not_know(folder, short, tmp_path):
+    """Of one with optional states the plain filter would be diagnosed, and every cause it names be false."""
+    scenario = dataclasses.replace(
+        short, gyro=dataclasses.replace(short.gyro, scale_factor=np.full(3, 1e-3), asymmetry=np.full(3, 2e-3))
+    )
+    held = recordfiles.read_record_file(folder / "record.h5")
+    recordfiles.write_record(
+        tmp_path / "record.h5",
+        held.record,
+        gyro_spec=scenario.gyro,
+        scenario=scenarios.scenario_to_toml(scenario),
+    )
+    shutil.copy(folder / "run" / "estimate.h5", tmp_path / "estimate.h5")
+    with h5py.File(tmp_path / "estimate.h5", "r+") as file:
+        chosen = setup.from_toml(file.attrs["filter"])
+        states = augmented.States(gyro_scale_sigma=1e-3)
+        file.attrs["filter"] = setup.to_toml(dataclasses.replace(chosen, states=states))
+    options = ["--record", str(tmp_path / "record.h5"), "--json", str(tmp_path / "check.json")]
+    result = CliRunner().invoke(cli.app, ["check", str(tmp_path / "estimate.h5"), *options])
+    assert result.exit_code in (0, 2), result.output
+    assert "Causes by what they would explain" not in result.output
+    assert (
+        "Causes were not looked for: the search knows a filter of attitude and bias alone, and this one has the "
+        in (result.output)
+    )
+    assert "states gyro.scale." in result.output
+    diagnosis = json.loads((tmp_path / "check.json").read_text())["diagnosis"]
+    assert diagnosis["without_a_state"] == ["the gyro's asymmetry of 2e+03 ppm"]
+    assert set(diagnosis) == {"not_looked_for", "without_a_state"}
+
+
+def test_what_the_record_specifies_and_the_filter_has_no_state_for_is_told_beside_the_causes(folder, short, tmp_path):
+    spec = dataclasses.replace(short.gyro, scale_factor=np.full(3, 1e-3))
+    held = recordfiles.read_record_file(folder / "record.h5")
+    toml = scenarios.scenario_to_toml(dataclasses.replace(short, gyro=spec))
+    recordfiles.write_record(tmp_path / "record.h5", held.record, gyro_spec=spec, scenario=toml)
+    command = ["check", str(folder / "run" / "estimate.h5"), "--record", str(tmp_path / "record.h5")]
+    result = CliRunner().invoke(cli.app, command)
+    assert "errors that this filter has no state for: the gyro's scale factor of 1e+03 ppm" in result.output
+    assert "Causes by what they would explain" in result.output
+
+
 def test_an_estimate_keeps_more_than_its_start(folder, tmp_path):
     said = refused(["estimate", folder / "record.h5", "--every", 5000, "--out", tmp_path / "run"])
     assert "every is 5000, more than the 2000 filter steps" in said
@@ -145,6 +211,15 @@ def test_errors_are_taken_at_the_same_times(folder):
     estimate = records.read_estimate(folder / "run" / "estimate.h5")
     with pytest.raises(InputError, match="same times"):
         consistency.errors(estimate.attitude, estimate.bias, estimate.attitude[:-1], estimate.bias[:-1])
+
+
+def test_numbers_that_nothing_can_be_are_told_before_anything_else(there, tmp_path):
+    for command in (
+        ["montecarlo", "short.toml", "--runs", 0, "--out", tmp_path / "x.h5"],
+        ["check", "run/estimate.h5", "--probability", 1],
+    ):
+        assert refused_at_once(command)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("command", ["check", "report", "estimate", "integrate", "doctor", "tune", "allan"])
@@ -305,6 +380,8 @@ def test_every_built_in_scenario_is_possible():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
+        (("--scale-factor", "-1"), "--scale-factor is -1 ppm; it must not be negative"),
+        (("--bias-sigma", "-2"), "--bias-sigma is -2 °/h"),
         (("--scale-factor", "1e300"), "scale_factor is 1e+294; no error is larger"),
         (("--g-sensitivity", "1e300"), "g_sensitivity is"),
         (("--bias-sigma", "1e300"), "initial_bias_sigma is"),

@@ -121,6 +121,18 @@ def test_the_campaign_page_tells_how_to_replay_its_worst_run(folder):
     assert f"campaign.h5 --replay {statistics['worst_runs'][0]}" in body(folder / "campaign.html")
 
 
+def test_the_campaign_page_tells_what_the_filter_has_no_state_for(folder, scenario, filter_setup, tmp_path):
+    assert "no state for" not in body(folder / "campaign.html")
+    assert ">reason<" not in body(folder / "campaign.html")
+    held = campaign.read(folder / "campaign.h5")
+    spec = dataclasses.replace(scenario.gyro, scale_factor=np.full(3, 0.05))
+    plan = dataclasses.replace(held.plan, scenario=dataclasses.replace(held.plan.scenario, gyro=spec))
+    campaign.run(plan, tmp_path / "scaled.h5", runs=16)
+    content = body(report.write(tmp_path / "scaled.h5").page)
+    assert "<strong>Not consistent.</strong>" in content
+    assert "The filter has no state for the gyro&#x27;s scale factor of 5e+04 ppm; `strapdown montecarlo" in content
+
+
 def test_a_tuning_is_reported_from_its_json(folder, scenario, tmp_path):
     (tmp_path / "scenario.toml").write_text(scenarios.scenario_to_toml(scenario), encoding="utf-8")
     for command in (
@@ -142,13 +154,25 @@ def test_a_tuning_is_reported_from_its_json(folder, scenario, tmp_path):
     content = body(tmp_path / "filter.html")
     tuned = json.loads((tmp_path / "filter.json").read_text())
     (parameter,) = tuned["parameters"]
+    assert (parameter["unit"], parameter["si_per_unit"]) == ("arcsec", pytest.approx(np.pi / 648000.0))
+    assert "<td>star 1.sigma, arcsec</td>" in content
     for value in (parameter["value"], parameter["lower"], parameter["upper"]):
-        assert f"{value:.4g}" in content
+        assert f"{value / parameter['si_per_unit']:.4g}" in content
+    assert "the verdict takes all tests of a record together" in content
     assert tuned["held_out"]["after"]["judgements"][0]["verdict"].capitalize() in content.split("<h2>")[0]
     assert content.count("data:image/png") == 2
     assert "[filter]" in content
     with pytest.raises(InputError, match="not what `strapdown tune` writes"):
         report.write(folder / "right.report.json", tmp_path / "page.html")
+    # A tuning without data held out, of the same name, leaves nothing of what was said of held-out data before.
+    figure = (tmp_path / "filter-heldout.png").read_bytes()
+    command = ["tune", str(tmp_path / "record.h5"), "--free", "star 1.sigma", "-o", str(tmp_path / "filter.toml")]
+    assert CliRunner().invoke(cli.app, [*command, "--starts", "1"]).exit_code == 0
+    assert not (tmp_path / "filter-heldout.png").exists()
+    (tmp_path / "filter-heldout.png").write_bytes(figure)
+    content = body(report.write(tmp_path / "filter.json").page)
+    assert content.count("data:image/png") == 1
+    assert "no data were held out" in content
 
 
 def test_gaps_become_null_not_nan():
@@ -171,6 +195,14 @@ def test_bad_input_is_refused_before_anything_is_written(folder, tmp_path):
     with pytest.raises(InputError, match=r"\.html"):
         report.write(folder / "right.h5", tmp_path / "page.pdf")
     assert [path.name for path in tmp_path.iterdir()] == ["cut.h5"]
+
+
+@pytest.mark.parametrize("place", [".", "/", ".."])
+def test_a_folder_without_a_name_is_no_result(place):
+    with pytest.raises(InputError, match="is a folder; name the file in it"):
+        report.write(place)
+    found = CliRunner().invoke(cli.app, ["report", place])
+    assert isinstance(found.exception, InputError)
 
 
 def test_the_command_says_the_verdict_and_where_the_page_is(folder, tmp_path):

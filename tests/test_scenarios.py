@@ -1,11 +1,12 @@
 """Scenarios: the built-in ones, files and their errors, and streams that do not disturb each other."""
 
 import dataclasses
+import tomllib
 
 import numpy as np
 import pytest
 
-from strapdown import motion, orbit, scenarios, vectors
+from strapdown import gyro, motion, orbit, scenarios, vectors
 from strapdown.checks import InputError
 from strapdown.gyro import GyroSpec
 from strapdown.scenarios import (
@@ -238,3 +239,54 @@ def test_a_g_sensitive_gyro_feels_gravity_and_not_in_free_fall():
         simulate(base, 1).rates, np.tile([0.0, 0.0, 9.80665e-4], (10, 1)), rtol=1e-12, atol=1e-18
     )
     assert not np.any(simulate(dataclasses.replace(base, gravity_f=(0.0, 0.0, 0.0)), 1).rates)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("rate_hz = 100.0", "rate_hz = 0"), r"rate is 0 Hz; it must be greater than zero \(two.toml: rate_hz = 0\)"),
+        (("seed = 1", "seed = -1"), r"\(two.toml: seed = -1\)"),
+        (
+            ("angle_random_walk_deg_per_sqrt_hour = 0.15", "angle_random_walk_deg_per_sqrt_hour = -1"),
+            r"\(two.toml: gyro: angle_random_walk_deg_per_sqrt_hour = -1\)",
+        ),
+        (("sigma_arcsec = 20.0", "sigma_arcsec = -20.0"), r"\(two.toml: sensors\[0\]: sigma_arcsec = -20.0\)"),
+        (
+            ("rate_hz = 1.0", "rate_hz = 1.0\noutlier_probability = 2"),
+            r"\(two.toml: sensors\[0\]: outlier_probability = 2\)",
+        ),
+        (('name = "star 1"', 'name = "star 2"'), r"two.toml: two sensors are named 'star 2'"),
+        (("[gyro]", '[gyro]\npreset = "mpu"'), r"two.toml: gyro: preset 'mpu' is not known; did you mean 'mpu-9250'\?"),
+    ],
+)
+def test_what_is_wrong_in_a_file_is_told_with_the_file_and_as_typed(tmp_path, change, words):
+    text = scenarios._BUILTIN.joinpath("two-stars.toml").read_text(encoding="utf-8")
+    assert change[0] in text
+    (tmp_path / "two.toml").write_text(text.replace(*change, 1), encoding="utf-8")
+    with pytest.raises(InputError, match=words):
+        scenarios.load_scenario(tmp_path / "two.toml")
+
+
+def test_a_byte_order_mark_is_no_matter(tmp_path):
+    """Editors of Windows write one."""
+    text = scenarios.scenario_to_toml(scenarios.load_scenario("two-stars"))
+    (tmp_path / "two.toml").write_text(text, encoding="utf-8-sig")
+    assert scenarios.scenario_to_toml(scenarios.load_scenario(tmp_path / "two.toml")) == text
+    (tmp_path / "gyro.toml").write_text("[gyro]\nquantization_rad = 1e-6\n", encoding="utf-8-sig")
+    assert gyro.read_spec(tmp_path / "gyro.toml").quantization == 1e-6
+
+
+def test_lists_of_numbers_stand_on_one_line():
+    for name in scenarios.SCENARIOS:
+        scenario = scenarios.load_scenario(name)
+        text = scenarios.scenario_to_toml(scenario)
+        assert tomllib.loads(text) == scenarios.scenario_to_table(scenario)
+    assert "rate_deg_per_s = [0.1, -0.2, 0.5]\n" in scenarios.scenario_to_toml(scenarios.load_scenario("two-stars"))
+
+
+@pytest.mark.parametrize("name", ["", " "])
+def test_a_sensor_has_a_name(name):
+    scenario = scenarios.load_scenario("two-stars")
+    sensors = (dataclasses.replace(scenario.sensors[0], name=name), *scenario.sensors[1:])
+    with pytest.raises(InputError, match="no name"):
+        dataclasses.replace(scenario, sensors=sensors)

@@ -115,6 +115,9 @@ def test_plan_tells_how_long_a_record_is_needed(run, tmp_path, record):
         (("--prior", "no-such-gyro"), "no-such-gyro"),
         (("--integration", "five"), "five"),
         (("--plan", "--length", "100;300"), "seconds with commas"),
+        (("--prior-factor", "2"), "--prior-factor goes with --prior"),
+        (("--free", " , "), "names no parameter"),
+        (("--truth", "--rmse"), "give one of them"),
     ],
 )
 def test_mistakes_are_told_in_one_line(run, tmp_path, record, arguments, complaint):

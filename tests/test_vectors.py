@@ -436,3 +436,32 @@ def test_eclipses_are_where_the_earth_hides_the_sun(sun, phase):
 
 def test_an_orbit_along_the_terminator_has_no_eclipse():
     assert orbit.CircularOrbit(inclination=np.pi / 2).eclipses([0.0, 1.0, 0.0], 0.0, 1e4) == ()
+
+
+@pytest.mark.parametrize(("field", "kind"), [([0.0, 0.0, 0.0], "direction"), ([0.0, 0.0, 5e-5], "heading")])
+def test_a_field_without_a_direction_is_told(field, kind):
+    with pytest.raises(InputError, match=r"compass: .*field_f is zero, which has no direction"):
+        vectors.Magnetometer(name="compass", field_f=np.array(field), sigma=1e-7, rate=1.0, kind=kind)
+
+
+def test_a_sigma_whose_square_vanishes_is_told_by_its_place():
+    sigma = np.array([1e-3, 1e-300, 1e-3])
+    with pytest.raises(InputError, match=r"star: sigma\[1\] is 1e-300, and its square is no number"):
+        vectors.VectorMeasurements(
+            sensor="star", kind="direction", time=np.arange(3.0), vector_b=np.eye(3), sigma=sigma
+        )
+
+
+def test_masked_measurements_are_missing_ones():
+    vector = np.ma.masked_array(np.eye(3), mask=[[0, 0, 0], [1, 1, 1], [0, 0, 0]])
+    sigma = np.ma.masked_array([1e-3, 7.0, 1e-3], mask=[0, 1, 0])
+    found = vectors.VectorMeasurements(
+        sensor="star", kind="direction", time=np.arange(3.0), vector_b=vector, sigma=sigma
+    )
+    np.testing.assert_array_equal(np.isnan(found.vector_b).all(axis=1), [False, True, False])
+    np.testing.assert_allclose(found.sigma, 1e-3)
+
+
+def test_a_series_has_a_name():
+    with pytest.raises(InputError, match="sensor is None"):
+        vectors.VectorMeasurements(sensor=None, kind="direction", time=[0.0], vector_b=[[1.0, 0.0, 0.0]], sigma=1e-3)

@@ -1,5 +1,8 @@
 """The command line. Only this package prints; units are degrees, hours and arcseconds here and radians and seconds below.
 
+A result replaces the one of an earlier run of the same name, whole: what that one had more goes too. ``simulate``, ``integrate`` and
+``tune`` refuse to replace a file that they did not write, and ``montecarlo``, whose result may have taken hours, wants to be told.
+
 ``terminal``
     What every command shares.
 ``studies``
@@ -24,7 +27,9 @@
 
 from __future__ import annotations
 
+import io
 import sys
+import traceback
 from typing import Annotated
 
 import typer
@@ -56,8 +61,15 @@ def info() -> None:
         console.print(f"{name}: {value}")
 
 
+FAULT = 70
+"""Exit status of a fault of the program itself (EX_SOFTWARE of BSD): no verdict, and not bad input."""
+
+
 def main() -> None:
-    """Run the command line; bad input ends with one clear line and status 2, Ctrl-C with status 130."""
+    """Run the command line; bad input ends with one clear line and status 2, Ctrl-C with 130, a fault of the program with 70."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # what ASCII or cp1252 has no sign for is a question mark, not the end
+            stream.reconfigure(errors="replace")
     try:
         app(standalone_mode=True)
     except InputError as error:
@@ -72,3 +84,13 @@ def main() -> None:
     except KeyboardInterrupt:
         errors.print("interrupted")
         sys.exit(130)
+    except Exception as error:
+        import strapdown
+
+        traceback.print_exc()
+        errors.print(
+            f"error: a fault of strapdown {strapdown.__version__} itself ({type(error).__name__}), not a verdict and not your input; "
+            "please report the traceback above with the command",
+            soft_wrap=True,
+        )
+        sys.exit(FAULT)

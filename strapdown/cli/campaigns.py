@@ -13,6 +13,7 @@ import typer
 from strapdown.cli.terminal import (
     app,
     console,
+    counted,
     progress_bar,
     rate_text,
     scenario_named,
@@ -76,7 +77,7 @@ def montecarlo(
 ) -> None:
     """Run a scenario many times through a filter; tell whether the filter may be believed."""
     from strapdown import montecarlo as engine
-    from strapdown.checks import InputError
+    from strapdown.checks import InputError, count
     from strapdown.files import write_json
     from strapdown.montecarlo import campaign as campaigns
 
@@ -117,9 +118,11 @@ def montecarlo(
     if workers is not None and cluster is not None:
         raise InputError("--workers and --cluster exclude each other: a cluster has workers of its own")
     choice = engine.choose(plan, machine)
+    count("runs", runs)
     engine.in_threads(threads)  # so that a wrong number is found now
     console.print(
-        f"{plan.scenario.name or source.stem}: {runs} runs, seed {plan.seed}, machine: {choice}.", soft_wrap=True
+        f"{plan.scenario.name or source.stem}: {counted(runs, 'run')}, seed {plan.seed}, machine: {choice}.",
+        soft_wrap=True,
     )
     with contextlib.ExitStack() as stack:
         hands = None
@@ -263,12 +266,14 @@ def _tell(campaign: Campaign) -> None:
     )
     console.print(f"Worst runs, by their largest NEES of six states: {worst}. See one with --replay.", soft_wrap=True)
     if report["failed_runs"]:
-        console.print(f"In {report['failed_runs']} runs the filter failed: no finite error or covariance.")
-    rate = f", {rate_text(campaign.statistics.runs / campaign.seconds)} runs/s" if campaign.seconds > 0.0 else ""
+        console.print(f"In {counted(report['failed_runs'], 'run')} the filter failed: no finite error or covariance.")
+    rate = ""
+    if campaign.seconds > 0.0:
+        rate = f" ({rate_text(campaign.statistics.runs / campaign.seconds)} runs/s, compiling included)"
     said = "may be believed" if report["consistent"] else "may NOT be believed"
     console.print(
-        f"{report['runs']} runs, {campaign.seconds:.3g} s{rate}. The filter {said}: bounds that a right filter keeps all together "
-        f"with {100.0 * report['probability']:g} %, NEES at {report['epochs_judged']} epochs.",
+        f"{counted(report['runs'], 'run')}, {campaign.seconds:.3g} s{rate}. The filter {said}: bounds that a right filter keeps all "
+        f"together with {100.0 * report['probability']:g} %, NEES at {report['epochs_judged']} epochs.",
         soft_wrap=True,
     )
     plan = campaign.plan

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from strapdown.cli.terminal import app, console, progress_bar, show, table, writable, written
+from strapdown.cli.terminal import app, console, need_own, progress_bar, show, table, writable, written
 
 
 @app.command()
@@ -63,6 +63,7 @@ def integrate(
     from strapdown.checks import InputError
 
     writable("out", out, suffixes=(".h5", ".hdf5"), sources=(recording,))
+    need_own(out, "integrate", lambda path: bool(records.read_attributes(path)["kind"] == "strapdown attitude"))
     chosen = coning.named(algorithm)
     units = {name: unit for name, unit in (("gyro", gyro_unit), ("time", time_unit)) if unit}
     gaps: list[tuple[float, float]] = []

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.text import Text
 
-from strapdown.cli.terminal import app, console, show, table, writable, written
+from strapdown.cli.terminal import app, console, counted, show, table, writable, written
 
 if TYPE_CHECKING:
     from strapdown.consistency import Judgement
@@ -41,12 +41,14 @@ def check(
     """Tell whether the filter may be believed: exit status 0 consistent, 1 not, 2 cannot tell (or bad input)."""
     from strapdown import consistency, records
     from strapdown.checks import InputError
+    from strapdown.consistency.bounds import tail
     from strapdown.files import write_json
 
     if json is not None:
         writable("json", json, suffixes=(".json",), sources=(result, record, filter_file))
     if record is None and filter_file is not None:
         raise InputError("--filter goes with --record: the record is needed to look for causes")
+    tail(probability)
     kind = _kind(result)
     content: dict[str, Any] = {"source": result.name, "kind": kind}
     if kind == "strapdown montecarlo":
@@ -57,7 +59,7 @@ def check(
         held = campaign.read(result)
         if held.statistics is None:
             raise InputError(f"{result} holds no finished run yet; resume it with `strapdown montecarlo --resume`")
-        console.print(f"{result.name}: {held.statistics.runs} of {held.runs} runs, machine {held.machine}.")
+        console.print(f"{result.name}: {held.statistics.runs} of {counted(held.runs, 'run')}, machine {held.machine}.")
         judgement = consistency.judge_runs(held.statistics, probability=probability)
     elif kind == "strapdown estimate":
         estimate = records.read_estimate(result)
@@ -131,6 +133,7 @@ def _diagnosed(result: Path, record: Path, filter_file: Path | None, probability
 
     from strapdown import diagnosis, mekf, recordfiles, records, setup
     from strapdown.checks import InputError
+    from strapdown.scenarios import scenario_from_toml
 
     if filter_file is not None:
         chosen = setup.read_setup(filter_file)
@@ -141,11 +144,28 @@ def _diagnosed(result: Path, record: Path, filter_file: Path | None, probability
         chosen = setup.from_toml(str(told), f"{result}: filter")
 
     estimate = records.read_estimate(result)
-    source = recordfiles.read_record(record)
+    held = recordfiles.read_record_file(record)
+    source = held.record
     unknown = sorted(set(estimate.innovations) - {series.sensor for series in source.vectors})
     if unknown or not np.isin(estimate.time, source.time).all():
         what = f"has no sensor {unknown[0]!r}" if unknown else "has other stamps"
         raise InputError(f"{record} {what}; {result} was made from another record")
+    missing: tuple[str, ...] = ()
+    if held.scenario:
+        scenario = scenario_from_toml(held.scenario, f"{record}: scenario")
+        missing = setup.not_covered(
+            held.gyro or scenario.gyro, scenario.sensors, chosen.states, gravity_f=scenario.gravity_f
+        )
+    if missing:
+        console.print(
+            f"The record specifies errors that this filter has no state for: {', '.join(missing)}; `strapdown estimate --states` gives it "
+            "states for most.",
+            soft_wrap=True,
+        )
+    if chosen.states is not None and chosen.states.names:
+        reason = f"the search knows a filter of attitude and bias alone, and this one has the states {', '.join(chosen.states.names)}"
+        console.print(f"Causes were not looked for: {reason}.", soft_wrap=True)
+        return {"not_looked_for": reason, "without_a_state": list(missing)}
     P = np.diag(estimate.variance[0]) if estimate.covariance is None else estimate.covariance[0]
     initial = mekf.State(attitude=estimate.attitude[0], bias=estimate.bias[0], covariance=P)
     found = diagnosis.diagnose(source, chosen, initial, probability=probability)
@@ -155,7 +175,7 @@ def _diagnosed(result: Path, record: Path, filter_file: Path | None, probability
         rows.add_row(cause.name, cause.of, f"{cause.gain:.4g}", f"{cause.log_p:.4g}", mark)
     show(rows)
     console.print(found.words, soft_wrap=True)
-    return found.summary()
+    return {**found.summary(), "without_a_state": list(missing)}
 
 
 @app.command()

@@ -75,9 +75,18 @@ def covariance(
     """Predict a filter's errors and their budget by source, in one pass without noise."""
     from strapdown import covariance as analysis
     from strapdown import setup
+    from strapdown.checks import non_negative
     from strapdown.files import usable_folder, write_json
     from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR, STANDARD_GRAVITY
 
+    for option, value, unit in (
+        ("--scale-factor", scale_factor, "ppm"),
+        ("--misalignment", misalignment, "mrad"),
+        ("--g-sensitivity", g_sensitivity, "°/h/g"),
+        ("--attitude-sigma", attitude_sigma or 0.0, "degrees"),
+        ("--bias-sigma", bias_sigma or 0.0, "°/h"),
+    ):
+        non_negative(option, value, unit=unit)  # in the unit that it was given in
     chosen = scenario_named(scenario)
     usable_folder("out", out)
     writable("out", out / "covariance.json", out / "budget.png", sources=(scenario, filter_file))

@@ -24,7 +24,9 @@ def report(
 ) -> None:
     """Write a self-contained HTML page about a result: verdict in words, numbers, figures, how to reproduce it; the statistics as JSON."""
     from strapdown import report as reports
+    from strapdown.files import existing_file
 
+    existing_file(result)
     page = result.with_suffix(".html") if out is None else out
     writable("out", page, page.with_suffix(".report.json"), sources=(result,))
     with progress_bar("judging, drawing", 1) as advance:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from strapdown.cli.terminal import app, console, progress_bar, scenario_named, show, table, writable, written
+from strapdown.cli.terminal import app, console, need_own, progress_bar, scenario_named, show, table, writable, written
 
 if TYPE_CHECKING:
     from strapdown import allan as identification
@@ -51,11 +51,12 @@ def simulate(
     writable("out", target, suffixes=(".h5", ".hdf5", ".csv"), sources=(scenario,))
     beside = [target.with_name(f"{target.stem}-vectors-{number}.csv") for number in range(len(chosen.sensors))]
     writable("out", *(beside if target.suffix.lower() == ".csv" else ()))
+    need_own(target, "simulate", recordfiles.is_record)
     with progress_bar("simulating, writing", 2) as advance:
         record = catalogue.simulate(chosen, used, run)
         advance(1)
         if target.suffix.lower() == ".csv":
-            paths = recordfiles.export_csv(target, record)
+            paths = recordfiles.export_csv(target, record, gyro_spec=chosen.gyro, scenario=toml, seed=used, run=run)
         else:
             recordfiles.write_record(target, record, gyro_spec=chosen.gyro, scenario=toml, seed=used, run=run)
             paths = (target,)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from strapdown.cli.terminal import app, console, progress_bar, show, table, verdict, writable, written
+from strapdown.cli.terminal import app, console, counted, progress_bar, show, table, verdict, writable, written
 
 LEAST_SAMPLES_A_CYCLE = 0.1
 """With fewer a step holds more than ten turns of the cone, and nothing of the study means anything."""
@@ -31,10 +31,12 @@ def coning(
 ) -> None:
     """Study coning: the drift of each integration algorithm, and what a filter makes of it."""
     from strapdown import coning_study
-    from strapdown.checks import InputError
+    from strapdown.checks import InputError, positive
     from strapdown.files import usable_folder, write_json
     from strapdown.units import DEGREE
 
+    if positive("--angle", angle, unit="degrees") >= 90.0:  # in the unit that it was given in
+        raise InputError(f"--angle is {angle:g} degrees; a cone's half-angle is below a right angle")
     parameters = coning_study.ConingParameters(
         angle=angle * DEGREE, frequency=frequency, rate=rate, duration=duration, runs=runs, seed=seed
     )
@@ -52,7 +54,7 @@ def coning(
     scenario = summary["scenario"]
     console.print(
         f"Coning of {angle:g}° at {frequency:g} Hz, gyro sampled at {rate:g} Hz ({rate / frequency:.3g} samples a cycle); "
-        f"{runs} runs of {scenario['duration_s']:g} s, seed {seed}.\n"
+        f"{counted(runs, 'run')} of {scenario['duration_s']:g} s, seed {seed}.\n"
     )
     if scenario["duration_s"] != duration:
         console.print(f"Runs are {scenario['duration_s']:g} s long, not {duration:g}: whole epochs of whole steps.\n")

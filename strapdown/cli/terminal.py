@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -45,6 +45,11 @@ errors = Console(stderr=True, markup=False, highlight=False)
 def rate_text(speed: float) -> str:
     """Return a rate in three digits or whole ones."""
     return f"{speed:.0f}" if speed >= 100.0 else f"{speed:.3g}"
+
+
+def counted(number: int, what: str) -> str:
+    """Return a number with what it counts, in the plural unless it is one."""
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 class _Rate(ProgressColumn):
@@ -165,6 +170,20 @@ def writable(
             )
         read = [source for source in sources if source is not None]
         output_file(option, target, suffixes or (target.suffix.lower(),), *read)
+
+
+def need_own(target: Path, command: str, own: Callable[[Path], bool]) -> None:
+    """Refuse to replace a file that the command did not write, of which there may be no other copy; its own it may make again."""
+    from strapdown.checks import InputError
+
+    try:
+        replaceable = not target.exists() or own(target)
+    except InputError:
+        replaceable = False
+    if not replaceable:
+        raise InputError(
+            f"{target} exists and is not what `strapdown {command}` writes; move it, or choose another --out"
+        )
 
 
 def written(*paths: Any) -> None:

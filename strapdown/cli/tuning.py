@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from strapdown.cli.terminal import app, console, progress_bar, show, table, writable, written
+from strapdown.cli.terminal import app, console, need_own, progress_bar, show, table, writable, written
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,6 +25,8 @@ GATED = ("gate.probability", "outliers.share", "outliers.scale")
 """Names of parameters that ask for a model of outliers."""
 FIGURES = ("likelihood", "heldout")
 """Figures that are drawn beside the filter, by the ends of their names."""
+PRIOR_FACTOR = 3.0
+"""One standard deviation of a prior, where none is given."""
 MOST_EXAMINED = 4
 """Records that are looked at for what the tuned filter leaves unexplained."""
 WORSE = 1.05
@@ -96,7 +98,9 @@ def tune(
         str | None,
         typer.Option(help="Weak prior of the gyro's noise: TOML of `strapdown allan`, or the name of a preset."),
     ] = None,
-    prior_factor: Annotated[float, typer.Option(help="One standard deviation of the prior is a factor of this.")] = 3.0,
+    prior_factor: Annotated[
+        float, typer.Option(help="One standard deviation of the prior is a factor of this.")
+    ] = PRIOR_FACTOR,
     spacing: Annotated[
         float,
         typer.Option(
@@ -128,6 +132,7 @@ def tune(
 
     from strapdown import coning, tuning
     from strapdown.checks import InputError, count, non_negative, one_of
+    from strapdown.report import tunings
     from strapdown.setup import read_setup
 
     workers = count("threads", threads if threads is not None else os.cpu_count() or 1)
@@ -159,6 +164,9 @@ def tune(
     writable(
         "out", out.with_suffix(".json"), *(out.with_name(f"{out.stem}-{name}.png") for name in FIGURES), sources=sources
     )
+    report = out.with_suffix(".json")
+    for target in (out, report):
+        need_own(target, "tune", lambda _: bool(tunings.read(report)))
     units = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
     cases, believed, gyros = _cases(
         records, chosen, {name: unit for name, unit in units.items() if unit}, states=states
@@ -172,6 +180,14 @@ def tune(
     if chosen is None or any(name.startswith(("gyro.", "filter.")) for name in wanted):
         tuning.one_gyro(gyros)
     objective: Any
+    if prior is None and prior_factor != PRIOR_FACTOR:
+        raise InputError("--prior-factor goes with --prior, the noise that it is about")
+    if names == []:
+        raise InputError(f"--free is {free!r} and names no parameter; name some, or leave it out")
+    if rmse and truth:
+        raise InputError(
+            "--rmse and --truth both tell what of the errors against the truth is tuned by; give one of them"
+        )
     if rmse and credibility:
         raise InputError(
             "--rmse and --credibility ask for different filters: small errors, or believable ones; give one of them"
@@ -381,10 +397,11 @@ def _anees(one: Performance) -> str:
 
 
 def _tell_comparison(comparison: Comparison, *, truth: bool) -> None:
+    from strapdown.report import tunings
     from strapdown.units import DEGREE
 
     listing = table(
-        "On the data held out", "filter", "log likelihood", "NIS", "bounds", "ANEES", "attitude RMS, °", "verdict"
+        "On the data held out", "filter", "log likelihood", "NIS", "99 % bounds", "ANEES", "attitude RMS, °", "verdict"
     )
     for name, one in (("before", comparison.before), ("after", comparison.after)):
         verdicts = [judgement.verdict for judgement in one.judgements]
@@ -401,6 +418,7 @@ def _tell_comparison(comparison: Comparison, *, truth: bool) -> None:
             told,
         )
     show(listing)
+    console.print(f"{tunings.BOUNDS}.", soft_wrap=True)
     for judgement in comparison.after.judgements[:1]:
         console.print("After: " + judgement.words, soft_wrap=True)
     if not comparison.better and not truth:
@@ -428,10 +446,13 @@ def _write(
 
     with written_beside(out) as temporary:
         temporary.write_text(to_toml(result.setup), encoding="utf-8")
+    for name in FIGURES:  # of an earlier tuning, which may have had more of them
+        out.with_name(f"{out.stem}-{name}.png").unlink(missing_ok=True)
     report = out.with_suffix(".json")
-    write_json(report, _report(result, comparison, paths, of, examined, gate))
     records = [case.record for case in cases]
     units = [_unit_of(name, records) for name in objective.names]
+    own = [_unit_of(one.name, records) for one in result.parameters]
+    write_json(report, _report(result, own, comparison, paths, of, examined, gate))
     figures = {
         out.with_name(f"{out.stem}-likelihood.png"): drawing.likelihood_slices(
             tuning.slices(objective, result), result, units
@@ -446,6 +467,7 @@ def _write(
 
 def _report(
     result: Tuning,
+    units: Sequence[Unit],
     comparison: Comparison | None,
     paths: Sequence[Path],
     of: str,
@@ -457,8 +479,11 @@ def _report(
     number = lambda value: None if isinstance(value, float) and not math.isfinite(value) else value  # noqa: E731
     content: dict[str, Any] = {
         "records": [path.name for path in paths],
-        "parameters": [{key: number(value) for key, value in vars(one).items()} for one in result.parameters],
-        "units": "SI: rad, s, and the units of whole vectors",
+        "parameters": [
+            {**{key: number(value) for key, value in vars(one).items()}, "unit": unit.name, "si_per_unit": unit.factor}
+            for one, unit in zip(result.parameters, units, strict=True)
+        ],
+        "units": "SI: rad, s, and the units of whole vectors; pages and tables tell each in its unit, of so much SI",
         "objective": {"name": of, "before": result.before, "after": result.after},
         "searches": {"number": len(result.starts), "at_the_best_point": result.agreeing},
         "innovations_fit": not result.misfit,

@@ -14,8 +14,6 @@ Colours are those of Okabe and Ito, told apart by every kind of colour vision. :
     Error statistics over many runs.
 ``sphere``
     The path of a body axis on the unit sphere, still or moving.
-``budget``
-    What a covariance analysis predicts, by source.
 ``coning``
     The coning study.
 ``allan``

@@ -84,7 +84,7 @@ def coning_consistency(outcomes: Sequence[FilterOutcome]) -> Figure:
     nis_over_time(named, axes[2], probability=first.probability)
     for ax, subset in zip(axes[:2], ("attitude", "bias"), strict=True):
         passed = sum(o.statistics.verdict(o.epochs, subset, o.probability).consistent for o in outcomes)
-        ax.set_title(f"{subset.capitalize()}: {passed} of {len(outcomes)} pass at the judged epochs")
+        ax.set_title(f"{subset.capitalize()}: {passed} of {len(outcomes)} pass")
     axes[2].set_title("Innovations")
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)

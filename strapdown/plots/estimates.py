@@ -42,24 +42,25 @@ def estimate_overview(estimate: Estimate, *, title: str = "") -> Figure:
         angle = np.where(np.abs(np.diff(euler[:, k], prepend=euler[0, k])) > 180.0, np.nan, euler[:, k])
         axes[0].plot(*decimated(estimate.time, angle), color=CYCLE[k], linewidth=0.9, label=name)
     sigma = estimate.sigma
+    settled = slice(len(estimate.time) // 10, None)
+    reach = np.abs(estimate.bias[settled]).max() + 3.0 * sigma[settled, 3:].max()
+    unit, size = rate_unit(3.0 * sigma[settled, 3:])
     for k, name in enumerate(AXES):
-        bias, spread = estimate.bias[:, k] / DEGREE, 3.0 * sigma[:, 3 + k] / DEGREE
+        bias, spread = estimate.bias[:, k] / size, 3.0 * sigma[:, 3 + k] / size
         when, low = decimated(estimate.time, bias - spread)
         high = np.interp(when, estimate.time, bias + spread)
         axes[1].fill_between(when, low, high, color=CYCLE[k], alpha=0.18, linewidth=0)
         axes[1].plot(*decimated(estimate.time, bias), color=CYCLE[k], linewidth=1.0, label=f"{name}, ±3σ")
     axes[2].plot(*decimated(estimate.time, np.linalg.norm(sigma[:, :3], axis=1) / DEGREE), color=ink(), linewidth=1.0)
-    settled = slice(len(estimate.time) // 10, None)
-    reach = np.abs(estimate.bias[settled]).max() + 3.0 * sigma[settled, 3:].max()
-    axes[1].set_ylim(-1.2 * reach / DEGREE, 1.2 * reach / DEGREE)
+    axes[1].set_ylim(-1.2 * reach / size, 1.2 * reach / size)
     axes[0].set_ylabel("attitude, °")
-    axes[1].set_ylabel("gyro bias, °/s")
+    axes[1].set_ylabel(f"gyro bias, {unit}")
     axes[2].set_ylabel("attitude σ, all axes, °")
     axes[2].set_ylim(bottom=0.0)
     axes[2].set_xlabel("time, s")
-    for ax in axes[:2]:
-        ax.legend(loc="upper right", ncols=3, frameon=False)
-    axes[0].set_title(title)
+    for ax in axes[:2]:  # above the curves, which fill the axes
+        ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1, ncols=3, frameon=False)
+    axes[0].set_title(title, loc="left")
     return figure
 
 

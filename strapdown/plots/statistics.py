@@ -67,7 +67,10 @@ def fan(statistics: Statistics, state: int, ax: Axes | None = None) -> Axes:
     shares = ((0.99, 2.5758), (0.9, 1.6449), (0.5, 0.6745))
     settled = max(1, len(statistics.time) // 20)
     quantiles = [statistics.error_quantile(share)[:, state] for share, _ in shares]
-    unit, size = state_unit(state, quantiles[0][settled:])
+    # One unit for the three axes beside each other.
+    unit, size = state_unit(
+        state, statistics.error_quantile(shares[0][0])[settled:, state // 3 * 3 : state // 3 * 3 + 3]
+    )
     for k, ((share, normal), quantile) in enumerate(zip(shares, quantiles, strict=True)):
         ax.fill_between(
             statistics.time,
@@ -131,8 +134,9 @@ def covariance_ellipses(
     ax = axes_or_new(ax)
     i, j = pair
     largest = np.sqrt(max(claimed[i, i], found[i, i])), np.sqrt(max(claimed[j, j], found[j, j]))
+    alike = i // 3 == j // 3  # two angles, or two rates: in one unit
     (unit_i, size_i), (unit_j, size_j) = (
-        state_unit(s, 3.0 * np.array([x])) for s, x in zip(pair, largest, strict=True)
+        state_unit(s, 3.0 * np.array(largest if alike else [x])) for s, x in zip(pair, largest, strict=True)
     )
     scale = np.array([size_i, size_j])
     reach = float(np.sqrt(chi2.ppf(probability, 2)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -87,7 +88,8 @@ def new_figure(
 
 def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
     """Write a figure (PNG, PDF or SVG by the suffix); the file appears whole or not at all."""
-    with written_beside(path) as temporary, matplotlib.rc_context(STYLE):
+    with written_beside(path) as temporary, matplotlib.rc_context(STYLE), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", r"Glyph .* missing from font")  # of a file's name: drawn as boxes
         figure.savefig(temporary)
     return Path(path)
 

@@ -20,7 +20,7 @@ from typing import Any
 
 from strapdown import records
 from strapdown.checks import InputError
-from strapdown.files import write_json, written_beside
+from strapdown.files import existing_file, write_json, written_beside
 from strapdown.report import campaigns, estimates, tunings
 
 _WRITERS: dict[str, Callable[[Path, float], tuple[str, dict[str, Any]]]] = {
@@ -60,6 +60,7 @@ def write(
         If the file is missing, truncated, or of another kind.
     """
     source = Path(result)
+    existing_file(source)
     target = source.with_suffix(".html") if out is None else Path(out)
     if target.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"out is {target}; a report is an .html file")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from strapdown import consistency, plots, records
+from strapdown import consistency, plots, records, setup
 from strapdown.checks import InputError
 from strapdown.montecarlo import campaign
 from strapdown.montecarlo.statistics import SUBSETS, Statistics
@@ -31,6 +31,7 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
         f"{statistics.runs} runs of {held.plan.scenario.duration:g} s, seed {held.plan.seed}, {len(statistics.time) - 1} epochs, machine: "
         f"{held.machine}{unfinished}; strapdown {held.version}",
         findings.verdict(judgement),
+        _without_a_state(held) if judgement.verdict != "consistent" else "",
         _numbers(statistics),
         findings.evidence(judgement),
         page.section(
@@ -54,7 +55,7 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
         _worst(statistics, path),
         page.section(
             "How it was made",
-            page.provenance({k: v for k, v in attributes.items() if k not in ("plan", "conventions")}),
+            page.provenance({k: v for k, v in attributes.items() if k not in ("plan", "conventions") and v != ""}),
         ),
     )
     return content, {
@@ -71,6 +72,17 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
     }
 
 
+def _without_a_state(held: campaign.Campaign) -> str:
+    """Return what the scenario specifies and the filter has no state for."""
+    scenario = held.plan.scenario
+    missing = setup.not_covered(scenario.gyro, scenario.sensors, held.plan.setup.states, gravity_f=scenario.gravity_f)
+    if not missing:
+        return ""
+    return page.paragraph(
+        f"The filter has no state for {', '.join(missing)}; `strapdown montecarlo --states` gives it states for most."
+    )
+
+
 def _plain(values: Any) -> list[float | None]:
     return [float(x) if np.isfinite(x) else None for x in values]
 
@@ -78,7 +90,7 @@ def _plain(values: Any) -> list[float | None]:
 def _numbers(statistics: Statistics) -> str:
     rows = []
     for k, name in enumerate(STATES):
-        unit, size = state_unit(k, 3.0 * statistics.sigma[-1:, k])
+        unit, size = state_unit(k, 3.0 * statistics.sigma[-1:, k // 3 * 3 : k // 3 * 3 + 3])
         quantiles = [page.number(float(statistics.error_quantile(share)[-1, k] / size), 3) for share in (0.5, 0.95)]
         rows.append(
             (
@@ -126,7 +138,8 @@ def _consistency(statistics: Statistics, probability: float) -> Figure:
         bounds = consistency.mean_bounds(3, statistics.runs, probability)
         plots.nees_over_time([("all runs", statistics)], bounds, subset, ax)
         low, high = np.nanmin(statistics.anees), np.nanmax(statistics.anees)
-        ax.set_ylim(min(0.5, 0.8 * float(low)), max(2.0, 1.3 * float(high)))
+        bottom, top = min(0.5, 0.8 * float(low)), max(2.0, 1.3 * float(high))
+        ax.set_ylim(bottom, top * (top / bottom) ** 0.35)  # room for the legend on a log axis
         ax.legend(loc="upper right")
     if statistics.sensor_degrees.sum() > 0:
         plots.nis_over_time([("all runs", statistics)], axes[2], probability=probability)

@@ -11,6 +11,12 @@ from strapdown.checks import InputError
 from strapdown.files import existing_file
 from strapdown.report import page
 
+BOUNDS = (
+    "The bounds hold the NIS of a right filter, by itself, with 99 %; the verdict takes all tests of a record together, so that each may "
+    "lie somewhat outside its own"
+)
+"""What is said below NIS and a verdict on the data held out."""
+
 _NEEDED = ("records", "parameters", "units", "objective", "searches")
 
 
@@ -26,7 +32,8 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
     ]
     if held:
         parts.append(page.section("On the data held out", *_held_out(held)))
-    parts += [_image(path.with_name(f"{path.stem}-{name}.png"), caption) for name, caption in _FIGURES]
+    drawn = {name: caption for name, caption in _FIGURES.items() if held or name != "heldout"}
+    parts += [_image(path.with_name(f"{path.stem}-{name}.png"), caption) for name, caption in drawn.items()]
     making = [page.provenance({"records": ", ".join(content["records"]), "units of the JSON": content["units"]})]
     if told.exists():
         making += [page.paragraph(f"The filter, {told.name}:"), page.code(told.read_text(encoding="utf-8"))]
@@ -34,17 +41,17 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
     parts.append(page.section("How it was made", *making))
     searches = content["searches"]
     subtitle = (
-        f"{len(content['parameters'])} parameters from {len(content['records'])} records; {searches['at_the_best_point']} of "
+        f"Parameters: {len(content['parameters'])}; records: {len(content['records'])}; {searches['at_the_best_point']} of "
         f"{searches['number']} searches ended at the best point"
     )
     html = page.page(f"Tuning: {path.name}", subtitle, *parts)
     return html, {"source": path.name, "judgement": {"verdict": verdict[0], "reason": verdict[1]}, "tuning": content}
 
 
-_FIGURES = (
-    ("likelihood", "Likelihood along each parameter, with its interval"),
-    ("heldout", "Statistics on the data held out, before and after"),
-)
+_FIGURES = {
+    "likelihood": "Likelihood along each parameter, with its interval",
+    "heldout": "Statistics on the data held out, before and after",
+}
 
 
 def read(path: Path) -> dict[str, Any]:
@@ -82,10 +89,10 @@ def _verdict(held: Any) -> tuple[str, str, list[str]]:
 def _parameters(content: dict[str, Any]) -> list[str]:
     rows = [
         (
-            one["name"],
+            f"{one['name']}, {one['unit']}" if "unit" in one else one["name"],
             one["note"],
             *(
-                page.number(one[key] if one[key] is not None else float("nan"))
+                page.number(one[key] / one.get("si_per_unit", 1.0) if one[key] is not None else float("nan"))
                 for key in ("start", "value", "lower", "upper")
             ),
         )
@@ -101,7 +108,7 @@ def _parameters(content: dict[str, Any]) -> list[str]:
         page.table(
             ("parameter", "what the data tell", "before", "after", "from", "to (95 %)"), rows, numbers=4, marked=marked
         ),
-        page.paragraph(f"Units: {content['units']}. {told}", faint=True),
+        page.paragraph(told, faint=True),
         *_gate(content.get("gate")),
         *(page.paragraph(words) for one in content.get("unmodelled", []) for words in one["words"]),
     ]
@@ -134,7 +141,7 @@ def _held_out(held: dict[str, Any]) -> list[str]:
             )
         )
     head = ("filter", "log likelihood an innovation", "NIS", "99 % bounds", "ANEES per state", "attitude RMS, rad")
-    return [page.table(head, rows, numbers=5)]
+    return [page.table(head, rows, numbers=5), page.paragraph(f"{BOUNDS}.", faint=True)]
 
 
 def _image(path: Path, caption: str) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import os
+import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -74,6 +75,8 @@ class Scenario:
         object.__setattr__(self, "gravity_f", tuple(array("gravity_f", self.gravity_f, (3,)).tolist()))
         names = [sensor.name for sensor in self.sensors]
         for name in names:
+            if not str(name).strip():
+                raise InputError("a sensor has no name; give each sensor a name of its own")
             if names.count(name) > 1 or name.startswith("gyro"):
                 raise InputError(
                     f"two sensors are named {name!r}, or it begins with 'gyro'; give each sensor a name of its own"
@@ -263,6 +266,12 @@ _SENSORS: dict[str, tuple[type, Form, tables.Choice]] = {
 }
 """Sensors by their word in a file: class, keys, unit of the correlated noise. A magnetometer takes a table ``orbit`` for a field."""
 
+_TOP_FORM: Form = {
+    "seed": tables.PLAIN,
+    "rate": tables.HERTZ,
+    "duration": tables.SECONDS,
+    "gravity_f": tables.METRES_PER_SECOND_SQUARED,
+}
 _TOP = ("name", "description", "seed", "rate_hz", "duration_s", "gravity_f_m_per_s2", "motion", "gyro", "sensors")
 
 
@@ -279,7 +288,7 @@ def load_scenario(name_or_path: str | os.PathLike[str]) -> Scenario:
     if path.suffix != ".toml" and not path.is_file():
         path = _BUILTIN / f"{one_of('scenario', text, SCENARIOS)}.toml"
     try:
-        content = path.read_text(encoding="utf-8")
+        content = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise InputError(
             f"{path} does not exist; give a TOML file, or a built-in name: {', '.join(SCENARIOS)}"
@@ -303,18 +312,19 @@ def scenario_from_toml(text: str, place: str = "scenario") -> Scenario:
     sensors = table.get("sensors", [])
     if not isinstance(sensors, list):
         raise InputError(f"{place}: sensors is one table; write [[sensors]] with two brackets")
-    return Scenario(
-        name=str(table.get("name", "")),
-        description=str(table.get("description", "")),
-        seed=table.get("seed", 0),
-        rate=table["rate_hz"],
-        duration=table["duration_s"],
-        gravity_f=table.get("gravity_f_m_per_s2", vectors.GRAVITY_F),
-        motion=_read_motion(_table(table["motion"], f"{place}: motion"), f"{place}: motion"),
-        gyro=spec,
-        gyro_preset=preset,
-        sensors=tuple(_read_sensor(entry, f"{place}: sensors[{i}]") for i, entry in enumerate(sensors)),
-    )
+    values = {
+        "name": str(table.get("name", "")),
+        "description": str(table.get("description", "")),
+        "seed": table.get("seed", 0),
+        "rate": table["rate_hz"],
+        "duration": table["duration_s"],
+        "gravity_f": table.get("gravity_f_m_per_s2", vectors.GRAVITY_F),
+        "motion": _read_motion(_table(table["motion"], f"{place}: motion"), f"{place}: motion"),
+        "gyro": spec,
+        "gyro_preset": preset,
+        "sensors": tuple(_read_sensor(entry, f"{place}: sensors[{i}]") for i, entry in enumerate(sensors)),
+    }
+    return tables.made(Scenario, values, table, _TOP_FORM, place)  # type: ignore[no-any-return]
 
 
 def _table(content: Any, place: str) -> dict[str, Any]:
@@ -370,10 +380,11 @@ def _read_gyro(table: dict[str, Any], place: str) -> tuple[str, GyroSpec]:
     from strapdown import datasheets
 
     known_keys(place, table, {**tables.keys(gyro.FORM), "preset": None})
-    spec = datasheets.preset(name).spec
+    spec = datasheets.PRESETS[one_of(f"{place}: preset", name, datasheets.PRESETS)].spec
     if not table:
         return name, spec
-    return "", dataclasses.replace(spec, **tables.decode(table, gyro.FORM, place))
+    change = functools.partial(dataclasses.replace, spec)
+    return "", tables.made(change, tables.decode(table, gyro.FORM, place), table, gyro.FORM, place)
 
 
 def _read_sensor(entry: Any, place: str) -> Sensor:
@@ -384,7 +395,7 @@ def _read_sensor(entry: Any, place: str) -> Sensor:
     faults = _faults(unit)
     known_keys(place, table, {**tables.keys(form), **tables.keys(faults)})
     amiss = {key: table.pop(key) for key in list(table) if key in tables.keys(faults)}
-    more: dict[str, Any] = {"faults": vectors.Faults(**tables.decode(amiss, faults, place))}
+    more: dict[str, Any] = {"faults": tables.build(vectors.Faults, amiss, faults, place)}
     if orbit is not None:
         orbit_place = f"{place}: orbit"
         more["field_f"] = tables.build(CircularOrbit, _table(orbit, orbit_place), _ORBIT, orbit_place).magnetic_field
@@ -430,7 +441,11 @@ def scenario_to_toml(scenario: Scenario) -> str:
     """Return a scenario as TOML; reading it gives the same scenario to the last bit."""
     import tomli_w
 
-    return tomli_w.dumps(scenario_to_table(scenario))
+    text = tomli_w.dumps(scenario_to_table(scenario))
+    # A list of numbers on one line.
+    return re.sub(
+        r"\[\n((?: +[^\[\]{}\"\n]+,\n)+) *\]", lambda found: f"[{' '.join(found[1].split()).rstrip(',')}]", text
+    )
 
 
 @functools.cache
