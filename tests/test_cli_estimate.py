@@ -261,6 +261,24 @@ def test_states_are_refused_where_they_make_no_sense(run, spinning, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_an_estimate_replaces_all_of_an_earlier_one_and_nothing_else(run, record, tmp_path):
+    out = tmp_path / "out"
+    assert run("estimate", record, "--observability", "--out", out)[0] == 0
+    left = (out / "observability.json", out / "estimate.html")
+    left[1].write_text("a report of the first estimate")
+    (out / "notes.txt").write_text("mine")
+    assert left[0].exists()
+    assert run("estimate", record, "--out", out)[0] == 0
+    assert not left[0].exists()
+    assert not left[1].exists()
+    assert (out / "notes.txt").read_text() == "mine"
+    (out / "estimate.h5").write_text("mine too")
+    status, _, error = run("estimate", record, "--out", out)
+    assert status == 2
+    assert "is not what `strapdown estimate` writes" in error
+    assert (out / "estimate.h5").read_text() == "mine too"
+
+
 def test_directions_that_contradict_each_other_start_nothing(run, tmp_path):
     """A star taken for another: no bank makes a start of that, unless the filter has states for what sensors get wrong."""
     whole = simulate(made(), 4)

@@ -1,7 +1,8 @@
 """The command line. Only this package prints; units are degrees, hours and arcseconds here and radians and seconds below.
 
-A result replaces the one of an earlier run of the same name, whole: what that one had more goes too. ``simulate``, ``integrate`` and
-``tune`` refuse to replace a file that they did not write, and ``montecarlo``, whose result may have taken hours, wants to be told.
+A result replaces the one of an earlier run of the same name, whole: what that one had more goes too. ``estimate``, ``simulate``,
+``integrate`` and ``tune`` refuse to replace a file that they did not write, and ``montecarlo``, whose result may have taken hours, wants to
+be told.
 
 ``terminal``
     What every command shares.

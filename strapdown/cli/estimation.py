@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from strapdown.cli.filters import filter_for
-from strapdown.cli.terminal import app, console, show, table, writable, written
+from strapdown.cli.terminal import app, console, need_own, show, table, writable, written
 
 if TYPE_CHECKING:
     from strapdown.mekf import State
@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from strapdown.records import Estimate, ImuRecord
     from strapdown.setup import FilterSetup
 
+FILES = ("estimate.h5", "errors.json", "states.json", "observability.json", "estimate.png", "errors.png")
+"""What the command may write to its folder."""
+ABOUT_IT = ("estimate.html", "estimate.report.json")
+"""What other commands write there about an estimate."""
 RECORDING_ONLY = ("motion", "latency")
 """Options that go with a recording."""
 RECORD_ONLY = ("filter", "gate", "robust", "states", "state", "attitude", "from_truth", "every", "observability")
@@ -111,10 +115,11 @@ def estimate(
     from strapdown.checks import InputError
     from strapdown.files import usable_folder
     from strapdown.recordfiles import is_record
+    from strapdown.records import read_attributes
 
     usable_folder("out", out)
-    names = ("estimate.h5", "errors.json", "states.json", "observability.json", "estimate.png", "errors.png")
-    writable("out", *(out / name for name in names), sources=(recording, gyro, filter_file))
+    writable("out", *(out / name for name in FILES), sources=(recording, gyro, filter_file))
+    need_own(out / FILES[0], "estimate", lambda path: bool(read_attributes(path)["kind"] == "strapdown estimate"))
     given = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
     units = {name: unit for name, unit in given.items() if unit}
     if is_record(recording):
@@ -236,6 +241,7 @@ def _estimate_record(
     if held.scenario:
         attributes["scenario"] = held.scenario
     attributes |= {name: value for name, value in (("seed", held.seed), ("run", held.run)) if value is not None}
+    _clear(out)
     write_estimate(paths[0], result, attributes, truth=truth)
     if isinstance(result, AugmentedEstimate) and result.blocks:
         paths.append(out / "states.json")
@@ -388,6 +394,12 @@ def _banked(record: ImuRecord, chosen: FilterSetup, problem: str, why: str) -> t
     return state, words, edge
 
 
+def _clear(out: Path) -> None:
+    """Remove what an earlier estimate left in the folder, which the next one may not write anew."""
+    for name in (*FILES[1:], *ABOUT_IT):
+        (out / name).unlink(missing_ok=True)
+
+
 def _tell(result: Estimate) -> None:
     """Say what was not used, and what happened."""
     for sensor, number in result.skipped.items():
@@ -464,6 +476,7 @@ def _estimate_recording(
         else "z up, heading arbitrary (no magnetometer)"
     )
     paths = [out / "estimate.h5"]
+    _clear(out)
     write_estimate(
         paths[0],
         found,

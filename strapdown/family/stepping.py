@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from strapdown import mekf
-from strapdown.checks import Array, count, instance
+from strapdown.checks import Array, count
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.mekf import Schedule
 from strapdown.mekf.states import check_arguments
@@ -38,8 +38,7 @@ class Steps:
 
 def check(record: object, process_noise: object, initial: object) -> None:
     """Refuse what a filter is given in place of the objects that it wants."""
-    instance("record", record, ImuRecord, "make it by records.ImuRecord, or read one by recordfiles.read_record")
-    check_arguments(process_noise, initial)
+    check_arguments(record=record, process_noise=process_noise, initial=initial)
 
 
 def events_and_steps(record: ImuRecord, every: int) -> tuple[Schedule, Steps]:

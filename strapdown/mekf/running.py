@@ -105,6 +105,7 @@ def run_on(
     It holds what a gate remembers as well: its counts, its challenger, and how wide a restart is. A lock-out that goes on is told by both
     parts, by the second as a whole. A monitor starts anew in each part.
     """
+    check_arguments(record=record)
     events = schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True)
     estimate, end, _, memory = _run(
         record,
@@ -168,7 +169,7 @@ def _run(
 ) -> tuple[Estimate, Array, Array, GateMemory | None]:
     """Do as :func:`run_events` and return what the gate remembers too."""
     count("every", every)
-    check_arguments(process_noise, initial, gate=gate, robust=robust, monitor=monitor)
+    check_arguments(process_noise=process_noise, initial=initial, gate=gate, robust=robust, monitor=monitor)
     rows = (len(record.increments)) // every + 1
     states = np.empty((2, 28))
     state = states[0]

@@ -108,19 +108,27 @@ def restart_bias_variance(gate: Gate | None, initial: Initial) -> Array:
     return gate.restart_bias_variance(initial.covariance)
 
 
-def check_arguments(
-    process_noise: object, initial: object, *, gate: object = None, robust: object = None, monitor: object = None
-) -> None:
-    """Refuse what a filter is given in place of the objects that it wants."""
-    instance("process_noise", process_noise, ProcessNoise, "give mekf.ProcessNoise(angle_random_walk=…, …)")
-    instance("initial", initial, State, "make it by mekf.initial_state, or from a record by mekf.first_state")
-    for name, value, wanted, example in (
-        ("gate", gate, Gate, "Gate(probability=0.999)"),
-        ("robust", robust, Robust, "Robust(kind='huber')"),
-        ("monitor", monitor, Monitor, "Monitor()"),
-    ):
-        if value is not None:
-            instance(name, value, wanted, f"give robustness.{example}, or None")
+NEEDED = {
+    "record": (ImuRecord, "make it by records.ImuRecord, or read one by recordfiles.read_record"),
+    "process_noise": (ProcessNoise, "give mekf.ProcessNoise(angle_random_walk=…, …)"),
+    "initial": (State, "make it by mekf.initial_state, or from a record by mekf.first_state"),
+}
+"""What filters are given, by name: its class, and how to come by one."""
+OPTIONAL = {
+    "gate": (Gate, "give robustness.Gate(probability=0.999), or None"),
+    "robust": (Robust, "give robustness.Robust(kind='huber'), or None"),
+    "monitor": (Monitor, "give robustness.Monitor(), or None"),
+}
+"""What they may be given beside it."""
+
+
+def check_arguments(**given: object) -> None:
+    """Refuse what a filter is given, by name, in place of the objects that it wants."""
+    for name, value in given.items():
+        if name in NEEDED:
+            instance(name, value, *NEEDED[name])
+        elif value is not None:
+            instance(name, value, *OPTIONAL[name])
 
 
 FIRST_SETS = 10

@@ -76,7 +76,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         sensors: Sequence[str] = (),
         time: float = 0.0,
     ) -> None:
-        check_arguments(process_noise, initial, gate=gate, robust=robust)
+        check_arguments(process_noise=process_noise, initial=initial, gate=gate, robust=robust)
         if isinstance(sensors, str):
             raise InputError(f"sensors is {sensors!r}; it must be a sequence of names, ({sensors!r},)")
         super().__init__(dim_x=6, dim_z=2)

@@ -27,7 +27,7 @@ import numpy as np
 import strapdown
 from strapdown import scenarios, setup
 from strapdown.checks import InputError, count
-from strapdown.files import existing_file
+from strapdown.files import existing_file, whole_hdf5
 from strapdown.montecarlo.engine import Chunks, Work, Workers, choose, in_threads, machine_named
 from strapdown.montecarlo.plan import Plan, from_table
 from strapdown.montecarlo.statistics import Statistics, merge
@@ -282,7 +282,7 @@ def _write(path: Path, campaign: Campaign, state: _Progress, table: Mapping[str,
     import numba
 
     plan = campaign.plan
-    with _replacing(path) as temporary, h5py.File(temporary, "w") as file:
+    with _replacing(path) as temporary, whole_hdf5(temporary) as file:
         file.attrs.update(
             kind=KIND,
             format=FORMAT,
