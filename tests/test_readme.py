@@ -1,0 +1,54 @@
+"""The README's code runs as it stands there."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from strapdown import quaternion
+
+README = Path(__file__).resolve().parents[1] / "README.md"
+ELSEWHERE = "dask_jobqueue"
+"""A block that needs a cluster."""
+
+
+@pytest.fixture
+def blocks():
+    """The blocks of Python in the README, in order."""
+    found = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+    return [block for block in found if ELSEWHERE not in block]
+
+
+def write_walk(path):
+    """Ten seconds of a unit at rest for three and then turned about, 100 Hz: its accelerometer in g, its gyro in °/s."""
+    draw = np.random.default_rng(5)
+    time = 0.01 * np.arange(1000)
+    rate = np.where(time > 3.0, 40.0 * np.sin(2.0 * np.pi * 0.5 * (time - 3.0)), 0.0)
+    angle = np.radians(np.cumsum(rate) * 0.01)
+    force = np.stack([np.zeros_like(time), np.sin(angle), np.cos(angle)], axis=1)
+    gyro = np.stack([rate, np.zeros_like(time), np.zeros_like(time)], axis=1)
+    rows = np.column_stack(
+        [time, gyro + 0.05 * draw.standard_normal((1000, 3)), force + 2e-3 * draw.standard_normal((1000, 3))]
+    )
+    np.savetxt(path, rows, delimiter=",", header="time,gx,gy,gz,ax,ay,az", comments="")
+    return angle
+
+
+def test_the_code_of_the_readme_runs(blocks, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    angle = write_walk(tmp_path / "walk.csv")
+    assert len(blocks) == 3
+    names = {}
+    for block in blocks:
+        exec(block, names)
+    nees = float(capsys.readouterr().out.split("\n")[0])
+    assert 0.02 < nees < 5.0
+    live, truth = names["live"], names["record"].truth
+    error = quaternion.log(quaternion.multiply(quaternion.conjugate(live.attitude), truth.attitude[-1]))
+    assert np.all(np.abs(error) < 5.0 * np.sqrt(np.diag(live.P)[:3]))
+    assert live.late == 0
+    found = names["found"]
+    up = quaternion.rotate(quaternion.conjugate(found.attitude), [0.0, 0.0, 1.0])
+    told = np.arctan2(up[:, 1], up[:, 2])
+    assert np.sqrt(np.mean((told - angle[-len(told) :]) ** 2)) < np.radians(1.0)
