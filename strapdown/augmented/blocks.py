@@ -51,7 +51,9 @@ class Effect:
     """Whether d is known only relative to the estimated attitude, and goes along when that is corrected: right for a noise that is alike in
     all directions. Firm in the fixed frame, an estimate of the noise would seem to show the attitude, which it does not: turn both, and
     every measurement and the noise's own law stay as they are. (A filter whose linearisation breaks such a symmetry finds information
-    where there is none: Huang, Mourikis & Roumeliotis 2010.)"""
+    where there is none: Huang, Mourikis & Roumeliotis 2010.) A correction of the attitude does not turn the estimate of c itself: of what
+    the filter, not the smoother, tells of c, the turns corrected within the noise's correlation time are left, times its size. To first
+    order the attitude and the bias do not depend on it."""
 
 
 class _Block:
