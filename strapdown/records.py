@@ -271,6 +271,23 @@ _ESTIMATE_UNITS = {
 }
 
 
+@dataclass(frozen=True, kw_only=True)
+class BlockEstimate:
+    """Estimate of one block of optional states (:mod:`strapdown.augmented`) at the kept edges."""
+
+    components: tuple[str, ...]
+    units: tuple[str, ...]
+    values: Array
+    """(m, size), in ``units``."""
+    variance: Array
+    """(m, size), the square of the units."""
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations (m, size)."""
+        return np.sqrt(self.variance)
+
+
 @contextlib.contextmanager
 def result_file(path: str | os.PathLike[str], kind: str, attributes: Mapping[str, Any] | None) -> Iterator[Any]:
     """Yield an HDF5 file that says what it is; it appears whole or not at all."""
@@ -303,6 +320,7 @@ def write_estimate(
 ) -> None:
     """Write an estimate to HDF5, units and conventions as attributes; the file appears whole or not at all.
 
+    Optional states go along, values and variances (:func:`read_states`); what a whole covariance tells of them does not.
     ``truth`` is that at the times of the estimate, where a simulation knows it, so that the file can be judged by itself.
     """
     if truth is not None and len(truth.attitude) != len(estimate.time):
@@ -333,6 +351,11 @@ def write_estimate(
                 put(group, "weight", innovations.weight, "1", "0: refused; 1: taken in whole")
         for number, event in enumerate(estimate.events):
             file.create_group(f"events/{number:06d}").attrs.update(vars(event))
+        for number, (name, block) in enumerate(getattr(estimate, "blocks", {}).items()):
+            group = file.create_group(f"states/{number}")
+            group.attrs.update(name=name, components=list(block.components), units=list(block.units))
+            put(group, "values", block.values, "those of the attribute units")
+            put(group, "variance", block.variance, "the square of the values'")
 
 
 def write_attitude(
@@ -455,6 +478,28 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
                 for one in (file["events"].values() if "events" in file else ())
             ),
         )
+
+
+def read_states(path: str | os.PathLike[str]) -> dict[str, BlockEstimate]:
+    """Read the optional states of an estimate written by :func:`write_estimate`, by name; none of a filter without.
+
+    Raises
+    ------
+    InputError
+        As :func:`read_estimate`.
+    """
+    with _estimate_file(path) as file:
+        rows = len(_numbers(file, "time", ("n",)))
+        found = {}
+        for part in file["states"].values() if "states" in file else ():
+            values = _numbers(part, "values", (rows, "states"))
+            found[str(part.attrs["name"])] = BlockEstimate(
+                components=tuple(str(one) for one in part.attrs["components"]),
+                units=tuple(str(one) for one in part.attrs["units"]),
+                values=values,
+                variance=_above_zero(_place(part, "variance"), _numbers(part, "variance", values.shape)),
+            )
+        return found
 
 
 def _innovations(part: Any) -> Innovations:

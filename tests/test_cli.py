@@ -306,7 +306,8 @@ def test_estimate_on_csv(run, tmp_path):
     columns = walk()
     status, said, error = run("estimate", write_csv(tmp_path / "walk.csv", columns, UNITS), "--out", tmp_path / "out")
     assert (status, error) == (0, "")
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"estimate.h5", "estimate.png"}
+    written = {path.name for path in (tmp_path / "out").iterdir()}
+    assert written == {"estimate.h5", "estimate.png", "states.json", "states.png"}
     assert "walk.csv" in said
     estimate = read_estimate(tmp_path / "out" / "estimate.h5")
     np.testing.assert_allclose(estimate.time, columns[:, 0], atol=1e-9)
@@ -358,6 +359,8 @@ def test_estimate_on_broad(run, broad, tmp_path):
         "estimate.png",
         "errors.json",
         "errors.png",
+        "states.json",
+        "states.png",
     }
     errors = json.loads((tmp_path / "out" / "errors.json").read_text())
     assert errors["source"] == path.name

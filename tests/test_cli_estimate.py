@@ -13,7 +13,7 @@ from strapdown.checks import InputError
 from strapdown.gyro import GyroSpec
 from strapdown.mekf import ProcessNoise
 from strapdown.recordfiles import write_record
-from strapdown.records import ImuRecord, Truth, read_estimate
+from strapdown.records import ImuRecord, Truth, read_estimate, read_states
 from strapdown.scenarios import Scenario, simulate
 from strapdown.vectors import Accelerometer, AttitudeSensor, Faults, Magnetometer, VectorSensor
 
@@ -193,6 +193,14 @@ def test_states_that_the_errors_call_for(run, spinning, tmp_path):
     assert states["gyro scale"]["components"] == ["z"]
     assert states["gyro scale"]["first_sigma"] == pytest.approx([1e-4])
     assert states["gyro scale"]["sigma"][0] < 0.7e-4
+    kept = read_states(tmp_path / "out" / "estimate.h5")["gyro scale"]
+    assert kept.components == ("z",)
+    assert kept.units == ("1",)
+    assert len(kept.values) == len(read_estimate(tmp_path / "out" / "estimate.h5").time)
+    np.testing.assert_allclose(
+        [kept.values[-1], kept.sigma[-1]], [[*states["gyro scale"][n]] for n in ("values", "sigma")]
+    )
+    assert (tmp_path / "out" / "states.png").stat().st_size > 10_000
     with h5py.File(tmp_path / "out" / "estimate.h5") as file:
         told = setup.from_toml(file.attrs["filter"])
     assert told == setup.matched_to_record(

@@ -53,12 +53,13 @@ from strapdown.augmented.blocks import (
     VectorScale,
     View,
 )
-from strapdown.augmented.filtering import AugmentedEstimate, BlockEstimate, run, run_on
+from strapdown.augmented.filtering import AugmentedEstimate, run, run_on
 from strapdown.augmented.model import AugmentedState, initial_state
 from strapdown.augmented.observing import Observability, observability
 from strapdown.augmented.smoothing import recentred, smooth, smooth_fixed_lag
 from strapdown.augmented.states import SensorStates, States
 from strapdown.augmented.stepping import StepFilter
+from strapdown.records import BlockEstimate
 
 __all__ = [
     "AugmentedEstimate",

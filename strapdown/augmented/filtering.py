@@ -23,27 +23,10 @@ from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.mekf import ProcessNoise, Schedule
 from strapdown.mekf.judging import event_rows, gate_events, kernel_options, remembered
 from strapdown.mekf.scheduling import skipped_too
-from strapdown.mekf.states import first_bias_variance, restart_bias_variance
-from strapdown.records import Estimate, Event, ImuRecord
+from strapdown.mekf.states import check_arguments, first_bias_variance, restart_bias_variance
+from strapdown.records import BlockEstimate, Estimate, Event, ImuRecord
 from strapdown.robustness import Gate, Robust
 from strapdown.vectors import KINDS, VectorMeasurements
-
-
-@dataclass(frozen=True, kw_only=True)
-class BlockEstimate:
-    """Estimate of one block at the kept edges."""
-
-    components: tuple[str, ...]
-    units: tuple[str, ...]
-    values: Array
-    """(m, size), in ``units``."""
-    variance: Array
-    """(m, size), the square of the units."""
-
-    @property
-    def sigma(self) -> Array:
-        """Standard deviations (m, size)."""
-        return np.sqrt(self.variance)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,6 +121,7 @@ def run_on(
     It holds what a gate remembers as well: its counts, its challenger, how wide a restart is, and the blocks' prior. A lock-out that goes
     on is told by both parts, by the second as a whole. With a block told by functions a gate starts anew in each part.
     """
+    check_arguments(record=record, process_noise=process_noise, gate=gate, robust=robust)
     blocks = modelling.as_blocks(blocks)
     state = modelling.begin(initial, blocks)
     count("every", every)

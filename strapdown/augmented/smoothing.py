@@ -11,14 +11,15 @@ from strapdown import kinematics, mekf, quaternion
 from strapdown.augmented import filtering, joining
 from strapdown.augmented import model as modelling
 from strapdown.augmented.blocks import Block, LinearBlock
-from strapdown.augmented.filtering import AugmentedEstimate, BlockEstimate
+from strapdown.augmented.filtering import AugmentedEstimate
 from strapdown.augmented.model import AugmentedGateMemory, AugmentedState, Model
 from strapdown.checks import Array, InputError, count, non_negative
 from strapdown.kernels import augmented_smoother
 from strapdown.kernels.augmented_chain import LINKS
 from strapdown.kernels.machine import compiled
 from strapdown.mekf import ProcessNoise
-from strapdown.records import Event, ImuRecord
+from strapdown.mekf.states import check_arguments
+from strapdown.records import BlockEstimate, Event, ImuRecord
 from strapdown.robustness import Gate, Robust
 
 MOST_CUT = 64
@@ -113,6 +114,7 @@ def smoothed(
     robust: Robust | None,
 ) -> AugmentedEstimate:
     """Return the smoother's estimate with a lag, s, infinite for the fixed interval."""
+    check_arguments(record=record, process_noise=process_noise, gate=gate, robust=robust)
     blocks = modelling.as_blocks(blocks)
     state = modelling.begin(initial, blocks)
     if modelling.general(blocks):

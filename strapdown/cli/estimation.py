@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
     from strapdown.records import Estimate, ImuRecord
     from strapdown.setup import FilterSetup
 
-FILES = ("estimate.h5", "errors.json", "states.json", "observability.json", "estimate.png", "errors.png")
+FILES = ("estimate.h5", "errors.json", "states.json", "observability.json", "estimate.png", "errors.png", "states.png")
 """What the command may write to its folder."""
 ABOUT_IT = ("estimate.html", "estimate.report.json")
 """What other commands write there about an estimate."""
@@ -243,15 +242,16 @@ def _estimate_record(
     attributes |= {name: value for name, value in (("seed", held.seed), ("run", held.run)) if value is not None}
     _clear(out)
     write_estimate(paths[0], result, attributes, truth=truth)
+    figures = {"estimate.png": plots.estimate_overview(result, title=path.name)}
     if isinstance(result, AugmentedEstimate) and result.blocks:
         paths.append(out / "states.json")
         write_json(paths[-1], {"source": str(path), **_tell_states(result)})
+        figures["states.png"] = plots.states_over_time(result, title=path.name)
     if observability:
         shown = setup.observability(used, chosen, initial)
         console.print(str(shown), soft_wrap=True, markup=False, highlight=False)
         paths.append(out / "observability.json")
         write_json(paths[-1], {"source": str(path), **shown.summary()})
-    figures = {"estimate.png": plots.estimate_overview(result, title=path.name)}
     if truth is not None:
         figures["errors.png"] = plots.error_overview(result, truth, title=path.name)
         paths.append(out / "errors.json")
@@ -468,6 +468,8 @@ def _estimate_recording(
         errors_found = reference_errors(found.attitude, used.true_attitude)
         rms = {name: value / DEGREE for name, value in errors_found.rms(used.movement).items()}
     figures = {"estimate.png": plots.estimate_overview(found, title=used.source)}
+    if isinstance(found, AugmentedEstimate):
+        figures["states.png"] = plots.states_over_time(found, title=used.source)
     if errors_found is not None:
         figures["errors.png"] = plots.recording_errors(used.time, errors_found, used.movement)
     frame = (
@@ -489,9 +491,11 @@ def _estimate_recording(
             **{f"parameter.{name}": value for name, value in vars(parameters).items()},
             "latency": late,
             "magnetometer_latency": result.magnetometer_latency,
-            "states": json.dumps(_states(found) if isinstance(found, AugmentedEstimate) else {}),
         },
     )
+    if isinstance(found, AugmentedEstimate):
+        paths.append(out / "states.json")
+        write_json(paths[-1], {"source": used.source, **_states(found)})
     console.print(
         f"{used.source}: {len(used.time)} samples over {used.time[-1] - used.time[0]:.1f} s, started in the quiet second "
         f"from {used.time[0]:.2f} s."

@@ -28,7 +28,13 @@ from strapdown.plots.allan import allan_axis, allan_overview
 from strapdown.plots.budget import error_budget
 from strapdown.plots.coning import coning_consistency, coning_errors, draw_coning_study, drift_by_algorithm
 from strapdown.plots.decimation import decimated
-from strapdown.plots.estimates import error_overview, errors_in_envelope, estimate_overview, recording_errors
+from strapdown.plots.estimates import (
+    error_overview,
+    errors_in_envelope,
+    estimate_overview,
+    recording_errors,
+    states_over_time,
+)
 from strapdown.plots.innovations import (
     error_distribution,
     innovation_autocorrelation,
@@ -76,5 +82,6 @@ __all__ = [
     "recording_errors",
     "save",
     "sphere_figure",
+    "states_over_time",
     "theme",
 ]

@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from strapdown import quaternion
+from strapdown.augmented import AugmentedEstimate
 from strapdown.checks import Array
 from strapdown.consistency import ReferenceErrors, errors
 from strapdown.plots.decimation import decimated
@@ -61,6 +62,38 @@ def estimate_overview(estimate: Estimate, *, title: str = "") -> Figure:
     for ax in axes[:2]:  # above the curves, which fill the axes
         ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1, ncols=3, frameon=False)
     axes[0].set_title(title, loc="left")
+    return figure
+
+
+def states_over_time(estimate: AugmentedEstimate, *, title: str = "") -> Figure:
+    """Draw the optional states over time inside their ±3σ, one axes a block and unit, in the states' units."""
+    panels = [
+        (name, block, unit, [k for k, one in enumerate(block.units) if one == unit])
+        for name, block in estimate.blocks.items()
+        for unit in dict.fromkeys(block.units)
+    ]
+    figure, grid = new_figure(len(panels), 1, size=(9.0, 1.2 + 1.8 * len(panels)), sharex=True)
+    axes = np.atleast_1d(grid)
+    settled = slice(len(estimate.time) // 10, None)
+    for ax, (name, block, unit, members) in zip(axes, panels, strict=True):
+        values, spread = block.values[:, members], 3.0 * block.sigma[:, members]
+        for k, member in enumerate(members):
+            color = CYCLE[k % len(CYCLE)]
+            when, low = decimated(estimate.time, values[:, k] - spread[:, k])
+            high = np.interp(when, estimate.time, values[:, k] + spread[:, k])
+            ax.fill_between(when, low, high, color=color, alpha=0.15, linewidth=0)
+            label = f"{block.components[member]}, ±3σ"
+            ax.plot(*decimated(estimate.time, values[:, k]), color=color, linewidth=0.9, label=label)
+        reach = 1.2 * float(np.max(np.abs(values[settled]) + spread[settled]))
+        ax.set_ylim(-reach, reach)
+        ax.set_ylabel(unit)
+        ax.set_title(name, loc="left")
+        ax.legend(
+            loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1, ncols=min(len(members), 9), frameon=False
+        )
+    axes[-1].set_xlabel("time, s")
+    if title:
+        figure.suptitle(title)
     return figure
 
 
