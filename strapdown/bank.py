@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import mekf, quaternion, records, vectors
-from strapdown.checks import Array, InputError, array, count, instance, positive
+from strapdown.checks import Array, InputError, array, count, finite, instance, positive
 from strapdown.kernels import bank_loop, filter_loop, robust_gate, robust_step
 from strapdown.kernels.machine import compiled
 from strapdown.mekf import ProcessNoise, Schedule, State, covariance_matrices, pack
-from strapdown.mekf.states import restart_bias_variance
+from strapdown.mekf.states import check_arguments, restart_bias_variance
 from strapdown.records import Estimate, Event, ImuRecord, Innovations
 from strapdown.robustness import UNIFORM_SIGMA, Gate, Monitor, Robust
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
@@ -135,10 +135,12 @@ def run(
     InputError
         If the record has no direction at all, or an argument makes no sense.
     """
+    check_arguments(record=record, process_noise=process_noise, gate=gate, robust=robust, monitor=monitor)
+    mekf.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1.0, bias_sigma=bias_sigma, bias=bias)  # refuses bad ones
     count("hypotheses", hypotheses, least=8)
     count("every", every)
     for name, value in (("least_weight", least_weight), ("largest_share", largest_share)):
-        if not 0.0 < value < 1.0:
+        if not 0.0 < finite(name, value) < 1.0:
             raise InputError(f"{name} is {value:g}; it must lie between 0 and 1")
     found, _ = _until_one(
         record,
@@ -211,6 +213,7 @@ def run_recovering(
     robust, monitor : optional
         As for :func:`strapdown.mekf.run`.
     """
+    check_arguments(record=record, process_noise=process_noise, initial=initial, robust=robust, monitor=monitor)
     count("hypotheses", hypotheses, least=8)
     instance("gate", gate, Gate, "give robustness.Gate(probability=0.999)")
 

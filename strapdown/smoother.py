@@ -32,6 +32,7 @@ from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.mekf import ProcessNoise, State
 from strapdown.mekf.memory import side_by_side
 from strapdown.mekf.running import LostDigitsError
+from strapdown.mekf.states import check_arguments
 from strapdown.records import Estimate, Event, ImuRecord
 from strapdown.robustness import Gate, Robust
 
@@ -103,6 +104,7 @@ def _smoothed(
     gate: Gate | None,
     robust: Robust | None,
 ) -> Estimate:
+    check_arguments(record=record, process_noise=process_noise, initial=initial, gate=gate, robust=robust)
     try:
         forward, event_time, segments = _filtered(record, process_noise, initial, gate, robust)
     except LostDigitsError:

@@ -42,7 +42,7 @@ def test_vertical_headings_and_missing_samples_are_skipped_and_counted(options):
     assert smoothed.skipped == both.skipped
     if options:
         return
-    f = StepFilter(NOISE, START, BLOCKS)
+    f = StepFilter(NOISE, START, BLOCKS, sensors=("north", "up"))
     for k in range(8):
         f.predict(np.zeros(3), 0.1)
         f.update_heading(seen[k], X, 0.1, "north")
@@ -53,7 +53,7 @@ def test_vertical_headings_and_missing_samples_are_skipped_and_counted(options):
 
 
 def test_missing_samples_of_every_kind_change_nothing():
-    f = StepFilter(NOISE, START, BLOCKS)
+    f = StepFilter(NOISE, START, BLOCKS, sensors=("a", "up", "c", "d"))
     P = f.P.copy()
     f.update_direction(NAN, NAN, np.nan, "a")
     f.update_vector([0.0, np.nan, 1.0], X, 0.1, "up")

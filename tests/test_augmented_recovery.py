@@ -511,7 +511,7 @@ def test_attitude_and_hard_iron_from_nothing_are_the_batch_solution(seed):
     mag = quaternion.rotate(quaternion.conjugate(true), FIELD) + iron + 3e-7 * rng.standard_normal(3)
     acc = quaternion.rotate(quaternion.conjugate(true), UP) + 0.05 * rng.standard_normal(3)
     start = mekf.initial_state(guess, attitude_sigma=UNIFORM_SIGMA, bias_sigma=BIAS_SIGMA)
-    face = augmented.StepFilter(NOISE, start, (IRON,))
+    face = augmented.StepFilter(NOISE, start, (IRON,), sensors=("mag", "acc"))
     face._passes = WIDE_PASSES
     assert face.update_vector(mag, FIELD, 3e-7, "mag")
     assert face.update_vector(acc, UP, 0.05, "acc")

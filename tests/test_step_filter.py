@@ -1,11 +1,13 @@
 """The step face where it is used live: late and simultaneous measurements, its clock, missing samples, and what it refuses."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from filterpy.common import Saver
 
-from strapdown import mekf, motion, quaternion, records
+from strapdown import augmented, bank, family, mekf, motion, quaternion, records
 from strapdown.checks import InputError
 from strapdown.gyro import GyroSpec
 from strapdown.mekf import ProcessNoise, StepFilter, initial_state
@@ -346,6 +348,68 @@ def test_missing_attitudes_are_counted_and_leave_the_others_as_they_are():
     assert quaternion.angle_between(found.attitude, record.truth.attitude[0]) < 0.2
 
 
+# ------------------------------------------------------------------------------- from part to part, and what is kept beside it
+
+
+def lost_record():
+    """A start that is off by a radian, and two directions to recover by."""
+    record = record_of(3.0)
+    record = replace(record, vectors=(record.vectors[0], record.vectors[3]))
+    attitude = quaternion.multiply(record.truth.attitude[0], quaternion.exp((1.0, 0.5, -1.0)))
+    return record, initial_state(attitude, attitude_sigma=1e-2, bias_sigma=3e-3)
+
+
+def test_the_step_face_goes_on_from_a_part_as_the_record_does():
+    """The gate's whole memory goes along: a challenger between, refusals counted, and lock-outs that go on."""
+    record, initial = lost_record()
+    gate, challenged, told = Gate(recovery=12), 0, 0
+    whole = mekf.run(record, NOISE, initial, gate=gate)
+    (recovery,) = [event for event in whole.events if event.kind == "recovery"]
+    for cut in (5, 10, 20, 30, 40, 60, 100):
+        first, rest = records.cut(record, 0, cut), records.cut(record, cut, len(record.increments))
+        _, middle = mekf.run_on(first, NOISE, initial, gate=gate)
+        second, end = mekf.run_on(rest, NOISE, middle, gate=gate)
+        challenged += int(middle.gate.counts[0])
+        face = handed_over(rest, middle, [s.time for s in rest.vectors], gate=gate)
+        assert quaternion.angle_between(face.attitude, end.attitude) < 1e-10
+        assert np.abs(face.bias - end.bias).max() < 1e-10
+        d = np.sqrt(np.diag(end.covariance))
+        assert np.abs((face.P - end.covariance) / np.outer(d, d)).max() < 1e-9
+        judged = [event for event in second.events if event.kind != "gap"]
+        assert sorted(map(str, face.events)) == sorted(map(str, judged))
+        told += recovery in face.events
+    assert challenged >= 2
+    assert told >= 2
+
+
+@pytest.mark.parametrize("look_back", [0.0, 0.3])
+def test_saver_and_pickle_take_the_step_face(look_back):
+    """Before the first measurement too, and with events that come meanwhile."""
+    record, initial = lost_record()
+    f = StepFilter(NOISE, initial, gate=Gate(recovery=4), look_back=look_back, sensors=("a", "b"))
+    history = Saver(f, save_current=True)
+    for k, t in enumerate(record.vectors[0].time):
+        if t > f.time:
+            now, then = np.searchsorted(record.time, [f.time, t])
+            f.predict(record.increments[now:then].sum(axis=0), time=t)
+        for series in record.vectors:
+            f.update_direction(series.vector_b[k], series.references_f[k], 2e-3, sensor=series.sensor)
+        history.save()
+    assert f.events
+    history.to_array()
+    n = len(record.vectors[0].time) + 1
+    assert history.P.shape == (n, 6, 6)
+    assert history.K.shape == (n, 6, 2)
+    assert history.attitude.shape == (n, 4)
+    copy = pickle.loads(pickle.dumps(f))
+    late = f.time - 0.5 * look_back
+    for one in (f, copy):
+        one.update_direction(X, X, 0.5, sensor="a", time=late)
+    assert np.array_equal(copy.P, f.P)
+    assert np.array_equal(copy.attitude, f.attitude)
+    assert copy.events == f.events
+
+
 # ------------------------------------------------------------------------------------------------------------ what is no argument
 
 SERIES = VectorMeasurements(sensor="s", kind="direction", time=[0.5], vector_b=[X], reference_f=X, sigma=0.1)
@@ -375,6 +439,60 @@ WRONG = {
     "no series": (lambda: ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=(X,)), r"vectors\[0\] is"),
     "an unknown algorithm": (lambda: records.compress(RECORD, "two-samples"), "did you mean 'two-sample'"),
 }
+
+
+FACES = {
+    "mekf.run": mekf.run,
+    "augmented.run": augmented.run,
+    "augmented.smooth": augmented.smooth,
+    "augmented.smooth_fixed_lag": lambda *given, **options: augmented.smooth_fixed_lag(*given, lag=1.0, **options),
+    "augmented.StepFilter": lambda record, *given, **options: augmented.StepFilter(*given, **options),
+    "augmented.observability": augmented.observability,
+    "augmented.recentred": augmented.recentred,
+    "bank.run": lambda record, noise, initial, **options: bank.run(record, noise, **options),
+    "bank.run_recovering": lambda *given, **options: bank.run_recovering(*given, **{"gate": Gate(), **options}),
+    "family.run": lambda *given: family.run("usque", *given),
+    "family.compare": family.compare,
+}
+WRONG_ARGUMENTS = {
+    "record": None,
+    "process_noise": None,
+    "initial": None,
+    "gate": 0.999,
+    "robust": "huber",
+}
+
+
+def wants(face, name):
+    """Whether a face has an argument of that name."""
+    if name in ("gate", "robust"):
+        return "family" not in face and face not in ("augmented.observability", "augmented.recentred")
+    return (face, name) not in {("bank.run", "initial"), ("augmented.StepFilter", "record")}
+
+
+@pytest.mark.parametrize(
+    ("face", "name"), [(face, name) for face in FACES for name in WRONG_ARGUMENTS if wants(face, name)]
+)
+def test_every_face_refuses_what_is_no_argument(face, name):
+    given = {"record": RECORD, "process_noise": NOISE, "initial": start(), name: WRONG_ARGUMENTS[name]}
+    three = [given.pop(one) for one in ("record", "process_noise", "initial")]
+    with pytest.raises(InputError, match=f"^{name} is {WRONG_ARGUMENTS[name]!r}, not of class"):
+        FACES[face](*three, **given)
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        ({"bias_sigma": [1.0, 2.0]}, r"bias_sigma has shape \(2,\); give one number, or three"),
+        ({"bias_sigma": -1.0}, "bias_sigma"),
+        ({"bias": [0.0, 1.0]}, "bias has shape"),
+        ({"least_weight": "a"}, "least_weight"),
+        ({"monitor": True}, "monitor is True"),
+    ],
+)
+def test_the_bank_names_what_it_cannot_start_with(option, words):
+    with pytest.raises(InputError, match=words):
+        bank.run(RECORD, NOISE, **option)
 
 
 @pytest.mark.parametrize("case", WRONG)

@@ -120,6 +120,11 @@ def run_on(
 
     It holds what a gate remembers as well: its counts, its challenger, how wide a restart is, and the blocks' prior. A lock-out that goes
     on is told by both parts, by the second as a whole. With a block told by functions a gate starts anew in each part.
+
+    Effects that are fixed in a sensor's own unit (``varying``) keep in all parts the unit of the first in which the sensor is, the strength
+    at the root mean square σ there (``unit_sigma`` of the state). A run over the whole record has that of the whole, and so another prior,
+    unless ``initial`` tells the same one. With a lever arm parts agree to some 1e-6 of what they estimate only: the angular acceleration
+    is found from the gyro about each measurement, and at a cut from one side of it.
     """
     check_arguments(record=record, process_noise=process_noise, gate=gate, robust=robust)
     blocks = modelling.as_blocks(blocks)
@@ -208,8 +213,9 @@ def run_events(
         model.chains,
         np.empty((len(model.chains), LINKS)),
     )
+    units = unit_sigmas(record, model, state.unit_sigma)
     measured = (
-        lengths(record, events, model),
+        lengths(record, events, model, units),
         events.sensor,
         events.reference,
         _turns(record, events, model),
@@ -312,6 +318,7 @@ def run_events(
     root = F[:size, :size][:, back]
     end = AugmentedState(
         gate=memory,
+        unit_sigma=units,
         attitude=attitude,
         bias=x[:3],
         values=x[3:][np.argsort(model.order)],
@@ -365,11 +372,11 @@ def start_arrays(model: Model, state: AugmentedState, width: int, columns: int) 
     return state.attitude.copy(), x, F
 
 
-def lengths(record: ImuRecord, events: Schedule, model: Model) -> Array:
+def lengths(record: ImuRecord, events: Schedule, model: Model, units: Mapping[str, float]) -> Array:
     """Return what each event's effects are divided by (events,).
 
     For kind ``"vector"`` that is the length of its reference; for a direction or heading with an effect that is fixed in the sensor's unit
-    the strength of what is measured over that at the root mean square σ; else 1.
+    the strength of what is measured over that at the σ that ``units`` tells; else 1.
     """
     result = np.ones(len(events.time))
     for i, series in enumerate(record.vectors):
@@ -380,24 +387,37 @@ def lengths(record: ImuRecord, events: Schedule, model: Model) -> Array:
         if series.kind == "vector":
             result[mine] = np.linalg.norm(series.references_f[which], axis=1)
         else:
-            result[mine] = strength(series)[which]
+            result[mine] = (units[series.sensor] / level_sigma(series))[which]
     return result
 
 
-def strength(series: VectorMeasurements) -> Array:
-    """Return the strength of what a direction or heading measures (m,), over that at its root mean square σ.
+def unit_sigmas(record: ImuRecord, model: Model, kept: Mapping[str, float]) -> dict[str, float]:
+    """Return ``unit_sigma`` of a state (:class:`AugmentedState`) after a record: that kept, and of sensors without it this record's."""
+    found = {
+        series.sensor: float(np.sqrt(np.mean(level_sigma(series) ** 2)))
+        for series in record.vectors
+        if series.sensor in model.varying and len(series.time)
+    }
+    return {**found, **kept}
 
-    Its σ is the sensor's own noise over the strength, of a heading over the level part of it.
-    """
+
+def strength(series: VectorMeasurements) -> Array:
+    """Return the strength of what a direction or heading measures (m,), over that at its root mean square σ."""
+    sigma = level_sigma(series)
+    return np.asarray(np.sqrt(np.mean(sigma**2)) / sigma)
+
+
+def level_sigma(series: VectorMeasurements) -> Array:
+    """Return a sensor's own noise over the strength of what it measures (m,): σ, which of a heading is over the level part of it."""
     level = np.ones(len(series.time))
     if series.kind == "heading":
         level = np.linalg.norm(series.references_f[:, :2], axis=1)
-    weight = series.sigma * level
-    if np.any(weight <= 0.0):
+    sigma = series.sigma * level
+    if np.any(sigma <= 0.0):
         raise InputError(
             f"{series.sensor}: sigma is 0, which does not tell how strong what it measures is; give it, or varying=False"
         )
-    return np.asarray(np.sqrt(np.mean(weight**2)) / weight)
+    return np.asarray(sigma)
 
 
 def packed(

@@ -6,16 +6,17 @@ constant ones, which then cost the prediction next to nothing (:mod:`strapdown.k
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from strapdown import mekf
 from strapdown.augmented.blocks import MOST_CHAIN_DECAY, Block, Effect, GeneralBlock, LinearBlock, check
-from strapdown.checks import Array, InputError, array, covariance, one_of, unit_quaternions
+from strapdown.checks import Array, InputError, array, covariance, one_of, positive, unit_quaternions
 from strapdown.kernels.augmented_chain import CHAIN, chain_start
 from strapdown.kernels.augmented_step import CARRIED, FIXED, FORCE, LEVER, NOISE_NODES, OFFSET, SCALE
+from strapdown.mekf.states import check_arguments
 from strapdown.robustness import GateMemory
 
 MOST_DECAY = 0.5
@@ -50,6 +51,8 @@ class AugmentedState:
     """A root R of it, ``P = Rᵀ R``, where there is one already: a filter's, which may hold what P itself has no digits for."""
     gate: AugmentedGateMemory | None = None
     """Of the end of a part of a record, what its gate remembers."""
+    unit_sigma: Mapping[str, float] = field(default_factory=dict)
+    """Of sensors with ``varying`` effects the σ, rad, whose strength is the values' unit; without it, the record's root mean square."""
 
     def __post_init__(self) -> None:
         """Check shapes, the norm and positive definiteness."""
@@ -57,6 +60,8 @@ class AugmentedState:
         object.__setattr__(self, "bias", array("bias", self.bias, (3,)))
         values = array("values", self.values, ("m",))
         object.__setattr__(self, "values", values)
+        told = {name: positive(f"unit_sigma[{name!r}]", sigma) for name, sigma in self.unit_sigma.items()}
+        object.__setattr__(self, "unit_sigma", told)
         size = 6 + len(values)
         if self.factor is None:
             object.__setattr__(self, "covariance", covariance("covariance", self.covariance, size))
@@ -71,6 +76,8 @@ def as_blocks(blocks: Sequence[Block]) -> tuple[Block, ...]:
     """Return the blocks as a tuple; one by itself is refused."""
     if isinstance(blocks, LinearBlock | GeneralBlock):
         raise InputError(f"blocks is the block {blocks.name} by itself; give a tuple of them, (block,)")
+    if not isinstance(blocks, Iterable):
+        raise InputError(f"blocks is {blocks!r}; give a tuple of them, () for none")
     return tuple(blocks)
 
 
@@ -94,6 +101,8 @@ def begin(initial: mekf.State | AugmentedState, blocks: tuple[Block, ...]) -> Au
     check(blocks)
     if isinstance(initial, mekf.State):
         return initial_state(initial, blocks)
+    if not isinstance(initial, AugmentedState):
+        check_arguments(initial=initial)
     size = sum(block.size for block in blocks)
     if len(initial.values) != size:
         raise InputError(f"initial has {len(initial.values)} block states, the blocks {size}; make it by initial_state")

@@ -17,8 +17,18 @@ from strapdown.augmented import filtering
 from strapdown.augmented import model as modelling
 from strapdown.augmented.blocks import Block, GeneralBlock, Interval, View
 from strapdown.augmented.filtering import AugmentedEstimate
-from strapdown.augmented.model import AugmentedState
-from strapdown.checks import Array, InputError, array, covariance, non_negative, positive, unit_quaternions
+from strapdown.augmented.model import AugmentedGateMemory, AugmentedState
+from strapdown.checks import (
+    Array,
+    InputError,
+    array,
+    covariance,
+    finite,
+    non_negative,
+    one_of,
+    positive,
+    unit_quaternions,
+)
 from strapdown.kernels import (
     augmented_chain,
     augmented_loop,
@@ -30,10 +40,11 @@ from strapdown.kernels import (
 from strapdown.kernels.robust_gate import WIDE_PASSES
 from strapdown.kernels.robust_step import ACCEPTED, PASSED_OVER, REFUSED
 from strapdown.mekf import ProcessNoise
-from strapdown.mekf.judging import Judging
+from strapdown.mekf.judging import Judging, ToldEvents
 from strapdown.mekf.scheduling import skipped_too
-from strapdown.mekf.states import restart_bias_variance
-from strapdown.records import Event, ImuRecord
+from strapdown.mekf.states import check_arguments, restart_bias_variance
+from strapdown.mekf.stepping import sensor_names, show_refused
+from strapdown.records import ImuRecord
 from strapdown.robustness import Gate, Linearised, Robust, Rows, seen_from, tilt_unknown
 from strapdown.vectors import KINDS, need_level, need_unit, triad
 
@@ -51,9 +62,22 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
     """The same filter with a whole covariance: ``P``, ``F``, ``Q``, ``R``, ``y``, ``S``, ``K``, ``Saver`` work as filterpy's users expect.
 
     ``x`` is the error state (δθ, δb, δc) (n,): zero before and after each update; ``x_post`` keeps the last correction. ``attitude`` (4,)
-    is q_fb, ``bias`` (3,) in rad/s, ``values`` (m,) those of the blocks one after the other. ``time`` counts from 0 unless set. ``nis`` is
-    that of the last measurement, ``weight`` what it was taken in with; ``refused`` counts by sensor what the gate refused, ``events`` tells
-    of recoveries and lock-outs. A heading that the estimate takes for vertical is passed over.
+    is q_fb, ``bias`` (3,) in rad/s, ``values`` (m,) those of the blocks one after the other, ``time`` in s. ``nis`` is that of the last
+    measurement, ``weight`` what it was taken in with; ``refused`` counts by sensor what the gate refused, ``events`` tells of recoveries
+    and lock-outs. A heading that the estimate takes for vertical is passed over.
+
+    Parameters
+    ----------
+    process_noise : ProcessNoise
+    initial : mekf.State or AugmentedState
+        Of the end of a part of a record (:func:`strapdown.augmented.run_on`), it goes on with what the gate remembers; give its ``time``.
+    blocks : sequence of blocks
+    gate : Gate, optional
+    robust : Robust, optional
+    sensors : sequence of str, optional
+        Names of all sensors. Default: those that linear blocks are about; where these are about none, any name will do.
+    time : float
+        Time of the initial state, s.
     """
 
     def __init__(
@@ -64,23 +88,31 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         *,
         gate: Gate | None = None,
         robust: Robust | None = None,
+        sensors: Sequence[str] = (),
+        time: float = 0.0,
     ) -> None:
+        check_arguments(process_noise=process_noise, gate=gate, robust=robust)
         blocks = modelling.as_blocks(blocks)
         state = modelling.begin(initial, blocks)
+        names = sensor_names(sensors)
+        about = {sensor: block.name for block in blocks for sensor in getattr(block, "effects", {})}
+        for sensor, block in about.items() if names else ():
+            one_of(f"{block}: sensor", sensor, names)
         size = 6 + len(state.values)
         super().__init__(dim_x=size, dim_z=2)
         self.process_noise = process_noise
         self.gate = gate
         self.robust = robust
         self.blocks = blocks
+        self.sensors = names or tuple(about)
         self.kinds: dict[str, str] = {}
         self.attitude: Array = state.attitude.copy()
         self.bias: Array = state.bias.copy()
         self.values: Array = state.values.copy()
-        self.x = np.zeros(size)
+        self.x, self.x_prior, self.x_post = np.zeros((3, size))
         self.P = state.covariance.copy()
-        self.y = np.zeros(2)
-        self.time = 0.0
+        self.y, self.z, self.K = np.zeros(2), np.zeros(2), np.zeros((size, 2))
+        self.time = finite("time", time, unit="s")
         self.rate = np.zeros(3)
         bounds = np.cumsum([0, *(block.size for block in self.blocks)])
         self._parts = [slice(a, b) for a, b in itertools.pairwise(bounds)]
@@ -91,16 +123,36 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         self.skipped: dict[str, int] = {}
         self.repeated = 0
         # What the blocks of a challenger know, carried along.
-        self._prior = filtering.restart_states(state, self.blocks)
+        self._prior = _Gaussian(*filtering.restart_states(state, self.blocks))
         self._restart_bias_variance = restart_bias_variance(gate, state)
-        self._expected = self.y, np.eye(2)
-        self._judging: Judging[StepFilter] = Judging(gate, state.gate)
+        self._expected = _Gaussian(self.y, np.eye(2))
+        memory = None if modelling.general(self.blocks) else state.gate
+        self._judging: Judging[StepFilter] = Judging(gate, memory)
         self._passes = self._judging.passes
+        if gate is not None and memory is not None:
+            self._go_on(memory)
 
-    @property
-    def events(self) -> tuple[Event, ...]:
-        """Recoveries and lock-outs so far, in order of time."""
-        return self._judging.events
+    events = ToldEvents()
+
+    def _go_on(self, memory: AugmentedGateMemory) -> None:
+        """Take over what the blocks of a challenger knew at the start of a record, and the challenger."""
+        if self.time < memory.start:
+            raise InputError(
+                f"time is {self.time:.9g} s, before the record of initial began, {memory.start:.9g} s; give the time of initial"
+            )
+        since = Interval(time=memory.start, dt=self.time - memory.start, attitude=self.attitude, rate=self.rate)
+        self._prior = self._carried(_Gaussian(memory.values, memory.covariance), since)
+        if self._judging.challenged:
+            order = modelling.assemble(self.blocks, dict.fromkeys(self.sensors, "vector")).whole_order
+            back, size = np.argsort(order), len(order)
+            attitude, x, F = np.split(memory.challenger, [4, 4 + size - 3])
+            root = F.reshape(size, size)[:, back]
+            others = np.concatenate([np.zeros(3), x])[back][3:]
+            self._judging.challenger = self._rival(
+                AugmentedState(
+                    attitude=attitude, bias=others[:3], values=others[3:], covariance=root.T @ root, factor=root
+                )
+            )
 
     def predict(self, delta_theta: ArrayLike, dt: float) -> None:
         """Propagate over one gyro increment (3,), rad, of dt seconds; a repeated sample (of no length) is counted and changes nothing."""
@@ -142,7 +194,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         gyro[:m], use[:m] = model.gyro, model.gyro_use
         for block, where in zip(self.blocks, self._parts, strict=True):
             if isinstance(block, GeneralBlock):
-                told, rows = block.gyro(self.values[where], interval)
+                told, rows = _told(block, "gyro", block.gyro(self.values[where], interval), interval.time)
                 gyro[where, :3] = rows
                 use[where] = augmented_step.OFFSET * np.any(np.asarray(rows) != 0.0, axis=1)
                 gyro[m, :3] += told - self.values[where] @ rows
@@ -178,29 +230,30 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         self.F, self.Q = columns.T.copy(), N.T @ N
         self.values = x[3 : 3 + m]
         if self.gate is not None and self.gate.recovery:
-            self._prior = self._carried_prior(interval)
+            self._prior = self._carried(self._prior, interval)
         for block, where in zip(self.blocks, self._parts, strict=True):
             if isinstance(block, GeneralBlock):
                 own = slice(6 + where.start, 6 + where.stop)
-                self.values[where], transition, from_attitude, driven = block.propagate(self.values[where], interval)
-                self.F[own, own], self.F[own, :3], self.Q[own, own] = transition, from_attitude, driven
+                after = _told(block, "propagate", block.propagate(self.values[where], interval), interval.time)
+                self.values[where], self.F[own, own], self.F[own, :3], self.Q[own, own] = after
         super().predict()
         self.attitude = quaternion.normalize(np.array(attitude))
         self.rate = np.array(rate)
         self.time += dt
 
-    def _carried_prior(self, interval: Interval) -> tuple[Array, Array]:
-        """Return values and covariance of the blocks' prior after an interval."""
-        values, P = self._prior
+    def _carried(self, prior: _Gaussian, interval: Interval) -> _Gaussian:
+        """Return what the blocks' prior is after an interval."""
+        values, P = prior.mean, prior.covariance
         Phi, Q, moved = np.zeros_like(P), np.zeros_like(P), np.empty(len(values))
         for block, where in zip(self.blocks, self._parts, strict=True):
             own = where, where
             if isinstance(block, GeneralBlock):
-                moved[where], Phi[own], _, Q[own] = block.propagate(values[where], interval)
+                after = _told(block, "propagate", block.propagate(values[where], interval), interval.time)
+                moved[where], Phi[own], _, Q[own] = after
             else:
                 Phi[own], Q[own] = block.transition(interval.dt), block.process_noise(interval.dt)
                 moved[where] = Phi[own] @ values[where]
-        return moved, Phi @ P @ Phi.T + Q
+        return _Gaussian(moved, Phi @ P @ Phi.T + Q)
 
     def update_direction(self, vector_b: ArrayLike, reference_f: ArrayLike, sigma: ArrayLike, sensor: str = "") -> bool:
         """Update with a measured unit direction (3,) of a known one (3,): two degrees of freedom.
@@ -253,12 +306,21 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             )
         )
 
+    def _need_known(self, sensor: str) -> None:
+        if self.sensors and sensor not in self.sensors:
+            raise InputError(
+                f"sensor is {sensor!r}, which is none of {', '.join(self.sensors)}; say which of them it is, or name all sensors to "
+                "StepFilter(sensors=…)"
+            )
+
     def _skip(self, sensor: str) -> bool:
+        self._need_known(sensor)
         self.skipped[sensor] = self.skipped.get(sensor, 0) + 1
         return False
 
     def _measure(self, measured: _Measured) -> bool:
         sensor = measured.sensor
+        self._need_known(sensor)
         if self.kinds.setdefault(sensor, measured.kind) != measured.kind:
             raise InputError(
                 f"{sensor or 'the sensor'} gave kind {self.kinds[sensor]!r} before, now {measured.kind!r}; name each sensor"
@@ -290,7 +352,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
                         raise InputError(
                             f"{block.name}: {measured.sensor} is of kind 'heading', on which it has no effect; leave it out"
                         )
-                    told, rows = effect
+                    told, rows = _told(block, "measured", effect, self.time, measured.sensor)
                     sensors[0, where, :3] = rows
                     use[0, where] = augmented_step.OFFSET
                     sensors[0, m, :3] += told - values[where] @ rows
@@ -351,18 +413,18 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         """Take in a measurement; return ``ACCEPTED``, ``REFUSED`` or ``PASSED_OVER``."""
         if not self._shows(measured):
             self.weight = 0.0
-            self._expected = np.array([np.nan]), np.eye(1)
+            self._expected = _Gaussian(np.array([np.nan]), np.eye(1))
             return PASSED_OVER
         others = np.concatenate([self.bias, self.values])
         threshold = np.inf if self.gate is None else float(self.gate.thresholds[KINDS[measured.kind] - 1])
         seen = self._linearised(measured, others, threshold)
         self.nis = seen.nis
         self.dim_z = len(seen.residual)
-        self._expected = seen.innovation, seen.predicted + seen.noise
+        self._expected = _Gaussian(seen.innovation, seen.predicted + seen.noise)
         unknown = self._passes > 1 and measured.kind == "heading" and tilt_unknown(self.attitude, self.P)
         if unknown or not seen.acceptable(threshold):
             self.weight = 0.0
-            self.y, self.S = self._expected
+            show_refused(self, seen)
             return PASSED_OVER if unknown else REFUSED
         self.weight = 1.0 if self.robust is None else seen.weight(self.robust)
         self.attitude, self.P, self.x = seen.attitude, seen.covariance, seen.prior.copy()
@@ -385,12 +447,16 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         self.bias, self.values = self.bias + correction[3:6], self.values + correction[6:]
 
     def _restarted(self, attitude_sigma: float, bias_width: float) -> StepFilter:
-        values, block = self._prior
         P = np.zeros_like(self.P)
         P[:3, :3] = attitude_sigma**2 * np.eye(3)
         P[3:6, 3:6] = self.P[3:6, 3:6] + bias_width**2 * np.diag(self._restart_bias_variance)
-        P[6:, 6:] = block
-        state = AugmentedState(attitude=self.attitude, bias=self.bias, values=values, covariance=P)
+        P[6:, 6:] = self._prior.covariance
+        return self._rival(
+            AugmentedState(attitude=self.attitude, bias=self.bias, values=self._prior.mean, covariance=P)
+        )
+
+    def _rival(self, state: AugmentedState) -> StepFilter:
+        """Return a challenger in this state."""
         rival = StepFilter(self.process_noise, state, self.blocks, gate=self.gate, robust=self.robust)
         rival.time, rival.rate = self.time, self.rate
         rival.kinds, rival._models = self.kinds, self._models
@@ -405,6 +471,14 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         """Return the present state."""
         P = 0.5 * (self.P + self.P.T)
         return AugmentedState(attitude=self.attitude, bias=self.bias, values=self.values, covariance=P)
+
+
+@dataclass(frozen=True)
+class _Gaussian:
+    """A vector and its covariance, as one object, for of a pair ``Saver`` makes an array, and finds no shape."""
+
+    mean: Array
+    covariance: Array
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -429,6 +503,31 @@ def _covariance(sigma: ArrayLike) -> Array:
     return np.diag([positive("sigma", value) ** 2 for value in np.broadcast_to(sigma, 3)])
 
 
+TOLD: dict[str, tuple[tuple[str, tuple[str | int, ...]], ...]] = {
+    "propagate": (
+        ("values", ("size",)),
+        ("Φ", ("size", "size")),
+        ("∂values/∂δθ", ("size", 3)),
+        ("Q", ("size", "size")),
+    ),
+    "gyro": (("what is added", (3,)), ("its derivatives", ("size", 3))),
+    "measured": (("what is added", (3,)), ("its derivatives", ("size", 3))),
+}
+"""What each function of a general block returns."""
+
+
+def _told(block: GeneralBlock, function: str, told: object, time: float, sensor: str = "") -> list[Array]:
+    """Return what a function of a block returned as arrays; anything but numbers of the right shapes is refused."""
+    of = f" of {sensor}" if sensor else ""
+    place, wanted = f"{block.name}: {function}{of} at {time:.9g} s", TOLD[function]
+    if not isinstance(told, tuple | list) or len(told) != len(wanted):
+        raise InputError(f"{place} returned {told!r:.60}; return {', '.join(name for name, _ in wanted)} as a tuple")
+    return [
+        array(f"{place}: {name}", value, tuple(block.size if n == "size" else n for n in shape))
+        for (name, shape), value in zip(wanted, told, strict=True)
+    ]
+
+
 def run_on(
     record: ImuRecord,
     process_noise: ProcessNoise,
@@ -446,8 +545,10 @@ def run_on(
     ``face`` is the filter itself, where the caller has made it.
     """
     events = mekf.schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True)
-    face = StepFilter(process_noise, initial, blocks, gate=gate, robust=robust) if face is None else face
-    face.time = float(record.time[0])
+    begin = float(record.time[0])
+    if face is None:
+        face = StepFilter(process_noise, initial, blocks, gate=gate, robust=robust, time=begin)
+    face.time, face.sensors = begin, events.sensors
     face.kinds = dict(zip(events.sensors, events.kinds, strict=True))
     modelling.assemble(blocks, face.kinds)  # refuses effects on sensors that are not there
     size = 6 + len(initial.values)
@@ -502,7 +603,7 @@ def _take(face: StepFilter, record: ImuRecord, events: mekf.Schedule, e: int, in
     else:
         update = face.update_direction if series.kind == "direction" else face.update_vector
         update(series.vector_b[j], series.references_f[j], series.covariances[j], series.sensor)
-    y, S = face._expected  # under the nominal noise, whatever the weight
+    y, S = face._expected.mean, face._expected.covariance  # under the nominal noise, whatever the weight
     L = np.linalg.cholesky(S)
     diagonal = np.diag(L)
     n = len(y)

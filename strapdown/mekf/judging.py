@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from typing import Generic, Protocol, Self, TypeVar
+from typing import Any, Generic, Protocol, Self, TypeVar, overload
 
 import numpy as np
 
@@ -86,6 +86,23 @@ class Judged(Protocol):
         """Take over another's state."""
 
 
+class ToldEvents:
+    """``events`` of a filter step by step: recoveries and lock-outs so far, in order of time.
+
+    No property, for of each of these filterpy's ``Saver`` makes an array, which a tuple that grows is not.
+    """
+
+    @overload
+    def __get__(self, filter: None, owner: type) -> Self: ...
+
+    @overload
+    def __get__(self, filter: object, owner: type) -> tuple[Event, ...]: ...
+
+    def __get__(self, filter: Any, owner: type) -> Self | tuple[Event, ...]:
+        """Return those of a filter."""
+        return self if filter is None else filter._judging.events  # type: ignore[no-any-return]
+
+
 Filter = TypeVar("Filter", bound=Judged)
 
 
@@ -94,12 +111,15 @@ class Judging(Generic[Filter]):
 
     def __init__(self, gate: Gate | None, memory: GateMemory | None) -> None:
         self.gate = gate
-        self.memory, self.standing = remembered(gate, None, ())
-        if memory is not None:
-            self.memory[robust_gate.PASSES] = memory.counts[robust_gate.PASSES]
+        self.sensors: tuple[str, ...] = () if memory is None else tuple(memory.standing)
+        self.memory, self.standing = remembered(gate, memory, self.sensors)
         self.challenger: Filter | None = None
-        self.sensors: tuple[str, ...] = ()
         self.recoveries, self.lock_outs = np.empty((0, 4)), np.empty((0, 4))
+
+    @property
+    def challenged(self) -> bool:
+        """Whether there is a challenger; of one that the memory tells of the filter has to make :attr:`challenger`."""
+        return bool(self.memory[robust_gate.CHALLENGED])
 
     @property
     def passes(self) -> int:

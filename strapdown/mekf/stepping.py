@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import filterpy.kalman
@@ -27,10 +28,9 @@ from strapdown.kernels import filter_loop, filter_step
 from strapdown.kernels.robust_gate import WIDE_PASSES
 from strapdown.kernels.robust_step import ACCEPTED, KNOWN, PASSED_OVER, REFUSED
 from strapdown.kernels.series import LARGEST_ANGLE
-from strapdown.mekf.judging import Judging
+from strapdown.mekf.judging import Judging, ToldEvents
 from strapdown.mekf.states import ProcessNoise, State, check_arguments, covariance_matrices, restart_bias_variance
-from strapdown.records import Event
-from strapdown.robustness import Gate, Robust, Rows, linearise, seen_from, tilt_unknown
+from strapdown.robustness import Gate, Linearised, Robust, Rows, linearise, seen_from, tilt_unknown
 from strapdown.vectors import need_level, need_unit, triad
 
 CLOCK_SHARE = 1e-3
@@ -53,6 +53,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
     ----------
     process_noise : ProcessNoise
     initial : State
+        Of the end of a part of a record (:func:`strapdown.mekf.run_on`), it goes on with what the gate remembers; give its ``time``.
     gate : Gate, optional
     robust : Robust, optional
     look_back : float
@@ -77,8 +78,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         time: float = 0.0,
     ) -> None:
         check_arguments(process_noise=process_noise, initial=initial, gate=gate, robust=robust)
-        if isinstance(sensors, str):
-            raise InputError(f"sensors is {sensors!r}; it must be a sequence of names, ({sensors!r},)")
+        names = sensor_names(sensors)
         super().__init__(dim_x=6, dim_z=2)
         self.process_noise = process_noise
         self.gate = gate
@@ -87,9 +87,9 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         self.time = finite("time", time, unit="s")
         self.attitude: Array = initial.attitude.copy()
         self.bias: Array = initial.bias.copy()
-        self.x = np.zeros(6)
+        self.x, self.x_prior, self.x_post = np.zeros((3, 6))
         self.P = initial.covariance.copy()
-        self.y = np.zeros(2)
+        self.y, self.z, self.K = np.zeros(2), np.zeros(2), np.zeros((6, 2))
         self.nis = 0.0
         self.weight = 1.0
         self.late = 0
@@ -98,8 +98,11 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         self._restart_bias_variance = restart_bias_variance(gate, initial)
         self._judging: Judging[StepFilter] = Judging(gate, initial.gate)
         self._passes = self._judging.passes
-        self._done: list[_Done] = []
-        self._places = {name: place for place, name in enumerate(sensors)}
+        if initial.gate is not None and self._judging.challenged:
+            rival = initial.gate.challenger
+            self._judging.challenger = self._rival(rival[:4], rival[4:7], covariance_matrices(rival[7:]))
+        self._past = _Past()
+        self._places = {name: place for place, name in enumerate(names)}
         self._missing: dict[str, int] = {}
         self._vertical: dict[str, int] = {}
         self._start = self.time
@@ -107,10 +110,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         self._steps = 0
         self._longest = 0.0
 
-    @property
-    def events(self) -> tuple[Event, ...]:
-        """Recoveries and lock-outs so far, in order of time."""
-        return self._judging.events
+    events = ToldEvents()
 
     @property
     def skipped(self) -> dict[str, int]:
@@ -193,14 +193,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         need_unit(_of(sensor, "vector_b"), z)
         frame = triad(array(_of(sensor, "reference_f"), reference_f, (3,)))
         C = _body_covariance(sigma, covariance)
-
-        def rows(attitude: Array) -> Rows:
-            u, v, r = frame @ quaternion.to_matrix(attitude)
-            basis = np.stack([u, v])
-            H = np.stack([-v, u])
-            return basis @ z, H, basis @ C @ basis.T, *_arc(basis @ z, float(r @ z))
-
-        return self._measure(rows, sensor, time)
+        return self._measure(partial(_direction_rows, z, frame, C), sensor, time)
 
     def update_vector(
         self,
@@ -217,18 +210,8 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         if np.isnan(z).any():
             return self._skip(sensor)
         r = array(_of(sensor, "reference_f"), reference_f, (3,))
-        frame = triad(r)
-        length = float(np.linalg.norm(r))
         C = _body_covariance(sigma, covariance)
-
-        def rows(attitude: Array) -> Rows:
-            basis = frame @ quaternion.to_matrix(attitude)
-            H = np.stack([-length * basis[1], length * basis[0], np.zeros(3)])
-            residual = basis @ z - np.array([0.0, 0.0, length])
-            arc = _arc(residual[:2] / length, float(basis[2] @ z) / length)
-            return residual, H, basis @ C @ basis.T, *arc
-
-        return self._measure(rows, sensor, time)
+        return self._measure(partial(_vector_rows, z, triad(r), float(np.linalg.norm(r)), C), sensor, time)
 
     def update_heading(
         self,
@@ -250,18 +233,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         reference = triad(array(_of(sensor, "reference_f"), reference_f, (3,)))[2]
         need_level(_of(sensor, "reference_f"), reference)
         variance = positive(_of(sensor, "sigma"), sigma, unit="rad") ** 2
-
-        def rows(attitude: Array) -> Rows:
-            R = quaternion.to_matrix(attitude)
-            m = R @ z
-            level = m[:2] @ m[:2]
-            if level <= filter_step.VERTICAL:
-                return np.zeros(1), np.zeros((1, 3)), np.array([[variance]]), 0.0, 1.0
-            error = filter_loop.heading_error(tuple(R.ravel()), z, reference)
-            H = (np.array([*(-m[2] * m[:2] / level), 1.0]) @ R)[None]
-            return np.array([error]), H, np.array([[variance]]), 0.0, 1.0
-
-        return self._measure(rows, sensor, time, of_heading=True)
+        return self._measure(partial(_heading_rows, z, reference, variance), sensor, time, of_heading=True)
 
     def update_attitude(
         self,
@@ -278,12 +250,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             return self._skip(sensor)
         measured = unit_quaternions(_of(sensor, "attitude"), given)
         C = _body_covariance(sigma, covariance)
-
-        def rows(estimate: Array) -> Rows:
-            residual = quaternion.log(quaternion.multiply(quaternion.conjugate(estimate), measured))
-            return residual, np.eye(3), C, 0.0, 1.0
-
-        return self._measure(rows, sensor, time)
+        return self._measure(partial(_attitude_rows, measured, C), sensor, time)
 
     def _skip(self, sensor: str) -> bool:
         self._missing[sensor] = self._missing.get(sensor, 0) + 1
@@ -298,14 +265,14 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             raise InputError(f"time is {when:.9g} s, after the filter's {self.time:.9g} s; predict up to it first")
         place = self._places.setdefault(sensor, len(self._places))
         if when < self.time and (
-            not self._done or when < max(self.time - self.look_back, self._done[0].kept["time"]) - room
+            not self._past.done or when < max(self.time - self.look_back, self._past.done[0].kept["time"]) - room
         ):
             self.late += 1
             return False
-        first = len(self._done)
-        while first and self._comes_after(self._done[first - 1], when, place, room):
+        first = len(self._past.done)
+        while first and self._comes_after(self._past.done[first - 1], when, place, room):
             first -= 1
-        after, self._done = self._done[first:], self._done[:first]
+        after, self._past.done = self._past.done[first:], self._past.done[:first]
         if not after:
             return self._take_now(rows, sensor, of_heading)
         self._restore(after[0].kept)
@@ -345,7 +312,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         unknown = self._passes > 1 and of_heading and tilt_unknown(self.attitude, self.P)
         if unknown or not seen.acceptable(threshold):
             self.weight = 0.0
-            self.y, self.S = seen.innovation, seen.predicted + seen.noise
+            show_refused(self, seen)
             return PASSED_OVER if unknown else REFUSED
         self.weight = 1.0 if self.robust is None else seen.weight(self.robust)
         self.attitude, self.P = seen.attitude, seen.covariance
@@ -372,7 +339,11 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         P = np.zeros((6, 6))
         P[:3, :3] = attitude_sigma**2 * np.eye(3)
         P[3:, 3:] = self.P[3:, 3:] + bias_width**2 * np.diag(self._restart_bias_variance)
-        state = State(attitude=self.attitude, bias=self.bias, covariance=P)
+        return self._rival(self.attitude, self.bias, P)
+
+    def _rival(self, attitude: Array, bias: Array, P: Array) -> StepFilter:
+        """Return a challenger in this state."""
+        state = State(attitude=attitude, bias=bias, covariance=P)
         rival = StepFilter(self.process_noise, state, gate=self.gate, robust=self.robust, time=self.time)
         rival._passes = WIDE_PASSES
         return rival
@@ -384,10 +355,10 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         """Keep what is done for as long as a measurement may still come in before it."""
         if self.look_back == 0.0:
             return
-        self._done.append(done)
+        self._past.done.append(done)
         oldest = self.time - self.look_back - self._rounding(self.time)
-        while self._done[0].end < oldest:
-            del self._done[0]
+        while self._past.done[0].end < oldest:
+            del self._past.done[0]
 
     def _again(self, done: _Done) -> None:
         if done.rows is None:
@@ -437,6 +408,58 @@ class _Done:
         share = (time - begin) / (self.end - begin)
         head = replace(self, end=time, dt=share * self.dt, increment=share * self.increment)
         return head, replace(self, dt=self.dt - head.dt, increment=self.increment - head.increment)
+
+
+@dataclass
+class _Past:
+    """What the step face did and may have to do again: one object, for Saver makes an array of a list, and finds no shape."""
+
+    done: list[_Done] = field(default_factory=list)
+
+
+def _direction_rows(z: Array, frame: Array, C: Array, attitude: Array) -> Rows:
+    u, v, r = frame @ quaternion.to_matrix(attitude)
+    basis = np.stack([u, v])
+    H = np.stack([-v, u])
+    return basis @ z, H, basis @ C @ basis.T, *_arc(basis @ z, float(r @ z))
+
+
+def _vector_rows(z: Array, frame: Array, length: float, C: Array, attitude: Array) -> Rows:
+    basis = frame @ quaternion.to_matrix(attitude)
+    H = np.stack([-length * basis[1], length * basis[0], np.zeros(3)])
+    residual = basis @ z - np.array([0.0, 0.0, length])
+    arc = _arc(residual[:2] / length, float(basis[2] @ z) / length)
+    return residual, H, basis @ C @ basis.T, *arc
+
+
+def _heading_rows(z: Array, reference: Array, variance: float, attitude: Array) -> Rows:
+    R = quaternion.to_matrix(attitude)
+    m = R @ z
+    level = m[:2] @ m[:2]
+    if level <= filter_step.VERTICAL:
+        return np.zeros(1), np.zeros((1, 3)), np.array([[variance]]), 0.0, 1.0
+    error = filter_loop.heading_error(tuple(R.ravel()), z, reference)
+    H = (np.array([*(-m[2] * m[:2] / level), 1.0]) @ R)[None]
+    return np.array([error]), H, np.array([[variance]]), 0.0, 1.0
+
+
+def _attitude_rows(measured: Array, C: Array, attitude: Array) -> Rows:
+    residual = quaternion.log(quaternion.multiply(quaternion.conjugate(attitude), measured))
+    return residual, np.eye(3), C, 0.0, 1.0
+
+
+def show_refused(filter: filterpy.kalman.ExtendedKalmanFilter, seen: Linearised) -> None:
+    """Leave what filterpy shows of an update at that of a measurement that is not taken in: of its shape, without a gain."""
+    filter.z, filter.y, filter.S = seen.residual, seen.innovation, seen.predicted + seen.noise
+    filter.SI, filter.K = np.linalg.inv(filter.S), np.zeros((len(filter.x), len(filter.y)))
+    filter._log_likelihood = filter._likelihood = filter._mahalanobis = None  # to be computed anew
+
+
+def sensor_names(sensors: Sequence[str]) -> tuple[str, ...]:
+    """Return names of sensors as a tuple; one by itself is refused."""
+    if isinstance(sensors, str):
+        raise InputError(f"sensors is {sensors!r}; it must be a sequence of names, ({sensors!r},)")
+    return tuple(sensors)
 
 
 def _of(sensor: str, name: str) -> str:
