@@ -19,6 +19,7 @@ from strapdown.kernels import augmented_factor, augmented_step
 from strapdown.kernels.machine import compiled
 from strapdown.mekf import ProcessNoise
 from strapdown.records import ImuRecord
+from strapdown.robustness import Gate
 from strapdown.vectors import VectorMeasurements
 
 NOISE = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-4)
@@ -540,12 +541,44 @@ def test_a_split_run_is_the_whole_run_to_the_bit(option):
     np.testing.assert_allclose(again.bias, second.bias, rtol=0, atol=1e-9 * np.max(second.sigma))
 
 
+@pytest.mark.parametrize("gate", [None, Gate()], ids=["plain", "gate"])
+def test_effects_in_the_sensors_own_unit_keep_it_from_part_to_part(gate):
+    """A field four times as strong in the first half: the second part goes on in the first's unit, as the whole in that unit to the bit."""
+    record = record_of()
+    series = next(s for s in record.vectors if s.kind == "direction")
+    half = len(record.increments) // 2
+    sigma = np.where(series.time < record.time[half], 0.25, 1.0) * series.sigma
+    weak = dataclasses.replace(series, sigma=sigma)
+    record = dataclasses.replace(record, vectors=tuple(weak if s is series else s for s in record.vectors))
+    blocks = (augmented.VectorBias(sensor=series.sensor, bias_sigma=0.02, varying=True),)
+    part, middle = augmented.run_on(records.cut(record, 0, half), NOISE, start(), blocks, gate=gate)
+    assert middle.unit_sigma == pytest.approx({series.sensor: float(sigma[0])}, rel=1e-12)
+    rest, last = augmented.run_on(records.cut(record, half, len(record.increments)), NOISE, middle, blocks, gate=gate)
+    assert last.unit_sigma == middle.unit_sigma
+    begin = dataclasses.replace(augmented.initial_state(start(), blocks), unit_sigma=middle.unit_sigma)
+    whole, end = augmented.run_on(record, NOISE, begin, blocks, gate=gate)
+    for name in ("attitude", "bias", "variance"):
+        joined = np.concatenate([getattr(part, name)[:-1], getattr(rest, name)])
+        assert np.array_equal(joined, getattr(whole, name)), name
+    assert np.array_equal(last.values, end.values)
+    assert np.array_equal(last.factor, end.factor)
+    # Told nothing, the whole has its own unit, the root mean square; its prior is made for that, and the rest is the same filter.
+    _, own = augmented.run_on(record, NOISE, start(), blocks, gate=gate)
+    unit = float(np.sqrt(np.mean(sigma**2)))
+    assert own.unit_sigma == pytest.approx({series.sensor: unit}, rel=1e-12)
+    ratio = unit / middle.unit_sigma[series.sensor]
+    prior = dataclasses.replace(blocks[0], bias_sigma=0.02 / ratio)
+    begin = dataclasses.replace(augmented.initial_state(start(), (prior,)), unit_sigma=middle.unit_sigma)
+    _, same = augmented.run_on(record, NOISE, begin, (prior,), gate=gate)
+    np.testing.assert_allclose(same.values * ratio, own.values, rtol=1e-9, atol=1e-14)
+
+
 # ------------------------------------------------------------------------------------------------------------------------- smoother
 
 
 def reference_smoother(record, initial, blocks):
     """The textbook smoother on whole matrices, over what the step-by-step face passed through."""
-    face = augmented.StepFilter(NOISE, initial, blocks)
+    face = augmented.StepFilter(NOISE, initial, blocks, sensors=[s.sensor for s in record.vectors])
     series = {(t, i): (s, j) for i, s in enumerate(record.vectors) for j, t in enumerate(s.time)}
     stops = np.unique(np.concatenate([record.time, [t for t, _ in series]]))
     filtered, steps, at_edge, n = [], [], [], len(face.x)

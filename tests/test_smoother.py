@@ -1264,13 +1264,13 @@ def test_edges_are_found_exactly() -> None:
 
 @pytest.mark.parametrize("name", ["record", "process_noise", "initial", "gate"])
 def test_what_is_no_argument_is_refused_by_name(name):
-    given = dict(record=None, process_noise=None, initial=None, gate=0.999)
+    given = {"record": None, "process_noise": None, "initial": None, "gate": 0.999}
     time = np.arange(3.0)
-    right = dict(
-        record=ImuRecord(time=time, increments=np.zeros((2, 3))),
-        process_noise=mekf.ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6),
-        initial=mekf.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.1, bias_sigma=1e-3),
-    )
+    right = {
+        "record": ImuRecord(time=time, increments=np.zeros((2, 3))),
+        "process_noise": mekf.ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6),
+        "initial": mekf.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.1, bias_sigma=1e-3),
+    }
     wrong = {**right, name: given[name]}
     record, noise, initial = (wrong.pop(one) for one in ("record", "process_noise", "initial"))
     with pytest.raises(InputError, match=name):

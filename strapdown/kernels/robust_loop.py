@@ -10,7 +10,16 @@ from __future__ import annotations
 import math
 
 from strapdown.kernels.algebra import combine, dot, full, minus_outer, scale, symmetric_minus_outer
-from strapdown.kernels.filter_loop import DIRECTION, HEADING, MOST_TURN, store_segment, store_state, vector_at
+from strapdown.kernels.filter_loop import (
+    CHECKED,
+    DIRECTION,
+    HEADING,
+    MOST_TURN,
+    least_share,
+    store_segment,
+    store_state,
+    vector_at,
+)
 from strapdown.kernels.filter_step import predict
 from strapdown.kernels.robust_gate import (
     CHALLENGED,
@@ -35,6 +44,9 @@ from strapdown.kernels.series import LARGEST_ANGLE
 
 BORROWS_ARRAYS = True
 """See :mod:`strapdown.kernels.machine`."""
+
+LENIENT = 1e3
+"""A challenger, which starts with next to nothing known, may lose so many times more of its covariance's digits than the filter."""
 
 
 def state_at(rows, i):
@@ -150,6 +162,9 @@ def run_robust(
     recovery_out,
     lock_out_out,
     segment_out,
+    sharp,
+    least,
+    work,
 ):
     """Run the filter over a record as :func:`strapdown.kernels.filter_loop.run_filter` does, with options.
 
@@ -163,12 +178,19 @@ def run_robust(
     ``weight_out`` (events,) gets the weight of each measurement, 0 where it was refused; ``recovery_out`` (rows, 4) time, sensor, time of
     the first refusal and refusals in a row of each recovery; ``lock_out_out`` (rows, 4) times of the first and of the last refusal, sensor
     and number of refusals of each lock-out, 0 of one that a recovery tells of.
-    Returns the numbers of segments, of recoveries and of lock-outs.
+    Returns the numbers of segments, of recoveries and of lock-outs; of segments −1 where a covariance would lose its digits, by what
+    ``sharp`` and ``least`` mean to ``run_filter`` (of a challenger's ``LENIENT`` times more). The run ends there, and all of it is to be
+    taken in the square root (:func:`strapdown.mekf.factored.run_robust_sharp`). ``work`` (7, 6) is scratch.
     """
     n = len(increments)
+    least_noise = 1.0 / sharp
+    check = CHECKED
     running = 1
     if memory[CHALLENGED] > 0.0:
         running = 2
+    for i in range(running):
+        if not least_share(states[i], work) >= (least if i == 0 else least / LENIENT):
+            return -1, 0, 0
     recoveries = 0
     lock_outs = 0
     events = len(event_time)
@@ -219,7 +241,7 @@ def run_robust(
             i = 0
             while i < running:
                 q, b, A, B, C = state_at(states, i)
-                outcome, w, q, b, A, B, C, e1, s1, e2, s2, e3, s3 = take_in(
+                outcome, w, q, b, A, B, C, e1, s1, e2, s2, e3, s3, noise_share = take_in(
                     q,
                     b,
                     A,
@@ -237,6 +259,8 @@ def run_robust(
                     robust_passes,
                 )
                 if outcome == ACCEPTED:
+                    if not noise_share >= (least_noise if i == 0 else least_noise / LENIENT):
+                        return -1, recoveries, lock_outs
                     store_state(states[i], q, b, A, B, C)
                 if i == 0:
                     weight_out[e] = w
@@ -286,6 +310,11 @@ def run_robust(
                 row += 1
             countdown -= 1
             k += 1
+            if k >= check or k == n:
+                check = k + CHECKED
+                for i in range(running):
+                    if not least_share(states[i], work) >= (least if i == 0 else least / LENIENT):
+                        return -1, recoveries, lock_outs
             if k < n:
                 end = edges[k + 1]
                 whole = end - now

@@ -238,9 +238,11 @@ def take_in(q, b, A, B, C, kind, z, frame, noise, passes, threshold, robust, par
     shows none, always is, and its innovation is NaN.
 
     Returns ``ACCEPTED``, ``REFUSED`` or ``PASSED_OVER``, the weight, q, b, A, B, C and e₁, s₁, e₂, s₂, e₃, s₃: independent innovations and
-    their variances under the nominal noise, of the last linearisation; where these do not come to rest, of the first.
+    their variances under the nominal noise, of the last linearisation; where these do not come to rest, of the first. At last the least
+    share that the noise has in such a variance where the measurement was taken in: its inverse is what the covariance loses by it.
     """
     now_q, now_A, now_B = q, A, B
+    share = 1.0
     tolerance = SETTLED if A[0] + A[3] + A[5] >= UNKNOWN else RELINEARIZED
     prior = (0.0, 0.0, 0.0)  # where the prior's mean lies, seen from the attitude of the linearisation
     R = rotation_matrix(q)
@@ -298,6 +300,7 @@ def take_in(q, b, A, B, C, kind, z, frame, noise, passes, threshold, robust, par
     elif accepted:
         outcome = ACCEPTED
         w = 1.0
+        share = min(F[3] * variance[0], F[4] * variance[1], F[5] * variance[2])
         if robust > 0:
             w = robust_weight(robust, parameter, numerator, robust_passes, now_A, h1, h2, h3, y, variance)
             variance = scale(1.0 / w, variance)
@@ -311,4 +314,4 @@ def take_in(q, b, A, B, C, kind, z, frame, noise, passes, threshold, robust, par
             q, A, B = corrected(now_q, now_A, now_B, correction)
         else:
             q, A, B = reset(now_q, now_A, now_B, correction)
-    return outcome, w, q, b, A, B, C, e1, 1.0 / F[3], e2, 1.0 / F[4], e3, 1.0 / F[5]
+    return outcome, w, q, b, A, B, C, e1, 1.0 / F[3], e2, 1.0 / F[4], e3, 1.0 / F[5], share

@@ -8,7 +8,7 @@ from strapdown.checks import Array, InputError, count
 from strapdown.kernels import filter_loop, robust_loop
 from strapdown.kernels.machine import compiled
 from strapdown.kernels.robust_gate import CHALLENGED
-from strapdown.mekf.factored import Outputs, run_sharp
+from strapdown.mekf.factored import Outputs, run_robust_sharp, run_sharp
 from strapdown.mekf.judging import event_rows, gate_events, kernel_options, remembered
 from strapdown.mekf.memory import side_by_side
 from strapdown.mekf.scheduling import Schedule, innovations_by_sensor, places, schedule, skipped_too
@@ -32,6 +32,10 @@ DIGITS = (1e9, 1e-10)
 which the covariance keeps too few digits."""
 LEAST_DIGITS = (1e14, 1e-15)
 """The same where it keeps none."""
+LOST = (
+    "the covariance loses its digits, by a measurement far sharper than what was known or an outage far too long; "
+    "smooth by augmented.smooth, which carries its square root"
+)
 
 
 class LostDigitsError(InputError):
@@ -103,7 +107,8 @@ def run_on(
     """Run the filter and return the end state too, from which the next part of a record goes on, bit for bit.
 
     It holds what a gate remembers as well: its counts, its challenger, and how wide a restart is. A lock-out that goes on is told by both
-    parts, by the second as a whole. A monitor starts anew in each part.
+    parts, by the second as a whole. A monitor starts anew in each part. Where a measurement is so sharp, or an outage so long, that the
+    covariance is carried in its square root, parts agree to its rounding.
     """
     check_arguments(record=record)
     events = schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True)
@@ -182,15 +187,15 @@ def _run(
     (stored,) = side_by_side(((segments + 1 if segments else 0, 32), float))
     weight, recoveries, lock_outs = None, np.empty((0, 4)), np.empty((0, 4))
     memory = None
+    outputs = Outputs(attitude=attitude, bias=bias, variance=variance, blocks=blocks, innovation=innovation)
     if plain:
-        outputs = Outputs(attitude=attitude, bias=bias, variance=variance, blocks=blocks, innovation=innovation)
         number = _run_plain(record, events, process_noise, state, every, outputs, stored[:segments])
     else:
         weight = np.empty(number_of_events)
         recoveries, lock_outs = event_rows(number_of_events, len(events.sensors))
         counts, standing = remembered(gate, initial.gate, events.sensors)
-        if initial.gate is not None:
-            states[1] = initial.gate.challenger
+        states[1] = 0.0 if initial.gate is None else initial.gate.challenger
+        first = states.copy()
         number, recovered, locked_out = compiled(robust_loop.run_robust)(
             record.time,
             np.ascontiguousarray(record.increments),
@@ -218,7 +223,30 @@ def _run(
             recoveries,
             lock_outs,
             stored[:segments],
+            *(DIGITS if segments == 0 else LEAST_DIGITS),
+            np.empty((7, 6)),
         )
+        if number < 0:
+            if segments:
+                raise LostDigitsError(LOST)
+            counts, standing = remembered(gate, initial.gate, events.sensors)
+            states[:] = first
+            recovered, locked_out = run_robust_sharp(
+                record,
+                events,
+                process_noise,
+                gate,
+                robust,
+                restart_bias_variance(gate, initial),
+                standing,
+                counts,
+                states,
+                every,
+                outputs,
+                weight,
+                recoveries,
+                lock_outs,
+            )
         recoveries, lock_outs = recoveries[:recovered], lock_outs[:locked_out]
         if gate is not None:
             memory = GateMemory(
@@ -295,10 +323,7 @@ def _run_plain(
         if good_row < 0:
             return int(number)
         if len(segments):
-            raise LostDigitsError(
-                f"after {record.time[good_row * every]:g} s the covariance loses its digits, by a measurement far sharper than what was "
-                "known or an outage far too long; smooth by augmented.smooth, which carries its square root"
-            )
+            raise LostDigitsError(f"after {record.time[good_row * every]:g} s {LOST}")
         place = row + good_row, event + good_event
         row, event = run_sharp(record, events, process_noise, state, every, outputs, *place)
         edge = row * every
