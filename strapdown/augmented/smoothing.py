@@ -56,6 +56,7 @@ def recentred(
             bias=whole.bias[0],
             values=np.concatenate([np.empty(0), *(block.values[0] for block in whole.blocks.values())]),
             covariance=carry @ state.covariance @ carry.T,
+            unit_sigma=state.unit_sigma,
         )
     return state
 
@@ -125,6 +126,8 @@ def smoothed(
     recovered = joining.recoveries(forward.events)
     if recovered:
         assert gate is not None
+        # Parts of the record keep the units of the whole.
+        state = replace(state, unit_sigma=filtering.unit_sigmas(record, model, state.unit_sigma))
         breaks, again = _begun_again(
             record,
             process_noise,
@@ -290,6 +293,7 @@ def _begun_again(
             values=values,
             covariance=whole,
             gate=replace(memory, counts=counts),
+            unit_sigma=state.unit_sigma if state is not None else {},
         )
         stretch = joining.part(record, one.since, one.end)
         _, _, times, rows = _filtered(stretch, process_noise, fresh, blocks, replace(gate, recovery=None), robust)

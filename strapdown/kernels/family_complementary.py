@@ -28,6 +28,19 @@ from strapdown.kernels.rotation import quaternion_multiply, rotation_matrix
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
+MOST_VARIANCE = 100.0
+"""Of the attitude, all axes, rad²."""
+
+
+def held(A):
+    """Return the diagonal of A, each number at most a third of ``MOST_VARIANCE``.
+
+    Gains that do not fit what is seen make the linear theory of the errors unstable. An attitude's error is bounded: beyond some radians
+    it only says that nothing is known, and what it says of correlations is rounding.
+    """
+    most = MOST_VARIANCE / 3.0
+    return (min(A[0], most), 0.0, 0.0, min(A[3], most), 0.0, min(A[5], most))
+
 
 def combine_symmetric(s, A, t, B):
     """Return s A + t B of two symmetric matrices."""
@@ -132,6 +145,8 @@ def run_complementary(
                 G = right_jacobian_of_any_turn(correction)
                 q = turned_by_any(q, correction)
                 A, B = congruent(G, A), multiply(G, B)
+                if not A[0] + A[3] + A[5] < MOST_VARIANCE:
+                    A, B, C = held(A), NOTHING, (C[0], 0.0, 0.0, C[3], 0.0, C[5])
             innovation_out[e, 0], innovation_out[e, 1] = e1, s1
             innovation_out[e, 2], innovation_out[e, 3] = e2, s2
             innovation_out[e, 4], innovation_out[e, 5] = e3, s3
