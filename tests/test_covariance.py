@@ -681,7 +681,7 @@ def test_the_command_refuses_in_one_line(run):
     for arguments, word in (
         (("spin", "--time-offset", "star"), "NAME=VALUE"),
         (("spin", "--mounting", "sta=3"), "did you mean 'star'"),
-        (("spin", "--scale-factor", "-1"), "scale_factor"),
+        (("spin", "--scale-factor", "-1"), "--scale-factor is -1 ppm"),
         (("nowhere",), "nowhere"),
     ):
         status, said, refused = run("covariance", *arguments, "--epochs", 4)

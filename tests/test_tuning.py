@@ -118,14 +118,14 @@ def test_a_lane_that_no_sub_steps_mend_cuts_no_step_of_the_others():
     room = np.empty(WIDTH)
     theta, b = (0.1, 0.2, 0.0), np.zeros((3, WIDTH))
     assert tuning_loop.calm_turn(tuple(b), 0.5) == pytest.approx((0.5 * LARGEST_ANGLE) ** 2)
-    assert tuning_loop.longest_step(theta, 0.5, tuple(b), room) == 0.5
+    assert tuning_loop.longest_step_of_lanes(theta, 0.5, tuple(b), room) == 0.5
     b[1, 3], b[1, 5], b[1, 6] = 4.0, 1e9, np.nan
     assert tuning_loop.calm_turn(tuple(b), 0.5) < 0.0
     # The bias turns the fourth lane by 2 rad; two others are lost.
-    found = tuning_loop.longest_step(theta, 0.5, tuple(b), room)
+    found = tuning_loop.longest_step_of_lanes(theta, 0.5, tuple(b), room)
     assert found == pytest.approx(0.5 * LARGEST_ANGLE / np.hypot(0.1, 0.2 - 2.0))
     b[1, 3] = 0.0
-    assert tuning_loop.longest_step(theta, 0.5, tuple(b), room) == 0.5
+    assert tuning_loop.longest_step_of_lanes(theta, 0.5, tuple(b), room) == 0.5
 
 
 def test_several_records_add_up_on_any_number_of_threads():

@@ -427,7 +427,10 @@ REFUSED = {
         (np.outer([1.0, 0.1], [1.0, 2.0, 3.0]), np.outer([1.0, 0.1], [1.0, 2.0, 3.0]), 1e-18),
         "not determined",
     ),
-    "closer than the noise": (([EYE[0], EYE[0] + 1e-4 * EYE[1]],) * 2 + (1e-3,), "1σ of 1[0-9.]* rad.*0.005729"),
+    "closer than the noise": (
+        ([EYE[0], EYE[0] + 1e-4 * EYE[1]],) * 2 + (1e-3,),
+        "1σ of its worst known turn is 1[0-9.]* rad.*0.005729",
+    ),
     "nearly opposite": (([EYE[0], 1e-4 * EYE[1] - EYE[0]],) * 2 + (1e-3,), "179.99"),
     "parallel in the body only": (
         ([EYE[0], EYE[0] + 1e-5 * EYE[1]], [EYE[0], EYE[0] + 5e-3 * EYE[1]], 1e-3),
