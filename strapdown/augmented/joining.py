@@ -16,10 +16,10 @@ import numpy as np
 
 from strapdown.checks import Array
 from strapdown.kernels.machine import compiled
-from strapdown.kernels.robust_gate import CHALLENGED, FIRST_BIAS, LEVEL, PASSES, SINCE, WIDE_PASSES, WIDENING
+from strapdown.kernels.robust_gate import CHALLENGED, FIRST_BIAS, PASSES, SINCE, WIDE_PASSES, restart_attitude
 from strapdown.kernels.smoother_loop import locate_edges
 from strapdown.records import Event, ImuRecord
-from strapdown.robustness import UNIFORM_SIGMA, Gate, GateMemory
+from strapdown.robustness import Gate, GateMemory
 
 STAMP_TOLERANCE = 1e-6
 """Of the mean gyro interval: an edge that lies beyond t + lag by no more is taken for one at t + lag."""
@@ -82,8 +82,7 @@ def break_of(event: Event, memory: GateMemory | None, begin: float) -> Break:
 
 def begun(gate: Gate, memory: GateMemory) -> tuple[Array, Array, Array]:
     """Return bias (3,) and variances of attitude and bias (6,) that a challenger started from, as wide as it has become; and its counts."""
-    widened = WIDENING ** memory.counts[LEVEL] * gate.restart_attitude_sigma
-    sigma = max(gate.restart_attitude_sigma, min(widened, UNIFORM_SIGMA))
+    sigma = restart_attitude(gate.restart_attitude_sigma, memory.counts)
     bias, variance = memory.counts[FIRST_BIAS : FIRST_BIAS + 3], memory.counts[FIRST_BIAS + 3 : FIRST_BIAS + 6]
     counts = memory.counts.copy()
     counts[CHALLENGED], counts[PASSES] = 0.0, WIDE_PASSES
