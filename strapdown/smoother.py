@@ -24,7 +24,7 @@ import numpy as np
 
 from strapdown import mekf
 from strapdown.augmented import joining, smoothing
-from strapdown.checks import Array, InputError, non_negative
+from strapdown.checks import Array, non_negative
 from strapdown.kernels import smoother_lag, smoother_loop
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.machine import compiled
@@ -38,9 +38,6 @@ from strapdown.robustness import Gate, Robust
 
 MOST_GROUPS = 3600
 """Groups of segments of which the fixed-lag smoother keeps the gains, 5.7 kB each; where a lag takes more, it computes them anew."""
-
-MOST_CUT = 64
-"""Times the segments that a record takes by its increments: a filter that takes more is lost."""
 
 
 def run(
@@ -227,29 +224,22 @@ def _filtered(
 ) -> tuple[Estimate, Array, Array]:
     """Run the filter and keep its segments; return its estimate, the times of its events, and the segments with the end state."""
     events = mekf.schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True)
-    usual = most = _most_segments(record, int(events.bounds[-1]))
-    while True:
-        # One more than it should take, which tells whether it took more.
-        forward, _, segments = mekf.run_events(
+    forward, segments = joining.kept_whole(
+        lambda segments: mekf.run_events(
             record,
             events,
             process_noise,
             initial,
             every=len(record.time),
             full_covariance=False,
-            segments=most + 1,
+            segments=segments,
             gate=gate,
             robust=robust,
-        )
-        if len(segments) - 1 <= most:
-            return forward, events.time, segments
-        # Steps are cut by the turn without the bias, which is known only when they are taken.
-        most *= 4
-        if most > MOST_CUT * usual:
-            raise InputError(
-                "the filter lost its way: by the bias that it found the body turns many times round in each gyro interval; "
-                "look at the record and the start with mekf.run first"
-            )
+        ),
+        _most_segments(record, int(events.bounds[-1])),
+        "mekf.run",
+    )
+    return forward, events.time, segments
 
 
 def _starts(record: ImuRecord, event_time: Array, segments: Array) -> np.ndarray:

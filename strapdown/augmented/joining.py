@@ -9,20 +9,44 @@ challenger's start at that time the filter is run again up to the recovery, so t
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
-from strapdown.checks import Array
+from strapdown.checks import Array, InputError
 from strapdown.kernels.machine import compiled
 from strapdown.kernels.robust_gate import CHALLENGED, FIRST_BIAS, PASSES, SINCE, WIDE_PASSES, restart_attitude
 from strapdown.kernels.smoother_loop import locate_edges
-from strapdown.records import Event, ImuRecord
+from strapdown.records import Estimate, Event, ImuRecord
 from strapdown.robustness import Gate, GateMemory
 
 STAMP_TOLERANCE = 1e-6
 """Of the mean gyro interval: an edge that lies beyond t + lag by no more is taken for one at t + lag."""
+
+
+MOST_CUT = 64
+"""Times the segments that a record takes by its increments: a filter that takes more is lost."""
+
+_Estimate = TypeVar("_Estimate", bound=Estimate)
+
+
+def kept_whole(run: Callable[[int], tuple[_Estimate, object, Array]], usual: int, by: str) -> tuple[_Estimate, Array]:
+    """Return the estimate and all segments of a filter, of which ``run`` keeps as many as it is told; ``usual`` are enough as a rule."""
+    most = usual
+    while True:
+        # One more than it should take, which tells whether it took more.
+        forward, _, segments = run(most + 1)
+        if len(segments) - 1 <= most:
+            return forward, segments
+        # Steps are cut by the turn without the bias, which is known only when they are taken.
+        most *= 4
+        if most > MOST_CUT * usual:
+            raise InputError(
+                "the filter lost its way: by the bias that it found the body turns many times round in each gyro interval; "
+                f"look at the record and the start with {by} first"
+            )
 
 
 def last_seen(time: Array, lag: float) -> np.ndarray:

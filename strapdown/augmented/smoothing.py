@@ -13,7 +13,7 @@ from strapdown.augmented import model as modelling
 from strapdown.augmented.blocks import Block, LinearBlock
 from strapdown.augmented.filtering import AugmentedEstimate
 from strapdown.augmented.model import AugmentedGateMemory, AugmentedState, Model
-from strapdown.checks import Array, InputError, count, non_negative
+from strapdown.checks import Array, count, non_negative
 from strapdown.kernels import augmented_smoother
 from strapdown.kernels.augmented_chain import LINKS
 from strapdown.kernels.machine import compiled
@@ -22,8 +22,6 @@ from strapdown.mekf.states import check_arguments
 from strapdown.records import BlockEstimate, Event, ImuRecord
 from strapdown.robustness import Gate, Robust
 
-MOST_CUT = 64
-"""Times the segments that a record takes by its increments: a filter that takes more is lost."""
 PASSES = 16
 """Backward passes of a fixed-lag smoother that go together and share what depends on the filter alone."""
 
@@ -223,10 +221,8 @@ def _filtered(
 ) -> tuple[AugmentedEstimate, Model, Array, Array]:
     """Run the filter and keep its segments; return its estimate, the model, the times of events, and the segments with the end state."""
     events, model = filtering.prepared(record, blocks)
-    usual = most = filtering.most_segments(record, model, len(events.time))
-    while True:
-        # One more than it should take, which tells whether it took more.
-        forward, _, segments = filtering.run_events(
+    forward, segments = joining.kept_whole(
+        lambda segments: filtering.run_events(
             record,
             events,
             model,
@@ -234,19 +230,14 @@ def _filtered(
             state,
             blocks,
             every=len(record.time),
-            segments=most + 1,
+            segments=segments,
             gate=gate,
             robust=robust,
-        )
-        if len(segments) - 1 <= most:
-            return forward, model, events.time, segments
-        # Steps are cut by the turn without the bias, which is known only when they are taken.
-        most *= 4
-        if most > MOST_CUT * usual:
-            raise InputError(
-                "the filter lost its way: by the bias that it found the body turns many times round in each gyro interval; "
-                "look at the record and the start with augmented.run first"
-            )
+        ),
+        filtering.most_segments(record, model, len(events.time)),
+        "augmented.run",
+    )
+    return forward, model, events.time, segments
 
 
 def _begun_again(
