@@ -181,9 +181,16 @@ def quiet_span(recording: Recording) -> slice:
         If the recording is shorter than that.
     """
     length = int(np.searchsorted(recording.time, recording.time[0] + QUIET_SPAN))
-    if length >= len(recording.time) or length < 2:
+    lasts = recording.time[-1] - recording.time[0]
+    if length >= len(recording.time):
         raise InputError(
-            f"{recording.source} lasts {recording.time[-1] - recording.time[0]:.3g} s; the start needs at least {QUIET_SPAN:g} s of samples"
+            f"{recording.source} lasts {lasts:.3g} s; the start needs at least {QUIET_SPAN:g} s of samples (or tell the unit "
+            "of its time)"
+        )
+    if length < 2:
+        raise InputError(
+            f"{recording.source}: its first {QUIET_SPAN:g} s hold one sample, {lasts / (len(recording.time) - 1):.3g} s is the mean "
+            "interval; if its stamps are in ms or us, say so (--time-unit, or units={'time': 'ms'})"
         )
     blocks = len(recording.time) // length
     rate = recording.rate[: blocks * length].reshape(blocks, length, 3)
@@ -334,7 +341,12 @@ def _mean(samples: Array, source: str, sensor: str) -> Array:
         raise InputError(
             f"{source}: the {sensor} has no valid sample in the first quiet second; cut the recording to where it has"
         )
-    return np.asarray(known.mean(axis=0))
+    mean = np.asarray(known.mean(axis=0))
+    if _norm(mean) == 0.0:
+        raise InputError(
+            f"{source}: the {sensor} is zero over the first quiet second and shows no direction; cut the recording to where it has one"
+        )
+    return mean
 
 
 def _norm(vector: Array) -> float:

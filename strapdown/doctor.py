@@ -20,7 +20,7 @@ import functools
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -28,7 +28,7 @@ import numpy as np
 from strapdown import coning, quaternion
 from strapdown.checks import Array, InputError
 from strapdown.recordings import Recording, increments
-from strapdown.units import STANDARD_GRAVITY
+from strapdown.units import DEGREE, STANDARD_GRAVITY
 
 AXES: tuple[Array, ...] = tuple(
     np.array([[s if column == where else 0.0 for column in range(3)] for where, s in zip(order, signs, strict=True)])
@@ -78,6 +78,8 @@ POOR = 0.4
 """Misfit of the gyro above which even the best explanation is none."""
 LEAST_TURN = 0.5
 """Turn, rad, summed over the windows used, below which nothing can be told."""
+FASTEST = 4000.0 * DEGREE
+"""Rate, rad/s, that hardly any gyro's range reaches."""
 
 
 def axes_words(matrix: Array) -> str:
@@ -117,6 +119,8 @@ class Examination:
     """The best explanations, by score."""
     notes: tuple[str, ...] = field(default=())
     """What this recording cannot show."""
+    doubts: tuple[str, ...] = field(default=())
+    """What of its values can hardly be, whatever the convention."""
 
     @property
     def words(self) -> str:
@@ -134,6 +138,7 @@ class Examination:
                 for one in self.candidates
             ],
             "notes": list(self.notes),
+            "doubts": list(self.doubts),
         }
 
 
@@ -151,9 +156,10 @@ def examine(recording: Recording) -> Examination:
         raise InputError(
             f"{recording.source} holds a gyro alone; a reference attitude, an accelerometer or a magnetometer is needed beside it"
         )
-    unit_changes, notes = _force_unit(recording)
+    unit_changes, doubts = _force_unit(recording)
+    doubts += _too_fast(recording)
     found = list(_with_reference(recording) if recording.true_attitude is not None else _without_reference(recording))
-    notes += _unseen(recording)
+    notes = _unseen(recording)
     if not found:
         return Examination(
             source=recording.source,
@@ -161,6 +167,7 @@ def examine(recording: Recording) -> Examination:
             reason="the recording hardly turns, or has too few samples",
             candidates=(),
             notes=tuple(notes),
+            doubts=tuple(doubts),
         )
     told = [
         Candidate(
@@ -171,7 +178,7 @@ def examine(recording: Recording) -> Examination:
         for one in found
     ]
     told.sort(key=lambda one: -one.score)
-    return _concluded(recording.source, told, unit_changes, notes)
+    return replace(_concluded(recording.source, told, unit_changes, notes), doubts=tuple(doubts))
 
 
 def _concluded(source: str, told: list[Candidate], sure: tuple[str, ...], notes: list[str]) -> Examination:
@@ -210,6 +217,17 @@ def _force_unit(recording: Recording) -> tuple[tuple[str, ...], list[str]]:
     if distances[words] > 0.5:
         return (), [f"the specific force of {strength:.3g} m/s² in the median fits neither m/s² nor g"]
     return ((words,) if words else ()), []
+
+
+def _too_fast(recording: Recording) -> list[str]:
+    speed = np.linalg.norm(recording.rate, axis=1)
+    k = int(np.argmax(speed))
+    if speed[k] <= FASTEST:
+        return []
+    return [
+        f"the gyro tells of {speed[k] / DEGREE:.3g} °/s at {recording.time[k]:.6g} s and in {np.mean(speed > FASTEST):.2%} of its samples "
+        f"of more than {FASTEST / DEGREE:g} °/s, which hardly any gyro measures"
+    ]
 
 
 def _unseen(recording: Recording) -> list[str]:

@@ -6,6 +6,8 @@ Equation numbers below are those of *Quaternion differentiation*, the document t
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,6 +21,8 @@ if TYPE_CHECKING:
 IDENTITY: Array = np.array([1.0, 0.0, 0.0, 0.0])
 IDENTITY.flags.writeable = False
 
+LONGEST = 1e150
+"""A rotation vector with a larger component, rad, has no norm in double precision."""
 ROTATION_MATRIX_TOLERANCE = 1e-6
 """Largest entry of ``R Rᵀ − I`` that is taken for rounding."""
 
@@ -28,15 +32,26 @@ def multiply(p: ArrayLike, q: ArrayLike) -> Array:
     a, b = array("p", p, (..., 4)), array("q", q, (..., 4))
     pw, px, py, pz = np.moveaxis(a, -1, 0)
     qw, qx, qy, qz = np.moveaxis(b, -1, 0)
-    return np.stack(
-        [
-            pw * qw - px * qx - py * qy - pz * qz,
-            pw * qx + px * qw + py * qz - pz * qy,
-            pw * qy - px * qz + py * qw + pz * qx,
-            pw * qz + px * qy - py * qx + pz * qw,
-        ],
-        axis=-1,
-    )
+    with _together(p=a, q=b):
+        return np.stack(
+            [
+                pw * qw - px * qx - py * qy - pz * qz,
+                pw * qx + px * qw + py * qz - pz * qy,
+                pw * qy - px * qz + py * qw + pz * qx,
+                pw * qz + px * qy - py * qx + pz * qw,
+            ],
+            axis=-1,
+        )
+
+
+@contextlib.contextmanager
+def _together(**given: Array) -> Iterator[None]:
+    """Say in words where leading axes do not go together."""
+    try:
+        yield
+    except ValueError:
+        shapes = " and ".join(f"{name} has shape {value.shape}" for name, value in given.items())
+        raise InputError(f"{shapes}; their leading axes must be equal, or 1") from None
 
 
 def conjugate(q: ArrayLike) -> Array:
@@ -47,23 +62,26 @@ def conjugate(q: ArrayLike) -> Array:
 def inverse(q: ArrayLike) -> Array:
     """Return q⁻¹, the conjugate divided by the *squared* norm, so that q ⊗ q⁻¹ = 1 (8) for any norm but zero."""
     value = array("q", q, (..., 4))
-    squared = np.sum(value * value, axis=-1, keepdims=True)
-    _refuse_zero(squared[..., 0] == 0.0)
-    return np.asarray(conjugate(value) / squared)
+    scale = _scale(value)
+    value = value / scale
+    return np.asarray(conjugate(value) / np.sum(value * value, axis=-1, keepdims=True) / scale)
 
 
 def normalize(q: ArrayLike) -> Array:
     """Return q / |q|; a zero quaternion is refused."""
     value = array("q", q, (..., 4))
-    norm = np.linalg.norm(value, axis=-1, keepdims=True)
-    _refuse_zero(norm[..., 0] == 0.0)
-    return np.asarray(value / norm)
+    value = value / _scale(value)
+    return np.asarray(value / np.linalg.norm(value, axis=-1, keepdims=True))
 
 
-def _refuse_zero(zero: np.ndarray) -> None:
+def _scale(value: Array) -> Array:
+    """Return powers of two (..., 1) near the largest entry, over which squares neither overflow nor vanish and no bit is lost."""
+    largest = np.max(np.abs(value), axis=-1, keepdims=True)
+    zero = largest[..., 0] == 0.0
     if np.any(zero):
         place = [int(i) for i in np.argwhere(zero)[0]] if zero.ndim else []
         raise InputError(f"q{place or ''} is the zero quaternion, which has no direction; remove it")
+    return np.asarray(np.ldexp(1.0, np.frexp(largest)[1] - 1))
 
 
 def rotate(q: ArrayLike, v: ArrayLike) -> Array:
@@ -75,13 +93,17 @@ def rotate(q: ArrayLike, v: ArrayLike) -> Array:
     vector = array("v", v, (..., 3))
     w, u = value[..., :1], value[..., 1:]
     # v + 2 w (u × v) + 2 u × (u × v): no matrix, no loss for small angles
-    t = 2.0 * np.cross(u, vector)
-    return np.asarray(vector + w * t + np.cross(u, t))
+    with _together(q=value, v=vector):
+        t = 2.0 * np.cross(u, vector)
+        return np.asarray(vector + w * t + np.cross(u, t))
 
 
 def exp(rotation_vector: ArrayLike) -> Array:
     """Return the unit quaternion (cos θ/2, φ/θ sin θ/2) of a rotation vector φ (..., 3), rad, θ = |φ|. Any θ."""
     phi = array("rotation_vector", rotation_vector, (..., 3))
+    longest = float(np.max(np.abs(phi), initial=0.0))
+    if longest > LONGEST:
+        raise InputError(f"rotation_vector holds {longest:g} rad, and nothing turns so far; check the unit")
     half = 0.5 * np.linalg.norm(phi, axis=-1, keepdims=True)
     # sin x / x needs no series: the quotient is accurate for every x but zero.
     safe = np.where(half > 0.0, half, 1.0)

@@ -29,6 +29,9 @@ FORCE_UNITS = {"m/s2": 1.0, "g": STANDARD_GRAVITY}
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Units of a time column, and their factor to s."""
 
+SHORT_STAMPS = 0.1
+"""Share of the rows with the stamp of the row before, above which stamps lack digits rather than that a row is wrong."""
+
 _COLUMNS = {"gyro": ("gx", "gy", "gz"), "accelerometer": ("ax", "ay", "az"), "magnetometer": ("mx", "my", "mz")}
 
 
@@ -102,7 +105,9 @@ class Recording:
         return " ".join(words)
 
 
-def read(path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> Recording:
+def read(
+    path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None, gyro_alone: bool = False
+) -> Recording:
     """Read a recording, HDF5 in the layout of BROAD or CSV, told apart by the suffix.
 
     Parameters
@@ -111,6 +116,8 @@ def read(path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None
         ``.hdf5``, ``.h5`` or ``.csv``.
     units : mapping, optional
         For CSV: units of ``time``, ``gyro`` and ``accelerometer`` where the header does not declare them.
+    gyro_alone : bool
+        For CSV: leave the columns of the other sensors alone, whose units need not be known then.
 
     Raises
     ------
@@ -126,7 +133,7 @@ def read(path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None
             )
         return read_broad(file)
     if file.suffix.lower() == ".csv":
-        return read_csv(file, units=units)
+        return read_csv(file, units=units, gyro_alone=gyro_alone)
     raise InputError(f"{file} has the suffix {file.suffix!r}; recordings are .hdf5 or .h5 (BROAD layout) or .csv")
 
 
@@ -166,7 +173,9 @@ def read_broad(path: str | os.PathLike[str]) -> Recording:
         raise InputError(f"{name} cannot be read as HDF5 ({error}); the file is truncated or of another kind") from None
 
 
-def read_csv(path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None) -> Recording:
+def read_csv(
+    path: str | os.PathLike[str], *, units: Mapping[str, str] | None = None, gyro_alone: bool = False
+) -> Recording:
     """Read columns ``time, gx, gy, gz[, ax, ay, az[, mx, my, mz]]`` in any order; other columns are left alone.
 
     A header may declare units in brackets, ``gx [deg/s]``; ``units`` ("time", "gyro", "accelerometer") declares them for files that do
@@ -190,7 +199,10 @@ def read_csv(path: str | os.PathLike[str], *, units: Mapping[str, str] | None = 
         if header is None:
             raise InputError(f"{file.name} is empty; wanted a header like time,gx,gy,gz,ax,ay,az")
         names, declared = _header(file.name, header)
-        present = {group: any(name in names for name in members) for group, members in _COLUMNS.items()}
+        present = {
+            group: any(name in names for name in members) and (group == "gyro" or not gyro_alone)
+            for group, members in _COLUMNS.items()
+        }
         needed = [
             "time",
             *_COLUMNS["gyro"],
@@ -202,6 +214,7 @@ def read_csv(path: str | os.PathLike[str], *, units: Mapping[str, str] | None = 
             words = f"; its columns are parted by {other!r}: write commas, and points in the decimals" if other else ""
             raise InputError(f"{file.name}: the header lacks {', '.join(missing)} (it has: {', '.join(names)}){words}")
         values = _numbers(file.name, rows, len(names), header)
+    _need_digits(file.name, values, names.index("time"))
     factors = _factors(file.name, {group for group, there in present.items() if there}, declared, units or {})
 
     def columns(group: str) -> Array:
@@ -240,6 +253,18 @@ def _with_gyro(*, source: str, time: Array, rate: Array, **columns: Any) -> Reco
     gone = stamps[~known]
     kept = {n: c if c is None or n == "repeated" else c[known] for n, c in columns.items()}
     return Recording(source=source, time=stamps[known], rate=rate[known], missing_gyro=gone, **kept)
+
+
+def _need_digits(source: str, values: Array, time: int) -> None:
+    """Refuse stamps, one in ten of which is that of the row before though the rows differ: they were written with too few digits."""
+    before, after = values[:-1], values[1:]
+    differ = np.any((before != after) & ~(np.isnan(before) & np.isnan(after)), axis=1)
+    repeats = np.flatnonzero((before[:, time] == after[:, time]) & differ)
+    if len(repeats) > max(2, SHORT_STAMPS * len(after)):
+        raise InputError(
+            f"{source}: {len(repeats)} of {len(values)} rows have the stamp of the row before and other samples, the first of them "
+            f"{after[repeats[0], time]:.17g} in data row {repeats[0] + 2}; write the stamps with more digits"
+        )
 
 
 def _seconds(stamps: Array, factor: float) -> Array:
@@ -391,7 +416,7 @@ def read_gyro(
             )
         record = recordfiles.read_record(file)
         return GyroSamples(values=record.increments, sample_interval=_even(file.name, record.time), kind="increments")
-    recording = read(file, units=given)
+    recording = read(file, units=given, gyro_alone=True)
     return GyroSamples(values=recording.rate, sample_interval=_even(file.name, recording.time), kind="rate")
 
 

@@ -460,6 +460,20 @@ def from_table(table: Mapping[str, Any], place: str = "filter") -> FilterSetup:
     )
 
 
+def need_angles(setup: FilterSetup, kinds: Mapping[str, str], place: str) -> None:
+    """Refuse a believed σ beyond half a turn of a sensor that measures angles, for it was meant in another unit than rad.
+
+    ``kinds`` are those of the sensors by their names; whole vectors ("vector") may have any σ. ``place`` is what is named in the error.
+    """
+    for name, told in setup.sigma.items():
+        largest = float(np.max(told))
+        if kinds.get(name, "vector") != "vector" and largest > np.pi:
+            raise InputError(
+                f"{place}: sigma: {name} is {largest:g} rad, beyond half a turn; sigma is in rad, and {largest:g} arcsec would be "
+                f"{largest * units.ARCSECOND:.4g}"
+            )
+
+
 def _part(table: Mapping[str, Any], name: str, place: str) -> Mapping[str, Any]:
     if not isinstance(table[name], Mapping):
         raise InputError(f"{place}: {name} is {table[name]!r}; it must be a table, [{place}.{name}]")

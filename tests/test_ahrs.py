@@ -209,6 +209,18 @@ def test_too_short_a_recording_is_refused():
         ahrs.estimate(short)
 
 
+def test_stamps_in_milliseconds_and_dead_sensors_are_told():
+    whole = recording(5.0)
+    slow = dataclasses.replace(whole, time=1e3 * whole.time)
+    with pytest.raises(InputError, match=r"hold one sample, 5 s is the mean interval; .* in ms or us, say so"):
+        ahrs.estimate(slow)
+    for name, sensor in (("specific_force", "accelerometer"), ("magnetic_field", "magnetometer")):
+        still = getattr(whole, name).copy()
+        still[: round(3 * RATE)] = 0.0
+        with pytest.raises(InputError, match=f"known truth: the {sensor} is zero over the first quiet second"):
+            ahrs.estimate(dataclasses.replace(whole, **{name: still}))
+
+
 @pytest.mark.parametrize("sensor", ["specific_force", "magnetic_field"])
 @pytest.mark.filterwarnings("error")
 def test_a_sensor_without_a_sample_at_the_start_is_refused(sensor):

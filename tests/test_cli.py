@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import strapdown
-from strapdown import cli, recordings
+from strapdown import cli, recordings, scenarios
 from strapdown.coning_study import ALGORITHMS
 from strapdown.records import read_estimate
 
@@ -459,3 +459,12 @@ def test_units_in_the_help_are_those_that_are_known(run):
     text = one_line(said)
     for unit in (*recordings.RATE_UNITS, *recordings.FORCE_UNITS, *recordings.TIME_UNITS):
         assert unit in text
+
+
+def test_a_statement_is_one_line_wherever_it_goes(run, monkeypatch):
+    """What a narrow terminal would break is whole in a file, so that a command told in it can be copied and searched for."""
+    monkeypatch.setenv("COLUMNS", "40")
+    status, said, _ = run("scenarios")
+    assert status == 0
+    for name in scenarios.SCENARIOS:
+        assert f"{name}: {scenarios.load_scenario(name).description}" in said.splitlines()

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 
 import h5py
 import numpy as np
@@ -10,10 +11,12 @@ import pytest
 from sims import hand_held
 from strapdown import ahrs, coning, consistency, mekf, motion, quaternion, records, scenarios, setup
 from strapdown.checks import InputError
+from strapdown.cli.filters import filter_for
 from strapdown.gyro import GyroSpec
 from strapdown.mekf import ProcessNoise
-from strapdown.recordfiles import write_record
+from strapdown.recordfiles import read_record_file, write_record
 from strapdown.records import ImuRecord, Truth, read_estimate, read_states
+from strapdown.report import estimates
 from strapdown.scenarios import Scenario, simulate
 from strapdown.vectors import Accelerometer, AttitudeSensor, Faults, Magnetometer, VectorSensor
 
@@ -232,6 +235,24 @@ def test_what_a_record_shows_of_each_state(run, spinning, tmp_path, states):
     assert set(told["directions"][0]["one_sigma_left"]) == set(names)
 
 
+def test_what_the_filter_has_no_state_for_is_told(spinning, record, tmp_path):
+    scenario = scenarios.load_scenario("spin")
+    toml = setup.to_toml(setup.matched(scenario))
+    (tmp_path / "filter.toml").write_text(toml)
+    held = read_record_file(spinning)
+    for file in (None, tmp_path / "filter.toml"):
+        (told,) = filter_for(spinning, held, None, file, None)[1]
+        assert "no state for: the gyro's scale factor of 100 ppm; --states of `strapdown estimate`" in told
+    assert filter_for(record, read_record_file(record), None, None, None)[1] == []
+    attributes = {"scenario": scenarios.scenario_to_toml(scenario), "filter": toml}
+    page = estimates.without_a_state(spinning, attributes)
+    assert "no state for the gyro&#x27;s scale factor of 100 ppm; `strapdown estimate --states`" in page
+    states = setup.to_toml(setup.matched(scenario, states=True))
+    assert estimates.without_a_state(spinning, {**attributes, "filter": states}) == ""
+    assert estimates.without_a_state(spinning, {"filter": toml}) == ""
+    assert estimates.without_a_state(spinning, {**attributes, "filter": "{}"}) == ""
+
+
 def test_states_of_a_record_that_tells_no_scenario_and_a_gate(run, record, tmp_path):
     status, said, error = run("estimate", record, "--out", tmp_path / "out", "--states", "--gate", 0.999)
     assert (status, error) == (0, "")
@@ -342,6 +363,19 @@ def test_a_record_is_smoothed(run, record, tmp_path):
         assert file.attrs["smoothed"]
 
 
+def test_hard_iron_and_a_start_are_told_in_units_that_people_know(run, tmp_path):
+    iron = dataclasses.replace(HAND[1], kind="direction", hard_iron=np.array([2e-6, 0.0, 0.0]))
+    scenario = made((HAND[0], iron))
+    path = tmp_path / "iron.h5"
+    toml = scenarios.scenario_to_toml(scenario)
+    write_record(path, simulate(scenario, 4), gyro_spec=SPEC, scenario=toml, seed=4, run=0)
+    _, said, _ = run("estimate", path, "--out", tmp_path / "out", "--states")
+    assert re.search(r"north bias x % of the vector \S+ \S+ 4\.472 ", said)
+    assert re.search(r"first measurements, σ \S+ to \S+° by direction\.", said)
+    states = json.loads((tmp_path / "out" / "states.json").read_text())
+    assert states["north bias"]["first_sigma"][0] == pytest.approx(0.04472, rel=1e-3)
+
+
 def test_smoothing_with_states_tells_of_them(run, tmp_path):
     path = tmp_path / "record.h5"
     scenario = dataclasses.replace(scenarios.load_scenario("spin"), duration=20.0)
@@ -387,6 +421,7 @@ def test_a_recording_is_taken_for_that_of_a_hand(run, recording, tmp_path):
     assert "Motion: of a hand, 0.5 m/s that last 0.3 s; σ is set for robustness and no verdict." in said
     assert "°/s, from that second." in said
     assert "later than what they show" not in said
+    assert "warning" not in said
     with h5py.File(tmp_path / "out" / "estimate.h5") as file:
         told = dict(file.attrs)
     states = json.loads((tmp_path / "out" / "states.json").read_text())
@@ -412,6 +447,16 @@ def test_any_motion_smoothing_and_latency(run, recording, tmp_path):
         assert ("Motion: any" in said) == (name == "any")
     assert errors["smoothed"] < errors["hand"] < errors["any"]
     assert abs(errors["later"] - errors["hand"]) < 0.3
+
+
+def test_a_recording_that_is_not_what_it_says_is_doubted(run, recording, tmp_path):
+    recording.write_text(recording.read_text().replace("[rad/s]", "[deg/s]").replace("[m/s2]", "[g]"))
+    status, said, error = run("estimate", recording, "--out", tmp_path / "out")
+    assert (status, error) == (0, "")
+    words = "warning: as it seems, gyro rates are 57.3 times too small (rad/s taken for deg/s); specific force is 9.81"
+    assert words in said
+    assert words in run("tune", recording, "--free", "")[1]  # which then ends for want of a parameter
+    assert f"See `strapdown doctor {recording}`." in said
 
 
 def test_a_hand_that_never_rests_is_told(run, recording, tmp_path):

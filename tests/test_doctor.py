@@ -186,7 +186,16 @@ def test_a_gyro_alone_is_refused():
 def test_a_force_in_no_unit_is_noted():
     recording = simulated(9)
     found = doctor.examine(replace(recording, specific_force=recording.specific_force / 3.0))
-    assert any("fits neither" in note for note in found.notes)
+    assert any("fits neither" in doubt for doubt in found.doubts)
+
+
+def test_rates_beyond_any_gyro_are_doubted():
+    recording = simulated(9)
+    assert doctor.examine(recording).doubts == ()
+    rate = recording.rate.copy()
+    rate[700, 1] = -1e6
+    (doubt,) = doctor.examine(replace(recording, rate=rate)).doubts
+    assert "5.73e+07 °/s at 7 s and in 0.02% of its samples" in doubt
 
 
 def test_all_axes_are_signed_permutations_the_identity_first():

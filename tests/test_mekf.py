@@ -527,3 +527,13 @@ def test_triad_is_right_handed():
         assert np.allclose(frame @ frame.T, np.eye(3), atol=1e-15)
         assert np.linalg.det(frame) == pytest.approx(1.0)
         assert np.allclose(frame[2], r / np.linalg.norm(r))
+
+
+def test_noise_and_starts_that_are_none_are_refused():
+    with pytest.raises(InputError, match=r"angle_random_walk is 1e\+200 rad/√s, and no gyro has so much"):
+        ProcessNoise(angle_random_walk=1e200, rate_random_walk=0.0)
+    with pytest.raises(InputError, match="rate_random_walk is"):
+        ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e10)
+    for ragged in ({"attitude": [1.0, 0.0, [0.0], 0.0]}, {"attitude": quaternion.IDENTITY, "bias": [0.0, [0.0], 0.0]}):
+        with pytest.raises(InputError, match="is not an array of numbers"):
+            initial_state(**ragged, attitude_sigma=0.1, bias_sigma=0.1)

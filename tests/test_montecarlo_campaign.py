@@ -419,6 +419,8 @@ def test_a_replay_is_the_run_of_the_campaign_to_the_bit(command, machine):
     )
     assert np.array_equal(error, held.statistics.example_error[5])
     assert np.array_equal(np.sqrt(estimate.variance[rows]), held.statistics.example_sigma[5])
+    # Causes can be sought in it: it tells its filter as any estimate does.
+    assert setups.from_toml(records.read_attributes("short-montecarlo-run-5-estimate.h5")["filter"]) == held.plan.setup
 
 
 @pytest.mark.parametrize(

@@ -287,3 +287,30 @@ def test_inputs_are_not_changed():
 def test_single_precision_quaternions_are_normalised():
     q = random_quaternions((20,)).astype(np.float32)
     close(np.linalg.det(quaternion.to_matrix(q)), np.ones(20))
+
+
+def test_shapes_that_do_not_go_together_are_named():
+    three, two = np.tile(quaternion.IDENTITY, (3, 1)), np.tile(quaternion.IDENTITY, (2, 1))
+    with pytest.raises(InputError, match=r"p has shape \(3, 4\) and q has shape \(2, 4\); their leading axes"):
+        quaternion.multiply(three, two)
+    with pytest.raises(InputError, match=r"q has shape \(3, 4\) and v has shape \(2, 3\)"):
+        quaternion.rotate(three, np.zeros((2, 3)))
+    with pytest.raises(InputError, match="their leading axes"):
+        quaternion.angle_between(three, two)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("size", [1e-300, 1e-200, 1.0, 1e200, 1e300])
+def test_quaternions_of_any_size_are_normalised_and_inverted(size):
+    q = size * np.array([[0.5, -0.5, 0.5, 0.5], [0.0, 3.0, 0.0, -4.0]])
+    unit = np.array([[0.5, -0.5, 0.5, 0.5], [0.0, 0.6, 0.0, -0.8]])
+    np.testing.assert_allclose(quaternion.normalize(q), unit, rtol=1e-15)
+    expected = quaternion.conjugate(unit) / (size * np.array([[1.0], [5.0]]))
+    np.testing.assert_allclose(quaternion.inverse(q), expected, rtol=1e-15)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_turn_without_a_norm_is_refused():
+    with pytest.raises(InputError, match=r"rotation_vector holds 1e\+300 rad"):
+        quaternion.exp([1e300, 0.0, 0.0])
+    assert np.isfinite(quaternion.exp([-1e149, 1e149, 0.0])).all()

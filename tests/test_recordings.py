@@ -107,6 +107,19 @@ def test_undeclared_units_are_refused_not_guessed(csv):
     refused(csv("time,gx [rad/s],gy,gz,ax,ay,az"), "unit of its accelerometer", "ax [m/s2]", "m/s2 or g")
 
 
+def test_units_of_other_sensors_need_not_be_told_where_the_gyro_alone_is_used(csv, tmp_path):
+    path = csv("time,gx [rad/s],gy,gz,ax,ay,az")
+    refused(path, "unit of its accelerometer")
+    alone = read(path, gyro_alone=True)
+    assert alone.specific_force is None
+    assert read(csv(), gyro_alone=True).specific_force is None
+    assert np.array_equal(recordings.read_gyro(path).values, alone.rate)
+    status = CliRunner().invoke(
+        app, ["integrate", str(path), "--algorithm", "one-sample", "--out", str(tmp_path / "a.h5")]
+    )
+    assert status.exit_code == 0, status.output
+
+
 def test_unknown_units_are_refused(csv):
     refused(csv(HEADER.replace("rad/s", "deg/sec")), "unit of the gyro 'deg/sec'", "did you mean 'deg/s'")
     refused(csv(HEADER.replace("m/s2", "ft/s2")), "unit of the accelerometer 'ft/s2' is not known")
@@ -251,6 +264,16 @@ def test_stamps_out_of_order_are_refused(csv):
     other = ",".join([ROWS[1].partition(",")[0], *["0.5"] * 6])
     refused(csv(rows=[ROWS[0], ROWS[1], other]), "time[2] repeats 0.01 s", "drop repeated")
     refused(csv(rows=[ROWS[0], ",0,0,0,0,0,9"]), "time[1] is nan")
+
+
+def test_stamps_with_too_few_digits_are_told_as_they_stand(csv):
+    rows = [f"{1.7e9 + 0.01 * k:.10g},{0.1 * k},0,0,0,0,9" for k in range(300)]
+    refused(
+        csv(rows=rows),
+        "296 of 300 rows have the stamp",
+        "1700000000 in data row 2",
+        "write the stamps with more digits",
+    )
 
 
 def test_empty_files_are_refused(csv, tmp_path):

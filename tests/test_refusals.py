@@ -399,6 +399,19 @@ def test_covariance_refuses_errors_that_nothing_has(there, tmp_path, options, wo
 
 
 @pytest.mark.parametrize(
+    ("command", "source"),
+    [("estimate", "record.h5"), ("tune", "record.h5"), ("montecarlo", "short.toml"), ("covariance", "short.toml")],
+)
+def test_sigma_of_an_angle_in_another_unit_is_told(folder, short, tmp_path, command, source):
+    believed = dataclasses.replace(setup.matched(short), sigma={"star 1": 20.0})
+    (tmp_path / "filter.toml").write_text(setup.to_toml(believed))
+    out = tmp_path / {"tune": "new.toml", "montecarlo": "new.h5"}.get(command, "new")
+    said = refused([command, folder / source, "--filter", tmp_path / "filter.toml", "--out", out])
+    assert "sigma: star 1 is 20 rad, beyond half a turn; sigma is in rad, and 20 arcsec would be 9.696e-05" in said
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
     ("rate", "factor", "words"),
     [
         (1e300, 1.0, "1e+300 Hz is no rate of a gyro"),

@@ -91,6 +91,16 @@ def test_no_sigma_may_be_zero(change):
         dataclasses.replace(SETUP, **change)
 
 
+def test_a_sigma_beyond_half_a_turn_is_refused_of_angles_alone():
+    wide = dataclasses.replace(SETUP, sigma={"star": (1e-4, 3.2, 1e-4)})
+    for kind in ("direction", "heading", "attitude"):
+        with pytest.raises(InputError, match=r"mine: sigma: star is 3\.2 rad, beyond half a turn"):
+            setup.need_angles(wide, {"star": kind}, "mine")
+    for kinds in ({"star": "vector"}, {}):
+        setup.need_angles(wide, kinds, "mine")
+    setup.need_angles(dataclasses.replace(SETUP, sigma={"star": 3.1}), {"star": "direction"}, "mine")
+
+
 def test_a_file_without_the_table_says_what_writes_one(tmp_path):
     path = tmp_path / "gyro.toml"
     path.write_text("[gyro]\n")

@@ -213,6 +213,24 @@ def test_steps_that_contradict_the_clock_are_refused(arguments, message):
     assert f.time == 1.0
 
 
+def test_turns_that_nothing_makes_are_refused():
+    f = StepFilter(NOISE, start())
+    for turn in (1e200, -2e6):
+        with pytest.raises(InputError, match="nothing turns so far between two samples"):
+            f.predict([0.0, turn, 0.0], 0.01)
+    assert f.time == 0.0
+
+
+def test_filterpys_own_updates_are_refused():
+    f = StepFilter(NOISE, start())
+    H = np.eye(6)[:2]
+    for update in (f.update, f.predict_update):
+        with pytest.raises(InputError, match=r"use .*update_direction"):
+            update(np.array([0.5, 0.0]), lambda x: H, lambda x: H @ x)
+    assert np.array_equal(f.x, np.zeros(6))
+    assert f.update_direction(X, X, 0.1)
+
+
 # ----------------------------------------------------------------------------------------- what the record refuses or skips
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from strapdown.cli.filters import filter_of_scenario
 from strapdown.cli.terminal import (
     app,
     console,
@@ -42,7 +43,8 @@ def montecarlo(
     filter_file: Annotated[
         Path | None,
         typer.Option(
-            "--filter", help="TOML with a table named filter; without it the filter that matches the scenario."
+            "--filter",
+            help="TOML with a table named filter, as `strapdown tune` writes it; without it the filter that matches the scenario.",
         ),
     ] = None,
     dispersions: Annotated[
@@ -120,10 +122,7 @@ def montecarlo(
     choice = engine.choose(plan, machine)
     count("runs", runs)
     engine.in_threads(threads)  # so that a wrong number is found now
-    console.print(
-        f"{plan.scenario.name or source.stem}: {counted(runs, 'run')}, seed {plan.seed}, machine: {choice}.",
-        soft_wrap=True,
-    )
+    console.print(f"{plan.scenario.name or source.stem}: {counted(runs, 'run')}, seed {plan.seed}, machine: {choice}.")
     with contextlib.ExitStack() as stack:
         hands = None
         if workers is not None or cluster is not None:
@@ -148,7 +147,7 @@ def montecarlo(
                 progress=advance,
             )
         except KeyboardInterrupt:
-            console.print(f"What is finished is in {target}; go on with --resume.", soft_wrap=True)
+            console.print(f"What is finished is in {target}; go on with --resume.")
             raise
     _tell(result)
     report = target.with_suffix(".json")
@@ -181,7 +180,9 @@ def _plan(
     if states and filter_file is not None:
         raise InputError("--filter tells the filter's states itself, in [filter.states]; leave --states out")
     loaded = scenario_named(scenario)
-    filter_setup = setup.matched(loaded, states=states) if filter_file is None else setup.read_setup(filter_file)
+    filter_setup = (
+        setup.matched(loaded, states=states) if filter_file is None else filter_of_scenario(filter_file, loaded)
+    )
     return engine.Plan(
         scenario=loaded,
         setup=filter_setup,
@@ -264,7 +265,7 @@ def _tell(campaign: Campaign) -> None:
         f"{part['run']} ({'failed' if part['largest_nees'] is None else format(part['largest_nees'], '.1f')})"
         for part in report["worst_runs"][:5]
     )
-    console.print(f"Worst runs, by their largest NEES of six states: {worst}. See one with --replay.", soft_wrap=True)
+    console.print(f"Worst runs, by their largest NEES of six states: {worst}. See one with --replay.")
     if report["failed_runs"]:
         console.print(f"In {counted(report['failed_runs'], 'run')} the filter failed: no finite error or covariance.")
     rate = ""
@@ -273,15 +274,15 @@ def _tell(campaign: Campaign) -> None:
     said = "may be believed" if report["consistent"] else "may NOT be believed"
     console.print(
         f"{counted(report['runs'], 'run')}, {campaign.seconds:.3g} s{rate}. The filter {said}: bounds that a right filter keeps all "
-        f"together with {100.0 * report['probability']:g} %, NEES at {report['epochs_judged']} epochs.",
-        soft_wrap=True,
+        f"together with {100.0 * report['probability']:g} %, NEES at {report['epochs_judged']} epochs."
     )
     plan = campaign.plan
     missing = not_covered(
         plan.scenario.gyro, plan.scenario.sensors, plan.setup.states, gravity_f=plan.scenario.gravity_f
     )
     if missing and not report["consistent"]:
-        console.print(f"The filter has no state for {', '.join(missing)}.", soft_wrap=True)
+        remedy = "; --states gives it states for most" if plan.setup.states is None else ""
+        console.print(f"The filter has no state for {', '.join(missing)}{remedy}.")
 
 
 def _worst_axis(values: list[float | None]) -> int:
@@ -299,7 +300,7 @@ def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
 
     import numpy as np
 
-    from strapdown import consistency, recordfiles
+    from strapdown import consistency, recordfiles, setup
     from strapdown import montecarlo as engine
     from strapdown.records import Truth, write_estimate
     from strapdown.scenarios import scenario_to_toml
@@ -311,14 +312,13 @@ def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
     # Of a filter that joins samples to steps some machines tell the record at the samples, some at the steps.
     edges = slice(None, None, (len(again.record.time) - 1) // (len(again.estimate.time) - 1))
     told = Truth(attitude=truth.attitude[edges], bias=truth.bias[edges])
-    table_of = plan.to_table()
     attributes: dict[str, Any] = {
         "scenario": scenario_to_toml(plan.scenario),
         "seed": plan.seed,
         "run": run,
         "machine": choice.machine,
-        "filter": json.dumps(table_of["filter"]),
-        "dispersions": json.dumps(table_of["dispersions"]),
+        "filter": setup.to_toml(plan.setup),
+        "dispersions": json.dumps(plan.to_table()["dispersions"]),
     }
     paths = _replayed(target, run)
     recordfiles.write_record(
@@ -338,7 +338,6 @@ def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
     step = int(np.argmax(nees))
     console.print(
         f"Run {run} of seed {plan.seed}, machine: {choice}. Its largest NEES is {nees[step]:.4g}, of six states, "
-        f"at {estimate.time[step]:g} s.",
-        soft_wrap=True,
+        f"at {estimate.time[step]:g} s."
     )
     written(*paths)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from strapdown.cli.filters import filter_for
-from strapdown.cli.terminal import app, console, need_own, show, table, writable, written
+from strapdown.cli.terminal import app, console, doubt, need_own, show, table, writable, written
 
 if TYPE_CHECKING:
     from strapdown.mekf import State
@@ -26,6 +26,9 @@ RECORDING_ONLY = ("motion", "latency")
 """Options that go with a recording."""
 RECORD_ONLY = ("filter", "gate", "robust", "states", "state", "attitude", "from_truth", "every", "observability")
 """Options that go with a record of `strapdown simulate`."""
+
+UNEVEN = 2.0
+"""Largest σ of an attitude over the least, above which both are told."""
 
 
 @app.command()
@@ -60,7 +63,8 @@ def estimate(
     filter_file: Annotated[
         Path | None,
         typer.Option(
-            "--filter", help="Record: TOML with a table named filter; without it the filter that matches the record."
+            "--filter",
+            help="Record: TOML with a table named filter, as `strapdown tune` writes it; without it the filter that matches the record.",
         ),
     ] = None,
     gate: Annotated[
@@ -232,7 +236,7 @@ def _estimate_record(
         f"{', '.join(f'{len(s.time)} of {s.sensor}' for s in held.record.vectors) or 'no measurements'}. {words}"
     )
     for remark in remarks:
-        console.print(remark, soft_wrap=True)
+        console.print(remark)
     _tell(result)
     paths = [out / "estimate.h5"]
     attributes: dict[str, Any] = {"source": str(path), "filter": setup.to_toml(chosen), "start": words}
@@ -245,11 +249,11 @@ def _estimate_record(
     figures = {"estimate.png": plots.estimate_overview(result, title=path.name)}
     if isinstance(result, AugmentedEstimate) and result.blocks:
         paths.append(out / "states.json")
-        write_json(paths[-1], {"source": str(path), **_tell_states(result)})
+        write_json(paths[-1], {"source": str(path), **_tell_states(result, used)})
         figures["states.png"] = plots.states_over_time(result, title=path.name)
     if observability:
         shown = setup.observability(used, chosen, initial)
-        console.print(str(shown), soft_wrap=True, markup=False, highlight=False)
+        console.print(str(shown))
         paths.append(out / "observability.json")
         write_json(paths[-1], {"source": str(path), **shown.summary()})
     if truth is not None:
@@ -292,15 +296,18 @@ def _states(result: Any) -> dict[str, Any]:
     }
 
 
-def _tell_states(result: Any) -> dict[str, Any]:
+def _tell_states(result: Any, record: ImuRecord) -> dict[str, Any]:
     """Show the optional states at the end, and return them for JSON."""
     from strapdown.units import DEGREE_PER_HOUR, STANDARD_GRAVITY
 
+    of_directions = tuple(f"{one.sensor} " for one in record.vectors if one.kind in ("direction", "heading"))
     rows = table("Optional states at the end", "state", "", "unit", "value", "σ", "σ at the start", left=3)
     for name, block in result.blocks.items():
         for k, (component, unit) in enumerate(zip(block.components, block.units, strict=True)):
             kind = " ".join(name.split()[:2])
             word, size = _STATE_UNITS.get(kind, {}).get(unit, (unit, 1.0))
+            if unit == "1" and name.startswith(of_directions):
+                word, size = "% of the vector", 0.01
             if size == 0.0:
                 size = DEGREE_PER_HOUR / (STANDARD_GRAVITY if kind == "gyro force" else 1.0)
             values = (block.values[-1, k], block.sigma[-1, k], block.sigma[0, k])
@@ -318,7 +325,6 @@ def _initial(
     from strapdown import mekf, quaternion, setup
     from strapdown.checks import InputError
     from strapdown.randomness import generator
-    from strapdown.units import DEGREE
     from strapdown.wahba import InconsistentError
 
     if attitude is not None and from_truth:
@@ -352,8 +358,7 @@ def _initial(
     except InputError as error:
         problem = str(error).removesuffix("; give the initial attitude")
         return _banked(record, chosen, problem, "One direction at a time does not give the attitude at once")
-    sigma = float(np.sqrt(np.trace(state.covariance[:3, :3]) / 3.0)) / DEGREE
-    return state, f"Started from the first measurements, σ {sigma:.3g}° an axis.", 0
+    return state, f"Started from the first measurements, σ {_sigma_words(state)}.", 0
 
 
 def _banked(record: ImuRecord, chosen: FilterSetup, problem: str, why: str) -> tuple[State, str, int]:
@@ -362,7 +367,6 @@ def _banked(record: ImuRecord, chosen: FilterSetup, problem: str, why: str) -> t
 
     from strapdown import bank, mekf
     from strapdown.checks import InputError
-    from strapdown.units import DEGREE
 
     try:
         found = bank.run(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
@@ -386,12 +390,23 @@ def _banked(record: ImuRecord, chosen: FilterSetup, problem: str, why: str) -> t
         bias=found.estimate.bias[row],
         covariance=found.estimate.covariance[row],
     )
-    sigma = float(np.sqrt(np.trace(state.covariance[:3, :3]) / 3.0)) / DEGREE
     words = (
         f"{why}: {len(found.angles)} hypotheses about it became one at "
-        f"{found.became_one:.6g} s, σ {sigma:.3g}° an axis; the estimate begins there."
+        f"{found.became_one:.6g} s, σ {_sigma_words(state)}; the estimate begins there."
     )
     return state, words, edge
+
+
+def _sigma_words(state: State) -> str:
+    """Return how well an attitude is known: one σ, or where it differs by direction, as of tilt and heading, from which to which."""
+    import numpy as np
+
+    from strapdown.units import DEGREE
+
+    least, _, most = np.sqrt(np.maximum(np.linalg.eigvalsh(state.covariance[:3, :3]), 0.0)) / DEGREE
+    if most < UNEVEN * least:
+        return f"{np.sqrt(np.trace(state.covariance[:3, :3]) / 3.0) / DEGREE:.3g}° an axis"
+    return f"{least:.3g} to {most:.3g}° by direction"
 
 
 def _clear(out: Path) -> None:
@@ -501,7 +516,8 @@ def _estimate_recording(
         f"from {used.time[0]:.2f} s."
     )
     console.print(f"Fixed frame: {frame}.")
-    console.print(_beliefs(moved_by, parameters, result), soft_wrap=True)
+    doubt(source, recording)
+    console.print(_beliefs(moved_by, parameters, result))
     if late:
         console.print(f"Samples are taken for {1e3 * late:g} ms later than what they show.")
     if result.magnetometer_latency:
@@ -512,7 +528,7 @@ def _estimate_recording(
     for begin, length in recordings.gaps(used.time):
         console.print(f"Gap of {length:.3g} s after {begin:.3f} s: the turn across it is a guess, whatever σ says.")
     if used.left_out_words:
-        console.print(used.left_out_words, soft_wrap=True)
+        console.print(used.left_out_words)
     for sensor, number in found.skipped.items():
         if number:
             console.print(f"{number} samples of the {sensor} are missing and were skipped.")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from strapdown.recordfiles import RecordFile
+    from strapdown.scenarios import Scenario
     from strapdown.setup import FilterSetup
 
 
@@ -29,35 +30,75 @@ def filter_for(
             raise InputError(
                 "--filter tells the filter's states itself, in [filter.states]; leave --states and --state out"
             )
-        return setup.read_setup(filter_file), []
+        chosen = setup.read_setup(filter_file)
+        need_angles(filter_file, chosen, held)
+        return chosen, no_state_words(without_a_state(path, held, chosen), chosen)
     spec = held.gyro if gyro is None else read_spec(gyro)
     if spec is None:
         raise InputError(f"{path} does not tell the gyro's specification; give --gyro or --filter, a TOML file")
     if states is None:
-        return setup.matched_to_record(spec, held.record), []
+        chosen = setup.matched_to_record(spec, held.record)
+        return chosen, no_state_words(without_a_state(path, held, chosen), chosen)
+    remarks = []
     if not held.scenario:
         chosen = setup.matched_to_record(spec, held.record, states=True)
-        remarks = [
+        remarks.append(
             f"{path.name} does not tell its scenario, so the errors of its sensors are not known: no state for them."
-        ]
-        missing = setup.not_covered(spec, (), chosen.states)
+        )
     else:
         scenario = scenario_from_toml(held.scenario, f"{path}: scenario")
         chosen = setup.matched_to_record(
             spec, held.record, states=True, sensors=scenario.sensors, gravity_f=scenario.gravity_f
         )
-        remarks = []
     optional = chosen.states or States()
     if states:
         optional = optional.chosen(states)
-    chosen = dataclasses.replace(chosen, states=optional)
-    if held.scenario:
-        missing = setup.not_covered(spec, scenario.sensors, optional, gravity_f=scenario.gravity_f)
-    if not optional.names:
-        remarks.append("No error is specified that would call for an optional state; the filter has none.")
-        chosen = dataclasses.replace(chosen, states=None)
-    else:
+    chosen = dataclasses.replace(chosen, states=optional if optional.names else None)
+    if optional.names:
         remarks.append(f"Optional states: {', '.join(optional.names)}.")
-    if missing:
-        remarks.append(f"Still without a state: {', '.join(missing)}.")
-    return chosen, remarks
+    else:
+        remarks.append("No error is specified that would call for an optional state; the filter has none.")
+    missing = without_a_state(path, held, chosen)
+    return chosen, [*remarks, *([f"Still without a state: {', '.join(missing)}."] if missing else [])]
+
+
+def need_angles(filter_file: Path, chosen: FilterSetup, held: RecordFile) -> None:
+    """Refuse σ of the record's sensors that cannot be in rad, but where the record's own are as wide."""
+    import numpy as np
+
+    from strapdown import setup
+
+    fine = {one.sensor: one.kind for one in held.record.vectors if len(one.time) and np.max(one.sigma) <= np.pi}
+    setup.need_angles(chosen, fine, f"{filter_file}: filter")
+
+
+def filter_of_scenario(filter_file: Path, scenario: Scenario) -> FilterSetup:
+    """Read a filter for the sensors of a scenario."""
+    from strapdown import setup
+
+    chosen = setup.read_setup(filter_file)
+    kinds = {sensor.name: str(getattr(sensor, "kind", "attitude")) for sensor in scenario.sensors}
+    setup.need_angles(chosen, kinds, f"{filter_file}: filter")
+    return chosen
+
+
+def without_a_state(path: Path, held: RecordFile, chosen: FilterSetup) -> tuple[str, ...]:
+    """Return, in words, what a record specifies and a filter has no state for; nothing where the record specifies nothing."""
+    from strapdown import setup
+    from strapdown.scenarios import scenario_from_toml
+
+    if held.scenario:
+        scenario = scenario_from_toml(held.scenario, f"{path}: scenario")
+        spec = held.gyro or scenario.gyro
+        return setup.not_covered(spec, scenario.sensors, chosen.states, gravity_f=scenario.gravity_f)
+    return () if held.gyro is None else setup.not_covered(held.gyro, (), chosen.states)
+
+
+def no_state_words(missing: tuple[str, ...], chosen: FilterSetup) -> list[str]:
+    """Return what to say of errors that a filter has no state for, and what helps; nothing where there are none."""
+    if not missing:
+        return []
+    remedy = "; --states of `strapdown estimate` and `strapdown tune` gives it states for most"
+    return [
+        f"The record specifies errors that this filter has no state for: {', '.join(missing)}{remedy if chosen.states is None else ''}."
+    ]

@@ -76,7 +76,7 @@ def integrate(
             time, increments = record.time, record.increments
             truth = None if record.truth is None else record.truth.attitude
         else:
-            source = recordings.read(recording, units=units)
+            source = recordings.read(recording, units=units, gyro_alone=True)
             gaps, words = recordings.gaps(source.time), source.left_out_words
             time, increments, truth = source.time, recordings.increments(source), source.true_attitude
         advance(1)
@@ -96,9 +96,7 @@ def integrate(
     console.print(f"{recording.name}: {len(increments)} samples over {time[-1] - time[0]:.6g} s with {chosen.name}.")
     left = len(increments) % chosen.samples
     if left:
-        console.print(
-            f"The last {left} of them do not fill a step of {chosen.samples} and are left out.", soft_wrap=True
-        )
+        console.print(f"The last {left} of them do not fill a step of {chosen.samples} and are left out.")
     if truth is not None:
         reference = truth[:: chosen.samples][: len(attitude)]
         known = np.isfinite(reference).all(axis=1)
@@ -108,7 +106,7 @@ def integrate(
     for begin, length in gaps:
         console.print(f"Gap of {length:.3g} s after {begin:.3f} s: the turn across it is a guess.")
     if words:
-        console.print(words, soft_wrap=True)
+        console.print(words)
     written(out)
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.text import Text
 
+from strapdown.cli.filters import no_state_words, without_a_state
 from strapdown.cli.terminal import app, console, counted, show, table, writable, written
 
 if TYPE_CHECKING:
@@ -120,12 +121,11 @@ def _show(judgement: Judgement) -> None:
         show(rows)
         console.print(
             "Each p-value is that of its statistic alone; pass and FAIL take all together "
-            f"(a right filter fails with at most {100.0 * (1.0 - judgement.probability):.2g} %). NIS and NEES are per degree of freedom.",
-            soft_wrap=True,
+            f"(a right filter fails with at most {100.0 * (1.0 - judgement.probability):.2g} %). NIS and NEES are per degree of freedom."
         )
     for limit in judgement.limits:
-        console.print(f"Note: {limit}.", soft_wrap=True)
-    console.print(judgement.words, soft_wrap=True)
+        console.print(f"Note: {limit}.")
+    console.print(judgement.words)
 
 
 def _diagnosed(result: Path, record: Path, filter_file: Path | None, probability: float) -> dict[str, Any]:
@@ -133,7 +133,6 @@ def _diagnosed(result: Path, record: Path, filter_file: Path | None, probability
 
     from strapdown import diagnosis, mekf, recordfiles, records, setup
     from strapdown.checks import InputError
-    from strapdown.scenarios import scenario_from_toml
 
     if filter_file is not None:
         chosen = setup.read_setup(filter_file)
@@ -150,21 +149,12 @@ def _diagnosed(result: Path, record: Path, filter_file: Path | None, probability
     if unknown or not np.isin(estimate.time, source.time).all():
         what = f"has no sensor {unknown[0]!r}" if unknown else "has other stamps"
         raise InputError(f"{record} {what}; {result} was made from another record")
-    missing: tuple[str, ...] = ()
-    if held.scenario:
-        scenario = scenario_from_toml(held.scenario, f"{record}: scenario")
-        missing = setup.not_covered(
-            held.gyro or scenario.gyro, scenario.sensors, chosen.states, gravity_f=scenario.gravity_f
-        )
-    if missing:
-        console.print(
-            f"The record specifies errors that this filter has no state for: {', '.join(missing)}; `strapdown estimate --states` gives it "
-            "states for most.",
-            soft_wrap=True,
-        )
+    missing = without_a_state(record, held, chosen)
+    for sentence in no_state_words(missing, chosen):
+        console.print(sentence)
     if chosen.states is not None and chosen.states.names:
         reason = f"the search knows a filter of attitude and bias alone, and this one has the states {', '.join(chosen.states.names)}"
-        console.print(f"Causes were not looked for: {reason}.", soft_wrap=True)
+        console.print(f"Causes were not looked for: {reason}.")
         return {"not_looked_for": reason, "without_a_state": list(missing)}
     P = np.diag(estimate.variance[0]) if estimate.covariance is None else estimate.covariance[0]
     initial = mekf.State(attitude=estimate.attitude[0], bias=estimate.bias[0], covariance=P)
@@ -174,7 +164,7 @@ def _diagnosed(result: Path, record: Path, filter_file: Path | None, probability
         mark = Text("likely", style="red") if cause in found.causes else Text("no")
         rows.add_row(cause.name, cause.of, f"{cause.gain:.4g}", f"{cause.log_p:.4g}", mark)
     show(rows)
-    console.print(found.words, soft_wrap=True)
+    console.print(found.words)
     return {**found.summary(), "without_a_state": list(missing)}
 
 
@@ -211,9 +201,9 @@ def doctor(
         for one in found.candidates[:8]:
             rows.add_row(one.words, f"{one.score:.1f}", *(f"{one.misfit[name]:.3f}" for name in names))
         show(rows)
-    for note in found.notes:
-        console.print(f"Note: {note}.", soft_wrap=True)
-    console.print(f"{found.source}: {found.words}", soft_wrap=True)
+    for note in (*found.doubts, *found.notes):
+        console.print(f"Note: {note}.")
+    console.print(f"{found.source}: {found.words}")
     if json is not None:
         write_json(json, found.summary())
         written(json)

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from strapdown.cli.filters import filter_of_scenario
 from strapdown.cli.terminal import app, console, progress_bar, scenario_named, show, table, writable, written
 
 
@@ -44,7 +45,8 @@ def covariance(
     filter_file: Annotated[
         Path | None,
         typer.Option(
-            "--filter", help="TOML with a table named filter; without it the filter that matches the scenario."
+            "--filter",
+            help="TOML with a table named filter, as `strapdown tune` writes it; without it the filter that matches the scenario.",
         ),
     ] = None,
     scale_factor: Annotated[float, typer.Option(help="Consider gyro scale factors of this 1σ, ppm.")] = 0.0,
@@ -98,7 +100,7 @@ def covariance(
         mounting={name: value * ARCSECOND for name, value in _named("mounting", mounting).items()},
         time_offset={name: 1e-3 * value for name, value in _named("time_offset", time_offset).items()},
     )
-    belief = setup.read_setup(filter_file) if filter_file else setup.matched(chosen)
+    belief = filter_of_scenario(filter_file, chosen) if filter_file else setup.matched(chosen)
     with progress_bar("covariance analysis", 1) as advance:
         found = analysis.analyse(
             chosen,
@@ -130,10 +132,7 @@ def _tell(name: str, found: Any, integration: str, *, matched: bool) -> None:
     unit, size = angle_unit(np.concatenate([rms[:3], sigma[:3]]))
     rate_name, rate = rate_unit(np.concatenate([rms[3:], sigma[3:]]))
     belief = "the filter that matches it" if matched else "the filter given"
-    console.print(
-        f"{name}, {belief}, integration {integration}; errors at {found.time[-1]:g} s, RMS of an axis.\n",
-        soft_wrap=True,
-    )
+    console.print(f"{name}, {belief}, integration {integration}; errors at {found.time[-1]:g} s, RMS of an axis.\n")
     rows = table("Error budget", "source", "kind", f"attitude\n{unit}", f"bias\n{rate_name}", left=2)
     budget = sorted(found.budget(), key=lambda row: -row[2])
     for source, kind, attitude, bias in budget:
@@ -148,36 +147,32 @@ def _tell(name: str, found: Any, integration: str, *, matched: bool) -> None:
     show(rows)
     console.print(
         "random: squares add. fixed: the same in every run, adds as an error. considered: 1σ of an error that neither the scenario nor the "
-        "filter knows of.\n",
-        soft_wrap=True,
+        "filter knows of.\n"
     )
     state, attitude, bias = found.expected_nees[-1]
     nis = ", ".join(f"{sensor} {value:.3g}" for sensor, value in found.expected_nis.items())
     console.print(
-        f"Expected NEES per state: {state:.3g} (attitude {attitude:.3g}, bias {bias:.3g}); NIS: {nis or 'none'}.",
-        soft_wrap=True,
+        f"Expected NEES per state: {state:.3g} (attitude {attitude:.3g}, bias {bias:.3g}); NIS: {nis or 'none'}."
     )
     largest = float(np.max(np.concatenate([rms[:3], sigma[:3]])))
     if largest > LARGEST_LINEAR:
         console.print(
             f"With an attitude error of {largest / DEGREE:.3g}° the analysis, linear about the truth, cannot tell whether the filter "
-            "will be as good as it says.",
-            soft_wrap=True,
+            "will be as good as it says."
         )
     elif max(attitude, bias) > 1.1:
         worst = "bias" if bias > attitude else "attitude"
         console.print(
-            f"The filter will be too sure of its {worst}: its errors are {np.sqrt(max(attitude, bias)):.3g} times what it says.",
-            soft_wrap=True,
+            f"The filter will be too sure of its {worst}: its errors are {np.sqrt(max(attitude, bias)):.3g} times what it says."
         )
     elif min(attitude, bias) < 0.9:
         console.print("The filter will be more modest than it need be.")
     else:
         console.print("The filter will be as good as it says.")
     if found.left_out:
-        console.print(f"Left out: {', '.join(found.left_out)}.", soft_wrap=True)
+        console.print(f"Left out: {', '.join(found.left_out)}.")
     for one in found.beyond_linear:
-        console.print(f"Beyond linear: {one}; take a Monte Carlo (`strapdown montecarlo`).", soft_wrap=True)
+        console.print(f"Beyond linear: {one}; take a Monte Carlo (`strapdown montecarlo`).")
     console.print("")
 
 

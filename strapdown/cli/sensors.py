@@ -44,7 +44,7 @@ def simulate(
     chosen = scenario_named(scenario)
     toml = catalogue.scenario_to_toml(chosen)
     if show:
-        console.print(toml, soft_wrap=True)
+        console.print(toml)
         return
     used = chosen.seed if seed is None else seed
     target = out or Path(f"{chosen.name or Path(scenario).stem}.h5")
@@ -72,8 +72,7 @@ def simulate(
         if series.covariance is None and (sigma == 0.0).any():
             console.print(
                 f"warning: {series.sensor}: its sigma is zero, which no filter can use; give it noise in the scenario, or tell the filter "
-                "another in [filter.sigma]",
-                soft_wrap=True,
+                "another in [filter.sigma]"
             )
     written(*paths)
 

@@ -24,6 +24,7 @@ from rich.table import Table
 from rich.text import Text
 
 if TYPE_CHECKING:
+    from strapdown.recordings import Recording
     from strapdown.scenarios import Scenario
 
 LARGEST_NUMBER = 1e30
@@ -37,8 +38,8 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-# Without markup, so that a file name in brackets is said as it is.
-console = Console(markup=False, highlight=False)
+# Without markup, so that a file name in brackets is said as it is; a statement is one line, which the terminal wraps.
+console = Console(markup=False, highlight=False, soft_wrap=True)
 errors = Console(stderr=True, markup=False, highlight=False)
 
 
@@ -186,6 +187,18 @@ def need_own(target: Path, command: str, own: Callable[[Path], bool]) -> None:
         )
 
 
+def doubt(source: Recording, path: Path) -> None:
+    """Say where a recording seems not to be what it says: of all that is made of it, a wrong unit is the likeliest to be missed."""
+    from strapdown import doctor
+
+    found = doctor.examine(source)
+    doubts = found.doubts
+    if found.verdict == "wrong convention":
+        doubts = (f"as it seems, {found.reason}",)
+    for words in doubts:
+        console.print(f"warning: {words}. See `strapdown doctor {path}`.")
+
+
 def written(*paths: Any) -> None:
     """Say which files were written."""
-    console.print("Written: " + ", ".join(str(path) for path in paths), soft_wrap=True)
+    console.print("Written: " + ", ".join(str(path) for path in paths))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from strapdown.cli.terminal import app, console, need_own, progress_bar, show, table, writable, written
+from strapdown.cli.terminal import app, console, doubt, need_own, progress_bar, show, table, writable, written
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -169,7 +169,7 @@ def tune(
         need_own(target, "tune", lambda _: bool(tunings.read(report)))
     units = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
     cases, believed, gyros = _cases(
-        records, chosen, {name: unit for name, unit in units.items() if unit}, states=states
+        records, chosen, filter_file, {name: unit for name, unit in units.items() if unit}, states=states
     )
     if algorithm is not None:
         believed = replace(believed, integration=algorithm)
@@ -261,7 +261,7 @@ def tune(
     if found is not None:
         _tell_gate(found)
     for sentence in () if worst is None else worst.words:
-        console.print(sentence, soft_wrap=True)
+        console.print(sentence)
     if comparison is not None:
         _tell_comparison(comparison, truth=bool(truth or rmse or credibility))
     objective_name = "credibility" if credibility else "rmse" if rmse else "likelihood"
@@ -285,12 +285,17 @@ def _by(text: str) -> Any:
 
 
 def _cases(
-    paths: Sequence[Path], chosen: FilterSetup | None, units: dict[str, str], *, states: bool
+    paths: Sequence[Path],
+    chosen: FilterSetup | None,
+    filter_file: Path | None,
+    units: dict[str, str],
+    *,
+    states: bool,
 ) -> tuple[list[Case], FilterSetup, dict[str, GyroSpec]]:
     """Return the records to tune on, the filter to start from, and the gyros of the records that tell theirs."""
     from strapdown import recordfiles, recordings, tuning
     from strapdown.checks import InputError
-    from strapdown.cli.filters import filter_for
+    from strapdown.cli.filters import filter_for, need_angles
 
     cases: list[Case] = []
     gyros: dict[str, GyroSpec] = {}
@@ -305,6 +310,8 @@ def _cases(
                 chosen, remarks = filter_for(path, file, None, None, () if states else None)
                 for remark in remarks:
                     console.print(remark)
+            elif filter_file is not None:
+                need_angles(filter_file, chosen, file)
             if file.gyro is not None:
                 gyros[str(path)] = file.gyro
             cases.append(tuning.record_case(file.record, chosen, name=path.name))
@@ -314,8 +321,9 @@ def _cases(
             recording = recordings.read(path, units=units)
             chosen = chosen or tuning.recording_setup()
             if recording.left_out_words:
-                console.print(recording.left_out_words, soft_wrap=True)
+                console.print(recording.left_out_words)
             cases.append(tuning.recording_case(recording))
+            doubt(recording, path)
     assert chosen is not None
     return cases, chosen, gyros
 
@@ -382,8 +390,7 @@ def _tell_gate(found: TunedGate) -> None:
     thresholds = ", ".join(f"{value:.1f} of {name}" for name, value in found.thresholds.items())
     console.print(
         f"An outlier is the likelier explanation of a NIS above {thresholds}. The gate lets {100.0 * found.probability:.4g} % of right "
-        f"measurements pass (95 %: {100.0 * found.lower:.4g} to {100.0 * found.upper:.4g}).",
-        soft_wrap=True,
+        f"measurements pass (95 %: {100.0 * found.lower:.4g} to {100.0 * found.upper:.4g})."
     )
 
 
@@ -418,9 +425,9 @@ def _tell_comparison(comparison: Comparison, *, truth: bool) -> None:
             told,
         )
     show(listing)
-    console.print(f"{tunings.BOUNDS}.", soft_wrap=True)
+    console.print(f"{tunings.BOUNDS}.")
     for judgement in comparison.after.judgements[:1]:
-        console.print("After: " + judgement.words, soft_wrap=True)
+        console.print("After: " + judgement.words)
     if not comparison.better and not truth:
         console.print("On the data held out the tuned filter is less likely than the one before: keep that one.")
     elif comparison.after.attitude_rms > WORSE * comparison.before.attitude_rms:

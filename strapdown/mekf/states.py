@@ -25,6 +25,9 @@ from strapdown.kernels.filter_step import heading_row
 from strapdown.records import ImuRecord
 from strapdown.robustness import Gate, GateMemory, Monitor, Robust
 
+LARGEST_NOISE = 1e9
+"""Noise of a gyro in SI beyond which it is a mistake."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ProcessNoise:
@@ -39,6 +42,9 @@ class ProcessNoise:
         """Check both."""
         positive("angle_random_walk", self.angle_random_walk, unit="rad/√s")
         non_negative("rate_random_walk", self.rate_random_walk, unit="rad/s/√s")
+        for name, unit in (("angle_random_walk", "rad/√s"), ("rate_random_walk", "rad/s/√s")):
+            if getattr(self, name) > LARGEST_NOISE:
+                raise InputError(f"{name} is {getattr(self, name):g} {unit}, and no gyro has so much; check the unit")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +77,9 @@ def initial_state(
         raise InputError(
             f"{'attitude' if k < 3 else 'bias'}_sigma[{k % 3}] is {sigma[k]:g}; it must be greater than zero"
         )
-    return State(attitude=np.asarray(attitude), bias=np.asarray(bias), covariance=np.diag(sigma**2))
+    return State(
+        attitude=array("attitude", attitude, (4,)), bias=array("bias", bias, (3,)), covariance=np.diag(sigma**2)
+    )
 
 
 def _by_axis(name: str, value: ArrayLike) -> Array:

@@ -30,6 +30,7 @@ from strapdown.kernels.robust_step import ACCEPTED, KNOWN, PASSED_OVER, REFUSED
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.mekf.judging import Judging, ToldEvents
 from strapdown.mekf.states import ProcessNoise, State, check_arguments, covariance_matrices, restart_bias_variance
+from strapdown.records import LARGEST_TURN
 from strapdown.robustness import Gate, Linearised, Robust, Rows, linearise, seen_from, tilt_unknown
 from strapdown.vectors import need_level, need_unit, triad
 
@@ -125,6 +126,10 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         goes on by a compensated sum; a measurement's time is equal to it within the rounding of a plain one.
         """
         increment = array("delta_theta", delta_theta, (3,))
+        if np.max(np.abs(increment)) > LARGEST_TURN:
+            raise InputError(
+                f"delta_theta is {increment}, and nothing turns so far between two samples; it is the rate times dt, rad: check the unit"
+            )
         step, end = self._ending(dt, time)
         if step == 0.0:
             self.repeated += 1
@@ -170,6 +175,19 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         self.time = end
         if self._judging.challenger is not None:
             self._judging.challenger._predict(increment, step, end)
+
+    def update(self, *arguments: Any, **options: Any) -> None:
+        """Refuse filterpy's own update by any ``Hx``: it would leave the correction in ``x``, outside ``attitude`` and ``bias``."""
+        raise InputError(
+            "update() by HJacobian and Hx knows no attitude, and would leave its correction in x; use update_direction, update_vector, "
+            "update_heading or update_attitude"
+        )
+
+    def predict_update(self, *arguments: Any, **options: Any) -> None:
+        """Refuse filterpy's own step, as :meth:`update` does."""
+        raise InputError(
+            "predict_update() would update by Hx, which knows no attitude; use predict, then update_direction or another"
+        )
 
     def update_direction(
         self,

@@ -43,7 +43,7 @@ def estimate_overview(estimate: Estimate, *, title: str = "") -> Figure:
         angle = np.where(np.abs(np.diff(euler[:, k], prepend=euler[0, k])) > 180.0, np.nan, euler[:, k])
         axes[0].plot(*decimated(estimate.time, angle), color=CYCLE[k], linewidth=0.9, label=name)
     sigma = estimate.sigma
-    settled = slice(len(estimate.time) // 10, None)
+    settled = slice(len(estimate.time) // 20, None)
     reach = np.abs(estimate.bias[settled]).max() + 3.0 * sigma[settled, 3:].max()
     unit, size = rate_unit(3.0 * sigma[settled, 3:])
     for k, name in enumerate(AXES):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from strapdown import consistency, plots, records, setup
+from strapdown import consistency, plots, records
 from strapdown.checks import InputError
 from strapdown.montecarlo import campaign
 from strapdown.montecarlo.statistics import SUBSETS, Statistics
@@ -31,7 +31,9 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
         f"{statistics.runs} runs of {held.plan.scenario.duration:g} s, seed {held.plan.seed}, {len(statistics.time) - 1} epochs, machine: "
         f"{held.machine}{unfinished}; strapdown {held.version}",
         findings.verdict(judgement),
-        _without_a_state(held) if judgement.verdict != "consistent" else "",
+        findings.without_a_state(held.plan.scenario, held.plan.setup.states, "montecarlo")
+        if judgement.verdict != "consistent"
+        else "",
         _numbers(statistics),
         findings.evidence(judgement),
         page.section(
@@ -70,17 +72,6 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
         "nis_by_sensor": dict(zip(statistics.sensors, _plain(statistics.sensor_nis), strict=True)),
         "worst_runs": statistics.worst_run.tolist(),
     }
-
-
-def _without_a_state(held: campaign.Campaign) -> str:
-    """Return what the scenario specifies and the filter has no state for."""
-    scenario = held.plan.scenario
-    missing = setup.not_covered(scenario.gyro, scenario.sensors, held.plan.setup.states, gravity_f=scenario.gravity_f)
-    if not missing:
-        return ""
-    return page.paragraph(
-        f"The filter has no state for {', '.join(missing)}; `strapdown montecarlo --states` gives it states for most."
-    )
 
 
 def _plain(values: Any) -> list[float | None]:

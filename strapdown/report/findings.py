@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from strapdown import setup
+from strapdown.augmented.states import States
 from strapdown.consistency import Judgement
 from strapdown.report import page
+from strapdown.scenarios import Scenario
 
 
 def verdict(judgement: Judgement) -> str:
@@ -37,3 +40,12 @@ def evidence(judgement: Judgement) -> str:
     parts = [page.table(head, rows, numbers=5, marked=marked), page.paragraph(note, faint=True)]
     parts += [page.paragraph(f"What this does not show: {limit}.", faint=True) for limit in judgement.limits]
     return page.section("The evidence", *parts)
+
+
+def without_a_state(scenario: Scenario, states: States | None, command: str) -> str:
+    """Return the paragraph on what the scenario specifies and the filter has no state for; nothing where it has one for all."""
+    missing = setup.not_covered(scenario.gyro, scenario.sensors, states, gravity_f=scenario.gravity_f)
+    if not missing:
+        return ""
+    remedy = f"; `strapdown {command} --states` gives it states for most" if states is None else ""
+    return page.paragraph(f"The filter has no state for {', '.join(missing)}{remedy}.")
