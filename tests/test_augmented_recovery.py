@@ -440,7 +440,7 @@ def challenger_of(P, bias, values):
     x[1] = [*bias, *values]
     memory = np.zeros(robust_gate.MEMORY)
     memory[robust_gate.FIRST_BIAS + 3 : robust_gate.FIRST_BIAS + 6] = STARTED**2
-    return attitude, x, F, size, memory, np.empty(size), np.empty(size)
+    return attitude, x, F, size, memory, np.empty((0, 3)), np.empty(size), np.empty(size)
 
 
 STARTED = np.array([0.1, 0.2, 0.3])
@@ -456,7 +456,7 @@ def test_a_challenger_that_is_widened_is_what_it_would_be_had_it_started_so():
     P, expected = (np.linalg.inv(np.diag(sigma**-2.0) + H.T @ H) for sigma in (start, wide))
     mean, there = P @ H.T @ z, expected @ H.T @ z
     rows = challenger_of(P, mean[3:6], mean[6:])
-    attitude, x, F, _, memory, _, _ = rows
+    attitude, x, F, _, memory, *_ = rows
     widen(*rows)
     np.testing.assert_allclose(x[1], there[3:], rtol=1e-9, atol=1e-12)
     turn = quaternion.exp(there[:3] - mean[:3])
@@ -690,11 +690,12 @@ def test_both_faces_recover_alike(case):
         np.testing.assert_allclose(step.innovations[name].nis, innovations.nis, rtol=1e-7)
 
 
-def test_both_faces_widen_a_challenger_alike():
+@pytest.mark.parametrize("case", ["hard iron", "chains"])
+def test_both_faces_widen_a_challenger_alike(case):
     """The bias is off by thirty times what the gate allows it to have changed."""
     one = made("hard iron", 3, duration=2.0)
     start = dataclasses.replace(lost(one.initial, 3), bias=one.initial.bias + np.array([0.3, -0.2, 0.25]))
-    gate, blocks = Gate(recovery=5, restart_bias_sigma=1e-2), CASES["hard iron"][1]
+    gate, blocks = Gate(recovery=5, restart_bias_sigma=1e-2), FACES[case][1]
     whole, end = augmented.run_on(one.record, NOISE, start, blocks, gate=gate, full_covariance=True)
     state = augmented.initial_state(start, blocks)
     step, _ = augmented.stepping.run_on(one.record, NOISE, state, blocks, gate=gate, full_covariance=True)

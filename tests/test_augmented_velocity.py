@@ -21,6 +21,7 @@ from strapdown.augmented.model import assemble
 from strapdown.checks import InputError
 from strapdown.consistency import reference_errors
 from strapdown.gyro import GyroSpec
+from strapdown.kernels.robust_gate import WIDE_PASSES
 from strapdown.mekf import ProcessNoise
 from strapdown.recordings import Recording, read
 from strapdown.records import ImuRecord
@@ -615,16 +616,38 @@ def test_consistency_over_many_runs(poles, smoothed):
         assert low < found[part][:, -1].mean() < high, (part, found[part].mean(axis=0), low, high)
 
 
-def test_what_the_smoother_tells_is_relative_to_its_own_attitude():
-    block = block_of("velocity")
-    turn = quaternion.exp(np.array([[0.2, -0.5, 0.3], [0.0, 0.0, 0.0]]))
-    values = np.arange(12.0).reshape(2, 6)
-    told = block.retold(values, turn)
-    np.testing.assert_allclose(told[0, 0::2], quaternion.to_matrix(turn[0]) @ values[0, 0::2], rtol=1e-14)
-    np.testing.assert_allclose(told[0, 1::2], quaternion.to_matrix(turn[0]) @ values[0, 1::2], rtol=1e-14)
-    np.testing.assert_allclose(told[1], values[1], rtol=1e-14)
-    other = augmented.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01)
-    assert other.retold(values, turn) is values
+@pytest.mark.parametrize("passes", [1, WIDE_PASSES], ids=["once", "iterated"])
+def test_a_correction_turns_what_is_carried(passes):
+    """By an attitude of which the states know nothing, so that only the turn changes them: as the body sees them they stay the same."""
+    blocks = (augmented.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01), block_of("position"))
+    initial = mekf.initial_state(quaternion.IDENTITY, attitude_sigma=1.0, bias_sigma=3e-3)
+    state = augmented.initial_state(initial, blocks)
+    rng = np.random.default_rng(5)
+    P = state.covariance.copy()
+    root = np.eye(9) + 0.3 * rng.standard_normal((9, 9))
+    P[15:, 15:] = root @ P[15:, 15:] @ root.T
+    state = dataclasses.replace(state, covariance=P, values=rng.standard_normal(18))
+    face = augmented.StepFilter(NOISE, state, blocks, sensors=("acc", "star"))
+    face._passes = passes
+    turn = quaternion.exp([0.5, -0.7, 0.4])
+    assert face.update_attitude(turn, 1e-6, "star")
+    np.testing.assert_allclose(quaternion.angle_between(face.attitude, turn), 0.0, atol=1e-9)
+    R = quaternion.to_matrix(face.attitude)
+    T = np.kron(R, np.eye(3))  # the states stand axis by axis
+    np.testing.assert_allclose(face.values[9:], T @ state.values[9:], rtol=1e-12)
+    np.testing.assert_allclose(face.P[15:, 15:], T @ P[15:, 15:] @ T.T, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(face.values[:9], state.values[:9], rtol=1e-12)
+
+
+def test_what_is_carried_must_be_alike_on_three_axes():
+    class Lopsided(augmented.BoundedVelocity):
+        @property
+        def decay(self):
+            return super().decay * np.array([1.0, 1.0, 1.0, 1.0, 1.0, 2.0])
+
+    block = Lopsided(sensor="acc", velocity_time=0.3, velocity_sigma=0.5, acceleration_time=0.1)
+    with pytest.raises(InputError, match="axes x, y and z in turn"):
+        assemble((block,), {"acc": "vector"})
 
 
 # ------------------------------------------------------------------------------------------------------------------ setups and files

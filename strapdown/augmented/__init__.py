@@ -21,7 +21,7 @@ with hard iron (9 states), 4.9 with the gyro's scale (15), 8 with both and a col
 filter.
 
 States may feed one another in chains (:mod:`strapdown.kernels.augmented_chain`), which shapes coloured noise of more than one pole: of the
-acceleration of a moving hand, whose velocity is bounded (:class:`BoundedVelocity`; 2.7 times a filter without a block).
+acceleration of a moving hand, whose velocity is bounded (:class:`BoundedVelocity`; 3.4 times a filter without a block).
 
 A filter that starts tenths of a radian off, as one does whose heading hard iron has turned, is linearised at the wrong place and believes
 too much for good; :func:`recentred` starts it anew where the smoother puts it.

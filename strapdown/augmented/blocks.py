@@ -13,7 +13,6 @@ from typing import Literal
 
 import numpy as np
 
-from strapdown import quaternion
 from strapdown.checks import Array, InputError, array, non_negative, one_of, positive
 from strapdown.kernels import augmented_chain
 from strapdown.units import STANDARD_GRAVITY
@@ -51,9 +50,9 @@ class Effect:
     """Whether d is known only relative to the estimated attitude, and goes along when that is corrected: right for a noise that is alike in
     all directions. Firm in the fixed frame, an estimate of the noise would seem to show the attitude, which it does not: turn both, and
     every measurement and the noise's own law stay as they are. (A filter whose linearisation breaks such a symmetry finds information
-    where there is none: Huang, Mourikis & Roumeliotis 2010.) A correction of the attitude does not turn the estimate of c itself: of what
-    the filter, not the smoother, tells of c, the turns corrected within the noise's correlation time are left, times its size. To first
-    order the attitude and the bias do not depend on it."""
+    where there is none: Huang, Mourikis & Roumeliotis 2010.) A correction of the attitude turns the states, with their covariance, by
+    itself. For that the block's states are those of the axes x, y and z in turn, alike: ``offset_f`` is ``kron(I, a)`` of a column a. What
+    is told of them is in the axes of the estimated attitude, their covariance too, which leaves out how well that is known."""
 
 
 class _Block:
@@ -137,10 +136,6 @@ class LinearBlock(_Block):
         with np.errstate(invalid="ignore", divide="ignore"):
             time = np.where(self.decay > 0.0, -0.5 * np.expm1(-2.0 * self.decay * dt) / self.decay, dt)
         return np.diag(self.density * time)
-
-    def retold(self, values: Array, turn: Array) -> Array:
-        """Return values (m, size) when the attitude that they are told relative to is turned, in fixed axes, by quaternions (m, 4)."""
-        return values
 
     def _chained(self, dt: float) -> tuple[Array, Array]:
         """Return Φ and Q of states in chains: of a step short enough for the kernel's series, doubled as often as it takes."""
@@ -570,10 +565,6 @@ class GaussMarkov(LinearBlock):
             return {self.sensor: Effect(offset_b=axes, varying=self.varying)}
         return {self.sensor: Effect(offset_f=axes, carried=True, varying=self.varying)}
 
-    def retold(self, values: Array, turn: Array) -> Array:
-        """Turn the vector that the states are in fixed axes."""
-        return quaternion.rotate(turn, values) if self.frame == "fixed" else values
-
 
 @dataclass(frozen=True, kw_only=True)
 class BoundedVelocity(LinearBlock):
@@ -689,11 +680,6 @@ class BoundedVelocity(LinearBlock):
         if len(rates) == 3:
             a = np.array([rates[0] ** 2, -rates[0] - rates[1], 1.0])
         return {self.sensor: Effect(offset_f=np.kron(np.eye(3), a[:, None]) / self.strength, carried=True)}
-
-    def retold(self, values: Array, turn: Array) -> Array:
-        """Turn the vectors that the states are."""
-        vectors = np.swapaxes(values.reshape(len(values), 3, -1), 1, 2)
-        return np.swapaxes(quaternion.rotate(turn[:, None], vectors), 1, 2).reshape(values.shape)
 
 
 def check(blocks: tuple[Block, ...]) -> None:

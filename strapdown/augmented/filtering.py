@@ -25,7 +25,7 @@ from strapdown.mekf.judging import event_rows, gate_events, kernel_options, reme
 from strapdown.mekf.scheduling import skipped_too
 from strapdown.mekf.states import check_arguments, first_bias_variance, restart_bias_variance
 from strapdown.records import BlockEstimate, Estimate, Event, ImuRecord
-from strapdown.robustness import Gate, Robust
+from strapdown.robustness import Gate, Monitor, Robust
 from strapdown.vectors import KINDS, VectorMeasurements
 
 
@@ -50,7 +50,8 @@ class AugmentedEstimate(Estimate):
     ) -> Array:
         """Return the error (m, n) of all states: Log(q_est⁻¹ ⊗ q_true), then true less estimated.
 
-        ``true_values`` holds for each block an array (size,) or (m, size).
+        ``true_values`` holds for each block an array (size,) or (m, size), of what is carried in the axes of the estimated attitude
+        (:attr:`strapdown.augmented.Effect.carried`).
         """
         given = dict(true_values or {})
         if set(given) != set(self.blocks):
@@ -71,6 +72,7 @@ def run(
     full_covariance: bool = False,
     gate: Gate | None = None,
     robust: Robust | None = None,
+    monitor: Monitor | None = None,
 ) -> AugmentedEstimate:
     """Run the filter over a whole record.
 
@@ -92,6 +94,8 @@ def run(
         Refuse measurements that no right filter would see, and recover where they agree with each other; the blocks then start anew.
     robust : Robust, optional
         Weigh measurements by how far they lie off.
+    monitor : Monitor, optional
+        Report when the running NIS leaves its bounds.
     """
     return run_on(
         record,
@@ -102,6 +106,7 @@ def run(
         full_covariance=full_covariance,
         gate=gate,
         robust=robust,
+        monitor=monitor,
     )[0]
 
 
@@ -115,25 +120,26 @@ def run_on(
     full_covariance: bool = False,
     gate: Gate | None = None,
     robust: Robust | None = None,
+    monitor: Monitor | None = None,
 ) -> tuple[AugmentedEstimate, AugmentedState]:
     """Run the filter and return the end state too, from which the next part of a record goes on, bit for bit.
 
     It holds what a gate remembers as well: its counts, its challenger, how wide a restart is, and the blocks' prior. A lock-out that goes
-    on is told by both parts, by the second as a whole. With a block told by functions a gate starts anew in each part.
+    on is told by both parts, by the second as a whole. A monitor starts anew in each part, and with a block told by functions a gate does.
 
     Effects that are fixed in a sensor's own unit (``varying``) keep in all parts the unit of the first in which the sensor is, the strength
     at the root mean square σ there (``unit_sigma`` of the state). A run over the whole record has that of the whole, and so another prior,
     unless ``initial`` tells the same one. With a lever arm parts agree to some 1e-6 of what they estimate only: the angular acceleration
     is found from the gyro about each measurement, and at a cut from one side of it.
     """
-    check_arguments(record=record, process_noise=process_noise, gate=gate, robust=robust)
+    check_arguments(record=record, process_noise=process_noise, gate=gate, robust=robust, monitor=monitor)
     blocks = modelling.as_blocks(blocks)
     state = modelling.begin(initial, blocks)
     count("every", every)
     if modelling.general(blocks):
         from strapdown.augmented import stepping
 
-        return stepping.run_on(
+        estimate, end = stepping.run_on(
             record,
             process_noise,
             state,
@@ -143,6 +149,7 @@ def run_on(
             gate=gate,
             robust=robust,
         )
+        return watched(estimate, monitor, gate), end
     events, model = prepared(record, blocks)
     estimate, end, _ = run_events(
         record,
@@ -156,7 +163,22 @@ def run_on(
         gate=gate,
         robust=robust,
     )
-    return estimate, end
+    return watched(estimate, monitor, gate), end
+
+
+def watched(estimate: AugmentedEstimate, monitor: Monitor | None, gate: Gate | None) -> AugmentedEstimate:
+    """Return an estimate with what a monitor says of all innovations in order of time; of refused ones the gate's threshold counts."""
+    parts = [one for one in estimate.innovations.values() if len(one.time)]
+    if monitor is None or not parts:
+        return estimate
+    time = np.concatenate([one.time for one in parts])
+    degrees = np.concatenate([np.full(len(one.time), one.innovation.shape[1]) for one in parts])
+    nis = np.concatenate([one.nis for one in parts])
+    if gate is not None:
+        nis = np.where(np.concatenate([one.used for one in parts]), nis, gate.thresholds[degrees - 1])
+    order = np.argsort(time, kind="stable")
+    told = [*estimate.events, *monitor.watch(time[order], nis[order], degrees[order])]
+    return replace(estimate, events=tuple(sorted(told, key=lambda event: event.start)))
 
 
 def prepared(record: ImuRecord, blocks: tuple[Block, ...]) -> tuple[Schedule, Model]:

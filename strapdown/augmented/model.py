@@ -14,6 +14,7 @@ import numpy as np
 from strapdown import mekf
 from strapdown.augmented.blocks import MOST_CHAIN_DECAY, Block, Effect, GeneralBlock, LinearBlock, check
 from strapdown.checks import Array, InputError, array, covariance, one_of, positive, unit_quaternions
+from strapdown.kernels import augmented_step
 from strapdown.kernels.augmented_chain import CHAIN, chain_start
 from strapdown.kernels.augmented_step import CARRIED, FIXED, FORCE, LEVER, NOISE_NODES, OFFSET, SCALE
 from strapdown.mekf.states import check_arguments
@@ -118,9 +119,10 @@ class Model:
     decay: Array
     density: Array
     chains: Array
-    """How the next state feeds each, and the PSD that drives a chain, which is then not in ``density`` (m, 2); empty without chains."""
+    """How the next state feeds each, the PSD that drives a chain, which is then not in ``density``, and of the x components of vectors that
+    are carried by how many states the next one follows (m, 3); empty where there is neither."""
     changing: int
-    """How many come first that decay, are driven or belong to a chain."""
+    """How many come first that decay, are driven, belong to a chain or are carried."""
     limit: float
     """Longest step, s."""
     gyro: Array
@@ -178,6 +180,7 @@ def assemble(blocks: tuple[Block, ...], kinds: Mapping[str, str]) -> Model:
     sensors = np.zeros((len(kinds), len(decay), 15))
     carried, levered = np.zeros((2, len(kinds), len(decay)), bool)
     varying = set()
+    stride, bound = np.zeros(len(decay)), np.zeros(len(decay), bool)
     names = list(kinds)
     first = 0
     for block in blocks:
@@ -192,6 +195,10 @@ def assemble(blocks: tuple[Block, ...], kinds: Mapping[str, str]) -> Model:
             place = names.index(sensor), slice(first, first + block.size)
             sensors[place] = _numbers(block, effect)
             carried[place] = effect.carried
+            if effect.carried and effect.offset_f is not None and isinstance(block, LinearBlock):
+                _check_carried(block, effect)
+                stride[first : first + block.size // 3] = block.size // 3
+                bound[place[1]] = True
             levered[place] = effect.lever is not None
             if effect.varying and kinds[sensor] in ("direction", "heading"):
                 varying.add(sensor)
@@ -199,7 +206,7 @@ def assemble(blocks: tuple[Block, ...], kinds: Mapping[str, str]) -> Model:
     feed = _feeds(blocks)
     fed = np.append(False, feed != 0.0)[: len(feed)]
     linked = (feed != 0.0) | fed
-    moves = (decay > 0.0) | (density > 0.0) | linked
+    moves = (decay > 0.0) | (density > 0.0) | linked | bound
     order = np.argsort(~moves, kind="stable")
     gyro_use = _uses(gyro[:, :3], scales) + FORCE * np.any(forces != 0.0, axis=1)
     sensor_use = _uses(sensors[..., :3], sensors[..., 6:], sensors[..., 3:6])
@@ -210,13 +217,14 @@ def assemble(blocks: tuple[Block, ...], kinds: Mapping[str, str]) -> Model:
             f"block state {int(np.argmax(linked & (gyro_use != 0)))} belongs to a chain and enters the gyro; give it a feed of 0, or no "
             "effect on the gyro"
         )
+    chains = np.stack([feed, np.where(fed, density, 0.0), stride], axis=1)
     quickened = np.where(linked, MOST_DECAY / MOST_CHAIN_DECAY, np.where(gyro_use & OFFSET, 5.0, 1.0))
     fastest = float(np.max(decay * quickened, initial=0.0))
     return Model(
         order=order,
         decay=decay[order],
         density=np.where(fed, 0.0, density)[order],
-        chains=np.stack([feed, np.where(fed, density, 0.0)], axis=1)[order] if linked.any() else np.empty((0, 2)),
+        chains=chains[order] if np.any(linked | bound) else np.empty((0, 3)),
         changing=int(np.sum(moves)),
         limit=MOST_DECAY / fastest if fastest > 0.0 else np.inf,
         gyro=np.ascontiguousarray(gyro[order]),
@@ -256,6 +264,20 @@ def _force(blocks: tuple[Block, ...], both: np.ndarray) -> Array:
                 f"two blocks tell forces {known[0].tolist()} and {one.tolist()}; give both the same gravity_f"
             )
     return array("force_f", known[0], (3,)) if known else np.zeros(3)
+
+
+def _check_carried(block: LinearBlock, effect: Effect) -> None:
+    """Refuse a block that is not the same on three axes in turn, which a turn makes the same again."""
+    rows = np.asarray(effect.offset_f)
+    alike = block.size % 3 == 0 and np.array_equal(rows, np.kron(np.eye(3), rows[: block.size // 3, :1]))
+    for name in ("decay", "density", "feed"):
+        values = np.asarray(getattr(block, name))
+        alike = alike and np.array_equal(values, np.tile(values[: block.size // 3], 3))
+    if not alike:
+        raise InputError(
+            f"{block.name}: what is carried is turned with the attitude, and its states are not those of the axes x, y and z in turn, "
+            "alike; give offset_f as kron(I, a) with the same decay, density and feed on each, or leave carried out"
+        )
 
 
 def _check_lever(block: Block, sensor: str, kind: str, effect: Effect) -> None:
@@ -306,6 +328,15 @@ def triangle(state: AugmentedState, model: Model) -> Array:
     if not np.array_equal(root, np.tril(root)):
         root = np.asarray(np.linalg.qr(root[:, ::-1], mode="r"))[::-1, ::-1]
     return np.ascontiguousarray(root)
+
+
+def turning_matrix(chains: Array, size: int, before: Array, after: Array) -> Array:
+    """Return what a correction of the attitude from one q_fb to another makes of the states (size, size), in the order of ``chains``."""
+    T = np.eye(size)
+    if len(chains):
+        # A turn of the columns of the identity's rows: Tᵀ, by rows.
+        augmented_step.turn_columns(chains, augmented_step.fixed_turn(tuple(before), tuple(after)), T, size)
+    return T.T
 
 
 def general(blocks: Sequence[Block]) -> bool:

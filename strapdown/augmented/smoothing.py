@@ -19,7 +19,7 @@ from strapdown.kernels.augmented_chain import LINKS
 from strapdown.kernels.machine import compiled
 from strapdown.mekf import ProcessNoise
 from strapdown.mekf.states import check_arguments
-from strapdown.records import BlockEstimate, Event, ImuRecord
+from strapdown.records import Event, ImuRecord
 from strapdown.robustness import Gate, Robust
 
 PASSES = 16
@@ -41,12 +41,15 @@ def recentred(
     and once for the estimate, which counts the prior too little by ``1/s²`` of its information, s the singular value of
     :func:`strapdown.augmented.observability`: for records that show a state much better than the prior.
     """
+    check_arguments(record=record, process_noise=process_noise)
     blocks = modelling.as_blocks(blocks)
     state = modelling.begin(initial, blocks)
+    model = modelling.assemble(blocks, {series.sensor: series.kind for series in record.vectors})
     for _ in range(count("passes", passes)):
         whole = smooth(record, process_noise, state, blocks)
         # The prior's tangent space goes along: exp(a + ε) = exp(a) ⊗ exp(J_r(a) ε).
-        carry = np.eye(len(state.covariance))
+        back = np.argsort(model.whole_order)
+        carry = modelling.turning_matrix(model.chains, len(back), state.attitude, whole.attitude[0])[np.ix_(back, back)]
         a = quaternion.log(quaternion.multiply(quaternion.conjugate(state.attitude), whole.attitude[0]))
         carry[:3, :3] = kinematics.right_jacobian(a)
         state = AugmentedState(
@@ -140,7 +143,6 @@ def smoothed(
     edges, size = len(record.time), 6 + model.states
     shapes = (edges, 4), (edges, size - 3), (edges, size), (edges if full_covariance else 0, size, size)
     outputs = [np.empty(shape) for shape in shapes]
-    turn = np.empty((edges, 4))
     until = joining.last_seen(record.time, lag)
     first = joining.starts(joining.stops(record.time, breaks), event_time, segments)
     for one in joining.trajectories(record.time, until, breaks, first, segments, again):
@@ -151,8 +153,6 @@ def smoothed(
             for out, there in zip(outputs, written, strict=True):
                 if len(out):
                     out[one.row] = there[one.edge]
-        filtered = one.segments[one.starts[one.edge], 4:8]
-        turn[one.row] = quaternion.multiply(outputs[0][one.row], quaternion.conjugate(filtered))
     attitude, x, variance, P = outputs
     found = filtering.packed(
         model,
@@ -166,7 +166,7 @@ def smoothed(
         forward.innovations,
         forward.skipped,
     )
-    return replace(found, blocks=_retold(found, blocks, turn), events=forward.events)
+    return replace(found, events=forward.events)
 
 
 def _stepwise(
@@ -182,7 +182,7 @@ def _stepwise(
     """Smooth with blocks told by functions."""
     from strapdown.augmented import stepwise
 
-    forward, rows, filtered = stepwise.smooth(record, process_noise, state, blocks, lag, gate, robust)
+    forward, rows = stepwise.smooth(record, process_noise, state, blocks, lag, gate, robust)
     attitude, x, P = (np.array([getattr(row, name) for row in rows]) for name in ("attitude", "others", "covariance"))
     model = modelling.assemble(blocks, {series.sensor: series.kind for series in record.vectors})
     found = filtering.packed(
@@ -197,18 +197,7 @@ def _stepwise(
         forward.innovations,
         forward.skipped,
     )
-    turn = quaternion.multiply(attitude, quaternion.conjugate(filtered))
-    return replace(found, blocks=_retold(found, blocks, turn), events=forward.events)
-
-
-def _retold(found: AugmentedEstimate, blocks: tuple[Block, ...], turn: Array) -> dict[str, BlockEstimate]:
-    """Return the blocks relative to the smoothed attitude: the way back leaves what is relative to one relative to the filter's."""
-    return {
-        block.name: replace(found.blocks[block.name], values=block.retold(found.blocks[block.name].values, turn))
-        if isinstance(block, LinearBlock)
-        else found.blocks[block.name]
-        for block in blocks
-    }
+    return replace(found, events=forward.events)
 
 
 def _filtered(

@@ -330,32 +330,13 @@ def run(
     assert found.whole_bias is not None
     assert found.whole_bias_variance is not None
     fast = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]) * states.gyro_fast_bias_sigma**2
-    told = found.events
-    if monitor is not None:
-        told = tuple(sorted([*told, *_watched(found, monitor, gate)], key=lambda event: event.start))
     covariance = found.whole_bias_covariance
     return replace(
-        found,
+        filtering.watched(found, monitor, gate),
         bias=found.whole_bias,
         variance=found.whole_bias_variance + fast,
         covariance=None if covariance is None else covariance + np.diag(fast),
-        events=told,
     )
-
-
-def _watched(found: AugmentedEstimate, monitor: Monitor, gate: Gate | None) -> list[Any]:
-    """Return what a monitor says of all innovations in order of time."""
-    parts = [one for one in found.innovations.values() if len(one.time)]
-    if not parts:
-        return []
-    time = np.concatenate([one.time for one in parts])
-    degrees = np.concatenate([np.full(len(one.time), one.innovation.shape[1]) for one in parts])
-    nis = np.concatenate([one.nis for one in parts])
-    if gate is not None:
-        used = np.concatenate([one.used for one in parts])
-        nis = np.where(used, nis, gate.thresholds[degrees - 1])
-    order = np.argsort(time, kind="stable")
-    return list(monitor.watch(time[order], nis[order], degrees[order]))
 
 
 # ------------------------------------------------------------------------------------------------------------------------- files

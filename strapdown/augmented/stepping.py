@@ -7,6 +7,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import filterpy.kalman
 import numpy as np
@@ -23,8 +24,6 @@ from strapdown.checks import (
     InputError,
     array,
     covariance,
-    finite,
-    non_negative,
     one_of,
     positive,
     unit_quaternions,
@@ -40,12 +39,12 @@ from strapdown.kernels import (
 from strapdown.kernels.robust_gate import WIDE_PASSES
 from strapdown.kernels.robust_step import ACCEPTED, PASSED_OVER, REFUSED
 from strapdown.mekf import ProcessNoise
-from strapdown.mekf.judging import Judging, ToldEvents
+from strapdown.mekf.judging import Judging
 from strapdown.mekf.scheduling import skipped_too
 from strapdown.mekf.states import check_arguments, restart_bias_variance
-from strapdown.mekf.stepping import sensor_names, show_refused
-from strapdown.records import ImuRecord
-from strapdown.robustness import Gate, Linearised, Robust, Rows, seen_from, tilt_unknown
+from strapdown.mekf.stepping import Measured, sensor_names, show_refused
+from strapdown.records import Event, ImuRecord
+from strapdown.robustness import Gate, GateMemory, Linearised, Monitor, Robust, Rows, seen_from, tilt_unknown
 from strapdown.vectors import KINDS, need_level, need_unit, triad
 
 KIND_CODES = {
@@ -58,13 +57,12 @@ TURNED = (filter_loop.DIRECTION, filter_loop.VECTOR)
 """Kinds whose angle from what is predicted the kernels measure."""
 
 
-class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
+class StepFilter(mekf.StepFilter):
     """The same filter with a whole covariance: ``P``, ``F``, ``Q``, ``R``, ``y``, ``S``, ``K``, ``Saver`` work as filterpy's users expect.
 
     ``x`` is the error state (δθ, δb, δc) (n,): zero before and after each update; ``x_post`` keeps the last correction. ``attitude`` (4,)
-    is q_fb, ``bias`` (3,) in rad/s, ``values`` (m,) those of the blocks one after the other, ``time`` in s. ``nis`` is that of the last
-    measurement, ``weight`` what it was taken in with; ``refused`` counts by sensor what the gate refused, ``events`` tells of recoveries
-    and lock-outs. A heading that the estimate takes for vertical is passed over.
+    is q_fb, ``bias`` (3,) in rad/s, ``values`` (m,) those of the blocks one after the other, ``time`` in s. All else, late measurements
+    and what is counted too, is as in :class:`strapdown.mekf.StepFilter`.
 
     Parameters
     ----------
@@ -74,8 +72,13 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
     blocks : sequence of blocks
     gate : Gate, optional
     robust : Robust, optional
+    monitor : Monitor, optional
+        Tells in ``events`` when the running NIS leaves its bounds. What it needs of each measurement is kept, in memory.
+    look_back : float
+        s; a measurement may be given so long after its time (:class:`strapdown.mekf.StepFilter`).
     sensors : sequence of str, optional
-        Names of all sensors. Default: those that linear blocks are about; where these are about none, any name will do.
+        Names of all sensors, in the order of the record's series. Default: those that linear blocks are about; where these are about none,
+        any name will do.
     time : float
         Time of the initial state, s.
     """
@@ -88,10 +91,12 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         *,
         gate: Gate | None = None,
         robust: Robust | None = None,
+        monitor: Monitor | None = None,
+        look_back: float = 0.0,
         sensors: Sequence[str] = (),
         time: float = 0.0,
     ) -> None:
-        check_arguments(process_noise=process_noise, gate=gate, robust=robust)
+        check_arguments(process_noise=process_noise, gate=gate, robust=robust, monitor=monitor)
         blocks = modelling.as_blocks(blocks)
         state = modelling.begin(initial, blocks)
         names = sensor_names(sensors)
@@ -99,40 +104,36 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         for sensor, block in about.items() if names else ():
             one_of(f"{block}: sensor", sensor, names)
         size = 6 + len(state.values)
-        super().__init__(dim_x=size, dim_z=2)
-        self.process_noise = process_noise
-        self.gate = gate
-        self.robust = robust
-        self.blocks = blocks
         self.sensors = names or tuple(about)
+        super().__init__(
+            process_noise,
+            mekf.State(attitude=state.attitude, bias=state.bias, covariance=np.eye(6)),
+            gate=gate,
+            robust=robust,
+            look_back=look_back,
+            sensors=self.sensors,
+            time=time,
+        )
+        filterpy.kalman.ExtendedKalmanFilter.__init__(self, dim_x=size, dim_z=2)
+        self.blocks = blocks
         self.kinds: dict[str, str] = {}
-        self.attitude: Array = state.attitude.copy()
-        self.bias: Array = state.bias.copy()
         self.values: Array = state.values.copy()
         self.x, self.x_prior, self.x_post = np.zeros((3, size))
         self.P = state.covariance.copy()
         self.y, self.z, self.K = np.zeros(2), np.zeros(2), np.zeros((size, 2))
-        self.time = finite("time", time, unit="s")
         self.rate = np.zeros(3)
         bounds = np.cumsum([0, *(block.size for block in self.blocks)])
         self._parts = [slice(a, b) for a, b in itertools.pairwise(bounds)]
         self._models: dict[str, modelling.Model] = {}
-        self.nis = 0.0
-        self.weight = 1.0
-        self.refused: dict[str, int] = {}
-        self.skipped: dict[str, int] = {}
-        self.repeated = 0
         # What the blocks of a challenger know, carried along.
         self._prior = _Gaussian(*filtering.restart_states(state, self.blocks))
         self._restart_bias_variance = restart_bias_variance(gate, state)
         self._expected = _Gaussian(self.y, np.eye(2))
         memory = None if modelling.general(self.blocks) else state.gate
-        self._judging: Judging[StepFilter] = Judging(gate, memory)
+        self._judging: _Judging = _Judging(gate, memory, monitor)  # type: ignore[assignment]
         self._passes = self._judging.passes
         if gate is not None and memory is not None:
             self._go_on(memory)
-
-    events = ToldEvents()
 
     def _go_on(self, memory: AugmentedGateMemory) -> None:
         """Take over what the blocks of a challenger knew at the start of a record, and the challenger."""
@@ -148,29 +149,25 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             attitude, x, F = np.split(memory.challenger, [4, 4 + size - 3])
             root = F.reshape(size, size)[:, back]
             others = np.concatenate([np.zeros(3), x])[back][3:]
-            self._judging.challenger = self._rival(
+            self._judging.challenger = self._challenger(
                 AugmentedState(
                     attitude=attitude, bias=others[:3], values=others[3:], covariance=root.T @ root, factor=root
                 )
             )
 
-    def predict(self, delta_theta: ArrayLike, dt: float) -> None:
-        """Propagate over one gyro increment (3,), rad, of dt seconds; a repeated sample (of no length) is counted and changes nothing."""
-        increment = array("delta_theta", delta_theta, (3,))
-        left = non_negative("dt", dt, unit="s")
-        if left == 0.0:
-            self.repeated += 1
-            return
-        model = self._model("")
+    def _predict(self, increment: Array, step: float, end: float) -> None:
+        model, left = self._model(""), step
+        rival = self._judging.challenger
+        running = [self] if rival is None else [self, rival]
         while left > 0.0:
-            rival = self._judging.challenger
-            running = [self] if rival is None else [self, rival]
             x = np.array([one.bias for one in running])
-            step = float(augmented_loop.longest_common_step(left, tuple(increment), x, len(x), model.limit))
-            part = increment * (step / left)
+            longest = float(augmented_loop.longest_common_step(left, tuple(increment), x, len(x), model.limit))
+            part = increment * (longest / left)
             for one in running:
-                one._step(part, step, model)
-            increment, left = increment - part, left - step if step < left else 0.0
+                one._step(part, longest, model)
+            increment, left = increment - part, left - longest if longest < left else 0.0
+        for one in running:
+            one.time = end
 
     def _model(self, sensor: str) -> modelling.Model:
         """Return the linear blocks as arrays, seen from one sensor."""
@@ -236,7 +233,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
                 own = slice(6 + where.start, 6 + where.stop)
                 after = _told(block, "propagate", block.propagate(self.values[where], interval), interval.time)
                 self.values[where], self.F[own, own], self.F[own, :3], self.Q[own, own] = after
-        super().predict()
+        filterpy.kalman.ExtendedKalmanFilter.predict(self)
         self.attitude = quaternion.normalize(np.array(attitude))
         self.rate = np.array(rate)
         self.time += dt
@@ -255,34 +252,75 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
                 moved[where] = Phi[own] @ values[where]
         return _Gaussian(moved, Phi @ P @ Phi.T + Q)
 
-    def update_direction(self, vector_b: ArrayLike, reference_f: ArrayLike, sigma: ArrayLike, sensor: str = "") -> bool:
+    def update_direction(
+        self,
+        vector_b: ArrayLike,
+        reference_f: ArrayLike,
+        sigma: ArrayLike | None = None,
+        sensor: str = "",
+        *,
+        covariance: ArrayLike | None = None,
+        time: float | None = None,
+    ) -> bool:
         """Update with a measured unit direction (3,) of a known one (3,): two degrees of freedom.
 
-        ``sigma``, here and below: of each component, of each body axis (3,), or a covariance in body axes (3, 3), the square of the unit.
-        Returns whether it was taken in.
+        ``sigma``, here and below: of each component, of each body axis (3,), or a covariance in body axes (3, 3), the square of the unit,
+        which ``covariance`` may tell as well. ``time`` is that of validity, s, if it is not now. Returns whether it was taken in.
         """
-        return self._update("direction", vector_b, reference_f, sigma, sensor)
+        return self._vector("direction", vector_b, reference_f, (sigma, covariance), sensor, time)
 
-    def update_vector(self, vector_b: ArrayLike, reference_f: ArrayLike, sigma: ArrayLike, sensor: str = "") -> bool:
+    def update_vector(
+        self,
+        vector_b: ArrayLike,
+        reference_f: ArrayLike,
+        sigma: ArrayLike | None = None,
+        sensor: str = "",
+        *,
+        covariance: ArrayLike | None = None,
+        time: float | None = None,
+    ) -> bool:
         """Update with a measured vector (3,) of a known one (3,), in their unit: three degrees of freedom."""
-        return self._update("vector", vector_b, reference_f, sigma, sensor)
+        return self._vector("vector", vector_b, reference_f, (sigma, covariance), sensor, time)
 
-    def update_heading(self, vector_b: ArrayLike, reference_f: ArrayLike, sigma: float, sensor: str = "") -> bool:
+    def update_heading(
+        self,
+        vector_b: ArrayLike,
+        reference_f: ArrayLike,
+        sigma: float,
+        sensor: str = "",
+        *,
+        time: float | None = None,
+    ) -> bool:
         """Update with the heading of a measured vector's horizontal part: one degree of freedom, ``sigma`` rad."""
-        return self._update("heading", vector_b, reference_f, sigma, sensor)
+        return self._vector("heading", vector_b, reference_f, (sigma, None), sensor, time)
 
-    def update_attitude(self, attitude: ArrayLike, sigma: ArrayLike, sensor: str = "") -> bool:
+    def update_attitude(
+        self,
+        attitude: ArrayLike,
+        sigma: ArrayLike | None = None,
+        sensor: str = "",
+        *,
+        covariance: ArrayLike | None = None,
+        time: float | None = None,
+    ) -> bool:
         """Update with a measured attitude q_fb (4,): three degrees of freedom."""
         given = array("attitude", attitude, (4,), allow_nan=True)
         if np.isnan(given).any():
             return self._skip(sensor)
         measured = unit_quaternions("attitude", given)
         frame = (*measured, 0.0, 0.0, 0.0, 0.0, 0.0)
-        return self._measure(
-            _Measured(kind="attitude", z=(0.0, 0.0, 0.0), frame=frame, noise=_covariance(sigma), sensor=sensor)
-        )
+        noise = _covariance(sigma, covariance)
+        return self._give(_Measured(kind="attitude", z=(0.0, 0.0, 0.0), frame=frame, noise=noise, sensor=sensor), time)
 
-    def _update(self, kind: str, vector_b: ArrayLike, reference_f: ArrayLike, sigma: ArrayLike, sensor: str) -> bool:
+    def _vector(
+        self,
+        kind: str,
+        vector_b: ArrayLike,
+        reference_f: ArrayLike,
+        noise: tuple[ArrayLike | None, ArrayLike | None],
+        sensor: str,
+        time: float | None,
+    ) -> bool:
         z = array("vector_b", vector_b, (3,), allow_nan=True)
         if np.isnan(z).any():
             return self._skip(sensor)
@@ -292,18 +330,19 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         frame = triad(r)
         if kind == "heading":
             need_level("reference_f", frame[2])
-            positive("sigma", sigma, unit="rad")  # type: ignore[arg-type]
+            positive("sigma", noise[0], unit="rad")  # type: ignore[arg-type]
         length = float(np.linalg.norm(r)) if kind == "vector" else 1.0
-        return self._measure(
+        return self._give(
             _Measured(
                 kind=kind,
                 z=tuple(z / length),
                 frame=tuple(frame.ravel()),
                 length=length,
-                noise=_covariance(sigma) / length**2,
+                noise=_covariance(*noise) / length**2,
                 sensor=sensor,
                 reference=r,
-            )
+            ),
+            time,
         )
 
     def _need_known(self, sensor: str) -> None:
@@ -315,24 +354,21 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
 
     def _skip(self, sensor: str) -> bool:
         self._need_known(sensor)
-        self.skipped[sensor] = self.skipped.get(sensor, 0) + 1
-        return False
+        return super()._skip(sensor)
 
-    def _measure(self, measured: _Measured) -> bool:
+    def _give(self, measured: _Measured, time: float | None) -> bool:
+        """Take in a measurement at its time (:meth:`strapdown.mekf.StepFilter._measure`)."""
         sensor = measured.sensor
         self._need_known(sensor)
         if self.kinds.setdefault(sensor, measured.kind) != measured.kind:
             raise InputError(
                 f"{sensor or 'the sensor'} gave kind {self.kinds[sensor]!r} before, now {measured.kind!r}; name each sensor"
             )
-        shown = self._shows(measured)
-        outcome = self._correct(measured)
-        if not shown:
-            self._skip(sensor)
-        elif outcome != ACCEPTED:
-            self.refused[sensor] = self.refused.get(sensor, 0) + 1
-        self._judging.judge(self, sensor, outcome, lambda rival: rival._correct(measured))
-        return outcome == ACCEPTED
+        return self._measure(measured, sensor, time, measured.kind == "heading")
+
+    def _kept(self) -> dict[str, Any]:
+        kept = super()._kept()
+        return {**kept, "values": self.values, "rate": self.rate, "_prior": self._prior} if kept else {}
 
     def _rows(self, measured: _Measured, attitude: Array, others: Array) -> Rows:
         """Return a measurement as seen from an attitude and (b, c) (3 + m,)."""
@@ -369,11 +405,6 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         noise = (basis @ measured.noise @ basis.T)[:count, :count]
         return y[:count].copy(), H[:count, : 6 + m].copy(), noise, angle, far
 
-    def _shows(self, measured: _Measured) -> bool:
-        """Return whether a measurement is not the heading of a vertical vector."""
-        R = tuple(quaternion.to_matrix(self.attitude).ravel())
-        return measured.kind != "heading" or bool(robust_step.has_heading(R, measured.z))
-
     def _linearised(self, measured: _Measured, others: Array, threshold: float) -> Linearised:
         """Return a measurement seen from the state that its update leads to: :func:`strapdown.robustness.linearise`, all states along."""
         A = self.P[:3, :3]
@@ -403,20 +434,29 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
                 done, now, now_others, step = 0, self.attitude, others, np.zeros(len(P))
                 axis = np.array(robust_step.least_certain_axis(tuple(A[np.triu_indices(3)])))
                 step[:3] = math.copysign(robust_step.TURN_ASIDE, trials - 1.5) * axis
-            now = quaternion.normalize(quaternion.multiply(now, quaternion.exp(step[:3])))
-            now_others = now_others + step[3:]
+            last, now = now, quaternion.normalize(quaternion.multiply(now, quaternion.exp(step[:3])))
+            now_others = self._turning(last, now)[3:, 3:] @ (now_others + step[3:])
             P, back = seen_from(quaternion.multiply(quaternion.conjugate(self.attitude), now), self.P)
-            prior = np.concatenate([back, others - now_others])
+            T = self._turning(self.attitude, now)
+            P = T @ P @ T.T
+            prior = np.concatenate([back, T[3:, 3:] @ others - now_others])
             done += 1
 
-    def _correct(self, measured: _Measured) -> int:
+    def _correct(self, rows: Measured, of_heading: bool) -> int:
         """Take in a measurement; return ``ACCEPTED``, ``REFUSED`` or ``PASSED_OVER``."""
-        if not self._shows(measured):
+        assert isinstance(rows, _Measured)
+        if not rows.shown(self.attitude):
             self.weight = 0.0
             self._expected = _Gaussian(np.array([np.nan]), np.eye(1))
             return PASSED_OVER
+        outcome = self._take(rows)
+        self._judging.watch(self, outcome)
+        return outcome
+
+    def _take(self, measured: _Measured) -> int:
         others = np.concatenate([self.bias, self.values])
         threshold = np.inf if self.gate is None else float(self.gate.thresholds[KINDS[measured.kind] - 1])
+        before = self.attitude
         seen = self._linearised(measured, others, threshold)
         self.nis = seen.nis
         self.dim_z = len(seen.residual)
@@ -428,8 +468,11 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             return PASSED_OVER if unknown else REFUSED
         self.weight = 1.0 if self.robust is None else seen.weight(self.robust)
         self.attitude, self.P, self.x = seen.attitude, seen.covariance, seen.prior.copy()
-        H = seen.H
-        super().update(seen.residual, HJacobian=lambda x: H, Hx=lambda x: H @ x, R=seen.noise / self.weight)
+        self.values = self._turning(before)[6:, 6:] @ self.values
+        H, before = seen.H, self.attitude
+        filterpy.kalman.ExtendedKalmanFilter.update(
+            self, seen.residual, HJacobian=lambda x: H, Hx=lambda x: H @ x, R=seen.noise / self.weight
+        )
         correction = self.x[:3]
         self._move(self.x - np.concatenate([np.zeros(3), seen.prior[3:]]))
         if self._passes > 1 and np.trace(self.P[:3, :3]) > robust_step.KNOWN:
@@ -438,32 +481,41 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             G = np.eye(len(self.x))
             G[:3, :3] = kinematics.right_jacobian(correction)
             self.P = G @ self.P @ G.T
+        G = self._turning(before)
+        self.P = G @ self.P @ G.T
         self.P_post = self.P.copy()
         self.x = np.zeros(len(self.x))
         return ACCEPTED
 
     def _move(self, correction: Array) -> None:
-        self.attitude = quaternion.normalize(quaternion.multiply(self.attitude, quaternion.exp(correction[:3])))
+        before = self.attitude
+        self.attitude = quaternion.normalize(quaternion.multiply(before, quaternion.exp(correction[:3])))
         self.bias, self.values = self.bias + correction[3:6], self.values + correction[6:]
+        self.values = self._turning(before)[6:, 6:] @ self.values
+
+    def _turning(self, before: Array, after: Array | None = None) -> Array:
+        """Return what a correction of the attitude, to the present one, makes of the states (n, n): it turns those that are carried."""
+        after = self.attitude if after is None else after
+        return modelling.turning_matrix(self._model("").chains, len(self.x), before, after)
 
     def _restarted(self, attitude_sigma: float, bias_width: float) -> StepFilter:
         P = np.zeros_like(self.P)
         P[:3, :3] = attitude_sigma**2 * np.eye(3)
         P[3:6, 3:6] = self.P[3:6, 3:6] + bias_width**2 * np.diag(self._restart_bias_variance)
         P[6:, 6:] = self._prior.covariance
-        return self._rival(
+        return self._challenger(
             AugmentedState(attitude=self.attitude, bias=self.bias, values=self._prior.mean, covariance=P)
         )
 
-    def _rival(self, state: AugmentedState) -> StepFilter:
+    def _challenger(self, state: AugmentedState) -> StepFilter:
         """Return a challenger in this state."""
-        rival = StepFilter(self.process_noise, state, self.blocks, gate=self.gate, robust=self.robust)
-        rival.time, rival.rate = self.time, self.rate
+        rival = StepFilter(self.process_noise, state, self.blocks, gate=self.gate, robust=self.robust, time=self.time)
+        rival.rate = self.rate
         rival.kinds, rival._models = self.kinds, self._models
         rival._passes = WIDE_PASSES
         return rival
 
-    def _become(self, other: StepFilter) -> None:
+    def _become(self, other: mekf.StepFilter) -> None:
         for name in ("attitude", "bias", "values", "P", "rate"):
             setattr(self, name, getattr(other, name))
 
@@ -471,6 +523,44 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         """Return the present state."""
         P = 0.5 * (self.P + self.P.T)
         return AugmentedState(attitude=self.attitude, bias=self.bias, values=self.values, covariance=P)
+
+
+class _Judging(Judging[StepFilter]):
+    """A gate and a monitor beside it."""
+
+    def __init__(self, gate: Gate | None, memory: GateMemory | None, monitor: Monitor | None) -> None:
+        super().__init__(gate, memory)
+        self.monitor = monitor
+        # Time, NIS and degrees of freedom of what was measured. Copies share the rows, of which each knows how many are its own: the
+        # filter goes back to what it was, and never forth again.
+        self.seen: list[tuple[float, float, int]] = []
+        self.number = 0
+
+    def watch(self, filter: StepFilter, outcome: int) -> None:
+        """Note the NIS of what was just measured; of what was not taken in the gate's threshold."""
+        if self.monitor is None:
+            return
+        degrees, nis = filter.dim_z, filter.nis
+        if self.gate is not None and outcome != ACCEPTED:
+            nis = float(self.gate.thresholds[degrees - 1])
+        del self.seen[self.number :]
+        self.seen.append((filter.time, nis, degrees))
+        self.number += 1
+
+    @property
+    def events(self) -> tuple[Event, ...]:
+        """Recoveries, lock-outs and what the monitor says, in order of time."""
+        told = super().events
+        if self.monitor is None or not self.number:
+            return told
+        time, nis, degrees = (np.array(column) for column in zip(*self.seen[: self.number], strict=True))
+        return tuple(sorted([*told, *self.monitor.watch(time, nis, degrees)], key=lambda event: event.start))
+
+    def _widen(self, rival: StepFilter) -> None:
+        before = rival.attitude
+        super()._widen(rival)
+        T = rival._turning(before)  # of what the rival carries, too
+        rival.P = T @ rival.P @ T.T
 
 
 @dataclass(frozen=True)
@@ -493,9 +583,22 @@ class _Measured:
     sensor: str
     reference: Array | None = None
 
+    def shown(self, attitude: Array) -> bool:
+        """Return whether it is not the heading of a vector that is vertical, seen from an attitude."""
+        R = tuple(quaternion.to_matrix(attitude).ravel())
+        return self.kind != "heading" or bool(robust_step.has_heading(R, self.z))
 
-def _covariance(sigma: ArrayLike) -> Array:
-    """Return the covariance (3, 3) of a noise told by one sigma, one an axis, or itself."""
+    def __call__(self, attitude: Array) -> Rows:
+        """Return rows that tell whether it shows anything at all, which is what the plain filter asks of it."""
+        return np.zeros(1), np.full((1, 1), float(self.shown(attitude))), np.eye(1), 0.0, 1.0
+
+
+def _covariance(sigma: ArrayLike | None, whole: ArrayLike | None) -> Array:
+    """Return the covariance (3, 3) of a noise told by one sigma, one an axis, or itself as either."""
+    if (sigma is None) == (whole is None):
+        raise InputError("give either sigma or covariance: the noise of the measurement")
+    if sigma is None:
+        return covariance("covariance", np.asarray(whole), 3)
     if np.ndim(sigma) == 2:
         return covariance("sigma", array("sigma", sigma, (3, 3)), 3)
     if np.shape(sigma) not in ((), (3,)):

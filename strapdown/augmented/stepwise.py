@@ -16,7 +16,7 @@ from strapdown import kinematics, mekf, quaternion
 from strapdown.augmented import joining, stepping
 from strapdown.augmented.blocks import Block
 from strapdown.augmented.filtering import AugmentedEstimate
-from strapdown.augmented.model import AugmentedState
+from strapdown.augmented.model import AugmentedState, turning_matrix
 from strapdown.checks import Array
 from strapdown.mekf import ProcessNoise
 from strapdown.records import ImuRecord
@@ -45,6 +45,8 @@ class Step:
     after: Passed
     transition: Array
     process_noise: Array
+    chains: Array
+    """Those of the blocks' model, which tell what is carried."""
 
 
 class RecordingFilter(stepping.StepFilter):
@@ -57,9 +59,9 @@ class RecordingFilter(stepping.StepFilter):
         self.steps: list[Step] = []
         self.number = [0]
 
-    def predict(self, delta_theta: ArrayLike, dt: float) -> None:
+    def predict(self, delta_theta: ArrayLike, dt: float | None = None, *, time: float | None = None) -> None:
         """Predict as ever."""
-        super().predict(delta_theta, dt)
+        super().predict(delta_theta, dt, time=time)
         self.number.append(len(self.steps))
 
     def _step(self, part: Array, dt: float, model: object) -> None:
@@ -71,6 +73,7 @@ class RecordingFilter(stepping.StepFilter):
                 after=Passed.of(self),
                 transition=self.F.copy(),
                 process_noise=self.Q.copy(),
+                chains=self._model("").chains,
             )
         )
 
@@ -82,18 +85,16 @@ def back(step: Step, later: Passed) -> Passed:
     scale = np.sqrt(np.diag(predicted))
     gain = np.linalg.solve(predicted / np.outer(scale, scale), (F @ P) / scale[:, None]).T / scale
     a = quaternion.log(quaternion.multiply(quaternion.conjugate(step.after.attitude), later.attitude))
-    J = np.eye(len(P))
+    J = turning_matrix(step.chains, len(P), later.attitude, step.after.attitude)
     J[:3, :3] = kinematics.inverse_right_jacobian(a)
-    x = gain @ np.concatenate([a, later.others - step.after.others])
+    x = gain @ np.concatenate([a, J[3:, 3:] @ later.others - step.after.others])
     kept = np.eye(len(P)) - gain @ F
     carried = gain @ J
     P = kept @ P @ kept.T + gain @ step.process_noise @ gain.T + carried @ later.covariance @ carried.T
+    attitude = quaternion.normalize(quaternion.multiply(step.before.attitude, quaternion.exp(x[:3])))
+    J = turning_matrix(step.chains, len(P), step.before.attitude, attitude)
     J[:3, :3] = kinematics.right_jacobian(x[:3])
-    return Passed(
-        attitude=quaternion.normalize(quaternion.multiply(step.before.attitude, quaternion.exp(x[:3]))),
-        others=step.before.others + x[3:],
-        covariance=J @ P @ J.T,
-    )
+    return Passed(attitude=attitude, others=J[3:, 3:] @ (step.before.others + x[3:]), covariance=J @ P @ J.T)
 
 
 def smooth(
@@ -104,8 +105,8 @@ def smooth(
     lag: float,
     gate: Gate | None,
     robust: Robust | None,
-) -> tuple[AugmentedEstimate, list[Passed], Array]:
-    """Return the filter's estimate, the smoothed state at every edge, and the filter's attitude there (n, 4)."""
+) -> tuple[AugmentedEstimate, list[Passed]]:
+    """Return the filter's estimate and the smoothed state at every edge."""
     face = RecordingFilter(process_noise, state, blocks, gate=gate, robust=robust)
     forward, _ = stepping.run_on(
         record, process_noise, state, blocks, every=len(record.time), gate=gate, robust=robust, face=face
@@ -120,7 +121,6 @@ def smooth(
     first = np.array(face.number)[np.searchsorted(predicted, joining.stops(record.time, breaks))]
     places = np.arange(len(rows))
     found: list[Passed] = [rows[-1]] * len(record.time)
-    filtered = np.empty((len(record.time), 4))
     for one in joining.trajectories(record.time, until, breaks, first, places, [None] * len(breaks)):
         own = one.segments[one.starts[one.edge]]
         # From edge to edge backward; those that see the same go on with what the one after has found.
@@ -134,5 +134,4 @@ def smooth(
                 now -= 1
                 later = back(steps[now], later)
             found[one.row[k]] = later
-            filtered[one.row[k]] = rows[own[k]].attitude
-    return forward, found, filtered
+    return forward, found

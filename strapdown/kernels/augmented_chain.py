@@ -1,9 +1,10 @@
 """Optional states in chains, each fed by the next: what shapes the white noise of a chain's last state by any real poles.
 
-``ċₖ = −λₖ cₖ + gₖ cₖ₊₁``, the last one of a chain driven by white noise of PSD q besides: ``decay`` λ, and ``chains`` (states, 2) with g
-and q. Chains have up to :data:`CHAIN` states and do not enter the gyro. :mod:`strapdown.kernels.augmented_step` lets each state decay by
-itself; what is here comes after it, as ``Φ = (I + U) diag(e^{−λ dt})`` with U strictly upper triangular. Triangular factors stay
-triangular, and where there is no chain nothing is called.
+``ċₖ = −λₖ cₖ + gₖ cₖ₊₁``, the last one of a chain driven by white noise of PSD q besides: ``decay`` λ, and ``chains`` (states, 3) with g
+and q; the last column is what :func:`strapdown.kernels.augmented_step.turn_values` wants. Chains have up to :data:`CHAIN` states and do
+not enter the gyro. :mod:`strapdown.kernels.augmented_step` lets each state decay by itself; what is here comes after it, as
+``Φ = (I + U) diag(e^{−λ dt})`` with U strictly upper triangular. Triangular factors stay triangular, and where there is no chain nothing is
+called.
 
 Plain arithmetic on arrays, for both faces.
 """

@@ -14,9 +14,12 @@ from strapdown.kernels.augmented_step import (
     decorrelate,
     fill_noise,
     fill_rows,
+    fixed_turn,
     longest_step,
     move,
+    turn_columns,
     turn_rows,
+    turn_values,
     turning_matrix,
 )
 from strapdown.kernels.filter_loop import ATTITUDE, DIRECTION, HEADING, vector_at
@@ -156,9 +159,9 @@ def run_augmented(
     ``attitude`` (4,), ``x`` and the triangle at the top of ``F`` hold the state and are left at the end state; the rest of F takes the rows
     of noise. ``scratch`` holds arrays (states, 3), (states,), (3, size), (3,), (3,), (3, 3), (size,), one as wide as F and (6, 6).
     ``limit`` bounds a step by the states that decay. ``chains`` and its scratch ``links`` are those of
-    :mod:`strapdown.kernels.augmented_chain`, empty where no state feeds another. ``event_turning`` (events, 9) has the measured rate and
-    the angular acceleration of each event, and the variances of the latter's axes, 0 for sensors without a lever arm. It may be empty, as
-    ``event_noise``, the two covariances, ``whole_variance_out`` and ``segment_out`` may.
+    :mod:`strapdown.kernels.augmented_chain`, empty where no state feeds another and none is carried. ``event_turning`` (events, 9) has the
+    measured rate and the angular acceleration of each event, and the variances of the latter's axes, 0 for sensors without a lever arm. It
+    may be empty, as ``event_noise``, the two covariances, ``whole_variance_out`` and ``segment_out`` may.
     Returns the number of segments stored.
     """
     size = len(x) + 3
@@ -256,6 +259,7 @@ def run_augmented(
             if kind == HEADING and H[0, 0] == 0.0 and H[0, 1] == 0.0 and H[0, 2] == 0.0:
                 innovation_out[e, 0] = math.nan  # of a vertical vector, which shows none: skipped
             a = (correction[0], correction[1], correction[2])
+            before = q
             if dot(a, a) > 1.0:
                 far, G = far_turn(a)
                 q = unit(quaternion_multiply(q, far))
@@ -265,7 +269,13 @@ def run_augmented(
             for i in range(len(x)):
                 x[i] += correction[3 + i]
             turn_rows(F, size, G)
-            triangularise(F, 3, 3, size, size, 0, 0, work)
+            if len(chains) > 0:
+                A = fixed_turn(before, q)
+                turn_values(chains, A, x, 3)
+                loose = turn_columns(chains, A, F, size)
+                triangularise(F, loose, loose, size, size, 0, 0, work)
+            else:
+                triangularise(F, 3, 3, size, size, 0, 0, work)  # numbers known beforehand
             e += 1
         if now >= end and (e == events or event_time[e] > end):
             if countdown == 0:

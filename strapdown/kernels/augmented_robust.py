@@ -20,6 +20,7 @@ from strapdown.kernels.algebra import (
     multiply,
     scale,
     times_transpose_upper,
+    transpose,
     transpose_times_vector,
 )
 from strapdown.kernels.augmented_chain import chain_start, chain_step
@@ -30,8 +31,11 @@ from strapdown.kernels.augmented_step import (
     arm_noise,
     decorrelate,
     fill_rows,
+    fixed_turn,
     put_row,
+    turn_columns,
     turn_rows,
+    turn_values,
     turning_matrix,
 )
 from strapdown.kernels.filter_loop import ATTITUDE, DIRECTION, HEADING, vector_at
@@ -153,6 +157,7 @@ def take_in(
     s,
     sensors,
     sensor_use,
+    chains,
     turning,
     passes,
     threshold,
@@ -167,7 +172,8 @@ def take_in(
     ``noise`` is its covariance in body axes, ``turning`` the measured rate and the angular acceleration, and ``arm`` the variances of the
     latter, which a lever arm needs. An iterated update is linearised anew in all states, until neither the attitude's correction nor what
     the others' does to the rows exceeds ``RELINEARIZED``. The rows are turned to the prior's tangent space, not the factor to theirs; it is
-    carried to that of the estimate at the end, with the reset. A heading of a vertical vector is passed over, and its innovation is NaN.
+    carried to that of the estimate at the end, with the reset. Carried states are turned along with the attitude likewise. A heading of a
+    vertical vector is passed over, and its innovation is NaN.
 
     Returns ``ACCEPTED``, ``REFUSED`` or ``PASSED_OVER``, the weight, q, and e₁, s₁, e₂, s₂, e₃, s₃; ``x`` and ``F`` are left at the new
     state, or as they were.
@@ -188,6 +194,7 @@ def take_in(
         first_H = turned_H
     tolerance = SETTLED if A[0] + A[3] + A[5] >= UNKNOWN else RELINEARIZED
     M = IDENTITY
+    B = IDENTITY  # the turn from the prior's attitude, fixed axes
     first_error = (0.0, 0.0, 0.0)
     first_factors = (0.0, 0.0, 0.0, 1.0, 1.0, 1.0)
     done = 1
@@ -213,6 +220,8 @@ def take_in(
                 p2 += H[2, i] * prior[i]
             for r in range(3):
                 put_row(turned_H, r, transpose_times_vector(M, (H[r, 0], H[r, 1], H[r, 2])))
+            if len(chains) > 0:
+                turn_columns(chains, transpose(B), turned_H, 3)
         S = predicted_rows(F, size, first_H, rows, seen)
         y0 = y[0]
         y1 = y[1] if rows > 1 else 0.0
@@ -239,6 +248,8 @@ def take_in(
             for i in range(j + 1):
                 step[i] += F[j, i] * w
         step[0], step[1], step[2] = matrix_times_vector(M, (step[0], step[1], step[2]))
+        if len(chains) > 0:
+            turn_values(chains, B, step, 6)
         for i in range(size):
             step[i] += prior[i]
         squared = step[0] * step[0] + step[1] * step[1] + step[2] * step[2]
@@ -262,12 +273,19 @@ def take_in(
                 now_x[i] = x[i]
                 step[3 + i] = 0.0
             step[0], step[1], step[2] = scale(math.copysign(TURN_ASIDE, trials - 1.5), least_certain_axis(A))
+        old_q = now_q
         now_q, _ = moved(now_q, (step[0], step[1], step[2]))
         _, M, back = seen_from(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), now_q), A, IDENTITY)
         prior[0], prior[1], prior[2] = back
         for i in range(len(x)):
             now_x[i] += step[3 + i]
-            prior[3 + i] = x[i] - now_x[i]
+            prior[3 + i] = x[i]
+        if len(chains) > 0:
+            B = fixed_turn(q, now_q)
+            turn_values(chains, fixed_turn(old_q, now_q), now_x, 3)
+            turn_values(chains, B, prior, 6)
+        for i in range(len(x)):
+            prior[3 + i] -= now_x[i]
         done += 1
     weight = 0.0
     outcome = REFUSED
@@ -288,6 +306,7 @@ def take_in(
             for i in range(size):
                 step[i] += left / s2 * work[i]
         a = add((prior[0], prior[1], prior[2]), matrix_times_vector(M, (step[0], step[1], step[2])))
+        before = q
         q, G = moved(now_q, a)
         for i in range(len(x)):
             x[i] += step[3 + i]
@@ -298,7 +317,13 @@ def take_in(
                 turn, _ = moved((1.0, 0.0, 0.0, 0.0), a)
                 _, G, _ = seen_from(turn, A, IDENTITY)
         turn_rows(F, size, G)
-        triangularise(F, 3, 3, size, size, 0, 0, work)
+        if len(chains) > 0:
+            B = fixed_turn(before, q)
+            turn_values(chains, B, x, 3)
+            loose = turn_columns(chains, B, F, size)
+            triangularise(F, loose, loose, size, size, 0, 0, work)
+        else:
+            triangularise(F, 3, 3, size, size, 0, 0, work)
     return outcome, weight, q, e1, 1.0 / factors[3], e2, 1.0 / factors[4], e3, 1.0 / factors[5]
 
 
@@ -448,7 +473,7 @@ def bias_variances(F, size):
     return (x, y, z)
 
 
-def widen(attitude, x, F, size, memory, column, work):
+def widen(attitude, x, F, size, memory, chains, column, work):
     """Make the challenger what it would be had its bias started wider: :func:`strapdown.kernels.robust_loop.widen` with optional states.
 
     What is taken in has a negative variance, beyond that of the bias, and only adds to P: |1/s| P e (P e)ᵀ, a row more of the factor.
@@ -474,8 +499,15 @@ def widen(attitude, x, F, size, memory, column, work):
     q, _ = moved((1.0, 0.0, 0.0, 0.0), turn)
     _, G, _ = seen_from(q, attitude_covariance(F[1], size), IDENTITY)
     turn_rows(F[1], size, G)
-    triangularise(F[1], 3, 3, size, size, 0, 0, work)
-    attitude[1, 0], attitude[1, 1], attitude[1, 2], attitude[1, 3] = quaternion_multiply(attitude_at(attitude, 1), q)
+    before = attitude_at(attitude, 1)
+    after = quaternion_multiply(before, q)
+    loose = 3
+    if len(chains) > 0:
+        B = fixed_turn(before, after)
+        turn_values(chains, B, x[1], 3)
+        loose = turn_columns(chains, B, F[1], size)
+    triangularise(F[1], loose, loose, size, size, 0, 0, work)
+    attitude[1, 0], attitude[1, 1], attitude[1, 2], attitude[1, 3] = after
     count_widening(memory)
 
 
@@ -642,6 +674,7 @@ def run_augmented_robust(
                     sensor,
                     sensors,
                     sensor_use,
+                    chains,
                     turning,
                     int(memory[PASSES]) if i == 0 else WIDE_PASSES,
                     thresholds[degrees - 1],
@@ -689,7 +722,7 @@ def run_augmented_robust(
                     if verdict == DROPPED:
                         running = 1
                     elif verdict == TOO_NARROW:
-                        widen(attitude, x, F, size, memory, measuring[6], work)
+                        widen(attitude, x, F, size, memory, chains, measuring[6], work)
                     if verdict != DROPPED and is_believed(sensor, recovery, standing, memory):
                         recover(now, sensor, lock_out_limit, standing, memory, recovery_out[recoveries], lock_out_out)
                         recoveries += 1

@@ -4,7 +4,8 @@ A step back estimates the step's own noise w from what came later and takes it o
 ``[Φ S, Nᵀ] Θ = [S⁻, 0]`` and ``[0, I] Θ = [Y, Z]``, later knowledge of the predicted error δ says ``w = Y S⁻⁻¹ δ`` and leaves w the
 covariance ``Z Zᵀ`` (Bierman 1983 does it one noise at a time). So ``δ_before = Φ⁻¹ (δ − Nᵀ w)``, and the covariance is a sum of two
 squares: no difference is formed, and what has no noise is not touched. As in :mod:`strapdown.kernels.smoother_step`, the later factor is
-carried to the tangent space at the predicted attitude before the step, and the result to that at the smoothed one after it.
+carried to the tangent space at the predicted attitude before the step, and the result to that at the smoothed one after it; so are
+states that go along with the attitude.
 
 What depends on the filter alone, Φ, N, ``Y S⁻⁻¹`` and ``Z N``, is prepared once for all passes that meet a segment (:func:`prepare_step`).
 Compiled by :func:`strapdown.kernels.machine.compiled`.
@@ -14,7 +15,16 @@ from __future__ import annotations
 
 from strapdown.kernels.augmented_chain import carry_chains_back, step_chains
 from strapdown.kernels.augmented_factor import covariances, triangularise, variances
-from strapdown.kernels.augmented_step import carry, carry_back, fill_noise, move, turn_rows
+from strapdown.kernels.augmented_step import (
+    carry,
+    carry_back,
+    fill_noise,
+    fixed_turn,
+    move,
+    turn_columns,
+    turn_rows,
+    turn_values,
+)
 from strapdown.kernels.rotation import logarithm, quaternion_multiply
 from strapdown.kernels.smoother_step import inverse_right_jacobian, moved
 
@@ -129,6 +139,10 @@ def step_back(
     inverse = (predicted[0], -predicted[1], -predicted[2], -predicted[3])
     a = logarithm(quaternion_multiply(inverse, later_q))
     turn_rows(later_F, size, inverse_right_jacobian(a))
+    if len(chains) > 0:
+        A = fixed_turn(later_q, predicted)
+        turn_values(chains, A, later_x, 3)
+        turn_columns(chains, A, later_F, size)
     # The difference itself goes through the step as one row more.
     later_F[rows, 0], later_F[rows, 1], later_F[rows, 2] = a
     for i in range(len(x)):
@@ -149,11 +163,15 @@ def step_back(
     if len(chains) > 0:
         carry_chains_back(later_F, 0, rows + 1, links)
     carry_back(later_F, 0, rows + 1, phi11, phi12, coupling, factor, gyro_use, changing)
-    q = (segments[j, 4], segments[j, 5], segments[j, 6], segments[j, 7])
-    q, J = moved(q, (later_F[rows, 0], later_F[rows, 1], later_F[rows, 2]))
+    filtered = (segments[j, 4], segments[j, 5], segments[j, 6], segments[j, 7])
+    q, J = moved(filtered, (later_F[rows, 0], later_F[rows, 1], later_F[rows, 2]))
     for i in range(len(x)):
         later_x[i] = segments[j, 8 + i] + later_F[rows, 3 + i]
     turn_rows(later_F, rows, J)
+    if len(chains) > 0:
+        A = fixed_turn(filtered, q)
+        turn_values(chains, A, later_x, 3)
+        turn_columns(chains, A, later_F, rows)
     triangularise(later_F, noisy, noisy, size, rows, 0, 0, work)
     return q
 

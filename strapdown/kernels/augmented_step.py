@@ -9,7 +9,8 @@ State: attitude ``q_fb``; ``x`` = (b, c): gyro bias and optional states c; facto
   (states, 12) holds e (3) and T or G (9, by rows), ``gyro_use`` the bits :data:`OFFSET`, :data:`SCALE` and :data:`FORCE`.
 - a sensor measures ``(I + Σ c U) R_fbᵀ (r + Σ c d) + Σ c a + v``: ``sensors`` (sensors, states, 15) holds a (3, body), d (3, fixed) and
   U (9), ``sensor_use`` the bits :data:`OFFSET`, :data:`FIXED` and :data:`SCALE`. With :data:`CARRIED` besides, d is not firm in the
-  fixed frame but goes along when the estimated attitude is corrected: the derivative with respect to the attitude leaves it out.
+  fixed frame but goes along when the estimated attitude is corrected: the derivative with respect to the attitude leaves it out, and each
+  correction turns the states themselves (:func:`turn_values`, :func:`turn_columns`).
   With :data:`LEVER` in place of OFFSET the offset is W a, ``W = [ẇ] + [w]²``: the acceleration at an arm a from the centre of turning.
 
 All but the square roots is plain arithmetic, so that the same functions serve the step-by-step face.
@@ -291,6 +292,38 @@ def turn_rows(F, end, G):
     """Carry the attitude's columns of rows 0 to ``end`` to another tangent space: ``S_θ ← G S_θ``."""
     for j in range(end):
         F[j, 0], F[j, 1], F[j, 2] = matrix_times_vector(G, (F[j, 0], F[j, 1], F[j, 2]))
+
+
+def fixed_turn(before, after):
+    """Return the turn from one attitude to another, fixed axes, as a matrix."""
+    return rotation_matrix(quaternion_multiply(after, (before[0], -before[1], -before[2], -before[3])))
+
+
+def turn_values(chains, A, values, first):
+    """Turn the vectors that carried states are by A; states stand in ``values`` from ``first`` on.
+
+    Such a state k, and those ``chains[k, 2]`` and twice as many after it, are the components of a vector in the axes of the *estimated*
+    attitude, ``c′ = R_est R_fbᵀ c``: what a sensor sees of it, ``R_estᵀ c′``, does not change when the attitude is corrected. So a
+    correction that turns R_est by A makes A c′ of it, exactly, and of its error likewise.
+    """
+    for k in range(len(chains)):
+        p = int(chains[k, 2])
+        if p > 0:
+            x, y, z = first + k, first + k + p, first + k + 2 * p
+            values[x], values[y], values[z] = matrix_times_vector(A, (values[x], values[y], values[z]))
+
+
+def turn_columns(chains, A, F, end):
+    """Turn the columns of carried states, of rows 0 to ``end``, likewise; return the number of columns that are no triangle's then."""
+    last = 3
+    for k in range(len(chains)):
+        p = int(chains[k, 2])
+        if p > 0:
+            x, y, z = 6 + k, 6 + k + p, 6 + k + 2 * p
+            last = max(last, z + 1)
+            for r in range(end):
+                F[r, x], F[r, y], F[r, z] = matrix_times_vector(A, (F[r, x], F[r, y], F[r, z]))
+    return last
 
 
 def matrix_at(array, s, k):
