@@ -348,8 +348,11 @@ def _nis_in_order(
 ) -> tuple[Array, Array, np.ndarray]:
     """Return times, NIS and degrees of freedom of all measurements in order; of refused ones the gate's threshold."""
     degrees = np.array([KINDS[kind] for kind in events.kinds], np.int64)[events.sensor]
-    each = innovation[:, 0::2] ** 2 / innovation[:, 1::2]
-    nis = np.sum(np.where(np.arange(each.shape[1]) < degrees[:, None], each, 0.0), axis=1)
+    # Beyond its degrees of freedom a row is not written.
+    each = np.zeros((len(innovation), innovation.shape[1] // 2))
+    told = np.arange(each.shape[1]) < degrees[:, None]
+    np.divide(np.square(innovation[:, 0::2], where=told, out=each), innovation[:, 1::2], out=each, where=told)
+    nis = np.sum(each, axis=1)
     if gate is not None and weight is not None:
         nis = np.where(weight > 0.0, nis, gate.thresholds[degrees - 1])
     if "heading" in events.kinds:
