@@ -61,7 +61,8 @@ def side_by_side(*wanted: tuple[Sequence[int], Any]) -> list[np.ndarray]:
     starts = [0]
     for size in sizes:
         starts.append(starts[-1] + -(-size // _ALIGNMENT) * _ALIGNMENT)
-    whole = _taken(starts[-1])
+    whole = _taken(starts[-1] + _ALIGNMENT)
+    whole = whole[-whole.__array_interface__["data"][0] % _ALIGNMENT :]
     return [
         whole[start : start + size].view(of).reshape(shape)
         for start, size, of, (shape, _) in zip(starts, sizes, types, wanted, strict=False)

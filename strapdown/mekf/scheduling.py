@@ -140,9 +140,9 @@ def schedule(
     bounds = np.cumsum([0, *(len(part.time) for part in parts)])
     first_frames = np.cumsum([0, *(len(part.frames) for part in parts[:-1])])
     return Schedule(
-        series_time=tuple(np.require(part.time, float, ("C", "A")) for part in parts),
-        series_vector_b=tuple(np.require(part.value, float, ("C", "A")) for part in parts),
-        series_sigma=tuple(np.require(part.sigma, float, ("C", "A")) for part in parts),
+        series_time=tuple(_plain(part.time) for part in parts),
+        series_vector_b=tuple(_plain(part.value) for part in parts),
+        series_sigma=tuple(_plain(part.sigma) for part in parts),
         standing_noise=_joined([part.noise for part in parts], (0, 6)) if any(s.anisotropic for s in vectors) else None,
         bounds=bounds,
         codes=np.array([_KIND_CODES[series.kind] for series in vectors], np.uint8),
@@ -165,6 +165,12 @@ def places(columns: Sequence[Array]) -> tuple[Array, np.ndarray]:
         return np.empty(0), np.empty(0, np.int64)
     addresses = np.array([column.ctypes.data for column in columns], np.int64)
     return columns[0].reshape(-1), (addresses - addresses[0]) // columns[0].itemsize
+
+
+def _plain(column: Array) -> Array:
+    """Return a column as kernels read it, aligned and without gaps; one that is so already is not touched."""
+    flags = column.flags
+    return column if flags.c_contiguous and flags.aligned else np.require(column, float, ("C", "A"))
 
 
 def _joined(columns: Sequence[Array], empty: tuple[int, ...]) -> Array:
@@ -199,8 +205,9 @@ class _Part:
 def _scheduled(series: VectorMeasurements, start: float, end: float) -> _Part:
     """Return the usable measurements of one series."""
     _need_noise(series)
-    inside = slice(*np.searchsorted(series.time, [start, np.nextafter(end, np.inf)]))
-    used = series if inside == slice(0, len(series.time)) else series.taken(inside)
+    used = series
+    if len(series.time) and not (start <= series.time[0] and series.time[-1] <= end):
+        used = series.taken(slice(*np.searchsorted(series.time, [start, np.nextafter(end, np.inf)])))
     content = used.vector_b if used.attitude is None else used.attitude
     # One number that is not finite makes their sum so; a sum takes no memory.
     if not np.isfinite(np.sum(content)):
@@ -237,7 +244,7 @@ def _scheduled(series: VectorMeasurements, start: float, end: float) -> _Part:
 
 def _need_noise(series: VectorMeasurements) -> None:
     """Refuse a series with a noise of zero about some axis."""
-    if not np.all(series.sigma > 0.0):
+    if len(series.sigma) and not np.min(series.sigma) > 0.0:
         k = int(np.argmin(series.sigma > 0.0))
         raise InputError(f"{series.sensor}: sigma[{k}] is 0 rad; a filter needs a noise greater than zero")
     if series.sigma_axes is not None and not np.all(series.sigma_axes > 0.0):
