@@ -274,28 +274,48 @@ def store(typingctx: Any, array: Any, start: Any, value: Any) -> Any:
     return types.void(array, types.intp, Lanes(array.dtype, WIDTH)), lower
 
 
+def _rows_of(builder: Any, columns: list[Any]) -> list[Any]:
+    """Return four columns of eight as eight rows of four."""
+    w, x, y, z = columns
+    pairs = [
+        [_picked(builder, a, b, [i for k in range(odd, WIDTH, 2) for i in (k, k + WIDTH)]) for a, b in ((w, x), (y, z))]
+        for odd in (0, 1)
+    ]
+    rows = []
+    for i in range(WIDTH):
+        wx, yz = pairs[i % 2]
+        place = i - i % 2
+        rows.append(_picked(builder, wx, yz, [place, place + 1, place + WIDTH, place + WIDTH + 1]))
+    return rows
+
+
 @intrinsic  # type: ignore[untyped-decorator]
 def store_quadruples(typingctx: Any, array: Any, start: Any, stride: Any, q: Any) -> Any:
     """Lower :func:`lane_values.store_quadruples`."""
 
     def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
         data, first, step, packed = arguments
-        w, x, y, z = cgutils.unpack_tuple(builder, packed)
-        pairs = [
-            [
-                _picked(builder, a, b, [i for k in range(odd, WIDTH, 2) for i in (k, k + WIDTH)])
-                for a, b in ((w, x), (y, z))
-            ]
-            for odd in (0, 1)
-        ]
-        for i in range(WIDTH):
-            wx, yz = pairs[i % 2]
-            place = i - i % 2
-            row = _picked(builder, wx, yz, [place, place + 1, place + WIDTH, place + WIDTH + 1])
+        for i, row in enumerate(_rows_of(builder, cgutils.unpack_tuple(builder, packed))):
             _write(context, builder, array, data, _row(builder, first, step, i), row)
         return context.get_dummy_value()
 
     return types.void(array, types.intp, types.intp, _tuple_of(array.dtype, 4)), lower
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def store_triples(typingctx: Any, array: Any, start: Any, stride: Any, v: Any) -> Any:
+    """Lower :func:`lane_values.store_triples`: a pair and a single, so that nothing beside them is written."""
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        data, first, step, packed = arguments
+        x, y, z = cgutils.unpack_tuple(builder, packed)
+        for i, row in enumerate(_rows_of(builder, [x, y, z, z])):
+            for places in ([0, 1], [2]):
+                part = _picked(builder, row, row, places)
+                _write(context, builder, array, data, _row(builder, first, step, i, places[0]), part)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, types.intp, _tuple_of(array.dtype, 3)), lower
 
 
 def _converted(builder: Any, value: Any, source: Any, target: Any) -> Any:
@@ -412,6 +432,21 @@ def store_like(typingctx: Any, array: Any, start: Any, value: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(array, types.intp, value), lower
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def fetch_ahead(typingctx: Any, array: Any, place: Any) -> Any:
+    """Lower :func:`lane_values.fetch_ahead`."""
+
+    def lower(context: Any, builder: Any, sig: Any, arguments: Any) -> Any:
+        data = context.make_array(array)(context, builder, arguments[0]).data
+        pointer = builder.bitcast(builder.gep(data, [arguments[1]]), ir.IntType(8).as_pointer())
+        flags = [ir.Constant(_INDEX, flag) for flag in (0, 3, 1)]  # to read, to keep, data
+        function = ir.FunctionType(ir.VoidType(), [pointer.type, _INDEX, _INDEX, _INDEX])
+        builder.call(cgutils.get_or_insert_function(builder.module, function, "llvm.prefetch.p0"), [pointer, *flags])
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp), lower
 
 
 @intrinsic  # type: ignore[untyped-decorator]
@@ -575,11 +610,13 @@ INTRINSICS = {
         load_quadruples,
         store,
         store_quadruples,
+        store_triples,
         lanes_of,
         flush_tiny,
         restore_mode,
         load_like,
         element,
+        fetch_ahead,
         store_like,
         narrowed,
         total,

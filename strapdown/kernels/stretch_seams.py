@@ -1,0 +1,429 @@
+"""Joining eight stretches of a record at their seams, on small arrays: where each begins, and what the stretches behind it tell.
+
+Stretch i stands in lane i of flat arrays of lanes (:mod:`strapdown.kernels.stretch_lanes`). ``work`` (8, 6, 6) is scratch.
+"""
+
+from __future__ import annotations
+
+import math
+
+from strapdown.kernels.algebra import full, multiply, times_transpose_upper
+from strapdown.kernels.filter_loop import store_state
+from strapdown.kernels.lane_values import WIDTH
+from strapdown.kernels.rotation import logarithm, quaternion_multiply, unit
+from strapdown.kernels.smoother_step import inverse_right_jacobian, moved, smooth
+from strapdown.kernels.stretch_lanes import STATE
+
+LEAST_LEFT = 1e-6
+"""Of a filtered variance: where less is left when all is known, the difference of covariances keeps too few digits."""
+_J = 36
+_ETA = 57
+
+
+def read_covariance(memory, place, lane, P):
+    """Write the covariance (A, B, C) of a lane to a 6×6 array."""
+    at = WIDTH * place + lane
+    n = 0
+    for i in range(3):
+        for j in range(i, 3):
+            P[i, j] = P[j, i] = memory[at + WIDTH * n]
+            P[3 + i, 3 + j] = P[3 + j, 3 + i] = memory[at + WIDTH * (15 + n)]
+            n += 1
+        for j in range(3):
+            P[i, 3 + j] = P[3 + j, i] = memory[at + WIDTH * (6 + 3 * i + j)]
+
+
+def write_covariance(memory, place, lane, P):
+    """Write what :func:`read_covariance` reads."""
+    at = WIDTH * place + lane
+    n = 0
+    for i in range(3):
+        for j in range(i, 3):
+            memory[at + WIDTH * n] = 0.5 * (P[i, j] + P[j, i])
+            memory[at + WIDTH * (15 + n)] = 0.5 * (P[3 + i, 3 + j] + P[3 + j, 3 + i])
+            n += 1
+        for j in range(3):
+            memory[at + WIDTH * (6 + 3 * i + j)] = 0.5 * (P[i, 3 + j] + P[3 + j, i])
+
+
+def read_sensitivity(sensitivity, lane, psi, J):
+    """Write Ψ and J of a lane to 6×6 arrays."""
+    n = WIDTH * _J + lane
+    for i in range(6):
+        for j in range(6):
+            psi[i, j] = sensitivity[WIDTH * (6 * i + j) + lane]
+        for j in range(i, 6):
+            J[i, j] = J[j, i] = sensitivity[n]
+            n += WIDTH
+
+
+def write_sensitivity(sensitivity, lane, psi, J):
+    """Write what :func:`read_sensitivity` reads."""
+    n = WIDTH * _J + lane
+    for i in range(6):
+        for j in range(6):
+            sensitivity[WIDTH * (6 * i + j) + lane] = psi[i, j]
+        for j in range(i, 6):
+            sensitivity[n] = 0.5 * (J[i, j] + J[j, i])
+            n += WIDTH
+
+
+def product(out, a, b):
+    """Write a b."""
+    for i in range(6):
+        for j in range(6):
+            total = 0.0
+            for k in range(6):
+                total += a[i, k] * b[k, j]
+            out[i, j] = total
+
+
+def product_transposed(out, a, b):
+    """Write a bᵀ."""
+    for i in range(6):
+        for j in range(6):
+            total = 0.0
+            for k in range(6):
+                total += a[i, k] * b[j, k]
+            out[i, j] = total
+
+
+def transposed_product(out, a, b):
+    """Write aᵀ b."""
+    for i in range(6):
+        for j in range(6):
+            total = 0.0
+            for k in range(6):
+                total += a[k, i] * b[k, j]
+            out[i, j] = total
+
+
+def times_left_block(out, M, a):
+    """Write diag(M, I) a, M a 9-tuple."""
+    for j in range(6):
+        for i in range(3):
+            out[i, j] = M[3 * i] * a[0, j] + M[3 * i + 1] * a[1, j] + M[3 * i + 2] * a[2, j]
+            out[3 + i, j] = a[3 + i, j]
+
+
+def times_right_block(out, a, M):
+    """Write a diag(M, I), M a 9-tuple."""
+    for i in range(6):
+        for j in range(3):
+            out[i, j] = a[i, 0] * M[j] + a[i, 1] * M[3 + j] + a[i, 2] * M[6 + j]
+            out[i, 3 + j] = a[i, 3 + j]
+
+
+def invert(a, out):
+    """Write the inverse of a, which is used up; return whether it has one. Gauss–Jordan with pivots of columns."""
+    for i in range(6):
+        for j in range(6):
+            out[i, j] = 1.0 if i == j else 0.0
+    for c in range(6):
+        best = c
+        for i in range(c + 1, 6):
+            if abs(a[i, c]) > abs(a[best, c]):
+                best = i
+        if not abs(a[best, c]) > 0.0:
+            return False
+        for j in range(6):
+            a[c, j], a[best, j] = a[best, j], a[c, j]
+            out[c, j], out[best, j] = out[best, j], out[c, j]
+        pivot = 1.0 / a[c, c]
+        for j in range(6):
+            a[c, j] *= pivot
+            out[c, j] *= pivot
+        for i in range(6):
+            factor = a[i, c]
+            if i != c and factor != 0.0:
+                for j in range(6):
+                    a[i, j] -= factor * a[c, j]
+                    out[i, j] -= factor * out[c, j]
+    return True
+
+
+def lane_attitude(memory, place, lane):
+    """Return the quaternion of a lane."""
+    at = WIDTH * place + lane
+    return (memory[at], memory[at + WIDTH], memory[at + 2 * WIDTH], memory[at + 3 * WIDTH])
+
+
+def lane_vector(memory, place, lane):
+    """Return a 3-vector of a lane."""
+    at = WIDTH * place + lane
+    return (memory[at], memory[at + WIDTH], memory[at + 2 * WIDTH])
+
+
+def row_times(a, i, v):
+    """Return row i of a times v (6,)."""
+    return (a[i, 0] * v[0] + a[i, 1] * v[1] + a[i, 2] * v[2]) + (a[i, 3] * v[3] + a[i, 4] * v[4] + a[i, 5] * v[5])
+
+
+def column_times(a, j, v):
+    """Return column j of a times v (6,)."""
+    return (a[0, j] * v[0] + a[1, j] * v[1] + a[2, j] * v[2]) + (a[3, j] * v[3] + a[4, j] * v[4] + a[5, j] * v[5])
+
+
+def six(a, b):
+    """Return two 3-vectors as one row of six."""
+    return (a[0], a[1], a[2], b[0], b[1], b[2])
+
+
+def join_starts(base, ends, sensitivity, starts, work):
+    """Write to ``starts`` where each stretch begins, from runs that began at ``base`` and came to ``ends``.
+
+    Stretch 0 begins where it did. The sensitivities are taken over to the new starts. Returns the largest move of a start, of its mean in σ
+    and of its covariance in units of the variances; infinity where a stretch's end cannot be told from its start.
+    """
+    psi, J, P, inverse, a, c, difference, moved_by = (
+        work[0],
+        work[1],
+        work[2],
+        work[3],
+        work[4],
+        work[5],
+        work[6],
+        work[7],
+    )
+    for i in range(STATE):
+        starts[WIDTH * i] = base[WIDTH * i]
+    largest = 0.0
+    for k in range(WIDTH):
+        read_sensitivity(sensitivity, k, psi, J)
+        eta = six(lane_vector(sensitivity, _ETA, k), lane_vector(sensitivity, _ETA + 3, k))
+        q = lane_attitude(base, 0, k)
+        b = lane_vector(base, 4, k)
+        start_b = lane_vector(starts, 4, k)
+        angle = logarithm(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), lane_attitude(starts, 0, k)))
+        d = six(angle, (start_b[0] - b[0], start_b[1] - b[1], start_b[2] - b[2]))
+        T = inverse_right_jacobian(angle)
+        # ΔP, both seen from the base's attitude.
+        read_covariance(starts, 7, k, P)
+        times_left_block(a, T, P)
+        times_right_block(c, a, (T[0], T[3], T[6], T[1], T[4], T[7], T[2], T[5], T[8]))
+        read_covariance(base, 7, k, a)
+        for i in range(6):
+            for j in range(6):
+                difference[i, j] = c[i, j] - a[i, j]
+                move = abs(difference[i, j]) / math.sqrt(P[i, i] * P[j, j])
+                if not move <= largest:
+                    largest = move
+            move = abs(d[i]) / math.sqrt(P[i, i])
+            if not move <= largest:
+                largest = move
+        if not largest < math.inf:
+            return math.inf
+        product(a, difference, J)
+        for i in range(6):
+            a[i, i] += 1.0
+        if not invert(a, inverse):
+            return math.inf
+        if k < WIDTH - 1:
+            v = (
+                d[0] + row_times(difference, 0, eta),
+                d[1] + row_times(difference, 1, eta),
+                d[2] + row_times(difference, 2, eta),
+                d[3] + row_times(difference, 3, eta),
+                d[4] + row_times(difference, 4, eta),
+                d[5] + row_times(difference, 5, eta),
+            )
+            v = (
+                row_times(inverse, 0, v),
+                row_times(inverse, 1, v),
+                row_times(inverse, 2, v),
+                row_times(inverse, 3, v),
+                row_times(inverse, 4, v),
+                row_times(inverse, 5, v),
+            )
+            step = (row_times(psi, 0, v), row_times(psi, 1, v), row_times(psi, 2, v))
+            product(a, inverse, difference)
+            product(c, psi, a)
+            product_transposed(a, c, psi)
+            read_covariance(ends, 7, k, c)
+            for i in range(6):
+                for j in range(6):
+                    a[i, j] += c[i, j]
+            end_q, G = moved(lane_attitude(ends, 0, k), step)
+            end_q = unit(end_q)
+            times_left_block(c, G, a)
+            times_right_block(moved_by, c, (G[0], G[3], G[6], G[1], G[4], G[7], G[2], G[5], G[8]))
+            for i in range(4):
+                starts[WIDTH * i + k + 1] = end_q[i]
+            for i in range(3):
+                starts[WIDTH * (4 + i) + k + 1] = ends[WIDTH * (4 + i) + k] + row_times(psi, 3 + i, v)
+            write_covariance(starts, 7, k + 1, moved_by)
+            for i in range(6):
+                if not moved_by[i, i] > 0.0:
+                    return math.inf
+            product(a, psi, inverse)
+            times_left_block(psi, G, a)
+        else:
+            product(a, psi, inverse)
+            for i in range(6):
+                for j in range(6):
+                    psi[i, j] = a[i, j]
+        # Ψ, J and η of a run from the new start, in its tangent space.
+        for i in range(6):
+            d_J = row_times(J, i, d)
+            moved_by[0, i] = eta[i] - d_J
+        product(a, J, inverse)
+        v = (moved_by[0, 0], moved_by[0, 1], moved_by[0, 2], moved_by[0, 3], moved_by[0, 4], moved_by[0, 5])
+        v = (
+            column_times(inverse, 0, v),
+            column_times(inverse, 1, v),
+            column_times(inverse, 2, v),
+            column_times(inverse, 3, v),
+            column_times(inverse, 4, v),
+            column_times(inverse, 5, v),
+        )
+        times_right_block(c, psi, T)
+        times_right_block(psi, a, T)
+        times_left_block(a, (T[0], T[3], T[6], T[1], T[4], T[7], T[2], T[5], T[8]), psi)
+        write_sensitivity(sensitivity, k, c, a)
+        for i in range(3):
+            sensitivity[WIDTH * (_ETA + i) + k] = T[i] * v[0] + T[3 + i] * v[1] + T[6 + i] * v[2]
+            sensitivity[WIDTH * (_ETA + 3 + i) + k] = v[3 + i]
+    return largest
+
+
+def join_ends(ends, sensitivity, adjoints, smoothed, work):
+    """Write the smoothed error of each stretch's end and its covariance (27 places); return whether enough digits are left.
+
+    By Bryson & Frazier's adjoint variables (Bierman 1977, ch. X): with λ and Λ at an end, λ ← η + Ψᵀ λ and Λ ← J + Ψᵀ Λ Ψ over the stretch
+    behind it, the error is P λ, its covariance P − P Λ P. ``adjoints`` (lanes, 6, 7) gets Λ and λ at the start of each stretch.
+    """
+    psi, J, P, a, c = work[0], work[1], work[2], work[3], work[4]
+    last = WIDTH - 1
+    for i in range(6):
+        smoothed[WIDTH * i + last] = 0.0
+    for i in range(21):
+        smoothed[WIDTH * (6 + i) + last] = ends[WIDTH * (7 + i) + last]
+    for k in range(last, 0, -1):
+        read_sensitivity(sensitivity, k, psi, J)
+        carry_adjoint(psi, adjoints, k, a, c)
+        for i in range(6):
+            adjoints[k, i, 6] += sensitivity[WIDTH * (_ETA + i) + k]
+            for j in range(6):
+                adjoints[k, i, j] += J[i, j]
+        read_covariance(ends, 7, k - 1, P)
+        product(a, P, adjoints[k])
+        product(c, a, P)
+        for i in range(6):
+            total = 0.0
+            for j in range(6):
+                total += P[i, j] * adjoints[k, j, 6]
+                a[i, j] = P[i, j] - c[i, j]
+            smoothed[WIDTH * i + k - 1] = total
+            if not a[i, i] > LEAST_LEFT * P[i, i]:
+                return False
+        write_covariance(smoothed, 6, k - 1, a)
+    return True
+
+
+def carry_adjoint(psi, adjoints, k, a, c):
+    """Write Ψᵀ Λ Ψ and Ψᵀ λ of the seam behind stretch k to that before it; behind the last there is nothing."""
+    if k == WIDTH - 1:
+        for i in range(6):
+            for j in range(7):
+                adjoints[k, i, j] = 0.0
+        return
+    transposed_product(a, psi, adjoints[k + 1])
+    product(c, a, psi)
+    for i in range(6):
+        total = 0.0
+        for j in range(6):
+            total += psi[j, i] * adjoints[k + 1, j, 6]
+            adjoints[k, i, j] = 0.5 * (c[i, j] + c[j, i])
+        adjoints[k, i, 6] = total
+
+
+def match_ends(ends, sensitivity, adjoints, assumed, found, work):
+    """Take the seams that :func:`join_ends` ``assumed`` to what the smoother ``found`` at the starts (27 places each).
+
+    J and η of each stretch become those that tell of its start what was found there, so that joined again the seams are better by as
+    much as Ψ is good. Returns the largest difference over the seams, of means in σ and of covariances in units of the variances; infinity
+    where a covariance has no inverse.
+    """
+    psi, J, P, inverse, a, c = work[0], work[1], work[2], work[3], work[4], work[5]
+    largest = 0.0
+    for k in range(1, WIDTH):
+        read_covariance(assumed, 6, k - 1, a)
+        read_covariance(found, 6, k, c)
+        for i in range(6):
+            off = abs(assumed[WIDTH * i + k - 1] - found[WIDTH * i + k]) / math.sqrt(c[i, i])
+            if not off <= largest:
+                largest = off
+            for j in range(6):
+                off = abs(a[i, j] - c[i, j]) / math.sqrt(c[i, i] * c[j, j])
+                if not off <= largest:
+                    largest = off
+    for k in range(1, WIDTH):
+        # Λ = P⁻¹ − P⁻¹ P_s P⁻¹ and λ = P⁻¹ ε at the start, as found.
+        read_covariance(ends, 7, k - 1, c)
+        if not invert(c, inverse):
+            return math.inf
+        read_covariance(found, 6, k, P)
+        product(a, inverse, P)
+        product(c, a, inverse)
+        read_sensitivity(sensitivity, k, psi, J)
+        for i in range(6):
+            total = 0.0
+            for j in range(6):
+                J[i, j] = inverse[i, j] - c[i, j]
+                total += inverse[i, j] * found[WIDTH * j + k]
+            P[0, i] = total
+        carry_adjoint(psi, adjoints, k, a, c)
+        for i in range(6):
+            sensitivity[WIDTH * (_ETA + i) + k] = P[0, i] - adjoints[k, i, 6]
+            for j in range(6):
+                J[i, j] -= adjoints[k, i, j]
+        write_sensitivity(sensitivity, k, psi, J)
+    return largest
+
+
+def smooth_before(
+    segments, state, smoothed, angle_variance, rate_variance, attitude_out, bias_out, variance_out, covariance_out
+):
+    """Smooth the intervals before the first stretch, whose filtered ``state`` (28,) has the smoothed error of lane 0; write their rows.
+
+    ``segments`` (intervals, 32) are those that :func:`strapdown.kernels.filter_loop.run_filter` kept. Returns nothing; ``state`` is left at
+    the smoothed one of the first row.
+    """
+    e = lane_vector(smoothed, 0, 0)
+    beta = lane_vector(smoothed, 3, 0)
+    q, M = moved((state[0], state[1], state[2], state[3]), e)
+    b = (state[4] + beta[0], state[5] + beta[1], state[6] + beta[2])
+    a0, a1 = lane_vector(smoothed, 6, 0), lane_vector(smoothed, 9, 0)
+    b0, b1, b2 = lane_vector(smoothed, 12, 0), lane_vector(smoothed, 15, 0), lane_vector(smoothed, 18, 0)
+    A = six(a0, a1)
+    B = (b0[0], b0[1], b0[2], b1[0], b1[1], b1[2], b2[0], b2[1], b2[2])
+    C = six(lane_vector(smoothed, 21, 0), lane_vector(smoothed, 24, 0))
+    A, B = times_transpose_upper(multiply(M, full(A)), M), multiply(M, B)
+    for k in range(len(segments) - 1, -1, -1):
+        s = segments[k]
+        q, b, A, B, C = smooth(
+            (s[4], s[5], s[6], s[7]),
+            (s[8], s[9], s[10]),
+            (s[11], s[12], s[13], s[14], s[15], s[16]),
+            (s[17], s[18], s[19], s[20], s[21], s[22], s[23], s[24], s[25]),
+            (s[26], s[27], s[28], s[29], s[30], s[31]),
+            (s[1], s[2], s[3]),
+            s[0],
+            angle_variance,
+            rate_variance,
+            q,
+            b,
+            A,
+            B,
+            C,
+        )
+        store_state(state, q, b, A, B, C)
+        for i in range(4):
+            attitude_out[k, i] = state[i]
+        for i in range(3):
+            bias_out[k, i] = state[4 + i]
+        variance_out[k, 0], variance_out[k, 1], variance_out[k, 2] = A[0], A[3], A[5]
+        variance_out[k, 3], variance_out[k, 4], variance_out[k, 5] = C[0], C[3], C[5]
+        if k < len(covariance_out):
+            for i in range(21):
+                covariance_out[k, i] = state[7 + i]
