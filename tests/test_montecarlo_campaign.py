@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+import weakref
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -467,24 +468,62 @@ def test_interrupted_it_keeps_what_is_finished_and_says_so(command, monkeypatch,
     assert campaign.read("short-montecarlo.h5").statistics.runs == 20
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_whose_exception_python_drops_is_heeded_after_the_chunk(command, monkeypatch, number):
+    original, written = campaign._write, []
+
+    def cleared(_):
+        signal.raise_signal(number)
+        for _ in range(
+            1000
+        ):  # the handler is called between two turns, and what it raises is dropped with the callback
+            pass
+
+    def interrupted(*arguments):
+        written.append(arguments)
+        if len(written) == 1:  # in the thread that signals are told to
+            gone = {1}
+            reference = weakref.ref(gone, cleared)
+            del gone
+            assert reference() is None
+        original(*arguments)
+
+    monkeypatch.setattr(campaign, "_write", interrupted)
+    status, said, _ = command("short.toml", "--runs", 60, "--threads", 1, *SCALAR)
+    assert status == 130
+    assert "go on with --resume" in said
+    assert campaign.read("short-montecarlo.h5").statistics.runs == 10
+
+
 @pytest.mark.slow
 def test_the_installed_command_killed_again_and_again(tmp_path):
+    """Killed a while after it has begun to write, for how long it takes to start and to compile is no matter of the campaign."""
+    path = tmp_path / "spin-montecarlo.h5"
     script = Path(sys.executable).with_name("strapdown")
-    arguments = [script, "montecarlo", "spin", "--runs", "60", "--machine", "scalar", "--chunk", "3", "--resume"]
+    arguments = [script, "montecarlo", "spin", "--machine", "scalar", "--chunk", "3", "--resume", "--runs"]
+    subprocess.run([*arguments, "3"], cwd=tmp_path, stdout=subprocess.DEVNULL, check=True)  # compiled
     random = np.random.default_rng(5)
     kills = 0
-    for _ in range(40):
-        child = subprocess.Popen(arguments, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    for wait in random.uniform(0.0, 0.5, 10):
+        before = path.stat().st_mtime_ns
+        child = subprocess.Popen(
+            [*arguments, "600"], cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        while child.poll() is None and path.stat().st_mtime_ns == before:
+            time.sleep(0.005)
         try:
-            status = child.wait(timeout=random.uniform(1.0, 12.0))
+            status = child.wait(timeout=wait)
         except subprocess.TimeoutExpired:
             child.send_signal(random.choice([signal.SIGKILL, signal.SIGKILL, signal.SIGINT, signal.SIGTERM]))
             child.wait()
-            kills += 1
+            kills += campaign.read(path).statistics.runs < 600
         else:
             assert status == 0
             break
     assert kills >= 2
-    held = campaign.read(tmp_path / "spin-montecarlo.h5")
+    assert campaign.read(path).statistics.runs > 3  # what was killed had got somewhere
+    subprocess.run([*arguments, "600"], cwd=tmp_path, stdout=subprocess.DEVNULL, check=True)
+    held = campaign.read(path)
     assert held.finished
-    assert_same(held.statistics, montecarlo.run_plan(held.plan, runs=60, chunk=3, machine="scalar"))
+    assert_same(held.statistics, montecarlo.run_plan(held.plan, runs=600, chunk=3, machine="scalar"))

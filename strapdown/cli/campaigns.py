@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -26,6 +26,8 @@ from strapdown.cli.terminal import (
 )
 
 if TYPE_CHECKING:
+    from types import FrameType
+
     from strapdown.montecarlo import Plan
     from strapdown.montecarlo.campaign import Campaign
 
@@ -131,8 +133,13 @@ def montecarlo(
             client = stack.enter_context(dask_client(workers=workers, address=cluster))
             hands = on_dask(client)
             console.print(f"Dask at {client.scheduler.address}: {sum(client.nthreads().values())} worker threads.")
-        stack.enter_context(_terminated_as_interrupted())
+        stop_if_asked = stack.enter_context(asked_to_stop())
         advance = stack.enter_context(progress_bar("runs", runs, rate="runs/s"))
+
+        def advanced(number: int) -> None:
+            advance(number)
+            stop_if_asked()
+
         try:
             result = campaigns.run(
                 plan,
@@ -144,7 +151,7 @@ def montecarlo(
                 machine=machine,
                 threads=threads,
                 workers=hands,
-                progress=advance,
+                progress=advanced,
             )
         except KeyboardInterrupt:
             console.print(f"What is finished is in {target}; go on with --resume.")
@@ -156,13 +163,29 @@ def montecarlo(
 
 
 @contextlib.contextmanager
-def _terminated_as_interrupted() -> Iterator[None]:
-    """Take SIGTERM, which batch systems send before they kill, for Ctrl-C, so that what is finished is written."""
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+def asked_to_stop() -> Iterator[Callable[[], None]]:
+    """Take SIGTERM, which batch systems send before they kill, for Ctrl-C, so that what is finished is written.
+
+    Yields what raises once more if one came: Python drops an exception that is raised while a weak reference is cleared.
+    """
+    asked = False
+
+    def ask(number: int, frame: FrameType | None) -> None:
+        nonlocal asked
+        asked = True
+        raise KeyboardInterrupt
+
+    def again() -> None:
+        if asked:
+            raise KeyboardInterrupt
+
+    heeded = [one for one in (signal.SIGTERM, signal.SIGINT) if signal.getsignal(one) is not signal.SIG_IGN]
+    before = {one: signal.signal(one, ask) for one in heeded}
     try:
-        yield
+        yield again
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for one, handler in before.items():
+            signal.signal(one, handler)
 
 
 def _plan(
