@@ -371,6 +371,8 @@ def _one_triad(x: float, y: float, z: float) -> Array:
     length = math.sqrt(x * x + y * y + z * z)
     if length == 0.0:
         raise InputError(_NO_DIRECTION)
+    if length == math.inf:
+        raise InputError(f"reference_f is [{x:g}, {y:g}, {z:g}], too long to have a direction in double precision")
     r = x / length, y / length, z / length
     least = min(range(3), key=lambda i: abs(r[i]))
     u = _cross_product([float(i == least) for i in range(3)], r)

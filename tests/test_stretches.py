@@ -11,7 +11,7 @@ from scipy import stats
 
 from strapdown import mekf, quaternion, records, smoother
 from strapdown.checks import Array
-from strapdown.kernels import stretch_loop
+from strapdown.kernels import stretch_loop, stretch_seams
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.machine import compiled
 from strapdown.kernels.stretch_lanes import STATE
@@ -227,12 +227,17 @@ def test_a_long_record_is_cut_without_being_told() -> None:
     assert stretches.smoothed(records.cut(record, 0, 8191), NOISE, START, False) is None
 
 
+def turned_at(record: ImuRecord, interval: int) -> ImuRecord:
+    """A record with one turn of more than a third of a radian."""
+    increments = record.increments.copy()
+    increments[interval] = [0.4, 0.0, 0.0]
+    return dataclasses.replace(record, increments=increments)
+
+
 def records_that_do_not_fit() -> dict[str, ImuRecord]:
     plain = FIT["two at each edge"]
     up, field = plain.vectors
     n = len(up.time)
-    fast = plain.increments.copy()
-    fast[900] = [0.4, 0.0, 0.0]
     by_axis = VectorMeasurements(
         sensor="accelerometer",
         kind="direction",
@@ -247,7 +252,10 @@ def records_that_do_not_fit() -> dict[str, ImuRecord]:
         "a heading": with_sensors(plain, up, dataclasses.replace(field, kind="heading")),
         "moving references": with_sensors(plain, dataclasses.replace(up, reference_f=np.tile(UP, (n, 1))), field),
         "noise by axis": with_sensors(plain, by_axis, field),
-        "a large turn": dataclasses.replace(plain, increments=fast),
+        **{f"a large turn at {k}": turned_at(plain, k) for k in (0, 5, 30, 900)},
+        "a large turn, unseen": turned_at(with_sensors(plain), 5),
+        "a long gap at the start": body(2, 1613, INTERVAL * np.arange(1614) + 3.0 * (np.arange(1614) > 7)),
+        "a σ that says to ignore it": with_sensors(plain, dataclasses.replace(up, sigma=np.full(n, 1e71)), field),
         "here and there": with_sensors(plain, at(up, np.flatnonzero(np.random.default_rng(1).random(n) < 0.1)), field),
         "far too sharp": body(4, 1613, sigma=1e-6),
     }
@@ -260,6 +268,67 @@ def test_one_pass_where_the_record_is_not_fit(name: str) -> None:
     assert stretches.smoothed(record, NOISE, START, True) is None
     wanted = one_pass(record)
     np.testing.assert_array_equal(smoother.run(record, NOISE, START, full_covariance=True).attitude, wanted.attitude)
+
+
+@pytest.mark.usefixtures("short")
+def test_quaternions_keep_their_sign() -> None:
+    """32 steps of a fast body are more than half a turn, of which the rotation vector does not tell the sign of the quaternion."""
+    record = ImuRecord(time=INTERVAL * np.arange(1614), increments=np.tile([0.1, 0.05, 0.0], (1613, 1)))
+    found = stretches.smoothed(record, NOISE, START, True)
+    assert found is not None
+    assert np.all(np.sum(found.attitude[1:] * found.attitude[:-1], axis=1) > 0.9)
+    np.testing.assert_allclose(found.attitude, one_pass(record).attitude, atol=1e-9)
+
+
+def test_what_is_no_number_is_no_agreement() -> None:
+    """Seams and states with NaN in any lane are told as such, not passed over."""
+    rng = np.random.default_rng(0)
+    root = rng.standard_normal((6, 6))
+    covariance = root @ root.T
+    room = [np.zeros(STATE * WIDTH) for _ in range(4)]
+    base, ends, found, assumed = (memory.reshape(STATE, WIDTH) for memory in room)
+    sensitivity, work = np.zeros((stretch_loop.SENSITIVITY, WIDTH)), np.empty((8, 6, 6))
+    adjoints = np.zeros((WIDTH, 6, 7))
+    whole = pack(quaternion.IDENTITY, np.zeros(3), covariance)
+    for lane in range(WIDTH):
+        base[:, lane] = ends[:, lane] = whole
+        found[6:27, lane] = assumed[6:27, lane] = whole[7:]
+    kept = np.repeat(base.reshape(-1)[None], 3, axis=0).reshape(-1)
+    least, match = compiled(stretch_loop.least_kept_share), compiled(stretch_seams.match_ends)
+    arguments = ends.reshape(-1), sensitivity.reshape(-1), adjoints, assumed.reshape(-1), found.reshape(-1), work
+    assert match(*arguments) == 0.0
+    assert least(kept, 2, np.empty(STATE), np.empty((7, 6))) > 0.0
+    for lane in (1, 3, 7):
+        spoilt = found.copy()
+        spoilt[:27, lane] = np.nan
+        assert not match(*arguments[:4], spoilt.reshape(-1), work) < np.inf
+        spoilt = base.copy()
+        spoilt[7, lane] = np.nan
+        spoilt_kept = np.repeat(spoilt.reshape(-1)[None], 3, axis=0).reshape(-1)
+        assert not least(spoilt_kept, 2, np.empty(STATE), np.empty((7, 6))) > 0.0
+        assert (
+            not compiled(stretch_seams.join_starts)(
+                base.reshape(-1), spoilt.reshape(-1), sensitivity.reshape(-1), np.empty(STATE * WIDTH), work
+            )
+            < np.inf
+            or lane == 7
+        )
+
+
+def test_seams_are_measured_where_they_differ_most() -> None:
+    """Against NumPy's own factor, for a covariance far from round."""
+    rng = np.random.default_rng(1)
+    root = np.tril(rng.standard_normal((6, 6))) * np.array([1.0, 0.5, 0.2, 0.1, 0.05, 0.02])
+    P = root @ root.T
+    difference = 1e-9 * root @ rng.standard_normal((6, 6)) @ root.T
+    difference += difference.T
+    shift = rng.standard_normal(6) * 1e-9
+    inverse = np.linalg.inv(np.linalg.cholesky(P))
+    wanted = max(np.linalg.norm(inverse @ shift), np.linalg.norm(inverse @ difference @ inverse.T))
+    found = compiled(stretch_seams.whitened)(P.copy(), difference.copy(), tuple(shift), np.empty((6, 6)))
+    assert found == pytest.approx(wanted, rel=1e-6)
+    found = compiled(stretch_seams.whitened)(P.copy(), difference.copy(), (0.0,) * 6, np.empty((6, 6)))
+    assert found == pytest.approx(np.linalg.norm(inverse @ difference @ inverse.T), rel=1e-6)
 
 
 @pytest.mark.usefixtures("short")
@@ -309,8 +378,12 @@ def test_end_follows_from_the_start_as_the_sensitivities_say() -> None:
     """Ψ, J and η against the filter itself, run from other starts, at angles where it is linear."""
     record = body(8, 8 * 96, sigma=1e-4, start=1e-4)
     steps = 96
-    covariance = np.diag([2e-9, 1e-9, 3e-9, 2e-10, 1e-10, 3e-10])
-    covariance[0, 4] = covariance[4, 0] = 2e-10
+    # As wide as one measurement, and far from round: else the two rows of a direction are independent by themselves.
+    root = (
+        np.tril(np.random.default_rng(4).uniform(0.5, 1.0, (6, 6)))
+        * np.array([1e-4, 1e-4, 1e-4, 2e-5, 2e-5, 2e-5])[:, None]
+    )
+    covariance = root @ root.T
     truth = record.truth
     assert truth is not None
     starts = [

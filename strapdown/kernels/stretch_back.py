@@ -19,7 +19,7 @@ from strapdown.kernels.algebra import (
 from strapdown.kernels.filter_step import transition
 from strapdown.kernels.lane_values import (
     WIDTH,
-    anywhere,
+    everywhere,
     fetch_ahead,
     lanes_of,
     load,
@@ -96,7 +96,7 @@ def smooth_stretches(
         dt = load(dts, w * k)
         phi = combine(1.0, load_triples(increments, 3 * (first + k), 3 * steps), -dt, b)
         x = dot(e, e)
-        if anywhere(x > _LARGEST_SQUARE):
+        if not everywhere(x <= _LARGEST_SQUARE):
             return False
         # Seen from the predicted state: a = Log(r ⊗ exp(ε)), of which the filter's own corrections are the larger part.
         p = turned(q, phi)
@@ -105,7 +105,7 @@ def smooth_stretches(
         u = quaternion_multiply(r, (cosine(0.25 * x), h * e[0], h * e[1], h * e[2]))
         v = (u[1], u[2], u[3])
         squared = dot(v, v)
-        if anywhere(squared > 0.25 * _LARGEST_SQUARE):
+        if not everywhere(squared <= 0.25 * _LARGEST_SQUARE):
             return False
         a = scale(2.0 * arcsine(squared), v)
         J = multiply(near_inverse_right_jacobian(a), right_jacobian(e))

@@ -18,6 +18,8 @@ PRESENT = 1e140
 """One below this is there."""
 STATE = 28
 """Numbers of a state."""
+J, ETA = 36, 57
+"""Where in a sensitivity J (21) and η (6) stand, after Ψ (36)."""
 AHEAD = 4
 """Steps that memory is fetched ahead. The machine does so by itself for fewer streams, and not beyond a page, which is two states."""
 

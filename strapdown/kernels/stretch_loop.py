@@ -33,6 +33,7 @@ from strapdown.kernels.lane_angles import rotation_vector
 from strapdown.kernels.lane_values import (
     WIDTH,
     anywhere,
+    everywhere,
     fetch_ahead,
     lanes_of,
     load,
@@ -42,7 +43,17 @@ from strapdown.kernels.lane_values import (
 )
 from strapdown.kernels.rotation import exponential, right_jacobian, rotation_matrix, turned
 from strapdown.kernels.series import LARGEST_ANGLE
-from strapdown.kernels.stretch_lanes import AHEAD, PRESENT, STATE, fetch_lanes, gathered, load_lanes, store_lanes
+from strapdown.kernels.stretch_lanes import (
+    AHEAD,
+    ETA,
+    PRESENT,
+    STATE,
+    J,
+    fetch_lanes,
+    gathered,
+    load_lanes,
+    store_lanes,
+)
 
 BORROWS_ARRAYS = True
 """See :mod:`strapdown.kernels.machine`."""
@@ -51,10 +62,8 @@ BUNDLE = 32
 """Steps that are taken as one to find where the stretches begin."""
 SENSITIVITY = 75
 """Numbers of Ψ (36), the upper triangle of J (21), η (6), and scratch for two rows of six."""
-_SUMS = 8
-"""Where in the scratch a bundle's sums begin: weight, time, vector, of each sensor."""
-_J = 36
-_ETA = 57
+SUMS, SUMMED = 8, 5
+"""Where in the scratch a bundle's sums begin, and how many each sensor has: weight, time, vector."""
 _ROWS = 63
 _LARGEST_SQUARE = LARGEST_ANGLE * LARGEST_ANGLE
 
@@ -68,11 +77,14 @@ def lay_out(edges, first, steps, dts_out):
 
 
 def lay_out_variances(sigma, first, steps, variances_out):
-    """Write the squares of ``sigma`` from row ``first`` on, (steps, lanes) flat."""
+    """Write the squares of ``sigma`` from row ``first`` on, (steps, lanes) flat; return whether all are those of measurements."""
+    present = True
     for k in range(steps):
         for i in range(WIDTH):
             one = sigma[first + steps * i + k]
             variances_out[WIDTH * k + i] = one * one
+            present = present and one * one < PRESENT
+    return present
 
 
 def bundle(
@@ -81,7 +93,8 @@ def bundle(
     """Take :data:`BUNDLE` steps as one: their turn, and of each sensor the mean of its vectors, seen from the mean of their times.
 
     Bundle n of stretch i goes to row ``i · bundles + n``, the last of a stretch has what steps are left. ``turns_out`` (rows, 4) gets
-    rotation vector and time; ``seen_out`` (sensors, rows, 8) mean vector, variance, and the time from the bundle's start; both are flat.
+    rotation vector and time; ``seen_out`` (sensors, rows, 8) mean vector, variance, and four times the time from the bundle's start; both
+    are flat.
     The turns within a bundle are taken without ``bias``, and what the gyro's noise does to them is neglected.
     """
     zero = lanes_of((0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
@@ -91,9 +104,9 @@ def bundle(
         q = (zero + 1.0, zero, zero, zero)
         span = zero
         for s in range(len(places)):
-            sums = w * (_SUMS + 5 * s)
+            sums = w * (SUMS + SUMMED * s)
             store(scratch, sums, zero + 1.0 / (PRESENT * PRESENT))
-            for i in range(1, 5):
+            for i in range(1, SUMMED):
                 store(scratch, sums + w * i, zero)
         for k in range(BUNDLE * n, min(BUNDLE * (n + 1), steps)):
             dt = load(dts, w * k)
@@ -111,7 +124,7 @@ def bundle(
                 else:
                     continue
                 weight = 1.0 / variance
-                sums = w * (_SUMS + 5 * s)
+                sums = w * (SUMS + SUMMED * s)
                 z = matrix_times_vector(R, z)
                 store(scratch, sums, load(scratch, sums) + weight)
                 store(scratch, sums + w, load(scratch, sums + w) + weight * span)
@@ -125,7 +138,7 @@ def bundle(
             (turn[0] + span * bias[0], turn[1] + span * bias[1], turn[2] + span * bias[2], span),
         )
         for s in range(len(places)):
-            sums = w * (_SUMS + 5 * s)
+            sums = w * (SUMS + SUMMED * s)
             variance = 1.0 / load(scratch, sums)
             elapsed = variance * load(scratch, sums + w)
             R = rotation_matrix(exponential(scale(elapsed / span, turn)))
@@ -221,12 +234,12 @@ def update_sensitivity(memory, B, G, h1, e1, h2, y2, pa1, pa2, s1, s12, s22):
 def add_information(memory, inverse1, inverse2, f1, f2):
     """Add what two rows g of h · Ψ tell of the start to J and η."""
     w = WIDTH
-    at = _J * w
+    at = J * w
     for i in range(6):
         g1 = load(memory, w * (_ROWS + i))
         g2 = load(memory, w * (_ROWS + 6 + i))
         k1, k2 = inverse1 * g1, inverse2 * g2
-        place = w * (_ETA + i)
+        place = w * (ETA + i)
         store(memory, place, load(memory, place) + g1 * f1 + g2 * f2)
         for j in range(i, 6):
             other1, other2 = load(memory, w * (_ROWS + j)), load(memory, w * (_ROWS + 6 + j))
@@ -275,7 +288,7 @@ def run_with_sensitivity(
         theta = load_triples(increments, 3 * (first + k), 3 * steps)
         dt = load(dts, w * k)
         phi = combine(1.0, theta, -dt, b)
-        if anywhere(dot(phi, phi) > _LARGEST_SQUARE):
+        if not everywhere(dot(phi, phi) <= _LARGEST_SQUARE):
             return False
         q, A, B, C = predict(q, b, A, B, C, theta, dt, angle_variance, rate_variance)
         phi11, phi12 = transition(phi, dt)
@@ -293,11 +306,11 @@ def run_with_sensitivity(
             v = (frames[s, 3], frames[s, 4], frames[s, 5])
             R = rotation_matrix(q)
             h1, e1, h2, y2, pa1, pa2, s1, s12, s22 = innovation_rows(A, R, u, v, z, variance)
-            if anywhere(s1 + s22 > SHORT_FORM * variance):
+            if not everywhere(s1 + s22 <= SHORT_FORM * variance):
                 return False
             prior = B
             correction, b, A, B, C, _, _, _ = rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, s1, s12, s22)
-            if anywhere(dot(correction, correction) > 1.0):
+            if not everywhere(dot(correction, correction) <= 1.0):
                 return False
             q, A, B, G = near_reset(q, A, B, correction)
             update_sensitivity(sensitivity, prior, G, h1, e1, h2, y2, pa1, pa2, s1, s12, s22)
@@ -316,8 +329,9 @@ def least_kept_share(kept, steps, one, work):
             for j in range(STATE):
                 one[j] = kept[WIDTH * (STATE * k + j) + i]
             share = least_share(one, work)
-            if not share >= least:
-                least = share
+            if not share > 0.0:
+                return 0.0
+            least = min(least, share)
     return least
 
 
@@ -358,7 +372,7 @@ def run_stretches(
         theta = load_triples(increments, 3 * (first + k), 3 * steps)
         dt = load(dts, w * k)
         phi = combine(1.0, theta, -dt, b)
-        if anywhere(dot(phi, phi) > _LARGEST_SQUARE):
+        if not everywhere(dot(phi, phi) <= _LARGEST_SQUARE):
             return False
         fetch_lanes(kept, STATE * w * (k + AHEAD))
         store_lanes(kept, STATE * w * k, q, b, A, B, C)
@@ -376,10 +390,10 @@ def run_stretches(
             v = (frames[s, 3], frames[s, 4], frames[s, 5])
             R = rotation_matrix(q)
             h1, e1, h2, y2, pa1, pa2, s1, s12, s22 = innovation_rows(A, R, u, v, z, variance)
-            if anywhere(s1 + s22 > SHORT_FORM * variance):
+            if not everywhere(s1 + s22 <= SHORT_FORM * variance):
                 return False
             correction, b, A, B, C, e2, s2, _ = rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, s1, s12, s22)
-            if anywhere(dot(correction, correction) > 1.0):
+            if not everywhere(dot(correction, correction) <= 1.0):
                 return False
             q, A, B, _ = near_reset(q, A, B, correction)
             place = innovation_places[s]

@@ -12,12 +12,25 @@ from strapdown.kernels.filter_loop import store_state
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.rotation import logarithm, quaternion_multiply, unit
 from strapdown.kernels.smoother_step import inverse_right_jacobian, moved, smooth
-from strapdown.kernels.stretch_lanes import STATE
+from strapdown.kernels.stretch_lanes import ETA, STATE
+from strapdown.kernels.stretch_lanes import J as INFORMATION
 
+CALLED = (
+    "read_covariance",
+    "write_covariance",
+    "read_sensitivity",
+    "write_sensitivity",
+    "product",
+    "product_transposed",
+    "transposed_product",
+    "times_left_block",
+    "times_right_block",
+    "invert",
+    "carry_adjoint",
+)
+"""Not inlined: here it is compiling that takes time."""
 LEAST_LEFT = 1e-6
 """Of a filtered variance: where less is left when all is known, the difference of covariances keeps too few digits."""
-_J = 36
-_ETA = 57
 
 
 def read_covariance(memory, place, lane, P):
@@ -48,7 +61,7 @@ def write_covariance(memory, place, lane, P):
 
 def read_sensitivity(sensitivity, lane, psi, J):
     """Write Ψ and J of a lane to 6×6 arrays."""
-    n = WIDTH * _J + lane
+    n = WIDTH * INFORMATION + lane
     for i in range(6):
         for j in range(6):
             psi[i, j] = sensitivity[WIDTH * (6 * i + j) + lane]
@@ -59,7 +72,7 @@ def read_sensitivity(sensitivity, lane, psi, J):
 
 def write_sensitivity(sensitivity, lane, psi, J):
     """Write what :func:`read_sensitivity` reads."""
-    n = WIDTH * _J + lane
+    n = WIDTH * INFORMATION + lane
     for i in range(6):
         for j in range(6):
             sensitivity[WIDTH * (6 * i + j) + lane] = psi[i, j]
@@ -142,6 +155,53 @@ def invert(a, out):
     return True
 
 
+def whitened(P, difference, shift, factor):
+    """Return the norms of L⁻¹ ``shift`` and of L⁻¹ ``difference`` L⁻ᵀ for L Lᵀ = P, the larger; infinity where P is not definite.
+
+    That is how many σ a mean is off in the direction in which it is off most, and likewise of the covariance: entry by entry a difference
+    may look small that is large along a direction in which much is known. ``difference`` and ``factor`` are used up.
+    """
+    for i in range(6):
+        for j in range(i + 1):
+            total = P[i, j]
+            for k in range(j):
+                total -= factor[i, k] * factor[j, k]
+            if i > j:
+                factor[i, j] = total / factor[j, j]
+            elif total > 0.0:
+                factor[i, i] = math.sqrt(total)
+            else:
+                return math.inf
+    mean = 0.0
+    for i in range(6):
+        total = shift[i]
+        for k in range(i):
+            total -= factor[i, k] * P[k, 0]
+        P[i, 0] = total / factor[i, i]
+        mean += P[i, 0] * P[i, 0]
+    for _ in range(2):  # L⁻¹ from the left, and with the transpose once more
+        for c in range(6):
+            for i in range(6):
+                total = difference[i, c]
+                for k in range(i):
+                    total -= factor[i, k] * difference[k, c]
+                difference[i, c] = total / factor[i, i]
+        for i in range(6):
+            for c in range(i):
+                difference[i, c], difference[c, i] = difference[c, i], difference[i, c]
+    spread = 0.0
+    for i in range(6):
+        for j in range(6):
+            spread += difference[i, j] * difference[i, j]
+    norm = math.sqrt(max(mean, spread))
+    return norm if norm < math.inf and mean < math.inf and spread < math.inf else math.inf
+
+
+def scale_quaternion(s, q):
+    """Return s q."""
+    return (s * q[0], s * q[1], s * q[2], s * q[3])
+
+
 def lane_attitude(memory, place, lane):
     """Return the quaternion of a lane."""
     at = WIDTH * place + lane
@@ -172,8 +232,8 @@ def six(a, b):
 def join_starts(base, ends, sensitivity, starts, work):
     """Write to ``starts`` where each stretch begins, from runs that began at ``base`` and came to ``ends``.
 
-    Stretch 0 begins where it did. The sensitivities are taken over to the new starts. Returns the largest move of a start, of its mean in σ
-    and of its covariance in units of the variances; infinity where a stretch's end cannot be told from its start.
+    Stretch 0 begins where it did. The sensitivities are taken over to the new starts. Returns the largest move of a start
+    (:func:`whitened`); infinity where a stretch's end cannot be told from its start.
     """
     psi, J, P, inverse, a, c, difference, moved_by = (
         work[0],
@@ -190,11 +250,12 @@ def join_starts(base, ends, sensitivity, starts, work):
     largest = 0.0
     for k in range(WIDTH):
         read_sensitivity(sensitivity, k, psi, J)
-        eta = six(lane_vector(sensitivity, _ETA, k), lane_vector(sensitivity, _ETA + 3, k))
+        eta = six(lane_vector(sensitivity, ETA, k), lane_vector(sensitivity, ETA + 3, k))
         q = lane_attitude(base, 0, k)
         b = lane_vector(base, 4, k)
         start_b = lane_vector(starts, 4, k)
-        angle = logarithm(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), lane_attitude(starts, 0, k)))
+        turn = quaternion_multiply((q[0], -q[1], -q[2], -q[3]), lane_attitude(starts, 0, k))
+        angle = logarithm(turn)
         d = six(angle, (start_b[0] - b[0], start_b[1] - b[1], start_b[2] - b[2]))
         T = inverse_right_jacobian(angle)
         # ΔP, both seen from the base's attitude.
@@ -204,15 +265,11 @@ def join_starts(base, ends, sensitivity, starts, work):
         read_covariance(base, 7, k, a)
         for i in range(6):
             for j in range(6):
-                difference[i, j] = c[i, j] - a[i, j]
-                move = abs(difference[i, j]) / math.sqrt(P[i, i] * P[j, j])
-                if not move <= largest:
-                    largest = move
-            move = abs(d[i]) / math.sqrt(P[i, i])
-            if not move <= largest:
-                largest = move
-        if not largest < math.inf:
+                difference[i, j] = moved_by[i, j] = c[i, j] - a[i, j]
+        move = whitened(P, moved_by, d, c)
+        if not move < math.inf:
             return math.inf
+        largest = max(largest, move)
         product(a, difference, J)
         for i in range(6):
             a[i, i] += 1.0
@@ -244,7 +301,8 @@ def join_starts(base, ends, sensitivity, starts, work):
                 for j in range(6):
                     a[i, j] += c[i, j]
             end_q, G = moved(lane_attitude(ends, 0, k), step)
-            end_q = unit(end_q)
+            # A quaternion and its negative are one attitude; from a bundle of more than half a turn came the other one.
+            end_q = unit(scale_quaternion(math.copysign(1.0, turn[0]), end_q))
             times_left_block(c, G, a)
             times_right_block(moved_by, c, (G[0], G[3], G[6], G[1], G[4], G[7], G[2], G[5], G[8]))
             for i in range(4):
@@ -264,8 +322,7 @@ def join_starts(base, ends, sensitivity, starts, work):
                     psi[i, j] = a[i, j]
         # Ψ, J and η of a run from the new start, in its tangent space.
         for i in range(6):
-            d_J = row_times(J, i, d)
-            moved_by[0, i] = eta[i] - d_J
+            moved_by[0, i] = eta[i] - row_times(J, i, d)  # what is told of the new start, before ΔP is
         product(a, J, inverse)
         v = (moved_by[0, 0], moved_by[0, 1], moved_by[0, 2], moved_by[0, 3], moved_by[0, 4], moved_by[0, 5])
         v = (
@@ -281,8 +338,8 @@ def join_starts(base, ends, sensitivity, starts, work):
         times_left_block(a, (T[0], T[3], T[6], T[1], T[4], T[7], T[2], T[5], T[8]), psi)
         write_sensitivity(sensitivity, k, c, a)
         for i in range(3):
-            sensitivity[WIDTH * (_ETA + i) + k] = T[i] * v[0] + T[3 + i] * v[1] + T[6 + i] * v[2]
-            sensitivity[WIDTH * (_ETA + 3 + i) + k] = v[3 + i]
+            sensitivity[WIDTH * (ETA + i) + k] = T[i] * v[0] + T[3 + i] * v[1] + T[6 + i] * v[2]
+            sensitivity[WIDTH * (ETA + 3 + i) + k] = v[3 + i]
     return largest
 
 
@@ -302,7 +359,7 @@ def join_ends(ends, sensitivity, adjoints, smoothed, work):
         read_sensitivity(sensitivity, k, psi, J)
         carry_adjoint(psi, adjoints, k, a, c)
         for i in range(6):
-            adjoints[k, i, 6] += sensitivity[WIDTH * (_ETA + i) + k]
+            adjoints[k, i, 6] += sensitivity[WIDTH * (ETA + i) + k]
             for j in range(6):
                 adjoints[k, i, j] += J[i, j]
         read_covariance(ends, 7, k - 1, P)
@@ -341,22 +398,30 @@ def match_ends(ends, sensitivity, adjoints, assumed, found, work):
     """Take the seams that :func:`join_ends` ``assumed`` to what the smoother ``found`` at the starts (27 places each).
 
     J and η of each stretch become those that tell of its start what was found there, so that joined again the seams are better by as
-    much as Ψ is good. Returns the largest difference over the seams, of means in σ and of covariances in units of the variances; infinity
-    where a covariance has no inverse.
+    much as Ψ is good. Returns the largest difference over the seams (:func:`whitened`); infinity where a covariance has no inverse.
     """
     psi, J, P, inverse, a, c = work[0], work[1], work[2], work[3], work[4], work[5]
     largest = 0.0
     for k in range(1, WIDTH):
         read_covariance(assumed, 6, k - 1, a)
-        read_covariance(found, 6, k, c)
+        read_covariance(found, 6, k, P)
         for i in range(6):
-            off = abs(assumed[WIDTH * i + k - 1] - found[WIDTH * i + k]) / math.sqrt(c[i, i])
-            if not off <= largest:
-                largest = off
             for j in range(6):
-                off = abs(a[i, j] - c[i, j]) / math.sqrt(c[i, i] * c[j, j])
-                if not off <= largest:
-                    largest = off
+                a[i, j] -= P[i, j]
+        before = six(lane_vector(assumed, 0, k - 1), lane_vector(assumed, 3, k - 1))
+        after = six(lane_vector(found, 0, k), lane_vector(found, 3, k))
+        shift = (
+            after[0] - before[0],
+            after[1] - before[1],
+            after[2] - before[2],
+            after[3] - before[3],
+            after[4] - before[4],
+            after[5] - before[5],
+        )
+        off = whitened(P, a, shift, c)
+        if not off < math.inf:
+            return math.inf
+        largest = max(largest, off)
     for k in range(1, WIDTH):
         # Λ = P⁻¹ − P⁻¹ P_s P⁻¹ and λ = P⁻¹ ε at the start, as found.
         read_covariance(ends, 7, k - 1, c)
@@ -374,7 +439,7 @@ def match_ends(ends, sensitivity, adjoints, assumed, found, work):
             P[0, i] = total
         carry_adjoint(psi, adjoints, k, a, c)
         for i in range(6):
-            sensitivity[WIDTH * (_ETA + i) + k] = P[0, i] - adjoints[k, i, 6]
+            sensitivity[WIDTH * (ETA + i) + k] = P[0, i] - adjoints[k, i, 6]
             for j in range(6):
                 J[i, j] -= adjoints[k, i, j]
         write_sensitivity(sensitivity, k, psi, J)
