@@ -108,6 +108,33 @@ def test_late_measurements_at_common_stamps_equal_the_filter_in_order(option, la
     assert quaternion.angle_between(estimate.attitude[-1], late.attitude) < 1e-10
 
 
+WATCH = Monitor(window=8, probability=0.99)
+
+
+@pytest.mark.parametrize("late", [False, True], ids=["in time", "late"])
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"gate": Gate(recovery=None)}, {"gate": Gate(recovery=4)}, {"robust": Robust(degrees_of_freedom=3.0)}],
+    ids=["plain", "gate", "recovery", "Student"],
+)
+def test_a_monitor_tells_what_it_tells_of_the_record(options, late):
+    """Of sensors that are far off now and then; what is done again after a late measurement counts once."""
+    record, begin = record_of(4.0), start(1e-2)
+    whole = mekf.run(record, NOISE, begin, monitor=WATCH, **options)
+    told = [event for event in whole.events if event.kind == "divergence"]
+    assert told
+    arrivals = [np.minimum(s.time + late * 0.05 * (1 + i), record.time[-1]) for i, s in enumerate(record.vectors)]
+    given = {"look_back": 0.5, "sensors": [s.sensor for s in record.vectors], **options}
+    face = handed_over(record, begin, arrivals, monitor=WATCH, **given)
+    without = handed_over(record, begin, arrivals, **given)
+    assert np.array_equal(face.attitude, without.attitude)
+    assert [event for event in face.events if event.kind != "divergence"] == list(without.events)
+    found = [event for event in face.events if event.kind == "divergence"]
+    for one, other in zip(told, found, strict=True):
+        assert (one.start, one.end) == pytest.approx((other.start, other.end))
+        assert one.value == pytest.approx(other.value, rel=1e-6)
+
+
 def both_ways(look_back, sensors=()):
     """Two measurements of one time, given in this order and in the other; the last state of each."""
     found = []

@@ -43,8 +43,8 @@ from strapdown.mekf.judging import Judging
 from strapdown.mekf.scheduling import skipped_too
 from strapdown.mekf.states import check_arguments, restart_bias_variance
 from strapdown.mekf.stepping import Measured, sensor_names, show_refused
-from strapdown.records import Event, ImuRecord
-from strapdown.robustness import Gate, GateMemory, Linearised, Monitor, Robust, Rows, seen_from, tilt_unknown
+from strapdown.records import ImuRecord
+from strapdown.robustness import Gate, Linearised, Monitor, Robust, Rows, seen_from, tilt_unknown
 from strapdown.vectors import KINDS, need_level, need_unit, triad
 
 KIND_CODES = {
@@ -449,9 +449,7 @@ class StepFilter(mekf.StepFilter):
             self.weight = 0.0
             self._expected = _Gaussian(np.array([np.nan]), np.eye(1))
             return PASSED_OVER
-        outcome = self._take(rows)
-        self._judging.watch(self, outcome)
-        return outcome
+        return self._take(rows)
 
     def _take(self, measured: _Measured) -> int:
         others = np.concatenate([self.bias, self.values])
@@ -526,35 +524,7 @@ class StepFilter(mekf.StepFilter):
 
 
 class _Judging(Judging[StepFilter]):
-    """A gate and a monitor beside it."""
-
-    def __init__(self, gate: Gate | None, memory: GateMemory | None, monitor: Monitor | None) -> None:
-        super().__init__(gate, memory)
-        self.monitor = monitor
-        # Time, NIS and degrees of freedom of what was measured. Copies share the rows, of which each knows how many are its own: the
-        # filter goes back to what it was, and never forth again.
-        self.seen: list[tuple[float, float, int]] = []
-        self.number = 0
-
-    def watch(self, filter: StepFilter, outcome: int) -> None:
-        """Note the NIS of what was just measured; of what was not taken in the gate's threshold."""
-        if self.monitor is None:
-            return
-        degrees, nis = filter.dim_z, filter.nis
-        if self.gate is not None and outcome != ACCEPTED:
-            nis = float(self.gate.thresholds[degrees - 1])
-        del self.seen[self.number :]
-        self.seen.append((filter.time, nis, degrees))
-        self.number += 1
-
-    @property
-    def events(self) -> tuple[Event, ...]:
-        """Recoveries, lock-outs and what the monitor says, in order of time."""
-        told = super().events
-        if self.monitor is None or not self.number:
-            return told
-        time, nis, degrees = (np.array(column) for column in zip(*self.seen[: self.number], strict=True))
-        return tuple(sorted([*told, *self.monitor.watch(time, nis, degrees)], key=lambda event: event.start))
+    """Judging with what a challenger carries."""
 
     def _widen(self, rival: StepFilter) -> None:
         before = rival.attitude

@@ -15,7 +15,7 @@ from strapdown import quaternion
 from strapdown.checks import Array
 from strapdown.kernels import robust_gate, robust_step
 from strapdown.records import Event
-from strapdown.robustness import LOCK_OUT, Gate, GateMemory, Robust, seen_from
+from strapdown.robustness import LOCK_OUT, Gate, GateMemory, Monitor, Robust, seen_from
 
 
 def kernel_options(gate: Gate | None, robust: Robust | None) -> tuple[object, ...]:
@@ -107,10 +107,15 @@ Filter = TypeVar("Filter", bound=Judged)
 
 
 class Judging(Generic[Filter]):
-    """A gate beside a filter that goes step by step: what it remembers, its challenger, and what it has told."""
+    """A gate and a monitor beside a filter that goes step by step: what they remember, the challenger, and what they have told."""
 
-    def __init__(self, gate: Gate | None, memory: GateMemory | None) -> None:
+    def __init__(self, gate: Gate | None, memory: GateMemory | None, monitor: Monitor | None = None) -> None:
         self.gate = gate
+        self.monitor = monitor
+        # Time, NIS and degrees of freedom of what was measured. Copies share the rows, of which each knows how many are its own: the
+        # filter goes back to what it was, and never forth again.
+        self.seen: list[tuple[float, float, int]] = []
+        self.number = 0
         self.sensors: tuple[str, ...] = () if memory is None else tuple(memory.standing)
         self.memory, self.standing = remembered(gate, memory, self.sensors)
         self.challenger: Filter | None = None
@@ -128,12 +133,17 @@ class Judging(Generic[Filter]):
 
     @property
     def events(self) -> tuple[Event, ...]:
-        """Recoveries and lock-outs so far, in order of time."""
+        """Recoveries, lock-outs and what the monitor says so far, in order of time."""
         told = gate_events(self.recoveries, self.lock_outs, self.sensors)
+        if self.monitor is not None and self.number:
+            time, nis, degrees = (np.array(column) for column in zip(*self.seen[: self.number], strict=True))
+            told += self.monitor.watch(time, nis, degrees)
         return tuple(sorted(told, key=lambda event: event.start))
 
     def judge(self, filter: Filter, sensor: str, outcome: int, follow: Callable[[Filter], int]) -> None:
         """Judge the filter by what it has made of a measurement, and its challenger, which ``follow`` gives the same one, too."""
+        if self.monitor is not None and outcome != robust_step.PASSED_OVER:
+            self._watch(filter, outcome)
         if self.gate is None:
             return
         if sensor not in self.sensors:
@@ -167,6 +177,15 @@ class Judging(Generic[Filter]):
             filter._become(rival)
             filter._passes = self.passes
             self.challenger = None
+
+    def _watch(self, filter: Filter, outcome: int) -> None:
+        """Note the NIS of what was just measured; of what was not taken in the gate's threshold."""
+        degrees, nis = filter.dim_z, filter.nis
+        if self.gate is not None and outcome != robust_step.ACCEPTED:
+            nis = float(self.gate.thresholds[degrees - 1])
+        del self.seen[self.number :]
+        self.seen.append((filter.time, nis, degrees))
+        self.number += 1
 
     def _widen(self, rival: Filter) -> None:
         """Make the challenger what it would be had its bias started wider, if that holds it back; all states go along."""

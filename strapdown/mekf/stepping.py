@@ -31,7 +31,7 @@ from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.mekf.judging import Judging, ToldEvents
 from strapdown.mekf.states import ProcessNoise, State, check_arguments, covariance_matrices, restart_bias_variance
 from strapdown.records import LARGEST_TURN
-from strapdown.robustness import Gate, Linearised, Robust, Rows, linearise, seen_from, tilt_unknown
+from strapdown.robustness import Gate, Linearised, Monitor, Robust, Rows, linearise, seen_from, tilt_unknown
 from strapdown.vectors import need_level, need_unit, triad
 
 CLOCK_SHARE = 1e-3
@@ -57,6 +57,8 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         Of the end of a part of a record (:func:`strapdown.mekf.run_on`), it goes on with what the gate remembers; give its ``time``.
     gate : Gate, optional
     robust : Robust, optional
+    monitor : Monitor, optional
+        Tells in ``events`` when the running NIS leaves its bounds. What it needs of each measurement is kept, in memory.
     look_back : float
         s; a measurement may be given so long after its time. The filter goes back to that time, takes it in, and does again what followed:
         the result is that of the filter which had it in order. What it did in that span is kept, in memory. Measurements of one time are
@@ -74,11 +76,12 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         *,
         gate: Gate | None = None,
         robust: Robust | None = None,
+        monitor: Monitor | None = None,
         look_back: float = 0.0,
         sensors: Sequence[str] = (),
         time: float = 0.0,
     ) -> None:
-        check_arguments(process_noise=process_noise, initial=initial, gate=gate, robust=robust)
+        check_arguments(process_noise=process_noise, initial=initial, gate=gate, robust=robust, monitor=monitor)
         names = sensor_names(sensors)
         super().__init__(dim_x=6, dim_z=2)
         self.process_noise = process_noise
@@ -97,7 +100,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         self.repeated = 0
         self.refused: dict[str, int] = {}
         self._restart_bias_variance = restart_bias_variance(gate, initial)
-        self._judging: Judging[StepFilter] = Judging(gate, initial.gate)
+        self._judging: Judging[StepFilter] = Judging(gate, initial.gate, monitor)
         self._passes = self._judging.passes
         if initial.gate is not None and self._judging.challenged:
             rival = initial.gate.challenger
