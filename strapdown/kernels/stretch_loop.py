@@ -1,7 +1,7 @@
 """The filter over eight stretches of one record side by side, a stretch a lane.
 
 A filter is a chain: no step can begin before the one before it. What can be known beforehand is where each stretch begins to a hundredth of
-its σ, from a filter that takes 32 steps as one (:func:`bundle`). From there :func:`run_with_sensitivity` runs the filter over all
+its σ, from a filter that takes many steps as one (:func:`bundle`). From there :func:`run_with_sensitivity` runs the filter over all
 stretches at once, and tells beside their ends how these would move with their starts; so the ends can be joined to the starts
 (:mod:`strapdown.kernels.stretch_seams`), and :func:`run_stretches` runs the filter from where each stretch truly begins.
 
@@ -58,8 +58,6 @@ from strapdown.kernels.stretch_lanes import (
 BORROWS_ARRAYS = True
 """See :mod:`strapdown.kernels.machine`."""
 
-BUNDLE = 32
-"""Steps that are taken as one to find where the stretches begin."""
 SENSITIVITY = 75
 """Numbers of Ψ (36), the upper triangle of J (21), η (6), and scratch for two rows of six."""
 SUMS, SUMMED = 8, 5
@@ -88,9 +86,23 @@ def lay_out_variances(sigma, first, steps, variances_out):
 
 
 def bundle(
-    increments, first, steps, dts, bias, values, places, complete, rows, variances, frames, scratch, turns_out, seen_out
+    increments,
+    first,
+    steps,
+    dts,
+    bias,
+    values,
+    places,
+    complete,
+    rows,
+    variances,
+    frames,
+    scratch,
+    size,
+    turns_out,
+    seen_out,
 ):
-    """Take :data:`BUNDLE` steps as one: their turn, and of each sensor the mean of its vectors, seen from the mean of their times.
+    """Take ``size`` steps as one: their turn, and of each sensor the mean of its vectors, seen from the mean of their times.
 
     Bundle n of stretch i goes to row ``i · bundles + n``, the last of a stretch has what steps are left. ``turns_out`` (rows, 4) gets
     rotation vector and time; ``seen_out`` (sensors, rows, 8) mean vector, variance, and four times the time from the bundle's start; both
@@ -99,7 +111,7 @@ def bundle(
     """
     zero = lanes_of((0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
     w = WIDTH
-    bundles = (steps + BUNDLE - 1) // BUNDLE
+    bundles = (steps + size - 1) // size
     for n in range(bundles):
         q = (zero + 1.0, zero, zero, zero)
         span = zero
@@ -108,7 +120,7 @@ def bundle(
             store(scratch, sums, zero + 1.0 / (PRESENT * PRESENT))
             for i in range(1, SUMMED):
                 store(scratch, sums + w * i, zero)
-        for k in range(BUNDLE * n, min(BUNDLE * (n + 1), steps)):
+        for k in range(size * n, min(size * (n + 1), steps)):
             dt = load(dts, w * k)
             theta = load_triples(increments, 3 * (first + k), 3 * steps)
             q = turned(q, (theta[0] - dt * bias[0], theta[1] - dt * bias[1], theta[2] - dt * bias[2]))
@@ -150,20 +162,32 @@ def bundle(
 
 
 def record_of_bundles(
-    edges, first, steps, turns, seen, edges_out, increments_out, time_out, row_out, series_out, value_out, sigma_out
+    edges,
+    first,
+    steps,
+    size,
+    turns,
+    seen,
+    edges_out,
+    increments_out,
+    time_out,
+    row_out,
+    series_out,
+    value_out,
+    sigma_out,
 ):
     """Write the bundles of all stretches but the last as :func:`strapdown.kernels.filter_loop.run_filter` takes them.
 
     A sensor's row is that of its bundle; bundles that it saw nothing in have no event. Returns the number of events.
     """
-    bundles = (steps + BUNDLE - 1) // BUNDLE
+    bundles = (steps + size - 1) // size
     rows = (WIDTH - 1) * bundles
     sensors = len(seen)
     events = 0
     edges_out[0] = edges[first]
     for n in range(rows):
         lane = n // bundles
-        edges_out[n + 1] = edges[first + steps * lane + min(BUNDLE * (n - bundles * lane + 1), steps)]
+        edges_out[n + 1] = edges[first + steps * lane + min(size * (n - bundles * lane + 1), steps)]
         for i in range(3):
             increments_out[n, i] = turns[n, i]
         begin = events

@@ -3,7 +3,7 @@
 Filter and smoother are chains in time, in which each step waits for the one before. A long record is cut into eight stretches instead, and
 what is not known of a stretch before the one ahead of it is done is told by linear maps of it, which are small:
 
-1. a filter that takes 32 steps as one runs over the record and guesses where each stretch begins;
+1. a filter that takes many steps as one (:data:`BUNDLE`) runs over the record and guesses where each stretch begins;
 2. the filter runs over all stretches from there, and carries how their ends depend on their starts;
 3. the ends are joined to the starts, one after the other, and the filter runs again from where each stretch truly begins;
 4. what each stretch tells of its start is added up from the last to the first, and all are smoothed backward from their ends.
@@ -27,7 +27,7 @@ from strapdown.kernels import filter_loop, stretch_back, stretch_loop, stretch_s
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.machine import compiled
 from strapdown.kernels.stretch_lanes import ABSENT, PRESENT, STATE
-from strapdown.kernels.stretch_loop import BUNDLE, SENSITIVITY, SUMMED, SUMS
+from strapdown.kernels.stretch_loop import SENSITIVITY, SUMMED, SUMS
 from strapdown.mekf.memory import side_by_side
 from strapdown.mekf.running import LEAST_DIGITS, gaps
 from strapdown.mekf.scheduling import Schedule, innovations_by_sensor, places, schedule, skipped_too
@@ -44,6 +44,9 @@ MOST_RUNS = 5
 """Runs over all stretches until ends and starts agree; a record that takes more is smoothed in one pass."""
 LEAST_GAIN = 3.0
 """By so much at least each run brings them nearer, or it is given up."""
+BUNDLE = 32
+"""Steps that are taken as one to guess where the stretches begin: those of a period of the sensors, if that is not less than a quarter of
+this, for a bundle of one measurement leaves nothing to guess."""
 _FEWEST_BEFORE = 32
 """Intervals before the first stretch, at least."""
 
@@ -56,6 +59,8 @@ class _Cut:
     """Interval that the first stretch begins with."""
     steps: int
     """Intervals of a stretch."""
+    bundle: int
+    """Steps that are taken as one."""
     increments: Array
     """Flat."""
     dts: Array
@@ -243,6 +248,7 @@ def _cut(record: ImuRecord, events: Schedule) -> _Cut:
     return _Cut(
         first=first,
         steps=steps,
+        bundle=period if BUNDLE // 4 <= period <= BUNDLE else BUNDLE,
         increments=np.ascontiguousarray(record.increments).reshape(-1),
         dts=dts,
         values=values,
@@ -312,17 +318,17 @@ def _run_before(
 def _guess_starts(record: ImuRecord, cut: _Cut, noise: tuple[float, float], state: Array) -> None:
     """Write where the stretches begin, the first at ``state``, the others by a filter over bundles."""
     sensors = len(cut.complete)
-    bundles = -(-cut.steps // BUNDLE)
+    bundles = -(-cut.steps // cut.bundle)
     rows = (WIDTH - 1) * bundles
     turns, seen = np.empty((WIDTH * bundles, 4)), np.empty((sensors, WIDTH * bundles, 8))
     flat = turns.reshape(-1), seen.reshape(-1)
-    compiled(stretch_loop.bundle)(*cut.taken, state[4:7].copy(), *cut.measured, *flat)
+    compiled(stretch_loop.bundle)(*cut.taken, state[4:7].copy(), *cut.measured, cut.bundle, *flat)
     number = sensors * rows
     edges, increments = np.empty(rows + 1), np.empty((rows, 3))
     time, row, sensor = np.empty(number), np.empty(number, np.uint32), np.empty(number, np.uint8)
     value, sigma = np.empty(3 * number), np.empty(number)
     events = compiled(stretch_loop.record_of_bundles)(
-        record.time, cut.first, cut.steps, turns, seen, edges, increments, time, row, sensor, value, sigma
+        record.time, cut.first, cut.steps, cut.bundle, turns, seen, edges, increments, time, row, sensor, value, sigma
     )
     sigma.flags.writeable = False  # as that of a record is: one more form of the kernel takes seconds to compile
     states = [np.empty((WIDTH, columns)) for columns in (4, 3, 6, 21)]
