@@ -110,3 +110,10 @@ def gathered(values, place, rows, at, scratch):
         for j in range(3):
             scratch[3 * i + j] = element(values, row + j)
     return load_triples(scratch, 0, 3)
+
+
+def measured(values, place, complete, rows, at, k, steps, scratch):
+    """Return the 3-vectors that a sensor measured at the end of step k of each stretch; ``at`` is where those stand in the table."""
+    if complete:
+        return load_triples(values, place + 3 * k, 3 * steps)
+    return gathered(values, place, rows, at, scratch)

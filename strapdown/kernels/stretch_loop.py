@@ -50,8 +50,8 @@ from strapdown.kernels.stretch_lanes import (
     STATE,
     J,
     fetch_lanes,
-    gathered,
     load_lanes,
+    measured,
     store_lanes,
 )
 
@@ -129,12 +129,9 @@ def bundle(
             for s in range(len(places)):
                 at = w * (steps * s + k)
                 variance = load(variances, at)
-                if complete[s]:
-                    z = load_triples(values, places[s] + 3 * k, 3 * steps)
-                elif anywhere(variance < PRESENT):
-                    z = gathered(values, places[s], rows, at, scratch)
-                else:
+                if not (complete[s] or anywhere(variance < PRESENT)):
                     continue
+                z = measured(values, places[s], complete[s], rows, at, k, steps, scratch)
                 weight = 1.0 / variance
                 sums = w * (SUMS + SUMMED * s)
                 z = matrix_times_vector(R, z)
@@ -320,12 +317,9 @@ def run_with_sensitivity(
         for s in range(len(places)):
             at = w * (steps * s + k)
             variance = load(variances, at)
-            if complete[s]:
-                z = load_triples(values, places[s] + 3 * k, 3 * steps)
-            elif anywhere(variance < PRESENT):
-                z = gathered(values, places[s], rows, at, scratch)
-            else:
+            if not (complete[s] or anywhere(variance < PRESENT)):
                 continue
+            z = measured(values, places[s], complete[s], rows, at, k, steps, scratch)
             u = (frames[s, 0], frames[s, 1], frames[s, 2])
             v = (frames[s, 3], frames[s, 4], frames[s, 5])
             R = rotation_matrix(q)
@@ -404,12 +398,9 @@ def run_stretches(
         for s in range(len(places)):
             at = w * (steps * s + k)
             variance = load(variances, at)
-            if complete[s]:
-                z = load_triples(values, places[s] + 3 * k, 3 * steps)
-            elif anywhere(variance < PRESENT):
-                z = gathered(values, places[s], rows, at, scratch)
-            else:
+            if not (complete[s] or anywhere(variance < PRESENT)):
                 continue
+            z = measured(values, places[s], complete[s], rows, at, k, steps, scratch)
             u = (frames[s, 0], frames[s, 1], frames[s, 2])
             v = (frames[s, 3], frames[s, 4], frames[s, 5])
             R = rotation_matrix(q)

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import math
 
-from strapdown.kernels.algebra import full, multiply, times_transpose_upper
+from strapdown.kernels.algebra import add, full, multiply, subtract, times_transpose_upper, transpose
+from strapdown.kernels.augmented_step import IDENTITY
 from strapdown.kernels.filter_loop import store_state
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.rotation import logarithm, quaternion_multiply, unit
+from strapdown.kernels.smoother_loop import write_filtered
 from strapdown.kernels.smoother_step import inverse_right_jacobian, moved, smooth
 from strapdown.kernels.stretch_lanes import ETA, STATE
 from strapdown.kernels.stretch_lanes import J as INFORMATION
@@ -21,10 +23,7 @@ CALLED = (
     "read_sensitivity",
     "write_sensitivity",
     "product",
-    "product_transposed",
-    "transposed_product",
     "times_left_block",
-    "times_right_block",
     "invert",
     "carry_adjoint",
 )
@@ -91,40 +90,12 @@ def product(out, a, b):
             out[i, j] = total
 
 
-def product_transposed(out, a, b):
-    """Write a bᵀ."""
-    for i in range(6):
-        for j in range(6):
-            total = 0.0
-            for k in range(6):
-                total += a[i, k] * b[j, k]
-            out[i, j] = total
-
-
-def transposed_product(out, a, b):
-    """Write aᵀ b."""
-    for i in range(6):
-        for j in range(6):
-            total = 0.0
-            for k in range(6):
-                total += a[k, i] * b[k, j]
-            out[i, j] = total
-
-
 def times_left_block(out, M, a):
     """Write diag(M, I) a, M a 9-tuple."""
     for j in range(6):
         for i in range(3):
             out[i, j] = M[3 * i] * a[0, j] + M[3 * i + 1] * a[1, j] + M[3 * i + 2] * a[2, j]
             out[3 + i, j] = a[3 + i, j]
-
-
-def times_right_block(out, a, M):
-    """Write a diag(M, I), M a 9-tuple."""
-    for i in range(6):
-        for j in range(3):
-            out[i, j] = a[i, 0] * M[j] + a[i, 1] * M[3 + j] + a[i, 2] * M[6 + j]
-            out[i, 3 + j] = a[i, 3 + j]
 
 
 def invert(a, out):
@@ -159,7 +130,7 @@ def whitened(P, difference, shift, factor):
     """Return the norms of L⁻¹ ``shift`` and of L⁻¹ ``difference`` L⁻ᵀ for L Lᵀ = P, the larger; infinity where P is not definite.
 
     That is how many σ a mean is off in the direction in which it is off most, and likewise of the covariance: entry by entry a difference
-    may look small that is large along a direction in which much is known. ``difference`` and ``factor`` are used up.
+    may look small that is large along a direction in which much is known. P, ``difference`` and ``factor`` are used up.
     """
     for i in range(6):
         for j in range(i + 1):
@@ -193,13 +164,7 @@ def whitened(P, difference, shift, factor):
     for i in range(6):
         for j in range(6):
             spread += difference[i, j] * difference[i, j]
-    norm = math.sqrt(max(mean, spread))
-    return norm if norm < math.inf and mean < math.inf and spread < math.inf else math.inf
-
-
-def scale_quaternion(s, q):
-    """Return s q."""
-    return (s * q[0], s * q[1], s * q[2], s * q[3])
+    return math.sqrt(max(mean, spread)) if mean + spread < math.inf else math.inf
 
 
 def lane_attitude(memory, place, lane):
@@ -219,14 +184,31 @@ def row_times(a, i, v):
     return (a[i, 0] * v[0] + a[i, 1] * v[1] + a[i, 2] * v[2]) + (a[i, 3] * v[3] + a[i, 4] * v[4] + a[i, 5] * v[5])
 
 
-def column_times(a, j, v):
-    """Return column j of a times v (6,)."""
-    return (a[0, j] * v[0] + a[1, j] * v[1] + a[2, j] * v[2]) + (a[3, j] * v[3] + a[4, j] * v[4] + a[5, j] * v[5])
+def times(a, v):
+    """Return a v (6,)."""
+    return (
+        row_times(a, 0, v),
+        row_times(a, 1, v),
+        row_times(a, 2, v),
+        row_times(a, 3, v),
+        row_times(a, 4, v),
+        row_times(a, 5, v),
+    )
 
 
 def six(a, b):
     """Return two 3-vectors as one row of six."""
     return (a[0], a[1], a[2], b[0], b[1], b[2])
+
+
+def add_six(a, b):
+    """Return a + b of two rows of six."""
+    return six(add((a[0], a[1], a[2]), (b[0], b[1], b[2])), add((a[3], a[4], a[5]), (b[3], b[4], b[5])))
+
+
+def subtract_six(a, b):
+    """Return a − b of two rows of six."""
+    return six(subtract((a[0], a[1], a[2]), (b[0], b[1], b[2])), subtract((a[3], a[4], a[5]), (b[3], b[4], b[5])))
 
 
 def join_starts(base, ends, sensitivity, starts, work):
@@ -261,7 +243,7 @@ def join_starts(base, ends, sensitivity, starts, work):
         # ΔP, both seen from the base's attitude.
         read_covariance(starts, 7, k, P)
         times_left_block(a, T, P)
-        times_right_block(c, a, (T[0], T[3], T[6], T[1], T[4], T[7], T[2], T[5], T[8]))
+        times_left_block(c.T, T, a.T)
         read_covariance(base, 7, k, a)
         for i in range(6):
             for j in range(6):
@@ -276,66 +258,38 @@ def join_starts(base, ends, sensitivity, starts, work):
         if not invert(a, inverse):
             return math.inf
         if k < WIDTH - 1:
-            v = (
-                d[0] + row_times(difference, 0, eta),
-                d[1] + row_times(difference, 1, eta),
-                d[2] + row_times(difference, 2, eta),
-                d[3] + row_times(difference, 3, eta),
-                d[4] + row_times(difference, 4, eta),
-                d[5] + row_times(difference, 5, eta),
-            )
-            v = (
-                row_times(inverse, 0, v),
-                row_times(inverse, 1, v),
-                row_times(inverse, 2, v),
-                row_times(inverse, 3, v),
-                row_times(inverse, 4, v),
-                row_times(inverse, 5, v),
-            )
-            step = (row_times(psi, 0, v), row_times(psi, 1, v), row_times(psi, 2, v))
+            step = times(psi, times(inverse, add_six(d, times(difference, eta))))
             product(a, inverse, difference)
             product(c, psi, a)
-            product_transposed(a, c, psi)
+            product(a, c, psi.T)
             read_covariance(ends, 7, k, c)
             for i in range(6):
                 for j in range(6):
                     a[i, j] += c[i, j]
-            end_q, G = moved(lane_attitude(ends, 0, k), step)
+            end_q, G = moved(lane_attitude(ends, 0, k), (step[0], step[1], step[2]))
             # A quaternion and its negative are one attitude; from a bundle of more than half a turn came the other one.
-            end_q = unit(scale_quaternion(math.copysign(1.0, turn[0]), end_q))
+            end_q = unit(quaternion_multiply((math.copysign(1.0, turn[0]), 0.0, 0.0, 0.0), end_q))
             times_left_block(c, G, a)
-            times_right_block(moved_by, c, (G[0], G[3], G[6], G[1], G[4], G[7], G[2], G[5], G[8]))
+            times_left_block(moved_by.T, G, c.T)
             for i in range(4):
                 starts[WIDTH * i + k + 1] = end_q[i]
             for i in range(3):
-                starts[WIDTH * (4 + i) + k + 1] = ends[WIDTH * (4 + i) + k] + row_times(psi, 3 + i, v)
+                starts[WIDTH * (4 + i) + k + 1] = ends[WIDTH * (4 + i) + k] + step[3 + i]
             write_covariance(starts, 7, k + 1, moved_by)
             for i in range(6):
                 if not moved_by[i, i] > 0.0:
                     return math.inf
-            product(a, psi, inverse)
-            times_left_block(psi, G, a)
         else:
-            product(a, psi, inverse)
-            for i in range(6):
-                for j in range(6):
-                    psi[i, j] = a[i, j]
+            G = IDENTITY  # what is behind the last stretch is not asked for
+        product(a, psi, inverse)
+        times_left_block(psi, G, a)
         # Ψ, J and η of a run from the new start, in its tangent space.
-        for i in range(6):
-            moved_by[0, i] = eta[i] - row_times(J, i, d)  # what is told of the new start, before ΔP is
+        v = times(inverse.T, subtract_six(eta, times(J, d)))
         product(a, J, inverse)
-        v = (moved_by[0, 0], moved_by[0, 1], moved_by[0, 2], moved_by[0, 3], moved_by[0, 4], moved_by[0, 5])
-        v = (
-            column_times(inverse, 0, v),
-            column_times(inverse, 1, v),
-            column_times(inverse, 2, v),
-            column_times(inverse, 3, v),
-            column_times(inverse, 4, v),
-            column_times(inverse, 5, v),
-        )
-        times_right_block(c, psi, T)
-        times_right_block(psi, a, T)
-        times_left_block(a, (T[0], T[3], T[6], T[1], T[4], T[7], T[2], T[5], T[8]), psi)
+        back = transpose(T)
+        times_left_block(c.T, back, psi.T)
+        times_left_block(psi.T, back, a.T)
+        times_left_block(a, back, psi)
         write_sensitivity(sensitivity, k, c, a)
         for i in range(3):
             sensitivity[WIDTH * (ETA + i) + k] = T[i] * v[0] + T[3 + i] * v[1] + T[6 + i] * v[2]
@@ -384,7 +338,7 @@ def carry_adjoint(psi, adjoints, k, a, c):
             for j in range(7):
                 adjoints[k, i, j] = 0.0
         return
-    transposed_product(a, psi, adjoints[k + 1])
+    product(a, psi.T, adjoints[k + 1])
     product(c, a, psi)
     for i in range(6):
         total = 0.0
@@ -410,15 +364,7 @@ def match_ends(ends, sensitivity, adjoints, assumed, found, work):
                 a[i, j] -= P[i, j]
         before = six(lane_vector(assumed, 0, k - 1), lane_vector(assumed, 3, k - 1))
         after = six(lane_vector(found, 0, k), lane_vector(found, 3, k))
-        shift = (
-            after[0] - before[0],
-            after[1] - before[1],
-            after[2] - before[2],
-            after[3] - before[3],
-            after[4] - before[4],
-            after[5] - before[5],
-        )
-        off = whitened(P, a, shift, c)
+        off = whitened(P, a, subtract_six(after, before), c)
         if not off < math.inf:
             return math.inf
         largest = max(largest, off)
@@ -483,12 +429,4 @@ def smooth_before(
             C,
         )
         store_state(state, q, b, A, B, C)
-        for i in range(4):
-            attitude_out[k, i] = state[i]
-        for i in range(3):
-            bias_out[k, i] = state[4 + i]
-        variance_out[k, 0], variance_out[k, 1], variance_out[k, 2] = A[0], A[3], A[5]
-        variance_out[k, 3], variance_out[k, 4], variance_out[k, 5] = C[0], C[3], C[5]
-        if k < len(covariance_out):
-            for i in range(21):
-                covariance_out[k, i] = state[7 + i]
+        write_filtered(state, 0, k, attitude_out, bias_out, variance_out, covariance_out)

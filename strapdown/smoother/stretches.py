@@ -128,8 +128,8 @@ def _smoothed(record: ImuRecord, process_noise: ProcessNoise, initial: State, fu
     *outputs, innovation = side_by_side(*((shape, float) for shape in shapes))
     state = pack(initial.attitude, initial.bias, initial.covariance)
     segments = np.empty((cut.first + 1, 32))  # one more tells whether a step was cut
-    _run_before(record, events, process_noise, cut, state, innovation, segments)
     noise = process_noise.angle_random_walk**2, process_noise.rate_random_walk**2
+    _run_before(record, events, noise, cut, state, innovation, segments)
     _guess_starts(record, cut, noise, state)
     _run(cut, noise, events.bounds, innovation)
     _go_back(cut, noise, outputs)
@@ -270,7 +270,7 @@ def _cut(record: ImuRecord, events: Schedule) -> _Cut:
 def _run_before(
     record: ImuRecord,
     events: Schedule,
-    process_noise: ProcessNoise,
+    noise: tuple[float, float],
     cut: _Cut,
     state: Array,
     innovation: Array,
@@ -289,8 +289,7 @@ def _run_before(
     taken, stopped, _ = compiled(filter_loop.run_filter)(
         record.time[: cut.first + 1],
         cut.increments.reshape(-1, 3)[: cut.first],
-        process_noise.angle_random_walk**2,
-        process_noise.rate_random_walk**2,
+        *noise,
         time,
         row,
         sensor,
