@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import operator
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -21,10 +20,7 @@ import numpy as np
 from strapdown import motion, vectors
 from strapdown.files import write_json
 from strapdown.gyro import GyroSpec
-from strapdown.kernels import lane_probes
-from strapdown.kernels.filter_step import predict, update_direction_and_judge
-from strapdown.kernels.machine import compiled, describe
-from strapdown.kernels.rotation import rotation_matrix
+from strapdown.kernels.machine import describe
 from strapdown.mekf import ProcessNoise, StepFilter, initial_state
 from strapdown.montecarlo import lanes, scalar
 from strapdown.montecarlo.plan import Plan
@@ -33,63 +29,6 @@ from strapdown.setup import FilterSetup
 
 NOISE = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6)
 RATE = 100.0
-
-
-class Counted:
-    """A number that counts what is done with it."""
-
-    operations = 0
-
-    def __init__(self, value: float) -> None:
-        self.value = value
-
-    def _with(self, other: Any, work: Callable[[float, float], float]) -> Counted:
-        Counted.operations += 1
-        return Counted(work(self.value, other.value if isinstance(other, Counted) else other))
-
-    def __add__(self, other: Any) -> Counted:
-        return self._with(other, operator.add)
-
-    def __sub__(self, other: Any) -> Counted:
-        return self._with(other, operator.sub)
-
-    def __mul__(self, other: Any) -> Counted:
-        return self._with(other, operator.mul)
-
-    def __truediv__(self, other: Any) -> Counted:
-        return self._with(other, operator.truediv)
-
-    __radd__, __rmul__ = __add__, __mul__
-
-    def __rsub__(self, other: Any) -> Counted:
-        return self._with(other, lambda a, b: b - a)
-
-    def __rtruediv__(self, other: Any) -> Counted:
-        return self._with(other, lambda a, b: b / a)
-
-    def __neg__(self) -> Counted:
-        return Counted(-self.value)
-
-    def __lt__(self, other: Any) -> bool:
-        return bool(self.value < (other.value if isinstance(other, Counted) else other))
-
-    def __gt__(self, other: Any) -> bool:
-        return bool(self.value > (other.value if isinstance(other, Counted) else other))
-
-
-def operations_a_step() -> int:
-    """Return the additions, multiplications and divisions of one prediction and one update, by counting them."""
-
-    def numbers(*values: float) -> tuple[Counted, ...]:
-        return tuple(Counted(value) for value in values)
-
-    Counted.operations = 0
-    q, b, B = numbers(1.0, 0.0, 0.0, 0.0), numbers(0.0, 0.0, 0.0), numbers(*[0.0] * 9)
-    A, C = numbers(1e-4, 0.0, 0.0, 1e-4, 0.0, 1e-4), numbers(1e-6, 0.0, 0.0, 1e-6, 0.0, 1e-6)
-    q, A, B, C = predict(q, b, A, B, C, numbers(1e-3, 2e-3, 3e-3), 0.01, 1e-8, 1e-12)
-    u, v, z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), numbers(0.01, 0.0, 1.0)
-    update_direction_and_judge(q, b, A, B, C, rotation_matrix(q), u, v, z, 1e-4)
-    return Counted.operations
 
 
 def plan(steps: int, precision: str = "float64") -> Plan:
@@ -114,33 +53,6 @@ def least(work: Callable[[], Any], repeats: int) -> float:
         work()
         times.append(time.process_time() - start)
     return min(times)
-
-
-def probes(repeats: int) -> dict[str, dict[str, float]]:
-    """Return by precision: fused multiply-adds a ns of all lanes together, ns a run-step of the filter alone, ns a normal."""
-    return {
-        "float64": probe(np.float64, 8, repeats),
-        "float32": probe(np.float32, 16, repeats),
-    }
-
-
-def probe(real: Any, width: int, repeats: int) -> dict[str, float]:
-    """Return the figures of one precision."""
-    pattern = tuple(real(0.0) for _ in range(width))
-    turns, number = 20_000, 2000
-    peak = least(lambda: compiled(lane_probes.peak)(pattern, np.ones(width, real), turns), repeats)
-    state = np.zeros((28, width), real)
-    state[0] = 1.0
-    state[[7, 10, 12]], state[[22, 25, 27]] = 1e-4, 1e-6
-    inputs = (1e-3 * np.random.default_rng(0).standard_normal((3, width))).astype(real).reshape(-1)
-    kernel = least(lambda: compiled(lane_probes.steps)(pattern, state.copy().reshape(-1), inputs, number), repeats)
-    rows, runs = np.empty(4000 * width, real), np.arange(width, dtype=np.uint64)
-    normals = least(lambda: compiled(lane_probes.normals)(pattern, runs, rows), repeats)
-    return {
-        "fused_per_ns": turns * lane_probes.FUSED * width / peak * 1e-9,
-        "kernel_ns": kernel / number / width * 1e9,
-        "normal_ns": normals / len(rows) * 1e9,
-    }
 
 
 def simdkalman_ns(repeats: int) -> float | None:
@@ -185,7 +97,6 @@ def threads_ratio(one: Plan, runs: int) -> float:
 
 def main(*, steps: int = 10_000, runs: int = 160, repeats: int = 9) -> dict[str, Any]:
     """Return all figures, ns a run-step unless the name says otherwise."""
-    machine = probes(repeats)
     full = {}
     for precision in ("float64", "float32"):
         one = plan(steps, precision)
@@ -202,12 +113,6 @@ def main(*, steps: int = 10_000, runs: int = 160, repeats: int = 9) -> dict[str,
         "steps": steps,
         "runs": runs,
         "full": full,
-        "probes": machine,
-        "operations_a_step": operations_a_step(),
-        "share_of_peak": {
-            name: operations_a_step() / values["kernel_ns"] / (2.0 * values["fused_per_ns"])
-            for name, values in machine.items()
-        },
         "peers": peers,
         "two_threads": threads_ratio(plan(steps), runs),
         "ten_thousand_squared_s": {name: ns * 1e-9 * 1e8 / 2 for name, ns in full.items()},
@@ -224,12 +129,7 @@ if __name__ == "__main__":
     result = main(steps=arguments.steps, runs=arguments.runs, repeats=arguments.repeats)
     print(json.dumps(result["machine"]))
     for name, ns in result["full"].items():
-        probe = result["probes"][name]
-        print(
-            f"{name}: whole run-step {ns:.1f} ns, filter alone {probe['kernel_ns']:.1f} ns "
-            f"({100 * result['share_of_peak'][name]:.0f} % of the peak of {2 * probe['fused_per_ns']:.0f} operations a ns), "
-            f"normal {probe['normal_ns']:.2f} ns"
-        )
+        print(f"{name}: whole run-step {ns:.1f} ns")
         print(f"    10000 runs of 10000 steps on two idle cores: {result['ten_thousand_squared_s'][name]:.1f} s")
     for name, ns in result["peers"].items():
         if ns is not None:

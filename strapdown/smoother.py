@@ -35,7 +35,6 @@ from strapdown.mekf.running import LostDigitsError
 from strapdown.mekf.states import check_arguments
 from strapdown.records import Estimate, Event, ImuRecord
 from strapdown.robustness import Gate, Robust
-from strapdown.smoother import stretches
 
 MOST_GROUPS = 3600
 """Groups of segments of which the fixed-lag smoother keeps the gains, 5.7 kB each; where a lag takes more, it computes them anew."""
@@ -67,8 +66,6 @@ def run(
     -------
     Estimate
         Attitude, bias and variance are smoothed; those at the last edge are the filter's. Innovations and events are the filter's.
-        A record of :data:`strapdown.smoother.stretches.FEWEST_STEPS` intervals or more, with measurements at their edges and without
-        options, is smoothed as eight stretches side by side, equal to one pass to a few 1e-4 of a σ at most.
         Memory for the filter's states: 256 bytes a gyro interval and a measurement. A record with recoveries takes three times as long;
         one whose covariance would lose its digits, by measurements 1e-7 times as wide as what was known or by an outage, is smoothed
         on its square root as by :func:`strapdown.augmented.smooth`, which takes a dozen times as long.
@@ -105,10 +102,6 @@ def _smoothed(
     robust: Robust | None,
 ) -> Estimate:
     check_arguments(record=record, process_noise=process_noise, initial=initial, gate=gate, robust=robust)
-    if gate is None and robust is None and record.time[0] + lag >= record.time[-1]:
-        by_stretches = stretches.smoothed(record, process_noise, initial, full_covariance)
-        if by_stretches is not None:
-            return by_stretches
     try:
         forward, event_time, segments = _filtered(record, process_noise, initial, gate, robust)
     except LostDigitsError:
