@@ -24,7 +24,7 @@ from strapdown.files import write_json
 from strapdown.kernels.machine import describe
 from strapdown.mekf import ProcessNoise, StepFilter, initial_state
 from strapdown.records import ImuRecord
-from strapdown.robustness import Gate, Robust
+from strapdown.estimation.gating import Gate, Robust
 from strapdown.vectors import VectorMeasurements
 
 RATE = 100.0

@@ -4,7 +4,7 @@ The built-in scenario ``magnetometer-only``: a satellite in a low orbit that tur
 magnetometer every ten seconds. One direction at a time leaves the turn about it open until the field has turned. Starts are uniform over
 all attitudes, gyro biases normal of 20 °/h. On the same records run
 
-- the bank of hypotheses (:mod:`strapdown.bank`), by numbers of hypotheses;
+- the bank of hypotheses (:mod:`strapdown.estimation.multiple_model`), by numbers of hypotheses;
 - single filters of the family from the middle of nowhere, with the covariance that such a start has: mekf, usque.
 
 Run it: ``python sims/unknown_start.py --out unknown-start-results`` (minutes, nearly all of them the unscented filter's).

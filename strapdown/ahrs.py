@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from strapdown import coning, mekf, quaternion, setup, wahba
-from strapdown.augmented import SensorStates, States
+from strapdown.setup.states import SensorStates, States
 from strapdown.checks import Array, InputError, non_negative, positive
 from strapdown.recordings import Recording, increments
 from strapdown.records import Estimate, ImuRecord

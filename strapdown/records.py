@@ -14,9 +14,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 import strapdown
-from strapdown import coning
+from strapdown import coning, quaternion
 from strapdown.checks import Array, InputError, array, increasing, instance, unit_quaternions
 from strapdown.files import existing_file, whole_hdf5, written_beside
 from strapdown.vectors import VectorMeasurements
@@ -231,6 +232,23 @@ class Event:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ErrorStateEstimate:
+    """Estimate of one declaration of error states (:mod:`strapdown.estimation.error_states`) at the kept edges."""
+
+    components: tuple[str, ...]
+    units: tuple[str, ...]
+    values: Array
+    """(m, size), in ``units``."""
+    variance: Array
+    """(m, size), the square of the units."""
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations (m, size)."""
+        return np.sqrt(self.variance)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Estimate:
     """What a filter made of a record, at the kept edges."""
 
@@ -250,6 +268,34 @@ class Estimate:
     """Measurements not used, by sensor: missing (NaN) ones and those outside the record's time."""
     events: tuple[Event, ...] = ()
     """What must be heard of the run, in order of time."""
+    error_states: Mapping[str, ErrorStateEstimate] = field(default_factory=dict)
+    """Error states by name, in the order given (c, below)."""
+    whole_covariance: Array | None = None
+    """P (m, n, n) of (δθ, δb, δc) of a filter with error states, if it was asked for; ``covariance`` is its part (m, 6, 6)."""
+    whole_bias: Array | None = None
+    """Gyro bias and all that error states add to it, ``b + Σ c e`` (m, 3), rad/s, if it was asked for."""
+    whole_bias_variance: Array | None = None
+    """Diagonal of the covariance of attitude and whole bias (m, 6)."""
+    whole_bias_covariance: Array | None = None
+    """That covariance (m, 6, 6)."""
+
+    def errors(
+        self, true_attitude: ArrayLike, true_bias: ArrayLike, true_values: Mapping[str, ArrayLike] | None = None
+    ) -> Array:
+        """Return the error (m, n) of all states: Log(q_est⁻¹ ⊗ q_true), then true less estimated.
+
+        ``true_values`` holds for each declaration of error states an array (size,) or (m, size), of what is carried in the axes of the
+        estimated attitude (:attr:`strapdown.estimation.error_states.Effect.carried`).
+        """
+        given = dict(true_values or {})
+        if set(given) != set(self.error_states):
+            raise InputError(
+                f"true_values has {sorted(given)}, and the error states are {sorted(self.error_states)}; give each of them"
+            )
+        turn = quaternion.log(quaternion.multiply(quaternion.conjugate(self.attitude), true_attitude))
+        parts = [turn, np.asarray(true_bias) - self.bias]
+        parts += [np.asarray(given[name]) - states.values for name, states in self.error_states.items()]
+        return np.concatenate(parts, axis=-1)
 
     @property
     def refused(self) -> dict[str, int]:
@@ -269,23 +315,6 @@ _ESTIMATE_UNITS = {
     "variance": "rad^2 (columns 0-2), (rad/s)^2 (columns 3-5)",
     "covariance": "rad^2, rad^2/s, (rad/s)^2",
 }
-
-
-@dataclass(frozen=True, kw_only=True)
-class BlockEstimate:
-    """Estimate of one block of optional states (:mod:`strapdown.augmented`) at the kept edges."""
-
-    components: tuple[str, ...]
-    units: tuple[str, ...]
-    values: Array
-    """(m, size), in ``units``."""
-    variance: Array
-    """(m, size), the square of the units."""
-
-    @property
-    def sigma(self) -> Array:
-        """Standard deviations (m, size)."""
-        return np.sqrt(self.variance)
 
 
 @contextlib.contextmanager
@@ -351,7 +380,7 @@ def write_estimate(
                 put(group, "weight", innovations.weight, "1", "0: refused; 1: taken in whole")
         for number, event in enumerate(estimate.events):
             file.create_group(f"events/{number:06d}").attrs.update(vars(event))
-        for number, (name, block) in enumerate(getattr(estimate, "blocks", {}).items()):
+        for number, (name, block) in enumerate(estimate.error_states.items()):
             group = file.create_group(f"states/{number}")
             group.attrs.update(name=name, components=list(block.components), units=list(block.units))
             put(group, "values", block.values, "those of the attribute units")
@@ -480,7 +509,7 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
         )
 
 
-def read_states(path: str | os.PathLike[str]) -> dict[str, BlockEstimate]:
+def read_states(path: str | os.PathLike[str]) -> dict[str, ErrorStateEstimate]:
     """Read the optional states of an estimate written by :func:`write_estimate`, by name; none of a filter without.
 
     Raises
@@ -493,7 +522,7 @@ def read_states(path: str | os.PathLike[str]) -> dict[str, BlockEstimate]:
         found = {}
         for part in file["states"].values() if "states" in file else ():
             values = _numbers(part, "values", (rows, "states"))
-            found[str(part.attrs["name"])] = BlockEstimate(
+            found[str(part.attrs["name"])] = ErrorStateEstimate(
                 components=tuple(str(one) for one in part.attrs["components"]),
                 units=tuple(str(one) for one in part.attrs["units"]),
                 values=values,

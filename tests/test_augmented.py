@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from strapdown import augmented, consistency, kinematics, mekf, motion, quaternion, records, smoother
-from strapdown.augmented.blocks import Block
-from strapdown.augmented.observing import without_errors
+from strapdown.estimation.error_states import Block
+from strapdown.estimation.observability import without_errors
 from strapdown.checks import InputError
 from strapdown.kernels import augmented_factor, augmented_step
 from strapdown.kernels.machine import compiled
 from strapdown.mekf import ProcessNoise
 from strapdown.records import ImuRecord
-from strapdown.robustness import Gate
+from strapdown.estimation.gating import Gate
 from strapdown.vectors import VectorMeasurements
 
 NOISE = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-4)

@@ -11,13 +11,13 @@ import pytest
 from filterpy.common import Saver
 
 from strapdown import augmented, mekf, motion, quaternion
-from strapdown.augmented.blocks import Block
+from strapdown.estimation.error_states import Block
 from strapdown.checks import InputError
 from strapdown.gyro import GyroSpec
 from strapdown.mekf import ProcessNoise
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord
-from strapdown.robustness import Gate, Monitor, Robust
+from strapdown.estimation.gating import Gate, Monitor, Robust
 from strapdown.scenarios import Scenario, simulate
 from strapdown.vectors import AttitudeSensor, Faults, VectorSensor
 

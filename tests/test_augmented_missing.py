@@ -10,7 +10,7 @@ from strapdown.augmented import StepFilter, VectorBias
 from strapdown.checks import InputError
 from strapdown.mekf import ProcessNoise
 from strapdown.records import ImuRecord
-from strapdown.robustness import Gate, Robust
+from strapdown.estimation.gating import Gate, Robust
 from strapdown.vectors import VectorMeasurements
 
 NOISE = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from strapdown import augmented, consistency, mekf, montecarlo, motion, quaternion, records, setup
-from strapdown.augmented import SensorStates, States, filtering
-from strapdown.augmented import states as optional
-from strapdown.augmented.blocks import Block
+from strapdown.setup.states import SensorStates, States, filtering
+from strapdown.setup import states as optional
+from strapdown.estimation.error_states import Block
 from strapdown.gyro import GyroSpec
 from strapdown.kernels import robust_gate, robust_step
 from strapdown.kernels.augmented_robust import start_challenger, widen
@@ -20,7 +20,7 @@ from strapdown.kernels.robust_gate import WIDE_PASSES
 from strapdown.mekf import ProcessNoise
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Truth
-from strapdown.robustness import UNIFORM_SIGMA, Gate, Robust
+from strapdown.estimation.gating import UNIFORM_SIGMA, Gate, Robust
 from strapdown.scenarios import Scenario
 from strapdown.setup import FilterSetup
 from strapdown.vectors import Accelerometer, Magnetometer, VectorMeasurements

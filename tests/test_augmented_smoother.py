@@ -11,11 +11,11 @@ import scipy.linalg
 
 from strapdown import augmented, consistency, kinematics, mekf, motion, quaternion, records
 from strapdown.augmented import filtering, joining, smoothing
-from strapdown.augmented.turning import turning
+from strapdown.estimation.angular_acceleration import turning
 from strapdown.checks import InputError
 from strapdown.mekf import ProcessNoise
 from strapdown.records import ImuRecord
-from strapdown.robustness import Gate
+from strapdown.estimation.gating import Gate
 from strapdown.vectors import VectorMeasurements
 
 UP, FIELD = np.array([0.0, 0.0, 9.81]), np.array([0.0, 0.6, -0.8])

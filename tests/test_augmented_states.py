@@ -10,14 +10,14 @@ import pytest
 from filterpy.common import Saver
 
 from strapdown import augmented, consistency, kinematics, mekf, motion, quaternion, records, scenarios, setup, vectors
-from strapdown.augmented import SensorStates, States, filtering, matching, turning
-from strapdown.augmented import states as optional
+from strapdown.setup.states import SensorStates, States, filtering, matching, turning
+from strapdown.setup import states as optional
 from strapdown.checks import InputError
 from strapdown.gyro import GyroSpec
 from strapdown.mekf import ProcessNoise
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Truth
-from strapdown.robustness import Gate, Monitor, Robust
+from strapdown.estimation.gating import Gate, Monitor, Robust
 from strapdown.scenarios import Scenario
 from strapdown.setup import FilterSetup
 from strapdown.vectors import VectorMeasurements

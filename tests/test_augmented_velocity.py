@@ -15,9 +15,9 @@ import scipy.linalg
 
 from sims import hand_held
 from strapdown import ahrs, augmented, consistency, kinematics, mekf, motion, quaternion, records, scenarios, setup
-from strapdown.augmented import SensorStates, States, stepping
-from strapdown.augmented.blocks import stationary_covariance
-from strapdown.augmented.model import assemble
+from strapdown.setup.states import SensorStates, States, stepping
+from strapdown.estimation.error_states import stationary_covariance
+from strapdown.estimation.model import assemble
 from strapdown.checks import InputError
 from strapdown.consistency import reference_errors
 from strapdown.gyro import GyroSpec

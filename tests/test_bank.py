@@ -17,7 +17,7 @@ from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.mekf import ProcessNoise
 from strapdown.motion import ConstantRate
 from strapdown.records import ImuRecord
-from strapdown.robustness import Gate, Monitor, Robust
+from strapdown.estimation.gating import Gate, Monitor, Robust
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 from strapdown.vectors import Faults, VectorMeasurements
 

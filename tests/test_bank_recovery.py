@@ -15,7 +15,7 @@ from strapdown.kernels import robust_gate
 from strapdown.mekf import ProcessNoise
 from strapdown.motion import ConstantRate
 from strapdown.randomness import generator
-from strapdown.robustness import Gate, Monitor, Robust
+from strapdown.estimation.gating import Gate, Monitor, Robust
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 from strapdown.vectors import VectorMeasurements
 

@@ -324,8 +324,7 @@ def test_scaled_noise_reaches_every_kind():
 
 def test_the_heading_of_an_inclined_vector_shifts_with_tilt():
     """Its row is the derivative of the heading by a small turn about each body axis."""
-    from strapdown.kernels.filter_loop import heading_error
-    from strapdown.kernels.filter_step import heading_row
+    from strapdown.kernels.measurement import heading_error, heading_row
 
     q = quaternion.exp([0.4, -0.3, 0.8])
     reference = np.array([0.3, 0.9, -1.2])

@@ -9,7 +9,7 @@ import pytest
 
 from strapdown import mekf
 from strapdown.mekf import memory
-from strapdown.mekf.memory import side_by_side
+from strapdown.estimation.memory import side_by_side
 from strapdown.records import ImuRecord
 from strapdown.vectors import VectorMeasurements
 

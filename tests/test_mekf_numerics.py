@@ -13,7 +13,7 @@ from strapdown.kernels.filter_loop import CHECKED
 from strapdown.kernels.robust_gate import CHALLENGED
 from strapdown.mekf import ProcessNoise, StepFilter, initial_state
 from strapdown.records import ImuRecord
-from strapdown.robustness import Gate, Robust
+from strapdown.estimation.gating import Gate, Robust
 from strapdown.scenarios import Scenario, simulate
 from strapdown.vectors import VectorMeasurements, VectorSensor
 

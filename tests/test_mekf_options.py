@@ -12,7 +12,7 @@ from strapdown.gyro import GyroSpec
 from strapdown.mekf import ProcessNoise, StepFilter, initial_state
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord
-from strapdown.robustness import Gate, Robust
+from strapdown.estimation.gating import Gate, Robust
 from strapdown.scenarios import Scenario, simulate
 from strapdown.setup import FilterSetup
 from strapdown.vectors import Accelerometer, AttitudeSensor, Faults, VectorMeasurements, VectorSensor

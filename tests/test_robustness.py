@@ -13,7 +13,7 @@ from strapdown.kernels import robust_gate, robust_loop
 from strapdown.kernels.robust_step import ACCEPTED, PASSED_OVER, REFUSED
 from strapdown.mekf import ProcessNoise, initial_state
 from strapdown.randomness import generator
-from strapdown.robustness import Gate, Monitor, Robust
+from strapdown.estimation.gating import Gate, Monitor, Robust
 from strapdown.scenarios import Scenario, simulate
 from strapdown.vectors import AttitudeSensor, Faults, VectorSensor
 
@@ -410,7 +410,7 @@ def test_the_rules_of_a_gate():
 
 def test_a_widened_challenger_is_one_that_started_wider():
     """Of the information of all that it has seen, P⁻¹, that of its start counts a ninth: in matrices, without a gain."""
-    from strapdown.mekf.states import covariance_matrices, pack
+    from strapdown.estimation.states import covariance_matrices, pack
 
     rng = np.random.default_rng(3)
     for _ in range(20):

@@ -11,7 +11,7 @@ from strapdown import augmented, coning, consistency, mekf, quaternion, records,
 from strapdown.checks import InputError
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
-from strapdown.robustness import Gate, Robust
+from strapdown.estimation.gating import Gate, Robust
 from strapdown.setup import FilterSetup
 
 SETUP = FilterSetup(

@@ -20,7 +20,7 @@ from strapdown.kernels.machine import compiled
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.mekf import ProcessNoise
 from strapdown.records import Estimate, ImuRecord, Truth
-from strapdown.robustness import Gate
+from strapdown.estimation.gating import Gate
 from strapdown.vectors import VectorMeasurements, triad
 
 DOWN, NORTH, STAR = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]), np.array([0.6, 0.48, 0.64])

@@ -13,7 +13,7 @@ from strapdown.gyro import GyroSpec
 from strapdown.mekf import ProcessNoise, StepFilter, initial_state
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord
-from strapdown.robustness import Gate, Monitor, Robust
+from strapdown.estimation.gating import Gate, Monitor, Robust
 from strapdown.scenarios import Scenario, simulate
 from strapdown.vectors import AttitudeSensor, Faults, VectorMeasurements, VectorSensor
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from strapdown import coning, consistency, gyro, mekf, motion, scenarios, setup, tuning, vectors
-from strapdown.augmented import SensorStates, States
+from strapdown.setup.states import SensorStates, States
 from strapdown.checks import InputError
 from strapdown.montecarlo.scalar import start
 from strapdown.randomness import generator

@@ -16,7 +16,7 @@ from strapdown.checks import InputError
 from strapdown.mekf import ProcessNoise
 from strapdown.records import ImuRecord
 from strapdown.report import tunings
-from strapdown.robustness import Gate
+from strapdown.estimation.gating import Gate
 from strapdown.setup import FilterSetup
 from strapdown.tuning import innovations, outliers
 from strapdown.vectors import VectorMeasurements

@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike
 from strapdown import kinematics, mekf, quaternion
 from strapdown.augmented import filtering
 from strapdown.augmented import model as modelling
-from strapdown.augmented.blocks import Block, GeneralBlock, Interval, View
-from strapdown.augmented.filtering import AugmentedEstimate
-from strapdown.augmented.model import AugmentedGateMemory, AugmentedState
+from strapdown.estimation.error_states import Block, GeneralBlock, Interval, View
+from strapdown.estimation.forward import AugmentedEstimate
+from strapdown.estimation.model import AugmentedGateMemory, AugmentedState
 from strapdown.checks import (
     Array,
     InputError,
@@ -40,11 +40,11 @@ from strapdown.kernels.robust_gate import WIDE_PASSES
 from strapdown.kernels.robust_step import ACCEPTED, PASSED_OVER, REFUSED
 from strapdown.mekf import ProcessNoise
 from strapdown.mekf.judging import Judging
-from strapdown.mekf.scheduling import skipped_too
-from strapdown.mekf.states import check_arguments, restart_bias_variance
+from strapdown.estimation.schedule import skipped_too
+from strapdown.estimation.states import check_arguments, restart_bias_variance
 from strapdown.mekf.stepping import Measured, sensor_names, show_refused
 from strapdown.records import ImuRecord
-from strapdown.robustness import Gate, Linearised, Monitor, Robust, Rows, seen_from, tilt_unknown
+from strapdown.estimation.gating import Gate, Linearised, Monitor, Robust, Rows, seen_from, tilt_unknown
 from strapdown.vectors import KINDS, need_level, need_unit, triad
 
 KIND_CODES = {
@@ -406,7 +406,7 @@ class StepFilter(mekf.StepFilter):
         return y[:count].copy(), H[:count, : 6 + m].copy(), noise, angle, far
 
     def _linearised(self, measured: _Measured, others: Array, threshold: float) -> Linearised:
-        """Return a measurement seen from the state that its update leads to: :func:`strapdown.robustness.linearise`, all states along."""
+        """Return a measurement seen from the state that its update leads to: :func:`strapdown.estimation.gating.linearise`, all states along."""
         A = self.P[:3, :3]
         unknown = np.trace(A) >= robust_step.UNKNOWN
         tolerance = robust_step.SETTLED if unknown else robust_step.RELINEARIZED

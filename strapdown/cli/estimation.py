@@ -196,7 +196,7 @@ def _estimate_record(
     from strapdown.files import write_json
     from strapdown.recordfiles import read_record_file
     from strapdown.records import Truth, write_estimate
-    from strapdown.robustness import Gate, Robust
+    from strapdown.estimation.gating import Gate, Robust
 
     count("every", every)
     if smooth and every > 1:

@@ -20,7 +20,7 @@ def filter_for(
     ``states`` None: of attitude and bias alone; empty: with all states that the specified errors call for.
     """
     from strapdown import setup
-    from strapdown.augmented import States
+    from strapdown.setup.states import States
     from strapdown.checks import InputError
     from strapdown.gyro import read_spec
     from strapdown.scenarios import scenario_from_toml

@@ -14,7 +14,7 @@ from strapdown import mekf
 from strapdown.checks import Array, count
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.mekf import Schedule
-from strapdown.mekf.states import check_arguments
+from strapdown.estimation.states import check_arguments
 from strapdown.records import Estimate, Event, ImuRecord
 
 

@@ -20,8 +20,7 @@ from strapdown import mekf, quaternion
 from strapdown.checks import Array, InputError
 from strapdown.family import stepping
 from strapdown.kernels.family_turns import process_noise_over_any_turn
-from strapdown.kernels.filter_loop import ATTITUDE, DIRECTION, HEADING, heading_error
-from strapdown.kernels.filter_step import shows_heading
+from strapdown.kernels.measurement import ATTITUDE, DIRECTION, HEADING, has_heading, heading_error
 from strapdown.kernels.rotation import quaternion_multiply
 from strapdown.mekf import ProcessNoise, Schedule, State
 from strapdown.records import Estimate, ImuRecord
@@ -136,7 +135,7 @@ def _update(
     triad = frame.reshape(3, 3)
     record = np.zeros(6)
     record[1::2] = 1.0
-    if kind == HEADING and not shows_heading(quaternion.to_matrix(q).ravel(), z):
+    if kind == HEADING and not has_heading(quaternion.to_matrix(q).ravel(), z):
         record[0] = np.nan
         return q, b, P, record
     sigma, attitudes = _spread(points, q, b, P)

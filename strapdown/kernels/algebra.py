@@ -210,3 +210,35 @@ def skew_polynomial(identity, linear, quadratic, v):
         yz + x,
         identity - quadratic * (xx + yy),
     )
+
+
+def factored(S):
+    """Return S = L D Lᵀ of a symmetric positive-definite matrix, as (l10, l20, l21, 1/d0, 1/d1, 1/d2).
+
+    Eliminated without fractions (Bareiss 1968), so that no division waits for another: the differences, and with them the rounding, are
+    those of the elimination by rows times the pivots before.
+    """
+    m11 = S[0] * S[3] - S[1] * S[1]
+    m21 = S[0] * S[4] - S[1] * S[2]
+    m22 = S[0] * S[5] - S[2] * S[2]
+    i0 = 1.0 / S[0]
+    j1 = 1.0 / m11
+    i2 = (S[0] * m11) / (m11 * m22 - m21 * m21)
+    return (S[1] * i0, S[2] * i0, m21 * j1, i0, S[0] * j1, i2)
+
+
+def solved(F, v):
+    """Return S⁻¹ v from the factors of S."""
+    y1 = v[1] - F[0] * v[0]
+    y2 = v[2] - F[1] * v[0] - F[2] * y1
+    x2 = F[5] * y2
+    x1 = F[4] * y1 - F[2] * x2
+    return (F[3] * v[0] - F[0] * x1 - F[1] * x2, x1, x2)
+
+
+def divided(X, F):
+    """Return X S⁻¹ of a matrix X, from the factors of S."""
+    a0, a1, a2 = solved(F, (X[0], X[1], X[2]))
+    b0, b1, b2 = solved(F, (X[3], X[4], X[5]))
+    c0, c1, c2 = solved(F, (X[6], X[7], X[8]))
+    return (a0, a1, a2, b0, b1, b2, c0, c1, c2)

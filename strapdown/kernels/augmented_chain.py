@@ -15,6 +15,9 @@ import math
 
 from strapdown.kernels.augmented_step import NODES, WEIGHTS
 
+CALLED = ("chain_step", "step_chains", "carry_chains_back")
+"""Not inlined where other kernels use them: their work is far more than a call, and each copy would be compiled anew."""
+
 CHAIN = 3
 """Most states of a chain."""
 TERMS = 14

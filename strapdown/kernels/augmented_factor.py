@@ -9,6 +9,9 @@ from __future__ import annotations
 
 import math
 
+CALLED = ("triangularise", "take_row", "variances", "covariances", "whole_bias")
+"""Not inlined where other kernels use them: their work is far more than a call, and each copy would be compiled anew."""
+
 
 def triangularise(F, last, dense, first_noise, end_noise, first_extra, end_extra, work):
     """Bring the rows above and the noise rows into the triangle, by Householder reflections: ``Fᵀ F`` stays.

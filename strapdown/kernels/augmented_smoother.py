@@ -13,23 +13,95 @@ Compiled by :func:`strapdown.kernels.machine.compiled`.
 
 from __future__ import annotations
 
-from strapdown.kernels.augmented_chain import carry_chains_back, step_chains
+from typing import NamedTuple
+
+import numpy as np
+
+from strapdown.kernels.augmented_chain import LINKS, carry_chains_back
 from strapdown.kernels.augmented_factor import covariances, triangularise, variances
 from strapdown.kernels.augmented_step import (
     carry,
     carry_back,
-    fill_noise,
     fixed_turn,
     move,
     turn_columns,
     turn_rows,
     turn_values,
 )
-from strapdown.kernels.rotation import logarithm, quaternion_multiply
-from strapdown.kernels.smoother_step import inverse_right_jacobian, moved
+from strapdown.kernels.root_form import step_noise
+from strapdown.kernels.rotation import inverse_right_jacobian, logarithm, moved, quaternion_multiply
+
+CALLED = ("load_segment", "prepare_step", "step_back", "write_smoothed")
+"""Not inlined where other kernels use them: their work is far more than a call, and each copy would be compiled anew."""
 
 BORROWS_ARRAYS = True
 """See :mod:`strapdown.kernels.machine`."""
+
+
+class Passes(NamedTuple):
+    """Backward passes: pass p goes from the filtered state at edge ``last[p]`` down and writes edges ``upto[p]`` to ``first[p]``."""
+
+    segments: np.ndarray
+    """The filter's rows, the last one the end state."""
+    starts: np.ndarray
+    """Row that starts at each edge."""
+    first: np.ndarray
+    upto: np.ndarray
+    last: np.ndarray
+    """From pass to pass ``last`` does not fall and ``upto`` stays below the next ``first``."""
+
+
+class Workspace(NamedTuple):
+    """Scratch of n states, p rows of noise and several passes that go together."""
+
+    links: np.ndarray
+    x: np.ndarray
+    """(n − 3,), the predicted values of a segment."""
+    F: np.ndarray
+    """(n + p, n + p)"""
+    noise: np.ndarray
+    """(p, n): the rows of noise of a segment."""
+    gain: np.ndarray
+    """(p, n): ``Y S⁻⁻¹``."""
+    left: np.ndarray
+    """(p, n): ``Z N``."""
+    coupling: np.ndarray
+    factor: np.ndarray
+    work: np.ndarray
+    later_q: np.ndarray
+    """Of each pass, what is known at the end of the segment: attitude (4,), x (n − 3,), and the triangle (n + p + 1, n)."""
+    later_x: np.ndarray
+    later_F: np.ndarray
+
+
+class Outputs(NamedTuple):
+    """Arrays that the passes write, a row an edge."""
+
+    attitude: np.ndarray
+    x: np.ndarray
+    variance: np.ndarray
+    covariance: np.ndarray
+    """(edges, n, n), or (0, n, n)."""
+
+
+def workspace(states, rows, chained, together):
+    """Return room for so many error states, rows of noise and passes at once."""
+    size = 6 + states
+    prepared = np.empty((3, rows, size))
+    return Workspace(
+        links=np.empty((chained, LINKS)),
+        x=np.empty(size - 3),
+        F=np.empty((size + rows, size + rows)),
+        noise=prepared[0],
+        gain=prepared[1],
+        left=prepared[2],
+        coupling=np.empty((states, 3)),
+        factor=np.empty(states),
+        work=np.empty(size + rows),
+        later_q=np.empty((together, 4)),
+        later_x=np.empty((together, size - 3)),
+        later_F=np.empty((together, size + rows + 1, size)),
+    )
 
 
 def load_segment(segments, k, x, F, size):
@@ -47,43 +119,24 @@ def load_segment(segments, k, x, F, size):
     return (segments[k, 4], segments[k, 5], segments[k, 6], segments[k, 7])
 
 
-def prepare_step(
-    segments,
-    j,
-    angle_variance,
-    rate_variance,
-    decay,
-    density,
-    changing,
-    gyro,
-    gyro_use,
-    force_f,
-    chains,
-    links,
-    x,
-    F,
-    noise,
-    gain,
-    left,
-    scratch,
-):
+def prepare_step(segments, j, model, space):
     """Prepare what segment j makes of any later knowledge; return the predicted attitude, Φ11, Φ12 and the rows of F in use.
 
-    ``F`` (size + p, size + p) is scratch. ``x`` is left at the predicted values, ``noise`` (p, size) at the rows of noise, ``gain``
-    (p, size) at ``Y S⁻⁻¹``, ``left`` (p, size) at ``Z N``, and so are Φ's own numbers in ``scratch``: arrays (states, 3), (states,) and
-    one as wide as F.
+    Leaves ``noise``, ``gain``, ``left`` and ``x`` of the work space, and Φ's own numbers there.
     """
+    x, F, noise, gain, left = space.x, space.F, space.noise, space.gain, space.left
+    coupling, factor, work = space.coupling, space.factor, space.work
+    gyro_use, changing = model.gyro_use, model.changing
     size = len(x) + 3
     noisy = 6 + changing
-    coupling, factor, work = scratch
     q = load_segment(segments, j, x, F, size)
     dt = segments[j, 0]
     part = (segments[j, 1], segments[j, 2], segments[j, 3])
-    predicted, phi11, phi12, rate, D = move(q, x, dt, part, decay, gyro, gyro_use, force_f, coupling, factor)
+    predicted, phi11, phi12, rate, D = move(
+        q, x, dt, part, model.decay, model.gyro, gyro_use, model.force_f, coupling, factor
+    )
     carry(F, 0, size, phi11, phi12, coupling, factor, gyro_use, changing)
-    rows = fill_noise(F, size, size, dt, rate, D, angle_variance, rate_variance, decay, density, gyro, gyro_use)
-    if len(chains) > 0:
-        rows = step_chains(F, size, rows, x, dt, decay, chains, links)
+    rows = step_noise(model, space.links, F, size, dt, rate, D, x)
     p = rows - size
     for r in range(p):
         for i in range(size):
@@ -107,34 +160,18 @@ def prepare_step(
     return predicted, phi11, phi12, rows
 
 
-def step_back(
-    segments,
-    j,
-    predicted,
-    phi11,
-    phi12,
-    rows,
-    changing,
-    gyro_use,
-    chains,
-    links,
-    x,
-    noise,
-    gain,
-    left,
-    scratch,
-    later_q,
-    later_x,
-    later_F,
-):
-    """Take what is known at the end of segment j, prepared, to its start: ``later_x`` and ``later_F`` in place; return the attitude.
+def step_back(segments, j, prepared, model, space, pass_, later_q):
+    """Take what a pass knows at the end of segment j, ``prepared`` by :func:`prepare_step`, to its start; return the attitude.
 
-    ``later_F`` (size + p + 1, size) holds the triangle.
+    The pass's ``later_x`` and ``later_F`` are left there.
     """
+    predicted, phi11, phi12, rows = prepared
+    x, noise, gain, left, work = space.x, space.noise, space.gain, space.left, space.work
+    later_x, later_F = space.later_x[pass_], space.later_F[pass_]
+    chains, changing = model.chains, model.changing
     size = len(x) + 3
     noisy = 6 + changing
     p = rows - size
-    coupling, factor, work = scratch
     # From the tangent space at the smoothed attitude to that at the predicted one: exp(a) ⊗ exp(ε) = exp(a + J_r(a)⁻¹ ε).
     inverse = (predicted[0], -predicted[1], -predicted[2], -predicted[3])
     a = logarithm(quaternion_multiply(inverse, later_q))
@@ -161,8 +198,8 @@ def step_back(
                 for i in range(noisy):
                     later_F[r, i] -= work[w] * noise[w, i]
     if len(chains) > 0:
-        carry_chains_back(later_F, 0, rows + 1, links)
-    carry_back(later_F, 0, rows + 1, phi11, phi12, coupling, factor, gyro_use, changing)
+        carry_chains_back(later_F, 0, rows + 1, space.links)
+    carry_back(later_F, 0, rows + 1, phi11, phi12, space.coupling, space.factor, model.gyro_use, changing)
     filtered = (segments[j, 4], segments[j, 5], segments[j, 6], segments[j, 7])
     q, J = moved(filtered, (later_F[rows, 0], later_F[rows, 1], later_F[rows, 2]))
     for i in range(len(x)):
@@ -176,48 +213,16 @@ def step_back(
     return q
 
 
-def smooth_augmented(
-    segments,
-    starts,
-    first,
-    upto,
-    last,
-    angle_variance,
-    rate_variance,
-    decay,
-    density,
-    changing,
-    gyro,
-    gyro_use,
-    force_f,
-    chains,
-    links,
-    x,
-    F,
-    prepared,
-    scratch,
-    later_q,
-    later_x,
-    later_F,
-    attitude_out,
-    x_out,
-    variance_out,
-    covariance_out,
-):
-    """Run backward passes: pass p goes from the filtered state at edge ``last[p]`` down and writes edges ``upto[p]`` to ``first[p]``.
-
-    ``segments`` holds the filter's rows, the last one the end state, and ``starts[k]`` is the row that starts at edge k. From pass to pass
-    ``last`` does not fall and ``upto`` stays below the next ``first``. ``later_q`` (n, 4), ``later_x`` (n, size − 3) and ``later_F``
-    (n, size + p + 1, size) are for n passes at once, which share what is prepared of a segment in ``prepared``, three arrays (p, size). The
-    rest is scratch as :func:`prepare_step` wants it.
-    """
-    size = len(x) + 3
-    noise, gain, left = prepared
+def smooth_augmented(passes, model, space, out):
+    """Run backward passes. As many go together as the work space has room for, and share what is prepared of a segment."""
+    segments, starts, first, upto, last = passes
+    later_q, later_x, later_F = space.later_q, space.later_x, space.later_F
+    size = len(space.x) + 3
     together = len(later_q)
     for begin in range(0, len(first), together):
-        passes = min(together, len(first) - begin)
-        joining = passes - 1
-        leaving = passes - 1
+        number = min(together, len(first) - begin)
+        joining = number - 1
+        leaving = number - 1
         edge = upto[begin + leaving]
         s = starts[last[begin + joining]]
         while True:
@@ -226,13 +231,7 @@ def smooth_augmented(
                 later_q[joining, 0], later_q[joining, 1], later_q[joining, 2], later_q[joining, 3] = q
                 joining -= 1
             while leaving >= 0 and starts[edge] == s:
-                for i in range(4):
-                    attitude_out[edge, i] = later_q[leaving, i]
-                for i in range(len(x)):
-                    x_out[edge, i] = later_x[leaving, i]
-                variances(later_F[leaving], size, variance_out, edge)
-                if edge < len(covariance_out):
-                    covariances(later_F[leaving], size, covariance_out, edge)
+                write_smoothed(out, edge, later_q[leaving], later_x[leaving], later_F[leaving], size)
                 if edge > first[begin + leaving]:
                     edge -= 1
                 else:
@@ -241,44 +240,19 @@ def smooth_augmented(
             if leaving < 0:
                 break
             s -= 1
-            predicted, phi11, phi12, rows = prepare_step(
-                segments,
-                s,
-                angle_variance,
-                rate_variance,
-                decay,
-                density,
-                changing,
-                gyro,
-                gyro_use,
-                force_f,
-                chains,
-                links,
-                x,
-                F,
-                noise,
-                gain,
-                left,
-                scratch,
-            )
+            prepared = prepare_step(segments, s, model, space)
             for i in range(joining + 1, leaving + 1):
-                later_q[i, 0], later_q[i, 1], later_q[i, 2], later_q[i, 3] = step_back(
-                    segments,
-                    s,
-                    predicted,
-                    phi11,
-                    phi12,
-                    rows,
-                    changing,
-                    gyro_use,
-                    chains,
-                    links,
-                    x,
-                    noise,
-                    gain,
-                    left,
-                    scratch,
-                    (later_q[i, 0], later_q[i, 1], later_q[i, 2], later_q[i, 3]),
-                    later_x[i],
-                    later_F[i],
-                )
+                q = (later_q[i, 0], later_q[i, 1], later_q[i, 2], later_q[i, 3])
+                q = step_back(segments, s, prepared, model, space, i, q)
+                later_q[i, 0], later_q[i, 1], later_q[i, 2], later_q[i, 3] = q
+
+
+def write_smoothed(out, edge, q, x, F, size):
+    """Write a smoothed state to the row of an edge."""
+    for i in range(4):
+        out.attitude[edge, i] = q[i]
+    for i in range(len(x)):
+        out.x[edge, i] = x[i]
+    variances(F, size, out.variance, edge)
+    if edge < len(out.covariance):
+        covariances(F, size, out.covariance, edge)

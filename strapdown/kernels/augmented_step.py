@@ -34,11 +34,25 @@ from strapdown.kernels.algebra import (
     symmetric_times_vector,
     transpose_times_vector,
 )
-from strapdown.kernels.filter_loop import ATTITUDE, DIRECTION, HEADING, MOST_TURN, heading_error
-from strapdown.kernels.filter_step import VERTICAL, process_noise, transition
-from strapdown.kernels.rotation import logarithm, quaternion_multiply, rotation_matrix, turned
+from strapdown.kernels.filter_step import process_noise, transition
+from strapdown.kernels.measurement import ATTITUDE, DIRECTION, HEADING, VERTICAL, heading_error
+from strapdown.kernels.rotation import logarithm, moved, quaternion_multiply, rotation_matrix, turned
 from strapdown.kernels.series import LARGEST_ANGLE, second, sinc
-from strapdown.kernels.smoother_step import moved
+from strapdown.kernels.walk import MAX_TURN
+
+CALLED = (
+    "response",
+    "move",
+    "fill_noise",
+    "carry",
+    "carry_back",
+    "fill_rows",
+    "decorrelate",
+    "arm_noise",
+    "turn_columns",
+    "turn_values",
+)
+"""Not inlined where other kernels use them: their work is far more than a call, and each copy would be compiled anew."""
 
 OFFSET = 1
 SCALE = 2
@@ -103,7 +117,7 @@ def longest_step(dt, theta, limit):
     """Return the longest step within an interval: what the polynomials bear of a turn, and ``limit`` for states that decay."""
     longest = dt
     squared = dot(theta, theta)
-    if LARGEST_ANGLE * LARGEST_ANGLE < squared < MOST_TURN * MOST_TURN:
+    if LARGEST_ANGLE * LARGEST_ANGLE < squared < MAX_TURN * MAX_TURN:
         longest = dt * (LARGEST_ANGLE / math.sqrt(squared))
     return min(longest, limit)
 

@@ -24,18 +24,22 @@ from strapdown.kernels.algebra import (
     times_transpose_upper,
     transpose_times_vector,
 )
-from strapdown.kernels.filter_loop import ATTITUDE, DIRECTION, HEADING, MOST_TURN, VECTOR, heading_error, vector_at
-from strapdown.kernels.filter_step import (
+from strapdown.kernels.filter_step import predict, update_attitude, update_heading, update_row
+from strapdown.kernels.measurement import (
+    ATTITUDE,
+    HEADING,
+    VECTOR,
+    degrees_of_freedom,
     direction_rows,
+    heading_error,
     heading_row,
-    predict,
-    update_attitude,
-    update_heading,
-    update_row,
+    vector_at,
 )
 from strapdown.kernels.robust_step import HUBER, STUDENT
 from strapdown.kernels.rotation import logarithm, quaternion_multiply, rotation_matrix, turned, unit
 from strapdown.kernels.series import LARGEST_ANGLE, second, sinc
+from strapdown.kernels.state import load_state, store_state
+from strapdown.kernels.walk import MAX_TURN
 
 PASSES = 5
 """Most Gauss–Newton passes of one update."""
@@ -44,26 +48,6 @@ SETTLED = 1e-6
 NEVER = -1
 LOST = -2
 """Instead of the edge at which hypotheses became one: they did not; most of them, by weight, refuse one measurement after the other."""
-
-
-def load_hypothesis(row):
-    """Return (q, b, A, B, C) of 28 numbers."""
-    return (
-        (row[0], row[1], row[2], row[3]),
-        (row[4], row[5], row[6]),
-        (row[7], row[8], row[9], row[10], row[11], row[12]),
-        (row[13], row[14], row[15], row[16], row[17], row[18], row[19], row[20], row[21]),
-        (row[22], row[23], row[24], row[25], row[26], row[27]),
-    )
-
-
-def store_hypothesis(row, q, b, A, B, C):
-    """Write (q, b, A, B, C) as 28 numbers."""
-    row[0], row[1], row[2], row[3] = q
-    row[4], row[5], row[6] = b
-    row[7], row[8], row[9], row[10], row[11], row[12] = A
-    row[13], row[14], row[15], row[16], row[17], row[18], row[19], row[20], row[21] = B
-    row[22], row[23], row[24], row[25], row[26], row[27] = C
 
 
 def update_iterated(q, b, A, B, C, u, v, z, variance):
@@ -136,13 +120,6 @@ def taken_in(kind, q, b, A, B, C, z, frame, variance, weight):
     return q, b, A, B, C, e1, s1, e2, s2, e3, s3, distance, spread
 
 
-def degrees_of_freedom(kind):
-    """Return how many a measurement of a kind has."""
-    if kind == HEADING:
-        return 1
-    return 2 if kind == DIRECTION else 3
-
-
 def heavy_tailed(robust, parameter, numerator, nis):
     """Return what stands for the NIS in −2 log of the likelihood under a robust update: Huber's function, or that of Student's t."""
     if robust == STUDENT:
@@ -212,7 +189,7 @@ def moment_match(states, weight, between, out):
     for i in range(len(weight)):
         w = weight[i]
         if w > 0.0:
-            own, b, A, B, C = load_hypothesis(states[i])
+            own, b, A, B, C = load_state(states[i])
             d = logarithm(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), own))
             e = subtract(b, mean)
             G = inverse_right_jacobian(d)
@@ -349,18 +326,18 @@ def run_bank(
                 part = scale(dt / (end - edges[k]), vector_at(increments, k))
                 for i in range(number):
                     if weight[i] > 0.0:
-                        q, b, A, B, C = load_hypothesis(states[i])
+                        q, b, A, B, C = load_state(states[i])
                         # A turn beyond the range of the polynomials goes in sub-steps: at constant rate they compose exactly.
                         turn = combine(1.0, part, -dt, b)
                         squared = dot(turn, turn)
                         pieces = 1
-                        if LARGEST_ANGLE * LARGEST_ANGLE < squared < MOST_TURN * MOST_TURN:
+                        if LARGEST_ANGLE * LARGEST_ANGLE < squared < MAX_TURN * MAX_TURN:
                             pieces = int(math.sqrt(squared) / LARGEST_ANGLE) + 1
                         for _ in range(pieces):
                             q, A, B, C = predict(
                                 q, b, A, B, C, scale(1.0 / pieces, part), dt / pieces, angle_variance, rate_variance
                             )
-                        store_hypothesis(states[i], q, b, A, B, C)
+                        store_state(states[i], q, b, A, B, C)
             now = event_time[e] if due else end
             if due:
                 leader = 0
@@ -377,7 +354,7 @@ def run_bank(
                 height = 0.0
                 for i in range(number):
                     if weight[i] > 0.0:
-                        q, b, A, B, C = load_hypothesis(states[i])
+                        q, b, A, B, C = load_state(states[i])
                         done = taken_in(kind, q, b, A, B, C, z, frame, event_variance[e], 1.0)
                         _, _, _, _, _, e1, s1, e2, s2, e3, s3, _, _ = done
                         nis = e1 * e1 / s1 + e2 * e2 / s2 + e3 * e3 / s3
@@ -396,7 +373,7 @@ def run_bank(
                                     share = 1.0
                                 done = taken_in(kind, q, b, A, B, C, z, frame, event_variance[e], share)
                         if share > 0.0:
-                            store_hypothesis(states[i], done[0], done[1], done[2], done[3], done[4])
+                            store_state(states[i], done[0], done[1], done[2], done[3], done[4])
                         # What a hypothesis refuses counts against it as if it lay at the threshold: else none would outlive an outlier.
                         told = min(heavy_tailed(robust, parameter, numerator, nis), threshold)
                         log_weight[i] -= 0.5 * (told + math.log(s1) + math.log(s2) + math.log(s3))

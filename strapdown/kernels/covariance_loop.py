@@ -26,8 +26,8 @@ from strapdown.kernels.algebra import (
     transpose,
     transpose_times_vector,
 )
-from strapdown.kernels.filter_loop import vector_at
 from strapdown.kernels.filter_step import process_noise, transition
+from strapdown.kernels.measurement import vector_at
 
 
 def load_blocks(row):

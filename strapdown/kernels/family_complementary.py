@@ -7,23 +7,32 @@ import math
 from strapdown.kernels.algebra import (
     combine_matrices,
     cross,
+    dot,
+    factored,
     full,
     minus_outer,
     multiply,
     scale,
     skew_polynomial,
     symmetric_minus_outer,
+    symmetric_times_vector,
     transpose,
     transpose_times_vector,
 )
-from strapdown.kernels.family_loop import state_at
 from strapdown.kernels.family_step import congruent, negated, predict_body_side
 from strapdown.kernels.family_turns import right_jacobian_of_any_turn, turned_by_any
-from strapdown.kernels.filter_loop import ATTITUDE, HEADING, store_state, vector_at
-from strapdown.kernels.filter_step import shows_heading
-from strapdown.kernels.robust_loop import frame_at, six_at
-from strapdown.kernels.robust_step import independent_rows, innovation_factors, measurement_rows
+from strapdown.kernels.measurement import (
+    ATTITUDE,
+    HEADING,
+    frame_at,
+    has_heading,
+    independent_rows,
+    measurement_rows,
+    six_at,
+    vector_at,
+)
 from strapdown.kernels.rotation import quaternion_multiply, rotation_matrix
+from strapdown.kernels.state import load_state, store_state
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 NOTHING = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -116,7 +125,7 @@ def run_complementary(
     ``ω_mes = z × R̂ᵀ r`` of each measurement turns the attitude by ``gain`` ω_mes and moves the bias by ``bias_gain`` ω_mes: equations (32)
     of the paper over the interval of one sample, k_P dt and −k_I dt. What ω_mes is of other kinds, :func:`measured_turn` says.
     """
-    q, b, A, B, C = state_at(state)
+    q, b, A, B, C = load_state(state)
     for k in range(len(dt)):
         if dt[k] > 0.0:
             q, A, B, C = predict_body_side(q, b, A, B, C, vector_at(increment, k), dt[k], angle_variance, rate_variance)
@@ -126,14 +135,26 @@ def run_complementary(
             z = vector_at(event_value, e)
             kind = event_kind[e]
             e1, s1, e2, s2, e3, s3 = math.nan, 0.0, 0.0, 1.0, 0.0, 1.0
-            if kind != HEADING or shows_heading(R, z):
+            if kind != HEADING or has_heading(R, z):
                 frame = frame_at(triads, event_reference[e])
                 noise = six_at(event_noise, e)
                 h1, h2, h3, y1, y2, y3, covariance = measurement_rows(kind, q, R, z, frame, noise)
                 turn, M, V = measured_turn(kind, q, R, z, frame, noise, h1, y1)
                 h1, h2, h3, e1, y2, y3, variance = independent_rows(h1, h2, h3, y1, y2, y3, covariance)
                 # Innovations of this filter, made independent: each less its regression on the ones before it.
-                F = innovation_factors(A, h1, h2, h3, variance)
+                p1 = symmetric_times_vector(A, h1)
+                p2 = symmetric_times_vector(A, h2)
+                p3 = symmetric_times_vector(A, h3)
+                F = factored(
+                    (
+                        dot(h1, p1) + variance[0],
+                        dot(h1, p2),
+                        dot(h1, p3),
+                        dot(h2, p2) + variance[1],
+                        dot(h2, p3),
+                        dot(h3, p3) + variance[2],
+                    )
+                )
                 e2 = y2 - F[0] * e1
                 e3 = y3 - F[1] * e1 - F[2] * e2
                 s1, s2, s3 = 1.0 / F[3], 1.0 / F[4], 1.0 / F[5]

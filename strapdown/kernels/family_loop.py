@@ -21,27 +21,24 @@ from strapdown.kernels.family_step import (
     predict_two_frame,
     take_row,
 )
-from strapdown.kernels.filter_loop import ATTITUDE, HEADING, VECTOR, store_state, vector_at
-from strapdown.kernels.filter_step import shows_heading
-from strapdown.kernels.robust_loop import frame_at, six_at
-from strapdown.kernels.robust_step import independent_rows, measurement_rows
+from strapdown.kernels.measurement import (
+    ATTITUDE,
+    HEADING,
+    VECTOR,
+    frame_at,
+    has_heading,
+    independent_rows,
+    measurement_rows,
+    six_at,
+    vector_at,
+)
 from strapdown.kernels.rotation import rotation_matrix
+from strapdown.kernels.state import load_state, store_state
 
 FIXED_SIDE = 0
 RIGHT_INVARIANT = 1
 TWO_FRAME = 2
 GEOMETRIC = 3
-
-
-def state_at(state):
-    """Return (q, b, A, B, C) of 28 numbers."""
-    return (
-        (state[0], state[1], state[2], state[3]),
-        (state[4], state[5], state[6]),
-        (state[7], state[8], state[9], state[10], state[11], state[12]),
-        (state[13], state[14], state[15], state[16], state[17], state[18], state[19], state[20], state[21]),
-        (state[22], state[23], state[24], state[25], state[26], state[27]),
-    )
 
 
 def from_body_side(variant, q, A, B, C):
@@ -87,7 +84,7 @@ def run_extended(
     ``event_noise`` (events, 6) holds the upper triangle of each measurement's covariance in body axes, of a heading its variance first.
     ``innovation_out`` (events, 6) gets e₁, s₁, e₂, s₂, e₃, s₃ of each event as :func:`strapdown.kernels.filter_loop.run_filter` does.
     """
-    q, b, A, B, C = state_at(state)
+    q, b, A, B, C = load_state(state)
     A, B, C = from_body_side(variant, q, A, B, C)
     for k in range(len(dt)):
         if dt[k] > 0.0:
@@ -106,7 +103,7 @@ def run_extended(
             a = (0.0, 0.0, 0.0)
             c = (0.0, 0.0, 0.0)
             e1, s1, e2, s2, e3, s3 = math.nan, 0.0, 0.0, 1.0, 0.0, 1.0
-            if kind != HEADING or shows_heading(R, z):
+            if kind != HEADING or has_heading(R, z):
                 h1, h2, h3, y1, y2, y3, noise = measurement_rows(
                     kind, q, R, z, frame_at(triads, event_reference[e]), six_at(event_noise, e)
                 )

@@ -17,10 +17,8 @@ from strapdown.kernels.algebra import (
     add_matrices,
     add_to_diagonal,
     combine,
-    combine_matrices,
     dot,
     full,
-    matrix_times_vector,
     minus_outer,
     multiply,
     multiply_add,
@@ -34,23 +32,12 @@ from strapdown.kernels.algebra import (
     transpose_times_vector,
 )
 from strapdown.kernels.lane_values import anywhere, chosen, everywhere
-from strapdown.kernels.rotation import (
-    exponential,
-    logarithm,
-    quaternion_multiply,
-    right_jacobian,
-    rotation_matrix,
-    turned,
-    unit,
-)
+from strapdown.kernels.measurement import direction_rows
+from strapdown.kernels.rotation import far_turn, logarithm, quaternion_multiply, right_jacobian, turned, unit
 from strapdown.kernels.series import fifth, fourth, second, sinc, third
 
 SHORT_FORM = 1000.0
 """Where an innovation's variance is less than this many times the measurement's, the short form loses no more than three digits."""
-
-
-VERTICAL = 1e-24
-"""Squared horizontal part of a vector below which it has no heading: a picoradian from the vertical, if it is of length one."""
 
 
 def transition(phi, dt):
@@ -190,33 +177,6 @@ def reset(q, A, B, correction):
     )
 
 
-def far_turn(phi):
-    """Return exp(φ) and J_r(φ) of a turn beyond the range of the polynomials, from a 64th of it by doubling.
-
-    ``J_r(2φ) = ½ (I + exp(−[φ])) J_r(φ)``. Good to rounding up to 20 rad: a correction of more than half a turn says only that the filter
-    is lost, but its Jacobian must stay one, of norm one at most, for the covariance to stay finite.
-    """
-    part = scale(0.015625, phi)
-    q = exponential(part)
-    J = right_jacobian(part)
-    for _ in range(6):
-        E = transpose(rotation_matrix(q))
-        J = combine_matrices(0.5, J, 0.5, multiply(E, J))
-        q = quaternion_multiply(q, q)
-    return q, J
-
-
-def direction_rows(R, u, v, z):
-    """Return the two rows (h, y), (h, y) of a unit direction ``z`` (body) whose reference r has the right-handed triad u × v = r (fixed).
-
-    A direction has two degrees of freedom: its components along the predicted u and v. With ``z = r_b + r_b × δθ``:
-    ``u_b · z = −v_b · δθ``, ``v_b · z = u_b · δθ``.
-    """
-    ub = transpose_times_vector(R, u)
-    vb = transpose_times_vector(R, v)
-    return (-vb[0], -vb[1], -vb[2]), dot(ub, z), ub, dot(vb, z)
-
-
 def rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, s1, s12, s22):
     """Take in two rows of covariance (s1, s12, s22), the second freed of the first: the divisions do not wait for each other.
 
@@ -287,26 +247,6 @@ def update_direction_and_judge(q, b, A, B, C, R, u, v, z, variance):
         correction, b, A, B, C, e2, s2, nis = row_after_row(b, A, B, C, h1, e1, h2, y2, variance)
     q, A, B = reset(q, A, B, correction)
     return q, b, A, B, C, e1, s1, e2, s2, nis
-
-
-def heading_row(R, z):
-    """Return h of the heading of the horizontal part of a vector ``z`` (body): the turn δθ of the body shifts it by h · δθ.
-
-    With m = R z, a turn δφ in fixed axes shifts the heading by ``δφ_z − m_z (m_x δφ_x + m_y δφ_y)/(m_x² + m_y²)``: only of a level vector
-    is it the turn about the vertical alone. A vertical vector has no heading, and its row is zero: nothing is learnt from it.
-    """
-    m = matrix_times_vector(R, z)
-    level = m[0] * m[0] + m[1] * m[1]
-    has_heading = level > VERTICAL
-    tilt = -m[2] / chosen(has_heading, level, 1.0)
-    whole = chosen(has_heading, level - level + 1.0, 0.0)
-    return transpose_times_vector(R, (whole * (tilt * m[0]), whole * (tilt * m[1]), whole))
-
-
-def shows_heading(R, z):
-    """Return whether a vector ``z`` (body) is not vertical; scalar machine only."""
-    x, y, _ = matrix_times_vector(R, z)
-    return x * x + y * y > VERTICAL
 
 
 def update_residual(q, b, A, B, C, y, variance):

@@ -2,6 +2,9 @@
 
 A kernel names its helpers as ordinary module globals. :func:`compiled` follows those names, compiles each helper once, and binds the
 compiled twins together, so that the source needs no decorator and stays plain Python.
+
+A kernel may leave functions open: it names them in ``OPEN`` of its module, where they stand without a body. :func:`compiled` takes the
+modules that define them; so :func:`strapdown.kernels.walk.walk` is the loop of every filter.
 """
 
 from __future__ import annotations
@@ -31,7 +34,36 @@ def _is_kernel(value: object) -> bool:
     return isinstance(value, FunctionType) and (value.__module__ or "").startswith(PACKAGE)
 
 
-def _twin(function: FunctionType) -> FunctionType:
+def _kernels_named(function: FunctionType) -> dict[str, FunctionType]:
+    """Return the kernel functions that a function names, by name."""
+    named = {name: function.__globals__.get(name) for name in function.__code__.co_names}
+    return {name: value for name, value in named.items() if isinstance(value, FunctionType) and _is_kernel(value)}
+
+
+def is_open(function: FunctionType) -> bool:
+    """Return whether a function is left open by its module, for another one to define."""
+    return function.__name__ in function.__globals__.get("OPEN", ())
+
+
+@functools.cache
+def _depends_on_parts(function: FunctionType) -> bool:
+    """Return whether a function is open or names, directly or not, one that is."""
+    return is_open(function) or any(_depends_on_parts(value) for value in _kernels_named(function).values())
+
+
+def _defined(function: FunctionType, parts: tuple[ModuleType, ...]) -> FunctionType:
+    """Return what defines a function: itself, or of an open one that of the first module among ``parts`` that has it."""
+    if not is_open(function):
+        return function
+    for module in parts:
+        found = getattr(module, function.__name__, None)
+        if isinstance(found, FunctionType) and not is_open(found):
+            return found
+    names = ", ".join(module.__name__ for module in parts) or "nothing"
+    raise TypeError(f"{function.__module__} leaves {function.__name__} open, and {names} does not define it")
+
+
+def _twin(function: FunctionType, parts: tuple[ModuleType, ...]) -> FunctionType:
     """Return a copy of ``function`` whose kernel globals are the compiled helpers."""
     bound: dict[str, Any] = {"__name__": function.__module__}
     for name in function.__code__.co_names:
@@ -39,7 +71,9 @@ def _twin(function: FunctionType) -> FunctionType:
             value = function.__globals__[name]
             if isinstance(value, ModuleType) and value.__name__.startswith(PACKAGE):
                 raise TypeError(f"kernel {function.__name__} names module {name}; import its functions by name instead")
-            bound[name] = helper(value) if _is_kernel(value) else value
+            if _is_kernel(value):
+                value = helper(_defined(value, parts), parts if _depends_on_parts(_defined(value, parts)) else ())
+            bound[name] = value
     twin = FunctionType(function.__code__, bound, function.__name__, function.__defaults__, function.__closure__)
     twin.__qualname__ = function.__qualname__
     twin.__doc__ = function.__doc__
@@ -55,10 +89,10 @@ def _options(function: FunctionType) -> dict[str, Any]:
 
 
 @functools.cache
-def helper(function: FunctionType) -> Any:
+def helper(function: FunctionType, parts: tuple[ModuleType, ...] = ()) -> Any:
     """Return ``function`` compiled for use inside another kernel, inlined: a call costs more than a 3-vector's work.
 
-    A module names in ``CALLED`` those of its functions that are long enough to be called.
+    A module names in ``CALLED`` those of its functions that are long enough to be called. ``parts`` define open functions.
     """
     import numba
 
@@ -67,7 +101,7 @@ def helper(function: FunctionType) -> Any:
 
         return INTRINSICS[function.__name__]
     called = function.__name__ in function.__globals__.get("CALLED", ())
-    plain = numba.njit(forceinline=not called, **_options(function))(_twin(function))
+    plain = numba.njit(forceinline=not called, **_options(function))(_twin(function, parts))
     if function.__module__ == f"{PACKAGE}.algebra":
         from strapdown.kernels.packed import PACKED, packed
 
@@ -77,21 +111,23 @@ def helper(function: FunctionType) -> Any:
 
 
 @functools.cache
-def compiled(function: Callable[..., Any]) -> Any:
+def compiled(function: Callable[..., Any], *parts: ModuleType) -> Any:
     """Return ``function`` compiled for calls from Python, cached on disk under the digest of all kernel sources.
 
-    Releases the GIL while it runs, so records can be spread over threads.
+    ``parts`` are the modules that define the functions left open, the first that has one of them. Releases the GIL while it runs, so records
+    can be spread over threads.
     """
     import numba
     from numba.core.caching import FunctionCache
 
     class KernelCache(FunctionCache):  # type: ignore[misc]
         def _index_key(self, signature: Any, codegen: Any) -> Any:
-            return (*super()._index_key(signature, codegen), sources_digest())
+            names = tuple(module.__name__ for module in parts)
+            return (*super()._index_key(signature, codegen), names, sources_digest())
 
     if not _is_kernel(function):
         raise TypeError(f"{function!r} does not live in {PACKAGE}; move it there before compiling it")
-    dispatcher = numba.njit(**_options(function))(_twin(function))  # type: ignore[arg-type]
+    dispatcher = numba.njit(**_options(function))(_twin(function, parts))  # type: ignore[arg-type]
     with contextlib.suppress(RuntimeError):  # no writable place for a cache: compile in every process
         dispatcher._cache = KernelCache(dispatcher.py_func)
     return dispatcher

@@ -21,14 +21,7 @@ from strapdown.kernels.algebra import (
     subtract,
     transpose_times_vector,
 )
-from strapdown.kernels.filter_loop import ATTITUDE, HEADING, VECTOR
-from strapdown.kernels.filter_step import (
-    heading_row,
-    predict,
-    update_direction_and_judge,
-    update_heading,
-    update_residual,
-)
+from strapdown.kernels.filter_step import predict, update_direction_and_judge, update_heading, update_residual
 from strapdown.kernels.lane_angles import arctangent, inverse_root, rotation_vector
 from strapdown.kernels.lane_values import (
     chosen,
@@ -40,6 +33,7 @@ from strapdown.kernels.lane_values import (
     restore_mode,
     store_like,
 )
+from strapdown.kernels.measurement import ATTITUDE, HEADING, VECTOR, heading_row
 from strapdown.kernels.noise import next_word, single_normals, stream_state
 from strapdown.kernels.rotation import exponential, quaternion_multiply, rotation_matrix, unit
 

@@ -1,11 +1,33 @@
-"""Rotations on tuples: quaternions (w, x, y, z), rotation vectors, the right Jacobian. Conventions as in :mod:`strapdown`."""
+"""Rotations on tuples: quaternions (w, x, y, z), rotation vectors, right Jacobians. Conventions as in :mod:`strapdown`.
+
+Of small angles (up to ``LARGEST_ANGLE``) the functions are polynomials without branches, of floats or lanes: :func:`exponential`,
+:func:`turned`, :func:`right_jacobian`, :func:`near_inverse_right_jacobian`. Of any angle they are scalar: :func:`moved`, :func:`logarithm`,
+:func:`inverse_right_jacobian`, :func:`composed`; :func:`far_turn` is for lanes too.
+"""
 
 from __future__ import annotations
 
 import math
 
-from strapdown.kernels.algebra import dot, skew_polynomial, square_root
-from strapdown.kernels.series import cosine, second, sinc, third
+from strapdown.kernels.algebra import (
+    combine_matrices,
+    dot,
+    multiply,
+    scale,
+    skew_polynomial,
+    square_root,
+    transpose,
+)
+from strapdown.kernels.series import LARGEST_ANGLE, cosine, polynomial, second, sinc, third
+
+_A = tuple(math.comb(2 * k, k) / (4.0**k * (2 * k + 1)) for k in range(12))
+_A0, _A1, _A2, _A3, _A4, _A5, _A6, _A7, _A8, _A9, _A10, _A11 = _A
+# |B_2k| / (2k)! for k = 1 … 6, with the Bernoulli numbers 1/6, 1/30, 1/42, 1/30, 5/66, 691/2730.
+_I0, _I1, _I2 = 1.0 / 12.0, 1.0 / 720.0, 1.0 / 30240.0
+_I3, _I4, _I5 = 1.0 / 1209600.0, 1.0 / 47900160.0, 691.0 / 1307674368000.0
+SHORT = 1e-4
+"""rad²: where two angles are not larger than its root, four terms of the series of their composition are good to rounding."""
+_SINE_SQUARED = math.sin(0.5 * LARGEST_ANGLE) ** 2
 
 
 def quaternion_multiply(p, q):
@@ -49,16 +71,6 @@ def unit(q):
     return (n * q[0], n * q[1], n * q[2], n * q[3])
 
 
-def logarithm(q):
-    """Return the rotation vector of a unit quaternion, the shorter way round. Scalar machine only."""
-    sine = square_root(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    # Below that its square would underflow, and the angle is twice the vector part.
-    factor = 2.0 if sine < 1e-150 else 2.0 * math.atan2(sine, abs(q[0])) / sine
-    if q[0] < 0.0:
-        factor = -factor
-    return (factor * q[1], factor * q[2], factor * q[3])
-
-
 def rotation_matrix(q):
     """Return the matrix R_fb of a unit quaternion q_fb: v_f = R_fb v_b."""
     dx = 2.0 * q[1]
@@ -90,3 +102,86 @@ def right_jacobian(phi):
     """Return J_r(φ) = I − (1 − cos θ)/θ² [φ] + (θ − sin θ)/θ³ [φ]²: exp(φ + δ) = exp(φ) ⊗ exp(J_r(φ) δ) to first order."""
     x = dot(phi, phi)
     return skew_polynomial(1.0, -second(x), third(x), phi)
+
+
+def far_turn(phi):
+    """Return exp(φ) and J_r(φ) of a turn beyond the range of the polynomials, from a 64th of it by doubling.
+
+    ``J_r(2φ) = ½ (I + exp(−[φ])) J_r(φ)``. Good to rounding up to 20 rad: a correction of more than half a turn says only that the filter
+    is lost, but its Jacobian must stay one, of norm one at most, for the covariance to stay finite.
+    """
+    part = scale(0.015625, phi)
+    q = exponential(part)
+    J = right_jacobian(part)
+    for _ in range(6):
+        E = transpose(rotation_matrix(q))
+        J = combine_matrices(0.5, J, 0.5, multiply(E, J))
+        q = quaternion_multiply(q, q)
+    return q, J
+
+
+def arcsine(x):
+    """Return asin s / s at s = √x, x ≤ sin²(``LARGEST_ANGLE``/2)."""
+    xxx = x * x * x
+    return polynomial(x, _A0, _A1, _A2, _A3, _A4, _A5) + xxx * xxx * polynomial(x, _A6, _A7, _A8, _A9, _A10, _A11)
+
+
+def arcsine_series(x):
+    """Return 2 asin s / s at s = √x to the fourth term: good to rounding for x ≤ ``SHORT``."""
+    return (2.0 + 2.0 * _A1 * x) + (x * x) * (2.0 * _A2 + 2.0 * _A3 * x)
+
+
+def logarithm(q):
+    """Return the rotation vector of a unit quaternion, the shorter way round, any angle."""
+    v = (q[1], q[2], q[3])
+    x = dot(v, v)
+    if x <= _SINE_SQUARED:
+        half = arcsine(x)
+    else:
+        s = math.sqrt(x)
+        half = math.atan2(s, abs(q[0])) / s
+    return scale(math.copysign(2.0 * half, q[0]), v)
+
+
+def near_inverse_right_jacobian(phi):
+    """Return :func:`inverse_right_jacobian` for θ ≤ ``LARGEST_ANGLE``, of floats or lanes."""
+    return skew_polynomial(1.0, 0.5, polynomial(dot(phi, phi), _I0, _I1, _I2, _I3, _I4, _I5), phi)
+
+
+def inverse_right_jacobian(phi):
+    """Return ``J_r(φ)⁻¹ = I + ½ [φ] + (1 − (θ/2) cot(θ/2))/θ² [φ]²``, θ = |φ| ≤ π."""
+    x = dot(phi, phi)
+    if x <= LARGEST_ANGLE * LARGEST_ANGLE:
+        return near_inverse_right_jacobian(phi)
+    half = 0.5 * math.sqrt(x)
+    return skew_polynomial(1.0, 0.5, (1.0 - half / math.tan(half)) / x, phi)
+
+
+def moved(q, phi):
+    """Return q ⊗ exp(φ) and J_r(φ) at any angle: what the filter does to an attitude and its tangent space, without its bound."""
+    x = dot(phi, phi)
+    if x <= LARGEST_ANGLE * LARGEST_ANGLE:
+        return turned(q, phi), right_jacobian(phi)
+    theta = math.sqrt(x)
+    s = math.sin(0.5 * theta)
+    q = quaternion_multiply(q, (math.cos(0.5 * theta), s / theta * phi[0], s / theta * phi[1], s / theta * phi[2]))
+    return q, skew_polynomial(1.0, -2.0 * s * s / x, (theta - math.sin(theta)) / (theta * x), phi)
+
+
+def composed(r, phi):
+    """Return the rotation vector of r ⊗ exp(φ), r a unit quaternion, any angles."""
+    u = (
+        r[0] * phi[0] + (r[2] * phi[2] - r[3] * phi[1]),
+        r[0] * phi[1] + (r[3] * phi[0] - r[1] * phi[2]),
+        r[0] * phi[2] + (r[1] * phi[1] - r[2] * phi[0]),
+    )
+    x = dot(phi, phi)
+    if x <= LARGEST_ANGLE * LARGEST_ANGLE:
+        c = cosine(0.25 * x)
+        h = 0.5 * sinc(0.25 * x)
+    else:
+        theta = math.sqrt(x)
+        c = math.cos(0.5 * theta)
+        h = math.sin(0.5 * theta) / theta
+    w = r[1] * phi[0] + r[2] * phi[1] + r[3] * phi[2]
+    return logarithm((c * r[0] - h * w, c * r[1] + h * u[0], c * r[2] + h * u[1], c * r[3] + h * u[2]))

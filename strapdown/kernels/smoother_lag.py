@@ -16,7 +16,14 @@ from strapdown.kernels.algebra import (
     times_transpose_upper,
 )
 from strapdown.kernels.lane_values import WIDTH, anywhere, lanes_of, load, store
-from strapdown.kernels.rotation import right_jacobian
+from strapdown.kernels.rotation import (
+    arcsine,
+    composed,
+    inverse_right_jacobian,
+    moved,
+    near_inverse_right_jacobian,
+    right_jacobian,
+)
 from strapdown.kernels.series import LARGEST_ANGLE, cosine, sinc
 from strapdown.kernels.smoother_loop import (
     ATTITUDE,
@@ -43,13 +50,6 @@ from strapdown.kernels.smoother_loop import (
     store_triple,
     write_filtered,
     write_smoothed,
-)
-from strapdown.kernels.smoother_step import (
-    arcsine,
-    composed,
-    inverse_right_jacobian,
-    moved,
-    near_inverse_right_jacobian,
 )
 
 # Places in the work space, from where the prepared groups of one pass begin.

@@ -20,20 +20,19 @@ from strapdown.kernels.lane_values import (
     spread,
     store,
 )
-from strapdown.kernels.rotation import quaternion_multiply, right_jacobian, turned
-from strapdown.kernels.series import LARGEST_ANGLE
-from strapdown.kernels.smoother_step import (
+from strapdown.kernels.rotation import (
     SHORT,
     arcsine_series,
     composed,
-    gain,
     inverse_right_jacobian,
-    kept_share,
-    left_noise,
     moved,
     near_inverse_right_jacobian,
-    step_noise,
+    quaternion_multiply,
+    right_jacobian,
+    turned,
 )
+from strapdown.kernels.series import LARGEST_ANGLE
+from strapdown.kernels.smoother_step import gain, kept_share, left_noise, step_noise
 
 ROW = 32
 """Numbers of a stored segment: dt, increment (3), state (28)."""

@@ -16,136 +16,25 @@ textbook's own would be rounding times the condition number. The covariance foll
 
 from __future__ import annotations
 
-import math
-
 from strapdown.kernels.algebra import (
     add,
     add_matrices,
     add_to_diagonal,
     combine,
-    dot,
+    divided,
+    factored,
     full,
     matrix_times_vector,
     multiply,
     multiply_add,
     scale,
-    skew_polynomial,
     subtract,
     times_transpose_upper,
     times_transpose_upper_add,
     transpose,
 )
 from strapdown.kernels.filter_step import process_noise, transition
-from strapdown.kernels.rotation import quaternion_multiply, right_jacobian, turned
-from strapdown.kernels.series import LARGEST_ANGLE, cosine, polynomial, sinc
-
-_A = tuple(math.comb(2 * k, k) / (4.0**k * (2 * k + 1)) for k in range(12))
-_A0, _A1, _A2, _A3, _A4, _A5, _A6, _A7, _A8, _A9, _A10, _A11 = _A
-# |B_2k| / (2k)! for k = 1 … 6, with the Bernoulli numbers 1/6, 1/30, 1/42, 1/30, 5/66, 691/2730.
-_I0, _I1, _I2 = 1.0 / 12.0, 1.0 / 720.0, 1.0 / 30240.0
-_I3, _I4, _I5 = 1.0 / 1209600.0, 1.0 / 47900160.0, 691.0 / 1307674368000.0
-SHORT = 1e-4
-"""rad²: where two angles are not larger than its root, four terms of the series of their composition are good to rounding."""
-_SINE_SQUARED = math.sin(0.5 * LARGEST_ANGLE) ** 2
-
-
-def arcsine(x):
-    """Return asin s / s at s = √x, x ≤ sin²(``LARGEST_ANGLE``/2)."""
-    xxx = x * x * x
-    return polynomial(x, _A0, _A1, _A2, _A3, _A4, _A5) + xxx * xxx * polynomial(x, _A6, _A7, _A8, _A9, _A10, _A11)
-
-
-def arcsine_series(x):
-    """Return 2 asin s / s at s = √x to the fourth term: good to rounding for x ≤ ``SHORT``."""
-    return (2.0 + 2.0 * _A1 * x) + (x * x) * (2.0 * _A2 + 2.0 * _A3 * x)
-
-
-def logarithm(q):
-    """Return the rotation vector of a unit quaternion, the shorter way round, any angle."""
-    v = (q[1], q[2], q[3])
-    x = dot(v, v)
-    if x <= _SINE_SQUARED:
-        half = arcsine(x)
-    else:
-        s = math.sqrt(x)
-        half = math.atan2(s, abs(q[0])) / s
-    return scale(math.copysign(2.0 * half, q[0]), v)
-
-
-def near_inverse_right_jacobian(phi):
-    """Return :func:`inverse_right_jacobian` for θ ≤ ``LARGEST_ANGLE``, of floats or lanes."""
-    return skew_polynomial(1.0, 0.5, polynomial(dot(phi, phi), _I0, _I1, _I2, _I3, _I4, _I5), phi)
-
-
-def inverse_right_jacobian(phi):
-    """Return ``J_r(φ)⁻¹ = I + ½ [φ] + (1 − (θ/2) cot(θ/2))/θ² [φ]²``, θ = |φ| ≤ π."""
-    x = dot(phi, phi)
-    if x <= LARGEST_ANGLE * LARGEST_ANGLE:
-        return near_inverse_right_jacobian(phi)
-    half = 0.5 * math.sqrt(x)
-    return skew_polynomial(1.0, 0.5, (1.0 - half / math.tan(half)) / x, phi)
-
-
-def moved(q, phi):
-    """Return q ⊗ exp(φ) and J_r(φ) at any angle: what the filter does to an attitude and its tangent space, without its bound."""
-    x = dot(phi, phi)
-    if x <= LARGEST_ANGLE * LARGEST_ANGLE:
-        return turned(q, phi), right_jacobian(phi)
-    theta = math.sqrt(x)
-    s = math.sin(0.5 * theta)
-    q = quaternion_multiply(q, (math.cos(0.5 * theta), s / theta * phi[0], s / theta * phi[1], s / theta * phi[2]))
-    return q, skew_polynomial(1.0, -2.0 * s * s / x, (theta - math.sin(theta)) / (theta * x), phi)
-
-
-def composed(r, phi):
-    """Return the rotation vector of r ⊗ exp(φ), r a unit quaternion, any angles."""
-    u = (
-        r[0] * phi[0] + (r[2] * phi[2] - r[3] * phi[1]),
-        r[0] * phi[1] + (r[3] * phi[0] - r[1] * phi[2]),
-        r[0] * phi[2] + (r[1] * phi[1] - r[2] * phi[0]),
-    )
-    x = dot(phi, phi)
-    if x <= LARGEST_ANGLE * LARGEST_ANGLE:
-        c = cosine(0.25 * x)
-        h = 0.5 * sinc(0.25 * x)
-    else:
-        theta = math.sqrt(x)
-        c = math.cos(0.5 * theta)
-        h = math.sin(0.5 * theta) / theta
-    w = r[1] * phi[0] + r[2] * phi[1] + r[3] * phi[2]
-    return logarithm((c * r[0] - h * w, c * r[1] + h * u[0], c * r[2] + h * u[1], c * r[3] + h * u[2]))
-
-
-def factored(S):
-    """Return S = L D Lᵀ of a symmetric positive-definite matrix, as (l10, l20, l21, 1/d0, 1/d1, 1/d2).
-
-    Eliminated without fractions (Bareiss 1968), so that no division waits for another: the differences, and with them the rounding, are
-    those of the elimination by rows times the pivots before.
-    """
-    m11 = S[0] * S[3] - S[1] * S[1]
-    m21 = S[0] * S[4] - S[1] * S[2]
-    m22 = S[0] * S[5] - S[2] * S[2]
-    i0 = 1.0 / S[0]
-    j1 = 1.0 / m11
-    i2 = (S[0] * m11) / (m11 * m22 - m21 * m21)
-    return (S[1] * i0, S[2] * i0, m21 * j1, i0, S[0] * j1, i2)
-
-
-def solved(F, v):
-    """Return S⁻¹ v from the factors of S."""
-    y1 = v[1] - F[0] * v[0]
-    y2 = v[2] - F[1] * v[0] - F[2] * y1
-    x2 = F[5] * y2
-    x1 = F[4] * y1 - F[2] * x2
-    return (F[3] * v[0] - F[0] * x1 - F[1] * x2, x1, x2)
-
-
-def divided(X, F):
-    """Return X S⁻¹ of a matrix X, from the factors of S."""
-    a0, a1, a2 = solved(F, (X[0], X[1], X[2]))
-    b0, b1, b2 = solved(F, (X[3], X[4], X[5]))
-    c0, c1, c2 = solved(F, (X[6], X[7], X[8]))
-    return (a0, a1, a2, b0, b1, b2, c0, c1, c2)
+from strapdown.kernels.rotation import inverse_right_jacobian, logarithm, moved, quaternion_multiply, turned
 
 
 def minus_product(S, A, B):

@@ -10,12 +10,13 @@ from __future__ import annotations
 import math
 
 from strapdown.kernels.algebra import add, combine, dot, matrix_times_vector, scale, transpose_times_vector
-from strapdown.kernels.filter_loop import ATTITUDE, HEADING, MOST_TURN, VECTOR, vector_at
-from strapdown.kernels.filter_step import direction_rows, heading_row, predict, reset, update_row
+from strapdown.kernels.filter_step import predict, reset, update_row
 from strapdown.kernels.lane_angles import arctangent, rotation_vector
 from strapdown.kernels.lane_values import WIDTH, load, spread, store, total
+from strapdown.kernels.measurement import ATTITUDE, HEADING, VECTOR, direction_rows, heading_row, vector_at
 from strapdown.kernels.rotation import quaternion_multiply, rotation_matrix
 from strapdown.kernels.series import LARGEST_ANGLE
+from strapdown.kernels.walk import MAX_TURN
 
 HALF_RANGE = 0.25 * LARGEST_ANGLE * LARGEST_ANGLE
 """The square of half the turn that the polynomials bear."""
@@ -97,13 +98,13 @@ def longest_step_of_lanes(theta, whole, b, room):
     """Return the longest step in an interval of increment ``theta`` and length ``whole`` that turns no lane too far.
 
     A turn beyond the range of the polynomials, in any lane, is cut into sub-steps of all: at constant rate they compose exactly. A lane
-    that is lost, of a turn above ``MOST_TURN``, is left out. ``room`` (WIDTH) is work space.
+    that is lost, of a turn above ``MAX_TURN``, is left out. ``room`` (WIDTH) is work space.
     """
     turn = combine(1.0, theta, -whole, b)
     store(room, 0, dot(turn, turn))
     squared = LARGEST_ANGLE * LARGEST_ANGLE
     for i in range(WIDTH):
-        if squared < room[i] < MOST_TURN * MOST_TURN:
+        if squared < room[i] < MAX_TURN * MAX_TURN:
             squared = room[i]
     return whole * (LARGEST_ANGLE / math.sqrt(squared))
 

@@ -11,10 +11,11 @@ from __future__ import annotations
 import math
 
 from strapdown.kernels.algebra import add, dot, scale, subtract
-from strapdown.kernels.filter_loop import ATTITUDE, VECTOR, vector_at
 from strapdown.kernels.filter_step import predict, reset, update_row
 from strapdown.kernels.lane_values import WIDTH, load, spread, store
-from strapdown.kernels.tuning_loop import calm_turn, load_state, longest_interval, longest_step_of_lanes, measured_rows
+from strapdown.kernels.measurement import ATTITUDE, VECTOR, vector_at
+from strapdown.kernels.state import load_state
+from strapdown.kernels.tuning_loop import calm_turn, longest_interval, longest_step_of_lanes, measured_rows
 
 
 def row_at(rows, r):

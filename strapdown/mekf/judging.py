@@ -14,8 +14,22 @@ import numpy as np
 from strapdown import quaternion
 from strapdown.checks import Array
 from strapdown.kernels import robust_gate, robust_step
+from strapdown.kernels.gate import Options
 from strapdown.records import Event
-from strapdown.robustness import LOCK_OUT, Gate, GateMemory, Monitor, Robust, seen_from
+from strapdown.estimation.gating import LOCK_OUT, Gate, GateMemory, Monitor, Robust, seen_from
+
+
+def gate_options(gate: Gate | None, robust: Robust | None) -> Options:
+    """Return a gate and a robust update as the kernels take them."""
+    return Options(
+        thresholds=np.full(3, np.inf) if gate is None else gate.thresholds,
+        robust=0 if robust is None else {"huber": robust_step.HUBER, "student": robust_step.STUDENT}[robust.kind],
+        parameters=np.ones((3, 2)) if robust is None else robust.parameters,
+        iterations=0 if robust is None else robust.iterations,
+        recovery=0 if gate is None else gate.recovery or 0,
+        lock_out=LOCK_OUT if gate is None else gate.lock_out_limit,
+        attitude_sigma=0.0 if gate is None else gate.restart_attitude_sigma,
+    )
 
 
 def kernel_options(gate: Gate | None, robust: Robust | None) -> tuple[object, ...]:

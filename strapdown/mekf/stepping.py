@@ -29,9 +29,9 @@ from strapdown.kernels.robust_gate import WIDE_PASSES
 from strapdown.kernels.robust_step import ACCEPTED, KNOWN, PASSED_OVER, REFUSED
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.mekf.judging import Judging, ToldEvents
-from strapdown.mekf.states import ProcessNoise, State, check_arguments, covariance_matrices, restart_bias_variance
+from strapdown.estimation.states import ProcessNoise, State, check_arguments, covariance_matrices, restart_bias_variance
 from strapdown.records import LARGEST_TURN
-from strapdown.robustness import Gate, Linearised, Monitor, Robust, Rows, linearise, seen_from, tilt_unknown
+from strapdown.estimation.gating import Gate, Linearised, Monitor, Robust, Rows, linearise, seen_from, tilt_unknown
 from strapdown.vectors import need_level, need_unit, triad
 
 CLOCK_SHARE = 1e-3

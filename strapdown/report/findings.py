@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from strapdown import setup
-from strapdown.augmented.states import States
+from strapdown.setup.states import States
 from strapdown.consistency import Judgement
 from strapdown.report import page
 from strapdown.scenarios import Scenario

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from strapdown import setup, units
-from strapdown.augmented.states import VELOCITY, Entries, SensorStates, States
+from strapdown.setup.states import VELOCITY, Entries, SensorStates, States
 from strapdown.checks import Array, InputError, count, one_of
 from strapdown.mekf import State
 from strapdown.records import ImuRecord

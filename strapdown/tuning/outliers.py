@@ -25,7 +25,7 @@ from strapdown.checks import Array, InputError, positive
 from strapdown.kernels import tuning_outliers
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.machine import compiled
-from strapdown.robustness import Gate
+from strapdown.estimation.gating import Gate
 from strapdown.setup import FilterSetup
 from strapdown.tuning.fitting import REACH, Estimated, Tuning
 from strapdown.tuning.innovations import MOST, STEP, Case, Derivatives, Likelihood, Prepared, likelihood

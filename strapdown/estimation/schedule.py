@@ -9,17 +9,17 @@ from functools import cached_property
 import numpy as np
 
 from strapdown.checks import Array, InputError
-from strapdown.kernels import filter_loop
+from strapdown.estimation.memory import side_by_side
+from strapdown.kernels import measurement
 from strapdown.kernels.machine import compiled
-from strapdown.mekf.memory import side_by_side
 from strapdown.records import Innovations
 from strapdown.vectors import KINDS, VectorMeasurements, triad
 
 _KIND_CODES = {
-    "direction": filter_loop.DIRECTION,
-    "vector": filter_loop.VECTOR,
-    "heading": filter_loop.HEADING,
-    "attitude": filter_loop.ATTITUDE,
+    "direction": measurement.DIRECTION,
+    "vector": measurement.VECTOR,
+    "heading": measurement.HEADING,
+    "attitude": measurement.ATTITUDE,
 }
 
 
@@ -61,10 +61,10 @@ class Schedule:
         time, row, sensor = side_by_side(((number,), float), ((number,), np.uint32), ((number,), narrow))
         first, *others = self.series_time or (np.empty(0),)
         if all(np.array_equal(first, other) for other in others):
-            compiled(filter_loop.common_order)(first, len(self.sensors), time, row, sensor)
+            compiled(measurement.common_order)(first, len(self.sensors), time, row, sensor)
         else:
             standing = np.concatenate(self.series_time)
-            compiled(filter_loop.merge_order)(standing, self.bounds[:-1].copy(), self.bounds[1:], time, row, sensor)
+            compiled(measurement.merge_order)(standing, self.bounds[:-1].copy(), self.bounds[1:], time, row, sensor)
         return time, row, sensor
 
     @property
@@ -113,11 +113,31 @@ class Schedule:
         return column if len(self.sensors) < 2 else np.take(column, self.row, axis=0)
 
     @property
+    def measurements(self) -> measurement.Measurements:
+        """The same as the kernels take it."""
+        columns = [places(column) for column in (self.series_vector_b, self.series_sigma)]
+        origins = [start - width * self.bounds[:-1] for (_, start), width in zip(columns, (3, 1), strict=True)]
+        time, place, sensor = self.order
+        return measurement.Measurements(
+            time=time,
+            place=place,
+            sensor=sensor,
+            value=columns[0][0],
+            sigma=columns[1][0],
+            noise=np.empty((0, 6)) if self.standing_noise is None else self.standing_noise,
+            origins=np.stack(origins, axis=1),
+            bounds=self.bounds,
+            kinds=self.codes,
+            frames=self.frames,
+            triads=self.triads,
+        )
+
+    @property
     def body_noise(self) -> Array:
         """Upper triangle of each measurement's covariance in body axes (events, 6); of a heading the first number is its variance."""
         if self.noise is not None:
             return self.noise
-        attitude = (self.kind == filter_loop.ATTITUDE)[:, None]
+        attitude = (self.kind == measurement.ATTITUDE)[:, None]
         rows = np.zeros((len(self.time), 6))
         rows[:, [0, 3, 5]] = np.where(attitude, self.vector_b, self.variance[:, None])
         return rows
@@ -263,20 +283,11 @@ def _need_noise(series: VectorMeasurements) -> None:
             )
 
 
-def innovations_by_sensor(
-    events: Schedule, rows: Array, weight: Array | None = None, *, parted: bool = False
-) -> dict[str, Innovations]:
-    """Return what a kernel wrote of each event, e₁, s₁, e₂, s₂, …, by sensor, as many as each has degrees of freedom.
+def innovations_by_sensor(events: Schedule, rows: Array, weight: Array | None = None) -> dict[str, Innovations]:
+    """Return what a kernel wrote of each measurement by place, e₁, s₁, e₂, s₂, …, by sensor, as many as it has degrees of freedom.
 
-    The rows are in order of time, or at ``events.row`` if ``parted`` already; the weights in order of time. A heading whose row is NaN was
-    that of a vertical vector, which shows none, and is left out (:func:`skipped_too`).
+    A heading whose row is NaN was that of a vertical vector, which shows none, and is left out (:func:`skipped_too`).
     """
-    if len(events.sensors) > 1 and not parted:
-        ordered, rows = rows, np.empty_like(rows)
-        rows[events.row] = ordered
-    if len(events.sensors) > 1 and weight is not None:
-        ordered, weight = weight, np.empty_like(weight)
-        weight[events.row] = ordered
     result = {}
     for i, (sensor, kind) in enumerate(zip(events.sensors, events.kinds, strict=True)):
         mine = slice(events.bounds[i], events.bounds[i + 1])

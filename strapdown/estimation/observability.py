@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import mekf, quaternion
-from strapdown.augmented import model as modelling
-from strapdown.augmented.blocks import AXES, Block
-from strapdown.augmented.model import AugmentedState
-from strapdown.augmented.smoothing import smooth
+from strapdown import quaternion
 from strapdown.checks import Array, positive
-from strapdown.mekf import ProcessNoise
+from strapdown.estimation import model as modelling
+from strapdown.estimation.error_states import AXES, ErrorStates
+from strapdown.estimation.smoothing import smooth
+from strapdown.estimation.states import ProcessNoise, State
 from strapdown.records import ImuRecord
 
 NAMED = 0.25
@@ -123,7 +122,7 @@ class Observability:
         }
 
 
-def state_names(blocks: Sequence[Block]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def state_names(blocks: Sequence[ErrorStates]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return name and unit of every state: attitude, bias, blocks."""
     names = [f"attitude {axis}" for axis in AXES] + [f"gyro bias {axis}" for axis in AXES]
     units = ["rad"] * 3 + ["rad/s"] * 3
@@ -136,8 +135,8 @@ def state_names(blocks: Sequence[Block]) -> tuple[tuple[str, ...], tuple[str, ..
 def observability(
     record: ImuRecord,
     process_noise: ProcessNoise,
-    initial: mekf.State | AugmentedState,
-    blocks: Sequence[Block] = (),
+    initial: State,
+    blocks: Sequence[ErrorStates] = (),
     *,
     threshold: float = 1.0,
 ) -> Observability:

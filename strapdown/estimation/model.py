@@ -7,82 +7,31 @@ constant ones, which then cost the prediction next to nothing (:mod:`strapdown.k
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
-from strapdown import mekf
-from strapdown.augmented.blocks import MOST_CHAIN_DECAY, Block, Effect, GeneralBlock, LinearBlock, check
-from strapdown.checks import Array, InputError, array, covariance, one_of, positive, unit_quaternions
+from strapdown.checks import Array, InputError, array, one_of
+from strapdown.estimation.error_states import MOST_CHAIN_DECAY, Effect, ErrorStates, check
+from strapdown.estimation.states import State, check_arguments
 from strapdown.kernels import augmented_step
 from strapdown.kernels.augmented_chain import CHAIN, chain_start
 from strapdown.kernels.augmented_step import CARRIED, FIXED, FORCE, LEVER, NOISE_NODES, OFFSET, SCALE
-from strapdown.mekf.states import check_arguments
-from strapdown.robustness import GateMemory
 
 MOST_DECAY = 0.5
 """Of λ dt in one step: a step back is well conditioned. For states that enter the gyro a tenth, where Gauss's rule is exact."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class AugmentedGateMemory(GateMemory):
-    """What a gate remembers with optional states; ``challenger`` holds q, (b, c) and the factor of P in the kernels' order."""
-
-    start: float
-    """Time that the first part of the record began, s."""
-    values: Array
-    """What a challenger takes the blocks for at that time (m,)."""
-    covariance: Array
-    """The covariance of them (m, m)."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class AugmentedState:
-    """Attitude, bias, the values of the blocks, and the covariance of their error."""
-
-    attitude: Array
-    """q_fb (4,)."""
-    bias: Array
-    """Gyro bias (3,), rad/s."""
-    values: Array
-    """States of the blocks (m,), one block after the other."""
-    covariance: Array
-    """P (6 + m, 6 + m) of (δθ, δb, δc)."""
-    factor: Array | None = None
-    """A root R of it, ``P = Rᵀ R``, where there is one already: a filter's, which may hold what P itself has no digits for."""
-    gate: AugmentedGateMemory | None = None
-    """Of the end of a part of a record, what its gate remembers."""
-    unit_sigma: Mapping[str, float] = field(default_factory=dict)
-    """Of sensors with ``varying`` effects the σ, rad, whose strength is the values' unit; without it, the record's root mean square."""
-
-    def __post_init__(self) -> None:
-        """Check shapes, the norm and positive definiteness."""
-        object.__setattr__(self, "attitude", unit_quaternions("attitude", array("attitude", self.attitude, (4,))))
-        object.__setattr__(self, "bias", array("bias", self.bias, (3,)))
-        values = array("values", self.values, ("m",))
-        object.__setattr__(self, "values", values)
-        told = {name: positive(f"unit_sigma[{name!r}]", sigma) for name, sigma in self.unit_sigma.items()}
-        object.__setattr__(self, "unit_sigma", told)
-        size = 6 + len(values)
-        if self.factor is None:
-            object.__setattr__(self, "covariance", covariance("covariance", self.covariance, size))
-            return
-        root, P = array("factor", self.factor, (size, size)), array("covariance", self.covariance, (size, size))
-        sigma = np.linalg.norm(root, axis=0)
-        if not np.all(sigma > 0.0) or np.any(np.abs(root.T @ root - P) > 1e-9 * np.outer(sigma, sigma)):
-            raise InputError("factor is no root of covariance; leave it out")
-
-
-def as_blocks(blocks: Sequence[Block]) -> tuple[Block, ...]:
+def as_blocks(blocks: Sequence[ErrorStates]) -> tuple[ErrorStates, ...]:
     """Return the blocks as a tuple; one by itself is refused."""
-    if isinstance(blocks, LinearBlock | GeneralBlock):
-        raise InputError(f"blocks is the block {blocks.name} by itself; give a tuple of them, (block,)")
+    if isinstance(blocks, ErrorStates):
+        raise InputError(f"error_states is {blocks.name} by itself; give a tuple, (…,)")
     if not isinstance(blocks, Iterable):
-        raise InputError(f"blocks is {blocks!r}; give a tuple of them, () for none")
+        raise InputError(f"error_states is {blocks!r}; give a tuple of declarations, () for none")
     return tuple(blocks)
 
 
-def initial_state(initial: mekf.State, blocks: Sequence[Block]) -> AugmentedState:
+def with_error_states(initial: State, blocks: Sequence[ErrorStates]) -> State:
     """Return a state whose blocks are zero, with errors of their own sigma independent of attitude and bias."""
     blocks = as_blocks(blocks)
     check(blocks)
@@ -94,19 +43,20 @@ def initial_state(initial: mekf.State, blocks: Sequence[Block]) -> AugmentedStat
         own = slice(first, first + block.size)
         P[own, own] = block.covariance
         first += block.size
-    return AugmentedState(attitude=initial.attitude, bias=initial.bias, values=np.zeros(size), covariance=P)
+    return State(attitude=initial.attitude, bias=initial.bias, values=np.zeros(size), covariance=P)
 
 
-def begin(initial: mekf.State | AugmentedState, blocks: tuple[Block, ...]) -> AugmentedState:
-    """Return the state to start from, whichever was given."""
+def begin(initial: State, blocks: tuple[ErrorStates, ...]) -> State:
+    """Return the state to start from: one without error states is given those of the blocks, at their prior."""
+    check_arguments(initial=initial)
     check(blocks)
-    if isinstance(initial, mekf.State):
-        return initial_state(initial, blocks)
-    if not isinstance(initial, AugmentedState):
-        check_arguments(initial=initial)
     size = sum(block.size for block in blocks)
+    if size and not len(initial.values):
+        return with_error_states(initial, blocks)
     if len(initial.values) != size:
-        raise InputError(f"initial has {len(initial.values)} block states, the blocks {size}; make it by initial_state")
+        raise InputError(
+            f"initial has {len(initial.values)} error states, and {size} are declared; declare the same ones"
+        )
     return initial
 
 
@@ -158,17 +108,17 @@ class Model:
         return np.concatenate([np.arange(6), 6 + self.order])
 
 
-def _stack(blocks: Sequence[Block], name: str, shape: tuple[int, ...]) -> Array:
+def _stack(blocks: Sequence[ErrorStates], name: str, shape: tuple[int, ...]) -> Array:
     parts = [np.empty((0, *shape))]
     for block in blocks:
-        if isinstance(block, LinearBlock):
+        if isinstance(block, ErrorStates):
             parts.append(array(f"{block.name}: {name}", getattr(block, name), (block.size, *shape)))
         else:
             parts.append(np.zeros((block.size, *shape)))
     return np.concatenate(parts)
 
 
-def assemble(blocks: tuple[Block, ...], kinds: Mapping[str, str]) -> Model:
+def assemble(blocks: tuple[ErrorStates, ...], kinds: Mapping[str, str]) -> Model:
     """Return the model of blocks for the sensors named, whose kinds are given; general blocks stand there without effect."""
     decay, density = _stack(blocks, "decay", ()), _stack(blocks, "density", ())
     for name, values in (("decay", decay), ("density", density)):
@@ -184,7 +134,7 @@ def assemble(blocks: tuple[Block, ...], kinds: Mapping[str, str]) -> Model:
     names = list(kinds)
     first = 0
     for block in blocks:
-        effects = block.effects if isinstance(block, LinearBlock) else {}
+        effects = block.effects if isinstance(block, ErrorStates) else {}
         for sensor, effect in effects.items():
             one_of(f"{block.name}: sensor", sensor, names)
             if kinds[sensor] == "attitude" and (effect.offset_f is not None or effect.scale is not None):
@@ -195,7 +145,7 @@ def assemble(blocks: tuple[Block, ...], kinds: Mapping[str, str]) -> Model:
             place = names.index(sensor), slice(first, first + block.size)
             sensors[place] = _numbers(block, effect)
             carried[place] = effect.carried
-            if effect.carried and effect.offset_f is not None and isinstance(block, LinearBlock):
+            if effect.carried and effect.offset_f is not None and isinstance(block, ErrorStates):
                 _check_carried(block, effect)
                 stride[first : first + block.size // 3] = block.size // 3
                 bound[place[1]] = True
@@ -236,7 +186,7 @@ def assemble(blocks: tuple[Block, ...], kinds: Mapping[str, str]) -> Model:
     )
 
 
-def _feeds(blocks: tuple[Block, ...]) -> Array:
+def _feeds(blocks: tuple[ErrorStates, ...]) -> Array:
     """Return how the next state feeds each, of chains that stay within their block."""
     feed = _stack(blocks, "feed", ())
     first = 0
@@ -253,11 +203,11 @@ def _feeds(blocks: tuple[Block, ...]) -> Array:
     return feed
 
 
-def _force(blocks: tuple[Block, ...], both: np.ndarray) -> Array:
+def _force(blocks: tuple[ErrorStates, ...], both: np.ndarray) -> Array:
     """Return the specific force that the blocks are about, one for all."""
     if both.any():
         raise InputError(f"block state {int(np.argmax(both))} has a gyro_scale and a gyro_force; make two states of it")
-    known = [np.asarray(b.force_f, np.float64) for b in blocks if isinstance(b, LinearBlock) and np.any(b.force_f)]
+    known = [np.asarray(b.force_f, np.float64) for b in blocks if isinstance(b, ErrorStates) and np.any(b.force_f)]
     for one in known[1:]:
         if not np.array_equal(one, known[0]):
             raise InputError(
@@ -266,7 +216,7 @@ def _force(blocks: tuple[Block, ...], both: np.ndarray) -> Array:
     return array("force_f", known[0], (3,)) if known else np.zeros(3)
 
 
-def _check_carried(block: LinearBlock, effect: Effect) -> None:
+def _check_carried(block: ErrorStates, effect: Effect) -> None:
     """Refuse a block that is not the same on three axes in turn, which a turn makes the same again."""
     rows = np.asarray(effect.offset_f)
     alike = block.size % 3 == 0 and np.array_equal(rows, np.kron(np.eye(3), rows[: block.size // 3, :1]))
@@ -280,7 +230,7 @@ def _check_carried(block: LinearBlock, effect: Effect) -> None:
         )
 
 
-def _check_lever(block: Block, sensor: str, kind: str, effect: Effect) -> None:
+def _check_lever(block: ErrorStates, sensor: str, kind: str, effect: Effect) -> None:
     if effect.lever is None:
         return
     if kind not in ("direction", "vector"):
@@ -291,7 +241,7 @@ def _check_lever(block: Block, sensor: str, kind: str, effect: Effect) -> None:
         raise InputError(f"{block.name}: a lever arm has no other effect beside it; make two blocks of it")
 
 
-def _numbers(block: Block, effect: Effect) -> Array:
+def _numbers(block: ErrorStates, effect: Effect) -> Array:
     """Return an effect as rows (size, 15)."""
     rows = np.zeros((block.size, 15))
     for name, place, shape in (
@@ -319,7 +269,7 @@ def lower_root(P: Array) -> Array:
     return np.ascontiguousarray(np.linalg.cholesky(P[::-1, ::-1])[::-1, ::-1].T)
 
 
-def triangle(state: AugmentedState, model: Model) -> Array:
+def triangle(state: State, model: Model) -> Array:
     """Return F, lower triangular, with ``P = Fᵀ F`` in the kernels' order."""
     order = model.whole_order
     if state.factor is None:
@@ -337,8 +287,3 @@ def turning_matrix(chains: Array, size: int, before: Array, after: Array) -> Arr
         # A turn of the columns of the identity's rows: Tᵀ, by rows.
         augmented_step.turn_columns(chains, augmented_step.fixed_turn(tuple(before), tuple(after)), T, size)
     return T.T
-
-
-def general(blocks: Sequence[Block]) -> bool:
-    """Return whether any block needs the step-by-step face."""
-    return any(isinstance(block, GeneralBlock) for block in blocks)

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from strapdown import flicker
-from strapdown.augmented.filtering import strength
-from strapdown.augmented.states import Entries, SensorStates, States
 from strapdown.checks import Array
+from strapdown.estimation.forward import strength
 from strapdown.gyro import GyroSpec
 from strapdown.records import ImuRecord
+from strapdown.setup.states import Entries, SensorStates, States
 from strapdown.vectors import VectorMeasurements
 
 DECADE = 10.0

@@ -9,18 +9,19 @@ challenger's start at that time the filter is run again up to the recovery, so t
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 
 from strapdown.checks import Array, InputError
+from strapdown.estimation.forward import Options, Problem, filtered, most_segments
+from strapdown.estimation.gating import Gate
+from strapdown.estimation.states import GateMemory
 from strapdown.kernels.machine import compiled
 from strapdown.kernels.robust_gate import CHALLENGED, FIRST_BIAS, PASSES, SINCE, WIDE_PASSES, restart_attitude
 from strapdown.kernels.smoother_loop import locate_edges
 from strapdown.records import Estimate, Event, ImuRecord
-from strapdown.robustness import Gate, GateMemory
 
 STAMP_TOLERANCE = 1e-6
 """Of the mean gyro interval: an edge that lies beyond t + lag by no more is taken for one at t + lag."""
@@ -29,23 +30,21 @@ STAMP_TOLERANCE = 1e-6
 MOST_CUT = 64
 """Times the segments that a record takes by its increments: a filter that takes more is lost."""
 
-_Estimate = TypeVar("_Estimate", bound=Estimate)
 
-
-def kept_whole(run: Callable[[int], tuple[_Estimate, object, Array]], usual: int, by: str) -> tuple[_Estimate, Array]:
-    """Return the estimate and all segments of a filter, of which ``run`` keeps as many as it is told; ``usual`` are enough as a rule."""
-    most = usual
+def filtered_whole(problem: Problem, options: Options) -> tuple[Estimate, Array]:
+    """Return the filter's estimate of a record and all its predictions (:attr:`strapdown.estimation.forward.Passed.segments`)."""
+    usual = most = most_segments(problem)
     while True:
-        # One more than it should take, which tells whether it took more.
-        forward, _, segments = run(most + 1)
-        if len(segments) - 1 <= most:
-            return forward, segments
+        # One more than it should take, which shows whether it took more.
+        passed = filtered(problem, replace(options, segments=most + 1, full_covariance=False))
+        if len(passed.segments) - 1 <= most:
+            return passed.estimate, passed.segments
         # Steps are cut by the turn without the bias, which is known only when they are taken.
         most *= 4
         if most > MOST_CUT * usual:
             raise InputError(
                 "the filter lost its way: by the bias that it found the body turns many times round in each gyro interval; "
-                f"look at the record and the start with {by} first"
+                "look at the record and the start with estimation.run first"
             )
 
 
@@ -104,7 +103,7 @@ def break_of(event: Event, memory: GateMemory | None, begin: float) -> Break:
     return Break(start=max(begin, event.start), since=since, end=event.end)
 
 
-def begun(gate: Gate, memory: GateMemory) -> tuple[Array, Array, Array]:
+def restarted(gate: Gate, memory: GateMemory) -> tuple[Array, Array, Array]:
     """Return bias (3,) and variances of attitude and bias (6,) that a challenger started from, as wide as it has become; and its counts."""
     sigma = restart_attitude(gate.restart_attitude_sigma, memory.counts)
     bias, variance = memory.counts[FIRST_BIAS : FIRST_BIAS + 3], memory.counts[FIRST_BIAS + 3 : FIRST_BIAS + 6]
@@ -141,7 +140,7 @@ def starts(time: Array, event_time: Array, segments: Array) -> np.ndarray:
     return found
 
 
-Again = tuple[Array, np.ndarray] | None
+Rerun = tuple[Array, np.ndarray] | None
 """Segments of a trajectory from its ``since`` to its ``end``, and the number of that which starts at each stop between; None: none."""
 
 
@@ -151,11 +150,11 @@ def trajectories(
     breaks: Sequence[Break],
     first: np.ndarray,
     segments: np.ndarray,
-    again: Sequence[Again],
+    reruns: Sequence[Rerun],
 ) -> list[Trajectory]:
     """Return the trajectories of a record with these edges, each of which sees the record up to the edge ``until``.
 
-    ``segments`` are the filter's, ``first`` tells which of them starts at each stop, and ``again`` those of each break.
+    ``segments`` are the filter's, ``first`` tells which of them starts at each stop, and ``reruns`` those of each break.
     """
     stop = stops(time, breaks)
     place = np.searchsorted(stop, time)
@@ -171,7 +170,7 @@ def trajectories(
         after = first[np.searchsorted(stop, breaks[k].end)] + 1 if k < len(breaks) else len(segments)
         rows, at = segments[first[begin] : after], first - first[begin]
         at[:begin] = -1
-        ran = again[k - 1] if k > 0 else None
+        ran = reruns[k - 1] if k > 0 else None
         if ran is not None:
             before, early = ran
             at[begin:] += len(before) - 1

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,9 +21,9 @@ from strapdown.checks import (
     positive,
     unit_quaternions,
 )
-from strapdown.kernels.filter_step import heading_row
+from strapdown.estimation.gating import Gate, Monitor, Robust
+from strapdown.kernels.measurement import heading_row
 from strapdown.records import ImuRecord
-from strapdown.robustness import Gate, GateMemory, Monitor, Robust
 
 LARGEST_NOISE = 1e9
 """Noise of a gyro in SI beyond which it is a mistake."""
@@ -31,7 +31,7 @@ LARGEST_NOISE = 1e9
 
 @dataclass(frozen=True, kw_only=True)
 class ProcessNoise:
-    """What the filter believes of the gyro."""
+    """Noise of the gyro in the filter's model."""
 
     angle_random_walk: float
     """σ_v, rad/√s; greater than zero."""
@@ -48,23 +48,73 @@ class ProcessNoise:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """The restart candidate that runs beside a gated filter."""
+
+    attitude: Array
+    """q_fb (4,)."""
+    others: Array
+    """Gyro bias and error states (n − 3,)."""
+    covariance: Array
+    """P (n, n)."""
+    factor: Array | None = None
+    """R with ``P = Rᵀ R``, if the filter carries it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GateMemory:
+    """What a gate remembers at the end of a part of a record, for the next part to go on from."""
+
+    restart_bias_variance: Array
+    """What the first candidate's bias variance grows by where the gate does not say (3,), (rad/s)²."""
+    candidate: Candidate | None = None
+    counts: Array
+    """Whether there is a candidate, how it does, and how wide the next one starts, as :mod:`strapdown.kernels.robust_gate` holds them."""
+    standing: Mapping[str, Array]
+    """Refusals of each sensor, as held there."""
+    start: float = 0.0
+    """Time that the first part of the record began, s."""
+    values: Array = field(default_factory=lambda: np.empty(0))
+    """Error states of a candidate at that time (m,)."""
+    covariance: Array = field(default_factory=lambda: np.empty((0, 0)))
+    """The covariance of them (m, m)."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class State:
-    """Attitude, bias and the covariance of their error."""
+    """Attitude, bias and error states of a filter, and the covariance of their errors."""
 
     attitude: Array
     """q_fb (4,)."""
     bias: Array
     """Gyro bias (3,), rad/s."""
     covariance: Array
-    """P (6, 6) of (δθ, δb): rad², rad²/s, (rad/s)²."""
+    """P (6 + m, 6 + m) of (δθ, δb, δc): rad², rad²/s, (rad/s)², …"""
+    values: Array = field(default_factory=lambda: np.empty(0))
+    """Error states c (m,), one declaration after the other; none by default."""
+    factor: Array | None = None
+    """A root R of P, ``P = Rᵀ R``, where there is one already: a filter's, which may hold what P itself has no digits for."""
     gate: GateMemory | None = None
     """Of the end of a part of a record, what its gate remembers."""
+    unit_sigma: Mapping[str, float] = field(default_factory=dict)
+    """Of sensors with ``varying`` effects the σ, rad, whose strength is the values' unit; without it, the record's root mean square."""
 
     def __post_init__(self) -> None:
         """Check shapes, the norm and positive definiteness."""
         object.__setattr__(self, "attitude", unit_quaternions("attitude", array("attitude", self.attitude, (4,))))
         object.__setattr__(self, "bias", array("bias", self.bias, (3,)))
-        object.__setattr__(self, "covariance", covariance("covariance", self.covariance, 6))
+        values = array("values", self.values, ("m",))
+        object.__setattr__(self, "values", values)
+        units = {name: positive(f"unit_sigma[{name!r}]", sigma) for name, sigma in self.unit_sigma.items()}
+        object.__setattr__(self, "unit_sigma", units)
+        size = 6 + len(values)
+        if self.factor is None:
+            object.__setattr__(self, "covariance", covariance("covariance", self.covariance, size))
+            return
+        root, P = array("factor", self.factor, (size, size)), array("covariance", self.covariance, (size, size))
+        sigma = np.linalg.norm(root, axis=0)
+        if not np.all(sigma > 0.0) or np.any(np.abs(root.T @ root - P) > 1e-9 * np.outer(sigma, sigma)):
+            raise InputError("factor is no root of covariance; leave it out")
 
 
 def initial_state(
@@ -90,25 +140,13 @@ def _by_axis(name: str, value: ArrayLike) -> Array:
     return np.broadcast_to(given, 3)
 
 
-class Initial(Protocol):
-    """A state that a filter starts from, with optional states or without."""
-
-    @property
-    def covariance(self) -> Array:
-        """P (n, n) of (δθ, δb, …)."""
-
-    @property
-    def gate(self) -> GateMemory | None:
-        """Of the end of a part of a record, what its gate remembers."""
-
-
-def first_bias_variance(initial: Initial) -> Array:
+def first_bias_variance(initial: State) -> Array:
     """Return the bias variance (3,) of the state that the first part of a record started from."""
     return np.diag(initial.covariance)[3:6].copy() if initial.gate is None else initial.gate.restart_bias_variance
 
 
-def restart_bias_variance(gate: Gate | None, initial: Initial) -> Array:
-    """Return what a gate adds to the variance of its first challenger's bias (3,), (rad/s)², of a filter that goes on from ``initial``."""
+def restart_bias_variance(gate: Gate | None, initial: State) -> Array:
+    """Return what a gate adds to the variance of its first candidate's bias (3,), (rad/s)², of a filter that goes on from ``initial``."""
     if gate is None:
         return np.zeros(3)
     if gate.restart_bias_sigma is None and initial.gate is not None:
@@ -118,14 +156,14 @@ def restart_bias_variance(gate: Gate | None, initial: Initial) -> Array:
 
 NEEDED = {
     "record": (ImuRecord, "make it by records.ImuRecord, or read one by recordfiles.read_record"),
-    "process_noise": (ProcessNoise, "give mekf.ProcessNoise(angle_random_walk=…, …)"),
-    "initial": (State, "make it by mekf.initial_state, or from a record by mekf.first_state"),
+    "process_noise": (ProcessNoise, "give estimation.ProcessNoise(angle_random_walk=…, …)"),
+    "initial": (State, "make it by estimation.initial_state, or from a record by estimation.first_state"),
 }
 """What filters are given, by name: its class, and how to come by one."""
 OPTIONAL = {
-    "gate": (Gate, "give robustness.Gate(probability=0.999), or None"),
-    "robust": (Robust, "give robustness.Robust(kind='huber'), or None"),
-    "monitor": (Monitor, "give robustness.Monitor(), or None"),
+    "gate": (Gate, "give estimation.Gate(probability=0.999), or None"),
+    "robust": (Robust, "give estimation.Robust(kind='huber'), or None"),
+    "monitor": (Monitor, "give estimation.Monitor(), or None"),
 }
 """What they may be given beside it."""
 

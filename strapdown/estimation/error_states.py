@@ -1,8 +1,7 @@
-"""Optional states as blocks: what each is, how it changes, and how it enters the gyro and the sensors.
+"""Declarations of error states: what each is, how it changes, and how it enters the gyro and the sensors.
 
-A :class:`LinearBlock` is told by arrays, and the compiled filter runs on those alone: it need not know the block. A :class:`GeneralBlock`
-is told by functions of the rate, the attitude and the time, and runs step by step in Python. A new block subclasses one of them and
-overrides what it has; everything else is "no effect".
+:class:`ErrorStates` describes them by arrays, and the compiled filter needs nothing else. A new declaration is a subclass that overrides
+what it has.
 """
 
 from __future__ import annotations
@@ -55,8 +54,12 @@ class Effect:
     is told of them is in the axes of the estimated attitude, their covariance too, which leaves out how well that is known."""
 
 
-class _Block:
-    """What every block has."""
+class ErrorStates:
+    """Error states that enter linearly and change each by itself, or in chains: ``ċₖ = −λₖ cₖ + gₖ cₖ₊₁ + √qₖ wₖ``.
+
+    Transition and noise are exact over any dt. A chain, of up to three states that do not enter the gyro, shapes the noise of its last one
+    by any real poles. A subclass overrides what it has; everything else is "no effect".
+    """
 
     name: str
     """Its name, which no other block has."""
@@ -76,14 +79,6 @@ class _Block:
     def covariance(self) -> Array:
         """Covariance of the states at the start (size, size): of states that are independent then, their variances."""
         return np.diag(np.asarray(self.sigma) ** 2)
-
-
-class LinearBlock(_Block):
-    """A block of states that enter linearly and change each by itself, or in chains: ``ċₖ = −λₖ cₖ + gₖ cₖ₊₁ + √qₖ wₖ``.
-
-    Transition and noise are exact over any dt. A chain, of up to three states that do not enter the gyro, shapes the noise of its last one
-    by any real poles.
-    """
 
     @property
     def decay(self) -> Array:
@@ -168,57 +163,6 @@ def stationary_covariance(decay: Array, density: Array, feed: Array) -> Array:
     return P[:n, :n]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Interval:
-    """A step of the filter: what a :class:`GeneralBlock` may ask for."""
-
-    time: float
-    """Begin, s."""
-    dt: float
-    """s."""
-    attitude: Array
-    """Estimated q_fb at the begin (4,)."""
-    rate: Array
-    """Estimated body rate (3,), rad/s."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class View:
-    """A measurement as the filter expects it: what a :class:`GeneralBlock` may ask for."""
-
-    sensor: str
-    time: float
-    attitude: Array
-    """Estimated q_fb (4,)."""
-    rate: Array
-    """Estimated body rate (3,) over the step before, rad/s."""
-    expected_b: Array
-    """R_fbᵀ r (3,), body axes, in the unit of the reference."""
-
-
-class GeneralBlock(_Block):
-    """A block told by functions: a latency, whose effect goes by the rate; a motion, whose change goes by the attitude.
-
-    It has no effect on kinds ``"heading"`` and ``"attitude"``. How its effects change with the attitude *error* is neglected: they are
-    small beside the measurement.
-    """
-
-    def propagate(self, values: Array, interval: Interval) -> tuple[Array, Array, Array, Array]:
-        """Return values (size,) after an interval, Φ (size, size), ∂values/∂δθ (size, 3), and Q (size, size)."""
-        return values, np.eye(self.size), np.zeros((self.size, 3)), np.zeros((self.size, self.size))
-
-    def gyro(self, values: Array, interval: Interval) -> tuple[Array, Array]:
-        """Return what is added to the measured rate (3,), rad/s, and its derivatives (size, 3); taken constant over the interval."""
-        return np.zeros(3), np.zeros((self.size, 3))
-
-    def measured(self, values: Array, view: View) -> tuple[Array, Array] | None:
-        """Return what is added to a sensor's vector (3,), body axes, and its derivatives (size, 3); None: nothing."""
-        return None
-
-
-Block = LinearBlock | GeneralBlock
-
-
 def _spread(name: str, value: float | Array, unit: str, size: int = 3) -> Array:
     spread = np.broadcast_to(np.asarray(value, np.float64), (size,)).copy() if np.ndim(value) < 2 else value
     return np.array([positive(f"{name}[{k}]", one, unit=unit) for k, one in enumerate(array(name, spread, (size,)))])
@@ -246,7 +190,7 @@ def _matrix(name: str, diagonal: float | Array, off_diagonal: float | Array, uni
 
 
 @dataclass(frozen=True, kw_only=True)
-class GyroScale(LinearBlock):
+class GyroScale(ErrorStates):
     """Scale factors and misalignments of the gyro: the entries of M in ``w_meas = (I + M) w_b + b + n``, constant.
 
     Entries of an array whose σ is 0 are taken for exact and are no states.
@@ -291,7 +235,7 @@ class GyroScale(LinearBlock):
 
 
 @dataclass(frozen=True, kw_only=True)
-class GyroForce(LinearBlock):
+class GyroForce(ErrorStates):
     """Sensitivity of the gyro to specific force: the entries of G in ``w_meas = w_b + b + G f_b + n``, constant.
 
     The force is that of a body held up, the reaction to gravity alone, ``f_b = −R_fbᵀ g_f``. Entries whose σ is 0 are no states.
@@ -348,7 +292,7 @@ class GyroForce(LinearBlock):
 
 
 @dataclass(frozen=True, kw_only=True)
-class GyroGaussMarkov(LinearBlock):
+class GyroGaussMarkov(ErrorStates):
     """A second gyro bias that forgets: first-order Gauss–Markov, stationary. Several of different times together cover flicker."""
 
     bias_sigma: float | Array
@@ -386,7 +330,7 @@ class GyroGaussMarkov(LinearBlock):
 
 
 @dataclass(frozen=True, kw_only=True)
-class VectorBias(LinearBlock):
+class VectorBias(ErrorStates):
     """A constant bias of a vector sensor in body axes: hard iron, accelerometer bias."""
 
     sensor: str
@@ -429,10 +373,10 @@ class VectorBias(LinearBlock):
 
 
 @dataclass(frozen=True, kw_only=True)
-class LeverArm(LinearBlock):
+class LeverArm(ErrorStates):
     """The place of an accelerometer on the body, from the point that does not accelerate: ``f_b = −R_fbᵀ g + ([ẇ] + [w]²) r``, constant.
 
-    Rate and angular acceleration are those of the gyro (:func:`strapdown.augmented.turning.turning`), whose noise becomes noise of the
+    Rate and angular acceleration are those of the gyro (:func:`strapdown.estimation.angular_acceleration.turning`), whose noise becomes noise of the
     sensor. Components whose σ is 0 are no states.
     """
 
@@ -480,7 +424,7 @@ class LeverArm(LinearBlock):
 
 
 @dataclass(frozen=True, kw_only=True)
-class VectorScale(LinearBlock):
+class VectorScale(ErrorStates):
     """Scale factors and misalignments of a vector sensor: all nine of S in ``m_b = (I + S) R_fbᵀ r``, constant: soft iron."""
 
     sensor: str
@@ -511,7 +455,7 @@ class VectorScale(LinearBlock):
 
 
 @dataclass(frozen=True, kw_only=True)
-class GaussMarkov(LinearBlock):
+class GaussMarkov(ErrorStates):
     """First-order coloured noise on a vector sensor, stationary: the acceleration of a moving hand on an accelerometer."""
 
     sensor: str
@@ -567,7 +511,7 @@ class GaussMarkov(LinearBlock):
 
 
 @dataclass(frozen=True, kw_only=True)
-class BoundedVelocity(LinearBlock):
+class BoundedVelocity(ErrorStates):
     """What an accelerometer on a moving hand feels of the motion: an acceleration whose velocity is bounded, stationary, in fixed axes.
 
     ``f_b = R_fbᵀ (a_f − g_f)`` with ``a = v̇``: on each axis ``v̇ = −v/τ_v + u``, ``u̇ = −u/τ_a + w``. The spectrum of a is that of
@@ -682,14 +626,14 @@ class BoundedVelocity(LinearBlock):
         return {self.sensor: Effect(offset_f=np.kron(np.eye(3), a[:, None]) / self.strength, carried=True)}
 
 
-def check(blocks: tuple[Block, ...]) -> None:
+def check(blocks: tuple[ErrorStates, ...]) -> None:
     """Refuse blocks that do not say what they are, and two of one name."""
     names: list[str] = []
     for block in blocks:
-        if not isinstance(block, LinearBlock | GeneralBlock):
-            raise InputError(f"{block!r} is no block; subclass LinearBlock or GeneralBlock of strapdown.augmented")
+        if not isinstance(block, ErrorStates):
+            raise InputError(f"{block!r} declares no error states; subclass ErrorStates")
         if block.name in names:
-            raise InputError(f"two blocks are named {block.name!r}; give each a name of its own")
+            raise InputError(f"two declarations of error states are named {block.name!r}; give each a name of its own")
         names.append(block.name)
         if len(block.units) != block.size:
             raise InputError(f"{block.name}: {len(block.units)} units for {block.size} components; give one each")

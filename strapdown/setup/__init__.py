@@ -14,16 +14,18 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import augmented, coning, gyro, mekf, quaternion, smoother, tables, units, vectors
-from strapdown.augmented import Observability, matching
-from strapdown.augmented import states as optional
-from strapdown.augmented.states import States
+from strapdown import coning, estimation, gyro, quaternion, tables, units, vectors
 from strapdown.checks import Array, InputError, known_keys, one_of, positive
+from strapdown.estimation import Observability
+from strapdown.estimation.error_states import ErrorStates
+from strapdown.estimation.gating import Gate, Robust
+from strapdown.estimation.states import ProcessNoise, State
 from strapdown.gyro import GyroSpec
-from strapdown.mekf import ProcessNoise
 from strapdown.records import Estimate, ImuRecord, compress
-from strapdown.robustness import Gate, Robust
 from strapdown.scenarios import Scenario, simulate
+from strapdown.setup import matching
+from strapdown.setup import states as optional
+from strapdown.setup.states import States
 from strapdown.vectors import VectorMeasurements
 
 ATTITUDE_SIGMA = 1.0 * units.DEGREE
@@ -328,19 +330,19 @@ def _by_axis(series: VectorMeasurements, told: tuple[float, float, float], facto
     )
 
 
-def run(record: ImuRecord, setup: FilterSetup, initial: mekf.State, **options: Any) -> Estimate:
-    """Run the filter of this setup over a record; ``options`` are those of :func:`strapdown.mekf.run`.
+def run(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any) -> Estimate:
+    """Run the filter of this setup over a record; ``options`` are those of :func:`strapdown.estimation.run`.
 
-    With optional states the estimate is one of :class:`strapdown.augmented.AugmentedEstimate`, which tells of them too.
+    With optional states the estimate is one of :class:`strapdown.records.Estimate`, which tells of them too.
     """
     chosen = {"gate": setup.gate, "robust": setup.robust, **options}
     if setup.states is not None:
         return optional.run(believed(record, setup), setup.process_noise, initial, setup.states, **chosen)
-    return mekf.run(believed(record, setup), setup.process_noise, initial, **chosen)
+    return estimation.run(believed(record, setup), setup.process_noise, initial, **chosen)
 
 
-def smooth(record: ImuRecord, setup: FilterSetup, initial: mekf.State, **options: Any) -> Estimate:
-    """Return the fixed-interval smoother's estimate of this setup; ``options`` are those of :func:`strapdown.smoother.run`.
+def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any) -> Estimate:
+    """Return the fixed-interval smoother's estimate of this setup; ``options`` are those of :func:`strapdown.estimation.smooth`.
 
     Raises
     ------
@@ -350,7 +352,7 @@ def smooth(record: ImuRecord, setup: FilterSetup, initial: mekf.State, **options
     """
     chosen = {"gate": setup.gate, "robust": setup.robust, **options}
     told = believed(record, setup)
-    blocks: tuple[augmented.Block, ...] = ()
+    blocks: tuple[ErrorStates, ...] = ()
     if setup.states is not None:
         if setup.states.gyro_drift_sigma:
             raise InputError(
@@ -365,25 +367,25 @@ def smooth(record: ImuRecord, setup: FilterSetup, initial: mekf.State, **options
             f"smoothing {len(told.increments)} samples with {n} states takes {need / 1e9:.3g} GB, more than {MOST_MEMORY / 1e9:g}; cut the "
             "record, or do not smooth"
         )
-    if setup.states is None:
-        return smoother.run(told, setup.process_noise, initial, **chosen)
-    return augmented.smooth(told, setup.process_noise, initial, blocks, **chosen)
+    return estimation.smooth(told, setup.process_noise, initial, blocks, **chosen)
 
 
-def observability(record: ImuRecord, setup: FilterSetup, initial: mekf.State) -> Observability:
-    """Return what a record shows of each state of this setup's filter: see :func:`strapdown.augmented.observability`."""
+def observability(record: ImuRecord, setup: FilterSetup, initial: State) -> Observability:
+    """Return what a record shows of each state of this setup's filter: see :func:`strapdown.estimation.observability`."""
     told = believed(record, setup)
     if setup.states is None:
-        return augmented.observability(told, setup.process_noise, initial)
+        return estimation.observability(told, setup.process_noise, initial)
     blocks = setup.states.blocks({series.sensor: series.kind for series in told.vectors})
-    return augmented.observability(told, setup.process_noise, optional.initial_state(initial, blocks), blocks)
+    return estimation.observability(told, setup.process_noise, optional.initial_state(initial, blocks), blocks)
 
 
 def initial_state(
     setup: FilterSetup, attitude: Array, bias: Array | tuple[float, float, float] = (0.0, 0.0, 0.0)
-) -> mekf.State:
+) -> State:
     """Return the state that the filter starts from: this attitude and bias, and the setup's σ of both."""
-    return mekf.initial_state(attitude, bias=bias, attitude_sigma=setup.attitude_sigma, bias_sigma=setup.bias_sigma)
+    return estimation.initial_state(
+        attitude, bias=bias, attitude_sigma=setup.attitude_sigma, bias_sigma=setup.bias_sigma
+    )
 
 
 _NOISE_FORM: tables.Form = {name: gyro.FORM[name] for name in ("angle_random_walk", "rate_random_walk")}

@@ -8,12 +8,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from strapdown import mekf, tables, units
-from strapdown.augmented import filtering
-from strapdown.augmented import model as modelling
-from strapdown.augmented.blocks import (
-    Block,
+from strapdown import tables, units
+from strapdown.checks import Array, InputError, array, known_keys, non_negative, one_of, positive
+from strapdown.estimation import forward
+from strapdown.estimation import model as modelling
+from strapdown.estimation.error_states import (
     BoundedVelocity,
+    ErrorStates,
     GaussMarkov,
     GyroForce,
     GyroGaussMarkov,
@@ -21,12 +22,9 @@ from strapdown.augmented.blocks import (
     LeverArm,
     VectorBias,
 )
-from strapdown.augmented.filtering import AugmentedEstimate
-from strapdown.augmented.model import AugmentedState
-from strapdown.checks import Array, InputError, array, known_keys, non_negative, one_of, positive
-from strapdown.mekf import ProcessNoise
-from strapdown.records import ImuRecord
-from strapdown.robustness import Gate, Monitor, Robust
+from strapdown.estimation.gating import Gate, Monitor, Robust
+from strapdown.estimation.states import ProcessNoise, State
+from strapdown.records import Estimate, ImuRecord
 from strapdown.vectors import GRAVITY_F, KINDS
 
 Entries = float | tuple[float, ...] | tuple[tuple[float, ...], ...]
@@ -113,10 +111,10 @@ class SensorStates:
         told = {name: getattr(self, name) for name in VELOCITY}
         return BoundedVelocity(sensor=sensor, strength=strength, **told)
 
-    def blocks(self, sensor: str, kind: str, gravity: float) -> tuple[Block, ...]:
+    def blocks(self, sensor: str, kind: str, gravity: float) -> tuple[ErrorStates, ...]:
         """Return them as blocks of a sensor of this kind; ``gravity``, m/s², is what a direction's specific force is over."""
         one_of(f"{sensor}: kind", kind, KINDS)
-        found: list[Block] = []
+        found: list[ErrorStates] = []
         if _any(self.bias_sigma):
             found.append(VectorBias(sensor=sensor, bias_sigma=np.asarray(self.bias_sigma), varying=self.varying))
         if _any(self.lever_arm_sigma):
@@ -191,9 +189,9 @@ class States:
         """Length of ``gravity_f``, m/s²."""
         return float(np.linalg.norm(self.gravity_f))
 
-    def gyro_blocks(self) -> tuple[Block, ...]:
+    def gyro_blocks(self) -> tuple[ErrorStates, ...]:
         """Return the blocks of the gyro."""
-        found: list[Block] = []
+        found: list[ErrorStates] = []
         if _any(self.gyro_scale_sigma) or _any(self.gyro_misalignment_sigma):
             scale, misalignment = _spread(self.gyro_scale_sigma, self.gyro_misalignment_sigma)
             found.append(GyroScale(scale_sigma=scale, misalignment_sigma=misalignment))
@@ -204,7 +202,7 @@ class States:
             found.append(GyroGaussMarkov(bias_sigma=sigma, correlation_time=time, name=f"gyro drift {time:g} s"))
         return tuple(found)
 
-    def blocks(self, kinds: Mapping[str, str]) -> tuple[Block, ...]:
+    def blocks(self, kinds: Mapping[str, str]) -> tuple[ErrorStates, ...]:
         """Return all as blocks of a filter on sensors of these kinds, by name."""
         found = list(self.gyro_blocks())
         for name, one in self.sensors.items():
@@ -274,30 +272,27 @@ def _spread(diagonal: Entries, off_diagonal: Entries) -> tuple[Array, Array]:
     return on, off
 
 
-def initial_state(initial: mekf.State, blocks: tuple[Block, ...]) -> AugmentedState:
-    """Return the state to start from where ``initial`` tells of the *whole* bias, the blocks' part of it included.
+def initial_state(initial: State, error_states: tuple[ErrorStates, ...]) -> State:
+    """Return the state to start from where ``initial`` has the *whole* bias, the error states' part of it included.
 
     Its error is what ``initial`` says, whatever the parts are: of the bias ``b = β − Σ c e`` the covariance follows, so that a drift that
     is large beside a well-known bias is known only together with it.
     """
-    plain = modelling.initial_state(initial, blocks)
-    size = len(plain.covariance)
-    turn = np.eye(size)
+    plain = modelling.with_error_states(initial, error_states)
+    turn = np.eye(len(plain.covariance))
     first = 6
-    for block in blocks:
-        turn[3:6, first : first + block.size] = -np.asarray(getattr(block, "gyro_offset", np.zeros((block.size, 3)))).T
-        first += block.size
+    for one in error_states:
+        turn[3:6, first : first + one.size] = -np.asarray(one.gyro_offset).T
+        first += one.size
     sigma = np.sqrt(np.diag(plain.covariance))
     root = (turn @ (sigma[:, None] * np.linalg.cholesky(plain.covariance / np.outer(sigma, sigma)))).T
-    return AugmentedState(
-        attitude=plain.attitude, bias=plain.bias, values=plain.values, covariance=root.T @ root, factor=root
-    )
+    return replace(plain, covariance=root.T @ root, factor=root)
 
 
 def run(
     record: ImuRecord,
     process_noise: ProcessNoise,
-    initial: mekf.State | AugmentedState,
+    initial: State,
     states: States,
     *,
     every: int = 1,
@@ -305,34 +300,22 @@ def run(
     gate: Gate | None = None,
     robust: Robust | None = None,
     monitor: Monitor | None = None,
-) -> AugmentedEstimate:
-    """Run the filter with these states; its estimate tells of the attitude and the whole gyro bias, drifts included, and of the blocks.
+) -> Estimate:
+    """Run the filter with these states; its estimate is of the attitude and the whole gyro bias, drifts included, and of the error states.
 
-    ``initial`` of class :class:`strapdown.mekf.State` tells of the whole bias. Options are those of :func:`strapdown.mekf.run`.
+    An ``initial`` without values has the whole bias. Options are those of :func:`strapdown.estimation.run`.
     """
-    blocks = states.blocks({series.sensor: series.kind for series in record.vectors})
-    state = initial_state(initial, blocks) if isinstance(initial, mekf.State) else initial
-    state = modelling.begin(state, blocks)
-    events, model = filtering.prepared(record, blocks)
-    found, _, _ = filtering.run_events(
-        record,
-        events,
-        model,
-        process_noise,
-        state,
-        blocks,
-        every=every,
-        full_covariance=full_covariance,
-        gate=gate,
-        robust=robust,
-        whole_bias=True,
-    )
+    error_states = states.blocks({series.sensor: series.kind for series in record.vectors})
+    state = initial if len(initial.values) else initial_state(initial, error_states)
+    problem = forward.prepared(record, process_noise, state, error_states)
+    options = forward.Options(every=every, full_covariance=full_covariance, gate=gate, robust=robust, whole_bias=True)
+    found = forward.filtered(problem, options).estimate
     assert found.whole_bias is not None
     assert found.whole_bias_variance is not None
     fast = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 1.0]) * states.gyro_fast_bias_sigma**2
     covariance = found.whole_bias_covariance
     return replace(
-        filtering.watched(found, monitor, gate),
+        forward.watched(found, monitor, gate),
         bias=found.whole_bias,
         variance=found.whole_bias_variance + fast,
         covariance=None if covariance is None else covariance + np.diag(fast),

@@ -1,0 +1,48 @@
+"""Attitude, gyro bias and error states from gyro increments and vector measurements.
+
+The process model is equation (17), ``q̇ = ½ q ⊗ (w_meas − b)``; the error state is ``(δθ, δb, δc)`` with ``q_true = q ⊗ exp(δθ)`` and
+``δb = b_true − b``. Transition and process noise are exact at constant rate; after each correction the covariance is carried to the new
+tangent space.
+
+``states``
+    Process noise, state, where the filter starts.
+``error_states``
+    Declarations of states beside attitude and gyro bias; ``model`` turns them into arrays.
+``gating``
+    Gate, robust weights and monitor.
+``schedule``
+    Measurements in order of time.
+``forward``
+    The filter over whole records.
+``smoothing``
+    The smoothers; ``recovery_segments`` what they make of recoveries.
+``observability``
+    What a record shows of each state.
+``multiple_model``
+    Unknown start, one vector at a time.
+"""
+
+from strapdown.estimation.forward import gaps, run, run_part
+from strapdown.estimation.gating import Gate, Monitor, Robust
+from strapdown.estimation.model import with_error_states
+from strapdown.estimation.observability import Observability, observability
+from strapdown.estimation.smoothing import relinearized_start, smooth
+from strapdown.estimation.states import ProcessNoise, State, first_state, initial_state
+
+__all__ = [
+    "Gate",
+    "Monitor",
+    "Observability",
+    "ProcessNoise",
+    "Robust",
+    "State",
+    "first_state",
+    "gaps",
+    "initial_state",
+    "observability",
+    "relinearized_start",
+    "run",
+    "run_part",
+    "smooth",
+    "with_error_states",
+]

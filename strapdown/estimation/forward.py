@@ -1,0 +1,858 @@
+"""The filter over whole records, compiled: :func:`run`, and :func:`run_part` for a record in parts.
+
+Without error states the covariance is carried in blocks (:mod:`strapdown.kernels.covariance_form`), the fast way; where it would lose its
+digits, and with error states, as its triangular factor (:mod:`strapdown.kernels.root_form`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from strapdown.checks import Array, InputError, count
+from strapdown.estimation import model as modelling
+from strapdown.estimation.angular_acceleration import turning
+from strapdown.estimation.error_states import ErrorStates
+from strapdown.estimation.gating import LOCK_OUT, Gate, Monitor, Robust
+from strapdown.estimation.memory import side_by_side
+from strapdown.estimation.model import Model
+from strapdown.estimation.schedule import Schedule, innovations_by_sensor, schedule, skipped_too
+from strapdown.estimation.states import (
+    Candidate,
+    GateMemory,
+    ProcessNoise,
+    State,
+    check_arguments,
+    covariance_blocks,
+    covariance_matrices,
+    first_bias_variance,
+    pack,
+    restart_bias_variance,
+)
+from strapdown.kernels import covariance_form, gate, robust_gate, robust_step, root_form
+from strapdown.kernels.augmented_chain import LINKS
+from strapdown.kernels.augmented_step import OFFSET
+from strapdown.kernels.machine import compiled
+from strapdown.kernels.measurement import Measurements
+from strapdown.kernels.series import LARGEST_ANGLE
+from strapdown.kernels.walk import walk
+from strapdown.records import ErrorStateEstimate, Estimate, Event, ImuRecord
+from strapdown.vectors import KINDS, VectorMeasurements
+
+GAP_FACTOR = 5.0
+"""A gyro interval longer than this many times the median one is reported as a gap."""
+CHECK_INTERVALS = 1024
+"""Check the covariance for lost digits every 1024 intervals."""
+SHARPNESS = 1e9
+"""Largest ratio of an innovation's variance to the measurement's at which the covariance keeps enough digits."""
+MIN_SHARE = 1e-10
+"""Smallest part of a state's variance, given the states after it, at which the covariance keeps enough digits."""
+NO_DIGITS = (1e14, 1e-15)
+"""The same two where the covariance keeps no digit at all."""
+HEALTHY_SHARE = 1e-7
+"""Part of each variance, given the states after it, from which on the covariance is carried in blocks again."""
+FIRST_SPAN = 64
+"""Intervals carried as a factor before the covariance is checked again; each further span is twice as long."""
+SHRINK = 1.0 - 1e-14
+"""Factor on reported correlations: rounding could make the covariance of one nearer to 1 indefinite."""
+
+
+class LostDigitsError(InputError):
+    """The covariance in blocks keeps no digit, and whoever asked for its segments must take the factor's."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """How a record is filtered."""
+
+    every: int = 1
+    full_covariance: bool = False
+    gate: Gate | None = None
+    robust: Robust | None = None
+    segments: int = 0
+    """How many predictions to keep for a smoother."""
+    whole_bias: bool = False
+    """Report the whole gyro bias, and by ``full_covariance`` its covariance instead of that of all states."""
+    factor: bool = False
+    """Carry the triangular factor even without error states."""
+
+    @property
+    def judged(self) -> bool:
+        """Whether measurements are tested or weighed."""
+        return self.gate is not None or self.robust is not None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Problem:
+    """A record, prepared for the kernels."""
+
+    record: ImuRecord
+    events: Schedule
+    process_noise: ProcessNoise
+    initial: State
+    error_states: tuple[ErrorStates, ...] = ()
+    model: Model
+
+    @property
+    def variances(self) -> tuple[float, float]:
+        """σ_v², rad²/s, and σ_u², rad²/s³."""
+        return self.process_noise.angle_random_walk**2, self.process_noise.rate_random_walk**2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Passed:
+    """A record that the filter has passed through."""
+
+    estimate: Estimate
+    end: State
+    segments: Array
+    """A row for each prediction, as the kernel of the form stores it, and one more for the end state."""
+
+
+def run(
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    initial: State,
+    error_states: Sequence[ErrorStates] = (),
+    *,
+    every: int = 1,
+    full_covariance: bool = False,
+    gate: Gate | None = None,
+    robust: Robust | None = None,
+    monitor: Monitor | None = None,
+) -> Estimate:
+    """Run the multiplicative EKF over a whole record.
+
+    Gyro intervals are split exactly at the times of measurements. Intervals in which the body turns by more than a third of a radian are
+    cut into sub-steps of the same constant-rate model. Missing measurements (NaN) and those outside the record are counted as skipped; gaps
+    of the gyro are reported as events.
+
+    Parameters
+    ----------
+    record : ImuRecord
+        Increments are used as turns at constant rate: correct them for coning first (:func:`strapdown.records.compress`).
+    process_noise : ProcessNoise
+    initial : State
+        State at the first edge. Without values, error states start at zero with their own sigma.
+    error_states : sequence of ErrorStates
+        States beside attitude and gyro bias. Default: none.
+    every : int
+        Keep the state at every ``every``-th edge, the first included.
+    full_covariance : bool
+        Keep whole covariance matrices too.
+    gate : Gate, optional
+        Refuse measurements that are too improbable, and recover where refused ones agree with each other; error states then start anew.
+        Default: use all.
+    robust : Robust, optional
+        Weigh measurements by their distance from the estimate. Default: all alike.
+    monitor : Monitor, optional
+        Report when the running NIS leaves its bounds. Default: do not watch it.
+
+    Returns
+    -------
+    Estimate
+
+    Raises
+    ------
+    InputError
+        If an argument is not what it should be.
+    """
+    return run_part(
+        record,
+        process_noise,
+        initial,
+        error_states,
+        every=every,
+        full_covariance=full_covariance,
+        gate=gate,
+        robust=robust,
+        monitor=monitor,
+    )[0]
+
+
+def run_part(
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    initial: State,
+    error_states: Sequence[ErrorStates] = (),
+    *,
+    every: int = 1,
+    full_covariance: bool = False,
+    gate: Gate | None = None,
+    robust: Robust | None = None,
+    monitor: Monitor | None = None,
+) -> tuple[Estimate, State]:
+    """Run the filter and return the end state too, from which the next part of a record goes on, bit for bit.
+
+    The end state holds what a gate remembers as well: its counts, its candidate, and how wide a restart is. A lock-out that goes on is
+    reported by both parts, by the second as a whole. A monitor starts anew in each part. Where the covariance is carried as its factor for
+    want of digits, parts agree to its rounding.
+
+    Effects that are fixed in a sensor's own unit (``varying``) keep in all parts the unit of the first in which the sensor is, the strength
+    at the root mean square σ there (``unit_sigma`` of the state). A run over the whole record has that of the whole, and so another prior,
+    unless ``initial`` has the same one. With a lever arm parts agree to some 1e-6 of their estimates only: the angular acceleration is
+    found from the gyro about each measurement, and at a cut from one side of it.
+    """
+    check_arguments(record=record, gate=gate, robust=robust, monitor=monitor)
+    problem = prepared(record, process_noise, initial, error_states)
+    options = Options(every=count("every", every), full_covariance=full_covariance, gate=gate, robust=robust)
+    passed = filtered(problem, options)
+    return watched(passed.estimate, monitor, gate), passed.end
+
+
+def prepared(
+    record: ImuRecord, process_noise: ProcessNoise, initial: State, error_states: Sequence[ErrorStates]
+) -> Problem:
+    """Return a record with its measurements in order of time, and the error states as arrays."""
+    check_arguments(process_noise=process_noise)
+    declared = modelling.as_blocks(error_states)
+    state = modelling.begin(initial, declared)
+    events = schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True)
+    model = modelling.assemble(declared, dict(zip(events.sensors, events.kinds, strict=True)))
+    return Problem(
+        record=record,
+        events=events,
+        process_noise=process_noise,
+        initial=state,
+        error_states=declared,
+        model=model,
+    )
+
+
+def filtered(problem: Problem, options: Options) -> Passed:
+    """Run the filter over a prepared record, in the form that it needs."""
+    if problem.model.states or options.factor or options.whole_bias:
+        return _in_factor(problem, options)
+    judged = options.judged or problem.events.noise is not None
+    return _judged_in_blocks(problem, options) if judged else _in_blocks(problem, options)
+
+
+def watched(estimate: Estimate, monitor: Monitor | None, gate: Gate | None) -> Estimate:
+    """Return an estimate with the monitor's events; of refused measurements the gate's threshold counts."""
+    parts = [one for one in estimate.innovations.values() if len(one.time)]
+    if monitor is None or not parts:
+        return estimate
+    time = np.concatenate([one.time for one in parts])
+    degrees = np.concatenate([np.full(len(one.time), one.innovation.shape[1]) for one in parts])
+    nis = np.concatenate([one.nis for one in parts])
+    if gate is not None:
+        nis = np.where(np.concatenate([one.used for one in parts]), nis, gate.thresholds[degrees - 1])
+    order = np.argsort(time, kind="stable")
+    events = [*estimate.events, *monitor.watch(time[order], nis[order], degrees[order])]
+    return replace(estimate, events=_in_order(events))
+
+
+def gaps(time: Array, factor: float = GAP_FACTOR) -> list[Event]:
+    """Return the gyro intervals that are more than ``factor`` times as long as the median interval, as events."""
+    steps = np.diff(time)
+    if np.max(steps, initial=0.0) <= factor * np.min(steps, initial=np.inf):
+        return []  # the median need not be sought
+    usual = float(np.median(steps))
+    return [
+        Event(kind="gap", start=float(time[k]), end=float(time[k + 1]), value=float(steps[k] / usual))
+        for k in np.flatnonzero(steps > factor * usual)
+    ]
+
+
+def _in_order(events: Sequence[Event]) -> tuple[Event, ...]:
+    return tuple(sorted(events, key=lambda event: event.start))
+
+
+def _increments(problem: Problem) -> Array:
+    return np.ascontiguousarray(problem.record.increments)
+
+
+def _innovations(events: Schedule, *, judged: bool) -> tuple[int, int]:
+    """Return the shape of the innovations' array: as many numbers a measurement as are written."""
+    most = 6 if judged else max([4, *(2 * KINDS[kind] for kind in events.kinds)])
+    return int(events.bounds[-1]), most
+
+
+# ------------------------------------------------------------------------------------------------------------- the covariance in blocks
+
+
+def _block_outputs(problem: Problem, options: Options, *, judged: bool) -> covariance_form.Outputs:
+    """Return room for what a run writes."""
+    rows = len(problem.record.increments) // options.every + 1
+    shapes = (rows, 4), (rows, 3), (rows, 6), (rows if options.full_covariance else 0, 21)
+    written = side_by_side(
+        *((shape, float) for shape in (*shapes, _innovations(problem.events, judged=judged))),
+    )
+    (segments,) = side_by_side(((options.segments + 1 if options.segments else 0, 32), float))
+    return covariance_form.Outputs(*written, segments)
+
+
+def _block_body(problem: Problem, options: Options, states: Array) -> covariance_form.Body:
+    """Return the filter as the kernels take it."""
+    sharpness, share = NO_DIGITS if options.segments else (SHARPNESS, MIN_SHARE)
+    angle_variance, rate_variance = problem.variances
+    return covariance_form.Body(
+        states=states,
+        angle_variance=angle_variance,
+        rate_variance=rate_variance,
+        sharpness=sharpness,
+        least_share=share,
+        check=(CHECK_INTERVALS + options.every - 1) // options.every,
+        good=np.zeros(2, np.int64),
+        work=np.empty((7, 6)),
+    )
+
+
+def _packed_states(initial: State) -> Array:
+    """Return the filter's state and its candidate's packed (2, 28)."""
+    states = np.zeros((2, 28))
+    states[0] = pack(initial.attitude, initial.bias, initial.covariance)
+    if initial.gate is not None and initial.gate.candidate is not None:
+        one = initial.gate.candidate
+        states[1] = pack(one.attitude, one.others, one.covariance)
+    return states
+
+
+def _in_blocks(problem: Problem, options: Options) -> Passed:
+    """Run the filter without options; spans in which the covariance would lose its digits are carried as its factor."""
+    record, events, every = problem.record, problem.events, options.every
+    out = _block_outputs(problem, options, judged=False)
+    written = out._replace(segments=out.segments[: options.segments])
+    body = _block_body(problem, options, _packed_states(problem.initial))
+    increments, measurements = _increments(problem), events.measurements
+    row, event = 0, 0
+    while True:
+        number = compiled(walk, covariance_form)(
+            record.time[row * every :],
+            increments[row * every :],
+            _after(measurements, event),
+            every,
+            body,
+            _rows_from(written, row),
+        )
+        if number >= 0:
+            break
+        row, event = row + int(body.good[0]), event + int(body.good[1])
+        if options.segments:
+            raise LostDigitsError(f"after {record.time[row * every]:g} s the covariance keeps no digits")
+        row, event = _span_in_factor(problem, options, body.states[0], out, row, event)
+        if row * every + every > len(increments):
+            number = 0
+            break
+    state = body.states[0]
+    end = State(attitude=state[:4], bias=state[4:7], covariance=covariance_matrices(state[7:]))
+    return _block_result(problem, options, out, end, int(number))
+
+
+def _after(measurements: Measurements, first: int, last: int | None = None) -> Measurements:
+    """Return the measurements from one in order of time to another."""
+    own = slice(first, last)
+    return measurements._replace(
+        time=measurements.time[own], place=measurements.place[own], sensor=measurements.sensor[own]
+    )
+
+
+def _rows_from(out: covariance_form.Outputs, row: int) -> covariance_form.Outputs:
+    """Return the outputs of edges from a row on."""
+    kept = {name: getattr(out, name)[row:] for name in ("attitude", "bias", "variance", "covariance")}
+    return out._replace(**kept)
+
+
+def _block_result(
+    problem: Problem,
+    options: Options,
+    out: covariance_form.Outputs,
+    end: State,
+    number: int,
+    weight: Array | None = None,
+    events: Sequence[Event] = (),
+) -> Passed:
+    """Return what a run has written, and its end state."""
+    if options.segments:
+        out.segments[number, :4] = 0.0
+        out.segments[number, 4:] = pack(end.attitude, end.bias, end.covariance)
+    innovations = innovations_by_sensor(problem.events, out.innovation, weight)
+    estimate = Estimate(
+        time=problem.record.time[:: options.every],
+        attitude=out.attitude,
+        bias=out.bias,
+        variance=out.variance,
+        covariance=covariance_matrices(out.covariance) if options.full_covariance else None,
+        innovations=innovations,
+        skipped=skipped_too(problem.events, innovations),
+        events=_in_order([*gaps(problem.record.time), *events]),
+    )
+    return Passed(estimate=estimate, end=end, segments=out.segments[: number + 1])
+
+
+def _judged_in_blocks(problem: Problem, options: Options) -> Passed:
+    """Run the filter with a gate, robust weights or noise of any shape; all of it as its factor where digits would be lost."""
+    body = _block_body(problem, options, _packed_states(problem.initial))
+    judge = _Judge(problem, options)
+    out = _block_outputs(problem, options, judged=True)
+    written = judge.outputs(out._replace(segments=out.segments[: options.segments]))
+    restart = covariance_form.Restart(bias_variance=restart_bias_variance(options.gate, problem.initial))
+    number, recovered, locked = compiled(walk, gate, covariance_form)(
+        problem.record.time,
+        _increments(problem),
+        problem.events.measurements,
+        options.every,
+        judge.body(body, restart),
+        written,
+    )
+    if number < 0:
+        if options.segments:
+            raise LostDigitsError("the covariance keeps no digits")
+        return _in_factor(problem, options)
+    states = body.states
+    candidate = None
+    if judge.memory[robust_gate.CHALLENGED]:
+        candidate = Candidate(
+            attitude=states[1, :4], others=states[1, 4:7], covariance=covariance_matrices(states[1, 7:])
+        )
+    end = State(
+        attitude=states[0, :4],
+        bias=states[0, 4:7],
+        covariance=covariance_matrices(states[0, 7:]),
+        gate=judge.remembered(candidate),
+    )
+    return _block_result(
+        problem, options, out, end, int(number), written.weight, judge.events(written, recovered, locked)
+    )
+
+
+# ------------------------------------------------------------------------------------------------------------------------------- a gate
+
+
+class _Judge:
+    """A gate and robust weights beside a run: what they remember, and what they report."""
+
+    def __init__(self, problem: Problem, options: Options) -> None:
+        self.problem = problem
+        self.gate = options.gate
+        self.options = gate_options(options.gate, options.robust)
+        sensors = problem.events.sensors
+        self.memory, self.standing = remembered(options.gate, problem.initial.gate, sensors)
+
+    def body(self, form: covariance_form.Body | root_form.Body, restart: object) -> gate.Body:
+        """Return the body of the walk around a form."""
+        return gate.Body(form=form, options=self.options, restart=restart, standing=self.standing, memory=self.memory)
+
+    def outputs(self, form: covariance_form.Outputs | root_form.Outputs) -> gate.Outputs:
+        """Return room for what is written beside the form's outputs.
+
+        A recovery or a lock-out needs two refusals, but for the first recovery, whose others may be of the part before, and a lock-out
+        that goes on.
+        """
+        number = len(self.problem.events.time)
+        return gate.Outputs(
+            form=form,
+            weight=np.empty(number),
+            recoveries=np.empty((number // 2 + 1, 4)),
+            lock_outs=np.empty((number // 2 + len(self.problem.events.sensors), 4)),
+        )
+
+    def events(self, out: gate.Outputs, recovered: int, locked: int) -> list[Event]:
+        """Return recoveries and lock-outs as events."""
+        return gate_events(out.recoveries[:recovered], out.lock_outs[:locked], self.problem.events.sensors)
+
+    def remembered(self, candidate: Candidate | None) -> GateMemory | None:
+        """Return what the gate remembers at the end; None without a gate."""
+        if self.gate is None:
+            return None
+        first = self.start()
+        return replace(
+            first,
+            candidate=candidate,
+            counts=self.memory,
+            standing=dict(zip(self.problem.events.sensors, self.standing, strict=True)),
+        )
+
+    def start(self) -> GateMemory:
+        """Return what a gate knows of a candidate's start, as of the start of the first part of the record."""
+        initial = self.problem.initial
+        if initial.gate is not None:
+            return initial.gate
+        values, P = restart_states(initial, self.problem.error_states)
+        return GateMemory(
+            restart_bias_variance=first_bias_variance(initial),
+            counts=np.empty(0),
+            standing={},
+            start=float(self.problem.record.time[0]),
+            values=values,
+            covariance=P,
+        )
+
+
+def gate_options(gate_: Gate | None, robust: Robust | None) -> gate.Options:
+    """Return a gate and a robust update as the kernels take them."""
+    return gate.Options(
+        thresholds=np.full(3, np.inf) if gate_ is None else gate_.thresholds,
+        robust=0 if robust is None else {"huber": robust_step.HUBER, "student": robust_step.STUDENT}[robust.kind],
+        parameters=np.ones((3, 2)) if robust is None else robust.parameters,
+        iterations=0 if robust is None else robust.iterations,
+        recovery=0 if gate_ is None else gate_.recovery or 0,
+        lock_out=LOCK_OUT if gate_ is None else gate_.lock_out_limit,
+        attitude_sigma=0.0 if gate_ is None else gate_.restart_attitude_sigma,
+    )
+
+
+def remembered(gate_: Gate | None, memory: GateMemory | None, sensors: tuple[str, ...]) -> tuple[Array, Array]:
+    """Return what a kernel goes on with: its ``memory``, and ``standing`` of these sensors."""
+    counts, standing = np.zeros(robust_gate.MEMORY), np.zeros((len(sensors), robust_gate.STANDING))
+    counts[robust_gate.PASSES] = 1.0
+    if gate_ is not None and memory is not None:
+        counts[:] = memory.counts
+        for row, sensor in zip(standing, sensors, strict=True):
+            row[:] = memory.standing.get(sensor, 0.0)
+    if gate_ is None or not gate_.recovery:
+        counts[robust_gate.CHALLENGED] = 0.0
+    standing[:, robust_gate.TOLD] = -1.0
+    return counts, standing
+
+
+def gate_events(recoveries: Array, lock_outs: Array, sensors: tuple[str, ...]) -> list[Event]:
+    """Return recoveries (n, 4) and lock-outs (m, 4) of a kernel as events."""
+    rows = [("recovery", row[[2, 0, 1, 3]]) for row in recoveries]
+    rows += [("lock-out", row) for row in lock_outs if row[3] > 0.0]
+    return [
+        Event(kind=kind, start=float(start), end=float(end), sensor=sensors[int(sensor)], value=float(value))
+        for kind, (start, end, sensor, value) in rows
+    ]
+
+
+def restart_states(state: State, error_states: tuple[ErrorStates, ...]) -> tuple[Array, Array]:
+    """Return values (m,) and covariance (m, m) that the error states of a candidate have at the start of the record.
+
+    They are those of the filter's own start, but each state at least as uncertain as its declaration says: a start that goes on from an
+    earlier part of a record may be what led the filter astray.
+    """
+    P = state.covariance[6:, 6:].copy()
+    minimum = np.concatenate([np.empty(0), *(np.asarray(one.sigma) ** 2 for one in error_states)])
+    P[np.diag_indices(len(P))] = np.maximum(np.diag(P), minimum)
+    return state.values, P
+
+
+# ----------------------------------------------------------------------------------------------------------------- the triangular factor
+
+
+def model_arrays(model: Model, variances: tuple[float, float]) -> root_form.Model:
+    """Return noise and error states as the kernels take them."""
+    return root_form.Model(
+        angle_variance=variances[0],
+        rate_variance=variances[1],
+        decay=model.decay,
+        density=model.density,
+        changing=model.changing,
+        limit=model.limit,
+        gyro=model.gyro,
+        gyro_use=model.gyro_use,
+        sensors=model.sensors,
+        sensor_use=model.sensor_use,
+        force_f=tuple(model.force_f.tolist()),
+        chains=model.chains,
+    )
+
+
+def scratch(model: Model) -> root_form.Scratch:
+    """Return work space for the kernels."""
+    m, size = model.states, 6 + model.states
+    rows = np.empty((3, 3, size))
+    return root_form.Scratch(
+        links=np.empty((len(model.chains), LINKS)),
+        coupling=np.empty((m, 3)),
+        factor=np.empty(m),
+        work=np.empty(size + model.noise_rows),
+        six=np.empty((6, 6)),
+        H=rows[0],
+        y=np.empty(3),
+        spread=np.empty(3),
+        basis=np.empty((3, 3)),
+        prior_H=rows[1],
+        seen=rows[2],
+        prior=np.empty(size),
+        step=np.empty(size),
+        now_x=np.empty(size - 3),
+        fresh=np.empty((3 * m + 6, 3 + m)),
+    )
+
+
+def _factor_body(problem: Problem, options: Options, units: Mapping[str, float]) -> root_form.Body:
+    """Return the filter as the kernels take it."""
+    model, initial = problem.model, problem.initial
+    size = 6 + model.states
+    attitude, x, F = np.zeros((2, 4)), np.zeros((2, size - 3)), np.zeros((2, size + model.noise_rows, size))
+    attitude[0], x[0] = initial.attitude, np.concatenate([initial.bias, initial.values[model.order]])
+    F[0, :size] = modelling.triangle(initial, model)
+    if initial.gate is not None and initial.gate.candidate is not None:
+        one = initial.gate.candidate
+        attitude[1], x[1] = one.attitude, np.concatenate([one.others[:3], one.others[3:][model.order]])
+        F[1, :size] = modelling.triangle(one, model)
+    return root_form.Body(
+        model=model_arrays(model, problem.variances),
+        attitude=attitude,
+        x=x,
+        F=F,
+        length=lengths(problem.record, problem.events, model, units),
+        turning=_turns(problem.record, problem.events, model),
+        scratch=scratch(model),
+        sharpness=np.inf,
+        least_share=0.0,
+        check=CHECK_INTERVALS,
+    )
+
+
+def _in_factor(problem: Problem, options: Options) -> Passed:
+    """Run the filter with the triangular factor of its covariance."""
+    record, events, model, every = problem.record, problem.events, problem.model, options.every
+    size, rows = 6 + model.states, len(record.increments) // every + 1
+    units = unit_sigmas(record, model, problem.initial.unit_sigma)
+    body = _factor_body(problem, options, units)
+    whole_rows = rows if options.whole_bias else 0
+    stored = np.empty((options.segments + 1 if options.segments else 0, 5 + size + size * (size + 1) // 2))
+    out = root_form.Outputs(
+        attitude=np.empty((rows, 4)),
+        x=np.empty((rows, size - 3)),
+        variance=np.empty((rows, size)),
+        covariance=np.empty((rows if options.full_covariance and not options.whole_bias else 0, size, size)),
+        whole_variance=np.empty((whole_rows, 6)),
+        whole_covariance=np.empty((whole_rows if options.full_covariance else 0, 6, 6)),
+        innovation=np.empty(_innovations(events, judged=options.judged)),
+        segments=stored[: options.segments],
+    )
+    judge = _Judge(problem, options)
+    weight, happened = None, []
+    arguments = record.time, _increments(problem), events.measurements, every
+    if options.judged:
+        first = judge.start()
+        restart = root_form.Restart(
+            bias_sigma=np.sqrt(restart_bias_variance(options.gate, problem.initial)),
+            values=first.values[model.order],
+            root=modelling.lower_root(first.covariance[np.ix_(model.order, model.order)]),
+            time=first.start,
+        )
+        written = judge.outputs(out)
+        number, recovered, locked = compiled(walk, gate, root_form)(*arguments, judge.body(body, restart), written)
+        weight, happened = written.weight, judge.events(written, recovered, locked)
+    else:
+        number = compiled(walk, root_form)(*arguments, body, out)
+    if options.segments:
+        stored[number, :4] = 0.0
+        stored[number, 4:8] = body.attitude[0]
+        stored[number, 8 : 5 + size] = body.x[0]
+        stored[number, 5 + size :] = body.F[0, :size][np.tril_indices(size)]
+    innovations = innovations_by_sensor(events, out.innovation, weight)
+    estimate = replace(
+        factor_estimate(
+            problem, every, out.attitude, out.x, out.variance, out.covariance if len(out.covariance) else None
+        ),
+        innovations=innovations,
+        skipped=skipped_too(events, innovations),
+        events=_in_order([*gaps(record.time), *happened]),
+    )
+    if options.whole_bias:
+        estimate = _with_whole_bias(estimate, model, out, full=options.full_covariance)
+    candidate = _candidate_in_factor(body, model) if judge.memory[robust_gate.CHALLENGED] else None
+    end = _end_in_factor(body, model, judge.remembered(candidate), units)
+    return Passed(estimate=estimate, end=end, segments=stored[: number + 1])
+
+
+def _with_whole_bias(estimate: Estimate, model: Model, out: root_form.Outputs, *, full: bool) -> Estimate:
+    """Return an estimate that reports the whole bias."""
+    offsets = model.gyro[:, :3] * (model.gyro_use & OFFSET > 0)[:, None]
+    return replace(
+        estimate,
+        whole_bias=out.x[:, :3] + out.x[:, 3:] @ offsets,
+        whole_bias_variance=out.whole_variance,
+        whole_bias_covariance=out.whole_covariance if full else None,
+    )
+
+
+def _outside(body: root_form.Body, model: Model, i: int) -> tuple[Array, Array, Array, Array]:
+    """Return attitude, bias, values and factor of state i in the order of the declarations."""
+    size = 6 + model.states
+    root = body.F[i, :size][:, np.argsort(model.whole_order)]
+    return body.attitude[i], body.x[i, :3], body.x[i, 3:][np.argsort(model.order)], root
+
+
+def _candidate_in_factor(body: root_form.Body, model: Model) -> Candidate:
+    attitude, bias, values, root = _outside(body, model, 1)
+    return Candidate(attitude=attitude, others=np.concatenate([bias, values]), covariance=root.T @ root, factor=root)
+
+
+def _end_in_factor(body: root_form.Body, model: Model, memory: GateMemory | None, units: Mapping[str, float]) -> State:
+    attitude, bias, values, root = _outside(body, model, 0)
+    if not model.states:
+        return State(attitude=attitude, bias=bias, covariance=_reported(root.T @ root), gate=memory)
+    return State(
+        attitude=attitude,
+        bias=bias,
+        values=values,
+        covariance=root.T @ root,
+        factor=root,
+        gate=memory,
+        unit_sigma=units,
+    )
+
+
+def factor_estimate(
+    problem: Problem, every: int, attitude: Array, x: Array, variance: Array, P: Array | None
+) -> Estimate:
+    """Return the estimate of states in the kernels' order, (b, c) and P, in the order of the declarations."""
+    model = problem.model
+    if P is not None and not model.states:
+        P = _reported(P)
+    back = np.argsort(model.whole_order)
+    values, spread = x[:, 3:][:, back[6:] - 6], variance[:, back]
+    whole = None if P is None else P[:, back[:, None], back]
+    found, first = {}, 0
+    for one in problem.error_states:
+        part = slice(first, first + one.size)
+        found[one.name] = ErrorStateEstimate(
+            components=tuple(one.components),
+            units=tuple(one.units),
+            values=values[:, part],
+            variance=spread[:, 6:][:, part],
+        )
+        first += one.size
+    return Estimate(
+        time=problem.record.time[::every],
+        attitude=attitude,
+        bias=x[:, :3].copy(),
+        variance=spread[:, :6],
+        covariance=None if whole is None else whole[:, :6, :6],
+        error_states=found,
+        whole_covariance=whole if model.states else None,
+    )
+
+
+def _reported(P: Array) -> Array:
+    """Return covariances (..., n, n) that rounding cannot have made indefinite."""
+    return np.where(np.eye(P.shape[-1], dtype=bool), P, SHRINK * P)
+
+
+def _span_in_factor(
+    problem: Problem, options: Options, state: Array, out: covariance_form.Outputs, row: int, event: int
+) -> tuple[int, int]:
+    """Go on from a row of the outputs and a measurement with the factor until the covariance has digits enough, or to the end.
+
+    ``state`` (28,) is that at the row, and is left at that of the row returned, or at the end state after the last one. Returns the row
+    and the number of measurements processed up to there.
+    """
+    record, events, every = problem.record, problem.events, options.every
+    increments, measurements = _increments(problem), events.measurements
+    last = len(increments) // every
+    start = State(attitude=state[:4], bias=state[4:7], covariance=np.eye(6))
+    body = _factor_body(replace(problem, initial=start), options, {})
+    body.F[0, :6] = _singular_triangle(covariance_matrices(state[7:]))
+    span = max(1, FIRST_SPAN // every)
+    while True:
+        to_row = min(row + span, last)
+        begin, end = row * every, len(increments) if to_row == last else to_row * every
+        beyond = int(np.searchsorted(events.time, record.time[end], side="right"))
+        rows = slice(row, to_row + 1)
+        whole = np.empty((to_row - row + 1 if options.full_covariance else 0, 6, 6))
+        written = root_form.Outputs(
+            attitude=out.attitude[rows],
+            x=out.bias[rows],
+            variance=out.variance[rows],
+            covariance=whole,
+            whole_variance=np.empty((0, 6)),
+            whole_covariance=np.empty((0, 6, 6)),
+            innovation=out.innovation,
+            segments=np.empty((0, 32)),
+        )
+        compiled(walk, root_form)(
+            record.time[begin : end + 1],
+            increments[begin:end],
+            _after(measurements, event, beyond),
+            every,
+            body,
+            written,
+        )
+        if len(whole):
+            out.covariance[rows] = covariance_blocks(_reported(whole))
+        row, event = to_row, beyond
+        span *= 2
+        F = body.F[0, :6]
+        if end == len(increments) or np.all(np.diag(F) ** 2 >= HEALTHY_SHARE * np.sum(F**2, axis=0)):
+            break
+    state[:4], state[4:7] = body.attitude[0], body.x[0]
+    state[7:] = covariance_blocks(_reported(F.T @ F))
+    return row, event
+
+
+def _singular_triangle(P: Array) -> Array:
+    """Return F, lower triangular, with ``P = Fᵀ F``, of a covariance that may be singular."""
+    sigma = np.sqrt(np.diag(P))
+    scale = np.where(sigma > 0.0, sigma, 1.0)
+    values, vectors = np.linalg.eigh(P / np.outer(scale, scale))
+    root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T * sigma
+    return np.asarray(np.linalg.qr(root[:, ::-1], mode="r"))[::-1, ::-1].copy()
+
+
+def _turns(record: ImuRecord, events: Schedule, model: Model) -> Array:
+    """Return rate, angular acceleration and the variances of the latter's axes at the events (events, 9); none without a lever arm."""
+    if not model.levers.any():
+        return np.empty((0, 9))
+    turns, variance = turning(record, events.time)
+    levered = model.levers[events.sensor]
+    return np.concatenate([turns, np.where(levered[:, None], variance, 0.0)], axis=1)
+
+
+def lengths(record: ImuRecord, events: Schedule, model: Model, units: Mapping[str, float]) -> Array:
+    """Return what each measurement's effects are divided by, in order of time (events,).
+
+    For kind ``"vector"`` that is the length of its reference; for a direction or heading with an effect that is fixed in the sensor's unit
+    the strength of what is measured over that at the σ in ``units``; else 1.
+    """
+    result = np.ones(len(events.time))
+    for i, series in enumerate(record.vectors if model.states else ()):
+        if series.kind != "vector" and series.sensor not in model.varying:
+            continue
+        mine = events.sensor == i
+        which = np.searchsorted(series.time, events.time[mine])
+        if series.kind == "vector":
+            result[mine] = np.linalg.norm(series.references_f[which], axis=1)
+        else:
+            result[mine] = (units[series.sensor] / level_sigma(series))[which]
+    return result
+
+
+def unit_sigmas(record: ImuRecord, model: Model, kept: Mapping[str, float]) -> dict[str, float]:
+    """Return ``unit_sigma`` of a :class:`State` after a record: that kept, and of sensors without it this record's."""
+    found = {
+        series.sensor: float(np.sqrt(np.mean(level_sigma(series) ** 2)))
+        for series in record.vectors
+        if series.sensor in model.varying and len(series.time)
+    }
+    return {**found, **kept}
+
+
+def strength(series: VectorMeasurements) -> Array:
+    """Return the strength of what a direction or heading measures (m,), over that at its root mean square σ."""
+    sigma = level_sigma(series)
+    return np.asarray(np.sqrt(np.mean(sigma**2)) / sigma)
+
+
+def level_sigma(series: VectorMeasurements) -> Array:
+    """Return a sensor's own noise over the strength of what it measures (m,): σ, which of a heading is over the level part of it."""
+    level = np.ones(len(series.time))
+    if series.kind == "heading":
+        level = np.linalg.norm(series.references_f[:, :2], axis=1)
+    sigma = series.sigma * level
+    if np.any(sigma <= 0.0):
+        raise InputError(
+            f"{series.sensor}: sigma is 0, which does not say how strong what it measures is; give it, or varying=False"
+        )
+    return np.asarray(sigma)
+
+
+def most_segments(problem: Problem) -> int:
+    """Return a bound of the number of predictions: one an interval and a measurement, and the sub-steps of both limits."""
+    record = problem.record
+    most = len(record.increments) + int(problem.events.bounds[-1])
+    if np.isinf(problem.model.limit) and (
+        3.0 * max(np.max(record.increments), -np.min(record.increments)) ** 2 <= LARGEST_ANGLE**2
+    ):
+        return most
+    dt = np.diff(record.time)
+    steps = np.maximum(np.linalg.norm(record.increments, axis=1) / LARGEST_ANGLE, dt / problem.model.limit)
+    return most + int(np.sum(np.floor(steps[steps > 1.0]) + 1.0))

@@ -1,0 +1,675 @@
+"""Unknown attitude, one vector at a time: a bank of hypotheses that becomes one filter.
+
+A measured direction leaves one thing open: the turn about it. The attitudes that map the first direction on its reference are a circle;
+hypotheses spread evenly over it, each a filter with the covariance that fills its part of the circle, cover every attitude whatever the
+start. The innovations of the measurements that follow weigh them (multiple-model estimation: Magill 1965, IEEE Trans. Automatic Control
+10); the improbable are dropped, and when those left lie on top of each other their mixture is matched by one Gaussian, which the plain
+filter (:mod:`strapdown.estimation`) takes over.
+
+Where nothing tells the hypotheses apart they stay apart, and :attr:`BankEstimate.reason` says why. A single filter from a wild start
+would have settled on some attitude and been sure of it.
+
+A gated filter that was lost starts as wildly: :func:`run_recovering` is that of :mod:`strapdown.estimation` with a bank at each such recovery.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from strapdown import estimation, quaternion, records, vectors
+from strapdown.checks import Array, InputError, array, count, finite, instance, positive
+from strapdown.estimation.forward import gaps
+from strapdown.estimation.gating import UNIFORM_SIGMA, Gate, Monitor, Robust
+from strapdown.estimation.schedule import Schedule, schedule
+from strapdown.estimation.states import (
+    ProcessNoise,
+    State,
+    check_arguments,
+    covariance_matrices,
+    initial_state,
+    pack,
+    restart_bias_variance,
+)
+from strapdown.kernels import bank_loop, measurement, robust_gate, robust_step
+from strapdown.kernels.machine import compiled
+from strapdown.records import Estimate, Event, ImuRecord, Innovations
+from strapdown.units import DEGREE, DEGREE_PER_HOUR
+from strapdown.vectors import VectorMeasurements
+
+HYPOTHESES = 96
+"""Hypotheses on the circle where nobody says: 3.75° apart. Fewer find the attitude as soon, but are some too sure of it:
+``sims/unknown_start.py``."""
+LEAST_WEIGHT = 1e-6
+"""A hypothesis of less than this part of the heaviest one's weight is dropped."""
+LARGEST_SHARE = 0.15
+"""Hypotheses are one Gaussian when less than this part of its covariance lies between them."""
+DOUBTED = 3
+"""Where outliers are reckoned with, so many of the first directions may all lie off."""
+DOUBT = 1e-3
+"""Weight of what refuses a direction to what takes it in, while nothing but the next one tells which of them lies off: that of lying at the
+threshold of a gate which refuses a right one with this probability."""
+KNOWN = 3.0 * DEGREE
+"""An attitude whose σ about each axis is less is known well enough for one filter, rad."""
+UNKNOWN = 0.9 * UNIFORM_SIGMA
+"""A turn whose σ is more is not known at all, rad."""
+CONSTANT = 1.0 * DEGREE
+"""References that turn by less than this over a record count as constant, rad."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BankEstimate:
+    """What the bank made of a record."""
+
+    estimate: Estimate
+    """The Gaussian of the mixture's mean and covariance (whole) at the kept edges from the first direction on; once the hypotheses are
+    one, the plain filter's. Innovations are those of the heaviest hypothesis until then."""
+    edges: np.ndarray
+    """Which edges of the record the rows of ``estimate`` belong to (m,): its truth there is ``record.truth.attitude[edges]``."""
+    angles: Array
+    """Where the hypotheses started on their circle (h,), rad: the turn about the first reference from the first of them; with a gate or a
+    robust update then those that each of the next directions left open."""
+    weights: Array
+    """Weights of the hypotheses (k, h) at the first k rows, until they became one."""
+    became_one: float
+    """Time at which the hypotheses became one, s; infinite if they did not."""
+    reason: str
+    """Why they did not, and what would help; empty if they did."""
+
+    @property
+    def converged(self) -> bool:
+        """Whether one Gaussian stands for all that is known of the attitude."""
+        return bool(np.isfinite(self.became_one))
+
+    @property
+    def left(self) -> int:
+        """Hypotheses left at the end of the bank's part."""
+        return int(np.sum(self.weights[-1] > 0.0))
+
+
+def run(
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    *,
+    hypotheses: int = HYPOTHESES,
+    bias_sigma: ArrayLike = 20.0 * DEGREE_PER_HOUR,
+    bias: ArrayLike = (0.0, 0.0, 0.0),
+    every: int = 1,
+    least_weight: float = LEAST_WEIGHT,
+    largest_share: float = LARGEST_SHARE,
+    gate: Gate | None = None,
+    robust: Robust | None = None,
+    monitor: Monitor | None = None,
+) -> BankEstimate:
+    """Estimate attitude and gyro bias from an unknown start.
+
+    Measurements before the first direction (or vector, or attitude) are left out and counted as skipped. Until the hypotheses are one, a
+    noise that differs by body axis (``sigma_axes``, ``covariance``) is taken for its largest σ about every axis; then it is what it is.
+
+    Parameters
+    ----------
+    record : ImuRecord
+        Increments corrected for coning (:func:`strapdown.records.compress`), measurements of any kind, at least one of them a direction.
+    process_noise : ProcessNoise
+    hypotheses : int
+        Attitudes on the circle, 8 or more. More of them cost time in proportion and are each closer to linear.
+    bias_sigma : float or (3,)
+        Standard deviation of the initial bias error, rad/s.
+    bias : (3,)
+        Initial bias, rad/s.
+    every : int
+        Keep every ``every``-th edge; the hypotheses can become one at kept edges.
+    least_weight : float
+        Hypotheses of less than this part of the heaviest one's weight are dropped.
+    largest_share : float
+        The hypotheses are one when less than this part of the covariance lies between them.
+    gate : Gate, optional
+        Each hypothesis refuses what no right filter would see; what it refuses counts against it as if it lay at the threshold. When
+        most of them have refused ``recovery`` measurements in a row, the bank starts anew from the first of these, its bias three times as
+        uncertain, and an event says so.
+        Once the hypotheses are one, it is the gate of :func:`strapdown.estimation.run`.
+    robust : Robust, optional
+        Each hypothesis weighs measurements by how far they lie off, and hypotheses are weighed by likelihoods with heavier tails. Alone it
+        cannot recover where the first measurements mislead it: give a gate too.
+    monitor : Monitor, optional
+        Report when the running NIS leaves its bounds, once the hypotheses are one.
+
+    With a gate or a robust update nothing vouches for the first direction: further hypotheses leave it out and start from the second,
+    others from the third and the fourth.
+
+    Raises
+    ------
+    InputError
+        If the record has no direction at all, or an argument makes no sense.
+    """
+    check_arguments(record=record, process_noise=process_noise, gate=gate, robust=robust, monitor=monitor)
+    initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1.0, bias_sigma=bias_sigma, bias=bias)  # refuses bad ones
+    count("hypotheses", hypotheses, least=8)
+    count("every", every)
+    for name, value in (("least_weight", least_weight), ("largest_share", largest_share)):
+        if not 0.0 < finite(name, value) < 1.0:
+            raise InputError(f"{name} is {value:g}; it must lie between 0 and 1")
+    found, _ = _until_one(
+        record,
+        process_noise,
+        hypotheses=hypotheses,
+        bias=bias,
+        bias_sigma=bias_sigma,
+        every=every,
+        least_weight=least_weight,
+        largest_share=largest_share,
+        gate=gate,
+        robust=robust,
+    )
+    if found.became_one >= record.time[-1]:
+        return found
+    rest, one = _from_where_one(record, found)
+    if gate is not None and gate.restart_bias_sigma is None:
+        # A restart is from as little as this one was, not from what the bank has learnt.
+        gate = replace(gate, restart_bias_sigma=float(np.max(bias_sigma)))
+    after = estimation.run(
+        rest, process_noise, one, every=every, full_covariance=True, gate=gate, robust=robust, monitor=monitor
+    )
+    whole = _joined([(-np.inf, found.estimate), (found.became_one, after)], gaps(record.time))
+    return replace(found, estimate=replace(whole, skipped=found.estimate.skipped))
+
+
+def run_recovering(
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    initial: State,
+    *,
+    gate: Gate,
+    hypotheses: int = HYPOTHESES,
+    every: int = 1,
+    full_covariance: bool = False,
+    robust: Robust | None = None,
+    monitor: Monitor | None = None,
+) -> Estimate:
+    """Run the gated filter, and a bank wherever a recovery leaves the turn about one direction open, until it is known.
+
+    :func:`strapdown.estimation.run` recovers as one Gaussian. Where a single direction is seen that turns slowly, the turn about it becomes known
+    little by little, not linearly, and some runs come out of that far too sure of themselves. Here hypotheses start where the challenger
+    did, take in what it has taken in, and take over in its place; when they are one, the gated filter goes on from them. It may be lost
+    again and recover again.
+
+    A recovery is handed over if the largest σ of the attitude that its measurements leave is between ``KNOWN`` and ``UNKNOWN`` at any edge,
+    or not below ``KNOWN`` at its end. Two directions, or a measured attitude, leave nothing open; nor does a gate whose
+    ``restart_attitude_sigma`` is less than ``UNKNOWN``. With nothing to hand over the estimate is that of :func:`strapdown.estimation.run`, to
+    the bit.
+
+    Beside each such recovery stands an event of kind ``"hypotheses"``, from when the bank took over to when it became one, or to the end of
+    the record; ``value`` is the number of hypotheses left then, 0 if they became one. In between, rows are mean and covariance of the
+    mixture and innovations those of the heaviest hypothesis, which the monitor does not watch. A bank has no step-by-step face.
+
+    Parameters
+    ----------
+    record : ImuRecord
+    process_noise : ProcessNoise
+    initial : State
+        State at the first edge.
+    gate : Gate
+        Hypotheses start with the bias that the challenger started with, as uncertain as it was, and three times as uncertain as the bank
+        before if what that one became was lost again before it had taken in ``5 recovery`` measurements.
+    hypotheses : int
+        As for :func:`run`.
+    every : int
+        Keep the state at every ``every``-th edge, the first included; the bank takes over and becomes one at kept edges.
+    full_covariance : bool
+        Keep whole covariance matrices too.
+    robust, monitor : optional
+        As for :func:`strapdown.estimation.run`.
+    """
+    check_arguments(record=record, process_noise=process_noise, initial=initial, robust=robust, monitor=monitor)
+    count("hypotheses", hypotheses, least=8)
+    instance("gate", gate, Gate, "give robustness.Gate(probability=0.999)")
+
+    def filtered(part: ImuRecord, state: State, gate: Gate) -> Estimate:
+        return estimation.run(
+            part,
+            process_noise,
+            state,
+            every=every,
+            full_covariance=full_covariance,
+            gate=gate,
+            robust=robust,
+            monitor=monitor,
+        )
+
+    parts: list[tuple[float, Estimate]] = []
+    handed: list[Event] = []
+    since, rest, state, own = -np.inf, record, initial, gate
+    least = np.zeros(3)
+    while True:
+        estimate = filtered(rest, state, own)
+        lost = _left_open(
+            rest, process_noise, state, estimate, least, gate=own, robust=robust, hypotheses=hypotheses, every=every
+        )
+        if lost is None:
+            parts.append((since, estimate))
+            break
+        before = records.cut(rest, 0, int(np.searchsorted(rest.time, lost.switch)))
+        parts += [(since, filtered(before, state, own)), *lost.parts(estimate)]
+        since = max(min(lost.bank.became_one, float(record.time[-1])), parts[-1][0])
+        left = 0.0 if lost.bank.converged else float(lost.bank.left)
+        handed.append(Event(kind="hypotheses", start=lost.switch, end=since, sensor=lost.recovery.sensor, value=left))
+        if lost.bank.became_one >= record.time[-1]:
+            break
+        rest, state = _from_where_one(lost.record, lost.bank)
+        restart = np.sqrt(restart_bias_variance(gate, initial))
+        own = replace(gate, restart_bias_sigma=float(np.max(restart)))
+        least = np.minimum(robust_gate.WIDENING * lost.bias_sigma, robust_gate.WIDENING**robust_gate.WIDEST * restart)
+    if not handed:
+        return estimate
+    whole = _joined(parts, gaps(record.time) + handed)
+    skipped = {
+        series.sensor: len(series.time) - len(whole.innovations[series.sensor].time) for series in record.vectors
+    }
+    return replace(whole, skipped=skipped)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _LeftOpen:
+    """A recovery that left a turn open."""
+
+    recovery: Event
+    record: ImuRecord
+    """From the measurements that led to it on."""
+    bank: BankEstimate
+    """What hypotheses make of that, until they are one."""
+    attempts: list[tuple[float, Estimate]]
+    """When they began, s, and what they made of it until they had to recover, or were one."""
+    bias_sigma: Array
+    """σ of the bias that they began with in the end (3,), rad/s."""
+
+    @property
+    def switch(self) -> float:
+        """The time from which on the bank is believed."""
+        return max(self.recovery.end, self.attempts[0][0])
+
+    def parts(self, gated: Estimate) -> list[tuple[float, Estimate]]:
+        """Return each attempt with the time from which on it is believed; in between, if need be, the ``gated`` filter."""
+        ends = [self.switch, *(max(event.end, self.switch) for event in _recoveries(self.bank.estimate))]
+        result = []
+        for end, (began, estimate) in zip(ends, self.attempts, strict=True):
+            if began > end:
+                result.append((end, replace(gated, events=())))
+            result.append((max(began, end), estimate))
+        return result
+
+
+def _left_open(
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    initial: State,
+    estimate: Estimate,
+    least_bias_sigma: Array,
+    *,
+    gate: Gate,
+    robust: Robust | None,
+    hypotheses: int,
+    every: int,
+) -> _LeftOpen | None:
+    """Return the first recovery of a gated filter that leaves a turn open; None if there is none, or none with kept edges to come.
+
+    Hypotheses begin with a bias of ``least_bias_sigma`` or more if the filter has not taken in enough before it was lost.
+    """
+    if gate.restart_attitude_sigma < UNKNOWN:
+        return None
+    for event in _recoveries(estimate):
+        end = int(np.searchsorted(record.time, event.end))
+        _, state = estimation.run_part(
+            records.cut(record, 0, end), process_noise, initial, every=end, gate=gate, robust=robust
+        )
+        assert state.gate is not None
+        # What the challenger that took over began with, unless another one has begun before that edge.
+        memory = state.gate.counts
+        began = float(memory[robust_gate.SINCE])
+        if began > event.end:
+            began = event.start
+        bias, variance = np.split(memory[robust_gate.FIRST_BIAS : robust_gate.FIRST_BIAS + 6], 2)
+        sigma = np.sqrt(variance)
+        first = max(int(np.searchsorted(record.time, began)) - 1, 0)
+        taken = sum(np.sum(one.used & (one.time < event.start)) for one in estimate.innovations.values())
+        if taken < robust_gate.FORGOTTEN * (gate.recovery or 0):
+            sigma = np.maximum(sigma, least_bias_sigma)
+        seen = _measured_from(began, record, first, end)
+        if _can_start(seen, 1):
+            alone, _ = _until_one(seen, process_noise, hypotheses=hypotheses, bias=bias, bias_sigma=sigma)
+            if _settled(alone.estimate):
+                continue
+        rest = _measured_from(began, record, first // every * every, len(record.time) - 1)
+        if not _can_start(rest, every):
+            continue
+        bank, attempts = _until_one(
+            rest,
+            process_noise,
+            hypotheses=hypotheses,
+            bias=bias,
+            bias_sigma=sigma,
+            every=every,
+            gate=gate,
+            robust=robust,
+            all_weights=False,
+        )
+        found = _LeftOpen(
+            recovery=event,
+            record=rest,
+            bank=bank,
+            attempts=attempts,
+            bias_sigma=sigma * _widened(len(attempts) - 1),
+        )
+        if found.switch <= estimate.time[-1]:
+            return found
+    return None
+
+
+def _widened(starts: int) -> float:
+    """Return how many times as wide as the first a start is before which so many have failed."""
+    return robust_gate.WIDENING ** (starts % (robust_gate.WIDEST + 1))
+
+
+def _settled(estimate: Estimate) -> bool:
+    """Return whether the attitude was known, or the turn about a direction not at all, at each edge, and is known at the last."""
+    assert estimate.covariance is not None
+    widest = np.sqrt(np.linalg.eigvalsh(estimate.covariance[:, :3, :3])[:, -1])
+    return bool(widest[-1] < KNOWN and np.all((widest < KNOWN) | (widest > UNKNOWN)))
+
+
+def _recoveries(estimate: Estimate) -> list[Event]:
+    return [event for event in estimate.events if event.kind == "recovery"]
+
+
+def _measured_from(time: float, record: ImuRecord, first: int, last: int) -> ImuRecord:
+    """Return the record from edge ``first`` to edge ``last`` with what was measured from a time on."""
+    part = records.cut(record, first, last)
+    return replace(part, vectors=tuple(series.taken(series.time >= time) for series in part.vectors))
+
+
+def _can_start(record: ImuRecord, every: int) -> bool:
+    """Return whether a direction comes before the last kept edge."""
+    events = schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True)
+    more = _directions(events, 0)
+    return len(more) > 0 and bool(events.time[more[0]] <= record.time[::every][-1])
+
+
+def _from_where_one(record: ImuRecord, found: BankEstimate) -> tuple[ImuRecord, State]:
+    """Return the record from where the hypotheses became one, and the state there."""
+    edge = int(np.searchsorted(record.time, found.became_one))
+    rest = records.cut(record, edge, len(record.time) - 1)
+    # The bank has taken in what was measured at that edge, which a cut leaves with a record's first part.
+    rest = replace(rest, vectors=tuple(series.taken(series.time > found.became_one) for series in rest.vectors))
+    last = found.estimate
+    assert last.covariance is not None
+    return rest, State(attitude=last.attitude[-1], bias=last.bias[-1], covariance=last.covariance[-1])
+
+
+def _until_one(
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    *,
+    hypotheses: int,
+    bias: ArrayLike,
+    bias_sigma: ArrayLike,
+    every: int = 1,
+    least_weight: float = LEAST_WEIGHT,
+    largest_share: float = LARGEST_SHARE,
+    gate: Gate | None = None,
+    robust: Robust | None = None,
+    all_weights: bool = True,
+) -> tuple[BankEstimate, list[tuple[float, Estimate]]]:
+    """Return the bank's own part of :func:`run`: until its hypotheses are one, or to the end; of the weights only the last if told so.
+
+    Beside it all attempts, the last one too, and when they began: those before it until they recovered.
+    """
+    coarse = tuple(_isotropic(series) for series in record.vectors)
+    events = schedule(coarse, record.time[0], record.time[-1])
+    doubted = gate is not None or robust is not None
+    recovery = None if gate is None else gate.recovery
+    told = gaps(record.time)
+    failed: list[tuple[float, Estimate]] = []
+    first = _first_direction(events)
+    spread = np.broadcast_to(bias_sigma, 3).astype(np.float64)
+    while True:
+        wide = _widened(len(failed)) * spread
+        states, angles = start(record, events, first, hypotheses, bias=bias, bias_sigma=wide)
+        later = _directions(events, first + 1)[: DOUBTED if doubted else 0]
+        sets = [len(states)]
+        for one in later:
+            more, turns = start(record, events, int(one), hypotheses, bias=bias, bias_sigma=wide)
+            states, angles = np.concatenate([states, more]), np.concatenate([angles, turns])
+            sets.append(len(states))
+        log_weight = np.where(np.arange(len(states)) < sets[0], 0.0, -np.inf)
+        began = float(events.time[first])
+        kept = np.arange(0, len(record.time), every)
+        kept = kept[record.time[kept] >= began]
+        if len(kept) == 0:
+            raise InputError(
+                f"the first direction comes at {began:.6g} s, after the last kept edge; keep more edges or give a longer record"
+            )
+        number = len(states)
+        attitude, estimated_bias = np.empty((len(kept), 4)), np.empty((len(kept), 3))
+        blocks, weight = np.empty((len(kept), 21)), np.empty(number)
+        weights = np.empty((len(kept) if all_weights else 0, number))
+        innovation, share = np.empty((len(events.time), 6)), np.empty(len(events.time))
+        rows, at, used = compiled(bank_loop.run_bank)(
+            record.time,
+            np.ascontiguousarray(record.increments),
+            process_noise.angle_random_walk**2,
+            process_noise.rate_random_walk**2,
+            events.time,
+            events.kind,
+            events.vector_b,
+            events.variance,
+            events.reference,
+            events.triads,
+            states,
+            log_weight,
+            began,
+            first + 1,
+            later,
+            np.array(sets),
+            -2.0 * np.log(DOUBT),
+            every,
+            least_weight,
+            largest_share,
+            weight,
+            np.empty(12),
+            np.empty(28),
+            attitude,
+            estimated_bias,
+            blocks,
+            weights,
+            innovation,
+            np.full(3, np.inf) if gate is None else gate.thresholds,
+            0 if robust is None else {"huber": robust_step.HUBER, "student": robust_step.STUDENT}[robust.kind],
+            np.ones((3, 2)) if robust is None else robust.parameters,
+            0 if robust is None else robust.iterations,
+            recovery or 0,
+            share,
+        )
+        taken = used if at != bank_loop.LOST or recovery is None else used + recovery
+        P = covariance_matrices(blocks[:rows])
+        estimate = Estimate(
+            time=record.time[kept[:rows]],
+            attitude=attitude[:rows],
+            bias=estimated_bias[:rows],
+            variance=np.ascontiguousarray(np.diagonal(P, axis1=1, axis2=2)),
+            covariance=P,
+            innovations=_innovations(events, np.arange(first + 1, taken), innovation, share if doubted else None),
+        )
+        if at != bank_loop.LOST:
+            break
+        assert recovery is not None
+        # What came before is not to be believed: the circle is that of the first refused direction.
+        again = _directions(events, used)
+        if len(again) == 0 or events.time[again[0]] > record.time[::every][-1]:
+            recovery = None  # too late for another start
+            continue
+        failed.append((began, estimate))
+        told.append(
+            Event(
+                kind="recovery",
+                start=float(events.time[used]),
+                end=float(events.time[taken - 1]),
+                sensor=events.sensors[events.sensor[used]],
+                value=float(recovery),
+            )
+        )
+        first = int(again[0])
+    skipped = {
+        sensor: events.skipped[sensor] + int(np.sum(events.sensor[:first] == i))
+        for i, sensor in enumerate(events.sensors)
+    }
+    estimate = replace(estimate, skipped=skipped, events=_in_order(told))
+    attempts = [*failed, (began, estimate)]
+    found = BankEstimate(
+        estimate=estimate,
+        edges=kept,
+        angles=angles,
+        weights=weights[:rows] if all_weights else weight[None],
+        became_one=float(record.time[at]) if at >= 0 else np.inf,
+        reason="" if at >= 0 else _reason(record, events, weight, P[-1], attitude[rows - 1]),
+    )
+    return found, attempts
+
+
+def start(
+    record: ImuRecord,
+    events: Schedule,
+    first: int,
+    hypotheses: int,
+    *,
+    bias: ArrayLike = (0.0, 0.0, 0.0),
+    bias_sigma: ArrayLike,
+) -> tuple[Array, Array]:
+    """Return the hypotheses (h, 28), packed, that event ``first``, a direction, leaves open, and their angles on the circle (h,), rad.
+
+    Across the direction each has the measurement's covariance. About it each has a standard deviation of
+    half the spacing: of Gaussians spread so, the sum is uniform over the circle to 1.5 %. A measured attitude leaves a single hypothesis.
+    """
+    spread = np.broadcast_to(bias_sigma, 3).astype(np.float64)
+    for k, value in enumerate(spread):
+        positive(f"bias_sigma[{k}]", value, unit="rad/s")
+    P = np.zeros((6, 6))
+    P[3:, 3:] = np.diag(spread**2)
+    given = array("bias", bias, (3,))
+    frame = events.triads[events.reference[first]]
+    if events.kind[first] == measurement.ATTITUDE:
+        P[:3, :3] = np.diag(events.vector_b[first])
+        return pack(frame[:4], given, P)[None, :].copy(), np.zeros(1)
+    z = events.vector_b[first] / np.linalg.norm(events.vector_b[first])
+    # Any attitude that maps z on the reference: the one that takes a triad about it to a triad about the reference.
+    q = quaternion.from_matrix(frame.reshape(3, 3).T @ vectors.triad(z))
+    angles = 2.0 * np.pi * np.arange(hypotheses) / hypotheses
+    P[:3, :3] = events.variance[first] * (np.eye(3) - np.outer(z, z)) + (np.pi / hypotheses) ** 2 * np.outer(z, z)
+    circle = quaternion.multiply(q, quaternion.exp(angles[:, None] * z))
+    return np.array([pack(attitude, given, P) for attitude in circle]), angles
+
+
+def _first_direction(events: Schedule) -> int:
+    """Return the first event that is more than a heading."""
+    more = _directions(events, 0)
+    if len(more) == 0:
+        raise InputError(
+            "the record has no direction, vector or attitude to start from inside its time; a bank needs one, a heading alone is not enough"
+        )
+    return int(more[0])
+
+
+def _directions(events: Schedule, first: int) -> np.ndarray:
+    """Return the events from number ``first`` on that are more than headings."""
+    return np.asarray(first + np.flatnonzero(events.kind[first:] != measurement.HEADING))
+
+
+def _isotropic(series: VectorMeasurements) -> VectorMeasurements:
+    """Return the series with one σ a sample, the largest about any axis, if it has more than one."""
+    if not series.anisotropic:
+        return series
+    largest = np.sqrt(np.linalg.eigvalsh(series.covariances)[..., -1])
+    if series.attitude is not None:
+        axes = np.repeat(largest[:, None], 3, axis=1)
+        return replace(series, sigma=largest, sigma_axes=axes, covariance=None)
+    return replace(series, sigma=largest, sigma_axes=None, covariance=None)
+
+
+def _innovations(events: Schedule, taken: np.ndarray, rows: Array, weight: Array | None) -> dict[str, Innovations]:
+    """Return the innovations e₁, s₁, e₂, s₂, … of the events taken, by sensor, as many as each has degrees of freedom."""
+    result = {}
+    for i, (sensor, kind) in enumerate(zip(events.sensors, events.kinds, strict=True)):
+        mine = taken[events.sensor[taken] == i]
+        filled = rows[mine, : 2 * vectors.KINDS[kind]]
+        result[sensor] = Innovations(
+            time=events.time[mine],
+            innovation=filled[:, 0::2],
+            variance=filled[:, 1::2],
+            weight=None if weight is None else weight[mine],
+        )
+    return result
+
+
+def _joined(parts: list[tuple[float, Estimate]], told: list[Event]) -> Estimate:
+    """Return estimates of one record as one, each from its time until the next one's; gaps are those ``told``, beside other events."""
+    bounds = [*np.maximum.accumulate([since for since, _ in parts]).tolist(), np.inf]
+    rows = [
+        (one.time >= since) & (one.time < until)
+        for (_, one), since, until in zip(parts, bounds[:-1], bounds[1:], strict=True)
+    ]
+
+    def of_rows(name: str) -> Array:
+        return np.concatenate([getattr(one, name)[taken] for (_, one), taken in zip(parts, rows, strict=True)])
+
+    innovations = {}
+    for sensor in parts[0][1].innovations:
+        series = [one.innovations[sensor] for _, one in parts]
+        # A measurement at a bound belongs to the estimate before it, a row to the one after it.
+        mine = [
+            (one.time > since) & (one.time <= until)
+            for one, since, until in zip(series, bounds[:-1], bounds[1:], strict=True)
+        ]
+        weights = [one.weight[taken] for one, taken in zip(series, mine, strict=True) if one.weight is not None]
+        innovations[sensor] = Innovations(
+            time=np.concatenate([one.time[taken] for one, taken in zip(series, mine, strict=True)]),
+            innovation=np.concatenate([one.innovation[taken] for one, taken in zip(series, mine, strict=True)]),
+            variance=np.concatenate([one.variance[taken] for one, taken in zip(series, mine, strict=True)]),
+            weight=np.concatenate(weights) if len(weights) == len(parts) else None,
+        )
+    events = [event for _, one in parts for event in one.events if event.kind != "gap"]
+    return Estimate(
+        time=of_rows("time"),
+        attitude=of_rows("attitude"),
+        bias=of_rows("bias"),
+        variance=of_rows("variance"),
+        covariance=of_rows("covariance") if all(one.covariance is not None for _, one in parts) else None,
+        innovations=innovations,
+        events=_in_order([*events, *told]),
+    )
+
+
+def _in_order(events: list[Event]) -> tuple[Event, ...]:
+    return tuple(sorted(events, key=lambda event: event.start))
+
+
+def _reason(record: ImuRecord, events: Schedule, weight: Array, P: Array, attitude: Array) -> str:
+    """Return why the hypotheses did not become one, in words."""
+    values, axes = np.linalg.eigh(P[:3, :3])
+    axis = quaternion.rotate(attitude, axes[:, -1])
+    told = (
+        f"{int(np.sum(weight > 0.0))} hypotheses are still possible after {record.time[-1] - record.time[0]:.6g} s; "
+        f"the turn about the fixed axis ({axis[0]:+.2f}, {axis[1]:+.2f}, {axis[2]:+.2f}) is known to 1σ "
+        f"{np.sqrt(values[-1]) / DEGREE:.3g}°"
+    )
+    references: Array = np.asarray(events.triads)[events.reference[events.kind != measurement.ATTITUDE]][:, 6:]
+    apart = float(np.max(np.linalg.norm(np.cross(references, references[0]), axis=1)))
+    turned = float(np.arcsin(min(apart, 1.0)))
+    if turned < CONSTANT:
+        return (
+            f"{told}: all references lie along one line of the fixed frame, and the turn about it cannot be observed, however the body "
+            "moves; add a sensor of another direction, or record until the reference has turned"
+        )
+    return (
+        f"{told}: the references lie up to {turned / DEGREE:.3g}° apart, which has not told the hypotheses apart yet; record longer, or "
+        "add a sensor of another direction"
+    )

@@ -1,0 +1,327 @@
+"""Smoothers: attitude, gyro bias and error states at each edge from the measurements before *and after* it.
+
+A Rauch–Tung–Striebel smoother on the manifold (Rauch, Tung & Striebel 1965; Särkkä 2013, section 8.2), over the states that the filter
+passed through. The filter moves its attitude at each correction and carries its covariance along, so every covariance has a tangent space
+of its own; the backward pass carries them from one to the next by the Jacobians of the rotation vector
+(:mod:`strapdown.kernels.smoother_step`, with the triangular factor :mod:`strapdown.kernels.augmented_smoother`). To first order in the
+errors this is the least-squares estimate over the whole record.
+
+Where a gate has recovered, the states before and after are two trajectories (:mod:`strapdown.estimation.recovery_segments`), each smoothed
+by itself:
+
+- up to the first refusal of those that led to it by what was measured before it;
+- from the start of the candidate that took over by what was measured from there on. That is as a rule the first refusal too: then the span
+  in which the filter was lost is estimated right;
+- what may lie between the two, if candidates failed, is the filter's own, and as wrong as the event says.
+
+Nothing is learnt across: not even the bias, which the candidate starts from as uncertain as :class:`strapdown.estimation.Gate` says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from strapdown import kinematics, quaternion
+from strapdown.checks import Array, count, non_negative
+from strapdown.estimation import forward, recovery_segments
+from strapdown.estimation import model as modelling
+from strapdown.estimation.error_states import ErrorStates
+from strapdown.estimation.forward import LostDigitsError, Options, Problem
+from strapdown.estimation.gating import Gate, Robust
+from strapdown.estimation.memory import side_by_side
+from strapdown.estimation.recovery_segments import Break, Rerun, Trajectory
+from strapdown.estimation.states import GateMemory, ProcessNoise, State, check_arguments, covariance_matrices
+from strapdown.kernels import augmented_smoother, smoother_lag, smoother_loop
+from strapdown.kernels.lane_values import WIDTH
+from strapdown.kernels.machine import compiled
+from strapdown.records import Estimate, Event, ImuRecord
+
+PASSES = 16
+"""Backward passes of a fixed-lag smoother that go together and share what depends on the filter alone."""
+MOST_GROUPS = 3600
+"""Groups of segments of which the fixed-lag smoother keeps the gains, 5.7 kB each; where a lag takes more, it computes them anew."""
+
+
+def smooth(
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    initial: State,
+    error_states: Sequence[ErrorStates] = (),
+    *,
+    lag: float = np.inf,
+    full_covariance: bool = False,
+    gate: Gate | None = None,
+    robust: Robust | None = None,
+) -> Estimate:
+    """Return the smoother's estimate at every edge of a record.
+
+    With a ``lag`` it is the fixed-lag smoother: at each edge t, what the measurements up to the last edge at or before t + lag tell, equal
+    to the fixed-interval smoother on the record cut there. Its work grows with the number of gyro intervals in the lag.
+
+    Parameters
+    ----------
+    record : ImuRecord
+    process_noise : ProcessNoise
+    initial : State
+        State at the first edge before any measurement, as for :func:`strapdown.estimation.run`.
+    error_states : sequence of ErrorStates
+        As for :func:`strapdown.estimation.run`.
+    lag : float
+        s; 0 is the filter. Default: the whole record.
+    full_covariance : bool
+        Keep whole covariance matrices too.
+    gate, robust : optional
+        As for :func:`strapdown.estimation.run`: what the filter refused or weighed down, the smoother does not use either.
+
+    Returns
+    -------
+    Estimate
+        Attitude, bias, error states and variance are smoothed; those at the last edge are the filter's. Innovations and events are the
+        filter's. Where a gate has recovered and error states hold a lever arm, the second trajectory begins only with the recovery, and
+        from the first refusal to there the rows are the filter's own.
+
+    Notes
+    -----
+    Memory for the filter's states: 256 bytes a gyro interval and a measurement, with error states 8 (n (n + 1)/2 + n + 5), n states in
+    all. A record without error states whose covariance would lose its digits is smoothed on its triangular factor, which takes a dozen
+    times as long.
+    """
+    check_arguments(record=record, gate=gate, robust=robust)
+    lag = lag if lag == np.inf else non_negative("lag", lag, unit="s")
+    problem = forward.prepared(record, process_noise, initial, error_states)
+    options = Options(every=len(record.time), full_covariance=full_covariance, gate=gate, robust=robust)
+    if not problem.model.states:
+        try:
+            return _Smoother(problem, options, _BlockForm(problem)).smoothed(lag)
+        except LostDigitsError:
+            options = replace(options, factor=True)
+    return _Smoother(problem, options, _FactorForm(problem)).smoothed(lag)
+
+
+def relinearized_start(
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    initial: State,
+    error_states: Sequence[ErrorStates] = (),
+    *,
+    passes: int = 2,
+) -> State:
+    """Return the start moved to the smoother's estimate of it, as uncertain as it was.
+
+    From a start that is off by tenths of a radian the first measurements are linearised at the wrong place, and the covariance stays too
+    small for good. Started anew from here the filter is linearised where it belongs. The record is used once for the place and once for
+    the estimate, which counts the prior too little by ``1/s²`` of its information, s the singular value of
+    :func:`strapdown.estimation.observability`: for records that show a state much better than the prior.
+    """
+    check_arguments(record=record)
+    problem = forward.prepared(record, process_noise, initial, error_states)
+    state, model = problem.initial, problem.model
+    for _ in range(count("passes", passes)):
+        whole = smooth(record, process_noise, state, problem.error_states)
+        # The prior's tangent space goes along: exp(a + ε) = exp(a) ⊗ exp(J_r(a) ε).
+        back = np.argsort(model.whole_order)
+        carry = modelling.turning_matrix(model.chains, len(back), state.attitude, whole.attitude[0])[np.ix_(back, back)]
+        a = quaternion.log(quaternion.multiply(quaternion.conjugate(state.attitude), whole.attitude[0]))
+        carry[:3, :3] = kinematics.right_jacobian(a)
+        state = State(
+            attitude=whole.attitude[0],
+            bias=whole.bias[0],
+            values=np.concatenate([np.empty(0), *(one.values[0] for one in whole.error_states.values())]),
+            covariance=carry @ state.covariance @ carry.T,
+            unit_sigma=state.unit_sigma,
+        )
+    return state
+
+
+@dataclass(frozen=True)
+class _Smoother:
+    """A record, and the form in which it is smoothed."""
+
+    problem: Problem
+    options: Options
+    form: _BlockForm | _FactorForm
+
+    def smoothed(self, lag: float) -> Estimate:
+        """Return the estimate with a lag, s."""
+        record = self.problem.record
+        estimate, segments = recovery_segments.filtered_whole(self.problem, self.options)
+        event_time = self.problem.events.time
+        recovered = recovery_segments.recoveries(estimate.events)
+        breaks, reruns = self._reruns(recovered, event_time, segments) if recovered else ([], [])
+        edges = len(record.time)
+        outputs = self.form.outputs(edges, self.options.full_covariance)
+        until = recovery_segments.last_seen(record.time, lag)
+        if not breaks and len(segments) == edges:  # each interval in one segment
+            first = np.arange(edges)
+        else:
+            first = recovery_segments.starts(recovery_segments.stops(record.time, breaks), event_time, segments)
+        for one in recovery_segments.trajectories(record.time, until, breaks, first, segments, reruns):
+            written = outputs
+            if breaks:
+                written = [np.empty((len(first) if len(out) else 0, *out.shape[1:])) for out in outputs]
+            for part in recovery_segments.climbing(one.last):
+                self.form.go_back(one, part, written)
+            if breaks:
+                for out, there in zip(outputs, written, strict=True):
+                    if len(out):
+                        out[one.row] = there[one.edge]
+        return replace(
+            self.form.estimate(outputs, self.options.full_covariance),
+            innovations=estimate.innovations,
+            skipped=estimate.skipped,
+            events=estimate.events,
+        )
+
+    def _reruns(
+        self, recovered: Sequence[Event], event_time: Array, segments: Array
+    ) -> tuple[list[Break], list[Rerun]]:
+        """Return the breaks of a record, and the candidate that took over at each, from its start to the recovery.
+
+        With a lever arm, which parts of a record do not show alike, a trajectory begins with the recovery.
+        """
+        record, gate = self.problem.record, self.options.gate
+        assert gate is not None
+        # Parts of the record keep the units of the whole.
+        units = forward.unit_sigmas(record, self.problem.model, self.problem.initial.unit_sigma)
+        state = replace(self.problem.initial, unit_sigma=units)
+        breaks: list[Break] = []
+        reruns: list[Rerun] = []
+        begin = float(record.time[0])
+        for event in recovered:
+            memory: GateMemory | None = None
+            if not self.problem.model.levers.any():
+                state = self._part(recovery_segments.part(record, begin, event.end), state, self.options).end
+                memory = state.gate
+                begin = event.end
+            one = recovery_segments.break_of(event, memory, float(record.time[0]))
+            breaks.append(one)
+            if memory is None or one.since == one.end:
+                reruns.append(None)
+                continue
+            bias, variance, counts = recovery_segments.restarted(gate, memory)
+            values, P = _aged(self.problem.error_states, memory, one.since)
+            stop = recovery_segments.stops(record.time, [one])
+            lost = recovery_segments.starts(stop, event_time, segments)[np.searchsorted(stop, one.since)]
+            whole = np.diag(np.concatenate([variance, np.zeros(len(values))]))
+            whole[6:, 6:] = P
+            fresh = State(
+                attitude=segments[lost, 4:8],
+                bias=bias,
+                values=values,
+                covariance=whole,
+                gate=replace(memory, counts=counts),
+                unit_sigma=state.unit_sigma,
+            )
+            span = recovery_segments.part(record, one.since, one.end)
+            problem = forward.prepared(span, self.problem.process_noise, fresh, self.problem.error_states)
+            again = replace(self.options, every=len(span.time), gate=replace(gate, recovery=None))
+            _, rows = recovery_segments.filtered_whole(problem, again)
+            reruns.append((rows, recovery_segments.starts(span.time, problem.events.time, rows)))
+        return breaks, reruns
+
+    def _part(self, part: ImuRecord, state: State, options: Options) -> forward.Passed:
+        """Return the filter's pass over a part of the record."""
+        problem = forward.prepared(part, self.problem.process_noise, state, self.problem.error_states)
+        return forward.filtered(problem, replace(options, every=len(part.time), full_covariance=False))
+
+
+def _aged(error_states: tuple[ErrorStates, ...], memory: GateMemory, time: float) -> tuple[Array, Array]:
+    """Return values and covariance of the error states' prior at a time."""
+    values, P, first = memory.values.copy(), memory.covariance, 0
+    transition, driven = np.eye(len(values)), np.zeros((len(values), len(values)))
+    for one in error_states:
+        own = slice(first, first + one.size)
+        transition[own, own] = one.transition(time - memory.start)
+        driven[own, own] = one.process_noise(time - memory.start)
+        first += one.size
+    return transition @ values, transition @ P @ transition.T + driven
+
+
+@dataclass(frozen=True)
+class _BlockForm:
+    """Backward passes over states with the covariance in blocks."""
+
+    problem: Problem
+
+    def outputs(self, edges: int, full_covariance: bool) -> list[Array]:
+        """Return room for the smoothed states."""
+        shapes = (edges, 4), (edges, 3), (edges, 6), (edges if full_covariance else 0, 21)
+        return side_by_side(*((shape, float) for shape in shapes))
+
+    def estimate(self, outputs: Sequence[Array], full_covariance: bool) -> Estimate:
+        """Return the smoothed states as an estimate."""
+        attitude, bias, variance, blocks = outputs
+        return Estimate(
+            time=self.problem.record.time,
+            attitude=attitude,
+            bias=bias,
+            variance=variance,
+            covariance=covariance_matrices(blocks) if full_covariance else None,
+        )
+
+    def go_back(self, one: Trajectory, part: slice, outputs: Sequence[Array]) -> None:
+        """Write the estimates of a part of a trajectory's edges, each from the last edge that it sees."""
+        segments, starts, edge, last = one.segments, one.starts, one.edge[part], one.last[part]
+        if len(segments) < smoother_loop.FEWEST_ROWS:
+            short = smoother_loop.FEWEST_ROWS - len(segments)
+            segments = np.concatenate([segments, np.tile(segments[-1], (short, 1))])
+        rows = segments.reshape(-1)
+        # All that see the same edge as the last of them does are written by one pass.
+        lagged = int(np.searchsorted(last, last[-1]))
+        if lagged:
+            first, seen = edge[:lagged], last[:lagged]
+            # Eight passes at a time, which share nearly all groups with the next eight.
+            ahead = np.minimum(np.arange(lagged) + WIDTH - 1, lagged - 1)
+            groups = int(np.max(starts[seen[ahead]] - starts[first])) // WIDTH + 2
+            work = np.empty(smoother_lag.lag_work_size(min(groups, MOST_GROUPS)))
+            compiled(smoother_lag.smooth_lagged)(rows, starts, first, seen, *self.problem.variances, work, *outputs)
+        compiled(smoother_loop.smooth_back)(
+            rows,
+            starts[: last[-1] + 1],
+            edge[lagged],
+            *self.problem.variances,
+            np.empty(smoother_loop.WORK_SIZE),
+            *outputs,
+        )
+
+
+@dataclass(frozen=True)
+class _FactorForm:
+    """Backward passes over states with the covariance as its triangular factor."""
+
+    problem: Problem
+
+    def outputs(self, edges: int, full_covariance: bool) -> list[Array]:
+        """Return room for the smoothed states."""
+        size = 6 + self.problem.model.states
+        shapes = (edges, 4), (edges, size - 3), (edges, size), (edges if full_covariance else 0, size, size)
+        return [np.empty(shape) for shape in shapes]
+
+    def estimate(self, outputs: Sequence[Array], full_covariance: bool) -> Estimate:
+        """Return the smoothed states as an estimate."""
+        attitude, x, variance, P = outputs
+        return forward.factor_estimate(self.problem, 1, attitude, x, variance, P if full_covariance else None)
+
+    def go_back(self, one: Trajectory, part: slice, outputs: Sequence[Array]) -> None:
+        """Write the estimates of a part of a trajectory's edges, each from the last edge that it sees."""
+        model = self.problem.model
+        edge, last = one.edge[part], one.last[part]
+        # One pass for all that see the same.
+        ends = np.append(np.flatnonzero(np.diff(last)), len(last) - 1)
+        begins = np.append(0, ends[:-1] + 1)
+        together = min(PASSES, len(ends))
+        compiled(augmented_smoother.smooth_augmented)(
+            augmented_smoother.Passes(
+                segments=one.segments,
+                starts=one.starts,
+                first=edge[begins],
+                upto=edge[ends],
+                last=last[ends],
+            ),
+            forward.model_arrays(model, self.problem.variances),
+            augmented_smoother.workspace(model.states, model.noise_rows, len(model.chains), together),
+            augmented_smoother.Outputs(*outputs),
+        )

@@ -1,0 +1,435 @@
+"""A gate and robust weights around a filter: a body of :mod:`strapdown.kernels.walk` over either form of the covariance.
+
+What a gate makes of refusals is in :mod:`strapdown.kernels.robust_gate`. The form (:mod:`strapdown.kernels.covariance_form` or
+:mod:`strapdown.kernels.root_form`) defines the functions left open here. Row 0 of its states is the filter, row 1 the restart candidate
+beside it while there is one, so that both go through one piece of code.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from strapdown.kernels.algebra import add, factored, matrix_times_vector, scale, solved
+from strapdown.kernels.measurement import (
+    DIRECTION,
+    HEADING,
+    degrees_of_freedom,
+    frame_of,
+    has_heading,
+    noise_of,
+    store_innovations,
+    value_of,
+)
+from strapdown.kernels.robust_gate import (
+    CHALLENGED,
+    DROPPED,
+    PASSES,
+    TOO_NARROW,
+    WIDE_PASSES,
+    is_believed,
+    judge_challenger,
+    judge_filter,
+    recover,
+)
+from strapdown.kernels.robust_step import (
+    ACCEPTED,
+    IDENTITY,
+    KNOWN,
+    PASSED_OVER,
+    REFUSED,
+    RELINEARIZED,
+    SETTLED,
+    TURN_ASIDE,
+    UNKNOWN,
+    UNKNOWN_TILT,
+    least_certain_axis,
+    robust_weight,
+    seen_from,
+    tangent_at,
+    tilt_variance,
+)
+from strapdown.kernels.rotation import moved, quaternion_multiply, rotation_matrix
+from strapdown.kernels.walk import SQUARED_RANGE, step_within, turn_squared
+
+CALLED = "judged_update"
+"""Not inlined where other kernels use them: their work is far more than a call, and each copy would be compiled anew."""
+
+BORROWS_ARRAYS = True
+"""See :mod:`strapdown.kernels.machine`."""
+
+
+OPEN = (
+    "load",
+    "save",
+    "become",
+    "attitude_of",
+    "bias_at",
+    "step_limit",
+    "digits_left",
+    "propagate",
+    "store_prediction",
+    "attitude_covariance",
+    "start_update",
+    "linearised",
+    "innovation_covariance",
+    "step_of",
+    "relinearise",
+    "correct",
+    "turn_tangent",
+    "set_attitude",
+    "start_candidate",
+    "widen",
+    "keep_row",
+)
+"""What a form defines; see :mod:`strapdown.kernels.covariance_form`."""
+
+LENIENT = 1e3
+"""A candidate, which starts with next to nothing known, may lose so many times more of its covariance's digits than the filter."""
+
+
+class Options(NamedTuple):
+    """A gate and a robust update as the kernels take them."""
+
+    thresholds: np.ndarray
+    """Largest NIS accepted of 1, 2, 3 degrees of freedom (3,)."""
+    robust: int
+    """0, or a kind of :mod:`strapdown.kernels.robust_step`."""
+    parameters: np.ndarray
+    """Of the robust weight, a row for each number of degrees of freedom (3, 2)."""
+    iterations: int
+    """Of the robust weight."""
+    recovery: int
+    """Refusals in a row that lead to recovery; 0: none."""
+    lock_out: int
+    """A sensor refused more often than accepted by more than this is reported."""
+    attitude_sigma: float
+    """σ of the first candidate's attitude, rad."""
+
+
+class Body(NamedTuple):
+    """A filter in one form, and what judges it."""
+
+    form: NamedTuple
+    options: Options
+    restart: NamedTuple
+    """What a candidate of the form starts from."""
+    standing: np.ndarray
+    """(sensors, ``STANDING``), what the gate remembers of each sensor; left at the end."""
+    memory: np.ndarray
+    """(``MEMORY``,), of the candidate; left at the end. At the start of a record zeros, but for ``PASSES``, 1, and ``TOLD``, −1."""
+
+
+class Outputs(NamedTuple):
+    """What a run writes beside the form's own outputs."""
+
+    form: NamedTuple
+    weight: np.ndarray
+    """(events,) by place, 0 where refused."""
+    recoveries: np.ndarray
+    """(rows, 4): time, sensor, time of the first refusal and refusals in a row of each recovery."""
+    lock_outs: np.ndarray
+    """(rows, 4): times of the first and of the last refusal, sensor and number of refusals, 0 of one that a recovery reports."""
+
+
+def load(form, i):
+    """Return state i."""
+
+
+def save(form, i, state):
+    """Keep state i."""
+
+
+def become(form):
+    """Let the filter be what the candidate is."""
+
+
+def attitude_of(state):
+    """Return q_fb of a state."""
+
+
+def bias_at(form, i):
+    """Return the gyro bias of state i."""
+
+
+def step_limit(form):
+    """Return the longest step, s, that states other than the attitude bear."""
+
+
+def digits_left(form, i):
+    """Return the share of its variance that the least certain pivot of state i keeps."""
+
+
+def propagate(form, i, state, part, dt):
+    """Return a state after an increment over dt."""
+
+
+def store_prediction(form, i, state, k, part, dt, out):
+    """Write what a smoother needs of a prediction."""
+
+
+def attitude_covariance(form, i, state):
+    """Return the covariance of the attitude (6-tuple)."""
+
+
+def start_update(form, i):
+    """Begin the linearisation at the state itself."""
+
+
+def linearised(form, i, e, now_q, q, M, z, frame, noise, kind, sensor, prior):
+    """Return rows, y (3,), what of y the prior predicts (3,), variances (3,), θ/sin θ and cos θ of a direction's angle; seen from now_q."""
+
+
+def innovation_covariance(form, i, state, rows):
+    """Return H P Hᵀ (6-tuple)."""
+
+
+def step_of(form, i, state, rows, u, M, prior, q, now_q):
+    """Return the step (3,) from the linearisation that P Hᵀ u leads to, and the square of what it changes in the rows."""
+
+
+def relinearise(form, i, q, old_q, now_q, prior, fresh):
+    """Go to another point of linearisation; ``fresh``: the states beside the attitude go back to the state itself."""
+
+
+def correct(form, i, state, rows, e, variance):
+    """Update with independent rows of innovations e (3,), prior's tangent space; return the state and the attitude's correction."""
+
+
+def turn_tangent(form, i, state, M):
+    """Carry the covariance to another tangent space by M."""
+
+
+def set_attitude(form, i, state, q, before):
+    """Return the state at an attitude, in place of that ``before`` the measurement."""
+
+
+def start_candidate(form, memory, now, attitude_sigma, restart):
+    """Write row 1: the filter's state, as uncertain as a fresh start."""
+
+
+def widen(form, memory):
+    """Make the candidate what it would be had its bias started wider, if that holds it back."""
+
+
+def keep_row(form, state, row, out):
+    """Write the state at a kept edge."""
+
+
+# ------------------------------------------------------------------------------------------------------------------ the body of the walk
+
+
+def begin(body):
+    """Return how many states run, the numbers of lock-outs, recoveries and segments, and whether digits are lost."""
+    running = 2 if body.memory[CHALLENGED] > 0.0 else 1
+    return running, 0, 0, 0, lost_digits(running, body)
+
+
+def lost_digits(running, body):
+    """Return whether any covariance has lost its digits."""
+    lost = False
+    for i in range(running):
+        least = body.form.least_share if i == 0 else body.form.least_share / LENIENT
+        lost = lost or not digits_left(body.form, i) >= least
+    return lost
+
+
+def largest_turn(running, part, dt, body):
+    """Return the largest squared turn of the states that run."""
+    squared = 0.0
+    for i in range(running):
+        squared = max(squared, turn_squared(part, dt, bias_at(body.form, i)))
+    return squared
+
+
+def is_small(state, part, dt, body):
+    """Return whether every state that runs takes the increment in one step."""
+    return largest_turn(state[0], part, dt, body) <= SQUARED_RANGE and dt <= step_limit(body.form)
+
+
+def longest_step(state, part, dt, body):
+    """Return the longest step, s; all states that run take the same ones."""
+    return min(step_within(largest_turn(state[0], part, dt, body), dt), step_limit(body.form))
+
+
+def predict(state, part, dt, body, out):
+    """Propagate the filter and the candidate."""
+    running, lock_outs, recoveries, segments, lost = state
+    form = body.form
+    for i in range(running):
+        one = load(form, i)
+        if i == 0 and segments < len(out.form.segments):
+            store_prediction(form, 0, one, segments, part, dt, out.form)
+            segments += 1
+        save(form, i, propagate(form, i, one, part, dt))
+    return running, lock_outs, recoveries, segments, lost
+
+
+def update(state, e, now, measured, body, out):
+    """Judge a measurement by the filter, and by the candidate if there is one, and update."""
+    running, lock_outs, recoveries, segments, lost = state
+    form, options, memory, standing = body.form, body.options, body.memory, body.standing
+    place = measured.place[e]
+    sensor = measured.sensor[e]
+    degrees = degrees_of_freedom(measured.kinds[sensor])
+    i = 0
+    while i < running:
+        passes = int(memory[PASSES]) if i == 0 else WIDE_PASSES
+        outcome, weight, innovation, variance, share = judged_update(form, i, e, measured, passes, options)
+        least_noise = 1.0 / form.sharpness if i == 0 else 1.0 / (form.sharpness * LENIENT)
+        lost = lost or not share >= least_noise
+        if i == 0:
+            out.weight[place] = weight
+            store_innovations(out.form.innovation, place, innovation, variance)
+            lock_outs, challenge = judge_filter(
+                outcome, now, sensor, options.recovery, options.lock_out, standing, memory, out.lock_outs, lock_outs
+            )
+            if challenge:
+                start_candidate(form, memory, now, options.attitude_sigma, body.restart)
+                running = 2
+        else:
+            nis = 0.0
+            for r in range(3):
+                nis += innovation[r] * innovation[r] / variance[r]
+            verdict = judge_challenger(outcome, nis, degrees, sensor, standing, memory, bias_at(form, 1))
+            if verdict == DROPPED:
+                running = 1
+            elif verdict == TOO_NARROW:
+                widen(form, memory)
+            if verdict != DROPPED and is_believed(sensor, options.recovery, standing, memory):
+                recover(now, sensor, options.lock_out, standing, memory, out.recoveries[recoveries], out.lock_outs)
+                recoveries += 1
+                become(form)
+                running = 1
+        i += 1
+    return running, lock_outs, recoveries, segments, lost
+
+
+def keep(state, row, e, body, out):
+    """Write a row; every ``check`` rows make sure that the covariances have digits left."""
+    running, lock_outs, recoveries, segments, lost = state
+    keep_row(body.form, load(body.form, 0), row, out.form)
+    if row % body.form.check == 0:
+        lost = lost or lost_digits(running, body)
+    return running, lock_outs, recoveries, segments, lost
+
+
+def stopped(state):
+    """Return whether a covariance has lost its digits."""
+    return state[4]
+
+
+def finish(state, row, e, body):
+    """Return the numbers of segments, of recoveries and of lock-outs; of segments −1 where a covariance has lost its digits."""
+    running, lock_outs, recoveries, segments, lost = state
+    if lost or lost_digits(running, body):
+        segments = -1
+    return segments, recoveries, lock_outs
+
+
+# ---------------------------------------------------------------------------------------------------------- one measurement, tested first
+
+
+def judged_update(form, i, e, measured, passes, options):
+    """Test a measurement against state i and update with it if its NIS is not above the threshold, and a direction not behind.
+
+    With ``passes`` above one the update is linearised anew, up to so many times, at the estimate that it leads to, while its correction
+    exceeds ``RELINEARIZED``; the rows are turned to the prior's tangent space, and the covariance in the end to that of the estimate, as
+    :func:`strapdown.kernels.robust_step.tangent_at` says. Where that ends above the threshold and the attitude is hardly known, it is
+    tried again from a third of a turn to either side about the least certain axis.
+
+    With ``passes`` above one a heading is passed over while the tilt is not known: its row depends on it. That of a vertical vector, which
+    shows none, always is, and its innovation is NaN.
+
+    Returns ``ACCEPTED``, ``REFUSED`` or ``PASSED_OVER``, the weight, independent innovations (3,) and their variances (3,) under the
+    nominal noise, of the last linearisation; where these do not come to rest, of the first. At last the smallest share that the noise has
+    in such a variance where the measurement was accepted: its inverse is what the covariance loses by it.
+    """
+    place = measured.place[e]
+    sensor = measured.sensor[e]
+    kind = measured.kinds[sensor]
+    z = value_of(measured, place, sensor)
+    frame = frame_of(measured, place, sensor)
+    noise = noise_of(measured, place, sensor, kind, z)
+    degrees = degrees_of_freedom(kind)
+    threshold = options.thresholds[degrees - 1]
+    state = load(form, i)
+    q = attitude_of(state)
+    R = rotation_matrix(q)
+    if kind == HEADING and not has_heading(R, z):
+        return PASSED_OVER, 0.0, (math.nan, 0.0, 0.0), (1.0, 1.0, 1.0), 1.0
+    A = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    if passes > 1:
+        A = attitude_covariance(form, i, state)
+    unknown = A[0] + A[3] + A[5] >= UNKNOWN
+    tolerance = SETTLED if unknown else RELINEARIZED
+    now_q = q
+    M = IDENTITY
+    prior = (0.0, 0.0, 0.0)  # where the prior's mean lies, seen from the attitude of the linearisation
+    start_update(form, i)
+    first_e = prior
+    first_F = (0.0, 0.0, 0.0, 1.0, 1.0, 1.0)
+    done = 1
+    trials = 0
+    while True:
+        rows, y, p, variance, far, along = linearised(form, i, e, now_q, q, M, z, frame, noise, kind, sensor, prior)
+        S = innovation_covariance(form, i, state, rows)
+        F = factored((S[0] + variance[0], S[1], S[2], S[3] + variance[1], S[4], S[5] + variance[2]))
+        innovation = (y[0] - p[0], y[1] - p[1], y[2] - p[2])
+        e1 = innovation[0]
+        e2 = innovation[1] - F[0] * e1
+        e3 = innovation[2] - F[1] * e1 - F[2] * e2
+        accepted = e1 * e1 * F[3] + e2 * e2 * F[4] + e3 * e3 * F[5] <= threshold
+        if kind == DIRECTION and along < 0.0 and threshold < math.inf:
+            accepted = False  # beyond a right angle from the predicted one, which the rows across it do not see
+        if passes == 1:
+            break
+        if done == 1 and trials == 0:
+            first_e = (e1, e2, e3)
+            first_F = F
+        u = solved(F, (far * y[0] - p[0], far * y[1] - p[1], innovation[2]))
+        step, squared = step_of(form, i, state, rows, u, M, prior, q, now_q)
+        converged = squared < tolerance * tolerance
+        fresh = False
+        if converged or done >= passes:
+            accepted = accepted and converged
+            if accepted or trials == 2 or not unknown:
+                if not converged:
+                    e1, e2, e3 = first_e
+                    F = first_F
+                break
+            trials += 1
+            done = 0
+            now_q = q
+            fresh = True
+            step = scale(math.copysign(TURN_ASIDE, trials - 1.5), least_certain_axis(A))
+        old_q = now_q
+        now_q, _ = moved(now_q, step)
+        M, prior = tangent_at(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), now_q), A)
+        relinearise(form, i, q, old_q, now_q, prior, fresh)
+        done += 1
+    weight = 0.0
+    share = 1.0
+    outcome = REFUSED
+    if kind == HEADING and passes > 1 and tilt_variance(R, A) > UNKNOWN_TILT:
+        outcome = PASSED_OVER
+    elif accepted:
+        outcome = ACCEPTED
+        weight = 1.0
+        share = min(F[3] * variance[0], F[4] * variance[1], F[5] * variance[2])
+        if options.robust > 0:
+            parameter, numerator = options.parameters[degrees - 1, 0], options.parameters[degrees - 1, 1]
+            weight = robust_weight(options.robust, parameter, numerator, options.iterations, S, innovation, variance)
+        state, taken = correct(form, i, state, rows, innovation, scale(1.0 / weight, variance))
+        if passes > 1:
+            taken = add(prior, matrix_times_vector(M, taken))
+            state = turn_tangent(form, i, state, M)
+            A = attitude_covariance(form, i, state)
+        new_q, G = moved(now_q, taken)
+        if passes > 1 and A[0] + A[3] + A[5] > KNOWN:
+            _, G = seen_from(taken, A)
+        state = turn_tangent(form, i, state, G)
+        save(form, i, set_attitude(form, i, state, new_q, q))
+    return outcome, weight, (e1, e2, e3), (1.0 / F[3], 1.0 / F[4], 1.0 / F[5]), share

@@ -1,0 +1,258 @@
+"""Measurements: their kinds, their order of time, where their numbers are, and the rows that a filter updates with.
+
+Every kind enters as scalar rows ``y = h · δθ + noise`` of the body-side attitude error (:mod:`strapdown.kernels.filter_step`), on floats or
+lanes.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from strapdown.kernels.algebra import (
+    combine,
+    dot,
+    matrix_times_vector,
+    symmetric_times_vector,
+    transpose_times_vector,
+)
+from strapdown.kernels.lane_values import chosen, element
+from strapdown.kernels.rotation import logarithm, quaternion_multiply
+
+BORROWS_ARRAYS = True
+"""See :mod:`strapdown.kernels.machine`."""
+
+DIRECTION = 0
+"""Kind: a unit direction, two degrees of freedom."""
+VECTOR = 1
+"""Kind: a whole vector over the length of its reference, three degrees of freedom."""
+HEADING = 2
+"""Kind: a body vector of which only the heading of its horizontal part is used, one degree of freedom."""
+ATTITUDE = 3
+"""Kind: a whole attitude, three degrees of freedom. Its frame holds the quaternion in its first four numbers, its value the three
+variances."""
+
+VERTICAL = 1e-24
+"""Squared horizontal part of a vector below which it has no heading: a picoradian from the vertical, if it is of length one."""
+
+
+class Measurements(NamedTuple):
+    """Measurements of all sensors (m in all). *Place*: number of a measurement where one sensor stands after the other."""
+
+    time: np.ndarray
+    """Times in order (m,)."""
+    place: np.ndarray
+    """Place of each, in order of time (m,)."""
+    sensor: np.ndarray
+    """Sensor of each, in order of time (m,)."""
+    value: np.ndarray
+    """Three numbers each, of the first sensor; ``origins`` leads to those of the others."""
+    sigma: np.ndarray
+    """σ each, of the first sensor, likewise."""
+    noise: np.ndarray
+    """Covariances in body axes (m, 6) by place, or (0, 6) where σ is all."""
+    origins: np.ndarray
+    """Where place 0 of each sensor would be in ``value`` and ``sigma`` (sensors, 2): each sensor's numbers stay where they were measured."""
+    bounds: np.ndarray
+    """First place of each sensor, and the end of the last (sensors + 1,)."""
+    kinds: np.ndarray
+    """Kind of each sensor (sensors,)."""
+    frames: np.ndarray
+    """Row of ``triads`` of each sensor's first measurement, and how many rows on that of each next is, 0 or 1 (sensors, 2)."""
+    triads: np.ndarray
+    """Right-handed frames (u, v, r) by rows about references r (rows, 9); of an attitude the measured quaternion."""
+
+
+def vector_at(array, k):
+    """Return row k of an (n, 3) array as a 3-tuple."""
+    return (array[k, 0], array[k, 1], array[k, 2])
+
+
+def six_at(array, k):
+    """Return row k of an (n, 6) array as a 6-tuple."""
+    return (array[k, 0], array[k, 1], array[k, 2], array[k, 3], array[k, 4], array[k, 5])
+
+
+def value_of(measured, place, sensor):
+    """Return the three numbers of a measurement."""
+    here = measured.origins[sensor, 0] + 3 * place
+    value = measured.value
+    return (element(value, here), element(value, here + 1), element(value, here + 2))
+
+
+def sigma_of(measured, place, sensor):
+    """Return σ of a measurement."""
+    return element(measured.sigma, measured.origins[sensor, 1] + place)
+
+
+def frame_row(measured, place, sensor):
+    """Return the row of ``triads`` of a measurement."""
+    return measured.frames[sensor, 0] + measured.frames[sensor, 1] * (place - measured.bounds[sensor])
+
+
+def frame_at(triads, t):
+    """Return row t of the frames as a 9-tuple."""
+    return (
+        triads[t, 0],
+        triads[t, 1],
+        triads[t, 2],
+        triads[t, 3],
+        triads[t, 4],
+        triads[t, 5],
+        triads[t, 6],
+        triads[t, 7],
+        triads[t, 8],
+    )
+
+
+def frame_of(measured, place, sensor):
+    """Return the frame of a measurement as a 9-tuple."""
+    return frame_at(measured.triads, frame_row(measured, place, sensor))
+
+
+def noise_of(measured, place, sensor, kind, z):
+    """Return the covariance of a measurement in body axes (6-tuple); of a heading its first number is the variance."""
+    if len(measured.noise) > 0:
+        return six_at(measured.noise, place)
+    if kind == ATTITUDE:
+        return (z[0], 0.0, 0.0, z[1], 0.0, z[2])
+    sigma = sigma_of(measured, place, sensor)
+    return (sigma * sigma, 0.0, 0.0, sigma * sigma, 0.0, sigma * sigma)
+
+
+def degrees_of_freedom(kind):
+    """Return how many degrees of freedom a measurement of a kind has."""
+    if kind == HEADING:
+        return 1
+    return 2 if kind == DIRECTION else 3
+
+
+def store_innovations(out, place, e, s):
+    """Write innovations (3,) and their variances (3,) to a row of ``out`` (m, 6)."""
+    for i in range(3):
+        out[place, 2 * i] = e[i]
+        out[place, 2 * i + 1] = s[i]
+
+
+def direction_rows(R, u, v, z):
+    """Return the two rows (h, y), (h, y) of a unit direction ``z`` (body) whose reference r has the right-handed triad u × v = r (fixed).
+
+    A direction has two degrees of freedom: its components along the predicted u and v. With ``z = r_b + r_b × δθ``:
+    ``u_b · z = −v_b · δθ``, ``v_b · z = u_b · δθ``.
+    """
+    ub = transpose_times_vector(R, u)
+    vb = transpose_times_vector(R, v)
+    return (-vb[0], -vb[1], -vb[2]), dot(ub, z), ub, dot(vb, z)
+
+
+def heading_row(R, z):
+    """Return h of the heading of the horizontal part of a vector ``z`` (body): the turn δθ of the body shifts it by h · δθ.
+
+    With m = R z, a turn δφ in fixed axes shifts the heading by ``δφ_z − m_z (m_x δφ_x + m_y δφ_y)/(m_x² + m_y²)``: only of a level vector
+    is it the turn about the vertical alone. A vertical vector has no heading, and its row is zero.
+    """
+    m = matrix_times_vector(R, z)
+    level = m[0] * m[0] + m[1] * m[1]
+    has_heading = level > VERTICAL
+    tilt = -m[2] / chosen(has_heading, level, 1.0)
+    whole = chosen(has_heading, level - level + 1.0, 0.0)
+    return transpose_times_vector(R, (whole * (tilt * m[0]), whole * (tilt * m[1]), whole))
+
+
+def has_heading(R, z):
+    """Return whether a vector ``z`` (body) is not vertical; scalar machine only."""
+    x, y, _ = matrix_times_vector(R, z)
+    return x * x + y * y > VERTICAL
+
+
+def heading_error(R, z, reference):
+    """Return the angle about the fixed z axis from the horizontal part of R z to that of ``reference``, rad in (−π, π]."""
+    x, y, _ = matrix_times_vector(R, z)
+    return math.atan2(x * reference[1] - y * reference[0], x * reference[0] + y * reference[1])
+
+
+def measurement_rows(kind, q, R, z, frame, noise):
+    """Return (h1, h2, h3, y1, y2, y3, covariance of the rows); ``frame`` the triad of the reference by rows, or a measured quaternion.
+
+    ``noise`` is the covariance in body axes (6-tuple); of a heading its first number is the variance. A measurement of fewer than three
+    degrees of freedom is filled up by rows of h = 0, y = 0 and unit variance, which change nothing. Scalar machine only.
+    """
+    none = (0.0, 0.0, 0.0)
+    if kind == ATTITUDE:
+        y = logarithm(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), (frame[0], frame[1], frame[2], frame[3])))
+        return (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), y[0], y[1], y[2], noise
+    if kind == HEADING:
+        error = heading_error(R, z, (frame[6], frame[7], frame[8]))
+        return heading_row(R, z), none, none, error, 0.0, 0.0, (noise[0], 0.0, 0.0, 1.0, 0.0, 1.0)
+    u = (frame[0], frame[1], frame[2])
+    v = (frame[3], frame[4], frame[5])
+    h1, y1, h2, y2 = direction_rows(R, u, v, z)
+    ub = h2
+    vb = (-h1[0], -h1[1], -h1[2])
+    nu = symmetric_times_vector(noise, ub)
+    nv = symmetric_times_vector(noise, vb)
+    if kind == VECTOR:
+        rb = transpose_times_vector(R, (frame[6], frame[7], frame[8]))
+        nr = symmetric_times_vector(noise, rb)
+        covariance = (dot(ub, nu), dot(ub, nv), dot(ub, nr), dot(vb, nv), dot(vb, nr), dot(rb, nr))
+        return h1, h2, none, y1, y2, dot(rb, z) - 1.0, covariance
+    return h1, h2, none, y1, y2, 0.0, (dot(ub, nu), dot(ub, nv), 0.0, dot(vb, nv), 0.0, 1.0)
+
+
+def independent_rows(h1, h2, h3, y1, y2, y3, noise):
+    """Return the rows by L⁻¹ of ``noise = L D Lᵀ`` and the three variances D: exact decorrelation, units kept."""
+    l21 = noise[1] / noise[0]
+    l31 = noise[2] / noise[0]
+    d2 = noise[3] - l21 * noise[1]
+    m32 = noise[4] - l21 * noise[2]
+    l32 = m32 / d2
+    d3 = noise[5] - l31 * noise[2] - l32 * m32
+    h2 = combine(1.0, h2, -l21, h1)
+    y2 = y2 - l21 * y1
+    h3 = combine(1.0, combine(1.0, h3, -l31, h1), -l32, h2)
+    y3 = y3 - l31 * y1 - l32 * y2
+    return h1, h2, h3, y1, y2, y3, (noise[0], d2, d3)
+
+
+def merge_order(time, heads, ends, ordered, place, sensor):
+    """Merge several series, each sorted, that stand one after the other in ``time``; at one time the earlier series comes first.
+
+    Writes for each measurement in order of time when and where it stands and the number of its series. ``heads`` and ``ends`` bound each
+    series; ``heads`` is used up.
+    """
+    for e in range(len(place)):
+        best = 0
+        earliest = math.inf
+        for s in range(len(heads)):
+            k = heads[s]
+            if k < ends[s] and time[k] < earliest:
+                best = s
+                earliest = time[k]
+        ordered[e] = earliest
+        place[e] = heads[best]
+        sensor[e] = best
+        heads[best] += 1
+
+
+def common_order(time, number, ordered, place, sensor):
+    """Write what :func:`merge_order` does for ``number`` series that share the times ``time``."""
+    count = len(time)
+    if number == 2:  # the commonest; written out, the loop goes in machine vectors and takes a third of the time
+        for k in range(count):
+            now = time[k]
+            ordered[2 * k] = now
+            ordered[2 * k + 1] = now
+            place[2 * k] = k
+            place[2 * k + 1] = count + k
+            sensor[2 * k] = 0
+            sensor[2 * k + 1] = 1
+        return
+    for s in range(number):
+        e = s
+        for k in range(count):
+            ordered[e] = time[k]
+            place[e] = s * count + k
+            sensor[e] = s
+            e += number

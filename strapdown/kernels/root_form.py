@@ -1,0 +1,784 @@
+"""The filter with optional error states, its covariance as a triangular factor: a body of :mod:`strapdown.kernels.walk`.
+
+State: attitude; ``x`` = (b, c): gyro bias and error states; the factor ``F`` (:mod:`strapdown.kernels.augmented_factor`). What the error
+states are, arrays say (:mod:`strapdown.kernels.augmented_step`). It keeps its digits however sharp a measurement is, so without error states
+it is also what :mod:`strapdown.kernels.covariance_form` gives way to.
+
+The first functions are the filter without a gate. Those under *for the gate* let :mod:`strapdown.kernels.gate` wrap it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from strapdown.kernels.algebra import (
+    combine,
+    cross,
+    dot,
+    full,
+    matrix_times_vector,
+    multiply,
+    times_transpose_upper,
+    transpose,
+    transpose_times_vector,
+)
+from strapdown.kernels.augmented_chain import chain_start, chain_step, step_chains
+from strapdown.kernels.augmented_factor import covariances, take_row, triangularise, variances, whole_bias
+from strapdown.kernels.augmented_step import (
+    OFFSET,
+    arm_noise,
+    carry,
+    decorrelate,
+    fill_noise,
+    fill_rows,
+    fixed_turn,
+    move,
+    put_row,
+    turn_columns,
+    turn_rows,
+    turn_values,
+    turning_matrix,
+)
+from strapdown.kernels.measurement import (
+    ATTITUDE,
+    DIRECTION,
+    HEADING,
+    frame_of,
+    noise_of,
+    sigma_of,
+    value_of,
+    vector_at,
+)
+from strapdown.kernels.robust_gate import (
+    FIRST_BIAS,
+    begin_challenge,
+    count_widening,
+    may_widen,
+    restart_attitude,
+    restart_width,
+    start_undone,
+)
+from strapdown.kernels.robust_step import arc_over_chord, seen_from
+from strapdown.kernels.rotation import far_turn, quaternion_multiply, right_jacobian, rotation_matrix, turned, unit
+from strapdown.kernels.walk import step_within, turn_squared
+
+CALLED = (
+    "advance",
+    "settle",
+    "seen_rows",
+    "keep_row",
+    "store_segment",
+    "attitude_covariance",
+    "linearised",
+    "innovation_covariance",
+    "step_of",
+    "relinearise",
+    "correct",
+    "start_candidate",
+    "age_chains",
+    "aged_chain",
+    "widen",
+)
+"""Not inlined where other kernels use them: their work is far more than a call, and each copy would be compiled anew."""
+
+BORROWS_ARRAYS = True
+"""See :mod:`strapdown.kernels.machine`."""
+
+
+SHORT = 0.2
+"""Of λ dt of a state in a chain: its series is exact."""
+
+
+class Model(NamedTuple):
+    """Noise of the gyro, and the error states as :mod:`strapdown.kernels.augmented_step` has them (m states)."""
+
+    angle_variance: float
+    """σ_v², rad²/s."""
+    rate_variance: float
+    """σ_u², rad²/s³."""
+    decay: np.ndarray
+    density: np.ndarray
+    changing: int
+    """How many states come first that change by themselves."""
+    limit: float
+    """Longest step, s, of the states that decay."""
+    gyro: np.ndarray
+    gyro_use: np.ndarray
+    sensors: np.ndarray
+    sensor_use: np.ndarray
+    force_f: tuple[float, float, float]
+    chains: np.ndarray
+
+
+class Scratch(NamedTuple):
+    """Work space of a step and of an update; n states in all."""
+
+    links: np.ndarray
+    """(chained states, ``LINKS``)"""
+    coupling: np.ndarray
+    """(m, 3)"""
+    factor: np.ndarray
+    """(m,)"""
+    work: np.ndarray
+    """As long as F has rows."""
+    six: np.ndarray
+    """(6, 6)"""
+    H: np.ndarray
+    """(3, n), and so ``prior_H`` and ``seen``."""
+    y: np.ndarray
+    """(3,), and so ``spread``."""
+    spread: np.ndarray
+    basis: np.ndarray
+    """(3, 3)"""
+    prior_H: np.ndarray
+    seen: np.ndarray
+    prior: np.ndarray
+    """(n,), and so ``step``."""
+    step: np.ndarray
+    now_x: np.ndarray
+    """(n − 3,)"""
+    fresh: np.ndarray
+    """(3 m + 6, 3 + m)"""
+
+
+class Body(NamedTuple):
+    """What the filter is made of; rows of the states: the filter, and a gate's restart candidate, left at the end state."""
+
+    model: Model
+    attitude: np.ndarray
+    """(2, 4)"""
+    x: np.ndarray
+    """(2, n − 3)"""
+    F: np.ndarray
+    """(2, rows, n), the triangle at the top and room for rows of noise below."""
+    length: np.ndarray
+    """What each measurement's effects are divided by, in order of time (events,)."""
+    turning: np.ndarray
+    """Measured rate, angular acceleration and variances of the latter's axes at each measurement (events, 9), or (0, 9) without lever arms."""
+    scratch: Scratch
+    sharpness: float
+    """Infinite: no measurement is too sharp."""
+    least_share: float
+    """0: no digit is lost."""
+    check: int
+
+
+class Restart(NamedTuple):
+    """What a restart candidate starts from."""
+
+    bias_sigma: np.ndarray
+    """Added to the bias's (3,), rad/s."""
+    values: np.ndarray
+    """Error states (m,) at ``time``."""
+    root: np.ndarray
+    """Their covariance ``rootᵀ root`` (m, m)."""
+    time: float
+
+
+class Outputs(NamedTuple):
+    """Arrays that a run writes: a row for each kept edge, and of innovations for each measurement, by place."""
+
+    attitude: np.ndarray
+    x: np.ndarray
+    variance: np.ndarray
+    covariance: np.ndarray
+    """(rows, n, n), or (0, n, n)."""
+    whole_variance: np.ndarray
+    """Of attitude and whole gyro bias (rows, 6), or (0, 6)."""
+    whole_covariance: np.ndarray
+    """(rows, 6, 6), or (0, 6, 6)."""
+    innovation: np.ndarray
+    segments: np.ndarray
+    """What a smoother needs of each prediction: dt, increment (3), attitude (4), x and the rows of the triangle."""
+
+
+def store_segment(out, k, dt, part, q, x, F, size):
+    """Write row k of the segments: dt, increment (3), attitude (4), x, and the rows of the triangle."""
+    out[k, 0] = dt
+    out[k, 1], out[k, 2], out[k, 3] = part
+    out[k, 4], out[k, 5], out[k, 6], out[k, 7] = q
+    place = 8
+    for i in range(len(x)):
+        out[k, place + i] = x[i]
+    place += len(x)
+    for j in range(size):
+        for i in range(j + 1):
+            out[k, place + i] = F[j, i]
+        place += j + 1
+
+
+def keep_row(form, q, row, out):
+    """Write the filter's state to a row of the outputs, covariances and the whole bias where there is room."""
+    x, F = form.x[0], form.F[0]
+    size = len(x) + 3
+    out.attitude[row, 0], out.attitude[row, 1], out.attitude[row, 2], out.attitude[row, 3] = q
+    for i in range(len(x)):
+        out.x[row, i] = x[i]
+    variances(F, size, out.variance, row)
+    if row < len(out.covariance):
+        covariances(F, size, out.covariance, row)
+    if row < len(out.whole_variance):
+        model = form.model
+        whole_bias(
+            F, size, model.gyro, model.gyro_use, OFFSET, out.whole_variance, out.whole_covariance, row, form.scratch.six
+        )
+
+
+def advance(model, scratch, q, x, F, dt, part):
+    """Propagate a state over an increment ``part``, ``x`` and ``F`` in place; return q."""
+    size = len(x) + 3
+    coupling, factor = scratch.coupling, scratch.factor
+    q, phi11, phi12, rate, D = move(
+        q, x, dt, part, model.decay, model.gyro, model.gyro_use, model.force_f, coupling, factor
+    )
+    carry(F, 0, size, phi11, phi12, coupling, factor, model.gyro_use, model.changing)
+    rows = step_noise(model, scratch.links, F, size, dt, rate, D, x)
+    triangularise(F, 6 + model.changing, 3, size, rows, 0, 0, scratch.work)
+    return q
+
+
+def step_noise(model, links, F, size, dt, rate, D, x):
+    """Write the rows of noise of a step under the triangle, and take states in chains and their columns over it; return the row after."""
+    rows = fill_noise(
+        F,
+        size,
+        size,
+        dt,
+        rate,
+        D,
+        model.angle_variance,
+        model.rate_variance,
+        model.decay,
+        model.density,
+        model.gyro,
+        model.gyro_use,
+    )
+    if len(model.chains) > 0:
+        rows = step_chains(F, size, rows, x, dt, model.decay, model.chains, links)
+    return rows
+
+
+def settle(model, scratch, F, before, after, x):
+    """Turn what goes along with a corrected attitude, and bring the factor, of which the attitude's columns are loose, to a triangle."""
+    size = len(x) + 3
+    loose = 3
+    if len(model.chains) > 0:
+        A = fixed_turn(before, after)
+        turn_values(model.chains, A, x, 3)
+        loose = turn_columns(model.chains, A, F, size)
+    triangularise(F, loose, loose, size, size, 0, 0, scratch.work)
+
+
+# --------------------------------------------------------------------------------------------------------------- the filter without a gate
+
+
+def begin(body):
+    """Return the attitude and the number of segments."""
+    return load(body, 0), 0
+
+
+def is_small(state, part, dt, body):
+    """Return whether an increment over dt can be taken in one step."""
+    return longest_step(state, part, dt, body) >= dt
+
+
+def longest_step(state, part, dt, body):
+    """Return the longest step, s."""
+    return min(step_within(turn_squared(part, dt, bias_at(body, 0)), dt), body.model.limit)
+
+
+def predict(state, part, dt, body, out):
+    """Propagate, and store what a smoother needs."""
+    q, segments = state
+    if segments < len(out.segments):
+        store_segment(out.segments, segments, dt, part, q, body.x[0], body.F[0], body.F.shape[2])
+        segments += 1
+    return advance(body.model, body.scratch, q, body.x[0], body.F[0], dt, part), segments
+
+
+def update(state, e, now, measured, body, out):
+    """Update with a measurement."""
+    q, segments = state
+    model, scratch, x, F = body.model, body.scratch, body.x[0], body.F[0]
+    H, y, spread, step, work = scratch.H, scratch.y, scratch.spread, scratch.step, scratch.work
+    size = len(x) + 3
+    place = measured.place[e]
+    s = measured.sensor[e]
+    kind = measured.kinds[s]
+    z = value_of(measured, place, s)
+    sigma = sigma_of(measured, place, s)
+    levered = len(body.turning) > 0 and body.turning[e, 6] > 0.0
+    rows = seen_rows(body, e, q, x, kind, z, frame_of(measured, place, s), s)
+    if levered or len(measured.noise) > 0:
+        C = noise_of(measured, place, s, kind, z)
+        if levered:
+            C = arm_noise(
+                x,
+                s,
+                model.sensors,
+                model.sensor_use,
+                body.length[e],
+                (body.turning[e, 6], body.turning[e, 7], body.turning[e, 8]),
+                C,
+            )
+        decorrelate(H, y, rows, scratch.basis, C, spread)
+    else:
+        for r in range(rows):
+            spread[r] = sigma * sigma
+            if kind == ATTITUDE:
+                spread[r] = z[0] if r == 0 else (z[1] if r == 1 else z[2])
+            elif kind == DIRECTION:
+                basis = scratch.basis
+                spread[r] *= basis[r, 0] ** 2 + basis[r, 1] ** 2 + basis[r, 2] ** 2
+    for i in range(size):
+        step[i] = 0.0
+    for r in range(rows):
+        error = y[r]
+        for i in range(size):
+            error -= H[r, i] * step[i]  # what the rows before it have corrected
+        s2 = take_row(F, size, H, r, spread[r], work)
+        for i in range(size):
+            step[i] += error / s2 * work[i]
+        out.innovation[place, 2 * r] = error
+        out.innovation[place, 2 * r + 1] = s2
+    if kind == HEADING and H[0, 0] == 0.0 and H[0, 1] == 0.0 and H[0, 2] == 0.0:
+        out.innovation[place, 0] = math.nan  # of a vertical vector, which shows none: skipped
+    a = (step[0], step[1], step[2])
+    before = q
+    if dot(a, a) > 1.0:
+        far, G = far_turn(a)
+        q = unit(quaternion_multiply(q, far))
+    else:
+        G = right_jacobian(a)
+        q = turned(q, a)
+    for i in range(len(x)):
+        x[i] += step[3 + i]
+    turn_rows(F, size, G)
+    settle(model, scratch, F, before, q, x)
+    return q, segments
+
+
+def seen_rows(form, e, q, x, kind, z, frame, sensor):
+    """Write H, y and the rows' axes of a measurement seen from a state to the scratch; return the number of rows."""
+    model, scratch = form.model, form.scratch
+    W = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    t = form.turning
+    if len(t) > 0:
+        turn = (t[e, 0] - x[0], t[e, 1] - x[1], t[e, 2] - x[2])
+        W = turning_matrix(turn, (t[e, 3], t[e, 4], t[e, 5]))
+    R = rotation_matrix(q)
+    length = form.length[e]
+    return fill_rows(
+        q, R, x, kind, z, frame, length, sensor, model.sensors, model.sensor_use, W, scratch.H, scratch.y, scratch.basis
+    )
+
+
+def keep(state, row, e, body, out):
+    """Write a row."""
+    keep_row(body, state[0], row, out)
+    return state
+
+
+def stopped(state):
+    """Go on to the end."""
+    return False
+
+
+def finish(state, row, e, body):
+    """Leave the end state and return the number of segments."""
+    save(body, 0, state[0])
+    return state[1]
+
+
+# --------------------------------------------------------------------------------------------------------------------------- for the gate
+
+
+def load(form, i):
+    """Return the attitude of state i; the rest stays in its arrays."""
+    a = form.attitude
+    return (a[i, 0], a[i, 1], a[i, 2], a[i, 3])
+
+
+def save(form, i, q):
+    """Keep the attitude of state i."""
+    a = form.attitude
+    a[i, 0], a[i, 1], a[i, 2], a[i, 3] = q
+
+
+def become(form):
+    """Let the filter be what the restart candidate is."""
+    size = form.F.shape[2]
+    save(form, 0, load(form, 1))
+    for j in range(size - 3):
+        form.x[0, j] = form.x[1, j]
+    for j in range(size):
+        for c in range(size):
+            form.F[0, j, c] = form.F[1, j, c]
+
+
+def attitude_of(q):
+    """Return q_fb of a state."""
+    return q
+
+
+def bias_at(form, i):
+    """Return the gyro bias of state i."""
+    return (form.x[i, 0], form.x[i, 1], form.x[i, 2])
+
+
+def step_limit(form):
+    """Return the longest step, s, that states other than the attitude bear."""
+    return form.model.limit
+
+
+def digits_left(form, i):
+    """Return 1: a factor loses none."""
+    return 1.0
+
+
+def propagate(form, i, q, part, dt):
+    """Return the attitude after an increment over dt."""
+    return advance(form.model, form.scratch, q, form.x[i], form.F[i], dt, part)
+
+
+def store_prediction(form, i, q, k, part, dt, out):
+    """Write what a smoother needs of a prediction."""
+    store_segment(out.segments, k, dt, part, q, form.x[i], form.F[i], form.F.shape[2])
+
+
+def attitude_covariance(form, i, q):
+    """Return the covariance of the attitude (6-tuple)."""
+    F = form.F[i]
+    s00 = s01 = s02 = s11 = s12 = s22 = 0.0
+    for j in range(F.shape[1]):
+        a, b, c = F[j, 0], F[j, 1], F[j, 2]
+        s00 += a * a
+        s01 += a * b
+        s02 += a * c
+        s11 += b * b
+        s12 += b * c
+        s22 += c * c
+    return (s00, s01, s02, s11, s12, s22)
+
+
+def start_update(form, i):
+    """Begin the linearisation at the state itself."""
+    scratch, x = form.scratch, form.x[i]
+    for j in range(len(x)):
+        scratch.now_x[j] = x[j]
+    for j in range(len(x) + 3):
+        scratch.prior[j] = 0.0  # where the prior's mean lies, seen from the state of the linearisation
+
+
+def linearised(form, i, e, now_q, q, M, z, frame, noise, kind, sensor, prior):
+    """Return the number of rows, y (3,), what of y the prior predicts (3,), variances (3,), θ/sin θ and cos θ of a direction's angle.
+
+    The rows stand in ``prior_H``, turned to the prior's tangent space, and as they are in ``H``.
+    """
+    model, scratch = form.model, form.scratch
+    H, y, spread, prior_H = scratch.H, scratch.y, scratch.spread, scratch.prior_H
+    size = H.shape[1]
+    now_x = scratch.now_x
+    rows = seen_rows(form, e, now_q, now_x, kind, z, frame, sensor)
+    far, along = seen_from_afar(kind, z, rows, y, scratch.basis)
+    C = noise
+    if len(form.turning) > 0 and form.turning[e, 6] > 0.0:
+        arm = (form.turning[e, 6], form.turning[e, 7], form.turning[e, 8])
+        C = arm_noise(now_x, sensor, model.sensors, model.sensor_use, form.length[e], arm, noise)
+    decorrelate(H, y, rows, scratch.basis, C, spread)
+    p0 = p1 = p2 = 0.0
+    for j in range(size):
+        for r in range(3):
+            prior_H[r, j] = H[r, j]
+        p0 += H[0, j] * scratch.prior[j]
+        p1 += H[1, j] * scratch.prior[j]
+        p2 += H[2, j] * scratch.prior[j]
+    for r in range(3):
+        put_row(prior_H, r, transpose_times_vector(M, vector_at(H, r)))
+    if len(model.chains) > 0:
+        turn_columns(model.chains, transpose(fixed_turn(q, now_q)), prior_H, 3)
+    two, three = rows > 1, rows > 2
+    variance = (spread[0], spread[1] if two else 1.0, spread[2] if three else 1.0)
+    return rows, (y[0], y[1] if two else 0.0, y[2] if three else 0.0), (p0, p1, p2), variance, far, along
+
+
+def seen_from_afar(kind, z, rows, y, basis):
+    """Return θ/sin θ of the angle θ between a measured and a predicted vector, and its cosine times their length; of other kinds 1, 1.
+
+    The rows of a direction measure across what is predicted with the error states, those of a vector across the reference, along which
+    the third row has the length.
+    """
+    if kind in (ATTITUDE, HEADING):
+        return 1.0, 1.0
+    if rows == 3:
+        along = y[2] + 1.0
+    else:
+        d = cross(vector_at(basis, 0), vector_at(basis, 1))
+        along = dot(d, z) / math.sqrt(dot(d, d))
+    return arc_over_chord(math.sqrt(y[0] * y[0] + y[1] * y[1]), along), along
+
+
+def innovation_covariance(form, i, q, rows):
+    """Return H P Hᵀ (6-tuple), rows that are not there as zeros; leave ``F Hᵀ`` in ``seen``."""
+    F, H, seen = form.F[i], form.scratch.prior_H, form.scratch.seen
+    size = H.shape[1]
+    for r in range(3):
+        for j in range(size):
+            total = 0.0
+            if r < rows:
+                for c in range(j + 1):
+                    total += F[j, c] * H[r, c]
+            seen[r, j] = total
+    s00 = s01 = s02 = s11 = s12 = s22 = 0.0
+    for j in range(size):
+        a, b, c = seen[0, j], seen[1, j], seen[2, j]
+        s00 += a * a
+        s01 += a * b
+        s02 += a * c
+        s11 += b * b
+        s12 += b * c
+        s22 += c * c
+    return (s00, s01, s02, s11, s12, s22)
+
+
+def step_of(form, i, state, rows, u, M, prior, q, now_q):
+    """Return the attitude's step (3,) from the linearisation that P Hᵀ u leads to; leave all of it in ``step``.
+
+    Also return the square of what it changes in the rows: the attitude's part, and the error states' seen in the rows.
+    """
+    scratch, F = form.scratch, form.F[i]
+    step, seen, H = scratch.step, scratch.seen, scratch.H
+    size = len(step)
+    for j in range(size):
+        step[j] = 0.0
+    for j in range(size):
+        w = u[0] * seen[0, j] + u[1] * seen[1, j] + u[2] * seen[2, j]
+        for c in range(j + 1):
+            step[c] += F[j, c] * w
+    step[0], step[1], step[2] = matrix_times_vector(M, (step[0], step[1], step[2]))
+    if len(form.model.chains) > 0:
+        turn_values(form.model.chains, fixed_turn(q, now_q), step, 6)
+    for j in range(size):
+        step[j] += scratch.prior[j]
+    squared = step[0] * step[0] + step[1] * step[1] + step[2] * step[2]
+    for r in range(rows):
+        total = 0.0
+        for j in range(6, size):
+            total += H[r, j] * step[j]
+        squared += total * total
+    return (step[0], step[1], step[2]), squared
+
+
+def relinearise(form, i, q, old_q, now_q, prior, fresh):
+    """Go to another point of linearisation; ``fresh``: the states beside the attitude go back to the state itself."""
+    scratch, x, chains = form.scratch, form.x[i], form.model.chains
+    now_x, all_prior = scratch.now_x, scratch.prior
+    all_prior[0], all_prior[1], all_prior[2] = prior
+    for j in range(len(x)):
+        now_x[j] = x[j] if fresh else now_x[j] + scratch.step[3 + j]
+        all_prior[3 + j] = x[j]
+    if len(chains) > 0:
+        turn_values(chains, fixed_turn(old_q, now_q), now_x, 3)
+        turn_values(chains, fixed_turn(q, now_q), all_prior, 6)
+    for j in range(len(x)):
+        all_prior[3 + j] -= now_x[j]
+
+
+def correct(form, i, q, rows, e, variance):
+    """Update with independent rows of innovations e (3,), prior's tangent space; return q and the attitude's correction."""
+    scratch, x, F = form.scratch, form.x[i], form.F[i]
+    H, step, work = scratch.prior_H, scratch.step, scratch.work
+    size = len(step)
+    for j in range(size):
+        step[j] = 0.0
+    for r in range(rows):
+        left = e[0] if r == 0 else (e[1] if r == 1 else e[2])
+        noise = variance[0] if r == 0 else (variance[1] if r == 1 else variance[2])
+        for j in range(size):
+            left -= H[r, j] * step[j]  # what the rows before it have corrected
+        s2 = take_row(F, size, H, r, noise, work)
+        for j in range(size):
+            step[j] += left / s2 * work[j]
+    for j in range(len(x)):
+        x[j] += step[3 + j]
+    return q, (step[0], step[1], step[2])
+
+
+def turn_tangent(form, i, q, M):
+    """Carry the factor to another tangent space by M, no triangle then."""
+    turn_rows(form.F[i], form.F.shape[2], M)
+    return q
+
+
+def set_attitude(form, i, state, q, before):
+    """Bring the factor back to a triangle at the corrected attitude, with what goes along."""
+    settle(form.model, form.scratch, form.F[i], before, q, form.x[i])
+    return q
+
+
+def start_candidate(form, memory, now, attitude_sigma, restart):
+    """Write row 1: the filter's attitude and bias, as uncertain as a fresh start, and the error states as the prior has them by now.
+
+    Whatever led the filter astray has gone into the error states too, and what they are still worth cannot be known; their prior is right
+    all the same. Attitude and bias are widened by how many candidates have been before it.
+    """
+    model, scratch, x, F = form.model, form.scratch, form.x, form.F
+    decay, density, chains, fresh = model.decay, model.density, model.chains, scratch.fresh
+    size = F.shape[2]
+    age = now - restart.time
+    width = restart_width(memory)
+    m = len(restart.values)
+    for r in range(3 * m + 6):
+        for c in range(3 + m):
+            fresh[r, c] = 0.0
+    for r in range(3):
+        fresh[r, r] = width * restart.bias_sigma[r]
+    for k in range(m):
+        kept = math.exp(-decay[k] * age)
+        if len(chains) > 0 and (chains[k, 0] != 0.0 or (k > 0 and chains[k - 1, 0] != 0.0)):
+            kept = 1.0  # age_chains has all of it
+        x[1, 3 + k] = kept * restart.values[k]
+        for r in range(k, m):
+            fresh[3 + r, 3 + k] = kept * restart.root[r, k]
+        driven = age
+        if decay[k] > 0.0:
+            driven = -0.5 * math.expm1(-2.0 * decay[k] * age) / decay[k]
+        fresh[3 + m + k, 3 + k] = math.sqrt(driven * density[k])
+    if len(chains) > 0:
+        age_chains(x, fresh, decay, chains, age)
+    for r in range(3 + m):
+        for c in range(3):
+            fresh[3 + 2 * m + r, c] = F[0, 3 + r, 3 + c]
+    triangularise(fresh, 3 + m, 0, 3 + m, 3 * m + 6, 0, 0, scratch.work)
+    for r in range(size):
+        for c in range(size):
+            F[1, r, c] = 0.0
+    for r in range(3):
+        F[1, r, r] = restart_attitude(attitude_sigma, memory)
+        x[1, r] = x[0, r]
+    for r in range(3 + m):
+        for c in range(r + 1):
+            F[1, 3 + r, 3 + c] = fresh[r, c]
+    save(form, 1, load(form, 0))
+    begin_challenge(memory, now, bias_at(form, 1), bias_variances(F[1], size))
+
+
+def bias_variances(F, size):
+    """Return the variances of the bias (3,) of a factor's covariance."""
+    x = y = z = 0.0
+    for j in range(size):
+        x += F[j, 3] * F[j, 3]
+        y += F[j, 4] * F[j, 4]
+        z += F[j, 5] * F[j, 5]
+    return (x, y, z)
+
+
+def aged_chain(decay, chains, first, k, age):
+    """Return Φ (9-tuple) of the states ``first`` to k of a chain, two or three, over any time, and Q (6-tuple) of what drives them.
+
+    :func:`strapdown.kernels.augmented_chain.chain_step` over a step short enough, doubled as often as it takes.
+    """
+    fastest = 0.0
+    for j in range(first, k + 1):
+        fastest = max(fastest, decay[j])
+    h = age
+    doublings = 0
+    while fastest * h > SHORT:
+        h *= 0.5
+        doublings += 1
+    _, _, own0, n20, n21, n22, n10, n11, n00 = chain_step(decay, chains, first, first, h)
+    # What drives the first state, which feeds none, is not the chain's.
+    _, near1, own1, n20, n21, n22, n10, n11, n00 = chain_step(decay, chains, first + 1, first, h)
+    d = chains[first + 1, 1]
+    q00 = d * (n21 * n21 + n11 * n11)
+    q01 = d * n21 * n22
+    q11 = d * n22 * n22
+    q02 = q12 = q22 = 0.0
+    far2, near2, own2 = 0.0, 0.0, 1.0
+    if k - first > 1:
+        far2, near2, own2, n20, n21, n22, n10, n11, n00 = chain_step(decay, chains, k, first, h)
+        d = chains[k, 1]
+        q00 += d * (n20 * n20 + n10 * n10 + n00 * n00)
+        q01 += d * (n20 * n21 + n10 * n11)
+        q02 = d * n20 * n22
+        q11 += d * (n21 * n21 + n11 * n11)
+        q12 = d * n21 * n22
+        q22 = d * n22 * n22
+    phi = (own0, near1, far2, 0.0, own1, near2, 0.0, 0.0, own2)
+    Q = (q00, q01, q02, q11, q12, q22)
+    for _ in range(doublings):
+        more = times_transpose_upper(multiply(phi, full(Q)), phi)
+        Q = (Q[0] + more[0], Q[1] + more[1], Q[2] + more[2], Q[3] + more[3], Q[4] + more[4], Q[5] + more[5])
+        phi = multiply(phi, phi)
+    return phi, Q
+
+
+def age_chains(x, fresh, decay, chains, age):
+    """Take the mean and the root of the optional states' prior over ``age``, of those in chains; the rows of their noise likewise."""
+    m = len(decay)
+    for k in range(1, m):
+        if chains[k - 1, 0] != 0.0 and chains[k, 0] == 0.0 and age > 0.0:
+            first = chain_start(chains, k)
+            last = k - first == 2
+            phi, Q = aged_chain(decay, chains, first, k, age)
+            a, b, c = x[1, 3 + first], x[1, 4 + first], x[1, 5 + first] if last else 0.0
+            x[1, 3 + first] = phi[0] * a + phi[1] * b + phi[2] * c
+            x[1, 4 + first] = phi[4] * b + phi[5] * c
+            if last:
+                x[1, 5 + first] = phi[8] * c
+            for r in range(3, 3 + m):
+                a, b, c = fresh[r, 3 + first], fresh[r, 4 + first], fresh[r, 5 + first] if last else 0.0
+                fresh[r, 3 + first] = phi[0] * a + phi[1] * b + phi[2] * c
+                fresh[r, 4 + first] = phi[4] * b + phi[5] * c
+                if last:
+                    fresh[r, 5 + first] = phi[8] * c
+            # A root of Q by rows from the last state up; what drives the first by itself stands in its row already.
+            n22 = math.sqrt(Q[5])
+            n21 = Q[4] / n22 if n22 > 0.0 else 0.0
+            n20 = Q[2] / n22 if n22 > 0.0 else 0.0
+            n11 = math.sqrt(max(Q[3] - n21 * n21, 0.0))
+            n10 = (Q[1] - n20 * n21) / n11 if n11 > 0.0 else 0.0
+            n00 = math.sqrt(max(Q[0] - n20 * n20 - n10 * n10, 0.0))
+            row = 3 + m + first
+            if last:
+                fresh[row + 2, 3 + first], fresh[row + 2, 4 + first], fresh[row + 2, 5 + first] = n20, n21, n22
+            fresh[row + 1, 3 + first], fresh[row + 1, 4 + first] = n10, n11
+            fresh[row, 3 + first] = math.sqrt(fresh[row, 3 + first] ** 2 + n00 * n00)
+
+
+def widen(form, memory):
+    """Make the candidate what it would be had its bias started wider, if that holds it back.
+
+    The start is given back as a measurement of negative variance, beyond that of the bias, which only adds to P: |1/s| P e (P e)ᵀ, a row
+    more of the factor.
+    """
+    scratch, x, F = form.scratch, form.x[1], form.F[1]
+    size = F.shape[1]
+    if not may_widen(bias_variances(F, size), memory):
+        return
+    column = scratch.prior
+    turn = (0.0, 0.0, 0.0)
+    for i in range(3):
+        for c in range(size):
+            column[c] = 0.0
+            for j in range(max(c, 3 + i), size):
+                column[c] += F[j, c] * F[j, 3 + i]
+        inverse = start_undone(i, column[3 + i], memory)
+        share = inverse * (memory[FIRST_BIAS + i] - x[i])
+        turn = combine(1.0, turn, share, (column[0], column[1], column[2]))
+        for c in range(3, size):
+            x[c - 3] += share * column[c]
+        root = math.sqrt(-inverse)
+        for c in range(size):
+            F[size, c] = root * column[c]
+        triangularise(F, size, 0, size, size + 1, 0, 0, scratch.work)
+    before = load(form, 1)
+    q, G = seen_from(turn, attitude_covariance(form, 1, before))
+    after = quaternion_multiply(before, q)
+    turn_rows(F, size, G)
+    settle(form.model, scratch, F, before, after, x)
+    save(form, 1, after)
+    count_widening(memory)
