@@ -322,7 +322,7 @@ def _in_blocks(problem: Problem, options: Options) -> Passed:
         number = compiled(walk, covariance_form)(
             record.time[row * every :],
             increments[row * every :],
-            _after(measurements, event),
+            after(measurements, event),
             every,
             body,
             _rows_from(written, row),
@@ -341,7 +341,7 @@ def _in_blocks(problem: Problem, options: Options) -> Passed:
     return _block_result(problem, options, out, end, int(number))
 
 
-def _after(measurements: Measurements, first: int, last: int | None = None) -> Measurements:
+def after(measurements: Measurements, first: int, last: int | None = None) -> Measurements:
     """Return the measurements from one in order of time to another."""
     own = slice(first, last)
     return measurements._replace(
@@ -554,23 +554,13 @@ def model_arrays(model: Model, variances: tuple[float, float]) -> root_form.Mode
 def scratch(model: Model) -> root_form.Scratch:
     """Return work space for the kernels."""
     m, size = model.states, 6 + model.states
-    rows = np.empty((3, 3, size))
     return root_form.Scratch(
-        links=np.empty((len(model.chains), LINKS)),
+        rows=np.empty((3, 3, size)),
+        lines=np.empty((root_form.LINES, size + model.noise_rows)),
+        threes=np.empty((5, 3)),
         coupling=np.empty((m, 3)),
-        factor=np.empty(m),
-        work=np.empty(size + model.noise_rows),
+        links=np.empty((len(model.chains), LINKS)),
         six=np.empty((6, 6)),
-        H=rows[0],
-        y=np.empty(3),
-        spread=np.empty(3),
-        basis=np.empty((3, 3)),
-        prior_H=rows[1],
-        seen=rows[2],
-        prior=np.empty(size),
-        step=np.empty(size),
-        now_x=np.empty(size - 3),
-        fresh=np.empty((3 * m + 6, 3 + m)),
     )
 
 
@@ -627,6 +617,7 @@ def _in_factor(problem: Problem, options: Options) -> Passed:
             values=first.values[model.order],
             root=modelling.lower_root(first.covariance[np.ix_(model.order, model.order)]),
             time=first.start,
+            fresh=np.empty((3 * model.states + 6, 3 + model.states)),
         )
         written = judge.outputs(out)
         number, recovered, locked = compiled(walk, gate, root_form)(*arguments, judge.body(body, restart), written)
@@ -762,7 +753,7 @@ def _span_in_factor(
         compiled(walk, root_form)(
             record.time[begin : end + 1],
             increments[begin:end],
-            _after(measurements, event, beyond),
+            after(measurements, event, beyond),
             every,
             body,
             written,

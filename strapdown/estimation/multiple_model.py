@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from strapdown import estimation, quaternion, records, vectors
 from strapdown.checks import Array, InputError, array, count, finite, instance, positive
-from strapdown.estimation.forward import gaps
+from strapdown.estimation.forward import after, gaps, gate_options
 from strapdown.estimation.gating import UNIFORM_SIGMA, Gate, Monitor, Robust
 from strapdown.estimation.schedule import Schedule, schedule
 from strapdown.estimation.states import (
@@ -33,8 +33,10 @@ from strapdown.estimation.states import (
     pack,
     restart_bias_variance,
 )
-from strapdown.kernels import bank_loop, measurement, robust_gate, robust_step
+from strapdown.kernels import hypotheses as hypotheses_kernel
+from strapdown.kernels import measurement, robust_gate
 from strapdown.kernels.machine import compiled
+from strapdown.kernels.walk import walk
 from strapdown.records import Estimate, Event, ImuRecord, Innovations
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 from strapdown.vectors import VectorMeasurements
@@ -449,58 +451,51 @@ def _until_one(
             raise InputError(
                 f"the first direction comes at {began:.6g} s, after the last kept edge; keep more edges or give a longer record"
             )
-        number = len(states)
-        attitude, estimated_bias = np.empty((len(kept), 4)), np.empty((len(kept), 3))
-        blocks, weight = np.empty((len(kept), 21)), np.empty(number)
-        weights = np.empty((len(kept) if all_weights else 0, number))
-        innovation, share = np.empty((len(events.time), 6)), np.empty(len(events.time))
-        rows, at, used = compiled(bank_loop.run_bank)(
-            record.time,
-            np.ascontiguousarray(record.increments),
-            process_noise.angle_random_walk**2,
-            process_noise.rate_random_walk**2,
-            events.time,
-            events.kind,
-            events.vector_b,
-            events.variance,
-            events.reference,
-            events.triads,
-            states,
-            log_weight,
-            began,
-            first + 1,
-            later,
-            np.array(sets),
-            -2.0 * np.log(DOUBT),
-            every,
-            least_weight,
-            largest_share,
-            weight,
-            np.empty(12),
-            np.empty(28),
-            attitude,
-            estimated_bias,
-            blocks,
-            weights,
-            innovation,
-            np.full(3, np.inf) if gate is None else gate.thresholds,
-            0 if robust is None else {"huber": robust_step.HUBER, "student": robust_step.STUDENT}[robust.kind],
-            np.ones((3, 2)) if robust is None else robust.parameters,
-            0 if robust is None else robust.iterations,
-            recovery or 0,
-            share,
+        number, doubt = len(states), -2.0 * np.log(DOUBT)
+        weight = np.empty(number)
+        out = hypotheses_kernel.Outputs(
+            attitude=np.empty((len(kept), 4)),
+            bias=np.empty((len(kept), 3)),
+            covariance=np.empty((len(kept), 21)),
+            weights=np.empty((len(kept) if all_weights else 0, number)),
+            innovation=np.empty((len(events.time), 6)),
+            share=np.empty(len(events.time)),
         )
-        taken = used if at != bank_loop.LOST or recovery is None else used + recovery
-        P = covariance_matrices(blocks[:rows])
+        edges, increments, first_edge = _from_time(record, began)
+        body = hypotheses_kernel.Body(
+            angle_variance=process_noise.angle_random_walk**2,
+            rate_variance=process_noise.rate_random_walk**2,
+            states=states,
+            log_weight=log_weight,
+            weight=weight,
+            later=later - (first + 1),
+            sets=np.array(sets),
+            charge=doubt,
+            options=gate_options(gate, robust)._replace(recovery=recovery or 0),
+            min_weight=least_weight,
+            max_share=largest_share,
+            first_edge=first_edge,
+            on_edge=bool(edges[0] == record.time[first_edge]),
+            every=every,
+            room=np.empty(40),
+        )
+        rows, at, used = compiled(walk, hypotheses_kernel)(
+            edges, increments, after(events.measurements, first + 1), 1, body, out
+        )
+        used += first + 1
+        taken = used if at != hypotheses_kernel.LOST or recovery is None else used + recovery
+        P = covariance_matrices(out.covariance[:rows])
         estimate = Estimate(
             time=record.time[kept[:rows]],
-            attitude=attitude[:rows],
-            bias=estimated_bias[:rows],
+            attitude=out.attitude[:rows],
+            bias=out.bias[:rows],
             variance=np.ascontiguousarray(np.diagonal(P, axis1=1, axis2=2)),
             covariance=P,
-            innovations=_innovations(events, np.arange(first + 1, taken), innovation, share if doubted else None),
+            innovations=_innovations(
+                events, np.arange(first + 1, taken), out.innovation, out.share if doubted else None
+            ),
         )
-        if at != bank_loop.LOST:
+        if at != hypotheses_kernel.LOST:
             break
         assert recovery is not None
         # What came before is not to be believed: the circle is that of the first refused direction.
@@ -529,11 +524,22 @@ def _until_one(
         estimate=estimate,
         edges=kept,
         angles=angles,
-        weights=weights[:rows] if all_weights else weight[None],
+        weights=out.weights[:rows] if all_weights else weight[None],
         became_one=float(record.time[at]) if at >= 0 else np.inf,
-        reason="" if at >= 0 else _reason(record, events, weight, P[-1], attitude[rows - 1]),
+        reason="" if at >= 0 else _reason(record, events, weight, P[-1], out.attitude[rows - 1]),
     )
     return found, attempts
+
+
+def _from_time(record: ImuRecord, time: float) -> tuple[Array, Array, int]:
+    """Return edges and increments from a time on, and the number of the edge at it or before it."""
+    k = int(np.searchsorted(record.time, time, side="right")) - 1
+    edges, increments = record.time[k:].copy(), np.ascontiguousarray(record.increments[k:])
+    if time > edges[0]:
+        increments = increments.copy()
+        increments[0] *= (edges[1] - time) / (edges[1] - edges[0])
+        edges[0] = time
+    return edges, increments, k
 
 
 def start(
@@ -600,12 +606,13 @@ def _innovations(events: Schedule, taken: np.ndarray, rows: Array, weight: Array
     result = {}
     for i, (sensor, kind) in enumerate(zip(events.sensors, events.kinds, strict=True)):
         mine = taken[events.sensor[taken] == i]
-        filled = rows[mine, : 2 * vectors.KINDS[kind]]
+        place = events.row[mine]
+        filled = rows[place, : 2 * vectors.KINDS[kind]]
         result[sensor] = Innovations(
             time=events.time[mine],
             innovation=filled[:, 0::2],
             variance=filled[:, 1::2],
-            weight=None if weight is None else weight[mine],
+            weight=None if weight is None else weight[place],
         )
     return result
 

@@ -115,20 +115,18 @@ class Schedule:
     @property
     def measurements(self) -> measurement.Measurements:
         """The same as the kernels take it."""
-        columns = [places(column) for column in (self.series_vector_b, self.series_sigma)]
-        origins = [start - width * self.bounds[:-1] for (_, start), width in zip(columns, (3, 1), strict=True)]
+        (value, values), (sigma, sigmas) = places(self.series_vector_b), places(self.series_sigma)
+        first = self.bounds[:-1]
+        columns = (values - 3 * first, sigmas - first, first, self.codes, *self.frames.T)
         time, place, sensor = self.order
         return measurement.Measurements(
             time=time,
             place=place,
             sensor=sensor,
-            value=columns[0][0],
-            sigma=columns[1][0],
+            value=value,
+            sigma=sigma,
             noise=np.empty((0, 6)) if self.standing_noise is None else self.standing_noise,
-            origins=np.stack(origins, axis=1),
-            bounds=self.bounds,
-            kinds=self.codes,
-            frames=self.frames,
+            series=np.stack([np.asarray(column, np.int64) for column in columns], axis=1),
             triads=self.triads,
         )
 

@@ -34,6 +34,7 @@ from strapdown.kernels.measurement import (
     ATTITUDE,
     DIRECTION,
     HEADING,
+    KIND,
     VECTOR,
     frame_row,
     has_heading,
@@ -154,7 +155,9 @@ def begin(body):
     q, b, A, B, C = load_state(body.states[0])
     body.good[0] = 0
     body.good[1] = 0
-    return q, b, A, B, C, 0, not least_share(body.states[0], body.work) >= body.least_share
+    # From an array, and not the literal 0: numba would compile the body for that type too.
+    segments = body.good[0]
+    return q, b, A, B, C, segments, not least_share(body.states[0], body.work) >= body.least_share
 
 
 def is_small(state, part, dt, body):
@@ -183,7 +186,7 @@ def update(state, e, now, measured, body, out):
     R = rotation_matrix(q)
     at = measured.place[e]
     s = measured.sensor[e]
-    kind = measured.kinds[s]
+    kind = measured.series[s, KIND]
     t = frame_row(measured, at, s)
     triads = measured.triads
     z = value_of(measured, at, s)

@@ -16,6 +16,7 @@ from strapdown.kernels.algebra import add, factored, matrix_times_vector, scale,
 from strapdown.kernels.measurement import (
     DIRECTION,
     HEADING,
+    KIND,
     degrees_of_freedom,
     frame_of,
     has_heading,
@@ -223,8 +224,12 @@ def keep_row(form, state, row, out):
 
 def begin(body):
     """Return how many states run, the numbers of lock-outs, recoveries and segments, and whether digits are lost."""
-    running = 2 if body.memory[CHALLENGED] > 0.0 else 1
-    return running, 0, 0, 0, lost_digits(running, body)
+    # From an array, and not literals: numba would compile the body for that type too.
+    none = 0 * len(body.memory)
+    running = none + 1
+    if body.memory[CHALLENGED] > 0.0:
+        running = none + 2
+    return running, none, none, none, lost_digits(running, body)
 
 
 def lost_digits(running, body):
@@ -273,7 +278,7 @@ def update(state, e, now, measured, body, out):
     form, options, memory, standing = body.form, body.options, body.memory, body.standing
     place = measured.place[e]
     sensor = measured.sensor[e]
-    degrees = degrees_of_freedom(measured.kinds[sensor])
+    degrees = degrees_of_freedom(measured.series[sensor, KIND])
     i = 0
     while i < running:
         passes = int(memory[PASSES]) if i == 0 else WIDE_PASSES
@@ -349,7 +354,7 @@ def judged_update(form, i, e, measured, passes, options):
     """
     place = measured.place[e]
     sensor = measured.sensor[e]
-    kind = measured.kinds[sensor]
+    kind = measured.series[sensor, KIND]
     z = value_of(measured, place, sensor)
     frame = frame_of(measured, place, sensor)
     noise = noise_of(measured, place, sensor, kind, z)

@@ -88,6 +88,17 @@ def _options(function: FunctionType) -> dict[str, Any]:
     return {"fastmath": {"contract"}, "error_model": "numpy", "nogil": True, "_nrt": counted}
 
 
+def _without_literals(dispatcher: Any) -> Any:
+    """Return a dispatcher that takes a literal number for any number of its type: numba would compile it anew for each literal."""
+    from numba import types
+
+    resolve = dispatcher.get_call_template
+    dispatcher.get_call_template = lambda args, kws: resolve(
+        tuple(types.unliteral(one) for one in args), {name: types.unliteral(one) for name, one in kws.items()}
+    )
+    return dispatcher
+
+
 @functools.cache
 def helper(function: FunctionType, parts: tuple[ModuleType, ...] = ()) -> Any:
     """Return ``function`` compiled for use inside another kernel, inlined: a call costs more than a 3-vector's work.
@@ -101,7 +112,7 @@ def helper(function: FunctionType, parts: tuple[ModuleType, ...] = ()) -> Any:
 
         return INTRINSICS[function.__name__]
     called = function.__name__ in function.__globals__.get("CALLED", ())
-    plain = numba.njit(forceinline=not called, **_options(function))(_twin(function, parts))
+    plain = _without_literals(numba.njit(forceinline=not called, **_options(function))(_twin(function, parts)))
     if function.__module__ == f"{PACKAGE}.algebra":
         from strapdown.kernels.packed import PACKED, packed
 

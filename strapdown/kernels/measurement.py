@@ -48,21 +48,26 @@ class Measurements(NamedTuple):
     sensor: np.ndarray
     """Sensor of each, in order of time (m,)."""
     value: np.ndarray
-    """Three numbers each, of the first sensor; ``origins`` leads to those of the others."""
+    """Three numbers each, of the first sensor; ``series`` leads to those of the others."""
     sigma: np.ndarray
     """σ each, of the first sensor, likewise."""
     noise: np.ndarray
     """Covariances in body axes (m, 6) by place, or (0, 6) where σ is all."""
-    origins: np.ndarray
-    """Where place 0 of each sensor would be in ``value`` and ``sigma`` (sensors, 2): each sensor's numbers stay where they were measured."""
-    bounds: np.ndarray
-    """First place of each sensor, and the end of the last (sensors + 1,)."""
-    kinds: np.ndarray
-    """Kind of each sensor (sensors,)."""
-    frames: np.ndarray
-    """Row of ``triads`` of each sensor's first measurement, and how many rows on that of each next is, 0 or 1 (sensors, 2)."""
+    series: np.ndarray
+    """A row for each sensor (sensors, 6), in the columns below."""
     triads: np.ndarray
     """Right-handed frames (u, v, r) by rows about references r (rows, 9); of an attitude the measured quaternion."""
+
+
+VALUE_ORIGIN = 0
+"""Where place 0 of a sensor would be in ``value``, and in ``sigma``: each sensor's numbers stay where they were measured."""
+SIGMA_ORIGIN = 1
+FIRST_PLACE = 2
+KIND = 3
+FIRST_FRAME = 4
+"""Row of ``triads`` of a sensor's first measurement, and how many rows on that of each next is, 0 or 1."""
+FRAME_STEP = 5
+COLUMNS = 6
 
 
 def vector_at(array, k):
@@ -77,19 +82,20 @@ def six_at(array, k):
 
 def value_of(measured, place, sensor):
     """Return the three numbers of a measurement."""
-    here = measured.origins[sensor, 0] + 3 * place
+    here = measured.series[sensor, VALUE_ORIGIN] + 3 * place
     value = measured.value
     return (element(value, here), element(value, here + 1), element(value, here + 2))
 
 
 def sigma_of(measured, place, sensor):
     """Return σ of a measurement."""
-    return element(measured.sigma, measured.origins[sensor, 1] + place)
+    return element(measured.sigma, measured.series[sensor, SIGMA_ORIGIN] + place)
 
 
 def frame_row(measured, place, sensor):
     """Return the row of ``triads`` of a measurement."""
-    return measured.frames[sensor, 0] + measured.frames[sensor, 1] * (place - measured.bounds[sensor])
+    s = measured.series
+    return s[sensor, FIRST_FRAME] + s[sensor, FRAME_STEP] * (place - s[sensor, FIRST_PLACE])
 
 
 def frame_at(triads, t):

@@ -46,6 +46,7 @@ from strapdown.kernels.measurement import (
     ATTITUDE,
     DIRECTION,
     HEADING,
+    KIND,
     frame_of,
     noise_of,
     sigma_of,
@@ -114,34 +115,32 @@ class Model(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Work space of a step and of an update; n states in all."""
+    """Work space of a step and of an update, in few arrays: each one more costs a kernel's compiling. n states in all, m error states."""
 
+    rows: np.ndarray
+    """(3, 3, n): H of a measurement, H turned to the prior's tangent space, and F Hᵀ."""
+    lines: np.ndarray
+    """(6, length of F): in the order of the constants below."""
+    threes: np.ndarray
+    """(5, 3): y, variances of the rows, and the body axes that the rows measure along."""
+    coupling: np.ndarray
+    """(m, 3): the attitude's share of each error state over a step."""
     links: np.ndarray
     """(chained states, ``LINKS``)"""
-    coupling: np.ndarray
-    """(m, 3)"""
-    factor: np.ndarray
-    """(m,)"""
-    work: np.ndarray
-    """As long as F has rows."""
     six: np.ndarray
     """(6, 6)"""
-    H: np.ndarray
-    """(3, n), and so ``prior_H`` and ``seen``."""
-    y: np.ndarray
-    """(3,), and so ``spread``."""
-    spread: np.ndarray
-    basis: np.ndarray
-    """(3, 3)"""
-    prior_H: np.ndarray
-    seen: np.ndarray
-    prior: np.ndarray
-    """(n,), and so ``step``."""
-    step: np.ndarray
-    now_x: np.ndarray
-    """(n − 3,)"""
-    fresh: np.ndarray
-    """(3 m + 6, 3 + m)"""
+
+
+PRIOR = 0
+"""Where the prior's mean lies (n,), seen from the state of the linearisation."""
+STEP = 1
+"""A correction (n,)."""
+NOW_X = 2
+"""Bias and error states at the linearisation (n − 3,)."""
+FACTOR = 3
+"""What of each error state is left after a step (m,)."""
+WORK = 4
+LINES = 5
 
 
 class Body(NamedTuple):
@@ -176,6 +175,8 @@ class Restart(NamedTuple):
     root: np.ndarray
     """Their covariance ``rootᵀ root`` (m, m)."""
     time: float
+    fresh: np.ndarray
+    """Scratch (3 m + 6, 3 + m)."""
 
 
 class Outputs(NamedTuple):
@@ -230,13 +231,13 @@ def keep_row(form, q, row, out):
 def advance(model, scratch, q, x, F, dt, part):
     """Propagate a state over an increment ``part``, ``x`` and ``F`` in place; return q."""
     size = len(x) + 3
-    coupling, factor = scratch.coupling, scratch.factor
+    coupling, factor = scratch.coupling, scratch.lines[FACTOR, : size - 6]
     q, phi11, phi12, rate, D = move(
         q, x, dt, part, model.decay, model.gyro, model.gyro_use, model.force_f, coupling, factor
     )
     carry(F, 0, size, phi11, phi12, coupling, factor, model.gyro_use, model.changing)
     rows = step_noise(model, scratch.links, F, size, dt, rate, D, x)
-    triangularise(F, 6 + model.changing, 3, size, rows, 0, 0, scratch.work)
+    triangularise(F, 6 + model.changing, 3, size, rows, 0, 0, scratch.lines[WORK])
     return q
 
 
@@ -269,7 +270,7 @@ def settle(model, scratch, F, before, after, x):
         A = fixed_turn(before, after)
         turn_values(model.chains, A, x, 3)
         loose = turn_columns(model.chains, A, F, size)
-    triangularise(F, loose, loose, size, size, 0, 0, scratch.work)
+    triangularise(F, loose, loose, size, size, 0, 0, scratch.lines[WORK])
 
 
 # --------------------------------------------------------------------------------------------------------------- the filter without a gate
@@ -277,7 +278,8 @@ def settle(model, scratch, F, before, after, x):
 
 def begin(body):
     """Return the attitude and the number of segments."""
-    return load(body, 0), 0
+    # From an array, and not the literal 0: numba would compile the body for that type too.
+    return load(body, 0), 0 * len(body.length)
 
 
 def is_small(state, part, dt, body):
@@ -303,11 +305,17 @@ def update(state, e, now, measured, body, out):
     """Update with a measurement."""
     q, segments = state
     model, scratch, x, F = body.model, body.scratch, body.x[0], body.F[0]
-    H, y, spread, step, work = scratch.H, scratch.y, scratch.spread, scratch.step, scratch.work
+    H, y, spread, step, work = (
+        scratch.rows[0],
+        scratch.threes[0],
+        scratch.threes[1],
+        scratch.lines[STEP],
+        scratch.lines[WORK],
+    )
     size = len(x) + 3
     place = measured.place[e]
     s = measured.sensor[e]
-    kind = measured.kinds[s]
+    kind = measured.series[s, KIND]
     z = value_of(measured, place, s)
     sigma = sigma_of(measured, place, s)
     levered = len(body.turning) > 0 and body.turning[e, 6] > 0.0
@@ -324,14 +332,14 @@ def update(state, e, now, measured, body, out):
                 (body.turning[e, 6], body.turning[e, 7], body.turning[e, 8]),
                 C,
             )
-        decorrelate(H, y, rows, scratch.basis, C, spread)
+        decorrelate(H, y, rows, scratch.threes[2:], C, spread)
     else:
         for r in range(rows):
             spread[r] = sigma * sigma
             if kind == ATTITUDE:
                 spread[r] = z[0] if r == 0 else (z[1] if r == 1 else z[2])
             elif kind == DIRECTION:
-                basis = scratch.basis
+                basis = scratch.threes[2:]
                 spread[r] *= basis[r, 0] ** 2 + basis[r, 1] ** 2 + basis[r, 2] ** 2
     for i in range(size):
         step[i] = 0.0
@@ -372,7 +380,20 @@ def seen_rows(form, e, q, x, kind, z, frame, sensor):
     R = rotation_matrix(q)
     length = form.length[e]
     return fill_rows(
-        q, R, x, kind, z, frame, length, sensor, model.sensors, model.sensor_use, W, scratch.H, scratch.y, scratch.basis
+        q,
+        R,
+        x,
+        kind,
+        z,
+        frame,
+        length,
+        sensor,
+        model.sensors,
+        model.sensor_use,
+        W,
+        scratch.rows[0],
+        scratch.threes[0],
+        scratch.threes[2:],
     )
 
 
@@ -468,9 +489,9 @@ def start_update(form, i):
     """Begin the linearisation at the state itself."""
     scratch, x = form.scratch, form.x[i]
     for j in range(len(x)):
-        scratch.now_x[j] = x[j]
+        scratch.lines[NOW_X][j] = x[j]
     for j in range(len(x) + 3):
-        scratch.prior[j] = 0.0  # where the prior's mean lies, seen from the state of the linearisation
+        scratch.lines[PRIOR][j] = 0.0  # where the prior's mean lies, seen from the state of the linearisation
 
 
 def linearised(form, i, e, now_q, q, M, z, frame, noise, kind, sensor, prior):
@@ -479,23 +500,23 @@ def linearised(form, i, e, now_q, q, M, z, frame, noise, kind, sensor, prior):
     The rows stand in ``prior_H``, turned to the prior's tangent space, and as they are in ``H``.
     """
     model, scratch = form.model, form.scratch
-    H, y, spread, prior_H = scratch.H, scratch.y, scratch.spread, scratch.prior_H
-    size = H.shape[1]
-    now_x = scratch.now_x
+    H, y, spread, prior_H = scratch.rows[0], scratch.threes[0], scratch.threes[1], scratch.rows[1]
+    size = form.F.shape[2]
+    now_x = scratch.lines[NOW_X, : size - 3]
     rows = seen_rows(form, e, now_q, now_x, kind, z, frame, sensor)
-    far, along = seen_from_afar(kind, z, rows, y, scratch.basis)
+    far, along = seen_from_afar(kind, z, rows, y, scratch.threes[2:])
     C = noise
     if len(form.turning) > 0 and form.turning[e, 6] > 0.0:
         arm = (form.turning[e, 6], form.turning[e, 7], form.turning[e, 8])
         C = arm_noise(now_x, sensor, model.sensors, model.sensor_use, form.length[e], arm, noise)
-    decorrelate(H, y, rows, scratch.basis, C, spread)
+    decorrelate(H, y, rows, scratch.threes[2:], C, spread)
     p0 = p1 = p2 = 0.0
     for j in range(size):
         for r in range(3):
             prior_H[r, j] = H[r, j]
-        p0 += H[0, j] * scratch.prior[j]
-        p1 += H[1, j] * scratch.prior[j]
-        p2 += H[2, j] * scratch.prior[j]
+        p0 += H[0, j] * scratch.lines[PRIOR][j]
+        p1 += H[1, j] * scratch.lines[PRIOR][j]
+        p2 += H[2, j] * scratch.lines[PRIOR][j]
     for r in range(3):
         put_row(prior_H, r, transpose_times_vector(M, vector_at(H, r)))
     if len(model.chains) > 0:
@@ -523,8 +544,8 @@ def seen_from_afar(kind, z, rows, y, basis):
 
 def innovation_covariance(form, i, q, rows):
     """Return H P Hᵀ (6-tuple), rows that are not there as zeros; leave ``F Hᵀ`` in ``seen``."""
-    F, H, seen = form.F[i], form.scratch.prior_H, form.scratch.seen
-    size = H.shape[1]
+    F, H, seen = form.F[i], form.scratch.rows[1], form.scratch.rows[2]
+    size = form.F.shape[2]
     for r in range(3):
         for j in range(size):
             total = 0.0
@@ -550,8 +571,8 @@ def step_of(form, i, state, rows, u, M, prior, q, now_q):
     Also return the square of what it changes in the rows: the attitude's part, and the error states' seen in the rows.
     """
     scratch, F = form.scratch, form.F[i]
-    step, seen, H = scratch.step, scratch.seen, scratch.H
-    size = len(step)
+    step, seen, H = scratch.lines[STEP], scratch.rows[2], scratch.rows[0]
+    size = form.F.shape[2]
     for j in range(size):
         step[j] = 0.0
     for j in range(size):
@@ -562,7 +583,7 @@ def step_of(form, i, state, rows, u, M, prior, q, now_q):
     if len(form.model.chains) > 0:
         turn_values(form.model.chains, fixed_turn(q, now_q), step, 6)
     for j in range(size):
-        step[j] += scratch.prior[j]
+        step[j] += scratch.lines[PRIOR][j]
     squared = step[0] * step[0] + step[1] * step[1] + step[2] * step[2]
     for r in range(rows):
         total = 0.0
@@ -575,10 +596,10 @@ def step_of(form, i, state, rows, u, M, prior, q, now_q):
 def relinearise(form, i, q, old_q, now_q, prior, fresh):
     """Go to another point of linearisation; ``fresh``: the states beside the attitude go back to the state itself."""
     scratch, x, chains = form.scratch, form.x[i], form.model.chains
-    now_x, all_prior = scratch.now_x, scratch.prior
+    now_x, all_prior = scratch.lines[NOW_X], scratch.lines[PRIOR]
     all_prior[0], all_prior[1], all_prior[2] = prior
     for j in range(len(x)):
-        now_x[j] = x[j] if fresh else now_x[j] + scratch.step[3 + j]
+        now_x[j] = x[j] if fresh else now_x[j] + scratch.lines[STEP][3 + j]
         all_prior[3 + j] = x[j]
     if len(chains) > 0:
         turn_values(chains, fixed_turn(old_q, now_q), now_x, 3)
@@ -590,8 +611,8 @@ def relinearise(form, i, q, old_q, now_q, prior, fresh):
 def correct(form, i, q, rows, e, variance):
     """Update with independent rows of innovations e (3,), prior's tangent space; return q and the attitude's correction."""
     scratch, x, F = form.scratch, form.x[i], form.F[i]
-    H, step, work = scratch.prior_H, scratch.step, scratch.work
-    size = len(step)
+    H, step, work = scratch.rows[1], scratch.lines[STEP], scratch.lines[WORK]
+    size = form.F.shape[2]
     for j in range(size):
         step[j] = 0.0
     for r in range(rows):
@@ -626,7 +647,7 @@ def start_candidate(form, memory, now, attitude_sigma, restart):
     all the same. Attitude and bias are widened by how many candidates have been before it.
     """
     model, scratch, x, F = form.model, form.scratch, form.x, form.F
-    decay, density, chains, fresh = model.decay, model.density, model.chains, scratch.fresh
+    decay, density, chains, fresh = model.decay, model.density, model.chains, restart.fresh
     size = F.shape[2]
     age = now - restart.time
     width = restart_width(memory)
@@ -652,7 +673,7 @@ def start_candidate(form, memory, now, attitude_sigma, restart):
     for r in range(3 + m):
         for c in range(3):
             fresh[3 + 2 * m + r, c] = F[0, 3 + r, 3 + c]
-    triangularise(fresh, 3 + m, 0, 3 + m, 3 * m + 6, 0, 0, scratch.work)
+    triangularise(fresh, 3 + m, 0, 3 + m, 3 * m + 6, 0, 0, scratch.lines[WORK])
     for r in range(size):
         for c in range(size):
             F[1, r, c] = 0.0
@@ -759,7 +780,7 @@ def widen(form, memory):
     size = F.shape[1]
     if not may_widen(bias_variances(F, size), memory):
         return
-    column = scratch.prior
+    column = scratch.lines[PRIOR]
     turn = (0.0, 0.0, 0.0)
     for i in range(3):
         for c in range(size):
@@ -774,7 +795,7 @@ def widen(form, memory):
         root = math.sqrt(-inverse)
         for c in range(size):
             F[size, c] = root * column[c]
-        triangularise(F, size, 0, size, size + 1, 0, 0, scratch.work)
+        triangularise(F, size, 0, size, size + 1, 0, 0, scratch.lines[WORK])
     before = load(form, 1)
     q, G = seen_from(turn, attitude_covariance(form, 1, before))
     after = quaternion_multiply(before, q)

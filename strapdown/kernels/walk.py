@@ -79,14 +79,15 @@ def walk(edges, increments, measured, every, body, out):
     state = begin(body)
     time = measured.time
     events = len(time)
-    e = 0
+    none = 0 * events  # an integer like any other and not the literal 0: numba would compile the body for that type too
+    e = none
     k = -1  # the interval before the first edge has no length; its end takes the measurements at the first edge
     now = edges[0]
     end = now
     whole = 1.0
     theta = (0.0, 0.0, 0.0)
     countdown = 0
-    row = 0
+    row = none
     # One pass predicts to the next measurement or edge, updates with the measurement, and closes the interval, each where there is one.
     while k < len(increments) and not stopped(state):
         due = e < events and time[e] <= end

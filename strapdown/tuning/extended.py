@@ -24,11 +24,11 @@ from typing import Any
 import numpy as np
 
 from strapdown import setup, units
-from strapdown.setup.states import VELOCITY, Entries, SensorStates, States
 from strapdown.checks import Array, InputError, count, one_of
 from strapdown.mekf import State
 from strapdown.records import ImuRecord
 from strapdown.setup import FilterSetup
+from strapdown.setup.states import VELOCITY, Entries, SensorStates, States
 from strapdown.tuning import parameters
 from strapdown.tuning.innovations import STEP, Case, Derivatives
 from strapdown.tuning.parameters import INITIAL_ATTITUDE, INITIAL_BIAS, SCALE, Unit

@@ -14,12 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import mekf, setup
+from strapdown import setup
 from strapdown.checks import Array, InputError, count
-from strapdown.kernels import tuning_loop
+from strapdown.estimation.schedule import Schedule, schedule
+from strapdown.estimation.states import State, pack
+from strapdown.kernels import likelihood as kernel
+from strapdown.kernels import likelihood_outliers
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.machine import compiled
-from strapdown.mekf import State
+from strapdown.kernels.walk import walk
 from strapdown.records import ImuRecord
 from strapdown.setup import FilterSetup
 from strapdown.tuning.parameters import (
@@ -79,7 +82,7 @@ class Prepared:
 
     time: Array
     increments: Array
-    events: mekf.Schedule
+    events: Schedule
     state: Array
     cuts: Array
     used: np.ndarray
@@ -228,47 +231,51 @@ class Likelihood:
         innovations: bool = False,
     ) -> dict[str, Array]:
         """Run up to eight points over one record."""
-        lane = self.lanes(case, points)
-        parts = len(case.cuts) + 1
         kept = np.empty(0, np.int64) if epochs is None else np.asarray(epochs, np.int64)
-        out = {
-            "minus_log": np.zeros((parts, WIDTH)),
-            "squares": np.zeros((parts, WIDTH)),
-            "score": np.zeros((parts, free)),
-            "information": np.zeros((parts, free, free)),
-            "outer": np.zeros((parts, free, free)),
-            "states": np.empty((len(kept), 28, WIDTH)),
-            "innovations": np.zeros((len(case.events.time) if innovations else 0, 3, 2, WIDTH)),
-        }
-        compiled(tuning_loop.run_parameters)(
-            case.time,
-            case.increments,
-            lane["noise"],
-            case.events.time,
-            case.events.kind,
-            case.events.vector_b,
-            case.events.variance,
-            case.events.sensor,
-            lane["factors"],
-            case.events.reference,
-            case.events.triads,
-            lane["state"],
-            case.cuts,
-            free,
-            STEP,
-            out["minus_log"].reshape(-1),
-            out["squares"].reshape(-1),
-            out["score"],
-            out["information"],
-            out["outer"],
-            kept,
-            out["states"].reshape(-1),
-            out["innovations"].reshape(-1),
-            np.empty(12 * WIDTH),
-            np.empty(6 * WIDTH),
-            np.empty(4 * WIDTH),
-        )
-        return out
+        room = pass_arrays(case, free, epochs=len(kept), innovations=innovations)
+        run_lanes(case, self.lanes(case, points), room, free, kept)
+        return room
+
+
+def pass_arrays(
+    case: Prepared, free: int, *, epochs: int = 0, innovations: bool = False, outliers: bool = False
+) -> dict[str, Array]:
+    """Return room for what one pass over a record writes, by its name in :class:`strapdown.kernels.likelihood.Outputs`."""
+    parts, events = len(case.cuts) + 1, len(case.events.time)
+    return {
+        "minus_log": np.zeros((parts, WIDTH)),
+        "squares": np.zeros((parts, WIDTH)),
+        "score": np.zeros((parts, free)),
+        "information": np.zeros((parts, free, free)),
+        "outer": np.zeros((parts, free, free)),
+        "states": np.empty((epochs, 28, WIDTH)),
+        "innovations": np.zeros((events if innovations else 0, 3, 2, WIDTH)),
+        "probability": np.empty((events if outliers else 0, 2)),
+    }
+
+
+def run_lanes(
+    case: Prepared,
+    lane: Mapping[str, Array],
+    room: Mapping[str, Array],
+    free: int,
+    epochs: np.ndarray,
+    outliers: Array | None = None,
+) -> None:
+    """Run the filter over a record at the parameters of each lane; with ``outliers`` by the mixture."""
+    flat = ("minus_log", "squares", "states", "innovations")
+    body = kernel.Body(
+        **lane,
+        outliers=np.empty(0) if outliers is None else outliers,
+        cuts=case.cuts,
+        epochs=epochs,
+        free=free,
+        step=STEP,
+        room=np.empty(kernel.ROOM),
+    )
+    out = kernel.Outputs(**{name: value.reshape(-1) if name in flat else value for name, value in room.items()})
+    parts = (kernel,) if outliers is None else (likelihood_outliers, kernel)
+    compiled(walk, *parts)(case.time, case.increments, case.events.measurements, 1, body, out)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -381,7 +388,7 @@ def _prepare(case: Case, chosen: FilterSetup, names: tuple[str, ...], parts: int
     if spacing > 0.0:
         record = replace(record, vectors=tuple(thinned(series, spacing) for series in record.vectors))
     start, end = float(record.time[0]), float(record.time[-1])
-    events = mekf.schedule(record.vectors, start, end)
+    events = schedule(record.vectors, start, end)
     first, last = max(case.first, start), min(case.last, end)
     inside = (events.time >= first) & (events.time <= last)
     if not inside.any():
@@ -417,7 +424,7 @@ def _prepare(case: Case, chosen: FilterSetup, names: tuple[str, ...], parts: int
         time=record.time,
         increments=np.ascontiguousarray(record.increments),
         events=events,
-        state=mekf.pack(case.initial.attitude, case.initial.bias, covariance),
+        state=pack(case.initial.attitude, case.initial.bias, covariance),
         cuts=np.array([*before, *inner, *after]),
         used=used,
         sensors=events.sensors,

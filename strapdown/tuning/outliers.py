@@ -4,7 +4,7 @@ A gate's threshold cannot be tuned by the likelihood of what passes it: the narr
 modelled: with probability ε (``outliers.share``) the noise of a measurement is κ times as large (``outliers.scale``; Tukey's contaminated
 normal, 1960). Each innovation is then a mixture of two normals, and share and scale are estimated with the filter's other parameters, which
 so no longer answer for the outliers. The filter of this likelihood makes each update both ways and goes on with mean and covariance of the
-mixture (:func:`strapdown.kernels.tuning_outliers.run_contaminated`). Share and scale are those of all sensors together.
+mixture (:func:`strapdown.kernels.likelihood_outliers`). Share and scale are those of all sensors together.
 
 The gate refuses where an outlier has become the likelier explanation (Bayes): with d rows and κ′ the ratio of σ of the innovations,
 
@@ -22,13 +22,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from strapdown.checks import Array, InputError, positive
-from strapdown.kernels import tuning_outliers
-from strapdown.kernels.lane_values import WIDTH
-from strapdown.kernels.machine import compiled
 from strapdown.estimation.gating import Gate
+from strapdown.kernels.lane_values import WIDTH
 from strapdown.setup import FilterSetup
 from strapdown.tuning.fitting import REACH, Estimated, Tuning
-from strapdown.tuning.innovations import MOST, STEP, Case, Derivatives, Likelihood, Prepared, likelihood
+from strapdown.tuning.innovations import (
+    MOST,
+    STEP,
+    Case,
+    Derivatives,
+    Likelihood,
+    Prepared,
+    likelihood,
+    pass_arrays,
+    run_lanes,
+)
 from strapdown.tuning.parameters import OUTLIER_SCALE, OUTLIER_SHARE
 from strapdown.vectors import KINDS
 
@@ -114,38 +122,8 @@ class ContaminatedLikelihood:
         rows = np.concatenate([points, np.repeat(points[:1], WIDTH - len(points), axis=0)])
         share = np.minimum(np.exp(rows[:, -2]), 0.9)  # beyond the search, for its differences and profiles
         spread = np.exp(2.0 * rows[:, -1])
-        parts = len(case.cuts) + 1
-        out = {
-            "minus_log": np.zeros((parts, WIDTH)),
-            "score": np.zeros((parts, free)),
-            "outer": np.zeros((parts, free, free)),
-            "probability": np.zeros((len(case.events.time), 2)),
-        }
-        compiled(tuning_outliers.run_contaminated)(
-            case.time,
-            case.increments,
-            lane["noise"],
-            case.events.time,
-            case.events.kind,
-            case.events.vector_b,
-            case.events.variance,
-            case.events.sensor,
-            lane["factors"],
-            case.events.reference,
-            case.events.triads,
-            np.concatenate([share, spread]),
-            lane["state"],
-            case.cuts,
-            free,
-            STEP,
-            out["minus_log"].reshape(-1),
-            out["score"],
-            out["outer"],
-            out["probability"],
-            np.empty(12 * WIDTH),
-            np.empty(4 * WIDTH),
-            np.empty(WIDTH),
-        )
+        out = pass_arrays(case, free, outliers=True)
+        run_lanes(case, lane, out, free, np.empty(0, np.int64), outliers=np.concatenate([share, spread]))
         return out
 
 

@@ -1,0 +1,455 @@
+"""Several attitude filters with weights, until their mixture is one Gaussian: a body of :mod:`strapdown.kernels.walk`.
+
+Each hypothesis is the filter of :mod:`strapdown.kernels.filter_step` with two changes that a wide covariance asks for. Directions are
+processed by Gauss–Newton passes (the iterated filter), so that row and evidence belong to the attitude that the measurement leads to. And a
+correction a carries the covariance by ``exp(−[a])`` instead of J_r(a): that keeps its axes in the *fixed* frame (the right-invariant
+error), where the turn about a reference that never changes stays exactly as unknown as it was.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from strapdown.kernels.algebra import (
+    add,
+    combine,
+    dot,
+    full,
+    matrix_times_vector,
+    multiply,
+    scale,
+    skew_polynomial,
+    subtract,
+    symmetric_times_vector,
+    times_transpose_upper,
+    transpose_times_vector,
+)
+from strapdown.kernels.filter_step import predict as propagated
+from strapdown.kernels.filter_step import update_attitude, update_heading, update_row
+from strapdown.kernels.gate import Options
+from strapdown.kernels.measurement import (
+    ATTITUDE,
+    HEADING,
+    KIND,
+    VECTOR,
+    degrees_of_freedom,
+    direction_rows,
+    frame_of,
+    heading_error,
+    heading_row,
+    sigma_of,
+    value_of,
+    vector_at,
+)
+from strapdown.kernels.robust_step import HUBER, STUDENT
+from strapdown.kernels.rotation import (
+    inverse_right_jacobian,
+    logarithm,
+    moved,
+    quaternion_multiply,
+    rotation_matrix,
+    turned,
+    unit,
+)
+from strapdown.kernels.series import second, sinc
+from strapdown.kernels.state import load_state, store_state
+from strapdown.kernels.walk import SQUARED_RANGE, step_within, turn_squared
+
+BORROWS_ARRAYS = True
+"""See :mod:`strapdown.kernels.machine`."""
+
+CALLED = ("updated", "moment_match", "normalized_weights")
+
+PASSES = 5
+"""Most Gauss–Newton passes of one update."""
+SETTLED = 1e-6
+"""Square of a step, rad², below which no further pass is made: what it leaves is half of it."""
+NEVER = -1
+LOST = -2
+"""Instead of the edge at which hypotheses became one: they did not; most of them, by weight, refuse one measurement after the other."""
+
+
+def update_iterated(q, b, A, B, C, u, v, z, variance):
+    """Update with a unit direction ``z`` (body), its reference in the triad u × v = r, by Gauss–Newton passes.
+
+    Pass by pass the point q moves towards the most probable attitude. At each the prior has the mean ``m`` (body axes of that point) and
+    the covariance carried there; rows are those of the point. Returns (q, b, A, B, C) and both innovations with their variances.
+    """
+    m = (0.0, 0.0, 0.0)
+    e1 = e2 = s1 = s2 = 1.0
+    A_new, B_new, C_new, b_new = A, B, C, b
+    for _ in range(PASSES):
+        h1, y1, h2, y2 = direction_rows(rotation_matrix(q), u, v, z)
+        e1 = y1 - dot(h1, m)
+        first, b_new, A_new, B_new, C_new, s1 = update_row(b, A, B, C, h1, e1, variance)
+        e2 = y2 - dot(h2, m) - dot(h2, first)
+        last, b_new, A_new, B_new, C_new, s2 = update_row(b_new, A_new, B_new, C_new, h2, e2, variance)
+        step = add(m, add(first, last))
+        squared = dot(step, step)
+        turn = skew_polynomial(1.0, -sinc(squared), second(squared), step)
+        q = unit(turned(q, step))
+        A = times_transpose_upper(multiply(turn, full(A)), turn)
+        B = multiply(turn, B)
+        A_new = times_transpose_upper(multiply(turn, full(A_new)), turn)
+        B_new = multiply(turn, B_new)
+        m = matrix_times_vector(turn, subtract(m, step))
+        if squared < SETTLED:
+            break
+    return q, b_new, A_new, B_new, C_new, e1, s1, e2, s2
+
+
+def updated(kind, q, b, A, B, C, z, frame, variance, weight):
+    """Update with one measurement of any kind, its variance divided by ``weight``.
+
+    ``frame`` is the row of the triads. Returns (q, b, A, B, C), the innovations with their variances (e₁, s₁, e₂, s₂, e₃, s₃), of a
+    measurement with fewer filled up by (0, 1), and the mean square of its residual after the update over its own variance:
+    rᵀR⁻¹r and tr R⁻¹HP⁺Hᵀ, R not divided.
+    """
+    e1, s1, e2, s2, e3, s3 = 0.0, 1.0, 0.0, 1.0, 0.0, 1.0
+    if kind == ATTITUDE:
+        measured = (frame[0], frame[1], frame[2], frame[3])
+        q, b, A, B, C, e1, s1, e2, s2, e3, s3 = update_attitude(q, b, A, B, C, measured, scale(1.0 / weight, z))
+        r = logarithm(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), measured))
+        distance = r[0] * r[0] / z[0] + r[1] * r[1] / z[1] + r[2] * r[2] / z[2]
+        spread = A[0] / z[0] + A[3] / z[1] + A[5] / z[2]
+    elif kind == HEADING:
+        level = (frame[6], frame[7], frame[8])
+        R = rotation_matrix(q)
+        h = heading_row(R, z)
+        error = heading_error(R, z, level)
+        q, b, A, B, C, e1, s1 = update_heading(q, b, A, B, C, h, error, variance / weight)
+        R = rotation_matrix(q)
+        h = heading_row(R, z)
+        left = heading_error(R, z, level)
+        distance = left * left / variance
+        spread = dot(h, symmetric_times_vector(A, h)) / variance
+    else:
+        u = (frame[0], frame[1], frame[2])
+        v = (frame[3], frame[4], frame[5])
+        q, b, A, B, C, e1, s1, e2, s2 = update_iterated(q, b, A, B, C, u, v, z, variance / weight)
+        R = rotation_matrix(q)
+        h1, y1, h2, y2 = direction_rows(R, u, v, z)
+        distance = (y1 * y1 + y2 * y2) / variance
+        spread = (dot(h1, symmetric_times_vector(A, h1)) + dot(h2, symmetric_times_vector(A, h2))) / variance
+        if kind == VECTOR:
+            # Its length says nothing of the attitude, but belongs to the innovation.
+            e3 = dot(transpose_times_vector(R, (frame[6], frame[7], frame[8])), z) - 1.0
+            s3 = variance / weight
+            distance += e3 * e3 / variance
+    return q, b, A, B, C, e1, s1, e2, s2, e3, s3, distance, spread
+
+
+def heavy_tailed(robust, parameter, numerator, nis):
+    """Return what stands for the NIS in −2 log of the likelihood under a robust update: Huber's function, or that of Student's t."""
+    if robust == STUDENT:
+        return numerator * math.log(1.0 + nis / parameter)
+    if robust == HUBER and nis > parameter:
+        return 2.0 * math.sqrt(parameter * nis) - parameter
+    return nis
+
+
+def mean_attitude(states, weight):
+    """Return the weighted mean attitude, Σ w Log(q̄⁻¹ ⊗ q_i) = 0, nearest to the heaviest hypothesis."""
+    heaviest = 0
+    for i in range(len(weight)):
+        if weight[i] > weight[heaviest]:
+            heaviest = i
+    q = (states[heaviest, 0], states[heaviest, 1], states[heaviest, 2], states[heaviest, 3])
+    for _ in range(20):
+        shift = (0.0, 0.0, 0.0)
+        for i in range(len(weight)):
+            if weight[i] > 0.0:
+                other = (states[i, 0], states[i, 1], states[i, 2], states[i, 3])
+                d = logarithm(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), other))
+                shift = combine(1.0, shift, weight[i], d)
+        q, _ = moved(q, shift)
+        q = unit(q)
+        if dot(shift, shift) < 1e-24:
+            break
+    return q
+
+
+def moment_match(states, weight, between, out):
+    """Write the Gaussian of the mixture's first two moments to ``out`` (28,), and how far its members lie apart to ``between`` (12,).
+
+    About the mean q̄ a member lies at d_i = Log(q̄⁻¹ ⊗ q_i), b_i − b̄, and its covariance is carried there by J_r⁻¹(d_i):
+    ``P = Σ w_i (G_i P_i G_iᵀ + d_i d_iᵀ)``. ``between`` gets the second part's attitude and bias blocks.
+    """
+    q = mean_attitude(states, weight)
+    mean = (0.0, 0.0, 0.0)
+    for i in range(len(weight)):
+        if weight[i] > 0.0:
+            mean = combine(1.0, mean, weight[i], (states[i, 4], states[i, 5], states[i, 6]))
+    for n in range(12):
+        between[n] = 0.0
+    for n in range(28):
+        out[n] = 0.0
+    out[0], out[1], out[2], out[3] = q
+    out[4], out[5], out[6] = mean
+    for i in range(len(weight)):
+        w = weight[i]
+        if w > 0.0:
+            own, b, A, B, C = load_state(states[i])
+            d = logarithm(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), own))
+            e = subtract(b, mean)
+            G = inverse_right_jacobian(d)
+            A = times_transpose_upper(multiply(G, full(A)), G)
+            B = multiply(G, B)
+            k = 0
+            for r in range(3):
+                for c in range(r, 3):
+                    between[k] += w * d[r] * d[c]
+                    between[6 + k] += w * e[r] * e[c]
+                    out[7 + k] += w * (A[k] + d[r] * d[c])
+                    out[22 + k] += w * (C[k] + e[r] * e[c])
+                    k += 1
+                for c in range(3):
+                    out[13 + 3 * r + c] += w * (B[3 * r + c] + d[r] * e[c])
+
+
+def share_between(total, part):
+    """Return tr(T⁻¹ S) of symmetric T > 0 and S: the part of a covariance that lies between the members, summed over its axes.
+
+    By Cholesky's factor T = L Lᵀ, a column of L⁻¹ at a time: T may have one axis open and two known a hundred thousand times better.
+    """
+    a = math.sqrt(total[0])
+    b, c = total[1] / a, total[2] / a
+    d = math.sqrt(total[3] - b * b)
+    e = (total[4] - b * c) / d
+    f = math.sqrt(total[5] - c * c - e * e)
+    # Rows of L⁻¹, each then w S wᵀ.
+    x = (1.0 / a, 0.0, 0.0)
+    y = (-b / (a * d), 1.0 / d, 0.0)
+    z = ((b * e - c * d) / (a * d * f), -e / (d * f), 1.0 / f)
+    S = (part[0], part[1], part[2], part[3], part[4], part[5])
+    return (
+        dot(x, symmetric_times_vector(S, x))
+        + dot(y, symmetric_times_vector(S, y))
+        + dot(z, symmetric_times_vector(S, z))
+    )
+
+
+def normalized_weights(log_weight, least, weight):
+    """Write the weights, those below ``least`` as 0 for good; return what was taken from each logarithm, so that the largest is 0."""
+    best = -math.inf
+    for i in range(len(log_weight)):
+        best = max(best, log_weight[i])
+    total = 0.0
+    for i in range(len(log_weight)):
+        relative = math.exp(log_weight[i] - best)
+        if relative < least:
+            log_weight[i] = -math.inf
+            relative = 0.0
+        else:
+            log_weight[i] -= best
+        weight[i] = relative
+        total += relative
+    for i in range(len(log_weight)):
+        weight[i] /= total
+    return best
+
+
+class Body(NamedTuple):
+    """The hypotheses, and what weighs them.
+
+    There may be further sets of hypotheses, of no weight at first: what the measurements ``later`` leave open, each on its own. A set is
+    given, at its measurement, the weight that those before would have had they refused all directions until then at a NIS of ``charge``:
+    the first ones may be outliers, and nothing else shows which. Hypotheses are not one before the first of these.
+    """
+
+    angle_variance: float
+    """σ_v², rad²/s."""
+    rate_variance: float
+    """σ_u², rad²/s³."""
+    states: np.ndarray
+    """(h, 28); row 0 is the Gaussian that they have become, where they have."""
+    log_weight: np.ndarray
+    """(h,), and so ``weight``, left at the last weights."""
+    weight: np.ndarray
+    later: np.ndarray
+    """Measurements whose sets come later (k,), counted from the first of the walk."""
+    sets: np.ndarray
+    """Where these sets begin, and the number of all hypotheses (k + 1,)."""
+    charge: float
+    options: Options
+    """Gate and robust weights. ``recovery``: hypotheses of more than half the weight that refuse so many in a row are lost; 0: never."""
+    min_weight: float
+    """Hypotheses of less weight than this relative to the heaviest are dropped."""
+    max_share: float
+    """They are one when less than this part of the attitude's and the bias's covariance lies between them."""
+    first_edge: int
+    """Number of the walk's first edge in the record."""
+    on_edge: bool
+    """Whether that is an edge, and not a time between two."""
+    every: int
+    room: np.ndarray
+    """Scratch (40,)."""
+
+
+class Outputs(NamedTuple):
+    """Arrays that a run writes: a row for each kept edge, and of innovations for each measurement, by place."""
+
+    attitude: np.ndarray
+    bias: np.ndarray
+    covariance: np.ndarray
+    weights: np.ndarray
+    """(rows, h), or (0, h)."""
+    innovation: np.ndarray
+    """Innovations of the heaviest hypothesis (events, 6)."""
+    share: np.ndarray
+    """Its weights of the measurements (events,)."""
+
+
+def begin(body):
+    """Return the sets started, the log weight of having refused all, refusals in a row, rows written, and the edge where all became one."""
+    normalized_weights(body.log_weight, body.min_weight, body.weight)
+    refused = 0.0
+    for i in range(len(body.weight)):
+        if body.weight[i] > 0.0:
+            refused += math.exp(body.log_weight[i])
+    none = 0 * len(body.weight)
+    return none, math.log(refused), none, none, none + NEVER
+
+
+def largest_turn(part, dt, body):
+    """Return the largest squared turn of the hypotheses."""
+    squared = 0.0
+    for i in range(len(body.weight)):
+        if body.weight[i] > 0.0:
+            squared = max(squared, turn_squared(part, dt, vector_at(body.states[:, 4:], i)))
+    return squared
+
+
+def is_small(state, part, dt, body):
+    """Return whether the turn of every hypothesis is in the range of the polynomials."""
+    return largest_turn(part, dt, body) <= SQUARED_RANGE
+
+
+def longest_step(state, part, dt, body):
+    """Return the longest step, s."""
+    return step_within(largest_turn(part, dt, body), dt)
+
+
+def predict(state, part, dt, body, out):
+    """Propagate every hypothesis."""
+    for i in range(len(body.weight)):
+        if body.weight[i] > 0.0:
+            q, b, A, B, C = load_state(body.states[i])
+            q, A, B, C = propagated(q, b, A, B, C, part, dt, body.angle_variance, body.rate_variance)
+            store_state(body.states[i], q, b, A, B, C)
+    return state
+
+
+def update(state, e, now, measured, body, out):
+    """Update every hypothesis with a measurement, and weigh it by its likelihood."""
+    started, refused, streak, row, one_at = state
+    options, weight, log_weight = body.options, body.weight, body.log_weight
+    place = measured.place[e]
+    sensor = measured.sensor[e]
+    kind = measured.series[sensor, KIND]
+    threshold = options.thresholds[degrees_of_freedom(kind) - 1]
+    leader = 0
+    for i in range(len(weight)):
+        if weight[i] > weight[leader]:
+            leader = i
+    refusing = 0.0
+    height = 0.0
+    for i in range(len(weight)):
+        if weight[i] > 0.0:
+            share, nis, e_s = update_one(i, place, sensor, kind, threshold, measured, body)
+            if share == 0.0:
+                refusing += weight[i]
+            spread = math.log(e_s[1]) + math.log(e_s[3]) + math.log(e_s[5])
+            log_weight[i] -= 0.5 * (nis + spread)
+            if i == leader:
+                height = spread
+                out.share[place] = share
+                for n in range(6):
+                    out.innovation[place, n] = e_s[n]
+    refused -= 0.5 * (height + (1.0 if kind == HEADING else body.charge))
+    if started < len(body.later) and e == body.later[started]:
+        members = body.sets[started + 1] - body.sets[started]
+        for i in range(body.sets[started], body.sets[started + 1]):
+            log_weight[i] = refused - math.log(members)
+        started += 1
+    refused -= normalized_weights(log_weight, body.min_weight, weight)
+    streak = streak + 1 if refusing > 0.5 else 0 * streak
+    if options.recovery > 0 and streak >= options.recovery:
+        one_at = 0 * one_at + LOST
+    return started, refused, streak, row, one_at
+
+
+def update_one(i, place, sensor, kind, threshold, measured, body):
+    """Update hypothesis i; return its weight of the measurement (0: refused), what counts as its NIS, and e₁, s₁, e₂, s₂, e₃, s₃."""
+    options = body.options
+    degrees = degrees_of_freedom(kind)
+    parameter, numerator = options.parameters[degrees - 1, 0], options.parameters[degrees - 1, 1]
+    z = value_of(measured, place, sensor)
+    frame = frame_of(measured, place, sensor)
+    sigma = sigma_of(measured, place, sensor)
+    variance = sigma * sigma
+    q, b, A, B, C = load_state(body.states[i])
+    done = updated(kind, q, b, A, B, C, z, frame, variance, 1.0)
+    e_s = (done[5], done[6], done[7], done[8], done[9], done[10])
+    nis = e_s[0] * e_s[0] / e_s[1] + e_s[2] * e_s[2] / e_s[3] + e_s[4] * e_s[4] / e_s[5]
+    share = 1.0
+    if nis > threshold:
+        share = 0.0
+    elif options.robust != 0:
+        for _ in range(options.iterations):
+            distance, spread = done[11], done[12]
+            if options.robust == STUDENT:
+                share = numerator / (parameter + distance + spread)
+            elif distance > parameter:
+                share = math.sqrt(parameter / distance)
+            else:
+                share = 1.0
+            done = updated(kind, q, b, A, B, C, z, frame, variance, share)
+    if share > 0.0:
+        store_state(body.states[i], done[0], done[1], done[2], done[3], done[4])
+    # What a hypothesis refuses counts against it as if it lay at the threshold: else none would outlive an outlier.
+    return share, min(heavy_tailed(options.robust, parameter, numerator, nis), threshold), e_s
+
+
+def keep(state, row, e, body, out):
+    """Write the mixture at a kept edge, and see whether the hypotheses are one."""
+    started, refused, streak, written, one_at = state
+    edge = body.first_edge + row
+    if one_at == NEVER and edge % body.every == 0 and (row > 0 or body.on_edge):
+        between, matched = body.room[:12], body.room[12:]
+        moment_match(body.states, body.weight, between, matched)
+        for n in range(4):
+            out.attitude[written, n] = matched[n]
+        for n in range(3):
+            out.bias[written, n] = matched[4 + n]
+        for n in range(21):
+            out.covariance[written, n] = matched[7 + n]
+        left = 0
+        for i in range(len(body.weight)):
+            if written < len(out.weights):
+                out.weights[written, i] = body.weight[i]
+            left += body.weight[i] > 0.0
+        written += 1
+        apart = max(share_between(matched[7:13], between[:6]), share_between(matched[22:28], between[6:]))
+        if (started > 0 or len(body.later) == 0) and (left == 1 or apart < body.max_share):
+            for n in range(28):
+                body.states[0, n] = matched[n]
+            one_at = edge
+    return started, refused, streak, written, one_at
+
+
+def stopped(state):
+    """Return whether the hypotheses are one, or lost."""
+    return state[4] != NEVER
+
+
+def finish(state, row, e, body):
+    """Return the rows written, the edge at which the hypotheses became one (``NEVER``, ``LOST``), and the number of the next measurement.
+
+    Of hypotheses that are lost it is the first of those that they refused in a row.
+    """
+    _, _, streak, written, one_at = state
+    return written, one_at, e - streak if one_at == LOST else e

@@ -1,0 +1,295 @@
+"""The filter at eight sets of parameters in step, one a lane, and the sensitivities of its innovations: a body of the walk.
+
+The same filter as :mod:`strapdown.kernels.covariance_form`: gyro noise, the σ of each sensor and the initial covariance differ from lane to
+lane. Where lane i is lane 0 with parameter i moved a little, differences between lanes are the derivatives of each innovation and of its
+variance, and their sums the score and the information of the likelihood.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from strapdown.kernels.algebra import add, combine, dot, matrix_times_vector, transpose_times_vector
+from strapdown.kernels.filter_step import predict as propagated
+from strapdown.kernels.filter_step import reset, update_row
+from strapdown.kernels.lane_angles import arctangent, rotation_vector
+from strapdown.kernels.lane_values import WIDTH, load, spread, store, total
+from strapdown.kernels.measurement import (
+    ATTITUDE,
+    HEADING,
+    KIND,
+    VECTOR,
+    direction_rows,
+    frame_row,
+    heading_row,
+    sigma_of,
+    value_of,
+)
+from strapdown.kernels.rotation import quaternion_multiply, rotation_matrix
+from strapdown.kernels.series import LARGEST_ANGLE
+from strapdown.kernels.state import load_lanes, store_lanes
+from strapdown.kernels.walk import MAX_TURN, SQUARED_RANGE
+
+BORROWS_ARRAYS = True
+"""See :mod:`strapdown.kernels.machine`."""
+
+HALF_RANGE = 0.25 * SQUARED_RANGE
+"""The square of half the turn that the polynomials bear."""
+FOUND = 12 * WIDTH
+"""Place in the work space of innovations and variances; before it the rows of a measurement."""
+WORK = 18 * WIDTH
+ROOM = 22 * WIDTH
+"""Size of the work space."""
+
+
+class Body(NamedTuple):
+    """Parameters of each lane, and the spans of the record whose sums are kept apart."""
+
+    noise: np.ndarray
+    """σ_v² and σ_u² in lanes (2 × WIDTH)."""
+    factors: np.ndarray
+    """What each sensor's variances are multiplied by (sensors × WIDTH)."""
+    outliers: np.ndarray
+    """Share of outliers and their variance over that of the others (2 × WIDTH); empty where there are none."""
+    state: np.ndarray
+    """Initial states (28 × WIDTH), left at the end states."""
+    cuts: np.ndarray
+    """The span from ``cuts[c − 1]`` to ``cuts[c]``, the last without end, is part c of the record."""
+    epochs: np.ndarray
+    """Edges at which states are kept."""
+    free: int
+    """How many parameters lanes 1, 2, … have moved by ``step``."""
+    step: float
+    room: np.ndarray
+    """Scratch (``ROOM``,)."""
+
+
+class Outputs(NamedTuple):
+    """What a run adds to, by part of the record, and writes."""
+
+    minus_log: np.ndarray
+    """Σ ½ (log s + e²/s) of the innovations (parts × WIDTH)."""
+    squares: np.ndarray
+    """Σ e²/s (parts × WIDTH)."""
+    score: np.ndarray
+    """Derivatives of lane 0 (parts, free)."""
+    information: np.ndarray
+    """Lower triangles (parts, free, free), and so ``outer``, the sums of the outer products of each measurement's gradient."""
+    outer: np.ndarray
+    states: np.ndarray
+    """States at the epochs (epochs × 28 × WIDTH)."""
+    innovations: np.ndarray
+    """e and s of each measurement in order of time (events × 6 × WIDTH, or nothing), one row after the other."""
+    probability: np.ndarray
+    """Of lane 0, that each measurement is an outlier, and its NIS were it none (events, 2), or (0, 2)."""
+
+
+def begin(body):
+    """Return (q, b, A, B, C) in lanes, the part of the record, and the number of states kept."""
+    q, b, A, B, C = load_lanes(body.state, 0)
+    none = 0 * len(body.cuts)
+    return q, b, A, B, C, none, none
+
+
+def is_small(state, part, dt, body):
+    """Return whether increment and bias of every lane turn by half the range of the polynomials at most."""
+    b = state[1]
+    # The sum over the lanes is no less than the largest, and NaN is not below anything.
+    return dot(part, part) <= HALF_RANGE and total(dot(b, b)) * (dt * dt) < HALF_RANGE
+
+
+def longest_step(state, part, dt, body):
+    """Return the longest step, s, that turns no lane too far; a lane that is lost, of a turn above ``MAX_TURN``, is left out."""
+    turn = combine(1.0, part, -dt, state[1])
+    room = body.room
+    store(room, WORK, dot(turn, turn))
+    squared = SQUARED_RANGE
+    for i in range(WIDTH):
+        if squared < room[WORK + i] < MAX_TURN * MAX_TURN:
+            squared = room[WORK + i]
+    return dt * (LARGEST_ANGLE / math.sqrt(squared))
+
+
+def predict(state, part, dt, body, out):
+    """Propagate all lanes."""
+    q, b, A, B, C, span, kept = state
+    q, A, B, C = propagated(q, b, A, B, C, part, dt, load(body.noise, 0), load(body.noise, WIDTH))
+    return q, b, A, B, C, span, kept
+
+
+def part_at(span, now, cuts):
+    """Return the part of the record that a time is in, from that before it on."""
+    while span < len(cuts) and now > cuts[span]:
+        span += 1
+    return span
+
+
+def put_row(rows, k, h, y):
+    """Write row k of a measurement, h (3) and y in lanes, to the work space."""
+    start = 4 * WIDTH * k
+    store(rows, start, h[0])
+    store(rows, start + WIDTH, h[1])
+    store(rows, start + 2 * WIDTH, h[2])
+    store(rows, start + 3 * WIDTH, y)
+
+
+def axis_row(k):
+    """Return unit vector k in lanes."""
+    return (
+        spread(1.0 if k == 0 else 0.0),
+        spread(1.0 if k == 1 else 0.0),
+        spread(1.0 if k == 2 else 0.0),
+    )
+
+
+def measured_rows(q, z, kind, t, triads, rows):
+    """Write the rows of one measurement to ``rows`` and return how many take part in the update."""
+    if kind == ATTITUDE:
+        measured = (
+            spread(triads[t, 0]),
+            spread(triads[t, 1]),
+            spread(triads[t, 2]),
+            spread(triads[t, 3]),
+        )
+        y = rotation_vector(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), measured))
+        put_row(rows, 0, axis_row(0), y[0])
+        put_row(rows, 1, axis_row(1), y[1])
+        put_row(rows, 2, axis_row(2), y[2])
+        return 3
+    R = rotation_matrix(q)
+    if kind == HEADING:
+        m = matrix_times_vector(R, z)
+        east, north = triads[t, 6], triads[t, 7]
+        put_row(rows, 0, heading_row(R, z), arctangent(m[0] * north - m[1] * east, m[0] * east + m[1] * north))
+        return 1
+    u = (triads[t, 0], triads[t, 1], triads[t, 2])
+    v = (triads[t, 3], triads[t, 4], triads[t, 5])
+    h1, y1, h2, y2 = direction_rows(R, u, v, z)
+    put_row(rows, 0, h1, y1)
+    put_row(rows, 1, h2, y2)
+    if kind == VECTOR:
+        r = (triads[t, 6], triads[t, 7], triads[t, 8])
+        store(rows, 8 * WIDTH, dot(transpose_times_vector(R, r), z) - 1.0)
+    return 2
+
+
+def add_derivatives(room, number, free, step, score, information, outer):
+    """Add one event to the score Σ ∂ℓ/∂θ, the information and the outer product of the score; ℓ = ½ (log s + e²/s).
+
+    The work space holds e and s of ``number`` innovations in lanes; lane i is lane 0 with parameter i moved by ``step``. The information is
+    Fisher's by sensitivities, ``ė_j ė_k/s + ½ ṡ_j ṡ_k/s²`` (Segal & Weinstein 1989): positive semidefinite whatever the data.
+    """
+    found = room[FOUND:]
+    work = room[WORK:]
+    for j in range(free):
+        work[j] = 0.0
+    for r in range(number):
+        place = 2 * WIDTH * r
+        e = found[place]
+        s = found[place + WIDTH]
+        inverse = 1.0 / s
+        over = inverse / step
+        whitened = e * e * inverse
+        for j in range(free):
+            change_e = (found[place + 1 + j] - e) * over
+            change_s = (found[place + WIDTH + 1 + j] - s) * over
+            work[WIDTH + j] = change_e
+            work[2 * WIDTH + j] = change_s
+            work[j] += 0.5 * change_s * (1.0 - whitened) + e * change_e
+        for j in range(free):
+            a = work[WIDTH + j] * s
+            c = 0.5 * work[2 * WIDTH + j]
+            for k in range(j + 1):
+                information[j, k] += a * work[WIDTH + k] + c * work[2 * WIDTH + k]
+    for j in range(free):
+        score[j] += work[j]
+        for k in range(j + 1):
+            outer[j, k] += work[j] * work[k]
+
+
+def variance_of(measured, place, sensor, kind, z, r):
+    """Return the variance of row r of a measurement."""
+    if kind == ATTITUDE:
+        return z[0] if r == 0 else (z[1] if r == 1 else z[2])
+    sigma = sigma_of(measured, place, sensor)
+    return sigma * sigma
+
+
+def update(state, e, now, measured, body, out):
+    """Update all lanes with a measurement, and add to the sums of its part of the record."""
+    q, b, A, B, C, span, kept = state
+    span = part_at(span, now, body.cuts)
+    room = body.room
+    place = measured.place[e]
+    sensor = measured.sensor[e]
+    kind = measured.series[sensor, KIND]
+    z = value_of(measured, place, sensor)
+    factor = load(body.factors, WIDTH * sensor)
+    number = measured_rows(q, z, kind, frame_row(measured, place, sensor), measured.triads, room)
+    correction = (spread(0.0), spread(0.0), spread(0.0))
+    for r in range(number):
+        h, y = row_at(room, r)
+        innovation = y - dot(h, correction)
+        variance = variance_of(measured, place, sensor, kind, z, r) * factor
+        turn, b, A, B, C, s = update_row(b, A, B, C, h, innovation, variance)
+        correction = add(correction, turn)
+        store(room, FOUND + 2 * WIDTH * r, innovation)
+        store(room, FOUND + 2 * WIDTH * r + WIDTH, s)
+    q, A, B = reset(q, A, B, correction)
+    if kind == VECTOR:
+        store(room, FOUND + 4 * WIDTH, load(room, 8 * WIDTH))
+        store(room, FOUND + 5 * WIDTH, variance_of(measured, place, sensor, kind, z, 2) * factor)
+        number = 3
+    add_likelihood(room, number, span, out)
+    if len(out.innovations) > 0:
+        start = 6 * WIDTH * e
+        for i in range(2 * WIDTH * number):
+            out.innovations[start + i] = room[FOUND + i]
+    if body.free > 0:
+        add_derivatives(room, number, body.free, body.step, out.score[span], out.information[span], out.outer[span])
+    return q, b, A, B, C, span, kept
+
+
+def add_likelihood(room, number, span, out):
+    """Add a measurement's deviance and log determinant to the sums of its part."""
+    for i in range(WIDTH):
+        product = 1.0
+        deviance = 0.0
+        for r in range(number):
+            e = room[FOUND + 2 * WIDTH * r + i]
+            s = room[FOUND + 2 * WIDTH * r + WIDTH + i]
+            deviance += e * e / s
+            product *= s
+        out.minus_log[WIDTH * span + i] += 0.5 * (math.log(product) + deviance)
+        out.squares[WIDTH * span + i] += deviance
+
+
+def row_at(room, r):
+    """Return h (3) and y of row r in lanes from the work space."""
+    start = 4 * WIDTH * r
+    h = (load(room, start), load(room, start + WIDTH), load(room, start + 2 * WIDTH))
+    return h, load(room, start + 3 * WIDTH)
+
+
+def keep(state, row, e, body, out):
+    """Write the state if the edge is an epoch."""
+    q, b, A, B, C, span, kept = state
+    if kept < len(body.epochs) and body.epochs[kept] == row:
+        store_lanes(out.states, 28 * WIDTH * kept, q, b, A, B, C)
+        kept += 1
+    return q, b, A, B, C, span, kept
+
+
+def stopped(state):
+    """Go on to the end."""
+    return False
+
+
+def finish(state, row, e, body):
+    """Leave the end states."""
+    q, b, A, B, C, _, _ = state
+    store_lanes(body.state, 0, q, b, A, B, C)
+    return row
