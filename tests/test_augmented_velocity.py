@@ -382,6 +382,13 @@ def test_both_faces_agree(option, kind):
         np.testing.assert_allclose(slow.innovations[name].innovation, one.innovation, rtol=1e-7, atol=1e-10)
 
 
+@pytest.mark.parametrize("option", BLOCKS)
+def test_no_time_changes_nothing(option):
+    for block in BLOCKS[option]:
+        assert np.array_equal(block.transition(0.0), np.eye(block.size))
+        assert np.array_equal(block.process_noise(0.0), np.zeros((block.size, block.size)))
+
+
 def test_a_record_may_be_cut_anywhere():
     block = (block_of("position"),)
     record, _ = record_of(block[0], duration=2.0)
