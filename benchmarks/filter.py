@@ -22,9 +22,10 @@ import numpy as np
 from strapdown import mekf
 from strapdown.files import write_json
 from strapdown.kernels.machine import describe
-from strapdown.mekf import ProcessNoise, StepFilter, initial_state
+from strapdown.mekf import ProcessNoise, initial_state
 from strapdown.records import ImuRecord
 from strapdown.robustness import Gate, Robust
+from strapdown.stepfilter import StepFilter
 from strapdown.vectors import VectorMeasurements
 
 RATE = 100.0

@@ -21,11 +21,12 @@ from strapdown import motion, vectors
 from strapdown.files import write_json
 from strapdown.gyro import GyroSpec
 from strapdown.kernels.machine import describe
-from strapdown.mekf import ProcessNoise, StepFilter, initial_state
+from strapdown.mekf import ProcessNoise, initial_state
 from strapdown.montecarlo import lanes, scalar
 from strapdown.montecarlo.plan import Plan
 from strapdown.scenarios import Scenario
 from strapdown.setup import FilterSetup
+from strapdown.stepfilter import StepFilter
 
 NOISE = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6)
 RATE = 100.0

@@ -7,6 +7,7 @@ import json
 import math
 
 import filterpy.common
+import in_steps
 import mpmath
 import numpy as np
 import pytest
@@ -18,9 +19,11 @@ from strapdown.checks import InputError
 from strapdown.kernels import augmented_factor, augmented_step
 from strapdown.kernels.machine import compiled
 from strapdown.mekf import ProcessNoise
+from strapdown.mekf.scheduling import KIND_CODES
 from strapdown.records import ImuRecord
 from strapdown.robustness import Gate
-from strapdown.vectors import VectorMeasurements
+from strapdown.stepfilter import StepFilter
+from strapdown.vectors import VectorMeasurements, triad
 
 NOISE = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-4)
 SWAY = motion.HarmonicRates(
@@ -108,7 +111,7 @@ def start(body_motion=SWAY, error=(0.02, -0.01, 0.015)) -> mekf.State:
 
 
 @dataclasses.dataclass(frozen=True)
-class ReferenceError(augmented.LinearBlock):
+class ReferenceError(augmented.Block):
     """A block that the package does not have: the field's direction is off in fixed axes, the same for two sensors."""
 
     name: str = "field"
@@ -132,7 +135,7 @@ class ReferenceError(augmented.LinearBlock):
 
 
 @dataclasses.dataclass(frozen=True)
-class Mounting(augmented.LinearBlock):
+class Mounting(augmented.Block):
     """The tracker's axes are turned a little against the body's."""
 
     name: str = "mounting"
@@ -227,28 +230,24 @@ def test_without_blocks_the_smoother_is_the_plain_smoother():
 def test_both_faces_are_one_filter(option):
     record, initial, blocks = record_of(duration=2.0, anisotropic=option == "all"), start(), OPTIONS[option]
     whole = augmented.run(record, NOISE, initial, blocks, full_covariance=True)
-    state = augmented.initial_state(initial, blocks)
-    step, end = augmented.stepping.run_on(record, NOISE, state, blocks, full_covariance=True)
+    step = in_steps.run(record, NOISE, augmented.initial_state(initial, blocks), blocks)
     sigma = np.sqrt(np.einsum("kii->ki", whole.whole_covariance))
-    values = {name: block.values for name, block in step.blocks.items()}
-    assert np.max(np.abs(whole.errors(step.attitude, step.bias, values)) / sigma) < 1e-10
+    assert np.max(np.abs(whole.errors(step.attitude, step.bias, step.values)) / sigma) < 1e-10
     assert np.max(np.abs(scaled(whole.whole_covariance - step.whole_covariance, sigma))) < 1e-10
     for name, innovations in whole.innovations.items():
-        np.testing.assert_allclose(step.innovations[name].whitened, innovations.whitened, rtol=0, atol=1e-8)
-    np.testing.assert_allclose(end.covariance, step.whole_covariance[-1], rtol=1e-9, atol=1e-30)
+        np.testing.assert_allclose(step.whitened[name], innovations.whitened, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(step.state.covariance, step.whole_covariance[-1], rtol=1e-9, atol=1e-30)
 
 
 # -------------------------------------------------------------------------------------------------------------------- exact models
 
 
-def face_at(blocks: tuple[Block, ...], values=None, body_motion=SWAY) -> augmented.StepFilter:
+def face_at(blocks: tuple[Block, ...], values=None, body_motion=SWAY) -> StepFilter:
     """The step-by-step face at an attitude with a bias, its blocks at random values."""
     state = augmented.initial_state(start(body_motion), blocks)
     if values is None:
         values = np.sqrt(np.diag(state.covariance)[6:]) * np.random.default_rng(4).standard_normal(len(state.values))
-    return augmented.StepFilter(
-        NOISE, dataclasses.replace(state, values=values, bias=np.array([2e-3, -1e-3, 4e-3])), blocks
-    )
+    return StepFilter(NOISE, dataclasses.replace(state, values=values, bias=np.array([2e-3, -1e-3, 4e-3])), blocks)
 
 
 GYRO_OPTIONS = {
@@ -298,7 +297,7 @@ def test_the_transition_is_the_derivative_of_the_turn(option):
             values=before.values + error[6:],
             covariance=before.covariance,
         )
-        other = augmented.StepFilter(NOISE, moved, blocks)
+        other = StepFilter(NOISE, moved, blocks)
         other.predict(part, dt)
         turn = quaternion.log(quaternion.multiply(quaternion.conjugate(face.attitude), other.attitude))
         return np.concatenate([turn, other.bias - face.bias, other.values - face.values])
@@ -408,15 +407,15 @@ def test_rows_are_the_derivative_of_what_sensors_give(option):
 def rows_at(face, sensor, kind, reference, z):
     """Return H and y that the kernel makes of a measurement at the face's estimate."""
     H, y, basis = np.empty((3, len(face.x))), np.empty(3), np.empty((3, 3))
-    model = face._model(sensor)
+    model = face._model(sensor, kind)
     length = np.linalg.norm(reference) if kind == "vector" else 1.0
     attitude = kind == "attitude"
-    frame = (*z, 0.0, 0.0, 0.0, 0.0, 0.0) if attitude else tuple(augmented.stepping.triad(reference).ravel())
+    frame = (*z, 0.0, 0.0, 0.0, 0.0, 0.0) if attitude else tuple(triad(reference).ravel())
     count = augmented_step.fill_rows(
         tuple(face.attitude),
         tuple(quaternion.to_matrix(face.attitude).ravel()),
         np.array([*face.bias, *face.values]),
-        augmented.stepping.KIND_CODES[kind],
+        KIND_CODES[kind],
         (0.0, 0.0, 0.0) if attitude else tuple(z / length),
         frame,
         length,
@@ -596,7 +595,7 @@ def turn_to(q, other) -> np.ndarray:
 
 def reference_smoother(record, initial, blocks):
     """The textbook smoother on whole matrices, over what the step-by-step face passed through."""
-    face = augmented.StepFilter(NOISE, initial, blocks, sensors=[s.sensor for s in record.vectors])
+    face = StepFilter(NOISE, initial, blocks, sensors=[s.sensor for s in record.vectors])
     series = {(t, i): (s, j) for i, s in enumerate(record.vectors) for j, t in enumerate(s.time)}
     stops = np.unique(np.concatenate([record.time, [t for t, _ in series]]))
     filtered, steps, at_edge = [], [], []
@@ -692,119 +691,6 @@ def test_a_gap_of_many_correlation_times_does_no_harm():
     assert np.all(np.isfinite(both.variance))
     assert np.all(both.sigma <= ahead.sigma * (1.0 + 1e-3))
     assert [event.kind for event in ahead.events] == ["gap"]
-
-
-# -------------------------------------------------------------------------------------------------------- blocks told by functions
-
-
-class AsGeneral(augmented.GeneralBlock):
-    """A linear block told by functions instead of by arrays."""
-
-    def __init__(self, block: augmented.LinearBlock) -> None:
-        self.block, self.name, self.components = block, block.name, block.components
-        self.units, self.sigma = block.units, block.sigma
-
-    def propagate(self, values, interval):
-        transition = self.block.transition(interval.dt)
-        return transition @ values, transition, np.zeros((self.size, 3)), self.block.process_noise(interval.dt)
-
-    def gyro(self, values, interval):
-        return values @ self.block.gyro_offset, self.block.gyro_offset
-
-    def measured(self, values, view):
-        effect = self.block.effects.get(view.sensor)
-        return None if effect is None else (values @ effect.offset_b, effect.offset_b)
-
-
-@dataclasses.dataclass(frozen=True)
-class SecondBias(augmented.LinearBlock):
-    """One more constant gyro bias, on one axis."""
-
-    name: str = "second bias"
-    components: tuple[str, ...] = ("y",)
-    units: tuple[str, ...] = ("rad/s",)
-
-    @property
-    def sigma(self):
-        return np.array([2e-3])
-
-    @property
-    def gyro_offset(self):
-        return np.array([[0.0, 1.0, 0.0]])
-
-
-@pytest.mark.parametrize(
-    "option", ["hard iron that walks", "bias of a direction", "acceleration in body axes", "second bias"]
-)
-def test_a_block_told_by_functions_is_the_same_block(option):
-    linear = {**OPTIONS, "second bias": (SecondBias(),)}[option]
-    record = record_of(duration=1.5)
-    others = (augmented.GyroScale(scale_sigma=0.02, misalignment_sigma=0.01),)
-    one = augmented.run(record, NOISE, start(), (*linear, *others), full_covariance=True)
-    told = tuple(AsGeneral(block) for block in linear)
-    other = augmented.run(record, NOISE, start(), (*told, *others), full_covariance=True)
-    sigma = np.sqrt(np.einsum("kii->ki", one.whole_covariance))
-    values = {name: block.values for name, block in other.blocks.items()}
-    assert np.max(np.abs(one.errors(other.attitude, other.bias, values)) / sigma) < 1e-9
-    assert np.max(np.abs(scaled(one.whole_covariance - other.whole_covariance, sigma))) < 1e-9
-
-
-class Latency(augmented.GeneralBlock):
-    """A sensor's stamps are late by τ: it shows where the body was, ``exp([ω] τ) R_fbᵀ r ≈ r_b + τ ω × r_b``."""
-
-    name, components, units, sigma = "latency", ("mag",), ("s",), np.array([0.05])
-
-    def measured(self, values, view):
-        if view.sensor != "mag":
-            return None
-        swept = np.cross(view.rate, view.expected_b)
-        return values[0] * swept, swept[None]
-
-
-def test_a_foreign_block_finds_a_latency():
-    """Declared here and unknown to the package: it goes by the rate, so it runs on the step-by-step face."""
-    rng = np.random.default_rng(2)
-    edges = np.arange(801) / 50.0
-    series = []
-    for name, r, late in (("mag", FIELD / np.linalg.norm(FIELD), 0.03), ("force", UP / 9.81, 0.0)):
-        z = seen(SWAY, edges[1::2] - late, r) + 3e-3 * rng.standard_normal((400, 3))
-        z /= np.linalg.norm(z, axis=1, keepdims=True)
-        series.append(
-            VectorMeasurements(
-                sensor=name, kind="direction", time=edges[1::2], vector_b=z, reference_f=r, sigma=np.full(400, 3e-3)
-            )
-        )
-    record = ImuRecord(time=edges, increments=SWAY.increments(edges), vectors=tuple(series))
-    found = augmented.run(record, NOISE, start(), (Latency(),)).blocks["latency"]
-    assert found.sigma[-1, 0] < 1e-3
-    assert abs(found.values[-1, 0] - 0.03) < 4.0 * found.sigma[-1, 0]
-
-
-class Velocity(augmented.GeneralBlock):
-    """Velocity in fixed axes, from a specific force that is constant in the body: it changes with the attitude."""
-
-    name, components, units, sigma = "velocity", ("x", "y", "z"), ("m/s",) * 3, np.full(3, 0.1)
-    force_b = np.array([1.0, -2.0, 9.0])
-
-    def propagate(self, values, interval):
-        R = quaternion.to_matrix(interval.attitude)
-        after = values + R @ self.force_b * interval.dt
-        return after, np.eye(3), -R @ kinematics.skew(self.force_b) * interval.dt, np.zeros((3, 3))
-
-
-def test_a_foreign_block_may_change_with_the_attitude():
-    face = augmented.StepFilter(NOISE, start(), (Velocity(),))
-    before = face.state()
-    turned = augmented.StepFilter(
-        NOISE,
-        dataclasses.replace(before, attitude=quaternion.multiply(before.attitude, quaternion.exp([0.0, 1e-6, 0.0]))),
-        (Velocity(),),
-    )
-    for one in (face, turned):
-        one.predict([0.01, 0.02, -0.01], 0.1)
-    np.testing.assert_allclose((turned.values - face.values) / 1e-6, face.F[6:, 1], rtol=1e-5)
-    assert np.all(face.P[6:, :3] != 0.0)
-    assert face.time == 0.1
 
 
 # ------------------------------------------------------------------------------------------------------------------- observability
@@ -933,7 +819,7 @@ def test_observability_takes_every_kind_of_measurement():
 
 
 @dataclasses.dataclass(frozen=True)
-class Wrong(augmented.LinearBlock):
+class Wrong(augmented.Block):
     name: str = "wrong"
     components: tuple[str, ...] = ("a",)
     units: tuple[str, ...] = ("1",)

@@ -175,7 +175,7 @@ BROKEN = {
 
 
 @dataclasses.dataclass(frozen=True)
-class WrongSign(augmented.LinearBlock):
+class WrongSign(augmented.Block):
     name: str = IRON.name
     components: tuple[str, ...] = ("x", "y", "z")
     units: tuple[str, ...] = ("T",) * 3
@@ -190,7 +190,7 @@ class WrongSign(augmented.LinearBlock):
 
 
 @dataclasses.dataclass(frozen=True)
-class Transposed(augmented.LinearBlock):
+class Transposed(augmented.Block):
     name: str = SOFT.name
     components: tuple[str, ...] = SOFT.components
     units: tuple[str, ...] = SOFT.units

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from strapdown import augmented, mekf
-from strapdown.augmented import StepFilter, VectorBias
+from strapdown.augmented import VectorBias
 from strapdown.checks import InputError
 from strapdown.mekf import ProcessNoise
 from strapdown.records import ImuRecord
 from strapdown.robustness import Gate, Robust
+from strapdown.stepfilter import StepFilter
 from strapdown.vectors import VectorMeasurements
 
 NOISE = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)
@@ -72,7 +73,7 @@ def test_missing_samples_of_every_kind_change_nothing():
         (lambda f: f.update_heading(1.5 * X, X, 0.1), "has length 1.5"),
         (lambda f: f.update_heading(X, UP, 0.1), "is vertical and shows no heading"),
         (lambda f: f.update_direction(X, X, [0.1, 0.1]), r"sigma has shape \(2,\)"),
-        (lambda f: augmented.StepFilter(NOISE, START, BLOCKS[0]), r"by itself; give a tuple of them, \(block,\)"),
+        (lambda f: StepFilter(NOISE, START, BLOCKS[0]), r"by itself; give a tuple of them, \(block,\)"),
         (lambda f: augmented.initial_state(START, BLOCKS[0]), r"\(block,\)"),
     ],
 )

@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 from collections.abc import Callable
 
+import in_steps
 import numpy as np
 import pytest
 
@@ -23,6 +24,7 @@ from strapdown.records import ImuRecord, Truth
 from strapdown.robustness import UNIFORM_SIGMA, Gate, Robust
 from strapdown.scenarios import Scenario
 from strapdown.setup import FilterSetup
+from strapdown.stepfilter import StepFilter
 from strapdown.vectors import Accelerometer, Magnetometer, VectorMeasurements
 
 HAND = motion.HarmonicRates(
@@ -44,7 +46,7 @@ SWAY = augmented.GaussMarkov(sensor="acc", noise_sigma=0.2, correlation_time=1.0
 
 
 @dataclasses.dataclass(frozen=True)
-class Mounting(augmented.LinearBlock):
+class Mounting(augmented.Block):
     """The axes of a sensor of whole attitudes are turned from the body's by a constant small angle."""
 
     name: str = "mounting"
@@ -511,7 +513,7 @@ def test_attitude_and_hard_iron_from_nothing_are_the_batch_solution(seed):
     mag = quaternion.rotate(quaternion.conjugate(true), FIELD) + iron + 3e-7 * rng.standard_normal(3)
     acc = quaternion.rotate(quaternion.conjugate(true), UP) + 0.05 * rng.standard_normal(3)
     start = mekf.initial_state(guess, attitude_sigma=UNIFORM_SIGMA, bias_sigma=BIAS_SIGMA)
-    face = augmented.StepFilter(NOISE, start, (IRON,), sensors=("mag", "acc"))
+    face = StepFilter(NOISE, start, (IRON,), sensors=("mag", "acc"))
     face._passes = WIDE_PASSES
     assert face.update_vector(mag, FIELD, 3e-7, "mag")
     assert face.update_vector(acc, UP, 0.05, "acc")
@@ -622,32 +624,13 @@ def test_the_heading_of_a_vertical_vector_is_passed_over(blocks, recovery):
     start = dataclasses.replace(one.initial, attitude=np.array([1.0, 0.0, 0.0, 0.0]))
     gate = Gate(recovery=recovery)
     whole = augmented.run(record, NOISE, start, blocks, gate=gate)
-    step, _ = augmented.stepping.run_on(record, NOISE, augmented.initial_state(start, blocks), blocks, gate=gate)
+    step = in_steps.run(record, NOISE, start, blocks, gate=gate)
     assert whole.skipped == step.skipped == {"compass": 1, "star": 0}
     assert whole.refused == step.refused
     assert len(whole.innovations["compass"].time) == len(compass.time) - 1
     assert np.isfinite(whole.attitude).all()
     if not blocks:
         assert mekf.run(record, NOISE, start, gate=gate).refused == whole.refused
-
-
-@dataclasses.dataclass(frozen=True)
-class IronByFunctions(augmented.GeneralBlock):
-    """Hard iron and a walk, told by functions."""
-
-    name: str = "mag bias"
-    components: tuple[str, ...] = ("x", "y", "z")
-    units: tuple[str, ...] = ("T",) * 3
-
-    @property
-    def sigma(self):
-        return np.full(3, 1e-6)
-
-    def measured(self, values, view):
-        return (values, np.eye(3)) if view.sensor == "mag" else None
-
-    def propagate(self, values, interval):
-        return values, np.eye(3), np.zeros((3, 3)), 1e-16 * interval.dt * np.eye(3)
 
 
 WALKING = augmented.VectorBias(sensor="mag", bias_sigma=1e-6, rate_random_walk=1e-8, unit="T")
@@ -659,7 +642,6 @@ HELD = augmented.BoundedVelocity(
 FACES = {
     **CASES,
     "hard iron that walks": (("mag", "acc"), (WALKING,)),
-    "by functions": (("mag", "acc"), (WALKING,)),
     "chains": (("mag", "acc"), (IRON, HELD)),
 }
 
@@ -667,27 +649,21 @@ FACES = {
 @pytest.mark.parametrize("case", FACES)
 def test_both_faces_recover_alike(case):
     _, blocks = FACES[case]
-    general = case == "by functions"
     one = made(case if case in CASES else "hard iron", 3, duration=1.6)
     start = lost(one.initial, 3)
-    options = {"gate": Gate(recovery=5), "robust": Robust(), "full_covariance": True}
-    whole = augmented.run(one.record, NOISE, start, blocks, **options)
-    if general:
-        step = augmented.run(one.record, NOISE, start, (IronByFunctions(),), **options)
-    else:
-        state = augmented.initial_state(start, blocks)
-        step, _ = augmented.stepping.run_on(one.record, NOISE, state, blocks, **options)
+    options = {"gate": Gate(recovery=5), "robust": Robust()}
+    whole = augmented.run(one.record, NOISE, start, blocks, full_covariance=True, **options)
+    step = in_steps.run(one.record, NOISE, start, blocks, **options)
     assert recoveries(whole)
     assert_same_events(whole, step)
     sigma = np.sqrt(np.einsum("kii->ki", whole.whole_covariance))
-    values = {name: block.values for name, block in step.blocks.items()}
-    assert np.max(np.abs(whole.errors(step.attitude, step.bias, values)) / sigma) < 1e-9
+    assert np.max(np.abs(whole.errors(step.attitude, step.bias, step.values)) / sigma) < 1e-9
     scale = sigma[:, :, None] * sigma[:, None, :]
     assert np.max(np.abs(whole.whole_covariance - step.whole_covariance) / scale) < 1e-9
     assert whole.refused == step.refused
     for name, innovations in whole.innovations.items():
-        np.testing.assert_allclose(step.innovations[name].weight, innovations.weight, atol=1e-9)
-        np.testing.assert_allclose(step.innovations[name].nis, innovations.nis, rtol=1e-7)
+        np.testing.assert_allclose(step.weight[name], innovations.weight, atol=1e-9)
+        np.testing.assert_allclose(step.nis[name], innovations.nis, rtol=1e-7)
 
 
 @pytest.mark.parametrize("case", ["hard iron", "chains"])
@@ -697,21 +673,19 @@ def test_both_faces_widen_a_challenger_alike(case):
     start = dataclasses.replace(lost(one.initial, 3), bias=one.initial.bias + np.array([0.3, -0.2, 0.25]))
     gate, blocks = Gate(recovery=5, restart_bias_sigma=1e-2), FACES[case][1]
     whole, end = augmented.run_on(one.record, NOISE, start, blocks, gate=gate, full_covariance=True)
-    state = augmented.initial_state(start, blocks)
-    step, _ = augmented.stepping.run_on(one.record, NOISE, state, blocks, gate=gate, full_covariance=True)
+    step = in_steps.run(one.record, NOISE, start, blocks, gate=gate)
     assert end.gate.counts[robust_gate.LEVEL] > 1.0
     assert recoveries(whole)
     assert_same_events(whole, step)
     sigma = np.sqrt(np.einsum("kii->ki", whole.whole_covariance))
-    values = {name: block.values for name, block in step.blocks.items()}
-    assert np.max(np.abs(whole.errors(step.attitude, step.bias, values)) / sigma) < 1e-8
+    assert np.max(np.abs(whole.errors(step.attitude, step.bias, step.values)) / sigma) < 1e-8
     scale = sigma[:, :, None] * sigma[:, None, :]
     assert np.max(np.abs(whole.whole_covariance - step.whole_covariance) / scale) < 1e-8
 
 
 def test_the_step_face_says_what_it_took():
     one = made("hard iron", 0, duration=1.0)
-    face = augmented.StepFilter(NOISE, one.initial, (IRON,), gate=Gate())
+    face = StepFilter(NOISE, one.initial, (IRON,), gate=Gate())
     mag = one.record.vectors[0]
     assert face.update_vector(mag.vector_b[0], FIELD, 3e-7, "mag")
     assert (face.weight, face.refused) == (1.0, {})

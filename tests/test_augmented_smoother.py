@@ -414,88 +414,6 @@ def test_a_bias_that_turns_more_than_the_increments_say_loses_no_segments():
     assert difference(found[0], found[1], slice(None), slice(None, None, 10)) < 1e-6
 
 
-# ------------------------------------------------------------------------------------------------------- blocks told by functions
-
-
-class Told(augmented.GeneralBlock):
-    """A linear block told by functions."""
-
-    def __init__(self, block) -> None:
-        self.block, self.name, self.components = block, block.name, block.components
-        self.units, self.sigma = block.units, block.sigma
-
-    def propagate(self, values, interval):
-        transition = self.block.transition(interval.dt)
-        return transition @ values, transition, np.zeros((self.size, 3)), self.block.process_noise(interval.dt)
-
-    def measured(self, values, view):
-        effect = self.block.effects.get(view.sensor)
-        return None if effect is None else (values @ effect.offset_b, effect.offset_b)
-
-
-@pytest.mark.parametrize("lag", [60.0, 0.2])
-def test_a_block_told_by_functions_is_smoothed_as_the_same_block_told_by_arrays(lag):
-    record, initial = swaying(1.0, start_error=(0.2, -0.1, 0.15))
-    body = augmented.GaussMarkov(sensor="acc", noise_sigma=0.3, correlation_time=0.4, name="body")
-    found = [
-        augmented.smooth_fixed_lag(record, NOISE, initial, (*blocks, SCALE, SWAY), lag=lag, full_covariance=True)
-        for blocks in ((IRON, body), (Told(IRON), Told(body)))
-    ]
-    assert difference(*found) < 1e-10
-    assert found[0].innovations["mag"].nis == pytest.approx(found[1].innovations["mag"].nis, rel=1e-8)
-
-
-class Latency(augmented.GeneralBlock):
-    """A sensor's stamps are late by τ: it shows where the body was, ``exp([ω] τ) R_fbᵀ r ≈ r_b + τ ω × r_b``."""
-
-    name, components, units, sigma = "latency", ("mag",), ("s",), np.array([0.02])
-
-    def measured(self, values, view):
-        if view.sensor != "mag":
-            return None
-        swept = np.cross(view.rate, view.expected_b)
-        return values[0] * swept, swept[None]
-
-
-def latencies(runs: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """NEES of all states at three edges over runs (runs, 3), and the mean squares of smoother and filter over the filter's variances."""
-    nees, squares = [], []
-    for run in range(runs):
-        rng = np.random.default_rng([seed, run])
-        record, initial = swaying(2.0, [seed, run], 0.05 * rng.standard_normal(3))
-        late = 0.02 * rng.standard_normal()
-        bias = 3e-3 * rng.standard_normal(3)
-        acc, mag = record.vectors
-        exact = quaternion.rotate(quaternion.conjugate(BODY.attitude(mag.time)), FIELD)
-        before = quaternion.rotate(quaternion.conjugate(BODY.attitude(mag.time - late)), FIELD)
-        mag = dataclasses.replace(mag, vector_b=mag.vector_b + before - exact)
-        record = dataclasses.replace(record, increments=record.increments + 0.02 * bias, vectors=(acc, mag))
-        noise = dataclasses.replace(NOISE, rate_random_walk=1e-7)
-        both = augmented.smooth(record, noise, initial, (Latency(),), full_covariance=True)
-        ahead = augmented.run(record, noise, initial, (Latency(),))
-        truth = record.truth.attitude, np.tile(bias, (len(record.time), 1)), {"latency": np.array([late])}
-        e = both.errors(*truth)
-        rows = [0, 50, 90]
-        nees.append(consistency.nees(e[rows], both.whole_covariance[rows]))
-        variance = np.concatenate([ahead.variance, ahead.blocks["latency"].variance], axis=1)
-        squares.append([np.mean(x**2 / variance) for x in (e, ahead.errors(*truth))])
-    return np.array(nees), np.mean(squares, axis=0)
-
-
-def test_a_latency_is_smoothed_to_be_believed():
-    nees, (smoothed, filtered) = latencies(8, 7)
-    low, high = consistency.mean_bounds(7, 8, 0.999)
-    assert np.all((low < nees.mean(axis=0) / 7.0) & (nees.mean(axis=0) / 7.0 < high)), nees.mean(axis=0) / 7.0
-    assert smoothed < 0.8 * filtered
-
-
-@pytest.mark.slow
-def test_a_latency_is_smoothed_to_be_believed_over_many_runs():
-    nees, _ = latencies(200, 8)
-    verdict = consistency.Verdict(mean=nees.mean(axis=0) / 7.0, degrees=7, runs=200, probability=0.99)
-    assert verdict.consistent, (verdict.mean, verdict.simultaneous_bounds)
-
-
 # --------------------------------------------------------------------------------------------------------------------- recoveries
 
 
@@ -639,18 +557,6 @@ def test_a_lost_stretch_is_smoothed_to_be_believed_over_many_runs():
     nees = recovered(300)
     verdict = consistency.Verdict(mean=nees.mean(axis=0) / 9.0, degrees=9, runs=300, probability=0.99)
     assert verdict.consistent, (verdict.mean, verdict.simultaneous_bounds)
-
-
-def test_with_a_block_told_by_functions_a_trajectory_begins_with_the_recovery():
-    record, _, initial = lost_start(1, 1.5)
-    told = (Told(STILL),)
-    ahead = augmented.run(record, NOISE, initial, told, gate=GATE, full_covariance=True)
-    both = augmented.smooth(record, NOISE, initial, told, gate=GATE, full_covariance=True)
-    event = recovery_of(both)
-    first, last = np.searchsorted(record.time, [event.start, event.end])
-    assert difference(both, ahead, slice(first + 1, last), slice(first + 1, last)) < 1e-12
-    arrays = augmented.smooth(record, NOISE, initial, (STILL,), gate=GATE, full_covariance=True)
-    assert difference(both, arrays, slice(last, None), slice(last, None)) < 1e-7
 
 
 def test_lock_outs_are_told():

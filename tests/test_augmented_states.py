@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import pickle
 
+import in_steps
 import numpy as np
 import pytest
-from filterpy.common import Saver
 
 from strapdown import augmented, consistency, kinematics, mekf, motion, quaternion, records, scenarios, setup, vectors
 from strapdown.augmented import SensorStates, States, filtering, matching, turning
@@ -20,6 +19,7 @@ from strapdown.records import ImuRecord, Truth
 from strapdown.robustness import Gate, Monitor, Robust
 from strapdown.scenarios import Scenario
 from strapdown.setup import FilterSetup
+from strapdown.stepfilter import StepFilter
 from strapdown.vectors import VectorMeasurements
 
 NOISE = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-5)
@@ -310,7 +310,7 @@ def test_force_s_transition_is_the_derivative():
 
     def moved(values):
         state = dataclasses.replace(augmented.initial_state(initial, (block,)), values=values)
-        face = augmented.StepFilter(NOISE, state, (block,))
+        face = StepFilter(NOISE, state, (block,))
         face.predict(np.array([0.02, -0.03, 0.01]), 0.05)
         return face
 
@@ -328,11 +328,7 @@ def test_faces_agree_with_force_and_gyro_scale_of_some_axes():
     blocks = (scale, force, augmented.VectorBias(sensor="mag", bias_sigma=3e-6))
     assert [block.components for block in blocks[:2]] == [("z",), ("x", "z")]
     one = augmented.run(record, NOISE, begun(record), blocks, full_covariance=True)
-    from strapdown.augmented import stepping
-
-    other, _ = stepping.run_on(
-        record, NOISE, augmented.initial_state(begun(record), blocks), blocks, full_covariance=True
-    )
+    other = in_steps.run(record, NOISE, begun(record), blocks)
     np.testing.assert_allclose(one.attitude, other.attitude, atol=1e-11)
     sigma = np.sqrt(np.einsum("kii->ki", one.whole_covariance))
     scaled = (one.whole_covariance - other.whole_covariance) / (sigma[:, :, None] * sigma[:, None, :])
@@ -349,43 +345,8 @@ IRON = augmented.VectorBias(sensor="mag", bias_sigma=3e-6, unit="T")
 HELD = augmented.GaussMarkov(sensor="acc", noise_sigma=0.3, correlation_time=1.0, unit="m/s²")
 
 
-@pytest.mark.parametrize("name", ["", "Mag", "acc"])
-@pytest.mark.parametrize("kind", ["direction", "vector", "heading", "attitude", "missing"])
-def test_a_sensor_that_no_block_knows_is_refused_before_anything_changes(kind, name):
-    face = augmented.StepFilter(NOISE, KNOWN, (augmented.VectorBias(sensor="mag", bias_sigma=0.01),))
-    face.predict([0.0, 0.0, 0.01], 0.1)
-    before = pickle.dumps(face.__dict__)
-    given = [1.0, 0.0, 0.0, 0.0] if kind == "attitude" else X
-    references = () if kind == "attitude" else (X,)
-    if kind == "missing":
-        kind, given = "direction", np.full(3, np.nan)
-    update = getattr(face, f"update_{kind}")
-    with pytest.raises(InputError, match=f"sensor is '{name}', which is none of mag; .*sensors="):
-        update(given, *references, 0.1, name)
-    assert pickle.dumps(face.__dict__) == before
-    assert update(X, X, 0.1, "mag") if kind == "direction" else True
-
-
-def test_the_sensors_of_a_step_face_can_be_named():
-    block = augmented.VectorBias(sensor="mag", bias_sigma=0.01)
-    face = augmented.StepFilter(NOISE, KNOWN, (block,), sensors=("acc", "mag"))
-    assert face.update_direction(UP, UP, 0.1, "acc")
-    with pytest.raises(InputError, match="sensor is 'up', which is none of acc, mag"):
-        face.update_direction(UP, UP, 0.1, "up")
-    with pytest.raises(InputError, match=r"mag bias: sensor 'mag' is not known; did you mean 'Mag'"):
-        augmented.StepFilter(NOISE, KNOWN, (block,), sensors=("acc", "Mag"))
-    with pytest.raises(InputError, match="sensors is 'mag'; it must be a sequence"):
-        augmented.StepFilter(NOISE, KNOWN, (block,), sensors="mag")
-    # Blocks that are about no sensor leave the names free.
-    free = augmented.StepFilter(NOISE, KNOWN, (augmented.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01),))
-    assert free.update_direction(UP, UP, 0.1)
-    assert free.update_direction(UP, UP, 0.1, "any")
-
-
 def test_the_step_face_goes_on_from_a_part_as_the_record_does():
     """The gate's whole memory goes along, and what a challenger's blocks know: one constant, one that forgets."""
-    from strapdown.augmented import stepping
-
     record, blocks, gate = simulated(duration=4.0), (IRON, HELD), Gate(recovery=30)
     record = dataclasses.replace(record, time=record.time + 100.0)
     record = dataclasses.replace(
@@ -400,7 +361,8 @@ def test_the_step_face_goes_on_from_a_part_as_the_record_does():
         _, middle = augmented.run_on(first, NOISE, initial, blocks, gate=gate)
         second, end = augmented.run_on(rest, NOISE, middle, blocks, gate=gate)
         challenged += int(middle.gate.counts[0])
-        step, last = stepping.run_on(rest, NOISE, middle, blocks, gate=gate)
+        step = in_steps.run(rest, NOISE, middle, blocks, gate=gate)
+        last = step.state
         assert quaternion.angle_between(last.attitude, end.attitude) < 1e-10
         sigma = np.sqrt(np.diag(end.covariance))
         np.testing.assert_allclose(last.values / sigma[6:], end.values / sigma[6:], rtol=0.0, atol=1e-8)
@@ -410,80 +372,7 @@ def test_the_step_face_goes_on_from_a_part_as_the_record_does():
     assert challenged >= 2
     assert told >= 2
     with pytest.raises(InputError, match=r"time is 0 s, before the record of initial began, 100 s; give the time"):
-        augmented.StepFilter(NOISE, middle, blocks, gate=gate)
-
-
-def test_saver_and_pickle_take_the_step_face_with_blocks():
-    record = simulated(duration=2.0)
-    initial = begun(record)
-    turned = quaternion.multiply(initial.attitude, quaternion.exp([1.0, 0.5, -1.0]))
-    initial = dataclasses.replace(initial, attitude=turned)
-    face = augmented.StepFilter(NOISE, initial, (IRON, HELD), gate=Gate(recovery=4))
-    mag, acc = record.vectors
-    history = Saver(face)
-    for k, t in enumerate(mag.time):
-        now, then = np.searchsorted(record.time, [face.time, t - 1e-9])
-        face.predict(record.increments[now:then].sum(axis=0), t - face.time)
-        j = int(np.argmin(np.abs(acc.time - t)))
-        face.update_vector(acc.vector_b[j], acc.references_f[j], 1.0, "acc")
-        face.update_vector(mag.vector_b[k], mag.references_f[k], mag.sigma[k], "mag")
-        history.save()
-    assert face.events
-    assert face.refused
-    history.to_array()
-    assert history.P.shape == (len(mag.time), 12, 12)
-    assert history.values.shape == (len(mag.time), 6)
-    copy = pickle.loads(pickle.dumps(face))
-    for one in (face, copy):
-        one.update_vector(mag.vector_b[-1], mag.references_f[-1], 5e-7, "mag")
-    assert np.array_equal(copy.P, face.P)
-    assert copy.events == face.events
-
-
-class Told(augmented.GeneralBlock):
-    """One state, and what its functions return as the test says."""
-
-    name, components, units, sigma = "latency", ("x",), ("s",), np.array([0.1])
-
-    def __init__(self, **told):
-        self.told = told
-
-    def propagate(self, values, interval):
-        return self.told.get("propagate", super().propagate(values, interval))
-
-    def gyro(self, values, interval):
-        return self.told.get("gyro", super().gyro(values, interval))
-
-    def measured(self, values, view):
-        return self.told.get("measured") if view.sensor == "mag" else None
-
-
-@pytest.mark.parametrize(
-    ("told", "words"),
-    [
-        ({"measured": (np.full(3, np.nan), np.zeros((1, 3)))}, r"measured of mag at 0.1 s: what is added\[0\] is nan"),
-        (
-            {"measured": (np.zeros(3), np.zeros((3, 1)))},
-            r"measured of mag at 0.1 s: its derivatives has shape \(3, 1\)",
-        ),
-        ({"measured": (np.zeros(3), np.full((1, 3), np.inf))}, "measured of mag at 0.1 s: its derivatives.*inf"),
-        ({"measured": np.zeros(3)}, r"measured of mag at 0.1 s returned .*; return what is added, its derivatives as"),
-        ({"gyro": (np.zeros(2), np.zeros((1, 3)))}, r"gyro at 0 s: what is added has shape \(2,\)"),
-        ({"propagate": (np.zeros(1), np.eye(1))}, r"propagate at 0 s returned .*; return values, Φ, ∂values/∂δθ, Q"),
-        (
-            {"propagate": (np.zeros(1), np.eye(1), np.zeros((3, 1)), np.eye(1))},
-            "propagate at 0 s: ∂values/∂δθ has shape",
-        ),
-        ({"propagate": (np.array([np.nan]), np.eye(1), np.zeros((1, 3)), np.eye(1))}, r"at 0 s: values\[0\] is nan"),
-    ],
-)
-@pytest.mark.parametrize("gate", [None, Gate()])
-def test_what_a_block_s_functions_return_is_checked(told, words, gate):
-    record = simulated(duration=0.5)
-    with pytest.raises(InputError, match=f"^latency: .*{words}"):
-        augmented.run(record, NOISE, begun(record), (Told(**told),), gate=gate)
-    fine = Told(measured=(np.zeros(3), [[0.0, 0.0, 0.0]]))
-    assert augmented.run(record, NOISE, begun(record), (fine,), gate=gate).attitude.shape == (26, 4)
+        StepFilter(NOISE, middle, blocks, gate=gate)
 
 
 # ------------------------------------------------------------------------------------------------------------------- sensors

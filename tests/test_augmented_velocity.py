@@ -7,6 +7,7 @@ import functools
 import json
 from pathlib import Path
 
+import in_steps
 import mpmath
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ import scipy.linalg
 
 from sims import hand_held
 from strapdown import ahrs, augmented, consistency, kinematics, mekf, motion, quaternion, records, scenarios, setup
-from strapdown.augmented import SensorStates, States, stepping
+from strapdown.augmented import SensorStates, States
 from strapdown.augmented.blocks import stationary_covariance
 from strapdown.augmented.model import assemble
 from strapdown.checks import InputError
@@ -25,6 +26,7 @@ from strapdown.kernels.robust_gate import WIDE_PASSES
 from strapdown.mekf import ProcessNoise
 from strapdown.recordings import Recording, read
 from strapdown.records import ImuRecord
+from strapdown.stepfilter import StepFilter
 from strapdown.units import DEGREE
 from strapdown.vectors import Accelerometer, VectorMeasurements
 
@@ -51,7 +53,7 @@ def block_of(poles: str, velocity_sigma: float = 0.5, **more) -> augmented.Bound
     )
 
 
-def system(block: augmented.LinearBlock) -> tuple[np.ndarray, np.ndarray]:
+def system(block: augmented.Block) -> tuple[np.ndarray, np.ndarray]:
     """Matrix of the block's states and diagonal of its driving noise, from what it declares."""
     n = block.size
     return np.diag(block.feed[: n - 1], 1) - np.diag(block.decay), np.asarray(block.density)
@@ -99,7 +101,7 @@ def test_transition_and_noise_are_those_of_van_loan(poles, dt):
 
 
 @dataclasses.dataclass(frozen=True)
-class Ramp(augmented.LinearBlock):
+class Ramp(augmented.Block):
     """A block that the package does not have: a slope that never changes feeds an offset that walks besides; a bias; a chain with feeds."""
 
     name: str = "ramp"
@@ -142,7 +144,7 @@ def test_a_step_of_the_filter_is_that_of_the_whole_system(option, dt):
     blocks = BLOCKS[option]
     m = sum(block.size for block in blocks)
     turn = np.array([0.3, -0.5, 0.2])
-    face = augmented.StepFilter(NOISE, augmented.initial_state(start(), blocks), blocks)
+    face = StepFilter(NOISE, augmented.initial_state(start(), blocks), blocks)
     face.bias = np.zeros(3)
     before = face.P.copy()
     face.predict(turn * dt, dt)
@@ -272,7 +274,7 @@ def test_impossible_chains_are_refused(fields, words):
     n = 2 if len(fields["feed"]) == 3 else len(fields["feed"])
     told = {name: property(lambda self, value=value: np.asarray(value)) for name, value in fields.items()}
     names = {"name": "x", "components": tuple("abcd"[:n]), "units": ("1",) * n, "sigma": np.ones(n)}
-    block = type("Foreign", (augmented.LinearBlock,), {**told, **names})()
+    block = type("Foreign", (augmented.Block,), {**told, **names})()
     with pytest.raises(InputError, match=words):
         assemble((block,), {"acc": "vector"})
 
@@ -373,13 +375,12 @@ def test_both_faces_agree(option, kind):
     record, _ = record_of(block_of("velocity", 0.02), duration=1.0, kind=kind, phase=0.0037)
     state = augmented.initial_state(start(), blocks)
     fast = augmented.run(record, NOISE, state, blocks, full_covariance=True)
-    slow, _ = stepping.run_on(record, NOISE, state, blocks, full_covariance=True)
+    slow = in_steps.run(record, NOISE, state, blocks)
     sigma = np.sqrt(np.einsum("kii->ki", fast.whole_covariance))
-    values = {name: block.values for name, block in slow.blocks.items()}
-    assert np.max(np.abs(fast.errors(slow.attitude, slow.bias, values)) / sigma) < 1e-9
+    assert np.max(np.abs(fast.errors(slow.attitude, slow.bias, slow.values)) / sigma) < 1e-9
     assert np.max(np.abs(scaled(fast.whole_covariance - slow.whole_covariance, sigma))) < 1e-8
     for name, one in fast.innovations.items():
-        np.testing.assert_allclose(slow.innovations[name].innovation, one.innovation, rtol=1e-7, atol=1e-10)
+        np.testing.assert_allclose(slow.whitened[name], one.whitened, rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.parametrize("option", BLOCKS)
@@ -634,7 +635,7 @@ def test_a_correction_turns_what_is_carried(passes):
     root = np.eye(9) + 0.3 * rng.standard_normal((9, 9))
     P[15:, 15:] = root @ P[15:, 15:] @ root.T
     state = dataclasses.replace(state, covariance=P, values=rng.standard_normal(18))
-    face = augmented.StepFilter(NOISE, state, blocks, sensors=("acc", "star"))
+    face = StepFilter(NOISE, state, blocks, sensors=("acc", "star"))
     face._passes = passes
     turn = quaternion.exp([0.5, -0.7, 0.4])
     assert face.update_attitude(turn, 1e-6, "star")

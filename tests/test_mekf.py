@@ -12,10 +12,11 @@ from filterpy.kalman import KalmanFilter
 from strapdown import coning, consistency, gyro, mekf, motion, quaternion, records, vectors
 from strapdown.checks import InputError
 from strapdown.kernels import filter_loop
-from strapdown.mekf import ProcessNoise, StepFilter, initial_state
+from strapdown.mekf import ProcessNoise, initial_state
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Truth
 from strapdown.scenarios import Scenario, simulate
+from strapdown.stepfilter import StepFilter
 from strapdown.vectors import VectorMeasurements, VectorSensor
 
 NOISE = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)

@@ -11,10 +11,11 @@ from strapdown.gyro import GyroSpec
 from strapdown.kernels import filter_loop
 from strapdown.kernels.filter_loop import CHECKED
 from strapdown.kernels.robust_gate import CHALLENGED
-from strapdown.mekf import ProcessNoise, StepFilter, initial_state
+from strapdown.mekf import ProcessNoise, initial_state
 from strapdown.records import ImuRecord
 from strapdown.robustness import Gate, Robust
 from strapdown.scenarios import Scenario, simulate
+from strapdown.stepfilter import StepFilter
 from strapdown.vectors import VectorMeasurements, VectorSensor
 
 NOISE = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)

@@ -9,12 +9,13 @@ import pytest
 from strapdown import consistency, mekf, montecarlo, motion, quaternion, recordfiles
 from strapdown.checks import InputError
 from strapdown.gyro import GyroSpec
-from strapdown.mekf import ProcessNoise, StepFilter, initial_state
+from strapdown.mekf import ProcessNoise, initial_state
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord
 from strapdown.robustness import Gate, Robust
 from strapdown.scenarios import Scenario, simulate
 from strapdown.setup import FilterSetup
+from strapdown.stepfilter import StepFilter
 from strapdown.vectors import Accelerometer, AttitudeSensor, Faults, VectorMeasurements, VectorSensor
 
 NOISE = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)

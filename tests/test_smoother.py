@@ -11,6 +11,7 @@ import filterpy.kalman
 import mpmath
 import numpy as np
 import pytest
+from in_steps import transition_and_noise
 from scipy.optimize import least_squares
 
 from strapdown import augmented, coning, consistency, kinematics, mekf, motion, quaternion, records, smoother
@@ -1110,7 +1111,7 @@ def test_noise_seen_from_the_start_of_a_step() -> None:
     for angle in sizes[sizes <= LARGEST_ANGLE]:
         turn = angle * quaternion.normalize(np.append(rng.standard_normal(3), 0.0))[:3]
         dt = 10.0 ** rng.uniform(-3, 1)
-        F, Q = mekf.transition_and_noise(turn, dt, noise)
+        F, Q = transition_and_noise(turn, dt, noise)
         back = np.linalg.inv(F)
         expected = back @ Q @ back.T
         q11, q12, q22 = smoother_step.step_noise(tuple(turn), dt, noise.angle_random_walk**2, noise.rate_random_walk**2)
@@ -1128,7 +1129,7 @@ def test_gain_and_what_it_leaves(decades: float) -> None:
     noise = ProcessNoise(angle_random_walk=sv, rate_random_walk=su)
     for _ in range(5):
         turn = 0.1 * rng.standard_normal(3)
-        F, Q = mekf.transition_and_noise(turn, dt, noise)
+        F, Q = transition_and_noise(turn, dt, noise)
         P = random_covariance(rng, decades)
         q11, q12, q22 = smoother_step.step_noise(tuple(turn), dt, sv**2, su**2)
         N = smoother_step.kept_share(*blocks(P), q11, q12, q22)
@@ -1201,7 +1202,7 @@ def test_one_step_keeps_its_digits_where_the_covariance_is_ill_conditioned(decad
     dt, sv, su = 0.01, 1e-5, 1e-8
     noise = ProcessNoise(angle_random_walk=sv, rate_random_walk=su)
     turn = np.array([0.01, -0.02, 0.03])
-    F, Q = mekf.transition_and_noise(turn, dt, noise)
+    F, Q = transition_and_noise(turn, dt, noise)
     q = tuple(quaternion.normalize(rng.standard_normal(4)))
     next_q = tuple(quaternion.multiply(q, quaternion.exp(turn)))
     worst_textbook = 0.0

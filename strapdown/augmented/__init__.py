@@ -29,10 +29,9 @@ too much for good; :func:`recentred` starts it anew where the smoother puts it.
 A filter setup (:mod:`strapdown.setup`) holds such states as :class:`States`, in a file and as ``setup.matched(scenario, states=True)``
 chooses them.
 
-Modules: ``blocks`` what can be declared, ``model`` blocks as arrays, ``filtering`` the compiled filter, ``stepping`` the step-by-step one,
-``smoothing`` the smoother, ``joining`` what it makes of recoveries, ``stepwise`` the one for blocks told by functions, ``observing`` the
-observability report, ``turning`` rate and angular acceleration for lever arms, ``states`` what a setup holds, ``matching`` which of them a
-specification calls for.
+Modules: ``blocks`` what can be declared, ``model`` blocks as arrays, ``filtering`` the compiled filter, ``smoothing`` the smoother,
+``joining`` what it makes of recoveries, ``observing`` the observability report, ``turning`` rate and angular acceleration for lever arms,
+``states`` what a setup holds, ``matching`` which of them a specification calls for.
 """
 
 from __future__ import annotations
@@ -42,23 +41,18 @@ from strapdown.augmented.blocks import (
     BoundedVelocity,
     Effect,
     GaussMarkov,
-    GeneralBlock,
     GyroForce,
     GyroGaussMarkov,
     GyroScale,
-    Interval,
     LeverArm,
-    LinearBlock,
     VectorBias,
     VectorScale,
-    View,
 )
 from strapdown.augmented.filtering import AugmentedEstimate, run, run_on
 from strapdown.augmented.model import AugmentedState, initial_state
 from strapdown.augmented.observing import Observability, observability
 from strapdown.augmented.smoothing import recentred, smooth, smooth_fixed_lag
 from strapdown.augmented.states import SensorStates, States
-from strapdown.augmented.stepping import StepFilter
 from strapdown.records import BlockEstimate
 
 __all__ = [
@@ -69,20 +63,15 @@ __all__ = [
     "BoundedVelocity",
     "Effect",
     "GaussMarkov",
-    "GeneralBlock",
     "GyroForce",
     "GyroGaussMarkov",
     "GyroScale",
-    "Interval",
     "LeverArm",
-    "LinearBlock",
     "Observability",
     "SensorStates",
     "States",
-    "StepFilter",
     "VectorBias",
     "VectorScale",
-    "View",
     "initial_state",
     "observability",
     "recentred",

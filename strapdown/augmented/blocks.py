@@ -1,8 +1,7 @@
 """Optional states as blocks: what each is, how it changes, and how it enters the gyro and the sensors.
 
-A :class:`LinearBlock` is told by arrays, and the compiled filter runs on those alone: it need not know the block. A :class:`GeneralBlock`
-is told by functions of the rate, the attitude and the time, and runs step by step in Python. A new block subclasses one of them and
-overrides what it has; everything else is "no effect".
+A :class:`Block` is described by arrays, and the compiled filter runs on those alone: it need not know the block. A new block subclasses it
+and overrides what it has; everything else is "no effect".
 """
 
 from __future__ import annotations
@@ -55,8 +54,12 @@ class Effect:
     is told of them is in the axes of the estimated attitude, their covariance too, which leaves out how well that is known."""
 
 
-class _Block:
-    """What every block has."""
+class Block:
+    """A block of states that enter linearly and change each by itself, or in chains: ``ċₖ = −λₖ cₖ + gₖ cₖ₊₁ + √qₖ wₖ``.
+
+    Transition and noise are exact over any dt. A chain, of up to three states that do not enter the gyro, shapes the noise of its last one
+    by any real poles.
+    """
 
     name: str
     """Its name, which no other block has."""
@@ -76,14 +79,6 @@ class _Block:
     def covariance(self) -> Array:
         """Covariance of the states at the start (size, size): of states that are independent then, their variances."""
         return np.diag(np.asarray(self.sigma) ** 2)
-
-
-class LinearBlock(_Block):
-    """A block of states that enter linearly and change each by itself, or in chains: ``ċₖ = −λₖ cₖ + gₖ cₖ₊₁ + √qₖ wₖ``.
-
-    Transition and noise are exact over any dt. A chain, of up to three states that do not enter the gyro, shapes the noise of its last one
-    by any real poles.
-    """
 
     @property
     def decay(self) -> Array:
@@ -170,57 +165,6 @@ def stationary_covariance(decay: Array, density: Array, feed: Array) -> Array:
     return P[:n, :n]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Interval:
-    """A step of the filter: what a :class:`GeneralBlock` may ask for."""
-
-    time: float
-    """Begin, s."""
-    dt: float
-    """s."""
-    attitude: Array
-    """Estimated q_fb at the begin (4,)."""
-    rate: Array
-    """Estimated body rate (3,), rad/s."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class View:
-    """A measurement as the filter expects it: what a :class:`GeneralBlock` may ask for."""
-
-    sensor: str
-    time: float
-    attitude: Array
-    """Estimated q_fb (4,)."""
-    rate: Array
-    """Estimated body rate (3,) over the step before, rad/s."""
-    expected_b: Array
-    """R_fbᵀ r (3,), body axes, in the unit of the reference."""
-
-
-class GeneralBlock(_Block):
-    """A block told by functions: a latency, whose effect goes by the rate; a motion, whose change goes by the attitude.
-
-    It has no effect on kinds ``"heading"`` and ``"attitude"``. How its effects change with the attitude *error* is neglected: they are
-    small beside the measurement.
-    """
-
-    def propagate(self, values: Array, interval: Interval) -> tuple[Array, Array, Array, Array]:
-        """Return values (size,) after an interval, Φ (size, size), ∂values/∂δθ (size, 3), and Q (size, size)."""
-        return values, np.eye(self.size), np.zeros((self.size, 3)), np.zeros((self.size, self.size))
-
-    def gyro(self, values: Array, interval: Interval) -> tuple[Array, Array]:
-        """Return what is added to the measured rate (3,), rad/s, and its derivatives (size, 3); taken constant over the interval."""
-        return np.zeros(3), np.zeros((self.size, 3))
-
-    def measured(self, values: Array, view: View) -> tuple[Array, Array] | None:
-        """Return what is added to a sensor's vector (3,), body axes, and its derivatives (size, 3); None: nothing."""
-        return None
-
-
-Block = LinearBlock | GeneralBlock
-
-
 def _spread(name: str, value: float | Array, unit: str, size: int = 3) -> Array:
     spread = np.broadcast_to(np.asarray(value, np.float64), (size,)).copy() if np.ndim(value) < 2 else value
     return np.array([positive(f"{name}[{k}]", one, unit=unit) for k, one in enumerate(array(name, spread, (size,)))])
@@ -248,7 +192,7 @@ def _matrix(name: str, diagonal: float | Array, off_diagonal: float | Array, uni
 
 
 @dataclass(frozen=True, kw_only=True)
-class GyroScale(LinearBlock):
+class GyroScale(Block):
     """Scale factors and misalignments of the gyro: the entries of M in ``w_meas = (I + M) w_b + b + n``, constant.
 
     Entries of an array whose σ is 0 are taken for exact and are no states.
@@ -293,7 +237,7 @@ class GyroScale(LinearBlock):
 
 
 @dataclass(frozen=True, kw_only=True)
-class GyroForce(LinearBlock):
+class GyroForce(Block):
     """Sensitivity of the gyro to specific force: the entries of G in ``w_meas = w_b + b + G f_b + n``, constant.
 
     The force is that of a body held up, the reaction to gravity alone, ``f_b = −R_fbᵀ g_f``. Entries whose σ is 0 are no states.
@@ -350,7 +294,7 @@ class GyroForce(LinearBlock):
 
 
 @dataclass(frozen=True, kw_only=True)
-class GyroGaussMarkov(LinearBlock):
+class GyroGaussMarkov(Block):
     """A second gyro bias that forgets: first-order Gauss–Markov, stationary. Several of different times together cover flicker."""
 
     bias_sigma: float | Array
@@ -388,7 +332,7 @@ class GyroGaussMarkov(LinearBlock):
 
 
 @dataclass(frozen=True, kw_only=True)
-class VectorBias(LinearBlock):
+class VectorBias(Block):
     """A constant bias of a vector sensor in body axes: hard iron, accelerometer bias."""
 
     sensor: str
@@ -431,7 +375,7 @@ class VectorBias(LinearBlock):
 
 
 @dataclass(frozen=True, kw_only=True)
-class LeverArm(LinearBlock):
+class LeverArm(Block):
     """The place of an accelerometer on the body, from the point that does not accelerate: ``f_b = −R_fbᵀ g + ([ẇ] + [w]²) r``, constant.
 
     Rate and angular acceleration are those of the gyro (:func:`strapdown.augmented.turning.turning`), whose noise becomes noise of the
@@ -482,7 +426,7 @@ class LeverArm(LinearBlock):
 
 
 @dataclass(frozen=True, kw_only=True)
-class VectorScale(LinearBlock):
+class VectorScale(Block):
     """Scale factors and misalignments of a vector sensor: all nine of S in ``m_b = (I + S) R_fbᵀ r``, constant: soft iron."""
 
     sensor: str
@@ -513,7 +457,7 @@ class VectorScale(LinearBlock):
 
 
 @dataclass(frozen=True, kw_only=True)
-class GaussMarkov(LinearBlock):
+class GaussMarkov(Block):
     """First-order coloured noise on a vector sensor, stationary: the acceleration of a moving hand on an accelerometer."""
 
     sensor: str
@@ -569,7 +513,7 @@ class GaussMarkov(LinearBlock):
 
 
 @dataclass(frozen=True, kw_only=True)
-class BoundedVelocity(LinearBlock):
+class BoundedVelocity(Block):
     """What an accelerometer on a moving hand feels of the motion: an acceleration whose velocity is bounded, stationary, in fixed axes.
 
     ``f_b = R_fbᵀ (a_f − g_f)`` with ``a = v̇``: on each axis ``v̇ = −v/τ_v + u``, ``u̇ = −u/τ_a + w``. The spectrum of a is that of
@@ -688,8 +632,8 @@ def check(blocks: tuple[Block, ...]) -> None:
     """Refuse blocks that do not say what they are, and two of one name."""
     names: list[str] = []
     for block in blocks:
-        if not isinstance(block, LinearBlock | GeneralBlock):
-            raise InputError(f"{block!r} is no block; subclass LinearBlock or GeneralBlock of strapdown.augmented")
+        if not isinstance(block, Block):
+            raise InputError(f"{block!r} is no block; subclass strapdown.augmented.Block")
         if block.name in names:
             raise InputError(f"two blocks are named {block.name!r}; give each a name of its own")
         names.append(block.name)

@@ -76,8 +76,7 @@ def run(
 ) -> AugmentedEstimate:
     """Run the filter over a whole record.
 
-    Intervals are split at the measurements as by :func:`strapdown.mekf.run`, and missing measurements (NaN) are counted as skipped. Linear
-    blocks run compiled; with a general one among them the run goes step by step in Python, some thousand times slower.
+    Intervals are split at the measurements as by :func:`strapdown.mekf.run`, and missing measurements (NaN) are counted as skipped.
 
     Parameters
     ----------
@@ -125,7 +124,7 @@ def run_on(
     """Run the filter and return the end state too, from which the next part of a record goes on, bit for bit.
 
     It holds what a gate remembers as well: its counts, its challenger, how wide a restart is, and the blocks' prior. A lock-out that goes
-    on is told by both parts, by the second as a whole. A monitor starts anew in each part, and with a block told by functions a gate does.
+    on is told by both parts, by the second as a whole. A monitor starts anew in each part.
 
     Effects that are fixed in a sensor's own unit (``varying``) keep in all parts the unit of the first in which the sensor is, the strength
     at the root mean square σ there (``unit_sigma`` of the state). A run over the whole record has that of the whole, and so another prior,
@@ -136,20 +135,6 @@ def run_on(
     blocks = modelling.as_blocks(blocks)
     state = modelling.begin(initial, blocks)
     count("every", every)
-    if modelling.general(blocks):
-        from strapdown.augmented import stepping
-
-        estimate, end = stepping.run_on(
-            record,
-            process_noise,
-            state,
-            blocks,
-            every=every,
-            full_covariance=full_covariance,
-            gate=gate,
-            robust=robust,
-        )
-        return watched(estimate, monitor, gate), end
     events, model = prepared(record, blocks)
     estimate, end, _ = run_events(
         record,

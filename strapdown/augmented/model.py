@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from strapdown import mekf
-from strapdown.augmented.blocks import MOST_CHAIN_DECAY, Block, Effect, GeneralBlock, LinearBlock, check
+from strapdown.augmented.blocks import MOST_CHAIN_DECAY, Block, Effect, check
 from strapdown.checks import Array, InputError, array, covariance, one_of, positive, unit_quaternions
 from strapdown.kernels import augmented_step
 from strapdown.kernels.augmented_chain import CHAIN, chain_start
@@ -75,7 +75,7 @@ class AugmentedState:
 
 def as_blocks(blocks: Sequence[Block]) -> tuple[Block, ...]:
     """Return the blocks as a tuple; one by itself is refused."""
-    if isinstance(blocks, LinearBlock | GeneralBlock):
+    if isinstance(blocks, Block):
         raise InputError(f"blocks is the block {blocks.name} by itself; give a tuple of them, (block,)")
     if not isinstance(blocks, Iterable):
         raise InputError(f"blocks is {blocks!r}; give a tuple of them, () for none")
@@ -112,7 +112,7 @@ def begin(initial: mekf.State | AugmentedState, blocks: tuple[Block, ...]) -> Au
 
 @dataclass(frozen=True, kw_only=True)
 class Model:
-    """Linear blocks as arrays, in the kernels' order."""
+    """Blocks as arrays, in the kernels' order."""
 
     order: np.ndarray
     """Which state from outside each of the kernels' block states is (m,)."""
@@ -161,15 +161,12 @@ class Model:
 def _stack(blocks: Sequence[Block], name: str, shape: tuple[int, ...]) -> Array:
     parts = [np.empty((0, *shape))]
     for block in blocks:
-        if isinstance(block, LinearBlock):
-            parts.append(array(f"{block.name}: {name}", getattr(block, name), (block.size, *shape)))
-        else:
-            parts.append(np.zeros((block.size, *shape)))
+        parts.append(array(f"{block.name}: {name}", getattr(block, name), (block.size, *shape)))
     return np.concatenate(parts)
 
 
 def assemble(blocks: tuple[Block, ...], kinds: Mapping[str, str]) -> Model:
-    """Return the model of blocks for the sensors named, whose kinds are given; general blocks stand there without effect."""
+    """Return the model of blocks for the sensors named, whose kinds are given."""
     decay, density = _stack(blocks, "decay", ()), _stack(blocks, "density", ())
     for name, values in (("decay", decay), ("density", density)):
         if np.any(values < 0.0):
@@ -184,8 +181,7 @@ def assemble(blocks: tuple[Block, ...], kinds: Mapping[str, str]) -> Model:
     names = list(kinds)
     first = 0
     for block in blocks:
-        effects = block.effects if isinstance(block, LinearBlock) else {}
-        for sensor, effect in effects.items():
+        for sensor, effect in block.effects.items():
             one_of(f"{block.name}: sensor", sensor, names)
             if kinds[sensor] == "attitude" and (effect.offset_f is not None or effect.scale is not None):
                 raise InputError(
@@ -195,7 +191,7 @@ def assemble(blocks: tuple[Block, ...], kinds: Mapping[str, str]) -> Model:
             place = names.index(sensor), slice(first, first + block.size)
             sensors[place] = _numbers(block, effect)
             carried[place] = effect.carried
-            if effect.carried and effect.offset_f is not None and isinstance(block, LinearBlock):
+            if effect.carried and effect.offset_f is not None:
                 _check_carried(block, effect)
                 stride[first : first + block.size // 3] = block.size // 3
                 bound[place[1]] = True
@@ -257,7 +253,7 @@ def _force(blocks: tuple[Block, ...], both: np.ndarray) -> Array:
     """Return the specific force that the blocks are about, one for all."""
     if both.any():
         raise InputError(f"block state {int(np.argmax(both))} has a gyro_scale and a gyro_force; make two states of it")
-    known = [np.asarray(b.force_f, np.float64) for b in blocks if isinstance(b, LinearBlock) and np.any(b.force_f)]
+    known = [np.asarray(b.force_f, np.float64) for b in blocks if np.any(b.force_f)]
     for one in known[1:]:
         if not np.array_equal(one, known[0]):
             raise InputError(
@@ -266,7 +262,7 @@ def _force(blocks: tuple[Block, ...], both: np.ndarray) -> Array:
     return array("force_f", known[0], (3,)) if known else np.zeros(3)
 
 
-def _check_carried(block: LinearBlock, effect: Effect) -> None:
+def _check_carried(block: Block, effect: Effect) -> None:
     """Refuse a block that is not the same on three axes in turn, which a turn makes the same again."""
     rows = np.asarray(effect.offset_f)
     alike = block.size % 3 == 0 and np.array_equal(rows, np.kron(np.eye(3), rows[: block.size // 3, :1]))
@@ -339,6 +335,12 @@ def turning_matrix(chains: Array, size: int, before: Array, after: Array) -> Arr
     return T.T
 
 
-def general(blocks: Sequence[Block]) -> bool:
-    """Return whether any block needs the step-by-step face."""
-    return any(isinstance(block, GeneralBlock) for block in blocks)
+def aged_prior(blocks: tuple[Block, ...], values: Array, covariance: Array, dt: float) -> tuple[Array, Array]:
+    """Return values (m,) and covariance (m, m) of the blocks' states after dt, s, in which nothing was measured."""
+    transition, driven = np.zeros((2, len(values), len(values)))
+    first = 0
+    for block in blocks:
+        own = slice(first, first + block.size)
+        transition[own, own], driven[own, own] = block.transition(dt), block.process_noise(dt)
+        first += block.size
+    return transition @ values, transition @ covariance @ transition.T + driven

@@ -10,7 +10,7 @@ import numpy as np
 from strapdown import kinematics, mekf, quaternion
 from strapdown.augmented import filtering, joining
 from strapdown.augmented import model as modelling
-from strapdown.augmented.blocks import Block, LinearBlock
+from strapdown.augmented.blocks import Block
 from strapdown.augmented.filtering import AugmentedEstimate
 from strapdown.augmented.model import AugmentedGateMemory, AugmentedState, Model
 from strapdown.checks import Array, count, non_negative
@@ -75,11 +75,10 @@ def smooth(
     """Return the fixed-interval smoother's estimate at every edge (Rauch, Tung & Striebel 1965, on the manifold and on triangular factors).
 
     Innovations and events are the filter's; ``gate`` and ``robust`` are as for :func:`strapdown.augmented.run`. Where the gate has
-    recovered, each trajectory is smoothed by itself, as :mod:`strapdown.smoother` says; with a lever arm, or a block told by functions, the
-    second begins only with the recovery, and from the first refusal to there the rows are the filter's own.
+    recovered, each trajectory is smoothed by itself, as :mod:`strapdown.smoother` says; with a lever arm the second begins
+    only with the recovery, and from the first refusal to there the rows are the filter's own.
 
-    Linear blocks run compiled. Memory: 8 (n (n + 1)/2 + n + 5) bytes for each gyro interval and measurement, n states: 1.7 kB at n = 18.
-    With a block told by functions all goes in matrices in Python, some thousand times slower, and takes 40 n² bytes.
+    Memory: 8 (n (n + 1)/2 + n + 5) bytes for each gyro interval and measurement, n states: 1.7 kB at n = 18.
     """
     return smoothed(record, process_noise, initial, blocks, np.inf, full_covariance, gate, robust)
 
@@ -119,8 +118,6 @@ def smoothed(
     check_arguments(record=record, process_noise=process_noise, gate=gate, robust=robust)
     blocks = modelling.as_blocks(blocks)
     state = modelling.begin(initial, blocks)
-    if modelling.general(blocks):
-        return _stepwise(record, process_noise, state, blocks, lag, full_covariance, gate, robust)
     forward, model, event_time, segments = _filtered(record, process_noise, state, blocks, gate, robust)
     breaks: list[joining.Break] = []
     again: list[joining.Again] = []
@@ -162,37 +159,6 @@ def smoothed(
         attitude,
         x,
         variance,
-        P if full_covariance else None,
-        forward.innovations,
-        forward.skipped,
-    )
-    return replace(found, events=forward.events)
-
-
-def _stepwise(
-    record: ImuRecord,
-    process_noise: ProcessNoise,
-    state: AugmentedState,
-    blocks: tuple[Block, ...],
-    lag: float,
-    full_covariance: bool,
-    gate: Gate | None,
-    robust: Robust | None,
-) -> AugmentedEstimate:
-    """Smooth with blocks told by functions."""
-    from strapdown.augmented import stepwise
-
-    forward, rows = stepwise.smooth(record, process_noise, state, blocks, lag, gate, robust)
-    attitude, x, P = (np.array([getattr(row, name) for row in rows]) for name in ("attitude", "others", "covariance"))
-    model = modelling.assemble(blocks, {series.sensor: series.kind for series in record.vectors})
-    found = filtering.packed(
-        replace(model, order=np.arange(model.states)),
-        blocks,
-        record.time,
-        1,
-        attitude,
-        x,
-        np.einsum("kii->ki", P),
         P if full_covariance else None,
         forward.innovations,
         forward.skipped,
@@ -262,7 +228,7 @@ def _begun_again(
             again.append(None)
             continue
         bias, variance, counts = joining.begun(gate, memory)
-        values, P = _aged(blocks, memory, one.since)
+        values, P = modelling.aged_prior(blocks, memory.values, memory.covariance, one.since - memory.start)
         stop = joining.stops(record.time, [one])
         lost = joining.starts(stop, event_time, segments)[np.searchsorted(stop, one.since)]
         whole = np.diag(np.concatenate([variance, np.zeros(len(values))]))
@@ -279,19 +245,6 @@ def _begun_again(
         _, _, times, rows = _filtered(stretch, process_noise, fresh, blocks, replace(gate, recovery=None), robust)
         again.append((rows, joining.starts(stretch.time, times, rows)))
     return breaks, again
-
-
-def _aged(blocks: tuple[Block, ...], memory: AugmentedGateMemory, time: float) -> tuple[Array, Array]:
-    """Return values and covariance of the blocks' prior at a time."""
-    values, P, first = memory.values.copy(), memory.covariance, 0
-    transition, driven = np.eye(len(values)), np.zeros((len(values), len(values)))
-    for block in blocks:
-        own = slice(first, first + block.size)
-        if isinstance(block, LinearBlock):
-            transition[own, own] = block.transition(time - memory.start)
-            driven[own, own] = block.process_noise(time - memory.start)
-        first += block.size
-    return transition @ values, transition @ P @ transition.T + driven
 
 
 def _go_back(

@@ -19,8 +19,8 @@ Every filter takes directions, vectors, headings and attitudes with every form o
 one number a sensor, whatever the shape of its noise; the covariance that it reports is that of those gains under that noise.
 
 They run over whole records only. A comparison needs no other face: what is fed sample by sample in a product is the MEKF
-(:class:`strapdown.mekf.StepFilter`: late measurements, gates, sensors declared beforehand), and seven copies of that would be seven to
-keep equal. Who wants to look inside one step finds it as plain functions on tuples in :mod:`strapdown.kernels.family_step`.
+(:class:`strapdown.stepfilter.StepFilter`: late measurements, gates, sensors declared beforehand), and seven copies of that would be seven
+to keep equal. Who wants to look inside one step finds it as plain functions on tuples in :mod:`strapdown.kernels.family_step`.
 
 Modules: ``stepping`` the schedule of steps, ``extended`` the Kalman filters, ``unscented``, ``complementary``, ``comparison`` the table.
 """

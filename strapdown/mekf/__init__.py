@@ -2,17 +2,14 @@
 
 The process model is equation (17), ``q̇ = ½ q ⊗ (w_meas − b)``; the error state is ``(δθ, δb)`` with ``q_true = q ⊗ exp(δθ)`` and
 ``δb = b_true − b``. Transition and process noise are exact at constant rate; after each correction the covariance is carried to the new
-tangent space. Two faces, held equal by a test: :func:`run`, compiled, for whole records, and :class:`StepFilter`, on filterpy, for
-people who look inside.
+tangent space. :func:`run` filters whole records, compiled; :class:`strapdown.stepfilter.StepFilter` is the same filter step by step.
 
 ``states``
     Process noise, state, where the filter starts.
 ``scheduling``
     Measurements in order of time.
 ``running``
-    The compiled face.
-``stepping``
-    The step face.
+    The filter over a record.
 """
 
 from strapdown.mekf.running import GAP_FACTOR, gaps, run, run_events, run_on
@@ -28,7 +25,6 @@ from strapdown.mekf.states import (
     initial_state,
     pack,
 )
-from strapdown.mekf.stepping import StepFilter, transition_and_noise
 
 __all__ = [
     "FIRST_SETS",
@@ -38,7 +34,6 @@ __all__ = [
     "ProcessNoise",
     "Schedule",
     "State",
-    "StepFilter",
     "covariance_matrices",
     "first_state",
     "gaps",
@@ -50,5 +45,4 @@ __all__ = [
     "run_on",
     "schedule",
     "skipped_too",
-    "transition_and_noise",
 ]

@@ -15,7 +15,7 @@ from strapdown.mekf.memory import side_by_side
 from strapdown.records import Innovations
 from strapdown.vectors import KINDS, VectorMeasurements, triad
 
-_KIND_CODES = {
+KIND_CODES = {
     "direction": filter_loop.DIRECTION,
     "vector": filter_loop.VECTOR,
     "heading": filter_loop.HEADING,
@@ -145,7 +145,7 @@ def schedule(
         series_sigma=tuple(_plain(part.sigma) for part in parts),
         standing_noise=_joined([part.noise for part in parts], (0, 6)) if any(s.anisotropic for s in vectors) else None,
         bounds=bounds,
-        codes=np.array([_KIND_CODES[series.kind] for series in vectors], np.uint8),
+        codes=np.array([KIND_CODES[series.kind] for series in vectors], np.uint8),
         frames=np.array(
             [(first, part.moving) for first, part in zip(first_frames, parts, strict=False)], np.int64
         ).reshape(-1, 2),
