@@ -11,6 +11,7 @@ import scipy.linalg
 
 from strapdown import augmented, consistency, kinematics, mekf, motion, quaternion, records
 from strapdown.augmented import filtering, joining, smoothing
+from strapdown.augmented.model import aged_prior
 from strapdown.augmented.turning import turning
 from strapdown.checks import InputError
 from strapdown.mekf import ProcessNoise
@@ -503,7 +504,7 @@ def test_the_prior_of_the_blocks_ages_as_the_filter_has_it():
     )
     ahead = augmented.run(bare, NOISE, begun, blocks, full_covariance=True)
     memory = filtering._first(begun, blocks, 3.0)
-    aged, covariance = smoothing._aged(blocks, memory, 5.0)
+    aged, covariance = aged_prior(blocks, memory.values, memory.covariance, 5.0 - memory.start)
     sigma = np.sqrt(np.diag(ahead.whole_covariance[-1])[6:])
     found = np.concatenate([block.values[-1] for block in ahead.blocks.values()])
     np.testing.assert_allclose(aged / sigma, found / sigma, rtol=0, atol=1e-8)

@@ -345,6 +345,18 @@ def test_a_long_sum_of_steps_stays_the_time():
     assert not f.update_direction(X, X, 0.1, time=1100.0 - 1e-4)
 
 
+def test_a_stamp_ends_a_sum_of_steps():
+    """What the sum lacks by rounding belongs to it alone: after a stamp a step is counted from there."""
+    for steps in range(1, 9):
+        f = StepFilter(NOISE, start(), time=1.7e9)
+        for _ in range(steps):
+            f.predict(np.zeros(3), 0.01)
+        f.predict(np.zeros(3), time=1.7e9 + 1.0)
+        for k in range(1, 9):
+            f.predict(np.zeros(3), 2.0**-23)
+            assert f.time == 1.7e9 + 1.0 + np.round(k * 0.5) * 2.0**-22, (steps, k)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
