@@ -19,12 +19,13 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import mekf
+from strapdown import estimation
+from strapdown.estimation.gating import Gate, Robust
+from strapdown.estimation.states import ProcessNoise, initial_state
+from strapdown.estimation.step_filter import StepFilter
 from strapdown.files import write_json
 from strapdown.kernels.machine import describe
-from strapdown.mekf import ProcessNoise, StepFilter, initial_state
 from strapdown.records import ImuRecord
-from strapdown.estimation.gating import Gate, Robust
 from strapdown.vectors import VectorMeasurements
 
 RATE = 100.0
@@ -139,15 +140,18 @@ def main(*, n: int = 200_000, repeats: int = 7) -> dict[str, Any]:
     edges = at_edges(between)
     gate, robust = Gate(recovery=None), Robust()
     works = {
-        "strapdown mekf.run, one vector": (lambda: mekf.run(one, NOISE, START), n),
-        "strapdown mekf.run, two vectors": (lambda: mekf.run(two, NOISE, START), n),
-        "strapdown mekf.run, two vectors, asynchronous": (lambda: mekf.run(between, NOISE, START), n),
-        "strapdown mekf.run, the same with gyro samples at their times": (
-            lambda: mekf.run(edges, NOISE, START, every=3),
+        "strapdown estimation.run, one vector": (lambda: estimation.run(one, NOISE, START), n),
+        "strapdown estimation.run, two vectors": (lambda: estimation.run(two, NOISE, START), n),
+        "strapdown estimation.run, two vectors, asynchronous": (lambda: estimation.run(between, NOISE, START), n),
+        "strapdown estimation.run, the same with gyro samples at their times": (
+            lambda: estimation.run(edges, NOISE, START, every=3),
             n,
         ),
-        "strapdown mekf.run, two vectors, gate": (lambda: mekf.run(two, NOISE, START, gate=gate), n),
-        "strapdown mekf.run, two vectors, Student's t": (lambda: mekf.run(two, NOISE, START, robust=robust), n),
+        "strapdown estimation.run, two vectors, gate": (lambda: estimation.run(two, NOISE, START, gate=gate), n),
+        "strapdown estimation.run, two vectors, Student's t": (
+            lambda: estimation.run(two, NOISE, START, robust=robust),
+            n,
+        ),
         **peers(rate, force, field),
         "strapdown StepFilter on filterpy": (step_by_step(one, 1000), 1000),
     }
@@ -160,7 +164,7 @@ def main(*, n: int = 200_000, repeats: int = 7) -> dict[str, Any]:
             start = time.process_time()  # what else the machine does is not counted
             work()
             times[name].append((time.process_time() - start) / count * 1e9)
-    base = statistics.median(times["strapdown mekf.run, one vector"])
+    base = statistics.median(times["strapdown estimation.run, one vector"])
     rows = [
         {"name": name, "ns_per_sample": statistics.median(t), "least": min(t), "ratio": statistics.median(t) / base}
         for name, t in times.items()

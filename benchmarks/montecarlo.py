@@ -18,10 +18,11 @@ from typing import Any
 import numpy as np
 
 from strapdown import motion, vectors
+from strapdown.estimation.states import ProcessNoise, initial_state
+from strapdown.estimation.step_filter import StepFilter
 from strapdown.files import write_json
 from strapdown.gyro import GyroSpec
 from strapdown.kernels.machine import describe
-from strapdown.mekf import ProcessNoise, StepFilter, initial_state
 from strapdown.montecarlo import lanes, scalar
 from strapdown.montecarlo.plan import Plan
 from strapdown.scenarios import Scenario

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from strapdown import mekf, quaternion, smoother
+from strapdown import estimation, quaternion
 from strapdown.files import write_json
 from strapdown.kernels.machine import describe
 from strapdown.records import ImuRecord
@@ -79,8 +79,8 @@ def record(rate: np.ndarray, up: np.ndarray, field: np.ndarray, spacing: int) ->
 
 def measure(samples: int, seconds: float) -> dict:
     data = sensors(samples)
-    noise = mekf.ProcessNoise(angle_random_walk=GYRO_SIGMA * math.sqrt(INTERVAL), rate_random_walk=1e-5)
-    initial = mekf.initial_state(quaternion.IDENTITY, attitude_sigma=0.1, bias_sigma=0.01)
+    noise = estimation.ProcessNoise(angle_random_walk=GYRO_SIGMA * math.sqrt(INTERVAL), rate_random_walk=1e-5)
+    initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=0.1, bias_sigma=0.01)
     absent = []
     try:
         import vqf
@@ -90,8 +90,8 @@ def measure(samples: int, seconds: float) -> dict:
     for name, spacing in SPACING.items():
         one = record(*data, spacing)
         functions: dict[str, Callable[[], object]] = {
-            "filter": lambda one=one: mekf.run(one, noise, initial),
-            "smoother": lambda one=one: smoother.run(one, noise, initial),
+            "filter": lambda one=one: estimation.run(one, noise, initial),
+            "smoother": lambda one=one: estimation.smooth(one, noise, initial),
         }
         if not absent:  # it takes the vectors of every sample in any case
             gyr, acc, mag = (np.ascontiguousarray(x) for x in (data[0], 9.81 * data[1], 50.0 * data[2]))
@@ -104,7 +104,7 @@ def measure(samples: int, seconds: float) -> dict:
         result["cases"][name] = figures
     one = record(*data, 10)
     short = ImuRecord(time=one.time[:2001], increments=one.increments[:2000], vectors=one.vectors)
-    lagged = least_times({"lag": lambda: smoother.run_fixed_lag(short, noise, initial, lag=1.0)}, seconds)["lag"]
+    lagged = least_times({"lag": lambda: estimation.smooth(short, noise, initial, lag=1.0)}, seconds)["lag"]
     result["fixed_lag_of_100_samples_ns"] = 1e9 * lagged / 2000
     return result
 

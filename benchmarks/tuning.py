@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from strapdown import gyro, mekf, motion, scenarios, setup, tuning, vectors
+from strapdown import gyro, motion, scenarios, setup, tuning, vectors
+from strapdown.estimation.step_filter import StepFilter
 from strapdown.files import write_json
 from strapdown.kernels.machine import describe
 
@@ -55,7 +56,7 @@ def seconds(work: Callable[[], Any], repeats: int) -> float:
 def step_seconds(one: tuning.Case, chosen: setup.FilterSetup, samples: int) -> float:
     """Return processor seconds a gyro sample of the filterpy face, measurements and all."""
     believed = setup.believed(one.record, chosen)
-    filter_ = mekf.StepFilter(chosen.process_noise, one.initial)
+    filter_ = StepFilter(chosen.process_noise, one.initial)
     first, second = believed.vectors
     dt = float(believed.time[1] - believed.time[0])
     every = round(1.0 / dt)

@@ -2,10 +2,10 @@
 
 A consumer-grade gyro with 1 % scale factors, 10 mrad misalignments and half a degree a second of bias; a magnetometer with 4 µT of hard
 iron left; an accelerometer with 0.1 m/s² of bias, in a hand that accelerates by 0.2 m/s² and so is no vertical. The unit is turned about
-all axes. One filter (:mod:`strapdown.augmented`, 24 states) estimates attitude, gyro bias, the nine entries of the gyro's scale matrix,
+all axes. One filter (:mod:`strapdown.estimation`, 24 states) estimates attitude, gyro bias, the nine entries of the gyro's scale matrix,
 hard iron, accelerometer bias and the acceleration of the hand. It starts from the first samples, so its heading is off by a fifth of a
 radian, which is what the hard iron does to it; so it starts anew from where the smoother puts that start
-(:func:`strapdown.augmented.recentred`), and what becomes of it otherwise is told beside.
+(:func:`strapdown.estimation.relinearized_start`), and what becomes of it otherwise is told beside.
 
 Told are, for each state, what was known before and after, whether the errors of all runs are what the covariance says, and what the plain
 filter makes of the same records. The figure shows one run's errors in the filter's own ±3σ.
@@ -21,9 +21,10 @@ from pathlib import Path
 
 import numpy as np
 
-from strapdown import augmented, coning, consistency, gyro, mekf, plots, quaternion, records, wahba
+from strapdown import coning, consistency, estimation, gyro, plots, quaternion, records, wahba
 from strapdown.checks import Array
-from strapdown.mekf import ProcessNoise
+from strapdown.estimation import error_states
+from strapdown.estimation.states import ProcessNoise
 from strapdown.motion import Harmonic, HarmonicRates
 from strapdown.plots.style import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION
 from strapdown.randomness import generator
@@ -38,10 +39,10 @@ UP = np.array([0.0, 0.0, 9.80665])
 BIAS = 0.5 * DEGREE
 SWAY_SIGMA, SWAY_TIME = 0.2, 0.3
 """Acceleration of the hand: standard deviation of each component, m/s², and correlation time, s."""
-SCALE = augmented.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01)
-IRON = augmented.VectorBias(sensor="magnetometer", bias_sigma=4e-6, unit="T", name="hard iron")
-FORCE = augmented.VectorBias(sensor="accelerometer", bias_sigma=0.1, unit="m/s²", name="accelerometer bias")
-SWAY = augmented.GaussMarkov(
+SCALE = error_states.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01)
+IRON = error_states.VectorBias(sensor="magnetometer", bias_sigma=4e-6, unit="T", name="hard iron")
+FORCE = error_states.VectorBias(sensor="accelerometer", bias_sigma=0.1, unit="m/s²", name="accelerometer bias")
+SWAY = error_states.GaussMarkov(
     sensor="accelerometer",
     noise_sigma=SWAY_SIGMA,
     correlation_time=SWAY_TIME,
@@ -147,7 +148,7 @@ def simulated(seed: int, run: int, duration: float) -> tuple[ImuRecord, dict[str
     return record, truth, sway
 
 
-def start(record: ImuRecord) -> mekf.State:
+def start(record: ImuRecord) -> estimation.State:
     """Return the attitude that the first samples show, and what hard iron and acceleration leave of it."""
     series = {s.sensor: s for s in record.vectors}
     up, field = (series[name].vector_b[0] for name in ("accelerometer", "magnetometer"))
@@ -159,7 +160,7 @@ def start(record: ImuRecord) -> mekf.State:
     P = np.zeros((6, 6))
     P[:3, :3] = tilt**2 * np.eye(3) + (heading**2 - tilt**2) * np.outer(vertical, vertical)
     P[3:, 3:] = BIAS**2 * np.eye(3)
-    return mekf.State(attitude=attitude, bias=np.zeros(3), covariance=P)
+    return estimation.State(attitude=attitude, bias=np.zeros(3), covariance=P)
 
 
 def main(*, runs: int = 20, duration: float = 120.0, seed: int = 1, out: Path | None = None) -> Result:
@@ -175,9 +176,9 @@ def main(*, runs: int = 20, duration: float = 120.0, seed: int = 1, out: Path | 
         initial = start(record)
         attitude, bias = record.truth.attitude[::every], record.truth.bias[::every]
         told = {**truth, SWAY.name: sway[::every]}
-        first = augmented.run(record, noise, initial, BLOCKS, every=every, full_covariance=True)
-        anew = augmented.recentred(record, noise, initial, BLOCKS)
-        estimate = augmented.run(record, noise, anew, BLOCKS, every=every, full_covariance=True)
+        first = estimation.run(record, noise, initial, BLOCKS, every=every, full_covariance=True)
+        anew = estimation.relinearized_start(record, noise, initial, BLOCKS)
+        estimate = estimation.run(record, noise, anew, BLOCKS, every=every, full_covariance=True)
         assert estimate.whole_covariance is not None
         for one, kept in ((first, first_nees), (estimate, nees)):
             error = one.errors(attitude, bias, told)
@@ -188,7 +189,7 @@ def main(*, runs: int = 20, duration: float = 120.0, seed: int = 1, out: Path | 
         plain.append(quaternion.angle_between(without_blocks(record, noise, initial, every), attitude))
         if run == 0:
             sigma, time = spread, estimate.time
-            shown = augmented.observability(record, noise, initial, BLOCKS)
+            shown = estimation.observability(record, noise, initial, BLOCKS)
             rank, states, units, prior = shown.rank, shown.states, shown.units, shown.prior_sigma
     assert sigma is not None
     result = Result(
@@ -213,7 +214,7 @@ def main(*, runs: int = 20, duration: float = 120.0, seed: int = 1, out: Path | 
     return result
 
 
-def without_blocks(record: ImuRecord, noise: ProcessNoise, initial: mekf.State, every: int) -> Array:
+def without_blocks(record: ImuRecord, noise: ProcessNoise, initial: estimation.State, every: int) -> Array:
     """Return the attitudes of the plain filter, which takes all that it has no state for as white noise of the same weight a second."""
     spread = {
         "accelerometer": np.sqrt(0.05**2 + FORCE.sigma[0] ** 2 * 120.0 + 2.0 * SWAY_SIGMA**2 * SWAY_TIME * 100.0),
@@ -222,7 +223,7 @@ def without_blocks(record: ImuRecord, noise: ProcessNoise, initial: mekf.State, 
     series = tuple(s.noise_scaled(spread[s.sensor] / s.sigma[0]) for s in record.vectors)
     believed = ImuRecord(time=record.time, increments=record.increments, vectors=series)
     wider = ProcessNoise(angle_random_walk=0.015, rate_random_walk=noise.rate_random_walk)
-    return augmented.run(believed, wider, initial, every=every).attitude
+    return estimation.run(believed, wider, initial, every=every).attitude
 
 
 PANELS = (

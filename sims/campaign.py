@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from strapdown import consistency, montecarlo, motion, plots
+from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
-from strapdown.mekf import ProcessNoise
 from strapdown.montecarlo import FilterSetup, Plan, Statistics
 from strapdown.plots import style
 from strapdown.scenarios import Scenario

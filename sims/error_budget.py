@@ -20,7 +20,7 @@ import numpy as np
 
 from strapdown import consistency, covariance, plots, quaternion, scenarios, setup
 from strapdown.checks import Array
-from strapdown.mekf import ProcessNoise
+from strapdown.estimation.states import ProcessNoise
 from strapdown.plots import style
 from strapdown.randomness import generator
 from strapdown.setup import FilterSetup

@@ -32,11 +32,12 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import consistency, family, mekf, plots, quaternion
+from strapdown import consistency, estimation, plots, quaternion
 from strapdown.checks import Array
+from strapdown.estimation import filters
+from strapdown.estimation.states import ProcessNoise
 from strapdown.files import write_json
 from strapdown.gyro import GyroSpec
-from strapdown.mekf import ProcessNoise
 from strapdown.motion import Harmonic, HarmonicRates
 from strapdown.randomness import generator
 from strapdown.scenarios import Scenario, simulate
@@ -171,14 +172,14 @@ def scenario(case: str, duration: float) -> Scenario:
     )
 
 
-def initial_state(case: str, attitude: Array, bias: Array, random: np.random.Generator) -> mekf.State:
+def initial_state(case: str, attitude: Array, bias: Array, random: np.random.Generator) -> estimation.State:
     """Return the state that a run starts from: the truth, off by an error of the case's kind."""
     axis = random.standard_normal(3)
     if case == "small":
         sigma, turn = SMALL_SIGMA, SMALL_SIGMA * axis
     else:
         sigma, turn = float(LARGE_SIGMA), random.uniform(*LARGE) * axis / np.linalg.norm(axis)
-    return mekf.initial_state(
+    return estimation.initial_state(
         quaternion.multiply(attitude, quaternion.exp(-turn)),
         attitude_sigma=sigma,
         bias_sigma=BIAS_SIGMA,
@@ -203,7 +204,7 @@ def study(
         for name in names:
             if name == "usque" and run >= unscented_runs:
                 continue
-            estimate = family.run(name, record, belief, initial, every=every, full_covariance=True)
+            estimate = filters.run(name, record, belief, initial, every=every, full_covariance=True)
             e = consistency.errors(estimate.attitude, estimate.bias, truth.attitude[::every], truth.bias[::every])
             nees[name].append(consistency.nees(e, estimate.covariance) / 6.0)
             errors[name].append(
@@ -330,7 +331,7 @@ def main(
     unscented_runs: int = 40,
     duration: float = 300.0,
     cases: Sequence[str] = CASES,
-    filters: Sequence[str] = tuple(family.FILTERS),
+    filters: Sequence[str] = tuple(filters.FILTERS),
     seed: int = 1,
     out: Path | None = None,
 ) -> Result:

@@ -26,7 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
-from strapdown import consistency, datasheets, flicker, gyro, mekf, motion, plots, quaternion
+from strapdown import consistency, datasheets, estimation, flicker, gyro, motion, plots, quaternion
 from strapdown.plots import style
 from strapdown.randomness import generator
 from strapdown.scenarios import Scenario, simulate
@@ -117,9 +117,9 @@ def judge(preset, runs, duration, seed, rate=None):
         for name in FILTERS[:-1]:
             record = simulate(without if name == "control" else scenario, seed, run)
             q0 = quaternion.exp(-offset)
-            initial = mekf.initial_state(q0, attitude_sigma=start, bias_sigma=bias_sigma)
-            noise = mekf.ProcessNoise(**noises[name])
-            estimate = mekf.run(record, noise, initial, every=every, full_covariance=True)
+            initial = estimation.initial_state(q0, attitude_sigma=start, bias_sigma=bias_sigma)
+            noise = estimation.ProcessNoise(**noises[name])
+            estimate = estimation.run(record, noise, initial, every=every, full_covariance=True)
             truth = record.truth
             error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude[::every], truth.bias[::every])[
                 :, :3

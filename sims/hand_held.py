@@ -5,8 +5,8 @@ acceleration, one set of numbers for all recordings:
 
 - white, as large and as lasting as makes the filter robust: ``ahrs.MOTIONS["any"]``;
 - the same, which starts from the gyro bias that the quiet second shows, as all further ones do;
-- coloured, first order (:class:`strapdown.augmented.GaussMarkov`), which lasts and so passes for tilt;
-- the derivative of a bounded velocity (:class:`strapdown.augmented.BoundedVelocity`);
+- coloured, first order (:class:`strapdown.error_states.GaussMarkov`), which lasts and so passes for tilt;
+- the derivative of a bounded velocity (:class:`strapdown.error_states.BoundedVelocity`);
 - hand held: that, with scale factors and misalignments of the gyro as states: :data:`strapdown.ahrs.HAND_HELD`, what
   ``strapdown estimate`` believes if not told otherwise.
 
@@ -37,11 +37,11 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 
-from strapdown import ahrs, augmented, plots, quaternion, recordings
+from strapdown import ahrs, estimation, plots, quaternion, recordings
 from strapdown.ahrs import HAND_HELD
-from strapdown.augmented import GaussMarkov
 from strapdown.checks import Array, InputError
 from strapdown.consistency import reference_errors
+from strapdown.estimation.error_states import GaussMarkov
 from strapdown.files import write_json
 from strapdown.motion import Harmonic, HarmonicRates
 from strapdown.plots import style
@@ -139,7 +139,7 @@ def coloured(recording: Recording, latency: float) -> tuple[Recording, Array]:
     plain = ahrs.estimate(recording, replace(BOUNDED, velocity_sigma=0.0), latency=latency)
     used = plain.recording
     quiet = ahrs.quiet_span(used)
-    found = augmented.run(
+    found = estimation.run(
         ahrs.imu_record(used, quiet, BOUNDED), BOUNDED.setup.process_noise, plain.initial, (COLOURED,)
     )
     return used, found.attitude

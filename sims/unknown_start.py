@@ -22,9 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import bank, consistency, family, mekf, plots, quaternion, scenarios
+from strapdown import consistency, estimation, plots, quaternion, scenarios
 from strapdown.checks import Array
-from strapdown.mekf import ProcessNoise
+from strapdown.estimation import filters, multiple_model
+from strapdown.estimation.states import ProcessNoise
 from strapdown.plots import style
 from strapdown.randomness import generator
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
@@ -118,14 +119,14 @@ def study(name: str, *, runs: int, duration: float, seed: int) -> Outcome:
         record = scenarios.simulate(dataclasses.replace(scenario, motion=turned), seed, run)
         assert record.truth is not None
         if name.startswith("bank"):
-            found = bank.run(
+            found = multiple_model.run(
                 record, belief, hypotheses=int(name.rpartition(" ")[2]), bias_sigma=BIAS_SIGMA, every=EVERY
             )
             estimate, rows = found.estimate, found.edges
             became_one.append(found.became_one)
         else:
-            initial = mekf.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=ANYWHERE, bias_sigma=BIAS_SIGMA)
-            estimate = family.run(name, record, belief, initial, every=EVERY, full_covariance=True)
+            initial = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=ANYWHERE, bias_sigma=BIAS_SIGMA)
+            estimate = filters.run(name, record, belief, initial, every=EVERY, full_covariance=True)
             rows = np.arange(0, len(record.time), EVERY)
             became_one.append(0.0)
         truth = record.truth

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import coning, mekf, quaternion, setup, wahba
-from strapdown.setup.states import SensorStates, States
+from strapdown import coning, estimation, quaternion, setup, wahba
 from strapdown.checks import Array, InputError, non_negative, positive
 from strapdown.recordings import Recording, increments
 from strapdown.records import Estimate, ImuRecord
 from strapdown.setup import FilterSetup
+from strapdown.setup.states import SensorStates, States
 from strapdown.units import DEGREE
 from strapdown.vectors import VectorMeasurements
 
@@ -38,7 +38,7 @@ class AhrsParameters:
 
     The noises are those of *independent* samples at ``reference_rate``, and are spread so that the weight a second does not depend on the
     recording's rate. They are much larger than the sensors' own noise, because what disturbs them, acceleration and iron, lasts over
-    many samples. With ``velocity_sigma`` the acceleration has states (:class:`strapdown.augmented.BoundedVelocity`), and
+    many samples. With ``velocity_sigma`` the acceleration has states (:class:`strapdown.error_states.BoundedVelocity`), and
     ``specific_force_sigma`` is what is left beside it; :data:`HAND_HELD` is such a set.
     """
 
@@ -98,7 +98,7 @@ class AhrsParameters:
             sensors=sensors,
         )
         return FilterSetup(
-            process_noise=mekf.ProcessNoise(
+            process_noise=estimation.ProcessNoise(
                 angle_random_walk=self.angle_random_walk, rate_random_walk=self.rate_random_walk
             ),
             attitude_sigma=self.attitude_sigma,
@@ -236,7 +236,7 @@ def imu_record(recording: Recording, quiet: slice, parameters: AhrsParameters) -
     return ImuRecord(time=recording.time, increments=increments(recording), vectors=tuple(vectors))
 
 
-def start(recording: Recording, quiet: slice, parameters: AhrsParameters) -> mekf.State:
+def start(recording: Recording, quiet: slice, parameters: AhrsParameters) -> estimation.State:
     """Return the state at the quiet samples: attitude by TRIAD from the mean vertical and field; any North without a magnetometer.
 
     With ``rest_bias_sigma`` the bias is that of :func:`resting_bias`.
@@ -254,7 +254,7 @@ def start(recording: Recording, quiet: slice, parameters: AhrsParameters) -> mek
     bias, bias_sigma = np.zeros(3), parameters.bias_sigma
     if parameters.rest_bias_sigma > 0.0:
         bias, bias_sigma = resting_bias(recording, quiet, parameters)
-    return mekf.initial_state(attitude, bias=bias, attitude_sigma=sigma, bias_sigma=bias_sigma)
+    return estimation.initial_state(attitude, bias=bias, attitude_sigma=sigma, bias_sigma=bias_sigma)
 
 
 def resting_bias(recording: Recording, quiet: slice, parameters: AhrsParameters) -> tuple[Array, float]:
@@ -293,7 +293,7 @@ class AhrsEstimate:
     recording: Recording
     """The recording from its first quiet second on, its samples as the filter takes them."""
     estimate: Estimate
-    initial: mekf.State
+    initial: estimation.State
     """Where the filter started."""
     magnetometer_latency: float = 0.0
     """How much later than the gyro's the magnetometer's samples were taken for, s."""

@@ -14,8 +14,8 @@ import numpy as np
 
 from strapdown import coning, montecarlo, quaternion
 from strapdown.checks import Array, InputError, count, non_negative, positive
+from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
-from strapdown.mekf import ProcessNoise
 from strapdown.montecarlo import FilterSetup, Statistics
 from strapdown.motion import Coning
 from strapdown.scenarios import Scenario

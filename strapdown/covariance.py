@@ -23,10 +23,10 @@ import numpy as np
 
 from strapdown import coning, flicker, gyro, kinematics, quaternion, vectors
 from strapdown.checks import Array, InputError, count, known_keys, non_negative
+from strapdown.estimation.states import covariance_matrices
 from strapdown.gyro import GyroSpec
 from strapdown.kernels import covariance_loop
 from strapdown.kernels.machine import compiled
-from strapdown.mekf import covariance_matrices
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord
 from strapdown.scenarios import Scenario
@@ -533,7 +533,7 @@ class _Random:
             amplitudes[c] = amplitude
             for a in range(3):
                 cross[c, 3 + a, a, :n] = -(amplitude[a] ** 2) * projected
-            self.blocks[source][[15, 18, 20]] = amplitude**2 * (gains @ projected)
+            self.error_states[source][[15, 18, 20]] = amplitude**2 * (gains @ projected)
         sources = np.array([source for source, *_ in self.shapes], np.int64)
         return amplitudes, table[0], table[1], table[2], cross, sources
 

@@ -24,7 +24,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     # 2 data
     ("records", "recordings", "recordfiles", "scenarios"),
     # 3 estimators
-    ("mekf", "robustness", "setup", "smoother", "family", "augmented", "bank", "ahrs"),
+    ("mekf", "robustness", "setup", "smoother", "family", "augmented", "bank", "ahrs", "stepfilter", "stepgate"),
     # 4 analysis
     ("consistency", "covariance", "montecarlo", "coning_study", "diagnosis", "doctor", "tuning"),
     # 5 faces
@@ -223,7 +223,7 @@ def test_import_strapdown_is_quick():
 
 
 HELP = """
-from strapdown import cli
+from strapdown import (cli)
 sys.argv = ["strapdown", {!r}]
 try:
     cli.main()

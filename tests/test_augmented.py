@@ -7,20 +7,25 @@ import json
 import math
 
 import filterpy.common
+import in_steps
 import mpmath
 import numpy as np
 import pytest
+from strapdown.error_states import Block
+from strapdown.observability import without_errors
 
-from strapdown import augmented, consistency, kinematics, mekf, motion, quaternion, records, smoother
-from strapdown.estimation.error_states import Block
-from strapdown.estimation.observability import without_errors
+from strapdown import consistency, estimation, kinematics, motion, quaternion, records
 from strapdown.checks import InputError
+from strapdown.estimation import error_states
+from strapdown.estimation.gating import Gate
+from strapdown.estimation.observability import state_names
+from strapdown.estimation.schedule import KIND_CODES
+from strapdown.estimation.states import ProcessNoise
+from strapdown.estimation.step_filter import StepFilter
 from strapdown.kernels import augmented_factor, augmented_step
 from strapdown.kernels.machine import compiled
-from strapdown.mekf import ProcessNoise
 from strapdown.records import ImuRecord
-from strapdown.estimation.gating import Gate
-from strapdown.vectors import VectorMeasurements
+from strapdown.vectors import VectorMeasurements, triad
 
 NOISE = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-4)
 SWAY = motion.HarmonicRates(
@@ -102,13 +107,13 @@ def record_of(body_motion=SWAY, duration=4.0, rate=50.0, seed=1, anisotropic=Fal
     return ImuRecord(time=edges, increments=increments, vectors=tuple(series))
 
 
-def start(body_motion=SWAY, error=(0.02, -0.01, 0.015)) -> mekf.State:
+def start(body_motion=SWAY, error=(0.02, -0.01, 0.015)) -> estimation.State:
     attitude = quaternion.multiply(body_motion.attitude(np.array(0.0)), quaternion.exp(error))
-    return mekf.initial_state(attitude, attitude_sigma=0.03, bias_sigma=3e-3)
+    return estimation.initial_state(attitude, attitude_sigma=0.03, bias_sigma=3e-3)
 
 
 @dataclasses.dataclass(frozen=True)
-class ReferenceError(augmented.LinearBlock):
+class ReferenceError(error_states.ErrorStates):
     """A block that the package does not have: the field's direction is off in fixed axes, the same for two sensors."""
 
     name: str = "field"
@@ -126,13 +131,13 @@ class ReferenceError(augmented.LinearBlock):
     @property
     def effects(self):
         return {
-            "mag": augmented.Effect(offset_f=np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])),
-            "compass": augmented.Effect(offset_f=1e4 * np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])),
+            "mag": error_states.Effect(offset_f=np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])),
+            "compass": error_states.Effect(offset_f=1e4 * np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])),
         }
 
 
 @dataclasses.dataclass(frozen=True)
-class Mounting(augmented.LinearBlock):
+class Mounting(error_states.ErrorStates):
     """The tracker's axes are turned a little against the body's."""
 
     name: str = "mounting"
@@ -145,40 +150,40 @@ class Mounting(augmented.LinearBlock):
 
     @property
     def effects(self):
-        return {"tracker": augmented.Effect(offset_b=np.eye(3))}
+        return {"tracker": error_states.Effect(offset_b=np.eye(3))}
 
 
 OPTIONS: dict[str, tuple[Block, ...]] = {
     "none": (),
-    "gyro scale": (augmented.GyroScale(scale_sigma=0.02, misalignment_sigma=0.01),),
-    "gyro drift": (augmented.GyroGaussMarkov(bias_sigma=np.array([3e-3, 4e-3, 5e-3]), correlation_time=1.5),),
-    "hard iron": (augmented.VectorBias(sensor="mag", bias_sigma=5e-6, unit="T"),),
-    "hard iron that walks": (augmented.VectorBias(sensor="mag", bias_sigma=5e-6, rate_random_walk=1e-7, unit="T"),),
-    "soft iron": (augmented.VectorScale(sensor="mag", scale_sigma=0.05),),
-    "bias of a direction": (augmented.VectorBias(sensor="force", bias_sigma=0.05),),
+    "gyro scale": (error_states.GyroScale(scale_sigma=0.02, misalignment_sigma=0.01),),
+    "gyro drift": (error_states.GyroGaussMarkov(bias_sigma=np.array([3e-3, 4e-3, 5e-3]), correlation_time=1.5),),
+    "hard iron": (error_states.VectorBias(sensor="mag", bias_sigma=5e-6, unit="T"),),
+    "hard iron that walks": (error_states.VectorBias(sensor="mag", bias_sigma=5e-6, rate_random_walk=1e-7, unit="T"),),
+    "soft iron": (error_states.VectorScale(sensor="mag", scale_sigma=0.05),),
+    "bias of a direction": (error_states.VectorBias(sensor="force", bias_sigma=0.05),),
     "bias and scale of a heading": (
-        augmented.VectorBias(sensor="compass", bias_sigma=0.05),
-        augmented.VectorScale(sensor="compass", scale_sigma=0.05),
+        error_states.VectorBias(sensor="compass", bias_sigma=0.05),
+        error_states.VectorScale(sensor="compass", scale_sigma=0.05),
     ),
-    "acceleration in body axes": (augmented.GaussMarkov(sensor="force", noise_sigma=0.1, correlation_time=0.7),),
+    "acceleration in body axes": (error_states.GaussMarkov(sensor="force", noise_sigma=0.1, correlation_time=0.7),),
     "acceleration in fixed axes": (
-        augmented.GaussMarkov(sensor="force", noise_sigma=0.1, correlation_time=0.2, frame="fixed"),
+        error_states.GaussMarkov(sensor="force", noise_sigma=0.1, correlation_time=0.2, frame="fixed"),
     ),
     "two frames": (
-        augmented.GaussMarkov(sensor="mag", noise_sigma=4e-6, correlation_time=0.7, frame="fixed", unit="T"),
-        augmented.VectorScale(sensor="mag", scale_sigma=0.05),
+        error_states.GaussMarkov(sensor="mag", noise_sigma=4e-6, correlation_time=0.7, frame="fixed", unit="T"),
+        error_states.VectorScale(sensor="mag", scale_sigma=0.05),
     ),
     "a carried offset of a heading": (
-        augmented.GaussMarkov(sensor="compass", noise_sigma=0.1, correlation_time=0.7, frame="fixed"),
-        augmented.VectorScale(sensor="compass", scale_sigma=0.05),
+        error_states.GaussMarkov(sensor="compass", noise_sigma=0.1, correlation_time=0.7, frame="fixed"),
+        error_states.VectorScale(sensor="compass", scale_sigma=0.05),
     ),
     "a foreign block": (ReferenceError(),),
     "mounting": (Mounting(),),
     "all": (
-        augmented.VectorBias(sensor="mag", bias_sigma=5e-6, unit="T"),
-        augmented.GyroScale(scale_sigma=0.02, misalignment_sigma=0.01),
-        augmented.GaussMarkov(sensor="force", noise_sigma=0.1, correlation_time=0.7),
-        augmented.GyroGaussMarkov(bias_sigma=3e-3, correlation_time=20.0),
+        error_states.VectorBias(sensor="mag", bias_sigma=5e-6, unit="T"),
+        error_states.GyroScale(scale_sigma=0.02, misalignment_sigma=0.01),
+        error_states.GaussMarkov(sensor="force", noise_sigma=0.1, correlation_time=0.7),
+        error_states.GyroGaussMarkov(bias_sigma=3e-3, correlation_time=20.0),
     ),
 }
 
@@ -197,8 +202,8 @@ FAST = motion.ConstantRate(rate=(30.0, -20.0, 25.0))
 @pytest.mark.parametrize("anisotropic", [False, True])
 def test_without_blocks_it_is_the_plain_filter(body_motion, anisotropic):
     record, initial = record_of(body_motion, anisotropic=anisotropic), start(body_motion)
-    one = mekf.run(record, NOISE, initial, every=3, full_covariance=True)
-    other = augmented.run(record, NOISE, initial, every=3, full_covariance=True)
+    one = estimation.run(record, NOISE, initial, every=3, full_covariance=True)
+    other = estimation.run(record, NOISE, initial, every=3, full_covariance=True)
     assert np.array_equal(one.time, other.time)
     error = consistency.errors(one.attitude, one.bias, other.attitude, other.bias)
     assert np.max(np.abs(error) / one.sigma) < 5e-12
@@ -213,8 +218,8 @@ def test_without_blocks_it_is_the_plain_filter(body_motion, anisotropic):
 def test_without_blocks_the_smoother_is_the_plain_smoother():
     record, initial = record_of(), start(error=(0.2, -0.3, 0.1))
     initial = dataclasses.replace(initial, covariance=100.0 * initial.covariance)
-    one = smoother.run(record, NOISE, initial, full_covariance=True)
-    other = augmented.smooth(record, NOISE, initial, full_covariance=True)
+    one = estimation.smooth(record, NOISE, initial, full_covariance=True)
+    other = estimation.smooth(record, NOISE, initial, full_covariance=True)
     error = consistency.errors(one.attitude, one.bias, other.attitude, other.bias)
     assert np.max(np.abs(error) / one.sigma) < 1e-8
     assert np.max(np.abs(scaled(one.covariance - other.covariance, one.sigma))) < 1e-8
@@ -226,29 +231,25 @@ def test_without_blocks_the_smoother_is_the_plain_smoother():
 @pytest.mark.parametrize("option", OPTIONS)
 def test_both_faces_are_one_filter(option):
     record, initial, blocks = record_of(duration=2.0, anisotropic=option == "all"), start(), OPTIONS[option]
-    whole = augmented.run(record, NOISE, initial, blocks, full_covariance=True)
-    state = augmented.initial_state(initial, blocks)
-    step, end = augmented.stepping.run_on(record, NOISE, state, blocks, full_covariance=True)
+    whole = estimation.run(record, NOISE, initial, blocks, full_covariance=True)
+    step = in_steps.run(record, NOISE, estimation.with_error_states(initial, blocks), blocks)
     sigma = np.sqrt(np.einsum("kii->ki", whole.whole_covariance))
-    values = {name: block.values for name, block in step.blocks.items()}
-    assert np.max(np.abs(whole.errors(step.attitude, step.bias, values)) / sigma) < 1e-10
+    assert np.max(np.abs(whole.errors(step.attitude, step.bias, step.values)) / sigma) < 1e-10
     assert np.max(np.abs(scaled(whole.whole_covariance - step.whole_covariance, sigma))) < 1e-10
     for name, innovations in whole.innovations.items():
-        np.testing.assert_allclose(step.innovations[name].whitened, innovations.whitened, rtol=0, atol=1e-8)
-    np.testing.assert_allclose(end.covariance, step.whole_covariance[-1], rtol=1e-9, atol=1e-30)
+        np.testing.assert_allclose(step.whitened[name], innovations.whitened, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(step.state.covariance, step.whole_covariance[-1], rtol=1e-9, atol=1e-30)
 
 
 # -------------------------------------------------------------------------------------------------------------------- exact models
 
 
-def face_at(blocks: tuple[Block, ...], values=None, body_motion=SWAY) -> augmented.StepFilter:
+def face_at(blocks: tuple[Block, ...], values=None, body_motion=SWAY) -> StepFilter:
     """The step-by-step face at an attitude with a bias, its blocks at random values."""
-    state = augmented.initial_state(start(body_motion), blocks)
+    state = estimation.with_error_states(start(body_motion), blocks)
     if values is None:
         values = np.sqrt(np.diag(state.covariance)[6:]) * np.random.default_rng(4).standard_normal(len(state.values))
-    return augmented.StepFilter(
-        NOISE, dataclasses.replace(state, values=values, bias=np.array([2e-3, -1e-3, 4e-3])), blocks
-    )
+    return StepFilter(NOISE, dataclasses.replace(state, values=values, bias=np.array([2e-3, -1e-3, 4e-3])), blocks)
 
 
 GYRO_OPTIONS = {
@@ -268,9 +269,9 @@ def test_the_turn_is_what_the_gyro_model_says(option):
     for block in blocks:
         values = face.values[first : first + block.size]
         first += block.size
-        if isinstance(block, augmented.GyroScale):
+        if isinstance(block, error_states.GyroScale):
             M = values.reshape(3, 3)
-        if isinstance(block, augmented.GyroGaussMarkov):
+        if isinstance(block, error_states.GyroGaussMarkov):
             tau = block.correlation_time
             drift = values * tau * (1.0 - math.exp(-dt / tau))
     turn = np.linalg.solve(np.eye(3) + M, part - face.bias * dt - drift)
@@ -292,13 +293,13 @@ def test_the_transition_is_the_derivative_of_the_turn(option):
     def after(column: int, step: float) -> np.ndarray:
         error = np.zeros(n)
         error[column] = step
-        moved = augmented.AugmentedState(
+        moved = estimation.State(
             attitude=quaternion.multiply(before.attitude, quaternion.exp(error[:3])),
             bias=before.bias + error[3:6],
             values=before.values + error[6:],
             covariance=before.covariance,
         )
-        other = augmented.StepFilter(NOISE, moved, blocks)
+        other = StepFilter(NOISE, moved, blocks)
         other.predict(part, dt)
         turn = quaternion.log(quaternion.multiply(quaternion.conjugate(face.attitude), other.attitude))
         return np.concatenate([turn, other.bias - face.bias, other.values - face.values])
@@ -306,7 +307,7 @@ def test_the_transition_is_the_derivative_of_the_turn(option):
     h = 1e-3 * sigma
     numeric = np.stack([(after(k, h[k]) - after(k, -h[k])) / (2.0 * h[k]) for k in range(n)], axis=-1)
     # The turn takes a drift by its mean over the step; Φ knows that it decays meanwhile.
-    drifts = [k for k, name in enumerate(augmented.observing.state_names(blocks)[0]) if name.startswith("gyro drift")]
+    drifts = [k for k, name in enumerate(state_names(blocks)[0]) if name.startswith("gyro drift")]
     tolerance = np.full(n, 1e-11)
     tolerance[drifts] = 2e-7
     assert np.all(np.abs((face.F - numeric) * sigma) < tolerance)
@@ -408,15 +409,15 @@ def test_rows_are_the_derivative_of_what_sensors_give(option):
 def rows_at(face, sensor, kind, reference, z):
     """Return H and y that the kernel makes of a measurement at the face's estimate."""
     H, y, basis = np.empty((3, len(face.x))), np.empty(3), np.empty((3, 3))
-    model = face._model(sensor)
+    model = face._model(sensor, kind)
     length = np.linalg.norm(reference) if kind == "vector" else 1.0
     attitude = kind == "attitude"
-    frame = (*z, 0.0, 0.0, 0.0, 0.0, 0.0) if attitude else tuple(augmented.stepping.triad(reference).ravel())
+    frame = (*z, 0.0, 0.0, 0.0, 0.0, 0.0) if attitude else tuple(triad(reference).ravel())
     count = augmented_step.fill_rows(
         tuple(face.attitude),
         tuple(quaternion.to_matrix(face.attitude).ravel()),
         np.array([*face.bias, *face.values]),
-        augmented.stepping.KIND_CODES[kind],
+        KIND_CODES[kind],
         (0.0, 0.0, 0.0) if attitude else tuple(z / length),
         frame,
         length,
@@ -449,9 +450,9 @@ def test_two_directions_and_a_diffuse_prior_give_the_closed_form():
         for name, axis in (("x", np.array([1.0, 0.0, 0.0])), ("y", np.array([0.0, 1.0, 0.0])))
     )
     record = ImuRecord(time=np.array([0.0, 1.0]), increments=np.zeros((1, 3)), vectors=series)
-    initial = mekf.initial_state(quaternion.IDENTITY, attitude_sigma=1e3, bias_sigma=1.0)
-    blocks = (augmented.GyroScale(scale_sigma=1.0, misalignment_sigma=1.0),)
-    P = augmented.run(record, NOISE, initial, blocks, full_covariance=True).whole_covariance[0]
+    initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=1e3, bias_sigma=1.0)
+    blocks = (error_states.GyroScale(scale_sigma=1.0, misalignment_sigma=1.0),)
+    P = estimation.run(record, NOISE, initial, blocks, full_covariance=True).whole_covariance[0]
     np.testing.assert_allclose(P[:3, :3], sigma**2 * np.diag([1.0, 1.0, 0.5]), rtol=1e-12, atol=1e-12 * sigma**2)
     np.testing.assert_allclose(P[3:, 3:], np.eye(12), rtol=1e-14, atol=1e-14)
 
@@ -512,7 +513,7 @@ def test_the_covariance_stays_positive_definite(sharpness):
         )
     increments = SWAY.increments(edges) + 1e-4 * rng.standard_normal((10000, 3)) * (sharpness > 1.0)
     record = ImuRecord(time=edges, increments=increments, vectors=tuple(sensors))
-    estimate, end = augmented.run_on(
+    estimate, end = estimation.run_part(
         record, NOISE, start(error=(0.0, 0.0, 0.0)), OPTIONS["all"], every=100, full_covariance=True
     )
     P = estimate.whole_covariance
@@ -527,17 +528,17 @@ def test_the_covariance_stays_positive_definite(sharpness):
 @pytest.mark.parametrize("option", ["all", "a foreign block"])
 def test_a_split_run_is_the_whole_run_to_the_bit(option):
     record, blocks = record_of(), OPTIONS[option]
-    whole, end = augmented.run_on(record, NOISE, start(), blocks, full_covariance=True)
-    first, middle = augmented.run_on(records.cut(record, 0, 77), NOISE, start(), blocks, full_covariance=True)
+    whole, end = estimation.run_part(record, NOISE, start(), blocks, full_covariance=True)
+    first, middle = estimation.run_part(records.cut(record, 0, 77), NOISE, start(), blocks, full_covariance=True)
     rest = records.cut(record, 77, len(record.increments))
-    second, last = augmented.run_on(rest, NOISE, middle, blocks, full_covariance=True)
+    second, last = estimation.run_part(rest, NOISE, middle, blocks, full_covariance=True)
     for name in ("attitude", "bias", "variance", "whole_covariance"):
         joined = np.concatenate([getattr(first, name)[:-1], getattr(second, name)])
         assert np.array_equal(joined, getattr(whole, name)), name
     assert np.array_equal(last.factor, end.factor)
     # Without the factor, from the covariance alone, the same to rounding.
     bare = dataclasses.replace(middle, factor=None)
-    again = augmented.run(rest, NOISE, bare, blocks)
+    again = estimation.run(rest, NOISE, bare, blocks)
     np.testing.assert_allclose(again.bias, second.bias, rtol=0, atol=1e-9 * np.max(second.sigma))
 
 
@@ -550,26 +551,28 @@ def test_effects_in_the_sensors_own_unit_keep_it_from_part_to_part(gate):
     sigma = np.where(series.time < record.time[half], 0.25, 1.0) * series.sigma
     weak = dataclasses.replace(series, sigma=sigma)
     record = dataclasses.replace(record, vectors=tuple(weak if s is series else s for s in record.vectors))
-    blocks = (augmented.VectorBias(sensor=series.sensor, bias_sigma=0.02, varying=True),)
-    part, middle = augmented.run_on(records.cut(record, 0, half), NOISE, start(), blocks, gate=gate)
+    blocks = (error_states.VectorBias(sensor=series.sensor, bias_sigma=0.02, varying=True),)
+    part, middle = estimation.run_part(records.cut(record, 0, half), NOISE, start(), blocks, gate=gate)
     assert middle.unit_sigma == pytest.approx({series.sensor: float(sigma[0])}, rel=1e-12)
-    rest, last = augmented.run_on(records.cut(record, half, len(record.increments)), NOISE, middle, blocks, gate=gate)
+    rest, last = estimation.run_part(
+        records.cut(record, half, len(record.increments)), NOISE, middle, blocks, gate=gate
+    )
     assert last.unit_sigma == middle.unit_sigma
-    begin = dataclasses.replace(augmented.initial_state(start(), blocks), unit_sigma=middle.unit_sigma)
-    whole, end = augmented.run_on(record, NOISE, begin, blocks, gate=gate)
+    begin = dataclasses.replace(estimation.with_error_states(start(), blocks), unit_sigma=middle.unit_sigma)
+    whole, end = estimation.run_part(record, NOISE, begin, blocks, gate=gate)
     for name in ("attitude", "bias", "variance"):
         joined = np.concatenate([getattr(part, name)[:-1], getattr(rest, name)])
         assert np.array_equal(joined, getattr(whole, name)), name
     assert np.array_equal(last.values, end.values)
     assert np.array_equal(last.factor, end.factor)
     # Told nothing, the whole has its own unit, the root mean square; its prior is made for that, and the rest is the same filter.
-    _, own = augmented.run_on(record, NOISE, start(), blocks, gate=gate)
+    _, own = estimation.run_part(record, NOISE, start(), blocks, gate=gate)
     unit = float(np.sqrt(np.mean(sigma**2)))
     assert own.unit_sigma == pytest.approx({series.sensor: unit}, rel=1e-12)
     ratio = unit / middle.unit_sigma[series.sensor]
     prior = dataclasses.replace(blocks[0], bias_sigma=0.02 / ratio)
-    begin = dataclasses.replace(augmented.initial_state(start(), (prior,)), unit_sigma=middle.unit_sigma)
-    _, same = augmented.run_on(record, NOISE, begin, (prior,), gate=gate)
+    begin = dataclasses.replace(estimation.with_error_states(start(), (prior,)), unit_sigma=middle.unit_sigma)
+    _, same = estimation.run_part(record, NOISE, begin, (prior,), gate=gate)
     np.testing.assert_allclose(same.values * ratio, own.values, rtol=1e-9, atol=1e-14)
 
 
@@ -596,7 +599,7 @@ def turn_to(q, other) -> np.ndarray:
 
 def reference_smoother(record, initial, blocks):
     """The textbook smoother on whole matrices, over what the step-by-step face passed through."""
-    face = augmented.StepFilter(NOISE, initial, blocks, sensors=[s.sensor for s in record.vectors])
+    face = StepFilter(NOISE, initial, blocks, sensors=[s.sensor for s in record.vectors])
     series = {(t, i): (s, j) for i, s in enumerate(record.vectors) for j, t in enumerate(s.time)}
     stops = np.unique(np.concatenate([record.time, [t for t, _ in series]]))
     filtered, steps, at_edge = [], [], []
@@ -644,7 +647,7 @@ def test_the_smoother_is_the_textbook_one(option):
     # A wrong start, so that corrections are tenths of a radian and a missing Jacobian shows.
     initial = start(error=(0.2, -0.1, 0.15))
     initial = dataclasses.replace(initial, covariance=np.diag([0.04] * 3 + [1e-5] * 3))
-    one = augmented.smooth(record, NOISE, initial, blocks, full_covariance=True)
+    one = estimation.smooth(record, NOISE, initial, blocks, full_covariance=True)
     q, b, c, P = reference_smoother(record, initial, blocks)
     sigma = np.sqrt(np.einsum("kii->ki", one.whole_covariance))
     values = dict(zip(one.blocks, np.split(c, np.cumsum([block.size for block in blocks])[:-1], axis=1), strict=True))
@@ -655,8 +658,8 @@ def test_the_smoother_is_the_textbook_one(option):
 @pytest.mark.parametrize("option", [name for name in OPTIONS if name != "none"])
 def test_the_smoother_is_never_worse_than_the_filter(option):
     record, blocks = record_of(), OPTIONS[option]
-    ahead = augmented.run(record, NOISE, start(), blocks, full_covariance=True)
-    both = augmented.smooth(record, NOISE, start(), blocks, full_covariance=True)
+    ahead = estimation.run(record, NOISE, start(), blocks, full_covariance=True)
+    both = estimation.smooth(record, NOISE, start(), blocks, full_covariance=True)
     sigma = np.sqrt(np.einsum("kii->ki", ahead.whole_covariance))
     # By the whole matrix, but for the turn of the tangent space, which is of second order.
     T = carried_by(blocks, turn_to(both.attitude, ahead.attitude))
@@ -670,7 +673,7 @@ def test_the_smoother_is_never_worse_than_the_filter(option):
     # What does not change is one number over the whole record.
     for block in blocks:
         still = (block.decay == 0.0) & (block.density == 0.0)
-        found = both.blocks[block.name]
+        found = both.error_states[block.name]
         assert (
             np.max(np.abs(found.values[:, still] - found.values[-1, still]) / found.sigma[:, still], initial=0.0) < 1e-9
         )
@@ -685,126 +688,13 @@ def test_a_gap_of_many_correlation_times_does_no_harm():
         for s in record.vectors[:3]
     )
     record = ImuRecord(time=time, increments=record.increments, vectors=later)
-    blocks = (augmented.GaussMarkov(sensor="force", noise_sigma=0.1, correlation_time=0.2),)
-    ahead = augmented.run(record, NOISE, start(), blocks)
-    both = augmented.smooth(record, NOISE, start(), blocks)
-    assert ahead.blocks["force disturbance"].sigma[101] == pytest.approx(0.1, rel=1e-6)
+    blocks = (error_states.GaussMarkov(sensor="force", noise_sigma=0.1, correlation_time=0.2),)
+    ahead = estimation.run(record, NOISE, start(), blocks)
+    both = estimation.smooth(record, NOISE, start(), blocks)
+    assert ahead.error_states["force disturbance"].sigma[101] == pytest.approx(0.1, rel=1e-6)
     assert np.all(np.isfinite(both.variance))
     assert np.all(both.sigma <= ahead.sigma * (1.0 + 1e-3))
     assert [event.kind for event in ahead.events] == ["gap"]
-
-
-# -------------------------------------------------------------------------------------------------------- blocks told by functions
-
-
-class AsGeneral(augmented.GeneralBlock):
-    """A linear block told by functions instead of by arrays."""
-
-    def __init__(self, block: augmented.LinearBlock) -> None:
-        self.block, self.name, self.components = block, block.name, block.components
-        self.units, self.sigma = block.units, block.sigma
-
-    def propagate(self, values, interval):
-        transition = self.block.transition(interval.dt)
-        return transition @ values, transition, np.zeros((self.size, 3)), self.block.process_noise(interval.dt)
-
-    def gyro(self, values, interval):
-        return values @ self.block.gyro_offset, self.block.gyro_offset
-
-    def measured(self, values, view):
-        effect = self.block.effects.get(view.sensor)
-        return None if effect is None else (values @ effect.offset_b, effect.offset_b)
-
-
-@dataclasses.dataclass(frozen=True)
-class SecondBias(augmented.LinearBlock):
-    """One more constant gyro bias, on one axis."""
-
-    name: str = "second bias"
-    components: tuple[str, ...] = ("y",)
-    units: tuple[str, ...] = ("rad/s",)
-
-    @property
-    def sigma(self):
-        return np.array([2e-3])
-
-    @property
-    def gyro_offset(self):
-        return np.array([[0.0, 1.0, 0.0]])
-
-
-@pytest.mark.parametrize(
-    "option", ["hard iron that walks", "bias of a direction", "acceleration in body axes", "second bias"]
-)
-def test_a_block_told_by_functions_is_the_same_block(option):
-    linear = {**OPTIONS, "second bias": (SecondBias(),)}[option]
-    record = record_of(duration=1.5)
-    others = (augmented.GyroScale(scale_sigma=0.02, misalignment_sigma=0.01),)
-    one = augmented.run(record, NOISE, start(), (*linear, *others), full_covariance=True)
-    told = tuple(AsGeneral(block) for block in linear)
-    other = augmented.run(record, NOISE, start(), (*told, *others), full_covariance=True)
-    sigma = np.sqrt(np.einsum("kii->ki", one.whole_covariance))
-    values = {name: block.values for name, block in other.blocks.items()}
-    assert np.max(np.abs(one.errors(other.attitude, other.bias, values)) / sigma) < 1e-9
-    assert np.max(np.abs(scaled(one.whole_covariance - other.whole_covariance, sigma))) < 1e-9
-
-
-class Latency(augmented.GeneralBlock):
-    """A sensor's stamps are late by τ: it shows where the body was, ``exp([ω] τ) R_fbᵀ r ≈ r_b + τ ω × r_b``."""
-
-    name, components, units, sigma = "latency", ("mag",), ("s",), np.array([0.05])
-
-    def measured(self, values, view):
-        if view.sensor != "mag":
-            return None
-        swept = np.cross(view.rate, view.expected_b)
-        return values[0] * swept, swept[None]
-
-
-def test_a_foreign_block_finds_a_latency():
-    """Declared here and unknown to the package: it goes by the rate, so it runs on the step-by-step face."""
-    rng = np.random.default_rng(2)
-    edges = np.arange(801) / 50.0
-    series = []
-    for name, r, late in (("mag", FIELD / np.linalg.norm(FIELD), 0.03), ("force", UP / 9.81, 0.0)):
-        z = seen(SWAY, edges[1::2] - late, r) + 3e-3 * rng.standard_normal((400, 3))
-        z /= np.linalg.norm(z, axis=1, keepdims=True)
-        series.append(
-            VectorMeasurements(
-                sensor=name, kind="direction", time=edges[1::2], vector_b=z, reference_f=r, sigma=np.full(400, 3e-3)
-            )
-        )
-    record = ImuRecord(time=edges, increments=SWAY.increments(edges), vectors=tuple(series))
-    found = augmented.run(record, NOISE, start(), (Latency(),)).blocks["latency"]
-    assert found.sigma[-1, 0] < 1e-3
-    assert abs(found.values[-1, 0] - 0.03) < 4.0 * found.sigma[-1, 0]
-
-
-class Velocity(augmented.GeneralBlock):
-    """Velocity in fixed axes, from a specific force that is constant in the body: it changes with the attitude."""
-
-    name, components, units, sigma = "velocity", ("x", "y", "z"), ("m/s",) * 3, np.full(3, 0.1)
-    force_b = np.array([1.0, -2.0, 9.0])
-
-    def propagate(self, values, interval):
-        R = quaternion.to_matrix(interval.attitude)
-        after = values + R @ self.force_b * interval.dt
-        return after, np.eye(3), -R @ kinematics.skew(self.force_b) * interval.dt, np.zeros((3, 3))
-
-
-def test_a_foreign_block_may_change_with_the_attitude():
-    face = augmented.StepFilter(NOISE, start(), (Velocity(),))
-    before = face.state()
-    turned = augmented.StepFilter(
-        NOISE,
-        dataclasses.replace(before, attitude=quaternion.multiply(before.attitude, quaternion.exp([0.0, 1e-6, 0.0]))),
-        (Velocity(),),
-    )
-    for one in (face, turned):
-        one.predict([0.01, 0.02, -0.01], 0.1)
-    np.testing.assert_allclose((turned.values - face.values) / 1e-6, face.F[6:, 1], rtol=1e-5)
-    assert np.all(face.P[6:, :3] != 0.0)
-    assert face.time == 0.1
 
 
 # ------------------------------------------------------------------------------------------------------------------- observability
@@ -839,9 +729,9 @@ HAND = motion.HarmonicRates(
 
 def test_hard_iron_needs_a_turn():
     """Still, the field's horizontal part and the heading are one; turned about, all is told."""
-    blocks = (augmented.VectorBias(sensor="mag", bias_sigma=1e-5, unit="T"),)
-    initial = mekf.initial_state(quaternion.IDENTITY, attitude_sigma=0.3, bias_sigma=5e-3)
-    still = augmented.observability(plain_record(motion.rest()), NOISE, initial, blocks)
+    blocks = (error_states.VectorBias(sensor="mag", bias_sigma=1e-5, unit="T"),)
+    initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=0.3, bias_sigma=5e-3)
+    still = estimation.observability(plain_record(motion.rest()), NOISE, initial, blocks)
     assert still.rank == 8
     assert still.singular_values[-1] < 0.5
     # Heading and what is east in the body: a heading δψ moves the field of 20 µT by 20 µT δψ.
@@ -850,7 +740,7 @@ def test_hard_iron_needs_a_turn():
     assert abs(still.directions[-1] @ expected) > 0.99
     assert "attitude z" in still.weakest(1)[0]
     assert "mag bias x" in still.weakest(1)[0]
-    turned = augmented.observability(plain_record(HAND), NOISE, initial, blocks)
+    turned = estimation.observability(plain_record(HAND), NOISE, initial, blocks)
     assert turned.rank == 9
     assert np.all(turned.unobserved == 0.0)
     assert np.all(turned.start_sigma[6:] < 0.1 * turned.prior_sigma[6:])
@@ -858,7 +748,7 @@ def test_hard_iron_needs_a_turn():
 
 
 def test_a_gyro_scale_needs_a_turn_about_each_axis():
-    blocks = (augmented.GyroScale(scale_sigma=0.02, misalignment_sigma=0.02),)
+    blocks = (error_states.GyroScale(scale_sigma=0.02, misalignment_sigma=0.02),)
     initial = start()
     ranks = {}
     for name, body in (
@@ -866,7 +756,7 @@ def test_a_gyro_scale_needs_a_turn_about_each_axis():
         ("about z", motion.HarmonicRates(harmonics=(motion.Harmonic(amplitude=(0.0, 0.0, 1.5), frequency=0.2),))),
         ("about all", HAND),
     ):
-        found = augmented.observability(plain_record(body), NOISE, initial, blocks)
+        found = estimation.observability(plain_record(body), NOISE, initial, blocks)
         ranks[name] = found.rank
         if name == "about z":
             seen_states = np.flatnonzero(found.unobserved < 0.5)
@@ -883,9 +773,9 @@ def test_singular_values_are_those_of_the_stacked_rows():
         sensor="star", kind="direction", time=np.array([0.0]), vector_b=[r], reference_f=r, sigma=np.array([0.01])
     )
     record = ImuRecord(time=edges, increments=np.zeros((1, 3)), vectors=(series,))
-    initial = mekf.initial_state(quaternion.IDENTITY, attitude_sigma=[0.2, 0.1, 0.3], bias_sigma=1e-3)
-    blocks = (augmented.VectorBias(sensor="star", bias_sigma=0.05),)
-    found = augmented.observability(record, NOISE, initial, blocks)
+    initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=[0.2, 0.1, 0.3], bias_sigma=1e-3)
+    blocks = (error_states.VectorBias(sensor="star", bias_sigma=0.05),)
+    found = estimation.observability(record, NOISE, initial, blocks)
     # Across z, the measured (x, y) is (−δθ_y + c_x, δθ_x + c_y).
     rows = np.zeros((2, 9))
     rows[0, 1], rows[0, 6], rows[1, 0], rows[1, 7] = -0.1, 0.05, 0.2, 0.05
@@ -897,16 +787,16 @@ def test_singular_values_are_those_of_the_stacked_rows():
 
 def test_what_is_left_along_each_direction_is_told_in_the_units_of_the_states():
     """Its rows are independent errors that make up the covariance; along the weakest the prior is left, state by state."""
-    blocks = (augmented.VectorBias(sensor="mag", bias_sigma=1e-5, unit="T"),)
+    blocks = (error_states.VectorBias(sensor="mag", bias_sigma=1e-5, unit="T"),)
     correlated = start().covariance * np.outer([3.0, 1.0, 2.0, 1.0, 1.0, 5.0], [3.0, 1.0, 2.0, 1.0, 1.0, 5.0])
     correlated[0, 1] = correlated[1, 0] = 0.6 * np.sqrt(correlated[0, 0] * correlated[1, 1])
     initial = dataclasses.replace(start(), covariance=correlated)
     record = plain_record(motion.rest())
-    found = augmented.observability(record, NOISE, initial, blocks)
-    where = augmented.smooth(record, NOISE, initial, blocks)
+    found = estimation.observability(record, NOISE, initial, blocks)
+    where = estimation.smooth(record, NOISE, initial, blocks)
     begin = dataclasses.replace(initial, attitude=where.attitude[0], bias=np.zeros(3))
     exact = without_errors(record, where.attitude)
-    whole = augmented.smooth(exact, NOISE, begin, blocks, full_covariance=True)
+    whole = estimation.smooth(exact, NOISE, begin, blocks, full_covariance=True)
     np.testing.assert_allclose(np.sqrt(np.diag(found.left.T @ found.left)), found.start_sigma, rtol=1e-6)
     apart = np.outer(found.start_sigma, found.start_sigma)
     np.testing.assert_allclose(found.left.T @ found.left / apart, whole.whole_covariance[0] / apart, atol=1e-6)
@@ -924,7 +814,7 @@ def test_what_is_left_along_each_direction_is_told_in_the_units_of_the_states():
 
 
 def test_observability_takes_every_kind_of_measurement():
-    found = augmented.observability(record_of(anisotropic=True), NOISE, start(), OPTIONS["all"])
+    found = estimation.observability(record_of(anisotropic=True), NOISE, start(), OPTIONS["all"])
     assert len(found.states) == len(found.units) == len(found.singular_values) == 24
     assert np.all(found.start_sigma <= found.prior_sigma * (1.0 + 1e-9))
 
@@ -933,7 +823,7 @@ def test_observability_takes_every_kind_of_measurement():
 
 
 @dataclasses.dataclass(frozen=True)
-class Wrong(augmented.LinearBlock):
+class Wrong(error_states.ErrorStates):
     name: str = "wrong"
     components: tuple[str, ...] = ("a",)
     units: tuple[str, ...] = ("1",)
@@ -943,36 +833,36 @@ class Wrong(augmented.LinearBlock):
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: augmented.GyroScale(scale_sigma=0.0, misalignment_sigma=0.1), "scale_sigma is 0"),
-        (lambda: augmented.VectorBias(sensor="mag", bias_sigma=[1.0, -1.0, 1.0]), r"bias_sigma\[1\] is -1"),
-        (lambda: augmented.GaussMarkov(sensor="mag", noise_sigma=1.0, correlation_time=-1.0), "correlation_time is -1 s"),
+        (lambda: error_states.GyroScale(scale_sigma=0.0, misalignment_sigma=0.1), "scale_sigma is 0"),
+        (lambda: error_states.VectorBias(sensor="mag", bias_sigma=[1.0, -1.0, 1.0]), r"bias_sigma\[1\] is -1"),
+        (lambda: error_states.GaussMarkov(sensor="mag", noise_sigma=1.0, correlation_time=-1.0), "correlation_time is -1 s"),
         (
-            lambda: augmented.GaussMarkov(sensor="mag", noise_sigma=1.0, correlation_time=1.0, frame="bodi"),
+            lambda: error_states.GaussMarkov(sensor="mag", noise_sigma=1.0, correlation_time=1.0, frame="bodi"),
             "did you mean 'body'",
         ),
-        (lambda: augmented.run(record_of(), NOISE, start(), (augmented.VectorBias(sensor="mga", bias_sigma=1.0),)), "'mag'"),
-        (lambda: augmented.run(record_of(), NOISE, start(), OPTIONS["hard iron"] * 2), "two blocks are named 'mag bias'"),
-        (lambda: augmented.run(record_of(), NOISE, start(), ("mag",)), "is no block"),
+        (lambda: estimation.run(record_of(), NOISE, start(), (error_states.VectorBias(sensor="mga", bias_sigma=1.0),)), "'mag'"),
+        (lambda: estimation.run(record_of(), NOISE, start(), OPTIONS["hard iron"] * 2), "two blocks are named 'mag bias'"),
+        (lambda: estimation.run(record_of(), NOISE, start(), ("mag",)), "is no block"),
         (
-            lambda: augmented.run(record_of(), NOISE, start(), (augmented.VectorScale(sensor="tracker", scale_sigma=0.1),)),
+            lambda: estimation.run(record_of(), NOISE, start(), (error_states.VectorScale(sensor="tracker", scale_sigma=0.1),)),
             "whole attitudes",
         ),
         (
-            lambda: augmented.run(
-                record_of(), NOISE, augmented.initial_state(start(), OPTIONS["hard iron"]), OPTIONS["gyro scale"]
+            lambda: estimation.run(
+                record_of(), NOISE, estimation.with_error_states(start(), OPTIONS["hard iron"]), OPTIONS["gyro scale"]
             ),
             "initial has 3 block states, the blocks 9",
         ),
-        (lambda: augmented.run(record_of(), NOISE, start(), (Wrong(sigma=np.zeros(1)),)), r"sigma\[0\] is 0"),
-        (lambda: augmented.run(record_of(), NOISE, start(), (Wrong(units=(), sigma=np.ones(1)),)), "0 units for 1"),
+        (lambda: estimation.run(record_of(), NOISE, start(), (Wrong(sigma=np.zeros(1)),)), r"sigma\[0\] is 0"),
+        (lambda: estimation.run(record_of(), NOISE, start(), (Wrong(units=(), sigma=np.ones(1)),)), "0 units for 1"),
         (
-            lambda: augmented.GaussMarkov(sensor="mag", noise_sigma=[1.0, 2.0, 1.0], correlation_time=1.0, frame="fixed"),
+            lambda: error_states.GaussMarkov(sensor="mag", noise_sigma=[1.0, 2.0, 1.0], correlation_time=1.0, frame="fixed"),
             "differs by axis",
         ),
-        (lambda: augmented.run(record_of(), NOISE, start(), every=0), "every is 0"),
-        (lambda: augmented.observability(record_of(), NOISE, start(), threshold=0.0), "threshold is 0"),
+        (lambda: estimation.run(record_of(), NOISE, start(), every=0), "every is 0"),
+        (lambda: estimation.observability(record_of(), NOISE, start(), threshold=0.0), "threshold is 0"),
         (
-            lambda: augmented.run(record_of(), NOISE, start(), OPTIONS["hard iron"]).errors(np.zeros(4), np.zeros(3)),
+            lambda: estimation.run(record_of(), NOISE, start(), OPTIONS["hard iron"]).errors(np.zeros(4), np.zeros(3)),
             "true_values tells",
         ),
     ],
@@ -984,11 +874,12 @@ def test_bad_input_is_refused_with_the_remedy(make, words):
 
 def test_the_kernels_are_compiled_once_for_all_blocks():
     """The kernels see arrays only: whatever the blocks, one compiled version each."""
-    from strapdown.kernels import augmented_loop, augmented_smoother
+    from strapdown.kernels import augmented_smoother, root_form
+    from strapdown.kernels.walk import walk
 
     for option in ("none", "all", "a foreign block"):
-        augmented.smooth(record_of(duration=0.5), NOISE, start(), OPTIONS[option])
-    assert len(compiled(augmented_loop.run_augmented).signatures) <= 2  # times written to, or read-only
+        estimation.smooth(record_of(duration=0.5), NOISE, start(), OPTIONS[option])
+    assert len(compiled(walk, root_form).signatures) <= 2  # times written to, or read-only
     assert len(compiled(augmented_smoother.smooth_augmented).signatures) == 1
 
 
@@ -998,14 +889,14 @@ def test_a_start_that_is_moved_takes_its_covariance_along(option):
     initial = start(error=(0.5, -0.4, 0.3))
     initial = dataclasses.replace(initial, covariance=np.diag([0.01, 0.09, 0.25, 1e-5, 1e-5, 1e-5]))
     blocks = OPTIONS[option]
-    before = augmented.initial_state(initial, blocks)
+    before = estimation.with_error_states(initial, blocks)
     P = before.covariance.copy()
     P[6:9, 6:9] *= 1.0 + np.array([[0.0, 0.0, 0.0], [0.0, 3.0, 0.0], [0.0, 0.0, 8.0]])
     before = dataclasses.replace(before, covariance=P)
-    after = augmented.recentred(record_of(), NOISE, before, blocks, passes=1)
-    smoothed = augmented.smooth(record_of(), NOISE, before, blocks)
+    after = estimation.relinearized_start(record_of(), NOISE, before, blocks, passes=1)
+    smoothed = estimation.smooth(record_of(), NOISE, before, blocks)
     assert np.array_equal(after.attitude, smoothed.attitude[0])
-    assert np.array_equal(after.values, np.concatenate([block.values[0] for block in smoothed.blocks.values()]))
+    assert np.array_equal(after.values, np.concatenate([block.values[0] for block in smoothed.error_states.values()]))
     move = quaternion.log(quaternion.multiply(quaternion.conjugate(before.attitude), after.attitude))
     assert np.linalg.norm(move) > 0.3
     J = carried_by(blocks, turn_to(before.attitude, after.attitude))

@@ -8,8 +8,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from strapdown import augmented, consistency, gyro, mekf, motion, quaternion
-from strapdown.mekf import ProcessNoise
+from strapdown import consistency, estimation, gyro, motion, quaternion
+from strapdown.estimation import error_states
+from strapdown.estimation.observability import state_names
+from strapdown.estimation.states import ProcessNoise
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord
 from strapdown.scenarios import Scenario, simulate
@@ -26,11 +28,11 @@ FIELD = np.array([0.0, 2e-5, -4e-5])
 ATTITUDE_SIGMA, BIAS_SIGMA = 0.02, 3e-3
 ARW, RRW = 1e-3, 1e-4
 
-SCALE = augmented.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01)
-IRON = augmented.VectorBias(sensor="mag", bias_sigma=5e-6, unit="T")
-SOFT = augmented.VectorScale(sensor="mag", scale_sigma=0.02)
-SWAY = augmented.GaussMarkov(sensor="acc", noise_sigma=0.4, correlation_time=1.0, unit="m/s²")
-DRIFT = augmented.GyroGaussMarkov(bias_sigma=4e-3, correlation_time=5.0)
+SCALE = error_states.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01)
+IRON = error_states.VectorBias(sensor="mag", bias_sigma=5e-6, unit="T")
+SOFT = error_states.VectorScale(sensor="mag", scale_sigma=0.02)
+SWAY = error_states.GaussMarkov(sensor="acc", noise_sigma=0.4, correlation_time=1.0, unit="m/s²")
+DRIFT = error_states.GyroGaussMarkov(bias_sigma=4e-3, correlation_time=5.0)
 
 CASES = {
     "gyro scale": (SCALE,),
@@ -47,7 +49,7 @@ class Run:
     """One record, what it starts from, and the truth of the blocks at every edge."""
 
     record: object
-    initial: mekf.State
+    initial: estimation.State
     noise: ProcessNoise
     truth: dict
 
@@ -100,7 +102,7 @@ def simulated(case: str, seed: int, run: int, duration: float) -> Run:
     if drifts:
         truth[DRIFT.name] = record.truth.bias - turn_on
     error = rng.standard_normal(6) * np.repeat([ATTITUDE_SIGMA, BIAS_SIGMA], 3)
-    initial = mekf.initial_state(
+    initial = estimation.initial_state(
         quaternion.multiply(record.truth.attitude[0], quaternion.exp(-error[:3])),
         attitude_sigma=ATTITUDE_SIGMA,
         bias_sigma=BIAS_SIGMA,
@@ -123,7 +125,7 @@ def judged(case: str, blocks, number: int, duration: float, *, smoothed=False, k
     epochs = None
     values = []
     for one in runs(case, number, duration, seed):
-        face = augmented.smooth if smoothed else augmented.run
+        face = estimation.smooth if smoothed else estimation.run
         estimate = face(one.record, one.noise, one.initial, blocks, full_covariance=True)
         if epochs is None:
             epochs = np.linspace(0.4, 0.95, 5) * (len(estimate.time) - 1)
@@ -136,7 +138,7 @@ def judged(case: str, blocks, number: int, duration: float, *, smoothed=False, k
             told[SWAY.name] = np.zeros(3)
         error = estimate.errors(one.record.truth.attitude, true_bias, told)[epochs]
         P = estimate.whole_covariance[epochs]
-        names = augmented.observing.state_names(blocks)[0]
+        names = state_names(blocks)[0]
         kept = [k for k, name in enumerate(names) if not name.startswith(SWAY.name)]
         values.append(consistency.nees(error[:, kept], P[:, kept][:, :, kept]))
     mean = np.mean(values, axis=0) / len(kept)
@@ -166,7 +168,7 @@ def test_it_is_not_with_the_block_left_out(case):
 
 
 BROKEN = {
-    "a prior too narrow": ("gyro scale", augmented.GyroScale(scale_sigma=0.002, misalignment_sigma=0.002)),
+    "a prior too narrow": ("gyro scale", error_states.GyroScale(scale_sigma=0.002, misalignment_sigma=0.002)),
     "the wrong sign": ("hard iron", None),
     "a correlation too short": ("acceleration", dataclasses.replace(SWAY, correlation_time=0.1)),
     "a drift too small": ("gyro drift", dataclasses.replace(DRIFT, bias_sigma=1e-3)),
@@ -175,7 +177,7 @@ BROKEN = {
 
 
 @dataclasses.dataclass(frozen=True)
-class WrongSign(augmented.LinearBlock):
+class WrongSign(error_states.ErrorStates):
     name: str = IRON.name
     components: tuple[str, ...] = ("x", "y", "z")
     units: tuple[str, ...] = ("T",) * 3
@@ -186,11 +188,11 @@ class WrongSign(augmented.LinearBlock):
 
     @property
     def effects(self):
-        return {"mag": augmented.Effect(offset_b=-np.eye(3))}
+        return {"mag": error_states.Effect(offset_b=-np.eye(3))}
 
 
 @dataclasses.dataclass(frozen=True)
-class Transposed(augmented.LinearBlock):
+class Transposed(error_states.ErrorStates):
     name: str = SOFT.name
     components: tuple[str, ...] = SOFT.components
     units: tuple[str, ...] = SOFT.units
@@ -201,7 +203,7 @@ class Transposed(augmented.LinearBlock):
 
     @property
     def effects(self):
-        return {"mag": augmented.Effect(scale=np.swapaxes(np.eye(9).reshape(9, 3, 3), 1, 2))}
+        return {"mag": error_states.Effect(scale=np.swapaxes(np.eye(9).reshape(9, 3, 3), 1, 2))}
 
 
 @pytest.mark.parametrize("how", BROKEN)
@@ -216,11 +218,11 @@ def test_it_is_not_with_the_block_broken(how):
 def test_calibration_is_found(case):
     """After a while of turning, what the simulated sensors have is found to a fraction of what was known before."""
     one = simulated(case, 21, 0, 60.0)
-    estimate = augmented.run(one.record, one.noise, one.initial, CASES[case])
+    estimate = estimation.run(one.record, one.noise, one.initial, CASES[case])
     for block in CASES[case]:
         if block is SWAY:
             continue
-        found = estimate.blocks[block.name]
+        found = estimate.error_states[block.name]
         error = one.truth[block.name] - found.values[-1]
         assert np.all(np.abs(error) < 4.0 * found.sigma[-1])
         assert np.all(found.sigma[-1] < 0.25 * block.sigma)
@@ -252,15 +254,15 @@ def swaying(seed: int, sigma: float, tau: float, duration: float = 60.0):
             )
         )
     increments = HAND.increments(edges) + ARW * np.sqrt(0.02) * rng.standard_normal((len(edges) - 1, 3))
-    block = augmented.GaussMarkov(sensor="acc", noise_sigma=sigma, correlation_time=tau, frame="fixed", unit="m/s²")
+    block = error_states.GaussMarkov(sensor="acc", noise_sigma=sigma, correlation_time=tau, frame="fixed", unit="m/s²")
     return ImuRecord(time=edges, increments=increments, vectors=tuple(series)), sway, block
 
 
 def test_an_acceleration_is_followed():
     record, sway, block = swaying(5, 0.5, 0.8)
-    initial = mekf.initial_state(HAND.attitude(np.array(0.0)), attitude_sigma=0.01, bias_sigma=1e-3)
+    initial = estimation.initial_state(HAND.attitude(np.array(0.0)), attitude_sigma=0.01, bias_sigma=1e-3)
     noise = ProcessNoise(angle_random_walk=ARW, rate_random_walk=0.0)
-    found = augmented.run(record, noise, initial, (block,), every=2).blocks["acc disturbance"]
+    found = estimation.run(record, noise, initial, (block,), every=2).blocks["acc disturbance"]
     error = sway - found.values[1:]
     late = slice(200, None)
     assert np.sqrt(np.mean(error[late] ** 2)) < 0.2
@@ -272,9 +274,9 @@ def test_an_acceleration_shows_no_heading(sigma):
     """Turn body and acceleration about the vertical together: nothing changes. The variance of the heading only grows."""
     record, _, block = swaying(6, sigma, 0.8)
     record = dataclasses.replace(record, vectors=record.vectors[:1])
-    initial = mekf.initial_state(HAND.attitude(np.array(0.0)), attitude_sigma=0.01, bias_sigma=1e-6)
+    initial = estimation.initial_state(HAND.attitude(np.array(0.0)), attitude_sigma=0.01, bias_sigma=1e-6)
     noise = ProcessNoise(angle_random_walk=ARW, rate_random_walk=0.0)
-    estimate = augmented.run(record, noise, initial, (block,), every=50, full_covariance=True)
+    estimate = estimation.run(record, noise, initial, (block,), every=50, full_covariance=True)
     vertical = quaternion.rotate(quaternion.conjugate(estimate.attitude), [0.0, 0.0, 1.0])
     heading = np.einsum("ki,kij,kj->k", vertical, estimate.covariance[:, :3, :3], vertical)
     expected = 0.01**2 + ARW**2 * estimate.time
@@ -288,16 +290,16 @@ def test_a_start_off_by_tenths_of_a_radian_is_moved_to_where_it_belongs():
     for k in range(number):
         one = simulated("hard iron", 31, k, 12.0)
         error = sigma * generator(31, k, "start").standard_normal(6)
-        state = mekf.initial_state(
+        state = estimation.initial_state(
             quaternion.multiply(one.record.truth.attitude[0], quaternion.exp(-error[:3])),
             attitude_sigma=0.4,
             bias_sigma=BIAS_SIGMA,
             bias=one.record.truth.bias[0] - error[3:],
         )
         block = (dataclasses.replace(IRON, bias_sigma=2e-5),)
-        better = augmented.recentred(one.record, one.noise, state, block)
-        for start, kept in ((augmented.initial_state(state, block), first), (better, anew)):
-            estimate = augmented.run(one.record, one.noise, start, block, every=600, full_covariance=True)
+        better = estimation.relinearized_start(one.record, one.noise, state, block)
+        for start, kept in ((estimation.with_error_states(state, block), first), (better, anew)):
+            estimate = estimation.run(one.record, one.noise, start, block, every=600, full_covariance=True)
             e = estimate.errors(one.record.truth.attitude[::600], one.record.truth.bias[::600], one.truth)[-1]
             kept.append(consistency.nees(e, estimate.whole_covariance[-1]) / 9.0)
     low, high = consistency.mean_bounds(9, number)

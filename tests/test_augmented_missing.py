@@ -5,19 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from strapdown import augmented, mekf
-from strapdown.augmented import StepFilter, VectorBias
+from strapdown import estimation
 from strapdown.checks import InputError
-from strapdown.mekf import ProcessNoise
-from strapdown.records import ImuRecord
+from strapdown.estimation.error_states import VectorBias
 from strapdown.estimation.gating import Gate, Robust
+from strapdown.estimation.states import ProcessNoise
+from strapdown.estimation.step_filter import StepFilter
+from strapdown.records import ImuRecord
 from strapdown.vectors import VectorMeasurements
 
 NOISE = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)
 X, _, UP = np.eye(3)
 NAN = np.full(3, np.nan)
 BLOCKS = (VectorBias(sensor="up", bias_sigma=1e-3),)
-START = mekf.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.1, bias_sigma=1e-3)
+START = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.1, bias_sigma=1e-3)
 
 
 @pytest.mark.filterwarnings("error")
@@ -33,12 +34,12 @@ def test_vertical_headings_and_missing_samples_are_skipped_and_counted(options):
     vertical = VectorMeasurements(sensor="up", kind="direction", time=time, vector_b=up, reference_f=UP, sigma=0.1)
     record = ImuRecord(time=np.linspace(0.0, 1.0, 11), increments=np.zeros((10, 3)), vectors=(north, vertical))
     rest = replace(record, vectors=(north.taken(~odd), vertical.taken(np.arange(8) != 3)))
-    both, without = (augmented.run(r, NOISE, START, BLOCKS, full_covariance=True, **options) for r in (record, rest))
+    both, without = (estimation.run(r, NOISE, START, BLOCKS, full_covariance=True, **options) for r in (record, rest))
     assert both.skipped == {"north": 4, "up": 1}
     assert np.array_equal(both.covariance, without.covariance)
     assert np.isfinite(both.covariance).all()
     assert np.array_equal(both.innovations["north"].nis, without.innovations["north"].nis)
-    smoothed = augmented.smooth(record, NOISE, START, BLOCKS, **options)
+    smoothed = estimation.smooth(record, NOISE, START, BLOCKS, **options)
     assert smoothed.skipped == both.skipped
     if options:
         return
@@ -72,8 +73,8 @@ def test_missing_samples_of_every_kind_change_nothing():
         (lambda f: f.update_heading(1.5 * X, X, 0.1), "has length 1.5"),
         (lambda f: f.update_heading(X, UP, 0.1), "is vertical and shows no heading"),
         (lambda f: f.update_direction(X, X, [0.1, 0.1]), r"sigma has shape \(2,\)"),
-        (lambda f: augmented.StepFilter(NOISE, START, BLOCKS[0]), r"by itself; give a tuple of them, \(block,\)"),
-        (lambda f: augmented.initial_state(START, BLOCKS[0]), r"\(block,\)"),
+        (lambda f: StepFilter(NOISE, START, BLOCKS[0]), r"by itself; give a tuple of them, \(block,\)"),
+        (lambda f: estimation.with_error_states(START, BLOCKS[0]), r"\(block,\)"),
     ],
 )
 def test_what_the_record_refuses_is_refused(call, words):

@@ -8,8 +8,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from strapdown import augmented, consistency, mekf, quaternion, scenarios, setup
-from strapdown.mekf import ProcessNoise
+from strapdown import consistency, estimation, quaternion, scenarios, setup
+from strapdown.estimation.states import ProcessNoise
 from strapdown.montecarlo.scalar import start
 from strapdown.records import ImuRecord
 from strapdown.vectors import VectorMeasurements
@@ -158,7 +158,7 @@ def test_a_correction_of_any_size_is_that_of_the_plain_filter():
     noise = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6)
     for seed in range(40):
         draw = np.random.default_rng(seed)
-        start = mekf.initial_state(
+        start = estimation.initial_state(
             quaternion.normalize(draw.standard_normal(4)), attitude_sigma=2.0 if seed % 2 else 20.0, bias_sigma=1e-3
         )
         series = tuple(
@@ -170,8 +170,8 @@ def test_a_correction_of_any_size_is_that_of_the_plain_filter():
         )
         for vectors in (series, (tracker,)):
             record = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=vectors)
-            plain = mekf.run(record, noise, start, full_covariance=True)
-            wide = augmented.run(record, noise, start, full_covariance=True)
+            plain = estimation.run(record, noise, start, full_covariance=True)
+            wide = estimation.run(record, noise, start, full_covariance=True)
             apart = quaternion.log(quaternion.multiply(quaternion.conjugate(plain.attitude), wide.attitude))
             assert np.abs(apart).max() < 1e-9
             sigma = np.sqrt(plain.variance)

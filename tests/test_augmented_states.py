@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
-import pickle
 
+import in_steps
 import numpy as np
 import pytest
-from filterpy.common import Saver
 
-from strapdown import augmented, consistency, kinematics, mekf, motion, quaternion, records, scenarios, setup, vectors
-from strapdown.setup.states import SensorStates, States, filtering, matching, turning
-from strapdown.setup import states as optional
+from strapdown import consistency, estimation, kinematics, motion, quaternion, records, scenarios, setup, vectors
 from strapdown.checks import InputError
+from strapdown.estimation import error_states
+from strapdown.estimation.gating import Gate, Monitor, Robust
+from strapdown.estimation.states import ProcessNoise
+from strapdown.estimation.step_filter import StepFilter
 from strapdown.gyro import GyroSpec
-from strapdown.mekf import ProcessNoise
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Truth
-from strapdown.estimation.gating import Gate, Monitor, Robust
 from strapdown.scenarios import Scenario
 from strapdown.setup import FilterSetup
+from strapdown.setup import states as optional
+from strapdown.setup.states import SensorStates, States, filtering, matching, turning
 from strapdown.vectors import VectorMeasurements
 
 NOISE = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-5)
@@ -70,9 +71,9 @@ def simulated(seed=3, duration=20.0, kind="vector", outlier_probability=0.0, **g
     return scenarios.simulate(scenario, seed)
 
 
-def begun(record, attitude_sigma=0.02, bias_sigma=3e-3, seed=1) -> mekf.State:
+def begun(record, attitude_sigma=0.02, bias_sigma=3e-3, seed=1) -> estimation.State:
     draw = np.random.default_rng(seed).standard_normal(6)
-    return mekf.initial_state(
+    return estimation.initial_state(
         quaternion.multiply(record.truth.attitude[0], quaternion.exp(-attitude_sigma * draw[:3])),
         attitude_sigma=attitude_sigma,
         bias_sigma=bias_sigma,
@@ -136,18 +137,18 @@ def test_bad_tables_are_refused_with_their_place(table, words):
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: FilterSetup(process_noise=NOISE, bias_sigma=1e-5, states={}), "it must be augmented.States"),
+        (lambda: FilterSetup(process_noise=NOISE, bias_sigma=1e-5, states={}), "it must be states.States"),
         (lambda: States(sensors={"mag": {}}), "must be SensorStates"),
         (lambda: setup.run(simulated(), chosen(States(sensors={"map": SensorStates(bias_sigma=1.0)})), None), "'mag'"),
         (lambda: WHOLE.chosen(("gyro.scael",)), "did you mean 'gyro.scale'"),
         (lambda: States().chosen(("gyro.scale",)), "there is none to choose from"),
         (lambda: run(uneven(), chosen(States(sensors={"acc": SensorStates(lever_arm_sigma=0.1)}))), "intervals that are alike"),
         (lambda: run(simulated(duration=1.0), chosen(States(sensors={"acc": SensorStates(lever_arm_sigma=0.1)}))), "needs 100"),
-        (lambda: augmented.LeverArm(sensor="acc", arm_sigma=0.0), "arm_sigma is 0"),
-        (lambda: augmented.LeverArm(sensor="acc", arm_sigma=[0.1, -1.0, 0.0]), r"arm_sigma\[1\] is -1 m"),
-        (lambda: augmented.GyroForce(along_sigma=0.0), "along_sigma is 0"),
+        (lambda: error_states.LeverArm(sensor="acc", arm_sigma=0.0), "arm_sigma is 0"),
+        (lambda: error_states.LeverArm(sensor="acc", arm_sigma=[0.1, -1.0, 0.0]), r"arm_sigma\[1\] is -1 m"),
+        (lambda: error_states.GyroForce(along_sigma=0.0), "along_sigma is 0"),
         (
-            lambda: augmented.GyroScale(scale_sigma=np.zeros(3), misalignment_sigma=np.zeros((3, 3))),
+            lambda: error_states.GyroScale(scale_sigma=np.zeros(3), misalignment_sigma=np.zeros((3, 3))),
             "scale_sigma and misalignment_sigma are both 0",
         ),
     ],
@@ -191,7 +192,7 @@ def uneven() -> ImuRecord:
 def test_without_states_it_is_the_plain_filter_gates_and_all(kind, options):
     record = missing(simulated(kind=kind, outlier_probability=0.1))
     initial = begun(record)
-    one = mekf.run(record, NOISE, initial, every=7, full_covariance=True, **options)
+    one = estimation.run(record, NOISE, initial, every=7, full_covariance=True, **options)
     other = optional.run(record, NOISE, initial, States(), every=7, full_covariance=True, **options)
     np.testing.assert_allclose(other.attitude, one.attitude, atol=1e-12)
     np.testing.assert_allclose(other.bias, one.bias, atol=1e-13)
@@ -230,13 +231,13 @@ def test_a_gate_keeps_outliers_from_the_states():
         run(record, chosen(states, **options)) for options in ({}, {"gate": Gate(recovery=None)}, {"robust": Robust()})
     )
     true = np.array([2e-6, -3e-6, 1e-6])
-    errors = [np.linalg.norm(one.blocks["mag bias"].values[-1] - true) for one in (plain, gated, robust)]
+    errors = [np.linalg.norm(one.error_states["mag bias"].values[-1] - true) for one in (plain, gated, robust)]
     struck = len(record.vectors[0].time) * 0.05
     assert 0.5 * struck < gated.refused["mag"] < 1.6 * struck
     assert gated.refused["acc"] < 10
     for one, error in ((gated, errors[1]), (robust, errors[2])):
         assert error < errors[0]
-        assert error < 4.0 * np.linalg.norm(one.blocks["mag bias"].sigma[-1])
+        assert error < 4.0 * np.linalg.norm(one.error_states["mag bias"].sigma[-1])
         used = one.innovations["mag"]
         nis = used.nis[used.weight > 0.5].mean() / 3.0
         assert 0.85 < nis < 1.1
@@ -261,7 +262,7 @@ def test_the_whole_bias_is_that_of_all_states():
     told = optional.run(record, NOISE, initial, states, every=50, full_covariance=True)
     blocks = states.blocks({"mag": "vector", "acc": "vector"})
     begin = optional.initial_state(initial, blocks)
-    whole = augmented.run(record, NOISE, begin, blocks, every=50, full_covariance=True)
+    whole = estimation.run(record, NOISE, begin, blocks, every=50, full_covariance=True)
     sum_of = np.zeros((6, 12))
     sum_of[:6, :6] = np.eye(6)
     sum_of[3:, 6:9] = sum_of[3:, 9:] = np.eye(3)
@@ -290,27 +291,29 @@ def test_force_is_what_the_simulated_gyro_feels():
     force = vectors.specific_force(SWAY, middle)
     increments = SWAY.increments(edges) + (force @ G.T) / 200.0
     record = ImuRecord(time=edges, increments=increments)
-    block = augmented.GyroForce(along_sigma=1e-3, across_sigma=1e-3)
+    block = error_states.GyroForce(along_sigma=1e-3, across_sigma=1e-3)
     noise = ProcessNoise(angle_random_walk=1e-9, rate_random_walk=0.0)
-    plain = mekf.initial_state(SWAY.attitude(np.array(0.0)), attitude_sigma=1e-6, bias_sigma=1e-9)
-    start = augmented.initial_state(plain, (block,))
+    plain = estimation.initial_state(SWAY.attitude(np.array(0.0)), attitude_sigma=1e-6, bias_sigma=1e-9)
+    start = estimation.with_error_states(plain, (block,))
     truth = SWAY.attitude(edges)
     for sign, least, most in ((1.0, 0.0, 2e-4), (-1.0, 1e-2, 1.0)):
         begin = dataclasses.replace(start, values=sign * G.ravel())
-        estimate = augmented.run(record, noise, begin, (block,))
+        estimate = estimation.run(record, noise, begin, (block,))
         off = np.max(quaternion.angle_between(estimate.attitude, truth))
         assert least <= off < most
 
 
 def test_force_s_transition_is_the_derivative():
     rng = np.random.default_rng(2)
-    block = augmented.GyroForce(along_sigma=1e-3, across_sigma=1e-3)
-    initial = mekf.initial_state(quaternion.normalize(rng.standard_normal(4)), attitude_sigma=0.1, bias_sigma=0.01)
+    block = error_states.GyroForce(along_sigma=1e-3, across_sigma=1e-3)
+    initial = estimation.initial_state(
+        quaternion.normalize(rng.standard_normal(4)), attitude_sigma=0.1, bias_sigma=0.01
+    )
     values = 1e-3 * rng.standard_normal(9)
 
     def moved(values):
-        state = dataclasses.replace(augmented.initial_state(initial, (block,)), values=values)
-        face = augmented.StepFilter(NOISE, state, (block,))
+        state = dataclasses.replace(estimation.with_error_states(initial, (block,)), values=values)
+        face = StepFilter(NOISE, state, (block,))
         face.predict(np.array([0.02, -0.03, 0.01]), 0.05)
         return face
 
@@ -323,69 +326,30 @@ def test_force_s_transition_is_the_derivative():
 
 def test_faces_agree_with_force_and_gyro_scale_of_some_axes():
     record = simulated(duration=3.0)
-    scale = augmented.GyroScale(scale_sigma=np.array([0.0, 0.0, 0.01]), misalignment_sigma=np.zeros((3, 3)))
-    force = augmented.GyroForce(along_sigma=np.array([1e-3, 0.0, 2e-3]))
-    blocks = (scale, force, augmented.VectorBias(sensor="mag", bias_sigma=3e-6))
+    scale = error_states.GyroScale(scale_sigma=np.array([0.0, 0.0, 0.01]), misalignment_sigma=np.zeros((3, 3)))
+    force = error_states.GyroForce(along_sigma=np.array([1e-3, 0.0, 2e-3]))
+    blocks = (scale, force, error_states.VectorBias(sensor="mag", bias_sigma=3e-6))
     assert [block.components for block in blocks[:2]] == [("z",), ("x", "z")]
-    one = augmented.run(record, NOISE, begun(record), blocks, full_covariance=True)
-    from strapdown.augmented import stepping
-
-    other, _ = stepping.run_on(
-        record, NOISE, augmented.initial_state(begun(record), blocks), blocks, full_covariance=True
-    )
+    one = estimation.run(record, NOISE, begun(record), blocks, full_covariance=True)
+    other = in_steps.run(record, NOISE, begun(record), blocks)
     np.testing.assert_allclose(one.attitude, other.attitude, atol=1e-11)
     sigma = np.sqrt(np.einsum("kii->ki", one.whole_covariance))
     scaled = (one.whole_covariance - other.whole_covariance) / (sigma[:, :, None] * sigma[:, None, :])
     assert np.max(np.abs(scaled)) < 1e-8
-    smoothed = augmented.smooth(record, NOISE, begun(record), blocks, full_covariance=True)
+    smoothed = estimation.smooth(record, NOISE, begun(record), blocks, full_covariance=True)
     np.testing.assert_allclose(smoothed.whole_covariance[-1], one.whole_covariance[-1], rtol=1e-8, atol=1e-16)
 
 
 # ------------------------------------------------------------------------------------------------------------- the step face
 
 X, _, UP = np.eye(3)
-KNOWN = mekf.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.1, bias_sigma=1e-3)
-IRON = augmented.VectorBias(sensor="mag", bias_sigma=3e-6, unit="T")
-HELD = augmented.GaussMarkov(sensor="acc", noise_sigma=0.3, correlation_time=1.0, unit="m/s²")
-
-
-@pytest.mark.parametrize("name", ["", "Mag", "acc"])
-@pytest.mark.parametrize("kind", ["direction", "vector", "heading", "attitude", "missing"])
-def test_a_sensor_that_no_block_knows_is_refused_before_anything_changes(kind, name):
-    face = augmented.StepFilter(NOISE, KNOWN, (augmented.VectorBias(sensor="mag", bias_sigma=0.01),))
-    face.predict([0.0, 0.0, 0.01], 0.1)
-    before = pickle.dumps(face.__dict__)
-    given = [1.0, 0.0, 0.0, 0.0] if kind == "attitude" else X
-    references = () if kind == "attitude" else (X,)
-    if kind == "missing":
-        kind, given = "direction", np.full(3, np.nan)
-    update = getattr(face, f"update_{kind}")
-    with pytest.raises(InputError, match=f"sensor is '{name}', which is none of mag; .*sensors="):
-        update(given, *references, 0.1, name)
-    assert pickle.dumps(face.__dict__) == before
-    assert update(X, X, 0.1, "mag") if kind == "direction" else True
-
-
-def test_the_sensors_of_a_step_face_can_be_named():
-    block = augmented.VectorBias(sensor="mag", bias_sigma=0.01)
-    face = augmented.StepFilter(NOISE, KNOWN, (block,), sensors=("acc", "mag"))
-    assert face.update_direction(UP, UP, 0.1, "acc")
-    with pytest.raises(InputError, match="sensor is 'up', which is none of acc, mag"):
-        face.update_direction(UP, UP, 0.1, "up")
-    with pytest.raises(InputError, match=r"mag bias: sensor 'mag' is not known; did you mean 'Mag'"):
-        augmented.StepFilter(NOISE, KNOWN, (block,), sensors=("acc", "Mag"))
-    with pytest.raises(InputError, match="sensors is 'mag'; it must be a sequence"):
-        augmented.StepFilter(NOISE, KNOWN, (block,), sensors="mag")
-    # Blocks that are about no sensor leave the names free.
-    free = augmented.StepFilter(NOISE, KNOWN, (augmented.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01),))
-    assert free.update_direction(UP, UP, 0.1)
-    assert free.update_direction(UP, UP, 0.1, "any")
+KNOWN = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.1, bias_sigma=1e-3)
+IRON = error_states.VectorBias(sensor="mag", bias_sigma=3e-6, unit="T")
+HELD = error_states.GaussMarkov(sensor="acc", noise_sigma=0.3, correlation_time=1.0, unit="m/s²")
 
 
 def test_the_step_face_goes_on_from_a_part_as_the_record_does():
     """The gate's whole memory goes along, and what a challenger's blocks know: one constant, one that forgets."""
-    from strapdown.augmented import stepping
-
     record, blocks, gate = simulated(duration=4.0), (IRON, HELD), Gate(recovery=30)
     record = dataclasses.replace(record, time=record.time + 100.0)
     record = dataclasses.replace(
@@ -397,10 +361,11 @@ def test_the_step_face_goes_on_from_a_part_as_the_record_does():
     challenged, told = 0, 0
     for cut in (7, 20, 33, 60, 120):
         first, rest = records.cut(record, 0, cut), records.cut(record, cut, len(record.increments))
-        _, middle = augmented.run_on(first, NOISE, initial, blocks, gate=gate)
-        second, end = augmented.run_on(rest, NOISE, middle, blocks, gate=gate)
+        _, middle = estimation.run_part(first, NOISE, initial, blocks, gate=gate)
+        second, end = estimation.run_part(rest, NOISE, middle, blocks, gate=gate)
         challenged += int(middle.gate.counts[0])
-        step, last = stepping.run_on(rest, NOISE, middle, blocks, gate=gate)
+        step = in_steps.run(rest, NOISE, middle, blocks, gate=gate)
+        last = step.state
         assert quaternion.angle_between(last.attitude, end.attitude) < 1e-10
         sigma = np.sqrt(np.diag(end.covariance))
         np.testing.assert_allclose(last.values / sigma[6:], end.values / sigma[6:], rtol=0.0, atol=1e-8)
@@ -410,80 +375,7 @@ def test_the_step_face_goes_on_from_a_part_as_the_record_does():
     assert challenged >= 2
     assert told >= 2
     with pytest.raises(InputError, match=r"time is 0 s, before the record of initial began, 100 s; give the time"):
-        augmented.StepFilter(NOISE, middle, blocks, gate=gate)
-
-
-def test_saver_and_pickle_take_the_step_face_with_blocks():
-    record = simulated(duration=2.0)
-    initial = begun(record)
-    turned = quaternion.multiply(initial.attitude, quaternion.exp([1.0, 0.5, -1.0]))
-    initial = dataclasses.replace(initial, attitude=turned)
-    face = augmented.StepFilter(NOISE, initial, (IRON, HELD), gate=Gate(recovery=4))
-    mag, acc = record.vectors
-    history = Saver(face)
-    for k, t in enumerate(mag.time):
-        now, then = np.searchsorted(record.time, [face.time, t - 1e-9])
-        face.predict(record.increments[now:then].sum(axis=0), t - face.time)
-        j = int(np.argmin(np.abs(acc.time - t)))
-        face.update_vector(acc.vector_b[j], acc.references_f[j], 1.0, "acc")
-        face.update_vector(mag.vector_b[k], mag.references_f[k], mag.sigma[k], "mag")
-        history.save()
-    assert face.events
-    assert face.refused
-    history.to_array()
-    assert history.P.shape == (len(mag.time), 12, 12)
-    assert history.values.shape == (len(mag.time), 6)
-    copy = pickle.loads(pickle.dumps(face))
-    for one in (face, copy):
-        one.update_vector(mag.vector_b[-1], mag.references_f[-1], 5e-7, "mag")
-    assert np.array_equal(copy.P, face.P)
-    assert copy.events == face.events
-
-
-class Told(augmented.GeneralBlock):
-    """One state, and what its functions return as the test says."""
-
-    name, components, units, sigma = "latency", ("x",), ("s",), np.array([0.1])
-
-    def __init__(self, **told):
-        self.told = told
-
-    def propagate(self, values, interval):
-        return self.told.get("propagate", super().propagate(values, interval))
-
-    def gyro(self, values, interval):
-        return self.told.get("gyro", super().gyro(values, interval))
-
-    def measured(self, values, view):
-        return self.told.get("measured") if view.sensor == "mag" else None
-
-
-@pytest.mark.parametrize(
-    ("told", "words"),
-    [
-        ({"measured": (np.full(3, np.nan), np.zeros((1, 3)))}, r"measured of mag at 0.1 s: what is added\[0\] is nan"),
-        (
-            {"measured": (np.zeros(3), np.zeros((3, 1)))},
-            r"measured of mag at 0.1 s: its derivatives has shape \(3, 1\)",
-        ),
-        ({"measured": (np.zeros(3), np.full((1, 3), np.inf))}, "measured of mag at 0.1 s: its derivatives.*inf"),
-        ({"measured": np.zeros(3)}, r"measured of mag at 0.1 s returned .*; return what is added, its derivatives as"),
-        ({"gyro": (np.zeros(2), np.zeros((1, 3)))}, r"gyro at 0 s: what is added has shape \(2,\)"),
-        ({"propagate": (np.zeros(1), np.eye(1))}, r"propagate at 0 s returned .*; return values, Φ, ∂values/∂δθ, Q"),
-        (
-            {"propagate": (np.zeros(1), np.eye(1), np.zeros((3, 1)), np.eye(1))},
-            "propagate at 0 s: ∂values/∂δθ has shape",
-        ),
-        ({"propagate": (np.array([np.nan]), np.eye(1), np.zeros((1, 3)), np.eye(1))}, r"at 0 s: values\[0\] is nan"),
-    ],
-)
-@pytest.mark.parametrize("gate", [None, Gate()])
-def test_what_a_block_s_functions_return_is_checked(told, words, gate):
-    record = simulated(duration=0.5)
-    with pytest.raises(InputError, match=f"^latency: .*{words}"):
-        augmented.run(record, NOISE, begun(record), (Told(**told),), gate=gate)
-    fine = Told(measured=(np.zeros(3), [[0.0, 0.0, 0.0]]))
-    assert augmented.run(record, NOISE, begun(record), (fine,), gate=gate).attitude.shape == (26, 4)
+        StepFilter(NOISE, middle, blocks, gate=gate)
 
 
 # ------------------------------------------------------------------------------------------------------------------- sensors
@@ -521,7 +413,7 @@ def test_a_lever_arm_is_found(kind):
     for seed in range(6):
         record = scenarios.simulate(scenario, seed)
         estimate = setup.run(record, believes, begun(record, 0.01, 1e-4, seed))
-        block = estimate.blocks["acc lever arm"]
+        block = estimate.error_states["acc lever arm"]
         assert block.units == ("m", "m", "m")
         assert np.all(block.sigma[-1] < 0.01)
         ratios.append(np.mean(((block.values[-1] - arm) / block.sigma[-1]) ** 2))
@@ -552,13 +444,13 @@ def test_hard_iron_in_a_field_that_changes_is_found_in_its_own_unit():
     nis = [one.innovations["magnetometer"].nis[300:].mean() / 2.0 for one in (right, wrong)]
     assert abs(nis[0] - 1.0) < 0.08
     assert nis[1] > 1.3
-    error = right.blocks["magnetometer bias"].values[-1] / np.sqrt(np.mean(field**-2.0)) - iron
+    error = right.error_states["magnetometer bias"].values[-1] / np.sqrt(np.mean(field**-2.0)) - iron
     assert np.all(np.abs(error) < 1e-7)
 
 
 def test_a_direction_that_its_states_make_longer_has_the_less_noise():
     """Of a sensor that normalises its vector, noise across it is over the length of what it really sees."""
-    strong = augmented.VectorBias(sensor="a", bias_sigma=1e-9)
+    strong = error_states.VectorBias(sensor="a", bias_sigma=1e-9)
     series = VectorMeasurements(
         sensor="a",
         kind="direction",
@@ -568,10 +460,12 @@ def test_a_direction_that_its_states_make_longer_has_the_less_noise():
         sigma=np.array([1e-3]),
     )
     record = ImuRecord(time=np.array([0.0, 1.0]), increments=np.zeros((1, 3)), vectors=(series,))
-    start = augmented.initial_state(mekf.initial_state([1.0, 0, 0, 0], attitude_sigma=1e-9, bias_sigma=1e-9), (strong,))
+    start = estimation.with_error_states(
+        estimation.initial_state([1.0, 0, 0, 0], attitude_sigma=1e-9, bias_sigma=1e-9), (strong,)
+    )
     for along in (0.0, 1.0, 3.0):
         state = dataclasses.replace(start, values=np.array([along, 0.0, 0.0]))
-        found = augmented.run(record, NOISE, state, (strong,)).innovations["a"]
+        found = estimation.run(record, NOISE, state, (strong,)).innovations["a"]
         np.testing.assert_allclose(found.variance, 1e-6 / (1.0 + along) ** 2, rtol=1e-6)
 
 

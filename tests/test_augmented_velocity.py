@@ -7,24 +7,28 @@ import functools
 import json
 from pathlib import Path
 
+import in_steps
 import mpmath
 import numpy as np
 import pytest
 import scipy.integrate
 import scipy.linalg
+from strapdown.setup.states import from_table
+from strapdown.error_states import stationary_covariance
+from strapdown.model import assemble
 
 from sims import hand_held
-from strapdown import ahrs, augmented, consistency, kinematics, mekf, motion, quaternion, records, scenarios, setup
-from strapdown.setup.states import SensorStates, States, stepping
-from strapdown.estimation.error_states import stationary_covariance
-from strapdown.estimation.model import assemble
+from strapdown import ahrs, consistency, estimation, kinematics, motion, quaternion, records, scenarios, setup
 from strapdown.checks import InputError
 from strapdown.consistency import reference_errors
+from strapdown.estimation import error_states
+from strapdown.estimation.states import ProcessNoise
+from strapdown.estimation.step_filter import StepFilter
 from strapdown.gyro import GyroSpec
 from strapdown.kernels.robust_gate import WIDE_PASSES
-from strapdown.mekf import ProcessNoise
 from strapdown.recordings import Recording, read
 from strapdown.records import ImuRecord
+from strapdown.setup.states import SensorStates, States
 from strapdown.units import DEGREE
 from strapdown.vectors import Accelerometer, VectorMeasurements
 
@@ -45,19 +49,19 @@ POLES = {
 }
 
 
-def block_of(poles: str, velocity_sigma: float = 0.5, **more) -> augmented.BoundedVelocity:
-    return augmented.BoundedVelocity(
+def block_of(poles: str, velocity_sigma: float = 0.5, **more) -> error_states.BoundedVelocity:
+    return error_states.BoundedVelocity(
         sensor="acc", velocity_sigma=velocity_sigma, **{"strength": 1.0, **POLES[poles], **more}
     )
 
 
-def system(block: augmented.LinearBlock) -> tuple[np.ndarray, np.ndarray]:
+def system(block: error_states.ErrorStates) -> tuple[np.ndarray, np.ndarray]:
     """Matrix of the block's states and diagonal of its driving noise, from what it declares."""
     n = block.size
     return np.diag(block.feed[: n - 1], 1) - np.diag(block.decay), np.asarray(block.density)
 
 
-def outputs(block: augmented.BoundedVelocity) -> dict[str, np.ndarray]:
+def outputs(block: error_states.BoundedVelocity) -> dict[str, np.ndarray]:
     """Rows that give position, velocity and acceleration of the first axis from its states: by differentiating them."""
     A, _ = system(block)
     n = block.size // 3
@@ -99,7 +103,7 @@ def test_transition_and_noise_are_those_of_van_loan(poles, dt):
 
 
 @dataclasses.dataclass(frozen=True)
-class Ramp(augmented.LinearBlock):
+class Ramp(error_states.ErrorStates):
     """A block that the package does not have: a slope that never changes feeds an offset that walks besides; a bias; a chain with feeds."""
 
     name: str = "ramp"
@@ -114,18 +118,18 @@ class Ramp(augmented.LinearBlock):
     def effects(self):
         rows = np.zeros((6, 3))
         rows[[0, 2, 3, 4], [0, 1, 2, 0]] = 1.0, 1.0, 0.4, -0.3
-        return {"acc": augmented.Effect(offset_b=rows)}
+        return {"acc": error_states.Effect(offset_b=rows)}
 
 
 BLOCKS = {
     **{poles: (block_of(poles),) for poles in POLES},
     "ramp": (Ramp(),),
     "among others": (
-        augmented.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01),
-        augmented.GyroGaussMarkov(bias_sigma=2e-3, correlation_time=3.0),
+        error_states.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01),
+        error_states.GyroGaussMarkov(bias_sigma=2e-3, correlation_time=3.0),
         block_of("velocity"),
         Ramp(),
-        augmented.VectorBias(sensor="acc", bias_sigma=0.1),
+        error_states.VectorBias(sensor="acc", bias_sigma=0.1),
     ),
 }
 
@@ -142,7 +146,7 @@ def test_a_step_of_the_filter_is_that_of_the_whole_system(option, dt):
     blocks = BLOCKS[option]
     m = sum(block.size for block in blocks)
     turn = np.array([0.3, -0.5, 0.2])
-    face = augmented.StepFilter(NOISE, augmented.initial_state(start(), blocks), blocks)
+    face = StepFilter(NOISE, estimation.with_error_states(start(), blocks), blocks)
     face.bias = np.zeros(3)
     before = face.P.copy()
     face.predict(turn * dt, dt)
@@ -173,7 +177,9 @@ def test_the_start_is_stationary(poles):
     for dt in (0.01, 0.4):
         phi = block.transition(dt)
         np.testing.assert_allclose(phi @ P @ phi.T + block.process_noise(dt), P, rtol=1e-10, atol=1e-15)
-    state = augmented.initial_state(start(), (augmented.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01), block))
+    state = estimation.with_error_states(
+        start(), (error_states.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01), block)
+    )
     np.testing.assert_array_equal(state.covariance[15:, 15:], P)
 
 
@@ -210,14 +216,14 @@ def test_two_of_three_tell_the_third():
         times = {name: getattr(whole, name) for name in ("velocity_time", "position_time")}
         for left_out, third in three.items():
             told = {name: value for name, value in three.items() if name != left_out}
-            other = augmented.BoundedVelocity(sensor="acc", strength=1.0, **times, **told)
+            other = error_states.BoundedVelocity(sensor="acc", strength=1.0, **times, **told)
             assert getattr(other, left_out) == pytest.approx(third, rel=1e-12)
             np.testing.assert_allclose(other.covariance, whole.covariance, rtol=1e-9)
         assert dataclasses.replace(whole, name="other").acceleration_sigma == whole.acceleration_sigma
 
 
 def test_names_units_and_strength():
-    block = augmented.BoundedVelocity(sensor="acc", velocity_time=0.3, velocity_sigma=0.5, acceleration_time=0.1)
+    block = error_states.BoundedVelocity(sensor="acc", velocity_time=0.3, velocity_sigma=0.5, acceleration_time=0.1)
     assert block.name == "acc velocity"
     assert block.components[:2] == ("velocity x", "drive x")
     assert block.units == ("m/s", "m/s²") * 3
@@ -256,7 +262,7 @@ def test_names_units_and_strength():
 )
 def test_impossible_blocks_are_refused(fields, words):
     with pytest.raises(InputError, match=words):
-        augmented.BoundedVelocity(sensor="acc", **fields)
+        error_states.BoundedVelocity(sensor="acc", **fields)
 
 
 @pytest.mark.parametrize(
@@ -272,7 +278,7 @@ def test_impossible_chains_are_refused(fields, words):
     n = 2 if len(fields["feed"]) == 3 else len(fields["feed"])
     told = {name: property(lambda self, value=value: np.asarray(value)) for name, value in fields.items()}
     names = {"name": "x", "components": tuple("abcd"[:n]), "units": ("1",) * n, "sigma": np.ones(n)}
-    block = type("Foreign", (augmented.LinearBlock,), {**told, **names})()
+    block = type("Foreign", (error_states.ErrorStates,), {**told, **names})()
     with pytest.raises(InputError, match=words):
         assemble((block,), {"acc": "vector"})
 
@@ -280,12 +286,12 @@ def test_impossible_chains_are_refused(fields, words):
 # ------------------------------------------------------------------------------------------------------------------ both faces
 
 
-def start(error=(0.02, -0.01, 0.015)) -> mekf.State:
+def start(error=(0.02, -0.01, 0.015)) -> estimation.State:
     attitude = quaternion.multiply(HAND.attitude(np.array(0.0)), quaternion.exp(error))
-    return mekf.initial_state(attitude, attitude_sigma=0.03, bias_sigma=3e-3)
+    return estimation.initial_state(attitude, attitude_sigma=0.03, bias_sigma=3e-3)
 
 
-def acceleration_path(block: augmented.BoundedVelocity, time: np.ndarray, rng: np.random.Generator) -> dict:
+def acceleration_path(block: error_states.BoundedVelocity, time: np.ndarray, rng: np.random.Generator) -> dict:
     """States (m, size) of the block at times, by SciPy's exponential, from the stationary start; and the acceleration (m, 3)."""
     A, q = system(block)
     P = scipy.linalg.solve_continuous_lyapunov(A, -np.diag(q))
@@ -306,7 +312,7 @@ def acceleration_path(block: augmented.BoundedVelocity, time: np.ndarray, rng: n
 
 
 def record_of(
-    block: augmented.BoundedVelocity,
+    block: error_states.BoundedVelocity,
     seed: int = 1,
     *,
     duration: float = 4.0,
@@ -367,37 +373,43 @@ def test_both_faces_agree(option, kind):
     """At times of their own too, so that every step has another length."""
     strength = 1.0 if kind == "vector" else 9.81
     blocks = tuple(
-        dataclasses.replace(b, strength=strength) if isinstance(b, augmented.BoundedVelocity) else b
+        dataclasses.replace(b, strength=strength) if isinstance(b, error_states.BoundedVelocity) else b
         for b in BLOCKS[option]
     )
     record, _ = record_of(block_of("velocity", 0.02), duration=1.0, kind=kind, phase=0.0037)
-    state = augmented.initial_state(start(), blocks)
-    fast = augmented.run(record, NOISE, state, blocks, full_covariance=True)
-    slow, _ = stepping.run_on(record, NOISE, state, blocks, full_covariance=True)
+    state = estimation.with_error_states(start(), blocks)
+    fast = estimation.run(record, NOISE, state, blocks, full_covariance=True)
+    slow = in_steps.run(record, NOISE, state, blocks)
     sigma = np.sqrt(np.einsum("kii->ki", fast.whole_covariance))
-    values = {name: block.values for name, block in slow.blocks.items()}
-    assert np.max(np.abs(fast.errors(slow.attitude, slow.bias, values)) / sigma) < 1e-9
+    assert np.max(np.abs(fast.errors(slow.attitude, slow.bias, slow.values)) / sigma) < 1e-9
     assert np.max(np.abs(scaled(fast.whole_covariance - slow.whole_covariance, sigma))) < 1e-8
     for name, one in fast.innovations.items():
-        np.testing.assert_allclose(slow.innovations[name].innovation, one.innovation, rtol=1e-7, atol=1e-10)
+        np.testing.assert_allclose(slow.whitened[name], one.whitened, rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("option", BLOCKS)
+def test_no_time_changes_nothing(option):
+    for block in BLOCKS[option]:
+        assert np.array_equal(block.transition(0.0), np.eye(block.size))
+        assert np.array_equal(block.process_noise(0.0), np.zeros((block.size, block.size)))
 
 
 def test_a_record_may_be_cut_anywhere():
     block = (block_of("position"),)
     record, _ = record_of(block[0], duration=2.0)
-    whole = augmented.run(record, NOISE, start(), block)
-    first, middle = augmented.run_on(records.cut(record, 0, 77), NOISE, start(), block)
-    second = augmented.run(records.cut(record, 77, 200), NOISE, middle, block)
+    whole = estimation.run(record, NOISE, start(), block)
+    first, middle = estimation.run_part(records.cut(record, 0, 77), NOISE, start(), block)
+    second = estimation.run(records.cut(record, 77, 200), NOISE, middle, block)
     name = block[0].name
     np.testing.assert_array_equal(second.attitude[-1], whole.attitude[-1])
-    np.testing.assert_array_equal(second.blocks[name].values[-1], whole.blocks[name].values[-1])
-    np.testing.assert_array_equal(first.blocks[name].values[-1], whole.blocks[name].values[77])
+    np.testing.assert_array_equal(second.error_states[name].values[-1], whole.error_states[name].values[-1])
+    np.testing.assert_array_equal(first.error_states[name].values[-1], whole.error_states[name].values[77])
 
 
 # ---------------------------------------------------------------------------------------------- smoother, observability, gaps
 
 
-def least_squares(record: ImuRecord, block: augmented.BoundedVelocity) -> tuple[np.ndarray, np.ndarray]:
+def least_squares(record: ImuRecord, block: error_states.BoundedVelocity) -> tuple[np.ndarray, np.ndarray]:
     """All states of a body that rests and is moved about, at every edge, by one least-squares problem: value and variance (m, n).
 
     Linear by design: the attitude error, bias and block at the edges, the model between them, and the measurements.
@@ -409,7 +421,7 @@ def least_squares(record: ImuRecord, block: augmented.BoundedVelocity) -> tuple[
     A[6:, 6:], G[6:] = system(block)
     phi, Q = exactly(A, G, float(record.time[1] - record.time[0]))
     information, right = np.zeros((edges * n, edges * n)), np.zeros(edges * n)
-    information[:n, :n] = np.linalg.inv(augmented.initial_state(start((0.0, 0.0, 0.0)), (block,)).covariance)
+    information[:n, :n] = np.linalg.inv(estimation.with_error_states(start((0.0, 0.0, 0.0)), (block,)).covariance)
     size = 1.0 / np.sqrt(np.diag(Q))
     weight, step = np.linalg.inv(Q * np.outer(size, size)) * np.outer(size, size), np.hstack([-phi, np.eye(n)])
     turned = np.zeros(n)
@@ -459,11 +471,11 @@ def test_the_smoother_is_one_least_squares_problem(poles):
         ),
     )
     record = ImuRecord(time=time, increments=increments, vectors=series)
-    initial = mekf.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.03, bias_sigma=3e-3)
-    found = augmented.smooth(record, NOISE, initial, (block,), full_covariance=True)
+    initial = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.03, bias_sigma=3e-3)
+    found = estimation.smooth(record, NOISE, initial, (block,), full_covariance=True)
     wanted, variance = least_squares(record, block)
     values = np.concatenate(
-        [quaternion.log(found.attitude), found.bias, found.blocks[block.name].values],
+        [quaternion.log(found.attitude), found.bias, found.error_states[block.name].values],
         axis=1,
     )
     sigma = np.sqrt(variance)
@@ -475,17 +487,17 @@ def test_the_smoother_is_one_least_squares_problem(poles):
 def test_the_smoother_is_better_than_the_filter(poles):
     block = block_of(poles)
     record, _ = record_of(block)
-    ahead = augmented.run(record, NOISE, start(), (block,), full_covariance=True)
-    both = augmented.smooth(record, NOISE, start(), (block,), full_covariance=True)
+    ahead = estimation.run(record, NOISE, start(), (block,), full_covariance=True)
+    both = estimation.smooth(record, NOISE, start(), (block,), full_covariance=True)
     assert np.all(both.sigma <= ahead.sigma * (1.0 + 1e-3))
-    assert np.all(both.blocks[block.name].sigma <= ahead.blocks[block.name].sigma * (1.0 + 1e-3))
+    assert np.all(both.error_states[block.name].sigma <= ahead.error_states[block.name].sigma * (1.0 + 1e-3))
     np.testing.assert_allclose(both.whole_covariance[-1], ahead.whole_covariance[-1], rtol=1e-10, atol=1e-16)
 
 
 def test_the_observability_report_knows_its_states():
     block = block_of("velocity")
     record, _ = record_of(block)
-    found = augmented.observability(record, NOISE, start(), (block,))
+    found = estimation.observability(record, NOISE, start(), (block,))
     assert found.states[6:8] == ("acc velocity velocity x", "acc velocity drive x")
     # What pushes is felt at once; of the velocity there is what it has been pushed to.
     assert np.all(found.start_sigma[7::2] < 0.9 * found.prior_sigma[7::2])
@@ -502,10 +514,10 @@ def test_a_gap_of_many_correlation_times_forgets_the_velocity():
         for s in record.vectors
     )
     record = ImuRecord(time=time, increments=record.increments, vectors=later)
-    ahead = augmented.run(record, NOISE, start(), (block,))
-    both = augmented.smooth(record, NOISE, start(), (block,))
-    np.testing.assert_allclose(ahead.blocks[block.name].sigma[101], block.sigma, rtol=1e-9)
-    assert np.all(np.abs(ahead.blocks[block.name].values[101]) < 1e-9)
+    ahead = estimation.run(record, NOISE, start(), (block,))
+    both = estimation.smooth(record, NOISE, start(), (block,))
+    np.testing.assert_allclose(ahead.error_states[block.name].sigma[101], block.sigma, rtol=1e-9)
+    assert np.all(np.abs(ahead.error_states[block.name].values[101]) < 1e-9)
     assert np.all(np.isfinite(both.variance))
     assert np.all(both.sigma <= ahead.sigma * (1.0 + 1e-3))
 
@@ -516,7 +528,7 @@ MODELS = {
     "bounded velocity": lambda block: ((block,), 0.05),
     "coloured": lambda block: (
         (
-            augmented.GaussMarkov(
+            error_states.GaussMarkov(
                 sensor="acc",
                 noise_sigma=block.acceleration_sigma,
                 correlation_time=block.acceleration_time,
@@ -544,13 +556,13 @@ def judged(
         record = dataclasses.replace(record, vectors=series + record.vectors[1:])
         rng = np.random.default_rng(1000 + seed)
         error = rng.standard_normal(6) * np.repeat([0.03, 3e-3], 3)
-        initial = mekf.initial_state(
+        initial = estimation.initial_state(
             quaternion.multiply(truth["attitude"][0], quaternion.exp(-error[:3])),
             attitude_sigma=0.03,
             bias=truth["bias"][0] - error[3:],
             bias_sigma=3e-3,
         )
-        face = augmented.smooth if smoothed else augmented.run
+        face = estimation.smooth if smoothed else estimation.run
         estimate = face(record, NOISE, initial, blocks, full_covariance=True)
         epochs = (np.linspace(0.5, 0.97, 5) * (len(record.time) - 1)).astype(int)
         told = {}
@@ -619,15 +631,15 @@ def test_consistency_over_many_runs(poles, smoothed):
 @pytest.mark.parametrize("passes", [1, WIDE_PASSES], ids=["once", "iterated"])
 def test_a_correction_turns_what_is_carried(passes):
     """By an attitude of which the states know nothing, so that only the turn changes them: as the body sees them they stay the same."""
-    blocks = (augmented.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01), block_of("position"))
-    initial = mekf.initial_state(quaternion.IDENTITY, attitude_sigma=1.0, bias_sigma=3e-3)
-    state = augmented.initial_state(initial, blocks)
+    blocks = (error_states.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01), block_of("position"))
+    initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=1.0, bias_sigma=3e-3)
+    state = estimation.with_error_states(initial, blocks)
     rng = np.random.default_rng(5)
     P = state.covariance.copy()
     root = np.eye(9) + 0.3 * rng.standard_normal((9, 9))
     P[15:, 15:] = root @ P[15:, 15:] @ root.T
     state = dataclasses.replace(state, covariance=P, values=rng.standard_normal(18))
-    face = augmented.StepFilter(NOISE, state, blocks, sensors=("acc", "star"))
+    face = StepFilter(NOISE, state, blocks, sensors=("acc", "star"))
     face._passes = passes
     turn = quaternion.exp([0.5, -0.7, 0.4])
     assert face.update_attitude(turn, 1e-6, "star")
@@ -640,7 +652,7 @@ def test_a_correction_turns_what_is_carried(passes):
 
 
 def test_what_is_carried_must_be_alike_on_three_axes():
-    class Lopsided(augmented.BoundedVelocity):
+    class Lopsided(error_states.BoundedVelocity):
         @property
         def decay(self):
             return super().decay * np.array([1.0, 1.0, 1.0, 1.0, 1.0, 2.0])
@@ -699,16 +711,18 @@ def test_a_setup_has_the_block_for_either_kind_of_accelerometer():
 )
 def test_bad_tables_are_refused(table, words):
     with pytest.raises(InputError, match=words):
-        augmented.states.from_table({"sensors": {"acc": table}})
+        from_table({"sensors": {"acc": table}})
 
 
 def test_a_setup_runs_it():
     record, _ = record_of(block_of("velocity"))
     chosen = setup.FilterSetup(process_noise=NOISE, bias_sigma=3e-3, states=States(sensors={"acc": TOLD}))
     found = setup.run(record, chosen, start())
-    same = augmented.run(record, NOISE, start(), (dataclasses.replace(block_of("velocity"), name=""),))
+    same = estimation.run(record, NOISE, start(), (dataclasses.replace(block_of("velocity"), name=""),))
     np.testing.assert_allclose(found.attitude, same.attitude, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(found.blocks["acc velocity"].values, same.blocks["acc velocity"].values, atol=1e-10)
+    np.testing.assert_allclose(
+        found.error_states["acc velocity"].values, same.error_states["acc velocity"].values, atol=1e-10
+    )
 
 
 def test_the_command_line_takes_it_from_a_filter_file(run):

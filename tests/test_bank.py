@@ -9,15 +9,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
-from strapdown import bank, consistency, kinematics, mekf, quaternion, records, scenarios, wahba
+from strapdown import consistency, estimation, kinematics, quaternion, records, scenarios, wahba
 from strapdown.checks import InputError
+from strapdown.estimation import multiple_model
+from strapdown.estimation.gating import Gate, Monitor, Robust
+from strapdown.estimation.schedule import schedule
+from strapdown.estimation.states import ProcessNoise, covariance_matrices, pack
 from strapdown.kernels import bank_loop
 from strapdown.kernels.machine import compiled
 from strapdown.kernels.series import LARGEST_ANGLE
-from strapdown.mekf import ProcessNoise
 from strapdown.motion import ConstantRate
 from strapdown.records import ImuRecord
-from strapdown.estimation.gating import Gate, Monitor, Robust
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 from strapdown.vectors import Faults, VectorMeasurements
 
@@ -70,8 +72,8 @@ def judged(found, record):
 
 def test_the_hypotheses_lie_evenly_on_the_circle_that_the_first_direction_leaves():
     record = still(np.array([0.5, 0.5, -0.5, 0.5]), [[0.3, -0.2, 0.9]], 1e-3, np.random.default_rng(1))
-    events = mekf.schedule(record.vectors, 0.0, 20.0)
-    states, angles = bank.start(record, events, 0, 24, bias_sigma=1e-4)
+    events = schedule(record.vectors, 0.0, 20.0)
+    states, angles = multiple_model.start(record, events, 0, 24, bias_sigma=1e-4)
     z, r = events.vector_b[0], record.vectors[0].reference_f
     q = states[:, :4]
     assert np.allclose(quaternion.rotate(q, np.broadcast_to(z, (24, 3))), r, atol=1e-14)
@@ -79,7 +81,7 @@ def test_the_hypotheses_lie_evenly_on_the_circle_that_the_first_direction_leaves
     assert np.allclose(quaternion.angle_between(q, np.roll(q, -1, axis=0)), 2.0 * np.pi / 24, atol=1e-12)
     assert np.allclose(np.abs(quaternion.log(turn) @ z), 2.0 * np.pi / 24, atol=1e-12)
     assert np.allclose(np.diff(angles), 2.0 * np.pi / 24)
-    P = mekf.covariance_matrices(states[:, 7:])[5]
+    P = covariance_matrices(states[:, 7:])[5]
     assert z @ P[:3, :3] @ z == pytest.approx((np.pi / 24) ** 2)
     assert np.allclose(np.linalg.eigvalsh(P[:3, :3])[:2], 1e-6)
     assert np.allclose(P[3:, 3:], 1e-8 * np.eye(3))
@@ -119,7 +121,7 @@ def mixture(random, members, spread):
     for _ in range(members):
         q = quaternion.multiply(centre, quaternion.exp(spread * random.standard_normal(3)))
         root = np.diag([1e-2] * 3 + [1e-5] * 3) @ random.standard_normal((6, 6))
-        states.append(mekf.pack(q, 1e-5 * random.standard_normal(3), root @ root.T))
+        states.append(pack(q, 1e-5 * random.standard_normal(3), root @ root.T))
     return np.array(states), weights / weights.sum()
 
 
@@ -130,11 +132,11 @@ def test_moment_matching_has_the_moments_of_draws_from_the_mixture():
     bank_loop.moment_match(states, weights, between, out)
     number = 400_000
     which = random.choice(5, number, p=weights)
-    P = mekf.covariance_matrices(states[:, 7:])
+    P = covariance_matrices(states[:, 7:])
     drawn = np.einsum("nij,nj->ni", np.linalg.cholesky(P)[which], random.standard_normal((number, 6)))
     q = quaternion.multiply(states[which, :4], quaternion.exp(drawn[:, :3]))
     e = consistency.errors(out[:4], out[4:7], q, states[which, 4:7] + drawn[:, 3:])
-    matched = mekf.covariance_matrices(out[7:])
+    matched = covariance_matrices(out[7:])
     sigma = np.sqrt(np.diag(matched))
     assert np.abs(e.mean(axis=0) / sigma).max() < 4.0 / np.sqrt(number) + 1e-3  # the mean attitude's own second order
     assert np.abs((e.T @ e / number - matched) / np.outer(sigma, sigma)).max() < 0.01
@@ -170,10 +172,12 @@ def test_the_iterated_update_meets_a_direction_that_one_pass_misses(monkeypatch)
 def test_for_small_errors_it_is_the_plain_filter():
     random = np.random.default_rng(8)
     record = still(np.array([1.0, 0.0, 0.0, 0.0]), [[1.0, 0.0, 0.0], [0.0, 1.0, 1.0]], 1e-4, random)
-    initial = mekf.initial_state(quaternion.exp(np.array([1e-4, -2e-4, 1e-4])), attitude_sigma=2e-4, bias_sigma=1e-6)
-    plain = mekf.run(record, QUIET, initial, full_covariance=True)
-    events = mekf.schedule(record.vectors, 0.0, 20.0)
-    states = mekf.pack(initial.attitude, initial.bias, initial.covariance)[None].copy()
+    initial = estimation.initial_state(
+        quaternion.exp(np.array([1e-4, -2e-4, 1e-4])), attitude_sigma=2e-4, bias_sigma=1e-6
+    )
+    plain = estimation.run(record, QUIET, initial, full_covariance=True)
+    events = schedule(record.vectors, 0.0, 20.0)
+    states = pack(initial.attitude, initial.bias, initial.covariance)[None].copy()
     rows = len(record.time)
     out = [np.empty((rows, n)) for n in (4, 3, 21, 1)]
     innovation = np.empty((len(events.time), 6))
@@ -188,7 +192,7 @@ def test_for_small_errors_it_is_the_plain_filter():
     assert done == (rows, -1, len(events.time))
     assert quaternion.angle_between(out[0], plain.attitude).max() < 1e-8  # 1e-4 of σ: the reset's second order
     assert np.allclose(out[1], plain.bias, rtol=0.0, atol=1e-10)
-    P = mekf.covariance_matrices(out[2])
+    P = covariance_matrices(out[2])
     scale = plain.sigma[:, :, None] * plain.sigma[:, None, :]
     assert np.abs((P - plain.covariance) / scale).max() < 1e-3
     assert np.allclose(out[3], 0.5)
@@ -206,14 +210,16 @@ def test_a_hypothesis_whose_bias_is_wild_is_cut_into_sub_steps_as_the_filter(bia
     )
     record = ImuRecord(time=time, increments=np.full((20, 3), 1e-3), vectors=(tracker,))
     noise = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-3)
-    found = bank.run(record, noise, bias_sigma=bias_sigma, every=20)  # one hypothesis, told at the end of the record
-    start = mekf.initial_state(attitude[0], attitude_sigma=1e-2, bias_sigma=bias_sigma)
+    found = multiple_model.run(
+        record, noise, bias_sigma=bias_sigma, every=20
+    )  # one hypothesis, told at the end of the record
+    start = estimation.initial_state(attitude[0], attitude_sigma=1e-2, bias_sigma=bias_sigma)
     increments = record.increments.copy()
     increments[0] *= 0.25 / 0.3
     rest = ImuRecord(
         time=np.concatenate([seen[:1], time[1:]]), increments=increments, vectors=(tracker.taken(seen > seen[0]),)
     )
-    plain = mekf.run(rest, noise, start, full_covariance=True)
+    plain = estimation.run(rest, noise, start, full_covariance=True)
     assert (np.abs(plain.bias).max() * 0.3 > 10.0 * LARGEST_ANGLE) == (bias_sigma > 1.0)
     np.testing.assert_allclose(found.estimate.innovations["tracker"].nis, plain.innovations["tracker"].nis, rtol=1e-7)
     np.testing.assert_allclose(found.estimate.bias[-1], plain.bias[-1], rtol=1e-7, atol=1e-12)
@@ -224,9 +230,9 @@ def test_weights_are_the_densities_of_the_measurement():
     """Two hypotheses of one attitude, one surer than the other: what counts is N(e; 0, S), its height and not its exponent alone."""
     random = np.random.default_rng(10)
     record = still(np.array([1.0, 0.0, 0.0, 0.0]), [[0.0, 0.0, 1.0]], 1e-3, random, seconds=1)
-    events = mekf.schedule(record.vectors, 0.0, 1.0)
+    events = schedule(record.vectors, 0.0, 1.0)
     prior = [np.diag([s**2, (2.0 * s) ** 2, s**2, 1e-12, 1e-12, 1e-12]) for s in (1e-3, 5e-3)]
-    states = np.array([mekf.pack(np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), P) for P in prior])
+    states = np.array([pack(np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), P) for P in prior])
     out = [np.empty((2, n)) for n in (4, 3, 21, 2)]
     compiled(bank_loop.run_bank)(
         record.time, record.increments, 1e-14, 0.0, events.time, events.kind, events.vector_b, events.variance,
@@ -242,13 +248,13 @@ def test_weights_are_the_densities_of_the_measurement():
 
 def test_compiled_and_plain_are_the_same():
     record, belief = orbit(0, duration=120.0)
-    fast = bank.run(record, belief, hypotheses=8, every=30)
+    fast = multiple_model.run(record, belief, hypotheses=8, every=30)
     slow_kernel = compiled
     try:
-        bank.compiled = lambda function: function
-        slow = bank.run(record, belief, hypotheses=8, every=30)
+        multiple_model.compiled = lambda function: function
+        slow = multiple_model.run(record, belief, hypotheses=8, every=30)
     finally:
-        bank.compiled = slow_kernel
+        multiple_model.compiled = slow_kernel
     assert np.allclose(fast.estimate.attitude, slow.estimate.attitude, atol=1e-9)
     assert np.allclose(fast.estimate.covariance, slow.estimate.covariance, rtol=1e-6, atol=1e-16)
     assert np.allclose(fast.weights, slow.weights, atol=1e-7)
@@ -261,7 +267,7 @@ def starts(runs, hypotheses, **options):
     outcomes = []
     for run in range(runs):
         record, belief = orbit(run, **options)
-        found = bank.run(record, belief, hypotheses=hypotheses, every=10)
+        found = multiple_model.run(record, belief, hypotheses=hypotheses, every=10)
         outcomes.append((found, *judged(found, record)))
     return outcomes
 
@@ -290,12 +296,12 @@ def check_starts(outcomes, epochs):
 
 
 def test_from_a_hundred_starts_anywhere_it_finds_the_attitude_and_is_consistent():
-    check_starts(starts(120, bank.HYPOTHESES), (60.0, 200.0, 400.0, 800.0, 1490.0))
+    check_starts(starts(120, multiple_model.HYPOTHESES), (60.0, 200.0, 400.0, 800.0, 1490.0))
 
 
 @pytest.mark.slow
 def test_from_a_thousand_starts_over_an_orbit_and_a_half():
-    outcomes = starts(1000, bank.HYPOTHESES, duration=9000.0)
+    outcomes = starts(1000, multiple_model.HYPOTHESES, duration=9000.0)
     check_starts(outcomes, (60.0, 200.0, 400.0, 800.0, 1500.0, 3000.0, 6000.0, 8990.0))
     hours = []
     for found, e, _ in outcomes:
@@ -306,25 +312,25 @@ def test_from_a_thousand_starts_over_an_orbit_and_a_half():
 
 def test_before_it_is_one_its_gaussian_is_no_narrower_than_the_mixture():
     record, belief = orbit(2, duration=300.0)
-    found = bank.run(record, belief)
+    found = multiple_model.run(record, belief)
     P = found.estimate.covariance
     assert np.sqrt(np.linalg.eigvalsh(P[0, :3, :3])[-1]) == pytest.approx(np.pi / np.sqrt(3.0), rel=0.03)  # uniform
-    assert np.allclose(found.weights[0], 1.0 / bank.HYPOTHESES)
+    assert np.allclose(found.weights[0], 1.0 / multiple_model.HYPOTHESES)
     assert np.allclose(found.weights.sum(axis=1), 1.0)
 
 
 def test_it_goes_on_as_the_plain_filter_once_it_is_one():
     record, belief = orbit(3)
-    found = bank.run(record, belief, every=10)
+    found = multiple_model.run(record, belief, every=10)
     k = int(np.searchsorted(found.estimate.time, found.became_one))
     assert found.estimate.time[k] == found.became_one
     assert len(found.weights) == k + 1
     assert found.estimate.time[-1] == record.time[-1]
-    one = mekf.State(
+    one = estimation.State(
         attitude=found.estimate.attitude[k], bias=found.estimate.bias[k], covariance=found.estimate.covariance[k]
     )
     first = int(np.searchsorted(record.time, found.became_one))
-    rest = mekf.run(records.cut(record, first, len(record.time) - 1), belief, one, every=10)
+    rest = estimation.run(records.cut(record, first, len(record.time) - 1), belief, one, every=10)
     assert np.array_equal(rest.attitude, found.estimate.attitude[k:])
     times = found.estimate.innovations["magnetometer"].time
     assert np.array_equal(times, record.vectors[0].time[1:])  # the first made the hypotheses
@@ -337,7 +343,7 @@ def test_a_constant_reference_leaves_the_turn_about_it_open_and_it_says_so(rate)
     sensor = dataclasses.replace(scenario.sensors[0], field_f=field, rate=1.0)
     scenario = dataclasses.replace(scenario, sensors=(sensor,), motion=ConstantRate(rate=rate), duration=600.0)
     record = scenarios.simulate(scenario, 4)
-    found = bank.run(record, ProcessNoise(angle_random_walk=1e-5, rate_random_walk=1e-8), hypotheses=24)
+    found = multiple_model.run(record, ProcessNoise(angle_random_walk=1e-5, rate_random_walk=1e-8), hypotheses=24)
     assert not found.converged
     assert found.left == 24
     assert found.became_one == np.inf
@@ -353,7 +359,7 @@ def test_a_constant_reference_leaves_the_turn_about_it_open_and_it_says_so(rate)
 
 def test_a_reference_that_turned_too_little_is_told():
     record, belief = orbit(5, duration=60.0)
-    found = bank.run(record, belief, hypotheses=48)
+    found = multiple_model.run(record, belief, hypotheses=48)
     assert not found.converged
     assert "record longer" in found.reason
 
@@ -366,7 +372,7 @@ def test_with_full_geometry_it_agrees_with_wahba(phases):
     for _ in range(25):
         q = quaternion.normalize(random.standard_normal(4))
         record = still(q, references, sigma, random, seconds=2, phases=phases)
-        found = bank.run(record, QUIET, bias_sigma=1e-9)
+        found = multiple_model.run(record, QUIET, bias_sigma=1e-9)
         row = 0 if phases[1] == 0.0 else 1  # the first edge after all three have measured once
         used = [one.vector_b[0] for one in record.vectors]
         r = references
@@ -404,7 +410,7 @@ def check_outliers(option, probability, runs, seed=11):
     epochs = (20.0, 30.0, 60.0, 100.0, 200.0, 400.0, 800.0, 1490.0)
     for run in range(runs):
         record, belief = orbit(run, seed=seed, sensors=contaminated(probability))
-        found = bank.run(record, belief, every=10, **OPTIONS[option])
+        found = multiple_model.run(record, belief, every=10, **OPTIONS[option])
         e, each = judged(found, record)
         nees.append(each[[int(np.searchsorted(found.estimate.time, seconds)) for seconds in epochs]])
         last.append(np.linalg.norm(e[-1, :3]))
@@ -434,7 +440,7 @@ def test_without_a_gate_outliers_make_it_too_sure():
     nees = []
     for run in range(60):
         record, belief = orbit(run, sensors=contaminated(0.05))
-        nees.append(judged(bank.run(record, belief, every=10), record)[1][40])
+        nees.append(judged(multiple_model.run(record, belief, every=10), record)[1][40])
     assert np.mean(nees) / 6.0 > 2.0
 
 
@@ -454,7 +460,7 @@ def test_wild_first_directions_do_not_mislead_it(number, size, option):
     nees = []
     for run in range(12):
         record, belief = orbit(run)
-        found = bank.run(wild(record, number, size, run), belief, every=10, **OPTIONS[option])
+        found = multiple_model.run(wild(record, number, size, run), belief, every=10, **OPTIONS[option])
         assert not found.estimate.events
         assert not found.estimate.skipped["magnetometer"]
         e, each = judged(found, record)
@@ -474,11 +480,13 @@ def test_a_wild_first_attitude_is_no_attitude_yet():
         sensor="tracker", kind="attitude", time=time, attitude=attitude, sigma_axes=np.full(3, 1e-3)
     )
     record = ImuRecord(time=time, increments=np.zeros((10, 3)), vectors=(tracker,))
-    found = bank.run(record, QUIET, bias_sigma=1e-4, gate=Gate())
+    found = multiple_model.run(record, QUIET, bias_sigma=1e-4, gate=Gate())
     assert not found.estimate.events
     assert 2.0 <= found.became_one <= 3.0
     assert quaternion.angle_between(found.estimate.attitude[3:], np.array([1.0, 0.0, 0.0, 0.0])).max() < 5e-3
-    right = bank.run(dataclasses.replace(record, vectors=(tracker.taken(time > 0.0),)), QUIET, bias_sigma=1e-4)
+    right = multiple_model.run(
+        dataclasses.replace(record, vectors=(tracker.taken(time > 0.0),)), QUIET, bias_sigma=1e-4
+    )
     assert np.all(np.abs(found.estimate.sigma[-1] / right.estimate.sigma[-1] - 1.0) < 0.01)
 
 
@@ -488,8 +496,10 @@ def test_from_more_wild_directions_than_it_doubts_it_recovers(size):
     recovered = 0
     for run in range(15):
         record, belief = orbit(run)
-        number = bank.DOUBTED + 1
-        found = bank.run(wild(record, number, size, run), belief, every=10, gate=Gate(restart_bias_sigma=1e-4))
+        number = multiple_model.DOUBTED + 1
+        found = multiple_model.run(
+            wild(record, number, size, run), belief, every=10, gate=Gate(restart_bias_sigma=1e-4)
+        )
         e, nees = judged(found, record)
         assert np.linalg.norm(e[-1, :3]) < 1.0 * DEGREE
         assert nees[-1] < 30.0
@@ -506,13 +516,13 @@ def test_from_more_wild_directions_than_it_doubts_it_recovers(size):
 @pytest.mark.parametrize("option", OPTIONS)
 def test_compiled_and_plain_are_the_same_with_every_option(option):
     record, belief = orbit(0, duration=150.0, sensors=contaminated(0.2))
-    fast = bank.run(record, belief, hypotheses=8, every=30, **OPTIONS[option])
+    fast = multiple_model.run(record, belief, hypotheses=8, every=30, **OPTIONS[option])
     slow_kernel = compiled
     try:
-        bank.compiled = lambda function: function
-        slow = bank.run(record, belief, hypotheses=8, every=30, **OPTIONS[option])
+        multiple_model.compiled = lambda function: function
+        slow = multiple_model.run(record, belief, hypotheses=8, every=30, **OPTIONS[option])
     finally:
-        bank.compiled = slow_kernel
+        multiple_model.compiled = slow_kernel
     assert np.allclose(fast.estimate.attitude, slow.estimate.attitude, atol=1e-9)
     assert np.allclose(fast.weights, slow.weights, atol=1e-7)
     for sensor, one in fast.estimate.innovations.items():
@@ -523,16 +533,16 @@ def test_compiled_and_plain_are_the_same_with_every_option(option):
 def test_gate_robust_and_monitor_go_on_once_it_is_one():
     record, belief = orbit(3, sensors=contaminated(0.05))
     gate, monitor = Gate(probability=0.9999), Monitor(window=10, probability=0.9)
-    found = bank.run(record, belief, every=10, gate=gate, robust=Robust(), monitor=monitor)
+    found = multiple_model.run(record, belief, every=10, gate=gate, robust=Robust(), monitor=monitor)
     assert found.converged
     k = int(np.searchsorted(found.estimate.time, found.became_one))
-    one = mekf.State(
+    one = estimation.State(
         attitude=found.estimate.attitude[k], bias=found.estimate.bias[k], covariance=found.estimate.covariance[k]
     )
     first = int(np.searchsorted(record.time, found.became_one))
     rest = records.cut(record, first, len(record.time) - 1)
     restart = Gate(probability=0.9999, restart_bias_sigma=20.0 * DEGREE_PER_HOUR)
-    plain = mekf.run(rest, belief, one, every=10, gate=restart, robust=Robust(), monitor=monitor)
+    plain = estimation.run(rest, belief, one, every=10, gate=restart, robust=Robust(), monitor=monitor)
     assert np.array_equal(plain.attitude, found.estimate.attitude[k:])
     assert plain.events
     assert found.estimate.events[-len(plain.events) :] == plain.events
@@ -567,11 +577,11 @@ def test_for_small_errors_its_weights_are_the_plain_filters(kind, robust, monkey
         second = series("second", at, seen, r, 1e-3, kind)
     record = ImuRecord(time=time, increments=np.zeros((40, 3)), vectors=(first, second))
     noise_of_gyro = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6)
-    monkeypatch.setattr(bank, "DOUBT", 1e-30)
-    found = bank.run(record, noise_of_gyro, bias_sigma=1e-4, robust=robust, every=40)
-    start = mekf.initial_state([1.0, 0.0, 0.0, 0.0], attitude_sigma=3e-3, bias_sigma=1e-4)
+    monkeypatch.setattr(multiple_model, "DOUBT", 1e-30)
+    found = multiple_model.run(record, noise_of_gyro, bias_sigma=1e-4, robust=robust, every=40)
+    start = estimation.initial_state([1.0, 0.0, 0.0, 0.0], attitude_sigma=3e-3, bias_sigma=1e-4)
     rest = ImuRecord(time=np.concatenate([[0.5], at]), increments=np.zeros((40, 3)), vectors=(second,))
-    plain = mekf.run(rest, noise_of_gyro, start, robust=robust)
+    plain = estimation.run(rest, noise_of_gyro, start, robust=robust)
     assert len(found.estimate.time) == 1
     weight, expected = (one.innovations["second"].weight for one in (found.estimate, plain))
     assert expected.min() < 0.5
@@ -592,8 +602,8 @@ def test_whole_vectors_count_by_their_direction():
     whole = dataclasses.replace(
         one, kind="vector", vector_b=one.vector_b * length[:, None], reference_f=field, sigma=one.sigma * length
     )
-    a = bank.run(record, belief, every=10)
-    b = bank.run(dataclasses.replace(record, vectors=(whole,)), belief, every=10)
+    a = multiple_model.run(record, belief, every=10)
+    b = multiple_model.run(dataclasses.replace(record, vectors=(whole,)), belief, every=10)
     assert quaternion.angle_between(a.estimate.attitude, b.estimate.attitude).max() < 1e-7
     assert b.estimate.innovations["magnetometer"].innovation.shape[1] == 3
     assert np.allclose(b.estimate.innovations["magnetometer"].innovation[-20:, 2], 0.0, atol=1e-4)
@@ -610,7 +620,7 @@ def test_a_measured_attitude_needs_no_bank():
         sigma_axes=np.array([1e-4, 1e-4, 1e-3]),
     )
     record = ImuRecord(time=time, increments=np.zeros((10, 3)), vectors=(tracker,))
-    found = bank.run(record, QUIET)
+    found = multiple_model.run(record, QUIET)
     assert found.became_one == 0.0
     assert quaternion.angle_between(found.estimate.attitude, q).max() < 1e-12
     assert np.allclose(found.estimate.sigma[0, :3], [1e-4, 1e-4, 1e-3])
@@ -626,12 +636,12 @@ def test_a_measured_attitude_at_the_first_edge_counts_once():
         sigma_axes=np.full(3, 1e-3),
     )
     record = ImuRecord(time=time, increments=np.zeros((10, 3)), vectors=(tracker,))
-    found = bank.run(record, QUIET, bias_sigma=1e-4)
+    found = multiple_model.run(record, QUIET, bias_sigma=1e-4)
     assert found.became_one == 0.0
     np.testing.assert_array_equal(found.estimate.innovations["tracker"].time, time[1:])
-    start = mekf.initial_state(tracker.attitude[0], attitude_sigma=1e-3, bias_sigma=1e-4)
+    start = estimation.initial_state(tracker.attitude[0], attitude_sigma=1e-3, bias_sigma=1e-4)
     rest = dataclasses.replace(record, vectors=(tracker.taken(time > 0.0),))
-    plain = mekf.run(rest, QUIET, start, full_covariance=True)
+    plain = estimation.run(rest, QUIET, start, full_covariance=True)
     np.testing.assert_allclose(found.estimate.covariance, plain.covariance, rtol=1e-12)
 
 
@@ -642,7 +652,7 @@ def test_it_starts_at_the_first_direction_and_counts_what_came_before():
     compass = series(
         "compass", np.array([5.0, 17.0]), np.tile([1.0, 0.0, 0.0], (2, 1)), np.array([1.0, 0.0, 0.0]), 9.0, "heading"
     )
-    found = bank.run(dataclasses.replace(record, vectors=(gap, compass)), belief, every=7)
+    found = multiple_model.run(dataclasses.replace(record, vectors=(gap, compass)), belief, every=7)
     assert found.estimate.skipped == {"magnetometer": 3, "compass": 2}
     assert found.estimate.time[0] == 42.0  # the first kept edge not before 40 s
     assert np.array_equal(found.estimate.time, record.time[found.edges])
@@ -661,7 +671,7 @@ def test_one_direction_between_edges_starts_there():
     record = ImuRecord(
         time=time, increments=np.tile(rate, (8, 1)), vectors=(series("star", at, measured, references, 1e-4),)
     )
-    found = bank.run(record, QUIET, bias_sigma=1e-8)
+    found = multiple_model.run(record, QUIET, bias_sigma=1e-8)
     assert found.estimate.time[0] == 1.0
     truth = quaternion.multiply(q, quaternion.exp(found.estimate.time[:, None] * rate))
     assert quaternion.angle_between(found.estimate.attitude, truth)[1:].max() < 1e-4
@@ -674,27 +684,27 @@ def test_gaps_of_the_gyro_are_told_whether_hypotheses_were_many_or_one(duration)
     early, late = edges // 3, edges - edges // 6
     later = np.where(np.arange(edges) > early, 8.0, 0.0) + np.where(np.arange(edges) > late, 9.0, 0.0)
     gaps = dataclasses.replace(record, time=record.time + later)
-    found = bank.run(gaps, belief, every=5)
+    found = multiple_model.run(gaps, belief, every=5)
     assert found.converged == (duration > 60.0)
-    assert found.estimate.events == tuple(mekf.gaps(gaps.time))
+    assert found.estimate.events == tuple(estimation.gaps(gaps.time))
     assert [(one.start, one.end) for one in found.estimate.events] == [
         (gaps.time[k], gaps.time[k + 1]) for k in (early, late)
     ]
-    assert bank.run(record, belief, every=5).estimate.events == ()
+    assert multiple_model.run(record, belief, every=5).estimate.events == ()
 
 
 def test_what_makes_no_sense_is_refused():
     record, belief = orbit(8, duration=100.0)
     with pytest.raises(InputError, match="hypotheses"):
-        bank.run(record, belief, hypotheses=4)
+        multiple_model.run(record, belief, hypotheses=4)
     with pytest.raises(InputError, match="least_weight"):
-        bank.run(record, belief, least_weight=1.0)
+        multiple_model.run(record, belief, least_weight=1.0)
     with pytest.raises(InputError, match=r"bias_sigma\[1\]"):
-        bank.run(record, belief, bias_sigma=[1.0, 0.0, 1.0])
+        multiple_model.run(record, belief, bias_sigma=[1.0, 0.0, 1.0])
     with pytest.raises(InputError, match="no direction"):
-        bank.run(dataclasses.replace(record, vectors=()), belief)
+        multiple_model.run(dataclasses.replace(record, vectors=()), belief)
     with pytest.raises(InputError, match="kept edge"):
-        bank.run(record, belief, every=200)
+        multiple_model.run(record, belief, every=200)
 
 
 @pytest.mark.parametrize(
@@ -729,28 +739,28 @@ def test_noise_by_axis_is_its_largest_until_they_are_one_and_then_what_it_is(kin
             else {"sigma_axes": None, "sigma": np.full(40, largest)}
         ),
     )
-    found = bank.run(dataclasses.replace(record, vectors=(first, uneven)), QUIET, bias_sigma=1e-6)
-    coarse = bank.run(dataclasses.replace(record, vectors=(first, even)), QUIET, bias_sigma=1e-6)
+    found = multiple_model.run(dataclasses.replace(record, vectors=(first, uneven)), QUIET, bias_sigma=1e-6)
+    coarse = multiple_model.run(dataclasses.replace(record, vectors=(first, even)), QUIET, bias_sigma=1e-6)
     assert found.converged
     assert found.became_one == coarse.became_one
     rows = len(found.weights)
     np.testing.assert_allclose(found.estimate.covariance[:rows], coarse.estimate.covariance[:rows], rtol=1e-9)
     at = int(np.searchsorted(record.time, found.became_one))
-    one = mekf.State(
+    one = estimation.State(
         attitude=found.estimate.attitude[rows - 1],
         bias=found.estimate.bias[rows - 1],
         covariance=found.estimate.covariance[rows - 1],
     )
     series_left = tuple(s.taken(s.time > record.time[at]) for s in (first, uneven))
     rest = dataclasses.replace(records.cut(record, at, 40), vectors=series_left)
-    plain = mekf.run(rest, QUIET, one, full_covariance=True)
+    plain = estimation.run(rest, QUIET, one, full_covariance=True)
     np.testing.assert_array_equal(found.estimate.covariance[rows - 1 :], plain.covariance)
     assert np.any(found.estimate.variance[-1, :3] < 0.9 * coarse.estimate.variance[-1, :3])
 
 
 def test_the_bias_is_found_from_twenty_degrees_an_hour():
     record, belief = orbit(9, duration=9000.0)
-    found = bank.run(record, belief, every=100)
+    found = multiple_model.run(record, belief, every=100)
     e, _ = judged(found, record)
     assert np.abs(record.truth.bias[0]).max() > 5.0 * DEGREE_PER_HOUR
     assert np.abs(e[-1, 3:]).max() < 0.1 * DEGREE_PER_HOUR

@@ -8,14 +8,15 @@ import functools
 import numpy as np
 import pytest
 
-from strapdown import bank, consistency, mekf, quaternion, records, scenarios, smoother
+from strapdown import consistency, estimation, quaternion, records, scenarios
 from strapdown.checks import InputError
+from strapdown.estimation import multiple_model
+from strapdown.estimation.gating import Gate, Monitor, Robust
+from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
 from strapdown.kernels import robust_gate
-from strapdown.mekf import ProcessNoise
 from strapdown.motion import ConstantRate
 from strapdown.randomness import generator
-from strapdown.estimation.gating import Gate, Monitor, Robust
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 from strapdown.vectors import VectorMeasurements
 
@@ -82,7 +83,7 @@ def lost_record(
     error = quaternion.exp(START_SIGMA * random.standard_normal(3))
     anywhere = quaternion.normalize(random.standard_normal(4))
     start = quaternion.multiply(truth[0], anywhere if lost else error)
-    return record, mekf.initial_state(start, attitude_sigma=START_SIGMA, bias_sigma=BIAS_SIGMA)
+    return record, estimation.initial_state(start, attitude_sigma=START_SIGMA, bias_sigma=BIAS_SIGMA)
 
 
 def events(estimate, kind):
@@ -99,7 +100,7 @@ AFTER = np.array([0.0, 2.0, 8.0, 14.0, 24.0])
 """Times after the first recovery, s."""
 
 
-def study(runs, filtered=bank.run_recovering, gate=None, every=5, **options):
+def study(runs, filtered=multiple_model.run_recovering, gate=None, every=5, **options):
     """NEES per state (runs, times) after the recovery; a start that happens to be right across the first direction needs none."""
     found = []
     for run in range(runs):
@@ -147,7 +148,7 @@ def test_with_a_bias_prior_that_is_right_it_is_consistent_at_once(runs):
 
 
 def test_the_gate_alone_comes_out_of_it_too_sure():
-    assert np.mean(study(20, mekf.run, lost=True)[:, -1]) > 3.0
+    assert np.mean(study(20, estimation.run, lost=True)[:, -1]) > 3.0
 
 
 @pytest.mark.parametrize("size", [3.0, 10.0, 30.0])
@@ -157,7 +158,7 @@ def test_bias_steps_of_any_size_are_followed_on_one_direction(size, runs):
     last = []
     for run in range(runs):
         record, start = lost_record(run, duration=60.0, step=(15.0, size * BIAS_SIGMA))
-        estimate = bank.run_recovering(record, NOISE, start, gate=Gate(), every=5, full_covariance=True)
+        estimate = multiple_model.run_recovering(record, NOISE, start, gate=Gate(), every=5, full_covariance=True)
         last.append(nees(estimate, record)[-1])
     # Of 30 σ one run in a hundred is lost for the third time when the record ends: what the second bank became lasted a while.
     right = np.array(last) < 5.0
@@ -186,7 +187,11 @@ def orbit(run, *, jump, duration, seed=21):
     belief = ProcessNoise(
         angle_random_walk=scenario.gyro.angle_random_walk, rate_random_walk=scenario.gyro.rate_random_walk
     )
-    return record, belief, mekf.initial_state(start, attitude_sigma=START_SIGMA, bias_sigma=20.0 * DEGREE_PER_HOUR)
+    return (
+        record,
+        belief,
+        estimation.initial_state(start, attitude_sigma=START_SIGMA, bias_sigma=20.0 * DEGREE_PER_HOUR),
+    )
 
 
 @pytest.mark.parametrize("runs", [40, pytest.param(600, marks=pytest.mark.slow)])
@@ -195,7 +200,7 @@ def test_a_magnetometer_in_orbit_is_consistent_after_a_turn_that_nothing_saw(run
     found = []
     for run in range(runs):
         record, belief, start = orbit(run, jump=1000.0, duration=2500.0)
-        estimate = bank.run_recovering(record, belief, start, gate=Gate(), every=10, full_covariance=True)
+        estimate = multiple_model.run_recovering(record, belief, start, gate=Gate(), every=10, full_covariance=True)
         assert len(events(estimate, "hypotheses")) == len(events(estimate, "recovery")) == 1
         found.append(nees(estimate, record)[np.searchsorted(estimate.time, [1400.0, 1800.0, 2490.0])])
     low, high = consistency.mean_bounds(6, runs, 1.0 - 0.01 / 3)
@@ -226,8 +231,8 @@ def test_with_nothing_open_it_is_the_gated_filter_to_the_bit(options, robust):
             "monitor": Monitor(window=20),
             "full_covariance": run > 0,
         }
-        plain = mekf.run(record, NOISE, start, **given)
-        mine = bank.run_recovering(record, NOISE, start, **given)
+        plain = estimation.run(record, NOISE, start, **given)
+        mine = multiple_model.run_recovering(record, NOISE, start, **given)
         assert len(events(plain, "recovery")) >= len(options.get("jumps", ())) + options.get("lost", 0)
         for name in ("time", "attitude", "bias", "variance", "covariance"):
             assert np.array_equal(getattr(mine, name), getattr(plain, name))
@@ -245,8 +250,8 @@ def test_with_nothing_open_it_is_the_gated_filter_to_the_bit(options, robust):
 )
 def test_a_gate_that_leaves_no_turn_open_hands_nothing_over(gate):
     record, start = lost_record(0, jumps=(15.0,), duration=30.0)
-    plain = mekf.run(record, NOISE, start, gate=gate)
-    mine = bank.run_recovering(record, NOISE, start, gate=gate)
+    plain = estimation.run(record, NOISE, start, gate=gate)
+    mine = multiple_model.run_recovering(record, NOISE, start, gate=gate)
     assert np.array_equal(mine.attitude, plain.attitude)
     assert mine.events == plain.events != ()
 
@@ -257,7 +262,7 @@ def test_a_second_direction_that_comes_at_once_leaves_nothing_open_and_one_that_
     late = record.vectors[1].taken(record.vectors[1].time > 10.0)
     for second, handed in ((record.vectors[1], 0), (late, 1)):
         both = dataclasses.replace(record, vectors=(record.vectors[0], second))
-        estimate = bank.run_recovering(both, NOISE, start, gate=Gate(), full_covariance=True)
+        estimate = multiple_model.run_recovering(both, NOISE, start, gate=Gate(), full_covariance=True)
         (recovery,) = events(estimate, "recovery")
         assert recovery.end < 2.0
         told = events(estimate, "hypotheses")
@@ -285,7 +290,7 @@ def one_recovery():
     record = dataclasses.replace(
         record, time=record.time + later, vectors=(dataclasses.replace(moved, vector_b=vector_b),)
     )
-    return record, start, bank.run_recovering(record, NOISE, start, gate=Gate(), full_covariance=True)
+    return record, start, multiple_model.run_recovering(record, NOISE, start, gate=Gate(), full_covariance=True)
 
 
 def test_its_parts_are_the_filter_the_bank_and_the_filter_again():
@@ -294,26 +299,28 @@ def test_its_parts_are_the_filter_the_bank_and_the_filter_again():
     assert (told.start, told.sensor, told.value) == (recovery.end, "star 0", 0.0)
     assert told.start < told.end < record.time[-1]
     assert np.array_equal(estimate.time, record.time)
-    before = mekf.run(record, NOISE, start, gate=Gate(), full_covariance=True)
+    before = estimation.run(record, NOISE, start, gate=Gate(), full_covariance=True)
     early = record.time < recovery.end
     assert np.array_equal(estimate.attitude[early], before.attitude[early])
     assert np.array_equal(estimate.covariance[early], before.covariance[early])
     # It starts with the bias before the first refusal, as uncertain as the challenger did; from then on it is a bank alone.
     first, last = (int(np.searchsorted(record.time, time)) for time in (recovery.start - 1e-9, recovery.end))
     first -= 1
-    _, end = mekf.run_on(records.cut(record, 0, last), NOISE, start, gate=Gate())
+    _, end = estimation.run_part(records.cut(record, 0, last), NOISE, start, gate=Gate())
     sigma = np.sqrt(end.gate.counts[robust_gate.FIRST_BIAS + 3 : robust_gate.FIRST_BIAS + 6])
     assert np.all(sigma**2 >= before.variance[first, 3:] + BIAS_SIGMA**2)
     rest = records.cut(record, first, len(record.time) - 1)
-    alone = bank.run(rest, NOISE, bias=before.bias[first], bias_sigma=sigma, gate=Gate(restart_bias_sigma=BIAS_SIGMA))
+    alone = multiple_model.run(
+        rest, NOISE, bias=before.bias[first], bias_sigma=sigma, gate=Gate(restart_bias_sigma=BIAS_SIGMA)
+    )
     assert alone.became_one == told.end
     same = np.searchsorted(alone.estimate.time, record.time[~early])
     assert np.array_equal(estimate.attitude[~early], alone.estimate.attitude[same])
     assert np.array_equal(estimate.covariance[~early], alone.estimate.covariance[same])
     at = int(np.searchsorted(record.time, told.end))
-    one = mekf.State(attitude=estimate.attitude[at], bias=estimate.bias[at], covariance=estimate.covariance[at])
+    one = estimation.State(attitude=estimate.attitude[at], bias=estimate.bias[at], covariance=estimate.covariance[at])
     rest = records.cut(record, at, len(record.time) - 1)
-    after = mekf.run(rest, NOISE, one, gate=Gate(restart_bias_sigma=BIAS_SIGMA))
+    after = estimation.run(rest, NOISE, one, gate=Gate(restart_bias_sigma=BIAS_SIGMA))
     assert np.array_equal(estimate.attitude[at:], after.attitude)
 
 
@@ -334,10 +341,10 @@ def test_each_measurement_is_told_once_and_what_was_missing_is_counted():
         ("recovery", recovery.start),
         ("hypotheses", recovery.end),
     ]
-    assert events(estimate, "gap") == mekf.gaps(record.time)
+    assert events(estimate, "gap") == estimation.gaps(record.time)
     assert len(events(estimate, "gap")) == 2
     taken = dataclasses.replace(record, vectors=(one.taken(there),))
-    other = bank.run_recovering(taken, NOISE, start, gate=Gate(), full_covariance=True)
+    other = multiple_model.run_recovering(taken, NOISE, start, gate=Gate(), full_covariance=True)
     assert np.array_equal(other.attitude, estimate.attitude)
     assert np.array_equal(other.covariance, estimate.covariance)
     assert other.events == estimate.events
@@ -345,12 +352,12 @@ def test_each_measurement_is_told_once_and_what_was_missing_is_counted():
 
 def test_it_is_the_same_each_time_and_whatever_is_kept():
     record, start, estimate = one_recovery()
-    again = bank.run_recovering(record, NOISE, start, gate=Gate())
+    again = multiple_model.run_recovering(record, NOISE, start, gate=Gate())
     assert again.covariance is None
     for name in ("attitude", "bias", "variance"):
         assert np.array_equal(getattr(again, name), getattr(estimate, name))
     (told,) = events(estimate, "hypotheses")
-    coarse = bank.run_recovering(record, NOISE, start, gate=Gate(), every=16)
+    coarse = multiple_model.run_recovering(record, NOISE, start, gate=Gate(), every=16)
     assert np.array_equal(coarse.time, record.time[::16])
     mine = coarse.time <= told.end  # they become one at kept edges
     assert np.array_equal(coarse.attitude[mine], estimate.attitude[::16][mine])
@@ -366,7 +373,7 @@ def test_a_second_loss_is_recovered_from_as_the_first(second):
     last, own = [], 0
     for run in range(8):
         record, start = lost_record(run, jumps=(15.0, second), duration=70.0)
-        estimate = bank.run_recovering(record, NOISE, start, gate=Gate(), every=5, full_covariance=True)
+        estimate = multiple_model.run_recovering(record, NOISE, start, gate=Gate(), every=5, full_covariance=True)
         assert np.array_equal(estimate.time, record.time[::5])
         assert np.array_equal(estimate.innovations["star 0"].time, record.vectors[0].time)
         last.append(nees(estimate, record)[-1])
@@ -391,19 +398,19 @@ def test_a_second_loss_is_recovered_from_as_the_first(second):
 @pytest.mark.parametrize(("rate", "duration"), [(0.02, 19.0), (0.0, 30.0)], ids=["too short", "it never turns"])
 def test_a_record_that_ends_before_they_are_one_says_so(rate, duration):
     record, start = lost_record(2, jumps=(15.0,), rate=rate, duration=duration)
-    estimate = bank.run_recovering(record, NOISE, start, gate=Gate(), full_covariance=True)
+    estimate = multiple_model.run_recovering(record, NOISE, start, gate=Gate(), full_covariance=True)
     (recovery,), (told,) = events(estimate, "recovery"), events(estimate, "hypotheses")
     assert (told.start, told.end) == (recovery.end, record.time[-1])
     assert told.value > 8
     assert nees(estimate, record)[-1] < 3.0
     widest = np.sqrt(np.linalg.eigvalsh(estimate.covariance[-1, :3, :3])[-1])
-    assert widest > 1.0 * DEGREE if rate else widest > bank.UNKNOWN
+    assert widest > 1.0 * DEGREE if rate else widest > multiple_model.UNKNOWN
 
 
 def test_a_takeover_after_the_last_kept_edge_changes_no_row():
     record, start = lost_record(2, jumps=(15.0,), duration=17.0)
-    plain = mekf.run(record, NOISE, start, gate=Gate(), every=780)
-    mine = bank.run_recovering(record, NOISE, start, gate=Gate(), every=780)
+    plain = estimation.run(record, NOISE, start, gate=Gate(), every=780)
+    mine = multiple_model.run_recovering(record, NOISE, start, gate=Gate(), every=780)
     assert events(plain, "recovery")[0].end > plain.time[-1] == 15.6
     assert np.array_equal(mine.attitude, plain.attitude)
     assert mine.events == plain.events
@@ -411,7 +418,9 @@ def test_a_takeover_after_the_last_kept_edge_changes_no_row():
 
 def test_the_monitor_watches_the_filters_parts():
     record, start, estimate = one_recovery()
-    watched = bank.run_recovering(record, NOISE, start, gate=Gate(), monitor=Monitor(window=5, probability=0.5))
+    watched = multiple_model.run_recovering(
+        record, NOISE, start, gate=Gate(), monitor=Monitor(window=5, probability=0.5)
+    )
     (told,) = events(estimate, "hypotheses")
     times = [(event.start, event.end) for event in events(watched, "divergence")]
     assert any(end <= told.start for _, end in times)
@@ -423,8 +432,10 @@ def test_the_monitor_watches_the_filters_parts():
 def test_a_smoother_takes_what_follows():
     record, _, estimate = one_recovery()
     at = int(np.searchsorted(record.time, events(estimate, "hypotheses")[0].end))
-    one = mekf.State(attitude=estimate.attitude[at], bias=estimate.bias[at], covariance=estimate.covariance[at])
-    smooth = smoother.run(records.cut(record, at, len(record.time) - 1), NOISE, one, gate=Gate(), full_covariance=True)
+    one = estimation.State(attitude=estimate.attitude[at], bias=estimate.bias[at], covariance=estimate.covariance[at])
+    smooth = estimation.smooth(
+        records.cut(record, at, len(record.time) - 1), NOISE, one, gate=Gate(), full_covariance=True
+    )
     assert np.all(smooth.variance[0] < estimate.variance[at])
     assert np.mean(nees(smooth, record)) < 2.5
 
@@ -432,10 +443,10 @@ def test_a_smoother_takes_what_follows():
 def test_a_part_that_begins_amid_refusals_recovers():
     """The end state of one part has six of them; the bank starts from those that this part has."""
     record, start = lost_record(3, jumps=(15.0,), duration=40.0)
-    _, state = mekf.run_on(records.cut(record, 0, 778), NOISE, start, gate=Gate())
+    _, state = estimation.run_part(records.cut(record, 0, 778), NOISE, start, gate=Gate())
     assert state.gate.standing["star 0"][robust_gate.IN_A_ROW] == 6.0
     rest = records.cut(record, 778, 2000)
-    estimate = bank.run_recovering(rest, NOISE, state, gate=Gate(), every=2, full_covariance=True)
+    estimate = multiple_model.run_recovering(rest, NOISE, state, gate=Gate(), every=2, full_covariance=True)
     assert len(events(estimate, "recovery")) == len(events(estimate, "hypotheses")) == 1
     assert nees(estimate, rest)[-1] < 4.0
 
@@ -447,7 +458,7 @@ def test_a_chance_refusal_just_before_it_is_none_of_its_measurements():
     vector_b = np.array(one.vector_b)
     vector_b[145:148] = -vector_b[145:148]
     record = dataclasses.replace(record, vectors=(dataclasses.replace(one, vector_b=vector_b),))
-    estimate = bank.run_recovering(record, NOISE, start, gate=Gate(), every=5, full_covariance=True)
+    estimate = multiple_model.run_recovering(record, NOISE, start, gate=Gate(), every=5, full_covariance=True)
     (recovery,) = events(estimate, "recovery")
     assert recovery.end < 17.0
     after = estimate.time >= recovery.end
@@ -460,8 +471,8 @@ def test_a_heading_alone_starts_no_bank():
     (one,) = record.vectors
     heading = dataclasses.replace(one, sensor="compass", kind="heading").taken(one.time > 15.0)
     hidden = dataclasses.replace(record, vectors=(one.taken(one.time < 15.0), heading))
-    plain = mekf.run(hidden, NOISE, start, gate=Gate(), every=5)
-    mine = bank.run_recovering(hidden, NOISE, start, gate=Gate(), every=5)
+    plain = estimation.run(hidden, NOISE, start, gate=Gate(), every=5)
+    mine = multiple_model.run_recovering(hidden, NOISE, start, gate=Gate(), every=5)
     assert np.array_equal(mine.attitude, plain.attitude)
     assert mine.events == plain.events
 
@@ -469,8 +480,8 @@ def test_a_heading_alone_starts_no_bank():
 def test_what_makes_no_sense_is_refused():
     record, start = lost_record(0, duration=1.0)
     with pytest.raises(InputError, match="gate is None"):
-        bank.run_recovering(record, NOISE, start, gate=None)
+        multiple_model.run_recovering(record, NOISE, start, gate=None)
     with pytest.raises(InputError, match="hypotheses"):
-        bank.run_recovering(record, NOISE, start, gate=Gate(), hypotheses=4)
+        multiple_model.run_recovering(record, NOISE, start, gate=Gate(), hypotheses=4)
     with pytest.raises(InputError, match="every"):
-        bank.run_recovering(record, NOISE, start, gate=Gate(), every=0)
+        multiple_model.run_recovering(record, NOISE, start, gate=Gate(), every=0)

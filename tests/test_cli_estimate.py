@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from sims import hand_held
-from strapdown import ahrs, coning, consistency, mekf, motion, quaternion, records, scenarios, setup
+from strapdown import ahrs, coning, consistency, estimation, motion, quaternion, records, scenarios, setup
 from strapdown.checks import InputError
 from strapdown.cli.filters import filter_for
+from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
-from strapdown.mekf import ProcessNoise
 from strapdown.recordfiles import read_record_file, write_record
 from strapdown.records import ImuRecord, Truth, read_estimate, read_states
 from strapdown.report import estimates
@@ -138,9 +138,9 @@ def test_the_first_measurements_start_the_filter_where_its_sigma_says(sensors):
     errors = []
     for run_number in range(20):
         record = simulate(made(sensors, 1.0), 8, run_number)
-        state = mekf.first_state(record, NOISE, bias_sigma=2e-3)
+        state = estimation.first_state(record, NOISE, bias_sigma=2e-3)
         e = quaternion.log(quaternion.multiply(quaternion.conjugate(state.attitude), record.truth.attitude[0]))
-        errors.append(e @ np.linalg.solve(state.covariance[:3, :3], e) * mekf.ONCE**2 / 3.0)
+        errors.append(e @ np.linalg.solve(state.covariance[:3, :3], e) * estimation.ONCE**2 / 3.0)
     assert 0.4 < np.mean(errors) < 1.8
 
 
@@ -158,7 +158,7 @@ def test_an_outlier_among_the_first_measurements_does_not_start_the_filter():
         ),
         truth=Truth(attitude=record.truth.attitude, bias=record.truth.bias),
     )
-    state = mekf.first_state(record, NOISE, bias_sigma=2e-3)
+    state = estimation.first_state(record, NOISE, bias_sigma=2e-3)
     assert quaternion.angle_between(state.attitude, record.truth.attitude[0]) < 0.02
 
 
@@ -169,7 +169,7 @@ def test_faults_do_not_hide_that_a_start_is_missing():
         ),
     )
     with pytest.raises(InputError, match="0 of directions"):
-        mekf.first_state(simulate(made(blind), 1), NOISE, bias_sigma=1e-3)
+        estimation.first_state(simulate(made(blind), 1), NOISE, bias_sigma=1e-3)
 
 
 # ---------------------------------------------------------------------------------------------------- optional states, one direction

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks import power
-from strapdown import consistency, mekf, motion, quaternion, scenarios, setup, units, vectors
+from strapdown import consistency, estimation, motion, quaternion, scenarios, setup, units, vectors
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
 from strapdown.records import Truth
@@ -109,7 +109,9 @@ def right_run(seed):
     )
     record = scenarios.simulate(scenario, seed=seed)
     believed = setup.FilterSetup(
-        process_noise=mekf.ProcessNoise(angle_random_walk=0.3 * units.DEGREE_PER_ROOT_HOUR, rate_random_walk=1e-6),
+        process_noise=estimation.ProcessNoise(
+            angle_random_walk=0.3 * units.DEGREE_PER_ROOT_HOUR, rate_random_walk=1e-6
+        ),
         attitude_sigma=1e-3,
         bias_sigma=1e-5,
     )

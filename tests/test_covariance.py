@@ -10,12 +10,12 @@ import pytest
 from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 from scipy.stats import norm
 
-from strapdown import coning, consistency, covariance, mekf, montecarlo, motion, quaternion, setup, vectors
+from strapdown import coning, consistency, covariance, estimation, montecarlo, motion, quaternion, setup, vectors
 from strapdown.checks import InputError
 from strapdown.covariance import Consider
+from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
 from strapdown.kernels import covariance_loop
-from strapdown.mekf import ProcessNoise
 from strapdown.scenarios import Scenario, load_scenario, simulate
 from strapdown.setup import FilterSetup
 from strapdown.units import ARCSECOND, DEGREE
@@ -405,7 +405,7 @@ def monte_carlo(scenario, belief, runs, epochs, seed=3):
     for run in range(runs):
         record = simulate(scenario, seed, run)
         used = setup.believed(record, belief)
-        estimate = mekf.run(
+        estimate = estimation.run(
             used,
             belief.process_noise,
             montecarlo.start(record, belief, seed, run),

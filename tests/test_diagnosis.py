@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from strapdown import coning, diagnosis, mekf, motion, quaternion, records, scenarios, setup, units, vectors
+from strapdown import coning, diagnosis, estimation, motion, quaternion, records, scenarios, setup, units, vectors
 from strapdown.checks import InputError
 from strapdown.diagnosis.likelihood import log_p
 from strapdown.gyro import GyroSpec
@@ -57,7 +57,7 @@ def scenario(gyro=None, magnetometer=None, star=None) -> scenarios.Scenario:
 
 
 RIGHT = setup.FilterSetup(
-    process_noise=mekf.ProcessNoise(angle_random_walk=WALK, rate_random_walk=1e-5),
+    process_noise=estimation.ProcessNoise(angle_random_walk=WALK, rate_random_walk=1e-5),
     attitude_sigma=1.0 * units.DEGREE,
     bias_sigma=1e-3,
 )
@@ -123,7 +123,7 @@ CASES = {
     "Q too large": Case(
         "Q too large",
         "angle random walk",
-        setup=replace(RIGHT, process_noise=mekf.ProcessNoise(angle_random_walk=3 * WALK, rate_random_walk=1e-5)),
+        setup=replace(RIGHT, process_noise=estimation.ProcessNoise(angle_random_walk=3 * WALK, rate_random_walk=1e-5)),
         estimate=-math.log(3.0),
         near=0.8,
     ),
@@ -153,7 +153,7 @@ CASES = {
 }
 
 
-def start(record: ImuRecord, believed: setup.FilterSetup, seed: int, bias_sigma: float) -> mekf.State:
+def start(record: ImuRecord, believed: setup.FilterSetup, seed: int, bias_sigma: float) -> estimation.State:
     draw = generator(seed, 0, "initial error").standard_normal(6)
     return setup.initial_state(
         believed,
@@ -208,7 +208,9 @@ SLOW_TURN = replace(
 )
 """Two hours in orbit: the gyro's noise is a good part of its rate."""
 ORBITAL = setup.FilterSetup(
-    process_noise=mekf.ProcessNoise(angle_random_walk=4e-5, rate_random_walk=8e-7), attitude_sigma=0.01, bias_sigma=1e-3
+    process_noise=estimation.ProcessNoise(angle_random_walk=4e-5, rate_random_walk=8e-7),
+    attitude_sigma=0.01,
+    bias_sigma=1e-3,
 )
 
 
@@ -245,7 +247,9 @@ CONING = scenarios.Scenario(
 
 def cone(algorithm: str, seed: int, truth: bool) -> diagnosis.Diagnosis:
     believed = setup.FilterSetup(
-        process_noise=mekf.ProcessNoise(angle_random_walk=0.08 * units.DEGREE_PER_ROOT_HOUR, rate_random_walk=5e-9),
+        process_noise=estimation.ProcessNoise(
+            angle_random_walk=0.08 * units.DEGREE_PER_ROOT_HOUR, rate_random_walk=5e-9
+        ),
         attitude_sigma=1e-3,
         bias_sigma=1e-4,
         integration=coning.ALGORITHMS[algorithm],

@@ -21,10 +21,12 @@ from scipy.linalg import expm, solve_discrete_are
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from strapdown import consistency, family, kinematics, mekf, motion, quaternion
+from strapdown import consistency, estimation, kinematics, motion, quaternion
 from strapdown.checks import InputError
 from strapdown.consistency import Verdict
-from strapdown.family import complementary, extended, stepping, unscented
+from strapdown.estimation import filters
+from strapdown.estimation.filters import complementary, stepping, unscented
+from strapdown.estimation.states import pack
 from strapdown.kernels import family_complementary, family_loop, family_step, family_turns, filter_loop, filter_step
 from strapdown.kernels.machine import compiled
 from strapdown.records import ImuRecord, Truth
@@ -119,12 +121,12 @@ def simulated(
     return ImuRecord(time=edges, increments=increments, vectors=tuple(series), truth=truth)
 
 
-BELIEF = mekf.ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6)
+BELIEF = estimation.ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6)
 
 
 def started(record, rng, *, attitude_sigma, bias_sigma):
     draw = rng.standard_normal(6)
-    return mekf.initial_state(
+    return estimation.initial_state(
         quaternion.multiply(record.truth.attitude[0], quaternion.exp(-attitude_sigma * draw[:3])),
         attitude_sigma=attitude_sigma,
         bias_sigma=bias_sigma,
@@ -156,8 +158,8 @@ def test_fixed_side_equals_the_mekf(seed, attitude_sigma, bias_sigma, kinds):
     rng = np.random.default_rng(seed)
     record = simulated(rng, kinds=kinds, sigma=10.0 ** rng.uniform(-3.0, -1.0), intervals=100)
     initial = started(record, rng, attitude_sigma=attitude_sigma, bias_sigma=bias_sigma)
-    reference = family.run("mekf", record, BELIEF, initial, full_covariance=True)
-    fixed = family.run("fixed-side", record, BELIEF, initial, full_covariance=True)
+    reference = filters.run("mekf", record, BELIEF, initial, full_covariance=True)
+    fixed = filters.run("fixed-side", record, BELIEF, initial, full_covariance=True)
     attitude, _, covariance = difference(fixed, reference)
     assert max(attitude, covariance) < 1e-12
     np.testing.assert_allclose(fixed.bias, reference.bias, rtol=0.0, atol=1e-12)
@@ -171,8 +173,8 @@ def test_without_its_reset_it_is_another_filter(name, seed):
     rng = np.random.default_rng(seed)
     record = simulated(rng)
     initial = started(record, rng, attitude_sigma=0.2, bias_sigma=1e-3)
-    reference = family.run("mekf", record, BELIEF, initial, full_covariance=True)
-    other = family.run(name, record, BELIEF, initial, full_covariance=True)
+    reference = filters.run("mekf", record, BELIEF, initial, full_covariance=True)
+    other = filters.run(name, record, BELIEF, initial, full_covariance=True)
     attitude, _, covariance = difference(other, reference)
     assert attitude > 1e-6
     assert covariance > 1e-3
@@ -180,12 +182,12 @@ def test_without_its_reset_it_is_another_filter(name, seed):
 
 @pytest.mark.parametrize("name", EXTENDED[1:])
 def test_what_each_filter_does_over_one_update(name):
-    """The table of :mod:`strapdown.family.extended`: P⁺ = G P⁻ Gᵀ and b⁺, with the Kalman update done by plain matrices."""
+    """The table of :mod:`strapdown.filters.extended`: P⁺ = G P⁻ Gᵀ and b⁺, with the Kalman update done by plain matrices."""
     rng = np.random.default_rng(5)
     time = np.array([0.0, 1.0])
     M = rng.standard_normal((6, 6)) * np.array([0.3] * 3 + [0.02] * 3)[:, None]
     bias = np.array([0.3, -0.2, 0.1])
-    initial = mekf.State(attitude=quaternion.exp([0.3, 0.2, -0.4]), bias=bias, covariance=M @ M.T)
+    initial = estimation.State(attitude=quaternion.exp([0.3, 0.2, -0.4]), bias=bias, covariance=M @ M.T)
     r, variance = REFERENCES["direction"], 0.05**2
     z = quaternion.rotate(
         quaternion.conjugate(quaternion.multiply(initial.attitude, quaternion.exp([0.2, -0.3, 0.1]))), r
@@ -194,7 +196,7 @@ def test_what_each_filter_does_over_one_update(name):
         sensor="sun", kind="direction", time=time[:1], vector_b=z[None], reference_f=r, sigma=np.sqrt(variance)
     )
     record = ImuRecord(time=time, increments=np.zeros((1, 3)), vectors=(series,))
-    estimate = family.run(name, record, BELIEF, initial, full_covariance=True)
+    estimate = filters.run(name, record, BELIEF, initial, full_covariance=True)
     # The update in the body side's own terms: predicted r_b and z = r_b + r_b × δθ, across r_b.
     r_b = quaternion.rotate(quaternion.conjugate(initial.attitude), r)
     across = np.linalg.svd(r_b[None])[2][1:]
@@ -227,13 +229,13 @@ def test_what_each_filter_does_over_one_update(name):
     np.testing.assert_allclose(estimate.covariance[0], G @ P @ G.T, atol=1e-13)
 
 
-@pytest.mark.parametrize("name", family.FILTERS)
+@pytest.mark.parametrize("name", filters.FILTERS)
 @pytest.mark.parametrize("kind", ["direction", "vector"])
 def test_nis_is_that_of_the_whole_innovation(name, kind):
     """One update under a prior with correlations: the sum of the whitened squares is eᵀ S⁻¹ e."""
     rng = np.random.default_rng(6)
     M = rng.standard_normal((6, 6)) * 1e-5
-    initial = mekf.State(attitude=quaternion.exp([0.3, 0.2, -0.4]), bias=np.zeros(3), covariance=M @ M.T)
+    initial = estimation.State(attitude=quaternion.exp([0.3, 0.2, -0.4]), bias=np.zeros(3), covariance=M @ M.T)
     r, sigma = REFERENCES["direction"], 1e-5
     r_b = quaternion.rotate(quaternion.conjugate(initial.attitude), r)
     z = r_b + 2e-5 * rng.standard_normal(3)
@@ -250,7 +252,7 @@ def test_nis_is_that_of_the_whole_innovation(name, kind):
     H = rows @ kinematics.skew(r_b)
     S = H @ initial.covariance[:3, :3] @ H.T + sigma**2 * np.eye(len(rows))
     e = rows @ (series.vector_b[0] - r_b)
-    nis = family.run(name, record, BELIEF, initial).innovations["sun"].nis
+    nis = filters.run(name, record, BELIEF, initial).innovations["sun"].nis
     np.testing.assert_allclose(nis, [e @ np.linalg.solve(S, e)], rtol=1e-3 if name == "usque" else 1e-8)
 
 
@@ -355,14 +357,14 @@ def test_invariant_filters_never_see_what_one_reference_hides():
     rng = np.random.default_rng(3)
     record = simulated(rng, kinds=("direction",), sigma=0.02, intervals=300, measurements=100)
     r = REFERENCES["direction"]
-    initial = mekf.initial_state(
+    initial = estimation.initial_state(
         quaternion.multiply(quaternion.exp([0.0, 0.9, 0.0]), record.truth.attitude[0]),
         attitude_sigma=1.0,
         bias_sigma=1e-6,
     )
     about = {}
     for name in EXTENDED:
-        estimate = family.run(name, record, BELIEF, initial, full_covariance=True)
+        estimate = filters.run(name, record, BELIEF, initial, full_covariance=True)
         r_b = quaternion.rotate(quaternion.conjugate(estimate.attitude), r)
         about[name] = np.einsum("ki,kij,kj->k", r_b, estimate.covariance[:, :3, :3], r_b)
     for name in ("right-invariant", "two-frame"):
@@ -394,11 +396,11 @@ def test_small_angles_about_one_axis_are_the_kalman_filter(name):
     sv, su = 3e-7, 2e-8
     measured, increments = 1e-6 * rng.standard_normal(n // every), 1e-6 * rng.standard_normal(n)
     record = heading_record(measured, increments, dt, sigma, every)
-    initial = mekf.initial_state(
+    initial = estimation.initial_state(
         [1.0, 0.0, 0.0, 0.0], attitude_sigma=[1e-9, 1e-9, 2e-6], bias_sigma=[1e-10, 1e-10, 1e-6]
     )
-    noise = mekf.ProcessNoise(angle_random_walk=sv, rate_random_walk=su)
-    estimate = family.run(name, record, noise, initial, full_covariance=True)
+    noise = estimation.ProcessNoise(angle_random_walk=sv, rate_random_walk=su)
+    estimate = filters.run(name, record, noise, initial, full_covariance=True)
     kf = KalmanFilter(dim_x=2, dim_z=1)
     kf.x, kf.P = np.zeros((2, 1)), np.diag([4e-12, 1e-12])
     kf.F, kf.H, kf.R = np.array([[1.0, -dt], [0.0, 1.0]]), np.array([[1.0, 0.0]]), np.array([[sigma**2]])
@@ -421,9 +423,9 @@ def test_small_angles_about_one_axis_are_the_kalman_filter(name):
 def test_usque_of_either_sigma_points_tends_to_the_mekf(points):
     rng = np.random.default_rng(11)
     record = simulated(rng, intervals=60, measurements=10, sigma=1e-5, noise=(1e-6, 1e-8))
-    noise = mekf.ProcessNoise(angle_random_walk=1e-6, rate_random_walk=1e-8)
+    noise = estimation.ProcessNoise(angle_random_walk=1e-6, rate_random_walk=1e-8)
     initial = started(record, rng, attitude_sigma=1e-4, bias_sigma=1e-5)
-    reference = mekf.run(record, noise, initial, full_covariance=True)
+    reference = estimation.run(record, noise, initial, full_covariance=True)
     attitude, bias, covariance = difference(
         unscented.run(record, noise, initial, full_covariance=True, points=points), reference
     )
@@ -432,7 +434,7 @@ def test_usque_of_either_sigma_points_tends_to_the_mekf(points):
     assert covariance < 1e-3
 
 
-@pytest.mark.parametrize("name", family.FILTERS)
+@pytest.mark.parametrize("name", filters.FILTERS)
 def test_an_edge_more_at_each_measurement_changes_nothing(name):
     """The interval is split at a measurement anyway; told so by the record, the filter must arrive at the same state."""
     rng = np.random.default_rng(12)
@@ -445,21 +447,21 @@ def test_an_edge_more_at_each_measurement_changes_nothing(name):
         increments=record.increments[interval] * (np.diff(times) / np.diff(record.time)[interval])[:, None],
         vectors=record.vectors,
     )
-    whole = family.run(name, record, BELIEF, initial, full_covariance=True)
-    parts = family.run(name, split, BELIEF, initial, full_covariance=True)
+    whole = filters.run(name, record, BELIEF, initial, full_covariance=True)
+    parts = filters.run(name, split, BELIEF, initial, full_covariance=True)
     kept = np.isin(times, record.time)
     np.testing.assert_allclose(parts.attitude[kept], whole.attitude, atol=1e-12)
     np.testing.assert_allclose(parts.bias[kept], whole.bias, atol=1e-12)
     np.testing.assert_allclose(parts.covariance[kept], whole.covariance, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", family.FILTERS)
+@pytest.mark.parametrize("name", filters.FILTERS)
 def test_every_and_variance_tell_the_same_as_the_whole(name):
     rng = np.random.default_rng(13)
     record = simulated(rng, intervals=31, measurements=6)
     initial = started(record, rng, attitude_sigma=0.1, bias_sigma=1e-3)
-    whole = family.run(name, record, BELIEF, initial, full_covariance=True)
-    some = family.run(name, record, BELIEF, initial, every=7)
+    whole = filters.run(name, record, BELIEF, initial, full_covariance=True)
+    some = filters.run(name, record, BELIEF, initial, every=7)
     np.testing.assert_array_equal(some.time, record.time[::7])
     np.testing.assert_array_equal(some.attitude, whole.attitude[::7])
     np.testing.assert_array_equal(some.variance, whole.variance[::7])
@@ -492,7 +494,7 @@ def test_plain_python_equals_compiled(variant):
     gains = complementary.steady_gains(record, BELIEF, initial)
     given_events = (events.kind, events.vector_b, events.body_noise, events.reference)
     walk = (steps.dt, steps.increment, steps.event, steps.row, 1e-8, 1e-12, *given_events)
-    state = mekf.pack(initial.attitude, initial.bias, initial.covariance)
+    state = pack(initial.attitude, initial.bias, initial.covariance)
     results = []
     for function in (family_loop.run_extended, compiled(family_loop.run_extended)):
         states, innovation = np.zeros((len(steps.time), 28)), np.zeros((len(events.time), 6))
@@ -517,8 +519,8 @@ def test_fixed_side_equals_the_mekf_for_every_kind_and_noise(kind, form):
         kinds = (kind,) if seed < 3 else ("direction", kind) if kind != "direction" else ("heading", kind)
         record = simulated(rng, kinds=kinds, form=form, sigma=10.0 ** rng.uniform(-3.0, -1.0), intervals=60)
         initial = started(record, rng, attitude_sigma=10.0 ** rng.uniform(-3.0, -0.5), bias_sigma=1e-3)
-        reference = family.run("mekf", record, BELIEF, initial, full_covariance=True)
-        fixed = family.run("fixed-side", record, BELIEF, initial, full_covariance=True)
+        reference = filters.run("mekf", record, BELIEF, initial, full_covariance=True)
+        fixed = filters.run("fixed-side", record, BELIEF, initial, full_covariance=True)
         attitude, _, covariance = difference(fixed, reference)
         assert max(attitude, covariance) < 1e-12
         np.testing.assert_allclose(fixed.bias, reference.bias, rtol=0.0, atol=1e-12)
@@ -643,7 +645,7 @@ def body_error(q, b, q1, b1):
     return np.concatenate([quaternion.log(quaternion.multiply(quaternion.conjugate(q), q1)), b1 - b])
 
 
-@pytest.mark.parametrize("name", family.FILTERS)
+@pytest.mark.parametrize("name", filters.FILTERS)
 @pytest.mark.parametrize("form", ["scalar", "covariance of each sample"])
 def test_a_missing_sample_is_as_if_it_were_not_there(name, form):
     """All kinds at the same times, edges among them, over uneven intervals and a gap: what is NaN is skipped and counted."""
@@ -668,7 +670,7 @@ def test_a_missing_sample_is_as_if_it_were_not_there(name, form):
         lost.append(dataclasses.replace(series, **{content: value}))
         fewer.append(series.taken(np.delete(np.arange(6), [k, 5])))
     one, other = (
-        family.run(name, dataclasses.replace(record, vectors=tuple(vectors)), BELIEF, initial, full_covariance=True)
+        filters.run(name, dataclasses.replace(record, vectors=tuple(vectors)), BELIEF, initial, full_covariance=True)
         for vectors in (lost, fewer)
     )
     assert one.skipped == dict.fromkeys(REFERENCES, 2)
@@ -681,7 +683,7 @@ def test_a_missing_sample_is_as_if_it_were_not_there(name, form):
         np.testing.assert_array_equal(innovations.whitened, other.innovations[sensor].whitened)
     assert_sound(one)
     if name == "fixed-side":
-        reference = family.run(
+        reference = filters.run(
             "mekf", dataclasses.replace(record, vectors=tuple(lost)), BELIEF, initial, full_covariance=True
         )
         attitude, _, covariance = difference(one, reference)
@@ -695,9 +697,9 @@ def test_extended_filters_equal_a_slow_reference(name, kind, form):
     rng = np.random.default_rng([41, list(REFERENCES).index(kind)])
     record = simulated(rng, intervals=3, dt=1.0, kinds=(kind, "direction") if kind != "direction" else (kind,),
                        measurements=2, form=form, sigma=0.05, noise=(0.05, 0.03))  # fmt: skip
-    noise = mekf.ProcessNoise(angle_random_walk=0.05, rate_random_walk=0.03)
+    noise = estimation.ProcessNoise(angle_random_walk=0.05, rate_random_walk=0.03)
     M = rng.standard_normal((6, 6)) * np.array([0.25] * 3 + [0.05] * 3)[:, None]
-    initial = mekf.State(
+    initial = estimation.State(
         attitude=quaternion.multiply(record.truth.attitude[0], quaternion.exp([0.3, -0.2, 0.25])),
         bias=np.array([0.2, -0.1, 0.15]),
         covariance=M @ M.T,
@@ -712,7 +714,7 @@ def test_extended_filters_equal_a_slow_reference(name, kind, form):
             if i >= 0:
                 nis[record.vectors[i].sensor].append(slow.update(record.vectors[i], k))
         rows.append((slow.q, slow.b, slow.body_covariance()))
-    estimate = family.run(name, record, noise, initial, full_covariance=True)
+    estimate = filters.run(name, record, noise, initial, full_covariance=True)
     for k, (q, b, P) in enumerate(rows):
         assert quaternion.angle_between(estimate.attitude[k], q) < 1e-9
         np.testing.assert_allclose(estimate.bias[k], b, rtol=0.0, atol=1e-9)
@@ -731,7 +733,7 @@ def test_usque_equals_filterpy_step_by_step(kind, form):
     record = simulated(
         rng, intervals=8, dt=0.4, kinds=(kind,), measurements=4, form=form, sigma=0.05, noise=(0.02, 0.01)
     )
-    noise = mekf.ProcessNoise(angle_random_walk=0.02, rate_random_walk=0.01)
+    noise = estimation.ProcessNoise(angle_random_walk=0.02, rate_random_walk=0.01)
     initial = started(record, rng, attitude_sigma=0.3, bias_sigma=0.05)
     (series,) = record.vectors
     to_q, to_p = unscented.rodrigues_to_quaternion, unscented.quaternion_to_rodrigues
@@ -796,7 +798,7 @@ def test_usque_equals_filterpy_step_by_step(kind, form):
             ukf.x[:3] = 0.0
         else:
             rows.append((q, ukf.x[3:].copy(), ukf.P.copy()))
-    estimate = family.run("usque", record, noise, initial, full_covariance=True)
+    estimate = filters.run("usque", record, noise, initial, full_covariance=True)
     for k, (attitude, bias, P) in enumerate(rows, start=1):
         assert quaternion.angle_between(estimate.attitude[k], attitude) < 1e-10
         np.testing.assert_allclose(estimate.bias[k], bias, rtol=0.0, atol=1e-10)
@@ -813,7 +815,7 @@ def test_in_the_small_all_filters_are_the_kalman_filter(kind, form):
     record = simulated(
         rng, intervals=n, kinds=(kind,), measurements=12, form=form, sigma=small, noise=(small, small), body=rest
     )
-    noise = mekf.ProcessNoise(angle_random_walk=small, rate_random_walk=small)
+    noise = estimation.ProcessNoise(angle_random_walk=small, rate_random_walk=small)
     initial = started(record, rng, attitude_sigma=2.0 * small, bias_sigma=small)
     (series,) = record.vectors
     kf = KalmanFilter(dim_x=6, dim_z=6)
@@ -852,7 +854,7 @@ def test_in_the_small_all_filters_are_the_kalman_filter(kind, form):
             N = rows @ N @ rows.T / size**2
         kf.update(z, R=N, H=np.hstack([H, np.zeros((len(z), 3))]))
     for name in [*EXTENDED, "usque"]:
-        estimate = family.run(name, record, noise, initial, full_covariance=True)
+        estimate = filters.run(name, record, noise, initial, full_covariance=True)
         for k, (x, P) in enumerate(states, start=1):
             sigma = np.sqrt(np.diag(P))
             angle = quaternion.log(quaternion.multiply(quaternion.conjugate(truth), estimate.attitude[k]))
@@ -934,7 +936,7 @@ def test_complementary_filter_follows_the_paper_in_the_limit():
     record = ImuRecord(time=time, increments=np.tile(gyro * dt, (n, 1)), vectors=(series,))
     gains = complementary.Gains(attitude=np.array([kp * dt]), bias=np.array([-ki * dt]))
     estimate = complementary.run(
-        record, BELIEF, mekf.initial_state(start, attitude_sigma=1.0, bias_sigma=0.1), gains=gains
+        record, BELIEF, estimation.initial_state(start, attitude_sigma=1.0, bias_sigma=0.1), gains=gains
     )
     assert quaternion.angle_between(estimate.attitude[-1], quaternion.normalize(wanted[:4])) < 1e-3
     np.testing.assert_allclose(estimate.bias[-1], wanted[4:], atol=1e-3)
@@ -961,7 +963,7 @@ def test_a_measured_attitude_makes_it_the_passive_filter():
     record = ImuRecord(time=time, increments=np.tile(gyro * dt, (n, 1)), vectors=(series,))
     gains = complementary.Gains(attitude=np.array([kp * dt]), bias=np.array([-ki * dt]))
     estimate = complementary.run(
-        record, BELIEF, mekf.initial_state(start, attitude_sigma=1.0, bias_sigma=0.1), gains=gains
+        record, BELIEF, estimation.initial_state(start, attitude_sigma=1.0, bias_sigma=0.1), gains=gains
     )
     assert quaternion.angle_between(estimate.attitude[-1], quaternion.normalize(wanted[:4])) < 1e-3
     np.testing.assert_allclose(estimate.bias[-1], wanted[4:], atol=1e-3)
@@ -1029,7 +1031,7 @@ def test_what_mahonys_turn_shows_is_its_derivative(kind, form):
 # ----------------------------------------------------------------------------------------------------------------- truth
 
 
-@pytest.mark.parametrize("name", family.FILTERS)
+@pytest.mark.parametrize("name", filters.FILTERS)
 def test_no_noise_and_no_error_stay_no_error(name):
     rng = np.random.default_rng(17)
     bias = np.array([1e-3, -2e-3, 5e-4])
@@ -1042,15 +1044,15 @@ def test_no_noise_and_no_error_stay_no_error(name):
         for s in record.vectors
     )
     record = ImuRecord(time=record.time, increments=record.increments, vectors=vectors, truth=record.truth)
-    initial = mekf.initial_state(record.truth.attitude[0], attitude_sigma=1e-6, bias_sigma=1e-7, bias=bias)
-    believed = mekf.ProcessNoise(angle_random_walk=1e-7, rate_random_walk=1e-9)
-    estimate = family.run(name, record, believed, initial)
+    initial = estimation.initial_state(record.truth.attitude[0], attitude_sigma=1e-6, bias_sigma=1e-7, bias=bias)
+    believed = estimation.ProcessNoise(angle_random_walk=1e-7, rate_random_walk=1e-9)
+    estimate = filters.run(name, record, believed, initial)
     error = consistency.errors(estimate.attitude, estimate.bias, record.truth.attitude, record.truth.bias)
     assert np.abs(error[:, :3]).max() < 1e-12
     assert np.abs(error[:, 3:]).max() < 1e-12
 
 
-@pytest.mark.parametrize("name", family.FILTERS)
+@pytest.mark.parametrize("name", filters.FILTERS)
 def test_consistent_from_small_errors(name):
     """ANEES of attitude and bias within two-sided 99 % bounds at three epochs; outside when the noise is believed half as large."""
     runs = 30 if name == "usque" else 100
@@ -1062,7 +1064,7 @@ def test_consistent_from_small_errors(name):
         for belief, values in ((record, nees), (halved(record), doubted)):
             if name == "usque" and values is doubted:
                 continue
-            estimate = family.run(name, belief, BELIEF, initial, every=30, full_covariance=True)
+            estimate = filters.run(name, belief, BELIEF, initial, every=30, full_covariance=True)
             error = consistency.errors(
                 estimate.attitude, estimate.bias, record.truth.attitude[::30], record.truth.bias[::30]
             )
@@ -1104,13 +1106,13 @@ def anees(name, kind, form, runs, factor):
     nees = []
     for record, initial in drawn(kind, form, runs):
         believed = dataclasses.replace(record, vectors=tuple(series.noise_scaled(factor) for series in record.vectors))
-        estimate = family.run(name, believed, BELIEF, initial, every=6, full_covariance=True)
+        estimate = filters.run(name, believed, BELIEF, initial, every=6, full_covariance=True)
         error = consistency.errors(estimate.attitude, estimate.bias, record.truth.attitude[::6], record.truth.bias[::6])
         nees.append(consistency.nees(error, estimate.covariance)[1:] / 6.0)
     return Verdict(mean=np.mean(nees, axis=0), degrees=6, runs=runs, probability=0.999)
 
 
-@pytest.mark.parametrize("name", [name for name in family.FILTERS if name != "usque"])
+@pytest.mark.parametrize("name", [name for name in filters.FILTERS if name != "usque"])
 @pytest.mark.parametrize(("kind", "form"), CASES)
 def test_consistent_for_every_kind_and_noise(name, kind, form):
     """ANEES inside its two-sided bounds (99.9 % each, there are many); outside above when the noise is believed a third of what it is."""
@@ -1128,7 +1130,7 @@ def test_usque_is_consistent_for_every_kind(kind, form):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", family.FILTERS)
+@pytest.mark.parametrize("name", filters.FILTERS)
 @pytest.mark.parametrize(("kind", "form"), CASES)
 def test_consistent_for_every_kind_and_noise_in_many_runs(name, kind, form):
     """The same over more runs; noise that is believed too large shows too, below the bounds."""
@@ -1143,19 +1145,19 @@ def test_consistent_for_every_kind_and_noise_in_many_runs(name, kind, form):
         assert np.min(high.mean) < 1.0
 
 
-@pytest.mark.parametrize("name", family.FILTERS)
+@pytest.mark.parametrize("name", filters.FILTERS)
 @pytest.mark.parametrize(("degrees", "left"), [(60.0, 0.5), (120.0, 3.0)])
 def test_converges_from_large_errors(name, degrees, left):
     rng = np.random.default_rng(20)
     record = simulated(rng, intervals=600, kinds=("direction", "vector"), measurements=150, bias=1e-3)
     axis = rng.standard_normal(3)
     axis /= np.linalg.norm(axis)
-    initial = mekf.initial_state(
+    initial = estimation.initial_state(
         quaternion.multiply(record.truth.attitude[0], quaternion.exp(degrees * DEGREE * axis)),
         attitude_sigma=60.0 * DEGREE,
         bias_sigma=2e-3,
     )
-    estimate = family.run(name, record, BELIEF, initial)
+    estimate = filters.run(name, record, BELIEF, initial)
     error = quaternion.angle_between(estimate.attitude, record.truth.attitude) / DEGREE
     np.testing.assert_allclose(error[0], degrees, rtol=1e-9)
     assert error[-1] < left
@@ -1239,7 +1241,7 @@ def wild(seed, intervals):
     )
     axis = rng.standard_normal(3)
     turn = (np.pi - 10.0 ** rng.uniform(-8.0, 0.4)) * axis / np.linalg.norm(axis)
-    initial = mekf.initial_state(
+    initial = estimation.initial_state(
         quaternion.multiply(record.truth.attitude[0], quaternion.exp(turn)),
         attitude_sigma=10.0 ** rng.uniform(-3.0, 1.0),
         bias_sigma=10.0 ** rng.uniform(-6.0, 0.0),
@@ -1256,17 +1258,17 @@ def assert_sound(estimate):
     assert np.linalg.eigvalsh(estimate.covariance / (sigma[:, :, None] * sigma[:, None, :])).min() > -1e-9
 
 
-@pytest.mark.parametrize("name", family.FILTERS)
+@pytest.mark.parametrize("name", filters.FILTERS)
 def test_every_filter_stays_finite_from_any_start(name):
     for seed in range(8 if name == "usque" else 100):
         record, initial = wild(seed, 60 if name == "usque" else 300)
-        assert_sound(family.run(name, record, BELIEF, initial, full_covariance=True))
+        assert_sound(filters.run(name, record, BELIEF, initial, full_covariance=True))
 
 
 @pytest.mark.parametrize(("kind", "form"), CASES)
 def test_every_filter_stays_finite_whatever_it_measures(kind, form):
     rng = np.random.default_rng([48, CASES.index((kind, form))])
-    names = [name for name in family.FILTERS if name != "usque" or (kind, form) in SHARPEST]
+    names = [name for name in filters.FILTERS if name != "usque" or (kind, form) in SHARPEST]
     for together in (False, True):
         record = simulated(
             rng,
@@ -1279,39 +1281,39 @@ def test_every_filter_stays_finite_whatever_it_measures(kind, form):
             together=together,
         )
         axis = rng.standard_normal(3)
-        initial = mekf.initial_state(
+        initial = estimation.initial_state(
             quaternion.multiply(record.truth.attitude[0], quaternion.exp(3.1 * axis / np.linalg.norm(axis))),
             attitude_sigma=10.0 ** rng.uniform(-3.0, 1.0),
             bias_sigma=10.0 ** rng.uniform(-6.0, 0.0),
         )
         for name in names:
-            assert_sound(family.run(name, record, BELIEF, initial, full_covariance=True))
+            assert_sound(filters.run(name, record, BELIEF, initial, full_covariance=True))
 
 
 @pytest.mark.parametrize("seed", [35, 163, 375, 483])
 def test_the_geometric_filter_stays_finite_where_its_bias_would_run_away(seed):
     """Starts from which the bias grows without end if corrections are taken in at any length."""
     record, initial = wild(seed, 2000)
-    assert_sound(family.run("geometric", record, BELIEF, initial, full_covariance=True))
+    assert_sound(filters.run("geometric", record, BELIEF, initial, full_covariance=True))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", family.FILTERS)
+@pytest.mark.parametrize("name", filters.FILTERS)
 def test_every_filter_stays_finite_from_thousands_of_starts(name):
     for seed in range(100, 300 if name == "usque" else 3000):
         record, initial = wild(seed, 60 if name == "usque" else 2000)
-        assert_sound(family.run(name, record, BELIEF, initial, full_covariance=True))
+        assert_sound(filters.run(name, record, BELIEF, initial, full_covariance=True))
 
 
-@pytest.mark.parametrize("name", family.FILTERS)
+@pytest.mark.parametrize("name", filters.FILTERS)
 def test_a_heading_seen_straight_up_says_nothing(name):
     """The start takes the measured vector to the vertical exactly: it has no heading, and the filter waits for the next."""
     series = VectorMeasurements(
         sensor="compass", kind="heading", time=[0.5], vector_b=[[0.0, 0.0, 1.0]], reference_f=[1.0, 0.0, 0.0], sigma=0.1
     )
     record = ImuRecord(time=np.array([0.0, 1.0]), increments=np.zeros((1, 3)), vectors=(series,))
-    initial = mekf.initial_state([1.0, 0.0, 0.0, 0.0], attitude_sigma=1.0, bias_sigma=0.1)
-    estimate = family.run(name, record, BELIEF, initial, full_covariance=True)
+    initial = estimation.initial_state([1.0, 0.0, 0.0, 0.0], attitude_sigma=1.0, bias_sigma=0.1)
+    estimate = filters.run(name, record, BELIEF, initial, full_covariance=True)
     assert_sound(estimate)
     assert (estimate.skipped, len(estimate.innovations["compass"].time)) == ({"compass": 1}, 0)
     if name in EXTENDED:
@@ -1319,17 +1321,17 @@ def test_a_heading_seen_straight_up_says_nothing(name):
         assert np.all(np.diff(estimate.variance[:, :3], axis=0) >= 0.0)
 
 
-@pytest.mark.parametrize("name", family.FILTERS)
+@pytest.mark.parametrize("name", filters.FILTERS)
 def test_a_gap_of_the_gyro_is_told(name):
     rng = np.random.default_rng(23)
     record = simulated(rng, intervals=20, measurements=5)
     initial = started(record, rng, attitude_sigma=0.1, bias_sigma=1e-3)
     longest = np.diff(record.time).max()
     late = dataclasses.replace(record, time=record.time + np.where(np.arange(21) > 12, 30.0 * longest, 0.0))
-    (event,) = family.run(name, late, BELIEF, initial).events
+    (event,) = filters.run(name, late, BELIEF, initial).events
     assert (event.kind, event.start, event.end) == ("gap", late.time[12], late.time[13])
-    assert event == mekf.run(late, BELIEF, initial).events[0]
-    assert family.run(name, record, BELIEF, initial).events == ()
+    assert event == estimation.run(late, BELIEF, initial).events[0]
+    assert filters.run(name, record, BELIEF, initial).events == ()
 
 
 # --------------------------------------------------------------------------------------------------------------- bad input
@@ -1340,7 +1342,7 @@ def test_bad_input_is_refused():
     record = simulated(rng, intervals=10, measurements=3)
     initial = started(record, rng, attitude_sigma=0.1, bias_sigma=1e-3)
     with pytest.raises(InputError, match="did you mean 'usque'"):
-        family.run("usqe", record, BELIEF, initial)
+        filters.run("usqe", record, BELIEF, initial)
     given = {"kind": "direction", "time": [0.1], "vector_b": [[1.0, 0.0, 0.0]], "reference_f": [1.0, 0.0, 0.0]}
     wrong = [
         (VectorMeasurements(sensor="sun", sigma=0.0, **given), r"^sun: sigma\[0\] is 0 rad; a filter needs"),
@@ -1350,7 +1352,7 @@ def test_bad_input_is_refused():
             r"^sun: covariance\[0\] is singular",
         ),
     ]
-    for name in family.FILTERS:
+    for name in filters.FILTERS:
         for arguments, message in (
             ((record, BELIEF, initial, 0), "^every is 0; it must be a whole number"),
             ((record, BELIEF, initial, 1.5), "^every is 1.5"),
@@ -1363,10 +1365,10 @@ def test_bad_input_is_refused():
         ):
             *first, every = arguments
             with pytest.raises(InputError, match=message):
-                family.run(name, *first, every=every)
+                filters.run(name, *first, every=every)
             if first[0] is record and every == 1 and name != "mekf":  # by the filter itself too
                 with pytest.raises(InputError, match=message):
-                    family.FILTERS[name](*first)
+                    filters.FILTERS[name](*first)
     for points, message in ((JulierSigmaPoints(3, kappa=0.0), "^points are of 3 states"), (5, "^points is 5; give")):
         with pytest.raises(InputError, match=message):
             unscented.run(record, BELIEF, initial, points=points)
@@ -1377,44 +1379,43 @@ def test_bad_input_is_refused():
         complementary.run(record, BELIEF, initial, gains=gains)
 
 
-@pytest.mark.parametrize("name", family.FILTERS)
+@pytest.mark.parametrize("name", filters.FILTERS)
 def test_a_reference_for_each_measurement_is_taken_as_it_is(name):
     rng = np.random.default_rng(22)
     record = simulated(rng, intervals=20, measurements=5)
     initial = started(record, rng, attitude_sigma=0.1, bias_sigma=1e-3)
     each = tuple(dataclasses.replace(series, reference_f=series.references_f.copy()) for series in record.vectors)
-    one = family.run(name, record, BELIEF, initial)
-    other = family.run(name, dataclasses.replace(record, vectors=each), BELIEF, initial)
+    one = filters.run(name, record, BELIEF, initial)
+    other = filters.run(name, dataclasses.replace(record, vectors=each), BELIEF, initial)
     assert np.allclose(one.attitude, other.attitude, rtol=0.0, atol=1e-12)
     assert np.allclose(one.bias, other.bias, rtol=0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", family.FILTERS)
+@pytest.mark.parametrize("name", filters.FILTERS)
 def test_a_record_without_measurements_is_dead_reckoning(name):
     rng = np.random.default_rng(21)
     record = simulated(rng, intervals=20, kinds=())
     initial = started(record, rng, attitude_sigma=1e-5, bias_sigma=1e-6)
-    reference = mekf.run(record, BELIEF, initial, full_covariance=True)
-    attitude, bias, covariance = difference(family.run(name, record, BELIEF, initial, full_covariance=True), reference)
+    reference = estimation.run(record, BELIEF, initial, full_covariance=True)
+    attitude, bias, covariance = difference(filters.run(name, record, BELIEF, initial, full_covariance=True), reference)
     assert attitude < 1e-12
     assert bias < 1e-6
     assert covariance < 1e-6
 
 
 def test_extended_filters_are_those_of_the_table():
-    assert family.FILTERS["fixed-side"] is extended.fixed_side
-    assert set(EXTENDED) | {"usque", "mahony"} == set(family.FILTERS)
+    assert set(EXTENDED) | {"usque", "mahony", "equivariant", "schmidt"} == set(filters.FILTERS)
 
 
 def test_comparing_all_is_one_line_with_a_table():
     rng = np.random.default_rng(47)
     record = simulated(rng, intervals=40, kinds=("direction", "attitude"), measurements=20)
     initial = started(record, rng, attitude_sigma=0.1, bias_sigma=1e-3)
-    told = family.compare(record, BELIEF, initial, every=2)
-    assert list(told.estimates) == list(family.FILTERS)
+    told = filters.compare(record, BELIEF, initial, every=2)
+    assert list(told.estimates) == list(filters.FILTERS)
     late = told.estimates["mekf"].time >= 0.5 * record.time[-1]
     for name, estimate in told.estimates.items():
-        np.testing.assert_array_equal(estimate.attitude, family.run(name, record, BELIEF, initial, every=2).attitude)
+        np.testing.assert_array_equal(estimate.attitude, filters.run(name, record, BELIEF, initial, every=2).attitude)
         error = consistency.errors(
             estimate.attitude, estimate.bias, record.truth.attitude[::2], record.truth.bias[::2]
         )[late]
@@ -1427,19 +1428,19 @@ def test_comparing_all_is_one_line_with_a_table():
         np.testing.assert_allclose(row["nis"], np.mean(np.concatenate(parts) ** 2), rtol=1e-12)
         assert row["degrees"] == len(np.concatenate(parts))
     lines = str(told).splitlines()
-    assert [line.split()[0] for line in lines[1:8]] == list(family.FILTERS)
+    assert [line.split()[0] for line in lines[1 : 1 + len(filters.FILTERS)]] == list(filters.FILTERS)
     assert f"{told.summary()['mekf']['attitude_error'] / DEGREE:.4g}" in lines[1]
     # Without truth it tells differences from the first filter.
-    blind = family.compare(dataclasses.replace(record, truth=None), BELIEF, initial, filters=["fixed-side", "mekf"])
+    blind = filters.compare(dataclasses.replace(record, truth=None), BELIEF, initial, filters=["fixed-side", "mekf"])
     assert "from fixed-side" in str(blind)
     assert str(blind).splitlines()[1].split()[1] == "-"
     assert blind.summary()["mekf"]["attitude_error"] < 1e-12
-    silent = family.compare(dataclasses.replace(record, vectors=()), BELIEF, initial, filters="mekf")
+    silent = filters.compare(dataclasses.replace(record, vectors=()), BELIEF, initial, filters="mekf")
     assert np.isnan(silent.summary()["mekf"]["nis"])
     assert "of a right filter" not in str(silent)
-    for filters, message in (((), "^filters is empty; name at least one of mekf, fixed"), (["mefk"], "mean 'mekf'")):
+    for names, message in (((), "^filters is empty; name at least one of mekf, fixed"), (["mefk"], "mean 'mekf'")):
         with pytest.raises(InputError, match=message):
-            family.compare(record, BELIEF, initial, filters=filters)
+            filters.compare(record, BELIEF, initial, filters=names)
 
 
 @pytest.fixture(scope="module")
@@ -1455,7 +1456,7 @@ def comparison():
 
 def test_study_says_which_filter_may_be_believed(comparison):
     """From small errors all are right; from large ones the MEKF is overconfident, the invariant filters less so, the baseline not."""
-    names = [name for name in family.FILTERS if name != "usque"]
+    names = [name for name in filters.FILTERS if name != "usque"]
     result = comparison.main(runs=25, duration=120.0, filters=names, seed=3)
     for name in names:
         assert result.outcome("small", name).consistent
@@ -1476,9 +1477,9 @@ def test_study_runs_small_and_draws(comparison, tmp_path):
     assert [path.name for path in result.figures] == ["filter_family.png"]
     assert (tmp_path / "filter_family.png").stat().st_size > 10_000
     text = (tmp_path / "filter_family.txt").read_text(encoding="utf-8")
-    assert all(name in text for name in family.FILTERS)
+    assert all(name in text for name in filters.FILTERS)
     told = json.loads((tmp_path / "filter_family.json").read_text(encoding="utf-8"))
-    assert len(told["outcomes"]) == len(comparison.CASES) * len(family.FILTERS)
+    assert len(told["outcomes"]) == len(comparison.CASES) * len(filters.FILTERS)
     for row in told["outcomes"]:
         outcome = result.outcome(row["case"], row["filter"])
         assert row["final_rms_deg"] == outcome.final_rms / DEGREE

@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 import scipy.linalg
 from filterpy.common import van_loan_discretization
+from in_steps import transition_and_noise
 
 from strapdown import kinematics, quaternion
+from strapdown.estimation.states import ProcessNoise, State, covariance_matrices
 from strapdown.kernels import filter_step
 from strapdown.kernels.machine import compiled
-from strapdown.mekf import ProcessNoise, State, covariance_matrices, transition_and_noise
 
 RATES = [
     np.array([0.0, 0.0, 0.0]),

@@ -590,7 +590,7 @@ def test_a_matrix_of_lanes():
 
 BITS = """
 import hashlib, numpy as np
-from strapdown import coning
+from strapdown import (coning)
 random = np.random.default_rng(8)
 increments = np.concatenate([1e-2 * random.standard_normal((3001, 3)), 0.5 * random.standard_normal((500, 3))])
 steps = coning.integrate(increments, "magnus-4"), coning.integrate(increments)

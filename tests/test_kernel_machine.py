@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 import strapdown
-from strapdown import mekf
+from strapdown import estimation
+from strapdown.estimation.states import running, scheduling
 from strapdown.kernels import algebra, filter_loop, machine
-from strapdown.mekf import running, scheduling
 from strapdown.records import ImuRecord
 from strapdown.vectors import VectorMeasurements
 
@@ -40,7 +40,7 @@ def test_functions_from_elsewhere_are_refused():
     with pytest.raises(TypeError, match="does not live in"):
         machine.compiled(math.sqrt)
     with pytest.raises(TypeError, match="does not live in"):
-        machine.compiled(mekf.initial_state)
+        machine.compiled(estimation.initial_state)
 
 
 def test_a_kernel_that_names_a_module_is_refused():
@@ -92,13 +92,13 @@ def test_compiled_loop_equals_plain_python(monkeypatch):
             VectorMeasurements(sensor=kind, kind=kind, time=time, vector_b=measured, reference_f=reference, sigma=0.01)
         )
     record = ImuRecord(time=edges, increments=increments, vectors=tuple(vectors))
-    noise = mekf.ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-4)
-    initial = mekf.initial_state([1.0, 0.0, 0.0, 0.0], attitude_sigma=0.1, bias_sigma=0.01)
-    fast = mekf.run(record, noise, initial, full_covariance=True)
+    noise = estimation.ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-4)
+    initial = estimation.initial_state([1.0, 0.0, 0.0, 0.0], attitude_sigma=0.1, bias_sigma=0.01)
+    fast = estimation.run(record, noise, initial, full_covariance=True)
     plain_calls = []
     for module in (running, scheduling):
         monkeypatch.setattr(module, "compiled", lambda function: plain_calls.append(function) or function)
-    plain = mekf.run(record, noise, initial, full_covariance=True)
+    plain = estimation.run(record, noise, initial, full_covariance=True)
     assert all(isinstance(function, FunctionType) for function in plain_calls)
     assert plain_calls
     for name in ("attitude", "bias", "variance", "covariance"):

@@ -9,10 +9,12 @@ import scipy.linalg
 from filterpy.common import Saver
 from filterpy.kalman import KalmanFilter
 
-from strapdown import coning, consistency, gyro, mekf, motion, quaternion, records, vectors
+from strapdown import coning, consistency, estimation, gyro, motion, quaternion, records, vectors
 from strapdown.checks import InputError
-from strapdown.kernels import filter_loop
-from strapdown.mekf import ProcessNoise, StepFilter, initial_state
+from strapdown.estimation.schedule import schedule
+from strapdown.estimation.states import ProcessNoise, initial_state
+from strapdown.estimation.step_filter import StepFilter
+from strapdown.kernels import measurement
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Truth
 from strapdown.scenarios import Scenario, simulate
@@ -117,7 +119,7 @@ def test_both_faces_are_one_filter(fast):
     record = with_vector_series(simulate(scenario(body_motion, duration=4.0), 1))
     record = with_moving_reference(with_attitude_series(record))
     initial = off(record)
-    whole = mekf.run(record, NOISE, initial, full_covariance=True)
+    whole = estimation.run(record, NOISE, initial, full_covariance=True)
     (attitude, bias, P), _ = stepped(record, initial)
     d = np.sqrt(np.einsum("kii->ki", P))
     assert np.max(quaternion.angle_between(attitude, whole.attitude[1:])) < 1e-10
@@ -136,7 +138,7 @@ def test_the_step_face_keeps_what_filterpys_users_expect():
 
 def test_innovations_agree_with_the_step_face():
     record = simulate(scenario(sensors=SENSORS[:1], duration=3.0), 1)
-    whole = mekf.run(record, NOISE, off(record))
+    whole = estimation.run(record, NOISE, off(record))
     _, history = stepped(record, off(record), saver=True)
     nis = [float(y @ np.linalg.solve(S, y)) for y, S in zip(history.y, history.S, strict=True)]
     assert np.allclose(whole.innovations["a"].nis, nis, rtol=1e-8)
@@ -145,9 +147,11 @@ def test_innovations_agree_with_the_step_face():
 @pytest.mark.parametrize("at", [1, 333, 799])
 def test_a_split_run_is_the_whole_run_to_the_bit(at):
     record = with_moving_reference(with_attitude_series(with_vector_series(simulate(scenario(), 1))))
-    whole, end = mekf.run_on(record, NOISE, off(record), full_covariance=True)
-    first, middle = mekf.run_on(records.cut(record, 0, at), NOISE, off(record), full_covariance=True)
-    second, last = mekf.run_on(records.cut(record, at, len(record.increments)), NOISE, middle, full_covariance=True)
+    whole, end = estimation.run_part(record, NOISE, off(record), full_covariance=True)
+    first, middle = estimation.run_part(records.cut(record, 0, at), NOISE, off(record), full_covariance=True)
+    second, last = estimation.run_part(
+        records.cut(record, at, len(record.increments)), NOISE, middle, full_covariance=True
+    )
     for name in ("attitude", "bias", "variance", "covariance"):
         joined = np.concatenate([getattr(first, name)[:-1], getattr(second, name)])
         assert np.array_equal(joined, getattr(whole, name)), name
@@ -167,7 +171,7 @@ def test_without_noise_there_is_no_error():
     body_motion = motion.ConstantRate(rate=(0.4, -0.3, 0.2), initial_attitude=(0.5, 0.5, -0.5, 0.5))
     record = noise_free(simulate(scenario(body_motion, duration=20.0), 1), body_motion)
     truth = Truth(attitude=body_motion.attitude(record.time), bias=np.zeros((len(record.time), 3)))
-    result = mekf.run(record, NOISE, initial_state(truth.attitude[0], attitude_sigma=1e-2, bias_sigma=1e-3))
+    result = estimation.run(record, NOISE, initial_state(truth.attitude[0], attitude_sigma=1e-2, bias_sigma=1e-3))
     error = consistency.errors(result.attitude, result.bias, truth.attitude, truth.bias)
     assert np.abs(error[:, :3]).max() < 1e-14
     # The vectors are rounded, and a rounding over the tenth of a second between two of them is a rate.
@@ -194,7 +198,7 @@ def test_small_angles_about_one_axis_are_the_linear_kalman_filter():
     )
     noise = ProcessNoise(angle_random_walk=1e-7, rate_random_walk=1e-8)
     initial = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-5, bias_sigma=1e-6)
-    result = mekf.run(ImuRecord(time=time, increments=increments, vectors=(series,)), noise, initial)
+    result = estimation.run(ImuRecord(time=time, increments=increments, vectors=(series,)), noise, initial)
     kf = KalmanFilter(dim_x=2, dim_z=1, dim_u=1)
     kf.F, kf.B, kf.H = np.array([[1.0, -dt], [0.0, 1.0]]), np.array([[1.0], [0.0]]), np.array([[1.0, 0.0]])
     v, u = noise.angle_random_walk**2, noise.rate_random_walk**2
@@ -221,7 +225,7 @@ def test_steady_state_is_farrenkopfs_closed_form():
     )
     record = ImuRecord(time=time, increments=np.zeros((steps, 3)), vectors=series)
     initial = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-3, bias_sigma=1e-4)
-    after = mekf.run(record, noise, initial, every=steps, full_covariance=True).covariance[-1]
+    after = estimation.run(record, noise, initial, every=steps, full_covariance=True).covariance[-1]
     s_u, s_v = 1e-6 * dt**1.5 / sigma, 3e-5 * np.sqrt(dt) / sigma
     gamma = np.sqrt(1.0 + s_v**2 / 4.0 + s_u**2 / 48.0)
     zeta = gamma + s_u / 4.0 + 0.5 * np.sqrt(2.0 * gamma * s_u + s_v**2 + s_u**2 / 3.0)
@@ -259,7 +263,7 @@ def test_steady_state_of_a_turning_body_solves_the_riccati_equation():
     )
     record = ImuRecord(time=time, increments=body_motion.increments(time), vectors=series)
     initial = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-3, bias_sigma=1e-4)
-    after = mekf.run(record, noise, initial, every=steps, full_covariance=True).covariance[-1]
+    after = estimation.run(record, noise, initial, every=steps, full_covariance=True).covariance[-1]
     # Three orthogonal equal directions give the information 2/σ² about every axis, in whatever frame.
     F = scipy.linalg.expm(np.block([[-_skew(w), -np.eye(3)], [np.zeros((3, 6))]]) * dt)
     grid = np.linspace(0.0, dt, 2001)
@@ -294,7 +298,7 @@ def test_two_orthogonal_equal_directions_and_a_diffuse_prior():
     )
     record = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=series)
     initial = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e3, bias_sigma=1.0)
-    after = mekf.run(record, NOISE, initial, full_covariance=True).covariance[0, :3, :3]
+    after = estimation.run(record, NOISE, initial, full_covariance=True).covariance[0, :3, :3]
     assert np.allclose(after, sigma**2 * np.diag([1.0, 1.0, 0.5]), rtol=1e-9, atol=1e-9 * sigma**2)
 
 
@@ -306,7 +310,7 @@ def test_an_attitude_and_a_diffuse_prior_is_the_attitude():
     record = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=(series,))
     start = quaternion.multiply(measured, quaternion.exp([1e-3, 1e-3, -1e-3]))
     initial = initial_state(start, attitude_sigma=1e2, bias_sigma=1.0)
-    result = mekf.run(record, NOISE, initial, full_covariance=True)
+    result = estimation.run(record, NOISE, initial, full_covariance=True)
     assert quaternion.angle_between(result.attitude[0], measured) < 1e-10
     assert np.allclose(result.covariance[0, :3, :3], np.diag(sigma**2), rtol=2e-3, atol=1e-8)
     assert result.innovations["t"].whitened.shape == (1, 3)
@@ -315,8 +319,8 @@ def test_an_attitude_and_a_diffuse_prior_is_the_attitude():
 def test_scaled_noise_reaches_every_kind():
     record = with_attitude_series(with_vector_series(simulate(scenario(duration=2.0), 1)))
     believed = replace(record, vectors=tuple(series.noise_scaled(3.0) for series in record.vectors))
-    plain, scaled = mekf.schedule(record.vectors, 0.0, 2.0), mekf.schedule(believed.vectors, 0.0, 2.0)
-    attitude = plain.kind == filter_loop.ATTITUDE
+    plain, scaled = schedule(record.vectors, 0.0, 2.0), schedule(believed.vectors, 0.0, 2.0)
+    attitude = plain.kind == measurement.ATTITUDE
     assert np.allclose(scaled.variance, 9.0 * plain.variance, rtol=1e-14)
     assert np.allclose(scaled.vector_b[attitude], 9.0 * plain.vector_b[attitude], rtol=1e-14)
     assert np.array_equal(scaled.vector_b[~attitude], plain.vector_b[~attitude])
@@ -343,7 +347,7 @@ def test_a_correction_of_more_than_a_radian_keeps_the_norm():
     )
     record = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=(series,))
     initial = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=3.0, bias_sigma=1.0)
-    estimate, end = mekf.run_on(record, NOISE, initial)
+    estimate, end = estimation.run_part(record, NOISE, initial)
     assert abs(np.linalg.norm(estimate.attitude[0]) - 1.0) < 1e-14
     assert np.linalg.norm(end.attitude) == pytest.approx(1.0, abs=1e-14)
 
@@ -352,7 +356,7 @@ def test_a_long_outage_grows_the_covariance_as_the_closed_form_says():
     dt, steps = 0.1, 5000
     record = ImuRecord(time=dt * np.arange(steps + 1), increments=np.zeros((steps, 3)))
     initial = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-3, bias_sigma=1e-4)
-    end = mekf.run(record, NOISE, initial, every=steps, full_covariance=True).covariance[-1]
+    end = estimation.run(record, NOISE, initial, every=steps, full_covariance=True).covariance[-1]
     T = dt * steps
     v, u = NOISE.angle_random_walk**2, NOISE.rate_random_walk**2
     assert end[0, 0] == pytest.approx(1e-6 + 1e-8 * T**2 + v * T + u * T**3 / 3.0, rel=1e-10)
@@ -364,9 +368,9 @@ def test_one_interval_or_many_at_constant_rate_are_the_same():
     """The model is exact at constant rate: a turn of 3 rad in one interval (sub-steps) equals a thousand small ones."""
     turn = np.array([1.0, -2.0, 2.0])
     initial = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-3, bias_sigma=1e-4)
-    one = mekf.run(ImuRecord(time=[0.0, 1.0], increments=[turn]), NOISE, initial, full_covariance=True)
+    one = estimation.run(ImuRecord(time=[0.0, 1.0], increments=[turn]), NOISE, initial, full_covariance=True)
     many = ImuRecord(time=np.linspace(0.0, 1.0, 1001), increments=np.tile(turn / 1000.0, (1000, 1)))
-    fine = mekf.run(many, NOISE, initial, every=1000, full_covariance=True)
+    fine = estimation.run(many, NOISE, initial, every=1000, full_covariance=True)
     assert quaternion.angle_between(one.attitude[-1], fine.attitude[-1]) < 1e-13
     assert quaternion.angle_between(one.attitude[-1], quaternion.exp(turn)) < 1e-14
     d = np.sqrt(np.diag(one.covariance[-1]))
@@ -392,7 +396,7 @@ def test_many_series_are_one_series_of_as_many_references():
     noise = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)
     start = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.1, bias_sigma=0.1)
     ran = [
-        mekf.run(ImuRecord(time=time, increments=body.increments(time), vectors=some), noise, start)
+        estimation.run(ImuRecord(time=time, increments=body.increments(time), vectors=some), noise, start)
         for some in (each, (whole,))
     ]
     np.testing.assert_array_equal(ran[0].attitude, ran[1].attitude)
@@ -418,8 +422,10 @@ def test_a_start_from_vertical_and_heading_knows_what_the_tilt_does_to_the_headi
             )
         ]
         record = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=tuple(series))
-        state = mekf.first_state(record, ProcessNoise(angle_random_walk=1e-6, rate_random_walk=0.0), bias_sigma=1e-3)
-        P = state.covariance[:3, :3] / mekf.ONCE**2
+        state = estimation.first_state(
+            record, ProcessNoise(angle_random_walk=1e-6, rate_random_walk=0.0), bias_sigma=1e-3
+        )
+        P = state.covariance[:3, :3] / estimation.ONCE**2
         e = quaternion.log(quaternion.multiply(quaternion.conjugate(state.attitude), q))
         vertical = quaternion.to_matrix(state.attitude)[2]
         whole.append(e @ np.linalg.solve(P, e) / 3.0)
@@ -432,7 +438,7 @@ def test_a_start_from_vertical_and_heading_knows_what_the_tilt_does_to_the_headi
     up = replace(level, sensor="up", kind="direction", reference_f=np.array([0.0, 0.0, 1.0]))
     blind = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=(up, level))
     with pytest.raises(InputError, match="do not give the attitude"):
-        mekf.first_state(blind, ProcessNoise(angle_random_walk=1e-6, rate_random_walk=0.0), bias_sigma=1e-3)
+        estimation.first_state(blind, ProcessNoise(angle_random_walk=1e-6, rate_random_walk=0.0), bias_sigma=1e-3)
 
 
 def test_missing_and_outside_measurements_are_counted():
@@ -441,18 +447,18 @@ def test_missing_and_outside_measurements_are_counted():
     value = series.vector_b.copy()
     value[3:7] = np.nan
     holed = replace(record, vectors=(replace(series, vector_b=value),))
-    result = mekf.run(holed, NOISE, off(record))
+    result = estimation.run(holed, NOISE, off(record))
     assert result.skipped == {"a": 4}
     assert len(result.innovations["a"].time) == len(series.time) - 4
     short = replace(records.cut(record, 0, 100), vectors=record.vectors)
-    assert mekf.run(short, NOISE, off(record)).skipped["a"] == int(np.sum(series.time > 1.0))
+    assert estimation.run(short, NOISE, off(record)).skipped["a"] == int(np.sum(series.time > 1.0))
 
 
 def test_compressed_steps_feed_the_filter():
     record = simulate(scenario(motion.Coning(angle=0.01, frequency=5.0), sensors=SENSORS[:2], duration=8.0), 1)
     short = records.compress(record, coning.ALGORITHMS["two-sample"])
     assert len(short.increments) == 400
-    result = mekf.run(short, NOISE, off(record))
+    result = estimation.run(short, NOISE, off(record))
     assert np.array_equal(result.time, record.time[::2])
 
 
@@ -468,13 +474,13 @@ BAD = {
         r"bias_sigma\[1\]",
     ),
     "not positive definite": (
-        lambda: mekf.State(
+        lambda: estimation.State(
             attitude=np.array([1.0, 0, 0, 0]), bias=np.zeros(3), covariance=np.eye(6) - 0.3 * np.ones((6, 6))
         ),
         "positive definite",
     ),
     "not symmetric": (
-        lambda: mekf.State(
+        lambda: estimation.State(
             attitude=np.array([1.0, 0, 0, 0]), bias=np.zeros(3), covariance=np.eye(6) + np.diag([0.1] * 5, 1)
         ),
         "not symmetric",
@@ -517,7 +523,7 @@ def test_zero_measurement_noise_is_refused_by_the_filter():
     )
     record = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=(series,))
     with pytest.raises(InputError, match=r"star: sigma\[0\] is 0"):
-        mekf.run(record, NOISE, initial_state((1.0, 0, 0, 0), attitude_sigma=1.0, bias_sigma=1.0))
+        estimation.run(record, NOISE, initial_state((1.0, 0, 0, 0), attitude_sigma=1.0, bias_sigma=1.0))
 
 
 def test_triad_is_right_handed():

@@ -7,15 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from strapdown import mekf
-from strapdown.mekf import memory
+from strapdown import estimation
 from strapdown.estimation.memory import side_by_side
+from strapdown.estimation.schedule import schedule
+from strapdown.estimation.states import memory
 from strapdown.records import ImuRecord
 from strapdown.vectors import VectorMeasurements
 
 MEGABYTE = 1 << 20
-NOISE = mekf.ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-5)
-START = mekf.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.1, bias_sigma=0.01)
+NOISE = estimation.ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-5)
+START = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.1, bias_sigma=0.01)
 
 
 @pytest.fixture(autouse=True)
@@ -57,16 +58,16 @@ def test_memory_of_a_result_that_is_gone_is_used_again():
 
 def test_results_do_not_change_when_the_filter_runs_again():
     records = [record(seed) for seed in range(3)]
-    kept = [mekf.run(each, NOISE, START) for each in records]
+    kept = [estimation.run(each, NOISE, START) for each in records]
     copies = [estimate.attitude.copy() for estimate in kept]
     innovations = [estimate.innovations["up"].innovation.copy() for estimate in kept]
     del kept[1]
     for each in records:
-        mekf.run(each, NOISE, START)
+        estimation.run(each, NOISE, START)
     for estimate, copy, innovation in zip(kept, copies[::2], innovations[::2], strict=True):
         assert np.array_equal(estimate.attitude, copy)
         assert np.array_equal(estimate.innovations["up"].innovation, innovation)
-    again = mekf.run(records[1], NOISE, START)  # in memory that held other results
+    again = estimation.run(records[1], NOISE, START)  # in memory that held other results
     assert np.array_equal(again.attitude, copies[1])
 
 
@@ -118,7 +119,7 @@ def test_events_come_in_order_of_time_and_of_sensors(sensors, times):
         picked = np.arange(200) if times == "the same" else np.sort(generator.choice(200, 60 + i, replace=False))
         shift = 1e-4 * i if times == "apart" else 0.0
         vectors.append(replace(up.taken(picked), sensor=f"s{i}", time=up.time[picked] - shift))
-    events = mekf.schedule(tuple(vectors), whole.time[0], whole.time[-1])
+    events = schedule(tuple(vectors), whole.time[0], whole.time[-1])
     standing = np.concatenate([each.time for each in vectors]) if vectors else np.empty(0)
     order = np.argsort(standing, kind="stable")
     assert np.array_equal(events.row, order)

@@ -5,15 +5,17 @@ from dataclasses import replace
 import mpmath
 import numpy as np
 import pytest
+from strapdown.kernels.filter_loop import CHECKED
 
-from strapdown import augmented, mekf, motion, quaternion, records, smoother
+from strapdown import estimation, motion, quaternion, records
+from strapdown.estimation.gating import Gate, Robust
+from strapdown.estimation.schedule import schedule
+from strapdown.estimation.states import ProcessNoise, covariance_matrices, initial_state, pack
+from strapdown.estimation.step_filter import StepFilter
 from strapdown.gyro import GyroSpec
 from strapdown.kernels import filter_loop
-from strapdown.kernels.filter_loop import CHECKED
 from strapdown.kernels.robust_gate import CHALLENGED
-from strapdown.mekf import ProcessNoise, StepFilter, initial_state
 from strapdown.records import ImuRecord
-from strapdown.estimation.gating import Gate, Robust
 from strapdown.scenarios import Scenario, simulate
 from strapdown.vectors import VectorMeasurements, VectorSensor
 
@@ -53,7 +55,7 @@ def test_positive_definite_over_twelve_decades_of_noise_over_the_prior(exponent,
     start = initial_state(
         quaternion.multiply(truth[0], quaternion.exp([1e-9, 0, 0])), attitude_sigma=1.0, bias_sigma=0.1
     )
-    result = mekf.run(record, NOISE, start, full_covariance=True, gate=gate)
+    result = estimation.run(record, NOISE, start, full_covariance=True, gate=gate)
     assert least_eigenvalue(result.covariance) > 0.0
     assert np.all(np.isfinite(result.attitude))
     assert np.max(quaternion.angle_between(result.attitude, truth)) < 1e-6
@@ -70,7 +72,7 @@ def test_the_covariance_is_that_of_the_information_form(exponent, gate):
     )
     record = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=series)
     start = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1.0, bias_sigma=0.1)
-    P = mekf.run(record, NOISE, start, full_covariance=True, gate=gate).covariance[0, :3, :3]
+    P = estimation.run(record, NOISE, start, full_covariance=True, gate=gate).covariance[0, :3, :3]
     information = np.eye(3) + sum(np.eye(3) - np.outer(r, r) for r in references) / sigma**2
     expected = np.linalg.inv(information)
     d = np.sqrt(np.diag(expected))
@@ -154,10 +156,10 @@ def test_no_digit_is_lost_where_the_covariance_holds_none(options, sensors, sigm
     chosen = {"gate": {"gate": OPTIONS}, "huber": {"robust": Robust(kind="huber")}}.get(options, {})
     if options == "covariance":
         record = replace(record, vectors=tuple(by_covariance(s) for s in series))
-    estimate = mekf.run(record, process, start, full_covariance=True, **chosen)
+    estimate = estimation.run(record, process, start, full_covariance=True, **chosen)
     assert np.max(np.abs(estimate.variance / expected - 1.0)) < 1e-6
     assert least_eigenvalue(estimate.covariance) > 0.0
-    thinned = mekf.run(record, process, start, every=7, **chosen)
+    thinned = estimation.run(record, process, start, every=7, **chosen)
     assert np.max(np.abs(thinned.variance / expected[::7] - 1.0)) < 1e-6
 
 
@@ -177,7 +179,7 @@ def test_an_outage_that_makes_attitude_and_bias_one_leaves_the_covariance_defini
         record = ImuRecord(time=time[:end], increments=np.zeros((end - 1, 3)), vectors=mine)
         expected = reference_variances(record, process, [1.0] * 3 + [0.1] * 3)
         for gate in (None, OPTIONS):
-            estimate = mekf.run(record, process, start, full_covariance=True, gate=gate)
+            estimate = estimation.run(record, process, start, full_covariance=True, gate=gate)
             assert least_eigenvalue(estimate.covariance) > 0.0
             assert np.max(np.abs(estimate.variance / expected - 1.0)) < 1e-6
 
@@ -191,18 +193,18 @@ def test_a_gate_recovers_in_the_square_root_and_in_parts(gate):
     record, truth = sharp_record(1e-7, steps=60)
     off = quaternion.multiply(truth[0], quaternion.exp([0.4, -0.2, 0.1]))
     start = initial_state(off, attitude_sigma=1e-3, bias_sigma=0.01)
-    estimate = mekf.run(record, NOISE, start, gate=gate, full_covariance=True)
+    estimate = estimation.run(record, NOISE, start, gate=gate, full_covariance=True)
     assert [event.kind for event in estimate.events] == ["recovery"]
     assert quaternion.angle_between(estimate.attitude[-1], truth[-1]) < 1e-9
     assert least_eigenvalue(estimate.covariance) > 0.0
-    other = augmented.run(record, NOISE, start, gate=gate)
+    other = estimation.run(record, NOISE, start, gate=gate)
     assert np.array_equal(estimate.attitude, other.attitude)
     assert estimate.events == other.events
     challenged = []
     for cut in (3, 5, 8, 12, 40):
-        first, state = mekf.run_on(records.cut(record, 0, cut), NOISE, start, gate=gate)
+        first, state = estimation.run_part(records.cut(record, 0, cut), NOISE, start, gate=gate)
         challenged.append(state.gate.counts[CHALLENGED])
-        rest, end = mekf.run_on(records.cut(record, cut, 60), NOISE, state, gate=gate, full_covariance=True)
+        rest, end = estimation.run_part(records.cut(record, cut, 60), NOISE, state, gate=gate, full_covariance=True)
         assert np.max(quaternion.angle_between(rest.attitude, estimate.attitude[cut:])) < 1e-13
         assert np.allclose(rest.variance[1:], estimate.variance[cut + 1 :], rtol=1e-6, atol=0.0)
         assert [event.kind for event in (*first.events, *rest.events)] == ["recovery"]
@@ -215,7 +217,7 @@ def test_factors_are_carried_through_large_corrections():
     record, truth = sharp_record(1e-5, steps=6)
     off = quaternion.multiply(truth[0], quaternion.exp([0.3, -0.2, 0.1]))
     start = initial_state(off, attitude_sigma=0.5, bias_sigma=0.01)
-    estimate = mekf.run(record, NOISE, start)
+    estimate = estimation.run(record, NOISE, start)
     f = StepFilter(NOISE, start)
     for k, now in enumerate(record.time[1:]):
         f.predict(record.increments[k], now - record.time[k])
@@ -238,7 +240,7 @@ def test_a_stretch_in_factors_is_the_filter_itself():
     )
     whole = replace(record, vectors=(*record.vectors, sharp))
     start = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.1, bias_sigma=0.01)
-    without, estimate = mekf.run(record, NOISE, start), mekf.run(whole, NOISE, start, full_covariance=True)
+    without, estimate = estimation.run(record, NOISE, start), estimation.run(whole, NOISE, start, full_covariance=True)
     assert np.array_equal(estimate.attitude[: CHECKED + 1], without.attitude[: CHECKED + 1])
     assert np.allclose(estimate.attitude[:at_step], without.attitude[:at_step], rtol=0.0, atol=1e-14)
     assert np.allclose(estimate.variance[:at_step], without.variance[:at_step], rtol=1e-11, atol=0.0)
@@ -278,7 +280,7 @@ def test_positive_definite_and_steady_over_a_long_run(parts, steps):
     state = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-2, bias_sigma=1e-3)
     seen = []
     for _ in range(parts):
-        whole, state = mekf.run_on(record, NOISE, state, every=steps // 10, full_covariance=True)
+        whole, state = estimation.run_part(record, NOISE, state, every=steps // 10, full_covariance=True)
         seen.append(whole.covariance[1:])
         assert abs(np.linalg.norm(state.attitude) - 1.0) < 1e-14
     P = np.concatenate(seen)  # whole turns apart
@@ -291,7 +293,7 @@ def test_positive_definite_and_steady_over_a_long_run(parts, steps):
 
 def run_plain(record, start, dtype):
     """Run the kernel's source in plain Python, with every number of one type."""
-    events = mekf.schedule(record.vectors, record.time[0], record.time[-1])
+    events = schedule(record.vectors, record.time[0], record.time[-1])
     n = len(record.increments)
 
     def of(value):
@@ -313,7 +315,7 @@ def run_plain(record, start, dtype):
         events.codes,
         events.frames,
         of(events.triads),
-        of(mekf.pack(start.attitude, start.bias, start.covariance)),
+        of(pack(start.attitude, start.bias, start.covariance)),
         1,
         *outputs,
         np.empty((len(events.row), 6), dtype),
@@ -347,7 +349,7 @@ def test_single_precision_is_good_to_a_hundredth_of_a_sigma():
     q, b, variance, blocks = run_plain(record, start, np.float32)
     q64, b64, variance64, _ = run_plain(record, start, np.float64)
     assert q.dtype == np.float32
-    whole = mekf.run(record, NOISE, start)
+    whole = estimation.run(record, NOISE, start)
     assert np.abs(q64 - whole.attitude).max() < 1e-13  # the plain source and the compiled one
     sigma = np.sqrt(variance64)
     off = quaternion.angle_between(quaternion.normalize(q.astype(np.float64)), q64)
@@ -355,7 +357,7 @@ def test_single_precision_is_good_to_a_hundredth_of_a_sigma():
     assert np.max(off / np.linalg.norm(sigma[:, :3], axis=1)) < 0.01
     assert np.max(np.abs(b - b64) / sigma[:, 3:]) < 0.02
     assert np.max(np.abs(np.sqrt(variance) / sigma - 1.0)) < 2e-4
-    assert least_eigenvalue(mekf.covariance_matrices(blocks.astype(np.float64))) > 0.0
+    assert least_eigenvalue(covariance_matrices(blocks.astype(np.float64))) > 0.0
     sharp = replace(record, vectors=tuple(replace(s, sigma=np.full(len(s.time), 1e-6)) for s in record.vectors))
     _, _, broken, _ = run_plain(sharp, start, np.float32)
     _, _, right, _ = run_plain(sharp, start, np.float64)
@@ -368,12 +370,12 @@ def test_the_smoother_takes_what_has_no_digits_left_on_its_square_root():
     record, truth = sharp_record(1e-9, steps=30)
     process = ProcessNoise(angle_random_walk=1e-12, rate_random_walk=1e-14)
     start = initial_state(truth[0], attitude_sigma=1.0, bias_sigma=0.1)
-    smoothed = smoother.run(record, process, start, full_covariance=True)
-    whole = augmented.smooth(record, process, start, full_covariance=True)
+    smoothed = estimation.smooth(record, process, start, full_covariance=True)
+    whole = estimation.smooth(record, process, start, full_covariance=True)
     assert np.array_equal(smoothed.covariance, whole.covariance)
     assert np.array_equal(smoothed.attitude, whole.attitude)
     assert np.max(quaternion.angle_between(whole.attitude, truth)) < 1e-8
     assert np.all(whole.variance > 0.0)
     usual, truth = sharp_record(1e-6, steps=30)  # an arc second or better from a start as bad is smoothed as ever
-    smoothed = smoother.run(usual, NOISE, start)
+    smoothed = estimation.smooth(usual, NOISE, start)
     assert np.max(quaternion.angle_between(smoothed.attitude, truth)) < 1e-6

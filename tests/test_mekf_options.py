@@ -6,13 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from strapdown import consistency, mekf, montecarlo, motion, quaternion, recordfiles
+from strapdown import consistency, estimation, montecarlo, motion, quaternion, recordfiles
 from strapdown.checks import InputError
+from strapdown.estimation.gating import Gate, Robust
+from strapdown.estimation.schedule import schedule
+from strapdown.estimation.states import ProcessNoise, initial_state
+from strapdown.estimation.step_filter import StepFilter
 from strapdown.gyro import GyroSpec
-from strapdown.mekf import ProcessNoise, StepFilter, initial_state
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord
-from strapdown.estimation.gating import Gate, Robust
 from strapdown.scenarios import Scenario, simulate
 from strapdown.setup import FilterSetup
 from strapdown.vectors import Accelerometer, AttitudeSensor, Faults, VectorMeasurements, VectorSensor
@@ -160,7 +162,7 @@ def test_both_faces_are_one_filter(option, kind, schedule):
     record = simulate(scenario(SCHEDULES[schedule](sensors()[kind]), duration=3.0), 5)
     if whole is not None:
         record = anisotropic(record, whole)
-    result = mekf.run(record, NOISE, near(record), full_covariance=True, **given)
+    result = estimation.run(record, NOISE, near(record), full_covariance=True, **given)
     f, (attitude, bias, P), taken = stepped(record, near(record), **given)
     assert_same(result, attitude, bias, P)
     assert sum(f.refused.values()) == sum(result.refused.values()) == len(taken) - sum(taken)
@@ -191,7 +193,7 @@ def consistency_of(kind, schedule, option, runs, sigma_factor=1.0):
         attitude = quaternion.multiply(record.truth.attitude[0], quaternion.exp(-draw[:3]))
         start = initial_state(attitude, attitude_sigma=1e-2, bias_sigma=1e-3, bias=record.truth.bias[0] - draw[3:])
         believed = replace(record, vectors=tuple(s.noise_scaled(sigma_factor) for s in record.vectors))
-        result = mekf.run(believed, NOISE, start, every=50, full_covariance=True, **given)
+        result = estimation.run(believed, NOISE, start, every=50, full_covariance=True, **given)
         truth = record.truth
         e = consistency.errors(result.attitude, result.bias, truth.attitude[::50], truth.bias[::50])[1:]
         P = result.covariance[1:]
@@ -250,7 +252,7 @@ def test_both_faces_recover_alike(kind, whole):
         record = anisotropic(record, whole)
     lost = near(record, error=(1.5, -0.9, 2.0))
     options = {"gate": Gate(recovery=5), "robust": Robust()}
-    result = mekf.run(record, NOISE, lost, full_covariance=True, **options)
+    result = estimation.run(record, NOISE, lost, full_covariance=True, **options)
     f, (attitude, bias, P), _ = stepped(record, lost, **options)
     assert_same(result, attitude, bias, P, 1e-9)  # a diffuse prior leaves fewer digits
     assert [event.kind for event in result.events] == ["recovery"]
@@ -281,7 +283,7 @@ def test_both_faces_restart_and_tell_of_lock_outs_alike(case):
         c = record.vectors[-1]
         turned = replace(c, vector_b=quaternion.rotate(quaternion.exp([0.2, 0.2, -0.2]), c.vector_b))
         record = replace(record, vectors=(*record.vectors[:-1], turned))
-    result = mekf.run(record, NOISE, start, full_covariance=True, **options)
+    result = estimation.run(record, NOISE, start, full_covariance=True, **options)
     f, (attitude, bias, P), _ = stepped(record, start, **options)
     # Beside a turn of 104° a milliradian has fewer digits.
     assert_same(result, attitude, bias, P, 1e-7 if case == "one direction" else 1e-8)
@@ -326,7 +328,7 @@ def test_late_measurements_equal_the_filter_that_had_them_in_order(option):
     assert np.abs(bias_late[-1] - bias[-1]).max() < 1e-12
     assert np.abs((P_late[-1] - P[-1]) / np.outer(d, d)).max() < 1e-12
     assert not np.allclose(attitude_late[20], attitude[20], rtol=0.0, atol=1e-12)  # before they came, it did not know
-    estimate = mekf.run(record, NOISE, start, full_covariance=True, **given)
+    estimate = estimation.run(record, NOISE, start, full_covariance=True, **given)
     assert quaternion.angle_between(estimate.attitude[-1], attitude_late[-1]) < 1e-10
 
 
@@ -357,7 +359,7 @@ def test_a_gap_of_the_gyro_is_told_and_grows_the_covariance_as_the_closed_form_s
     edges = np.concatenate([dt * np.arange(51), 1.0 + T + dt * np.arange(50)])
     record = ImuRecord(time=edges, increments=np.zeros((100, 3)))
     start = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-3, bias_sigma=1e-4)
-    estimate = mekf.run(record, NOISE, start, full_covariance=True)
+    estimate = estimation.run(record, NOISE, start, full_covariance=True)
     (event,) = estimate.events
     assert (event.kind, event.start, event.end) == ("gap", 1.0, 1.0 + T)
     assert event.value == pytest.approx(T / dt)
@@ -371,7 +373,7 @@ def test_a_gap_of_the_gyro_is_told_and_grows_the_covariance_as_the_closed_form_s
 def test_an_outage_of_all_measurements_grows_the_covariance_and_ends_consistent():
     chosen = tuple(replace(s, faults=Faults(outages=((1.0, 3.0),))) for s in sensors()["direction"])
     record = simulate(scenario(chosen, duration=4.0), 5)
-    estimate = mekf.run(record, NOISE, near(record), gate=Gate(probability=0.9999))
+    estimate = estimation.run(record, NOISE, near(record), gate=Gate(probability=0.9999))
     assert not sum(estimate.refused.values())
     growth = estimate.variance[149, 3:] - estimate.variance[50, 3:]
     assert np.allclose(growth, NOISE.rate_random_walk**2 * (estimate.time[149] - estimate.time[50]), rtol=1e-9)
@@ -385,10 +387,11 @@ def test_a_constant_covariance_is_one_for_each_sample():
     each = replace(force, sigma=0.0, covariance=np.tile(C, (len(force.time), 1, 1)))
     assert np.allclose(once.sigma, np.sqrt(np.trace(C) / 3.0))
     results = [
-        mekf.run(replace(record, vectors=(s, other)), NOISE, near(record), full_covariance=True) for s in (once, each)
+        estimation.run(replace(record, vectors=(s, other)), NOISE, near(record), full_covariance=True)
+        for s in (once, each)
     ]
     assert np.array_equal(results[0].covariance, results[1].covariance)
-    turned = mekf.run(
+    turned = estimation.run(
         replace(record, vectors=(once.noise_scaled(2.0), other)), NOISE, near(record), full_covariance=True
     )
     assert np.trace(turned.covariance[-1]) > np.trace(results[0].covariance[-1])
@@ -397,8 +400,8 @@ def test_a_constant_covariance_is_one_for_each_sample():
 def test_a_covariance_proportional_to_one_is_a_sigma():
     record = simulate(scenario(SCHEDULES["asynchronous"](sensors(Faults())["vector"]), duration=1.0), 5)
     told = tuple(replace(s, sigma=0.0, covariance=s.sigma[0] ** 2 * np.eye(3)) for s in record.vectors)
-    one = mekf.run(record, NOISE, near(record), full_covariance=True)
-    other = mekf.run(replace(record, vectors=told), NOISE, near(record), full_covariance=True)
+    one = estimation.run(record, NOISE, near(record), full_covariance=True)
+    other = estimation.run(replace(record, vectors=told), NOISE, near(record), full_covariance=True)
     assert_same(one, other.attitude[1:], other.bias[1:], other.covariance[1:], 1e-12)
 
 
@@ -411,7 +414,7 @@ def test_correlated_noise_is_decorrelated_exactly():
     )
     record = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=(series,))
     start = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.1, bias_sigma=1e-3)
-    result = mekf.run(record, NOISE, start, full_covariance=True)
+    result = estimation.run(record, NOISE, start, full_covariance=True)
     H = np.array([[0.0, -r[2], 0.0], [r[2], 0.0, 0.0], [0.0, 0.0, 0.0]])  # z = r + [r] δθ
     P = np.linalg.inv(H.T @ np.linalg.solve(C, H) + np.eye(3) / 0.01)
     x = P @ H.T @ np.linalg.solve(C, np.array([0.05, -0.08, 0.1]))
@@ -451,9 +454,9 @@ def test_noise_that_is_no_noise_is_refused_by_the_filter():
         series = VectorMeasurements(**base, **noise)
         record = ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=(series,))
         with pytest.raises(InputError, match=words):
-            mekf.run(record, NOISE, start)
+            estimation.run(record, NOISE, start)
         with pytest.raises(InputError, match="one sigma a sample"):
-            mekf.schedule(record.vectors, 0.0, 1.0)
+            schedule(record.vectors, 0.0, 1.0)
 
 
 @pytest.mark.parametrize("whole", [False, True], ids=["per axis", "covariance"])

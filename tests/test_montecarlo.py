@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from strapdown import coning, mekf, montecarlo, motion, quaternion
+from strapdown import coning, estimation, montecarlo, motion, quaternion
 from strapdown.checks import InputError
 from strapdown.coning_study import ConingParameters
-from strapdown.mekf import ProcessNoise
+from strapdown.estimation.states import ProcessNoise
 from strapdown.montecarlo import FilterSetup
 
 PARAMETERS = ConingParameters(duration=60.0)
@@ -134,7 +134,7 @@ def test_a_run_does_not_depend_on_the_others():
 
 
 def test_statistics_are_plain_sums():
-    """Against the runs taken one by one through mekf.run."""
+    """Against the runs taken one by one through estimation.run."""
     from strapdown import consistency
     from strapdown.records import compress
     from strapdown.scenarios import simulate
@@ -145,7 +145,9 @@ def test_statistics_are_plain_sums():
         record = simulate(SCENARIO, 9, run)
         short = compress(record, coning.ALGORITHMS["matched-4-11"])
         every = len(short.increments) // 100
-        result = mekf.run(short, NOISE, montecarlo.start(record, setup(), 9, run), every=every, full_covariance=True)
+        result = estimation.run(
+            short, NOISE, montecarlo.start(record, setup(), 9, run), every=every, full_covariance=True
+        )
         truth = short.truth
         e = consistency.errors(result.attitude, result.bias, truth.attitude[::every], truth.bias[::every])
         nees = nees + consistency.nees(e, result.covariance)

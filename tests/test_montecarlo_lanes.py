@@ -9,8 +9,8 @@ from scipy import stats
 
 from strapdown import coning, motion, setup, vectors
 from strapdown.consistency import errors, nees
+from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
-from strapdown.mekf import ProcessNoise
 from strapdown.montecarlo import lanes, scalar
 from strapdown.montecarlo.plan import Dispersions, Plan
 from strapdown.montecarlo.statistics import Statistics
@@ -81,7 +81,7 @@ def test_one_lane_is_eight_bit_for_bit_in_the_replay():
 
 
 def test_the_scalar_filter_makes_the_same_of_the_replayed_record():
-    """What the lanes' filter did is what mekf.run does with the same measurements: truth from another loop."""
+    """What the lanes' filter did is what estimation.run does with the same measurements: truth from another loop."""
     replay = lanes.replay(PLAN, 11)
     estimate = setup.run(replay.record, SETUP, replay.initial, full_covariance=True)
     np.testing.assert_allclose(estimate.attitude, replay.estimate.attitude, atol=2e-15)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from strapdown import consistency, mekf, montecarlo, quaternion, scenarios
+from strapdown import consistency, estimation, montecarlo, quaternion, scenarios
 from strapdown import setup as setups
 from strapdown.checks import InputError
 from strapdown.montecarlo import campaign, engine, plan, scalar, statistics
@@ -97,7 +97,7 @@ def test_every_sum_is_what_its_definition_says():
     for run in range(first, first + runs):
         record = scenarios.simulate(SCENARIO, PLAN.seed, run)
         initial = montecarlo.start(record, SETUP, PLAN.seed, run)
-        estimate = mekf.run(record, SETUP.process_noise, initial, full_covariance=True)
+        estimate = estimation.run(record, SETUP.process_noise, initial, full_covariance=True)
         peak = 0.0
         for k in range(m):
             step = k * 240 // PLAN.epochs

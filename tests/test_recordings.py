@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from strapdown import mekf, recordfiles, recordings
+from strapdown import estimation, recordfiles, recordings
 from strapdown.checks import InputError
 from strapdown.cli import app
 from strapdown.recordings import Recording, read
@@ -208,10 +208,10 @@ def test_rows_without_a_gyro_sample_are_left_out_and_told(csv, bad):
     np.testing.assert_allclose(recordings.increments(recording)[1, 0], 0.5 * (0.2 + 0.5) * 0.03, rtol=1e-14)
     assert recording.left_out_words.startswith("3 rows without a gyro sample, the first at 0.000 s, were left out")
     assert read(csv()).left_out_words == ""
-    growth = mekf.run(
+    growth = estimation.run(
         ImuRecord(time=recording.time, increments=recordings.increments(recording)),
-        mekf.ProcessNoise(angle_random_walk=1e-3, rate_random_walk=0.0),
-        mekf.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-6, bias_sigma=1e-9),
+        estimation.ProcessNoise(angle_random_walk=1e-3, rate_random_walk=0.0),
+        estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-6, bias_sigma=1e-9),
     ).variance[:, 0]
     np.testing.assert_allclose(np.diff(growth), 1e-6 * np.diff(recording.time), rtol=1e-6)
 

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from strapdown import augmented, cli, consistency, recordfiles, records, scenarios, setup
+from strapdown import cli, consistency, recordfiles, records, scenarios, setup
 from strapdown.checks import InputError, count
 from strapdown.cli.terminal import scenario_named
+from strapdown.setup.states import States
 
 
 @pytest.fixture(scope="module")
@@ -174,8 +175,8 @@ def test_no_cause_is_named_of_a_filter_that_the_search_does_not_know(folder, sho
     shutil.copy(folder / "run" / "estimate.h5", tmp_path / "estimate.h5")
     with h5py.File(tmp_path / "estimate.h5", "r+") as file:
         chosen = setup.from_toml(file.attrs["filter"])
-        states = augmented.States(gyro_scale_sigma=1e-3)
-        file.attrs["filter"] = setup.to_toml(dataclasses.replace(chosen, states=states))
+        chosen_states = States(gyro_scale_sigma=1e-3)
+        file.attrs["filter"] = setup.to_toml(dataclasses.replace(chosen, states=chosen_states))
     options = ["--record", str(tmp_path / "record.h5"), "--json", str(tmp_path / "check.json")]
     result = CliRunner().invoke(cli.app, ["check", str(tmp_path / "estimate.h5"), *options])
     assert result.exit_code in (0, 2), result.output

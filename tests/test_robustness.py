@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chi2
 
-from strapdown import consistency, mekf, motion, quaternion, records, robustness, smoother
+from strapdown import consistency, estimation, motion, quaternion, records
 from strapdown.checks import InputError
+from strapdown.estimation.gating import Gate, Monitor, Robust
+from strapdown.estimation.states import ProcessNoise, initial_state
 from strapdown.gyro import GyroSpec
 from strapdown.kernels import robust_gate, robust_loop
 from strapdown.kernels.robust_step import ACCEPTED, PASSED_OVER, REFUSED
-from strapdown.mekf import ProcessNoise, initial_state
 from strapdown.randomness import generator
-from strapdown.estimation.gating import Gate, Monitor, Robust
 from strapdown.scenarios import Scenario, simulate
 from strapdown.vectors import AttitudeSensor, Faults, VectorSensor
 
@@ -79,7 +79,7 @@ def test_false_alarms_are_as_often_as_asked_for(kind):
         "attitude": (AttitudeSensor(name="a", sigma_across=1e-3, sigma_about=5e-3, rate=25.0),),
     }[kind]
     record = simulate(scenario(duration=160.0, sensors=chosen), 2)
-    estimate = mekf.run(record, NOISE, started(record, 0), gate=Gate(probability=probability))
+    estimate = estimation.run(record, NOISE, started(record, 0), gate=Gate(probability=probability))
     used = estimate.innovations["a"].used
     low, high = binom.ppf([0.005, 0.995], len(used), 1.0 - probability)
     assert low <= estimate.refused["a"] <= high
@@ -93,8 +93,8 @@ def test_false_alarms_are_as_often_as_asked_for(kind):
 def test_isolated_outliers_are_refused_and_start_no_recovery():
     faults = Faults(outlier_probability=0.2, outlier_scale=30.0)
     record = simulate(scenario(faults, duration=60.0), 2)
-    gated = mekf.run(record, NOISE, started(record, 0), gate=Gate(), full_covariance=True)
-    plain = mekf.run(record, NOISE, started(record, 0))
+    gated = estimation.run(record, NOISE, started(record, 0), gate=Gate(), full_covariance=True)
+    plain = estimation.run(record, NOISE, started(record, 0))
     assert not gated.events
     share = sum(gated.refused.values()) / sum(len(i.time) for i in gated.innovations.values())
     assert 0.15 < share < 0.25
@@ -111,8 +111,8 @@ def test_a_refused_measurement_leaves_the_state_as_if_it_had_not_been():
     missing[7] = np.nan
     start = started(record, 0)
     gate = Gate(probability=1.0 - 1e-9)
-    one = mekf.run(replace(record, vectors=(replace(a, vector_b=wrong), b)), NOISE, start, gate=gate)
-    other = mekf.run(replace(record, vectors=(replace(a, vector_b=missing), b)), NOISE, start, gate=gate)
+    one = estimation.run(replace(record, vectors=(replace(a, vector_b=wrong), b)), NOISE, start, gate=gate)
+    other = estimation.run(replace(record, vectors=(replace(a, vector_b=missing), b)), NOISE, start, gate=gate)
     assert np.array_equal(one.attitude, other.attitude)
     assert np.array_equal(one.variance, other.variance)
     assert one.refused == {"a": 1, "b": 0}
@@ -122,8 +122,8 @@ def test_a_refused_measurement_leaves_the_state_as_if_it_had_not_been():
 def test_a_gate_that_refuses_nothing_is_the_plain_filter():
     record = simulate(scenario(), 1)
     start = started(record, 0)
-    plain = mekf.run(record, NOISE, start, full_covariance=True)
-    gated = mekf.run(record, NOISE, start, full_covariance=True, gate=Gate(probability=1.0 - 1e-14))
+    plain = estimation.run(record, NOISE, start, full_covariance=True)
+    gated = estimation.run(record, NOISE, start, full_covariance=True, gate=Gate(probability=1.0 - 1e-14))
     assert np.allclose(plain.attitude, gated.attitude, rtol=0.0, atol=1e-13)
     assert np.allclose(plain.covariance, gated.covariance, rtol=1e-9, atol=1e-20)
 
@@ -140,7 +140,9 @@ def lost_runs(runs, recovery=10, every=50):
         start = started(record, run, bias_sigma=1e-3)
         lost = replace(start, attitude=quaternion.multiply(record.truth.attitude[0], anywhere))
         made.append(record)
-        estimates.append(mekf.run(record, NOISE, lost, gate=Gate(recovery=recovery), every=every, full_covariance=True))
+        estimates.append(
+            estimation.run(record, NOISE, lost, gate=Gate(recovery=recovery), every=every, full_covariance=True)
+        )
     return estimates, made
 
 
@@ -166,7 +168,7 @@ def test_without_recovery_it_stays_lost():
     record = simulate(scenario(), 3)
     start = started(record, 0)
     lost = replace(start, attitude=quaternion.multiply(record.truth.attitude[0], quaternion.exp([0.0, 1.57, 0.0])))
-    estimate = mekf.run(record, NOISE, lost, gate=Gate(recovery=None))
+    estimate = estimation.run(record, NOISE, lost, gate=Gate(recovery=None))
     assert [(event.kind, event.sensor) for event in estimate.events] == [("lock-out", "a"), ("lock-out", "b")]
     assert quaternion.angle_between(estimate.attitude[-1], record.truth.attitude[-1]) > 1.0
     assert estimate.refused["a"] > 70
@@ -191,7 +193,7 @@ def test_a_bias_step_is_recovered_from(runs):
         made.append(record)
         # A start to 2σ of a measurement: one whose first measurement is not linear in its error may itself have to recover.
         start = started(record, run, attitude_sigma=2e-3)
-        estimates.append(mekf.run(record, NOISE, start, gate=gate, every=50, full_covariance=True))
+        estimates.append(estimation.run(record, NOISE, start, gate=gate, every=50, full_covariance=True))
     for estimate in estimates:
         events = [event for event in estimate.events if event.kind == "recovery"]
         assert len(events) == 1
@@ -200,7 +202,7 @@ def test_a_bias_step_is_recovered_from(runs):
     low, high = consistency.mean_bounds(3, runs, 0.999)  # of each of three epochs
     attitude = anees(estimates, made, [12, 14, 16], 50)[:, 0]
     assert np.all((low < attitude) & (attitude < high)), attitude
-    blind = mekf.run(made[0], NOISE, started(made[0], 0), gate=Gate(recovery=None))
+    blind = estimation.run(made[0], NOISE, started(made[0], 0), gate=Gate(recovery=None))
     assert quaternion.angle_between(blind.attitude[-1], made[0].truth.attitude[-1]) > 0.05
 
 
@@ -213,7 +215,7 @@ def stepped_runs(runs, step, bias_sigma, duration=24.0, at=300, fixed=None):
         record = stepped_bias(simulate(scenario(duration=duration), 4, run), jump, at)
         start = started(record, run, attitude_sigma=2e-3, bias_sigma=bias_sigma)
         made.append(record)
-        estimates.append(mekf.run(record, NOISE, start, gate=Gate(), every=5, full_covariance=True))
+        estimates.append(estimation.run(record, NOISE, start, gate=Gate(), every=5, full_covariance=True))
     return estimates, made
 
 
@@ -273,7 +275,7 @@ def test_the_restart_is_as_wide_as_the_start_unless_told():
     record = simulate(scenario(duration=1.0), 3)
     start = started(record, 0, bias_sigma=0.02)
     lost = replace(start, attitude=quaternion.multiply(start.attitude, quaternion.exp([0.0, 1.57, 0.0])))
-    _, end = mekf.run_on(records.cut(record, 0, 20), NOISE, lost, gate=Gate())
+    _, end = estimation.run_part(records.cut(record, 0, 20), NOISE, lost, gate=Gate())
     assert end.gate.counts[robust_gate.CHALLENGED] == 1.0
     first = end.gate.counts[robust_gate.FIRST_BIAS + 3 : robust_gate.FIRST_BIAS + 6]
     assert np.all(first > 1.9 * 0.02**2)  # what the filter had left, and the restart's
@@ -283,20 +285,22 @@ def test_the_restart_is_as_wide_as_the_start_unless_told():
 def test_a_filter_that_believes_far_too_little_noise_says_that_it_is_locked_out(factor):
     record = simulate(scenario(duration=60.0), 5)
     believed = replace(record, vectors=tuple(s.noise_scaled(1.0 / factor) for s in record.vectors))
-    estimate = mekf.run(believed, NOISE, started(record, 0), gate=Gate())
+    estimate = estimation.run(believed, NOISE, started(record, 0), gate=Gate())
     told = [event for event in estimate.events if event.kind == "lock-out"]
     assert {event.sensor for event in told} == {"a", "b"}
     assert sum(estimate.refused.values()) > 1000
     assert sum(event.value for event in told) > 0.9 * sum(estimate.refused.values())
     assert f"measurements of {told[0].sensor} were refused" in str(told[0])
     if not recoveries(estimate):
-        assert smoother.run(believed, NOISE, started(record, 0), gate=Gate()).events == estimate.events
+        assert estimation.smooth(believed, NOISE, started(record, 0), gate=Gate()).events == estimate.events
 
 
 def test_outliers_alone_lead_to_no_event():
     for run in range(8):
         record = simulate(scenario(Faults(outlier_probability=0.1, outlier_scale=10.0), duration=60.0), 12, run)
-        estimate = mekf.run(record, NOISE, started(record, run, attitude_sigma=1e-3, bias_sigma=1e-4), gate=Gate())
+        estimate = estimation.run(
+            record, NOISE, started(record, run, attitude_sigma=1e-3, bias_sigma=1e-4), gate=Gate()
+        )
         assert not estimate.events
         assert 50 < sum(estimate.refused.values()) < 200
 
@@ -313,10 +317,12 @@ def test_a_record_in_parts_recovers_as_the_whole_does(case):
     else:
         noise = 0.03
     record = replace(record, vectors=tuple(s.noise_scaled(noise) for s in record.vectors))
-    whole, _ = mekf.run_on(record, NOISE, start, gate=Gate(), full_covariance=True)
+    whole, _ = estimation.run_part(record, NOISE, start, gate=Gate(), full_covariance=True)
     state, parts, told = start, [], []
     for first, last in ((0, 23), (23, 250), (250, 337), (337, 600)):
-        part, state = mekf.run_on(records.cut(record, first, last), NOISE, state, gate=Gate(), full_covariance=True)
+        part, state = estimation.run_part(
+            records.cut(record, first, last), NOISE, state, gate=Gate(), full_covariance=True
+        )
         parts.append(part)
         told += [event for event in part.events if event.kind == "recovery" or last == 600]
     for name in ("attitude", "bias", "covariance"):
@@ -333,10 +339,10 @@ def test_a_record_in_single_intervals_recovers_as_the_whole_does():
     start = replace(start, attitude=quaternion.multiply(start.attitude, quaternion.exp([0.0, 1.57, 0.0])))
     in_turn = tuple(s.taken(np.arange(len(s.time)) % 2 == k) for k, s in enumerate(record.vectors))
     record = replace(record, vectors=in_turn)
-    whole, end = mekf.run_on(record, NOISE, start, gate=Gate())
+    whole, end = estimation.run_part(record, NOISE, start, gate=Gate())
     state, told = start, []
     for k in range(len(record.increments)):
-        part, state = mekf.run_on(records.cut(record, k, k + 1), NOISE, state, gate=Gate())
+        part, state = estimation.run_part(records.cut(record, k, k + 1), NOISE, state, gate=Gate())
         told += [event for event in part.events if event.kind == "recovery"]
         assert np.array_equal(part.attitude[1], whole.attitude[k + 1])
     assert told == recoveries(whole) != []
@@ -405,7 +411,7 @@ def test_the_rules_of_a_gate():
     assert np.array_equal(memory[robust_gate.FIRST_VARIANCE :], [9.0, 9.0, 9.0])
     assert (memory[robust_gate.LEVEL], memory[robust_gate.NIS], memory[robust_gate.DEGREES]) == (1.0, 0.0, 0.0)
     assert robust_gate.restart_attitude(0.1, memory) == pytest.approx(0.3)
-    assert robust_gate.restart_attitude(1.0, memory) == robustness.UNIFORM_SIGMA
+    assert robust_gate.restart_attitude(1.0, memory) == estimation.UNIFORM_SIGMA
 
 
 def test_a_widened_challenger_is_one_that_started_wider():
@@ -493,14 +499,14 @@ def test_a_recovery_on_one_direction_knows_what_it_does_not_know(runs):
         record = simulate(one, 31, run)
         anywhere = quaternion.normalize(generator(3, run, "lost").standard_normal(4))
         lost = replace(started(record, run), attitude=quaternion.multiply(record.truth.attitude[0], anywhere))
-        estimate = mekf.run(record, NOISE, lost, gate=Gate(), every=50, full_covariance=True)
+        estimate = estimation.run(record, NOISE, lost, gate=Gate(), every=50, full_covariance=True)
         assert len(recoveries(estimate)) == 1
         error, n = turn_and_tilt(estimate, record, STARS[0], 50)
         nees.append(consistency.nees(error, estimate.covariance)[[2, 4, 8, 16]] / 6.0)
         turns.append(np.sqrt(np.einsum("ki,kij,kj->k", n, estimate.covariance[:, :3, :3], n))[2:])
     low, high = consistency.mean_bounds(6, runs, 0.999)
     assert np.all((low < np.mean(nees, axis=0)) & (np.mean(nees, axis=0) < high)), np.mean(nees, axis=0)
-    assert np.allclose(turns, robustness.UNIFORM_SIGMA, rtol=0.02)
+    assert np.allclose(turns, estimation.UNIFORM_SIGMA, rtol=0.02)
 
 
 @pytest.mark.parametrize("bias_sigma", [1e-3, 2e-2])
@@ -520,7 +526,7 @@ def test_after_a_recovery_on_one_direction_a_second_one_tells_the_turn(runs, bia
         start = started(record, run, bias_sigma=bias_sigma)
         lost = replace(start, attitude=quaternion.multiply(record.truth.attitude[0], anywhere))
         made.append(record)
-        estimates.append(mekf.run(record, NOISE, lost, gate=Gate(), every=25, full_covariance=True))
+        estimates.append(estimation.run(record, NOISE, lost, gate=Gate(), every=25, full_covariance=True))
         assert len(recoveries(estimates[-1])) == 1
     nees = anees(estimates, made, [13, 14, 20], 25)[:, 1]
     low, high = consistency.mean_bounds(6, runs, 0.999)
@@ -534,7 +540,7 @@ def test_a_sensor_that_contradicts_two_others_is_refused_and_not_followed():
     a, b, c = record.vectors
     turned = quaternion.rotate(quaternion.exp([0.2, 0.2, -0.2]), c.vector_b)
     record = replace(record, vectors=(a, b, replace(c, vector_b=turned)))
-    estimate = mekf.run(record, NOISE, started(record, 0, attitude_sigma=1e-3), gate=Gate())
+    estimate = estimation.run(record, NOISE, started(record, 0, attitude_sigma=1e-3), gate=Gate())
     (event,) = estimate.events
     assert (event.kind, event.sensor, event.value) == ("lock-out", "c", len(c.time))
     assert (event.start, event.end) == (c.time[0], c.time[-1])
@@ -546,7 +552,7 @@ def test_a_sensor_that_contradicts_two_others_is_refused_and_not_followed():
 def test_a_recovery_is_told_in_the_file(tmp_path):
     record = simulate(scenario(duration=3.0), 3)
     lost = replace(started(record, 0), attitude=quaternion.multiply(record.truth.attitude[0], [0.0, 0.6, 0.8, 0.0]))
-    estimate = mekf.run(record, NOISE, lost, gate=Gate(), robust=Robust(), monitor=Monitor(window=20))
+    estimate = estimation.run(record, NOISE, lost, gate=Gate(), robust=Robust(), monitor=Monitor(window=20))
     records.write_estimate(tmp_path / "e.h5", estimate)
     back = records.read_estimate(tmp_path / "e.h5")
     assert back.events == estimate.events
@@ -574,7 +580,7 @@ def contaminated(runs, faults, duration=16.0):
         record = simulate(scenario(faults, duration=duration), 9, run)
         start = started(record, run)
         for name, given in TREATMENTS.items():
-            estimate = mekf.run(record, NOISE, start, every=50, full_covariance=True, **given)
+            estimate = estimation.run(record, NOISE, start, every=50, full_covariance=True, **given)
             e = errors(estimate, record, 50)[8:, :3]
             squares[name] += np.mean(e**2) / runs
             consistent[name] += np.mean(consistency.nees(e, estimate.covariance[8:, :3, :3])) / 3.0 / runs
@@ -658,17 +664,17 @@ def test_hubers_update_is_the_minimum_of_hubers_cost():
 def test_the_smoother_leaves_out_what_the_filter_refused():
     record = simulate(scenario(Faults(outlier_probability=0.1, outlier_scale=30.0)), 2)
     start = started(record, 0)
-    gated = mekf.run(record, NOISE, start, gate=Gate())
+    gated = estimation.run(record, NOISE, start, gate=Gate())
     cleaned = tuple(
         replace(s, vector_b=np.where(gated.innovations[s.sensor].used[:, None], s.vector_b, np.nan))
         for s in record.vectors
     )
-    one = smoother.run(record, NOISE, start, gate=Gate(), full_covariance=True)
-    other = smoother.run(replace(record, vectors=cleaned), NOISE, start, full_covariance=True)
+    one = estimation.smooth(record, NOISE, start, gate=Gate(), full_covariance=True)
+    other = estimation.smooth(replace(record, vectors=cleaned), NOISE, start, full_covariance=True)
     assert gated.refused["a"] > 3
     assert np.allclose(one.attitude, other.attitude, rtol=0.0, atol=1e-12)
     assert np.allclose(one.covariance, other.covariance, rtol=1e-7, atol=1e-16)
-    lagged = smoother.run_fixed_lag(record, NOISE, start, lag=record.time[-1], gate=Gate(), full_covariance=True)
+    lagged = estimation.smooth(record, NOISE, start, lag=record.time[-1], gate=Gate(), full_covariance=True)
     assert np.array_equal(lagged.attitude, one.attitude)
 
 
@@ -677,9 +683,9 @@ def test_robust_smoothing_is_better_and_consistent():
     for run in range(20):
         record = simulate(scenario(Faults(outlier_probability=0.1, outlier_scale=10.0)), 9, run)
         start = started(record, run)
-        robust = smoother.run(record, NOISE, start, robust=Robust(), full_covariance=True)
-        filtered = mekf.run(record, NOISE, start, robust=Robust())
-        plain = smoother.run(record, NOISE, start)
+        robust = estimation.smooth(record, NOISE, start, robust=Robust(), full_covariance=True)
+        filtered = estimation.run(record, NOISE, start, robust=Robust())
+        plain = estimation.smooth(record, NOISE, start)
         squares += [np.mean(errors(e, record)[100:300, :3] ** 2) / 20.0 for e in (robust, filtered, plain)]
         e, P = errors(robust, record)[100:300:20, :3], robust.covariance[100:300:20, :3, :3]
         nees += np.mean(consistency.nees(e, P)) / 3.0 / 20.0
@@ -691,7 +697,7 @@ def test_robust_smoothing_is_better_and_consistent():
 def test_the_smoother_does_not_smooth_across_a_recovery():
     record = simulate(scenario(duration=3.0), 3)
     lost = replace(started(record, 0), attitude=quaternion.multiply(record.truth.attitude[0], [0.0, 0.6, 0.8, 0.0]))
-    filtered, smoothed = (run(record, NOISE, lost, gate=Gate()) for run in (mekf.run, smoother.run))
+    filtered, smoothed = (run(record, NOISE, lost, gate=Gate()) for run in (estimation.run, estimation.smooth))
     (event,) = filtered.events
     assert smoothed.events == (event,)
     first = int(np.searchsorted(record.time, event.start))
@@ -704,7 +710,7 @@ def test_the_smoother_does_not_smooth_across_a_recovery():
 
 def test_the_monitor_is_silent_on_a_right_filter_and_keeps_its_false_alarm_rate():
     record = simulate(scenario(duration=160.0, rate=25.0), 5)
-    estimate = mekf.run(record, NOISE, started(record, 0), monitor=Monitor())
+    estimate = estimation.run(record, NOISE, started(record, 0), monitor=Monitor())
     assert not estimate.events
     draw = generator(1, 0, "nis").chisquare(2, 400_000)
     monitor = Monitor(window=50, probability=0.95)
@@ -719,7 +725,7 @@ def test_the_monitor_is_silent_on_a_right_filter_and_keeps_its_false_alarm_rate(
 def test_a_filter_that_believes_the_wrong_noise_is_reported(factor):
     record = simulate(scenario(duration=30.0), 5)
     believed = replace(record, vectors=tuple(s.noise_scaled(1.0 / factor) for s in record.vectors))
-    estimate = mekf.run(believed, NOISE, started(record, 0), monitor=Monitor())
+    estimate = estimation.run(believed, NOISE, started(record, 0), monitor=Monitor())
     assert [event.kind for event in estimate.events] == ["divergence"]
     (event,) = estimate.events
     assert event.start < 8.0
@@ -735,7 +741,7 @@ def test_the_times_of_a_passing_divergence_are_reported():
     value = np.where(ill[:, None], a.vector_b + draw, a.vector_b)
     value /= np.linalg.norm(value, axis=1, keepdims=True)
     record = replace(record, vectors=(replace(a, vector_b=value), b))
-    estimate = mekf.run(record, NOISE, started(record, 0), monitor=Monitor(window=50))
+    estimate = estimation.run(record, NOISE, started(record, 0), monitor=Monitor(window=50))
     first, last = estimate.events[0], estimate.events[-1]
     assert 20.0 < first.start < 22.0
     assert 30.0 < last.end < 40.0
@@ -762,4 +768,4 @@ def test_bad_input_is_named(case):
 
 def test_a_uniform_angle_has_the_standard_deviation_of_a_fresh_start():
     draw = generator(1, 0, "uniform").uniform(-np.pi, np.pi, 100_000)
-    assert np.std(draw) == pytest.approx(robustness.UNIFORM_SIGMA, rel=5e-3)
+    assert np.std(draw) == pytest.approx(estimation.UNIFORM_SIGMA, rel=5e-3)

@@ -7,15 +7,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from strapdown import augmented, coning, consistency, mekf, quaternion, records, scenarios, setup, smoother, units
+from strapdown import coning, consistency, estimation, quaternion, records, scenarios, setup, units
 from strapdown.checks import InputError
+from strapdown.estimation.gating import Gate, Robust
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
-from strapdown.estimation.gating import Gate, Robust
-from strapdown.setup import FilterSetup
+from strapdown.setup import FilterSetup, states
 
 SETUP = FilterSetup(
-    process_noise=mekf.ProcessNoise(angle_random_walk=1.234567e-5, rate_random_walk=3.3e-8),
+    process_noise=estimation.ProcessNoise(angle_random_walk=1.234567e-5, rate_random_walk=3.3e-8),
     attitude_sigma=0.0123,
     bias_sigma=4.5e-6,
     integration=coning.ALGORITHMS["four-sample"],
@@ -111,7 +111,7 @@ def test_a_file_without_the_table_says_what_writes_one(tmp_path):
 def test_matched_takes_the_gyro_at_its_word():
     spec = GyroSpec(angle_random_walk=2e-5, rate_random_walk=1e-8, turn_on_bias_sigma=3e-5)
     chosen = setup.matched(scenario(gyro=spec))
-    assert chosen.process_noise == mekf.ProcessNoise(angle_random_walk=2e-5, rate_random_walk=1e-8)
+    assert chosen.process_noise == estimation.ProcessNoise(angle_random_walk=2e-5, rate_random_walk=1e-8)
     assert chosen.bias_sigma == pytest.approx(3e-5)
 
 
@@ -251,10 +251,10 @@ def test_smoothing_by_a_setup_is_that_of_the_smoother(states):
     told = setup.believed(record, believes)
     if states:
         blocks = believes.states.blocks({series.sensor: series.kind for series in told.vectors})
-        same = augmented.smooth(told, believes.process_noise, start, blocks, full_covariance=True)
+        same = estimation.smooth(told, believes.process_noise, start, blocks, full_covariance=True)
         assert list(found.blocks) == [block.name for block in blocks]
     else:
-        same = smoother.run(told, believes.process_noise, start, full_covariance=True)
+        same = estimation.smooth(told, believes.process_noise, start, full_covariance=True)
     np.testing.assert_array_equal(found.attitude, same.attitude)
     np.testing.assert_array_equal(found.covariance, same.covariance)
     plain = setup.run(record, believes, start)
@@ -266,7 +266,7 @@ def test_what_cannot_be_smoothed_is_refused(monkeypatch):
     record = scenarios.simulate(chosen, 3)
     believes = setup.matched(chosen)
     start = setup.initial_state(believes, record.truth.attitude[0])
-    drifting = augmented.States(gyro_drift_sigma=(1e-5,), gyro_drift_time=(10.0,))
+    drifting = states.States(gyro_drift_sigma=(1e-5,), gyro_drift_time=(10.0,))
     with pytest.raises(InputError, match="does not tell a gyro drift"):
         setup.smooth(record, dataclasses.replace(believes, states=drifting), start)
     monkeypatch.setattr(setup, "MOST_MEMORY", 1e5)

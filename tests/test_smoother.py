@@ -11,16 +11,18 @@ import filterpy.kalman
 import mpmath
 import numpy as np
 import pytest
+from in_steps import transition_and_noise
 from scipy.optimize import least_squares
 
-from strapdown import augmented, coning, consistency, kinematics, mekf, motion, quaternion, records, smoother
+from strapdown import coning, consistency, estimation, kinematics, motion, quaternion, records
 from strapdown.checks import InputError
+from strapdown.estimation import forward, recovery_segments, smoothing
+from strapdown.estimation.gating import Gate
+from strapdown.estimation.states import ProcessNoise, covariance_matrices
 from strapdown.kernels import smoother_lag, smoother_loop, smoother_step
 from strapdown.kernels.machine import compiled
 from strapdown.kernels.series import LARGEST_ANGLE
-from strapdown.mekf import ProcessNoise
 from strapdown.records import Estimate, ImuRecord, Truth
-from strapdown.estimation.gating import Gate
 from strapdown.vectors import VectorMeasurements, triad
 
 DOWN, NORTH, STAR = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]), np.array([0.6, 0.48, 0.64])
@@ -78,10 +80,10 @@ def simulate(case: Case, rng: np.random.Generator, edges: np.ndarray | None = No
     )
 
 
-def believed(case: Case, rng: np.random.Generator) -> tuple[ImuRecord, mekf.State]:
+def believed(case: Case, rng: np.random.Generator) -> tuple[ImuRecord, estimation.State]:
     record = simulate(case, rng)
     error = rng.standard_normal(6) * np.repeat([case.attitude_sigma, case.bias_sigma], 3)
-    initial = mekf.initial_state(
+    initial = estimation.initial_state(
         quaternion.multiply(record.truth.attitude[0], quaternion.exp(-error[:3])),
         attitude_sigma=case.attitude_sigma,
         bias_sigma=case.bias_sigma,
@@ -161,7 +163,7 @@ def on_attitude(J: np.ndarray) -> np.ndarray:
     return G
 
 
-def fixed_side_smoother(record: ImuRecord, noise: ProcessNoise, initial: mekf.State) -> Estimate:
+def fixed_side_smoother(record: ImuRecord, noise: ProcessNoise, initial: estimation.State) -> Estimate:
     """Filter and textbook smoother with the *fixed-side* error, by matrices.
 
     A correction there is a left product and its Jacobians are left ones. So it agrees with the body-side smoother only if both carry
@@ -245,7 +247,7 @@ def test_equals_the_fixed_side_reference(name: str) -> None:
     # A wide prior and a wrong start, so that corrections are tenths of a radian and a missing Jacobian shows in the first digits.
     case = dataclasses.replace(CASES[name], duration=4.0, attitude_sigma=0.2, bias_sigma=0.02)
     record, initial = believed(case, np.random.default_rng(11))
-    one = smoother.run(record, case.noise, initial, full_covariance=True)
+    one = estimation.smooth(record, case.noise, initial, full_covariance=True)
     assert_same(one, fixed_side_smoother(record, case.noise, initial), 1e-8)
 
 
@@ -272,8 +274,8 @@ def test_single_axis_equals_filterpy() -> None:
         sigma=np.full(len(picked), sigma),
     )
     record = ImuRecord(time=time, increments=np.outer(angle, DOWN), vectors=(series,))
-    initial = mekf.initial_state(quaternion.IDENTITY, attitude_sigma=0.1, bias_sigma=0.01)
-    estimate = smoother.run(record, noise, initial, full_covariance=True)
+    initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=0.1, bias_sigma=0.01)
+    estimate = estimation.smooth(record, noise, initial, full_covariance=True)
 
     kalman = filterpy.kalman.KalmanFilter(dim_x=2, dim_z=1)  # of the deviation from the summed increments, and the bias
     kalman.x, kalman.P = np.zeros(2), np.diag([0.01, 1e-4])
@@ -297,7 +299,9 @@ def test_single_axis_equals_filterpy() -> None:
     np.testing.assert_allclose(axis, P, rtol=1e-9, atol=0)
 
 
-def least_squares_estimate(record: ImuRecord, noise: ProcessNoise, initial: mekf.State, guess: Estimate) -> np.ndarray:
+def least_squares_estimate(
+    record: ImuRecord, noise: ProcessNoise, initial: estimation.State, guess: Estimate
+) -> np.ndarray:
     """The whole trajectory that minimises prior, gyro and measurement residuals: its error state (n + 1, 6) from ``guess``."""
     edges = len(record.time)
     prior = np.linalg.inv(np.linalg.cholesky(initial.covariance))
@@ -355,13 +359,13 @@ def test_equals_least_squares_to_first_order() -> None:
         rng = np.random.default_rng(8)
         record = simulate(case, rng, edges)
         error = rng.standard_normal(6) * 0.1 * scale
-        initial = mekf.initial_state(
+        initial = estimation.initial_state(
             quaternion.multiply(record.truth.attitude[0], quaternion.exp(-error[:3])),
             attitude_sigma=case.attitude_sigma,
             bias_sigma=case.bias_sigma,
             bias=record.truth.bias[0] - error[3:],
         )
-        estimate = smoother.run(record, case.noise, initial)
+        estimate = estimation.smooth(record, case.noise, initial)
         distances.append(np.max(np.abs(least_squares_estimate(record, case.noise, initial, estimate)) / estimate.sigma))
     assert distances[0] < 0.2
     assert 5.0 < distances[0] / distances[1] < 20.0
@@ -376,8 +380,8 @@ def test_consistent_and_better_than_the_filter(name: str) -> None:
     nees, squares = [], []
     for _ in range(runs):
         record, initial = believed(case, rng)
-        smoothed = smoother.run(record, case.noise, initial, full_covariance=True)
-        filtered = mekf.run(record, case.noise, initial)
+        smoothed = estimation.smooth(record, case.noise, initial, full_covariance=True)
+        filtered = estimation.run(record, case.noise, initial)
         epochs = np.linspace(0, len(record.time) - 1, 6).astype(int)
         e = errors(smoothed, record)
         P = smoothed.covariance
@@ -404,7 +408,7 @@ def test_consistent_over_many_runs(name: str) -> None:
     nees = []
     for _ in range(runs):
         record, initial = believed(case, rng)
-        smoothed = smoother.run(record, case.noise, initial, full_covariance=True)
+        smoothed = estimation.smooth(record, case.noise, initial, full_covariance=True)
         epochs = np.linspace(0, len(record.time) - 1, 6).astype(int)
         nees.append(consistency.nees(errors(smoothed, record)[epochs], smoothed.covariance[epochs]))
     verdict = consistency.Verdict(mean=np.mean(nees, axis=0) / 6.0, degrees=6, runs=runs, probability=0.99)
@@ -421,7 +425,7 @@ def test_a_wrong_gyro_model_is_outside(wrong: float, above: bool) -> None:
     for _ in range(60):
         record, initial = believed(case, rng)
         middle = len(record.time) // 2
-        estimate = smoother.run(record, noise, initial, full_covariance=True)
+        estimate = estimation.smooth(record, noise, initial, full_covariance=True)
         nees.append(consistency.nees(errors(estimate, record)[middle], estimate.covariance[middle]))
     low, high = consistency.mean_bounds(6, 60)
     mean = np.mean(nees) / 6.0
@@ -450,8 +454,8 @@ def scaled(case: Case, factor: float) -> Case:
 def test_never_worse_than_the_filter(name: str, factor: float, curvature: float) -> None:
     case = scaled(CASES[name], factor)
     record, initial = believed(case, np.random.default_rng(7))
-    smoothed = smoother.run(record, case.noise, initial, full_covariance=True)
-    filtered = mekf.run(record, case.noise, initial, full_covariance=True)
+    smoothed = estimation.smooth(record, case.noise, initial, full_covariance=True)
+    filtered = estimation.run(record, case.noise, initial, full_covariance=True)
     # In one tangent space, P_filter − P_smoothed is positive semi-definite: no direction of the state is worse. But for the curvature of
     # the rotations, of second order in the corrections: two moves of a tangent space are not quite one.
     moved = quaternion.log(quaternion.multiply(quaternion.conjugate(filtered.attitude), smoothed.attitude))
@@ -471,8 +475,8 @@ def test_never_worse_than_the_filter(name: str, factor: float, curvature: float)
 def test_last_state_is_the_filters() -> None:
     case = CASES["asynchronous"]
     record, initial = believed(case, np.random.default_rng(7))
-    smoothed = smoother.run(record, case.noise, initial, full_covariance=True)
-    filtered = mekf.run(record, case.noise, initial, full_covariance=True)
+    smoothed = estimation.smooth(record, case.noise, initial, full_covariance=True)
+    filtered = estimation.run(record, case.noise, initial, full_covariance=True)
     for name in ("attitude", "bias", "variance", "covariance"):
         np.testing.assert_array_equal(getattr(smoothed, name)[-1], getattr(filtered, name)[-1])
     np.testing.assert_array_equal(smoothed.time, filtered.time)
@@ -485,8 +489,8 @@ def test_last_state_is_the_filters() -> None:
 def test_without_measurements_it_is_the_filter() -> None:
     case = dataclasses.replace(CASES["directions"], sensors=())
     record, initial = believed(case, np.random.default_rng(7))
-    smoothed = smoother.run(record, case.noise, initial, full_covariance=True)
-    assert_same(smoothed, mekf.run(record, case.noise, initial, full_covariance=True), 1e-8)
+    smoothed = estimation.smooth(record, case.noise, initial, full_covariance=True)
+    assert_same(smoothed, estimation.run(record, case.noise, initial, full_covariance=True), 1e-8)
 
 
 def exact_record(case: Case) -> ImuRecord:
@@ -505,22 +509,24 @@ def exact_record(case: Case) -> ImuRecord:
 def test_no_noise_no_error() -> None:
     case = CASES["asynchronous"]
     record = exact_record(case)
-    exact = mekf.initial_state(record.truth.attitude[0], attitude_sigma=0.1, bias_sigma=0.01, bias=record.truth.bias[0])
-    assert np.max(np.abs(errors(smoother.run(record, case.noise, exact), record))) < 1e-12
+    exact = estimation.initial_state(
+        record.truth.attitude[0], attitude_sigma=0.1, bias_sigma=0.01, bias=record.truth.bias[0]
+    )
+    assert np.max(np.abs(errors(estimation.smooth(record, case.noise, exact), record))) < 1e-12
 
 
 def test_a_wrong_start_is_mended_to_its_very_beginning() -> None:
     # Without noise in data or gyro model and with a wide prior, what is left of an initial error is what the measurements' σ lets pass.
     case = dataclasses.replace(CASES["directions"], noise=ProcessNoise(angle_random_walk=1e-9, rate_random_walk=0.0))
     record = exact_record(case)
-    wrong = mekf.initial_state(
+    wrong = estimation.initial_state(
         quaternion.multiply(record.truth.attitude[0], quaternion.exp(np.array([1e-4, -2e-4, 3e-4]))),
         attitude_sigma=1.0,
         bias_sigma=1.0,
         bias=record.truth.bias[0] + np.array([2e-5, -1e-5, 3e-5]),
     )
-    estimate = smoother.run(record, case.noise, wrong)
-    before = errors(mekf.run(record, case.noise, wrong), record)[0]
+    estimate = estimation.smooth(record, case.noise, wrong)
+    before = errors(estimation.run(record, case.noise, wrong), record)[0]
     assert np.all(np.abs(errors(estimate, record)[0]) < 1e-3 * np.abs(before))
 
 
@@ -530,18 +536,18 @@ def test_a_wrong_start_is_mended_to_its_very_beginning() -> None:
 def test_frames_are_a_matter_of_choice() -> None:
     case = CASES["asynchronous"]
     record, initial = believed(case, np.random.default_rng(12))
-    plain = smoother.run(record, case.noise, initial, full_covariance=True)
+    plain = estimation.smooth(record, case.noise, initial, full_covariance=True)
     p = quaternion.normalize([0.3, -0.5, 0.7, 0.2])
     back = quaternion.conjugate(p)
     directions = tuple(s for s in record.vectors if s.kind != "heading")  # a heading knows which axis is vertical
     record = dataclasses.replace(record, vectors=directions)
-    plain = smoother.run(record, case.noise, initial, full_covariance=True)
+    plain = estimation.smooth(record, case.noise, initial, full_covariance=True)
     other_fixed = dataclasses.replace(
         record,
         vectors=tuple(dataclasses.replace(s, reference_f=quaternion.rotate(p, s.reference_f)) for s in directions),
     )
     start = dataclasses.replace(initial, attitude=quaternion.multiply(p, initial.attitude))
-    found = smoother.run(other_fixed, case.noise, start, full_covariance=True)
+    found = estimation.smooth(other_fixed, case.noise, start, full_covariance=True)
     found = dataclasses.replace(found, attitude=quaternion.multiply(back, found.attitude))
     assert_same(found, plain, 1e-9)
     other_body = dataclasses.replace(
@@ -553,7 +559,7 @@ def test_frames_are_a_matter_of_choice() -> None:
     start = dataclasses.replace(
         initial, attitude=quaternion.multiply(initial.attitude, p), bias=quaternion.rotate(back, initial.bias)
     )
-    found = smoother.run(other_body, case.noise, start, full_covariance=True)
+    found = estimation.smooth(other_body, case.noise, start, full_covariance=True)
     T = np.kron(np.eye(2), quaternion.to_matrix(p))
     covariance = T @ found.covariance @ T.T
     found = dataclasses.replace(
@@ -579,8 +585,8 @@ def test_large_turns_are_taken_in_sub_steps() -> None:
     parts = 8
     fine = np.interp(np.arange(parts * (len(record.time) - 1) + 1) / parts, np.arange(len(record.time)), record.time)
     split = ImuRecord(time=fine, increments=np.repeat(record.increments / parts, parts, axis=0), vectors=record.vectors)
-    coarse = smoother.run(record, case.noise, initial, full_covariance=True)
-    fine = smoother.run(split, case.noise, initial, full_covariance=True)
+    coarse = estimation.smooth(record, case.noise, initial, full_covariance=True)
+    fine = estimation.smooth(split, case.noise, initial, full_covariance=True)
     every = {name: getattr(fine, name)[::parts] for name in ("time", "attitude", "bias", "variance", "covariance")}
     assert_same(coarse, dataclasses.replace(fine, **every), 1e-9)
 
@@ -589,7 +595,7 @@ def test_a_measurement_that_tells_nothing_changes_nothing() -> None:
     # It splits intervals, so the segments are others.
     case = CASES["directions"]
     record, initial = believed(case, np.random.default_rng(13))
-    plain = smoother.run(record, case.noise, initial, full_covariance=True)
+    plain = estimation.smooth(record, case.noise, initial, full_covariance=True)
     rng = np.random.default_rng(0)
     time = np.sort(np.concatenate([rng.uniform(0.0, 20.0, 300), record.time[10:20], [0.0, 20.0]]))
     blind = VectorMeasurements(
@@ -601,7 +607,7 @@ def test_a_measurement_that_tells_nothing_changes_nothing() -> None:
         sigma=np.full(len(time), 1e8),
     )
     record = dataclasses.replace(record, vectors=(*record.vectors, blind))
-    assert_same(smoother.run(record, case.noise, initial, full_covariance=True), plain, 1e-8)
+    assert_same(estimation.smooth(record, case.noise, initial, full_covariance=True), plain, 1e-8)
 
 
 def test_a_start_half_way_round_is_survived() -> None:
@@ -610,10 +616,10 @@ def test_a_start_half_way_round_is_survived() -> None:
     record, _ = believed(case, np.random.default_rng(21))
     for angle in (0.6, 1.5, 2.5, 3.1):
         turn = quaternion.exp(angle * np.array([0.48, 0.6, 0.64]))
-        initial = mekf.initial_state(
+        initial = estimation.initial_state(
             quaternion.multiply(record.truth.attitude[0], turn), attitude_sigma=1.5, bias_sigma=0.01
         )
-        estimate = smoother.run(record, case.noise, initial, full_covariance=True)
+        estimate = estimation.smooth(record, case.noise, initial, full_covariance=True)
         assert np.max(np.abs(np.linalg.norm(estimate.attitude, axis=1) - 1.0)) < 1e-12
         assert (
             np.linalg.eigvalsh(estimate.covariance / np.einsum("ki,kj->kij", estimate.sigma, estimate.sigma)).min()
@@ -631,8 +637,8 @@ def test_a_start_half_way_round_is_survived() -> None:
 def test_a_lag_as_long_as_the_record_is_the_fixed_interval(lag: float) -> None:
     case = CASES["asynchronous"]
     record, initial = believed(case, np.random.default_rng(9))
-    whole = smoother.run(record, case.noise, initial, full_covariance=True)
-    lagged = smoother.run_fixed_lag(record, case.noise, initial, lag=lag, full_covariance=True)
+    whole = estimation.smooth(record, case.noise, initial, full_covariance=True)
+    lagged = estimation.smooth(record, case.noise, initial, lag=lag, full_covariance=True)
     for name in ("attitude", "bias", "variance", "covariance"):
         np.testing.assert_array_equal(getattr(lagged, name), getattr(whole, name))
 
@@ -640,8 +646,8 @@ def test_a_lag_as_long_as_the_record_is_the_fixed_interval(lag: float) -> None:
 def test_no_lag_is_the_filter() -> None:
     case = CASES["asynchronous"]
     record, initial = believed(case, np.random.default_rng(9))
-    filtered = mekf.run(record, case.noise, initial, full_covariance=True)
-    lagged = smoother.run_fixed_lag(record, case.noise, initial, lag=0.0, full_covariance=True)
+    filtered = estimation.run(record, case.noise, initial, full_covariance=True)
+    lagged = estimation.smooth(record, case.noise, initial, lag=0.0, full_covariance=True)
     for name in ("attitude", "bias", "variance", "covariance"):
         np.testing.assert_array_equal(getattr(lagged, name), getattr(filtered, name))
 
@@ -650,7 +656,7 @@ def test_no_lag_is_the_filter() -> None:
 def test_fixed_lag_is_the_smoother_of_what_was_known(lag: float) -> None:
     case = CASES["asynchronous"]
     record, initial = believed(case, np.random.default_rng(9))
-    lagged = smoother.run_fixed_lag(record, case.noise, initial, lag=lag, full_covariance=True)
+    lagged = estimation.smooth(record, case.noise, initial, lag=lag, full_covariance=True)
     steps = math.floor(lag * case.rate + 1e-6)
     # Among them edges where t + lag falls short of an edge by rounding only.
     short = (
@@ -658,7 +664,9 @@ def test_fixed_lag_is_the_smoother_of_what_was_known(lag: float) -> None:
     )
     for k in (0, 1, 250, 901, len(record.time) - 1, *short[:2]):
         last = min(k + steps, len(record.time) - 1)
-        known = smoother.run(records.cut(record, 0, last), case.noise, initial, full_covariance=True) if last else None
+        known = (
+            estimation.smooth(records.cut(record, 0, last), case.noise, initial, full_covariance=True) if last else None
+        )
         if known is not None:
             np.testing.assert_allclose(lagged.attitude[k], known.attitude[k], rtol=0, atol=1e-15)
             # To rounding in units of σ: entries that are zero but for rounding differ by the order of operations.
@@ -667,13 +675,20 @@ def test_fixed_lag_is_the_smoother_of_what_was_known(lag: float) -> None:
             np.testing.assert_allclose(difference, 0.0, rtol=0, atol=1e-13)
 
 
+def filtered_segments(record, noise, initial):
+    """Return the segment that starts at each edge, and the filter's segments with the end state."""
+    problem = forward.prepared(record, noise, initial, ())
+    _, segments = recovery_segments.filtered_whole(problem, forward.Options(every=len(record.time)))
+    return recovery_segments.starts(record.time, problem.events.time, segments), segments
+
+
 def test_gains_kept_or_not(monkeypatch: pytest.MonkeyPatch) -> None:
     case = CASES["asynchronous"]
     record, initial = believed(case, np.random.default_rng(10))
-    kept = smoother.run_fixed_lag(record, case.noise, initial, lag=0.7, full_covariance=True)
+    kept = estimation.smooth(record, case.noise, initial, lag=0.7, full_covariance=True)
     for groups in range(3, 10):  # too few for each pass, for some, for none
-        monkeypatch.setattr(smoother, "MOST_GROUPS", groups)
-        anew = smoother.run_fixed_lag(record, case.noise, initial, lag=0.7, full_covariance=True)
+        monkeypatch.setattr(smoothing, "MOST_GROUPS", groups)
+        anew = estimation.smooth(record, case.noise, initial, lag=0.7, full_covariance=True)
         for name in ("attitude", "bias", "variance", "covariance"):
             np.testing.assert_array_equal(getattr(kept, name), getattr(anew, name))
 
@@ -685,10 +700,10 @@ def test_any_number_of_passes_at_once(edges: int) -> None:
     record, initial = believed(case, np.random.default_rng(12))
     part = records.cut(record, 0, edges)
     for steps in (1, 3, 11):
-        lagged = smoother.run_fixed_lag(part, case.noise, initial, lag=steps / case.rate, full_covariance=True)
+        lagged = estimation.smooth(part, case.noise, initial, lag=steps / case.rate, full_covariance=True)
         for k in range(edges):
             last = min(k + steps, edges)
-            known = smoother.run(records.cut(part, 0, last), case.noise, initial, full_covariance=True)
+            known = estimation.smooth(records.cut(part, 0, last), case.noise, initial, full_covariance=True)
             np.testing.assert_allclose(lagged.attitude[k], known.attitude[k], rtol=0, atol=1e-14)
             np.testing.assert_allclose(lagged.bias[k], known.bias[k], rtol=0, atol=1e-14)
             np.testing.assert_allclose(lagged.variance[k], known.variance[k], rtol=1e-12)
@@ -700,11 +715,11 @@ def test_fixed_lag_where_corrections_are_large(angle: float) -> None:
     case = CASES["asynchronous"]
     record, _ = believed(case, np.random.default_rng(21))
     q = quaternion.multiply(record.truth.attitude[0], quaternion.exp(angle * np.array([0.6, 0.0, -0.8])))
-    initial = mekf.initial_state(q, attitude_sigma=2.0 * angle, bias_sigma=0.01)
+    initial = estimation.initial_state(q, attitude_sigma=2.0 * angle, bias_sigma=0.01)
     part = records.cut(record, 0, 60)
-    lagged = smoother.run_fixed_lag(part, case.noise, initial, lag=20.0 / case.rate, full_covariance=True)
+    lagged = estimation.smooth(part, case.noise, initial, lag=20.0 / case.rate, full_covariance=True)
     for k in (0, 1, 7, 8, 20, 35):
-        known = smoother.run(records.cut(part, 0, k + 20), case.noise, initial, full_covariance=True)
+        known = estimation.smooth(records.cut(part, 0, k + 20), case.noise, initial, full_covariance=True)
         assert quaternion.angle_between(lagged.attitude[k], known.attitude[k]) < 1e-12
         sigma = np.sqrt(np.diagonal(known.covariance[k]))
         difference = (lagged.covariance[k] - known.covariance[k]) / np.outer(sigma, sigma)
@@ -714,8 +729,7 @@ def test_fixed_lag_where_corrections_are_large(angle: float) -> None:
 def test_plain_python_equals_compiled_for_a_lag() -> None:
     case = dataclasses.replace(CASES["asynchronous"], duration=1.0)
     record, initial = believed(case, np.random.default_rng(9))
-    _, event_time, segments = smoother._filtered(record, case.noise, initial)
-    starts = smoother._starts(record, event_time, segments)
+    starts, segments = filtered_segments(record, case.noise, initial)
     first = np.arange(len(record.time) - 12)
     results = []
     for back in (smoother_lag.smooth_lagged, compiled(smoother_lag.smooth_lagged)):
@@ -738,12 +752,12 @@ def test_a_bias_that_turns_more_than_the_increments_say() -> None:
     def smoothed(parts: int, bias: float) -> Estimate:
         edges = np.arange(40 * parts + 1) / parts
         record = ImuRecord(time=edges, increments=np.zeros((40 * parts, 3)), vectors=(series,))
-        start = mekf.State(
+        start = estimation.State(
             attitude=quaternion.IDENTITY,
             bias=np.array([0.0, 0.0, bias]),
             covariance=np.diag([1e-4] * 3 + [1e-12] * 3),
         )
-        return smoother.run(record, noise, start, full_covariance=True)
+        return estimation.smooth(record, noise, start, full_covariance=True)
 
     for bias in (0.5, 3.0):
         whole, cut = smoothed(1, bias), smoothed(10, bias)
@@ -757,7 +771,7 @@ def test_a_bias_that_turns_more_than_the_increments_say() -> None:
 def test_more_lag_more_certain() -> None:
     case = CASES["directions"]
     record, initial = believed(case, np.random.default_rng(9))
-    variances = [smoother.run_fixed_lag(record, case.noise, initial, lag=lag).variance for lag in (0.0, 0.5, 2.0, 30.0)]
+    variances = [estimation.smooth(record, case.noise, initial, lag=lag).variance for lag in (0.0, 0.5, 2.0, 30.0)]
     middle = len(record.time) // 2
     for less, more in itertools.pairwise(variances):
         assert np.all(more[middle] < less[middle])
@@ -767,7 +781,7 @@ def test_a_negative_lag_is_refused() -> None:
     case = CASES["rest"]
     record, initial = believed(case, np.random.default_rng(9))
     with pytest.raises(InputError, match="lag is -1 s; it must not be negative"):
-        smoother.run_fixed_lag(record, case.noise, initial, lag=-1.0)
+        estimation.smooth(record, case.noise, initial, lag=-1.0)
 
 
 # ------------------------------------------------------------------------------------------------- recoveries, and lost digits
@@ -781,7 +795,7 @@ WELL_SEEN = dataclasses.replace(
 )
 
 
-def far_off(seed: int, sensors: tuple = WELL_SEEN.sensors) -> tuple[ImuRecord, mekf.State]:
+def far_off(seed: int, sensors: tuple = WELL_SEEN.sensors) -> tuple[ImuRecord, estimation.State]:
     """A record, and a start off by an angle that it does not believe in."""
     rng = np.random.default_rng([6, seed])
     record, initial = believed(dataclasses.replace(WELL_SEEN, sensors=sensors), rng)
@@ -798,8 +812,8 @@ def recovery_of(estimate: Estimate) -> records.Event:
 
 def test_a_lost_stretch_is_told_by_what_was_measured_from_its_beginning_on() -> None:
     record, initial = far_off(1)
-    filtered = mekf.run(record, NOISE, initial, gate=GATE, full_covariance=True)
-    smoothed = smoother.run(record, NOISE, initial, gate=GATE, full_covariance=True)
+    filtered = estimation.run(record, NOISE, initial, gate=GATE, full_covariance=True)
+    smoothed = estimation.smooth(record, NOISE, initial, gate=GATE, full_covariance=True)
     event = recovery_of(filtered)
     assert smoothed.events == filtered.events
     first, last = np.searchsorted(record.time, [event.start, event.end])
@@ -808,8 +822,8 @@ def test_a_lost_stretch_is_told_by_what_was_measured_from_its_beginning_on() -> 
     assert np.max(np.abs(errors(smoothed, record) / smoothed.sigma)[first:]) < 5.0
     # The smoother of a filter that starts there knowing nothing, linearised about the truth.
     rest = records.cut(record, first, len(record.time) - 1)
-    fresh = mekf.initial_state(record.truth.attitude[first], attitude_sigma=2.0, bias_sigma=math.sqrt(2.0) * 3e-3)
-    known = smoother.run(rest, NOISE, fresh, full_covariance=True)
+    fresh = estimation.initial_state(record.truth.attitude[first], attitude_sigma=2.0, bias_sigma=math.sqrt(2.0) * 3e-3)
+    known = estimation.smooth(rest, NOISE, fresh, full_covariance=True)
     off = quaternion.log(quaternion.multiply(quaternion.conjugate(smoothed.attitude[first:]), known.attitude))
     assert np.max(np.abs(off) / known.sigma[:, :3]) < 0.8
     np.testing.assert_allclose(smoothed.sigma[first:], known.sigma, rtol=0.2)
@@ -822,7 +836,7 @@ def test_a_lost_stretch_is_told_by_what_was_measured_from_its_beginning_on() -> 
 def test_of_a_filter_that_is_lost_on_its_way_the_part_before_is_smoothed_too() -> None:
     """A turn in a gap of the gyro's: the sensors are refused from there on."""
     record, _ = far_off(2)
-    initial = mekf.initial_state(record.truth.attitude[0], attitude_sigma=0.03, bias_sigma=3e-3)
+    initial = estimation.initial_state(record.truth.attitude[0], attitude_sigma=0.03, bias_sigma=3e-3)
     middle = 120
     turn = quaternion.exp([0.0, 1.2, 0.7])
     after = record.time >= record.time[middle]
@@ -847,7 +861,7 @@ def test_of_a_filter_that_is_lost_on_its_way_the_part_before_is_smoothed_too() -
         ),
     )
     record = ImuRecord(time=record.time, increments=increments, vectors=moved, truth=truth)
-    both = smoother.run(record, NOISE, initial, gate=GATE, full_covariance=True)
+    both = estimation.smooth(record, NOISE, initial, gate=GATE, full_covariance=True)
     event = recovery_of(both)
     first = int(np.searchsorted(record.time, event.start))
     assert middle <= first < middle + 8
@@ -855,7 +869,7 @@ def test_of_a_filter_that_is_lost_on_its_way_the_part_before_is_smoothed_too() -
     assert np.max(off[:middle]) < 5.0
     assert np.max(off[first:]) < 5.0
     # Before it: the smoother of the record that ends with the first refusal, whose measurement was not taken in.
-    known = smoother.run(records.cut(record, 0, first - 1), NOISE, initial, gate=GATE, full_covariance=True)
+    known = estimation.smooth(records.cut(record, 0, first - 1), NOISE, initial, gate=GATE, full_covariance=True)
     assert_same(
         known,
         dataclasses.replace(
@@ -863,7 +877,7 @@ def test_of_a_filter_that_is_lost_on_its_way_the_part_before_is_smoothed_too() -
         ),
         1e-9,
     )
-    ahead = mekf.run(record, NOISE, initial, gate=GATE)
+    ahead = estimation.run(record, NOISE, initial, gate=GATE)
     assert np.all(both.sigma[20:middle] < ahead.sigma[20:middle])
 
 
@@ -877,8 +891,8 @@ def test_what_lies_between_the_first_refusal_and_the_last_challenger_is_the_filt
         z /= np.linalg.norm(z, axis=1, keepdims=True)
         vectors.append(dataclasses.replace(s, vector_b=np.where((s.time < 0.6)[:, None], z, s.vector_b)))
     record = dataclasses.replace(record, vectors=tuple(vectors))
-    filtered = mekf.run(record, NOISE, initial, gate=GATE, full_covariance=True)
-    smoothed = smoother.run(record, NOISE, initial, gate=GATE, full_covariance=True)
+    filtered = estimation.run(record, NOISE, initial, gate=GATE, full_covariance=True)
+    smoothed = estimation.smooth(record, NOISE, initial, gate=GATE, full_covariance=True)
     event = recovery_of(smoothed)
     assert event.start < 0.1
     between = (record.time > event.start) & (record.time < 0.6)
@@ -908,8 +922,8 @@ def test_several_recoveries_and_a_record_in_parts() -> None:
         bias=np.where(later, quaternion.rotate(back, record.truth.bias), record.truth.bias),
     )
     twice = ImuRecord(time=record.time, increments=increments, vectors=vectors, truth=truth)
-    whole = smoother.run(twice, NOISE, initial, gate=GATE, full_covariance=True)
-    on_factors = augmented.smooth(twice, NOISE, initial, gate=GATE, full_covariance=True)
+    whole = estimation.smooth(twice, NOISE, initial, gate=GATE, full_covariance=True)
+    on_factors = estimation.smooth(twice, NOISE, initial, gate=GATE, full_covariance=True)
     assert_same(whole, on_factors, 1e-9)
     assert [event.kind for event in whole.events] == ["recovery", "recovery"]
     first, second = np.searchsorted(record.time, [event.start for event in whole.events])
@@ -917,9 +931,9 @@ def test_several_recoveries_and_a_record_in_parts() -> None:
     assert np.max(off[first:120]) < 5.0
     assert np.max(off[second:]) < 5.0
     middle = int(np.searchsorted(record.time, whole.events[0].end)) - 8
-    _, state = mekf.run_on(records.cut(twice, 0, middle), NOISE, initial, gate=GATE)
+    _, state = estimation.run_part(records.cut(twice, 0, middle), NOISE, initial, gate=GATE)
     rest = records.cut(twice, middle, len(twice.time) - 1)
-    part = smoother.run(rest, NOISE, state, gate=GATE, full_covariance=True)
+    part = estimation.smooth(rest, NOISE, state, gate=GATE, full_covariance=True)
     off = np.max(np.abs(errors(part, rest) / part.sigma), axis=1)
     assert np.max(off[: 120 - middle]) < 5.0
     assert part.events == whole.events
@@ -934,7 +948,7 @@ ON_EDGES = tuple(
 @pytest.mark.parametrize(("lag", "sensors"), [(0.1, WELL_SEEN.sensors), (0.7, WELL_SEEN.sensors), (0.1, ON_EDGES)])
 def test_a_fixed_lag_knows_of_a_recovery_when_it_has_happened(lag: float, sensors: tuple) -> None:
     record, initial = far_off(1, sensors)
-    lagged = smoother.run_fixed_lag(record, NOISE, initial, lag=lag, gate=GATE, full_covariance=True)
+    lagged = estimation.smooth(record, NOISE, initial, lag=lag, gate=GATE, full_covariance=True)
     event = recovery_of(lagged)
     first, last = np.searchsorted(record.time, [event.start, event.end])
     steps = round(50 * lag)
@@ -942,7 +956,7 @@ def test_a_fixed_lag_knows_of_a_recovery_when_it_has_happened(lag: float, sensor
         if k < 0:
             continue
         part = records.cut(record, 0, min(k + steps, len(record.time) - 1))
-        known = smoother.run(part, NOISE, initial, gate=GATE, full_covariance=True)
+        known = estimation.smooth(part, NOISE, initial, gate=GATE, full_covariance=True)
         assert (len(known.events) > 0) == (part.time[-1] >= event.end)
         np.testing.assert_allclose(lagged.attitude[k], known.attitude[k], rtol=0, atol=1e-12)
         np.testing.assert_allclose(lagged.variance[k], known.variance[k], rtol=1e-9)
@@ -953,7 +967,7 @@ def nees_of_recoveries(runs: int) -> np.ndarray:
     nees = []
     for run in range(runs):
         record, initial = far_off(100 + run)
-        both = smoother.run(record, NOISE, initial, gate=GATE, full_covariance=True)
+        both = estimation.smooth(record, NOISE, initial, gate=GATE, full_covariance=True)
         event = recovery_of(both)
         first, last = np.searchsorted(record.time, [event.start, event.end])
         rows = [(first + last) // 2, last, 200]
@@ -994,9 +1008,9 @@ def test_a_measurement_that_leaves_no_digits_is_smoothed_on_the_square_root() ->
         for k, r in enumerate(references)
     )
     record = ImuRecord(time=time, increments=np.zeros((12, 3)), vectors=series)
-    initial = mekf.initial_state(quaternion.IDENTITY, attitude_sigma=first[0], bias_sigma=first[1])
+    initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=first[0], bias_sigma=first[1])
     noise = ProcessNoise(angle_random_walk=1e-18, rate_random_walk=0.0)
-    both = smoother.run(record, noise, initial, full_covariance=True)
+    both = estimation.smooth(record, noise, initial, full_covariance=True)
     with mpmath.workdps(60):
         information = mpmath.diag([1 / mpmath.mpf(first[0]) ** 2] * 3 + [1 / mpmath.mpf(first[1]) ** 2] * 3)
         for k, r in enumerate(references):
@@ -1022,10 +1036,10 @@ def test_a_measurement_that_leaves_no_digits_is_smoothed_on_the_square_root() ->
                 atol=1e-6,
             )
     assert both.innovations["s0"].nis.max() < 1e-6
-    ahead = mekf.run(record, noise, initial, full_covariance=True)
+    ahead = estimation.run(record, noise, initial, full_covariance=True)
     np.testing.assert_allclose(both.sigma[-1], ahead.sigma[-1], rtol=1e-6)
-    lagged = smoother.run_fixed_lag(record, noise, initial, lag=1.0)
-    known = smoother.run(records.cut(record, 0, 6), noise, initial)
+    lagged = estimation.smooth(record, noise, initial, lag=1.0)
+    known = estimation.smooth(records.cut(record, 0, 6), noise, initial)
     np.testing.assert_allclose(lagged.sigma[2], known.sigma[2], rtol=1e-9)
 
 
@@ -1110,12 +1124,12 @@ def test_noise_seen_from_the_start_of_a_step() -> None:
     for angle in sizes[sizes <= LARGEST_ANGLE]:
         turn = angle * quaternion.normalize(np.append(rng.standard_normal(3), 0.0))[:3]
         dt = 10.0 ** rng.uniform(-3, 1)
-        F, Q = mekf.transition_and_noise(turn, dt, noise)
+        F, Q = transition_and_noise(turn, dt, noise)
         back = np.linalg.inv(F)
         expected = back @ Q @ back.T
         q11, q12, q22 = smoother_step.step_noise(tuple(turn), dt, noise.angle_random_walk**2, noise.rate_random_walk**2)
         bias = np.array([q22, 0.0, 0.0, q22, 0.0, q22])
-        found = mekf.covariance_matrices(np.array([*q11, *q12, *bias]))
+        found = covariance_matrices(np.array([*q11, *q12, *bias]))
         scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
         np.testing.assert_allclose(found / scale, expected / scale, rtol=0, atol=1e-13)
 
@@ -1128,14 +1142,14 @@ def test_gain_and_what_it_leaves(decades: float) -> None:
     noise = ProcessNoise(angle_random_walk=sv, rate_random_walk=su)
     for _ in range(5):
         turn = 0.1 * rng.standard_normal(3)
-        F, Q = mekf.transition_and_noise(turn, dt, noise)
+        F, Q = transition_and_noise(turn, dt, noise)
         P = random_covariance(rng, decades)
         q11, q12, q22 = smoother_step.step_noise(tuple(turn), dt, sv**2, su**2)
         N = smoother_step.kept_share(*blocks(P), q11, q12, q22)
         tt, tb, bt, bb = (np.reshape(block, (3, 3)) for block in smoother_step.gain(N, tuple(turn), dt))
         found = np.block([[tt, tb], [bt, bb]])
         upper, across, lower = smoother_step.left_noise(N, q11, q12, q22)
-        left = mekf.covariance_matrices(np.array([*upper, *across, *lower]))
+        left = covariance_matrices(np.array([*upper, *across, *lower]))
         with mpmath.workdps(60):
             p, f, r = (mpmath.matrix(m.tolist()) for m in (P, F, Q))
             predicted = f * p * f.T + r
@@ -1157,7 +1171,7 @@ def test_any_number_of_segments(intervals: int) -> None:
     )
     record, initial = believed(case, np.random.default_rng(intervals))
     record = records.cut(record, 0, intervals)
-    one = smoother.run(record, case.noise, initial, full_covariance=True)
+    one = estimation.smooth(record, case.noise, initial, full_covariance=True)
     assert_same(one, fixed_side_smoother(record, case.noise, initial), 1e-8)
 
 
@@ -1167,11 +1181,11 @@ def test_corrections_beyond_the_series(angle: float) -> None:
     case = dataclasses.replace(CASES["directions"], attitude_sigma=0.3, bias_sigma=0.02, duration=2.0)
     record, _ = believed(case, np.random.default_rng(5))
     turn = quaternion.exp(angle * np.array([0.48, 0.6, 0.64]))
-    initial = mekf.initial_state(
+    initial = estimation.initial_state(
         quaternion.multiply(record.truth.attitude[0], turn), attitude_sigma=0.3, bias_sigma=0.02
     )
-    one = smoother.run(record, case.noise, initial, full_covariance=True)
-    filtered = mekf.run(record, case.noise, initial)
+    one = estimation.smooth(record, case.noise, initial, full_covariance=True)
+    filtered = estimation.run(record, case.noise, initial)
     moved = quaternion.log(quaternion.multiply(quaternion.conjugate(filtered.attitude), one.attitude))
     assert (np.linalg.norm(moved, axis=1).max() > LARGEST_ANGLE) == (angle > 0.35)
     assert_same(one, fixed_side_smoother(record, case.noise, initial), 1e-8)
@@ -1201,7 +1215,7 @@ def test_one_step_keeps_its_digits_where_the_covariance_is_ill_conditioned(decad
     dt, sv, su = 0.01, 1e-5, 1e-8
     noise = ProcessNoise(angle_random_walk=sv, rate_random_walk=su)
     turn = np.array([0.01, -0.02, 0.03])
-    F, Q = mekf.transition_and_noise(turn, dt, noise)
+    F, Q = transition_and_noise(turn, dt, noise)
     q = tuple(quaternion.normalize(rng.standard_normal(4)))
     next_q = tuple(quaternion.multiply(q, quaternion.exp(turn)))
     worst_textbook = 0.0
@@ -1211,7 +1225,7 @@ def test_one_step_keeps_its_digits_where_the_covariance_is_ill_conditioned(decad
         _, _, A, B, C = smoother_step.smooth(
             q, (0.0, 0.0, 0.0), *blocks(P), tuple(turn), dt, sv**2, su**2, next_q, (0.0, 0.0, 0.0), *blocks(P_next)
         )
-        found = mekf.covariance_matrices(np.array([*A, *B, *C]))
+        found = covariance_matrices(np.array([*A, *B, *C]))
         with mpmath.workdps(60):
             p, f, r, n = (mpmath.matrix(m.tolist()) for m in (P, F, Q, P_next))
             predicted = f * p * f.T + r
@@ -1230,8 +1244,7 @@ def test_one_step_keeps_its_digits_where_the_covariance_is_ill_conditioned(decad
 def test_plain_python_equals_compiled() -> None:
     case = dataclasses.replace(CASES["asynchronous"], duration=2.0)
     record, initial = believed(case, np.random.default_rng(9))
-    _, event_time, segments = smoother._filtered(record, case.noise, initial)
-    starts = smoother._starts(record, event_time, segments)
+    starts, segments = filtered_segments(record, case.noise, initial)
     results = []
     for back in (smoother_loop.smooth_back, compiled(smoother_loop.smooth_back)):
         out = [np.empty((len(record.time), size)) for size in (4, 3, 6, 21)]
@@ -1254,12 +1267,11 @@ def test_edges_are_found_exactly() -> None:
     series = measure("a", "direction", DOWN, 0.02, stamps, np.tile(quaternion.IDENTITY, (len(stamps), 1)), rng)
     record = ImuRecord(time=time, increments=rng.uniform(-1.0, 1.0, (59, 3)), vectors=(series,))
     noise = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-5)
-    initial = mekf.initial_state(quaternion.IDENTITY, attitude_sigma=0.1, bias_sigma=0.01)
-    _, event_time, segments = smoother._filtered(record, noise, initial)
-    starts = smoother._starts(record, event_time, segments)
-    filtered = mekf.run(record, noise, initial, full_covariance=True)
+    initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=0.1, bias_sigma=0.01)
+    starts, segments = filtered_segments(record, noise, initial)
+    filtered = estimation.run(record, noise, initial, full_covariance=True)
     np.testing.assert_array_equal(segments[starts, 4:8], filtered.attitude)
-    np.testing.assert_array_equal(mekf.covariance_matrices(segments[starts, 11:]), filtered.covariance)
+    np.testing.assert_array_equal(covariance_matrices(segments[starts, 11:]), filtered.covariance)
 
 
 @pytest.mark.parametrize("name", ["record", "process_noise", "initial", "gate"])
@@ -1268,10 +1280,10 @@ def test_what_is_no_argument_is_refused_by_name(name):
     time = np.arange(3.0)
     right = {
         "record": ImuRecord(time=time, increments=np.zeros((2, 3))),
-        "process_noise": mekf.ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6),
-        "initial": mekf.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.1, bias_sigma=1e-3),
+        "process_noise": estimation.ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6),
+        "initial": estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.1, bias_sigma=1e-3),
     }
     wrong = {**right, name: given[name]}
     record, noise, initial = (wrong.pop(one) for one in ("record", "process_noise", "initial"))
     with pytest.raises(InputError, match=name):
-        smoother.run(record, noise, initial, **wrong)
+        estimation.smooth(record, noise, initial, **wrong)

@@ -12,10 +12,10 @@ from two_stars import ARW, BELIEVED, FREE, RRW, case, scenario
 
 from strapdown import consistency, gyro, motion, quaternion, scenarios, setup, tuning, units, vectors
 from strapdown.checks import InputError
+from strapdown.estimation.states import ProcessNoise
 from strapdown.kernels import tuning_loop
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.series import LARGEST_ANGLE
-from strapdown.mekf import ProcessNoise
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Truth
 from strapdown.setup import FilterSetup

@@ -13,7 +13,7 @@ from two_stars import BELIEVED, FREE, TRUTH, WRONG, case, scenario
 
 from strapdown import consistency, recordfiles, scenarios, setup, tuning
 from strapdown.checks import InputError
-from strapdown.mekf import ProcessNoise
+from strapdown.estimation.states import ProcessNoise
 from strapdown.records import ImuRecord
 from strapdown.setup import FilterSetup
 from strapdown.tuning import credibility

@@ -7,12 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from strapdown import coning, consistency, gyro, mekf, motion, scenarios, setup, tuning, vectors
-from strapdown.setup.states import SensorStates, States
+from strapdown import coning, consistency, estimation, gyro, motion, scenarios, setup, tuning, vectors
 from strapdown.checks import InputError
 from strapdown.montecarlo.scalar import start
 from strapdown.randomness import generator
 from strapdown.scenarios import Scenario
+from strapdown.setup.states import SensorStates, States
 from strapdown.tuning import extended
 
 SWAY = motion.HarmonicRates(
@@ -313,7 +313,7 @@ def test_a_case_of_first_measurements_is_taken_too():
     scenario = dataclasses.replace(scenarios.load_scenario("spin"), duration=60.0)
     chosen = setup.matched(scenario, states=True)
     case = tuning.record_case(scenarios.simulate(scenario, 1), chosen)
-    assert isinstance(case.initial, mekf.State)
+    assert isinstance(case.initial, estimation.State)
     objective = extended.likelihood([case], chosen, ["gyro.arw", "initial.bias", "star.sigma"])
     assert np.all(np.isfinite(objective.derivatives(objective.start).information))
     assert objective.setup(objective.start + np.log(2.0)).bias_sigma == pytest.approx(2.0 * chosen.bias_sigma)

@@ -13,10 +13,10 @@ from two_stars import BELIEVED, FREE, TRUTH, WRONG
 
 from strapdown import gyro, motion, quaternion, recordfiles, scenarios, setup, tuning, vectors
 from strapdown.checks import InputError
-from strapdown.mekf import ProcessNoise
+from strapdown.estimation.gating import Gate
+from strapdown.estimation.states import ProcessNoise
 from strapdown.records import ImuRecord
 from strapdown.report import tunings
-from strapdown.estimation.gating import Gate
 from strapdown.setup import FilterSetup
 from strapdown.tuning import innovations, outliers
 from strapdown.vectors import VectorMeasurements

@@ -12,9 +12,9 @@ from scipy.stats import chi2
 from strapdown import motion, recordfiles, scenarios, setup, tuning, vectors
 from strapdown.checks import InputError
 from strapdown.diagnosis import Cause, turning
+from strapdown.estimation.gating import Gate
 from strapdown.gyro import GyroSpec
 from strapdown.report import tunings
-from strapdown.estimation.gating import Gate
 from strapdown.tuning import suspicion
 
 SPEC = GyroSpec(angle_random_walk=3e-5, rate_random_walk=2e-7, turn_on_bias_sigma=1e-5)

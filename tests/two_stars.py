@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from strapdown import gyro, motion, scenarios, tuning, vectors
-from strapdown.mekf import ProcessNoise
+from strapdown.estimation.states import ProcessNoise
 from strapdown.setup import FilterSetup
 
 ARW, RRW = 1e-4, 3e-6

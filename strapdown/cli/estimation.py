@@ -13,7 +13,7 @@ from strapdown.cli.filters import filter_for
 from strapdown.cli.terminal import app, console, doubt, need_own, show, table, writable, written
 
 if TYPE_CHECKING:
-    from strapdown.mekf import State
+    from strapdown.estimation.states import State
     from strapdown.recordfiles import RecordFile
     from strapdown.records import Estimate, ImuRecord
     from strapdown.setup import FilterSetup
@@ -191,12 +191,11 @@ def _estimate_record(
     import numpy as np
 
     from strapdown import plots, records, setup
-    from strapdown.augmented import AugmentedEstimate
     from strapdown.checks import InputError, count
+    from strapdown.estimation.gating import Gate, Robust
     from strapdown.files import write_json
     from strapdown.recordfiles import read_record_file
-    from strapdown.records import Truth, write_estimate
-    from strapdown.estimation.gating import Gate, Robust
+    from strapdown.records import Estimate, Truth, write_estimate
 
     count("every", every)
     if smooth and every > 1:
@@ -247,7 +246,7 @@ def _estimate_record(
     _clear(out)
     write_estimate(paths[0], result, attributes, truth=truth)
     figures = {"estimate.png": plots.estimate_overview(result, title=path.name)}
-    if isinstance(result, AugmentedEstimate) and result.blocks:
+    if isinstance(result, Estimate) and result.blocks:
         paths.append(out / "states.json")
         write_json(paths[-1], {"source": str(path), **_tell_states(result, used)})
         figures["states.png"] = plots.states_over_time(result, title=path.name)
@@ -322,7 +321,7 @@ def _initial(
     """Return the initial state, how it came about, and the filter's edge that it stands at."""
     import numpy as np
 
-    from strapdown import mekf, quaternion, setup
+    from strapdown import estimation, quaternion, setup
     from strapdown.checks import InputError
     from strapdown.randomness import generator
     from strapdown.wahba import InconsistentError
@@ -346,7 +345,7 @@ def _initial(
         words = "Started from the truth, off by errors drawn from the filter's σ."
         return setup.initial_state(chosen, q, bias), words, 0
     try:
-        state = mekf.first_state(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
+        state = estimation.first_state(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
     except InconsistentError as error:
         problem = str(error).removesuffix("; give the initial attitude")
         # A sensor's own errors may be among the states, and then the filter can tell who is right.
@@ -365,11 +364,12 @@ def _banked(record: ImuRecord, chosen: FilterSetup, problem: str, why: str) -> t
     """Return the state that a bank of hypotheses finds, where the first measurements do not give the attitude."""
     import numpy as np
 
-    from strapdown import bank, mekf
+    from strapdown import estimation
     from strapdown.checks import InputError
+    from strapdown.estimation import multiple_model
 
     try:
-        found = bank.run(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
+        found = multiple_model.run(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
     except InputError as error:
         raise InputError(
             f"{problem}, nor does a bank of hypotheses ({error}); give --attitude, or --from-truth"
@@ -385,7 +385,7 @@ def _banked(record: ImuRecord, chosen: FilterSetup, problem: str, why: str) -> t
         )
     row = int(np.searchsorted(found.estimate.time, found.became_one))
     assert found.estimate.covariance is not None
-    state = mekf.State(
+    state = estimation.State(
         attitude=found.estimate.attitude[row],
         bias=found.estimate.bias[row],
         covariance=found.estimate.covariance[row],
@@ -462,12 +462,11 @@ def _estimate_recording(
 ) -> None:
     """Run the filter over a recording: accelerometer as the vertical, magnetometer as the heading."""
     from strapdown import ahrs, plots, recordings, setup
-    from strapdown.augmented import AugmentedEstimate
     from strapdown.checks import non_negative, one_of
     from strapdown.consistency import reference_errors
     from strapdown.files import write_json
     from strapdown.gyro import process_noise, read_spec
-    from strapdown.records import write_estimate
+    from strapdown.records import Estimate, write_estimate
     from strapdown.units import DEGREE
 
     moved_by = one_of("--motion", motion or "hand", ahrs.MOTIONS)
@@ -483,7 +482,7 @@ def _estimate_recording(
         errors_found = reference_errors(found.attitude, used.true_attitude)
         rms = {name: value / DEGREE for name, value in errors_found.rms(used.movement).items()}
     figures = {"estimate.png": plots.estimate_overview(found, title=used.source)}
-    if isinstance(found, AugmentedEstimate):
+    if isinstance(found, Estimate):
         figures["states.png"] = plots.states_over_time(found, title=used.source)
     if errors_found is not None:
         figures["errors.png"] = plots.recording_errors(used.time, errors_found, used.movement)
@@ -508,7 +507,7 @@ def _estimate_recording(
             "magnetometer_latency": result.magnetometer_latency,
         },
     )
-    if isinstance(found, AugmentedEstimate):
+    if isinstance(found, Estimate):
         paths.append(out / "states.json")
         write_json(paths[-1], {"source": used.source, **_states(found)})
     console.print(

@@ -20,10 +20,10 @@ def filter_for(
     ``states`` None: of attitude and bias alone; empty: with all states that the specified errors call for.
     """
     from strapdown import setup
-    from strapdown.setup.states import States
     from strapdown.checks import InputError
     from strapdown.gyro import read_spec
     from strapdown.scenarios import scenario_from_toml
+    from strapdown.setup.states import States
 
     if filter_file is not None:
         if states is not None:

@@ -131,7 +131,7 @@ def _show(judgement: Judgement) -> None:
 def _diagnosed(result: Path, record: Path, filter_file: Path | None, probability: float) -> dict[str, Any]:
     import numpy as np
 
-    from strapdown import diagnosis, mekf, recordfiles, records, setup
+    from strapdown import diagnosis, estimation, recordfiles, records, setup
     from strapdown.checks import InputError
 
     if filter_file is not None:
@@ -157,7 +157,7 @@ def _diagnosed(result: Path, record: Path, filter_file: Path | None, probability
         console.print(f"Causes were not looked for: {reason}.")
         return {"not_looked_for": reason, "without_a_state": list(missing)}
     P = np.diag(estimate.variance[0]) if estimate.covariance is None else estimate.covariance[0]
-    initial = mekf.State(attitude=estimate.attitude[0], bias=estimate.bias[0], covariance=P)
+    initial = estimation.State(attitude=estimate.attitude[0], bias=estimate.bias[0], covariance=P)
     found = diagnosis.diagnose(source, chosen, initial, probability=probability)
     rows = table("Causes by what they would explain", "cause", "of", "gain", "ln p", "", left=2)
     for cause in found.considered[:8]:

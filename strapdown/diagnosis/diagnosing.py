@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from strapdown import consistency, mekf
+from strapdown import consistency, estimation
 from strapdown.checks import InputError
 from strapdown.consistency.bounds import tail
 from strapdown.diagnosis.causes import Diagnosis
@@ -20,7 +20,9 @@ GROSS = 3.0
 """Discrete conventions are tried where the NIS per degree of freedom of some sensor exceeds this: a wrong one is not subtle."""
 
 
-def diagnose(record: ImuRecord, setup: FilterSetup, initial: mekf.State, *, probability: float = 0.99) -> Diagnosis:
+def diagnose(
+    record: ImuRecord, setup: FilterSetup, initial: estimation.State, *, probability: float = 0.99
+) -> Diagnosis:
     """Return the likely causes of what is wrong with a filter on a record.
 
     Parameters
@@ -43,7 +45,7 @@ def diagnose(record: ImuRecord, setup: FilterSetup, initial: mekf.State, *, prob
         raise InputError("record has no vector measurements, so there are no innovations to diagnose from")
     model = Model(record=believed(record, setup), noise=setup.process_noise, initial=initial)
     every = max(1, len(model.record.increments) // 1000)
-    estimate = mekf.run(model.record, model.noise, model.initial, every=every, full_covariance=True)
+    estimate = estimation.run(model.record, model.noise, model.initial, every=every, full_covariance=True)
     truth = model.record.truth
     kept = None if truth is None else Truth(attitude=truth.attitude[::every], bias=truth.bias[::every])
     judgement = consistency.judge(estimate, kept, probability=probability)

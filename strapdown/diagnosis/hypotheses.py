@@ -9,7 +9,7 @@ from typing import cast
 
 import numpy as np
 
-from strapdown import mekf, quaternion
+from strapdown import estimation, quaternion
 from strapdown.checks import Array
 from strapdown.diagnosis.causes import Cause
 from strapdown.diagnosis.likelihood import Hypothesis, Model, Run, log_p, run
@@ -66,7 +66,7 @@ def mean_hypotheses(model: Model) -> Iterator[Hypothesis]:
         )
 
 
-def _moved(state: mekf.State, part: str, theta: Array) -> mekf.State:
+def _moved(state: estimation.State, part: str, theta: Array) -> estimation.State:
     if part == "attitude":
         return replace(state, attitude=quaternion.normalize(quaternion.multiply(state.attitude, quaternion.exp(theta))))
     return replace(state, bias=state.bias + theta)

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from strapdown import mekf
+from strapdown import estimation
 from strapdown.checks import Array
 from strapdown.diagnosis.causes import Cause
-from strapdown.mekf import ProcessNoise
+from strapdown.estimation.states import ProcessNoise
 from strapdown.records import ImuRecord
 from strapdown.vectors import VectorMeasurements
 
@@ -22,7 +22,7 @@ class Model:
 
     record: ImuRecord
     noise: ProcessNoise
-    initial: mekf.State
+    initial: estimation.State
 
     def with_series(self, sensor: str, change: Callable[[VectorMeasurements], VectorMeasurements]) -> Model:
         """Return the model with one sensor's series changed."""
@@ -49,7 +49,7 @@ class Run:
 
 def run(model: Model) -> Run:
     """Return the innovations of a model's filter."""
-    estimate = mekf.run(model.record, model.noise, model.initial, every=len(model.record.increments))
+    estimate = estimation.run(model.record, model.noise, model.initial, every=len(model.record.increments))
     white, log_variance = [], []
     for series in model.record.vectors:
         innovations = estimate.innovations[series.sensor]

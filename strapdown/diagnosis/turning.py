@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from strapdown import mekf
+from strapdown import estimation
 from strapdown.checks import Array
-from strapdown.mekf import ProcessNoise
+from strapdown.estimation.states import ProcessNoise
 from strapdown.records import ImuRecord
 
 PLAUSIBLE = 0.01
@@ -15,7 +15,7 @@ UNLIKELY = 0.01
 """Probability that anything is taken for motion where the body rests."""
 
 
-def turns(record: ImuRecord, noise: ProcessNoise, initial: mekf.State) -> Array:
+def turns(record: ImuRecord, noise: ProcessNoise, initial: estimation.State) -> Array:
     """Return by how much the body turned in each gyro interval (n, 3), rad, as far as that stands out of the gyro's noise.
 
     The increments themselves would not do. A filter that is given back a share of the gyro's noise has less of it, so the noise would
@@ -25,7 +25,7 @@ def turns(record: ImuRecord, noise: ProcessNoise, initial: mekf.State) -> Array:
     """
     from scipy.fft import dct, idct
 
-    estimate = mekf.run(record, noise, initial)
+    estimate = estimation.run(record, noise, initial)
     dt = np.diff(record.time)[:, None]
     free = record.increments / dt - 0.5 * (estimate.bias[1:] + estimate.bias[:-1])
     # Unlike Fourier's, the ends of the record need not meet; orthonormal, it leaves white noise as it is.

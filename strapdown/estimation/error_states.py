@@ -134,6 +134,8 @@ class ErrorStates:
 
     def _chained(self, dt: float) -> tuple[Array, Array]:
         """Return Φ and Q of states in chains: of a step short enough for the kernel's series, doubled as often as it takes."""
+        if dt == 0.0:  # where the series divides by dt
+            return np.eye(self.size), np.zeros((self.size, self.size))
         decay, density = np.asarray(self.decay, np.float64), np.asarray(self.density, np.float64)
         chains = np.stack([np.asarray(self.feed, np.float64), density], axis=1)
         doublings = max(0, int(np.ceil(np.log2(max(np.max(decay) * dt / MOST_CHAIN_DECAY, 1e-9)))))

@@ -8,23 +8,20 @@
 :class:`Monitor`
     A running mean of the normalised innovation squared, whose excursions are reported with their times.
 
-They are options of :func:`strapdown.mekf.run` and of :class:`strapdown.mekf.StepFilter`, and of their like in :mod:`strapdown.augmented`.
+They are options of :func:`strapdown.estimation.run` and of :class:`strapdown.estimation.StepFilter`, and of their like in :mod:`strapdown.estimation`.
 """
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from strapdown import quaternion
 from strapdown.checks import Array, InputError, count, finite, one_of, positive
 from strapdown.kernels import robust_gate
-from strapdown.kernels.robust_step import ONE_AXIS, RELINEARIZED, SETTLED, TURN_ASIDE, UNKNOWN, UNKNOWN_TILT
 from strapdown.records import Event
 
 UNIFORM_SIGMA = robust_gate.UNIFORM_SIGMA
@@ -223,147 +220,3 @@ class Monitor:
             )
             for first, last in edges.reshape(-1, 2)
         ]
-
-
-# ------------------------------------------------------------------------- the same update as the kernels', in matrices, for the step face
-
-Rows = tuple[Array, Array, Array, float, float]
-"""Residual (d,), H (d, k) of the first k states, covariance (d, d); of a direction or vector the angle θ from the predicted one, rad, and
-θ over the length of its part across (of other kinds 0 and 1)."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Linearised:
-    """A measurement as seen from the state that an update is linearised at: its attitude, or with optional states all of it."""
-
-    attitude: Array
-    """q_fb (4,)."""
-    covariance: Array
-    """The prior's P (n, n), moved there."""
-    prior: Array
-    """Where the prior's mean lies, seen from there (k,): of the attitude, rad, k = 3, or of all n states."""
-    residual: Array
-    H: Array
-    """(d, k)."""
-    noise: Array
-    """Covariance of the residual (d, d)."""
-    angle: float = 0.0
-    """Of a direction or vector the angle from the predicted one, rad."""
-    converged: bool = True
-    """Whether the linearisations came to rest."""
-
-    @property
-    def innovation(self) -> Array:
-        """The residual less what the prior predicts (d,)."""
-        return self.residual - self.H @ self.prior
-
-    @property
-    def predicted(self) -> Array:
-        """H P Hᵀ (d, d)."""
-        k = len(self.prior)
-        return np.asarray(self.H @ self.covariance[:k, :k] @ self.H.T)
-
-    @property
-    def nis(self) -> float:
-        """Normalised innovation squared."""
-        return float(self.innovation @ np.linalg.solve(self.predicted + self.noise, self.innovation))
-
-    def acceptable(self, threshold: float) -> bool:
-        """Return whether a gate of this threshold takes it in; a direction beyond a right angle never, which the rows across do not see."""
-        behind = len(self.residual) == 2 and self.angle > 0.5 * math.pi and threshold < math.inf
-        return self.converged and self.nis <= threshold and not behind
-
-    def weight(self, robust: Robust) -> float:
-        """Return the weight of the measurement under a robust update."""
-        parameter, numerator = robust.parameters[len(self.residual) - 1]
-        w = 1.0
-        for _ in range(robust.iterations):
-            R = self.noise / w
-            gain = R @ np.linalg.inv(self.predicted + R)
-            r = gain @ self.innovation
-            distance = float(r @ np.linalg.solve(self.noise, r))
-            if robust.kind == "huber":
-                limit = float(parameter)
-                w = 1.0 if distance <= limit else math.sqrt(limit / distance)
-            else:
-                spread = float(np.trace(np.linalg.solve(self.noise, R - gain @ R)))
-                w = float(numerator / (parameter + distance + spread))
-        return w
-
-
-def linearise(
-    rows: Callable[..., Rows],
-    attitude: Array,
-    covariance: Array,
-    passes: int,
-    threshold: float,
-) -> Linearised:
-    """Return a measurement seen from the state that its update leads to, by at most ``passes`` linearisations; one is the plain filter.
-
-    ``rows`` tells the measurement at an attitude. The method is that of :func:`strapdown.kernels.robust_step.take_in`, which tells its
-    reasons.
-    """
-    now, P, prior = attitude, covariance, np.zeros(3)
-    unknown = np.trace(covariance[:3, :3]) >= UNKNOWN
-    tolerance = SETTLED if unknown else RELINEARIZED
-    done, trials, first = 1, 0, None
-    while True:
-        residual, H, noise, angle, far = rows(now)
-        seen = Linearised(attitude=now, covariance=P, prior=prior, residual=residual, H=H, noise=noise, angle=angle)
-        if passes == 1:
-            return seen
-        first = first or seen
-        # The arc replaces the chord in the rows made independent, the first two of them.
-        lower = np.linalg.cholesky(noise)
-        lower = lower / np.diag(lower)
-        stretch = np.array([far, far, 1.0])[: len(residual)]
-        from_afar = lower @ (stretch * np.linalg.solve(lower, residual)) - H @ prior
-        step = prior + P[:3, :3] @ H.T @ np.linalg.solve(seen.predicted + noise, from_afar)
-        converged = bool(step @ step < tolerance**2)
-        if converged or done >= passes:
-            seen = seen if converged else replace(first, converged=False)
-            if seen.acceptable(threshold) or trials == 2 or not unknown:
-                return seen
-            trials += 1
-            done, now = 0, attitude
-            step = math.copysign(TURN_ASIDE, trials - 1.5) * _least_certain(covariance)
-        now = quaternion.normalize(quaternion.multiply(now, quaternion.exp(step)))
-        P, prior = seen_from(quaternion.multiply(quaternion.conjugate(attitude), now), covariance)
-        done += 1
-
-
-def seen_from(q: Array, covariance: Array) -> tuple[Array, Array]:
-    """Return the P (6, 6) of a prior at the attitude that lies the turn q from its mean, and where the mean lies seen from there (3,), rad.
-
-    The method is that of :func:`strapdown.kernels.robust_step.seen_from`, which tells its reasons.
-    """
-    A = covariance[:3, :3]
-    axis = _least_certain(covariance)
-    largest = float(axis @ A @ axis)
-    turn, tilt = 0.0, quaternion.log(q)
-    if largest > ONE_AXIS * (np.trace(A) - largest):
-        turn = 2.0 * math.atan2(float(axis @ q[1:]), float(q[0]))
-        tilt = quaternion.log(quaternion.multiply(quaternion.exp(-turn * axis), q))
-        turn = (turn + math.pi) % (2.0 * math.pi) - math.pi
-    else:
-        axis = np.zeros(3)
-    halfway = quaternion.to_matrix(quaternion.exp(-0.5 * tilt))
-    whole = halfway @ halfway @ axis
-    G = np.eye(len(covariance))
-    G[:3, :3] = halfway + np.outer(whole - halfway @ axis, axis)
-    return G @ covariance @ G.T, -turn * whole - tilt
-
-
-def tilt_unknown(attitude: Array, covariance: Array) -> bool:
-    """Return whether the turns about the two horizontal fixed axes are so uncertain that a heading tells nothing."""
-    R = quaternion.to_matrix(attitude)[:2]
-    return float(np.trace(R @ covariance[:3, :3] @ R.T)) > UNKNOWN_TILT
-
-
-def _least_certain(covariance: Array) -> Array:
-    """Return the unit vector along which the attitude variance is largest, near enough: powers of it applied to a vector."""
-    v = np.array([0.6, 0.48, 0.64])
-    for _ in range(20):
-        v = covariance[:3, :3] @ v
-        v /= np.linalg.norm(v)
-    return v

@@ -287,3 +287,16 @@ def turning_matrix(chains: Array, size: int, before: Array, after: Array) -> Arr
         # A turn of the columns of the identity's rows: Tᵀ, by rows.
         augmented_step.turn_columns(chains, augmented_step.fixed_turn(tuple(before), tuple(after)), T, size)
     return T.T
+
+
+def aged_prior(
+    error_states: tuple[ErrorStates, ...], values: Array, covariance: Array, dt: float
+) -> tuple[Array, Array]:
+    """Return values (m,) and covariance (m, m) of the error states after dt, s, in which nothing was measured."""
+    transition, driven = np.zeros((2, len(values), len(values)))
+    first = 0
+    for one in error_states:
+        own = slice(first, first + one.size)
+        transition[own, own], driven[own, own] = one.transition(dt), one.process_noise(dt)
+        first += one.size
+    return transition @ values, transition @ covariance @ transition.T + driven

@@ -226,7 +226,7 @@ def run_recovering(
     """
     check_arguments(record=record, process_noise=process_noise, initial=initial, robust=robust, monitor=monitor)
     count("hypotheses", hypotheses, least=8)
-    instance("gate", gate, Gate, "give robustness.Gate(probability=0.999)")
+    instance("gate", gate, Gate, "give estimation.Gate(probability=0.999)")
 
     def filtered(part: ImuRecord, state: State, gate: Gate) -> Estimate:
         return estimation.run(

@@ -142,9 +142,9 @@ def observability(
 ) -> Observability:
     """Return what a record shows of each state of the filter with these blocks.
 
-    The same record and belief as for :func:`strapdown.augmented.run`; the model is linearised along the smoothed attitude, with no
+    The same record and belief as for :func:`strapdown.estimation.run`; the model is linearised along the smoothed attitude, with no
     calibration errors. A direction counts as observed from ``threshold`` on: at 1, the record tells as much of it as the prior. Singular
-    values are good to about 1e7; a state that forgets (:class:`strapdown.augmented.GaussMarkov`) is judged by what the record tells of
+    values are good to about 1e7; a state that forgets (:class:`strapdown.error_states.GaussMarkov`) is judged by what the record tells of
     its first value.
     """
     blocks = modelling.as_blocks(blocks)

@@ -15,7 +15,7 @@ from strapdown.kernels.machine import compiled
 from strapdown.records import Innovations
 from strapdown.vectors import KINDS, VectorMeasurements, triad
 
-_KIND_CODES = {
+KIND_CODES = {
     "direction": measurement.DIRECTION,
     "vector": measurement.VECTOR,
     "heading": measurement.HEADING,
@@ -152,7 +152,7 @@ def schedule(
     for series in vectors:
         if series.anisotropic and not anisotropic:
             raise InputError(
-                f"{series.sensor}: this filter takes one sigma a sample, not sigma_axes or covariance; use mekf.run, or give sigma"
+                f"{series.sensor}: this filter takes one sigma a sample, not sigma_axes or covariance; use estimation.run, or give sigma"
             )
     parts = [_scheduled(series, start, end) for series in vectors]
     bounds = np.cumsum([0, *(len(part.time) for part in parts)])
@@ -163,7 +163,7 @@ def schedule(
         series_sigma=tuple(_plain(part.sigma) for part in parts),
         standing_noise=_joined([part.noise for part in parts], (0, 6)) if any(s.anisotropic for s in vectors) else None,
         bounds=bounds,
-        codes=np.array([_KIND_CODES[series.kind] for series in vectors], np.uint8),
+        codes=np.array([KIND_CODES[series.kind] for series in vectors], np.uint8),
         frames=np.array(
             [(first, part.moving) for first, part in zip(first_frames, parts, strict=False)], np.int64
         ).reshape(-1, 2),

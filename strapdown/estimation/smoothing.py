@@ -202,7 +202,8 @@ class _Smoother:
                 reruns.append(None)
                 continue
             bias, variance, counts = recovery_segments.restarted(gate, memory)
-            values, P = _aged(self.problem.error_states, memory, one.since)
+            age = one.since - memory.start
+            values, P = modelling.aged_prior(self.problem.error_states, memory.values, memory.covariance, age)
             stop = recovery_segments.stops(record.time, [one])
             lost = recovery_segments.starts(stop, event_time, segments)[np.searchsorted(stop, one.since)]
             whole = np.diag(np.concatenate([variance, np.zeros(len(values))]))
@@ -226,18 +227,6 @@ class _Smoother:
         """Return the filter's pass over a part of the record."""
         problem = forward.prepared(part, self.problem.process_noise, state, self.problem.error_states)
         return forward.filtered(problem, replace(options, every=len(part.time), full_covariance=False))
-
-
-def _aged(error_states: tuple[ErrorStates, ...], memory: GateMemory, time: float) -> tuple[Array, Array]:
-    """Return values and covariance of the error states' prior at a time."""
-    values, P, first = memory.values.copy(), memory.covariance, 0
-    transition, driven = np.eye(len(values)), np.zeros((len(values), len(values)))
-    for one in error_states:
-        own = slice(first, first + one.size)
-        transition[own, own] = one.transition(time - memory.start)
-        driven[own, own] = one.process_noise(time - memory.start)
-        first += one.size
-    return transition @ values, transition @ P @ transition.T + driven
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 The rules of :class:`strapdown.estimation.gating.Gate`, of which none depends on what a state looks like. They work on what a gate remembers:
 ``memory`` (``MEMORY``,) of the challenger, and ``standing`` (sensors, ``STANDING``). The record loops of both filters call them compiled
 (:mod:`strapdown.kernels.robust_loop`, :mod:`strapdown.kernels.augmented_robust`), the step faces as they are, by
-:mod:`strapdown.mekf.judging`.
+:mod:`strapdown.estimation.judging`.
 
 Of each measurement :func:`judge_filter` counts what the filter has made of it, and may ask for a challenger (:func:`begin_challenge`); then
 :func:`judge_challenger` what the challenger has made of it. One that is too narrow is made wider where :func:`may_widen` says so; one that

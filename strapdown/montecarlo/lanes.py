@@ -25,8 +25,10 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import flicker, mekf, quaternion, setup, vectors
+from strapdown import estimation, flicker, quaternion, setup, vectors
 from strapdown.checks import Array, count
+from strapdown.estimation.schedule import Schedule, schedule
+from strapdown.estimation.states import covariance_matrices
 from strapdown.gyro import GyroSpec
 from strapdown.kernels import gyro_errors, machine, montecarlo_run, montecarlo_statistics
 from strapdown.kernels.machine import compiled
@@ -122,7 +124,7 @@ class _Prepared:
     """Arguments of :func:`strapdown.kernels.montecarlo_run.advance` from the edges to the outliers."""
     record: ImuRecord
     """The filter's steps without any noise; its series tell nominal σ."""
-    events: mekf.Schedule
+    events: Schedule
     truth: Array
     """True attitudes at the epochs (m, 4)."""
     degrees: Counts
@@ -175,7 +177,7 @@ def _prepare(plan: Plan) -> _Prepared:
     series = tuple(_nominal(sensor, scenario, plan.seed) for sensor in scenario.sensors)
     record = replace(steps, vectors=series)
     believed = setup.believed(replace(quiet, vectors=series), plan.setup)
-    events = mekf.schedule(believed.vectors, float(record.time[0]), float(record.time[-1]))
+    events = schedule(believed.vectors, float(record.time[0]), float(record.time[-1]))
     values = [_exact(sensor, scenario, own) for sensor, own in zip(scenario.sensors, series, strict=True)]
     real = _real(plan)
     shared = (
@@ -309,7 +311,7 @@ def _exact(sensor: Any, scenario: Scenario, series: VectorMeasurements) -> tuple
     return values, np.repeat(sensor.sigma / length[:, None], 3, axis=1), 1.0 / length
 
 
-def _event_terms(plan: Plan, events: mekf.Schedule, values: list[tuple[Array, Array, Array]]) -> tuple[Any, ...]:
+def _event_terms(plan: Plan, events: Schedule, values: list[tuple[Array, Array, Array]]) -> tuple[Any, ...]:
     """Return what the kernel wants of the measurements and sensors."""
     m = len(events.time)
     exact, sigma = np.zeros((m, 4)), np.zeros((m, 3))
@@ -470,8 +472,8 @@ def run_chunk(plan: Plan, first_run: int, runs: int, *, width: int | None = None
         runs=runs,
         finite=finite,
         error_sum=total[:, :6],
-        error_product_sum=mekf.covariance_matrices(total[:, 6:27]),
-        covariance_sum=mekf.covariance_matrices(total[:, 27:48]),
+        error_product_sum=covariance_matrices(total[:, 6:27]),
+        covariance_sum=covariance_matrices(total[:, 27:48]),
         nees_sum=total[:, 48:51],
         log_nees_sum=_total(binades * math.log(2.0) - 0.5 * minus_two_log(products)),
         coverage=coverage,
@@ -530,7 +532,7 @@ def replay(plan: Plan, run: int, *, width: int = 1) -> Replay:
         ),
         truth=truth,
     )
-    covariance = mekf.covariance_matrices(kept[:, 7:28])
+    covariance = covariance_matrices(kept[:, 7:28])
     rows = group.innovations.reshape(-1, 6, width)[:, :, 0]
     estimate = Estimate(
         time=record.time,
@@ -548,7 +550,7 @@ def replay(plan: Plan, run: int, *, width: int = 1) -> Replay:
         },
         skipped=events.skipped,
     )
-    initial = mekf.State(attitude=kept[0, :4], bias=kept[0, 4:7], covariance=covariance[0])
+    initial = estimation.State(attitude=kept[0, :4], bias=kept[0, 4:7], covariance=covariance[0])
     return Replay(record=record, initial=initial, estimate=estimate)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from strapdown import consistency, mekf, quaternion, setup
+from strapdown import consistency, estimation, quaternion, setup
 from strapdown.checks import Array, InputError, count
 from strapdown.gyro import GyroSpec
 from strapdown.montecarlo.plan import Dispersions, Plan
@@ -47,10 +47,10 @@ def supports(plan: Plan) -> str | None:
 
 def start(
     record: ImuRecord, filter_setup: FilterSetup, seed: int, run: int, dispersions: Dispersions | None = None
-) -> mekf.State:
+) -> estimation.State:
     """Return the initial state of one run: the truth, off by errors drawn from the filter's own prior, or as the dispersions say."""
     if record.truth is None:
-        raise InputError("record has no truth to start from; simulate one, or give an initial state to mekf.run")
+        raise InputError("record has no truth to start from; simulate one, or give an initial state to estimation.run")
     given = Dispersions() if dispersions is None else dispersions
     draw = generator(seed, run, "initial error").standard_normal(6)
     attitude_sigma = filter_setup.attitude_sigma if given.attitude_sigma is None else given.attitude_sigma

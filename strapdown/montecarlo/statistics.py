@@ -45,7 +45,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from strapdown import consistency, mekf
+from strapdown import consistency, estimation
 from strapdown.checks import Array, InputError
 from strapdown.consistency import Verdict
 from strapdown.records import Estimate, ImuRecord
@@ -98,7 +98,7 @@ class Replay:
 
     record: ImuRecord
     """What the sensors gave, with the truth."""
-    initial: mekf.State
+    initial: estimation.State
     """Where the filter started."""
     estimate: Estimate
     """What the filter made of it, at every step, with whole covariances."""

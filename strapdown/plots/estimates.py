@@ -7,7 +7,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from strapdown import quaternion
-from strapdown.augmented import AugmentedEstimate
 from strapdown.checks import Array
 from strapdown.consistency import ReferenceErrors, errors
 from strapdown.plots.decimation import decimated
@@ -65,7 +64,7 @@ def estimate_overview(estimate: Estimate, *, title: str = "") -> Figure:
     return figure
 
 
-def states_over_time(estimate: AugmentedEstimate, *, title: str = "") -> Figure:
+def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:
     """Draw the optional states over time inside their ±3σ, one axes a block and unit, in the states' units."""
     panels = [
         (name, block, unit, [k for k, one in enumerate(block.units) if one == unit])

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from strapdown import setup
-from strapdown.setup.states import States
 from strapdown.consistency import Judgement
 from strapdown.report import page
 from strapdown.scenarios import Scenario
+from strapdown.setup.states import States
 
 
 def verdict(judgement: Judgement) -> str:

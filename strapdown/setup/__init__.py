@@ -84,7 +84,7 @@ class FilterSetup:
     def __post_init__(self) -> None:
         """Check every number."""
         if self.states is not None and not isinstance(self.states, States):
-            raise InputError(f"states is {self.states!r}; it must be augmented.States, or None")
+            raise InputError(f"states is {self.states!r}; it must be states.States, or None")
         positive("attitude_sigma", self.attitude_sigma, unit="rad")
         positive("bias_sigma", self.bias_sigma, unit="rad/s")
         positive("measurement_sigma_factor", self.measurement_sigma_factor)

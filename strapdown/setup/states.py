@@ -75,7 +75,7 @@ class SensorStates:
     lever_arm_sigma: Entries = 0.0
     """σ of the place of an accelerometer from the point that does not accelerate, body axes, one or one an axis, m."""
     velocity_time: float = 0.0
-    """Of an accelerometer on a moving hand, whose velocity is bounded (:class:`strapdown.augmented.BoundedVelocity`): how long a velocity
+    """Of an accelerometer on a moving hand, whose velocity is bounded (:class:`strapdown.error_states.BoundedVelocity`): how long a velocity
     lasts, s. With it two of the next three."""
     velocity_sigma: float = 0.0
     """Stationary σ of each component of the velocity, m/s."""

@@ -12,8 +12,9 @@ from typing import Literal
 
 import numpy as np
 
-from strapdown import consistency, mekf
+from strapdown import consistency
 from strapdown.checks import Array, InputError, one_of
+from strapdown.estimation.states import covariance_matrices
 from strapdown.setup import FilterSetup
 from strapdown.tuning.innovations import MOST, STEP, Case, Composite, Derivatives, Likelihood, likelihood
 
@@ -51,7 +52,7 @@ class ErrorObjective(Composite):
         bias = states[..., 4:7] if case.true_bias is None else case.true_bias[epochs][:, None]
         error = consistency.errors(states[..., :4], states[..., 4:7], case.true_attitude[epochs][:, None], bias)
         n = 3 if case.true_bias is None or self.measure == "rmse" else 6
-        return error[..., :n], mekf.covariance_matrices(states[..., 7:])[..., :n, :n]
+        return error[..., :n], covariance_matrices(states[..., 7:])[..., :n, :n]
 
     def _likelihood(self, error: Array, P: Array) -> Derivatives:
         scale = np.sqrt(np.einsum("mii->mi", P[:, 0]))  # rad beside rad/s

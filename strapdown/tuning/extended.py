@@ -25,7 +25,7 @@ import numpy as np
 
 from strapdown import setup, units
 from strapdown.checks import Array, InputError, count, one_of
-from strapdown.mekf import State
+from strapdown.estimation.states import State
 from strapdown.records import ImuRecord
 from strapdown.setup import FilterSetup
 from strapdown.setup.states import VELOCITY, Entries, SensorStates, States
@@ -43,7 +43,7 @@ GYRO = {
     "gyro.drift_sigma": "gyro_drift_sigma",
     "gyro.drift_time": "gyro_drift_time",
 }
-"""Parameters of the gyro's states, and the fields of :class:`strapdown.augmented.States` that they scale."""
+"""Parameters of the gyro's states, and the fields of :class:`strapdown.states.States` that they scale."""
 SENSOR = {
     "bias_sigma": "bias_sigma",
     "correlated_sigma": "correlated_sigma",
@@ -51,7 +51,7 @@ SENSOR = {
     "lever_sigma": "lever_arm_sigma",
     **{name: name for name in VELOCITY},
 }
-"""Parameters of a sensor's states by what follows its name and a dot, and the fields of :class:`strapdown.augmented.SensorStates`."""
+"""Parameters of a sensor's states by what follows its name and a dot, and the fields of :class:`strapdown.states.SensorStates`."""
 LARGEST_SCALE = 0.1
 """σ of scale factors and misalignments from which on a filter that is linear in them makes no sense: noise would pass for a turn."""
 QUICKEST, SLOWEST = 0.05, 100.0
@@ -335,4 +335,6 @@ def _check_case(case: Case, chosen: FilterSetup) -> None:
             f"{what} has no measurement between {first:g} and {last:g} s; tuning needs vector measurements"
         )
     if not isinstance(case.initial, State):
-        raise InputError(f"{what}: initial is {case.initial!r}; it must be a mekf.State, which tells of the whole bias")
+        raise InputError(
+            f"{what}: initial is {case.initial!r}; it must be a estimation.State, which tells of the whole bias"
+        )

@@ -17,8 +17,8 @@ import numpy as np
 
 from strapdown import gyro, setup, units
 from strapdown.checks import Array, InputError, one_of, positive
+from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
-from strapdown.mekf import ProcessNoise
 from strapdown.records import ImuRecord
 from strapdown.setup import FilterSetup, Sigma
 

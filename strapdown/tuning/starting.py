@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from strapdown import ahrs, mekf, quaternion, setup
+from strapdown import ahrs, estimation, quaternion, setup
 from strapdown.ahrs import AhrsParameters
 from strapdown.checks import InputError
 from strapdown.gyro import GyroSpec
@@ -45,7 +45,7 @@ def recording_case(recording: Recording, parameters: AhrsParameters | None = Non
 def record_case(record: ImuRecord, chosen: FilterSetup, *, name: str = "", seed: int | None = None) -> Case:
     """Return a record with where the filter starts on it: from its first measurements, or off its truth by errors drawn with ``seed``.
 
-    Without a seed the attitude is that of the first measurements (:func:`strapdown.mekf.first_state`), and the bias zero; a setup whose
+    Without a seed the attitude is that of the first measurements (:func:`strapdown.estimation.first_state`), and the bias zero; a setup whose
     initial σ are large against the measurements forgets both at once.
     """
     if seed is not None and record.truth is not None:
@@ -54,7 +54,7 @@ def record_case(record: ImuRecord, chosen: FilterSetup, *, name: str = "", seed:
         bias = record.truth.bias[0] - chosen.bias_sigma * draw[3:]
         return Case(record=record, initial=setup.initial_state(chosen, attitude, bias), name=name)
     try:
-        first = mekf.first_state(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
+        first = estimation.first_state(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
     except InputError as error:
         raise InputError(f"{name or 'record'}: {error}") from None
     return Case(record=record, initial=setup.initial_state(chosen, first.attitude), name=name)

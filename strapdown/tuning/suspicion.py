@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import diagnosis, mekf, setup
+from strapdown import diagnosis, estimation, setup
 from strapdown.checks import Array
 from strapdown.consistency import Judgement
 from strapdown.consistency.bounds import tail
@@ -26,7 +26,7 @@ from strapdown.consistency.judgement import concluded
 from strapdown.diagnosis import Cause
 from strapdown.diagnosis.likelihood import Model, log_p, run
 from strapdown.diagnosis.turning import PLAUSIBLE, turns
-from strapdown.mekf import ProcessNoise
+from strapdown.estimation.states import ProcessNoise
 from strapdown.records import Estimate, ImuRecord, cut
 from strapdown.setup import FilterSetup
 from strapdown.tuning.fitting import Tuning
@@ -188,7 +188,7 @@ def accepted(record: ImuRecord, estimate: Estimate) -> ImuRecord:
     return replace(record, vectors=tuple(kept))
 
 
-def scale_factor(record: ImuRecord, noise: ProcessNoise, initial: mekf.State) -> ScaleFactor:
+def scale_factor(record: ImuRecord, noise: ProcessNoise, initial: estimation.State) -> ScaleFactor:
     """Return the scale factor of the gyro that explains most beside a filter of this noise, or of less walk of the bias.
 
     ``record`` as the filter takes it (:func:`strapdown.setup.believed`).

@@ -11,12 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from strapdown import mekf
 from strapdown.checks import Array, array, instance
-from strapdown.family import stepping
-from strapdown.kernels import family_complementary
-from strapdown.kernels.machine import compiled
-from strapdown.mekf import ProcessNoise, Schedule, State
+from strapdown.estimation.filters import extended
+from strapdown.estimation.schedule import Schedule
+from strapdown.estimation.states import ProcessNoise, State
+from strapdown.kernels.filters import complementary as kernel
 from strapdown.records import Estimate, ImuRecord
 
 
@@ -52,7 +51,7 @@ def steady_gains(record: ImuRecord, process_noise: ProcessNoise, initial: State)
     A gain that is fixed must serve the start as well as the end. It is designed for random walks that would carry attitude and bias through
     their initial standard deviations over the record, on top of the gyro's own.
     """
-    events, _ = stepping.events_and_steps(record, 1)
+    events = extended.checked_schedule(record, process_noise, initial, 1)
     return _steady_gains(record, events, process_noise, initial)
 
 
@@ -89,34 +88,16 @@ def run(
     Parameters
     ----------
     record, process_noise, initial, every, full_covariance
-        As :func:`strapdown.family.run`.
+        As :func:`strapdown.estimation.filters.run`.
     gains : Gains, optional
         Default: :func:`steady_gains`.
     """
-    stepping.check(record, process_noise, initial)
-    events, steps = stepping.events_and_steps(record, every)
+    events = extended.checked_schedule(record, process_noise, initial, every)
     if gains is not None:
         instance("gains", gains, Gains, "give complementary.Gains(attitude=…, bias=…), or None")
     chosen = _steady_gains(record, events, process_noise, initial) if gains is None else gains
     sensors = len(events.sensors)
-    states, innovation = np.empty((len(steps.time), 28)), np.empty((len(events.time), 6))
-    compiled(family_complementary.run_complementary)(
-        steps.dt,
-        steps.increment,
-        steps.event,
-        steps.row,
-        process_noise.angle_random_walk**2,
-        process_noise.rate_random_walk**2,
-        events.kind,
-        events.vector_b,
-        events.body_noise,
-        events.reference,
-        events.sensor,
-        events.triads,
-        array("gains.attitude", chosen.attitude, (sensors,)),
-        array("gains.bias", chosen.bias, (sensors,)),
-        mekf.pack(initial.attitude, initial.bias, initial.covariance),
-        states,
-        innovation,
+    rows = np.stack(
+        [array("gains.attitude", chosen.attitude, (sensors,)), array("gains.bias", chosen.bias, (sensors,))]
     )
-    return stepping.estimate(events, steps, states, innovation, full_covariance)
+    return extended.run_scheduled(kernel, record, events, process_noise, initial, rows, every, full_covariance)

@@ -2,7 +2,7 @@
 
 The attitude error of each sigma point is three generalised Rodrigues parameters p about the central quaternion, body side,
 ``q_true = q ⊗ δq(p)``, scaled so that p is the rotation vector for small errors. Two points are not the paper's: the process noise is the
-exact one of :mod:`strapdown.mekf`, added after the propagation, where the paper adds half of a trapezoid before and half after; and a
+exact one of :mod:`strapdown.estimation`, added after the propagation, where the paper adds half of a trapezoid before and half after; and a
 direction enters with all three components (Shuster's trick: along the direction goes the mean of the two variances across it), its
 innovation told as its two degrees of freedom. A measured attitude enters as its own three parameters about the central quaternion, linear
 in the state: no spread of the points, however wide, cuts it at half a turn.
@@ -10,19 +10,22 @@ in the state: no spread of the points, however wide, cuts it at half a turn.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from filterpy.kalman import JulierSigmaPoints, unscented_transform
 from numpy.typing import ArrayLike
 
-from strapdown import mekf, quaternion
+from strapdown import quaternion
 from strapdown.checks import Array, InputError
-from strapdown.family import stepping
-from strapdown.kernels.family_turns import process_noise_over_any_turn
+from strapdown.estimation.filters import extended
+from strapdown.estimation.schedule import Schedule
+from strapdown.estimation.states import ProcessNoise, State, covariance_matrices, pack
+from strapdown.kernels.filter_step import process_noise as process_noise_of
 from strapdown.kernels.measurement import ATTITUDE, DIRECTION, HEADING, has_heading, heading_error
 from strapdown.kernels.rotation import quaternion_multiply
-from strapdown.mekf import ProcessNoise, Schedule, State
+from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.records import Estimate, ImuRecord
 
 _CONJUGATE = np.array([1.0, -1.0, -1.0, -1.0])
@@ -61,7 +64,7 @@ def run(
     Parameters
     ----------
     record, process_noise, initial, every, full_covariance
-        As :func:`strapdown.family.run`.
+        As :func:`strapdown.estimation.filters.run`.
     points : object, optional
         ``filterpy.kalman.JulierSigmaPoints`` or ``MerweScaledSigmaPoints`` of 6 states. Default: Julier's with κ = 1, the paper's λ, all
         weights positive.
@@ -72,8 +75,8 @@ def run(
         raise InputError(
             f"points {what}; give filterpy's sigma points of 6 states, three of attitude and three of bias"
         )
-    stepping.check(record, process_noise, initial)
-    events, steps = stepping.events_and_steps(record, every)
+    events = extended.checked_schedule(record, process_noise, initial, every)
+    steps = in_steps(record, events, every)
     q, b, P = initial.attitude, initial.bias, initial.covariance
     states, innovation = np.empty((len(steps.time), 28)), np.zeros((len(events.time), 6))
     noise = events.body_noise[:, _WHOLE].reshape(-1, 3, 3)
@@ -82,10 +85,57 @@ def run(
         if dt > 0.0:
             q, b, P = _predict(points, q, b, P, increment, dt, process_noise)
         if event >= 0:
-            q, b, P, innovation[event] = _update(points, q, b, P, events, event, noise[event])
+            place = events.row[event]
+            q, b, P, innovation[place] = _update(points, q, b, P, events, event, noise[event])
         if row >= 0:
-            states[row] = mekf.pack(q, b, P)
-    return stepping.estimate(events, steps, states, innovation, full_covariance)
+            states[row] = pack(q, b, P)
+    return extended.estimate(record, events, every, states, innovation, full_covariance)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Steps:
+    """Each step predicts over ``dt`` if that is greater than zero, then updates with an event if it has one, then keeps the state if asked."""
+
+    dt: Array
+    """s (k,)."""
+    increment: Array
+    """Integral of the measured rate over dt (k, 3), rad."""
+    event: np.ndarray
+    """Index of the measurement, −1: none."""
+    row: np.ndarray
+    """Row of the estimate that the state goes to, −1: none."""
+    time: Array
+    """Times of the rows (m,), s."""
+
+
+def in_steps(record: ImuRecord, events: Schedule, every: int) -> Steps:
+    """Return the steps that take a filter through a record."""
+    edges = record.time
+    # Both are in order already; at one time the events come first.
+    at_event = np.arange(len(events.time)) + np.searchsorted(edges, events.time, side="left")
+    at_edge = np.arange(len(edges)) + np.searchsorted(events.time, edges, side="right")
+    time = np.empty(len(at_event) + len(at_edge))
+    time[at_event], time[at_edge] = events.time, edges
+    event, row = np.full(len(time), -1), np.full(len(time), -1)
+    event[at_event] = np.arange(len(at_event))
+    row[at_edge[::every]] = np.arange(len(at_edge[::every]))
+    interval = np.empty(len(time), np.int64)
+    interval[at_event] = np.maximum(at_event - np.arange(len(at_event)) - 1, 0)
+    interval[at_edge] = np.maximum(np.arange(len(edges)) - 1, 0)
+    dt = np.diff(time, prepend=edges[0])
+    increment = record.increments[interval] * (dt / np.diff(edges)[interval])[:, None]
+    # Parts of a large turn end in steps that neither take in nor keep anything; the last part does.
+    parts = (np.linalg.norm(increment, axis=1) / LARGEST_ANGLE).astype(np.int64) + 1
+    whole = np.repeat(np.arange(len(dt)), parts)
+    last = np.append(whole[1:] != whole[:-1], True)
+    steps = Steps(
+        dt=dt[whole] / parts[whole],
+        increment=np.ascontiguousarray(increment[whole] / parts[whole, None]),
+        event=np.where(last, event[whole], -1),
+        row=np.where(last, row[whole], -1),
+        time=edges[::every],
+    )
+    return steps
 
 
 def _product(p: Array, q: Array) -> Array:
@@ -113,10 +163,10 @@ def _predict(
 
 def _process_noise(phi: Array, dt: float, process_noise: ProcessNoise) -> Array:
     """Return Q (6, 6) over a turn φ (3,) of any size."""
-    q11, q12, q22 = process_noise_over_any_turn(
+    q11, q12, q22 = process_noise_of(
         tuple(phi.tolist()), dt, process_noise.angle_random_walk**2, process_noise.rate_random_walk**2
     )
-    return mekf.covariance_matrices(np.array([*q11, *q12, q22, 0.0, 0.0, q22, 0.0, q22]))
+    return covariance_matrices(np.array([*q11, *q12, q22, 0.0, 0.0, q22, 0.0, q22]))
 
 
 def _moved(q: Array, mean: Array) -> Array:

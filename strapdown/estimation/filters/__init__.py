@@ -1,40 +1,42 @@
-"""The family of attitude filters on one interface.
+"""Other attitude filters on one interface.
 
 They can be compared in one line, which prints a table::
 
-    print(family.compare(record, process_noise, initial))
+    print(filters.compare(record, process_noise, initial))
 
-All of them estimate attitude and gyro bias from the same record, by the same schedule of measurements, with the same belief of the gyro,
+All of them estimate attitude and gyro bias from the same record, by the same schedule of measurements, with the same model of the gyro,
 and report their covariance in the body-side convention of the package, (δθ, δb). They differ in how they define the error:
 
-- ``mekf``: body side, ``q_true = q ⊗ exp(δθ)``, with the reset of the covariance (:mod:`strapdown.mekf`; the one to use);
+- ``mekf``: body side, ``q_true = q ⊗ exp(δθ)``, with the reset of the covariance (:mod:`strapdown.estimation.forward`; the one to use);
 - ``fixed-side``: ``q_true = exp(δφ) ⊗ q``, with its reset: the same filter in other coordinates;
 - ``right-invariant``: fixed-side without a reset, the "imperfect" invariant filter (Barrau & Bonnabel 2017);
 - ``two-frame``: right-invariant on the two-frames group, attitude and bias error both in fixed axes (Barrau & Bonnabel 2023);
+- ``equivariant``: that of two-frame, with the equivariant rows of directions (van Goor, Hamel & Mahony 2022; Fornasier et al. 2022);
 - ``geometric``: bias error in a common frame, body side (Andrle & Crassidis 2015);
+- ``schmidt``: body side, the gyro bias considered and not estimated (Schmidt 1966);
 - ``usque``: unscented, generalised Rodrigues parameters (Crassidis & Markley 2003);
 - ``mahony``: complementary, fixed gains (Mahony, Hamel & Pflimlin 2008).
 
 Every filter takes directions, vectors, headings and attitudes with every form of noise (:mod:`strapdown.vectors`). Mahony's gains are
 one number a sensor, whatever the shape of its noise; the covariance that it reports is that of those gains under that noise.
 
-They run over whole records only. A comparison needs no other face: what is fed sample by sample in a product is the MEKF
-(:class:`strapdown.mekf.StepFilter`: late measurements, gates, sensors declared beforehand), and seven copies of that would be seven to
-keep equal. Who wants to look inside one step finds it as plain functions on tuples in :mod:`strapdown.kernels.family_step`.
+They run over whole records only: sample by sample the MEKF is there (:class:`strapdown.estimation.StepFilter`).
 
-Modules: ``stepping`` the schedule of steps, ``extended`` the Kalman filters, ``unscented``, ``complementary``, ``comparison`` the table.
+To add a filter, write a module like those of :mod:`strapdown.kernels.filters`, which defines its error, and enter it in :data:`FILTERS`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import partial
 from typing import Protocol
 
-from strapdown import mekf
 from strapdown.checks import InputError, one_of
-from strapdown.family import complementary, extended, stepping, unscented
-from strapdown.family.comparison import Comparison
-from strapdown.mekf import ProcessNoise, State
+from strapdown.estimation import forward
+from strapdown.estimation.filters import complementary, extended, unscented
+from strapdown.estimation.filters.comparison import Comparison
+from strapdown.estimation.states import ProcessNoise, State
+from strapdown.kernels.filters import equivariant, fixed_side, geometric, right_invariant, schmidt, two_frame
 from strapdown.records import Estimate, ImuRecord, Truth
 
 __all__ = ["FILTERS", "Comparison", "Filter", "compare", "run"]
@@ -56,11 +58,13 @@ class Filter(Protocol):
 
 
 FILTERS: dict[str, Filter] = {
-    "mekf": mekf.run,
-    "fixed-side": extended.fixed_side,
-    "right-invariant": extended.right_invariant,
-    "two-frame": extended.two_frame,
-    "geometric": extended.geometric,
+    "mekf": forward.run,
+    "fixed-side": partial(extended.run, fixed_side),
+    "right-invariant": partial(extended.run, right_invariant),
+    "two-frame": partial(extended.run, two_frame),
+    "equivariant": partial(extended.run, equivariant),
+    "geometric": partial(extended.run, geometric),
+    "schmidt": partial(extended.run, schmidt),
     "usque": unscented.run,
     "mahony": complementary.run,
 }
@@ -76,7 +80,7 @@ def run(
     every: int = 1,
     full_covariance: bool = False,
 ) -> Estimate:
-    """Run one filter of the family over a whole record.
+    """Run one filter  over a whole record.
 
     Parameters
     ----------
@@ -98,7 +102,6 @@ def run(
         If the name is not known, or an argument is not what it should be.
     """
     one_of("filter", name, FILTERS)
-    stepping.check(record, process_noise, initial)
     return FILTERS[name](record, process_noise, initial, every=every, full_covariance=full_covariance)
 
 
@@ -111,7 +114,7 @@ def compare(
     every: int = 1,
     full_covariance: bool = False,
 ) -> Comparison:
-    """Run several filters of the family over one record; printed, the result is a table.
+    """Run several filters  over one record; printed, the result is a table.
 
     One record tells how filters differ on it, not which of them may be believed: for that :func:`strapdown.consistency.judge` an estimate,
     or look at many runs (``sims/filter_family.py``).

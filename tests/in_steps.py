@@ -1,0 +1,87 @@
+"""A record through the step-by-step filter, as the tests compare it with the compiled one."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from strapdown import estimation
+from strapdown.estimation.states import covariance_matrices
+from strapdown.estimation.step_filter import StepFilter
+from strapdown.kernels import filter_step
+
+
+def transition_and_noise(phi, dt, process_noise):
+    """Return Φ and Q (6, 6) of attitude and bias over a turn φ at constant rate, by the kernels' own formulas as matrices."""
+    turn = tuple(float(component) for component in phi)
+    phi11, phi12 = filter_step.transition(turn, dt)
+    q11, q12, q22 = filter_step.process_noise(
+        turn, dt, process_noise.angle_random_walk**2, process_noise.rate_random_walk**2
+    )
+    F = np.eye(6)
+    F[:3, :3] = np.reshape(phi11, (3, 3))
+    F[:3, 3:] = np.reshape(phi12, (3, 3))
+    return F, covariance_matrices(np.array([*q11, *q12, q22, 0.0, 0.0, q22, 0.0, q22]))
+
+
+def update(f, series, k, time=None):
+    """Give sample k of a series to a filter; return whether it was used."""
+    noise = {"covariance": series.covariances[k]} if series.kind != "heading" else {"sigma": series.sigma[k]}
+    given = {"sensor": series.sensor, "time": time, **noise}
+    if series.kind == "attitude":
+        return f.update_attitude(series.attitude[k], **given)
+    return getattr(f, f"update_{series.kind}")(series.vector_b[k], series.references_f[k], **given)
+
+
+def run(record, process_noise, initial, error_states=(), **options):
+    """Return what the step-by-step filter makes of a record: the states at every edge, and innovations, counts and events."""
+    sensors = [series.sensor for series in record.vectors]
+    f = StepFilter(process_noise, initial, error_states, time=record.time[0], sensors=sensors, **options)
+    events = sorted((t, i, k) for i, series in enumerate(record.vectors) for k, t in enumerate(series.time))
+    events = [event for event in events if event[0] >= record.time[0]]
+    rows, seen = [], {sensor: [] for sensor in sensors}
+
+    def give_until(end):
+        now = f.time
+        while events and events[0][0] <= end:
+            t, i, k = events.pop(0)
+            if t > now:
+                f.predict(delta * ((t - now) / whole), time=t)
+                now = t
+            series, skipped = record.vectors[i], sum(f.skipped.values())
+            update(f, series, k)
+            if sum(f.skipped.values()) == skipped:
+                seen[series.sensor].append((f.nis, f.weight, f.y, f.S))
+        return now
+
+    whole, delta = 0.0, np.zeros(3)
+    give_until(record.time[0])
+    rows.append((f.attitude, f.bias, f.values, f.P))
+    for n, delta in enumerate(record.increments):
+        end = record.time[n + 1]
+        whole = end - record.time[n]
+        now = give_until(end)
+        if end > now:
+            f.predict(delta * ((end - now) / whole), time=end)
+        rows.append((f.attitude, f.bias, f.values, f.P))
+    attitude, bias, values, P = (np.array(column) for column in zip(*rows, strict=True))
+    ends = np.cumsum([block.size for block in error_states])[:-1]
+    return SimpleNamespace(
+        attitude=attitude,
+        bias=bias,
+        values=dict(zip([block.name for block in error_states], np.split(values, ends, axis=1), strict=False)),
+        whole_covariance=P,
+        nis={sensor: np.array([one[0] for one in found]) for sensor, found in seen.items()},
+        weight={sensor: np.array([one[1] for one in found]) for sensor, found in seen.items()},
+        whitened={sensor: np.array([whitened(*one[2:]) for one in found]) for sensor, found in seen.items()},
+        refused={sensor: f.refused.get(sensor, 0) for sensor in sensors},
+        skipped={sensor: f.skipped.get(sensor, 0) for sensor in sensors},
+        events=tuple(sorted([*estimation.gaps(record.time), *f.events], key=lambda event: event.start)),
+        state=f.state(),
+    )
+
+
+def whitened(y, S):
+    """Return an innovation made independent in the order of its rows, over its standard deviations."""
+    return np.linalg.solve(np.linalg.cholesky(S), y)
