@@ -650,7 +650,9 @@ def test_the_smoother_is_the_textbook_one(option):
     one = estimation.smooth(record, NOISE, initial, blocks, full_covariance=True)
     q, b, c, P = reference_smoother(record, initial, blocks)
     sigma = np.sqrt(np.einsum("kii->ki", one.whole_covariance))
-    values = dict(zip(one.blocks, np.split(c, np.cumsum([block.size for block in blocks])[:-1], axis=1), strict=True))
+    values = dict(
+        zip(one.error_states, np.split(c, np.cumsum([block.size for block in blocks])[:-1], axis=1), strict=True)
+    )
     assert np.max(np.abs(one.errors(q, b, values)) / sigma) < 1e-8
     assert np.max(np.abs(scaled(one.whole_covariance - P, sigma))) < 1e-8
 

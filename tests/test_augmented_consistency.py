@@ -262,7 +262,7 @@ def test_an_acceleration_is_followed():
     record, sway, block = swaying(5, 0.5, 0.8)
     initial = estimation.initial_state(HAND.attitude(np.array(0.0)), attitude_sigma=0.01, bias_sigma=1e-3)
     noise = ProcessNoise(angle_random_walk=ARW, rate_random_walk=0.0)
-    found = estimation.run(record, noise, initial, (block,), every=2).blocks["acc disturbance"]
+    found = estimation.run(record, noise, initial, (block,), every=2).error_states["acc disturbance"]
     error = sway - found.values[1:]
     late = slice(200, None)
     assert np.sqrt(np.mean(error[late] ** 2)) < 0.2

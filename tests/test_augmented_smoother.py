@@ -253,7 +253,7 @@ CARRIED = {
 def distance_to_the_optimum(small: Small) -> np.ndarray:
     """Of attitude, bias and values at the edges (n + 1, 6 + m), over the smoother's σ."""
     found = estimation.smooth(small.record, small.noise, small.initial, small.blocks, full_covariance=True)
-    values = np.concatenate([block.values for block in found.blocks.values()], axis=1)
+    values = np.concatenate([block.values for block in found.error_states.values()], axis=1)
     guess = np.concatenate([np.zeros_like(found.bias), found.bias, values], axis=1)
     q, rest = optimum(small, guess, found.attitude)
     off = quaternion.log(quaternion.multiply(quaternion.conjugate(found.attitude), q))
@@ -289,7 +289,7 @@ def pushed(kind: str, runs: int) -> np.ndarray:
         rng = np.random.default_rng([run, 8])
         small = small_record((CARRIED[kind],), 0.03, seed=100 + run, late=True, off=rng.standard_normal(3))
         estimate = estimation.smooth(small.record, small.noise, small.initial, small.blocks, full_covariance=True)
-        told = next(iter(estimate.blocks.values())).values
+        told = next(iter(estimate.error_states.values())).values
         # Relative to the estimated attitude, of which alone it is known.
         turn = quaternion.to_matrix(quaternion.multiply(estimate.attitude, quaternion.conjugate(small.attitude)))
         true = np.einsum("kij,kjp->kip", turn, small.values.reshape(len(turn), 3, -1)).reshape(told.shape)
@@ -355,7 +355,7 @@ def difference(one, other, k=slice(None), j=slice(None)):
     sigma = np.sqrt(np.einsum("...ii->...i", other.whole_covariance[j]))
     off = quaternion.log(quaternion.multiply(quaternion.conjugate(one.attitude[k]), other.attitude[j]))
     parts = [off, one.bias[k] - other.bias[j]]
-    parts += [block.values[k] - other.error_states[name].values[j] for name, block in one.blocks.items()]
+    parts += [block.values[k] - other.error_states[name].values[j] for name, block in one.error_states.items()]
     P = (one.whole_covariance[k] - other.whole_covariance[j]) / (sigma[..., :, None] * sigma[..., None, :])
     return max(np.max(np.abs(np.concatenate(parts, axis=-1)) / sigma), np.max(np.abs(P)))
 
@@ -509,7 +509,7 @@ def test_the_prior_of_the_blocks_ages_as_the_filter_has_it():
     memory = filtering._first(begun, blocks, 3.0)
     aged, covariance = aged_prior(blocks, memory.values, memory.covariance, 5.0 - memory.start)
     sigma = np.sqrt(np.diag(ahead.whole_covariance[-1])[6:])
-    found = np.concatenate([block.values[-1] for block in ahead.blocks.values()])
+    found = np.concatenate([block.values[-1] for block in ahead.error_states.values()])
     np.testing.assert_allclose(aged / sigma, found / sigma, rtol=0, atol=1e-8)
     scale = np.outer(sigma, sigma)
     np.testing.assert_allclose(covariance / scale, ahead.whole_covariance[-1][6:, 6:] / scale, rtol=0, atol=1e-8)

@@ -271,7 +271,7 @@ def test_the_whole_bias_is_that_of_all_states():
     np.testing.assert_allclose(told.covariance, expected, rtol=1e-9, atol=1e-18)
     np.testing.assert_allclose(told.variance, np.einsum("kii->ki", expected), rtol=1e-11)
     np.testing.assert_allclose(
-        told.bias, whole.bias + sum(one.values for one in whole.blocks.values()), rtol=0, atol=1e-15
+        told.bias, whole.bias + sum(one.values for one in whole.error_states.values()), rtol=0, atol=1e-15
     )
     # The start is what it says of the whole bias, whatever the parts are.
     at_start = sum_of @ begin.covariance @ sum_of.T

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.linalg
-from strapdown.setup.states import from_table
 from strapdown.error_states import stationary_covariance
 from strapdown.model import assemble
 
@@ -28,7 +27,7 @@ from strapdown.gyro import GyroSpec
 from strapdown.kernels.robust_gate import WIDE_PASSES
 from strapdown.recordings import Recording, read
 from strapdown.records import ImuRecord
-from strapdown.setup.states import SensorStates, States
+from strapdown.setup.states import SensorStates, States, from_table
 from strapdown.units import DEGREE
 from strapdown.vectors import Accelerometer, VectorMeasurements
 

@@ -232,7 +232,7 @@ def test_an_estimate_of_a_setup_with_states_tells_of_them():
     start = setup.initial_state(believes, record.truth.attitude[0], record.truth.bias[0])
     estimate = setup.run(record, believes, start, every=10, full_covariance=True)
     assert estimate.covariance.shape == (301, 6, 6)
-    assert list(estimate.blocks) == ["gyro scale"]
+    assert list(estimate.error_states) == ["gyro scale"]
     plain = setup.run(record, dataclasses.replace(believes, states=None), start, every=10)
     assert np.all(estimate.variance[-1, 5] > 2.0 * plain.variance[-1, 5])
 
@@ -252,7 +252,7 @@ def test_smoothing_by_a_setup_is_that_of_the_smoother(states):
     if states:
         blocks = believes.states.blocks({series.sensor: series.kind for series in told.vectors})
         same = estimation.smooth(told, believes.process_noise, start, blocks, full_covariance=True)
-        assert list(found.blocks) == [block.name for block in blocks]
+        assert list(found.error_states) == [block.name for block in blocks]
     else:
         same = estimation.smooth(told, believes.process_noise, start, full_covariance=True)
     np.testing.assert_array_equal(found.attitude, same.attitude)

@@ -246,7 +246,7 @@ def _estimate_record(
     _clear(out)
     write_estimate(paths[0], result, attributes, truth=truth)
     figures = {"estimate.png": plots.estimate_overview(result, title=path.name)}
-    if isinstance(result, Estimate) and result.blocks:
+    if isinstance(result, Estimate) and result.error_states:
         paths.append(out / "states.json")
         write_json(paths[-1], {"source": str(path), **_tell_states(result, used)})
         figures["states.png"] = plots.states_over_time(result, title=path.name)
@@ -291,7 +291,7 @@ def _states(result: Any) -> dict[str, Any]:
             "sigma": block.sigma[-1].tolist(),
             "first_sigma": block.sigma[0].tolist(),
         }
-        for name, block in result.blocks.items()
+        for name, block in result.error_states.items()
     }
 
 
@@ -301,7 +301,7 @@ def _tell_states(result: Any, record: ImuRecord) -> dict[str, Any]:
 
     of_directions = tuple(f"{one.sensor} " for one in record.vectors if one.kind in ("direction", "heading"))
     rows = table("Optional states at the end", "state", "", "unit", "value", "σ", "σ at the start", left=3)
-    for name, block in result.blocks.items():
+    for name, block in result.error_states.items():
         for k, (component, unit) in enumerate(zip(block.components, block.units, strict=True)):
             kind = " ".join(name.split()[:2])
             word, size = _STATE_UNITS.get(kind, {}).get(unit, (unit, 1.0))

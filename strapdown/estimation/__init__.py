@@ -18,9 +18,15 @@ tangent space.
     The smoothers; ``recovery_segments`` what they make of recoveries.
 ``observability``
     What a record shows of each state.
+``step_filter``
+    The filter step by step, on filterpy; ``step_gate`` its gate.
 ``multiple_model``
     Unknown start, one vector at a time.
+``filters``
+    Other filters on the same interface, for comparison.
 """
+
+from typing import TYPE_CHECKING, Any
 
 from strapdown.estimation.forward import gaps, run, run_part
 from strapdown.estimation.gating import Gate, Monitor, Robust
@@ -36,6 +42,7 @@ __all__ = [
     "ProcessNoise",
     "Robust",
     "State",
+    "StepFilter",
     "first_state",
     "gaps",
     "initial_state",
@@ -46,3 +53,14 @@ __all__ = [
     "smooth",
     "with_error_states",
 ]
+
+if TYPE_CHECKING:
+    from strapdown.estimation.step_filter import StepFilter
+
+
+def __getattr__(name: str) -> Any:
+    if name == "StepFilter":  # filterpy loads when it is needed
+        from strapdown.estimation.step_filter import StepFilter
+
+        return StepFilter
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -68,7 +68,7 @@ def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:
     """Draw the optional states over time inside their ±3σ, one axes a block and unit, in the states' units."""
     panels = [
         (name, block, unit, [k for k, one in enumerate(block.units) if one == unit])
-        for name, block in estimate.blocks.items()
+        for name, block in estimate.error_states.items()
         for unit in dict.fromkeys(block.units)
     ]
     figure, grid = new_figure(len(panels), 1, size=(9.0, 1.2 + 1.8 * len(panels)), sharex=True)
