@@ -533,7 +533,7 @@ class _Random:
             amplitudes[c] = amplitude
             for a in range(3):
                 cross[c, 3 + a, a, :n] = -(amplitude[a] ** 2) * projected
-            self.error_states[source][[15, 18, 20]] = amplitude**2 * (gains @ projected)
+            self.blocks[source][[15, 18, 20]] = amplitude**2 * (gains @ projected)
         sources = np.array([source for source, *_ in self.shapes], np.int64)
         return amplitudes, table[0], table[1], table[2], cross, sources
 

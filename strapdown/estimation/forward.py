@@ -6,8 +6,9 @@ digits, and with error states, as its triangular factor (:mod:`strapdown.kernels
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -106,9 +107,14 @@ class Passed:
     """A record that the filter has passed through."""
 
     estimate: Estimate
-    end: State
+    make_end: Callable[[], State] = field(repr=False)
     segments: Array
     """A row for each prediction, as the kernel of the form stores it, and one more for the end state."""
+
+    @property
+    def end(self) -> State:
+        """The end state, made and checked when it is asked for."""
+        return self.make_end()
 
 
 def run(
@@ -159,17 +165,8 @@ def run(
     InputError
         If an argument is not what it should be.
     """
-    return run_part(
-        record,
-        process_noise,
-        initial,
-        error_states,
-        every=every,
-        full_covariance=full_covariance,
-        gate=gate,
-        robust=robust,
-        monitor=monitor,
-    )[0]
+    passed = _checked(record, process_noise, initial, error_states, every, full_covariance, gate, robust, monitor)
+    return watched(passed.estimate, monitor, gate)
 
 
 def run_part(
@@ -195,11 +192,26 @@ def run_part(
     unless ``initial`` has the same one. With a lever arm parts agree to some 1e-6 of their estimates only: the angular acceleration is
     found from the gyro about each measurement, and at a cut from one side of it.
     """
+    passed = _checked(record, process_noise, initial, error_states, every, full_covariance, gate, robust, monitor)
+    return watched(passed.estimate, monitor, gate), passed.end
+
+
+def _checked(
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    initial: State,
+    error_states: Sequence[ErrorStates],
+    every: int,
+    full_covariance: bool,
+    gate: Gate | None,
+    robust: Robust | None,
+    monitor: Monitor | None,
+) -> Passed:
+    """Return the filter's pass over a record; arguments of the wrong kind are refused."""
     check_arguments(record=record, gate=gate, robust=robust, monitor=monitor)
     problem = prepared(record, process_noise, initial, error_states)
     options = Options(every=count("every", every), full_covariance=full_covariance, gate=gate, robust=robust)
-    passed = filtered(problem, options)
-    return watched(passed.estimate, monitor, gate), passed.end
+    return filtered(problem, options)
 
 
 def prepared(
@@ -281,7 +293,15 @@ def _block_outputs(problem: Problem, options: Options, *, judged: bool) -> covar
         *((shape, float) for shape in (*shapes, _innovations(problem.events, judged=judged))),
     )
     (segments,) = side_by_side(((options.segments + 1 if options.segments else 0, 32), float))
-    return covariance_form.Outputs(*written, segments)
+    attitude, bias, variance, covariance, innovation = written
+    return covariance_form.Outputs(
+        attitude=attitude,
+        bias=bias,
+        variance=variance,
+        covariance=covariance,
+        innovation=innovation,
+        segments=segments,
+    )
 
 
 def _block_body(problem: Problem, options: Options, states: Array) -> covariance_form.Body:
@@ -336,9 +356,7 @@ def _in_blocks(problem: Problem, options: Options) -> Passed:
         if row * every + every > len(increments):
             number = 0
             break
-    state = body.states[0]
-    end = State(attitude=state[:4], bias=state[4:7], covariance=covariance_matrices(state[7:]))
-    return _block_result(problem, options, out, end, int(number))
+    return _block_result(problem, options, out, body.states[0], int(number))
 
 
 def after(measurements: Measurements, first: int, last: int | None = None) -> Measurements:
@@ -359,15 +377,16 @@ def _block_result(
     problem: Problem,
     options: Options,
     out: covariance_form.Outputs,
-    end: State,
+    end: Array,
     number: int,
     weight: Array | None = None,
     events: Sequence[Event] = (),
+    memory: GateMemory | None = None,
 ) -> Passed:
-    """Return what a run has written, and its end state."""
+    """Return what a run has written, and its packed end state."""
     if options.segments:
         out.segments[number, :4] = 0.0
-        out.segments[number, 4:] = pack(end.attitude, end.bias, end.covariance)
+        out.segments[number, 4:] = end
     innovations = innovations_by_sensor(problem.events, out.innovation, weight)
     estimate = Estimate(
         time=problem.record.time[:: options.every],
@@ -379,7 +398,11 @@ def _block_result(
         skipped=skipped_too(problem.events, innovations),
         events=_in_order([*gaps(problem.record.time), *events]),
     )
-    return Passed(estimate=estimate, end=end, segments=out.segments[: number + 1])
+    return Passed(
+        estimate=estimate,
+        make_end=lambda: State(attitude=end[:4], bias=end[4:7], covariance=covariance_matrices(end[7:]), gate=memory),
+        segments=out.segments[: number + 1],
+    )
 
 
 def _judged_in_blocks(problem: Problem, options: Options) -> Passed:
@@ -407,14 +430,15 @@ def _judged_in_blocks(problem: Problem, options: Options) -> Passed:
         candidate = Candidate(
             attitude=states[1, :4], others=states[1, 4:7], covariance=covariance_matrices(states[1, 7:])
         )
-    end = State(
-        attitude=states[0, :4],
-        bias=states[0, 4:7],
-        covariance=covariance_matrices(states[0, 7:]),
-        gate=judge.remembered(candidate),
-    )
     return _block_result(
-        problem, options, out, end, int(number), written.weight, judge.events(written, recovered, locked)
+        problem,
+        options,
+        out,
+        states[0],
+        int(number),
+        written.weight,
+        judge.events(written, recovered, locked),
+        judge.remembered(candidate),
     )
 
 
@@ -431,7 +455,7 @@ class _Judge:
         sensors = problem.events.sensors
         self.memory, self.standing = remembered(options.gate, problem.initial.gate, sensors)
 
-    def body(self, form: covariance_form.Body | root_form.Body, restart: object) -> gate.Body:
+    def body(self, form: covariance_form.Body | root_form.Body, restart: Any) -> gate.Body:
         """Return the body of the walk around a form."""
         return gate.Body(form=form, options=self.options, restart=restart, standing=self.standing, memory=self.memory)
 
@@ -641,8 +665,12 @@ def _in_factor(problem: Problem, options: Options) -> Passed:
     if options.whole_bias:
         estimate = _with_whole_bias(estimate, model, out, full=options.full_covariance)
     candidate = _candidate_in_factor(body, model) if judge.memory[robust_gate.CHALLENGED] else None
-    end = _end_in_factor(body, model, judge.remembered(candidate), units)
-    return Passed(estimate=estimate, end=end, segments=stored[: number + 1])
+    memory = judge.remembered(candidate)
+    return Passed(
+        estimate=estimate,
+        make_end=lambda: _end_in_factor(body, model, memory, units),
+        segments=stored[: number + 1],
+    )
 
 
 def _with_whole_bias(estimate: Estimate, model: Model, out: root_form.Outputs, *, full: bool) -> Estimate:

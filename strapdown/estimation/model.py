@@ -6,6 +6,7 @@ constant ones, which then cost the prediction next to nothing (:mod:`strapdown.k
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -13,7 +14,7 @@ import numpy as np
 
 from strapdown.checks import Array, InputError, array, one_of
 from strapdown.estimation.error_states import MOST_CHAIN_DECAY, Effect, ErrorStates, check
-from strapdown.estimation.states import State, check_arguments
+from strapdown.estimation.states import Candidate, State, check_arguments
 from strapdown.kernels import augmented_step
 from strapdown.kernels.augmented_chain import CHAIN, chain_start
 from strapdown.kernels.augmented_step import CARRIED, FIXED, FORCE, LEVER, NOISE_NODES, OFFSET, SCALE
@@ -120,6 +121,8 @@ def _stack(blocks: Sequence[ErrorStates], name: str, shape: tuple[int, ...]) -> 
 
 def assemble(blocks: tuple[ErrorStates, ...], kinds: Mapping[str, str]) -> Model:
     """Return the model of blocks for the sensors named, whose kinds are given; general blocks stand there without effect."""
+    if not blocks:
+        return _empty(len(kinds))
     decay, density = _stack(blocks, "decay", ()), _stack(blocks, "density", ())
     for name, values in (("decay", decay), ("density", density)):
         if np.any(values < 0.0):
@@ -183,6 +186,25 @@ def assemble(blocks: tuple[ErrorStates, ...], kinds: Mapping[str, str]) -> Model
         sensor_use=np.ascontiguousarray(sensor_use[:, order]),
         force_f=force_f,
         varying=frozenset(varying),
+    )
+
+
+@functools.cache
+def _empty(sensors: int) -> Model:
+    """Return the model of a filter without error states."""
+    none, unused = np.empty(0), np.empty(0, np.int64)
+    return Model(
+        order=unused,
+        decay=none,
+        density=none,
+        chains=np.empty((0, 3)),
+        changing=0,
+        limit=np.inf,
+        gyro=np.empty((0, 12)),
+        gyro_use=unused,
+        sensors=np.empty((sensors, 0, 15)),
+        sensor_use=np.empty((sensors, 0), np.int64),
+        force_f=np.zeros(3),
     )
 
 
@@ -269,7 +291,7 @@ def lower_root(P: Array) -> Array:
     return np.ascontiguousarray(np.linalg.cholesky(P[::-1, ::-1])[::-1, ::-1].T)
 
 
-def triangle(state: State, model: Model) -> Array:
+def triangle(state: State | Candidate, model: Model) -> Array:
     """Return F, lower triangular, with ``P = Fᵀ F`` in the kernels' order."""
     order = model.whole_order
     if state.factor is None:

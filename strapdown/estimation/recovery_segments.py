@@ -130,6 +130,8 @@ class Trajectory:
 
 def stops(time: Array, breaks: Sequence[Break]) -> Array:
     """Return the edges (n,) and the times of breaks."""
+    if not breaks:
+        return time
     return np.unique(np.concatenate([time, *([one.start, one.since, one.end] for one in breaks)]))
 
 
@@ -156,6 +158,9 @@ def trajectories(
 
     ``segments`` are the filter's, ``first`` tells which of them starts at each stop, and ``reruns`` those of each break.
     """
+    if not breaks:
+        every = np.arange(len(time))
+        return [Trajectory(segments=segments, starts=first, edge=every, last=until, row=every)]
     stop = stops(time, breaks)
     place = np.searchsorted(stop, time)
     since, end = ([-np.inf, *(getattr(one, name) for one in breaks)] for name in ("since", "end"))

@@ -154,7 +154,7 @@ class _Smoother:
         edges = len(record.time)
         outputs = self.form.outputs(edges, self.options.full_covariance)
         until = recovery_segments.last_seen(record.time, lag)
-        if not breaks and len(segments) == edges:  # each interval in one segment
+        if len(segments) == edges and not breaks:  # each interval in one segment
             first = np.arange(edges)
         else:
             first = recovery_segments.starts(recovery_segments.stops(record.time, breaks), event_time, segments)

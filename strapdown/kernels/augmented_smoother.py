@@ -31,8 +31,7 @@ from strapdown.kernels.augmented_step import (
 from strapdown.kernels.root_form import step_noise
 from strapdown.kernels.rotation import inverse_right_jacobian, logarithm, moved, quaternion_multiply
 
-CALLED = ("load_segment", "prepare_step", "step_back", "write_smoothed")
-"""Not inlined where other kernels use them: their work is far more than a call, and each copy would be compiled anew."""
+CALLED = ("load_segment",)
 
 BORROWS_ARRAYS = True
 """See :mod:`strapdown.kernels.machine`."""

@@ -55,8 +55,6 @@ from strapdown.kernels.robust_step import (
 from strapdown.kernels.rotation import moved, quaternion_multiply, rotation_matrix
 from strapdown.kernels.walk import SQUARED_RANGE, step_within, turn_squared
 
-CALLED = "judged_update"
-"""Not inlined where other kernels use them: their work is far more than a call, and each copy would be compiled anew."""
 
 BORROWS_ARRAYS = True
 """See :mod:`strapdown.kernels.machine`."""

@@ -66,24 +66,8 @@ from strapdown.kernels.robust_step import arc_over_chord, seen_from
 from strapdown.kernels.rotation import far_turn, quaternion_multiply, right_jacobian, rotation_matrix, turned, unit
 from strapdown.kernels.walk import step_within, turn_squared
 
-CALLED = (
-    "advance",
-    "settle",
-    "seen_rows",
-    "keep_row",
-    "store_segment",
-    "attitude_covariance",
-    "linearised",
-    "innovation_covariance",
-    "step_of",
-    "relinearise",
-    "correct",
-    "start_candidate",
-    "age_chains",
-    "aged_chain",
-    "widen",
-)
-"""Not inlined where other kernels use them: their work is far more than a call, and each copy would be compiled anew."""
+CALLED = ("store_segment", "age_chains", "aged_chain")
+"""Not inlined. Only functions of few arrays are: each array of a NamedTuple is handed over as seven numbers."""
 
 BORROWS_ARRAYS = True
 """See :mod:`strapdown.kernels.machine`."""
