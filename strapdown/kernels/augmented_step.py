@@ -94,23 +94,22 @@ def inverse(A):
     )
 
 
-def turned_back(rate, u, v):
-    """Return exp(−[ω] u) v: what an attitude error becomes while the body turns at the rate ω for the time u."""
-    phi = scale(u, rate)
-    y = dot(phi, phi)
-    return matrix_times_vector(skew_polynomial(1.0, -sinc(y), second(y), phi), v)
-
-
-def response(rate, u, decay, v):
-    """Return ``∫₀ᵘ exp(−[ω](u − s)) v e^{−λs} ds``: the attitude error that a decaying rate error v makes in the time u.
+def response(rate, u, decay):
+    """Return the matrix ``∫₀ᵘ exp(−[ω](u − s)) e^{−λs} ds``: the attitude error that a decaying rate error makes in the time u.
 
     Gauss's rule of five nodes: to rounding for |ω| u ≤ 1/3 and λ u ≤ 1/2.
     """
-    total = (0.0, 0.0, 0.0)
+    squared = dot(rate, rate)
+    identity = linear = quadratic = 0.0
     for i in range(5):
         s = u * NODES[i]
-        total = add(total, scale(u * WEIGHTS[i] * math.exp(-decay * s), turned_back(rate, u - s, v)))
-    return total
+        left = u - s
+        weight = u * WEIGHTS[i] * math.exp(-decay * s)
+        y = left * left * squared
+        identity += weight
+        linear -= weight * left * sinc(y)
+        quadratic += weight * left * left * second(y)
+    return skew_polynomial(identity, linear, quadratic, rate)
 
 
 def longest_step(dt, theta, limit):
@@ -163,7 +162,10 @@ def move(q, x, dt, part, decay, gyro, gyro_use, force_f, coupling, factor):
     if dot(force_f, force_f) > 0.0:
         force = transpose_times_vector(rotation_matrix(turned(q, scale(0.5, r))), force_f)
     for k in range(len(decay)):
-        factor[k] = math.exp(-decay[k] * dt)
+        if k > 0 and decay[k] == decay[k - 1]:
+            factor[k] = factor[k - 1]
+        else:
+            factor[k] = math.exp(-decay[k] * dt) if decay[k] > 0.0 else 1.0
         if gyro_use[k] & OFFSET:
             mean = -math.expm1(-decay[k] * dt) / decay[k] if decay[k] > 0.0 else dt
             r = combine(1.0, r, -mean * x[3 + k], (gyro[k, 0], gyro[k, 1], gyro[k, 2]))
@@ -192,12 +194,16 @@ def move(q, x, dt, part, decay, gyro, gyro_use, force_f, coupling, factor):
     if scaled:
         phi12 = multiply(phi12, D)
     rate = scale(1.0 / dt, phi)
+    E = IDENTITY
+    held = 0.0  # the decay that E is of; states of one block have the same
     for k in range(len(decay)):
         column = (0.0, 0.0, 0.0)
         if gyro_use[k] & OFFSET:
             e = (gyro[k, 0], gyro[k, 1], gyro[k, 2])
             if decay[k] > 0.0:
-                column = scale(-1.0, response(rate, dt, decay[k], matrix_times_vector(D, e)))
+                if decay[k] != held:
+                    E, held = multiply(response(rate, dt, decay[k]), D), decay[k]
+                column = scale(-1.0, matrix_times_vector(E, e))
             else:
                 column = matrix_times_vector(phi12, e)
         if gyro_use[k] & SCALE:
@@ -251,9 +257,25 @@ def fill_noise(F, first, columns, dt, rate, D, angle_variance, rate_variance, de
             F[first + 3 + i, j] = a[3 * i + j]
         F[first + 3 + i, 3 + i] = root
     row = first + 6
+    nodes = (
+        dt * (1.0 - THREE_NODES[0]),
+        dt * (1.0 - THREE_NODES[1]),
+        dt * (1.0 - THREE_NODES[2]),
+    )  # what is left of the step
+    E = (IDENTITY, IDENTITY, IDENTITY)
+    kept = (1.0, 1.0, 1.0)
+    held = -1.0  # the decay that both are of
     for k in range(len(decay)):
         if density[k] > 0.0:
             rows = NOISE_NODES if gyro_use[k] & OFFSET else 1
+            if rows > 1 and decay[k] != held:
+                held = decay[k]
+                E = (
+                    multiply(response(rate, nodes[0], held), D),
+                    multiply(response(rate, nodes[1], held), D),
+                    multiply(response(rate, nodes[2], held), D),
+                )
+                kept = (math.exp(-held * nodes[0]), math.exp(-held * nodes[1]), math.exp(-held * nodes[2]))
             for r in range(rows):
                 for i in range(columns):
                     F[row + r, i] = 0.0
@@ -261,29 +283,25 @@ def fill_noise(F, first, columns, dt, rate, D, angle_variance, rate_variance, de
                     mean = -0.5 * math.expm1(-2.0 * decay[k] * dt) / decay[k] if decay[k] > 0.0 else dt
                     F[row, 6 + k] = math.sqrt(mean * density[k])
                 else:
-                    left = dt * (1.0 - THREE_NODES[r])
                     size = math.sqrt(THREE_WEIGHTS[r] * dt * density[k])
-                    e = matrix_times_vector(D, (gyro[k, 0], gyro[k, 1], gyro[k, 2]))
-                    t = scale(-size, response(rate, left, decay[k], e))
+                    t = scale(-size, matrix_times_vector(E[r], (gyro[k, 0], gyro[k, 1], gyro[k, 2])))
                     F[row + r, 0], F[row + r, 1], F[row + r, 2] = t
-                    F[row + r, 6 + k] = size * math.exp(-decay[k] * left)
+                    F[row + r, 6 + k] = size * kept[r]
             row += rows
     return row
 
 
 def carry(F, first, end, phi11, phi12, coupling, factor, gyro_use, changing):
-    """Carry rows of F over a step: each is a column of S, so ``S ← Φ S``."""
+    """Carry rows of a triangle, the attitude's three columns full, over a step: each is a column of S, so ``S ← Φ S``."""
     for j in range(first, end):
         t = matrix_times_vector(phi11, (F[j, 0], F[j, 1], F[j, 2]))
         if j >= 3:
             t = add(t, matrix_times_vector(phi12, (F[j, 3], F[j, 4], F[j, 5])))
-        for k in range(len(factor)):
+        for k in range(min(j - 5, len(factor))):
             f = F[j, 6 + k]
-            if f != 0.0:
-                if gyro_use[k] != 0:
-                    t = (t[0] + coupling[k, 0] * f, t[1] + coupling[k, 1] * f, t[2] + coupling[k, 2] * f)
-                if k < changing:
-                    F[j, 6 + k] = factor[k] * f
+            t = (t[0] + coupling[k, 0] * f, t[1] + coupling[k, 1] * f, t[2] + coupling[k, 2] * f)
+        for k in range(min(j - 5, changing)):
+            F[j, 6 + k] *= factor[k]
         F[j, 0], F[j, 1], F[j, 2] = t
 
 
