@@ -89,7 +89,7 @@ _STRETCHES = 64
 _FLICKER_SUM_LIMIT = 4096
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class AllanDeviation:
     """Allan deviation of a record with its confidence band.
 
@@ -119,7 +119,7 @@ class AllanDeviation:
     sample_interval: float
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class NoiseFit:
     """Noise coefficients of a record, SI units.
 

@@ -34,7 +34,7 @@ LARGEST_TURN = 1e6
 """rad: nothing turns so far in one sample interval, nor does a filter cut such a turn into steps."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Truth:
     """What only a simulation, or a reference system, knows."""
 
@@ -44,7 +44,7 @@ class Truth:
     """True gyro bias at the edges (n + 1, 3), rad/s."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ImuRecord:
     """Gyro increments and vector measurements over one run.
 
@@ -146,7 +146,7 @@ def cut(record: ImuRecord, first: int, last: int) -> ImuRecord:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Innovations:
     """Innovations of one sensor, in the order of its measurements."""
 
@@ -230,7 +230,7 @@ class Event:
         return f"Gap of {self.end - self.start:.3g} s after {self.start:.6g} s: the turn across it is taken for one at constant rate."
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Estimate:
     """What a filter made of a record, at the kept edges."""
 
@@ -271,7 +271,7 @@ _ESTIMATE_UNITS = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class BlockEstimate:
     """Estimate of one block of optional states (:mod:`strapdown.augmented`) at the kept edges."""
 

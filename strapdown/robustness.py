@@ -102,7 +102,7 @@ class Gate:
         return np.full(3, self.restart_bias_sigma**2)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class GateMemory:
     """What a gate remembers at the end of a part of a record, for the next part to go on from."""
 
@@ -246,7 +246,7 @@ Rows = tuple[Array, Array, Array, float, float]
 θ over the length of its part across (of other kinds 0 and 1)."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Linearised:
     """A measurement as seen from the state that an update is linearised at: its attitude, or with optional states all of it."""
 

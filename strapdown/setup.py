@@ -19,6 +19,7 @@ from strapdown.augmented import Observability, matching
 from strapdown.augmented import states as optional
 from strapdown.augmented.states import States
 from strapdown.checks import Array, InputError, known_keys, one_of, positive
+from strapdown.equality import ByValue
 from strapdown.gyro import GyroSpec
 from strapdown.mekf import ProcessNoise
 from strapdown.records import Estimate, ImuRecord, compress
@@ -55,8 +56,8 @@ def _sigma(name: str, value: Any) -> Sigma:
     return x, y, z
 
 
-@dataclass(frozen=True, kw_only=True)
-class FilterSetup:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FilterSetup(ByValue):
     """What the filter believes, where it starts, what integrates the gyro."""
 
     process_noise: ProcessNoise

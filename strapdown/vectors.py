@@ -31,6 +31,7 @@ from strapdown.checks import (
     positive,
     unit_quaternions,
 )
+from strapdown.equality import ByValue
 from strapdown.motion import Motion
 from strapdown.units import STANDARD_GRAVITY
 
@@ -58,7 +59,7 @@ class Sensor(Protocol):
         """Return the measurements over (start, end] of a body that moves so."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class VectorMeasurements:
     """A series of measurements of one sensor.
 
@@ -472,8 +473,8 @@ def _body(motion: Any, time: Array, vector_f: Array) -> Array:
     return quaternion.rotate(quaternion.conjugate(attitude(time)), vector_f)
 
 
-@dataclass(frozen=True, kw_only=True)
-class VectorSensor:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class VectorSensor(ByValue):
     """A sensor of one known direction: a star, the sun, a beacon."""
 
     name: str
@@ -572,8 +573,8 @@ class AttitudeSensor:
         return self.faults.heard(series)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Magnetometer:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Magnetometer(ByValue):
     """A magnetometer in a known field: ``m_b = (I + S) R_fbᵀ B_f + h + v``, S soft iron, h hard iron (the calibration left over)."""
 
     name: str
@@ -655,8 +656,8 @@ def specific_force(
     return np.asarray(_body(motion, t, pull) + turning)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Accelerometer:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Accelerometer(ByValue):
     """An accelerometer taken for a sensor of the vertical: right at rest, wrong by whatever the body accelerates."""
 
     name: str
@@ -705,8 +706,8 @@ class Accelerometer:
         return self.faults.heard(series)
 
 
-@dataclass(frozen=True, kw_only=True)
-class HeadingPair:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HeadingPair(ByValue):
     """Two GNSS antennas on the body: the heading of the line between them.
 
     The line is known in the body and measured in the fixed frame, so ``vector_b`` is exact and ``reference_f`` (m, 3) has the noise.

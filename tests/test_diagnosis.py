@@ -11,7 +11,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from strapdown import coning, diagnosis, mekf, motion, quaternion, records, scenarios, setup, units, vectors
+from strapdown import (
+    coning,
+    diagnosis,
+    mekf,
+    motion,
+    quaternion,
+    recordfiles,
+    records,
+    scenarios,
+    setup,
+    units,
+    vectors,
+)
 from strapdown.checks import InputError
 from strapdown.diagnosis.likelihood import log_p
 from strapdown.gyro import GyroSpec
@@ -344,3 +356,21 @@ def test_outliers_are_counted_and_sized():
     assert found.gain > 1000.0
     # What is larger as a whole is no outliers of a part: these are of three times the noise at least.
     assert outliers("star", 1.2 * random.standard_normal((4000, 2))).estimate[1] >= 3.0
+
+
+@pytest.mark.parametrize(
+    "matrix", [np.diag([-1.0, -1.0, 1.0]), np.eye(3)[[1, 0, 2]], -np.eye(3)], ids=["flipped", "swapped", "inverted"]
+)
+def test_check_names_a_wrong_axis_on_the_command_line(run, tmp_path, matrix):
+    """The grossest faults: many causes explain them, several of the same name and sensor."""
+    made = scenario()
+    record = scenarios.simulate(made, seed=1)
+    record = replace(record, increments=record.increments @ matrix.T)
+    recordfiles.write_record(tmp_path / "record.h5", record, gyro_spec=made.gyro, seed=1, run=0)
+    assert run("estimate", "record.h5", "--from-truth", "--out", "out")[::2] == (0, "")
+    status, said, error = run("check", "out/estimate.h5", "--record", "record.h5", "--json", "check.json")
+    assert (status, error) == (1, "")
+    assert "axes should be read as" in " ".join(said.split())
+    causes = json.loads((tmp_path / "check.json").read_text())["diagnosis"]["causes"]
+    assert causes[0]["name"] == "wrong convention"
+    assert causes[0]["significant"]

@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 
 from strapdown.checks import Array, InputError, array, non_negative, one_of, positive
+from strapdown.equality import ByValue
 from strapdown.kernels import augmented_chain
 from strapdown.units import STANDARD_GRAVITY
 from strapdown.vectors import GRAVITY_F
@@ -25,7 +26,7 @@ ENTRIES = tuple(a if a == b else f"{a}{b}" for a in AXES for b in AXES)
 """Entries of a matrix by rows: x, xy, xz, yx, y, …"""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Effect:
     """How the states c of a block enter one sensor: it measures ``(I + Σ c U) R_fbᵀ (r + Σ c d) + Σ c a``.
 
@@ -55,7 +56,7 @@ class Effect:
     is told of them is in the axes of the estimated attitude, their covariance too, which leaves out how well that is known."""
 
 
-class _Block:
+class _Block(ByValue):
     """What every block has."""
 
     name: str
@@ -168,7 +169,7 @@ def stationary_covariance(decay: Array, density: Array, feed: Array) -> Array:
     return P[:n, :n]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Interval:
     """A step of the filter: what a :class:`GeneralBlock` may ask for."""
 
@@ -182,7 +183,7 @@ class Interval:
     """Estimated body rate (3,), rad/s."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class View:
     """A measurement as the filter expects it: what a :class:`GeneralBlock` may ask for."""
 
@@ -245,7 +246,7 @@ def _matrix(name: str, diagonal: float | Array, off_diagonal: float | Array, uni
     return whole
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class GyroScale(LinearBlock):
     """Scale factors and misalignments of the gyro: the entries of M in ``w_meas = (I + M) w_b + b + n``, constant.
 
@@ -290,7 +291,7 @@ class GyroScale(LinearBlock):
         return np.asarray(np.eye(9)[self._entries].reshape(-1, 3, 3))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class GyroForce(LinearBlock):
     """Sensitivity of the gyro to specific force: the entries of G in ``w_meas = w_b + b + G f_b + n``, constant.
 
@@ -347,7 +348,7 @@ class GyroForce(LinearBlock):
         return -np.asarray(self.gravity_f)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class GyroGaussMarkov(LinearBlock):
     """A second gyro bias that forgets: first-order Gauss–Markov, stationary. Several of different times together cover flicker."""
 
@@ -385,7 +386,7 @@ class GyroGaussMarkov(LinearBlock):
         return np.eye(3)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class VectorBias(LinearBlock):
     """A constant bias of a vector sensor in body axes: hard iron, accelerometer bias."""
 
@@ -428,7 +429,7 @@ class VectorBias(LinearBlock):
         return {self.sensor: Effect(offset_b=np.eye(3), varying=self.varying)}
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class LeverArm(LinearBlock):
     """The place of an accelerometer on the body, from the point that does not accelerate: ``f_b = −R_fbᵀ g + ([ẇ] + [w]²) r``, constant.
 
@@ -510,7 +511,7 @@ class VectorScale(LinearBlock):
         return {self.sensor: Effect(scale=np.eye(9).reshape(9, 3, 3))}
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class GaussMarkov(LinearBlock):
     """First-order coloured noise on a vector sensor, stationary: the acceleration of a moving hand on an accelerometer."""
 

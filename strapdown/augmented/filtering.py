@@ -29,7 +29,7 @@ from strapdown.robustness import Gate, Monitor, Robust
 from strapdown.vectors import KINDS, VectorMeasurements
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class AugmentedEstimate(Estimate):
     """What the filter made of a record: an estimate of attitude and bias like any other, and the blocks."""
 

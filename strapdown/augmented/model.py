@@ -24,7 +24,7 @@ MOST_DECAY = 0.5
 """Of λ dt in one step: a step back is well conditioned. For states that enter the gyro a tenth, where Gauss's rule is exact."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class AugmentedGateMemory(GateMemory):
     """What a gate remembers with optional states; ``challenger`` holds q, (b, c) and the factor of P in the kernels' order."""
 
@@ -36,7 +36,7 @@ class AugmentedGateMemory(GateMemory):
     """The covariance of them (m, m)."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class AugmentedState:
     """Attitude, bias, the values of the blocks, and the covariance of their error."""
 
@@ -110,7 +110,7 @@ def begin(initial: mekf.State | AugmentedState, blocks: tuple[Block, ...]) -> Au
     return initial
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Model:
     """Linear blocks as arrays, in the kernels' order."""
 

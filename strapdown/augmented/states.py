@@ -24,6 +24,7 @@ from strapdown.augmented.blocks import (
 from strapdown.augmented.filtering import AugmentedEstimate
 from strapdown.augmented.model import AugmentedState
 from strapdown.checks import Array, InputError, array, known_keys, non_negative, one_of, positive
+from strapdown.equality import ByValue
 from strapdown.mekf import ProcessNoise
 from strapdown.records import ImuRecord
 from strapdown.robustness import Gate, Monitor, Robust
@@ -138,8 +139,8 @@ class SensorStates:
         return tuple(found)
 
 
-@dataclass(frozen=True, kw_only=True)
-class States:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class States(ByValue):
     """Optional states of a filter beside attitude and bias, by the standard deviation that each starts with; what is 0 is no state."""
 
     gyro_scale_sigma: Entries = 0.0

@@ -533,7 +533,7 @@ class _Judging(Judging[StepFilter]):
         rival.P = T @ rival.P @ T.T
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Gaussian:
     """A vector and its covariance, as one object, for of a pair ``Saver`` makes an array, and finds no shape."""
 
@@ -541,7 +541,7 @@ class _Gaussian:
     covariance: Array
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _Measured:
     """A measurement as the kernels take it."""
 

@@ -23,7 +23,7 @@ from strapdown.records import ImuRecord
 from strapdown.robustness import Gate, Robust
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Passed:
     """A state that the filter passed through: attitude (4,), the bias and the blocks' values (3 + m,), and their covariance."""
 
@@ -37,7 +37,7 @@ class Passed:
         return cls(attitude=face.attitude, others=np.append(face.bias, face.values), covariance=face.P.copy())
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Step:
     """A prediction of the filter."""
 

@@ -10,7 +10,7 @@ from strapdown.checks import Array
 from strapdown.consistency import Judgement
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Cause:
     """One hypothesis with the θ that fits best."""
 

@@ -20,7 +20,7 @@ from strapdown.mekf import ProcessNoise, Schedule, State
 from strapdown.records import Estimate, ImuRecord
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Gains:
     """What one measurement of each sensor, in the order of the record, does with ``ω_mes = z × R̂ᵀ r``."""
 

@@ -18,7 +18,7 @@ from strapdown.mekf.states import check_arguments
 from strapdown.records import Estimate, Event, ImuRecord
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Steps:
     """Each step predicts over ``dt`` if that is greater than zero, then takes in an event if it has one, then keeps the state if asked."""
 

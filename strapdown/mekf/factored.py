@@ -32,7 +32,7 @@ STEPS = np.empty((0, 3)), np.empty(0)
 """Scratch of the optional states, of which there are none."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Outputs:
     """Arrays that a run writes, a row for each kept edge; innovations a row for each event, one sensor after the other."""
 

@@ -47,7 +47,7 @@ class ProcessNoise:
                 raise InputError(f"{name} is {getattr(self, name):g} {unit}, and no gyro has so much; check the unit")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class State:
     """Attitude, bias and the covariance of their error."""
 

@@ -51,7 +51,7 @@ _FEWEST_BEFORE = 32
 """Intervals before the first stretch, at least."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _Cut:
     """A record cut into eight stretches, as the kernels take it."""
 

@@ -44,7 +44,7 @@ SHAPES = ("whiteness", "normality", "mean innovation", "cross-correlation")
 """Tests of innovations that no tuning of σ makes pass."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ScaleFactor:
     """A gyro's scale factor as an explanation of what the tuned filter puts down to noise."""
 
