@@ -565,7 +565,7 @@ def test_savages_two_speed_algorithm_drifts_as_its_table_says():
 
 @pytest.mark.parametrize(("previous", "following"), [(1, 0), (0, 1), (2, 3), (4, 0)])
 def test_a_pair_table_over_a_window_keeps_its_order_up_to_both_ends(previous, following):
-    """The rate is a polynomial that every time-Taylor table of the window integrates exactly to second order: by hand from the step's start."""
+    """A polynomial rate that time-Taylor tables integrate exactly to second order; expected by hand from each step's start."""
     n = 2
     a, b, quadratic = (
         np.array([0.02, -0.01, 0.005]),
