@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 
 from strapdown import (
     coning,
+    consistency,
     diagnosis,
     mekf,
     motion,
@@ -374,3 +376,69 @@ def test_check_names_a_wrong_axis_on_the_command_line(run, tmp_path, matrix):
     causes = json.loads((tmp_path / "check.json").read_text())["diagnosis"]["causes"]
     assert causes[0]["name"] == "wrong convention"
     assert causes[0]["significant"]
+
+
+# -------------------------------------------------------------------------------------------------------------------- one verdict
+
+
+def written(folder: Path, made: scenarios.Scenario, chosen: setup.FilterSetup, seed: int) -> None:
+    """A record without its truth, and a filter, as files."""
+    record = replace(scenarios.simulate(made, seed=seed), truth=None)
+    recordfiles.write_record(folder / "record.h5", record, gyro_spec=made.gyro, seed=seed, run=0)
+    (folder / "filter.toml").write_text(setup.to_toml(chosen))
+
+
+def test_the_verdict_is_that_of_all_evidence(run, tmp_path):
+    """A rate random walk a tenth of the truth: the NIS hardly shows it, the likelihood does, and no output may say both."""
+    written(tmp_path, scenario({"rate_random_walk": 1e-4}), RIGHT, 0)
+    estimated = run("estimate", "record.h5", "--filter", "filter.toml", "--out", "out")
+    assert estimated[::2] == (0, "")
+    assert run("check", "out/estimate.h5")[0] == 0  # the statistics alone
+    status, said, error = run("check", "out/estimate.h5", "--record", "record.h5", "--json", "check.json")
+    said = " ".join(said.split())
+    assert (status, error) == (1, "")
+    assert "Likeliest cause: the gyro's rate random walk of the bias is" in said
+    assert "not consistent: the filter is" in said
+    assert ": consistent" not in said.replace("not consistent", "")
+    told = json.loads((tmp_path / "check.json").read_text())
+    assert told["verdict"] == told["diagnosis"]["judgement"]["verdict"] == "not consistent"
+
+
+@pytest.mark.parametrize("name", ["R too small", "scale factor", "late star"])
+def test_a_filter_with_a_cause_is_not_called_consistent(name):
+    found = diagnosed(CASES[name], 1)
+    assert found.causes
+    assert found.judgement.verdict == "not consistent"
+    assert found.words.startswith("not consistent")
+
+
+def test_evidence_is_taken_together_at_one_rate_of_false_alarms():
+    """Holm's procedure by hand: of 20 statistics and causes together the least p-value must be below 0.01/20."""
+    found = diagnosed(Case("", ""), 3)
+    every = found.judgement.findings
+    assert len(every) > len(found.considered) > 10
+    assert not any(finding.rejected for finding in every)
+    least = min(every, key=lambda finding: finding.p_value)
+    assert least.p_value > 0.01 / len(every)
+    for p, verdict in ((0.009 / len(every), "not consistent"), (0.011 / len(every), "consistent")):
+        changed = [replace(one, p_value=p) if one is least else one for one in every]
+        assert consistency.concluded(changed, (), 0.99).verdict == verdict
+
+
+def test_a_gate_that_refuses_the_outliers_leaves_nothing_to_explain(run, tmp_path):
+    """The verdict is on the filter with its gate, so the causes are looked for in the measurements that it used."""
+    struck = scenario(None, None, {"faults": vectors.Faults(outlier_probability=0.03, outlier_scale=100.0)})
+    written(tmp_path, struck, RIGHT, 2)
+    for gate, expected in (((), 1), (("--gate", "0.9999"), 0)):
+        estimated = run("estimate", "record.h5", "--filter", "filter.toml", "--out", "out", *gate)
+        assert estimated[::2] == (0, "")
+        status, said, error = run("check", "out/estimate.h5", "--record", "record.h5")
+        assert (status, error) == (expected, "")
+        assert ("are outliers of" in said) is (expected == 1)
+
+
+@pytest.mark.slow
+def test_a_right_filter_is_called_wrong_in_one_run_of_a_hundred_at_most():
+    """Statistics and causes together, at 0.99: of 300 runs 8 with less than a hundredth, were the rate exactly 0.01."""
+    alarms = sum(diagnosed(Case("", ""), seed).judgement.verdict != "consistent" for seed in range(1000, 1300))
+    assert alarms <= 8

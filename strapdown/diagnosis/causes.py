@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from strapdown.checks import Array
-from strapdown.consistency import Judgement
+from strapdown.consistency import Finding, Judgement
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -31,22 +31,32 @@ class Cause:
     words: str
     """What it says, with its size."""
 
+    @property
+    def finding(self) -> Finding:
+        """The cause as evidence against the filter, to be taken together with the statistics."""
+        return Finding(name=self.name, of=self.of, value=self.gain, p_value=math.exp(self.log_p), samples=1)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnosis:
     """Likely causes, the likeliest first, and the evidence."""
 
     causes: tuple[Cause, ...]
-    """Those that are significant, all hypotheses taken together. After the first, others may only mirror it: correct it and look again."""
+    """Those that are significant, all evidence taken together. After the first, others may only mirror it: correct it and look again."""
     considered: tuple[Cause, ...]
     """All hypotheses, by rank."""
     judgement: Judgement
-    """What the statistics say of the filter as it is."""
+    """The verdict on the filter as it is: statistics and causes taken together (Holm), so that neither contradicts the other."""
     probability: float
-    """Probability that no cause is named of a right filter, at least."""
+    """Probability that a right filter is neither called wrong nor given a cause, at least."""
 
     @property
     def words(self) -> str:
+        """The verdict and the causes, for people."""
+        return f"{self.judgement.words}\n{self.cause_words}"
+
+    @property
+    def cause_words(self) -> str:
         """The causes, for people."""
         if not self.causes:
             return "No cause among those considered is significant."
