@@ -115,6 +115,23 @@ class Case:
 
 HARD_IRON = np.array([3e-7, -1e-7, 2e-7])
 SCALE = np.array([3e-3, -2e-3, 2e-3])
+TURN = np.array([2e-3, 3e-3, -2.5e-3])
+"""A mounting, rad."""
+TURNED_BACK = quaternion.to_matrix(quaternion.exp(-TURN))
+"""What sensors whose axes are turned by it make of a vector."""
+SKEWED = np.array([[0.0, 6e-3, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+WHOLE = {"kind": "vector"}
+
+
+def sensed(sensor: str, change: Callable[[vectors.VectorMeasurements], vectors.VectorMeasurements]) -> Any:
+    """What changes the measurements of one sensor."""
+
+    def changed(record: ImuRecord) -> ImuRecord:
+        series = tuple(change(one) if one.sensor == sensor else one for one in record.vectors)
+        return replace(record, vectors=series)
+
+    return changed
+
 
 CASES = {
     "R too small": Case(
@@ -157,6 +174,35 @@ CASES = {
         near=1.5e-3,
     ),
     "scale factor": Case("scale factor", "gyro", scenario({"scale_factor": SCALE}), estimate=SCALE, near=1e-3),
+    "gyro mounting": Case(
+        "mounting",
+        "gyro",
+        change=lambda r: replace(r, increments=r.increments @ TURNED_BACK.T),
+        estimate=TURN,
+        near=1.5e-3,
+    ),
+    "gyro misalignment": Case(
+        "misalignment",
+        "gyro",
+        scenario({"misalignment": SKEWED}),
+        estimate=SKEWED[~np.eye(3, dtype=bool)],
+        near=2e-3,
+    ),
+    "star mounting": Case(
+        "mounting",
+        "star",
+        change=sensed("star", lambda s: replace(s, vector_b=s.vector_b @ TURNED_BACK.T)),
+        estimate=TURN,
+        near=1e-3,
+    ),
+    "reference too long": Case(
+        "reference length",
+        "magnetometer",
+        scenario(None, WHOLE),
+        change=sensed("magnetometer", lambda s: replace(s, reference_f=1.03 * s.reference_f)),
+        estimate=0.03,
+        near=1e-3,
+    ),
     "outliers": Case("outliers", "star", scenario(None, None, {"faults": vectors.Faults(outlier_probability=0.03)})),
     "start": Case(
         "initial bias", "start", setup=replace(RIGHT, bias_sigma=1e-4), bias_error=np.array([1e-3, -1e-3, 1e-3])
@@ -376,6 +422,47 @@ def test_check_names_a_wrong_axis_on_the_command_line(run, tmp_path, matrix):
     causes = json.loads((tmp_path / "check.json").read_text())["diagnosis"]["causes"]
     assert causes[0]["name"] == "wrong convention"
     assert causes[0]["significant"]
+
+
+# ------------------------------------------------------------------------------------------------------------- one of these causes
+
+
+def test_of_two_directions_nobody_can_tell_whose_reference_is_off():
+    """Two directions show the angle between their references alone: turn one or the other."""
+    off = quaternion.exp(np.array([2e-3, 0.0, 0.0]))
+    turned = sensed("star", lambda s: replace(s, reference_f=quaternion.rotate(off, s.reference_f)))
+    found = diagnosed(Case("", "", change=turned), 0)
+    assert {(cause.name, cause.of) for cause in found.alternatives} >= {
+        ("reference direction", "star"),
+        ("reference direction", "magnetometer"),
+    }
+    assert "One of these causes, which the data do not tell apart:" in found.words
+    told = {row["of"]: row["alternative"] for row in found.summary()["causes"] if row["name"] == "reference direction"}
+    assert told == {"star": True, "magnetometer": True}
+
+
+def test_of_three_directions_the_one_is_told():
+    """With whole vectors, in which a turn of the reference shows across it, and a third sensor to hold it against."""
+    made = scenario()
+    third = vectors.VectorSensor(name="sun", reference_f=np.array([1.0, 0.3, 0.0]), sigma=1e-3, rate=5.0)
+    made = replace(made, sensors=(*made.sensors, third))
+    theta = np.array([2e-3, -1.6e-3, 1.2e-3])  # across the reference
+    turned = sensed("star", lambda s: replace(s, reference_f=quaternion.rotate(quaternion.exp(theta), s.reference_f)))
+    found = diagnosed(Case("", "", made, change=turned), 0)
+    assert [(cause.name, cause.of) for cause in found.alternatives] == [("reference direction", "star")]
+    assert found.causes[0].estimate == pytest.approx(theta, abs=6e-4)
+
+
+def test_of_one_sensor_nobody_can_tell_whether_it_or_the_gyro_is_turned():
+    whole = scenario()
+    alone = replace(whole, sensors=whole.sensors[1:])
+    turn = quaternion.to_matrix(quaternion.exp(-np.array([8e-3, 6e-3, -7e-3])))
+    for change in (
+        lambda r: replace(r, increments=r.increments @ turn.T),
+        sensed("star", lambda s: replace(s, vector_b=s.vector_b @ turn.T)),
+    ):
+        found = diagnosed(Case("", "", alone, change=change), 0)
+        assert {(cause.name, cause.of) for cause in found.alternatives} >= {("mounting", "gyro"), ("mounting", "star")}
 
 
 # -------------------------------------------------------------------------------------------------------------------- one verdict

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -145,6 +144,7 @@ def _diagnosed(
     import numpy as np
 
     from strapdown import diagnosis, mekf, recordfiles, records
+    from strapdown.tuning.suspicion import accepted
 
     chosen = _filter_of(result, filter_file)
     estimate = records.read_estimate(result)
@@ -159,8 +159,9 @@ def _diagnosed(
         return {"not_looked_for": reason, "without_a_state": list(missing)}, None
     P = np.diag(estimate.variance[0]) if estimate.covariance is None else estimate.covariance[0]
     initial = mekf.State(attitude=estimate.attitude[0], bias=estimate.bias[0], covariance=P)
+    # The verdict is on the filter with its gate, so what that refused is left out.
     found = diagnosis.diagnose(
-        _without_refused(held.record, estimate), chosen, initial, probability=judgement.probability, judgement=judgement
+        accepted(held.record, estimate), chosen, initial, probability=judgement.probability, judgement=judgement
     )
     rows = table("Causes by what they would explain", "cause", "of", "gain", "ln p", "", left=2)
     for cause in found.considered[:8]:
@@ -199,18 +200,6 @@ def _need_same(result: Path, estimate: Estimate, path: Path, record: ImuRecord) 
     if unknown or not np.isin(estimate.time, record.time).all():
         what = f"has no sensor {unknown[0]!r}" if unknown else "has other stamps"
         raise InputError(f"{path} {what}; {result} was made from another record")
-
-
-def _without_refused(record: ImuRecord, estimate: Estimate) -> ImuRecord:
-    """Return a record without the measurements that the filter's gate refused: the verdict is on the filter with its gate."""
-    import numpy as np
-
-    series = []
-    for one in record.vectors:
-        found = estimate.innovations.get(one.sensor)
-        lost = np.zeros(len(one.time), bool) if found is None else np.isin(one.time, found.time[~found.used])
-        series.append(one.taken(~lost) if lost.any() else one)
-    return replace(record, vectors=tuple(series))
 
 
 def _not_of_the_search(chosen: FilterSetup, estimate: Estimate) -> str:
