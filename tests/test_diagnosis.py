@@ -442,15 +442,17 @@ def test_of_two_directions_nobody_can_tell_whose_reference_is_off():
 
 
 def test_of_three_directions_the_one_is_told():
-    """With whole vectors, in which a turn of the reference shows across it, and a third sensor to hold it against."""
-    made = scenario()
-    third = vectors.VectorSensor(name="sun", reference_f=np.array([1.0, 0.3, 0.0]), sigma=1e-3, rate=5.0)
-    made = replace(made, sensors=(*made.sensors, third))
-    theta = np.array([2e-3, -1.6e-3, 1.2e-3])  # across the reference
+    """A quarter of a milliradian across the reference of one of three fine sensors, which only the angles to the others show."""
+    theta = np.array([2e-4, -1.2e-4, 0.9e-4])
+    names = {"star": [0.0, 0.6, 0.8], "sun": [1.0, 0.3, 0.0], "beacon": [-0.5, 0.5, -0.7]}
+    sensors = tuple(
+        vectors.VectorSensor(name=name, reference_f=np.array(reference), sigma=2e-4, rate=5.0)
+        for name, reference in names.items()
+    )
     turned = sensed("star", lambda s: replace(s, reference_f=quaternion.rotate(quaternion.exp(theta), s.reference_f)))
-    found = diagnosed(Case("", "", made, change=turned), 0)
+    found = diagnosed(Case("", "", replace(scenario(), sensors=sensors), change=turned), 0)
     assert [(cause.name, cause.of) for cause in found.alternatives] == [("reference direction", "star")]
-    assert found.causes[0].estimate == pytest.approx(theta, abs=6e-4)
+    assert found.causes[0].estimate == pytest.approx(theta, abs=6e-5)
 
 
 def test_of_one_sensor_nobody_can_tell_whether_it_or_the_gyro_is_turned():
@@ -526,6 +528,6 @@ def test_a_gate_that_refuses_the_outliers_leaves_nothing_to_explain(run, tmp_pat
 
 @pytest.mark.slow
 def test_a_right_filter_is_called_wrong_in_one_run_of_a_hundred_at_most():
-    """Statistics and causes together, at 0.99: of 300 runs 8 with less than a hundredth, were the rate exactly 0.01."""
+    """Statistics and causes together, at 0.99 (measured: 3 of 300): more than 8 by chance once in 250 such studies, were the rate 0.01."""
     alarms = sum(diagnosed(Case("", ""), seed).judgement.verdict != "consistent" for seed in range(1000, 1300))
     assert alarms <= 8
