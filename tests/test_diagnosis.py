@@ -526,6 +526,19 @@ def test_a_gate_that_refuses_the_outliers_leaves_nothing_to_explain(run, tmp_pat
         assert ("are outliers of" in said) is (expected == 1)
 
 
+def test_of_a_robust_filter_the_causes_are_no_part_of_the_verdict(run, tmp_path):
+    """It weighs what the search for causes takes whole: outliers are a cause there, and none of its faults."""
+    written(tmp_path, scenario({"rate_random_walk": 1e-4}), RIGHT, 0)
+    assert run("estimate", "record.h5", "--filter", "filter.toml", "--robust", "huber", "--out", "out")[::2] == (0, "")
+    alone = run("check", "out/estimate.h5")[0]
+    status, said, error = run("check", "out/estimate.h5", "--record", "record.h5", "--json", "check.json")
+    assert (status, error) == (alone, "")
+    assert "so the causes are no part of the verdict" in " ".join(said.split())
+    assert "Likeliest cause: the gyro's rate random walk" in said
+    told = json.loads((tmp_path / "check.json").read_text())
+    assert len(told["findings"]) < len(told["diagnosis"]["judgement"]["findings"])
+
+
 @pytest.mark.slow
 def test_a_right_filter_is_called_wrong_in_one_run_of_a_hundred_at_most():
     """Statistics and causes together, at 0.99 (measured: 3 of 300): more than 8 by chance once in 250 such studies, were the rate 0.01."""
