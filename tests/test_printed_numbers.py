@@ -10,8 +10,11 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, f, norm
+
+from strapdown import gyro, mekf, motion, scenarios, setup, vectors
 
 DEGREE_PER_HOUR = math.pi / 180.0 / 3600.0
 
@@ -175,3 +178,71 @@ def test_constants_of_algorithms_and_drifts_of_coning_budget(run, tmp_path):
     exact = 0.5 * math.sin(beta) ** 2 * omega * (1.0 - math.sin(lam) / lam) / DEGREE_PER_HOUR
     assert abs(drifts["one-sample"]) == pytest.approx(exact, rel=1e-3)
     assert abs(drifts["two-sample"]) == pytest.approx(beta**2 * omega * lam**4 / 60.0 / DEGREE_PER_HOUR, rel=0.02)
+
+
+def test_error_budget_of_covariance(run, tmp_path):
+    """A Kalman filter written here: the gains from all noise, then each source alone through the same gains."""
+    body = motion.ConstantRate(rate=(0.02, -0.03, 0.05))
+    stars = {"star 1": ([1.0, 0.0, 0.0], 2e-4), "star 2": ([0.0, 0.6, 0.8], 3e-4)}
+    made = scenarios.Scenario(
+        name="turning",
+        motion=body,
+        gyro=gyro.GyroSpec(angle_random_walk=1e-4, rate_random_walk=3e-6),
+        sensors=tuple(
+            vectors.VectorSensor(name=name, reference_f=np.array(r), sigma=s, rate=1.0)
+            for name, (r, s) in stars.items()
+        ),
+        rate=4.0,
+        duration=60.0,
+    )
+    noise = mekf.ProcessNoise(angle_random_walk=1e-4, rate_random_walk=3e-6)
+    chosen = setup.FilterSetup(process_noise=noise, attitude_sigma=1e-3, bias_sigma=1e-4)
+    (tmp_path / "turning.toml").write_text(scenarios.scenario_to_toml(made))
+    (tmp_path / "filter.toml").write_text(setup.to_toml(chosen))
+    said = run("covariance", "turning.toml", "--filter", "filter.toml")
+
+    def skew(v):
+        return np.cross(np.eye(3), v)
+
+    dt = 0.25
+    A = np.block([[-skew(np.array(body.rate)), -np.eye(3)], [np.zeros((3, 6))]])
+    density = {
+        "angle random walk": np.diag([1e-8] * 3 + [0.0] * 3),
+        "rate random walk": np.diag([0.0] * 3 + [9e-12] * 3),
+    }
+
+    def discrete(D):  # Van Loan (1978)
+        M = expm(np.block([[-A, D], [np.zeros((6, 6)), A.T]]) * dt)
+        return M[6:, 6:].T @ M[:6, 6:]
+
+    F = expm(A * dt)
+    Q = {name: discrete(D) for name, D in density.items()}
+    parts = dict.fromkeys((*Q, *stars), np.zeros((6, 6)))
+    parts["initial attitude"], parts["initial bias"] = np.diag([1e-6] * 3 + [0.0] * 3), np.diag([0.0] * 3 + [1e-8] * 3)
+    P = parts["initial attitude"] + parts["initial bias"]
+    for k in range(1, 241):
+        P = F @ P @ F.T + sum(Q.values())
+        parts = {name: F @ S @ F.T + Q.get(name, 0.0) for name, S in parts.items()}
+        if k % 4:
+            continue
+        R_bf = rotations(body.attitude(k * dt)).as_matrix().T
+        for star, (reference, sigma) in stars.items():
+            H = np.hstack(
+                [skew(R_bf @ np.array(reference)), np.zeros((3, 3))]
+            )  # of the whole vector: its length tells nothing
+            K = P @ H.T @ np.linalg.inv(H @ P @ H.T + sigma**2 * np.eye(3))
+            keep = np.eye(6) - K @ H
+            P = keep @ P @ keep.T + sigma**2 * K @ K.T
+            parts = {name: keep @ S @ keep.T + (name == star) * sigma**2 * K @ K.T for name, S in parts.items()}
+
+    def row(S):
+        return [
+            math.sqrt(np.trace(S[:3, :3]) / 3.0) * 648000.0 / math.pi,
+            math.sqrt(np.trace(S[3:, 3:]) / 3.0) / DEGREE_PER_HOUR,
+        ]
+
+    expected = {f"{name} random": row(S) for name, S in parts.items()}
+    expected |= {"actual error all": row(sum(parts.values())), "the filter's own σ": row(P)}
+    for name, values in expected.items():
+        told = re.search(rf"{name} ([\d.e-]+) ([\d.e-]+)", said)
+        assert [float(x) for x in told.groups()] == pytest.approx(values, rel=0.006), name
