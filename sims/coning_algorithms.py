@@ -420,12 +420,7 @@ def curves(
 
 def noise_gain(table: Algorithm) -> float:
     """Return the root sum of squares of Σ_j K_ij over the window, over √N: noise beside a steady turn of one unit a sample."""
-    m = table.window
-    if table.solver == "compressed":
-        k = [float(x) for x in table.coefficients]
-        row = [*reversed(k), -math.fsum(k)]
-    else:
-        row = [float(sum(table.pairs[i][j] for j in range(m))) for i in range(m)]
+    row = [float(sum(products)) for products in table.products]
     return math.sqrt(math.fsum(x * x for x in row) / table.samples)
 
 

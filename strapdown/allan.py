@@ -2,7 +2,7 @@
 
 Two views of one record:
 
-- :func:`allan_deviation` is the picture: the overlapping (or a robust) Allan deviation with χ² confidence bands.
+- :func:`allan_deviation` is the picture: the overlapping, a robust, the modified Allan or the Hadamard deviation with χ² confidence bands.
 - :func:`fit_noise` is the estimator: quantisation Q, angle random walk N, bias instability B, rate random walk K and rate ramp R by
   maximum likelihood on the cosine transform of the record, with profile-likelihood intervals.
 
@@ -76,6 +76,14 @@ SUPPORT_PROBABILITY = 1e-3
 MISFIT_PROBABILITY = 1e-3
 """Below this ``NoiseFit.misfit_probability`` tells of a record that holds something else than the noises."""
 
+ESTIMATORS = {
+    "overlapping": "overlapping Allan deviation, OADEV",
+    "robust": "Allan deviation by the median of second differences",
+    "modified": "modified Allan deviation, MDEV: of the angle averaged over τ, which parts quantisation from flicker of the angle",
+    "hadamard": "overlapping Hadamard deviation, HDEV: by third differences of the angle, which do not see a rate ramp",
+}
+"""Estimators of :func:`allan_deviation`."""
+
 _MEDIAN_OF_NORMAL = 0.6744897501960817  # Φ⁻¹(3/4): median of |z|, z standard normal
 _MEDIAN_EFFICIENCY = (
     0.3675  # of the median of |z| against the mean square, independent normal data: 8 (z φ(z))², z = Φ⁻¹(3/4)
@@ -83,15 +91,16 @@ _MEDIAN_EFFICIENCY = (
 _FEWEST_BLOCKS = 30  # below this the lag-1 autocorrelation says little (SP 1065, §5.5.6)
 _MANY_BLOCKS = 128  # its scatter is then well below what moves the power law by one half
 _MOST_BLOCKS = 1 << 17
+_STRETCH = 1 << 16
 _BIN_GROWTH = 1.05
 _LARGEST_EXACT = 1 << 16
 _STRETCHES = 64
 _FLICKER_SUM_LIMIT = 4096
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class AllanDeviation:
-    """Allan deviation of a record with its confidence band.
+    """Allan, modified Allan or Hadamard deviation of a record with its confidence band.
 
     Attributes
     ----------
@@ -104,7 +113,7 @@ class AllanDeviation:
     level : float
         Confidence of the band, pointwise.
     estimator : str
-        ``"overlapping"`` or ``"robust"``.
+        One of :data:`ESTIMATORS`.
     """
 
     taus: Array
@@ -119,7 +128,7 @@ class AllanDeviation:
     sample_interval: float
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class NoiseFit:
     """Noise coefficients of a record, SI units.
 
@@ -166,7 +175,7 @@ def allan_deviation(
     estimator: str = "overlapping",
     level: float = 0.95,
 ) -> AllanDeviation:
-    """Return the Allan deviation of a record with its confidence band.
+    """Return the Allan deviation of a record with its confidence band, or the modified Allan or the Hadamard deviation.
 
     The phase is kept as float64: the sum of the rate less its mean, carried with its rounding error, so that each value is rounded once
     (½ unit in the last place of the largest phase) also after 1e8 samples. Memory: one float64 a sample beyond the record, an axis at a
@@ -175,6 +184,9 @@ def allan_deviation(
     The overlapping estimator equals ``allantools.oadev``. The robust one takes the median size of the second differences, divided by
     what it is for a Gaussian; it stands single outliers, bursts and bias steps as long as well under half of all spans of 2τ are
     touched, so at long τ only few of them. Not for records of a few coarse counts: their median sits on the counts.
+
+    The modified one equals ``allantools.mdev`` and the Hadamard one ``allantools.ohdev``; the model of the module's table is not theirs (of
+    angle random walk, N²/τ, the modified variance is (1 + 1/m²)/2 of it at m samples, and the Hadamard one all of it).
 
     Parameters
     ----------
@@ -186,20 +198,21 @@ def allan_deviation(
     taus : array_like, optional
         Averaging times, s; each is rounded to a multiple of the sample interval, repeated ones are dropped. Default: 12 a decade, up to
         a third of the record.
-    estimator : {"overlapping", "robust"}
+    estimator : {"overlapping", "robust", "modified", "hadamard"}
     level : float
         Confidence of the band.
 
     Raises
     ------
     InputError
-        On samples that are not finite, a τ outside [sample interval, half the record], or an unknown ``kind`` or ``estimator``.
+        On samples that are not finite, a τ outside [sample interval, half the record] (modified and Hadamard: a third), or an unknown
+        ``kind`` or ``estimator``.
     """
     record, dt, scale = _record(values, sample_interval, kind)
-    checks.one_of("estimator", estimator, ("overlapping", "robust"))
+    checks.one_of("estimator", estimator, ESTIMATORS)
     level = _level(level)
     samples = record.shape[0]
-    multiples = _multiples(taus, samples, dt)
+    multiples = _multiples(taus, samples, dt, _order(estimator))
     deviation = np.empty((record.shape[1], len(multiples)))
     edf = np.empty_like(deviation)
     alphas = np.empty(deviation.shape, dtype=int)
@@ -212,7 +225,7 @@ def allan_deviation(
         for i, m in enumerate(int(m) for m in multiples):
             alpha = _power_law(phase, m, alpha)
             alphas[axis, i] = alpha
-            edf[axis, i] = equivalent_degrees_of_freedom(alpha, samples, m)
+            edf[axis, i] = equivalent_degrees_of_freedom(alpha, samples, m, estimator)
             if estimator == "robust":
                 deviation[axis, i] = _median_deviation(phase, m, alpha)
                 edf[axis, i] *= _MEDIAN_EFFICIENCY
@@ -220,6 +233,12 @@ def allan_deviation(
             squares = np.empty(len(multiples))
             compiled(second_difference_squares)(phase, multiples, lanes, np.empty(len(multiples)), squares)
             deviation[axis] = np.sqrt(squares / (2.0 * (samples + 1 - 2 * multiples))) / multiples
+        elif estimator == "modified":
+            summed = np.empty(samples + 2)
+            compiled(accumulate)(phase, float(np.mean(phase)), summed)
+            deviation[axis] = [math.sqrt(_third_differences(summed, int(m)) / 2.0) / m**2 for m in multiples]
+        elif estimator == "hadamard":
+            deviation[axis] = [math.sqrt(_third_differences(phase, int(m)) / 6.0) / m for m in multiples]
     deviation *= scale
     from scipy.stats import chi2
 
@@ -237,66 +256,118 @@ def allan_deviation(
     )
 
 
-def equivalent_degrees_of_freedom(alpha: int, samples: int, m: int) -> float:
-    """Return the equivalent degrees of freedom of the overlapping Allan variance of m samples, out of ``samples`` of the rate.
+def _order(estimator: str) -> int:
+    """Return the order of the differences that an estimator squares: of the angle, or of its sum for the modified Allan deviation."""
+    return 3 if estimator in ("modified", "hadamard") else 2
 
-    ``2 E²/Var`` of the mean of squared second differences, by summing their squared autocorrelation (Greenhall & Riley 2003). Sampled
+
+def _third_differences(series: Array, m: int) -> float:
+    """Return the mean of (y[k + 3m] − 3 y[k + 2m] + 3 y[k + m] − y[k])² over all k, a stretch at a time."""
+    count = len(series) - 3 * m
+    total = 0.0
+    for start in range(0, count, _STRETCH):
+        end = min(start + _STRETCH, count)
+        a, b, c, d = (series[start + j * m : end + j * m] for j in range(4))
+        difference = (d - a) - 3.0 * (c - b)
+        total += float(difference @ difference)
+    return total / count
+
+
+def equivalent_degrees_of_freedom(alpha: int, samples: int, m: int, estimator: str = "overlapping") -> float:
+    """Return the equivalent degrees of freedom of the variance averaged over m samples, out of ``samples`` of the rate.
+
+    ``2 E²/Var`` of the mean of squared differences, by summing their squared autocorrelation (Greenhall & Riley 2003). Sampled
     phase of a noise that is white, flicker or random walk in continuous time has the generalised covariances −|t|, t² ln|t| and |t|³,
-    which need no further approximation; quantisation is white phase.
+    which need no further approximation; quantisation is white phase. The sum of the phase, whose third differences the modified Allan
+    deviation squares, has the second integrals of these.
 
     Parameters
     ----------
     alpha : int
         Power law of the rate, a key of :data:`NOISE_TYPES`.
+    samples, m : int
+    estimator : str
+        One of :data:`ESTIMATORS`; ``"robust"`` as ``"overlapping"``, whose median has 0.37 times as many.
     """
     if alpha not in NOISE_TYPES:
         raise InputError(f"alpha is {alpha!r}; it must be one of {', '.join(map(str, NOISE_TYPES))}")
+    checks.one_of("estimator", estimator, ESTIMATORS)
     checks.count("samples", samples, least=2)
-    if not 1 <= m <= samples // 2:
-        raise InputError(f"m is {m!r}; with {samples} samples it must lie between 1 and {samples // 2}")
-    count = samples + 1 - 2 * m
-    if alpha == 2:
-        overlaps = 18.0 * count + 16.0 * max(count - m, 0) + max(count - 2 * m, 0)  # 6² / 2, 4², 1² by lag 0, m, 2m
-        return 18.0 * count**2 / overlaps
-    # Cells of one lag near the peaks at 0, m and 2m (sharp for flicker phase), wider ones elsewhere, each by its middle.
+    order = _order(estimator)
+    if not 1 <= m <= samples // order:
+        raise InputError(f"m is {m!r}; with {samples} samples it must lie between 1 and {samples // order}")
+    summed = estimator == "modified"
+    count = samples + 1 + summed - order * m
+    if alpha == 2 and not summed:  # overlaps of the differences by lags of 0, m, 2m, …
+        weights = [math.comb(2 * order, order + j) for j in range(order + 1)]
+        overlaps = sum((1 + (j > 0)) * w**2 * max(count - j * m, 0) for j, w in enumerate(weights))
+        return float((weights[0] * count) ** 2 / overlaps)
+    # Cells of one lag near the peaks at 0, m, 2m, … (sharp for flicker phase), wider ones elsewhere, each by its middle.
     end = min(count, 6 * m)
     if m <= 1000:
         edges = np.arange(end + 1)
     else:
-        fine = [np.arange(centre - 1000, centre + 1001) for centre in (0, m, 2 * m)]
+        fine = [np.arange(centre - 1000, centre + 1001) for centre in range(0, (order + 1) * m, m)]
         edges = np.unique(np.concatenate([*fine, np.arange(0, end, m // 500), [0, end]]))
         edges = edges[(edges >= 0) & (edges <= end)]
     width = np.diff(edges)
     lag = edges[:-1] + 0.5 * (width - 1)
-    correlation = _second_difference_covariance(alpha, lag, m) / _second_difference_covariance(alpha, np.zeros(1), m)
+    covariance = _summed_phase_covariance if summed else _phase_covariance
+    correlation = _difference_covariance(covariance, alpha, lag, m, order)
+    correlation /= _difference_covariance(covariance, alpha, np.zeros(1), m, order)
     both_sides = np.where(edges[:-1] == 0, 1.0, 2.0) * width
     return float(max(1.0, count / float(np.sum(both_sides * correlation**2 * (1.0 - lag / count)))))
 
 
-def _second_difference_covariance(alpha: int, lag: Array, m: int) -> Array:
-    """Return the autocovariance of x[k + 2m] − 2 x[k + m] + x[k], up to a factor, from the generalised covariance of x."""
+def _difference_covariance(
+    covariance: Callable[[int, Array, int], Array], alpha: int, lag: Array, m: int, order: int
+) -> Array:
+    """Return the autocovariance of the differences over m of an order, up to a factor, from a generalised covariance."""
+    total = np.zeros_like(lag)
+    for j in range(-order, order + 1):
+        total += (-1) ** j * math.comb(2 * order, order + j) * covariance(alpha, lag + j * m, m)
+    return total
 
-    def phase_covariance(k: Array) -> Array:
-        t = np.abs(k) / m
-        logarithm = np.log(np.where(t > 0.0, t, 1.0))
-        if alpha == 0:
-            return np.asarray(-t)
-        if alpha == -1:
-            return np.asarray(t * t * logarithm)
-        if alpha == -2:
-            return np.asarray(t**3)
 
-        # Flicker of the phase has infinite variance unless its band ends: Greenhall's second difference over one sample interval.
-        def smooth(j: Array) -> Array:
-            size = np.abs(j)
-            return np.asarray(size * size * np.log(np.where(size > 0.0, size, 1.0)))
+def _phase_covariance(alpha: int, k: Array, m: int) -> Array:
+    """Return the generalised covariance of the phase at lags of k samples, in units of m samples, up to a factor."""
+    t = np.abs(k) / m
+    if alpha == 0:
+        return np.asarray(-t)
+    if alpha == -1:
+        return np.asarray(t * t * _logarithm(t))
+    if alpha == -2:
+        return np.asarray(t**3)
 
-        near = np.minimum(np.abs(k), 1000)
-        difference = 2.0 * smooth(near) - smooth(near - 1) - smooth(near + 1)
-        return np.asarray(np.where(np.abs(k) <= 1000, difference, -2.0 * np.log(np.maximum(np.abs(k), 1)) - 3.0))
+    # Flicker of the phase has infinite variance unless its band ends: Greenhall's second difference over one sample interval.
+    def smooth(j: Array) -> Array:
+        return np.asarray(j * j * _logarithm(np.abs(j)))
 
-    g = phase_covariance
-    return g(lag) * 6.0 - 4.0 * (g(lag - m) + g(lag + m)) + g(lag - 2 * m) + g(lag + 2 * m)
+    near = np.minimum(np.abs(k), 1000)
+    difference = 2.0 * smooth(near) - smooth(near - 1) - smooth(near + 1)
+    return np.asarray(np.where(np.abs(k) <= 1000, difference, -2.0 * np.log(np.maximum(np.abs(k), 1)) - 3.0))
+
+
+def _summed_phase_covariance(alpha: int, k: Array, m: int) -> Array:
+    """Return the same of the running sum of the phase: minus its second difference over one sample is that of the phase.
+
+    Exactly so, but for flicker of the rate, where the difference is taken for the derivative.
+    """
+    t, step = np.abs(k) / m, 1.0 / m
+    if alpha == 2:
+        return np.asarray(-t)
+    if alpha == 1:
+        return np.asarray(t * t * _logarithm(t))
+    if alpha == 0:
+        return np.asarray(t**3 - step**2 * t)
+    if alpha == -1:
+        return np.asarray(-(t**4) * _logarithm(t))
+    return np.asarray(-(t**5) + step**2 * t**3 * 5.0 / 3.0 - step**4 * t * 2.0 / 3.0)
+
+
+def _logarithm(t: Array) -> Array:
+    """Return ln t, and 0 at 0, where a power of t stands before it."""
+    return np.asarray(np.log(np.where(t > 0.0, t, 1.0)))
 
 
 def _median_deviation(phase: Array, m: int, alpha: int) -> float:
@@ -591,16 +662,16 @@ def _record(values: ArrayLike, sample_interval: float, kind: str) -> tuple[Array
     return record, dt, 1.0 if kind == "rate" else 1.0 / dt
 
 
-def _multiples(taus: ArrayLike | None, samples: int, dt: float) -> NDArray[np.int64]:
+def _multiples(taus: ArrayLike | None, samples: int, dt: float, order: int) -> NDArray[np.int64]:
     if taus is None:
         largest = max(1, samples // 3)
         return np.unique(np.round(np.geomspace(1, largest, 2 + int(12 * math.log10(largest)))).astype(np.int64))
     wanted = np.atleast_1d(checks.array("taus", taus, (...,))).ravel()
     multiples = np.round(wanted / dt)
     for tau, m in zip(wanted, multiples, strict=True):
-        if not 1 <= m <= samples // 2:
+        if not 1 <= m <= samples // order:
             raise InputError(
-                f"taus holds {tau:g} s; with {samples} samples of {dt:g} s it must lie between {dt:g} s and {samples // 2 * dt:g} s"
+                f"taus holds {tau:g} s; with {samples} samples of {dt:g} s it must lie between {dt:g} s and {samples // order * dt:g} s"
             )
     if len(multiples) == 0:
         raise InputError("taus is empty; leave it out for the default")

@@ -127,7 +127,7 @@ class Drift:
     """By the formula; NaN where it does not serve."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class FilterOutcome:
     """What the filter made of one integration algorithm."""
 

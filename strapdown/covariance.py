@@ -23,6 +23,7 @@ import numpy as np
 
 from strapdown import coning, flicker, gyro, kinematics, quaternion, vectors
 from strapdown.checks import Array, InputError, count, known_keys, non_negative
+from strapdown.equality import ByValue
 from strapdown.estimation.states import covariance_matrices
 from strapdown.gyro import GyroSpec
 from strapdown.kernels import covariance_loop
@@ -58,8 +59,8 @@ def _no_sensors() -> dict[str, float]:
     return {}
 
 
-@dataclass(frozen=True, kw_only=True)
-class Consider:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Consider(ByValue):
     """Errors that neither the scenario nor the filter knows of: one standard deviation each, independent on every axis."""
 
     scale_factor: float = 0.0
@@ -88,7 +89,7 @@ class Consider:
             object.__setattr__(self, name, checked)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Analysis:
     """What the filter will do, predicted: the error state e = (δθ, δb), rad in the body frame and rad/s."""
 
@@ -180,7 +181,7 @@ class Analysis:
 # ------------------------------------------------------------------------------------------------------------- the trajectory
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _Rows:
     """Scalar rows of one sensor's measurements, in the order of time."""
 
@@ -409,7 +410,7 @@ def _diagonal(attitude_sigma: float, bias_sigma: float) -> Array:
     return block
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _Path:
     """The trajectory cut at every gyro edge and every measurement, and the rows of all sensors in order."""
 
@@ -538,7 +539,7 @@ class _Random:
         return amplitudes, table[0], table[1], table[2], cross, sources
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _Column:
     """An error without noise: a rate error in each segment (n, 3), an error in each row (r,), a bias that grows (3,)."""
 

@@ -129,7 +129,7 @@ def express(name: str, value: float, unit: str) -> float:
     return float(value) / parse(name, f"1 {unit}", wanted, example)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Preset:
     """A gyro on the market, by its public data sheet."""
 

@@ -91,7 +91,7 @@ def axes_words(matrix: Array) -> str:
     return ", ".join(names)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Candidate:
     """One explanation of a recording."""
 

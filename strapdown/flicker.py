@@ -31,7 +31,7 @@ _POLES = (-0.92314517, -0.60000265, -0.10898167)
 """Least-squares fit of ``|Π(1 − ζ/z)/Π(1 − p/z)|²`` to sin(πf)/(πf), up to a factor, on 0 < f < ½: 0.22 % at worst, checked by a test."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Shaping:
     """A shaping filter of unit flicker: ``x ← p x + w``, ``y = g · x``, with w one standard normal a sample.
 

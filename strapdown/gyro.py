@@ -40,7 +40,6 @@ the simulator's bias holds too. Judge such a filter by its attitude.
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -51,6 +50,7 @@ from numpy.typing import ArrayLike
 
 from strapdown import flicker, tables, units
 from strapdown.checks import Array, InputError, array, finite, increasing, non_negative, positive
+from strapdown.equality import ByValue
 from strapdown.kernels import gyro_errors, noise
 from strapdown.kernels.machine import compiled
 
@@ -79,7 +79,7 @@ _BY_AXIS = {
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class GyroSpec:
+class GyroSpec(ByValue):
     """Parameters of a three-axis gyro, SI and radians. Every default is a perfect gyro.
 
     The noise coefficients take one number for all axes or one an axis.
@@ -155,14 +155,6 @@ class GyroSpec:
         if self.drop_probability >= 1.0:
             raise InputError(f"drop_probability is {self.drop_probability:g}; it must be below 1")
 
-    def __eq__(self, other: object) -> bool:
-        """Compare all fields by value."""
-        if not isinstance(other, GyroSpec):
-            return NotImplemented
-        return all(np.array_equal(getattr(self, f.name), getattr(other, f.name)) for f in dataclasses.fields(self))
-
-    __hash__ = None  # type: ignore[assignment]
-
     @property
     def error_matrix(self) -> Array:
         """M of ``(I + M) w_b``: scale factors on the diagonal, misalignments off it."""
@@ -183,7 +175,7 @@ def _by_axis(name: str, value: Any, unit: str) -> Axes:
     return values
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class GyroOutput:
     """What the gyro gave, and the bias it gave it with."""
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown.checks import Array, InputError, array, unit_quaternions
+from strapdown.checks import covariance as checked
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -25,6 +26,8 @@ LONGEST = 1e150
 """A rotation vector with a larger component, rad, has no norm in double precision."""
 ROTATION_MATRIX_TOLERANCE = 1e-6
 """Largest entry of ``R Rᵀ − I`` that is taken for rounding."""
+UNDETERMINED = 1e-9
+"""Gap between the two least losses of a mean, over the largest, below which the mean is not determined."""
 
 
 def multiply(p: ArrayLike, q: ArrayLike) -> Array:
@@ -168,7 +171,7 @@ def from_matrix(matrix: ArrayLike) -> Array:
     best = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
     row = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
     q = row / np.linalg.norm(row, axis=-1, keepdims=True)
-    return np.asarray(np.where(q[..., :1] < 0.0, -q, q))
+    return _with_positive_w(q)
 
 
 def to_rotation(q: ArrayLike) -> Rotation:
@@ -188,3 +191,123 @@ def angle_between(p: ArrayLike, q: ArrayLike) -> Array:
     return np.asarray(
         np.linalg.norm(log(multiply(conjugate(unit_quaternions("p", p)), unit_quaternions("q", q))), axis=-1)
     )
+
+
+def to_euler(q: ArrayLike, sequence: str = "ZYX") -> Array:
+    """Return Euler angles (..., 3), rad, of unit quaternions q_fb, in the order of the sequence.
+
+    Parameters
+    ----------
+    q : array_like (..., 4)
+    sequence : str, default "ZYX"
+        Axes of the three turns as SciPy names them: capitals about the body's axes as they turn, small letters about the fixed ones. The
+        default is yaw ψ, pitch θ, roll φ with R_fb = R_z(ψ) R_y(θ) R_x(φ): of a fixed frame whose z axis points down, heading, elevation
+        and bank of an aircraft.
+
+    Returns
+    -------
+    array (..., 3)
+        The middle angle in [−π/2, π/2], or [0, π] where first and last axis are the same; the others in [−π, π]. Where first and last
+        turn are about one line (a pitch of ±π/2) the last angle is 0, and SciPy warns.
+
+    Examples
+    --------
+    >>> to_euler([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]).round(6).tolist()
+    [1.570796, 0.0, 0.0]
+    """
+    value = unit_quaternions("q", q)
+    with _named_sequence(sequence):
+        angles = to_rotation(value.reshape(-1, 4)).as_euler(sequence)
+    return np.asarray(angles).reshape(*value.shape[:-1], 3)
+
+
+def from_euler(angles: ArrayLike, sequence: str = "ZYX") -> Array:
+    """Return unit quaternions q_fb (..., 4), w ≥ 0, of Euler angles (..., 3), rad; the inverse of :func:`to_euler`."""
+    from scipy.spatial.transform import Rotation
+
+    value = array("angles", angles, (..., 3))
+    with _named_sequence(sequence):
+        rotation = Rotation.from_euler(sequence, value.reshape(-1, 3))
+    return _with_positive_w(from_rotation(rotation)).reshape(*value.shape[:-1], 4)
+
+
+@contextlib.contextmanager
+def _named_sequence(sequence: str) -> Iterator[None]:
+    """Refuse what names no three turns, in words."""
+    if not isinstance(sequence, str) or len(sequence) != 3:
+        raise InputError(f"sequence is {sequence!r}; give three axes, as 'ZYX'")
+    try:
+        yield
+    except ValueError as error:
+        raise InputError(
+            f"sequence {sequence!r} is not a sequence of Euler angles ({error}); give three axes, as 'ZYX'"
+        ) from None
+
+
+def to_mrp(q: ArrayLike) -> Array:
+    """Return modified Rodrigues parameters tan(θ/4) n (..., 3) of unit quaternions q_fb, those of the shorter way round: |p| ≤ 1."""
+    value = unit_quaternions("q", q)
+    return np.asarray(to_rotation(value.reshape(-1, 4)).as_mrp()).reshape(*value.shape[:-1], 3)
+
+
+def from_mrp(mrp: ArrayLike) -> Array:
+    """Return unit quaternions q_fb (..., 4), w ≥ 0, of modified Rodrigues parameters p (..., 3); p and −p/|p|² give the same."""
+    from scipy.spatial.transform import Rotation
+
+    value = array("mrp", mrp, (..., 3))
+    return _with_positive_w(from_rotation(Rotation.from_mrp(value.reshape(-1, 3)))).reshape(*value.shape[:-1], 4)
+
+
+def _with_positive_w(q: Array) -> Array:
+    return np.asarray(np.where(q[..., :1] < 0.0, -q, q))
+
+
+def mean(q: ArrayLike, covariance: ArrayLike | None = None) -> tuple[Array, Array]:
+    """Return the mean of attitudes (4,), w ≥ 0, and the covariance of its error (3, 3), rad², body side, body axes.
+
+    The mean is the most likely attitude for small errors: the unit quaternion of least ``Σ v_iᵀ R_i⁻¹ v_i``, v_i the vector part of
+    ``q_i⁻¹ ⊗ q``, by the eigenvectors of a matrix (4, 4) (Markley, Cheng, Crassidis & Oshman 2007, J. Guid. Control Dyn. 30). The signs of
+    the quaternions do not matter.
+
+    Parameters
+    ----------
+    q : array_like (n, 4)
+        Unit quaternions q_fb.
+    covariance : array_like (3, 3) or (n, 3, 3), optional
+        R of the error of each, δθ of ``q_i = q ⊗ exp(δθ)``, rad². Default: all alike, and the covariance of the mean is found from their
+        scatter, which takes two attitudes or more.
+
+    Raises
+    ------
+    InputError
+        If no mean is the best, as of attitudes half a turn apart, or a covariance is not symmetric and positive definite.
+
+    Examples
+    --------
+    >>> q, P = mean([[1.0, 0.0, 0.0, 0.0], exp([0.0, 0.0, 0.02])])
+    >>> float(log(q)[2].round(6))
+    0.01
+    """
+    value = unit_quaternions("q", array("q", q, ("n", 4)))
+    n = len(value)
+    if covariance is None:
+        if n < 2:
+            raise InputError(f"q holds {n} attitudes; their scatter takes two or more, or give the covariance of each")
+        information = np.broadcast_to(np.eye(3), (n, 3, 3))
+    else:
+        if n < 1:
+            raise InputError("q holds no attitude; give one or more")
+        given = np.asarray(covariance)
+        whole = array("covariance", given if given.ndim != 2 else np.broadcast_to(given, (n, *given.shape)), (n, 3, 3))
+        information = np.linalg.inv(np.array([checked(f"covariance[{k}]", R, 3) for k, R in enumerate(whole)]))
+    # Rows (3, 4) that take q to the vector part of q_i⁻¹ ⊗ q.
+    w, v = value[:, 0, None, None], value[:, 1:]
+    rows = np.concatenate([-v[:, :, None], w * np.eye(3) - np.cross(np.eye(3), v[:, None, :])], axis=2)
+    loss, vectors = np.linalg.eigh(np.einsum("nia,nij,njb->ab", rows, information, rows))
+    if loss[1] - loss[0] < UNDETERMINED * loss[-1]:
+        raise InputError("the attitudes have no mean: others are as near to all of them; are two half a turn apart?")
+    best = _with_positive_w(vectors[:, 0])
+    if covariance is not None:
+        return best, np.asarray(np.linalg.inv(np.sum(information, axis=0)))
+    error = log(multiply(conjugate(best), value))
+    return best, np.asarray(error.T @ error / (n * (n - 1.0)))

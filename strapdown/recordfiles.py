@@ -32,7 +32,7 @@ FORMAT = 1
 """Version of the layout; a reader refuses a newer one."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class RecordFile:
     """A record with what its file tells of its making."""
 

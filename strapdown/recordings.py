@@ -35,7 +35,7 @@ SHORT_STAMPS = 0.1
 _COLUMNS = {"gyro": ("gx", "gy", "gz"), "accelerometer": ("ax", "ay", "az"), "magnetometer": ("mx", "my", "mz")}
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Recording:
     """A recording of one inertial measurement unit."""
 
@@ -357,7 +357,7 @@ def increments(recording: Recording) -> Array:
     return np.asarray(0.5 * (recording.rate[1:] + recording.rate[:-1]) * np.diff(recording.time)[:, None])
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class GyroSamples:
     """Gyro samples at even intervals, for noise identification."""
 

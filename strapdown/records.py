@@ -35,7 +35,7 @@ LARGEST_TURN = 1e6
 """rad: nothing turns so far in one sample interval, nor does a filter cut such a turn into steps."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Truth:
     """What only a simulation, or a reference system, knows."""
 
@@ -45,7 +45,7 @@ class Truth:
     """True gyro bias at the edges (n + 1, 3), rad/s."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ImuRecord:
     """Gyro increments and vector measurements over one run.
 
@@ -147,7 +147,7 @@ def cut(record: ImuRecord, first: int, last: int) -> ImuRecord:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Innovations:
     """Innovations of one sensor, in the order of its measurements."""
 
@@ -231,7 +231,7 @@ class Event:
         return f"Gap of {self.end - self.start:.3g} s after {self.start:.6g} s: the turn across it is taken for one at constant rate."
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ErrorStateEstimate:
     """Estimate of one declaration of error states (:mod:`strapdown.estimation.error_states`) at the kept edges."""
 
@@ -248,7 +248,7 @@ class ErrorStateEstimate:
         return np.sqrt(self.variance)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Estimate:
     """What a filter made of a record, at the kept edges."""
 

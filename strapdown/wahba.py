@@ -149,7 +149,7 @@ class InconsistentError(InputError):
     """Directions whose angles differ between the frames by more than their noise explains."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Solution:
     """The attitude that minimises Wahba's loss, and how far it may be believed."""
 

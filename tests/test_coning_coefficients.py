@@ -8,7 +8,7 @@ import pytest
 
 from strapdown import coning
 from strapdown.checks import InputError
-from strapdown.coning import ALGORITHMS
+from strapdown.coning import ALGORITHMS, Algorithm
 from strapdown.coning import coefficients as exact
 
 NUMBERS = ("one", "two", "three", "four", "five", "six", "seven", "eight")
@@ -168,10 +168,11 @@ def test_a_table_with_one_wrong_coefficient_refuses_to_be_made(name):
     if good.solver == "compressed":
         bad = {"coefficients": (good.coefficients[0] + Fraction(1, 1000), *good.coefficients[1:])}
     else:
-        rows = [list(row) for row in good.pairs]
+        what = "correction" if good.solver == "polynomial" else "pairs"
+        rows = [list(row) for row in good.products]
         rows[0][1] += Fraction(1, 1000)
         rows[1][0] -= Fraction(1, 1000)
-        bad = {"pairs": tuple(map(tuple, rows))}
+        bad = {what: tuple(map(tuple, rows))}
     with pytest.raises(InputError, match=name):
         dataclasses.replace(good, **bad)
 
@@ -195,3 +196,59 @@ def test_catalogue_names_are_the_algorithms_names():
     assert "two-samples" not in ALGORITHMS
     with pytest.raises(InputError, match="did you mean 'two-sample'"):
         coning.named("two-samples")
+
+
+def test_what_a_solver_does_not_use_is_refused():
+    """Or the algorithm would not be what its table says, and the order check would be of something else."""
+    third = Fraction(1, 3)
+    with pytest.raises(InputError, match="ends with the step's last increment"):
+        Algorithm(
+            name="mine", solver="compressed", samples=1, following=1, order=3, drift_order=4, coefficients=(third,)
+        )
+    pairs = ((Fraction(0), Fraction(2, 3)), (Fraction(-2, 3), Fraction(0)))
+    for solver in ("euler", "magnus-4", "runge-kutta-4", "polynomial", "compressed"):
+        with pytest.raises(InputError, match=f"mine: solver '{solver}' does not use pairs"):
+            Algorithm(
+                name="mine",
+                solver=solver,
+                samples=2,
+                order=2,
+                drift_order=4,
+                pairs=pairs,
+                coefficients=(Fraction(2, 3),) if solver == "compressed" else (),
+                correction=((Fraction(0),) * 2,) * 2 if solver == "polynomial" else (),
+            )
+    with pytest.raises(InputError, match="does not use coefficients"):
+        dataclasses.replace(ALGORITHMS["time-taylor-2"], coefficients=(Fraction(2, 3),))
+    for solver in ("euler", "commutator-free-4", "magnus-6"):
+        for around in ({"previous": 1}, {"following": 2}):
+            with pytest.raises(InputError, match="previous and following must be 0"):
+                Algorithm(name="mine", solver=solver, samples=3, order=2, drift_order=4, **around)
+    # Two increments summed, and then Euler's step: no products of two, whatever is claimed.
+    with pytest.raises(InputError, match="the drift begins at λ\\^2"):
+        Algorithm(name="mine", solver="euler", samples=2, order=2, drift_order=4)
+
+
+def test_tables_of_other_shapes_and_numbers_are_refused():
+    zeros = ((Fraction(0),) * 5,) * 5
+    with pytest.raises(InputError, match="correction is not 4 by 4"):
+        dataclasses.replace(ALGORITHMS["polynomial-4"], correction=zeros)
+    with pytest.raises(InputError, match="correction is not 4 by 4"):
+        dataclasses.replace(ALGORITHMS["polynomial-4"], correction=())
+    with pytest.raises(InputError, match="not rational"):
+        dataclasses.replace(ALGORITHMS["two-sample"], coefficients=(2.0 / 3.0,))
+    with pytest.raises(InputError, match="drift_order is 3; it must be even"):
+        dataclasses.replace(ALGORITHMS["one-sample"], drift_order=3)
+    with pytest.raises(InputError, match="rate_points is 3; it must be even"):
+        dataclasses.replace(ALGORITHMS["one-sample-rate-2"], rate_points=3)
+
+
+def test_products_of_the_published_schemes():
+    """Of a rate a + b t they make T³/12 a × b: ½ ∫ (A b − B a) dt, all that there is to second order."""
+    for name in ("magnus-4", "magnus-6", "commutator-free-4"):
+        table = ALGORITHMS[name].products
+        n = len(table)
+        ones, ramp = monomial_increments(0, 0, n), monomial_increments(1, 0, n)
+        got = sum(table[i][j] * (ones[i] * ramp[j] - ones[j] * ramp[i]) for i in range(n) for j in range(i + 1, n))
+        assert got == second_order(0, 1, n)
+    assert ALGORITHMS["two-sample"].products == ((0, Fraction(2, 3)), (Fraction(-2, 3), 0))

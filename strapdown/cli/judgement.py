@@ -14,6 +14,9 @@ from strapdown.cli.terminal import app, console, counted, show, table, writable,
 
 if TYPE_CHECKING:
     from strapdown.consistency import Judgement
+    from strapdown.diagnosis import Diagnosis
+    from strapdown.records import Estimate, ImuRecord
+    from strapdown.setup import FilterSetup
 
 CONSISTENT, NOT, CANNOT_TELL = 0, 1, 2
 """Exit status of a verdict. Bad input ends with 2 too, and an error on standard error."""
@@ -39,7 +42,10 @@ def check(
     ] = None,
     json: Annotated[Path | None, typer.Option("--json", help="File for all statistics.")] = None,
 ) -> None:
-    """Tell whether the filter may be believed: exit status 0 consistent, 1 not, 2 cannot tell (or bad input)."""
+    """Tell whether the filter may be believed: exit status 0 consistent, 1 not, 2 cannot tell (or bad input).
+
+    With --record the verdict takes the statistics and the causes that were looked for together.
+    """
     from strapdown import consistency, records
     from strapdown.checks import InputError
     from strapdown.consistency.bounds import tail
@@ -76,10 +82,16 @@ def check(
             f"{result} is {f'a {kind}' if kind else 'HDF5 of another program'}; pass what `strapdown estimate` or "
             "`strapdown montecarlo` wrote"
         )
-    content.update(judgement.summary())
-    _show(judgement)
+    _show_statistics(judgement)
+    words = judgement.words
     if record is not None:
-        content["diagnosis"] = _diagnosed(result, record, filter_file, probability)
+        content["diagnosis"], found = _diagnosed(result, record, filter_file, judgement)
+        if found is not None:
+            judgement, words = found.judgement, found.words
+    for limit in judgement.limits:
+        console.print(f"Note: {limit}.")
+    console.print(words)
+    content.update(judgement.summary())
     if json is not None:
         write_json(json, content)
         written(json)
@@ -101,7 +113,7 @@ def _kind(path: Path) -> str:
         raise InputError(f"{path} cannot be read as HDF5 ({error}); the file is truncated or of another kind") from None
 
 
-def _show(judgement: Judgement) -> None:
+def _show_statistics(judgement: Judgement) -> None:
     rows = table(
         "Statistics of the filter against what they are of a right one",
         "statistic",
@@ -123,49 +135,80 @@ def _show(judgement: Judgement) -> None:
             "Each p-value is that of its statistic alone; pass and FAIL take all together "
             f"(a right filter fails with at most {100.0 * (1.0 - judgement.probability):.2g} %). NIS and NEES are per degree of freedom."
         )
-    for limit in judgement.limits:
-        console.print(f"Note: {limit}.")
-    console.print(judgement.words)
 
 
-def _diagnosed(result: Path, record: Path, filter_file: Path | None, probability: float) -> dict[str, Any]:
+def _diagnosed(
+    result: Path, record: Path, filter_file: Path | None, judgement: Judgement
+) -> tuple[dict[str, Any], Diagnosis | None]:
+    """Show the causes that a record gives evidence of; return them as plain values, and with the verdict by all evidence, if any."""
     import numpy as np
 
-    from strapdown import diagnosis, estimation, recordfiles, records, setup
-    from strapdown.checks import InputError
+    from strapdown import diagnosis, estimation, recordfiles, records
+    from strapdown.tuning.suspicion import accepted
 
-    if filter_file is not None:
-        chosen = setup.read_setup(filter_file)
-    else:
-        told = records.read_attributes(result).get("filter")
-        if told is None:
-            raise InputError(f"{result} does not tell its filter; give --filter, a TOML file with the table [filter]")
-        chosen = setup.from_toml(str(told), f"{result}: filter")
-
+    chosen = _filter_of(result, filter_file)
     estimate = records.read_estimate(result)
     held = recordfiles.read_record_file(record)
-    source = held.record
-    unknown = sorted(set(estimate.innovations) - {series.sensor for series in source.vectors})
-    if unknown or not np.isin(estimate.time, source.time).all():
-        what = f"has no sensor {unknown[0]!r}" if unknown else "has other stamps"
-        raise InputError(f"{record} {what}; {result} was made from another record")
+    _need_same(result, estimate, record, held.record)
     missing = without_a_state(record, held, chosen)
     for sentence in no_state_words(missing, chosen):
         console.print(sentence)
     if chosen.states is not None and chosen.states.names:
         reason = f"the search knows a filter of attitude and bias alone, and this one has the states {', '.join(chosen.states.names)}"
         console.print(f"Causes were not looked for: {reason}.")
-        return {"not_looked_for": reason, "without_a_state": list(missing)}
+        return {"not_looked_for": reason, "without_a_state": list(missing)}, None
     P = np.diag(estimate.variance[0]) if estimate.covariance is None else estimate.covariance[0]
     initial = estimation.State(attitude=estimate.attitude[0], bias=estimate.bias[0], covariance=P)
-    found = diagnosis.diagnose(source, chosen, initial, probability=probability)
+    # The verdict is on the filter with its gate, so what that refused is left out.
+    found = diagnosis.diagnose(
+        accepted(held.record, estimate), chosen, initial, probability=judgement.probability, judgement=judgement
+    )
     rows = table("Causes by what they would explain", "cause", "of", "gain", "ln p", "", left=2)
     for cause in found.considered[:8]:
         mark = Text("likely", style="red") if cause in found.causes else Text("no")
         rows.add_row(cause.name, cause.of, f"{cause.gain:.4g}", f"{cause.log_p:.4g}", mark)
     show(rows)
-    console.print(found.words)
-    return {**found.summary(), "without_a_state": list(missing)}
+    content = {**found.summary(), "without_a_state": list(missing)}
+    own = _not_of_the_search(chosen, estimate)
+    if own:
+        console.print(f"{own}; so the causes are no part of the verdict, which the statistics give alone.")
+        console.print(found.cause_words)
+        return content, None
+    return content, found
+
+
+def _filter_of(result: Path, filter_file: Path | None) -> FilterSetup:
+    """Return the setup that an estimate was made with, as a file gives it or as the estimate itself does."""
+    from strapdown import records, setup
+    from strapdown.checks import InputError
+
+    if filter_file is not None:
+        return setup.read_setup(filter_file)
+    told = records.read_attributes(result).get("filter")
+    if told is None:
+        raise InputError(f"{result} does not tell its filter; give --filter, a TOML file with the table [filter]")
+    return setup.from_toml(str(told), f"{result}: filter")
+
+
+def _need_same(result: Path, estimate: Estimate, path: Path, record: ImuRecord) -> None:
+    """Refuse a record that an estimate was not made from."""
+    import numpy as np
+
+    from strapdown.checks import InputError
+
+    unknown = sorted(set(estimate.innovations) - {series.sensor for series in record.vectors})
+    if unknown or not np.isin(estimate.time, record.time).all():
+        what = f"has no sensor {unknown[0]!r}" if unknown else "has other stamps"
+        raise InputError(f"{path} {what}; {result} was made from another record")
+
+
+def _not_of_the_search(chosen: FilterSetup, estimate: Estimate) -> str:
+    """Say what a filter did that the search for causes does not; empty if there is nothing."""
+    if chosen.robust is not None:
+        return "The filter weighs measurements by how far they lie off, and the search for causes does not"
+    if any(event.kind == "recovery" for event in estimate.events):
+        return "The filter recovered from a lost attitude, and the search for causes does not"
+    return ""
 
 
 @app.command()

@@ -6,6 +6,7 @@ import functools
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
+from numbers import Rational
 
 import numpy as np
 
@@ -25,6 +26,20 @@ SOLVERS = {
     "euler": "first-order update of the quaternion, normalised",
 }
 """How an algorithm turns the increments of a step into its rotation."""
+
+_TABLES = {"compressed": "coefficients", "pairs": "pairs", "polynomial": "correction"}
+"""The table that a solver reads. The other solvers read none, and no increments but those of the step."""
+
+
+def pair_tables(samples: int, window: int, own: Mapping[int, Table]) -> Array:
+    """Return pair tables as floats by the place of the step in the window (M − N + 1, M, M): ``own``, and time-Taylor ones elsewhere.
+
+    Near the ends of a record the window stays inside it and the step takes another place in the window, for which the algorithm's own
+    table is not made; a record shorter than the window has none of it.
+    """
+    places = range(max(0, window - samples + 1))
+    tables = [own.get(place) or exact.taylor_pairs(samples, place, window - samples - place) for place in places]
+    return np.array([exact.floats(table) for table in tables]).reshape(len(places), window, window)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,33 +67,64 @@ class Algorithm:
     coefficients: Rationals = field(default=(), repr=False)
     """Of the compressed solver: k_1 … k_{N−1+p} in φ = Σ Δθ_i + (Σ_j k_j Δθ_{N−j}) × Δθ_N."""
     pairs: Table = field(default=(), repr=False)
-    """Of the other solvers: all products of two increments in the step, as a pair table over the window (see ``coefficients``)."""
+    """Of the pairs solver: K over the window in φ = Σ Δθ_i + Σ_{i<j} K_ij Δθ_i × Δθ_j, a pair table (see ``coefficients``)."""
     correction: Table = field(default=(), repr=False)
-    """Of the polynomial solver: the part of ``pairs`` that is added to the solution of the quaternion equation."""
+    """Of the polynomial solver: the pair table C that is added to the solution of the quaternion equation; zeros for none."""
     source: str = ""
     """Where it was published."""
 
     def __post_init__(self) -> None:
         """Check shapes and order conditions."""
         checks.one_of(f"{self.name}: solver", self.solver, SOLVERS)
-        for what, value in (("samples", self.samples), ("order", self.order)):
-            checks.count(f"{self.name}: {what}", value)
-        for what, value in (
-            ("previous", self.previous),
-            ("following", self.following),
-            ("rate_points", self.rate_points),
-        ):
-            checks.count(f"{self.name}: {what}", value, least=0)
-        m = self.window
-        if self.solver == "compressed":
-            if len(self.coefficients) != m - 1:
-                raise InputError(f"{self.name}: {len(self.coefficients)} coefficients; N − 1 + p = {m - 1} are needed")
-        elif len(self.pairs) != m or any(len(row) != m for row in self.pairs):
-            raise InputError(f"{self.name}: the pair table is not {m} by {m}, one row for each increment of the window")
-        elif any(self.pairs[i][j] != -self.pairs[j][i] for i in range(m) for j in range(i + 1)):
+        for what in ("samples", "order", "drift_order"):
+            checks.count(f"{self.name}: {what}", getattr(self, what))
+        for what in ("previous", "following", "rate_points"):
+            checks.count(f"{self.name}: {what}", getattr(self, what), least=0)
+        for what in ("drift_order", "rate_points"):
+            if getattr(self, what) % 2:
+                raise InputError(f"{self.name}: {what} is {getattr(self, what)}; it must be even")
+        self._check_window()
+        self._check_tables()
+        self._check_drift()
+
+    def _check_window(self) -> None:
+        if self.solver == "compressed" and self.following:
             raise InputError(
-                f"{self.name}: the pair table is not antisymmetric; Δθ_i × Δθ_j changes sign with its order"
+                f"{self.name}: following is {self.following}, but the compressed solver ends with the step's last increment; "
+                "use solver 'pairs'"
             )
+        if self.solver not in _TABLES and self.window != self.samples:
+            raise InputError(
+                f"{self.name}: solver {self.solver!r} uses the increments of the step alone; previous and following must be 0"
+            )
+
+    def _check_tables(self) -> None:
+        m = self.window
+        own = _TABLES.get(self.solver)
+        for what in _TABLES.values():
+            if what != own and getattr(self, what):
+                raise InputError(f"{self.name}: solver {self.solver!r} does not use {what}; leave the table out")
+        if own is None:
+            return
+        table = getattr(self, own)
+        entries = table if own == "coefficients" else [x for row in table for x in row]
+        if not all(isinstance(x, Rational) for x in entries):
+            raise InputError(
+                f"{self.name}: {own} holds a number that is not rational; give fractions.Fraction or int, for orders are checked exactly"
+            )
+        if own == "coefficients":
+            if len(table) != m - 1:
+                raise InputError(f"{self.name}: {len(table)} coefficients; N − 1 + p = {m - 1} are needed")
+        elif len(table) != m or any(len(row) != m for row in table):
+            raise InputError(
+                f"{self.name}: the table {own} is not {m} by {m}, one row for each increment of the window"
+            )
+        elif any(table[i][j] != -table[j][i] for i in range(m) for j in range(i + 1)):
+            raise InputError(
+                f"{self.name}: the table {own} is not antisymmetric; Δθ_i × Δθ_j changes sign with its order"
+            )
+
+    def _check_drift(self) -> None:
         series = self._drift_series(self.drift_order // 2 + 1)
         bad = next((n for n, c in enumerate(series[:-1]) if c != 0), None)
         if bad is not None:
@@ -101,9 +147,22 @@ class Algorithm:
         return "increments" + (f", {self.following} samples late" if self.following else "")
 
     @functools.cached_property
+    def products(self) -> Table:
+        """All products of two increments in a step, to second order, as a pair table over the window; it follows from the solver."""
+        n, m = self.samples, self.window
+        if self.solver == "compressed":
+            before = [*reversed(self.coefficients), Fraction(0)]
+            return exact.outer_pairs(tuple(before), (*[Fraction(0)] * (m - 1), Fraction(1)))
+        if self.solver == "pairs":
+            return self.pairs
+        if self.solver == "polynomial":
+            return exact.sum_of_tables(exact.taylor_pairs(n, self.previous, self.following), self.correction)
+        return _scheme_products(self.solver, n)
+
+    @functools.cached_property
     def lags(self) -> Rationals:
-        """k_1 … k_{M−1}: sums of the pair table by lag."""
-        return self.coefficients if self.solver == "compressed" else exact.lag_sums(self.pairs)
+        """k_1 … k_{M−1}: sums of the products by lag."""
+        return exact.lag_sums(self.products)
 
     @functools.cached_property
     def drift_constant(self) -> Fraction:
@@ -118,9 +177,9 @@ class Algorithm:
         return np.array([float(k) for k in self.coefficients])
 
     @functools.cached_property
-    def pair_array(self) -> Array:
-        """``pairs`` as floats."""
-        return exact.floats(self.pairs)
+    def pair_arrays(self) -> Array:
+        """``pairs`` as floats, by the place of the step in the window (M − N + 1, M, M), as :func:`pair_tables` gives them."""
+        return pair_tables(self.samples, self.window, {self.previous: self.pairs})
 
     @functools.cached_property
     def correction_array(self) -> Array:
@@ -135,6 +194,23 @@ class Algorithm:
     def drift_series(self) -> tuple[float, ...]:
         """The powers 0, 2, 4, … of λ of the drift over β²ω, enough of them for λ ≤ 1 and a window of 17."""
         return tuple(float(c) for c in self._drift_series(48))
+
+
+def _scheme_products(solver: str, samples: int) -> Table:
+    """Return the products of two increments that a one-step scheme makes of its moments B_n, or of its rates w."""
+    if solver == "euler":
+        return ((Fraction(0),) * samples,) * samples
+    if solver == "runge-kutta-4":
+        # In the vector part of the step quaternion, doubled: T²/12 (w₀ × w_½ + w_½ × w₁).
+        w = exact.step_rates_at(samples, (Fraction(0), Fraction(samples, 2), Fraction(samples)))
+        both = exact.sum_of_tables(exact.outer_pairs(w[0], w[1]), exact.outer_pairs(w[1], w[2]))
+        return tuple(tuple(x / 12 for x in row) for row in both)
+    b = exact.step_moments(samples, 3)
+    if solver == "magnus-6":
+        # α₁ = 9/4 B₀ − 15 B₂, α₂ = 12 B₁, α₃ = −15 B₀ + 180 B₂; (20 α₁ + α₃) × α₂ / 240.
+        left = tuple((30 * x - 120 * z) / 240 for x, z in zip(b[0], b[2], strict=True))
+        return exact.outer_pairs(left, tuple(12 * y for y in b[1]))
+    return exact.outer_pairs(b[0], b[1])
 
 
 # ------------------------------------------------------------------------------------------------------------------- makers
@@ -198,7 +274,6 @@ def polynomial(samples: int) -> Algorithm:
         samples=samples,
         order=_fitted_order(samples),
         drift_order=_fitted_order(samples),
-        pairs=exact.taylor_pairs(samples),
         correction=((Fraction(0),) * samples,) * samples,
         source="Wu 2018 (RodFIter, QuatFIter); Yan 2017 (Picard)",
     )
@@ -207,7 +282,6 @@ def polynomial(samples: int) -> Algorithm:
 def matched(samples: int, previous: int, following: int = 0) -> Algorithm:
     """Return this package's own algorithm; :func:`strapdown.coning.coefficients.matched_correction` derives it."""
     m = samples + previous + following
-    correction = exact.matched_correction(samples, previous, following)
     return Algorithm(
         name=f"matched-{samples}-{previous}" + (f"-{following}" if following else ""),
         solver="polynomial",
@@ -216,75 +290,45 @@ def matched(samples: int, previous: int, following: int = 0) -> Algorithm:
         following=following,
         order=_fitted_order(m) if previous == following else m + 1,
         drift_order=2 * m,
-        pairs=exact.sum_of_tables(exact.taylor_pairs(samples, previous, following), correction),
-        correction=correction,
+        correction=exact.matched_correction(samples, previous, following),
         source="this package",
     )
 
 
 def magnus(order: int) -> Algorithm:
     """Return the Magnus integrator of order 4 (three samples) or 6 (four samples), on moments of the rate polynomial."""
-    samples = {4: 3, 6: 4}[order]
-    b = exact.step_moments(samples, order // 2)
-    if order == 4:
-        pairs = exact.outer_pairs(b[0], b[1])
-    else:
-        # α₁ = 9/4 B₀ − 15 B₂, α₂ = 12 B₁, α₃ = −15 B₀ + 180 B₂; (20 α₁ + α₃) × α₂ / 240.
-        pairs = exact.outer_pairs(
-            tuple((30 * x - 120 * z) / 240 for x, z in zip(b[0], b[2], strict=True)), tuple(12 * y for y in b[1])
-        )
     return Algorithm(
         name=f"magnus-{order}",
         solver=f"magnus-{order}",
-        samples=samples,
+        samples={4: 3, 6: 4}[order],
         order=order,
         drift_order=order,
-        pairs=pairs,
         source="Blanes, Casas, Ros 2000",
     )
 
 
 def commutator_free() -> Algorithm:
     """Return the commutator-free integrator of order 4: two exponentials, exp(½B₀ − 2B₁) ⊗ exp(½B₀ + 2B₁), three samples."""
-    b = exact.step_moments(3, 2)
     return Algorithm(
         name="commutator-free-4",
         solver="commutator-free-4",
         samples=3,
         order=4,
         drift_order=4,
-        pairs=exact.outer_pairs(b[0], b[1]),
         source="Blanes, Moan 2006",
     )
 
 
 def runge_kutta() -> Algorithm:
     """Return classical Runge–Kutta on equation (17), with rates at 0, T/2, T of the polynomial through three increments."""
-    w = exact.step_rates_at(3, (Fraction(0), Fraction(3, 2), Fraction(3)))
-    # Products of two in the vector part of the step quaternion, doubled: T²/12 (w₀ × w_½ + w_½ × w₁).
-    pairs = exact.sum_of_tables(exact.outer_pairs(w[0], w[1]), exact.outer_pairs(w[1], w[2]))
     return Algorithm(
-        name="runge-kutta-4",
-        solver="runge-kutta-4",
-        samples=3,
-        order=4,
-        drift_order=4,
-        pairs=tuple(tuple(x / 12 for x in row) for row in pairs),
-        source="Kutta 1901",
+        name="runge-kutta-4", solver="runge-kutta-4", samples=3, order=4, drift_order=4, source="Kutta 1901"
     )
 
 
 def euler() -> Algorithm:
     """Return q + ½ q ⊗ Δθ, normalised: what many small projects do."""
-    return Algorithm(
-        name="quaternion-euler",
-        solver="euler",
-        samples=1,
-        order=2,
-        drift_order=2,
-        pairs=((Fraction(0),),),
-        source="Euler 1768",
-    )
+    return Algorithm(name="quaternion-euler", solver="euler", samples=1, order=2, drift_order=2, source="Euler 1768")
 
 
 def _fitted_order(samples: int) -> int:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from strapdown import checks, quaternion
 from strapdown.checks import Array, InputError
 from strapdown.coning import coefficients as exact
-from strapdown.coning.algorithms import Algorithm, named
+from strapdown.coning.algorithms import Algorithm, named, pair_tables
 from strapdown.kernels import integration_polynomial as kernels
 from strapdown.kernels import integration_uneven
 from strapdown.kernels.integration import (
@@ -215,7 +215,10 @@ def _vectors(increments: Array, table: Algorithm) -> Array:
         else:
             compiled(compressed_vectors)(flat, coefficients, table.samples, rows)
     else:
-        compiled(pair_vectors)(increments, table.pair_array, vectors)
+        short = len(increments) < table.window
+        tables = pair_tables(table.samples, len(increments), {}) if short else table.pair_arrays
+        previous = len(increments) if short else table.previous
+        compiled(pair_vectors)(increments, table.samples, previous, tables, vectors)
     return vectors
 
 

@@ -36,7 +36,7 @@ from strapdown.consistency.bounds import (
     mean_p_value,
 )
 from strapdown.consistency.ensemble import Credibility, credibility
-from strapdown.consistency.judgement import Finding, Judgement, judge
+from strapdown.consistency.judgement import Finding, Judgement, concluded, judge
 from strapdown.consistency.manifold import SUBSETS, errors, fixed_frame, nees, whitened
 from strapdown.consistency.runs import judge_runs
 from strapdown.consistency.timeaverage import TimeAverage, time_average
@@ -66,6 +66,7 @@ __all__ = [
     "Verdict",
     "anderson_darling",
     "autocorrelation",
+    "concluded",
     "convergence_time",
     "coverage",
     "credibility",

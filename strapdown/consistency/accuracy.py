@@ -13,7 +13,7 @@ from strapdown.checks import Array, InputError, array, count, increasing, positi
 from strapdown.consistency.bounds import mean_bounds, tail
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Efficiency:
     """RMS error over independent runs against the square root of the posterior Cramér–Rao bound, at each epoch."""
 
@@ -54,7 +54,7 @@ def convergence_time(time: ArrayLike, magnitude: ArrayLike, threshold: float) ->
     return float(stamps[first]) if first < len(stamps) else math.nan
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Distribution:
     """The empirical distribution of error magnitudes."""
 
@@ -88,7 +88,7 @@ def distribution(error: ArrayLike) -> Distribution:
     return Distribution(values=values, probability=np.arange(1, len(values) + 1) / len(values))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ReferenceErrors:
     """Errors of an estimated attitude against a reference, as the BROAD benchmark tells them, rad; NaN where there is no reference."""
 

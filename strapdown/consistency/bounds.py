@@ -119,7 +119,7 @@ def log_mean_p_value(mean: float, degrees: int, samples: int) -> float:
     return two_sided(below, 1.0 - below)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Coverage:
     """How many of independent errors lie within k σ, for k of :data:`SIGMAS`."""
 
@@ -179,7 +179,7 @@ def coverage(error: ArrayLike, sigma: ArrayLike, probability: float = 0.99) -> C
     return Coverage(samples=len(e), inside=inside.mean(axis=0), probability=probability)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Verdict:
     """The mean over independent runs of a χ² statistic, per degree of freedom, at several epochs, against its two-sided bounds."""
 

@@ -7,7 +7,7 @@ probability that a right filter is called wrong by any of them is at most 1 − 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -89,7 +89,7 @@ class Judgement:
     def words(self) -> str:
         """The verdict and what contradicts the filter, for people."""
         lines = [f"{self.verdict}: {self.reason}"]
-        lines += [f"  - {finding.means}" for finding in self.findings if finding.rejected]
+        lines += [f"  - {finding.means}" for finding in self.findings if finding.rejected and finding.means]
         return "\n".join(lines)
 
     def summary(self) -> dict[str, Any]:
@@ -305,8 +305,8 @@ def error_words(what: str, ratio: float) -> str:
     return f"{what} is smaller than the filter says (NEES {ratio:.4g} per state)"
 
 
-def concluded(findings: list[Finding], limits: list[str], probability: float) -> Judgement:
-    """Return the verdict that findings lead to, all taken together."""
+def concluded(findings: Sequence[Finding], limits: Sequence[str], probability: float) -> Judgement:
+    """Return the verdict that findings lead to, all taken together; what each was before, rejected or not, does not count."""
     marked = holm(findings, 1.0 - probability)
     rejected = [finding for finding in marked if finding.rejected]
     verdict: Answer
@@ -353,7 +353,7 @@ def resolution(findings: Iterable[Finding], probability: float) -> float:
 
 def holm(findings: Iterable[Finding], error: float) -> list[Finding]:
     """Return the findings with those marked that Holm's step-down procedure rejects at a family-wise error of ``error``."""
-    marked = list(findings)
+    marked = [replace(finding, rejected=False) for finding in findings]
     order = sorted(range(len(marked)), key=lambda k: marked[k].p_value)
     for rank, k in enumerate(order):
         if not marked[k].p_value <= error / (len(marked) - rank):

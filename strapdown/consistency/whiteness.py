@@ -26,7 +26,7 @@ def usual_lags(samples: int) -> int:
     return max(1, min(MOST_LAGS, samples // 50))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Autocorrelation:
     """Autocorrelation of each component of a series."""
 
@@ -127,7 +127,7 @@ def anderson_darling(whitened: ArrayLike) -> tuple[float, float]:
     return a, p
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class QuantilePairs:
     """Sorted values beside the quantiles of the standard normal: a Q–Q plot."""
 

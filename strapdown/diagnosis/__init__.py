@@ -6,7 +6,8 @@ likelihood of the record is ``−½ Σ (ln s + z²)`` over its whitened innovati
 filter is run again and the θ of the largest likelihood found: by Gauss–Newton on the innovations, whose derivatives are differences of
 filter runs, where θ shifts them, and by a parabola where it scales them. Twice the gain in log-likelihood is χ² with as many degrees of
 freedom as θ has numbers if the filter is right (Wilks 1938; Willsky & Jones 1976). Causes are ranked by that probability; so each one is
-named with its size, and a cause that only looks alike explains less.
+named with its size, and a cause that only looks alike explains less. Where two explain the same (of two directions, which reference is off)
+both are named.
 
 Commutation error is the exception: to the innovations it *is* a gyro bias, which the filter estimates. It is computed from the increments
 themselves, by a better integration algorithm, and held against the filter's own σ of the bias, and against the truth if there is one.
@@ -18,7 +19,7 @@ themselves, by a better integration algorithm, and held against the filter's own
 ``hypotheses``, ``commutation``
     What may be wrong.
 ``turning``
-    What a scale factor of the gyro multiplies.
+    What a gyro's scale factor, misalignment and mounting act on.
 ``likelihood``
     How well a hypothesis explains the record.
 """

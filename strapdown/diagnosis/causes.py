@@ -7,16 +7,20 @@ from dataclasses import dataclass
 from typing import Any
 
 from strapdown.checks import Array
-from strapdown.consistency import Judgement
+from strapdown.consistency import Finding, Judgement
+
+LIKELIER = math.log(20.0)
+"""By so much in ln p the likeliest of two causes is told from the other: odds of 20 to 1, "strong" evidence (Kass & Raftery 1995)."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Cause:
     """One hypothesis with the θ that fits best."""
 
     name: str
     """What is wrong: "R too small", "R too large", "Q too small", "Q too large", "outliers", "time offset", "hard iron", "body-fixed bias",
-    "misalignment", "scale factor", "initial attitude", "initial bias", "commutation", "wrong convention"."""
+    "mounting", "misalignment", "scale factor", "reference length", "reference direction", "initial attitude", "initial bias",
+    "commutation", "wrong convention"."""
     of: str
     """Of what: a sensor, "gyro", …"""
     estimate: Array
@@ -31,27 +35,49 @@ class Cause:
     words: str
     """What it says, with its size."""
 
+    @property
+    def finding(self) -> Finding:
+        """The cause as evidence against the filter, to be taken together with the statistics."""
+        return Finding(name=self.name, of=self.of, value=self.gain, p_value=math.exp(self.log_p), samples=1)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnosis:
     """Likely causes, the likeliest first, and the evidence."""
 
     causes: tuple[Cause, ...]
-    """Those that are significant, all hypotheses taken together. After the first, others may only mirror it: correct it and look again."""
+    """Those that are significant, all evidence taken together. After the first, others may only mirror it: correct it and look again."""
     considered: tuple[Cause, ...]
     """All hypotheses, by rank."""
     judgement: Judgement
-    """What the statistics say of the filter as it is."""
+    """The verdict on the filter as it is: statistics and causes taken together (Holm), so that neither contradicts the other."""
     probability: float
-    """Probability that no cause is named of a right filter, at least."""
+    """Probability that a right filter is neither called wrong nor given a cause, at least."""
+
+    @property
+    def alternatives(self) -> tuple[Cause, ...]:
+        """The likeliest cause and those that are less likely by a factor of 20 at most: the data do not tell them apart."""
+        return tuple(cause for cause in self.causes if cause.log_p <= self.causes[0].log_p + LIKELIER)
 
     @property
     def words(self) -> str:
+        """The verdict and the causes, for people."""
+        return f"{self.judgement.words}\n{self.cause_words}"
+
+    @property
+    def cause_words(self) -> str:
         """The causes, for people."""
         if not self.causes:
             return "No cause among those considered is significant."
-        lines = [f"Likeliest cause: {self.causes[0].words}"]
-        lines += [f"  then, unless it mirrors the first: {cause.words}" for cause in self.causes[1:4]]
+        first = self.alternatives
+        if len(first) == 1:
+            lines = [f"Likeliest cause: {first[0].words}"]
+        else:
+            lines = [
+                "One of these causes, which the data do not tell apart:",
+                *(f"  - {cause.words}" for cause in first),
+            ]
+        lines += [f"  then, unless it mirrors the first: {cause.words}" for cause in self.causes[len(first) : 4]]
         return "\n".join(lines)
 
     def summary(self) -> dict[str, Any]:
@@ -69,6 +95,7 @@ class Diagnosis:
                 "log_p": number(cause.log_p),
                 "words": cause.words,
                 "significant": cause in self.causes,
+                "alternative": cause in self.alternatives,
             }
 
         return {

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from strapdown import consistency, estimation
 from strapdown.checks import InputError
+from strapdown.consistency import Judgement
 from strapdown.consistency.bounds import tail
 from strapdown.diagnosis.causes import Diagnosis
 from strapdown.diagnosis.commutation import commutation
@@ -21,24 +20,37 @@ GROSS = 3.0
 
 
 def diagnose(
-    record: ImuRecord, setup: FilterSetup, initial: estimation.State, *, probability: float = 0.99
+    record: ImuRecord,
+    setup: FilterSetup,
+    initial: estimation.State,
+    *,
+    probability: float = 0.99,
+    judgement: Judgement | None = None,
 ) -> Diagnosis:
-    """Return the likely causes of what is wrong with a filter on a record.
+    """Return the verdict on a filter by all evidence in a record, and the likely causes of what is wrong with it.
 
     Parameters
     ----------
     record : ImuRecord
         As the sensors gave it, gyro samples not yet compressed; its truth, if any, is used too.
     setup : FilterSetup
-        What the filter believes. Gates and robust updates are left out here: they hide what is to be seen.
+        The filter's model. Gates and robust updates are left out here: they hide what is to be seen.
     initial : State
         Where the filter starts.
     probability : float
-        A right filter is given no cause with at least this.
+        A right filter is neither called wrong nor given a cause with at least this.
+    judgement : Judgement, optional
+        Of the filter's own estimate, by :func:`strapdown.consistency.judge`; default: the filter is run here and judged.
+
+    Returns
+    -------
+    Diagnosis
+        Its ``judgement`` takes the statistics and the likelihood ratios of all hypotheses together, at one probability of a false alarm.
 
     Notes
     -----
-    The filter is run some ten times a sensor, and a hundred times more where something is grossly wrong.
+    The filter is run some ten times a sensor, and a hundred times more where something is grossly wrong. Statistics may pass where a
+    likelihood ratio does not: a rate random walk ten times too small leaves hardly a trace in the NIS.
     """
     tail(probability)
     if not any(len(series.time) for series in record.vectors):
@@ -48,7 +60,8 @@ def diagnose(
     estimate = estimation.run(model.record, model.noise, model.initial, every=every, full_covariance=True)
     truth = model.record.truth
     kept = None if truth is None else Truth(attitude=truth.attitude[::every], bias=truth.bias[::every])
-    judgement = consistency.judge(estimate, kept, probability=probability)
+    if judgement is None:
+        judgement = consistency.judge(estimate, kept, probability=probability)
     base = run(model)
     considered = [by_variance(model, base, hypothesis) for hypothesis in noise_hypotheses(model)]
     considered += [by_mean(model, base, hypothesis) for hypothesis in mean_hypotheses(model)]
@@ -60,10 +73,12 @@ def diagnose(
     if worst > GROSS:
         considered += conventions(model, base)
     considered.sort(key=lambda cause: (cause.log_p, -cause.gain))
-    least = math.log((1.0 - probability) / len(considered))
+    evidence = [*judgement.findings, *(cause.finding for cause in considered)]
+    together = consistency.concluded(evidence, judgement.limits, probability)
+    rejected = [finding.rejected for finding in together.findings[len(judgement.findings) :]]
     return Diagnosis(
-        causes=tuple(cause for cause in considered if cause.log_p <= least),
+        causes=tuple(cause for cause, significant in zip(considered, rejected, strict=True) if significant),
         considered=tuple(considered),
-        judgement=judgement,
+        judgement=together,
         probability=probability,
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import cast
 
@@ -30,26 +30,17 @@ def mean_hypotheses(model: Model) -> Iterator[Hypothesis]:
     seen = [series for series in record.vectors if len(series.time)]
     for series in seen:
         yield _time_offset(series.sensor, (series.sensor,), interval)
+        yield _mounting(series)
         if series.kind != "attitude":
             yield _body_fixed(series)
-        if len(seen) > 1 or series.kind == "attitude":
-            yield _misalignment(series)
+        if series.kind == "vector":
+            yield _reference_length(series)
+        if len(seen) > 1:  # of one sensor alone a turned reference is another fixed frame
+            yield _reference_direction(series)
     if len(seen) > 1:
         yield _time_offset("gyro", tuple(series.sensor for series in seen), interval)
     turned = turns(record, model.noise, model.initial)
-    yield Hypothesis(
-        name="scale factor",
-        of="gyro",
-        unit="1",
-        steps=np.full(3, 1e-5),
-        limit=0.2,
-        plausible=PLAUSIBLE,
-        # Not the increments over 1 + θ: that would take off their noise and their bias too.
-        apply=lambda m, theta: replace(
-            m, record=replace(m.record, increments=m.record.increments - turned * (theta / (1.0 + theta)))
-        ),
-        words=lambda theta, _: f"the gyro's scale factor is off by {shown(theta, 1e6)} ppm",
-    )
+    yield from (_gyro_errors(turned, *kind) for kind in GYRO_ERRORS)
     for part, unit, rows in (("attitude", "rad", slice(0, 3)), ("bias", "rad/s", slice(3, 6))):
         sigma = np.sqrt(np.diag(model.initial.covariance)[rows])
         yield Hypothesis(
@@ -119,7 +110,7 @@ def _body_fixed(series: VectorMeasurements) -> Hypothesis:
     )
 
 
-def _misalignment(series: VectorMeasurements) -> Hypothesis:
+def _mounting(series: VectorMeasurements) -> Hypothesis:
     def change(old: VectorMeasurements, theta: Array) -> VectorMeasurements:
         turn = quaternion.exp(theta)
         if old.attitude is not None:
@@ -130,13 +121,100 @@ def _misalignment(series: VectorMeasurements) -> Hypothesis:
         return replace(old, vector_b=old.vector_b @ quaternion.to_matrix(turn).T)  # rows of NaN pass
 
     return Hypothesis(
-        name="misalignment",
+        name="mounting",
         of=series.sensor,
         unit="rad",
         steps=np.full(3, 1e-5),
         limit=0.35,
         apply=lambda model, theta: model.with_series(series.sensor, lambda s: change(s, theta)),
-        words=lambda theta, _: f"{series.sensor} is turned in the body by {shown(-theta, 1e3)} mrad",
+        words=lambda theta, _: f"{series.sensor} is mounted off by a rotation of {shown(theta, 1e3)} mrad in the body",
+    )
+
+
+def _reference_length(series: VectorMeasurements) -> Hypothesis:
+    def apply(model: Model, theta: Array) -> Model:
+        return model.with_series(series.sensor, lambda s: replace(s, reference_f=s.reference_f / (1.0 + theta[0])))
+
+    return Hypothesis(
+        name="reference length",
+        of=series.sensor,
+        unit="1",
+        steps=np.array([1e-5]),
+        limit=0.5,
+        apply=apply,
+        words=lambda theta, spread: (
+            f"the reference of {series.sensor} is {100.0 * abs(theta[0]):.3g} ± {100.0 * spread[0]:.2g} % too "
+            f"{'long' if theta[0] > 0.0 else 'short'}, or its scale factor too {'small' if theta[0] > 0.0 else 'large'} by as much"
+        ),
+    )
+
+
+def _reference_direction(series: VectorMeasurements) -> Hypothesis:
+    def change(old: VectorMeasurements, theta: Array) -> VectorMeasurements:
+        back = quaternion.exp(-theta)
+        if old.attitude is not None:
+            return replace(old, attitude=quaternion.normalize(quaternion.multiply(back, old.attitude)))
+        if old.kind == "heading":  # about the fixed z axis, or the reference would leave the horizontal
+            back = quaternion.exp(-theta * np.array([0.0, 0.0, 1.0]))
+        return replace(old, reference_f=quaternion.rotate(back, old.reference_f))
+
+    return Hypothesis(
+        name="reference direction",
+        of=series.sensor,
+        unit="rad",
+        steps=np.full(3, 1e-5),
+        limit=0.35,
+        apply=lambda model, theta: model.with_series(series.sensor, lambda s: change(s, theta)),
+        words=lambda theta, _: (
+            f"the reference of {series.sensor} is turned by {shown(theta, 1e3)} mrad in the fixed frame"
+        ),
+    )
+
+
+def _off_diagonal(theta: Array) -> Array:
+    matrix = np.zeros((3, 3))
+    matrix[~np.eye(3, dtype=bool)] = theta
+    return matrix
+
+
+GYRO_ERRORS: tuple[tuple[str, str, int, Callable[[Array], Array], Callable[[Array], str]], ...] = (
+    ("scale factor", "1", 3, np.diag, lambda theta: f"the gyro's scale factor is off by {shown(theta, 1e6)} ppm"),
+    (
+        "mounting",
+        "rad",
+        3,
+        # What is measured in axes turned by θ is the rate turned back.
+        lambda theta: quaternion.to_matrix(quaternion.exp(-theta)) - np.eye(3),
+        lambda theta: f"the gyro is mounted off by a rotation of {shown(theta, 1e3)} mrad in the body",
+    ),
+    (
+        "misalignment",
+        "rad",
+        6,
+        _off_diagonal,
+        lambda theta: f"the gyro's axes are misaligned, xy, xz, yx, yz, zx, zy by {shown(theta, 1e3)} mrad",
+    ),
+)
+"""Errors M of a gyro that measures (I + M) w: name, unit, how many numbers θ, M of θ, and its words."""
+
+
+def _gyro_errors(
+    turned: Array, name: str, unit: str, size: int, matrix: Callable[[Array], Array], words: Callable[[Array], str]
+) -> Hypothesis:
+    def apply(model: Model, theta: Array) -> Model:
+        # Not the increments times (I + M)⁻¹: that would change their noise and their bias too.
+        excess = turned @ (np.eye(3) - np.linalg.inv(np.eye(3) + matrix(theta))).T
+        return replace(model, record=replace(model.record, increments=model.record.increments - excess))
+
+    return Hypothesis(
+        name=name,
+        of="gyro",
+        unit=unit,
+        steps=np.full(size, 1e-5),
+        limit=0.2,
+        plausible=PLAUSIBLE,
+        apply=apply,
+        words=lambda theta, _: words(theta),
     )
 
 

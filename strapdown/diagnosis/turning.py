@@ -1,4 +1,4 @@
-"""What a scale factor of the gyro multiplies: the turns of the body, without the gyro's bias and hardly with its noise."""
+"""What a gyro's scale factor, misalignment and mounting act on: the body's turns, without the gyro's bias and hardly with its noise."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from strapdown.estimation.states import ProcessNoise
 from strapdown.records import ImuRecord
 
 PLAUSIBLE = 0.01
-"""Standard deviation of a scale factor before the data are seen."""
+"""Standard deviation of a scale factor, or a misalignment in rad, before the data are seen."""
 UNLIKELY = 0.01
 """Probability that anything is taken for motion where the body rests."""
 

@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 
 from strapdown.checks import Array, InputError, array, non_negative, one_of, positive
+from strapdown.equality import ByValue
 from strapdown.kernels import augmented_chain
 from strapdown.units import STANDARD_GRAVITY
 from strapdown.vectors import GRAVITY_F
@@ -24,7 +25,7 @@ ENTRIES = tuple(a if a == b else f"{a}{b}" for a in AXES for b in AXES)
 """Entries of a matrix by rows: x, xy, xz, yx, y, …"""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Effect:
     """How the states c of a block enter one sensor: it measures ``(I + Σ c U) R_fbᵀ (r + Σ c d) + Σ c a``.
 
@@ -54,7 +55,7 @@ class Effect:
     is told of them is in the axes of the estimated attitude, their covariance too, which leaves out how well that is known."""
 
 
-class ErrorStates:
+class ErrorStates(ByValue):
     """Error states that enter linearly and change each by itself, or in chains: ``ċₖ = −λₖ cₖ + gₖ cₖ₊₁ + √qₖ wₖ``.
 
     Transition and noise are exact over any dt. A chain, of up to three states that do not enter the gyro, shapes the noise of its last one
@@ -191,7 +192,7 @@ def _matrix(name: str, diagonal: float | Array, off_diagonal: float | Array, uni
     return whole
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class GyroScale(ErrorStates):
     """Scale factors and misalignments of the gyro: the entries of M in ``w_meas = (I + M) w_b + b + n``, constant.
 
@@ -236,7 +237,7 @@ class GyroScale(ErrorStates):
         return np.asarray(np.eye(9)[self._entries].reshape(-1, 3, 3))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class GyroForce(ErrorStates):
     """Sensitivity of the gyro to specific force: the entries of G in ``w_meas = w_b + b + G f_b + n``, constant.
 
@@ -293,7 +294,7 @@ class GyroForce(ErrorStates):
         return -np.asarray(self.gravity_f)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class GyroGaussMarkov(ErrorStates):
     """A second gyro bias that forgets: first-order Gauss–Markov, stationary. Several of different times together cover flicker."""
 
@@ -331,7 +332,7 @@ class GyroGaussMarkov(ErrorStates):
         return np.eye(3)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class VectorBias(ErrorStates):
     """A constant bias of a vector sensor in body axes: hard iron, accelerometer bias."""
 
@@ -374,7 +375,7 @@ class VectorBias(ErrorStates):
         return {self.sensor: Effect(offset_b=np.eye(3), varying=self.varying)}
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class LeverArm(ErrorStates):
     """The place of an accelerometer on the body, from the point that does not accelerate: ``f_b = −R_fbᵀ g + ([ẇ] + [w]²) r``, constant.
 
@@ -425,7 +426,7 @@ class LeverArm(ErrorStates):
         return {self.sensor: Effect(lever=np.eye(3)[self._axes] / self.strength)}
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class VectorScale(ErrorStates):
     """Scale factors and misalignments of a vector sensor: all nine of S in ``m_b = (I + S) R_fbᵀ r``, constant: soft iron."""
 
@@ -456,7 +457,7 @@ class VectorScale(ErrorStates):
         return {self.sensor: Effect(scale=np.eye(9).reshape(9, 3, 3))}
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class GaussMarkov(ErrorStates):
     """First-order coloured noise on a vector sensor, stationary: the acceleration of a moving hand on an accelerometer."""
 
@@ -512,7 +513,7 @@ class GaussMarkov(ErrorStates):
         return {self.sensor: Effect(offset_f=axes, carried=True, varying=self.varying)}
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class BoundedVelocity(ErrorStates):
     """What an accelerometer on a moving hand feels of the motion: an acceleration whose velocity is bounded, stationary, in fixed axes.
 

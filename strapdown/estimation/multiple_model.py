@@ -61,7 +61,7 @@ CONSTANT = 1.0 * DEGREE
 """References that turn by less than this over a record count as constant, rad."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class BankEstimate:
     """What the bank made of a record."""
 
@@ -272,7 +272,7 @@ def run_recovering(
     return replace(whole, skipped=skipped)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _LeftOpen:
     """A recovery that left a turn open."""
 

@@ -21,7 +21,7 @@ NAMED = 0.25
 """A state is named in a direction if its share is at least so much of the greatest."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Observability:
     """What the measurements of a record tell of the state at its start, in units of what was known before.
 

@@ -112,7 +112,7 @@ def restarted(gate: Gate, memory: GateMemory) -> tuple[Array, Array, Array]:
     return bias.copy(), np.concatenate([np.full(3, sigma**2), variance]), counts
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Trajectory:
     """Segments that a smoother goes back over, and what of them it writes."""
 

@@ -23,7 +23,7 @@ KIND_CODES = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Schedule:
     """Measurements of all sensors and their order of time. Those at one time keep the order of the sensors.
 
@@ -198,7 +198,7 @@ def _joined(columns: Sequence[Array], empty: tuple[int, ...]) -> Array:
     return np.concatenate(columns) if columns else np.empty(empty)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _Part:
     """The usable measurements of one series."""
 

@@ -31,7 +31,13 @@ LARGEST_NOISE = 1e9
 
 @dataclass(frozen=True, kw_only=True)
 class ProcessNoise:
-    """Noise of the gyro in the filter's model."""
+    """White noise and random walk of the gyro's bias, as the filter models them.
+
+    The noise of the attitude over an interval is that of a continuous rate, σ_v² dt I. A gyro gives increments, and the noise of an
+    increment φ + ν enters the attitude by the right Jacobian of SO(3), as σ_v² dt J_r(φ) J_r(φ)ᵀ: σ_v² dt about the axis of turn and
+    2(1 − cos x)/x² of it across, x = |φ|. So the filter's variance across the axis is too large by a share of about x²/12: 1 % at a turn
+    of 0.35 rad a sample, 9 % at 1 rad, 41 % at 2 rad. It is never too small. Where a body turns farther, sample the gyro faster.
+    """
 
     angle_random_walk: float
     """σ_v, rad/√s; greater than zero."""

@@ -241,13 +241,17 @@ def add_scaled(s, a, b):
         b[i] += s * a[i]
 
 
-def pair_vectors(increments, pairs, vectors):
-    """Write the rotation vectors φ = Σ Δθ_i + Σ_{i<j} K_ij Δθ_i × Δθ_j of all steps of N = len(``pairs``) samples."""
-    samples = len(pairs)
+def pair_vectors(increments, samples, previous, tables, vectors):
+    """Write the rotation vectors φ = Σ Δθ_i + Σ_{i<j} K_ij Δθ_i × Δθ_j of all steps, Σ Δθ_i over the step, the products over its window.
+
+    ``tables`` (M − N + 1, M, M) holds K by the place of the step in the window of M increments. Near the ends of the record the window
+    stays inside it and the step sits elsewhere in the window than at ``previous``.
+    """
+    latest = len(increments) - tables.shape[1]
     for k in range(len(vectors)):
         first = k * samples
-        phi = pair_correction(increments, first, pairs)
-        x, y, z = phi
+        start = min(max(first - previous, 0), latest)
+        x, y, z = pair_correction(increments, start, tables[first - start])
         for i in range(first, first + samples):
             x += increments[i, 0]
             y += increments[i, 1]

@@ -17,7 +17,7 @@ from strapdown.motion.exact_phase import DIGITS, Pair, cosine_sine, halved, prod
 from strapdown.motion.parameters import stacked
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class EulerPoinsot:
     """The solution in principal axes 1, 2, 3: ``w = (A_1 cn u, A_2 sn u, A_3 dn u)``, ``u = p t + u_0``.
 

@@ -23,7 +23,7 @@ CHART_POINTS = 6000
 _DOTS_PER_INCH = 120
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Series:
     """One line of a chart."""
 
@@ -36,7 +36,7 @@ class Series:
     """Drawn thin and dashed, as an edge of a band."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Chart:
     """An interactive time series."""
 

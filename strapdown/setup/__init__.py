@@ -16,6 +16,7 @@ import numpy as np
 
 from strapdown import coning, estimation, gyro, quaternion, tables, units, vectors
 from strapdown.checks import Array, InputError, known_keys, one_of, positive
+from strapdown.equality import ByValue
 from strapdown.estimation import Observability
 from strapdown.estimation.error_states import ErrorStates
 from strapdown.estimation.gating import Gate, Robust
@@ -57,8 +58,8 @@ def _sigma(name: str, value: Any) -> Sigma:
     return x, y, z
 
 
-@dataclass(frozen=True, kw_only=True)
-class FilterSetup:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FilterSetup(ByValue):
     """What the filter believes, where it starts, what integrates the gyro."""
 
     process_noise: ProcessNoise

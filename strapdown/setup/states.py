@@ -10,6 +10,7 @@ import numpy as np
 
 from strapdown import tables, units
 from strapdown.checks import Array, InputError, array, known_keys, non_negative, one_of, positive
+from strapdown.equality import ByValue
 from strapdown.estimation import forward
 from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import (
@@ -136,8 +137,8 @@ class SensorStates:
         return tuple(found)
 
 
-@dataclass(frozen=True, kw_only=True)
-class States:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class States(ByValue):
     """Optional states of a filter beside attitude and bias, by the standard deviation that each starts with; what is 0 is no state."""
 
     gyro_scale_sigma: Entries = 0.0

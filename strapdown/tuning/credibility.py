@@ -53,7 +53,7 @@ CURVATURE_STEP = 0.05
 """Of a log parameter, for second derivatives."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Sample:
     """Squares that should all be χ² of one number of degrees of freedom."""
 
@@ -70,7 +70,7 @@ class Sample:
     """Part of the records that each belongs to (n,)."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Distance:
     """Half of Neyman's statistic of one sample, and its derivatives."""
 

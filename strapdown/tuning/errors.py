@@ -23,7 +23,7 @@ MOST_EPOCHS = 1000
 """Epochs taken of one record."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ErrorObjective(Composite):
     """What the errors of the state say of the parameters; built by :func:`error_objective`."""
 

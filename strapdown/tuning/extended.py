@@ -123,7 +123,7 @@ def with_state_values(states: States, values: Mapping[str, float]) -> States:
     return replace(states, sensors=sensors, **changed)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ExtendedLikelihood:
     """Minus the log likelihood of the innovations of a filter with optional states; built by :func:`likelihood`.
 

@@ -87,7 +87,7 @@ def limits_of(objective: Objective) -> tuple[Array, Array]:
     return objective.limits if isinstance(objective, Bounded) else (objective.start - REACH, objective.start + REACH)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Local:
     """Value, gradient and information of an objective, prior and all, at one point."""
 
@@ -97,7 +97,7 @@ class Local:
     derivatives: Derivatives
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Optimum:
     """Where one search ended."""
 
@@ -193,7 +193,7 @@ class Estimated:
     """What to make of it, in words."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Tuning:
     """The outcome of a tuning."""
 
@@ -228,7 +228,7 @@ class Tuning:
         return next(one for one in self.parameters if one.name == name)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _Known:
     lower: float
     upper: float
@@ -378,7 +378,7 @@ def rescaled(tuning: Tuning, factor: float) -> Tuning:
     )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Slices:
     """The likelihood along each parameter, the others at their most likely values."""
 

@@ -53,7 +53,7 @@ def split(cases: Sequence[Case], share: float, by: By = "time") -> tuple[tuple[C
     return tuple(train), tuple(test)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class NeesCourse:
     """NEES of one set of states over the time of a record."""
 
@@ -72,7 +72,7 @@ class NeesCourse:
         return mean_bounds(3, max(self.effective, 1.0), 0.99)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Performance:
     """One filter on held-out data."""
 

@@ -44,7 +44,7 @@ MOST = WIDTH - 1
 """Derivatives that one pass over a record gives."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Case:
     """A record to tune on, and where the filter starts on it."""
 
@@ -62,7 +62,7 @@ class Case:
     """Edges at which errors against it count (n + 1,), bool; None: all."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Derivatives:
     """Minus the log likelihood, without its constant, and its derivatives by the log parameters, part by part."""
 
@@ -76,7 +76,7 @@ class Derivatives:
     """Σ g gᵀ over the measurements (p, p), g the gradient of each."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Prepared:
     """A record as the kernel takes it."""
 
@@ -96,7 +96,7 @@ class Prepared:
     """Edges where the truth is known and counts for tuning (edges,), bool."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Likelihood:
     """Minus the log likelihood of the innovations of several records under one set of parameters.
 

@@ -159,7 +159,7 @@ def contaminated_likelihood(
     return ContaminatedLikelihood(base=base, first=(share, scale))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class TunedGate:
     """The gate that suits the outliers of the records."""
 

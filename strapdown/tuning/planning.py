@@ -18,7 +18,7 @@ from strapdown.tuning.innovations import Case, likelihood
 from strapdown.tuning.parameters import values_of
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Plan:
     """Standard errors that records of several lengths will give at best."""
 

@@ -44,7 +44,7 @@ SHAPES = ("whiteness", "normality", "mean innovation", "cross-correlation")
 """Tests of innovations that no tuning of σ makes pass."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ScaleFactor:
     """A gyro's scale factor as an explanation of what the tuned filter puts down to noise."""
 
@@ -158,7 +158,7 @@ def unmodelled(case: Case, chosen: FilterSetup, *, probability: float = 0.99) ->
     if used.gate is not None:
         # What passes a gate has lost its tails, and keeps the outliers that are like the rest: neither is news.
         kept = tuple(one for one in judgement.findings if one.name not in ("NIS", "normality"))
-        judgement = concluded([replace(one, rejected=False) for one in kept], list(judgement.limits), probability)
+        judgement = concluded(kept, judgement.limits, probability)
         record = accepted(record, setup.run(record, used, initial, every=len(record.increments)))
     causes: tuple[Cause, ...] = ()
     if any(finding.rejected and finding.name in SHAPES for finding in judgement.findings):
@@ -183,8 +183,8 @@ def accepted(record: ImuRecord, estimate: Estimate) -> ImuRecord:
     """Return a record without the measurements that the gate of an estimate refused."""
     kept = []
     for series in record.vectors:
-        found = estimate.innovations[series.sensor]
-        kept.append(series.taken(~np.isin(series.time, found.time[~found.used])))
+        found = estimate.innovations.get(series.sensor)
+        kept.append(series if found is None else series.taken(~np.isin(series.time, found.time[~found.used])))
     return replace(record, vectors=tuple(kept))
 
 

@@ -14,7 +14,7 @@ from strapdown.records import Estimate, Truth
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Comparison:
     """What several filters made of one record. Printed, it is a table.
 

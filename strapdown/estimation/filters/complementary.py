@@ -19,7 +19,7 @@ from strapdown.kernels.filters import complementary as kernel
 from strapdown.records import Estimate, ImuRecord
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Gains:
     """What one measurement of each sensor, in the order of the record, does with ``ω_mes = z × R̂ᵀ r``."""
 

@@ -1,0 +1,121 @@
+"""Every dataclass of the package can be compared, looked for in a tuple and hashed, whatever its fields hold."""
+
+from __future__ import annotations
+
+import collections.abc
+import dataclasses
+import importlib
+import pkgutil
+import types
+import typing
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+import strapdown
+from strapdown import estimation, gyro, motion, scenarios, setup, vectors
+from strapdown.diagnosis import Cause
+
+
+def dataclasses_of_the_package() -> Iterator[type]:
+    for module in pkgutil.walk_packages(strapdown.__path__, "strapdown."):
+        content = vars(importlib.import_module(module.name))
+        yield from (
+            one
+            for one in content.values()
+            if isinstance(one, type) and dataclasses.is_dataclass(one) and one.__module__ == module.name
+        )
+
+
+def dummy(hint: Any) -> Any:  # noqa: PLR0911
+    """A value of a type; of several alternatives the one that is hardest to compare."""
+    origin, arguments = typing.get_origin(hint) or hint, typing.get_args(hint)
+    if origin is np.ndarray or hint is Any:
+        return np.arange(3.0)
+    if origin in (types.UnionType, typing.Union):
+        made = [dummy(one) for one in arguments if one is not type(None)]
+        return next((one for one in made if isinstance(one, np.ndarray | dict | list)), made[0])
+    if origin is tuple:
+        return tuple(dummy(one) for one in arguments if one is not Ellipsis)
+    if origin in (dict, collections.abc.Mapping):
+        return {"key": dummy(arguments[1])}
+    if origin is collections.abc.Sequence:  # all make a tuple of it
+        return (dummy(arguments[0]),)
+    if origin is list:
+        return [dummy(arguments[0])]
+    if dataclasses.is_dataclass(origin):
+        return filled(origin)
+    return 1.0 if origin in (int, float) else "text"
+
+
+def filled(kind: type) -> Any:
+    """An instance whose fields hold values of their types, unchecked."""
+    made = object.__new__(kind)
+    hints = typing.get_type_hints(kind)
+    for field in dataclasses.fields(kind):
+        object.__setattr__(made, field.name, dummy(hints[field.name]))
+    return made
+
+
+@pytest.mark.parametrize(
+    "kind", tuple(dataclasses_of_the_package()), ids=lambda kind: f"{kind.__module__}.{kind.__name__}"
+)
+def test_any_two_can_be_compared_and_hashed(kind):
+    one, other = filled(kind), filled(kind)
+    assert one in (one,)
+    equal = one == other
+    assert isinstance(equal, bool)
+    assert (one in (other,)) is equal
+    if kind.__dataclass_params__.frozen:
+        assert hash(one) == hash(one)
+        assert not equal or hash(one) == hash(other)
+
+
+def test_specifications_are_compared_by_value():
+    """They are written to files and read back, so two of the same numbers are the same."""
+
+    def scenario(bias: float = 1e-3) -> scenarios.Scenario:
+        return scenarios.Scenario(
+            motion=motion.TorqueFree(inertia=(1.0, 1.5, 2.0), initial_rate=np.array([0.1, 0.2, 0.3])),
+            gyro=gyro.GyroSpec(turn_on_bias=np.array([bias, 0.0, -0.0])),
+            sensors=(
+                vectors.VectorSensor(name="star", reference_f=np.array([0.0, 3.0, 4.0]), sigma=1e-3, rate=1.0),
+                vectors.Magnetometer(name="field", field_f=np.array([2e-5, 0.0, 0.0]), sigma=1e-7, rate=1.0),
+                vectors.Accelerometer(name="vertical", sigma=0.1, rate=1.0),
+                vectors.HeadingPair(name="line", baseline_b=np.array([1.0, 0.0, 0.0]), sigma=1e-2, rate=1.0),
+            ),
+            rate=10.0,
+            duration=10.0,
+        )
+
+    assert scenario() == scenario()
+    assert hash(scenario()) == hash(scenario())
+    assert scenario() != scenario(2e-3)
+    assert len({scenario(), scenario(), scenario(2e-3)}) == 2
+    noise = estimation.ProcessNoise(angle_random_walk=1e-4, rate_random_walk=0.0)
+    chosen = setup.FilterSetup(process_noise=noise, bias_sigma=1e-3, sigma={"star": (1e-3, 1e-3, 2e-3)})
+    assert chosen == dataclasses.replace(chosen)
+    assert hash(chosen) == hash(dataclasses.replace(chosen))
+    assert chosen != dataclasses.replace(chosen, sigma={"star": 1e-3})
+
+
+def test_results_are_compared_by_identity():
+    """Two causes with the same estimate are two causes; the one that is listed is found."""
+
+    def cause() -> Cause:
+        return Cause(
+            name="R",
+            of="star",
+            estimate=np.zeros(3),
+            standard_error=np.ones(3),
+            unit="",
+            gain=1.0,
+            log_p=-1.0,
+            words="",
+        )
+
+    one, other = cause(), cause()
+    assert one in (other, one)
+    assert one not in (other,)
