@@ -24,7 +24,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     # 2 data
     ("records", "recordings", "recordfiles", "scenarios"),
     # 3 estimators
-    ("mekf", "robustness", "setup", "smoother", "family", "augmented", "bank", "ahrs", "stepfilter", "stepgate"),
+    ("estimation", "setup", "ahrs"),
     # 4 analysis
     ("consistency", "covariance", "montecarlo", "coning_study", "diagnosis", "doctor", "tuning"),
     # 5 faces

@@ -85,7 +85,7 @@ class Options:
         return self.gate is not None or self.robust is not None
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Problem:
     """A record, prepared for the kernels."""
 
@@ -102,7 +102,7 @@ class Problem:
         return self.process_noise.angle_random_walk**2, self.process_noise.rate_random_walk**2
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Passed:
     """A record that the filter has passed through."""
 

@@ -61,7 +61,7 @@ def begin(initial: State, blocks: tuple[ErrorStates, ...]) -> State:
     return initial
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Model:
     """Linear blocks as arrays, in the kernels' order."""
 

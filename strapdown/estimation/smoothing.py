@@ -136,7 +136,7 @@ def relinearized_start(
     return state
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Smoother:
     """A record, and the form in which it is smoothed."""
 
@@ -229,7 +229,7 @@ class _Smoother:
         return forward.filtered(problem, replace(options, every=len(part.time), full_covariance=False))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _BlockForm:
     """Backward passes over states with the covariance in blocks."""
 
@@ -277,7 +277,7 @@ class _BlockForm:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _FactorForm:
     """Backward passes over states with the covariance as its triangular factor."""
 

@@ -53,7 +53,7 @@ class ProcessNoise:
                 raise InputError(f"{name} is {getattr(self, name):g} {unit}, and no gyro has so much; check the unit")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Candidate:
     """The restart candidate that runs beside a gated filter."""
 
@@ -67,7 +67,7 @@ class Candidate:
     """R with ``P = Rᵀ R``, if the filter carries it."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class GateMemory:
     """What a gate remembers at the end of a part of a record, for the next part to go on from."""
 
@@ -86,7 +86,7 @@ class GateMemory:
     """The covariance of them (m, m)."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class State:
     """Attitude, bias and error states of a filter, and the covariance of their errors."""
 

@@ -609,7 +609,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             setattr(self, name, value)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _Measurement:
     """A measurement as the kernels take it (:func:`strapdown.kernels.augmented_step.fill_rows`)."""
 
@@ -642,7 +642,7 @@ class _Measurement:
         return angle, 1.0 if sine < 1e-9 else angle / sine
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _Prior:
     """What is known of the optional error states before any measurement, from which a restart candidate starts."""
 
@@ -697,7 +697,7 @@ class _Clock:
         return 4.0 * ulp + (min(gathered, CLOCK_SHARE * self.longest) if self.longest else gathered)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _Entry:
     """A prediction or a measurement of the past, with the state before it."""
 

@@ -49,7 +49,7 @@ MeasurementModel = Callable[[Array, Array], Rows]
 """A measurement as a function of the attitude q_fb (4,) and the other states (n − 3,) at which it is linearised."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Linearization:
     """A measurement and the prior, both in the tangent space of the state at which the update is linearised."""
 

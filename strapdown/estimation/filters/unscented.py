@@ -92,7 +92,7 @@ def run(
     return extended.estimate(record, events, every, states, innovation, full_covariance)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Steps:
     """Each step predicts over ``dt`` if that is greater than zero, then updates with an event if it has one, then keeps the state if asked."""
 
