@@ -204,8 +204,7 @@ def test_states_that_the_errors_call_for(run, spinning, tmp_path):
         [kept.values[-1], kept.sigma[-1]], [[*states["gyro scale"][n]] for n in ("values", "sigma")]
     )
     assert (tmp_path / "out" / "states.png").stat().st_size > 10_000
-    with h5py.File(tmp_path / "out" / "estimate.h5") as file:
-        told = setup.from_toml(file.attrs["filter"])
+    told = setup.from_toml(records.read_attributes(tmp_path / "out" / "estimate.h5")["filter"])
     assert told == setup.matched_to_record(
         scenarios.load_scenario("spin").gyro, simulate(scenarios.load_scenario("spin"), 3), states=True
     )

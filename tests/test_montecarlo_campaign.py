@@ -14,11 +14,11 @@ import weakref
 from dataclasses import fields, replace
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
+from hdf5 import changed
 
-from strapdown import cli, consistency, montecarlo, recordfiles, records, scenarios
+from strapdown import cli, consistency, montecarlo, reading, recordfiles, records, scenarios
 from strapdown import setup as setups
 from strapdown.checks import InputError
 from strapdown.montecarlo import campaign, engine, scalar, statistics
@@ -75,18 +75,16 @@ def test_the_file_holds_what_a_plain_run_gives(tmp_path):
 def test_the_file_describes_itself(tmp_path):
     path = tmp_path / "c.h5"
     go(path, 21)
-    with h5py.File(path) as file:
-        assert file.attrs["kind"] == "strapdown montecarlo"
-        assert (
-            scenarios.scenario_to_toml(scenarios.scenario_from_toml(file.attrs["scenario"])) == file.attrs["scenario"]
-        )
-        assert "[filter]" in file.attrs["filter"]
-        assert file.attrs["finished_runs"] == 21
-        assert {"python", "numpy", "numba", "h5py"} == set(json.loads(file.attrs["versions"]))
-        assert "quaternions Hamilton" in file.attrs["conventions"]
+    with reading.hdf5(path) as file:
+        told = reading.attributes(file)
+        assert told["kind"] == "strapdown montecarlo"
+        assert scenarios.scenario_to_toml(scenarios.scenario_from_toml(told["scenario"])) == told["scenario"]
+        assert "[filter]" in told["filter"]
+        assert told["finished_runs"] == 21
+        assert {"python", "numpy", "numba", "h5py"} == set(json.loads(told["versions"]))
+        assert "quaternions Hamilton" in told["conventions"]
         for dataset in file["statistics"].values():
-            assert dataset.attrs["unit"]
-            assert dataset.attrs["meaning"]
+            assert reading.attributes(dataset).keys() >= {"unit", "meaning"}
         names = {field.name for field in fields(statistics.Statistics)} - {"runs", "sensors"}
         assert set(file["statistics"]) == names
 
@@ -240,7 +238,7 @@ def test_killed_in_the_middle_of_writing_the_file_is_the_one_before(tmp_path, di
 
 
 def _forged(path, name, value):
-    with h5py.File(path, "r+") as file:
+    with changed(path) as file:
         file.attrs[name] = value
 
 

@@ -7,12 +7,12 @@ import json
 import os
 import shutil
 
-import h5py
 import numpy as np
 import pytest
+from hdf5 import changed
 from typer.testing import CliRunner
 
-from strapdown import augmented, cli, consistency, recordfiles, records, scenarios, setup
+from strapdown import augmented, cli, consistency, reading, recordfiles, records, scenarios, setup
 from strapdown.checks import InputError, count
 from strapdown.cli.terminal import scenario_named
 
@@ -126,7 +126,7 @@ def test_tuning_refuses_a_negative_seed_and_a_record_twice(folder):
 def test_a_damaged_estimate_is_no_verdict(folder, tmp_path, name, change, complaint, command):
     path = tmp_path / "bad.h5"
     shutil.copy(folder / "run" / "estimate.h5", path)
-    with h5py.File(path, "r+") as file:
+    with changed(path) as file:
         value = change(file[name][:])
         del file[name]
         file[name] = value
@@ -138,7 +138,7 @@ def test_a_damaged_estimate_is_no_verdict(folder, tmp_path, name, change, compla
 def test_a_damaged_campaign_is_no_verdict(folder, tmp_path, change, command):
     path = tmp_path / "bad.h5"
     shutil.copy(folder / "runs.h5", path)
-    with h5py.File(path, "r+") as file:
+    with changed(path) as file:
         value = change(file["statistics/nees_sum"][:])
         del file["statistics/nees_sum"]
         file["statistics/nees_sum"] = value
@@ -172,8 +172,8 @@ def test_no_cause_is_named_of_a_filter_that_the_search_does_not_know(folder, sho
         scenario=scenarios.scenario_to_toml(scenario),
     )
     shutil.copy(folder / "run" / "estimate.h5", tmp_path / "estimate.h5")
-    with h5py.File(tmp_path / "estimate.h5", "r+") as file:
-        chosen = setup.from_toml(file.attrs["filter"])
+    with changed(tmp_path / "estimate.h5") as file:
+        chosen = setup.from_toml(reading.attributes(file)["filter"])
         states = augmented.States(gyro_scale_sigma=1e-3)
         file.attrs["filter"] = setup.to_toml(dataclasses.replace(chosen, states=states))
     options = ["--record", str(tmp_path / "record.h5"), "--json", str(tmp_path / "check.json")]
