@@ -43,7 +43,7 @@ PACKING = 1100
 """Greatest ratio of an array to its compressed form: deflate reaches 1032."""
 DOTTED_KEYS = 32
 """Most parts of a dotted key in TOML: the time to read one grows with the square of their number."""
-LONGEST_MESSAGE = 1000
+LONGEST_MESSAGE = 2000
 
 SEAL = b"strapdown file, SHA-256 of the bytes from 512 on: "
 """Beginning of the user block."""
@@ -67,10 +67,10 @@ def from_file(path: Name) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        text = str(error)
-        if Path(path).name in text:
-            raise InputError(_short(text)) from error.__cause__ if len(text) > LONGEST_MESSAGE else None
-        raise InputError(f"{path}: {_short(text)}") from None
+        said = _short(str(error))
+        if said == str(error) and Path(path).name in said:
+            raise
+        raise InputError(said if Path(path).name in said else f"{path}: {said}") from error.__cause__
     except MemoryError:
         raise InputError(f"{path} does not fit into memory; cut it into parts") from None
     except Exception as error:
@@ -265,8 +265,8 @@ def has_digest(path: Name) -> bool:
         found = hashlib.file_digest(handle, "sha256").hexdigest()
     if block.removeprefix(SEAL)[:64] != found.encode():
         raise InputError(
-            f"{path} cannot be read: its content does not fit its digest, so it is damaged or truncated; take a copy, or make it again (if you changed it on "
-            "purpose, strapdown.files.seal gives it a new digest)"
+            f"{path} cannot be read: its content does not fit its digest, so it is damaged or truncated; take a copy, or make it "
+            "again (if you changed it on purpose, strapdown.files.seal gives it a new digest)"
         )
     return True
 
@@ -275,21 +275,17 @@ def _need_plain(path: Name, file: Any) -> None:
     """Refuse an HDF5 file that refers to others, or declares more than it holds."""
     import h5py
 
-    names: list[bytes] = []
-
-    def look(name: bytes, link: Any) -> None:
-        if link.type != h5py.h5l.TYPE_HARD:
-            kind = {h5py.h5l.TYPE_EXTERNAL: "an external link", h5py.h5l.TYPE_SOFT: "a soft link"}.get(
-                link.type, "a link"
-            )
+    links: list[tuple[bytes, int]] = []
+    file.id.links.visit(lambda name, link: links.append((name, link.type)), info=True)
+    kinds = {h5py.h5l.TYPE_EXTERNAL: "an external link", h5py.h5l.TYPE_SOFT: "a soft link"}
+    for name, kind in links:
+        if kind != h5py.h5l.TYPE_HARD:
+            place = f"{path}: {name.decode(errors='replace')}"
             raise InputError(
-                f"{path}: {name.decode(errors='replace')} is {kind}, which is not followed; put the data there"
+                f"{place} is {kinds.get(kind, 'a link')}, which is not followed; put the data itself there"
             )
-        names.append(name)
-
-    file.id.links.visit(look, info=True)
     total = 0
-    for name in names:
+    for name, _ in links:
         dataset = file[name]
         if not isinstance(dataset, h5py.Dataset):
             continue
@@ -372,6 +368,8 @@ def numbers(group: Any, name: str) -> np.ndarray[Any, Any]:
     if name not in group:
         raise InputError(f"{place} is missing; the file is damaged, make it again")
     node = group[name]
+    if isinstance(node, h5py.Group):
+        raise InputError(f"{place} is a group and not an array; the file is damaged, make it again")
     if not isinstance(node, h5py.Dataset) or node.dtype.kind not in "fiub" or node.shape is None:
         raise InputError(f"{place} is no array of numbers; the file is damaged, make it again")
     return np.asarray(node[()])

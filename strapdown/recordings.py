@@ -76,8 +76,8 @@ class Recording:
         if np.max(np.abs(self.rate)) > LARGEST_RATE:
             row, axis = (int(i) for i in np.unravel_index(np.argmax(np.abs(self.rate)), self.rate.shape))
             raise InputError(
-                f"{self.source}: rate[{row}, {axis}] is {self.rate[row, axis]:g} rad/s, which no gyro measures; convert raw counts to rad/s "
-                "or deg/s by the scale factor of the datasheet, or remove the row"
+                f"{self.source}: rate[{row}, {axis}] is {self.rate[row, axis]:g} rad/s, which no gyro measures; convert raw counts to "
+                "rad/s or deg/s by the scale factor of the datasheet, or remove the row"
             )
         for name, width in (("specific_force", 3), ("magnetic_field", 3), ("true_attitude", 4)):
             value = getattr(self, name)

@@ -28,7 +28,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     # 4 analysis
     ("consistency", "covariance", "montecarlo", "coning_study", "diagnosis", "doctor", "tuning"),
     # 5 faces
-    ("plots", "report", "cli"),
+    ("plots", "report", "cli", "__main__"),
 )
 """Modules and sub-packages of ``strapdown`` by floor, from the ground up. An import may go down or stay on its floor, never up."""
 
@@ -36,7 +36,7 @@ STRANGERS = (("motion", "coning"),)
 """Pairs that never import each other: the closed-form truth and the integrator, so that neither can hide the other's fault."""
 
 DRAWING = ("plots", "report")
-PRINTING = ("cli",)
+PRINTING = ("cli", "__main__")
 MACHINES = ("kernels.machine", "kernels.lanes", "kernels.packed")
 """Kernel modules that know of compilers; all others are plain Python."""
 

@@ -31,6 +31,7 @@ from __future__ import annotations
 import io
 import sys
 import traceback
+import warnings
 from typing import Annotated
 
 import typer
@@ -62,12 +63,19 @@ def info() -> None:
         console.print(f"{name}: {value}")
 
 
+def _say(message: Warning | str, category: type[Warning], *place: object, **more: object) -> None:
+    """Say a warning that is meant for the user in one line, without where in the code it came up; others are the developer's."""
+    if issubclass(category, UserWarning):
+        errors.print(f"warning: {message}", soft_wrap=True)
+
+
 FAULT = 70
 """Exit status of a fault of the program itself (EX_SOFTWARE of BSD): no verdict, and not bad input."""
 
 
 def main() -> None:
     """Run the command line; bad input ends with one clear line and status 2, Ctrl-C with 130, a fault of the program with 70."""
+    warnings.showwarning = _say
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # what ASCII or cp1252 has no sign for is a question mark, not the end
             stream.reconfigure(errors="replace")

@@ -198,7 +198,7 @@ def _parameters(content: dict[str, Any]) -> list[str]:
 
 
 def _gate(found: Any) -> list[str]:
-    if not found or found["probability"] is None:
+    if not found or None in (found["probability"], found["lower"], found["upper"]):
         return []
     thresholds = ", ".join(f"{value:.3g} of {name}" for name, value in found["thresholds"].items())
     words = (
