@@ -239,7 +239,7 @@ def hdf5(path: Name) -> Iterator[Any]:
             if not sealed and str(attributes(file).get("kind", "")).startswith("strapdown "):
                 if file.userblock_size == BLOCK:
                     raise InputError(f"{path} is damaged: its digest is gone; make it again, or take a copy")
-                warnings.warn(NoDigestWarning(f"{path} has no digest, so damage to it may pass unseen"), stacklevel=4)
+                warnings.warn(NoDigestWarning(f"{path} has no digest, so damage to it may pass unseen"), stacklevel=1)
             _need_plain(path, file)
             yield file
 

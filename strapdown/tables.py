@@ -23,6 +23,8 @@ Choice = tuple[tuple[str, float], ...]
 Form = Mapping[str, Choice]
 
 PLAIN: Choice = (("", 1.0),)
+TEXT: Choice = (("", 0.0),)
+"""Words and names; what has this choice holds no number."""
 RATIO: Choice = (("ratio", 1.0),)
 PPM: Choice = (("ppm", 1e-6), ("ratio", 1.0))
 SECONDS: Choice = (("s", 1.0),)
@@ -71,7 +73,7 @@ def _same(a: Any, b: Any) -> bool:
 
 def _entry(name: str, content: Any, choice: Choice) -> dict[str, Any]:
     if isinstance(content, str | bool | int):
-        return {name if choice == PLAIN else f"{name}_{choice[0][0]}": content}
+        return {name if choice in (PLAIN, TEXT) else f"{name}_{choice[0][0]}": content}
     for suffix, factor in choice:
         told = _exact_quotient(np.asarray(content, np.float64), factor)
         if told is not None:
@@ -103,6 +105,10 @@ def decode(table: Mapping[str, Any], form: Form, place: str) -> dict[str, Any]:
 
 
 def _number(content: Any, factor: float, choice: Choice, place: str) -> Any:
+    if choice == TEXT:
+        if not isinstance(content, str):
+            raise InputError(f"{place} is {content!r}; it must be a text in quotes")
+        return content
     if choice == PLAIN and isinstance(content, str):
         return content
     if isinstance(content, bool) or not isinstance(content, int | float | list):
@@ -142,9 +148,8 @@ def made(make: Callable[..., Any], values: Mapping[str, Any], table: Mapping[str
     except InputError as error:
         raise InputError(_with_typed(str(error), table, form, place)) from None
     except (TypeError, ValueError, ArithmeticError, LookupError) as error:
-        raise InputError(
-            f"{place}: a value is of the wrong type or size ({error}); compare it with the documented ones"
-        ) from error
+        keys = ", ".join(table) or "the values"
+        raise InputError(f"{place}: one of {keys} is of the wrong type or size ({error}); check each") from error
 
 
 def _with_typed(text: str, table: Mapping[str, Any], form: Form, place: str) -> str:

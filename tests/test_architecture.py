@@ -132,6 +132,37 @@ def test_strangers_never_meet(one, other):
             assert not seen & ({one, other} - {unit(module)}), f"{module} imports its stranger"
 
 
+PARSERS = (
+    "np.load",
+    "np.loadtxt",
+    "np.genfromtxt",
+    "np.fromfile",
+    "tomllib.load",
+    "tomllib.loads",
+    "json.load",
+    "json.loads",
+    "pickle.load",
+)
+READERS = ("open", "io.open", "os.open", "h5py.File", *PARSERS)
+OF_A_PATH = (".read_text", ".read_bytes", ".open")
+NOT_OF_THE_USER = ("kernels.machine", "report.page")
+"""They read files of the package itself."""
+
+
+@pytest.mark.parametrize("module", [name for name in sources() if name not in ("reading", *NOT_OF_THE_USER)])
+def test_every_file_passes_the_reading_layer(module):
+    """Nobody else opens a file to read it, or parses one: limits, names of files and digests are in one place."""
+    for node in ast.walk(sources()[module]):
+        if not isinstance(node, ast.Call):
+            continue
+        call = ast.unparse(node.func)
+        if call in READERS or call.endswith(OF_A_PATH):
+            words = ast.unparse(node)
+            writes = any(mode in words for mode in ("'w'", "'wb'", "'a+'", "'r+b'")) or "reading.opened" in words
+            own = module == "montecarlo.campaign" and "temporary.open('rb')" in words  # to have it on the disk
+            assert writes or own, f"{module} line {node.lineno}: {words}"
+
+
 def top_names(tree: ast.AST) -> set[str]:
     return {name.partition(".")[0] for name in imports(tree)}
 

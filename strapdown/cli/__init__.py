@@ -28,17 +28,20 @@ be told.
 
 from __future__ import annotations
 
+import functools
 import io
 import sys
 import traceback
 import warnings
-from typing import Annotated
+from collections.abc import Callable
+from typing import Annotated, Any
 
 import typer
 
 from strapdown.checks import InputError
 from strapdown.cli import campaigns, estimation, integration, judgement, planning, reporting, sensors, studies, tuning  # noqa: F401  (each registers its commands)
 from strapdown.cli.terminal import app, console, errors
+from strapdown.reading import NoDigestWarning
 
 
 @app.callback(invoke_without_command=True)
@@ -63,10 +66,12 @@ def info() -> None:
         console.print(f"{name}: {value}")
 
 
-def _say(message: Warning | str, category: type[Warning], *place: object, **more: object) -> None:
-    """Say a warning that is meant for the user in one line, without where in the code it came up; others are the developer's."""
-    if issubclass(category, UserWarning):
+def _say(usual: Callable[..., None], message: Warning | str, category: type[Warning], *place: Any) -> None:
+    """Say a warning about a file in one line, without where in the code it came up."""
+    if issubclass(category, NoDigestWarning):
         errors.print(f"warning: {message}", soft_wrap=True)
+    else:
+        usual(message, category, *place)
 
 
 FAULT = 70
@@ -75,7 +80,7 @@ FAULT = 70
 
 def main() -> None:
     """Run the command line; bad input ends with one clear line and status 2, Ctrl-C with 130, a fault of the program with 70."""
-    warnings.showwarning = _say
+    warnings.showwarning = functools.partial(_say, warnings.showwarning)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # what ASCII or cp1252 has no sign for is a question mark, not the end
             stream.reconfigure(errors="replace")

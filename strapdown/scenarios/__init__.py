@@ -210,7 +210,7 @@ def _faults(unit: tables.Choice) -> Form:
     }
 
 
-_NAMED: Form = {"name": tables.PLAIN, "rate": tables.HERTZ, "phase": tables.SECONDS, "kind": tables.PLAIN}
+_NAMED: Form = {"name": tables.TEXT, "rate": tables.HERTZ, "phase": tables.SECONDS, "kind": tables.TEXT}
 _SENSORS: dict[str, tuple[type, Form, tables.Choice]] = {
     "direction": (
         vectors.VectorSensor,
@@ -220,10 +220,10 @@ _SENSORS: dict[str, tuple[type, Form, tables.Choice]] = {
     "attitude": (
         vectors.AttitudeSensor,
         {
-            "name": tables.PLAIN,
+            "name": tables.TEXT,
             "rate": tables.HERTZ,
             "phase": tables.SECONDS,
-            "boresight": tables.PLAIN,
+            "boresight": tables.TEXT,
             "sigma_across": tables.ARCSECONDS,
             "sigma_about": tables.ARCSECONDS,
         },
@@ -254,7 +254,7 @@ _SENSORS: dict[str, tuple[type, Form, tables.Choice]] = {
     "heading-pair": (
         vectors.HeadingPair,
         {
-            "name": tables.PLAIN,
+            "name": tables.TEXT,
             "rate": tables.HERTZ,
             "phase": tables.SECONDS,
             "sigma": tables.METRES,

@@ -1,4 +1,4 @@
-"""Damage to files: bytes, text and structure. Each function takes a source of chance and a file's content and returns the damaged content."""
+"""Damage to files: bytes, text and structure. Each function takes a source of chance and a file's content, and returns it damaged."""
 
 from __future__ import annotations
 

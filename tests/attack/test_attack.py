@@ -13,7 +13,6 @@ import traceback
 import warnings
 from pathlib import Path
 
-import pytest
 from targets import Target, targets
 
 from strapdown.checks import InputError
