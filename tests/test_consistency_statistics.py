@@ -383,3 +383,13 @@ def test_non_credibility_needs_more_runs_than_states():
         consistency.credibility(np.ones((6, 6)), np.broadcast_to(np.eye(6), (6, 6, 6)))
     index, inclination = ensemble.credibility_indices(np.random.default_rng(22).standard_normal((4, 10, 2)))
     assert index.shape == inclination.shape == (4,)
+
+
+@pytest.mark.parametrize(("samples", "inside"), [(10, 3), (10, 9), (10, 10), (50, 40), (50, 30), (7, 0)])
+def test_the_p_value_of_a_coverage_counts_what_is_as_far_off_or_farther(samples, inside):
+    """Twice the smaller of P(N ≤ k) and P(N ≥ k), both with k itself, by sums of binomial terms."""
+    found = consistency.Coverage(samples=samples, inside=np.full(3, inside / samples), probability=0.99).p_values
+    for k, p in enumerate(math.erf(s / math.sqrt(2.0)) for s in (1, 2, 3)):
+        terms = [math.comb(samples, j) * p**j * (1.0 - p) ** (samples - j) for j in range(samples + 1)]
+        wanted = min(1.0, 2.0 * min(math.fsum(terms[: inside + 1]), math.fsum(terms[inside:])))
+        assert found[k] == pytest.approx(wanted, rel=1e-9)
