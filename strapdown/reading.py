@@ -292,12 +292,12 @@ def _need_plain(path: Name, file: Any) -> None:
         place = f"{path}: {name.decode(errors='replace')}"
         if dataset.is_virtual or dataset.external:
             raise InputError(f"{place} lies in other files, which are not followed; put the data there")
-        declared, held = dataset.size * dataset.dtype.itemsize, dataset.id.get_storage_size()
-        if (declared or 0) > max(PACKING * held, 65536):
+        declared, held = (dataset.size or 0) * dataset.dtype.itemsize, dataset.id.get_storage_size()
+        if declared > max(PACKING * held, 65536):
             raise InputError(
                 f"{place} declares {declared / 1e6:.4g} MB and the file holds {held / 1e6:.3g} MB of it; it is damaged or of another kind"
             )
-        total += declared or 0
+        total += declared
     _need_size(path, total, limit())
 
 
@@ -354,7 +354,7 @@ def attributes(node: Any) -> dict[str, Any]:
 
 def _plain(value: Any) -> Any:
     if isinstance(value, bytes):
-        return value.decode("utf-8")
+        return value.decode("utf-8", "replace")  # another program's may be in another encoding
     if isinstance(value, (np.ndarray, np.generic)):
         return _plain(value.tolist()) if value.dtype.kind in "SO" else value.tolist()
     return [_plain(one) for one in value] if isinstance(value, list) else value

@@ -428,3 +428,12 @@ def test_a_clock_that_counts_from_the_start_is_left_as_it_is(tmp_path):
     rows = "".join(f"{100_000 + k},0.1,0.2,0.{k + 1}\n" for k in range(9))
     (tmp_path / "walk.csv").write_text("time [ms],gx [rad/s],gy,gz\n" + rows)
     assert recordings.read(tmp_path / "walk.csv").time[0] == 100.0
+
+
+def test_two_gyro_samples_are_enough_and_one_is_not(tmp_path):
+    path = tmp_path / "walk.csv"
+    path.write_text("time,gx [rad/s],gy,gz\n0,0.1,0.2,0.3\n1,,,\n2,0.1,0.2,0.4\n")
+    assert len(recordings.read(path).time) == 2
+    path.write_text("time,gx [rad/s],gy,gz\n0,0.1,0.2,0.3\n1,,,\n2,0.1,,0.4\n")
+    with pytest.raises(InputError, match="1 of 3 rows have a gyro sample about each axis; at least 2 are needed"):
+        recordings.read(path)
