@@ -591,3 +591,14 @@ def test_readers_of_vibration_and_dispersions_name_the_file(tmp_path):
     (tmp_path / "d.toml").write_text("[dispersions]\nattitude_sigma_deg = [1, 2]\n")
     with pytest.raises(InputError, match=r"d\.toml.*attitude_sigma"):
         montecarlo.read_dispersions(tmp_path / "d.toml")
+
+
+def test_a_tuning_that_tells_no_unit_is_shown_in_si(known, tmp_path):
+    tuning = json.loads(known["tuning.json"].content)
+    (tuning["parameters"][0]).update(value=0.0123, upper=0.0456)
+    for key in ("unit", "si_per_unit"):
+        del tuning["parameters"][0][key]
+    (tmp_path / "tuning.json").write_text(json.dumps(tuning))
+    content = tunings.report(tmp_path / "tuning.json", 0.99)[0]
+    assert ">0.0123<" in content
+    assert ">0.0456<" in content
