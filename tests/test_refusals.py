@@ -432,7 +432,7 @@ def test_coning_refuses_what_no_algorithm_follows(tmp_path, options):
 
 
 def test_a_budget_of_no_vibration_is_refused(folder, tmp_path):
-    assert "is no text" in refused(["coning-budget", "--psd", folder / "record.h5", "--rate", 100])
+    assert "cannot be read as text" in refused(["coning-budget", "--psd", folder / "record.h5", "--rate", 100])
     assert "is a folder" in refused(["coning-budget", "--psd", tmp_path, "--rate", 100])
     (tmp_path / "lines.csv").write_text("frequency_hz,angle_deg\n10,90\n", encoding="utf-8")
     assert "an amplitude of 90°" in refused(["coning-budget", "--psd", tmp_path / "lines.csv", "--rate", 100])
