@@ -421,8 +421,7 @@ def test_a_recording_is_taken_for_that_of_a_hand(run, recording, tmp_path):
     assert "°/s, from that second." in said
     assert "later than what they show" not in said
     assert "warning" not in said
-    with h5py.File(tmp_path / "out" / "estimate.h5") as file:
-        told = dict(file.attrs)
+    told = records.read_attributes(tmp_path / "out" / "estimate.h5")
     states = json.loads((tmp_path / "out" / "states.json").read_text())
     assert states["accelerometer velocity"]["units"] == ["m/s", "m/s²"] * 3
     assert len(states["gyro scale"]["values"]) == 9
