@@ -237,7 +237,7 @@ def hdf5(path: Name) -> Iterator[Any]:
             _need_readable(path)
         with h5py.File(path, "r") as file:
             if not sealed and str(attributes(file).get("kind", "")).startswith("strapdown "):
-                if file.userblock_size == BLOCK:
+                if file.userblock_size:  # which files of earlier versions have not
                     raise InputError(f"{path} is damaged: its digest is gone; make it again, or take a copy")
                 warnings.warn(NoDigestWarning(f"{path} has no digest, so damage to it may pass unseen"), stacklevel=1)
             _need_plain(path, file)

@@ -111,6 +111,7 @@ def test_what_a_record_does_not_tell_is_asked_for(run, record, tmp_path):
     bare = tmp_path / "bare.h5"
     whole = simulate(made(STARS[:1]), 4)
     write_record(bare, ImuRecord(time=whole.time, increments=whole.increments, vectors=whole.vectors))
+    (tmp_path / "own.csv").write_text("time,gx,gy,gz\n")
     cases = (
         ((bare,), "--gyro or --filter"),
         ((record, "--attitude", "1,0,0"), "w,x,y,z"),
@@ -118,7 +119,8 @@ def test_what_a_record_does_not_tell_is_asked_for(run, record, tmp_path):
         ((record, "--robust", "hubert"), "did you mean 'huber'"),
         ((record, "--gate", 1.5), "between 0 and 1"),
         ((record, "--time-unit", "ms"), "goes with a CSV file"),
-        ((tmp_path / "none.csv", "--gate", 0.99), "goes with a record"),
+        ((tmp_path / "own.csv", "--gate", 0.99), "goes with a record"),
+        ((tmp_path / "none.csv", "--gate", 0.99), "none.csv does not exist"),
     )
     for arguments, words in cases:
         status, _, error = run("estimate", *arguments, "--out", tmp_path / "out")

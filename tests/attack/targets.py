@@ -86,12 +86,12 @@ def targets(folder: Path) -> list[Target]:
         target("alone.csv", recordfiles.import_csv, damage.TEXT, 0.1),
         target("walk.csv", recordings.read, damage.TEXT, 0.12),
         target("gyro.npy", lambda path: recordings.read_gyro(path, rate=100.0, units=units), (*bytewise, damage.replace_word), 0.08),
-        target("scenario.toml", scenarios.load_scenario, damage.TEXT, 0.06),
-        target("attitude.toml", scenarios.load_scenario, damage.TEXT, 0.06),
+        target("scenario.toml", scenarios.load_scenario, damage.TEXT, 0.04),
+        target("attitude.toml", scenarios.load_scenario, damage.TEXT, 0.05),
         target("filter.toml", setup.read_setup, damage.TEXT, 0.06),
         target("gyro.toml", gyro.read_spec, damage.TEXT, 0.05),
         target("dispersions.toml", montecarlo.read_dispersions, damage.TEXT, 0.05),
-        target("vibration.csv", coning.read_vibration, damage.TEXT, 0.08),
+        target("vibration.csv", coning.read_vibration, damage.TEXT, 0.11),
         target("tuning.json", lambda path: tunings.report(path, 0.99), (*damage.TEXT, damage.replace_node, damage.replace_node), 0.12),
     ]  # fmt: skip
 
