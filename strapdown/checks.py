@@ -131,7 +131,7 @@ def finite(name: str, value: float, *, unit: str = "") -> float:
         if given.ndim or given.dtype.kind in _NO_NUMBERS:  # "60" in a file is a slip, not a number; so is True
             raise ValueError
         number = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError(f"{name} is {value!r}; it must be one number{_unit(unit, ' in ')}") from None
     if not np.isfinite(number):
         raise InputError(f"{name} is {number}; it must be a finite number{_unit(unit, ' in ')}")

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import contextlib
+import datetime
+import hashlib
 import io
 import json
 import os
+import platform
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from strapdown.checks import InputError
+from strapdown.reading import BLOCK, SEAL
 
 
 @contextlib.contextmanager
@@ -35,24 +41,95 @@ def written_beside(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def whole_hdf5(path: str | os.PathLike[str]) -> Iterator[Any]:
-    """Yield an HDF5 file in memory; at the end its bytes go to ``path`` as those of any file.
+    """Yield an HDF5 file in memory; at the end its bytes go to ``path`` as those of any file, with their digest before them.
 
     A disk that is full is then an ordinary OSError: HDF5 itself, stopped in the middle of a write, ends the whole program when it closes.
     """
     import h5py
 
     content = io.BytesIO()
-    with h5py.File(content, "w") as file:
+    with h5py.File(content, "w", userblock_size=BLOCK, libver=("v110", "v110")) as file:  # v110: attributes above 64 kB
         yield file
-    Path(path).write_bytes(content.getbuffer())
+    held = content.getbuffer()
+    held[:BLOCK] = _user_block(held[BLOCK:])
+    Path(path).write_bytes(held)
 
 
-def existing_file(path: str | os.PathLike[str]) -> None:
-    """Refuse an input that is not there, or is a folder, before a library says so in its own words."""
-    if Path(path).is_dir():
-        raise InputError(f"{path} is a folder; name the file in it")
-    if not Path(path).exists():
-        raise InputError(f"{path} does not exist; check the path")
+@contextlib.contextmanager
+def locked(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Keep other processes from writing the same output for a while; where one has it already, refuse and say which.
+
+    The lock is a file ``.NAME.lock`` beside the output, and ends with the process, however that ends. Windows has no such lock.
+    """
+    try:
+        import fcntl
+    except ModuleNotFoundError:
+        yield
+        return
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    lock = target.with_name(f".{target.name}.lock")
+    while True:
+        with open(lock, "a+", encoding="utf-8") as handle:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                handle.seek(0)
+                raise InputError(
+                    f"{target} is being written by {handle.read() or 'another process'}; wait for it, or choose another file"
+                ) from None
+            try:
+                if not os.path.samestat(os.fstat(handle.fileno()), os.stat(lock)):
+                    continue  # another process had it and took it away in between
+            except FileNotFoundError:
+                continue
+            try:
+                handle.truncate(0)
+                handle.write(
+                    f"process {os.getpid()} on {platform.node()} since {datetime.datetime.now():%Y-%m-%d %H:%M:%S}"
+                )
+                handle.flush()
+                yield
+            finally:
+                lock.unlink(missing_ok=True)
+            return
+
+
+def _user_block(content: bytes | memoryview) -> bytes:
+    return (SEAL + hashlib.sha256(content).hexdigest().encode() + b"\n").ljust(BLOCK, b"\0")
+
+
+def seal(path: str | os.PathLike[str]) -> None:
+    """Give an HDF5 file of this package a new digest, after it was changed on purpose by another program.
+
+    Raises
+    ------
+    InputError
+        If the file has no digest: it is of another program, or of an earlier version.
+    """
+    with open(path, "r+b") as file:
+        content = file.read()
+        if not content.startswith(SEAL):
+            raise InputError(f"{path} has no digest; only a file that this version wrote has one")
+        file.seek(0)
+        file.write(_user_block(content[BLOCK:]))
+
+
+def set_attributes(node: Any, values: Mapping[str, Any]) -> None:
+    """Set attributes of an HDF5 file, group or dataset; texts have a fixed length.
+
+    The HDF5 library keeps texts of variable length in a heap, where damage makes it loop for ever.
+    """
+    import h5py
+
+    for name, value in values.items():
+        texts = [value] if isinstance(value, str) else value
+        if isinstance(texts, (list, tuple)) and all(isinstance(one, str) for one in texts):
+            held = [one.encode("utf-8", "backslashreplace") for one in texts]
+            dtype = h5py.string_dtype("utf-8", max((1, *map(len, held))))
+            node.attrs.create(name, held[0] if isinstance(value, str) else np.array(held, dtype), dtype=dtype)
+        else:
+            node.attrs[name] = value
 
 
 def usable_folder(name: str, folder: str | os.PathLike[str]) -> None:

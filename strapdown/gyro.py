@@ -582,4 +582,4 @@ def read_spec(path: str | os.PathLike[str]) -> GyroSpec:
     InputError
         If the file is missing, no TOML, has no such table, or a key that no gyro has.
     """
-    return from_table(tables.read(path, "gyro", "`strapdown allan` writes one"), f"{path}: gyro")
+    return tables.read(path, "gyro", "`strapdown allan` writes one", from_table)

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 import strapdown
-from strapdown import gyro
-from strapdown.checks import Array, InputError
-from strapdown.files import existing_file, written_beside
+from strapdown import gyro, reading
+from strapdown.checks import Array, InputError, count, known_keys
+from strapdown.files import set_attributes, written_beside
 from strapdown.gyro import GyroSpec
 from strapdown.records import CONVENTIONS, ImuRecord, Truth, put, result_file
 from strapdown.vectors import KINDS, VectorMeasurements
@@ -90,13 +90,14 @@ def write_record(
         if name in _RESERVED:
             raise InputError(f"attributes holds {name!r}, which the file has already; choose another name")
     with result_file(path, "record", {"format": FORMAT}) as file:
-        if gyro_spec is not None:
-            file.attrs["gyro"] = json.dumps(gyro.to_table(gyro_spec))
-        if scenario:
-            file.attrs["scenario"] = scenario
-        for name, value in {"seed": seed, "run": run, **(attributes or {})}.items():
-            if value is not None:
-                file.attrs[name] = value
+        made = {
+            "gyro": None if gyro_spec is None else json.dumps(gyro.to_table(gyro_spec)),
+            "scenario": scenario or None,
+            "seed": seed,
+            "run": run,
+            **(attributes or {}),
+        }
+        set_attributes(file, {name: value for name, value in made.items() if value is not None})
         put(file, "time", record.time, "s", "edges of the sample intervals, one more than there are increments")
         put(
             file,
@@ -107,7 +108,8 @@ def write_record(
         )
         for number, series in enumerate(record.vectors):
             group = file.create_group(f"vectors/{number}")
-            group.attrs.update(sensor=series.sensor, kind=series.kind, degrees_of_freedom=KINDS[series.kind])
+            degrees = KINDS[series.kind]
+            set_attributes(group, {"sensor": series.sensor, "kind": series.kind, "degrees_of_freedom": degrees})
             for name, unit in _SERIES.items():
                 value = getattr(series, name)
                 if value is not None and not (series.kind == "attitude" and name in ("vector_b", "sigma")):
@@ -119,21 +121,16 @@ def write_record(
 
 def is_record(path: str | os.PathLike[str]) -> bool:
     """Return whether a file says that :func:`write_record` or :func:`export_csv` wrote it; its content is not checked."""
-    import h5py
-
-    try:
-        if _is_csv(path):
-            return True
-        with h5py.File(path, "r") as file:
-            return bool(file.attrs.get("kind") == KIND)
-    except OSError:
+    if _begins(path, f"{_MARK} record".encode()):
+        return True
+    if not reading.is_hdf5(path):
         return False
+    with reading.hdf5(path) as file:
+        return bool(reading.attributes(file).get("kind") == KIND)
 
 
-def _is_csv(path: str | os.PathLike[str]) -> bool:
-    """Return whether a file begins as the record of :func:`export_csv` does."""
-    mark = f"{_MARK} record".encode()
-    with open(path, "rb") as file:
+def _begins(path: str | os.PathLike[str], mark: bytes) -> bool:
+    with reading.opened(path) as file:
         return file.read(len(mark)) == mark
 
 
@@ -151,73 +148,70 @@ def read_record_file(path: str | os.PathLike[str]) -> RecordFile:
         If the file is missing, truncated, another kind of file, of a newer layout, or its units or conventions are not those of
         :func:`write_record`.
     """
-    import h5py
-
-    existing_file(path)
-    try:
-        if _is_csv(path):
+    if _begins(path, _MARK.encode()):
+        with reading.from_file(path):
             return _read_csv_record(Path(path))
-        with h5py.File(path, "r") as file:
-            kind = file.attrs.get("kind")
-            if kind != KIND:
-                raise InputError(
-                    f"{path} is {f'a {kind}' if kind else 'HDF5 of another program'}, not a {KIND}; pass one that write_record wrote"
-                )
-            if int(file.attrs["format"]) > FORMAT:
-                raise InputError(
-                    f"{path} has layout {int(file.attrs['format'])}, this version ({strapdown.__version__}) reads up to {FORMAT}; update it"
-                )
-            told = file.attrs.get("conventions", CONVENTIONS)
-            if told != CONVENTIONS:
-                raise InputError(
-                    f"{path} follows other conventions ({told}); convert it to those of this package: {CONVENTIONS}"
-                )
-            group = file.get("vectors", {})
-            series = tuple(_series(group[str(number)]) for number in range(len(group)))
-            truth = None
-            if "truth" in file:
-                truth = Truth(attitude=_values(file, "truth/attitude", "1"), bias=_values(file, "truth/bias", "rad/s"))
-            time, increments = _values(file, "time", "s"), _values(file, "increments", "rad")
-            return RecordFile(
-                record=ImuRecord(time=time, increments=increments, vectors=series, truth=truth),
-                gyro=gyro.from_table(json.loads(file.attrs["gyro"]), f"{path}: gyro") if "gyro" in file.attrs else None,
-                scenario=file.attrs.get("scenario", ""),
-                seed=int(file.attrs["seed"]) if "seed" in file.attrs else None,
-                run=int(file.attrs["run"]) if "run" in file.attrs else None,
-                version=file.attrs["version"],
-                attributes={
-                    name: value.item() if hasattr(value, "item") else value
-                    for name, value in file.attrs.items()
-                    if name not in _RESERVED
-                },
+    with reading.hdf5(path) as file:
+        told = reading.attributes(file)
+        kind = told.get("kind")
+        if kind != KIND:
+            raise InputError(
+                f"{path} is {f'a {kind}' if kind else 'HDF5 of another program'}, not a {KIND}; pass one that write_record wrote"
             )
-    except InputError:
-        raise
-    except (OSError, KeyError, RuntimeError, ValueError) as error:
-        raise InputError(
-            f"{path} cannot be read ({error}); the file is truncated, damaged or of another kind"
-        ) from None
+        if count("format", told["format"]) > FORMAT:
+            raise InputError(
+                f"{path} has layout {told['format']}, this version ({strapdown.__version__}) reads up to {FORMAT}; update it"
+            )
+        if told.get("conventions", CONVENTIONS) != CONVENTIONS:
+            raise InputError(
+                f"{path} follows other conventions ({told['conventions']}); convert it to those of this package: {CONVENTIONS}"
+            )
+        group = file.get("vectors", {})
+        series = tuple(_series(group[str(number)]) for number in range(len(group)))
+        truth = None
+        if "truth" in file:
+            truth = Truth(attitude=_values(file, "truth/attitude", "1"), bias=_values(file, "truth/bias", "rad/s"))
+        record = ImuRecord(
+            time=_values(file, "time", "s"), increments=_values(file, "increments", "rad"), vectors=series, truth=truth
+        )
+        more = {name: value for name, value in told.items() if name not in _RESERVED}
+        return RecordFile(record=record, version=str(told["version"]), attributes=more, **_making(told, path))
+
+
+def _making(told: Mapping[str, Any], path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Return what a file tells of how a record was made."""
+    made: dict[str, Any] = {name: count(name, told[name], least=0) for name in ("seed", "run") if name in told}
+    if "gyro" in told:
+        table = told["gyro"]
+        table = reading.from_json(table, f"{path}: gyro") if isinstance(table, str) else table
+        made["gyro"] = gyro.from_table(table, f"{path}: gyro")
+    if "scenario" in told:
+        if not isinstance(told["scenario"], str):
+            raise InputError(f"{path}: scenario is {told['scenario']!r}; it must be a text of TOML")
+        made["scenario"] = told["scenario"]
+    return made
 
 
 def _values(group: Any, name: str, unit: str) -> Array:
     """Return an array of a file, whose attribute ``unit``, where there is one, must be the one that it is read in."""
-    told = group[name].attrs.get("unit", unit)
-    told = told.decode() if isinstance(told, bytes) else told
+    value = reading.numbers(group, name)
+    told = reading.attributes(group[name]).get("unit", unit)
     if told != unit:
         raise InputError(
             f"{group.file.filename}: {f'{group.name}/{name}'.lstrip('/')} is in {told!r}, and read in {unit!r}; convert it"
         )
-    return np.asarray(group[name][:])
+    return value
 
 
 def _series(group: Any) -> VectorMeasurements:
     fields = {name: _values(group, name, unit) for name, unit in _SERIES.items() if name in group}
-    if group.attrs["kind"] != "attitude" and not fields.keys() & {"sigma", "sigma_axes", "covariance"}:
+    told = reading.attributes(group)
+    if told["kind"] != "attitude" and not fields.keys() & {"sigma", "sigma_axes", "covariance"}:
         raise InputError(
-            f"{group.file.filename}: {group.name.lstrip('/')} ({group.attrs['sensor']}) lacks sigma; give each measurement its standard "
+            f"{group.file.filename}: {group.name.lstrip('/')} ({told['sensor']}) lacks sigma; give each measurement its standard "
             "deviation"
         )
-    return VectorMeasurements(sensor=group.attrs["sensor"], kind=group.attrs["kind"], **fields)
+    return VectorMeasurements(sensor=told["sensor"], kind=told["kind"], **fields)
 
 
 # --------------------------------------------------------------------------------------------------------------------- CSV
@@ -300,7 +294,7 @@ def export_csv(
     _write_csv(target, comment, names, table)
     for number in itertools.count(len(record.vectors)):
         stale = _series_file(target, number)
-        if not stale.is_file() or not stale.read_bytes().startswith(f"{_MARK} vectors ".encode()):
+        if not stale.is_file() or not _begins(stale, f"{_MARK} vectors ".encode()):
             break
         stale.unlink()
     return tuple(written)
@@ -328,7 +322,8 @@ def import_csv(path: str | os.PathLike[str]) -> ImuRecord:
         If the file is missing, is not such a file, does not go to the time that it tells of, or a row is cut short, holds no number or no
         increment (its line is named).
     """
-    return _read_csv_record(Path(path)).record
+    with reading.from_file(path):
+        return _read_csv_record(Path(path)).record
 
 
 def _read_csv_record(target: Path) -> RecordFile:
@@ -354,10 +349,10 @@ def _read_csv_record(target: Path) -> RecordFile:
     if not made:
         return RecordFile(record=record)
     try:
-        own = json.loads(made)
-        spec = own.pop("gyro", None)
-        return RecordFile(record=record, gyro=None if spec is None else gyro.from_table(spec, f"{target}: gyro"), **own)
-    except (json.JSONDecodeError, TypeError, AttributeError) as error:
+        own = reading.from_json(made, f"{target}, line 1")
+        known_keys(f"{target}, line 1", own, ("gyro", "scenario", "seed", "run"))
+        return RecordFile(record=record, **_making(own, target))
+    except (InputError, TypeError) as error:
         raise InputError(
             f"{target}, line 1: how it was made cannot be read ({error}); take '{_MADE.strip()} …' away"
         ) from None
@@ -378,8 +373,10 @@ def _series_beside(target: Path, comment: str) -> list[Path]:
     told = re.search(rf", (\d+){_COUNTED};", comment)
     if told is None:
         return list(itertools.takewhile(Path.is_file, (_series_file(target, number) for number in itertools.count())))
-    files = [_series_file(target, number) for number in range(int(told[1]))]
-    for file in files:
+    files = []
+    for number in range(int(told[1])):
+        file = _series_file(target, number)
+        files.append(file)
         if not file.is_file():
             raise InputError(
                 f"{file} does not exist, one of {told[1]} vector series of {target.name}; put it beside the record"
@@ -388,12 +385,12 @@ def _series_beside(target: Path, comment: str) -> list[Path]:
 
 
 def _import_series(path: Path) -> VectorMeasurements:
-    comment, names, rows = _read_csv(path)
+    comment, names, rows = _read_csv(path, link=False)
     mark = f"{_MARK} vectors "
     try:
         if not comment.startswith(mark):
             raise ValueError
-        head = json.loads(comment.removeprefix(mark))
+        head = reading.from_json(comment.removeprefix(mark), str(path))
         attitude = head["kind"] == "attitude"
         wanted = _ATTITUDE_COLUMNS if attitude else _VECTOR_COLUMNS
         if names[:8] != wanted or names[8:] not in ((), (_ARRIVAL,)):
@@ -415,13 +412,9 @@ def _import_series(path: Path) -> VectorMeasurements:
     return VectorMeasurements(**own)
 
 
-def _read_csv(path: Path) -> tuple[str, tuple[str, ...], Array]:
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist; check the path") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read as text ({error}); pass a CSV file") from None
+def _read_csv(path: Path, *, link: bool = True) -> tuple[str, tuple[str, ...], Array]:
+    """Return the comment, the names of the columns and the rows; ``link`` as of :func:`strapdown.reading.opened`."""
+    lines = reading.text(path, link=link).splitlines()
     if len(lines) < 2 or not lines[0].startswith(_MARK):
         raise InputError(f"{path} does not begin with '{_MARK}'; it is no file that export_csv wrote")
     names = tuple(lines[1].split(","))

@@ -6,6 +6,7 @@ of it is in :mod:`strapdown.ahrs`.
 
 from __future__ import annotations
 
+import collections
 import csv
 import io
 import os
@@ -17,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import recordfiles
+from strapdown import reading, recordfiles
 from strapdown.checks import Array, InputError, array, increasing, known_keys, one_of, positive
-from strapdown.files import existing_file
+from strapdown.reading import existing_file
 from strapdown.units import DEGREE, STANDARD_GRAVITY
 
 RATE_UNITS = {"rad/s": 1.0, "deg/s": DEGREE}
@@ -29,9 +30,15 @@ FORCE_UNITS = {"m/s2": 1.0, "g": STANDARD_GRAVITY}
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Units of a time column, and their factor to s."""
 
+LARGEST_RATE = 2000.0
+"""rad/s: five times the range of the fastest gyros. More are raw counts, or a damaged row; and a filter would cut each interval into
+thousands of steps."""
+
 SHORT_STAMPS = 0.1
 """Share of the rows with the stamp of the row before, above which stamps lack digits rather than that a row is wrong."""
 
+_BROAD = ("imu_gyr", "imu_acc", "imu_mag", "opt_quat", "movement")
+"""Data sets of a BROAD file that are read."""
 _COLUMNS = {"gyro": ("gx", "gy", "gz"), "accelerometer": ("ax", "ay", "az"), "magnetometer": ("mx", "my", "mz")}
 
 
@@ -66,6 +73,12 @@ class Recording:
         n = len(time)
         object.__setattr__(self, "time", time)
         object.__setattr__(self, "rate", array(f"{self.source}: rate", self.rate, (n, 3)))
+        if np.max(np.abs(self.rate)) > LARGEST_RATE:
+            row, axis = (int(i) for i in np.unravel_index(np.argmax(np.abs(self.rate)), self.rate.shape))
+            raise InputError(
+                f"{self.source}: rate[{row}, {axis}] is {self.rate[row, axis]:g} rad/s, which no gyro measures; convert raw counts to "
+                "rad/s or deg/s by the scale factor of the datasheet, or remove the row"
+            )
         for name, width in (("specific_force", 3), ("magnetic_field", 3), ("true_attitude", 4)):
             value = getattr(self, name)
             if value is not None:
@@ -139,38 +152,35 @@ def read(
 
 def read_broad(path: str | os.PathLike[str]) -> Recording:
     """Read a trial of the BROAD data set (Laidig et al. 2021): ``imu_gyr``, ``imu_acc``, ``imu_mag``, ``opt_quat``, ``movement``."""
-    import h5py
-
     name = Path(path).name
-    try:
-        with h5py.File(path, "r") as file:
-            kind = str(file.attrs.get("kind", ""))
-            if kind.startswith("strapdown ") and kind != recordfiles.KIND:
-                raise InputError(f"{name} is a {kind}, a result and no recording; give what it was made from")
-            if kind == recordfiles.KIND:
-                raise InputError(
-                    f"{name} is a simulated record, no recording; integrate it (`strapdown integrate`) or filter it (`strapdown estimate`)"
-                )
-            missing = [key for key in ("imu_gyr",) if key not in file]
-            if "sampling_rate" not in file.attrs:
-                missing.append("the attribute sampling_rate")
-            if missing:
-                raise InputError(
-                    f"{name} lacks {', '.join(missing)}; it is not in the layout of BROAD (has: {', '.join(file)})"
-                )
-            rate = file["imu_gyr"][:]
-            sampling = positive(f"{name}: sampling_rate", file.attrs["sampling_rate"], unit="Hz")
-            return _with_gyro(
-                source=name,
-                time=np.arange(len(rate)) / sampling,
-                rate=rate,
-                specific_force=file["imu_acc"][:] if "imu_acc" in file else None,
-                magnetic_field=file["imu_mag"][:] if "imu_mag" in file else None,
-                true_attitude=file["opt_quat"][:] if "opt_quat" in file else None,
-                movement=file["movement"][:].astype(bool) if "movement" in file else None,
+    with reading.hdf5(path) as file:
+        told = reading.attributes(file)
+        kind = str(told.get("kind", ""))
+        if kind.startswith("strapdown ") and kind != recordfiles.KIND:
+            raise InputError(f"{name} is a {kind}, a result and no recording; give what it was made from")
+        if kind == recordfiles.KIND:
+            raise InputError(
+                f"{name} is a simulated record, no recording; integrate it (`strapdown integrate`) or filter it (`strapdown estimate`)"
             )
-    except OSError as error:
-        raise InputError(f"{name} cannot be read as HDF5 ({error}); the file is truncated or of another kind") from None
+        missing = [key for key in ("imu_gyr",) if key not in file]
+        if "sampling_rate" not in told:
+            missing.append("the attribute sampling_rate")
+        if missing:
+            raise InputError(
+                f"{name} lacks {', '.join(missing)}; it is not in the layout of BROAD (has: {', '.join(file)})"
+            )
+        columns = {key: reading.numbers(file, key) for key in _BROAD if key in file}
+        movement = columns.get("movement")
+        sampling = positive(f"{name}: sampling_rate", told["sampling_rate"], unit="Hz")
+        return _with_gyro(
+            source=name,
+            time=np.arange(len(columns["imu_gyr"])) / sampling,
+            rate=columns["imu_gyr"],
+            specific_force=columns.get("imu_acc"),
+            magnetic_field=columns.get("imu_mag"),
+            true_attitude=columns.get("opt_quat"),
+            movement=None if movement is None else movement.astype(bool),
+        )
 
 
 def read_csv(
@@ -183,12 +193,13 @@ def read_csv(
     is. Time is in s unless declared otherwise. Empty fields of the accelerometer and the magnetometer are missing samples; rows with an
     empty field of the gyro are left out, and told in ``missing_gyro``, as are rows that repeat the row before, in ``repeated``.
     """
-    file = Path(path)
     known_keys("units", units or {}, ("time", "gyro", "accelerometer"))
-    try:
-        stream = io.StringIO(file.read_text(encoding="utf-8-sig"), newline="")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{file.name} cannot be read as text ({error}); pass a CSV file in UTF-8") from None
+    with reading.from_file(path):
+        return _csv(Path(path), units, gyro_alone)
+
+
+def _csv(file: Path, units: Mapping[str, str] | None, gyro_alone: bool) -> Recording:
+    stream = io.StringIO(reading.text(file), newline="")
     if recordfiles.is_record(file):
         raise InputError(
             f"{file.name} is a simulated record, no recording; integrate it (`strapdown integrate`) or filter it (`strapdown estimate`)"
@@ -281,8 +292,6 @@ def _header(source: str, header: list[str]) -> tuple[list[str], dict[str, str]]:
     for cell in header:
         name, bracket, rest = cell.strip().partition("[")
         name = name.strip().lower()
-        if name in names:
-            raise InputError(f"{source}: the header names the column {name!r} twice; rename or drop one")
         names.append(name)
         if bracket and name in groups:
             unit = rest.strip().removesuffix("]").strip().replace("²", "2").replace("^", "").replace("°", "deg")
@@ -291,6 +300,9 @@ def _header(source: str, header: list[str]) -> tuple[list[str], dict[str, str]]:
                     f"{source}: column {name} is in {unit} but another {groups[name]} column in {declared[groups[name]]}; "
                     "give all axes of one sensor the same unit"
                 )
+    twice = [name for name, number in collections.Counter(names).items() if number > 1]
+    if twice:
+        raise InputError(f"{source}: the header names the column {twice[0]!r} twice; rename or drop one")
     return names, declared
 
 
@@ -391,17 +403,16 @@ def read_gyro(
     An array tells neither its rate nor its unit: give ``rate`` in Hz and ``units={"gyro": ...}``. Samples must lie at even intervals.
     """
     file = Path(path)
+    with reading.from_file(file):
+        return _gyro(file, rate, dict(units or {}))
+
+
+def _gyro(file: Path, rate: float | None, given: dict[str, str]) -> GyroSamples:
     existing_file(file)
-    given = dict(units or {})
     if file.suffix.lower() == ".npy":
         if rate is None or "gyro" not in given:
             raise InputError(f"{file.name} is a bare array; give its rate in Hz and its unit (rad/s or deg/s)")
-        try:
-            values = np.load(file, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise InputError(
-                f"{file.name} cannot be read as an array ({error}); the file is truncated or of another kind"
-            ) from None
+        values = reading.npy(file)
         factor = RATE_UNITS[one_of(f"{file.name}: unit of the gyro", given["gyro"], RATE_UNITS)]
         columns = array(file.name, np.reshape(values, (-1, 1)) if np.ndim(values) == 1 else values, ("n", "axes"))
         return GyroSamples(

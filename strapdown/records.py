@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 import strapdown
-from strapdown import coning, quaternion
-from strapdown.checks import Array, InputError, array, increasing, instance, unit_quaternions
-from strapdown.files import existing_file, whole_hdf5, written_beside
+from strapdown import coning, quaternion, reading
+from strapdown.checks import Array, InputError, array, count, finite, increasing, instance, one_of, unit_quaternions
+from strapdown.files import set_attributes, whole_hdf5, written_beside
 from strapdown.vectors import VectorMeasurements
 
 CONVENTIONS = (
@@ -321,11 +321,8 @@ _ESTIMATE_UNITS = {
 def result_file(path: str | os.PathLike[str], kind: str, attributes: Mapping[str, Any] | None) -> Iterator[Any]:
     """Yield an HDF5 file that says what it is; it appears whole or not at all."""
     with written_beside(path) as temporary, whole_hdf5(temporary) as file:
-        file.attrs["kind"] = f"strapdown {kind}"
-        file.attrs["version"] = strapdown.__version__
-        file.attrs["conventions"] = CONVENTIONS
-        for name, value in (attributes or {}).items():
-            file.attrs[name] = value
+        own = {"kind": f"strapdown {kind}", "version": strapdown.__version__, "conventions": CONVENTIONS}
+        set_attributes(file, {**own, **(attributes or {})})
         yield file
 
 
@@ -335,9 +332,7 @@ def put(group: Any, name: str, value: Array, unit: str, meaning: str = "") -> No
     dataset = group.create_dataset(
         name, data=value, **({"compression": "gzip", "compression_opts": 1, "shuffle": True} if large else {})
     )
-    dataset.attrs["unit"] = unit
-    if meaning:
-        dataset.attrs["meaning"] = meaning
+    set_attributes(dataset, {"unit": unit, "meaning": meaning} if meaning else {"unit": unit})
 
 
 def write_estimate(
@@ -366,8 +361,8 @@ def write_estimate(
             put(file, "truth/bias", truth.bias, "rad/s")
         for number, (sensor, innovations) in enumerate(estimate.innovations.items()):
             group = file.create_group(f"innovations/{number}")
-            group.attrs["sensor"] = sensor  # not the group's name: a slash in it would part groups
-            group.attrs["skipped"] = estimate.skipped.get(sensor, 0)
+            # The sensor is not the group's name: a slash in it would part groups.
+            set_attributes(group, {"sensor": sensor, "skipped": estimate.skipped.get(sensor, 0)})
             put(group, "time", innovations.time, "s")
             put(
                 group,
@@ -379,10 +374,10 @@ def write_estimate(
             if innovations.weight is not None:
                 put(group, "weight", innovations.weight, "1", "0: refused; 1: taken in whole")
         for number, event in enumerate(estimate.events):
-            file.create_group(f"events/{number:06d}").attrs.update(vars(event))
+            set_attributes(file.create_group(f"events/{number:06d}"), vars(event))
         for number, (name, block) in enumerate(estimate.error_states.items()):
             group = file.create_group(f"states/{number}")
-            group.attrs.update(name=name, components=list(block.components), units=list(block.units))
+            set_attributes(group, {"name": name, "components": block.components, "units": block.units})
             put(group, "values", block.values, "those of the attribute units")
             put(group, "variance", block.variance, "the square of the values'")
 
@@ -399,28 +394,17 @@ def write_attitude(
 @contextlib.contextmanager
 def _estimate_file(path: str | os.PathLike[str]) -> Iterator[Any]:
     """Yield an estimate's HDF5 file, read only; what is wrong with it is told in one line."""
-    import h5py
-
-    existing_file(path)
-    try:
-        with h5py.File(path, "r") as file:
-            if file.attrs.get("kind") != "strapdown estimate":
-                raise InputError(
-                    f"{path} is not a strapdown estimate; pass the estimate.h5 that `strapdown estimate` writes"
-                )
-            yield file
-    except InputError:
-        raise
-    except (OSError, KeyError, RuntimeError, TypeError, ValueError) as error:
-        raise InputError(f"{path} cannot be read as HDF5 ({error}); the file is truncated or of another kind") from None
+    with reading.hdf5(path) as file:
+        if reading.attributes(file).get("kind") != "strapdown estimate":
+            raise InputError(
+                f"{path} is not a strapdown estimate; pass the estimate.h5 that `strapdown estimate` writes"
+            )
+        yield file
 
 
 def _numbers(group: Any, name: str, shape: tuple[int | str, ...]) -> Array:
     """Return an array of a file as :func:`strapdown.checks.array` lets it pass."""
-    place = _place(group, name)
-    if not hasattr(group[name], "dtype"):
-        raise InputError(f"{place} is a group and not an array; the file is damaged, make it again")
-    return array(place, group[name][()], shape)
+    return array(_place(group, name), reading.numbers(group, name), shape)
 
 
 def _place(group: Any, name: str) -> str:
@@ -487,24 +471,22 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
         covariance = _numbers(file, "covariance", (rows, 6, 6)) if "covariance" in file else None
         if covariance is not None:
             _above_zero(f"{_place(file, 'covariance')}, diagonal", np.diagonal(covariance, axis1=1, axis2=2))
-        groups = file["innovations"].values() if "innovations" in file else ()
+        sensors = {told["sensor"]: (told, part) for told, part in _parts(file, "innovations")}
         return Estimate(
             time=time,
             attitude=_attitudes(file, "attitude", rows),
             bias=_biases(file, "bias", rows),
             variance=_above_zero(_place(file, "variance"), _numbers(file, "variance", (rows, 6))),
             covariance=covariance,
-            innovations={part.attrs["sensor"]: _innovations(part) for part in groups},
-            skipped={part.attrs["sensor"]: int(part.attrs["skipped"]) for part in groups},
+            innovations={sensor: _innovations(part) for sensor, (_, part) in sensors.items()},
+            skipped={sensor: count("skipped", told["skipped"], least=0) for sensor, (told, _) in sensors.items()},
             events=tuple(
                 Event(
-                    kind=one.attrs["kind"],
-                    start=float(one.attrs["start"]),
-                    end=float(one.attrs["end"]),
-                    sensor=one.attrs["sensor"],
-                    value=float(one.attrs["value"]),
+                    kind=one_of("kind of an event", told["kind"], EVENT_KINDS),
+                    sensor=str(told["sensor"]),
+                    **{name: finite(f"{name} of an event", told[name]) for name in ("start", "end", "value")},
                 )
-                for one in (file["events"].values() if "events" in file else ())
+                for told, _ in _parts(file, "events")
             ),
         )
 
@@ -520,15 +502,24 @@ def read_states(path: str | os.PathLike[str]) -> dict[str, ErrorStateEstimate]:
     with _estimate_file(path) as file:
         rows = len(_numbers(file, "time", ("n",)))
         found = {}
-        for part in file["states"].values() if "states" in file else ():
-            values = _numbers(part, "values", (rows, "states"))
-            found[str(part.attrs["name"])] = ErrorStateEstimate(
-                components=tuple(str(one) for one in part.attrs["components"]),
-                units=tuple(str(one) for one in part.attrs["units"]),
+        for told, part in _parts(file, "states"):
+            values = _numbers(part, "values", (rows, len(told["components"])))
+            if len(told["units"]) != len(told["components"]):
+                raise InputError(
+                    f"{_place(part, 'units')} are not as many as components; the file is damaged, make it again"
+                )
+            found[str(told["name"])] = ErrorStateEstimate(
+                components=tuple(str(one) for one in told["components"]),
+                units=tuple(str(one) for one in told["units"]),
                 values=values,
                 variance=_above_zero(_place(part, "variance"), _numbers(part, "variance", values.shape)),
             )
         return found
+
+
+def _parts(file: Any, name: str) -> list[tuple[dict[str, Any], Any]]:
+    """Return the groups below a group, each with its attributes; none where it is not there."""
+    return [(reading.attributes(part), part) for part in file[name].values()] if name in file else []
 
 
 def _innovations(part: Any) -> Innovations:
@@ -551,14 +542,8 @@ def read_attributes(path: str | os.PathLike[str]) -> dict[str, Any]:
     InputError
         If the file is missing, no HDF5, or not of this package.
     """
-    import h5py
-
-    existing_file(path)
-    try:
-        with h5py.File(path, "r") as file:
-            attributes = {name: value.item() if hasattr(value, "item") else value for name, value in file.attrs.items()}
-    except OSError as error:
-        raise InputError(f"{path} cannot be read as HDF5 ({error}); the file is truncated or of another kind") from None
+    with reading.hdf5(path) as file:
+        attributes = reading.attributes(file)
     if not str(attributes.get("kind", "")).startswith("strapdown "):
         raise InputError(f"{path} is no result of strapdown; pass a file that one of its commands has written")
     return attributes

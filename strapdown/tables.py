@@ -10,14 +10,12 @@ from __future__ import annotations
 import dataclasses
 import os
 import re
-import tomllib
 from collections.abc import Callable, Mapping
-from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from strapdown import units
+from strapdown import reading, units
 from strapdown.checks import Array, InputError, known_keys, numbers
 
 Choice = tuple[tuple[str, float], ...]
@@ -25,6 +23,8 @@ Choice = tuple[tuple[str, float], ...]
 Form = Mapping[str, Choice]
 
 PLAIN: Choice = (("", 1.0),)
+TEXT: Choice = (("", 0.0),)
+"""Words and names; what has this choice holds no number."""
 RATIO: Choice = (("ratio", 1.0),)
 PPM: Choice = (("ppm", 1e-6), ("ratio", 1.0))
 SECONDS: Choice = (("s", 1.0),)
@@ -73,7 +73,7 @@ def _same(a: Any, b: Any) -> bool:
 
 def _entry(name: str, content: Any, choice: Choice) -> dict[str, Any]:
     if isinstance(content, str | bool | int):
-        return {name if choice == PLAIN else f"{name}_{choice[0][0]}": content}
+        return {name if choice in (PLAIN, TEXT) else f"{name}_{choice[0][0]}": content}
     for suffix, factor in choice:
         told = _exact_quotient(np.asarray(content, np.float64), factor)
         if told is not None:
@@ -105,15 +105,20 @@ def decode(table: Mapping[str, Any], form: Form, place: str) -> dict[str, Any]:
 
 
 def _number(content: Any, factor: float, choice: Choice, place: str) -> Any:
+    if choice == TEXT:
+        if not isinstance(content, str):
+            raise InputError(f"{place} is {content!r}; it must be a text in quotes")
+        return content
     if choice == PLAIN and isinstance(content, str):
         return content
-    if isinstance(content, str | bool | Mapping):
+    if isinstance(content, bool) or not isinstance(content, int | float | list):
         raise InputError(f"{place} is {content!r}; it must be a number or a list of numbers, its unit is in the key")
-    if np.ndim(content) == 0:
-        return float(content) * factor if choice != PLAIN else content
     try:
-        return numbers(place, content) * factor
-    except InputError:
+        if isinstance(content, list):
+            return numbers(place, content) * factor
+        number = float(content) * factor
+        return number if choice != PLAIN else content
+    except (InputError, OverflowError):
         raise InputError(f"{place} is {content!r}; it must be a list of numbers, rows of one length") from None
 
 
@@ -133,11 +138,18 @@ def build(kind: type, table: Mapping[str, Any], form: Form, place: str, **more: 
 
 
 def made(make: Callable[..., Any], values: Mapping[str, Any], table: Mapping[str, Any], form: Form, place: str) -> Any:
-    """Return ``make(**values)``; what is refused is told with its place in the file, and the key and the number that stand there."""
+    """Return ``make(**values)``; what is refused is told with its place in the file, and the key and the number that stand there.
+
+    The values have the type of a file's (text, number, list), not always that of the field: what ``make`` cannot even compare or convert is
+    refused too.
+    """
     try:
         return make(**values)
     except InputError as error:
         raise InputError(_with_typed(str(error), table, form, place)) from None
+    except (TypeError, ValueError, ArithmeticError, LookupError) as error:
+        keys = ", ".join(table) or "the values"
+        raise InputError(f"{place}: one of {keys} is of the wrong type or size ({error}); check each") from error
 
 
 def _with_typed(text: str, table: Mapping[str, Any], form: Form, place: str) -> str:
@@ -148,21 +160,21 @@ def _with_typed(text: str, table: Mapping[str, Any], form: Form, place: str) -> 
     return text if text.startswith(place.split(":", 1)[0]) else f"{place}: {text}"
 
 
-def read(path: str | os.PathLike[str], name: str, remedy: str) -> dict[str, Any]:
-    """Return the table ``[name]`` of a TOML file; ``remedy`` says what to do where there is none.
+Kind = TypeVar("Kind")
+
+
+def read(path: str | os.PathLike[str], name: str, remedy: str, make: Callable[[Mapping[str, Any], str], Kind]) -> Kind:
+    """Return what ``make`` makes of the table ``[name]`` of a TOML file; ``remedy`` says what to do where there is none.
+
+    ``make`` is called with the table and what it is called in errors.
 
     Raises
     ------
     InputError
-        If the file is missing, no TOML, or has no such table.
+        If the file is missing, no TOML, has no such table, or ``make`` refuses it.
     """
-    try:
-        content = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist; check the path") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is no TOML ({error})") from None
-    table = content.get(name)
-    if not isinstance(table, dict):
-        raise InputError(f"{path} has no table [{name}]; {remedy}")
-    return table
+    with reading.from_file(path):
+        table = reading.toml(path).get(name)
+        if not isinstance(table, dict):
+            raise InputError(f"{path} has no table [{name}]; {remedy}")
+        return make(table, f"{path}: {name}")

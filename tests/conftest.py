@@ -14,6 +14,10 @@ BROAD = Path(__file__).resolve().parents[1] / ".." / "shared" / "data" / "broad"
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--slow", action="store_true", help="run the statistical studies too, which take minutes")
+    parser.addoption("--attack-files", type=int, help="number of damaged files that tests/attack makes")
+    parser.addoption("--attack-seed", type=int, default=1, help="seed of the damage")
+    parser.addoption("--soak", type=int, help="steps of the filter that tests/attack/test_soak.py takes")
+    parser.addoption("--attack-log", help="file for what became of the damaged files")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -759,3 +759,11 @@ RECORD = np.random.default_rng(0).standard_normal(200)
 def test_bad_input_is_named(call, words):
     with pytest.raises(InputError, match=words):
         call()
+
+
+def test_the_covariance_of_a_coefficient_is_that_of_the_coefficient_not_of_its_square():
+    """Of n samples of white noise alone σ is known to σ/√(2n)."""
+    n = 20_000
+    fit = allan.fit_noise(np.random.default_rng(5).standard_normal((n, 1)), 1.0, terms=("angle_random_walk",))
+    assert fit.covariance.shape == (1, 1, 1)
+    assert np.sqrt(fit.covariance[0, 0, 0]) == pytest.approx(1.0 / np.sqrt(2.0 * n), rel=0.02)

@@ -18,7 +18,7 @@ PACKAGE = Path(strapdown.__file__).parent
 
 FLOORS: tuple[tuple[str, ...], ...] = (
     # 0 mathematics, and what everything stands on
-    ("checks", "equality", "files", "units", "tables", "randomness", "quaternion", "kinematics", "kernels"),
+    ("checks", "equality", "reading", "files", "units", "tables", "randomness", "quaternion", "kinematics", "kernels"),
     # 1 models
     ("motion", "coning", "flicker", "gyro", "datasheets", "orbit", "vectors", "allan", "wahba"),
     # 2 data
@@ -28,7 +28,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     # 4 analysis
     ("consistency", "covariance", "montecarlo", "coning_study", "diagnosis", "doctor", "tuning"),
     # 5 faces
-    ("plots", "report", "cli"),
+    ("plots", "report", "cli", "__main__"),
 )
 """Modules and sub-packages of ``strapdown`` by floor, from the ground up. An import may go down or stay on its floor, never up."""
 
@@ -36,7 +36,7 @@ STRANGERS = (("motion", "coning"),)
 """Pairs that never import each other: the closed-form truth and the integrator, so that neither can hide the other's fault."""
 
 DRAWING = ("plots", "report")
-PRINTING = ("cli",)
+PRINTING = ("cli", "__main__")
 MACHINES = ("kernels.machine", "kernels.lanes", "kernels.packed")
 """Kernel modules that know of compilers; all others are plain Python."""
 
@@ -130,6 +130,37 @@ def test_strangers_never_meet(one, other):
         seen = {unit(found) for name in imports(tree) if (found := internal(name))}
         if unit(module) in (one, other):
             assert not seen & ({one, other} - {unit(module)}), f"{module} imports its stranger"
+
+
+PARSERS = (
+    "np.load",
+    "np.loadtxt",
+    "np.genfromtxt",
+    "np.fromfile",
+    "tomllib.load",
+    "tomllib.loads",
+    "json.load",
+    "json.loads",
+    "pickle.load",
+)
+READERS = ("open", "io.open", "os.open", "h5py.File", *PARSERS)
+OF_A_PATH = (".read_text", ".read_bytes", ".open")
+NOT_OF_THE_USER = ("kernels.machine", "report.page")
+"""They read files of the package itself."""
+
+
+@pytest.mark.parametrize("module", [name for name in sources() if name not in ("reading", *NOT_OF_THE_USER)])
+def test_every_file_passes_the_reading_layer(module):
+    """Nobody else opens a file to read it, or parses one: limits, names of files and digests are in one place."""
+    for node in ast.walk(sources()[module]):
+        if not isinstance(node, ast.Call):
+            continue
+        call = ast.unparse(node.func)
+        if call in READERS or call.endswith(OF_A_PATH):
+            words = ast.unparse(node)
+            writes = any(mode in words for mode in ("'w'", "'wb'", "'a+'", "'r+b'")) or "reading.opened" in words
+            own = module == "montecarlo.campaign" and "temporary.open('rb')" in words  # to have it on the disk
+            assert writes or own, f"{module} line {node.lineno}: {words}"
 
 
 def top_names(tree: ast.AST) -> set[str]:

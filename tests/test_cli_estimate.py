@@ -111,6 +111,7 @@ def test_what_a_record_does_not_tell_is_asked_for(run, record, tmp_path):
     bare = tmp_path / "bare.h5"
     whole = simulate(made(STARS[:1]), 4)
     write_record(bare, ImuRecord(time=whole.time, increments=whole.increments, vectors=whole.vectors))
+    (tmp_path / "own.csv").write_text("time,gx,gy,gz\n")
     cases = (
         ((bare,), "--gyro or --filter"),
         ((record, "--attitude", "1,0,0"), "w,x,y,z"),
@@ -118,7 +119,8 @@ def test_what_a_record_does_not_tell_is_asked_for(run, record, tmp_path):
         ((record, "--robust", "hubert"), "did you mean 'huber'"),
         ((record, "--gate", 1.5), "between 0 and 1"),
         ((record, "--time-unit", "ms"), "goes with a CSV file"),
-        ((tmp_path / "none.csv", "--gate", 0.99), "goes with a record"),
+        ((tmp_path / "own.csv", "--gate", 0.99), "goes with a record"),
+        ((tmp_path / "none.csv", "--gate", 0.99), "none.csv does not exist"),
     )
     for arguments, words in cases:
         status, _, error = run("estimate", *arguments, "--out", tmp_path / "out")
@@ -204,8 +206,7 @@ def test_states_that_the_errors_call_for(run, spinning, tmp_path):
         [kept.values[-1], kept.sigma[-1]], [[*states["gyro scale"][n]] for n in ("values", "sigma")]
     )
     assert (tmp_path / "out" / "states.png").stat().st_size > 10_000
-    with h5py.File(tmp_path / "out" / "estimate.h5") as file:
-        told = setup.from_toml(file.attrs["filter"])
+    told = setup.from_toml(records.read_attributes(tmp_path / "out" / "estimate.h5")["filter"])
     assert told == setup.matched_to_record(
         scenarios.load_scenario("spin").gyro, simulate(scenarios.load_scenario("spin"), 3), states=True
     )
@@ -422,8 +423,7 @@ def test_a_recording_is_taken_for_that_of_a_hand(run, recording, tmp_path):
     assert "°/s, from that second." in said
     assert "later than what they show" not in said
     assert "warning" not in said
-    with h5py.File(tmp_path / "out" / "estimate.h5") as file:
-        told = dict(file.attrs)
+    told = records.read_attributes(tmp_path / "out" / "estimate.h5")
     states = json.loads((tmp_path / "out" / "states.json").read_text())
     assert states["accelerometer velocity"]["units"] == ["m/s", "m/s²"] * 3
     assert len(states["gyro scale"]["values"]) == 9

@@ -187,3 +187,9 @@ def test_vibration_line_refuses_nonsense(change):
 def test_small_angle_drift_refuses_ratios_beyond_its_series():
     with pytest.raises(InputError, match="sample faster"):
         coning.small_angle_drift("two-sample", 1.5)
+
+
+def test_comments_and_empty_lines_of_a_vibration_file_are_no_lines(tmp_path):
+    path = tmp_path / "v.csv"
+    path.write_text("# measured on the bench\n\nfrequency_hz,angle_deg\n  \n10,0.1\n # 20,0.1\n\n")
+    assert [line.frequency for line in coning.read_vibration(path)] == [10.0]

@@ -81,6 +81,19 @@ def test_a_bias_error_shows_in_the_errors_alone():
     assert "bias error that the start hides" in blind.limits[0]  # and it says what it cannot show
 
 
+def test_an_error_that_hardly_moves_is_not_averaged_over_the_run_and_that_is_told():
+    """A bias error that drifts by a tenth of its σ over the run is one sample, not 200."""
+    result, truth = estimate()
+    slow = 1e-5 * (0.6 + 0.1 * np.linspace(0.0, 1.0, 200))[:, None] * np.array([1.0, -1.0, 1.0])
+    judgement = consistency.judge(replace(result, bias=-slow), truth)
+    assert any(
+        limit.startswith("the bias error changes too slowly for this run to average over") for limit in judgement.limits
+    )
+    averaged = {finding.of for finding in judgement.findings if finding.name == "time-averaged NEES"}
+    assert "bias" not in averaged
+    assert "attitude" in averaged
+
+
 def test_sensors_that_share_an_error_are_told():
     judgement = consistency.judge(estimate(correlated=True)[0])
     assert [(f.name, f.of) for f in judgement.findings if f.rejected] == [("cross-correlation", "star 1 and star 2")]

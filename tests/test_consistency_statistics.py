@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.linalg
+import scipy.optimize
 import scipy.signal
 import scipy.stats
 
@@ -383,3 +384,25 @@ def test_non_credibility_needs_more_runs_than_states():
         consistency.credibility(np.ones((6, 6)), np.broadcast_to(np.eye(6), (6, 6, 6)))
     index, inclination = ensemble.credibility_indices(np.random.default_rng(22).standard_normal((4, 10, 2)))
     assert index.shape == inclination.shape == (4,)
+
+
+@pytest.mark.parametrize(("samples", "inside"), [(10, 3), (10, 9), (10, 10), (50, 40), (50, 30), (7, 0)])
+def test_the_p_value_of_a_coverage_counts_what_is_as_far_off_or_farther(samples, inside):
+    """Twice the smaller of P(N ≤ k) and P(N ≥ k), both with k itself, by sums of binomial terms."""
+    found = consistency.Coverage(samples=samples, inside=np.full(3, inside / samples), probability=0.99).p_values
+    for k, p in enumerate(math.erf(s / math.sqrt(2.0)) for s in (1, 2, 3)):
+        terms = [math.comb(samples, j) * p**j * (1.0 - p) ** (samples - j) for j in range(samples + 1)]
+        wanted = min(1.0, 2.0 * min(math.fsum(terms[: inside + 1]), math.fsum(terms[inside:])))
+        assert found[k] == pytest.approx(wanted, rel=1e-9)
+
+
+@pytest.mark.parametrize(("critical", "level"), [(0.631, 0.1), (0.752, 0.05), (0.873, 0.025), (1.035, 0.01)])
+def test_the_p_value_of_anderson_and_darling_is_that_of_the_table(critical, level):
+    """D'Agostino & Stephens (1986), table 4.7: the levels of A²*, on samples bent until they have just that statistic."""
+    normal = scipy.stats.norm.ppf((np.arange(300) + 0.5) / 300)[:, None]
+
+    def found(bent):
+        return whiteness.anderson_darling(np.sinh(bent * normal))
+
+    bent = scipy.optimize.brentq(lambda x: found(x)[0] - critical, 0.05, 3.0)
+    assert found(bent)[1] == pytest.approx(level, rel=0.04)

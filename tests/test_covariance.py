@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are, solve_discrete_lyapunov
 from scipy.stats import norm
+from typer.testing import CliRunner
 
-from strapdown import coning, consistency, covariance, estimation, montecarlo, motion, quaternion, setup, vectors
+from strapdown import cli, coning, consistency, covariance, estimation, montecarlo, motion, quaternion, setup, vectors
 from strapdown.checks import InputError
 from strapdown.covariance import Consider
 from strapdown.estimation.states import ProcessNoise
@@ -687,3 +688,21 @@ def test_the_command_refuses_in_one_line(run):
         status, said, refused = run("covariance", *arguments, "--epochs", 4)
         assert word in " ".join((said + refused).split())
         assert status == 2
+
+
+def test_the_options_of_the_command_are_in_the_units_that_they_name(monkeypatch, tmp_path):
+    class Reached(Exception):  # noqa: N818
+        pass
+
+    def analysed(scenario, belief, **options):
+        raise Reached(options["consider"])
+
+    monkeypatch.setattr(covariance, "analyse", analysed)
+    monkeypatch.chdir(tmp_path)
+    command = ["covariance", "coning", "--scale-factor", "3", "--misalignment", "2", "--g-sensitivity", "7"]
+    found = CliRunner().invoke(cli.app, command)
+    assert isinstance(found.exception, Reached), found.output
+    (consider,) = found.exception.args
+    assert consider.scale_factor == pytest.approx(3e-6)
+    assert consider.misalignment == pytest.approx(2e-3)
+    assert consider.g_sensitivity == pytest.approx(7.0 * np.pi / 180.0 / 3600.0 / 9.80665, rel=1e-12)  # rad/s per m/s²

@@ -14,11 +14,11 @@ import weakref
 from dataclasses import fields, replace
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
+from hdf5 import changed
 
-from strapdown import cli, consistency, montecarlo, recordfiles, records, scenarios
+from strapdown import cli, consistency, montecarlo, reading, recordfiles, records, scenarios
 from strapdown import setup as setups
 from strapdown.checks import InputError
 from strapdown.montecarlo import campaign, engine, scalar, statistics
@@ -75,18 +75,16 @@ def test_the_file_holds_what_a_plain_run_gives(tmp_path):
 def test_the_file_describes_itself(tmp_path):
     path = tmp_path / "c.h5"
     go(path, 21)
-    with h5py.File(path) as file:
-        assert file.attrs["kind"] == "strapdown montecarlo"
-        assert (
-            scenarios.scenario_to_toml(scenarios.scenario_from_toml(file.attrs["scenario"])) == file.attrs["scenario"]
-        )
-        assert "[filter]" in file.attrs["filter"]
-        assert file.attrs["finished_runs"] == 21
-        assert {"python", "numpy", "numba", "h5py"} == set(json.loads(file.attrs["versions"]))
-        assert "quaternions Hamilton" in file.attrs["conventions"]
+    with reading.hdf5(path) as file:
+        told = reading.attributes(file)
+        assert told["kind"] == "strapdown montecarlo"
+        assert scenarios.scenario_to_toml(scenarios.scenario_from_toml(told["scenario"])) == told["scenario"]
+        assert "[filter]" in told["filter"]
+        assert told["finished_runs"] == 21
+        assert {"python", "numpy", "numba", "h5py"} == set(json.loads(told["versions"]))
+        assert "quaternions Hamilton" in told["conventions"]
         for dataset in file["statistics"].values():
-            assert dataset.attrs["unit"]
-            assert dataset.attrs["meaning"]
+            assert reading.attributes(dataset).keys() >= {"unit", "meaning"}
         names = {field.name for field in fields(statistics.Statistics)} - {"runs", "sensors"}
         assert set(file["statistics"]) == names
 
@@ -240,7 +238,7 @@ def test_killed_in_the_middle_of_writing_the_file_is_the_one_before(tmp_path, di
 
 
 def _forged(path, name, value):
-    with h5py.File(path, "r+") as file:
+    with changed(path) as file:
         file.attrs[name] = value
 
 
@@ -291,7 +289,7 @@ def test_an_existing_file_is_not_written_over_by_mistake(tmp_path):
     with pytest.raises(InputError, match="--resume"):
         go(path, 8)
     assert path.read_text() == "the only copy of my thesis"
-    with pytest.raises(InputError, match="cannot be read as a campaign"):
+    with pytest.raises(InputError, match="cannot be read as HDF5"):
         go(path, 8, resume=True)
     assert path.read_text() == "the only copy of my thesis"
     assert go(path, 8, overwrite=True).finished
@@ -446,8 +444,19 @@ def test_the_command_refuses(command, arguments, message, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["short.toml"]
 
 
+@pytest.fixture
+def heeded():
+    """Signals as a program has them that was started in the foreground; tests may run in the background, with SIGINT ignored."""
+    before = {one: signal.getsignal(one) for one in (signal.SIGINT, signal.SIGTERM)}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    yield
+    for one, handler in before.items():
+        signal.signal(one, handler)
+
+
 @pytest.mark.parametrize("how", ["Ctrl-C", "SIGTERM"])
-def test_interrupted_it_keeps_what_is_finished_and_says_so(command, monkeypatch, how):
+def test_interrupted_it_keeps_what_is_finished_and_says_so(command, heeded, monkeypatch, how):
     original, done = scalar.run_chunks, []
 
     def interrupted(plans, first_run, runs):
@@ -470,7 +479,7 @@ def test_interrupted_it_keeps_what_is_finished_and_says_so(command, monkeypatch,
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_whose_exception_python_drops_is_heeded_after_the_chunk(command, monkeypatch, number):
+def test_a_signal_whose_exception_python_drops_is_heeded_after_the_chunk(command, heeded, monkeypatch, number):
     original, written = campaign._write, []
 
     def cleared(_):
@@ -494,6 +503,23 @@ def test_a_signal_whose_exception_python_drops_is_heeded_after_the_chunk(command
     assert status == 130
     assert "go on with --resume" in said
     assert campaign.read("short-montecarlo.h5").statistics.runs == 10
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_that_whoever_started_the_command_had_ignored_stays_ignored(command, heeded, monkeypatch, number):
+    """As a shell has SIGINT ignored for what it starts in the background, and nohup SIGHUP."""
+    original = campaign._write
+
+    def interrupted(*arguments):
+        signal.raise_signal(number)
+        original(*arguments)
+
+    signal.signal(number, signal.SIG_IGN)
+    monkeypatch.setattr(campaign, "_write", interrupted)
+    status, _, _ = command("short.toml", "--runs", 20, "--threads", 1, *SCALAR)
+    assert status == 0
+    assert campaign.read("short-montecarlo.h5").finished
+    assert signal.getsignal(number) is signal.SIG_IGN
 
 
 @pytest.mark.slow

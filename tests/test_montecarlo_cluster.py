@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -84,9 +85,63 @@ def test_an_error_on_a_worker_comes_out(client):
 
 
 def test_a_worker_of_another_version_is_refused(client, monkeypatch):
-    monkeypatch.setattr(cluster, "_chunk", lambda payload, first, runs: ("0.0.1", ()))
+    monkeypatch.setattr(cluster, "_chunk", lambda payload, first, runs: ("0.0.1", engine.arithmetic(), ()))
     with pytest.raises(InputError, match=r"a worker has strapdown 0\.0\.1"):
         montecarlo.run_plan(PLAN, runs=4, chunk=2, machine="scalar", workers=cluster.on_dask(client))
+
+
+def test_a_worker_whose_processor_rounds_otherwise_is_refused(client, monkeypatch):
+    monkeypatch.setattr(
+        cluster, "_chunk", lambda payload, first, runs: (strapdown.__version__, "x86_64, no vectors, no FMA", ())
+    )
+    with pytest.raises(
+        InputError,
+        match=r"a worker computes on x86_64, no vectors, no FMA, this process on .*, which round differently",
+    ):
+        montecarlo.run_plan(PLAN, runs=4, chunk=2, machine="scalar", workers=cluster.on_dask(client))
+
+
+@pytest.fixture
+def certificates(tmp_path):
+    """Dask's configuration for a certificate that is signed by itself."""
+    if shutil.which("openssl") is None:
+        pytest.skip("no openssl on this machine, which makes the certificate")
+    key, certificate = (str(tmp_path / name) for name in ("key.pem", "certificate.pem"))
+    command = ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", "/CN=localhost"]
+    subprocess.run([*command, "-keyout", key, "-out", certificate], check=True, capture_output=True)
+    pair = {"key": key, "cert": certificate}
+    return {f"distributed.comm.tls.{name}": value for name, value in (
+        ("ca-file", certificate), *((f"{who}.{part}", file) for who in ("client", "scheduler", "worker") for part, file in pair.items())
+    )}  # fmt: skip
+
+
+def test_an_encrypted_scheduler_is_reached_with_the_certificates_of_dask(certificates, monkeypatch):
+    """The configuration passes through; without it, or without encryption, nobody gets in."""
+    dask = pytest.importorskip("dask")
+    monkeypatch.setattr(cluster, "CONNECT_SECONDS", 5)
+    with dask.config.set(certificates), distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None, silence_logs="CRITICAL", protocol="tls://",
+        security=distributed.Security(require_encryption=True), host="127.0.0.1",
+    ) as local:  # fmt: skip
+        address = local.scheduler_address
+        assert address.startswith("tls://127.0.0.1:")
+        with cluster.dask_client(address=address) as here:
+            found = montecarlo.run_plan(PLAN, runs=8, chunk=4, machine="scalar", workers=cluster.on_dask(here))
+        assert_same(found, alone(8, 4))
+        with dask.config.set(dict.fromkeys(certificates)):
+            for wrong in (address, address.replace("tls://", "tcp://")):
+                with (
+                    pytest.raises(InputError, match=f"no Dask scheduler answers at {wrong}"),
+                    cluster.dask_client(address=wrong),
+                ):
+                    pass
+
+
+def test_the_help_says_what_trust_a_scheduler_takes(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["strapdown", "montecarlo", "--help"])
+    with pytest.raises(SystemExit):
+        cli.main()
+    assert "can run any code here" in " ".join(capsys.readouterr().out.replace("│", " ").split())
 
 
 def test_without_the_extra_the_remedy_is_told(monkeypatch, capsys, tmp_path):

@@ -411,3 +411,29 @@ def test_every_unit_has_a_factor():
     assert recordings.RATE_UNITS["deg/s"] == np.pi / 180.0
     assert recordings.FORCE_UNITS["g"] == 9.80665
     assert recordings.TIME_UNITS == {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("us", 1_000_000), ("ms", 1000)])
+def test_a_clock_that_counts_from_1970_keeps_its_digits(tmp_path, unit, factor):
+    """In seconds a double has 0.24 µs left of such a stamp."""
+    begin, step = 1_750_000_000 * factor, factor // 100
+    rows = "".join(f"{begin + step * k},0.1,0.2,0.{k + 1}\n" for k in range(9))
+    (tmp_path / "walk.csv").write_text(f"time [{unit}],gx [rad/s],gy,gz\n" + rows)
+    found = recordings.read(tmp_path / "walk.csv")
+    np.testing.assert_allclose(np.diff(found.time), 0.01, rtol=0.0, atol=1e-15)
+    assert found.time[0] == 0.0
+
+
+def test_a_clock_that_counts_from_the_start_is_left_as_it_is(tmp_path):
+    rows = "".join(f"{100_000 + k},0.1,0.2,0.{k + 1}\n" for k in range(9))
+    (tmp_path / "walk.csv").write_text("time [ms],gx [rad/s],gy,gz\n" + rows)
+    assert recordings.read(tmp_path / "walk.csv").time[0] == 100.0
+
+
+def test_two_gyro_samples_are_enough_and_one_is_not(tmp_path):
+    path = tmp_path / "walk.csv"
+    path.write_text("time,gx [rad/s],gy,gz\n0,0.1,0.2,0.3\n1,,,\n2,0.1,0.2,0.4\n")
+    assert len(recordings.read(path).time) == 2
+    path.write_text("time,gx [rad/s],gy,gz\n0,0.1,0.2,0.3\n1,,,\n2,0.1,,0.4\n")
+    with pytest.raises(InputError, match="1 of 3 rows have a gyro sample about each axis; at least 2 are needed"):
+        recordings.read(path)

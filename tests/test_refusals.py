@@ -7,12 +7,12 @@ import json
 import os
 import shutil
 
-import h5py
 import numpy as np
 import pytest
+from hdf5 import changed
 from typer.testing import CliRunner
 
-from strapdown import cli, consistency, recordfiles, records, scenarios, setup
+from strapdown import cli, consistency, reading, recordfiles, records, scenarios, setup
 from strapdown.checks import InputError, count
 from strapdown.cli.terminal import scenario_named
 from strapdown.setup.states import States
@@ -127,7 +127,7 @@ def test_tuning_refuses_a_negative_seed_and_a_record_twice(folder):
 def test_a_damaged_estimate_is_no_verdict(folder, tmp_path, name, change, complaint, command):
     path = tmp_path / "bad.h5"
     shutil.copy(folder / "run" / "estimate.h5", path)
-    with h5py.File(path, "r+") as file:
+    with changed(path) as file:
         value = change(file[name][:])
         del file[name]
         file[name] = value
@@ -139,7 +139,7 @@ def test_a_damaged_estimate_is_no_verdict(folder, tmp_path, name, change, compla
 def test_a_damaged_campaign_is_no_verdict(folder, tmp_path, change, command):
     path = tmp_path / "bad.h5"
     shutil.copy(folder / "runs.h5", path)
-    with h5py.File(path, "r+") as file:
+    with changed(path) as file:
         value = change(file["statistics/nees_sum"][:])
         del file["statistics/nees_sum"]
         file["statistics/nees_sum"] = value
@@ -173,10 +173,10 @@ def test_no_cause_is_named_of_a_filter_that_the_search_does_not_know(folder, sho
         scenario=scenarios.scenario_to_toml(scenario),
     )
     shutil.copy(folder / "run" / "estimate.h5", tmp_path / "estimate.h5")
-    with h5py.File(tmp_path / "estimate.h5", "r+") as file:
-        chosen = setup.from_toml(file.attrs["filter"])
-        chosen_states = States(gyro_scale_sigma=1e-3)
-        file.attrs["filter"] = setup.to_toml(dataclasses.replace(chosen, states=chosen_states))
+    with changed(tmp_path / "estimate.h5") as file:
+        chosen = setup.from_toml(reading.attributes(file)["filter"])
+        states = States(gyro_scale_sigma=1e-3)
+        file.attrs["filter"] = setup.to_toml(dataclasses.replace(chosen, states=states))
     options = ["--record", str(tmp_path / "record.h5"), "--json", str(tmp_path / "check.json")]
     result = CliRunner().invoke(cli.app, ["check", str(tmp_path / "estimate.h5"), *options])
     assert result.exit_code in (0, 2), result.output
@@ -433,7 +433,7 @@ def test_coning_refuses_what_no_algorithm_follows(tmp_path, options):
 
 
 def test_a_budget_of_no_vibration_is_refused(folder, tmp_path):
-    assert "is no text" in refused(["coning-budget", "--psd", folder / "record.h5", "--rate", 100])
+    assert "cannot be read as text" in refused(["coning-budget", "--psd", folder / "record.h5", "--rate", 100])
     assert "is a folder" in refused(["coning-budget", "--psd", tmp_path, "--rate", 100])
     (tmp_path / "lines.csv").write_text("frequency_hz,angle_deg\n10,90\n", encoding="utf-8")
     assert "an amplitude of 90°" in refused(["coning-budget", "--psd", tmp_path / "lines.csv", "--rate", 100])

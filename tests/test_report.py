@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from strapdown import cli, coning, gyro, montecarlo, records, report, scenarios, setup
+from strapdown import cli, coning, gyro, montecarlo, plots, records, report, scenarios, setup
 from strapdown.checks import InputError
 from strapdown.montecarlo import campaign
 from strapdown.report import page
@@ -250,3 +250,40 @@ def test_a_browser_shows_figures_and_charts(folder, tmp_path, name, width):
     assert found["images"] >= 3
     assert found["overflow"] <= 0
     assert found["charts"] == (6 if name == "right" else 0)
+
+
+def rows_of(content, first):
+    """Numbers of the row of a table whose first cell begins so."""
+    row = next(row for row in re.findall(r"<tr>(.*?)</tr>", content) if re.match(rf"<td[^>]*>{first}", row))
+    return [float(cell) for cell in re.findall(r'<td class="number">(.*?)</td>', row)]
+
+
+def test_each_column_of_the_estimates_table_is_what_its_head_says(folder):
+    """Of a filter that is three times too sure, so that no column is another's."""
+    estimate, truth = records.read_estimate(folder / "wrong.h5"), records.read_truth(folder / "wrong.h5")
+    half = len(estimate.time) // 2
+    error = 648000.0 / np.pi * (truth.bias - estimate.bias)[half:]
+    sigma = 648000.0 / np.pi * np.sqrt(estimate.variance[half:, 3:])
+    for axis, name in enumerate("xyz"):
+        wanted = [
+            np.sqrt(np.mean(sigma[:, axis] ** 2)),
+            np.sqrt(np.mean(error[:, axis] ** 2)),
+            np.mean(error[:, axis]),
+            np.abs(error[:, axis]).max(),
+        ]
+        np.testing.assert_allclose(rows_of(body(folder / "wrong.html"), f"gyro bias {name}, °/h"), wanted, rtol=6e-4)
+        assert abs(wanted[1] / wanted[0] - 1.0) > 0.2
+
+
+def test_what_a_campaign_page_says_of_the_end_is_of_the_last_epoch(folder, monkeypatch):
+    held = campaign.read(folder / "campaign.h5").statistics
+    inside = 100.0 * held.coverage / held.finite[:, None, None]
+    assert not np.array_equal(inside[-1], inside[0])
+    content = body(folder / "campaign.html")
+    for state, name in enumerate([f"{what} {axis}" for what in ("attitude", "bias") for axis in "xyz"]):
+        shown = rows_of(content, f"(?:gyro )?{name}")
+        np.testing.assert_allclose(shown[-3:], inside[-1, state], atol=0.051)
+    drawn = []
+    monkeypatch.setattr(plots, "coverage_by_state", lambda statistics, epoch, ax: drawn.append(epoch))
+    report.write(folder / "campaign.h5", folder / "again.html")
+    assert set(drawn) == {-1}

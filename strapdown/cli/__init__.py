@@ -28,16 +28,20 @@ be told.
 
 from __future__ import annotations
 
+import functools
 import io
 import sys
 import traceback
-from typing import Annotated
+import warnings
+from collections.abc import Callable
+from typing import Annotated, Any
 
 import typer
 
 from strapdown.checks import InputError
 from strapdown.cli import campaigns, estimation, integration, judgement, planning, reporting, sensors, studies, tuning  # noqa: F401  (each registers its commands)
 from strapdown.cli.terminal import app, console, errors
+from strapdown.reading import NoDigestWarning
 
 
 @app.callback(invoke_without_command=True)
@@ -62,12 +66,21 @@ def info() -> None:
         console.print(f"{name}: {value}")
 
 
+def _say(usual: Callable[..., None], message: Warning | str, category: type[Warning], *place: Any) -> None:
+    """Say a warning about a file in one line, without where in the code it came up."""
+    if issubclass(category, NoDigestWarning):
+        errors.print(f"warning: {message}", soft_wrap=True)
+    else:
+        usual(message, category, *place)
+
+
 FAULT = 70
 """Exit status of a fault of the program itself (EX_SOFTWARE of BSD): no verdict, and not bad input."""
 
 
 def main() -> None:
     """Run the command line; bad input ends with one clear line and status 2, Ctrl-C with 130, a fault of the program with 70."""
+    warnings.showwarning = functools.partial(_say, warnings.showwarning)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # what ASCII or cp1252 has no sign for is a question mark, not the end
             stream.reconfigure(errors="replace")

@@ -73,7 +73,11 @@ def montecarlo(
         int | None, typer.Option(help="Compute in so many processes instead of threads (needs Dask).")
     ] = None,
     cluster: Annotated[
-        str | None, typer.Option(help="Compute on the Dask scheduler at this address, tcp://HOST:8786.")
+        str | None,
+        typer.Option(
+            help="Compute on the Dask scheduler at this address, tcp://HOST:8786, or tls:// with Dask's certificates configured. Scheduler "
+            "and workers can run any code here (they send pickles): name only one that you trust as you trust your own account."
+        ),
     ] = None,
     replay: Annotated[
         int | None, typer.Option(help="Compute this one run again and write it in full detail: record and estimate.")

@@ -125,16 +125,12 @@ def coning_budget(
     """Tell the drift that an angular vibration spectrum leaves, for each algorithm and sample rate."""
     from strapdown import coning
     from strapdown.checks import InputError
-    from strapdown.files import existing_file, write_json
+    from strapdown.files import write_json
     from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
     if json is not None:
         writable("json", json, suffixes=(".json",), sources=(psd,))
-    existing_file(psd)
-    try:
-        lines = coning.read_vibration(psd)
-    except UnicodeDecodeError:
-        raise InputError(f"{psd} is no text; give a CSV of vibration lines") from None
+    lines = coning.read_vibration(psd)
     largest = max(max(line.angle, line.angle_across or 0.0) for line in lines)
     if largest >= _RIGHT_ANGLE:
         raise InputError(

@@ -56,7 +56,7 @@ def check(
     if record is None and filter_file is not None:
         raise InputError("--filter goes with --record: the record is needed to look for causes")
     tail(probability)
-    kind = _kind(result)
+    kind = str(records.read_attributes(result)["kind"])
     content: dict[str, Any] = {"source": result.name, "kind": kind}
     if kind == "strapdown montecarlo":
         from strapdown.montecarlo import campaign
@@ -78,10 +78,7 @@ def check(
         )
         judgement = consistency.judge(estimate, truth, probability=probability)
     else:
-        raise InputError(
-            f"{result} is {f'a {kind}' if kind else 'HDF5 of another program'}; pass what `strapdown estimate` or "
-            "`strapdown montecarlo` wrote"
-        )
+        raise InputError(f"{result} is a {kind}; pass what `strapdown estimate` or `strapdown montecarlo` wrote")
     _show_statistics(judgement)
     words = judgement.words
     if record is not None:
@@ -96,21 +93,6 @@ def check(
         write_json(json, content)
         written(json)
     raise typer.Exit({"consistent": CONSISTENT, "not consistent": NOT}.get(judgement.verdict, CANNOT_TELL))
-
-
-def _kind(path: Path) -> str:
-    """Return what a result file says it is; empty if it does not."""
-    import h5py
-
-    from strapdown.checks import InputError
-    from strapdown.files import existing_file
-
-    existing_file(path)
-    try:
-        with h5py.File(path, "r") as file:
-            return str(file.attrs.get("kind", ""))
-    except OSError as error:
-        raise InputError(f"{path} cannot be read as HDF5 ({error}); the file is truncated or of another kind") from None
 
 
 def _show_statistics(judgement: Judgement) -> None:

@@ -118,13 +118,11 @@ def scenario_named(name: str) -> Scenario:
     Refused are numbers beyond :data:`LARGEST_NUMBER`, a duration shorter than one gyro sample, and more measurements of a sensor than
     :data:`MOST_MEASUREMENTS`: each would end deep inside, as an infinity or for want of memory.
     """
-    import tomllib
-
     from strapdown.checks import InputError
-    from strapdown.scenarios import load_scenario, scenario_to_toml
+    from strapdown.scenarios import load_scenario, scenario_to_table
 
     chosen = load_scenario(name)
-    for key, number in _numbers("", tomllib.loads(scenario_to_toml(chosen))):
+    for key, number in _numbers("", scenario_to_table(chosen)):
         if LARGEST_NUMBER < abs(number) < float("inf"):  # infinite is what never happens, such as a time without end
             raise InputError(f"{name}: {key} is {number:g}, which no such thing can be; check it and its unit")
     if chosen.duration * chosen.rate < 1.0:

@@ -8,7 +8,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from strapdown import checks
+from strapdown import checks, reading
 from strapdown.checks import InputError
 from strapdown.coning.algorithms import ALGORITHMS, Algorithm, named
 from strapdown.units import DEGREE
@@ -153,11 +153,12 @@ def read_vibration(path: str | os.PathLike[str]) -> tuple[VibrationLine, ...]:
         If the file is missing, a column is unknown or lacking, or a field is no number.
     """
     file = Path(path)
-    try:
-        text = file.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(f"{file} does not exist; check the path") from None
-    rows = csv.reader(line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#"))
+    with reading.from_file(file):
+        return _vibration(file, reading.text(file).splitlines())
+
+
+def _vibration(file: Path, text: list[str]) -> tuple[VibrationLine, ...]:
+    rows = csv.reader(line for line in text if line.strip() and not line.lstrip().startswith("#"))
     names = [name.strip() for name in next(rows, [])]
     checks.known_keys(f"{file.name}: columns", names, _COLUMNS)
     lacking = [name for name in _COLUMNS[:2] if name not in names]

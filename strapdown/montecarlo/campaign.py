@@ -25,12 +25,12 @@ from typing import Any
 import numpy as np
 
 import strapdown
-from strapdown import scenarios, setup
-from strapdown.checks import InputError, count
-from strapdown.files import existing_file, whole_hdf5
-from strapdown.montecarlo.engine import Chunks, Work, Workers, choose, in_threads, machine_named
+from strapdown import reading, scenarios, setup
+from strapdown.checks import InputError, count, finite, one_of
+from strapdown.files import locked, set_attributes, whole_hdf5
+from strapdown.montecarlo.engine import MACHINES, Chunks, Work, Workers, arithmetic, choose, in_threads, machine_named
 from strapdown.montecarlo.plan import Plan, from_table
-from strapdown.montecarlo.statistics import Statistics, merge
+from strapdown.montecarlo.statistics import BINS, Statistics, merge
 from strapdown.records import CONVENTIONS, put
 
 KIND = "strapdown montecarlo"
@@ -77,6 +77,17 @@ _BY_EPOCH = (
 )
 """What has one row an epoch; all are sums over runs whose numbers are finite."""
 
+_COUNTED = (
+    "finite",
+    "coverage",
+    "histogram",
+    "sensor_degrees",
+    "sensor_refused",
+    "worst_run",
+    "example_run",
+)
+"""What counts: whole numbers."""
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Campaign:
@@ -92,6 +103,8 @@ class Campaign:
     statistics: Statistics | None
     """Of the runs finished so far, in their order without a gap; None if there is none."""
     version: str = strapdown.__version__
+    arithmetic: str = ""
+    """Processor features that the bits depend on (:func:`strapdown.montecarlo.engine.arithmetic`); empty in files of earlier versions."""
     seconds: float = 0.0
     """Time spent computing, s, over all resumptions."""
 
@@ -184,53 +197,57 @@ def run(
             f"{target} exists; go on with it (--resume), write over it (--overwrite), or choose another name (--out)"
         )
     chosen = choose(plan, machine)
-    stored = _stored(target) if resume and target.exists() else None
-    if stored is None:
-        size = machine_named(chosen.machine).CHUNK if chunk is None else count("chunk", chunk)
-        state, before = _Progress(None, {}, size), 0.0
-    else:
-        held, state = stored
-        size, before = held.chunk, held.seconds
-        _need_same(target, held, plan, chosen.machine, size if chunk is None else count("chunk", chunk), runs)
-    begun = time.perf_counter()
+    with locked(target):
+        stored = _stored(target) if resume and target.exists() else None
+        if stored is None:
+            size = machine_named(chosen.machine).CHUNK if chunk is None else count("chunk", chunk)
+            state, before = _Progress(None, {}, size), 0.0
+        else:
+            held, state = stored
+            size, before = held.chunk, held.seconds
+            _need_same(target, held, plan, chosen.machine, size if chunk is None else count("chunk", chunk), runs)
+        begun = time.perf_counter()
 
-    def campaign() -> Campaign:
-        return Campaign(
-            plan=plan,
-            machine=chosen.machine,
-            reason=chosen.reason,
-            chunk=size,
-            runs=runs,
-            statistics=state.statistics,
-            seconds=before + time.perf_counter() - begun,
-        )
+        def campaign() -> Campaign:
+            return Campaign(
+                plan=plan,
+                machine=chosen.machine,
+                reason=chosen.reason,
+                chunk=size,
+                runs=runs,
+                statistics=state.statistics,
+                arithmetic=arithmetic(),
+                seconds=before + time.perf_counter() - begun,
+            )
 
-    missing = state.missing(runs)
-    if progress is not None and (done := runs - sum(n for _, n in missing)):
-        progress(done)
-    hands = in_threads(threads) if workers is None else workers
-    due, unwritten = 0.0, True  # the first time in any case, so that a file that cannot be written is found at once
-    _write(target, campaign(), state, table)
-    try:
-        for place, (part,) in hands(Work(plans=(plan,), machine=chosen.machine), missing):
-            state.take(missing[place][0], part)
-            unwritten = True
-            if progress is not None:
-                progress(missing[place][1])
-            if (now := time.perf_counter()) >= due:
+        missing = state.missing(runs)
+        if progress is not None and (done := runs - sum(n for _, n in missing)):
+            progress(done)
+        hands = in_threads(threads) if workers is None else workers
+        due, unwritten = 0.0, True  # the first time in any case, so that a file that cannot be written is found at once
+        _write(target, campaign(), state, table)
+        try:
+            for place, (part,) in hands(Work(plans=(plan,), machine=chosen.machine), missing):
+                state.take(missing[place][0], part)
+                unwritten = True
+                if progress is not None:
+                    progress(missing[place][1])
+                if (now := time.perf_counter()) >= due:
+                    _write(target, campaign(), state, table)
+                    unwritten = False
+                    due = time.perf_counter() + (time.perf_counter() - now) * (1.0 / SHARE - 1.0)
+        finally:
+            if unwritten:
                 _write(target, campaign(), state, table)
-                unwritten = False
-                due = time.perf_counter() + (time.perf_counter() - now) * (1.0 / SHARE - 1.0)
-    finally:
-        if unwritten:
-            _write(target, campaign(), state, table)
-    return campaign()
+        return campaign()
 
 
 def _need_same(target: Path, held: Campaign, plan: Plan, machine: str, chunk: int, runs: int) -> None:
     """Refuse to go on with a file of another plan; name the first difference."""
     given = {**_flat(plan.to_table()), "machine": machine, "chunk": chunk, "version": strapdown.__version__}
     there = {**_flat(held.plan.to_table()), "machine": held.machine, "chunk": held.chunk, "version": held.version}
+    if held.arithmetic:
+        given["arithmetic"], there["arithmetic"] = arithmetic(), held.arithmetic
     for name in sorted(given.keys() | there.keys()):
         if given.get(name) != there.get(name):
             raise InputError(
@@ -264,7 +281,7 @@ def _replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary file that replaces ``path`` on success, safe on the disk before.
 
     Its name is always the same, unlike that of :func:`strapdown.files.written_beside`: of many commits, killed at any moment, at most one
-    such file is left, and the next commit takes it.
+    such file is left, and the next commit takes it. The lock that :func:`run` holds keeps other processes from it.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.part")
@@ -283,11 +300,11 @@ def _write(path: Path, campaign: Campaign, state: _Progress, table: Mapping[str,
 
     plan = campaign.plan
     with _replacing(path) as temporary, whole_hdf5(temporary) as file:
-        file.attrs.update(
-            kind=KIND,
-            format=FORMAT,
-            version=campaign.version,
-            versions=json.dumps(
+        attributes = {
+            "kind": KIND,
+            "format": FORMAT,
+            "version": campaign.version,
+            "versions": json.dumps(
                 {
                     "python": platform.python_version(),
                     "numpy": np.__version__,
@@ -295,20 +312,22 @@ def _write(path: Path, campaign: Campaign, state: _Progress, table: Mapping[str,
                     "h5py": h5py.__version__,
                 }
             ),
-            conventions=CONVENTIONS,
-            scenario=scenarios.scenario_to_toml(plan.scenario),
-            filter=setup.to_toml(plan.setup),
-            plan=json.dumps(table, default=float),
-            digest=plan.digest,
-            seed=plan.seed,
-            machine=campaign.machine,
-            reason=campaign.reason,
-            precision=plan.precision,
-            chunk=campaign.chunk,
-            runs=campaign.runs,
-            finished_runs=0 if campaign.statistics is None else campaign.statistics.runs,
-            seconds=campaign.seconds,
-        )
+            "conventions": CONVENTIONS,
+            "scenario": scenarios.scenario_to_toml(plan.scenario),
+            "filter": setup.to_toml(plan.setup),
+            "plan": json.dumps(table, default=float),
+            "digest": plan.digest,
+            "seed": plan.seed,
+            "machine": campaign.machine,
+            "arithmetic": campaign.arithmetic,
+            "reason": campaign.reason,
+            "precision": plan.precision,
+            "chunk": campaign.chunk,
+            "runs": campaign.runs,
+            "finished_runs": 0 if campaign.statistics is None else campaign.statistics.runs,
+            "seconds": campaign.seconds,
+        }
+        set_attributes(file, attributes)
         if campaign.statistics is not None:
             _put_statistics(file.create_group("statistics"), campaign.statistics)
         if state.early and state.whole is not None and campaign.statistics is not state.whole:
@@ -320,26 +339,56 @@ def _write(path: Path, campaign: Campaign, state: _Progress, table: Mapping[str,
 def _put_statistics(group: Any, statistics: Statistics) -> None:
     from strapdown.montecarlo.statistics import BINS_PER_OCTAVE, ERROR_EXPONENT, NEES_EXPONENT
 
-    group.attrs.update(
-        runs=statistics.runs,
-        sensors=json.dumps(statistics.sensors),
-        bins_per_octave=BINS_PER_OCTAVE,
-        first_error_exponent=ERROR_EXPONENT,
-        first_nees_exponent=NEES_EXPONENT,
-    )
+    attributes = {
+        "runs": statistics.runs,
+        "sensors": json.dumps(statistics.sensors),
+        "bins_per_octave": BINS_PER_OCTAVE,
+        "first_error_exponent": ERROR_EXPONENT,
+        "first_nees_exponent": NEES_EXPONENT,
+    }
+    set_attributes(group, attributes)
     for name, (unit, meaning) in _UNITS.items():
         put(group, name, getattr(statistics, name), unit, meaning)
 
 
-def _statistics_of(group: Any) -> Statistics:
-    arrays = {f.name: group[f.name][()] for f in fields(Statistics) if f.name not in ("runs", "sensors")}
-    for name in _BY_EPOCH:
-        if len(arrays[name]) != len(arrays["time"]) or not np.isfinite(arrays[name]).all():
+def _statistics_of(group: Any, plan: Plan) -> Statistics:
+    """Return the statistics in a group, whose shapes must be those that a plan of so many epochs and sensors has."""
+    told = reading.attributes(group)
+    arrays = {f.name: reading.numbers(group, f.name) for f in fields(Statistics) if f.name not in ("runs", "sensors")}
+    place = f"{group.file.filename}: {group.name.lstrip('/')}"
+    epochs, spans, sensors = plan.epochs + 1, plan.nis_bins, len(plan.sensors)
+    worst, examples = len(arrays["worst_run"]), len(arrays["example_run"])
+    wanted: dict[str, tuple[int, ...]] = {
+        "time": (epochs,),
+        "finite": (epochs,),
+        "error_sum": (epochs, 6),
+        "error_product_sum": (epochs, 6, 6),
+        "covariance_sum": (epochs, 6, 6),
+        "nees_sum": (epochs, 3),
+        "log_nees_sum": (epochs, 3),
+        "coverage": (epochs, 6, 3),
+        "histogram": (epochs, 9, BINS),
+        "nis_edges": (spans + 1,),
+        "sensor_nis_sum": (sensors, spans),
+        "sensor_degrees": (sensors, spans),
+        "sensor_refused": (sensors, spans),
+        "worst_run": (worst,),
+        "worst_score": (worst,),
+        "example_run": (examples,),
+        "example_error": (examples, epochs, 6),
+        "example_sigma": (examples, epochs, 6),
+    }
+    for name, value in arrays.items():
+        if value.shape != wanted[name] or (name in _BY_EPOCH and not np.isfinite(value).all()):
             raise InputError(
-                f"{group.file.filename}: {name} has {len(arrays[name])} rows for {len(arrays['time'])} epochs, or is not finite; "
-                "the file is damaged: run the campaign anew"
+                f"{place}: {name} has shape {value.shape}, wanted {wanted[name]}, or is not finite; it is damaged: run the campaign anew"
             )
-    return Statistics(runs=int(group.attrs["runs"]), sensors=tuple(json.loads(group.attrs["sensors"])), **arrays)
+        if value.dtype.kind != ("i" if name in _COUNTED else "f"):
+            raise InputError(f"{place}: {name} is of type {value.dtype}; the file is damaged: run the campaign anew")
+    names = tuple(reading.from_json(told["sensors"], f"{place}: sensors"))
+    if names != plan.sensors:
+        raise InputError(f"{place}: sensors are {names}, those of the plan {plan.sensors}; run the campaign anew")
+    return Statistics(runs=count(f"{place}: runs", told["runs"]), sensors=names, **arrays)
 
 
 def read(path: str | os.PathLike[str]) -> Campaign:
@@ -354,37 +403,34 @@ def read(path: str | os.PathLike[str]) -> Campaign:
 
 
 def _stored(path: Path) -> tuple[Campaign, _Progress]:
-    import h5py
-
-    existing_file(path)
-    try:
-        with h5py.File(path, "r") as file:
-            if file.attrs.get("kind") != KIND:
-                raise InputError(f"{path} is no Monte Carlo campaign; `strapdown montecarlo` writes one")
-            if file.attrs["format"] > FORMAT:
-                raise InputError(
-                    f"{path} has format {file.attrs['format']}, newer than this package knows; install strapdown {file.attrs['version']}"
-                )
-            campaign = Campaign(
-                plan=from_table(json.loads(file.attrs["plan"])),
-                machine=str(file.attrs["machine"]),
-                reason=str(file.attrs["reason"]),
-                chunk=int(file.attrs["chunk"]),
-                runs=int(file.attrs["runs"]),
-                statistics=_statistics_of(file["statistics"]) if "statistics" in file else None,
-                version=str(file.attrs["version"]),
-                seconds=float(file.attrs["seconds"]),
+    with reading.hdf5(path) as file:
+        told = reading.attributes(file)
+        if told.get("kind") != KIND:
+            raise InputError(f"{path} is no Monte Carlo campaign; `strapdown montecarlo` writes one")
+        if count("format", told["format"]) > FORMAT:
+            raise InputError(
+                f"{path} has format {told['format']}, newer than this package knows; install strapdown {told['version']}"
             )
-            early = file.get("resume", {})
-            return campaign, _Progress(
-                _statistics_of(early["whole"]) if "whole" in early else _whole(campaign, early),
-                {int(name): _statistics_of(group) for name, group in early.items() if name != "whole"},
-                campaign.chunk,
-            )
-    except (OSError, KeyError) as error:
-        raise InputError(
-            f"{path} cannot be read as a campaign ({error}); the file is truncated or of another kind"
-        ) from None
+        plan = from_table(reading.from_json(told["plan"], f"{path}: plan"))
+        if told["digest"] != plan.digest:
+            raise InputError(f"{path}: digest is not that of the plan; the file is damaged: run the campaign anew")
+        campaign = Campaign(
+            plan=plan,
+            machine=one_of("machine", told["machine"], MACHINES),
+            reason=str(told["reason"]),
+            chunk=count("chunk", told["chunk"]),
+            runs=count("runs", told["runs"]),
+            statistics=_statistics_of(file["statistics"], plan) if "statistics" in file else None,
+            version=str(told["version"]),
+            arithmetic=str(told.get("arithmetic", "")),
+            seconds=finite("seconds", told["seconds"], unit="s"),
+        )
+        early = file.get("resume", {})
+        return campaign, _Progress(
+            _statistics_of(early["whole"], plan) if "whole" in early else _whole(campaign, early),
+            {int(name): _statistics_of(group, plan) for name, group in early.items() if name != "whole"},
+            campaign.chunk,
+        )
 
 
 def _whole(campaign: Campaign, early: Mapping[str, Any]) -> Statistics | None:

@@ -1,6 +1,13 @@
 """Chunks on other processes and hosts, through Dask distributed (the extra ``cluster``).
 
-The same chunks give the same bits wherever they run; Dask gives a chunk that was lost with its worker to another one.
+The same chunks give the same bits on processors of one kind (:func:`strapdown.montecarlo.engine.arithmetic`); Dask gives a chunk that was
+lost with its worker to another one.
+
+Trust: client, scheduler and workers send each other pickles, so each of them can run any code on the others. Name only a scheduler that you
+would let log in to your account. Plain ``tcp://`` is neither encrypted nor authenticated; across a network that others share use
+``tls://`` with Dask's own configuration of certificates, which passes through: ``distributed.comm.tls.ca-file``, ``.client.cert`` and
+``.client.key`` in a file of ``~/.config/dask``, or the environment variables ``DASK_DISTRIBUTED__COMM__TLS__CA_FILE``,
+``DASK_DISTRIBUTED__COMM__TLS__CLIENT__CERT`` and ``…__CLIENT__KEY``.
 """
 
 from __future__ import annotations
@@ -14,7 +21,7 @@ from typing import Any
 
 import strapdown
 from strapdown.checks import InputError, count
-from strapdown.montecarlo.engine import Chunks, Parts, Window, Work, Workers
+from strapdown.montecarlo.engine import Chunks, Parts, Window, Work, Workers, arithmetic
 
 CONNECT_SECONDS = 15
 
@@ -37,7 +44,7 @@ def dask_client(*, workers: int | None = None, address: str | None = None) -> It
         except (OSError, ValueError, TypeError) as error:
             raise InputError(
                 f"no Dask scheduler answers at {address} ({error}); start one with `dask scheduler` and give its address, "
-                "tcp://HOST:8786"
+                "tcp://HOST:8786, or tls:// with Dask's certificates configured"
             ) from None
         with client:
             yield client
@@ -75,10 +82,15 @@ def on_dask(client: Any) -> Workers:
                     finished.add(future)
                 future = next(finished)
                 place = places.pop(future)
-                version, parts = _result(distributed, future, chunks[place])
+                version, features, parts = _result(distributed, future, chunks[place])
                 if version != strapdown.__version__:
                     raise InputError(
                         f"a worker has strapdown {version}, this process {strapdown.__version__}; install the same everywhere"
+                    )
+                if features != arithmetic():
+                    raise InputError(
+                        f"a worker computes on {features}, this process on {arithmetic()}, which round differently; take workers "
+                        "of one kind and start the campaign on such a machine"
                     )
                 window.finish(place)
                 yield place, parts
@@ -88,10 +100,10 @@ def on_dask(client: Any) -> Workers:
     return work_through
 
 
-def _result(distributed: Any, future: Any, chunk: tuple[int, int]) -> tuple[str, Parts]:
+def _result(distributed: Any, future: Any, chunk: tuple[int, int]) -> tuple[str, str, Parts]:
     runs = f"runs {chunk[0]} to {sum(chunk) - 1}"
     try:
-        result: tuple[str, Parts] = future.result()
+        result: tuple[str, str, Parts] = future.result()
     except distributed.KilledWorker:
         raise InputError(
             f"{runs} were lost with one worker after the other: they end where this chunk runs; look at their logs, memory first"
@@ -103,9 +115,9 @@ def _result(distributed: Any, future: Any, chunk: tuple[int, int]) -> tuple[str,
     return result
 
 
-def _chunk(payload: bytes, first_run: int, runs: int) -> tuple[str, Parts]:
-    """Compute a chunk where a worker is."""
-    return strapdown.__version__, _work(payload)(first_run, runs)
+def _chunk(payload: bytes, first_run: int, runs: int) -> tuple[str, str, Parts]:
+    """Compute a chunk where a worker is; tell the version and arithmetic it was computed with."""
+    return strapdown.__version__, arithmetic(), _work(payload)(first_run, runs)
 
 
 @functools.lru_cache(maxsize=4)

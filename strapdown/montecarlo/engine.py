@@ -82,6 +82,22 @@ def choose(plan: Plan, machine: str = "auto") -> Choice:
     raise InputError(f"no machine computes this plan ({told}); take a plainer filter or scenario, or precision float64")
 
 
+def arithmetic() -> str:
+    """Return what the bits of a result depend on besides the plan: the processor's family, its vectors and fused multiply-add.
+
+    Numba contracts products and sums where the processor can, and lanes follow the width of its vectors.
+    """
+    import platform
+
+    from numba.core.codegen import get_host_cpu_features
+
+    from strapdown.kernels.machine import has_vectors
+
+    arm = platform.machine() in ("aarch64", "arm64")
+    fused = arm or "+fma" in get_host_cpu_features().split(",")
+    return f"{platform.machine()}, {'vectors' if has_vectors() else 'no vectors'}, {'FMA' if fused else 'no FMA'}"
+
+
 def replay(plan: Plan, run: int, *, machine: str = "auto") -> Replay:
     """Return one run of a plan in full detail, bitwise what it was among the others."""
     return machine_named(choose(plan, machine).machine).replay(plan, count("run", run, least=0))

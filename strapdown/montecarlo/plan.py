@@ -156,15 +156,19 @@ def from_table(table: Mapping[str, Any]) -> Plan:
     return Plan(
         scenario=scenarios.scenario_from_toml(tomli_w.dumps(dict(table["scenario"]))),
         setup=setup.from_table(table["filter"]),
-        dispersions=tables.build(Dispersions, table["dispersions"], _FORM, "dispersions"),
+        dispersions=_dispersions(table["dispersions"], "dispersions"),
         **{name: table[name] for name in ("seed", "epochs", "nis_bins", "precision")},
     )
 
 
 def read_dispersions(path: str | os.PathLike[str]) -> Dispersions:
     """Read the table ``[dispersions]`` of a TOML file; other tables are left alone."""
-    table = tables.read(path, "dispersions", f"its keys are {', '.join(tables.keys(_FORM))}")
-    return tables.build(Dispersions, table, _FORM, f"{path}: dispersions")  # type: ignore[no-any-return]
+    remedy = f"its keys are {', '.join(tables.keys(_FORM))}"
+    return tables.read(path, "dispersions", remedy, _dispersions)
+
+
+def _dispersions(table: Mapping[str, Any], place: str) -> Dispersions:
+    return tables.build(Dispersions, table, _FORM, place)  # type: ignore[no-any-return]
 
 
 def whole_epochs(scenario: Scenario, filter_setup: FilterSetup, most: int = 100) -> int:

@@ -20,7 +20,8 @@ from typing import Any
 
 from strapdown import records
 from strapdown.checks import InputError
-from strapdown.files import existing_file, write_json, written_beside
+from strapdown.files import write_json, written_beside
+from strapdown.reading import existing_file, from_file
 from strapdown.report import campaigns, estimates, tunings
 
 _WRITERS: dict[str, Callable[[Path, float], tuple[str, dict[str, Any]]]] = {
@@ -68,9 +69,10 @@ def write(
     if kind not in _WRITERS:
         known = ", ".join(name.removeprefix("strapdown ") for name in _WRITERS)
         raise InputError(f"{source} holds: {kind.removeprefix('strapdown ')}; reports are written of: {known}")
-    content, statistics = _WRITERS[kind](source, probability)
+    with from_file(source):  # what is wrong with a number shows at the latest where it is drawn
+        content, statistics = _WRITERS[kind](source, probability)
     beside = target.with_suffix(".report.json")  # not .json alone, which other commands write beside their results
     with written_beside(target) as temporary:
-        temporary.write_text(content, encoding="utf-8")
+        temporary.write_text(content, encoding="utf-8", errors="backslashreplace")  # a name may be no UTF-8
     write_json(beside, statistics)
     return Report(page=target, statistics=beside, verdict=str(statistics["judgement"]["verdict"]))

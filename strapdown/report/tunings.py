@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import base64
-import json
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from strapdown import reading
 from strapdown.checks import InputError
-from strapdown.files import existing_file
 from strapdown.report import page
 
 BOUNDS = (
@@ -17,7 +18,86 @@ BOUNDS = (
 )
 """What is said below NIS and a verdict on the data held out."""
 
-_NEEDED = ("records", "parameters", "units", "objective", "searches")
+LARGEST_FIGURE = 50_000_000
+"""Bytes of a PNG beside the result that goes into the page."""
+
+
+class _Table(BaseModel):
+    """A table of the JSON: what the page needs of it; more is left alone."""
+
+    model_config = ConfigDict(strict=True, allow_inf_nan=False)
+
+
+class _Parameter(_Table):
+    name: str
+    note: str
+    identified: bool
+    start: float | None
+    value: float | None
+    lower: float | None
+    upper: float | None
+    unit: str = ""
+    si_per_unit: float = 1.0
+
+
+class _Objective(_Table):
+    name: str
+    before: float
+    after: float
+
+
+class _Searches(_Table):
+    number: int
+    at_the_best_point: int
+
+
+class _Finding(_Table):
+    rejected: bool
+    means: str
+
+
+class _Judgement(_Table):
+    verdict: Literal["consistent", "cannot tell", "not consistent"]
+    reason: str
+    findings: list[_Finding]
+
+
+class _HeldOut(_Table):
+    log_likelihood_per_innovation: float
+    nis_per_degree: float
+    nis_bounds: tuple[float, float]
+    anees_per_state: float | None = None
+    attitude_rms_rad: float | None = None
+    judgements: list[_Judgement]
+
+
+class _Comparison(_Table):
+    before: _HeldOut
+    after: _HeldOut
+
+
+class _Gate(_Table):
+    probability: float | None
+    lower: float | None
+    upper: float | None
+    thresholds: dict[str, float]
+
+
+class _Unmodelled(_Table):
+    words: list[str]
+
+
+class _Tuning(_Table):
+    """The JSON of `strapdown tune`."""
+
+    records: list[str]
+    parameters: list[_Parameter]
+    units: str
+    objective: _Objective
+    searches: _Searches
+    held_out: _Comparison | None = None
+    gate: _Gate | None = None
+    unmodelled: list[_Unmodelled] = []
 
 
 def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
@@ -36,7 +116,7 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
     parts += [_image(path.with_name(f"{path.stem}-{name}.png"), caption) for name, caption in drawn.items()]
     making = [page.provenance({"records": ", ".join(content["records"]), "units of the JSON": content["units"]})]
     if told.exists():
-        making += [page.paragraph(f"The filter, {told.name}:"), page.code(told.read_text(encoding="utf-8"))]
+        making += [page.paragraph(f"The filter, {told.name}:"), page.code(reading.text(told, link=False))]
     making += [page.paragraph("Use it:"), page.code(f"strapdown estimate RECORD.h5 --filter {told.name}")]
     parts.append(page.section("How it was made", *making))
     searches = content["searches"]
@@ -62,14 +142,15 @@ def read(path: Path) -> dict[str, Any]:
     InputError
         If it is missing, no JSON, or not written by `strapdown tune`.
     """
-    existing_file(path)
+    content = reading.json_file(path)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is no JSON ({error}); the file is truncated or of another kind") from None
-    missing = [key for key in _NEEDED if not isinstance(content, dict) or key not in content]
-    if missing:
-        raise InputError(f"{path} has no {missing[0]!r}: it is not what `strapdown tune` writes beside its filter.toml")
+        _Tuning.model_validate_json(reading.text(path))
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise InputError(
+            f"{path}: {place or 'its content'}: {first['msg']}; it is not what `strapdown tune` writes beside its filter.toml"
+        ) from None
     return content  # type: ignore[no-any-return]
 
 
@@ -78,6 +159,8 @@ def _verdict(held: Any) -> tuple[str, str, list[str]]:
     if not held:
         return "cannot tell", "no data were held out to prove it on; tune with --holdout", []
     after = held["after"]["judgements"]
+    if not after:
+        return "cannot tell", "the data held out were not judged", []
     worst = max(after, key=lambda one: ("consistent", "cannot tell", "not consistent").index(one["verdict"]))
     details = [finding["means"] for one in after for finding in one["findings"] if finding["rejected"]]
     gain = held["after"]["log_likelihood_per_innovation"] - held["before"]["log_likelihood_per_innovation"]
@@ -115,7 +198,7 @@ def _parameters(content: dict[str, Any]) -> list[str]:
 
 
 def _gate(found: Any) -> list[str]:
-    if not found or found["probability"] is None:
+    if not found or None in (found["probability"], found["lower"], found["upper"]):
         return []
     thresholds = ", ".join(f"{value:.3g} of {name}" for name, value in found["thresholds"].items())
     words = (
@@ -148,7 +231,10 @@ def _image(path: Path, caption: str) -> str:
     """Return a figure that the tuning drew beside its result; nothing where it is gone."""
     if not path.exists():
         return ""
-    data = base64.b64encode(path.read_bytes()).decode()
+    found = reading.content(path, link=False, most=LARGEST_FIGURE)
+    if not found.startswith(b"\x89PNG\r\n\x1a\n"):
+        raise InputError(f"{path} is no PNG; take it away, or tune again")
+    data = base64.b64encode(found).decode()
     return page.section(
         caption, f'<figure><img src="data:image/png;base64,{data}" alt="{page.text(caption)}"></figure>'
     )

@@ -9,7 +9,6 @@ import dataclasses
 import functools
 import os
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import gyro, motion, tables, vectors
+from strapdown import gyro, motion, reading, tables, vectors
 from strapdown.checks import Array, InputError, array, count, known_keys, one_of, positive
 from strapdown.gyro import GyroSpec
 from strapdown.motion import Motion
@@ -211,7 +210,7 @@ def _faults(unit: tables.Choice) -> Form:
     }
 
 
-_NAMED: Form = {"name": tables.PLAIN, "rate": tables.HERTZ, "phase": tables.SECONDS, "kind": tables.PLAIN}
+_NAMED: Form = {"name": tables.TEXT, "rate": tables.HERTZ, "phase": tables.SECONDS, "kind": tables.TEXT}
 _SENSORS: dict[str, tuple[type, Form, tables.Choice]] = {
     "direction": (
         vectors.VectorSensor,
@@ -221,10 +220,10 @@ _SENSORS: dict[str, tuple[type, Form, tables.Choice]] = {
     "attitude": (
         vectors.AttitudeSensor,
         {
-            "name": tables.PLAIN,
+            "name": tables.TEXT,
             "rate": tables.HERTZ,
             "phase": tables.SECONDS,
-            "boresight": tables.PLAIN,
+            "boresight": tables.TEXT,
             "sigma_across": tables.ARCSECONDS,
             "sigma_about": tables.ARCSECONDS,
         },
@@ -255,7 +254,7 @@ _SENSORS: dict[str, tuple[type, Form, tables.Choice]] = {
     "heading-pair": (
         vectors.HeadingPair,
         {
-            "name": tables.PLAIN,
+            "name": tables.TEXT,
             "rate": tables.HERTZ,
             "phase": tables.SECONDS,
             "sigma": tables.METRES,
@@ -285,36 +284,34 @@ def load_scenario(name_or_path: str | os.PathLike[str]) -> Scenario:
     """
     text = os.fspath(name_or_path)
     path = Path(text)
-    if path.suffix != ".toml" and not path.is_file():
+    if not path.exists():
+        if path.suffix == ".toml":
+            raise InputError(f"{path} does not exist; give a TOML file, or a built-in name: {', '.join(SCENARIOS)}")
         path = _BUILTIN / f"{one_of('scenario', text, SCENARIOS)}.toml"
-    try:
-        content = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(
-            f"{path} does not exist; give a TOML file, or a built-in name: {', '.join(SCENARIOS)}"
-        ) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read ({error}); give a TOML file") from None
-    return scenario_from_toml(content, place=path.name)
+    with reading.from_file(path):
+        return _from_table(reading.toml(path), path.name)
 
 
 def scenario_from_toml(text: str, place: str = "scenario") -> Scenario:
     """Return the scenario that a TOML text tells."""
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{place} is no TOML ({error})") from None
+    return _from_table(reading.from_toml(text, place), place)
+
+
+def _from_table(table: dict[str, Any], place: str) -> Scenario:
     known_keys(place, table, _TOP)
     for key in ("rate_hz", "duration_s", "motion"):
         if key not in table:
             raise InputError(f"{place}: {key} is missing; add it")
+    for key in ("name", "description"):
+        if not isinstance(table.get(key, ""), str):
+            raise InputError(f"{place}: {key} is {table[key]!r}; it must be a text")
     preset, spec = _read_gyro(_table(table.get("gyro", {}), f"{place}: gyro"), f"{place}: gyro")
     sensors = table.get("sensors", [])
     if not isinstance(sensors, list):
         raise InputError(f"{place}: sensors is one table; write [[sensors]] with two brackets")
     values = {
-        "name": str(table.get("name", "")),
-        "description": str(table.get("description", "")),
+        "name": table.get("name", ""),
+        "description": table.get("description", ""),
         "seed": table.get("seed", 0),
         "rate": table["rate_hz"],
         "duration": table["duration_s"],
@@ -342,8 +339,8 @@ def _word(table: dict[str, Any], place: str, choices: Any) -> str:
 def _read_motion(table: dict[str, Any], place: str) -> Motion:
     word = _word(table, place, [*_MOTIONS, "rest", "composed"])
     if word == "rest":
-        known_keys(place, table, ("initial_attitude",))
-        return motion.rest(**table)
+        form: Form = {"initial_attitude": tables.PLAIN}
+        return tables.made(motion.rest, tables.decode(table, form, place), table, form, place)  # type: ignore[no-any-return]
     if word == "composed":
         known_keys(place, table, ("base", "vibration"))
         parts = {
@@ -354,9 +351,12 @@ def _read_motion(table: dict[str, Any], place: str) -> Motion:
     kind, form = _MOTIONS[word]
     more: dict[str, Any] = {}
     if kind is motion.HarmonicRates:
-        entries = enumerate(table.pop("harmonics", []))
+        entries = table.pop("harmonics", [])
+        if not isinstance(entries, list):
+            raise InputError(f"{place}: harmonics is one table; write [[motion.harmonics]] with two brackets")
         more["harmonics"] = tuple(
-            tables.build(motion.Harmonic, h, _HARMONIC, f"{place}: harmonics[{i}]") for i, h in entries
+            tables.build(motion.Harmonic, _table(h, f"{place}: harmonics[{i}]"), _HARMONIC, f"{place}: harmonics[{i}]")
+            for i, h in enumerate(entries)
         )
     return tables.build(kind, table, form, place, **more)  # type: ignore[no-any-return]
 
@@ -453,7 +453,7 @@ def builtin_rows() -> tuple[dict[str, object], ...]:
     """Return one row a built-in scenario for printing: name, description, duration s, rate Hz, motion, gyro, sensors."""
     rows = []
     for name in SCENARIOS:
-        table = tomllib.loads((_BUILTIN / f"{name}.toml").read_text(encoding="utf-8"))
+        table = reading.toml(_BUILTIN / f"{name}.toml")
         rows.append(
             {
                 "name": name,

@@ -7,14 +7,13 @@ names of its keys; a setup read back is equal to the last bit.
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from strapdown import coning, estimation, gyro, quaternion, tables, units, vectors
+from strapdown import coning, estimation, gyro, quaternion, reading, tables, units, vectors
 from strapdown.checks import Array, InputError, known_keys, one_of, positive
 from strapdown.equality import ByValue
 from strapdown.estimation import Observability
@@ -494,10 +493,7 @@ def to_toml(setup: FilterSetup) -> str:
 
 def from_toml(text: str, place: str = "filter") -> FilterSetup:
     """Return the setup in the table ``[filter]`` of a TOML text, such as :func:`to_toml` gives."""
-    try:
-        table = tomllib.loads(text).get("filter")
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{place} is no TOML ({error})") from None
+    table = reading.from_toml(text, place).get("filter")
     if not isinstance(table, dict):
         raise InputError(f"{place} has no table [filter]")
     return from_table(table, place)
@@ -511,4 +507,4 @@ def read_setup(path: str | os.PathLike[str]) -> FilterSetup:
     InputError
         If the file is missing, no TOML, has no such table, or a key that no filter has.
     """
-    return from_table(tables.read(path, "filter", "`strapdown tune` writes one"), f"{path}: filter")
+    return tables.read(path, "filter", "`strapdown tune` writes one", from_table)

@@ -1,0 +1,202 @@
+"""Files of every kind that the package reads, with the function that reads them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import damage
+import h5py
+import numpy as np
+
+from strapdown import coning, gyro, montecarlo, quaternion, recordfiles, recordings, records, scenarios, setup
+from strapdown.montecarlo import campaign
+from strapdown.montecarlo import statistics as sums
+from strapdown.report import tunings
+
+Damage = Callable[..., bytes]
+
+
+@dataclass(frozen=True)
+class Target:
+    """A file, what reads it, and the damage that is done to it."""
+
+    name: str
+    """With the suffix that its reader looks at."""
+    content: bytes
+    read: Callable[[Path], Any]
+    damages: tuple[Damage, ...]
+    share: float
+    """Of all damaged files."""
+
+
+def targets(folder: Path) -> list[Target]:
+    """Write one file of every kind to a folder; return them."""
+    low = dataclasses.replace(scenarios.load_scenario("low-orbit"), duration=3.0, gyro_preset="")
+    record = scenarios.simulate(low, 3, 1)
+    recordfiles.write_record(
+        folder / "record.h5", record, gyro_spec=low.gyro, scenario=scenarios.scenario_to_toml(low), seed=3, run=1
+    )
+    short = dataclasses.replace(
+        record, time=record.time[:20], increments=record.increments[:19], vectors=(), truth=None
+    )
+    recordfiles.export_csv(folder / "alone.csv", short, gyro_spec=low.gyro, seed=3, run=1)
+    _write_estimate(folder / "estimate.h5")
+    _write_campaign(folder / "campaign.h5", low)
+    with h5py.File(folder / "broad.hdf5", "w") as file:
+        file.attrs["sampling_rate"], file.attrs["text"] = 100.0, "of variable length"
+        for name, width in (("imu_gyr", 3), ("imu_acc", 3), ("imu_mag", 3), ("opt_quat", 4)):
+            file.create_dataset(name, data=np.ones((400, width)), chunks=(50, width), compression="gzip")
+    rows = "".join(f"{0.01 * k:.2f},{0.1 * k},0.2,-0.3,0.1,0.2,9.8,20,{k},-40\n" for k in range(20))
+    (folder / "walk.csv").write_text("time,gx [deg/s],gy [deg/s],gz [deg/s],ax [m/s2],ay,az,mx,my,mz\n" + rows)
+    np.save(folder / "gyro.npy", np.arange(300.0).reshape(100, 3) * 1e-4)
+    (folder / "scenario.toml").write_text(scenarios.scenario_to_toml(scenarios.load_scenario("tumbling-satellite")))
+    attitude = scenarios.scenario_to_toml(scenarios.load_scenario("slew-vibration")).split("[[sensors]]")[0] + _TRACKER
+    (folder / "attitude.toml").write_text(attitude)
+    chosen = setup.matched(scenarios.load_scenario("hand-held"), states=True)
+    (folder / "filter.toml").write_text(setup.to_toml(chosen) + _GATE)
+    (folder / "gyro.toml").write_text(
+        '[gyro]\nangle_random_walk_deg_per_sqrt_hour = 0.1\n"scale_factor_ppm" = [1, 2, 3]\n'
+    )
+    (folder / "dispersions.toml").write_text(
+        "[dispersions]\nattitude_sigma_deg = 1.0\nbias_error_deg_per_hour = [1, 2, 3]\n"
+    )
+    (folder / "vibration.csv").write_text(
+        "frequency_hz,angle_deg,angle_across_deg,phase_deg\n10,0.1,0.2,90\n20,0.1,0.05,80\n"
+    )
+    (folder / "tuning.json").write_text(json.dumps(_TUNING))
+
+    def target(name: str, read: Callable[[Path], Any], damages: tuple[Damage, ...], share: float) -> Target:
+        return Target(name, (folder / name).read_bytes(), read, damages, share)
+
+    bytewise, structure = damage.BYTES, (damage.change_hdf5,)
+    units = {"gyro": "rad/s"}
+    return [
+        target("record.h5", recordfiles.read_record_file, bytewise, 0.06),
+        target("estimate.h5", records.read_estimate, bytewise, 0.03),
+        target("campaign.h5", campaign.read, bytewise, 0.06),
+        target("record.h5", recordfiles.read_record_file, structure, 0.015),
+        target("estimate.h5", _whole_estimate, structure, 0.015),
+        target("campaign.h5", campaign.read, structure, 0.015),
+        target("broad.hdf5", recordings.read, (*bytewise, damage.change_hdf5), 0.001),
+        target("alone.csv", recordfiles.import_csv, damage.TEXT, 0.1),
+        target("walk.csv", recordings.read, damage.TEXT, 0.12),
+        target("gyro.npy", lambda path: recordings.read_gyro(path, rate=100.0, units=units), (*bytewise, damage.replace_word), 0.08),
+        target("scenario.toml", scenarios.load_scenario, damage.TEXT, 0.04),
+        target("attitude.toml", scenarios.load_scenario, damage.TEXT, 0.05),
+        target("filter.toml", setup.read_setup, damage.TEXT, 0.06),
+        target("gyro.toml", gyro.read_spec, damage.TEXT, 0.05),
+        target("dispersions.toml", montecarlo.read_dispersions, damage.TEXT, 0.05),
+        target("vibration.csv", coning.read_vibration, damage.TEXT, 0.11),
+        target("tuning.json", lambda path: tunings.report(path, 0.99), (*damage.TEXT, damage.replace_node, damage.replace_node), 0.12),
+    ]  # fmt: skip
+
+
+def _whole_estimate(path: Path) -> tuple[Any, ...]:
+    return (
+        records.read_estimate(path),
+        records.read_truth(path),
+        records.read_states(path),
+        records.read_attributes(path),
+    )
+
+
+def _write_estimate(path: Path) -> None:
+    n, draw = 12, np.random.default_rng(1)
+    attitude = quaternion.normalize(draw.standard_normal((n, 4)))
+    innovations = records.Innovations(
+        time=np.arange(5.0), innovation=draw.standard_normal((5, 2)), variance=np.ones((5, 2))
+    )
+    told = records.Estimate(
+        time=np.arange(float(n)),
+        attitude=attitude,
+        bias=1e-3 * draw.standard_normal((n, 3)),
+        variance=np.full((n, 6), 1e-6),
+        covariance=np.tile(1e-6 * np.eye(6), (n, 1, 1)),
+        innovations={"star": innovations},
+        skipped={"star": 1},
+        events=(records.Event(kind="gap", start=1.0, end=2.0, value=3.0),),
+    )
+    records.write_estimate(
+        path, told, {"filter": "[filter]\n"}, truth=records.Truth(attitude=attitude, bias=np.zeros((n, 3)))
+    )
+
+
+def _write_campaign(path: Path, scenario: scenarios.Scenario) -> None:
+    plan = montecarlo.Plan(scenario=scenario, setup=setup.matched(scenario), epochs=2, nis_bins=2)
+    m, s, runs = 3, len(plan.sensors), 4
+    zeros: dict[str, Any] = {
+        "error_sum": (m, 6), "error_product_sum": (m, 6, 6), "covariance_sum": (m, 6, 6), "nees_sum": (m, 3), "log_nees_sum": (m, 3),
+        "sensor_nis_sum": (s, 2), "worst_score": (runs,), "example_error": (runs, m, 6), "example_sigma": (runs, m, 6),
+    }  # fmt: skip
+    counts: dict[str, Any] = {
+        "coverage": (m, 6, 3),
+        "histogram": (m, 9, sums.BINS),
+        "sensor_degrees": (s, 2),
+        "sensor_refused": (s, 2),
+    }
+    found = sums.Statistics(
+        time=plan.time,
+        nis_edges=plan.nis_edges,
+        sensors=plan.sensors,
+        runs=runs,
+        finite=np.full(m, runs),
+        worst_run=np.arange(runs),
+        example_run=np.arange(runs),
+        **{name: np.zeros(shape) for name, shape in zeros.items()},
+        **{name: np.zeros(shape, np.int64) for name, shape in counts.items()},
+    )
+    held = campaign.Campaign(plan=plan, machine="lanes", reason="", chunk=4, runs=8, statistics=found)
+    campaign._write(path, held, campaign._Progress(found, {}, 4), plan.to_table())
+
+
+_TRACKER = """[[sensors]]
+type = "attitude"
+name = "tracker"
+rate_hz = 1.0
+sigma_across_arcsec = 10.0
+sigma_about_arcsec = 40.0
+boresight = "z"
+latency_s = 0.1
+outages_s = [[1.0, 2.0]]
+
+[[sensors]]
+type = "magnetometer"
+name = "field"
+rate_hz = 1.0
+sigma_nt = 100.0
+orbit = { altitude_km = 500.0, inclination_deg = 97.0 }
+"""
+_GATE = """
+[filter.gate]
+probability_ratio = 0.999
+
+[filter.robust]
+kind = "huber"
+"""
+_JUDGEMENT = {
+    "verdict": "consistent",
+    "reason": "all is well",
+    "findings": [{"rejected": False, "means": "", "value": None}],
+}
+_SIDE = {
+    "log_likelihood_per_innovation": 1.0, "nis_per_degree": 1.0, "nis_bounds": [0.9, 1.1], "anees_per_state": None,
+    "attitude_rms_rad": 1e-3, "judgements": [_JUDGEMENT],
+}  # fmt: skip
+_TUNING = {
+    "records": ["a.h5"],
+    "parameters": [
+        {"name": "sigma", "note": "seen", "identified": True, "start": 1.0, "value": 2.0, "lower": None, "upper": 3.0, "unit": "arcsec",
+         "si_per_unit": 5e-6}
+    ],
+    "units": "SI",
+    "objective": {"name": "likelihood", "before": 2.0, "after": 1.0},
+    "searches": {"number": 3, "at_the_best_point": 2},
+    "unmodelled": [{"record": "a.h5", "words": ["nothing"]}],
+    "gate": {"probability": 0.99, "lower": 0.9, "upper": 1.0, "thresholds": {"star": 9.2}},
+    "held_out": {"before": _SIDE, "after": _SIDE},
+}  # fmt: skip

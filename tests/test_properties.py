@@ -1,0 +1,273 @@
+"""Properties that hold for any input, sought by hypothesis: quaternions, kinematics, units, files, filter = batch least squares."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from strapdown import datasheets, estimation, files, gyro, kinematics, quaternion, reading, recordfiles, records, units
+from strapdown.checks import InputError
+from strapdown.records import ImuRecord, Truth
+from strapdown.vectors import VectorMeasurements
+
+numbers = st.floats(-1e3, 1e3, allow_nan=False, width=64)
+vectors = arrays(np.float64, 3, elements=st.floats(-10.0, 10.0))
+quaternions = (
+    arrays(np.float64, 4, elements=st.floats(-1.0, 1.0))
+    .filter(lambda q: np.linalg.norm(q) > 1e-3)
+    .map(lambda q: q / np.linalg.norm(q))
+)
+quick = settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+few = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def scipy_of(q) -> Rotation:
+    return Rotation.from_quat(np.roll(q, -1))
+
+
+# --------------------------------------------------------------------------------------------------------------- quaternions
+
+
+@quick
+@given(quaternions, quaternions, vectors)
+def test_products_and_rotations_are_those_of_scipy(p, q, v):
+    np.testing.assert_allclose(
+        quaternion.rotate(quaternion.multiply(p, q), v),
+        (scipy_of(p) * scipy_of(q)).apply(v),
+        atol=1e-13 * (1.0 + np.abs(v).max()),
+    )
+
+
+@quick
+@given(quaternions, quaternions, quaternions)
+def test_products_associate_and_conjugates_undo(p, q, r):
+    left = quaternion.multiply(quaternion.multiply(p, q), r)
+    np.testing.assert_allclose(left, quaternion.multiply(p, quaternion.multiply(q, r)), atol=1e-15 * 8)
+    np.testing.assert_allclose(quaternion.multiply(q, quaternion.conjugate(q)), [1.0, 0.0, 0.0, 0.0], atol=1e-15 * 4)
+
+
+@quick
+@given(vectors)
+def test_the_exponential_is_that_of_scipy_and_the_logarithm_undoes_it(v):
+    q = quaternion.exp(v)
+    matrix = Rotation.from_rotvec(v).as_matrix()
+    np.testing.assert_allclose(scipy_of(q).as_matrix(), matrix, atol=1e-13 * (1.0 + np.abs(v).max()))
+    angle = np.linalg.norm(v)
+    assume(angle < 3.0)
+    np.testing.assert_allclose(quaternion.log(q), v, rtol=1e-12, atol=1e-300)
+
+
+# ---------------------------------------------------------------------------------------------------------------- kinematics
+
+
+@quick
+@given(quaternions, vectors)
+def test_both_forms_of_the_kinematics_are_one_and_keep_the_norm(q, rate):
+    body = kinematics.body_quaternion_derivative(q, rate)
+    np.testing.assert_allclose(
+        kinematics.fixed_quaternion_derivative(q, quaternion.rotate(q, rate)),
+        body,
+        atol=1e-14 * (1.0 + np.abs(rate).max()),
+    )
+    assert abs(q @ body) < 1e-14 * (1.0 + np.abs(rate).max())
+
+
+@quick
+@given(quaternions, vectors)
+def test_the_derivative_is_that_of_the_turn(q, rate):
+    """Of a body that turns at a constant rate: expm of the matrix of equation (17), by another way."""
+    w = np.concatenate([[0.0], rate])
+    right = np.array(
+        [[w[0], -w[1], -w[2], -w[3]], [w[1], w[0], w[3], -w[2]], [w[2], -w[3], w[0], w[1]], [w[3], w[2], -w[1], w[0]]]
+    )
+    np.testing.assert_allclose(
+        kinematics.body_quaternion_derivative(q, rate), 0.5 * right @ q, atol=1e-14 * (1.0 + np.abs(rate).max())
+    )
+    turned = quaternion.multiply(q, quaternion.exp(0.1 * rate))
+    np.testing.assert_allclose(turned, expm(0.05 * right) @ q, atol=1e-13)
+
+
+# --------------------------------------------------------------------------------------------------------------------- units
+
+
+@quick
+@given(st.floats(1e-9, 1e6))
+def test_a_density_and_a_random_walk_are_one_quantity(value):
+    walk = datasheets.from_datasheet(arw=f"{value * 60.0!r} deg/sqrt(h)").angle_random_walk
+    density = datasheets.from_datasheet(arw=f"{value!r} deg/s/sqrt(Hz)").angle_random_walk
+    assert walk == density or math.isclose(walk, density, rel_tol=1e-14)
+    assert math.isclose(density, value * math.pi / 180.0, rel_tol=1e-14)
+    assert math.isclose(units.DEGREE_PER_ROOT_HOUR, math.pi / 10800.0, rel_tol=1e-15)
+
+
+@quick
+@given(st.floats(1e-300, 1e15), st.lists(st.floats(-0.5, 0.5), min_size=3, max_size=3))
+def test_a_specification_goes_through_its_table_to_the_last_bit(walk, scale):
+    assume(walk < 1e9)
+    spec = gyro.GyroSpec(angle_random_walk=walk, scale_factor=np.array(scale))
+    back = gyro.from_table(json.loads(json.dumps(gyro.to_table(spec))))
+    assert back.angle_random_walk == walk
+    assert np.array_equal(back.scale_factor, scale)
+
+
+# --------------------------------------------------------------------------------------------------------------------- files
+
+texts = st.text(st.characters(blacklist_categories=("Cs",), blacklist_characters="\0"), max_size=40)
+
+
+@st.composite
+def recorded(draw) -> ImuRecord:
+    n = draw(st.integers(1, 12))
+    steps = draw(st.lists(st.floats(1e-6, 1e3), min_size=n, max_size=n))
+    time = draw(st.floats(-1e3, 1e6)) + np.concatenate([[0.0], np.cumsum(steps)])
+    assume(np.all(np.diff(time) > 0.0))
+    increments = draw(arrays(np.float64, (n, 3), elements=st.floats(-1e3, 1e3)))
+    series = []
+    if draw(st.booleans()):
+        m = draw(st.integers(1, 4))
+        values = draw(arrays(np.float64, (m, 3), elements=st.floats(-1.0, 1.0)))
+        values[np.linalg.norm(values, axis=1) < 0.1] = [1.0, 0.0, 0.0]
+        if draw(st.booleans()):
+            values[0] = np.nan
+        name = draw(st.text(st.characters(categories=("L", "N")), min_size=1, max_size=10))
+        unit = values / np.linalg.norm(values, axis=1, keepdims=True)
+        series.append(
+            VectorMeasurements(
+                sensor=name, kind="direction", time=time[0] + np.arange(m), vector_b=unit, reference_f=np.array([0.0, 0.0, 1.0]),
+                sigma=np.full(m, draw(st.floats(1e-9, 1.0))),
+            )
+        )  # fmt: skip
+    truth = None
+    if draw(st.booleans()):
+        attitude = np.array([draw(quaternions) for _ in time])
+        truth = Truth(attitude=attitude, bias=draw(arrays(np.float64, (n + 1, 3), elements=numbers)))
+    return ImuRecord(time=time, increments=increments, vectors=tuple(series), truth=truth)
+
+
+def assert_equal(a, b):
+    for left, right in ((a, b), *zip(a.vectors, b.vectors, strict=True), *(((a.truth, b.truth),) if a.truth else ())):
+        for field in dataclasses.fields(left):
+            one, other = getattr(left, field.name), getattr(right, field.name)
+            if field.name not in ("vectors", "truth"):
+                same = np.array_equal(one, other, equal_nan=True) if isinstance(one, np.ndarray) else one == other
+                assert same, field.name
+    assert (a.truth is None) == (b.truth is None)
+
+
+@few
+@given(recorded(), texts, st.integers(0, 2**62))
+def test_a_record_goes_through_hdf5_to_the_last_bit(tmp_path, record, text, seed):
+    recordfiles.write_record(
+        tmp_path / "r.h5", record, scenario=text, seed=seed, attributes={"note": text, "list": ["a", text]}
+    )
+    back = recordfiles.read_record_file(tmp_path / "r.h5")
+    assert_equal(record, back.record)
+    assert (back.scenario, back.seed) == (text, seed)
+    assert back.attributes == {"note": text, "list": ["a", text]}
+
+
+@few
+@given(recorded())
+def test_a_record_goes_through_csv_to_the_last_bit(tmp_path, record):
+    assert_equal(record, recordfiles.import_csv(recordfiles.export_csv(tmp_path / "r.csv", record)[0]))
+
+
+@few
+@given(
+    arrays(np.float64, (5, 3), elements=st.floats(-1e3, 1e3)),
+    arrays(np.float64, (5, 6), elements=st.floats(1e-20, 1.0)),
+    texts,
+)
+def test_an_estimate_goes_through_its_file_to_the_last_bit(tmp_path, bias, variance, text):
+    attitude = np.tile([0.6, 0.0, 0.8, 0.0], (5, 1))
+    written = records.Estimate(time=np.arange(5.0), attitude=attitude, bias=bias, variance=variance)
+    records.write_estimate(tmp_path / "e.h5", written, {"text": text})
+    back = records.read_estimate(tmp_path / "e.h5")
+    for name in ("time", "attitude", "bias", "variance"):
+        assert np.array_equal(getattr(back, name), getattr(written, name))
+    assert records.read_attributes(tmp_path / "e.h5")["text"] == text
+
+
+trees = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**53), 2**53) | st.floats(allow_nan=False, allow_infinity=False) | texts,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(texts, inner, max_size=4),
+    max_leaves=20,
+)
+
+
+@quick
+@given(trees)
+def test_json_goes_through_a_file(tmp_path, tree):
+    files.write_json(tmp_path / "t.json", tree)
+    assert reading.json_file(tmp_path / "t.json") == tree
+
+
+@quick
+@given(st.binary(max_size=400))
+def test_any_bytes_are_read_or_refused_by_name(tmp_path, content):
+    path = tmp_path / "any.file"
+    path.write_bytes(content)
+    for read in (reading.text, reading.toml, reading.json_file, reading.npy, recordfiles.read_record_file):
+        try:
+            read(path)
+        except InputError as error:
+            assert "any.file" in str(error)  # noqa: PT017
+
+
+# ----------------------------------------------------------------------------------------------- filter = batch least squares
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.floats(1e-6, 1e-4), st.floats(1e-5, 1e-3))
+def test_without_process_noise_and_with_small_errors_the_filter_is_batch_least_squares(seed, n, spread, sigma):
+    """At rest, with a bias, no process noise: each direction is a linear measurement of the error and bias at the start."""
+    chance = np.random.default_rng(seed)
+    dt = 0.1
+    P0 = np.diag([spread**2] * 3 + [(0.1 * spread) ** 2] * 3)
+    rows, values = [np.eye(6)], [np.zeros(6)]
+    weights = [np.linalg.inv(P0)]
+    sensors = []
+    for k, reference in enumerate(np.eye(3)[:2]):
+        b = reference + sigma * chance.standard_normal((n, 3))
+        b /= np.linalg.norm(b, axis=1, keepdims=True)
+        time = dt * np.arange(1, n + 1)
+        sensors.append(
+            VectorMeasurements(
+                sensor=f"s{k}", kind="direction", time=time, vector_b=b, reference_f=reference, sigma=np.full(n, sigma)
+            )
+        )
+        for one, t in zip(b, time, strict=True):
+            # b = exp(-δθ) r = r + r × δθ; of the gyro's increments, all zero, the filter takes its bias: δθ(t) = δθ(0) - t δb.
+            skew = np.array(
+                [
+                    [0.0, -reference[2], reference[1]],
+                    [reference[2], 0.0, -reference[0]],
+                    [-reference[1], reference[0], 0.0],
+                ]
+            )
+            rows.append(np.hstack([skew, -t * skew]))
+            values.append(one - reference)
+            weights.append((np.eye(3) - np.outer(reference, reference)) / sigma**2)
+    information = sum(H.T @ W @ H for H, W in zip(rows, weights, strict=True))
+    solution = np.linalg.solve(information, sum(H.T @ W @ z for H, W, z in zip(rows, weights, values, strict=True)))
+    record = ImuRecord(time=dt * np.arange(n + 1), increments=np.zeros((n, 3)), vectors=tuple(sensors))
+    start = estimation.State(attitude=np.array([1.0, 0.0, 0.0, 0.0]), bias=np.zeros(3), covariance=P0)
+    noise = estimation.ProcessNoise(angle_random_walk=1e-14, rate_random_walk=1e-14)
+    found = estimation.run(record, noise, start, full_covariance=True)
+    moved = np.eye(6)
+    moved[:3, 3:] = -n * dt * np.eye(3)
+    covariance = moved @ np.linalg.inv(information) @ moved.T
+    scale = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(
+        found.covariance[-1] / np.outer(scale, scale), covariance / np.outer(scale, scale), atol=2e-3
+    )
+    error = np.concatenate([quaternion.log(found.attitude[-1]), found.bias[-1]])
+    np.testing.assert_allclose(error / scale, (moved @ solution) / scale, atol=5e-3)

@@ -1,0 +1,605 @@
+"""The one layer that every file passes: what it lets through, and what it refuses in time and by name."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import random
+import subprocess
+import sys
+import time
+import tracemalloc
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from hdf5 import changed
+from targets import targets
+
+from strapdown import coning, files, montecarlo, reading, recordfiles, recordings, records, report, scenarios
+from strapdown.checks import InputError
+from strapdown.montecarlo import campaign, engine
+from strapdown.records import ImuRecord
+from strapdown.report import tunings
+
+UNITS = {"gyro": "rad/s"}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    where = tmp_path_factory.mktemp("files")
+    targets(where)
+    return where
+
+
+@pytest.fixture(scope="module")
+def known(tmp_path_factory):
+    return {target.name: target for target in targets(tmp_path_factory.mktemp("known"))}
+
+
+# --------------------------------------------------------------------------------------------------------- no regular files
+
+
+KINDS = (
+    "record.h5",
+    "estimate.h5",
+    "campaign.h5",
+    "broad.hdf5",
+    "alone.csv",
+    "walk.csv",
+    "gyro.npy",
+    "scenario.toml",
+    "filter.toml",
+)
+KINDS += ("gyro.toml", "dispersions.toml", "vibration.csv", "tuning.json")
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_what_is_no_regular_file_is_refused_at_once(known, tmp_path, name):
+    """A pipe that nobody writes to would block for ever, /dev/zero never end."""
+    path, begun = tmp_path / name, time.monotonic()
+    with pytest.raises(InputError, match=rf"{name}.*does not exist"):
+        known[name].read(path)
+    path.mkdir()
+    with pytest.raises(InputError, match=rf"{name} is a folder"):
+        known[name].read(path)
+    path.rmdir()
+    os.mkfifo(path)
+    with pytest.raises(InputError, match=rf"{name} is no regular file but a pipe or a device"):
+        known[name].read(path)
+    path.unlink()
+    path.symlink_to("/dev/zero")
+    with pytest.raises(InputError, match=rf"{name} is no regular file but a pipe or a device"):
+        known[name].read(path)
+    path.unlink()
+    path.symlink_to(path)
+    with pytest.raises(InputError, match=rf"{name}"):
+        known[name].read(path)
+    assert time.monotonic() - begun < 2.0
+
+
+def test_a_path_that_is_not_utf8_is_read_and_named(known, tmp_path):
+    path = tmp_path / os.fsdecode(b"w\xff.csv")
+    path.write_bytes(known["walk.csv"].content)
+    assert len(recordings.read(path).time) == 20
+    held = dataclasses.replace(
+        recordfiles.read_record_file(_written(tmp_path / "record.h5")), attributes={"source": str(path)}
+    )
+    recordfiles.write_record(tmp_path / "again.h5", held.record, attributes=held.attributes)
+    assert recordfiles.read_record_file(tmp_path / "again.h5").attributes == {"source": str(tmp_path / "w\\udcff.csv")}
+    tuning = tmp_path / os.fsdecode(b"t\xff.json")
+    tuning.write_bytes(known["tuning.json"].content)
+    assert report.write(tuning).page.stat().st_size > 1000
+
+
+def _written(path, **more) -> Path:
+    record = ImuRecord(time=np.arange(2001.0), increments=np.random.default_rng(2).standard_normal((2000, 3)))
+    recordfiles.write_record(path, record, scenario="# a text\n" * 20, seed=3, **more)
+    return path
+
+
+# --------------------------------------------------------------------------------------------------------------------- sizes
+
+
+def spent(refused) -> tuple[float, float]:
+    """Seconds and megabytes that a refusal takes."""
+    tracemalloc.start()
+    begun = time.perf_counter()
+    try:
+        refused()
+        return time.perf_counter() - begun, tracemalloc.get_traced_memory()[1] / 1e6
+    finally:
+        tracemalloc.stop()
+
+
+def test_an_array_that_declares_more_than_it_holds_is_refused_before_memory_is_taken(tmp_path):
+    path = tmp_path / "bomb.npy"
+    with path.open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (300_000_000, 3)})
+
+    def refused():
+        with pytest.raises(
+            InputError,
+            match=r"bomb\.npy cannot be read \(its header declares 7200000000 bytes of float64, and 0 follow",
+        ):
+            recordings.read_gyro(path, rate=100.0, units=UNITS)
+
+    seconds, megabytes = spent(refused)
+    assert seconds < 1.0
+    assert megabytes < 10.0
+
+
+@pytest.mark.parametrize("sealed", [True, False])
+def test_a_dataset_that_declares_more_than_the_file_holds_is_refused(tmp_path, sealed):
+    path = _written(tmp_path / "bomb.h5")
+    with changed(path) as file:
+        del file["increments"]
+        file.create_dataset("increments", shape=(300_000_000, 3), dtype="f8", chunks=True)
+    if not sealed:
+        _old(path)
+
+    def refused():
+        with pytest.raises(InputError, match=r"bomb\.h5: increments declares 7200 MB and the file holds 0 MB of it"):
+            recordfiles.read_record(path)
+
+    seconds, megabytes = spent(refused)
+    assert seconds < (1.0 if sealed else 5.0)
+    assert megabytes < 10.0
+
+
+def test_the_limit_is_on_what_is_unpacked_and_a_user_can_raise_it(tmp_path, monkeypatch):
+    path = tmp_path / "zeros.h5"
+    recordfiles.write_record(path, ImuRecord(time=np.arange(60_001.0), increments=np.zeros((60_000, 3))))
+    assert path.stat().st_size < 200_000
+    monkeypatch.setenv("STRAPDOWN_MAX_MB", "1")
+    with pytest.raises(
+        InputError, match=r"zeros\.h5 holds 1\.92 MB, more than the 1 MB that may be read.*STRAPDOWN_MAX_MB \(1 now\)"
+    ):
+        recordfiles.read_record(path)
+    monkeypatch.setenv("STRAPDOWN_MAX_MB", "2")
+    assert len(recordfiles.read_record(path).increments) == 60_000
+    monkeypatch.setenv("STRAPDOWN_MAX_MB", "much")
+    with pytest.raises(InputError, match="STRAPDOWN_MAX_MB is 'much'; it must be a whole number"):
+        recordfiles.read_record(path)
+
+
+@pytest.mark.parametrize("name", ["walk.csv", "alone.csv", "scenario.toml", "tuning.json", "gyro.npy"])
+def test_a_large_file_is_refused_before_it_is_read(known, tmp_path, name):
+    path = tmp_path / name
+    with path.open("wb") as file:
+        file.truncate(5_000_000_000)  # of holes, which take no place on the disk
+
+    def refused():
+        with pytest.raises(InputError, match=rf"{name} holds 5000 MB, more than"):
+            known[name].read(path)
+
+    seconds, megabytes = spent(refused)
+    assert seconds < 1.0
+    assert megabytes < 10.0
+
+
+@pytest.mark.parametrize(
+    ("name", "begin", "unit", "end"),
+    [
+        ("scenario.toml", "", "a.", "a = 1\n"),
+        ("scenario.toml", "", '"a b" . ', "a = 1\n"),
+        ("scenario.toml", "[", "a.", "a]\n"),
+        ("scenario.toml", "a = ", "[", "\n"),
+        ("scenario.toml", "a = ", "{a = ", "\n"),
+        ("scenario.toml", "", "a", "\n"),
+        ("scenario.toml", "", "a = 1\n", ""),
+        ("scenario.toml", "a = ", "9", "\n"),
+        ("tuning.json", "", "[", ""),
+        ("tuning.json", "", '{"a":', ""),
+        ("tuning.json", "", "9", ""),
+        ("walk.csv", "time,gx,gy,gz", ",a", "\n1,2,3,4\n"),
+        ("walk.csv", "time,gx,gy,gz\n", "x", "\n"),
+        ("walk.csv", "time,gx,gy,gz\n1,2,3,", "9", "\n"),
+        ("alone.csv", "# strapdown record\n", "time_s,", "a\n1,2\n"),
+        (
+            "alone.csv",
+            "# strapdown record; made by ",
+            "[",
+            "\ntime_s,increment_x_rad,increment_y_rad,increment_z_rad\n0,nan,nan,nan\n",
+        ),
+        ("vibration.csv", "", "frequency_hz,", "a\n"),
+        ("vibration.csv", "", "\0", ""),
+    ],
+)
+def test_reading_takes_time_in_proportion_to_the_size(known, tmp_path, name, begin, unit, end):
+    path = tmp_path / name
+    took = []
+    for number in (100_000, 400_000):
+        path.write_text(begin + unit * number + end)
+        begun = time.process_time()
+        with pytest.raises(InputError, match=name) as refusal:
+            known[name].read(path)
+        took.append(time.process_time() - begun)
+        assert len(str(refusal.value)) < 5000
+    assert took[1] < 8.0 * took[0] + 0.5
+    assert took[1] < 5.0
+
+
+def test_a_csv_of_many_columns_is_read(tmp_path):
+    path = tmp_path / "wide.csv"
+    extra = 50_000
+    rows = "".join(f"{k},1,2,3{',0' * extra}\n" for k in range(3))
+    path.write_text("time,gx [deg/s],gy,gz," + ",".join(f"c{k}" for k in range(extra)) + "\n" + rows)
+    begun = time.process_time()
+    assert recordings.read(path).rate.shape == (3, 3)
+    assert time.process_time() - begun < 3.0
+
+
+# --------------------------------------------------------------------------------------------------------------------- links
+
+
+def _external(file):
+    file["truth/bias"] = h5py.ExternalLink("neighbour.h5", "/truth/bias")
+
+
+def _soft(file):
+    file["truth/bias"] = h5py.SoftLink("/increments")
+
+
+def _virtual(file):
+    layout = h5py.VirtualLayout(shape=(2001, 3), dtype="f8")
+    layout[:] = h5py.VirtualSource("neighbour.h5", "truth/bias", shape=(2001, 3))
+    file.create_virtual_dataset("truth/bias", layout)
+
+
+def _external_storage(file):
+    file.create_dataset("truth/bias", shape=(2001, 3), dtype="f8", external=[("neighbour.raw", 0, 2001 * 24)])
+
+
+@pytest.mark.parametrize("sealed", [True, False])
+@pytest.mark.parametrize(
+    ("refer", "words"),
+    [
+        (_external, "truth/bias is an external link, which is not followed"),
+        (_soft, "truth/bias is a soft link, which is not followed"),
+        (_virtual, "truth/bias lies in other files, which are not followed"),
+        (_external_storage, "truth/bias lies in other files, which are not followed"),
+    ],
+)
+def test_data_of_other_files_are_refused(tmp_path, refer, words, sealed):
+    truth = records.Truth(attitude=np.tile([1.0, 0.0, 0.0, 0.0], (2001, 1)), bias=np.ones((2001, 3)))
+    record = ImuRecord(time=np.arange(2001.0), increments=np.zeros((2000, 3)), truth=truth)
+    recordfiles.write_record(tmp_path / "neighbour.h5", record)
+    (tmp_path / "neighbour.raw").write_bytes(bytes(2001 * 24))
+    recordfiles.write_record(tmp_path / "record.h5", record)
+    with changed(tmp_path / "record.h5") as file:
+        del file["truth/bias"]
+        refer(file)
+    if not sealed:
+        _old(tmp_path / "record.h5")
+    with pytest.raises(InputError, match=rf"record\.h5: {words}"):
+        recordfiles.read_record(tmp_path / "record.h5")
+
+
+@pytest.mark.parametrize("suffix", [".toml", "-likelihood.png"])
+def test_a_report_does_not_show_what_a_link_beside_the_result_leads_to(known, tmp_path, suffix):
+    (tmp_path / "secret").write_bytes(b"\x89PNG\r\n\x1a\n secret")
+    (tmp_path / "filter.json").write_bytes(known["tuning.json"].content)
+    beside = tmp_path / f"filter{suffix}"
+    beside.write_bytes((tmp_path / "secret").read_bytes() if suffix.endswith("png") else b"[filter]\n")
+    assert tunings.report(tmp_path / "filter.json", 0.99)
+    beside.unlink()
+    beside.symlink_to(tmp_path / "secret")
+    with pytest.raises(InputError, match=rf"filter{suffix} is a symbolic link"):
+        tunings.report(tmp_path / "filter.json", 0.99)
+
+
+def test_what_lies_beside_a_result_and_is_no_figure_is_not_shown(known, tmp_path):
+    (tmp_path / "filter.json").write_bytes(known["tuning.json"].content)
+    (tmp_path / "filter-likelihood.png").write_bytes(b"root:x:0:0")
+    with pytest.raises(InputError, match=r"filter-likelihood\.png is no PNG"):
+        tunings.report(tmp_path / "filter.json", 0.99)
+
+
+def test_the_series_of_a_csv_record_are_no_links(tmp_path):
+    low = dataclasses.replace(scenarios.load_scenario("low-orbit"), duration=2.0)
+    written = recordfiles.export_csv(tmp_path / "record.csv", scenarios.simulate(low, 3))
+    written[1].rename(tmp_path / "elsewhere.csv")
+    written[1].symlink_to(tmp_path / "elsewhere.csv")
+    with pytest.raises(InputError, match=r"record-vectors-0\.csv is a symbolic link"):
+        recordfiles.import_csv(written[0])
+
+
+def test_a_file_that_the_user_names_may_be_a_link(tmp_path):
+    (tmp_path / "link.h5").symlink_to(_written(tmp_path / "record.h5"))
+    assert len(recordfiles.read_record(tmp_path / "link.h5").time) == 2001
+
+
+# -------------------------------------------------------------------------------------------------------------------- digest
+
+
+def _old(path: Path) -> None:
+    """Write a file anew as earlier versions did: no digest, texts of variable length."""
+    content = path.read_bytes()
+    with h5py.File(path, "r") as source, h5py.File(path.with_suffix(".new"), "w") as file:
+        for name in source:
+            source.copy(name, file, expand_soft=False, expand_external=False)
+        for name, value in reading.attributes(source).items():
+            file.attrs[name] = value
+        texts = []
+        file.visititems(lambda name, node: texts.extend((node, key) for key in node.attrs))
+        for node, key in texts:
+            value = reading.attributes(node)[key]
+            del node.attrs[key]
+            node.attrs[key] = value
+    path.with_suffix(".new").replace(path)
+    assert content.startswith(reading.SEAL)
+    assert not path.read_bytes().startswith(reading.SEAL)
+
+
+def test_a_written_file_is_hdf5_to_others_with_its_digest_in_front(tmp_path):
+    content = _written(tmp_path / "record.h5").read_bytes()
+    line = content.split(b"\n")[0].decode()
+    digest = (
+        subprocess.run(["sha256sum"], input=content[512:], capture_output=True, check=True).stdout.split()[0].decode()
+    )
+    assert line == f"strapdown file, SHA-256 of the bytes from 512 on: {digest}"
+    assert content[512:520] == b"\x89HDF\r\n\x1a\n"
+    assert b"GCOL" not in content  # the heap of texts of variable length
+    with h5py.File(tmp_path / "record.h5") as file:
+        assert file.userblock_size == 512
+        assert file.attrs["kind"].decode() == "strapdown record"
+    long = "é" * 100_000
+    _written(tmp_path / "long.h5", attributes={"text": long, "empty": "", "list": ["a", "é", ""]})
+    assert recordfiles.read_record_file(tmp_path / "long.h5").attributes == {
+        "text": long,
+        "empty": "",
+        "list": ["a", "é", ""],
+    }
+
+
+@pytest.mark.parametrize("name", ["record.h5", "estimate.h5", "campaign.h5"])
+def test_a_zeroed_sector_is_an_error_within_a_second_wherever_it_is(known, tmp_path, name):
+    content = known[name].content
+    path = tmp_path / name
+    for start in range(512, len(content), 512):
+        damaged = content[:start] + bytes(len(content[start : start + 512])) + content[start + 512 :]
+        if damaged == content:
+            continue
+        path.write_bytes(damaged)
+        begun = time.monotonic()
+        with pytest.raises(InputError, match=rf"{name} cannot be read: its content does not fit its digest"):
+            known[name].read(path)
+        assert time.monotonic() - begun < 1.0
+    for front in (bytes(512), bytes(512) + content[:512]):
+        path.write_bytes(front + content[512:])
+        with pytest.raises(InputError, match=rf"{name} is damaged: its digest is gone"):
+            known[name].read(path)
+
+
+def test_every_bit_counts(tmp_path):
+    content = bytearray(_written(tmp_path / "record.h5").read_bytes())
+    chance, path = random.Random(3), tmp_path / "flipped.h5"
+    begin = len(reading.SEAL)
+    places = [8 * begin + bit for bit in range(8 * 64)] + [
+        chance.randrange(8 * 512, 8 * len(content)) for _ in range(500)
+    ]
+    for bit in places:
+        content[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=r"flipped\.h5 cannot be read: its content does not fit its digest"):
+            recordfiles.read_record(path)
+        content[bit // 8] ^= 1 << bit % 8
+
+
+def test_a_file_changed_on_purpose_gets_a_new_digest(tmp_path):
+    path = _written(tmp_path / "record.h5")
+    with h5py.File(path, "r+") as file:
+        file.attrs["place"] = 5.0
+    with pytest.raises(InputError, match=r"if you changed it on purpose, strapdown\.files\.seal"):
+        recordfiles.read_record_file(path)
+    files.seal(path)
+    assert recordfiles.read_record_file(path).attributes == {"place": 5.0}
+    _old(path)
+    with pytest.raises(InputError, match=r"record\.h5 has no digest; only a file that this version wrote has one"):
+        files.seal(path)
+
+
+def test_an_old_file_is_read_and_said_to_have_no_digest(tmp_path, run):
+    path = _written(tmp_path / "record.h5")
+    new = recordfiles.read_record_file(path)
+    _old(path)
+    assert b"GCOL" in path.read_bytes()
+    with pytest.warns(reading.NoDigestWarning, match=r"record\.h5 has no digest, so damage to it may pass unseen"):
+        old = recordfiles.read_record_file(path)
+    assert np.array_equal(old.record.increments, new.record.increments)
+    assert (old.scenario, old.seed) == (new.scenario, new.seed)
+    status, _, errors = run("integrate", path)
+    assert status == 0
+    assert errors.count("warning:") == 1
+    assert "record.h5 has no digest" in errors
+
+
+def test_an_old_file_whose_heap_of_texts_is_damaged_is_refused_and_does_not_hang(tmp_path):
+    """The HDF5 library loops for ever, deaf to Ctrl-C, where a sector of this heap is zero."""
+    path = _written(tmp_path / "record.h5")
+    _old(path)
+    content = path.read_bytes()
+    heap = content.index(b"GCOL")
+    path.write_bytes(content[: heap + 16] + bytes(512) + content[heap + 528 :])
+    begun = time.monotonic()
+    with pytest.raises(InputError, match=r"record\.h5 is damaged: the HDF5 library does not come to an end"):
+        recordfiles.read_record(path)
+    assert time.monotonic() - begun < 30.0  # 2 s of the processor
+
+
+def test_what_is_no_hdf5_at_all_costs_no_child(tmp_path, monkeypatch):
+    monkeypatch.setattr(reading, "_fault_of_child", None)
+    (tmp_path / "text.h5").write_text("time,gx\n")
+    with pytest.raises(InputError, match=r"text\.h5 cannot be read as HDF5 \(it has no signature\)"):
+        recordfiles.read_record(tmp_path / "text.h5")
+
+
+# ----------------------------------------------------------------------------------------------------- wrong types, raw counts
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('boresight = "z"', "boresight = [0, 0, 1]", r"sensors\[0\]: .*boresight"),
+        ('name = "tracker"', "name = 5", r"sensors\[0\]"),
+        ('name = "tracker"', "name = [1]", r"sensors\[0\]"),
+        ("rate_hz = 1.0", 'rate_hz = "1"', "rate_hz is '1'; it must be a number"),
+        ("rate_hz = 1.0", "rate_hz = 1979-05-27", "rate_hz is datetime.*; it must be a number"),
+        ("rate_hz = 1.0", "rate_hz = true", "rate_hz is True; it must be a number"),
+        ("rate_hz = 1.0", f"rate_hz = {'9' * 400}", "rate_hz"),
+        ("rate_hz = 1.0", "rate_hz = [1.0, 2.0]", "rate"),
+        ("outages_s = [[1.0, 2.0]]", "outages_s = [[1.0], [2.0, 3.0]]", "outages_s is .*rows of one length"),
+        ("outages_s = [[1.0, 2.0]]", "outages_s = 1.0", "outages"),
+        ("[motion]", "name = 5\n[motion]", "name is 5; it must be a text"),
+        ("[motion]", "sensor = 5\n[motion]", "key 'sensor' is not known"),
+    ],
+)
+def test_a_scenario_of_wrong_types_is_refused_with_its_place(known, tmp_path, old, new, words):
+    path = tmp_path / "attitude.toml"
+    content = known["attitude.toml"].content.decode()
+    if "name =" in new and "motion" in new:
+        content = "\n".join(line for line in content.split("\n") if not line.startswith('name = "slew'))
+    assert old in content
+    path.write_text(content.replace(old, new, 1))
+    with pytest.raises(InputError, match=rf"attitude\.toml.*{words}"):
+        scenarios.load_scenario(path)
+
+
+def test_raw_counts_are_refused_before_they_are_integrated(tmp_path):
+    rows = "".join(f"{0.01 * k:.2f},{-3000 + k},5,7\n" for k in range(50))
+    (tmp_path / "raw.csv").write_text("time,gx [rad/s],gy,gz\n" + rows)
+    with pytest.raises(
+        InputError, match=r"raw\.csv: rate\[0, 0\] is -3000 rad/s, which no gyro measures; convert raw counts"
+    ):
+        recordings.read(tmp_path / "raw.csv")
+
+
+# --------------------------------------------------------------------------------------------------------------- two writers
+
+
+HOLD = """
+import sys, time
+from strapdown.files import locked
+with locked(sys.argv[1]):
+    print("locked", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such lock there")
+def test_of_two_processes_on_one_output_the_second_is_told_who_writes(known, tmp_path):
+    path = tmp_path / "runs.h5"
+    other = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert other.stdout.readline() == "locked\n"
+    plan = campaign.read(tmp_path_of(known, tmp_path)).plan
+    begun = time.monotonic()
+    with pytest.raises(
+        InputError, match=rf"runs\.h5 is being written by process {other.pid} on .* since 20\d\d-.*; wait for it, or"
+    ):
+        campaign.run(plan, path, runs=4)
+    assert time.monotonic() - begun < 5.0
+    assert [one.name for one in tmp_path.iterdir() if "runs" in one.name] == [".runs.h5.lock"]
+    other.kill()
+    other.communicate()
+    with (
+        files.locked(path),
+        pytest.raises(InputError, match=rf"runs\.h5 is being written by process {os.getpid()} on"),
+        files.locked(path),
+    ):
+        pass
+    assert not list(tmp_path.glob(".runs*"))
+
+
+def tmp_path_of(known, tmp_path) -> Path:
+    (tmp_path / "campaign.h5").write_bytes(known["campaign.h5"].content)
+    return tmp_path / "campaign.h5"
+
+
+# ------------------------------------------------------------------------------------------------------------ the processor
+
+
+def test_a_campaign_goes_on_only_on_a_processor_that_rounds_alike(known, tmp_path, monkeypatch):
+    path = tmp_path_of(known, tmp_path)
+    plan = campaign.read(path).plan
+    held = campaign.read(path)
+    campaign._write(
+        path,
+        dataclasses.replace(held, arithmetic=engine.arithmetic()),
+        campaign._Progress(held.statistics, {}, 4),
+        plan.to_table(),
+    )
+    assert campaign.read(path).arithmetic == engine.arithmetic()
+    monkeypatch.setattr(campaign, "arithmetic", lambda: "x86_64, no vectors, no FMA")
+    with pytest.raises(
+        InputError, match=r"another campaign: arithmetic is \w+, .* there and x86_64, no vectors, no FMA here"
+    ):
+        campaign.run(plan, path, runs=4, resume=True, chunk=4, machine="lanes")
+
+
+def test_the_arithmetic_tells_vectors_and_fused_multiply_add():
+    told = engine.arithmetic().split(", ")
+    assert len(told) == 3
+    assert told[1] in ("vectors", "no vectors")
+    assert told[2] in ("FMA", "no FMA")
+    cpu = Path("/proc/cpuinfo")
+    if told[0] == "x86_64" and cpu.exists():
+        flags = next(line for line in cpu.read_text().splitlines() if line.startswith("flags")).split()
+        assert (told[2] == "FMA") == ("fma" in flags)
+        assert (told[1] == "vectors") == ({"fma", "avx2"} <= set(flags))
+
+
+# -------------------------------------------------------------------------------------------------------- the command line
+
+
+def test_ctrl_c_while_the_program_is_loaded_is_no_traceback(tmp_path):
+    (tmp_path / "typer.py").write_text("raise KeyboardInterrupt\n")
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", ""), str(Path.cwd())]),
+    }
+    done = subprocess.run(
+        [sys.executable, "-m", "strapdown", "info"], capture_output=True, text=True, env=environment, check=False
+    )
+    assert (done.returncode, done.stderr) == (130, "interrupted\n")
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"[]", b'"x"', b"{}", b"nan", b"\xff", b'{"records": 5}', b'{"records": ["a"], "parameters": {}}']
+)
+def test_a_json_that_is_no_tuning_is_refused_with_its_place(tmp_path, content):
+    (tmp_path / "tuning.json").write_bytes(content)
+    with pytest.raises(InputError, match=r"tuning\.json"):
+        report.write(tmp_path / "tuning.json")
+
+
+def test_the_refusal_of_a_tuning_names_the_entry(known, tmp_path):
+    tuning = json.loads(known["tuning.json"].content)
+    tuning["parameters"][0]["value"] = "2"
+    (tmp_path / "tuning.json").write_text(json.dumps(tuning))
+    with pytest.raises(InputError, match=r"tuning\.json: parameters\.0\.value: Input should be a valid number"):
+        report.write(tmp_path / "tuning.json")
+
+
+def test_readers_of_vibration_and_dispersions_name_the_file(tmp_path):
+    (tmp_path / "v.csv").write_bytes(b"frequency_hz,angle_deg\n10,\xff\n")
+    with pytest.raises(InputError, match=r"v\.csv cannot be read as text"):
+        coning.read_vibration(tmp_path / "v.csv")
+    (tmp_path / "d.toml").write_text("[dispersions]\nattitude_sigma_deg = [1, 2]\n")
+    with pytest.raises(InputError, match=r"d\.toml.*attitude_sigma"):
+        montecarlo.read_dispersions(tmp_path / "d.toml")
+
+
+def test_a_tuning_that_tells_no_unit_is_shown_in_si(known, tmp_path):
+    tuning = json.loads(known["tuning.json"].content)
+    (tuning["parameters"][0]).update(value=0.0123, upper=0.0456)
+    for key in ("unit", "si_per_unit"):
+        del tuning["parameters"][0][key]
+    (tmp_path / "tuning.json").write_text(json.dumps(tuning))
+    content = tunings.report(tmp_path / "tuning.json", 0.99)[0]
+    assert ">0.0123<" in content
+    assert ">0.0456<" in content
