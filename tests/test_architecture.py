@@ -195,7 +195,7 @@ def test_kernels_are_plain_python(module):
         assert other is None or unit(other) == "kernels", f"{module} imports {other}"
     if module in MACHINES:
         return
-    assert top_names(tree) <= {"__future__", "math", "numpy", "strapdown"}
+    assert top_names(tree) <= {"__future__", "math", "numpy", "strapdown", "typing"}
     for name in imports(tree):
         other = internal(name)
         assert other not in MACHINES, f"{module} imports {other}; kernels do not know what compiles them"
