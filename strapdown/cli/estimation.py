@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from strapdown.cli.filters import filter_for
+from strapdown.cli.reading import RECORDING_HELP, AccelerometerUnit, Columns, GyroUnit, TimeUnit, Topic, told
 from strapdown.cli.terminal import app, console, doubt, need_own, show, table, writable, written
 
 if TYPE_CHECKING:
@@ -35,18 +36,16 @@ UNEVEN = 2.0
 def estimate(
     recording: Annotated[
         Path,
-        typer.Argument(
-            help="BROAD HDF5 file, CSV with time, gx, gy, gz, ax, ay, az[, mx, my, mz], or record of `strapdown simulate` (HDF5)."
-        ),
+        typer.Argument(help=f"{RECORDING_HELP}; or record of `strapdown simulate` (HDF5)."),
     ],
     out: Annotated[Path, typer.Option(help="Folder for estimate.h5, errors.json and the figures.")] = Path(
         "estimate-results"
     ),
-    gyro_unit: Annotated[str | None, typer.Option(help="Unit of a CSV file's gyro: rad/s or deg/s.")] = None,
-    accelerometer_unit: Annotated[
-        str | None, typer.Option(help="Unit of a CSV file's accelerometer: m/s2 or g.")
-    ] = None,
-    time_unit: Annotated[str | None, typer.Option(help="Unit of a CSV file's time: s, ms, us or ns.")] = None,
+    gyro_unit: GyroUnit = None,
+    accelerometer_unit: AccelerometerUnit = None,
+    time_unit: TimeUnit = None,
+    columns: Columns = None,
+    topic: Topic = None,
     gyro: Annotated[
         Path | None,
         typer.Option(
@@ -117,17 +116,16 @@ def estimate(
     """Estimate attitude and gyro bias from a recording (accelerometer as vertical, magnetometer as heading) or a simulated record."""
     from strapdown.checks import InputError
     from strapdown.files import usable_folder
-    from strapdown.recordfiles import is_record
+    from strapdown.recordings import is_record
     from strapdown.records import read_attributes
 
     usable_folder("out", out)
     writable("out", *(out / name for name in FILES), sources=(recording, gyro, filter_file))
     need_own(out / FILES[0], "estimate", lambda path: bool(read_attributes(path)["kind"] == "strapdown estimate"))
-    given = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
-    units = {name: unit for name, unit in given.items() if unit}
+    layout = told(
+        recording, columns=columns, topic=topic, gyro=gyro_unit, accelerometer=accelerometer_unit, time=time_unit
+    )
     if is_record(recording):
-        for name in units:
-            raise InputError(f"--{name}-unit goes with a CSV file; the record {recording} tells its units itself")
         for name, text in zip(RECORDING_ONLY, (motion, latency), strict=True):
             if text is not None:
                 raise InputError(f"--{name} goes with a recording; {recording} is a record of `strapdown simulate`")
@@ -169,7 +167,7 @@ def estimate(
             raise InputError(
                 f"--{name.replace('_', '-')} goes with a record of `strapdown simulate`; {recording} is none"
             )
-    _estimate_recording(recording, out, units, gyro, bool(full_covariance), smooth, motion, latency)
+    _estimate_recording(recording, out, layout, gyro, bool(full_covariance), smooth, motion, latency)
 
 
 def _estimate_record(
@@ -453,7 +451,7 @@ def _errors(result: Estimate, truth: Any) -> dict[str, float]:
 def _estimate_recording(
     recording: Path,
     out: Path,
-    units: dict[str, str],
+    layout: dict[str, Any],
     gyro: Path | None,
     full_covariance: bool,
     smooth: bool,
@@ -472,7 +470,7 @@ def _estimate_recording(
 
     moved_by = one_of("--motion", motion or "hand", ahrs.MOTIONS)
     late = 1e-3 * non_negative("--latency", latency or 0.0, unit="ms")
-    source = recordings.read(recording, units=units)
+    source = recordings.read(recording, **layout)
     parameters = ahrs.MOTIONS[moved_by]
     if gyro is not None:
         parameters = replace(parameters, **process_noise(read_spec(gyro)))
@@ -515,6 +513,8 @@ def _estimate_recording(
         f"{used.source}: {len(used.time)} samples over {used.time[-1] - used.time[0]:.1f} s, started in the quiet second "
         f"from {used.time[0]:.2f} s."
     )
+    for remark in used.remarks:
+        console.print(remark)
     console.print(f"Fixed frame: {frame}.")
     doubt(source, recording)
     console.print(_beliefs(moved_by, parameters, result))

@@ -1,0 +1,63 @@
+"""Recordings from the bench and the field: any format in, any format out, with clear words where a file is not what it should be.
+
+A recording holds point samples of rate, specific force and magnetic field as a device gave them, on one time axis. What a filter makes
+of it is in :mod:`strapdown.ahrs`.
+
+``formats``
+    The table of formats, :func:`read` by content, :func:`write` by ending.
+``recording``
+    :class:`Recording` and its units.
+``columns``, ``delimited``, ``dataframes``
+    Tables: which column is what; CSV and TSV; Parquet, pandas and xarray.
+``broad``
+    BROAD HDF5.
+``samples``
+    One sensor at rest, for the identification of its noise.
+"""
+
+from __future__ import annotations
+
+from strapdown.recordings.broad import EVEN, read_broad, write_broad
+from strapdown.recordings.columns import SHORT_STAMPS, parse_mapping
+from strapdown.recordings.delimited import read_csv, write_csv
+from strapdown.recordings.formats import FORMATS, Format, format_of, from_record, is_record, read, write, writers
+from strapdown.recordings.recording import (
+    FORCE_UNITS,
+    GAP,
+    MAGNETIC_UNITS,
+    RATE_UNITS,
+    TIME_UNITS,
+    Recording,
+    gaps,
+    increments,
+)
+from strapdown.recordings.samples import GyroSamples, read_gyro, read_samples
+
+__all__ = [
+    "EVEN",
+    "FORCE_UNITS",
+    "FORMATS",
+    "GAP",
+    "MAGNETIC_UNITS",
+    "RATE_UNITS",
+    "SHORT_STAMPS",
+    "TIME_UNITS",
+    "Format",
+    "GyroSamples",
+    "Recording",
+    "format_of",
+    "from_record",
+    "gaps",
+    "increments",
+    "is_record",
+    "parse_mapping",
+    "read",
+    "read_broad",
+    "read_csv",
+    "read_gyro",
+    "read_samples",
+    "write",
+    "write_broad",
+    "write_csv",
+    "writers",
+]

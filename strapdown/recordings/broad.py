@@ -1,0 +1,93 @@
+"""The HDF5 layout of the BROAD data set (Laidig et al. 2021).
+
+``imu_gyr`` (n, 3) rad/s, ``imu_acc`` (n, 3) m/s², ``imu_mag`` (n, 3) µT, in the axes of the unit; ``opt_quat`` (n, 4), the optical
+reference q_fb, scalar first, East-North-Up with magnetic North; ``movement`` (n,) bool; the attribute ``sampling_rate``, Hz. There are no
+stamps: time begins at 0. :func:`write_broad` writes the same, and so only of even stamps.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from strapdown import recordfiles
+from strapdown.checks import InputError, positive
+from strapdown.files import whole_hdf5, written_beside
+from strapdown.recordings.recording import MAGNETIC_UNITS, Recording, with_gyro
+
+
+def read_broad(path: str | os.PathLike[str]) -> Recording:
+    """Read a trial of the BROAD data set (Laidig et al. 2021): ``imu_gyr``, ``imu_acc``, ``imu_mag``, ``opt_quat``, ``movement``."""
+    import h5py
+
+    name = Path(path).name
+    try:
+        with h5py.File(path, "r") as file:
+            kind = str(file.attrs.get("kind", ""))
+            if kind.startswith("strapdown ") and kind != recordfiles.KIND:
+                raise InputError(f"{name} is a {kind}, a result and no recording; give what it was made from")
+            if kind == recordfiles.KIND:
+                raise InputError(
+                    f"{name} is a simulated record, no recording; integrate it (`strapdown integrate`) or filter it (`strapdown estimate`)"
+                )
+            missing = [key for key in ("imu_gyr",) if key not in file]
+            if "sampling_rate" not in file.attrs:
+                missing.append("the attribute sampling_rate")
+            if missing:
+                raise InputError(
+                    f"{name} lacks {', '.join(missing)}; it is not in the layout of BROAD (has: {', '.join(file)})"
+                )
+            rate = file["imu_gyr"][:]
+            sampling = positive(f"{name}: sampling_rate", file.attrs["sampling_rate"], unit="Hz")
+            return with_gyro(
+                source=name,
+                time=np.arange(len(rate)) / sampling,
+                rate=rate,
+                specific_force=file["imu_acc"][:] if "imu_acc" in file else None,
+                magnetic_field=file["imu_mag"][:] if "imu_mag" in file else None,
+                magnetic_unit="uT" if "imu_mag" in file else "",
+                true_attitude=file["opt_quat"][:] if "opt_quat" in file else None,
+                movement=file["movement"][:].astype(bool) if "movement" in file else None,
+            )
+    except OSError as error:
+        raise InputError(f"{name} cannot be read as HDF5 ({error}); the file is truncated or of another kind") from None
+
+
+EVEN = 1e-3
+"""Largest relative departure of a sample interval from their mean that still counts as even."""
+
+
+def sample_interval(recording: Recording) -> float:
+    """Return the interval between the stamps of a recording, s; uneven ones are refused, the worst of them named."""
+    steps = np.diff(recording.time)
+    mean = float(steps.mean())
+    worst = int(np.argmax(np.abs(steps - mean)))
+    if abs(steps[worst] - mean) > EVEN * mean:
+        raise InputError(
+            f"{recording.source}: the interval after {recording.time[worst]:.6g} s is {steps[worst]:.6g} s, the mean {mean:.6g} s; cut the "
+            "recording to where its samples lie at even intervals"
+        )
+    return mean
+
+
+def write_broad(recording: Recording, path: str | os.PathLike[str]) -> None:
+    """Write a recording of even stamps in the layout of BROAD; its clock is lost, for the layout has none."""
+    interval = sample_interval(recording)
+    content = {
+        "imu_gyr": recording.rate,
+        "imu_acc": recording.specific_force,
+        "imu_mag": None
+        if recording.magnetic_field is None or not recording.magnetic_unit
+        else recording.magnetic_field * (MAGNETIC_UNITS[recording.magnetic_unit] / MAGNETIC_UNITS["uT"]),
+        "opt_quat": recording.true_attitude,
+        "movement": recording.movement,
+    }
+    if recording.magnetic_field is not None and content["imu_mag"] is None:
+        content["imu_mag"] = recording.magnetic_field  # of a unit that nobody knows
+    with written_beside(path) as temporary, whole_hdf5(temporary) as file:
+        file.attrs["sampling_rate"] = 1.0 / interval
+        for name, value in content.items():
+            if value is not None:
+                file.create_dataset(name, data=value)

@@ -1,0 +1,268 @@
+"""Recordings as text: CSV, TSV and their kin, with a header of any names.
+
+The separator is the one of ``, ; tab |`` that parts the header into most columns. Lines of ``#`` are comments; if no other header comes
+before the numbers, the last of them is it (EuRoC). Two header rows are joined, an empty cell of the first taking what stands before it
+(RepoIMU), and a second row of units goes into brackets. Where the separator is no comma, decimals may have commas. Which column is what:
+:mod:`strapdown.recordings.columns`. Axes, units and clock are those of the file's columns; stamps written as whole numbers are read as
+such, so that nanoseconds since 1970 keep all their digits.
+
+:func:`write_csv` writes the package's own names with units in brackets, 17 digits a number; time in ns of the source's clock where that
+counts from 1970, else in s.
+"""
+
+from __future__ import annotations
+
+import csv
+import functools
+import math
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from strapdown import recordfiles
+from strapdown.checks import Array, InputError
+from strapdown.files import written_beside
+from strapdown.recordings import columns as naming
+from strapdown.recordings.recording import CLOCK_OFFSET, Recording
+
+SEPARATORS = ",;\t|"
+_LARGE = 10**15
+"""Whole numbers from here on may lose digits as float64."""
+
+
+def read_csv(
+    path: str | os.PathLike[str],
+    *,
+    units: Mapping[str, str] | None = None,
+    gyro_alone: bool = False,
+    columns: Mapping[str, str] | None = None,
+) -> Recording:
+    """Read a table of text, by default of columns ``time, gx, gy, gz[, ax, ay, az[, mx, my, mz]]`` in any order.
+
+    Other columns are left alone. Empty fields of accelerometer and magnetometer are missing samples; rows with an empty field of the gyro
+    are left out and named in ``missing_gyro``, as are rows that repeat the row before, in ``repeated``.
+
+    Parameters
+    ----------
+    path : path
+        Text in UTF-8.
+    units : mapping, optional
+        Units of ``time``, ``gyro``, ``accelerometer``, ``magnetometer`` where the header does not declare them.
+    gyro_alone : bool
+        Leave the columns of the other sensors alone, whose units need not be known then.
+    columns : mapping, optional
+        Names of columns by role where they are not the usual ones: ``{"time": "timestamp [us]", "gx": "gyro_x[dps]"}``.
+
+    Raises
+    ------
+    InputError
+        If the file is no such table, a row is cut short or holds no number, a unit is unknown, undeclared or contradicted, or a column is
+        missing or could be one of several.
+    """
+    file = Path(path)
+    if recordfiles.is_record(file):
+        raise InputError(
+            f"{file.name} is a simulated record, no recording; integrate it (`strapdown integrate`) or filter it (`strapdown estimate`)"
+        )
+    try:
+        with open(file, encoding="utf-8-sig", newline="") as stream:
+            table = _Table(file.name, stream)
+            return naming.recording(
+                file.name,
+                table.header,
+                lambda k: table.numbers[:, k],
+                table.clock_ns,
+                units=units,
+                mapping=columns,
+                gyro_alone=gyro_alone,
+            )
+    except InputError:
+        raise
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{file.name} cannot be read as text ({error}); pass a CSV file in UTF-8") from None
+
+
+class _Table:
+    """A header and rows of numbers, which are read when they are first asked for: a header that will not do is refused before."""
+
+    def __init__(self, source: str, lines: Iterator[str]) -> None:
+        self.source = source
+        head = _Head(source, lines)
+        self.header = head.names
+        self._separator = head.separator
+        self._whole: dict[int, list[int]] = {}  # columns of large whole numbers
+        self._rows = csv.reader(_rest(head.first, lines), delimiter=head.separator)
+
+    def clock_ns(self, k: int) -> tuple[Array, int] | None:
+        """Return time and epoch of a column of large whole stamps, in ns; None of others."""
+        numbers = self.numbers
+        whole = self._whole.get(k)
+        unit = naming.unit_of("time", naming.column(self.header[k]).unit)
+        if whole is None or len(whole) != len(numbers) or unit not in ("", "ns") or abs(whole[0]) < CLOCK_OFFSET * 1e9:
+            return None
+        stamps = np.array(whole, dtype=np.int64)
+        return (stamps - stamps[0]) / 1e9, whole[0]
+
+    @functools.cached_property
+    def numbers(self) -> Array:
+        """The numbers (n, columns); empty fields are NaN."""
+        result: list[list[float]] = []
+        width = len(self.header)
+        commas = self._separator != ","
+        for k, row in enumerate(self._rows):
+            if len(row) == width + 1 and not row[-1].strip():
+                del row[-1]  # a separator at the end of the line
+            if len(row) != width:
+                raise InputError(
+                    f"{self.source}: data row {k + 1} has {len(row)} fields, the header {width}; {_why(row, width)}"
+                )
+            try:
+                result.append([float(cell) if cell.strip() else np.nan for cell in row])
+            except ValueError:
+                result.append(
+                    [
+                        _number(self.source, k, self.header[j], cell.replace(",", ".") if commas else cell, cell)
+                        for j, cell in enumerate(row)
+                    ]
+                )
+            if k == 0:
+                self._whole = {j: [] for j, x in enumerate(result[0]) if abs(x) >= _LARGE}
+            for j, whole in self._whole.items():
+                if re.fullmatch(r"\s*\d{1,19}\s*", row[j]):
+                    whole.append(int(row[j]))
+        if not result:
+            raise InputError(f"{self.source} has a header but no data rows")
+        return np.array(result)
+
+
+class _Head:
+    """The lines before the numbers: the names of the columns, the separator, and the first line of numbers (empty: none)."""
+
+    def __init__(self, source: str, lines: Iterator[str]) -> None:
+        titles: list[str] = []
+        comment = self.first = ""
+        for line in lines:
+            if not line.strip():
+                continue
+            if line.lstrip().startswith("#"):
+                comment = line.lstrip().lstrip("#").strip() or comment
+                continue
+            if titles and _numeric(line):
+                self.first = line
+                break
+            if not titles and _numeric(line):  # numbers at once: the last comment may name them
+                titles, self.first = [comment], line
+                break
+            titles.append(line.rstrip("\r\n"))
+            if len(titles) == 3:
+                self.first = titles.pop()
+                break
+        if not any(title.strip() for title in titles):
+            words = "has no header" if self.first else "is empty"
+            raise InputError(f"{source} {words}; wanted a header like time,gx,gy,gz,ax,ay,az")
+        self.separator = max(SEPARATORS, key=titles[0].count)
+        cells = [next(csv.reader([title], delimiter=self.separator)) for title in titles]
+        if len(cells) == 2 and not self._second_row(cells[0], cells[1]):
+            self.first, cells = titles[1], cells[:1]  # a row of the data that is no number: said with its place
+        self.names = [cell.strip() for cell in cells[0]] if len(cells) == 1 else _joined(*cells)
+        while self.names and not self.names[-1]:
+            self.names.pop()
+
+    @staticmethod
+    def _second_row(first: Sequence[str], second: Sequence[str]) -> bool:
+        """Return whether a second row of words goes with the first: no number in it, and of the same width."""
+        return len(first) == len(second) and not any(_is_number(cell) and cell.strip() for cell in second)
+
+
+def _rest(first: str, lines: Iterator[str]) -> Iterator[str]:
+    if first:
+        yield first
+    for line in lines:
+        if line.strip() and not line.lstrip().startswith("#"):
+            yield line
+
+
+def _joined(first: Sequence[str], second: Sequence[str]) -> list[str]:
+    """Return the names of two header rows: a second row of units goes into brackets, one of axes or names is put behind."""
+    if all(any(naming.unit_of(group, cell) for group in naming.UNITS) for cell in second if cell.strip()):
+        return [f"{a.strip()} [{b.strip()}]" if b.strip() else a.strip() for a, b in zip(first, second, strict=True)]
+    names, before = [], ""
+    for a, b in zip(first, second, strict=True):
+        before = a.strip() or before
+        one = naming.column(before)
+        name = f"{one.name} {b.strip()}".strip()
+        names.append(f"{name} [{one.unit}]" if one.unit and "[" not in b else name)
+    return names
+
+
+def _numeric(line: str) -> bool:
+    """Return whether a line begins with a number, of the separators that there are; empty first fields do not count."""
+    cells = [cell.strip().strip('"') for cell in re.split(r"[,;\t|]", line)]
+    filled = [cell for cell in cells if cell]
+    return bool(filled) and _is_number(filled[0])
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell or "nan")
+    except ValueError:
+        return False
+    return True
+
+
+def _number(source: str, row: int, name: str, cell: str, said: str) -> float:
+    try:
+        return float(cell) if cell.strip() else np.nan
+    except ValueError:
+        raise InputError(f"{source}: data row {row + 1}, column {name} is {said!r}, not a number") from None
+
+
+def _why(row: Sequence[str], width: int) -> str:
+    if width < len(row) and all(re.fullmatch(r"\s*-?\d+(e-?\d+)?\s*", part) for part in row):
+        return "its decimals seem to have commas: write points"
+    return "the file is truncated or damaged there"
+
+
+def recording_columns(recording: Recording) -> tuple[dict[str, NDArray[np.generic]], dict[str, str]]:
+    """Return what a recording holds as columns by the package's names, and the unit of each that has one."""
+    clock = bool(recording.epoch_ns)
+    found: dict[str, NDArray[np.generic]] = {"time": recording.clock_ns if clock else recording.time}
+    unit = {"time": "ns" if clock else "s"}
+    triples = {
+        "gyro": (recording.rate, "rad/s"),
+        "accelerometer": (recording.specific_force, "m/s2"),
+        "magnetometer": (recording.magnetic_field, recording.magnetic_unit),
+        "temperature": (None if recording.temperature is None else recording.temperature[:, None], "degC"),
+        "reference": (recording.true_attitude, ""),
+        "movement": (None if recording.movement is None else recording.movement[:, None].astype(np.int64), ""),
+    }
+    for group, (values, name) in triples.items():
+        if values is not None:
+            found |= {role: values[:, k] for k, role in enumerate(naming.GROUPS[group])}
+            unit |= dict.fromkeys(naming.GROUPS[group], name) if name else {}
+    return found, unit
+
+
+def write_csv(recording: Recording, path: str | os.PathLike[str]) -> None:
+    """Write a recording as CSV (as TSV where the ending is ``.tsv``), so that :func:`read_csv` gives the same numbers back."""
+    found, unit = recording_columns(recording)
+    names = [f"{name} [{unit[name]}]" if name in unit else name for name in found]
+    write_columns(path, dict(zip(names, found.values(), strict=True)))
+
+
+def write_columns(path: str | os.PathLike[str], found: Mapping[str, NDArray[np.generic]]) -> None:
+    """Write columns of numbers as text, 17 digits a number, whole numbers whole; NaN is an empty field."""
+    separator = "\t" if Path(path).suffix.lower() == ".tsv" else ","
+    texts = []
+    for column in found.values():
+        if column.dtype.kind in "iu":
+            texts.append([str(x) for x in column.tolist()])
+        else:
+            texts.append(["" if math.isnan(x) else repr(x) for x in column.tolist()])
+    with written_beside(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as file:
+        file.write(separator.join(found) + "\n")
+        file.writelines(separator.join(row) + "\n" for row in zip(*texts, strict=True))

@@ -1,0 +1,174 @@
+"""Samples of one sensor at even intervals, for the identification of its noise."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from strapdown import recordfiles
+from strapdown.checks import Array, InputError, array, one_of, positive
+from strapdown.files import existing_file
+from strapdown.recordings import formats
+from strapdown.recordings.broad import EVEN, sample_interval
+from strapdown.recordings.columns import SENSORS, UNITS
+from strapdown.recordings.recording import RATE_UNITS, Recording
+
+
+@dataclass(frozen=True, kw_only=True)
+class GyroSamples:
+    """Samples of a gyro, or of another sensor, at even intervals, for noise identification."""
+
+    values: Array
+    """Samples (n, axes), SI: rad/s, m/s², T; of a gyro perhaps increments, rad. NaN where a sample is missing, if gaps were allowed."""
+    sample_interval: float
+    """s"""
+    kind: str
+    """"rate" (samples) or "increments"."""
+    temperature: Array | None = None
+    """Temperature (n,), °C, where it was recorded."""
+    remarks: tuple[str, ...] = field(default=())
+    """What the reader chose or left out."""
+
+
+def read_gyro(
+    path: str | os.PathLike[str],
+    *,
+    rate: float | None = None,
+    units: Mapping[str, str] | None = None,
+    columns: Mapping[str, str] | None = None,
+    topic: str = "",
+) -> GyroSamples:
+    """Read the gyro of a recording of any format, a simulated record, or a NPY array (n,) or (n, 3) of rates.
+
+    An array tells neither its rate nor its unit: give ``rate`` in Hz and ``units={"gyro": ...}``. Samples must lie at even intervals.
+    """
+    return read_samples(path, "gyro", rate=rate, units=units, columns=columns, topic=topic)
+
+
+def read_samples(
+    path: str | os.PathLike[str],
+    sensor: str = "gyro",
+    *,
+    rate: float | None = None,
+    units: Mapping[str, str] | None = None,
+    columns: Mapping[str, str] | None = None,
+    topic: str = "",
+    gaps: bool = False,
+) -> GyroSamples:
+    """Read one sensor of a recording of any format, a simulated record's gyro, or a NPY array (n,) or (n, 3).
+
+    Parameters
+    ----------
+    path : path
+    sensor : {"gyro", "accelerometer", "magnetometer"}
+    rate : float, optional
+        Samples a second, Hz, of a bare array.
+    units, columns, topic
+        As :func:`strapdown.recordings.read` takes them; ``units`` tells the unit of a bare array too.
+    gaps : bool
+        Allow gaps: samples lie on a grid of the usual interval then, and missing ones are NaN.
+
+    Raises
+    ------
+    InputError
+        If the sensor is not there, its unit is unknown, or its samples lie at uneven intervals.
+    """
+    file = Path(path)
+    one_of("sensor", sensor, SENSORS)
+    given = dict(units or {})
+    if file.suffix.lower() == ".npy":
+        existing_file(file)
+        return _read_array(file, sensor, rate, given)
+    if rate is not None:
+        raise InputError(f"{file.name} tells its own rate; drop the option rate")
+    if not file.is_dir() and file.exists() and recordfiles.is_record(file):
+        if given:
+            raise InputError(
+                f"{file.name} is a record, whose layout says its units; drop the option for {', '.join(given)}"
+            )
+        record = recordfiles.read_record(file)
+        if sensor == "gyro":
+            interval = sample_interval(Recording(source=file.name, time=record.time[1:], rate=record.increments))
+            return GyroSamples(values=record.increments, sample_interval=interval, kind="increments")
+        return _of_recording(formats.from_record(record, file.name), sensor, gaps)
+    recording = formats.read(file, units=given, gyro_alone=sensor == "gyro", columns=columns, topic=topic)
+    return _of_recording(recording, sensor, gaps)
+
+
+def _read_array(file: Path, sensor: str, rate: float | None, given: Mapping[str, str]) -> GyroSamples:
+    names = " or ".join(list(UNITS[sensor])[:2]) if sensor == "gyro" else " or ".join(UNITS[sensor])
+    if rate is None or sensor not in given:
+        raise InputError(f"{file.name} is a bare array; give its rate in Hz and its unit ({names})")
+    try:
+        values = np.load(file, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise InputError(
+            f"{file.name} cannot be read as an array ({error}); the file is truncated or of another kind"
+        ) from None
+    factor = UNITS[sensor][one_of(f"{file.name}: unit of the {sensor}", given[sensor], UNITS[sensor])]
+    axes = array(file.name, np.reshape(values, (-1, 1)) if np.ndim(values) == 1 else values, ("n", "axes"))
+    return GyroSamples(values=axes * factor, sample_interval=1.0 / positive("rate", rate, unit="Hz"), kind="rate")
+
+
+def _of_recording(recording: Recording, sensor: str, gaps: bool) -> GyroSamples:
+    """Return one sensor's samples, SI; a slower sensor's at its own stamps."""
+    values = {
+        "gyro": recording.rate,
+        "accelerometer": recording.specific_force,
+        "magnetometer": recording.magnetic_field,
+    }[sensor]
+    if values is None:
+        raise InputError(f"{recording.source} has no {sensor}; choose another sensor or file")
+    factor = 1.0
+    if sensor == "magnetometer":
+        if not recording.magnetic_unit:
+            raise InputError(
+                f"{recording.source} does not say the unit of its magnetometer; declare it in the header or by option "
+                f"({' or '.join(UNITS['magnetometer'])})"
+            )
+        factor = UNITS["magnetometer"][recording.magnetic_unit]
+    known = np.asarray(~np.isnan(values).any(axis=1))
+    time, samples = recording.time[known], values[known] * factor
+    temperature = None if recording.temperature is None else recording.temperature[known]
+    if not gaps:
+        interval = sample_interval(Recording(source=recording.source, time=time, rate=np.zeros((len(time), 3))))
+    else:
+        interval, place = _grid(recording.source, time)
+        filled = np.full((place[-1] + 1, 3), np.nan)
+        filled[place] = samples
+        samples = filled
+        if temperature is not None:
+            temperature = np.interp(np.arange(place[-1] + 1), place, temperature)
+    return GyroSamples(
+        values=samples, sample_interval=interval, kind="rate", temperature=temperature, remarks=recording.remarks
+    )
+
+
+JITTER = 0.25
+"""Largest distance of a stamp from the grid, in intervals, at which a sample is still that of its place."""
+
+
+def _grid(source: str, time: Array) -> tuple[float, np.ndarray]:
+    """Return the interval of the grid that the stamps lie on, s, and the place of each; gaps are whole numbers of intervals."""
+    if len(time) < 3:
+        raise InputError(f"{source} has {len(time)} samples; an Allan deviation needs at least 3")
+    steps = np.diff(time)
+    interval = float(np.median(steps))
+    interval = float(np.mean(steps[np.abs(steps - interval) < 0.5 * interval]))
+    whole = np.rint(steps / interval)
+    off = np.abs(steps - whole * interval)
+    worst = int(np.argmax(off))
+    if off[worst] > JITTER * interval or whole.min() < 1.0:
+        bad = worst if off[worst] > JITTER * interval else int(np.argmin(whole))
+        raise InputError(
+            f"{source}: the interval after {time[bad]:.6g} s is {steps[bad]:.6g} s, no whole number of the usual {interval:.6g} s; cut the "
+            "recording to where its samples lie on even intervals"
+        )
+    return interval, np.concatenate([[0], np.cumsum(whole)]).astype(np.int64)
+
+
+__all__ = ["EVEN", "JITTER", "RATE_UNITS", "GyroSamples", "read_gyro", "read_samples"]
