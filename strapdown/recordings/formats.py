@@ -17,6 +17,7 @@ import numpy as np
 
 from strapdown import recordfiles
 from strapdown.checks import InputError
+from strapdown.recordings import ros
 from strapdown.recordings.recording import Recording, with_gyro
 from strapdown.records import Estimate, ImuRecord
 
@@ -40,8 +41,6 @@ class Format:
     """The same for an estimate."""
     options: tuple[str, ...] = ()
     """Keywords of :func:`read` that the reader takes."""
-    library: str = ""
-    """What reads and writes it, if that is an extra."""
 
 
 def _starts(*signatures: bytes) -> Callable[[Path, bytes], bool]:
@@ -60,6 +59,8 @@ def _text(head: bytes) -> bool:
 
 
 FORMATS: tuple[Format, ...] = (
+    Format("ROS bag", (".bag", ".mcap", ".db3"), lambda path, head: ros.is_folder(path) or head.startswith(ros.MAGICS),
+           "ros:read_bag", "ros:write_bag", "ros:write_estimate", ("topic",)),
     Format("BROAD", (".hdf5", ".h5"), _starts(b"\x89HDF\r\n\x1a\n"), "broad:read_broad", "broad:write_broad", "estimates:write_hdf5"),
     Format("CSV", (".csv", ".tsv", ".txt"), lambda path, head: _text(head), "delimited:read_csv", "delimited:write_csv",
            "estimates:write_csv", ("units", "columns", "gyro_alone")),
