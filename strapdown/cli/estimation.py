@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,6 +17,7 @@ from strapdown.cli.terminal import app, console, doubt, need_own, show, table, w
 if TYPE_CHECKING:
     from strapdown.mekf import State
     from strapdown.recordfiles import RecordFile
+    from strapdown.recordings import Recording
     from strapdown.records import Estimate, ImuRecord
     from strapdown.setup import FilterSetup
 
@@ -106,6 +108,17 @@ def estimate(
             "whose acceleration is white noise, without."
         ),
     ] = None,
+    to: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Write the estimate to this file too, in the format of its ending: .csv, .tsv, .parquet, .tum, .h5, and of a recording "
+            ".bag, .mcap or .db3 with orientation and covariance filled in; may be repeated."
+        ),
+    ] = None,
+    euler: Annotated[
+        str | None, typer.Option(help="With --to a table: Euler angles of this sequence, ZYX if not given.")
+    ] = None,
+    frame: Annotated[str | None, typer.Option(help="With --to: fixed frame ENU (if not given) or NED.")] = None,
     latency: Annotated[
         float | None,
         typer.Option(
@@ -125,6 +138,7 @@ def estimate(
     layout = told(
         recording, columns=columns, topic=topic, gyro=gyro_unit, accelerometer=accelerometer_unit, time=time_unit
     )
+    exports = _exports(to or (), recording, euler, frame)
     if is_record(recording):
         for name, text in zip(RECORDING_ONLY, (motion, latency), strict=True):
             if text is not None:
@@ -143,6 +157,7 @@ def estimate(
             full_covariance is not False,
             observability,
             smooth,
+            exports,
         )
         return
     options = dict(
@@ -167,7 +182,43 @@ def estimate(
             raise InputError(
                 f"--{name.replace('_', '-')} goes with a record of `strapdown simulate`; {recording} is none"
             )
-    _estimate_recording(recording, out, layout, gyro, bool(full_covariance), smooth, motion, latency)
+    _estimate_recording(recording, out, layout, gyro, bool(full_covariance), smooth, motion, latency, exports)
+
+
+def _exports(
+    to: Sequence[Path], recording: Path, euler: str | None, frame: str | None
+) -> list[tuple[Path, dict[str, Any]]]:
+    """Return the further files of an estimate with the options of their writers; what cannot be written is refused."""
+    from strapdown import outputs, recordings
+    from strapdown.checks import InputError, one_of
+
+    if frame is not None:
+        one_of("--frame", frame, outputs.FRAMES)
+    if euler is not None:
+        outputs.euler([[1.0, 0.0, 0.0, 0.0]], euler)
+    given = {name: value for name, value in (("sequence", euler), ("frame", frame)) if value is not None}
+    if given and not to:
+        raise InputError("--euler and --frame go with --to FILE; give the file")
+    found = []
+    for target in to:
+        writable("to", target, suffixes=recordings.writers("write_estimate"), sources=(recording,))
+        options: dict[str, Any] = dict(given)
+        chosen = recordings.estimate_format(target, given, recording=not recordings.is_record(recording))
+        if "source" in chosen.estimate_options and recordings.format_of(recording) is chosen:
+            options["source"] = recording
+        found.append((target, options))
+    return found
+
+
+def _export(
+    exports: Sequence[tuple[Path, dict[str, Any]]], estimate: Estimate, recording: Recording | None
+) -> list[Path]:
+    """Write an estimate to its further files and return them."""
+    from strapdown import recordings
+
+    for target, options in exports:
+        recordings.write(estimate, target, recording=recording, **options)
+    return [target for target, _ in exports]
 
 
 def _estimate_record(
@@ -184,6 +235,7 @@ def _estimate_record(
     full_covariance: bool,
     observability: bool,
     smooth: bool,
+    exports: Sequence[tuple[Path, dict[str, Any]]],
 ) -> None:
     """Run the filter over a record, tell and write what it made of it."""
     import numpy as np
@@ -266,6 +318,7 @@ def _estimate_record(
         if "nees_per_state" in found:
             line += f"; mean NEES per state {found['nees_per_state']:.3g} (right: about 1)"
         console.print(line + ".")
+    paths += _export(exports, result, None)
     seen = {s: i for s, i in result.innovations.items() if np.sum(i.used)}
     if seen:
         each = ", ".join(f"{np.mean(i.nis[i.used]) / i.innovation.shape[1]:.3g} {s}" for s, i in seen.items())
@@ -457,6 +510,7 @@ def _estimate_recording(
     smooth: bool,
     motion: str | None,
     latency: float | None,
+    exports: Sequence[tuple[Path, dict[str, Any]]],
 ) -> None:
     """Run the filter over a recording: accelerometer as the vertical, magnetometer as the heading."""
     from strapdown import ahrs, plots, recordings, setup
@@ -538,6 +592,7 @@ def _estimate_recording(
         rows = table("RMS error over the movement phase, degrees", *rms, left=0)
         rows.add_row(*(f"{value:.2f}" for value in rms.values()))
         show(rows)
+    paths += _export(exports, found, source)
     written(*paths, *(plots.save(figure, out / name) for name, figure in figures.items()))
 
 

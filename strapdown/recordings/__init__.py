@@ -9,8 +9,12 @@ of it is in :mod:`strapdown.ahrs`.
     :class:`Recording` and its units.
 ``columns``, ``delimited``, ``dataframes``
     Tables: which column is what; CSV and TSV; Parquet, pandas and xarray.
+``ros``
+    ROS bags.
 ``broad``
     BROAD HDF5.
+``estimates``
+    An estimate in files of all these kinds.
 ``samples``
     One sensor at rest, for the identification of its noise.
 """
@@ -19,8 +23,19 @@ from __future__ import annotations
 
 from strapdown.recordings.broad import EVEN, read_broad, write_broad
 from strapdown.recordings.columns import SHORT_STAMPS, parse_mapping
+from strapdown.recordings.dataframes import from_table
 from strapdown.recordings.delimited import read_csv, write_csv
-from strapdown.recordings.formats import FORMATS, Format, format_of, from_record, is_record, read, write, writers
+from strapdown.recordings.formats import (
+    FORMATS,
+    Format,
+    estimate_format,
+    format_of,
+    from_record,
+    is_record,
+    read,
+    write,
+    writers,
+)
 from strapdown.recordings.recording import (
     FORCE_UNITS,
     GAP,
@@ -45,8 +60,10 @@ __all__ = [
     "Format",
     "GyroSamples",
     "Recording",
+    "estimate_format",
     "format_of",
     "from_record",
+    "from_table",
     "gaps",
     "increments",
     "is_record",

@@ -7,7 +7,7 @@ A file of no known content is read by its ending, whose reader says what is wron
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -41,6 +41,10 @@ class Format:
     """The same for an estimate."""
     options: tuple[str, ...] = ()
     """Keywords of :func:`read` that the reader takes."""
+    estimate_options: tuple[str, ...] = ()
+    """Keywords that the writer of estimates takes."""
+    with_samples: bool = False
+    """Whether an estimate is written with the recording's samples, and so never without a recording."""
 
 
 def _starts(*signatures: bytes) -> Callable[[Path, bytes], bool]:
@@ -60,10 +64,13 @@ def _text(head: bytes) -> bool:
 
 FORMATS: tuple[Format, ...] = (
     Format("ROS bag", (".bag", ".mcap", ".db3"), lambda path, head: ros.is_folder(path) or head.startswith(ros.MAGICS),
-           "ros:read_bag", "ros:write_bag", "ros:write_estimate", ("topic",)),
+           "ros:read_bag", "ros:write_bag", "ros:write_estimate", ("topic",), ("source",), with_samples=True),
+    Format("Parquet", (".parquet",), _starts(b"PAR1"), "dataframes:read_parquet", "dataframes:write_parquet",
+           "estimates:write_parquet", ("units", "columns", "gyro_alone"), ("sequence", "frame")),
+    Format("TUM trajectory", (".tum",), lambda path, head: False, "", "", "estimates:write_tum", (), ("frame",)),
     Format("BROAD", (".hdf5", ".h5"), _starts(b"\x89HDF\r\n\x1a\n"), "broad:read_broad", "broad:write_broad", "estimates:write_hdf5"),
     Format("CSV", (".csv", ".tsv", ".txt"), lambda path, head: _text(head), "delimited:read_csv", "delimited:write_csv",
-           "estimates:write_csv", ("units", "columns", "gyro_alone")),
+           "estimates:write_csv", ("units", "columns", "gyro_alone"), ("sequence", "frame")),
 )  # fmt: skip
 """Formats in the order that they are tried."""
 
@@ -206,10 +213,33 @@ def write(
     if isinstance(content, ImuRecord):
         content = from_record(content, "record")
     if isinstance(content, Estimate):
-        found = _by_ending(path, "write_estimate")
+        found = estimate_format(path, options, recording=recording is not None)
         _function(found.write_estimate)(content, Path(path), recording=recording, **options)
     else:
         _function(_by_ending(path, "write").write)(content, Path(path), **options)
+
+
+def estimate_format(path: str | os.PathLike[str], options: Iterable[str] = (), *, recording: bool = True) -> Format:
+    """Return the format that an estimate's file is written in, so that what cannot be is refused before anything is computed.
+
+    Parameters
+    ----------
+    path : path
+    options : iterable of str
+        Options of the writer that are to be used.
+    recording : bool
+        Whether the estimate was made from a recording, whose samples some formats need.
+    """
+    found = _by_ending(path, "write_estimate")
+    for name in options:
+        if name not in found.estimate_options:
+            raise InputError(f"{path} is {found.name}, which has no {name}; leave it out, or choose another ending")
+    if found.with_samples and not recording:
+        raise InputError(
+            f"{path} is {found.name}, which holds the samples too; give the recording that the estimate was made from, or choose another "
+            "ending"
+        )
+    return found
 
 
 def writers(kind: str) -> tuple[str, ...]:

@@ -456,12 +456,9 @@ def write_estimate(
     Raises
     ------
     InputError
-        If there is no recording, or no stamp of it is the estimate's.
+        If no stamp of the recording is the estimate's.
     """
-    if recording is None:
-        raise InputError(
-            f"{Path(path).name} is a ROS bag, which holds the samples too; give the recording that the estimate was made from"
-        )
+    assert recording is not None
     target = Path(path)
     series = _series(recording, estimate)
     others: list[_Topic] = []
