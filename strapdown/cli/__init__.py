@@ -12,6 +12,8 @@ be told.
     ``algorithms``, ``integrate``, ``coning-budget``
 ``estimation``
     ``estimate``
+``conversion``
+    ``convert``
 ``campaigns``
     ``montecarlo``
 ``judgement``
@@ -36,7 +38,18 @@ from typing import Annotated
 import typer
 
 from strapdown.checks import InputError
-from strapdown.cli import campaigns, estimation, integration, judgement, planning, reporting, sensors, studies, tuning  # noqa: F401  (each registers its commands)
+from strapdown.cli import (  # noqa: F401  (each registers its commands)
+    campaigns,
+    conversion,
+    estimation,
+    integration,
+    judgement,
+    planning,
+    reporting,
+    sensors,
+    studies,
+    tuning,
+)
 from strapdown.cli.terminal import app, console, errors
 
 

@@ -11,6 +11,10 @@ of it is in :mod:`strapdown.ahrs`.
     Tables: which column is what; CSV and TSV; Parquet, pandas and xarray.
 ``ros``
     ROS bags.
+``ulog``
+    Flight logs of PX4.
+``trajectories``
+    Folders of EuRoC and TUM-VI, TUM trajectories as references.
 ``broad``
     BROAD HDF5.
 ``estimates``
@@ -31,7 +35,9 @@ from strapdown.recordings.formats import (
     estimate_format,
     format_of,
     from_record,
+    is_estimate,
     is_record,
+    not_held,
     read,
     write,
     writers,
@@ -47,6 +53,7 @@ from strapdown.recordings.recording import (
     increments,
 )
 from strapdown.recordings.samples import GyroSamples, read_gyro, read_samples
+from strapdown.recordings.trajectories import read_euroc, read_tum, with_reference
 
 __all__ = [
     "EVEN",
@@ -66,13 +73,18 @@ __all__ = [
     "from_table",
     "gaps",
     "increments",
+    "is_estimate",
     "is_record",
+    "not_held",
     "parse_mapping",
     "read",
     "read_broad",
     "read_csv",
+    "read_euroc",
     "read_gyro",
     "read_samples",
+    "read_tum",
+    "with_reference",
     "write",
     "write_broad",
     "write_csv",

@@ -17,7 +17,7 @@ import numpy as np
 
 from strapdown import recordfiles
 from strapdown.checks import InputError
-from strapdown.recordings import ros
+from strapdown.recordings import ros, trajectories
 from strapdown.recordings.recording import Recording, with_gyro
 from strapdown.records import Estimate, ImuRecord
 
@@ -43,6 +43,8 @@ class Format:
     """Keywords of :func:`read` that the reader takes."""
     estimate_options: tuple[str, ...] = ()
     """Keywords that the writer of estimates takes."""
+    lacks: tuple[str, ...] = ()
+    """What a recording may hold and the format cannot: ``"temperature"``, ``"reference"``, ``"movement"``, ``"clock"``."""
     with_samples: bool = False
     """Whether an estimate is written with the recording's samples, and so never without a recording."""
 
@@ -63,15 +65,70 @@ def _text(head: bytes) -> bool:
 
 
 FORMATS: tuple[Format, ...] = (
-    Format("ROS bag", (".bag", ".mcap", ".db3"), lambda path, head: ros.is_folder(path) or head.startswith(ros.MAGICS),
-           "ros:read_bag", "ros:write_bag", "ros:write_estimate", ("topic",), ("source",), with_samples=True),
-    Format("Parquet", (".parquet",), _starts(b"PAR1"), "dataframes:read_parquet", "dataframes:write_parquet",
-           "estimates:write_parquet", ("units", "columns", "gyro_alone"), ("sequence", "frame")),
-    Format("TUM trajectory", (".tum",), lambda path, head: False, "", "", "estimates:write_tum", (), ("frame",)),
-    Format("BROAD", (".hdf5", ".h5"), _starts(b"\x89HDF\r\n\x1a\n"), "broad:read_broad", "broad:write_broad", "estimates:write_hdf5"),
-    Format("CSV", (".csv", ".tsv", ".txt"), lambda path, head: _text(head), "delimited:read_csv", "delimited:write_csv",
-           "estimates:write_csv", ("units", "columns", "gyro_alone"), ("sequence", "frame")),
-)  # fmt: skip
+    Format(
+        name="ROS bag",
+        endings=(".bag", ".mcap", ".db3"),
+        recognised=lambda path, head: ros.is_folder(path) or head.startswith(ros.MAGICS),
+        read="ros:read_bag",
+        options=("topic",),
+        write="ros:write_bag",
+        lacks=("movement",),
+        write_estimate="ros:write_estimate",
+        estimate_options=("source",),
+        with_samples=True,
+    ),
+    Format(
+        name="ULog",
+        endings=(".ulg",),
+        recognised=_starts(b"ULog\x01\x12\x35"),
+        read="ulog:read_ulog",
+        options=("topic",),
+        write="ulog:write_ulog",
+        lacks=("temperature", "movement"),
+    ),
+    Format(
+        name="Parquet",
+        endings=(".parquet",),
+        recognised=_starts(b"PAR1"),
+        read="dataframes:read_parquet",
+        options=("units", "columns", "gyro_alone"),
+        write="dataframes:write_parquet",
+        write_estimate="estimates:write_parquet",
+        estimate_options=("sequence", "frame"),
+    ),
+    Format(
+        name="EuRoC folder",
+        endings=(),
+        recognised=lambda path, head: trajectories.is_folder(path),
+        read="trajectories:read_euroc",
+    ),
+    Format(
+        name="TUM trajectory",
+        endings=(".tum",),
+        recognised=lambda path, head: _text(head) and trajectories.is_tum(head),
+        write_estimate="estimates:write_tum",
+        estimate_options=("frame",),
+    ),
+    Format(
+        name="BROAD",
+        endings=(".hdf5", ".h5"),
+        recognised=_starts(b"\x89HDF\r\n\x1a\n"),
+        read="broad:read_broad",
+        write="broad:write_broad",
+        lacks=("temperature", "clock"),
+        write_estimate="estimates:write_hdf5",
+    ),
+    Format(
+        name="CSV",
+        endings=(".csv", ".tsv", ".txt"),
+        recognised=lambda path, head: _text(head),
+        read="delimited:read_csv",
+        options=("units", "columns", "gyro_alone"),
+        write="delimited:write_csv",
+        write_estimate="estimates:write_csv",
+        estimate_options=("sequence", "frame"),
+    ),
+)
 """Formats in the order that they are tried."""
 
 
@@ -90,17 +147,17 @@ def format_of(path: str | os.PathLike[str]) -> Format:
     if not file.is_dir():
         with open(file, "rb") as stream:
             head = stream.read(HEAD)
-    binary = [one for one in FORMATS if one.name != "CSV"]
-    for one in binary:
-        if one.recognised(file, head):
-            return one
-    by_ending = [one for one in FORMATS if file.suffix.lower() in one.endings]
-    if by_ending and not file.is_dir():
-        return by_ending[0]
+    table = FORMATS[-1]
+    found = next((one for one in FORMATS if one is not table and one.recognised(file, head)), None)
+    if found is not None:
+        return found
     if file.is_dir():
         raise InputError(f"{path} is a folder, and no recording ({', '.join(_folders())}); name the file in it")
-    if _text(head):
-        return next(one for one in FORMATS if one.name == "CSV")
+    by_ending = next((one for one in FORMATS if file.suffix.lower() in one.endings), None)
+    if by_ending is not None:
+        return by_ending
+    if table.recognised(file, head):
+        return table
     raise InputError(
         f"{file} has the suffix {file.suffix!r} and the content of no known format; recordings are {_known()}"
     )
@@ -163,7 +220,9 @@ def read(
     file = Path(path)
     found = format_of(file)
     if not found.read:
-        raise InputError(f"{file.name} is {found.name}, which holds no inertial samples; give the recording")
+        raise InputError(
+            f"{file.name} is a {found.name}, which holds no inertial samples; give the recording, and this as its reference"
+        )
     given = {"units": dict(units or {}), "columns": dict(columns or {}), "topic": topic}
     for name, value in given.items():
         if value and name not in found.options:
@@ -282,6 +341,25 @@ def from_record(record: ImuRecord, source: str = "record") -> Recording:
         true_attitude=None if record.truth is None else record.truth.attitude[1:],
         **own,
     )
+
+
+def not_held(path: str | os.PathLike[str]) -> tuple[str, ...]:
+    """Return what a recording may hold and the format of a path's ending has no room for."""
+    return _by_ending(path, "write").lacks
+
+
+def is_estimate(path: str | os.PathLike[str]) -> bool:
+    """Return whether a path is an estimate of this package, in HDF5."""
+    file = Path(path)
+    if not file.is_file() or format_of(file).name != "BROAD":
+        return False
+    import h5py
+
+    try:
+        with h5py.File(file, "r") as content:
+            return bool(content.attrs.get("kind") == "strapdown estimate")
+    except OSError:
+        return False
 
 
 def is_record(path: str | os.PathLike[str]) -> bool:
