@@ -169,7 +169,7 @@ def recording(
     _no_doubles(source, columns)
     roles, declared, remark = _roles(source, columns, mapping or {})
     if gyro_alone:
-        roles = {role: k for role, k in roles.items() if _group(role) in ("time", "gyro", "reference")}
+        roles = {role: k for role, k in roles.items() if _group(role) in ("time", "gyro", "temperature", "reference")}
     for group, members in GROUPS.items():
         missing = [role for role in members if role not in roles]
         if missing and (group in ("time", "gyro") or len(missing) < len(members)):

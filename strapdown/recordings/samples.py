@@ -15,7 +15,7 @@ from strapdown.files import existing_file
 from strapdown.recordings import formats
 from strapdown.recordings.broad import EVEN, sample_interval
 from strapdown.recordings.columns import SENSORS, UNITS
-from strapdown.recordings.recording import RATE_UNITS, Recording
+from strapdown.recordings.recording import GAP, RATE_UNITS, Recording
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,41 +134,52 @@ def _of_recording(recording: Recording, sensor: str, gaps: bool) -> GyroSamples:
     known = np.asarray(~np.isnan(values).any(axis=1))
     time, samples = recording.time[known], values[known] * factor
     temperature = None if recording.temperature is None else recording.temperature[known]
-    if not gaps:
-        interval = sample_interval(Recording(source=recording.source, time=time, rate=np.zeros((len(time), 3))))
-    else:
-        interval, place = _grid(recording.source, time)
+    remarks = recording.remarks
+    own = Recording(source=recording.source, time=time, rate=np.zeros((len(time), 3)))
+    try:
+        interval = sample_interval(own)
+    except InputError:
+        if not gaps:
+            raise
+        interval, place, words = _grid(recording.source, time)
+        remarks += words
         filled = np.full((place[-1] + 1, 3), np.nan)
         filled[place] = samples
         samples = filled
         if temperature is not None:
             temperature = np.interp(np.arange(place[-1] + 1), place, temperature)
-    return GyroSamples(
-        values=samples, sample_interval=interval, kind="rate", temperature=temperature, remarks=recording.remarks
-    )
+    return GyroSamples(values=samples, sample_interval=interval, kind="rate", temperature=temperature, remarks=remarks)
 
 
 JITTER = 0.25
 """Largest distance of a stamp from the grid, in intervals, at which a sample is still that of its place."""
 
 
-def _grid(source: str, time: Array) -> tuple[float, np.ndarray]:
-    """Return the interval of the grid that the stamps lie on, s, and the place of each; gaps are whole numbers of intervals."""
-    if len(time) < 3:
-        raise InputError(f"{source} has {len(time)} samples; an Allan deviation needs at least 3")
+def _grid(source: str, time: Array) -> tuple[float, np.ndarray, tuple[str, ...]]:
+    """Return the interval of the grid that the stamps lie on, s, the place of each, and what is to be said.
+
+    Stamps near the grid tell every lost sample. Those that are late by more, as of a computer that was busy, tell only gaps: within a
+    stretch between gaps the samples are taken to be even.
+    """
     steps = np.diff(time)
-    interval = float(np.median(steps))
-    interval = float(np.mean(steps[np.abs(steps - interval) < 0.5 * interval]))
+    usual = float(np.median(steps))
+    interval = float(np.mean(steps[np.abs(steps - usual) < 0.5 * usual]))
     whole = np.rint(steps / interval)
     off = np.abs(steps - whole * interval)
-    worst = int(np.argmax(off))
-    if off[worst] > JITTER * interval or whole.min() < 1.0:
-        bad = worst if off[worst] > JITTER * interval else int(np.argmin(whole))
-        raise InputError(
-            f"{source}: the interval after {time[bad]:.6g} s is {steps[bad]:.6g} s, no whole number of the usual {interval:.6g} s; cut the "
-            "recording to where its samples lie on even intervals"
+    words: tuple[str, ...] = ()
+    if off.max() > JITTER * interval or whole.min() < 1.0:
+        gap = steps > GAP * usual
+        interval = float(np.mean(steps[~gap]))
+        whole = np.where(gap, np.rint(steps / interval), 1.0)
+        words = (
+            f"Intervals of {source} stray by up to {1e3 * float(np.abs(steps[~gap] - interval).max()):.3g} ms from the mean: between gaps "
+            f"the samples are taken for even, {1.0 / interval:.6g} Hz.",
         )
-    return interval, np.concatenate([[0], np.cumsum(whole)]).astype(np.int64)
+    place = np.concatenate([[0], np.cumsum(whole)]).astype(np.int64)
+    missing = int(place[-1] + 1 - len(place))
+    if missing:
+        words += (f"{missing} samples are missing in {int(np.sum(whole > 1.0))} gaps.",)
+    return interval, place, words
 
 
 __all__ = ["EVEN", "JITTER", "RATE_UNITS", "GyroSamples", "read_gyro", "read_samples"]
