@@ -205,6 +205,63 @@ def test_a_missing_library_is_named_with_its_remedy(tmp_path, monkeypatch, modul
         read(tmp_path / f"x.{ending}")
 
 
+# --------------------------------------------------------------------------------------------- cameras and flight controllers
+
+GCSV = """GYROFLOW IMU LOG
+version,1.3
+id,custom_logger_name
+orientation,XYZ
+timestamp,1644159993
+vendor,potatocam
+tscale,0.001
+gscale,0.00122173047
+ascale,0.00048828125
+t,gx,gy,gz,ax,ay,az
+0,39,86,183,-1137,-15689,-2986
+1,56,100,202,-1179,-15694,-2887
+2,63,108,218,-1247,-15702,-2794
+"""
+"""Gyroflow's documented format: counts, with their scales to s, rad/s and g."""
+
+
+def test_a_cameras_log_is_read(tmp_path):
+    pytest.importorskip("telemetry_parser", reason=f"telemetry-parser {MISSING}")
+    path = tmp_path / "camera.log"  # by its content
+    path.write_text(GCSV)
+    recording = read(path)
+    counts = np.array(
+        [
+            [39, 86, 183, -1137, -15689, -2986],
+            [56, 100, 202, -1179, -15694, -2887],
+            [63, 108, 218, -1247, -15702, -2794],
+        ]
+    )
+    np.testing.assert_allclose(recording.rate, counts[:, :3] * 0.00122173047, rtol=1e-6)
+    np.testing.assert_allclose(recording.specific_force, counts[:, 3:] * 0.00048828125 * 9.80665, rtol=1e-6)
+    np.testing.assert_allclose(recording.time, [0.0, 1e-3, 2e-3], atol=1e-12)
+    assert recording.magnetic_field is None
+    assert "potatocam custom logger name" in recording.remarks[0]
+    (tmp_path / "none.mp4").write_bytes(b"\0\0\0\x18ftypmp42" + bytes(200))
+    with pytest.raises(InputError, match=r"none.mp4 (cannot be read by telemetry-parser|.*holds no gyro samples)"):
+        read(tmp_path / "none.mp4")
+
+
+def test_a_decoded_blackbox_is_a_table(tmp_path):
+    """What blackbox_decode writes with units."""
+    path = tmp_path / "log.csv"
+    head = [
+        "loopIteration",
+        "time (us)",
+        *(f"gyroADC[{k}] (deg/s)" for k in range(3)),
+        *(f"accSmooth[{k}] (g)" for k in range(3)),
+    ]
+    path.write_text(",".join(head) + "\n" + "".join(f"{k},{1000 * k},1,2,3,0,0,1\n" for k in range(5)))
+    recording = read(path)
+    np.testing.assert_allclose(recording.time, 1e-3 * np.arange(5), atol=1e-12)
+    np.testing.assert_allclose(recording.rate[0], np.radians([1, 2, 3]), rtol=1e-15)
+    np.testing.assert_allclose(recording.specific_force[0], [0, 0, 9.80665], rtol=1e-15)
+
+
 # --------------------------------------------------------------------------------------------- EuRoC, trajectories
 
 

@@ -13,6 +13,8 @@ of it is in :mod:`strapdown.ahrs`.
     ROS bags.
 ``ulog``
     Flight logs of PX4.
+``telemetry``
+    Logs of cameras, flight controllers and phones.
 ``trajectories``
     Folders of EuRoC and TUM-VI, TUM trajectories as references.
 ``broad``

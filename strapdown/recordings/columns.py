@@ -89,16 +89,17 @@ class Column:
 def column(cell: str) -> Column:
     """Return a header's cell as name and unit; in parentheses only what is a known unit is taken for one."""
     text = " ".join(cell.replace("\N{NO-BREAK SPACE}", " ").split()).strip('"')
+    unit = ""
+    parted = re.fullmatch(r"(.*\S)\s*\(([^()]*)\)", text)
+    if parted and any(unit_of(group, parted[2]) for group in UNITS):
+        text, unit = parted[1], parted[2]
     indexed = re.fullmatch(r"(.*\S)\s*\[([012])\]", text)  # accelerometer_m_s2[0] of flight logs
     if indexed:
-        return Column(f"{indexed[1]}[{indexed[2]}]")
+        return Column(f"{indexed[1]}[{indexed[2]}]", unit)
     bracketed = re.fullmatch(r"(.*?)\s*\[(.*)\]?", text)
     if bracketed and bracketed[1]:
         return Column(bracketed[1].strip(), bracketed[2].removesuffix("]").strip())
-    parted = re.fullmatch(r"(.*\S)\s*\(([^()]*)\)", text)
-    if parted and any(unit_of(group, parted[2]) for group in UNITS):
-        return Column(parted[1], parted[2])
-    return Column(text)
+    return Column(text, unit)
 
 
 def unit_of(group: str, text: str) -> str:

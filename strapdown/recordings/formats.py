@@ -17,7 +17,7 @@ import numpy as np
 
 from strapdown import recordfiles
 from strapdown.checks import InputError
-from strapdown.recordings import ros, trajectories
+from strapdown.recordings import ros, telemetry, trajectories
 from strapdown.recordings.recording import Recording, with_gyro
 from strapdown.records import Estimate, ImuRecord
 
@@ -95,6 +95,12 @@ FORMATS: tuple[Format, ...] = (
         write="dataframes:write_parquet",
         write_estimate="estimates:write_parquet",
         estimate_options=("sequence", "frame"),
+    ),
+    Format(
+        name="camera or flight log",
+        endings=telemetry.ENDINGS,
+        recognised=lambda path, head: telemetry.is_log(head),
+        read="telemetry:read_telemetry",
     ),
     Format(
         name="EuRoC folder",

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, one_of
-from strapdown.recordings.extras import library
+from strapdown.recordings.extras import library, with_ending
 from strapdown.recordings.recording import MAGNETIC_UNITS, Recording, at_nearest, relative_time, with_gyro
 from strapdown.records import Estimate
 
@@ -245,11 +245,7 @@ def _named(path: Path, folder: Path) -> Path:
     with open(path, "rb") as stream:
         head = stream.read(16)
     suffix = next((suffix for magic, suffix in _SUFFIX.items() if head.startswith(magic)), path.suffix)
-    if path.suffix == suffix:
-        return path
-    link = folder / f"{path.stem}{suffix}"
-    link.symlink_to(path.absolute())
-    return link
+    return with_ending(path, suffix, folder)
 
 
 # ----------------------------------------------------------------------------------------------------------- what is whole
