@@ -37,7 +37,7 @@ def convert(
         typer.Argument(
             metavar="OUT",
             help="File whose ending names the format: .csv, .tsv, .parquet, .bag (ROS 1), .mcap or .db3 (ROS 2), .h5 (BROAD); of an "
-            "estimate .csv, .tsv, .parquet, .tum.",
+            "estimate .csv, .tsv, .parquet, .tum, .rrd.",
         ),
     ],
     gyro_unit: GyroUnit = None,
