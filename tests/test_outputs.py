@@ -212,7 +212,7 @@ def test_what_an_ending_has_no_room_for_is_refused(case, tmp_path):
     estimate, _ = case
     with pytest.raises(InputError, match=r"ends in '.xls', and an estimate is written as .bag, "):
         recordings.write(estimate, tmp_path / "x.xls")
-    with pytest.raises(InputError, match="is TUM trajectory, which has no sequence"):
+    with pytest.raises(InputError, match=r"x.tum \(TUM trajectory\) has no sequence"):
         recordings.write(estimate, tmp_path / "x.tum", sequence="ZYX")
     with pytest.raises(InputError, match="holds the samples too; give the recording"):
         recordings.write(estimate, tmp_path / "x.bag")

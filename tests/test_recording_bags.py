@@ -193,6 +193,24 @@ def test_a_folder_whose_recorder_was_killed_is_read_from_its_files(bag):
     assert "has no metadata.yaml" in " ".join(recording.remarks)
 
 
+def test_a_folder_of_several_bags_is_none(bag, tmp_path):
+    """Bags of other names in one folder are not the parts of one."""
+    for name in ("one", "two"):
+        (tmp_path / f"{name}.mcap").write_bytes(bag("mcap", imu()[1], name=f"f{name}").read_bytes())
+    with pytest.raises(InputError, match="is a folder, and no recording"):
+        read(tmp_path)
+
+
+def test_parts_of_a_bag_without_metadata_are_read_in_their_order(bag):
+    values, content = imu(60)
+    path = bag("folder", content[:20], name="parts")
+    (path / "metadata.yaml").unlink()
+    (path / "parts.mcap").rename(path / "parts_0.mcap")
+    for k in (1, 2):
+        (path / f"parts_{k}.mcap").write_bytes(bag("mcap", content[20 * k : 20 * k + 20], name=f"x{k}").read_bytes())
+    np.testing.assert_array_equal(read(path).rate, values[:, :3])
+
+
 def test_content_decides_not_the_ending(bag, tmp_path):
     values, content = imu()
     for suffix in ("bag", "mcap", "db3"):

@@ -111,8 +111,8 @@ def estimate(
     to: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Write the estimate to this file too, in the format of its ending: .csv, .tsv, .parquet, .tum, .h5, .rrd (Rerun), and of a recording "
-            ".bag, .mcap or .db3 with orientation and covariance filled in; may be repeated."
+            help="Write the estimate to this file too, in the format of its ending: .csv, .tsv, .parquet, .tum, .h5, .rrd (Rerun), and of "
+            "a recording .bag, .mcap or .db3 with orientation and covariance filled in; may be repeated."
         ),
     ] = None,
     euler: Annotated[

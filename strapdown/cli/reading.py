@@ -24,7 +24,7 @@ Columns = Annotated[
     typer.Option(
         "--columns",
         metavar="ROLE=NAME,…",
-        help="Table: its columns where they are not the usual ones, such as time=timestamp[us],gx=gyro_x[dps].",
+        help="Table: its columns where they are not the usual ones, unit in parentheses: time=timestamp(us),gx=gyro_x(dps),gy=….",
     ),
 ]
 Topic = Annotated[

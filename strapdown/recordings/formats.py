@@ -253,7 +253,7 @@ def _refuse_option(file: Path, found: Format, name: str, value: Any) -> None:
     what = {"columns": "columns go with a table (CSV, Parquet)", "topic": "a topic goes with a bag or a flight log"}[
         name
     ]
-    raise InputError(f"{file.name} is {found.name}, and {what}; drop the option")
+    raise InputError(f"{file.name} ({found.name}): {what}; drop the option")
 
 
 def write(
@@ -304,10 +304,10 @@ def estimate_format(path: str | os.PathLike[str], options: Iterable[str] = (), *
     found = _by_ending(path, "write_estimate")
     for name in options:
         if name not in found.estimate_options:
-            raise InputError(f"{path} is {found.name}, which has no {name}; leave it out, or choose another ending")
+            raise InputError(f"{path} ({found.name}) has no {name}; leave it out, or choose another ending")
     if found.with_samples and not recording:
         raise InputError(
-            f"{path} is {found.name}, which holds the samples too; give the recording that the estimate was made from, or choose another "
+            f"{path} ({found.name}) holds the samples too; give the recording that the estimate was made from, or choose another "
             "ending"
         )
     return found

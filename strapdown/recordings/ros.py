@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import bz2
 import os
+import re
 import shutil
 import sqlite3
 import struct
@@ -76,7 +77,12 @@ def is_folder(path: Path) -> bool:
 
 
 def _storages(path: Path) -> list[Path]:
-    return sorted([*path.glob("*.mcap"), *path.glob("*.db3")])
+    """Return the storage files of a folder in their order: named as the folder, or that and a number."""
+    found = [one for suffix in (".mcap", ".db3") for one in path.glob(f"*{suffix}")]
+    numbers = {one: re.fullmatch(rf"{re.escape(path.absolute().name)}(?:_(\d+))?", one.stem) for one in found}
+    return sorted(
+        (one for one, number in numbers.items() if number), key=lambda one: int((numbers[one] or [0, 0])[1] or 0)
+    )
 
 
 # ----------------------------------------------------------------------------------------------------------- reading
