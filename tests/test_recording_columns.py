@@ -163,6 +163,17 @@ def test_what_is_no_plain_sample_is_not_taken_for_one(table, name):
     assert recording.remarks == ()
 
 
+def test_columns_that_nobody_asks_for_may_hold_anything(table, tmp_path):
+    path = tmp_path / "labels.csv"
+    path.write_text(
+        "date,time,gx [dps],gy,gz,label\n2024-03-01T12:00:00Z,0,1,2,3,walk\n2024-03-01T12:00:01Z,1,1,2,3,\n"
+    )
+    recording = read(path)
+    np.testing.assert_allclose(recording.rate[1], np.radians([1, 2, 3]), rtol=1e-15)
+    with pytest.raises(InputError, match=r"data row 1, column label is 'walk', not a number"):
+        read(path, columns={"gx": "label"})
+
+
 def test_temperature_goes_along(table):
     recording = read(table("time,gx [rad/s],gy,gz,temperature [°C],a1,a2,mx,my,mz"))
     np.testing.assert_array_equal(recording.temperature, VALUES[:, 4])

@@ -139,7 +139,7 @@ def parse_mapping(text: str) -> dict[str, str]:
 def recording(
     source: str,
     header: Sequence[str],
-    values: Callable[[int], Array],
+    load: Callable[[Sequence[int]], Mapping[int, Array]],
     clock_ns: Callable[[int], tuple[Array, int] | None],
     *,
     units: Mapping[str, str] | None = None,
@@ -154,10 +154,10 @@ def recording(
         What errors call the table.
     header : sequence of str
         Names of the columns, perhaps with their units.
-    values : callable
-        Returns a column's numbers (n,), empty fields NaN, by its number.
+    load : callable
+        Returns the numbers (n,) of columns, empty fields NaN, of their places; called once.
     clock_ns : callable
-        Returns (time, epoch_ns) of a column that holds stamps as whole ns or dates, None of one that holds numbers.
+        Returns (time, epoch_ns) of a loaded column that holds stamps as whole ns or dates, None of one that holds numbers.
     units : mapping, optional
         Units of ``time``, ``gyro``, ``accelerometer``, ``magnetometer`` where the header does not declare them.
     mapping : mapping, optional
@@ -177,6 +177,7 @@ def recording(
             raise InputError(_lacks(source, missing, columns))
     present = {_group(role) for role in roles}
     chosen = _units(source, present, declared, units or {})
+    values = load(sorted(set(roles.values()))).__getitem__
     _need_digits(source, values, roles)
     stamps = clock_ns(roles["time"])
     time, epoch = _seconds(values(roles["time"]), TIME_UNITS[chosen["time"]]) if stamps is None else stamps
@@ -224,7 +225,7 @@ def _lacks(source: str, missing: Sequence[str], columns: Sequence[Column]) -> st
     has = ", ".join(one.name for one in columns)
     return (
         f"{source}: the header lacks {', '.join(missing)} (it has: {has}); name the columns, as in "
-        f"--columns {missing[0]}={columns[0].name or 'NAME'},…"
+        f"--columns {missing[0]}=NAME,…"
     )
 
 
@@ -248,10 +249,9 @@ def _roles(
             unit_by_role[role] = wanted.unit
     guessed: list[str] = []
     for group, members in GROUPS.items():
-        if any(role in roles for role in members):
-            continue
-        if any(role in names for role in members):
-            roles |= {role: names.index(role) for role in members if role in names}
+        named = {role: names.index(role) for role in members if role in names}
+        if named or any(role in roles for role in members):
+            roles = named | roles
             continue
         found_unit = _guess(source, group, columns)
         if found_unit is not None:

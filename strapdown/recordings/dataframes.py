@@ -79,7 +79,15 @@ def from_table(
             return relative_time(x.astype(np.int64))
         return None
 
-    return naming.recording(source, names, values, clock_ns, units=units, mapping=columns, gyro_alone=gyro_alone)
+    return naming.recording(
+        source,
+        names,
+        lambda places: {k: values(k) for k in places},
+        clock_ns,
+        units=units,
+        mapping=columns,
+        gyro_alone=gyro_alone,
+    )
 
 
 def _columns(source: str, table: Any) -> dict[str, NDArray[np.generic]]:

@@ -13,7 +13,6 @@ counts from 1970, else in s.
 from __future__ import annotations
 
 import csv
-import functools
 import math
 import os
 import re
@@ -74,7 +73,7 @@ def read_csv(
             return naming.recording(
                 file.name,
                 table.header,
-                lambda k: table.numbers[:, k],
+                table.load,
                 table.clock_ns,
                 units=units,
                 mapping=columns,
@@ -87,7 +86,7 @@ def read_csv(
 
 
 class _Table:
-    """A header and rows of numbers, which are read when they are first asked for: a header that will not do is refused before."""
+    """A header and rows of numbers, of which only the columns that are asked for are read: the others may hold anything."""
 
     def __init__(self, source: str, lines: Iterator[str]) -> None:
         self.source = source
@@ -95,24 +94,13 @@ class _Table:
         self.header = head.names
         self._separator = head.separator
         self._whole: dict[int, list[int]] = {}  # columns of large whole numbers
+        self._rows_read = 0
         self._rows = csv.reader(_rest(head.first, lines), delimiter=head.separator)
 
-    def clock_ns(self, k: int) -> tuple[Array, int] | None:
-        """Return time and epoch of a column of large whole stamps, in ns; None of others."""
-        numbers = self.numbers
-        whole = self._whole.get(k)
-        unit = naming.unit_of("time", naming.column(self.header[k]).unit)
-        if whole is None or len(whole) != len(numbers) or unit not in ("", "ns") or abs(whole[0]) < CLOCK_OFFSET * 1e9:
-            return None
-        stamps = np.array(whole, dtype=np.int64)
-        return (stamps - stamps[0]) / 1e9, whole[0]
-
-    @functools.cached_property
-    def numbers(self) -> Array:
-        """The numbers (n, columns); empty fields are NaN."""
+    def load(self, places: Sequence[int]) -> dict[int, Array]:
+        """Return the numbers (n,) of columns; empty fields are NaN."""
         result: list[list[float]] = []
         width = len(self.header)
-        commas = self._separator != ","
         for k, row in enumerate(self._rows):
             if len(row) == width + 1 and not row[-1].strip():
                 del row[-1]  # a separator at the end of the line
@@ -121,30 +109,45 @@ class _Table:
                     f"{self.source}: data row {k + 1} has {len(row)} fields, the header {width}; {_why(row, width)}"
                 )
             try:
-                result.append([float(cell) if cell.strip() else np.nan for cell in row])
+                result.append([float(cell) if (cell := row[j]).strip() else np.nan for j in places])
             except ValueError:
-                result.append(
-                    [
-                        _number(self.source, k, self.header[j], cell.replace(",", ".") if commas else cell, cell)
-                        for j, cell in enumerate(row)
-                    ]
-                )
+                result.append([self._number(k, j, row[j]) for j in places])
             if k == 0:
-                self._whole = {j: [] for j, x in enumerate(result[0]) if abs(x) >= _LARGE}
+                self._whole = {j: [] for j, x in zip(places, result[0], strict=True) if abs(x) >= _LARGE}
             for j, whole in self._whole.items():
                 if re.fullmatch(r"\s*\d{1,19}\s*", row[j]):
                     whole.append(int(row[j]))
         if not result:
             raise InputError(f"{self.source} has a header but no data rows")
-        return np.array(result)
+        self._rows_read = len(result)
+        return dict(zip(places, np.array(result).T.copy(), strict=True))
+
+    def _number(self, row: int, place: int, cell: str) -> float:
+        """Return a cell's number; its decimals may have a comma where that is not the separator."""
+        try:
+            return float(cell if self._separator == "," else cell.replace(",", ".")) if cell.strip() else np.nan
+        except ValueError:
+            raise InputError(
+                f"{self.source}: data row {row + 1}, column {self.header[place]} is {cell!r}, not a number"
+            ) from None
+
+    def clock_ns(self, k: int) -> tuple[Array, int] | None:
+        """Return time and epoch of a column of large whole stamps, in ns, that was loaded; None of others."""
+        whole = self._whole.get(k)
+        unit = naming.unit_of("time", naming.column(self.header[k]).unit)
+        if not whole or unit not in ("", "ns") or whole[0] < CLOCK_OFFSET * 1e9 or len(whole) != self._rows_read:
+            return None
+        stamps = np.array(whole, dtype=np.int64)
+        return (stamps - stamps[0]) / 1e9, whole[0]
 
 
 class _Head:
-    """The lines before the numbers: the names of the columns, the separator, and the first line of numbers (empty: none)."""
+    """The lines before the numbers: the names of the columns, the separator, and the first lines of numbers."""
 
     def __init__(self, source: str, lines: Iterator[str]) -> None:
         titles: list[str] = []
-        comment = self.first = ""
+        comment = ""
+        self.first: list[str] = []
         for line in lines:
             if not line.strip():
                 continue
@@ -152,14 +155,14 @@ class _Head:
                 comment = line.lstrip().lstrip("#").strip() or comment
                 continue
             if titles and _numeric(line):
-                self.first = line
+                self.first = [line]
                 break
             if not titles and _numeric(line):  # numbers at once: the last comment may name them
-                titles, self.first = [comment], line
+                titles, self.first = [comment], [line]
                 break
             titles.append(line.rstrip("\r\n"))
             if len(titles) == 3:
-                self.first = titles.pop()
+                self.first = [titles.pop()]
                 break
         if not any(title.strip() for title in titles):
             words = "has no header" if self.first else "is empty"
@@ -167,7 +170,10 @@ class _Head:
         self.separator = max(SEPARATORS, key=titles[0].count)
         cells = [next(csv.reader([title], delimiter=self.separator)) for title in titles]
         if len(cells) == 2 and not self._second_row(cells[0], cells[1]):
-            self.first, cells = titles[1], cells[:1]  # a row of the data that is no number: said with its place
+            self.first, cells = (
+                [titles[1], *self.first],
+                cells[:1],
+            )  # a row of the data that is no number: said with its place
         self.names = [cell.strip() for cell in cells[0]] if len(cells) == 1 else _joined(*cells)
         while self.names and not self.names[-1]:
             self.names.pop()
@@ -178,9 +184,8 @@ class _Head:
         return len(first) == len(second) and not any(_is_number(cell) and cell.strip() for cell in second)
 
 
-def _rest(first: str, lines: Iterator[str]) -> Iterator[str]:
-    if first:
-        yield first
+def _rest(first: Sequence[str], lines: Iterator[str]) -> Iterator[str]:
+    yield from first
     for line in lines:
         if line.strip() and not line.lstrip().startswith("#"):
             yield line
@@ -200,10 +205,9 @@ def _joined(first: Sequence[str], second: Sequence[str]) -> list[str]:
 
 
 def _numeric(line: str) -> bool:
-    """Return whether a line begins with a number, of the separators that there are; empty first fields do not count."""
-    cells = [cell.strip().strip('"') for cell in re.split(r"[,;\t|]", line)]
-    filled = [cell for cell in cells if cell]
-    return bool(filled) and _is_number(filled[0])
+    """Return whether a line is one of numbers: most of its filled fields are, of whatever separator."""
+    filled = [cell for part in re.split(r"[,;\t|]", line) if (cell := part.strip().strip('"'))]
+    return bool(filled) and 2 * sum(map(_is_number, filled)) >= len(filled)
 
 
 def _is_number(cell: str) -> bool:
@@ -212,13 +216,6 @@ def _is_number(cell: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-def _number(source: str, row: int, name: str, cell: str, said: str) -> float:
-    try:
-        return float(cell) if cell.strip() else np.nan
-    except ValueError:
-        raise InputError(f"{source}: data row {row + 1}, column {name} is {said!r}, not a number") from None
 
 
 def _why(row: Sequence[str], width: int) -> str:
