@@ -171,7 +171,7 @@ def test_columns_that_nobody_asks_for_may_hold_anything(table, tmp_path):
     recording = read(path)
     np.testing.assert_allclose(recording.rate[1], np.radians([1, 2, 3]), rtol=1e-15)
     with pytest.raises(InputError, match=r"data row 1, column label is 'walk', not a number"):
-        read(path, columns={"gx": "label"})
+        read(path, columns={"gy": "label"})
 
 
 def test_temperature_goes_along(table):
