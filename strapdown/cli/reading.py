@@ -56,7 +56,8 @@ def told(
         ]
         for name in options:
             what = "a table" if name != "topic" else "a bag or a flight log"
-            raise InputError(f"--{name} goes with {what}; the record {path} says itself what it holds")
+            own = "tells its units itself" if name.endswith("-unit") else "says itself what it holds"
+            raise InputError(f"--{name} goes with {what}; the record {path} {own}")
     found: dict[str, Any] = {"units": given}
     if columns:
         found["columns"] = recordings.parse_mapping(columns)

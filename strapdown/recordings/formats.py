@@ -164,7 +164,9 @@ def format_of(path: str | os.PathLike[str]) -> Format:
     if found is not None:
         return found
     if file.is_dir():
-        raise InputError(f"{path} is a folder, and no recording ({', '.join(_folders())}); name the file in it")
+        raise InputError(
+            f"{path} is a folder; name the file in it (a folder is read that is a ROS 2 bag, or holds imu0/data.csv as EuRoC)"
+        )
     by_ending = next((one for one in FORMATS if file.suffix.lower() in one.endings), None)
     if by_ending is not None:
         return by_ending
@@ -173,10 +175,6 @@ def format_of(path: str | os.PathLike[str]) -> Format:
     raise InputError(
         f"{file} has the suffix {file.suffix!r} and the content of no known format; recordings are {_known()}"
     )
-
-
-def _folders() -> list[str]:
-    return ["ROS 2 bag with metadata.yaml", "EuRoC with imu0/data.csv"]
 
 
 def _known() -> str:
