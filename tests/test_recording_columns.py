@@ -163,6 +163,22 @@ def test_what_is_no_plain_sample_is_not_taken_for_one(table, name):
     assert recording.remarks == ()
 
 
+def test_a_time_may_be_a_date(tmp_path):
+    path = tmp_path / "phone.csv"
+    rows = (
+        "2024-03-01T13:00:00.000250+01:00,1,2,3",
+        "2024-03-01T12:00:00.010250Z,1,2,3",
+        "2024-03-01 12:00:00.020250,1,2,3",
+    )
+    path.write_text("timestamp,gyro_x [dps],gyro_y,gyro_z\n" + "\n".join(rows) + "\n")
+    recording = read(path)
+    np.testing.assert_allclose(recording.time, [0.0, 0.01, 0.02], atol=1e-12)
+    assert recording.epoch_ns == 1_709_294_400_000_250_000
+    path.write_text(path.read_text().replace("2024-03-01 12", "2024-13-01 12"))
+    with pytest.raises(InputError, match=r"data row 3, column timestamp is '2024-13-01 12:00:00.020250', not a number"):
+        read(path)
+
+
 def test_columns_that_nobody_asks_for_may_hold_anything(table, tmp_path):
     path = tmp_path / "labels.csv"
     path.write_text(

@@ -12,6 +12,8 @@ be told.
     ``algorithms``, ``integrate``, ``coning-budget``
 ``estimation``
     ``estimate``
+``reading``
+    Options of every command that reads a recording.
 ``conversion``
     ``convert``
 ``campaigns``

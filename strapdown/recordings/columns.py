@@ -139,7 +139,7 @@ def parse_mapping(text: str) -> dict[str, str]:
 def recording(
     source: str,
     header: Sequence[str],
-    load: Callable[[Sequence[int]], Mapping[int, Array]],
+    load: Callable[[Sequence[int], int], Mapping[int, Array]],
     clock_ns: Callable[[int], tuple[Array, int] | None],
     *,
     units: Mapping[str, str] | None = None,
@@ -155,7 +155,7 @@ def recording(
     header : sequence of str
         Names of the columns, perhaps with their units.
     load : callable
-        Returns the numbers (n,) of columns, empty fields NaN, of their places; called once.
+        Returns the numbers (n,) of columns, empty fields NaN, of their places and that of the time; called once.
     clock_ns : callable
         Returns (time, epoch_ns) of a loaded column that holds stamps as whole ns or dates, None of one that holds numbers.
     units : mapping, optional
@@ -177,7 +177,7 @@ def recording(
             raise InputError(_lacks(source, missing, columns))
     present = {_group(role) for role in roles}
     chosen = _units(source, present, declared, units or {})
-    values = load(sorted(set(roles.values()))).__getitem__
+    values = load(sorted(set(roles.values())), roles["time"]).__getitem__
     _need_digits(source, values, roles)
     stamps = clock_ns(roles["time"])
     time, epoch = _seconds(values(roles["time"]), TIME_UNITS[chosen["time"]]) if stamps is None else stamps

@@ -82,7 +82,7 @@ def from_table(
     return naming.recording(
         source,
         names,
-        lambda places: {k: values(k) for k in places},
+        lambda places, _: {k: values(k) for k in places},
         clock_ns,
         units=units,
         mapping=columns,

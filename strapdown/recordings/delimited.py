@@ -4,7 +4,8 @@ The separator is the one of ``, ; tab |`` that parts the header into most column
 before the numbers, the last of them is it (EuRoC). Two header rows are joined, an empty cell of the first taking what stands before it
 (RepoIMU), and a second row of units goes into brackets. Where the separator is no comma, decimals may have commas. Which column is what:
 :mod:`strapdown.recordings.columns`. Axes, units and clock are those of the file's columns; stamps written as whole numbers are read as
-such, so that nanoseconds since 1970 keep all their digits.
+such, so that nanoseconds since 1970 keep all their digits; a time may be a date of ISO 8601, to the microsecond, UTC unless it names a
+zone.
 
 :func:`write_csv` writes the package's own names with units in brackets, 17 digits a number; time in ns of the source's clock where that
 counts from 1970, else in s.
@@ -13,6 +14,7 @@ counts from 1970, else in s.
 from __future__ import annotations
 
 import csv
+import datetime
 import math
 import os
 import re
@@ -97,8 +99,8 @@ class _Table:
         self._rows_read = 0
         self._rows = csv.reader(_rest(head.first, lines), delimiter=head.separator)
 
-    def load(self, places: Sequence[int]) -> dict[int, Array]:
-        """Return the numbers (n,) of columns; empty fields are NaN."""
+    def load(self, places: Sequence[int], time: int) -> dict[int, Array]:
+        """Return the numbers (n,) of columns; empty fields are NaN, dates of the time are ns since 1970."""
         result: list[list[float]] = []
         width = len(self.header)
         for k, row in enumerate(self._rows):
@@ -111,19 +113,24 @@ class _Table:
             try:
                 result.append([float(cell) if (cell := row[j]).strip() else np.nan for j in places])
             except ValueError:
-                result.append([self._number(k, j, row[j]) for j in places])
+                result.append([self._number(k, j, row[j], j == time) for j in places])
             if k == 0:
                 self._whole = {j: [] for j, x in zip(places, result[0], strict=True) if abs(x) >= _LARGE}
             for j, whole in self._whole.items():
                 if re.fullmatch(r"\s*\d{1,19}\s*", row[j]):
                     whole.append(int(row[j]))
+                elif j == time and (date := _date(row[j])) is not None:
+                    whole.append(date)
         if not result:
             raise InputError(f"{self.source} has a header but no data rows")
         self._rows_read = len(result)
         return dict(zip(places, np.array(result).T.copy(), strict=True))
 
-    def _number(self, row: int, place: int, cell: str) -> float:
-        """Return a cell's number; its decimals may have a comma where that is not the separator."""
+    def _number(self, row: int, place: int, cell: str, time: bool) -> float:
+        """Return a cell's number; its decimals may have a comma where that is not the separator, and a time may be a date."""
+        date = _date(cell) if time else None
+        if date is not None:
+            return float(date)
         try:
             return float(cell if self._separator == "," else cell.replace(",", ".")) if cell.strip() else np.nan
         except ValueError:
@@ -182,6 +189,20 @@ class _Head:
     def _second_row(first: Sequence[str], second: Sequence[str]) -> bool:
         """Return whether a second row of words goes with the first: no number in it, and of the same width."""
         return len(first) == len(second) and not any(_is_number(cell) and cell.strip() for cell in second)
+
+
+def _date(cell: str) -> int | None:
+    """Return a date and time of ISO 8601 in ns since 1970, UTC where it names no zone; None of other text."""
+    if not re.match(r"\s*\d{4}-\d\d-\d\d[T ]", cell):
+        return None
+    try:
+        date = datetime.datetime.fromisoformat(cell.strip())
+    except ValueError:
+        return None
+    since = (date if date.tzinfo else date.replace(tzinfo=datetime.UTC)) - datetime.datetime(
+        1970, 1, 1, tzinfo=datetime.UTC
+    )
+    return (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000
 
 
 def _rest(first: Sequence[str], lines: Iterator[str]) -> Iterator[str]:
