@@ -20,7 +20,20 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     # 0 mathematics, and what everything stands on
     ("checks", "files", "units", "tables", "randomness", "quaternion", "kinematics", "kernels"),
     # 1 models
-    ("motion", "coning", "flicker", "gyro", "datasheets", "orbit", "vectors", "allan", "allan_gaps", "allan_temperature", "noise_parameters", "wahba"),
+    (
+        "motion",
+        "coning",
+        "flicker",
+        "gyro",
+        "datasheets",
+        "orbit",
+        "vectors",
+        "wahba",
+        "allan",
+        "allan_gaps",
+        "allan_temperature",
+        "noise_parameters",
+    ),
     # 2 data
     ("records", "recordings", "recordfiles", "scenarios", "outputs"),
     # 3 estimators
