@@ -15,8 +15,8 @@ Units
     SI and radians inside. Degrees, °/h, °/√h and arcseconds appear at the rim only, with the unit in the name.
 
 Modules, from the ground up: ``quaternion``, ``kinematics``, ``kernels`` (mathematics); ``motion``, ``coning``, ``gyro``,
-``vectors``, ``allan``, ``wahba`` (models); ``records``, ``recordings``, ``scenarios`` (data); ``mekf``, ``ahrs``, ``smoother``,
-``family`` (estimators); ``consistency``, ``montecarlo``, ``coning_study`` (analysis); ``plots``, ``cli`` (faces).
+``vectors``, ``allan``, ``wahba`` (models); ``records``, ``recordings``, ``outputs``, ``scenarios`` (data); ``mekf``, ``ahrs``,
+``smoother``, ``family`` (estimators); ``consistency``, ``montecarlo``, ``coning_study`` (analysis); ``plots``, ``cli`` (faces).
 """
 
 __version__ = "0.1.0"

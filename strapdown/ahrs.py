@@ -137,8 +137,29 @@ def aligned(recording: Recording, latency: float = 0.0, magnetometer: float = 0.
                 name == "magnetic_field"
             ):  # a field of zero is a missing sample, and nothing lies between it and the next
                 samples = np.where(np.any(samples != 0.0, axis=1, keepdims=True), samples, np.nan)
-            moved[name] = np.stack([np.interp(recording.time + late, recording.time, one) for one in samples.T], axis=1)
+            moved[name] = _moved(recording.time, samples, late)
     return replace(recording, **moved)
+
+
+def _moved(time: Array, samples: Array, late: float) -> Array:
+    """Return samples as they were ``late``, s, before their stamps; nothing is taken across a gap.
+
+    Of a slower sensor, which has samples at fewer than half of the stamps, the rows between them stay missing.
+    """
+    known = np.flatnonzero(np.isfinite(samples).all(axis=1))
+    if 2 * len(known) >= len(time):
+        return np.stack([np.interp(time + late, time, one) for one in samples.T], axis=1)
+    result = np.full(samples.shape, np.nan)
+    if len(known) < 2:
+        return result
+    stamps = time[known]
+    wanted = stamps + late
+    result[known] = np.stack([np.interp(wanted, stamps, one) for one in samples[known].T], axis=1)
+    steps = np.diff(stamps)
+    place = np.clip(np.searchsorted(stamps, wanted), 1, len(steps)) - 1
+    across = (steps[place] > 1.5 * np.median(steps)) & (wanted > stamps[place]) & (wanted < stamps[place + 1])
+    result[known[across]] = np.nan
+    return result
 
 
 def magnetometer_latency(recording: Recording) -> tuple[float, float]:

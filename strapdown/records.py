@@ -11,16 +11,19 @@ import dataclasses
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 import strapdown
-from strapdown import coning, quaternion, reading
+from strapdown import coning, outputs, quaternion, reading
 from strapdown.checks import Array, InputError, array, count, finite, increasing, instance, one_of, unit_quaternions
 from strapdown.files import set_attributes, whole_hdf5, written_beside
 from strapdown.vectors import VectorMeasurements
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 CONVENTIONS = (
     "quaternions Hamilton, scalar first, body to fixed frame: v_f = q v_b q^-1; error state (dtheta, db): "
@@ -306,6 +309,28 @@ class Estimate:
     def sigma(self) -> Array:
         """Standard deviations (m, 6): rad, rad/s."""
         return np.sqrt(self.variance)
+
+    @property
+    def matrix(self) -> Array:
+        """Rotation matrices R_fb (m, 3, 3)."""
+        return quaternion.to_matrix(self.attitude)
+
+    @property
+    def rotation(self) -> Rotation:
+        """Attitudes as a ``scipy.spatial.transform.Rotation`` that takes body vectors to the fixed frame."""
+        return quaternion.to_rotation(self.attitude)
+
+    def euler(self, sequence: str = "ZYX") -> outputs.Angles:
+        """Return Euler angles (m, 3) and their σ, rad (:func:`strapdown.outputs.euler`)."""
+        return outputs.euler(self.attitude, sequence, outputs.attitude_covariance(self))
+
+    def heading(self, axis: str = "x") -> outputs.Angles:
+        """Return the heading (m,) of a body axis from North towards East, and its σ, rad (:func:`strapdown.outputs.heading`)."""
+        return outputs.heading(self.attitude, outputs.attitude_covariance(self), axis=axis)
+
+    def to_dataframe(self, **options: Any) -> Any:
+        """Return the estimate as a pandas ``DataFrame`` (:func:`strapdown.outputs.to_dataframe`)."""
+        return outputs.to_dataframe(self, **options)
 
 
 _ESTIMATE_UNITS = {

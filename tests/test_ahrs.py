@@ -445,3 +445,16 @@ def test_the_magnetometer_of_the_broad_trials_is_late(broad):
     found = np.array([ahrs.magnetometer_latency(read(file)) for file in sorted(broad.glob("*.hdf5"))])
     assert np.all(np.abs(found[:, 0] - 0.0112) < 3.0 * found[:, 1] + 3e-4)
     assert np.sum(found[:, 1] < 5e-4) >= 5
+
+
+def test_a_slower_magnetometer_is_moved_between_its_own_samples():
+    """Every fourth row holds a sample; a missing one among them is not bridged."""
+    time = 0.01 * np.arange(80)
+    field = np.full((80, 3), np.nan)
+    field[::4] = np.outer(1.0 + time[::4], [1.0, 2.0, 3.0])
+    field[40] = np.nan
+    recording = Recording(source="x", time=time, rate=np.zeros((80, 3)), magnetic_field=field)
+    moved = ahrs.aligned(recording, 0.01).magnetic_field
+    rows = np.setdiff1d(np.arange(0, 76, 4), [36, 40])
+    np.testing.assert_allclose(moved[rows], np.outer(1.01 + time[rows], [1.0, 2.0, 3.0]), rtol=1e-12)
+    assert np.isnan(np.delete(moved, [*rows, 76], axis=0)).all()

@@ -20,9 +20,22 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     # 0 mathematics, and what everything stands on
     ("checks", "equality", "reading", "files", "units", "tables", "randomness", "quaternion", "kinematics", "kernels"),
     # 1 models
-    ("motion", "coning", "flicker", "gyro", "datasheets", "orbit", "vectors", "allan", "wahba"),
+    (
+        "motion",
+        "coning",
+        "flicker",
+        "gyro",
+        "datasheets",
+        "orbit",
+        "vectors",
+        "wahba",
+        "allan",
+        "allan_gaps",
+        "allan_temperature",
+        "noise_parameters",
+    ),
     # 2 data
-    ("records", "recordings", "recordfiles", "scenarios"),
+    ("records", "recordings", "recordfiles", "scenarios", "outputs"),
     # 3 estimators
     ("estimation", "setup", "ahrs"),
     # 4 analysis

@@ -118,7 +118,8 @@ def test_what_a_record_does_not_tell_is_asked_for(run, record, tmp_path):
         ((record, "--attitude", "1,0,0,0", "--from-truth"), "give one of them"),
         ((record, "--robust", "hubert"), "did you mean 'huber'"),
         ((record, "--gate", 1.5), "between 0 and 1"),
-        ((record, "--time-unit", "ms"), "goes with a CSV file"),
+        ((record, "--time-unit", "ms"), "goes with a table"),
+        ((record, "--columns", "time=t"), "goes with a table"),
         ((tmp_path / "own.csv", "--gate", 0.99), "goes with a record"),
         ((tmp_path / "none.csv", "--gate", 0.99), "none.csv does not exist"),
     )

@@ -12,6 +12,10 @@ be told.
     ``algorithms``, ``integrate``, ``coning-budget``
 ``estimation``
     ``estimate``
+``reading``
+    Options of every command that reads a recording.
+``conversion``
+    ``convert``
 ``campaigns``
     ``montecarlo``
 ``judgement``
@@ -39,7 +43,18 @@ from typing import Annotated, Any
 import typer
 
 from strapdown.checks import InputError
-from strapdown.cli import campaigns, estimation, integration, judgement, planning, reporting, sensors, studies, tuning  # noqa: F401  (each registers its commands)
+from strapdown.cli import (  # noqa: F401  (each registers its commands)
+    campaigns,
+    conversion,
+    estimation,
+    integration,
+    judgement,
+    planning,
+    reporting,
+    sensors,
+    studies,
+    tuning,
+)
 from strapdown.cli.terminal import app, console, errors
 from strapdown.reading import NoDigestWarning
 

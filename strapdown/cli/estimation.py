@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,11 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from strapdown.cli.filters import filter_for
+from strapdown.cli.reading import RECORDING_HELP, AccelerometerUnit, Columns, GyroUnit, TimeUnit, Topic, told
 from strapdown.cli.terminal import app, console, doubt, need_own, show, table, writable, written
 
 if TYPE_CHECKING:
     from strapdown.estimation.states import State
     from strapdown.recordfiles import RecordFile
+    from strapdown.recordings import Recording
     from strapdown.records import Estimate, ImuRecord
     from strapdown.setup import FilterSetup
 
@@ -35,18 +38,16 @@ UNEVEN = 2.0
 def estimate(
     recording: Annotated[
         Path,
-        typer.Argument(
-            help="BROAD HDF5 file, CSV with time, gx, gy, gz, ax, ay, az[, mx, my, mz], or record of `strapdown simulate` (HDF5)."
-        ),
+        typer.Argument(help=f"{RECORDING_HELP}; or record of `strapdown simulate` (HDF5)."),
     ],
     out: Annotated[Path, typer.Option(help="Folder for estimate.h5, errors.json and the figures.")] = Path(
         "estimate-results"
     ),
-    gyro_unit: Annotated[str | None, typer.Option(help="Unit of a CSV file's gyro: rad/s or deg/s.")] = None,
-    accelerometer_unit: Annotated[
-        str | None, typer.Option(help="Unit of a CSV file's accelerometer: m/s2 or g.")
-    ] = None,
-    time_unit: Annotated[str | None, typer.Option(help="Unit of a CSV file's time: s, ms, us or ns.")] = None,
+    gyro_unit: GyroUnit = None,
+    accelerometer_unit: AccelerometerUnit = None,
+    time_unit: TimeUnit = None,
+    columns: Columns = None,
+    topic: Topic = None,
     gyro: Annotated[
         Path | None,
         typer.Option(
@@ -107,6 +108,17 @@ def estimate(
             "whose acceleration is white noise, without."
         ),
     ] = None,
+    to: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Write the estimate to this file too, in the format of its ending: .csv, .tsv, .parquet, .tum, .h5, .rrd (Rerun), and of "
+            "a recording .bag, .mcap or .db3 with orientation and covariance filled in; may be repeated."
+        ),
+    ] = None,
+    euler: Annotated[
+        str | None, typer.Option(help="With --to a table: Euler angles of this sequence, ZYX if not given.")
+    ] = None,
+    frame: Annotated[str | None, typer.Option(help="With --to: fixed frame ENU (if not given) or NED.")] = None,
     latency: Annotated[
         float | None,
         typer.Option(
@@ -117,17 +129,17 @@ def estimate(
     """Estimate attitude and gyro bias from a recording (accelerometer as vertical, magnetometer as heading) or a simulated record."""
     from strapdown.checks import InputError
     from strapdown.files import usable_folder
-    from strapdown.recordfiles import is_record
+    from strapdown.recordings import is_record
     from strapdown.records import read_attributes
 
     usable_folder("out", out)
     writable("out", *(out / name for name in FILES), sources=(recording, gyro, filter_file))
     need_own(out / FILES[0], "estimate", lambda path: bool(read_attributes(path)["kind"] == "strapdown estimate"))
-    given = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
-    units = {name: unit for name, unit in given.items() if unit}
+    layout = told(
+        recording, columns=columns, topic=topic, gyro=gyro_unit, accelerometer=accelerometer_unit, time=time_unit
+    )
+    exports = _exports(to or (), recording, euler, frame)
     if is_record(recording):
-        for name in units:
-            raise InputError(f"--{name}-unit goes with a CSV file; the record {recording} tells its units itself")
         for name, text in zip(RECORDING_ONLY, (motion, latency), strict=True):
             if text is not None:
                 raise InputError(f"--{name} goes with a recording; {recording} is a record of `strapdown simulate`")
@@ -145,6 +157,7 @@ def estimate(
             full_covariance is not False,
             observability,
             smooth,
+            exports,
         )
         return
     options = dict(
@@ -169,7 +182,43 @@ def estimate(
             raise InputError(
                 f"--{name.replace('_', '-')} goes with a record of `strapdown simulate`; {recording} is none"
             )
-    _estimate_recording(recording, out, units, gyro, bool(full_covariance), smooth, motion, latency)
+    _estimate_recording(recording, out, layout, gyro, bool(full_covariance), smooth, motion, latency, exports)
+
+
+def _exports(
+    to: Sequence[Path], recording: Path, euler: str | None, frame: str | None
+) -> list[tuple[Path, dict[str, Any]]]:
+    """Return the further files of an estimate with the options of their writers; what cannot be written is refused."""
+    from strapdown import outputs, recordings
+    from strapdown.checks import InputError, one_of
+
+    if frame is not None:
+        one_of("--frame", frame, outputs.FRAMES)
+    if euler is not None:
+        outputs.euler([[1.0, 0.0, 0.0, 0.0]], euler)
+    given = {name: value for name, value in (("sequence", euler), ("frame", frame)) if value is not None}
+    if given and not to:
+        raise InputError("--euler and --frame go with --to FILE; give the file")
+    found = []
+    for target in to:
+        writable("to", target, suffixes=recordings.writers("write_estimate"), sources=(recording,))
+        options: dict[str, Any] = dict(given)
+        chosen = recordings.estimate_format(target, given, recording=not recordings.is_record(recording))
+        if "source" in chosen.estimate_options and recordings.format_of(recording) is chosen:
+            options["source"] = recording
+        found.append((target, options))
+    return found
+
+
+def _export(
+    exports: Sequence[tuple[Path, dict[str, Any]]], estimate: Estimate, recording: Recording | None
+) -> list[Path]:
+    """Write an estimate to its further files and return them."""
+    from strapdown import recordings
+
+    for target, options in exports:
+        recordings.write(estimate, target, recording=recording, **options)
+    return [target for target, _ in exports]
 
 
 def _estimate_record(
@@ -186,6 +235,7 @@ def _estimate_record(
     full_covariance: bool,
     observability: bool,
     smooth: bool,
+    exports: Sequence[tuple[Path, dict[str, Any]]],
 ) -> None:
     """Run the filter over a record, tell and write what it made of it."""
     import numpy as np
@@ -267,6 +317,7 @@ def _estimate_record(
         if "nees_per_state" in found:
             line += f"; mean NEES per state {found['nees_per_state']:.3g} (right: about 1)"
         console.print(line + ".")
+    paths += _export(exports, result, None)
     seen = {s: i for s, i in result.innovations.items() if np.sum(i.used)}
     if seen:
         each = ", ".join(f"{np.mean(i.nis[i.used]) / i.innovation.shape[1]:.3g} {s}" for s, i in seen.items())
@@ -453,12 +504,13 @@ def _errors(result: Estimate, truth: Any) -> dict[str, float]:
 def _estimate_recording(
     recording: Path,
     out: Path,
-    units: dict[str, str],
+    layout: dict[str, Any],
     gyro: Path | None,
     full_covariance: bool,
     smooth: bool,
     motion: str | None,
     latency: float | None,
+    exports: Sequence[tuple[Path, dict[str, Any]]],
 ) -> None:
     """Run the filter over a recording: accelerometer as the vertical, magnetometer as the heading."""
     from strapdown import ahrs, plots, recordings, setup
@@ -471,7 +523,7 @@ def _estimate_recording(
 
     moved_by = one_of("--motion", motion or "hand", ahrs.MOTIONS)
     late = 1e-3 * non_negative("--latency", latency or 0.0, unit="ms")
-    source = recordings.read(recording, units=units)
+    source = recordings.read(recording, **layout)
     parameters = ahrs.MOTIONS[moved_by]
     if gyro is not None:
         parameters = replace(parameters, **process_noise(read_spec(gyro)))
@@ -514,6 +566,8 @@ def _estimate_recording(
         f"{used.source}: {len(used.time)} samples over {used.time[-1] - used.time[0]:.1f} s, started in the quiet second "
         f"from {used.time[0]:.2f} s."
     )
+    for remark in used.remarks:
+        console.print(remark)
     console.print(f"Fixed frame: {frame}.")
     doubt(source, recording)
     console.print(_beliefs(moved_by, parameters, result))
@@ -537,6 +591,7 @@ def _estimate_recording(
         rows = table("RMS error over the movement phase, degrees", *rms, left=0)
         rows.add_row(*(f"{value:.2f}" for value in rms.values()))
         show(rows)
+    paths += _export(exports, found, source)
     written(*paths, *(plots.save(figure, out / name) for name, figure in figures.items()))
 
 

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from strapdown.cli.reading import RECORDING_HELP, Columns, GyroUnit, TimeUnit, Topic, told
 from strapdown.cli.terminal import app, console, need_own, progress_bar, show, table, writable, written
 
 
@@ -48,13 +49,13 @@ def algorithms(
 
 @app.command()
 def integrate(
-    recording: Annotated[
-        Path, typer.Argument(help="Simulated record (HDF5), BROAD HDF5, or CSV with time, gx, gy, gz.")
-    ],
+    recording: Annotated[Path, typer.Argument(help=f"Simulated record (HDF5). {RECORDING_HELP}.")],
     algorithm: Annotated[str, typer.Option(help="Name of the algorithm; see `strapdown algorithms`.")] = "four-sample",
     out: Annotated[Path, typer.Option(help="HDF5 file for the attitude.")] = Path("attitude.h5"),
-    gyro_unit: Annotated[str | None, typer.Option(help="Unit of a CSV file's gyro: rad/s or deg/s.")] = None,
-    time_unit: Annotated[str | None, typer.Option(help="Unit of a CSV file's time: s, ms, us or ns.")] = None,
+    gyro_unit: GyroUnit = None,
+    time_unit: TimeUnit = None,
+    columns: Columns = None,
+    topic: Topic = None,
 ) -> None:
     """Integrate a gyro recording to attitude, starting at the true attitude if the file holds it, else at the identity."""
     import numpy as np
@@ -65,19 +66,17 @@ def integrate(
     writable("out", out, suffixes=(".h5", ".hdf5"), sources=(recording,))
     need_own(out, "integrate", lambda path: bool(records.read_attributes(path)["kind"] == "strapdown attitude"))
     chosen = coning.named(algorithm)
-    units = {name: unit for name, unit in (("gyro", gyro_unit), ("time", time_unit)) if unit}
+    layout = told(recording, columns=columns, topic=topic, gyro=gyro_unit, time=time_unit)
     gaps: list[tuple[float, float]] = []
     words = ""
     with progress_bar("reading, integrating, writing", 3) as advance:
-        if recordfiles.is_record(recording):
-            for name in units:
-                raise InputError(f"--{name}-unit goes with a CSV file; the record {recording} tells its units itself")
+        if recordings.is_record(recording):
             record = recordfiles.read_record(recording)
             time, increments = record.time, record.increments
             truth = None if record.truth is None else record.truth.attitude
         else:
-            source = recordings.read(recording, units=units, gyro_alone=True)
-            gaps, words = recordings.gaps(source.time), source.left_out_words
+            source = recordings.read(recording, **layout, gyro_alone=True)
+            gaps, words = recordings.gaps(source.time), " ".join([*source.remarks, source.left_out_words]).strip()
             time, increments, truth = source.time, recordings.increments(source), source.true_attitude
         advance(1)
         if len(increments) < chosen.samples:

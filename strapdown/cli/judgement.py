@@ -10,6 +10,7 @@ import typer
 from rich.text import Text
 
 from strapdown.cli.filters import no_state_words, without_a_state
+from strapdown.cli.reading import RECORDING_HELP, AccelerometerUnit, Columns, GyroUnit, TimeUnit, Topic, told
 from strapdown.cli.terminal import app, console, counted, show, table, writable, written
 
 if TYPE_CHECKING:
@@ -195,14 +196,12 @@ def _not_of_the_search(chosen: FilterSetup, estimate: Estimate) -> str:
 
 @app.command()
 def doctor(
-    recording: Annotated[
-        Path, typer.Argument(help="BROAD HDF5 file, or CSV with time, gx, gy, gz[, ax, ay, az[, mx, my, mz]].")
-    ],
-    gyro_unit: Annotated[str | None, typer.Option(help="Unit of a CSV file's gyro: rad/s or deg/s.")] = None,
-    accelerometer_unit: Annotated[
-        str | None, typer.Option(help="Unit of a CSV file's accelerometer: m/s2 or g.")
-    ] = None,
-    time_unit: Annotated[str | None, typer.Option(help="Unit of a CSV file's time: s, ms, us or ns.")] = None,
+    recording: Annotated[Path, typer.Argument(help=f"{RECORDING_HELP}.")],
+    gyro_unit: GyroUnit = None,
+    accelerometer_unit: AccelerometerUnit = None,
+    time_unit: TimeUnit = None,
+    columns: Columns = None,
+    topic: Topic = None,
     json: Annotated[Path | None, typer.Option("--json", help="File for the explanations and their scores.")] = None,
 ) -> None:
     """Tell which conventions a recording follows, by trying the others: exit status 0 as told, 1 wrong, 2 cannot tell."""
@@ -213,7 +212,9 @@ def doctor(
     if json is not None:
         writable("json", json, suffixes=(".json",), sources=(recording,))
     given = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
-    source = recordings.read(recording, units={name: unit for name, unit in given.items() if unit})
+    source = recordings.read(recording, **told(recording, columns=columns, topic=topic, **given))
+    for remark in source.remarks:
+        console.print(f"Note: {remark}")
     found = conventions.examine(source)
     if found.candidates:
         names = list(found.candidates[0].misfit)

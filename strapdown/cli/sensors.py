@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
+from strapdown.cli.reading import (
+    RECORDING_HELP,
+    AccelerometerUnit,
+    Columns,
+    GyroUnit,
+    MagnetometerUnit,
+    TimeUnit,
+    Topic,
+    told,
+)
 from strapdown.cli.terminal import app, console, need_own, progress_bar, scenario_named, show, table, writable, written
 
 if TYPE_CHECKING:
     from strapdown import allan as identification
+    from strapdown.recordings import GyroSamples
 
 
 @app.command()
@@ -80,11 +91,20 @@ def simulate(
 @app.command()
 def allan(
     recording: Annotated[
-        Path, typer.Argument(help="Gyro at rest: HDF5 (simulated record or BROAD), CSV with time, gx, gy, gz, or NPY.")
+        Path,
+        typer.Argument(help=f"Sensor at rest: simulated record (HDF5), NPY. {RECORDING_HELP}."),
     ],
+    sensor: Annotated[
+        list[str] | None,
+        typer.Option(help="gyro (if not given), accelerometer or magnetometer; may be repeated."),
+    ] = None,
     rate: Annotated[float | None, typer.Option(help="Samples a second, Hz; for NPY.")] = None,
-    gyro_unit: Annotated[str | None, typer.Option(help="Unit of a CSV or NPY file's gyro: rad/s or deg/s.")] = None,
-    time_unit: Annotated[str | None, typer.Option(help="Unit of a CSV file's time: s, ms, us or ns.")] = None,
+    gyro_unit: GyroUnit = None,
+    accelerometer_unit: AccelerometerUnit = None,
+    magnetometer_unit: MagnetometerUnit = None,
+    time_unit: TimeUnit = None,
+    columns: Columns = None,
+    topic: Topic = None,
     highest_frequency: Annotated[
         float | None,
         typer.Option(help="Hz; the fit leaves out what lies above: a low-pass filter's shape, vibration."),
@@ -92,53 +112,138 @@ def allan(
     robust: Annotated[
         bool, typer.Option(help="Draw the deviation by medians, which stands outliers; the fit stays as it is.")
     ] = False,
+    temperature: Annotated[
+        int | None,
+        typer.Option(
+            metavar="ORDER",
+            help="Regress the bias on the recorded temperature, by a polynomial of this order, and identify the noise of what is left.",
+        ),
+    ] = None,
+    kalibr: Annotated[bool, typer.Option("--kalibr", help="Write imu.yaml too; needs gyro and accelerometer.")] = False,
+    factor: Annotated[
+        float, typer.Option(help="What the numbers of imu.yaml are multiplied by; people take 5 to 10.")
+    ] = 1.0,
+    px4: Annotated[
+        bool, typer.Option("--px4", help="Write px4.params of EKF2 too; needs gyro and accelerometer.")
+    ] = False,
+    matlab: Annotated[bool, typer.Option("--matlab", help="Write imu_sensor.m, for imuSensor, too.")] = False,
     out: Annotated[Path, typer.Option(help="Folder for gyro.toml, allan.json and the figure.")] = Path("allan-results"),
 ) -> None:
-    """Identify a gyro's noise from a recording at rest: Allan deviation, fitted coefficients, specification as TOML."""
-    import math
+    """Identify a sensor's noise from a recording at rest: Allan deviation, fitted coefficients, specification as TOML."""
+    from strapdown import noise_parameters
+    from strapdown.checks import InputError, count, one_of, positive
+    from strapdown.files import usable_folder, written_beside
 
+    chosen = list(dict.fromkeys(sensor or ["gyro"]))
+    for one in chosen:
+        one_of("--sensor", one, noise_parameters.SENSORS)
+    if (kalibr or px4) and not {"gyro", "accelerometer"} <= set(chosen):
+        raise InputError("--kalibr and --px4 need both: --sensor gyro --sensor accelerometer")
+    positive("--factor", factor)
+    if temperature is not None:
+        count("--temperature", temperature)
+    usable_folder("out", out)
+    exports = {"imu.yaml": kalibr, "px4.params": px4, "imu_sensor.m": matlab}
+    names = [name for one in chosen for name in _names(one)] + [name for name, wanted in exports.items() if wanted]
+    writable("out", *(out / name for name in names), sources=(recording,))
+    units = {
+        "gyro": gyro_unit,
+        "accelerometer": accelerometer_unit,
+        "magnetometer": magnetometer_unit,
+        "time": time_unit,
+    }
+    options = _Options(rate, _layout(recording, columns, topic, units), highest_frequency, robust, temperature, out)
+    fits = {one: _identify(recording, one, options) for one in chosen}
+    made = {
+        "imu.yaml": lambda: noise_parameters.to_kalibr(
+            fits, factor=factor, topic=topic or "/imu0", source=recording.name
+        ),
+        "px4.params": lambda: noise_parameters.to_px4(fits, source=recording.name),
+        "imu_sensor.m": lambda: noise_parameters.to_matlab(fits, source=recording.name),
+    }
+    further = [out / name for name, wanted in exports.items() if wanted]
+    for path in further:
+        with written_beside(path) as temporary:
+            temporary.write_text(made[path.name](), encoding="utf-8")
+    if further:
+        written(*further)
+    if kalibr:
+        console.print(f"imu.yaml holds the largest of the axes, times {factor:g} (--factor).")
+
+
+class _Options(NamedTuple):
+    """How a recording is read and identified."""
+
+    rate: float | None
+    layout: dict[str, Any]
+    highest_frequency: float | None
+    robust: bool
+    temperature: int | None
+    out: Path
+
+
+def _layout(recording: Path, columns: str | None, topic: str | None, units: dict[str, str | None]) -> dict[str, Any]:
+    """Return how the file is read; of a simulated record and of an array the reader itself refuses what does not go with them."""
+    if recording.suffix.lower() == ".npy" or (columns is None and topic is None):
+        return {"units": {name: unit for name, unit in units.items() if unit}}
+    return told(recording, columns=columns, topic=topic, **units)
+
+
+def _names(sensor: str) -> tuple[str, ...]:
+    """Return the files of a sensor: its specification, the numbers, the figure."""
+    stem = "allan" if sensor == "gyro" else sensor
+    return (f"{sensor}.toml", f"{stem}.json", f"{stem}.png", f"{sensor}-temperature.toml")
+
+
+def _identify(recording: Path, sensor: str, options: _Options) -> identification.NoiseFit:
+    """Identify one sensor, tell and write what was found."""
     import numpy as np
 
     from strapdown import allan as identification
-    from strapdown import plots, recordings
+    from strapdown import allan_gaps, noise_parameters, plots, recordings
     from strapdown.checks import InputError
-    from strapdown.files import usable_folder, write_json, written_beside
+    from strapdown.files import written_beside
 
-    given = {"gyro": gyro_unit, "time": time_unit}
-    usable_folder("out", out)
-    writable("out", *(out / name for name in ("gyro.toml", "allan.json", "allan.png")), sources=(recording,))
-    if recording.is_dir():
-        raise InputError(f"{recording} is a folder; name a file")
-    source = recordings.read_gyro(recording, rate=rate, units={name: unit for name, unit in given.items() if unit})
-    if source.values.shape[1] not in (1, 3):
-        raise InputError(
-            f"{recording.name} has {source.values.shape[1]} columns; a gyro has three axes, or pass one column, (n,) or (n, 1)"
-        )
-    largest = float(np.abs(source.values).max(initial=0.0))
-    if largest > _LARGEST_RATE:
-        raise InputError(f"{recording.name} holds {largest:g} rad/s, which no gyro measures; check its unit")
-    if not 1.0 / _LARGEST_RATE <= source.sample_interval <= _LARGEST_RATE:
-        raise InputError(
-            f"{recording.name}: {1.0 / source.sample_interval:g} Hz is no rate of a gyro; check it and its unit"
-        )
+    out, specification = options.out, _names(sensor)[0]
+    source = recordings.read_samples(recording, sensor, rate=options.rate, gaps=True, **options.layout)
+    _plausible(recording, sensor, source)
+    gaps = bool(np.isnan(source.values).any())
+    if gaps and options.robust:
+        raise InputError(f"{recording.name} has gaps, with which --robust does not go; leave it out")
+    values = source.values
+    paths: list[Path] = []
     try:
+        if options.temperature is not None:
+            values = _regressed(recording, sensor, source, options.temperature, out, paths)
         with progress_bar("fit, deviation, figure", 3) as advance:
-            fit = identification.fit_noise(
-                source.values, source.sample_interval, kind=source.kind, highest_frequency=highest_frequency
-            )
+            if gaps:
+                fit = allan_gaps.fit_noise(values, source.sample_interval, highest_frequency=options.highest_frequency)
+                advance(1)
+                deviation = allan_gaps.allan_deviation(values, source.sample_interval)
+            else:
+                fit = identification.fit_noise(
+                    values, source.sample_interval, kind=source.kind, highest_frequency=options.highest_frequency
+                )
+                advance(1)
+                estimator = "robust" if options.robust else "overlapping"
+                deviation = identification.allan_deviation(
+                    values, source.sample_interval, kind=source.kind, estimator=estimator
+                )
             advance(1)
-            deviation = identification.allan_deviation(
-                source.values, source.sample_interval, kind=source.kind, estimator="robust" if robust else "overlapping"
-            )
-            advance(1)
-            figure = plots.allan_overview(deviation, fit, identification.curves_by_axis(fit, deviation))
+            figure = plots.allan_overview(deviation, fit, identification.curves_by_axis(fit, deviation), sensor=sensor)
             advance(1)
     except InputError as error:
         raise InputError(f"{recording.name}: {error}") from None
-    hours = len(source.values) * source.sample_interval / 3600.0
-    length = f"{len(source.values)} samples at {1.0 / source.sample_interval:.6g} Hz, {hours:.3g} h"
+    hours = len(values) * source.sample_interval / 3600.0
+    length = f"{len(values)} samples at {1.0 / source.sample_interval:.6g} Hz, {hours:.3g} h"
     console.print(f"{recording.name}: {length}.", highlight=False)
-    rows = identification.table(fit)
+    for remark in source.remarks:
+        console.print(remark)
+    if gaps:
+        console.print(
+            f"With gaps: the fit uses {fit.samples} samples in stretches of {allan_gaps.SHORTEST} or more, the deviation all there are."
+        )
+    rows = noise_parameters.table(fit, sensor)
     listing = table("Noise coefficients with 95 % intervals", "axis", "term", "unit", "estimate", "from", "to", left=3)
     for row in rows:
         estimate = f"{row['estimate']:.4g}" if row["supported"] else "not seen"
@@ -158,67 +263,142 @@ def allan(
         for axis, (probability, what) in enumerate(zip(fit.misfit_probability, fit.misfit, strict=True))
         if probability < identification.MISFIT_PROBABILITY
     ]
-    with written_beside(out / "gyro.toml") as temporary:
-        temporary.write_text(_specification(fit, f"{recording.name}, {length}", warnings), encoding="utf-8")
+    with written_beside(out / specification) as temporary:
+        temporary.write_text(_specification(fit, f"{recording.name}, {length}", warnings, sensor), encoding="utf-8")
+    _write_numbers(out / _names(sensor)[1], recording.name, fit, deviation, rows, sensor)
+    written(out / specification, out / _names(sensor)[1], *paths, plots.save(figure, out / _names(sensor)[2]))
+    for warning in warnings:
+        console.print(f"warning: {warning}", highlight=False)
+    if warnings:
+        console.print(
+            f"Cut the recording to where the {sensor} rests, or leave a filter's band out by --highest-frequency."
+        )
+        console.print(f"warning: {_DISBELIEF}, nor {specification}.", highlight=False)
+    return fit
+
+
+def _plausible(recording: Path, sensor: str, source: GyroSamples) -> None:
+    """Refuse samples that no sensor gives, from which squares would leave the range of doubles."""
+    import numpy as np
+
+    from strapdown.checks import InputError
+
+    if source.values.shape[1] not in (1, 3):
+        raise InputError(
+            f"{recording.name} has {source.values.shape[1]} columns; a {sensor} has three axes, or pass one column, (n,) or (n, 1)"
+        )
+    largest = float(np.nanmax(np.abs(source.values), initial=0.0))
+    if largest > _LARGEST_RATE:
+        unit = {"gyro": "rad/s", "accelerometer": "m/s²", "magnetometer": "T"}[sensor]
+        raise InputError(f"{recording.name} holds {largest:g} {unit}, which no {sensor} measures; check its unit")
+    if not 1.0 / _LARGEST_RATE <= source.sample_interval <= _LARGEST_RATE:
+        raise InputError(
+            f"{recording.name}: {1.0 / source.sample_interval:g} Hz is no rate of a {sensor}; check it and its unit"
+        )
+
+
+def _regressed(recording: Path, sensor: str, source: GyroSamples, order: int, out: Path, paths: list[Path]) -> Any:
+    """Return the samples without their dependence on temperature, which is told and written."""
+    import numpy as np
+    import tomli_w
+
+    from strapdown import allan_temperature
+    from strapdown.checks import InputError
+    from strapdown.files import written_beside
+
+    if source.temperature is None or not np.isfinite(source.temperature).all():
+        raise InputError("no temperature is recorded for every sample; leave --temperature out")
+    if np.isnan(source.values).any():
+        raise InputError("there are gaps, with which --temperature does not go; cut the recording between them")
+    fit = allan_temperature.fit_temperature(source.values, source.temperature, source.sample_interval, order=order)
+    unit = {"gyro": "rad/s", "accelerometer": "m/s2", "magnetometer": "T"}[sensor]
+    key = {"gyro": "rad_per_s", "accelerometer": "m_per_s2", "magnetometer": "t"}[sensor]
+    listing = table(
+        f"Bias over temperature, T − {fit.reference:.3f} °C", "axis", "power", "unit", "estimate", "from", "to", left=3
+    )
+    content: dict[str, Any] = {
+        "reference_degc": fit.reference,
+        "lowest_degc": fit.span[0],
+        "highest_degc": fit.span[1],
+    }
+    for k in range(order + 1):
+        per = f"{key}_per_k{k if k > 1 else ''}" if k else key
+        content[f"bias_{per}"] = [float(x) for x in fit.coefficients[:, k]]
+        if k:
+            content[f"sigma_{per}"] = [float(x) for x in fit.sigma[:, k]]
+        for axis in range(len(fit.coefficients)):
+            ends = (f"{fit.lower[axis, k]:.4g}", f"{fit.upper[axis, k]:.4g}") if k else ("", "")
+            said = f"{unit}/K{k if k > 1 else ''}" if k else unit
+            listing.add_row("xyz"[axis], str(k), said, f"{fit.coefficients[axis, k]:.4g}", *ends)
+    show(listing)
+    paths.append(out / _names(sensor)[3])
+    with written_beside(paths[-1]) as temporary:
+        text = _commented(
+            [f"Bias over temperature by `strapdown allan` from {recording.name}, a polynomial in T - reference."]
+        )
+        temporary.write_text(text + "\n" + tomli_w.dumps({sensor: content}), encoding="utf-8")
+    return fit.left
+
+
+def _write_numbers(
+    path: Path,
+    source: str,
+    fit: identification.NoiseFit,
+    deviation: identification.AllanDeviation,
+    rows: list[dict[str, object]],
+    sensor: str,
+) -> None:
+    """Write coefficients and deviation as JSON, which has no word for NaN."""
+    import math
+
+    from strapdown.files import write_json
+
     number = lambda value: None if isinstance(value, float) and not math.isfinite(value) else value  # noqa: E731
+    unit = {"gyro": "rad_per_s", "accelerometer": "m_per_s2", "magnetometer": "t"}[sensor]
     write_json(
-        out / "allan.json",
+        path,
         {
-            "source": recording.name,
-            "sample_interval_s": source.sample_interval,
+            "source": source,
+            "sample_interval_s": fit.sample_interval,
             "level": fit.level,
             "coefficients": [{key: number(value) for key, value in row.items()} for row in rows],
             "misfit_probability": [float(p) for p in fit.misfit_probability],
             "misfit": list(fit.misfit),
             "estimator": deviation.estimator,
             "tau_s": [float(tau) for tau in deviation.taus],
-            "deviation_rad_per_s": [[number(float(x)) for x in axis] for axis in deviation.deviation],
+            f"deviation_{unit}": [[number(float(x)) for x in axis] for axis in deviation.deviation],
         },
     )
-    written(out / "gyro.toml", out / "allan.json", plots.save(figure, out / "allan.png"))
-    for warning in warnings:
-        console.print(f"warning: {warning}", highlight=False)
-    if warnings:
-        console.print("Cut the recording to where the gyro rests, or leave a filter's band out by --highest-frequency.")
-        console.print(f"warning: {_DISBELIEF}.", highlight=False)
 
 
 _LARGEST_RATE = 1e12
 """rad/s and Hz: far beyond any gyro, and far from where the fit's squares overflow."""
-_DISBELIEF = "do not believe these intervals, nor gyro.toml"
+_DISBELIEF = "do not believe these intervals"
 
 
-def _specification(fit: identification.NoiseFit, source: str, warnings: list[str]) -> str:
-    """Return the text of gyro.toml: the terms seen, and in comments the bounds of those not seen, and the warnings."""
-    import numpy as np
+def _specification(fit: identification.NoiseFit, source: str, warnings: list[str], sensor: str) -> str:
+    """Return the text of gyro.toml, or of another sensor's: the terms seen, and as comments bounds of the others, and warnings."""
     import tomli_w
 
     from strapdown import allan as identification
-    from strapdown import gyro
+    from strapdown import noise_parameters
 
-    rounded: dict[str, Any] = {}  # six digits of the unit that is written: an estimate has no more
-    for term, value in identification.to_gyro_parameters(fit).items():
-        factor = gyro.FORM[term][0][1]
-        rounded[term] = np.array([float(f"{x / factor:.6g}") * factor for x in np.atleast_1d(value)]).reshape(
-            np.shape(value)
-        )
-    spec = gyro.GyroSpec(**rounded)
-    lines = [f"Gyro noise by `strapdown allan` from {source}."]
+    lines = [f"{sensor.capitalize()} noise by `strapdown allan` from {source}."]
     lines += [f"WARNING: {warning}." for warning in warnings]
     if warnings:
-        lines.append(f"WARNING: {_DISBELIEF}.")
-    text = _commented(lines) + "\n" + tomli_w.dumps({"gyro": gyro.to_table(spec)})
+        lines.append(f"WARNING: {_DISBELIEF}, nor this file.")
+    text = _commented(lines) + "\n" + tomli_w.dumps(noise_parameters.to_toml(fit, sensor))
     partly, wholly = [], []
     for term, bound in identification.upper_bounds(fit).items():
-        suffix, factor = gyro.FORM[term][0]
+        key, factor = noise_parameters.key(sensor, term)
         values = [bound] if isinstance(bound, float) else list(bound)
         seen = fit.supported[:, fit.terms.index(term)]
         if seen.any():
-            told = ", ".join(f"{'xyz'[k]} below {values[k] / factor:.4g}" for k in range(len(values)) if not seen[k])
-            partly.append(f"{term}_{suffix}: 0 where not seen, {told}.")
+            below = ", ".join(f"{'xyz'[k]} below {values[k] / factor:.4g}" for k in range(len(values)) if not seen[k])
+            partly.append(f"{key}: 0 where not seen, {below}.")
         else:
             shown = ", ".join(f"{value / factor:.4g}" for value in values)
-            wholly.append(f"{term}_{suffix} = {shown if len(values) == 1 else f'[{shown}]'}")
+            wholly.append(f"{key} = {shown if len(values) == 1 else f'[{shown}]'}")
     if partly or wholly:
         text += "\n" + _commented(
             [

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from strapdown.allan import AllanDeviation, NoiseFit
 from strapdown.checks import Array
+from strapdown.noise_parameters import UNITS, name
 from strapdown.plots.style import (
     AXES,
     BLUE,
@@ -22,16 +24,22 @@ from strapdown.plots.style import (
     ink,
     new_figure,
 )
-from strapdown.units import DEGREE_PER_HOUR
 
 
 def allan_axis(
-    deviation: AllanDeviation, fit: NoiseFit, curves: Mapping[str, Array], axis: int, ax: Axes | None = None
+    deviation: AllanDeviation,
+    fit: NoiseFit,
+    curves: Mapping[str, Array],
+    axis: int,
+    ax: Axes | None = None,
+    *,
+    sensor: str = "gyro",
 ) -> Axes:
-    """Draw one axis of an Allan deviation with its confidence band, the fit, and the fitted terms (``curves``, rad/s at the same τ)."""
+    """Draw one axis of an Allan deviation with its confidence band, the fit, and the fitted terms (``curves``, SI at the same τ)."""
     ax = axes_or_new(ax)
-    scale = DEGREE_PER_HOUR
-    band = (deviation.lower[axis] / scale, deviation.upper[axis] / scale)
+    unit, scale = UNITS[sensor]["bias_instability"]
+    upper = np.where(np.isfinite(deviation.upper[axis]), deviation.upper[axis], np.nan)
+    band = (deviation.lower[axis] / scale, upper / scale)
     ax.fill_between(
         deviation.taus, *band, color=SKY, alpha=0.5, linewidth=0, label=f"{100 * deviation.level:.0f} % band"
     )
@@ -46,24 +54,27 @@ def allan_axis(
                 "--",
                 color=colors[term],
                 linewidth=1.1,
-                label=term.replace("_", " "),
+                label=name(sensor, term).replace("_", " "),
             )
-    low, high = deviation.deviation[axis].min() / scale, deviation.deviation[axis].max() / scale
+    low, high = np.nanmin(deviation.deviation[axis]) / scale, np.nanmax(deviation.deviation[axis]) / scale
     ax.set_ylim(0.2 * low, 3.0 * high)
     ax.set_xlabel("averaging time τ, s")
-    ax.set_ylabel("Allan deviation, °/h")
+    ax.set_ylabel(f"Allan deviation, {unit}")
     return ax
 
 
-def allan_overview(deviation: AllanDeviation, fit: NoiseFit, curves: Sequence[Mapping[str, Array]]) -> Figure:
-    """Draw each axis of an Allan deviation with its fit, side by side."""
+def allan_overview(
+    deviation: AllanDeviation, fit: NoiseFit, curves: Sequence[Mapping[str, Array]], *, sensor: str = "gyro"
+) -> Figure:
+    """Draw each axis of an Allan deviation with its fit, side by side, in the units of a sensor."""
+    unit, scale = UNITS[sensor]["bias_instability"]
     number = len(deviation.deviation)
     figure, axes = new_figure(1, number, size=(1.5 + 4.2 * number, 4.8), sharey=True, squeeze=False)
     for axis in range(number):
-        ax = allan_axis(deviation, fit, curves[axis], axis, axes[0, axis])
+        ax = allan_axis(deviation, fit, curves[axis], axis, axes[0, axis], sensor=sensor)
         ax.set_title(AXES[axis])
-        ax.set_ylabel("Allan deviation, °/h" if axis == 0 else "")
-    drawn = deviation.deviation[deviation.deviation > 0.0] / DEGREE_PER_HOUR
+        ax.set_ylabel(f"Allan deviation, {unit}" if axis == 0 else "")
+    drawn = deviation.deviation[deviation.deviation > 0.0] / scale
     axes[0, 0].set_ylim(0.2 * drawn.min(), 3.0 * drawn.max())  # shared: the last axis alone would cut the others off
     handles = {label: handle for ax in axes[0] for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, frameon=False)

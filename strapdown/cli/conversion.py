@@ -1,0 +1,121 @@
+"""Recordings and estimates from one format to another."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from strapdown.cli.reading import (
+    RECORDING_HELP,
+    AccelerometerUnit,
+    Columns,
+    GyroUnit,
+    MagnetometerUnit,
+    TimeUnit,
+    Topic,
+    told,
+)
+from strapdown.cli.terminal import app, console, writable, written
+
+if TYPE_CHECKING:
+    from strapdown.recordings import Recording
+
+
+@app.command()
+def convert(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="IN",
+            help=f"{RECORDING_HELP}; record of `strapdown simulate`, or estimate.h5 of `strapdown estimate`.",
+        ),
+    ],
+    target: Annotated[
+        Path,
+        typer.Argument(
+            metavar="OUT",
+            help="File whose ending names the format: .csv, .tsv, .parquet, .bag (ROS 1), .mcap or .db3 (ROS 2), .h5 (BROAD); of an "
+            "estimate .csv, .tsv, .parquet, .tum, .rrd.",
+        ),
+    ],
+    gyro_unit: GyroUnit = None,
+    accelerometer_unit: AccelerometerUnit = None,
+    magnetometer_unit: MagnetometerUnit = None,
+    time_unit: TimeUnit = None,
+    columns: Columns = None,
+    topic: Topic = None,
+    reference: Annotated[
+        Path | None, typer.Option(help="TUM trajectory whose attitudes become the recording's reference.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace OUT if it is there.")] = False,
+) -> None:
+    """Convert a recording, a simulated record or an estimate: IN is recognised by its content, OUT written by its ending."""
+    from strapdown import recordings
+    from strapdown.checks import InputError
+    from strapdown.records import read_estimate
+
+    units = {
+        "gyro": gyro_unit,
+        "accelerometer": accelerometer_unit,
+        "magnetometer": magnetometer_unit,
+        "time": time_unit,
+    }
+    options = told(source, columns=columns, topic=topic, **units)
+    estimate = recordings.is_estimate(source)
+    writable(
+        "OUT",
+        target,
+        suffixes=recordings.writers("write_estimate" if estimate else "write"),
+        sources=(source, reference),
+    )
+    if target.exists() and not force:
+        raise InputError(f"{target} exists; move it, choose another name, or say --force")
+    if estimate:
+        recordings.estimate_format(target, recording=False)
+        if reference is not None:
+            raise InputError("--reference goes with a recording; an estimate has attitudes of its own")
+        held = read_estimate(source)
+        recordings.write(held, target)
+        console.print(
+            f"{source.name}: an estimate at {len(held.time)} times over {held.time[-1] - held.time[0]:.6g} s."
+        )
+    else:
+        if recordings.is_record(source):
+            from strapdown.recordfiles import read_record
+
+            content = recordings.from_record(read_record(source), source.name)
+            console.print(
+                "A simulated record: the rate at each stamp is the mean over the sample interval that ends there."
+            )
+        else:
+            content = recordings.read(source, **options)
+        if reference is not None:
+            content = recordings.with_reference(content, reference)
+        recordings.write(content, target)
+        _say(content, target)
+    written(target)
+
+
+def _say(recording: Recording, target: Path) -> None:
+    """Say what was read, and what of it the target has no room for."""
+    from strapdown import recordings
+
+    held = {
+        "accelerometer": recording.specific_force,
+        "magnetometer": recording.magnetic_field,
+        "temperature": recording.temperature,
+        "reference": recording.true_attitude,
+        "movement": recording.movement,
+    }
+    parts = ["gyro", *(name for name, values in held.items() if values is not None)]
+    length = recording.time[-1] - recording.time[0]
+    console.print(f"{recording.source}: {len(recording.time)} samples over {length:.6g} s of {', '.join(parts)}.")
+    for remark in recording.remarks:
+        console.print(remark)
+    if recording.left_out_words:
+        console.print(recording.left_out_words)
+    lost = [name for name in recordings.not_held(target) if name in parts or (name == "clock" and recording.epoch_ns)]
+    if lost:
+        console.print(f"{target.name} has no room for {', '.join(lost)}: left out.")

@@ -1,0 +1,292 @@
+"""An estimate in the forms that people use: angles of any sequence with σ, heading from North, North-East-Down, free acceleration, tables.
+
+The fixed frame of an estimate is East-North-Up (z up with any heading where there was no magnetometer), and ``q_fb`` takes body vectors to
+it. Rotation matrices and SciPy rotations are :func:`strapdown.quaternion.to_matrix` and :func:`strapdown.quaternion.to_rotation`.
+
+Covariances are those of the body-side error, ``q_true = q_est ⊗ exp(δθ)``. An estimate that kept variances alone has no correlations
+between axes; σ of angles is then that of a diagonal covariance (``full_covariance=True`` keeps the whole).
+"""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from strapdown import quaternion
+from strapdown.checks import Array, InputError, array, finite, one_of, unit_quaternions
+from strapdown.units import DEGREE, DEGREE_PER_HOUR, STANDARD_GRAVITY
+
+if TYPE_CHECKING:
+    from strapdown.recordings import Recording
+    from strapdown.records import Estimate
+
+FRAMES = ("ENU", "NED")
+NED_OF_ENU = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
+"""Turns East-North-Up to North-East-Down and back: half a turn about the horizontal line to the north-east."""
+FRD_OF_FLU = np.array([0.0, 1.0, 0.0, 0.0])
+"""Turns forward-left-up body axes to forward-right-down ones and back: half a turn about x."""
+NAMES = {"Z": "yaw", "Y": "pitch", "X": "roll"}
+"""Names of the angles of a sequence of three different axes."""
+
+
+class Angles(NamedTuple):
+    """Angles with their standard deviations."""
+
+    angles: Array
+    """rad"""
+    sigma: Array | None
+    """rad; None without a covariance. Infinite where the sequence is singular (gimbal lock)."""
+
+
+def attitude_covariance(estimate: Estimate) -> Array:
+    """Return the covariance (m, 3, 3) of an estimate's attitude error, rad², body axes; diagonal where only variances were kept."""
+    if estimate.covariance is not None:
+        return np.asarray(estimate.covariance[:, :3, :3])
+    result = np.zeros((len(estimate.time), 3, 3))
+    result[:, [0, 1, 2], [0, 1, 2]] = estimate.variance[:, :3]
+    return result
+
+
+def euler(attitude: ArrayLike, sequence: str = "ZYX", covariance: ArrayLike | None = None) -> Angles:
+    """Return Euler angles of attitudes, and their σ.
+
+    Parameters
+    ----------
+    attitude : (n, 4)
+        Unit quaternions q_fb.
+    sequence : str
+        Three axes as SciPy names them: capitals turn about the body's own axes one after the other (``"ZYX"``: yaw, pitch, roll), small
+        letters about the fixed ones. Neighbours must differ.
+    covariance : (n, 3, 3), optional
+        Of the body-side attitude error, rad².
+
+    Returns
+    -------
+    Angles
+        ``angles`` (n, 3) in the order of the sequence, rad. To first order ``δθ = E δφ``, the columns of E being the axes of the three
+        turns in the body frame, so that ``σ²`` is the diagonal of ``E⁻¹ P E⁻ᵀ``.
+
+    Raises
+    ------
+    InputError
+        If the sequence is none.
+
+    Examples
+    --------
+    >>> euler([[1.0, 0.0, 0.0, 0.0]]).angles.tolist()
+    [[0.0, 0.0, 0.0]]
+    """
+    q = unit_quaternions("attitude", array("attitude", attitude, ("n", 4)))
+    axes = [*sequence.upper()]
+    repeated = any(a == b for a, b in itertools.pairwise(axes))
+    if len(axes) != 3 or set(axes) - set("XYZ") or sequence not in (sequence.upper(), sequence.lower()) or repeated:
+        raise InputError(
+            f"sequence is {sequence!r}; give three axes such as ZYX (body) or xyz (fixed), neighbours different"
+        )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # gimbal lock: σ says it
+        angles = np.asarray(quaternion.to_rotation(q).as_euler(sequence), np.float64)
+    if covariance is None:
+        return Angles(angles, None)
+    P = array("covariance", covariance, (len(q), 3, 3))
+    intrinsic = sequence == sequence.upper()
+    order = [0, 1, 2] if intrinsic else [2, 1, 0]  # turns about fixed axes are those about body axes, the last first
+    directions = np.eye(3)[["XYZ".index(axes[k]) for k in order]]
+    half = 0.5 * angles[:, order]
+    turns = [
+        np.concatenate([np.cos(half[:, k : k + 1]), np.sin(half[:, k : k + 1]) * directions[k]], axis=1)
+        for k in range(3)
+    ]
+    E = np.empty((len(q), 3, 3))
+    E[:, :, 2] = directions[2]
+    E[:, :, 1] = quaternion.rotate(quaternion.conjugate(turns[2]), directions[1])
+    E[:, :, 0] = quaternion.rotate(quaternion.conjugate(quaternion.multiply(turns[1], turns[2])), directions[0])
+    regular = np.abs(np.linalg.det(E)) > 1e-9
+    variance = np.full((len(q), 3), np.inf)
+    inverse = np.linalg.inv(E[regular])
+    variance[regular] = np.einsum("nij,njk,nik->ni", inverse, P[regular], inverse)
+    sigma = np.sqrt(variance)
+    return Angles(angles, sigma if intrinsic else sigma[:, ::-1])
+
+
+def heading(attitude: ArrayLike, covariance: ArrayLike | None = None, *, axis: str = "x") -> Angles:
+    """Return the heading of a body axis: its angle from North towards East, rad in [0, 2π), and its σ.
+
+    Parameters
+    ----------
+    attitude : (n, 4)
+        q_fb, fixed frame East-North-Up. North is the one of the estimate: magnetic where a magnetometer was used, any without.
+    covariance : (n, 3, 3), optional
+        Of the body-side attitude error, rad².
+    axis : {"x", "y", "z", "-x", "-y", "-z"}
+        The body axis that points forward.
+
+    Returns
+    -------
+    Angles
+        (n,); σ is infinite where the axis points up or down.
+    """
+    q = unit_quaternions("attitude", array("attitude", attitude, ("n", 4)))
+    one_of("axis", axis, ("x", "y", "z", "-x", "-y", "-z"))
+    forward = np.eye(3)["xyz".index(axis[-1])] * (-1.0 if axis.startswith("-") else 1.0)
+    R = quaternion.to_matrix(q)
+    v = R @ forward
+    angle = np.mod(np.arctan2(v[:, 0], v[:, 1]), 2.0 * np.pi)
+    if covariance is None:
+        return Angles(angle, None)
+    P = array("covariance", covariance, (len(q), 3, 3))
+    change = -R @ _skew(forward)  # d(R f)/dδθ
+    level = v[:, 0] ** 2 + v[:, 1] ** 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        row = (v[:, 1, None] * change[:, 0] - v[:, 0, None] * change[:, 1]) / level[:, None]
+        sigma = np.sqrt(np.einsum("ni,nij,nj->n", row, P, row))
+    return Angles(angle, np.where(level > 1e-18, sigma, np.inf))
+
+
+def _skew(v: Array) -> Array:
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def to_ned(attitude: ArrayLike, *, body_flu: bool = False) -> Array:
+    """Return attitudes (n, 4) to East-North-Up as attitudes to North-East-Down.
+
+    Parameters
+    ----------
+    attitude : (n, 4)
+    body_flu : bool
+        The body axes are forward, left, up, and forward, right, down ones are wanted; without, body axes stay as they are.
+    """
+    turned = quaternion.multiply(NED_OF_ENU, array("attitude", attitude, (..., 4)))
+    return quaternion.multiply(turned, FRD_OF_FLU) if body_flu else turned
+
+
+def from_ned(attitude: ArrayLike, *, body_frd: bool = False) -> Array:
+    """Return attitudes (n, 4) to North-East-Down as attitudes to East-North-Up, the inverse of :func:`to_ned`."""
+    turned = quaternion.multiply(NED_OF_ENU, array("attitude", attitude, (..., 4)))
+    return quaternion.multiply(turned, FRD_OF_FLU) if body_frd else turned
+
+
+def free_acceleration(
+    attitude: ArrayLike, specific_force: ArrayLike, *, gravity: float = STANDARD_GRAVITY, fixed: bool = True
+) -> Array:
+    """Return the acceleration without gravity (n, 3), m/s²: ``R f − g up``.
+
+    Parameters
+    ----------
+    attitude : (n, 4)
+        q_fb, fixed frame z up.
+    specific_force : (n, 3)
+        m/s², body axes; rows of NaN stay so.
+    gravity : float
+        m/s².
+    fixed : bool
+        In the fixed frame, or (False) in body axes.
+    """
+    q = unit_quaternions("attitude", array("attitude", attitude, ("n", 4)))
+    f = array("specific_force", specific_force, (len(q), 3), allow_nan=True)
+    R = quaternion.to_matrix(q)
+    up = np.array([0.0, 0.0, finite("gravity", gravity, unit="m/s²")])
+    if fixed:
+        return np.asarray(np.einsum("nij,nj->ni", R, f) - up)
+    return np.asarray(f - np.einsum("nji,j->ni", R, up))
+
+
+def table(
+    estimate: Estimate, *, recording: Recording | None = None, sequence: str = "ZYX", frame: str = "ENU"
+) -> dict[str, NDArray[np.generic]]:
+    """Return an estimate as columns, the unit in each name.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    recording : Recording, optional
+        What the estimate was made from: its clock, its rate without the bias, and its acceleration without gravity go along.
+    sequence : str
+        Of the Euler angles, as :func:`euler` takes it.
+    frame : {"ENU", "NED"}
+        Fixed frame of quaternion, angles and acceleration; body axes stay as they are.
+
+    Returns
+    -------
+    dict
+        ``time_s`` (or ``time_ns`` of a clock that counts from 1970), ``qw qx qy qz``, the angles and their σ in degrees, ``heading_deg``
+        of the body's x axis from North towards East, bias and σ in °/h, ``rate_*_rad_per_s``, ``free_acceleration_*_m_per_s2``.
+    """
+    one_of("frame", frame, FRAMES)
+    P = attitude_covariance(estimate)
+    q = estimate.attitude if frame == "ENU" else to_ned(estimate.attitude)
+    found: dict[str, NDArray[np.generic]] = _clock(estimate, recording)
+    found |= {f"q{name}": q[:, k] for k, name in enumerate("wxyz")}
+    angles = euler(q, sequence, P)
+    assert angles.sigma is not None
+    for k, name in enumerate(_angle_names(sequence)):
+        found[f"{name}_deg"] = angles.angles[:, k] / DEGREE
+        found[f"{name}_sigma_deg"] = angles.sigma[:, k] / DEGREE
+    north = heading(estimate.attitude, P)
+    assert north.sigma is not None
+    found |= {"heading_deg": north.angles / DEGREE, "heading_sigma_deg": north.sigma / DEGREE}
+    sigma = estimate.sigma
+    for k, axis in enumerate("xyz"):
+        found[f"bias_{axis}_deg_per_h"] = estimate.bias[:, k] / DEGREE_PER_HOUR
+        found[f"bias_{axis}_sigma_deg_per_h"] = sigma[:, 3 + k] / DEGREE_PER_HOUR
+    if recording is not None:
+        rows = rows_of(estimate, recording)
+        rate = recording.rate[rows] - estimate.bias
+        found |= {f"rate_{axis}_rad_per_s": rate[:, k] for k, axis in enumerate("xyz")}
+        if recording.specific_force is not None:
+            free = free_acceleration(estimate.attitude, recording.specific_force[rows])
+            free = free if frame == "ENU" else free[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
+            found |= {f"free_acceleration_{axis}_m_per_s2": free[:, k] for k, axis in enumerate("xyz")}
+    return found
+
+
+def _angle_names(sequence: str) -> list[str]:
+    axes = sequence.upper()
+    return (
+        [NAMES[axis] for axis in axes]
+        if len(set(axes)) == 3
+        else [f"angle_{k + 1}_{axis.lower()}" for k, axis in enumerate(axes)]
+    )
+
+
+def rows_of(estimate: Estimate, recording: Recording) -> NDArray[np.int64]:
+    """Return the row of the recording of each time of an estimate.
+
+    Raises
+    ------
+    InputError
+        If a time of the estimate is no stamp of the recording.
+    """
+    rows = np.clip(np.searchsorted(recording.time, estimate.time - 1e-7), 0, len(recording.time) - 1)
+    off = np.abs(recording.time[rows] - estimate.time)
+    if off.max() > 1e-6:
+        k = int(np.argmax(off))
+        raise InputError(
+            f"{recording.source} has no stamp {estimate.time[k]:.6g} s, which the estimate has; give the recording that it was made from"
+        )
+    return np.asarray(rows)
+
+
+def _clock(estimate: Estimate, recording: Recording | None) -> dict[str, NDArray[np.generic]]:
+    if recording is None or not recording.epoch_ns:
+        return {"time_s": estimate.time}
+    return {"time_ns": np.rint(estimate.time * 1e9).astype(np.int64) + recording.epoch_ns}
+
+
+def to_dataframe(estimate: Estimate, **options: Any) -> Any:
+    """Return an estimate as a pandas ``DataFrame`` of the columns of :func:`table`, whose options it takes.
+
+    Raises
+    ------
+    InputError
+        If pandas is not installed.
+    """
+    try:
+        import pandas
+    except ImportError:
+        raise InputError("a DataFrame needs pandas; pip install 'strapdown[formats]'") from None
+    return pandas.DataFrame(table(estimate, **options))

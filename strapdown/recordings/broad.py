@@ -1,0 +1,92 @@
+"""The HDF5 layout of the BROAD data set (Laidig et al. 2021).
+
+``imu_gyr`` (n, 3) rad/s, ``imu_acc`` (n, 3) m/s², ``imu_mag`` (n, 3) µT, in the axes of the unit; ``opt_quat`` (n, 4), the optical
+reference q_fb, scalar first, East-North-Up with magnetic North; ``movement`` (n,) bool; the attribute ``sampling_rate``, Hz. There are no
+stamps: time begins at 0. :func:`write_broad` writes the same, and so only of even stamps.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from strapdown import reading, recordfiles
+from strapdown.checks import InputError, positive
+from strapdown.files import whole_hdf5, written_beside
+from strapdown.recordings.recording import MAGNETIC_UNITS, Recording, with_gyro
+
+
+def read_broad(path: str | os.PathLike[str]) -> Recording:
+    """Read a trial of the BROAD data set (Laidig et al. 2021): ``imu_gyr``, ``imu_acc``, ``imu_mag``, ``opt_quat``, ``movement``."""
+    name = Path(path).name
+    with reading.hdf5(path) as file:
+        held = reading.attributes(file)
+        kind = str(held.get("kind", ""))
+        if kind.startswith("strapdown ") and kind != recordfiles.KIND:
+            raise InputError(f"{name} is a {kind}, a result and no recording; give what it was made from")
+        if kind == recordfiles.KIND:
+            raise InputError(
+                f"{name} is a simulated record, no recording; integrate it (`strapdown integrate`) or filter it (`strapdown estimate`)"
+            )
+        missing = [key for key in ("imu_gyr",) if key not in file]
+        if "sampling_rate" not in held:
+            missing.append("the attribute sampling_rate")
+        if missing:
+            raise InputError(
+                f"{name} lacks {', '.join(missing)}; it is not in the layout of BROAD (has: {', '.join(file)})"
+            )
+        columns = {key: reading.numbers(file, key) for key in _READ if key in file}
+        movement = columns.get("movement")
+        sampling = positive(f"{name}: sampling_rate", held["sampling_rate"], unit="Hz")
+        return with_gyro(
+            source=name,
+            time=np.arange(len(columns["imu_gyr"])) / sampling,
+            rate=columns["imu_gyr"],
+            specific_force=columns.get("imu_acc"),
+            magnetic_field=columns.get("imu_mag"),
+            magnetic_unit="uT" if "imu_mag" in columns else "",
+            true_attitude=columns.get("opt_quat"),
+            movement=None if movement is None else movement.astype(bool),
+        )
+
+
+_READ = ("imu_gyr", "imu_acc", "imu_mag", "opt_quat", "movement")
+"""Data sets that are read."""
+EVEN = 1e-3
+"""Largest relative departure of a sample interval from their mean that still counts as even."""
+
+
+def sample_interval(recording: Recording) -> float:
+    """Return the interval between the stamps of a recording, s; uneven ones are refused, the worst of them named."""
+    steps = np.diff(recording.time)
+    mean = float(steps.mean())
+    worst = int(np.argmax(np.abs(steps - mean)))
+    if abs(steps[worst] - mean) > EVEN * mean:
+        raise InputError(
+            f"{recording.source}: the interval after {recording.time[worst]:.6g} s is {steps[worst]:.6g} s, the mean {mean:.6g} s; cut the "
+            "recording to where its samples lie at even intervals"
+        )
+    return mean
+
+
+def write_broad(recording: Recording, path: str | os.PathLike[str]) -> None:
+    """Write a recording of even stamps in the layout of BROAD; its clock is lost, for the layout has none."""
+    interval = sample_interval(recording)
+    content = {
+        "imu_gyr": recording.rate,
+        "imu_acc": recording.specific_force,
+        "imu_mag": None
+        if recording.magnetic_field is None or not recording.magnetic_unit
+        else recording.magnetic_field * (MAGNETIC_UNITS[recording.magnetic_unit] / MAGNETIC_UNITS["uT"]),
+        "opt_quat": recording.true_attitude,
+        "movement": recording.movement,
+    }
+    if recording.magnetic_field is not None and content["imu_mag"] is None:
+        content["imu_mag"] = recording.magnetic_field  # of a unit that nobody knows
+    with written_beside(path) as temporary, whole_hdf5(temporary) as file:
+        file.attrs["sampling_rate"] = 1.0 / interval
+        for name, value in content.items():
+            if value is not None:
+                file.create_dataset(name, data=value)

@@ -1,0 +1,424 @@
+"""Which column of a table is what, and in which unit: by name, by a mapping, or guessed from the header and said.
+
+The package's own names are ``time``, ``gx gy gz`` (gyro), ``ax ay az`` (specific force), ``mx my mz`` (magnetic field), ``temperature``
+(°C), and of a reference ``reference_qw … reference_qz`` (q_fb) and ``movement`` (0 or 1). Where a header has other names, complete triples
+whose names end in an axis and hold a sensor's usual word are taken for these sensors: ``gyro_x``, ``GyrX``, ``angular_velocity.x``,
+``w_RS_S_x``, ``Gyroscope X (deg/s)``, ``accelerometer_m_s2[0]``. What was taken is among the recording's ``remarks``. Two triples that fit
+one sensor are refused, as is an acceleration without gravity.
+
+A unit stands in brackets after the name, in parentheses, or as the end of the name (``time_us``, ``gyro_x_dps``). A factor of 57.3 or 9.81
+is the commonest mistake there is, so a gyro or an accelerometer without a unit is refused rather than guessed. Time is in s unless declared
+otherwise; a magnetometer without a unit keeps the numbers it has.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from strapdown.checks import Array, InputError, known_keys, one_of
+from strapdown.recordings.recording import (
+    CLOCK_OFFSET,
+    FORCE_UNITS,
+    MAGNETIC_UNITS,
+    RATE_UNITS,
+    TIME_UNITS,
+    Recording,
+    with_gyro,
+)
+
+GROUPS = {
+    "time": ("time",),
+    "gyro": ("gx", "gy", "gz"),
+    "accelerometer": ("ax", "ay", "az"),
+    "magnetometer": ("mx", "my", "mz"),
+    "temperature": ("temperature",),
+    "reference": ("reference_qw", "reference_qx", "reference_qy", "reference_qz"),
+    "movement": ("movement",),
+}
+"""Columns by what measures them."""
+SENSORS = ("gyro", "accelerometer", "magnetometer")
+UNITS: Mapping[str, Mapping[str, float]] = {
+    "time": TIME_UNITS,
+    "gyro": RATE_UNITS,
+    "accelerometer": FORCE_UNITS,
+    "magnetometer": MAGNETIC_UNITS,
+    "temperature": {"degC": 1.0},
+}
+"""Units by group, with their factor to SI."""
+
+_SPELLINGS = {
+    "time": {"sec": "s", "secs": "s", "second": "s", "seconds": "s", "msec": "ms", "usec": "us", "nsec": "ns"}
+    | {"milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns"},
+    "gyro": {"dps": "deg/s", "mdps": "mdeg/s", "rads-1": "rad/s", "rads": "rad/s", "rad": "rad/s", "degs-1": "deg/s"}
+    | {"degs": "deg/s", "degpers": "deg/s", "radpers": "rad/s", "mrads": "mrad/s", "mdegs": "mdeg/s"},
+    "accelerometer": {"ms-2": "m/s2", "m/s/s": "m/s2", "ms2": "m/s2", "mpers2": "m/s2", "milli-g": "mg", "gs": "g"},
+    "magnetometer": {"microtesla": "uT", "nanotesla": "nT", "gauss": "G", "ga": "G", "milligauss": "mG", "mgauss": "mG"}
+    | {"tesla": "T", "mga": "mG", "ut": "uT", "nt": "nT", "g": "G", "mg": "mG"},
+    "temperature": {"c": "degC", "celsius": "degC", "degc": "degC"},
+}
+"""Other spellings of units, without spaces and in small letters."""
+_WORDS = {
+    "gyro": {"gyro", "gyr", "gyros", "gyroscope", "gyrometer", "g", "w", "omega", "angular", "angularvelocity"},
+    "accelerometer": {"acc", "accel", "accl", "accelerometer", "acceleration", "a", "specific"},
+    "magnetometer": {"mag", "magn", "magnet", "magnetometer", "magnetic", "m", "compass", "magneticfield"},
+}
+_OTHER = {"linear", "user", "gravity", "free", "world", "earth", "global", "nav", "bias", "std", "sigma", "cov"}
+_OTHER |= {"covariance", "var", "variance", "offset", "delta", "filtered", "temperature", "temp"}
+"""Words of columns that are no plain sample of a sensor."""
+_TIMES = ("time", "timestamp", "timestamps", "t", "stamp", "ts", "seconds elapsed")
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column's header: its name, and the unit it declares."""
+
+    name: str
+    unit: str = ""
+
+    @property
+    def said(self) -> str:
+        """The header as it stands, nearly."""
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
+
+
+def column(cell: str) -> Column:
+    """Return a header's cell as name and unit; in parentheses only what is a known unit is taken for one."""
+    text = " ".join(cell.replace("\N{NO-BREAK SPACE}", " ").split()).strip('"')
+    unit = ""
+    parted = re.fullmatch(r"(.*\S)\s*\(([^()]*)\)", text)
+    if parted and any(unit_of(group, parted[2]) for group in UNITS):
+        text, unit = parted[1], parted[2]
+    indexed = re.fullmatch(r"(.*\S)\s*\[([012])\]", text)  # accelerometer_m_s2[0] of flight logs
+    if indexed:
+        return Column(f"{indexed[1]}[{indexed[2]}]", unit)
+    bracketed = re.fullmatch(r"(.*?)\s*\[(.*)\]?", text)
+    if bracketed and bracketed[1]:
+        return Column(bracketed[1].strip(), bracketed[2].removesuffix("]").strip())
+    return Column(text, unit)
+
+
+def unit_of(group: str, text: str) -> str:
+    """Return the package's name of a unit of that group, however it is spelt; empty where it is none."""
+    plain = (text.strip().replace("²", "2").replace("^", "").replace("°", "deg").replace("⁻¹", "-1").replace("⁻2", "-2")
+             .replace("µ", "u").replace("μ", "u"))  # fmt: skip
+    if plain in UNITS[group]:
+        return plain
+    squeezed = re.sub(r"[\s_·*.]", "", plain).lower()
+    small = {unit.lower(): unit for unit in UNITS[group]}
+    found = _SPELLINGS[group].get(squeezed) or (squeezed if squeezed in UNITS[group] else "")
+    return found or ("" if group == "magnetometer" else small.get(squeezed, ""))
+
+
+def parse_mapping(text: str) -> dict[str, str]:
+    """Return the columns of ``time=timestamp,gx=gyro_x[dps],…`` by role, as ``--columns`` takes them.
+
+    Raises
+    ------
+    InputError
+        If a part has no ``=``, a role is not known, or is given twice.
+    """
+    roles = [role for members in GROUPS.values() for role in members]
+    found: dict[str, str] = {}
+    for part in text.split(","):
+        role, equals, name = part.partition("=")
+        role = role.strip()
+        if not equals or not name.strip():
+            raise InputError(f"columns: {part.strip()!r} is no ROLE=NAME; write time=timestamp,gx=gyro_x[dps],…")
+        one_of("columns: role", role, roles)
+        if role in found:
+            raise InputError(f"columns: {role} is given twice; keep one")
+        found[role] = name.strip()
+    return found
+
+
+def recording(
+    source: str,
+    header: Sequence[str],
+    load: Callable[[Sequence[int], int], Mapping[int, Array]],
+    clock_ns: Callable[[int], tuple[Array, int] | None],
+    *,
+    units: Mapping[str, str] | None = None,
+    mapping: Mapping[str, str] | None = None,
+    gyro_alone: bool = False,
+) -> Recording:
+    """Return the recording of a table.
+
+    Parameters
+    ----------
+    source : str
+        What errors call the table.
+    header : sequence of str
+        Names of the columns, perhaps with their units.
+    load : callable
+        Returns the numbers (n,) of columns, empty fields NaN, of their places and that of the time; called once.
+    clock_ns : callable
+        Returns (time, epoch_ns) of a loaded column that holds stamps as whole ns or dates, None of one that holds numbers.
+    units : mapping, optional
+        Units of ``time``, ``gyro``, ``accelerometer``, ``magnetometer`` where the header does not declare them.
+    mapping : mapping, optional
+        Names of columns by role, perhaps with a unit: ``{"gx": "gyro_x [dps]"}``; the others are found by their names.
+    gyro_alone : bool
+        Leave the columns of the other sensors alone.
+    """
+    known_keys("units", units or {}, [group for group in UNITS if group != "temperature"])
+    columns = [column(cell) for cell in header]
+    _no_doubles(source, columns)
+    roles, declared, remark = _roles(source, columns, mapping or {})
+    if gyro_alone:
+        roles = {role: k for role, k in roles.items() if _group(role) in ("time", "gyro", "temperature", "reference")}
+    for group, members in GROUPS.items():
+        missing = [role for role in members if role not in roles]
+        if missing and (group in ("time", "gyro") or len(missing) < len(members)):
+            raise InputError(_lacks(source, missing, columns))
+    present = {_group(role) for role in roles}
+    chosen = _units(source, present, declared, units or {})
+    values = load(sorted(set(roles.values())), roles["time"]).__getitem__
+    _need_digits(source, values, roles)
+    stamps = clock_ns(roles["time"])
+    time, epoch = _seconds(values(roles["time"]), TIME_UNITS[chosen["time"]]) if stamps is None else stamps
+    if "time" not in declared and not (units or {}).get("time"):
+        _need_time_unit(source, columns[roles["time"]].name, time)
+
+    def triple(group: str, factor: float) -> Array:
+        return np.stack([values(roles[role]) for role in GROUPS[group]], axis=1) * factor
+
+    own: dict[str, Any] = {}
+    if "accelerometer" in present:
+        own["specific_force"] = triple("accelerometer", FORCE_UNITS[chosen["accelerometer"]])
+    if "magnetometer" in present:
+        own["magnetic_field"] = triple("magnetometer", 1.0)
+        own["magnetic_unit"] = chosen["magnetometer"]
+    if "temperature" in present:
+        own["temperature"] = values(roles["temperature"])
+    if "reference" in present:
+        own["true_attitude"] = triple("reference", 1.0)
+    if "movement" in present:
+        own["movement"] = values(roles["movement"]) > 0.5
+    return with_gyro(
+        source=source,
+        time=time,
+        rate=triple("gyro", RATE_UNITS[chosen["gyro"]]),
+        epoch_ns=epoch,
+        remarks=(remark,) if remark else (),
+        **own,
+    )
+
+
+def _no_doubles(source: str, columns: Sequence[Column]) -> None:
+    seen: set[str] = set()
+    for one in columns:
+        if one.name and one.name.lower() in seen:
+            raise InputError(f"{source}: the header names the column {one.name.lower()!r} twice; rename or drop one")
+        seen.add(one.name.lower())
+
+
+def _group(role: str) -> str:
+    return next(group for group, members in GROUPS.items() if role in members)
+
+
+def _lacks(source: str, missing: Sequence[str], columns: Sequence[Column]) -> str:
+    has = ", ".join(one.name for one in columns)
+    return (
+        f"{source}: the header lacks {', '.join(missing)} (it has: {has}); name the columns, as in "
+        f"--columns {missing[0]}=NAME,…"
+    )
+
+
+def _roles(
+    source: str, columns: Sequence[Column], mapping: Mapping[str, str]
+) -> tuple[dict[str, int], dict[str, str], str]:
+    """Return the column of each role, the unit that each group's columns declare, and what is to be said of a guess."""
+    names = [one.name.lower() for one in columns]
+    unit_by_role: dict[str, str] = {}
+    roles: dict[str, int] = {}
+    for role, cell in mapping.items():
+        wanted = column(cell)
+        cells = {one.said.lower(): k for k, one in enumerate(columns)} | {name: k for k, name in enumerate(names)}
+        found = cells.get(cell.lower(), cells.get(wanted.name.lower()))
+        if found is None:
+            raise InputError(
+                f"{source} has no column {cell!r} for {role} (it has: {', '.join(c.name for c in columns)})"
+            )
+        roles[role] = found
+        if wanted.unit and cell.lower() not in names:
+            unit_by_role[role] = wanted.unit
+    guessed: list[str] = []
+    for group, members in GROUPS.items():
+        named = {role: names.index(role) for role in members if role in names}
+        if named or any(role in roles for role in members):
+            roles = named | roles
+            continue
+        found_unit = _guess(source, group, columns)
+        if found_unit is not None:
+            places, unit = found_unit
+            roles |= dict(zip(members, places, strict=True))
+            unit_by_role |= dict.fromkeys(members, unit) if unit else {}
+            said = ", ".join(repr(columns[k].said) for k in places)
+            guessed.append(f"{' '.join(members)} from {said}{f' in {unit}' if unit else ''}")
+    declared: dict[str, str] = {}
+    for role, k in roles.items():
+        unit = unit_by_role.get(role) or columns[k].unit
+        group = _group(role)
+        if unit and group in UNITS:
+            unit = unit_of(group, unit) or unit
+            if declared.setdefault(group, unit) != unit:
+                raise InputError(
+                    f"{source}: column {columns[k].name} is in {unit} but another {group} column in {declared[group]}; "
+                    "give all axes of one sensor the same unit"
+                )
+    return roles, declared, f"Columns taken by their names: {'; '.join(guessed)}." if guessed else ""
+
+
+def _words(name: str) -> list[str]:
+    """Return the words of a name: parted where letters end, where small ones turn to capitals, and before digits in brackets."""
+    name = re.sub(r"\[(\d)\]", r" axis\1 ", name)
+    name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", " ", name)
+    return [word.lower() for word in re.split(r"[^A-Za-z0-9µμ°²/]+", name) if word]
+
+
+def _guess(source: str, group: str, columns: Sequence[Column]) -> tuple[tuple[int, ...], str] | None:
+    """Return the columns that seem to be a group's, and the unit in their names; None where none do, an error where several do."""
+    if group == "time":
+        return _guess_time(columns)
+    if group == "temperature":
+        hits = [k for k, one in enumerate(columns) if _words(one.name)[:1] in (["temp"], ["temperature"])]
+        usable = len(hits) == 1 and unit_of("temperature", columns[hits[0]].unit or _end(group, columns[hits[0]].name))
+        return ((hits[0],), "degC") if usable else None
+    if group not in SENSORS:
+        return None
+    found: dict[tuple[str, ...], dict[int, tuple[int, str]]] = {}
+    for k, one in enumerate(columns):
+        parted = _axis(group, one.name)
+        if parted is not None:
+            prefix, axis, unit = parted
+            found.setdefault(prefix, {})[axis] = (k, unit)
+    whole = [(prefix, axes) for prefix, axes in found.items() if len(axes) == 3]
+    if len(whole) > 1:
+        said = " or ".join(columns[axes[0][0]].said for _, axes in whole)
+        role = GROUPS[group][0]
+        raise InputError(
+            f"{source}: the {group} may be that of {said}; say which, as in --columns {role}={columns[whole[0][1][0][0]].name},…"
+        )
+    if not whole:
+        return None
+    axes = whole[0][1]
+    return tuple(axes[axis][0] for axis in range(3)), axes[0][1]
+
+
+def _axis(group: str, name: str) -> tuple[tuple[str, ...], int, str] | None:
+    """Return a column's name without its axis, the axis, and the unit in the name; None where it is no axis of that sensor."""
+    words = _words(name)
+    joined = re.fullmatch(r"([a-z]+)([xyz])", words[-1]) if words else None
+    if joined and joined[1] in _WORDS[group]:
+        words = [*words[:-1], joined[1], joined[2]]
+    elif words and (first := re.fullmatch(r"([a-z]+)([xyz])", words[0])) and first[1] in _WORDS[group]:
+        words = [first[1], first[2], *words[1:]]
+    places = [k for k, word in enumerate(words) if word in ("x", "y", "z", "axis0", "axis1", "axis2")]
+    if not places:
+        return None
+    place = places[-1]
+    before, after = words[:place], words[place + 1 :]
+    unit = unit_of(group, "".join(after)) if after else ""
+    if after and not unit:
+        return None
+    known = before and (before[0] in _WORDS[group] or any(len(word) > 2 for word in _WORDS[group] & set(before)))
+    foreign = set(before) & _OTHER
+    if "linear_acceleration" in name.lower():  # the field of a ROS message, which holds gravity
+        foreign -= {"linear"}
+    if not known or foreign or any(set(before) & _WORDS[o] - {"g", "a", "m", "w"} for o in SENSORS if o != group):
+        return None
+    rest = [word for word in before if word not in _WORDS[group]]
+    if not unit and rest:
+        unit = unit_of(group, "".join(rest))
+    return tuple(before), "xyz012".index(words[place][-1]) % 3, unit
+
+
+def _guess_time(columns: Sequence[Column]) -> tuple[tuple[int, ...], str] | None:
+    for wanted in _TIMES:
+        for k, one in enumerate(columns):
+            words = _words(one.name)
+            size = len(wanted.split())
+            if " ".join(words[:size]) == wanted:
+                unit = unit_of("time", "".join(words[size:])) if words[size:] else ""
+                if unit or not words[size:]:
+                    return (k,), unit
+    return None
+
+
+def _end(group: str, name: str) -> str:
+    words = _words(name)
+    return words[-1] if len(words) > 1 else ""
+
+
+def _units(
+    source: str, present: Collection[str], declared: Mapping[str, str], given: Mapping[str, str]
+) -> dict[str, str]:
+    """Return the unit of each group of columns that the table has; empty of a magnetometer that declares none."""
+    chosen: dict[str, str] = {}
+    for group, units in UNITS.items():
+        if group not in present:
+            continue
+        option = given.get(group, "")
+        option = unit_of(group, option) or option
+        unit = option or declared.get(group) or {"time": "s", "temperature": "degC"}.get(group, "")
+        if not unit and group != "magnetometer":
+            raise InputError(
+                f"{source} does not say the unit of its {group} columns; declare it in the header, as in "
+                f"{GROUPS[group][0]} [{next(iter(units))}], or by option ({' or '.join(units)})"
+            )
+        if option and declared.get(group) and option != declared[group]:
+            raise InputError(
+                f"{source}: the header says {declared[group]} for the {group}, the option {option}; drop one"
+            )
+        chosen[group] = one_of(f"{source}: unit of the {group}", unit, units) if unit else ""
+    return chosen
+
+
+SHORT_STAMPS = 0.1
+"""Share of the rows with the stamp of the row before, above which stamps lack digits rather than that a row is wrong."""
+
+
+def _need_digits(source: str, values: Callable[[int], Array], roles: Mapping[str, int]) -> None:
+    """Refuse stamps, one in ten of which is that of the row before though the rows differ: they were written with too few digits."""
+    stamps = values(roles["time"])
+    same = np.flatnonzero(stamps[1:] == stamps[:-1])
+    if len(same) <= SHORT_STAMPS * len(stamps[1:]):
+        return
+    differ = np.zeros(len(same), bool)
+    for role in roles:
+        x = values(roles[role])
+        a, b = x[same], x[same + 1]
+        differ |= (a != b) & ~(np.isnan(a) & np.isnan(b))
+    repeats = same[differ]
+    if len(repeats) > max(2, SHORT_STAMPS * len(stamps[1:])):
+        raise InputError(
+            f"{source}: {len(repeats)} of {len(stamps)} rows have the stamp of the row before and other samples, the first of them "
+            f"{stamps[repeats[0] + 1]:.17g} in data row {repeats[0] + 2}; write the stamps with more digits"
+        )
+
+
+def _seconds(stamps: Array, factor: float) -> tuple[Array, int]:
+    """Return stamps as time in s and the clock's reading at its start, ns; those of a clock that counts from 1970 begin at 0."""
+    beyond = len(stamps) > 0 and abs(stamps[0] * factor) > CLOCK_OFFSET
+    origin = stamps[0] if beyond else 0.0
+    return np.asarray((stamps - origin) * factor), round(float(origin) * factor * 1e9) if beyond else 0
+
+
+USUAL_INTERVALS = (1e-6, 2.0)
+"""Sample intervals, s, outside which stamps of an undeclared unit are not taken for seconds."""
+
+
+def _need_time_unit(source: str, name: str, time: Array) -> None:
+    """Refuse stamps of an undeclared unit that no inertial sensor has in seconds: those of flight logs are mostly microseconds."""
+    steps = np.abs(np.diff(time))
+    usual = float(np.median(steps[steps > 0.0])) if np.any(steps > 0.0) else 1.0
+    if not USUAL_INTERVALS[0] <= usual <= USUAL_INTERVALS[1]:
+        raise InputError(
+            f"{source}: the stamps of {name} are {usual:g} apart, which are hardly seconds; declare their unit, as in {name} [us], or by "
+            f"option ({' or '.join(TIME_UNITS)})"
+        )

@@ -1,0 +1,185 @@
+"""Recordings as columns in memory or in Parquet: pandas, xarray, pyarrow. Libraries: ``pandas``, ``xarray``, ``pyarrow``.
+
+Which column is what, and in which unit: :mod:`strapdown.recordings.columns`, by the names of the columns; a column's unit may also be its
+attribute ``units`` (xarray) or the metadata ``unit`` of its field (Parquet). A time column, or an index named time, may hold dates: they
+are ns since 1970, UTC. Missing values are missing samples. Axes are those of the columns.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from strapdown.checks import Array, InputError
+from strapdown.files import written_beside
+from strapdown.recordings import columns as naming
+from strapdown.recordings.delimited import recording_columns
+from strapdown.recordings.extras import library
+from strapdown.recordings.recording import CLOCK_OFFSET, Recording, relative_time
+
+
+def from_table(
+    table: Any,
+    *,
+    source: str = "table",
+    units: Mapping[str, str] | None = None,
+    columns: Mapping[str, str] | None = None,
+    gyro_alone: bool = False,
+) -> Recording:
+    """Return the recording of a pandas ``DataFrame``, an xarray ``Dataset``, or a mapping of names to arrays.
+
+    Parameters
+    ----------
+    table : DataFrame, Dataset or mapping
+        Columns named as those of a CSV file; variables of a Dataset with a second dimension of length 3 are x, y and z.
+    source : str
+        What messages call it.
+    units, columns, gyro_alone
+        As :func:`strapdown.recordings.read` takes them.
+
+    Raises
+    ------
+    InputError
+        As for a CSV file.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> rest = {"time": np.arange(3.0), "gx [dps]": np.zeros(3), "gy": np.zeros(3), "gz": np.zeros(3)}
+    >>> from_table(rest).rate.shape
+    (3, 3)
+    """
+    found = _columns(source, table)
+    names, arrays = list(found), list(found.values())
+    for name, one in found.items():
+        if np.shape(one) != np.shape(arrays[0]) or np.ndim(one) != 1:
+            raise InputError(
+                f"{source}: column {name} has shape {np.shape(one)}, the first {np.shape(arrays[0])}; give rows of one length"
+            )
+
+    def values(k: int) -> Array:
+        try:
+            return np.asarray(arrays[k], np.float64)
+        except (TypeError, ValueError):
+            raise InputError(f"{source}: column {names[k]} holds {arrays[k].dtype}, no numbers") from None
+
+    def clock_ns(k: int) -> tuple[Array, int] | None:
+        x = arrays[k]
+        if x.dtype.kind in "mM":
+            if np.isnat(x).any():
+                raise InputError(f"{source}: {names[k]}[{int(np.argmax(np.isnat(x)))}] is no date; drop such rows")
+            return relative_time(x.astype("M8[ns]" if x.dtype.kind == "M" else "m8[ns]").astype(np.int64))
+        unit = naming.unit_of("time", naming.column(names[k]).unit) or (units or {}).get("time", "")
+        if x.dtype.kind in "iu" and len(x) and unit in ("", "ns") and abs(int(x[0])) > CLOCK_OFFSET * 1e9:
+            return relative_time(x.astype(np.int64))
+        return None
+
+    return naming.recording(
+        source,
+        names,
+        lambda places, _: {k: values(k) for k in places},
+        clock_ns,
+        units=units,
+        mapping=columns,
+        gyro_alone=gyro_alone,
+    )
+
+
+def _columns(source: str, table: Any) -> dict[str, NDArray[np.generic]]:
+    """Return names, with units where the table declares them, and arrays."""
+    if hasattr(table, "data_vars"):
+        return _of_dataset(table)
+    found: dict[str, NDArray[np.generic]] = {}
+    if hasattr(table, "columns"):  # a DataFrame
+        index = table.index
+        if (index.name or getattr(index, "tz", None) is not None or np.asarray(index).dtype.kind in "mM") and not (
+            {"time", index.name} & {str(name) for name in table.columns}
+        ):
+            found[str(index.name or "time")] = _plain(index)
+        found |= {str(name): _plain(table[name]) for name in table.columns}
+    else:
+        found = {str(name): np.asarray(values) for name, values in dict(table).items()}
+    if not found:
+        raise InputError(f"{source} has no columns; give time, gx, gy, gz, …")
+    return found
+
+
+def _plain(series: Any) -> NDArray[np.generic]:
+    """Return a column as an array; dates with a zone as UTC, what is missing in a column of objects as NaN."""
+    if getattr(getattr(series, "dt", series), "tz", None) is not None:
+        series = (
+            series.dt.tz_convert("UTC").dt.tz_localize(None)
+            if hasattr(series, "dt")
+            else series.tz_convert("UTC").tz_localize(None)
+        )
+    if hasattr(series, "to_numpy"):
+        kind = getattr(series.dtype, "kind", "O")
+        if kind in "iuf" and not isinstance(series.dtype, np.dtype):  # the nullable types of pandas
+            return np.asarray(
+                series.to_numpy(dtype=np.float64, na_value=np.nan) if series.isna().any() else series.to_numpy()
+            )
+        return np.asarray(series.to_numpy())
+    return np.asarray(series)
+
+
+def _of_dataset(table: Any) -> dict[str, NDArray[np.generic]]:
+    found: dict[str, NDArray[np.generic]] = {}
+    for name, variable in {**table.coords, **table.data_vars}.items():
+        unit = str(variable.attrs.get("units", variable.attrs.get("unit", "")))
+        values = np.asarray(variable.values)
+        declared = f" [{unit}]" if unit and values.dtype.kind not in "mM" else ""
+        if values.ndim == 1 and values.dtype.kind not in "OSU" and name != "axis":
+            found[f"{name}{declared}"] = values
+        elif values.ndim == 2 and values.shape[1] == 3:
+            found |= {f"{name}_{axis}{declared}": values[:, k] for k, axis in enumerate("xyz")}
+    length = max((len(values) for values in found.values()), default=0)
+    return {name: values for name, values in found.items() if len(values) == length}
+
+
+def read_parquet(
+    path: str | os.PathLike[str],
+    *,
+    units: Mapping[str, str] | None = None,
+    columns: Mapping[str, str] | None = None,
+    gyro_alone: bool = False,
+) -> Recording:
+    """Read a recording from Parquet; options as :func:`strapdown.recordings.read`."""
+    file = Path(path)
+    parquet = library("pyarrow.parquet", f"{file.name} is Parquet, which")
+    try:
+        table = parquet.read_table(file)
+    except Exception as error:  # of a cut file the library raises several kinds
+        raise InputError(
+            f"{file.name} cannot be read as Parquet ({' '.join(str(error).split())}); the file is truncated or damaged"
+        ) from None
+    found: dict[str, NDArray[np.generic]] = {}
+    for entry, chunks in zip(table.schema, table.columns, strict=True):
+        unit = (entry.metadata or {}).get(b"unit", b"").decode()
+        found[f"{entry.name} [{unit}]" if unit else entry.name] = np.asarray(chunks.to_numpy())
+    return from_table(found, source=file.name, units=units, columns=columns, gyro_alone=gyro_alone)
+
+
+def write_parquet(recording: Recording, path: str | os.PathLike[str]) -> None:
+    """Write a recording as Parquet, its units as metadata of the fields."""
+    found, unit = recording_columns(recording)
+    write_parquet_columns(path, found, unit)
+
+
+def write_parquet_columns(
+    path: str | os.PathLike[str], found: Mapping[str, NDArray[np.generic]], units: Mapping[str, str] | None = None
+) -> None:
+    """Write columns as Parquet, units as metadata of the fields."""
+    arrow = library("pyarrow", f"writing {Path(path).name}")
+    parquet = library("pyarrow.parquet", f"writing {Path(path).name}")
+    arrays = [arrow.array(np.ascontiguousarray(values)) for values in found.values()]
+    fields = [
+        arrow.field(name, values.type, metadata={"unit": unit} if (unit := (units or {}).get(name)) else None)
+        for name, values in zip(found, arrays, strict=True)
+    ]
+    with written_beside(path) as temporary:
+        parquet.write_table(arrow.Table.from_arrays(arrays, schema=arrow.schema(fields)), temporary)

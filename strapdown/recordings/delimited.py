@@ -1,0 +1,282 @@
+"""Recordings as text: CSV, TSV and their kin, with a header of any names.
+
+The separator is the one of ``, ; tab |`` that parts the header into most columns. Lines of ``#`` are comments; if no other header comes
+before the numbers, the last of them is it (EuRoC). Two header rows are joined, an empty cell of the first taking what stands before it
+(RepoIMU), and a second row of units goes into brackets. Where the separator is no comma, decimals may have commas. Which column is what:
+:mod:`strapdown.recordings.columns`. Axes, units and clock are those of the file's columns; stamps written as whole numbers are read as
+such, so that nanoseconds since 1970 keep all their digits; a time may be a date of ISO 8601, to the microsecond, UTC unless it names a
+zone.
+
+:func:`write_csv` writes the package's own names with units in brackets, 17 digits a number; time in ns of the source's clock where that
+counts from 1970, else in s.
+"""
+
+from __future__ import annotations
+
+import csv
+import datetime
+import io
+import math
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from strapdown import reading, recordfiles
+from strapdown.checks import Array, InputError
+from strapdown.files import written_beside
+from strapdown.recordings import columns as naming
+from strapdown.recordings.recording import CLOCK_OFFSET, Recording
+
+SEPARATORS = ",;\t|"
+_LARGE = 10**15
+"""Whole numbers from here on may lose digits as float64."""
+
+
+def read_csv(
+    path: str | os.PathLike[str],
+    *,
+    units: Mapping[str, str] | None = None,
+    gyro_alone: bool = False,
+    columns: Mapping[str, str] | None = None,
+) -> Recording:
+    """Read a table of text, by default of columns ``time, gx, gy, gz[, ax, ay, az[, mx, my, mz]]`` in any order.
+
+    Other columns are left alone. Empty fields of accelerometer and magnetometer are missing samples; rows with an empty field of the gyro
+    are left out and named in ``missing_gyro``, as are rows that repeat the row before, in ``repeated``.
+
+    Parameters
+    ----------
+    path : path
+        Text in UTF-8.
+    units : mapping, optional
+        Units of ``time``, ``gyro``, ``accelerometer``, ``magnetometer`` where the header does not declare them.
+    gyro_alone : bool
+        Leave the columns of the other sensors alone, whose units need not be known then.
+    columns : mapping, optional
+        Names of columns by role where they are not the usual ones: ``{"time": "timestamp [us]", "gx": "gyro_x[dps]"}``.
+
+    Raises
+    ------
+    InputError
+        If the file is no such table, a row is cut short or holds no number, a unit is unknown, undeclared or contradicted, or a column is
+        missing or could be one of several.
+    """
+    file = Path(path)
+    if recordfiles.is_record(file):
+        raise InputError(
+            f"{file.name} is a simulated record, no recording; integrate it (`strapdown integrate`) or filter it (`strapdown estimate`)"
+        )
+    with reading.from_file(file):
+        table = _Table(file.name, io.StringIO(reading.text(file), newline=""))
+        return naming.recording(
+            file.name,
+            table.header,
+            table.load,
+            table.clock_ns,
+            units=units,
+            mapping=columns,
+            gyro_alone=gyro_alone,
+        )
+
+
+class _Table:
+    """A header and rows of numbers, of which only the columns that are asked for are read: the others may hold anything."""
+
+    def __init__(self, source: str, lines: Iterator[str]) -> None:
+        self.source = source
+        head = _Head(source, lines)
+        self.header = head.names
+        self._separator = head.separator
+        self._whole: dict[int, list[int]] = {}  # columns of large whole numbers
+        self._rows_read = 0
+        self._rows = csv.reader(_rest(head.first, lines), delimiter=head.separator)
+
+    def load(self, places: Sequence[int], time: int) -> dict[int, Array]:
+        """Return the numbers (n,) of columns; empty fields are NaN, dates of the time are ns since 1970."""
+        result: list[list[float]] = []
+        width = len(self.header)
+        for k, row in enumerate(self._rows):
+            if len(row) == width + 1 and not row[-1].strip():
+                del row[-1]  # a separator at the end of the line
+            if len(row) != width:
+                raise InputError(
+                    f"{self.source}: data row {k + 1} has {len(row)} fields, the header {width}; {_why(row, width)}"
+                )
+            try:
+                result.append([float(cell) if (cell := row[j]).strip() else np.nan for j in places])
+            except ValueError:
+                result.append([self._number(k, j, row[j], j == time) for j in places])
+            if k == 0:
+                self._whole = {j: [] for j, x in zip(places, result[0], strict=True) if abs(x) >= _LARGE}
+            for j, whole in self._whole.items():
+                if re.fullmatch(r"\s*\d{1,19}\s*", row[j]):
+                    whole.append(int(row[j]))
+                elif j == time and (date := _date(row[j])) is not None:
+                    whole.append(date)
+        if not result:
+            raise InputError(f"{self.source} has a header but no data rows")
+        self._rows_read = len(result)
+        return dict(zip(places, np.array(result).T.copy(), strict=True))
+
+    def _number(self, row: int, place: int, cell: str, time: bool) -> float:
+        """Return a cell's number; its decimals may have a comma where that is not the separator, and a time may be a date."""
+        date = _date(cell) if time else None
+        if date is not None:
+            return float(date)
+        try:
+            return float(cell if self._separator == "," else cell.replace(",", ".")) if cell.strip() else np.nan
+        except ValueError:
+            raise InputError(
+                f"{self.source}: data row {row + 1}, column {self.header[place]} is {cell!r}, not a number"
+            ) from None
+
+    def clock_ns(self, k: int) -> tuple[Array, int] | None:
+        """Return time and epoch of a column of large whole stamps, in ns, that was loaded; None of others."""
+        whole = self._whole.get(k)
+        unit = naming.unit_of("time", naming.column(self.header[k]).unit)
+        if not whole or unit not in ("", "ns") or whole[0] < CLOCK_OFFSET * 1e9 or len(whole) != self._rows_read:
+            return None
+        stamps = np.array(whole, dtype=np.int64)
+        return (stamps - stamps[0]) / 1e9, whole[0]
+
+
+class _Head:
+    """The lines before the numbers: the names of the columns, the separator, and the first lines of numbers."""
+
+    def __init__(self, source: str, lines: Iterator[str]) -> None:
+        titles: list[str] = []
+        comment = ""
+        self.first: list[str] = []
+        for line in lines:
+            if not line.strip():
+                continue
+            if line.lstrip().startswith("#"):
+                comment = line.lstrip().lstrip("#").strip() or comment
+                continue
+            if titles and _numeric(line):
+                self.first = [line]
+                break
+            if not titles and _numeric(line):  # numbers at once: the last comment may name them
+                titles, self.first = [comment], [line]
+                break
+            titles.append(line.rstrip("\r\n"))
+            if len(titles) == 3:
+                self.first = [titles.pop()]
+                break
+        if not any(title.strip() for title in titles):
+            words = "has no header" if self.first else "is empty"
+            raise InputError(f"{source} {words}; wanted a header like time,gx,gy,gz,ax,ay,az")
+        self.separator = max(SEPARATORS, key=titles[0].count)
+        cells = [next(csv.reader([title], delimiter=self.separator)) for title in titles]
+        if len(cells) == 2 and not self._second_row(cells[0], cells[1]):
+            self.first, cells = (
+                [titles[1], *self.first],
+                cells[:1],
+            )  # a row of the data that is no number: said with its place
+        self.names = [cell.strip() for cell in cells[0]] if len(cells) == 1 else _joined(*cells)
+        while self.names and not self.names[-1]:
+            self.names.pop()
+
+    @staticmethod
+    def _second_row(first: Sequence[str], second: Sequence[str]) -> bool:
+        """Return whether a second row of words goes with the first: no number in it, and of the same width."""
+        return len(first) == len(second) and not any(_is_number(cell) and cell.strip() for cell in second)
+
+
+def _date(cell: str) -> int | None:
+    """Return a date and time of ISO 8601 in ns since 1970, UTC where it names no zone; None of other text."""
+    if not re.match(r"\s*\d{4}-\d\d-\d\d[T ]", cell):
+        return None
+    try:
+        date = datetime.datetime.fromisoformat(cell.strip())
+    except ValueError:
+        return None
+    since = (date if date.tzinfo else date.replace(tzinfo=datetime.UTC)) - datetime.datetime(
+        1970, 1, 1, tzinfo=datetime.UTC
+    )
+    return (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000
+
+
+def _rest(first: Sequence[str], lines: Iterator[str]) -> Iterator[str]:
+    yield from first
+    for line in lines:
+        if line.strip() and not line.lstrip().startswith("#"):
+            yield line
+
+
+def _joined(first: Sequence[str], second: Sequence[str]) -> list[str]:
+    """Return the names of two header rows: a second row of units goes into brackets, one of axes or names is put behind."""
+    if all(any(naming.unit_of(group, cell) for group in naming.UNITS) for cell in second if cell.strip()):
+        return [f"{a.strip()} [{b.strip()}]" if b.strip() else a.strip() for a, b in zip(first, second, strict=True)]
+    names, before = [], ""
+    for a, b in zip(first, second, strict=True):
+        before = a.strip() or before
+        one = naming.column(before)
+        name = f"{one.name} {b.strip()}".strip()
+        names.append(f"{name} [{one.unit}]" if one.unit and "[" not in b else name)
+    return names
+
+
+def _numeric(line: str) -> bool:
+    """Return whether a line is one of numbers: most of its filled fields are, of whatever separator."""
+    filled = [cell for part in re.split(r"[,;\t|]", line) if (cell := part.strip().strip('"'))]
+    return bool(filled) and 2 * sum(map(_is_number, filled)) >= len(filled)
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell or "nan")
+    except ValueError:
+        return False
+    return True
+
+
+def _why(row: Sequence[str], width: int) -> str:
+    if width < len(row) and all(re.fullmatch(r"\s*-?\d+(e-?\d+)?\s*", part) for part in row):
+        return "its decimals seem to have commas: write points"
+    return "the file is truncated or damaged there"
+
+
+def recording_columns(recording: Recording) -> tuple[dict[str, NDArray[np.generic]], dict[str, str]]:
+    """Return what a recording holds as columns by the package's names, and the unit of each that has one."""
+    clock = bool(recording.epoch_ns)
+    found: dict[str, NDArray[np.generic]] = {"time": recording.clock_ns if clock else recording.time}
+    unit = {"time": "ns" if clock else "s"}
+    triples = {
+        "gyro": (recording.rate, "rad/s"),
+        "accelerometer": (recording.specific_force, "m/s2"),
+        "magnetometer": (recording.magnetic_field, recording.magnetic_unit),
+        "temperature": (None if recording.temperature is None else recording.temperature[:, None], "degC"),
+        "reference": (recording.true_attitude, ""),
+        "movement": (None if recording.movement is None else recording.movement[:, None].astype(np.int64), ""),
+    }
+    for group, (values, name) in triples.items():
+        if values is not None:
+            found |= {role: values[:, k] for k, role in enumerate(naming.GROUPS[group])}
+            unit |= dict.fromkeys(naming.GROUPS[group], name) if name else {}
+    return found, unit
+
+
+def write_csv(recording: Recording, path: str | os.PathLike[str]) -> None:
+    """Write a recording as CSV (as TSV where the ending is ``.tsv``), so that :func:`read_csv` gives the same numbers back."""
+    found, unit = recording_columns(recording)
+    names = [f"{name} [{unit[name]}]" if name in unit else name for name in found]
+    write_columns(path, dict(zip(names, found.values(), strict=True)))
+
+
+def write_columns(path: str | os.PathLike[str], found: Mapping[str, NDArray[np.generic]]) -> None:
+    """Write columns of numbers as text, 17 digits a number, whole numbers whole; NaN is an empty field."""
+    separator = "\t" if Path(path).suffix.lower() == ".tsv" else ","
+    texts = []
+    for column in found.values():
+        if column.dtype.kind in "iu":
+            texts.append([str(x) for x in column.tolist()])
+        else:
+            texts.append(["" if math.isnan(x) else repr(x) for x in column.tolist()])
+    with written_beside(path) as temporary, open(temporary, "w", encoding="utf-8", newline="") as file:
+        file.write(separator.join(found) + "\n")
+        file.writelines(separator.join(row) + "\n" for row in zip(*texts, strict=True))

@@ -1,0 +1,199 @@
+"""The recording: point samples of rate, specific force and magnetic field on one time axis, whatever file they came from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from strapdown.checks import Array, InputError, array, increasing, one_of
+from strapdown.units import DEGREE, STANDARD_GRAVITY
+
+RATE_UNITS = {"rad/s": 1.0, "deg/s": DEGREE, "mrad/s": 1e-3, "mdeg/s": 1e-3 * DEGREE}
+"""Units of a gyro column, and their factor to rad/s."""
+FORCE_UNITS = {"m/s2": 1.0, "g": STANDARD_GRAVITY, "mg": 1e-3 * STANDARD_GRAVITY}
+"""Units of an accelerometer column, and their factor to m/s²."""
+MAGNETIC_UNITS = {"T": 1.0, "mT": 1e-3, "uT": 1e-6, "nT": 1e-9, "G": 1e-4, "mG": 1e-7}
+"""Units of a magnetometer column, and their factor to T."""
+TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+"""Units of a time column, and their factor to s."""
+
+CLOCK_OFFSET = 1e8
+"""Stamps beyond this many seconds count from 1970 or from the start of a machine: a recording's time then begins at the first of them."""
+
+GAP = 5.0
+"""An interval between stamps of more than this many usual ones is a gap."""
+
+_ROWS = ("time", "rate", "specific_force", "magnetic_field", "temperature", "true_attitude", "movement")
+
+
+LARGEST_RATE = 2000.0
+"""rad/s: five times the range of the fastest gyros. More are raw counts, or a damaged row; and a filter would cut each interval into
+thousands of steps."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Recording:
+    """A recording of one inertial measurement unit."""
+
+    source: str
+    """Where it comes from: the file's name."""
+    time: Array
+    """Time stamps (n,), s, increasing."""
+    rate: Array
+    """Angular rate at the stamps (n, 3), rad/s, body axes."""
+    specific_force: Array | None = None
+    """Specific force (n, 3), m/s², body axes: at rest 9.81 upwards; rows of NaN are missing."""
+    magnetic_field: Array | None = None
+    """Magnetic field (n, 3), any one unit, body axes; rows of NaN are missing."""
+    magnetic_unit: str = ""
+    """Unit of the magnetic field, of :data:`MAGNETIC_UNITS`; empty where the file does not say."""
+    temperature: Array | None = None
+    """Temperature of the sensor (n,), °C; NaN is missing."""
+    true_attitude: Array | None = None
+    """Reference q_fb (n, 4), fixed frame East-North-Up with magnetic North; rows of NaN are missing."""
+    movement: np.ndarray | None = None
+    """Samples that errors are judged over (n,), bool."""
+    epoch_ns: int = 0
+    """What the source's clock read at time 0, ns: of a clock that counts from 1970, nanoseconds since then."""
+    missing_gyro: Array = field(default_factory=lambda: np.empty(0))
+    """Stamps of the file's rows without a gyro sample (k,), s. They are left out as a whole: the intervals on both sides are one, the turn
+    over it is taken from the samples at its ends, and a filter's covariance grows over all of it."""
+    repeated: Array = field(default_factory=lambda: np.empty(0))
+    """Stamps of the file's rows that say the same as the row before, stamp and all (k,), s: they are left out. The same stamp with other
+    values is refused, for two samples at one time have no interval between them."""
+    remarks: tuple[str, ...] = ()
+    """What the reader chose or left out, a sentence each: columns it guessed, topics it took, the part of a truncated file."""
+
+    def __post_init__(self) -> None:
+        """Check shapes, order and values."""
+        time = increasing(f"{self.source}: time", self.time, least=2)
+        n = len(time)
+        object.__setattr__(self, "time", time)
+        object.__setattr__(self, "rate", array(f"{self.source}: rate", self.rate, (n, 3)))
+        if np.max(np.abs(self.rate)) > LARGEST_RATE:
+            row, axis = (int(i) for i in np.unravel_index(np.argmax(np.abs(self.rate)), self.rate.shape))
+            raise InputError(
+                f"{self.source}: rate[{row}, {axis}] is {self.rate[row, axis]:g} rad/s, which no gyro measures; convert raw counts to "
+                "rad/s or deg/s by the scale factor of the datasheet, or remove the row"
+            )
+        for name, width in (("specific_force", 3), ("magnetic_field", 3), ("true_attitude", 4)):
+            value = getattr(self, name)
+            if value is not None:
+                value = array(f"{self.source}: {name}", value, (n, width), allow_nan=True)
+                if name != "true_attitude" and not np.any(value[~np.isnan(value)]) and not np.isnan(value).all():
+                    raise InputError(
+                        f"{self.source}: {name} is 0 in every row, as where there is no such sensor; leave its columns out"
+                    )
+                object.__setattr__(self, name, value)
+        if self.temperature is not None:
+            value = array(f"{self.source}: temperature", self.temperature, (n,), allow_nan=True)
+            object.__setattr__(self, "temperature", value)
+        if self.magnetic_unit:
+            one_of(f"{self.source}: magnetic_unit", self.magnetic_unit, MAGNETIC_UNITS)
+        for name in ("missing_gyro", "repeated"):
+            object.__setattr__(self, name, array(f"{self.source}: {name}", getattr(self, name), ("k",)))
+        if self.movement is not None and np.shape(self.movement) != (n,):
+            raise InputError(f"{self.source}: movement has shape {np.shape(self.movement)}, wanted ({n},)")
+
+    def since(self, first: int) -> Recording:
+        """Return the recording from sample ``first`` on."""
+        rows = slice(first, None)
+        parts: dict[str, Any] = {n: None if getattr(self, n) is None else getattr(self, n)[rows] for n in _ROWS}
+        begin = parts["time"][0]
+        missing, repeated = (stamps[stamps > begin] for stamps in (self.missing_gyro, self.repeated))
+        return replace(self, missing_gyro=missing, repeated=repeated, **parts)
+
+    @property
+    def clock_ns(self) -> NDArray[np.int64]:
+        """Time stamps (n,) of the source's clock, ns."""
+        return np.rint(self.time * 1e9).astype(np.int64) + self.epoch_ns
+
+    @property
+    def left_out_words(self) -> str:
+        """What is to be said of rows that were left out; nothing where there are none."""
+        words = []
+        if len(self.missing_gyro):
+            words.append(
+                f"{len(self.missing_gyro)} rows without a gyro sample, the first at {self.missing_gyro[0]:.3f} s, were left out: the "
+                "turn across them is taken from the samples beside them."
+            )
+        if len(self.repeated):
+            words.append(
+                f"{len(self.repeated)} rows that repeat the row before, the first at {self.repeated[0]:.3f} s, were left out."
+            )
+        return " ".join(words)
+
+
+def with_gyro(*, source: str, time: Array, rate: Array, **columns: Any) -> Recording:
+    """Return a recording of the rows that have a gyro sample and do not repeat the row before; the stamps of the others go along."""
+    same = np.diff(time) == 0.0
+    if same.any():
+        for column in (rate, *columns.values()):
+            if np.shape(column)[:1] != time.shape:
+                continue  # not there, or not of this length, which is refused below
+            rows = np.asarray(column).reshape(len(time), -1).astype(np.float64)
+            same &= np.all((rows[1:] == rows[:-1]) | (np.isnan(rows[1:]) & np.isnan(rows[:-1])), axis=1)
+    if same.any():
+        columns = _rows(columns, np.concatenate([[True], ~same]))
+        columns["repeated"] = time[1:][same]
+        time, rate = time[np.concatenate([[True], ~same])], rate[np.concatenate([[True], ~same])]
+    known = np.asarray(~np.isnan(rate).any(axis=1))
+    if known.all():
+        return Recording(source=source, time=time, rate=rate, **columns)
+    if np.sum(known) < 2:
+        raise InputError(
+            f"{source}: {np.sum(known)} of {len(known)} rows have a gyro sample about each axis; at least 2 are needed"
+        )
+    stamps = increasing(f"{source}: time", time)
+    return Recording(
+        source=source, time=stamps[known], rate=rate[known], missing_gyro=stamps[~known], **_rows(columns, known)
+    )
+
+
+def _rows(columns: dict[str, Any], kept: NDArray[np.bool_]) -> dict[str, Any]:
+    """Return the columns with those rows; what has no rows (units, remarks, stamps of repeated rows) stays as it is."""
+    return {n: c[kept] if n in _ROWS and np.shape(c)[:1] == kept.shape else c for n, c in columns.items()}
+
+
+def relative_time(clock_ns: NDArray[np.int64]) -> tuple[Array, int]:
+    """Return stamps of a clock that counts ns as time in s, and the clock's reading at time 0 (``epoch_ns``).
+
+    Time begins at the first stamp where the clock is beyond :data:`CLOCK_OFFSET`, for float64 would otherwise lose its digits.
+    """
+    epoch = int(clock_ns[0]) if len(clock_ns) and abs(int(clock_ns[0])) > CLOCK_OFFSET * 1e9 else 0
+    return np.asarray((clock_ns - epoch) / 1e9), epoch
+
+
+def at_nearest(time: Array, other: Array, values: Array) -> tuple[Array, int]:
+    """Return the samples of a sensor with its own stamps at the nearest of ``time``, NaN elsewhere, and the number that found no place.
+
+    No sample is interpolated, for that would correlate its noise: each moves by at most half an interval of ``time``. A stamp takes the
+    nearest of the samples that fall to it; further ones, and those more than an interval outside, find no place.
+    """
+    placed = np.full((len(time), *values.shape[1:]), np.nan)
+    right = np.clip(np.searchsorted(time, other), 1, len(time) - 1)
+    nearest = np.where(other - time[right - 1] < time[right] - other, right - 1, right)
+    distance = np.abs(other - time[nearest])
+    usable = distance <= np.median(np.diff(time))
+    order = np.flatnonzero(usable)[np.argsort(-distance[usable], kind="stable")]  # the nearest comes last and stays
+    placed[nearest[order]] = values[order]
+    return placed, int(len(other) - len(np.unique(nearest[usable])))
+
+
+def increments(recording: Recording) -> Array:
+    """Return body increments (n − 1, 3), rad, over the intervals between the stamps, by the trapezoid rule.
+
+    Point samples of rate say no more at uneven stamps; at even ones :func:`strapdown.coning.increments_from_rates` fits higher
+    polynomials.
+    """
+    return np.asarray(0.5 * (recording.rate[1:] + recording.rate[:-1]) * np.diff(recording.time)[:, None])
+
+
+def gaps(time: ArrayLike) -> list[tuple[float, float]]:
+    """Return (begin, length) of every gap between stamps, s: what the body did there, no sample tells."""
+    stamps = np.asarray(time, np.float64)
+    steps = np.diff(stamps)
+    return [(float(stamps[k]), float(steps[k])) for k in np.flatnonzero(steps > GAP * np.median(steps))]

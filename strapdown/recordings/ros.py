@@ -1,0 +1,598 @@
+"""ROS bags: ROS 1 (``.bag``), ROS 2 in SQLite (``.db3``) and MCAP (``.mcap``), or the folder of a ROS 2 bag. Library: ``rosbags``.
+
+``sensor_msgs/Imu``: angular velocity rad/s, linear acceleration m/s² (gravity is in it: at rest 9.81 upwards), in the axes of the message's
+frame, which by REP 103 and 145 are x forward, y left, z up; its orientation is another filter's estimate and left alone. Beside it go
+``sensor_msgs/MagneticField`` (T), ``sensor_msgs/Temperature`` (°C), and on a topic ``…reference`` a ``geometry_msgs/QuaternionStamped``
+(q_fb, East-North-Up), each at the nearest stamp of the inertial unit. The clock is that of the headers' stamps, ns; where these are all
+zero, that of the recorder. Stamps that go back are sorted and counted.
+
+Orientation's covariance is written about the axes of the fixed frame, as REP 103 has it for poses: ``R P Rᵀ`` of the filter's body-side
+covariance. Where the filter says nothing of a stamp, the first element is −1.
+
+The messages have a fixed layout behind the name of their frame, so they are decoded as arrays. A truncated bag, which the library
+refuses, is scanned record by record, and what is whole is read.
+"""
+
+from __future__ import annotations
+
+import bz2
+import os
+import re
+import shutil
+import sqlite3
+import struct
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from strapdown import quaternion, reading
+from strapdown.checks import Array, InputError, one_of
+from strapdown.recordings.extras import library, with_ending
+from strapdown.recordings.recording import MAGNETIC_UNITS, Recording, at_nearest, relative_time, with_gyro
+from strapdown.records import Estimate
+
+IMU, FIELD, TEMPERATURE, REFERENCE = (
+    "sensor_msgs/msg/Imu",
+    "sensor_msgs/msg/MagneticField",
+    "sensor_msgs/msg/Temperature",
+    "geometry_msgs/msg/QuaternionStamped",
+)
+DOUBLES = {IMU: 37, FIELD: 12, TEMPERATURE: 2, REFERENCE: 4}
+"""Numbers behind the header of each message."""
+TOPICS = {IMU: "/imu/data_raw", FIELD: "/imu/mag", TEMPERATURE: "/imu/temperature", REFERENCE: "/imu/reference"}
+"""Topics that are written, by the names of REP 145."""
+WITH_ORIENTATION = "/imu/data"
+FRAME = "imu_link"
+
+ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC = b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\0"
+MAGICS = (ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC)
+_SUFFIX = {ROS1_MAGIC: ".bag", MCAP_MAGIC: ".mcap", SQLITE_MAGIC: ".db3"}
+
+
+@dataclass
+class _Topic:
+    """The raw messages of one topic, in the order of the bag."""
+
+    name: str
+    kind: str
+    logged: list[int] = field(default_factory=list)
+    """Times of the recorder, ns."""
+    raw: list[bytes] = field(default_factory=list)
+
+
+class _Bag(NamedTuple):
+    topics: dict[str, _Topic]
+    ros2: bool
+    remarks: tuple[str, ...]
+
+
+def is_folder(path: Path) -> bool:
+    """Return whether a folder is a ROS 2 bag: metadata.yaml, or storage files alone, of a recorder that was killed."""
+    return path.is_dir() and ((path / "metadata.yaml").is_file() or bool(_storages(path)))
+
+
+def _storages(path: Path) -> list[Path]:
+    """Return the storage files of a folder in their order: named as the folder, or that and a number."""
+    found = [one for suffix in (".mcap", ".db3") for one in path.glob(f"*{suffix}")]
+    numbers = {one: re.fullmatch(rf"{re.escape(path.absolute().name)}(?:_(\d+))?", one.stem) for one in found}
+    return sorted(
+        (one for one, number in numbers.items() if number), key=lambda one: int((numbers[one] or [0, 0])[1] or 0)
+    )
+
+
+# ----------------------------------------------------------------------------------------------------------- reading
+
+
+def read_bag(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
+    """Read the inertial unit of a bag.
+
+    Parameters
+    ----------
+    path : path
+        A bag's file or folder.
+    topic : str
+        Topic of ``sensor_msgs/Imu``, where there are several.
+
+    Raises
+    ------
+    InputError
+        If the bag has no or several such topics, is no bag, or holds no whole message.
+    """
+    file = Path(path)
+    bag = _messages(file, wanted=tuple(DOUBLES))
+    chosen = _chosen(file.name, bag.topics, topic)
+    stamps, values, order_words = _decoded(file.name, bag.topics[chosen], bag.ros2)
+    said = [f"Topic {chosen}: {len(stamps)} messages.", *bag.remarks, *order_words]
+    if values[0, 16] == -1.0:
+        raise InputError(
+            f"{file.name}, topic {chosen}: message 1 says that it has no angular velocity; choose another topic"
+        )
+    time, epoch = relative_time(stamps)
+    own: dict[str, Any] = {} if values[0, 28] == -1.0 else {"specific_force": values[:, 25:28]}
+    for kind, name in ((FIELD, "magnetic_field"), (TEMPERATURE, "temperature"), (REFERENCE, "true_attitude")):
+        other = _beside(chosen, [t for t in bag.topics.values() if t.kind == kind and t.raw])
+        if isinstance(other, str):
+            said.append(other)
+        if not isinstance(other, _Topic) or (kind == REFERENCE and not other.name.endswith("reference")):
+            continue
+        other_stamps, other_values, words = _decoded(file.name, other, bag.ros2)
+        places = {FIELD: [0, 1, 2], TEMPERATURE: [0], REFERENCE: [3, 0, 1, 2]}[kind]  # a quaternion of ROS ends in w
+        own[name], lost = at_nearest(time, (other_stamps - epoch) / 1e9, other_values[:, places])
+        said += [
+            f"Topic {other.name} beside it: {len(other_stamps)} messages{f', {lost} of them beyond its stamps' if lost else ''}."
+        ]
+        said += words
+    if "magnetic_field" in own:
+        own["magnetic_unit"] = "T"
+    if "temperature" in own:
+        own["temperature"] = own["temperature"][:, 0]
+    return with_gyro(source=file.name, time=time, rate=values[:, 13:16], epoch_ns=epoch, remarks=tuple(said), **own)
+
+
+def _chosen(name: str, topics: Mapping[str, _Topic], topic: str) -> str:
+    """Return the topic of the inertial unit: the one asked for, or the only one."""
+    units = {t.name: t for t in topics.values() if t.kind == IMU}
+    listed = ", ".join(f"{t.name} ({len(t.raw)} messages)" for t in units.values())
+    if topic:
+        if not units:
+            raise InputError(f"{name} has no topic of {IMU} (it has: {', '.join(topics) or 'none that is read'})")
+        return one_of(f"{name}: topic", topic, units)
+    filled = [t.name for t in units.values() if t.raw]
+    if not filled:
+        what = f"no message of {IMU}" + (f" on {listed}" if units else "")
+        raise InputError(f"{name} holds {what}; give a bag of an inertial unit")
+    if len(filled) > 1:
+        raise InputError(f"{name} has several inertial units: {listed}; choose one, --topic {filled[0]}")
+    return filled[0]
+
+
+def _beside(unit: str, found: list[_Topic]) -> _Topic | str | None:
+    """Return the topic of a kind that goes with an inertial unit: the only one, or the only one of its namespace; else what to say."""
+    if len(found) <= 1:
+        return found[0] if found else None
+    space = unit.rpartition("/")[0] + "/"
+    near = [t for t in found if t.name.startswith(space)]
+    if len(near) == 1:
+        return near[0]
+    names = ", ".join(t.name for t in found)
+    return f"None of {names} was taken, for none alone stands beside {unit}."
+
+
+def _decoded(name: str, topic: _Topic, ros2: bool) -> tuple[NDArray[np.int64], Array, list[str]]:
+    """Return stamps (n,), ns, numbers (n, d) of a topic's messages, in order of time, and what is to be said of them."""
+    wanted = DOUBLES[topic.kind]
+    stamps = np.empty(len(topic.raw), np.int64)
+    values = np.empty((len(topic.raw), wanted))
+    lengths = np.fromiter((len(raw) for raw in topic.raw), np.int64, len(topic.raw))
+    for length in np.unique(lengths).tolist():
+        rows = np.flatnonzero(lengths == length)
+        if length < 16 + 8 * wanted:
+            _bad(name, topic, rows, f"{length} bytes long, shorter than its type")
+        raws = topic.raw if len(rows) == len(topic.raw) else [topic.raw[k] for k in rows]
+        table = np.frombuffer(b"".join(raws), np.uint8).reshape(len(rows), length)
+        if ros2 and not np.all((table[:, 0] == 0) & (table[:, 1] == 1)):
+            _bad(
+                name, topic, rows[(table[:, 0] != 0) | (table[:, 1] != 1)], "in another encoding than little-endian CDR"
+            )
+        words = table[:, 4:16].copy().view("<u4")  # seconds, nanoseconds, length of the frame's name
+        for frame in np.unique(words[:, 2]).tolist():
+            same = words[:, 2] == frame
+            begin = 16 + frame
+            begin += -(begin - 4) % 8 if ros2 else 0  # CDR aligns doubles
+            if begin + 8 * wanted > length:
+                _bad(name, topic, rows[same], f"{length} bytes long, shorter than its type")
+            numbers = np.ascontiguousarray(table[same, begin : begin + 8 * wanted]).view("<f8")
+            values[rows[same]] = numbers
+            stamps[rows[same]] = words[same, 0].astype(np.int64) * 10**9 + words[same, 1]
+    said = []
+    if not stamps.any() and len(stamps) > 1:
+        stamps = np.array(topic.logged, np.int64)
+        said.append(f"The headers of {topic.name} have no stamps: time is that of the recorder.")
+    back = int(np.sum(np.diff(stamps) < 0))
+    if back:
+        first = int(np.argmax(np.diff(stamps) < 0)) + 2
+        order = np.argsort(stamps, kind="stable")
+        stamps, values = stamps[order], values[order]
+        said.append(
+            f"{back} messages of {topic.name}, the first of them number {first}, came after later ones and were sorted."
+        )
+    return stamps, values, said
+
+
+def _bad(name: str, topic: _Topic, rows: NDArray[np.int64], what: str) -> None:
+    raise InputError(
+        f"{name}, topic {topic.name}: message {int(rows[0]) + 1} is {what}; the bag is damaged or of another type"
+    )
+
+
+def _messages(path: Path, wanted: tuple[str, ...] = ()) -> _Bag:
+    """Return the messages of a bag by topic, of the wanted types (empty: of all), from the library or, of a damaged bag, what is whole."""
+    highlevel = library("rosbags.highlevel", f"{path.name} is a ROS bag, which")
+    typesys = library("rosbags.typesys", f"{path.name} is a ROS bag, which")
+    files = [path]
+    if path.is_dir() and not (path / "metadata.yaml").is_file():
+        files = _storages(path)
+    topics: dict[str, _Topic] = {}
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            named = [_named(one, Path(folder)) for one in files]
+            store = typesys.get_typestore(typesys.Stores.LATEST)
+            with highlevel.AnyReader(named, default_typestore=store) as reader:
+                chosen = [c for c in reader.connections if not wanted or c.msgtype in wanted]
+                for connection in chosen:
+                    topics.setdefault(connection.topic, _Topic(connection.topic, connection.msgtype))
+                if chosen:
+                    for connection, logged, raw in reader.messages(connections=chosen):
+                        topic = topics[connection.topic]
+                        topic.logged.append(logged)
+                        topic.raw.append(raw)
+                ros2 = bool(reader.is2)
+    except InputError:
+        raise
+    except Exception as error:  # the library raises what its parsers do: of a cut file, anything
+        return _salvaged(path, files, wanted, error)
+    words: tuple[str, ...] = ()
+    if files != [path]:
+        words = (
+            f"{path.name} has no metadata.yaml, as where the recorder was killed: read from its {len(files)} files.",
+        )
+    return _Bag(topics, ros2, words)
+
+
+def _named(path: Path, folder: Path) -> Path:
+    """Return a path whose ending is that of its content, by which the library tells bags apart."""
+    if path.is_dir():
+        return path
+    with reading.opened(path) as stream:
+        head = stream.read(16)
+    suffix = next((suffix for magic, suffix in _SUFFIX.items() if head.startswith(magic)), path.suffix)
+    return with_ending(path, suffix, folder)
+
+
+# ----------------------------------------------------------------------------------------------------------- what is whole
+
+
+def _salvaged(path: Path, files: list[Path], wanted: tuple[str, ...], error: Exception) -> _Bag:
+    """Return the whole messages of a bag that the library cannot open."""
+    topics: dict[str, _Topic] = {}
+    ros2 = True
+    for file in _storages(path) if path.is_dir() else files:
+        with reading.opened(file) as stream:
+            head = stream.read(16)
+            scan = next((scan for magic, scan in _SCANS.items() if head.startswith(magic)), None)
+            if scan is None:
+                continue
+            ros2 = not head.startswith(ROS1_MAGIC)
+            for name, kind, logged, raw in scan(file):
+                if not wanted or kind in wanted:
+                    topic = topics.setdefault(name, _Topic(name, kind))
+                    topic.logged.append(logged)
+                    topic.raw.append(raw)
+    number = sum(len(topic.raw) for topic in topics.values())
+    reason = " ".join(str(error).split()) or type(error).__name__
+    if not number:
+        raise InputError(
+            f"{path.name} cannot be read as a ROS bag ({reason}), and holds no whole message; record it again"
+        ) from None
+    return _Bag(
+        topics,
+        ros2,
+        (f"{path.name} is truncated or damaged ({reason}): read are the {number} messages that are whole.",),
+    )
+
+
+_Message = tuple[str, str, int, bytes]
+
+
+def _scan_ros1(path: Path) -> Iterator[_Message]:
+    """Yield the whole messages of a ROS 1 bag, record by record, without its index."""
+    connections: dict[int, tuple[str, str]] = {}
+
+    def records(data: memoryview) -> Iterator[tuple[dict[bytes, bytes], memoryview, bool]]:
+        place = 0
+        while place + 4 <= len(data):
+            (size,) = struct.unpack_from("<I", data, place)
+            end = place + 4 + size
+            if end + 4 > len(data):
+                return
+            fields, at = {}, place + 4
+            while at + 4 <= end:
+                (length,) = struct.unpack_from("<I", data, at)
+                key, _, value = bytes(data[at + 4 : at + 4 + length]).partition(b"=")
+                fields[key] = value
+                at += 4 + length
+            (size,) = struct.unpack_from("<I", data, end)
+            yield fields, data[end + 4 : end + 4 + size], end + 4 + size <= len(data)
+            place = end + 4 + size
+
+    def messages(data: memoryview) -> Iterator[_Message]:
+        for fields, content, whole in records(data):
+            kind = fields.get(b"op", b"")
+            if kind == b"\x05":
+                packed = fields.get(b"compression", b"none")
+                if packed == b"none":
+                    yield from messages(content)
+                elif whole:
+                    yield from messages(memoryview(_unpack(packed.decode(), bytes(content))))
+            elif kind == b"\x07" and whole:
+                number = struct.unpack("<I", fields[b"conn"])[0]
+                own = next(
+                    (f for f, _, _ in records(memoryview(struct.pack("<I", len(content)) + bytes(content) + bytes(4)))),
+                    {},
+                )
+                connections[number] = (fields[b"topic"].decode(), _ros2_name(own.get(b"type", b"").decode()))
+            elif kind == b"\x02" and whole:
+                topic = connections.get(struct.unpack("<I", fields[b"conn"])[0])
+                if topic is not None:
+                    seconds, nanoseconds = struct.unpack("<II", fields[b"time"])
+                    yield *topic, seconds * 10**9 + nanoseconds, bytes(content)
+
+    with reading.opened(path) as stream:
+        stream.seek(len(ROS1_MAGIC))
+        yield from messages(memoryview(stream.read()))
+
+
+def _ros2_name(kind: str) -> str:
+    package, _, name = kind.partition("/")
+    return kind if name.startswith("msg/") else f"{package}/msg/{name}"
+
+
+def _scan_mcap(path: Path) -> Iterator[_Message]:
+    """Yield the whole messages of an MCAP file, record by record, without its summary."""
+    schemas: dict[int, str] = {}
+    channels: dict[int, tuple[str, str]] = {}
+
+    def text(data: memoryview, place: int) -> tuple[str, int]:
+        (size,) = struct.unpack_from("<I", data, place)
+        return bytes(data[place + 4 : place + 4 + size]).decode(), place + 4 + size
+
+    def messages(data: memoryview) -> Iterator[_Message]:
+        place = 0
+        while place + 9 <= len(data):
+            kind, size = struct.unpack_from("<BQ", data, place)
+            content = data[place + 9 : place + 9 + size]
+            whole = len(content) == size
+            place += 9 + size
+            if kind == 0x06 and len(content) > 40:
+                packed, at = text(content, 28)
+                inner = content[at + 8 :]
+                if not packed:
+                    yield from messages(inner)
+                elif whole:
+                    yield from messages(memoryview(_unpack(packed, bytes(inner))))
+            elif kind == 0x03 and whole:
+                schemas[struct.unpack_from("<H", content)[0]] = text(content, 2)[0]
+            elif kind == 0x04 and whole:
+                number, schema = struct.unpack_from("<HH", content)
+                channels[number] = (text(content, 4)[0], schemas.get(schema, ""))
+            elif kind == 0x05 and whole and size >= 22:
+                number, _, logged, _ = struct.unpack_from("<HIQQ", content)
+                if number in channels:
+                    yield *channels[number], logged, bytes(content[22:])
+
+    with reading.opened(path) as stream:
+        stream.seek(len(MCAP_MAGIC))
+        yield from messages(memoryview(stream.read()))
+
+
+def _scan_sqlite(path: Path) -> Iterator[_Message]:
+    """Yield the rows of a ROS 2 database up to where it is damaged.
+
+    A database shorter than its header says is refused as a whole, so a copy is filled up with zeros: reading it ends at the first of them.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / "filled.db3"
+        shutil.copyfile(path, copy)
+        with open(copy, "r+b") as stream:
+            header = stream.read(32)
+            if len(header) < 32:
+                return
+            (size,) = struct.unpack_from(">H", header, 16)
+            size = 65536 if size == 1 else size
+            stream.truncate(copy.stat().st_size // size * size)  # a page that is cut would be read as rows of zeros
+            stream.truncate(struct.unpack_from(">I", header, 28)[0] * size)
+        database = sqlite3.connect(f"{copy.as_uri()}?immutable=1", uri=True)
+        try:
+            topics = {
+                number: (name, kind) for number, name, kind in database.execute("SELECT id, name, type FROM topics")
+            }
+            for number, logged, raw in database.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY id"):
+                if number in topics:
+                    yield *topics[number], logged, raw
+        except sqlite3.DatabaseError:
+            return
+        finally:
+            database.close()
+
+
+def _unpack(compression: str, data: bytes) -> bytes:
+    if compression == "bz2":
+        return bz2.decompress(data)
+    if compression == "lz4":
+        unpacked: bytes = library("lz4.frame", "a bag compressed by lz4").decompress(data)
+        return unpacked
+    if compression == "zstd":
+        unpacked = library("backports.zstd", "a bag compressed by zstd").decompress(data)
+        return unpacked
+    return b""
+
+
+_SCANS: dict[bytes, Callable[[Path], Iterator[_Message]]] = {
+    ROS1_MAGIC: _scan_ros1,
+    MCAP_MAGIC: _scan_mcap,
+    SQLITE_MAGIC: _scan_sqlite,
+}
+
+
+# ----------------------------------------------------------------------------------------------------------- writing
+
+
+def write_bag(recording: Recording, path: str | os.PathLike[str]) -> None:
+    """Write a recording as a bag: ``.bag`` ROS 1, ``.mcap`` and ``.db3`` ROS 2, one file each.
+
+    Missing samples are not written; of a magnetometer the unit must be known.
+    """
+    _write(Path(path), _series(recording, None))
+
+
+def write_estimate(
+    estimate: Estimate, path: str | os.PathLike[str], *, recording: Recording | None = None, source: Path | None = None
+) -> None:
+    """Write the samples that an estimate was made from as a bag, with orientation and its covariance filled in.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    path : path
+        ``.bag``, ``.mcap`` or ``.db3``.
+    recording : Recording
+        What the estimate was made from.
+    source : path, optional
+        The bag that the recording was read from: all its other topics go along as they are, if it is of the same ROS.
+
+    Raises
+    ------
+    InputError
+        If no stamp of the recording is the estimate's.
+    """
+    assert recording is not None
+    target = Path(path)
+    series = _series(recording, estimate)
+    others: list[_Topic] = []
+    if source is not None:
+        bag = _messages(source)
+        if bag.ros2 == (target.suffix.lower() != ".bag"):
+            written = {TOPICS[kind] if kind != IMU else WITH_ORIENTATION for kind, _, _ in series}
+            others = [t for t in bag.topics.values() if t.kind != IMU and t.name not in written]
+    _write(target, series, others, source)
+
+
+_Series = tuple[str, NDArray[np.int64], Array]
+
+
+def _series(recording: Recording, estimate: Estimate | None) -> list[_Series]:
+    """Return the messages of a recording by type: stamps, ns, and the numbers behind the header."""
+    stamps = recording.clock_ns
+    if stamps[0] < 0:
+        raise InputError(
+            f"{recording.source}: time begins at {recording.time[0]:g} s, and a bag's clock has no negative times; move it"
+        )
+    imu = np.zeros((len(stamps), DOUBLES[IMU]))
+    imu[:, 3] = 1.0
+    imu[:, 4] = -1.0  # no orientation
+    if estimate is not None:
+        _fill_orientation(imu, recording, estimate)
+    imu[:, 13:16] = recording.rate
+    if recording.specific_force is None:
+        imu[:, 28] = -1.0
+    else:
+        imu[:, 25:28] = recording.specific_force
+    found: list[_Series] = [(IMU, stamps, imu)]
+    if recording.magnetic_field is not None:
+        if not recording.magnetic_unit:
+            raise InputError(
+                f"{recording.source} does not say the unit of its magnetometer, and a bag holds tesla; declare it in the header or by "
+                f"option ({' or '.join(MAGNETIC_UNITS)})"
+            )
+        known = ~np.isnan(recording.magnetic_field).any(axis=1)
+        magnetic = np.zeros((int(known.sum()), DOUBLES[FIELD]))
+        magnetic[:, :3] = recording.magnetic_field[known] * MAGNETIC_UNITS[recording.magnetic_unit]
+        found.append((FIELD, stamps[known], magnetic))
+    if recording.temperature is not None:
+        known = ~np.isnan(recording.temperature)
+        found.append(
+            (TEMPERATURE, stamps[known], np.stack([recording.temperature[known], np.zeros(known.sum())], axis=1))
+        )
+    if recording.true_attitude is not None:
+        known = ~np.isnan(recording.true_attitude).any(axis=1)
+        found.append((REFERENCE, stamps[known], recording.true_attitude[known][:, [1, 2, 3, 0]]))
+    return found
+
+
+def _fill_orientation(imu: Array, recording: Recording, estimate: Estimate) -> None:
+    """Write an estimate's attitude and covariance into the messages of its stamps."""
+    places = np.clip(np.searchsorted(recording.time, estimate.time - 1e-7), 0, len(recording.time) - 1)
+    same = np.abs(recording.time[places] - estimate.time) < 1e-6
+    if not same.any():
+        raise InputError(
+            f"{recording.source}: no stamp of it is one of the estimate's; give the recording that the estimate was made from"
+        )
+    rows, q = places[same], estimate.attitude[same]
+    imu[rows, 0:4] = q[:, [1, 2, 3, 0]]
+    body = np.zeros((len(q), 3, 3))
+    if estimate.covariance is not None:
+        body[:] = estimate.covariance[same, :3, :3]
+    else:
+        body[:, [0, 1, 2], [0, 1, 2]] = estimate.variance[same, :3]
+    turn = quaternion.to_matrix(q)
+    imu[rows, 4:13] = (turn @ body @ np.swapaxes(turn, 1, 2)).reshape(-1, 9)
+
+
+def _encoded(stamps: NDArray[np.int64], numbers: Array, ros2: bool) -> NDArray[np.uint8]:
+    """Return messages as rows of bytes."""
+    frame = FRAME.encode() + (b"\0" if ros2 else b"")
+    begin = 16 + len(frame)
+    begin += -(begin - 4) % 8 if ros2 else 0
+    table = np.zeros((len(stamps), begin + 8 * numbers.shape[1]), np.uint8)
+    words = np.zeros((len(stamps), 4), "<u4")
+    words[:, 0] = (
+        256 if ros2 else np.arange(len(stamps))
+    )  # 00 01 00 00: little-endian CDR; of ROS 1 the header's number
+    words[:, 1], words[:, 2], words[:, 3] = stamps // 10**9, stamps % 10**9, len(frame)
+    table[:, :16] = words.view(np.uint8)
+    table[:, 16 : 16 + len(frame)] = np.frombuffer(frame, np.uint8)
+    table[:, begin:] = np.ascontiguousarray(numbers, "<f8").view(np.uint8)
+    return table
+
+
+def _write(target: Path, series: list[_Series], others: list[_Topic] | None = None, source: Path | None = None) -> None:
+    """Write messages in the order of their times; the bag appears whole or not at all."""
+    what = f"writing {target.name}"
+    ros2 = target.suffix.lower() != ".bag"
+    typesys = library("rosbags.typesys", what)
+    store = typesys.get_typestore(typesys.Stores.LATEST if ros2 else typesys.Stores.ROS1_NOETIC)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{target.stem}-", dir=target.parent) as folder:
+        place = Path(folder) / f"bag{'' if ros2 else '.bag'}"
+        with _writer(place, target.suffix.lower(), what) as writer:
+            queue: list[tuple[int, Any, bytes | memoryview]] = []
+            for kind, stamps, numbers in series:
+                name = WITH_ORIENTATION if kind == IMU and np.any(numbers[:, 4] != -1.0) else TOPICS[kind]
+                connection = writer.add_connection(name, kind, typestore=store)
+                rows = _encoded(stamps, numbers, ros2)
+                queue += [(stamp, connection, row.tobytes()) for stamp, row in zip(stamps.tolist(), rows, strict=True)]
+            if others and source is not None:
+                queue += _copied(writer, others, source)
+            queue.sort(key=lambda one: one[0])
+            for stamp, connection, data in queue:
+                writer.write(connection, stamp, data)
+        made = place if not ros2 else next(one for one in place.iterdir() if one.suffix == target.suffix.lower())
+        if target.is_dir():
+            raise InputError(f"{target} is a folder; choose another name")
+        shutil.move(made, target)
+
+
+def _writer(place: Path, suffix: str, what: str) -> Any:
+    if suffix == ".bag":
+        return library("rosbags.rosbag1", what).Writer(place)
+    rosbag2 = library("rosbags.rosbag2", what)
+    plugin = rosbag2.StoragePlugin.MCAP if suffix == ".mcap" else rosbag2.StoragePlugin.SQLITE3
+    return rosbag2.Writer(place, version=9, storage_plugin=plugin)
+
+
+def _copied(writer: Any, topics: list[_Topic], source: Path) -> list[tuple[int, Any, bytes]]:
+    """Return the messages of topics that go along as they are, their types from the source."""
+    highlevel, typesys = library("rosbags.highlevel", source.name), library("rosbags.typesys", source.name)
+    queue = []
+    with tempfile.TemporaryDirectory() as folder:
+        store = typesys.get_typestore(typesys.Stores.LATEST)
+        with highlevel.AnyReader([_named(source, Path(folder))], default_typestore=store) as reader:
+            for topic in topics:
+                connection = writer.add_connection(topic.name, topic.kind, typestore=reader.typestore)
+                queue += [(logged, connection, raw) for logged, raw in zip(topic.logged, topic.raw, strict=True)]
+    return queue

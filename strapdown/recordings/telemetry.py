@@ -1,0 +1,94 @@
+"""Logs of cameras, flight controllers and phones. Library: ``telemetry-parser``.
+
+Gyroflow ``.gcsv``, Betaflight Blackbox (``.bbl``, ``.bfl``), ArduPilot (``.bin``), videos of GoPro, DJI, Sony, Insta360 (``.mp4``,
+``.mov``, ``.insv``, ``.braw``, ``.r3d``) and what else the library knows. It turns the axes of each device to one orientation of its own
+and gives gyro in °/s, accelerometer in m/s² and magnetometer in µT; which of the body's axes these are depends on the device, and so does
+the sign of the accelerometer: ask ``strapdown doctor``. The clock counts ms from the beginning of the log or video.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from strapdown import reading
+from strapdown.checks import Array, InputError
+from strapdown.recordings.extras import library, with_ending
+from strapdown.recordings.recording import Recording, with_gyro
+from strapdown.units import DEGREE
+
+ENDINGS = (".gcsv", ".bbl", ".bfl", ".bin", ".mp4", ".mov", ".insv", ".braw", ".r3d")
+_BEGINNINGS = {
+    b"GYROFLOW IMU LOG": ".gcsv",
+    b"CAMERA IMU LOG": ".gcsv",
+    b"H Product:Blackbox": ".bbl",
+    b"\xa3\x95\x80": ".bin",
+}
+"""How logs begin, and the ending that the library knows them by."""
+
+
+def is_log(head: bytes) -> bool:
+    """Return whether a file begins as such a log, or as a video."""
+    return head.startswith(tuple(_BEGINNINGS)) or head[4:8] == b"ftyp"
+
+
+def read_telemetry(path: str | os.PathLike[str]) -> Recording:
+    """Read the inertial unit of a camera's, flight controller's or phone's log.
+
+    Raises
+    ------
+    InputError
+        If the library does not know the file, or it holds no gyro.
+    """
+    file = Path(path)
+    parser = library("telemetry_parser", f"{file.name} is a log of a camera or flight controller, which")
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            found = parser.Parser(str(with_ending(file, _ending(file), Path(folder))))
+            rows: list[dict[str, Any]] = found.normalized_imu()
+    except (KeyboardInterrupt, SystemExit, MemoryError):
+        raise
+    except BaseException as error:  # a fault inside the library is no Exception
+        reason = " ".join(str(error).split())
+        raise InputError(
+            f"{file.name} cannot be read by telemetry-parser ({reason}); the log is damaged or of another device"
+        ) from None
+    if len(rows) < 2 or all(row.get("gyro") is None for row in rows):
+        raise InputError(
+            f"{file.name} ({found.camera or 'unknown device'}) holds no gyro samples; give a log with raw inertial data"
+        )
+    time = np.array([row["timestamp_ms"] for row in rows], np.float64) / 1e3
+    device = " ".join(part for part in (found.camera, found.model) if part)
+    field = _columns(rows, "magn")
+    return with_gyro(
+        source=file.name,
+        time=time,
+        rate=np.asarray(_triples(rows, "gyro") * DEGREE),
+        specific_force=_columns(rows, "accl"),
+        magnetic_field=field,
+        magnetic_unit="" if field is None else "uT",
+        remarks=(f"Device: {device}. Its axes are those that telemetry-parser gives; `strapdown doctor` tells more.",),
+    )
+
+
+def _ending(file: Path) -> str:
+    """Return the ending that the library knows a file by; its own where that is known."""
+    if file.suffix.lower() in ENDINGS:
+        return file.suffix.lower()
+    with reading.opened(file) as stream:
+        head = stream.read(32)
+    return next((ending for begin, ending in _BEGINNINGS.items() if head.startswith(begin)), ".mp4")
+
+
+def _triples(rows: list[dict[str, Any]], name: str) -> Array:
+    return np.array([row[name] if row.get(name) is not None else (np.nan,) * 3 for row in rows], np.float64)
+
+
+def _columns(rows: list[dict[str, Any]], name: str) -> Array | None:
+    """Return a sensor's samples, None where there are none at all."""
+    found = _triples(rows, name)
+    return None if np.isnan(found).all() else found

@@ -1,0 +1,197 @@
+"""Folders of EuRoC and TUM-VI, with their ground truth, and TUM trajectories.
+
+EuRoC (Burri et al. 2016; TUM-VI has the same layout): ``imu0/data.csv`` below ``mav0`` or the folder named; time ns since 1970, gyro rad/s,
+accelerometer m/s², in the axes of the inertial unit. Ground truth beside it, the first that is there of
+``state_groundtruth_estimate0/data.csv`` and ``mocap0/data.csv``: time ns, position m, quaternion scalar first, body to a frame whose z axis
+is up, with any heading (EuRoC's body frame is that of the inertial unit; TUM-VI's motion-capture body is turned into it by the data set's
+authors).
+
+A TUM trajectory is text, a row each of ``time tx ty tz qx qy qz qw``: s, m, quaternion **scalar last**, body to a fixed frame, which is
+taken to be z up. It holds no inertial samples: it is the reference of a recording, or an estimate that is written.
+
+References have stamps of their own. At a recording's stamps they are interpolated along the shortest turn where the reference's stamps on
+both sides are at most :data:`BRIDGED` apart, and missing elsewhere.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from strapdown import quaternion
+from strapdown.checks import Array, InputError
+from strapdown.recordings.delimited import read_csv
+from strapdown.recordings.recording import Recording
+
+TRUTHS = ("state_groundtruth_estimate0", "mocap0")
+BRIDGED = 0.1
+"""Largest interval between two stamps of a reference, s, that is interpolated over."""
+
+
+def _root(path: Path) -> Path | None:
+    """Return the folder that holds imu0, of a data set's folder."""
+    return next((one for one in (path, path / "mav0") if (one / "imu0" / "data.csv").is_file()), None)
+
+
+def is_folder(path: Path) -> bool:
+    """Return whether a folder is of the layout of EuRoC."""
+    return path.is_dir() and _root(path) is not None
+
+
+def read_euroc(path: str | os.PathLike[str]) -> Recording:
+    """Read a folder of EuRoC or TUM-VI: the inertial unit, and ground truth where there is some.
+
+    Raises
+    ------
+    InputError
+        If there is no ``imu0/data.csv``, or a file of the folder is damaged.
+    """
+    folder = Path(path)
+    root = _root(folder)
+    if root is None:
+        raise InputError(f"{path} holds no imu0/data.csv; give the folder of a EuRoC or TUM-VI sequence")
+    recording = replace(read_csv(root / "imu0" / "data.csv"), source=folder.name, remarks=("EuRoC layout, imu0.",))
+    truth = next((root / name / "data.csv" for name in TRUTHS if (root / name / "data.csv").is_file()), None)
+    if truth is None:
+        return recording
+    stamps, attitude = _read_truth(truth)
+    return _with_reference(recording, stamps, attitude, f"{truth.parent.name}/data.csv")
+
+
+def _read_truth(path: Path) -> tuple[NDArray[np.int64], Array]:
+    """Return stamps, ns, and quaternions, scalar first, of a ground truth of EuRoC."""
+    rows = _rows(path, ",")
+    if rows and len(rows[0]) < 8:
+        raise InputError(f"{path} has {len(rows[0])} columns; wanted time, position and quaternion, 8 or more")
+    return _whole(path, [row[0] for row in rows], 1), np.array([[float(x) for x in row[4:8]] for row in rows])
+
+
+def read_tum(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], Array]:
+    """Read the attitudes of a TUM trajectory.
+
+    Returns
+    -------
+    stamps : (n,) int
+        ns.
+    attitude : (n, 4)
+        Unit quaternions, scalar first.
+
+    Raises
+    ------
+    InputError
+        If a row has not eight numbers.
+    """
+    file = Path(path)
+    rows = _rows(file, None)
+    for k, row in enumerate(rows):
+        if len(row) != 8:
+            raise InputError(
+                f"{file.name}: data row {k + 1} has {len(row)} numbers; a TUM trajectory has time tx ty tz qx qy qz qw"
+            )
+    q = np.array([[float(x) for x in row[4:]] for row in rows])[:, [3, 0, 1, 2]]
+    if np.any(np.linalg.norm(q, axis=1) < 0.5):
+        raise InputError(
+            f"{file.name}: data row {int(np.argmin(np.linalg.norm(q, axis=1))) + 1} has a quaternion that is none; its norm is 1"
+        )
+    return _whole(file, [row[0] for row in rows], 10**9), quaternion.normalize(q)
+
+
+def is_tum(head: bytes) -> bool:
+    """Return whether a text begins as a TUM trajectory does: eight numbers a row, parted by blanks."""
+    lines = [
+        line.split()
+        for line in head.decode("utf-8", "ignore").splitlines()[:-1]
+        if line.strip() and not line.startswith("#")
+    ]
+    if not lines:
+        return False
+    return all(len(line) == 8 and all(map(_is_number, line)) for line in lines)
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _rows(path: Path, separator: str | None) -> list[list[str]]:
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path.name} cannot be read as text ({error})") from None
+    rows = [line.strip().split(separator) for line in lines if line.strip() and not line.lstrip().startswith("#")]
+    for k, row in enumerate(rows):
+        try:
+            [float(x) for x in row]
+        except ValueError:
+            raise InputError(f"{path.name}: data row {k + 1} holds what is no number: {' '.join(row)[:60]!r}") from None
+        if len(row) != len(rows[0]):
+            raise InputError(
+                f"{path.name}: data row {k + 1} has {len(row)} fields, the first {len(rows[0])}; the file is truncated there"
+            )
+    if not rows:
+        raise InputError(f"{path.name} has no data rows")
+    return rows
+
+
+def _whole(path: Path, cells: list[str], factor: int) -> NDArray[np.int64]:
+    """Return stamps as whole ns, without the rounding of floats: seconds of a clock from 1970 have more digits than these."""
+    stamps = np.empty(len(cells), np.int64)
+    for k, cell in enumerate(cells):
+        whole, _, part = cell.partition(".")
+        if whole.lstrip("-").isdigit() and (part.isdigit() or not part):
+            digits = int((part + "0" * 9)[:9]) if factor > 1 else 0
+            stamps[k] = int(whole) * factor + (-digits if whole.startswith("-") else digits)
+        else:
+            stamps[k] = round(float(cell) * factor)
+    back = np.diff(stamps) <= 0
+    if back.any():
+        raise InputError(f"{path.name}: data row {int(np.argmax(back)) + 2} is not after the one before; sort the rows")
+    return stamps
+
+
+def with_reference(recording: Recording, path: str | os.PathLike[str]) -> Recording:
+    """Return a recording with the attitudes of a TUM trajectory, of the same clock and body axes, as its reference.
+
+    Raises
+    ------
+    InputError
+        If the file is no trajectory, or none of its stamps lies within the recording.
+    """
+    stamps, attitude = read_tum(path)
+    return _with_reference(recording, stamps, attitude, Path(path).name)
+
+
+def _with_reference(recording: Recording, stamps: NDArray[np.int64], attitude: Array, name: str) -> Recording:
+    time = (stamps - recording.epoch_ns) / 1e9
+    found = interpolated(recording.time, time, attitude)
+    known = int(np.sum(~np.isnan(found[:, 0])))
+    if not known:
+        raise InputError(
+            f"{name} goes from {time[0]:.3f} to {time[-1]:.3f} s of the recording's time and {recording.source} from "
+            f"{recording.time[0]:.3f} to {recording.time[-1]:.3f} s; give both of one clock"
+        )
+    words = f"Reference of {name}: at {known} of {len(found)} stamps."
+    return replace(recording, true_attitude=found, remarks=(*recording.remarks, words))
+
+
+def interpolated(time: Array, stamps: Array, attitude: Array) -> Array:
+    """Return attitudes (n, 4) at ``time`` (n,) between those at ``stamps``, along the shortest turn; NaN outside and in gaps."""
+    result = np.full((len(time), 4), np.nan)
+    if len(stamps) < 2:
+        return result
+    k = np.clip(np.searchsorted(stamps, time, side="right") - 1, 0, len(stamps) - 2)
+    share = (time - stamps[k]) / (stamps[k + 1] - stamps[k])
+    slack = 1e-9 / (stamps[k + 1] - stamps[k])
+    usable = (share >= -slack) & (share <= 1.0 + slack) & (stamps[k + 1] - stamps[k] <= BRIDGED)
+    k, share = k[usable], share[usable]
+    q = quaternion.normalize(attitude)
+    turn = quaternion.log(quaternion.multiply(quaternion.conjugate(q[k]), q[k + 1]))
+    result[usable] = quaternion.multiply(q[k], quaternion.exp(share[:, None] * turn))
+    return result

@@ -1,0 +1,221 @@
+"""Flight logs of PX4 (ULog, ``.ulg``). Library: ``pyulog``.
+
+``sensor_combined``: gyro rad/s and specific force m/s², in the body axes of the vehicle, forward, right, down (so at rest and level the
+specific force is (0, 0, −9.81)). Beside it ``vehicle_magnetometer`` (Gauss; of old logs the field in ``sensor_combined``) at the nearest
+stamps, and as reference ``vehicle_attitude``, the vehicle's own estimate, which PX4 gives from body to North-East-Down and which is turned
+to East-North-Up here; its North is true North where the vehicle knew its place. Body axes stay as they are. Numbers are single precision.
+The clock counts µs from the start of the machine.
+
+Of a damaged or truncated log what is whole is read.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from strapdown import outputs, quaternion
+from strapdown.checks import Array, InputError, one_of
+from strapdown.files import written_beside
+from strapdown.recordings.extras import library
+from strapdown.recordings.recording import MAGNETIC_UNITS, Recording, at_nearest, relative_time, with_gyro
+from strapdown.recordings.trajectories import interpolated
+
+UNIT, FIELD, ATTITUDE = "sensor_combined", "vehicle_magnetometer", "vehicle_attitude"
+NO_SAMPLE = 0x7FFFFFFF
+"""``accelerometer_timestamp_relative`` where there is no new sample."""
+LATE = 0.5
+"""Share of the sample interval beyond which the accelerometer's own offset in time is said."""
+
+
+def read_ulog(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
+    """Read the inertial unit of a flight log.
+
+    Parameters
+    ----------
+    path : path
+    topic : str
+        ``sensor_combined``, or with a number behind a colon where there are several.
+
+    Raises
+    ------
+    InputError
+        If the log has no such topic, or is no log.
+    """
+    file = Path(path)
+    pyulog = library("pyulog", f"{file.name} is a flight log of PX4, which")
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):  # the library says what it finds to whoever listens
+            log = pyulog.ULog(str(file), [UNIT, FIELD, ATTITUDE])
+    except Exception as error:  # of a damaged log the library raises what its parsers do
+        raise InputError(
+            f"{file.name} cannot be read as ULog ({' '.join(str(error).split())}); the log is damaged"
+        ) from None
+    data = {one.name if one.multi_id == 0 else f"{one.name}:{one.multi_id}": one.data for one in log.data_list}
+    units = [name for name in data if name.startswith(UNIT) and len(data[name]["timestamp"])]
+    if not units:
+        raise InputError(f"{file.name} holds no message of {UNIT} (it has: {', '.join(data) or 'none that is read'})")
+    chosen = one_of(f"{file.name}: topic", topic or units[0], units)
+    stamps, order, remarks = _stamps(chosen, data[chosen])
+    remarks = [f"Topic {chosen}: {len(stamps)} messages.", *remarks]
+    if log.file_corruption:
+        remarks.append(f"{file.name} is damaged: read is what is whole.")
+    if log.dropouts:
+        lost = sum(one.duration for one in log.dropouts)
+        remarks.append(f"The logger lost {lost} ms in {len(log.dropouts)} dropouts.")
+    time, epoch = relative_time(stamps * 1000)
+    rows = data[chosen]
+    rate = _columns(rows, "gyro_rad", 3)[order]
+    force = _columns(rows, "accelerometer_m_s2", 3)[order]
+    relative = np.asarray(rows.get("accelerometer_timestamp_relative", np.zeros(len(order))))[order]
+    force[relative == NO_SAMPLE] = np.nan
+    usual = float(np.median(np.diff(stamps))) if len(stamps) > 1 else 1.0
+    late = float(np.median(relative[relative != NO_SAMPLE])) if np.any(relative != NO_SAMPLE) else 0.0
+    if abs(late) > LATE * usual:
+        remarks.append(
+            f"The accelerometer's samples are {1e-3 * late:.3g} ms off the gyro's stamps, which is left as it is."
+        )
+    own: dict[str, Any] = {}
+    if FIELD in data:
+        own["magnetic_field"] = _beside(FIELD, data[FIELD], "magnetometer_ga", time, epoch, remarks)
+    elif "magnetometer_ga[0]" in rows:
+        field = _columns(rows, "magnetometer_ga", 3)[order]
+        field[np.asarray(rows.get("magnetometer_timestamp_relative", np.zeros(len(order))))[order] == NO_SAMPLE] = (
+            np.nan
+        )
+        own["magnetic_field"] = field
+    if "magnetic_field" in own:
+        own["magnetic_unit"] = "G"
+    if ATTITUDE in data and len(data[ATTITUDE]["timestamp"]) > 1:
+        at, kept, words = _stamps(ATTITUDE, data[ATTITUDE])
+        ned = quaternion.normalize(_columns(data[ATTITUDE], "q", 4)[kept])
+        own["true_attitude"] = interpolated(time, (at * 1000 - epoch) / 1e9, outputs.from_ned(ned))
+        remarks += [f"Reference: {ATTITUDE}, the vehicle's own estimate.", *words]
+    return with_gyro(
+        source=file.name, time=time, rate=rate, specific_force=force, epoch_ns=epoch, remarks=tuple(remarks), **own
+    )
+
+
+def _columns(rows: dict[str, Any], name: str, size: int) -> Array:
+    return np.stack([np.asarray(rows[f"{name}[{k}]"], np.float64) for k in range(size)], axis=1)
+
+
+def _stamps(topic: str, rows: dict[str, Any]) -> tuple[NDArray[np.int64], NDArray[np.int64], list[str]]:
+    """Return stamps, µs, in order, the rows that they are of, and what is to be said: a stamp is taken once, the first time."""
+    stamps = np.asarray(rows["timestamp"]).astype(np.int64)
+    order = np.argsort(stamps, kind="stable")
+    fresh = np.concatenate([[True], np.diff(stamps[order]) > 0])
+    words = []
+    back, twice = int(np.sum(np.diff(stamps) < 0)), int(np.sum(~fresh))
+    if back:
+        words.append(f"{back} messages of {topic} came after later ones and were sorted.")
+    if twice:
+        words.append(f"{twice} messages of {topic} have the stamp of the one before and were left out.")
+    kept = order[fresh]
+    return stamps[kept], kept, words
+
+
+def _beside(topic: str, rows: dict[str, Any], name: str, time: Array, epoch: int, remarks: list[str]) -> Array:
+    """Return a sensor's samples at the nearest stamps of the inertial unit; its own ``timestamp_sample`` counts where it has one."""
+    stamped = {**rows, "timestamp": rows.get("timestamp_sample", rows["timestamp"])}
+    stamps, kept, words = _stamps(topic, stamped)
+    values, lost = at_nearest(time, (stamps * 1000 - epoch) / 1e9, _columns(rows, name, 3)[kept])
+    remarks.append(
+        f"Topic {topic} beside it: {len(stamps)} messages{f', {lost} of them beyond its stamps' if lost else ''}."
+    )
+    remarks += words
+    return values
+
+
+_LAYOUTS: dict[str, list[tuple[str, str, int]]] = {
+    UNIT: [
+        ("float", "gyro_rad", 3),
+        ("int32_t", "accelerometer_timestamp_relative", 0),
+        ("float", "accelerometer_m_s2", 3),
+    ],
+    FIELD: [("uint64_t", "timestamp_sample", 0), ("float", "magnetometer_ga", 3)],
+    ATTITUDE: [("float", "q", 4)],
+}
+_TYPES = {"float": "<f4", "int32_t": "<i4", "uint64_t": "<u8"}
+
+
+def write_ulog(recording: Recording, path: str | os.PathLike[str]) -> None:
+    """Write a recording as a flight log: numbers in single precision, stamps in whole µs; body axes stay as they are.
+
+    Raises
+    ------
+    InputError
+        If there is no accelerometer, the magnetometer's unit is unknown, two stamps are less than 1 µs apart, or time is negative.
+    """
+    stamps = np.rint(recording.clock_ns / 1000).astype(np.int64)
+    if recording.specific_force is None:
+        raise InputError(
+            f"{recording.source} has no accelerometer, which {UNIT} of a flight log has; choose another ending"
+        )
+    if stamps[0] < 0:
+        raise InputError(
+            f"{recording.source}: time begins at {recording.time[0]:g} s, and a log's clock has no negative times; move it"
+        )
+    if np.any(np.diff(stamps) <= 0):
+        raise InputError(
+            f"{recording.source}: stamps are less than 1 µs apart, which a log's clock does not part; choose another ending"
+        )
+    known = np.asarray(~np.isnan(recording.specific_force).any(axis=1))
+    columns: list[tuple[str, NDArray[np.int64], list[NDArray[Any]]]] = [
+        (
+            UNIT,
+            stamps,
+            [recording.rate, np.where(known, 0, NO_SAMPLE), np.nan_to_num(recording.specific_force)],
+        )
+    ]
+    if recording.magnetic_field is not None:
+        if not recording.magnetic_unit:
+            raise InputError(
+                f"{recording.source} does not say the unit of its magnetometer, and a log holds Gauss; declare it in the header or by "
+                f"option ({' or '.join(MAGNETIC_UNITS)})"
+            )
+        seen = ~np.isnan(recording.magnetic_field).any(axis=1)
+        gauss = recording.magnetic_field[seen] * (MAGNETIC_UNITS[recording.magnetic_unit] / MAGNETIC_UNITS["G"])
+        columns.append((FIELD, stamps[seen], [stamps[seen], gauss]))
+    if recording.true_attitude is not None:
+        seen = ~np.isnan(recording.true_attitude).any(axis=1)
+        columns.append((ATTITUDE, stamps[seen], [outputs.to_ned(quaternion.normalize(recording.true_attitude[seen]))]))
+    content = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", int(stamps[0])), _message("B", bytes(40))]
+    for name, _, _ in columns:
+        fields = "".join(f"{kind}{f'[{size}]' if size else ''} {field};" for kind, field, size in _LAYOUTS[name])
+        content.append(_message("F", f"{name}:uint64_t timestamp;{fields}".encode()))
+    content += [
+        _message("A", struct.pack("<BH", 0, number) + name.encode()) for number, (name, _, _) in enumerate(columns)
+    ]
+    rows: list[tuple[int, bytes]] = []
+    for number, (name, at, values) in enumerate(columns):
+        rows += zip(at.tolist(), _rows(name, number, at, values), strict=True)
+    rows.sort(key=lambda row: row[0])
+    with written_beside(path) as temporary, open(temporary, "wb") as stream:
+        stream.writelines(content)
+        stream.writelines(row for _, row in rows)
+
+
+def _message(kind: str, content: bytes) -> bytes:
+    return struct.pack("<HB", len(content), ord(kind)) + content
+
+
+def _rows(name: str, number: int, stamps: NDArray[np.int64], values: list[NDArray[Any]]) -> list[bytes]:
+    """Return the data messages of a topic."""
+    fields: list[Any] = [("size", "<u2"), ("kind", "u1"), ("number", "<u2"), ("timestamp", "<u8")]
+    fields += [
+        (field, _TYPES[kind], (size,)) if size else (field, _TYPES[kind]) for kind, field, size in _LAYOUTS[name]
+    ]
+    table = np.zeros(len(stamps), np.dtype(fields))
+    table["size"], table["kind"], table["number"] = table.dtype.itemsize - 3, ord("D"), number
+    table["timestamp"] = stamps
+    for (_, field, _), column in zip(_LAYOUTS[name], values, strict=True):
+        table[field] = column
+    return [row.tobytes() for row in table]

@@ -1,0 +1,276 @@
+"""An estimate in other forms: angles and σ against SciPy and finite differences, frames against closed forms, files read back."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+from strapdown import outputs, quaternion, recordings
+from strapdown.checks import InputError
+from strapdown.cli import app
+from strapdown.recordings import Recording
+from strapdown.records import Estimate, read_estimate
+
+SEQUENCES = ["".join(s) for s in itertools.product("XYZ", repeat=3) if s[0] != s[1] != s[2]]
+
+
+def attitudes(n: int = 20) -> np.ndarray:
+    return quaternion.normalize(np.random.default_rng(5).standard_normal((n, 4)))
+
+
+def covariances(n: int = 20) -> np.ndarray:
+    roots = np.random.default_rng(6).standard_normal((n, 3, 3))
+    return roots @ np.swapaxes(roots, 1, 2) * 1e-6
+
+
+@pytest.mark.parametrize("sequence", [*SEQUENCES, *(s.lower() for s in SEQUENCES)])
+def test_euler_angles_are_scipys_and_their_sigma_that_of_differences(sequence):
+    q, P = attitudes(), covariances()
+    found = outputs.euler(q, sequence, P)
+    rotation = Rotation.from_quat(q[:, [1, 2, 3, 0]])
+    np.testing.assert_allclose(found.angles, rotation.as_euler(sequence), atol=1e-12)
+    step = 1e-6
+    J = np.empty((len(q), 3, 3))
+    for k in range(3):
+        turn = Rotation.from_rotvec(step * np.eye(3)[k])
+        change = (rotation * turn).as_euler(sequence) - (rotation * turn.inv()).as_euler(sequence)
+        J[:, :, k] = (np.mod(change + np.pi, 2 * np.pi) - np.pi) / (2 * step)
+    expected = np.sqrt(np.einsum("nij,njk,nik->ni", J, P, J))
+    np.testing.assert_allclose(found.sigma, expected, rtol=1e-5)
+
+
+def test_gimbal_lock_has_no_sigma():
+    up = quaternion.from_rotation(Rotation.from_euler("ZYX", [0.3, np.pi / 2, 0.0]))
+    assert np.isinf(outputs.euler(up[None], "ZYX", np.eye(3)[None]).sigma).all()
+
+
+@pytest.mark.parametrize("bad", ["ZZX", "ZY", "ZyX", "ABC", ""])
+def test_what_is_no_sequence_is_refused(bad):
+    with pytest.raises(InputError, match="give three axes such as ZYX"):
+        outputs.euler([[1.0, 0, 0, 0]], bad)
+
+
+@pytest.mark.parametrize(
+    ("yaw", "axis", "degrees"),
+    [(0.0, "x", 90.0), (90.0, "x", 0.0), (180.0, "x", 270.0), (-90.0, "x", 180.0), (0.0, "y", 0.0), (0.0, "-y", 180.0)],
+)
+def test_heading_is_from_north_towards_east(yaw, axis, degrees):
+    """East-North-Up: at rest the body's x looks East; a turn to the left about up takes it North."""
+    q = quaternion.from_rotation(Rotation.from_euler("z", yaw, degrees=True))
+    found = outputs.heading(q[None], np.diag([1.0, 4.0, 9.0])[None], axis=axis)
+    assert abs((np.degrees(found.angles[0]) - degrees + 180.0) % 360.0 - 180.0) < 1e-9
+    assert abs(found.sigma[0] - 3.0) < 1e-12  # level: a turn about up alone moves it
+
+
+def test_heading_of_a_tilted_body_has_the_sigma_of_differences():
+    q, P = attitudes(), covariances()
+    found = outputs.heading(q, P)
+    rotation = Rotation.from_quat(q[:, [1, 2, 3, 0]])
+    J = np.empty((len(q), 3))
+    for k in range(3):
+        both = []
+        for step in (1e-6, -1e-6):
+            v = (rotation * Rotation.from_rotvec(step * np.eye(3)[k])).apply([1.0, 0.0, 0.0])
+            both.append(np.arctan2(v[:, 0], v[:, 1]))
+        J[:, k] = (np.mod(both[0] - both[1] + np.pi, 2 * np.pi) - np.pi) / 2e-6
+    np.testing.assert_allclose(found.sigma, np.sqrt(np.einsum("ni,nij,nj->n", J, P, J)), rtol=1e-5)
+    up = quaternion.from_rotation(Rotation.from_euler("y", -90.0, degrees=True))
+    assert np.isinf(outputs.heading(up[None], np.eye(3)[None]).sigma[0])
+
+
+def test_north_east_down():
+    """A body whose axes are East, North and Up: in North-East-Down these are (0, 1, 0), (1, 0, 0) and (0, 0, −1)."""
+    R = quaternion.to_matrix(outputs.to_ned([1.0, 0.0, 0.0, 0.0]))
+    np.testing.assert_allclose(R, [[0, 1, 0], [1, 0, 0], [0, 0, -1]], atol=1e-15)
+    north = quaternion.from_rotation(Rotation.from_euler("z", 90.0, degrees=True))  # forward to the North, left, up
+    np.testing.assert_allclose(np.abs(outputs.to_ned(north, body_flu=True)), [1, 0, 0, 0], atol=1e-15)
+    q = attitudes()
+    for flu in (False, True):
+        back = outputs.from_ned(outputs.to_ned(q, body_flu=flu), body_frd=flu)
+        np.testing.assert_allclose(quaternion.angle_between(back, q), 0.0, atol=1e-14)
+
+
+def test_acceleration_without_gravity():
+    q = attitudes()
+    truth = np.random.default_rng(7).standard_normal((20, 3))
+    R = Rotation.from_quat(q[:, [1, 2, 3, 0]])
+    force = R.inv().apply(truth + np.array([0.0, 0.0, 9.80665]))
+    np.testing.assert_allclose(outputs.free_acceleration(q, force), truth, atol=1e-13)
+    np.testing.assert_allclose(outputs.free_acceleration(q, force, fixed=False), R.inv().apply(truth), atol=1e-13)
+    force[3] = np.nan
+    assert np.isnan(outputs.free_acceleration(q, force)[3]).all()
+
+
+# ------------------------------------------------------------------------------------------------------ tables and files
+
+
+@pytest.fixture
+def case():
+    n = 30
+    random = np.random.default_rng(8)
+    recording = Recording(
+        source="walk",
+        time=np.arange(n) * 0.01,
+        rate=random.standard_normal((n, 3)),
+        specific_force=random.standard_normal((n, 3)),
+        epoch_ns=1_700_000_000_000_000_001,
+    )
+    P = np.zeros((20, 6, 6))
+    P[:, :3, :3], P[:, 3:, 3:] = covariances(), covariances()
+    estimate = Estimate(
+        time=recording.time[10:],
+        attitude=attitudes(),
+        bias=1e-3 * random.standard_normal((20, 3)),
+        variance=np.diagonal(P, axis1=1, axis2=2).copy(),
+        covariance=P,
+    )
+    return estimate, recording
+
+
+def test_a_table_tells_all_in_its_names(case):
+    estimate, recording = case
+    found = outputs.table(estimate, recording=recording)
+    assert found["time_ns"][3] == 1_700_000_000_130_000_001
+    np.testing.assert_array_equal(found["qw"], estimate.attitude[:, 0])
+    yaw = Rotation.from_quat(estimate.attitude[:, [1, 2, 3, 0]]).as_euler("ZYX", degrees=True)
+    np.testing.assert_allclose(np.stack([found[f"{n}_deg"] for n in ("yaw", "pitch", "roll")], axis=1), yaw, atol=1e-10)
+    np.testing.assert_allclose(found["rate_y_rad_per_s"], recording.rate[10:, 1] - estimate.bias[:, 1], rtol=1e-15)
+    np.testing.assert_allclose(found["bias_z_deg_per_h"], np.degrees(estimate.bias[:, 2]) * 3600.0, rtol=1e-12)
+    np.testing.assert_allclose(
+        found["bias_x_sigma_deg_per_h"], np.degrees(np.sqrt(estimate.variance[:, 3])) * 3600.0, rtol=1e-12
+    )
+    ned = outputs.table(estimate, recording=recording, frame="NED", sequence="ZXZ")
+    np.testing.assert_allclose(ned["free_acceleration_x_m_per_s2"], found["free_acceleration_y_m_per_s2"], rtol=1e-15)
+    np.testing.assert_allclose(ned["free_acceleration_z_m_per_s2"], -found["free_acceleration_z_m_per_s2"], rtol=1e-15)
+    assert "angle_1_z_deg" in ned
+    np.testing.assert_array_equal(ned["heading_deg"], found["heading_deg"])
+    with pytest.raises(InputError, match=r"walk has no stamp 0.1 s"):
+        outputs.table(estimate, recording=recording.since(20))
+
+
+def test_an_estimate_has_methods_for_all_of_it(case):
+    estimate, _ = case
+    np.testing.assert_allclose(estimate.matrix, estimate.rotation.as_matrix(), atol=1e-15)
+    np.testing.assert_array_equal(
+        estimate.euler("ZYX").sigma, outputs.euler(estimate.attitude, "ZYX", estimate.covariance[:, :3, :3]).sigma
+    )
+    assert estimate.heading().angles.shape == (20,)
+
+
+@pytest.mark.parametrize("ending", ["csv", "tsv", "parquet"])
+def test_tables_in_files_hold_the_same_numbers(case, tmp_path, ending):
+    estimate, recording = case
+    path = tmp_path / f"estimate.{ending}"
+    if ending == "parquet":
+        pytest.importorskip("pyarrow", reason="pyarrow is not installed: pip install 'strapdown[formats]'")
+    recordings.write(estimate, path, recording=recording, sequence="XYZ")
+    wanted = outputs.table(estimate, recording=recording, sequence="XYZ")
+    if ending == "parquet":
+        import pyarrow.parquet
+
+        found = {
+            name: column.to_numpy()
+            for name, column in zip(wanted, pyarrow.parquet.read_table(path).columns, strict=True)
+        }
+    else:
+        with open(path, newline="") as stream:
+            rows = list(csv.reader(stream, delimiter="\t" if ending == "tsv" else ","))
+        assert rows[0] == list(wanted)
+        found = {name: np.array([float(row[k]) for row in rows[1:]]) for k, name in enumerate(rows[0])}
+        assert rows[4][0] == "1700000000130000001"
+    for name, values in wanted.items():
+        np.testing.assert_array_equal(found[name], values, err_msg=name)
+
+
+def test_a_tum_trajectory_and_the_packages_own_file(case, tmp_path):
+    estimate, recording = case
+    recordings.write(estimate, tmp_path / "x.tum", recording=recording)
+    lines = (tmp_path / "x.tum").read_text().splitlines()
+    assert lines[0].startswith("#")
+    assert lines[4].split()[0] == "1700000000.130000001"
+    table = np.loadtxt(tmp_path / "x.tum")
+    np.testing.assert_array_equal(table[:, 4:], estimate.attitude[:, [1, 2, 3, 0]])
+    recordings.write(estimate, tmp_path / "x.h5")
+    np.testing.assert_array_equal(read_estimate(tmp_path / "x.h5").covariance, estimate.covariance)
+
+
+def test_a_data_frame(case):
+    pandas = pytest.importorskip("pandas", reason="pandas is not installed: pip install 'strapdown[formats]'")
+    estimate, recording = case
+    frame = estimate.to_dataframe(recording=recording)
+    assert isinstance(frame, pandas.DataFrame)
+    assert list(frame) == list(outputs.table(estimate, recording=recording))
+    assert len(frame) == 20
+
+
+def test_what_an_ending_has_no_room_for_is_refused(case, tmp_path):
+    estimate, _ = case
+    with pytest.raises(InputError, match=r"ends in '.xls', and an estimate is written as .bag, "):
+        recordings.write(estimate, tmp_path / "x.xls")
+    with pytest.raises(InputError, match=r"x.tum \(TUM trajectory\) has no sequence"):
+        recordings.write(estimate, tmp_path / "x.tum", sequence="ZYX")
+    with pytest.raises(InputError, match="holds the samples too; give the recording"):
+        recordings.write(estimate, tmp_path / "x.bag")
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command_writes_further_files(tmp_path):
+    n = 300
+    rows = np.column_stack([np.arange(n) / 100.0, np.zeros((n, 3)), np.zeros((n, 2)), np.full(n, 9.8)])
+    path = tmp_path / "rest.csv"
+    recordings.write(Recording(source="rest", time=rows[:, 0], rate=rows[:, 1:4], specific_force=rows[:, 4:]), path)
+    run = lambda *more: CliRunner().invoke(app, ["estimate", str(path), "--out", str(tmp_path / "out"), *more])  # noqa: E731
+    said = run("--to", str(tmp_path / "e.csv"), "--to", str(tmp_path / "f.tsv"), "--euler", "xyz", "--frame", "NED")
+    assert said.exit_code == 0, said.output
+    assert "e.csv" in said.output
+    assert "roll_sigma_deg" in (tmp_path / "e.csv").read_text().splitlines()[0]
+    said = run("--to", str(tmp_path / "e.tum"))
+    assert said.exit_code == 0, said.output
+    assert len((tmp_path / "e.tum").read_text().splitlines()) == len((tmp_path / "e.csv").read_text().splitlines())
+    for bad in (
+        ("--euler", "ZYX"),
+        ("--to", str(path)),
+        ("--to", "x.xls"),
+        ("--to", str(tmp_path / "e.tum"), "--euler", "ZYX"),
+    ):
+        assert run(*bad).exit_code == 1
+    (tmp_path / "out").rename(tmp_path / "first")
+    assert run("--to", str(tmp_path / "no.csv"), "--euler", "ZZZ").exit_code == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_rerun_recording_holds_curves_and_turns(case, tmp_path):
+    """Read back by the library's own reader."""
+    reader = pytest.importorskip("rerun.chunk", reason="rerun-sdk is not installed: pip install 'strapdown[rerun]'")
+    from dataclasses import replace
+
+    from strapdown.records import Innovations
+
+    estimate, recording = case
+    seen = Innovations(time=estimate.time[::2], innovation=np.arange(10.0)[:, None], variance=np.full((10, 1), 4.0))
+    estimate = replace(estimate, innovations={"accelerometer": seen})
+    recordings.write(estimate, tmp_path / "x.rrd", recording=recording)
+    found: dict[str, list] = {}
+    for chunk in reader.RrdReader(tmp_path / "x.rrd").stream():
+        batch = chunk.to_record_batch()
+        for name in batch.schema.names:
+            if (
+                name.startswith(("Scalars", "Transform3D"))
+                or ":Scalars" in name
+                or "scalars" in name
+                or "quaternion" in name
+            ):
+                found.setdefault(str(chunk.entity_path), []).extend(batch.column(name).to_pylist())
+    yaw = outputs.table(estimate)["yaw_deg"]
+    np.testing.assert_allclose(np.ravel(found["/angles/yaw/value"]), yaw, rtol=1e-12)
+    np.testing.assert_allclose(np.ravel(found["/innovations/accelerometer/0/plus_3_sigma"]), 6.0, rtol=1e-12)
+    np.testing.assert_allclose(
+        np.ravel(found["/rate/x"]), np.degrees(recording.rate[10:, 0] - estimate.bias[:, 0]), rtol=1e-12
+    )
+    turns = np.array(found["/body"]).reshape(-1, 4)
+    np.testing.assert_allclose(turns, estimate.attitude[:, [1, 2, 3, 0]], atol=1e-6)

@@ -1,0 +1,333 @@
+"""ROS bags: written by the library's own serialiser and read here, written here and read by the library, truncated, of several units."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from strapdown import quaternion, recordings
+from strapdown.checks import InputError
+from strapdown.cli import app
+from strapdown.recordings import Recording, read
+from strapdown.records import Estimate
+
+rosbags = pytest.importorskip("rosbags", reason="rosbags is not installed: pip install 'strapdown[formats]'")
+
+START = 1_700_000_000_123_456_789
+KINDS = ("bag", "mcap", "db3", "folder")
+
+
+def stores():
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.LATEST)
+
+
+def message(store, kind: str, stamp: int, frame: str, numbers, ros1: bool):
+    """Build a message of the library's own classes from the numbers behind the header."""
+    t = store.types
+    more = {"seq": 0} if ros1 else {}
+    time = t["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9)
+    header = t["std_msgs/msg/Header"](stamp=time, frame_id=frame, **more)
+    vector = lambda v: t["geometry_msgs/msg/Vector3"](x=v[0], y=v[1], z=v[2])  # noqa: E731
+    zeros = np.zeros(9)
+    if kind == "Imu":
+        none = zeros.copy()
+        none[0] = -1.0
+        return t["sensor_msgs/msg/Imu"](
+            header=header,
+            orientation=t["geometry_msgs/msg/Quaternion"](x=0.1, y=0.2, z=0.3, w=0.9),
+            orientation_covariance=none,
+            angular_velocity=vector(numbers[:3]),
+            angular_velocity_covariance=zeros,
+            linear_acceleration=vector(numbers[3:6]),
+            linear_acceleration_covariance=zeros if len(numbers) > 3 and numbers[3] != 0.0 else none,
+        )
+    if kind == "MagneticField":
+        return t["sensor_msgs/msg/MagneticField"](
+            header=header, magnetic_field=vector(numbers), magnetic_field_covariance=zeros
+        )
+    return t["std_msgs/msg/String"](data=str(numbers))
+
+
+@pytest.fixture
+def bag(tmp_path):
+    """Write messages (topic, kind, stamp, frame, numbers) with the library's own writer and serialiser and return the bag's path."""
+
+    def write(suffix: str, content, name: str = "walk") -> Path:
+        from rosbags import rosbag1, rosbag2
+
+        ros1 = suffix == "bag"
+        store = stores()[0 if ros1 else 1]
+        path = tmp_path / (f"{name}.bag" if ros1 else name)
+        plugin = rosbag2.StoragePlugin.SQLITE3 if suffix == "db3" else rosbag2.StoragePlugin.MCAP
+        with rosbag1.Writer(path) if ros1 else rosbag2.Writer(path, version=9, storage_plugin=plugin) as writer:
+            connections = {}
+            for k, (topic, kind, stamp, frame, numbers) in enumerate(content):
+                full = ("std_msgs/msg/" if kind == "String" else "sensor_msgs/msg/") + kind
+                if topic not in connections:
+                    connections[topic] = writer.add_connection(topic, full, typestore=store)
+                made = message(store, kind, stamp, frame, numbers, ros1)
+                raw = store.serialize_ros1(made, full) if ros1 else store.serialize_cdr(made, full)
+                writer.write(connections[topic], START + 1000 * k, raw)
+        if suffix in ("bag", "folder"):
+            return path
+        return next(one for one in path.iterdir() if one.suffix == f".{suffix}")
+
+    return write
+
+
+def imu(n: int = 40, topic: str = "/imu/data", frame: str = "imu_link", start: int = START):
+    values = np.random.default_rng(1).standard_normal((n, 6))
+    return values, [(topic, "Imu", start + 5_000_001 * k, frame, values[k]) for k in range(n)]
+
+
+@pytest.mark.parametrize("suffix", KINDS)
+@pytest.mark.parametrize("frame", ["", "a", "imu", "imu_link", "a/long/frame/name"])
+def test_an_inertial_unit_is_read(bag, suffix, frame):
+    """Whatever the length of the frame's name, by which the numbers behind it move."""
+    values, content = imu(frame=frame)
+    recording = read(bag(suffix, content))
+    np.testing.assert_array_equal(recording.rate, values[:, :3])
+    np.testing.assert_array_equal(recording.specific_force, values[:, 3:])
+    assert recording.clock_ns.tolist() == [one[2] for one in content]
+    assert recording.epoch_ns == START
+    assert recording.magnetic_field is None
+    assert recording.remarks == ("Topic /imu/data: 40 messages.",)
+
+
+def test_frames_of_several_names_are_read_in_their_order(bag):
+    values, content = imu()
+    content = [(t, k, s, "x" * (j % 5), v) for j, (t, k, s, _, v) in enumerate(content)]
+    for suffix in KINDS:
+        np.testing.assert_array_equal(read(bag(suffix, content, name=f"x{suffix}")).rate, values[:, :3])
+
+
+@pytest.mark.parametrize("suffix", KINDS)
+def test_a_magnetometer_goes_to_the_nearest_stamps(bag, suffix):
+    _, content = imu()
+    field = np.arange(30.0).reshape(10, 3) * 1e-6
+    content += [("/imu/mag", "MagneticField", START + 20_000_004 * k + 1_000_000, "m", field[k]) for k in range(10)]
+    content.append(("/chatter", "String", START, "", "hello"))
+    recording = read(bag(suffix, content))
+    np.testing.assert_array_equal(recording.magnetic_field[::4], field)
+    assert np.isnan(recording.magnetic_field[np.arange(40) % 4 != 0]).all()
+    assert recording.magnetic_unit == "T"
+    assert recording.remarks[1] == "Topic /imu/mag beside it: 10 messages."
+
+
+def test_of_several_units_one_must_be_chosen(bag):
+    _, first = imu(topic="/left/imu")
+    other, second = imu(20, topic="/right/imu")
+    field = [("/right/mag", "MagneticField", START + 5_000_001 * k, "m", [1e-5 + k, 0, 0]) for k in range(20)]
+    content = first + second + field + [("/left/mag", "MagneticField", START, "m", [1e-5, 0, 0])]
+    path = bag("mcap", content)
+    with pytest.raises(
+        InputError,
+        match=r"several inertial units: /left/imu \(40 messages\), /right/imu \(20 messages\).*--topic /left/imu",
+    ):
+        read(path)
+    with pytest.raises(InputError, match=r"topic '/right/im' is not known; did you mean '/right/imu'"):
+        read(path, topic="/right/im")
+    right = read(path, topic="/right/imu")
+    np.testing.assert_array_equal(right.rate, other[:, :3])
+    assert right.magnetic_field[3, 0] == 1e-5 + 3
+    assert len(read(path, topic="/left/imu").time) == 40
+
+
+def test_a_unit_without_an_accelerometer_has_none(bag):
+    _, content = imu()
+    content = [(t, k, s, f, np.r_[v[:3], 0, 0, 0]) for t, k, s, f, v in content]
+    assert read(bag("mcap", content)).specific_force is None
+
+
+def test_headers_without_stamps_and_stamps_out_of_order_are_said(bag):
+    values, content = imu()
+    path = bag("mcap", [content[1], content[0], *content[2:]], name="order")
+    recording = read(path)
+    np.testing.assert_array_equal(recording.rate, values[:, :3])
+    assert (
+        "1 messages of /imu/data, the first of them number 2, came after later ones and were sorted."
+        in recording.remarks
+    )
+
+
+def test_bags_without_an_inertial_unit_and_what_is_no_bag_are_refused(bag, tmp_path):
+    with pytest.raises(InputError, match=r"holds no message of sensor_msgs/msg/Imu; give a bag"):
+        read(bag("bag", [("/chatter", "String", START, "", "x")]))
+    fake = tmp_path / "fake.bag"
+    fake.write_bytes(b"#ROSBAG V2.0\n" + bytes(100))
+    with pytest.raises(InputError, match=r"fake.bag cannot be read as a ROS bag .* holds no whole message"):
+        read(fake)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="is a folder; name the file in it"):
+        read(tmp_path / "empty")
+
+
+@pytest.mark.parametrize("suffix", ["bag", "mcap", "db3"])
+def test_a_truncated_bag_gives_what_is_whole_and_says_so(bag, suffix):
+    values, content = imu(2000)
+    path = bag(suffix, content)
+    whole = path.read_bytes()
+    kept = []
+    for share in (0.5, 0.9):
+        path.write_bytes(whole[: int(share * len(whole))])
+        recording = read(path)
+        kept.append(len(recording.time))
+        np.testing.assert_array_equal(recording.rate, values[: kept[-1], :3])
+        assert "truncated or damaged" in " ".join(recording.remarks)
+        assert f"read are the {kept[-1]} messages that are whole" in " ".join(recording.remarks)
+    assert 0.4 * 2000 < kept[0] < 0.6 * 2000
+    assert 0.8 * 2000 < kept[1] < 2000
+
+
+def test_a_folder_whose_recorder_was_killed_is_read_from_its_files(bag):
+    values, content = imu()
+    path = bag("folder", content)
+    (path / "metadata.yaml").unlink()
+    recording = read(path)
+    np.testing.assert_array_equal(recording.rate, values[:, :3])
+    assert "has no metadata.yaml" in " ".join(recording.remarks)
+
+
+def test_a_folder_of_several_bags_is_none(bag, tmp_path):
+    """Bags of other names in one folder are not the parts of one."""
+    for name in ("one", "two"):
+        (tmp_path / f"{name}.mcap").write_bytes(bag("mcap", imu()[1], name=f"f{name}").read_bytes())
+    with pytest.raises(InputError, match="is a folder; name the file in it"):
+        read(tmp_path)
+
+
+def test_parts_of_a_bag_without_metadata_are_read_in_their_order(bag):
+    values, content = imu(60)
+    path = bag("folder", content[:20], name="parts")
+    (path / "metadata.yaml").unlink()
+    (path / "parts.mcap").rename(path / "parts_0.mcap")
+    for k in (1, 2):
+        (path / f"parts_{k}.mcap").write_bytes(bag("mcap", content[20 * k : 20 * k + 20], name=f"x{k}").read_bytes())
+    np.testing.assert_array_equal(read(path).rate, values[:, :3])
+
+
+def test_content_decides_not_the_ending(bag, tmp_path):
+    values, content = imu()
+    for suffix in ("bag", "mcap", "db3"):
+        path = bag(suffix, content, name=f"y{suffix}")
+        other = tmp_path / f"{suffix}.log"
+        other.write_bytes(path.read_bytes())
+        np.testing.assert_array_equal(read(other).rate, values[:, :3])
+
+
+def test_a_message_of_another_layout_is_named(bag):
+    """A type of the right name and another definition: its message is too short."""
+    from strapdown.recordings import ros
+
+    topic = ros._Topic("/imu", ros.IMU, [0, 1], [bytes([0, 1, 0, 0]) + bytes(340), bytes([0, 1, 0, 0]) + bytes(20)])
+    with pytest.raises(InputError, match=r"x.bag, topic /imu: message 2 is 24 bytes long, shorter than its type"):
+        ros._decoded("x.bag", topic, True)
+
+
+def walk(n: int = 60, epoch: int = START) -> Recording:
+    random = np.random.default_rng(2)
+    field = random.standard_normal((n, 3)) * 1e-5
+    field[1::2] = np.nan
+    return Recording(
+        source="walk",
+        time=np.cumsum(random.integers(4_000_000, 6_000_000, n)) / 1e9,
+        rate=random.standard_normal((n, 3)),
+        specific_force=random.standard_normal((n, 3)),
+        magnetic_field=field,
+        magnetic_unit="T",
+        temperature=random.standard_normal(n),
+        true_attitude=quaternion.normalize(random.standard_normal((n, 4))),
+        epoch_ns=epoch,
+    )
+
+
+@pytest.mark.parametrize("suffix", ["bag", "mcap", "db3"])
+@pytest.mark.parametrize("epoch", [0, START])
+def test_what_is_written_comes_back_to_the_bit(tmp_path, suffix, epoch):
+    whole = walk(epoch=epoch)
+    recordings.write(whole, tmp_path / f"x.{suffix}")
+    back = read(tmp_path / f"x.{suffix}")
+    assert back.clock_ns.tolist() == whole.clock_ns.tolist()
+    for name in ("rate", "specific_force", "magnetic_field", "temperature", "true_attitude"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(whole, name))
+    assert sorted(p.name for p in tmp_path.iterdir()) == [f"x.{suffix}"]
+
+
+@pytest.mark.parametrize("suffix", ["bag", "mcap"])
+def test_the_library_reads_what_is_written(tmp_path, suffix):
+    from rosbags.highlevel import AnyReader
+
+    whole = walk()
+    recordings.write(whole, tmp_path / f"x.{suffix}")
+    with AnyReader([tmp_path / f"x.{suffix}"]) as reader:
+        found = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages() if c.topic == "/imu/data_raw"]
+    assert len(found) == 60
+    assert found[7].header.frame_id == "imu_link"
+    assert found[7].header.stamp.sec * 10**9 + found[7].header.stamp.nanosec == whole.clock_ns[7]
+    assert found[7].angular_velocity.y == whole.rate[7, 1]
+    assert found[7].linear_acceleration.z == whole.specific_force[7, 2]
+    assert found[7].orientation_covariance[0] == -1.0
+
+
+@pytest.mark.parametrize("suffix", ["bag", "mcap"])
+def test_an_estimate_fills_in_orientation_and_covariance_and_keeps_other_topics(bag, tmp_path, suffix):
+    """About the fixed axes: a third of a turn about (1, 1, 1) takes the body's x, y, z to the fixed y, z, x."""
+    from rosbags.highlevel import AnyReader
+
+    _, content = imu()
+    content.append(("/chatter", "String", START, "", "hello"))
+    source = bag(suffix, content)
+    recording = read(source)
+    q = np.full((30, 4), 0.5)
+    variance = np.tile([1.0, 4.0, 9.0, 1.0, 1.0, 1.0], (30, 1))
+    estimate = Estimate(time=recording.time[10:], attitude=q, bias=np.zeros((30, 3)), variance=variance)
+    recordings.write(estimate, tmp_path / f"out.{suffix}", recording=recording, source=source)
+    with AnyReader([tmp_path / f"out.{suffix}"]) as reader:
+        found = [(c.topic, reader.deserialize(raw, c.msgtype)) for c, _, raw in reader.messages()]
+    units = [one for topic, one in found if topic == "/imu/data"]
+    assert [one.data for topic, one in found if topic == "/chatter"] == ["hello"]
+    assert units[9].orientation_covariance[0] == -1.0
+    np.testing.assert_allclose(units[10].orientation_covariance.reshape(3, 3), np.diag([9.0, 1.0, 4.0]), atol=1e-12)
+    assert (units[10].orientation.w, units[10].orientation.z) == (0.5, 0.5)
+    assert units[10].angular_velocity.x == recording.rate[10, 0]
+    with pytest.raises(InputError, match="no stamp of it is one of the estimate's"):
+        recordings.write(estimate, tmp_path / f"no.{suffix}", recording=walk(10))
+    with pytest.raises(InputError, match="give the recording that the estimate was made from"):
+        recordings.write(estimate, tmp_path / f"no.{suffix}")
+
+
+def test_what_a_bag_cannot_hold_is_refused(tmp_path):
+    from dataclasses import replace
+
+    with pytest.raises(InputError, match="does not say the unit of its magnetometer, and a bag holds tesla"):
+        recordings.write(replace(walk(), magnetic_unit=""), tmp_path / "x.bag")
+    with pytest.raises(InputError, match="no negative times"):
+        recordings.write(replace(walk(epoch=0), time=np.arange(60.0) - 5.0), tmp_path / "x.bag")
+    assert not list(tmp_path.iterdir())
+
+
+def test_commands_read_bags_and_say_the_topic(bag, tmp_path):
+    rest = np.tile([0.0, 0.0, 0.0, 0.1, 0.1, 9.8], (300, 1)) + 1e-3 * np.random.default_rng(3).standard_normal((300, 6))
+    content = [("/a/imu", "Imu", START + 10_000_000 * k, "i", rest[k]) for k in range(300)]
+    path = bag("folder", content)
+    said = CliRunner().invoke(app, ["estimate", str(path), "--out", str(tmp_path / "out")])
+    assert said.exit_code == 0, said.output
+    assert "Topic /a/imu: 300 messages." in said.output
+    two = bag("mcap", content + [("/b/imu", "Imu", *one[2:]) for one in content], name="two")
+    for options, status in (((), 1), (("--topic", "/b/imu"), 0)):
+        said = CliRunner().invoke(app, ["integrate", str(two), "--out", str(tmp_path / "i.h5"), *options])
+        assert said.exit_code == status, said.output
+
+
+def test_without_the_library_the_remedy_is_one_line(bag, monkeypatch):
+    import sys
+
+    path = bag("mcap", imu()[1])
+    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    with pytest.raises(InputError, match=r"needs rosbags .*pip install 'strapdown\[formats\]'"):
+        read(path)

@@ -1,0 +1,254 @@
+"""Which column of a table is what: mapped, guessed and said, or refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from strapdown import recordings
+from strapdown.checks import InputError
+from strapdown.cli import app
+from strapdown.recordings import columns, read
+
+DEGREE = np.pi / 180.0
+G = 9.80665
+VALUES = np.column_stack([[1.0, 2.0, 3.0], np.arange(1.0, 28.0).reshape(3, 9)])
+"""time, three of the gyro, of the accelerometer, of the magnetometer; three rows."""
+
+
+@pytest.fixture
+def table(tmp_path):
+    """Write a table of VALUES below some header lines and return its path."""
+
+    def write(*header: str, name: str = "walk.csv", separator: str = ",", values=VALUES):
+        rows = [separator.join(f"{x:g}" for x in row) for row in np.asarray(values)]
+        path = tmp_path / name
+        path.write_text("\n".join([*header, *rows]) + "\n", encoding="utf-8")
+        return path
+
+    return write
+
+
+HEADERS = {
+    "x-io": "Time (s),Gyroscope X (deg/s),Gyroscope Y (deg/s),Gyroscope Z (deg/s),Accelerometer X (g),Accelerometer Y (g),"
+    "Accelerometer Z (g),Magnetometer X (uT),Magnetometer Y (uT),Magnetometer Z (uT)",
+    "words": "timestamp,gyro_x_dps,gyro_y_dps,gyro_z_dps,accel_x_g,accel_y_g,accel_z_g,mag_x_uT,mag_y_uT,mag_z_uT",
+    "camel": "t,GyrX [deg/s],GyrY,GyrZ,AccX [g],AccY,AccZ,MagX [µT],MagY,MagZ",
+    "ros": "time,angular_velocity.x [°/s],angular_velocity.y,angular_velocity.z,linear_acceleration.x [g],linear_acceleration.y,"
+    "linear_acceleration.z,magnetic_field.x [uT],magnetic_field.y,magnetic_field.z",
+    "imu prefix": "Time [s],imu_gyro_x [dps],imu_gyro_y,imu_gyro_z,imu_acc_x [g],imu_acc_y,imu_acc_z,imu_mag_x [uT],imu_mag_y,imu_mag_z",
+    "joined": "seconds_elapsed,wx [deg/s],wy,wz,accx [g],accy,accz,magx [uT],magy,magz",
+}
+
+
+@pytest.mark.parametrize("header", HEADERS.values(), ids=HEADERS)
+def test_usual_headers_are_understood_and_said(table, header):
+    recording = read(table(header))
+    np.testing.assert_allclose(recording.time, VALUES[:, 0], rtol=1e-15)
+    np.testing.assert_allclose(recording.rate, VALUES[:, 1:4] * DEGREE, rtol=1e-15)
+    np.testing.assert_allclose(recording.specific_force, VALUES[:, 4:7] * G, rtol=1e-15)
+    np.testing.assert_array_equal(recording.magnetic_field, VALUES[:, 7:])
+    assert recording.magnetic_unit == "uT"
+    (remark,) = recording.remarks
+    assert remark.startswith("Columns taken by their names: ")
+    for role in ("gx gy gz from", "ax ay az from", "mx my mz from"):
+        assert role in remark
+
+
+def test_the_packages_own_names_need_no_remark(table):
+    own = "time,gx [dps],gy,gz,ax [mg],ay,az,mx,my,mz"
+    recording = read(table(own))
+    assert recording.remarks == ()
+    assert recording.magnetic_unit == ""
+    np.testing.assert_allclose(recording.specific_force, VALUES[:, 4:7] * 1e-3 * G, rtol=1e-14)
+
+
+def test_a_flight_log_as_csv_has_its_axes_in_brackets(table):
+    """What ulog2csv writes; the stamps are µs, which the header does not say, and as seconds no gyro has."""
+    header = "timestamp,gyro_rad[0],gyro_rad[1],gyro_rad[2],accelerometer_m_s2[0],accelerometer_m_s2[1],accelerometer_m_s2[2]"
+    values = VALUES[:, :7] * [4000.0, 1, 1, 1, 1, 1, 1]
+    path = table(header, values=values)
+    with pytest.raises(InputError, match=r"stamps of timestamp are 4000 apart.*hardly seconds.*\[us\]"):
+        read(path)
+    recording = read(path, units={"time": "us"})
+    np.testing.assert_allclose(recording.time, values[:, 0] * 1e-6, rtol=1e-15)
+    np.testing.assert_array_equal(recording.rate, VALUES[:, 1:4])
+    np.testing.assert_array_equal(recording.specific_force, VALUES[:, 4:7])
+
+
+def test_euroc_names_its_columns_in_a_comment_and_keeps_its_nanoseconds(table, tmp_path):
+    header = (
+        "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
+        "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
+    )
+    path = tmp_path / "data.csv"
+    stamps = [1403636579758555392 + 5_000_001 * k for k in range(4)]
+    path.write_text(header + "\n" + "".join(f"{stamp},1,2,3,4,5,{6 + k}\n" for k, stamp in enumerate(stamps)))
+    recording = read(path)
+    assert recording.epoch_ns == stamps[0]
+    np.testing.assert_allclose(recording.time, 5_000_001e-9 * np.arange(4), rtol=1e-15)
+    assert recording.clock_ns.tolist() == stamps
+    np.testing.assert_array_equal(recording.rate[0], [1, 2, 3])
+    np.testing.assert_array_equal(recording.specific_force[3], [4, 5, 9])
+
+
+def test_two_header_rows_are_one_of_sensors_and_axes(table):
+    """As in RepoIMU: the sensor stands once above its three axes, parted by semicolons."""
+    first = "Time [s];Gyroscope [rad/s];;;Accelerometer [m/s^2];;;Magnetometer [uT];;"
+    recording = read(table(first, ";X;Y;Z;X;Y;Z;X;Y;Z", separator=";"))
+    np.testing.assert_array_equal(recording.rate, VALUES[:, 1:4])
+    np.testing.assert_array_equal(recording.specific_force, VALUES[:, 4:7])
+    np.testing.assert_array_equal(recording.magnetic_field, VALUES[:, 7:])
+
+
+def test_two_header_rows_are_one_of_names_and_units(table):
+    names = "time\tgx\tgy\tgz\tax\tay\taz\tmx\tmy\tmz"
+    recording = read(table(names, "ms\tdps\tdps\tdps\tg\tg\tg\tnT\tnT\tnT", separator="\t"))
+    np.testing.assert_allclose(recording.time, VALUES[:, 0] * 1e-3, rtol=1e-15)
+    np.testing.assert_allclose(recording.rate, VALUES[:, 1:4] * DEGREE, rtol=1e-15)
+    assert recording.magnetic_unit == "nT"
+
+
+ODD = "when,u1,u2,u3,f1,f2,f3,n1,n2,n3"
+
+
+def test_a_mapping_names_columns_and_units(table):
+    path = table(ODD)
+    with pytest.raises(InputError, match=r"lacks time.*it has: when, u1.*--columns time="):
+        read(path)
+    mapping = columns.parse_mapping("time=when[ms],gx=u3[dps],gy=u2,gz=u1,ax=f1[mg],ay=f2,az=f3")
+    recording = read(path, columns=mapping)
+    np.testing.assert_allclose(recording.time, VALUES[:, 0] * 1e-3, rtol=1e-15)
+    np.testing.assert_allclose(recording.rate, VALUES[:, [3, 2, 1]] * DEGREE, rtol=1e-15)
+    np.testing.assert_allclose(recording.specific_force, VALUES[:, 4:7] * 1e-3 * G, rtol=1e-14)
+    assert recording.magnetic_field is None
+
+
+@pytest.mark.parametrize(
+    ("mapping", "words"),
+    [
+        ("time", "'time' is no ROLE=NAME"),
+        ("tme=when", "role 'tme' is not known; did you mean 'time'"),
+        ("time=when,time=u1", "time is given twice"),
+        ("time=then", "has no column 'then' for time"),
+        ("time=when,gx=u1", "lacks gy, gz"),
+    ],
+)
+def test_bad_mappings_are_refused(table, mapping, words):
+    with pytest.raises(InputError) as caught:
+        read(table(ODD), columns=columns.parse_mapping(mapping))
+    assert words in str(caught.value)
+
+
+def test_two_sensors_that_fit_are_refused_not_chosen(table):
+    header = "time,gyro_x [dps],gyro_y,gyro_z,gyr_x,gyr_y,gyr_z,mx,my,mz"
+    path = table(header)
+    with pytest.raises(
+        InputError, match=r"the gyro may be that of gyro_x \[dps\] or gyr_x; say which, as in --columns gx="
+    ):
+        read(path)
+    chosen = read(path, columns={"gx": "gyr_x[deg/s]", "gy": "gyr_y", "gz": "gyr_z"})
+    np.testing.assert_allclose(chosen.rate, VALUES[:, 4:7] * DEGREE, rtol=1e-15)
+
+
+@pytest.mark.parametrize("name", ["Linear Acceleration {} (m/s^2)", "userAcceleration{}", "gyro_bias_{}", "acc_{}_std"])
+def test_what_is_no_plain_sample_is_not_taken_for_one(table, name):
+    """An acceleration without gravity shows no vertical."""
+    other = ",".join(name.format(axis) for axis in "xyz")
+    recording = read(table(f"time,gx [rad/s],gy,gz,{other},mx,my,mz"))
+    assert recording.specific_force is None
+    assert recording.remarks == ()
+
+
+def test_a_time_may_be_a_date(tmp_path):
+    path = tmp_path / "phone.csv"
+    rows = (
+        "2024-03-01T13:00:00.000250+01:00,1,2,3",
+        "2024-03-01T12:00:00.010250Z,1,2,3",
+        "2024-03-01 12:00:00.020250,1,2,3",
+    )
+    path.write_text("timestamp,gyro_x [dps],gyro_y,gyro_z\n" + "\n".join(rows) + "\n")
+    recording = read(path)
+    np.testing.assert_allclose(recording.time, [0.0, 0.01, 0.02], atol=1e-12)
+    assert recording.epoch_ns == 1_709_294_400_000_250_000
+    path.write_text(path.read_text().replace("2024-03-01 12", "2024-13-01 12"))
+    with pytest.raises(InputError, match=r"data row 3, column timestamp is '2024-13-01 12:00:00.020250', not a number"):
+        read(path)
+
+
+def test_columns_that_nobody_asks_for_may_hold_anything(table, tmp_path):
+    path = tmp_path / "labels.csv"
+    path.write_text(
+        "date,time,gx [dps],gy,gz,label\n2024-03-01T12:00:00Z,0,1,2,3,walk\n2024-03-01T12:00:01Z,1,1,2,3,\n"
+    )
+    recording = read(path)
+    np.testing.assert_allclose(recording.rate[1], np.radians([1, 2, 3]), rtol=1e-15)
+    with pytest.raises(InputError, match=r"data row 1, column label is 'walk', not a number"):
+        read(path, columns={"gy": "label"})
+
+
+def test_temperature_goes_along(table):
+    recording = read(table("time,gx [rad/s],gy,gz,temperature [°C],a1,a2,mx,my,mz"))
+    np.testing.assert_array_equal(recording.temperature, VALUES[:, 4])
+    guessed = read(table("time,gx [rad/s],gy,gz,temp_C,a1,a2,mx,my,mz"))
+    np.testing.assert_array_equal(guessed.temperature, VALUES[:, 4])
+
+
+def test_what_is_written_is_read_back_to_the_bit(tmp_path):
+    random = np.random.default_rng(3)
+    n = 50
+    field = random.standard_normal((n, 3))
+    field[::3] = np.nan
+    whole = recordings.Recording(
+        source="x.csv",
+        time=np.cumsum(random.integers(1_000_000, 9_000_000, n)) / 1e9,
+        rate=random.standard_normal((n, 3)),
+        specific_force=random.standard_normal((n, 3)),
+        magnetic_field=field,
+        magnetic_unit="mG",
+        temperature=random.standard_normal(n),
+        true_attitude=random.standard_normal((n, 4)),
+        movement=random.random(n) > 0.5,
+        epoch_ns=1_700_000_000_123_456_789,
+    )
+    for ending in ("csv", "tsv"):
+        recordings.write(whole, tmp_path / f"x.{ending}")
+        back = read(tmp_path / f"x.{ending}")
+        assert back.remarks == ()
+        assert back.clock_ns.tolist() == whole.clock_ns.tolist()
+        for name in ("rate", "specific_force", "magnetic_field", "temperature", "true_attitude", "movement"):
+            np.testing.assert_array_equal(getattr(back, name), getattr(whole, name))
+        assert back.magnetic_unit == "mG"
+
+
+def test_the_xio_recording_is_understood(xio):
+    recording = read(xio / "sensor_data.csv")
+    assert len(recording.time) == 13514
+    assert abs(np.linalg.norm(recording.specific_force[:50].mean(axis=0)) - G) < 0.1
+    assert "Gyroscope X" in recording.remarks[0]
+
+
+@pytest.fixture
+def xio():
+    folder = Path(__file__).resolve().parents[1] / ".." / "shared" / "data" / "xio"
+    if not folder.is_dir():
+        pytest.skip("the x-io recording is not here")
+    return folder
+
+
+def test_commands_take_columns_and_say_what_they_guessed(table, tmp_path):
+    time = np.arange(300) / 100.0
+    values = np.column_stack([time, np.zeros((300, 3)), np.zeros((300, 2)), np.full(300, 1.0)])
+    guessed = table("t,GyrX [dps],GyrY,GyrZ,AccX [g],AccY,AccZ", values=values)
+    odd = table("t,u1,u2,u3,f1,f2,f3", values=values, name="odd.csv")
+    mapping = "time=t,gx=u1[dps],gy=u2,gz=u3,ax=f1[g],ay=f2,az=f3"
+    for command in ("estimate", "integrate", "doctor"):
+        out = ["--out", str(tmp_path / f"{command}.h5")] if command != "doctor" else []
+        said = CliRunner().invoke(app, [command, str(guessed), *out])
+        assert "Columns taken by their names: time from 't'" in said.output, said.output
+        other = CliRunner().invoke(app, [command, str(odd), *out, "--columns", mapping])
+        assert other.exit_code == said.exit_code, other.output
+        assert "Columns taken" not in other.output
