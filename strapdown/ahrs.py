@@ -20,6 +20,8 @@ import numpy as np
 from strapdown import augmented, coning, mekf, quaternion, sensor_delays, sensor_faults, wahba
 from strapdown.augmented import AugmentedEstimate, AugmentedState, SensorStates, States
 from strapdown.checks import Array, InputError, non_negative, positive
+from strapdown.kernels import recording_steps
+from strapdown.kernels.machine import compiled
 from strapdown.recordings import Recording, increments
 from strapdown.records import BlockEstimate, Estimate, ImuRecord, Innovations, cut
 from strapdown.robustness import Gate, Robust
@@ -179,6 +181,7 @@ def prepare(
     field_delay : float or array_like, (n,)
         Delay of the magnetometer's samples beside the gyro's, s: each is turned forward by the gyro.
     """
+    initial = start(recording, quiet, parameters)  # first, for it refuses a sensor without samples
     turned = coning.integrate(increments(recording), coning.ALGORITHMS["one-sample"])
     edge = _edges(recording.time, parameters.step)
     time = recording.time[edge]
@@ -186,7 +189,7 @@ def prepare(
     interval = float(np.median(np.diff(recording.time)))
     assert recording.specific_force is not None
     force, number = _averages(recording.specific_force, turned, edge)
-    gravity = _norm(_mean(recording.specific_force[quiet], recording.source, "accelerometer"))
+    gravity = _norm(_mean_at_first(recording, recording.specific_force, quiet, "accelerometer")[0])
     vectors = [
         VectorMeasurements(
             sensor="accelerometer",
@@ -199,7 +202,6 @@ def prepare(
     ]
     dip = None
     if recording.magnetic_field is not None:
-        _mean(recording.magnetic_field[quiet], recording.source, "magnetometer")
         back = quaternion.exp(-sensor_delays.turn_over(recording, field_delay)) if np.any(field_delay) else None
         frame = turned if back is None else quaternion.multiply(turned, back)
         field, number = _averages(recording.magnetic_field, frame, edge)
@@ -207,7 +209,7 @@ def prepare(
         vectors.append(heading)
     turn = quaternion.log(quaternion.multiply(quaternion.conjugate(at_edge[:-1]), at_edge[1:]))
     record = ImuRecord(time=time, increments=turn, vectors=tuple(vectors))
-    return Prepared(record, start(recording, quiet, parameters), edge, turned, dip)
+    return Prepared(record, initial, edge, turned, dip)
 
 
 def _edges(time: Array, step: float) -> Array:
@@ -218,10 +220,8 @@ def _edges(time: Array, step: float) -> Array:
 
 def _averages(samples: Array, frame: Array, edge: Array) -> tuple[Array, Array]:
     """Return the mean of each step's samples in the axes that ``frame`` (n, 4) turns them to (k, 3), and their number; 0 where none."""
-    known = np.isfinite(samples).all(axis=1) & samples.any(axis=1)  # a sample of zeros is a missing one
-    turned = quaternion.rotate(frame, np.where(known[:, None], samples, 0.0))
-    number = np.add.reduceat(known[1:].astype(np.float64), edge[:-1])
-    total = np.add.reduceat(turned[1:], edge[:-1], axis=0)
+    total, number = np.empty((len(edge) - 1, 3)), np.empty(len(edge) - 1)
+    compiled(recording_steps.average_samples)(samples, frame, edge, total, number)
     return total / np.maximum(number, 1.0)[:, None], number
 
 
@@ -285,24 +285,37 @@ def _low_pass(values: Array, step: float) -> Array:
 
 
 def start(recording: Recording, quiet: slice, parameters: AhrsParameters) -> mekf.State:
-    """Return the state at the quiet samples: attitude by TRIAD from the mean vertical and field; any North without a magnetometer.
+    """Return the state at the first of the quiet samples: attitude by TRIAD from the mean vertical and field, any North without a field.
 
-    With ``rest_bias_sigma`` the bias is that of :func:`resting_bias`.
+    The means are taken in the frame that the gyro keeps over those samples, and σ grows with the acceleration that is left there. With
+    ``rest_bias_sigma`` the bias is that of :func:`resting_bias`.
     """
     assert recording.specific_force is not None
-    up = _mean(recording.specific_force[quiet], recording.source, "accelerometer")
-    sigma = np.full(3, parameters.attitude_sigma)
+    force, spread = _mean_at_first(recording, recording.specific_force, quiet, "accelerometer")
     if recording.magnetic_field is None:
         # Any horizontal direction will do for a heading that nothing measures.
-        across = np.eye(3)[np.argmin(np.abs(up))]
-        attitude = wahba.from_vertical_and_heading(up, across)
+        across = np.eye(3)[np.argmin(np.abs(force))]
     else:
-        field = _mean(recording.magnetic_field[quiet], recording.source, "magnetometer")
-        attitude = wahba.from_vertical_and_heading(up, field)
+        across, _ = _mean_at_first(recording, recording.magnetic_field, quiet, "magnetometer")
     bias, bias_sigma = np.zeros(3), parameters.bias_sigma
     if parameters.rest_bias_sigma > 0.0:
         bias, bias_sigma = resting_bias(recording, quiet, parameters)
-    return mekf.initial_state(attitude, bias=bias, attitude_sigma=sigma, bias_sigma=bias_sigma)
+    return mekf.initial_state(
+        wahba.from_vertical_and_heading(force, across),
+        bias=bias,
+        attitude_sigma=float(np.hypot(parameters.attitude_sigma, spread / _norm(force))),
+        bias_sigma=bias_sigma,
+    )
+
+
+def _mean_at_first(recording: Recording, samples: Array, quiet: slice, sensor: str) -> tuple[Array, float]:
+    """Return the mean of the quiet samples in the body axes of their first (3,), and how far they spread about it."""
+    turn = 0.5 * (recording.rate[quiet][1:] + recording.rate[quiet][:-1]) * np.diff(recording.time[quiet])[:, None]
+    own = samples[quiet]
+    known = np.isfinite(own).all(axis=1)
+    still = quaternion.rotate(coning.integrate(turn)[known], own[known])
+    mean = _mean(still, recording.source, sensor)
+    return mean, _norm(still.std(axis=0))
 
 
 def resting_bias(recording: Recording, quiet: slice, parameters: AhrsParameters) -> tuple[Array, float]:
@@ -498,23 +511,21 @@ def _at_stamps(
     ahead = -sensor_delays.turn_over(used, -late) if smooth else used.rate * late[:, None]
     ahead = ahead - bias * (used.time - used.time[edge][row] + late)[:, None]
     step = quaternion.multiply(filtered.attitude, quaternion.conjugate(turned[edge]))
-    attitude = quaternion.multiply(quaternion.multiply(step[row], turned), quaternion.exp(ahead))
-    # The covariance of the step, in the axes that the body has turned to since.
-    R = quaternion.to_matrix(attitude)
-    C = quaternion.to_matrix(filtered.attitude)[row].transpose(0, 2, 1) @ R
     assert filtered.covariance is not None
-    P = filtered.covariance[row]
-    C_T = C.transpose(0, 2, 1)
-    own = C_T @ P[:, :3, :3] @ C
-    own += (delays.sigma * used.rate)[:, :, None] * (delays.sigma * used.rate)[:, None, :]
-    if prepared.dip is not None:
-        up = parameters.iron_sigma / np.cos(prepared.dip) * R[:, 2, :]
-        own += up[:, :, None] * up[:, None, :]
-    variance = filtered.variance[row].copy()
+    R = quaternion.to_matrix(filtered.attitude)
+    fixed = R @ filtered.covariance[:, :3, :3] @ R.transpose(0, 2, 1)
+    iron = 0.0 if prepared.dip is None else (parameters.iron_sigma / np.cos(prepared.dip)) ** 2
+    attitude, own = np.empty((len(row), 4)), np.empty((len(row), 3, 3))
+    compiled(recording_steps.carry_to_stamps)(
+        row, step, fixed, turned, ahead, used.rate, delays.sigma**2, iron, attitude, own
+    )
+    variance = filtered.variance[row]
     variance[:, :3] = np.einsum("kii->ki", own)
+    P = None
     if full_covariance:
-        P = P.copy()
-        P[:, :3, :3], P[:, :3, 3:] = own, C_T @ P[:, :3, 3:]
+        P = filtered.covariance[row]
+        P[:, :3, :3] = own
+        P[:, :3, 3:] = quaternion.to_matrix(attitude).transpose(0, 2, 1) @ (R @ filtered.covariance[:, :3, 3:])[row]
         P[:, 3:, :3] = P[:, :3, 3:].transpose(0, 2, 1)
     sensors = {"accelerometer": used.specific_force, "magnetometer": used.magnetic_field}
     return AugmentedEstimate(
@@ -522,7 +533,7 @@ def _at_stamps(
         attitude=attitude,
         bias=bias,
         variance=variance,
-        covariance=P if full_covariance else None,
+        covariance=P,
         innovations=filtered.innovations,
         skipped={
             name: int(np.sum(~(np.isfinite(samples).all(axis=1) & samples.any(axis=1))))
@@ -540,12 +551,12 @@ def _at_stamps(
 
 
 def _mean(samples: Array, source: str, sensor: str) -> Array:
-    known = samples[np.isfinite(samples).all(axis=1)]
-    if len(known) == 0:
+    """Return the mean of samples (k, 3) of the quiet second, which must show a direction."""
+    if len(samples) == 0:
         raise InputError(
             f"{source}: the {sensor} has no valid sample in the first quiet second; cut the recording to where it has"
         )
-    mean = np.asarray(known.mean(axis=0))
+    mean = np.asarray(samples.mean(axis=0))
     if _norm(mean) == 0.0:
         raise InputError(
             f"{source}: the {sensor} is zero over the first quiet second and shows no direction; cut the recording to where it has one"

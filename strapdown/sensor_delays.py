@@ -146,17 +146,18 @@ def _evidence(recording: Recording) -> tuple[Array, Array, Array]:
 
 def _fitted(change: Array, wanted: Array) -> tuple[float, float]:
     """Return the delay, s, and its σ, by which ``wanted`` (m, 3) makes up ``change`` (m, 3), without the farthest."""
+    across, along, total = (np.einsum("ki,ki->k", a, b) for a, b in ((change, wanted), (wanted, wanted), (change, change)))
     kept = np.full(len(change), True)
-    for _ in range(6):
-        information = float(np.sum(wanted[kept] ** 2))
+    for _ in range(4):
+        information = float(np.sum(along[kept]))
         if information == 0.0:
             return 0.0, np.inf
-        delay = float(np.sum(change[kept] * wanted[kept])) / information
-        left = np.linalg.norm(change - delay * wanted, axis=1)
+        delay = float(np.sum(across[kept])) / information
+        left = total - 2.0 * delay * across + delay**2 * along
         middle = float(np.median(left))
-        kept = left <= 2.5 * middle
+        kept = left <= 2.5**2 * middle
     # Of a normal residual with three components the median length is 1.54 σ; the pairs of one span overlap and are not independent.
-    return delay, middle / 1.54 * float(np.sqrt(PAIRS_IN_SPAN / information))
+    return delay, float(np.sqrt(max(middle, 0.0) * PAIRS_IN_SPAN / information)) / 1.54
 
 
 def turn_over(recording: Recording, delay: Array | float) -> Array:

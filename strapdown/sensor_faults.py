@@ -55,7 +55,7 @@ def find(recording: Recording) -> Faults:
             if clipped[:, k].any()
         )
         words.append(
-            f"The gyro was clipped: {limits} of the samples. The rate there is restored from the samples around it, and σ grows over each run"
+            f"The gyro was clipped: {limits} of the samples. The rate is restored from the samples around, and σ grows over each run"
         )
     force = recording.specific_force
     if force is not None and (saturated := clipped_samples(force, MIN_CLIPPED_FORCE)).any():

@@ -461,7 +461,7 @@ def test_a_recording_that_is_not_what_it_says_is_doubted(run, recording, tmp_pat
 
 def test_gate_robust_weights_and_observability_of_a_recording(run, recording, tmp_path):
     options = ("--gate", 0.999, "--robust", "student", "--observability")
-    status, said, error = run("estimate", recording, "--out", tmp_path / "out", *options)
+    status, _, error = run("estimate", recording, "--out", tmp_path / "out", *options)
     assert (status, error) == (0, "")
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"estimate.h5", "states.json", "observability.json"}
     with h5py.File(tmp_path / "out" / "estimate.h5") as file:
