@@ -110,7 +110,7 @@ class Result:
 
     def mean(self, name: str, treatment: str = "as recorded") -> Array:
         """Return the mean errors of one filter over the recordings (3,), rad."""
-        return np.mean([one.errors for one in self.scores[treatment][name]], axis=0)
+        return np.asarray(np.mean([one.errors for one in self.scores[treatment][name]], axis=0))
 
 
 def swelling(t: Array, w: float, phase: Array) -> tuple[Array, Array]:
@@ -348,7 +348,7 @@ def leave_one_out(read: Sequence[Recording], latency: float, smooth: bool) -> Ar
     """Return the total error on each recording with the candidate that has the least mean error on the others (recordings,), rad."""
     errors = np.array([[ours(one, latency, p, smooth)[1].errors[0] for p in CANDIDATES.values()] for one in read])
     others = errors.sum(axis=0) - errors
-    return errors[np.arange(len(read)), np.argmin(others, axis=1)]
+    return np.asarray(errors[np.arange(len(read)), np.argmin(others, axis=1)])
 
 
 def draw(result: Result, path: Path) -> Path:

@@ -158,7 +158,7 @@ class Prepared(NamedTuple):
     record: ImuRecord
     """Increments and vectors at the filter's steps."""
     initial: mekf.State
-    edge: Array
+    edge: np.ndarray
     """Sample at which each step ends, the first at the start (k + 1,)."""
     turned: Array
     """Attitude by the gyro alone at every sample, from the identity at the first one (n, 4)."""
@@ -212,7 +212,7 @@ def prepare(
     return Prepared(record, initial, edge, turned, dip)
 
 
-def _edges(time: Array, step: float) -> Array:
+def _edges(time: Array, step: float) -> np.ndarray:
     """Return the samples at which steps end (k + 1,): the first, the last before each multiple of ``step``, s, and the last of all."""
     bins = np.floor((time - time[0]) / step + 1e-6)
     return np.unique(np.concatenate([[0], np.flatnonzero(np.diff(bins)), [len(time) - 1]]))
@@ -242,7 +242,9 @@ def _headings(
     strength = np.linalg.norm(field, axis=1)
     strength[~known] = 1.0
     interval = float(np.median(np.diff(time)))
-    vertical = _low_pass(_low_pass(_held(force, force.any(axis=1)), interval / VERTICAL_TIME), interval / VERTICAL_TIME)
+    vertical = _low_pass(
+        _low_pass(_held(force, np.asarray(force.any(axis=1))), interval / VERTICAL_TIME), interval / VERTICAL_TIME
+    )
     vertical /= np.linalg.norm(vertical, axis=1, keepdims=True)
     dip = np.arcsin(np.clip(-np.sum(field * vertical, axis=1) / strength, -1.0, 1.0))
     first = known & ~later if np.any(known & ~later) else known
@@ -441,7 +443,7 @@ def _run(
     record, own = prepared.record, parameters.setup
     kinds = {series.sensor: series.kind for series in record.vectors}
     blocks = () if own.states is None else own.states.blocks(kinds)
-    extra = np.add.reduceat(turn_variance, prepared.edge[:-1])
+    extra = np.add.reduceat(turn_variance, prepared.edge[:-1].astype(np.intp))
     change = np.flatnonzero(np.diff(extra > 0.0)) + 1
     bounds = [0, *change.tolist(), len(extra)]
     state: mekf.State | AugmentedState = prepared.initial
@@ -487,7 +489,11 @@ def _joined(parts: list[AugmentedEstimate]) -> AugmentedEstimate:
         for name, block in parts[0].blocks.items()
     }
     return AugmentedEstimate(
-        **{name: rows(name) for name in ("time", "attitude", "bias", "variance", "covariance")},
+        time=rows("time"),
+        attitude=rows("attitude"),
+        bias=rows("bias"),
+        variance=rows("variance"),
+        covariance=rows("covariance"),
         innovations=innovations,
         events=tuple(event for part in parts for event in part.events),
         blocks=blocks,

@@ -136,7 +136,7 @@ def _evidence(recording: Recording) -> tuple[Array, Array, Array]:
     lag = max(1, lag // stride)
     attitude = coning.integrate(increments(recording), coning.ALGORITHMS["one-sample"])[at]
     field = recording.magnetic_field[at]
-    known = np.isfinite(field).all(axis=1) & field.any(axis=1)
+    known = np.asarray(np.isfinite(field).all(axis=1) & field.any(axis=1))
     field = np.where(known[:, None], field, 0.0)
     still = quaternion.rotate(attitude, field)
     late = quaternion.rotate(attitude, np.cross(recording.rate[at], field))

@@ -8,6 +8,7 @@ gap. A clipped sample of the accelerometer has a false direction and is left out
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -46,7 +47,7 @@ def find(recording: Recording) -> Faults:
     """Return the faults of a recording's samples, and the recording without them."""
     words = []
     rate, variance, clipped = restored(recording.time, recording.rate)
-    changes: dict[str, Array] = {}
+    changes: dict[str, Any] = {}
     if clipped.any():
         changes["rate"] = rate
         limits = ", ".join(
@@ -59,7 +60,7 @@ def find(recording: Recording) -> Faults:
         )
     force = recording.specific_force
     if force is not None and (saturated := clipped_samples(force, MIN_CLIPPED_FORCE)).any():
-        lost = saturated.any(axis=1)
+        lost = np.asarray(saturated.any(axis=1))
         changes["specific_force"] = np.where(lost[:, None], np.nan, force)
         words.append(f"The accelerometer was clipped in {np.sum(lost)} samples ({lost.mean():.2%}), which are left out")
     steps = np.diff(recording.time)
