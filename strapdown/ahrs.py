@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from strapdown import augmented, coning, mekf, quaternion, sensor_delays, sensor_faults, wahba
+from strapdown import augmented, coning, mekf, quaternion, sensor_delays, sensor_faults, unit_calibration, wahba
 from strapdown.augmented import AugmentedEstimate, AugmentedState, SensorStates, States
 from strapdown.checks import Array, InputError, non_negative, positive
 from strapdown.kernels import recording_steps
@@ -28,6 +28,7 @@ from strapdown.robustness import Gate, Robust
 from strapdown.sensor_delays import Delays
 from strapdown.sensor_faults import Faults
 from strapdown.setup import FilterSetup
+from strapdown.unit_calibration import UnitCalibration
 from strapdown.units import DEGREE
 from strapdown.vectors import VectorMeasurements
 
@@ -365,6 +366,8 @@ class AhrsEstimate:
     """Delays of the sensors that are made good."""
     faults: Faults
     """What of the samples is not what the unit did."""
+    calibration: UnitCalibration | None
+    """What the recording shows of the unit, for its next recording; None where the filter has no states for it."""
 
 
 def estimate(
@@ -372,6 +375,7 @@ def estimate(
     parameters: AhrsParameters = HAND_HELD,
     *,
     latency: float | None = None,
+    calibration: UnitCalibration | None = None,
     gate: Gate | None = None,
     robust: Robust | None = None,
     full_covariance: bool = False,
@@ -387,6 +391,8 @@ def estimate(
         Delay of the gyro's and the accelerometer's samples, s: the group delay of the sensors; 0: point samples at their stamps. By
         default each sample is taken for the mean over the interval before its stamp, half of which is its delay. That of the
         magnetometer beside the gyro is found by :func:`strapdown.sensor_delays.magnetometer_delay`.
+    calibration : UnitCalibration, optional
+        What an earlier recording of the same unit showed: scale and misalignment of its gyro, the magnetometer's delay.
     gate : Gate, optional
         Refuse measurements that the filter's model does not explain.
     robust : Robust, optional
@@ -411,14 +417,23 @@ def estimate(
     span = quiet_span(recording)
     faults = sensor_faults.find(recording.since(span.start))
     used = faults.recording
+    field_delay = None
+    if calibration is not None:
+        used, field_delay = calibration.applied(used), calibration.magnetometer_delay or None
+        if parameters.gyro_scale_sigma > 0.0:
+            parameters = replace(parameters, gyro_scale_sigma=calibration.sigma)
     quiet = slice(0, span.stop - span.start)
-    delays = sensor_delays.find(used, latency, causal=not smooth)
+    delays = sensor_delays.find(used, latency, field_delay, causal=not smooth)
     prepared = prepare(used, quiet, parameters, delays.field)
     filtered = _run(prepared, parameters, faults.turn_variance, gate, robust, smooth)
     found = _at_stamps(filtered, used, prepared, parameters, delays, smooth, full_covariance)
+    scale = found.blocks.get("gyro scale")
     return AhrsEstimate(
         recording=used,
         estimate=found,
+        calibration=None
+        if scale is None
+        else (calibration or unit_calibration.NONE).and_then(scale, delays.last_field, used.source),
         record=prepared.record,
         initial=prepared.initial,
         delays=delays,

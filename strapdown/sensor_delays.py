@@ -71,7 +71,9 @@ class Delays:
         return float(np.ravel(self.field)[-1])
 
 
-def find(recording: Recording, latency: float | None = None, *, causal: bool = False) -> Delays:
+def find(
+    recording: Recording, latency: float | None = None, field: float | None = None, *, causal: bool = False
+) -> Delays:
     """Return the delays of a recording's sensors.
 
     Parameters
@@ -80,6 +82,8 @@ def find(recording: Recording, latency: float | None = None, *, causal: bool = F
     latency : float, optional
         Delay of gyro and accelerometer where it is known, s. By default half a sample interval, as of samples that are means over the
         interval before their stamp; or as much as the magnetometer is ahead of the gyro, for no sensor shows what is to come.
+    field : float, optional
+        Delay of the magnetometer beside the gyro where it is known, s. By default it is found from the recording.
     causal : bool
         Each sample's delay from the samples before it: found anew whenever the recording has become twice as long.
 
@@ -91,9 +95,9 @@ def find(recording: Recording, latency: float | None = None, *, causal: bool = F
     length = recording.time[-1] - recording.time[0]
     if latency is not None and non_negative("latency", latency, unit="s") >= length:
         raise InputError(f"latency is {latency:g} s, and {recording.source} lasts {length:.3g} s")
-    field: Array = np.zeros(len(recording.time))
-    sigma = np.inf
-    if recording.magnetic_field is not None:
+    found = np.full(len(recording.time), field or 0.0)
+    sigma = GIVEN_SIGMA if field is not None else np.inf
+    if field is None and recording.magnetic_field is not None:
         evidence = _evidence(recording)
         spans = [1.0] if causal else [length]
         while spans[-1] < length:
@@ -102,13 +106,13 @@ def find(recording: Recording, latency: float | None = None, *, causal: bool = F
             delay, sigma = _fitted(*(part[evidence[0] <= recording.time[0] + span] for part in evidence[1:]))
             if sigma < MAX_DELAY_SIGMA and 3.0 * sigma < abs(delay) < MAX_DELAY:
                 since = recording.time[0] + span if causal else recording.time[0]
-                field[np.searchsorted(recording.time, since) :] = delay
+                found[np.searchsorted(recording.time, since) :] = delay
     half = 0.5 * float(np.median(np.diff(recording.time)))
-    gyro: Array | float = np.maximum(half, -field) if latency is None else latency
+    gyro: Array | float = np.maximum(half, -found) if latency is None else latency
     return Delays(
         gyro=gyro,
         sigma=ASSUMED_SIGMA if latency is None else GIVEN_SIGMA,
-        field=field,
+        field=found,
         field_sigma=sigma,
         given=latency is not None,
     )
@@ -146,7 +150,9 @@ def _evidence(recording: Recording) -> tuple[Array, Array, Array]:
 
 def _fitted(change: Array, wanted: Array) -> tuple[float, float]:
     """Return the delay, s, and its σ, by which ``wanted`` (m, 3) makes up ``change`` (m, 3), without the farthest."""
-    across, along, total = (np.einsum("ki,ki->k", a, b) for a, b in ((change, wanted), (wanted, wanted), (change, change)))
+    across, along, total = (
+        np.einsum("ki,ki->k", a, b) for a, b in ((change, wanted), (wanted, wanted), (change, change))
+    )
     kept = np.full(len(change), True)
     for _ in range(4):
         information = float(np.sum(along[kept]))

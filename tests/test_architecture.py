@@ -22,7 +22,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     # 1 models
     ("motion", "coning", "flicker", "gyro", "datasheets", "orbit", "vectors", "allan", "wahba"),
     # 2 data
-    ("records", "recordings", "recordfiles", "scenarios"),
+    ("records", "recordings", "recordfiles", "scenarios", "sensor_faults", "sensor_delays", "unit_calibration"),
     # 3 estimators
     ("mekf", "robustness", "setup", "smoother", "family", "augmented", "bank", "ahrs"),
     # 4 analysis

@@ -308,7 +308,7 @@ def test_estimate_on_csv(run, tmp_path):
     status, said, error = run("estimate", walked, "--out", tmp_path / "out", "--figures")
     assert (status, error) == (0, "")
     written = {path.name for path in (tmp_path / "out").iterdir()}
-    assert written == {"estimate.h5", "estimate.png", "states.json", "states.png"}
+    assert written == {"estimate.h5", "calibration.toml", "estimate.png", "states.json", "states.png"}
     assert "walk.csv" in said
     estimate = read_estimate(tmp_path / "out" / "estimate.h5")
     np.testing.assert_allclose(estimate.time, columns[:, 0], atol=1e-9)
@@ -357,6 +357,7 @@ def test_estimate_on_broad(run, broad, tmp_path):
     assert (status, error) == (0, "")
     assert {p.name for p in (tmp_path / "out").iterdir()} == {
         "estimate.h5",
+        "calibration.toml",
         "estimate.png",
         "errors.json",
         "errors.png",

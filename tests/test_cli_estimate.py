@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sims import hand_held
-from strapdown import ahrs, coning, consistency, mekf, motion, quaternion, records, scenarios, setup
+from strapdown import ahrs, coning, consistency, mekf, motion, quaternion, records, scenarios, setup, unit_calibration
 from strapdown.checks import InputError
 from strapdown.cli.filters import filter_for
 from strapdown.gyro import GyroSpec
@@ -463,13 +463,29 @@ def test_gate_robust_weights_and_observability_of_a_recording(run, recording, tm
     options = ("--gate", 0.999, "--robust", "student", "--observability")
     status, _, error = run("estimate", recording, "--out", tmp_path / "out", *options)
     assert (status, error) == (0, "")
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"estimate.h5", "states.json", "observability.json"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "estimate.h5",
+        "states.json",
+        "calibration.toml",
+        "observability.json",
+    }
     with h5py.File(tmp_path / "out" / "estimate.h5") as file:
         used = setup.from_toml(file.attrs["filter"])
     assert (used.gate.probability, used.robust.kind) == (0.999, "student")
     estimate = read_estimate(tmp_path / "out" / "estimate.h5")
     assert all(one.weight is not None for one in estimate.innovations.values())
     assert off(tmp_path / "out", 0.0) < 1.5
+
+
+def test_a_calibration_is_written_and_used(run, recording, tmp_path):
+    assert run("estimate", recording, "--out", tmp_path / "first", "--smooth")[0] == 0
+    first = unit_calibration.read(tmp_path / "first" / "calibration.toml")
+    again = ("--calibration", tmp_path / "first" / "calibration.toml")
+    status, _, error = run("estimate", recording, "--out", tmp_path / "again", *again)
+    assert (status, error) == (0, "")
+    second = unit_calibration.read(tmp_path / "again" / "calibration.toml")
+    assert second.sigma < first.sigma < 2e-3
+    assert np.abs(second.matrix - first.matrix).max() < 2e-3
 
 
 def test_a_clipped_gyro_is_reported(run, recording, tmp_path):
@@ -501,6 +517,7 @@ def test_a_hand_that_never_rests_is_told(run, recording, tmp_path):
         (("--gate", 1.5), "between 0 and 1"),
         (("--robust", "hubert"), "did you mean 'huber'"),
         (("--states",), "goes with a record"),
+        (("--calibration", "none.toml"), "none.toml does not exist"),
     ],
 )
 def test_bad_options_of_a_recording_are_refused(run, recording, tmp_path, options, words):
@@ -515,6 +532,7 @@ def test_bad_options_of_a_recording_are_refused(run, recording, tmp_path, option
     [
         (("--motion", "hand"), "--motion goes with a recording"),
         (("--latency", 4.0), "--latency goes with a recording"),
+        (("--calibration", "unit.toml"), "--calibration goes with a recording"),
         (("--smooth", "--every", 2), "leave one of them out"),
     ],
 )

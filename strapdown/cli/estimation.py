@@ -18,11 +18,20 @@ if TYPE_CHECKING:
     from strapdown.records import Estimate, ImuRecord
     from strapdown.setup import FilterSetup
 
-FILES = ("estimate.h5", "errors.json", "states.json", "observability.json", "estimate.png", "errors.png", "states.png")
+FILES = (
+    "estimate.h5",
+    "errors.json",
+    "states.json",
+    "observability.json",
+    "calibration.toml",
+    "estimate.png",
+    "errors.png",
+    "states.png",
+)
 """What the command may write to its folder."""
 ABOUT_IT = ("estimate.html", "estimate.report.json")
 """What other commands write there about an estimate."""
-RECORDING_ONLY = ("motion", "latency")
+RECORDING_ONLY = ("motion", "latency", "calibration")
 """Options that go with a recording."""
 RECORD_ONLY = ("filter", "states", "state", "attitude", "from_truth", "every")
 """Options that go with a record of `strapdown simulate`."""
@@ -116,25 +125,32 @@ def estimate(
             help="Recording: delay of the gyro's samples, ms, that of its low-pass; 0: point samples. If not given, half a sample interval."
         ),
     ] = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            help="Recording: calibration.toml of an earlier one of the same unit; that of this one is written too."
+        ),
+    ] = None,
     figures: Annotated[
         bool, typer.Option("--figures", help="Draw the estimate, its states and errors as PNG.")
     ] = False,
 ) -> None:
     """Estimate attitude and gyro bias from a recording (accelerometer as vertical, magnetometer as heading) or a simulated record."""
+    from strapdown import unit_calibration
     from strapdown.checks import InputError
     from strapdown.files import usable_folder
     from strapdown.recordfiles import is_record
     from strapdown.records import read_attributes
 
     usable_folder("out", out)
-    writable("out", *(out / name for name in FILES), sources=(recording, gyro, filter_file))
+    writable("out", *(out / name for name in FILES), sources=(recording, gyro, filter_file, calibration))
     need_own(out / FILES[0], "estimate", lambda path: bool(read_attributes(path)["kind"] == "strapdown estimate"))
     given = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
     units = {name: unit for name, unit in given.items() if unit}
     if is_record(recording):
         for name in units:
             raise InputError(f"--{name}-unit goes with a CSV file; the record {recording} tells its units itself")
-        for name, text in zip(RECORDING_ONLY, (motion, latency), strict=True):
+        for name, text in zip(RECORDING_ONLY, (motion, latency, calibration), strict=True):
             if text is not None:
                 raise InputError(f"--{name} goes with a recording; {recording} is a record of `strapdown simulate`")
         _estimate_record(
@@ -173,7 +189,14 @@ def estimate(
             raise InputError(
                 f"--{name.replace('_', '-')} goes with a record of `strapdown simulate`; {recording} is none"
             )
-    options_used = {"gate": gate, "robust": robust, "full_covariance": bool(full_covariance), "smooth": smooth}
+    carried = None if calibration is None else unit_calibration.read(calibration)
+    options_used = {
+        "calibration": carried,
+        "gate": gate,
+        "robust": robust,
+        "full_covariance": bool(full_covariance),
+        "smooth": smooth,
+    }
     _estimate_recording(recording, out, units, gyro, motion, latency, observability, figures, options_used)
 
 
@@ -483,7 +506,7 @@ def _estimate_recording(
     options: dict[str, Any],
 ) -> None:
     """Run the filter over a recording: accelerometer as the vertical, magnetometer as the heading."""
-    from strapdown import ahrs, recordings, setup
+    from strapdown import ahrs, recordings, setup, unit_calibration
     from strapdown.augmented import AugmentedEstimate
     from strapdown.checks import non_negative, one_of
     from strapdown.consistency import reference_errors
@@ -539,6 +562,9 @@ def _estimate_recording(
     console.print(_model(moved_by, parameters, result))
     for sentence in (*result.delays.words, *(f"{one}." for one in result.faults.words)):
         console.print(sentence)
+    if result.calibration is not None:
+        paths.append(out / "calibration.toml")
+        paths[-1].write_text(unit_calibration.to_toml(result.calibration), encoding="utf-8")
     for begin, length in recordings.gaps(used.time):
         console.print(f"Gap of {length:.3g} s after {begin:.3f} s.")
     if used.left_out_words:
