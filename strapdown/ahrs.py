@@ -250,8 +250,8 @@ def _headings(
     dip = np.arcsin(np.clip(-np.sum(field * vertical, axis=1) / strength, -1.0, 1.0))
     first = known & ~later if np.any(known & ~later) else known
     dip_0, strength_0 = float(np.mean(dip[first])), float(np.mean(strength[first]))
-    deviation = _held((strength / strength_0 - 1.0) ** 2 + (dip - dip_0) ** 2, known)
-    deviation = _low_pass(deviation, interval / parameters.field_memory)
+    deviation = _held(((strength / strength_0 - 1.0) ** 2 + (dip - dip_0) ** 2)[:, None], known)
+    deviation = _low_pass(deviation, interval / parameters.field_memory)[:, 0]
     noise = (parameters.field_disturbance / np.cos(dip_0)) ** 2 * (1.0 + deviation / parameters.field_deviation**2)
     # Steps are gathered over the heading interval, each with its own weight.
     information = length / noise
@@ -280,11 +280,10 @@ def _held(values: Array, known: np.ndarray) -> Array:
 
 
 def _low_pass(values: Array, step: float) -> Array:
-    """Return rows (k, …) after a first-order low-pass from the first one on, ``step`` being the interval over the time constant; causal."""
-    from scipy.signal import lfilter
-
-    share = -np.expm1(-step)
-    return np.asarray(lfilter([share], [1.0, share - 1.0], values, axis=0, zi=(1.0 - share) * values[:1])[0])
+    """Return rows (k, m) after a first-order low-pass from the first one on, ``step`` being the interval over the time constant; causal."""
+    result = np.empty_like(values)
+    compiled(recording_steps.low_pass)(values, -np.expm1(-step), result)
+    return result
 
 
 def start(recording: Recording, quiet: slice, parameters: AhrsParameters) -> mekf.State:

@@ -63,3 +63,12 @@ def carry_to_stamps(row, step, covariance_f, turned, ahead, rate, timing, iron, 
                 p += timing * rate[n, i] * rate[n, j] + iron * R[2][i] * R[2][j]
                 covariance[n, i, j] = p
                 covariance[n, j, i] = p
+
+
+def low_pass(values, share, result):
+    """Pass rows (k, m) through ``y += share (x − y)``, from the first row on."""
+    for j in range(values.shape[1]):
+        y = values[0, j]
+        for i in range(len(values)):
+            y += share * (values[i, j] - y)
+            result[i, j] = y
