@@ -37,6 +37,8 @@ specification calls for.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 from strapdown.augmented.blocks import (
     Block,
     BoundedVelocity,
@@ -58,8 +60,10 @@ from strapdown.augmented.model import AugmentedState, initial_state
 from strapdown.augmented.observing import Observability, observability
 from strapdown.augmented.smoothing import recentred, smooth, smooth_fixed_lag
 from strapdown.augmented.states import SensorStates, States
-from strapdown.augmented.stepping import StepFilter
 from strapdown.records import BlockEstimate
+
+if TYPE_CHECKING:
+    from strapdown.augmented.stepping import StepFilter
 
 __all__ = [
     "AugmentedEstimate",
@@ -91,3 +95,12 @@ __all__ = [
     "smooth",
     "smooth_fixed_lag",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Load the step-by-step filter only when it is asked for: filterpy's import takes longer than a recording's estimate."""
+    if name in ("StepFilter",):
+        from strapdown.augmented import stepping
+
+        return getattr(stepping, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -15,6 +15,8 @@ people who look inside.
     The step face.
 """
 
+from typing import TYPE_CHECKING, Any
+
 from strapdown.mekf.running import GAP_FACTOR, gaps, run, run_events, run_on
 from strapdown.mekf.scheduling import Schedule, innovations_by_sensor, schedule, skipped_too
 from strapdown.mekf.states import (
@@ -28,7 +30,9 @@ from strapdown.mekf.states import (
     initial_state,
     pack,
 )
-from strapdown.mekf.stepping import StepFilter, transition_and_noise
+
+if TYPE_CHECKING:
+    from strapdown.mekf.stepping import StepFilter, transition_and_noise
 
 __all__ = [
     "FIRST_SETS",
@@ -52,3 +56,12 @@ __all__ = [
     "skipped_too",
     "transition_and_noise",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Load the step-by-step filter only when it is asked for: filterpy's import takes longer than a recording's estimate."""
+    if name in ("StepFilter", "transition_and_noise"):
+        from strapdown.mekf import stepping
+
+        return getattr(stepping, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
