@@ -32,6 +32,9 @@ TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 SHORT_STAMPS = 0.1
 """Share of the rows with the stamp of the row before, above which stamps lack digits rather than that a row is wrong."""
 
+FEW_REPEATED = 0.01
+"""Share of the rows with the stamp of the row before, below which they are left out though their samples differ."""
+
 _COLUMNS = {"gyro": ("gx", "gy", "gz"), "accelerometer": ("ax", "ay", "az"), "magnetometer": ("mx", "my", "mz")}
 
 
@@ -57,8 +60,8 @@ class Recording:
     """Stamps of the file's rows without a gyro sample (k,), s. They are left out as a whole: the intervals on both sides are one, the turn
     over it is taken from the samples at its ends, and a filter's covariance grows over all of it."""
     repeated: Array = field(default_factory=lambda: np.empty(0))
-    """Stamps of the file's rows that say the same as the row before, stamp and all (k,), s: they are left out. The same stamp with other
-    values is refused, for two samples at one time have no interval between them."""
+    """Stamps of the file's rows that have the stamp of the row before (k,), s: they are left out. Where they are more than
+    :data:`FEW_REPEATED` of all, and their samples differ, the file is refused, for two samples at one time have no interval."""
 
     def __post_init__(self) -> None:
         """Check shapes, order and values."""
@@ -232,8 +235,9 @@ def read_csv(
 def _with_gyro(*, source: str, time: Array, rate: Array, **columns: Any) -> Recording:
     """Return a recording of the rows that have a gyro sample and do not repeat the row before; the stamps of the others go along."""
     same = np.diff(time) == 0.0
+    few = np.mean(same) < FEW_REPEATED
     for column in (rate, *columns.values()):
-        if np.shape(column)[:1] != time.shape:
+        if few or np.shape(column)[:1] != time.shape:
             continue  # not there, or not of this length, which is refused below
         rows = np.asarray(column).reshape(len(time), -1).astype(np.float64)
         same &= np.all((rows[1:] == rows[:-1]) | (np.isnan(rows[1:]) & np.isnan(rows[:-1])), axis=1)

@@ -411,3 +411,19 @@ def test_every_unit_has_a_factor():
     assert recordings.RATE_UNITS["deg/s"] == np.pi / 180.0
     assert recordings.FORCE_UNITS["g"] == 9.80665
     assert recordings.TIME_UNITS == {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+
+
+def test_few_repeated_stamps_are_left_out_whatever_their_samples(tmp_path):
+    """Three of 1,000 rows with the stamp of the row before; one of ten is refused."""
+    time = np.arange(1000) * 0.01
+    time[[200, 500, 800]] = time[[199, 499, 799]]
+    values = np.column_stack([time, np.random.default_rng(1).standard_normal((1000, 3))])
+    path = tmp_path / "repeated.csv"
+    np.savetxt(path, values, delimiter=",", header="time,gx [rad/s],gy,gz", comments="")
+    found = read(path)
+    np.testing.assert_allclose(found.repeated, [1.99, 4.99, 7.99])
+    assert len(found.time) == 997
+    np.testing.assert_array_equal(found.rate, np.delete(values[:, 1:], [200, 500, 800], axis=0))
+    np.savetxt(path, values[195:205], delimiter=",", header="time,gx [rad/s],gy,gz", comments="")
+    with pytest.raises(InputError, match="time"):
+        read(path)
