@@ -1,27 +1,20 @@
-"""How much better is the attitude of a unit in the hand for knowing how a hand moves? On BROAD files or simulated.
+"""How good is the attitude of a unit in the hand, and does its σ hold? On BROAD files or simulated, beside other filters.
 
-An accelerometer shows the vertical and whatever the hand does. The same recordings go through one filter with several beliefs of the hand's
-acceleration, one set of numbers for all recordings:
+The same recordings go through ``strapdown estimate``'s filter and smoother (:data:`strapdown.ahrs.HAND_HELD`, and ``any`` motion), VQF 9D,
+offline VQF, imufusion and Madgwick's filter (package ``ahrs``), each with one set of numbers for all; packages that are not installed are
+left out. The error is that of the BROAD benchmark: RMS over the movement, of the whole rotation, the heading and the inclination.
 
-- white, as large and as lasting as makes the filter robust: ``ahrs.MOTIONS["any"]``;
-- the same, which starts from the gyro bias that the quiet second shows, as all further ones do;
-- coloured, first order (:class:`strapdown.error_states.GaussMarkov`), which lasts and so passes for tilt;
-- the derivative of a bounded velocity (:class:`strapdown.error_states.BoundedVelocity`);
-- hand held: that, with scale factors and misalignments of the gyro as states: :data:`strapdown.ahrs.HAND_HELD`, what
-  ``strapdown estimate`` believes if not told otherwise.
+As recorded, the gyro's samples come some milliseconds after the reference (:func:`gyro_latency`, 4.1 ms in BROAD), which no recording shows
+by itself; compensated, every filter's samples are shifted by ``--latency``.
 
-Beside them the smoother of the last, and VQF and offline VQF where the package ``vqf`` is installed.
-
-Samples come after what they show, each sensor's by its own delay. :func:`gyro_latency` finds that of the gyro beside the reference, without
-any filter: about 4.1 ms in each of eleven trials of BROAD. Of a fast body that is degrees, for every filter alike, unless it is told
-(``--latency``). (VQF takes the rate of an interval from the sample at its end, the trapezoid rule from both ends: VQF lags half a sample
-less.) How late the magnetometer is beside the gyro, 11 ms, a recording shows by itself (:func:`strapdown.ahrs.magnetometer_latency`), and
-the beliefs here take it into account; VQF takes the samples as they are.
+- *coverage*: share of the movement in which the 95 % regions of our σ hold the error: of all angles, the heading, the inclination.
+- *NIS*: normalised innovation squared per degree of freedom, accelerometer and magnetometer. Far below 1: their noise is modelled as white
+  at the level that its slow part has, because it is far from white.
+- *left out*: the error on each recording with the numbers (:data:`CANDIDATES`) that are best on all the others.
+- *modified*: recordings with a clipped gyro, dropouts, uneven stamps, no magnetometer, no rest at the start: error, σ and coverage.
 
 Without recordings the unit is simulated: at rest for two seconds, then turned and moved about on smooth paths that are not the filter's own
-model. Told is the RMS error against the reference over the movement, total, heading and inclination, as the BROAD benchmark has it.
-
-Run ``python sims/hand_held.py [--latency MS] [--out FOLDER] [RECORDING...]``, recordings being files of the BROAD data set.
+model. Run ``python sims/hand_held.py [--latency MS] [--out FOLDER] [RECORDING...]``, recordings being files of the BROAD data set.
 """
 
 from __future__ import annotations
@@ -29,6 +22,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+import time as clock
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -36,9 +30,10 @@ from pathlib import Path
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
+from scipy.stats import chi2
 
 from strapdown import ahrs, estimation, plots, quaternion, recordings
-from strapdown.ahrs import HAND_HELD
+from strapdown.ahrs import HAND_HELD, AhrsEstimate, AhrsParameters
 from strapdown.checks import Array, InputError
 from strapdown.consistency import reference_errors
 from strapdown.estimation.error_states import GaussMarkov
@@ -49,23 +44,31 @@ from strapdown.randomness import generator
 from strapdown.recordings import Recording
 from strapdown.units import DEGREE
 
-WHITE = ahrs.MOTIONS["any"]
-QUIET = replace(WHITE, rest_bias_sigma=HAND_HELD.rest_bias_sigma)
+QUIET = replace(ahrs.MOTIONS["any"], rest_bias_sigma=HAND_HELD.rest_bias_sigma)
 BOUNDED = replace(HAND_HELD, gyro_scale_sigma=0.0)
 COLOURED = GaussMarkov(
-    sensor="accelerometer", noise_sigma=2.9, correlation_time=0.1, frame="fixed", unit="m/s²", name="acceleration"
+    sensor="accelerometer", noise_sigma=5.8, correlation_time=0.1, frame="fixed", unit="m/s²", name="acceleration"
 )
 """Acceleration of the same σ and of the same spectrum at high frequency as that of the bounded velocity."""
+CANDIDATES = {
+    "as released": HAND_HELD,
+    "half the velocity": replace(HAND_HELD, velocity_sigma=0.5),
+    "twice the velocity": replace(HAND_HELD, velocity_sigma=2.0),
+    "half the field's noise": replace(HAND_HELD, field_disturbance=0.025),
+    "twice the field's noise": replace(HAND_HELD, field_disturbance=0.1),
+    "half the weight of its deviation": replace(HAND_HELD, field_deviation=0.05),
+    "no deviation of the field": replace(HAND_HELD, field_deviation=1e3),
+}
+"""Sets of numbers that leave-one-out chooses from."""
 PARTS = ("total", "heading", "inclination")
 COLOURS = {
-    "white": style.SKY,
-    "white, bias of the quiet second": style.BLUE,
-    "coloured": style.PURPLE,
-    "bounded velocity": style.VERMILION,
-    "hand held": style.ORANGE,
-    "hand held, smoother": style.YELLOW,
+    "strapdown": style.VERMILION,
+    "strapdown, smoother": style.ORANGE,
+    "strapdown, any motion": style.SKY,
     "VQF": style.GREEN,
-    "offline VQF": "0.5",
+    "offline VQF": style.BLUE,
+    "imufusion": style.PURPLE,
+    "Madgwick": "0.5",
 }
 RATE = 200.0
 """Of the simulated unit, Hz."""
@@ -75,20 +78,39 @@ SMALL = {"runs": 2, "duration": 12.0}
 
 
 @dataclass(frozen=True, kw_only=True)
+class Score:
+    """What one filter made of one recording."""
+
+    errors: tuple[float, ...]
+    """RMS error over the movement: total, heading, inclination, rad."""
+    time: float
+    """Time taken, s a sample."""
+    coverage: tuple[float, ...] | None = None
+    """Share of the movement in which the 95 % regions hold the error: of all angles, heading, inclination."""
+    sigma: float = np.nan
+    """RMS of σ, the root of the trace over the three angles, rad."""
+    nis: tuple[float, ...] = ()
+    """Mean NIS per degree of freedom: accelerometer, magnetometer."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Result:
-    """RMS errors over the movement."""
+    """Scores of all filters."""
 
     recordings: tuple[str, ...]
-    filters: tuple[str, ...]
+    scores: dict[str, dict[str, list[Score]]]
+    """By treatment ("as recorded", "compensated") and filter, one for each recording."""
+    left_out: dict[str, Array]
+    """Total error on each recording by numbers chosen on the others, online and smoothed, rad."""
+    modified: dict[str, list[Score]]
+    """By modification, online, one for each recording."""
     latencies: Array
     """Of the gyro beside the reference (recordings,), s."""
-    errors: Array
-    """(recordings, filters, 3): total, heading, inclination, rad."""
     figures: tuple[Path, ...]
 
-    def mean(self, name: str) -> Array:
-        """Return the mean over the recordings of one filter (3,), rad."""
-        return np.asarray(self.errors[:, self.filters.index(name)].mean(axis=0))
+    def mean(self, name: str, treatment: str = "as recorded") -> Array:
+        """Return the mean errors of one filter over the recordings (3,), rad."""
+        return np.asarray(np.mean([one.errors for one in self.scores[treatment][name]], axis=0))
 
 
 def swelling(t: Array, w: float, phase: Array) -> tuple[Array, Array]:
@@ -135,33 +157,13 @@ def simulated(seed: int, run: int, duration: float) -> Recording:
 
 
 def coloured(recording: Recording, latency: float) -> tuple[Recording, Array]:
-    """Return the recording as the filter takes it, and the attitude by the belief that the acceleration is coloured."""
-    plain = ahrs.estimate(recording, replace(BOUNDED, velocity_sigma=0.0), latency=latency)
+    """Return the recording at the filter's steps, and the attitude there with the acceleration modelled as first-order coloured noise."""
+    plain = ahrs.estimate(recording, replace(BOUNDED, velocity_sigma=0.0, specific_force_noise=0.06), latency=latency)
+    found = estimation.run(plain.record, BOUNDED.setup.process_noise, plain.initial, (COLOURED,))
     used = plain.recording
-    quiet = ahrs.quiet_span(used)
-    found = estimation.run(
-        ahrs.imu_record(used, quiet, BOUNDED), BOUNDED.setup.process_noise, plain.initial, (COLOURED,)
-    )
-    return used, found.attitude
-
-
-def estimates(recording: Recording, latency: float) -> dict[str, tuple[Recording, Array]]:
-    """Return the attitudes of every filter, each beside the part of the recording that it is of."""
-    found = {}
-    for name, parameters in (
-        ("white", WHITE),
-        ("white, bias of the quiet second", QUIET),
-        ("bounded velocity", BOUNDED),
-        ("hand held", HAND_HELD),
-        ("hand held, smoother", HAND_HELD),
-    ):
-        result = ahrs.estimate(recording, parameters, latency=latency, smooth="smoother" in name)
-        found[name] = (result.recording, result.estimate.attitude)
-    found["coloured"] = coloured(recording, latency)
-    begin = int(np.searchsorted(recording.time, found["white"][0].time[0]))
-    used = ahrs.aligned(recording, latency).since(begin)
-    found |= {name: (used, q) for name, q in peers(used).items()}
-    return {name: found[name] for name in COLOURS if name in found}
+    rows = np.searchsorted(used.time, plain.record.time)
+    names = ("time", "rate", "specific_force", "magnetic_field", "true_attitude", "movement")
+    return replace(used, **{name: getattr(used, name)[rows] for name in names}), found.attitude
 
 
 def gyro_latency(recording: Recording) -> tuple[float, float]:
@@ -193,66 +195,257 @@ def gyro_latency(recording: Recording) -> tuple[float, float]:
     return float(found.x), float(found.fun)
 
 
-def peers(used: Recording) -> dict[str, Array]:
-    """Return what VQF makes of a recording whose samples are all there; nothing without the package."""
-    try:
-        import vqf
-    except ImportError:
-        return {}
+def shifted(recording: Recording, latency: float) -> Recording:
+    """Return the recording with all samples moved forward by ``latency``, s, between their neighbours; the last ones are held."""
+    moved = {}
+    for name in ("rate", "specific_force", "magnetic_field"):
+        columns = getattr(recording, name).T
+        moved[name] = np.stack([np.interp(recording.time + latency, recording.time, one) for one in columns], axis=1)
+    return replace(recording, **moved)
+
+
+def modified(recording: Recording, seed: int = 1) -> dict[str, Recording]:
+    """Return the recording as sensors at their limits would have given it."""
+    random = generator(seed, 0, "modified")
+    n = len(recording.time)
+    limit = 0.6 * np.abs(recording.rate[:, 0]).max()
+    clipped = recording.rate.copy()
+    clipped[:, 0] = np.clip(clipped[:, 0], -limit, limit)
+    kept = np.ones(n, bool)
+    for begin in (0.4, 0.55, 0.7):
+        kept[round(begin * n) : round(begin * n) + round(0.3 / np.median(np.diff(recording.time)))] = False
+    moving = np.flatnonzero(recording.movement) if recording.movement is not None else np.arange(n)
+    begin = moving[0] + round(5.0 / np.median(np.diff(recording.time)))
+    return {
+        f"clipped at {limit / DEGREE:.0f} °/s": replace(recording, rate=clipped),
+        "three dropouts of 0.3 s": _rows(recording, kept),
+        "a fifth of the rows lost": _rows(recording, random.random(n) > 0.2),
+        "no magnetometer": replace(recording, magnetic_field=None),
+        "no rest": _rows(recording, np.arange(n)[begin : moving[-1]]),
+    }
+
+
+def _rows(recording: Recording, rows: np.ndarray) -> Recording:
+    names = ("time", "rate", "specific_force", "magnetic_field", "true_attitude", "movement")
+    return replace(
+        recording, **{n: None if getattr(recording, n) is None else getattr(recording, n)[rows] for n in names}
+    )
+
+
+def scored(result: AhrsEstimate, taken: float) -> Score:
+    """Return errors, coverage and NIS of one of our estimates, which has whole covariances."""
+    used, found = result.recording, result.estimate
+    assert used.true_attitude is not None
+    assert found.covariance is not None
+    judged = np.isfinite(used.true_attitude).all(axis=1)
+    if used.movement is not None:
+        judged &= used.movement
+    R = quaternion.to_matrix(found.attitude[judged])
+    reference = quaternion.normalize(used.true_attitude[judged])
+    error = quaternion.log(quaternion.multiply(reference, quaternion.conjugate(found.attitude[judged])))
+    P = R @ found.covariance[judged][:, :3, :3] @ R.transpose(0, 2, 1)  # fixed axes, as the error
+
+    def held(part: slice) -> float:
+        e, own = error[:, part], P[:, part, part]
+        square = np.einsum("ki,ki->k", e, np.linalg.solve(own, e[..., None])[..., 0])
+        return float(np.mean(square <= chi2.ppf(0.95, e.shape[1])))
+
+    errors = reference_errors(found.attitude, used.true_attitude).rms(used.movement)
+    if used.magnetic_field is None:  # of an arbitrary heading only the inclination can be right
+        errors = {**errors, "total": np.nan, "heading": np.nan}
+    return Score(
+        errors=tuple(errors[part] for part in PARTS),
+        time=taken / len(used.time),
+        coverage=(held(slice(0, 3)), held(slice(2, 3)), held(slice(0, 2))),
+        sigma=float(np.sqrt(np.mean(np.trace(P, axis1=1, axis2=2)))),
+        nis=tuple(float(np.mean(one.nis)) / one.innovation.shape[1] for one in found.innovations.values()),
+    )
+
+
+def ours(
+    recording: Recording, latency: float | None, parameters: AhrsParameters = HAND_HELD, smooth: bool = False
+) -> tuple[AhrsEstimate, Score]:
+    """Return our estimate and its score."""
+    begin = clock.perf_counter()
+    result = ahrs.estimate(recording, parameters, latency=latency, smooth=smooth, full_covariance=True)
+    return result, scored(result, clock.perf_counter() - begin)
+
+
+def peers(used: Recording) -> dict[str, tuple[Array, float]]:
+    """Return what the installed ones of other filters make of a recording whose samples are all there, and the time that each took, s."""
     if used.magnetic_field is None or used.specific_force is None:
         return {}
     interval = float(np.median(np.diff(used.time)))
     samples = [np.ascontiguousarray(each) for each in (used.rate, used.specific_force, used.magnetic_field)]
-    return {
-        "VQF": vqf.VQF(interval).updateBatch(*samples)["quat9D"],
-        "offline VQF": vqf.offlineVQF(*samples, interval)["quat9D"],
-    }
+    found: dict[str, tuple[Array, float]] = {}
+
+    def timed(name: str, call: Callable[[], Array]) -> None:
+        begin = clock.perf_counter()
+        found[name] = (call(), clock.perf_counter() - begin)
+
+    try:
+        import vqf
+    except ImportError:
+        pass
+    else:
+        timed("VQF", lambda: vqf.VQF(interval).updateBatch(*samples)["quat9D"])
+        timed("offline VQF", lambda: vqf.offlineVQF(*samples, interval)["quat9D"])
+    try:
+        import imufusion
+    except ImportError:
+        pass
+    else:
+        timed("imufusion", lambda: _imufusion(imufusion, samples, interval))
+    try:
+        from ahrs.filters import Madgwick
+    except ImportError:
+        pass
+    else:
+        # Its x axis points North: a quarter turn from East-North-Up.
+        quarter = quaternion.exp([0.0, 0.0, 0.5 * np.pi])
+        begun = ahrs.start(used, slice(0, round(1.0 / interval)), HAND_HELD).attitude
+        begun = quaternion.multiply(quaternion.conjugate(quarter), begun)
+        timed("Madgwick", lambda: quaternion.multiply(quarter, Madgwick(*samples, Dt=interval, q0=begun).Q))
+    return found
+
+
+def _imufusion(imufusion, samples: Sequence[Array], interval: float) -> Array:  # type: ignore[no-untyped-def]
+    """Run imufusion sample by sample, East-North-Up, with the settings that its documentation gives."""
+    filter_, settings = imufusion.Ahrs(), imufusion.AhrsSettings()
+    settings.convention = imufusion.CONVENTION_ENU
+    settings.gain, settings.gyroscope_range = 0.5, 2000.0
+    settings.acceleration_rejection = settings.magnetic_rejection = 10.0
+    settings.rejection_timeout, settings.sample_rate = 5.0, 1.0 / interval
+    filter_.set_settings(settings)
+    rate, force, field = samples[0] / DEGREE, samples[1] / 9.80665, samples[2]
+    attitude = np.empty((len(rate), 4))
+    for k in range(len(rate)):
+        filter_.update(rate[k], force[k], field[k])
+        attitude[k] = np.ravel(filter_.get_quaternion())
+    return attitude
+
+
+def compared(recording: Recording, latency: float | None) -> tuple[dict[str, Score], list[AhrsEstimate]]:
+    """Return the scores of every filter on a recording, and our estimates; ``latency`` in s, None as recorded."""
+    found, scores = [], {}
+    for name, options in (
+        ("strapdown", {}),
+        ("strapdown, smoother", {"smooth": True}),
+        ("strapdown, any motion", {"parameters": ahrs.MOTIONS["any"]}),
+    ):
+        result, scores[name] = ours(recording, latency, **options)
+        found.append(result)
+    # Others start where ours does.
+    begin = int(np.searchsorted(recording.time, found[0].recording.time[0]))
+    used = (recording if latency is None else shifted(recording, latency)).since(begin)
+    for name, (attitude, taken) in peers(used).items():
+        errors = reference_errors(attitude, used.true_attitude).rms(used.movement)  # type: ignore[arg-type]
+        scores[name] = Score(errors=tuple(errors[part] for part in PARTS), time=taken / len(used.time))
+    return {name: scores[name] for name in COLOURS if name in scores}, found
+
+
+def leave_one_out(read: Sequence[Recording], latency: float, smooth: bool) -> Array:
+    """Return the total error on each recording with the candidate that has the least mean error on the others (recordings,), rad."""
+    errors = np.array([[ours(one, latency, p, smooth)[1].errors[0] for p in CANDIDATES.values()] for one in read])
+    others = errors.sum(axis=0) - errors
+    return np.asarray(errors[np.arange(len(read)), np.argmin(others, axis=1)])
 
 
 def draw(result: Result, path: Path) -> Path:
     """Draw the errors of every recording by filter, and their means, and write the figure."""
+    treatment = list(result.scores)[-1]
+    scores = result.scores[treatment]
     figure, axes = plots.new_figure(1, 2, size=(13.0, 5.6))
     places = np.arange(len(result.recordings) + 1)
     for axis, part in zip(axes, (2, 0), strict=True):
-        values = result.errors[:, :, part] / DEGREE
-        for k, name in enumerate(result.filters):
-            shift = 0.1 * (k - 0.5 * (len(result.filters) - 1))
-            each = np.append(values[:, k], values[:, k].mean())
-            marker = "D" if "VQF" in name else "o"
-            axis.plot(places + shift, each, marker, markersize=5.0, color=COLOURS[name], label=name)
-        axis.set(yscale="log", ylabel="RMS error over the movement, °", title=PARTS[part].capitalize())
-        ticks = [
-            t
-            for t in (0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 3.0, 5.0, 10.0, 20.0)
-            if values.min() / 1.5 < t < 1.5 * values.max()
-        ]
-        axis.set_yticks(ticks, [f"{t:g}" for t in ticks])
-        axis.set_yticks([], minor=True)
-        axis.set_xticks(places, [*_heads(result), "mean"])
+        for k, (name, each) in enumerate(scores.items()):
+            values = np.array([one.errors[part] for one in each]) / DEGREE
+            shift = 0.1 * (k - 0.5 * (len(scores) - 1))
+            marker = "o" if name.startswith("strapdown") else "D"
+            axis.plot(
+                places + shift,
+                np.append(values, values.mean()),
+                marker,
+                markersize=5.0,
+                color=COLOURS[name],
+                label=name,
+            )
+        axis.set(
+            yscale="log", ylabel="RMS error over the movement, °", title=f"{PARTS[part].capitalize()}, {treatment}"
+        )
+        axis.set_xticks(places, [*_heads(result.recordings), "mean"])
         axis.set_xlabel("recording")
         axis.axvspan(places[-1] - 0.5, places[-1] + 0.5, color="0.93", zorder=0)
-        for place in places[:-2]:
-            axis.axvline(place + 0.5, color="0.85", linewidth=0.6, zorder=0)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
     return plots.save(figure, path)
 
 
-def _heads(result: Result) -> list[str]:
+def draw_worst(found: Sequence[AhrsEstimate], path: Path) -> Path:
+    """Draw heading error and inclination error over time inside ±2σ of the recordings given, and write the figure."""
+    figure, axes = plots.new_figure(2, len(found), size=(6.5 * len(found), 6.0))
+    for column, result in zip(np.reshape(axes, (2, len(found))).T, found, strict=True):
+        used, estimate = result.recording, result.estimate
+        assert used.true_attitude is not None
+        assert estimate.covariance is not None
+        R = quaternion.to_matrix(estimate.attitude)
+        P = R @ estimate.covariance[:, :3, :3] @ R.transpose(0, 2, 1)
+        errors = reference_errors(estimate.attitude, used.true_attitude)
+        sigma = {"heading": np.sqrt(P[:, 2, 2]), "inclination": np.sqrt(P[:, 0, 0] + P[:, 1, 1])}
+        for axis, part in zip(column, sigma, strict=True):
+            axis.fill_between(used.time, 0.0, 2.0 * sigma[part] / DEGREE, color="0.88", label="2σ")
+            axis.plot(used.time, getattr(errors, part) / DEGREE, linewidth=0.7, color=style.VERMILION, label="error")
+            axis.set(ylabel=f"{part} error, °", xlabel="time, s", title=used.source)
+        column[0].legend(frameon=False)
+    return plots.save(figure, path)
+
+
+def _plain(score: Score) -> dict[str, object]:
+    """Return a score for JSON, which has no NaN: the error of an arbitrary heading is null."""
+    plain = asdict(score)
+    plain["errors"] = [None if np.isnan(one) else one for one in score.errors]
+    return {**plain, "sigma": None if np.isnan(score.sigma) else score.sigma}
+
+
+def _heads(names: Sequence[str]) -> list[str]:
     """Return short names: the number of a trial of BROAD, or of a simulated recording."""
-    return [name[:2] if name[:2].isdigit() else name.split()[-1][:8] for name in result.recordings]
+    return [name[:2] if name[:2].isdigit() else name.split()[-1][:8] for name in names]
 
 
 def table(result: Result) -> str:
-    """Return the figures as text: total and inclination by recording, and the means."""
-    width = max(len(name) for name in result.filters)
-    lines = [f"{'RMS error, °':{width}s}  {' '.join(f'{head:>6s}' for head in _heads(result))} {'mean':>7s}"]
-    for part in (0, 1, 2):
-        lines.append(f"{PARTS[part]}:")
-        for k, name in enumerate(result.filters):
-            each = result.errors[:, k, part] / DEGREE
-            lines.append(f"{name:{width}s}  {' '.join(f'{value:6.2f}' for value in each)} {each.mean():7.2f}")
+    """Return the figures as text."""
+    width = 2 + max(len(name) for name in (*COLOURS, *result.modified))
+    lines = []
+    for treatment, scores in result.scores.items():
+        lines.append(f"RMS error over the movement, °, {treatment}".upper())
+        lines.append(
+            f"{'':{width}s}{'total':>7s}{'head.':>7s}{'incl.':>7s}{'worst':>7s}{'us':>7s}   coverage total/head./incl. (worst)  NIS acc/mag"
+        )
+        for name, each in scores.items():
+            mean = np.mean([one.errors for one in each], axis=0) / DEGREE
+            worst, time = max(one.errors[0] for one in each) / DEGREE, 1e6 * np.median([one.time for one in each])
+            line = f"{name:{width}s}{mean[0]:7.2f}{mean[1]:7.2f}{mean[2]:7.2f}{worst:7.2f}{time:7.2f}"
+            if each[0].coverage is not None:
+                cover = np.array([one.coverage for one in each])
+                nis = np.exp(np.mean([np.log(one.nis) for one in each], axis=0))
+                line += f"   {'/'.join(f'{c:.2f}' for c in cover.mean(axis=0))} ({cover[:, 0].min():.2f})"
+                line += f"{'':18s}{'/'.join(f'{one:.2g}' for one in nis)}"
+            lines.append(line)
+        lines += ["", f"{'Total':{width}s}" + "".join(f"{head:>7s}" for head in _heads(result.recordings))]
+        for name, each in scores.items():
+            lines.append(f"{name:{width}s}" + "".join(f"{one.errors[0] / DEGREE:7.2f}" for one in each))
+        lines.append("")
+    for name, errors in result.left_out.items():
+        each = "".join(f"{one / DEGREE:7.2f}" for one in errors)
+        lines.append(f"{f'left out, {name}':{width}s}{each}   mean {errors.mean() / DEGREE:.2f}")
+    lines += ["", f"{'MODIFIED, ONLINE':{width}s}{'total':>7s}{'incl.':>7s}{'sigma':>7s}   coverage total/head./incl."]
+    for name, each in result.modified.items():
+        mean = np.sqrt(np.mean(np.square([one.errors for one in each]), axis=0)) / DEGREE
+        sigma, cover = np.sqrt(np.mean([one.sigma**2 for one in each])), np.mean([one.coverage for one in each], axis=0)
+        lines.append(
+            f"{name:{width}s}{mean[0]:7.2f}{mean[2]:7.2f}{sigma / DEGREE:7.2f}   {'/'.join(f'{c:.2f}' for c in cover)}"
+        )
     late = 1e3 * result.latencies
-    lines.append(f"{'latency of the gyro, ms':{width}s}  {' '.join(f'{one:6.2f}' for one in late)} {late.mean():7.2f}")
+    lines += ["", f"{'gyro delay, ms':{width}s}{''.join(f'{one:7.2f}' for one in late)}   mean {late.mean():.2f}"]
     return "\n".join(lines)
 
 
@@ -262,49 +455,64 @@ def main(
     runs: int = 12,
     duration: float = 60.0,
     seed: int = 1,
-    latency: float = 0.0,
+    latency: float = 4.1,
     out: str | os.PathLike[str] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Result:
-    """Compare the beliefs on recordings with a reference, or on ``runs`` simulated ones of ``duration`` s; ``latency`` in ms.
+    """Compare the filters on recordings with a reference, or on ``runs`` simulated ones of ``duration`` s.
 
-    Figure, table and JSON are written to ``out`` if it is given; ``progress`` is told what is done.
+    ``latency`` in ms is what *compensated* makes good; that of simulated recordings is 0. Table, JSON and figures are written to ``out`` if
+    it is given; ``progress`` is called with a line for each recording.
     """
-    sources = len(files) or runs
-    names, errors, latencies, filters = [], [], [], ()
-    for k in range(sources):
-        recording = recordings.read(files[k]) if files else simulated(seed, k, duration)
-        if recording.true_attitude is None:
-            raise InputError(f"{recording.source} has no reference attitude to compare with; give BROAD files")
-        found = estimates(recording, 1e-3 * latency)
-        latencies.append(gyro_latency(recording)[0])
-        names.append(Path(recording.source).stem)
-        filters = tuple(found)
-        rows = [reference_errors(q, used.true_attitude).rms(used.movement) for used, q in found.values()]  # type: ignore[arg-type]
-        errors.append([[row[part] for part in PARTS] for row in rows])
+    read = [recordings.read(file) for file in files] or [simulated(seed, k, duration) for k in range(runs)]
+    for one in read:
+        if one.true_attitude is None:
+            raise InputError(f"{one.source} has no reference attitude to compare with; give BROAD files")
+    late = 1e-3 * latency if files else 0.0
+    scores: dict[str, dict[str, list[Score]]] = {"as recorded": {}, "compensated": {}}
+    changed: dict[str, list[Score]] = {}
+    online: list[AhrsEstimate] = []
+    for k, one in enumerate(read):
+        for treatment, each in scores.items():
+            found, estimates = compared(one, None if treatment == "as recorded" else late)
+            for name, score in found.items():
+                each.setdefault(name, []).append(score)
+        online.append(estimates[0])
+        for name, other in modified(one).items():
+            changed.setdefault(name.split(" at ")[0], []).append(ours(other, late)[1])
         if progress is not None:
-            progress(f"{k + 1} of {sources}: {recording.source}")
+            progress(f"{k + 1} of {len(read)}: {one.source}")
     result = Result(
-        recordings=tuple(names), filters=filters, latencies=np.array(latencies), errors=np.array(errors), figures=()
+        recordings=tuple(Path(one.source).stem for one in read),
+        scores=scores,
+        left_out={name: leave_one_out(read, late, name == "smoothed") for name in ("online", "smoothed")},
+        modified=changed,
+        latencies=np.array([gyro_latency(one)[0] for one in read]),
+        figures=(),
     )
     if out is None:
         return result
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
-    result = replace(result, figures=(draw(result, folder / "hand_held.png"),))
+    worst = np.argsort([-one.errors[0] for one in scores["compensated"]["strapdown"]])[:2]
+    figures = (
+        draw(result, folder / "hand_held.png"),
+        draw_worst([online[k] for k in worst], folder / "hand_held_worst.png"),
+    )
     (folder / "hand_held.txt").write_text(table(result) + "\n", encoding="utf-8")
-    told = {
+    content = {
         "recordings": list(result.recordings),
         "parameters": asdict(HAND_HELD),
-        "latency_ms": latency,
+        "latency_ms": 1e3 * late,
         "gyro_latency_ms": (1e3 * result.latencies).tolist(),
-        "rms_error_deg": {
-            name: {part: (result.errors[:, k, p] / DEGREE).tolist() for p, part in enumerate(PARTS)}
-            for k, name in enumerate(result.filters)
+        "scores": {
+            treatment: {name: [_plain(one) for one in each] for name, each in some.items()}
+            for treatment, some in {**scores, "modified": changed}.items()
         },
+        "left_out_total_rad": {name: errors.tolist() for name, errors in result.left_out.items()},
     }
-    write_json(folder / "hand_held.json", told)
-    return result
+    write_json(folder / "hand_held.json", content)
+    return replace(result, figures=figures)
 
 
 if __name__ == "__main__":
@@ -313,6 +521,6 @@ if __name__ == "__main__":
     parser.add_argument("--runs", type=int, default=12, help="simulated recordings")
     parser.add_argument("--duration", type=float, default=60.0, help="of a simulated recording, s")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--latency", type=float, default=0.0, help="of the gyro and the accelerometer, ms")
+    parser.add_argument("--latency", type=float, default=4.1, help="of the gyro and the accelerometer, ms")
     parser.add_argument("--out", type=Path, default=Path("results/hand_held"))
     print(table(main(**vars(parser.parse_args()), progress=lambda line: print(line, file=sys.stderr))))

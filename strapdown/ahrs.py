@@ -1,22 +1,34 @@
 """Attitude and heading from a recording: accelerometer as the vertical, magnetometer as the heading only, one filter for both.
 
-The fixed frame is East-North-Up with magnetic North. This module says what the filter's measurements are, where it starts and what it
-believes (:data:`MOTIONS`); the filter is that of :mod:`strapdown.setup`.
+The fixed frame is East-North-Up with magnetic North. This module models the sensors (:class:`AhrsParameters`, :data:`MOTIONS`),
+averages their samples over filter steps, starts the filter (:mod:`strapdown.estimation`) and carries its estimate to every stamp.
+
+The disturbances of both vectors last much longer than a sample, so little is lost by updating less often than the sensors sample: the
+samples of a step are turned by the gyro into one frame and averaged there. What disturbs the heading, iron in the unit and in the
+surroundings, shows in the strength and the dip of the field too. The heading's noise follows their deviation, and is the larger the
+steeper the field.
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
-from strapdown import coning, estimation, quaternion, setup, wahba
+from strapdown import coning, estimation, quaternion, sensor_delays, sensor_faults, unit_calibration, wahba
 from strapdown.checks import Array, InputError, non_negative, positive
+from strapdown.estimation.gating import Gate, Robust
+from strapdown.kernels import recording_steps
+from strapdown.kernels.machine import compiled
 from strapdown.recordings import Recording, increments
-from strapdown.records import Estimate, ImuRecord
+from strapdown.records import ErrorStateEstimate, Estimate, ImuRecord, Innovations, cut
+from strapdown.sensor_delays import Delays
+from strapdown.sensor_faults import Faults
 from strapdown.setup import FilterSetup
 from strapdown.setup.states import SensorStates, States
+from strapdown.unit_calibration import UnitCalibration
 from strapdown.units import DEGREE
 from strapdown.vectors import VectorMeasurements
 
@@ -24,67 +36,63 @@ UP = np.array([0.0, 0.0, 1.0])
 NORTH = np.array([0.0, 1.0, 0.0])
 QUIET_SPAN = 1.0
 """Length of the quiet span that the filter starts from, s."""
-FIELD_SPAN = 0.2
-"""Over which the field, turned back by the gyro, must stand still for the magnetometer's latency, s."""
-MOST_LATENCY_SIGMA = 2e-3
-"""A latency of the magnetometer that is known no better is not used, s."""
-MOST_LATENCY = 0.05
-"""Nor is one beyond this, which is another error than a latency, s."""
+VERTICAL_TIME = 1.0
+"""Time constant of the low-pass that gives the vertical beside which the field's dip is judged, s."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class AhrsParameters:
-    """What the filter believes of the unit. The defaults are one set for consumer and industrial MEMS units on whatever moves.
+    """The filter's model of a unit and of what moves it. The defaults hold for consumer and industrial MEMS units under any motion.
 
-    The noises are those of *independent* samples at ``reference_rate``, and are spread so that the weight a second does not depend on the
-    recording's rate. They are much larger than the sensors' own noise, because what disturbs them, acceleration and iron, lasts over
-    many samples. With ``velocity_sigma`` the acceleration has states (:class:`strapdown.error_states.BoundedVelocity`), and
-    ``specific_force_sigma`` is what is left beside it; :data:`HAND_HELD` is such a set.
+    Noises of the vectors are densities: σ of a mean over one second, whatever the recording's rate. They are much larger than the sensors'
+    own noise, because what disturbs them lasts over many samples. With ``velocity_sigma`` the acceleration has states
+    (:class:`strapdown.error_states.BoundedVelocity`), and ``specific_force_noise`` is what is left beside it.
     """
 
     angle_random_walk: float = 3e-3
     """σ_v, rad/√s; scale-factor and alignment errors of a moving unit included."""
     rate_random_walk: float = 1e-5
     """σ_u, rad/s/√s."""
-    specific_force_sigma: float = 10.0
-    """Acceleration that has no states, each component, m/s²."""
-    heading_sigma: float = 5.0
-    """Disturbance of the magnetic heading, rad."""
-    field_strength_weight: float = 10.0
-    """Heading σ added, in rad, for each unit of relative deviation of the field's strength from that at the start."""
-    reference_rate: float = 285.0
-    """Rate that the two noises above are told for, Hz."""
+    specific_force_noise: float = 0.6
+    """Acceleration without states, each component, m/s²/√Hz."""
+    field_disturbance: float = 0.05
+    """Disturbance of a field that is as strong and as steep as at the start, across it, share of its strength/√Hz over its level part's:
+    the heading's noise density is this over the cosine of the dip."""
+    field_deviation: float = 0.025
+    """Deviation of the field's strength (share) and dip (rad), as a root sum of squares, that doubles the variance of that noise."""
+    field_memory: float = 0.5
+    """Time constant over which that deviation is averaged, s: a disturbance does not end where the field happens to look right."""
+    iron_sigma: float = 0.02
+    """Constant disturbance of the field that nothing shows, share of its strength: part of the σ reported, and not estimated."""
+    step: float = 0.03
+    """Interval of the filter's steps, s."""
+    heading_interval: float = 0.15
+    """Interval of the heading measurements, s."""
     attitude_sigma: float = 3.0 * DEGREE
     """Error of the attitude at the start, each axis, rad."""
     bias_sigma: float = 0.5 * DEGREE
     """Gyro bias at the start, each axis, rad/s."""
     rest_bias_sigma: float = 0.0
-    """How well the mean rate of the quiet second at the start tells the bias where the unit rests, each axis, rad/s; 0: it is not asked."""
+    """Error of the mean rate of the quiet second as an estimate of the bias, each axis, rad/s; 0: the bias starts at zero."""
     velocity_sigma: float = 0.0
-    """Velocity of the hand, each component, m/s; 0: no states, all its acceleration is white."""
+    """Velocity of the unit, each component, m/s; 0: no states, all its acceleration is white."""
     velocity_time: float = 0.3
-    """How long a velocity of the hand lasts, s."""
+    """Correlation time of that velocity, s."""
     acceleration_time: float = 0.1
-    """How long a push of the hand lasts, s."""
+    """Correlation time of the acceleration, s."""
     gyro_scale_sigma: float = 0.0
     """Each of the gyro's scale factors (1) and misalignments (rad); 0: no states."""
 
     def __post_init__(self) -> None:
         """Check every field."""
-        may_be_zero = (
-            "field_strength_weight",
-            "rate_random_walk",
-            "rest_bias_sigma",
-            "velocity_sigma",
-            "gyro_scale_sigma",
-        )
+        may_be_zero = ("iron_sigma", "rate_random_walk", "rest_bias_sigma", "velocity_sigma", "gyro_scale_sigma")
         for name in self.__dataclass_fields__:
             check = non_negative if name in may_be_zero else positive
             check(name, getattr(self, name))
 
     @property
     def setup(self) -> FilterSetup:
-        """The filter of these beliefs."""
+        """The filter of this model."""
         sensors = {}
         if self.velocity_sigma > 0.0:
             sensors["accelerometer"] = SensorStates(
@@ -108,89 +116,14 @@ class AhrsParameters:
 
 
 HAND_HELD = AhrsParameters(
-    specific_force_sigma=1.0,
+    specific_force_noise=0.06,
     rest_bias_sigma=0.05 * DEGREE,
-    velocity_sigma=0.5,
+    velocity_sigma=1.0,
     gyro_scale_sigma=2e-3,
 )
 """A unit in the hand: its velocity is bounded, and of its gyro, whose turns are large, scale factors and misalignments are states."""
 MOTIONS = {"hand": HAND_HELD, "any": AhrsParameters()}
-"""What may move a unit, and what the filter then believes."""
-
-
-def aligned(recording: Recording, latency: float = 0.0, magnetometer: float = 0.0) -> Recording:
-    """Return a recording whose samples show what was at their time stamps.
-
-    They come ``latency``, s, after what they show, those of the magnetometer ``magnetometer`` more. A sensor's low-pass delays what it
-    shows by its group delay, and the sensors of one unit differ in it: a magnetometer 11 ms behind the gyro is 6° off at 500 °/s. Samples
-    are taken between their neighbours; the last ones are held.
-    """
-    non_negative("latency", latency, unit="s")
-    length = recording.time[-1] - recording.time[0]
-    moved: dict[str, Any] = {}
-    for name in ("rate", "specific_force", "magnetic_field"):
-        samples, late = getattr(recording, name), latency + (magnetometer if name == "magnetic_field" else 0.0)
-        if abs(late) >= length:
-            raise InputError(f"latency is {late:g} s, and {recording.source} lasts {length:.3g} s")
-        if late != 0.0 and samples is not None:
-            if (
-                name == "magnetic_field"
-            ):  # a field of zero is a missing sample, and nothing lies between it and the next
-                samples = np.where(np.any(samples != 0.0, axis=1, keepdims=True), samples, np.nan)
-            moved[name] = _moved(recording.time, samples, late)
-    return replace(recording, **moved)
-
-
-def _moved(time: Array, samples: Array, late: float) -> Array:
-    """Return samples as they were ``late``, s, before their stamps; nothing is taken across a gap.
-
-    Of a slower sensor, which has samples at fewer than half of the stamps, the rows between them stay missing.
-    """
-    known = np.flatnonzero(np.isfinite(samples).all(axis=1))
-    if 2 * len(known) >= len(time):
-        return np.stack([np.interp(time + late, time, one) for one in samples.T], axis=1)
-    result = np.full(samples.shape, np.nan)
-    if len(known) < 2:
-        return result
-    stamps = time[known]
-    wanted = stamps + late
-    result[known] = np.stack([np.interp(wanted, stamps, one) for one in samples[known].T], axis=1)
-    steps = np.diff(stamps)
-    place = np.clip(np.searchsorted(stamps, wanted), 1, len(steps)) - 1
-    across = (steps[place] > 1.5 * np.median(steps)) & (wanted > stamps[place]) & (wanted < stamps[place + 1])
-    result[known[across]] = np.nan
-    return result
-
-
-def magnetometer_latency(recording: Recording) -> tuple[float, float]:
-    """Return how long after the gyro's the magnetometer's samples come, s, and the σ of that; (0, ∞) where nothing shows it.
-
-    Turned back by the gyro alone, the field m stands still over a fraction of a second. Samples that are late by τ are off by ``−τ ṁ``,
-    ``ṁ = −w × m``, and how that changes over :data:`FIELD_SPAN` is what is fitted, least squares without the farthest. A field that
-    turns with the body (hard iron) is in quadrature to it in a swing: it does not pass for latency, but a strong one hides some.
-    """
-    nothing = (0.0, np.inf)
-    lag = int(np.searchsorted(recording.time, recording.time[0] + FIELD_SPAN))
-    if recording.magnetic_field is None or len(recording.time) < 10 * lag:
-        return nothing
-    attitude = coning.integrate(increments(recording), coning.ALGORITHMS["one-sample"])
-    field = np.nan_to_num(recording.magnetic_field)
-    known = np.asarray(np.isfinite(recording.magnetic_field).all(axis=1))
-    still = quaternion.rotate(attitude, field)
-    late = quaternion.rotate(attitude, np.cross(recording.rate, field))
-    pairs = known[lag:] & known[:-lag]
-    change, wanted = (still[lag:] - still[:-lag])[pairs], (late[lag:] - late[:-lag])[pairs]
-    kept = np.full(len(change), True)
-    for _ in range(6):
-        information = float(np.sum(wanted[kept] ** 2))
-        if information == 0.0:
-            return nothing
-        latency = float(np.sum(change[kept] * wanted[kept])) / information
-        left = np.linalg.norm(change - latency * wanted, axis=1)
-        middle = float(np.median(left))
-        kept = left <= 2.5 * middle
-    # Of a normal residual with three components the median length is 1.54 σ; pairs that overlap are not independent.
-    return latency, middle / 1.54 * float(np.sqrt(lag / information))
+"""The model by what moves the unit."""
 
 
 def quiet_span(recording: Recording) -> slice:
@@ -205,8 +138,7 @@ def quiet_span(recording: Recording) -> slice:
     lasts = recording.time[-1] - recording.time[0]
     if length >= len(recording.time):
         raise InputError(
-            f"{recording.source} lasts {lasts:.3g} s; the start needs at least {QUIET_SPAN:g} s of samples (or tell the unit "
-            "of its time)"
+            f"{recording.source} lasts {lasts:.3g} s; the start needs at least {QUIET_SPAN:g} s of samples (or give the unit of its time)"
         )
     if length < 2:
         raise InputError(
@@ -221,61 +153,171 @@ def quiet_span(recording: Recording) -> slice:
     return slice(first * length, (first + 1) * length)
 
 
-def imu_record(recording: Recording, quiet: slice, parameters: AhrsParameters) -> ImuRecord:
-    """Return what the filter takes: increments by the trapezoid rule, specific force and heading with their noise.
+class Prepared(NamedTuple):
+    """A recording as the filter takes it."""
 
-    The strengths of gravity and of the field are those of the samples ``quiet``.
+    record: ImuRecord
+    """Increments and vectors at the filter's steps."""
+    initial: estimation.State
+    edge: np.ndarray
+    """Sample at which each step ends, the first at the start (k + 1,)."""
+    turned: Array
+    """Attitude by the gyro alone at every sample, from the identity at the first one (n, 4)."""
+    dip: float | None
+    """Angle of the field below the level at the start, rad; None without a magnetometer."""
+
+
+def prepare(
+    recording: Recording, quiet: slice, parameters: AhrsParameters, field_delay: Array | float = 0.0
+) -> Prepared:
+    """Return the record that the filter runs on, and its start.
+
+    Parameters
+    ----------
+    recording : Recording
+        From its first quiet second on.
+    quiet : slice
+        The samples of that second, over which gravity and the field are those of the start.
+    parameters : AhrsParameters
+    field_delay : float or array_like, (n,)
+        Delay of the magnetometer's samples beside the gyro's, s: each is turned forward by the gyro.
     """
-    spread = np.sqrt(1.0 / (np.median(np.diff(recording.time)) * parameters.reference_rate))
+    initial = start(recording, quiet, parameters)  # first, for it refuses a sensor without samples
+    turned = coning.integrate(increments(recording), coning.ALGORITHMS["one-sample"])
+    edge = _edges(recording.time, parameters.step)
+    time = recording.time[edge]
+    at_edge = turned[edge]
+    interval = float(np.median(np.diff(recording.time)))
     assert recording.specific_force is not None
-    gravity = _norm(_mean(recording.specific_force[quiet], recording.source, "accelerometer"))
+    force, number = _averages(recording.specific_force, turned, edge)
+    gravity = _norm(_mean_at_first(recording, recording.specific_force, quiet, "accelerometer")[0])
     vectors = [
         VectorMeasurements(
             sensor="accelerometer",
             kind="vector",
-            time=recording.time,
-            vector_b=recording.specific_force,
+            time=time[1:][number > 0],
+            vector_b=quaternion.rotate(quaternion.conjugate(at_edge[1:]), force)[number > 0],
             reference_f=gravity * UP,
-            sigma=np.full(len(recording.time), parameters.specific_force_sigma * spread),
+            sigma=parameters.specific_force_noise / np.sqrt(number[number > 0] * interval),
         )
     ]
+    dip = None
     if recording.magnetic_field is not None:
-        strength = np.linalg.norm(recording.magnetic_field, axis=1, keepdims=True)
-        strength[strength == 0.0] = np.nan  # a field of zero is no field: a missing sample
-        _mean(recording.magnetic_field[quiet], recording.source, "magnetometer")
-        deviation = np.nan_to_num(strength[:, 0] / np.nanmean(strength[quiet]) - 1.0)
-        vectors.append(
-            VectorMeasurements(
-                sensor="magnetometer",
-                kind="heading",
-                time=recording.time,
-                vector_b=recording.magnetic_field / strength,
-                reference_f=NORTH,
-                sigma=np.hypot(parameters.heading_sigma, parameters.field_strength_weight * deviation) * spread,
-            )
-        )
-    return ImuRecord(time=recording.time, increments=increments(recording), vectors=tuple(vectors))
+        back = quaternion.exp(-sensor_delays.turn_over(recording, field_delay)) if np.any(field_delay) else None
+        frame = turned if back is None else quaternion.multiply(turned, back)
+        field, number = _averages(recording.magnetic_field, frame, edge)
+        heading, dip = _headings(field, number * interval, force, at_edge, time, quiet.stop <= edge[1:], parameters)
+        vectors.append(heading)
+    turn = quaternion.log(quaternion.multiply(quaternion.conjugate(at_edge[:-1]), at_edge[1:]))
+    record = ImuRecord(time=time, increments=turn, vectors=tuple(vectors))
+    return Prepared(record, initial, edge, turned, dip)
+
+
+def _edges(time: Array, step: float) -> np.ndarray:
+    """Return the samples at which steps end (k + 1,): the first, the last before each multiple of ``step``, s, and the last of all."""
+    bins = np.floor((time - time[0]) / step + 1e-6)
+    return np.unique(np.concatenate([[0], np.flatnonzero(np.diff(bins)), [len(time) - 1]]))
+
+
+def _averages(samples: Array, frame: Array, edge: Array) -> tuple[Array, Array]:
+    """Return the mean of each step's samples in the axes that ``frame`` (n, 4) turns them to (k, 3), and their number; 0 where none."""
+    total, number = np.empty((len(edge) - 1, 3)), np.empty(len(edge) - 1)
+    compiled(recording_steps.average_samples)(samples, frame, edge, total, number)
+    return total / np.maximum(number, 1.0)[:, None], number
+
+
+def _headings(
+    field: Array,
+    length: Array,
+    force: Array,
+    at_edge: Array,
+    time: Array,
+    later: np.ndarray,
+    parameters: AhrsParameters,
+) -> tuple[VectorMeasurements, float]:
+    """Return the heading measurements from a field and specific force averaged in one frame (k, 3), and the dip at the start.
+
+    ``length`` (k,) is the time that the field's samples of each step stand for, s, and ``later`` are the steps after the quiet second.
+    """
+    known = length > 0.0
+    strength = np.linalg.norm(field, axis=1)
+    strength[~known] = 1.0
+    interval = float(np.median(np.diff(time)))
+    vertical = _low_pass(
+        _low_pass(_held(force, np.asarray(force.any(axis=1))), interval / VERTICAL_TIME), interval / VERTICAL_TIME
+    )
+    vertical /= np.linalg.norm(vertical, axis=1, keepdims=True)
+    dip = np.arcsin(np.clip(-np.sum(field * vertical, axis=1) / strength, -1.0, 1.0))
+    first = known & ~later if np.any(known & ~later) else known
+    dip_0, strength_0 = float(np.mean(dip[first])), float(np.mean(strength[first]))
+    deviation = _held(((strength / strength_0 - 1.0) ** 2 + (dip - dip_0) ** 2)[:, None], known)
+    deviation = _low_pass(deviation, interval / parameters.field_memory)[:, 0]
+    noise = (parameters.field_disturbance / np.cos(dip_0)) ** 2 * (1.0 + deviation / parameters.field_deviation**2)
+    # Steps are gathered over the heading interval, each with its own weight.
+    information = length / noise
+    edge = np.flatnonzero(np.diff(np.floor((time[1:] - time[0]) / parameters.heading_interval - 1e-6), append=np.inf))
+    begin = np.append(0, edge[:-1] + 1)
+    total = np.add.reduceat(
+        np.where(known[:, None], field / strength[:, None], 0.0) * information[:, None], begin, axis=0
+    )
+    information = np.add.reduceat(information, begin)
+    seen = information > 0.0
+    total[seen] /= np.linalg.norm(total[seen], axis=1, keepdims=True)
+    return VectorMeasurements(
+        sensor="magnetometer",
+        kind="heading",
+        time=time[1:][edge][seen],
+        vector_b=quaternion.rotate(quaternion.conjugate(at_edge[1:][edge][seen]), total[seen]),
+        reference_f=NORTH,
+        sigma=1.0 / np.sqrt(information[seen]),
+    ), dip_0
+
+
+def _held(values: Array, known: np.ndarray) -> Array:
+    """Return rows (k, …) with each that is not known replaced by the last before it that is, or the first of all."""
+    last = np.maximum.accumulate(np.where(known, np.arange(len(values)), -1))
+    return np.asarray(values[np.where(last < 0, int(np.argmax(known)), last)])
+
+
+def _low_pass(values: Array, step: float) -> Array:
+    """Return rows (k, m) after a first-order low-pass from the first one on, ``step`` being the interval over the time constant; causal."""
+    result = np.empty_like(values)
+    compiled(recording_steps.low_pass)(values, -np.expm1(-step), result)
+    return result
 
 
 def start(recording: Recording, quiet: slice, parameters: AhrsParameters) -> estimation.State:
-    """Return the state at the quiet samples: attitude by TRIAD from the mean vertical and field; any North without a magnetometer.
+    """Return the state at the first of the quiet samples: attitude by TRIAD from the mean vertical and field, any North without a field.
 
-    With ``rest_bias_sigma`` the bias is that of :func:`resting_bias`.
+    The means are taken in the frame that the gyro keeps over those samples, and σ grows with the acceleration that is left there. With
+    ``rest_bias_sigma`` the bias is that of :func:`resting_bias`.
     """
     assert recording.specific_force is not None
-    up = _mean(recording.specific_force[quiet], recording.source, "accelerometer")
-    sigma = np.full(3, parameters.attitude_sigma)
+    force, spread = _mean_at_first(recording, recording.specific_force, quiet, "accelerometer")
     if recording.magnetic_field is None:
         # Any horizontal direction will do for a heading that nothing measures.
-        across = np.eye(3)[np.argmin(np.abs(up))]
-        attitude = wahba.from_vertical_and_heading(up, across)
+        across = np.eye(3)[np.argmin(np.abs(force))]
     else:
-        field = _mean(recording.magnetic_field[quiet], recording.source, "magnetometer")
-        attitude = wahba.from_vertical_and_heading(up, field)
+        across, _ = _mean_at_first(recording, recording.magnetic_field, quiet, "magnetometer")
     bias, bias_sigma = np.zeros(3), parameters.bias_sigma
     if parameters.rest_bias_sigma > 0.0:
         bias, bias_sigma = resting_bias(recording, quiet, parameters)
-    return estimation.initial_state(attitude, bias=bias, attitude_sigma=sigma, bias_sigma=bias_sigma)
+    return estimation.initial_state(
+        wahba.from_vertical_and_heading(force, across),
+        bias=bias,
+        attitude_sigma=float(np.hypot(parameters.attitude_sigma, spread / _norm(force))),
+        bias_sigma=bias_sigma,
+    )
+
+
+def _mean_at_first(recording: Recording, samples: Array, quiet: slice, sensor: str) -> tuple[Array, float]:
+    """Return the mean of the quiet samples in the body axes of their first (3,), and how far they spread about it."""
+    turn = 0.5 * (recording.rate[quiet][1:] + recording.rate[quiet][:-1]) * np.diff(recording.time[quiet])[:, None]
+    own = samples[quiet]
+    known = np.isfinite(own).all(axis=1)
+    still = quaternion.rotate(coning.integrate(turn)[known], own[known])
+    mean = _mean(still, recording.source, sensor)
+    return mean, _norm(still.std(axis=0))
 
 
 def resting_bias(recording: Recording, quiet: slice, parameters: AhrsParameters) -> tuple[Array, float]:
@@ -312,19 +354,29 @@ class AhrsEstimate:
     """An estimate beside the samples that it was made from, one row for one row."""
 
     recording: Recording
-    """The recording from its first quiet second on, its samples as the filter takes them."""
+    """The recording from its first quiet second on, clipped gyro samples restored."""
     estimate: Estimate
+    """At the stamps of the recording; the covariance includes timing and constant iron, which the filter does not estimate."""
+    record: ImuRecord
+    """What the filter ran on: increments and vectors averaged over its steps."""
     initial: estimation.State
     """Where the filter started."""
-    magnetometer_latency: float = 0.0
-    """How much later than the gyro's the magnetometer's samples were taken for, s."""
+    delays: Delays
+    """Delays of the sensors that are made good."""
+    faults: Faults
+    """What of the samples is not what the unit did."""
+    calibration: UnitCalibration | None
+    """What the recording shows of the unit, for its next recording; None where the filter has no states for it."""
 
 
 def estimate(
     recording: Recording,
     parameters: AhrsParameters = HAND_HELD,
     *,
-    latency: float = 0.0,
+    latency: float | None = None,
+    calibration: UnitCalibration | None = None,
+    gate: Gate | None = None,
+    robust: Robust | None = None,
     full_covariance: bool = False,
     smooth: bool = False,
 ) -> AhrsEstimate:
@@ -334,35 +386,197 @@ def estimate(
     ----------
     recording : Recording
     parameters : AhrsParameters
-    latency : float
-        How long after what they show the samples of gyro and accelerometer come, s: the group delay of the sensors. That of the
-        magnetometer beside the gyro is found by :func:`magnetometer_latency` where the recording shows it.
+    latency : float, optional
+        Delay of the gyro's and the accelerometer's samples, s: the group delay of the sensors; 0: point samples at their stamps. By
+        default each sample is taken for the mean over the interval before its stamp, half of which is its delay. That of the
+        magnetometer beside the gyro is found by :func:`strapdown.sensor_delays.magnetometer_delay`.
+    calibration : UnitCalibration, optional
+        What an earlier recording of the same unit showed: scale and misalignment of its gyro, the magnetometer's delay.
+    gate : Gate, optional
+        Refuse measurements that the filter's model does not explain.
+    robust : Robust, optional
+        Weigh measurements by how far they lie off, each sensor by itself.
     full_covariance : bool
         Keep whole covariance matrices too.
     smooth : bool
         From all samples, by the fixed-interval smoother, instead of those up to each stamp.
+
+    Returns
+    -------
+    AhrsEstimate
+        Without ``smooth`` each row depends on the samples up to its stamp alone; only the choice of the quiet second does not.
+
+    Raises
+    ------
+    InputError
+        If there is no accelerometer, a sensor has no valid sample in the quiet second, or the recording is too short.
     """
     if recording.specific_force is None:
         raise InputError(f"{recording.source} has no accelerometer, which shows the vertical; add columns ax, ay, az")
     span = quiet_span(recording)
-    field_latency, sigma = magnetometer_latency(recording)
-    if not (sigma < MOST_LATENCY_SIGMA and 3.0 * sigma < abs(field_latency) < MOST_LATENCY):
-        field_latency = 0.0
-    used = aligned(recording, latency, field_latency).since(span.start)
+    faults = sensor_faults.find(recording.since(span.start))
+    used = faults.recording
+    field_delay = None
+    if calibration is not None:
+        used, field_delay = calibration.applied(used), calibration.magnetometer_delay or None
+        if parameters.gyro_scale_sigma > 0.0:
+            parameters = replace(parameters, gyro_scale_sigma=calibration.sigma)
     quiet = slice(0, span.stop - span.start)
-    initial = start(used, quiet, parameters)
-    face = setup.smooth if smooth else setup.run
-    result = face(imu_record(used, quiet, parameters), parameters.setup, initial, full_covariance=full_covariance)
-    return AhrsEstimate(recording=used, estimate=result, initial=initial, magnetometer_latency=field_latency)
+    delays = sensor_delays.find(used, latency, field_delay, causal=not smooth)
+    prepared = prepare(used, quiet, parameters, delays.field)
+    filtered = _run(prepared, parameters, faults.turn_variance, gate, robust, smooth)
+    found = _at_stamps(filtered, used, prepared, parameters, delays, smooth, full_covariance)
+    scale = found.error_states.get("gyro scale")
+    return AhrsEstimate(
+        recording=used,
+        estimate=found,
+        calibration=None
+        if scale is None
+        else (calibration or unit_calibration.NONE).and_then(scale, delays.last_field, used.source),
+        record=prepared.record,
+        initial=prepared.initial,
+        delays=delays,
+        faults=faults,
+    )
+
+
+def _run(
+    prepared: Prepared,
+    parameters: AhrsParameters,
+    turn_variance: Array,
+    gate: Gate | None,
+    robust: Robust | None,
+    smooth: bool,
+) -> Estimate:
+    """Return the filter's or the smoother's estimate at the steps.
+
+    Where the gyro does not show how the unit turned, the record is run in parts, each with an angle random walk of its own: that of the
+    gyro, or as much more as makes up ``turn_variance`` (n,), rad², of the sample intervals. Each part is smoothed by itself, for samples
+    after such a part say little about what was before it.
+    """
+    record, own = prepared.record, parameters.setup
+    kinds = {series.sensor: series.kind for series in record.vectors}
+    blocks = () if own.states is None else own.states.blocks(kinds)
+    extra = np.add.reduceat(turn_variance, prepared.edge[:-1].astype(np.intp))
+    change = np.flatnonzero(np.diff(extra > 0.0)) + 1
+    bounds = [0, *change.tolist(), len(extra)]
+    state = prepared.initial
+    parts: list[Estimate] = []
+    for first, last in itertools.pairwise(bounds):
+        part = record if len(bounds) == 2 else cut(record, first, last)
+        walk = parameters.angle_random_walk**2 + float(np.sum(extra[first:last])) / (part.time[-1] - part.time[0])
+        noise = replace(own.process_noise, angle_random_walk=float(np.sqrt(walk)))
+        end = state
+        if not smooth or last < len(extra):
+            found, end = estimation.run_part(part, noise, state, blocks, full_covariance=True, gate=gate, robust=robust)
+        if smooth:
+            found = estimation.smooth(part, noise, state, blocks, full_covariance=True, gate=gate, robust=robust)
+        state = end
+        parts.append(found)
+    return _joined(parts)
+
+
+def _joined(parts: list[Estimate]) -> Estimate:
+    """Return the estimates of successive parts as one; at an edge between two stands the first part's."""
+    if len(parts) == 1:
+        return parts[0]
+
+    def rows(name: str) -> Array:
+        return np.concatenate([getattr(part, name)[k > 0 :] for k, part in enumerate(parts)])
+
+    innovations = {}
+    for sensor in dict.fromkeys(name for part in parts for name in part.innovations):
+        own = [part.innovations[sensor] for part in parts if sensor in part.innovations]
+        weights = [one.weight for one in own if one.weight is not None]
+        innovations[sensor] = Innovations(
+            time=np.concatenate([one.time for one in own]),
+            innovation=np.concatenate([one.innovation for one in own]),
+            variance=np.concatenate([one.variance for one in own]),
+            weight=np.concatenate(weights) if len(weights) == len(own) else None,
+        )
+    blocks = {
+        name: replace(
+            block,
+            values=np.concatenate([part.error_states[name].values[k > 0 :] for k, part in enumerate(parts)]),
+            variance=np.concatenate([part.error_states[name].variance[k > 0 :] for k, part in enumerate(parts)]),
+        )
+        for name, block in parts[0].error_states.items()
+    }
+    return Estimate(
+        time=rows("time"),
+        attitude=rows("attitude"),
+        bias=rows("bias"),
+        variance=rows("variance"),
+        covariance=rows("covariance"),
+        innovations=innovations,
+        events=tuple(event for part in parts for event in part.events),
+        error_states=blocks,
+    )
+
+
+def _at_stamps(
+    filtered: Estimate,
+    used: Recording,
+    prepared: Prepared,
+    parameters: AhrsParameters,
+    delays: Delays,
+    smooth: bool,
+    full_covariance: bool,
+) -> Estimate:
+    """Return the estimate at the recording's stamps: carried on by the gyro from the step before each, and over the delay of the gyro."""
+    edge, turned = prepared.edge, prepared.turned
+    row = np.searchsorted(edge, np.arange(len(used.time)), side="right") - 1
+    bias = filtered.bias[row]
+    late = np.broadcast_to(delays.gyro, used.time.shape)
+    ahead = -sensor_delays.turn_over(used, -late) if smooth else used.rate * late[:, None]
+    ahead = ahead - bias * (used.time - used.time[edge][row] + late)[:, None]
+    step = quaternion.multiply(filtered.attitude, quaternion.conjugate(turned[edge]))
+    assert filtered.covariance is not None
+    R = quaternion.to_matrix(filtered.attitude)
+    fixed = R @ filtered.covariance[:, :3, :3] @ R.transpose(0, 2, 1)
+    iron = 0.0 if prepared.dip is None else (parameters.iron_sigma / np.cos(prepared.dip)) ** 2
+    attitude, own = np.empty((len(row), 4)), np.empty((len(row), 3, 3))
+    compiled(recording_steps.carry_to_stamps)(
+        row, step, fixed, turned, ahead, used.rate, delays.sigma**2, iron, attitude, own
+    )
+    variance = filtered.variance[row]
+    variance[:, :3] = np.einsum("kii->ki", own)
+    P = None
+    if full_covariance:
+        P = filtered.covariance[row]
+        P[:, :3, :3] = own
+        P[:, :3, 3:] = quaternion.to_matrix(attitude).transpose(0, 2, 1) @ (R @ filtered.covariance[:, :3, 3:])[row]
+        P[:, 3:, :3] = P[:, :3, 3:].transpose(0, 2, 1)
+    sensors = {"accelerometer": used.specific_force, "magnetometer": used.magnetic_field}
+    return Estimate(
+        time=used.time,
+        attitude=attitude,
+        bias=bias,
+        variance=variance,
+        covariance=P,
+        innovations=filtered.innovations,
+        skipped={
+            name: int(np.sum(~(np.isfinite(samples).all(axis=1) & samples.any(axis=1))))
+            for name, samples in sensors.items()
+            if samples is not None
+        },
+        events=filtered.events,
+        error_states={
+            name: ErrorStateEstimate(
+                components=block.components, units=block.units, values=block.values[row], variance=block.variance[row]
+            )
+            for name, block in filtered.error_states.items()
+        },
+    )
 
 
 def _mean(samples: Array, source: str, sensor: str) -> Array:
-    known = samples[np.isfinite(samples).all(axis=1)]
-    if len(known) == 0:
+    """Return the mean of samples (k, 3) of the quiet second, which must show a direction."""
+    if len(samples) == 0:
         raise InputError(
             f"{source}: the {sensor} has no valid sample in the first quiet second; cut the recording to where it has"
         )
-    mean = np.asarray(known.mean(axis=0))
+    mean = np.asarray(samples.mean(axis=0))
     if _norm(mean) == 0.0:
         raise InputError(
             f"{source}: the {sensor} is zero over the first quiet second and shows no direction; cut the recording to where it has one"

@@ -35,7 +35,16 @@ FLOORS: tuple[tuple[str, ...], ...] = (
         "noise_parameters",
     ),
     # 2 data
-    ("records", "recordings", "recordfiles", "scenarios", "outputs"),
+    (
+        "records",
+        "recordings",
+        "recordfiles",
+        "scenarios",
+        "outputs",
+        "sensor_faults",
+        "sensor_delays",
+        "unit_calibration",
+    ),
     # 3 estimators
     ("estimation", "setup", "ahrs"),
     # 4 analysis

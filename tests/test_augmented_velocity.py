@@ -809,35 +809,34 @@ def test_the_latency_of_a_gyro_beside_a_reference():
     """The reference moved by 4 ms; no filter has part in it."""
     one = hand_held.simulated(1, 0, 20.0)
     assert hand_held.gyro_latency(one)[0] == pytest.approx(0.0, abs=1e-4)
-    delayed = ahrs.aligned(one, 0.004)
+    delayed = hand_held.shifted(one, 0.004)
     assert hand_held.gyro_latency(delayed)[0] == pytest.approx(-0.004, abs=2e-4)
 
 
 def test_broad_trials_by_bounded_velocity(broad):
-    """One set of numbers for all: the mean below that of VQF (2.6°), no trial beyond 5°, and none much worse than by white noise."""
-    files = sorted(broad.glob("*.hdf5"))
-    found, white, hand, told, smoothed, late = [], [], [], [], [], []
-    for k, file in enumerate(files):
+    """One set of numbers for all, held against VQF on the same trials (2.6°); at rest the field of trial 27 is 4.6° off."""
+    found: dict[str, list[list[float]]] = {"white": [], "hand": [], "given": [], "smoothed": []}
+    late = []
+    for k, file in enumerate(sorted(broad.glob("*.hdf5"))):
         recording = read(file)
-        found.append(errors_by(recording, hand_held.BOUNDED))
-        white.append(errors_by(recording, hand_held.QUIET))
-        hand.append(errors_by(recording, ahrs.HAND_HELD))
-        told.append(errors_by(recording, ahrs.HAND_HELD, latency=4.1e-3))
+        for name, parameters, options in (
+            ("white", hand_held.QUIET, {}),
+            ("hand", ahrs.HAND_HELD, {}),
+            ("given", ahrs.HAND_HELD, {"latency": 4.1e-3}),
+            ("smoothed", ahrs.HAND_HELD, {"latency": 4.1e-3, "smooth": True}),
+        ):
+            errors = errors_by(recording, parameters, **options)
+            found[name].append([errors["total"], errors["inclination"]])
         if k % 3 == 0:
             late.append(hand_held.gyro_latency(recording)[0])
-            smoothed.append(errors_by(recording, ahrs.HAND_HELD, latency=4.1e-3, smooth=True)["total"])
-    total, inclination = (
-        np.array([[one[part] for one in each] for each in (found, white, hand, told)])
-        for part in ("total", "inclination")
-    )
-    assert 1.0 < total[0].mean() < 2.6
-    assert total[0].max() < 5.0
-    assert np.all(total[0] < 1.1 * total[1])
-    assert np.all(inclination[0] < 1.02 * inclination[1])
-    assert inclination[0].mean() < 0.8 * inclination[1].mean()
-    # With states for the gyro's scale, and its latency made good.
-    assert total[2].mean() < 2.35
-    assert total[3].mean() < 2.0
-    assert inclination[3].mean() < 0.5
-    assert np.mean(smoothed) < 0.7 * total[3][::3].mean()
+    white, hand, given, smoothed = (np.array(values) for values in found.values())
+    assert 1.0 < hand[:, 0].mean() < 2.1
+    assert 1.0 < given[:, 0].mean() < 1.9
+    assert np.sort(given[:, 0])[:-1].mean() < 1.4
+    assert np.sort(smoothed[:, 0])[:-1].mean() < 0.72
+    assert given[:, 0].max() < 7.5
+    assert hand[:, 1].mean() < 0.7
+    assert given[:, 1].mean() < 0.48
+    assert smoothed[:, 1].mean() < 0.36
+    assert given[:, 1].mean() < 0.8 * white[:, 1].mean()
     np.testing.assert_allclose(late, 4.15e-3, atol=1.5e-4)

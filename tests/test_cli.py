@@ -304,10 +304,11 @@ def yaw_of(attitude: np.ndarray) -> np.ndarray:
 
 def test_estimate_on_csv(run, tmp_path):
     columns = walk()
-    status, said, error = run("estimate", write_csv(tmp_path / "walk.csv", columns, UNITS), "--out", tmp_path / "out")
+    walked = write_csv(tmp_path / "walk.csv", columns, UNITS)
+    status, said, error = run("estimate", walked, "--out", tmp_path / "out", "--figures")
     assert (status, error) == (0, "")
     written = {path.name for path in (tmp_path / "out").iterdir()}
-    assert written == {"estimate.h5", "estimate.png", "states.json", "states.png"}
+    assert written == {"estimate.h5", "calibration.toml", "estimate.png", "states.json", "states.png"}
     assert "walk.csv" in said
     estimate = read_estimate(tmp_path / "out" / "estimate.h5")
     np.testing.assert_allclose(estimate.time, columns[:, 0], atol=1e-9)
@@ -318,7 +319,7 @@ def test_estimate_on_csv(run, tmp_path):
     assert told["source"] == "walk.csv"
     assert "scalar first" in told["conventions"]
     assert "East-North-Up" in told["fixed_frame"]
-    assert told["parameter.reference_rate"] > 0.0
+    assert told["parameter.field_disturbance"] > 0.0
 
 
 def test_estimate_takes_units_by_option(run, tmp_path):
@@ -351,10 +352,11 @@ def test_estimate_tells_of_missing_samples(run, tmp_path):
 
 def test_estimate_on_broad(run, broad, tmp_path):
     path = broad / "11_undisturbed_slow_translation_B.hdf5"
-    status, said, error = run("estimate", path, "--out", tmp_path / "out")
+    status, said, error = run("estimate", path, "--out", tmp_path / "out", "--figures")
     assert (status, error) == (0, "")
     assert {p.name for p in (tmp_path / "out").iterdir()} == {
         "estimate.h5",
+        "calibration.toml",
         "estimate.png",
         "errors.json",
         "errors.png",

@@ -9,7 +9,18 @@ import numpy as np
 import pytest
 
 from sims import hand_held
-from strapdown import ahrs, coning, consistency, estimation, motion, quaternion, records, scenarios, setup
+from strapdown import (
+    ahrs,
+    coning,
+    consistency,
+    estimation,
+    motion,
+    quaternion,
+    records,
+    scenarios,
+    setup,
+    unit_calibration,
+)
 from strapdown.checks import InputError
 from strapdown.cli.filters import filter_for
 from strapdown.estimation.states import ProcessNoise
@@ -59,7 +70,7 @@ def record(tmp_path):
 
 
 def test_a_simulated_record_is_estimated_by_the_filter_that_matches_it(run, record, tmp_path):
-    status, said, error = run("estimate", record, "--out", tmp_path / "out")
+    status, said, error = run("estimate", record, "--out", tmp_path / "out", "--figures")
     assert (status, error) == (0, "")
     assert "Started from the first measurements" in said
     assert "mean NEES per state" in said
@@ -120,8 +131,8 @@ def test_what_a_record_does_not_tell_is_asked_for(run, record, tmp_path):
         ((record, "--gate", 1.5), "between 0 and 1"),
         ((record, "--time-unit", "ms"), "goes with a table"),
         ((record, "--columns", "time=t"), "goes with a table"),
-        ((tmp_path / "own.csv", "--gate", 0.99), "goes with a record"),
-        ((tmp_path / "none.csv", "--gate", 0.99), "none.csv does not exist"),
+        ((tmp_path / "own.csv", "--every", 2), "goes with a record"),
+        ((tmp_path / "none.csv", "--every", 2), "none.csv does not exist"),
     )
     for arguments, words in cases:
         status, _, error = run("estimate", *arguments, "--out", tmp_path / "out")
@@ -189,7 +200,7 @@ def spinning(tmp_path):
 
 def test_states_that_the_errors_call_for(run, spinning, tmp_path):
     status, said, error = run(
-        "estimate", spinning, "--out", tmp_path / "out", "--states", "--from-truth", "--every", 100
+        "estimate", spinning, "--out", tmp_path / "out", "--states", "--from-truth", "--every", 100, "--figures"
     )
     assert (status, error) == (0, "")
     assert "Optional states: gyro.scale." in said
@@ -420,15 +431,15 @@ def off(folder, shift):
 def test_a_recording_is_taken_for_that_of_a_hand(run, recording, tmp_path):
     status, said, error = run("estimate", recording, "--out", tmp_path / "out")
     assert (status, error) == (0, "")
-    assert "Motion: of a hand, 0.5 m/s that last 0.3 s; σ is set for robustness and no verdict." in said
+    assert "Motion: of a hand, 1 m/s with a correlation time of 0.3 s." in said
     assert "°/s, from that second." in said
-    assert "later than what they show" not in said
+    assert "Samples are taken as 2.5 ms later than what they show, half a sample interval, σ 2 ms" in said
     assert "warning" not in said
     told = records.read_attributes(tmp_path / "out" / "estimate.h5")
     states = json.loads((tmp_path / "out" / "states.json").read_text())
     assert states["accelerometer velocity"]["units"] == ["m/s", "m/s²"] * 3
     assert len(states["gyro scale"]["values"]) == 9
-    assert (told["motion"], told["smoothed"], told["latency"]) == ("hand", False, 0.0)
+    assert (told["motion"], told["smoothed"], told["latency"]) == ("hand", False, pytest.approx(0.0025))
     assert setup.from_toml(told["filter"]) == ahrs.HAND_HELD.setup
     assert off(tmp_path / "out", 0.0) < 1.5
 
@@ -444,7 +455,7 @@ def test_any_motion_smoothing_and_latency(run, recording, tmp_path):
         status, said, error = run("estimate", recording, "--out", tmp_path / name, *options)
         assert (status, error) == (0, ""), name
         errors[name] = off(tmp_path / name, 0.005 if name == "later" else 0.0)
-        assert ("Samples are taken for 5 ms later than what they show." in said) == (name == "later")
+        assert ("Samples are taken as 5 ms later than what they show." in said) == (name == "later")
         assert ("Motion: any" in said) == (name == "any")
     assert errors["smoothed"] < errors["hand"] < errors["any"]
     assert abs(errors["later"] - errors["hand"]) < 0.3
@@ -458,6 +469,45 @@ def test_a_recording_that_is_not_what_it_says_is_doubted(run, recording, tmp_pat
     assert words in said
     assert words in run("tune", recording, "--free", "")[1]  # which then ends for want of a parameter
     assert f"See `strapdown doctor {recording}`." in said
+
+
+def test_gate_robust_weights_and_observability_of_a_recording(run, recording, tmp_path):
+    options = ("--gate", 0.999, "--robust", "student", "--observability")
+    status, _, error = run("estimate", recording, "--out", tmp_path / "out", *options)
+    assert (status, error) == (0, "")
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "estimate.h5",
+        "states.json",
+        "calibration.toml",
+        "observability.json",
+    }
+    with h5py.File(tmp_path / "out" / "estimate.h5") as file:
+        used = setup.from_toml(file.attrs["filter"])
+    assert (used.gate.probability, used.robust.kind) == (0.999, "student")
+    estimate = read_estimate(tmp_path / "out" / "estimate.h5")
+    assert all(one.weight is not None for one in estimate.innovations.values())
+    assert off(tmp_path / "out", 0.0) < 1.5
+
+
+def test_a_calibration_is_written_and_used(run, recording, tmp_path):
+    assert run("estimate", recording, "--out", tmp_path / "first", "--smooth")[0] == 0
+    first = unit_calibration.read(tmp_path / "first" / "calibration.toml")
+    again = ("--calibration", tmp_path / "first" / "calibration.toml")
+    status, _, error = run("estimate", recording, "--out", tmp_path / "again", *again)
+    assert (status, error) == (0, "")
+    second = unit_calibration.read(tmp_path / "again" / "calibration.toml")
+    assert second.sigma < first.sigma < 2e-3
+    assert np.abs(second.matrix - first.matrix).max() < 2e-3
+
+
+def test_a_clipped_gyro_is_reported(run, recording, tmp_path):
+    header, *rows = recording.read_text().splitlines()
+    values = np.loadtxt(rows, delimiter=",")
+    values[:, 1] = np.clip(values[:, 1], -1.2, 1.2)
+    np.savetxt(recording, values, delimiter=",", header=header, comments="")
+    status, said, error = run("estimate", recording, "--out", tmp_path / "out")
+    assert (status, error) == (0, "")
+    assert "The gyro was clipped: x at 68.75 °/s" in said
 
 
 def test_a_hand_that_never_rests_is_told(run, recording, tmp_path):
@@ -476,7 +526,10 @@ def test_a_hand_that_never_rests_is_told(run, recording, tmp_path):
         (("--latency", -1.0), "--latency is -1 ms"),
         (("--latency", "nan"), "--latency is nan"),
         (("--latency", 60000.0), "lasts"),
-        (("--gate", 0.999), "goes with a record"),
+        (("--gate", 1.5), "between 0 and 1"),
+        (("--robust", "hubert"), "did you mean 'huber'"),
+        (("--states",), "goes with a record"),
+        (("--calibration", "none.toml"), "none.toml does not exist"),
     ],
 )
 def test_bad_options_of_a_recording_are_refused(run, recording, tmp_path, options, words):
@@ -491,6 +544,7 @@ def test_bad_options_of_a_recording_are_refused(run, recording, tmp_path, option
     [
         (("--motion", "hand"), "--motion goes with a recording"),
         (("--latency", 4.0), "--latency goes with a recording"),
+        (("--calibration", "unit.toml"), "--calibration goes with a recording"),
         (("--smooth", "--every", 2), "leave one of them out"),
     ],
 )

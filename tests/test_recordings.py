@@ -445,3 +445,19 @@ def test_two_gyro_samples_are_enough_and_one_is_not(tmp_path):
     path.write_text("time,gx [rad/s],gy,gz\n0,0.1,0.2,0.3\n1,,,\n2,0.1,,0.4\n")
     with pytest.raises(InputError, match="1 of 3 rows have a gyro sample about each axis; at least 2 are needed"):
         recordings.read(path)
+
+
+def test_few_repeated_stamps_are_left_out_whatever_their_samples(tmp_path):
+    """Three of 1,000 rows with the stamp of the row before; one of ten is refused."""
+    time = np.arange(1000) * 0.01
+    time[[200, 500, 800]] = time[[199, 499, 799]]
+    values = np.column_stack([time, np.random.default_rng(1).standard_normal((1000, 3))])
+    path = tmp_path / "repeated.csv"
+    np.savetxt(path, values, delimiter=",", header="time,gx [rad/s],gy,gz", comments="")
+    found = read(path)
+    np.testing.assert_allclose(found.repeated, [1.99, 4.99, 7.99])
+    assert len(found.time) == 997
+    np.testing.assert_array_equal(found.rate, np.delete(values[:, 1:], [200, 500, 800], axis=0))
+    np.savetxt(path, values[195:205], delimiter=",", header="time,gx [rad/s],gy,gz", comments="")
+    with pytest.raises(InputError, match="time"):
+        read(path)

@@ -244,7 +244,7 @@ FOLDERS = {
     "covariance": (["covariance", "short.toml", "--epochs", 2], ("covariance.json", "budget.png")),
     "estimate": (
         ["estimate", "record.h5", "--from-truth"],
-        ("estimate.h5", "errors.json", "states.json", "estimate.png", "errors.png", "states.png"),
+        ("estimate.h5", "errors.json", "states.json", "calibration.toml", "estimate.png", "errors.png", "states.png"),
     ),
 }
 """Commands that write to a folder, and the files that they write there."""

@@ -21,13 +21,22 @@ if TYPE_CHECKING:
     from strapdown.records import Estimate, ImuRecord
     from strapdown.setup import FilterSetup
 
-FILES = ("estimate.h5", "errors.json", "states.json", "observability.json", "estimate.png", "errors.png", "states.png")
+FILES = (
+    "estimate.h5",
+    "errors.json",
+    "states.json",
+    "observability.json",
+    "calibration.toml",
+    "estimate.png",
+    "errors.png",
+    "states.png",
+)
 """What the command may write to its folder."""
 ABOUT_IT = ("estimate.html", "estimate.report.json")
 """What other commands write there about an estimate."""
-RECORDING_ONLY = ("motion", "latency")
+RECORDING_ONLY = ("motion", "latency", "calibration")
 """Options that go with a recording."""
-RECORD_ONLY = ("filter", "gate", "robust", "states", "state", "attitude", "from_truth", "every", "observability")
+RECORD_ONLY = ("filter", "states", "state", "attitude", "from_truth", "every")
 """Options that go with a record of `strapdown simulate`."""
 
 UNEVEN = 2.0
@@ -70,7 +79,7 @@ def estimate(
     ] = None,
     gate: Annotated[
         float | None,
-        typer.Option(help="Record: refuse measurements beyond this quantile (0.999) of chi-squared, and recover."),
+        typer.Option(help="Refuse measurements beyond this quantile (0.999) of chi-squared, and recover."),
     ] = None,
     robust: Annotated[
         str | None, typer.Option(help="Record: weigh measurements by how far they lie off: huber or student.")
@@ -95,7 +104,10 @@ def estimate(
     ] = False,
     every: Annotated[int, typer.Option(help="Record: keep each so-manieth step of the filter.")] = 1,
     observability: Annotated[
-        bool, typer.Option("--observability", help="Record: tell what it shows of each state, optional ones included.")
+        bool,
+        typer.Option(
+            "--observability", help="Report what the measurements show of each state, optional ones included."
+        ),
     ] = False,
     smooth: Annotated[
         bool,
@@ -122,25 +134,35 @@ def estimate(
     latency: Annotated[
         float | None,
         typer.Option(
-            help="Recording: how long after what they show its gyro's samples come, ms: the delay of the sensor's low-pass."
+            help="Recording: delay of the gyro's samples, ms, that of its low-pass; 0: point samples. If not given, half a sample interval."
         ),
     ] = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            help="Recording: calibration.toml of an earlier one of the same unit; that of this one is written too."
+        ),
+    ] = None,
+    figures: Annotated[
+        bool, typer.Option("--figures", help="Draw the estimate, its states and errors as PNG.")
+    ] = False,
 ) -> None:
     """Estimate attitude and gyro bias from a recording (accelerometer as vertical, magnetometer as heading) or a simulated record."""
+    from strapdown import unit_calibration
     from strapdown.checks import InputError
     from strapdown.files import usable_folder
     from strapdown.recordings import is_record
     from strapdown.records import read_attributes
 
     usable_folder("out", out)
-    writable("out", *(out / name for name in FILES), sources=(recording, gyro, filter_file))
+    writable("out", *(out / name for name in FILES), sources=(recording, gyro, filter_file, calibration))
     need_own(out / FILES[0], "estimate", lambda path: bool(read_attributes(path)["kind"] == "strapdown estimate"))
     layout = told(
         recording, columns=columns, topic=topic, gyro=gyro_unit, accelerometer=accelerometer_unit, time=time_unit
     )
     exports = _exports(to or (), recording, euler, frame)
     if is_record(recording):
-        for name, text in zip(RECORDING_ONLY, (motion, latency), strict=True):
+        for name, text in zip(RECORDING_ONLY, (motion, latency, calibration), strict=True):
             if text is not None:
                 raise InputError(f"--{name} goes with a recording; {recording} is a record of `strapdown simulate`")
         _estimate_record(
@@ -158,6 +180,7 @@ def estimate(
             observability,
             smooth,
             exports,
+            figures,
         )
         return
     options = dict(
@@ -165,14 +188,11 @@ def estimate(
             RECORD_ONLY,
             (
                 filter_file,
-                gate,
-                robust,
                 states or None,
                 state or None,
                 attitude,
                 from_truth or None,
                 None if every == 1 else every,
-                observability or None,
             ),
             strict=True,
         )
@@ -182,7 +202,15 @@ def estimate(
             raise InputError(
                 f"--{name.replace('_', '-')} goes with a record of `strapdown simulate`; {recording} is none"
             )
-    _estimate_recording(recording, out, layout, gyro, bool(full_covariance), smooth, motion, latency, exports)
+    carried = None if calibration is None else unit_calibration.read(calibration)
+    options_used = {
+        "calibration": carried,
+        "gate": gate,
+        "robust": robust,
+        "full_covariance": bool(full_covariance),
+        "smooth": smooth,
+    }
+    _estimate_recording(recording, out, layout, gyro, motion, latency, observability, figures, exports, options_used)
 
 
 def _exports(
@@ -236,16 +264,17 @@ def _estimate_record(
     observability: bool,
     smooth: bool,
     exports: Sequence[tuple[Path, dict[str, Any]]],
+    figures: bool,
 ) -> None:
-    """Run the filter over a record, tell and write what it made of it."""
+    """Run the filter over a record, report and write its estimate."""
     import numpy as np
 
-    from strapdown import plots, records, setup
+    from strapdown import records, setup
     from strapdown.checks import InputError, count
     from strapdown.estimation.gating import Gate, Robust
     from strapdown.files import write_json
     from strapdown.recordfiles import read_record_file
-    from strapdown.records import Estimate, Truth, write_estimate
+    from strapdown.records import Truth, write_estimate
 
     count("every", every)
     if smooth and every > 1:
@@ -295,18 +324,15 @@ def _estimate_record(
     attributes |= {name: value for name, value in (("seed", held.seed), ("run", held.run)) if value is not None}
     _clear(out)
     write_estimate(paths[0], result, attributes, truth=truth)
-    figures = {"estimate.png": plots.estimate_overview(result, title=path.name)}
-    if isinstance(result, Estimate) and result.error_states:
+    if result.error_states:
         paths.append(out / "states.json")
         write_json(paths[-1], {"source": str(path), **_tell_states(result, used)})
-        figures["states.png"] = plots.states_over_time(result, title=path.name)
     if observability:
         shown = setup.observability(used, chosen, initial)
         console.print(str(shown))
         paths.append(out / "observability.json")
         write_json(paths[-1], {"source": str(path), **shown.summary()})
     if truth is not None:
-        figures["errors.png"] = plots.error_overview(result, truth, title=path.name)
         paths.append(out / "errors.json")
         found = _errors(result, truth)
         write_json(paths[-1], {"source": str(path), **found})
@@ -322,7 +348,25 @@ def _estimate_record(
     if seen:
         each = ", ".join(f"{np.mean(i.nis[i.used]) / i.innovation.shape[1]:.3g} {s}" for s, i in seen.items())
         console.print(f"Mean NIS per degree of freedom (right: 1): {each}. `strapdown check {paths[0]}` judges them.")
-    written(*paths, *(plots.save(figure, out / name) for name, figure in figures.items()))
+    if figures:
+        paths += _drawn(out, result, path.name, truth=truth)
+    written(*paths)
+
+
+def _drawn(
+    out: Path, result: Estimate, title: str, truth: Any = None, used: Any = None, errors: Any = None
+) -> list[Path]:
+    """Draw the estimate, its optional states, and its errors beside a truth or a recording's reference; return the files."""
+    from strapdown import plots
+
+    figures = {"estimate.png": plots.estimate_overview(result, title=title)}
+    if getattr(result, "blocks", None):
+        figures["states.png"] = plots.states_over_time(result, title=title)  # type: ignore[arg-type]
+    if truth is not None:
+        figures["errors.png"] = plots.error_overview(result, truth, title=title)
+    if errors is not None:
+        figures["errors.png"] = plots.recording_errors(used.time, errors, used.movement)
+    return [plots.save(figure, out / name) for name, figure in figures.items()]
 
 
 _STATE_UNITS = {
@@ -506,38 +550,36 @@ def _estimate_recording(
     out: Path,
     layout: dict[str, Any],
     gyro: Path | None,
-    full_covariance: bool,
-    smooth: bool,
     motion: str | None,
     latency: float | None,
+    observability: bool,
+    figures: bool,
     exports: Sequence[tuple[Path, dict[str, Any]]],
+    options: dict[str, Any],
 ) -> None:
     """Run the filter over a recording: accelerometer as the vertical, magnetometer as the heading."""
-    from strapdown import ahrs, plots, recordings, setup
+    from strapdown import ahrs, recordings, setup, unit_calibration
     from strapdown.checks import non_negative, one_of
     from strapdown.consistency import reference_errors
+    from strapdown.estimation.gating import Gate, Robust
     from strapdown.files import write_json
     from strapdown.gyro import process_noise, read_spec
-    from strapdown.records import Estimate, write_estimate
+    from strapdown.records import write_estimate
     from strapdown.units import DEGREE
 
     moved_by = one_of("--motion", motion or "hand", ahrs.MOTIONS)
-    late = 1e-3 * non_negative("--latency", latency or 0.0, unit="ms")
+    late = None if latency is None else 1e-3 * non_negative("--latency", latency, unit="ms")
+    if options["gate"] is not None:
+        options["gate"] = Gate(probability=options["gate"])
+    if options["robust"] is not None:
+        options["robust"] = Robust(kind=options["robust"])
     source = recordings.read(recording, **layout)
     parameters = ahrs.MOTIONS[moved_by]
     if gyro is not None:
         parameters = replace(parameters, **process_noise(read_spec(gyro)))
-    result = ahrs.estimate(source, parameters, latency=late, full_covariance=full_covariance, smooth=smooth)
+    result = ahrs.estimate(source, parameters, latency=late, **options)
     used, found = result.recording, result.estimate
-    errors_found = None
-    if used.true_attitude is not None:
-        errors_found = reference_errors(found.attitude, used.true_attitude)
-        rms = {name: value / DEGREE for name, value in errors_found.rms(used.movement).items()}
-    figures = {"estimate.png": plots.estimate_overview(found, title=used.source)}
-    if isinstance(found, Estimate):
-        figures["states.png"] = plots.states_over_time(found, title=used.source)
-    if errors_found is not None:
-        figures["errors.png"] = plots.recording_errors(used.time, errors_found, used.movement)
+    errors = None if used.true_attitude is None else reference_errors(found.attitude, used.true_attitude)
     frame = (
         "East-North-Up, magnetic North"
         if used.magnetic_field is not None
@@ -552,14 +594,14 @@ def _estimate_recording(
             "source": used.source,
             "fixed_frame": frame,
             "motion": moved_by,
-            "smoothed": smooth,
-            "filter": setup.to_toml(parameters.setup),
+            "smoothed": options["smooth"],
+            "filter": setup.to_toml(replace(parameters.setup, gate=options["gate"], robust=options["robust"])),
             **{f"parameter.{name}": value for name, value in vars(parameters).items()},
-            "latency": late,
-            "magnetometer_latency": result.magnetometer_latency,
+            "latency": result.delays.last_gyro,
+            "magnetometer_latency": result.delays.last_field,
         },
     )
-    if isinstance(found, Estimate):
+    if found.error_states:
         paths.append(out / "states.json")
         write_json(paths[-1], {"source": used.source, **_states(found)})
     console.print(
@@ -570,43 +612,49 @@ def _estimate_recording(
         console.print(remark)
     console.print(f"Fixed frame: {frame}.")
     doubt(source, recording)
-    console.print(_beliefs(moved_by, parameters, result))
-    if late:
-        console.print(f"Samples are taken for {1e3 * late:g} ms later than what they show.")
-    if result.magnetometer_latency:
-        behind = 1e3 * result.magnetometer_latency
-        console.print(
-            f"The magnetometer's samples come {abs(behind):.1f} ms {'after' if behind > 0.0 else 'before'} the gyro's, which is made good."
-        )
+    console.print(_model(moved_by, parameters, result))
+    for sentence in (*result.delays.words, *(f"{one}." for one in result.faults.words)):
+        console.print(sentence)
+    if result.calibration is not None:
+        paths.append(out / "calibration.toml")
+        paths[-1].write_text(unit_calibration.to_toml(result.calibration), encoding="utf-8")
     for begin, length in recordings.gaps(used.time):
-        console.print(f"Gap of {length:.3g} s after {begin:.3f} s: the turn across it is a guess, whatever σ says.")
+        console.print(f"Gap of {length:.3g} s after {begin:.3f} s.")
     if used.left_out_words:
         console.print(used.left_out_words)
     for sensor, number in found.skipped.items():
         if number:
             console.print(f"{number} samples of the {sensor} are missing and were skipped.")
-    if errors_found is not None:
+    _tell(replace(found, skipped={}))
+    if observability:
+        shown = setup.observability(result.record, parameters.setup, result.initial)
+        console.print(str(shown))
+        paths.append(out / "observability.json")
+        write_json(paths[-1], {"source": used.source, **shown.summary()})
+    if errors is not None:
+        rms = {name: value / DEGREE for name, value in errors.rms(used.movement).items()}
         paths.append(out / "errors.json")
         write_json(paths[-1], {"source": used.source, **{f"{name}_rmse_deg": value for name, value in rms.items()}})
         rows = table("RMS error over the movement phase, degrees", *rms, left=0)
         rows.add_row(*(f"{value:.2f}" for value in rms.values()))
         show(rows)
     paths += _export(exports, found, source)
-    written(*paths, *(plots.save(figure, out / name) for name, figure in figures.items()))
+    if figures:
+        paths += _drawn(out, found, used.source, used=used, errors=errors)
+    written(*paths)
 
 
-def _beliefs(moved_by: str, parameters: Any, result: Any) -> str:
-    """Return in words what the filter believes of a recording, and of the bias that it started from."""
+def _model(moved_by: str, parameters: Any, result: Any) -> str:
+    """Return in words the model of a recording's motion, and the bias that the filter started from."""
     import numpy as np
 
     from strapdown.units import DEGREE
 
     if moved_by == "any":
-        return "Motion: any, its acceleration taken for white noise; σ is set for robustness and no verdict."
+        return "Motion: any, its acceleration modelled as white noise."
     bias, sigma = result.initial.bias / DEGREE, np.sqrt(result.initial.covariance[3, 3]) / DEGREE
     words = (
-        f"Motion: of a hand, {parameters.velocity_sigma:g} m/s that last {parameters.velocity_time:g} s; σ is set for robustness and no "
-        "verdict. "
+        f"Motion: of a hand, {parameters.velocity_sigma:g} m/s with a correlation time of {parameters.velocity_time:g} s. "
         f"Gyro bias at the start: {', '.join(f'{value:.3g}' for value in bias)} °/s, σ {sigma:.2g} °/s"
     )
     if sigma > 0.5 * parameters.bias_sigma / DEGREE:

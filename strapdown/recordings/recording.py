@@ -29,6 +29,8 @@ GAP = 5.0
 _ROWS = ("time", "rate", "specific_force", "magnetic_field", "temperature", "true_attitude", "movement")
 
 
+FEW_REPEATED = 0.01
+"""Share of the rows with the stamp of the row before, below which they are left out though their samples differ."""
 LARGEST_RATE = 2000.0
 """rad/s: five times the range of the fastest gyros. More are raw counts, or a damaged row; and a filter would cut each interval into
 thousands of steps."""
@@ -62,8 +64,8 @@ class Recording:
     """Stamps of the file's rows without a gyro sample (k,), s. They are left out as a whole: the intervals on both sides are one, the turn
     over it is taken from the samples at its ends, and a filter's covariance grows over all of it."""
     repeated: Array = field(default_factory=lambda: np.empty(0))
-    """Stamps of the file's rows that say the same as the row before, stamp and all (k,), s: they are left out. The same stamp with other
-    values is refused, for two samples at one time have no interval between them."""
+    """Stamps of the file's rows that have the stamp of the row before (k,), s: they are left out. Where they are more than
+    :data:`FEW_REPEATED` of all, and their samples differ, the file is refused, for two samples at one time have no interval."""
     remarks: tuple[str, ...] = ()
     """What the reader chose or left out, a sentence each: columns it guessed, topics it took, the part of a truncated file."""
 
@@ -130,7 +132,7 @@ class Recording:
 def with_gyro(*, source: str, time: Array, rate: Array, **columns: Any) -> Recording:
     """Return a recording of the rows that have a gyro sample and do not repeat the row before; the stamps of the others go along."""
     same = np.diff(time) == 0.0
-    if same.any():
+    if same.any() and np.mean(same) >= FEW_REPEATED:
         for column in (rate, *columns.values()):
             if np.shape(column)[:1] != time.shape:
                 continue  # not there, or not of this length, which is refused below

@@ -27,18 +27,17 @@ def recording_case(recording: Recording, parameters: AhrsParameters | None = Non
 
     By ``ahrs.MOTIONS["any"]`` if not told, and without what is made good of the delays between sensors.
     """
-    chosen = parameters or ahrs.MOTIONS["any"]
     if recording.specific_force is None:
         raise InputError(f"{recording.source} has no accelerometer, which shows the vertical; add columns ax, ay, az")
     span = ahrs.quiet_span(recording)
     used = recording.since(span.start)
-    quiet = slice(0, span.stop - span.start)
+    prepared = ahrs.prepare(used, slice(0, span.stop - span.start), parameters or ahrs.MOTIONS["any"])
     return Case(
-        record=ahrs.imu_record(used, quiet, chosen),
-        initial=ahrs.start(used, quiet, chosen),
+        record=prepared.record,
+        initial=prepared.initial,
         name=used.source,
-        true_attitude=used.true_attitude,
-        judged=used.movement,
+        true_attitude=None if used.true_attitude is None else used.true_attitude[prepared.edge],
+        judged=None if used.movement is None else used.movement[prepared.edge],
     )
 
 

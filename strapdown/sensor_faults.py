@@ -1,0 +1,132 @@
+"""Samples of a recording that are not what the unit did: clipped ones, and a gyro that was silent.
+
+A clipped gyro sample is a lower bound of the rate. Between the samples before and after such a run the rate is restored by a cubic
+(:func:`restored`), and its error becomes a variance of the turn, which the filter adds to that of the gyro's noise. So does the turn over a
+gap. A clipped sample of the accelerometer has a false direction and is left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from strapdown.checks import Array
+from strapdown.recordings import Recording
+
+MIN_CLIPPED_RATE = 1.0
+"""A gyro axis is not taken for clipped below this, rad/s: quantised samples at rest repeat their extreme too."""
+MIN_CLIPPED_FORCE = 15.0
+"""Nor an accelerometer axis below this, m/s²."""
+MIN_CLIPPED = 3
+"""Samples at the extreme, at least two of them in a row, that make an axis clipped."""
+MAX_REPEATS = 0.1
+"""Share of the other samples equal to the one before above which a sensor repeats samples as it is, and nothing is said of clipping."""
+RESTORED_ERROR = 0.5
+"""σ of the turn beyond the limit over a clipped run, as a share of what the cubic makes of it."""
+RESTORED_SPAN = 0.3
+"""How long the angular acceleration at the ends of a clipped run is taken to last, s."""
+LONG_INTERVAL = 1.5
+"""An interval between stamps of more than this many usual ones has a turn that the gyro does not show."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Faults:
+    """What was found in a recording."""
+
+    recording: Recording
+    """The recording with clipped gyro samples restored and clipped samples of the accelerometer missing."""
+    turn_variance: Array
+    """Variance of the turn over each interval that the gyro does not show (n − 1,), rad² an axis, beyond its noise; mostly 0."""
+    words: tuple[str, ...]
+    """What is to be said of it."""
+
+
+def find(recording: Recording) -> Faults:
+    """Return the faults of a recording's samples, and the recording without them."""
+    words = []
+    rate, variance, clipped = restored(recording.time, recording.rate)
+    changes: dict[str, Any] = {}
+    if clipped.any():
+        changes["rate"] = rate
+        limits = ", ".join(
+            f"{axis} at {np.rad2deg(np.abs(recording.rate[clipped[:, k], k]).max()):.4g} °/s ({clipped[:, k].mean():.2%})"
+            for k, axis in enumerate("xyz")
+            if clipped[:, k].any()
+        )
+        words.append(
+            f"The gyro was clipped: {limits} of the samples. The rate is restored from the samples around, and σ grows over each run"
+        )
+    force = recording.specific_force
+    if force is not None and (saturated := clipped_samples(force, MIN_CLIPPED_FORCE)).any():
+        lost = np.asarray(saturated.any(axis=1))
+        changes["specific_force"] = np.where(lost[:, None], np.nan, force)
+        words.append(f"The accelerometer was clipped in {np.sum(lost)} samples ({lost.mean():.2%}), which are left out")
+    steps = np.diff(recording.time)
+    usual = float(np.median(steps))
+    long = np.flatnonzero(steps > LONG_INTERVAL * usual)
+    for k in long:
+        variance[k] += turn_variance_over(recording.time, rate, float(steps[k]), usual)
+    if len(long):
+        words.append(
+            f"{len(long)} intervals between stamps are longer than {LONG_INTERVAL:g} usual ones, up to {steps.max():.3g} s: σ grows over "
+            "each by what the rate changes in as long a time"
+        )
+    return Faults(recording=replace(recording, **changes), turn_variance=variance, words=tuple(words))
+
+
+def clipped_samples(samples: Array, least: float) -> np.ndarray:
+    """Return which of the samples (n, 3) are at their sensor's limit: those that repeat the extreme of their axis, beyond ``least``."""
+    found = np.zeros(samples.shape, bool)
+    for k, axis in enumerate(samples.T):
+        same = np.append(False, axis[1:] == axis[:-1])
+        extremes = [axis == end for end in (np.nanmax(axis, initial=-np.inf), np.nanmin(axis, initial=np.inf))]
+        between = ~(extremes[0] | extremes[1])
+        if not between.any() or np.mean(same[between]) > MAX_REPEATS:
+            continue
+        for at in extremes:
+            if np.sum(at) >= MIN_CLIPPED and np.any(at & same) and abs(axis[np.argmax(at)]) >= least:
+                found[:, k] |= at
+    return found
+
+
+def restored(time: Array, rate: Array) -> tuple[Array, Array, np.ndarray]:
+    """Return rates (n, 3) with clipped runs restored, the variance of the turn (n − 1,) over each interval, and which samples were clipped.
+
+    A run is bridged by the cubic of the values and slopes beside it, but stays beyond the limit. The turn beyond the limit over a whole
+    run is uncertain by :data:`RESTORED_ERROR` of itself; its variance is spread evenly over the intervals of the run.
+    """
+    clipped = clipped_samples(rate, MIN_CLIPPED_RATE)
+    result, variance = rate.copy(), np.zeros(len(time) - 1)
+    for k in np.flatnonzero(clipped.any(axis=0)):
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], clipped[:, k].astype(int), [0]])))
+        for first, stop in edges.reshape(-1, 2):
+            limit = rate[first, k]
+            if first < 2 or stop + 1 >= len(time):
+                variance[max(first - 1, 0) : stop] += (RESTORED_ERROR * limit * (time[1] - time[0])) ** 2
+                continue
+            t0, t1 = time[first - 1], time[stop]
+            u = (time[first:stop] - t0) / (t1 - t0)
+            start, end = rate[first - 1, k], rate[stop, k]
+            span = min(t1 - t0, RESTORED_SPAN)
+            rise = (start - rate[first - 2, k]) / (t0 - time[first - 2]) * span
+            fall = (rate[stop + 1, k] - end) / (time[stop + 1] - t1) * span
+            cubic = start + u * (
+                rise + u * (3.0 * (end - start) - 2.0 * rise - fall + u * (2.0 * (start - end) + rise + fall))
+            )
+            beyond = np.maximum(np.sign(limit) * (cubic - limit), 0.0)
+            result[first:stop, k] = limit + np.sign(limit) * beyond
+            turn = float(np.sum(beyond)) * (t1 - t0) / (stop - first + 1)
+            variance[first - 1 : stop] += (RESTORED_ERROR * turn) ** 2 / (stop - first + 1)
+    return result, variance, clipped
+
+
+def turn_variance_over(time: Array, rate: Array, length: float, usual: float) -> float:
+    """Return the variance of a turn, rad² an axis, that is taken from the rates at the ends of an interval of this length, s.
+
+    With D the mean square change of the rate over as long a time elsewhere in the recording, a rate that wanders between both ends as a
+    Brownian bridge turns by ``T² D/12`` about the mean of both.
+    """
+    lag = min(max(1, round(length / usual)), len(time) - 1)
+    return length**2 / 12.0 * float(np.mean((rate[lag:] - rate[:-lag]) ** 2))
