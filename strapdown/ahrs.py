@@ -349,7 +349,7 @@ def _turns(recording: Recording, quiet: slice, rate: Array) -> bool:
     return bool(s @ e > 0.5 * (e @ e))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class AhrsEstimate:
     """An estimate beside the samples that it was made from, one row for one row."""
 

@@ -28,7 +28,7 @@ SMALLEST_SPAN = 0.5
 """Range of temperature, K, below which no regression is made."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class TemperatureFit:
     """A sensor's bias over temperature."""
 

@@ -28,7 +28,7 @@ GIVEN_SIGMA = 3e-4
 """σ of a gyro delay that is given, s."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Delays:
     """Delays of a recording's sensors."""
 

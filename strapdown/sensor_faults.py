@@ -31,7 +31,7 @@ LONG_INTERVAL = 1.5
 """An interval between stamps of more than this many usual ones has a turn that the gyro does not show."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Faults:
     """What was found in a recording."""
 

@@ -20,7 +20,7 @@ from strapdown.records import ErrorStateEstimate
 KEYS = ("gyro_scale_and_misalignment", "sigma", "magnetometer_delay_ms", "source")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class UnitCalibration:
     """Calibration of one unit."""
 

@@ -22,7 +22,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from strapdown import quaternion
+from strapdown import quaternion, reading
 from strapdown.checks import Array, InputError
 from strapdown.recordings.delimited import read_csv
 from strapdown.recordings.recording import Recording
@@ -121,10 +121,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _rows(path: Path, separator: str | None) -> list[list[str]]:
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path.name} cannot be read as text ({error})") from None
+    lines = reading.text(path).splitlines()
     rows = [line.strip().split(separator) for line in lines if line.strip() and not line.lstrip().startswith("#")]
     for k, row in enumerate(rows):
         try:
