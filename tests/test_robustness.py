@@ -8,10 +8,11 @@ from scipy.stats import binom, chi2
 
 from strapdown import consistency, estimation, motion, quaternion, records
 from strapdown.checks import InputError
+from strapdown.estimation import gating
 from strapdown.estimation.gating import Gate, Monitor, Robust
 from strapdown.estimation.states import ProcessNoise, initial_state
 from strapdown.gyro import GyroSpec
-from strapdown.kernels import robust_gate, robust_loop
+from strapdown.kernels import covariance_form, robust_gate
 from strapdown.kernels.robust_step import ACCEPTED, PASSED_OVER, REFUSED
 from strapdown.randomness import generator
 from strapdown.scenarios import Scenario, simulate
@@ -411,7 +412,7 @@ def test_the_rules_of_a_gate():
     assert np.array_equal(memory[robust_gate.FIRST_VARIANCE :], [9.0, 9.0, 9.0])
     assert (memory[robust_gate.LEVEL], memory[robust_gate.NIS], memory[robust_gate.DEGREES]) == (1.0, 0.0, 0.0)
     assert robust_gate.restart_attitude(0.1, memory) == pytest.approx(0.3)
-    assert robust_gate.restart_attitude(1.0, memory) == estimation.UNIFORM_SIGMA
+    assert robust_gate.restart_attitude(1.0, memory) == gating.UNIFORM_SIGMA
 
 
 def test_a_widened_challenger_is_one_that_started_wider():
@@ -427,9 +428,19 @@ def test_a_widened_challenger_is_one_that_started_wider():
         bias, first = rng.standard_normal(3), 1e-7 * rng.standard_normal(3)
         states = np.zeros((2, 28))
         states[1] = pack(np.array([1.0, 0.0, 0.0, 0.0]), bias, P)
+        form = covariance_form.Body(
+            states=states,
+            angle_variance=0.0,
+            rate_variance=0.0,
+            sharpness=np.inf,
+            least_share=0.0,
+            check=1,
+            good=np.zeros(2, np.int64),
+            work=np.empty((7, 6)),
+        )
         memory = np.zeros(robust_gate.MEMORY)
         memory[robust_gate.FIRST_BIAS :] = [*(bias + first), *variance]
-        robust_loop.widen(states, memory)
+        covariance_form.widen(form, memory)
         expected = np.linalg.inv(seen + np.diag([0.0, 0.0, 0.0, *(1.0 / (9.0 * variance))]))
         # The mean solves P⁻¹ x = seen x̂ + start, of which the start's part shrinks too.
         mean = -expected[:, 3:] @ (8.0 / 9.0 / variance * first)
@@ -506,7 +517,7 @@ def test_a_recovery_on_one_direction_knows_what_it_does_not_know(runs):
         turns.append(np.sqrt(np.einsum("ki,kij,kj->k", n, estimate.covariance[:, :3, :3], n))[2:])
     low, high = consistency.mean_bounds(6, runs, 0.999)
     assert np.all((low < np.mean(nees, axis=0)) & (np.mean(nees, axis=0) < high)), np.mean(nees, axis=0)
-    assert np.allclose(turns, estimation.UNIFORM_SIGMA, rtol=0.02)
+    assert np.allclose(turns, gating.UNIFORM_SIGMA, rtol=0.02)
 
 
 @pytest.mark.parametrize("bias_sigma", [1e-3, 2e-2])
@@ -768,4 +779,4 @@ def test_bad_input_is_named(case):
 
 def test_a_uniform_angle_has_the_standard_deviation_of_a_fresh_start():
     draw = generator(1, 0, "uniform").uniform(-np.pi, np.pi, 100_000)
-    assert np.std(draw) == pytest.approx(estimation.UNIFORM_SIGMA, rel=5e-3)
+    assert np.std(draw) == pytest.approx(gating.UNIFORM_SIGMA, rel=5e-3)
