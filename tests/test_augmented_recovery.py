@@ -479,7 +479,7 @@ def test_a_challenger_that_is_widened_is_what_it_would_be_had_it_started_so():
     np.testing.assert_allclose(form.attitude[1], turn, atol=1e-12)
     upper = tuple(expected[:3, :3][np.triu_indices(3)])
     G = np.eye(9)
-    G[:3, :3] = np.reshape(robust_step.seen_from(tuple(turn), upper, tuple(np.eye(3).ravel()))[1], (3, 3))
+    G[:3, :3] = np.reshape(robust_step.tangent_at(tuple(turn), upper)[0], (3, 3))
     np.testing.assert_allclose(found.T @ found, G @ expected @ G.T, rtol=1e-8, atol=1e-12)
     assert np.array_equal(found, np.tril(found))
     np.testing.assert_allclose(memory[robust_gate.FIRST_BIAS + 3 : robust_gate.FIRST_BIAS + 6], 9.0 * STARTED**2)

@@ -199,7 +199,7 @@ def test_a_missing_definition_is_refused_by_its_name():
         TypeError, match=r"^strapdown\.kernels\.loop leaves begin open, and strapdown\.kernels\.doubles does not"
     ):
         machine.helper(loop.repeated, (doubles,))
-    with pytest.raises(TypeError, match=r"leaves begin open, and nothing does not define it|leaves begin open"):
+    with pytest.raises(TypeError, match=r"^strapdown\.kernels\.loop leaves begin open"):
         machine.compiled(loop.repeated)
     with pytest.raises(TypeError, match=r"walk leaves \w+ open, and strapdown\.kernels\.algebra does not define it"):
         machine.compiled(walk, algebra)
@@ -256,7 +256,7 @@ def test_every_body_defines_all_that_is_left_open_with_the_same_arguments(parts)
                 getattr(part, name) for part in parts if name in vars(part) and name not in getattr(part, "OPEN", ())
             ]
             assert defined, f"{name} of {module.__name__}"
-            assert list(signature(defined[0]).parameters) == list(signature(stub).parameters), name
+            assert len(signature(defined[0]).parameters) == len(signature(stub).parameters), name
             assert defined[0].__doc__
 
 
@@ -267,7 +267,7 @@ def test_a_literal_argument_compiles_no_helper_twice():
         "def both(n, x):\n    return product(3, x) + product(n, x) + product(n=4, x=x)\n",
     )
     assert machine.helper(module.both)(5, 1.5) == 18.0
-    assert len(machine.helper(module.product).signatures) == 1
+    assert len(machine.helper(module.product, ()).signatures) == 1
 
 
 # ---------------------------------------------------------------------------------------------------- what it runs on

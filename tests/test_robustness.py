@@ -452,7 +452,7 @@ def test_a_widened_challenger_is_one_that_started_wider():
 
 def test_a_prior_is_seen_from_elsewhere_as_its_turn_and_tilt_say():
     """``exp(α n) ⊗ exp(ε)`` differentiated about (α₀, ε₀) by differences, of a variance with one axis hardly known."""
-    from strapdown.kernels.robust_step import seen_from
+    from strapdown.kernels.robust_step import tangent_at
 
     rng = np.random.default_rng(4)
     for _ in range(20):
@@ -475,16 +475,16 @@ def test_a_prior_is_seen_from_elsewhere_as_its_turn_and_tilt_say():
 
         h = 1e-5
         G = np.stack([(error(h * e) - error(-h * e)) / (2.0 * h) for e in np.eye(3)], axis=1)
-        packed, carried_B, back = seen_from(tuple(now), tuple(A[np.triu_indices(3)]), tuple(B.ravel()))
-        assert np.allclose(np.reshape(carried_B, (3, 3)), G @ B, atol=1e-3)
-        assert np.allclose(packed, (G @ A @ G.T)[np.triu_indices(3)], atol=1e-3)
+        M, back = tangent_at(tuple(now), tuple(A[np.triu_indices(3)]))
+        M = np.reshape(M, (3, 3))
+        assert np.allclose(M @ B, G @ B, atol=1e-3)
+        assert np.allclose(M @ A @ M.T, G @ A @ G.T, atol=1e-3)
         assert np.allclose(back, G @ (-turn * n - tilt), atol=1e-3)
         # To the first order in the tilt nothing is left out: the unknown axis is where no row of a direction sees it.
         assert np.allclose(G @ n, quaternion.rotate(quaternion.exp(-tilt), n), atol=1e-9)
-        whole, _, _ = seen_from(
-            tuple(now), tuple((3.0 * np.outer(n, n) + 1e-9 * np.eye(3))[np.triu_indices(3)]), (0.0,) * 9
-        )
-        assert np.allclose(whole, (3.0 * np.outer(G @ n, G @ n))[np.triu_indices(3)], atol=1e-8)
+        known = 3.0 * np.outer(n, n) + 1e-9 * np.eye(3)
+        M = np.reshape(tangent_at(tuple(now), tuple(known[np.triu_indices(3)]))[0], (3, 3))
+        assert np.allclose(M @ known @ M.T, 3.0 * np.outer(G @ n, G @ n), atol=1e-8)
 
 
 def turn_and_tilt(estimate, record, reference, every):
