@@ -351,11 +351,14 @@ def swaying(duration=2.0, seed=1, start_error=(0.05, -0.02, 0.03)):
 
 def difference(one, other, k=slice(None), j=slice(None)):
     """Largest difference of rows k of one estimate and j of another, in σ, and of covariances scaled to correlations."""
-    sigma = np.sqrt(np.einsum("...ii->...i", other.whole_covariance[j]))
+    mine, theirs = (
+        e.covariance[r] if e.whole_covariance is None else e.whole_covariance[r] for e, r in ((one, k), (other, j))
+    )
+    sigma = np.sqrt(np.einsum("...ii->...i", theirs))
     off = quaternion.log(quaternion.multiply(quaternion.conjugate(one.attitude[k]), other.attitude[j]))
     parts = [off, one.bias[k] - other.bias[j]]
     parts += [block.values[k] - other.error_states[name].values[j] for name, block in one.error_states.items()]
-    P = (one.whole_covariance[k] - other.whole_covariance[j]) / (sigma[..., :, None] * sigma[..., None, :])
+    P = (mine - theirs) / (sigma[..., :, None] * sigma[..., None, :])
     return max(np.max(np.abs(np.concatenate(parts, axis=-1)) / sigma), np.max(np.abs(P)))
 
 

@@ -570,7 +570,7 @@ def judged(
         elif blocks:
             told = {blocks[0].name: np.zeros(3)}
         e = estimate.errors(truth["attitude"], truth["bias"], told)[epochs]
-        P = estimate.whole_covariance[epochs]
+        P = (estimate.whole_covariance if blocks else estimate.covariance)[epochs]
         parts = {"attitude": slice(0, 3), "bias": slice(3, 6), "block": slice(6, None), "all": slice(None)}
         for name, part in parts.items():
             if name in ("block", "all") and model != "bounded velocity":

@@ -592,7 +592,7 @@ def test_for_small_errors_its_weights_are_the_plain_filters(kind, robust, monkey
     rest = ImuRecord(time=np.concatenate([[0.5], at]), increments=np.zeros((40, 3)), vectors=(second,))
     single = estimation.run(rest, noise_of_gyro, start, robust=robust)
     assert len(found.estimate.time) == 1
-    weight, expected = (one.innovations["second"].weight for one in (found.estimate, plain))
+    weight, expected = (one.innovations["second"].weight for one in (found.estimate, single))
     assert expected.min() < 0.5
     np.testing.assert_allclose(weight, expected, rtol=3e-3)
     np.testing.assert_allclose(found.estimate.attitude[-1], single.attitude[-1], atol=2e-5)

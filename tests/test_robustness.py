@@ -633,7 +633,8 @@ def test_a_weight_is_the_fixed_point_of_its_equation():
         variance = rng.uniform(0.1, 2.0, 3)
         y = 3.0 * rng.standard_normal(3)
         packed = tuple(A[np.triu_indices(3)])
-        w = robust_weight(STUDENT, 5.0, 7.0, 200, packed, *(tuple(h) for h in H), tuple(y), tuple(variance))
+        S = covariance_form.innovation_covariance(None, 0, (None, None, packed, None, None), tuple(map(tuple, H)))
+        w = robust_weight(STUDENT, 5.0, 7.0, 200, S, tuple(y), tuple(variance))
         R = np.diag(variance) / w
         gain = A @ H.T @ np.linalg.inv(H @ A @ H.T + R)
         posterior = A - gain @ H @ A
@@ -655,9 +656,8 @@ def test_hubers_update_is_the_minimum_of_hubers_cost():
         variance = rng.uniform(0.1, 0.5, 3)
         y = 6.0 * rng.standard_normal(3)
         k = 1.5
-        w = robust_weight(
-            HUBER, k * k, 0.0, 400, tuple(A[np.triu_indices(3)]), *(tuple(h) for h in H), tuple(y), tuple(variance)
-        )
+        S = tuple((H @ A @ H.T)[np.triu_indices(3)])
+        w = robust_weight(HUBER, k * k, 0.0, 400, S, tuple(y), tuple(variance))
         R = np.diag(variance) / w
         x = A @ H.T @ np.linalg.solve(H @ A @ H.T + R, y)
 
