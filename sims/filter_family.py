@@ -65,7 +65,9 @@ COLOURS = {
     "fixed-side": plots.ink(),
     "right-invariant": plots.VERMILION,
     "two-frame": plots.ink(),
+    "equivariant": plots.YELLOW,
     "geometric": plots.SKY,
+    "schmidt": plots.ORANGE,
     "usque": plots.PURPLE,
     "mahony": plots.GREEN,
 }

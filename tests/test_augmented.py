@@ -11,14 +11,12 @@ import in_steps
 import mpmath
 import numpy as np
 import pytest
-from strapdown.error_states import Block
-from strapdown.observability import without_errors
 
 from strapdown import consistency, estimation, kinematics, motion, quaternion, records
 from strapdown.checks import InputError
 from strapdown.estimation import error_states
 from strapdown.estimation.gating import Gate
-from strapdown.estimation.observability import state_names
+from strapdown.estimation.observability import state_names, without_errors
 from strapdown.estimation.schedule import KIND_CODES
 from strapdown.estimation.states import ProcessNoise
 from strapdown.estimation.step_filter import StepFilter
@@ -153,7 +151,7 @@ class Mounting(error_states.ErrorStates):
         return {"tracker": error_states.Effect(offset_b=np.eye(3))}
 
 
-OPTIONS: dict[str, tuple[Block, ...]] = {
+OPTIONS: dict[str, tuple[error_states.ErrorStates, ...]] = {
     "none": (),
     "gyro scale": (error_states.GyroScale(scale_sigma=0.02, misalignment_sigma=0.01),),
     "gyro drift": (error_states.GyroGaussMarkov(bias_sigma=np.array([3e-3, 4e-3, 5e-3]), correlation_time=1.5),),
@@ -244,7 +242,7 @@ def test_both_faces_are_one_filter(option):
 # -------------------------------------------------------------------------------------------------------------------- exact models
 
 
-def face_at(blocks: tuple[Block, ...], values=None, body_motion=SWAY) -> StepFilter:
+def face_at(blocks: tuple[error_states.ErrorStates, ...], values=None, body_motion=SWAY) -> StepFilter:
     """The step-by-step face at an attitude with a bias, its blocks at random values."""
     state = estimation.with_error_states(start(body_motion), blocks)
     if values is None:
@@ -362,7 +360,7 @@ SENSORS = {
 }
 
 
-def effects_of(blocks: tuple[Block, ...], values: np.ndarray) -> dict:
+def effects_of(blocks: tuple[error_states.ErrorStates, ...], values: np.ndarray) -> dict:
     found: dict = {}
     first = 0
     for block in blocks:
@@ -579,7 +577,7 @@ def test_effects_in_the_sensors_own_unit_keep_it_from_part_to_part(gate):
 # ------------------------------------------------------------------------------------------------------------------------- smoother
 
 
-def carried_by(blocks: tuple[Block, ...], turn: np.ndarray) -> np.ndarray:
+def carried_by(blocks: tuple[error_states.ErrorStates, ...], turn: np.ndarray) -> np.ndarray:
     """What a turn of the attitude, fixed axes, makes of the states (…, n, n): of those of coloured noise in fixed axes a turned vector."""
     size = 6 + sum(block.size for block in blocks)
     T = np.broadcast_to(np.eye(size), (*turn.shape[:-1], size, size)).copy()

@@ -9,24 +9,22 @@ from collections.abc import Callable
 import in_steps
 import numpy as np
 import pytest
-from strapdown.kernels.augmented_robust import start_challenger, widen
 
 from strapdown import consistency, estimation, montecarlo, motion, quaternion, records, setup
-from strapdown.estimation import error_states
-from strapdown.estimation.error_states import Block
+from strapdown.estimation import error_states, forward
 from strapdown.estimation.gating import UNIFORM_SIGMA, Gate, Robust
-from strapdown.estimation.model import assemble
+from strapdown.estimation.model import Model, assemble
 from strapdown.estimation.states import ProcessNoise
 from strapdown.estimation.step_filter import StepFilter
 from strapdown.gyro import GyroSpec
-from strapdown.kernels import robust_gate, robust_step
+from strapdown.kernels import robust_gate, robust_step, root_form
 from strapdown.kernels.robust_gate import WIDE_PASSES
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Truth
 from strapdown.scenarios import Scenario
 from strapdown.setup import FilterSetup
 from strapdown.setup import states as optional
-from strapdown.setup.states import SensorStates, States, filtering
+from strapdown.setup.states import SensorStates, States
 from strapdown.vectors import Accelerometer, Magnetometer, VectorMeasurements
 
 HAND = motion.HarmonicRates(
@@ -64,7 +62,7 @@ class Mounting(error_states.ErrorStates):
         return {"tracker": error_states.Effect(offset_b=np.eye(3))}
 
 
-CASES: dict[str, tuple[tuple[str, ...], tuple[Block, ...]]] = {
+CASES: dict[str, tuple[tuple[str, ...], tuple[error_states.ErrorStates, ...]]] = {
     "hard iron": (("mag", "acc"), (IRON,)),
     "all": (("mag", "acc"), (IRON, SCALE, SWAY)),
     "biased direction": (
@@ -343,6 +341,41 @@ def test_a_right_filter_never_starts_anew(runs):
 # ---------------------------------------------------------------------------------------------------------- what a challenger knows
 
 
+def still_model(decay, density):
+    """A model of states that enter nothing."""
+    m = len(decay)
+    return Model(
+        order=np.arange(m),
+        decay=decay,
+        density=density,
+        chains=np.empty((0, 3)),
+        changing=int(np.sum((decay > 0.0) | (density > 0.0))),
+        limit=np.inf,
+        gyro=np.zeros((m, 12)),
+        gyro_use=np.zeros(m, np.int64),
+        sensors=np.zeros((0, m, 15)),
+        sensor_use=np.zeros((0, m), np.int64),
+        force_f=np.zeros(3),
+    )
+
+
+def form_of(model):
+    """A filter of a model and its restart candidate, all zero."""
+    size = 6 + model.states
+    return root_form.Body(
+        model=forward.model_arrays(model, (0.0, 0.0)),
+        attitude=np.zeros((2, 4)),
+        x=np.zeros((2, size - 3)),
+        F=np.zeros((2, size + model.noise_rows, size)),
+        length=np.empty(0),
+        turning=np.empty((0, 9)),
+        scratch=forward.scratch(model),
+        sharpness=np.inf,
+        least_share=0.0,
+        check=1,
+    )
+
+
 @pytest.mark.parametrize("level", [0, 2])
 def test_a_challenger_knows_what_the_prior_says_by_now(level):
     """Means and covariance of states: one stays, one walks, one forgets, and two hang together; the others' σ is 3^level times as wide."""
@@ -353,41 +386,29 @@ def test_a_challenger_knows_what_the_prior_says_by_now(level):
     root = np.tril(rng.standard_normal((4, 4)))
     values, age = rng.standard_normal(4), 1.7
     size, bias_sigma = 10, np.array([0.3, 0.1, 0.2])
-    attitude, x, F = np.zeros((2, 4)), np.zeros((2, 7)), np.zeros((2, size, size))
+    form = form_of(still_model(decay, density))
+    attitude, x, F = form.attitude, form.x, form.F
     attitude[0], x[0] = unit(rng.standard_normal(4)), rng.standard_normal(7)
-    F[0] = np.tril(rng.standard_normal((size, size)))
+    F[0, :size] = np.tril(rng.standard_normal((size, size)))
     F[1] = np.nan
-    P = F[0].T @ F[0]
-    start_challenger(
-        attitude,
-        x,
-        F,
-        size,
-        memory,
-        now,
-        1.8,
-        bias_sigma,
-        values,
-        root,
-        now - age,
-        decay,
-        density,
-        np.empty((0, 2)),
-        np.empty((18, 7)),
-        np.empty(size),
+    P = F[0, :size].T @ F[0, :size]
+    restart = root_form.Restart(
+        bias_sigma=bias_sigma, values=values, root=root, time=now - age, fresh=np.empty((18, 7))
     )
+    root_form.start_candidate(form, memory, now, 1.8, restart)
     expected = np.zeros((size, size))
     expected[:3, :3] = max(1.8, min(1.8 * width, UNIFORM_SIGMA)) ** 2 * np.eye(3)
     expected[3:6, 3:6] = P[3:6, 3:6] + width**2 * np.diag(bias_sigma**2)
     kept = np.exp(-decay * age)
     time = np.where(decay > 0.0, (1.0 - kept**2) / np.where(decay > 0.0, 2.0 * decay, 1.0), age)
     expected[6:, 6:] = kept[:, None] * (root.T @ root) * kept + np.diag(density * time)
-    np.testing.assert_allclose(F[1].T @ F[1], expected, rtol=1e-12, atol=1e-14)
-    assert np.array_equal(F[1], np.tril(F[1]))
+    found = F[1, :size]
+    np.testing.assert_allclose(found.T @ found, expected, rtol=1e-12, atol=1e-14)
+    assert np.array_equal(found, np.tril(found))
     assert np.array_equal(attitude[1], attitude[0])
     assert np.array_equal(x[1, :3], x[0, :3])
     np.testing.assert_allclose(x[1, 3:], kept * values, rtol=1e-14)
-    np.testing.assert_allclose(F[0].T @ F[0], P, rtol=1e-14)
+    np.testing.assert_allclose(F[0, :size].T @ F[0, :size], P, rtol=1e-14)
     assert (memory[robust_gate.CHALLENGED], memory[robust_gate.SINCE]) == (1.0, now)
     assert np.array_equal(memory[robust_gate.FIRST_BIAS : robust_gate.FIRST_VARIANCE], x[0, :3])
     np.testing.assert_allclose(memory[robust_gate.FIRST_VARIANCE :], np.diag(expected)[3:6], rtol=1e-12)
@@ -407,26 +428,13 @@ def test_a_challenger_knows_what_the_prior_of_chains_says_by_now(age):
     root, values = np.tril(rng.standard_normal((m, m))), rng.standard_normal(m)
     model = assemble(blocks, {"acc": "direction"})
     assert np.array_equal(model.order, np.arange(m))
-    attitude, x, F = np.zeros((2, 4)), np.zeros((2, 3 + m)), np.zeros((2, 6 + m, 6 + m))
-    F[0] = np.eye(6 + m)
-    start_challenger(
-        attitude,
-        x,
-        F,
-        6 + m,
-        np.zeros(robust_gate.MEMORY),
-        age,
-        1.8,
-        np.ones(3),
-        values,
-        root,
-        0.0,
-        model.decay,
-        model.density,
-        model.chains,
-        np.empty((3 * m + 6, 3 + m)),
-        np.empty(6 + m),
+    form = form_of(model)
+    x, F = form.x, form.F
+    F[0, : 6 + m] = np.eye(6 + m)
+    restart = root_form.Restart(
+        bias_sigma=np.ones(3), values=values, root=root, time=0.0, fresh=np.empty((3 * m + 6, 3 + m))
     )
+    root_form.start_candidate(form, np.zeros(robust_gate.MEMORY), age, 1.8, restart)
     Phi, Q = np.eye(m), np.zeros((m, m))
     first = 0
     for block in blocks:
@@ -435,19 +443,20 @@ def test_a_challenger_knows_what_the_prior_of_chains_says_by_now(age):
             Phi[own, own], Q[own, own] = block.transition(age), block.process_noise(age)
         first += block.size
     np.testing.assert_allclose(x[1, 3:], Phi @ values, rtol=1e-9, atol=1e-12)
-    found = (F[1].T @ F[1])[6:, 6:]
+    found = (F[1, : 6 + m].T @ F[1, : 6 + m])[6:, 6:]
     np.testing.assert_allclose(found, Phi @ root.T @ root @ Phi.T + Q, rtol=1e-8, atol=1e-9)
 
 
 def challenger_of(P, bias, values):
-    """Rows of a challenger with covariance P, and its memory where its bias, which started at zero, has the σ of ``STARTED``."""
+    """A challenger with covariance P, and its memory where its bias, which started at zero, has the σ of ``STARTED``."""
     size = len(P)
-    attitude, x, F = np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)), np.zeros((2, size - 3)), np.zeros((2, size + 6, size))
-    F[1, :size] = np.linalg.cholesky(P[::-1, ::-1])[::-1, ::-1].T
-    x[1] = [*bias, *values]
+    form = form_of(still_model(*np.zeros((2, size - 6))))
+    form.attitude[:, 0] = 1.0
+    form.F[1, :size] = np.linalg.cholesky(P[::-1, ::-1])[::-1, ::-1].T
+    form.x[1] = [*bias, *values]
     memory = np.zeros(robust_gate.MEMORY)
     memory[robust_gate.FIRST_BIAS + 3 : robust_gate.FIRST_BIAS + 6] = STARTED**2
-    return attitude, x, F, size, memory, np.empty((0, 3)), np.empty(size), np.empty(size)
+    return form, memory
 
 
 STARTED = np.array([0.1, 0.2, 0.3])
@@ -462,17 +471,17 @@ def test_a_challenger_that_is_widened_is_what_it_would_be_had_it_started_so():
     wide = start * np.array([1.0, 1.0, 1.0, 3.0, 3.0, 3.0, 1.0, 1.0, 1.0])
     P, expected = (np.linalg.inv(np.diag(sigma**-2.0) + H.T @ H) for sigma in (start, wide))
     mean, there = P @ H.T @ z, expected @ H.T @ z
-    rows = challenger_of(P, mean[3:6], mean[6:])
-    attitude, x, F, _, memory, *_ = rows
-    widen(*rows)
-    np.testing.assert_allclose(x[1], there[3:], rtol=1e-9, atol=1e-12)
+    form, memory = challenger_of(P, mean[3:6], mean[6:])
+    root_form.widen(form, memory)
+    found = form.F[1, :9]
+    np.testing.assert_allclose(form.x[1], there[3:], rtol=1e-9, atol=1e-12)
     turn = quaternion.exp(there[:3] - mean[:3])
-    np.testing.assert_allclose(attitude[1], turn, atol=1e-12)
+    np.testing.assert_allclose(form.attitude[1], turn, atol=1e-12)
     upper = tuple(expected[:3, :3][np.triu_indices(3)])
     G = np.eye(9)
-    G[:3, :3] = np.reshape(robust_step.seen_from(tuple(turn), upper, tuple(np.eye(3).ravel()))[1], (3, 3))
-    np.testing.assert_allclose(F[1].T @ F[1], G @ expected @ G.T, rtol=1e-8, atol=1e-12)
-    assert np.array_equal(F[1], np.tril(F[1]))
+    G[:3, :3] = np.reshape(robust_step.tangent_at(tuple(turn), upper)[0], (3, 3))
+    np.testing.assert_allclose(found.T @ found, G @ expected @ G.T, rtol=1e-8, atol=1e-12)
+    assert np.array_equal(found, np.tril(found))
     np.testing.assert_allclose(memory[robust_gate.FIRST_BIAS + 3 : robust_gate.FIRST_BIAS + 6], 9.0 * STARTED**2)
     assert memory[robust_gate.LEVEL] == 1.0
 
@@ -481,9 +490,9 @@ def test_widening_a_bias_whose_axes_hang_together_leaves_a_covariance():
     """Of a filter's own bias, as uncertain as its start and correlated: more is known of the start than its diagonal says."""
     P = np.eye(6)
     P[3:, 3:] = np.outer(STARTED, STARTED) * (0.2 * np.eye(3) + 0.8)
-    rows = challenger_of(P, 0.5 * STARTED, ())
-    widen(*rows)
-    found = rows[2][1].T @ rows[2][1]
+    form, memory = challenger_of(P, 0.5 * STARTED, ())
+    root_form.widen(form, memory)
+    found = form.F[1, :6].T @ form.F[1, :6]
     assert np.isfinite(found).all()
     assert np.min(np.linalg.eigvalsh(found - P)) > -1e-12
     assert np.all(np.diag(found)[3:] > np.diag(P)[3:])
@@ -496,7 +505,7 @@ def test_a_start_that_is_surer_than_its_blocks_is_not_believed_by_a_challenger()
     P = begun.covariance.copy()
     P[6:, 6:] = np.diag([1e-8, 1e-8, 3e-6]) ** 2
     P[6, 7] = P[7, 6] = 5e-17
-    values, found = filtering.restart_states(
+    values, found = forward.restart_states(
         dataclasses.replace(begun, values=np.array([1e-6, 2e-6, 3e-6]), covariance=P), (IRON,)
     )
     assert np.array_equal(values, [1e-6, 2e-6, 3e-6])

@@ -8,14 +8,13 @@ import math
 import numpy as np
 import pytest
 import scipy.linalg
-from strapdown.angular_acceleration import turning
-from strapdown.augmented import filtering, joining, smoothing
-from strapdown.model import aged_prior
 
 from strapdown import consistency, estimation, kinematics, motion, quaternion, records
 from strapdown.checks import InputError
-from strapdown.estimation import error_states
+from strapdown.estimation import error_states, forward, recovery_segments, smoothing
+from strapdown.estimation.angular_acceleration import turning
 from strapdown.estimation.gating import Gate
+from strapdown.estimation.model import aged_prior
 from strapdown.estimation.states import ProcessNoise
 from strapdown.records import ImuRecord
 from strapdown.vectors import VectorMeasurements
@@ -352,11 +351,14 @@ def swaying(duration=2.0, seed=1, start_error=(0.05, -0.02, 0.03)):
 
 def difference(one, other, k=slice(None), j=slice(None)):
     """Largest difference of rows k of one estimate and j of another, in σ, and of covariances scaled to correlations."""
-    sigma = np.sqrt(np.einsum("...ii->...i", other.whole_covariance[j]))
+    mine, theirs = (
+        e.covariance[r] if e.whole_covariance is None else e.whole_covariance[r] for e, r in ((one, k), (other, j))
+    )
+    sigma = np.sqrt(np.einsum("...ii->...i", theirs))
     off = quaternion.log(quaternion.multiply(quaternion.conjugate(one.attitude[k]), other.attitude[j]))
     parts = [off, one.bias[k] - other.bias[j]]
     parts += [block.values[k] - other.error_states[name].values[j] for name, block in one.error_states.items()]
-    P = (one.whole_covariance[k] - other.whole_covariance[j]) / (sigma[..., :, None] * sigma[..., None, :])
+    P = (mine - theirs) / (sigma[..., :, None] * sigma[..., None, :])
     return max(np.max(np.abs(np.concatenate(parts, axis=-1)) / sigma), np.max(np.abs(P)))
 
 
@@ -448,7 +450,7 @@ def test_a_part_of_a_record_between_any_two_times():
     mag = record.vectors[1]
     begin, end = float(mag.time[2]), float(mag.time[7])
     middle = 0.5 * (record.time[40] + record.time[41])
-    one, other = joining.part(record, begin, middle), joining.part(record, middle, end)
+    one, other = recovery_segments.part(record, begin, middle), recovery_segments.part(record, middle, end)
     assert (one.time[0], one.time[-1], other.time[-1]) == (begin, middle, end)
     edges = np.cumsum(np.vstack([np.zeros(3), record.increments]), axis=0)
     turned = [np.interp([begin, middle, end], record.time, edges[:, i]) for i in range(3)]
@@ -506,8 +508,7 @@ def test_the_prior_of_the_blocks_ages_as_the_filter_has_it():
         vectors=tuple(dataclasses.replace(s, vector_b=np.full_like(s.vector_b, np.nan)) for s in record.vectors),
     )
     ahead = estimation.run(bare, NOISE, begun, blocks, full_covariance=True)
-    memory = filtering._first(begun, blocks, 3.0)
-    aged, covariance = aged_prior(blocks, memory.values, memory.covariance, 5.0 - memory.start)
+    aged, covariance = aged_prior(blocks, *forward.restart_states(begun, blocks), 2.0)
     sigma = np.sqrt(np.diag(ahead.whole_covariance[-1])[6:])
     found = np.concatenate([block.values[-1] for block in ahead.error_states.values()])
     np.testing.assert_allclose(aged / sigma, found / sigma, rtol=0, atol=1e-8)

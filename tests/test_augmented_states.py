@@ -10,7 +10,7 @@ import pytest
 
 from strapdown import consistency, estimation, kinematics, motion, quaternion, records, scenarios, setup, vectors
 from strapdown.checks import InputError
-from strapdown.estimation import error_states
+from strapdown.estimation import angular_acceleration, error_states, forward
 from strapdown.estimation.gating import Gate, Monitor, Robust
 from strapdown.estimation.states import ProcessNoise
 from strapdown.estimation.step_filter import StepFilter
@@ -18,9 +18,9 @@ from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Truth
 from strapdown.scenarios import Scenario
-from strapdown.setup import FilterSetup
+from strapdown.setup import FilterSetup, matching
 from strapdown.setup import states as optional
-from strapdown.setup.states import SensorStates, States, filtering, matching, turning
+from strapdown.setup.states import SensorStates, States
 from strapdown.vectors import VectorMeasurements
 
 NOISE = ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-5)
@@ -388,7 +388,7 @@ def test_rate_and_angular_acceleration_are_those_of_the_motion():
     time = np.linspace(1.0, 28.0, 400)
     for white in (1e-7, 1e-4, 1e-3):
         record = ImuRecord(time=edges, increments=exact + white * np.sqrt(0.005) * rng.standard_normal(exact.shape))
-        found, variance = turning.turning(record, time)
+        found, variance = angular_acceleration.turning(record, time)
         error = found[:, 3:] - SWAY.body_angular_acceleration(time)
         assert np.max(np.abs(found[:, :3] - SWAY.body_rate(time))) < 6.0 * white / np.sqrt(0.005) + 1e-4
         ratio = np.mean(error**2 / variance)
@@ -481,7 +481,7 @@ def test_the_strength_of_a_heading_s_field_leaves_its_level_part_out():
         reference_f=reference,
         sigma=0.1 / (field * level),
     )
-    np.testing.assert_allclose(filtering.strength(series) / field, filtering.strength(series)[0] / field[0], rtol=1e-12)
+    np.testing.assert_allclose(forward.strength(series) / field, forward.strength(series)[0] / field[0], rtol=1e-12)
 
 
 # ------------------------------------------------------------------------------------------------------------------ what is matched
@@ -568,6 +568,6 @@ def test_the_acceleration_of_a_vibration_is_not_told_too_small():
         record = scenarios.simulate(chosen, seed)
         time = record.vectors[0].time
         exact = np.concatenate([chosen.motion.body_rate(time), chosen.motion.body_angular_acceleration(time)], axis=1)
-        found, _ = turning.turning(record, time)
+        found, _ = angular_acceleration.turning(record, time)
         gains.append(np.sum(found * exact, axis=0) / np.sum(exact**2, axis=0))
     np.testing.assert_allclose(np.mean(gains, axis=0), 1.0, rtol=0.0, atol=1e-3)

@@ -6,28 +6,27 @@ import dataclasses
 
 import numpy as np
 import pytest
+from plain_kernels import plain
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
 from strapdown import consistency, estimation, kinematics, quaternion, records, scenarios, wahba
 from strapdown.checks import InputError
 from strapdown.estimation import multiple_model
+from strapdown.estimation.forward import gate_options
 from strapdown.estimation.gating import Gate, Monitor, Robust
 from strapdown.estimation.schedule import schedule
 from strapdown.estimation.states import ProcessNoise, covariance_matrices, pack
-from strapdown.kernels import bank_loop
+from strapdown.kernels import hypotheses, rotation
 from strapdown.kernels.machine import compiled
 from strapdown.kernels.series import LARGEST_ANGLE
+from strapdown.kernels.walk import walk
 from strapdown.motion import ConstantRate
 from strapdown.records import ImuRecord
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 from strapdown.vectors import Faults, VectorMeasurements
 
 QUIET = ProcessNoise(angle_random_walk=1e-7, rate_random_walk=1e-10)
-WITHOUT = (np.full(3, np.inf), 0, np.ones((3, 2)), 0, 0)
-"""The kernel's arguments for no gate and no robust update."""
-ALL = (np.empty(0, np.int64), np.array([2]), 0.0)
-"""Its arguments for two hypotheses, and no further sets."""
 
 
 def series(name, time, vector_b, reference_f, sigma, kind="direction"):
@@ -98,7 +97,7 @@ def test_gaussians_of_half_the_spacing_fill_the_circle_to_one_and_a_half_percent
 
 def test_inverse_right_jacobian(rotation_vectors):
     phi = np.concatenate([rotation_vectors(200), rotation_vectors(100, 0.01, np.pi, seed=2)])
-    mine = np.array([bank_loop.inverse_right_jacobian(tuple(one)) for one in phi]).reshape(-1, 3, 3)
+    mine = np.array([rotation.inverse_right_jacobian(tuple(one)) for one in phi]).reshape(-1, 3, 3)
     assert np.allclose(mine, kinematics.inverse_right_jacobian(phi), rtol=0.0, atol=2e-12)
 
 
@@ -110,7 +109,7 @@ def test_share_between_is_a_trace(decades):
         T = axes @ np.diag(10.0 ** np.array([0.0, -decades, -decades])) ** 2 @ axes.T
         d = np.linalg.cholesky(T) @ random.standard_normal(3)
         upper = np.triu_indices(3)
-        share = bank_loop.share_between(tuple(T[upper]), tuple(np.outer(d, d)[upper]))
+        share = hypotheses.share_between(tuple(T[upper]), tuple(np.outer(d, d)[upper]))
         assert share == pytest.approx(d @ np.linalg.solve(T, d), rel=10.0 ** (2.0 * decades - 14.0) + 1e-10)
 
 
@@ -129,7 +128,7 @@ def test_moment_matching_has_the_moments_of_draws_from_the_mixture():
     random = np.random.default_rng(5)
     states, weights = mixture(random, 5, 0.05)
     out, between = np.empty(28), np.empty(12)
-    bank_loop.moment_match(states, weights, between, out)
+    hypotheses.moment_match(states, weights, between, out)
     number = 400_000
     which = random.choice(5, number, p=weights)
     P = covariance_matrices(states[:, 7:])
@@ -142,13 +141,13 @@ def test_moment_matching_has_the_moments_of_draws_from_the_mixture():
     assert np.abs((e.T @ e / number - matched) / np.outer(sigma, sigma)).max() < 0.01
     inside = np.einsum("n,nij->ij", weights, P)
     share = np.trace(np.linalg.solve(matched[:3, :3], matched[:3, :3] - inside[:3, :3]))
-    assert bank_loop.share_between(out[7:13], between[:6]) == pytest.approx(share, rel=0.02)
+    assert hypotheses.share_between(out[7:13], between[:6]) == pytest.approx(share, rel=0.02)
 
 
 def test_moment_matching_of_equal_members_is_the_member():
     states, _ = mixture(np.random.default_rng(6), 1, 0.0)
     out, between = np.empty(28), np.empty(12)
-    bank_loop.moment_match(np.repeat(states, 4, axis=0), np.full(4, 0.25), between, out)
+    hypotheses.moment_match(np.repeat(states, 4, axis=0), np.full(4, 0.25), between, out)
     assert np.allclose(out, states[0], rtol=1e-12, atol=1e-16)
     assert np.abs(between).max() < 1e-20
 
@@ -161,12 +160,43 @@ def test_the_iterated_update_meets_a_direction_that_one_pass_misses(monkeypatch)
     frame = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 
     def missed():
-        done = bank_loop.update_iterated(tuple(q), (0.0,) * 3, A, (0.0,) * 9, C, *frame, tuple(z), 1e-10)
+        done = hypotheses.update_iterated(tuple(q), (0.0,) * 3, A, (0.0,) * 9, C, *frame, tuple(z), 1e-10)
         return np.linalg.norm(np.cross(quaternion.rotate(quaternion.conjugate(np.array(done[0])), r), z))
 
     assert missed() < 1e-7
-    monkeypatch.setattr(bank_loop, "PASSES", 1)
+    monkeypatch.setattr(hypotheses, "PASSES", 1)
     assert missed() > 1e-4
+
+
+def kernel_run(walked, record, events, states, process):
+    """Run equally likely hypotheses that are never one over a record by the walk itself; return its outputs and what it says."""
+    rows, number = len(record.time), len(states)
+    out = hypotheses.Outputs(
+        attitude=np.empty((rows, 4)),
+        bias=np.empty((rows, 3)),
+        covariance=np.empty((rows, 21)),
+        weights=np.empty((rows, number)),
+        innovation=np.empty((len(events.time), 6)),
+        share=np.empty(len(events.time)),
+    )
+    body = hypotheses.Body(
+        angle_variance=process.angle_random_walk**2,
+        rate_variance=process.rate_random_walk**2,
+        states=states,
+        log_weight=np.zeros(number),
+        weight=np.empty(number),
+        later=np.empty(0, np.int64),
+        sets=np.array([number]),
+        charge=0.0,
+        options=gate_options(None, None),
+        min_weight=1e-6,
+        max_share=-1.0,  # a share that nothing is below
+        first_edge=0,
+        on_edge=True,
+        every=1,
+        room=np.empty(40),
+    )
+    return out, walked(record.time, record.increments, events.measurements, 1, body, out)
 
 
 def test_for_small_errors_it_is_the_plain_filter():
@@ -175,27 +205,18 @@ def test_for_small_errors_it_is_the_plain_filter():
     initial = estimation.initial_state(
         quaternion.exp(np.array([1e-4, -2e-4, 1e-4])), attitude_sigma=2e-4, bias_sigma=1e-6
     )
-    plain = estimation.run(record, QUIET, initial, full_covariance=True)
+    without = estimation.run(record, QUIET, initial, full_covariance=True)
     events = schedule(record.vectors, 0.0, 20.0)
     states = pack(initial.attitude, initial.bias, initial.covariance)[None].copy()
-    rows = len(record.time)
-    out = [np.empty((rows, n)) for n in (4, 3, 21, 1)]
-    innovation = np.empty((len(events.time), 6))
     # One hypothesis is one at the first edge; a share that nothing is below and a weight that is never alone keep it running.
-    two = np.repeat(states, 2, axis=0)
-    out[3] = np.empty((rows, 2))
-    done = bank_loop.run_bank(
-        record.time, record.increments, QUIET.angle_random_walk**2, QUIET.rate_random_walk**2, events.time, events.kind,
-        events.vector_b, events.variance, events.reference, events.triads, two, np.zeros(2), 0.0, 0, *ALL, 1, 1e-6, -1.0,
-        np.empty(2), np.empty(12), np.empty(28), *out, innovation, *WITHOUT, np.empty(len(events.time)),
-    )  # fmt: skip
-    assert done == (rows, -1, len(events.time))
-    assert quaternion.angle_between(out[0], plain.attitude).max() < 1e-8  # 1e-4 of σ: the reset's second order
-    assert np.allclose(out[1], plain.bias, rtol=0.0, atol=1e-10)
-    P = covariance_matrices(out[2])
-    scale = plain.sigma[:, :, None] * plain.sigma[:, None, :]
-    assert np.abs((P - plain.covariance) / scale).max() < 1e-3
-    assert np.allclose(out[3], 0.5)
+    out, done = kernel_run(plain(walk, hypotheses), record, events, np.repeat(states, 2, axis=0), QUIET)
+    assert done == (len(record.time), hypotheses.NEVER, len(events.time))
+    assert quaternion.angle_between(out.attitude, without.attitude).max() < 1e-8  # 1e-4 of σ: the reset's second order
+    assert np.allclose(out.bias, without.bias, rtol=0.0, atol=1e-10)
+    P = covariance_matrices(out.covariance)
+    scale = without.sigma[:, :, None] * without.sigma[:, None, :]
+    assert np.abs((P - without.covariance) / scale).max() < 1e-3
+    assert np.allclose(out.weights, 0.5)
 
 
 @pytest.mark.parametrize("bias_sigma", [1e-2, 3.0, 60.0], ids=["right", "wild", "wilder"])
@@ -219,11 +240,11 @@ def test_a_hypothesis_whose_bias_is_wild_is_cut_into_sub_steps_as_the_filter(bia
     rest = ImuRecord(
         time=np.concatenate([seen[:1], time[1:]]), increments=increments, vectors=(tracker.taken(seen > seen[0]),)
     )
-    plain = estimation.run(rest, noise, start, full_covariance=True)
-    assert (np.abs(plain.bias).max() * 0.3 > 10.0 * LARGEST_ANGLE) == (bias_sigma > 1.0)
-    np.testing.assert_allclose(found.estimate.innovations["tracker"].nis, plain.innovations["tracker"].nis, rtol=1e-7)
-    np.testing.assert_allclose(found.estimate.bias[-1], plain.bias[-1], rtol=1e-7, atol=1e-12)
-    np.testing.assert_allclose(found.estimate.covariance[-1], plain.covariance[-1], rtol=1e-7, atol=1e-15)
+    single = estimation.run(rest, noise, start, full_covariance=True)
+    assert (np.abs(single.bias).max() * 0.3 > 10.0 * LARGEST_ANGLE) == (bias_sigma > 1.0)
+    np.testing.assert_allclose(found.estimate.innovations["tracker"].nis, single.innovations["tracker"].nis, rtol=1e-7)
+    np.testing.assert_allclose(found.estimate.bias[-1], single.bias[-1], rtol=1e-7, atol=1e-12)
+    np.testing.assert_allclose(found.estimate.covariance[-1], single.covariance[-1], rtol=1e-7, atol=1e-15)
 
 
 def test_weights_are_the_densities_of_the_measurement():
@@ -233,28 +254,20 @@ def test_weights_are_the_densities_of_the_measurement():
     events = schedule(record.vectors, 0.0, 1.0)
     prior = [np.diag([s**2, (2.0 * s) ** 2, s**2, 1e-12, 1e-12, 1e-12]) for s in (1e-3, 5e-3)]
     states = np.array([pack(np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), P) for P in prior])
-    out = [np.empty((2, n)) for n in (4, 3, 21, 2)]
-    compiled(bank_loop.run_bank)(
-        record.time, record.increments, 1e-14, 0.0, events.time, events.kind, events.vector_b, events.variance,
-        events.reference, events.triads, states, np.zeros(2), 0.0, 0, *ALL, 1, 1e-6, -1.0, np.empty(2), np.empty(12),
-        np.empty(28), *out, np.empty((1, 6)), *WITHOUT, np.empty(1),
-    )  # fmt: skip
+    process = ProcessNoise(angle_random_walk=1e-7, rate_random_walk=0.0)
+    out, _ = kernel_run(compiled(walk, hypotheses), record, events, states, process)
     z = events.vector_b[0]
     densities = [
         multivariate_normal.pdf([z[0], z[1]], cov=np.diag([P[1, 1], P[0, 0]]) + 1e-6 * np.eye(2)) for P in prior
     ]
-    assert np.allclose(out[3][0], np.array(densities) / np.sum(densities), rtol=1e-4)
+    assert np.allclose(out.weights[0], np.array(densities) / np.sum(densities), rtol=1e-4)
 
 
-def test_compiled_and_plain_are_the_same():
+def test_compiled_and_plain_are_the_same(monkeypatch):
     record, belief = orbit(0, duration=120.0)
     fast = multiple_model.run(record, belief, hypotheses=8, every=30)
-    slow_kernel = compiled
-    try:
-        multiple_model.compiled = lambda function: function
-        slow = multiple_model.run(record, belief, hypotheses=8, every=30)
-    finally:
-        multiple_model.compiled = slow_kernel
+    monkeypatch.setattr(multiple_model, "compiled", plain)
+    slow = multiple_model.run(record, belief, hypotheses=8, every=30)
     assert np.allclose(fast.estimate.attitude, slow.estimate.attitude, atol=1e-9)
     assert np.allclose(fast.estimate.covariance, slow.estimate.covariance, rtol=1e-6, atol=1e-16)
     assert np.allclose(fast.weights, slow.weights, atol=1e-7)
@@ -514,15 +527,11 @@ def test_from_more_wild_directions_than_it_doubts_it_recovers(size):
 
 
 @pytest.mark.parametrize("option", OPTIONS)
-def test_compiled_and_plain_are_the_same_with_every_option(option):
+def test_compiled_and_plain_are_the_same_with_every_option(option, monkeypatch):
     record, belief = orbit(0, duration=150.0, sensors=contaminated(0.2))
     fast = multiple_model.run(record, belief, hypotheses=8, every=30, **OPTIONS[option])
-    slow_kernel = compiled
-    try:
-        multiple_model.compiled = lambda function: function
-        slow = multiple_model.run(record, belief, hypotheses=8, every=30, **OPTIONS[option])
-    finally:
-        multiple_model.compiled = slow_kernel
+    monkeypatch.setattr(multiple_model, "compiled", plain)
+    slow = multiple_model.run(record, belief, hypotheses=8, every=30, **OPTIONS[option])
     assert np.allclose(fast.estimate.attitude, slow.estimate.attitude, atol=1e-9)
     assert np.allclose(fast.weights, slow.weights, atol=1e-7)
     for sensor, one in fast.estimate.innovations.items():
@@ -542,13 +551,13 @@ def test_gate_robust_and_monitor_go_on_once_it_is_one():
     first = int(np.searchsorted(record.time, found.became_one))
     rest = records.cut(record, first, len(record.time) - 1)
     restart = Gate(probability=0.9999, restart_bias_sigma=20.0 * DEGREE_PER_HOUR)
-    plain = estimation.run(rest, belief, one, every=10, gate=restart, robust=Robust(), monitor=monitor)
-    assert np.array_equal(plain.attitude, found.estimate.attitude[k:])
-    assert plain.events
-    assert found.estimate.events[-len(plain.events) :] == plain.events
+    single = estimation.run(rest, belief, one, every=10, gate=restart, robust=Robust(), monitor=monitor)
+    assert np.array_equal(single.attitude, found.estimate.attitude[k:])
+    assert single.events
+    assert found.estimate.events[-len(single.events) :] == single.events
     weight = found.estimate.innovations["magnetometer"].weight
     assert np.array_equal(
-        weight[-len(plain.innovations["magnetometer"].weight) :], plain.innovations["magnetometer"].weight
+        weight[-len(single.innovations["magnetometer"].weight) :], single.innovations["magnetometer"].weight
     )
     assert found.estimate.refused["magnetometer"] > 0
 
@@ -581,12 +590,12 @@ def test_for_small_errors_its_weights_are_the_plain_filters(kind, robust, monkey
     found = multiple_model.run(record, noise_of_gyro, bias_sigma=1e-4, robust=robust, every=40)
     start = estimation.initial_state([1.0, 0.0, 0.0, 0.0], attitude_sigma=3e-3, bias_sigma=1e-4)
     rest = ImuRecord(time=np.concatenate([[0.5], at]), increments=np.zeros((40, 3)), vectors=(second,))
-    plain = estimation.run(rest, noise_of_gyro, start, robust=robust)
+    single = estimation.run(rest, noise_of_gyro, start, robust=robust)
     assert len(found.estimate.time) == 1
-    weight, expected = (one.innovations["second"].weight for one in (found.estimate, plain))
+    weight, expected = (one.innovations["second"].weight for one in (found.estimate, single))
     assert expected.min() < 0.5
     np.testing.assert_allclose(weight, expected, rtol=3e-3)
-    np.testing.assert_allclose(found.estimate.attitude[-1], plain.attitude[-1], atol=2e-5)
+    np.testing.assert_allclose(found.estimate.attitude[-1], single.attitude[-1], atol=2e-5)
 
 
 # --------------------------------------------------------------------------------------------------------------------- the rim
@@ -641,8 +650,8 @@ def test_a_measured_attitude_at_the_first_edge_counts_once():
     np.testing.assert_array_equal(found.estimate.innovations["tracker"].time, time[1:])
     start = estimation.initial_state(tracker.attitude[0], attitude_sigma=1e-3, bias_sigma=1e-4)
     rest = dataclasses.replace(record, vectors=(tracker.taken(time > 0.0),))
-    plain = estimation.run(rest, QUIET, start, full_covariance=True)
-    np.testing.assert_allclose(found.estimate.covariance, plain.covariance, rtol=1e-12)
+    single = estimation.run(rest, QUIET, start, full_covariance=True)
+    np.testing.assert_allclose(found.estimate.covariance, single.covariance, rtol=1e-12)
 
 
 def test_it_starts_at_the_first_direction_and_counts_what_came_before():
@@ -753,8 +762,8 @@ def test_noise_by_axis_is_its_largest_until_they_are_one_and_then_what_it_is(kin
     )
     series_left = tuple(s.taken(s.time > record.time[at]) for s in (first, uneven))
     rest = dataclasses.replace(records.cut(record, at, 40), vectors=series_left)
-    plain = estimation.run(rest, QUIET, one, full_covariance=True)
-    np.testing.assert_array_equal(found.estimate.covariance[rows - 1 :], plain.covariance)
+    single = estimation.run(rest, QUIET, one, full_covariance=True)
+    np.testing.assert_array_equal(found.estimate.covariance[rows - 1 :], single.covariance)
     assert np.any(found.estimate.variance[-1, :3] < 0.9 * coarse.estimate.variance[-1, :3])
 
 

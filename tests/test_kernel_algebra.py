@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from strapdown import kinematics, quaternion
 from strapdown.kernels import algebra, rotation
 from strapdown.kernels.machine import helper
 from strapdown.kernels.series import LARGEST_ANGLE
@@ -80,6 +81,20 @@ def exact_jacobian(phi: tuple) -> np.ndarray:
     return np.eye(3) - a * skew(phi) + b * skew(phi) @ skew(phi)
 
 
+def exact_factors(s: tuple) -> np.ndarray:
+    root = np.linalg.cholesky(symmetric(s))
+    d = np.diagonal(root, axis1=-2, axis2=-1)
+    L = root / d[..., None, :]
+    return np.stack([L[..., 1, 0], L[..., 2, 0], L[..., 2, 1], *np.moveaxis(d**-2.0, -1, 0)], -1)
+
+
+def inverse_of(F: tuple) -> np.ndarray:
+    """Return S⁻¹ of (l10, l20, l21, 1/d0, 1/d1, 1/d2), S = L D Lᵀ."""
+    zero, one = np.zeros_like(F[0]), np.ones_like(F[0])
+    L = np.linalg.inv(matrix((one, zero, zero, F[0], one, zero, F[1], F[2], one)))
+    return swapped(L) @ (vector(F[3:])[..., :, None] * L)
+
+
 # name: (kernel, sizes of its arguments (0: a scalar), what NumPy says of them)
 S, V, M, U, Q = 0, 3, 9, 6, 4
 KERNELS: dict[str, tuple[Callable, tuple[int, ...], Callable]] = {
@@ -130,6 +145,9 @@ KERNELS: dict[str, tuple[Callable, tuple[int, ...], Callable]] = {
             scalar(i)[..., None] * np.eye(3) + scalar(j)[..., None] * skew(v) + scalar(k)[..., None] * skew(v) @ skew(v)
         ),
     ),
+    "factored": (algebra.factored, (U,), exact_factors),
+    "solved": (algebra.solved, (U, V), lambda F, v: times(inverse_of(F), v)),
+    "divided": (algebra.divided, (M, U), lambda X, F: flat(matrix(X) @ inverse_of(F))),
     "quaternion_multiply": (rotation.quaternion_multiply, (Q, Q), quaternion_product),
     "exponential": (rotation.exponential, (V,), exact_exponential),
     "turned": (
@@ -144,8 +162,17 @@ KERNELS: dict[str, tuple[Callable, tuple[int, ...], Callable]] = {
         lambda q: flat(Rotation.from_quat(np.roll(vector(q), -1, -1)).as_matrix()),
     ),
     "right_jacobian": (rotation.right_jacobian, (V,), lambda phi: flat(exact_jacobian(phi))),
+    "near_inverse_right_jacobian": (
+        rotation.near_inverse_right_jacobian,
+        (V,),
+        lambda phi: flat(np.linalg.inv(exact_jacobian(phi))),
+    ),
+    "arcsine": (rotation.arcsine, (S,), lambda x: np.arcsin(np.sqrt(x)) / np.sqrt(x)),
+    "arcsine_series": (rotation.arcsine_series, (S,), lambda x: 2.0 * np.arcsin(np.sqrt(x)) / np.sqrt(x)),
 }
 RUNS = 11
+LARGEST_SQUARE = {"arcsine": np.sin(0.5 * LARGEST_ANGLE) ** 2, "arcsine_series": rotation.SHORT}
+"""Of the sine in the range of a polynomial in it."""
 
 
 def arguments(name: str) -> list:
@@ -158,6 +185,13 @@ def arguments(name: str) -> list:
             value /= np.linalg.norm(value, axis=0)
         if size == V and KERNELS[name][0].__module__ == rotation.__name__:
             value *= random.uniform(0.3, LARGEST_ANGLE, RUNS) / np.linalg.norm(value, axis=0)
+        if name in LARGEST_SQUARE:
+            value = random.uniform(0.01, 1.0, (1, RUNS)) * LARGEST_SQUARE[name]
+        if name in ("solved", "divided") and size == U:
+            value = np.clip(value, -1.0, 1.0)
+        if name == "factored":
+            value[[0, 3, 5]] = 3.0 + np.abs(value[[0, 3, 5]])
+            value[[1, 2, 4]] = np.clip(value[[1, 2, 4]], -1.0, 1.0)  # positive definite
         drawn.append(tuple(value) if size else value[0])
     return drawn
 
@@ -170,13 +204,11 @@ def stacked(result) -> np.ndarray:
     return np.stack(result, -1) if isinstance(result, tuple) else np.asarray(result)
 
 
-SCALAR_ONLY = {"unit", "logarithm"}
-"""Kernels with a square root or an arctangent: not for arrays as scalars."""
+APART = {"unit", "logarithm", "inverse_right_jacobian", "sine_and_versine", "moved", "composed", "far_turn"}
+"""Rotations of any angle: with branches, which arrays as scalars do not take, or a pair of results."""
 
 
 def test_unit_and_logarithm_against_the_public_algebra(rotation_vectors):
-    from strapdown import quaternion
-
     for phi in rotation_vectors(200):
         q = quaternion.exp(phi)
         for sign in (1.0, -1.0):
@@ -185,8 +217,39 @@ def test_unit_and_logarithm_against_the_public_algebra(rotation_vectors):
     assert rotation.logarithm((1.0, 0.0, 0.0, 0.0)) == (0.0, 0.0, 0.0)
 
 
+@pytest.mark.parametrize("largest", [0.9 * LARGEST_ANGLE, np.pi, 19.0])
+def test_turns_of_any_angle_against_the_public_algebra(rotation_vectors, largest):
+    """Plain and compiled; beyond π what has an inverse there, that of the angle itself."""
+    q = quaternion.exp(np.array([0.7, -0.4, 1.1]))
+    for function in (lambda f: f, helper):
+        moved, far, sine, composed = map(
+            function, (rotation.moved, rotation.far_turn, rotation.sine_and_versine, rotation.composed)
+        )
+        for phi in rotation_vectors(60, 1e-3 * largest, largest):
+            turn, J = quaternion.exp(phi), kinematics.right_jacobian(phi)
+            theta = np.linalg.norm(phi)
+            for (end, jacobian), wanted in (
+                (moved(tuple(q), tuple(phi)), quaternion.multiply(q, turn)),
+                (far(tuple(phi)), turn),
+            ):
+                # A quaternion and its negative are one attitude.
+                assert np.allclose(np.array(end) * np.sign(end @ wanted), wanted, rtol=0.0, atol=1e-13)
+                assert np.allclose(np.reshape(jacobian, (3, 3)), J, rtol=0.0, atol=1e-13)
+            expected = np.sin(theta) / theta, 2.0 * (np.sin(0.5 * theta) / theta) ** 2
+            assert np.allclose(sine(theta * theta), expected, rtol=1e-12, atol=1e-15)
+            assert np.allclose(
+                quaternion.exp(np.array(composed(tuple(q), tuple(phi)))),
+                quaternion.exp(quaternion.log(quaternion.multiply(q, turn))),
+                rtol=0.0,
+                atol=1e-13,
+            )
+            if theta < np.pi:
+                inverse = function(rotation.inverse_right_jacobian)(tuple(phi))
+                assert np.allclose(np.reshape(inverse, (3, 3)) @ J, np.eye(3), rtol=0.0, atol=1e-13)
+
+
 def test_every_kernel_is_here():
-    here = {function.__name__ for function, _, _ in KERNELS.values()} | {"square_root"} | SCALAR_ONLY
+    here = {function.__name__ for function, _, _ in KERNELS.values()} | {"square_root"} | APART
     for module in (algebra, rotation):
         own = {name for name, f in vars(module).items() if callable(f) and f.__module__ == module.__name__}
         assert own <= here, f"add {own - here} to KERNELS"

@@ -2,22 +2,39 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
 import json
 import math
 import os
+import pkgutil
 import shutil
 import subprocess
 import sys
+from inspect import signature
 from pathlib import Path
-from types import FunctionType
+from types import FunctionType, ModuleType
 
 import numpy as np
+import plain_kernels
 import pytest
 
 import strapdown
 from strapdown import estimation
-from strapdown.estimation.states import running, scheduling
-from strapdown.kernels import algebra, filter_loop, machine
+from strapdown.estimation import forward, schedule
+from strapdown.kernels import (
+    algebra,
+    covariance_form,
+    filters,
+    gate,
+    hypotheses,
+    likelihood,
+    likelihood_outliers,
+    machine,
+    root_form,
+)
+from strapdown.kernels.filters import body_side, extended
+from strapdown.kernels.walk import walk
 from strapdown.records import ImuRecord
 from strapdown.vectors import VectorMeasurements
 
@@ -52,14 +69,16 @@ def test_a_kernel_that_names_a_module_is_refused():
 
 
 def test_compiled_once():
-    assert machine.compiled(filter_loop.run_filter) is machine.compiled(filter_loop.run_filter)
+    assert machine.compiled(walk, covariance_form) is machine.compiled(walk, covariance_form)
     assert machine.helper(algebra.dot) is machine.helper(algebra.dot)
 
 
 def test_the_plain_function_stays_plain():
     machine.helper(algebra.dot)
     assert isinstance(algebra.dot, FunctionType)
-    assert isinstance(filter_loop.run_filter, FunctionType)
+    machine.compiled(walk, covariance_form)
+    assert isinstance(walk, FunctionType)
+    assert isinstance(covariance_form.predict, FunctionType)
 
 
 def is_nan(x):
@@ -96,16 +115,162 @@ def test_compiled_loop_equals_plain_python(monkeypatch):
     initial = estimation.initial_state([1.0, 0.0, 0.0, 0.0], attitude_sigma=0.1, bias_sigma=0.01)
     fast = estimation.run(record, noise, initial, full_covariance=True)
     plain_calls = []
-    for module in (running, scheduling):
-        monkeypatch.setattr(module, "compiled", lambda function: plain_calls.append(function) or function)
+
+    def uncompiled(function, *parts):
+        plain_calls.append(plain_kernels.plain(function, *parts))
+        return plain_calls[-1]
+
+    for module in (forward, schedule):
+        monkeypatch.setattr(module, "compiled", uncompiled)
     plain = estimation.run(record, noise, initial, full_covariance=True)
+    assert {function.__name__ for function in plain_calls} == {"walk", "merge_order"}
     assert all(isinstance(function, FunctionType) for function in plain_calls)
-    assert plain_calls
     for name in ("attitude", "bias", "variance", "covariance"):
         slow_result, fast_result = getattr(plain, name), getattr(fast, name)
         np.testing.assert_allclose(fast_result, slow_result, rtol=1e-11, atol=1e-13 * np.abs(slow_result).max())
     for sensor, innovations in plain.innovations.items():
         np.testing.assert_allclose(fast.innovations[sensor].whitened, innovations.whitened, rtol=1e-9, atol=1e-11)
+
+
+# ---------------------------------------------------------------------------------------------------- functions left open
+
+
+def module_of(name: str, source: str) -> ModuleType:
+    """A module that claims to live among the kernels."""
+    module = ModuleType(f"strapdown.kernels.{name}")
+    exec(source, module.__dict__)
+    return module
+
+
+LOOP = """
+OPEN = ("begin", "step")
+def begin(body):
+    pass
+def step(state, body):
+    pass
+def repeated(n, body):
+    state = begin(body)
+    for _ in range(n):
+        state = step(state, body)
+    return state
+"""
+ADDS = """
+def begin(body):
+    return 0.0 * body
+def step(state, body):
+    return state + body
+"""
+DOUBLES = """
+def step(state, body):
+    return 2.0 * state
+"""
+
+
+def test_a_module_leaves_functions_open_for_others_to_define():
+    loop, adds, doubles = module_of("loop", LOOP), module_of("adds", ADDS), module_of("doubles", DOUBLES)
+    ones = module_of("ones", "def begin(body):\n    return 1.0\n")
+    for call in (machine.helper, lambda function, parts: plain_kernels.plain(function, *parts)):
+        assert call(loop.repeated, (adds,))(5, 0.25) == 1.25
+        # The first module that has a function defines it.
+        assert call(loop.repeated, (doubles, ones))(5, 0.25) == 32.0
+        assert call(loop.repeated, (doubles, adds))(5, 0.25) == 0.0
+        assert call(loop.repeated, (ones, adds))(5, 0.25) == 2.25
+
+
+def test_a_part_may_leave_functions_open_in_its_turn():
+    """As the gate does around a form; a stub of the same name defines nothing."""
+    loop = module_of("loop", LOOP)
+    outer = module_of(
+        "outer",
+        "OPEN = ('inner', 'step')\n"
+        "def inner(body):\n    pass\n"
+        "def step(state, body):\n    pass\n"
+        "def begin(body):\n    return inner(body) + 1.0\n",
+    )
+    inner = module_of(
+        "inner", "def inner(body):\n    return 10.0 * body\ndef step(state, body):\n    return state + 100.0\n"
+    )
+    assert machine.helper(loop.repeated, (outer, inner))(2, 0.5) == 206.0
+
+
+def test_a_missing_definition_is_refused_by_its_name():
+    loop, doubles = module_of("loop", LOOP), module_of("doubles", DOUBLES)
+    with pytest.raises(
+        TypeError, match=r"^strapdown\.kernels\.loop leaves begin open, and strapdown\.kernels\.doubles does not"
+    ):
+        machine.helper(loop.repeated, (doubles,))
+    with pytest.raises(TypeError, match=r"^strapdown\.kernels\.loop leaves begin open"):
+        machine.compiled(loop.repeated)
+    with pytest.raises(TypeError, match=r"walk leaves \w+ open, and strapdown\.kernels\.algebra does not define it"):
+        machine.compiled(walk, algebra)
+
+
+BODIES = [
+    (covariance_form,),
+    (root_form,),
+    (gate, covariance_form),
+    (gate, root_form),
+    (likelihood,),
+    (likelihood_outliers, likelihood),
+    (hypotheses,),
+    *(
+        (importlib.import_module(f"{filters.__name__}.{name}"), extended, body_side)
+        for name in sorted(one.name for one in pkgutil.iter_modules(filters.__path__))
+        if name not in ("extended", "body_side")
+    ),
+]
+"""What the walk is compiled with."""
+
+
+def parts_used() -> set[tuple[str, ...]]:
+    """What the package's calls of ``compiled(walk, …)`` name."""
+    found = set()
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "compiled" and node.args:
+                first, *others = node.args
+                if getattr(first, "id", "") == "walk":
+                    found.add(tuple(ast.unparse(one) for one in others))
+    return found
+
+
+def test_every_body_of_the_walk_is_listed_here():
+    assert parts_used() == {
+        ("covariance_form",),
+        ("root_form",),
+        ("gate", "covariance_form"),
+        ("gate", "root_form"),
+        ("*parts",),
+        ("hypotheses_kernel",),
+        ("definition", "kernel", "body_side"),
+    }
+
+
+@pytest.mark.parametrize("parts", BODIES, ids=lambda parts: " ".join(one.__name__.rpartition(".")[2] for one in parts))
+def test_every_body_defines_all_that_is_left_open_with_the_same_arguments(parts):
+    plain_kernels.plain(walk, *parts)  # raises where one that is reached is not defined
+    for module in (sys.modules[walk.__module__], *parts):
+        for name in getattr(module, "OPEN", ()):
+            stub = getattr(module, name)
+            defined = [
+                getattr(part, name) for part in parts if name in vars(part) and name not in getattr(part, "OPEN", ())
+            ]
+            assert defined, f"{name} of {module.__name__}"
+            assert len(signature(defined[0]).parameters) == len(signature(stub).parameters), name
+            assert defined[0].__doc__
+
+
+def test_a_literal_argument_compiles_no_helper_twice():
+    module = module_of(
+        "literals",
+        "def product(n, x):\n    return n * x\n"
+        "def both(n, x):\n    return product(3, x) + product(n, x) + product(n=4, x=x)\n",
+    )
+    assert machine.helper(module.both)(5, 1.5) == 18.0
+    assert len(machine.helper(module.product, ()).signatures) == 1
+
+
+# ---------------------------------------------------------------------------------------------------- what it runs on
 
 
 def test_describe():
@@ -180,13 +345,61 @@ def test_cache_is_used_and_notices_edited_constants_and_helpers(copied_kernels):
     assert ask()["hits"] == 1
 
 
+OPEN_PROBE = """
+OPEN = ("term",)
+
+
+def term(x):
+    pass
+
+
+def run(x):
+    return 2.0 * term(x)
+"""
+
+ASK_PARTS = """
+import importlib, json, sys
+from strapdown.kernels import machine, open_probe
+parts = [importlib.import_module(f"strapdown.kernels.{name}") for name in sys.argv[1:]]
+fast = machine.compiled(open_probe.run, *parts)
+print(json.dumps({"value": fast(1.0), "hits": sum(fast.stats.cache_hits.values())}))
+"""
+
+
+def test_cache_distinguishes_what_open_functions_are_bound_to(copied_kernels):
+    """One loop, two bodies of the same types: neither may be taken for the other, whichever was compiled first."""
+    kernels, _ = copied_kernels
+    root = kernels.parent.parent
+    (kernels / "open_probe.py").write_text(OPEN_PROBE)
+    for number in (3, 7):
+        (kernels / f"term_{number}.py").write_text(f"def term(x):\n    return {number}.0 * x\n")
+    environment = {**os.environ, "PYTHONPATH": str(root), "NUMBA_CACHE_DIR": str(root / "cache")}
+
+    def ask(*parts: str) -> tuple[float, int]:
+        done = subprocess.run(
+            [sys.executable, "-c", ASK_PARTS, *parts],
+            env=environment,
+            cwd=root,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        answer = json.loads(done.stdout)
+        return answer["value"], answer["hits"]
+
+    assert ask("term_3") == (6.0, 0)
+    assert ask("term_7") == (14.0, 0)
+    assert ask("term_3") == (6.0, 1)
+    assert ask("term_7", "term_3") == (14.0, 0)
+
+
 def test_digest_depends_on_every_kernel_source(monkeypatch, tmp_path):
     copy = tmp_path / "kernels"
     shutil.copytree(PACKAGE / "kernels", copy, ignore=shutil.ignore_patterns("__pycache__"))
     monkeypatch.setattr(machine, "__file__", str(copy / "machine.py"))
     digest = machine.sources_digest.__wrapped__
     seen = {digest()}
-    for path in sorted(copy.glob("*.py")):
+    for path in sorted(copy.rglob("*.py")):
         path.write_text(path.read_text() + "\n# edited\n")
         seen.add(digest())
-    assert len(seen) == 1 + len(list(copy.glob("*.py")))
+    assert len(seen) == 1 + len(list(copy.rglob("*.py")))

@@ -12,7 +12,7 @@ from filterpy.kalman import KalmanFilter
 from strapdown import coning, consistency, estimation, gyro, motion, quaternion, records, vectors
 from strapdown.checks import InputError
 from strapdown.estimation.schedule import schedule
-from strapdown.estimation.states import ProcessNoise, initial_state
+from strapdown.estimation.states import ONCE, ProcessNoise, initial_state
 from strapdown.estimation.step_filter import StepFilter
 from strapdown.kernels import measurement
 from strapdown.randomness import generator
@@ -425,7 +425,7 @@ def test_a_start_from_vertical_and_heading_knows_what_the_tilt_does_to_the_headi
         state = estimation.first_state(
             record, ProcessNoise(angle_random_walk=1e-6, rate_random_walk=0.0), bias_sigma=1e-3
         )
-        P = state.covariance[:3, :3] / estimation.ONCE**2
+        P = state.covariance[:3, :3] / ONCE**2
         e = quaternion.log(quaternion.multiply(quaternion.conjugate(state.attitude), q))
         vertical = quaternion.to_matrix(state.attitude)[2]
         whole.append(e @ np.linalg.solve(P, e) / 3.0)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from strapdown import estimation
+from strapdown.estimation import memory
 from strapdown.estimation.memory import side_by_side
 from strapdown.estimation.schedule import schedule
-from strapdown.estimation.states import memory
 from strapdown.records import ImuRecord
 from strapdown.vectors import VectorMeasurements
 

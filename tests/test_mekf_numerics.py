@@ -5,16 +5,19 @@ from dataclasses import replace
 import mpmath
 import numpy as np
 import pytest
-from strapdown.kernels.filter_loop import CHECKED
+from plain_kernels import plain
 
 from strapdown import estimation, motion, quaternion, records
+from strapdown.estimation.forward import CHECK_INTERVALS
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.schedule import schedule
 from strapdown.estimation.states import ProcessNoise, covariance_matrices, initial_state, pack
 from strapdown.estimation.step_filter import StepFilter
 from strapdown.gyro import GyroSpec
-from strapdown.kernels import filter_loop
+from strapdown.kernels import covariance_form
+from strapdown.kernels.measurement import SIGMA_ORIGIN, VALUE_ORIGIN
 from strapdown.kernels.robust_gate import CHALLENGED
+from strapdown.kernels.walk import walk
 from strapdown.records import ImuRecord
 from strapdown.scenarios import Scenario, simulate
 from strapdown.vectors import VectorMeasurements, VectorSensor
@@ -230,8 +233,8 @@ def test_factors_are_carried_through_large_corrections():
 
 def test_a_stretch_in_factors_is_the_filter_itself():
     """One sharp direction in a record of many: up to the stretch bit for bit as without it, after it as the step face to its rounding."""
-    record, _ = sharp_record(1e-2, steps=CHECKED + 500)
-    at_step = CHECKED + 200
+    record, _ = sharp_record(1e-2, steps=CHECK_INTERVALS + 500)
+    at_step = CHECK_INTERVALS + 200
     middle = float(record.time[at_step])
     body = motion.ConstantRate(rate=(0.3, -0.5, 0.4))
     seen = quaternion.rotate(quaternion.conjugate(body.attitude(middle)), np.array([0.0, 0.0, 1.0]))
@@ -241,7 +244,7 @@ def test_a_stretch_in_factors_is_the_filter_itself():
     whole = replace(record, vectors=(*record.vectors, sharp))
     start = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.1, bias_sigma=0.01)
     without, estimate = estimation.run(record, NOISE, start), estimation.run(whole, NOISE, start, full_covariance=True)
-    assert np.array_equal(estimate.attitude[: CHECKED + 1], without.attitude[: CHECKED + 1])
+    assert np.array_equal(estimate.attitude[: CHECK_INTERVALS + 1], without.attitude[: CHECK_INTERVALS + 1])
     assert np.allclose(estimate.attitude[:at_step], without.attitude[:at_step], rtol=0.0, atol=1e-14)
     assert np.allclose(estimate.variance[:at_step], without.variance[:at_step], rtol=1e-11, atol=0.0)
     spread = np.linalg.eigvalsh(estimate.covariance[at_step, :3, :3])
@@ -300,31 +303,28 @@ def run_plain(record, start, dtype):
         return np.asarray(value, dtype)
 
     outputs = [np.empty((n + 1, width), dtype) for width in (4, 3, 6, 21)]
-    filter_loop.run_filter(
-        of(record.time),
-        of(record.increments),
-        dtype(NOISE.angle_random_walk**2),
-        dtype(NOISE.rate_random_walk**2),
-        of(events.time),
-        events.row,
-        events.sensor,
-        of(np.concatenate(events.series_vector_b)).reshape(-1),
-        of(np.concatenate(events.series_sigma)),
-        np.zeros((len(events.sensors), 2), np.int64),
-        events.bounds,
-        events.codes,
-        events.frames,
-        of(events.triads),
-        of(pack(start.attitude, start.bias, start.covariance)),
-        1,
-        *outputs,
-        np.empty((len(events.row), 6), dtype),
-        np.empty((0, 32), dtype),
-        np.inf,  # the run goes on where digits are lost
-        -np.inf,
-        np.empty(28, dtype),
-        np.empty((7, 6), dtype),
+    out = covariance_form.Outputs(*outputs, np.empty((len(events.row), 6), dtype), np.empty((0, 32), dtype))
+    body = covariance_form.Body(
+        states=np.stack([of(pack(start.attitude, start.bias, start.covariance)), np.empty(28, dtype)]),
+        angle_variance=dtype(NOISE.angle_random_walk**2),
+        rate_variance=dtype(NOISE.rate_random_walk**2),
+        sharpness=np.inf,  # the run goes on where digits are lost
+        least_share=-np.inf,
+        check=n + 1,
+        good=np.zeros(2, np.int64),
+        work=np.empty((7, 6), dtype),
     )
+    measured = events.measurements
+    columns = measured.series.copy()
+    columns[:, VALUE_ORIGIN] = columns[:, SIGMA_ORIGIN] = 0  # one sensor after the other, as they stand here
+    measured = measured._replace(
+        time=of(measured.time),
+        value=of(np.concatenate(events.series_vector_b)).reshape(-1),
+        sigma=of(np.concatenate(events.series_sigma)),
+        series=columns,
+        triads=of(measured.triads),
+    )
+    plain(walk, covariance_form)(of(record.time), of(record.increments), measured, 1, body, out)
     return outputs
 
 

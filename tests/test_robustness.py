@@ -8,10 +8,11 @@ from scipy.stats import binom, chi2
 
 from strapdown import consistency, estimation, motion, quaternion, records
 from strapdown.checks import InputError
+from strapdown.estimation import gating
 from strapdown.estimation.gating import Gate, Monitor, Robust
 from strapdown.estimation.states import ProcessNoise, initial_state
 from strapdown.gyro import GyroSpec
-from strapdown.kernels import robust_gate, robust_loop
+from strapdown.kernels import covariance_form, robust_gate
 from strapdown.kernels.robust_step import ACCEPTED, PASSED_OVER, REFUSED
 from strapdown.randomness import generator
 from strapdown.scenarios import Scenario, simulate
@@ -411,7 +412,7 @@ def test_the_rules_of_a_gate():
     assert np.array_equal(memory[robust_gate.FIRST_VARIANCE :], [9.0, 9.0, 9.0])
     assert (memory[robust_gate.LEVEL], memory[robust_gate.NIS], memory[robust_gate.DEGREES]) == (1.0, 0.0, 0.0)
     assert robust_gate.restart_attitude(0.1, memory) == pytest.approx(0.3)
-    assert robust_gate.restart_attitude(1.0, memory) == estimation.UNIFORM_SIGMA
+    assert robust_gate.restart_attitude(1.0, memory) == gating.UNIFORM_SIGMA
 
 
 def test_a_widened_challenger_is_one_that_started_wider():
@@ -427,9 +428,19 @@ def test_a_widened_challenger_is_one_that_started_wider():
         bias, first = rng.standard_normal(3), 1e-7 * rng.standard_normal(3)
         states = np.zeros((2, 28))
         states[1] = pack(np.array([1.0, 0.0, 0.0, 0.0]), bias, P)
+        form = covariance_form.Body(
+            states=states,
+            angle_variance=0.0,
+            rate_variance=0.0,
+            sharpness=np.inf,
+            least_share=0.0,
+            check=1,
+            good=np.zeros(2, np.int64),
+            work=np.empty((7, 6)),
+        )
         memory = np.zeros(robust_gate.MEMORY)
         memory[robust_gate.FIRST_BIAS :] = [*(bias + first), *variance]
-        robust_loop.widen(states, memory)
+        covariance_form.widen(form, memory)
         expected = np.linalg.inv(seen + np.diag([0.0, 0.0, 0.0, *(1.0 / (9.0 * variance))]))
         # The mean solves P⁻¹ x = seen x̂ + start, of which the start's part shrinks too.
         mean = -expected[:, 3:] @ (8.0 / 9.0 / variance * first)
@@ -441,7 +452,7 @@ def test_a_widened_challenger_is_one_that_started_wider():
 
 def test_a_prior_is_seen_from_elsewhere_as_its_turn_and_tilt_say():
     """``exp(α n) ⊗ exp(ε)`` differentiated about (α₀, ε₀) by differences, of a variance with one axis hardly known."""
-    from strapdown.kernels.robust_step import seen_from
+    from strapdown.kernels.robust_step import tangent_at
 
     rng = np.random.default_rng(4)
     for _ in range(20):
@@ -464,16 +475,16 @@ def test_a_prior_is_seen_from_elsewhere_as_its_turn_and_tilt_say():
 
         h = 1e-5
         G = np.stack([(error(h * e) - error(-h * e)) / (2.0 * h) for e in np.eye(3)], axis=1)
-        packed, carried_B, back = seen_from(tuple(now), tuple(A[np.triu_indices(3)]), tuple(B.ravel()))
-        assert np.allclose(np.reshape(carried_B, (3, 3)), G @ B, atol=1e-3)
-        assert np.allclose(packed, (G @ A @ G.T)[np.triu_indices(3)], atol=1e-3)
+        M, back = tangent_at(tuple(now), tuple(A[np.triu_indices(3)]))
+        M = np.reshape(M, (3, 3))
+        assert np.allclose(M @ B, G @ B, atol=1e-3)
+        assert np.allclose(M @ A @ M.T, G @ A @ G.T, atol=1e-3)
         assert np.allclose(back, G @ (-turn * n - tilt), atol=1e-3)
         # To the first order in the tilt nothing is left out: the unknown axis is where no row of a direction sees it.
         assert np.allclose(G @ n, quaternion.rotate(quaternion.exp(-tilt), n), atol=1e-9)
-        whole, _, _ = seen_from(
-            tuple(now), tuple((3.0 * np.outer(n, n) + 1e-9 * np.eye(3))[np.triu_indices(3)]), (0.0,) * 9
-        )
-        assert np.allclose(whole, (3.0 * np.outer(G @ n, G @ n))[np.triu_indices(3)], atol=1e-8)
+        known = 3.0 * np.outer(n, n) + 1e-9 * np.eye(3)
+        M = np.reshape(tangent_at(tuple(now), tuple(known[np.triu_indices(3)]))[0], (3, 3))
+        assert np.allclose(M @ known @ M.T, 3.0 * np.outer(G @ n, G @ n), atol=1e-8)
 
 
 def turn_and_tilt(estimate, record, reference, every):
@@ -506,7 +517,7 @@ def test_a_recovery_on_one_direction_knows_what_it_does_not_know(runs):
         turns.append(np.sqrt(np.einsum("ki,kij,kj->k", n, estimate.covariance[:, :3, :3], n))[2:])
     low, high = consistency.mean_bounds(6, runs, 0.999)
     assert np.all((low < np.mean(nees, axis=0)) & (np.mean(nees, axis=0) < high)), np.mean(nees, axis=0)
-    assert np.allclose(turns, estimation.UNIFORM_SIGMA, rtol=0.02)
+    assert np.allclose(turns, gating.UNIFORM_SIGMA, rtol=0.02)
 
 
 @pytest.mark.parametrize("bias_sigma", [1e-3, 2e-2])
@@ -622,7 +633,8 @@ def test_a_weight_is_the_fixed_point_of_its_equation():
         variance = rng.uniform(0.1, 2.0, 3)
         y = 3.0 * rng.standard_normal(3)
         packed = tuple(A[np.triu_indices(3)])
-        w = robust_weight(STUDENT, 5.0, 7.0, 200, packed, *(tuple(h) for h in H), tuple(y), tuple(variance))
+        S = covariance_form.innovation_covariance(None, 0, (None, None, packed, None, None), tuple(map(tuple, H)))
+        w = robust_weight(STUDENT, 5.0, 7.0, 200, S, tuple(y), tuple(variance))
         R = np.diag(variance) / w
         gain = A @ H.T @ np.linalg.inv(H @ A @ H.T + R)
         posterior = A - gain @ H @ A
@@ -644,9 +656,8 @@ def test_hubers_update_is_the_minimum_of_hubers_cost():
         variance = rng.uniform(0.1, 0.5, 3)
         y = 6.0 * rng.standard_normal(3)
         k = 1.5
-        w = robust_weight(
-            HUBER, k * k, 0.0, 400, tuple(A[np.triu_indices(3)]), *(tuple(h) for h in H), tuple(y), tuple(variance)
-        )
+        S = tuple((H @ A @ H.T)[np.triu_indices(3)])
+        w = robust_weight(HUBER, k * k, 0.0, 400, S, tuple(y), tuple(variance))
         R = np.diag(variance) / w
         x = A @ H.T @ np.linalg.solve(H @ A @ H.T + R, y)
 
@@ -768,4 +779,4 @@ def test_bad_input_is_named(case):
 
 def test_a_uniform_angle_has_the_standard_deviation_of_a_fresh_start():
     draw = generator(1, 0, "uniform").uniform(-np.pi, np.pi, 100_000)
-    assert np.std(draw) == pytest.approx(estimation.UNIFORM_SIGMA, rel=5e-3)
+    assert np.std(draw) == pytest.approx(gating.UNIFORM_SIGMA, rel=5e-3)

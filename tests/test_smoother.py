@@ -19,7 +19,7 @@ from strapdown.checks import InputError
 from strapdown.estimation import forward, recovery_segments, smoothing
 from strapdown.estimation.gating import Gate
 from strapdown.estimation.states import ProcessNoise, covariance_matrices
-from strapdown.kernels import smoother_lag, smoother_loop, smoother_step
+from strapdown.kernels import rotation, smoother_lag, smoother_loop, smoother_step
 from strapdown.kernels.machine import compiled
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.records import Estimate, ImuRecord, Truth
@@ -1062,16 +1062,16 @@ def test_rotation_kernels_at_any_angle() -> None:
         phi = angle * quaternion.normalize(np.append(rng.standard_normal(3), 0.0))[:3]
         q = quaternion.exp(phi)
         for sign in (1.0, -1.0):
-            found = smoother_step.logarithm(tuple(sign * q))
+            found = rotation.logarithm(tuple(sign * q))
             np.testing.assert_allclose(found, phi, rtol=0, atol=4e-15 * angle if angle < 3.0 else 1e-13)
         np.testing.assert_allclose(
-            np.reshape(smoother_step.inverse_right_jacobian(tuple(phi)), (3, 3)),
+            np.reshape(rotation.inverse_right_jacobian(tuple(phi)), (3, 3)),
             kinematics.inverse_right_jacobian(phi),
             rtol=0,
             atol=1e-14,
         )
         start = quaternion.normalize(rng.standard_normal(4))
-        moved, J = smoother_step.moved(tuple(start), tuple(phi))
+        moved, J = rotation.moved(tuple(start), tuple(phi))
         np.testing.assert_allclose(moved, quaternion.multiply(start, q), rtol=0, atol=1e-15)
         np.testing.assert_allclose(np.reshape(J, (3, 3)), kinematics.right_jacobian(phi), rtol=0, atol=1e-14)
 
@@ -1113,7 +1113,7 @@ def test_composed_rotations_at_any_angle() -> None:
             r = (float(c), *(float(s * x) for x in u))
             phi = [float(2 * halves[1] * x) for x in v]
         if angle < 3.1:  # else its sign hangs on the rounding of the arguments
-            found = smoother_step.composed(r, tuple(phi))
+            found = rotation.composed(r, tuple(phi))
             np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15 * (one + other))
 
 

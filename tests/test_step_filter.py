@@ -712,7 +712,7 @@ WRONG_ARGUMENTS = {
 def wants(face, name):
     """Whether a face has an argument of that name."""
     if name in ("gate", "robust"):
-        return "family" not in face and face not in ("estimation.observability", "estimation.relinearized_start")
+        return "filters" not in face and face not in ("estimation.observability", "estimation.relinearized_start")
     return (face, name) not in {("multiple_model.run", "initial"), ("StepFilter", "record")}
 
 

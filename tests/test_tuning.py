@@ -13,7 +13,7 @@ from two_stars import ARW, BELIEVED, FREE, RRW, case, scenario
 from strapdown import consistency, gyro, motion, quaternion, scenarios, setup, tuning, units, vectors
 from strapdown.checks import InputError
 from strapdown.estimation.states import ProcessNoise
-from strapdown.kernels import tuning_loop
+from strapdown.kernels import likelihood
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.randomness import generator
@@ -115,17 +115,32 @@ def test_a_start_that_makes_the_bias_wild_is_cut_into_sub_steps_as_by_the_filter
 
 
 def test_a_lane_that_no_sub_steps_mend_cuts_no_step_of_the_others():
-    room = np.empty(WIDTH)
+    body = likelihood.Body(*[None] * len(likelihood.Body._fields))._replace(room=np.empty(likelihood.ROOM))
     theta, b = (0.1, 0.2, 0.0), np.zeros((3, WIDTH))
-    assert tuning_loop.calm_turn(tuple(b), 0.5) == pytest.approx((0.5 * LARGEST_ANGLE) ** 2)
-    assert tuning_loop.longest_step_of_lanes(theta, 0.5, tuple(b), room) == 0.5
+
+    def small(part):
+        return likelihood.is_small((None, tuple(b)), part, 0.5, body)
+
+    def longest():
+        return likelihood.longest_step((None, tuple(b)), theta, 0.5, body)
+
+    # Whole steps without a look at each lane: turns of half the range by the increment and half by the bias.
+    along = np.array([0.6, 0.0, 0.8])
+    assert small(tuple(0.5 * (1.0 - 1e-9) * LARGEST_ANGLE * along))
+    assert not small(tuple(0.5 * (1.0 + 1e-9) * LARGEST_ANGLE * along))
+    assert small(theta) == (np.hypot(0.1, 0.2) <= 0.5 * LARGEST_ANGLE)
+    assert longest() == 0.5
+    b[1, 3] = 0.999 * LARGEST_ANGLE
+    assert small((0.0, 0.0, 0.0))
+    b[1, 3] = 1.001 * LARGEST_ANGLE
+    assert not small((0.0, 0.0, 0.0))
     b[1, 3], b[1, 5], b[1, 6] = 4.0, 1e9, np.nan
-    assert tuning_loop.calm_turn(tuple(b), 0.5) < 0.0
+    assert not small((0.0, 0.0, 0.0))
     # The bias turns the fourth lane by 2 rad; two others are lost.
-    found = tuning_loop.longest_step_of_lanes(theta, 0.5, tuple(b), room)
-    assert found == pytest.approx(0.5 * LARGEST_ANGLE / np.hypot(0.1, 0.2 - 2.0))
+    assert longest() == pytest.approx(0.5 * LARGEST_ANGLE / np.hypot(0.1, 0.2 - 2.0))
     b[1, 3] = 0.0
-    assert tuning_loop.longest_step_of_lanes(theta, 0.5, tuple(b), room) == 0.5
+    assert not small((0.0, 0.0, 0.0))
+    assert longest() == 0.5
 
 
 def test_several_records_add_up_on_any_number_of_threads():

@@ -281,7 +281,7 @@ def update(state, e, now, measured, body, out):
         passes = int(memory[PASSES]) if i == 0 else WIDE_PASSES
         outcome, weight, innovation, variance, share = judged_update(form, i, e, measured, passes, options)
         least_noise = 1.0 / form.sharpness if i == 0 else 1.0 / (form.sharpness * LENIENT)
-        lost = lost or not share >= least_noise
+        lost = lost or (form.sharpness < math.inf and not share >= least_noise)
         if i == 0:
             out.weight[place] = weight
             store_innovations(out.form.innovation, place, innovation, variance)

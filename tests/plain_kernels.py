@@ -1,0 +1,34 @@
+"""Kernels in plain Python, where compiled ones would hide a fault in their source or could not run (float32)."""
+
+from __future__ import annotations
+
+from types import FunctionType, ModuleType
+
+KERNELS = "strapdown.kernels"
+
+
+def plain(function: FunctionType, *parts: ModuleType) -> FunctionType:
+    """Return what :func:`strapdown.kernels.machine.compiled` would compile: the source, its open functions bound to ``parts``."""
+    made: dict[FunctionType, FunctionType] = {}
+
+    def definition(one: FunctionType) -> FunctionType:
+        if one.__name__ not in one.__globals__.get("OPEN", ()):
+            return one
+        for part in parts:
+            found = getattr(part, one.__name__, None)
+            if isinstance(found, FunctionType) and one.__name__ not in found.__globals__.get("OPEN", ()):
+                return found
+        raise TypeError(f"nothing defines {one.__name__}")
+
+    def bound(one: FunctionType) -> FunctionType:
+        one = definition(one)
+        if one not in made:
+            names = dict(one.__globals__)
+            made[one] = FunctionType(one.__code__, names, one.__name__, one.__defaults__)
+            for name in one.__code__.co_names:
+                value = names.get(name)
+                if isinstance(value, FunctionType) and value.__module__.startswith(KERNELS):
+                    names[name] = bound(value)
+        return made[one]
+
+    return bound(function) if parts else function
