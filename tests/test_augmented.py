@@ -134,23 +134,6 @@ class ReferenceError(error_states.ErrorStates):
         }
 
 
-@dataclasses.dataclass(frozen=True)
-class Mounting(error_states.ErrorStates):
-    """The tracker's axes are turned a little against the body's."""
-
-    name: str = "mounting"
-    components: tuple[str, ...] = ("x", "y", "z")
-    units: tuple[str, ...] = ("rad",) * 3
-
-    @property
-    def sigma(self):
-        return np.full(3, 0.05)
-
-    @property
-    def effects(self):
-        return {"tracker": error_states.Effect(offset_b=np.eye(3))}
-
-
 OPTIONS: dict[str, tuple[error_states.ErrorStates, ...]] = {
     "none": (),
     "gyro scale": (error_states.GyroScale(scale_sigma=0.02, misalignment_sigma=0.01),),
@@ -176,7 +159,10 @@ OPTIONS: dict[str, tuple[error_states.ErrorStates, ...]] = {
         error_states.VectorScale(sensor="compass", scale_sigma=0.05),
     ),
     "a foreign block": (ReferenceError(),),
-    "mounting": (Mounting(),),
+    "mounting of whole attitudes": (error_states.VectorBias(sensor="tracker", bias_sigma=0.05),),
+    "mounting of a direction": (
+        error_states.SensorMounting(sensor="force", mounting_sigma=np.array([0.05, 0.03, 0.02])),
+    ),
     "all": (
         error_states.VectorBias(sensor="mag", bias_sigma=5e-6, unit="T"),
         error_states.GyroScale(scale_sigma=0.02, misalignment_sigma=0.01),
@@ -638,7 +624,7 @@ def reference_smoother(record, initial, blocks):
 
 
 @pytest.mark.parametrize(
-    "option", ["gyro scale", "gyro drift", "two frames", "hard iron that walks", "mounting", "all"]
+    "option", ["gyro scale", "gyro drift", "two frames", "hard iron that walks", "mounting of whole attitudes", "all"]
 )
 def test_the_smoother_is_the_textbook_one(option):
     record, blocks = record_of(duration=1.5, rate=25.0), OPTIONS[option]
@@ -841,8 +827,8 @@ class Wrong(error_states.ErrorStates):
             "did you mean 'body'",
         ),
         (lambda: estimation.run(record_of(), NOISE, start(), (error_states.VectorBias(sensor="mga", bias_sigma=1.0),)), "'mag'"),
-        (lambda: estimation.run(record_of(), NOISE, start(), OPTIONS["hard iron"] * 2), "two blocks are named 'mag bias'"),
-        (lambda: estimation.run(record_of(), NOISE, start(), ("mag",)), "is no block"),
+        (lambda: estimation.run(record_of(), NOISE, start(), OPTIONS["hard iron"] * 2), "two declarations of error states are named 'mag bias'"),
+        (lambda: estimation.run(record_of(), NOISE, start(), ("mag",)), "declares no error states"),
         (
             lambda: estimation.run(record_of(), NOISE, start(), (error_states.VectorScale(sensor="tracker", scale_sigma=0.1),)),
             "whole attitudes",
@@ -851,7 +837,7 @@ class Wrong(error_states.ErrorStates):
             lambda: estimation.run(
                 record_of(), NOISE, estimation.with_error_states(start(), OPTIONS["hard iron"]), OPTIONS["gyro scale"]
             ),
-            "initial has 3 block states, the blocks 9",
+            "initial has 3 error states, and 9 are declared",
         ),
         (lambda: estimation.run(record_of(), NOISE, start(), (Wrong(sigma=np.zeros(1)),)), r"sigma\[0\] is 0"),
         (lambda: estimation.run(record_of(), NOISE, start(), (Wrong(units=(), sigma=np.ones(1)),)), "0 units for 1"),
@@ -863,7 +849,7 @@ class Wrong(error_states.ErrorStates):
         (lambda: estimation.observability(record_of(), NOISE, start(), threshold=0.0), "threshold is 0"),
         (
             lambda: estimation.run(record_of(), NOISE, start(), OPTIONS["hard iron"]).errors(np.zeros(4), np.zeros(3)),
-            "true_values tells",
+            "true_values has",
         ),
     ],
 )  # fmt: skip

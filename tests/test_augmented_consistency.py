@@ -32,6 +32,7 @@ SCALE = error_states.GyroScale(scale_sigma=0.01, misalignment_sigma=0.01)
 IRON = error_states.VectorBias(sensor="mag", bias_sigma=5e-6, unit="T")
 SOFT = error_states.VectorScale(sensor="mag", scale_sigma=0.02)
 SWAY = error_states.GaussMarkov(sensor="acc", noise_sigma=0.4, correlation_time=1.0, unit="m/s²")
+MOUNTING = error_states.SensorMounting(sensor="mag", mounting_sigma=0.02)
 DRIFT = error_states.GyroGaussMarkov(bias_sigma=4e-3, correlation_time=5.0)
 
 CASES = {
@@ -40,6 +41,7 @@ CASES = {
     "soft iron": (SOFT,),
     "acceleration": (SWAY,),
     "gyro drift": (DRIFT,),
+    "mounting": (MOUNTING,),
     "all": (SCALE, IRON, SWAY),
 }
 
@@ -52,6 +54,17 @@ class Run:
     initial: estimation.State
     noise: ProcessNoise
     truth: dict
+
+
+def mounted(record: ImuRecord, theta: np.ndarray) -> ImuRecord:
+    """Return the record with the magnetometer's axes turned by theta, rad, exactly."""
+    turned = [
+        dataclasses.replace(one, vector_b=quaternion.rotate(quaternion.exp(-theta), one.vector_b))
+        if one.sensor == "mag"
+        else one
+        for one in record.vectors
+    ]
+    return dataclasses.replace(record, vectors=tuple(turned))
 
 
 def simulated(case: str, seed: int, run: int, duration: float) -> Run:
@@ -97,6 +110,8 @@ def simulated(case: str, seed: int, run: int, duration: float) -> Run:
         duration=duration,
     )
     record = simulate(scenario, seed, run)
+    if MOUNTING in blocks:
+        record = mounted(record, truth[MOUNTING.name])
     if SWAY in blocks:
         truth[SWAY.name] = None
     if drifts:
@@ -137,7 +152,7 @@ def judged(case: str, blocks, number: int, duration: float, *, smoothed=False, k
         if any(block is SWAY or block.name == SWAY.name for block in blocks):
             told[SWAY.name] = np.zeros(3)
         error = estimate.errors(one.record.truth.attitude, true_bias, told)[epochs]
-        P = estimate.whole_covariance[epochs]
+        P = (estimate.whole_covariance if blocks else estimate.covariance)[epochs]
         names = state_names(blocks)[0]
         kept = [k for k, name in enumerate(names) if not name.startswith(SWAY.name)]
         values.append(consistency.nees(error[:, kept], P[:, kept][:, :, kept]))
@@ -173,6 +188,7 @@ BROKEN = {
     "a correlation too short": ("acceleration", dataclasses.replace(SWAY, correlation_time=0.1)),
     "a drift too small": ("gyro drift", dataclasses.replace(DRIFT, bias_sigma=1e-3)),
     "rows for columns": ("soft iron", None),
+    "a mounting of another sensor": ("mounting", dataclasses.replace(MOUNTING, sensor="acc")),
 }
 
 
@@ -214,7 +230,7 @@ def test_it_is_not_with_the_block_broken(how):
     assert not judged(case, (block,), 40, 12.0).consistent
 
 
-@pytest.mark.parametrize("case", ["gyro scale", "hard iron", "soft iron", "all"])
+@pytest.mark.parametrize("case", ["gyro scale", "hard iron", "soft iron", "mounting", "all"])
 def test_calibration_is_found(case):
     """After a while of turning, what the simulated sensors have is found to a fraction of what was known before."""
     one = simulated(case, 21, 0, 60.0)

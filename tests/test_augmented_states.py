@@ -41,7 +41,7 @@ WHOLE = States(
     gyro_fast_bias_sigma=3.3e-7,
     gravity_f=(0.0, 0.1, -9.8),
     sensors={
-        "mag": SensorStates(bias_sigma=(1e-3, 2e-3, 3.14e-3), varying=True),
+        "mag": SensorStates(mounting_sigma=(1e-3, 2e-3, 2.5e-3), bias_sigma=(1e-3, 2e-3, 3.14e-3), varying=True),
         "acc": SensorStates(
             correlated_sigma=0.05, correlation_time=0.7, frame="fixed", lever_arm_sigma=(0.0, 0.1, 0.3)
         ),
@@ -535,7 +535,7 @@ def test_chosen_states_are_those_named():
     assert part.gyro_fast_bias_sigma == WHOLE.gyro_fast_bias_sigma
     assert WHOLE.chosen(WHOLE.names) == WHOLE
     assert WHOLE.names == (
-        "gyro.scale", "gyro.misalignment", "gyro.force", "gyro.drift", "mag.bias", "acc.lever", "acc.correlated",
+        "gyro.scale", "gyro.misalignment", "gyro.force", "gyro.drift", "mag.mounting", "mag.bias", "acc.lever", "acc.correlated",
     )  # fmt: skip
 
 

@@ -379,8 +379,8 @@ class VectorBias(ErrorStates):
 class LeverArm(ErrorStates):
     """The place of an accelerometer on the body, from the point that does not accelerate: ``f_b = −R_fbᵀ g + ([ẇ] + [w]²) r``, constant.
 
-    Rate and angular acceleration are those of the gyro (:func:`strapdown.estimation.angular_acceleration.turning`), whose noise becomes noise of the
-    sensor. Components whose σ is 0 are no states.
+    Rate and angular acceleration are those of the gyro (:func:`strapdown.estimation.angular_acceleration.turning`), whose noise becomes
+    noise of the sensor. Components whose σ is 0 are no states.
     """
 
     sensor: str
@@ -455,6 +455,44 @@ class VectorScale(ErrorStates):
     def effects(self) -> Mapping[str, Effect]:
         """One entry of S a state."""
         return {self.sensor: Effect(scale=np.eye(9).reshape(9, 3, 3))}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SensorMounting(ErrorStates):
+    """Mounting of a vector sensor: the small constant rotation θ from the body's axes to the sensor's, ``m = (I − [θ]×) R_fbᵀ r``.
+
+    It is the C of attitude–bias–calibration filters. A common rotation of all sensors is not observable: leave one sensor without this
+    block; that sensor defines the body's axes. For a sensor of whole attitudes the mounting is a :class:`VectorBias`.
+
+    Examples
+    --------
+    >>> mounting = SensorMounting(sensor="star", mounting_sigma=3e-3)
+    >>> mounting.size, mounting.units
+    (3, ('rad', 'rad', 'rad'))
+    """
+
+    sensor: str
+    mounting_sigma: float | Array
+    """Standard deviation of θ at the start, rad, one or one for each axis (3,)."""
+    name: str = ""
+    components: tuple[str, ...] = field(default=AXES)
+    units: tuple[str, ...] = ("rad",) * 3
+
+    def __post_init__(self) -> None:
+        """Check the deviation."""
+        object.__setattr__(self, "name", self.name or f"{self.sensor} mounting")
+        object.__setattr__(self, "mounting_sigma", _spread(f"{self.name}: mounting_sigma", self.mounting_sigma, "rad"))
+
+    @property
+    def sigma(self) -> Array:  # type: ignore[override]
+        """Standard deviation of each angle."""
+        return np.asarray(self.mounting_sigma)
+
+    @property
+    def effects(self) -> Mapping[str, Effect]:
+        """One axis a state."""
+        axes = np.eye(3)
+        return {self.sensor: Effect(scale=np.cross(axes[:, None], axes))}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

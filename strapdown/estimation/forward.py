@@ -648,6 +648,8 @@ def _in_factor(problem: Problem, options: Options) -> Passed:
         weight, happened = written.weight, judge.events(written, recovered, locked)
     else:
         number = compiled(walk, root_form)(*arguments, body, out)
+    if number < 0:  # rows from there on are not written
+        raise RuntimeError("the triangular factor lost its last digits; please report this with the record")
     if options.segments:
         stored[number, :4] = 0.0
         stored[number, 4:8] = body.attitude[0]

@@ -142,7 +142,8 @@ def assemble(blocks: tuple[ErrorStates, ...], kinds: Mapping[str, str]) -> Model
             one_of(f"{block.name}: sensor", sensor, names)
             if kinds[sensor] == "attitude" and (effect.offset_f is not None or effect.scale is not None):
                 raise InputError(
-                    f"{block.name}: {sensor} gives whole attitudes, which have an offset_b only; drop the rest"
+                    f"{block.name}: {sensor} gives whole attitudes, of which only an offset_b can be estimated; "
+                    "use VectorBias for its mounting"
                 )
             _check_lever(block, sensor, kinds[sensor], effect)
             place = names.index(sensor), slice(first, first + block.size)

@@ -9,7 +9,7 @@ filter (:mod:`strapdown.estimation`) takes over.
 Where nothing tells the hypotheses apart they stay apart, and :attr:`BankEstimate.reason` says why. A single filter from a wild start
 would have settled on some attitude and been sure of it.
 
-A gated filter that was lost starts as wildly: :func:`run_recovering` is that of :mod:`strapdown.estimation` with a bank at each such recovery.
+A gated filter that was lost starts as wildly: :func:`run_recovering` runs it with a bank at each such recovery.
 """
 
 from __future__ import annotations
@@ -192,15 +192,15 @@ def run_recovering(
 ) -> Estimate:
     """Run the gated filter, and a bank wherever a recovery leaves the turn about one direction open, until it is known.
 
-    :func:`strapdown.estimation.run` recovers as one Gaussian. Where a single direction is seen that turns slowly, the turn about it becomes known
-    little by little, not linearly, and some runs come out of that far too sure of themselves. Here hypotheses start where the challenger
-    did, take in what it has taken in, and take over in its place; when they are one, the gated filter goes on from them. It may be lost
-    again and recover again.
+    :func:`strapdown.estimation.run` recovers as one Gaussian. Where only one direction is observed, and turns slowly, the rotation about it
+    becomes known gradually and not linearly, and some runs are then far too confident. Here a bank of hypotheses starts where that
+    recovery started, processes the same measurements and takes over; when they have become one, the gated filter continues from it. It
+    may be lost and recover again.
 
     A recovery is handed over if the largest σ of the attitude that its measurements leave is between ``KNOWN`` and ``UNKNOWN`` at any edge,
     or not below ``KNOWN`` at its end. Two directions, or a measured attitude, leave nothing open; nor does a gate whose
-    ``restart_attitude_sigma`` is less than ``UNKNOWN``. With nothing to hand over the estimate is that of :func:`strapdown.estimation.run`, to
-    the bit.
+    ``restart_attitude_sigma`` is less than ``UNKNOWN``. With nothing to hand over the estimate equals that of
+    :func:`strapdown.estimation.run` bit for bit.
 
     Beside each such recovery stands an event of kind ``"hypotheses"``, from when the bank took over to when it became one, or to the end of
     the record; ``value`` is the number of hypotheses left then, 0 if they became one. In between, rows are mean and covariance of the

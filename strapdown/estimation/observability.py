@@ -154,8 +154,9 @@ def observability(
     fixed = without_errors(record, where.attitude)
     begin = dataclasses.replace(state, attitude=where.attitude[0], bias=np.zeros(3), values=np.zeros(len(state.values)))
     whole = smooth(fixed, process_noise, begin, blocks, full_covariance=True)
-    assert whole.whole_covariance is not None
-    P = whole.whole_covariance[0]
+    covariance = whole.whole_covariance if blocks else whole.covariance
+    assert covariance is not None
+    P = covariance[0]
     sigma = np.sqrt(np.diag(state.covariance))
     value, vector = np.linalg.eigh(state.covariance / np.outer(sigma, sigma))
     # The symmetric root of the correlation turns the states as little as can be: none where the prior is diagonal.
@@ -169,7 +170,7 @@ def observability(
         units=units,
         prior_sigma=sigma,
         start_sigma=np.sqrt(np.diag(P)),
-        final_sigma=np.sqrt(np.diag(whole.whole_covariance[-1])),
+        final_sigma=np.sqrt(np.diag(covariance[-1])),
         singular_values=np.sqrt(1.0 / left - 1.0),
         directions=directions / np.linalg.norm(directions, axis=1, keepdims=True),
         left=directions * np.sqrt(left)[:, None] * sigma,

@@ -125,8 +125,8 @@ def helper(function: FunctionType, parts: tuple[ModuleType, ...] = ()) -> Any:
 def compiled(function: Callable[..., Any], *parts: ModuleType) -> Any:
     """Return ``function`` compiled for calls from Python, cached on disk under the digest of all kernel sources.
 
-    ``parts`` are the modules that define the functions left open, the first that has one of them. Releases the GIL while it runs, so records
-    can be spread over threads.
+    ``parts`` are the modules that define the functions left open, the first that has one of them. It releases the GIL, so records can be
+    spread over threads.
     """
     import numba
     from numba.core.caching import FunctionCache

@@ -1,6 +1,6 @@
 """How a gate judges: refusals sensor by sensor, lock-outs, a challenger beside the filter, and restarts that widen.
 
-The rules of :class:`strapdown.estimation.gating.Gate`, of which none depends on what a state looks like. They work on what a gate remembers:
+The rules of :class:`strapdown.estimation.gating.Gate`; none depends on the form of a state. They work on what a gate remembers:
 ``memory`` (``MEMORY``,) of the challenger, and ``standing`` (sensors, ``STANDING``). The record loops of both filters call them compiled
 (:mod:`strapdown.kernels.robust_loop`, :mod:`strapdown.kernels.augmented_robust`), the step faces as they are, by
 :mod:`strapdown.estimation.judging`.

@@ -97,7 +97,7 @@ def least_certain_axis(A):
 
 
 def tangent_at(q, A):
-    """Return M, which carries a prior's attitude error to the attitude that lies the turn q from its mean, and where the mean lies from there.
+    """Return M, which carries a prior's attitude error to the attitude the turn q away, and where the mean lies from there.
 
     A Gaussian that knows an axis n far less than the others stands for attitudes ``exp(α n) ⊗ exp(ε)``, ε across n: what one direction has
     shown of the tilt ε, and of the gyro's bias by it, holds in body axes whatever the turn α about it. With ``q = exp(α₀ n) ⊗ exp(ε₀)`` the

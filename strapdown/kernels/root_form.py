@@ -1,8 +1,8 @@
 """The filter with optional error states, its covariance as a triangular factor: a body of :mod:`strapdown.kernels.walk`.
 
 State: attitude; ``x`` = (b, c): gyro bias and error states; the factor ``F`` (:mod:`strapdown.kernels.augmented_factor`). What the error
-states are, arrays say (:mod:`strapdown.kernels.augmented_step`). It keeps its digits however sharp a measurement is, so without error states
-it is also what :mod:`strapdown.kernels.covariance_form` gives way to.
+states are, arrays say (:mod:`strapdown.kernels.augmented_step`). It keeps its digits however sharp a measurement is, so without error
+states it is also what :mod:`strapdown.kernels.covariance_form` gives way to.
 
 The first functions are the filter without a gate. Those under *for the gate* let :mod:`strapdown.kernels.gate` wrap it.
 """
@@ -140,7 +140,7 @@ class Body(NamedTuple):
     length: np.ndarray
     """What each measurement's effects are divided by, in order of time (events,)."""
     turning: np.ndarray
-    """Measured rate, angular acceleration and variances of the latter's axes at each measurement (events, 9), or (0, 9) without lever arms."""
+    """Measured rate, angular acceleration and the latter's variances at each measurement (events, 9); (0, 9) without lever arms."""
     scratch: Scratch
     sharpness: float
     """Infinite: no measurement is too sharp."""

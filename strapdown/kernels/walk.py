@@ -1,7 +1,7 @@
 """The loop of every filter over a record: from gyro interval to gyro interval, split at the times of measurements.
 
-A filter is a module that defines the functions left open here (a *body*); :func:`strapdown.kernels.machine.compiled` binds them. Its state is
-whatever ``begin`` returns, and what it needs beside (noise, options, scratch) is in ``body``, a NamedTuple of its own.
+A filter is a module that defines the functions left open here (a *body*); :func:`strapdown.kernels.machine.compiled` binds them. Its
+state is whatever ``begin`` returns, and what it needs beside (noise, options, scratch) is in ``body``, a NamedTuple of its own.
 """
 
 from __future__ import annotations

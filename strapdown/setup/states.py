@@ -21,6 +21,7 @@ from strapdown.estimation.error_states import (
     GyroGaussMarkov,
     GyroScale,
     LeverArm,
+    SensorMounting,
     VectorBias,
 )
 from strapdown.estimation.gating import Gate, Monitor, Robust
@@ -62,6 +63,8 @@ VELOCITY = {
 class SensorStates:
     """Optional states of one sensor; what is 0 is no state."""
 
+    mounting_sigma: Entries = 0.0
+    """σ of a small constant rotation of the sensor's axes from the body's, rad, one or one an axis; of whole attitudes ``bias_sigma``."""
     bias_sigma: Entries = 0.0
     """σ of a constant bias in body axes, hard iron for one, one or one an axis: rad, or of whole vectors the unit of their reference."""
     correlated_sigma: float = 0.0
@@ -76,8 +79,8 @@ class SensorStates:
     lever_arm_sigma: Entries = 0.0
     """σ of the place of an accelerometer from the point that does not accelerate, body axes, one or one an axis, m."""
     velocity_time: float = 0.0
-    """Of an accelerometer on a moving hand, whose velocity is bounded (:class:`strapdown.error_states.BoundedVelocity`): how long a velocity
-    lasts, s. With it two of the next three."""
+    """How long a velocity lasts of a moving hand with an accelerometer (:class:`strapdown.error_states.BoundedVelocity`), s. With it two of
+    the next three."""
     velocity_sigma: float = 0.0
     """Stationary σ of each component of the velocity, m/s."""
     acceleration_sigma: float = 0.0
@@ -89,6 +92,7 @@ class SensorStates:
 
     def __post_init__(self) -> None:
         """Check every field."""
+        object.__setattr__(self, "mounting_sigma", _entries("mounting_sigma", self.mounting_sigma, (3,), "rad"))
         object.__setattr__(self, "bias_sigma", _entries("bias_sigma", self.bias_sigma, (3,), ""))
         object.__setattr__(self, "lever_arm_sigma", _entries("lever_arm_sigma", self.lever_arm_sigma, (3,), "m"))
         non_negative("correlated_sigma", self.correlated_sigma)
@@ -99,8 +103,10 @@ class SensorStates:
                 "give both above zero, or neither"
             )
         one_of("frame", self.frame, ("body", "fixed"))
-        if np.ndim(self.bias_sigma) and _any(self.bias_sigma) and 0.0 in np.asarray(self.bias_sigma):
-            raise InputError(f"bias_sigma is {self.bias_sigma}; give every axis one above zero, or leave it out")
+        for name in ("mounting_sigma", "bias_sigma"):
+            value = getattr(self, name)
+            if np.ndim(value) and _any(value) and 0.0 in np.asarray(value):
+                raise InputError(f"{name} is {value}; give every axis one above zero, or leave it out")
         if not isinstance(self.varying, bool):
             raise InputError(f"varying is {self.varying!r}; it must be true or false")
         for name, unit in VELOCITY.items():
@@ -116,6 +122,8 @@ class SensorStates:
         """Return them as blocks of a sensor of this kind; ``gravity``, m/s², is what a direction's specific force is over."""
         one_of(f"{sensor}: kind", kind, KINDS)
         found: list[ErrorStates] = []
+        if _any(self.mounting_sigma):
+            found.append(SensorMounting(sensor=sensor, mounting_sigma=np.asarray(self.mounting_sigma)))
         if _any(self.bias_sigma):
             found.append(VectorBias(sensor=sensor, bias_sigma=np.asarray(self.bias_sigma), varying=self.varying))
         if _any(self.lever_arm_sigma):
@@ -223,6 +231,7 @@ class States(ByValue):
         found = [name for name, there in gyro if there]
         for sensor, one in self.sensors.items():
             parts = (
+                ("mounting", _any(one.mounting_sigma)),
                 ("bias", _any(one.bias_sigma)),
                 ("lever", _any(one.lever_arm_sigma)),
                 ("correlated", one.correlated_sigma > 0.0),
@@ -252,6 +261,7 @@ class States(ByValue):
             correlated = f"{sensor}.correlated" in names
             part = replace(
                 one,
+                mounting_sigma=one.mounting_sigma if f"{sensor}.mounting" in names else 0.0,
                 bias_sigma=one.bias_sigma if f"{sensor}.bias" in names else 0.0,
                 lever_arm_sigma=one.lever_arm_sigma if f"{sensor}.lever" in names else 0.0,
                 correlated_sigma=one.correlated_sigma if correlated else 0.0,
@@ -342,6 +352,7 @@ FORM: tables.Form = {
 }
 """Keys of the states of the gyro in files."""
 SENSOR_FORM: tables.Form = {
+    "mounting_sigma": tables.MILLIRADIANS,
     "bias_sigma": tables.PLAIN,
     "correlated_sigma": tables.PLAIN,
     "correlation_time": tables.SECONDS,

@@ -44,8 +44,8 @@ def recording_case(recording: Recording, parameters: AhrsParameters | None = Non
 def record_case(record: ImuRecord, chosen: FilterSetup, *, name: str = "", seed: int | None = None) -> Case:
     """Return a record with where the filter starts on it: from its first measurements, or off its truth by errors drawn with ``seed``.
 
-    Without a seed the attitude is that of the first measurements (:func:`strapdown.estimation.first_state`), and the bias zero; a setup whose
-    initial σ are large against the measurements forgets both at once.
+    Without a seed the attitude is that of the first measurements (:func:`strapdown.estimation.first_state`), and the bias zero; a setup
+    whose initial σ are large against the measurements forgets both at once.
     """
     if seed is not None and record.truth is not None:
         draw = generator(seed, 0, "initial error").standard_normal(6)

@@ -94,7 +94,7 @@ def run(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Steps:
-    """Each step predicts over ``dt`` if that is greater than zero, then updates with an event if it has one, then keeps the state if asked."""
+    """Each step predicts over ``dt`` if ``dt > 0``, then updates with an event if it has one, then keeps the state if asked."""
 
     dt: Array
     """s (k,)."""

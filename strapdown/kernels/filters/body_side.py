@@ -1,4 +1,4 @@
-"""The error of the MEKF, body side: ``q_true = q ⊗ exp(δθ)``, ``δb = b_true − b``; what a definition that differs in one thing starts from."""
+"""The error of the MEKF, body side: ``q_true = q ⊗ exp(δθ)``, ``δb = b_true − b``; others start from it."""
 
 from __future__ import annotations
 
