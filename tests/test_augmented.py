@@ -827,7 +827,7 @@ class Wrong(error_states.ErrorStates):
             "did you mean 'body'",
         ),
         (lambda: estimation.run(record_of(), NOISE, start(), (error_states.VectorBias(sensor="mga", bias_sigma=1.0),)), "'mag'"),
-        (lambda: estimation.run(record_of(), NOISE, start(), OPTIONS["hard iron"] * 2), "two declarations of error states are named 'mag bias'"),
+        (lambda: estimation.run(record_of(), NOISE, start(), OPTIONS["hard iron"] * 2), "are named 'mag bias'"),
         (lambda: estimation.run(record_of(), NOISE, start(), ("mag",)), "declares no error states"),
         (
             lambda: estimation.run(record_of(), NOISE, start(), (error_states.VectorScale(sensor="tracker", scale_sigma=0.1),)),
