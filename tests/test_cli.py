@@ -381,8 +381,8 @@ def bad_csv(folder: Path, case: str) -> Path:
     elif case == "infinite":
         columns[7, 2] = np.inf
     elif case == "repeated":
-        columns[7, 0] = columns[6, 0]
-        columns[7, 1] += 0.1
+        columns[7:17, 0] = columns[6, 0]
+        columns[7:17, 1] += 0.1
     elif case == "short":
         columns = columns[:50]
     write_csv(path, columns, header)

@@ -482,7 +482,7 @@ def test_gate_robust_weights_and_observability_of_a_recording(run, recording, tm
         "observability.json",
     }
     with h5py.File(tmp_path / "out" / "estimate.h5") as file:
-        used = setup.from_toml(file.attrs["filter"])
+        used = setup.from_toml(file.attrs["filter"].decode())
     assert (used.gate.probability, used.robust.kind) == (0.999, "student")
     estimate = read_estimate(tmp_path / "out" / "estimate.h5")
     assert all(one.weight is not None for one in estimate.innovations.values())

@@ -193,9 +193,9 @@ def test_rates_beyond_any_gyro_are_doubted():
     recording = simulated(9)
     assert doctor.examine(recording).doubts == ()
     rate = recording.rate.copy()
-    rate[700, 1] = -1e6
+    rate[700, 1] = -1.5e3
     (doubt,) = doctor.examine(replace(recording, rate=rate)).doubts
-    assert "5.73e+07 °/s at 7 s and in 0.02% of its samples" in doubt
+    assert "8.59e+04 °/s at 7 s and in 0.02% of its samples" in doubt
 
 
 def test_all_axes_are_signed_permutations_the_identity_first():

@@ -91,7 +91,7 @@ def test_every_statistic_of_check(run, estimated):
     with h5py.File("estimate-results/estimate.h5") as file:
         error, covariance = errors(file), file["covariance"][:]
         white = {
-            held.attrs["sensor"]: held["innovation"][:] / np.sqrt(held["variance"][:])
+            held.attrs["sensor"].decode(): held["innovation"][:] / np.sqrt(held["variance"][:])
             for held in file["innovations"].values()
         }
     for star, z in white.items():

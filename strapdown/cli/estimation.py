@@ -360,8 +360,8 @@ def _drawn(
     from strapdown import plots
 
     figures = {"estimate.png": plots.estimate_overview(result, title=title)}
-    if getattr(result, "blocks", None):
-        figures["states.png"] = plots.states_over_time(result, title=title)  # type: ignore[arg-type]
+    if result.error_states:
+        figures["states.png"] = plots.states_over_time(result, title=title)
     if truth is not None:
         figures["errors.png"] = plots.error_overview(result, truth, title=title)
     if errors is not None:
@@ -580,6 +580,7 @@ def _estimate_recording(
     result = ahrs.estimate(source, parameters, latency=late, **options)
     used, found = result.recording, result.estimate
     errors = None if used.true_attitude is None else reference_errors(found.attitude, used.true_attitude)
+    rms = None if errors is None else {name: value / DEGREE for name, value in errors.rms(used.movement).items()}
     frame = (
         "East-North-Up, magnetic North"
         if used.magnetic_field is not None
@@ -631,8 +632,7 @@ def _estimate_recording(
         console.print(str(shown))
         paths.append(out / "observability.json")
         write_json(paths[-1], {"source": used.source, **shown.summary()})
-    if errors is not None:
-        rms = {name: value / DEGREE for name, value in errors.rms(used.movement).items()}
+    if rms is not None:
         paths.append(out / "errors.json")
         write_json(paths[-1], {"source": used.source, **{f"{name}_rmse_deg": value for name, value in rms.items()}})
         rows = table("RMS error over the movement phase, degrees", *rms, left=0)

@@ -369,4 +369,4 @@ def is_estimate(path: str | os.PathLike[str]) -> bool:
 
 def is_record(path: str | os.PathLike[str]) -> bool:
     """Return whether a path is a simulated record (:mod:`strapdown.recordfiles`); a folder is none."""
-    return Path(path).is_file() and recordfiles.is_record(path)
+    return not Path(path).is_dir() and recordfiles.is_record(path)
