@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from dataclasses import replace
 
@@ -228,3 +229,34 @@ def test_doctor_ends_with_the_status_of_the_verdict(monkeypatch, capsys, tmp_pat
     told = json.loads((tmp_path / "doctor.json").read_text())
     assert told["verdict"] == verdict
     assert told["candidates"][0]["score"] >= told["candidates"][1]["score"]
+
+
+@pytest.mark.parametrize("angle", [0.03, 0.1])
+def test_misfits_have_their_closed_forms(angle):
+    """Of a reference turned by an angle about East or Up, and of a gyro whose scale factor is off, all without noise."""
+    body = motion.HarmonicRates(harmonics=[motion.Harmonic(amplitude=(0.9, -0.7, 0.8), frequency=0.2)])
+    time = np.arange(6000) / 100.0
+    right = body.attitude(time)
+
+    def misfit(axis: tuple[float, float, float], scale: float = 1.0) -> list[float]:
+        back = quaternion.conjugate(right)
+        recording = Recording(
+            source="exact",
+            time=time,
+            rate=scale * body.body_rate(time),
+            specific_force=quaternion.rotate(back, np.array([0.0, 0.0, 9.80665])),
+            magnetic_field=quaternion.rotate(back, EAST_NORTH_UP_FIELD),
+            true_attitude=quaternion.multiply(quaternion.exp(angle * np.array(axis)), right),
+        )
+        best = doctor.examine(recording).candidates[0]
+        assert best.changes == ()
+        logs = [math.log(value + doctor.FLOORS["reference"]) for value in best.misfit.values()]
+        assert best.score == pytest.approx(-1.5 * doctor.INDEPENDENT * sum(logs))  # of 20 vectors of unknown variance
+        return [best.misfit[name] for name in ("gyro", "accelerometer", "magnetometer")]
+
+    _, north, up = EAST_NORTH_UP_FIELD / np.linalg.norm(EAST_NORTH_UP_FIELD)
+    declined = 1.0 - math.hypot(north * math.cos(angle), up)
+    scale = angle**2 / ((1.0 + angle) ** 2 + 1.0)
+    assert misfit((1.0, 0.0, 0.0)) == pytest.approx([0.0, 1.0 - math.cos(angle), 0.0], abs=1e-9)
+    assert misfit((0.0, 0.0, 1.0)) == pytest.approx([0.0, 0.0, declined], abs=1e-9)
+    assert misfit((0.0, 0.0, 0.0), 1.0 + angle) == pytest.approx([scale, 0.0, 0.0], rel=1e-3, abs=1e-6)
