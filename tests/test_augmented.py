@@ -864,9 +864,13 @@ def test_the_kernels_are_compiled_once_for_all_blocks():
     from strapdown.kernels import augmented_smoother, root_form
     from strapdown.kernels.walk import walk
 
+    counts = []
     for option in ("none", "all", "a foreign block"):
         estimation.smooth(record_of(duration=0.5), NOISE, start(), OPTIONS[option])
-    assert len(compiled(walk, root_form).signatures) <= 2  # times written to, or read-only
+        counts.append(len(compiled(walk, root_form).signatures))
+    assert (
+        counts[0] == counts[1] == counts[2]
+    )  # others may have been compiled before, for records whose times are read-only
     assert len(compiled(augmented_smoother.smooth_augmented).signatures) == 1
 
 
