@@ -121,7 +121,7 @@ def step_by_step(record: ImuRecord, few: int) -> Callable[[], None]:
 
 
 def import_times(repeats: int = 7) -> tuple[float, float]:
-    """Return median wall times of ``import numpy`` and ``import strapdown, strapdown.mekf`` in fresh processes, s."""
+    """Return median wall times of ``import numpy`` and ``import numpy, strapdown`` in fresh processes, s."""
 
     def once(what: str) -> float:
         start = time.perf_counter()

@@ -474,19 +474,7 @@ def fit_noise(
         )
         fits.append(_fit_axis(bins, random_terms, "rate_ramp" in chosen, level))
         misfits.append(_misfit(coefficient, bins, fits[-1].best, random_terms, starts, last, dt))
-    return NoiseFit(
-        terms=chosen,
-        estimate=np.stack([f.estimate for f in fits]),
-        lower=np.stack([f.lower for f in fits]),
-        upper=np.stack([f.upper for f in fits]),
-        supported=np.stack([f.supported for f in fits]),
-        covariance=np.stack([f.covariance for f in fits]),
-        misfit_probability=np.array([probability for probability, _ in misfits]),
-        misfit=tuple(what for _, what in misfits),
-        level=level,
-        samples=samples,
-        sample_interval=dt,
-    )
+    return _of_axes(chosen, fits, misfits, level=level, samples=samples, sample_interval=dt)
 
 
 def expected_errors(parameters: Mapping[str, float], samples: int, sample_interval: float) -> dict[str, float]:
@@ -933,6 +921,31 @@ def _fit_axis(bins: _Bins, random_terms: tuple[str, ...], with_ramp: bool, level
             wide[-1, -1] = 1.0 / np.sum(bins.ramp / best.variance)
         covariance = wide
     return _AxisFit(estimate, lower, upper, supported, covariance, best)
+
+
+def _of_axes(
+    terms: tuple[str, ...],
+    fits: Sequence[_AxisFit],
+    misfits: Sequence[tuple[float, str]],
+    *,
+    level: float,
+    samples: int,
+    sample_interval: float,
+) -> NoiseFit:
+    """Return the fits of single axes as one; a misfit is its probability and what was seen."""
+    return NoiseFit(
+        terms=terms,
+        estimate=np.stack([f.estimate for f in fits]),
+        lower=np.stack([f.lower for f in fits]),
+        upper=np.stack([f.upper for f in fits]),
+        supported=np.stack([f.supported for f in fits]),
+        covariance=np.stack([f.covariance for f in fits]),
+        misfit_probability=np.array([probability for probability, _ in misfits]),
+        misfit=tuple(what for _, what in misfits),
+        level=level,
+        samples=samples,
+        sample_interval=sample_interval,
+    )
 
 
 def _crossing(fall: Callable[[float], float], centre: float, step: float, level: float) -> float:

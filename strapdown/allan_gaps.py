@@ -283,19 +283,8 @@ def fit_noise(
             )
         least = min(found, key=lambda one: one[0])
         misfits.append((min(1.0, len(found) * least[0]), least[1]))
-    return NoiseFit(
-        terms=chosen,
-        estimate=np.stack([f.estimate for f in fits]),
-        lower=np.stack([f.lower for f in fits]),
-        upper=np.stack([f.upper for f in fits]),
-        supported=np.stack([f.supported for f in fits]),
-        covariance=np.stack([f.covariance for f in fits]),
-        misfit_probability=np.array([probability for probability, _ in misfits]),
-        misfit=tuple(what for _, what in misfits),
-        level=level,
-        samples=sum(place.stop - place.start for place in places),
-        sample_interval=dt,
-    )
+    samples = sum(place.stop - place.start for place in places)
+    return allan._of_axes(chosen, fits, misfits, level=level, samples=samples, sample_interval=dt)
 
 
 def _stretch(x: Array, dt: float, random_terms: tuple[str, ...], highest_frequency: float | None) -> _Stretch:

@@ -294,8 +294,24 @@ class GyroForce(ErrorStates):
         return -np.asarray(self.gravity_f)
 
 
+class _FirstOrder(ErrorStates):
+    """First-order Gauss–Markov states of one correlation time, stationary with ``sigma``."""
+
+    correlation_time: float
+
+    @property
+    def decay(self) -> Array:
+        """1/τ."""
+        return np.full(3, 1.0 / self.correlation_time)
+
+    @property
+    def density(self) -> Array:
+        """2σ²/τ."""
+        return 2.0 * self.sigma**2 / self.correlation_time
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
-class GyroGaussMarkov(ErrorStates):
+class GyroGaussMarkov(_FirstOrder):
     """A second gyro bias that forgets: first-order Gauss–Markov, stationary. Several of different times together cover flicker."""
 
     bias_sigma: float | Array
@@ -315,16 +331,6 @@ class GyroGaussMarkov(ErrorStates):
     def sigma(self) -> Array:  # type: ignore[override]
         """The stationary one."""
         return np.asarray(self.bias_sigma)
-
-    @property
-    def decay(self) -> Array:
-        """1/τ."""
-        return np.full(3, 1.0 / self.correlation_time)
-
-    @property
-    def density(self) -> Array:
-        """2σ²/τ."""
-        return 2.0 * self.sigma**2 / self.correlation_time
 
     @property
     def gyro_offset(self) -> Array:
@@ -496,7 +502,7 @@ class SensorMounting(ErrorStates):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class GaussMarkov(ErrorStates):
+class GaussMarkov(_FirstOrder):
     """First-order coloured noise on a vector sensor, stationary: the acceleration of a moving hand on an accelerometer."""
 
     sensor: str
@@ -531,16 +537,6 @@ class GaussMarkov(ErrorStates):
     def sigma(self) -> Array:  # type: ignore[override]
         """The stationary one."""
         return np.asarray(self.noise_sigma)
-
-    @property
-    def decay(self) -> Array:
-        """1/τ."""
-        return np.full(3, 1.0 / self.correlation_time)
-
-    @property
-    def density(self) -> Array:
-        """2σ²/τ."""
-        return 2.0 * self.sigma**2 / self.correlation_time
 
     @property
     def effects(self) -> Mapping[str, Effect]:
