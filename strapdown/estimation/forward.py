@@ -588,7 +588,7 @@ def scratch(model: Model) -> root_form.Scratch:
     )
 
 
-def _factor_body(problem: Problem, options: Options, units: Mapping[str, float]) -> root_form.Body:
+def _factor_body(problem: Problem, units: Mapping[str, float]) -> root_form.Body:
     """Return the filter as the kernels take it."""
     model, initial = problem.model, problem.initial
     size = 6 + model.states
@@ -618,7 +618,7 @@ def _in_factor(problem: Problem, options: Options) -> Passed:
     record, events, model, every = problem.record, problem.events, problem.model, options.every
     size, rows = 6 + model.states, len(record.increments) // every + 1
     units = unit_sigmas(record, model, problem.initial.unit_sigma)
-    body = _factor_body(problem, options, units)
+    body = _factor_body(problem, units)
     whole_rows = rows if options.whole_bias else 0
     stored = np.empty((options.segments + 1 if options.segments else 0, 5 + size + size * (size + 1) // 2))
     out = root_form.Outputs(
@@ -761,7 +761,7 @@ def _span_in_factor(
     increments, measurements = _increments(problem), events.measurements
     last = len(increments) // every
     start = State(attitude=state[:4], bias=state[4:7], covariance=np.eye(6))
-    body = _factor_body(replace(problem, initial=start), options, {})
+    body = _factor_body(replace(problem, initial=start), {})
     body.F[0, :6] = _singular_triangle(covariance_matrices(state[7:]))
     span = max(1, FIRST_SPAN // every)
     while True:

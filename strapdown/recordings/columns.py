@@ -287,7 +287,7 @@ def _guess(source: str, group: str, columns: Sequence[Column]) -> tuple[tuple[in
         return _guess_time(columns)
     if group == "temperature":
         hits = [k for k, one in enumerate(columns) if _words(one.name)[:1] in (["temp"], ["temperature"])]
-        usable = len(hits) == 1 and unit_of("temperature", columns[hits[0]].unit or _end(group, columns[hits[0]].name))
+        usable = len(hits) == 1 and unit_of("temperature", columns[hits[0]].unit or _end(columns[hits[0]].name))
         return ((hits[0],), "degC") if usable else None
     if group not in SENSORS:
         return None
@@ -350,7 +350,7 @@ def _guess_time(columns: Sequence[Column]) -> tuple[tuple[int, ...], str] | None
     return None
 
 
-def _end(group: str, name: str) -> str:
+def _end(name: str) -> str:
     words = _words(name)
     return words[-1] if len(words) > 1 else ""
 

@@ -133,15 +133,6 @@ class Likelihood:
         sums = [np.sum(results[k : k + len(self.prepared)], axis=0) for k in range(0, len(jobs), len(self.prepared))]
         return np.concatenate(sums)
 
-    def by_part(self, point: Array) -> list[tuple[Array, Array]]:
-        """Return for each record minus the log likelihood and Σ e²/s of every part, at one point."""
-
-        def one(case: Prepared) -> tuple[Array, Array]:
-            found = self._pass(case, point[None])
-            return found["minus_log"][:, 0], found["squares"][:, 0]
-
-        return self.each(one, self.prepared)
-
     def derivatives(self, point: Array) -> Derivatives:
         """Return the likelihood and its derivatives at a point; one pass over each record for up to seven parameters."""
         p = len(self.names)
