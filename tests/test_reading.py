@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import json
 import os
 import random
@@ -59,7 +60,7 @@ KINDS += ("gyro.toml", "dispersions.toml", "vibration.csv", "tuning.json")
 @pytest.mark.parametrize("name", KINDS)
 def test_what_is_no_regular_file_is_refused_at_once(known, tmp_path, name):
     """A pipe that nobody writes to would block for ever, /dev/zero never end."""
-    path, begun = tmp_path / name, time.monotonic()
+    path, begun = tmp_path / name, time.process_time()  # a pipe would hold the test itself
     with pytest.raises(InputError, match=rf"{name}.*does not exist"):
         known[name].read(path)
     path.mkdir()
@@ -77,7 +78,7 @@ def test_what_is_no_regular_file_is_refused_at_once(known, tmp_path, name):
     path.symlink_to(path)
     with pytest.raises(InputError, match=rf"{name}"):
         known[name].read(path)
-    assert time.monotonic() - begun < 2.0
+    assert time.process_time() - begun < 2.0
 
 
 def test_a_path_that_is_not_utf8_is_read_and_named(known, tmp_path):
@@ -104,14 +105,25 @@ def _written(path, **more) -> Path:
 
 
 def spent(refused) -> tuple[float, float]:
-    """Seconds and megabytes that a refusal takes."""
+    """Seconds of the processor and megabytes that a refusal takes."""
     tracemalloc.start()
-    begun = time.perf_counter()
+    begun = time.process_time()
     try:
         refused()
-        return time.perf_counter() - begun, tracemalloc.get_traced_memory()[1] / 1e6
+        return time.process_time() - begun, tracemalloc.get_traced_memory()[1] / 1e6
     finally:
         tracemalloc.stop()
+
+
+def processor_seconds(read) -> float:
+    """Least processor time of three attempts: what else the machine does only adds to it."""
+    took = []
+    for _ in range(3):
+        gc.collect()  # what earlier tests left is not this one's to collect
+        begun = time.process_time()
+        read()
+        took.append(time.process_time() - begun)
+    return min(took)
 
 
 def test_an_array_that_declares_more_than_it_holds_is_refused_before_memory_is_taken(tmp_path):
@@ -210,14 +222,16 @@ def test_a_large_file_is_refused_before_it_is_read(known, tmp_path, name):
 )
 def test_reading_takes_time_in_proportion_to_the_size(known, tmp_path, name, begin, unit, end):
     path = tmp_path / name
+
+    def refused():
+        with pytest.raises(InputError, match=name) as refusal:
+            known[name].read(path)
+        assert len(str(refusal.value)) < 5000
+
     took = []
     for number in (100_000, 400_000):
         path.write_text(begin + unit * number + end)
-        begun = time.process_time()
-        with pytest.raises(InputError, match=name) as refusal:
-            known[name].read(path)
-        took.append(time.process_time() - begun)
-        assert len(str(refusal.value)) < 5000
+        took.append(processor_seconds(refused))
     assert took[1] < 8.0 * took[0] + 0.5
     assert took[1] < 5.0
 
@@ -227,9 +241,8 @@ def test_a_csv_of_many_columns_is_read(tmp_path):
     extra = 50_000
     rows = "".join(f"{k},1,2,3{',0' * extra}\n" for k in range(3))
     path.write_text("time,gx [deg/s],gy,gz," + ",".join(f"c{k}" for k in range(extra)) + "\n" + rows)
-    begun = time.process_time()
+    assert processor_seconds(lambda: recordings.read(path)) < 3.0
     assert recordings.read(path).rate.shape == (3, 3)
-    assert time.process_time() - begun < 3.0
 
 
 # --------------------------------------------------------------------------------------------------------------------- links
@@ -364,10 +377,10 @@ def test_a_zeroed_sector_is_an_error_within_a_second_wherever_it_is(known, tmp_p
         if damaged == content:
             continue
         path.write_bytes(damaged)
-        begun = time.monotonic()
+        begun = time.process_time()  # the library would loop, not wait
         with pytest.raises(InputError, match=rf"{name} cannot be read: its content does not fit its digest"):
             known[name].read(path)
-        assert time.monotonic() - begun < 1.0
+        assert time.process_time() - begun < 1.0
     for front in (bytes(512), bytes(512) + content[:512]):
         path.write_bytes(front + content[512:])
         with pytest.raises(InputError, match=rf"{name} is damaged: its digest is gone"):
