@@ -21,7 +21,7 @@ from strapdown import coning, estimation, quaternion, sensor_delays, sensor_faul
 from strapdown.checks import Array, InputError, non_negative, positive
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.kernels import recording_steps
-from strapdown.kernels.machine import compiled
+from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings import Recording, increments
 from strapdown.records import ErrorStateEstimate, Estimate, ImuRecord, Innovations, cut
 from strapdown.sensor_delays import Delays
@@ -222,7 +222,7 @@ def _edges(time: Array, step: float) -> np.ndarray:
 def _averages(samples: Array, frame: Array, edge: Array) -> tuple[Array, Array]:
     """Return the mean of each step's samples in the axes that ``frame`` (n, 4) turns them to (k, 3), and their number; 0 where none."""
     total, number = np.empty((len(edge) - 1, 3)), np.empty(len(edge) - 1)
-    compiled(recording_steps.average_samples)(samples, frame, edge, total, number)
+    compiled(recording_steps.average_samples)(read_only(samples), read_only(frame), edge, total, number)
     return total / np.maximum(number, 1.0)[:, None], number
 
 
@@ -537,7 +537,7 @@ def _at_stamps(
     iron = 0.0 if prepared.dip is None else (parameters.iron_sigma / np.cos(prepared.dip)) ** 2
     attitude, own = np.empty((len(row), 4)), np.empty((len(row), 3, 3))
     compiled(recording_steps.carry_to_stamps)(
-        row, step, fixed, turned, ahead, used.rate, delays.sigma**2, iron, attitude, own
+        row, step, fixed, turned, ahead, read_only(used.rate), delays.sigma**2, iron, attitude, own
     )
     variance = filtered.variance[row]
     variance[:, :3] = np.einsum("kii->ki", own)

@@ -46,7 +46,7 @@ from numpy.typing import ArrayLike, NDArray
 from strapdown import checks, units
 from strapdown.checks import Array, InputError
 from strapdown.kernels.allan import accumulate, second_difference_sizes, second_difference_squares
-from strapdown.kernels.machine import compiled
+from strapdown.kernels.machine import compiled, read_only
 
 TERMS = ("quantization", "angle_random_walk", "bias_instability", "rate_random_walk", "rate_ramp")
 """The noise terms, in the order of every array over terms; also the names of the gyro specification."""
@@ -218,7 +218,7 @@ def allan_deviation(
     alphas = np.empty(deviation.shape, dtype=int)
     phase, lanes = np.empty(samples + 1), np.empty(512)
     for axis in range(record.shape[1]):
-        rate = record[:, axis]
+        rate = read_only(record[:, axis])
         compiled(accumulate)(rate, float(np.mean(rate)), phase)
         # Where the first τ has few averages, what comes before it is the longest one that has many.
         alpha = _power_law(phase, max(1, min(int(multiples[0]), samples // _MANY_BLOCKS)), 0)
@@ -235,7 +235,7 @@ def allan_deviation(
             deviation[axis] = np.sqrt(squares / (2.0 * (samples + 1 - 2 * multiples))) / multiples
         elif estimator == "modified":
             summed = np.empty(samples + 2)
-            compiled(accumulate)(phase, float(np.mean(phase)), summed)
+            compiled(accumulate)(read_only(phase), float(np.mean(phase)), summed)
             deviation[axis] = [math.sqrt(_third_differences(summed, int(m)) / 2.0) / m**2 for m in multiples]
         elif estimator == "hadamard":
             deviation[axis] = [math.sqrt(_third_differences(phase, int(m)) / 6.0) / m for m in multiples]

@@ -52,7 +52,7 @@ from strapdown import flicker, tables, units
 from strapdown.checks import Array, InputError, array, finite, increasing, non_negative, positive
 from strapdown.equality import ByValue
 from strapdown.kernels import gyro_errors, noise
-from strapdown.kernels.machine import compiled
+from strapdown.kernels.machine import compiled, read_only
 
 Axes = float | Array
 """One number for all axes, or an array (3,) of one an axis."""
@@ -249,13 +249,13 @@ def simulate(
     increments, bias = np.empty((n, 3)), np.empty((n + 1, 3))
     words, normals = np.empty((2, gyro_errors.BLOCK // 2), np.uint64), np.zeros((4, gyro_errors.BLOCK))
     compiled(gyro_errors.drift_and_noise)(
-        stamps,
-        exact,
+        read_only(stamps),
+        read_only(exact),
         np.eye(3) + spec.error_matrix,
         spec.asymmetry,
         spec.turn_on_bias + _axes(spec.turn_on_bias_sigma) * initial[:, -1],
         _axes(spec.rate_ramp),
-        np.zeros(3) if low_passed else white,
+        _axes(0.0) if low_passed else white,
         _axes(spec.rate_random_walk),
         q,
         np.full(3, tau),
@@ -302,7 +302,7 @@ def simulate(
 
 
 def _axes(value: Axes) -> Array:
-    return np.ascontiguousarray(np.broadcast_to(value, 3), dtype=np.float64)
+    return read_only(np.broadcast_to(np.asarray(value, dtype=np.float64), 3))
 
 
 def _streams(key: np.ndarray) -> np.ndarray:

@@ -20,7 +20,7 @@ from strapdown.estimation.observability import state_names, without_errors
 from strapdown.estimation.schedule import KIND_CODES
 from strapdown.estimation.states import ProcessNoise
 from strapdown.estimation.step_filter import StepFilter
-from strapdown.kernels import augmented_factor, augmented_step
+from strapdown.kernels import error_state_step, triangle
 from strapdown.kernels.machine import compiled
 from strapdown.records import ImuRecord
 from strapdown.vectors import VectorMeasurements, triad
@@ -398,7 +398,7 @@ def rows_at(face, sensor, kind, reference, z):
     length = np.linalg.norm(reference) if kind == "vector" else 1.0
     attitude = kind == "attitude"
     frame = (*z, 0.0, 0.0, 0.0, 0.0, 0.0) if attitude else tuple(triad(reference).ravel())
-    count = augmented_step.fill_rows(
+    count = error_state_step.fill_rows(
         tuple(face.attitude),
         tuple(quaternion.to_matrix(face.attitude).ravel()),
         np.array([*face.bias, *face.values]),
@@ -460,11 +460,11 @@ def test_the_factor_keeps_its_digits_however_sharp_the_measurement(sharpness):
             noise[:, :noisy] = 1e-3 * rng.standard_normal((p, noisy)) * prior[:noisy]
             F[:n] = F[:n] @ phi.T
             F[n:] = noise
-            augmented_factor.triangularise(F, noisy, 3, n, n + p, 0, 0, work)
+            triangle.triangularise(F, noisy, 3, n, n + p, 0, 0, work)
             P = mpmath.matrix(phi) * P * mpmath.matrix(phi).T + mpmath.matrix(noise).T * mpmath.matrix(noise)
             for _ in range(4):
                 H = rng.standard_normal((1, n)) / prior
-                s = augmented_factor.take_row(F, n, H, 0, sharpness**2, gain)
+                s = triangle.take_row(F, n, H, 0, sharpness**2, gain)
                 h = mpmath.matrix(H)
                 exact = (h * P * h.T)[0] + mpmath.mpf(sharpness) ** 2
                 K = P * h.T / exact
@@ -859,19 +859,23 @@ def test_bad_input_is_refused_with_the_remedy(make, words):
         make()
 
 
-def test_the_kernels_are_compiled_once_for_all_blocks():
-    """The kernels see arrays only: whatever the blocks, one compiled version each."""
-    from strapdown.kernels import augmented_smoother, root_form
+def _laid_out_otherwise(record):
+    """Return the same record with times that may be written to and come with gaps, and one σ for all measurements of a sensor."""
+    series = (dataclasses.replace(one, sigma=float(one.sigma[0])) for one in record.vectors)
+    return dataclasses.replace(record, time=np.repeat(record.time, 2)[::2], vectors=tuple(series))
+
+
+def test_the_kernels_are_compiled_once_for_all_blocks_and_records():
+    """The kernels see arrays of one layout: whatever the error states and the record, one compiled version each."""
+    from strapdown.kernels import root_form, root_smoother
     from strapdown.kernels.walk import walk
 
-    counts = []
+    record = record_of(duration=0.5)
     for option in ("none", "all", "a foreign block"):
-        estimation.smooth(record_of(duration=0.5), NOISE, start(), OPTIONS[option])
-        counts.append(len(compiled(walk, root_form).signatures))
-    assert (
-        counts[0] == counts[1] == counts[2]
-    )  # others may have been compiled before, for records whose times are read-only
-    assert len(compiled(augmented_smoother.smooth_augmented).signatures) == 1
+        for one in (record, _laid_out_otherwise(record)):
+            estimation.smooth(one, NOISE, start(), OPTIONS[option])
+    assert len(compiled(walk, root_form).signatures) == 1
+    assert len(compiled(root_smoother.smooth_augmented).signatures) == 1
 
 
 @pytest.mark.parametrize("option", ["hard iron", "two frames"])

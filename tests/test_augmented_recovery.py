@@ -17,8 +17,8 @@ from strapdown.estimation.model import Model, assemble
 from strapdown.estimation.states import ProcessNoise
 from strapdown.estimation.step_filter import StepFilter
 from strapdown.gyro import GyroSpec
-from strapdown.kernels import robust_gate, robust_step, root_form
-from strapdown.kernels.robust_gate import WIDE_PASSES
+from strapdown.kernels import gate_rules, iterated_update, root_form
+from strapdown.kernels.gate_rules import WIDE_PASSES
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Truth
 from strapdown.scenarios import Scenario
@@ -379,8 +379,8 @@ def form_of(model):
 @pytest.mark.parametrize("level", [0, 2])
 def test_a_challenger_knows_what_the_prior_says_by_now(level):
     """Means and covariance of states: one stays, one walks, one forgets, and two hang together; the others' σ is 3^level times as wide."""
-    memory, now, width = np.zeros(robust_gate.MEMORY), 7.1, 3.0**level
-    memory[robust_gate.LEVEL] = level
+    memory, now, width = np.zeros(gate_rules.MEMORY), 7.1, 3.0**level
+    memory[gate_rules.LEVEL] = level
     decay, density = np.array([0.0, 0.0, 0.3, 0.5]), np.array([0.0, 4e-4, 0.05, 0.0])
     rng = np.random.default_rng(3)
     root = np.tril(rng.standard_normal((4, 4)))
@@ -409,9 +409,9 @@ def test_a_challenger_knows_what_the_prior_says_by_now(level):
     assert np.array_equal(x[1, :3], x[0, :3])
     np.testing.assert_allclose(x[1, 3:], kept * values, rtol=1e-14)
     np.testing.assert_allclose(F[0, :size].T @ F[0, :size], P, rtol=1e-14)
-    assert (memory[robust_gate.CHALLENGED], memory[robust_gate.SINCE]) == (1.0, now)
-    assert np.array_equal(memory[robust_gate.FIRST_BIAS : robust_gate.FIRST_VARIANCE], x[0, :3])
-    np.testing.assert_allclose(memory[robust_gate.FIRST_VARIANCE :], np.diag(expected)[3:6], rtol=1e-12)
+    assert (memory[gate_rules.CHALLENGED], memory[gate_rules.SINCE]) == (1.0, now)
+    assert np.array_equal(memory[gate_rules.FIRST_BIAS : gate_rules.FIRST_VARIANCE], x[0, :3])
+    np.testing.assert_allclose(memory[gate_rules.FIRST_VARIANCE :], np.diag(expected)[3:6], rtol=1e-12)
 
 
 @pytest.mark.parametrize("age", [0.0, 0.03, 1.7, 300.0])
@@ -434,7 +434,7 @@ def test_a_challenger_knows_what_the_prior_of_chains_says_by_now(age):
     restart = root_form.Restart(
         bias_sigma=np.ones(3), values=values, root=root, time=0.0, fresh=np.empty((3 * m + 6, 3 + m))
     )
-    root_form.start_candidate(form, np.zeros(robust_gate.MEMORY), age, 1.8, restart)
+    root_form.start_candidate(form, np.zeros(gate_rules.MEMORY), age, 1.8, restart)
     Phi, Q = np.eye(m), np.zeros((m, m))
     first = 0
     for block in blocks:
@@ -454,8 +454,8 @@ def challenger_of(P, bias, values):
     form.attitude[:, 0] = 1.0
     form.F[1, :size] = np.linalg.cholesky(P[::-1, ::-1])[::-1, ::-1].T
     form.x[1] = [*bias, *values]
-    memory = np.zeros(robust_gate.MEMORY)
-    memory[robust_gate.FIRST_BIAS + 3 : robust_gate.FIRST_BIAS + 6] = STARTED**2
+    memory = np.zeros(gate_rules.MEMORY)
+    memory[gate_rules.FIRST_BIAS + 3 : gate_rules.FIRST_BIAS + 6] = STARTED**2
     return form, memory
 
 
@@ -479,11 +479,11 @@ def test_a_challenger_that_is_widened_is_what_it_would_be_had_it_started_so():
     np.testing.assert_allclose(form.attitude[1], turn, atol=1e-12)
     upper = tuple(expected[:3, :3][np.triu_indices(3)])
     G = np.eye(9)
-    G[:3, :3] = np.reshape(robust_step.tangent_at(tuple(turn), upper)[0], (3, 3))
+    G[:3, :3] = np.reshape(iterated_update.tangent_at(tuple(turn), upper)[0], (3, 3))
     np.testing.assert_allclose(found.T @ found, G @ expected @ G.T, rtol=1e-8, atol=1e-12)
     assert np.array_equal(found, np.tril(found))
-    np.testing.assert_allclose(memory[robust_gate.FIRST_BIAS + 3 : robust_gate.FIRST_BIAS + 6], 9.0 * STARTED**2)
-    assert memory[robust_gate.LEVEL] == 1.0
+    np.testing.assert_allclose(memory[gate_rules.FIRST_BIAS + 3 : gate_rules.FIRST_BIAS + 6], 9.0 * STARTED**2)
+    assert memory[gate_rules.LEVEL] == 1.0
 
 
 def test_widening_a_bias_whose_axes_hang_together_leaves_a_covariance():
@@ -697,7 +697,7 @@ def test_both_faces_widen_a_challenger_alike(case):
     gate, blocks = Gate(recovery=5, restart_bias_sigma=1e-2), FACES[case][1]
     whole, end = estimation.run_part(one.record, NOISE, start, blocks, gate=gate, full_covariance=True)
     step = in_steps.run(one.record, NOISE, start, blocks, gate=gate)
-    assert end.gate.counts[robust_gate.LEVEL] > 1.0
+    assert end.gate.counts[gate_rules.LEVEL] > 1.0
     assert recoveries(whole)
     assert_same_events(whole, step)
     sigma = np.sqrt(np.einsum("kii->ki", whole.whole_covariance))

@@ -24,7 +24,7 @@ from strapdown.estimation.model import assemble
 from strapdown.estimation.states import ProcessNoise
 from strapdown.estimation.step_filter import StepFilter
 from strapdown.gyro import GyroSpec
-from strapdown.kernels.robust_gate import WIDE_PASSES
+from strapdown.kernels.gate_rules import WIDE_PASSES
 from strapdown.recordings import Recording, read
 from strapdown.records import ImuRecord
 from strapdown.setup.states import SensorStates, States, from_table

@@ -14,7 +14,7 @@ from strapdown.estimation import multiple_model
 from strapdown.estimation.gating import Gate, Monitor, Robust
 from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
-from strapdown.kernels import robust_gate
+from strapdown.kernels import gate_rules
 from strapdown.motion import ConstantRate
 from strapdown.randomness import generator
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
@@ -307,7 +307,7 @@ def test_its_parts_are_the_filter_the_bank_and_the_filter_again():
     first, last = (int(np.searchsorted(record.time, time)) for time in (recovery.start - 1e-9, recovery.end))
     first -= 1
     _, end = estimation.run_part(records.cut(record, 0, last), NOISE, start, gate=Gate())
-    sigma = np.sqrt(end.gate.counts[robust_gate.FIRST_BIAS + 3 : robust_gate.FIRST_BIAS + 6])
+    sigma = np.sqrt(end.gate.counts[gate_rules.FIRST_BIAS + 3 : gate_rules.FIRST_BIAS + 6])
     assert np.all(sigma**2 >= before.variance[first, 3:] + BIAS_SIGMA**2)
     rest = records.cut(record, first, len(record.time) - 1)
     alone = multiple_model.run(
@@ -444,7 +444,7 @@ def test_a_part_that_begins_amid_refusals_recovers():
     """The end state of one part has six of them; the bank starts from those that this part has."""
     record, start = lost_record(3, jumps=(15.0,), duration=40.0)
     _, state = estimation.run_part(records.cut(record, 0, 778), NOISE, start, gate=Gate())
-    assert state.gate.standing["star 0"][robust_gate.IN_A_ROW] == 6.0
+    assert state.gate.standing["star 0"][gate_rules.IN_A_ROW] == 6.0
     rest = records.cut(record, 778, 2000)
     estimate = multiple_model.run_recovering(rest, NOISE, state, gate=Gate(), every=2, full_covariance=True)
     assert len(events(estimate, "recovery")) == len(events(estimate, "hypotheses")) == 1

@@ -15,8 +15,8 @@ from strapdown.estimation.states import ProcessNoise, covariance_matrices, initi
 from strapdown.estimation.step_filter import StepFilter
 from strapdown.gyro import GyroSpec
 from strapdown.kernels import covariance_form
+from strapdown.kernels.gate_rules import CHALLENGED
 from strapdown.kernels.measurement import SIGMA_ORIGIN, VALUE_ORIGIN
-from strapdown.kernels.robust_gate import CHALLENGED
 from strapdown.kernels.walk import walk
 from strapdown.records import ImuRecord
 from strapdown.scenarios import Scenario, simulate

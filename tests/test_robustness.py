@@ -12,8 +12,8 @@ from strapdown.estimation import gating
 from strapdown.estimation.gating import Gate, Monitor, Robust
 from strapdown.estimation.states import ProcessNoise, initial_state
 from strapdown.gyro import GyroSpec
-from strapdown.kernels import covariance_form, robust_gate
-from strapdown.kernels.robust_step import ACCEPTED, PASSED_OVER, REFUSED
+from strapdown.kernels import covariance_form, gate_rules
+from strapdown.kernels.iterated_update import ACCEPTED, PASSED_OVER, REFUSED
 from strapdown.randomness import generator
 from strapdown.scenarios import Scenario, simulate
 from strapdown.vectors import AttitudeSensor, Faults, VectorSensor
@@ -277,8 +277,8 @@ def test_the_restart_is_as_wide_as_the_start_unless_told():
     start = started(record, 0, bias_sigma=0.02)
     lost = replace(start, attitude=quaternion.multiply(start.attitude, quaternion.exp([0.0, 1.57, 0.0])))
     _, end = estimation.run_part(records.cut(record, 0, 20), NOISE, lost, gate=Gate())
-    assert end.gate.counts[robust_gate.CHALLENGED] == 1.0
-    first = end.gate.counts[robust_gate.FIRST_BIAS + 3 : robust_gate.FIRST_BIAS + 6]
+    assert end.gate.counts[gate_rules.CHALLENGED] == 1.0
+    first = end.gate.counts[gate_rules.FIRST_BIAS + 3 : gate_rules.FIRST_BIAS + 6]
     assert np.all(first > 1.9 * 0.02**2)  # what the filter had left, and the restart's
 
 
@@ -352,23 +352,23 @@ def test_a_record_in_single_intervals_recovers_as_the_whole_does():
 
 def judged(outcomes, recovery=3, limit=4):
     """Rows of a gate with two sensors after outcomes (sensor, filter's, challenger's or None); verdicts, recoveries and lock-outs."""
-    memory, standing = np.zeros(robust_gate.MEMORY), np.zeros((2, robust_gate.STANDING))
-    standing[:, robust_gate.TOLD] = -1.0
+    memory, standing = np.zeros(gate_rules.MEMORY), np.zeros((2, gate_rules.STANDING))
+    standing[:, gate_rules.TOLD] = -1.0
     lock_outs, told, found = np.zeros((9, 4)), 0, []
     for k, (sensor, mine, other) in enumerate(outcomes):
-        told, begins = robust_gate.judge_filter(
+        told, begins = gate_rules.judge_filter(
             mine, float(k), sensor, recovery, limit, standing, memory, lock_outs, told
         )
         if begins:
-            robust_gate.begin_challenge(memory, float(k), np.zeros(3), np.ones(3))
-        if memory[robust_gate.CHALLENGED]:
-            found.append(robust_gate.judge_challenger(other, 2.0, 2, sensor, standing, memory, np.zeros(3)))
+            gate_rules.begin_challenge(memory, float(k), np.zeros(3), np.ones(3))
+        if memory[gate_rules.CHALLENGED]:
+            found.append(gate_rules.judge_challenger(other, 2.0, 2, sensor, standing, memory, np.zeros(3)))
     return memory, standing, lock_outs[:told], found
 
 
 def test_the_rules_of_a_gate():
     """Plain numbers: when a challenger is dropped, believed, wider; what is told; what a widening sets back."""
-    dropped, followed, narrow = robust_gate.DROPPED, robust_gate.FOLLOWED, robust_gate.TOO_NARROW
+    dropped, followed, narrow = gate_rules.DROPPED, gate_rules.FOLLOWED, gate_rules.TOO_NARROW
     refused, both = (0, REFUSED, ACCEPTED), (0, REFUSED, REFUSED)
     assert judged([refused, refused, (0, ACCEPTED, ACCEPTED)])[3] == [followed, followed, dropped]
     assert judged([refused, (1, ACCEPTED, ACCEPTED)])[3] == [
@@ -377,42 +377,42 @@ def test_the_rules_of_a_gate():
     ]  # of which the other sensor is none refused
     memory, standing, lock_outs, found = judged([refused, both, both])
     assert found == [followed, followed, dropped]  # two misses are more than 1 + half of one hit
-    assert (memory[robust_gate.LEVEL], memory[robust_gate.CHALLENGED]) == (1.0, 0.0)
+    assert (memory[gate_rules.LEVEL], memory[gate_rules.CHALLENGED]) == (1.0, 0.0)
     assert judged([refused] * 6 + [both] * 3)[3][-2:] == [followed, dropped]  # three in a row
     assert judged([refused] * 6 + [both] * 2 + [refused, both])[3][-1] == followed
-    assert judged([refused] * 3 + [(0, ACCEPTED, ACCEPTED)] * 2)[1][0, robust_gate.EXCESS] == 1.0
+    assert judged([refused] * 3 + [(0, ACCEPTED, ACCEPTED)] * 2)[1][0, gate_rules.EXCESS] == 1.0
     memory, standing, _, _ = judged([(0, REFUSED, PASSED_OVER)] * 4)
-    assert not robust_gate.is_believed(0, 3, standing, memory)
+    assert not gate_rules.is_believed(0, 3, standing, memory)
     memory, standing, lock_outs, found = judged([(1, ACCEPTED, None)] * 14 + [refused, both, both, refused])
-    assert memory[robust_gate.LEVEL] == 1.0
+    assert memory[gate_rules.LEVEL] == 1.0
     for accepted, level in ((14, 1.0), (15, 0.0)):  # 5 × 3 accepted since
         memory, _, _, _ = judged([refused, both, both] + [(1, ACCEPTED, ACCEPTED)] * accepted + [refused])
-        assert memory[robust_gate.LEVEL] == level
+        assert memory[gate_rules.LEVEL] == level
     memory, standing, lock_outs, found = judged([refused] * 6)
     assert [list(row) for row in lock_outs] == [[0.0, 5.0, 0.0, 6.0]]
-    assert robust_gate.is_believed(0, 3, standing, memory)
-    assert not robust_gate.is_believed(1, 3, standing, memory)
-    assert not robust_gate.is_believed(0, 7, standing, memory)
+    assert gate_rules.is_believed(0, 3, standing, memory)
+    assert not gate_rules.is_believed(1, 3, standing, memory)
+    assert not gate_rules.is_believed(0, 7, standing, memory)
     row = np.zeros(4)
-    memory[robust_gate.SINCE] = 2.0
-    robust_gate.recover(5.0, 0, 4, standing, memory, row, lock_outs)
+    memory[gate_rules.SINCE] = 2.0
+    gate_rules.recover(5.0, 0, 4, standing, memory, row, lock_outs)
     assert list(row) == [5.0, 0.0, 0.0, 6.0]
     assert lock_outs[0, 3] == 0.0
-    assert not standing[:, : robust_gate.TOLD].any()
-    assert memory[robust_gate.PASSES] == robust_gate.WIDE_PASSES
+    assert not standing[:, : gate_rules.TOLD].any()
+    assert memory[gate_rules.PASSES] == gate_rules.WIDE_PASSES
     memory, standing, _, _ = judged([refused])
     for nis, expected in ((2.0, followed), (40.0, narrow)):
-        assert robust_gate.judge_challenger(ACCEPTED, nis, 2, 0, standing, memory, np.zeros(3)) == expected
-    assert robust_gate.judge_challenger(ACCEPTED, 0.0, 99, 0, standing, memory, np.array([1.6, 0.0, 0.0])) == narrow
-    assert robust_gate.may_widen(np.full(3, 1.04), memory)
-    assert not robust_gate.may_widen([1.0, 1.06, 1.0], memory)
-    assert robust_gate.start_undone(0, 1.0, memory) == pytest.approx(-8.0)
-    assert robust_gate.start_undone(0, 1.2, memory) == 0.0
-    robust_gate.count_widening(memory)
-    assert np.array_equal(memory[robust_gate.FIRST_VARIANCE :], [9.0, 9.0, 9.0])
-    assert (memory[robust_gate.LEVEL], memory[robust_gate.NIS], memory[robust_gate.DEGREES]) == (1.0, 0.0, 0.0)
-    assert robust_gate.restart_attitude(0.1, memory) == pytest.approx(0.3)
-    assert robust_gate.restart_attitude(1.0, memory) == gating.UNIFORM_SIGMA
+        assert gate_rules.judge_challenger(ACCEPTED, nis, 2, 0, standing, memory, np.zeros(3)) == expected
+    assert gate_rules.judge_challenger(ACCEPTED, 0.0, 99, 0, standing, memory, np.array([1.6, 0.0, 0.0])) == narrow
+    assert gate_rules.may_widen(np.full(3, 1.04), memory)
+    assert not gate_rules.may_widen([1.0, 1.06, 1.0], memory)
+    assert gate_rules.start_undone(0, 1.0, memory) == pytest.approx(-8.0)
+    assert gate_rules.start_undone(0, 1.2, memory) == 0.0
+    gate_rules.count_widening(memory)
+    assert np.array_equal(memory[gate_rules.FIRST_VARIANCE :], [9.0, 9.0, 9.0])
+    assert (memory[gate_rules.LEVEL], memory[gate_rules.NIS], memory[gate_rules.DEGREES]) == (1.0, 0.0, 0.0)
+    assert gate_rules.restart_attitude(0.1, memory) == pytest.approx(0.3)
+    assert gate_rules.restart_attitude(1.0, memory) == gating.UNIFORM_SIGMA
 
 
 def test_a_widened_challenger_is_one_that_started_wider():
@@ -438,8 +438,8 @@ def test_a_widened_challenger_is_one_that_started_wider():
             good=np.zeros(2, np.int64),
             work=np.empty((7, 6)),
         )
-        memory = np.zeros(robust_gate.MEMORY)
-        memory[robust_gate.FIRST_BIAS :] = [*(bias + first), *variance]
+        memory = np.zeros(gate_rules.MEMORY)
+        memory[gate_rules.FIRST_BIAS :] = [*(bias + first), *variance]
         covariance_form.widen(form, memory)
         expected = np.linalg.inv(seen + np.diag([0.0, 0.0, 0.0, *(1.0 / (9.0 * variance))]))
         # The mean solves P⁻¹ x = seen x̂ + start, of which the start's part shrinks too.
@@ -447,12 +447,12 @@ def test_a_widened_challenger_is_one_that_started_wider():
         assert np.allclose(covariance_matrices(states[1, 7:]), expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
         assert np.allclose(states[1, 4:7] - bias, mean[3:], rtol=1e-6, atol=1e-14)
         assert np.allclose(quaternion.log(states[1, :4]), mean[:3], rtol=1e-6, atol=1e-14)
-        assert np.allclose(memory[robust_gate.FIRST_BIAS + 3 :], 9.0 * variance)
+        assert np.allclose(memory[gate_rules.FIRST_BIAS + 3 :], 9.0 * variance)
 
 
 def test_a_prior_is_seen_from_elsewhere_as_its_turn_and_tilt_say():
     """``exp(α n) ⊗ exp(ε)`` differentiated about (α₀, ε₀) by differences, of a variance with one axis hardly known."""
-    from strapdown.kernels.robust_step import tangent_at
+    from strapdown.kernels.iterated_update import tangent_at
 
     rng = np.random.default_rng(4)
     for _ in range(20):
@@ -623,7 +623,7 @@ def test_what_robustness_costs_where_the_noise_is_normal():
 
 def test_a_weight_is_the_fixed_point_of_its_equation():
     """Student's t: w = (ν + d)/(ν + E|r|²/σ²) under the posterior that w itself leads to, by a plain iteration in matrices."""
-    from strapdown.kernels.robust_step import STUDENT, robust_weight
+    from strapdown.kernels.iterated_update import STUDENT, robust_weight
 
     rng = np.random.default_rng(1)
     for _ in range(20):
@@ -647,7 +647,7 @@ def test_hubers_update_is_the_minimum_of_hubers_cost():
     """½ xᵀP⁻¹x + ρ(√(rᵀR⁻¹r)), ρ quadratic up to k and linear beyond: by scipy.optimize, without weights."""
     from scipy.optimize import minimize
 
-    from strapdown.kernels.robust_step import HUBER, robust_weight
+    from strapdown.kernels.iterated_update import HUBER, robust_weight
 
     rng = np.random.default_rng(2)
     for _ in range(10):

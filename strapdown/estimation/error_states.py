@@ -14,7 +14,6 @@ import numpy as np
 
 from strapdown.checks import Array, InputError, array, non_negative, one_of, positive
 from strapdown.equality import ByValue
-from strapdown.kernels import augmented_chain
 from strapdown.units import STANDARD_GRAVITY
 from strapdown.vectors import GRAVITY_F
 
@@ -143,9 +142,9 @@ class ErrorStates(ByValue):
         h = dt / 2**doublings
         phi, Q = np.zeros((2, self.size, self.size))
         for k in range(self.size):
-            first = augmented_chain.chain_start(chains, k)
+            first = chains.chain_start(chains, k)
             own = slice(first, k + 1)
-            far, near, itself, n20, n21, n22, n10, n11, n00 = augmented_chain.chain_step(decay, chains, k, first, h)
+            far, near, itself, n20, n21, n22, n10, n11, n00 = chains.chain_step(decay, chains, k, first, h)
             phi[own, k] = (far, near, itself)[first - k - 1 :]
             N = np.array([[n00, 0.0, 0.0], [n10, n11, 0.0], [n20, n21, n22]])[:, first - k - 1 :]
             Q[own, own] += density[k] * N.T @ N

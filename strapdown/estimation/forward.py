@@ -32,10 +32,10 @@ from strapdown.estimation.states import (
     pack,
     restart_bias_variance,
 )
-from strapdown.kernels import covariance_form, gate, robust_gate, robust_step, root_form
-from strapdown.kernels.augmented_chain import LINKS
-from strapdown.kernels.augmented_step import OFFSET
-from strapdown.kernels.machine import compiled
+from strapdown.kernels import covariance_form, gate, gate_rules, iterated_update, root_form
+from strapdown.kernels.chains import LINKS
+from strapdown.kernels.error_state_step import OFFSET
+from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.measurement import Measurements
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.kernels.walk import walk
@@ -100,6 +100,11 @@ class Problem:
     def variances(self) -> tuple[float, float]:
         """σ_v², rad²/s, and σ_u², rad²/s³."""
         return self.process_noise.angle_random_walk**2, self.process_noise.rate_random_walk**2
+
+    @property
+    def gyro(self) -> tuple[Array, Array]:
+        """Edges of the intervals (n + 1,), s, and increments (n, 3), rad, for the kernels."""
+        return read_only(self.record.time), read_only(self.record.increments)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -272,10 +277,6 @@ def _in_order(events: Sequence[Event]) -> tuple[Event, ...]:
     return tuple(sorted(events, key=lambda event: event.start))
 
 
-def _increments(problem: Problem) -> Array:
-    return np.ascontiguousarray(problem.record.increments)
-
-
 def _innovations(events: Schedule, *, judged: bool) -> tuple[int, int]:
     """Return the shape of the innovations' array: as many numbers a measurement as are written."""
     most = 6 if judged else max([4, *(2 * KINDS[kind] for kind in events.kinds)])
@@ -336,11 +337,11 @@ def _in_blocks(problem: Problem, options: Options) -> Passed:
     out = _block_outputs(problem, options, judged=False)
     written = out._replace(segments=out.segments[: options.segments])
     body = _block_body(problem, options, _packed_states(problem.initial))
-    increments, measurements = _increments(problem), events.measurements
+    (edges, increments), measurements = problem.gyro, events.measurements
     row, event = 0, 0
     while True:
         number = compiled(walk, covariance_form)(
-            record.time[row * every :],
+            edges[row * every :],
             increments[row * every :],
             after(measurements, event),
             every,
@@ -413,8 +414,7 @@ def _judged_in_blocks(problem: Problem, options: Options) -> Passed:
     written = judge.outputs(out._replace(segments=out.segments[: options.segments]))
     restart = covariance_form.Restart(bias_variance=restart_bias_variance(options.gate, problem.initial))
     number, recovered, locked = compiled(walk, gate, covariance_form)(
-        problem.record.time,
-        _increments(problem),
+        *problem.gyro,
         problem.events.measurements,
         options.every,
         judge.body(body, restart),
@@ -426,7 +426,7 @@ def _judged_in_blocks(problem: Problem, options: Options) -> Passed:
         return _in_factor(problem, options)
     states = body.states
     candidate = None
-    if judge.memory[robust_gate.CHALLENGED]:
+    if judge.memory[gate_rules.CHALLENGED]:
         candidate = Candidate(
             attitude=states[1, :4], others=states[1, 4:7], covariance=covariance_matrices(states[1, 7:])
         )
@@ -509,7 +509,9 @@ def gate_options(gate_: Gate | None, robust: Robust | None) -> gate.Options:
     """Return a gate and a robust update as the kernels take them."""
     return gate.Options(
         thresholds=np.full(3, np.inf) if gate_ is None else gate_.thresholds,
-        robust=0 if robust is None else {"huber": robust_step.HUBER, "student": robust_step.STUDENT}[robust.kind],
+        robust=0
+        if robust is None
+        else {"huber": iterated_update.HUBER, "student": iterated_update.STUDENT}[robust.kind],
         parameters=np.ones((3, 2)) if robust is None else robust.parameters,
         iterations=0 if robust is None else robust.iterations,
         recovery=0 if gate_ is None else gate_.recovery or 0,
@@ -520,15 +522,15 @@ def gate_options(gate_: Gate | None, robust: Robust | None) -> gate.Options:
 
 def remembered(gate_: Gate | None, memory: GateMemory | None, sensors: tuple[str, ...]) -> tuple[Array, Array]:
     """Return what a kernel goes on with: its ``memory``, and ``standing`` of these sensors."""
-    counts, standing = np.zeros(robust_gate.MEMORY), np.zeros((len(sensors), robust_gate.STANDING))
-    counts[robust_gate.PASSES] = 1.0
+    counts, standing = np.zeros(gate_rules.MEMORY), np.zeros((len(sensors), gate_rules.STANDING))
+    counts[gate_rules.PASSES] = 1.0
     if gate_ is not None and memory is not None:
         counts[:] = memory.counts
         for row, sensor in zip(standing, sensors, strict=True):
             row[:] = memory.standing.get(sensor, 0.0)
     if gate_ is None or not gate_.recovery:
-        counts[robust_gate.CHALLENGED] = 0.0
-    standing[:, robust_gate.TOLD] = -1.0
+        counts[gate_rules.CHALLENGED] = 0.0
+    standing[:, gate_rules.TOLD] = -1.0
     return counts, standing
 
 
@@ -633,7 +635,7 @@ def _in_factor(problem: Problem, options: Options) -> Passed:
     )
     judge = _Judge(problem, options)
     weight, happened = None, []
-    arguments = record.time, _increments(problem), events.measurements, every
+    arguments = *problem.gyro, events.measurements, every
     if options.judged:
         first = judge.start()
         restart = root_form.Restart(
@@ -666,7 +668,7 @@ def _in_factor(problem: Problem, options: Options) -> Passed:
     )
     if options.whole_bias:
         estimate = _with_whole_bias(estimate, model, out, full=options.full_covariance)
-    candidate = _candidate_in_factor(body, model) if judge.memory[robust_gate.CHALLENGED] else None
+    candidate = _candidate_in_factor(body, model) if judge.memory[gate_rules.CHALLENGED] else None
     memory = judge.remembered(candidate)
     return Passed(
         estimate=estimate,
@@ -757,8 +759,8 @@ def _span_in_factor(
     ``state`` (28,) is that at the row, and is left at that of the row returned, or at the end state after the last one. Returns the row
     and the number of measurements processed up to there.
     """
-    record, events, every = problem.record, problem.events, options.every
-    increments, measurements = _increments(problem), events.measurements
+    events, every = problem.events, options.every
+    (edges, increments), measurements = problem.gyro, events.measurements
     last = len(increments) // every
     start = State(attitude=state[:4], bias=state[4:7], covariance=np.eye(6))
     body = _factor_body(replace(problem, initial=start), {})
@@ -767,7 +769,7 @@ def _span_in_factor(
     while True:
         to_row = min(row + span, last)
         begin, end = row * every, len(increments) if to_row == last else to_row * every
-        beyond = int(np.searchsorted(events.time, record.time[end], side="right"))
+        beyond = int(np.searchsorted(events.time, edges[end], side="right"))
         rows = slice(row, to_row + 1)
         whole = np.empty((to_row - row + 1 if options.full_covariance else 0, 6, 6))
         written = root_form.Outputs(
@@ -781,7 +783,7 @@ def _span_in_factor(
             segments=np.empty((0, 32)),
         )
         compiled(walk, root_form)(
-            record.time[begin : end + 1],
+            edges[begin : end + 1],
             increments[begin:end],
             after(measurements, event, beyond),
             every,

@@ -21,10 +21,10 @@ from typing import Literal
 import numpy as np
 
 from strapdown.checks import Array, InputError, count, finite, one_of, positive
-from strapdown.kernels import robust_gate
+from strapdown.kernels import gate_rules
 from strapdown.records import Event
 
-UNIFORM_SIGMA = robust_gate.UNIFORM_SIGMA
+UNIFORM_SIGMA = gate_rules.UNIFORM_SIGMA
 """Standard deviation of an angle that is uniform over the whole turn, rad."""
 
 

@@ -1,7 +1,7 @@
 """Blocks as the arrays that the kernels take, and the states in both orders.
 
 For whoever looks from outside the order is attitude, bias, then the blocks as given. In the kernels the states that change come before the
-constant ones, which then cost the prediction next to nothing (:mod:`strapdown.kernels.augmented_factor`).
+constant ones, which then cost the prediction next to nothing (:mod:`strapdown.kernels.triangle`).
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import numpy as np
 from strapdown.checks import Array, InputError, array, one_of
 from strapdown.estimation.error_states import MOST_CHAIN_DECAY, Effect, ErrorStates, check
 from strapdown.estimation.states import Candidate, State, check_arguments
-from strapdown.kernels import augmented_step
-from strapdown.kernels.augmented_chain import CHAIN, chain_start
-from strapdown.kernels.augmented_step import CARRIED, FIXED, FORCE, LEVER, NOISE_NODES, OFFSET, SCALE
+from strapdown.kernels import error_state_step
+from strapdown.kernels.chains import CHAIN, chain_start
+from strapdown.kernels.error_state_step import CARRIED, FIXED, FORCE, LEVER, NOISE_NODES, OFFSET, SCALE
 
 MOST_DECAY = 0.5
 """Of λ dt in one step: a step back is well conditioned. For states that enter the gyro a tenth, where Gauss's rule is exact."""
@@ -308,7 +308,7 @@ def turning_matrix(chains: Array, size: int, before: Array, after: Array) -> Arr
     T = np.eye(size)
     if len(chains):
         # A turn of the columns of the identity's rows: Tᵀ, by rows.
-        augmented_step.turn_columns(chains, augmented_step.fixed_turn(tuple(before), tuple(after)), T, size)
+        error_state_step.turn_columns(chains, error_state_step.fixed_turn(tuple(before), tuple(after)), T, size)
     return T.T
 
 

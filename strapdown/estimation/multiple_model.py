@@ -33,9 +33,9 @@ from strapdown.estimation.states import (
     pack,
     restart_bias_variance,
 )
+from strapdown.kernels import gate_rules, measurement
 from strapdown.kernels import hypotheses as hypotheses_kernel
-from strapdown.kernels import measurement, robust_gate
-from strapdown.kernels.machine import compiled
+from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.walk import walk
 from strapdown.records import Estimate, Event, ImuRecord, Innovations
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
@@ -262,7 +262,7 @@ def run_recovering(
         rest, state = _from_where_one(lost.record, lost.bank)
         restart = np.sqrt(restart_bias_variance(gate, initial))
         own = replace(gate, restart_bias_sigma=float(np.max(restart)))
-        least = np.minimum(robust_gate.WIDENING * lost.bias_sigma, robust_gate.WIDENING**robust_gate.WIDEST * restart)
+        least = np.minimum(gate_rules.WIDENING * lost.bias_sigma, gate_rules.WIDENING**gate_rules.WIDEST * restart)
     if not handed:
         return estimate
     whole = _joined(parts, gaps(record.time) + handed)
@@ -328,14 +328,14 @@ def _left_open(
         assert state.gate is not None
         # What the challenger that took over began with, unless another one has begun before that edge.
         memory = state.gate.counts
-        began = float(memory[robust_gate.SINCE])
+        began = float(memory[gate_rules.SINCE])
         if began > event.end:
             began = event.start
-        bias, variance = np.split(memory[robust_gate.FIRST_BIAS : robust_gate.FIRST_BIAS + 6], 2)
+        bias, variance = np.split(memory[gate_rules.FIRST_BIAS : gate_rules.FIRST_BIAS + 6], 2)
         sigma = np.sqrt(variance)
         first = max(int(np.searchsorted(record.time, began)) - 1, 0)
         taken = sum(np.sum(one.used & (one.time < event.start)) for one in estimate.innovations.values())
-        if taken < robust_gate.FORGOTTEN * (gate.recovery or 0):
+        if taken < gate_rules.FORGOTTEN * (gate.recovery or 0):
             sigma = np.maximum(sigma, least_bias_sigma)
         seen = _measured_from(began, record, first, end)
         if _can_start(seen, 1):
@@ -370,7 +370,7 @@ def _left_open(
 
 def _widened(starts: int) -> float:
     """Return how many times as wide as the first a start is before which so many have failed."""
-    return robust_gate.WIDENING ** (starts % (robust_gate.WIDEST + 1))
+    return gate_rules.WIDENING ** (starts % (gate_rules.WIDEST + 1))
 
 
 def _settled(estimate: Estimate) -> bool:
@@ -539,7 +539,7 @@ def _from_time(record: ImuRecord, time: float) -> tuple[Array, Array, int]:
         increments = increments.copy()
         increments[0] *= (edges[1] - time) / (edges[1] - edges[0])
         edges[0] = time
-    return edges, increments, k
+    return read_only(edges), read_only(increments), k
 
 
 def start(

@@ -18,8 +18,8 @@ from strapdown.checks import Array, InputError
 from strapdown.estimation.forward import Options, Problem, filtered, most_segments
 from strapdown.estimation.gating import Gate
 from strapdown.estimation.states import GateMemory
-from strapdown.kernels.machine import compiled
-from strapdown.kernels.robust_gate import CHALLENGED, FIRST_BIAS, PASSES, SINCE, WIDE_PASSES, restart_attitude
+from strapdown.kernels.gate_rules import CHALLENGED, FIRST_BIAS, PASSES, SINCE, WIDE_PASSES, restart_attitude
+from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.smoother_loop import locate_edges
 from strapdown.records import Estimate, Event, ImuRecord
 
@@ -138,7 +138,7 @@ def stops(time: Array, breaks: Sequence[Break]) -> Array:
 def starts(time: Array, event_time: Array, segments: Array) -> np.ndarray:
     """Return the number of the segment that starts at each time; the last row of segments is the end state."""
     found = np.empty(len(time), np.int64)
-    compiled(locate_edges)(time, event_time, segments, len(segments) - 1, found)
+    compiled(locate_edges)(read_only(time), event_time, segments, len(segments) - 1, found)
     return found
 
 

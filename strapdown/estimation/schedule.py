@@ -11,7 +11,7 @@ import numpy as np
 from strapdown.checks import Array, InputError
 from strapdown.estimation.memory import side_by_side
 from strapdown.kernels import measurement
-from strapdown.kernels.machine import compiled
+from strapdown.kernels.machine import compiled, read_only
 from strapdown.records import Innovations
 from strapdown.vectors import KINDS, VectorMeasurements, triad
 
@@ -119,15 +119,10 @@ class Schedule:
         first = self.bounds[:-1]
         columns = (values - 3 * first, sigmas - first, first, self.codes, *self.frames.T)
         time, place, sensor = self.order
+        noise = np.empty((0, 6)) if self.standing_noise is None else self.standing_noise
+        series = np.stack([np.asarray(column, np.int64) for column in columns], axis=1)
         return measurement.Measurements(
-            time=time,
-            place=place,
-            sensor=sensor,
-            value=value,
-            sigma=sigma,
-            noise=np.empty((0, 6)) if self.standing_noise is None else self.standing_noise,
-            series=np.stack([np.asarray(column, np.int64) for column in columns], axis=1),
-            triads=self.triads,
+            *(read_only(column) for column in (time, place, sensor, value, sigma, noise, series, self.triads))
         )
 
     @property
@@ -158,9 +153,9 @@ def schedule(
     bounds = np.cumsum([0, *(len(part.time) for part in parts)])
     first_frames = np.cumsum([0, *(len(part.frames) for part in parts[:-1])])
     return Schedule(
-        series_time=tuple(_plain(part.time) for part in parts),
-        series_vector_b=tuple(_plain(part.value) for part in parts),
-        series_sigma=tuple(_plain(part.sigma) for part in parts),
+        series_time=tuple(read_only(part.time) for part in parts),
+        series_vector_b=tuple(read_only(part.value) for part in parts),
+        series_sigma=tuple(read_only(part.sigma) for part in parts),
         standing_noise=_joined([part.noise for part in parts], (0, 6)) if any(s.anisotropic for s in vectors) else None,
         bounds=bounds,
         codes=np.array([KIND_CODES[series.kind] for series in vectors], np.uint8),
@@ -183,12 +178,6 @@ def places(columns: Sequence[Array]) -> tuple[Array, np.ndarray]:
         return np.empty(0), np.empty(0, np.int64)
     addresses = np.array([column.ctypes.data for column in columns], np.int64)
     return columns[0].reshape(-1), (addresses - addresses[0]) // columns[0].itemsize
-
-
-def _plain(column: Array) -> Array:
-    """Return a column as kernels read it, aligned and without gaps; one that is so already is not touched."""
-    flags = column.flags
-    return column if flags.c_contiguous and flags.aligned else np.require(column, float, ("C", "A"))
 
 
 def _joined(columns: Sequence[Array], empty: tuple[int, ...]) -> Array:

@@ -3,7 +3,7 @@
 A Rauch–Tung–Striebel smoother on the manifold (Rauch, Tung & Striebel 1965; Särkkä 2013, section 8.2), over the states that the filter
 passed through. The filter moves its attitude at each correction and carries its covariance along, so every covariance has a tangent space
 of its own; the backward pass carries them from one to the next by the Jacobians of the rotation vector
-(:mod:`strapdown.kernels.smoother_step`, with the triangular factor :mod:`strapdown.kernels.augmented_smoother`). To first order in the
+(:mod:`strapdown.kernels.smoother_step`, with the triangular factor :mod:`strapdown.kernels.root_smoother`). To first order in the
 errors this is the least-squares estimate over the whole record.
 
 Where a gate has recovered, the states before and after are two trajectories (:mod:`strapdown.estimation.recovery_segments`), each smoothed
@@ -34,7 +34,7 @@ from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.memory import side_by_side
 from strapdown.estimation.recovery_segments import Break, Rerun, Trajectory
 from strapdown.estimation.states import GateMemory, ProcessNoise, State, check_arguments, covariance_matrices
-from strapdown.kernels import augmented_smoother, smoother_lag, smoother_loop
+from strapdown.kernels import root_smoother, smoother_lag, smoother_loop
 from strapdown.kernels.lane_values import WIDTH
 from strapdown.kernels.machine import compiled
 from strapdown.records import Estimate, Event, ImuRecord
@@ -302,8 +302,8 @@ class _FactorForm:
         ends = np.append(np.flatnonzero(np.diff(last)), len(last) - 1)
         begins = np.append(0, ends[:-1] + 1)
         together = min(PASSES, len(ends))
-        compiled(augmented_smoother.smooth_augmented)(
-            augmented_smoother.Passes(
+        compiled(root_smoother.smooth_augmented)(
+            root_smoother.Passes(
                 segments=one.segments,
                 starts=one.starts,
                 first=edge[begins],
@@ -311,6 +311,6 @@ class _FactorForm:
                 last=last[ends],
             ),
             forward.model_arrays(model, self.problem.variances),
-            augmented_smoother.workspace(model.states, model.noise_rows, len(model.chains), together),
-            augmented_smoother.Outputs(*outputs),
+            root_smoother.workspace(model.states, model.noise_rows, len(model.chains), together),
+            root_smoother.Outputs(*outputs),
         )

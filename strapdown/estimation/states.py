@@ -75,7 +75,7 @@ class GateMemory:
     """What the first candidate's bias variance grows by where the gate does not say (3,), (rad/s)²."""
     candidate: Candidate | None = None
     counts: Array
-    """Whether there is a candidate, how it does, and how wide the next one starts, as :mod:`strapdown.kernels.robust_gate` holds them."""
+    """Whether there is a candidate, how it does, and how wide the next one starts, as :mod:`strapdown.kernels.gate_rules` holds them."""
     standing: Mapping[str, Array]
     """Refusals of each sensor, as held there."""
     start: float = 0.0

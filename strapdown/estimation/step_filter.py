@@ -36,11 +36,11 @@ from strapdown.estimation.gating import Gate, Monitor, Robust
 from strapdown.estimation.schedule import KIND_CODES
 from strapdown.estimation.states import ProcessNoise, State, check_arguments, restart_bias_variance
 from strapdown.estimation.step_gate import Events, Linearization, Rows, Supervision, linearize, seen_from, tilt_unknown
-from strapdown.kernels import augmented_chain, augmented_step
+from strapdown.kernels import chains, error_state_step
 from strapdown.kernels.algebra import cross, dot
+from strapdown.kernels.gate_rules import WIDE_PASSES
+from strapdown.kernels.iterated_update import ACCEPTED, KNOWN, PASSED_OVER, REFUSED
 from strapdown.kernels.measurement import has_heading
-from strapdown.kernels.robust_gate import WIDE_PASSES
-from strapdown.kernels.robust_step import ACCEPTED, KNOWN, PASSED_OVER, REFUSED
 from strapdown.kernels.rotation import rotation_matrix
 from strapdown.records import LARGEST_TURN
 from strapdown.vectors import KINDS, need_level, need_unit, triad
@@ -256,7 +256,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         left, limit = step, self._motion.limit
         while left > 0.0:
             turns = [(increment - left * one.bias).tolist() for one in running]
-            longest = float(min(augmented_step.longest_step(left, tuple(turn), limit) for turn in turns))
+            longest = float(min(error_state_step.longest_step(left, tuple(turn), limit) for turn in turns))
             part = increment * (longest / left)
             for one in running:
                 one._sub_step(part, longest)
@@ -270,17 +270,17 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         q, phi, x = tuple(self.attitude.tolist()), tuple(part.tolist()), np.concatenate([self.bias, self.values])
         gyro, force = (model.gyro, model.gyro_use), tuple(model.force_f.tolist())
         coupling, factor = np.empty((m, 3)), np.empty(m)
-        attitude, phi11, phi12, rate, D = augmented_step.move(
+        attitude, phi11, phi12, rate, D = error_state_step.move(
             q, x, dt, phi, model.decay, *gyro, force, coupling, factor
         )
         # Rows 0 to n become Φᵀ, the rows after them N with Q = Nᵀ N.
         rows = np.zeros((n + model.noise_rows, n))
         rows[:n] = np.eye(n)
-        augmented_step.carry(rows, 0, n, phi11, phi12, coupling, factor, model.gyro_use, m)
+        error_state_step.carry(rows, 0, n, phi11, phi12, coupling, factor, model.gyro_use, m)
         white = self.process_noise.angle_random_walk**2, self.process_noise.rate_random_walk**2
-        row = augmented_step.fill_noise(rows, n, n, dt, rate, D, *white, model.decay, model.density, *gyro)
-        links = np.empty((len(model.chains), augmented_chain.LINKS))
-        augmented_chain.step_chains(rows, n, row, x, dt, model.decay, model.chains, links)
+        row = error_state_step.fill_noise(rows, n, n, dt, rate, D, *white, model.decay, model.density, *gyro)
+        links = np.empty((len(model.chains), chains.LINKS))
+        chains.step_chains(rows, n, row, x, dt, model.decay, model.chains, links)
         self.F, self.Q = rows[:n].T.copy(), rows[n:].T @ rows[n:]
         super().predict()
         self.values = x[3:]
@@ -540,7 +540,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         q = tuple(attitude.tolist())
         given = KIND_CODES[measurement.kind], measurement.z, measurement.frame, measurement.length
         effects = 0, model.sensors, model.sensor_use, NO_LEVER
-        d = augmented_step.fill_rows(q, rotation_matrix(q), others, *given, *effects, H, y, basis)
+        d = error_state_step.fill_rows(q, rotation_matrix(q), others, *given, *effects, H, y, basis)
         angle, arc = measurement.arc(y, basis)
         return Rows(y[:d].copy(), H[:d].copy(), (basis @ measurement.noise @ basis.T)[:d, :d], angle, arc)
 
@@ -611,7 +611,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Measurement:
-    """A measurement as the kernels take it (:func:`strapdown.kernels.augmented_step.fill_rows`)."""
+    """A measurement as the kernels take it (:func:`strapdown.kernels.error_state_step.fill_rows`)."""
 
     kind: str
     z: tuple[float, ...]

@@ -3,8 +3,8 @@
 - :func:`linearize`: the measurement linearised at the estimate that its update leads to (iterated update), its NIS, and its robust weight.
 - :class:`Supervision`: the gate's counters, the restart candidate that it runs beside the filter, and the NIS that a monitor judges.
 
-Methods, thresholds and their reasons are those of the kernels: :mod:`strapdown.kernels.robust_step` and
-:mod:`strapdown.kernels.robust_gate`, whose counting runs here as plain Python.
+Methods, thresholds and their reasons are those of the kernels: :mod:`strapdown.kernels.iterated_update` and
+:mod:`strapdown.kernels.gate_rules`, whose counting runs here as plain Python.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from strapdown.estimation.forward import gate_events, remembered
 from strapdown.estimation.gating import Gate, Monitor, Robust
 from strapdown.estimation.model import turning_matrix
 from strapdown.estimation.states import GateMemory
-from strapdown.kernels import robust_gate, robust_step
-from strapdown.kernels.robust_step import ONE_AXIS, RELINEARIZED, SETTLED, TURN_ASIDE, UNKNOWN, UNKNOWN_TILT
+from strapdown.kernels import gate_rules, iterated_update
+from strapdown.kernels.iterated_update import ONE_AXIS, RELINEARIZED, SETTLED, TURN_ASIDE, UNKNOWN, UNKNOWN_TILT
 from strapdown.records import Event
 
 # ------------------------------------------------------------------------------------------------------ one measurement, linearised
@@ -179,7 +179,7 @@ def prior_at(prior: Linearization, attitude: Array, others: Array, chains: Array
 def seen_from(q: Array, covariance: Array) -> tuple[Array, Array]:
     """Return a prior's P (n, n) at the attitude that lies the turn q from its mean, and where the mean lies seen from there (3,), rad.
 
-    The method is that of :func:`strapdown.kernels.robust_step.seen_from`, which gives the reasons.
+    The method is that of :func:`strapdown.kernels.iterated_update.seen_from`, which gives the reasons.
     """
     A = covariance[:3, :3]
     axis = least_certain_axis(covariance)
@@ -200,7 +200,7 @@ def seen_from(q: Array, covariance: Array) -> tuple[Array, Array]:
 
 def least_certain_axis(covariance: Array) -> Array:
     """Return the unit vector (3,) along which the attitude variance of P (n, n) is largest."""
-    return np.array(robust_step.least_certain_axis(tuple(covariance[:3, :3][np.triu_indices(3)].tolist())))
+    return np.array(iterated_update.least_certain_axis(tuple(covariance[:3, :3][np.triu_indices(3)].tolist())))
 
 
 def tilt_unknown(attitude: Array, covariance: Array) -> bool:
@@ -274,12 +274,12 @@ class Supervision(Generic[Filter]):
     @property
     def has_candidate(self) -> bool:
         """Whether a restart candidate is running; one of an earlier part of a record the filter has to restore itself."""
-        return bool(self.memory[robust_gate.CHALLENGED])
+        return bool(self.memory[gate_rules.CHALLENGED])
 
     @property
     def passes(self) -> int:
         """Most linearisations of an update of the filter: more than one after a recovery."""
-        return int(self.memory[robust_gate.PASSES])
+        return int(self.memory[gate_rules.PASSES])
 
     @property
     def events(self) -> tuple[Event, ...]:
@@ -292,13 +292,13 @@ class Supervision(Generic[Filter]):
 
     def judge(self, filter: Filter, sensor: str, outcome: int, update: Callable[[Filter], int]) -> None:
         """Count the outcome of a measurement for a filter; ``update`` gives the same measurement to the restart candidate."""
-        if self.monitor is not None and outcome != robust_step.PASSED_OVER:
+        if self.monitor is not None and outcome != iterated_update.PASSED_OVER:
             self._record_nis(filter, outcome)
         if self.gate is None:
             return
         s, recovery, limit = self._row_of(sensor), self.gate.recovery or 0, self.gate.lock_out_limit
         memory, standing, room = self.memory, self.standing, np.vstack([self.lock_outs, np.empty((1, 4))])
-        number, restart = robust_gate.judge_filter(
+        number, restart = gate_rules.judge_filter(
             outcome, filter.time, s, recovery, limit, standing, memory, room, len(self.lock_outs)
         )
         self.lock_outs = room[:number]
@@ -307,9 +307,9 @@ class Supervision(Generic[Filter]):
         if self.candidate is None:
             return
         self._judge_candidate(self.candidate, s, update(self.candidate))
-        if self.candidate is not None and robust_gate.is_believed(s, recovery, standing, memory):
+        if self.candidate is not None and gate_rules.is_believed(s, recovery, standing, memory):
             row = np.empty(4)
-            robust_gate.recover(filter.time, s, limit, standing, memory, row, self.lock_outs)
+            gate_rules.recover(filter.time, s, limit, standing, memory, row, self.lock_outs)
             self.recoveries = np.vstack([self.recoveries, row])
             filter._become(self.candidate)
             filter._passes = self.passes
@@ -325,40 +325,40 @@ class Supervision(Generic[Filter]):
     def _record_nis(self, filter: Filter, outcome: int) -> None:
         """Keep the NIS of the last measurement for the monitor; of a refused one the gate's threshold."""
         degrees, nis = filter.dim_z, filter.nis
-        if self.gate is not None and outcome != robust_step.ACCEPTED:
+        if self.gate is not None and outcome != iterated_update.ACCEPTED:
             nis = float(self.gate.thresholds[degrees - 1])
         del self.nis_history[self.number :]
         self.nis_history.append((filter.time, nis, degrees))
         self.number += 1
 
     def _start_candidate(self, filter: Filter, gate: Gate) -> None:
-        sigma = robust_gate.restart_attitude(gate.restart_attitude_sigma, self.memory)
-        self.candidate = filter._restarted(sigma, robust_gate.restart_width(self.memory))
-        robust_gate.begin_challenge(self.memory, filter.time, self.candidate.bias, np.diag(self.candidate.P)[3:6])
+        sigma = gate_rules.restart_attitude(gate.restart_attitude_sigma, self.memory)
+        self.candidate = filter._restarted(sigma, gate_rules.restart_width(self.memory))
+        gate_rules.begin_challenge(self.memory, filter.time, self.candidate.bias, np.diag(self.candidate.P)[3:6])
 
     def _judge_candidate(self, candidate: Filter, sensor: int, outcome: int) -> None:
         """Count the outcome of a measurement for the restart candidate, and drop or widen it."""
-        verdict = robust_gate.judge_challenger(
+        verdict = gate_rules.judge_challenger(
             outcome, candidate.nis, candidate.dim_z, sensor, self.standing, self.memory, candidate.bias
         )
-        if verdict == robust_gate.DROPPED:
+        if verdict == gate_rules.DROPPED:
             self.candidate = None
-        elif verdict == robust_gate.TOO_NARROW:
+        elif verdict == gate_rules.TOO_NARROW:
             self._widen(candidate)
 
     def _widen(self, candidate: Filter) -> None:
         """Make the candidate what it would be if its bias had started with a larger σ, where that start holds it back."""
         P = candidate.P.copy()
-        if not robust_gate.may_widen(np.diag(P)[3:6], self.memory):
+        if not gate_rules.may_widen(np.diag(P)[3:6], self.memory):
             return
         correction = np.zeros(len(P))
         for i in range(3):
-            gain = robust_gate.start_undone(i, P[3 + i, 3 + i], self.memory) * P[:, 3 + i]
+            gain = gate_rules.start_undone(i, P[3 + i, 3 + i], self.memory) * P[:, 3 + i]
             moved = candidate.bias[i] + correction[3 + i]
-            correction += gain * (self.memory[robust_gate.FIRST_BIAS + i] - moved)
+            correction += gain * (self.memory[gate_rules.FIRST_BIAS + i] - moved)
             P -= np.outer(gain, P[3 + i])
         candidate._reset(correction, P, far=True)
-        robust_gate.count_widening(self.memory)
+        gate_rules.count_widening(self.memory)
 
     def copied(self) -> Self:
         """Return it as it is now."""

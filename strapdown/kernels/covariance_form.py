@@ -30,6 +30,16 @@ from strapdown.kernels.algebra import (
 )
 from strapdown.kernels.filter_step import predict as propagated
 from strapdown.kernels.filter_step import update_attitude, update_direction, update_heading, update_row
+from strapdown.kernels.gate_rules import (
+    FIRST_BIAS,
+    begin_challenge,
+    count_widening,
+    may_widen,
+    restart_attitude,
+    restart_width,
+    start_undone,
+)
+from strapdown.kernels.iterated_update import arc_over_chord, seen_from
 from strapdown.kernels.measurement import (
     ATTITUDE,
     DIRECTION,
@@ -45,16 +55,6 @@ from strapdown.kernels.measurement import (
     sigma_of,
     value_of,
 )
-from strapdown.kernels.robust_gate import (
-    FIRST_BIAS,
-    begin_challenge,
-    count_widening,
-    may_widen,
-    restart_attitude,
-    restart_width,
-    start_undone,
-)
-from strapdown.kernels.robust_step import arc_over_chord, seen_from
 from strapdown.kernels.rotation import quaternion_multiply, rotation_matrix
 from strapdown.kernels.state import SIZE, keep_state, load_state, store_state
 from strapdown.kernels.walk import SQUARED_RANGE, step_within, turn_squared
@@ -429,6 +429,6 @@ def widen(form, memory):
 
 
 def corrected(q, A, B, correction):
-    """Return q, A and B moved by a correction (3,), rad, as :func:`strapdown.kernels.robust_step.seen_from` has it."""
+    """Return q, A and B moved by a correction (3,), rad, as :func:`strapdown.kernels.iterated_update.seen_from` has it."""
     turn, M = seen_from(correction, A)
     return quaternion_multiply(q, turn), times_transpose_upper(multiply(M, full(A)), M), multiply(M, B)

@@ -1,6 +1,6 @@
 """A gate and robust weights around a filter: a body of :mod:`strapdown.kernels.walk` over either form of the covariance.
 
-What a gate makes of refusals is in :mod:`strapdown.kernels.robust_gate`. The form (:mod:`strapdown.kernels.covariance_form` or
+What a gate makes of refusals is in :mod:`strapdown.kernels.gate_rules`. The form (:mod:`strapdown.kernels.covariance_form` or
 :mod:`strapdown.kernels.root_form`) defines the functions left open here. Row 0 of its states is the filter, row 1 the restart candidate
 beside it while there is one, so that both go through one piece of code.
 """
@@ -13,18 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from strapdown.kernels.algebra import add, factored, matrix_times_vector, scale, solved
-from strapdown.kernels.measurement import (
-    DIRECTION,
-    HEADING,
-    KIND,
-    degrees_of_freedom,
-    frame_of,
-    has_heading,
-    noise_of,
-    store_innovations,
-    value_of,
-)
-from strapdown.kernels.robust_gate import (
+from strapdown.kernels.gate_rules import (
     CHALLENGED,
     DROPPED,
     PASSES,
@@ -35,7 +24,7 @@ from strapdown.kernels.robust_gate import (
     judge_filter,
     recover,
 )
-from strapdown.kernels.robust_step import (
+from strapdown.kernels.iterated_update import (
     ACCEPTED,
     IDENTITY,
     KNOWN,
@@ -51,6 +40,17 @@ from strapdown.kernels.robust_step import (
     seen_from,
     tangent_at,
     tilt_variance,
+)
+from strapdown.kernels.measurement import (
+    DIRECTION,
+    HEADING,
+    KIND,
+    degrees_of_freedom,
+    frame_of,
+    has_heading,
+    noise_of,
+    store_innovations,
+    value_of,
 )
 from strapdown.kernels.rotation import moved, quaternion_multiply, rotation_matrix
 from strapdown.kernels.walk import SQUARED_RANGE, step_within, turn_squared
@@ -94,7 +94,7 @@ class Options(NamedTuple):
     thresholds: np.ndarray
     """Largest NIS accepted of 1, 2, 3 degrees of freedom (3,)."""
     robust: int
-    """0, or a kind of :mod:`strapdown.kernels.robust_step`."""
+    """0, or a kind of :mod:`strapdown.kernels.iterated_update`."""
     parameters: np.ndarray
     """Of the robust weight, a row for each number of degrees of freedom (3, 2)."""
     iterations: int
@@ -339,7 +339,7 @@ def judged_update(form, i, e, measured, passes, options):
 
     With ``passes`` above one the update is linearised anew, up to so many times, at the estimate that it leads to, while its correction
     exceeds ``RELINEARIZED``; the rows are turned to the prior's tangent space, and the covariance in the end to that of the estimate, as
-    :func:`strapdown.kernels.robust_step.tangent_at` says. Where that ends above the threshold and the attitude is hardly known, it is
+    :func:`strapdown.kernels.iterated_update.tangent_at` says. Where that ends above the threshold and the attitude is hardly known, it is
     tried again from a third of a turn to either side about the least certain axis.
 
     With ``passes`` above one a heading is passed over while the tilt is not known: its row depends on it. That of a vertical vector, which

@@ -30,6 +30,7 @@ from strapdown.kernels.algebra import (
 from strapdown.kernels.filter_step import predict as propagated
 from strapdown.kernels.filter_step import update_attitude, update_heading, update_row
 from strapdown.kernels.gate import Options
+from strapdown.kernels.iterated_update import HUBER, STUDENT
 from strapdown.kernels.measurement import (
     ATTITUDE,
     HEADING,
@@ -44,7 +45,6 @@ from strapdown.kernels.measurement import (
     value_of,
     vector_at,
 )
-from strapdown.kernels.robust_step import HUBER, STUDENT
 from strapdown.kernels.rotation import (
     inverse_right_jacobian,
     logarithm,

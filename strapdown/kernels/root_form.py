@@ -1,7 +1,7 @@
 """The filter with optional error states, its covariance as a triangular factor: a body of :mod:`strapdown.kernels.walk`.
 
-State: attitude; ``x`` = (b, c): gyro bias and error states; the factor ``F`` (:mod:`strapdown.kernels.augmented_factor`). What the error
-states are, arrays say (:mod:`strapdown.kernels.augmented_step`). It keeps its digits however sharp a measurement is, so without error
+State: attitude; ``x`` = (b, c): gyro bias and error states; the factor ``F`` (:mod:`strapdown.kernels.triangle`). What the error
+states are, arrays say (:mod:`strapdown.kernels.error_state_step`). It keeps its digits however sharp a measurement is, so without error
 states it is also what :mod:`strapdown.kernels.covariance_form` gives way to.
 
 The first functions are the filter without a gate. Those under *for the gate* let :mod:`strapdown.kernels.gate` wrap it.
@@ -25,9 +25,8 @@ from strapdown.kernels.algebra import (
     transpose,
     transpose_times_vector,
 )
-from strapdown.kernels.augmented_chain import chain_start, chain_step, step_chains
-from strapdown.kernels.augmented_factor import covariances, take_row, triangularise, variances, whole_bias
-from strapdown.kernels.augmented_step import (
+from strapdown.kernels.chains import chain_start, chain_step, step_chains
+from strapdown.kernels.error_state_step import (
     OFFSET,
     arm_noise,
     carry,
@@ -42,6 +41,16 @@ from strapdown.kernels.augmented_step import (
     turn_values,
     turning_matrix,
 )
+from strapdown.kernels.gate_rules import (
+    FIRST_BIAS,
+    begin_challenge,
+    count_widening,
+    may_widen,
+    restart_attitude,
+    restart_width,
+    start_undone,
+)
+from strapdown.kernels.iterated_update import arc_over_chord, seen_from
 from strapdown.kernels.measurement import (
     ATTITUDE,
     DIRECTION,
@@ -53,17 +62,8 @@ from strapdown.kernels.measurement import (
     value_of,
     vector_at,
 )
-from strapdown.kernels.robust_gate import (
-    FIRST_BIAS,
-    begin_challenge,
-    count_widening,
-    may_widen,
-    restart_attitude,
-    restart_width,
-    start_undone,
-)
-from strapdown.kernels.robust_step import arc_over_chord, seen_from
 from strapdown.kernels.rotation import far_turn, quaternion_multiply, right_jacobian, rotation_matrix, turned, unit
+from strapdown.kernels.triangle import covariances, take_row, triangularise, variances, whole_bias
 from strapdown.kernels.walk import step_within, turn_squared
 
 CALLED = ("store_segment", "age_chains", "aged_chain")
@@ -78,7 +78,7 @@ SHORT = 0.2
 
 
 class Model(NamedTuple):
-    """Noise of the gyro, and the error states as :mod:`strapdown.kernels.augmented_step` has them (m states)."""
+    """Noise of the gyro, and the error states as :mod:`strapdown.kernels.error_state_step` has them (m states)."""
 
     angle_variance: float
     """σ_v², rad²/s."""
@@ -684,7 +684,7 @@ def bias_variances(F, size):
 def aged_chain(decay, chains, first, k, age):
     """Return Φ (9-tuple) of the states ``first`` to k of a chain, two or three, over any time, and Q (6-tuple) of what drives them.
 
-    :func:`strapdown.kernels.augmented_chain.chain_step` over a step short enough, doubled as often as it takes.
+    :func:`strapdown.kernels.chains.chain_step` over a step short enough, doubled as often as it takes.
     """
     fastest = 0.0
     for j in range(first, k + 1):

@@ -21,7 +21,7 @@ from strapdown.estimation.states import State, pack
 from strapdown.kernels import likelihood as kernel
 from strapdown.kernels import likelihood_outliers
 from strapdown.kernels.lane_values import WIDTH
-from strapdown.kernels.machine import compiled
+from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.walk import walk
 from strapdown.records import ImuRecord
 from strapdown.setup import FilterSetup
@@ -258,7 +258,7 @@ def run_lanes(
     body = kernel.Body(
         **lane,
         outliers=np.empty(0) if outliers is None else outliers,
-        cuts=case.cuts,
+        cuts=read_only(case.cuts),
         epochs=epochs,
         free=free,
         step=STEP,
@@ -266,7 +266,7 @@ def run_lanes(
     )
     out = kernel.Outputs(**{name: value.reshape(-1) if name in flat else value for name, value in room.items()})
     parts = (kernel,) if outliers is None else (likelihood_outliers, kernel)
-    compiled(walk, *parts)(case.time, case.increments, case.events.measurements, 1, body, out)
+    compiled(walk, *parts)(read_only(case.time), read_only(case.increments), case.events.measurements, 1, body, out)
 
 
 @dataclass(frozen=True, kw_only=True)

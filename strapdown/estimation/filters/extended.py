@@ -38,7 +38,7 @@ from strapdown.estimation.schedule import Schedule, innovations_by_sensor, sched
 from strapdown.estimation.states import ProcessNoise, State, check_arguments, covariance_matrices, pack
 from strapdown.kernels.filters import body_side
 from strapdown.kernels.filters import extended as kernel
-from strapdown.kernels.machine import compiled
+from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.walk import walk
 from strapdown.records import Estimate, ImuRecord
 
@@ -85,7 +85,7 @@ def run_scheduled(
     )
     out = kernel.Outputs(states=states, innovation=innovation)
     compiled(walk, definition, kernel, body_side)(
-        record.time, np.ascontiguousarray(record.increments), events.measurements, every, body, out
+        read_only(record.time), read_only(record.increments), events.measurements, every, body, out
     )
     return estimate(record, events, every, states, innovation, full_covariance)
 

@@ -26,6 +26,7 @@ from strapdown.kernels.algebra import (
 )
 from strapdown.kernels.filters.body_side import from_body_side, propagated, to_body_side
 from strapdown.kernels.filters.extended import congruent, negated
+from strapdown.kernels.iterated_update import IDENTITY
 from strapdown.kernels.measurement import (
     ATTITUDE,
     HEADING,
@@ -38,7 +39,6 @@ from strapdown.kernels.measurement import (
     store_innovations,
     value_of,
 )
-from strapdown.kernels.robust_step import IDENTITY
 from strapdown.kernels.rotation import moved, quaternion_multiply, rotation_matrix, unit
 
 __all__ = ["from_body_side", "propagated", "to_body_side", "update"]

@@ -27,7 +27,7 @@ from strapdown.kernels.filters.extended import (
     rows_in_fixed_axes,
     turned_in_fixed_axes,
 )
-from strapdown.kernels.robust_step import IDENTITY
+from strapdown.kernels.iterated_update import IDENTITY
 from strapdown.kernels.rotation import moved, rotation_matrix, turned
 
 

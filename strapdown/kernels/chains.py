@@ -1,8 +1,8 @@
 """Optional states in chains, each fed by the next: what shapes the white noise of a chain's last state by any real poles.
 
 ``ċₖ = −λₖ cₖ + gₖ cₖ₊₁``, the last one of a chain driven by white noise of PSD q besides: ``decay`` λ, and ``chains`` (states, 3) with g
-and q; the last column is what :func:`strapdown.kernels.augmented_step.turn_values` wants. Chains have up to :data:`CHAIN` states and do
-not enter the gyro. :mod:`strapdown.kernels.augmented_step` lets each state decay by itself; what is here comes after it, as
+and q; the last column is what :func:`strapdown.kernels.error_state_step.turn_values` wants. Chains have up to :data:`CHAIN` states and do
+not enter the gyro. :mod:`strapdown.kernels.error_state_step` lets each state decay by itself; what is here comes after it, as
 ``Φ = (I + U) diag(e^{−λ dt})`` with U strictly upper triangular. Triangular factors stay triangular, and where there is no chain nothing is
 called.
 
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 
-from strapdown.kernels.augmented_step import NODES, WEIGHTS
+from strapdown.kernels.error_state_step import NODES, WEIGHTS
 
 CALLED = ("chain_step", "step_chains", "carry_chains_back")
 """Not inlined where other kernels use them: their work is far more than a call, and each copy would be compiled anew."""
@@ -158,7 +158,7 @@ def carry_chains_back(F, first, end, links):
 
 
 def fill_chain_noise(F, row, columns, chains, links):
-    """Write the rows of noise of driven chains from a row of F on, as :func:`strapdown.kernels.augmented_step.fill_noise` those before."""
+    """Write the rows of noise of driven chains from a row of F on; ``error_state_step.fill_noise`` writes those before."""
     for k in range(len(chains)):
         if chains[k, 1] > 0.0:
             number = k - chain_start(chains, k) + 1

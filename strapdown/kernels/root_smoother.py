@@ -17,9 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from strapdown.kernels.augmented_chain import LINKS, carry_chains_back
-from strapdown.kernels.augmented_factor import covariances, triangularise, variances
-from strapdown.kernels.augmented_step import (
+from strapdown.kernels.chains import LINKS, carry_chains_back
+from strapdown.kernels.error_state_step import (
     carry,
     carry_back,
     fixed_turn,
@@ -30,6 +29,7 @@ from strapdown.kernels.augmented_step import (
 )
 from strapdown.kernels.root_form import step_noise
 from strapdown.kernels.rotation import inverse_right_jacobian, logarithm, moved, quaternion_multiply
+from strapdown.kernels.triangle import covariances, triangularise, variances
 
 CALLED = ("load_segment",)
 

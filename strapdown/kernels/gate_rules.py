@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 
-from strapdown.kernels.robust_step import ACCEPTED, REFUSED
+from strapdown.kernels.iterated_update import ACCEPTED, REFUSED
 
 BORROWS_ARRAYS = True
 """See :mod:`strapdown.kernels.machine`."""

@@ -1,7 +1,7 @@
 """The MEKF with optional states, one step at a time: scalars and tuples for the attitude, arrays for the rest.
 
 State: attitude ``q_fb``; ``x`` = (b, c): gyro bias and optional states c; factor ``F`` of the covariance of (δθ, δb, δc)
-(:mod:`strapdown.kernels.augmented_factor`). The optional states are told by arrays, so that no kernel knows what they are:
+(:mod:`strapdown.kernels.triangle`). The optional states are told by arrays, so that no kernel knows what they are:
 
 - each decays at its own rate and is driven by its own white noise, ``ċ = −λ c + √q w``: ``decay`` λ, ``density`` q. Those that change come
   first, those with neither come last.
