@@ -137,14 +137,14 @@ class ErrorStates(ByValue):
         if dt == 0.0:  # where the series divides by dt
             return np.eye(self.size), np.zeros((self.size, self.size))
         decay, density = np.asarray(self.decay, np.float64), np.asarray(self.density, np.float64)
-        chains = np.stack([np.asarray(self.feed, np.float64), density], axis=1)
+        link = np.stack([np.asarray(self.feed, np.float64), density], axis=1)
         doublings = max(0, int(np.ceil(np.log2(max(np.max(decay) * dt / MOST_CHAIN_DECAY, 1e-9)))))
         h = dt / 2**doublings
         phi, Q = np.zeros((2, self.size, self.size))
         for k in range(self.size):
-            first = chains.chain_start(chains, k)
+            first = chains.chain_start(link, k)
             own = slice(first, k + 1)
-            far, near, itself, n20, n21, n22, n10, n11, n00 = chains.chain_step(decay, chains, k, first, h)
+            far, near, itself, n20, n21, n22, n10, n11, n00 = chains.chain_step(decay, link, k, first, h)
             phi[own, k] = (far, near, itself)[first - k - 1 :]
             N = np.array([[n00, 0.0, 0.0], [n10, n11, 0.0], [n20, n21, n22]])[:, first - k - 1 :]
             Q[own, own] += density[k] * N.T @ N
