@@ -520,8 +520,8 @@ class _Random:
             source = self.add(f"{sensor.name}, correlated")
             self.coloured.append((source, number, faults.correlated_sigma, faults.correlation_time))
 
-    def shaping(self) -> tuple[Array, Array, Array, Array, Array, np.ndarray]:
-        """Return amplitudes, gains, poles, X g, cross-covariances at the start, and sources, of all coloured biases.
+    def shaping(self) -> covariance_loop.Shapes:
+        """Return the coloured biases, for the kernel, and give their sources the covariance at the start.
 
         The filter starts from a bias that is off by its prior from the *whole* true bias, so that what it calls its error holds −f.
         """
@@ -536,7 +536,7 @@ class _Random:
                 cross[c, 3 + a, a, :n] = -(amplitude[a] ** 2) * projected
             self.blocks[source][[15, 18, 20]] = amplitude**2 * (gains @ projected)
         sources = np.array([source for source, *_ in self.shapes], np.int64)
-        return amplitudes, table[0], table[1], table[2], cross, sources
+        return covariance_loop.Shapes(amplitudes, *table, cross, sources)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -662,7 +662,6 @@ def analyse(
     random.add_gyro(scenario.gyro, float(edges[1] - edges[0]), len(edges) - 1)
     for i, sensor in enumerate(scenario.sensors):
         random.add_sensor(i, sensor)
-    amplitudes, gains, poles, projected, cross, shape_sources = random.shaping()
     coloured = random.coloured
 
     fixed = _fixed_columns(scenario, setup, path)
@@ -679,58 +678,56 @@ def analyse(
             row_error[:, k] = column.rows
 
     stations = np.searchsorted(path.stamps, edges[path.kept])
-    out = np.empty((len(stations), len(random.names), 21))
-    columns_out = np.empty((len(stations), len(columns), 6))
-    nis = np.zeros((len(names), 2))
-    compiled(covariance_loop.run_covariance)(
-        path.dt,
-        np.ascontiguousarray(path.phi),
-        path.new_sample,
-        path.row_bounds,
-        rows["h"],
-        rows["noise"],
-        rows["filter_variance"],
-        rows["variance"],
-        path.sensor,
-        rows["time"],
-        row_error,
-        np.array(random.angle),
-        np.array(random.rate),
-        np.array(random.sensor),
-        np.array(random.blocks),
-        amplitudes,
-        gains,
-        poles,
-        projected,
-        cross,
-        shape_sources,
-        np.array([number for _, number, _, _ in coloured], np.int64),
-        np.array([sigma for _, _, sigma, _ in coloured], np.float64),
-        np.array([tau for *_, tau in coloured], np.float64),
-        np.zeros((len(coloured), 6, 3)),
-        np.array([source for source, *_ in coloured], np.int64),
-        np.full(len(coloured), path.stamps[0]),
-        column_rate,
-        place,
-        np.array([column.ramp for column in columns]).reshape(-1, 3),
-        len(fixed),
-        np.zeros((len(columns), 6)),
-        stations,
-        out,
-        columns_out,
-        nis,
+    shapes = random.shaping()  # before the blocks are read
+    out = covariance_loop.Outputs(
+        stations=stations,
+        blocks=np.empty((len(stations), len(random.names), 21)),
+        columns=np.empty((len(stations), len(columns), 6)),
+        nis=np.zeros((len(names), 2)),
     )
-    whole = covariance_matrices(out)
+    compiled(covariance_loop.run_covariance)(
+        covariance_loop.Path(path.dt, np.ascontiguousarray(path.phi), path.new_sample, path.row_bounds),
+        covariance_loop.Rows(
+            h=rows["h"],
+            noise=rows["noise"],
+            filter_variance=rows["filter_variance"],
+            variance=rows["variance"],
+            sensor=path.sensor,
+            time=rows["time"],
+            error=row_error,
+        ),
+        covariance_loop.White(*(np.array(of) for of in (random.angle, random.rate, random.sensor, random.blocks))),
+        shapes,
+        covariance_loop.Coloured(
+            sensor=np.array([number for _, number, _, _ in coloured], np.int64),
+            sigma=np.array([sigma for _, _, sigma, _ in coloured], np.float64),
+            time=np.array([tau for *_, tau in coloured], np.float64),
+            cross=np.zeros((len(coloured), 6, 3)),
+            source=np.array([source for source, *_ in coloured], np.int64),
+            seen=np.full(len(coloured), path.stamps[0]),
+        ),
+        covariance_loop.Columns(
+            rate=column_rate,
+            place=place,
+            ramp=np.array([column.ramp for column in columns]).reshape(-1, 3),
+            fixed=len(fixed),
+            value=np.zeros((len(columns), 6)),
+        ),
+        out,
+    )
+    whole = covariance_matrices(out.blocks)
     found = Analysis(
         time=edges[path.kept],
         filter_covariance=whole[:, 0],
         sources=tuple(random.names[1:]),
         contributions=whole[:, 1:],
         fixed=tuple(column.name for column in fixed),
-        fixed_errors=columns_out[:, : len(fixed)],
+        fixed_errors=out.columns[:, : len(fixed)],
         considered=tuple(column.name for column in columns[len(fixed) :]),
-        considered_errors=columns_out[:, len(fixed) :],
-        expected_nis={name: float(total / seen) for name, (total, seen) in zip(names, nis, strict=True) if seen > 0.0},
+        considered_errors=out.columns[:, len(fixed) :],
+        expected_nis={
+            name: float(total / seen) for name, (total, seen) in zip(names, out.nis, strict=True) if seen > 0.0
+        },
         left_out=_left_out(scenario, setup),
         beyond_linear=(),
     )

@@ -16,7 +16,6 @@ from strapdown.checks import InputError
 from strapdown.covariance import Consider
 from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
-from strapdown.kernels import covariance_loop
 from strapdown.scenarios import Scenario, load_scenario, simulate
 from strapdown.setup import FilterSetup
 from strapdown.units import ARCSECOND, DEGREE
@@ -252,7 +251,6 @@ def test_the_source_runs_uncompiled(monkeypatch):
     slow = covariance.analyse(scenario, BELIEF, consider=Consider(scale_factor=1e-4), epochs=3)
     assert np.allclose(slow.contributions, fast.contributions, rtol=1e-9, atol=1e-24)
     assert np.allclose(slow.considered_errors, fast.considered_errors, rtol=1e-9, atol=1e-18)
-    assert covariance_loop.run_covariance is not None
 
 
 # ----------------------------------------------------------------------------------------------------- errors without noise

@@ -7,6 +7,9 @@ Everything is linear about the truth. The error state is that of the filter, (δ
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
+
+import numpy as np
 
 from strapdown.kernels.algebra import (
     add,
@@ -128,220 +131,295 @@ def reported(A, B, C, cross, gains, poles, variance, edge_variance, first):
     return A, B, C
 
 
-def run_covariance(
-    dt,
-    phi,
-    new_sample,
-    row_bounds,
-    row_h,
-    row_noise,
-    row_filter_variance,
-    row_variance,
-    row_sensor,
-    row_time,
-    row_error,
-    angle_density,
-    rate_density,
-    source_sensor,
-    blocks,
-    shape_amplitude,
-    shape_gains,
-    shape_poles,
-    shape_states,
-    shape_cross,
-    shape_source,
-    noise_sensor,
-    noise_sigma,
-    noise_time,
-    noise_cross,
-    noise_source,
-    noise_seen,
-    column_rate,
-    rate_place,
-    column_ramp,
-    fixed,
-    columns,
-    stations,
-    blocks_out,
-    columns_out,
-    nis,
-):
-    """Send every source through the filter's gains; write its covariance at the wanted stations.
+class Path(NamedTuple):
+    """Segments of the trajectory (segments,), between edges, stations and measurements."""
 
-    Station j lies after j segments of ``dt``, ``phi``; its rows are ``row_bounds[j]`` to ``row_bounds[j + 1]``. ``blocks`` (1 + s, 21)
-    holds the filter's own P first, then a covariance a source: white ones of densities ``angle_density``, ``rate_density`` (1 + s, 3) or
-    of the rows of ``source_sensor``; coloured ones, which have a place in ``blocks`` too, ``shape_…`` in the gyro, ``noise_…`` in sensors.
-    ``columns`` (k, 6) are errors without noise: column k comes in as the rate ``column_rate[:, rate_place[k]]`` of each segment (−1: none),
-    with ``row_error`` (rows, k) in the rows, and with ``column_ramp`` (k, 3) as a bias that grows. The first ``fixed`` are the same in
-    every run, the others have unit variance. ``nis`` (sensors, 2) gets the sums of the expected squares of
-    normalised innovations, and their number.
-    """
-    sources = len(blocks)
-    shapes = len(shape_source)
-    coloured = len(noise_source)
-    number = len(columns)
+    dt: np.ndarray
+    phi: np.ndarray
+    """Turns (segments, 3), rad."""
+    new_sample: np.ndarray
+    """Whether a gyro sample begins."""
+    row_bounds: np.ndarray
+    """Station j, which lies after j segments, has the rows ``row_bounds[j]`` to ``row_bounds[j + 1]`` (segments + 2,)."""
+
+
+class Rows(NamedTuple):
+    """Scalar rows ``y = h · δθ + v`` of the measurements (rows,)."""
+
+    h: np.ndarray
+    noise: np.ndarray
+    """Weights of the three components of a sensor's coloured noise (rows, 3)."""
+    filter_variance: np.ndarray
+    variance: np.ndarray
+    """What the filter assumes and what is true."""
+    sensor: np.ndarray
+    time: np.ndarray
+    error: np.ndarray
+    """Errors without noise by column (rows, k)."""
+
+
+class White(NamedTuple):
+    """Sources of white noise, the first the filter's own P (1 + s,)."""
+
+    angle_density: np.ndarray
+    rate_density: np.ndarray
+    """One an axis (1 + s, 3), rad²/s and rad²/s³."""
+    sensor: np.ndarray
+    """Sensor whose rows have the noise, −1 for none."""
+    blocks: np.ndarray
+    """Covariances (1 + s, 21); coloured sources have a place here too."""
+
+
+class Shapes(NamedTuple):
+    """Coloured rates of the gyro, each of n first-order states an axis (c,)."""
+
+    amplitude: np.ndarray
+    gains: np.ndarray
+    poles: np.ndarray
+    states: np.ndarray
+    cross: np.ndarray
+    """Covariances of the error and the states that make the rate (c, 6, 3, n)."""
+    source: np.ndarray
+
+
+class Coloured(NamedTuple):
+    """Coloured noise of sensors, of first order (c,)."""
+
+    sensor: np.ndarray
+    sigma: np.ndarray
+    time: np.ndarray
+    """Correlation times, s."""
+    cross: np.ndarray
+    """Covariances of the error and the noise (c, 6, 3)."""
+    source: np.ndarray
+    seen: np.ndarray
+    """Time of the last row of the sensor, s."""
+
+
+class Columns(NamedTuple):
+    """Errors without noise (k,), of which the first ``fixed`` are the same in every run and the others have unit variance."""
+
+    rate: np.ndarray
+    """Rates of each segment (segments, r, 3), rad/s."""
+    place: np.ndarray
+    """Which of the rates is the column's, −1 for none."""
+    ramp: np.ndarray
+    """Bias that grows (k, 3), rad/s²."""
+    fixed: int
+    value: np.ndarray
+    """The errors (k, 6)."""
+
+
+class Outputs(NamedTuple):
+    """What is written: at ``stations`` in order, and by sensor."""
+
+    stations: np.ndarray
+    blocks: np.ndarray
+    columns: np.ndarray
+    nis: np.ndarray
+    """Sum of the expected squares of normalized innovations, and their number (sensors, 2)."""
+
+
+def shape_of(shapes, source):
+    """Return which coloured rate is this source, or −1."""
+    for c in range(len(shapes.source)):
+        if shapes.source[c] == source:
+            return c
+    return -1
+
+
+def shape_powers(shapes, c):
+    """Return the variances (3,) of a coloured rate over an interval and at the edge between two."""
+    inside, edge = 0.0, 0.0
+    for n in range(shapes.gains.shape[1]):
+        power = shapes.gains[c, n] * shapes.states[c, n]
+        inside += power
+        edge += 0.5 * (1.0 + shapes.poles[c, n]) * power
+    a = vector_at(shapes.amplitude, c)
+    squared = (a[0] * a[0], a[1] * a[1], a[2] * a[2])
+    return scale(inside, squared), scale(edge, squared)
+
+
+def propagate_shape(A, B, C, shapes, c, phi11, phi12, new_sample):
+    """Return the blocks of a coloured rate's source after a segment, and propagate its cross-covariance."""
+    gains, poles, states, cross = shapes.gains[c], shapes.poles[c], shapes.states[c], shapes.cross[c]
+    amplitude = vector_at(shapes.amplitude, c)
+    if new_sample:
+        for r in range(6):
+            for a in range(3):
+                for n in range(len(gains)):
+                    cross[r, a, n] *= poles[n]
+    variance, _ = shape_powers(shapes, c)
+    A, B, C = shaped_rate(A, B, C, cross, gains, phi11, phi12, variance)
+    for a in range(3):
+        for n in range(len(gains)):
+            t = (cross[0, a, n], cross[1, a, n], cross[2, a, n])
+            b = (cross[3, a, n], cross[4, a, n], cross[5, a, n])
+            t = add(matrix_times_vector(phi11, t), matrix_times_vector(phi12, b))
+            drive = amplitude[a] * amplitude[a] * states[n]
+            cross[0, a, n] = t[0] + phi12[a] * drive
+            cross[1, a, n] = t[1] + phi12[3 + a] * drive
+            cross[2, a, n] = t[2] + phi12[6 + a] * drive
+    return A, B, C
+
+
+def propagate_white(A, B, C, turn, dt, phi11, phi12, angle, rate):
+    """Return the blocks of a white source after a segment."""
+    A, B, C = carried(A, B, C, phi11, phi12)
+    if angle[0] + angle[1] + angle[2] + rate[0] + rate[1] + rate[2] > 0.0:
+        q11, q12, q22 = driven(turn, phi12, dt, angle, rate)
+        A = (A[0] + q11[0], A[1] + q11[1], A[2] + q11[2], A[3] + q11[3], A[4] + q11[4], A[5] + q11[5])
+        B = add_matrices(B, q12)
+        C = (C[0] + q22[0], C[1] + q22[1], C[2] + q22[2], C[3] + q22[3], C[4] + q22[4], C[5] + q22[5])
+    return A, B, C
+
+
+def propagate_columns(columns, i, dt, phi11, phi12):
+    """Propagate the errors without noise over segment i."""
+    value = columns.value
+    for k in range(len(value)):
+        t = (value[k, 0], value[k, 1], value[k, 2])
+        b = (value[k, 3], value[k, 4], value[k, 5])
+        ramp = vector_at(columns.ramp, k)
+        held = combine(1.0, b, 0.5 * dt, ramp)
+        r = columns.place[k]
+        if r >= 0:
+            held = add(held, (columns.rate[i, r, 0], columns.rate[i, r, 1], columns.rate[i, r, 2]))
+        value[k, 0], value[k, 1], value[k, 2] = add(matrix_times_vector(phi11, t), matrix_times_vector(phi12, held))
+        value[k, 3], value[k, 4], value[k, 5] = combine(1.0, b, dt, ramp)
+
+
+def propagate(i, path, white, shapes, coloured, columns):
+    """Propagate every source over segment i."""
+    turn = vector_at(path.phi, i)
+    dt = path.dt[i]
+    phi11, phi12 = transition(turn, dt)
+    for s in range(len(white.blocks)):
+        A, B, C = load_blocks(white.blocks[s])
+        shape = shape_of(shapes, s)
+        if shape >= 0:
+            A, B, C = propagate_shape(A, B, C, shapes, shape, phi11, phi12, path.new_sample[i])
+        else:
+            angle, rate = vector_at(white.angle_density, s), vector_at(white.rate_density, s)
+            A, B, C = propagate_white(A, B, C, turn, dt, phi11, phi12, angle, rate)
+        store_blocks(white.blocks[s], A, B, C)
+    for c in range(len(coloured.source)):
+        cross = coloured.cross[c]
+        for a in range(3):
+            t = (cross[0, a], cross[1, a], cross[2, a])
+            b = (cross[3, a], cross[4, a], cross[5, a])
+            t = add(matrix_times_vector(phi11, t), matrix_times_vector(phi12, b))
+            cross[0, a], cross[1, a], cross[2, a] = t
+    propagate_columns(columns, i, dt, phi11, phi12)
+
+
+def gain_at(ka, kb, r):
+    """Return component r of the gain (6,)."""
+    return ka[r] if r < 3 else kb[r - 3]
+
+
+def update_coloured(A, B, C, e, h, ka, kb, rows, coloured, c):
+    """Return the blocks after row e of a source that is coloured noise, and what it adds to the expected square of the innovation."""
+    cross = coloured.cross[c]
+    sigma = coloured.sigma[c]
+    mine = coloured.sensor[c] == rows.sensor[e]
+    if mine:
+        decay = math.exp(-(rows.time[e] - coloured.seen[c]) / coloured.time[c])
+        coloured.seen[c] = rows.time[e]
+        for r in range(6):
+            for a in range(3):
+                cross[r, a] *= decay
+    weight = vector_at(rows.noise, e) if mine else (0.0, 0.0, 0.0)
+    seen = (0.0, 0.0, 0.0)
+    for r in range(3):
+        seen = combine(1.0, seen, h[r], vector_at(cross, r))
+    for r in range(6):
+        for a in range(3):
+            cross[r, a] -= gain_at(ka, kb, r) * seen[a]
+    # The rest of the cross-covariance, times the noise's weight: the new error and the noise in this row.
+    lt = (dot(vector_at(cross, 0), weight), dot(vector_at(cross, 1), weight), dot(vector_at(cross, 2), weight))
+    lb = (dot(vector_at(cross, 3), weight), dot(vector_at(cross, 4), weight), dot(vector_at(cross, 5), weight))
+    power = sigma * sigma * dot(weight, weight)
+    lt = combine(1.0, lt, -0.5 * power, ka)
+    lb = combine(1.0, lb, -0.5 * power, kb)
+    A = symmetric_minus_outer(symmetric_minus_outer(A, ka, lt), lt, ka)
+    B = minus_outer(minus_outer(B, ka, lb), lt, kb)
+    C = symmetric_minus_outer(symmetric_minus_outer(C, kb, lb), lb, kb)
+    for r in range(6):
+        for a in range(3):
+            cross[r, a] -= gain_at(ka, kb, r) * sigma * sigma * weight[a]
+    return A, B, C, power + 2.0 * dot(seen, weight)
+
+
+def update_shapes(h, ka, kb, shapes):
+    """Update the cross-covariances of coloured rates with a row."""
+    for c in range(len(shapes.source)):
+        cross = shapes.cross[c]
+        for a in range(3):
+            for n in range(cross.shape[2]):
+                seen = h[0] * cross[0, a, n] + h[1] * cross[1, a, n] + h[2] * cross[2, a, n]
+                for r in range(6):
+                    cross[r, a, n] -= gain_at(ka, kb, r) * seen
+
+
+def update(e, rows, white, shapes, coloured, columns, nis):
+    """Update every source with row e by the filter's gain."""
+    h = vector_at(rows.h, e)
+    A, B, C = load_blocks(white.blocks[0])
+    pa = symmetric_times_vector(A, h)
+    innovation = dot(h, pa) + rows.filter_variance[e]
+    ka = scale(1.0 / innovation, pa)
+    kb = scale(1.0 / innovation, transpose_times_vector(B, h))
+    A, B, C, _ = corrected(A, B, C, h, ka, kb, rows.filter_variance[e])
+    store_blocks(white.blocks[0], A, B, C)
+    expected = rows.variance[e]
+    for s in range(1, len(white.blocks)):
+        A, B, C = load_blocks(white.blocks[s])
+        own = rows.variance[e] if white.sensor[s] == rows.sensor[e] else 0.0
+        A, B, C, seen = corrected(A, B, C, h, ka, kb, own)
+        expected += seen
+        for c in range(len(coloured.source)):
+            if coloured.source[c] == s:
+                A, B, C, more = update_coloured(A, B, C, e, h, ka, kb, rows, coloured, c)
+                expected += more
+        store_blocks(white.blocks[s], A, B, C)
+    update_shapes(h, ka, kb, shapes)
+    mean = 0.0
+    value = columns.value
+    for k in range(len(value)):
+        shift = h[0] * value[k, 0] + h[1] * value[k, 1] + h[2] * value[k, 2] + rows.error[e, k]
+        if k < columns.fixed:
+            mean += shift
+        else:
+            expected += shift * shift
+        for r in range(6):
+            value[k, r] -= gain_at(ka, kb, r) * shift
+    nis[rows.sensor[e], 0] += (expected + mean * mean) / innovation
+    nis[rows.sensor[e], 1] += 1.0
+
+
+def keep(row, first, white, shapes, columns, out):
+    """Write the covariances and errors at a station; ``first`` says that no segment lies before it."""
+    for s in range(len(white.blocks)):
+        A, B, C = load_blocks(white.blocks[s])
+        c = shape_of(shapes, s)
+        if c >= 0:
+            inside, edge = shape_powers(shapes, c)
+            A, B, C = reported(A, B, C, shapes.cross[c], shapes.gains[c], shapes.poles[c], inside, edge, first)
+        store_blocks(out.blocks[row, s], A, B, C)
+    for k in range(len(columns.value)):
+        for r in range(6):
+            out.columns[row, k, r] = columns.value[k, r]
+
+
+def run_covariance(path, rows, white, shapes, coloured, columns, out):
+    """Propagate and update every source with the filter's gains; write its covariance at the stations of ``out``."""
     wanted = 0
-    for j in range(len(dt) + 1):
+    for j in range(len(path.dt) + 1):
         if j > 0:
-            i = j - 1
-            turn = vector_at(phi, i)
-            step = dt[i]
-            phi11, phi12 = transition(turn, step)
-            for s in range(sources):
-                A, B, C = load_blocks(blocks[s])
-                shape = -1
-                for c in range(shapes):
-                    if shape_source[c] == s:
-                        shape = c
-                if shape >= 0:
-                    gains = shape_gains[shape]
-                    poles = shape_poles[shape]
-                    states = shape_states[shape]
-                    cross = shape_cross[shape]
-                    amplitude = vector_at(shape_amplitude, shape)
-                    if new_sample[i]:
-                        for r in range(6):
-                            for a in range(3):
-                                for n in range(len(gains)):
-                                    cross[r, a, n] *= poles[n]
-                    unit_variance = 0.0
-                    for n in range(len(gains)):
-                        unit_variance += gains[n] * states[n]
-                    variance = (
-                        amplitude[0] * amplitude[0] * unit_variance,
-                        amplitude[1] * amplitude[1] * unit_variance,
-                        amplitude[2] * amplitude[2] * unit_variance,
-                    )
-                    A, B, C = shaped_rate(A, B, C, cross, gains, phi11, phi12, variance)
-                    for a in range(3):
-                        for n in range(len(gains)):
-                            t = (cross[0, a, n], cross[1, a, n], cross[2, a, n])
-                            b = (cross[3, a, n], cross[4, a, n], cross[5, a, n])
-                            t = add(matrix_times_vector(phi11, t), matrix_times_vector(phi12, b))
-                            drive = amplitude[a] * amplitude[a] * states[n]
-                            cross[0, a, n] = t[0] + phi12[a] * drive
-                            cross[1, a, n] = t[1] + phi12[3 + a] * drive
-                            cross[2, a, n] = t[2] + phi12[6 + a] * drive
-                else:
-                    A, B, C = carried(A, B, C, phi11, phi12)
-                    angle = vector_at(angle_density, s)
-                    rate = vector_at(rate_density, s)
-                    if angle[0] + angle[1] + angle[2] + rate[0] + rate[1] + rate[2] > 0.0:
-                        q11, q12, q22 = driven(turn, phi12, step, angle, rate)
-                        A = (A[0] + q11[0], A[1] + q11[1], A[2] + q11[2], A[3] + q11[3], A[4] + q11[4], A[5] + q11[5])
-                        B = add_matrices(B, q12)
-                        C = (C[0] + q22[0], C[1] + q22[1], C[2] + q22[2], C[3] + q22[3], C[4] + q22[4], C[5] + q22[5])
-                store_blocks(blocks[s], A, B, C)
-            for c in range(coloured):
-                for a in range(3):
-                    t = (noise_cross[c, 0, a], noise_cross[c, 1, a], noise_cross[c, 2, a])
-                    b = (noise_cross[c, 3, a], noise_cross[c, 4, a], noise_cross[c, 5, a])
-                    t = add(matrix_times_vector(phi11, t), matrix_times_vector(phi12, b))
-                    noise_cross[c, 0, a], noise_cross[c, 1, a], noise_cross[c, 2, a] = t
-            for k in range(number):
-                t = (columns[k, 0], columns[k, 1], columns[k, 2])
-                b = (columns[k, 3], columns[k, 4], columns[k, 5])
-                ramp = vector_at(column_ramp, k)
-                held = combine(1.0, b, 0.5 * step, ramp)
-                r = rate_place[k]
-                if r >= 0:
-                    held = add(held, (column_rate[i, r, 0], column_rate[i, r, 1], column_rate[i, r, 2]))
-                t = add(matrix_times_vector(phi11, t), matrix_times_vector(phi12, held))
-                b = combine(1.0, b, step, ramp)
-                columns[k, 0], columns[k, 1], columns[k, 2] = t
-                columns[k, 3], columns[k, 4], columns[k, 5] = b
-        for e in range(row_bounds[j], row_bounds[j + 1]):
-            h = vector_at(row_h, e)
-            A, B, C = load_blocks(blocks[0])
-            pa = symmetric_times_vector(A, h)
-            innovation = dot(h, pa) + row_filter_variance[e]
-            ka = scale(1.0 / innovation, pa)
-            kb = scale(1.0 / innovation, transpose_times_vector(B, h))
-            A, B, C, _ = corrected(A, B, C, h, ka, kb, row_filter_variance[e])
-            store_blocks(blocks[0], A, B, C)
-            expected = row_variance[e]
-            for s in range(1, sources):
-                A, B, C = load_blocks(blocks[s])
-                own = row_variance[e] if source_sensor[s] == row_sensor[e] else 0.0
-                A, B, C, seen = corrected(A, B, C, h, ka, kb, own)
-                expected += seen
-                for c in range(coloured):
-                    if noise_source[c] == s:
-                        cross = noise_cross[c]
-                        sigma = noise_sigma[c]
-                        mine = noise_sensor[c] == row_sensor[e]
-                        if mine:
-                            decay = math.exp(-(row_time[e] - noise_seen[c]) / noise_time[c])
-                            noise_seen[c] = row_time[e]
-                            for r in range(6):
-                                for a in range(3):
-                                    cross[r, a] *= decay
-                        weight = vector_at(row_noise, e) if mine else (0.0, 0.0, 0.0)
-                        seen_cross = (0.0, 0.0, 0.0)
-                        for r in range(3):
-                            seen_cross = combine(1.0, seen_cross, h[r], vector_at(cross, r))
-                        for r in range(6):
-                            gain = ka[r] if r < 3 else kb[r - 3]
-                            for a in range(3):
-                                cross[r, a] -= gain * seen_cross[a]
-                        # What is left of the cross-covariance, times the noise's weight: the new error and the noise in this row.
-                        lt = (
-                            dot(vector_at(cross, 0), weight),
-                            dot(vector_at(cross, 1), weight),
-                            dot(vector_at(cross, 2), weight),
-                        )
-                        lb = (
-                            dot(vector_at(cross, 3), weight),
-                            dot(vector_at(cross, 4), weight),
-                            dot(vector_at(cross, 5), weight),
-                        )
-                        power = sigma * sigma * dot(weight, weight)
-                        lt = combine(1.0, lt, -0.5 * power, ka)
-                        lb = combine(1.0, lb, -0.5 * power, kb)
-                        A = symmetric_minus_outer(symmetric_minus_outer(A, ka, lt), lt, ka)
-                        B = minus_outer(minus_outer(B, ka, lb), lt, kb)
-                        C = symmetric_minus_outer(symmetric_minus_outer(C, kb, lb), lb, kb)
-                        expected += power + 2.0 * dot(seen_cross, weight)
-                        for r in range(6):
-                            gain = ka[r] if r < 3 else kb[r - 3]
-                            for a in range(3):
-                                cross[r, a] -= gain * sigma * sigma * weight[a]
-                store_blocks(blocks[s], A, B, C)
-            for c in range(shapes):
-                cross = shape_cross[c]
-                for a in range(3):
-                    for n in range(cross.shape[2]):
-                        seen = h[0] * cross[0, a, n] + h[1] * cross[1, a, n] + h[2] * cross[2, a, n]
-                        for r in range(6):
-                            cross[r, a, n] -= (ka[r] if r < 3 else kb[r - 3]) * seen
-            mean = 0.0
-            for k in range(number):
-                shift = h[0] * columns[k, 0] + h[1] * columns[k, 1] + h[2] * columns[k, 2] + row_error[e, k]
-                if k < fixed:
-                    mean += shift
-                else:
-                    expected += shift * shift
-                for r in range(6):
-                    columns[k, r] -= (ka[r] if r < 3 else kb[r - 3]) * shift
-            nis[row_sensor[e], 0] += (expected + mean * mean) / innovation
-            nis[row_sensor[e], 1] += 1.0
-        if wanted < len(stations) and stations[wanted] == j:
-            for s in range(sources):
-                A, B, C = load_blocks(blocks[s])
-                for c in range(shapes):
-                    if shape_source[c] == s:
-                        gains, poles, states = shape_gains[c], shape_poles[c], shape_states[c]
-                        now, edge = 0.0, 0.0
-                        for n in range(len(gains)):
-                            now += gains[n] * states[n]
-                            edge += 0.5 * (1.0 + poles[n]) * gains[n] * states[n]
-                        a = vector_at(shape_amplitude, c)
-                        squared = (a[0] * a[0], a[1] * a[1], a[2] * a[2])
-                        A, B, C = reported(
-                            A, B, C, shape_cross[c], gains, poles, scale(now, squared), scale(edge, squared), j == 0
-                        )
-                store_blocks(blocks_out[wanted, s], A, B, C)
-            for k in range(number):
-                for r in range(6):
-                    columns_out[wanted, k, r] = columns[k, r]
+            propagate(j - 1, path, white, shapes, coloured, columns)
+        for e in range(path.row_bounds[j], path.row_bounds[j + 1]):
+            update(e, rows, white, shapes, coloured, columns, out.nis)
+        if wanted < len(out.stations) and out.stations[wanted] == j:
+            keep(wanted, j == 0, white, shapes, columns, out)
             wanted += 1
