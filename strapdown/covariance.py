@@ -536,7 +536,7 @@ class _Random:
                 cross[c, 3 + a, a, :n] = -(amplitude[a] ** 2) * projected
             self.blocks[source][[15, 18, 20]] = amplitude**2 * (gains @ projected)
         sources = np.array([source for source, *_ in self.shapes], np.int64)
-        return covariance_loop.Shapes(amplitudes, *table, cross, sources)
+        return covariance_loop.Shapes(amplitudes, table[0], table[1], table[2], cross, sources)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -10,6 +10,8 @@ Lanes in memory lie one after the other, so place p of a flat array begins at ``
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from strapdown.kernels.algebra import (
@@ -33,7 +35,7 @@ from strapdown.kernels.lane_values import (
     restore_mode,
     store_like,
 )
-from strapdown.kernels.measurement import ATTITUDE, HEADING, VECTOR, heading_row
+from strapdown.kernels.measurement import ATTITUDE, HEADING, VECTOR, heading_row, vector_at
 from strapdown.kernels.noise import next_word, single_normals, stream_state
 from strapdown.kernels.rotation import exponential, quaternion_multiply, rotation_matrix, unit
 
@@ -60,8 +62,107 @@ KEPT = 31
 """Numbers kept at an epoch: q (4), b (3), P in blocks (21), true bias (3)."""
 
 WHITE_SIGMA, WALK_SIGMA, MARKOV_DECAY, MARKOV_SIGMA, MARKOV_MEAN, MARKOV_START, TURN_ON_SIGMA, FLICKER_SIZE = range(8)
-"""Rows of ``gyro``: what a step's noise is by axis. σ of the increment given the bias at both ends, σ of the walk's step, decay of the
+"""Rows of the sizes: what a step's noise is by axis. σ of the increment given the bias at both ends, σ of the walk's step, decay of the
 Markov bias, σ of its step, what its ends add to the increment, σ at the start, σ of the turn-on bias, flicker B."""
+
+
+class Gyro(NamedTuple):
+    """The gyro over n steps of the filter."""
+
+    edges: np.ndarray
+    """Edges of the steps (n + 1,), s."""
+    substeps: np.ndarray
+    """The longest time over which the filter may predict at once in each step (n,), s. Beyond the range of the polynomials a step is made
+    of several: at constant rate they compose exactly, so this is the same model."""
+    increments: np.ndarray
+    """Without the errors that differ from run to run (n, 3), rad."""
+    true_increments: np.ndarray
+    """(n, 3), rad."""
+    true_bias: np.ndarray
+    """The part of the bias that is the same in all runs (n + 1, 3), rad/s."""
+    terms: np.ndarray
+    """Which noises there are (4,): walk, Markov, flicker, error matrix."""
+    sizes: np.ndarray
+    """Sizes of the noises by axis (8, 3), rows :data:`WHITE_SIGMA` to :data:`FLICKER_SIZE`."""
+    poles: np.ndarray
+    gains: np.ndarray
+    poles_start: np.ndarray
+    """Flicker (:class:`strapdown.flicker.Shaping`) (16,), (16,), and what makes stationary states of normals (16, 16) or (0, 16)."""
+    dispersion: np.ndarray
+    """σ of the entries of the error matrix (3, 3)."""
+
+
+class Start(NamedTuple):
+    """The state at the first edge, and the process noise of the filter."""
+
+    attitude: np.ndarray
+    """True attitude (4,)."""
+    error: np.ndarray
+    """True initial error (8,): σ of δθ and δb, then the part that is the same in all runs (6)."""
+    variance: np.ndarray
+    """The filter's initial variances of attitude and bias (2,)."""
+    noise: np.ndarray
+    """σ_v² and σ_u² of the filter (2,)."""
+
+
+class Events(NamedTuple):
+    """Measurements in order of time (m,)."""
+
+    time: np.ndarray
+    kind: np.ndarray
+    """Code of :mod:`strapdown.kernels.measurement`."""
+    sensor: np.ndarray
+    span: np.ndarray
+    """Span of time for the NIS."""
+    exact: np.ndarray
+    """Without noise (m, 4): a vector or a quaternion."""
+    sigma: np.ndarray
+    """True σ (m, 3)."""
+    variance: np.ndarray
+    """The filter's variances (m, 3)."""
+    decay: np.ndarray
+    share: np.ndarray
+    """Decay and new part of correlated noise."""
+    number: np.ndarray
+    """Number among the sensor's own."""
+    frame: np.ndarray
+    """Row of ``frames``."""
+    frames: np.ndarray
+    """Right-handed frames (u, v, r) by rows about the references (rows, 9)."""
+    struck_below: np.ndarray
+    """By sensor, the word below which a measurement is an outlier; 0 for none."""
+    outlier_scale: np.ndarray
+
+
+class Draws(NamedTuple):
+    """What a run draws from and remembers, flat."""
+
+    streams: np.ndarray
+    """States of the streams."""
+    ahead: np.ndarray
+    """:data:`AHEAD` normals a source, in single precision."""
+    memory: np.ndarray
+    """Places of :func:`memory`."""
+
+
+class Outputs(NamedTuple):
+    """What is written of every group of runs, flat."""
+
+    kept: np.ndarray
+    """:data:`KEPT` numbers an epoch."""
+    nis: np.ndarray
+    """By sensor and span of time; it is added to."""
+
+
+class Detail(NamedTuple):
+    """What is written of runs to look at, flat."""
+
+    increments: np.ndarray
+    """What the gyro gave, 3 an interval."""
+    values: np.ndarray
+    """What the sensors gave, 4 a measurement."""
+    innovations: np.ndarray
+    """e₁, s₁, e₂, s₂, e₃, s₃ of each measurement."""
 
 
 def memory(sensors):
@@ -162,19 +263,21 @@ def fill_with_normals(pattern, k0, k1, numbers, out):
         store_like(out, at + 2 * n, y)
 
 
-def start_streams(keys, numbers, streams, ahead, like):
+def start_streams(keys, numbers, draws, like):
     """Fill the states of all streams of the runs of these numbers, ``keys`` (sources, 2), and draw what a run starts with."""
     number = load_like(numbers, 0, like)
     for source in range(len(keys)):
         s0, s1, s2, s3 = stream_state(keys[source, 0], keys[source, 1], number)
-        store_stream(streams, 4 * source * len(like), like, s0, s1, s2, s3)
+        store_stream(draws.streams, 4 * source * len(like), like, s0, s1, s2, s3)
     for source in (FLICKER, TURN_ON, START, DISPERSIONS):
-        refill(streams, source, ahead, 3 * STATES, like)
+        refill(draws.streams, source, draws.ahead, 3 * STATES, like)
 
 
-def start_gyro(gyro, poles_start, dispersion, ahead, memory, like):
+def start_gyro(gyro, draws, like):
     """Draw what a run's gyro starts with: turn-on bias, Markov bias, flicker states, error matrix."""
     n = len(like)
+    sizes, poles_start, dispersion = gyro.sizes, gyro.poles_start, gyro.dispersion
+    ahead, memory = draws.ahead, draws.memory
     x = drawn_triple(ahead, TURN_ON, 0, like)
     y = drawn_triple(ahead, TURN_ON, 3, like)
     for i in range(3):
@@ -183,13 +286,13 @@ def start_gyro(gyro, poles_start, dispersion, ahead, memory, like):
         memory,
         _TURN_ON,
         like,
-        (x[0] * gyro[TURN_ON_SIGMA, 0], x[1] * gyro[TURN_ON_SIGMA, 1], x[2] * gyro[TURN_ON_SIGMA, 2]),
+        (x[0] * sizes[TURN_ON_SIGMA, 0], x[1] * sizes[TURN_ON_SIGMA, 1], x[2] * sizes[TURN_ON_SIGMA, 2]),
     )
     store_triple(
         memory,
         _MARKOV,
         like,
-        (y[0] * gyro[MARKOV_START, 0], y[1] * gyro[MARKOV_START, 1], y[2] * gyro[MARKOV_START, 2]),
+        (y[0] * sizes[MARKOV_START, 0], y[1] * sizes[MARKOV_START, 1], y[2] * sizes[MARKOV_START, 2]),
     )
     for i in range(3 * STATES):
         store_like(memory, (_STATES + i) * n, lanes_zero(like))
@@ -244,11 +347,10 @@ def flicker_value(gains, memory, axis, like):
     return value
 
 
-def drift_step(terms, gyro, poles, gains, k, dt, true_increment, memory, streams, ahead, like):
-    """Draw interval k of the gyro; return the bias at its start and what the noise adds to its increment.
-
-    The bias is without its part common to all runs. ``terms`` tells which noises there are: (walk, Markov, flicker, matrix).
-    """
+def drift_step(gyro, k, dt, true_increment, draws, like):
+    """Draw interval k of the gyro; return the bias at its start, without its part common to all runs, and the noise of its increment."""
+    terms, sizes, poles, gains = gyro.terms, gyro.sizes, gyro.poles, gyro.gains
+    streams, ahead, memory = draws.streams, draws.ahead, draws.memory
     walk = triple(memory, _WALK, like)
     turn_on = triple(memory, _TURN_ON, like)
     bias = add(walk, turn_on)
@@ -256,9 +358,9 @@ def drift_step(terms, gyro, poles, gains, k, dt, true_increment, memory, streams
         white = normal_triple(streams, GYRO, ahead, 2 * k, like)
         steps = normal_triple(streams, GYRO, ahead, 2 * k + 1, like)
         after = (
-            walk[0] + gyro[WALK_SIGMA, 0] * steps[0],
-            walk[1] + gyro[WALK_SIGMA, 1] * steps[1],
-            walk[2] + gyro[WALK_SIGMA, 2] * steps[2],
+            walk[0] + sizes[WALK_SIGMA, 0] * steps[0],
+            walk[1] + sizes[WALK_SIGMA, 1] * steps[1],
+            walk[2] + sizes[WALK_SIGMA, 2] * steps[2],
         )
         store_triple(memory, _WALK, like, after)
         drift = combine(dt, turn_on, 0.5 * dt, add(walk, after))
@@ -270,28 +372,28 @@ def drift_step(terms, gyro, poles, gains, k, dt, true_increment, memory, streams
         g = triple(memory, _MARKOV, like)
         x = normal_triple(streams, MARKOV, ahead, k, like)
         after = (
-            gyro[MARKOV_DECAY, 0] * g[0] + gyro[MARKOV_SIGMA, 0] * x[0],
-            gyro[MARKOV_DECAY, 1] * g[1] + gyro[MARKOV_SIGMA, 1] * x[1],
-            gyro[MARKOV_DECAY, 2] * g[2] + gyro[MARKOV_SIGMA, 2] * x[2],
+            sizes[MARKOV_DECAY, 0] * g[0] + sizes[MARKOV_SIGMA, 0] * x[0],
+            sizes[MARKOV_DECAY, 1] * g[1] + sizes[MARKOV_SIGMA, 1] * x[1],
+            sizes[MARKOV_DECAY, 2] * g[2] + sizes[MARKOV_SIGMA, 2] * x[2],
         )
         store_triple(memory, _MARKOV, like, after)
         bias = add(bias, g)
         drift = (
-            drift[0] + gyro[MARKOV_MEAN, 0] * (g[0] + after[0]),
-            drift[1] + gyro[MARKOV_MEAN, 1] * (g[1] + after[1]),
-            drift[2] + gyro[MARKOV_MEAN, 2] * (g[2] + after[2]),
+            drift[0] + sizes[MARKOV_MEAN, 0] * (g[0] + after[0]),
+            drift[1] + sizes[MARKOV_MEAN, 1] * (g[1] + after[1]),
+            drift[2] + sizes[MARKOV_MEAN, 2] * (g[2] + after[2]),
         )
     if terms[2]:
         if k == 0:
             for axis in range(3):
-                value = gyro[FLICKER_SIZE, axis] * flicker_value(gains, memory, axis, like)
+                value = sizes[FLICKER_SIZE, axis] * flicker_value(gains, memory, axis, like)
                 store_like(memory, (_BEFORE + axis) * len(like), value)
         x = normal_triple(streams, FLICKER, ahead, k, like)
         before = triple(memory, _BEFORE, like)
         now = (
-            gyro[FLICKER_SIZE, 0] * flicker_step(poles, gains, memory, 0, x[0], like),
-            gyro[FLICKER_SIZE, 1] * flicker_step(poles, gains, memory, 1, x[1], like),
-            gyro[FLICKER_SIZE, 2] * flicker_step(poles, gains, memory, 2, x[2], like),
+            sizes[FLICKER_SIZE, 0] * flicker_step(poles, gains, memory, 0, x[0], like),
+            sizes[FLICKER_SIZE, 1] * flicker_step(poles, gains, memory, 1, x[1], like),
+            sizes[FLICKER_SIZE, 2] * flicker_step(poles, gains, memory, 2, x[2], like),
         )
         store_triple(memory, _BEFORE, like, now)
         bias = combine(1.0, bias, 0.5, add(before, now))
@@ -304,31 +406,34 @@ def drift_step(terms, gyro, poles, gains, k, dt, true_increment, memory, streams
         )
         drift = add(drift, matrix_times_vector(M, true_increment))
     drift = (
-        drift[0] + gyro[WHITE_SIGMA, 0] * white[0],
-        drift[1] + gyro[WHITE_SIGMA, 1] * white[1],
-        drift[2] + gyro[WHITE_SIGMA, 2] * white[2],
+        drift[0] + sizes[WHITE_SIGMA, 0] * white[0],
+        drift[1] + sizes[WHITE_SIGMA, 1] * white[1],
+        drift[2] + sizes[WHITE_SIGMA, 2] * white[2],
     )
     return bias, drift
 
 
-def sensor_noise(sensor, sigma, decay, share, struck_below, outlier_scale, number, memory, streams, ahead, like):
-    """Return the noise of a sensor's measurement of this number: white, of ``sigma`` by component, outliers and correlated noise."""
+def sensor_noise(e, events, draws, like):
+    """Return the noise of a measurement: white by component, outliers and correlated noise."""
+    streams, ahead, memory = draws.streams, draws.ahead, draws.memory
+    sensor, number, share = events.sensor[e], events.number[e], events.share[e]
+    struck_below = events.struck_below[sensor]
     mine = _SENSORS + _OF_A_SENSOR * sensor
     source = SENSORS + 2 * sensor
     white = normal_triple(streams, source, ahead, number, like)
-    noise = (sigma[0] * white[0], sigma[1] * white[1], sigma[2] * white[2])
+    noise = (events.sigma[e, 0] * white[0], events.sigma[e, 1] * white[1], events.sigma[e, 2] * white[2])
     if struck_below > np.uint64(0) or share > 0.0:
         place = 4 * (source + 1) * len(like)
         s0, s1, s2, s3 = stored_stream(streams, place, like)
         word, s0, s1, s2, s3 = next_word(s0, s1, s2, s3)
-        larger = chosen(word < struck_below, like - like + outlier_scale, 1.0)
+        larger = chosen(word < struck_below, like - like + events.outlier_scale[sensor], 1.0)
         noise = (larger * noise[0], larger * noise[1], larger * noise[2])
         store_stream(streams, place, like, s0, s1, s2, s3)
         if share > 0.0:
             refill(streams, source + 1, ahead, 4, like)
             drive = scale(share, drawn_triple(ahead, source + 1, 0, like))
             if number > 0:
-                drive = combine(decay, triple(memory, mine, like), 1.0, drive)
+                drive = combine(events.decay[e], triple(memory, mine, like), 1.0, drive)
             store_triple(memory, mine, like, drive)
             noise = add(noise, drive)
     return noise
@@ -356,48 +461,76 @@ def add_nis(nis, place, like, value):
     store_like(nis, at, load_like(nis, at, like) + value)
 
 
-def advance(
-    pattern,
-    numbers,
-    keys,
-    edges,
-    substeps,
-    increments,
-    true_increments,
-    true_bias,
-    first_attitude,
-    terms,
-    gyro,
-    poles,
-    gains,
-    poles_start,
-    dispersion,
-    start,
-    believed,
-    event_time,
-    event_kind,
-    event_sensor,
-    event_bin,
-    event_exact,
-    event_sigma,
-    event_variance,
-    event_decay,
-    event_share,
-    event_count,
-    event_frame,
-    frames,
-    struck_below,
-    outlier_scale,
-    every,
-    streams,
-    ahead,
-    memory,
-    kept,
-    nis,
-    increments_out,
-    values_out,
-    innovations_out,
-):
+def update(q, b, A, B, C, e, events, draws, out, detail, like):
+    """Draw measurement e, update the filter with it, and return its state; the NIS is added to that of its sensor and span of time."""
+    noise = sensor_noise(e, events, draws, like)
+    exact, kind = events.exact, events.kind[e]
+    spans = len(out.nis) // (len(like) * max(len(events.struck_below), 1))
+    place = events.sensor[e] * spans + events.span[e]
+    one = like + 1.0
+    e2 = like
+    s2 = one
+    e3 = like
+    s3 = one
+    z0 = like
+    if kind == ATTITUDE:
+        measured = quaternion_multiply((exact[e, 0], exact[e, 1], exact[e, 2], exact[e, 3]), exponential(noise))
+        y = rotation_vector(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), measured))
+        variances = (events.variance[e, 0], events.variance[e, 1], events.variance[e, 2])
+        q, b, A, B, C, e1, s1, e2, s2, e3, s3 = update_residual(q, b, A, B, C, y, variances)
+        chi = e1 * e1 / s1 + e2 * e2 / s2 + e3 * e3 / s3
+        z = (measured[1], measured[2], measured[3])
+        z0 = measured[0]
+    else:
+        z = add((exact[e, 0], exact[e, 1], exact[e, 2]), noise)
+        t = events.frame[e]
+        frames = events.frames
+        R = rotation_matrix(q)
+        r = (frames[t, 6], frames[t, 7], frames[t, 8])
+        variance = events.variance[e, 0]
+        if kind != VECTOR:
+            z = scale(inverse_root(dot(z, z)), z)
+        if kind == HEADING:
+            m = matrix_times_vector(R, z)
+            error = arctangent(m[0] * r[1] - m[1] * r[0], m[0] * r[0] + m[1] * r[1])
+            q, b, A, B, C, e1, s1 = update_heading(q, b, A, B, C, heading_row(R, z), error, variance)
+            chi = e1 * e1 / s1
+        else:
+            u = (frames[t, 0], frames[t, 1], frames[t, 2])
+            v = (frames[t, 3], frames[t, 4], frames[t, 5])
+            q, b, A, B, C, e1, s1, e2, s2, chi = update_direction_and_judge(q, b, A, B, C, R, u, v, z, variance)
+            if kind == VECTOR:
+                e3 = dot(transpose_times_vector(R, r), z) - 1.0
+                s3 = variance * one
+                chi = chi + e3 * e3 / variance
+    add_nis(out.nis, place, like, chi)
+    if detail is not None:
+        store_four(detail.values, 4 * e, like, (z0, z[0], z[1], z[2]))
+        store_four(detail.innovations, 6 * e, like, (e1, s1, e2, s2))
+        store_like(detail.innovations, (6 * e + 4) * len(like), e3)
+        store_like(detail.innovations, (6 * e + 5) * len(like), s3)
+    return q, b, A, B, C
+
+
+def store_four(array, place, like, values):
+    """Write four neighbouring places."""
+    n = len(like)
+    for i in range(4):
+        store_like(array, (place + i) * n, values[i])
+
+
+def filter_start(bias, start, draws, like):
+    """Return the attitude and bias that the filter of a run starts with: the truth less the error drawn."""
+    x = drawn_triple(draws.ahead, START, 0, like)
+    y = drawn_triple(draws.ahead, START, 3, like)
+    given = start.error
+    error = combine(given[0], x, 1.0, (given[2], given[3], given[4]))
+    attitude = (start.attitude[0], start.attitude[1], start.attitude[2], start.attitude[3])
+    q = unit(quaternion_multiply(attitude, exponential((-error[0], -error[1], -error[2]))))
+    return q, subtract(bias, combine(given[1], y, 1.0, (given[5], given[6], given[7])))
+
+
+def advance(pattern, numbers, keys, gyro, start, events, every, draws, out, detail):
     """Run ``len(pattern)`` runs of the given numbers over a whole scenario.
 
     Parameters
@@ -406,54 +539,28 @@ def advance(
         Its length and type are those of the lanes.
     numbers : array of words (W,)
     keys : array of words (sources, 2)
-    edges : array (n + 1,)
-        Edges of the filter's steps, s.
-    substeps : array (n,)
-        The longest time that the filter may predict over at once in each step, s. Beyond the range of the polynomials a step is made of
-        several: at constant rate they compose exactly, so this is the same model.
-    increments, true_increments : array (n, 3)
-        What the gyro gives without any error that differs from run to run, and the true turns, rad.
-    true_bias : array (n + 1, 3)
-        The part of the bias that all runs share, rad/s.
-    first_attitude : array (4,)
-    terms, gyro : array (4,) of booleans, (8, 3)
-        :func:`drift_step`, :data:`FLICKER_SIZE`.
-    poles, gains, poles_start : array (16,), (16,), (16, 16) or (0, 16)
-        Flicker (:class:`strapdown.flicker.Shaping`) and what makes stationary states of normals.
-    dispersion : array (3, 3)
-        σ of the entries of the gyro's error matrix.
-    start : array (14,)
-        σ of the true initial error (δθ, δb), its fixed part (6), the filter's prior variances of attitude and bias.
-    believed : array (2,)
-        σ_v² and σ_u² of the filter.
-    event_… : arrays (events, …)
-        Measurements in order of time: kind (:mod:`strapdown.kernels.filter_loop`), sensor, span of time for the NIS, value without noise
-        (4: a vector or a quaternion), σ (3), the filter's variance (3), decay and share of correlated noise, number among its sensor's,
-        row of ``frames`` (rows, 9: triads).
-    struck_below, outlier_scale : arrays (sensors,)
-        Word below which a measurement is an outlier; 0 for none.
+    gyro : Gyro
+    start : Start
+    events : Events
     every : int
         Steps from one kept epoch to the next.
-    streams, ahead, memory, kept, nis : arrays
-        Flat: states of the streams, :data:`AHEAD` normals a source (singles), places of :func:`memory`, :data:`KEPT` numbers an epoch,
-        NIS by sensor and span of time. ``nis`` is added to.
-    increments_out, values_out, innovations_out : arrays
-        Flat, 3 an interval, 4 and 6 an event, or None: what the sensors gave, and e₁, s₁, e₂, s₂, e₃, s₃.
+    draws : Draws
+    out : Outputs
+    detail : Detail or None
     """
     like = lanes_of(pattern)
-    n = len(like)
     one = like + 1.0
     mode = flush_tiny(like)
-    events = len(event_time)
-    steps = len(increments)
-    bins = len(nis) // (n * max(len(struck_below), 1))
-    start_streams(keys, numbers, streams, ahead, like)
-    start_gyro(gyro, poles_start, dispersion, ahead, memory, like)
+    count = len(events.time)
+    edges = gyro.edges
+    steps = len(gyro.increments)
+    start_streams(keys, numbers, draws, like)
+    start_gyro(gyro, draws, like)
     q = (one, like, like, like)
     b = (like, like, like)
-    A = (start[8] * one, like, like, start[8] * one, like, start[8] * one)
+    A = (start.variance[0] * one, like, like, start.variance[0] * one, like, start.variance[0] * one)
     B = (like, like, like, like, like, like, like, like, like)
-    C = (start[9] * one, like, like, start[9] * one, like, start[9] * one)
+    C = (start.variance[1] * one, like, like, start.variance[1] * one, like, start.variance[1] * one)
     theta = (like, like, like)
     e = 0
     countdown = 0
@@ -464,8 +571,8 @@ def advance(
     for k in range(-1, steps):
         end = edges[k + 1]
         while k >= 0:
-            due = e < events and event_time[e] <= end
-            stop = event_time[e] if due else end
+            due = e < count and events.time[e] <= end
+            stop = events.time[e] if due else end
             dt = stop - now
             if dt > 0.0:
                 if dt > longest:
@@ -475,99 +582,26 @@ def advance(
                 part = theta
                 if dt < whole:
                     part = scale(dt / whole, theta)
-                q, A, B, C = predict(q, b, A, B, C, part, dt, believed[0], believed[1])
+                q, A, B, C = predict(q, b, A, B, C, part, dt, start.noise[0], start.noise[1])
                 now = stop
             if due:
-                sensor = event_sensor[e]
-                noise = sensor_noise(
-                    sensor,
-                    (event_sigma[e, 0], event_sigma[e, 1], event_sigma[e, 2]),
-                    event_decay[e],
-                    event_share[e],
-                    struck_below[sensor],
-                    outlier_scale[sensor],
-                    event_count[e],
-                    memory,
-                    streams,
-                    ahead,
-                    like,
-                )
-                exact = (event_exact[e, 0], event_exact[e, 1], event_exact[e, 2])
-                place = sensor * bins + event_bin[e]
-                e3 = like
-                s3 = one
-                if event_kind[e] == ATTITUDE:
-                    whole_attitude = (event_exact[e, 0], event_exact[e, 1], event_exact[e, 2], event_exact[e, 3])
-                    measured = quaternion_multiply(whole_attitude, exponential(noise))
-                    y = rotation_vector(quaternion_multiply((q[0], -q[1], -q[2], -q[3]), measured))
-                    variances = (event_variance[e, 0], event_variance[e, 1], event_variance[e, 2])
-                    q, b, A, B, C, e1, s1, e2, s2, e3, s3 = update_residual(q, b, A, B, C, y, variances)
-                    add_nis(nis, place, like, e1 * e1 / s1 + e2 * e2 / s2 + e3 * e3 / s3)
-                    z = (measured[1], measured[2], measured[3])
-                    z0 = measured[0]
-                else:
-                    z0 = like
-                    z = add(exact, noise)
-                    t = event_frame[e]
-                    R = rotation_matrix(q)
-                    r = (frames[t, 6], frames[t, 7], frames[t, 8])
-                    variance = event_variance[e, 0]
-                    if event_kind[e] != VECTOR:
-                        z = scale(inverse_root(dot(z, z)), z)
-                    if event_kind[e] == HEADING:
-                        m = matrix_times_vector(R, z)
-                        error = arctangent(m[0] * r[1] - m[1] * r[0], m[0] * r[0] + m[1] * r[1])
-                        q, b, A, B, C, e1, s1 = update_heading(q, b, A, B, C, heading_row(R, z), error, variance)
-                        add_nis(nis, place, like, e1 * e1 / s1)
-                        e2 = like
-                        s2 = one
-                    else:
-                        u = (frames[t, 0], frames[t, 1], frames[t, 2])
-                        v = (frames[t, 3], frames[t, 4], frames[t, 5])
-                        q, b, A, B, C, e1, s1, e2, s2, chi = update_direction_and_judge(
-                            q, b, A, B, C, R, u, v, z, variance
-                        )
-                        if event_kind[e] == VECTOR:
-                            e3 = dot(transpose_times_vector(R, r), z) - 1.0
-                            s3 = variance * one
-                            chi = chi + e3 * e3 / variance
-                        add_nis(nis, place, like, chi)
-                if values_out is not None:
-                    at = 4 * e * n
-                    store_like(values_out, at, z0)
-                    store_like(values_out, at + n, z[0])
-                    store_like(values_out, at + 2 * n, z[1])
-                    store_like(values_out, at + 3 * n, z[2])
-                    at = 6 * e * n
-                    store_like(innovations_out, at, e1)
-                    store_like(innovations_out, at + n, s1)
-                    store_like(innovations_out, at + 2 * n, e2)
-                    store_like(innovations_out, at + 3 * n, s2)
-                    store_like(innovations_out, at + 4 * n, e3)
-                    store_like(innovations_out, at + 5 * n, s3)
+                q, b, A, B, C = update(q, b, A, B, C, e, events, draws, out, detail, like)
                 e += 1
             elif now >= end:
                 break
         i = min(k + 1, steps - 1)
         whole = edges[i + 1] - edges[i]
-        true_increment = (true_increments[i, 0], true_increments[i, 1], true_increments[i, 2])
-        given = (increments[i, 0], increments[i, 1], increments[i, 2])
-        bias, drift = drift_step(terms, gyro, poles, gains, k + 1, whole, true_increment, memory, streams, ahead, like)
-        theta = add(given, drift)
-        bias = add((true_bias[k + 1, 0], true_bias[k + 1, 1], true_bias[k + 1, 2]), bias)
-        longest = substeps[i]
-        if increments_out is not None and k + 1 < steps:
-            store_triple(increments_out, 3 * (k + 1), like, theta)
+        bias, drift = drift_step(gyro, k + 1, whole, vector_at(gyro.true_increments, i), draws, like)
+        theta = add(vector_at(gyro.increments, i), drift)
+        bias = add(vector_at(gyro.true_bias, k + 1), bias)
+        longest = gyro.substeps[i]
+        if detail is not None and k + 1 < steps:
+            store_triple(detail.increments, 3 * (k + 1), like, theta)
         if k < 0:
-            x = drawn_triple(ahead, START, 0, like)
-            y = drawn_triple(ahead, START, 3, like)
-            error = combine(start[0], x, 1.0, (start[2], start[3], start[4]))
-            initial = (first_attitude[0], first_attitude[1], first_attitude[2], first_attitude[3])
-            q = unit(quaternion_multiply(initial, exponential((-error[0], -error[1], -error[2]))))
-            b = subtract(bias, combine(start[1], y, 1.0, (start[5], start[6], start[7])))
+            q, b = filter_start(bias, start, draws, like)
         if countdown == 0:
             countdown = every
-            keep(kept, row, like, q, b, A, B, C, bias)
+            keep(out.kept, row, like, q, b, A, B, C, bias)
             row += 1
         countdown -= 1
     restore_mode(mode)

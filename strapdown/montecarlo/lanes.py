@@ -120,8 +120,9 @@ def _start_sigma(plan: Plan) -> tuple[float, float]:
 class _Prepared:
     """What all runs of a plan share, as the kernels take it."""
 
-    shared: tuple[Any, ...]
-    """Arguments of :func:`strapdown.kernels.montecarlo_run.advance` from the edges to the outliers."""
+    gyro: montecarlo_run.Gyro
+    start: montecarlo_run.Start
+    events_of_runs: montecarlo_run.Events
     record: ImuRecord
     """The filter's steps without any noise; its series tell nominal σ."""
     events: Schedule
@@ -180,32 +181,28 @@ def _prepare(plan: Plan) -> _Prepared:
     events = schedule(believed.vectors, float(record.time[0]), float(record.time[-1]))
     values = [_exact(sensor, scenario, own) for sensor, own in zip(scenario.sensors, series, strict=True)]
     real = _real(plan)
-    shared = (
+    gyro = montecarlo_run.Gyro(
         np.ascontiguousarray(record.time),
         _substeps(record),
         np.ascontiguousarray(record.increments, real),
         np.ascontiguousarray(turns.reshape(-1, n, 3).sum(axis=1), real),
         np.ascontiguousarray(quiet.truth.bias[::n], real),
-        np.ascontiguousarray(quiet.truth.attitude[0]),
         *_gyro_terms(plan, n * dt, len(record.increments)),
-        np.array(
-            [
-                *_start_sigma(plan),
-                *plan.dispersions.attitude_error,
-                *plan.dispersions.bias_error,
-                plan.setup.attitude_sigma**2,
-                plan.setup.bias_sigma**2,
-            ]
-        ),
-        np.array([plan.setup.process_noise.angle_random_walk, plan.setup.process_noise.rate_random_walk]) ** 2,
-        *_event_terms(plan, events, values),
-        plan.every,
+    )
+    noise = plan.setup.process_noise
+    start = montecarlo_run.Start(
+        attitude=np.ascontiguousarray(quiet.truth.attitude[0]),
+        error=np.array([*_start_sigma(plan), *plan.dispersions.attitude_error, *plan.dispersions.bias_error]),
+        variance=np.array([plan.setup.attitude_sigma, plan.setup.bias_sigma]) ** 2,
+        noise=np.array([noise.angle_random_walk, noise.rate_random_walk]) ** 2,
     )
     place = np.clip(np.searchsorted(plan.nis_edges, events.time, side="left") - 1, 0, plan.nis_bins - 1)
     degrees = np.zeros((len(plan.sensors), plan.nis_bins), np.int64)
     np.add.at(degrees, (events.sensor, place), np.array([vectors.KINDS[kind] for kind in events.kinds])[events.sensor])
     prepared = _Prepared(
-        shared=shared,
+        gyro=gyro,
+        start=start,
+        events_of_runs=_event_terms(plan, events, values),
         record=record,
         events=events,
         truth=np.ascontiguousarray(quiet.truth.attitude[:: n * plan.every]),
@@ -311,8 +308,8 @@ def _exact(sensor: Any, scenario: Scenario, series: VectorMeasurements) -> tuple
     return values, np.repeat(sensor.sigma / length[:, None], 3, axis=1), 1.0 / length
 
 
-def _event_terms(plan: Plan, events: Schedule, values: list[tuple[Array, Array, Array]]) -> tuple[Any, ...]:
-    """Return what the kernel wants of the measurements and sensors."""
+def _event_terms(plan: Plan, events: Schedule, values: list[tuple[Array, Array, Array]]) -> montecarlo_run.Events:
+    """Return the measurements and sensors for the kernel."""
     m = len(events.time)
     exact, sigma = np.zeros((m, 4)), np.zeros((m, 3))
     decay, share, number = np.zeros(m), np.zeros(m), np.zeros(m, np.int64)
@@ -334,21 +331,21 @@ def _event_terms(plan: Plan, events: Schedule, values: list[tuple[Array, Array, 
             share[mine] = faults.correlated_sigma * length * np.sqrt(1.0 - decay[mine] ** 2)
     place = np.clip(np.searchsorted(plan.nis_edges, events.time, side="left") - 1, 0, plan.nis_bins - 1)
     real = _real(plan)
-    return (
-        events.time,
-        events.kind,
-        events.sensor.astype(np.int64),
-        place.astype(np.int64),
-        exact.astype(real),
-        sigma.astype(real),
-        variance.astype(real),
-        decay.astype(real),
-        share.astype(real),
-        number,
-        events.reference,
-        events.triads.astype(real),
-        struck,
-        scale,
+    return montecarlo_run.Events(
+        time=events.time,
+        kind=events.kind,
+        sensor=events.sensor.astype(np.int64),
+        span=place.astype(np.int64),
+        exact=exact.astype(real),
+        sigma=sigma.astype(real),
+        variance=variance.astype(real),
+        decay=decay.astype(real),
+        share=share.astype(real),
+        number=number,
+        frame=events.reference,
+        frames=events.triads.astype(real),
+        struck_below=struck,
+        outlier_scale=scale,
     )
 
 
@@ -376,39 +373,39 @@ class _Group:
         self.width = width
         real = _real(plan)
         self.pattern = tuple(real(0.0) for _ in range(width))
-        *self.shared, self.every = self.prepared.shared
-        if every is not None:
-            self.every = every
+        self.every = plan.every if every is None else every
         steps, events, sensors = len(self.prepared.record.increments), len(self.prepared.events.time), len(plan.sensors)
         self.epochs = steps // self.every + 1
         self.places = sensors * plan.nis_bins
-        self.streams = np.empty(4 * len(self.prepared.keys) * width, np.uint64)
-        self.ahead = np.empty(len(self.prepared.keys) * montecarlo_run.AHEAD * width, np.float32)
-        self.memory = np.empty(montecarlo_run.memory(sensors) * width, real)
+        self.draws = montecarlo_run.Draws(
+            streams=np.empty(4 * len(self.prepared.keys) * width, np.uint64),
+            ahead=np.empty(len(self.prepared.keys) * montecarlo_run.AHEAD * width, np.float32),
+            memory=np.empty(montecarlo_run.memory(sensors) * width, real),
+        )
         self.kept = np.empty(self.epochs * montecarlo_run.KEPT * width)
         self.nis = np.zeros(self.places * width, real)
         # Without detail the kernel is compiled without it, and saves the divisions of the innovations.
-        self.increments = np.empty(3 * steps * width) if detail else None
-        self.values = np.empty(4 * events * width) if detail else None
-        self.innovations = np.empty(6 * events * width) if detail else None
+        self.detail = (
+            montecarlo_run.Detail(*(np.empty(size * width) for size in (3 * steps, 4 * events, 6 * events)))
+            if detail
+            else None
+        )
 
     def advance(self, first: int) -> None:
         """Run the runs from number ``first`` on."""
         self.nis[:] = 0.0
+        prepared = self.prepared
         compiled(montecarlo_run.advance)(
             self.pattern,
             np.arange(first, first + self.width, dtype=np.uint64),
-            self.prepared.keys,
-            *self.shared,
+            prepared.keys,
+            prepared.gyro,
+            prepared.start,
+            prepared.events_of_runs,
             self.every,
-            self.streams,
-            self.ahead,
-            self.memory,
-            self.kept,
-            self.nis,
-            self.increments,
-            self.values,
-            self.innovations,
+            self.draws,
+            montecarlo_run.Outputs(self.kept, self.nis),
+            self.detail,
         )
 
 
@@ -516,24 +513,22 @@ def replay(plan: Plan, run: int, *, width: int = 1) -> Replay:
     group = _Group(plan, width, every=1, detail=True)
     group.advance(number)
     prepared = group.prepared
-    assert group.increments is not None
-    assert group.values is not None
-    assert group.innovations is not None
+    assert group.detail is not None
     kept = np.ascontiguousarray(group.kept.reshape(group.epochs, montecarlo_run.KEPT, width)[:, :, 0])
     assert prepared.record.truth is not None
     truth = Truth(attitude=prepared.record.truth.attitude, bias=kept[:, 28:31])
     events = prepared.events
-    values = group.values.reshape(-1, 4, width)[:, :, 0]
+    values = group.detail.values.reshape(-1, 4, width)[:, :, 0]
     record = replace(
         prepared.record,
-        increments=np.ascontiguousarray(group.increments.reshape(-1, 3, width)[:, :, 0]),
+        increments=np.ascontiguousarray(group.detail.increments.reshape(-1, 3, width)[:, :, 0]),
         vectors=tuple(
             _measured(series, values[events.sensor == i]) for i, series in enumerate(prepared.record.vectors)
         ),
         truth=truth,
     )
     covariance = covariance_matrices(kept[:, 7:28])
-    rows = group.innovations.reshape(-1, 6, width)[:, :, 0]
+    rows = group.detail.innovations.reshape(-1, 6, width)[:, :, 0]
     estimate = Estimate(
         time=record.time,
         attitude=kept[:, :4],
