@@ -50,6 +50,7 @@ def test_sim_is_a_script_with_a_main(path):
     assert {"--out", "--seed"} <= options
 
 
+@pytest.mark.slow  # minutes for all of them: a step of .ci/run
 @pytest.mark.parametrize("path", SIMS, ids=lambda path: path.stem)
 def test_sim_runs_small(path, tmp_path):
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
