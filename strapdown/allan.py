@@ -2,17 +2,19 @@
 
 Two views of one record:
 
-- :func:`allan_deviation` is the picture: the overlapping, a robust, the modified Allan or the Hadamard deviation with χ² confidence bands.
-- :func:`fit_noise` is the estimator: quantisation Q, angle random walk N, bias instability B, rate random walk K and rate ramp R by
+- :func:`allan_deviation` is the picture: the overlapping, a robust, the modified Allan or the Hadamard deviation with χ² confidence
+bands. - :func:`fit_noise` is the estimator: quantisation Q, angle random walk N, bias instability B, rate random walk K and rate
+ramp R by
   maximum likelihood on the cosine transform of the record, with profile-likelihood intervals.
 
 Why not least squares on the Allan deviation: its values at neighbouring τ share nearly all their data, so their errors are strongly
-correlated, and at long τ, which alone tells of K and R, they are far from Gaussian. The cosine (DCT-II) coefficients of averaged-rate
-samples are independent and Gaussian instead, exactly for angle and rate random walk, which a DCT diagonalises, and nearly for flicker
-and quantisation, whose exact variances are used; the Allan variance is a smoothing of their squares and holds no more. So no
-covariance between taus has to be modelled, and the intervals are those of a likelihood.
+correlated, and at long τ, which alone contains K and R, they are far from Gaussian. The cosine (DCT-II) coefficients of averaged-
+rate samples are independent and Gaussian instead, exactly for angle and rate random walk, which a DCT diagonalises, and nearly for
+flicker and quantisation, whose exact variances are used; the Allan variance is a smoothing of their squares and holds no more. So
+no covariance between taus has to be modelled, and the intervals are those of a likelihood.
 
-The noises, with the Allan variance σ²(τ) of samples that average the rate over the sample interval (exact at every τ; bias: the floor):
+The noises, with the Allan variance σ²(τ) of samples that average the rate over the sample interval (exact at every τ; bias: the
+floor):
 
 ============  ======================  =============  ==========================================================================
 term          two-sided PSD of rate   σ²(τ)          unit
@@ -24,11 +26,11 @@ rate          K²/(2π f)²              K² τ/3         rad/s/√s
 ramp          deterministic R t       R² τ²/2        rad/s²
 ============  ======================  =============  ==========================================================================
 
-Quantisation is white only while successive angles differ by noise or motion of about half a step or more; below that its error follows
-the motion, no coefficient describes it, and ``NoiseFit.misfit_probability`` falls to nothing.
+Quantisation is white only while successive angles differ by noise or motion of about half a step or more; below that its error
+follows the motion, no coefficient describes it, and ``NoiseFit.misfit_probability`` approaches zero.
 
-Sources: IEEE Std 952-1997 annex C; NIST SP 1065 (Riley 2008); Greenhall & Riley, "Uncertainty of stability variances based on finite
-differences", PTTI 2003; Riley & Greenhall, "Power law noise identification using the lag 1 autocorrelation", EFTF 2004.
+Sources: IEEE Std 952-1997 annex C; NIST SP 1065 (Riley 2008); Greenhall & Riley, "Uncertainty of stability variances based on
+finite differences", PTTI 2003; Riley & Greenhall, "Power law noise identification using the lag 1 autocorrelation", EFTF 2004.
 """
 
 from __future__ import annotations
@@ -47,6 +49,16 @@ from strapdown import checks, units
 from strapdown.checks import Array, InputError
 from strapdown.kernels.allan import accumulate, second_difference_sizes, second_difference_squares
 from strapdown.kernels.machine import compiled, read_only
+
+__all__ = [
+    "AllanDeviation",
+    "NoiseFit",
+    "allan_deviation",
+    "expected_errors",
+    "fit_noise",
+    "model_deviation",
+    "to_gyro_parameters",
+]
 
 TERMS = ("quantization", "angle_random_walk", "bias_instability", "rate_random_walk", "rate_ramp")
 """The noise terms, in the order of every array over terms; also the names of the gyro specification."""
@@ -71,10 +83,10 @@ UNITS = {
 """Unit at the rim and its factor to SI, for each term."""
 
 SUPPORT_PROBABILITY = 1e-3
-"""A term is supported when a record without it would show its likelihood ratio by chance less often than this."""
+"""A term is supported if its likelihood ratio would occur by chance, in a record without it, with less than this probability."""
 
 MISFIT_PROBABILITY = 1e-3
-"""Below this ``NoiseFit.misfit_probability`` tells of a record that holds something else than the noises."""
+"""Value of ``NoiseFit.misfit_probability`` below which the record contains more than the noises."""
 
 ESTIMATORS = {
     "overlapping": "overlapping Allan deviation, OADEV",
@@ -104,16 +116,24 @@ class AllanDeviation:
 
     Attributes
     ----------
-    taus : (t,) s
-    deviation, lower, upper : (axes, t) rad/s
-    edf : (axes, t)
+    taus : ndarray (t,)
+        Averaging times τ, s.
+    deviation : ndarray (axes, t)
+        Deviation, rad/s.
+    lower, upper : ndarray (axes, t)
+        Confidence band, rad/s.
+    edf : ndarray (axes, t)
         Equivalent degrees of freedom of ``deviation``².
-    noise_type : (axes, t) str
+    noise_type : ndarray of str (axes, t)
         A value of :data:`NOISE_TYPES`, found from the lag-1 autocorrelation at each τ.
     level : float
         Confidence of the band, pointwise.
     estimator : str
-        One of :data:`ESTIMATORS`.
+        Key of :data:`ESTIMATORS`.
+    samples : int
+        Samples of the record.
+    sample_interval : float
+        Sample interval, s.
     """
 
     taus: Array
@@ -135,22 +155,29 @@ class NoiseFit:
     Attributes
     ----------
     terms : tuple of str
-        The terms that were fitted, a subset of :data:`TERMS`; they index the last axis below.
-    estimate : (axes, terms)
-        NaN where the term is not supported by the record.
-    lower, upper : (axes, terms)
-        Two-sided interval of confidence ``level``. Where the term is not supported ``lower`` is 0 and ``upper`` the upper end of that
-        interval (for the ramp: a bound on its size), so that the pair covers the truth at least as often as ``level`` whether or not
-        the term is supported; a bound that were laxer there would miss where the threshold of support selects the low estimates.
-    supported : (axes, terms) bool
-    covariance : (axes, terms, terms)
-        Of the estimates, from the Fisher information; NaN for unsupported terms.
-    misfit_probability : (axes,)
-        Probability that a record of the fitted noises departs as far from them, by the most telling of three tests: its spectrum, its
-        largest sample and its noise by stretches, the last two after whitening. Near zero: the record holds something else (motion, a
-        vibration line, a low-pass filter, outliers, a Gauss–Markov bias), and the intervals are not to be believed.
-    misfit : tuple of str, one an axis
-        What that test saw, and when.
+        Terms fitted, a subset of :data:`TERMS`; they index the last axis below.
+    estimate : ndarray (axes, terms)
+        Coefficients; NaN where the record does not support the term.
+    lower, upper : ndarray (axes, terms)
+        Two-sided interval of confidence ``level``. Where the term is not supported ``lower`` is 0 and ``upper`` the upper end of
+        that interval (for the ramp: a bound on its size), so that the pair covers the truth at least as often as ``level`` whether
+        or not the term is supported; a looser bound there would fail where the threshold of support selects the low estimates.
+    supported : ndarray of bool (axes, terms)
+        Whether the record supports the term.
+    covariance : ndarray (axes, terms, terms)
+        Covariance of the estimates, from the Fisher information; NaN for unsupported terms.
+    misfit_probability : ndarray (axes,)
+        Probability that a record of the fitted noises departs as far from them, by the most significant of three tests: its
+        spectrum, its largest sample and its noise by segments, the last two after whitening. Near zero the record contains
+        something else (motion, a vibration line, a low-pass filter, outliers, a Gauss–Markov bias), and the intervals do not hold.
+    misfit : tuple of str
+        What that test found and when, for each axis.
+    level : float
+        Confidence of the intervals.
+    samples : int
+        Samples of the record.
+    sample_interval : float
+        Sample interval, s.
     """
 
     terms: tuple[str, ...]
@@ -175,38 +202,48 @@ def allan_deviation(
     estimator: str = "overlapping",
     level: float = 0.95,
 ) -> AllanDeviation:
-    """Return the Allan deviation of a record with its confidence band, or the modified Allan or the Hadamard deviation.
-
-    The phase is kept as float64: the sum of the rate less its mean, carried with its rounding error, so that each value is rounded once
-    (½ unit in the last place of the largest phase) also after 1e8 samples. Memory: one float64 a sample beyond the record, an axis at a
-    time. Time: proportional to the samples for each τ.
-
-    The overlapping estimator equals ``allantools.oadev``. The robust one takes the median size of the second differences, divided by
-    what it is for a Gaussian; it stands single outliers, bursts and bias steps as long as well under half of all spans of 2τ are
-    touched, so at long τ only few of them. Not for records of a few coarse counts: their median sits on the counts.
-
-    The modified one equals ``allantools.mdev`` and the Hadamard one ``allantools.ohdev``; the model of the module's table is not theirs (of
-    angle random walk, N²/τ, the modified variance is (1 + 1/m²)/2 of it at m samples, and the Hadamard one all of it).
+    """Return the Allan, modified Allan or Hadamard deviation of a record with its confidence band.
 
     Parameters
     ----------
-    values : (n,) or (n, axes)
+    values : array_like (n,) or (n, axes)
         Averaged-rate samples, rad/s, or angle increments, rad; at most three axes.
     sample_interval : float
-        s.
-    kind : {"rate", "increments"}
+        Sample interval, s.
+    kind : {"rate", "increments"}, default "rate"
+        Kind of the values.
     taus : array_like, optional
-        Averaging times, s; each is rounded to a multiple of the sample interval, repeated ones are dropped. Default: 12 a decade, up to
-        a third of the record.
-    estimator : {"overlapping", "robust", "modified", "hadamard"}
-    level : float
-        Confidence of the band.
+        Averaging times, s, each rounded to a multiple of the sample interval; repeated ones are dropped. Default: 12 a decade, up
+        to a third of the record.
+    estimator : {"overlapping", "robust", "modified", "hadamard"}, default "overlapping"
+        Estimator, see the notes.
+    level : float, default 0.95
+        Confidence of the band, 0.5 to 1.
+
+    Returns
+    -------
+    AllanDeviation
+        The deviation of each axis.
 
     Raises
     ------
     InputError
-        On samples that are not finite, a τ outside [sample interval, half the record] (modified and Hadamard: a third), or an unknown
-        ``kind`` or ``estimator``.
+        If samples are not finite, a τ is outside [sample interval, half the record] (modified and Hadamard: a third), or ``kind``
+        or ``estimator`` is unknown.
+
+    Notes
+    -----
+    The overlapping estimator equals ``allantools.oadev``, the modified one ``allantools.mdev`` and the Hadamard one
+    ``allantools.ohdev``. The model of the module's table is that of the Allan variance only (of angle random walk, N²/τ, the
+    modified variance is (1 + 1/m²)/2 of it at m samples, and the Hadamard one all of it).
+
+    The robust estimator is the median size of the second differences over its value for a Gaussian. It withstands single outliers,
+    bursts and bias steps as long as well under half of all spans of 2τ are affected, so only few of them at long τ. It does not
+    suit records of a few coarse counts, whose median sits on the counts.
+
+    The phase is kept as float64: the sum of the rate less its mean, carried with its rounding error, so that each value is rounded
+    once (½ unit in the last place of the largest phase) also after 1e8 samples. Memory: one float64 per sample beyond the record,
+    an axis at a time. Time: proportional to the samples for each τ.
     """
     record, dt, scale = _record(values, sample_interval, kind)
     checks.one_of("estimator", estimator, ESTIMATORS)
@@ -262,7 +299,7 @@ def _order(estimator: str) -> int:
 
 
 def _third_differences(series: Array, m: int) -> float:
-    """Return the mean of (y[k + 3m] − 3 y[k + 2m] + 3 y[k + m] − y[k])² over all k, a stretch at a time."""
+    """Return the mean of (y[k + 3m] − 3 y[k + 2m] + 3 y[k + m] − y[k])² over all k, a block at a time."""
     count = len(series) - 3 * m
     total = 0.0
     for start in range(0, count, _STRETCH):
@@ -351,7 +388,7 @@ def _phase_covariance(alpha: int, k: Array, m: int) -> Array:
 def _summed_phase_covariance(alpha: int, k: Array, m: int) -> Array:
     """Return the same of the running sum of the phase: minus its second difference over one sample is that of the phase.
 
-    Exactly so, but for flicker of the rate, where the difference is taken for the derivative.
+    Exactly so, but for flicker of the rate, where the difference approximates the derivative.
     """
     t, step = np.abs(k) / m, 1.0 / m
     if alpha == 2:
@@ -415,30 +452,42 @@ def fit_noise(
     highest_frequency: float | None = None,
     level: float = 0.95,
 ) -> NoiseFit:
-    """Return the noise coefficients of a record at rest, each with its interval, or with a bound where the record does not support it.
-
-    The squared DCT-II coefficients of the record, j = 1 … n − 1 at frequency j/(2 n dt), are taken as independent χ² of one degree of
-    freedom around ``Σ θ_i V_i(j)``, θ = (Q², N², B², K²) ≥ 0, V the exact expectation for each noise on a finite record; a rate ramp is
-    a mean. Coefficients are pooled in bins of 5 % in frequency. θ maximises the likelihood restricted for the ramp (REML); intervals
-    are those where twice the log-likelihood, maximised over all other terms, falls by the χ² quantile. Terms without support stay in
-    the model at their most likely value while the others are judged, so what is not known about them widens the other intervals.
+    """Return the noise coefficients of a record at rest, each with its interval, or a bound where it is not supported.
 
     Parameters
     ----------
-    values, sample_interval, kind
-        As in :func:`allan_deviation`; at least 64 samples.
-    terms : sequence of str
-        The terms to consider, of :data:`TERMS`.
+    values : array_like (n,) or (n, axes)
+        Averaged-rate samples, rad/s, or angle increments, rad; at least 64 samples, at most three axes.
+    sample_interval : float
+        Sample interval, s.
+    kind : {"rate", "increments"}, default "rate"
+        Kind of the values.
+    terms : sequence of str, default TERMS
+        Terms to fit, of :data:`TERMS`.
     highest_frequency : float, optional
-        Hz; leave out what lies above, where a low-pass filter or a vibration shapes the spectrum. The samples are then taken to be
-        averages below it.
-    level : float
-        Confidence of the intervals.
+        Frequency, Hz, above which the spectrum is left out, where a low-pass filter or a vibration shapes it. The samples are then
+        regarded as averages below it.
+    level : float, default 0.95
+        Confidence of the intervals, 0.5 to 1.
+
+    Returns
+    -------
+    NoiseFit
+        Coefficients, SI, of each axis.
 
     Raises
     ------
     InputError
-        On samples that are not finite, a record without noise, an unknown term, or too short a record.
+        If samples are not finite, the record has no noise or is too short, or a term is unknown.
+
+    Notes
+    -----
+    The squared DCT-II coefficients of the record, j = 1 … n − 1 at frequency j/(2 n dt), are modelled as independent χ² of one
+    degree of freedom around ``Σ θ_i V_i(j)``, θ = (Q², N², B², K²) ≥ 0, V the exact expectation for each noise on a finite record;
+    a rate ramp is a mean. Coefficients are pooled in bins of 5 % in frequency. θ maximises the likelihood restricted for the ramp
+    (REML); intervals are those where twice the log-likelihood, maximised over all other terms, falls by the χ² quantile. Terms
+    without support stay in the model at their most likely value while the others are judged, so that their uncertainty widens the
+    other intervals.
     """
     record, dt, scale = _record(values, sample_interval, kind)
     level = _level(level)
@@ -448,7 +497,7 @@ def fit_noise(
         raise InputError("terms names no random noise; add one of quantization, angle_random_walk, …")
     samples = record.shape[0]
     if samples < 64:
-        raise InputError(f"values has {samples} samples; at least 64 are needed to tell noises apart")
+        raise InputError(f"values has {samples} samples; at least 64 are needed to separate the noises")
     last = samples - 1
     if highest_frequency is not None:
         last = min(last, int(2.0 * samples * dt * checks.positive("highest_frequency", highest_frequency, unit="Hz")))
@@ -478,24 +527,31 @@ def fit_noise(
 
 
 def expected_errors(parameters: Mapping[str, float], samples: int, sample_interval: float) -> dict[str, float]:
-    """Return the standard error that a fit of all terms has of each given one: how long a record shows them.
-
-    The Cramér–Rao bound of the cosine coefficients, which the fit attains where an error is well below the coefficient itself; where it
-    is not, the record does not support the term.
+    """Return the standard errors that a fit of all terms would have: how long a record must be.
 
     Parameters
     ----------
-    parameters : mapping
-        SI coefficients by name, of :data:`TERMS`; absent or zero: not there, but looked for.
+    parameters : mapping of str to float
+        Coefficients, SI, by name in :data:`TERMS`; absent or zero ones are fitted too.
     samples : int
-        At least 64.
+        Samples of the record, at least 64.
     sample_interval : float
-        s.
+        Sample interval, s.
 
     Returns
     -------
-    dict
+    dict of str to float
         Standard error, SI, of each term that is not zero.
+
+    Raises
+    ------
+    InputError
+        If no random noise is given or a name is unknown.
+
+    Notes
+    -----
+    The Cramér–Rao bound of the cosine coefficients, which the fit attains where an error is well below the coefficient itself;
+    elsewhere the record does not support the term.
     """
     checks.known_keys("parameters", parameters, TERMS)
     dt = checks.positive("sample_interval", sample_interval, unit="s")
@@ -551,12 +607,26 @@ def flicker_variance(multiples: ArrayLike) -> Array:
 
 
 def model_deviation(parameters: Mapping[str, float], taus: ArrayLike, sample_interval: float) -> dict[str, Array]:
-    """Return the Allan deviation of each term and their ``"total"``, rad/s, at the given taus (t,), s.
+    """Return the Allan deviation of each noise term and of their sum.
 
     Parameters
     ----------
-    parameters : mapping
-        SI coefficients by name, of :data:`TERMS`; absent ones are zero.
+    parameters : mapping of str to float
+        Coefficients, SI, by name in :data:`TERMS`; absent ones are zero.
+    taus : array_like (t,)
+        Averaging times, s.
+    sample_interval : float
+        Sample interval, s.
+
+    Returns
+    -------
+    dict of str to ndarray (t,)
+        Allan deviations, rad/s, by term, and ``"total"``.
+
+    Examples
+    --------
+    >>> model_deviation({"angle_random_walk": 3e-5}, [1.0, 9.0], 0.01)["total"].round(9).tolist()
+    [3e-05, 1e-05]
     """
     checks.known_keys("parameters", parameters, TERMS)
     tau = checks.array("taus", taus, ("t",))
@@ -574,7 +644,7 @@ def model_deviation(parameters: Mapping[str, float], taus: ArrayLike, sample_int
 
 
 def curves_by_axis(fit: NoiseFit, deviation: AllanDeviation) -> list[dict[str, Array]]:
-    """Return, for each axis, the deviation (rad/s) of each fitted term and their total at the taus of ``deviation``, to be drawn."""
+    """Return, for each axis, the curves of each fitted term and their total at the taus of ``deviation``, rad/s, for plotting."""
     filled = np.where(fit.supported, fit.estimate, 0.0)
     return [
         model_deviation(dict(zip(fit.terms, map(float, row), strict=True)), deviation.taus, fit.sample_interval)
@@ -583,17 +653,26 @@ def curves_by_axis(fit: NoiseFit, deviation: AllanDeviation) -> list[dict[str, A
 
 
 def to_gyro_parameters(fit: NoiseFit) -> dict[str, float | tuple[float, ...]]:
-    """Return the coefficients by the names of the gyro specification, SI; one number, or one an axis.
+    """Return the coefficients by the names of the gyro specification.
 
-    A term that no axis supports is left out, one that some axes support is 0 on the others.
+    Parameters
+    ----------
+    fit : NoiseFit
+        Coefficients of one sensor.
+
+    Returns
+    -------
+    dict of str to float or tuple of float
+        Coefficients, SI, one number or one per axis. A term that no axis supports is left out; one that some axes support is 0 on
+        the others.
     """
     return _by_name(fit, np.where(fit.supported, fit.estimate, 0.0), np.asarray(fit.supported.any(axis=0)))
 
 
 def upper_bounds(fit: NoiseFit) -> dict[str, float | tuple[float, ...]]:
-    """Return the upper ends of the intervals of the terms that some axis does not support, by name, SI; one number, or one an axis.
+    """Return the upper ends of the intervals of the terms that some axis does not support, by name, SI; one number or one per axis.
 
-    What the record cannot rule out; a filter that must not be too sure may take these for the coefficients.
+    The record cannot exclude coefficients up to these; a filter that must not be overconfident may use them.
     """
     return _by_name(fit, fit.upper, np.asarray(~fit.supported.all(axis=0)))
 
@@ -607,7 +686,7 @@ def _by_name(fit: NoiseFit, values: Array, wanted: NDArray[np.bool_]) -> dict[st
 
 
 def table(fit: NoiseFit) -> list[dict[str, object]]:
-    """Return one row an axis and term for printing, in the units of :data:`UNITS`: estimate, lower and upper (NaN: no such value)."""
+    """Return one row per axis and term for printing, in the units of :data:`UNITS`: estimate, lower and upper (NaN: no such value)."""
     rows: list[dict[str, object]] = []
     for axis, i in np.ndindex(*fit.estimate.shape):
         term = fit.terms[i]
@@ -992,10 +1071,10 @@ def _misfit(
     last: int,
     dt: float,
 ) -> tuple[float, str]:
-    """Return the probability of so large a departure from the fit, and what it is; overwrites ``coefficient``.
+    """Return the probability of a departure from the fit this large, and its description; overwrites ``coefficient``.
 
     Divided by their fitted sizes and transformed back, the coefficients are a white series of unit variance. A turn or a step of the
-    bias, whose spectrum may pass for a random walk's, stands out in it. Three tests are made, so the least probability is taken thrice.
+    bias, whose spectrum may pass for a random walk's, stands out in it. Of three tests the smallest probability is multiplied by three.
     """
     samples = len(coefficient)
     for s in _slices(starts, last):
@@ -1028,7 +1107,7 @@ def _misfit(
         ),
         (_spectrum_probability(bins, best), "its spectrum has another shape"),
     )
-    probability, what = min(found, key=lambda test: test[0])  # of several at 0 the one that tells a time
+    probability, what = min(found, key=lambda test: test[0])  # of several at 0 the one with a time
     return min(1.0, len(found) * probability), what
 
 

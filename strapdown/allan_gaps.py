@@ -1,16 +1,16 @@
 """Allan deviation and noise coefficients of a record with gaps: samples on an even grid, missing ones NaN.
 
-Gaps must not depend on what the sensor would have said there: a lost packet does not, a sensor that is cut off at its range does.
+Gaps must not depend on the values lost: those of a lost packet do not, those of a sensor that saturates do.
 
 - :func:`allan_deviation` is the wavelet-variance estimator for gappy series of Mondal & Percival ("Wavelet variance analysis for gappy time
   series", Ann. Inst. Stat. Math. 62, 2010) for the Haar wavelet, whose variance the Allan variance is. With the semivariogram of all pairs
   of samples that are there, ``V_k = ½⟨(x_{t+k} − x_t)²⟩``, it is ``σ²(m) = −Σ_{k=1}^{2m−1} r_k V_k / m²``, r being the autocorrelation of m
   times −1 and m times +1. It is unbiased for every noise of the table in :mod:`strapdown.allan`, whatever the gaps, and no sum of squares:
   where few pairs are left it may come out below zero (6 % of records of white noise at a tenth of the record, a fifth of it lost); the
-  deviation is NaN there and its band everything. The band comes from simulated records of the same gaps and the power law at hand.
-- :func:`fit_noise` takes the cosine transforms of the stretches between gaps, of one set of coefficients: the likelihood of all that
-  samples within a stretch tell of each other. What the means of different stretches tell is not used, so that many short stretches say
-  little of a random walk. Without a gap it is :func:`strapdown.allan.fit_noise`.
+  deviation is NaN there and its band unbounded. The band comes from simulated records of the same gaps and the power law at hand.
+- :func:`fit_noise` fits one set of coefficients to the cosine transforms of the segments between gaps: the likelihood within each
+  segment. The differences between the means of segments are not used, so that many short segments contain little information on a
+  random walk. Without a gap it is :func:`strapdown.allan.fit_noise`.
 """
 
 from __future__ import annotations
@@ -25,8 +25,13 @@ from strapdown import allan, checks
 from strapdown.allan import NOISE_TYPES, TERMS, AllanDeviation, NoiseFit
 from strapdown.checks import Array, InputError
 
+__all__ = [
+    "allan_deviation",
+    "fit_noise",
+]
+
 SHORTEST = 64
-"""Samples of the shortest stretch that a fit uses."""
+"""Samples of the shortest segment that a fit uses."""
 SIMULATED = 1 << 12
 """Largest number of samples of a simulated record; several samples of a longer record are one there."""
 RUNS = 400
@@ -40,21 +45,26 @@ def allan_deviation(
 
     Parameters
     ----------
-    values : (n,) or (n, axes)
+    values : array_like (n,) or (n, axes)
         Averaged samples on an even grid, SI; a row with a NaN is missing.
     sample_interval : float
-        s.
+        Sample interval, s.
     taus : array_like, optional
         Averaging times, s. Default: 12 a decade, up to a tenth of the record.
-    level : float
-        Confidence of the band.
-    seed : int
-        Of the simulated records that the band comes from.
+    level : float, default 0.95
+        Confidence of the band, 0.5 to 1.
+    seed : int, default 0
+        Seed of the simulated records that the band comes from.
 
     Returns
     -------
     AllanDeviation
-        With the estimator ``"gaps"``; NaN where too few pairs of samples are that far apart.
+        The deviation with the estimator ``"gaps"``; NaN where too few pairs of samples are that far apart.
+
+    Raises
+    ------
+    InputError
+        If too few samples are present, or a τ is outside [sample interval, half the record].
     """
     dt = checks.positive("sample_interval", sample_interval, unit="s")
     if not 0.5 < level < 1.0:
@@ -95,7 +105,7 @@ def _record(values: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
     record = record[:, None] if record.ndim == 1 else record
     known = np.asarray(~np.isnan(record).any(axis=1))
     if known.sum() < 3:
-        raise InputError(f"values has {int(known.sum())} samples that are there; an Allan deviation needs at least 3")
+        raise InputError(f"values has {int(known.sum())} samples that are present; an Allan deviation needs at least 3")
     return np.where(known[:, None], record, 0.0), known
 
 
@@ -161,8 +171,8 @@ def _spread(
 ) -> tuple[Array, Array, Array]:
     """Return how the estimator spreads over simulated records with the same gaps: degrees of freedom, low and high quantile over its mean.
 
-    Below one sample of the simulation, of records longer than :data:`SIMULATED`, a χ² stands for it, of as many more degrees of freedom as
-    averages fit in.
+    Below one sample of the simulation, of records longer than :data:`SIMULATED`, a χ² replaces it, with as many
+    more degrees of freedom as averages fit in.
     """
     from scipy.stats import chi2
 
@@ -213,7 +223,7 @@ def _noise(alpha: int, samples: int, random: np.random.Generator) -> Array:
 
 
 class _Stretch(NamedTuple):
-    """One stretch between gaps: its cosine coefficients, and their bins."""
+    """One segment between gaps: its cosine coefficients, and their bins."""
 
     coefficient: Array
     starts: NDArray[np.int64]
@@ -222,7 +232,7 @@ class _Stretch(NamedTuple):
 
 
 def stretches(known: NDArray[np.bool_], shortest: int = SHORTEST) -> list[slice]:
-    """Return the stretches of samples that are there, those of fewer than ``shortest`` left out."""
+    """Return the segments of samples between gaps, without those of fewer than ``shortest``."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(np.int8)))
     return [slice(int(a), int(b)) for a, b in edges.reshape(-1, 2) if b - a >= shortest]
 
@@ -235,24 +245,31 @@ def fit_noise(
     highest_frequency: float | None = None,
     level: float = 0.95,
 ) -> NoiseFit:
-    """Return the noise coefficients of a record with gaps, with intervals, from its stretches of at least :data:`SHORTEST` samples.
+    """Return the noise coefficients of a record with gaps, with intervals.
 
     Parameters
     ----------
-    values : (n,) or (n, axes)
+    values : array_like (n,) or (n, axes)
         Averaged samples on an even grid, SI; a row with a NaN is missing.
-    sample_interval, terms, highest_frequency, level
-        As in :func:`strapdown.allan.fit_noise`.
+    sample_interval : float
+        Sample interval, s.
+    terms : sequence of str, default TERMS
+        Terms to fit, of :data:`strapdown.allan.TERMS`.
+    highest_frequency : float, optional
+        Frequency, Hz, above which the spectrum is left out.
+    level : float, default 0.95
+        Confidence of the intervals, 0.5 to 1.
 
     Returns
     -------
     NoiseFit
-        ``samples`` counts those that were used. ``misfit_probability`` is that of the worst stretch, times their number.
+        Coefficients from the segments of at least :data:`SHORTEST` samples, which ``samples`` counts. ``misfit_probability`` is
+        that of the worst segment, times their number.
 
     Raises
     ------
     InputError
-        If no stretch is long enough, or as :func:`strapdown.allan.fit_noise`.
+        If no segment is long enough, or as :func:`strapdown.allan.fit_noise`.
     """
     dt = checks.positive("sample_interval", sample_interval, unit="s")
     record, known = _record(values)
@@ -279,7 +296,7 @@ def fit_noise(
             best = fit.best._replace(variance=fit.best.theta @ bins.basis)
             probability, what = allan._misfit(part.coefficient, bins, best, random_terms, part.starts, part.last, dt)
             found.append(
-                (probability, what if len(places) == 1 else f"in the stretch from {place.start * dt:.6g} s {what}")
+                (probability, what if len(places) == 1 else f"in the segment from {place.start * dt:.6g} s {what}")
             )
         least = min(found, key=lambda one: one[0])
         misfits.append((min(1.0, len(found) * least[0]), least[1]))
@@ -294,7 +311,7 @@ def _stretch(x: Array, dt: float, random_terms: tuple[str, ...], highest_frequen
         last = min(last, int(2.0 * samples * dt * checks.positive("highest_frequency", highest_frequency, unit="Hz")))
         if last < 1:
             raise InputError(
-                f"highest_frequency is {highest_frequency:g} Hz: a stretch of {samples} samples has nothing below; raise it"
+                f"highest_frequency is {highest_frequency:g} Hz: a segment of {samples} samples has nothing below; raise it"
             )
     starts = allan._bin_starts(last)
     basis = np.stack([allan._basis(term, samples, dt, starts, last) for term in random_terms])
@@ -302,7 +319,7 @@ def _stretch(x: Array, dt: float, random_terms: tuple[str, ...], highest_frequen
 
 
 def _bins(parts: Sequence[_Stretch], dt: float) -> tuple[list[allan._Bins], allan._Bins]:
-    """Return the sums over bins of each stretch and of all, the lowest frequencies first; one ramp goes through all of them."""
+    """Return the sums over bins of each segment and of all, the lowest frequencies first; one ramp goes through all of them."""
     ramps = [dt * allan._ramp_coefficients(len(p.coefficient), np.arange(1, p.last + 1)) for p in parts]
     slope = float(
         sum(r @ p.coefficient[1 : p.last + 1] for r, p in zip(ramps, parts, strict=True)) / sum(r @ r for r in ramps)

@@ -1,11 +1,12 @@
-"""A sensor's bias over temperature, from a record at rest whose temperature was recorded: polynomial with intervals, and what is left.
+"""A sensor's bias over temperature, from a record at rest with its temperature: a polynomial with intervals, and the remainder.
 
-``x = c_0 + c_1 (T − T_0) + c_2 (T − T_0)² + … + noise``. The noise is anything but white (a bias that wanders looks like one that follows
-the temperature), so plain least squares would be far too sure. The cosine transform of the record has independent coefficients, whose
-variances the noise's terms give (:mod:`strapdown.allan`): the regression is weighted by these, generalised least squares, and repeated
-with the noise of what is left until it stands still. A rate ramp is not fitted beside it, for a sensor that warms up has one.
+``x = c_0 + c_1 (T − T_0) + c_2 (T − T_0)² + … + noise``. The noise is far from white (a wandering bias looks like one that follows
+the temperature), so plain least squares would be overconfident. The cosine transform of the record has independent coefficients,
+whose variances the noise terms give (:mod:`strapdown.allan`): the regression is weighted by these, generalised least squares, and
+iterated with the noise of the remainder until it converges. A rate ramp is not fitted beside it, for a sensor that warms up has
+one.
 
-``c_0``, the bias at ``T_0``, is the mean that is left; a wandering bias gives it no interval. Gaps must not be in the record.
+``c_0``, the bias at ``T_0``, is the mean of the remainder; a wandering bias gives it no interval. The record must have no gaps.
 
 Source: IEEE Std 952-1997, 12.11 (temperature sensitivity); the weights: as in :mod:`strapdown.allan`.
 """
@@ -20,35 +21,65 @@ from numpy.typing import ArrayLike
 from strapdown import allan, checks
 from strapdown.checks import Array, InputError
 
+__all__ = [
+    "TemperatureFit",
+    "fit_temperature",
+]
+
 MOST_PASSES = 50
-"""Most regressions, each with the noise of what the one before left."""
+"""Most iterations of the regression, each with the noise of the last residuals."""
 SETTLED = 1e-3
-"""Largest change of a coefficient, in σ, and relative change of the noise's spectrum, that end them."""
+"""Convergence: largest change of a coefficient, in σ, and relative change of the noise's spectrum."""
 SMALLEST_SPAN = 0.5
 """Range of temperature, K, below which no regression is made."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TemperatureFit:
-    """A sensor's bias over temperature."""
+    """A sensor's bias over temperature.
+
+    Parameters
+    ----------
+    reference : float
+        T_0, °C: the mean temperature of the record.
+    span : (float, float)
+        Lowest and highest temperature of the record, °C; the polynomial holds between them only.
+    coefficients : ndarray (axes, order + 1)
+        c of ``bias = Σ c_k (T − T_0)^k``, SI per K to the power k.
+    sigma : ndarray (axes, order + 1)
+        Standard deviations; NaN of c_0.
+    lower : ndarray (axes, order + 1)
+        Lower ends of the intervals.
+    upper : ndarray (axes, order + 1)
+        Upper ends of the intervals.
+    level : float
+        Confidence of the intervals.
+    left : ndarray (n, axes)
+        The record without its dependence on temperature, the mean kept.
+    """
 
     reference: float
-    """T_0, °C: the mean temperature of the record."""
     span: tuple[float, float]
-    """Lowest and highest temperature, °C: outside the polynomial says nothing."""
     coefficients: Array
-    """(axes, order + 1), SI per K to the power."""
     sigma: Array
-    """Standard deviations (axes, order + 1); NaN of c_0."""
     lower: Array
-    """Ends of the intervals, of the same shape."""
     upper: Array
     level: float
     left: Array
-    """The record (n, axes) without its dependence on temperature, the mean kept."""
 
     def bias(self, temperature: ArrayLike) -> Array:
-        """Return the bias (..., axes) at temperatures, °C, SI."""
+        """Return the bias at given temperatures.
+
+        Parameters
+        ----------
+        temperature : array_like (...)
+            Temperatures, °C.
+
+        Returns
+        -------
+        ndarray (..., axes)
+            Bias, SI.
+        """
         T = checks.array("temperature", temperature, (...,)) - self.reference
         powers = T[..., None] ** np.arange(self.coefficients.shape[1])
         return np.asarray(powers @ self.coefficients.T)
@@ -61,21 +92,26 @@ def fit_temperature(
 
     Parameters
     ----------
-    values : (n,) or (n, axes)
+    values : array_like (n,) or (n, axes)
         Averaged samples at rest, SI.
-    temperature : (n,)
-        °C.
+    temperature : array_like (n,)
+        Temperature of the sensor, °C.
     sample_interval : float
-        s.
-    order : int
+        Sample interval, s.
+    order : int, default 1
         Highest power of the temperature.
-    level : float
-        Confidence of the intervals.
+    level : float, default 0.95
+        Confidence of the intervals, 0.5 to 1.
+
+    Returns
+    -------
+    TemperatureFit
+        Coefficients with intervals, and the record without the dependence.
 
     Raises
     ------
     InputError
-        If the temperature spans too little, or samples are missing.
+        If the temperature spans less than 0.5 K, or samples are missing.
     """
     x = checks.array("values", values, ("n",) if np.ndim(values) == 1 else ("n", "axes"))
     x = x[:, None] if x.ndim == 1 else x

@@ -17,6 +17,14 @@ import numpy as np
 from strapdown.checks import Array, InputError, known_keys, one_of
 from strapdown.gyro import GyroSpec
 
+__all__ = [
+    "PRESETS",
+    "Preset",
+    "from_datasheet",
+    "preset",
+]
+
+
 _QUANTITIES = {
     "arw": ("angle_random_walk", "rad / second ** 0.5", "deg/sqrt(h) or deg/s/sqrt(Hz)"),
     "bias_instability": ("bias_instability", "rad / second", "deg/h"),
@@ -35,7 +43,7 @@ _QUANTITIES = {
     "bandwidth": ("bandwidth", "1 / second", "Hz"),
     "range": ("range", "rad / second", "deg/s"),
 }
-"""Word of the sheet: field of the specification, unit it is wanted in, and an example of how to write it."""
+"""Name in the sheet: field of the specification, its unit, and an example."""
 
 
 @functools.cache
@@ -46,14 +54,14 @@ def _registry() -> Any:
 
 
 def parse(name: str, text: str, wanted: str, example: str = "") -> float:
-    """Return a quantity written as text in the unit ``wanted``.
+    """Return a quantity given as text, in the unit ``wanted``.
 
     Understands pint's syntax, ``sqrt(…)``, √ and °; ``h`` is the hour, ``g`` standard gravity and ``Hz`` 1/s.
 
     Raises
     ------
     InputError
-        If the text is no quantity, or of another dimension; names both.
+        If the text is not a quantity, or has another dimension; the message names both.
     """
     registry = _registry()
     if not isinstance(text, str):
@@ -72,7 +80,7 @@ def parse(name: str, text: str, wanted: str, example: str = "") -> float:
         units = quantity.to_root_units().units
     except Exception as error:  # pint raises whatever Python raises on a text that is no expression
         raise InputError(
-            f"{name} is {text!r}, which is no quantity with a unit ({error}); write for example {example or wanted!r}"
+            f"{name} is {text!r}, which is not a quantity with a unit ({error}); write for example {example or wanted!r}"
         ) from None
     needed = registry.Quantity(1.0, wanted).to_root_units().units
     # The radian has no dimension, so a forgotten "deg" would pass for radians: compare the units, not the dimensions alone.
@@ -88,16 +96,31 @@ def from_datasheet(**quantities: str) -> GyroSpec:
     Parameters
     ----------
     **quantities : str
-        ``arw`` (or noise density), ``bias_instability`` (the minimum of the Allan deviation as sheets give it: B is that over 0.664, see
-        below), ``rrw``, ``rate_ramp``, ``quantization`` (Q) or ``angle_resolution`` (step, Q√12), ``rate_resolution``, ``turn_on_bias``
-        (1 σ), ``markov_noise``, ``markov_correlation_time``, ``scale_factor`` and ``asymmetry`` (taken for all axes), ``misalignment`` (for
-        all entries), ``g_sensitivity`` (along each axis), ``bandwidth``, ``range``.
+        ``arw`` (or noise density), ``bias_instability`` (B as below), ``rrw``, ``rate_ramp``, ``quantization`` (Q) or
+        ``angle_resolution`` (step, Q√12), ``rate_resolution``, ``turn_on_bias`` (1 σ), ``markov_noise``,
+        ``markov_correlation_time``, ``scale_factor`` and ``asymmetry`` (for all axes), ``misalignment`` (for all entries),
+        ``g_sensitivity`` (along each axis), ``bandwidth``, ``range``.
+
+    Returns
+    -------
+    GyroSpec
+        The specification, SI.
+
+    Raises
+    ------
+    InputError
+        If a quantity is unknown, is not text with a unit, or has another dimension.
 
     Notes
     -----
     IEEE Std 952 defines B by the PSD B²/(2π f), whose Allan deviation is flat at √(2 ln 2/π) B = 0.664 B. Most sheets print the
-    coefficient under the name "bias instability" or the minimum itself under "in-run bias stability", and few say which. The figure is
-    taken for B as it stands.
+    coefficient under the name "bias instability" or the minimum itself under "in-run bias stability", and few say which. The figure
+    is used as B.
+
+    Examples
+    --------
+    >>> from_datasheet(arw="60 deg/sqrt(h)").angle_random_walk == from_datasheet(arw="1 deg/s/sqrt(Hz)").angle_random_walk
+    True
     """
     known_keys("from_datasheet", quantities, _QUANTITIES)
     if "quantization" in quantities and "angle_resolution" in quantities:
@@ -131,21 +154,36 @@ def express(name: str, value: float, unit: str) -> float:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Preset:
-    """A gyro on the market, by its public data sheet."""
+    """A gyro on the market, by its public data sheet.
+
+    Parameters
+    ----------
+    name : str
+        Key in :data:`PRESETS`.
+    title : str
+        Maker, type and range.
+    grade : str
+        Kind of gyro, such as "consumer MEMS".
+    document : str
+        Data sheet of the stated figures.
+    checked : str
+        How the stated figures were checked against that sheet.
+    rate : float
+        A sample rate at which it is commonly run, Hz.
+    stated : mapping of str to str
+        Figures of the sheet, in its own units.
+    assumed : mapping of str to str
+        Figures that the sheet does not give in this form, assumed of the size usual for the grade.
+    """
 
     name: str
     title: str
     grade: str
     document: str
-    """The sheet that the stated figures are from."""
     checked: str
-    """How the stated figures were held against that sheet."""
     rate: float
-    """A sample rate at which it is commonly run, Hz."""
     stated: Mapping[str, str]
-    """Figures of the sheet, in its own units."""
     assumed: Mapping[str, str]
-    """Figures that the sheet does not give, or not in this form: assumed, of the size usual for the grade."""
 
     @property
     def spec(self) -> GyroSpec:
@@ -295,5 +333,26 @@ leaves the rate random walk out, as nearly all do, the figure is under ``assumed
 
 
 def preset(name: str) -> Preset:
-    """Return a preset by name; an unknown name is refused with the nearest known one."""
+    """Return a preset by name.
+
+    Parameters
+    ----------
+    name : str
+        Key of :data:`PRESETS`.
+
+    Returns
+    -------
+    Preset
+        The preset.
+
+    Raises
+    ------
+    InputError
+        If the name is unknown; the message names the nearest known one.
+
+    Examples
+    --------
+    >>> preset("stim300").grade
+    'tactical MEMS'
+    """
     return PRESETS[one_of("preset", name, PRESETS)]

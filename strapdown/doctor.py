@@ -1,17 +1,17 @@
-"""The convention doctor: which discrete mistake explains a recording? Conjugated quaternions, swapped axes, wrong frames and units.
+"""Check of conventions: which discrete mistake explains a recording? Conjugated quaternions, swapped axes, wrong frames and units.
 
-A recording that follows the conventions of :mod:`strapdown` obeys a few plain relations, whatever the motion:
+A recording that follows the conventions of :mod:`strapdown` satisfies a few plain relations, whatever the motion:
 
-- the turn that the gyro tells over a short window is that of the reference attitude, log(q₁⁻¹ ⊗ q₂);
-- the specific force, turned into the fixed frame by the reference, is gravity's reaction on average over some seconds, for no body
+- the rotation measured by the gyro over a short window is that of the reference attitude, log(q₁⁻¹ ⊗ q₂);
+- the specific force, rotated to the fixed frame by the reference, is gravity's reaction on average over some seconds, for no body
   accelerates one way for long; the magnetic field points North and up or down;
-- without a reference: turned by the integrated gyro, both stay where they are over some seconds, and so keep their strength in the mean;
+- without a reference: rotated by the integrated gyro, both stay constant over some seconds, and so keep their strength in the mean;
   and the angle between both means is always the same.
 
-Each hypothesis (how the quaternions are meant, which frame, which of the 48 ways to swap and invert a sensor's axes, which unit) is put in,
-and its misfit m of each relation taken: 0 of a perfect fit, 1 of things unrelated, 2 of opposite ones. The score is a log-likelihood,
-``−½ 3K ln(m + m₀)`` summed over the relations, K = 20, m₀ what a good recording leaves, less 5 for each change against what the recording
-says of itself: of two explanations that fit alike the simpler one is named.
+Each hypothesis (order and direction of the quaternions, fixed frame, which of the 48 permutations and inversions of a sensor's
+axes, which unit) is applied, and its misfit m of each relation computed: 0 of a perfect fit, 1 of unrelated data, 2 of opposite
+data. The score is a log-likelihood, ``−½ 3K ln(m + m₀)`` summed over the relations, K = 20, m₀ the misfit of a good recording, less
+5 for each change from what the recording declares: of two explanations that fit alike the simpler one is named.
 """
 
 from __future__ import annotations
@@ -30,6 +30,12 @@ from strapdown.checks import Array, InputError
 from strapdown.recordings import Recording, increments
 from strapdown.units import DEGREE, STANDARD_GRAVITY
 
+__all__ = [
+    "Candidate",
+    "Examination",
+    "examine",
+]
+
 AXES: tuple[Array, ...] = tuple(
     np.array([[s if column == where else 0.0 for column in range(3)] for where, s in zip(order, signs, strict=True)])
     for order in itertools.permutations(range(3))
@@ -43,7 +49,7 @@ ATTITUDE_READINGS: dict[str, Callable[[Array], Array]] = {
     "scalar-last": lambda q: np.roll(q, 1, axis=-1),
     "scalar-last and conjugated": lambda q: quaternion.conjugate(np.roll(q, 1, axis=-1)),
 }
-"""How quaternions told otherwise become body to fixed, scalar first."""
+"""Conversions of quaternions in other conventions to body to fixed, scalar first."""
 
 FRAMES: dict[str, Array] = {
     "East-North-Up": np.eye(3),
@@ -67,23 +73,23 @@ PENALTY = 5.0
 FLOORS = {"reference": 0.003, "vectors": 0.04}
 """m₀ of relations to a reference, and of those between sensors alone, which accelerations and the gyro's bias disturb."""
 WINDOWS = 50
-"""Windows that are looked at."""
+"""Windows evaluated."""
 INDEPENDENT = 20
-"""Windows that count: their disturbances are not independent."""
+"""Effective number of windows: their disturbances are not independent."""
 MARGIN = 5.0
-"""What one explanation must score above another to be told from it."""
+"""Difference in score that separates one explanation from another."""
 MOST_EQUAL = 8
-"""So many other explanations that fit as well are symmetries of the relations; more say that the recording is too poor."""
+"""Largest number of equally good explanations that can be symmetries of the relations; with more the recording is too poor."""
 POOR = 0.4
-"""Misfit of the gyro above which even the best explanation is none."""
+"""Misfit of the gyro above which even the best explanation is rejected."""
 LEAST_TURN = 0.5
-"""Turn, rad, summed over the windows used, below which nothing can be told."""
+"""Rotation, rad, summed over the windows used, below which nothing can be decided."""
 FASTEST = 4000.0 * DEGREE
-"""Rate, rad/s, that hardly any gyro's range reaches."""
+"""Rate, rad/s, beyond the range of nearly all gyros."""
 
 
 def axes_words(matrix: Array) -> str:
-    """Return what a signed permutation makes of x, y, z, as "x, −z, y"."""
+    """Return a signed permutation as the axes that it makes of x, y, z, such as "x, −z, y"."""
     names = []
     for row in matrix:
         k = int(np.argmax(np.abs(row)))
@@ -93,42 +99,68 @@ def axes_words(matrix: Array) -> str:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Candidate:
-    """One explanation of a recording."""
+    """One explanation of a recording.
+
+    Parameters
+    ----------
+    changes : tuple of str
+        Departures from what the recording declares; empty: none.
+    score : float
+        Log-likelihood less the penalty for changes.
+    misfit : mapping of str to float
+        Misfit of each relation: 0 perfect, 1 unrelated, 2 opposite.
+    """
 
     changes: tuple[str, ...]
-    """What is otherwise than the recording says; none: all as it says."""
     score: float
-    """Log-likelihood less the penalty."""
     misfit: Mapping[str, float]
-    """Of each relation: 0 perfect, 1 unrelated, 2 opposite."""
 
     @property
     def words(self) -> str:
         """The changes in one line."""
-        return "; ".join(self.changes) or "all as it says of itself"
+        return "; ".join(self.changes) or "no change"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Examination:
-    """What the doctor found."""
+    """Result of the check of conventions.
+
+    Parameters
+    ----------
+    source : str
+        Name of the recording.
+    verdict : {"as told", "wrong convention", "cannot tell"}
+        Verdict.
+    reason : str
+        Why, in one sentence.
+    candidates : tuple of Candidate
+        The best explanations, by score.
+    notes : tuple of str, default empty
+        What this recording cannot show.
+    doubts : tuple of str, default empty
+        Implausible values, whatever the convention.
+    """
 
     source: str
     verdict: Literal["as told", "wrong convention", "cannot tell"]
     reason: str
     candidates: tuple[Candidate, ...]
-    """The best explanations, by score."""
     notes: tuple[str, ...] = field(default=())
-    """What this recording cannot show."""
     doubts: tuple[str, ...] = field(default=())
-    """What of its values can hardly be, whatever the convention."""
 
     @property
     def words(self) -> str:
-        """The verdict for people."""
+        """Verdict and reason in one line."""
         return f"{self.verdict}: {self.reason}"
 
     def summary(self) -> dict[str, Any]:
-        """Return everything as plain values for JSON."""
+        """Return everything as plain values for JSON.
+
+        Returns
+        -------
+        dict
+            Fields of the examination.
+        """
         return {
             "source": self.source,
             "verdict": self.verdict,
@@ -143,9 +175,17 @@ class Examination:
 
 
 def examine(recording: Recording) -> Examination:
-    """Return which conventions a recording follows, by trying the others.
+    """Return which conventions a recording follows, by comparison with the alternatives.
 
-    Needs a reference attitude, or an accelerometer, or a magnetometer; what it can tell grows with each.
+    Parameters
+    ----------
+    recording : Recording
+        Recording with a reference attitude, an accelerometer or a magnetometer; each of them adds to what can be found.
+
+    Returns
+    -------
+    Examination
+        Verdict, reason and the best explanations.
 
     Raises
     ------
@@ -154,7 +194,7 @@ def examine(recording: Recording) -> Examination:
     """
     if all(value is None for value in (recording.true_attitude, recording.specific_force, recording.magnetic_field)):
         raise InputError(
-            f"{recording.source} holds a gyro alone; a reference attitude, an accelerometer or a magnetometer is needed beside it"
+            f"{recording.source} holds a gyro alone; a reference attitude, an accelerometer or a magnetometer is needed too"
         )
     unit_changes, doubts = _force_unit(recording)
     doubts += _too_fast(recording)
@@ -198,7 +238,7 @@ def _concluded(source: str, told: list[Candidate], sure: tuple[str, ...], notes:
         reason = f"{len(equal)} other explanations fit as well as “{named.words}”: the recording turns too little, or about one axis only"
     elif named is plain:
         verdict = "wrong convention" if sure else "as told"
-        reason = "; ".join(sure) if sure else "no change explains the recording better than its own word"
+        reason = "; ".join(sure) if sure else "no change explains the recording better than its declared conventions"
     else:
         verdict, reason = "wrong convention", named.words
     if equal and verdict != "cannot tell":
@@ -211,7 +251,7 @@ def _force_unit(recording: Recording) -> tuple[tuple[str, ...], list[str]]:
         return (), []
     strength = float(np.nanmedian(np.linalg.norm(recording.specific_force, axis=1)))
     if not strength > 0.0:
-        return (), ["the accelerometer tells nothing but zeros"]
+        return (), ["the accelerometer reads zero throughout"]
     distances = {words: abs(math.log(strength * factor / STANDARD_GRAVITY)) for words, factor in FORCE_UNITS.items()}
     words = min(distances, key=lambda name: distances[name])
     if distances[words] > 0.5:
@@ -225,7 +265,7 @@ def _too_fast(recording: Recording) -> list[str]:
     if speed[k] <= FASTEST:
         return []
     return [
-        f"the gyro tells of {speed[k] / DEGREE:.3g} °/s at {recording.time[k]:.6g} s and in {np.mean(speed > FASTEST):.2%} of its samples "
+        f"the gyro reads {speed[k] / DEGREE:.3g} °/s at {recording.time[k]:.6g} s and in {np.mean(speed > FASTEST):.2%} of its samples "
         f"of more than {FASTEST / DEGREE:g} °/s, which hardly any gyro measures"
     ]
 
@@ -234,15 +274,15 @@ def _unseen(recording: Recording) -> list[str]:
     notes = []
     if recording.true_attitude is None:
         notes.append(
-            "without a reference attitude nothing tells an accelerometer (or magnetometer) inverted on all axes, "
+            "without a reference attitude nothing reveals an accelerometer (or magnetometer) inverted on all axes, "
             "axes swapped alike on all sensors, nor the fixed frame"
         )
         if recording.specific_force is None or recording.magnetic_field is None:
-            notes.append("with one sensor beside the gyro nothing tells which of the two has its axes wrong")
+            notes.append("with one sensor beside the gyro nothing shows which of the two has its axes wrong")
     elif recording.magnetic_field is None:
-        notes.append("without a magnetometer nothing tells the frame from an inverted accelerometer")
+        notes.append("without a magnetometer nothing separates a wrong frame from an inverted accelerometer")
     elif recording.specific_force is None:
-        notes.append("without an accelerometer nothing tells which way is up")
+        notes.append("without an accelerometer nothing shows which way is up")
     return notes
 
 
@@ -335,7 +375,7 @@ def _with_reference(recording: Recording) -> Iterator[Candidate]:
 
 
 def _turns(recording: Recording, known: np.ndarray) -> tuple[np.ndarray, np.ndarray, Array]:
-    """Return first and last samples of the short windows with the largest turns, and the turns (k, 3) that the gyro tells over them.
+    """Return first and last samples of the short windows with the largest turns, and the rotations (k, 3) that the gyro measured over them.
 
     ``known`` masks the samples that a window may begin and end at.
     """
@@ -426,7 +466,7 @@ def _candidate(changes: tuple[str, ...], misfit: dict[str, float], kind: str = "
 
 
 def _without_reference(recording: Recording) -> Iterator[Candidate]:
-    """Yield explanations with one sensor at fault: two at once could not be told from a third.
+    """Yield explanations with one sensor at fault: two at once could not be separated from a third.
 
     Increments P Δθ of proper axes P integrate to P R Pᵀ, so gyro axes P do to a vector's mean what axes Pᵀ of its own sensor do; improper
     ones are those of the inverted gyro, which is integrated by itself.

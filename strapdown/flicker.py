@@ -1,7 +1,7 @@
 """Flicker noise as the output of a small linear system: bias instability for simulators and filters.
 
-Samples with the two-sided PSD ``1/(2π f)``, f in cycles a sample, from far below 1/T up to the Nyquist frequency. The rational function of
-``s = 4 sin²(π f)`` nearest to 1/√s on [s_min, 4] is Zolotarev's, known in closed form; a fixed factor of three poles and zeros makes of
+Samples with the two-sided PSD ``1/(2π f)``, f in cycles per sample, from far below 1/T up to the Nyquist frequency. The rational function
+of ``s = 4 sin²(π f)`` nearest to 1/√s on [s_min, 4] is Zolotarev's, known in closed form; a fixed factor of three poles and zeros makes of
 1/√s = 1/(2 sin π f) the wanted 1/(2π f). Each factor of a rational function of s is a squared modulus, so the spectrum has a filter with
 real poles, and in partial fractions the filter is sixteen first-order states driven by *one* white noise:
 
@@ -20,6 +20,8 @@ import numpy as np
 
 from strapdown.checks import Array, count
 
+__all__: list[str] = []
+
 STATES = 16
 """States of the shaping filter."""
 
@@ -33,7 +35,7 @@ _POLES = (-0.92314517, -0.60000265, -0.10898167)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Shaping:
-    """A shaping filter of unit flicker: ``x ← p x + w``, ``y = g · x``, with w one standard normal a sample.
+    """A shaping filter of unit flicker: ``x ← p x + w``, ``y = g · x``, with w one standard normal per sample.
 
     For a bias instability B the noise is B y; its PSD B²/(2π f) does not depend on the sample interval.
     """
@@ -66,7 +68,7 @@ class Shaping:
         return np.asarray(scale * (normals @ np.linalg.cholesky(correlation).T))
 
     def spectrum(self, frequency: Array) -> Array:
-        """Return the two-sided PSD of y at frequencies in cycles a sample."""
+        """Return the two-sided PSD of y at frequencies in cycles per sample."""
         turn = -2.0 * np.pi * np.asarray(frequency)[..., None]
         # 1 − p e^{jθ} = (1 − e^{jθ}) + (1 − p) e^{jθ}, without cancellation at low frequency.
         back = np.exp(1j * turn)
@@ -76,10 +78,10 @@ class Shaping:
 
 @functools.lru_cache(maxsize=64)
 def shaping(samples: int) -> Shaping:
-    """Return the shaping filter for records of so many samples.
+    """Return the shaping filter for records of that many samples.
 
-    The poles and zeros of Zolotarev's function are ``−c_l``, ``c_l = 4 κ² tn²(l K'/(2n); k')`` for odd and even l, κ² = s_min/4 (Petrushev
-    & Popov 1987, section 4.3).
+    The poles and zeros of Zolotarev's function are ``−c_l``, ``c_l = 4 κ² tn²(l K'/(2n); k')`` for odd and even l, κ² = s_min/4
+    (Petrushev & Popov 1987, section 4.3).
     """
     from scipy.special import ellipkm1
 

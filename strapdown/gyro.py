@@ -1,27 +1,28 @@
-"""Gyro error model: what a rate gyro makes of the true rotation.
+"""Gyro error model: from the true rotation to the output of a rate gyro.
 
-Rate form: ``w_meas = (I + M) w_b + b + n``, with ``n`` white of PSD σ_v² (angle random walk) and b a sum of drifts; increment form: the
-integral of that over each sample interval. An increment over its interval is the averaged-rate sample, so both outputs are the same
-numbers (:attr:`GyroOutput.rates`). All noise is exact in discrete time, for any interval.
+Rate form: ``w_meas = (I + M) w_b + b + n``, with ``n`` white of PSD σ_v² (angle random walk) and b a sum of drifts; increment form:
+the integral of that over each sample interval. An increment over its interval is the averaged-rate sample, so both outputs are the
+same numbers (:attr:`GyroOutput.rates`). All noise is exact in discrete time, for any interval.
 
 Power spectral densities are two-sided, as in IEEE Std 952: ARW σ_v², flicker B²/(2π f), rate random walk σ_u²/(2π f)².
 
 Flicker in the filter
 ---------------------
-A filter with a random-walk bias has no flicker. :func:`process_noise` covers it by the least white and random-walk noise whose spectrum
-is nowhere below that of the gyro: ``σ_v'² = σ_v² + B²/(2ω*)`` and ``σ_u'² = σ_u² + ω* B²/2``; by the inequality of the means
-``B²/(2ω*) + ω* B²/(2ω²) ≥ B²/ω`` for every ω, with equality at ω*. A spectrum that is nowhere below gives an attitude covariance that is
-nowhere too small. :func:`best_bandwidth` puts ω* where that costs least: at the natural frequency of the filter.
+A filter with a random-walk bias has no flicker. :func:`process_noise` covers it by the smallest white and random-walk noise whose
+spectrum is nowhere below that of the gyro: ``σ_v'² = σ_v² + B²/(2ω*)`` and ``σ_u'² = σ_u² + ω* B²/2``; by the inequality of the
+means ``B²/(2ω*) + ω* B²/(2ω²) ≥ B²/ω`` for every ω, with equality at ω*. A spectrum that is nowhere below gives an attitude
+covariance that is nowhere too small. :func:`best_bandwidth` puts ω* where that costs least: at the natural frequency of the filter.
 
-That bound is safe and rather modest. :func:`matched_process_noise` scales it so that the filter's attitude variance is the actual one.
-Exact is to put the sixteen states of :class:`strapdown.flicker.Shaping` into the filter, driven by one white noise an axis.
+That bound is safe and rather conservative. :func:`matched_process_noise` scales it so that the filter's attitude variance is the
+actual one. The exact model adds the sixteen states of :class:`strapdown.flicker.Shaping` to the filter, driven by one white noise
+per axis.
 
-``sims/flicker_in_filter.py`` compares them on the presets, each at its natural rate with vector measurements once a second. Mean NEES of
-the attitude over its three degrees of freedom (40 runs of 600 s; the scatter of each is 0.012 to 0.049, 0.073 for the blind mpu-9250; the
-columns share their random numbers):
+``sims/flicker_in_filter.py`` compares them on the presets, each at its natural rate with vector measurements once a second. Mean
+NEES of the attitude over its three degrees of freedom (40 runs of 600 s; the scatter of each is 0.012 to 0.049, 0.073 for the
+mpu-9250 with its flicker ignored; the columns share their random numbers):
 
 ===========  ===============  =========  ==============  =======  =========
-preset       without flicker  blind      spectral bound  matched  augmented
+preset       without flicker  ignored    spectral bound  matched  augmented
 ===========  ===============  =========  ==============  =======  =========
 mpu-9250     0.973            1.611      0.919           1.003    0.994
 bmi088       1.043            1.117      1.017           1.047    1.044
@@ -33,9 +34,9 @@ dsp-1760     1.020            1.074      0.982           1.020    1.018
 hg9900       1.003            1.009      1.001           1.007    1.009
 ===========  ===============  =========  ==============  =======  =========
 
-So: match it, or bound it where too small a covariance is not to be risked. The rms error is within 1.2 % of the augmented filter's.
-The bias is another matter: a random-walk bias tracks the slow part of the flicker, and its covariance does not cover the fast part, which
-the simulator's bias holds too. Judge such a filter by its attitude.
+So match it, or bound it where too small a covariance must be excluded. The RMS error is within 1.2 % of the augmented filter's.
+The bias is another matter: a random-walk bias tracks the slow part of the flicker, and its covariance does not cover the fast part,
+which the simulator's bias holds too. Judge such a filter by its attitude.
 """
 
 from __future__ import annotations
@@ -54,8 +55,18 @@ from strapdown.equality import ByValue
 from strapdown.kernels import gyro_errors, noise
 from strapdown.kernels.machine import compiled, read_only
 
+__all__ = [
+    "GyroOutput",
+    "GyroSpec",
+    "best_bandwidth",
+    "matched_process_noise",
+    "process_noise",
+    "read_spec",
+    "simulate",
+]
+
 Axes = float | Array
-"""One number for all axes, or an array (3,) of one an axis."""
+"""One number for all axes, or an array (3,) of one per axis."""
 
 
 def _zeros() -> Array:
@@ -75,60 +86,85 @@ _BY_AXIS = {
     "rate_resolution": "rad/s",
     "turn_on_bias_sigma": "rad/s",
 }
-"""Fields of zero or more, one number or one an axis, and their units."""
+"""Non-negative fields, one number or one per axis, and their units."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GyroSpec(ByValue):
     """Parameters of a three-axis gyro, SI and radians. Every default is a perfect gyro.
 
-    The noise coefficients take one number for all axes or one an axis.
+    Noise coefficients are one number for all axes, or one per axis.
+
+    Parameters
+    ----------
+    angle_random_walk : float or ndarray (3,), default 0.0
+        σ_v (N), rad/√s; 1 °/√h = π/10800 rad/√s.
+    rate_random_walk : float or ndarray (3,), default 0.0
+        σ_u (K), rad/s/√s: a random walk of the bias from 0 at the first edge.
+    bias_instability : float or ndarray (3,), default 0.0
+        B, rad/s: flicker of two-sided PSD B²/(2π f), stationary from the first sample; the floor of the Allan deviation is 0.664 B.
+    quantization : float or ndarray (3,), default 0.0
+        Q, rad: the increments are whole multiples of Q√12 and the remainder is carried to the next, which gives 3Q²/τ².
+    rate_ramp : float or ndarray (3,), default 0.0
+        R, rad/s²: slope of the bias, which starts at 0 at the first edge.
+    markov_noise : float or ndarray (3,), default 0.0
+        √q, rad/s/√s, driving a Gauss–Markov bias ``ḃ = −b/τ + √q w``; its stationary standard deviation is √(qτ/2).
+    markov_correlation_time : float, default inf
+        τ, s; a finite one starts stationary, an infinite one is a random walk from 0.
+    turn_on_bias : ndarray (3,), default zeros
+        Fixed bias, rad/s, body axes.
+    turn_on_bias_sigma : float or ndarray (3,), default 0.0
+        Standard deviation of a bias drawn anew for every run, rad/s.
+    scale_factor : ndarray (3,), default zeros
+        Scale-factor errors, dimensionless: the diagonal of M.
+    asymmetry : ndarray (3,), default zeros
+        Scale-factor asymmetry a, dimensionless: adds a |w|, so that the scale factor is 1 + s ± a by the sign of the rate.
+    misalignment : ndarray (3, 3), default zeros
+        Off-diagonal part of M, rad; entry (i, j) is the share of the rate about axis j that axis i senses.
+    g_sensitivity : ndarray (3, 3), default zeros
+        Bias per specific force, rad/s per m/s², body axes.
+    temperature_coefficient : ndarray (3,), default zeros
+        Bias per temperature above that of calibration, rad/s/K.
+    bandwidth : float, default inf
+        Natural frequency of a second-order low-pass, Hz; needs uniform edges. Infinite: none.
+    damping : float, default √½
+        Damping ratio of the low-pass.
+    range : float, default inf
+        Largest rate that an axis measures, rad/s; beyond it the output saturates.
+    rate_resolution : float or ndarray (3,), default 0.0
+        Step of a rate output, rad/s: each averaged rate is rounded on its own, without carrying the remainder.
+    sampling_jitter : float, default 0.0
+        Standard deviation of the sampling instants about the nominal ones, s.
+    timestamp_error : float, default 0.0
+        Standard deviation of the stamps about the nominal instants, s.
+    timestamp_offset : float, default 0.0
+        Delay of the stamps after the nominal instants, s.
+    drop_probability : float, default 0.0
+        Probability that a sample is lost, independently of the others; 0 to below 1.
     """
 
     angle_random_walk: Axes = 0.0
-    """σ_v (N), rad/√s; 1 °/√h = π/10800 rad/√s."""
     rate_random_walk: Axes = 0.0
-    """σ_u (K), rad/s/√s: a random walk of the bias from 0 at the first edge."""
     bias_instability: Axes = 0.0
-    """B, rad/s: flicker of two-sided PSD B²/(2π f), stationary from the first sample; the floor of the Allan deviation is 0.664 B."""
     quantization: Axes = 0.0
-    """Q, rad: the increments are whole multiples of Q√12 and the remainder is carried to the next, which gives 3Q²/τ²."""
     rate_ramp: Axes = 0.0
-    """R, rad/s²: the bias grows so much a second, from 0 at the first edge."""
     markov_noise: Axes = 0.0
-    """√q, rad/s/√s, driving a Gauss–Markov bias ``ḃ = −b/τ + √q w``; its stationary standard deviation is √(qτ/2)."""
     markov_correlation_time: float = np.inf
-    """τ, s; a finite one starts stationary, an infinite one is a random walk from 0."""
     turn_on_bias: Array = field(default_factory=_zeros)
-    """Fixed bias, (3,), rad/s, body axes."""
     turn_on_bias_sigma: Axes = 0.0
-    """Standard deviation of a bias drawn anew for every run, rad/s."""
     scale_factor: Array = field(default_factory=_zeros)
-    """Scale-factor errors, (3,), dimensionless: the diagonal of M."""
     asymmetry: Array = field(default_factory=_zeros)
-    """Scale-factor asymmetry a, (3,), dimensionless: adds a |w|, so the scale factor is 1 + s ± a by the sign of the rate."""
     misalignment: Array = field(default_factory=_zero_matrix)
-    """Off-diagonal part of M, (3, 3), rad; entry (i, j) is how much of the rate about j shows on axis i."""
     g_sensitivity: Array = field(default_factory=_zero_matrix)
-    """(3, 3), rad/s per m/s²: the bias that a specific force adds."""
     temperature_coefficient: Array = field(default_factory=_zeros)
-    """(3,), rad/s/K: the bias that a temperature above that of calibration adds."""
     bandwidth: float = np.inf
-    """Natural frequency of a second-order low-pass, Hz; needs uniform edges. Infinite: none."""
     damping: float = 0.7071067811865476
-    """Damping ratio of the low-pass."""
     range: float = np.inf
-    """Largest rate that an axis tells, rad/s: beyond, it saturates."""
     rate_resolution: Axes = 0.0
-    """Step of a rate output, rad/s: each averaged rate is rounded by itself, no remainder is carried."""
     sampling_jitter: float = 0.0
-    """Standard deviation of the sampling instants about the nominal ones, s."""
     timestamp_error: float = 0.0
-    """Standard deviation of the stamps about the nominal instants, s."""
     timestamp_offset: float = 0.0
-    """What the stamps are late by, s."""
     drop_probability: float = 0.0
-    """Probability that a sample is lost, each by itself."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -177,15 +213,22 @@ def _by_axis(name: str, value: Any, unit: str) -> Axes:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GyroOutput:
-    """What the gyro gave, and the bias it gave it with."""
+    """Output of the gyro and its true bias.
+
+    Parameters
+    ----------
+    increments : ndarray (n, 3)
+        Measured rotation increments, rad, body axes.
+    bias : ndarray (n + 1, 3)
+        True bias at the edges, rad/s, body axes: turn-on bias and all drifts, before any low-pass and without the effect of
+        acceleration. Flicker has no value at an instant; its mean over the two intervals at the edge is taken.
+    edges : ndarray (n + 1,)
+        Edges of the intervals, s.
+    """
 
     increments: Array
-    """Measured rotation increments (n, 3), rad, body axes."""
     bias: Array
-    """True bias at the edges (n + 1, 3), rad/s: turn-on bias and all drifts. Flicker has no value at an instant; here it is the mean of
-    those of the two intervals at the edge. (Before any low-pass; the effect of acceleration is not part of it.)"""
     edges: Array
-    """Edges of the intervals (n + 1,), s."""
 
     @property
     def rates(self) -> Array:
@@ -195,7 +238,7 @@ class GyroOutput:
 
 _INITIAL, _LOW_PASS = 4, 5  # stream numbers above those of gyro_errors
 _STREAMS = 8  # stream numbers reserved for an axis
-_UNEVEN = 0.1  # of the mean interval: what flicker and low-pass bear
+_UNEVEN = 0.1  # of the mean interval: largest departure of an interval with flicker or low-pass
 
 
 def simulate(
@@ -209,24 +252,37 @@ def simulate(
 ) -> GyroOutput:
     """Return the increments that the gyro measures, and its bias.
 
-    Over an interval dt the bias walks by σ_u √dt n₁; its integral, given both ends, is ½ (b_k + b_{k+1}) dt plus a Gaussian of variance
-    σ_u² dt³/12 (the Brownian bridge), and the integral of the white noise has variance σ_v² dt. So an increment is
-    ``(I + M) Δθ + ½ (b_k + b_{k+1}) dt + √(σ_v² dt + σ_u² dt³/12) n₂``: exact, whatever dt. A Gauss–Markov bias goes by its own exact step
-    and bridge (:func:`strapdown.kernels.gyro_errors.markov_step`). Then come the low-pass, saturation and rounding.
-
     Parameters
     ----------
     spec : GyroSpec
-    true_increments : array (n, 3)
-        Exact integrals of the body rate over each interval, rad.
-    edges : array (n + 1,)
-        Edges of the sample intervals, s; uniform to a tenth (jitter, no gaps) if there is flicker or a low-pass, which go by the mean.
+        Specification of the gyro.
+    true_increments : array_like (n, 3)
+        Exact integrals of the body rate over each interval, rad, body axes.
+    edges : array_like (n + 1,)
+        Edges of the sample intervals, s. With flicker or a low-pass, which use the mean interval, uniform to a tenth.
     generator : numpy.random.Generator
-        Names the gyro's streams: two words are drawn from it, and each noise term of each axis has a stream of its own under them.
-    specific_force : array (n, 3), optional
-        Mean specific force over each interval, m/s², body axes; needed if the specification has a g-sensitivity.
-    temperature : array (n + 1,), optional
-        Temperature at the edges above that of calibration, K; needed if the specification has a temperature coefficient.
+        Source of the streams: two words are drawn from it, and each noise term of each axis has its own stream under them.
+    specific_force : array_like (n, 3), optional
+        Mean specific force over each interval, m/s², body axes; required if the specification has a g-sensitivity.
+    temperature : array_like (n + 1,), optional
+        Temperature at the edges above that of calibration, K; required if the specification has a temperature coefficient.
+
+    Returns
+    -------
+    GyroOutput
+        Measured increments and true bias.
+
+    Raises
+    ------
+    InputError
+        If shapes do not fit, the edges are not uniform where they must be, or a required input is missing.
+
+    Notes
+    -----
+    Over an interval dt the bias walks by σ_u √dt n₁; its integral, given both ends, is ½ (b_k + b_{k+1}) dt plus a Gaussian of
+    variance σ_u² dt³/12 (the Brownian bridge), and the integral of the white noise has variance σ_v² dt. So an increment is
+    ``(I + M) Δθ + ½ (b_k + b_{k+1}) dt + √(σ_v² dt + σ_u² dt³/12) n₂``: exact for any dt. A Gauss–Markov bias has its own exact
+    step and bridge (:func:`strapdown.kernels.gyro_errors.markov_step`). Low-pass, saturation and rounding follow.
     """
     stamps = increasing("edges", edges, least=2)
     exact = np.ascontiguousarray(array("true_increments", true_increments, (len(stamps) - 1, 3)))
@@ -335,7 +391,7 @@ def _low_pass(
     words: np.ndarray,
     normals: Array,
 ) -> Array:
-    """Return the increments behind ``H(s) = ω²/(s² + 2ζωs + ω²)``, white noise and all, exact over each interval."""
+    """Return the increments after ``H(s) = ω²/(s² + 2ζωs + ω²)``, with the white noise, exact over each interval."""
     natural, damping = 2.0 * np.pi * spec.bandwidth, spec.damping
     transition, factor = low_pass_step(natural, damping, dt)
     # Stationary: ȳ is the first mean rate; the white noise alone gives var y = σ_v² ω/(4ζ), var ẏ = σ_v² ω³/(4ζ), uncorrelated.
@@ -397,7 +453,7 @@ def low_pass_step(natural: float, damping: float, dt: float) -> tuple[Array, Arr
 
 
 def sampling(spec: GyroSpec, edges: ArrayLike, generator: np.random.Generator) -> tuple[Array, Array]:
-    """Return the instants at which the gyro really samples (n + 1,), and the stamps it tells (n + 1,), of nominal edges, s.
+    """Return the true sampling instants (n + 1,) and the reported stamps (n + 1,), s, for nominal edges.
 
     Jitter and stamp error are independent and normal, cut off at two fifths of the shortest interval so that the order stays.
     """
@@ -415,9 +471,9 @@ def dropped(spec: GyroSpec, samples: int, generator: np.random.Generator) -> np.
 
 
 def bridge_dropped(increments: ArrayLike, edges: ArrayLike, lost: np.ndarray) -> tuple[Array, np.ndarray]:
-    """Return increments without the lost samples, and the indices of the edges left: what a reader of the record makes of a gap.
+    """Return increments without the lost samples, and the indices of the edges left, as a reader of the record bridges a gap.
 
-    A gap joins the sample after it, whose rate is taken to hold throughout; lost samples at the end are cut off.
+    A gap is joined to the sample after it, whose rate is held throughout; lost samples at the end are cut off.
     """
     stamps = increasing("edges", edges, least=2)
     turns = array("increments", increments, (len(stamps) - 1, 3))
@@ -430,16 +486,35 @@ def bridge_dropped(increments: ArrayLike, edges: ArrayLike, lost: np.ndarray) ->
 
 
 def process_noise(spec: GyroSpec, *, bandwidth: float | None = None) -> dict[str, float]:
-    """Return ``angle_random_walk`` and ``rate_random_walk`` for a filter with a random-walk bias: ``ProcessNoise(**process_noise(spec))``.
-
-    Without flicker these are the gyro's own, and a Gauss–Markov bias is held by its driving noise, which is right over times short against
-    τ. Flicker is covered by the spectral bound of :mod:`strapdown.gyro`, touching at ω* = ``bandwidth``. Axes that differ give the largest.
+    """Return the noise of a filter with a random-walk bias: ``ProcessNoise(**process_noise(spec))``.
 
     Parameters
     ----------
     spec : GyroSpec
-    bandwidth : float
-        ω*, rad/s: :func:`best_bandwidth` of the vector measurements; needed if there is flicker.
+        Specification of the gyro.
+    bandwidth : float, optional
+        ω*, rad/s, where the spectral bound of :mod:`strapdown.gyro` touches the flicker: :func:`best_bandwidth` of the
+        measurements. Required if the gyro has flicker.
+
+    Returns
+    -------
+    dict
+        ``angle_random_walk``, rad/√s, and ``rate_random_walk``, rad/s/√s, of the worst axis.
+
+    Raises
+    ------
+    InputError
+        If the gyro has flicker and no bandwidth is given.
+
+    Notes
+    -----
+    Without flicker these are the gyro's own; a Gauss–Markov bias is represented by its driving noise, which holds over times short
+    against τ.
+
+    Examples
+    --------
+    >>> process_noise(GyroSpec(angle_random_walk=1e-5, rate_random_walk=1e-8))
+    {'angle_random_walk': 1e-05, 'rate_random_walk': 1e-08}
     """
     white, walk, instability = _filter_terms(spec)
     if instability > 0.0:
@@ -454,17 +529,30 @@ def process_noise(spec: GyroSpec, *, bandwidth: float | None = None) -> dict[str
 
 
 def best_bandwidth(spec: GyroSpec, measurement_density: float) -> float:
-    """Return the ω*, rad/s, at which the spectral bound of flicker gives the least attitude variance.
-
-    A filter with white and random-walk noise and measurements of density r has the steady attitude variance ``√r √(σ_v'² + 2 σ_u' √r)``
-    about an axis (Farrenkopf 1978, in the limit of frequent measurements). With the bound put in, it is least where
-    ``r ω*⁴ = σ_u² + ω* B²/2``, which is where ω* is the natural frequency of the filter itself.
+    """Return the ω* at which the spectral bound of flicker gives the least attitude variance.
 
     Parameters
     ----------
     spec : GyroSpec
+        Specification of the gyro.
     measurement_density : float
-        r, rad² s: variance about an axis of a measurement times the interval between measurements.
+        r, rad² s: variance of a measurement about an axis times the interval between measurements.
+
+    Returns
+    -------
+    float
+        ω*, rad/s.
+
+    Raises
+    ------
+    InputError
+        If the gyro has neither flicker nor a drifting bias.
+
+    Notes
+    -----
+    A filter with white and random-walk noise and measurements of density r has the steady attitude variance ``√r √(σ_v'² + 2 σ_u'
+    √r)`` about an axis (Farrenkopf 1978, in the limit of frequent measurements). With the bound inserted it is least where ``r ω*⁴
+    = σ_u² + ω* B²/2``, where ω* is the natural frequency of the filter itself.
     """
     _, walk, instability = _filter_terms(spec)
     density = positive("measurement_density", measurement_density, unit="rad² s")
@@ -476,18 +564,26 @@ def best_bandwidth(spec: GyroSpec, measurement_density: float) -> float:
 
 
 def matched_process_noise(spec: GyroSpec, measurement_density: float) -> dict[str, float]:
-    """Return white and random-walk noise with which the filter's attitude variance is right, flicker and all, in the steady state.
-
-    The filter's error answers to the rate with ``s/(s² + 2ζω s + ω²)``, so flicker gives the attitude variance
-    ``B²/(2πω²) arccos ζ/(ζ √(1 − ζ²))``, and the bound at ω* = ω gives ``B²/(4ζω²)``. Their ratio is
-    ``κ(ζ) = (2/π) arccos ζ/√(1 − ζ²)`` (arcosh and ζ² − 1 above ζ = 1): 1, 0.71 and 0.64 at ζ = 0, 0.71 and 1. The bound with κ B² for
-    B² is solved for the ω and ζ that it gives the filter.
+    """Return the noise with which the filter's steady attitude variance is right, flicker included.
 
     Parameters
     ----------
     spec : GyroSpec
+        Specification of the gyro.
     measurement_density : float
-        r, rad² s, as for :func:`best_bandwidth`.
+        r, rad² s: variance of a measurement about an axis times the interval between measurements.
+
+    Returns
+    -------
+    dict
+        ``angle_random_walk``, rad/√s, and ``rate_random_walk``, rad/s/√s.
+
+    Notes
+    -----
+    The filter's error responds to the rate with ``s/(s² + 2ζω s + ω²)``, so flicker gives the attitude variance
+    ``B²/(2πω²) arccos ζ/(ζ √(1 − ζ²))``, and the bound at ω* = ω gives ``B²/(4ζω²)``. Their ratio is ``κ(ζ) = (2/π) arccos ζ/√(1 −
+    ζ²)`` (arcosh and ζ² − 1 above ζ = 1): 1, 0.71 and 0.64 at ζ = 0, 0.71 and 1. The bound with κ B² for B² is solved for the ω and
+    ζ of the filter itself.
     """
     white, walk, instability = _filter_terms(spec)
     density = positive("measurement_density", measurement_density, unit="rad² s")
@@ -506,7 +602,7 @@ def matched_process_noise(spec: GyroSpec, measurement_density: float) -> dict[st
 
 
 def flicker_share(damping: float) -> float:
-    """Return κ(ζ) of :func:`matched_process_noise`: the attitude variance that flicker gives over that of its spectral bound."""
+    """Return κ(ζ) of :func:`matched_process_noise`: the attitude variance due to flicker over that of its spectral bound."""
     away = 1.0 - damping**2
     if abs(away) < 1e-6:
         return float(2.0 / np.pi * (1.0 + (1.0 - damping) / 3.0))
@@ -565,21 +661,31 @@ FORM: tables.Form = {
 
 
 def to_table(spec: GyroSpec) -> dict[str, Any]:
-    """Return what differs from a perfect gyro as a table for TOML or JSON, units in the key names; exact both ways."""
+    """Return the departures from a perfect gyro as a table for TOML or JSON, units in the key names; exact both ways."""
     return tables.encode(spec, FORM)
 
 
 def from_table(table: Mapping[str, Any], place: str = "gyro") -> GyroSpec:
-    """Return the specification told by a table with units in the key names; unknown keys are refused with the nearest known one."""
+    """Return the specification in a table with units in the key names; an unknown key is refused with the nearest known one."""
     return tables.build(GyroSpec, table, FORM, place)  # type: ignore[no-any-return]
 
 
 def read_spec(path: str | os.PathLike[str]) -> GyroSpec:
-    """Read the specification in the table ``[gyro]`` of a TOML file, such as ``strapdown allan`` writes.
+    """Read the table ``[gyro]`` of a TOML file, such as ``strapdown allan`` writes.
+
+    Parameters
+    ----------
+    path : path-like
+        File.
+
+    Returns
+    -------
+    GyroSpec
+        The specification.
 
     Raises
     ------
     InputError
-        If the file is missing, no TOML, has no such table, or a key that no gyro has.
+        If the file is missing, is not TOML, has no such table, or has an unknown key.
     """
     return tables.read(path, "gyro", "`strapdown allan` writes one", from_table)

@@ -1,7 +1,7 @@
 """Kinematics of attitude: rates and quaternion derivatives, equations (3), (4), (15)–(17), and the Jacobians of the rotation vector.
 
-Equation numbers are those of *Quaternion differentiation*, the document this project comes from. It writes one letter W for both
-rates; here ``w_b`` is the angular velocity in body axes, ``w_f`` the same vector in fixed axes, rad/s, shapes (..., 3).
+Equation numbers are those of *Quaternion differentiation*, which writes one letter W for both rates. Here ``w_b`` is the angular
+velocity in body axes and ``w_f`` the same vector in fixed axes, rad/s, shapes (..., 3).
 """
 
 from __future__ import annotations
@@ -15,6 +15,18 @@ from numpy.typing import ArrayLike
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, array
 
+__all__ = [
+    "body_quaternion_derivative",
+    "body_rate",
+    "body_to_fixed_rate",
+    "fixed_quaternion_derivative",
+    "fixed_rate",
+    "fixed_to_body_rate",
+    "inverse_right_jacobian",
+    "right_jacobian",
+    "skew",
+]
+
 
 def _pure(v: Array) -> Array:
     """Return vectors as quaternions with zero scalar part, equation (2)."""
@@ -22,37 +34,138 @@ def _pure(v: Array) -> Array:
 
 
 def fixed_quaternion_derivative(q: ArrayLike, w_f: ArrayLike) -> Array:
-    """Return q̇ = ½ W ⊗ q, equation (3) (its components are (4)), for the rate in fixed axes."""
+    """Return q̇ = ½ W ⊗ q for a rate in fixed axes, equation (3); by components equation (4).
+
+    Parameters
+    ----------
+    q : array_like (..., 4)
+        Unit quaternions q_fb.
+    w_f : array_like (..., 3)
+        Angular rate in fixed axes, rad/s.
+
+    Returns
+    -------
+    ndarray (..., 4)
+        q̇, 1/s.
+
+    Examples
+    --------
+    >>> fixed_quaternion_derivative([1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 2.0]).tolist()
+    [0.0, 0.0, 0.0, 1.0]
+    """
     return 0.5 * quaternion.multiply(_pure(array("w_f", w_f, (..., 3))), q)
 
 
 def body_quaternion_derivative(q: ArrayLike, w_b: ArrayLike) -> Array:
-    """Return q̇ = ½ q ⊗ W̄, equation (17), for the rate in body axes. The process model of the filters."""
+    """Return q̇ = ½ q ⊗ W̄ for a rate in body axes, equation (17).
+
+    This is the process model of the filters.
+
+    Parameters
+    ----------
+    q : array_like (..., 4)
+        Unit quaternions q_fb.
+    w_b : array_like (..., 3)
+        Angular rate in body axes, rad/s.
+
+    Returns
+    -------
+    ndarray (..., 4)
+        q̇, 1/s.
+    """
     return 0.5 * quaternion.multiply(q, _pure(array("w_b", w_b, (..., 3))))
 
 
 def fixed_rate(q: ArrayLike, q_dot: ArrayLike) -> Array:
-    """Return w_f, the vector part of 2 q̇ ⊗ q⁻¹, equation (15), rad/s in fixed axes."""
+    """Return the rate in fixed axes, the vector part of 2 q̇ ⊗ q⁻¹, equation (15).
+
+    Parameters
+    ----------
+    q : array_like (..., 4)
+        Unit quaternions q_fb.
+    q_dot : array_like (..., 4)
+        Time derivative q̇, 1/s.
+
+    Returns
+    -------
+    ndarray (..., 3)
+        w_f, rad/s.
+    """
     return 2.0 * quaternion.multiply(q_dot, quaternion.inverse(q))[..., 1:]
 
 
 def body_rate(q: ArrayLike, q_dot: ArrayLike) -> Array:
-    """Return w_b, the vector part of 2 q⁻¹ ⊗ q̇, the body twin of equation (15), rad/s in body axes."""
+    """Return the rate in body axes, the vector part of 2 q⁻¹ ⊗ q̇, equation (17) solved for W̄.
+
+    Parameters
+    ----------
+    q : array_like (..., 4)
+        Unit quaternions q_fb.
+    q_dot : array_like (..., 4)
+        Time derivative q̇, 1/s.
+
+    Returns
+    -------
+    ndarray (..., 3)
+        w_b, rad/s.
+    """
     return 2.0 * quaternion.multiply(quaternion.inverse(q), q_dot)[..., 1:]
 
 
 def body_to_fixed_rate(q: ArrayLike, w_b: ArrayLike) -> Array:
-    """Return w_f = q ⊗ w_b ⊗ q⁻¹, equation (16)."""
+    """Return w_f = q ⊗ w_b ⊗ q⁻¹, equation (16).
+
+    Parameters
+    ----------
+    q : array_like (..., 4)
+        Unit quaternions q_fb.
+    w_b : array_like (..., 3)
+        Angular rate in body axes, rad/s.
+
+    Returns
+    -------
+    ndarray (..., 3)
+        w_f, rad/s.
+    """
     return quaternion.rotate(q, w_b)
 
 
 def fixed_to_body_rate(q: ArrayLike, w_f: ArrayLike) -> Array:
-    """Return w_b = q⁻¹ ⊗ w_f ⊗ q, equation (16) the other way."""
+    """Return w_b = q⁻¹ ⊗ w_f ⊗ q, the inverse of equation (16).
+
+    Parameters
+    ----------
+    q : array_like (..., 4)
+        Unit quaternions q_fb.
+    w_f : array_like (..., 3)
+        Angular rate in fixed axes, rad/s.
+
+    Returns
+    -------
+    ndarray (..., 3)
+        w_b, rad/s.
+    """
     return quaternion.rotate(quaternion.conjugate(q), w_f)
 
 
 def skew(v: ArrayLike) -> Array:
-    """Return the skew matrices [v] (..., 3, 3) with [v] u = v × u."""
+    """Return the skew-symmetric matrices [v] with [v] u = v × u.
+
+    Parameters
+    ----------
+    v : array_like (..., 3)
+        Vectors.
+
+    Returns
+    -------
+    ndarray (..., 3, 3)
+        Matrices.
+
+    Examples
+    --------
+    >>> skew([1.0, 2.0, 3.0]).tolist()
+    [[0.0, -3.0, 2.0], [3.0, 0.0, -1.0], [-2.0, 1.0, 0.0]]
+    """
     vector = array("v", v, (..., 3))
     result = np.zeros((*vector.shape[:-1], 3, 3))
     for i in range(3):
@@ -85,9 +198,19 @@ def _joined(x: Array, coefficients: Array, closed_form: Array) -> Array:
 
 
 def right_jacobian(rotation_vector: ArrayLike) -> Array:
-    """Return J_r(φ) (..., 3, 3): exp(φ + δ) = exp(φ) ⊗ exp(J_r(φ) δ) to first order in δ, and w_b = J_r(φ) φ̇.
+    """Return the right Jacobian J_r(φ) of the rotation vector: w_b = J_r(φ) φ̇.
 
-    ``J_r = I − (1 − cos θ)/θ² [φ] + (θ − sin θ)/θ³ [φ]²``, θ = |φ| (Solà, Deray, Atchuthan 2018, *A micro Lie theory*, eq. (143)).
+    To first order in δ, exp(φ + δ) = exp(φ) ⊗ exp(J_r(φ) δ).
+
+    Parameters
+    ----------
+    rotation_vector : array_like (..., 3)
+        φ, rad, of any length θ.
+
+    Returns
+    -------
+    ndarray (..., 3, 3)
+        ``J_r = I − (1 − cos θ)/θ² [φ] + (θ − sin θ)/θ³ [φ]²`` (Solà, Deray & Atchuthan 2018, *A micro Lie theory*, eq. (143)).
     """
     phi = array("rotation_vector", rotation_vector, (..., 3))
     theta = np.linalg.norm(phi, axis=-1)
@@ -101,9 +224,22 @@ def right_jacobian(rotation_vector: ArrayLike) -> Array:
 
 
 def inverse_right_jacobian(rotation_vector: ArrayLike) -> Array:
-    """Return J_r(φ)⁻¹ (..., 3, 3): φ̇ = J_r(φ)⁻¹ w_b, the Bortz equation. For |φ| < 2π.
+    """Return J_r(φ)⁻¹ of the Bortz equation φ̇ = J_r(φ)⁻¹ w_b.
 
-    ``J_r⁻¹ = I + ½ [φ] + (1 − (θ/2) cot(θ/2))/θ² [φ]²`` (Solà et al. 2018, eq. (144); Bortz 1971, eq. (12)).
+    Parameters
+    ----------
+    rotation_vector : array_like (..., 3)
+        φ, rad, shorter than 2π.
+
+    Returns
+    -------
+    ndarray (..., 3, 3)
+        ``J_r⁻¹ = I + ½ [φ] + (1 − (θ/2) cot(θ/2))/θ² [φ]²`` (Solà et al. 2018, eq. (144); Bortz 1971, eq. (12)).
+
+    Raises
+    ------
+    InputError
+        If a vector is 2π long or more, where J_r is singular.
     """
     phi = array("rotation_vector", rotation_vector, (..., 3))
     theta = np.linalg.norm(phi, axis=-1)

@@ -1,18 +1,20 @@
-"""Noise coefficients of gyros, accelerometers and magnetometers in the words and units of the field, and in other programs' files.
+"""Noise coefficients of gyros, accelerometers and magnetometers in the terms and units of the field, and in the files of other programs.
 
-The coefficients of :class:`strapdown.allan.NoiseFit` are SI of whatever was sampled: N in rad/s, m/s² or T per √Hz (the same as per √Hz of
-a two-sided density, rad/√s), B in the unit itself, K in the unit per √s. Other programs take one number for all axes: the largest. Where
-no axis shows a term, the upper end of its interval is written, which the record cannot rule out, and a comment says so.
+The coefficients of :class:`strapdown.allan.NoiseFit` are SI of the sampled quantity: N in rad/s, m/s² or T per √Hz (the same as per
+√Hz of a two-sided density, rad/√s), B in the unit itself, K in the unit per √s. Other programs use one number for all axes: the
+largest. Where no axis shows a term, the upper end of its interval is written, which the record cannot exclude, and a comment says
+so.
 
 Kalibr
-    ``imu.yaml``: noise densities N and random walks K of gyro and accelerometer. People multiply them by 5 to 10 or more, for Kalibr has no
-    terms for vibration, scale and temperature; here by the factor that is asked for, which a comment says.
+    ``imu.yaml``: noise densities N and random walks K of gyro and accelerometer. They are commonly multiplied by 5 to 10 or more,
+    for Kalibr has no terms for vibration, scale and temperature; here by the requested factor, which a comment states.
 PX4
-    Parameters of EKF2, which takes them for the standard deviation of white noise over one step of the filter, ``EKF2_PREDICT_US``: N/√dt
-    for ``EKF2_GYR_NOISE`` (rad/s) and ``EKF2_ACC_NOISE`` (m/s²), K/√dt for ``EKF2_GYR_B_NOISE`` (rad/s²) and ``EKF2_ACC_B_NOISE`` (m/s³).
+    Parameters of EKF2, which uses them as the standard deviation of white noise over one step of the filter, ``EKF2_PREDICT_US``:
+    N/√dt for ``EKF2_GYR_NOISE`` (rad/s) and ``EKF2_ACC_NOISE`` (m/s²), K/√dt for ``EKF2_GYR_B_NOISE`` (rad/s²) and
+    ``EKF2_ACC_B_NOISE`` (m/s³).
 MATLAB
-    ``gyroparams``, ``accelparams`` and ``magparams`` of ``imuSensor``, of each axis. ``NoiseType`` must be single-sided for N to be what
-    the Allan deviation shows at 1 s; the default makes it smaller by √2. The magnetometer is in µT there.
+    ``gyroparams``, ``accelparams`` and ``magparams`` of ``imuSensor``, for each axis. ``NoiseType`` must be single-sided for N to
+    be the Allan deviation at 1 s; the default makes it smaller by √2. The magnetometer is in µT there.
 """
 
 from __future__ import annotations
@@ -26,6 +28,13 @@ import numpy as np
 from strapdown import allan, checks, gyro, units
 from strapdown.allan import NoiseFit
 from strapdown.checks import InputError
+
+__all__ = [
+    "to_kalibr",
+    "to_matlab",
+    "to_px4",
+    "to_toml",
+]
 
 SENSORS = ("gyro", "accelerometer", "magnetometer")
 _MICRO_G = 1e-6 * units.STANDARD_GRAVITY
@@ -64,12 +73,12 @@ PX4_STEP = 0.01
 
 
 def name(sensor: str, term: str) -> str:
-    """Return what a term is called of a sensor."""
+    """Return the name of a term for a sensor."""
     return NAMES[checks.one_of("sensor", sensor, SENSORS)].get(term, term)
 
 
 def table(fit: NoiseFit, sensor: str = "gyro") -> list[dict[str, object]]:
-    """Return one row an axis and term for printing, as :func:`strapdown.allan.table`, in the names and units of a sensor."""
+    """Return one row per axis and term for printing, as :func:`strapdown.allan.table`, in the names and units of a sensor."""
     checks.one_of("sensor", sensor, SENSORS)
     rows = allan.table(fit)
     for row in rows:
@@ -92,9 +101,19 @@ def key(sensor: str, term: str) -> tuple[str, float]:
 
 
 def to_toml(fit: NoiseFit, sensor: str = "gyro") -> dict[str, dict[str, Any]]:
-    """Return a sensor's table for TOML: the terms that are seen, 0 on an axis that does not show one.
+    """Return a sensor's table for TOML: the terms that are supported, 0 on an axis that does not show one.
 
-    That of a gyro is what :func:`strapdown.gyro.read_spec` reads. Six digits of the unit that is written: an estimate has no more.
+    Parameters
+    ----------
+    fit : NoiseFit
+        Coefficients of one sensor.
+    sensor : {"gyro", "accelerometer", "magnetometer"}, default "gyro"
+        Kind of the sensor.
+
+    Returns
+    -------
+    dict
+        Table with the unit in each key, to six digits; that of a gyro is the input of :func:`strapdown.gyro.read_spec`.
     """
     rounded: dict[str, Any] = {}
     for term, value in allan.to_gyro_parameters(fit).items():
@@ -122,14 +141,24 @@ def to_kalibr(fits: Mapping[str, NoiseFit], *, factor: float = 1.0, topic: str =
 
     Parameters
     ----------
-    fits : mapping
-        Of ``"gyro"`` and ``"accelerometer"``.
-    factor : float
-        What all four numbers are multiplied by.
-    topic : str
+    fits : mapping of str to NoiseFit
+        Fits of ``"gyro"`` and ``"accelerometer"``.
+    factor : float, default 1.0
+        Factor on all four numbers.
+    topic : str, default "/imu0"
         Topic of the inertial unit.
-    source : str
-        What a comment says of where they come from.
+    source : str, default ""
+        Origin of the numbers, for a comment.
+
+    Returns
+    -------
+    str
+        Content of the file.
+
+    Raises
+    ------
+    InputError
+        If a sensor or a term is missing.
     """
     _both(fits, "Kalibr")
     checks.positive("factor", factor)
@@ -151,13 +180,33 @@ def to_kalibr(fits: Mapping[str, NoiseFit], *, factor: float = 1.0, topic: str =
 
 
 def to_px4(fits: Mapping[str, NoiseFit], *, step: float = PX4_STEP, source: str = "") -> str:
-    """Return parameters of PX4's EKF2 as QGroundControl reads them; ``step`` is the filter's, s (EKF2_PREDICT_US)."""
+    """Return parameters of PX4's EKF2 in QGroundControl's format.
+
+    Parameters
+    ----------
+    fits : mapping of str to NoiseFit
+        Fits of ``"gyro"`` and ``"accelerometer"``.
+    step : float, default 0.01
+        Step of the filter (EKF2_PREDICT_US), s.
+    source : str, default ""
+        Origin of the numbers, for a comment.
+
+    Returns
+    -------
+    str
+        Content of the file.
+
+    Raises
+    ------
+    InputError
+        If a sensor or a term is missing.
+    """
     _both(fits, "PX4")
     root = math.sqrt(checks.positive("step", step, unit="s"))
     lines = [
         *([f"# {_plain(source)}"] if source else []),
         f"# Noise by `strapdown allan`, the largest of the axes, over steps of {1e6 * step:.0f} us (EKF2_PREDICT_US).",
-        "# PX4's own values are larger: they stand for vibration too.",
+        "# PX4's own values are larger: they include vibration.",
         "# Vehicle-Id Component-Id Name Value Type",
     ]
     for parameter, sensor, term in (
@@ -173,7 +222,20 @@ def to_px4(fits: Mapping[str, NoiseFit], *, step: float = PX4_STEP, source: str 
 
 
 def to_matlab(fits: Mapping[str, NoiseFit], *, source: str = "") -> str:
-    """Return MATLAB code that makes an ``imuSensor`` of these sensors, each axis its own; a term that an axis does not show is 0."""
+    """Return MATLAB code for an ``imuSensor``, each axis with its own noise; a term that an axis does not show is 0.
+
+    Parameters
+    ----------
+    fits : mapping of str to NoiseFit
+        Fits by sensor.
+    source : str, default ""
+        Origin of the numbers, for a comment.
+
+    Returns
+    -------
+    str
+        MATLAB code.
+    """
     made = {"gyro": ("Gyroscope", "gyroparams", 1.0), "accelerometer": ("Accelerometer", "accelparams", 1.0)}
     made["magnetometer"] = ("Magnetometer", "magparams", 1e6)
     rate = 1.0 / next(iter(fits.values())).sample_interval

@@ -1,4 +1,4 @@
-"""A circular low orbit: where the satellite is, when it is in the earth's shadow, and the magnetic field it meets."""
+"""A circular low orbit: position, eclipses and magnetic field along it."""
 
 from __future__ import annotations
 
@@ -8,6 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown.checks import Array, InputError, array, finite, positive
+
+__all__ = [
+    "CircularOrbit",
+]
 
 EARTH_RADIUS = 6371.2e3
 """m, mean; the reference radius of the geomagnetic field."""
@@ -19,14 +23,21 @@ DIPOLE_STRENGTH = 2.98e-5
 
 @dataclass(frozen=True, kw_only=True)
 class CircularOrbit:
-    """A circular orbit in an inertial fixed frame, z to the north pole, its ascending node on the x axis."""
+    """A circular orbit in an inertial fixed frame, z to the north pole, its ascending node on the x axis.
+
+    Parameters
+    ----------
+    altitude : float, default 500e3
+        Altitude above the mean radius of the earth, m.
+    inclination : float, default 1.7
+        Inclination to the equator, rad.
+    phase : float, default 0.0
+        Angle from the ascending node at time 0, rad.
+    """
 
     altitude: float = 500e3
-    """m."""
     inclination: float = 1.7
-    """rad."""
     phase: float = 0.0
-    """Angle from the ascending node at time 0, rad."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -45,18 +56,58 @@ class CircularOrbit:
         return float(np.sqrt(EARTH_GRAVITATION / self.radius**3))
 
     def position(self, time: ArrayLike) -> Array:
-        """Return the position (..., 3), m, fixed frame."""
+        """Return the position.
+
+        Parameters
+        ----------
+        time : array_like (...)
+            Times, s.
+
+        Returns
+        -------
+        ndarray (..., 3)
+            Position, m, fixed (inertial) frame.
+        """
         angle = self.phase + self.rate * np.asarray(time, np.float64)
         level = np.sin(angle)
         axes = [np.cos(angle), level * np.cos(self.inclination), level * np.sin(self.inclination)]
         return np.asarray(self.radius * np.stack(axes, axis=-1))
 
     def magnetic_field(self, time: ArrayLike) -> Array:
-        """Return the field (..., 3), T, fixed frame, of a dipole at the centre along −z: ``B = B₀ (R/r)³ (3 (m·r̂) r̂ − m)``."""
+        """Return the magnetic field of a dipole at the centre along −z: ``B = B₀ (R/r)³ (3 (m·r̂) r̂ − m)``.
+
+        Parameters
+        ----------
+        time : array_like (...)
+            Times, s.
+
+        Returns
+        -------
+        ndarray (..., 3)
+            Field, T, fixed frame.
+        """
         return dipole_field(self.position(time))
 
     def eclipses(self, sun_f: ArrayLike, start: float, end: float) -> tuple[tuple[float, float], ...]:
-        """Return the windows of [start, end] in the earth's shadow, a cylinder away from the sun's direction."""
+        """Return the windows in the earth's shadow, a cylinder away from the sun's direction.
+
+        Parameters
+        ----------
+        sun_f : array_like (3,)
+            Direction of the sun, fixed frame, of any length.
+        start, end : float
+            Interval [start, end], s.
+
+        Returns
+        -------
+        tuple of (float, float)
+            Windows (from, to), s.
+
+        Raises
+        ------
+        InputError
+            If ``sun_f`` is zero.
+        """
         sun = array("sun_f", sun_f, (3,))
         if not np.linalg.norm(sun) > 0.0:
             raise InputError("sun_f is the zero vector, which has no direction")

@@ -1,10 +1,11 @@
-"""An estimate in the forms that people use: angles of any sequence with σ, heading from North, North-East-Down, free acceleration, tables.
+"""An estimate in usual forms: Euler angles with σ, heading from North, North-East-Down, free acceleration, tables.
 
-The fixed frame of an estimate is East-North-Up (z up with any heading where there was no magnetometer), and ``q_fb`` takes body vectors to
-it. Rotation matrices and SciPy rotations are :func:`strapdown.quaternion.to_matrix` and :func:`strapdown.quaternion.to_rotation`.
+The fixed frame of an estimate is East-North-Up (z up with an arbitrary heading without a magnetometer), and ``q_fb`` takes body
+vectors to it. Rotation matrices and SciPy rotations are :func:`strapdown.quaternion.to_matrix` and
+:func:`strapdown.quaternion.to_rotation`.
 
-Covariances are those of the body-side error, ``q_true = q_est ⊗ exp(δθ)``. An estimate that kept variances alone has no correlations
-between axes; σ of angles is then that of a diagonal covariance (``full_covariance=True`` keeps the whole).
+Covariances are those of the body-side error, ``q_true = q_est ⊗ exp(δθ)``. An estimate that kept variances alone has no
+correlations between axes; σ of angles is then that of a diagonal covariance (``full_covariance=True`` keeps the whole).
 """
 
 from __future__ import annotations
@@ -24,6 +25,16 @@ if TYPE_CHECKING:
     from strapdown.recordings import Recording
     from strapdown.records import Estimate
 
+__all__ = [
+    "Angles",
+    "euler",
+    "free_acceleration",
+    "from_ned",
+    "heading",
+    "table",
+    "to_ned",
+]
+
 FRAMES = ("ENU", "NED")
 NED_OF_ENU = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
 """Turns East-North-Up to North-East-Down and back: half a turn about the horizontal line to the north-east."""
@@ -34,12 +45,18 @@ NAMES = {"Z": "yaw", "Y": "pitch", "X": "roll"}
 
 
 class Angles(NamedTuple):
-    """Angles with their standard deviations."""
+    """Angles with their standard deviations.
+
+    Parameters
+    ----------
+    angles : ndarray (n, 3) or (n,)
+        Angles, rad.
+    sigma : ndarray, optional
+        Standard deviations in the same shape, rad; None without a covariance, infinite in gimbal lock.
+    """
 
     angles: Array
-    """rad"""
     sigma: Array | None
-    """rad; None without a covariance. Infinite where the sequence is singular (gimbal lock)."""
 
 
 def attitude_covariance(estimate: Estimate) -> Array:
@@ -52,28 +69,28 @@ def attitude_covariance(estimate: Estimate) -> Array:
 
 
 def euler(attitude: ArrayLike, sequence: str = "ZYX", covariance: ArrayLike | None = None) -> Angles:
-    """Return Euler angles of attitudes, and their σ.
+    """Return Euler angles of attitudes, and their standard deviations.
 
     Parameters
     ----------
-    attitude : (n, 4)
+    attitude : array_like (n, 4)
         Unit quaternions q_fb.
-    sequence : str
-        Three axes as SciPy names them: capitals turn about the body's own axes one after the other (``"ZYX"``: yaw, pitch, roll), small
+    sequence : str, default "ZYX"
+        Axes of the three rotations in SciPy's notation: capitals about the rotating body axes (``"ZYX"``: yaw, pitch, roll), small
         letters about the fixed ones. Neighbours must differ.
-    covariance : (n, 3, 3), optional
-        Of the body-side attitude error, rad².
+    covariance : array_like (n, 3, 3), optional
+        Covariance of the body-side attitude error, rad².
 
     Returns
     -------
     Angles
-        ``angles`` (n, 3) in the order of the sequence, rad. To first order ``δθ = E δφ``, the columns of E being the axes of the three
-        turns in the body frame, so that ``σ²`` is the diagonal of ``E⁻¹ P E⁻ᵀ``.
+        ``angles`` (n, 3) in the order of the sequence, rad. To first order ``δθ = E δφ``, the columns of E being the axes of the
+        three rotations in the body frame, so that ``σ²`` is the diagonal of ``E⁻¹ P E⁻ᵀ``.
 
     Raises
     ------
     InputError
-        If the sequence is none.
+        If the sequence is not one of three axes.
 
     Examples
     --------
@@ -114,21 +131,27 @@ def euler(attitude: ArrayLike, sequence: str = "ZYX", covariance: ArrayLike | No
 
 
 def heading(attitude: ArrayLike, covariance: ArrayLike | None = None, *, axis: str = "x") -> Angles:
-    """Return the heading of a body axis: its angle from North towards East, rad in [0, 2π), and its σ.
+    """Return the heading of a body axis, its angle from North towards East, and its standard deviation.
 
     Parameters
     ----------
-    attitude : (n, 4)
-        q_fb, fixed frame East-North-Up. North is the one of the estimate: magnetic where a magnetometer was used, any without.
-    covariance : (n, 3, 3), optional
-        Of the body-side attitude error, rad².
-    axis : {"x", "y", "z", "-x", "-y", "-z"}
-        The body axis that points forward.
+    attitude : array_like (n, 4)
+        Unit quaternions q_fb, fixed frame East-North-Up. North is that of the estimate: magnetic with a magnetometer, arbitrary
+        without.
+    covariance : array_like (n, 3, 3), optional
+        Covariance of the body-side attitude error, rad².
+    axis : {"x", "y", "z", "-x", "-y", "-z"}, default "x"
+        Body axis that points forward.
 
     Returns
     -------
     Angles
-        (n,); σ is infinite where the axis points up or down.
+        Heading (n,), rad in [0, 2π); σ is infinite where the axis points up or down.
+
+    Examples
+    --------
+    >>> heading([[1.0, 0.0, 0.0, 0.0]]).angles.round(6).tolist()  # x points East
+    [1.570796]
     """
     q = unit_quaternions("attitude", array("attitude", attitude, ("n", 4)))
     one_of("axis", axis, ("x", "y", "z", "-x", "-y", "-z"))
@@ -152,20 +175,39 @@ def _skew(v: Array) -> Array:
 
 
 def to_ned(attitude: ArrayLike, *, body_flu: bool = False) -> Array:
-    """Return attitudes (n, 4) to East-North-Up as attitudes to North-East-Down.
+    """Return attitudes relative to East-North-Up as attitudes relative to North-East-Down.
 
     Parameters
     ----------
-    attitude : (n, 4)
-    body_flu : bool
-        The body axes are forward, left, up, and forward, right, down ones are wanted; without, body axes stay as they are.
+    attitude : array_like (n, 4)
+        Unit quaternions q_fb, fixed frame East-North-Up.
+    body_flu : bool, default False
+        Whether the body axes are forward-left-up and are to become forward-right-down; they stay as they are otherwise.
+
+    Returns
+    -------
+    ndarray (n, 4)
+        Unit quaternions, fixed frame North-East-Down.
     """
     turned = quaternion.multiply(NED_OF_ENU, array("attitude", attitude, (..., 4)))
     return quaternion.multiply(turned, FRD_OF_FLU) if body_flu else turned
 
 
 def from_ned(attitude: ArrayLike, *, body_frd: bool = False) -> Array:
-    """Return attitudes (n, 4) to North-East-Down as attitudes to East-North-Up, the inverse of :func:`to_ned`."""
+    """Return attitudes relative to North-East-Down as attitudes relative to East-North-Up, the inverse of :func:`to_ned`.
+
+    Parameters
+    ----------
+    attitude : array_like (n, 4)
+        Unit quaternions q_fb, fixed frame North-East-Down.
+    body_frd : bool, default False
+        Whether the body axes are forward-right-down and are to become forward-left-up; they stay as they are otherwise.
+
+    Returns
+    -------
+    ndarray (n, 4)
+        Unit quaternions, fixed frame East-North-Up.
+    """
     turned = quaternion.multiply(NED_OF_ENU, array("attitude", attitude, (..., 4)))
     return quaternion.multiply(turned, FRD_OF_FLU) if body_frd else turned
 
@@ -173,18 +215,28 @@ def from_ned(attitude: ArrayLike, *, body_frd: bool = False) -> Array:
 def free_acceleration(
     attitude: ArrayLike, specific_force: ArrayLike, *, gravity: float = STANDARD_GRAVITY, fixed: bool = True
 ) -> Array:
-    """Return the acceleration without gravity (n, 3), m/s²: ``R f − g up``.
+    """Return the acceleration without gravity, ``R f − g up``.
 
     Parameters
     ----------
-    attitude : (n, 4)
-        q_fb, fixed frame z up.
-    specific_force : (n, 3)
-        m/s², body axes; rows of NaN stay so.
-    gravity : float
-        m/s².
-    fixed : bool
-        In the fixed frame, or (False) in body axes.
+    attitude : array_like (n, 4)
+        Unit quaternions q_fb, fixed z axis up.
+    specific_force : array_like (n, 3)
+        Specific force, m/s², body axes; rows of NaN stay NaN.
+    gravity : float, default 9.80665
+        Acceleration of gravity, m/s².
+    fixed : bool, default True
+        Axes of the result: fixed, or body.
+
+    Returns
+    -------
+    ndarray (n, 3)
+        Acceleration, m/s².
+
+    Examples
+    --------
+    >>> free_acceleration([[1.0, 0.0, 0.0, 0.0]], [[0.5, 0.0, STANDARD_GRAVITY]]).tolist()
+    [[0.5, 0.0, 0.0]]
     """
     q = unit_quaternions("attitude", array("attitude", attitude, ("n", 4)))
     f = array("specific_force", specific_force, (len(q), 3), allow_nan=True)
@@ -203,18 +255,25 @@ def table(
     Parameters
     ----------
     estimate : Estimate
+        Estimate.
     recording : Recording, optional
-        What the estimate was made from: its clock, its rate without the bias, and its acceleration without gravity go along.
-    sequence : str
-        Of the Euler angles, as :func:`euler` takes it.
-    frame : {"ENU", "NED"}
+        Recording that the estimate was made from: adds its clock, its rate without the bias, and its acceleration without gravity.
+    sequence : str, default "ZYX"
+        Sequence of the Euler angles, as in :func:`euler`.
+    frame : {"ENU", "NED"}, default "ENU"
         Fixed frame of quaternion, angles and acceleration; body axes stay as they are.
 
     Returns
     -------
-    dict
-        ``time_s`` (or ``time_ns`` of a clock that counts from 1970), ``qw qx qy qz``, the angles and their σ in degrees, ``heading_deg``
-        of the body's x axis from North towards East, bias and σ in °/h, ``rate_*_rad_per_s``, ``free_acceleration_*_m_per_s2``.
+    dict of str to ndarray (m,)
+        ``time_s`` (or ``time_ns`` of a clock that counts from 1970), ``qw qx qy qz``, the angles and their σ in degrees,
+        ``heading_deg`` of the body x axis from North towards East, bias and σ in °/h, ``rate_*_rad_per_s``,
+        ``free_acceleration_*_m_per_s2``.
+
+    Raises
+    ------
+    InputError
+        If a time of the estimate is not a stamp of the recording.
     """
     one_of("frame", frame, FRAMES)
     P = attitude_covariance(estimate)

@@ -1,7 +1,7 @@
 """Quaternion algebra: Hamilton product, scalar first ``(w, x, y, z)``, shape ``(..., 4)``, vectorised over leading axes.
 
-A unit quaternion ``q_fb`` takes body vectors to the fixed frame, ``v_f = q_fb ⊗ v_b ⊗ q_fb⁻¹`` (equation (5) of the source document).
-Equation numbers below are those of *Quaternion differentiation*, the document this project comes from.
+A unit quaternion ``q_fb`` takes body vectors to the fixed frame, ``v_f = q_fb ⊗ v_b ⊗ q_fb⁻¹``. Equation numbers are those of
+*Quaternion differentiation*; this is equation (5).
 """
 
 from __future__ import annotations
@@ -19,19 +19,56 @@ from strapdown.checks import covariance as checked
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
+__all__ = [
+    "IDENTITY",
+    "angle_between",
+    "conjugate",
+    "exp",
+    "from_euler",
+    "from_matrix",
+    "from_mrp",
+    "from_rotation",
+    "inverse",
+    "log",
+    "mean",
+    "multiply",
+    "normalize",
+    "rotate",
+    "to_euler",
+    "to_matrix",
+    "to_mrp",
+    "to_rotation",
+]
+
 IDENTITY: Array = np.array([1.0, 0.0, 0.0, 0.0])
 IDENTITY.flags.writeable = False
 
 LONGEST = 1e150
-"""A rotation vector with a larger component, rad, has no norm in double precision."""
+"""Largest component of a rotation vector, rad; the square of a larger one overflows."""
 ROTATION_MATRIX_TOLERANCE = 1e-6
-"""Largest entry of ``R Rᵀ − I`` that is taken for rounding."""
+"""Largest entry of ``R Rᵀ − I`` that counts as rounding."""
 UNDETERMINED = 1e-9
-"""Gap between the two least losses of a mean, over the largest, below which the mean is not determined."""
+"""Relative gap between the two smallest losses of a mean below which the mean is not unique."""
 
 
 def multiply(p: ArrayLike, q: ArrayLike) -> Array:
-    """Return the Hamilton product p ⊗ q, shapes (..., 4) broadcast; neither need be of unit norm."""
+    """Return the Hamilton product p ⊗ q.
+
+    Parameters
+    ----------
+    p, q : array_like (..., 4)
+        Quaternions of any norm; their leading axes broadcast.
+
+    Returns
+    -------
+    ndarray (..., 4)
+        Product p ⊗ q.
+
+    Examples
+    --------
+    >>> multiply([0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]).tolist()  # i j = k
+    [0.0, 0.0, 0.0, 1.0]
+    """
     a, b = array("p", p, (..., 4)), array("q", q, (..., 4))
     pw, px, py, pz = np.moveaxis(a, -1, 0)
     qw, qx, qy, qz = np.moveaxis(b, -1, 0)
@@ -49,7 +86,7 @@ def multiply(p: ArrayLike, q: ArrayLike) -> Array:
 
 @contextlib.contextmanager
 def _together(**given: Array) -> Iterator[None]:
-    """Say in words where leading axes do not go together."""
+    """Raise an InputError where leading axes do not broadcast."""
     try:
         yield
     except ValueError:
@@ -58,12 +95,44 @@ def _together(**given: Array) -> Iterator[None]:
 
 
 def conjugate(q: ArrayLike) -> Array:
-    """Return the conjugate (w, −x, −y, −z)."""
+    """Return the conjugate (w, −x, −y, −z).
+
+    Parameters
+    ----------
+    q : array_like (..., 4)
+        Quaternions of any norm.
+
+    Returns
+    -------
+    ndarray (..., 4)
+        Conjugates; the inverses of unit quaternions, equation (12).
+    """
     return np.asarray(array("q", q, (..., 4)) * np.array([1.0, -1.0, -1.0, -1.0]))
 
 
 def inverse(q: ArrayLike) -> Array:
-    """Return q⁻¹, the conjugate divided by the *squared* norm, so that q ⊗ q⁻¹ = 1 (8) for any norm but zero."""
+    """Return q⁻¹, so that q ⊗ q⁻¹ = 1, equation (8).
+
+    Parameters
+    ----------
+    q : array_like (..., 4)
+        Quaternions of any norm except zero.
+
+    Returns
+    -------
+    ndarray (..., 4)
+        The conjugate divided by the *squared* norm.
+
+    Raises
+    ------
+    InputError
+        If a quaternion is zero.
+
+    Examples
+    --------
+    >>> inverse([2.0, 0.0, 0.0, 0.0]).tolist()
+    [0.5, -0.0, -0.0, -0.0]
+    """
     value = array("q", q, (..., 4))
     scale = _scale(value)
     value = value / scale
@@ -71,7 +140,23 @@ def inverse(q: ArrayLike) -> Array:
 
 
 def normalize(q: ArrayLike) -> Array:
-    """Return q / |q|; a zero quaternion is refused."""
+    """Return q / |q|, of unit norm, equation (1).
+
+    Parameters
+    ----------
+    q : array_like (..., 4)
+        Quaternions of any norm except zero.
+
+    Returns
+    -------
+    ndarray (..., 4)
+        Unit quaternions.
+
+    Raises
+    ------
+    InputError
+        If a quaternion is zero.
+    """
     value = array("q", q, (..., 4))
     value = value / _scale(value)
     return np.asarray(value / np.linalg.norm(value, axis=-1, keepdims=True))
@@ -88,9 +173,24 @@ def _scale(value: Array) -> Array:
 
 
 def rotate(q: ArrayLike, v: ArrayLike) -> Array:
-    """Return q ⊗ v ⊗ q⁻¹ (5): a body vector in the fixed frame, for unit ``q_fb`` (..., 4) and ``v_b`` (..., 3).
+    """Return q ⊗ v ⊗ q⁻¹, equation (5): body vectors in the fixed frame.
 
-    Rotate by ``conjugate(q)`` for the way back.
+    Parameters
+    ----------
+    q : array_like (..., 4)
+        Unit quaternions q_fb; their conjugates take fixed-frame vectors to the body.
+    v : array_like (..., 3)
+        Vectors in body axes, any unit; leading axes broadcast with those of q.
+
+    Returns
+    -------
+    ndarray (..., 3)
+        The vectors in fixed axes.
+
+    Examples
+    --------
+    >>> rotate([0.5, 0.5, 0.5, 0.5], [1.0, 0.0, 0.0]).tolist()  # x → y → z → x
+    [0.0, 1.0, 0.0]
     """
     value = unit_quaternions("q", q)
     vector = array("v", v, (..., 3))
@@ -102,11 +202,32 @@ def rotate(q: ArrayLike, v: ArrayLike) -> Array:
 
 
 def exp(rotation_vector: ArrayLike) -> Array:
-    """Return the unit quaternion (cos θ/2, φ/θ sin θ/2) of a rotation vector φ (..., 3), rad, θ = |φ|. Any θ."""
+    """Return the unit quaternion (cos θ/2, φ/θ sin θ/2) of a rotation vector φ, θ = |φ|.
+
+    Parameters
+    ----------
+    rotation_vector : array_like (..., 3)
+        φ, rad, of any length.
+
+    Returns
+    -------
+    ndarray (..., 4)
+        Unit quaternions.
+
+    Raises
+    ------
+    InputError
+        If a component exceeds 1e150 rad.
+
+    Examples
+    --------
+    >>> exp([0.0, 0.0, np.pi]).round(12).tolist()
+    [0.0, 0.0, 0.0, 1.0]
+    """
     phi = array("rotation_vector", rotation_vector, (..., 3))
     longest = float(np.max(np.abs(phi), initial=0.0))
     if longest > LONGEST:
-        raise InputError(f"rotation_vector holds {longest:g} rad, and nothing turns so far; check the unit")
+        raise InputError(f"rotation_vector holds {longest:g} rad, more than {LONGEST:g} rad; check the unit")
     half = 0.5 * np.linalg.norm(phi, axis=-1, keepdims=True)
     # sin x / x needs no series: the quotient is accurate for every x but zero.
     safe = np.where(half > 0.0, half, 1.0)
@@ -115,9 +236,22 @@ def exp(rotation_vector: ArrayLike) -> Array:
 
 
 def log(q: ArrayLike) -> Array:
-    """Return the rotation vector (..., 3), rad, of unit quaternions; the shorter way round, |φ| ≤ π.
+    """Return the rotation vector of the shorter rotation, |φ| ≤ π, of unit quaternions.
 
-    ``q`` and ``−q`` are the same attitude and give the same vector; at half a turn exactly (w = 0) both ±φ are right.
+    Parameters
+    ----------
+    q : array_like (..., 4)
+        Unit quaternions q_fb.
+
+    Returns
+    -------
+    ndarray (..., 3)
+        φ, rad. ``q`` and ``−q`` are the same attitude and give the same vector; at half a turn exactly (w = 0) both ±φ are right.
+
+    Examples
+    --------
+    >>> log([0.0, 0.0, 0.0, 1.0]).round(6).tolist()
+    [0.0, 0.0, 3.141593]
     """
     value = unit_quaternions("q", q)
     w, u = value[..., :1], value[..., 1:]
@@ -132,7 +266,18 @@ def log(q: ArrayLike) -> Array:
 
 
 def to_matrix(q: ArrayLike) -> Array:
-    """Return the rotation matrix R_fb (..., 3, 3) of unit quaternions q_fb: v_f = R_fb v_b."""
+    """Return the rotation matrices R_fb of unit quaternions, v_f = R_fb v_b.
+
+    Parameters
+    ----------
+    q : array_like (..., 4)
+        Unit quaternions q_fb.
+
+    Returns
+    -------
+    ndarray (..., 3, 3)
+        Rotation matrices.
+    """
     from strapdown.kernels.rotation import rotation_matrix
 
     value = unit_quaternions("q", q)
@@ -141,14 +286,26 @@ def to_matrix(q: ArrayLike) -> Array:
 
 
 def from_matrix(matrix: ArrayLike) -> Array:
-    """Return unit quaternions q_fb (..., 4), w ≥ 0, of rotation matrices R_fb (..., 3, 3).
+    """Return the unit quaternions of rotation matrices.
 
-    Shepperd's method: the largest of the four components is computed first, so no branch divides by a small number.
+    Parameters
+    ----------
+    matrix : array_like (..., 3, 3)
+        Rotation matrices R_fb, v_f = R_fb v_b; orthogonal to 1e-6.
+
+    Returns
+    -------
+    ndarray (..., 4)
+        Unit quaternions q_fb, w ≥ 0.
 
     Raises
     ------
     InputError
         If a matrix is not orthogonal or is a reflection.
+
+    Notes
+    -----
+    Shepperd's method (1978): the largest of the four components is computed first, so that no branch divides by a small number.
     """
     R = array("matrix", matrix, (..., 3, 3))
     defect = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(axis=(-2, -1))
@@ -175,40 +332,84 @@ def from_matrix(matrix: ArrayLike) -> Array:
 
 
 def to_rotation(q: ArrayLike) -> Rotation:
-    """Return the ``scipy.spatial.transform.Rotation`` that takes body vectors to the fixed frame (its storage is scalar last)."""
+    """Return a SciPy ``Rotation`` that takes body vectors to the fixed frame.
+
+    Parameters
+    ----------
+    q : array_like (..., 4)
+        Unit quaternions q_fb, scalar first.
+
+    Returns
+    -------
+    scipy.spatial.transform.Rotation
+        The same rotations; SciPy stores quaternions scalar last.
+    """
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_quat(np.roll(unit_quaternions("q", q), -1, axis=-1))
 
 
 def from_rotation(rotation: Rotation) -> Array:
-    """Return unit quaternions q_fb, scalar first, of a SciPy ``Rotation`` that takes body vectors to the fixed frame."""
+    """Return the unit quaternions, scalar first, of a SciPy ``Rotation``.
+
+    Parameters
+    ----------
+    rotation : scipy.spatial.transform.Rotation
+        Rotations that take body vectors to the fixed frame.
+
+    Returns
+    -------
+    ndarray (..., 4)
+        Unit quaternions q_fb.
+    """
     return np.roll(np.asarray(rotation.as_quat(), dtype=np.float64), 1, axis=-1)
 
 
 def angle_between(p: ArrayLike, q: ArrayLike) -> Array:
-    """Return the angle (...,), rad in [0, π], of the rotation that takes attitude p to attitude q. Accurate for tiny angles too."""
+    """Return the angle of the rotation that takes attitude p to attitude q.
+
+    Parameters
+    ----------
+    p, q : array_like (..., 4)
+        Unit quaternions; their leading axes broadcast.
+
+    Returns
+    -------
+    ndarray (...,)
+        Angle, rad, in [0, π]; accurate for tiny angles too.
+
+    Examples
+    --------
+    >>> float(angle_between(IDENTITY, exp([0.0, 0.0, 1e-9])).round(15))
+    1e-09
+    """
     return np.asarray(
         np.linalg.norm(log(multiply(conjugate(unit_quaternions("p", p)), unit_quaternions("q", q))), axis=-1)
     )
 
 
 def to_euler(q: ArrayLike, sequence: str = "ZYX") -> Array:
-    """Return Euler angles (..., 3), rad, of unit quaternions q_fb, in the order of the sequence.
+    """Return Euler angles of unit quaternions, in the order of the sequence.
 
     Parameters
     ----------
     q : array_like (..., 4)
+        Unit quaternions q_fb.
     sequence : str, default "ZYX"
-        Axes of the three turns as SciPy names them: capitals about the body's axes as they turn, small letters about the fixed ones. The
-        default is yaw ψ, pitch θ, roll φ with R_fb = R_z(ψ) R_y(θ) R_x(φ): of a fixed frame whose z axis points down, heading, elevation
-        and bank of an aircraft.
+        Axes of the three rotations in SciPy's notation: capitals about the rotating body axes, small letters about the fixed axes.
+        The default is yaw ψ, pitch θ, roll φ with R_fb = R_z(ψ) R_y(θ) R_x(φ): where the fixed z axis points down, the heading,
+        elevation and bank of an aircraft.
 
     Returns
     -------
-    array (..., 3)
-        The middle angle in [−π/2, π/2], or [0, π] where first and last axis are the same; the others in [−π, π]. Where first and last
-        turn are about one line (a pitch of ±π/2) the last angle is 0, and SciPy warns.
+    ndarray (..., 3)
+        Angles, rad. The middle one lies in [−π/2, π/2], or in [0, π] where the first and last axes are the same; the others in [−π,
+        π]. In gimbal lock (a pitch of ±π/2) the last angle is 0, and SciPy warns.
+
+    Raises
+    ------
+    InputError
+        If the sequence is not one of three axes.
 
     Examples
     --------
@@ -222,7 +423,25 @@ def to_euler(q: ArrayLike, sequence: str = "ZYX") -> Array:
 
 
 def from_euler(angles: ArrayLike, sequence: str = "ZYX") -> Array:
-    """Return unit quaternions q_fb (..., 4), w ≥ 0, of Euler angles (..., 3), rad; the inverse of :func:`to_euler`."""
+    """Return the unit quaternions of Euler angles, the inverse of :func:`to_euler`.
+
+    Parameters
+    ----------
+    angles : array_like (..., 3)
+        Angles in the order of the sequence, rad.
+    sequence : str, default "ZYX"
+        Axes of the three rotations, as in :func:`to_euler`.
+
+    Returns
+    -------
+    ndarray (..., 4)
+        Unit quaternions q_fb, w ≥ 0.
+
+    Raises
+    ------
+    InputError
+        If the sequence is not one of three axes.
+    """
     from scipy.spatial.transform import Rotation
 
     value = array("angles", angles, (..., 3))
@@ -233,7 +452,7 @@ def from_euler(angles: ArrayLike, sequence: str = "ZYX") -> Array:
 
 @contextlib.contextmanager
 def _named_sequence(sequence: str) -> Iterator[None]:
-    """Refuse what names no three turns, in words."""
+    """Raise an InputError for a sequence that is not one of three axes."""
     if not isinstance(sequence, str) or len(sequence) != 3:
         raise InputError(f"sequence is {sequence!r}; give three axes, as 'ZYX'")
     try:
@@ -245,13 +464,35 @@ def _named_sequence(sequence: str) -> Iterator[None]:
 
 
 def to_mrp(q: ArrayLike) -> Array:
-    """Return modified Rodrigues parameters tan(θ/4) n (..., 3) of unit quaternions q_fb, those of the shorter way round: |p| ≤ 1."""
+    """Return the modified Rodrigues parameters p = tan(θ/4) n of unit quaternions.
+
+    Parameters
+    ----------
+    q : array_like (..., 4)
+        Unit quaternions q_fb.
+
+    Returns
+    -------
+    ndarray (..., 3)
+        Parameters of the shorter rotation, |p| ≤ 1 (Schaub & Junkins 1996).
+    """
     value = unit_quaternions("q", q)
     return np.asarray(to_rotation(value.reshape(-1, 4)).as_mrp()).reshape(*value.shape[:-1], 3)
 
 
 def from_mrp(mrp: ArrayLike) -> Array:
-    """Return unit quaternions q_fb (..., 4), w ≥ 0, of modified Rodrigues parameters p (..., 3); p and −p/|p|² give the same."""
+    """Return the unit quaternions of modified Rodrigues parameters.
+
+    Parameters
+    ----------
+    mrp : array_like (..., 3)
+        p = tan(θ/4) n; p and its shadow −p/|p|² are the same attitude.
+
+    Returns
+    -------
+    ndarray (..., 4)
+        Unit quaternions q_fb, w ≥ 0.
+    """
     from scipy.spatial.transform import Rotation
 
     value = array("mrp", mrp, (..., 3))
@@ -263,24 +504,31 @@ def _with_positive_w(q: Array) -> Array:
 
 
 def mean(q: ArrayLike, covariance: ArrayLike | None = None) -> tuple[Array, Array]:
-    """Return the mean of attitudes (4,), w ≥ 0, and the covariance of its error (3, 3), rad², body side, body axes.
+    """Return the mean of attitudes and the covariance of its error.
 
-    The mean is the most likely attitude for small errors: the unit quaternion of least ``Σ v_iᵀ R_i⁻¹ v_i``, v_i the vector part of
-    ``q_i⁻¹ ⊗ q``, by the eigenvectors of a matrix (4, 4) (Markley, Cheng, Crassidis & Oshman 2007, J. Guid. Control Dyn. 30). The signs of
-    the quaternions do not matter.
+    The mean is the most likely attitude for small errors: the unit quaternion that minimises ``Σ v_iᵀ R_i⁻¹ v_i``, v_i the vector
+    part of ``q_i⁻¹ ⊗ q``, found as an eigenvector of a 4 × 4 matrix (Markley, Cheng, Crassidis & Oshman 2007, J. Guid. Control Dyn.
+    30). The signs of the quaternions do not matter.
 
     Parameters
     ----------
     q : array_like (n, 4)
         Unit quaternions q_fb.
     covariance : array_like (3, 3) or (n, 3, 3), optional
-        R of the error of each, δθ of ``q_i = q ⊗ exp(δθ)``, rad². Default: all alike, and the covariance of the mean is found from their
-        scatter, which takes two attitudes or more.
+        Covariance R_i of each error δθ, ``q_i = q ⊗ exp(δθ)``, rad², body axes. Default: equal weights, and the covariance of the
+        mean comes from the scatter of two attitudes or more.
+
+    Returns
+    -------
+    mean : ndarray (4,)
+        Unit quaternion q_fb, w ≥ 0.
+    covariance : ndarray (3, 3)
+        Covariance of its error δθ, rad², body axes.
 
     Raises
     ------
     InputError
-        If no mean is the best, as of attitudes half a turn apart, or a covariance is not symmetric and positive definite.
+        If the mean is not unique, as of attitudes half a turn apart, or a covariance is not symmetric and positive definite.
 
     Examples
     --------
@@ -292,7 +540,7 @@ def mean(q: ArrayLike, covariance: ArrayLike | None = None) -> tuple[Array, Arra
     n = len(value)
     if covariance is None:
         if n < 2:
-            raise InputError(f"q holds {n} attitudes; their scatter takes two or more, or give the covariance of each")
+            raise InputError(f"q holds {n} attitudes; the scatter needs two or more, or give the covariance of each")
         information = np.broadcast_to(np.eye(3), (n, 3, 3))
     else:
         if n < 1:
@@ -305,7 +553,7 @@ def mean(q: ArrayLike, covariance: ArrayLike | None = None) -> tuple[Array, Arra
     rows = np.concatenate([-v[:, :, None], w * np.eye(3) - np.cross(np.eye(3), v[:, None, :])], axis=2)
     loss, vectors = np.linalg.eigh(np.einsum("nia,nij,njb->ab", rows, information, rows))
     if loss[1] - loss[0] < UNDETERMINED * loss[-1]:
-        raise InputError("the attitudes have no mean: others are as near to all of them; are two half a turn apart?")
+        raise InputError("the mean of the attitudes is not unique; are two of them half a turn apart?")
     best = _with_positive_w(vectors[:, 0])
     if covariance is not None:
         return best, np.asarray(np.linalg.inv(np.sum(information, axis=0)))

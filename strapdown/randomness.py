@@ -1,4 +1,4 @@
-"""Randomness is an argument: one independent stream for every (seed, run, source), whatever else is simulated and by how many workers."""
+"""Random streams: one independent stream for every (seed, run, source), whatever else is simulated and by how many workers."""
 
 from __future__ import annotations
 
@@ -8,12 +8,35 @@ import numpy as np
 
 from strapdown.checks import count
 
+__all__ = [
+    "generator",
+]
+
 
 def generator(seed: int, run: int, source: str) -> np.random.Generator:
-    """Return the random stream of one source (``"gyro"``, ``"star tracker"``, …) in one run.
+    """Return the random stream of one source in one run.
 
-    The stream depends on these three alone: adding a sensor, changing the order of runs or the number of workers changes no other
-    stream. (``SeedSequence`` with the run and the CRC-32 of the source's name as spawn key.)
+    The stream depends on these three alone: adding a sensor, or changing the order of runs or the number of workers, changes no
+    other stream.
+
+    Parameters
+    ----------
+    seed : int
+        Seed of the study, ≥ 0.
+    run : int
+        Number of the run, ≥ 0.
+    source : str
+        Name of the source, such as ``"gyro"`` or ``"star tracker"``.
+
+    Returns
+    -------
+    numpy.random.Generator
+        The stream, of ``SeedSequence(seed)`` with the run and the CRC-32 of the source's name as spawn key.
+
+    Examples
+    --------
+    >>> bool(generator(1, 0, "gyro").random() == generator(1, 0, "gyro").random())
+    True
     """
     key = (count("run", run, least=0), zlib.crc32(source.encode()))
     return np.random.default_rng(np.random.SeedSequence(count("seed", seed, least=0), spawn_key=key))

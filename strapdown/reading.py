@@ -1,8 +1,8 @@
-"""Reading files: the one layer that every file passes on its way in, whatever its format.
+"""Reading files: the one layer that opens every input file, whatever its format.
 
 A file may be damaged, of another kind, or made to do harm. So each format has one function here that opens it: no other module opens a
-file to read it. Whatever is wrong with a file is an :class:`~strapdown.checks.InputError` that names it, raised within
-:func:`from_file`, and sizes are checked before memory is taken.
+file to read it. Every fault of a file is an :class:`~strapdown.checks.InputError` that names it, raised within
+:func:`from_file`, and sizes are checked before memory is allocated.
 
 HDF5 files of this package begin with a block of 512 bytes (a *user block*, which other programs skip) that holds the SHA-256 of all that
 follows. It is compared before the HDF5 library sees the file, because that library may loop for ever, or crash, on damaged ones. A file
@@ -32,13 +32,15 @@ import numpy as np
 
 from strapdown.checks import InputError
 
+__all__: list[str] = []
+
 Name = str | os.PathLike[str]
 
 LIMIT = "STRAPDOWN_MAX_MB"
 """Environment variable: most megabytes that one file may hold, unpacked."""
 DEFAULT_LIMIT = 4096
 TABLE_SHARE = 64
-"""TOML and JSON may be so many times smaller: they take that much more memory than their text."""
+"""Factor by which TOML and JSON must be smaller than the limit: parsed, they need that much more memory than their text."""
 PACKING = 1100
 """Greatest ratio of an array to its compressed form: deflate reaches 1032."""
 DOTTED_KEYS = 32
@@ -60,9 +62,9 @@ class NoDigestWarning(UserWarning):
 
 @contextlib.contextmanager
 def from_file(path: Name) -> Iterator[None]:
-    """Raise what goes wrong within as an InputError that names the file.
+    """Raise any exception within as an InputError that names the file.
 
-    The content of a file decides what the code within meets, so any exception is the file's fault; the original is chained to the error.
+    The content of the file is the input of the code within, so any exception is the file's fault; the original is chained to the error.
     """
     try:
         yield
@@ -87,7 +89,7 @@ def _short(text: str) -> str:
 
 
 def limit() -> int:
-    """Return how many bytes one file may hold, unpacked: 4 GB, or what the environment variable ``STRAPDOWN_MAX_MB`` says."""
+    """Return how many bytes one file may hold, unpacked: 4 GB, or the environment variable ``STRAPDOWN_MAX_MB``."""
     told = os.environ.get(LIMIT, str(DEFAULT_LIMIT))
     if not told.isdecimal() or int(told) == 0:
         raise InputError(f"the environment variable {LIMIT} is {told!r}; it must be a whole number of megabytes")
@@ -104,13 +106,13 @@ def existing_file(path: Name) -> None:
 def opened(path: Name, *, link: bool = True, most: int | None = None) -> Iterator[io.BufferedReader]:
     """Yield a regular file of at most ``most`` bytes (by default :func:`limit`), open for reading.
 
-    ``link`` False refuses a symbolic link: of a file that the user did not name, it would show whoever reads the result another one.
+    ``link`` False refuses a symbolic link: of a file that the user did not name, it could expose another file in the result.
     """
     most = limit() if most is None else most
     if not link and Path(path).is_symlink():
         raise InputError(f"{path} is a symbolic link, which is not followed here; put the file itself there")
     try:
-        # Without blocking, so that a pipe that nobody writes to is opened and then refused.
+        # Without blocking, so that a pipe without a writer is opened and then refused.
         handle = os.fdopen(os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)), "rb")
     except FileNotFoundError:
         raise InputError(f"{path} does not exist; check the path") from None
@@ -143,7 +145,7 @@ def content(path: Name, *, link: bool = True, most: int | None = None) -> bytes:
     with from_file(path), opened(path, link=link, most=most) as handle:
         most = limit() if most is None else most
         found = handle.read(most + 1)
-        _need_size(path, len(found), most)  # one that tells no size (/proc), or grows
+        _need_size(path, len(found), most)  # one without a stated size (/proc), or that grows
         return found
 
 

@@ -1,7 +1,7 @@
 """IMU records in files: HDF5, whole and self-describing; CSV, for exchange.
 
-HDF5 holds everything to the last bit: increments, every vector series, the truth, the specification of the gyro, the scenario, seed, units,
-conventions and version. CSV holds the gyro in one file, and each vector series in one beside it.
+HDF5 holds everything to the last bit: increments, every vector series, the truth, the specification of the gyro, the scenario,
+seed, units, conventions and version. CSV holds the gyro in one file, and each vector series in a further one.
 """
 
 from __future__ import annotations
@@ -25,6 +25,15 @@ from strapdown.gyro import GyroSpec
 from strapdown.records import CONVENTIONS, ImuRecord, Truth, put, result_file
 from strapdown.vectors import KINDS, VectorMeasurements
 
+__all__ = [
+    "RecordFile",
+    "export_csv",
+    "import_csv",
+    "read_record",
+    "read_record_file",
+    "write_record",
+]
+
 KIND = "strapdown record"
 """The attribute ``kind`` of a record's file."""
 
@@ -34,19 +43,33 @@ FORMAT = 1
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RecordFile:
-    """A record with what its file tells of its making."""
+    """A record and how it was made, as its file states.
+
+    Parameters
+    ----------
+    record : ImuRecord
+        The record.
+    gyro : GyroSpec, optional
+        Specification of the gyro that it was simulated with.
+    scenario : str, default ""
+        The scenario, as TOML.
+    seed : int, optional
+        Seed of the random streams.
+    run : int, optional
+        Run of the random streams.
+    version : str, default that of the running package
+        Version of the package that wrote it.
+    attributes : mapping of str, default empty
+        Further attributes, numbers and texts.
+    """
 
     record: ImuRecord
     gyro: GyroSpec | None = None
-    """The specification it was simulated with."""
     scenario: str = ""
-    """The scenario, as TOML."""
     seed: int | None = None
     run: int | None = None
     version: str = strapdown.__version__
-    """Version of the package that wrote it."""
     attributes: Mapping[str, Any] = field(default_factory=dict)
-    """Further attributes: numbers and texts."""
 
 
 _SERIES = {
@@ -76,15 +99,23 @@ def write_record(
 
     Parameters
     ----------
-    path : path
+    path : path-like
+        File.
     record : ImuRecord
+        Record.
     gyro_spec : GyroSpec, optional
-    scenario : str
-        The scenario as TOML (:func:`strapdown.scenarios.scenario_to_toml`).
+        Specification of the gyro that it was simulated with.
+    scenario : str, default ""
+        Scenario as TOML (:func:`strapdown.scenarios.scenario_to_toml`).
     seed, run : int, optional
-        What the streams of random numbers were named by.
-    attributes : mapping, optional
+        Seed and run of the random streams.
+    attributes : mapping of str, optional
         Further attributes of the file.
+
+    Raises
+    ------
+    InputError
+        If an attribute has the name of one that the file has already.
     """
     for name in attributes or {}:
         if name in _RESERVED:
@@ -120,7 +151,7 @@ def write_record(
 
 
 def is_record(path: str | os.PathLike[str]) -> bool:
-    """Return whether a file says that :func:`write_record` or :func:`export_csv` wrote it; its content is not checked."""
+    """Return whether a file is marked as written by :func:`write_record` or :func:`export_csv`; its content is not checked."""
     if _begins(path, f"{_MARK} record".encode()):
         return True
     if not reading.is_hdf5(path):
@@ -135,17 +166,43 @@ def _begins(path: str | os.PathLike[str], mark: bytes) -> bool:
 
 
 def read_record(path: str | os.PathLike[str]) -> ImuRecord:
-    """Read the record of a file written by :func:`write_record` or :func:`export_csv`."""
-    return read_record_file(path).record
+    """Read the record of a file written by :func:`write_record` or :func:`export_csv`.
 
+    Parameters
+    ----------
+    path : path-like
+        File.
 
-def read_record_file(path: str | os.PathLike[str]) -> RecordFile:
-    """Read a file written by :func:`write_record` or :func:`export_csv` with all that it tells.
+    Returns
+    -------
+    ImuRecord
+        The record.
 
     Raises
     ------
     InputError
-        If the file is missing, truncated, another kind of file, of a newer layout, or its units or conventions are not those of
+        As :func:`read_record_file`.
+    """
+    return read_record_file(path).record
+
+
+def read_record_file(path: str | os.PathLike[str]) -> RecordFile:
+    """Read a file written by :func:`write_record` or :func:`export_csv` with all that it holds.
+
+    Parameters
+    ----------
+    path : path-like
+        File.
+
+    Returns
+    -------
+    RecordFile
+        The record and how it was made.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, truncated, of another kind or a newer layout, or its units or conventions are not those of
         :func:`write_record`.
     """
     if _begins(path, _MARK.encode()):
@@ -156,7 +213,7 @@ def read_record_file(path: str | os.PathLike[str]) -> RecordFile:
         kind = told.get("kind")
         if kind != KIND:
             raise InputError(
-                f"{path} is {f'a {kind}' if kind else 'HDF5 of another program'}, not a {KIND}; pass one that write_record wrote"
+                f"{path} is {f'a {kind}' if kind else 'HDF5 of another program'}, not a {KIND}; pass one written by write_record"
             )
         if count("format", told["format"]) > FORMAT:
             raise InputError(
@@ -179,7 +236,7 @@ def read_record_file(path: str | os.PathLike[str]) -> RecordFile:
 
 
 def _making(told: Mapping[str, Any], path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Return what a file tells of how a record was made."""
+    """Return how a record was made, as its file states."""
     made: dict[str, Any] = {name: count(name, told[name], least=0) for name in ("seed", "run") if name in told}
     if "gyro" in told:
         table = told["gyro"]
@@ -187,13 +244,13 @@ def _making(told: Mapping[str, Any], path: str | os.PathLike[str]) -> dict[str, 
         made["gyro"] = gyro.from_table(table, f"{path}: gyro")
     if "scenario" in told:
         if not isinstance(told["scenario"], str):
-            raise InputError(f"{path}: scenario is {told['scenario']!r}; it must be a text of TOML")
+            raise InputError(f"{path}: scenario is {told['scenario']!r}; it must be TOML text")
         made["scenario"] = told["scenario"]
     return made
 
 
 def _values(group: Any, name: str, unit: str) -> Array:
-    """Return an array of a file, whose attribute ``unit``, where there is one, must be the one that it is read in."""
+    """Return an array of a file; its attribute ``unit``, if present, must be the expected one."""
     value = reading.numbers(group, name)
     told = reading.attributes(group[name]).get("unit", unit)
     if told != unit:
@@ -234,17 +291,37 @@ def export_csv(
     seed: int | None = None,
     run: int | None = None,
 ) -> tuple[Path, ...]:
-    """Write a record as CSV, 17 digits a number, and return the files; how it was made as :func:`write_record` is told it.
+    """Write a record as CSV, 17 digits per number.
 
-    ``path`` holds one row an edge: its time, the increment of the interval that ends there (none in the first row), and the truth if there
-    is one. Each vector series goes to ``STEM-vectors-N.csv`` beside it. The first line of each is a comment that tells what it is, the
-    time of its last row, and of the record how many series belong to it; then come the names of the columns, with their units. The record
-    is written last. Series that an earlier record of the same name had more are removed.
+    Parameters
+    ----------
+    path : path-like
+        File.
+    record : ImuRecord
+        Record.
+    gyro_spec : GyroSpec, optional
+        Specification of the gyro that it was simulated with.
+    scenario : str, default ""
+        Scenario as TOML (:func:`strapdown.scenarios.scenario_to_toml`).
+    seed, run : int, optional
+        Seed and run of the random streams.
+
+    Returns
+    -------
+    tuple of Path
+        Files written: the record, then its vector series.
 
     Raises
     ------
     InputError
-        If a sensor's noise differs by body axis, which CSV has no columns for; then nothing is written.
+        If the noise of a sensor differs by body axis, for which CSV has no columns; then nothing is written.
+
+    Notes
+    -----
+    ``path`` holds one row per edge: its time, the increment of the interval that ends there (NaN in the first row), and the truth
+    if there is one. Each vector series goes to ``STEM-vectors-N.csv`` in the same folder. The first line of each is a comment with
+    the kind of file, the time of its last row, and for the record the number of its series; the second names the columns, with
+    their units. The record is written last. Superfluous series of an earlier record of the same name are removed.
     """
     for series in record.vectors:
         if series.anisotropic:
@@ -311,16 +388,28 @@ def _write_csv(path: Path, comment: str, names: tuple[str, ...], rows: Array) ->
 
 
 def import_csv(path: str | os.PathLike[str]) -> ImuRecord:
-    """Read what :func:`export_csv` wrote, with the vector series beside the file.
+    """Read a record written by :func:`export_csv`, with the vector series in the same folder.
 
-    Measurements of NaN are missing ones. An increment has no such rows: what the body turned over an interval without one nobody knows,
-    and whoever made the file must say where the next increment begins. Left out, a row joins its interval to the next.
+    Parameters
+    ----------
+    path : path-like
+        File.
+
+    Returns
+    -------
+    ImuRecord
+        The record.
 
     Raises
     ------
     InputError
-        If the file is missing, is not such a file, does not go to the time that it tells of, or a row is cut short, holds no number or no
-        increment (its line is named).
+        If the file is missing or of another kind, does not reach the time stated in its first line, or a row is cut short, holds no
+        number or no increment (the message names its line).
+
+    Notes
+    -----
+    Measurements of NaN are missing. An increment must not be NaN: the rotation over an interval without one is unknown. If a row is
+    left out, the next one must hold the rotation over both intervals.
     """
     with reading.from_file(path):
         return _read_csv_record(Path(path)).record
@@ -329,7 +418,7 @@ def import_csv(path: str | os.PathLike[str]) -> ImuRecord:
 def _read_csv_record(target: Path) -> RecordFile:
     comment, names, rows = _read_csv(target)
     if not comment.startswith(f"{_MARK} record"):
-        raise InputError(f"{target} does not begin with '{_MARK} record'; it is no record that export_csv wrote")
+        raise InputError(f"{target} does not begin with '{_MARK} record'; it is not a record written by export_csv")
     if names not in (_GYRO_COLUMNS, _GYRO_COLUMNS + _TRUTH_COLUMNS):
         raise InputError(
             f"{target} has the columns {', '.join(names)}; wanted {', '.join(_GYRO_COLUMNS)} and perhaps {', '.join(_TRUTH_COLUMNS)}"
@@ -339,7 +428,7 @@ def _read_csv_record(target: Path) -> RecordFile:
     if len(lost):
         row, column = lost[0]
         raise InputError(
-            f"{target}, line {row + 4}: {names[column + 1]} is nan; leave the row out and give the next one the turn over both intervals"
+            f"{target}, line {row + 4}: {names[column + 1]} is nan; leave the row out; the next one needs the rotation over both"
         )
     truth = Truth(attitude=rows[:, 4:8], bias=rows[:, 8:11]) if len(names) > 4 else None
     series = tuple(_import_series(beside) for beside in _series_beside(target, comment))
@@ -359,17 +448,17 @@ def _read_csv_record(target: Path) -> RecordFile:
 
 
 def _need_end(path: Path, rows: Array, told: float | None) -> None:
-    """Refuse a file that ends at another time than it tells, None of one without rows: at the end of a line, a cut is not to be seen."""
+    """Refuse a file that ends at another time than its first line states (None: no rows): a cut between two lines leaves no other trace."""
     ends = rows[-1, 0] if len(rows) else None
     if ends != told:
         raise InputError(
-            f"{path} ends at {ends} s, its first line says {told} s; it was cut or added to: take it whole, or change the time there if "
-            "the rows are meant"
+            f"{path} ends at {ends} s, its first line states {told} s; it was truncated or extended: restore it, or "
+            "change the time there if the rows are intended"
         )
 
 
 def _series_beside(target: Path, comment: str) -> list[Path]:
-    """Return the files of vector series of a record: as many as it says; of one that says nothing, all that are numbered in turn."""
+    """Return the files of the vector series of a record: the stated number, or without one all that are numbered in sequence."""
     told = re.search(rf", (\d+){_COUNTED};", comment)
     if told is None:
         return list(itertools.takewhile(Path.is_file, (_series_file(target, number) for number in itertools.count())))
@@ -379,7 +468,7 @@ def _series_beside(target: Path, comment: str) -> list[Path]:
         files.append(file)
         if not file.is_file():
             raise InputError(
-                f"{file} does not exist, one of {told[1]} vector series of {target.name}; put it beside the record"
+                f"{file} does not exist, one of {told[1]} vector series of {target.name}; put it in the folder of the record"
             )
     return files
 
@@ -398,7 +487,7 @@ def _import_series(path: Path) -> VectorMeasurements:
         own: dict[str, Any] = {"sensor": head["sensor"], "kind": head["kind"], "time": rows[:, 0]}
         constant = bool(head["constant_reference"])
     except (ValueError, KeyError, TypeError):
-        raise InputError(f"{path} is no vector series that export_csv wrote; check its first two lines") from None
+        raise InputError(f"{path} is not a vector series written by export_csv; check its first two lines") from None
     if "last_time_s" in head:
         _need_end(path, rows, head["last_time_s"])
     if attitude:
@@ -416,7 +505,7 @@ def _read_csv(path: Path, *, link: bool = True) -> tuple[str, tuple[str, ...], A
     """Return the comment, the names of the columns and the rows; ``link`` as of :func:`strapdown.reading.opened`."""
     lines = reading.text(path, link=link).splitlines()
     if len(lines) < 2 or not lines[0].startswith(_MARK):
-        raise InputError(f"{path} does not begin with '{_MARK}'; it is no file that export_csv wrote")
+        raise InputError(f"{path} does not begin with '{_MARK}'; it is not a file written by export_csv")
     names = tuple(lines[1].split(","))
     rows = np.empty((len(lines) - 2, len(names)))
     for number, line in enumerate(lines[2:]):

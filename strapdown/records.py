@@ -1,7 +1,7 @@
 """The IMU record, the estimate, and their files.
 
-Everything is told by *edges*: the n + 1 times that bound the n sample intervals. A gyro sample is the rotation increment over its
-interval; attitude, bias and covariance are values at the edges. So nobody need ask which end of an interval a stamp means.
+All times are *edges*: the n + 1 times that bound the n sample intervals. A gyro sample is the rotation increment over its interval;
+attitude, bias and covariance are values at the edges. So it is never ambiguous which end of an interval a stamp means.
 """
 
 from __future__ import annotations
@@ -25,43 +25,72 @@ from strapdown.vectors import VectorMeasurements
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
+__all__ = [
+    "ErrorStateEstimate",
+    "Estimate",
+    "Event",
+    "ImuRecord",
+    "Innovations",
+    "Truth",
+    "compress",
+    "cut",
+    "read_estimate",
+    "read_states",
+    "read_truth",
+    "write_estimate",
+]
+
 CONVENTIONS = (
     "quaternions Hamilton, scalar first, body to fixed frame: v_f = q v_b q^-1; error state (dtheta, db): "
     "q_true = q exp(dtheta), db = b_true - b; SI units and radians"
 )
 
 LARGEST_BIAS = 1e6
-"""rad/s: no gyro has such a bias; an estimate that tells of one is of a filter that was lost, or damaged."""
+"""Largest credible gyro bias, rad/s; an estimate beyond it comes from a filter that diverged or a damaged file."""
 
 
 LARGEST_TURN = 1e6
-"""rad: nothing turns so far in one sample interval, nor does a filter cut such a turn into steps."""
+"""Largest rotation in one sample interval, rad; a filter could not divide a larger one into steps."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Truth:
-    """What only a simulation, or a reference system, knows."""
+    """True attitude and bias, known from a simulation or a reference system.
+
+    Parameters
+    ----------
+    attitude : ndarray (n + 1, 4)
+        True q_fb at the edges.
+    bias : ndarray (n + 1, 3)
+        True gyro bias at the edges, rad/s.
+    """
 
     attitude: Array
-    """True q_fb at the edges (n + 1, 4)."""
     bias: Array
-    """True gyro bias at the edges (n + 1, 3), rad/s."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ImuRecord:
     """Gyro increments and vector measurements over one run.
 
-    Arrays of floats are taken as they are and not copied, for a long record fills much of the memory: whoever goes on writing to a buffer
-    gives a copy of it.
+    Arrays of floats are kept without a copy, for a long record fills much of the memory: pass a copy of a buffer that is written to
+    afterwards.
+
+    Parameters
+    ----------
+    time : ndarray (n + 1,)
+        Edges of the sample intervals, s, strictly increasing.
+    increments : ndarray (n, 3)
+        Integrals of the measured body rate over each interval, rad.
+    vectors : tuple of VectorMeasurements, default empty
+        Vector measurements, one series per sensor, each with its own times.
+    truth : Truth, optional
+        True attitude and bias, where known.
     """
 
     time: Array
-    """Edges of the sample intervals (n + 1,), s, strictly increasing."""
     increments: Array
-    """Integrals of the measured body rate over each interval (n, 3), rad."""
     vectors: tuple[VectorMeasurements, ...] = ()
-    """Vector measurements, each with its own times."""
     truth: Truth | None = None
 
     def __post_init__(self) -> None:
@@ -72,8 +101,8 @@ class ImuRecord:
             row, axis = (int(i) for i in np.unravel_index(index, increments.shape))
             if abs(increments[row, axis]) > LARGEST_TURN:
                 raise InputError(
-                    f"increments[{row}, {axis}] is {increments[row, axis]:g} rad in {time[row + 1] - time[row]:g} s, and nothing turns so "
-                    "far between two samples; check the unit, or remove it"
+                    f"increments[{row}, {axis}] is {increments[row, axis]:g} rad in {time[row + 1] - time[row]:g} s, more than "
+                    f"{LARGEST_TURN:g} rad between two samples; check the unit, or remove it"
                 )
         object.__setattr__(self, "time", time)
         object.__setattr__(self, "increments", increments)
@@ -104,9 +133,28 @@ class ImuRecord:
 def compress(record: ImuRecord, algorithm: str | coning.Algorithm) -> ImuRecord:
     """Return the record at the rate of an N-sample coning algorithm: each N increments become one rotation vector.
 
-    The rotation vector stands for the increment of the longer interval: with commutation corrected, a filter may take it for a turn
-    at constant rate. Where sample intervals differ in length the correction is that of their lengths, and across a gap there is none
-    (:func:`strapdown.coning.rotation_vectors`). Intervals left over at the end are dropped.
+    Parameters
+    ----------
+    record : ImuRecord
+        Record.
+    algorithm : str or Algorithm
+        Coning algorithm, a name in :data:`strapdown.coning.ALGORITHMS` or an algorithm.
+
+    Returns
+    -------
+    ImuRecord
+        Record of n // N intervals; intervals left over at the end are dropped.
+
+    Raises
+    ------
+    InputError
+        If the record has fewer than N intervals.
+
+    Notes
+    -----
+    The rotation vector is the increment of the longer interval: with commutation corrected, a filter may treat it as a rotation at
+    constant rate. Where sample intervals differ in length the correction is that of their lengths, and across a gap there is none
+    (:func:`strapdown.coning.rotation_vectors`).
     """
     table = coning.named(algorithm)
     n = table.samples
@@ -126,9 +174,24 @@ def compress(record: ImuRecord, algorithm: str | coning.Algorithm) -> ImuRecord:
 
 
 def cut(record: ImuRecord, first: int, last: int) -> ImuRecord:
-    """Return the part of the record from edge ``first`` to edge ``last``; measurements in (t_first, t_last] go along.
+    """Return the part of the record between two edges, with the measurements in (t_first, t_last].
 
-    Measurements exactly at the first edge of the whole record belong to its first part.
+    Parameters
+    ----------
+    record : ImuRecord
+        Record of n intervals.
+    first, last : int
+        Indices of the edges, 0 ≤ first < last ≤ n.
+
+    Returns
+    -------
+    ImuRecord
+        The part. Measurements at the very first edge of the whole record belong to its first part.
+
+    Raises
+    ------
+    InputError
+        If the indices are out of range.
     """
     if not 0 <= first < last < len(record.time):
         raise InputError(
@@ -152,26 +215,34 @@ def cut(record: ImuRecord, first: int, last: int) -> ImuRecord:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Innovations:
-    """Innovations of one sensor, in the order of its measurements."""
+    """Innovations of one sensor, in the order of its measurements.
+
+    Parameters
+    ----------
+    time : ndarray (m,)
+        Times of the measurements used, s.
+    innovation : ndarray (m, dof)
+        Independent innovations, each less its prediction from those before it in the row; rad, or the sensor's unit over the length
+        of its reference.
+    variance : ndarray (m, dof)
+        Variances of the innovations that the filter predicts, the square of their unit.
+    weight : ndarray (m,), optional
+        Weight of each measurement in the update: 1 whole, 0 rejected by a gate, between them a robust update; None: all 1.
+    """
 
     time: Array
-    """Times of the measurements used (m,), s."""
     innovation: Array
-    """Independent innovations (m, dof): each less what the ones before it in its row predict; rad, or the sensor's unit over the length
-    of its reference."""
     variance: Array
-    """What the filter takes their variances for (m, dof)."""
     weight: Array | None = None
-    """Weight that each measurement was taken in with (m,): 1 whole, 0 refused by a gate, between them a robust update's; None: all 1."""
 
     @property
     def used(self) -> np.ndarray:
-        """Which measurements were not refused (m,)."""
+        """Mask (m,) of the measurements that were not rejected."""
         return np.ones(len(self.time), bool) if self.weight is None else np.asarray(self.weight > 0.0)
 
     @property
     def refused(self) -> int:
-        """How many measurements were refused."""
+        """Number of measurements rejected."""
         return int(np.sum(~self.used))
 
     @property
@@ -191,59 +262,80 @@ EVENT_KINDS = ("recovery", "hypotheses", "lock-out", "divergence", "gap")
 
 @dataclass(frozen=True, kw_only=True)
 class Event:
-    """Something in a run that whoever uses the estimate must hear of."""
+    """An event in a run that a user of the estimate must know.
+
+    Parameters
+    ----------
+    kind : {"recovery", "hypotheses", "lock-out", "divergence", "gap"}
+        What happened: a filter that rejected good measurements was restarted; a bank of hypotheses replaced it while a turn was
+        ambiguous; a gate rejected a sensor more often than it accepted it; the running NIS left its bounds; the gyro was silent for
+        much longer than its sample interval.
+    start : float
+        Time of its beginning, s.
+    end : float
+        Time of its end, s: the recovery, the decision between the hypotheses, the last rejection, the return of the NIS (or the end
+        of the record), the next gyro sample.
+    sensor : str, default ""
+        Sensor concerned, if there is one.
+    value : float, default 0.0
+        Of a recovery the rejections in a row; of hypotheses the number left (0: decided); of a lock-out the rejections; of a
+        divergence the largest mean NIS per degree of freedom; of a gap its length over the usual interval.
+    """
 
     kind: str
-    """One of :data:`EVENT_KINDS`: a filter that refused good measurements started anew; hypotheses stood in for it while a turn was
-    open; a gate refused a sensor more often than it took it in; the running NIS left its bounds; the gyro was silent for much longer
-    than its interval."""
     start: float
-    """When it began, s."""
     end: float
-    """When it was over, s: the filter's recovery, the hypotheses becoming one, the last refusal, the return of the NIS (or the end of the
-    record), the next gyro sample."""
     sensor: str = ""
-    """Sensor concerned, if it is one."""
     value: float = 0.0
-    """Of a recovery the refusals in a row, of hypotheses the number left (0 if they became one), of a lock-out the refusals, of a
-    divergence the greatest mean NIS per degree of freedom, of a gap its length over the usual interval."""
 
     def __str__(self) -> str:
-        """Say it in one line."""
+        """Describe the event in one line."""
         if self.kind == "recovery":
             return (
-                f"Recovered at {self.end:.6g} s: {self.value:.0f} measurements of {self.sensor} in a row were refused and agreed with each "
-                f"other from {self.start:.6g} s on; what the filter said in between is wrong."
+                f"Recovered at {self.end:.6g} s: {self.value:.0f} measurements of {self.sensor} in a row were rejected and agreed with "
+                f"each other from {self.start:.6g} s on; the estimate in between is wrong."
             )
         if self.kind == "hypotheses":
-            end = f"{self.value:.0f} of them were left at the end of the record" if self.value else "then they were one"
+            end = (
+                f"{self.value:.0f} of them were left at the end of the record" if self.value else "then one was chosen"
+            )
             return (
-                f"From {self.start:.6g} s to {self.end:.6g} s hypotheses stood in for the filter, because {self.sensor} left a turn open: "
-                f"{end}."
+                f"From {self.start:.6g} s to {self.end:.6g} s hypotheses replaced the filter, because {self.sensor} left a rotation "
+                f"ambiguous: {end}."
             )
         if self.kind == "lock-out":
             return (
-                f"Locked out from {self.start:.6g} s to {self.end:.6g} s: {self.value:.0f} measurements of {self.sensor} were refused, "
-                "more than were taken in, and no restart could follow them: the sensor, its sigma or the filter is wrong there."
+                f"Locked out from {self.start:.6g} s to {self.end:.6g} s: {self.value:.0f} measurements of {self.sensor} were rejected, "
+                "more than were accepted, and no restart agreed with them: the sensor, its sigma or the filter is wrong there."
             )
         if self.kind == "divergence":
             return (
                 f"The mean NIS left its bounds from {self.start:.6g} s to {self.end:.6g} s, up to {self.value:.3g} per degree of freedom: "
                 "the model does not hold there."
             )
-        return f"Gap of {self.end - self.start:.3g} s after {self.start:.6g} s: the turn across it is taken for one at constant rate."
+        return f"Gap of {self.end - self.start:.3g} s after {self.start:.6g} s: the rotation across it is assumed to be at constant rate."
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ErrorStateEstimate:
-    """Estimate of one declaration of error states (:mod:`strapdown.estimation.error_states`) at the kept edges."""
+    """Estimate of one declaration of error states (:mod:`strapdown.estimation.error_states`) at the kept edges.
+
+    Parameters
+    ----------
+    components : tuple of str
+        Name of each component.
+    units : tuple of str
+        Unit of each component.
+    values : ndarray (m, size)
+        Estimates in ``units``.
+    variance : ndarray (m, size)
+        Variances, the square of the units.
+    """
 
     components: tuple[str, ...]
     units: tuple[str, ...]
     values: Array
-    """(m, size), in ``units``."""
     variance: Array
-    """(m, size), the square of the units."""
 
     @property
     def sigma(self) -> Array:
@@ -253,42 +345,76 @@ class ErrorStateEstimate:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Estimate:
-    """What a filter made of a record, at the kept edges."""
+    """What a filter made of a record, at the kept edges.
+
+    Parameters
+    ----------
+    time : ndarray (m,)
+        Times of the stored edges, s.
+    attitude : ndarray (m, 4)
+        Unit quaternions q_fb.
+    bias : ndarray (m, 3)
+        Gyro bias, rad/s, body axes.
+    variance : ndarray (m, 6)
+        Diagonal of P: attitude error, rad², body axes; bias error, (rad/s)².
+    covariance : ndarray (m, 6, 6), optional
+        Whole P of (δθ, δb), if asked for.
+    innovations : mapping of str to Innovations, default empty
+        Innovations by sensor.
+    skipped : mapping of str to int, default empty
+        Measurements not used, by sensor: missing (NaN) ones and those outside the record's time.
+    events : tuple of Event, default empty
+        Events of the run that a user of the estimate must know, in order of time.
+    error_states : mapping of str to ErrorStateEstimate, default empty
+        Error states c by name, in the order given.
+    whole_covariance : ndarray (m, n, n), optional
+        P of (δθ, δb, δc) of a filter with error states, if asked for; ``covariance`` is its part (m, 6, 6).
+    whole_bias : ndarray (m, 3), optional
+        Gyro bias with all that error states add to it, ``b + Σ c e``, rad/s, if asked for.
+    whole_bias_variance : ndarray (m, 6), optional
+        Diagonal of the covariance of attitude and whole bias.
+    whole_bias_covariance : ndarray (m, 6, 6), optional
+        Covariance of attitude and whole bias.
+    """
 
     time: Array
-    """Times (m,), s."""
     attitude: Array
-    """q_fb (m, 4)."""
     bias: Array
-    """Gyro bias (m, 3), rad/s, body axes."""
     variance: Array
-    """Diagonal of P (m, 6): attitude error rad², bias error (rad/s)²."""
     covariance: Array | None = None
-    """Whole P (m, 6, 6), if it was asked for."""
     innovations: Mapping[str, Innovations] = field(default_factory=dict)
-    """Innovations by sensor."""
     skipped: Mapping[str, int] = field(default_factory=dict)
-    """Measurements not used, by sensor: missing (NaN) ones and those outside the record's time."""
     events: tuple[Event, ...] = ()
-    """What must be heard of the run, in order of time."""
     error_states: Mapping[str, ErrorStateEstimate] = field(default_factory=dict)
-    """Error states by name, in the order given (c, below)."""
     whole_covariance: Array | None = None
-    """P (m, n, n) of (δθ, δb, δc) of a filter with error states, if it was asked for; ``covariance`` is its part (m, 6, 6)."""
     whole_bias: Array | None = None
-    """Gyro bias and all that error states add to it, ``b + Σ c e`` (m, 3), rad/s, if it was asked for."""
     whole_bias_variance: Array | None = None
-    """Diagonal of the covariance of attitude and whole bias (m, 6)."""
     whole_bias_covariance: Array | None = None
-    """That covariance (m, 6, 6)."""
 
     def errors(
         self, true_attitude: ArrayLike, true_bias: ArrayLike, true_values: Mapping[str, ArrayLike] | None = None
     ) -> Array:
-        """Return the error (m, n) of all states: Log(q_est⁻¹ ⊗ q_true), then true less estimated.
+        """Return the error of all states: Log(q_est⁻¹ ⊗ q_true), then true less estimated.
 
-        ``true_values`` holds for each declaration of error states an array (size,) or (m, size), of what is carried in the axes of the
-        estimated attitude (:attr:`strapdown.estimation.error_states.Effect.carried`).
+        Parameters
+        ----------
+        true_attitude : array_like (m, 4)
+            True q_fb at the times of the estimate.
+        true_bias : array_like (m, 3)
+            True gyro bias, rad/s, body axes.
+        true_values : mapping of str to array_like (size,) or (m, size), optional
+            True error states by name, in the axes of the estimated attitude where they are carried so
+            (:attr:`strapdown.estimation.error_states.Effect.carried`). Required for a filter with error states.
+
+        Returns
+        -------
+        ndarray (m, n)
+            δθ, rad, body axes; δb, rad/s; error states in their units.
+
+        Raises
+        ------
+        InputError
+            If ``true_values`` does not name the error states of the estimate.
         """
         given = dict(true_values or {})
         if set(given) != set(self.error_states):
@@ -302,7 +428,7 @@ class Estimate:
 
     @property
     def refused(self) -> dict[str, int]:
-        """Measurements refused by a gate, by sensor."""
+        """Number of measurements rejected by a gate, by sensor."""
         return {sensor: innovations.refused for sensor, innovations in self.innovations.items()}
 
     @property
@@ -321,15 +447,48 @@ class Estimate:
         return quaternion.to_rotation(self.attitude)
 
     def euler(self, sequence: str = "ZYX") -> outputs.Angles:
-        """Return Euler angles (m, 3) and their σ, rad (:func:`strapdown.outputs.euler`)."""
+        """Return Euler angles and their standard deviations, as :func:`strapdown.outputs.euler`.
+
+        Parameters
+        ----------
+        sequence : str, default "ZYX"
+            Axes of the three rotations.
+
+        Returns
+        -------
+        Angles
+            Angles (m, 3) and their σ, rad.
+        """
         return outputs.euler(self.attitude, sequence, outputs.attitude_covariance(self))
 
     def heading(self, axis: str = "x") -> outputs.Angles:
-        """Return the heading (m,) of a body axis from North towards East, and its σ, rad (:func:`strapdown.outputs.heading`)."""
+        """Return the heading of a body axis, as :func:`strapdown.outputs.heading`.
+
+        Parameters
+        ----------
+        axis : {"x", "y", "z", "-x", "-y", "-z"}, default "x"
+            Body axis that points forward.
+
+        Returns
+        -------
+        Angles
+            Heading (m,) from North towards East and its σ, rad.
+        """
         return outputs.heading(self.attitude, outputs.attitude_covariance(self), axis=axis)
 
     def to_dataframe(self, **options: Any) -> Any:
-        """Return the estimate as a pandas ``DataFrame`` (:func:`strapdown.outputs.to_dataframe`)."""
+        """Return the estimate as a pandas ``DataFrame``, as :func:`strapdown.outputs.to_dataframe`.
+
+        Parameters
+        ----------
+        **options : dict
+            Options of :func:`strapdown.outputs.table`.
+
+        Returns
+        -------
+        pandas.DataFrame
+            One row per time.
+        """
         return outputs.to_dataframe(self, **options)
 
 
@@ -344,7 +503,7 @@ _ESTIMATE_UNITS = {
 
 @contextlib.contextmanager
 def result_file(path: str | os.PathLike[str], kind: str, attributes: Mapping[str, Any] | None) -> Iterator[Any]:
-    """Yield an HDF5 file that says what it is; it appears whole or not at all."""
+    """Yield an HDF5 file with its kind, version and conventions as attributes; it appears whole or not at all."""
     with written_beside(path) as temporary, whole_hdf5(temporary) as file:
         own = {"kind": f"strapdown {kind}", "version": strapdown.__version__, "conventions": CONVENTIONS}
         set_attributes(file, {**own, **(attributes or {})})
@@ -352,7 +511,7 @@ def result_file(path: str | os.PathLike[str], kind: str, attributes: Mapping[str
 
 
 def put(group: Any, name: str, value: Array, unit: str, meaning: str = "") -> None:
-    """Write an array with its unit, and what it means where the name does not say, as attributes; compressed unless it is small."""
+    """Write an array with its unit, and its meaning where the name does not state it, as attributes; compressed unless it is small."""
     large = value.size > 256
     dataset = group.create_dataset(
         name, data=value, **({"compression": "gzip", "compression_opts": 1, "shuffle": True} if large else {})
@@ -369,8 +528,21 @@ def write_estimate(
 ) -> None:
     """Write an estimate to HDF5, units and conventions as attributes; the file appears whole or not at all.
 
-    Optional states go along, values and variances (:func:`read_states`); what a whole covariance tells of them does not.
-    ``truth`` is that at the times of the estimate, where a simulation knows it, so that the file can be judged by itself.
+    Parameters
+    ----------
+    path : path-like
+        File.
+    estimate : Estimate
+        Estimate. Values and variances of error states are written (:func:`read_states`); a whole covariance is not.
+    attributes : mapping of str, optional
+        Further attributes of the file.
+    truth : Truth, optional
+        Truth at the times of the estimate, so that the file can be judged on its own.
+
+    Raises
+    ------
+    InputError
+        If the truth has another number of rows than the estimate, or the file cannot be written.
     """
     if truth is not None and len(truth.attitude) != len(estimate.time):
         raise InputError(
@@ -397,7 +569,7 @@ def write_estimate(
             )
             put(group, "variance", innovations.variance, "the square of the innovation's")
             if innovations.weight is not None:
-                put(group, "weight", innovations.weight, "1", "0: refused; 1: taken in whole")
+                put(group, "weight", innovations.weight, "1", "0: rejected; 1: full weight")
         for number, event in enumerate(estimate.events):
             set_attributes(file.create_group(f"events/{number:06d}"), vars(event))
         for number, (name, block) in enumerate(estimate.error_states.items()):
@@ -418,7 +590,7 @@ def write_attitude(
 
 @contextlib.contextmanager
 def _estimate_file(path: str | os.PathLike[str]) -> Iterator[Any]:
-    """Yield an estimate's HDF5 file, read only; what is wrong with it is told in one line."""
+    """Yield an estimate's HDF5 file, read only; errors are InputErrors that name it."""
     with reading.hdf5(path) as file:
         if reading.attributes(file).get("kind") != "strapdown estimate":
             raise InputError(
@@ -428,7 +600,7 @@ def _estimate_file(path: str | os.PathLike[str]) -> Iterator[Any]:
 
 
 def _numbers(group: Any, name: str, shape: tuple[int | str, ...]) -> Array:
-    """Return an array of a file as :func:`strapdown.checks.array` lets it pass."""
+    """Return an array of a file checked by :func:`strapdown.checks.array`."""
     return array(_place(group, name), reading.numbers(group, name), shape)
 
 
@@ -441,20 +613,20 @@ def _above_zero(place: str, variance: Array) -> Array:
     if np.any(variance <= 0.0):
         index = tuple(int(i) for i in np.argwhere(variance <= 0.0)[0])
         raise InputError(
-            f"{place}{list(index)} is {variance[index]:g}, and a variance is greater than zero; the file is damaged, or a sensor had no "
-            "noise: give each a sigma above zero and make the estimate again"
+            f"{place}{list(index)} is {variance[index]:g}, and a variance must be greater than zero; the file is damaged, or a sensor had "
+            "no noise: give each a sigma above zero and make the estimate again"
         )
     return variance
 
 
 def _biases(group: Any, name: str, rows: int) -> Array:
-    """Return gyro biases (rows, 3) that a gyro may have."""
+    """Return gyro biases (rows, 3), none beyond :data:`LARGEST_BIAS`."""
     value = _numbers(group, name, (rows, 3))
     if np.any(np.abs(value) > LARGEST_BIAS):
         index = tuple(int(i) for i in np.argwhere(np.abs(value) > LARGEST_BIAS)[0])
         raise InputError(
-            f"{_place(group, name)}{list(index)} is {value[index]:g} rad/s, the bias of no gyro; the file is damaged or its filter was "
-            "lost: make the estimate again, and look at its start and the gyro's unit"
+            f"{_place(group, name)}{list(index)} is {value[index]:g} rad/s, more than any gyro has; the file is damaged or its filter "
+            "diverged: make the estimate again, and check its start and the gyro's unit"
         )
     return value
 
@@ -467,7 +639,17 @@ def _attitudes(group: Any, name: str, rows: int) -> Array:
 
 
 def read_truth(path: str | os.PathLike[str]) -> Truth | None:
-    """Read the truth that :func:`write_estimate` was given, at the times of the estimate; None if it was given none.
+    """Read the truth of a file written by :func:`write_estimate`.
+
+    Parameters
+    ----------
+    path : path-like
+        File.
+
+    Returns
+    -------
+    Truth or None
+        Truth at the times of the estimate; None if the file has none.
 
     Raises
     ------
@@ -484,11 +666,21 @@ def read_truth(path: str | os.PathLike[str]) -> Truth | None:
 def read_estimate(path: str | os.PathLike[str]) -> Estimate:
     """Read an estimate written by :func:`write_estimate`.
 
+    Parameters
+    ----------
+    path : path-like
+        File.
+
+    Returns
+    -------
+    Estimate
+        The estimate without its error states (:func:`read_states`).
+
     Raises
     ------
     InputError
-        If the file is missing, truncated, no HDF5 or another kind of file, or holds what no filter estimates: shapes that do not fit each
-        other, times that go back, quaternions of another norm than one, variances of zero or less, biases above ``LARGEST_BIAS``.
+        If the file is missing, truncated, not HDF5 or of another kind, or holds what no filter estimates: shapes that do not fit
+        each other, decreasing times, quaternions that are not of unit norm, variances of zero or less, biases above 1e6 rad/s.
     """
     with _estimate_file(path) as file:
         time = increasing(_place(file, "time"), _numbers(file, "time", ("n",)))
@@ -517,7 +709,17 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
 
 
 def read_states(path: str | os.PathLike[str]) -> dict[str, ErrorStateEstimate]:
-    """Read the optional states of an estimate written by :func:`write_estimate`, by name; none of a filter without.
+    """Read the error states of an estimate written by :func:`write_estimate`.
+
+    Parameters
+    ----------
+    path : path-like
+        File.
+
+    Returns
+    -------
+    dict of str to ErrorStateEstimate
+        Error states by name; empty for a filter without.
 
     Raises
     ------
@@ -531,7 +733,7 @@ def read_states(path: str | os.PathLike[str]) -> dict[str, ErrorStateEstimate]:
             values = _numbers(part, "values", (rows, len(told["components"])))
             if len(told["units"]) != len(told["components"]):
                 raise InputError(
-                    f"{_place(part, 'units')} are not as many as components; the file is damaged, make it again"
+                    f"{_place(part, 'units')} are not as many as the components; the file is damaged, make it again"
                 )
             found[str(told["name"])] = ErrorStateEstimate(
                 components=tuple(str(one) for one in told["components"]),
@@ -560,15 +762,15 @@ def _innovations(part: Any) -> Innovations:
 
 
 def read_attributes(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read what a result file of any kind says of its making: its kind, version, conventions, and all that the writer gave.
+    """Read the attributes of a result file of any kind: its kind, version, conventions, and those of the writer.
 
     Raises
     ------
     InputError
-        If the file is missing, no HDF5, or not of this package.
+        If the file is missing, not HDF5, or not of this package.
     """
     with reading.hdf5(path) as file:
         attributes = reading.attributes(file)
     if not str(attributes.get("kind", "")).startswith("strapdown "):
-        raise InputError(f"{path} is no result of strapdown; pass a file that one of its commands has written")
+        raise InputError(f"{path} is not a result of strapdown; pass a file written by one of its commands")
     return attributes

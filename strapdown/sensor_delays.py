@@ -14,6 +14,8 @@ from strapdown import coning, quaternion
 from strapdown.checks import Array, InputError, non_negative
 from strapdown.recordings import Recording, increments
 
+__all__: list[str] = []
+
 FIELD_SPAN = 0.2
 """Span over which the change of the field, turned back by the gyro, shows the magnetometer's delay, s."""
 PAIRS_IN_SPAN = 12
@@ -33,11 +35,11 @@ class Delays:
     """Delays of a recording's sensors."""
 
     gyro: Array | float
-    """How long after what they show the samples of gyro and accelerometer are stamped, s: one number, or one a sample (n,)."""
+    """Delay of the stamps of gyro and accelerometer after the motion, s: one number, or one per sample (n,)."""
     sigma: float
-    """σ of that, s."""
+    """Its standard deviation, s."""
     field: Array | float
-    """How much later those of the magnetometer are, s, negative for earlier: one number, or one a sample."""
+    """Delay of the magnetometer's stamps behind the gyro's, s, negative for earlier: one number, or one per sample."""
     field_sigma: float
     """σ of the last of them, s; infinite where the recording does not show it."""
     given: bool
@@ -45,18 +47,18 @@ class Delays:
 
     @property
     def words(self) -> tuple[str, ...]:
-        """What is to be said of them."""
+        """Description of the delays."""
         late, field = 1e3 * self.last_gyro, 1e3 * self.last_field
         found = [
-            f"Samples are taken as {late:.3g} ms later than what they show."
+            f"Samples are assumed to be stamped {late:.3g} ms late."
             if self.given
-            else f"Samples are taken as {late:.3g} ms later than what they show, half a sample interval, σ {1e3 * self.sigma:.2g} ms; "
+            else f"Samples are assumed to be stamped {late:.3g} ms late, half a sample interval, σ {1e3 * self.sigma:.2g} ms; "
             "give --latency if it is known (0: point samples)."
         ]
         if field:
             side = "after" if field > 0.0 else "before"
             found.append(
-                f"The magnetometer's samples come {abs(field):.1f} ms {side} the gyro's, σ {1e3 * self.field_sigma:.1g} ms: made good."
+                f"The magnetometer's samples come {abs(field):.1f} ms {side} the gyro's, σ {1e3 * self.field_sigma:.1g} ms: compensated."
             )
         return tuple(found)
 
@@ -67,7 +69,7 @@ class Delays:
 
     @property
     def last_field(self) -> float:
-        """The magnetometer's delay beside the gyro at the end, s."""
+        """The magnetometer's delay behind the gyro at the end, s."""
         return float(np.ravel(self.field)[-1])
 
 
@@ -83,7 +85,7 @@ def find(
         Delay of gyro and accelerometer where it is known, s. By default half a sample interval, as of samples that are means over the
         interval before their stamp; or as much as the magnetometer is ahead of the gyro, for no sensor shows what is to come.
     field : float, optional
-        Delay of the magnetometer beside the gyro where it is known, s. By default it is found from the recording.
+        Delay of the magnetometer behind the gyro where it is known, s. By default it is found from the recording.
     causal : bool
         Each sample's delay from the samples before it: found anew whenever the recording has become twice as long.
 
@@ -119,10 +121,10 @@ def find(
 
 
 def magnetometer_delay(recording: Recording) -> tuple[float, float]:
-    """Return how long after the gyro's samples the magnetometer's are stamped, s, and the σ of that; (0, ∞) where nothing shows it.
+    """Return the delay of the magnetometer's stamps behind the gyro's, s, and its σ; (0, ∞) where it is not observable.
 
-    Turned back by the gyro alone, the field m stands still over a fraction of a second. Samples that are late by τ are off by ``−τ ṁ``,
-    ``ṁ = −w × m``, and how that changes over :data:`FIELD_SPAN` is what is fitted, least squares without the farthest. A field that
+    Rotated back by the gyro alone, the field m is constant over a fraction of a second. Samples that are late by τ are in error by
+    ``−τ ṁ``, ``ṁ = −w × m``, and how that changes over :data:`FIELD_SPAN` is fitted by least squares without the outliers. A field that
     turns with the body (hard iron) is in quadrature to it in a swing: it does not pass for a delay, but a strong one hides some.
     """
     return (0.0, np.inf) if recording.magnetic_field is None else _fitted(*_evidence(recording)[1:])

@@ -1,4 +1,4 @@
-"""Samples of a recording that are not what the unit did: clipped ones, and a gyro that was silent.
+"""Faulty samples of a recording: clipped ones, and a gyro that was silent.
 
 A clipped gyro sample is a lower bound of the rate. Between the samples before and after such a run the rate is restored by a cubic
 (:func:`restored`), and its error becomes a variance of the turn, which the filter adds to that of the gyro's noise. So does the turn over a
@@ -15,32 +15,34 @@ import numpy as np
 from strapdown.checks import Array
 from strapdown.recordings import Recording
 
+__all__: list[str] = []
+
 MIN_CLIPPED_RATE = 1.0
-"""A gyro axis is not taken for clipped below this, rad/s: quantised samples at rest repeat their extreme too."""
+"""Smallest limit of a clipped gyro axis, rad/s; quantised samples at rest repeat their extreme too."""
 MIN_CLIPPED_FORCE = 15.0
-"""Nor an accelerometer axis below this, m/s²."""
+"""Smallest limit of a clipped accelerometer axis, m/s²."""
 MIN_CLIPPED = 3
-"""Samples at the extreme, at least two of them in a row, that make an axis clipped."""
+"""Smallest number of samples at the extreme, at least two of them in a row, of a clipped axis."""
 MAX_REPEATS = 0.1
-"""Share of the other samples equal to the one before above which a sensor repeats samples as it is, and nothing is said of clipping."""
+"""Share of the other samples equal to the one before above which the sensor repeats samples anyway, and clipping is not reported."""
 RESTORED_ERROR = 0.5
 """σ of the turn beyond the limit over a clipped run, as a share of what the cubic makes of it."""
 RESTORED_SPAN = 0.3
-"""How long the angular acceleration at the ends of a clipped run is taken to last, s."""
+"""Assumed duration of the angular acceleration at the ends of a clipped run, s."""
 LONG_INTERVAL = 1.5
-"""An interval between stamps of more than this many usual ones has a turn that the gyro does not show."""
+"""Ratio of an interval between stamps to the usual one above which its rotation is uncertain."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Faults:
-    """What was found in a recording."""
+    """Faults of a recording."""
 
     recording: Recording
     """The recording with clipped gyro samples restored and clipped samples of the accelerometer missing."""
     turn_variance: Array
-    """Variance of the turn over each interval that the gyro does not show (n − 1,), rad² an axis, beyond its noise; mostly 0."""
+    """Variance (n − 1,) of the rotation over each interval beyond the gyro's noise, rad² per axis; mostly 0."""
     words: tuple[str, ...]
-    """What is to be said of it."""
+    """Description of the faults."""
 
 
 def find(recording: Recording) -> Faults:
@@ -62,7 +64,7 @@ def find(recording: Recording) -> Faults:
     if force is not None and (saturated := clipped_samples(force, MIN_CLIPPED_FORCE)).any():
         lost = np.asarray(saturated.any(axis=1))
         changes["specific_force"] = np.where(lost[:, None], np.nan, force)
-        words.append(f"The accelerometer was clipped in {np.sum(lost)} samples ({lost.mean():.2%}), which are left out")
+        words.append(f"The accelerometer was clipped in {np.sum(lost)} samples ({lost.mean():.2%}), which are ignored")
     steps = np.diff(recording.time)
     usual = float(np.median(steps))
     long = np.flatnonzero(steps > LONG_INTERVAL * usual)
@@ -123,7 +125,7 @@ def restored(time: Array, rate: Array) -> tuple[Array, Array, np.ndarray]:
 
 
 def turn_variance_over(time: Array, rate: Array, length: float, usual: float) -> float:
-    """Return the variance of a turn, rad² an axis, that is taken from the rates at the ends of an interval of this length, s.
+    """Return the variance, rad² per axis, of a rotation computed from the rates at the ends of an interval of this length, s.
 
     With D the mean square change of the rate over as long a time elsewhere in the recording, a rate that wanders between both ends as a
     Brownian bridge turns by ``T² D/12`` about the mean of both.

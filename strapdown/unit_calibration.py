@@ -1,4 +1,4 @@
-"""What one recording shows of a unit, carried to the next recording of the same unit: scale and misalignment of its gyro, and delays.
+"""Calibration of one unit, found from one recording and used for the next of the same unit: gyro scale and misalignment, and delays.
 
 As a file it is the table ``[calibration]`` of a TOML document, units in the names of its keys.
 """
@@ -17,21 +17,34 @@ from strapdown.checks import Array, InputError, array, finite, known_keys, non_n
 from strapdown.recordings import Recording
 from strapdown.records import ErrorStateEstimate
 
+__all__ = [
+    "UnitCalibration",
+    "read",
+]
+
 KEYS = ("gyro_scale_and_misalignment", "sigma", "magnetometer_delay_ms", "source")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class UnitCalibration:
-    """Calibration of one unit."""
+    """Calibration of one unit.
+
+    Parameters
+    ----------
+    matrix : ndarray (3, 3)
+        M of a gyro that measures ``(I + M) w``: scale-factor errors on the diagonal, misalignments, rad, off it.
+    sigma : float
+        Root mean square of the standard deviations of the entries.
+    magnetometer_delay : float, default 0.0
+        Delay of the magnetometer's stamps behind the gyro's, s; 0: unknown.
+    source : str, default ""
+        Recording that it was found from.
+    """
 
     matrix: Array
-    """M (3, 3) of a gyro that measures ``(I + M) w``: scale factors on the diagonal, misalignments, rad, beside it."""
     sigma: float
-    """σ of its entries, root mean square."""
     magnetometer_delay: float = 0.0
-    """How much later than the gyro's the magnetometer's samples are stamped, s; 0: not known."""
     source: str = ""
-    """The recording that it was found from."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -45,11 +58,37 @@ class UnitCalibration:
         finite("magnetometer_delay", self.magnetometer_delay)
 
     def applied(self, recording: Recording) -> Recording:
-        """Return the recording with its rates corrected."""
+        """Return the recording with its rates corrected.
+
+        Parameters
+        ----------
+        recording : Recording
+            Recording of the same unit.
+
+        Returns
+        -------
+        Recording
+            Recording with the rates ``(I + M)⁻¹ w``, rad/s.
+        """
         return replace(recording, rate=recording.rate @ np.linalg.inv(np.eye(3) + self.matrix).T)
 
     def and_then(self, block: ErrorStateEstimate, magnetometer_delay: float, source: str) -> UnitCalibration:
-        """Return the calibration with what a filter found beside it at the end of a recording: its states of scale and misalignment."""
+        """Return the calibration combined with what a filter found with it applied.
+
+        Parameters
+        ----------
+        block : ErrorStateEstimate
+            States of gyro scale and misalignment; their last values count.
+        magnetometer_delay : float
+            Delay of the magnetometer behind the gyro, s.
+        source : str
+            Name of the recording.
+
+        Returns
+        -------
+        UnitCalibration
+            The combined calibration.
+        """
         found = (np.eye(3) + self.matrix) @ (np.eye(3) + matrix_of(block)) - np.eye(3)
         return UnitCalibration(
             matrix=found,
@@ -88,12 +127,22 @@ def to_toml(calibration: UnitCalibration) -> str:
 
 
 def read(path: str | os.PathLike[str]) -> UnitCalibration:
-    """Read the table ``[calibration]`` of a TOML file that ``strapdown estimate`` wrote.
+    """Read the table ``[calibration]`` of a TOML file written by ``strapdown estimate``.
+
+    Parameters
+    ----------
+    path : path-like
+        File.
+
+    Returns
+    -------
+    UnitCalibration
+        The calibration.
 
     Raises
     ------
     InputError
-        If the file is missing, no TOML, has no such table, or another key or shape.
+        If the file is missing, is not TOML, has no such table, or has another key or shape.
     """
     return tables.read(path, "calibration", "`strapdown estimate` writes one", _from_table)
 

@@ -1,8 +1,17 @@
-"""Units at the rim: factors that take a value in the named unit to SI and radians. Multiply on the way in, divide on the way out."""
+"""Factors from the named unit to SI and radians: multiply on input, divide on output."""
 
 from __future__ import annotations
 
 import math
+
+__all__ = [
+    "ARCSECOND",
+    "DEGREE",
+    "DEGREE_PER_HOUR",
+    "DEGREE_PER_HOUR_PER_ROOT_HOUR",
+    "DEGREE_PER_ROOT_HOUR",
+    "STANDARD_GRAVITY",
+]
 
 DEGREE = math.pi / 180.0
 """rad"""

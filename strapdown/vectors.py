@@ -1,16 +1,16 @@
-"""Vector sensors: what is known in the fixed frame, measured in the body frame, ``q⁻¹ r q + v``, or the attitude itself.
+"""Vector sensors: measurements in the body frame of what is known in the fixed frame, ``q⁻¹ r q + v``, or of the attitude itself.
 
-Every sensor has its own rate, phase and :class:`Faults` (latency, outages, outliers, correlated noise), and gives a series of
-:class:`VectorMeasurements`. The series tells the *nominal* noise: outliers, correlation, hard iron and acceleration are what the filter is
-not told.
+Every sensor has its own rate, phase and :class:`Faults` (latency, outages, outliers, correlated noise), and returns a series of
+:class:`VectorMeasurements`. The series states the *nominal* noise: outliers, correlation, hard iron and acceleration are hidden
+from the filter.
 
 Noise of a normalised vector
 ----------------------------
-A direction is a noisy vector over its length: its noise of σ a component, relative to the length, leaves σ²(1 − σ² − σ⁴ − …) of variance
-across the direction, exactly ``σ² [1 − √2 σ D(1/(√2 σ))]`` with Dawson's function D; and the mean of what is measured along it is shorter
-than 1, by about σ². Filters take σ² and 1. So the NIS of a right filter is too small by a share of about σ²: 0.25 % at σ = 0.05 rad, 1 % at
-0.1 rad, 4.2 % at 0.2 rad, 10 % at 0.3 rad. Where that matters (``σ`` above 0.1 rad), give the whole vector (kind ``"vector"``), whose noise
-is the same in all components.
+A direction is a noisy vector over its length: its noise of σ per component, relative to the length, leaves σ²(1 − σ² − σ⁴ − …) of
+variance across the direction, exactly ``σ² [1 − √2 σ D(1/(√2 σ))]`` with Dawson's function D; and the mean of the measured
+component along it is shorter than 1, by about σ². Filters assume σ² and 1. So the NIS of a right filter is too small by a fraction
+of about σ²: 0.25 % at σ = 0.05 rad, 1 % at 0.1 rad, 4.2 % at 0.2 rad, 10 % at 0.3 rad. Where that matters (``σ`` above 0.1 rad),
+give the whole vector (kind ``"vector"``), whose noise is the same in all components.
 """
 
 from __future__ import annotations
@@ -43,6 +43,19 @@ from strapdown.equality import ByValue
 from strapdown.motion import Motion
 from strapdown.units import STANDARD_GRAVITY
 
+__all__ = [
+    "Accelerometer",
+    "AttitudeSensor",
+    "Faults",
+    "HeadingPair",
+    "Magnetometer",
+    "Sensor",
+    "VectorMeasurements",
+    "VectorSensor",
+    "specific_force",
+    "star_directions",
+]
+
 Kind = Literal["direction", "heading", "vector", "attitude"]
 KINDS: dict[str, int] = {"direction": 2, "heading": 1, "vector": 3, "attitude": 3}
 """Kinds of measurement and their degrees of freedom: of a direction both components across it; of a heading only the turn about the
@@ -57,51 +70,84 @@ VectorField = Callable[[Array], Array]
 
 
 class Sensor(Protocol):
-    """What a scenario wants of a sensor."""
+    """A sensor of a scenario.
+
+    Attributes
+    ----------
+    name : str
+        Name of the sensor and of its stream of random numbers.
+    """
 
     @property
     def name(self) -> str:
         """Name of the sensor and of its stream of random numbers."""
 
     def observe(self, motion: Any, start: float, end: float, generator: np.random.Generator) -> VectorMeasurements:
-        """Return the measurements over (start, end] of a body that moves so."""
+        """Return the measurements of a moving body.
+
+        Parameters
+        ----------
+        motion : Motion or callable
+            Motion of the body, or its attitude q_fb (..., 4) as a function of time, s; an accelerometer needs a motion.
+        start, end : float
+            Interval (start, end], s.
+        generator : numpy.random.Generator
+            Random stream of the sensor.
+
+        Returns
+        -------
+        VectorMeasurements
+            The series.
+        """
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VectorMeasurements:
     """A series of measurements of one sensor.
 
-    A sample with a NaN in ``vector_b``, or in ``attitude``, is missing: filters skip and count it. What else belongs to it may be NaN too:
-    in place of its σ and covariance then stands the mean square of the others', of its reference another's, of its arrival its time, so
-    that nothing computed over the series is touched by it.
+    A sample with a NaN in ``vector_b``, or in ``attitude``, is missing: filters skip and count it. Its other entries may be NaN too; they
+    are then replaced (σ and covariance by the mean square of the others, the reference by another one, the arrival by the time), so that
+    nothing computed over the series is affected.
 
-    Arrays of floats are taken as they are and not copied: whoever goes on writing to a buffer gives a copy of it.
+    Arrays of floats are kept without a copy: pass a copy of a buffer that is written to afterwards.
+
+    Parameters
+    ----------
+    sensor : str
+        Name of the sensor.
+    kind : {"direction", "heading", "vector", "attitude"}
+        What is measured; see :data:`KINDS`.
+    time : ndarray (m,)
+        Times of measurement, s, increasing.
+    reference_f : ndarray (3,) or (m, 3), default (0, 0, 1)
+        Reference in the fixed frame: a unit direction; for kind ``"vector"`` with its length. Not used for kind ``"attitude"``.
+    vector_b : ndarray (m, 3), default empty
+        Measured vectors, body frame, of unit length except for kind ``"vector"``. NaN for kind ``"attitude"``, which has none.
+    sigma : float or ndarray (m,), default 0
+        Noise of each component: rad across a direction, the unit of a vector, rad about each body axis of an attitude. Where
+        ``sigma_axes`` or ``covariance`` are given, their root mean square.
+    attitude : ndarray (m, 4), optional
+        Measured q_fb for kind ``"attitude"``, with the error on the body side.
+    sigma_axes : ndarray (3,) or (m, 3), optional
+        Noise along each body axis, in the unit of sigma. For a direction the part across it counts. A series of kind ``"attitude"``
+        always has it.
+    covariance : ndarray (3, 3) or (m, 3, 3), optional
+        Covariance of the noise in body axes, the unit of sigma squared. For a direction the part across it counts; a heading has
+        none.
+    arrival : ndarray (m,), optional
+        Time of arrival of each sample, s, not before its time; None: at once.
     """
 
     sensor: str
-    """Name of the sensor."""
     kind: Kind
     time: Array
-    """Times of measurement (m,), s, increasing."""
     reference_f: Array = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
-    """What is measured, in the fixed frame: a unit direction (3,), or (m, 3) if it changes; for kind ``"vector"`` with its length. Not used
-    for kind ``"attitude"``."""
     vector_b: Array = field(default_factory=lambda: np.empty((0, 3)))
-    """Measured vectors (m, 3), body frame; of unit length but for kind ``"vector"``. For kind ``"attitude"`` there are none and this is
-    filled with NaN."""
     sigma: Array = field(default_factory=lambda: np.zeros(1))
-    """Noise of each component (across the direction: rad; of a vector: its unit; of an attitude about each body axis: rad), (m,); a scalar
-    is spread over all samples. Where ``sigma_axes`` or ``covariance`` are given, their root mean square."""
     attitude: Array | None = None
-    """Measured q_fb (m, 4) for kind ``"attitude"``, with the error on the body side."""
     sigma_axes: Array | None = None
-    """Noise of each body axis (m, 3), in the unit of sigma; (3,) is spread over all samples. Of a direction the part across it counts. A
-    series of kind ``"attitude"`` always has it, from whatever its noise was told by."""
     covariance: Array | None = None
-    """Covariance of the noise in body axes (m, 3, 3), the square of the unit of sigma; (3, 3) is spread over all samples. Of a direction
-    the part across it counts; a heading has none."""
     arrival: Array | None = None
-    """When each sample arrives (m,), s, not before its time; None: at once."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -163,8 +209,8 @@ class VectorMeasurements:
             if self.kind == "attitude":
                 found["sigma_axes"] = axes
         given = self._given_sigma(m)
-        told = np.any(numbers("sigma", self.sigma, allow_nan=True) != 0.0)  # of an empty series too
-        if axes is None and self.kind == "attitude" and not told:
+        given_sigma = np.any(numbers("sigma", self.sigma, allow_nan=True) != 0.0)  # of an empty series too
+        if axes is None and self.kind == "attitude" and not given_sigma:
             raise InputError(
                 f"{self.sensor}: a series of kind 'attitude' needs its noise: sigma (m,), sigma_axes (m, 3) or covariance (m, 3, 3)"
             )
@@ -175,10 +221,14 @@ class VectorMeasurements:
         vanishing = (sigma > 0.0) & (sigma**2 < np.finfo(np.float64).tiny)
         if vanishing.any():
             k = int(np.argmax(vanishing))
-            raise InputError(f"{self.sensor}: sigma[{k}] is {sigma[k]:g}, and its square is no number; check its unit")
+            raise InputError(f"{self.sensor}: sigma[{k}] is {sigma[k]:g}, and its square underflows; check its unit")
         if axes is not None:
             mean = np.sqrt(np.mean(axes**2, axis=1))
-            if self.kind != "attitude" and told and not np.allclose(sigma[known], mean[known], rtol=1e-12, atol=0.0):
+            if (
+                self.kind != "attitude"
+                and given_sigma
+                and not np.allclose(sigma[known], mean[known], rtol=1e-12, atol=0.0)
+            ):
                 raise InputError(
                     f"{self.sensor}: sigma contradicts sigma_axes or covariance; leave it out, it is their root mean square"
                 )
@@ -192,9 +242,9 @@ class VectorMeasurements:
         """Return σ of each sample (m,) as it was given, a single one spread over all."""
         given = numbers(f"{self.sensor}: sigma", self.sigma, allow_nan=True)
         if given.shape not in ((), (1,), (m,)):
-            by_axis = "" if self.kind == "heading" else ", and one a body axis as sigma_axes"
+            by_axis = "" if self.kind == "heading" else ", and one per body axis as sigma_axes"
             raise InputError(
-                f"{self.sensor}: sigma has shape {given.shape} for {m} samples; give one number, or one a sample{by_axis}"
+                f"{self.sensor}: sigma has shape {given.shape} for {m} samples; give one number, or one per sample{by_axis}"
             )
         return array(f"{self.sensor}: sigma", np.broadcast_to(given, (m,)), (m,), allow_nan=True)
 
@@ -203,7 +253,7 @@ class VectorMeasurements:
         given = numbers(f"{self.sensor}: sigma_axes", self.sigma_axes, allow_nan=True)  # type: ignore[arg-type]
         if given.shape not in ((), (3,), (1, 3), (m, 3)):
             raise InputError(
-                f"{self.sensor}: sigma_axes has shape {given.shape} for {m} samples; give one number a body axis (3,), or (m, 3)"
+                f"{self.sensor}: sigma_axes has shape {given.shape} for {m} samples; give one number per body axis (3,), or (m, 3)"
             )
         return array(f"{self.sensor}: sigma_axes", np.broadcast_to(given, (m, 3)), (m, 3), allow_nan=True)
 
@@ -225,11 +275,22 @@ class VectorMeasurements:
 
     @property
     def references_f(self) -> Array:
-        """The reference of every sample (m, 3)."""
+        """Reference of every sample (m, 3), fixed frame."""
         return np.broadcast_to(self.reference_f, (len(self.time), 3))
 
     def taken(self, which: Any) -> VectorMeasurements:
-        """Return the samples that a mask (m,), slice or array of indices picks, with all that belongs to them."""
+        """Return the samples that an index selects, with all that belongs to them.
+
+        Parameters
+        ----------
+        which : ndarray or slice
+            Mask (m,), slice or array of indices.
+
+        Returns
+        -------
+        VectorMeasurements
+            The selected samples.
+        """
         names = ("time", "sigma", "sigma_axes", "covariance", "attitude", "arrival")
         rows = {name: getattr(self, name) for name in names}
         changed = {name: value[which] for name, value in rows.items() if value is not None}
@@ -240,7 +301,18 @@ class VectorMeasurements:
         return dataclasses.replace(self, **changed)
 
     def noise_scaled(self, factor: float) -> VectorMeasurements:
-        """Return the same samples with all their standard deviations multiplied by ``factor``."""
+        """Return the same samples with all standard deviations multiplied by a factor.
+
+        Parameters
+        ----------
+        factor : float
+            Factor, ≥ 0.
+
+        Returns
+        -------
+        VectorMeasurements
+            The series with the scaled noise.
+        """
         changed: dict[str, Any] = {"sigma": factor * self.sigma}
         if self.sigma_axes is not None:
             changed["sigma_axes"] = factor * self.sigma_axes
@@ -250,12 +322,12 @@ class VectorMeasurements:
 
     @property
     def anisotropic(self) -> bool:
-        """Whether its noise is not told by one sigma a sample; of an attitude, not by one an axis."""
+        """Whether the noise needs more than one sigma per sample; for an attitude, more than one per axis."""
         return self.covariance is not None or (self.kind != "attitude" and self.sigma_axes is not None)
 
     @property
     def covariances(self) -> Array:
-        """Covariance of the noise of every sample in body axes (m, 3, 3); of a heading its variance stands on the diagonal."""
+        """Covariance of the noise of every sample (m, 3, 3), body axes; for a heading its variance on the diagonal."""
         if self.covariance is not None:
             return self.covariance
         if self.sigma_axes is not None:
@@ -264,16 +336,16 @@ class VectorMeasurements:
 
 
 def _missing(value: Array) -> np.ndarray:
-    """Return which rows (m,) hold a NaN; one makes the sum so, which is the quicker to tell that there is none."""
+    """Return which rows (m,) hold a NaN. The sum is NaN if any is, which is the quickest check that there is none."""
     if np.isnan(np.sum(value)):
         return np.asarray(np.isnan(value).any(axis=1))
     return np.zeros(len(value), bool)
 
 
 def _of_known(name: str, value: Array, missing: np.ndarray, stand_in: Array | Callable[[Array], ArrayLike]) -> Array:
-    """Return what belongs to each sample (m, ...), where it is NaN of a missing one (m,) with ``stand_in`` for it.
+    """Return a property of each sample (m, ...), NaN of a missing sample (m,) replaced by ``stand_in``.
 
-    That is an array as long, or a function of what is known of the others.
+    ``stand_in`` is an array of the same length, or a function of the known entries.
     """
     if not np.isnan(np.sum(value)):
         return value
@@ -281,7 +353,7 @@ def _of_known(name: str, value: Array, missing: np.ndarray, stand_in: Array | Ca
     if np.any(lost & ~missing):
         k = int(np.argmax(lost & ~missing))
         raise InputError(
-            f"{name}[{k}] is nan beside a measured value; give it, or mark the sample as missing by NaN in the value itself"
+            f"{name}[{k}] is nan at a measured value; give it, or mark the sample as missing by NaN in the value itself"
         )
     filled = value.copy()
     filled[lost] = stand_in(value[~lost]) if callable(stand_in) else stand_in[lost]
@@ -320,9 +392,9 @@ def _covariances(name: str, value: ArrayLike, m: int, missing: np.ndarray) -> Ar
 
 
 UNIT_TOLERANCE = 1e-6
-"""A measured direction whose length is off by more than this is taken for a mistake, not for rounding."""
+"""Departure of the length of a measured direction from 1 above which it is an error, not rounding."""
 LEAST_LEVEL = 1e-3
-"""A unit reference with a horizontal part below this shows no heading."""
+"""Horizontal part of a unit reference below which it shows no heading."""
 
 
 def need_unit(name: str, vector: Array) -> None:
@@ -396,20 +468,30 @@ def _cross_product(a: Sequence[float], b: Sequence[float]) -> tuple[float, float
 
 @dataclass(frozen=True, kw_only=True)
 class Faults:
-    """What is amiss with a sensor beyond its white noise. The default is nothing."""
+    """Errors of a sensor beyond its white noise. The default is none.
+
+    Parameters
+    ----------
+    latency : float, default 0.0
+        Delay from the time of a sample to its arrival, s.
+    outages : sequence of (float, float), default empty
+        Windows (from, to) without samples, s: eclipse, blinding, a lost fix.
+    outlier_probability : float, default 0.0
+        Probability that a sample is an outlier, independently of the others.
+    outlier_scale : float, default 10.0
+        Noise of an outlier over that of other samples (contaminated normal, Tukey 1960).
+    correlated_sigma : float, default 0.0
+        Standard deviation of an additional first-order Gauss–Markov noise of each component, in the unit of sigma.
+    correlation_time : float, default 100.0
+        Correlation time of that noise, s.
+    """
 
     latency: float = 0.0
-    """Samples arrive so much after their time, s."""
     outages: Sequence[tuple[float, float]] = ()
-    """Windows [from, to] without samples, s: eclipse, blinding, a lost fix."""
     outlier_probability: float = 0.0
-    """Probability that a sample is an outlier, each by itself."""
     outlier_scale: float = 10.0
-    """The noise of outliers over that of the others: contaminated normal (Tukey 1960)."""
     correlated_sigma: float = 0.0
-    """Standard deviation of a first-order Gauss–Markov noise on top, of each component, in the unit of sigma."""
     correlation_time: float = 100.0
-    """Its correlation time, s."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -429,9 +511,21 @@ class Faults:
         positive("correlation_time", self.correlation_time, unit="s")
 
     def noise(self, time: Array, generator: np.random.Generator) -> tuple[Array, Array]:
-        """Return white noise of unit σ with its outliers, and the correlated noise, (m, 3) each.
+        """Return white noise of unit σ with its outliers, and the correlated noise.
 
-        The white noise is drawn first and in one go, so a sensor has the same one with faults and without.
+        Parameters
+        ----------
+        time : ndarray (m,)
+            Times of the measurements, s, increasing.
+        generator : numpy.random.Generator
+            Random stream of the sensor.
+
+        Returns
+        -------
+        white : ndarray (m, 3)
+            White noise of unit σ; the same one with faults and without, as it is drawn first.
+        correlated : ndarray (m, 3)
+            Gauss–Markov noise, in the unit of ``correlated_sigma``.
         """
         white = generator.standard_normal((len(time), 3))
         struck = (
@@ -450,7 +544,18 @@ class Faults:
         return white, correlated
 
     def heard(self, series: VectorMeasurements) -> VectorMeasurements:
-        """Return the series without the samples in outages, with the times of arrival if there is a latency."""
+        """Return the series without the samples in outages, with arrival times if there is a latency.
+
+        Parameters
+        ----------
+        series : VectorMeasurements
+            Measurements without faults of timing.
+
+        Returns
+        -------
+        VectorMeasurements
+            The series as it arrives.
+        """
         arrival = series.time + self.latency if self.latency > 0.0 else None
         series = dataclasses.replace(series, arrival=arrival)
         if not self.outages:
@@ -483,17 +588,31 @@ def _body(motion: Any, time: Array, vector_f: Array) -> Array:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VectorSensor(ByValue):
-    """A sensor of one known direction: a star, the sun, a beacon."""
+    """A sensor of one known direction: a star, the sun, a beacon.
+
+    Parameters
+    ----------
+    name : str
+        Name of the sensor and of its stream of random numbers.
+    reference_f : ndarray (3,)
+        Direction measured, fixed frame; its length does not matter.
+    sigma : float
+        Noise of each component of the unit direction before it is normalised, rad; above 0.1 rad see the module's notes.
+    rate : float
+        Measurements per second, Hz.
+    phase : float, default 0.0
+        Time of the first measurement after the start, s; 0: one interval after it.
+    kind : {"direction", "heading"}, default "direction"
+        Direction, or heading about the fixed z axis.
+    faults : Faults, default no faults
+        Errors beyond the white noise.
+    """
 
     name: str
     reference_f: Array
-    """Direction in the fixed frame (3,); its length does not matter."""
     sigma: float
-    """Noise of each component of the unit direction before it is normalised, rad; above 0.1 rad see the module's notes."""
     rate: float
-    """Measurements a second, Hz."""
     phase: float = 0.0
-    """Time of the first measurement after the start, s; 0 means one interval after it."""
     kind: Kind = "direction"
     faults: Faults = field(default_factory=Faults)
 
@@ -504,11 +623,22 @@ class VectorSensor(ByValue):
         one_of(f"{self.name}: kind", self.kind, ("direction", "heading"))
 
     def times(self, start: float, end: float) -> Array:
-        """Return the measurement times in (start, end], s."""
+        """Return the measurement times.
+
+        Parameters
+        ----------
+        start, end : float
+            Interval (start, end], s.
+
+        Returns
+        -------
+        ndarray (m,)
+            Times, s.
+        """
         return sample_times(self.rate, self.phase, start, end)
 
     def observe(self, motion: Any, start: float, end: float, generator: np.random.Generator) -> VectorMeasurements:
-        """Return noisy measurements over (start, end] of a body that moves so (a motion, or its attitude q_fb as a function of time)."""
+        """Return noisy measurements over (start, end] of a motion, or of an attitude q_fb given as a function of time."""
         time = self.times(start, end)
         white, correlated = self.faults.noise(time, generator)
         noisy = _body(motion, time, self.reference_f) + self.sigma * white + correlated
@@ -528,7 +658,33 @@ class VectorSensor(ByValue):
 def star_directions(
     name: str, stars_f: ArrayLike, *, sigma: float, rate: float, phase: float = 0.0, faults: Faults | None = None
 ) -> tuple[VectorSensor, ...]:
-    """Return a star tracker that gives several stars (k, 3) as directions: one sensor a star, all at the same times."""
+    """Return a star tracker that measures several stars as directions: one sensor per star, all at the same times.
+
+    Parameters
+    ----------
+    name : str
+        Name of the tracker; the sensors are numbered after it.
+    stars_f : array_like (k, 3)
+        Directions of the stars, fixed frame.
+    sigma : float
+        Noise of each component of a unit direction, rad.
+    rate : float
+        Measurements per second, Hz.
+    phase : float, default 0.0
+        Time of the first measurement after the start, s; 0: one interval after it.
+    faults : Faults, optional
+        Errors beyond the white noise; None: none.
+
+    Returns
+    -------
+    tuple of VectorSensor
+        The sensors.
+
+    Examples
+    --------
+    >>> [sensor.name for sensor in star_directions("tracker", np.eye(3)[:2], sigma=1e-4, rate=1.0)]
+    ['tracker 1', 'tracker 2']
+    """
     stars = array(f"{name}: stars_f", stars_f, ("k", 3))
     return tuple(
         VectorSensor(
@@ -540,17 +696,31 @@ def star_directions(
 
 @dataclass(frozen=True, kw_only=True)
 class AttitudeSensor:
-    """A star tracker that gives the attitude as a quaternion; coarse about its boresight, fine across it."""
+    """A star tracker that gives the attitude as a quaternion; coarse about its boresight, fine across it.
+
+    Parameters
+    ----------
+    name : str
+        Name of the sensor and of its stream of random numbers.
+    sigma_across : float
+        Noise about the two axes across the boresight, rad.
+    sigma_about : float
+        Noise about the boresight, rad.
+    rate : float
+        Measurements per second, Hz.
+    boresight : {"x", "y", "z"}, default "z"
+        Body axis of the boresight.
+    phase : float, default 0.0
+        Time of the first measurement after the start, s; 0: one interval after it.
+    faults : Faults, default no faults
+        Errors beyond the white noise.
+    """
 
     name: str
     sigma_across: float
-    """Noise about the axes across the boresight, rad."""
     sigma_about: float
-    """Noise about the boresight, rad."""
     rate: float
-    """Hz."""
     boresight: Literal["x", "y", "z"] = "z"
-    """Body axis along which it looks."""
     phase: float = 0.0
     faults: Faults = field(default_factory=Faults)
 
@@ -583,21 +753,37 @@ class AttitudeSensor:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Magnetometer(ByValue):
-    """A magnetometer in a known field: ``m_b = (I + S) R_fbᵀ B_f + h + v``, S soft iron, h hard iron (the calibration left over)."""
+    """A magnetometer in a known field: ``m_b = (I + S) R_fbᵀ B_f + h + v``, S soft iron, h hard iron (the residual of the calibration).
+
+    Parameters
+    ----------
+    name : str
+        Name of the sensor and of its stream of random numbers.
+    field_f : ndarray (3,) or callable
+        Magnetic field, T, fixed frame; or a function of time (m,), s, that returns it (m, 3).
+    sigma : float
+        Noise of each component, T.
+    rate : float
+        Measurements per second, Hz.
+    hard_iron : ndarray (3,), default zeros
+        Offset h, T, body axes.
+    soft_iron : ndarray (3, 3), default zeros
+        S, dimensionless.
+    kind : {"direction", "heading", "vector"}, default "direction"
+        Direction, heading about the fixed z axis, or the whole vector in T.
+    phase : float, default 0.0
+        Time of the first measurement after the start, s; 0: one interval after it.
+    faults : Faults, default no faults
+        Errors beyond the white noise.
+    """
 
     name: str
     field_f: Array | VectorField
-    """The field in the fixed frame, T: a vector (3,), or a function of time (m,) that returns (m, 3)."""
     sigma: float
-    """Noise of each component, T."""
     rate: float
-    """Hz."""
     hard_iron: Array = field(default_factory=lambda: np.zeros(3))
-    """(3,), T."""
     soft_iron: Array = field(default_factory=lambda: np.zeros((3, 3)))
-    """(3, 3)."""
     kind: Kind = "direction"
-    """``"direction"``, ``"heading"`` (about the fixed z axis) or ``"vector"`` (T)."""
     phase: float = 0.0
     faults: Faults = field(default_factory=Faults)
 
@@ -650,9 +836,31 @@ def specific_force(
     acceleration_f: VectorField | None = None,
     gravity_f: ArrayLike = GRAVITY_F,
 ) -> Array:
-    """Return the specific force (..., 3), m/s², body axes, at a point of the body: what an ideal accelerometer there feels.
+    """Return the specific force at a point of the body: the output of an ideal accelerometer there.
 
-    ``f_b = R_fbᵀ (a_f − g_f) + ẇ_b × r + w_b × (w_b × r)`` at the lever arm r from the point that moves with a_f.
+    Parameters
+    ----------
+    motion : Motion
+        Motion of the body.
+    time : array_like (...)
+        Times, s.
+    lever_arm_b : array_like (3,), default zeros
+        Position r of the point, m, body axes, from the point that moves with ``acceleration_f``.
+    acceleration_f : callable, optional
+        Acceleration a_f, m/s², fixed frame, as a function of time (m,), s, that returns (m, 3). Default: zero.
+    gravity_f : array_like (3,), default (0, 0, −9.80665)
+        Acceleration of gravity g_f, m/s², fixed frame.
+
+    Returns
+    -------
+    ndarray (..., 3)
+        ``f_b = R_fbᵀ (a_f − g_f) + ẇ_b × r + w_b × (w_b × r)``, m/s², body axes.
+
+    Examples
+    --------
+    >>> from strapdown.motion import rest
+    >>> specific_force(rest(), 0.0).tolist()
+    [0.0, 0.0, 9.80665]
     """
     t = np.asarray(time, np.float64)
     arm = array("lever_arm_b", lever_arm_b, (3,))
@@ -666,23 +874,40 @@ def specific_force(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Accelerometer(ByValue):
-    """An accelerometer taken for a sensor of the vertical: right at rest, wrong by whatever the body accelerates."""
+    """An accelerometer used as a sensor of the vertical: right at rest, in error by the acceleration of the body.
+
+    Parameters
+    ----------
+    name : str
+        Name of the sensor and of its stream of random numbers.
+    sigma : float
+        Noise of each component, m/s².
+    rate : float
+        Measurements per second, Hz.
+    lever_arm_b : ndarray (3,), default zeros
+        Position on the body, m, from the point that moves with ``acceleration_f``.
+    bias : ndarray (3,), default zeros
+        Bias, m/s², body axes.
+    acceleration_f : callable, optional
+        Acceleration of that point, m/s², fixed frame, as a function of time (m,), s, that returns (m, 3); None: none.
+    gravity_f : ndarray (3,), default (0, 0, −9.80665)
+        Acceleration of gravity, m/s², fixed frame.
+    kind : {"direction", "vector"}, default "direction"
+        Direction of the vertical, or the whole vector in m/s².
+    phase : float, default 0.0
+        Time of the first measurement after the start, s; 0: one interval after it.
+    faults : Faults, default no faults
+        Errors beyond the white noise.
+    """
 
     name: str
     sigma: float
-    """Noise of each component, m/s²."""
     rate: float
-    """Hz."""
     lever_arm_b: Array = field(default_factory=lambda: np.zeros(3))
-    """Place on the body (3,), m, from the point that moves with ``acceleration_f``."""
     bias: Array = field(default_factory=lambda: np.zeros(3))
-    """(3,), m/s²."""
     acceleration_f: VectorField | None = None
-    """Acceleration of that point in the fixed frame, m/s²; None: none."""
     gravity_f: Array = field(default_factory=lambda: np.array(GRAVITY_F))
-    """(3,), m/s²."""
     kind: Kind = "direction"
-    """``"direction"`` or ``"vector"`` (m/s²)."""
     phase: float = 0.0
     faults: Faults = field(default_factory=Faults)
 
@@ -719,15 +944,27 @@ class HeadingPair(ByValue):
     """Two GNSS antennas on the body: the heading of the line between them.
 
     The line is known in the body and measured in the fixed frame, so ``vector_b`` is exact and ``reference_f`` (m, 3) has the noise.
+
+    Parameters
+    ----------
+    name : str
+        Name of the sensor and of its stream of random numbers.
+    baseline_b : ndarray (3,)
+        From the first antenna to the second, m, body axes.
+    sigma : float
+        Noise of each component of the relative position, m; that of the heading is this over the baseline's horizontal length.
+    rate : float
+        Measurements per second, Hz.
+    phase : float, default 0.0
+        Time of the first measurement after the start, s; 0: one interval after it.
+    faults : Faults, default no faults
+        Errors beyond the white noise.
     """
 
     name: str
     baseline_b: Array
-    """From the first antenna to the second (3,), m, body axes."""
     sigma: float
-    """Noise of each component of the relative position, m; the heading's is that over the baseline's level length."""
     rate: float
-    """Hz."""
     phase: float = 0.0
     faults: Faults = field(default_factory=Faults)
 

@@ -1,10 +1,11 @@
-"""Attitude from vector observations at one instant: TRIAD, and the optimal answer to Wahba's problem with its covariance.
+"""Attitude from vector observations at one instant: TRIAD, and the optimal solution of Wahba's problem with its covariance.
 
-Directions ``b_i`` measured in the body frame are known as ``r_i`` in the fixed frame; wanted is the attitude ``q_fb``, matrix R, that
-minimises Wahba's loss ``½ Σ |b_i − Rᵀ r_i|² / σ_i²`` (Wahba 1965, SIAM Review 7). ``σ_i`` is the noise of each of the *two* components
-across the direction, rad: ``E[n nᵀ] = σ² (I − b bᵀ)``, the QUEST measurement model (Shuster & Oh 1981, J. Guidance and Control 4).
+Directions ``b_i`` measured in the body frame are known as ``r_i`` in the fixed frame; wanted is the attitude ``q_fb``, matrix R,
+that minimises Wahba's loss ``½ Σ |b_i − Rᵀ r_i|² / σ_i²`` (Wahba 1965, SIAM Review 7). ``σ_i`` is the noise of each of the *two*
+components across the direction, rad: ``E[n nᵀ] = σ² (I − b bᵀ)``, the QUEST measurement model (Shuster & Oh 1981, J. Guidance and
+Control 4).
 
-Only directions count: the length of every vector given is divided out.
+Only directions count: every vector is divided by its length.
 """
 
 from __future__ import annotations
@@ -21,25 +22,34 @@ from strapdown.checks import Array, InputError, array, one_of
 from strapdown.kinematics import skew
 from strapdown.units import DEGREE
 
+__all__ = [
+    "InconsistentError",
+    "Solution",
+    "from_vertical_and_heading",
+    "solve",
+    "triad",
+    "triad_covariance",
+]
+
 Method = Literal["svd", "davenport", "quest", "foam"]
 
 INCONSISTENT = 6.0
-"""Two measured directions whose angle is off by more than this many σ are refused: chance does so about once in 1e8 pairs."""
+"""Two measured directions whose angle is off by more than this many σ are inconsistent: chance exceeds it twice in 1e9 pairs."""
 
 LARGEST_UNCERTAINTY = 1.0
 """A 1σ of the attitude, rad, beyond which a direction of it counts as undetermined (a uniform angle has 1.8)."""
 
 LEAST_ANGLE = 1e-6
-"""Two directions closer than this to one line, rad, are refused where no σ is given to judge by."""
+"""Smallest angle between two directions and one line, rad, where no σ is given to judge by."""
 
 LEAST_HORIZONTAL_ANGLE = 1e-3
-"""A magnetic field closer than this to the vertical, rad, shows no heading."""
+"""Angle between magnetic field and vertical, rad, below which there is no heading."""
 
 LEAST_WEIGHT = 1e-12
 """Weights 1/σ² below this part of the largest are lifted to it in the matrices that the methods start from: doubles hold no more."""
 
 ROUNDING = 1e-15
-"""What rounding leaves of the direction of a unit vector, rad."""
+"""Rounding error of the direction of a unit vector, rad."""
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -54,7 +64,7 @@ def triad(
     *,
     sigmas: ArrayLike | None = None,
 ) -> Array:
-    """Return q_fb (..., 4) from two directions: the first is met exactly, the second only turns about it (TRIAD; Black 1964).
+    """Return the attitude from two directions: the first is met exactly, the second fixes the rotation about it.
 
     Parameters
     ----------
@@ -63,12 +73,23 @@ def triad(
     primary_f, secondary_f : array_like (..., 3)
         The same directions in the fixed frame.
     sigmas : array_like (2,), optional
-        Noise of both, rad. Given, the angle between the two must agree in both frames to within it; without, it is not looked at.
+        Noise of both, rad. If given, the angle between the two must agree in both frames within the noise; it is not checked
+        otherwise.
+
+    Returns
+    -------
+    ndarray (..., 4)
+        Unit quaternions q_fb (TRIAD; Black 1964).
 
     Raises
     ------
     InputError
         If two directions of one frame lie on one line, or their angles disagree beyond the noise.
+
+    Examples
+    --------
+    >>> triad([0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]).tolist()
+    [1.0, 0.0, 0.0, 0.0]
     """
     first_b, second_b = _directions("primary_b", primary_b), _directions("secondary_b", secondary_b)
     first_f, second_f = _directions("primary_f", primary_f), _directions("secondary_f", secondary_f)
@@ -83,10 +104,29 @@ def triad(
 def triad_covariance(
     primary_b: ArrayLike, secondary_b: ArrayLike, primary_sigma: float, secondary_sigma: float
 ) -> Array:
-    """Return the covariance (..., 3, 3), rad², of TRIAD's body-side error δθ, q_true = q ⊗ exp(δθ).
+    """Return the covariance of TRIAD's body-side error δθ, q_true = q ⊗ exp(δθ).
 
-    With c, s the cosine and sine of the angle between the two and (b₁, u, e) the right-handed axes in which b₂ = c b₁ + s u: σ₁² about u
-    and about e, ``(σ₂² + c² σ₁²)/s²`` about b₁, and ``c σ₁²/s`` between b₁ and u (Shuster & Oh 1981, in other letters).
+    Parameters
+    ----------
+    primary_b, secondary_b : array_like (..., 3)
+        Directions in the body frame.
+    primary_sigma, secondary_sigma : float
+        Noise of each component across them, rad.
+
+    Returns
+    -------
+    ndarray (..., 3, 3)
+        Covariance, rad², body axes.
+
+    Raises
+    ------
+    InputError
+        If the two directions lie on one line.
+
+    Notes
+    -----
+    With c, s the cosine and sine of the angle between the two and (b₁, u, e) the right-handed axes in which b₂ = c b₁ + s u: σ₁²
+    about u and about e, ``(σ₂² + c² σ₁²)/s²`` about b₁, and ``c σ₁²/s`` between b₁ and u (Shuster & Oh 1981, in other letters).
     """
     first, second = _directions("primary_b", primary_b), _directions("secondary_b", secondary_b)
     _refuse_parallel("primary_b", "secondary_b", first, second, LEAST_ANGLE)
@@ -104,17 +144,20 @@ def triad_covariance(
 
 
 def from_vertical_and_heading(up_b: ArrayLike, magnetic_b: ArrayLike) -> Array:
-    """Return q_fb (..., 4) in the East-North-Up frame (x East, y magnetic North, z up).
-
-    The vertical is met exactly; of the magnetic field only its horizontal part counts, which points North whatever the dip. The
-    covariance is that of :func:`triad_covariance` of the same two vectors.
+    """Return the attitude in the East-North-Up frame (x East, y magnetic North, z up).
 
     Parameters
     ----------
     up_b : array_like (..., 3)
-        Specific force of a body at rest (an accelerometer then measures *up*), any unit.
+        Specific force of a body at rest (an accelerometer then measures *up*), any unit, body axes.
     magnetic_b : array_like (..., 3)
-        Magnetic field, any unit, hard and soft iron taken out.
+        Magnetic field without hard and soft iron, any unit, body axes.
+
+    Returns
+    -------
+    ndarray (..., 4)
+        Unit quaternions q_fb. The vertical is met exactly; of the field only the horizontal part counts, which points North
+        whatever the dip. The covariance is :func:`triad_covariance` of the same two vectors.
 
     Raises
     ------
@@ -151,16 +194,24 @@ class InconsistentError(InputError):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solution:
-    """The attitude that minimises Wahba's loss, and how far it may be believed."""
+    """The attitude that minimises Wahba's loss, and its uncertainty.
+
+    Parameters
+    ----------
+    attitude : ndarray (..., 4)
+        Unit quaternions q_fb, w ≥ 0.
+    covariance : ndarray (..., 3, 3)
+        Covariance of the body-side error δθ, q_true = q ⊗ exp(δθ), rad²: ``[Σ (I − b bᵀ)/σ²]⁻¹``.
+    loss : ndarray (...,)
+        Wahba's loss ``½ Σ |b − Rᵀ r|²/σ²`` at the minimum.
+    dof : int
+        Degrees of freedom of the residual: two per direction, less three.
+    """
 
     attitude: Array
-    """q_fb (..., 4), w ≥ 0."""
     covariance: Array
-    """Covariance (..., 3, 3) of the body-side error δθ, q_true = q ⊗ exp(δθ), rad²: ``[Σ (I − b bᵀ)/σ²]⁻¹``."""
     loss: Array
-    """Wahba's loss ``½ Σ |b − Rᵀ r|²/σ²`` at the minimum (...,)."""
     dof: int
-    """Degrees of freedom of the residual: two a direction, less three."""
 
     @property
     def chi_square(self) -> Array:
@@ -178,7 +229,7 @@ class Solution:
 def solve(
     vectors_b: ArrayLike, references_f: ArrayLike, sigmas: ArrayLike, *, method: Method = "svd", refine: bool = True
 ) -> Solution:
-    """Return the attitude that minimises ``½ Σ |b_i − Rᵀ r_i|²/σ_i²``, with its covariance and residual.
+    """Return the attitude that minimises Wahba's loss, with its covariance and residual.
 
     Parameters
     ----------
@@ -186,20 +237,32 @@ def solve(
         Directions measured in the body frame.
     references_f : array_like (..., n, 3)
         The same directions in the fixed frame, in the same order.
-    sigmas : array_like (..., n) or scalar
+    sigmas : array_like (..., n) or float
         Noise of each component across each direction, rad.
-    method : {"svd", "davenport", "quest", "foam"}
-        They minimise the same loss and differ in arithmetic. ``foam`` takes n³ operations as written here to keep its digits.
-    refine : bool
-        End with Gauss–Newton steps on the residuals themselves. The matrix that all the methods start from holds 1/σ², so that its
-        rounding turns the attitude by up to 1e-16 (σ_max/σ_min)² rad about the worst known axis; the residuals hold 1/σ and do not.
-        Without them keep σ_max/σ_min below 1e6.
+    method : {"svd", "davenport", "quest", "foam"}, default "svd"
+        Methods with the same minimum and different arithmetic. ``foam`` needs n³ operations as implemented here, to keep its
+        digits.
+    refine : bool, default True
+        End with Gauss–Newton steps on the residuals. The matrix that all methods start from holds 1/σ², so that its rounding
+        rotates the attitude by up to 1e-16 (σ_max/σ_min)² rad about the worst known axis; the residuals hold 1/σ and do not.
+        Without these steps keep σ_max/σ_min below 1e6.
+
+    Returns
+    -------
+    Solution
+        Attitude, covariance, loss and degrees of freedom.
 
     Raises
     ------
     InputError
-        If there are fewer than two directions, one is zero or not finite, all lie on one line as seen by the noise, or the angle of a
-        pair differs between the frames by more than the noise explains.
+        If there are fewer than two directions, one is zero or not finite, all lie on one line within the noise, or the angle of a
+        pair differs between the frames by more than the noise explains (:class:`InconsistentError`).
+
+    Examples
+    --------
+    >>> found = solve([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], 1e-3)
+    >>> found.attitude.tolist(), found.dof
+    ([1.0, 0.0, 0.0, 0.0], 1)
     """
     one_of("method", method, _METHODS)
     b, r = _directions("vectors_b", vectors_b), _directions("references_f", references_f)
@@ -212,7 +275,7 @@ def solve(
         )
     if b.shape[-2] < 2:
         raise InputError(
-            f"vectors_b has {b.shape[-2]} direction(s), which leaves the turn about it open; give two or more, not on one line"
+            f"vectors_b has {b.shape[-2]} direction(s), which leaves the rotation about it undetermined; give two or more, not on one line"
         )
     try:
         b, r = (np.asarray(value) for value in np.broadcast_arrays(b, r))
@@ -391,7 +454,7 @@ _GAUSS_NEWTON_STEPS = 10
 
 
 # ----------------------------------------------------------------------------------------------------------------------
-# What is refused, and why
+# Checks of the input
 
 
 def _place(name: str, *index: int | np.intp) -> str:
@@ -437,7 +500,7 @@ def _refuse_parallel(first_name: str, second_name: str, first: Array, second: Ar
         index = np.argwhere(bad)[0]
         raise InputError(
             f"{_place(first_name, *index)} and {_place(second_name, *index)} are {angle[tuple(index)] / DEGREE:.6g}° apart, less than "
-            f"{least / DEGREE:.2g}° from one line: the turn about it cannot be known; give a second direction away from the first"
+            f"{least / DEGREE:.2g}° from one line: the rotation about it is not determined; give a second direction away from the first"
         )
 
 

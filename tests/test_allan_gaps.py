@@ -107,13 +107,13 @@ def test_a_stretch_that_moves_is_seen():
     x[4000:4050] += 8.0
     fit = allan_gaps.fit_noise(x, 0.01)
     assert fit.misfit_probability[0] < 1e-6
-    assert fit.misfit[0].startswith("in the stretch from 21 s ")
+    assert fit.misfit[0].startswith("in the segment from 21 s ")
 
 
 @pytest.mark.parametrize(
     ("values", "words"),
     [
-        (np.full(100, np.nan), "0 samples that are there"),
+        (np.full(100, np.nan), "0 samples that are present"),
         (np.where(np.arange(500) % 50, 1.0, np.nan), "no 64 samples in a row"),
         (np.where(np.arange(500) == 250, np.nan, 1.0), "axis 0, holds no noise"),
     ],

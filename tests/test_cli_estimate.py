@@ -433,7 +433,7 @@ def test_a_recording_is_taken_for_that_of_a_hand(run, recording, tmp_path):
     assert (status, error) == (0, "")
     assert "Motion: of a hand, 1 m/s with a correlation time of 0.3 s." in said
     assert "°/s, from that second." in said
-    assert "Samples are taken as 2.5 ms later than what they show, half a sample interval, σ 2 ms" in said
+    assert "Samples are assumed to be stamped 2.5 ms late, half a sample interval, σ 2 ms" in said
     assert "warning" not in said
     told = records.read_attributes(tmp_path / "out" / "estimate.h5")
     states = json.loads((tmp_path / "out" / "states.json").read_text())
@@ -455,7 +455,7 @@ def test_any_motion_smoothing_and_latency(run, recording, tmp_path):
         status, said, error = run("estimate", recording, "--out", tmp_path / name, *options)
         assert (status, error) == (0, ""), name
         errors[name] = off(tmp_path / name, 0.005 if name == "later" else 0.0)
-        assert ("Samples are taken as 5 ms later than what they show." in said) == (name == "later")
+        assert ("Samples are assumed to be stamped 5 ms late." in said) == (name == "later")
         assert ("Motion: any" in said) == (name == "any")
     assert errors["smoothed"] < errors["hand"] < errors["any"]
     assert abs(errors["later"] - errors["hand"]) < 0.3

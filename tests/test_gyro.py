@@ -499,7 +499,7 @@ def test_one_degree_a_second_a_root_hertz_is_sixty_degrees_a_root_hour():
         ({"arw": "0.15"}, "no unit"),
         ({"arw": "0.15 1/sqrt(h)"}, "radian / second"),
         ({"arw": "0.15 bananas"}, "bananas"),
-        ({"arw": "deg//h"}, "no quantity"),
+        ({"arw": "deg//h"}, "not a quantity"),
         ({"arw": 0.15}, "as text with its unit"),
         ({"bandwidth": "50 rad/s"}, "bandwidth.*Hz"),
         ({"awr": "1 deg/h"}, "did you mean 'arw'"),

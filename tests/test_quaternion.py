@@ -426,7 +426,7 @@ def test_the_covariance_of_the_mean_is_that_of_its_error(told):
 
 def test_what_has_no_mean_is_refused():
     half_turn = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]]
-    with pytest.raises(InputError, match="no mean"):
+    with pytest.raises(InputError, match="mean of the attitudes is not unique"):
         quaternion.mean(half_turn)
     with pytest.raises(InputError, match="two or more"):
         quaternion.mean(half_turn[:1])

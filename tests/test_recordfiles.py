@@ -192,7 +192,7 @@ def test_foreign_and_damaged_csv_is_refused(made, tmp_path):
         ("\n".join([lines[0], "time_s,x", "1,2"]), "columns"),
         ("\n".join([*lines[:5], lines[5][:40]]), "line 6"),
         ("\n".join([*lines[:4], lines[4].replace(lines[4].split(",")[2], "abc")]), "line 5"),
-        ("\n".join(["# strapdown vectors {}", *lines[1:]]), "no record"),
+        ("\n".join(["# strapdown vectors {}", *lines[1:]]), "not a record"),
         ("\n".join(lines[:3]), "at least 2"),
     ):
         path.write_text(content)
@@ -204,7 +204,7 @@ def test_foreign_and_damaged_csv_is_refused(made, tmp_path):
     export_csv(path, made[1])
     beside = tmp_path / "record-vectors-1.csv"
     beside.write_text(beside.read_text().replace('"magnetometer"', "magnetometer"))
-    with pytest.raises(InputError, match="no vector series"):
+    with pytest.raises(InputError, match="not a vector series"):
         import_csv(path)
     assert recordfiles.KIND == "strapdown record"
 
@@ -244,7 +244,7 @@ def test_csv_cut_at_the_end_of_a_line_is_refused(made, tmp_path):
         lines = whole.splitlines()
         for cut in (lines[:-1], lines[:-2], [*lines, lines[-1].replace(lines[-1].split(",")[0], "1e3", 1)]):
             path.write_text("\n".join(cut) + "\n")
-            with pytest.raises(InputError, match=rf"{path.name} ends at .* s, its first line says .* s; it was cut or"):
+            with pytest.raises(InputError, match=rf"{path.name} ends at .* s, its first line states .* s; it was truncated or"):
                 import_csv(written[0])
         path.write_text(whole)
     lines = written[1].read_text().splitlines()

@@ -173,12 +173,12 @@ def test_a_sensor_of_zeros_is_told(csv, columns, name):
 def test_a_result_is_no_recording(tmp_path):
     with h5py.File(tmp_path / "estimate.h5", "w") as file:
         file.attrs["kind"] = "strapdown estimate"
-    refused(tmp_path / "estimate.h5", "is a strapdown estimate, a result and no recording; give what it was made from")
+    refused(tmp_path / "estimate.h5", "is a strapdown estimate, a result, not a recording; give the recording that it was made from")
 
 
 def test_a_simulated_record_in_csv_is_no_recording(tmp_path):
     recordfiles.export_csv(tmp_path / "x.csv", ImuRecord(time=[0.0, 1.0], increments=[[0.0, 0.1, 0.2]]))
-    refused(tmp_path / "x.csv", "is a simulated record, no recording; integrate it")
+    refused(tmp_path / "x.csv", "is a simulated record, not a recording; integrate it")
 
 
 def test_half_a_magnetometer_is_refused(csv):

@@ -274,14 +274,14 @@ def test_foreign_files_are_refused(tmp_path):
         (
             "variance",
             lambda x: np.where(np.arange(6) == 4, 0.0, x),
-            r"variance\[0, 4\] is 0, and a variance is greater than zero",
+            r"variance\[0, 4\] is 0, and a variance must be greater than zero",
         ),
         ("variance", lambda x: -x, r"variance\[0, 0\] is -.*make the estimate again"),
         ("covariance", lambda x: -x, r"covariance, diagonal\[0, 0\] is -"),
         ("innovations/0/variance", lambda x: x - 1e3, r"innovations/0/variance\[0, 0\] is -.*give each a sigma"),
         ("innovations/0/variance", lambda x: x[:, :1], r"innovations/0/variance has shape"),
         ("innovations/0/time", lambda x: x[1:], r"innovations/0/innovation has shape"),
-        ("bias", lambda x: x + 1e200, r"bias\[0, 0\] is 1e\+200 rad/s, the bias of no gyro.*unit"),
+        ("bias", lambda x: x + 1e200, r"bias\[0, 0\] is 1e\+200 rad/s, more than any gyro has.*unit"),
         ("bias", lambda x: x[:, 0], r"bias has shape"),
         ("bias", lambda x: np.array(["1.0"] * 7, dtype="S3"), r"bias "),
         ("attitude", lambda x: 2.0 * x, r"attitude\[0\] has norm 2"),
@@ -313,7 +313,7 @@ def test_a_turn_that_nothing_makes_is_told_by_its_place():
     """Deep inside it would end as an attitude of NaN."""
     increments = np.zeros((4, 3))
     increments[2, 1] = -1e10
-    with pytest.raises(InputError, match=r"increments\[2, 1\] is -1e\+10 rad in 0.5 s, and nothing turns so far"):
+    with pytest.raises(InputError, match=r"increments\[2, 1\] is -1e\+10 rad in 0.5 s, more than 1e\+06 rad between"):
         ImuRecord(time=0.5 * np.arange(5), increments=increments)
 
 

@@ -262,19 +262,19 @@ ATTITUDES = {
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"sigma": [0.1, 0.1]}, r"s: sigma has shape \(2,\) for 5 samples; give one number, or one a sample"),
+        ({"sigma": [0.1, 0.1]}, r"s: sigma has shape \(2,\) for 5 samples; give one number, or one per sample"),
         ({"sigma": [0.1, 0.1, 0.2]}, r"s: sigma has shape \(3,\) .* as sigma_axes"),
         ({"sigma": 0.1 * np.ones((5, 3))}, r"s: sigma has shape \(5, 3\)"),
         ({"sigma": "0.1"}, "s: sigma is not an array of numbers"),
-        ({"sigma": 0.0, "sigma_axes": [0.1, 0.1]}, r"s: sigma_axes has shape \(2,\) .* one number a body axis"),
+        ({"sigma": 0.0, "sigma_axes": [0.1, 0.1]}, r"s: sigma_axes has shape \(2,\) .* one number per body axis"),
         ({"sigma": 0.0, "covariance": np.eye(2)}, r"s: covariance has shape \(2, 2\)"),
         ({"time": 0.5}, r"s: time has shape \(\)"),
         ({"time": None}, "s: time"),
         ({"kind": "attitude", "attitude": None}, "needs attitude"),
         ({**ATTITUDES, "sigma": 0.0}, r"needs its noise: sigma \(m,\), sigma_axes \(m, 3\) or covariance \(m, 3, 3\)"),
         ({**ATTITUDES, "attitude": 2.0 * ATTITUDES["attitude"]}, r"s: attitude\[0\] has norm 2"),
-        ({"sigma": np.nan}, r"s: sigma\[0\] is nan beside a measured value; give it, or mark the sample as missing"),
-        ({"sigma": [0.1, 0.1, 0.1, np.nan, 0.1]}, r"s: sigma\[3\] is nan beside a measured value"),
+        ({"sigma": np.nan}, r"s: sigma\[0\] is nan at a measured value; give it, or mark the sample as missing"),
+        ({"sigma": [0.1, 0.1, 0.1, np.nan, 0.1]}, r"s: sigma\[3\] is nan at a measured value"),
         ({"sigma": [0.1, 0.1, 0.1, np.inf, 0.1]}, r"s: sigma\[3\] is inf"),
         ({"sigma": 0.0, "sigma_axes": np.diag([1.0] * 5)[:, :3] * np.nan}, r"s: sigma_axes\[0\] is nan"),
         ({"sigma": 0.0, "covariance": np.full((5, 3, 3), np.nan)}, r"s: covariance\[0\] is nan beside"),
@@ -446,7 +446,7 @@ def test_a_field_without_a_direction_is_told(field, kind):
 
 def test_a_sigma_whose_square_vanishes_is_told_by_its_place():
     sigma = np.array([1e-3, 1e-300, 1e-3])
-    with pytest.raises(InputError, match=r"star: sigma\[1\] is 1e-300, and its square is no number"):
+    with pytest.raises(InputError, match=r"star: sigma\[1\] is 1e-300, and its square underflows"):
         vectors.VectorMeasurements(
             sensor="star", kind="direction", time=np.arange(3.0), vector_b=np.eye(3), sigma=sigma
         )

@@ -1,4 +1,4 @@
-"""The algorithms: frozen tables that refuse to be made when their order conditions fail, and the catalogue of all of them."""
+"""The algorithms: frozen tables that are rejected on construction if their order conditions fail, and the catalogue of all of them."""
 
 from __future__ import annotations
 
@@ -47,31 +47,47 @@ class Algorithm:
     """An integration algorithm as a table; refuses to be made if the drift order it claims is not the one its coefficients have.
 
     The claim is checked exactly, in rationals: the power series of the drift under small coning must begin at λ^``drift_order``.
+
+    Parameters
+    ----------
+    name : str
+        Name in the catalogue.
+    solver : str
+        One of :data:`SOLVERS`.
+    samples : int
+        N, increments in a step.
+    previous : int, default 0
+        p, increments used before the step.
+    following : int, default 0
+        f, increments used after the step: the delay in samples.
+    rate_points : int, default 0
+        Rate samples in the quadrature that forms one increment; 0 where the algorithm takes true increments.
+    order : int
+        Global order of convergence on any smooth motion, with all increments exact.
+    drift_order : int
+        Even power of λ with which the drift under small coning falls.
+    coefficients : tuple of Fraction, default empty
+        Of the compressed solver: k_1 … k_{N−1+p} in φ = Σ Δθ_i + (Σ_j k_j Δθ_{N−j}) × Δθ_N.
+    pairs : tuple of tuples of Fraction, default empty
+        Of the pairs solver: K over the window in φ = Σ Δθ_i + Σ_{i<j} K_ij Δθ_i × Δθ_j, a pair table (see ``coefficients``).
+    correction : tuple of tuples of Fraction, default empty
+        Of the polynomial solver: the pair table C that is added to the solution of the quaternion equation; zeros for none.
+    source : str, default ""
+        Where it was published.
     """
 
     name: str
     solver: str
-    """One of :data:`SOLVERS`."""
     samples: int
-    """N, increments in a step."""
     previous: int = 0
-    """p, increments used of those before the step."""
     following: int = 0
-    """f, increments used of those after the step: the delay, in samples."""
     rate_points: int = 0
-    """Rate samples in the quadrature that forms one increment; 0 where the algorithm takes true increments."""
     order: int
-    """Global order of convergence on any smooth motion, with all increments exact."""
     drift_order: int
-    """The drift under small coning falls as λ to this power."""
     coefficients: Rationals = field(default=(), repr=False)
-    """Of the compressed solver: k_1 … k_{N−1+p} in φ = Σ Δθ_i + (Σ_j k_j Δθ_{N−j}) × Δθ_N."""
     pairs: Table = field(default=(), repr=False)
-    """Of the pairs solver: K over the window in φ = Σ Δθ_i + Σ_{i<j} K_ij Δθ_i × Δθ_j, a pair table (see ``coefficients``)."""
     correction: Table = field(default=(), repr=False)
-    """Of the polynomial solver: the pair table C that is added to the solution of the quaternion equation; zeros for none."""
     source: str = ""
-    """Where it was published."""
 
     def __post_init__(self) -> None:
         """Check shapes and order conditions."""
@@ -141,7 +157,7 @@ class Algorithm:
 
     @property
     def needs(self) -> str:
-        """What the algorithm takes, in words."""
+        """Input of the algorithm in words: increments or rates, and the delay."""
         if self.rate_points:
             return f"rates ({self.rate_points}-point quadrature)"
         return "increments" + (f", {self.following} samples late" if self.following else "")
@@ -327,7 +343,7 @@ def runge_kutta() -> Algorithm:
 
 
 def euler() -> Algorithm:
-    """Return q + ½ q ⊗ Δθ, normalised: what many small projects do."""
+    """Return q + ½ q ⊗ Δθ, normalised: the scheme of many small projects."""
     return Algorithm(name="quaternion-euler", solver="euler", samples=1, order=2, drift_order=2, source="Euler 1768")
 
 
@@ -400,16 +416,31 @@ ALGORITHMS: Mapping[str, Algorithm] = Catalogue(_makers())
 
 
 def named(algorithm: str | Algorithm) -> Algorithm:
-    """Return the algorithm of that name, or the one given."""
+    """Return the algorithm of that name, or the one given.
+
+    Parameters
+    ----------
+    algorithm : str or Algorithm
+        Name in :data:`ALGORITHMS`, or an algorithm.
+
+    Returns
+    -------
+    Algorithm
+        The algorithm.
+    """
     if isinstance(algorithm, Algorithm):
         return algorithm
     return ALGORITHMS[checks.one_of("algorithm", algorithm, ALGORITHMS)]
 
 
 def algorithm_rows() -> list[dict[str, str | int | float]]:
-    """Return the printed table of the catalogue, one row an algorithm: name, samples, orders, drift constant, what it needs, source.
+    """Return the printed table of the catalogue, one row per algorithm.
 
-    ``drift constant`` is C of the leading drift −C β² ω λ^``drift order`` under small coning (λ = ω × sample interval).
+    Returns
+    -------
+    list of dict
+        Name, samples, previous, following, order, drift order, drift constant, needs, method, source. The drift constant is C of
+        the leading drift −C β² ω λ^(drift order) under small coning, λ = ω × sample interval.
     """
     return [
         {

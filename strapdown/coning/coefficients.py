@@ -1,9 +1,9 @@
 """Coefficients of the integration algorithms, in exact rationals.
 
 Time is counted in sample intervals. A window of M increments covers [0, M]; a step of N of them starts at sample p of the window and
-leaves f = M − N − p after it. A *pair table* K is antisymmetric and stands for Σ_{i<j} K_ij Δθ_i × Δθ_j. Its *lag sums*
-``k_l = Σ_i K_{i,i+l}`` are all that small coning sees: two increments l samples apart have the mean product 2(1 − cos λ) sin lλ, so that
-the drift of a step, for small β, is ``β² [Σ k_l 2(1 − cos λ) sin lλ − ½(Nλ − sin Nλ)]``.
+leaves f = M − N − p after it. A *pair table* K is antisymmetric and means Σ_{i<j} K_ij Δθ_i × Δθ_j. Its *lag sums*
+``k_l = Σ_i K_{i,i+l}`` determine the response to small coning: two increments l samples apart have the mean product 2(1 − cos λ) sin lλ, so
+that the drift of a step, for small β, is ``β² [Σ k_l 2(1 − cos λ) sin lλ − ½(Nλ − sin Nλ)]``.
 """
 
 from __future__ import annotations
@@ -125,10 +125,11 @@ def matched_correction(samples: int, previous: int = 0, following: int = 0) -> T
     2. *Products of two* make the drift at small β. Only the lag sums matter there, and the best M − 1 of them are the closed form of
        :func:`compressed_coefficients` (the step's position in the window does not enter): drift λ^{2M} instead of about λ^{M+1}. So the
        lag sums of C must be the difference between those and the lag sums of :func:`taylor_pairs`.
-    3. *Nothing else may suffer.* Any pair table with those lag sums would do for two axes in quadrature, but would wrongly turn, say, a
-       constant rate beside an oscillation into a periodic error, of order β³. Both tables being exact for polynomials, the difference of
-       their generating functions is divisible by (2 − z − 1/z)^d, d = ⌊M/2⌋: C = Dᵀ S D with D the d-th difference. C then gives exactly
-       zero whenever either factor is a polynomial of degree below d, and is of the order of the interpolation error itself otherwise.
+    3. *No other motion may lose accuracy.* Any pair table with those lag sums would serve two axes in quadrature, but would
+       turn, for example, a constant rate beside an oscillation into a periodic error of order β³. Both tables being exact for
+       polynomials, the difference of their generating functions is divisible by (2 − z − 1/z)^d, d = ⌊M/2⌋: C = Dᵀ S D with D the
+       d-th difference. C then gives exactly zero whenever either factor is a polynomial of degree below d, and is of the order of
+       the interpolation error itself otherwise.
     4. S has its lag sums from the division, spread evenly along its diagonals.
 
     With f = 0 the algorithm is causal; with f > 0 it needs f samples of delay (or a recorded file), the step lies inside the window

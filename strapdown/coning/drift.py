@@ -1,4 +1,4 @@
-"""What vibration costs: the attitude drift that coning leaves behind, in closed form, and its sum over a spectrum."""
+"""The attitude drift that coning leaves behind, in closed form, and its sum over a vibration spectrum."""
 
 from __future__ import annotations
 
@@ -15,23 +15,24 @@ from strapdown.units import DEGREE
 
 
 def predicted_coning_drift(algorithm: str | Algorithm, angle: float, frequency: float, sample_interval: float) -> float:
-    """Return the leading term of the attitude drift under coning, rad/s about the cone's axis, for small ``angle``.
+    """Return the leading term of the attitude drift under coning, for a small angle.
 
     Parameters
     ----------
     algorithm : str or Algorithm
+        Name in :data:`ALGORITHMS`, or an algorithm.
     angle : float
         Half-angle β of the cone, rad.
     frequency : float
-        Of the coning, Hz; ω = 2π × frequency.
+        Coning frequency, Hz; ω = 2π × frequency.
     sample_interval : float
         h, s; λ = ωh.
 
     Returns
     -------
     float
-        −C β² ω λ^{drift order}; −c_M β² ω λ^{2M}, c_M = (M!)²/(2(2M+1)!), for M = N + p compressed samples. For one sample without
-        correction the exact −½ sin²β ω (1 − sin λ/λ).
+        Drift about the cone's axis, rad/s: −C β² ω λ^(drift order), which for M = N + p compressed samples is −c_M β² ω λ^(2M),
+        c_M = (M!)²/(2(2M+1)!) (Miller 1983; Ignagni 1996). For one sample without correction the exact −½ sin²β ω (1 − sin λ/λ).
     """
     table = named(algorithm)
     beta, omega, lam = _motion(angle, frequency, sample_interval)
@@ -41,7 +42,25 @@ def predicted_coning_drift(algorithm: str | Algorithm, angle: float, frequency: 
 
 
 def small_angle_drift(algorithm: str | Algorithm, frequency_ratio: float) -> float:
-    """Return the drift over β²ω for small β at any λ = ω × sample interval up to 1: the whole power series, not its leading term only."""
+    """Return the drift over β²ω for small β, from the whole power series in λ.
+
+    Parameters
+    ----------
+    algorithm : str or Algorithm
+        Name in :data:`ALGORITHMS`, or an algorithm.
+    frequency_ratio : float
+        λ = ω × sample interval, 0 to 1.
+
+    Returns
+    -------
+    float
+        Drift about the cone's axis over β²ω, dimensionless.
+
+    Raises
+    ------
+    InputError
+        If λ is above 1, where the series does not serve.
+    """
     table = named(algorithm)
     lam = checks.non_negative("frequency_ratio", frequency_ratio)
     if lam > 1.0:
@@ -60,16 +79,24 @@ def _motion(angle: float, frequency: float, sample_interval: float) -> tuple[flo
 
 @dataclass(frozen=True, kw_only=True)
 class VibrationLine:
-    """One line of an angular vibration spectrum: two orthogonal axes at one frequency."""
+    """One line of an angular vibration spectrum: two orthogonal axes at one frequency.
+
+    Parameters
+    ----------
+    frequency : float
+        Frequency, Hz.
+    angle : float
+        Amplitude about the first axis, rad.
+    angle_across : float, optional
+        Amplitude about the second axis, rad; ``angle`` if not given.
+    phase : float, default π/2
+        Lag of the second axis behind the first, rad; π/2 is coning, 0 or π rocking without drift.
+    """
 
     frequency: float
-    """Hz"""
     angle: float
-    """Amplitude about the first axis, rad."""
     angle_across: float | None = None
-    """Amplitude about the second axis, rad; the same as ``angle`` if not given."""
     phase: float = 0.5 * math.pi
-    """By which the second axis lags the first, rad; π/2 is coning, 0 or π rocking without drift."""
 
     def __post_init__(self) -> None:
         """Check the fields."""
@@ -93,11 +120,19 @@ class ConingBudget:
     Lines at different frequencies do not drift together (their products average out), so the drifts of the lines add. Angles are taken
     as small: of each drift the part in β² is counted. The β⁴ floor of the rotation-vector forms comes on top; it matters above a degree
     or so (``sims/coning_algorithms.py`` shows where).
+
+    Parameters
+    ----------
+    lines : tuple of VibrationLine
+        Lines of the spectrum.
+    sample_rates : tuple of float
+        Sample rates, Hz.
+    algorithms : tuple of str, default ("one-sample", "two-sample", "four-sample", "matched-4-11", "matched-1-8-8")
+        Names of :data:`ALGORITHMS`.
     """
 
     lines: tuple[VibrationLine, ...]
     sample_rates: tuple[float, ...]
-    """Hz"""
     algorithms: tuple[str, ...] = ("one-sample", "two-sample", "four-sample", "matched-4-11", "matched-1-8-8")
 
     def __post_init__(self) -> None:
@@ -118,11 +153,37 @@ class ConingBudget:
                 )
 
     def drift(self, algorithm: str, sample_rate: float) -> float:
-        """Return the sum of the lines' drifts, rad/s about the third axis."""
+        """Return the sum of the drifts of the lines.
+
+        Parameters
+        ----------
+        algorithm : str
+            Name in :data:`ALGORITHMS`.
+        sample_rate : float
+            Sample rate, Hz.
+
+        Returns
+        -------
+        float
+            Drift about the third axis, rad/s.
+        """
         return math.fsum(self.drifts(algorithm, sample_rate))
 
     def drifts(self, algorithm: str, sample_rate: float) -> tuple[float, ...]:
-        """Return each line's drift, rad/s."""
+        """Return the drift of each line.
+
+        Parameters
+        ----------
+        algorithm : str
+            Name in :data:`ALGORITHMS`.
+        sample_rate : float
+            Sample rate, Hz.
+
+        Returns
+        -------
+        tuple of float
+            Drifts about the third axis, rad/s, in the order of the lines.
+        """
         table = named(algorithm)
         omegas = [2.0 * math.pi * line.frequency for line in self.lines]
         return tuple(
@@ -131,7 +192,13 @@ class ConingBudget:
         )
 
     def rows(self) -> list[dict[str, str | float]]:
-        """Return one row an algorithm and rate: algorithm, sample rate (Hz), drift (rad/s)."""
+        """Return the drifts as a table, one row per algorithm and rate.
+
+        Returns
+        -------
+        list of dict
+            ``algorithm``, ``sample_rate`` (Hz) and ``drift`` (rad/s).
+        """
         return [
             {"algorithm": name, "sample_rate": rate, "drift": self.drift(name, rate)}
             for name in self.algorithms
@@ -143,14 +210,23 @@ _COLUMNS = ("frequency_hz", "angle_deg", "angle_across_deg", "phase_deg")
 
 
 def read_vibration(path: str | os.PathLike[str]) -> tuple[VibrationLine, ...]:
-    """Read vibration lines from CSV with the columns ``frequency_hz, angle_deg[, angle_across_deg][, phase_deg]``.
+    """Read vibration lines from CSV.
 
-    Left out, the second axis has the amplitude of the first and lags it by 90°: coning.
+    Parameters
+    ----------
+    path : path-like
+        File with the columns ``frequency_hz, angle_deg[, angle_across_deg][, phase_deg]``. Without the optional columns the second
+        axis has the amplitude of the first and lags it by 90°: coning.
+
+    Returns
+    -------
+    tuple of VibrationLine
+        The lines.
 
     Raises
     ------
     InputError
-        If the file is missing, a column is unknown or lacking, or a field is no number.
+        If the file is missing, a column is unknown or missing, or a field is not a number.
     """
     file = Path(path)
     with reading.from_file(file):

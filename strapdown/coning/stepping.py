@@ -31,12 +31,12 @@ _UNTURNED = np.array(IDENTITY)
 _VECTOR_SOLVERS = ("compressed", "pairs")
 
 EVEN = 1e-3
-"""Largest departure of an interval from the mean of its window, relative, with which the intervals still count as equal: stamps in
-microseconds leave as much at a kilohertz."""
+"""Largest relative departure of an interval from the mean of its window with which the intervals count as equal: the rounding of
+stamps in microseconds at a kilohertz."""
 GAP = 4.0
-"""No polynomial is laid across an interval that is so many times as long, or as short, as the one it is for."""
+"""Largest ratio of an interval to its neighbour, or of the neighbour to it, across which a rate polynomial is fitted."""
 LOPSIDED = 4
-"""On one side of an interval its polynomial goes through at most so many increments more than on the other, where they are uneven."""
+"""Largest excess of increments on one side of an interval over the other side in the fit of its polynomial, uneven intervals."""
 
 
 def integrate(
@@ -47,19 +47,30 @@ def integrate(
     frame: str = "body",
     edges: ArrayLike | None = None,
 ) -> Array:
-    """Return attitude q_fb at the step edges, (n // N + 1, 4), the first row being the initial attitude.
+    """Return the attitude at the step edges from gyro increments.
 
     Parameters
     ----------
-    increments : array_like, (n, 3)
-        Integrals of the rate over each sample interval, rad; a rest of n % N increments is left out.
-    algorithm : str or Algorithm
-        See :func:`strapdown.coning.algorithm_rows`.
-    initial_attitude : array_like, (4,)
-    frame : {"body", "fixed"}
-        Of the increments: body rates, equation (17), or rates in the fixed frame, equation (3).
-    edges : array_like, (n + 1,), optional
-        Times of the edges of the sample intervals, as :func:`rotation_vectors` takes them; without them the intervals are taken for equal.
+    increments : array_like (n, 3)
+        Integrals of the rate over each sample interval, rad, axes by ``frame``; a remainder of n mod N increments is not used.
+    algorithm : str or Algorithm, default "one-sample"
+        Name in :data:`ALGORITHMS`, or an algorithm.
+    initial_attitude : array_like (4,), default identity
+        Unit quaternion q_fb at the first edge.
+    frame : {"body", "fixed"}, default "body"
+        Axes of the increments: of body rates, equation (17), or of fixed-frame rates, equation (3) of *Quaternion differentiation*.
+    edges : array_like (n + 1,), optional
+        Times of the edges of the sample intervals, s, as in :func:`rotation_vectors`. Default: equal intervals.
+
+    Returns
+    -------
+    ndarray (n // N + 1, 4)
+        Unit quaternions q_fb, first the initial attitude.
+
+    Raises
+    ------
+    InputError
+        If the algorithm or frame is unknown, or an input has the wrong shape or is not finite.
     """
     table = named(algorithm)
     checks.one_of("frame", frame, ("body", "fixed"))
@@ -102,11 +113,29 @@ def integrate_rates(
     *,
     frame: str = "body",
 ) -> Array:
-    """Return attitude q_fb at the step edges from rate samples (n + 1, 3) rad/s at the edges of n equal sample intervals.
+    """Return the attitude at the step edges from rate samples.
 
-    An algorithm made for rates (``…-rate-2``) says by its number how many samples its quadrature uses, and undoes in the drift what the
-    quadrature loses. Any other gets the eight-point quadrature: the drift and the periodic error are then of order λ⁸ at best. The plain
-    trapezoid under a coning correction made for increments drifts by β²ωλ²/12, as much as no correction at all.
+    An algorithm made for rates (``…-rate-2``) uses the quadrature named by its number and compensates in the drift what the
+    quadrature loses. Any other is given eight-point quadrature: drift and periodic error are then of order λ⁸ at best. The plain
+    trapezoid with a coning correction made for increments drifts by β²ωλ²/12, as much as no correction.
+
+    Parameters
+    ----------
+    rates : array_like (n + 1, 3)
+        Rates at the edges of n equal sample intervals, rad/s, axes by ``frame``.
+    sample_interval : float
+        Interval between samples, s.
+    algorithm : str or Algorithm, default "four-sample-rate-2"
+        Name in :data:`ALGORITHMS`, or an algorithm.
+    initial_attitude : array_like (4,), default identity
+        Unit quaternion q_fb at the first sample.
+    frame : {"body", "fixed"}, default "body"
+        Axes of the rates.
+
+    Returns
+    -------
+    ndarray (n // N + 1, 4)
+        Unit quaternions q_fb, first the initial attitude.
     """
     table = named(algorithm)
     points = table.rate_points or 8
@@ -114,10 +143,32 @@ def integrate_rates(
 
 
 def increments_from_rates(rates: ArrayLike, sample_interval: float, points: int = 2) -> Array:
-    """Return increments (n, 3) rad from rate samples (n + 1, 3) rad/s at the edges of the intervals.
+    """Return rotation increments from rate samples at the edges of the intervals.
 
-    Each increment is the integral of the polynomial through the ``points`` (even; 2 is the trapezoid) nearest samples. For an oscillation
-    it is too small by a relative error of order λ^points. Near the ends the samples lie to one side.
+    Parameters
+    ----------
+    rates : array_like (n + 1, 3)
+        Rates, rad/s.
+    sample_interval : float
+        Interval between samples, s.
+    points : int, default 2
+        Even number of nearest samples whose interpolating polynomial is integrated; 2 is the trapezoid rule.
+
+    Returns
+    -------
+    ndarray (n, 3)
+        Increments, rad. For an oscillation they are too small by a relative error of order λ^points. Near the ends the samples used
+        lie to one side.
+
+    Raises
+    ------
+    InputError
+        If ``points`` is odd or there are fewer than two samples.
+
+    Examples
+    --------
+    >>> increments_from_rates([[0.0, 0.0, 1.0], [0.0, 0.0, 3.0]], 0.5).tolist()
+    [[0.0, 0.0, 1.0]]
     """
     samples = checks.array("rates", rates, ("n", 3))
     interval = checks.positive("sample_interval", sample_interval, unit="s")
@@ -143,14 +194,28 @@ def increments_from_rates(rates: ArrayLike, sample_interval: float, points: int 
 def rotation_vectors(
     increments: ArrayLike, algorithm: str | Algorithm = "one-sample", *, edges: ArrayLike | None = None
 ) -> Array:
-    """Return the body rotation vector of each step, (n // N, 3) rad, from gyro increments (n, 3) rad; a rest of n % N is left out.
+    """Return the body rotation vector of each step from gyro increments.
 
-    The coefficients of every algorithm are made for intervals of equal length. With ``edges`` (n + 1,), the times of their edges, a step
-    in whose window the intervals are not equal is taken by the polynomial solver instead: the quaternion equation on the rate polynomial
-    through the increments of the window, of whatever lengths its intervals are. An interval that is a gap among its neighbours is a turn at
-    constant rate. Stamps are taken at their word: where they are coarser than the sampling was (milliseconds at 300 Hz), give none.
+    Parameters
+    ----------
+    increments : array_like (n, 3)
+        Integrals of the body rate over each sample interval, rad; a remainder of n mod N increments is not used.
+    algorithm : str or Algorithm, default "one-sample"
+        Name in :data:`ALGORITHMS`, or an algorithm.
+    edges : array_like (n + 1,), optional
+        Times of the edges of the sample intervals, s. Give none where stamps are coarser than the sampling was (milliseconds at 300
+        Hz). Default: equal intervals.
 
-    The solvers that work on quaternions give the logarithm of their step, of length at most π.
+    Returns
+    -------
+    ndarray (n // N, 3)
+        Rotation vectors, rad. The solvers that work on quaternions return the logarithm of their step, of length at most π.
+
+    Notes
+    -----
+    The coefficients of every algorithm hold for intervals of equal length. Where ``edges`` show unequal intervals in the window of
+    a step, the polynomial solver computes that step instead: the quaternion equation on the rate polynomial through the increments,
+    whatever the lengths of the intervals. An interval that is a gap among its neighbours is a rotation at constant rate.
     """
     table = named(algorithm)
     samples = _increments(increments)
@@ -166,7 +231,22 @@ def rotation_vectors(
 
 
 def time_per_sample(algorithm: str | Algorithm, samples: int = 20_160, repeats: int = 5) -> float:
-    """Return the least time that :func:`integrate` takes here, s a sample, compiling not counted."""
+    """Return the least time per sample that :func:`integrate` needs here, compilation excluded.
+
+    Parameters
+    ----------
+    algorithm : str or Algorithm
+        Name in :data:`ALGORITHMS`, or an algorithm.
+    samples : int, default 20160
+        Samples of the record that is timed.
+    repeats : int, default 5
+        Timed calls.
+
+    Returns
+    -------
+    float
+        Time, s.
+    """
     table = named(algorithm)
     checks.count("samples", samples, least=table.window)
     increments = 1e-3 * np.random.default_rng(0).standard_normal((samples, 3))

@@ -1,26 +1,26 @@
-"""Exact motions: attitude, rates and gyro increments known to rounding, the truth that integration algorithms are measured against.
+"""Exact motions: attitude, rates and gyro increments known to rounding, the truth for integration algorithms and simulations.
 
-Every motion is a frozen dataclass that satisfies :class:`Motion`. Nothing here comes from an integration algorithm under test, and no
-increment is a difference of attitudes or of angles: each is the integral of the body rate over its own interval, good to rounding
-relative to its own size, however short the interval is and however far from the origin of time.
+Every motion is a frozen dataclass that satisfies :class:`Motion`. None of them uses an integration algorithm under test, and no
+increment is a difference of attitudes or of angles: each is the integral of the body rate over its own interval, accurate to
+rounding relative to its own size, however short the interval and however far from the origin of time.
 
 ``protocol``
-    :class:`Motion`: what a motion offers, and how one with kinks of its own declares them.
+    :class:`Motion`: the methods of a motion, and how one declares its breaks.
 
 Closed forms:
 
 ``constant_rate``
     :class:`ConstantRate`, and :func:`rest`.
 ``cones``
-    :class:`Coning`, equation (18), and :class:`SpinCone`.
+    :class:`Coning`, equation (18) of *Quaternion differentiation*, and :class:`SpinCone`.
 ``spin_rock``
     :class:`SpinRock`: a spinning body whose axis rocks.
 ``slew``
-    :class:`Slew`: a turn about one axis from rest to rest.
+    :class:`Slew`: a rotation about one axis from rest to rest.
 ``torque_free``
     :class:`TorqueFree`: the free rigid body, solved in ``euler_poinsot`` by the functions of ``elliptic``.
 
-From given rates, given attitudes, given motions:
+From given rates, attitudes or motions:
 
 ``harmonic``
     :class:`HarmonicRates` of :class:`Harmonic` terms: vibration on any axes.
@@ -29,8 +29,8 @@ From given rates, given attitudes, given motions:
 ``composed``
     :class:`Composed`: a vibration on a base motion.
 
-What they share: ``parameters`` checks and keeps what they are made of; ``exact_phase`` forms ω t as exact products, so that an hour of a
-100 Hz motion is as good as its first second; ``quadrature`` integrates a rate that has no closed integral.
+Shared parts: ``parameters`` checks and stores the parameters; ``exact_phase`` forms ω t as exact products, so that an hour of a 100
+Hz motion is as accurate as its first second; ``quadrature`` integrates a rate that has no closed integral.
 """
 
 from strapdown.motion.composed import Composed

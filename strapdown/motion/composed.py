@@ -18,14 +18,15 @@ from strapdown.motion.quadrature import interval_integrals
 class Composed:
     """A vibration on a base motion, ``q = q_base ⊗ q_vibration``: the body vibrates about the moving base and truly cones.
 
-    ``w_b = R_vᵀ w_base + w_v``. Increments: those of the vibration, exact, plus the integral of ``R_vᵀ w_base``, converged to
-    rounding.
+    The rate is ``w_b = R_vᵀ w_base + w_v``. The increments are those of the vibration, exact, plus the integral of ``R_vᵀ w_base``,
+    converged to rounding.
 
     Parameters
     ----------
     base : Motion
+        Attitude of the base in the fixed frame.
     vibration : Motion
-        The attitude of the body relative to the base.
+        Attitude of the body relative to the base.
     """
 
     base: Motion

@@ -1,4 +1,4 @@
-"""Coning, equation (18), and the spin-cone that generalises it."""
+"""Coning, equation (18) of *Quaternion differentiation*, and the spin-cone that generalises it."""
 
 from __future__ import annotations
 
@@ -18,12 +18,19 @@ from strapdown.motion.parameters import edge_stamps, stacked, store_number, time
 class Coning:
     """Coning motion, equation (18): ``q = (cos β/2, sin β/2 (cos ωt, sin ωt, 0))`` with ω = 2π ``frequency``.
 
+    Equation (18) of *Quaternion differentiation*; the body and fixed rates are those given after it.
+
     Parameters
     ----------
     angle : float
         β, the half-angle of the cone that the body z axis sweeps, rad; 0 to π.
     frequency : float
-        Turns round the cone a second, Hz; negative runs it backwards.
+        Revolutions of the cone per second, Hz; negative runs it backwards.
+
+    Examples
+    --------
+    >>> float(Coning(angle=0.01, frequency=10.0).increments([0.0, 0.1])[0, 2].round(9))  # −2π (1 − cos β)
+    -0.000314157
     """
 
     angle: float
@@ -39,7 +46,7 @@ class Coning:
         return 2.0 * math.pi * self.frequency
 
     def attitude(self, time: ArrayLike) -> Array:
-        """Return q_fb (..., 4), equation (18)."""
+        """Return q_fb, equation (18)."""
         cosine, sine = cosine_sine((self.rate, 0.0), times(time))
         half = math.sin(0.5 * self.angle)
         return stacked(math.cos(0.5 * self.angle), half * cosine, half * sine, 0.0)
@@ -79,7 +86,7 @@ class Coning:
 class SpinCone:
     """Spin-cone motion ``q = q_z(Ω_p t) q_x(β) q_z(Ω_s t)``: spin about body z, which itself precesses round a cone.
 
-    ``spin_rate = −precession_rate`` is coning, equation (18).
+    ``spin_rate = −precession_rate`` is coning, equation (18) of *Quaternion differentiation*.
 
     Parameters
     ----------

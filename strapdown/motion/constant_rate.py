@@ -22,10 +22,15 @@ class ConstantRate:
 
     Parameters
     ----------
-    rate : sequence of 3 floats
+    rate : array_like (3,)
         w_b, rad/s.
-    initial_attitude : sequence of 4 floats
-        q_fb at time 0.
+    initial_attitude : array_like (4,), default identity
+        Unit quaternion q_fb at time 0.
+
+    Examples
+    --------
+    >>> ConstantRate(rate=(0.0, 0.0, np.pi)).attitude(1.0).round(12).tolist()
+    [0.0, 0.0, 0.0, 1.0]
     """
 
     rate: Sequence[float]
@@ -64,5 +69,16 @@ class ConstantRate:
 
 
 def rest(initial_attitude: Sequence[float] = IDENTITY) -> ConstantRate:
-    """Return the motion of a body at rest in the attitude q_fb."""
+    """Return the motion of a body at rest.
+
+    Parameters
+    ----------
+    initial_attitude : array_like (4,), default identity
+        Unit quaternion q_fb.
+
+    Returns
+    -------
+    ConstantRate
+        The motion with rate zero.
+    """
     return ConstantRate(rate=(0.0, 0.0, 0.0), initial_attitude=initial_attitude)

@@ -28,11 +28,11 @@ class Harmonic:
 
     Parameters
     ----------
-    amplitude : sequence of 3 floats
+    amplitude : array_like (3,)
         a, rad/s along each body axis.
     frequency : float
         f, Hz.
-    phase : float
+    phase : float, default 0.0
         φ, rad. Two harmonics of one frequency on different axes make an elliptic vibration, which cones.
     """
 
@@ -53,18 +53,19 @@ class Harmonic:
 
 @dataclass(frozen=True, kw_only=True)
 class HarmonicRates:
-    """Body rate ``w_b = mean + Σ a_j cos(2π f_j t + φ_j)``: rates and increments closed, attitude by Taylor series.
+    """Body rate ``w_b = mean + Σ a_j cos(2π f_j t + φ_j)``: rates and increments in closed form, attitude by Taylor series.
 
     The attitude has no closed form. It is expanded to degree 26 about evenly spaced nodes whose spacing keeps a majorant of the
-    neglected terms below 1e-21; nodes are chained with compensated sums. :meth:`attitude_error` states what is left.
+    neglected terms below 1e-21; nodes are chained with compensated sums. :meth:`attitude_error` bounds the remaining error.
 
     Parameters
     ----------
     harmonics : sequence of Harmonic
-    mean : sequence of 3 floats
-        rad/s.
-    initial_attitude : sequence of 4 floats
-        q_fb at time 0.
+        Terms of the rate.
+    mean : array_like (3,), default zeros
+        Constant part of the rate, rad/s, body axes.
+    initial_attitude : array_like (4,), default identity
+        Unit quaternion q_fb at time 0.
     """
 
     harmonics: Sequence[Harmonic]
@@ -141,11 +142,23 @@ class HarmonicRates:
         return float(series[_TERMS + 1 :].sum())
 
     def attitude_error(self, duration: float) -> float:
-        """Return the error of the attitude ``duration`` s from time 0, rad: the truncation bound plus an estimate of the rounding.
+        """Return the error of the attitude: the truncation bound plus an estimate of the rounding.
 
+        Parameters
+        ----------
+        duration : float
+            Time from time 0, s.
+
+        Returns
+        -------
+        float
+            Error, rad.
+
+        Notes
+        -----
         Rounding has a random part, of the deviations between nodes, and a part that can repeat at every node (a coning rate of
-        constant size does that), at most a quarter of a unit in the last place of the angle turned. It stays below 1e-13 rad as long
-        as the body turns through less than 1400 rad in all.
+        constant size does that), at most a quarter of a unit in the last place of the angle turned. It stays below 1e-13 rad as
+        long as the body turns through less than 1400 rad in all.
         """
         time = abs(checks.finite("duration", duration, unit="s"))
         nodes = 1.0 + time / self._spacing

@@ -13,34 +13,88 @@ from strapdown.checks import Array
 
 @runtime_checkable
 class Motion(Protocol):
-    """A motion of a rigid body about one point, as a function of time in s; ``time`` may have any shape ``(...)``.
+    """A motion of a rigid body about one point, as a function of time.
 
     Any object with these methods is a motion and may be the base or the vibration of a :class:`Composed`.
 
-    A motion whose body rate is not smooth everywhere also has an attribute or property ``breaks``: the times, s, of shape (k,), at
-    which the rate or one of its derivatives jumps. It is optional, so it is no member of this protocol; whoever integrates the rate
-    (:class:`Composed` does) then integrates from break to break. A break left unnamed costs accuracy and time, one too
-    many a little time.
+    A motion whose body rate is not smooth everywhere also has an attribute or property ``breaks``: the times (k,), s, at which the
+    rate or one of its derivatives jumps. It is optional and so no member of this protocol. An integral of the rate is then taken
+    from break to break (:class:`Composed` does so). A missing break costs accuracy and time; a superfluous one costs a little time.
     """
 
     def attitude(self, time: ArrayLike) -> Array:
-        """Return q_fb, unit, shape (..., 4)."""
+        """Return the attitude.
+
+        Parameters
+        ----------
+        time : array_like (...)
+            Times, s.
+
+        Returns
+        -------
+        ndarray (..., 4)
+            Unit quaternions q_fb.
+        """
         ...
 
     def body_rate(self, time: ArrayLike) -> Array:
-        """Return w_b of equation (17), rad/s, shape (..., 3)."""
+        """Return the angular rate in body axes, w_b of equation (17) of *Quaternion differentiation*.
+
+        Parameters
+        ----------
+        time : array_like (...)
+            Times, s.
+
+        Returns
+        -------
+        ndarray (..., 3)
+            w_b, rad/s.
+        """
         ...
 
     def fixed_rate(self, time: ArrayLike) -> Array:
-        """Return w_f of equation (3), rad/s, shape (..., 3)."""
+        """Return the angular rate in fixed axes, w_f of equation (3) of *Quaternion differentiation*.
+
+        Parameters
+        ----------
+        time : array_like (...)
+            Times, s.
+
+        Returns
+        -------
+        ndarray (..., 3)
+            w_f, rad/s.
+        """
         ...
 
     def body_angular_acceleration(self, time: ArrayLike) -> Array:
-        """Return dw_b/dt (components in body axes), rad/s², shape (..., 3)."""
+        """Return the angular acceleration in body axes, dw_b/dt.
+
+        Parameters
+        ----------
+        time : array_like (...)
+            Times, s.
+
+        Returns
+        -------
+        ndarray (..., 3)
+            dw_b/dt, rad/s².
+        """
         ...
 
     def increments(self, edges: ArrayLike) -> Array:
-        """Return ∫ w_b dt over each interval between consecutive edges, rad, shape (n, 3) for n + 1 edges."""
+        """Return the rotation increments, ∫ w_b dt over each interval between consecutive edges.
+
+        Parameters
+        ----------
+        edges : array_like (n + 1,)
+            Times of the edges, s, increasing.
+
+        Returns
+        -------
+        ndarray (n, 3)
+            Increments in body axes, rad.
+        """
         ...
 
 

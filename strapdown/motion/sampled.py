@@ -20,22 +20,22 @@ _WIDEST_DEGREES = 170.0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SampledAttitude:
-    """Smooth motion through given attitudes: a spline through the quaternions in four dimensions, scaled to the unit sphere.
+    """Smooth motion through given attitudes: a spline of the quaternions in four dimensions, scaled to the unit sphere.
 
-    ``q = s/|s|`` with s a spline of degree 5 (four continuous derivatives) or 3 (two). Unlike a spline of rotation vectors it needs no
-    iteration, has no small-angle switch, and turning the body or the fixed axes turns the motion with them. The rate
+    ``q = s/|s|`` with s a spline of degree 5 (four continuous derivatives) or 3 (two). Unlike a spline of rotation vectors it needs
+    no iteration and no small-angle switch, and rotating the body or the fixed axes rotates the motion with them. The rate
     ``w_b = 2 vec(s* ⊗ ṡ)/|s|²`` is exact for this motion; increments are its integrals, converged to rounding.
 
     Parameters
     ----------
-    time : sequence of n floats
-        s, increasing; the motion is defined between the first and the last.
-    attitudes : sequence of n quaternions
-        q_fb, either sign; consecutive ones less than 170° apart.
-    degree : int
-        5 or 3.
-    ends : str
-        ``"free"`` (no condition beyond the samples) or ``"rest"`` (rate zero at both ends; with degree 5 angular acceleration too).
+    time : array_like (n,)
+        Times, s, increasing; the motion is defined between the first and the last.
+    attitudes : array_like (n, 4)
+        Unit quaternions q_fb, either sign, consecutive ones less than 170° apart.
+    degree : {5, 3}, default 5
+        Degree of the spline.
+    ends : {"free", "rest"}, default "free"
+        No condition at the ends, or rate zero there (with degree 5 angular acceleration too).
     """
 
     time: Array
@@ -128,5 +128,20 @@ class SampledAttitude:
 
 
 def waypoints(time: ArrayLike, attitudes: ArrayLike, *, degree: int = 5) -> SampledAttitude:
-    """Return the smooth motion from rest through the given attitudes q_fb (n, 4) at the given times to rest, n ≥ 2."""
+    """Return the smooth motion from rest through the given attitudes to rest.
+
+    Parameters
+    ----------
+    time : array_like (n,)
+        Times, s, increasing; n ≥ 2.
+    attitudes : array_like (n, 4)
+        Unit quaternions q_fb, consecutive ones less than 170° apart.
+    degree : {5, 3}, default 5
+        Degree of the spline.
+
+    Returns
+    -------
+    SampledAttitude
+        The motion, with ``ends="rest"``.
+    """
     return SampledAttitude(time=np.asarray(time), attitudes=np.asarray(attitudes), degree=degree, ends="rest")

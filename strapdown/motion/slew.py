@@ -1,4 +1,4 @@
-"""A smooth turn about one axis from rest to rest."""
+"""A smooth rotation about one axis from rest to rest."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from strapdown.motion.parameters import IDENTITY, edge_stamps, store_attitude, s
 
 @dataclass(frozen=True, kw_only=True)
 class Slew:
-    """Rest-to-rest turn about one axis, ``q = q_0 ⊗ exp(s(x) Φ)``, ``x = (t − start)/duration``; at rest before and after.
+    """Rest-to-rest rotation about one axis, ``q = q_0 ⊗ exp(s(x) Φ)``, ``x = (t − start)/duration``; at rest before and after.
 
     ``s = 35 x⁴ − 84 x⁵ + 70 x⁶ − 20 x⁷``: rate, angular acceleration and its derivative start and end at zero. The largest rate is
     ``35/16 |Φ|/duration``.
 
     Parameters
     ----------
-    rotation_vector : sequence of 3 floats
-        Φ, the whole turn in body axes, rad; may exceed π.
+    rotation_vector : array_like (3,)
+        Φ, the whole rotation in body axes, rad; may exceed π.
     duration : float
-        s.
-    start : float
-        s.
-    initial_attitude : sequence of 4 floats
-        q_fb before the slew.
+        Duration, s.
+    start : float, default 0.0
+        Time of the start, s.
+    initial_attitude : array_like (4,), default identity
+        Unit quaternion q_fb before the slew.
     """
 
     rotation_vector: Sequence[float]

@@ -27,7 +27,7 @@ class SpinRock:
         f, Hz.
     spin_rate : float
         Ω_s, rad/s.
-    rock_phase : float
+    rock_phase : float, default 0.0
         φ, rad.
     """
 

@@ -22,18 +22,19 @@ from strapdown.motion.parameters import IDENTITY, edge_stamps, store_attitude, s
 class TorqueFree:
     """Rigid body free of torque, by Jacobi elliptic functions (Landau and Lifshitz, *Mechanics*, §37).
 
-    Any moments and any initial rate: both energy branches, the separatrix between them, symmetric and spherical bodies, spin about a
-    principal axis. Constants are computed to 60 digits, so long times cost no accuracy: attitude and rates are good to a few 1e-16
-    relative, increments too (closed forms for each interval). Very close to the separatrix 1 − m is exact, not 1 less a rounded m.
+    Any moments and any initial rate: both energy branches, the separatrix between them, symmetric and spherical bodies, spin about
+    a principal axis. Constants are computed to 60 digits, so long times cost no accuracy: attitude, rates and increments are
+    accurate to a few 1e-16 relative (closed forms for each interval). Very close to the separatrix 1 − m is exact, not 1 less a
+    rounded m.
 
     Parameters
     ----------
-    inertia : sequence of 3 floats
+    inertia : array_like (3,)
         Principal moments about the body axes x, y, z, kg m² (only their ratios matter); none may exceed the sum of the others.
-    initial_rate : sequence of 3 floats
+    initial_rate : array_like (3,)
         w_b at time 0, rad/s.
-    initial_attitude : sequence of 4 floats
-        q_fb at time 0.
+    initial_attitude : array_like (4,), default identity
+        Unit quaternion q_fb at time 0.
     """
 
     inertia: Sequence[float]

@@ -1,14 +1,14 @@
-"""Recordings from the bench and the field: any format in, any format out, with clear words where a file is not what it should be.
+"""Recordings from the bench and the field, read from and written to many formats, with clear errors where a file is faulty.
 
-A recording holds point samples of rate, specific force and magnetic field as a device gave them, on one time axis. What a filter makes
-of it is in :mod:`strapdown.ahrs`.
+A recording holds point samples of rate, specific force and magnetic field of a device, on one time axis. :mod:`strapdown.ahrs`
+estimates attitude from it.
 
 ``formats``
     The table of formats, :func:`read` by content, :func:`write` by ending.
 ``recording``
     :class:`Recording` and its units.
 ``columns``, ``delimited``, ``dataframes``
-    Tables: which column is what; CSV and TSV; Parquet, pandas and xarray.
+    Tables: roles of columns; CSV and TSV; Parquet, pandas and xarray.
 ``ros``
     ROS bags.
 ``ulog``
@@ -20,75 +20,69 @@ of it is in :mod:`strapdown.ahrs`.
 ``broad``
     BROAD HDF5.
 ``estimates``
-    An estimate in files of all these kinds.
+    Estimates in files of all these kinds.
 ``samples``
     One sensor at rest, for the identification of its noise.
 """
 
 from __future__ import annotations
 
-from strapdown.recordings.broad import EVEN, read_broad, write_broad
-from strapdown.recordings.columns import SHORT_STAMPS, parse_mapping
+from strapdown.recordings.columns import parse_mapping as parse_mapping
 from strapdown.recordings.dataframes import from_table
-from strapdown.recordings.delimited import read_csv, write_csv
 from strapdown.recordings.formats import (
-    FORMATS,
-    Format,
-    estimate_format,
-    format_of,
-    from_record,
-    is_estimate,
-    is_record,
-    not_held,
+    estimate_format as estimate_format,
+)
+from strapdown.recordings.formats import (
+    format_of as format_of,
+)
+from strapdown.recordings.formats import (
+    from_record as from_record,
+)
+from strapdown.recordings.formats import (
+    is_estimate as is_estimate,
+)
+from strapdown.recordings.formats import (
+    is_record as is_record,
+)
+from strapdown.recordings.formats import (
+    not_held as not_held,
+)
+from strapdown.recordings.formats import (
     read,
     write,
-    writers,
+)
+from strapdown.recordings.formats import (
+    writers as writers,
 )
 from strapdown.recordings.recording import (
-    FORCE_UNITS,
-    GAP,
-    MAGNETIC_UNITS,
-    RATE_UNITS,
-    TIME_UNITS,
+    FORCE_UNITS as FORCE_UNITS,
+)
+from strapdown.recordings.recording import (
+    RATE_UNITS as RATE_UNITS,
+)
+from strapdown.recordings.recording import (
+    TIME_UNITS as TIME_UNITS,
+)
+from strapdown.recordings.recording import (
     Recording,
-    gaps,
     increments,
 )
+from strapdown.recordings.recording import (
+    gaps as gaps,
+)
 from strapdown.recordings.samples import GyroSamples, read_gyro, read_samples
-from strapdown.recordings.trajectories import read_euroc, read_tum, with_reference
+from strapdown.recordings.trajectories import read_tum as read_tum
+from strapdown.recordings.trajectories import with_reference
 
+# Imported as itself above and not listed here: for the package alone.
 __all__ = [
-    "EVEN",
-    "FORCE_UNITS",
-    "FORMATS",
-    "GAP",
-    "MAGNETIC_UNITS",
-    "RATE_UNITS",
-    "SHORT_STAMPS",
-    "TIME_UNITS",
-    "Format",
     "GyroSamples",
     "Recording",
-    "estimate_format",
-    "format_of",
-    "from_record",
     "from_table",
-    "gaps",
     "increments",
-    "is_estimate",
-    "is_record",
-    "not_held",
-    "parse_mapping",
     "read",
-    "read_broad",
-    "read_csv",
-    "read_euroc",
     "read_gyro",
     "read_samples",
-    "read_tum",
     "with_reference",
     "write",
-    "write_broad",
-    "write_csv",
-    "writers",
 ]

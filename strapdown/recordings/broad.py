@@ -25,10 +25,10 @@ def read_broad(path: str | os.PathLike[str]) -> Recording:
         held = reading.attributes(file)
         kind = str(held.get("kind", ""))
         if kind.startswith("strapdown ") and kind != recordfiles.KIND:
-            raise InputError(f"{name} is a {kind}, a result and no recording; give what it was made from")
+            raise InputError(f"{name} is a {kind}, a result, not a recording; give the recording that it was made from")
         if kind == recordfiles.KIND:
             raise InputError(
-                f"{name} is a simulated record, no recording; integrate it (`strapdown integrate`) or filter it (`strapdown estimate`)"
+                f"{name} is a simulated record, not a recording; integrate it (`strapdown integrate`) or filter it (`strapdown estimate`)"
             )
         missing = [key for key in ("imu_gyr",) if key not in file]
         if "sampling_rate" not in held:
@@ -84,7 +84,7 @@ def write_broad(recording: Recording, path: str | os.PathLike[str]) -> None:
         "movement": recording.movement,
     }
     if recording.magnetic_field is not None and content["imu_mag"] is None:
-        content["imu_mag"] = recording.magnetic_field  # of a unit that nobody knows
+        content["imu_mag"] = recording.magnetic_field  # of unknown unit
     with written_beside(path) as temporary, whole_hdf5(temporary) as file:
         file.attrs["sampling_rate"] = 1.0 / interval
         for name, value in content.items():

@@ -1,8 +1,8 @@
-"""Which column of a table is what, and in which unit: by name, by a mapping, or guessed from the header and said.
+"""Which column of a table is what, and in which unit: by name, by a mapping, or guessed from the header with a remark.
 
 The package's own names are ``time``, ``gx gy gz`` (gyro), ``ax ay az`` (specific force), ``mx my mz`` (magnetic field), ``temperature``
 (°C), and of a reference ``reference_qw … reference_qz`` (q_fb) and ``movement`` (0 or 1). Where a header has other names, complete triples
-whose names end in an axis and hold a sensor's usual word are taken for these sensors: ``gyro_x``, ``GyrX``, ``angular_velocity.x``,
+whose names end in an axis and contain a usual name of a sensor are assigned to it: ``gyro_x``, ``GyrX``, ``angular_velocity.x``,
 ``w_RS_S_x``, ``Gyroscope X (deg/s)``, ``accelerometer_m_s2[0]``. What was taken is among the recording's ``remarks``. Two triples that fit
 one sensor are refused, as is an acceleration without gravity.
 
@@ -82,12 +82,12 @@ class Column:
 
     @property
     def said(self) -> str:
-        """The header as it stands, nearly."""
+        """The header, nearly as written."""
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
 
 def column(cell: str) -> Column:
-    """Return a header's cell as name and unit; in parentheses only what is a known unit is taken for one."""
+    """Return a header's cell as name and unit; in parentheses only a known unit counts as one."""
     text = " ".join(cell.replace("\N{NO-BREAK SPACE}", " ").split()).strip('"')
     unit = ""
     parted = re.fullmatch(r"(.*\S)\s*\(([^()]*)\)", text)
@@ -232,7 +232,7 @@ def _lacks(source: str, missing: Sequence[str], columns: Sequence[Column]) -> st
 def _roles(
     source: str, columns: Sequence[Column], mapping: Mapping[str, str]
 ) -> tuple[dict[str, int], dict[str, str], str]:
-    """Return the column of each role, the unit that each group's columns declare, and what is to be said of a guess."""
+    """Return the column of each role, the unit that each group's columns declare, and remarks on guesses."""
     names = [one.name.lower() for one in columns]
     unit_by_role: dict[str, str] = {}
     roles: dict[str, int] = {}
@@ -410,7 +410,7 @@ def _seconds(stamps: Array, factor: float) -> tuple[Array, int]:
 
 
 USUAL_INTERVALS = (1e-6, 2.0)
-"""Sample intervals, s, outside which stamps of an undeclared unit are not taken for seconds."""
+"""Sample intervals, s, outside which stamps of an undeclared unit cannot be seconds."""
 
 
 def _need_time_unit(source: str, name: str, time: Array) -> None:

@@ -35,17 +35,27 @@ def from_table(
 
     Parameters
     ----------
-    table : DataFrame, Dataset or mapping
+    table : DataFrame, Dataset or mapping of str to array_like
         Columns named as those of a CSV file; variables of a Dataset with a second dimension of length 3 are x, y and z.
-    source : str
-        What messages call it.
-    units, columns, gyro_alone
-        As :func:`strapdown.recordings.read` takes them.
+    source : str, default "table"
+        Name of the recording, for messages.
+    units : mapping of str to str, optional
+        Units of ``time``, ``gyro``, ``accelerometer`` and ``magnetometer`` where the header does not declare them.
+    columns : mapping of str to str, optional
+        Names of columns by role, perhaps with a unit, ``{"time": "timestamp [us]", "gx": "gyro_x[dps]"}``; the others are found by
+        their names.
+    gyro_alone : bool, default False
+        Whether to ignore the other sensors, whose units then need not be known.
+
+    Returns
+    -------
+    Recording
+        The recording.
 
     Raises
     ------
     InputError
-        As for a CSV file.
+        As :func:`read` for a CSV file.
 
     Examples
     --------

@@ -10,7 +10,7 @@ from strapdown.checks import InputError
 
 
 def library(name: str, what: str, extra: str = "formats") -> Any:
-    """Return an optional module; where it is not installed, say for what it is needed and how to install it."""
+    """Return an optional module; where it is not installed, raise an InputError with its purpose and how to install it."""
     try:
         return import_module(name)
     except ImportError as error:

@@ -1,7 +1,7 @@
 """The table of formats: how each is recognised, read and written, and what installs it.
 
 A format is one entry of :data:`FORMATS` and the module of its family. Content decides: the first bytes of a file, the files of a folder.
-A file of no known content is read by its ending, whose reader says what is wrong with it.
+A file of no known content is read by its ending, whose reader reports its fault.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ FORMATS: tuple[Format, ...] = (
 
 
 def format_of(path: str | os.PathLike[str]) -> Format:
-    """Return the format of a file or folder by its content, or by its ending where the content tells nothing.
+    """Return the format of a file or folder by its content, or by its ending where the content is not conclusive.
 
     Raises
     ------
@@ -201,22 +201,22 @@ def read(
 
     Parameters
     ----------
-    path : path
+    path : path-like
         A file, or the folder of a ROS 2 bag or of EuRoC.
-    units : mapping, optional
+    units : mapping of str to str, optional
         For tables: units of ``time``, ``gyro``, ``accelerometer`` and ``magnetometer`` where the header does not declare them.
-    gyro_alone : bool
-        Leave the other sensors alone, whose units need not be known then.
-    columns : mapping, optional
-        For tables: names of columns by role, perhaps with a unit, ``{"time": "timestamp [us]", "gx": "gyro_x[dps]"}``; the others are
-        found by their names.
-    topic : str
-        For bags and flight logs: the topic of the inertial unit, where there are several.
+    gyro_alone : bool, default False
+        Whether to ignore the other sensors, whose units then need not be known.
+    columns : mapping of str to str, optional
+        For tables: names of columns by role, perhaps with a unit, ``{"time": "timestamp [us]", "gx": "gyro_x[dps]"}``; the others
+        are found by their names.
+    topic : str, default ""
+        For bags and flight logs: topic of the inertial unit, where there are several.
 
     Returns
     -------
     Recording
-        Its ``remarks`` say what the reader chose.
+        The recording; its ``remarks`` state the choices of the reader.
 
     Raises
     ------
@@ -247,7 +247,9 @@ def read(
 def _refuse_option(file: Path, found: Format, name: str, value: Any) -> None:
     if name == "units":
         said = found.name if found.name != "BROAD" else "HDF5"
-        raise InputError(f"{file.name} is {said}, whose layout says its units; drop the option for {', '.join(value)}")
+        raise InputError(
+            f"{file.name} is {said}, whose layout defines its units; drop the option for {', '.join(value)}"
+        )
     what = {"columns": "columns go with a table (CSV, Parquet)", "topic": "a topic goes with a bag or a flight log"}[
         name
     ]
@@ -261,23 +263,24 @@ def write(
     recording: Recording | None = None,
     **options: Any,
 ) -> None:
-    """Write a recording or an estimate in the format that the ending names; the file appears whole or not at all.
+    """Write a recording or an estimate in the format of the ending; the file appears whole or not at all.
 
     Parameters
     ----------
     content : Recording, ImuRecord or Estimate
-        A simulated record is written as :func:`from_record` makes a recording of it.
-    path : path
-        ``.csv``, ``.tsv``, ``.parquet``, ``.h5``, ``.bag``, ``.mcap`` …: :func:`writers` lists them.
+        What to write. A simulated record is written as the recording of a device.
+    path : path-like
+        File: ``.csv``, ``.tsv``, ``.parquet``, ``.h5``, ``.bag``, ``.mcap`` …
     recording : Recording, optional
-        With an estimate: what it was made from, whose samples go along where the format has room (a ROS bag needs it).
-    options
-        Of the format's own writer.
+        With an estimate: the recording that it was made from, whose samples are written where the format has room (a ROS bag needs
+        it).
+    **options : dict
+        Options of the format's own writer.
 
     Raises
     ------
     InputError
-        If the ending names no format that holds such a thing, or the content lacks what the format needs.
+        If no format of that ending holds such content, or the content lacks what the format needs.
     """
     if isinstance(content, ImuRecord):
         content = from_record(content, "record")
@@ -330,8 +333,8 @@ def _by_ending(path: str | os.PathLike[str], kind: str) -> Format:
 def from_record(record: ImuRecord, source: str = "record") -> Recording:
     """Return a simulated record as a device would have recorded it.
 
-    The rate at each stamp is the mean over the sample interval that ends there, as of a gyro that integrates: half an interval late.
-    Vector series named accelerometer and magnetometer go along where they have samples at the stamps; a record's truth is the reference.
+    The rate at each stamp is the mean over the sample interval that ends there, as of an integrating gyro: half an interval late.
+    Vector series named accelerometer and magnetometer are included where they have samples at the stamps; the truth is the reference.
     """
     steps = np.diff(record.time)[:, None]
     own: dict[str, Any] = {}

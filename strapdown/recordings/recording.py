@@ -1,4 +1,4 @@
-"""The recording: point samples of rate, specific force and magnetic field on one time axis, whatever file they came from."""
+"""The recording: point samples of rate, specific force and magnetic field on one time axis, from any file."""
 
 from __future__ import annotations
 
@@ -38,36 +38,53 @@ thousands of steps."""
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Recording:
-    """A recording of one inertial measurement unit."""
+    """A recording of one inertial measurement unit.
+
+    Parameters
+    ----------
+    source : str
+        Name of the file or object that it comes from.
+    time : ndarray (n,)
+        Time stamps, s, increasing.
+    rate : ndarray (n, 3)
+        Angular rate at the stamps, rad/s, body axes.
+    specific_force : ndarray (n, 3), optional
+        Specific force, m/s², body axes: +9.81 along the upward axis at rest. Rows of NaN are missing.
+    magnetic_field : ndarray (n, 3), optional
+        Magnetic field in any one unit, body axes. Rows of NaN are missing.
+    magnetic_unit : str, default ""
+        Unit of the magnetic field, a key of :data:`MAGNETIC_UNITS`; empty if unknown.
+    temperature : ndarray (n,), optional
+        Temperature of the sensor, °C; NaN is missing.
+    true_attitude : ndarray (n, 4), optional
+        Reference attitude q_fb; fixed frame East-North-Up, magnetic North. Rows of NaN are missing.
+    movement : ndarray of bool (n,), optional
+        Samples over which errors are judged; None: all.
+    epoch_ns : int, default 0
+        Reading of the source's clock at time 0, ns; nanoseconds since 1970 for a clock that counts from then.
+    missing_gyro : ndarray (k,), default empty
+        Stamps of rows without a gyro sample, s. These rows are left out whole: the intervals on both sides are joined, the turn
+        comes from the samples at the ends, and the covariance of a filter grows over the whole interval.
+    repeated : ndarray (k,), default empty
+        Stamps of rows that repeat the stamp of the row before, s; they are left out. Where they are more than :data:`FEW_REPEATED`
+        of all and their samples differ, the file is refused.
+    remarks : tuple of str, default empty
+        Choices and omissions of the reader, a sentence each: columns guessed, topics used, the part of a truncated file.
+    """
 
     source: str
-    """Where it comes from: the file's name."""
     time: Array
-    """Time stamps (n,), s, increasing."""
     rate: Array
-    """Angular rate at the stamps (n, 3), rad/s, body axes."""
     specific_force: Array | None = None
-    """Specific force (n, 3), m/s², body axes: at rest 9.81 upwards; rows of NaN are missing."""
     magnetic_field: Array | None = None
-    """Magnetic field (n, 3), any one unit, body axes; rows of NaN are missing."""
     magnetic_unit: str = ""
-    """Unit of the magnetic field, of :data:`MAGNETIC_UNITS`; empty where the file does not say."""
     temperature: Array | None = None
-    """Temperature of the sensor (n,), °C; NaN is missing."""
     true_attitude: Array | None = None
-    """Reference q_fb (n, 4), fixed frame East-North-Up with magnetic North; rows of NaN are missing."""
     movement: np.ndarray | None = None
-    """Samples that errors are judged over (n,), bool."""
     epoch_ns: int = 0
-    """What the source's clock read at time 0, ns: of a clock that counts from 1970, nanoseconds since then."""
     missing_gyro: Array = field(default_factory=lambda: np.empty(0))
-    """Stamps of the file's rows without a gyro sample (k,), s. They are left out as a whole: the intervals on both sides are one, the turn
-    over it is taken from the samples at its ends, and a filter's covariance grows over all of it."""
     repeated: Array = field(default_factory=lambda: np.empty(0))
-    """Stamps of the file's rows that have the stamp of the row before (k,), s: they are left out. Where they are more than
-    :data:`FEW_REPEATED` of all, and their samples differ, the file is refused, for two samples at one time have no interval."""
     remarks: tuple[str, ...] = ()
-    """What the reader chose or left out, a sentence each: columns it guessed, topics it took, the part of a truncated file."""
 
     def __post_init__(self) -> None:
         """Check shapes, order and values."""
@@ -101,7 +118,18 @@ class Recording:
             raise InputError(f"{self.source}: movement has shape {np.shape(self.movement)}, wanted ({n},)")
 
     def since(self, first: int) -> Recording:
-        """Return the recording from sample ``first`` on."""
+        """Return the recording from one sample on.
+
+        Parameters
+        ----------
+        first : int
+            Index of the first sample kept.
+
+        Returns
+        -------
+        Recording
+            The rest of the recording.
+        """
         rows = slice(first, None)
         parts: dict[str, Any] = {n: None if getattr(self, n) is None else getattr(self, n)[rows] for n in _ROWS}
         begin = parts["time"][0]
@@ -115,12 +143,12 @@ class Recording:
 
     @property
     def left_out_words(self) -> str:
-        """What is to be said of rows that were left out; nothing where there are none."""
+        """Description of the rows that were left out; empty if there are none."""
         words = []
         if len(self.missing_gyro):
             words.append(
                 f"{len(self.missing_gyro)} rows without a gyro sample, the first at {self.missing_gyro[0]:.3f} s, were left out: the "
-                "turn across them is taken from the samples beside them."
+                "rotation across them comes from the samples before and after."
             )
         if len(self.repeated):
             words.append(
@@ -130,7 +158,7 @@ class Recording:
 
 
 def with_gyro(*, source: str, time: Array, rate: Array, **columns: Any) -> Recording:
-    """Return a recording of the rows that have a gyro sample and do not repeat the row before; the stamps of the others go along."""
+    """Return a recording of the rows with a gyro sample that do not repeat the row before, and the stamps of the others."""
     same = np.diff(time) == 0.0
     if same.any() and np.mean(same) >= FEW_REPEATED:
         for column in (rate, *columns.values()):
@@ -170,10 +198,10 @@ def relative_time(clock_ns: NDArray[np.int64]) -> tuple[Array, int]:
 
 
 def at_nearest(time: Array, other: Array, values: Array) -> tuple[Array, int]:
-    """Return the samples of a sensor with its own stamps at the nearest of ``time``, NaN elsewhere, and the number that found no place.
+    """Return the samples of a sensor with its own stamps at the nearest of ``time``, NaN elsewhere, and the number left over.
 
-    No sample is interpolated, for that would correlate its noise: each moves by at most half an interval of ``time``. A stamp takes the
-    nearest of the samples that fall to it; further ones, and those more than an interval outside, find no place.
+    No sample is interpolated, for that would correlate its noise: each moves by at most half an interval of ``time``. A stamp keeps
+    the nearest of the samples that fall to it; further ones, and those more than an interval outside, are left over.
     """
     placed = np.full((len(time), *values.shape[1:]), np.nan)
     right = np.clip(np.searchsorted(time, other), 1, len(time) - 1)
@@ -186,16 +214,28 @@ def at_nearest(time: Array, other: Array, values: Array) -> tuple[Array, int]:
 
 
 def increments(recording: Recording) -> Array:
-    """Return body increments (n − 1, 3), rad, over the intervals between the stamps, by the trapezoid rule.
+    """Return body increments over the intervals between the stamps, by the trapezoid rule.
 
-    Point samples of rate say no more at uneven stamps; at even ones :func:`strapdown.coning.increments_from_rates` fits higher
-    polynomials.
+    Parameters
+    ----------
+    recording : Recording
+        Recording of n samples.
+
+    Returns
+    -------
+    ndarray (n − 1, 3)
+        Rotation increments, rad, body axes.
+
+    Notes
+    -----
+    At uneven stamps point samples of rate support no higher order; at even ones :func:`strapdown.coning.increments_from_rates` fits
+    higher polynomials.
     """
     return np.asarray(0.5 * (recording.rate[1:] + recording.rate[:-1]) * np.diff(recording.time)[:, None])
 
 
 def gaps(time: ArrayLike) -> list[tuple[float, float]]:
-    """Return (begin, length) of every gap between stamps, s: what the body did there, no sample tells."""
+    """Return (begin, length), s, of every gap between stamps, where the motion is unknown."""
     stamps = np.asarray(time, np.float64)
     steps = np.diff(stamps)
     return [(float(stamps[k]), float(steps[k])) for k in np.flatnonzero(steps > GAP * np.median(steps))]

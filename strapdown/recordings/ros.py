@@ -7,7 +7,7 @@ frame, which by REP 103 and 145 are x forward, y left, z up; its orientation is 
 zero, that of the recorder. Stamps that go back are sorted and counted.
 
 Orientation's covariance is written about the axes of the fixed frame, as REP 103 has it for poses: ``R P Rᵀ`` of the filter's body-side
-covariance. Where the filter says nothing of a stamp, the first element is −1.
+covariance. Where the filter has no estimate for a stamp, the first element is −1.
 
 The messages have a fixed layout behind the name of their frame, so they are decoded as arrays. A truncated bag, which the library
 refuses, is scanned record by record, and what is whole is read.
@@ -110,7 +110,7 @@ def read_bag(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
     said = [f"Topic {chosen}: {len(stamps)} messages.", *bag.remarks, *order_words]
     if values[0, 16] == -1.0:
         raise InputError(
-            f"{file.name}, topic {chosen}: message 1 says that it has no angular velocity; choose another topic"
+            f"{file.name}, topic {chosen}: message 1 declares that it has no angular velocity; choose another topic"
         )
     time, epoch = relative_time(stamps)
     own: dict[str, Any] = {} if values[0, 28] == -1.0 else {"specific_force": values[:, 25:28]}
@@ -152,7 +152,7 @@ def _chosen(name: str, topics: Mapping[str, _Topic], topic: str) -> str:
 
 
 def _beside(unit: str, found: list[_Topic]) -> _Topic | str | None:
-    """Return the topic of a kind that goes with an inertial unit: the only one, or the only one of its namespace; else what to say."""
+    """Return the topic of a kind that goes with an inertial unit: the only one, or the only one of its namespace; else a remark."""
     if len(found) <= 1:
         return found[0] if found else None
     space = unit.rpartition("/")[0] + "/"
@@ -164,7 +164,7 @@ def _beside(unit: str, found: list[_Topic]) -> _Topic | str | None:
 
 
 def _decoded(name: str, topic: _Topic, ros2: bool) -> tuple[NDArray[np.int64], Array, list[str]]:
-    """Return stamps (n,), ns, numbers (n, d) of a topic's messages, in order of time, and what is to be said of them."""
+    """Return stamps (n,), ns, numbers (n, d) of a topic's messages, in order of time, and remarks."""
     wanted = DOUBLES[topic.kind]
     stamps = np.empty(len(topic.raw), np.int64)
     values = np.empty((len(topic.raw), wanted))

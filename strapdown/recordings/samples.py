@@ -12,25 +12,34 @@ import numpy as np
 from strapdown import reading, recordfiles
 from strapdown.checks import Array, InputError, array, one_of, positive
 from strapdown.recordings import formats
-from strapdown.recordings.broad import EVEN, sample_interval
+from strapdown.recordings.broad import sample_interval
 from strapdown.recordings.columns import SENSORS, UNITS
-from strapdown.recordings.recording import GAP, RATE_UNITS, Recording
+from strapdown.recordings.recording import GAP, Recording
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GyroSamples:
-    """Samples of a gyro, or of another sensor, at even intervals, for noise identification."""
+    """Samples of a gyro, or of another sensor, at even intervals, for noise identification.
+
+    Parameters
+    ----------
+    values : ndarray (n, axes)
+        Samples, SI (rad/s, m/s², T), or increments of a gyro, rad. NaN where a sample is missing, if gaps were allowed.
+    sample_interval : float
+        Sample interval, s.
+    kind : {"rate", "increments"}
+        Kind of the values.
+    temperature : ndarray (n,), optional
+        Temperature, °C, where it was recorded.
+    remarks : tuple of str, default empty
+        Choices and omissions of the reader.
+    """
 
     values: Array
-    """Samples (n, axes), SI: rad/s, m/s², T; of a gyro perhaps increments, rad. NaN where a sample is missing, if gaps were allowed."""
     sample_interval: float
-    """s"""
     kind: str
-    """"rate" (samples) or "increments"."""
     temperature: Array | None = None
-    """Temperature (n,), °C, where it was recorded."""
     remarks: tuple[str, ...] = field(default=())
-    """What the reader chose or left out."""
 
 
 def read_gyro(
@@ -41,9 +50,31 @@ def read_gyro(
     columns: Mapping[str, str] | None = None,
     topic: str = "",
 ) -> GyroSamples:
-    """Read the gyro of a recording of any format, a simulated record, or a NPY array (n,) or (n, 3) of rates.
+    """Read the gyro of a recording of any format, of a simulated record, or of a NPY array (n,) or (n, 3) of rates.
 
-    An array tells neither its rate nor its unit: give ``rate`` in Hz and ``units={"gyro": ...}``. Samples must lie at even intervals.
+    Parameters
+    ----------
+    path : path-like
+        File. An array states neither its rate nor its unit: give ``rate`` and ``units={"gyro": ...}``.
+    rate : float, optional
+        Sample rate of a bare array, Hz.
+    units : mapping of str to str, optional
+        Units as in :func:`strapdown.recordings.read`; of a bare array by the name of the sensor.
+    columns : mapping of str to str, optional
+        For tables: names of columns by role, perhaps with a unit, ``{"time": "timestamp [us]", "gx": "gyro_x[dps]"}``; the others
+        are found by their names.
+    topic : str, default ""
+        For bags and flight logs: topic of the inertial unit, where there are several.
+
+    Returns
+    -------
+    GyroSamples
+        Samples at even intervals.
+
+    Raises
+    ------
+    InputError
+        If there is no gyro, its unit is unknown, or its samples lie at uneven intervals.
     """
     return read_samples(path, "gyro", rate=rate, units=units, columns=columns, topic=topic)
 
@@ -58,23 +89,35 @@ def read_samples(
     topic: str = "",
     gaps: bool = False,
 ) -> GyroSamples:
-    """Read one sensor of a recording of any format, a simulated record's gyro, or a NPY array (n,) or (n, 3).
+    """Read one sensor of a recording of any format, the gyro of a simulated record, or a NPY array (n,) or (n, 3).
 
     Parameters
     ----------
-    path : path
-    sensor : {"gyro", "accelerometer", "magnetometer"}
+    path : path-like
+        File.
+    sensor : {"gyro", "accelerometer", "magnetometer"}, default "gyro"
+        Sensor.
     rate : float, optional
-        Samples a second, Hz, of a bare array.
-    units, columns, topic
-        As :func:`strapdown.recordings.read` takes them; ``units`` tells the unit of a bare array too.
-    gaps : bool
-        Allow gaps: samples lie on a grid of the usual interval then, and missing ones are NaN.
+        Sample rate of a bare array, Hz.
+    units : mapping of str to str, optional
+        Units as in :func:`strapdown.recordings.read`; of a bare array by the name of the sensor.
+    columns : mapping of str to str, optional
+        For tables: names of columns by role, perhaps with a unit, ``{"time": "timestamp [us]", "gx": "gyro_x[dps]"}``; the others
+        are found by their names.
+    topic : str, default ""
+        For bags and flight logs: topic of the inertial unit, where there are several.
+    gaps : bool, default False
+        Whether gaps are allowed: samples then lie on a grid of the usual interval, and missing ones are NaN.
+
+    Returns
+    -------
+    GyroSamples
+        Samples at even intervals.
 
     Raises
     ------
     InputError
-        If the sensor is not there, its unit is unknown, or its samples lie at uneven intervals.
+        If the sensor is missing, its unit is unknown, or its samples lie at uneven intervals.
     """
     file = Path(path)
     one_of("sensor", sensor, SENSORS)
@@ -84,11 +127,11 @@ def read_samples(
         with reading.from_file(file):
             return _read_array(file, sensor, rate, given)
     if rate is not None:
-        raise InputError(f"{file.name} tells its own rate; drop the option rate")
+        raise InputError(f"{file.name} states its own rate; drop the option rate")
     if not file.is_dir() and file.exists() and recordfiles.is_record(file):
         if given:
             raise InputError(
-                f"{file.name} is a record, whose layout says its units; drop the option for {', '.join(given)}"
+                f"{file.name} is a record, whose layout defines its units; drop the option for {', '.join(given)}"
             )
         record = recordfiles.read_record(file)
         if sensor == "gyro":
@@ -151,10 +194,10 @@ JITTER = 0.25
 
 
 def _grid(source: str, time: Array) -> tuple[float, np.ndarray, tuple[str, ...]]:
-    """Return the interval of the grid that the stamps lie on, s, the place of each, and what is to be said.
+    """Return the interval of the grid that the stamps lie on, s, the place of each, and remarks.
 
-    Stamps near the grid tell every lost sample. Those that are late by more, as of a computer that was busy, tell only gaps: within a
-    stretch between gaps the samples are taken to be even.
+    Stamps near the grid reveal every lost sample. Stamps with larger delays, as from a busy computer, reveal only gaps: between gaps the
+    samples are assumed to be even.
     """
     steps = np.diff(time)
     usual = float(np.median(steps))
@@ -168,13 +211,10 @@ def _grid(source: str, time: Array) -> tuple[float, np.ndarray, tuple[str, ...]]
         whole = np.where(gap, np.rint(steps / interval), 1.0)
         words = (
             f"Intervals of {source} stray by up to {1e3 * float(np.abs(steps[~gap] - interval).max()):.3g} ms from the mean: between gaps "
-            f"the samples are taken for even, {1.0 / interval:.6g} Hz.",
+            f"the samples are assumed to be even, {1.0 / interval:.6g} Hz.",
         )
     place = np.concatenate([[0], np.cumsum(whole)]).astype(np.int64)
     missing = int(place[-1] + 1 - len(place))
     if missing:
         words += (f"{missing} samples are missing in {int(np.sum(whole > 1.0))} gaps.",)
     return interval, place, words
-
-
-__all__ = ["EVEN", "JITTER", "RATE_UNITS", "GyroSamples", "read_gyro", "read_samples"]

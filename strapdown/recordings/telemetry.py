@@ -71,7 +71,7 @@ def read_telemetry(path: str | os.PathLike[str]) -> Recording:
         specific_force=_columns(rows, "accl"),
         magnetic_field=field,
         magnetic_unit="" if field is None else "uT",
-        remarks=(f"Device: {device}. Its axes are those that telemetry-parser gives; `strapdown doctor` tells more.",),
+        remarks=(f"Device: {device}. Its axes are those of telemetry-parser; check them with `strapdown doctor`.",),
     )
 
 

@@ -32,7 +32,7 @@ UNIT, FIELD, ATTITUDE = "sensor_combined", "vehicle_magnetometer", "vehicle_atti
 NO_SAMPLE = 0x7FFFFFFF
 """``accelerometer_timestamp_relative`` where there is no new sample."""
 LATE = 0.5
-"""Share of the sample interval beyond which the accelerometer's own offset in time is said."""
+"""Share of the sample interval beyond which the accelerometer's own offset in time is reported."""
 
 
 def read_ulog(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
@@ -52,7 +52,7 @@ def read_ulog(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
     file = Path(path)
     pyulog = library("pyulog", f"{file.name} is a flight log of PX4, which")
     try:
-        with contextlib.redirect_stdout(io.StringIO()):  # the library says what it finds to whoever listens
+        with contextlib.redirect_stdout(io.StringIO()):  # the library prints its findings
             log = pyulog.ULog(str(file), [UNIT, FIELD, ATTITUDE])
     except Exception as error:  # of a damaged log the library raises what its parsers do
         raise InputError(
@@ -108,7 +108,7 @@ def _columns(rows: dict[str, Any], name: str, size: int) -> Array:
 
 
 def _stamps(topic: str, rows: dict[str, Any]) -> tuple[NDArray[np.int64], NDArray[np.int64], list[str]]:
-    """Return stamps, µs, in order, the rows that they are of, and what is to be said: a stamp is taken once, the first time."""
+    """Return stamps, µs, in order, the rows that they are of, and remarks; of repeated stamps the first counts."""
     stamps = np.asarray(rows["timestamp"]).astype(np.int64)
     order = np.argsort(stamps, kind="stable")
     fresh = np.concatenate([[True], np.diff(stamps[order]) > 0])

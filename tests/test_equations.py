@@ -1,0 +1,112 @@
+"""Formulas of docstrings that no other test holds, each against an independent computation.
+
+Equations (1)–(18) of *Quaternion differentiation* are held in ``test_reference_equations.py``.
+"""
+
+from __future__ import annotations
+
+import math
+
+import mpmath as mp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.linalg import solve_continuous_are
+
+from strapdown import allan, coning, gyro, kinematics, motion, orbit, quaternion, wahba
+
+
+@pytest.mark.parametrize(("angle", "axis"), [(1e-3, (1.0, 2.0, -2.0)), (1.0, (2.0, -1.0, 2.0)), (6.0, (0.0, 3.0, 4.0))])
+def test_the_bortz_equation_as_bortz_wrote_it(angle, axis):
+    """Bortz 1971, equation (12): φ̇ = w + ½ φ × w + (1/φ²) (1 − φ sin φ/(2 (1 − cos φ))) φ × (φ × w), in 40 digits."""
+    phi = angle * np.array(axis) / np.linalg.norm(axis)
+    w = np.array([0.3, -0.7, 0.2])
+    with mp.workdps(40):
+        size = mp.sqrt(sum(mp.mpf(x) ** 2 for x in phi))
+        factor = float((1 - size * mp.sin(size) / (2 * (1 - mp.cos(size)))) / size**2)
+    expected = w + 0.5 * np.cross(phi, w) + factor * np.cross(phi, np.cross(phi, w))
+    assert_allclose(kinematics.inverse_right_jacobian(phi) @ w, expected, rtol=1e-14)
+
+
+def test_a_slew_is_its_polynomial_and_its_largest_rate_35_sixteenths():
+    slew = motion.Slew(rotation_vector=(0.0, 0.0, 2.0), duration=8.0, start=1.0)
+    s = np.polynomial.Polynomial([0, 0, 0, 0, 35, -84, 70, -20])
+    x = np.linspace(0.0, 1.0, 33)
+    assert_allclose(quaternion.log(slew.attitude(1.0 + 8.0 * x))[:, 2], 2.0 * s(x), atol=1e-15)
+    assert [float(s.deriv(k)(end)) for k in (1, 2, 3) for end in (0, 1)] == [0.0] * 6
+    rates = slew.body_rate(1.0 + 8.0 * np.linspace(0.0, 1.0, 10_001))[:, 2]
+    assert rates.max() == slew.body_rate(5.0)[2] == pytest.approx(35.0 / 16.0 * 2.0 / 8.0, rel=1e-15)
+
+
+@pytest.mark.parametrize(("white", "walk", "density"), [(0.1, 0.2, 1.0), (1e-3, 0.5, 1e-2), (2.0, 1e-3, 7.0)])
+def test_the_steady_variance_of_frequent_measurements(white, walk, density):
+    """√r √(σ_v² + 2 σ_u √r), of ``gyro.best_bandwidth`` (Farrenkopf 1978), by the algebraic Riccati equation."""
+    root = math.sqrt(density)
+    dynamics = np.array([[0.0, -1.0], [0.0, 0.0]])  # the error of the angle, driven by that of the bias
+    P = solve_continuous_are(dynamics.T, np.array([[1.0], [0.0]]), np.diag([white**2, walk**2]), np.array([[density]]))
+    assert P[0, 0] == pytest.approx(root * math.sqrt(white**2 + 2.0 * walk * root), rel=1e-9)
+    # The natural frequency of that filter, s² + (P₁₁/r) s − P₁₂/r, is where r ω⁴ = σ_u²: no flicker, no bound.
+    spec = gyro.GyroSpec(angle_random_walk=white, rate_random_walk=walk)
+    assert gyro.best_bandwidth(spec, density) == pytest.approx(math.sqrt(-P[0, 1] / density), rel=1e-9)
+
+
+@pytest.mark.parametrize("m", [1, 2, 5, 16])
+def test_modified_and_hadamard_variance_of_angle_random_walk(m):
+    """(1 + 1/m²)/2 N²/τ and N²/τ, from the definitions of NIST SP 1065 applied to white samples of variance N²/dt, dt = 1."""
+    phase = np.tril(np.ones((4 * m, 4 * m)))  # rows: angle after each sample, as weights of the samples
+    phase = np.vstack([np.zeros(4 * m), phase])
+    second = phase[2 * m : 3 * m] - 2.0 * phase[m : 2 * m] + phase[:m]
+    modified = np.sum(second.mean(axis=0) ** 2) / (2.0 * m**2)
+    third = phase[3 * m] - 3.0 * phase[2 * m] + 3.0 * phase[m] - phase[0]
+    hadamard = np.sum(third**2) / (6.0 * m**2)
+    assert modified == pytest.approx(0.5 * (1.0 + 1.0 / m**2) / m, rel=1e-12)
+    assert hadamard == pytest.approx(1.0 / m, rel=1e-12)
+    record = np.random.default_rng(5).standard_normal(400_000)
+    for estimator, variance in (("modified", modified), ("hadamard", hadamard)):
+        found = allan.allan_deviation(record, 1.0, taus=[float(m)], estimator=estimator)
+        assert found.deviation[0, 0] == pytest.approx(math.sqrt(variance), rel=5.0 / math.sqrt(2.0 * found.edf[0, 0]))
+
+
+def test_the_floor_of_bias_instability():
+    """0.664 B: √(2 ln 2/π), the limit of the Allan deviation of flicker."""
+    floor = float(mp.sqrt(2 * mp.log(2) / mp.pi))
+    assert floor == pytest.approx(0.664, abs=5e-4)
+    assert allan.model_deviation({"bias_instability": 2.0}, [100.0], 0.01)["total"][0] == pytest.approx(
+        2.0 * floor, rel=1e-6
+    )
+
+
+def test_efficiency_of_the_median_of_gaussian_sizes():
+    """8 (z φ(z))² at z = Φ⁻¹(3/4): variance of the median of |x|, 1/(4 n f²), against that of the root mean square, 1/(2 n)."""
+    with mp.workdps(30):
+        z = mp.findroot(lambda x: mp.ncdf(x) - mp.mpf(3) / 4, 0.67)
+        f = 2 * mp.npdf(z)  # density of |x| at its median
+        efficiency = (1 / mp.mpf(2)) / (1 / (4 * f**2) / z**2)
+        assert efficiency == pytest.approx(float(8 * (z * mp.npdf(z)) ** 2), rel=1e-20)
+        assert pytest.approx(float(efficiency), rel=2e-4) == allan._MEDIAN_EFFICIENCY
+        assert pytest.approx(float(z), rel=1e-15) == allan._MEDIAN_OF_NORMAL
+
+
+@pytest.mark.parametrize(("name", "gain"), [("matched-4-11", 24.0), ("matched-2-8", 2.1), ("matched-1-8-8", 0.12)])
+def test_noise_beside_a_steady_rotation_counts_as_often_as_the_module_says(name, gain):
+    """Change each increment of the window: the change of the step across both, over rotation and change, root sum of squares."""
+    table = coning.ALGORITHMS[name]
+    n, step = table.samples, 12  # a step in the middle of the record
+    rotation, change = 1e-3, 1e-6
+    steady = np.tile([0.0, 0.0, rotation], (25 * n, 1))
+    across = []
+    for k in range(len(steady)):
+        changed = steady.copy()
+        changed[k, 0] += change
+        across.append(coning.rotation_vectors(changed, table)[step, 1] / (rotation * change))
+    assert math.sqrt(np.sum(np.square(across)) / n) == pytest.approx(gain, rel=0.02)
+
+
+def test_the_dipole_is_that_of_igrf_13():
+    """√(g₁₀² + g₁₁² + h₁₁²) of epoch 2020, nT (Alken et al. 2021)."""
+    assert math.hypot(29404.8, 1450.9, 4652.5) * 1e-9 == pytest.approx(orbit.DIPOLE_STRENGTH, rel=1e-3)
+
+
+def test_limits_of_wahba_are_the_probabilities_they_name():
+    assert 1e-9 < math.erfc(wahba.INCONSISTENT / math.sqrt(2.0)) < 3e-9
+    assert math.pi / math.sqrt(3.0) == pytest.approx(1.8, abs=0.02)  # standard deviation of a uniform angle
