@@ -32,6 +32,7 @@ os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(DOCS.parent), os.en
 os.environ.update(
     STRAPDOWN_DOCS=str(DOCS), COLUMNS="96", NO_COLOR="1", TERM="dumb", OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1"
 )
+os.environ.pop("MPLBACKEND", None)  # pages draw inline
 _profile = tempfile.TemporaryDirectory()
 os.environ["IPYTHONDIR"] = _profile.name
 (Path(_profile.name) / "profile_default").mkdir()
