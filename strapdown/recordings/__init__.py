@@ -54,7 +54,7 @@ from strapdown.recordings.recording import (
     gaps,
     increments,
 )
-from strapdown.recordings.samples import GyroSamples, read_gyro, read_samples
+from strapdown.recordings.samples import GyroSamples, read_gyro, read_samples, samples_of
 from strapdown.recordings.trajectories import read_euroc, read_tum, with_reference
 
 __all__ = [
@@ -86,6 +86,7 @@ __all__ = [
     "read_gyro",
     "read_samples",
     "read_tum",
+    "samples_of",
     "with_reference",
     "write",
     "write_broad",

@@ -1,5 +1,7 @@
 """Tuning a filter from data: maximum likelihood, how sure one may be of each parameter, and proof on data held out.
 
+``procedure``
+    :func:`tune`: objective, search and what follows it in one call.
 ``innovations``
     Of the filter's innovations, with score and information, eight sets of parameters a pass.
 ``errors``
@@ -55,10 +57,12 @@ from strapdown.tuning.parameters import (
     with_values,
 )
 from strapdown.tuning.planning import Plan, plan, simulated_again
+from strapdown.tuning.procedure import GATED, Tuned, objective_for, tune
 from strapdown.tuning.starting import one_gyro, record_case, recording_case, recording_setup
 from strapdown.tuning.suspicion import ScaleFactor, Unmodelled, doubted, unmodelled
 
 __all__ = [
+    "GATED",
     "Case",
     "Comparison",
     "ContaminatedLikelihood",
@@ -73,6 +77,7 @@ __all__ = [
     "Prior",
     "ScaleFactor",
     "Slices",
+    "Tuned",
     "TunedGate",
     "Tuning",
     "Unmodelled",
@@ -88,6 +93,7 @@ __all__ = [
     "known_names",
     "likelihood",
     "log_likelihood",
+    "objective_for",
     "one_gyro",
     "performance",
     "plan",
@@ -101,6 +107,7 @@ __all__ = [
     "slices",
     "split",
     "thinned",
+    "tune",
     "tuned_gate",
     "unit_of",
     "unmodelled",
