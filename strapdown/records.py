@@ -28,6 +28,20 @@ if TYPE_CHECKING:
     from strapdown.gyro import GyroSpec
     from strapdown.scenarios import Scenario
 
+__all__ = [
+    "ErrorStateEstimate",
+    "Estimate",
+    "Event",
+    "ImuRecord",
+    "Innovations",
+    "Origin",
+    "Truth",
+    "compress",
+    "cut",
+    "read_estimate",
+    "write_estimate",
+]
+
 CONVENTIONS = (
     "quaternions Hamilton, scalar first, body to fixed frame: v_f = q v_b q^-1; error state (dtheta, db): "
     "q_true = q exp(dtheta), db = b_true - b; SI units and radians"

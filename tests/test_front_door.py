@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import importlib
 import subprocess
 import sys
+import types
 from pathlib import Path
 
 import numpy as np
@@ -251,6 +253,29 @@ def test_dir_shows_the_names_and_the_public_submodules_alone():
         assert getattr(sd, name) is not None
     with pytest.raises(AttributeError, match="mekf"):
         _ = sd.mekf
+
+
+BELOW = (
+    "estimation.error_states",
+    "estimation.filters",
+    "estimation.multiple_model",
+    "montecarlo.campaign",
+    "montecarlo.cluster",
+)
+"""Public modules below the public submodules."""
+
+
+def test_every_public_module_says_what_is_public_and_it_is_not_much():
+    public = {f"strapdown.{name}" for name in NAMES}
+    for name in (*sorted(set(dir(sd)) - NAMES), *BELOW):
+        module = importlib.import_module(f"strapdown.{name}")
+        assert module.__all__, name
+        for one in module.__all__:
+            value = getattr(module, one)
+            assert not isinstance(value, types.ModuleType), f"{name}.{one}"
+            if value is not getattr(sd, one, None):  # what the front door shows too is one name
+                public.add(f"strapdown.{name}.{one}")
+    assert 200 < len(public) <= 250, len(public)
 
 
 def test_type_checkers_see_what_is_there():

@@ -26,6 +26,15 @@ from strapdown.records import ImuRecord, Origin, Truth
 from strapdown.tables import Form
 from strapdown.vectors import Sensor
 
+__all__ = [
+    "SCENARIOS",
+    "Scenario",
+    "drawn",
+    "load_scenario",
+    "scenario_to_toml",
+    "simulate",
+]
+
 _BUILTIN = Path(__file__).parent / "builtin"
 
 SCENARIOS: tuple[str, ...] = tuple(sorted(path.stem for path in _BUILTIN.glob("*.toml")))
