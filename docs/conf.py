@@ -95,8 +95,16 @@ def _spaced(markup: str) -> str:
     return re.sub(r"<mo[^>]*>([/|])</mo>", r'<mo lspace="0" rspace="0">\1</mo>', markup)
 
 
+def _absolute_values(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Escape the bars of absolute values outside literals: reStructuredText would take |q| for a substitution."""
+    for k, line in enumerate(lines):
+        parts = re.split(r"(``.*?``)", line)
+        lines[k] = "".join(part if part.startswith("``") else part.replace("|", r"\|") for part in parts)
+
+
 def setup(app: Any) -> None:
     """Register the writer of formulas."""
+    app.connect("autodoc-process-docstring", _absolute_values)
     app.add_html_math_renderer(
         "mathml",
         (lambda self, node: _mathml(self, node, block=False), None),
