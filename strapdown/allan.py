@@ -48,6 +48,16 @@ from strapdown.checks import Array, InputError
 from strapdown.kernels.allan import accumulate, second_difference_sizes, second_difference_squares
 from strapdown.kernels.machine import compiled
 
+__all__ = [
+    "AllanDeviation",
+    "NoiseFit",
+    "allan_deviation",
+    "fit_noise",
+    "model_deviation",
+    "to_gyro_parameters",
+    "upper_bounds",
+]
+
 TERMS = ("quantization", "angle_random_walk", "bias_instability", "rate_random_walk", "rate_ramp")
 """The noise terms, in the order of every array over terms; also the names of the gyro specification."""
 

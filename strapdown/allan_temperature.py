@@ -20,6 +20,11 @@ from numpy.typing import ArrayLike
 from strapdown import allan, checks
 from strapdown.checks import Array, InputError
 
+__all__ = [
+    "TemperatureFit",
+    "fit_temperature",
+]
+
 MOST_PASSES = 50
 """Most regressions, each with the noise of what the one before left."""
 SETTLED = 1e-3

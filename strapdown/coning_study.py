@@ -28,6 +28,12 @@ from strapdown.units import (
 )
 from strapdown.vectors import VectorSensor
 
+__all__ = [
+    "ConingParameters",
+    "ConingStudy",
+    "run",
+]
+
 ALGORITHMS = ("one-sample", "two-sample", "three-sample", "four-sample", "matched-4-11")
 """Integration algorithms that the study compares, by name in :data:`strapdown.coning.ALGORITHMS`."""
 

@@ -35,6 +35,12 @@ from strapdown.setup import FilterSetup, believed, matched
 from strapdown.units import DEGREE
 from strapdown.vectors import VectorMeasurements
 
+__all__ = [
+    "Analysis",
+    "Consider",
+    "analyse",
+]
+
 AXES = ("x", "y", "z")
 
 LEAST_ERROR = 1e-12

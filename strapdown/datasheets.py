@@ -17,6 +17,12 @@ import numpy as np
 from strapdown.checks import Array, InputError, known_keys, one_of
 from strapdown.gyro import GyroSpec
 
+__all__ = [
+    "PRESETS",
+    "from_datasheet",
+    "preset",
+]
+
 _QUANTITIES = {
     "arw": ("angle_random_walk", "rad / second ** 0.5", "deg/sqrt(h) or deg/s/sqrt(Hz)"),
     "bias_instability": ("bias_instability", "rad / second", "deg/h"),

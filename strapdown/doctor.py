@@ -30,6 +30,11 @@ from strapdown.checks import Array, InputError
 from strapdown.recordings import Recording, increments
 from strapdown.units import DEGREE, STANDARD_GRAVITY
 
+__all__ = [
+    "Examination",
+    "examine",
+]
+
 AXES: tuple[Array, ...] = tuple(
     np.array([[s if column == where else 0.0 for column in range(3)] for where, s in zip(order, signs, strict=True)])
     for order in itertools.permutations(range(3))

@@ -54,6 +54,14 @@ from strapdown.equality import ByValue
 from strapdown.kernels import gyro_errors, noise
 from strapdown.kernels.machine import compiled
 
+__all__ = [
+    "GyroSpec",
+    "matched_process_noise",
+    "process_noise",
+    "read_spec",
+    "simulate",
+]
+
 Axes = float | Array
 """One number for all axes, or an array (3,) of one an axis."""
 

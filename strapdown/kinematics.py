@@ -15,6 +15,16 @@ from numpy.typing import ArrayLike
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, array
 
+__all__ = [
+    "body_quaternion_derivative",
+    "body_rate",
+    "body_to_fixed_rate",
+    "fixed_quaternion_derivative",
+    "fixed_rate",
+    "fixed_to_body_rate",
+    "skew",
+]
+
 
 def _pure(v: Array) -> Array:
     """Return vectors as quaternions with zero scalar part, equation (2)."""

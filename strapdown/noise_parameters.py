@@ -27,6 +27,13 @@ from strapdown import allan, checks, gyro, units
 from strapdown.allan import NoiseFit
 from strapdown.checks import InputError
 
+__all__ = [
+    "to_kalibr",
+    "to_matlab",
+    "to_px4",
+    "to_toml",
+]
+
 SENSORS = ("gyro", "accelerometer", "magnetometer")
 _MICRO_G = 1e-6 * units.STANDARD_GRAVITY
 UNITS: Mapping[str, Mapping[str, tuple[str, float]]] = {

@@ -9,6 +9,11 @@ from numpy.typing import ArrayLike
 
 from strapdown.checks import Array, InputError, array, finite, positive
 
+__all__ = [
+    "CircularOrbit",
+    "dipole_field",
+]
+
 EARTH_RADIUS = 6371.2e3
 """m, mean; the reference radius of the geomagnetic field."""
 EARTH_GRAVITATION = 3.986004418e14

@@ -24,6 +24,17 @@ if TYPE_CHECKING:
     from strapdown.recordings import Recording
     from strapdown.records import Estimate
 
+__all__ = [
+    "Angles",
+    "euler",
+    "free_acceleration",
+    "from_ned",
+    "heading",
+    "table",
+    "to_dataframe",
+    "to_ned",
+]
+
 FRAMES = ("ENU", "NED")
 NED_OF_ENU = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
 """Turns East-North-Up to North-East-Down and back: half a turn about the horizontal line to the north-east."""

@@ -19,6 +19,27 @@ from strapdown.checks import covariance as checked
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
+__all__ = [
+    "IDENTITY",
+    "angle_between",
+    "conjugate",
+    "exp",
+    "from_euler",
+    "from_matrix",
+    "from_mrp",
+    "from_rotation",
+    "inverse",
+    "log",
+    "mean",
+    "multiply",
+    "normalize",
+    "rotate",
+    "to_euler",
+    "to_matrix",
+    "to_mrp",
+    "to_rotation",
+]
+
 IDENTITY: Array = np.array([1.0, 0.0, 0.0, 0.0])
 IDENTITY.flags.writeable = False
 

@@ -25,6 +25,23 @@ from strapdown.vectors import VectorMeasurements
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
+    from strapdown.gyro import GyroSpec
+    from strapdown.scenarios import Scenario
+
+__all__ = [
+    "ErrorStateEstimate",
+    "Estimate",
+    "Event",
+    "ImuRecord",
+    "Innovations",
+    "Origin",
+    "Truth",
+    "compress",
+    "cut",
+    "read_estimate",
+    "write_estimate",
+]
+
 CONVENTIONS = (
     "quaternions Hamilton, scalar first, body to fixed frame: v_f = q v_b q^-1; error state (dtheta, db): "
     "q_true = q exp(dtheta), db = b_true - b; SI units and radians"
@@ -49,6 +66,17 @@ class Truth:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Origin:
+    """How a record was simulated, as far as it is known."""
+
+    gyro: GyroSpec | None = None
+    """Specification of the gyro."""
+    scenario: Scenario | None = None
+    seed: int | None = None
+    run: int | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ImuRecord:
     """Gyro increments and vector measurements over one run.
 
@@ -63,6 +91,8 @@ class ImuRecord:
     vectors: tuple[VectorMeasurements, ...] = ()
     """Vector measurements, each with its own times."""
     truth: Truth | None = None
+    origin: Origin | None = None
+    """How it was simulated: a filter can be matched to the scenario; None of measured data."""
 
     def __post_init__(self) -> None:
         """Check shapes, order and finiteness."""

@@ -17,6 +17,12 @@ from strapdown.checks import Array, InputError, array, finite, known_keys, non_n
 from strapdown.recordings import Recording
 from strapdown.records import ErrorStateEstimate
 
+__all__ = [
+    "UnitCalibration",
+    "read",
+    "to_toml",
+]
+
 KEYS = ("gyro_scale_and_misalignment", "sigma", "magnetometer_delay_ms", "source")
 
 

@@ -4,6 +4,15 @@ from __future__ import annotations
 
 import math
 
+__all__ = [
+    "ARCSECOND",
+    "DEGREE",
+    "DEGREE_PER_HOUR",
+    "DEGREE_PER_HOUR_PER_ROOT_HOUR",
+    "DEGREE_PER_ROOT_HOUR",
+    "STANDARD_GRAVITY",
+]
+
 DEGREE = math.pi / 180.0
 """rad"""
 ARCSECOND = DEGREE / 3600.0

@@ -43,6 +43,18 @@ from strapdown.equality import ByValue
 from strapdown.motion import Motion
 from strapdown.units import STANDARD_GRAVITY
 
+__all__ = [
+    "Accelerometer",
+    "AttitudeSensor",
+    "Faults",
+    "HeadingPair",
+    "Magnetometer",
+    "VectorMeasurements",
+    "VectorSensor",
+    "specific_force",
+    "star_directions",
+]
+
 Kind = Literal["direction", "heading", "vector", "attitude"]
 KINDS: dict[str, int] = {"direction": 2, "heading": 1, "vector": 3, "attitude": 3}
 """Kinds of measurement and their degrees of freedom: of a direction both components across it; of a heading only the turn about the

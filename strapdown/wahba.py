@@ -21,6 +21,14 @@ from strapdown.checks import Array, InputError, array, one_of
 from strapdown.kinematics import skew
 from strapdown.units import DEGREE
 
+__all__ = [
+    "InconsistentError",
+    "Solution",
+    "from_vertical_and_heading",
+    "solve",
+    "triad",
+]
+
 Method = Literal["svd", "davenport", "quest", "foam"]
 
 INCONSISTENT = 6.0

@@ -48,7 +48,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     # 3 estimators
     ("estimation", "setup", "ahrs"),
     # 4 analysis
-    ("consistency", "covariance", "montecarlo", "coning_study", "diagnosis", "doctor", "tuning"),
+    ("consistency", "covariance", "montecarlo", "coning_study", "diagnosis", "doctor", "tuning", "workflows"),
     # 5 faces
     ("plots", "report", "cli", "__main__"),
 )

@@ -201,21 +201,18 @@ def _plan(
     states: bool,
 ) -> Plan:
     from strapdown import montecarlo as engine
-    from strapdown import setup
+    from strapdown import workflows
     from strapdown.checks import InputError
 
     if states and filter_file is not None:
         raise InputError("--filter tells the filter's states itself, in [filter.states]; leave --states out")
     loaded = scenario_named(scenario)
-    filter_setup = (
-        setup.matched(loaded, states=states) if filter_file is None else filter_of_scenario(filter_file, loaded)
-    )
-    return engine.Plan(
-        scenario=loaded,
-        setup=filter_setup,
-        seed=loaded.seed if seed is None else seed,
-        epochs=engine.whole_epochs(loaded, filter_setup),
-        dispersions=engine.Dispersions() if dispersions is None else engine.read_dispersions(dispersions),
+    return workflows.plan(
+        loaded,
+        setup=None if filter_file is None else filter_of_scenario(filter_file, loaded),
+        seed=seed,
+        states=states,
+        dispersions=None if dispersions is None else engine.read_dispersions(dispersions),
         precision="float32" if float32 else "float64",
     )
 

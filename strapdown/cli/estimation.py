@@ -15,11 +15,10 @@ from strapdown.cli.reading import RECORDING_HELP, AccelerometerUnit, Columns, Gy
 from strapdown.cli.terminal import app, console, doubt, need_own, show, table, writable, written
 
 if TYPE_CHECKING:
-    from strapdown.estimation.states import State
-    from strapdown.recordfiles import RecordFile
     from strapdown.recordings import Recording
     from strapdown.records import Estimate, ImuRecord
     from strapdown.setup import FilterSetup
+    from strapdown.setup.for_record import Start
 
 FILES = (
     "estimate.h5",
@@ -38,9 +37,6 @@ RECORDING_ONLY = ("motion", "latency", "calibration")
 """Options that go with a recording."""
 RECORD_ONLY = ("filter", "states", "state", "attitude", "from_truth", "every")
 """Options that go with a record of `strapdown simulate`."""
-
-UNEVEN = 2.0
-"""Largest σ of an attitude over the least, above which both are told."""
 
 
 @app.command()
@@ -269,12 +265,12 @@ def _estimate_record(
     """Run the filter over a record, report and write its estimate."""
     import numpy as np
 
-    from strapdown import records, setup
+    from strapdown import setup, workflows
     from strapdown.checks import InputError, count
     from strapdown.estimation.gating import Gate, Robust
     from strapdown.files import write_json
     from strapdown.recordfiles import read_record_file
-    from strapdown.records import Truth, write_estimate
+    from strapdown.records import write_estimate
 
     count("every", every)
     if smooth and every > 1:
@@ -287,27 +283,11 @@ def _estimate_record(
         chosen = dataclasses.replace(chosen, gate=Gate(probability=gate))
     if robust is not None:
         chosen = dataclasses.replace(chosen, robust=Robust(kind=robust))  # type: ignore[arg-type]
-    believed = setup.believed(held.record, chosen)
-    if every > len(believed.increments):
-        raise InputError(
-            f"every is {every}, more than the {len(believed.increments)} filter steps of the record; only the start would be kept"
-        )
-    initial, words, first = _initial(believed, held, chosen, attitude, from_truth)
-    used = held.record
-    if first > 0:
-        used = records.cut(used, first * chosen.integration.samples, len(used.increments))
-        believed = records.cut(believed, first, len(believed.increments))
-        if every > len(believed.increments):
-            raise InputError(
-                f"every is {every}, and {len(believed.increments)} filter steps are left from the start on"
-            )
-    if smooth:
-        result = setup.smooth(used, chosen, initial, full_covariance=full_covariance)
-    else:
-        result = setup.run(used, chosen, initial, every=every, full_covariance=full_covariance)
-    truth = None
-    if believed.truth is not None:
-        truth = Truth(attitude=believed.truth.attitude[::every], bias=believed.truth.bias[::every])
+    record = held.with_origin(str(path))
+    start = _start(record, chosen, attitude, from_truth)
+    result, used, truth, initial, words = workflows.estimate_record(
+        record, chosen, start, every=every, full_covariance=full_covariance, smooth=smooth
+    )
     length = held.record.time[-1] - held.record.time[0]
     console.print(
         f"{path.name}: {len(held.record.increments)} gyro samples over {length:.6g} s, "
@@ -410,98 +390,27 @@ def _tell_states(result: Any, record: ImuRecord) -> dict[str, Any]:
     return _states(result)
 
 
-def _initial(
-    record: ImuRecord, held: RecordFile, chosen: FilterSetup, attitude: str | None, from_truth: bool
-) -> tuple[State, str, int]:
-    """Return the initial state, how it came about, and the filter's edge that it stands at."""
+def _start(record: ImuRecord, chosen: FilterSetup, attitude: str | None, from_truth: bool) -> Start | None:
+    """Return the start that the options give; None: from the first measurements."""
     import numpy as np
 
-    from strapdown import estimation, quaternion, setup
+    from strapdown import setup
     from strapdown.checks import InputError
-    from strapdown.randomness import generator
-    from strapdown.wahba import InconsistentError
+    from strapdown.setup.for_record import Start, drawn_start
 
     if attitude is not None and from_truth:
         raise InputError("--attitude and --from-truth both tell the start; give one of them")
-    if attitude is not None:
-        try:
-            q = np.array([float(part) for part in attitude.split(",")])
-        except ValueError:
-            raise InputError(f"--attitude is {attitude!r}; give four numbers w,x,y,z") from None
-        if q.shape != (4,) or np.linalg.norm(q) == 0.0:
-            raise InputError(f"--attitude is {attitude!r}; give four numbers w,x,y,z, not all zero")
-        return setup.initial_state(chosen, q / np.linalg.norm(q)), "Started from the attitude given.", 0
     if from_truth:
-        if record.truth is None:
-            raise InputError("--from-truth needs a record with the truth; this one has none")
-        draw = generator(held.seed or 0, held.run or 0, "initial error").standard_normal(6)
-        q = quaternion.multiply(record.truth.attitude[0], quaternion.exp(-chosen.attitude_sigma * draw[:3]))
-        bias = record.truth.bias[0] - chosen.bias_sigma * draw[3:]
-        words = "Started from the truth, off by errors drawn from the filter's σ."
-        return setup.initial_state(chosen, q, bias), words, 0
+        return drawn_start(record, chosen)
+    if attitude is None:
+        return None
     try:
-        state = estimation.first_state(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
-    except InconsistentError as error:
-        problem = str(error).removesuffix("; give the initial attitude")
-        # A sensor's own errors may be among the states, and then the filter can tell who is right.
-        if chosen.states is None:
-            raise InputError(
-                f"{problem}; if a sensor has a bias, give the filter its state (--states); or give --attitude, or --from-truth"
-            ) from None
-        return _banked(record, chosen, problem, f"{problem[:1].upper()}{problem[1:]}. So a bank took them one by one")
-    except InputError as error:
-        problem = str(error).removesuffix("; give the initial attitude")
-        return _banked(record, chosen, problem, "One direction at a time does not give the attitude at once")
-    return state, f"Started from the first measurements, σ {_sigma_words(state)}.", 0
-
-
-def _banked(record: ImuRecord, chosen: FilterSetup, problem: str, why: str) -> tuple[State, str, int]:
-    """Return the state that a bank of hypotheses finds, where the first measurements do not give the attitude."""
-    import numpy as np
-
-    from strapdown import estimation
-    from strapdown.checks import InputError
-    from strapdown.estimation import multiple_model
-
-    try:
-        found = multiple_model.run(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
-    except InputError as error:
-        raise InputError(
-            f"{problem}, nor does a bank of hypotheses ({error}); give --attitude, or --from-truth"
-        ) from None
-    if not found.converged:
-        raise InputError(
-            f"{problem}, nor does a bank of hypotheses: {found.reason}; or give --attitude, or --from-truth"
-        )
-    edge = int(np.searchsorted(record.time, found.became_one))
-    if edge >= len(record.increments):
-        raise InputError(
-            f"{problem}, and a bank of hypotheses found it only at the end; record longer, or give --attitude"
-        )
-    row = int(np.searchsorted(found.estimate.time, found.became_one))
-    assert found.estimate.covariance is not None
-    state = estimation.State(
-        attitude=found.estimate.attitude[row],
-        bias=found.estimate.bias[row],
-        covariance=found.estimate.covariance[row],
-    )
-    words = (
-        f"{why}: {len(found.angles)} hypotheses about it became one at "
-        f"{found.became_one:.6g} s, σ {_sigma_words(state)}; the estimate begins there."
-    )
-    return state, words, edge
-
-
-def _sigma_words(state: State) -> str:
-    """Return how well an attitude is known: one σ, or where it differs by direction, as of tilt and heading, from which to which."""
-    import numpy as np
-
-    from strapdown.units import DEGREE
-
-    least, _, most = np.sqrt(np.maximum(np.linalg.eigvalsh(state.covariance[:3, :3]), 0.0)) / DEGREE
-    if most < UNEVEN * least:
-        return f"{np.sqrt(np.trace(state.covariance[:3, :3]) / 3.0) / DEGREE:.3g}° an axis"
-    return f"{least:.3g} to {most:.3g}° by direction"
+        q = np.array([float(part) for part in attitude.split(",")])
+    except ValueError:
+        raise InputError(f"--attitude is {attitude!r}; give four numbers w,x,y,z") from None
+    if q.shape != (4,) or np.linalg.norm(q) == 0.0:
+        raise InputError(f"--attitude is {attitude!r}; give four numbers w,x,y,z, not all zero")
+    return Start(setup.initial_state(chosen, q / np.linalg.norm(q)), "Started from the attitude given.")
 
 
 def _clear(out: Path) -> None:

@@ -18,7 +18,9 @@ turn of one radian a sample counts 24 times, with ``"matched-2-8"`` twice, with 
 package's own; :func:`strapdown.coning.coefficients.matched_correction` derives it.
 """
 
-from strapdown.coning.algorithms import ALGORITHMS, Algorithm, algorithm_rows, named
+from strapdown.coning.algorithms import ALGORITHMS, Algorithm
+from strapdown.coning.algorithms import algorithm_rows as algorithm_rows
+from strapdown.coning.algorithms import named as named
 from strapdown.coning.drift import (
     ConingBudget,
     VibrationLine,
@@ -26,27 +28,19 @@ from strapdown.coning.drift import (
     read_vibration,
     small_angle_drift,
 )
-from strapdown.coning.stepping import (
-    increments_from_rates,
-    integrate,
-    integrate_rates,
-    rotation_vectors,
-    time_per_sample,
-)
+from strapdown.coning.stepping import increments_from_rates, integrate, integrate_rates, rotation_vectors
+from strapdown.coning.stepping import time_per_sample as time_per_sample
 
 __all__ = [
     "ALGORITHMS",
     "Algorithm",
     "ConingBudget",
     "VibrationLine",
-    "algorithm_rows",
     "increments_from_rates",
     "integrate",
     "integrate_rates",
-    "named",
     "predicted_coning_drift",
     "read_vibration",
     "rotation_vectors",
     "small_angle_drift",
-    "time_per_sample",
 ]

@@ -27,68 +27,45 @@ of it is in :mod:`strapdown.ahrs`.
 
 from __future__ import annotations
 
-from strapdown.recordings.broad import EVEN, read_broad, write_broad
-from strapdown.recordings.columns import SHORT_STAMPS, parse_mapping
+from strapdown.recordings.broad import EVEN as EVEN
+from strapdown.recordings.broad import read_broad as read_broad
+from strapdown.recordings.broad import write_broad as write_broad
+from strapdown.recordings.columns import SHORT_STAMPS as SHORT_STAMPS
+from strapdown.recordings.columns import parse_mapping as parse_mapping
 from strapdown.recordings.dataframes import from_table
-from strapdown.recordings.delimited import read_csv, write_csv
-from strapdown.recordings.formats import (
-    FORMATS,
-    Format,
-    estimate_format,
-    format_of,
-    from_record,
-    is_estimate,
-    is_record,
-    not_held,
-    read,
-    write,
-    writers,
-)
-from strapdown.recordings.recording import (
-    FORCE_UNITS,
-    GAP,
-    MAGNETIC_UNITS,
-    RATE_UNITS,
-    TIME_UNITS,
-    Recording,
-    gaps,
-    increments,
-)
-from strapdown.recordings.samples import GyroSamples, read_gyro, read_samples
-from strapdown.recordings.trajectories import read_euroc, read_tum, with_reference
+from strapdown.recordings.delimited import read_csv as read_csv
+from strapdown.recordings.delimited import write_csv as write_csv
+from strapdown.recordings.formats import FORMATS, from_record, read, write
+from strapdown.recordings.formats import Format as Format
+from strapdown.recordings.formats import estimate_format as estimate_format
+from strapdown.recordings.formats import format_of as format_of
+from strapdown.recordings.formats import is_estimate as is_estimate
+from strapdown.recordings.formats import is_record as is_record
+from strapdown.recordings.formats import not_held as not_held
+from strapdown.recordings.formats import writers as writers
+from strapdown.recordings.recording import FORCE_UNITS as FORCE_UNITS
+from strapdown.recordings.recording import GAP as GAP
+from strapdown.recordings.recording import MAGNETIC_UNITS as MAGNETIC_UNITS
+from strapdown.recordings.recording import RATE_UNITS as RATE_UNITS
+from strapdown.recordings.recording import TIME_UNITS as TIME_UNITS
+from strapdown.recordings.recording import Recording, gaps
+from strapdown.recordings.recording import increments as increments
+from strapdown.recordings.samples import GyroSamples, read_samples
+from strapdown.recordings.samples import read_gyro as read_gyro
+from strapdown.recordings.samples import samples_of as samples_of
+from strapdown.recordings.trajectories import read_euroc as read_euroc
+from strapdown.recordings.trajectories import read_tum as read_tum
+from strapdown.recordings.trajectories import with_reference
 
 __all__ = [
-    "EVEN",
-    "FORCE_UNITS",
     "FORMATS",
-    "GAP",
-    "MAGNETIC_UNITS",
-    "RATE_UNITS",
-    "SHORT_STAMPS",
-    "TIME_UNITS",
-    "Format",
     "GyroSamples",
     "Recording",
-    "estimate_format",
-    "format_of",
     "from_record",
     "from_table",
     "gaps",
-    "increments",
-    "is_estimate",
-    "is_record",
-    "not_held",
-    "parse_mapping",
     "read",
-    "read_broad",
-    "read_csv",
-    "read_euroc",
-    "read_gyro",
     "read_samples",
-    "read_tum",
     "with_reference",
     "write",
-    "write_broad",
-    "write_csv",
-    "writers",
 ]

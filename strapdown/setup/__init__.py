@@ -25,8 +25,23 @@ from strapdown.records import Estimate, ImuRecord, compress
 from strapdown.scenarios import Scenario, simulate
 from strapdown.setup import matching
 from strapdown.setup import states as optional
-from strapdown.setup.states import States
+from strapdown.setup.states import SensorStates, States
 from strapdown.vectors import VectorMeasurements
+
+__all__ = [
+    "FilterSetup",
+    "SensorStates",
+    "States",
+    "initial_state",
+    "matched",
+    "matched_to_record",
+    "not_covered",
+    "observability",
+    "read_setup",
+    "run",
+    "smooth",
+    "to_toml",
+]
 
 ATTITUDE_SIGMA = 1.0 * units.DEGREE
 """Standard deviation of the initial attitude error where nobody says, each axis, rad; less where the sensors are very fine."""

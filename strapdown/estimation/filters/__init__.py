@@ -34,12 +34,16 @@ from typing import Protocol
 from strapdown.checks import InputError, one_of
 from strapdown.estimation import forward
 from strapdown.estimation.filters import complementary, extended, unscented
-from strapdown.estimation.filters.comparison import Comparison
+from strapdown.estimation.filters.comparison import Comparison as Comparison
 from strapdown.estimation.states import ProcessNoise, State
 from strapdown.kernels.filters import equivariant, fixed_side, geometric, right_invariant, schmidt, two_frame
 from strapdown.records import Estimate, ImuRecord, Truth
 
-__all__ = ["FILTERS", "Comparison", "Filter", "compare", "run"]
+__all__ = [
+    "FILTERS",
+    "compare",
+    "run",
+]
 
 
 class Filter(Protocol):
