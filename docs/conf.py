@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from docutils import nodes
-from docutils.utils.math import latex2mathml
+from docutils.utils.math import MathError, latex2mathml
+from sphinx.errors import ExtensionError
 
 DOCS = Path(__file__).resolve().parent
 sys.path.insert(0, str(DOCS.parent))
@@ -47,6 +48,7 @@ nb_execution_in_temp = True
 nb_execution_raise_on_error = True
 nb_execution_timeout = 300
 nb_merge_streams = True
+nb_render_markdown_format = "myst"
 nb_output_stderr = "remove"  # progress bars; an error still stops the build
 myst_enable_extensions = ["amsmath", "dollarmath", "deflist", "attrs_inline"]
 myst_heading_anchors = 3
@@ -69,8 +71,10 @@ html_theme_options = {"navigation_with_keys": True}
 
 def _mathml(self: Any, node: nodes.Element, *, block: bool) -> None:
     """Write a formula as MathML, which browsers draw by themselves: no script and nothing to fetch."""
-    tex = node.astext()
-    markup = latex2mathml.tex2mathml(tex, as_block=block)
+    try:
+        markup = latex2mathml.tex2mathml(node.astext(), as_block=block)
+    except MathError as error:
+        raise ExtensionError(f"{node.source}:{node.line}: {error} in {node.astext()}") from error
     if not block:
         self.body.append(markup)
         raise nodes.SkipNode
