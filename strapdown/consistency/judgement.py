@@ -27,6 +27,7 @@ from strapdown.consistency.whiteness import (
     ljung_box,
     mean_innovation_p_value,
 )
+from strapdown.listing import Listed, Listing, figure
 from strapdown.records import Estimate, Truth
 
 Answer = Literal["consistent", "not consistent", "cannot tell"]
@@ -73,7 +74,7 @@ _RATIOS = ("NIS", "NEES at the end", "time-averaged NEES", "ANEES")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Judgement:
+class Judgement(Listed):
     """A verdict with its evidence."""
 
     verdict: Answer
@@ -84,6 +85,24 @@ class Judgement:
     """What this evidence cannot show."""
     probability: float
     """Probability that a right filter is not called wrong, at least."""
+
+    def listing(self) -> Listing:
+        """Return the verdict and each statistic against its bounds, as a table."""
+        rows = [
+            (
+                one.name,
+                one.of,
+                figure(one.value),
+                f"{figure(one.low)} to {figure(one.high)}" if math.isfinite(one.low) else "",
+                figure(one.p_value, 2),
+                "FAIL" if one.rejected else "pass",
+            )
+            for one in self.findings
+        ]
+        columns = ("statistic", "of", "value", f"{100.0 * self.probability:g} % bounds", "p-value", "")
+        return Listing(
+            f"{self.verdict}: {self.reason}", columns, rows, [f"Note: {one}." for one in self.limits], left=2
+        )
 
     @property
     def words(self) -> str:

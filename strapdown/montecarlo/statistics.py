@@ -48,6 +48,7 @@ from numpy.typing import ArrayLike, NDArray
 from strapdown import consistency, estimation
 from strapdown.checks import Array, InputError
 from strapdown.consistency import Verdict
+from strapdown.listing import Listed, Listing, figure
 from strapdown.records import Estimate, ImuRecord
 
 Counts = NDArray[np.int64]
@@ -105,7 +106,7 @@ class Replay:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Statistics:
+class Statistics(Listed):
     """Sums over independent runs at each epoch. The head of this module defines each field.
 
     Errors are e = (δθ, δb): rad in the body frame, rad/s.
@@ -131,6 +132,30 @@ class Statistics:
     example_run: Counts
     example_error: Array
     example_sigma: Array
+
+    def listing(self) -> Listing:
+        """Return NEES and NIS per degree of freedom, and the errors at the end, as a table."""
+        from strapdown.montecarlo.verdicts import summary
+
+        report = summary(self)
+        parts = [(f"NEES of the {subset}", part["anees"], part) for subset, part in report["nees"].items()]
+        parts += [(f"NIS of {part['sensor']}", part["nis"], part) for part in report["nis"]]
+        rows = [
+            (name, figure(mean), "{:.4f} to {:.4f}".format(*part["bounds"]), "pass" if part["consistent"] else "FAIL")
+            for name, mean, part in parts
+        ]
+        last = report["last_epoch"]
+        notes = [
+            f"{what} at {last['time_s']:.6g} s (x, y, z), {words}: RMS error {numbers[0]}, σ {numbers[1]}"
+            for what, unit, words in (("attitude", "arcsec", "arcsec"), ("bias", "deg_per_hour", "°/h"))
+            for numbers in [
+                [", ".join(figure(x) for x in last[f"{what}_{key}_{unit}"]) for key in ("rms_error", "sigma")]
+            ]
+        ]
+        if self.failed:
+            notes.append(f"{self.failed} runs failed: no finite error or covariance")
+        title = f"{self.runs} runs, per degree of freedom (1 expected); {100.0 * report['probability']:g} % bounds of all together"
+        return Listing(title, ("statistic", "mean", "bounds", ""), rows, notes)
 
     @property
     def failed(self) -> int:
