@@ -7,7 +7,7 @@ names of its keys; a setup read back is equal to the last bit.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -16,8 +16,9 @@ import numpy as np
 from strapdown import coning, estimation, gyro, quaternion, reading, tables, units, vectors
 from strapdown.checks import Array, InputError, known_keys, one_of, positive
 from strapdown.equality import ByValue
-from strapdown.estimation import Observability
+from strapdown.estimation import Observability, filters
 from strapdown.estimation.error_states import ErrorStates
+from strapdown.estimation.filters.own import Own, OwnFilter, as_own
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import ProcessNoise, State
 from strapdown.gyro import GyroSpec
@@ -40,6 +41,8 @@ LEAST_SAMPLES = 32
 """Gyro samples below which nothing is said of commutation."""
 LEAST_BIAS_SIGMA = 0.1 * units.DEGREE_PER_HOUR
 """Standard deviation of the initial bias error of a gyro whose specification tells of no bias, rad/s."""
+MEKF = "mekf"
+"""The estimator that all of this package works with; others run over records, and can be judged."""
 MOST_MEMORY = 8e9
 """Bytes that the smoother may keep of the filter's way."""
 
@@ -80,6 +83,9 @@ class FilterSetup(ByValue):
     """Weighs measurements by how far they lie off; None: all alike."""
     states: States | None = None
     """Optional states beside attitude and bias; None: none. With drifts among them, the bias of the filter is the whole of it."""
+    estimator: str | Own | OwnFilter | Callable[[ImuRecord, State], Estimate] = MEKF
+    """What runs over a record: the name of one of :data:`strapdown.estimation.filters.FILTERS`, or a filter of one's own
+    (:mod:`strapdown.estimation.filters.own`). Of the latter, ``process_noise`` is not used; the two σ above are its start's."""
 
     def __post_init__(self) -> None:
         """Check every number."""
@@ -90,6 +96,22 @@ class FilterSetup(ByValue):
         positive("measurement_sigma_factor", self.measurement_sigma_factor)
         believed_sigma = {str(name): _sigma(f"sigma[{name!r}]", s) for name, s in self.sigma.items()}
         object.__setattr__(self, "sigma", believed_sigma)
+        self._check_estimator()
+
+    def _check_estimator(self) -> None:
+        if isinstance(self.estimator, str):
+            one_of("estimator", self.estimator, filters.FILTERS)
+        else:
+            object.__setattr__(self, "estimator", as_own(self.estimator))
+        if self.estimator != MEKF and (self.gate, self.robust, self.states) != (None, None, None):
+            raise InputError(
+                f"gate, robust and states are options of the mekf, and the estimator is {self.estimator_name}; leave them out"
+            )
+
+    @property
+    def estimator_name(self) -> str:
+        """Name of the estimator."""
+        return self.estimator.name if isinstance(self.estimator, Own) else str(self.estimator)
 
 
 def matched(scenario: Scenario, *, attitude_sigma: float | None = None, states: bool = False) -> FilterSetup:
@@ -333,12 +355,33 @@ def _by_axis(series: VectorMeasurements, told: tuple[float, float, float], facto
 def run(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any) -> Estimate:
     """Run the filter of this setup over a record; ``options`` are those of :func:`strapdown.estimation.run`.
 
-    With optional states the estimate is one of :class:`strapdown.records.Estimate`, which tells of them too.
+    With optional states the estimate is one of :class:`strapdown.records.Estimate`, which tells of them too. Other estimators than the
+    mekf take ``every`` and ``full_covariance`` alone.
     """
+    if setup.estimator != MEKF:
+        return _run_other(believed(record, setup), setup, initial, **options)
     chosen = {"gate": setup.gate, "robust": setup.robust, **options}
     if setup.states is not None:
         return optional.run(believed(record, setup), setup.process_noise, initial, setup.states, **chosen)
     return estimation.run(believed(record, setup), setup.process_noise, initial, **chosen)
+
+
+def _run_other(
+    record: ImuRecord, setup: FilterSetup, initial: State, *, every: int = 1, full_covariance: bool = False
+) -> Estimate:
+    if isinstance(setup.estimator, Own):
+        return setup.estimator(record, initial, times=None if every == 1 else record.time[::every])
+    return filters.run(
+        setup.estimator_name, record, setup.process_noise, initial, every=every, full_covariance=full_covariance
+    )
+
+
+def need_mekf(setup: FilterSetup, what: str) -> None:
+    """Refuse a setup of another estimator for ``what`` works with the mekf alone."""
+    if setup.estimator != MEKF:
+        raise InputError(
+            f"{what} works with the mekf, and the estimator is {setup.estimator_name}; take a setup with estimator='mekf'"
+        )
 
 
 def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any) -> Estimate:
@@ -350,6 +393,7 @@ def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any
         If the record is so long that what the way back needs of the way forth exceeds :data:`MOST_MEMORY`, or a gyro drift is among the
         states.
     """
+    need_mekf(setup, "the smoother")
     chosen = {"gate": setup.gate, "robust": setup.robust, **options}
     told = believed(record, setup)
     blocks: tuple[ErrorStates, ...] = ()
@@ -372,6 +416,7 @@ def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any
 
 def observability(record: ImuRecord, setup: FilterSetup, initial: State) -> Observability:
     """Return what a record shows of each state of this setup's filter: see :func:`strapdown.estimation.observability`."""
+    need_mekf(setup, "observability")
     told = believed(record, setup)
     if setup.states is None:
         return estimation.observability(told, setup.process_noise, initial)
@@ -406,7 +451,7 @@ _ROBUST_FORM: tables.Form = {
     "degrees_of_freedom": tables.RATIO,
     "iterations": tables.PLAIN,
 }
-_PARTS = ("integration", "sigma", "gate", "robust", "states")
+_PARTS = ("integration", "sigma", "gate", "robust", "states", "estimator")
 NEVER = 0
 """What stands in a file for the ``recovery`` of a gate that never recovers, as TOML has no word for nothing."""
 
@@ -426,6 +471,8 @@ def to_table(setup: FilterSetup) -> dict[str, Any]:
         table["robust"] = tables.encode(setup.robust, _ROBUST_FORM)
     if setup.states is not None:
         table["states"] = optional.to_table(setup.states)
+    if setup.estimator != MEKF:
+        table["estimator"] = setup.estimator.table if isinstance(setup.estimator, Own) else setup.estimator
     return table
 
 
@@ -452,6 +499,9 @@ def from_table(table: Mapping[str, Any], place: str = "filter") -> FilterSetup:
         parts["robust"] = tables.build(Robust, _part(table, "robust", place), _ROBUST_FORM, f"{place}: robust")
     if "states" in table:
         parts["states"] = optional.from_table(_part(table, "states", place), f"{place}: states")
+    if "estimator" in table:
+        told = table["estimator"]  # a table describes a filter of one's own, whose code no file holds
+        parts["estimator"] = Own(told) if isinstance(told, Mapping) and "name" in told else str(told)
     return tables.build(  # type: ignore[no-any-return]
         FilterSetup,
         {key: value for key, value in table.items() if key not in own and key not in _PARTS},
