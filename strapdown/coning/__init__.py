@@ -18,7 +18,7 @@ turn of one radian a sample counts 24 times, with ``"matched-2-8"`` twice, with 
 package's own; :func:`strapdown.coning.coefficients.matched_correction` derives it.
 """
 
-from strapdown.coning.algorithms import ALGORITHMS, Algorithm, algorithm_rows, named
+from strapdown.coning.algorithms import ALGORITHMS, Algorithm, algorithm_rows, named, read_algorithms
 from strapdown.coning.drift import (
     ConingBudget,
     VibrationLine,
@@ -45,6 +45,7 @@ __all__ = [
     "integrate_rates",
     "named",
     "predicted_coning_drift",
+    "read_algorithms",
     "read_vibration",
     "rotation_vectors",
     "small_angle_drift",

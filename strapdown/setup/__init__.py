@@ -459,7 +459,8 @@ NEVER = 0
 def to_table(setup: FilterSetup) -> dict[str, Any]:
     """Return a setup as the table that its file holds."""
     table = {**tables.encode(setup.process_noise, _NOISE_FORM), **tables.encode(setup, _FORM)}
-    table["integration"] = setup.integration.name
+    own = setup.integration.name not in coning.ALGORITHMS
+    table["integration"] = setup.integration.to_table() if own else setup.integration.name
     if setup.sigma:
         table["sigma"] = {name: list(s) if isinstance(s, tuple) else s for name, s in setup.sigma.items()}
     if setup.gate is not None:
@@ -482,8 +483,11 @@ def from_table(table: Mapping[str, Any], place: str = "filter") -> FilterSetup:
     own = tables.keys(_NOISE_FORM)
     parts: dict[str, Any] = {}
     if "integration" in table:
-        name = one_of(f"{place}: integration", table["integration"], coning.ALGORITHMS)
-        parts["integration"] = coning.ALGORITHMS[name]
+        told = table["integration"]
+        if isinstance(told, Mapping):
+            parts["integration"] = coning.Algorithm.from_table(told, f"{place}: integration")
+        else:
+            parts["integration"] = coning.ALGORITHMS[one_of(f"{place}: integration", told, coning.ALGORITHMS)]
     if "sigma" in table:
         believed_sigma = _part(table, "sigma", place)
         parts["sigma"] = {name: _sigma(f"{place}: sigma: {name}", value) for name, value in believed_sigma.items()}
