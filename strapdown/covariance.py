@@ -32,7 +32,7 @@ from strapdown.listing import Listed, Listing, figure
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord
 from strapdown.scenarios import Scenario
-from strapdown.setup import FilterSetup, believed, matched
+from strapdown.setup import FilterSetup, believed, matched, need_mekf
 from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR
 from strapdown.vectors import VectorMeasurements
 
@@ -367,6 +367,7 @@ def _integration_rate(scenario: Scenario, setup: FilterSetup, stamps: Array, att
     error ``e(t) = Log(exp(−share φ) ⊗ q_true(t))`` from the step's start is exact; the rate is the one that drives it so.
     """
     n = setup.integration.samples
+    need_mekf(setup, "the covariance analysis")
     edges = scenario.edges
     steps = (len(edges) - 1) // n
     turns = coning.rotation_vectors(scenario.motion.increments(edges[: steps * n + 1]), setup.integration)

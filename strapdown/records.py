@@ -344,6 +344,67 @@ class Estimate(Listed):
             left=2,
         )
 
+    @classmethod
+    def from_arrays(
+        cls,
+        time: ArrayLike,
+        attitude: ArrayLike,
+        covariance: ArrayLike,
+        *,
+        bias: ArrayLike | None = None,
+        innovations: Mapping[str, Innovations] | None = None,
+    ) -> Estimate:
+        """Return the estimate that arrays of any filter make.
+
+        Parameters
+        ----------
+        time : array_like (m,)
+            s, strictly increasing.
+        attitude : array_like (m, 4)
+            q_fb, scalar first.
+        covariance : array_like (m, 3, 3) or (m, 6, 6)
+            Of δθ, rad², with ``q_true = q_est ⊗ exp(δθ)`` (body axes), or of (δθ, δb), δb = b_true − b_est, rad/s. NaN where the filter
+            has none.
+        bias : array_like (m, 3), optional
+            Gyro bias, rad/s, body axes. Without one it is NaN, as is its covariance: only the attitude is judged.
+        innovations : mapping, optional
+            :class:`Innovations` by sensor; without them there is no NIS.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> Estimate.from_arrays([0.0, 1.0], [[1, 0, 0, 0]] * 2, [1e-4 * np.eye(3)] * 2).sigma[0, :3]
+        array([0.01, 0.01, 0.01])
+        """
+        stamps = increasing("time", time)
+        m = len(stamps)
+        q = array("attitude", attitude, (m, 4), allow_nan=True)
+        told = np.isfinite(q).all(axis=1)
+        unit_quaternions("attitude", q[told])
+        P = np.asarray(covariance, np.float64)
+        if P.shape not in ((m, 3, 3), (m, 6, 6)):
+            raise InputError(
+                f"covariance has shape {P.shape}, wanted ({m}, 3, 3) or ({m}, 6, 6), a matrix for each time"
+            )
+        if bias is not None and P.shape[1] == 3:
+            raise InputError("bias is given, but covariance is of the attitude alone; give that of (δθ, δb), (m, 6, 6)")
+        whole = np.full((m, 6, 6), np.nan)
+        size = 3 if bias is None else 6
+        whole[:, :size, :size] = P[:, :size, :size]
+        return cls(
+            time=stamps,
+            attitude=q,
+            bias=np.full((m, 3), np.nan) if bias is None else array("bias", bias, (m, 3), allow_nan=True),
+            variance=np.diagonal(whole, axis1=1, axis2=2).copy(),
+            covariance=whole,
+            innovations=dict(innovations or {}),
+        )
+
+    @property
+    def has_bias(self) -> bool:
+        """Whether a gyro bias is estimated at all."""
+        return bool(np.isfinite(self.bias).any())
+
     def errors(
         self, true_attitude: ArrayLike, true_bias: ArrayLike, true_values: Mapping[str, ArrayLike] | None = None
     ) -> Array:
