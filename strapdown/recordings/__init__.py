@@ -7,6 +7,8 @@ of it is in :mod:`strapdown.ahrs`.
     The table of formats, :func:`read` by content, :func:`write` by ending.
 ``recording``
     :class:`Recording` and its units.
+``body_axes``
+    Axes and signs that are not the package's: :func:`with_axes`.
 ``columns``, ``delimited``, ``dataframes``
     Tables: which column is what; CSV and TSV; Parquet, pandas and xarray.
 ``ros``
@@ -27,6 +29,7 @@ of it is in :mod:`strapdown.ahrs`.
 
 from __future__ import annotations
 
+from strapdown.recordings.body_axes import SENSORS, axes_matrix, with_axes
 from strapdown.recordings.broad import EVEN, read_broad, write_broad
 from strapdown.recordings.columns import SHORT_STAMPS, parse_mapping
 from strapdown.recordings.dataframes import from_table
@@ -64,11 +67,13 @@ __all__ = [
     "GAP",
     "MAGNETIC_UNITS",
     "RATE_UNITS",
+    "SENSORS",
     "SHORT_STAMPS",
     "TIME_UNITS",
     "Format",
     "GyroSamples",
     "Recording",
+    "axes_matrix",
     "estimate_format",
     "format_of",
     "from_record",
@@ -86,6 +91,7 @@ __all__ = [
     "read_gyro",
     "read_samples",
     "read_tum",
+    "with_axes",
     "with_reference",
     "write",
     "write_broad",
