@@ -4,6 +4,7 @@ Every page is executed when it is built, in an empty folder, and nothing is fetc
 """
 
 import os
+import re
 import sys
 import tempfile
 from pathlib import Path
@@ -75,12 +76,23 @@ def _mathml(self: Any, node: nodes.Element, *, block: bool) -> None:
         markup = latex2mathml.tex2mathml(node.astext(), as_block=block)
     except MathError as error:
         raise ExtensionError(f"{node.source}:{node.line}: {error} in {node.astext()}") from error
-    if not block:
-        self.body.append(markup)
-        raise nodes.SkipNode
-    number = f'<span class="eqno">({node["number"]})</span>' if node.get("number") else ""
-    self.body.append(f'<div class="math">{number}{markup}</div>\n')
+    markup = _spaced(markup)
+    if block:
+        number = f'<span class="eqno">({node["number"]})</span>' if node.get("number") else ""
+        markup = f'<div class="math">{markup}{number}</div>\n'
+    self.body.append(markup)
     raise nodes.SkipNode
+
+
+_FUNCTION = r"<mi>[a-zA-Z]+</mi>\s*<mo>&ApplyFunction;</mo>"
+_THIN = '<mspace width="0.17em"></mspace>'
+
+
+def _spaced(markup: str) -> str:
+    """Return MathML with TeX's spaces: thin ones about the name of a function, none about a slash or a bar."""
+    markup = re.sub(rf"(</(?:mi|mn|mfrac|mrow|msup|msub)>)(\s*{_FUNCTION})", rf"\1{_THIN}\2", markup)
+    markup = re.sub(rf"({_FUNCTION})(?!\s*(?:<mrow>\s*)?<mo[^>]*>[(\[])", rf"\1{_THIN}", markup)
+    return re.sub(r"<mo[^>]*>([/|])</mo>", r'<mo lspace="0" rspace="0">\1</mo>', markup)
 
 
 def setup(app: Any) -> None:
