@@ -8,6 +8,7 @@ is the place for more options: :mod:`strapdown.estimation` and :mod:`strapdown.s
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -104,7 +105,7 @@ def simulate(scenario: Scenario | str | os.PathLike[str], *, seed: int | None = 
     >>> import strapdown as sd
     >>> record = sd.simulate("two-stars", seed=1)
     >>> len(record.increments), [one.sensor for one in record.vectors]
-    (60000, ['star 1', 'star 2'])
+    (30000, ['star 1', 'star 2'])
     """
     return scenarios.simulate(_scenario(scenario), seed, run)
 
@@ -499,12 +500,13 @@ def integrate(
     chosen = coning.named(algorithm)
     if isinstance(source, ImuRecord):
         time, increments = source.time, source.increments
-        known = None if source.truth is None else source.truth.attitude
+        known, place = None if source.truth is None else source.truth.attitude, "the record"
     else:
+        place = source.source
         time, increments, known = source.time, recordings.increments(source), source.true_attitude
     if len(increments) < chosen.samples:
         raise InputError(
-            f"there are {len(increments)} gyro samples, fewer than the {chosen.samples} of one step of {chosen.name}; choose another "
+            f"{place} holds {len(increments)} gyro samples, fewer than the {chosen.samples} of one step of {chosen.name}; choose another "
             "algorithm or a longer recording"
         )
     start: ArrayLike = quaternion.IDENTITY
@@ -895,6 +897,5 @@ def fit_noise(
     >>> estimate = sd.estimate(record, noise=noise)  # doctest: +SKIP
     """
     values, interval, what, gaps = _samples(source, sample_interval, sensor, kind)
-    if gaps:
-        return allan_gaps.fit_noise(values, interval, **options)
-    return allan.fit_noise(values, interval, kind=what, **options)
+    fit: Callable[..., NoiseFit] = allan_gaps.fit_noise if gaps else functools.partial(allan.fit_noise, kind=what)
+    return dataclasses.replace(fit(values, interval, **options), sensor=sensor)

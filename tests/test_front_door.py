@@ -5,15 +5,18 @@ from __future__ import annotations
 import ast
 import dataclasses
 import importlib
+import math
 import subprocess
 import sys
 import types
+import xml.etree.ElementTree
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import strapdown as sd
+from strapdown import listing
 
 NAMES = {
     "FilterSetup",
@@ -226,6 +229,75 @@ def test_covariance_analysis_is_that_of_the_matched_filter():
         initial=sd.setup.initial_state(sd.setup.matched(scenario(20.0)), sd.simulate(scenario(20.0)).truth.attitude[0]),
     )
     np.testing.assert_allclose(found.filter_covariance[-1], estimate.covariance[-1], rtol=1e-3, atol=1e-16)
+
+
+# ---------------------------------------------------------------------------------------------------------- results in print
+
+
+def test_a_listing_is_aligned_text_and_escaped_html():
+    made = listing.Listing(
+        "A < B", ("state", "", "σ"), [("x", "rad", "1.5"), ("long name", "", "12")], ["a note"], left=2
+    )
+    assert made.text.splitlines() == [
+        "A < B",
+        "state             σ",
+        "-------------------",
+        "x          rad  1.5",
+        "long name        12",
+        "a note",
+    ]
+    html = xml.etree.ElementTree.fromstring(made.html)
+    assert html.find("p/b").text == "A < B"
+    assert [cell.text for cell in html.iter("td")] == ["x", "rad", "1.5", "long name", None, "12"]
+    assert [row.get("style") for row in html.iter("th")] == ["text-align:left"] * 2 + ["text-align:right"]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0.00012345, "0.0001234"), (None, "-"), (math.nan, "-"), (math.inf, "∞"), (-math.inf, "-∞")]
+)
+def test_figures(value, text):
+    assert listing.figure(value) == text
+
+
+def test_an_estimate_prints_what_is_known_at_the_end():
+    sigma = np.radians([0.1, 0.2, 0.3, 1.0 / 3600, 2.0 / 3600, 3.0 / 3600])
+    estimate = sd.records.Estimate(
+        time=np.array([0.0, 10.0]),
+        attitude=np.array([[1.0, 0.0, 0.0, 0.0]] * 2),
+        bias=np.radians([[0.0] * 3, [5.0 / 3600, -6.0 / 3600, 7.0 / 3600]]),
+        variance=np.stack([4.0 * sigma**2, sigma**2]),
+    )
+    lines = [line.split() for line in str(estimate).splitlines()]
+    assert lines[3] == ["attitude", "x", "°", "0.1", "0.2"]
+    assert lines[8] == ["gyro", "bias", "z", "°/h", "7", "3", "6"]
+    assert "1.000000, 0.000000" in str(estimate)
+
+
+def test_results_print_as_short_tables():
+    record = sd.simulate(scenario(30.0))
+    estimate = sd.estimate(record)
+    statistics = sd.monte_carlo(scenario(30.0), runs=20, threads=1)
+    samples = np.random.default_rng(1).standard_normal((2000, 3))
+    results = [
+        estimate,
+        sd.check(estimate, record),
+        statistics,
+        sd.check(statistics),
+        sd.covariance_analysis(scenario(30.0), epochs=5),
+        sd.allan_deviation(samples, 0.01),
+        sd.fit_noise(samples, 0.01),
+        sd.tune(record, free=["star 1.sigma"], starts=1, threads=1),
+    ]
+    for one in results:
+        lines = str(one).splitlines()
+        assert 4 < len(lines) < 30, one
+        assert max(map(len, lines)) < 140, one
+        rows = xml.etree.ElementTree.fromstring(one._repr_html_())
+        widths = {len(row) for row in rows.iter("tr")}
+        assert len(widths) == 1
+    # Of another sensor than a gyro the units are not the gyro's.
+    assert "°/√h" in str(sd.fit_noise(samples, 0.01))
+    assert "°" not in str(sd.fit_noise(samples, 0.01, sensor="accelerometer"))
 
 
 # ------------------------------------------------------------------------------------------------------------ what it shows

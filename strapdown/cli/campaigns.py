@@ -272,6 +272,8 @@ def _tell(campaign: Campaign) -> None:
         left=2,
     )
     for name, unit, text in (("attitude", "arcsec", "arcsec"), ("bias", "deg_per_hour", "°/h")):
+        if name not in report["nees"]:  # a filter of one's own without a bias
+            continue
         axis = _worst_axis(last[f"{name}_rms_error_{unit}"])
         keys = ("rms_error", "sigma", *(f"error_quantile_{q:g}" for q in QUANTILES))
         sizes = [last[f"{name}_{key}_{unit}"][axis] for key in keys]
@@ -289,7 +291,7 @@ def _tell(campaign: Campaign) -> None:
         f"{part['run']} ({'failed' if part['largest_nees'] is None else format(part['largest_nees'], '.1f')})"
         for part in report["worst_runs"][:5]
     )
-    console.print(f"Worst runs, by their largest NEES of six states: {worst}. See one with --replay.")
+    console.print(f"Worst runs, by their largest NEES of the state: {worst}. See one with --replay.")
     if report["failed_runs"]:
         console.print(f"In {counted(report['failed_runs'], 'run')} the filter failed: no finite error or covariance.")
     rate = ""

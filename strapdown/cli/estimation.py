@@ -11,7 +11,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from strapdown.cli.filters import filter_for
-from strapdown.cli.reading import RECORDING_HELP, AccelerometerUnit, Columns, GyroUnit, TimeUnit, Topic, told
+from strapdown.cli.reading import (
+    RECORDING_HELP,
+    AccelerometerUnit,
+    Axes,
+    Columns,
+    GyroUnit,
+    Invert,
+    TimeUnit,
+    Topic,
+    told,
+)
 from strapdown.cli.terminal import app, console, doubt, need_own, show, table, writable, written
 
 if TYPE_CHECKING:
@@ -53,6 +63,8 @@ def estimate(
     time_unit: TimeUnit = None,
     columns: Columns = None,
     topic: Topic = None,
+    axes: Axes = None,
+    invert: Invert = None,
     gyro: Annotated[
         Path | None,
         typer.Option(
@@ -126,7 +138,12 @@ def estimate(
     euler: Annotated[
         str | None, typer.Option(help="With --to a table: Euler angles of this sequence, ZYX if not given.")
     ] = None,
-    frame: Annotated[str | None, typer.Option(help="With --to: fixed frame ENU (if not given) or NED.")] = None,
+    frame: Annotated[
+        str | None,
+        typer.Option(
+            help="With --to: fixed frame of the output, enu (if not given) or ned; body axes stay as they are."
+        ),
+    ] = None,
     latency: Annotated[
         float | None,
         typer.Option(
@@ -153,10 +170,9 @@ def estimate(
     usable_folder("out", out)
     writable("out", *(out / name for name in FILES), sources=(recording, gyro, filter_file, calibration))
     need_own(out / FILES[0], "estimate", lambda path: bool(read_attributes(path)["kind"] == "strapdown estimate"))
-    layout = told(
-        recording, columns=columns, topic=topic, gyro=gyro_unit, accelerometer=accelerometer_unit, time=time_unit
-    )
-    exports = _exports(to or (), recording, euler, frame)
+    units = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
+    layout = told(recording, columns=columns, topic=topic, axes=axes, invert=invert, **units)
+    exports = _exports(to or (), recording, euler, frame, changed=bool(axes or invert))
     if is_record(recording):
         for name, text in zip(RECORDING_ONLY, (motion, latency, calibration), strict=True):
             if text is not None:
@@ -210,14 +226,17 @@ def estimate(
 
 
 def _exports(
-    to: Sequence[Path], recording: Path, euler: str | None, frame: str | None
+    to: Sequence[Path], recording: Path, euler: str | None, frame: str | None, *, changed: bool
 ) -> list[tuple[Path, dict[str, Any]]]:
-    """Return the further files of an estimate with the options of their writers; what cannot be written is refused."""
+    """Return the further files of an estimate with the options of their writers; what cannot be written is refused.
+
+    ``changed``: the samples are read in other axes than those of the file.
+    """
     from strapdown import outputs, recordings
     from strapdown.checks import InputError, one_of
 
     if frame is not None:
-        one_of("--frame", frame, outputs.FRAMES)
+        frame = one_of("--frame", frame.upper(), outputs.FRAMES)
     if euler is not None:
         outputs.euler([[1.0, 0.0, 0.0, 0.0]], euler)
     given = {name: value for name, value in (("sequence", euler), ("frame", frame)) if value is not None}
@@ -228,7 +247,8 @@ def _exports(
         writable("to", target, suffixes=recordings.writers("write_estimate"), sources=(recording,))
         options: dict[str, Any] = dict(given)
         chosen = recordings.estimate_format(target, given, recording=not recordings.is_record(recording))
-        if "source" in chosen.estimate_options and recordings.format_of(recording) is chosen:
+        # A copy of the file with the orientation filled in would put it beside samples in other axes.
+        if "source" in chosen.estimate_options and recordings.format_of(recording) is chosen and not changed:
             options["source"] = recording
         found.append((target, options))
     return found
@@ -483,6 +503,7 @@ def _estimate_recording(
     if options["robust"] is not None:
         options["robust"] = Robust(kind=options["robust"])
     source = recordings.read(recording, **layout)
+    doubt(source, recording)
     parameters = ahrs.MOTIONS[moved_by]
     if gyro is not None:
         parameters = replace(parameters, **process_noise(read_spec(gyro)))
@@ -521,7 +542,6 @@ def _estimate_recording(
     for remark in used.remarks:
         console.print(remark)
     console.print(f"Fixed frame: {frame}.")
-    doubt(source, recording)
     console.print(_model(moved_by, parameters, result))
     for sentence in (*result.delays.words, *(f"{one}." for one in result.faults.words)):
         console.print(sentence)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from strapdown.cli.reading import RECORDING_HELP, Columns, GyroUnit, TimeUnit, Topic, told
+from strapdown.cli.reading import RECORDING_HELP, Axes, Columns, GyroUnit, Invert, TimeUnit, Topic, told
 from strapdown.cli.terminal import app, console, need_own, progress_bar, show, table, writable, written
 
 if TYPE_CHECKING:
@@ -60,6 +60,8 @@ def integrate(
     time_unit: TimeUnit = None,
     columns: Columns = None,
     topic: Topic = None,
+    axes: Axes = None,
+    invert: Invert = None,
 ) -> None:
     """Integrate a gyro recording to attitude, starting at the true attitude if the file holds it, else at the identity."""
     import numpy as np
@@ -69,7 +71,7 @@ def integrate(
     writable("out", out, suffixes=(".h5", ".hdf5"), sources=(recording,))
     need_own(out, "integrate", lambda path: bool(records.read_attributes(path)["kind"] == "strapdown attitude"))
     chosen = coning.named(algorithm)
-    layout = told(recording, columns=columns, topic=topic, gyro=gyro_unit, time=time_unit)
+    layout = told(recording, columns=columns, topic=topic, axes=axes, invert=invert, gyro=gyro_unit, time=time_unit)
     gaps: list[tuple[float, float]] = []
     words = ""
     with progress_bar("reading, integrating, writing", 3) as advance:

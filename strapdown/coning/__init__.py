@@ -18,7 +18,7 @@ turn of one radian a sample counts 24 times, with ``"matched-2-8"`` twice, with 
 package's own; :func:`strapdown.coning.coefficients.matched_correction` derives it.
 """
 
-from strapdown.coning.algorithms import ALGORITHMS, Algorithm
+from strapdown.coning.algorithms import ALGORITHMS, Algorithm, read_algorithms
 from strapdown.coning.algorithms import algorithm_rows as algorithm_rows
 from strapdown.coning.algorithms import named as named
 from strapdown.coning.drift import (
@@ -40,6 +40,7 @@ __all__ = [
     "integrate",
     "integrate_rates",
     "predicted_coning_drift",
+    "read_algorithms",
     "read_vibration",
     "rotation_vectors",
     "small_angle_drift",

@@ -7,6 +7,8 @@ of it is in :mod:`strapdown.ahrs`.
     The table of formats, :func:`read` by content, :func:`write` by ending.
 ``recording``
     :class:`Recording` and its units.
+``body_axes``
+    Axes and signs that are not the package's: :func:`with_axes`.
 ``columns``, ``delimited``, ``dataframes``
     Tables: which column is what; CSV and TSV; Parquet, pandas and xarray.
 ``ros``
@@ -27,6 +29,9 @@ of it is in :mod:`strapdown.ahrs`.
 
 from __future__ import annotations
 
+from strapdown.recordings.body_axes import SENSORS as SENSORS
+from strapdown.recordings.body_axes import axes_matrix as axes_matrix
+from strapdown.recordings.body_axes import with_axes as with_axes
 from strapdown.recordings.broad import EVEN as EVEN
 from strapdown.recordings.broad import read_broad as read_broad
 from strapdown.recordings.broad import write_broad as write_broad
