@@ -49,6 +49,7 @@ from strapdown import checks, units
 from strapdown.checks import Array, InputError
 from strapdown.kernels.allan import accumulate, second_difference_sizes, second_difference_squares
 from strapdown.kernels.machine import compiled, read_only
+from strapdown.listing import Listed, Listing, figure
 
 __all__ = [
     "AllanDeviation",
@@ -58,6 +59,7 @@ __all__ = [
     "fit_noise",
     "model_deviation",
     "to_gyro_parameters",
+    "upper_bounds",
 ]
 
 TERMS = ("quantization", "angle_random_walk", "bias_instability", "rate_random_walk", "rate_ramp")
@@ -111,7 +113,7 @@ _FLICKER_SUM_LIMIT = 4096
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class AllanDeviation:
+class AllanDeviation(Listed):
     """Allan, modified Allan or Hadamard deviation of a record with its confidence band.
 
     Attributes
@@ -147,9 +149,25 @@ class AllanDeviation:
     samples: int
     sample_interval: float
 
+    def listing(self) -> Listing:
+        """Return the deviation at averaging times about a factor of three apart, SI, as a table."""
+        wanted = np.geomspace(self.taus[0], self.taus[-1], 2 + round(2.0 * math.log10(self.taus[-1] / self.taus[0])))
+        places = np.unique([int(np.argmin(np.abs(np.log(self.taus / tau)))) for tau in wanted])
+        axes = "xyz"[: len(self.deviation)]
+        rows = [
+            (
+                figure(self.taus[i]),
+                *(figure(one[i]) for one in self.deviation),
+                figure(float(np.min(self.edf[:, i])), 3),
+            )
+            for i in places
+        ]
+        title = f"Allan deviation ({self.estimator}), {self.samples} samples of {self.sample_interval:.6g} s, SI"
+        return Listing(title, ("τ, s", *axes, "degrees of freedom"), rows, left=0)
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class NoiseFit:
+class NoiseFit(Listed):
     """Noise coefficients of a record, SI units.
 
     Attributes
@@ -191,6 +209,26 @@ class NoiseFit:
     level: float
     samples: int
     sample_interval: float
+    sensor: str = "gyro"
+    """Whose noise it is, for its units in print."""
+
+    def listing(self) -> Listing:
+        """Return the coefficients with their intervals, as a table."""
+        rows = []
+        for row in table(self):
+            axis, term, seen = int(str(row["axis"])), str(row["term"]), bool(row["supported"])
+            factor = 1.0 if self.sensor == "gyro" else UNITS[term][1]
+            unit = str(row["unit"]) if self.sensor == "gyro" else "SI"
+            estimate, lower, upper = (float(row[end]) * factor for end in ("estimate", "lower", "upper"))  # type: ignore[arg-type]
+            first = (figure(estimate), figure(lower)) if seen else ("not seen", "")
+            rows.append(("xyz"[axis], f"{term} ({row['symbol']})", unit, *first, figure(upper)))
+        notes = [
+            f"axis {'xyz'[axis]} holds more than such noises: {what} (probability {max(probability, 1e-99):.0e})"
+            for axis, (probability, what) in enumerate(zip(self.misfit_probability, self.misfit, strict=True))
+            if probability < MISFIT_PROBABILITY
+        ]
+        title = f"Noise of the {self.sensor}, {self.samples} samples of {self.sample_interval:.6g} s, {100.0 * self.level:g} % intervals"
+        return Listing(title, ("axis", "term", "unit", "estimate", "from", "to"), rows, notes, left=3)
 
 
 def allan_deviation(

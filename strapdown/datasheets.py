@@ -24,7 +24,6 @@ __all__ = [
     "preset",
 ]
 
-
 _QUANTITIES = {
     "arw": ("angle_random_walk", "rad / second ** 0.5", "deg/sqrt(h) or deg/s/sqrt(Hz)"),
     "bias_instability": ("bias_instability", "rad / second", "deg/h"),

@@ -65,6 +65,14 @@ __all__ = [
     "simulate",
 ]
 
+__all__ = [
+    "GyroSpec",
+    "matched_process_noise",
+    "process_noise",
+    "read_spec",
+    "simulate",
+]
+
 Axes = float | Array
 """One number for all axes, or an array (3,) of one per axis."""
 

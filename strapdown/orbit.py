@@ -11,6 +11,7 @@ from strapdown.checks import Array, InputError, array, finite, positive
 
 __all__ = [
     "CircularOrbit",
+    "dipole_field",
 ]
 
 EARTH_RADIUS = 6371.2e3

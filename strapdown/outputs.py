@@ -32,6 +32,7 @@ __all__ = [
     "from_ned",
     "heading",
     "table",
+    "to_dataframe",
     "to_ned",
 ]
 

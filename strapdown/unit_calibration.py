@@ -20,6 +20,7 @@ from strapdown.records import ErrorStateEstimate
 __all__ = [
     "UnitCalibration",
     "read",
+    "to_toml",
 ]
 
 KEYS = ("gyro_scale_and_misalignment", "sigma", "magnetometer_delay_ms", "source")

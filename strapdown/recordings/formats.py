@@ -18,6 +18,7 @@ import numpy as np
 from strapdown import reading, recordfiles
 from strapdown.checks import InputError
 from strapdown.recordings import ros, telemetry, trajectories
+from strapdown.recordings.body_axes import with_axes
 from strapdown.recordings.recording import Recording, with_gyro
 from strapdown.records import Estimate, ImuRecord
 
@@ -196,6 +197,8 @@ def read(
     gyro_alone: bool = False,
     columns: Mapping[str, str] | None = None,
     topic: str = "",
+    axes: str | Mapping[str, str] | None = None,
+    invert: str | Iterable[str] = (),
 ) -> Recording:
     """Read a recording of any format, recognised by its content.
 
@@ -212,6 +215,11 @@ def read(
         are found by their names.
     topic : str, default ""
         For bags and flight logs: topic of the inertial unit, where there are several.
+    axes : str or mapping, optional
+        The recorded axes that become the body's x, y, z, ``"x,-y,-z"`` for a unit whose z axis points down; or of single sensors,
+        ``{"magnetometer": "y,x,-z"}``. See :func:`strapdown.recordings.with_axes`.
+    invert : str or iterable of str, default ()
+        Sensors of inverted sign: ``"accelerometer"`` of one that reads −g upward at rest.
 
     Returns
     -------
@@ -241,7 +249,7 @@ def read(
     if "gyro_alone" in found.options:
         options["gyro_alone"] = gyro_alone
     recording: Recording = _function(found.read)(file, **options)
-    return recording
+    return with_axes(recording, axes, invert) if axes or invert else recording
 
 
 def _refuse_option(file: Path, found: Format, name: str, value: Any) -> None:

@@ -15,6 +15,7 @@ from strapdown.recordings import formats
 from strapdown.recordings.broad import sample_interval
 from strapdown.recordings.columns import SENSORS, UNITS
 from strapdown.recordings.recording import GAP, Recording
+from strapdown.records import ImuRecord
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -133,13 +134,41 @@ def read_samples(
             raise InputError(
                 f"{file.name} is a record, whose layout defines its units; drop the option for {', '.join(given)}"
             )
-        record = recordfiles.read_record(file)
-        if sensor == "gyro":
-            interval = sample_interval(Recording(source=file.name, time=record.time[1:], rate=record.increments))
-            return GyroSamples(values=record.increments, sample_interval=interval, kind="increments")
-        return _of_recording(formats.from_record(record, file.name), sensor, gaps)
+        return samples_of(recordfiles.read_record(file), sensor, gaps=gaps, source=file.name)
     recording = formats.read(file, units=given, gyro_alone=sensor == "gyro", columns=columns, topic=topic)
-    return _of_recording(recording, sensor, gaps)
+    return samples_of(recording, sensor, gaps=gaps)
+
+
+def samples_of(
+    content: Recording | ImuRecord, sensor: str = "gyro", *, gaps: bool = False, source: str = "record"
+) -> GyroSamples:
+    """Return one sensor's samples of a recording or a simulated record, as :func:`read_samples` reads them from its file.
+
+    Parameters
+    ----------
+    content : Recording or ImuRecord
+    sensor : {"gyro", "accelerometer", "magnetometer"}
+    gaps : bool, default False
+        Allow gaps: missing samples are rows of NaN then.
+    source : str
+        What errors call a record; a recording has a name of its own.
+
+    Returns
+    -------
+    GyroSamples
+
+    Raises
+    ------
+    InputError
+        If the sensor is not there, its unit is unknown, or its samples lie at uneven intervals.
+    """
+    one_of("sensor", sensor, SENSORS)
+    if isinstance(content, Recording):
+        return _of_recording(content, sensor, gaps)
+    if sensor == "gyro":
+        interval = sample_interval(Recording(source=source, time=content.time[1:], rate=content.increments))
+        return GyroSamples(values=content.increments, sample_interval=interval, kind="increments")
+    return _of_recording(formats.from_record(content, source), sensor, gaps)
 
 
 def _read_array(file: Path, sensor: str, rate: float | None, given: Mapping[str, str]) -> GyroSamples:
