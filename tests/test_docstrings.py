@@ -21,6 +21,7 @@ from numpydoc.docscrape import NumpyDocString, get_doc_object
 from numpydoc.validate import ERROR_MSGS, Validator, validate
 
 TO_BE_DOCUMENTED = (
+    "strapdown",
     "strapdown.ahrs",
     "strapdown.coning_study",
     "strapdown.consistency",
