@@ -312,27 +312,31 @@ def simulate(
     states = shaping.start(initial[:, : flicker.STATES])
     increments, bias = np.empty((n, 3)), np.empty((n + 1, 3))
     words, normals = np.empty((2, gyro_errors.BLOCK // 2), np.uint64), np.zeros((4, gyro_errors.BLOCK))
+    errors = gyro_errors.Errors(
+        matrix=np.eye(3) + spec.error_matrix,
+        asymmetry=read_only(spec.asymmetry),
+        constant=spec.turn_on_bias + _axes(spec.turn_on_bias_sigma) * initial[:, -1],
+        ramp=_axes(spec.rate_ramp),
+        white=_axes(0.0) if low_passed else white,
+        walk=_axes(spec.rate_random_walk),
+        markov=q,
+        correlation_time=np.full(3, tau),
+        flicker=instability,
+        poles=np.ascontiguousarray(shaping.poles),
+        gains=np.ascontiguousarray(shaping.gains),
+    )
+    state = gyro_errors.Drift(
+        flicker_states=states,
+        flicker_before=instability * (states @ shaping.gains),
+        walk=np.zeros(3),
+        markov=q * np.sqrt(0.5 * tau) * initial[:, -2] if np.isfinite(tau) else np.zeros(3),
+    )
     compiled(gyro_errors.drift_and_noise)(
         read_only(stamps),
         read_only(exact),
-        np.eye(3) + spec.error_matrix,
-        spec.asymmetry,
-        spec.turn_on_bias + _axes(spec.turn_on_bias_sigma) * initial[:, -1],
-        _axes(spec.rate_ramp),
-        _axes(0.0) if low_passed else white,
-        _axes(spec.rate_random_walk),
-        q,
-        np.full(3, tau),
-        instability,
-        np.ascontiguousarray(shaping.poles),
-        np.ascontiguousarray(shaping.gains),
-        states,
-        instability * (states @ shaping.gains),
-        np.zeros(3),
-        q * np.sqrt(0.5 * tau) * initial[:, -2] if np.isfinite(tau) else np.zeros(3),
-        streams,
-        words,
-        normals,
+        errors,
+        state,
+        gyro_errors.Draws(streams, words, normals),
         increments,
         bias,
     )

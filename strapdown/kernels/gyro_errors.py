@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
+
+import numpy as np
 
 from strapdown.kernels.noise import fill_normals
 
@@ -53,36 +56,62 @@ def flicker_block(poles, gains, states, scale, normals, out):
         out[k] = scale * ((s0 + s2) + (s1 + s3))
 
 
-def drift_and_noise(
-    edges,
-    true_increments,
-    matrix,
-    asymmetry,
-    constant,
-    ramp,
-    white,
-    walk,
-    markov,
-    correlation_time,
-    flicker,
-    poles,
-    gains,
-    flicker_states,
-    flicker_before,
-    walk_now,
-    markov_now,
-    streams,
-    words,
-    normals,
-    increments,
-    bias,
-):
+class Errors(NamedTuple):
+    """Errors of a gyro; those by axis are (3,)."""
+
+    matrix: np.ndarray
+    """Scale factors and misalignments with the identity (3, 3)."""
+    asymmetry: np.ndarray
+    constant: np.ndarray
+    """Bias, rad/s."""
+    ramp: np.ndarray
+    """rad/s²."""
+    white: np.ndarray
+    """σ_v, rad/√s."""
+    walk: np.ndarray
+    """σ_u, rad/s/√s."""
+    markov: np.ndarray
+    """√q of the Markov bias, rad/s/√s."""
+    correlation_time: np.ndarray
+    """Of the Markov bias, s."""
+    flicker: np.ndarray
+    """Bias instability B, rad/s."""
+    poles: np.ndarray
+    gains: np.ndarray
+    """Of the flicker (16,)."""
+
+
+class Drift(NamedTuple):
+    """The drift's state, which goes on, by axis."""
+
+    flicker_states: np.ndarray
+    """(3, 16)."""
+    flicker_before: np.ndarray
+    """Flicker of the interval before (3,), rad/s."""
+    walk: np.ndarray
+    markov: np.ndarray
+    """Random walk and Markov bias (3,), rad/s."""
+
+
+class Draws(NamedTuple):
+    """Generators and scratch."""
+
+    streams: np.ndarray
+    """(3, terms, 2, 4), by axis and term."""
+    words: np.ndarray
+    """(2, BLOCK / 2)."""
+    normals: np.ndarray
+    """(4, BLOCK)."""
+
+
+def drift_and_noise(edges, true_increments, errors, drift, draws, increments, bias):
     """Fill increments (n, 3) and bias (n + 1, 3) from the true increments.
 
-    Parameters by axis (3,): ``white`` σ_v, ``walk`` σ_u, ``markov`` √q, ``flicker`` B, and the rest. ``streams`` (3, terms, 2, 4) are the
-    generators by axis and term; ``words`` (2, BLOCK/2) and ``normals`` (4, BLOCK) scratch. ``flicker_before`` is the flicker of the
-    interval before the first; the bias at an edge holds the mean of the flicker of the intervals beside it.
+    The bias at an edge holds the mean of the flicker of the intervals beside it.
     """
+    matrix, asymmetry, constant, ramp, white, walk, markov, correlation_time, flicker, poles, gains = errors
+    flicker_states, flicker_before, walk_now, markov_now = drift
+    streams, words, normals = draws
     n = increments.shape[0]
     start = edges[0]
     for first in range(0, n + 1, BLOCK):
@@ -139,8 +168,8 @@ def drift_and_noise(
                     g1 = decay * g + markov_spread * wandering[i]
                     turn = a0 * true_increments[k, 0] + a1 * true_increments[k, 1] + a2 * true_increments[k, 2]
                     turn += bent * abs(true_increments[k, axis])
-                    drift = steady + slope * (edges[k] - start + 0.5 * dt) + 0.5 * (r + r1) + now
-                    increments[k, axis] = turn + drift * dt + mean * (g + g1) + spread * whites[i]
+                    rate = steady + slope * (edges[k] - start + 0.5 * dt) + 0.5 * (r + r1) + now
+                    increments[k, axis] = turn + rate * dt + mean * (g + g1) + spread * whites[i]
                     r = r1
                     g = g1
             walk_now[axis] = r
