@@ -1,10 +1,24 @@
 """Strapdown gyro attitude estimation.
 
+>>> import strapdown as sd
+>>> record = sd.simulate("two-stars", seed=1)  # gyro increments, star vectors, truth
+>>> estimate = sd.estimate(record)  # multiplicative EKF, matched to the scenario  # doctest: +SKIP
+>>> print(sd.check(estimate, record))  # is the filter consistent?  # doctest: +SKIP
+
+Tasks
+    ``simulate``, ``read``, ``write``, ``estimate``, ``smooth``, ``integrate``, ``check``, ``tune``, ``monte_carlo``,
+    ``covariance_analysis``, ``allan_deviation``, ``fit_noise``, ``initial_state``
+What they take
+    ``Scenario``, ``GyroSpec``, ``VectorSensor``, ``FilterSetup``, ``ProcessNoise``, ``Gate``, ``Robust``; ``StepFilter`` filters step by
+    step; ``InputError`` is raised on bad input.
+More
+    The submodules, each with its own ``__all__``. Names and submodules load when they are first used.
+
 Conventions, the same in code, files and plots
 ----------------------------------------------
 Quaternions
     Hamilton product, scalar first ``(w, x, y, z)``, shape ``(..., 4)``. ``q_fb`` takes body vectors to the fixed (reference)
-    frame: ``v_f = q_fb ⊗ v_b ⊗ q_fb⁻¹``, equation (5) of the source document.
+    frame: ``v_f = q_fb ⊗ v_b ⊗ q_fb⁻¹``, *Quaternion differentiation*, equation (5).
 Kinematics
     Body rate ``w_b``: ``q̇ = ½ q ⊗ w_b``, equation (17). Fixed-frame rate ``w_f``: ``q̇ = ½ w_f ⊗ q``, equation (3).
 Attitude error
@@ -12,11 +26,162 @@ Attitude error
 Error state of the filter
     ``(δθ, δb)`` with ``δb = b_true − b_estimate`` in rad/s; ``P = E[δx δxᵀ]`` in the tangent space after the reset.
 Units
-    SI and radians inside. Degrees, °/h, °/√h and arcseconds appear at the rim only, with the unit in the name.
-
-Modules, from the ground up: ``quaternion``, ``kinematics``, ``kernels`` (mathematics); ``motion``, ``coning``, ``gyro``,
-``vectors``, ``allan``, ``wahba`` (models); ``records``, ``recordings``, ``outputs``, ``scenarios`` (data); ``mekf``, ``ahrs``,
-``smoother``, ``family`` (estimators); ``consistency``, ``montecarlo``, ``coning_study`` (analysis); ``plots``, ``cli`` (faces).
+    SI and radians inside. Degrees, °/h, °/√h and arcseconds appear in files, figures and on the command line only, with the unit in the
+    name.
 """
 
 __version__ = "0.1.0"
+
+TYPE_CHECKING = False  # typing has the same constant, and would take longer to load than this module
+if TYPE_CHECKING:
+    from strapdown import (
+        ahrs,
+        allan,
+        allan_temperature,
+        coning,
+        coning_study,
+        consistency,
+        covariance,
+        datasheets,
+        diagnosis,
+        doctor,
+        estimation,
+        gyro,
+        kinematics,
+        montecarlo,
+        motion,
+        noise_parameters,
+        orbit,
+        outputs,
+        plots,
+        quaternion,
+        recordings,
+        records,
+        report,
+        scenarios,
+        setup,
+        tuning,
+        unit_calibration,
+        units,
+        vectors,
+        wahba,
+    )
+    from strapdown.checks import InputError
+    from strapdown.estimation import Gate, ProcessNoise, Robust, StepFilter, initial_state
+    from strapdown.gyro import GyroSpec
+    from strapdown.scenarios import Scenario
+    from strapdown.setup import FilterSetup
+    from strapdown.vectors import VectorSensor
+    from strapdown.workflows import (
+        allan_deviation,
+        check,
+        covariance_analysis,
+        estimate,
+        fit_noise,
+        integrate,
+        monte_carlo,
+        read,
+        simulate,
+        smooth,
+        tune,
+        write,
+    )
+
+__all__ = [
+    "FilterSetup",
+    "Gate",
+    "GyroSpec",
+    "InputError",
+    "ProcessNoise",
+    "Robust",
+    "Scenario",
+    "StepFilter",
+    "VectorSensor",
+    "ahrs",
+    "allan",
+    "allan_deviation",
+    "allan_temperature",
+    "check",
+    "coning",
+    "coning_study",
+    "consistency",
+    "covariance",
+    "covariance_analysis",
+    "datasheets",
+    "diagnosis",
+    "doctor",
+    "estimate",
+    "estimation",
+    "fit_noise",
+    "gyro",
+    "initial_state",
+    "integrate",
+    "kinematics",
+    "monte_carlo",
+    "montecarlo",
+    "motion",
+    "noise_parameters",
+    "orbit",
+    "outputs",
+    "plots",
+    "quaternion",
+    "read",
+    "recordings",
+    "records",
+    "report",
+    "scenarios",
+    "setup",
+    "simulate",
+    "smooth",
+    "tune",
+    "tuning",
+    "unit_calibration",
+    "units",
+    "vectors",
+    "wahba",
+    "write",
+]
+
+_HOMES = {
+    "FilterSetup": "setup",
+    "Gate": "estimation",
+    "GyroSpec": "gyro",
+    "InputError": "checks",
+    "ProcessNoise": "estimation",
+    "Robust": "estimation",
+    "Scenario": "scenarios",
+    "StepFilter": "estimation",
+    "VectorSensor": "vectors",
+    "allan_deviation": "workflows",
+    "check": "workflows",
+    "covariance_analysis": "workflows",
+    "estimate": "workflows",
+    "fit_noise": "workflows",
+    "initial_state": "estimation",
+    "integrate": "workflows",
+    "monte_carlo": "workflows",
+    "read": "workflows",
+    "simulate": "workflows",
+    "smooth": "workflows",
+    "tune": "workflows",
+    "write": "workflows",
+}
+"""The submodule of each name that is none itself."""
+
+
+if not TYPE_CHECKING:  # type checkers know the names above, and shall find fault with any other
+
+    def __getattr__(name: str):
+        """Load a name or a submodule when it is first used (PEP 562)."""
+        if name not in __all__:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        from importlib import import_module
+
+        if name not in _HOMES:
+            return import_module(f"{__name__}.{name}")
+        value = globals()[name] = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+        return value
+
+
+def __dir__() -> list[str]:
+    return list(__all__)

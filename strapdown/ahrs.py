@@ -32,6 +32,13 @@ from strapdown.unit_calibration import UnitCalibration
 from strapdown.units import DEGREE
 from strapdown.vectors import VectorMeasurements
 
+__all__ = [
+    "MOTIONS",
+    "AhrsEstimate",
+    "AhrsParameters",
+    "estimate",
+]
+
 UP = np.array([0.0, 0.0, 1.0])
 NORTH = np.array([0.0, 1.0, 0.0])
 QUIET_SPAN = 1.0

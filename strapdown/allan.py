@@ -49,15 +49,16 @@ from strapdown import checks, units
 from strapdown.checks import Array, InputError
 from strapdown.kernels.allan import accumulate, second_difference_sizes, second_difference_squares
 from strapdown.kernels.machine import compiled
+from strapdown.listing import Listed, Listing, figure
 
 __all__ = [
     "AllanDeviation",
     "NoiseFit",
     "allan_deviation",
-    "expected_errors",
     "fit_noise",
     "model_deviation",
     "to_gyro_parameters",
+    "upper_bounds",
 ]
 
 TERMS = ("quantization", "angle_random_walk", "bias_instability", "rate_random_walk", "rate_ramp")
@@ -111,7 +112,7 @@ _FLICKER_SUM_LIMIT = 4096
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class AllanDeviation:
+class AllanDeviation(Listed):
     """Allan, modified Allan or Hadamard deviation of a record with its confidence band.
 
     Attributes
@@ -147,9 +148,25 @@ class AllanDeviation:
     samples: int
     sample_interval: float
 
+    def listing(self) -> Listing:
+        """Return the deviation at averaging times about a factor of three apart, SI, as a table."""
+        wanted = np.geomspace(self.taus[0], self.taus[-1], 2 + round(2.0 * math.log10(self.taus[-1] / self.taus[0])))
+        places = np.unique([int(np.argmin(np.abs(np.log(self.taus / tau)))) for tau in wanted])
+        axes = "xyz"[: len(self.deviation)]
+        rows = [
+            (
+                figure(self.taus[i]),
+                *(figure(one[i]) for one in self.deviation),
+                figure(float(np.min(self.edf[:, i])), 3),
+            )
+            for i in places
+        ]
+        title = f"Allan deviation ({self.estimator}), {self.samples} samples of {self.sample_interval:.6g} s, SI"
+        return Listing(title, ("τ, s", *axes, "degrees of freedom"), rows, left=0)
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class NoiseFit:
+class NoiseFit(Listed):
     """Noise coefficients of a record, SI units.
 
     Attributes
@@ -178,6 +195,8 @@ class NoiseFit:
         Samples of the record.
     sample_interval : float
         Sample interval, s.
+    sensor : {"gyro", "accelerometer", "magnetometer"}, default "gyro"
+        Sensor, for its units in print.
     """
 
     terms: tuple[str, ...]
@@ -191,6 +210,25 @@ class NoiseFit:
     level: float
     samples: int
     sample_interval: float
+    sensor: str = "gyro"
+
+    def listing(self) -> Listing:
+        """Return the coefficients with their intervals, as a table."""
+        rows = []
+        for row in table(self):
+            axis, term, seen = int(str(row["axis"])), str(row["term"]), bool(row["supported"])
+            factor = 1.0 if self.sensor == "gyro" else UNITS[term][1]
+            unit = str(row["unit"]) if self.sensor == "gyro" else "SI"
+            estimate, lower, upper = (float(row[end]) * factor for end in ("estimate", "lower", "upper"))  # type: ignore[arg-type]
+            first = (figure(estimate), figure(lower)) if seen else ("not seen", "")
+            rows.append(("xyz"[axis], f"{term} ({row['symbol']})", unit, *first, figure(upper)))
+        notes = [
+            f"axis {'xyz'[axis]} holds more than such noises: {what} (probability {max(probability, 1e-99):.0e})"
+            for axis, (probability, what) in enumerate(zip(self.misfit_probability, self.misfit, strict=True))
+            if probability < MISFIT_PROBABILITY
+        ]
+        title = f"Noise of the {self.sensor}, {self.samples} samples of {self.sample_interval:.6g} s, {100.0 * self.level:g} % intervals"
+        return Listing(title, ("axis", "term", "unit", "estimate", "from", "to"), rows, notes, left=3)
 
 
 def allan_deviation(
@@ -670,9 +708,18 @@ def to_gyro_parameters(fit: NoiseFit) -> dict[str, float | tuple[float, ...]]:
 
 
 def upper_bounds(fit: NoiseFit) -> dict[str, float | tuple[float, ...]]:
-    """Return the upper ends of the intervals of the terms that some axis does not support, by name, SI; one number or one per axis.
+    """Return the upper ends of the intervals of the terms that some axis does not support.
 
-    The record cannot exclude coefficients up to these; a filter that must not be overconfident may use them.
+    Parameters
+    ----------
+    fit : NoiseFit
+        Coefficients of one sensor.
+
+    Returns
+    -------
+    dict of str to float or tuple of float
+        Upper ends by name, SI, one number or one per axis. The record cannot exclude coefficients up to these; a filter that must
+        not be overconfident may use them.
     """
     return _by_name(fit, fit.upper, np.asarray(~fit.supported.all(axis=0)))
 

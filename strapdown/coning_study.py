@@ -6,6 +6,7 @@ bias cannot tell that rate from a bias: its attitude stays good, its bias is wro
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -17,7 +18,7 @@ from strapdown.checks import Array, InputError, count, non_negative, positive
 from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
 from strapdown.montecarlo import FilterSetup, Statistics
-from strapdown.motion import Coning
+from strapdown.motion import Coning, Harmonic, HarmonicRates, Motion, SpinRock, TorqueFree
 from strapdown.scenarios import Scenario
 from strapdown.units import (
     ARCSECOND,
@@ -28,11 +29,18 @@ from strapdown.units import (
 )
 from strapdown.vectors import VectorSensor
 
+__all__ = [
+    "ConingParameters",
+    "ConingStudy",
+    "run",
+]
+
 ALGORITHMS = ("one-sample", "two-sample", "three-sample", "four-sample", "matched-4-11")
 """Integration algorithms that the study compares, by name in :data:`strapdown.coning.ALGORITHMS`."""
 
 STEP_MULTIPLE = 12
-"""Samples between measurements and epochs are a multiple of this, so that they end on whole steps of 1, 2, 3, 4, 6 or 12 samples.
+"""Samples between measurements and epochs are a multiple of this, so that they end on whole steps of 1, 2, 3, 4, 6 or 12 samples; of a step
+of one's own the least common multiple.
 
 A compressed step split in its middle would be taken for a turn at constant rate, which under coning it is not."""
 
@@ -66,6 +74,8 @@ class ConingParameters:
     """Initial bias error, each axis, rad/s."""
     probability: float = 0.99
     """Probability content of all bounds."""
+    own: tuple[coning.Algorithm, ...] = ()
+    """Algorithms of one's own, compared beside those of the package."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -87,17 +97,32 @@ class ConingParameters:
         count("seed", self.seed, least=0)
         if not 0.0 < self.probability < 1.0:
             raise InputError(f"probability is {self.probability}; it must lie between 0 and 1")
+        names = [one.name for one in self.algorithms]
+        if len(set(names)) < len(names):
+            raise InputError(
+                f"own holds an algorithm of a name that is among {', '.join(names)} already; give it another"
+            )
+
+    @property
+    def algorithms(self) -> tuple[coning.Algorithm, ...]:
+        """What is compared: the package's (:data:`ALGORITHMS`), then one's own."""
+        return (*(coning.ALGORITHMS[name] for name in ALGORITHMS), *self.own)
+
+    @property
+    def step_multiple(self) -> int:
+        """Least common multiple of :data:`STEP_MULTIPLE` and one's own steps."""
+        return math.lcm(STEP_MULTIPLE, *(one.samples for one in self.own))
 
     @property
     def samples(self) -> int:
-        """Gyro samples in a run: the duration, rounded to a multiple of ``EPOCHS`` times ``STEP_MULTIPLE``."""
-        block = EPOCHS * STEP_MULTIPLE
+        """Gyro samples in a run: the duration, rounded to a multiple of ``EPOCHS`` times :attr:`step_multiple`."""
+        block = EPOCHS * self.step_multiple
         return block * max(1, round(self.duration * self.rate / block))
 
     @property
     def measurement_interval(self) -> float:
         """Interval of the direction measurements, s: about a second, in whole steps."""
-        return STEP_MULTIPLE * max(1, round(self.rate / STEP_MULTIPLE)) / self.rate
+        return self.step_multiple * max(1, round(self.rate / self.step_multiple)) / self.rate
 
     @property
     def scenario(self) -> Scenario:
@@ -225,7 +250,26 @@ class ConingStudy:
                 for drift in self.drifts
             ],
             "filter": [outcome.summary() for outcome in self.outcomes],
+            **({"own": [own_summary(one) for one in p.own]} if p.own else {}),
         }
+
+
+def own_summary(algorithm: coning.Algorithm) -> dict[str, Any]:
+    """Return what follows from the coefficients of an algorithm of one's own, beside the best that as many increments allow.
+
+    ``drift_constant`` is C of the leading drift −C β² ω λ^``drift_order``, as a fraction and as a number; the best has drift order 2M and
+    the constant (M!)²/(2 (2M+1)!), M increments in the window.
+    """
+    m = algorithm.window
+    return {
+        **algorithm.to_table(),
+        "order": algorithm.order,
+        "drift_order": algorithm.drift_order,
+        "drift_constant": str(algorithm.drift_constant),
+        "drift_constant_value": float(algorithm.drift_constant),
+        "best_drift_order": 2 * m,
+        "best_drift_constant": math.factorial(m) ** 2 / (2.0 * math.factorial(2 * m + 1)),
+    }
 
 
 def predicted_drift(motion: Coning, rate: float, algorithm: coning.Algorithm) -> float:
@@ -259,10 +303,56 @@ def measured_drift(motion: Coning, rate: float, algorithm: coning.Algorithm, ste
     return float(error_f[2] / edges[-1])
 
 
+def step_drift(motion: Coning, rate: float, algorithm: coning.Algorithm) -> float:
+    """Return the drift of noise-free integration at any coning frequency, rad/s along the cone's axis: estimated minus true.
+
+    One step seen from axes that turn with the coning, ``F = δq ⊗ R_z(ωT)``, is the same for all steps, so the error over many is that of
+    its angle, ωT for the truth. No run is averaged over, and the periodic error does not enter.
+    """
+    n, h = algorithm.samples, 1.0 / rate
+    # A step far enough from the ends of a short record for its window to lie inside it, and for the record not to count as short.
+    place = -(-algorithm.window // n)
+    steps = 2 * place + 1
+    edges = np.arange(steps * n + 1) * h
+    attitude = coning.integrate(motion.increments(edges), algorithm)
+    omega = 2.0 * np.pi * motion.frequency
+    turned = quaternion.exp(np.array([0.0, 0.0, omega * place * n * h]))
+    step = quaternion.multiply(quaternion.conjugate(attitude[place]), attitude[place + 1])
+    fixed = quaternion.multiply(quaternion.multiply(quaternion.conjugate(turned), step), turned)
+    angle = omega * n * h
+    w, x, y, z = quaternion.multiply(fixed, quaternion.exp(np.array([0.0, 0.0, angle])))
+    found = 2.0 * math.atan2(math.copysign(math.sqrt(x * x + y * y + z * z), z), w)  # about an axis near z
+    return math.remainder(found - angle, 2.0 * np.pi) / (n * h)
+
+
+MANOEUVRES: dict[str, Motion] = {
+    "spin 60 rpm, rocking": SpinRock(rock_angle=10.0 * DEGREE, rock_frequency=1.0, spin_rate=2.0 * np.pi),
+    "three axes at once": HarmonicRates(
+        mean=(0.0, 0.0, 0.2),
+        harmonics=(
+            Harmonic(amplitude=(2.0, 0.0, 0.0), frequency=0.8),
+            Harmonic(amplitude=(0.0, 1.5, 0.0), frequency=1.3, phase=1.0),
+            Harmonic(amplitude=(0.0, 0.0, 1.0), frequency=2.1, phase=2.0),
+        ),
+    ),
+    "tumble free of torque": TorqueFree(inertia=(1.0, 2.0, 2.5), initial_rate=(1.0, 2.0, 0.5)),
+}
+"""Motions other than coning over which integration errs, 2 s of each (:func:`manoeuvre_error`)."""
+MANOEUVRE_SECONDS = 2.0
+
+
+def manoeuvre_error(motion: Motion, rate: float, algorithm: coning.Algorithm) -> float:
+    """Return the largest attitude error of noise-free integration over :data:`MANOEUVRE_SECONDS` of a motion, rad."""
+    steps = max(1, int(MANOEUVRE_SECONDS * rate) // algorithm.samples)
+    edges = np.arange(steps * algorithm.samples + 1) / rate
+    estimate = coning.integrate(motion.increments(edges), algorithm, motion.attitude(0.0))
+    return float(quaternion.angle_between(motion.attitude(edges[:: algorithm.samples]), estimate).max())
+
+
 def run(parameters: ConingParameters, *, progress: Callable[[int], None] | None = None) -> ConingStudy:
     """Run the study; ``progress`` is called with the number of Monte Carlo runs just finished."""
     scenario = parameters.scenario
-    algorithms = [coning.ALGORITHMS[name] for name in ALGORITHMS]
+    algorithms = parameters.algorithms
     motion = Coning(angle=parameters.angle, frequency=parameters.frequency)
     drifts = tuple(
         Drift(

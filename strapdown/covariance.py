@@ -28,12 +28,19 @@ from strapdown.estimation.states import covariance_matrices
 from strapdown.gyro import GyroSpec
 from strapdown.kernels import covariance_loop
 from strapdown.kernels.machine import compiled
+from strapdown.listing import Listed, Listing, figure
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord
 from strapdown.scenarios import Scenario
-from strapdown.setup import FilterSetup, believed, matched
-from strapdown.units import DEGREE
+from strapdown.setup import FilterSetup, believed, matched, need_mekf
+from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR
 from strapdown.vectors import VectorMeasurements
+
+__all__ = [
+    "Analysis",
+    "Consider",
+    "analyse",
+]
 
 AXES = ("x", "y", "z")
 
@@ -90,7 +97,7 @@ class Consider(ByValue):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Analysis:
+class Analysis(Listed):
     """What the filter will do, predicted: the error state e = (δθ, δb), rad in the body frame and rad/s."""
 
     time: Array
@@ -115,6 +122,20 @@ class Analysis:
     """Errors of the scenario that the analysis leaves out."""
     beyond_linear: tuple[str, ...]
     """What is too large for an analysis that is linear about the truth, in words: take a Monte Carlo there."""
+
+    def listing(self) -> Listing:
+        """Return the error budget at the last epoch, as a table."""
+        rows = [
+            (name, kind, figure(attitude / ARCSECOND), figure(bias / DEGREE_PER_HOUR))
+            for name, kind, attitude, bias in self.budget()
+        ]
+        for name, sigma in (("actual RMS error", self.rms[-1]), ("filter's σ", self.filter_sigma[-1])):
+            sizes = [float(np.sqrt(np.mean(sigma[part] ** 2))) for part in (slice(0, 3), slice(3, 6))]
+            rows.append((name, "total", figure(sizes[0] / ARCSECOND), figure(sizes[1] / DEGREE_PER_HOUR)))
+        notes = [f"Left out: {one}." for one in self.left_out]
+        notes += [f"Beyond a linear analysis: {one}; use a Monte Carlo." for one in self.beyond_linear]
+        columns = ("source", "kind", "attitude, arcsec", "bias, °/h")
+        return Listing(f"Error budget an axis at {self.time[-1]:.6g} s", columns, rows, notes, left=2)
 
     @property
     def covariance(self) -> Array:
@@ -346,6 +367,7 @@ def _integration_rate(scenario: Scenario, setup: FilterSetup, stamps: Array, att
     error ``e(t) = Log(exp(−share φ) ⊗ q_true(t))`` from the step's start is exact; the rate is the one that drives it so.
     """
     n = setup.integration.samples
+    need_mekf(setup, "the covariance analysis")
     edges = scenario.edges
     steps = (len(edges) - 1) // n
     turns = coning.rotation_vectors(scenario.motion.increments(edges[: steps * n + 1]), setup.integration)

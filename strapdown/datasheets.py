@@ -19,11 +19,9 @@ from strapdown.gyro import GyroSpec
 
 __all__ = [
     "PRESETS",
-    "Preset",
     "from_datasheet",
     "preset",
 ]
-
 
 _QUANTITIES = {
     "arw": ("angle_random_walk", "rad / second ** 0.5", "deg/sqrt(h) or deg/s/sqrt(Hz)"),

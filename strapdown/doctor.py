@@ -25,13 +25,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from strapdown import coning, quaternion
+from strapdown import ahrs, coning, quaternion
 from strapdown.checks import Array, InputError
 from strapdown.recordings import Recording, increments
 from strapdown.units import DEGREE, STANDARD_GRAVITY
 
 __all__ = [
-    "Candidate",
     "Examination",
     "examine",
 ]
@@ -198,6 +197,7 @@ def examine(recording: Recording) -> Examination:
         )
     unit_changes, doubts = _force_unit(recording)
     doubts += _too_fast(recording)
+    upright = at_rest(recording)
     found = list(_with_reference(recording) if recording.true_attitude is not None else _without_reference(recording))
     notes = _unseen(recording)
     if not found:
@@ -207,7 +207,7 @@ def examine(recording: Recording) -> Examination:
             reason="the recording hardly turns, or has too few samples",
             candidates=(),
             notes=tuple(notes),
-            doubts=tuple(doubts),
+            doubts=tuple(upright + doubts),
         )
     told = [
         Candidate(
@@ -218,7 +218,12 @@ def examine(recording: Recording) -> Examination:
         for one in found
     ]
     told.sort(key=lambda one: -one.score)
-    return replace(_concluded(recording.source, told, unit_changes, notes), doubts=tuple(doubts))
+    result = _concluded(recording.source, told, unit_changes, notes)
+    if upright and result.verdict == "as told":
+        result = replace(
+            result, verdict="cannot tell", reason="the sensors agree with each other; see the warning on their sign"
+        )
+    return replace(result, doubts=tuple(upright + doubts))
 
 
 def _concluded(source: str, told: list[Candidate], sure: tuple[str, ...], notes: list[str]) -> Examination:
@@ -244,6 +249,76 @@ def _concluded(source: str, told: list[Candidate], sure: tuple[str, ...], notes:
     if equal and verdict != "cannot tell":
         notes = [*notes, "fits as well: " + " / ".join(one.words for one in equal)]
     return Examination(source=source, verdict=verdict, reason=reason, candidates=tuple(told[:12]), notes=tuple(notes))
+
+
+REST_SPREAD = 0.05
+"""σ of the specific force over the quiet second, as a share of its mean, above which the unit does not rest."""
+REST_STRENGTH = 0.15
+"""Deviation of the mean specific force from gravity, as a share of it, above which it is not gravity alone."""
+DOWN = 0.7
+"""Share of gravity along the body's −z axis above which z points down."""
+LEAST_DIP = 10.0 * DEGREE
+"""Angle of the field to the horizontal below which it does not tell up from down."""
+
+
+def at_rest(recording: Recording) -> list[str]:
+    """Return what gravity and the field at rest say against body axes with z up and an accelerometer that reads +g upward.
+
+    The sensors of a body whose z axis points down agree with each other, and so do those of a unit with an inverted accelerometer; the
+    attitude is then half a turn off what is expected. A reference attitude tells, and is compared by :func:`examine`.
+    """
+    seen = None if recording.true_attitude is not None else _resting(recording)
+    if seen is None:
+        return []
+    upward, reading, dip = seen
+    reads = f"at rest the accelerometer reads {reading:.3g} m/s² along z"
+    if dip is not None and dip < -LEAST_DIP:
+        field = (
+            f"the field points {-dip / DEGREE:.0f}° upward by the accelerometer, as south of the magnetic equator only"
+        )
+        if upward > DOWN:
+            return [f"{field}; elsewhere the magnetometer is inverted (--invert magnetometer)"]
+        return [
+            f"{reads}, and {field}; elsewhere the accelerometer is inverted, as those of iPhones (--invert accelerometer)"
+        ]
+    if upward >= -DOWN:
+        return []
+    where = " south of the magnetic equator" if dip is not None and dip > LEAST_DIP else ""
+    return [
+        f"{reads}: the body's z axis points down (--axes x,-y,-z reads forward-right-down axes as forward-left-up ones; --frame ned keeps "
+        f"them and gives the output in North-East-Down), or the unit lies upside down, or{where} the accelerometer is inverted "
+        "(--invert accelerometer)"
+    ]
+
+
+def _resting(recording: Recording) -> tuple[float, float, float | None] | None:
+    """Return the share of gravity along the body's z axis, the reading there, m/s², and the field's dip, rad; None without rest."""
+    force = recording.specific_force
+    try:
+        quiet = ahrs.quiet_span(recording)
+    except InputError:  # too short to say
+        return None
+    if force is None or not (known := np.isfinite(force[quiet]).all(axis=1)).any():
+        return None
+    samples = force[quiet][known]
+    mean = samples.mean(axis=0)
+    strength = float(np.linalg.norm(mean))
+    unit = STANDARD_GRAVITY if strength > math.sqrt(STANDARD_GRAVITY) else 1.0  # m/s², or g taken for m/s²
+    moving = np.linalg.norm(samples.std(axis=0)) >= REST_SPREAD * strength
+    if moving or abs(strength / unit - 1.0) > REST_STRENGTH:
+        return None
+    return float(mean[2]) / strength, float(mean[2]), _dip(recording, quiet, mean / strength)
+
+
+def _dip(recording: Recording, quiet: slice, up: Array) -> float | None:
+    """Return the angle of the field below the horizontal, rad, at quiet samples."""
+    if recording.magnetic_field is None:
+        return None
+    samples = recording.magnetic_field[quiet]
+    field = samples[np.isfinite(samples).all(axis=1)]
+    if len(field) == 0 or not np.any(mean := field.mean(axis=0)):
+        return None
+    return -math.asin(float(np.clip(mean @ up / np.linalg.norm(mean), -1.0, 1.0)))
 
 
 def _force_unit(recording: Recording) -> tuple[tuple[str, ...], list[str]]:
@@ -452,9 +527,13 @@ def _combined(common: tuple[str, ...], parts: dict[str, _Fits]) -> Iterator[Cand
 
 @functools.cache
 def _axes_change(name: str, k: int) -> str:
-    inverted = np.array_equal(AXES[k], -np.eye(3))
-    what = "are inverted" if inverted else f"should be read as ({axes_words(AXES[k])})"
-    return f"axes of the {name} {what}"
+    if np.array_equal(AXES[k], -np.eye(3)):
+        return f"axes of the {name} are inverted" + (f" (--invert {name})" if name != "whole unit" else "")
+    words = axes_words(AXES[k])
+    option = words.replace("−", "-").replace(" ", "")
+    return (
+        f"axes of the {name} should be read as ({words}) (--axes {'' if name == 'whole unit' else f'{name}='}{option})"
+    )
 
 
 def _candidate(changes: tuple[str, ...], misfit: dict[str, float], kind: str = "reference") -> Candidate:

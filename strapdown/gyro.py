@@ -56,9 +56,7 @@ from strapdown.kernels import gyro_errors, noise
 from strapdown.kernels.machine import compiled
 
 __all__ = [
-    "GyroOutput",
     "GyroSpec",
-    "best_bandwidth",
     "matched_process_noise",
     "process_noise",
     "read_spec",

@@ -32,6 +32,7 @@ __all__ = [
     "from_ned",
     "heading",
     "table",
+    "to_dataframe",
     "to_ned",
 ]
 
@@ -337,7 +338,19 @@ def _clock(estimate: Estimate, recording: Recording | None) -> dict[str, NDArray
 
 
 def to_dataframe(estimate: Estimate, **options: Any) -> Any:
-    """Return an estimate as a pandas ``DataFrame`` of the columns of :func:`table`, whose options it takes.
+    """Return an estimate as a pandas ``DataFrame``.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        Estimate.
+    **options : dict
+        Options of :func:`table`.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Columns of :func:`table`, one row per time.
 
     Raises
     ------

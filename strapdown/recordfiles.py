@@ -11,7 +11,7 @@ import json
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,17 +22,9 @@ from strapdown import gyro, reading
 from strapdown.checks import Array, InputError, count, known_keys
 from strapdown.files import set_attributes, written_beside
 from strapdown.gyro import GyroSpec
-from strapdown.records import CONVENTIONS, ImuRecord, Truth, put, result_file
+from strapdown.records import CONVENTIONS, ImuRecord, Origin, Truth, put, result_file
+from strapdown.scenarios import scenario_from_toml
 from strapdown.vectors import KINDS, VectorMeasurements
-
-__all__ = [
-    "RecordFile",
-    "export_csv",
-    "import_csv",
-    "read_record",
-    "read_record_file",
-    "write_record",
-]
 
 KIND = "strapdown record"
 """The attribute ``kind`` of a record's file."""
@@ -70,6 +62,15 @@ class RecordFile:
     run: int | None = None
     version: str = strapdown.__version__
     attributes: Mapping[str, Any] = field(default_factory=dict)
+
+    def with_origin(self, place: str = "record") -> ImuRecord:
+        """Return the record with its origin, the scenario read from its TOML; ``place`` is named where that cannot be."""
+        if self.gyro is None and not self.scenario:
+            return self.record
+        scenario = scenario_from_toml(self.scenario, f"{place}: scenario") if self.scenario else None
+        spec = scenario.gyro if self.gyro is None and scenario is not None else self.gyro
+        origin = Origin(gyro=spec, scenario=scenario, seed=self.seed, run=self.run)
+        return replace(self.record, origin=origin)
 
 
 _SERIES = {

@@ -20,10 +20,15 @@ import strapdown
 from strapdown import coning, outputs, quaternion, reading
 from strapdown.checks import Array, InputError, array, count, finite, increasing, instance, one_of, unit_quaternions
 from strapdown.files import set_attributes, whole_hdf5, written_beside
+from strapdown.listing import Listed, Listing, figure
+from strapdown.units import DEGREE, DEGREE_PER_HOUR
 from strapdown.vectors import VectorMeasurements
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
+
+    from strapdown.gyro import GyroSpec
+    from strapdown.scenarios import Scenario
 
 __all__ = [
     "ErrorStateEstimate",
@@ -31,12 +36,11 @@ __all__ = [
     "Event",
     "ImuRecord",
     "Innovations",
+    "Origin",
     "Truth",
     "compress",
     "cut",
     "read_estimate",
-    "read_states",
-    "read_truth",
     "write_estimate",
 ]
 
@@ -70,6 +74,28 @@ class Truth:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Origin:
+    """How a record was simulated, as far as it is known.
+
+    Parameters
+    ----------
+    gyro : GyroSpec, optional
+        Specification of the gyro.
+    scenario : Scenario, optional
+        Scenario.
+    seed : int, optional
+        Seed of the random streams.
+    run : int, optional
+        Run of the random streams.
+    """
+
+    gyro: GyroSpec | None = None
+    scenario: Scenario | None = None
+    seed: int | None = None
+    run: int | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ImuRecord:
     """Gyro increments and vector measurements over one run.
 
@@ -86,12 +112,15 @@ class ImuRecord:
         Vector measurements, one series per sensor, each with its own times.
     truth : Truth, optional
         True attitude and bias, where known.
+    origin : Origin, optional
+        How it was simulated, so that a filter can be matched to the scenario; None for measured data.
     """
 
     time: Array
     increments: Array
     vectors: tuple[VectorMeasurements, ...] = ()
     truth: Truth | None = None
+    origin: Origin | None = None
 
     def __post_init__(self) -> None:
         """Check shapes, order and finiteness."""
@@ -208,8 +237,12 @@ def cut(record: ImuRecord, first: int, last: int) -> ImuRecord:
     truth = (
         None if record.truth is None else Truth(attitude=record.truth.attitude[edges], bias=record.truth.bias[edges])
     )
-    return ImuRecord(
-        time=record.time[edges], increments=record.increments[first:last], vectors=tuple(vectors), truth=truth
+    return dataclasses.replace(
+        record,
+        time=record.time[edges],
+        increments=record.increments[first:last],
+        vectors=tuple(vectors),
+        truth=truth,
     )
 
 
@@ -344,8 +377,8 @@ class ErrorStateEstimate:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Estimate:
-    """What a filter made of a record, at the kept edges.
+class Estimate(Listed):
+    """Attitude and gyro bias with their covariance, at the stored epochs of a filter's run.
 
     Parameters
     ----------
@@ -390,6 +423,103 @@ class Estimate:
     whole_bias: Array | None = None
     whole_bias_variance: Array | None = None
     whole_bias_covariance: Array | None = None
+
+    def listing(self) -> Listing:
+        """Return σ at the start and at the end, the estimate at the end, and the innovations, as a table."""
+        rows: list[tuple[str, ...]] = []
+        for k in range(6):
+            name, unit, size = ("attitude", "°", DEGREE) if k < 3 else ("gyro bias", "°/h", DEGREE_PER_HOUR)
+            value = "" if k < 3 else figure(self.bias[-1, k - 3] / size)
+            first, last = (figure(self.sigma[row, k] / size, 3) for row in (0, -1))
+            rows.append((f"{name} {'xyz'[k % 3]}", unit, value, last, first))
+        for name, states in self.error_states.items():
+            for k, (component, unit) in enumerate(zip(states.components, states.units, strict=True)):
+                ends = (figure(states.sigma[row, k], 3) for row in (-1, 0))
+                rows.append((f"{name} {component}".strip(), unit, figure(states.values[-1, k]), *ends))
+        notes = [f"Attitude at the end, body to fixed (w, x, y, z): {', '.join(f'{q:.6f}' for q in self.attitude[-1])}"]
+        for sensor, one in self.innovations.items():
+            if np.any(one.used):
+                nis = np.mean(one.nis[one.used]) / one.innovation.shape[1]
+                gate = f", {one.refused} refused by the gate" if one.refused else ""
+                notes.append(f"{sensor}: {len(one.time)} measurements{gate}, mean NIS per degree of freedom {nis:.3f}")
+        return Listing(
+            f"Estimate at {len(self.time)} epochs over {self.time[-1] - self.time[0]:.6g} s",
+            ("state", "unit", "at the end", "σ", "σ at the start"),
+            rows,
+            [*notes, *map(str, self.events)],
+            left=2,
+        )
+
+    @classmethod
+    def from_arrays(
+        cls,
+        time: ArrayLike,
+        attitude: ArrayLike,
+        covariance: ArrayLike,
+        *,
+        bias: ArrayLike | None = None,
+        innovations: Mapping[str, Innovations] | None = None,
+    ) -> Estimate:
+        """Return an estimate made of the arrays of any filter.
+
+        Parameters
+        ----------
+        time : array_like (m,)
+            Times, s, strictly increasing.
+        attitude : array_like (m, 4)
+            Unit quaternions q_fb, scalar first. NaN where the filter has none.
+        covariance : array_like (m, 3, 3) or (m, 6, 6)
+            Covariance of δθ, rad², with ``q_true = q_est ⊗ exp(δθ)`` (body axes), or of (δθ, δb), δb = b_true − b_est, rad/s. NaN where
+            the filter has none.
+        bias : array_like (m, 3), optional
+            Gyro bias, rad/s, body axes. Without one it is NaN, as is its covariance: only the attitude is judged.
+        innovations : mapping of str to Innovations, optional
+            Innovations by sensor; without them there is no NIS.
+
+        Returns
+        -------
+        Estimate
+            The estimate.
+
+        Raises
+        ------
+        InputError
+            If shapes do not fit, or a bias is given without its covariance.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> Estimate.from_arrays([0.0, 1.0], [[1, 0, 0, 0]] * 2, [1e-4 * np.eye(3)] * 2).sigma[0, :3]
+        array([0.01, 0.01, 0.01])
+        """
+        stamps = increasing("time", time)
+        m = len(stamps)
+        q = array("attitude", attitude, (m, 4), allow_nan=True)
+        told = np.isfinite(q).all(axis=1)
+        unit_quaternions("attitude", q[told])
+        P = np.asarray(covariance, np.float64)
+        if P.shape not in ((m, 3, 3), (m, 6, 6)):
+            raise InputError(
+                f"covariance has shape {P.shape}, wanted ({m}, 3, 3) or ({m}, 6, 6), a matrix for each time"
+            )
+        if bias is not None and P.shape[1] == 3:
+            raise InputError("bias is given, but covariance is of the attitude alone; give that of (δθ, δb), (m, 6, 6)")
+        whole = np.full((m, 6, 6), np.nan)
+        size = 3 if bias is None else 6
+        whole[:, :size, :size] = P[:, :size, :size]
+        return cls(
+            time=stamps,
+            attitude=q,
+            bias=np.full((m, 3), np.nan) if bias is None else array("bias", bias, (m, 3), allow_nan=True),
+            variance=np.diagonal(whole, axis1=1, axis2=2).copy(),
+            covariance=whole,
+            innovations=dict(innovations or {}),
+        )
+
+    @property
+    def has_bias(self) -> bool:
+        """Whether a gyro bias is estimated at all."""
+        return bool(np.isfinite(self.bias).any())
 
     def errors(
         self, true_attitude: ArrayLike, true_bias: ArrayLike, true_values: Mapping[str, ArrayLike] | None = None

@@ -49,7 +49,6 @@ __all__ = [
     "Faults",
     "HeadingPair",
     "Magnetometer",
-    "Sensor",
     "VectorMeasurements",
     "VectorSensor",
     "specific_force",

@@ -18,7 +18,7 @@ PACKAGE = Path(strapdown.__file__).parent
 
 FLOORS: tuple[tuple[str, ...], ...] = (
     # 0 mathematics, and what everything stands on
-    ("checks", "equality", "reading", "files", "units", "tables", "randomness", "quaternion", "kinematics", "kernels"),
+    ("checks", "equality", "listing", "reading", "files", "units", "tables", "randomness", "quaternion", "kinematics", "kernels"),
     # 1 models
     (
         "motion",
@@ -48,7 +48,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     # 3 estimators
     ("estimation", "setup", "ahrs"),
     # 4 analysis
-    ("consistency", "covariance", "montecarlo", "coning_study", "diagnosis", "doctor", "tuning"),
+    ("consistency", "covariance", "montecarlo", "coning_study", "diagnosis", "doctor", "tuning", "workflows"),
     # 5 faces
     ("plots", "report", "cli", "__main__"),
 )

@@ -244,7 +244,9 @@ def test_csv_cut_at_the_end_of_a_line_is_refused(made, tmp_path):
         lines = whole.splitlines()
         for cut in (lines[:-1], lines[:-2], [*lines, lines[-1].replace(lines[-1].split(",")[0], "1e3", 1)]):
             path.write_text("\n".join(cut) + "\n")
-            with pytest.raises(InputError, match=rf"{path.name} ends at .* s, its first line states .* s; it was truncated or"):
+            with pytest.raises(
+                InputError, match=rf"{path.name} ends at .* s, its first line states .* s; it was truncated or"
+            ):
                 import_csv(written[0])
         path.write_text(whole)
     lines = written[1].read_text().splitlines()

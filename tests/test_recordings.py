@@ -173,7 +173,10 @@ def test_a_sensor_of_zeros_is_told(csv, columns, name):
 def test_a_result_is_no_recording(tmp_path):
     with h5py.File(tmp_path / "estimate.h5", "w") as file:
         file.attrs["kind"] = "strapdown estimate"
-    refused(tmp_path / "estimate.h5", "is a strapdown estimate, a result, not a recording; give the recording that it was made from")
+    refused(
+        tmp_path / "estimate.h5",
+        "is a strapdown estimate, a result, not a recording; give the recording that it was made from",
+    )
 
 
 def test_a_simulated_record_in_csv_is_no_recording(tmp_path):

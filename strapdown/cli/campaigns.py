@@ -201,21 +201,18 @@ def _plan(
     states: bool,
 ) -> Plan:
     from strapdown import montecarlo as engine
-    from strapdown import setup
+    from strapdown import workflows
     from strapdown.checks import InputError
 
     if states and filter_file is not None:
         raise InputError("--filter tells the filter's states itself, in [filter.states]; leave --states out")
     loaded = scenario_named(scenario)
-    filter_setup = (
-        setup.matched(loaded, states=states) if filter_file is None else filter_of_scenario(filter_file, loaded)
-    )
-    return engine.Plan(
-        scenario=loaded,
-        setup=filter_setup,
-        seed=loaded.seed if seed is None else seed,
-        epochs=engine.whole_epochs(loaded, filter_setup),
-        dispersions=engine.Dispersions() if dispersions is None else engine.read_dispersions(dispersions),
+    return workflows.plan(
+        loaded,
+        setup=None if filter_file is None else filter_of_scenario(filter_file, loaded),
+        seed=seed,
+        states=states,
+        dispersions=None if dispersions is None else engine.read_dispersions(dispersions),
         precision="float32" if float32 else "float64",
     )
 
@@ -275,6 +272,8 @@ def _tell(campaign: Campaign) -> None:
         left=2,
     )
     for name, unit, text in (("attitude", "arcsec", "arcsec"), ("bias", "deg_per_hour", "°/h")):
+        if name not in report["nees"]:  # a filter of one's own without a bias
+            continue
         axis = _worst_axis(last[f"{name}_rms_error_{unit}"])
         keys = ("rms_error", "sigma", *(f"error_quantile_{q:g}" for q in QUANTILES))
         sizes = [last[f"{name}_{key}_{unit}"][axis] for key in keys]
@@ -292,7 +291,7 @@ def _tell(campaign: Campaign) -> None:
         f"{part['run']} ({'failed' if part['largest_nees'] is None else format(part['largest_nees'], '.1f')})"
         for part in report["worst_runs"][:5]
     )
-    console.print(f"Worst runs, by their largest NEES of six states: {worst}. See one with --replay.")
+    console.print(f"Worst runs, by their largest NEES of the state: {worst}. See one with --replay.")
     if report["failed_runs"]:
         console.print(f"In {counted(report['failed_runs'], 'run')} the filter failed: no finite error or covariance.")
     rate = ""

@@ -10,8 +10,10 @@ import typer
 from strapdown.cli.reading import (
     RECORDING_HELP,
     AccelerometerUnit,
+    Axes,
     Columns,
     GyroUnit,
+    Invert,
     MagnetometerUnit,
     TimeUnit,
     Topic,
@@ -46,6 +48,8 @@ def convert(
     time_unit: TimeUnit = None,
     columns: Columns = None,
     topic: Topic = None,
+    axes: Axes = None,
+    invert: Invert = None,
     reference: Annotated[
         Path | None, typer.Option(help="TUM trajectory whose attitudes become the recording's reference.")
     ] = None,
@@ -62,7 +66,7 @@ def convert(
         "magnetometer": magnetometer_unit,
         "time": time_unit,
     }
-    options = told(source, columns=columns, topic=topic, **units)
+    options = told(source, columns=columns, topic=topic, axes=axes, invert=invert, **units)
     estimate = recordings.is_estimate(source)
     writable(
         "OUT",
@@ -74,6 +78,8 @@ def convert(
         raise InputError(f"{target} exists; move it, choose another name, or say --force")
     if estimate:
         recordings.estimate_format(target, recording=False)
+        if axes or invert:
+            raise InputError("--axes and --invert go with a recording; estimate again with them")
         if reference is not None:
             raise InputError("--reference goes with a recording; an estimate has attitudes of its own")
         held = read_estimate(source)

@@ -11,15 +11,24 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from strapdown.cli.filters import filter_for
-from strapdown.cli.reading import RECORDING_HELP, AccelerometerUnit, Columns, GyroUnit, TimeUnit, Topic, told
+from strapdown.cli.reading import (
+    RECORDING_HELP,
+    AccelerometerUnit,
+    Axes,
+    Columns,
+    GyroUnit,
+    Invert,
+    TimeUnit,
+    Topic,
+    told,
+)
 from strapdown.cli.terminal import app, console, doubt, need_own, show, table, writable, written
 
 if TYPE_CHECKING:
-    from strapdown.estimation.states import State
-    from strapdown.recordfiles import RecordFile
     from strapdown.recordings import Recording
     from strapdown.records import Estimate, ImuRecord
     from strapdown.setup import FilterSetup
+    from strapdown.setup.for_record import Start
 
 FILES = (
     "estimate.h5",
@@ -39,9 +48,6 @@ RECORDING_ONLY = ("motion", "latency", "calibration")
 RECORD_ONLY = ("filter", "states", "state", "attitude", "from_truth", "every")
 """Options that go with a record of `strapdown simulate`."""
 
-UNEVEN = 2.0
-"""Largest σ of an attitude over the least, above which both are told."""
-
 
 @app.command()
 def estimate(
@@ -57,6 +63,8 @@ def estimate(
     time_unit: TimeUnit = None,
     columns: Columns = None,
     topic: Topic = None,
+    axes: Axes = None,
+    invert: Invert = None,
     gyro: Annotated[
         Path | None,
         typer.Option(
@@ -130,7 +138,12 @@ def estimate(
     euler: Annotated[
         str | None, typer.Option(help="With --to a table: Euler angles of this sequence, ZYX if not given.")
     ] = None,
-    frame: Annotated[str | None, typer.Option(help="With --to: fixed frame ENU (if not given) or NED.")] = None,
+    frame: Annotated[
+        str | None,
+        typer.Option(
+            help="With --to: fixed frame of the output, enu (if not given) or ned; body axes stay as they are."
+        ),
+    ] = None,
     latency: Annotated[
         float | None,
         typer.Option(
@@ -157,10 +170,9 @@ def estimate(
     usable_folder("out", out)
     writable("out", *(out / name for name in FILES), sources=(recording, gyro, filter_file, calibration))
     need_own(out / FILES[0], "estimate", lambda path: bool(read_attributes(path)["kind"] == "strapdown estimate"))
-    layout = told(
-        recording, columns=columns, topic=topic, gyro=gyro_unit, accelerometer=accelerometer_unit, time=time_unit
-    )
-    exports = _exports(to or (), recording, euler, frame)
+    units = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
+    layout = told(recording, columns=columns, topic=topic, axes=axes, invert=invert, **units)
+    exports = _exports(to or (), recording, euler, frame, changed=bool(axes or invert))
     if is_record(recording):
         for name, text in zip(RECORDING_ONLY, (motion, latency, calibration), strict=True):
             if text is not None:
@@ -214,14 +226,17 @@ def estimate(
 
 
 def _exports(
-    to: Sequence[Path], recording: Path, euler: str | None, frame: str | None
+    to: Sequence[Path], recording: Path, euler: str | None, frame: str | None, *, changed: bool
 ) -> list[tuple[Path, dict[str, Any]]]:
-    """Return the further files of an estimate with the options of their writers; what cannot be written is refused."""
+    """Return the further files of an estimate with the options of their writers; what cannot be written is refused.
+
+    ``changed``: the samples are read in other axes than those of the file.
+    """
     from strapdown import outputs, recordings
     from strapdown.checks import InputError, one_of
 
     if frame is not None:
-        one_of("--frame", frame, outputs.FRAMES)
+        frame = one_of("--frame", frame.upper(), outputs.FRAMES)
     if euler is not None:
         outputs.euler([[1.0, 0.0, 0.0, 0.0]], euler)
     given = {name: value for name, value in (("sequence", euler), ("frame", frame)) if value is not None}
@@ -232,7 +247,8 @@ def _exports(
         writable("to", target, suffixes=recordings.writers("write_estimate"), sources=(recording,))
         options: dict[str, Any] = dict(given)
         chosen = recordings.estimate_format(target, given, recording=not recordings.is_record(recording))
-        if "source" in chosen.estimate_options and recordings.format_of(recording) is chosen:
+        # A copy of the file with the orientation filled in would put it beside samples in other axes.
+        if "source" in chosen.estimate_options and recordings.format_of(recording) is chosen and not changed:
             options["source"] = recording
         found.append((target, options))
     return found
@@ -269,12 +285,12 @@ def _estimate_record(
     """Run the filter over a record, report and write its estimate."""
     import numpy as np
 
-    from strapdown import records, setup
+    from strapdown import setup, workflows
     from strapdown.checks import InputError, count
     from strapdown.estimation.gating import Gate, Robust
     from strapdown.files import write_json
     from strapdown.recordfiles import read_record_file
-    from strapdown.records import Truth, write_estimate
+    from strapdown.records import write_estimate
 
     count("every", every)
     if smooth and every > 1:
@@ -287,27 +303,11 @@ def _estimate_record(
         chosen = dataclasses.replace(chosen, gate=Gate(probability=gate))
     if robust is not None:
         chosen = dataclasses.replace(chosen, robust=Robust(kind=robust))  # type: ignore[arg-type]
-    believed = setup.believed(held.record, chosen)
-    if every > len(believed.increments):
-        raise InputError(
-            f"every is {every}, more than the {len(believed.increments)} filter steps of the record; only the start would be kept"
-        )
-    initial, words, first = _initial(believed, held, chosen, attitude, from_truth)
-    used = held.record
-    if first > 0:
-        used = records.cut(used, first * chosen.integration.samples, len(used.increments))
-        believed = records.cut(believed, first, len(believed.increments))
-        if every > len(believed.increments):
-            raise InputError(
-                f"every is {every}, and {len(believed.increments)} filter steps are left from the start on"
-            )
-    if smooth:
-        result = setup.smooth(used, chosen, initial, full_covariance=full_covariance)
-    else:
-        result = setup.run(used, chosen, initial, every=every, full_covariance=full_covariance)
-    truth = None
-    if believed.truth is not None:
-        truth = Truth(attitude=believed.truth.attitude[::every], bias=believed.truth.bias[::every])
+    record = held.with_origin(str(path))
+    start = _start(record, chosen, attitude, from_truth)
+    result, used, truth, initial, words = workflows.estimate_record(
+        record, chosen, start, every=every, full_covariance=full_covariance, smooth=smooth
+    )
     length = held.record.time[-1] - held.record.time[0]
     console.print(
         f"{path.name}: {len(held.record.increments)} gyro samples over {length:.6g} s, "
@@ -410,98 +410,27 @@ def _tell_states(result: Any, record: ImuRecord) -> dict[str, Any]:
     return _states(result)
 
 
-def _initial(
-    record: ImuRecord, held: RecordFile, chosen: FilterSetup, attitude: str | None, from_truth: bool
-) -> tuple[State, str, int]:
-    """Return the initial state, how it came about, and the filter's edge that it stands at."""
+def _start(record: ImuRecord, chosen: FilterSetup, attitude: str | None, from_truth: bool) -> Start | None:
+    """Return the start that the options give; None: from the first measurements."""
     import numpy as np
 
-    from strapdown import estimation, quaternion, setup
+    from strapdown import setup
     from strapdown.checks import InputError
-    from strapdown.randomness import generator
-    from strapdown.wahba import InconsistentError
+    from strapdown.setup.for_record import Start, drawn_start
 
     if attitude is not None and from_truth:
         raise InputError("--attitude and --from-truth both tell the start; give one of them")
-    if attitude is not None:
-        try:
-            q = np.array([float(part) for part in attitude.split(",")])
-        except ValueError:
-            raise InputError(f"--attitude is {attitude!r}; give four numbers w,x,y,z") from None
-        if q.shape != (4,) or np.linalg.norm(q) == 0.0:
-            raise InputError(f"--attitude is {attitude!r}; give four numbers w,x,y,z, not all zero")
-        return setup.initial_state(chosen, q / np.linalg.norm(q)), "Started from the attitude given.", 0
     if from_truth:
-        if record.truth is None:
-            raise InputError("--from-truth needs a record with the truth; this one has none")
-        draw = generator(held.seed or 0, held.run or 0, "initial error").standard_normal(6)
-        q = quaternion.multiply(record.truth.attitude[0], quaternion.exp(-chosen.attitude_sigma * draw[:3]))
-        bias = record.truth.bias[0] - chosen.bias_sigma * draw[3:]
-        words = "Started from the truth, off by errors drawn from the filter's σ."
-        return setup.initial_state(chosen, q, bias), words, 0
+        return drawn_start(record, chosen)
+    if attitude is None:
+        return None
     try:
-        state = estimation.first_state(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
-    except InconsistentError as error:
-        problem = str(error).removesuffix("; give the initial attitude")
-        # A sensor's own errors may be among the states, and then the filter can tell who is right.
-        if chosen.states is None:
-            raise InputError(
-                f"{problem}; if a sensor has a bias, give the filter its state (--states); or give --attitude, or --from-truth"
-            ) from None
-        return _banked(record, chosen, problem, f"{problem[:1].upper()}{problem[1:]}. So a bank took them one by one")
-    except InputError as error:
-        problem = str(error).removesuffix("; give the initial attitude")
-        return _banked(record, chosen, problem, "One direction at a time does not give the attitude at once")
-    return state, f"Started from the first measurements, σ {_sigma_words(state)}.", 0
-
-
-def _banked(record: ImuRecord, chosen: FilterSetup, problem: str, why: str) -> tuple[State, str, int]:
-    """Return the state that a bank of hypotheses finds, where the first measurements do not give the attitude."""
-    import numpy as np
-
-    from strapdown import estimation
-    from strapdown.checks import InputError
-    from strapdown.estimation import multiple_model
-
-    try:
-        found = multiple_model.run(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
-    except InputError as error:
-        raise InputError(
-            f"{problem}, nor does a bank of hypotheses ({error}); give --attitude, or --from-truth"
-        ) from None
-    if not found.converged:
-        raise InputError(
-            f"{problem}, nor does a bank of hypotheses: {found.reason}; or give --attitude, or --from-truth"
-        )
-    edge = int(np.searchsorted(record.time, found.became_one))
-    if edge >= len(record.increments):
-        raise InputError(
-            f"{problem}, and a bank of hypotheses found it only at the end; record longer, or give --attitude"
-        )
-    row = int(np.searchsorted(found.estimate.time, found.became_one))
-    assert found.estimate.covariance is not None
-    state = estimation.State(
-        attitude=found.estimate.attitude[row],
-        bias=found.estimate.bias[row],
-        covariance=found.estimate.covariance[row],
-    )
-    words = (
-        f"{why}: {len(found.angles)} hypotheses about it became one at "
-        f"{found.became_one:.6g} s, σ {_sigma_words(state)}; the estimate begins there."
-    )
-    return state, words, edge
-
-
-def _sigma_words(state: State) -> str:
-    """Return how well an attitude is known: one σ, or where it differs by direction, as of tilt and heading, from which to which."""
-    import numpy as np
-
-    from strapdown.units import DEGREE
-
-    least, _, most = np.sqrt(np.maximum(np.linalg.eigvalsh(state.covariance[:3, :3]), 0.0)) / DEGREE
-    if most < UNEVEN * least:
-        return f"{np.sqrt(np.trace(state.covariance[:3, :3]) / 3.0) / DEGREE:.3g}° an axis"
-    return f"{least:.3g} to {most:.3g}° by direction"
+        q = np.array([float(part) for part in attitude.split(",")])
+    except ValueError:
+        raise InputError(f"--attitude is {attitude!r}; give four numbers w,x,y,z") from None
+    if q.shape != (4,) or np.linalg.norm(q) == 0.0:
+        raise InputError(f"--attitude is {attitude!r}; give four numbers w,x,y,z, not all zero")
+    return Start(setup.initial_state(chosen, q / np.linalg.norm(q)), "Started from the attitude given.")
 
 
 def _clear(out: Path) -> None:
@@ -574,6 +503,7 @@ def _estimate_recording(
     if options["robust"] is not None:
         options["robust"] = Robust(kind=options["robust"])
     source = recordings.read(recording, **layout)
+    doubt(source, recording)
     parameters = ahrs.MOTIONS[moved_by]
     if gyro is not None:
         parameters = replace(parameters, **process_noise(read_spec(gyro)))
@@ -612,7 +542,6 @@ def _estimate_recording(
     for remark in used.remarks:
         console.print(remark)
     console.print(f"Fixed frame: {frame}.")
-    doubt(source, recording)
     console.print(_model(moved_by, parameters, result))
     for sentence in (*result.delays.words, *(f"{one}." for one in result.faults.words)):
         console.print(sentence)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,11 +18,10 @@ def filter_for(
 
     ``states`` None: of attitude and bias alone; empty: with all states that the specified errors call for.
     """
-    from strapdown import setup
+    from strapdown import reading, setup
     from strapdown.checks import InputError
     from strapdown.gyro import read_spec
-    from strapdown.scenarios import scenario_from_toml
-    from strapdown.setup.states import States
+    from strapdown.setup.for_record import matched_setup
 
     if filter_file is not None:
         if states is not None:
@@ -33,32 +31,24 @@ def filter_for(
         chosen = setup.read_setup(filter_file)
         need_angles(filter_file, chosen, held)
         return chosen, no_state_words(without_a_state(path, held, chosen), chosen)
-    spec = held.gyro if gyro is None else read_spec(gyro)
-    if spec is None:
+    spec = None if gyro is None else read_spec(gyro)
+    if spec is None and held.gyro is None:
         raise InputError(f"{path} does not tell the gyro's specification; give --gyro or --filter, a TOML file")
+    with reading.from_file(path):
+        record = held.with_origin(str(path))
+    chosen = matched_setup(record, spec, states=False if states is None else states or True)
+    missing = without_a_state(path, held, chosen)
     if states is None:
-        chosen = setup.matched_to_record(spec, held.record)
-        return chosen, no_state_words(without_a_state(path, held, chosen), chosen)
+        return chosen, no_state_words(missing, chosen)
     remarks = []
     if not held.scenario:
-        chosen = setup.matched_to_record(spec, held.record, states=True)
         remarks.append(
             f"{path.name} does not tell its scenario, so the errors of its sensors are not known: no state for them."
         )
-    else:
-        scenario = scenario_from_toml(held.scenario, f"{path}: scenario")
-        chosen = setup.matched_to_record(
-            spec, held.record, states=True, sensors=scenario.sensors, gravity_f=scenario.gravity_f
-        )
-    optional = chosen.states or States()
-    if states:
-        optional = optional.chosen(states)
-    chosen = dataclasses.replace(chosen, states=optional if optional.names else None)
-    if optional.names:
-        remarks.append(f"Optional states: {', '.join(optional.names)}.")
+    if chosen.states is not None:
+        remarks.append(f"Optional states: {', '.join(chosen.states.names)}.")
     else:
         remarks.append("No error is specified that would call for an optional state; the filter has none.")
-    missing = without_a_state(path, held, chosen)
     return chosen, [*remarks, *([f"Still without a state: {', '.join(missing)}."] if missing else [])]
 
 
@@ -84,14 +74,9 @@ def filter_of_scenario(filter_file: Path, scenario: Scenario) -> FilterSetup:
 
 def without_a_state(path: Path, held: RecordFile, chosen: FilterSetup) -> tuple[str, ...]:
     """Return, in words, what a record specifies and a filter has no state for; nothing where the record specifies nothing."""
-    from strapdown import setup
-    from strapdown.scenarios import scenario_from_toml
+    from strapdown.setup.for_record import unmodelled_errors
 
-    if held.scenario:
-        scenario = scenario_from_toml(held.scenario, f"{path}: scenario")
-        spec = held.gyro or scenario.gyro
-        return setup.not_covered(spec, scenario.sensors, chosen.states, gravity_f=scenario.gravity_f)
-    return () if held.gyro is None else setup.not_covered(held.gyro, (), chosen.states)
+    return unmodelled_errors(held.with_origin(str(path)), chosen)
 
 
 def no_state_words(missing: tuple[str, ...], chosen: FilterSetup) -> list[str]:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from strapdown.cli.reading import RECORDING_HELP, Columns, GyroUnit, TimeUnit, Topic, told
+from strapdown.cli.reading import RECORDING_HELP, Axes, Columns, GyroUnit, Invert, TimeUnit, Topic, told
 from strapdown.cli.terminal import app, console, need_own, progress_bar, show, table, writable, written
+
+if TYPE_CHECKING:
+    from strapdown.recordings import Recording
+    from strapdown.records import ImuRecord
 
 
 @app.command()
@@ -56,44 +60,38 @@ def integrate(
     time_unit: TimeUnit = None,
     columns: Columns = None,
     topic: Topic = None,
+    axes: Axes = None,
+    invert: Invert = None,
 ) -> None:
     """Integrate a gyro recording to attitude, starting at the true attitude if the file holds it, else at the identity."""
     import numpy as np
 
-    from strapdown import coning, quaternion, recordfiles, recordings, records
-    from strapdown.checks import InputError
+    from strapdown import coning, quaternion, reading, recordfiles, recordings, records, workflows
 
     writable("out", out, suffixes=(".h5", ".hdf5"), sources=(recording,))
     need_own(out, "integrate", lambda path: bool(records.read_attributes(path)["kind"] == "strapdown attitude"))
     chosen = coning.named(algorithm)
-    layout = told(recording, columns=columns, topic=topic, gyro=gyro_unit, time=time_unit)
+    layout = told(recording, columns=columns, topic=topic, axes=axes, invert=invert, gyro=gyro_unit, time=time_unit)
     gaps: list[tuple[float, float]] = []
     words = ""
     with progress_bar("reading, integrating, writing", 3) as advance:
+        source: ImuRecord | Recording
         if recordings.is_record(recording):
-            record = recordfiles.read_record(recording)
-            time, increments = record.time, record.increments
-            truth = None if record.truth is None else record.truth.attitude
+            source = recordfiles.read_record(recording)
+            samples = len(source.increments)
+            truth = None if source.truth is None else source.truth.attitude
         else:
             source = recordings.read(recording, **layout, gyro_alone=True)
+            samples, truth = len(source.time) - 1, source.true_attitude
             gaps, words = recordings.gaps(source.time), " ".join([*source.remarks, source.left_out_words]).strip()
-            time, increments, truth = source.time, recordings.increments(source), source.true_attitude
         advance(1)
-        if len(increments) < chosen.samples:
-            raise InputError(
-                f"{recording.name} holds {len(increments)} gyro samples, fewer than the {chosen.samples} of one step of {chosen.name}; "
-                "choose another algorithm or a longer recording"
-            )
-        start = quaternion.IDENTITY
-        if truth is not None and np.isfinite(truth[0]).all():
-            start = truth[0]
-        attitude = coning.integrate(increments, chosen, start, edges=time)
-        time = time[: len(attitude) * chosen.samples : chosen.samples]
+        with reading.from_file(recording):
+            time, attitude = workflows.integrate(source, chosen)
         advance(1)
         records.write_attitude(out, time, attitude, {"source": recording.name, "algorithm": chosen.name})
         advance(1)
-    console.print(f"{recording.name}: {len(increments)} samples over {time[-1] - time[0]:.6g} s with {chosen.name}.")
-    left = len(increments) % chosen.samples
+    console.print(f"{recording.name}: {samples} samples over {time[-1] - time[0]:.6g} s with {chosen.name}.")
+    left = samples % chosen.samples
     if left:
         console.print(f"The last {left} of them do not fill a step of {chosen.samples} and are left out.")
     if truth is not None:

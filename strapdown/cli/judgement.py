@@ -10,7 +10,17 @@ import typer
 from rich.text import Text
 
 from strapdown.cli.filters import no_state_words, without_a_state
-from strapdown.cli.reading import RECORDING_HELP, AccelerometerUnit, Columns, GyroUnit, TimeUnit, Topic, told
+from strapdown.cli.reading import (
+    RECORDING_HELP,
+    AccelerometerUnit,
+    Axes,
+    Columns,
+    GyroUnit,
+    Invert,
+    TimeUnit,
+    Topic,
+    told,
+)
 from strapdown.cli.terminal import app, console, counted, show, table, writable, written
 
 if TYPE_CHECKING:
@@ -202,6 +212,8 @@ def doctor(
     time_unit: TimeUnit = None,
     columns: Columns = None,
     topic: Topic = None,
+    axes: Axes = None,
+    invert: Invert = None,
     json: Annotated[Path | None, typer.Option("--json", help="File for the explanations and their scores.")] = None,
 ) -> None:
     """Tell which conventions a recording follows, by trying the others: exit status 0 as told, 1 wrong, 2 cannot tell."""
@@ -212,10 +224,15 @@ def doctor(
     if json is not None:
         writable("json", json, suffixes=(".json",), sources=(recording,))
     given = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
-    source = recordings.read(recording, **told(recording, columns=columns, topic=topic, **given))
+    source = recordings.read(
+        recording, **told(recording, columns=columns, topic=topic, axes=axes, invert=invert, **given)
+    )
+    found = conventions.examine(source)
+    console.print(f"{found.source}: {found.words}")
+    for words in found.doubts:
+        console.print(f"warning: {words}.")
     for remark in source.remarks:
         console.print(f"Note: {remark}")
-    found = conventions.examine(source)
     if found.candidates:
         names = list(found.candidates[0].misfit)
         rows = table(
@@ -227,9 +244,8 @@ def doctor(
         for one in found.candidates[:8]:
             rows.add_row(one.words, f"{one.score:.1f}", *(f"{one.misfit[name]:.3f}" for name in names))
         show(rows)
-    for note in (*found.doubts, *found.notes):
+    for note in found.notes:
         console.print(f"Note: {note}.")
-    console.print(f"{found.source}: {found.words}")
     if json is not None:
         write_json(json, found.summary())
         written(json)

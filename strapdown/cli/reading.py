@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
 GyroUnit = Annotated[
@@ -30,6 +31,23 @@ Columns = Annotated[
 Topic = Annotated[
     str | None, typer.Option("--topic", help="Bag or flight log: topic of the inertial unit, where there are several.")
 ]
+Axes = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--axes",
+        metavar="[SENSOR=]AXES",
+        help="Recorded axes that become the body's x, y, z: x,-y,-z of a unit whose z axis points down, magnetometer=y,x,-z of one sensor; "
+        "may be repeated.",
+    ),
+]
+Invert = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--invert",
+        metavar="SENSOR",
+        help="Sensor of inverted sign: accelerometer (of one that reads -g upward at rest), magnetometer or gyro; may be repeated.",
+    ),
+]
 RECORDING_HELP = (
     "Recording of any format: table (CSV, TSV, Parquet) with time, gx, gy, gz[, ax, ay, az[, mx, my, mz]], ROS bag, ULog, EuRoC folder, "
     "BROAD HDF5, camera or phone log"
@@ -41,11 +59,13 @@ def told(
     *,
     columns: str | None = None,
     topic: str | None = None,
+    axes: Sequence[str] | None = None,
+    invert: Sequence[str] | None = None,
     **units: str | None,
 ) -> dict[str, Any]:
-    """Return the options of :func:`strapdown.recordings.read` that the command line tells; of a simulated record none is left standing."""
+    """Return the options of :func:`strapdown.recordings.read` that the command line gives; a simulated record takes none of them."""
     from strapdown import recordings
-    from strapdown.checks import InputError
+    from strapdown.checks import InputError, one_of
 
     given = {name.removesuffix("_unit"): unit for name, unit in units.items() if unit}
     if recordings.is_record(path):
@@ -53,9 +73,13 @@ def told(
             *(f"{name}-unit" for name in given),
             *(["columns"] if columns else []),
             *(["topic"] if topic else []),
+            *(["axes"] if axes else []),
+            *(["invert"] if invert else []),
         ]
         for name in options:
-            what = "a table" if name != "topic" else "a bag or a flight log"
+            what = {"topic": "a bag or a flight log", "axes": "a recording", "invert": "a recording"}.get(
+                name, "a table"
+            )
             own = "tells its units itself" if name.endswith("-unit") else "says itself what it holds"
             raise InputError(f"--{name} goes with {what}; the record {path} {own}")
     found: dict[str, Any] = {"units": given}
@@ -63,4 +87,27 @@ def told(
         found["columns"] = recordings.parse_mapping(columns)
     if topic:
         found["topic"] = topic
+    if axes:
+        found["axes"] = _axes(axes)
+    if invert:
+        found["invert"] = tuple(one_of("--invert", sensor, recordings.SENSORS) for sensor in invert)
     return found
+
+
+def _axes(texts: Sequence[str]) -> str | dict[str, str]:
+    """Return the axes of the whole unit, or those of sensors by name."""
+    from strapdown import recordings
+    from strapdown.checks import InputError, one_of
+
+    single = {}
+    for text in texts:
+        sensor, equals, axes = text.partition("=")
+        if not equals and len(texts) > 1:
+            raise InputError(
+                f"--axes {text} is of the whole unit; give it alone, or each sensor its own, as gyro=y,x,-z"
+            )
+        recordings.axes_matrix(axes if equals else text, "--axes")
+        if not equals:
+            return text
+        single[one_of("--axes: sensor", sensor, recordings.SENSORS)] = axes
+    return single

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from strapdown.cli.terminal import app, console, counted, progress_bar, show, table, verdict, writable, written
+
+if TYPE_CHECKING:
+    from strapdown.coning import Algorithm
 
 LEAST_SAMPLES_A_CYCLE = 0.1
 """With fewer a step holds more than ten turns of the cone, and nothing of the study means anything."""
@@ -19,6 +22,48 @@ def _drift(value: float | None) -> str:
     return f"{value:.4g}" if abs(value) > 1e-6 else "rounding"
 
 
+def _show_own(own: tuple[Algorithm, ...]) -> None:
+    """Show what follows from the coefficients of one's own algorithms."""
+    from strapdown.coning_study import own_summary
+
+    if not own:
+        return
+    rows = table(
+        "Your own algorithms: drift under small coning is −C β² ω (ωh)^n, derived from the coefficients",
+        "algorithm",
+        "samples",
+        "order",
+        "n",
+        "C",
+        "best n, C of as many increments",
+    )
+    for one in own:
+        told = own_summary(one)
+        constant = one.drift_constant
+        exact = f" = {constant}" if constant.denominator < _SHOWN_DENOMINATOR else ""
+        rows.add_row(
+            one.name,
+            str(one.samples),
+            str(one.order),
+            str(one.drift_order),
+            f"{float(constant):.4g}{exact}",
+            f"{told['best_drift_order']}, {told['best_drift_constant']:.4g}",
+        )
+    show(rows)
+    for one in own:
+        following = own_summary(one)
+        if one.drift_order < following["best_drift_order"] and abs(one.drift_constant) < _ROUNDED:
+            console.print(
+                f"Note: {one.name} drifts from (ωh)^{one.drift_order} on, by a small constant: rounded coefficients do so. Give them as "
+                "fractions, or with all digits, if they are."
+            )
+
+
+_SHOWN_DENOMINATOR = 10**7
+_ROUNDED = 1e-3
+"""A drift constant below this in an order that the increments could do without is likely that of rounded coefficients."""
+
+
 @app.command()
 def coning(
     angle: Annotated[float, typer.Option(help="Half-angle of the cone, degrees.")] = 0.7,
@@ -28,17 +73,26 @@ def coning(
     runs: Annotated[int, typer.Option(help="Monte Carlo runs.")] = 100,
     seed: Annotated[int, typer.Option(help="Seed; the same one gives the same runs.")] = 1,
     out: Annotated[Path, typer.Option(help="Folder for coning.json and the figures.")] = Path("coning-results"),
+    algorithm: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="TOML file of algorithms of your own, coefficients as textbooks write them; compared beside the package's. May be given "
+            "several times."
+        ),
+    ] = None,
 ) -> None:
     """Study coning: the drift of each integration algorithm, and what a filter makes of it."""
     from strapdown import coning_study
     from strapdown.checks import InputError, positive
+    from strapdown.coning import read_algorithms
     from strapdown.files import usable_folder, write_json
     from strapdown.units import DEGREE
 
     if positive("--angle", angle, unit="degrees") >= 90.0:  # in the unit that it was given in
         raise InputError(f"--angle is {angle:g} degrees; a cone's half-angle is below a right angle")
+    own = tuple(one for path in algorithm or () for one in read_algorithms(path))
     parameters = coning_study.ConingParameters(
-        angle=angle * DEGREE, frequency=frequency, rate=rate, duration=duration, runs=runs, seed=seed
+        angle=angle * DEGREE, frequency=frequency, rate=rate, duration=duration, runs=runs, seed=seed, own=own
     )
     if rate < LEAST_SAMPLES_A_CYCLE * frequency:
         raise InputError(
@@ -46,7 +100,9 @@ def coning(
             f"raise the rate, to {LEAST_SAMPLES_A_CYCLE:g} samples a cycle at least"
         )
     usable_folder("out", out)
-    writable("out", *(out / name for name in ("coning.json", "drift.png", "errors.png", "consistency.png")))
+    names = ("coning.json", "drift.png", "errors.png", "consistency.png", *(["algorithms.png"] if own else []))
+    writable("out", *(out / name for name in names))
+    _show_own(own)
     with progress_bar("Monte Carlo runs", runs) as advance:
         study = coning_study.run(parameters, progress=advance)
     summary = study.summary()

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from strapdown.tuning.parameters import Unit
 
 
-GATED = ("gate.probability", "outliers.share", "outliers.scale")
-"""Names of parameters that ask for a model of outliers."""
 FIGURES = ("likelihood", "heldout")
 """Figures that are drawn beside the filter, by the ends of their names."""
 PRIOR_FACTOR = 3.0
@@ -131,7 +129,7 @@ def tune(
     import os
 
     from strapdown import coning, tuning
-    from strapdown.checks import InputError, count, non_negative, one_of
+    from strapdown.checks import InputError, count, one_of
     from strapdown.report import tunings
     from strapdown.setup import read_setup
 
@@ -151,7 +149,6 @@ def tune(
     if length is not None:
         raise InputError("--length is for --plan; the records' own length is taken")
     count("seed", seed, least=0)
-    non_negative("spacing", spacing, unit="s")
     same = [
         path
         for k, path in enumerate(records)
@@ -174,78 +171,36 @@ def tune(
     if algorithm is not None:
         believed = replace(believed, integration=algorithm)
     train, held = (tuple(cases), ()) if holdout is None else tuning.split(cases, holdout, _by(holdout_by))
-    gate = gate or any(name in GATED for name in names or [])
-    wanted = [name for name in names or [] if name not in GATED]
+    gate = gate or any(name in tuning.GATED for name in names or [])
+    wanted = [name for name in names or [] if name not in tuning.GATED]
     wanted = wanted or list(tuning.default_names([case.record for case in cases]))
     if chosen is None or any(name.startswith(("gyro.", "filter.")) for name in wanted):
         tuning.one_gyro(gyros)
-    objective: Any
     if prior is None and prior_factor != PRIOR_FACTOR:
         raise InputError("--prior-factor goes with --prior, the noise that it is about")
     if names == []:
         raise InputError(f"--free is {free!r} and names no parameter; name some, or leave it out")
-    if rmse and truth:
-        raise InputError(
-            "--rmse and --truth both tell what of the errors against the truth is tuned by; give one of them"
-        )
-    if rmse and credibility:
-        raise InputError(
-            "--rmse and --credibility ask for different filters: small errors, or believable ones; give one of them"
-        )
-    if spacing > 0.0 and (truth or rmse or credibility):
-        raise InputError(
-            "--spacing thins the innovations of the likelihood; against a truth, or for credibility, there are none to thin: leave it away"
-        )
-    if gate and (truth or rmse or credibility or spacing > 0.0):
-        raise InputError(
-            "--gate needs the likelihood of all innovations: leave --truth, --rmse, --credibility and --spacing away"
-        )
-    if believed.states is not None and (gate or truth or rmse or credibility or spacing > 0.0):
-        raise InputError(
-            "a filter with optional states is tuned by the likelihood of all innovations: leave --gate, --truth, --rmse, --credibility and "
-            "--spacing away"
-        )
-    by_axis = any(tuning.axis_of(name) for name in wanted)
-    if by_axis and (gate or truth or rmse or credibility or spacing > 0.0):
-        raise InputError(
-            "a sigma of one axis is tuned by the likelihood of all innovations: leave --gate, --truth, --rmse, --credibility and --spacing "
-            "away"
-        )
-    if believed.states is not None or by_axis:
-        from strapdown.tuning import extended
-
-        objective = extended.likelihood(train, believed, wanted, threads=workers)
-    elif gate:
-        objective = tuning.contaminated_likelihood(train, believed, wanted)
-    elif credibility:
-        objective = tuning.credibility_objective(train, believed, wanted, truth=truth, threads=workers)
-    elif truth or rmse:
-        objective = tuning.error_objective(
-            train, believed, wanted, measure="rmse" if rmse else "likelihood", threads=workers
-        )
-    else:
-        objective = tuning.likelihood(train, believed, wanted, spacing=spacing)
     priors = {} if prior is None else _priors(prior, prior_factor, train[0].record, wanted)
     with progress_bar("searches, intervals", starts + len(wanted)) as advance:
-        result = tuning.fit(
-            objective,
+        result, objective, found = tuning.tune(
+            train,
+            believed,
+            wanted,
             priors=priors,
             starts=starts,
             factor=factor,
             seed=seed,
-            threads=1 if truth or rmse or credibility or believed.states is not None or by_axis else workers,
+            threads=workers,
             progress=advance,
+            gate=gate,
+            truth=truth,
+            rmse=rmse,
+            credibility=credibility,
+            spacing=spacing,
         )
-    if rmse:
-        # The size of the error leaves a common scale open; the innovations tell it.
-        scaled = tuning.fit(tuning.likelihood(train, result.setup, ["filter.scale"]), starts=2, threads=workers)
-        result = tuning.rescaled(result, scaled["filter.scale"].value)
-    found = tuning.tuned_gate(objective, result) if gate else None
-    if found is not None and found.gate is not None:
-        result = replace(result, setup=replace(result.setup, gate=found.gate))
     comparison = tuning.compare(held, believed, result.setup, threads=workers) if held else None
     if comparison is not None and gate:
-        likely = tuning.log_likelihood(held, objective, result)
+        likely = tuning.log_likelihood(held, objective, result)  # type: ignore[arg-type]
         comparison = replace(comparison, after=replace(comparison.after, log_likelihood=likely))
     # What is looked for is what optional states are there for, and by filters that take one σ a sample.
     suspects = train[:MOST_EXAMINED] if believed.states is None and not _differs_by_axis(train, result.setup) else ()

@@ -18,7 +18,8 @@ allowed; ``"matched-2-8"`` in real time; ``"matched-4-11"`` in real time with a 
 family is this package's own; :func:`strapdown.coning.coefficients.matched_correction` derives it.
 """
 
-from strapdown.coning.algorithms import ALGORITHMS, Algorithm, algorithm_rows
+from strapdown.coning.algorithms import ALGORITHMS, Algorithm, read_algorithms
+from strapdown.coning.algorithms import algorithm_rows as algorithm_rows
 from strapdown.coning.algorithms import named as named
 from strapdown.coning.drift import (
     ConingBudget,
@@ -29,15 +30,8 @@ from strapdown.coning.drift import (
 from strapdown.coning.drift import (
     small_angle_drift as small_angle_drift,
 )
-from strapdown.coning.stepping import (
-    increments_from_rates,
-    integrate,
-    integrate_rates,
-    rotation_vectors,
-)
-from strapdown.coning.stepping import (
-    time_per_sample as time_per_sample,
-)
+from strapdown.coning.stepping import increments_from_rates, integrate, integrate_rates, rotation_vectors
+from strapdown.coning.stepping import time_per_sample as time_per_sample
 
 # Imported as itself above and not listed here: for the package alone.
 __all__ = [
@@ -45,11 +39,11 @@ __all__ = [
     "Algorithm",
     "ConingBudget",
     "VibrationLine",
-    "algorithm_rows",
     "increments_from_rates",
     "integrate",
     "integrate_rates",
     "predicted_coning_drift",
+    "read_algorithms",
     "read_vibration",
     "rotation_vectors",
 ]

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Mapping
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from numbers import Rational
+from typing import Any
 
 import numpy as np
 
-from strapdown import checks
+from strapdown import checks, reading
 from strapdown.checks import Array, InputError
 from strapdown.coning import coefficients as exact
 from strapdown.coning.coefficients import Rationals, Table
@@ -26,6 +28,9 @@ SOLVERS = {
     "euler": "first-order update of the quaternion, normalised",
 }
 """How an algorithm turns the increments of a step into its rotation."""
+
+Coefficient = int | float | str | Fraction
+"""What may be given for a coefficient: 27/20 as "27/20", 1.35, "1.35" or Fraction(27, 20)."""
 
 _TABLES = {"compressed": "coefficients", "pairs": "pairs", "polynomial": "correction"}
 """The table that a solver reads. The other solvers read none, and no increments but those of the step."""
@@ -150,6 +155,236 @@ class Algorithm:
         if series[-1] == 0:
             raise InputError(f"{self.name}: the drift at λ^{self.drift_order} is zero; claim a higher drift_order")
 
+    @classmethod
+    def from_coefficients(
+        cls, name: str, coefficients: Sequence[Coefficient], *, previous: int = 0, source: str = ""
+    ) -> Algorithm:
+        """Return the algorithm ``φ = Σ Δθ_i + (c_1 Δθ_1 + … + c_{M−1} Δθ_{M−1}) × Δθ_M``.
+
+        Parameters
+        ----------
+        name : str
+            Name of the algorithm.
+        coefficients : sequence of int, float, str or Fraction
+            c_1 … c_{M−1}, the oldest increment's first, as textbooks write them (the field ``coefficients`` counts them from the
+            last). M = N + p. A float is taken as the nearest simple fraction (:func:`strapdown.coning.coefficients.rational`).
+        previous : int, default 0
+            p, increments before the step; the sum Σ Δθ_i is that of the N others.
+        source : str, default ""
+            Publication.
+
+        Returns
+        -------
+        Algorithm
+            The algorithm, its orders and drift constant derived.
+
+        Raises
+        ------
+        InputError
+            If the coefficients leave no increment in the step or are not numbers.
+
+        Examples
+        --------
+        >>> own = Algorithm.from_coefficients("ignagni-3", ["9/20", "27/20"])
+        >>> own.samples, own.order, own.drift_order, str(own.drift_constant)
+        (3, 3, 6, '1/280')
+        """
+        given = _rationals(f"{name}: coefficients", coefficients)
+        checks.count(f"{name}: previous", previous, least=0)
+        samples = len(given) + 1 - previous
+        if samples < 1:
+            raise InputError(
+                f"{name}: {len(given)} coefficients with previous {previous} leave no increment in the step; give at least {previous}"
+            )
+        own = tuple(reversed(given))
+        table = exact.outer_pairs((*given, Fraction(0)), (*[Fraction(0)] * len(given), Fraction(1)))
+        return cls(
+            name=name,
+            solver="compressed",
+            samples=samples,
+            previous=previous,
+            coefficients=own,
+            source=source,
+            **_derived(name, table, samples, previous),
+        )
+
+    @classmethod
+    def from_products(
+        cls,
+        name: str,
+        samples: int,
+        products: Iterable[tuple[int, int, Coefficient]],
+        *,
+        previous: int = 0,
+        following: int = 0,
+        source: str = "",
+    ) -> Algorithm:
+        """Return the algorithm ``φ = Σ Δθ_i + Σ K_ij Δθ_i × Δθ_j``.
+
+        Parameters
+        ----------
+        name : str
+            Name of the algorithm.
+        samples : int
+            N, increments in a step.
+        products : iterable of (i, j, K_ij)
+            Increments are counted from 1, the oldest of the window; i and j differ. K_ij as in :meth:`from_coefficients`.
+        previous, following : int, default 0
+            Increments of the window before and after the step.
+        source : str, default ""
+            Publication.
+
+        Returns
+        -------
+        Algorithm
+            The algorithm, its orders and drift constant derived.
+
+        Raises
+        ------
+        InputError
+            If a product is not one of two different increments of the window.
+
+        Examples
+        --------
+        >>> own = Algorithm.from_products("miller-3", 3, [(1, 3, "9/20"), (1, 2, "27/40"), (2, 3, "27/40")])
+        >>> own.order, own.drift_order, str(own.drift_constant)
+        (4, 6, '1/280')
+        """
+        for what, number, least in (("samples", samples, 1), ("previous", previous, 0), ("following", following, 0)):
+            checks.count(f"{name}: {what}", number, least=least)
+        window = samples + previous + following
+        table = [[Fraction(0)] * window for _ in range(window)]
+        for k, entry in enumerate(products):
+            place = f"{name}: products[{k}]"
+            if not isinstance(entry, Sequence) or isinstance(entry, str) or len(entry) != 3:
+                raise InputError(f"{place} is {entry!r}; give (i, j, K), the coefficient K of Δθ_i × Δθ_j")
+            i, j = (checks.count(place, index) for index in entry[:2])
+            if i == j or max(i, j) > window:
+                raise InputError(f"{place} is of Δθ_{i} × Δθ_{j}; give two different increments of 1 … {window}")
+            (value,) = _rationals(place, entry[2:])
+            table[i - 1][j - 1] += value
+            table[j - 1][i - 1] -= value
+        pairs = tuple(tuple(row) for row in table)
+        return cls(
+            name=name,
+            solver="pairs",
+            samples=samples,
+            previous=previous,
+            following=following,
+            pairs=pairs,
+            source=source,
+            **_derived(name, pairs, samples, previous),
+        )
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Any], place: str = "algorithm") -> Algorithm:
+        """Return the algorithm in a table of a file.
+
+        Parameters
+        ----------
+        table : mapping of str
+            Arguments of :meth:`from_coefficients` or :meth:`from_products` by name.
+        place : str, default "algorithm"
+            Name of the table, for messages.
+
+        Returns
+        -------
+        Algorithm
+            The algorithm.
+
+        Raises
+        ------
+        InputError
+            If a key is unknown or missing, or a value is not what it must be.
+        """
+        checks.known_keys(
+            place, table, ("name", "samples", "previous", "following", "coefficients", "products", "source")
+        )
+        if not isinstance(table.get("name"), str):
+            raise InputError(f"{place}: name is missing; give the algorithm one, in quotes")
+        if ("coefficients" in table) == ("products" in table):
+            raise InputError(
+                f"{place}: give either coefficients, [c_1, …] of (Σ c_i Δθ_i) × Δθ_M, or products, [[i, j, K], …] of K Δθ_i × Δθ_j"
+            )
+        entries = table.get("coefficients", table.get("products"))
+        if not isinstance(entries, list):
+            raise InputError(f"{place}: {entries!r} is no list; write numbers, or fractions in quotes, in brackets")
+        rest = {key: value for key, value in table.items() if key not in ("coefficients", "products")}
+        if "products" in table:
+            if "samples" not in rest:
+                raise InputError(f"{place}: samples is missing; give the number of increments in a step")
+            return cls.from_products(products=entries, **rest)
+        wanted, late = rest.pop("samples", None), rest.pop("following", 0)
+        made = cls.from_coefficients(coefficients=entries, **rest)
+        if wanted is not None and wanted != made.samples:
+            raise InputError(
+                f"{place}: samples is {wanted}, but {len(entries)} coefficients with previous {made.previous} are of {made.samples} samples"
+            )
+        if late:
+            raise InputError(
+                f"{place}: following is {late}; coefficients end with the step's last increment: give products"
+            )
+        return made
+
+    @classmethod
+    def from_toml(cls, path: str | os.PathLike[str]) -> Algorithm:
+        """Read the one table ``[algorithm]`` of a TOML file.
+
+        Parameters
+        ----------
+        path : path-like
+            File; for one with several tables see :func:`read_algorithms`.
+
+        Returns
+        -------
+        Algorithm
+            The algorithm.
+
+        Raises
+        ------
+        InputError
+            If the file does not hold exactly one valid table.
+        """
+        found = read_algorithms(path)
+        if len(found) > 1:
+            raise InputError(
+                f"{path} holds {len(found)} algorithms; use coning.read_algorithms, or keep one in the file"
+            )
+        return found[0]
+
+    def to_table(self) -> dict[str, Any]:
+        """Return the algorithm as a table for :meth:`from_table`.
+
+        Returns
+        -------
+        dict
+            Table of a rotation-vector algorithm; no other has such a form.
+
+        Raises
+        ------
+        InputError
+            If the solver has no table.
+        """
+        table: dict[str, Any] = {"name": self.name, "samples": self.samples}
+        if self.previous:
+            table["previous"] = self.previous
+        if self.following:
+            table["following"] = self.following
+        if self.solver == "compressed" and not self.rate_points:
+            table["coefficients"] = [str(k) for k in reversed(self.coefficients)]
+        elif self.solver == "pairs":
+            m = self.window
+            table["products"] = [
+                [i + 1, j + 1, str(self.pairs[i][j])] for i in range(m) for j in range(i + 1, m) if self.pairs[i][j]
+            ]
+        else:
+            raise InputError(
+                f"{self.name}: an algorithm with solver {self.solver!r} is told in files by its name alone"
+            )
+        if self.source:
+            table["source"] = self.source
+        return table
+
     @property
     def window(self) -> int:
         """M = N + p + f, increments used for one step."""
@@ -210,6 +445,67 @@ class Algorithm:
     def drift_series(self) -> tuple[float, ...]:
         """The powers 0, 2, 4, … of λ of the drift over β²ω, enough of them for λ ≤ 1 and a window of 17."""
         return tuple(float(c) for c in self._drift_series(48))
+
+
+def _rationals(place: str, values: Iterable[Coefficient]) -> Rationals:
+    found = []
+    for k, value in enumerate(values):
+        try:
+            found.append(exact.rational(value))
+        except (ValueError, TypeError, ZeroDivisionError, OverflowError):
+            raise InputError(
+                f'{place}[{k}] is {value!r}; give a number, a fraction in quotes such as "27/20", or fractions.Fraction'
+            ) from None
+    return tuple(found)
+
+
+def _derived(name: str, table: Table, samples: int, previous: int) -> dict[str, Any]:
+    """Return the orders of a pair table: of convergence, and of the drift under small coning."""
+    # M − 1 lag sums satisfy at most as many conditions, so the drift begins at λ^{2M} at the latest.
+    series = exact.residuals(exact.lag_sums(table), samples, 0, len(table) + 1)
+    first = next((n for n, c in enumerate(series) if c != 0), None)
+    if not first:
+        raise InputError(f"{name}: the drift has no order; check the coefficients")
+    return {"order": exact.second_order(table, samples, previous), "drift_order": 2 * first}
+
+
+def read_algorithms(path: str | os.PathLike[str]) -> tuple[Algorithm, ...]:
+    """Read the algorithms of a TOML file: one table ``[algorithm]``, or several ``[[algorithm]]``.
+
+    Parameters
+    ----------
+    path : path-like
+        File with the tables of :meth:`Algorithm.from_table`.
+
+    Returns
+    -------
+    tuple of Algorithm
+        The algorithms.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, is not TOML, has no such table, or a table is not one of an algorithm.
+    """
+    with reading.from_file(path):
+        told = reading.toml(path)
+        checks.known_keys(f"{path}", told, ("algorithm",))
+        tables = told.get("algorithm")
+        several = isinstance(tables, list)
+        found = [
+            (f"{path}: algorithm" + (f"[{k}]" if several else ""), table)
+            for k, table in enumerate(tables if isinstance(tables, list) else [tables])
+        ]
+        if not found or not all(isinstance(table, Mapping) for _, table in found):
+            raise InputError(f"{path} has no table [algorithm]; write name, and coefficients or products, into one")
+        made = tuple(Algorithm.from_table(table, place) for place, table in found)
+    names = [one.name for one in made]
+    for one in made:
+        if names.count(one.name) > 1:
+            raise InputError(f"{path} holds two algorithms of the name {one.name}; give each its own")
+        if one.name in ALGORITHMS:
+            raise InputError(f"{path}: {one.name} is the name of a built-in algorithm; choose another")
+    return made
 
 
 def _scheme_products(solver: str, samples: int) -> Table:
@@ -416,12 +712,12 @@ ALGORITHMS: Mapping[str, Algorithm] = Catalogue(_makers())
 
 
 def named(algorithm: str | Algorithm) -> Algorithm:
-    """Return the algorithm of that name, or the one given.
+    """Return the algorithm of that name or file, or the one given.
 
     Parameters
     ----------
     algorithm : str or Algorithm
-        Name in :data:`ALGORITHMS`, or an algorithm.
+        Name in :data:`ALGORITHMS`, FILE.toml (:meth:`Algorithm.from_toml`), or an algorithm.
 
     Returns
     -------
@@ -430,6 +726,8 @@ def named(algorithm: str | Algorithm) -> Algorithm:
     """
     if isinstance(algorithm, Algorithm):
         return algorithm
+    if isinstance(algorithm, str) and algorithm.lower().endswith(".toml"):
+        return Algorithm.from_toml(algorithm)
     return ALGORITHMS[checks.one_of("algorithm", algorithm, ALGORITHMS)]
 
 

@@ -9,6 +9,7 @@ that the drift of a step, for small β, is ``β² [Σ k_l 2(1 − cos λ) sin l�
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections.abc import Sequence
 from fractions import Fraction
@@ -190,6 +191,49 @@ def step_rates_at(samples: int, instants: Sequence[Fraction]) -> Table:
     return tuple(
         tuple(samples * sum((c * t**power for power, c in enumerate(b)), Fraction(0)) for b in basis) for t in instants
     )
+
+
+def second_order(pairs: Table, samples: int, previous: int = 0) -> int:
+    """Return the global order of convergence that a pair table has on any smooth motion, triple products left out.
+
+    For rates tᵃ and tᵇ along two axes the table must give ``½ ∫ (L_a L_b' − L_b L_a') dt``, L' the rates, L = 0 at the step's start. If
+    the first a + b for which it does not is d, a step is wrong by h^{d+2} and the whole by h^{d+1}. Products of three rates, which no
+    such table has, are wrong by h⁵ a step, and bound the order by 4.
+    """
+    window, n = len(pairs), Fraction(samples)
+    edges = [Fraction(i - previous) for i in range(window + 1)]
+    for degree in range(1, 3):
+        for a in range((degree + 1) // 2):
+            b = degree - a
+            u, v = (
+                [(high ** (p + 1) - low ** (p + 1)) / (p + 1) for low, high in itertools.pairwise(edges)]
+                for p in (a, b)
+            )
+            # A table holds K_ij and −K_ij, and Σ_{i<j} K_ij (u_i v_j − u_j v_i) = Σ_ij K_ij u_i v_j.
+            made = sum(
+                (k * x * y for row, x in zip(pairs, u, strict=True) for k, y in zip(row, v, strict=True)), Fraction(0)
+            )
+            if made != n ** (degree + 2) * (Fraction(1, a + 1) - Fraction(1, b + 1)) / (2 * (degree + 2)):
+                return degree + 1
+    return 4
+
+
+MOST_DENOMINATOR = 10**6
+"""Largest denominator of a fraction that a float is taken for."""
+
+
+def rational(value: float | str | Fraction) -> Fraction:
+    """Return a coefficient as a fraction.
+
+    A text is read exactly ("27/20", "1.35"), a float is taken for the fraction of least denominator, up to a million, that is equal to it
+    as a float (2/3 for 0.6666666666666666), or for the decimal that it prints as.
+    """
+    if isinstance(value, bool):
+        raise TypeError("a truth value is no coefficient")
+    if isinstance(value, float):
+        near = Fraction(value).limit_denominator(MOST_DENOMINATOR)
+        return near if float(near) == value else Fraction(repr(value))
+    return Fraction(value)
 
 
 def outer_pairs(a: Rationals, b: Rationals) -> Table:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from strapdown import checks, reading
 from strapdown.checks import InputError
-from strapdown.coning.algorithms import ALGORITHMS, Algorithm, named
+from strapdown.coning.algorithms import Algorithm, named
 from strapdown.units import DEGREE
 
 
@@ -142,7 +142,7 @@ class ConingBudget:
         if not self.sample_rates:
             raise InputError("sample_rates is empty; give at least one rate in Hz")
         for name in self.algorithms:
-            checks.one_of("algorithm", name, ALGORITHMS)
+            named(name)
         highest = max(line.frequency for line in self.lines)
         for rate in self.sample_rates:
             checks.positive("sample rate", rate, unit="Hz")

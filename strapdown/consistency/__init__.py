@@ -16,77 +16,50 @@
     The verdict in words, with its evidence, at one stated probability of a false alarm: on one run, and on independent ones.
 """
 
-from strapdown.consistency.accuracy import (
-    Distribution,
-    Efficiency,
-    ReferenceErrors,
-    convergence_time,
-    distribution,
-    efficiency,
-    reference_errors,
-)
-from strapdown.consistency.bounds import (
-    Coverage,
-    Verdict,
-    coverage,
-    log_mean_bounds,
-    log_mean_p_value,
-    log_moments,
-    mean_bounds,
-    mean_p_value,
-)
-from strapdown.consistency.ensemble import Credibility, credibility
-from strapdown.consistency.judgement import Finding, Judgement, concluded, judge
-from strapdown.consistency.manifold import SUBSETS, errors, fixed_frame, nees, whitened
+from strapdown.consistency.accuracy import Distribution as Distribution
+from strapdown.consistency.accuracy import Efficiency as Efficiency
+from strapdown.consistency.accuracy import ReferenceErrors as ReferenceErrors
+from strapdown.consistency.accuracy import convergence_time as convergence_time
+from strapdown.consistency.accuracy import distribution as distribution
+from strapdown.consistency.accuracy import efficiency as efficiency
+from strapdown.consistency.accuracy import reference_errors
+from strapdown.consistency.bounds import Coverage as Coverage
+from strapdown.consistency.bounds import Verdict as Verdict
+from strapdown.consistency.bounds import coverage as coverage
+from strapdown.consistency.bounds import log_mean_bounds as log_mean_bounds
+from strapdown.consistency.bounds import log_mean_p_value as log_mean_p_value
+from strapdown.consistency.bounds import log_moments as log_moments
+from strapdown.consistency.bounds import mean_bounds
+from strapdown.consistency.bounds import mean_p_value as mean_p_value
+from strapdown.consistency.ensemble import Credibility as Credibility
+from strapdown.consistency.ensemble import credibility
+from strapdown.consistency.judgement import Finding, Judgement, judge
+from strapdown.consistency.judgement import concluded as concluded
+from strapdown.consistency.manifold import SUBSETS as SUBSETS
+from strapdown.consistency.manifold import errors, fixed_frame, nees
+from strapdown.consistency.manifold import whitened as whitened
 from strapdown.consistency.runs import judge_runs
-from strapdown.consistency.timeaverage import TimeAverage, time_average
-from strapdown.consistency.whiteness import (
-    Autocorrelation,
-    QuantilePairs,
-    anderson_darling,
-    autocorrelation,
-    cross_correlation_p_value,
-    ljung_box,
-    mean_innovation_p_value,
-    quantile_pairs,
-)
+from strapdown.consistency.timeaverage import TimeAverage as TimeAverage
+from strapdown.consistency.timeaverage import time_average as time_average
+from strapdown.consistency.whiteness import Autocorrelation as Autocorrelation
+from strapdown.consistency.whiteness import QuantilePairs as QuantilePairs
+from strapdown.consistency.whiteness import anderson_darling as anderson_darling
+from strapdown.consistency.whiteness import autocorrelation, ljung_box
+from strapdown.consistency.whiteness import cross_correlation_p_value as cross_correlation_p_value
+from strapdown.consistency.whiteness import mean_innovation_p_value as mean_innovation_p_value
+from strapdown.consistency.whiteness import quantile_pairs as quantile_pairs
 
 __all__ = [
-    "SUBSETS",
-    "Autocorrelation",
-    "Coverage",
-    "Credibility",
-    "Distribution",
-    "Efficiency",
     "Finding",
     "Judgement",
-    "QuantilePairs",
-    "ReferenceErrors",
-    "TimeAverage",
-    "Verdict",
-    "anderson_darling",
     "autocorrelation",
-    "concluded",
-    "convergence_time",
-    "coverage",
     "credibility",
-    "cross_correlation_p_value",
-    "distribution",
-    "efficiency",
     "errors",
     "fixed_frame",
     "judge",
     "judge_runs",
     "ljung_box",
-    "log_mean_bounds",
-    "log_mean_p_value",
-    "log_moments",
     "mean_bounds",
-    "mean_innovation_p_value",
-    "mean_p_value",
     "nees",
-    "quantile_pairs",
     "reference_errors",
-    "time_average",
-    "whitened",
 ]

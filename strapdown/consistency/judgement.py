@@ -27,6 +27,7 @@ from strapdown.consistency.whiteness import (
     ljung_box,
     mean_innovation_p_value,
 )
+from strapdown.listing import Listed, Listing, figure
 from strapdown.records import Estimate, Truth
 
 Answer = Literal["consistent", "not consistent", "cannot tell"]
@@ -73,7 +74,7 @@ _RATIOS = ("NIS", "NEES at the end", "time-averaged NEES", "ANEES")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Judgement:
+class Judgement(Listed):
     """A verdict with its evidence."""
 
     verdict: Answer
@@ -84,6 +85,24 @@ class Judgement:
     """What this evidence cannot show."""
     probability: float
     """Probability that a right filter is not called wrong, at least."""
+
+    def listing(self) -> Listing:
+        """Return the verdict and each statistic against its bounds, as a table."""
+        rows = [
+            (
+                one.name,
+                one.of,
+                figure(one.value),
+                f"{figure(one.low)} to {figure(one.high)}" if math.isfinite(one.low) else "",
+                figure(one.p_value, 2),
+                "FAIL" if one.rejected else "pass",
+            )
+            for one in self.findings
+        ]
+        columns = ("statistic", "of", "value", f"{100.0 * self.probability:g} % bounds", "p-value", "")
+        return Listing(
+            f"{self.verdict}: {self.reason}", columns, rows, [f"Note: {one}." for one in self.limits], left=2
+        )
 
     @property
     def words(self) -> str:
@@ -256,9 +275,14 @@ def _of_errors(estimate: Estimate, truth: Truth, probability: float, limits: lis
                 means=f"the {name} error at the end is {math.sqrt(ratio):.3g} σ",
             )
         ]
+    # Neither a filter nor a reference need have a bias.
+    known = 6 if np.isfinite(e[:, 3:]).any() and np.isfinite(estimate.variance[:, 3:]).any() else 3
+    e, P = e[:, :known], estimate.covariance[:, :known, :known]
     found = []
     for subset, states in SUBSETS.items():
-        value = float(nees(e[-1], estimate.covariance[-1], states)) / len(states)
+        if max(states) >= known:
+            continue
+        value = float(nees(e[-1], P[-1], states)) / len(states)
         low, high = mean_bounds(len(states), 1, probability)
         found.append(
             Finding(
@@ -275,7 +299,7 @@ def _of_errors(estimate: Estimate, truth: Truth, probability: float, limits: lis
         )
         if m < 20:
             continue
-        average = time_average(e, estimate.covariance, states, probability)
+        average = time_average(e, P, states, probability)
         if not average.reliable:
             limits.append(
                 f"the {subset} error changes too slowly for this run to average over: {average.effective:.3g} effective samples"

@@ -34,6 +34,10 @@ class RunStatistics(Protocol):
         """Runs whose errors and covariance are finite, by epoch (m,)."""
 
     @property
+    def subsets(self) -> tuple[str, ...]:
+        """Subsets of the states that are estimated: "state", "attitude", "bias", or "attitude" alone."""
+
+    @property
     def error_sum(self) -> Array:
         """Σ e (m, 6)."""
 
@@ -94,6 +98,8 @@ def judge_runs(
     failed = int(runs - np.min(statistics.finite[chosen]))
     findings = []
     for column, (subset, states) in enumerate(SUBSETS.items()):
+        if subset not in statistics.subsets:
+            continue
         verdict = statistics.verdict(chosen, subset, probability)
         extreme = np.abs(np.log(np.clip(verdict.mean, 1e-300, 1e300)))
         value = float(verdict.mean[int(np.argmax(extreme))])
@@ -157,13 +163,19 @@ def _log_nees(statistics: RunStatistics, epochs: np.ndarray, column: int, subset
     )
 
 
+def _estimated(statistics: RunStatistics) -> slice:
+    """Return the states that are estimated: all, or those of the attitude."""
+    return slice(None) if "bias" in statistics.subsets else slice(3)
+
+
 def _mean_error(statistics: RunStatistics, epochs: np.ndarray) -> Finding:
     """Return whether any state's mean error over the runs is other than zero: Student's t, the worst of all epochs and states."""
     from scipy.special import stdtr
 
     runs = statistics.runs
-    mean = statistics.error_sum[epochs] / runs
-    square = np.diagonal(statistics.error_product_sum[epochs], axis1=1, axis2=2) / runs
+    estimated = _estimated(statistics)
+    mean = statistics.error_sum[epochs][:, estimated] / runs
+    square = np.diagonal(statistics.error_product_sum[epochs], axis1=1, axis2=2)[:, estimated] / runs
     t = np.abs(mean) / np.sqrt(np.maximum(square - mean**2, 1e-300) / (runs - 1))
     name = state_name(int(np.argmax(t.max(axis=0))))
     return Finding(
@@ -178,7 +190,7 @@ def _mean_error(statistics: RunStatistics, epochs: np.ndarray) -> Finding:
 
 def _run_coverage(statistics: RunStatistics, epochs: np.ndarray, probability: float) -> Finding:
     """Return whether the errors of any state lie within 1, 2 or 3 σ too often or too seldom, the worst of all epochs and states."""
-    inside = statistics.coverage[epochs] / statistics.runs
+    inside = statistics.coverage[epochs][:, _estimated(statistics)] / statistics.runs
     p = np.array(
         [
             [Coverage(samples=statistics.runs, inside=state, probability=probability).p_values for state in epoch]

@@ -25,7 +25,11 @@ themselves, by a better integration algorithm, and held against the filter's own
 """
 
 from strapdown.diagnosis.causes import Cause, Diagnosis
-from strapdown.diagnosis.commutation import commutation_drift
+from strapdown.diagnosis.commutation import commutation_drift as commutation_drift
 from strapdown.diagnosis.diagnosing import diagnose
 
-__all__ = ["Cause", "Diagnosis", "commutation_drift", "diagnose"]
+__all__ = [
+    "Cause",
+    "Diagnosis",
+    "diagnose",
+]

@@ -8,6 +8,7 @@ from typing import Any
 
 from strapdown.checks import Array
 from strapdown.consistency import Finding, Judgement
+from strapdown.listing import Listed, Listing, figure
 
 LIKELIER = math.log(20.0)
 """By so much in ln p the likeliest of two causes is told from the other: odds of 20 to 1, "strong" evidence (Kass & Raftery 1995)."""
@@ -42,7 +43,7 @@ class Cause:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Diagnosis:
+class Diagnosis(Listed):
     """Likely causes, the likeliest first, and the evidence."""
 
     causes: tuple[Cause, ...]
@@ -53,6 +54,15 @@ class Diagnosis:
     """The verdict on the filter as it is: statistics and causes taken together (Holm), so that neither contradicts the other."""
     probability: float
     """Probability that a right filter is neither called wrong nor given a cause, at least."""
+
+    def listing(self) -> Listing:
+        """Return the causes considered, the likeliest first, as a table."""
+        rows = [
+            (one.name, one.of, figure(one.gain), figure(one.log_p), "significant" if one in self.causes else "")
+            for one in self.considered[:8]
+        ]
+        notes = self.words.splitlines()
+        return Listing("Causes by log-likelihood gained", ("cause", "of", "gain", "ln p", ""), rows, notes, left=2)
 
     @property
     def alternatives(self) -> tuple[Cause, ...]:

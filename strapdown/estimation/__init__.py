@@ -28,11 +28,14 @@ tangent space.
 
 from typing import TYPE_CHECKING, Any
 
-from strapdown.estimation.forward import gaps, run, run_part
+from strapdown.estimation.forward import gaps as gaps
+from strapdown.estimation.forward import run
+from strapdown.estimation.forward import run_part as run_part
 from strapdown.estimation.gating import Gate, Monitor, Robust
-from strapdown.estimation.model import with_error_states
+from strapdown.estimation.model import with_error_states as with_error_states
 from strapdown.estimation.observability import Observability, observability
-from strapdown.estimation.smoothing import relinearized_start, smooth
+from strapdown.estimation.smoothing import relinearized_start as relinearized_start
+from strapdown.estimation.smoothing import smooth
 from strapdown.estimation.states import ProcessNoise, State, first_state, initial_state
 
 __all__ = [
@@ -44,14 +47,10 @@ __all__ = [
     "State",
     "StepFilter",
     "first_state",
-    "gaps",
     "initial_state",
     "observability",
-    "relinearized_start",
     "run",
-    "run_part",
     "smooth",
-    "with_error_states",
 ]
 
 if TYPE_CHECKING:

@@ -18,6 +18,19 @@ from strapdown.kernels import augmented_chain
 from strapdown.units import STANDARD_GRAVITY
 from strapdown.vectors import GRAVITY_F
 
+__all__ = [
+    "BoundedVelocity",
+    "ErrorStates",
+    "GaussMarkov",
+    "GyroForce",
+    "GyroGaussMarkov",
+    "GyroScale",
+    "LeverArm",
+    "SensorMounting",
+    "VectorBias",
+    "VectorScale",
+]
+
 AXES = ("x", "y", "z")
 MOST_CHAIN_DECAY = 0.2
 """Of λ dt of a state in a chain in one step: its series and Gauss's rule are exact."""

@@ -41,6 +41,12 @@ from strapdown.records import Estimate, Event, ImuRecord, Innovations
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 from strapdown.vectors import VectorMeasurements
 
+__all__ = [
+    "BankEstimate",
+    "run",
+    "run_recovering",
+]
+
 HYPOTHESES = 96
 """Hypotheses on the circle where nobody says: 3.75° apart. Fewer find the attitude as soon, but are some too sure of it:
 ``sims/unknown_start.py``."""

@@ -21,34 +21,32 @@ order, so the statistics do not depend on the number of threads, processes or ho
 
 from __future__ import annotations
 
-from strapdown.montecarlo.engine import Choice, choose, in_threads, machine_named, replay, run, run_plan
-from strapdown.montecarlo.plan import Dispersions, Plan, from_table, read_dispersions, whole_epochs
-from strapdown.montecarlo.scalar import start
-from strapdown.montecarlo.statistics import EXAMPLES, WORST, Replay, Statistics, judged_epochs, merge, merge_all
+from strapdown.montecarlo.engine import Choice as Choice
+from strapdown.montecarlo.engine import choose as choose
+from strapdown.montecarlo.engine import in_threads as in_threads
+from strapdown.montecarlo.engine import machine_named as machine_named
+from strapdown.montecarlo.engine import replay, run, run_plan
+from strapdown.montecarlo.plan import Dispersions, Plan, read_dispersions
+from strapdown.montecarlo.plan import from_table as from_table
+from strapdown.montecarlo.plan import whole_epochs as whole_epochs
+from strapdown.montecarlo.scalar import start as start
+from strapdown.montecarlo.statistics import EXAMPLES as EXAMPLES
+from strapdown.montecarlo.statistics import WORST as WORST
+from strapdown.montecarlo.statistics import Replay as Replay
+from strapdown.montecarlo.statistics import Statistics
+from strapdown.montecarlo.statistics import judged_epochs as judged_epochs
+from strapdown.montecarlo.statistics import merge as merge
+from strapdown.montecarlo.statistics import merge_all as merge_all
 from strapdown.montecarlo.verdicts import summary
-from strapdown.setup import FilterSetup
+from strapdown.setup import FilterSetup as FilterSetup
 
 __all__ = [
-    "EXAMPLES",
-    "WORST",
-    "Choice",
     "Dispersions",
-    "FilterSetup",
     "Plan",
-    "Replay",
     "Statistics",
-    "choose",
-    "from_table",
-    "in_threads",
-    "judged_epochs",
-    "machine_named",
-    "merge",
-    "merge_all",
     "read_dispersions",
     "replay",
     "run",
     "run_plan",
-    "start",
     "summary",
-    "whole_epochs",
 ]

@@ -33,6 +33,12 @@ from strapdown.montecarlo.plan import Plan, from_table
 from strapdown.montecarlo.statistics import BINS, Statistics, merge
 from strapdown.records import CONVENTIONS, put
 
+__all__ = [
+    "Campaign",
+    "read",
+    "run",
+]
+
 KIND = "strapdown montecarlo"
 """The attribute ``kind`` of a campaign's file."""
 FORMAT = 1

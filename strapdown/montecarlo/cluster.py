@@ -23,6 +23,11 @@ import strapdown
 from strapdown.checks import InputError, count
 from strapdown.montecarlo.engine import Chunks, Parts, Window, Work, Workers, arithmetic
 
+__all__ = [
+    "dask_client",
+    "on_dask",
+]
+
 CONNECT_SECONDS = 15
 
 

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from strapdown import consistency, estimation, quaternion, setup
 from strapdown.checks import Array, InputError, count
+from strapdown.estimation.filters.own import Own
 from strapdown.gyro import GyroSpec
 from strapdown.montecarlo.plan import Dispersions, Plan
 from strapdown.montecarlo.statistics import (
@@ -181,17 +182,17 @@ class Sums:
         """Filter one run and add what comes of it."""
         plan = self.plan
         initial = start(record, plan.setup, plan.seed, run, plan.dispersions)
-        # A record that has lost samples has its epochs at no fixed step, so all steps are kept and the epochs picked.
-        regular = len(record.increments) == plan.samples
+        # A record that has lost samples has its epochs at no fixed step, so all steps are kept and the epochs picked; and so where a filter
+        # of one's own chooses its times.
+        regular = len(record.increments) == plan.samples and not isinstance(plan.setup.estimator, Own)
         every = plan.every if regular else 1
         estimate = setup.run(record, plan.setup, initial, every=every, full_covariance=True)
         assert record.truth is not None
         assert estimate.covariance is not None
-        n = plan.setup.integration.samples
         rows = slice(None) if regular else _at_epochs(estimate.time, self.time)
-        edges = np.arange(len(estimate.time))[rows] * (n * every)
+        edges = np.searchsorted(record.time, estimate.time[rows])
         P = estimate.covariance[rows]
-        told = np.isfinite(estimate.attitude[rows]).all(axis=1) & np.isfinite(estimate.bias[rows]).all(axis=1)
+        told = np.isfinite(estimate.attitude[rows]).all(axis=1)
         error = np.full((len(P), 6), np.nan)
         error[told] = consistency.errors(
             estimate.attitude[rows][told],
@@ -205,7 +206,13 @@ class Sums:
     def _add_errors(self, run: int, error: Array, P: Array) -> None:
         with np.errstate(invalid="ignore"):  # a filter that failed has anything there
             sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-        nees = np.stack([_nees(error[:, a:b], P[:, a:b, a:b]) for a, b in ((0, 6), (0, 3), (3, 6))], axis=1)
+        if np.isnan(P[:, 3:, 3:]).all():  # no bias is estimated: it adds nothing, and the state is the attitude
+            attitude = _nees(error[:, :3], P[:, :3, :3])
+            nees = np.stack([attitude, attitude, np.zeros(len(P))], axis=1)
+            error = np.where(np.arange(6) < 3, error, 0.0)
+            P = np.nan_to_num(P)
+        else:
+            nees = np.stack([_nees(error[:, a:b], P[:, a:b, a:b]) for a, b in ((0, 6), (0, 3), (3, 6))], axis=1)
         good = np.isfinite(nees).all(axis=1) & np.isfinite(error).all(axis=1) & np.isfinite(P).all(axis=(1, 2))
         m = np.flatnonzero(good)
         e, squares = error[m], nees[m]
@@ -225,6 +232,8 @@ class Sums:
     def _add_innovations(self, estimate: Estimate) -> None:
         bins = self.plan.nis_bins
         for i, sensor in enumerate(self.plan.sensors):
+            if sensor not in estimate.innovations:  # a filter of one's own may give none
+                continue
             innovations = estimate.innovations[sensor]
             place = np.clip(np.searchsorted(self.nis_edges, innovations.time, side="left") - 1, 0, bins - 1)
             used = innovations.used

@@ -48,6 +48,7 @@ from numpy.typing import ArrayLike, NDArray
 from strapdown import consistency, estimation
 from strapdown.checks import Array, InputError
 from strapdown.consistency import Verdict
+from strapdown.listing import Listed, Listing, figure
 from strapdown.records import Estimate, ImuRecord
 
 Counts = NDArray[np.int64]
@@ -105,7 +106,7 @@ class Replay:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Statistics:
+class Statistics(Listed):
     """Sums over independent runs at each epoch. The head of this module defines each field.
 
     Errors are e = (δθ, δb): rad in the body frame, rad/s.
@@ -132,6 +133,46 @@ class Statistics:
     example_error: Array
     example_sigma: Array
 
+    def listing(self) -> Listing:
+        """Return NEES and NIS per degree of freedom, and the errors at the end, as a table."""
+        from strapdown.montecarlo.verdicts import summary
+
+        report = summary(self)
+        parts = [(f"NEES of the {subset}", part["anees"], part) for subset, part in report["nees"].items()]
+        parts += [(f"NIS of {part['sensor']}", part["nis"], part) for part in report["nis"]]
+        rows = [
+            (name, figure(mean), "{:.4f} to {:.4f}".format(*part["bounds"]), "pass" if part["consistent"] else "FAIL")
+            for name, mean, part in parts
+        ]
+        last = report["last_epoch"]
+        notes = [
+            f"{what} at {last['time_s']:.6g} s (x, y, z), {words}: RMS error {numbers[0]}, σ {numbers[1]}"
+            for what, unit, words in (("attitude", "arcsec", "arcsec"), ("bias", "deg_per_hour", "°/h"))
+            for numbers in [
+                [", ".join(figure(x) for x in last[f"{what}_{key}_{unit}"]) for key in ("rms_error", "sigma")]
+            ]
+        ]
+        if self.failed:
+            notes.append(f"{self.failed} runs failed: no finite error or covariance")
+        title = f"{self.runs} runs, per degree of freedom (1 expected); {100.0 * report['probability']:g} % bounds of all together"
+        return Listing(title, ("statistic", "mean", "bounds", ""), rows, notes)
+
+    @property
+    def has_bias(self) -> bool:
+        """Whether the filter estimates a gyro bias; of one of one's own that does not, the bias adds zero to every sum."""
+        return bool(self.covariance_sum[:, 3:, 3:].any()) or not self.finite.any()
+
+    @property
+    def subsets(self) -> tuple[str, ...]:
+        """What is judged: "state", "attitude" and "bias", or "attitude" alone where no bias is estimated."""
+        return tuple(SUBSETS) if self.has_bias else ("attitude",)
+
+    @property
+    def _runs_of_state(self) -> Array:
+        """Runs that the sums hold by epoch and state (m, 6)."""
+        estimated = np.where(self.has_bias | (np.arange(6) < 3), 1.0, 0.0)
+        return np.asarray(self.finite[:, None] * estimated)
+
     @property
     def failed(self) -> int:
         """Runs that were not finite at some epoch, at the least."""
@@ -145,12 +186,14 @@ class Statistics:
     @property
     def mean_error(self) -> Array:
         """Mean error at each epoch (m, 6)."""
-        return _divided(self.error_sum, self.finite[:, None])
+        return _divided(self.error_sum, self._runs_of_state)
 
     @property
     def mean_square_error(self) -> Array:
         """Mean of e eᵀ at each epoch (m, 6, 6), which P claims to be."""
-        return _divided(self.error_product_sum, self.finite[:, None, None])
+        return _divided(
+            self.error_product_sum, np.minimum(self._runs_of_state[:, :, None], self._runs_of_state[:, None])
+        )
 
     @property
     def rms_error(self) -> Array:
@@ -160,7 +203,7 @@ class Statistics:
     @property
     def covariance(self) -> Array:
         """The filter's own covariance, mean over runs (m, 6, 6)."""
-        return _divided(self.covariance_sum, self.finite[:, None, None])
+        return _divided(self.covariance_sum, np.minimum(self._runs_of_state[:, :, None], self._runs_of_state[:, None]))
 
     @property
     def sigma(self) -> Array:
@@ -169,13 +212,15 @@ class Statistics:
 
     @property
     def anees(self) -> Array:
-        """NEES averaged over runs and states (m, 3): of all six states, attitude, bias; 1 for a right filter."""
-        return _divided(self.nees_sum, self.finite[:, None] * np.array([6.0, 3.0, 3.0]))
+        """NEES averaged over runs and states (m, 3): of all six states, attitude, bias; 1 for a right filter, NaN where no bias is."""
+        return _divided(
+            self.nees_sum, self.finite[:, None] * np.array([6.0, 3.0, 3.0] if self.has_bias else [0.0, 3.0, 0.0])
+        )
 
     @property
     def covered(self) -> Array:
         """Share of the runs whose error lies inside 1, 2, 3 σ (m, 6, 3); :data:`COVERED` for a right filter."""
-        return _divided(self.coverage, self.finite[:, None, None])
+        return _divided(self.coverage, self._runs_of_state[:, :, None])
 
     @property
     def nis_time(self) -> Array:
@@ -223,7 +268,8 @@ class Statistics:
 
     def error_quantile(self, probability: float) -> Array:
         """Return the quantile of |e| at each epoch (m, 6), from the histogram: off by less than half a bin, 6 %, mostly far less."""
-        return _quantile(self.histogram[:, :6], probability, bin_edges(ERROR_EXPONENT))
+        found = _quantile(self.histogram[:, :6], probability, bin_edges(ERROR_EXPONENT))
+        return np.asarray(np.where(self._runs_of_state > 0.0, found, np.nan))
 
     def nees_quantile(self, probability: float) -> Array:
         """Return the quantile of the NEES of state, attitude and bias at each epoch (m, 3)."""

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from strapdown import consistency, units
-from strapdown.montecarlo.statistics import COVERED, SUBSETS, Counts, Statistics, judged_epochs
+from strapdown.montecarlo.statistics import COVERED, Counts, Statistics, judged_epochs
 
 QUANTILES = (0.5, 0.95, 0.997)
 """Quantiles of the last epoch's errors that the summary tells."""
@@ -28,9 +28,9 @@ def summary(statistics: Statistics, *, epochs: Counts | None = None, probability
     """
     chosen = judged_epochs(len(statistics.time) - 1) if epochs is None else epochs
     seen = [i for i in range(len(statistics.sensors)) if statistics.sensor_degrees[i].sum() > 0]
-    single = 1.0 - (1.0 - probability) / (len(SUBSETS) + len(seen))
+    single = 1.0 - (1.0 - probability) / (len(statistics.subsets) + len(seen))
     nees = {}
-    for subset in SUBSETS:
+    for subset in statistics.subsets:
         verdict = statistics.verdict(chosen, subset, single)
         nees[subset] = {
             "anees": _number(verdict.mean.mean()),

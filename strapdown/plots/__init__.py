@@ -24,64 +24,51 @@ Colours are those of Okabe and Ito, told apart by every kind of colour vision. :
     Likelihood slices, and the statistics before and after.
 """
 
-from strapdown.plots.allan import allan_axis, allan_overview
+from strapdown.plots.allan import allan_axis as allan_axis
+from strapdown.plots.allan import allan_overview
 from strapdown.plots.budget import error_budget
-from strapdown.plots.coning import coning_consistency, coning_errors, draw_coning_study, drift_by_algorithm
-from strapdown.plots.decimation import decimated
-from strapdown.plots.estimates import (
-    error_overview,
-    errors_in_envelope,
-    estimate_overview,
-    recording_errors,
-    states_over_time,
-)
-from strapdown.plots.innovations import (
-    error_distribution,
-    innovation_autocorrelation,
-    innovation_histogram,
-    innovation_quantiles,
-    nis_over_record,
-)
-from strapdown.plots.sphere import animate_body_axis, body_axis_on_sphere, sphere_figure
-from strapdown.plots.statistics import covariance_ellipses, coverage_by_state, fan, nees_over_time, nis_over_time
-from strapdown.plots.style import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION, YELLOW, ink, new_figure, save, theme
+from strapdown.plots.coning import coning_consistency as coning_consistency
+from strapdown.plots.coning import coning_errors as coning_errors
+from strapdown.plots.coning import draw_coning_study
+from strapdown.plots.coning import drift_by_algorithm as drift_by_algorithm
+from strapdown.plots.decimation import decimated as decimated
+from strapdown.plots.estimates import error_overview, estimate_overview, states_over_time
+from strapdown.plots.estimates import errors_in_envelope as errors_in_envelope
+from strapdown.plots.estimates import recording_errors as recording_errors
+from strapdown.plots.innovations import error_distribution, innovation_autocorrelation, nis_over_record
+from strapdown.plots.innovations import innovation_histogram as innovation_histogram
+from strapdown.plots.innovations import innovation_quantiles as innovation_quantiles
+from strapdown.plots.sphere import animate_body_axis as animate_body_axis
+from strapdown.plots.sphere import body_axis_on_sphere
+from strapdown.plots.sphere import sphere_figure as sphere_figure
+from strapdown.plots.statistics import covariance_ellipses as covariance_ellipses
+from strapdown.plots.statistics import coverage_by_state as coverage_by_state
+from strapdown.plots.statistics import fan as fan
+from strapdown.plots.statistics import nees_over_time, nis_over_time
+from strapdown.plots.style import BLUE as BLUE
+from strapdown.plots.style import GREEN as GREEN
+from strapdown.plots.style import ORANGE as ORANGE
+from strapdown.plots.style import PURPLE as PURPLE
+from strapdown.plots.style import SKY as SKY
+from strapdown.plots.style import VERMILION as VERMILION
+from strapdown.plots.style import YELLOW as YELLOW
+from strapdown.plots.style import ink as ink
+from strapdown.plots.style import new_figure, save
+from strapdown.plots.style import theme as theme
 
 __all__ = [
-    "BLUE",
-    "GREEN",
-    "ORANGE",
-    "PURPLE",
-    "SKY",
-    "VERMILION",
-    "YELLOW",
-    "allan_axis",
     "allan_overview",
-    "animate_body_axis",
     "body_axis_on_sphere",
-    "coning_consistency",
-    "coning_errors",
-    "covariance_ellipses",
-    "coverage_by_state",
-    "decimated",
     "draw_coning_study",
-    "drift_by_algorithm",
     "error_budget",
     "error_distribution",
     "error_overview",
-    "errors_in_envelope",
     "estimate_overview",
-    "fan",
-    "ink",
     "innovation_autocorrelation",
-    "innovation_histogram",
-    "innovation_quantiles",
     "nees_over_time",
     "new_figure",
     "nis_over_record",
     "nis_over_time",
-    "recording_errors",
     "save",
-    "sphere_figure",
     "states_over_time",
-    "theme",
 ]

@@ -10,10 +10,19 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from strapdown.coning_study import ConingStudy, Drift, FilterOutcome
+from strapdown.coning_study import (
+    MANOEUVRE_SECONDS,
+    MANOEUVRES,
+    ConingStudy,
+    Drift,
+    FilterOutcome,
+    manoeuvre_error,
+    step_drift,
+)
+from strapdown.motion import Coning
 from strapdown.plots.estimates import errors_in_envelope
 from strapdown.plots.statistics import nees_over_time, nis_over_time
-from strapdown.plots.style import SKY, axes_or_new, ink, new_figure, save
+from strapdown.plots.style import CYCLE, SKY, axes_or_new, ink, new_figure, save
 from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR
 
 _ROUNDING = 1e-6  # °/h: below it a drift is rounding of the run that measures it
@@ -91,6 +100,38 @@ def coning_consistency(outcomes: Sequence[FilterOutcome]) -> Figure:
     return figure
 
 
+FREQUENCIES = 60
+"""Coning frequencies that drift is drawn at, evenly spaced on a log axis from a hundredth of the sample rate to 0.4 of it."""
+
+
+def algorithms_compared(study: ConingStudy) -> Figure:
+    """Draw the drift of each algorithm over the coning frequency, and its largest error over manoeuvres; one's own are drawn bold."""
+    figure, (left, right) = new_figure(1, 2, size=(12.0, 4.8))
+    p = study.parameters
+    frequencies = np.geomspace(0.01, 0.4, FREQUENCIES) * p.rate
+    for k, algorithm in enumerate(p.algorithms):
+        own = algorithm in p.own
+        style = {"color": CYCLE[k % len(CYCLE)], "linestyle": "-" if own or k < len(CYCLE) else "--"}
+        drift = np.abs([step_drift(Coning(angle=p.angle, frequency=f), p.rate, algorithm) for f in frequencies])
+        drift = np.where(drift > _ROUNDING * DEGREE_PER_HOUR, drift, np.nan)
+        width = 2.4 if own else 1.2
+        left.plot(frequencies, drift / DEGREE_PER_HOUR, label=algorithm.name, linewidth=width, **style)
+        errors = np.array([manoeuvre_error(motion, p.rate, algorithm) for motion in MANOEUVRES.values()]) / ARCSECOND
+        place = np.arange(len(errors)) + 0.7 * ((k + 0.5) / len(p.algorithms) - 0.5)
+        size = 9 if own else 6
+        right.plot(place, np.maximum(errors, 1e-9), "D" if own else "o", markersize=size, color=style["color"])
+    left.set(xscale="log", yscale="log", xlabel="coning frequency, Hz", ylabel="drift, °/h")
+    left.axvline(p.frequency, color=ink(), linewidth=0.8, linestyle=":")
+    left.set_title(f"Coning of {p.angle / DEGREE:g}°, gyro at {p.rate:g} Hz")
+    right.set_yscale("log")
+    right.set_xticks(range(len(MANOEUVRES)), [name.replace(", ", ",\n") for name in MANOEUVRES])
+    right.grid(visible=False, axis="x")
+    right.set_ylabel("largest attitude error, arcsec")
+    right.set_title(f"Manoeuvres of {MANOEUVRE_SECONDS:g} s, gyro at {p.rate:g} Hz")
+    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
+    return figure
+
+
 def draw_coning_study(study: ConingStudy, folder: str | os.PathLike[str]) -> list[Path]:
     """Write the figures of the coning study to a folder and return their paths."""
     figure, ax = new_figure(size=(7.0, 4.2))
@@ -104,4 +145,5 @@ def draw_coning_study(study: ConingStudy, folder: str | os.PathLike[str]) -> lis
         save(figure, target / "drift.png"),
         save(coning_errors(study.outcomes), target / "errors.png"),
         save(coning_consistency(study.outcomes), target / "consistency.png"),
+        *([save(algorithms_compared(study), target / "algorithms.png")] if p.own else []),
     ]

@@ -18,6 +18,7 @@ import numpy as np
 from strapdown import reading, recordfiles
 from strapdown.checks import InputError
 from strapdown.recordings import ros, telemetry, trajectories
+from strapdown.recordings.body_axes import with_axes
 from strapdown.recordings.recording import Recording, with_gyro
 from strapdown.records import Estimate, ImuRecord
 
@@ -196,6 +197,8 @@ def read(
     gyro_alone: bool = False,
     columns: Mapping[str, str] | None = None,
     topic: str = "",
+    axes: str | Mapping[str, str] | None = None,
+    invert: str | Iterable[str] = (),
 ) -> Recording:
     """Read a recording of any format, recognised by its content.
 
@@ -212,6 +215,11 @@ def read(
         are found by their names.
     topic : str, default ""
         For bags and flight logs: topic of the inertial unit, where there are several.
+    axes : str or mapping of str to str, optional
+        The recorded axes that become the body's x, y, z, ``"x,-y,-z"`` for a unit whose z axis points down; or of single sensors,
+        ``{"magnetometer": "y,x,-z"}``. See :func:`strapdown.recordings.with_axes`.
+    invert : str or iterable of str, default empty
+        Sensors of inverted sign: ``"accelerometer"`` for one that reads −g upward at rest.
 
     Returns
     -------
@@ -241,7 +249,7 @@ def read(
     if "gyro_alone" in found.options:
         options["gyro_alone"] = gyro_alone
     recording: Recording = _function(found.read)(file, **options)
-    return recording
+    return with_axes(recording, axes, invert) if axes or invert else recording
 
 
 def _refuse_option(file: Path, found: Format, name: str, value: Any) -> None:
@@ -333,8 +341,19 @@ def _by_ending(path: str | os.PathLike[str], kind: str) -> Format:
 def from_record(record: ImuRecord, source: str = "record") -> Recording:
     """Return a simulated record as a device would have recorded it.
 
-    The rate at each stamp is the mean over the sample interval that ends there, as of an integrating gyro: half an interval late.
-    Vector series named accelerometer and magnetometer are included where they have samples at the stamps; the truth is the reference.
+    Parameters
+    ----------
+    record : ImuRecord
+        Record of n intervals.
+    source : str, default "record"
+        Name of the recording.
+
+    Returns
+    -------
+    Recording
+        Recording of n samples. The rate at each stamp is the mean over the sample interval that ends there, as of an integrating
+        gyro: half an interval late. Vector series named accelerometer and magnetometer are included where they have samples at the
+        stamps; the truth is the reference.
     """
     steps = np.diff(record.time)[:, None]
     own: dict[str, Any] = {}

@@ -15,6 +15,7 @@ from strapdown.recordings import formats
 from strapdown.recordings.broad import sample_interval
 from strapdown.recordings.columns import SENSORS, UNITS
 from strapdown.recordings.recording import GAP, Recording
+from strapdown.records import ImuRecord
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -133,13 +134,44 @@ def read_samples(
             raise InputError(
                 f"{file.name} is a record, whose layout defines its units; drop the option for {', '.join(given)}"
             )
-        record = recordfiles.read_record(file)
-        if sensor == "gyro":
-            interval = sample_interval(Recording(source=file.name, time=record.time[1:], rate=record.increments))
-            return GyroSamples(values=record.increments, sample_interval=interval, kind="increments")
-        return _of_recording(formats.from_record(record, file.name), sensor, gaps)
+        return samples_of(recordfiles.read_record(file), sensor, gaps=gaps, source=file.name)
     recording = formats.read(file, units=given, gyro_alone=sensor == "gyro", columns=columns, topic=topic)
-    return _of_recording(recording, sensor, gaps)
+    return samples_of(recording, sensor, gaps=gaps)
+
+
+def samples_of(
+    content: Recording | ImuRecord, sensor: str = "gyro", *, gaps: bool = False, source: str = "record"
+) -> GyroSamples:
+    """Return the samples of one sensor of a recording or a simulated record, as :func:`read_samples` for its file.
+
+    Parameters
+    ----------
+    content : Recording or ImuRecord
+        Source of the samples.
+    sensor : {"gyro", "accelerometer", "magnetometer"}, default "gyro"
+        Sensor.
+    gaps : bool, default False
+        Whether gaps are allowed: missing samples are then rows of NaN.
+    source : str, default "record"
+        Name of a record, for messages; a recording has its own.
+
+    Returns
+    -------
+    GyroSamples
+        Samples at even intervals.
+
+    Raises
+    ------
+    InputError
+        If the sensor is missing, its unit is unknown, or its samples lie at uneven intervals.
+    """
+    one_of("sensor", sensor, SENSORS)
+    if isinstance(content, Recording):
+        return _of_recording(content, sensor, gaps)
+    if sensor == "gyro":
+        interval = sample_interval(Recording(source=source, time=content.time[1:], rate=content.increments))
+        return GyroSamples(values=content.increments, sample_interval=interval, kind="increments")
+    return _of_recording(formats.from_record(content, source), sensor, gaps)
 
 
 def _read_array(file: Path, sensor: str, rate: float | None, given: Mapping[str, str]) -> GyroSamples:
@@ -218,3 +250,6 @@ def _grid(source: str, time: Array) -> tuple[float, np.ndarray, tuple[str, ...]]
     if missing:
         words += (f"{missing} samples are missing in {int(np.sum(whole > 1.0))} gaps.",)
     return interval, place, words
+
+
+__all__ = ["GyroSamples", "read_gyro", "read_samples", "samples_of"]

@@ -24,6 +24,10 @@ from strapdown.files import write_json, written_beside
 from strapdown.reading import existing_file, from_file
 from strapdown.report import campaigns, estimates, tunings
 
+__all__ = [
+    "write",
+]
+
 _WRITERS: dict[str, Callable[[Path, float], tuple[str, dict[str, Any]]]] = {
     "strapdown estimate": estimates.report,
     "strapdown montecarlo": campaigns.report,

@@ -66,12 +66,17 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
         "runs": statistics.runs,
         "failed_runs": statistics.failed,
         "time_s": statistics.time.tolist(),
-        "anees": {subset: statistics.anees[:, k].tolist() for k, subset in enumerate(SUBSETS)},
-        "rms_error_si": statistics.rms_error.tolist(),
-        "sigma_si": statistics.sigma.tolist(),
+        "anees": {name: statistics.anees[:, SUBSETS[name][0]].tolist() for name in statistics.subsets},
+        "rms_error_si": statistics.rms_error[:, : len(_estimated(statistics))].tolist(),
+        "sigma_si": statistics.sigma[:, : len(_estimated(statistics))].tolist(),
         "nis_by_sensor": dict(zip(statistics.sensors, _plain(statistics.sensor_nis), strict=True)),
         "worst_runs": statistics.worst_run.tolist(),
     }
+
+
+def _estimated(statistics: Statistics) -> tuple[str, ...]:
+    """Return the names of the states that the filter estimates."""
+    return STATES if statistics.has_bias else STATES[:3]
 
 
 def _plain(values: Any) -> list[float | None]:
@@ -80,7 +85,7 @@ def _plain(values: Any) -> list[float | None]:
 
 def _numbers(statistics: Statistics) -> str:
     rows = []
-    for k, name in enumerate(STATES):
+    for k, name in enumerate(_estimated(statistics)):
         unit, size = state_unit(k, 3.0 * statistics.sigma[-1:, k // 3 * 3 : k // 3 * 3 + 3])
         quantiles = [page.number(float(statistics.error_quantile(share)[-1, k] / size), 3) for share in (0.5, 0.95)]
         rows.append(
@@ -125,7 +130,8 @@ def _numbers(statistics: Statistics) -> str:
 
 def _consistency(statistics: Statistics, probability: float) -> Figure:
     figure, axes = plots.new_figure(1, 3, size=(12.0, 4.0))
-    for ax, subset in zip(axes, ("attitude", "bias"), strict=False):
+    axes[1].set_visible(statistics.has_bias)
+    for ax, subset in zip(axes, ("attitude", "bias") if statistics.has_bias else ("attitude",), strict=False):
         bounds = consistency.mean_bounds(3, statistics.runs, probability)
         plots.nees_over_time([("all runs", statistics)], bounds, subset, ax)
         low, high = np.nanmin(statistics.anees), np.nanmax(statistics.anees)
@@ -143,7 +149,8 @@ def _consistency(statistics: Statistics, probability: float) -> Figure:
 
 
 def _fans(statistics: Statistics) -> Figure:
-    figure, axes = plots.new_figure(2, 3, size=(13.0, 7.0))
+    rows = len(_estimated(statistics)) // 3
+    figure, axes = plots.new_figure(rows, 3, size=(13.0, 3.5 * rows), squeeze=False)
     for state, ax in enumerate(axes.ravel()):
         plots.fan(statistics, state, ax)
         ax.get_legend().remove()
@@ -158,7 +165,7 @@ def _end(statistics: Statistics) -> Figure:
     # The bias axis that is claimed worst, beside the attitude about it.
     ratio = np.diag(statistics.mean_square_error[-1]) / np.diag(statistics.covariance[-1])
     worst = int(np.argmax(np.abs(np.log(np.maximum(ratio[3:], 1e-300)))))
-    for ax, pair in zip(axes[1:], ((0, 1), (worst, 3 + worst)), strict=True):
+    for ax, pair in zip(axes[1:], ((0, 1), (worst, 3 + worst) if statistics.has_bias else (0, 2)), strict=True):
         plots.covariance_ellipses(statistics.covariance[-1], statistics.mean_square_error[-1], pair, ax)
     return figure
 

@@ -22,9 +22,18 @@ from strapdown.gyro import GyroSpec
 from strapdown.motion import Motion
 from strapdown.orbit import CircularOrbit
 from strapdown.randomness import generator
-from strapdown.records import ImuRecord, Truth
+from strapdown.records import ImuRecord, Origin, Truth
 from strapdown.tables import Form
 from strapdown.vectors import Sensor
+
+__all__ = [
+    "SCENARIOS",
+    "Scenario",
+    "drawn",
+    "load_scenario",
+    "scenario_to_toml",
+    "simulate",
+]
 
 _BUILTIN = Path(__file__).parent / "builtin"
 
@@ -114,7 +123,8 @@ def simulate(scenario: Scenario, seed: int | None = None, run: int = 0) -> ImuRe
         for sensor in scenario.sensors
     )
     truth = Truth(attitude=scenario.motion.attitude(edges), bias=bias)
-    return ImuRecord(time=stamps, increments=increments, vectors=series, truth=truth)
+    origin = Origin(gyro=spec, scenario=scenario, seed=seed, run=run)
+    return ImuRecord(time=stamps, increments=increments, vectors=series, truth=truth, origin=origin)
 
 
 def drawn(scenario: Scenario, seed: int, run: int = 0) -> Scenario:

@@ -7,7 +7,7 @@ names of its keys; a setup read back is equal to the last bit.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -16,8 +16,9 @@ import numpy as np
 from strapdown import coning, estimation, gyro, quaternion, reading, tables, units, vectors
 from strapdown.checks import Array, InputError, known_keys, one_of, positive
 from strapdown.equality import ByValue
-from strapdown.estimation import Observability
+from strapdown.estimation import Observability, filters
 from strapdown.estimation.error_states import ErrorStates
+from strapdown.estimation.filters.own import Own, OwnFilter, as_own
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import ProcessNoise, State
 from strapdown.gyro import GyroSpec
@@ -25,8 +26,23 @@ from strapdown.records import Estimate, ImuRecord, compress
 from strapdown.scenarios import Scenario, simulate
 from strapdown.setup import matching
 from strapdown.setup import states as optional
-from strapdown.setup.states import States
+from strapdown.setup.states import SensorStates, States
 from strapdown.vectors import VectorMeasurements
+
+__all__ = [
+    "FilterSetup",
+    "SensorStates",
+    "States",
+    "initial_state",
+    "matched",
+    "matched_to_record",
+    "not_covered",
+    "observability",
+    "read_setup",
+    "run",
+    "smooth",
+    "to_toml",
+]
 
 ATTITUDE_SIGMA = 1.0 * units.DEGREE
 """Standard deviation of the initial attitude error where nobody says, each axis, rad; less where the sensors are very fine."""
@@ -40,6 +56,8 @@ LEAST_SAMPLES = 32
 """Gyro samples below which nothing is said of commutation."""
 LEAST_BIAS_SIGMA = 0.1 * units.DEGREE_PER_HOUR
 """Standard deviation of the initial bias error of a gyro whose specification tells of no bias, rad/s."""
+MEKF = "mekf"
+"""The estimator that all of this package works with; others run over records, and can be judged."""
 MOST_MEMORY = 8e9
 """Bytes that the smoother may keep of the filter's way."""
 
@@ -80,6 +98,9 @@ class FilterSetup(ByValue):
     """Weighs measurements by how far they lie off; None: all alike."""
     states: States | None = None
     """Optional states beside attitude and bias; None: none. With drifts among them, the bias of the filter is the whole of it."""
+    estimator: str | Own | OwnFilter | Callable[[ImuRecord, State], Estimate] = MEKF
+    """What runs over a record: the name of one of :data:`strapdown.estimation.filters.FILTERS`, or a filter of one's own
+    (:mod:`strapdown.estimation.filters.own`). Of the latter, ``process_noise`` is not used; the two σ above are its start's."""
 
     def __post_init__(self) -> None:
         """Check every number."""
@@ -90,6 +111,22 @@ class FilterSetup(ByValue):
         positive("measurement_sigma_factor", self.measurement_sigma_factor)
         believed_sigma = {str(name): _sigma(f"sigma[{name!r}]", s) for name, s in self.sigma.items()}
         object.__setattr__(self, "sigma", believed_sigma)
+        self._check_estimator()
+
+    def _check_estimator(self) -> None:
+        if isinstance(self.estimator, str):
+            one_of("estimator", self.estimator, filters.FILTERS)
+        else:
+            object.__setattr__(self, "estimator", as_own(self.estimator))
+        if self.estimator != MEKF and (self.gate, self.robust, self.states) != (None, None, None):
+            raise InputError(
+                f"gate, robust and states are options of the mekf, and the estimator is {self.estimator_name}; leave them out"
+            )
+
+    @property
+    def estimator_name(self) -> str:
+        """Name of the estimator."""
+        return self.estimator.name if isinstance(self.estimator, Own) else str(self.estimator)
 
 
 def matched(scenario: Scenario, *, attitude_sigma: float | None = None, states: bool = False) -> FilterSetup:
@@ -333,12 +370,33 @@ def _by_axis(series: VectorMeasurements, told: tuple[float, float, float], facto
 def run(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any) -> Estimate:
     """Run the filter of this setup over a record; ``options`` are those of :func:`strapdown.estimation.run`.
 
-    With optional states the estimate is one of :class:`strapdown.records.Estimate`, which tells of them too.
+    With optional states the estimate is one of :class:`strapdown.records.Estimate`, which tells of them too. Other estimators than the
+    mekf take ``every`` and ``full_covariance`` alone.
     """
+    if setup.estimator != MEKF:
+        return _run_other(believed(record, setup), setup, initial, **options)
     chosen = {"gate": setup.gate, "robust": setup.robust, **options}
     if setup.states is not None:
         return optional.run(believed(record, setup), setup.process_noise, initial, setup.states, **chosen)
     return estimation.run(believed(record, setup), setup.process_noise, initial, **chosen)
+
+
+def _run_other(
+    record: ImuRecord, setup: FilterSetup, initial: State, *, every: int = 1, full_covariance: bool = False
+) -> Estimate:
+    if isinstance(setup.estimator, Own):
+        return setup.estimator(record, initial, times=None if every == 1 else record.time[::every])
+    return filters.run(
+        setup.estimator_name, record, setup.process_noise, initial, every=every, full_covariance=full_covariance
+    )
+
+
+def need_mekf(setup: FilterSetup, what: str) -> None:
+    """Refuse a setup of another estimator for ``what`` works with the mekf alone."""
+    if setup.estimator != MEKF:
+        raise InputError(
+            f"{what} works with the mekf, and the estimator is {setup.estimator_name}; take a setup with estimator='mekf'"
+        )
 
 
 def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any) -> Estimate:
@@ -350,6 +408,7 @@ def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any
         If the record is so long that what the way back needs of the way forth exceeds :data:`MOST_MEMORY`, or a gyro drift is among the
         states.
     """
+    need_mekf(setup, "the smoother")
     chosen = {"gate": setup.gate, "robust": setup.robust, **options}
     told = believed(record, setup)
     blocks: tuple[ErrorStates, ...] = ()
@@ -372,6 +431,7 @@ def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any
 
 def observability(record: ImuRecord, setup: FilterSetup, initial: State) -> Observability:
     """Return what a record shows of each state of this setup's filter: see :func:`strapdown.estimation.observability`."""
+    need_mekf(setup, "observability")
     told = believed(record, setup)
     if setup.states is None:
         return estimation.observability(told, setup.process_noise, initial)
@@ -406,7 +466,7 @@ _ROBUST_FORM: tables.Form = {
     "degrees_of_freedom": tables.RATIO,
     "iterations": tables.PLAIN,
 }
-_PARTS = ("integration", "sigma", "gate", "robust", "states")
+_PARTS = ("integration", "sigma", "gate", "robust", "states", "estimator")
 NEVER = 0
 """What stands in a file for the ``recovery`` of a gate that never recovers, as TOML has no word for nothing."""
 
@@ -414,7 +474,8 @@ NEVER = 0
 def to_table(setup: FilterSetup) -> dict[str, Any]:
     """Return a setup as the table that its file holds."""
     table = {**tables.encode(setup.process_noise, _NOISE_FORM), **tables.encode(setup, _FORM)}
-    table["integration"] = setup.integration.name
+    own = setup.integration.name not in coning.ALGORITHMS
+    table["integration"] = setup.integration.to_table() if own else setup.integration.name
     if setup.sigma:
         table["sigma"] = {name: list(s) if isinstance(s, tuple) else s for name, s in setup.sigma.items()}
     if setup.gate is not None:
@@ -426,6 +487,8 @@ def to_table(setup: FilterSetup) -> dict[str, Any]:
         table["robust"] = tables.encode(setup.robust, _ROBUST_FORM)
     if setup.states is not None:
         table["states"] = optional.to_table(setup.states)
+    if setup.estimator != MEKF:
+        table["estimator"] = setup.estimator.table if isinstance(setup.estimator, Own) else setup.estimator
     return table
 
 
@@ -435,8 +498,11 @@ def from_table(table: Mapping[str, Any], place: str = "filter") -> FilterSetup:
     own = tables.keys(_NOISE_FORM)
     parts: dict[str, Any] = {}
     if "integration" in table:
-        name = one_of(f"{place}: integration", table["integration"], coning.ALGORITHMS)
-        parts["integration"] = coning.ALGORITHMS[name]
+        told = table["integration"]
+        if isinstance(told, Mapping):
+            parts["integration"] = coning.Algorithm.from_table(told, f"{place}: integration")
+        else:
+            parts["integration"] = coning.ALGORITHMS[one_of(f"{place}: integration", told, coning.ALGORITHMS)]
     if "sigma" in table:
         believed_sigma = _part(table, "sigma", place)
         parts["sigma"] = {name: _sigma(f"{place}: sigma: {name}", value) for name, value in believed_sigma.items()}
@@ -452,6 +518,9 @@ def from_table(table: Mapping[str, Any], place: str = "filter") -> FilterSetup:
         parts["robust"] = tables.build(Robust, _part(table, "robust", place), _ROBUST_FORM, f"{place}: robust")
     if "states" in table:
         parts["states"] = optional.from_table(_part(table, "states", place), f"{place}: states")
+    if "estimator" in table:
+        told = table["estimator"]  # a table describes a filter of one's own, whose code no file holds
+        parts["estimator"] = Own(told) if isinstance(told, Mapping) and "name" in told else str(told)
     return tables.build(  # type: ignore[no-any-return]
         FilterSetup,
         {key: value for key, value in table.items() if key not in own and key not in _PARTS},

@@ -1,5 +1,7 @@
 """Tuning a filter from data: maximum likelihood, how sure one may be of each parameter, and proof on data held out.
 
+``procedure``
+    :func:`tune`: objective, search and what follows it in one call.
 ``innovations``
     Of the filter's innovations, with score and information, eight sets of parameters a pass.
 ``errors``
@@ -31,79 +33,64 @@ samples break it, and the most likely filter may then follow them (:attr:`strapd
 (:func:`contaminated_likelihood`), and an error without a state looks like noise of the gyro (:func:`unmodelled` tells).
 """
 
-from strapdown.tuning.credibility import CredibilityObjective, credibility_objective
-from strapdown.tuning.errors import ErrorObjective, error_objective
-from strapdown.tuning.fitting import Estimated, Slices, Tuning, fit, rescaled, search, slices
-from strapdown.tuning.holding import Comparison, NeesCourse, Performance, compare, performance, split
-from strapdown.tuning.innovations import Case, Derivatives, Likelihood, likelihood, thinned
-from strapdown.tuning.outliers import (
-    ContaminatedLikelihood,
-    TunedGate,
-    contaminated_likelihood,
-    log_likelihood,
-    tuned_gate,
-)
-from strapdown.tuning.parameters import (
-    Prior,
-    axis_names,
-    axis_of,
-    default_names,
-    known_names,
-    priors_from_gyro,
-    unit_of,
-    values_of,
-    with_values,
-)
-from strapdown.tuning.planning import Plan, plan, simulated_again
-from strapdown.tuning.starting import one_gyro, record_case, recording_case, recording_setup
-from strapdown.tuning.suspicion import ScaleFactor, Unmodelled, doubted, unmodelled
+from strapdown.tuning.credibility import CredibilityObjective as CredibilityObjective
+from strapdown.tuning.credibility import credibility_objective as credibility_objective
+from strapdown.tuning.errors import ErrorObjective as ErrorObjective
+from strapdown.tuning.errors import error_objective as error_objective
+from strapdown.tuning.fitting import Estimated as Estimated
+from strapdown.tuning.fitting import Slices as Slices
+from strapdown.tuning.fitting import Tuning, fit
+from strapdown.tuning.fitting import rescaled as rescaled
+from strapdown.tuning.fitting import search as search
+from strapdown.tuning.fitting import slices as slices
+from strapdown.tuning.holding import Comparison as Comparison
+from strapdown.tuning.holding import NeesCourse as NeesCourse
+from strapdown.tuning.holding import Performance as Performance
+from strapdown.tuning.holding import compare, split
+from strapdown.tuning.holding import performance as performance
+from strapdown.tuning.innovations import Case, likelihood
+from strapdown.tuning.innovations import Derivatives as Derivatives
+from strapdown.tuning.innovations import Likelihood as Likelihood
+from strapdown.tuning.innovations import thinned as thinned
+from strapdown.tuning.outliers import ContaminatedLikelihood as ContaminatedLikelihood
+from strapdown.tuning.outliers import TunedGate as TunedGate
+from strapdown.tuning.outliers import contaminated_likelihood as contaminated_likelihood
+from strapdown.tuning.outliers import log_likelihood as log_likelihood
+from strapdown.tuning.outliers import tuned_gate as tuned_gate
+from strapdown.tuning.parameters import Prior, priors_from_gyro
+from strapdown.tuning.parameters import axis_names as axis_names
+from strapdown.tuning.parameters import axis_of as axis_of
+from strapdown.tuning.parameters import default_names as default_names
+from strapdown.tuning.parameters import known_names as known_names
+from strapdown.tuning.parameters import unit_of as unit_of
+from strapdown.tuning.parameters import values_of as values_of
+from strapdown.tuning.parameters import with_values as with_values
+from strapdown.tuning.planning import Plan as Plan
+from strapdown.tuning.planning import plan
+from strapdown.tuning.planning import simulated_again as simulated_again
+from strapdown.tuning.procedure import GATED as GATED
+from strapdown.tuning.procedure import Tuned as Tuned
+from strapdown.tuning.procedure import objective_for as objective_for
+from strapdown.tuning.procedure import tune
+from strapdown.tuning.starting import one_gyro as one_gyro
+from strapdown.tuning.starting import record_case, recording_case
+from strapdown.tuning.starting import recording_setup as recording_setup
+from strapdown.tuning.suspicion import ScaleFactor as ScaleFactor
+from strapdown.tuning.suspicion import Unmodelled as Unmodelled
+from strapdown.tuning.suspicion import doubted as doubted
+from strapdown.tuning.suspicion import unmodelled as unmodelled
 
 __all__ = [
     "Case",
-    "Comparison",
-    "ContaminatedLikelihood",
-    "CredibilityObjective",
-    "Derivatives",
-    "ErrorObjective",
-    "Estimated",
-    "Likelihood",
-    "NeesCourse",
-    "Performance",
-    "Plan",
     "Prior",
-    "ScaleFactor",
-    "Slices",
-    "TunedGate",
     "Tuning",
-    "Unmodelled",
-    "axis_names",
-    "axis_of",
     "compare",
-    "contaminated_likelihood",
-    "credibility_objective",
-    "default_names",
-    "doubted",
-    "error_objective",
     "fit",
-    "known_names",
     "likelihood",
-    "log_likelihood",
-    "one_gyro",
-    "performance",
     "plan",
     "priors_from_gyro",
     "record_case",
     "recording_case",
-    "recording_setup",
-    "rescaled",
-    "search",
-    "simulated_again",
-    "slices",
     "split",
-    "thinned",
-    "tuned_gate",
-    "unit_of",
-    "unmodelled",
-    "values_of",
-    "with_values",
+    "tune",
 ]

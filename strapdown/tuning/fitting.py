@@ -15,9 +15,10 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from strapdown.checks import Array, InputError, count, known_keys, positive
+from strapdown.listing import Listed, Listing, figure
 from strapdown.setup import FilterSetup
 from strapdown.tuning.innovations import Derivatives
-from strapdown.tuning.parameters import RRW, SCALE, Prior, with_values
+from strapdown.tuning.parameters import RRW, SCALE, Prior, fixed_unit, with_values
 
 LONGEST_STEP = 2.0
 """Of a log parameter in one step of the search."""
@@ -194,7 +195,7 @@ class Estimated:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Tuning:
+class Tuning(Listed):
     """The outcome of a tuning."""
 
     parameters: tuple[Estimated, ...]
@@ -221,6 +222,23 @@ class Tuning:
     """Searches that ended within a thousandth of a log likelihood of the best."""
     composite: bool = False
     """Whether what was minimised is no likelihood, so that intervals come from the scatter of its gradient (sandwich)."""
+
+    def listing(self) -> Listing:
+        """Return the parameters with their intervals, as a table; σ of sensors in rad or the unit of the vector."""
+        rows = []
+        for one in self.parameters:
+            unit = fixed_unit(one.name)
+            values = [figure(x / unit.factor, 3) for x in (one.start, one.value, one.lower, one.upper)]
+            rows.append((one.name, unit.name, *values, "" if one.identified else "not identified"))
+        notes = [
+            f"{self.agreeing} of {len(self.starts)} searches ended at the best point; gain {self.before - self.after:.4g}"
+        ]
+        if self.misfit:
+            notes.append(
+                "The innovations are not those of any such filter: disturbances last over many samples, or change."
+            )
+        columns = ("parameter", "unit", "before", "after", "from", "to", "")
+        return Listing("Tuned parameters with 95 % intervals", columns, rows, notes, left=2)
 
     def __getitem__(self, name: str) -> Estimated:
         """Return the parameter of that name."""

@@ -327,6 +327,7 @@ def likelihood(
     threads : int
         Records, or points, that are worked on at once.
     """
+    setup.need_mekf(chosen, "tuning by name")
     if not cases:
         raise InputError("there is no record to tune on; give one")
     records = [case.record for case in cases]

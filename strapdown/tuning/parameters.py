@@ -127,6 +127,20 @@ def unit_of(name: str, records: Sequence[ImuRecord]) -> Unit:
     return Unit(name="arcsec", factor=units.ARCSECOND)
 
 
+def fixed_unit(name: str) -> Unit:
+    """Return the unit that a parameter is printed in where its records are not known: SI of a sensor's σ.
+
+    Parameters
+    ----------
+    name : str
+
+    Returns
+    -------
+    Unit
+    """
+    return _UNITS.get(name, Unit(name="rad or SI", factor=1.0))
+
+
 def own_sigma(name: str, records: Sequence[ImuRecord]) -> float:
     """Return the root mean square of the σ that the records tell of a sensor, over all of its measurements."""
     sensor = name.removesuffix(SIGMA)

@@ -22,24 +22,31 @@ one number a sensor, whatever the shape of its noise; the covariance that it rep
 
 They run over whole records only: sample by sample the MEKF is there (:class:`strapdown.estimation.StepFilter`).
 
-To add a filter, write a module like those of :mod:`strapdown.kernels.filters`, which defines its error, and enter it in :data:`FILTERS`.
+A filter of one's own is compared by giving it beside their names (:mod:`strapdown.estimation.filters.own`). To add one to the package,
+write a module like those of :mod:`strapdown.kernels.filters`, which defines its error, and enter it in :data:`FILTERS`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Protocol
 
 from strapdown.checks import InputError, one_of
 from strapdown.estimation import forward
 from strapdown.estimation.filters import complementary, extended, unscented
-from strapdown.estimation.filters.comparison import Comparison
+from strapdown.estimation.filters.comparison import Comparison as Comparison
+from strapdown.estimation.filters.own import Own, OwnFilter, as_own
 from strapdown.estimation.states import ProcessNoise, State
 from strapdown.kernels.filters import equivariant, fixed_side, geometric, right_invariant, schmidt, two_frame
 from strapdown.records import Estimate, ImuRecord, Truth
 
-__all__ = ["FILTERS", "Comparison", "Filter", "compare", "run"]
+__all__ = [
+    "FILTERS",
+    "OwnFilter",
+    "compare",
+    "run",
+]
 
 
 class Filter(Protocol):
@@ -110,7 +117,7 @@ def compare(
     process_noise: ProcessNoise,
     initial: State,
     *,
-    filters: Iterable[str] = tuple(FILTERS),
+    filters: Iterable[str | OwnFilter | Callable[[ImuRecord, State], Estimate]] = tuple(FILTERS),
     every: int = 1,
     full_covariance: bool = False,
 ) -> Comparison:
@@ -123,16 +130,27 @@ def compare(
     ----------
     record, process_noise, initial, every, full_covariance
         As :func:`run`. Of a record with truth the errors are told, of others the differences from the first filter.
-    filters : iterable of str
-        Default: all. The unscented filter takes some tenths of a millisecond a step, the others a microsecond.
+    filters : iterable of str or filter
+        Names of :data:`FILTERS`, and filters of one's own (:mod:`strapdown.estimation.filters.own`). Default: all of this package. The
+        unscented filter takes some tenths of a millisecond a step, the others a microsecond.
     """
-    names = [filters] if isinstance(filters, str) else list(filters)
-    if not names:
+    chosen = [
+        one if isinstance(one, str) else as_own(one) for one in ([filters] if isinstance(filters, str) else filters)
+    ]
+    if not chosen:
         raise InputError(f"filters is empty; name at least one of {', '.join(FILTERS)}")
-    for name in names:
-        one_of("filter", name, FILTERS)
+    for one in chosen:
+        if isinstance(one, str):
+            one_of("filter", one, FILTERS)
+    names = [one if isinstance(one, str) else one.name for one in chosen]
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        raise InputError(f"filters holds two of the name {min(twice)}; give yours another by an attribute name")
     estimates = {
-        name: run(name, record, process_noise, initial, every=every, full_covariance=full_covariance) for name in names
+        name: one(record, initial, times=record.time[::every])
+        if isinstance(one, Own)
+        else run(one, record, process_noise, initial, every=every, full_covariance=full_covariance)
+        for name, one in zip(names, chosen, strict=True)
     }
     truth = record.truth
     kept = None if truth is None else Truth(attitude=truth.attitude[::every], bias=truth.bias[::every])

@@ -1,0 +1,107 @@
+"""Configuration of the documentation: ``pip install '.[docs]' && sphinx-build -W -b html docs docs/_build``.
+
+Every page is executed when it is built, in an empty folder, and nothing is fetched from the network, neither by the build nor by the pages.
+"""
+
+import os
+import re
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from docutils import nodes
+from docutils.utils.math import MathError, latex2mathml
+from sphinx.errors import ExtensionError
+
+DOCS = Path(__file__).resolve().parent
+sys.path.insert(0, str(DOCS.parent))
+
+import strapdown  # noqa: E402
+
+project = "strapdown"
+author = "The strapdown founders"
+copyright = "The strapdown founders, MIT licence"
+version = release = strapdown.__version__
+
+extensions = ["myst_nb", "numpydoc", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.viewcode"]
+exclude_patterns = ["_build", "jupyter_execute", "_data", "_templates", "**.ipynb_checkpoints"]
+templates_path = ["_templates"]
+
+# What a page's kernel needs: the program and the package of this build, one thread, tables of one width, and the way back to the docs.
+os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(DOCS.parent), os.environ.get("PYTHONPATH", "")]))
+os.environ.update(
+    STRAPDOWN_DOCS=str(DOCS), COLUMNS="96", NO_COLOR="1", TERM="dumb", OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1"
+)
+os.environ.pop("MPLBACKEND", None)  # pages draw inline
+_profile = tempfile.TemporaryDirectory()
+os.environ["IPYTHONDIR"] = _profile.name
+(Path(_profile.name) / "profile_default").mkdir()
+(Path(_profile.name) / "profile_default/ipython_kernel_config.py").write_text(
+    "c.IPKernelApp.log_level = 40\n"
+    "c.InlineBackend.figure_formats = {'svg'}\n"
+    "c.InlineBackend.rc = {'figure.figsize': (6.4, 3.6), 'font.size': 9.0, 'svg.fonttype': 'path'}\n"
+)
+
+nb_execution_mode = "force"
+nb_execution_in_temp = True
+nb_execution_raise_on_error = True
+nb_execution_timeout = 300
+nb_merge_streams = True
+nb_render_markdown_format = "myst"
+nb_output_stderr = "remove"  # progress bars; an error still stops the build
+myst_enable_extensions = ["amsmath", "dollarmath", "deflist", "attrs_inline"]
+myst_heading_anchors = 3
+
+autosummary_generate = True
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"  # numpydoc's parameters say it
+autodoc_default_options = {"members": True}
+numpydoc_show_class_members = False
+numpydoc_class_members_toctree = False
+
+html_theme = "furo"
+html_title = "strapdown"
+html_static_path = ["_static"]
+html_css_files = ["strapdown.css"]
+html_copy_source = False
+html_show_sphinx = False
+html_theme_options = {"navigation_with_keys": True}
+
+
+def _mathml(self: Any, node: nodes.Element, *, block: bool) -> None:
+    """Write a formula as MathML, which browsers draw by themselves: no script and nothing to fetch."""
+    try:
+        markup = latex2mathml.tex2mathml(node.astext(), as_block=block)
+    except MathError as error:
+        raise ExtensionError(f"{node.source}:{node.line}: {error} in {node.astext()}") from error
+    markup = _spaced(markup)
+    if block:
+        number = f'<span class="eqno">({node["number"]})</span>' if node.get("number") else ""
+        markup = f'<div class="math">{markup}{number}</div>\n'
+    self.body.append(markup)
+    raise nodes.SkipNode
+
+
+_FUNCTION = r"<mi>[a-zA-Z]+</mi>\s*<mo>&ApplyFunction;</mo>"
+_THIN = '<mspace width="0.17em"></mspace>'
+
+
+def _spaced(markup: str) -> str:
+    """Return MathML with TeX's spaces: thin ones about the name of a function, none about a slash or a bar."""
+    markup = re.sub(rf"(</(?:mi|mn|mfrac|mrow|msup|msub)>)(\s*{_FUNCTION})", rf"\1{_THIN}\2", markup)
+    markup = re.sub(rf"({_FUNCTION})(?!\s*(?:<mrow>\s*)?<mo[^>]*>[(\[])", rf"\1{_THIN}", markup)
+    return re.sub(r"<mo[^>]*>([/|])</mo>", r'<mo lspace="0" rspace="0">\1</mo>', markup)
+
+
+def setup(app: Any) -> None:
+    """Register the writer of formulas."""
+    app.add_html_math_renderer(
+        "mathml",
+        (lambda self, node: _mathml(self, node, block=False), None),
+        (lambda self, node: _mathml(self, node, block=True), None),
+    )
+
+
+html_math_renderer = "mathml"

@@ -1,0 +1,235 @@
+"""Reference of the scenario file, generated from the tables and dataclasses that the parser itself uses.
+
+``sections()`` returns every table of a scenario file with its keys; ``markdown()`` renders those of one table for ``guide/simulate.md``.
+"""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import inspect
+import itertools
+import math
+import textwrap
+import typing
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpydoc.docscrape import NumpyDocString
+
+from strapdown import datasheets, gyro, motion, orbit, scenarios, tables, vectors
+
+SYMBOLS = {
+    "": "",
+    "s": "s",
+    "hz": "Hz",
+    "m": "m",
+    "km": "km",
+    "kg_m2": "kg m²",
+    "deg": "°",
+    "rad": "rad",
+    "arcsec": "″",
+    "mrad": "mrad",
+    "ppm": "ppm",
+    "ratio": "1",
+    "nt": "nT",
+    "t": "T",
+    "deg_per_s": "°/s",
+    "deg_per_hour": "°/h",
+    "deg_per_sqrt_hour": "°/√h",
+    "deg_per_hour_per_sqrt_hour": "°/h/√h",
+    "deg_per_hour_per_hour": "°/h²",
+    "deg_per_hour_per_g": "°/h/g",
+    "deg_per_hour_per_kelvin": "°/h/K",
+    "rad_per_s": "rad/s",
+    "rad_per_sqrt_s": "rad/√s",
+    "rad_per_s_per_sqrt_s": "rad/s/√s",
+    "rad_per_s2": "rad/s²",
+    "rad_per_s_per_kelvin": "rad/s/K",
+    "rad_s_per_m": "rad s/m",
+    "m_per_s2": "m/s²",
+}
+"""The unit that each ending of a key stands for."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Key:
+    """One quantity of a table."""
+
+    name: str
+    """Key with its usual unit."""
+    others: tuple[str, ...] = ()
+    """The same quantity in other units."""
+    unit: str = ""
+    type: str
+    default: str
+    """As TOML; "required" where there is none, "none" for one that no number stands for."""
+    meaning: str = ""
+    example: Any
+    """A value that the parser accepts."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Section:
+    """One table of the file, of one type."""
+
+    group: Literal["top", "motion", "gyro", "sensors"]
+    header: str
+    """How the table begins in the file."""
+    type: str = ""
+    """Value of the key ``type``, if the table has one."""
+    summary: str
+    keys: tuple[Key, ...] = ()
+
+
+def sections() -> list[Section]:
+    """Return every table of a scenario file."""
+    said = _meanings(scenarios.Scenario)
+    names = (_text(name, said.get(name, "")) for name in ("name", "description"))
+    keys = (*names, *_keys(scenarios.Scenario, scenarios._TOP_FORM))
+    top = Section(group="top", header="top of the file", summary="before the first table.", keys=keys)
+    return [top, *_motions(), _gyro(), *_sensors()]
+
+
+def markdown(group: str) -> str:
+    """Return the sections of one group (``top``, ``motion``, ``gyro``, ``sensors``) as MyST Markdown, keys that all sensors share once."""
+    chosen = [one for one in sections() if one.group == group]
+    if group == "sensors":
+        typed = [one for one in chosen if one.type]
+        shared = set.intersection(*({key.name for key in one.keys} for one in typed))
+        first = tuple(key for key in typed[0].keys if key.name in shared)
+        own = [
+            replace(one, keys=tuple(key for key in one.keys if not (one.type and key.name in shared))) for one in chosen
+        ]
+        chosen = [replace(typed[0], type="", summary="Keys of every type of sensor.", keys=first), *own]
+    return "\n\n".join(_section(one) for one in chosen)
+
+
+def _section(section: Section) -> str:
+    type_line = f', `type = "{section.type}"`' if section.type else ""
+    head = f"**`{section.header}`{type_line}**: {section.summary}"
+    rows = ["| key | unit | value | default | meaning |", "|---|---|---|---|---|"]
+    for key in section.keys:
+        other = "".join(f"<br>or `{name}`" for name in key.others)
+        rows.append(f"| `{key.name}`{other} | {key.unit} | {key.type} | {key.default} | {key.meaning} |")
+    return "\n".join([head, "", *(rows if section.keys else [])])
+
+
+# ---------------------------------------------------------------------------------------------------------------- the tables
+
+
+def _motions() -> list[Section]:
+    def section(word: str, subject: Any, keys: tuple[Key, ...], more: str = "", header: str = "[motion]") -> Section:
+        return Section(group="motion", header=header, type=word, summary=_summary(subject) + more, keys=keys)
+
+    found = [section(word, kind, _keys(kind, form)) for word, (kind, form) in scenarios._MOTIONS.items()]
+    harmonic = _keys(motion.Harmonic, scenarios._HARMONIC)
+    start = _keys(motion.ConstantRate, {"initial_attitude": tables.PLAIN})
+    parts = " Each is a table with a `type` and keys of its own: `[motion.base]`, `[motion.vibration]`."
+    return [
+        *found,
+        section("", motion.Harmonic, harmonic, " One such table for each.", "[[motion.harmonics]]"),
+        section("rest", motion.rest, start),
+        section("composed", motion.Composed, (), parts),
+    ]
+
+
+def _gyro() -> Section:
+    names = ", ".join(f"`{name}`" for name in datasheets.PRESETS)
+    preset = _text("preset", f"A gyro on the market, of which other keys change what they name. One of {names}.")
+    keys = (replace(preset, example=next(iter(datasheets.PRESETS))), *_keys(gyro.GyroSpec, gyro.FORM))
+    return Section(group="gyro", header="[gyro]", summary="the gyro; what is left out is perfect.", keys=keys)
+
+
+def _sensors() -> list[Section]:
+    def section(word: str, subject: Any, keys: tuple[Key, ...], header: str = "[[sensors]]") -> Section:
+        return Section(group="sensors", header=header, type=word, summary=_summary(subject), keys=keys)
+
+    found = [
+        section(word, kind, (*_keys(kind, form), *_keys(vectors.Faults, scenarios._faults(unit))))
+        for word, (kind, form, unit) in scenarios._SENSORS.items()
+    ]
+    return [*found, section("", orbit.CircularOrbit, _keys(orbit.CircularOrbit, scenarios._ORBIT), "[sensors.orbit]")]
+
+
+# ------------------------------------------------------------------------------------------------------- from the dataclasses
+
+
+def _keys(kind: type, form: tables.Form) -> tuple[Key, ...]:
+    meanings, hints = _meanings(kind), typing.get_type_hints(kind)
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+    return tuple(_key(fields[name], hints[name], choice, meanings.get(name, "")) for name, choice in form.items())
+
+
+def _key(field: dataclasses.Field[Any], hint: Any, choice: tables.Choice, meaning: str) -> Key:
+    names = [f"{field.name}_{suffix}" if suffix else field.name for suffix, _ in choice]
+    suffix, factor = choice[0]
+    default = field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
+    kind = _type(hint, default)
+    if default is dataclasses.MISSING:
+        example = _EXAMPLES[kind]
+    else:
+        example = default if isinstance(default, str | int) else (np.asarray(default, float) / (factor or 1.0)).tolist()
+    return Key(
+        name=names[0],
+        others=tuple(names[1:]),
+        unit=SYMBOLS[suffix],
+        type=kind,
+        default="required" if default is dataclasses.MISSING else _toml(example),
+        meaning=meaning,
+        example=example,
+    )
+
+
+_TYPES = {str: "text", int: "whole number", float: "number", gyro.Axes: "number, or one an axis"}
+
+
+def _type(hint: Any, default: Any) -> str:
+    if hint in _TYPES or typing.get_origin(hint) is Literal:
+        return _TYPES.get(hint, "text")
+    shape = (3,) if default is dataclasses.MISSING else np.shape(default)
+    if shape == (0,):
+        return "list of [from, to]"
+    return f"{shape[0]} rows of {shape[1]}" if len(shape) == 2 else f"list of {shape[0]}"
+
+
+_EXAMPLES: dict[str, Any] = {"text": "some text", "number": 1.0, "list of 3": [1.0, 1.0, 1.0]}
+
+
+def _text(name: str, meaning: str) -> Key:
+    return Key(name=name, type="text", default="none", meaning=meaning, example="some text")
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, list):
+        flat = np.asarray(value).ravel()
+        if value and not np.any(flat):
+            return "zeros"
+        return "[" + ", ".join(_toml(one) for one in value) + "]"
+    if isinstance(value, float):
+        return "none (`inf`)" if math.isinf(value) else f"{value:.9g}"
+    return f"`{value!r}`".replace("'", '"') if isinstance(value, str) else str(value)
+
+
+def _summary(subject: Any) -> str:
+    text = " ".join((inspect.getdoc(subject) or "").split("\n\n")[0].split())
+    return text.replace("``", "`").removeprefix("Return ")
+
+
+def _meanings(kind: type) -> dict[str, str]:
+    """Return what is said of each field: in the string below it, or in the section Parameters or Attributes of the class."""
+    said = {}
+    document = NumpyDocString(inspect.getdoc(kind) or "")
+    for entry in (*document["Parameters"], *document["Attributes"]):
+        said[entry.name] = " ".join(entry.desc)
+    body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0].body  # type: ignore[attr-defined]
+    for statement, below in itertools.pairwise(body):
+        if (
+            isinstance(statement, ast.AnnAssign)
+            and isinstance(below, ast.Expr)
+            and isinstance(below.value, ast.Constant)
+            and isinstance(below.value.value, str)
+        ):
+            said[ast.unparse(statement.target)] = below.value.value
+    return {name: " ".join(text.split()).replace("``", "`").replace("|", "\\|") for name, text in said.items()}

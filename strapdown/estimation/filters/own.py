@@ -1,0 +1,220 @@
+"""A filter of one's own: a function, or an object with a method ``run``, that takes a record and an initial state and returns an estimate.
+
+Where a filter of this package is named, one's own may stand instead: in :attr:`strapdown.setup.FilterSetup.estimator`, and so in every
+Monte Carlo (threads, processes or Dask, resumed and replayed), and in :func:`strapdown.estimation.filters.compare`.
+
+>>> import numpy as np
+>>> from strapdown import quaternion
+>>> from strapdown.records import Estimate
+>>> def dead_reckoning(record, initial):
+...     turns = quaternion.exp(record.increments - initial.bias * np.diff(record.time)[:, None])
+...     attitude = [initial.attitude]
+...     for turn in turns:
+...         attitude.append(quaternion.normalize(quaternion.multiply(attitude[-1], turn)))
+...     P = np.repeat(initial.covariance[None, :3, :3], len(attitude), axis=0)
+...     return Estimate.from_arrays(record.time, attitude, P)
+"""
+
+from __future__ import annotations
+
+import copy
+import functools
+import hashlib
+import inspect
+import json
+import types
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+
+from strapdown.checks import Array, InputError, array, increasing, instance
+from strapdown.estimation.states import State
+from strapdown.records import Estimate, ImuRecord
+
+__all__ = ["Own", "OwnFilter", "as_own"]
+
+
+class OwnFilter(Protocol):
+    """What a filter of one's own provides; a plain function of the same two arguments does as well."""
+
+    def run(self, record: ImuRecord, initial: State) -> Estimate:
+        """Return the estimate at the record's edges, or at some of them.
+
+        Parameters
+        ----------
+        record : ImuRecord
+            Gyro increments, rad, and measurements; without the truth. Its σ are those that the setup says the filter assumes.
+        initial : State
+            Attitude, gyro bias (rad/s) and covariance (6, 6) of their errors at the first edge. A filter that finds its start by itself
+            ignores it.
+
+        Returns
+        -------
+        Estimate
+            :meth:`strapdown.records.Estimate.from_arrays` makes one.
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class Own:
+    """A filter of one's own with its description; :func:`as_own` makes it. Two of the same description are equal.
+
+    Each call works on a deep copy of an object, so that runs share no state: they may go on in several threads, and in any order.
+    """
+
+    given: Any
+    """The function or object, or the description of one that a file holds."""
+
+    def __post_init__(self) -> None:
+        """Check that it can be called."""
+        if not isinstance(self.given, Mapping):
+            _function(self.given)
+
+    @property
+    def name(self) -> str:
+        """Its attribute ``name`` where it has one, or the name of the function or class."""
+        return str(self.table["name"])
+
+    @functools.cached_property
+    def table(self) -> dict[str, Any]:
+        """What identifies it in files: name, parameters, and the SHA-256 of its source where Python knows that."""
+        if isinstance(self.given, Mapping):
+            return dict(self.given)
+        inner, parameters = self.given, {}
+        while isinstance(inner, functools.partial):
+            parameters.update({**{str(k): v for k, v in enumerate(inner.args)}, **inner.keywords})
+            inner = inner.func
+        code: Any = inner if isinstance(inner, types.FunctionType | types.BuiltinFunctionType | type) else type(inner)
+        if isinstance(inner, types.MethodType):
+            code, inner = inner.__func__, inner.__self__
+        if code is not inner:
+            names = [f.name for f in fields(inner)] if is_dataclass(inner) else list(getattr(inner, "__dict__", {}))
+            parameters.update({name: getattr(inner, name) for name in names})
+        name = getattr(inner, "name", None)
+        table: dict[str, Any] = {
+            "name": name if isinstance(name, str) else getattr(code, "__name__", type(code).__name__)
+        }
+        plain = {key: _plain(value) for key, value in sorted(parameters.items()) if key != "name"}
+        if plain:
+            table["parameters"] = plain
+        try:
+            table["source_sha256"] = hashlib.sha256(inspect.getsource(code).encode()).hexdigest()
+        except (OSError, TypeError):  # typed at a prompt, or compiled
+            table["module"] = str(getattr(code, "__module__", ""))
+        return table
+
+    def __eq__(self, other: object) -> bool:
+        """Compare descriptions."""
+        return isinstance(other, Own) and self.table == other.table
+
+    def __hash__(self) -> int:
+        """Return a hash of the description."""
+        return hash(json.dumps(self.table, sort_keys=True, default=str))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Send the filter itself; its description is made anew."""
+        return Own, (self.given,)
+
+    def __call__(self, record: ImuRecord, initial: State, *, times: Array | None = None) -> Estimate:
+        """Run it over a record and check what it returns.
+
+        Parameters
+        ----------
+        record : ImuRecord
+            The truth is taken out before the filter sees it.
+        initial : State
+        times : array, optional
+            Times wanted, of the record's edges; default: those that the filter returns.
+        """
+        if isinstance(self.given, Mapping):
+            raise InputError(
+                f"{self.name} is a filter of your own, whose code no file holds; in Python, give it again: "
+                "replace(plan, setup=replace(plan.setup, estimator=…))"
+            )
+        estimate = _function(_copied(self.given, self.name))(replace(record, truth=None), initial)
+        return _checked(self.name, estimate, record, times)
+
+
+def as_own(filter_: Any) -> Own:
+    """Return one's own filter with its description.
+
+    Raises
+    ------
+    InputError
+        If it is neither a function nor an object with a method ``run``, or has not two arguments.
+    """
+    return filter_ if isinstance(filter_, Own) else Own(filter_)
+
+
+def _function(given: Any) -> Any:
+    """Return what is called: the method ``run`` of an object that has one, else the object itself."""
+    if isinstance(given, type):
+        raise InputError(f"{given.__name__} is a class; give an object of it, {given.__name__}(…)")
+    function = getattr(given, "run", given)
+    if not callable(function):
+        raise InputError(
+            f"{given!r} is no filter; give a function of (record, initial) that returns an Estimate, or an object with such a method run"
+        )
+    try:
+        inspect.signature(function).bind(None, None)
+    except TypeError:
+        raise InputError(
+            f"{getattr(function, '__qualname__', given)} cannot be called with (record, initial); give it these two arguments"
+        ) from None
+    except ValueError:  # a compiled function without a signature
+        pass
+    return function
+
+
+def _copied(given: Any, name: str) -> Any:
+    try:
+        return copy.deepcopy(given)  # functions come back as they are
+    except Exception as error:
+        raise InputError(
+            f"{name} cannot be copied for each run ({error}); give a function that makes what cannot be copied anew"
+        ) from None
+
+
+def _checked(name: str, estimate: Any, record: ImuRecord, times: Array | None) -> Estimate:
+    """Return an estimate, of the wanted times only; refuse what cannot be compared with the record's truth."""
+    own: Estimate = estimate
+    instance(
+        f"what {name} returns", estimate, Estimate, "return Estimate.from_arrays(record.time, attitude, covariance)"
+    )
+    time = increasing(f"{name}: time", estimate.time)
+    place = np.minimum(np.searchsorted(record.time, time), len(record.time) - 1)
+    if not np.array_equal(record.time[place], time):
+        k = int(np.argmax(record.time[place] != time))
+        raise InputError(
+            f"{name}: time[{k}] is {time[k]:.9g} s, and the record has no edge there; return values at record.time"
+        )
+    for what, width in (("attitude", 4), ("bias", 3), ("variance", 6)):
+        array(f"{name}: {what}", np.nan_to_num(getattr(estimate, what)), (len(time), width))
+    if times is None:
+        return own
+    rows = np.minimum(np.searchsorted(time, times), len(time) - 1)
+    if not np.array_equal(time[rows], times):
+        k = int(np.argmax(time[rows] != times))
+        raise InputError(f"{name} gives no value at {times[k]:.9g} s; return one at each of record.time")
+    of_rows: dict[str, Any] = {
+        what: None if (value := getattr(estimate, what)) is None else value[rows]
+        for what in ("attitude", "bias", "variance", "covariance")
+    }
+    return replace(own, time=time[rows], **of_rows)
+
+
+def _plain(value: Any) -> Any:
+    """Return a parameter as a file can hold it: numbers and texts as they are, anything else by its type."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    if isinstance(value, Mapping):
+        return {str(key): _plain(one) for key, one in value.items()}
+    if is_dataclass(value) and not isinstance(value, type):
+        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
+    return getattr(value, "__qualname__", None) or ("none" if value is None else type(value).__qualname__)

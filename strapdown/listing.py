@@ -1,0 +1,94 @@
+"""Results as short tables: for ``print`` and for notebooks. Private; results derive from :class:`Listed`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from html import escape
+from typing import NamedTuple
+
+__all__ = ["Listed", "Listing", "figure"]
+
+
+class Listing(NamedTuple):
+    """A table of text with a title above and notes below."""
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    notes: Sequence[str] = ()
+    left: int = 1
+    """Number of first columns that hold words, the others hold numbers."""
+
+    @property
+    def text(self) -> str:
+        """The table as lines of text."""
+        cells = [list(self.columns), *(list(row) for row in self.rows)]
+        widths = [max(len(row[k]) for row in cells) for k in range(len(self.columns))]
+        lines = [
+            "  ".join(
+                f"{cell:{'<' if k < self.left else '>'}{width}}"
+                for k, (cell, width) in enumerate(zip(row, widths, strict=True))
+            )
+            for row in cells
+        ]
+        table = [lines[0], "-" * len(lines[0]), *lines[1:]] if self.rows else []
+        return "\n".join(line.rstrip() for line in (self.title, *table, *self.notes))
+
+    @property
+    def html(self) -> str:
+        """The table as HTML, for notebooks."""
+
+        def row(cells: Sequence[str], tag: str) -> str:
+            sides = ("left" if k < self.left else "right" for k in range(len(cells)))
+            return "".join(
+                f'<{tag} style="text-align:{side}">{escape(cell)}</{tag}>'
+                for side, cell in zip(sides, cells, strict=True)
+            )
+
+        body = "".join(f"<tr>{row(cells, 'td')}</tr>" for cells in self.rows)
+        table = f"<table><thead><tr>{row(self.columns, 'th')}</tr></thead><tbody>{body}</tbody></table>"
+        notes = "".join(f"<p>{escape(line)}</p>" for note in self.notes for line in note.splitlines())
+        return f"<div><p><b>{escape(self.title)}</b></p>{table if self.rows else ''}{notes}</div>"
+
+
+class Listed:
+    """Base of a result that prints as a short table.
+
+    Examples
+    --------
+    >>> class Result(Listed):
+    ...     def listing(self):
+    ...         return Listing("Errors", ("axis", "deg"), [("x", "0.1"), ("y", "12.3")])
+    >>> print(Result())
+    Errors
+    axis   deg
+    ----------
+    x      0.1
+    y     12.3
+    """
+
+    def listing(self) -> Listing:
+        """Return the result as a table."""
+        raise NotImplementedError
+
+    def __str__(self) -> str:
+        return self.listing().text
+
+    def _repr_html_(self) -> str:
+        return self.listing().html
+
+
+def figure(value: float | None, digits: int = 4) -> str:
+    """Return a number with so many significant digits; a dash where there is none.
+
+    Examples
+    --------
+    >>> figure(0.123456), figure(float("nan")), figure(float("inf"))
+    ('0.1235', '-', '∞')
+    """
+    if value is None or math.isnan(value):
+        return "-"
+    if math.isinf(value):
+        return "∞" if value > 0.0 else "-∞"
+    return f"{value:.{digits}g}"

@@ -1,0 +1,104 @@
+"""Axes and signs of a recording's sensors, where they are not those of :mod:`strapdown`.
+
+A rate gyro measures by the right-hand rule, an accelerometer the specific force (at rest +g upward), a magnetometer the field. Devices
+differ: bodies whose z axis points down, phones whose accelerometer reads the opposite sign, boards with a turned magnetometer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from strapdown import quaternion
+from strapdown.checks import Array, InputError, one_of
+from strapdown.recordings.recording import Recording
+
+SENSORS = {"gyro": "rate", "accelerometer": "specific_force", "magnetometer": "magnetic_field"}
+"""Sensors of a recording, and their columns."""
+
+
+def axes_matrix(text: str, name: str = "axes") -> Array:
+    """Return the signed permutation C (3, 3) of a text such as ``"x,-y,-z"``: ``v = C v_recorded``.
+
+    Raises
+    ------
+    InputError
+        If the text does not name each of x, y, z once.
+
+    Examples
+    --------
+    >>> axes_matrix("y,-x,z") @ [1.0, 2.0, 3.0]
+    array([ 2., -1.,  3.])
+    """
+    parts = text.replace("\N{MINUS SIGN}", "-").replace("+", "").replace(" ", "").lower().split(",")
+    if sorted(part.removeprefix("-") for part in parts) != ["x", "y", "z"]:
+        raise InputError(f"{name} is {text!r}; give each of x, y and z once, with a sign where inverted, as in x,-y,-z")
+    matrix = np.zeros((3, 3))
+    for row, part in enumerate(parts):
+        matrix[row, "xyz".index(part[-1])] = -1.0 if part.startswith("-") else 1.0
+    return matrix
+
+
+def with_axes(
+    recording: Recording, axes: str | Mapping[str, str] | None = None, invert: str | Iterable[str] = ()
+) -> Recording:
+    """Return a recording in other body axes, or with the axes of single sensors corrected.
+
+    Parameters
+    ----------
+    recording : Recording
+    axes : str or mapping, optional
+        The recorded axes that become x, y, z: ``"x,-y,-z"`` turns forward-right-down axes to forward-left-up ones. Of the whole unit,
+        its reference attitude included; or by sensor, ``{"magnetometer": "y,x,-z"}``.
+    invert : str or iterable of str
+        Sensors whose sign is inverted on all axes: gyro, accelerometer, magnetometer.
+
+    Returns
+    -------
+    Recording
+        Its ``remarks`` say what was changed.
+
+    Raises
+    ------
+    InputError
+        If the axes are none, the recording has no such sensor, or a mirrored unit has a reference attitude.
+    """
+    whole, single = (None, dict(axes)) if isinstance(axes, Mapping) else (axes, {})
+    matrices = {sensor: axes_matrix(text, f"axes of the {sensor}") for sensor, text in single.items()}
+    words = [f"Axes of the {sensor} read as ({text})." for sensor, text in single.items()]
+    for sensor in [invert] if isinstance(invert, str) and invert else invert:
+        matrices[sensor] = -matrices.get(sensor, np.eye(3))
+        words.append(f"Sign of the {sensor} inverted.")
+    changed: dict[str, Array] = {}
+    for sensor, matrix in matrices.items():
+        column = SENSORS[one_of("axes and invert: sensor", sensor, SENSORS)]
+        samples = getattr(recording, column)
+        if samples is None:
+            raise InputError(f"{recording.source} has no {sensor}; leave its axes and its inversion out")
+        changed[column] = samples @ matrix.T
+    result = replace(recording, **changed)  # type: ignore[arg-type]
+    if whole:
+        result = _turned(result, axes_matrix(whole))
+        words.append(f"Body axes read as ({whole}).")
+    return replace(result, remarks=(*recording.remarks, *words))
+
+
+def _turned(recording: Recording, matrix: Array) -> Recording:
+    """Return the recording in the axes v' = C v, for which R' = R Cᵀ."""
+    changed = {
+        column: getattr(recording, column) @ matrix.T
+        for column in SENSORS.values()
+        if getattr(recording, column) is not None
+    }
+    if recording.true_attitude is not None:
+        if np.linalg.det(matrix) < 0.0:
+            raise InputError(
+                f"{recording.source}: axes mirror the unit, which its reference attitude cannot follow; give the axes of single sensors"
+            )
+        known = np.isfinite(recording.true_attitude).all(axis=1)
+        changed["true_attitude"] = recording.true_attitude.copy()
+        turn = quaternion.from_matrix(matrix.T)
+        changed["true_attitude"][known] = quaternion.multiply(recording.true_attitude[known], turn)
+    return replace(recording, **changed)

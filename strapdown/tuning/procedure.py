@@ -1,0 +1,184 @@
+"""A whole tuning: which objective, the search with its intervals, and what each objective leaves to be done after it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from strapdown.checks import InputError, non_negative
+from strapdown.setup import FilterSetup
+from strapdown.tuning import extended
+from strapdown.tuning.credibility import credibility_objective
+from strapdown.tuning.errors import error_objective
+from strapdown.tuning.fitting import Objective, Tuning, fit, rescaled
+from strapdown.tuning.innovations import Case, likelihood
+from strapdown.tuning.outliers import TunedGate, contaminated_likelihood, tuned_gate
+from strapdown.tuning.parameters import Prior, axis_of, default_names
+
+__all__ = ["GATED", "Tuned", "objective_for", "tune"]
+
+GATED = ("gate.probability", "outliers.share", "outliers.scale")
+"""Names of parameters that ask for a model of outliers."""
+
+
+class Tuned(NamedTuple):
+    """The outcome of :func:`tune`."""
+
+    tuning: Tuning
+    objective: Objective
+    """What was minimised."""
+    gate: TunedGate | None
+    """The gate found, with ``gate``."""
+
+
+def objective_for(
+    cases: Sequence[Case],
+    setup: FilterSetup,
+    names: Sequence[str],
+    *,
+    truth: bool = False,
+    rmse: bool = False,
+    credibility: bool = False,
+    gate: bool = False,
+    spacing: float = 0.0,
+    threads: int = 1,
+) -> Objective:
+    """Return the objective of a tuning: by default the likelihood of the innovations.
+
+    Parameters
+    ----------
+    cases : sequence of Case
+    setup : FilterSetup
+        The filter to start from; with error states, or with a σ of one axis in ``names``, the likelihood is that of
+        :mod:`strapdown.tuning.extended`.
+    names : sequence of str
+        Parameters to tune.
+    truth : bool, default False
+        The likelihood of the errors against the truth; with ``credibility`` the distribution of NEES instead of NIS.
+    rmse : bool, default False
+        The RMS attitude error against the truth.
+    credibility : bool, default False
+        The whole distribution of NIS, and whiteness.
+    gate : bool, default False
+        Model outliers too, their share and scale.
+    spacing : float, default 0
+        Least time between the samples of a sensor that are used, s.
+    threads : int, default 1
+
+    Returns
+    -------
+    Objective
+
+    Raises
+    ------
+    InputError
+        If options exclude each other, or a parameter is unknown.
+    """
+    non_negative("spacing", spacing, unit="s")
+    if rmse and truth:
+        raise InputError(
+            "--rmse and --truth both tell what of the errors against the truth is tuned by; give one of them"
+        )
+    if rmse and credibility:
+        raise InputError(
+            "--rmse and --credibility ask for different filters: small errors, or believable ones; give one of them"
+        )
+    other = truth or rmse or credibility
+    if spacing > 0.0 and other:
+        raise InputError(
+            "--spacing thins the innovations of the likelihood; against a truth, or for credibility, there are none to thin: leave it away"
+        )
+    if gate and (other or spacing > 0.0):
+        raise InputError(
+            "--gate needs the likelihood of all innovations: leave --truth, --rmse, --credibility and --spacing away"
+        )
+    by_axis = any(axis_of(name) for name in names)
+    for whole, what in (
+        (setup.states is None, "a filter with optional states"),
+        (not by_axis, "a sigma of one axis"),
+    ):
+        if not whole and (gate or other or spacing > 0.0):
+            raise InputError(
+                f"{what} is tuned by the likelihood of all innovations: leave --gate, --truth, --rmse, --credibility and --spacing away"
+            )
+    if setup.states is not None or by_axis:
+        return extended.likelihood(cases, setup, names, threads=threads)
+    if gate:
+        return contaminated_likelihood(cases, setup, names)
+    if credibility:
+        return credibility_objective(cases, setup, names, truth=truth, threads=threads)
+    if truth or rmse:
+        return error_objective(cases, setup, names, measure="rmse" if rmse else "likelihood", threads=threads)
+    return likelihood(cases, setup, names, spacing=spacing)
+
+
+def tune(
+    cases: Sequence[Case],
+    setup: FilterSetup,
+    names: Sequence[str] | None = None,
+    *,
+    priors: Mapping[str, Prior] | None = None,
+    starts: int = 4,
+    factor: float = 30.0,
+    seed: int = 0,
+    threads: int = 1,
+    progress: Callable[[int], None] | None = None,
+    gate: bool = False,
+    **objective: Any,
+) -> Tuned:
+    """Tune a filter: the objective, the search, and with ``rmse`` the common scale of all σ, with ``gate`` the filter's gate.
+
+    Parameters
+    ----------
+    cases : sequence of Case
+        Records with their initial states (:func:`record_case`, :func:`recording_case`).
+    setup : FilterSetup
+        The filter to start from.
+    names : sequence of str, optional
+        Parameters to tune; those of :data:`GATED` ask for ``gate``. Default: :func:`default_names`.
+    priors : mapping of str to Prior, optional
+    starts, factor, seed
+        As of :func:`fit`.
+    threads : int, default 1
+    progress : callable, optional
+        As of :func:`fit`.
+    gate : bool, default False
+        Model outliers too, and set the gate where an outlier is the likelier explanation.
+    **objective
+        ``truth``, ``rmse``, ``credibility``, ``spacing`` of :func:`objective_for`.
+
+    Returns
+    -------
+    Tuned
+
+    Raises
+    ------
+    InputError
+        If options exclude each other, a parameter is unknown, or the search does not converge.
+    """
+    gate = gate or any(name in GATED for name in names or ())
+    wanted = [name for name in names or () if name not in GATED] or list(default_names([case.record for case in cases]))
+    made = objective_for(cases, setup, wanted, gate=gate, threads=threads, **objective)
+    # Objectives that filter the records in threads of their own are searched one start at a time.
+    plain = gate or not (
+        any(objective.get(name) for name in ("truth", "rmse", "credibility"))
+        or isinstance(made, extended.ExtendedLikelihood)
+    )
+    result = fit(
+        made,
+        priors=priors,
+        starts=starts,
+        factor=factor,
+        seed=seed,
+        threads=threads if plain else 1,
+        progress=progress,
+    )
+    if objective.get("rmse"):
+        # The size of the error leaves a common scale open; the innovations determine it.
+        scaled = fit(likelihood(cases, result.setup, ["filter.scale"]), starts=2, threads=threads)
+        result = rescaled(result, scaled["filter.scale"].value)
+    found = tuned_gate(made, result) if gate else None  # type: ignore[arg-type]
+    if found is not None and found.gate is not None:
+        result = dataclasses.replace(result, setup=dataclasses.replace(result.setup, gate=found.gate))
+    return Tuned(result, made, found)

@@ -1,0 +1,901 @@
+"""The commonest tasks, one call each: what ``import strapdown as sd`` offers by name, shared with the command line.
+
+Each function chooses what the data specify (noise of the gyro, filter, initial state) and then calls the module that does the work, which
+is the place for more options: :mod:`strapdown.estimation` and :mod:`strapdown.setup`, :mod:`strapdown.ahrs`, :mod:`strapdown.consistency`,
+:mod:`strapdown.montecarlo`, :mod:`strapdown.tuning`, :mod:`strapdown.covariance`, :mod:`strapdown.allan`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from strapdown import (
+    ahrs,
+    allan,
+    allan_gaps,
+    coning,
+    consistency,
+    covariance,
+    gyro,
+    quaternion,
+    recordfiles,
+    recordings,
+    records,
+    scenarios,
+)
+from strapdown import setup as setups
+from strapdown.checks import Array, InputError, count, one_of
+from strapdown.consistency import Judgement
+from strapdown.covariance import Analysis, Consider
+from strapdown.estimation.gating import Gate, Robust
+from strapdown.estimation.states import ProcessNoise, State
+from strapdown.files import written_beside
+from strapdown.gyro import GyroSpec
+from strapdown.recordings import Recording
+from strapdown.records import Estimate, ImuRecord, Origin, Truth
+from strapdown.scenarios import Scenario
+from strapdown.setup import FilterSetup, for_record
+
+if TYPE_CHECKING:
+    from strapdown.allan import AllanDeviation, NoiseFit
+    from strapdown.montecarlo import Dispersions, Plan, Statistics
+    from strapdown.montecarlo.campaign import Campaign
+    from strapdown.recordings import GyroSamples
+    from strapdown.tuning import Prior, Tuning
+    from strapdown.unit_calibration import UnitCalibration
+
+__all__ = [
+    "AttitudeHistory",
+    "RecordRun",
+    "allan_deviation",
+    "check",
+    "covariance_analysis",
+    "estimate",
+    "estimate_record",
+    "fit_noise",
+    "integrate",
+    "monte_carlo",
+    "plan",
+    "read",
+    "simulate",
+    "smooth",
+    "tune",
+    "write",
+]
+
+SAME_STAMP = 1e-9
+"""Largest difference of two stamps of one epoch, s."""
+
+
+# --------------------------------------------------------------------------------------------------------- simulate, read, write
+
+
+def simulate(scenario: Scenario | str | os.PathLike[str], *, seed: int | None = None, run: int = 0) -> ImuRecord:
+    """Simulate a scenario: gyro increments and vector measurements, with the true attitude and gyro bias.
+
+    Parameters
+    ----------
+    scenario : Scenario, str or path
+        A scenario, the name of a built-in one (``strapdown.scenarios.SCENARIOS``), or the path of its TOML file.
+    seed : int, optional
+        Of the random numbers; default the scenario's own.
+    run : int, default 0
+        Number of the run; runs of one seed are independent.
+
+    Returns
+    -------
+    ImuRecord
+        Its ``truth`` is known, and its ``origin`` is the scenario, which :func:`estimate` matches its filter to.
+
+    Raises
+    ------
+    InputError
+        If there is no such scenario, or its file has an unknown key or a value out of range.
+
+    Examples
+    --------
+    >>> import strapdown as sd
+    >>> record = sd.simulate("two-stars", seed=1)
+    >>> len(record.increments), [one.sensor for one in record.vectors]
+    (30000, ['star 1', 'star 2'])
+    """
+    return scenarios.simulate(_scenario(scenario), seed, run)
+
+
+def _scenario(given: Scenario | str | os.PathLike[str]) -> Scenario:
+    return given if isinstance(given, Scenario) else scenarios.load_scenario(given)
+
+
+def read(path: str | os.PathLike[str], **options: Any) -> ImuRecord | Recording | Estimate | Campaign:
+    """Read a file of any known kind, recognised by its content.
+
+    Parameters
+    ----------
+    path : path
+        A simulated record, an estimate or a Monte Carlo of this package, or a recording of any format of
+        :data:`strapdown.recordings.FORMATS` (CSV, ROS bag, ULog, EuRoC folder, …).
+    **options
+        For recordings: ``units``, ``columns`` and ``topic`` of :func:`strapdown.recordings.read`.
+
+    Returns
+    -------
+    ImuRecord, Estimate, Campaign or Recording
+        A record has its ``origin``, a recording in ``remarks`` what the reader chose.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged, of no known format, or does not declare a unit that is needed; or if options are given that do
+        not go with it.
+
+    Examples
+    --------
+    >>> import strapdown as sd
+    >>> walk = sd.read("walk.csv", units={"gyro": "deg/s", "accelerometer": "g"})  # doctest: +SKIP
+    """
+    file = Path(path)
+    kind = ""
+    if file.is_file():
+        kind = "record" if recordfiles.is_record(file) else _kind(file)
+    if not kind:
+        return recordings.read(file, **options)
+    if options:
+        raise InputError(
+            f"{file} is a {kind} of this package and declares its own layout; leave {', '.join(options)} out"
+        )
+    if kind == "record":
+        return recordfiles.read_record_file(file).with_origin(str(file))
+    if kind == "estimate":
+        return records.read_estimate(file)
+    from strapdown.montecarlo import campaign
+
+    return campaign.read(file)
+
+
+def _kind(file: Path) -> str:
+    """Return which of this package's other files it is; empty: none of them."""
+    from strapdown import reading
+
+    if not reading.is_hdf5(file):
+        return ""
+    with reading.hdf5(file) as content:
+        kind = reading.attributes(content).get("kind")
+    return {"strapdown estimate": "estimate", "strapdown montecarlo": "Monte Carlo"}.get(str(kind), "")
+
+
+def write(
+    content: ImuRecord | Recording | Estimate | Scenario | FilterSetup, path: str | os.PathLike[str], **options: Any
+) -> None:
+    """Write a record, recording, estimate, scenario or filter setup to a file; it appears whole or not at all.
+
+    Parameters
+    ----------
+    content : ImuRecord, Recording, Estimate, Scenario or FilterSetup
+    path : path
+        The ending names the format: ``.h5`` or ``.csv`` of a record, ``.toml`` of a scenario or a filter setup,
+        and :func:`strapdown.recordings.writers` lists those of recordings and estimates.
+    **options
+        Of the format (:func:`strapdown.recordings.write`): ``sequence`` and ``frame`` of an estimate as a table.
+
+    Raises
+    ------
+    InputError
+        If the ending names no format that holds such content.
+
+    Examples
+    --------
+    >>> import strapdown as sd
+    >>> sd.write(estimate, "walk-angles.csv", sequence="ZYX")  # doctest: +SKIP
+    """
+    if isinstance(content, (Scenario, FilterSetup)):
+        if Path(path).suffix.lower() != ".toml" or options:
+            raise InputError(
+                f"{path}: a {type(content).__name__} is written as TOML without options; name a file *.toml"
+            )
+        text = setups.to_toml(content) if isinstance(content, FilterSetup) else scenarios.scenario_to_toml(content)
+        with written_beside(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    elif isinstance(content, ImuRecord) and Path(path).suffix.lower() in (".h5", ".hdf5", ".csv"):
+        _write_record(content, Path(path), options)
+    else:
+        recordings.write(content, path, **options)
+
+
+def _write_record(record: ImuRecord, path: Path, options: Mapping[str, Any]) -> None:
+    origin = record.origin or Origin()
+    writer = recordfiles.export_csv if path.suffix.lower() == ".csv" else recordfiles.write_record
+    scenario = "" if origin.scenario is None else scenarios.scenario_to_toml(origin.scenario)
+    writer(path, record, gyro_spec=origin.gyro, scenario=scenario, seed=origin.seed, run=origin.run, **options)
+
+
+# ------------------------------------------------------------------------------------------------------------------- estimate
+
+
+class RecordRun(NamedTuple):
+    """A filter's run over a record."""
+
+    estimate: Estimate
+    record: ImuRecord
+    """The part of the record from the filter's start on, at the gyro's rate."""
+    truth: Truth | None
+    """At the epochs of the estimate."""
+    initial: State
+    start: str
+    """How the initial state was found, in words."""
+
+
+def estimate_record(
+    record: ImuRecord,
+    chosen: FilterSetup,
+    start: for_record.Start | None = None,
+    *,
+    every: int = 1,
+    full_covariance: bool = True,
+    smooth: bool = False,
+) -> RecordRun:
+    """Run the filter, or the smoother, of a setup over a record, from its first measurements on.
+
+    Parameters
+    ----------
+    record : ImuRecord
+    chosen : FilterSetup
+    start : strapdown.setup.for_record.Start, optional
+        Default: from the first measurements (:func:`strapdown.setup.for_record.start`).
+    every : int, default 1
+        Store every n-th filter step; not with ``smooth``.
+    full_covariance : bool, default True
+        Store whole covariance matrices, not their diagonals alone.
+    smooth : bool, default False
+        Estimate each epoch from all measurements (fixed-interval smoother).
+
+    Returns
+    -------
+    RecordRun
+
+    Raises
+    ------
+    InputError
+        If the measurements do not give the initial attitude, or fewer than ``every`` filter steps are left from the start on.
+    """
+    modelled = setups.believed(record, chosen)
+    if count("every", every) > len(modelled.increments):
+        raise InputError(
+            f"every is {every}, more than the {len(modelled.increments)} filter steps of the record; only the start would be kept"
+        )
+    found = for_record.start(modelled, chosen) if start is None else start
+    used = record
+    if found.edge > 0:
+        used = records.cut(used, found.edge * chosen.integration.samples, len(used.increments))
+        modelled = records.cut(modelled, found.edge, len(modelled.increments))
+        if every > len(modelled.increments):
+            raise InputError(
+                f"every is {every}, and {len(modelled.increments)} filter steps are left from the start on"
+            )
+    if smooth:
+        result = setups.smooth(used, chosen, found.state, full_covariance=full_covariance)
+    else:
+        result = setups.run(used, chosen, found.state, every=every, full_covariance=full_covariance)
+    truth = None
+    if modelled.truth is not None:
+        truth = Truth(attitude=modelled.truth.attitude[::every], bias=modelled.truth.bias[::every])
+    return RecordRun(result, used, truth, found.state, found.words)
+
+
+def estimate(
+    source: ImuRecord | Recording,
+    *,
+    noise: GyroSpec | NoiseFit | ProcessNoise | None = None,
+    setup: FilterSetup | None = None,
+    initial: State | None = None,
+    states: bool | Sequence[str] = False,
+    gate: Gate | float | None = None,
+    robust: Robust | str | None = None,
+    motion: str | None = None,
+    latency: float | None = None,
+    calibration: UnitCalibration | None = None,
+    full_covariance: bool | None = None,
+    smooth: bool = False,
+) -> Estimate:
+    """Estimate attitude and gyro bias by a multiplicative extended Kalman filter, as the command ``strapdown estimate`` does.
+
+    Of a simulated record the filter is matched to the scenario and starts from the first measurements. Of a recording the accelerometer
+    gives the vertical and the magnetometer the heading (:mod:`strapdown.ahrs`), from the first quiet second on.
+
+    Parameters
+    ----------
+    source : ImuRecord or Recording
+        What :func:`simulate` or :func:`read` returned, or a record of your own data.
+    noise : GyroSpec, NoiseFit or ProcessNoise, optional
+        Noise of the gyro: a specification, an Allan fit (:func:`fit_noise`), or the filter's own two coefficients. Default: that of the
+        record's origin; for a recording that of :data:`strapdown.ahrs.MOTIONS`.
+    setup : FilterSetup, optional
+        Record: the whole filter, such as :func:`tune` returns it, instead of ``noise`` and ``states``.
+    initial : State, optional
+        Record: initial state (:func:`initial_state`) at the first edge. Default: from the first measurements.
+    states : bool or sequence of str, default False
+        Record: with an error state for each error that the scenario specifies (scale factor, misalignment, hard iron, …), or for those
+        named alone.
+    gate : Gate or float, optional
+        Refuse measurements beyond this quantile of χ² (0.999), and recover from a lost attitude.
+    robust : Robust or {"huber", "student"}, optional
+        Weigh measurements by the size of their innovations.
+    motion : {"hand", "any"}, optional
+        Recording: model of the motion; default ``"hand"``, of bounded velocity, with states for the gyro's scale factors.
+    latency : float, optional
+        Recording: delay of the gyro's samples, s; default half a sample interval.
+    calibration : UnitCalibration, optional
+        Recording: what an earlier recording of the same unit showed.
+    full_covariance : bool, optional
+        Store whole covariance matrices, not their diagonals alone; default: of a record yes, of a recording no.
+    smooth : bool, default False
+        Estimate each epoch from all measurements: see :func:`smooth`.
+
+    Returns
+    -------
+    Estimate
+        At the edges of the filter's steps (record) or at the stamps of the recording: ``time`` (m,) s, ``attitude`` (m, 4) q_fb,
+        ``bias`` (m, 3) rad/s, ``variance`` (m, 6) rad² and (rad/s)². A recording's fixed frame is East-North-Up with magnetic North.
+
+    Raises
+    ------
+    InputError
+        If the gyro's noise is unknown, the measurements do not give the initial attitude, a recording has no accelerometer, or an option
+        does not go with the source.
+
+    Examples
+    --------
+    >>> import strapdown as sd
+    >>> estimate = sd.estimate(sd.simulate("two-stars"))  # doctest: +SKIP
+    >>> estimate.attitude[-1], estimate.sigma[-1]  # doctest: +SKIP
+    """
+    gate = Gate(probability=gate) if isinstance(gate, (int, float)) else gate
+    robust = Robust(kind=robust) if isinstance(robust, str) else robust  # type: ignore[arg-type]
+    if isinstance(source, Recording):
+        _refuse("a record", setup=setup, initial=initial, states=states or None)
+        found = ahrs.estimate(
+            source,
+            _recording_parameters(motion, noise),
+            latency=latency,
+            calibration=calibration,
+            gate=gate,
+            robust=robust,
+            full_covariance=bool(full_covariance),
+            smooth=smooth,
+        )
+        return found.estimate
+    if not isinstance(source, ImuRecord):
+        raise InputError(
+            f"source is {type(source).__name__}; give an ImuRecord or a Recording, as simulate and read return them"
+        )
+    _refuse("a recording", motion=motion, latency=latency, calibration=calibration)
+    chosen = _record_setup(source, noise, setup, initial, states)
+    changed = {name: value for name, value in (("gate", gate), ("robust", robust)) if value is not None}
+    chosen = dataclasses.replace(chosen, **changed)  # type: ignore[arg-type]
+    start = None if initial is None else for_record.Start(initial, "Started from the state given.")
+    return estimate_record(source, chosen, start, full_covariance=full_covariance is not False, smooth=smooth).estimate
+
+
+def smooth(source: ImuRecord | Recording, **options: Any) -> Estimate:
+    """Estimate attitude and gyro bias at each epoch from all measurements, those after it too (fixed-interval smoother).
+
+    Parameters
+    ----------
+    source : ImuRecord or Recording
+    **options
+        As of :func:`estimate`.
+
+    Returns
+    -------
+    Estimate
+
+    Raises
+    ------
+    InputError
+        As :func:`estimate`, or if the record is too long for the memory.
+
+    References
+    ----------
+    H. E. Rauch, F. Tung, C. T. Striebel, Maximum likelihood estimates of linear dynamic systems, AIAA Journal 3(8), 1965.
+    """
+    return estimate(source, **options, smooth=True)
+
+
+def _refuse(what: str, **options: Any) -> None:
+    for name, value in options.items():
+        if value is not None:
+            raise InputError(f"{name} goes with {what}; leave it out")
+
+
+def _specification(noise: GyroSpec | NoiseFit) -> GyroSpec:
+    if isinstance(noise, allan.NoiseFit):
+        return GyroSpec(**allan.to_gyro_parameters(noise))  # type: ignore[arg-type]
+    if not isinstance(noise, GyroSpec):
+        raise InputError(f"noise is {type(noise).__name__}; give a GyroSpec, a NoiseFit or a ProcessNoise")
+    return noise
+
+
+def _recording_parameters(motion: str | None, noise: GyroSpec | NoiseFit | ProcessNoise | None) -> ahrs.AhrsParameters:
+    parameters = ahrs.MOTIONS[one_of("motion", motion or "hand", ahrs.MOTIONS)]
+    if noise is None:
+        return parameters
+    if isinstance(noise, ProcessNoise):
+        return dataclasses.replace(
+            parameters, angle_random_walk=noise.angle_random_walk, rate_random_walk=noise.rate_random_walk
+        )
+    return dataclasses.replace(parameters, **gyro.process_noise(_specification(noise)))
+
+
+def _record_setup(
+    record: ImuRecord,
+    noise: GyroSpec | NoiseFit | ProcessNoise | None,
+    setup: FilterSetup | None,
+    initial: State | None,
+    states: bool | Sequence[str],
+) -> FilterSetup:
+    if setup is not None:
+        _refuse("the scenario's own filter, and setup is a whole one", noise=noise, states=states or None)
+        return setup
+    if not isinstance(noise, ProcessNoise):
+        spec = None if noise is None else _specification(noise)
+        return for_record.matched_setup(record, spec, states=states)
+    if initial is None:
+        raise InputError(
+            "noise is a ProcessNoise, which says nothing of the initial gyro bias; give initial= too, or a GyroSpec as noise"
+        )
+    _refuse("a specified gyro; declare the states of your own filter in setup=", states=states or None)
+    sigma = np.sqrt(np.diag(initial.covariance))
+    return FilterSetup(
+        process_noise=noise, attitude_sigma=float(np.max(sigma[:3])), bias_sigma=float(np.max(sigma[3:6]))
+    )
+
+
+class AttitudeHistory(NamedTuple):
+    """Attitude from the gyro alone."""
+
+    time: Array
+    """Edges of the algorithm's steps (k + 1,), s."""
+    attitude: Array
+    """q_fb (k + 1, 4)."""
+
+
+def integrate(
+    source: ImuRecord | Recording,
+    algorithm: str | coning.Algorithm = "four-sample",
+    *,
+    initial_attitude: ArrayLike | None = None,
+) -> AttitudeHistory:
+    """Integrate a gyro to attitude, without any other sensor.
+
+    Parameters
+    ----------
+    source : ImuRecord or Recording
+    algorithm : str or Algorithm, default "four-sample"
+        Coning algorithm (``strapdown.coning.ALGORITHMS``).
+    initial_attitude : array_like (4,), optional
+        q_fb at the first edge. Default: the true attitude where the source has it, else the identity.
+
+    Returns
+    -------
+    AttitudeHistory
+        ``time`` (k + 1,), s, and ``attitude`` (k + 1, 4), q_fb, at the edges of the algorithm's steps; samples left over are dropped.
+
+    Raises
+    ------
+    InputError
+        If there is no such algorithm, or fewer samples than one of its steps needs.
+
+    Examples
+    --------
+    >>> import strapdown as sd
+    >>> found = sd.integrate(sd.simulate("coning"))  # doctest: +SKIP
+    """
+    chosen = coning.named(algorithm)
+    if isinstance(source, ImuRecord):
+        time, increments = source.time, source.increments
+        known, place = None if source.truth is None else source.truth.attitude, "the record"
+    else:
+        place = source.source
+        time, increments, known = source.time, recordings.increments(source), source.true_attitude
+    if len(increments) < chosen.samples:
+        raise InputError(
+            f"{place} holds {len(increments)} gyro samples, fewer than the {chosen.samples} of one step of {chosen.name}; choose another "
+            "algorithm or a longer recording"
+        )
+    start: ArrayLike = quaternion.IDENTITY
+    if initial_attitude is not None:
+        start = initial_attitude
+    elif known is not None and np.isfinite(known[0]).all():
+        start = known[0]
+    attitude = coning.integrate(increments, chosen, start, edges=time)
+    return AttitudeHistory(time[: len(attitude) * chosen.samples : chosen.samples], attitude)
+
+
+# ---------------------------------------------------------------------------------------------------------------------- check
+
+
+def check(
+    result: Estimate | Statistics | Campaign, truth: Truth | ImuRecord | None = None, *, probability: float = 0.99
+) -> Judgement:
+    """Test whether a filter is consistent: whether its errors and innovations agree with its own covariance.
+
+    Parameters
+    ----------
+    result : Estimate, Statistics or Campaign
+        What :func:`estimate` or :func:`monte_carlo` returned, or :func:`read` read.
+    truth : Truth or ImuRecord, optional
+        Truth at the epochs of the estimate, or the record with its truth, whose stamps are matched. Without it the innovations alone are
+        tested.
+    probability : float, default 0.99
+        A consistent filter passes with at least this probability, all tests together.
+
+    Returns
+    -------
+    Judgement
+        ``verdict`` is "consistent", "not consistent" or "cannot tell"; ``findings`` are the statistics.
+
+    Raises
+    ------
+    InputError
+        If the truth is not that of the estimate's epochs, or a Monte Carlo has no finished run.
+
+    Examples
+    --------
+    >>> import strapdown as sd
+    >>> record = sd.simulate("two-stars")
+    >>> sd.check(sd.estimate(record), record).verdict  # doctest: +SKIP
+    'consistent'
+    """
+    if isinstance(result, Estimate):
+        return consistency.judge(result, _truth_at(result, truth), probability=probability)
+    statistics: Any = getattr(result, "statistics", result)
+    if statistics is None:
+        raise InputError("the Monte Carlo has no finished run yet; resume it")
+    if not hasattr(statistics, "log_nees_sum"):
+        raise InputError(f"result is {type(result).__name__}; give an Estimate, or what monte_carlo returned")
+    if truth is not None:
+        raise InputError("truth goes with an estimate; a Monte Carlo knows its own; leave it out")
+    return consistency.judge_runs(statistics, probability=probability)
+
+
+def _truth_at(result: Estimate, truth: Truth | ImuRecord | None) -> Truth | None:
+    """Return the truth at the epochs of an estimate."""
+    if isinstance(truth, ImuRecord):
+        if truth.truth is None:
+            raise InputError("the record has no truth; leave it out, and the innovations are tested alone")
+        rows = np.minimum(np.searchsorted(truth.time, result.time - SAME_STAMP), len(truth.time) - 1)
+        if np.max(np.abs(truth.time[rows] - result.time)) > SAME_STAMP:
+            raise InputError("the record has other stamps than the estimate, which was made from another record")
+        return Truth(attitude=truth.truth.attitude[rows], bias=truth.truth.bias[rows])
+    if truth is not None and len(truth.attitude) != len(result.time):
+        raise InputError(
+            f"truth has {len(truth.attitude)} epochs and the estimate {len(result.time)}; give the record, whose stamps are matched"
+        )
+    return truth
+
+
+def plan(
+    scenario: Scenario,
+    *,
+    setup: FilterSetup | None = None,
+    seed: int | None = None,
+    states: bool = False,
+    dispersions: Dispersions | None = None,
+    precision: str = "float64",
+) -> Plan:
+    """Return the plan of a Monte Carlo: a scenario through the filter that matches it, or another.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    setup : FilterSetup, optional
+        Default: matched to the scenario (:func:`strapdown.setup.matched`).
+    seed : int, optional
+        Default: the scenario's own.
+    states : bool, default False
+        Give the matched filter an error state for each error that the scenario specifies.
+    dispersions : Dispersions, optional
+        Initial errors and gyro parameters that differ from run to run.
+    precision : {"float64", "float32"}
+
+    Returns
+    -------
+    Plan
+
+    Raises
+    ------
+    InputError
+        If both ``setup`` and ``states`` are given, or the scenario's duration is no whole number of filter steps.
+    """
+    from strapdown import montecarlo
+
+    if states and setup is not None:
+        raise InputError("a filter setup has its own states; leave states out")
+    chosen = setups.matched(scenario, states=states) if setup is None else setup
+    return montecarlo.Plan(
+        scenario=scenario,
+        setup=chosen,
+        seed=scenario.seed if seed is None else seed,
+        epochs=montecarlo.whole_epochs(scenario, chosen),
+        dispersions=dispersions or montecarlo.Dispersions(),
+        precision=precision,  # type: ignore[arg-type]
+    )
+
+
+def monte_carlo(
+    scenario: Scenario | str | os.PathLike[str],
+    *,
+    runs: int = 1000,
+    seed: int | None = None,
+    setup: FilterSetup | None = None,
+    states: bool = False,
+    dispersions: Dispersions | None = None,
+    threads: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Statistics:
+    """Run a scenario many times through a filter and return the statistics over the runs.
+
+    :func:`strapdown.montecarlo.campaign.run` does the same with a file that survives interruptions, and on clusters.
+
+    Parameters
+    ----------
+    scenario : Scenario, str or path
+        As of :func:`simulate`.
+    runs : int, default 1000
+    seed : int, optional
+        Default: the scenario's own.
+    setup : FilterSetup, optional
+        The filter; default: matched to the scenario.
+    states : bool, default False
+        Give the matched filter an error state for each error that the scenario specifies.
+    dispersions : Dispersions, optional
+        Initial errors and gyro parameters that differ from run to run.
+    threads : int, optional
+        Default: one a core.
+    progress : callable, optional
+        Called with the number of runs just finished.
+
+    Returns
+    -------
+    Statistics
+        For :func:`check`; the same to the bit for any number of threads.
+
+    Raises
+    ------
+    InputError
+        If there is no such scenario, or no machine computes it with this filter.
+
+    Examples
+    --------
+    >>> import strapdown as sd
+    >>> print(sd.check(sd.monte_carlo("two-stars", runs=1000)))  # doctest: +SKIP
+    """
+    from strapdown import montecarlo
+
+    chosen = plan(_scenario(scenario), setup=setup, seed=seed, states=states, dispersions=dispersions)
+    return montecarlo.run_plan(chosen, runs=runs, threads=threads, progress=progress)
+
+
+def covariance_analysis(
+    scenario: Scenario | str | os.PathLike[str],
+    setup: FilterSetup | None = None,
+    *,
+    consider: Consider | None = None,
+    epochs: int = 100,
+) -> Analysis:
+    """Predict the errors of a filter on a scenario without noise samples: σ and error budget by source.
+
+    Parameters
+    ----------
+    scenario : Scenario, str or path
+        As of :func:`simulate`.
+    setup : FilterSetup, optional
+        The filter; default: matched to the scenario.
+    consider : Consider, optional
+        Errors besides those of the scenario.
+    epochs : int, default 100
+        Intervals between the epochs of the result.
+
+    Returns
+    -------
+    Analysis
+
+    Raises
+    ------
+    InputError
+        As :func:`strapdown.covariance.analyse`.
+
+    Examples
+    --------
+    >>> import strapdown as sd
+    >>> budget = sd.covariance_analysis("two-stars")  # doctest: +SKIP
+    """
+    return covariance.analyse(_scenario(scenario), setup, consider=consider, epochs=epochs)
+
+
+# ----------------------------------------------------------------------------------------------------------------------- tune
+
+
+def tune(
+    sources: ImuRecord | Recording | Sequence[ImuRecord | Recording],
+    *,
+    setup: FilterSetup | None = None,
+    free: Sequence[str] | None = None,
+    priors: Mapping[str, Prior] | None = None,
+    starts: int = 4,
+    seed: int = 0,
+    threads: int | None = None,
+    **objective: Any,
+) -> Tuning:
+    """Tune noise parameters of a filter by maximum likelihood of its innovations, with intervals.
+
+    Parameters
+    ----------
+    sources : ImuRecord, Recording, or sequence of them
+        All of one unit.
+    setup : FilterSetup, optional
+        The filter to start from. Default: matched to the first record, or that of recordings.
+    free : sequence of str, optional
+        Parameters to tune: ``"gyro.arw"``, ``"gyro.rrw"``, ``"SENSOR.sigma"``, …; default the gyro's two and every sensor's σ.
+    priors : mapping of str to Prior, optional
+        What is known of a parameter before, by its name.
+    starts : int, default 4
+        Searches: one from the filter, the others from random starts.
+    seed : int, default 0
+        Of the random starts.
+    threads : int, optional
+        Default: one a core.
+    **objective
+        Other objectives than the likelihood of the innovations: options of :func:`strapdown.tuning.tune`.
+
+    Returns
+    -------
+    Tuning
+        ``setup`` is the tuned filter, for :func:`estimate` and :func:`monte_carlo`.
+
+    Raises
+    ------
+    InputError
+        If a parameter is unknown, or the options exclude each other.
+
+    Examples
+    --------
+    >>> import strapdown as sd
+    >>> tuned = sd.tune(record, free=["gyro.arw", "star 1.sigma"])  # doctest: +SKIP
+    >>> estimate = sd.estimate(record, setup=tuned.setup)  # doctest: +SKIP
+    """
+    from strapdown import tuning
+
+    given = [sources] if isinstance(sources, (ImuRecord, Recording)) else list(sources)
+    if not given:
+        raise InputError("sources is empty; give a record or recording at least")
+    tuning.one_gyro(
+        {
+            f"record {k}": one.origin.gyro
+            for k, one in enumerate(given)
+            if isinstance(one, ImuRecord) and one.origin and one.origin.gyro
+        }
+    )
+    cases = []
+    for one in given:
+        if isinstance(one, ImuRecord):
+            setup = setup or for_record.matched_setup(one)
+            cases.append(tuning.record_case(one, setup))
+        else:
+            setup = setup or tuning.recording_setup()
+            cases.append(tuning.recording_case(one))
+    assert setup is not None
+    workers = count("threads", threads if threads is not None else os.cpu_count() or 1)
+    return tuning.tune(cases, setup, free, priors=priors, starts=starts, seed=seed, threads=workers, **objective).tuning
+
+
+# ---------------------------------------------------------------------------------------------------------------------- Allan
+
+
+def _samples(
+    source: Recording | ImuRecord | GyroSamples | ArrayLike, sample_interval: float | None, sensor: str, kind: str
+) -> tuple[ArrayLike, float, str, bool]:
+    """Return samples, their interval, their kind and whether some are missing."""
+    if isinstance(source, (Recording, ImuRecord)):
+        source = recordings.samples_of(source, sensor, gaps=True)
+    if isinstance(source, recordings.GyroSamples):
+        if sample_interval is not None:
+            raise InputError("sample_interval goes with an array; a recording has its own: leave it out")
+        return source.values, source.sample_interval, source.kind, bool(np.isnan(source.values).any())
+    if sample_interval is None:
+        raise InputError(
+            "sample_interval is missing; an array does not know the time between its samples: give it in s"
+        )
+    return source, sample_interval, kind, False
+
+
+def allan_deviation(
+    source: Recording | ImuRecord | GyroSamples | ArrayLike,
+    sample_interval: float | None = None,
+    *,
+    sensor: str = "gyro",
+    kind: str = "rate",
+    **options: Any,
+) -> AllanDeviation:
+    """Return the Allan deviation of a sensor at rest, with its confidence band.
+
+    Parameters
+    ----------
+    source : Recording, ImuRecord, GyroSamples or array_like (n,) or (n, axes)
+        A recording may have gaps (:mod:`strapdown.allan_gaps`).
+    sample_interval : float, optional
+        Of an array: time between its samples, s.
+    sensor : {"gyro", "accelerometer", "magnetometer"}
+        Of a recording.
+    kind : {"rate", "increments"}
+        Of an array: averaged samples, or their integrals over each interval.
+    **options
+        ``taus``, ``level``, ``estimator`` of :func:`strapdown.allan.allan_deviation`.
+
+    Returns
+    -------
+    AllanDeviation
+
+    Raises
+    ------
+    InputError
+        If samples are not finite, too few, or at uneven intervals.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import strapdown as sd
+    >>> white = np.random.default_rng(1).standard_normal(100_000)
+    >>> found = sd.allan_deviation(white, 0.01, taus=[1.0])
+    >>> round(float(found.deviation[0, 0]), 2)  # σ √(dt/τ)
+    0.1
+    """
+    values, interval, what, gaps = _samples(source, sample_interval, sensor, kind)
+    if gaps:
+        return allan_gaps.allan_deviation(values, interval, **options)
+    return allan.allan_deviation(values, interval, kind=what, **options)
+
+
+def fit_noise(
+    source: Recording | ImuRecord | GyroSamples | ArrayLike,
+    sample_interval: float | None = None,
+    *,
+    sensor: str = "gyro",
+    kind: str = "rate",
+    **options: Any,
+) -> NoiseFit:
+    """Return the noise coefficients of a sensor at rest (angle random walk, bias instability, …), with intervals.
+
+    Parameters
+    ----------
+    source, sample_interval, sensor, kind
+        As of :func:`allan_deviation`.
+    **options
+        ``highest_frequency``, ``terms``, ``level`` of :func:`strapdown.allan.fit_noise`.
+
+    Returns
+    -------
+    NoiseFit
+        For ``noise`` of :func:`estimate`.
+
+    Raises
+    ------
+    InputError
+        If samples are not finite, too few, or at uneven intervals.
+
+    Examples
+    --------
+    >>> import strapdown as sd
+    >>> noise = sd.fit_noise(sd.read("rest.csv", units={"gyro": "deg/s"}))  # doctest: +SKIP
+    >>> estimate = sd.estimate(record, noise=noise)  # doctest: +SKIP
+    """
+    values, interval, what, gaps = _samples(source, sample_interval, sensor, kind)
+    fit: Callable[..., NoiseFit] = allan_gaps.fit_noise if gaps else functools.partial(allan.fit_noise, kind=what)
+    return dataclasses.replace(fit(values, interval, **options), sensor=sensor)

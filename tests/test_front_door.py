@@ -1,0 +1,376 @@
+"""``import strapdown as sd``: the five commonest programs, what the package shows, and that it loads nothing before it is used."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import importlib
+import math
+import subprocess
+import sys
+import types
+import xml.etree.ElementTree
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import strapdown as sd
+from strapdown import listing
+
+NAMES = {
+    "FilterSetup",
+    "Gate",
+    "GyroSpec",
+    "InputError",
+    "ProcessNoise",
+    "Robust",
+    "Scenario",
+    "StepFilter",
+    "VectorSensor",
+    "allan_deviation",
+    "check",
+    "covariance_analysis",
+    "estimate",
+    "fit_noise",
+    "initial_state",
+    "integrate",
+    "monte_carlo",
+    "read",
+    "simulate",
+    "smooth",
+    "tune",
+    "write",
+}
+
+
+def scenario(duration: float = 60.0) -> sd.Scenario:
+    return sd.Scenario(
+        motion=sd.motion.ConstantRate(rate=(0.01, -0.02, 0.03)),
+        gyro=sd.GyroSpec(angle_random_walk=2e-5, rate_random_walk=1e-7, turn_on_bias_sigma=5e-6),
+        sensors=(
+            sd.VectorSensor(name="star 1", reference_f=[1.0, 0.0, 0.0], sigma=1e-4, rate=1.0),
+            sd.VectorSensor(name="star 2", reference_f=[0.0, 1.0, 1.0], sigma=1e-4, rate=1.0),
+        ),
+        rate=20.0,
+        duration=duration,
+        name="two stars, small",
+        seed=3,
+    )
+
+
+# ------------------------------------------------------------------------------------------------------------ the five programs
+
+
+def test_simulate_estimate_check(tmp_path):
+    record = sd.simulate(scenario(200.0))
+    estimate = sd.estimate(record)
+    assert sd.check(estimate, record).verdict != "not consistent"
+    # The error of the attitude is that of its own σ, and not of another: 3 axes, the last half.
+    error = sd.consistency.errors(estimate.attitude, estimate.bias, record.truth.attitude, record.truth.bias)
+    ratio = error[len(error) // 2 :] / estimate.sigma[len(error) // 2 :]
+    assert 0.3 < np.sqrt(np.mean(ratio[:, :3] ** 2)) < 2.0
+    # A filter with a hundredth of the measurements' σ is not consistent, and the check says so.
+    wrong = dataclasses.replace(sd.setup.matched(scenario(200.0)), measurement_sigma_factor=0.01)
+    assert sd.check(sd.estimate(record, setup=wrong), record).verdict == "not consistent"
+    # From a file the same numbers.
+    sd.write(record, tmp_path / "record.h5")
+    again = sd.read(tmp_path / "record.h5")
+    assert again.origin.scenario == record.origin.scenario
+    np.testing.assert_array_equal(sd.estimate(again).attitude, estimate.attitude)
+
+
+def test_a_recording_to_euler_angles(tmp_path):
+    """A unit that turns at a constant rate about the vertical: roll and pitch stay, yaw turns at that rate."""
+    rate = np.radians(20.0)
+    time = np.arange(0.0, 12.0, 0.01)
+    moving = time > 3.0
+    yaw = np.where(moving, rate * (time - 3.0), 0.0)
+    noise = np.random.default_rng(5)
+    gyro = np.degrees(np.where(moving, rate, 0.0))[:, None] * [0.0, 0.0, 1.0] + 0.05 * noise.standard_normal(
+        (len(time), 3)
+    )
+    force = np.tile([0.0, 0.0, 1.0], (len(time), 1)) + 0.002 * noise.standard_normal((len(time), 3))
+    # The field points North (y) and down; the body's yaw turns it the other way.
+    field = 50.0 * np.stack([0.5 * np.sin(yaw), 0.5 * np.cos(yaw), np.full_like(yaw, -0.87)], axis=1)
+    table = np.column_stack([time, gyro, force, field + 0.1 * noise.standard_normal((len(time), 3))])
+    path = tmp_path / "phone.csv"
+    np.savetxt(path, table, delimiter=",", header="time,gx,gy,gz,ax,ay,az,mx,my,mz", comments="", fmt="%.9g")
+
+    phone = sd.read(path, units={"time": "s", "gyro": "deg/s", "accelerometer": "g", "magnetometer": "uT"})
+    estimate = sd.estimate(phone)
+    angles = estimate.euler("ZYX").angles
+    truth = np.interp(estimate.time, time, yaw)
+    turned = np.unwrap(angles[:, 0]) - angles[0, 0]
+    assert np.degrees(np.abs(turned - truth)).max() < 3.0
+    assert np.degrees(np.abs(angles[:, 1:])).max() < 3.0
+    sd.write(estimate, tmp_path / "angles.csv", sequence="ZYX")
+    assert (tmp_path / "angles.csv").read_text().count("\n") >= len(estimate.time)
+    smoothed = sd.smooth(phone)
+    assert np.mean(smoothed.variance[:, 2]) < np.mean(estimate.variance[:, 2])
+
+
+def test_noise_from_a_rest_recording_into_the_filter(tmp_path):
+    arw, dt = 3e-4, 0.01
+    samples = arw / np.sqrt(dt) * np.random.default_rng(7).standard_normal((30_000, 3))
+    table = np.column_stack([dt * np.arange(len(samples)), samples])
+    path = tmp_path / "rest.csv"
+    np.savetxt(path, table, delimiter=",", header="time,gx,gy,gz", comments="", fmt="%.9g")
+
+    rest = sd.read(path, units={"time": "s", "gyro": "rad/s"})
+    deviation = sd.allan_deviation(rest, taus=[1.0])
+    np.testing.assert_allclose(deviation.deviation, arw, rtol=0.1)  # N/√τ of white noise
+    noise = sd.fit_noise(rest)
+    k = noise.terms.index("angle_random_walk")
+    np.testing.assert_allclose(noise.estimate[:, k], arw, rtol=0.03)
+
+    record = sd.simulate(scenario())
+    wider = sd.estimate(record, noise=noise)
+    assert np.all(wider.variance[-1, :3] > 1.5 * sd.estimate(record).variance[-1, :3])
+
+
+def test_tune():
+    true = scenario(300.0)
+    record = sd.simulate(true)
+    start = dataclasses.replace(sd.setup.matched(true), sigma={"star 1": 5e-4, "star 2": 1e-4})
+    tuned = sd.tune(record, setup=start, free=["star 1.sigma"], starts=1, threads=1)
+    found = tuned["star 1.sigma"]
+    assert found.lower < 1e-4 < found.upper
+    assert abs(found.value / 1e-4 - 1.0) < 0.15
+    assert tuned.setup.sigma["star 1"] == pytest.approx(found.value)
+    assert len(sd.estimate(record, setup=tuned.setup).time) == len(record.time)
+
+
+def test_monte_carlo_verdict():
+    statistics = sd.monte_carlo(scenario(30.0), runs=120, seed=4, threads=1)
+    assert statistics.runs == 120
+    assert sd.check(statistics).verdict == "consistent"
+    wrong = dataclasses.replace(sd.setup.matched(scenario(30.0)), measurement_sigma_factor=0.5)
+    assert (
+        sd.check(sd.monte_carlo(scenario(30.0), runs=120, seed=4, setup=wrong, threads=1)).verdict == "not consistent"
+    )
+
+
+# ----------------------------------------------------------------------------------------------------------------- other calls
+
+
+def test_own_data_with_own_noise():
+    made = sd.simulate(scenario())
+    own = sd.records.ImuRecord(time=made.time, increments=made.increments, vectors=made.vectors)
+    with pytest.raises(sd.InputError, match="noise="):
+        sd.estimate(own)
+    noise = sd.ProcessNoise(angle_random_walk=2e-5, rate_random_walk=1e-7)
+    with pytest.raises(sd.InputError, match="initial="):
+        sd.estimate(own, noise=noise)
+    start = sd.initial_state(made.truth.attitude[0], attitude_sigma=1e-3, bias_sigma=1e-5)
+    estimate = sd.estimate(own, noise=noise, initial=start)
+    direct = sd.estimation.run(own, noise, start, full_covariance=True)
+    np.testing.assert_array_equal(estimate.attitude, direct.attitude)
+    np.testing.assert_array_equal(estimate.covariance, direct.covariance)
+
+
+def test_integrate_starts_at_the_truth():
+    record = sd.simulate(scenario(10.0))
+    time, attitude = sd.integrate(record, "one-sample")
+    np.testing.assert_array_equal(time, record.time)
+    error = sd.quaternion.angle_between(attitude, record.truth.attitude)
+    assert error.max() < 1e-3  # at constant rate one sample is exact: what is left is noise and bias
+    assert sd.integrate(record, initial_attitude=[1.0, 0.0, 0.0, 0.0]).attitude[0] == pytest.approx([1, 0, 0, 0])
+
+
+def test_files_are_recognised_by_their_content(tmp_path):
+    record = sd.simulate(scenario(10.0))
+    sd.write(record, tmp_path / "record.csv")
+    assert sd.read(tmp_path / "record.csv").origin.seed == 3
+    estimate = sd.estimate(record)
+    sd.write(estimate, tmp_path / "estimate.h5")
+    np.testing.assert_array_equal(sd.read(tmp_path / "estimate.h5").attitude, estimate.attitude)
+    sd.write(scenario(), tmp_path / "scenario.toml")
+    np.testing.assert_array_equal(
+        sd.simulate(tmp_path / "scenario.toml").increments, sd.simulate(scenario()).increments
+    )
+    sd.write(sd.setup.matched(scenario()), tmp_path / "filter.toml")
+    assert sd.setup.read_setup(tmp_path / "filter.toml") == sd.setup.matched(scenario())
+    with pytest.raises(sd.InputError, match="units"):
+        sd.read(tmp_path / "record.csv", units={"gyro": "deg/s"})
+    with pytest.raises(sd.InputError, match="toml"):
+        sd.write(scenario(), tmp_path / "scenario.h5")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"motion": "hand"}, "recording"),
+        ({"latency": 0.01}, "recording"),
+        ({"setup": sd.setup.matched(scenario(1.0)), "states": True}, "whole"),
+        ({"states": ["gyro.nothing"]}, "gyro.nothing"),
+        ({"gate": 1.5}, "1.5"),
+        ({"robust": "hubert"}, "hubert"),
+        ({"noise": 3.0}, "GyroSpec"),
+    ],
+)
+def test_options_that_do_not_go_together(options, words):
+    with pytest.raises(sd.InputError, match=words):
+        sd.estimate(sd.simulate(scenario(5.0)), **options)
+
+
+def test_check_refuses_the_truth_of_another_record():
+    estimate = sd.estimate(sd.simulate(scenario(10.0)))
+    with pytest.raises(sd.InputError, match="stamps"):
+        sd.check(estimate, sd.simulate(dataclasses.replace(scenario(10.0), rate=40.0, duration=5.0)))
+    with pytest.raises(sd.InputError, match="epochs"):
+        sd.check(estimate, sd.simulate(scenario(5.0)).truth)
+
+
+def test_covariance_analysis_is_that_of_the_matched_filter():
+    found = sd.covariance_analysis(scenario(20.0), epochs=10)
+    estimate = sd.estimate(
+        sd.simulate(scenario(20.0)),
+        initial=sd.setup.initial_state(sd.setup.matched(scenario(20.0)), sd.simulate(scenario(20.0)).truth.attitude[0]),
+    )
+    np.testing.assert_allclose(found.filter_covariance[-1], estimate.covariance[-1], rtol=1e-3, atol=1e-16)
+
+
+# ---------------------------------------------------------------------------------------------------------- results in print
+
+
+def test_a_listing_is_aligned_text_and_escaped_html():
+    made = listing.Listing(
+        "A < B", ("state", "", "σ"), [("x", "rad", "1.5"), ("long name", "", "12")], ["a note"], left=2
+    )
+    assert made.text.splitlines() == [
+        "A < B",
+        "state             σ",
+        "-------------------",
+        "x          rad  1.5",
+        "long name        12",
+        "a note",
+    ]
+    html = xml.etree.ElementTree.fromstring(made.html)
+    assert html.find("p/b").text == "A < B"
+    assert [cell.text for cell in html.iter("td")] == ["x", "rad", "1.5", "long name", None, "12"]
+    assert [row.get("style") for row in html.iter("th")] == ["text-align:left"] * 2 + ["text-align:right"]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0.00012345, "0.0001234"), (None, "-"), (math.nan, "-"), (math.inf, "∞"), (-math.inf, "-∞")]
+)
+def test_figures(value, text):
+    assert listing.figure(value) == text
+
+
+def test_an_estimate_prints_what_is_known_at_the_end():
+    sigma = np.radians([0.1, 0.2, 0.3, 1.0 / 3600, 2.0 / 3600, 3.0 / 3600])
+    estimate = sd.records.Estimate(
+        time=np.array([0.0, 10.0]),
+        attitude=np.array([[1.0, 0.0, 0.0, 0.0]] * 2),
+        bias=np.radians([[0.0] * 3, [5.0 / 3600, -6.0 / 3600, 7.0 / 3600]]),
+        variance=np.stack([4.0 * sigma**2, sigma**2]),
+    )
+    lines = [line.split() for line in str(estimate).splitlines()]
+    assert lines[3] == ["attitude", "x", "°", "0.1", "0.2"]
+    assert lines[8] == ["gyro", "bias", "z", "°/h", "7", "3", "6"]
+    assert "1.000000, 0.000000" in str(estimate)
+
+
+def test_results_print_as_short_tables():
+    record = sd.simulate(scenario(30.0))
+    estimate = sd.estimate(record)
+    statistics = sd.monte_carlo(scenario(30.0), runs=20, threads=1)
+    samples = np.random.default_rng(1).standard_normal((2000, 3))
+    results = [
+        estimate,
+        sd.check(estimate, record),
+        statistics,
+        sd.check(statistics),
+        sd.covariance_analysis(scenario(30.0), epochs=5),
+        sd.allan_deviation(samples, 0.01),
+        sd.fit_noise(samples, 0.01),
+        sd.tune(record, free=["star 1.sigma"], starts=1, threads=1),
+    ]
+    for one in results:
+        lines = str(one).splitlines()
+        assert 4 < len(lines) < 30, one
+        assert max(map(len, lines)) < 140, one
+        rows = xml.etree.ElementTree.fromstring(one._repr_html_())
+        widths = {len(row) for row in rows.iter("tr")}
+        assert len(widths) == 1
+    # Of another sensor than a gyro the units are not the gyro's.
+    assert "°/√h" in str(sd.fit_noise(samples, 0.01))
+    assert "°" not in str(sd.fit_noise(samples, 0.01, sensor="accelerometer"))
+
+
+# ------------------------------------------------------------------------------------------------------------ what it shows
+
+
+def test_dir_shows_the_names_and_the_public_submodules_alone():
+    shown = set(dir(sd))
+    modules = shown - NAMES
+    assert shown >= NAMES
+    package = Path(sd.__file__).parent
+    present = {path.stem for path in package.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
+    assert modules <= present
+    assert not modules & {
+        "kernels",
+        "cli",
+        "checks",
+        "files",
+        "tables",
+        "equality",
+        "reading",
+        "workflows",
+        "randomness",
+    }
+    for name in shown:
+        assert getattr(sd, name) is not None
+    with pytest.raises(AttributeError, match="mekf"):
+        _ = sd.mekf
+
+
+BELOW = (
+    "estimation.error_states",
+    "estimation.filters",
+    "estimation.multiple_model",
+    "montecarlo.campaign",
+    "montecarlo.cluster",
+)
+"""Public modules below the public submodules."""
+
+
+def test_every_public_module_says_what_is_public_and_it_is_not_much():
+    public = {f"strapdown.{name}" for name in NAMES}
+    for name in (*sorted(set(dir(sd)) - NAMES), *BELOW):
+        module = importlib.import_module(f"strapdown.{name}")
+        assert module.__all__, name
+        for one in module.__all__:
+            value = getattr(module, one)
+            assert not isinstance(value, types.ModuleType), f"{name}.{one}"
+            if value is not getattr(sd, one, None):  # what the front door shows too is one name
+                public.add(f"strapdown.{name}.{one}")
+    assert 200 < len(public) <= 250, len(public)
+
+
+def test_type_checkers_see_what_is_there():
+    """The imports for type checkers name each public name, from the module that it is loaded from."""
+    tree = ast.parse(Path(sd.__file__).read_text(encoding="utf-8"))
+    (block,) = [node for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]
+    seen = {
+        alias.name: node.module.removeprefix("strapdown").removeprefix(".")
+        for node in block.body
+        if isinstance(node, ast.ImportFrom) and node.module != "typing"
+        for alias in node.names
+    }
+    assert set(seen) == set(dir(sd))
+    assert {name: home for name, home in seen.items() if home} == sd._HOMES
+
+
+def test_import_loads_nothing_else():
+    code = "import sys; before = set(sys.modules); import strapdown; print(sorted(set(sys.modules) - before))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout.split() == ["['strapdown']"]
+
+
+def test_a_simulation_loads_neither_compiler_nor_plots():
+    code = "import sys; import strapdown as sd; sd.Scenario; sd.simulate; print({'numba', 'matplotlib', 'pandas'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout.split() == ["set()"]

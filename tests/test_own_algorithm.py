@@ -1,0 +1,198 @@
+"""Coning algorithms of one's own: coefficients as textbooks write them, their orders derived, studied beside the package's."""
+
+import json
+import math
+import sys
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from strapdown import cli, coning, coning_study, motion, setup
+from strapdown.checks import InputError
+from strapdown.coning import ALGORITHMS, Algorithm
+from strapdown.coning import coefficients as exact
+from strapdown.units import DEGREE, DEGREE_PER_HOUR
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "docs" / "examples"
+IGNAGNI = coning.read_algorithms(EXAMPLES / "ignagni-1996.toml")
+MILLER = Algorithm.from_toml(EXAMPLES / "miller-1983.toml")
+
+
+@pytest.mark.parametrize("own", IGNAGNI, ids=lambda one: one.name)
+def test_ignagnis_table_is_the_closed_form_and_drifts_as_he_says(own):
+    m = own.samples
+    built_in = next(a for a in ALGORITHMS.values() if (a.solver, a.samples, a.window) == ("compressed", m, m))
+    assert own.coefficients == built_in.coefficients
+    assert (own.order, own.drift_order) == (built_in.order, 2 * m)
+    assert own.drift_constant == Fraction(math.factorial(m) ** 2, 2 * math.factorial(2 * m + 1))
+
+
+def test_millers_three_samples_are_the_best_in_drift_and_keep_their_own_products():
+    assert (MILLER.samples, MILLER.order, MILLER.drift_order) == (3, 4, 6)
+    assert MILLER.drift_constant == Fraction(1, 280)
+    increments = motion.SpinRock(rock_angle=0.1, rock_frequency=1.0, spin_rate=1.0).increments(np.arange(4) * 0.01)
+    a, b, c = increments
+    by_hand = a + b + c + 9 / 20 * np.cross(a, c) + 27 / 40 * np.cross(b, c - a)
+    np.testing.assert_allclose(coning.rotation_vectors(increments, MILLER)[0], by_hand, rtol=0, atol=2e-17)
+
+
+def test_textbook_order_is_that_of_the_increments():
+    """φ = Σ Δθ + (c_1 Δθ_1 + c_2 Δθ_2) × Δθ_3, each coefficient alone, with and without increments of the step before."""
+    rng = np.random.default_rng(1)
+    a, b, c = increments = 1e-2 * rng.standard_normal((3, 3))
+    own = Algorithm.from_coefficients("own", [0.3, 0.7])
+    by_hand = a + b + c + np.cross(0.3 * a + 0.7 * b, c)
+    np.testing.assert_allclose(coning.rotation_vectors(increments, own)[0], by_hand, rtol=0, atol=2e-17)
+    late = Algorithm.from_coefficients("late", [0.3, 0.7], previous=1)
+    assert (late.samples, late.previous) == (2, 1)
+    d, e = 1e-2 * rng.standard_normal((2, 3))
+    vectors = coning.rotation_vectors(np.array([a, b, c, d]), late)
+    np.testing.assert_allclose(vectors[1], c + d + np.cross(0.3 * b + 0.7 * c, d), rtol=0, atol=2e-17)
+    pairs = Algorithm.from_products("pairs", 1, [(2, 1, 0.5), (1, 3, 0.25)], previous=1, following=1)
+    vectors = coning.rotation_vectors(np.array([a, b, c, d, e]), pairs)
+    np.testing.assert_allclose(vectors[2], c + 0.5 * np.cross(c, b) + 0.25 * np.cross(b, d), rtol=0, atol=2e-17)
+
+
+def test_derived_orders_are_those_that_the_catalogue_claims_and_checks():
+    compared = 0
+    for one in ALGORITHMS.values():
+        if one.solver in ("compressed", "pairs") and not one.rate_points:
+            own = Algorithm.from_table(one.to_table())
+            assert own == one, one.name
+            compared += 1
+    assert compared > 30
+
+
+OWN = [Algorithm.from_coefficients("own", c) for c in ([], ["1/2"], ["2/3"], ["9/20", "27/20"], ["1/20", "27/20"])]
+
+
+@pytest.mark.parametrize(("own", "order"), zip([*OWN, MILLER], (2, 2, 4, 3, 2, 4), strict=True))
+def test_the_order_of_convergence_shows_over_a_manoeuvre(own, order):
+    """Halving the sample interval divides the error by 2 to the order: three axes at once, the truth by the Taylor series."""
+    path = coning_study.MANOEUVRES["three axes at once"]
+    errors = np.array([coning_study.manoeuvre_error(path, rate, own) for rate in (240.0, 480.0, 960.0)])
+    slopes = np.log2(errors[:-1] / errors[1:])
+    assert own.order == order
+    assert slopes == pytest.approx(order, abs=0.25)
+
+
+@pytest.mark.parametrize("name", ["one-sample", "two-sample", "three-sample-previous-2", "matched-4-11"])
+@pytest.mark.parametrize("ratio", [0.05, 0.11, 0.3])
+def test_one_step_gives_the_drift_of_a_long_run(name, ratio):
+    rate, angle = 100.0, 2.0 * DEGREE
+    cone, one = motion.Coning(angle=angle, frequency=ratio * rate), ALGORITHMS[name]
+    found = coning_study.step_drift(cone, rate, one)
+    assert found == pytest.approx(coning_study.measured_drift(cone, rate, one), rel=2e-3, abs=1e-12)
+    if name == "one-sample":
+        omega = 2.0 * math.pi * ratio * rate
+        lam = omega / rate
+        assert found == pytest.approx(-0.5 * math.sin(angle) ** 2 * omega * (1.0 - math.sin(lam) / lam), rel=2e-4)
+
+
+def test_the_derived_constant_is_what_integration_drifts_by():
+    own = Algorithm.from_coefficients("own", ["1/2", "13/10"])
+    cone = motion.Coning(angle=0.1 * DEGREE, frequency=0.5)
+    predicted = coning.predicted_coning_drift(own, cone.angle, cone.frequency, 0.01)
+    assert own.drift_order == 2
+    assert coning_study.step_drift(cone, 100.0, own) == pytest.approx(predicted, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("value", "fraction"),
+    [
+        ("27/20", Fraction(27, 20)),
+        (1.35, Fraction(27, 20)),
+        ("1.35", Fraction(27, 20)),
+        (2 / 3, Fraction(2, 3)),
+        (0.6667, Fraction(6667, 10000)),
+        (-1375 / 504, Fraction(-1375, 504)),
+        (2, Fraction(2)),
+        (math.pi, Fraction("3.141592653589793")),
+    ],
+)
+def test_coefficients_are_read_as_fractions(value, fraction):
+    assert exact.rational(value) == fraction
+
+
+def test_a_setup_with_it_is_read_back(tmp_path):
+    from strapdown import montecarlo, scenarios
+
+    scenario = scenarios.load_scenario("two-stars")
+    chosen = setup.replace(setup.matched(scenario), integration=MILLER)
+    assert setup.from_toml(setup.to_toml(chosen)) == chosen
+    plan = montecarlo.Plan(scenario=scenario, setup=chosen, epochs=1)
+    assert montecarlo.from_table(json.loads(json.dumps(plan.to_table()))).digest == plan.digest
+
+
+def test_the_command_studies_it(tmp_path, monkeypatch, capsys):
+    own = tmp_path / "own.toml"
+    own.write_text('[algorithm]\nname = "rounded"\ncoefficients = [0.5143, 0.8762, 2.0381]\n')
+    command = ["strapdown", "coning", "--runs", "2", "--duration", "12", "--out", str(tmp_path / "out")]
+    command += ["--algorithm", str(own), "--algorithm", str(EXAMPLES / "miller-1983.toml")]
+    monkeypatch.setattr(sys, "argv", command)
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert not end.value.code
+    said = " ".join(capsys.readouterr().out.split())
+    assert "0.003571 = 1/280" in said
+    assert "rounded drifts from (ωh)^2 on" in said
+    study = json.loads((tmp_path / "out" / "coning.json").read_text())
+    rows = {row["algorithm"]: row for row in study["integration"]}
+    assert list(rows)[-2:] == ["rounded", "miller-3"]
+    predicted = rows["miller-3"]["predicted_deg_per_hour"]
+    assert rows["miller-3"]["drift_deg_per_hour"] == pytest.approx(predicted, rel=0.02)
+    assert predicted == pytest.approx(rows["three-sample"]["predicted_deg_per_hour"], rel=0.2)
+    assert [one["name"] for one in study["own"]] == ["rounded", "miller-3"]
+    assert (tmp_path / "out" / "algorithms.png").stat().st_size > 10_000
+
+
+def test_every_command_takes_a_file_for_a_name():
+    assert coning.named(str(EXAMPLES / "miller-1983.toml")) == MILLER
+    line = coning.VibrationLine(frequency=10.0, angle=0.1 * DEGREE)
+    names = (str(EXAMPLES / "miller-1983.toml"), "three-sample")
+    budget = coning.ConingBudget(lines=(line,), sample_rates=(200.0,), algorithms=names)
+    one, other = (row["drift"] / DEGREE_PER_HOUR for row in budget.rows())
+    assert one == pytest.approx(other, rel=1e-12)  # the same lag sums
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('name = "x"', "give either coefficients"),
+        ('name = "x"\ncoefficients = ["2/0"]', r"coefficients\[0\] is '2/0'"),
+        ('name = "x"\ncoefficients = ["two"]', "fraction in quotes"),
+        ('name = "x"\ncoefficients = [true]', "is True"),
+        ('name = "x"\ncoefficients = "2/3"', "is no list"),
+        ('name = "x"\nsamples = 3\ncoefficients = ["2/3"]', "are of 2 samples"),
+        ('name = "x"\nprevious = 2\ncoefficients = ["2/3"]', "leave no increment"),
+        ('name = "x"\nsamples = 2\nproducts = [[1, 1, 0.5]]', "two different increments"),
+        ('name = "x"\nsamples = 2\nproducts = [[1, 3, 0.5]]', "increments of 1 … 2"),
+        ('name = "x"\nsamples = 2\nproducts = [[1, 2]]', r"give \(i, j, K\)"),
+        ('name = "x"\nproducts = [[1, 2, 0.5]]', "samples is missing"),
+        ('name = "x"\nsample = 2\ncoefficients = []', "sample"),
+        ('coefficients = ["2/3"]', "name is missing"),
+        ('name = "two-sample"\ncoefficients = ["2/3"]', "built-in"),
+    ],
+)
+def test_bad_files_are_refused_with_their_place(tmp_path, text, message):
+    path = tmp_path / "own.toml"
+    path.write_text(f"[algorithm]\n{text}\n")
+    with pytest.raises(InputError, match=message) as refused:
+        Algorithm.from_toml(path)
+    assert "own.toml" in str(refused.value)
+
+
+def test_several_algorithms_need_names_of_their_own(tmp_path):
+    with pytest.raises(InputError, match="holds 4 algorithms"):
+        Algorithm.from_toml(EXAMPLES / "ignagni-1996.toml")
+    path = tmp_path / "own.toml"
+    path.write_text(2 * '[[algorithm]]\nname = "x"\ncoefficients = ["2/3"]\n')
+    with pytest.raises(InputError, match="two algorithms of the name x"):
+        coning.read_algorithms(path)
+    with pytest.raises(InputError, match="already; give it another"):
+        coning_study.ConingParameters(own=(MILLER, MILLER))
+    path.write_text("x = 1\n")
+    with pytest.raises(InputError, match="x"):
+        coning.read_algorithms(path)

@@ -1,0 +1,270 @@
+"""A filter of one's own wherever the package's filter goes: the same filter, wrapped, must give the same to the bit."""
+
+import importlib.util
+import json
+import sys
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from strapdown import cli, consistency, covariance, estimation, montecarlo, setup, tuning
+from strapdown.checks import InputError
+from strapdown.estimation import filters
+from strapdown.montecarlo import Plan, campaign
+from strapdown.records import Estimate, Truth
+from strapdown.report import campaigns
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def sim():
+    spec = importlib.util.spec_from_file_location("own_filter_sim", ROOT / "sims" / "own_filter.py")
+    module = sys.modules["own_filter_sim"] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+SIM = sim()
+SCENARIO = SIM.scenario(20.0)
+SETUP = setup.matched(SCENARIO)
+PLAN = Plan(scenario=SCENARIO, setup=SETUP, seed=3, epochs=20, nis_bins=5)
+
+
+def wrapped(record, initial):
+    """The package's filter as if it were somebody else's."""
+    return estimation.run(record, SETUP.process_noise, initial, full_covariance=True)
+
+
+def attitude_only(record, initial):
+    estimate = wrapped(record, initial)
+    return Estimate.from_arrays(estimate.time, estimate.attitude, estimate.covariance[:, :3, :3])
+
+
+@dataclass
+class Wrapped:
+    """The same as an object that spoils itself: only a copy for each run keeps runs apart."""
+
+    factor: float = 1.0
+    runs: int = 0
+
+    def run(self, record, initial):
+        self.runs += 1
+        assert self.runs == 1, "the state of another run"
+        assert record.truth is None, "a filter must not see the truth"
+        estimate = wrapped(record, initial)
+        return replace(estimate, covariance=self.factor**2 * estimate.covariance)
+
+
+def with_filter(estimator, plan=PLAN):
+    return replace(plan, setup=replace(SETUP, estimator=estimator))
+
+
+def same(one, other, but=()):
+    for field in fields(one):
+        if field.name not in but:
+            np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name), err_msg=field.name)
+
+
+@pytest.fixture(scope="module")
+def own():
+    return montecarlo.run_plan(PLAN, runs=12, machine="scalar", chunk=5)
+
+
+@pytest.mark.parametrize("estimator", [wrapped, Wrapped()], ids=["function", "object"])
+@pytest.mark.parametrize("threads", [1, 3])
+def test_the_packages_filter_wrapped_gives_the_same_statistics_to_the_bit(own, estimator, threads):
+    same(own, montecarlo.run_plan(with_filter(estimator), runs=12, chunk=5, threads=threads))
+
+
+def test_a_filter_at_fewer_times_is_judged_by_the_last_before_each_epoch(own):
+    """At every fifth edge, once a second as the epochs."""
+
+    def sparse(record, initial):
+        estimate = wrapped(record, initial)
+        rows = slice(None, None, 5)
+        made = Estimate.from_arrays(
+            estimate.time[rows], estimate.attitude[rows], estimate.covariance[rows], bias=estimate.bias[rows]
+        )
+        return replace(made, innovations=estimate.innovations)
+
+    same(own, montecarlo.run_plan(with_filter(sparse), runs=12, chunk=5))
+
+
+def test_with_a_coning_algorithm_it_gets_the_longer_steps():
+    from strapdown import coning
+
+    four = replace(SETUP, integration=coning.ALGORITHMS["four-sample"])
+    plan = replace(PLAN, setup=four, epochs=5)
+    one = montecarlo.run_plan(plan, runs=4, machine="scalar")
+    same(one, montecarlo.run_plan(replace(plan, setup=replace(four, estimator=wrapped)), runs=4))
+
+
+def test_without_a_bias_the_attitude_alone_is_judged(own, tmp_path, capsys):
+    statistics = montecarlo.run_plan(with_filter(attitude_only), runs=12, chunk=5)
+    assert statistics.subsets == ("attitude",)
+    np.testing.assert_array_equal(statistics.nees_sum[:, 1], own.nees_sum[:, 1])
+    np.testing.assert_array_equal(statistics.rms_error[:, :3], own.rms_error[:, :3])
+    assert np.isnan(statistics.rms_error[:, 3:]).all()
+    assert np.isnan(statistics.anees[:, [0, 2]]).all()
+    judgement = consistency.judge_runs(statistics)
+    assert {one.of for one in judgement.findings if "NEES" in one.name} == {"attitude"}
+    assert list(montecarlo.summary(statistics)["nees"]) == ["attitude"]
+    campaign.run(with_filter(attitude_only), tmp_path / "own.h5", runs=12)
+    page, numbers = campaigns.report(tmp_path / "own.h5", 0.99)
+    assert list(numbers["anees"]) == ["attitude"]
+    assert "bias x" not in page
+    assert "nan" not in json.dumps(numbers).lower()
+    cli.app(["montecarlo", str(tmp_path / "own.h5")], standalone_mode=False)
+    assert "NEES of the attitude" in (told := capsys.readouterr().out)
+    assert "bias" not in told
+
+
+def test_a_filter_that_fails_in_a_run_is_counted(own):
+    def failing(record, initial):
+        estimate = wrapped(record, initial)
+        late = estimate.time > 10.0
+        return replace(estimate, attitude=np.where(late[:, None], np.nan, estimate.attitude))
+
+    statistics = montecarlo.run_plan(with_filter(failing), runs=3)
+    assert statistics.failed == 3
+    assert consistency.judge_runs(statistics).verdict == "not consistent"
+
+
+def test_a_too_modest_filter_is_found_out():
+    statistics = montecarlo.run_plan(with_filter(Wrapped(factor=2.0)), runs=40)
+    np.testing.assert_allclose(
+        statistics.anees, 0.25 * montecarlo.run_plan(with_filter(wrapped), runs=40).anees, rtol=1e-9
+    )
+    assert consistency.judge_runs(statistics).verdict == "not consistent"
+
+
+def test_a_campaign_goes_on_and_is_replayed(own, tmp_path):
+    plan, path = with_filter(Wrapped()), tmp_path / "own.h5"
+    campaign.run(plan, path, runs=5, chunk=5)
+    held = campaign.run(plan, path, runs=12, resume=True)
+    same(own, held.statistics)
+    again = montecarlo.replay(plan, 7)
+    same(montecarlo.replay(PLAN, 7, machine="scalar").estimate, again.estimate, but=("innovations", "skipped"))
+    with pytest.raises(InputError, match=r"filter.estimator.parameters.factor is 1.0 there and 2.0 here"):
+        campaign.run(with_filter(Wrapped(factor=2.0)), path, runs=13, resume=True)
+    read = campaign.read(path).plan
+    assert read.digest == plan.digest
+    assert read.setup == plan.setup
+    with pytest.raises(InputError, match="Wrapped is a filter of your own, whose code no file holds"):
+        montecarlo.replay(read, 0)
+    assert "textbook" not in campaigns.report(path, 0.99)[0]
+
+
+def test_on_dask_it_gives_the_same_bits(own):
+    pytest.importorskip("distributed")
+    from strapdown.montecarlo.cluster import dask_client, on_dask
+
+    def by_value(record, initial):  # known to this process alone
+        return estimation.run(record, noise, initial, full_covariance=True)
+
+    noise = SETUP.process_noise
+    with dask_client(workers=1) as client:
+        same(own, montecarlo.run_plan(with_filter(by_value), runs=12, chunk=5, workers=on_dask(client)))
+
+
+@pytest.mark.parametrize("name", ["right-invariant", "mahony"])
+def test_the_packages_other_filters_run_in_a_monte_carlo_by_name(name):
+    def by_hand(record, initial):
+        return filters.run(name, record, SETUP.process_noise, initial, full_covariance=True)
+
+    same(montecarlo.run_plan(with_filter(name), runs=3), montecarlo.run_plan(with_filter(by_hand), runs=3))
+    chosen = replace(SETUP, estimator=name)
+    assert setup.from_toml(setup.to_toml(chosen)) == chosen != SETUP
+    assert "estimator" not in setup.to_table(SETUP)
+
+
+def test_it_is_compared_with_the_packages_filters():
+    record = montecarlo.replay(PLAN, 0, machine="scalar")
+    table = filters.compare(
+        record.record, SETUP.process_noise, record.initial, filters=["mekf", wrapped, SIM.textbook], every=5
+    )
+    rows = table.summary()
+    assert list(rows) == ["mekf", "wrapped", "textbook"]
+    assert rows["wrapped"] == rows["mekf"]
+    # First order in steps of 0.2 s at 0.06 rad/s, and vectors with three degrees of freedom: not the same, but no other filter.
+    for what, left in {"attitude_sigma": 0.02, "bias_sigma": 0.02}.items():
+        assert rows["textbook"][what] == pytest.approx(rows["mekf"][what], rel=left)
+    assert np.isnan(rows["textbook"]["nis"])
+
+
+def test_one_run_is_judged(own):
+    again = montecarlo.replay(with_filter(SIM.textbook), 1)
+    truth = again.record.truth
+    judged = consistency.judge(again.estimate, truth)
+    assert {one.of for one in judged.findings} == {"state", "attitude", "bias"}
+    alone = montecarlo.replay(with_filter(attitude_only), 1).estimate
+    assert {one.of for one in consistency.judge(alone, truth).findings} == {"attitude"}
+    no_bias = Truth(attitude=truth.attitude, bias=np.full_like(truth.bias, np.nan))
+    assert {one.of for one in consistency.judge(again.estimate, no_bias).findings} == {"attitude"}
+
+
+@pytest.mark.slow
+def test_the_example_tells_the_right_filter_from_the_faulty_one():
+    found = SIM.main(runs=100, duration=60.0, seed=1)
+    assert found.verdicts["textbook"].startswith("consistent")
+    assert found.verdicts["turned reference"].startswith("not consistent")
+
+
+def test_bad_filters_are_refused():
+    class NoRun:
+        pass
+
+    for bad, message in (
+        (3, "3 is no filter"),
+        (Wrapped, "Wrapped is a class"),
+        (NoRun(), "is no filter"),
+        (lambda record: None, "cannot be called with \\(record, initial\\)"),
+        ("mekff", "mekff"),
+    ):
+        with pytest.raises(InputError, match=message):
+            replace(SETUP, estimator=bad)
+    with pytest.raises(InputError, match="options of the mekf"):
+        replace(SETUP, estimator=wrapped, gate=estimation.Gate())
+
+    def shifted(record, initial):
+        estimate = wrapped(record, initial)
+        return replace(estimate, time=estimate.time + 0.01)
+
+    for bad, message in (
+        (lambda record, initial: 3, "return Estimate.from_arrays"),
+        (shifted, "time\\[0\\] is 0.01 s, and the record has no edge there"),
+    ):
+        with pytest.raises(InputError, match=message):
+            montecarlo.run_plan(with_filter(bad), runs=1)
+    record = montecarlo.replay(PLAN, 0, machine="scalar")
+    with pytest.raises(InputError, match="two of the name wrapped"):
+        filters.compare(record.record, SETUP.process_noise, record.initial, filters=[wrapped, wrapped])
+
+
+def test_what_works_with_the_mekf_alone_says_so():
+    record = montecarlo.replay(PLAN, 0, machine="scalar")
+    chosen = replace(SETUP, estimator=wrapped)
+    for work in (
+        lambda: setup.smooth(record.record, chosen, record.initial),
+        lambda: setup.observability(record.record, chosen, record.initial),
+        lambda: covariance.analyse(SCENARIO, chosen),
+        lambda: tuning.likelihood([tuning.record_case(record.record, SETUP)], chosen, ["gyro.arw"]),
+    ):
+        with pytest.raises(InputError, match="works with the mekf, and the estimator is wrapped"):
+            work()
+    assert "wrapped" in str(montecarlo.choose(with_filter(wrapped)))
+
+
+def test_arrays_that_make_no_estimate_are_refused():
+    time, q, P = np.arange(3.0), np.tile([1.0, 0, 0, 0], (3, 1)), np.tile(np.eye(3), (3, 1, 1))
+    assert not Estimate.from_arrays(time, q, P).has_bias
+    for change, message in (
+        ({"covariance": P[0]}, "a matrix for each time"),
+        ({"attitude": 2.0 * q}, "attitude"),
+        ({"time": time[::-1]}, "time"),
+        ({"bias": np.zeros((3, 3))}, "covariance is of the attitude alone"),
+    ):
+        with pytest.raises(InputError, match=message):
+            Estimate.from_arrays(**{"time": time, "attitude": q, "covariance": P, **change})

@@ -1,0 +1,123 @@
+"""The reference of the scenario file on the documentation site: each key in it is accepted, and each accepted key is in it."""
+
+import copy
+import importlib.util
+import re
+import sys
+from pathlib import Path
+
+import pytest
+import tomli_w
+
+from strapdown import scenarios
+from strapdown.checks import InputError
+
+pytest.importorskip("numpydoc", reason="the documentation's tools are not installed")
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+def _load():
+    spec = importlib.util.spec_from_file_location("toml_reference", DOCS / "toml_reference.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["toml_reference"] = module  # dataclasses look their module up there
+    spec.loader.exec_module(module)
+    return module
+
+
+if not (DOCS / "toml_reference.py").exists():
+    pytest.skip("the documentation is not in this distribution", allow_module_level=True)
+reference = _load()
+SECTIONS = reference.sections()
+NAMES = [f"{section.header} {section.type}".strip() for section in SECTIONS]
+TABLES = {"motion", "gyro", "sensors", "base", "vibration"}
+"""Keys that hold tables: headers of the reference."""
+
+
+def _required(section):
+    return {key.name: key.example for key in section.keys if key.default == "required"}
+
+
+def _least(section):
+    """Return a scenario with the fewest keys that holds the section, and the table in it that the section is."""
+    scenario = {"rate_hz": 10.0, "duration_s": 2.0, "motion": {"type": "rest"}, "gyro": {}}
+    table = {**({"type": section.type} if section.type else {}), **_required(section)}
+    match section.header:
+        case "top of the file":
+            return scenario, scenario
+        case "[motion]":
+            scenario["motion"] = table
+            if section.type == "composed":
+                table.update(base={"type": "rest"}, vibration={"type": "rest"})
+        case "[[motion.harmonics]]":
+            scenario["motion"] = {"type": "harmonic-rates", "harmonics": [table]}
+        case "[gyro]":
+            scenario["gyro"] = table
+        case "[[sensors]]":
+            scenario["sensors"] = [table]
+        case "[sensors.orbit]":
+            magnetometer = {"type": "magnetometer", "name": "m", "sigma_nt": 1.0, "rate_hz": 1.0, "orbit": table}
+            scenario["sensors"] = [magnetometer]
+    return scenario, table
+
+
+def _refusal(section, key, value, **others):
+    """Return the message by which the parser refuses a key of this section; empty if it accepts it."""
+    scenario, table = _least(section)
+    table.update(others)
+    table[key] = copy.deepcopy(value)
+    try:
+        scenarios.scenario_from_toml(tomli_w.dumps(scenario))
+    except InputError as error:
+        return str(error)
+    return ""
+
+
+@pytest.mark.parametrize("section", SECTIONS, ids=NAMES)
+def test_every_key_of_the_reference_is_accepted_with_its_default(section):
+    for key in section.keys:
+        assert _refusal(section, key.name, key.example) == ""
+        for other in key.others:
+            table_keys = {k for k in _required(section) if k == key.name}
+            if not table_keys:  # a required quantity in a second unit would be given twice
+                assert _refusal(section, other, key.example) == ""
+            else:
+                assert "a second time" in _refusal(section, other, key.example)
+
+
+@pytest.mark.parametrize("section", SECTIONS, ids=NAMES)
+def test_every_accepted_key_is_in_the_reference(section):
+    refusal = _refusal(section, "no_such_key", 1.0)
+    if section.header == "[gyro]":
+        refusal = _refusal(section, "no_such_key", 1.0, preset="stim300")
+    accepted = set(re.search(r"\(known: (.*)\)", refusal)[1].split(", "))
+    assert accepted - TABLES == {name for key in section.keys for name in (key.name, *key.others)}
+
+
+def test_every_section_and_key_is_printed():
+    page = "\n".join(reference.markdown(group) for group in ("top", "motion", "gyro", "sensors"))
+    printed = set(re.findall(r"`([a-z0-9_]+)`", page))
+    for section in SECTIONS:
+        assert f"`{section.header}`" in page
+        assert f'type = "{section.type}"' in page or not section.type
+        assert {name for key in section.keys for name in (key.name, *key.others)} <= printed
+
+
+def test_every_type_of_motion_and_sensor_of_the_parser_is_in_the_reference():
+    for table, header in (({"motion": {"type": "?"}}, "[motion]"), ({"sensors": [{"type": "?"}]}, "[[sensors]]")):
+        scenario = {"rate_hz": 10.0, "duration_s": 2.0, "motion": {"type": "rest"}, **table}
+        with pytest.raises(InputError) as refused:
+            scenarios.scenario_from_toml(tomli_w.dumps(scenario))
+        known = {section.type for section in SECTIONS if section.header == header} - {""}
+        assert known
+        assert set(re.findall(r"[a-z][a-z-]+", str(refused.value).split("one of")[-1])) >= known
+
+
+def test_every_key_has_a_meaning_and_texts_name_their_choices():
+    for section in SECTIONS:
+        for key in section.keys:
+            assert len(key.meaning.split()) >= 2, f"{section.header} {section.type}: {key.name} has no docstring"
+            if key.name in ("kind", "boresight"):
+                for word in re.findall(r'`"([a-z]+)"`', key.meaning):
+                    assert _refusal(section, key.name, word) == ""
+                assert len(re.findall(r'`"([a-z]+)"`', key.meaning)) >= 2
