@@ -3,15 +3,15 @@
 Two views of one record:
 
 - :func:`allan_deviation` is the picture: the overlapping, a robust, the modified Allan or the Hadamard deviation with χ² confidence
-bands. - :func:`fit_noise` is the estimator: quantisation Q, angle random walk N, bias instability B, rate random walk K and rate
-ramp R by
+  bands.
+- :func:`fit_noise` is the estimator: quantisation Q, angle random walk N, bias instability B, rate random walk K and rate ramp R by
   maximum likelihood on the cosine transform of the record, with profile-likelihood intervals.
 
 Why not least squares on the Allan deviation: its values at neighbouring τ share nearly all their data, so their errors are strongly
-correlated, and at long τ, which alone contains K and R, they are far from Gaussian. The cosine (DCT-II) coefficients of averaged-
-rate samples are independent and Gaussian instead, exactly for angle and rate random walk, which a DCT diagonalises, and nearly for
-flicker and quantisation, whose exact variances are used; the Allan variance is a smoothing of their squares and holds no more. So
-no covariance between taus has to be modelled, and the intervals are those of a likelihood.
+correlated, and at long τ, which alone contains K and R, they are far from Gaussian. The cosine (DCT-II) coefficients of
+averaged-rate samples are independent and Gaussian instead, exactly for angle and rate random walk, which a DCT diagonalises, and
+nearly for flicker and quantisation, whose exact variances are used; the Allan variance is a smoothing of their squares and holds no
+more. So no covariance between taus has to be modelled, and the intervals are those of a likelihood.
 
 The noises, with the Allan variance σ²(τ) of samples that average the rate over the sample interval (exact at every τ; bias: the
 floor):
@@ -124,7 +124,7 @@ class AllanDeviation(Listed):
     lower, upper : ndarray (axes, t)
         Confidence band, rad/s.
     edf : ndarray (axes, t)
-        Equivalent degrees of freedom of ``deviation``².
+        Equivalent degrees of freedom of the squared deviation.
     noise_type : ndarray of str (axes, t)
         A value of :data:`NOISE_TYPES`, found from the lag-1 autocorrelation at each τ.
     level : float

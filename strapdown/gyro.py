@@ -116,7 +116,7 @@ class GyroSpec(ByValue):
     scale_factor : ndarray (3,), default zeros
         Scale-factor errors, dimensionless: the diagonal of M.
     asymmetry : ndarray (3,), default zeros
-        Scale-factor asymmetry a, dimensionless: adds a |w|, so that the scale factor is 1 + s ± a by the sign of the rate.
+        Scale-factor asymmetry a, dimensionless: adds ``a |w|``, so that the scale factor is 1 + s ± a by the sign of the rate.
     misalignment : ndarray (3, 3), default zeros
         Off-diagonal part of M, rad; entry (i, j) is the share of the rate about axis j that axis i senses.
     g_sensitivity : ndarray (3, 3), default zeros
