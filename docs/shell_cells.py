@@ -6,16 +6,15 @@ The cells look and act as in any notebook; ``%%bash --no-raise-error`` goes on w
 from __future__ import annotations
 
 import subprocess
-import sys
 from typing import Any
 
 
 def bash(line: str, cell: str) -> None:
     """Run a cell in Bash until a command fails; print what it wrote."""
-    options = [] if "--no-raise-error" in line else ["-e"]
-    # stderr holds progress bars; commands that show an error redirect it.
-    done = subprocess.run(["bash", *options, "-c", cell], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    sys.stdout.write("\n".join(row.rstrip() for row in done.stdout.splitlines()))
+    options = [] if "--no-raise-error" in line else ["-e", "-o", "pipefail"]
+    # stderr holds progress bars; cells that show an error redirect it.
+    done = subprocess.run(["bash", *options, "-c", cell], capture_output=True, text=True, check=False)
+    print("\n".join(row.rstrip() for row in done.stdout.splitlines()))
     if done.returncode and options:
         raise RuntimeError(f"exit status {done.returncode}: {done.stderr}")
 
