@@ -32,7 +32,7 @@ templates_path = ["_templates"]
 os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(DOCS.parent), os.environ.get("PYTHONPATH", "")]))
 os.environ.update(
-    STRAPDOWN_DOCS=str(DOCS), COLUMNS="96", NO_COLOR="1", TERM="dumb", OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1"
+    STRAPDOWN_DOCS=str(DOCS), COLUMNS="96", NO_COLOR="1", TERM="dumb", TTY_COMPATIBLE="0", OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1"
 )
 os.environ.pop("MPLBACKEND", None)  # pages draw inline
 _profile = tempfile.TemporaryDirectory()
@@ -95,8 +95,16 @@ def _spaced(markup: str) -> str:
     return re.sub(r"<mo[^>]*>([/|])</mo>", r'<mo lspace="0" rspace="0">\1</mo>', markup)
 
 
+def _absolute_values(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Escape the bars of absolute values outside literals: reStructuredText would take |q| for a substitution."""
+    for k, line in enumerate(lines):
+        parts = re.split(r"(``.*?``)", line)
+        lines[k] = "".join(part if part.startswith("``") else part.replace("|", r"\|") for part in parts)
+
+
 def setup(app: Any) -> None:
     """Register the writer of formulas."""
+    app.connect("autodoc-process-docstring", _absolute_values)
     app.add_html_math_renderer(
         "mathml",
         (lambda self, node: _mathml(self, node, block=False), None),
