@@ -96,19 +96,19 @@ class GyroSpec(ByValue):
     Parameters
     ----------
     angle_random_walk : float or ndarray (3,), default 0.0
-        σ_v (N), rad/√s; 1 °/√h = π/10800 rad/√s.
+        Angle random walk σ_v (N), rad/√s; 1 °/√h = π/10800 rad/√s.
     rate_random_walk : float or ndarray (3,), default 0.0
-        σ_u (K), rad/s/√s: a random walk of the bias from 0 at the first edge.
+        Rate random walk σ_u (K), rad/s/√s, of the bias, from 0 at the first edge.
     bias_instability : float or ndarray (3,), default 0.0
-        B, rad/s: flicker of two-sided PSD B²/(2π f), stationary from the first sample; the floor of the Allan deviation is 0.664 B.
+        Bias instability B, rad/s: flicker of two-sided PSD B²/(2π f), stationary from the first sample; the floor of the Allan deviation is 0.664 B.
     quantization : float or ndarray (3,), default 0.0
-        Q, rad: the increments are whole multiples of Q√12 and the remainder is carried to the next, which gives 3Q²/τ².
+        Quantisation Q, rad: the increments are whole multiples of Q√12 and the remainder is carried to the next, which gives 3Q²/τ².
     rate_ramp : float or ndarray (3,), default 0.0
-        R, rad/s²: slope of the bias, which starts at 0 at the first edge.
+        Rate ramp R, rad/s²: slope of the bias, which starts at 0 at the first edge.
     markov_noise : float or ndarray (3,), default 0.0
-        √q, rad/s/√s, driving a Gauss–Markov bias ``ḃ = −b/τ + √q w``; its stationary standard deviation is √(qτ/2).
+        Noise √q, rad/s/√s, that drives a Gauss–Markov bias ``ḃ = −b/τ + √q w``; its stationary standard deviation is √(qτ/2).
     markov_correlation_time : float, default inf
-        τ, s; a finite one starts stationary, an infinite one is a random walk from 0.
+        Correlation time τ of that bias, s; a finite one starts stationary, an infinite one is a random walk from 0.
     turn_on_bias : ndarray (3,), default zeros
         Fixed bias, rad/s, body axes.
     turn_on_bias_sigma : float or ndarray (3,), default 0.0
