@@ -3,15 +3,15 @@
 Two views of one record:
 
 - :func:`allan_deviation` is the picture: the overlapping, a robust, the modified Allan or the Hadamard deviation with χ² confidence
-bands. - :func:`fit_noise` is the estimator: quantisation Q, angle random walk N, bias instability B, rate random walk K and rate
-ramp R by
+  bands.
+- :func:`fit_noise` is the estimator: quantisation Q, angle random walk N, bias instability B, rate random walk K and rate ramp R by
   maximum likelihood on the cosine transform of the record, with profile-likelihood intervals.
 
 Why not least squares on the Allan deviation: its values at neighbouring τ share nearly all their data, so their errors are strongly
-correlated, and at long τ, which alone contains K and R, they are far from Gaussian. The cosine (DCT-II) coefficients of averaged-
-rate samples are independent and Gaussian instead, exactly for angle and rate random walk, which a DCT diagonalises, and nearly for
-flicker and quantisation, whose exact variances are used; the Allan variance is a smoothing of their squares and holds no more. So
-no covariance between taus has to be modelled, and the intervals are those of a likelihood.
+correlated, and at long τ, which alone contains K and R, they are far from Gaussian. The cosine (DCT-II) coefficients of
+averaged-rate samples are independent and Gaussian instead, exactly for angle and rate random walk, which a DCT diagonalises, and
+nearly for flicker and quantisation, whose exact variances are used; the Allan variance is a smoothing of their squares and holds no
+more. So no covariance between taus has to be modelled, and the intervals are those of a likelihood.
 
 The noises, with the Allan variance σ²(τ) of samples that average the rate over the sample interval (exact at every τ; bias: the
 floor):
@@ -55,7 +55,6 @@ __all__ = [
     "AllanDeviation",
     "NoiseFit",
     "allan_deviation",
-    "expected_errors",
     "fit_noise",
     "model_deviation",
     "to_gyro_parameters",
@@ -125,7 +124,7 @@ class AllanDeviation(Listed):
     lower, upper : ndarray (axes, t)
         Confidence band, rad/s.
     edf : ndarray (axes, t)
-        Equivalent degrees of freedom of ``deviation``².
+        Equivalent degrees of freedom of the squared deviation.
     noise_type : ndarray of str (axes, t)
         A value of :data:`NOISE_TYPES`, found from the lag-1 autocorrelation at each τ.
     level : float
@@ -196,6 +195,8 @@ class NoiseFit(Listed):
         Samples of the record.
     sample_interval : float
         Sample interval, s.
+    sensor : {"gyro", "accelerometer", "magnetometer"}, default "gyro"
+        Sensor, for its units in print.
     """
 
     terms: tuple[str, ...]
@@ -210,7 +211,6 @@ class NoiseFit(Listed):
     samples: int
     sample_interval: float
     sensor: str = "gyro"
-    """Whose noise it is, for its units in print."""
 
     def listing(self) -> Listing:
         """Return the coefficients with their intervals, as a table."""
@@ -708,9 +708,18 @@ def to_gyro_parameters(fit: NoiseFit) -> dict[str, float | tuple[float, ...]]:
 
 
 def upper_bounds(fit: NoiseFit) -> dict[str, float | tuple[float, ...]]:
-    """Return the upper ends of the intervals of the terms that some axis does not support, by name, SI; one number or one per axis.
+    """Return the upper ends of the intervals of the terms that some axis does not support.
 
-    The record cannot exclude coefficients up to these; a filter that must not be overconfident may use them.
+    Parameters
+    ----------
+    fit : NoiseFit
+        Coefficients of one sensor.
+
+    Returns
+    -------
+    dict of str to float or tuple of float
+        Upper ends by name, SI, one number or one per axis. The record cannot exclude coefficients up to these; a filter that must
+        not be overconfident may use them.
     """
     return _by_name(fit, fit.upper, np.asarray(~fit.supported.all(axis=0)))
 

@@ -25,11 +25,6 @@ from strapdown import allan, checks
 from strapdown.allan import NOISE_TYPES, TERMS, AllanDeviation, NoiseFit
 from strapdown.checks import Array, InputError
 
-__all__ = [
-    "allan_deviation",
-    "fit_noise",
-]
-
 SHORTEST = 64
 """Samples of the shortest segment that a fit uses."""
 SIMULATED = 1 << 12

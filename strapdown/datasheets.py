@@ -19,7 +19,6 @@ from strapdown.gyro import GyroSpec
 
 __all__ = [
     "PRESETS",
-    "Preset",
     "from_datasheet",
     "preset",
 ]

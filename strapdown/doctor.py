@@ -31,7 +31,6 @@ from strapdown.recordings import Recording, increments
 from strapdown.units import DEGREE, STANDARD_GRAVITY
 
 __all__ = [
-    "Candidate",
     "Examination",
     "examine",
 ]

@@ -20,8 +20,6 @@ import numpy as np
 
 from strapdown.checks import Array, count
 
-__all__: list[str] = []
-
 STATES = 16
 """States of the shaping filter."""
 

@@ -56,16 +56,6 @@ from strapdown.kernels import gyro_errors, noise
 from strapdown.kernels.machine import compiled, read_only
 
 __all__ = [
-    "GyroOutput",
-    "GyroSpec",
-    "best_bandwidth",
-    "matched_process_noise",
-    "process_noise",
-    "read_spec",
-    "simulate",
-]
-
-__all__ = [
     "GyroSpec",
     "matched_process_noise",
     "process_noise",
@@ -106,19 +96,20 @@ class GyroSpec(ByValue):
     Parameters
     ----------
     angle_random_walk : float or ndarray (3,), default 0.0
-        σ_v (N), rad/√s; 1 °/√h = π/10800 rad/√s.
+        Angle random walk σ_v (N), rad/√s; 1 °/√h = π/10800 rad/√s.
     rate_random_walk : float or ndarray (3,), default 0.0
-        σ_u (K), rad/s/√s: a random walk of the bias from 0 at the first edge.
+        Rate random walk σ_u (K), rad/s/√s, of the bias, from 0 at the first edge.
     bias_instability : float or ndarray (3,), default 0.0
-        B, rad/s: flicker of two-sided PSD B²/(2π f), stationary from the first sample; the floor of the Allan deviation is 0.664 B.
+        Bias instability B, rad/s: flicker of two-sided PSD B²/(2π f), stationary from the first sample; the floor of
+        the Allan deviation is 0.664 B.
     quantization : float or ndarray (3,), default 0.0
-        Q, rad: the increments are whole multiples of Q√12 and the remainder is carried to the next, which gives 3Q²/τ².
+        Quantisation Q, rad: the increments are whole multiples of Q√12 and the remainder is carried to the next, which gives 3Q²/τ².
     rate_ramp : float or ndarray (3,), default 0.0
-        R, rad/s²: slope of the bias, which starts at 0 at the first edge.
+        Rate ramp R, rad/s²: slope of the bias, which starts at 0 at the first edge.
     markov_noise : float or ndarray (3,), default 0.0
-        √q, rad/s/√s, driving a Gauss–Markov bias ``ḃ = −b/τ + √q w``; its stationary standard deviation is √(qτ/2).
+        Noise √q, rad/s/√s, that drives a Gauss–Markov bias ``ḃ = −b/τ + √q w``; its stationary standard deviation is √(qτ/2).
     markov_correlation_time : float, default inf
-        τ, s; a finite one starts stationary, an infinite one is a random walk from 0.
+        Correlation time τ of that bias, s; a finite one starts stationary, an infinite one is a random walk from 0.
     turn_on_bias : ndarray (3,), default zeros
         Fixed bias, rad/s, body axes.
     turn_on_bias_sigma : float or ndarray (3,), default 0.0
@@ -126,7 +117,7 @@ class GyroSpec(ByValue):
     scale_factor : ndarray (3,), default zeros
         Scale-factor errors, dimensionless: the diagonal of M.
     asymmetry : ndarray (3,), default zeros
-        Scale-factor asymmetry a, dimensionless: adds a |w|, so that the scale factor is 1 + s ± a by the sign of the rate.
+        Scale-factor asymmetry a, dimensionless: adds ``a |w|``, so that the scale factor is 1 + s ± a by the sign of the rate.
     misalignment : ndarray (3, 3), default zeros
         Off-diagonal part of M, rad; entry (i, j) is the share of the rate about axis j that axis i senses.
     g_sensitivity : ndarray (3, 3), default zeros

@@ -22,8 +22,6 @@ __all__ = [
     "fixed_quaternion_derivative",
     "fixed_rate",
     "fixed_to_body_rate",
-    "inverse_right_jacobian",
-    "right_jacobian",
     "skew",
 ]
 

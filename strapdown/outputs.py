@@ -338,7 +338,19 @@ def _clock(estimate: Estimate, recording: Recording | None) -> dict[str, NDArray
 
 
 def to_dataframe(estimate: Estimate, **options: Any) -> Any:
-    """Return an estimate as a pandas ``DataFrame`` of the columns of :func:`table`, whose options it takes.
+    """Return an estimate as a pandas ``DataFrame``.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        Estimate.
+    **options : dict
+        Options of :func:`table`.
+
+    Returns
+    -------
+    pandas.DataFrame
+        Columns of :func:`table`, one row per time.
 
     Raises
     ------

@@ -140,7 +140,7 @@ def inverse(q: ArrayLike) -> Array:
 
 
 def normalize(q: ArrayLike) -> Array:
-    """Return q / |q|, of unit norm, equation (1).
+    """Return quaternions divided by their norm, so that equation (1) holds.
 
     Parameters
     ----------
@@ -202,7 +202,7 @@ def rotate(q: ArrayLike, v: ArrayLike) -> Array:
 
 
 def exp(rotation_vector: ArrayLike) -> Array:
-    """Return the unit quaternion (cos θ/2, φ/θ sin θ/2) of a rotation vector φ, θ = |φ|.
+    """Return the unit quaternion (cos θ/2, φ/θ sin θ/2) of a rotation vector φ of length θ.
 
     Parameters
     ----------
@@ -236,7 +236,7 @@ def exp(rotation_vector: ArrayLike) -> Array:
 
 
 def log(q: ArrayLike) -> Array:
-    """Return the rotation vector of the shorter rotation, |φ| ≤ π, of unit quaternions.
+    """Return the rotation vector of unit quaternions, that of the shorter rotation.
 
     Parameters
     ----------
@@ -246,7 +246,8 @@ def log(q: ArrayLike) -> Array:
     Returns
     -------
     ndarray (..., 3)
-        φ, rad. ``q`` and ``−q`` are the same attitude and give the same vector; at half a turn exactly (w = 0) both ±φ are right.
+        φ, rad, no longer than π. ``q`` and ``−q`` are the same attitude and give the same vector; at half a turn exactly (w = 0)
+        both ±φ are right.
 
     Examples
     --------
@@ -474,7 +475,7 @@ def to_mrp(q: ArrayLike) -> Array:
     Returns
     -------
     ndarray (..., 3)
-        Parameters of the shorter rotation, |p| ≤ 1 (Schaub & Junkins 1996).
+        Parameters of the shorter rotation, ``|p| ≤ 1`` (Schaub & Junkins 1996).
     """
     value = unit_quaternions("q", q)
     return np.asarray(to_rotation(value.reshape(-1, 4)).as_mrp()).reshape(*value.shape[:-1], 3)
@@ -486,7 +487,7 @@ def from_mrp(mrp: ArrayLike) -> Array:
     Parameters
     ----------
     mrp : array_like (..., 3)
-        p = tan(θ/4) n; p and its shadow −p/|p|² are the same attitude.
+        p = tan(θ/4) n; p and its shadow ``−p/|p|²`` are the same attitude.
 
     Returns
     -------

@@ -8,10 +8,6 @@ import numpy as np
 
 from strapdown.checks import count
 
-__all__ = [
-    "generator",
-]
-
 
 def generator(seed: int, run: int, source: str) -> np.random.Generator:
     """Return the random stream of one source in one run.

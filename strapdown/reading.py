@@ -32,8 +32,6 @@ import numpy as np
 
 from strapdown.checks import InputError
 
-__all__: list[str] = []
-
 Name = str | os.PathLike[str]
 
 LIMIT = "STRAPDOWN_MAX_MB"

@@ -26,15 +26,6 @@ from strapdown.records import CONVENTIONS, ImuRecord, Origin, Truth, put, result
 from strapdown.scenarios import scenario_from_toml
 from strapdown.vectors import KINDS, VectorMeasurements
 
-__all__ = [
-    "RecordFile",
-    "export_csv",
-    "import_csv",
-    "read_record",
-    "read_record_file",
-    "write_record",
-]
-
 KIND = "strapdown record"
 """The attribute ``kind`` of a record's file."""
 

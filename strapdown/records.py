@@ -41,8 +41,6 @@ __all__ = [
     "compress",
     "cut",
     "read_estimate",
-    "read_states",
-    "read_truth",
     "write_estimate",
 ]
 
@@ -77,10 +75,21 @@ class Truth:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Origin:
-    """How a record was simulated, as far as it is known."""
+    """How a record was simulated, as far as it is known.
+
+    Parameters
+    ----------
+    gyro : GyroSpec, optional
+        Specification of the gyro.
+    scenario : Scenario, optional
+        Scenario.
+    seed : int, optional
+        Seed of the random streams.
+    run : int, optional
+        Run of the random streams.
+    """
 
     gyro: GyroSpec | None = None
-    """Specification of the gyro."""
     scenario: Scenario | None = None
     seed: int | None = None
     run: int | None = None
@@ -103,6 +112,8 @@ class ImuRecord:
         Vector measurements, one series per sensor, each with its own times.
     truth : Truth, optional
         True attitude and bias, where known.
+    origin : Origin, optional
+        How it was simulated, so that a filter can be matched to the scenario; None for measured data.
     """
 
     time: Array
@@ -110,7 +121,6 @@ class ImuRecord:
     vectors: tuple[VectorMeasurements, ...] = ()
     truth: Truth | None = None
     origin: Origin | None = None
-    """How it was simulated: a filter can be matched to the scenario; None of measured data."""
 
     def __post_init__(self) -> None:
         """Check shapes, order and finiteness."""
@@ -368,7 +378,7 @@ class ErrorStateEstimate:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Estimate(Listed):
-    """Attitude and gyro bias with their covariance, at the stored edges of a filter's run.
+    """Attitude and gyro bias with their covariance, at the stored epochs of a filter's run.
 
     Parameters
     ----------
@@ -450,21 +460,31 @@ class Estimate(Listed):
         bias: ArrayLike | None = None,
         innovations: Mapping[str, Innovations] | None = None,
     ) -> Estimate:
-        """Return the estimate that arrays of any filter make.
+        """Return an estimate made of the arrays of any filter.
 
         Parameters
         ----------
         time : array_like (m,)
-            s, strictly increasing.
+            Times, s, strictly increasing.
         attitude : array_like (m, 4)
-            q_fb, scalar first.
+            Unit quaternions q_fb, scalar first. NaN where the filter has none.
         covariance : array_like (m, 3, 3) or (m, 6, 6)
-            Of δθ, rad², with ``q_true = q_est ⊗ exp(δθ)`` (body axes), or of (δθ, δb), δb = b_true − b_est, rad/s. NaN where the filter
-            has none.
+            Covariance of δθ, rad², with ``q_true = q_est ⊗ exp(δθ)`` (body axes), or of (δθ, δb), δb = b_true − b_est, rad/s. NaN where
+            the filter has none.
         bias : array_like (m, 3), optional
             Gyro bias, rad/s, body axes. Without one it is NaN, as is its covariance: only the attitude is judged.
-        innovations : mapping, optional
-            :class:`Innovations` by sensor; without them there is no NIS.
+        innovations : mapping of str to Innovations, optional
+            Innovations by sensor; without them there is no NIS.
+
+        Returns
+        -------
+        Estimate
+            The estimate.
+
+        Raises
+        ------
+        InputError
+            If shapes do not fit, or a bias is given without its covariance.
 
         Examples
         --------

@@ -14,8 +14,6 @@ from strapdown import coning, quaternion
 from strapdown.checks import Array, InputError, non_negative
 from strapdown.recordings import Recording, increments
 
-__all__: list[str] = []
-
 FIELD_SPAN = 0.2
 """Span over which the change of the field, turned back by the gyro, shows the magnetometer's delay, s."""
 PAIRS_IN_SPAN = 12

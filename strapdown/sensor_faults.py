@@ -15,8 +15,6 @@ import numpy as np
 from strapdown.checks import Array
 from strapdown.recordings import Recording
 
-__all__: list[str] = []
-
 MIN_CLIPPED_RATE = 1.0
 """Smallest limit of a clipped gyro axis, rad/s; quantised samples at rest repeat their extreme too."""
 MIN_CLIPPED_FORCE = 15.0

@@ -113,7 +113,18 @@ def matrix_of(block: ErrorStateEstimate) -> Array:
 
 
 def to_toml(calibration: UnitCalibration) -> str:
-    """Return a calibration as TOML with the table ``[calibration]``."""
+    """Return a calibration as TOML with the table ``[calibration]``.
+
+    Parameters
+    ----------
+    calibration : UnitCalibration
+        Calibration.
+
+    Returns
+    -------
+    str
+        TOML, for :func:`read`.
+    """
     import tomli_w
 
     content: dict[str, Any] = {

@@ -49,7 +49,6 @@ __all__ = [
     "Faults",
     "HeadingPair",
     "Magnetometer",
-    "Sensor",
     "VectorMeasurements",
     "VectorSensor",
     "specific_force",
@@ -603,7 +602,7 @@ class VectorSensor(ByValue):
     phase : float, default 0.0
         Time of the first measurement after the start, s; 0: one interval after it.
     kind : {"direction", "heading"}, default "direction"
-        Direction, or heading about the fixed z axis.
+        ``"direction"``, or ``"heading"``: only the rotation about the fixed z axis.
     faults : Faults, default no faults
         Errors beyond the white noise.
     """
@@ -709,7 +708,7 @@ class AttitudeSensor:
     rate : float
         Measurements per second, Hz.
     boresight : {"x", "y", "z"}, default "z"
-        Body axis of the boresight.
+        Body axis of the boresight, ``"x"``, ``"y"`` or ``"z"``.
     phase : float, default 0.0
         Time of the first measurement after the start, s; 0: one interval after it.
     faults : Faults, default no faults
@@ -766,11 +765,11 @@ class Magnetometer(ByValue):
     rate : float
         Measurements per second, Hz.
     hard_iron : ndarray (3,), default zeros
-        Offset h, T, body axes.
+        Hard iron h: field of magnetised parts that move with the body, T, body axes.
     soft_iron : ndarray (3, 3), default zeros
-        S, dimensionless.
+        Soft iron S: of parts that the outer field magnetises, dimensionless.
     kind : {"direction", "heading", "vector"}, default "direction"
-        Direction, heading about the fixed z axis, or the whole vector in T.
+        ``"direction"``, ``"heading"`` (about the fixed z axis) or ``"vector"`` (the whole field, T).
     phase : float, default 0.0
         Time of the first measurement after the start, s; 0: one interval after it.
     faults : Faults, default no faults
@@ -893,7 +892,7 @@ class Accelerometer(ByValue):
     gravity_f : ndarray (3,), default (0, 0, −9.80665)
         Acceleration of gravity, m/s², fixed frame.
     kind : {"direction", "vector"}, default "direction"
-        Direction of the vertical, or the whole vector in m/s².
+        ``"direction"`` of the vertical, or ``"vector"`` (the specific force, m/s²).
     phase : float, default 0.0
         Time of the first measurement after the start, s; 0: one interval after it.
     faults : Faults, default no faults

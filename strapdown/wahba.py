@@ -28,7 +28,6 @@ __all__ = [
     "from_vertical_and_heading",
     "solve",
     "triad",
-    "triad_covariance",
 ]
 
 Method = Literal["svd", "davenport", "quest", "foam"]

@@ -159,17 +159,29 @@ class Algorithm:
     def from_coefficients(
         cls, name: str, coefficients: Sequence[Coefficient], *, previous: int = 0, source: str = ""
     ) -> Algorithm:
-        """Return the algorithm ``φ = Σ Δθ_i + (c_1 Δθ_1 + … + c_{M−1} Δθ_{M−1}) × Δθ_M``; orders and drift constant are derived.
+        """Return the algorithm ``φ = Σ Δθ_i + (c_1 Δθ_1 + … + c_{M−1} Δθ_{M−1}) × Δθ_M``.
 
         Parameters
         ----------
         name : str
+            Name of the algorithm.
         coefficients : sequence of int, float, str or Fraction
-            c_1 … c_{M−1}, the oldest increment's first, as textbooks write them (the field ``coefficients`` counts them from the last).
-            M = N + p. A float is taken for the fraction that it is nearest to (:func:`strapdown.coning.coefficients.rational`).
-        previous : int
-            p, how many of the increments belong to the step before; the sum Σ Δθ_i is that of the N others.
-        source : str
+            c_1 … c_{M−1}, the oldest increment's first, as textbooks write them (the field ``coefficients`` counts them from the
+            last). M = N + p. A float is taken as the nearest simple fraction (:func:`strapdown.coning.coefficients.rational`).
+        previous : int, default 0
+            p, increments before the step; the sum Σ Δθ_i is that of the N others.
+        source : str, default ""
+            Publication.
+
+        Returns
+        -------
+        Algorithm
+            The algorithm, its orders and drift constant derived.
+
+        Raises
+        ------
+        InputError
+            If the coefficients leave no increment in the step or are not numbers.
 
         Examples
         --------
@@ -207,18 +219,30 @@ class Algorithm:
         following: int = 0,
         source: str = "",
     ) -> Algorithm:
-        """Return the algorithm ``φ = Σ Δθ_i + Σ K_ij Δθ_i × Δθ_j``; orders and drift constant are derived.
+        """Return the algorithm ``φ = Σ Δθ_i + Σ K_ij Δθ_i × Δθ_j``.
 
         Parameters
         ----------
         name : str
+            Name of the algorithm.
         samples : int
             N, increments in a step.
         products : iterable of (i, j, K_ij)
-            Increments are counted from 1, the oldest of the window; i and j differ. K_ij as the coefficients above.
-        previous, following : int
-            How many of the window's increments lie before and after the step.
-        source : str
+            Increments are counted from 1, the oldest of the window; i and j differ. K_ij as in :meth:`from_coefficients`.
+        previous, following : int, default 0
+            Increments of the window before and after the step.
+        source : str, default ""
+            Publication.
+
+        Returns
+        -------
+        Algorithm
+            The algorithm, its orders and drift constant derived.
+
+        Raises
+        ------
+        InputError
+            If a product is not one of two different increments of the window.
 
         Examples
         --------
@@ -254,7 +278,25 @@ class Algorithm:
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any], place: str = "algorithm") -> Algorithm:
-        """Return the algorithm that a table of a file holds, with the arguments of :meth:`from_coefficients` or :meth:`from_products`."""
+        """Return the algorithm in a table of a file.
+
+        Parameters
+        ----------
+        table : mapping of str
+            Arguments of :meth:`from_coefficients` or :meth:`from_products` by name.
+        place : str, default "algorithm"
+            Name of the table, for messages.
+
+        Returns
+        -------
+        Algorithm
+            The algorithm.
+
+        Raises
+        ------
+        InputError
+            If a key is unknown or missing, or a value is not what it must be.
+        """
         checks.known_keys(
             place, table, ("name", "samples", "previous", "following", "coefficients", "products", "source")
         )
@@ -286,7 +328,23 @@ class Algorithm:
 
     @classmethod
     def from_toml(cls, path: str | os.PathLike[str]) -> Algorithm:
-        """Read the one table ``[algorithm]`` of a TOML file (:meth:`from_table`); of several, :func:`read_algorithms`."""
+        """Read the one table ``[algorithm]`` of a TOML file.
+
+        Parameters
+        ----------
+        path : path-like
+            File; for one with several tables see :func:`read_algorithms`.
+
+        Returns
+        -------
+        Algorithm
+            The algorithm.
+
+        Raises
+        ------
+        InputError
+            If the file does not hold exactly one valid table.
+        """
         found = read_algorithms(path)
         if len(found) > 1:
             raise InputError(
@@ -295,7 +353,18 @@ class Algorithm:
         return found[0]
 
     def to_table(self) -> dict[str, Any]:
-        """Return the algorithm as :meth:`from_table` reads it; only one whose table is of vectors has such a form."""
+        """Return the algorithm as a table for :meth:`from_table`.
+
+        Returns
+        -------
+        dict
+            Table of a rotation-vector algorithm; no other has such a form.
+
+        Raises
+        ------
+        InputError
+            If the solver has no table.
+        """
         table: dict[str, Any] = {"name": self.name, "samples": self.samples}
         if self.previous:
             table["previous"] = self.previous
@@ -401,12 +470,22 @@ def _derived(name: str, table: Table, samples: int, previous: int) -> dict[str, 
 
 
 def read_algorithms(path: str | os.PathLike[str]) -> tuple[Algorithm, ...]:
-    """Read the algorithms of a TOML file: one table ``[algorithm]``, or several ``[[algorithm]]``, as :meth:`Algorithm.from_table`.
+    """Read the algorithms of a TOML file: one table ``[algorithm]``, or several ``[[algorithm]]``.
+
+    Parameters
+    ----------
+    path : path-like
+        File with the tables of :meth:`Algorithm.from_table`.
+
+    Returns
+    -------
+    tuple of Algorithm
+        The algorithms.
 
     Raises
     ------
     InputError
-        If the file is missing, no TOML, has no such table, or a table is none of an algorithm.
+        If the file is missing, is not TOML, has no such table, or a table is not one of an algorithm.
     """
     with reading.from_file(path):
         told = reading.toml(path)
@@ -633,12 +712,12 @@ ALGORITHMS: Mapping[str, Algorithm] = Catalogue(_makers())
 
 
 def named(algorithm: str | Algorithm) -> Algorithm:
-    """Return the algorithm of that name, or the one given, or that in a file FILE.toml (:meth:`Algorithm.from_toml`).
+    """Return the algorithm of that name or file, or the one given.
 
     Parameters
     ----------
     algorithm : str or Algorithm
-        Name in :data:`ALGORITHMS`, a file ``FILE.toml``, or an algorithm.
+        Name in :data:`ALGORITHMS`, FILE.toml (:meth:`Algorithm.from_toml`), or an algorithm.
 
     Returns
     -------

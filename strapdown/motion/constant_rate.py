@@ -23,7 +23,7 @@ class ConstantRate:
     Parameters
     ----------
     rate : array_like (3,)
-        w_b, rad/s.
+        Rate w_b about each body axis, rad/s.
     initial_attitude : array_like (4,), default identity
         Unit quaternion q_fb at time 0.
 

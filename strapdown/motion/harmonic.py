@@ -29,11 +29,11 @@ class Harmonic:
     Parameters
     ----------
     amplitude : array_like (3,)
-        a, rad/s along each body axis.
+        Amplitude a about each body axis, rad/s.
     frequency : float
-        f, Hz.
+        Frequency f of this harmonic, Hz.
     phase : float, default 0.0
-        φ, rad. Two harmonics of one frequency on different axes make an elliptic vibration, which cones.
+        Phase φ, rad. Two harmonics of one frequency on different axes make an elliptic vibration, which cones.
     """
 
     amplitude: Sequence[float]
@@ -63,7 +63,7 @@ class HarmonicRates:
     harmonics : sequence of Harmonic
         Terms of the rate.
     mean : array_like (3,), default zeros
-        Constant part of the rate, rad/s, body axes.
+        Mean rate about each body axis, rad/s.
     initial_attitude : array_like (4,), default identity
         Unit quaternion q_fb at time 0.
     """

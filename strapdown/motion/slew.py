@@ -25,9 +25,9 @@ class Slew:
     rotation_vector : array_like (3,)
         Φ, the whole rotation in body axes, rad; may exceed π.
     duration : float
-        Duration, s.
+        Duration of the rotation, s.
     start : float, default 0.0
-        Time of the start, s.
+        Time at which the rotation begins, s.
     initial_attitude : array_like (4,), default identity
         Unit quaternion q_fb before the slew.
     """

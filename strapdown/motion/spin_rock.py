@@ -22,13 +22,13 @@ class SpinRock:
     Parameters
     ----------
     rock_angle : float
-        A, rad.
+        Amplitude A of the rocking, rad.
     rock_frequency : float
-        f, Hz.
+        Frequency f of the rocking, Hz.
     spin_rate : float
-        Ω_s, rad/s.
+        Rate Ω_s of the spin about body z, rad/s.
     rock_phase : float, default 0.0
-        φ, rad.
+        Phase φ of the rocking at time 0, rad.
     """
 
     rock_angle: float

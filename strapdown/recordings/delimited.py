@@ -68,7 +68,7 @@ def read_csv(
     file = Path(path)
     if recordfiles.is_record(file):
         raise InputError(
-            f"{file.name} is a simulated record, no recording; integrate it (`strapdown integrate`) or filter it (`strapdown estimate`)"
+            f"{file.name} is a simulated record, not a recording; integrate it (`strapdown integrate`) or filter it (`strapdown estimate`)"
         )
     with reading.from_file(file):
         table = _Table(file.name, io.StringIO(reading.text(file), newline=""))

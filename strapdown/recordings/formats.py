@@ -215,11 +215,11 @@ def read(
         are found by their names.
     topic : str, default ""
         For bags and flight logs: topic of the inertial unit, where there are several.
-    axes : str or mapping, optional
+    axes : str or mapping of str to str, optional
         The recorded axes that become the body's x, y, z, ``"x,-y,-z"`` for a unit whose z axis points down; or of single sensors,
         ``{"magnetometer": "y,x,-z"}``. See :func:`strapdown.recordings.with_axes`.
-    invert : str or iterable of str, default ()
-        Sensors of inverted sign: ``"accelerometer"`` of one that reads −g upward at rest.
+    invert : str or iterable of str, default empty
+        Sensors of inverted sign: ``"accelerometer"`` for one that reads −g upward at rest.
 
     Returns
     -------
@@ -341,8 +341,19 @@ def _by_ending(path: str | os.PathLike[str], kind: str) -> Format:
 def from_record(record: ImuRecord, source: str = "record") -> Recording:
     """Return a simulated record as a device would have recorded it.
 
-    The rate at each stamp is the mean over the sample interval that ends there, as of an integrating gyro: half an interval late.
-    Vector series named accelerometer and magnetometer are included where they have samples at the stamps; the truth is the reference.
+    Parameters
+    ----------
+    record : ImuRecord
+        Record of n intervals.
+    source : str, default "record"
+        Name of the recording.
+
+    Returns
+    -------
+    Recording
+        Recording of n samples. The rate at each stamp is the mean over the sample interval that ends there, as of an integrating
+        gyro: half an interval late. Vector series named accelerometer and magnetometer are included where they have samples at the
+        stamps; the truth is the reference.
     """
     steps = np.diff(record.time)[:, None]
     own: dict[str, Any] = {}

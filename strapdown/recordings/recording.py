@@ -235,7 +235,23 @@ def increments(recording: Recording) -> Array:
 
 
 def gaps(time: ArrayLike) -> list[tuple[float, float]]:
-    """Return (begin, length), s, of every gap between stamps, where the motion is unknown."""
+    """Return the gaps between stamps, where the motion is unknown.
+
+    Parameters
+    ----------
+    time : array_like (n,)
+        Stamps, s, increasing.
+
+    Returns
+    -------
+    list of (float, float)
+        Begin and length of each gap, s: intervals of more than five usual ones.
+
+    Examples
+    --------
+    >>> gaps([0.0, 1.0, 2.0, 3.0, 9.0, 10.0])
+    [(3.0, 6.0)]
+    """
     stamps = np.asarray(time, np.float64)
     steps = np.diff(stamps)
     return [(float(stamps[k]), float(steps[k])) for k in np.flatnonzero(steps > GAP * np.median(steps))]

@@ -142,25 +142,28 @@ def read_samples(
 def samples_of(
     content: Recording | ImuRecord, sensor: str = "gyro", *, gaps: bool = False, source: str = "record"
 ) -> GyroSamples:
-    """Return one sensor's samples of a recording or a simulated record, as :func:`read_samples` reads them from its file.
+    """Return the samples of one sensor of a recording or a simulated record, as :func:`read_samples` for its file.
 
     Parameters
     ----------
     content : Recording or ImuRecord
-    sensor : {"gyro", "accelerometer", "magnetometer"}
+        Source of the samples.
+    sensor : {"gyro", "accelerometer", "magnetometer"}, default "gyro"
+        Sensor.
     gaps : bool, default False
-        Allow gaps: missing samples are rows of NaN then.
-    source : str
-        What errors call a record; a recording has a name of its own.
+        Whether gaps are allowed: missing samples are then rows of NaN.
+    source : str, default "record"
+        Name of a record, for messages; a recording has its own.
 
     Returns
     -------
     GyroSamples
+        Samples at even intervals.
 
     Raises
     ------
     InputError
-        If the sensor is not there, its unit is unknown, or its samples lie at uneven intervals.
+        If the sensor is missing, its unit is unknown, or its samples lie at uneven intervals.
     """
     one_of("sensor", sensor, SENSORS)
     if isinstance(content, Recording):
@@ -247,3 +250,6 @@ def _grid(source: str, time: Array) -> tuple[float, np.ndarray, tuple[str, ...]]
     if missing:
         words += (f"{missing} samples are missing in {int(np.sum(whole > 1.0))} gaps.",)
     return interval, place, words
+
+
+__all__ = ["GyroSamples", "read_gyro", "read_samples", "samples_of"]
