@@ -203,7 +203,12 @@ class ConingStudy:
     outcomes: tuple[FilterOutcome, ...]
 
     def summary(self) -> dict[str, Any]:
-        """Return the study as ``coning.json`` holds it: degrees, hours, arcseconds, with the unit in each key."""
+        """Return the study as ``coning.json`` holds it: degrees, hours, arcseconds, with the unit in each key.
+
+        Returns
+        -------
+        dict
+        """
         p = self.parameters
         return {
             "scenario": {
@@ -266,7 +271,28 @@ def measured_drift(motion: Coning, rate: float, algorithm: coning.Algorithm, ste
 
 
 def run(parameters: ConingParameters, *, progress: Callable[[int], None] | None = None) -> ConingStudy:
-    """Run the study; ``progress`` is called with the number of Monte Carlo runs just finished."""
+    """Run the coning study: drift by algorithm, and the same filter on the increments of each.
+
+    Parameters
+    ----------
+    parameters : ConingParameters
+    progress : callable, optional
+        Called with the number of Monte Carlo runs just finished.
+
+    Returns
+    -------
+    ConingStudy
+
+    Raises
+    ------
+    InputError
+        If a parameter is out of range.
+
+    References
+    ----------
+    P. G. Savage, Strapdown inertial navigation integration algorithm design part 1: attitude algorithms, J. Guidance, Control, and
+    Dynamics 21(1), 1998.
+    """
     scenario = parameters.scenario
     algorithms = [coning.ALGORITHMS[name] for name in ALGORITHMS]
     motion = Coning(angle=parameters.angle, frequency=parameters.frequency)

@@ -124,7 +124,12 @@ class Analysis(Listed):
     """What is too large for an analysis that is linear about the truth, in words: take a Monte Carlo there."""
 
     def listing(self) -> Listing:
-        """Return the error budget at the last epoch, as a table."""
+        """Return the error budget at the last epoch, as a table.
+
+        Returns
+        -------
+        Listing
+        """
         rows = [
             (name, kind, figure(attitude / ARCSECOND), figure(bias / DEGREE_PER_HOUR))
             for name, kind, attitude, bias in self.budget()
@@ -180,10 +185,19 @@ class Analysis(Listed):
         )
 
     def budget(self, epoch: int = -1) -> list[tuple[str, str, float, float]]:
-        """Return one row a source at an epoch: name, kind, RMS error of an attitude axis (rad) and of a bias axis (rad/s).
+        """Return the error budget at an epoch, one row a source.
 
-        Kinds are "random", "fixed" and "considered"; parts of one considered error (its axes) are taken together. Squares of all rows but
-        the fixed ones add up; those add as errors.
+        Squares of all rows but the fixed ones add up; the fixed ones add as errors. The axes of one considered error are one row.
+
+        Parameters
+        ----------
+        epoch : int, default -1
+            Index of the epoch.
+
+        Returns
+        -------
+        list of (str, str, float, float)
+            Name, kind ("random", "fixed" or "considered"), RMS error of an attitude axis (rad) and of a bias axis (rad/s).
         """
         rows: dict[tuple[str, str], Array] = {}
         for name, block in zip(self.sources, self.contributions[epoch], strict=True):
@@ -636,24 +650,39 @@ def analyse(
     initial_bias_sigma: float | None = None,
     epochs: int = 100,
 ) -> Analysis:
-    """Return the predicted errors of a filter on a scenario, from one pass without noise.
+    """Predict the errors of a filter on a scenario, in one pass without noise samples.
 
     Parameters
     ----------
     scenario : Scenario
-    setup : FilterSetup
-        What the filter believes; None: what a right one does (:func:`strapdown.setup.matched`).
-    consider : Consider
+    setup : FilterSetup, optional
+        The filter. Default: matched to the scenario (:func:`strapdown.setup.matched`).
+    consider : Consider, optional
         Errors besides those of the scenario.
-    initial_attitude_sigma, initial_bias_sigma : float
-        Actual standard deviations of the initial errors, rad and rad/s, where they are not what the filter believes.
-    epochs : int
+    initial_attitude_sigma, initial_bias_sigma : float, optional
+        Actual standard deviations of the initial errors, each axis, rad and rad/s. Default: those of the setup.
+    epochs : int, default 100
         Intervals between the epochs of the result; they end on filter steps, as those of :func:`strapdown.montecarlo.run` do.
+
+    Returns
+    -------
+    Analysis
 
     Raises
     ------
     InputError
-        If a considered sensor is not in the scenario or late by more than that lasts, or a sensor is of its own class or without noise.
+        If a considered sensor is not in the scenario, a considered time offset is longer than the scenario, or a sensor is of a class of
+        your own or without noise.
+
+    References
+    ----------
+    A. Gelb (ed.), Applied Optimal Estimation, 1974, chapter 7 (suboptimal filters and sensitivity analysis).
+
+    Examples
+    --------
+    >>> from strapdown import covariance, scenarios
+    >>> found = covariance.analyse(scenarios.load_scenario("two-stars"))  # doctest: +SKIP
+    >>> print(found)  # doctest: +SKIP
     """
     setup = matched(scenario) if setup is None else setup
     consider = Consider() if consider is None else consider

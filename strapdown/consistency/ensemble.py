@@ -83,10 +83,29 @@ class Credibility:
 
 
 def credibility(error: ArrayLike, covariance: ArrayLike, probability: float = 0.99) -> Credibility:
-    """Return the statistics of independent errors (runs, n) with their covariances (runs, n, n).
+    """Return the credibility statistics of independent errors at one epoch.
 
-    X. R. Li & Z. Zhao, *Measuring estimator's credibility: noncredibility index* (Fusion 2006); log-NEES after the same authors. At least
-    n + 1 runs, or the actual mean square error has no inverse.
+    Parameters
+    ----------
+    error : array_like (runs, n)
+        At least n + 1 runs, so that the mean square error has an inverse.
+    covariance : array_like (runs, n, n)
+        The filter's covariance in each run.
+    probability : float, default 0.99
+        Of the bounds.
+
+    Returns
+    -------
+    Credibility
+
+    Raises
+    ------
+    InputError
+        If the shapes do not agree, or a covariance is not positive definite.
+
+    References
+    ----------
+    X. R. Li, Z. Zhao, Measuring estimator's credibility: noncredibility index, Fusion 2006.
     """
     tail(probability)
     white = whitened(error, covariance)

@@ -56,7 +56,12 @@ class Diagnosis(Listed):
     """Probability that a right filter is neither called wrong nor given a cause, at least."""
 
     def listing(self) -> Listing:
-        """Return the causes considered, the likeliest first, as a table."""
+        """Return the causes considered, the likeliest first, as a table.
+
+        Returns
+        -------
+        Listing
+        """
         rows = [
             (one.name, one.of, figure(one.gain), figure(one.log_p), "significant" if one in self.causes else "")
             for one in self.considered[:8]
@@ -91,7 +96,12 @@ class Diagnosis(Listed):
         return "\n".join(lines)
 
     def summary(self) -> dict[str, Any]:
-        """Return everything as plain values for JSON."""
+        """Return causes and verdict as plain values for JSON.
+
+        Returns
+        -------
+        dict
+        """
         number = lambda x: float(x) if math.isfinite(x) else None  # noqa: E731
 
         def row(cause: Cause) -> dict[str, Any]:

@@ -134,7 +134,12 @@ class Statistics(Listed):
     example_sigma: Array
 
     def listing(self) -> Listing:
-        """Return NEES and NIS per degree of freedom, and the errors at the end, as a table."""
+        """Return NEES and NIS per degree of freedom, and the errors at the end, as a table.
+
+        Returns
+        -------
+        Listing
+        """
         from strapdown.montecarlo.verdicts import summary
 
         report = summary(self)
@@ -233,25 +238,67 @@ class Statistics(Listed):
         return _divided(self.sensor_nis_sum.sum(axis=1), self.sensor_degrees.sum(axis=1))
 
     def nis_bounds(self, probability: float = 0.99, sensor: str | None = None) -> tuple[float, float]:
-        """Return two-sided bounds of :attr:`mean_nis`, or of that of one sensor."""
+        """Return two-sided bounds of the mean NIS per degree of freedom of a consistent filter.
+
+        Parameters
+        ----------
+        probability : float, default 0.99
+        sensor : str, optional
+            Default: all sensors together (:attr:`mean_nis`).
+
+        Returns
+        -------
+        low, high : float
+        """
         rows = slice(None) if sensor is None else self.sensors.index(sensor)
         return consistency.mean_bounds(1, int(self.sensor_degrees[rows].sum()), probability)
 
     def verdict(self, epochs: NDArray[Any], subset: str = "state", probability: float = 0.99) -> Verdict:
-        """Return the two-sided χ² verdict on ``subset`` ("state", "attitude" or "bias") at the epochs of the given indices.
+        """Return the two-sided χ² test of the ANEES at given epochs.
 
-        An epoch at which some run was not finite counts as infinite: no filter that fails is consistent.
+        An epoch at which some run was not finite counts as infinite: a filter that fails in a run is not consistent.
+
+        Parameters
+        ----------
+        epochs : array of int
+            Indices of epochs.
+        subset : {"state", "attitude", "bias"}
+        probability : float, default 0.99
+            Of the bounds at all epochs together.
+
+        Returns
+        -------
+        Verdict
         """
         column, degrees = SUBSETS[subset]
         mean = np.where(self.finite == self.runs, self.anees[:, column], np.inf)[epochs]
         return Verdict(mean=mean, degrees=degrees, runs=self.runs, probability=probability)
 
     def error_quantile(self, probability: float) -> Array:
-        """Return the quantile of |e| at each epoch (m, 6), from the histogram: off by less than half a bin, 6 %, mostly far less."""
+        """Return a quantile of |e| at each epoch, from the histogram; its error is less than half a bin, 6 %.
+
+        Parameters
+        ----------
+        probability : float
+
+        Returns
+        -------
+        ndarray (m, 6)
+            rad, rad/s.
+        """
         return _quantile(self.histogram[:, :6], probability, bin_edges(ERROR_EXPONENT))
 
     def nees_quantile(self, probability: float) -> Array:
-        """Return the quantile of the NEES of state, attitude and bias at each epoch (m, 3)."""
+        """Return a quantile of the NEES of state, attitude and bias at each epoch.
+
+        Parameters
+        ----------
+        probability : float
+
+        Returns
+        -------
+        ndarray (m, 3)
+        """
         return _quantile(self.histogram[:, 6:], probability, bin_edges(NEES_EXPONENT))
 
 
