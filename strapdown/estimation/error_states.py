@@ -135,11 +135,31 @@ class ErrorStates(ByValue):
         return {}
 
     def transition(self, dt: float) -> Array:
-        """Return Φ (size, size) over dt, s."""
+        """Return the transition matrix Φ.
+
+        Parameters
+        ----------
+        dt : float
+            s.
+
+        Returns
+        -------
+        ndarray (size, size)
+        """
         return np.diag(np.exp(-self.decay * dt)) if not np.any(self.feed) else self._chained(dt)[0]
 
     def process_noise(self, dt: float) -> Array:
-        """Return Q (size, size) over dt, s."""
+        """Return the covariance Q of the process noise.
+
+        Parameters
+        ----------
+        dt : float
+            s.
+
+        Returns
+        -------
+        ndarray (size, size)
+        """
         if np.any(self.feed):
             return self._chained(dt)[1]
         with np.errstate(invalid="ignore", divide="ignore"):

@@ -93,7 +93,18 @@ class Gate:
         return self.recovery or LOCK_OUT
 
     def restart_bias_variance(self, initial: Array) -> Array:
-        """Return what is added to the variance of the first challenger's bias (3,), (rad/s)², of a filter with this initial P (n, n)."""
+        """Return what is added to the bias variance of the first restart candidate.
+
+        Parameters
+        ----------
+        initial : ndarray (n, n)
+            Initial covariance of the filter.
+
+        Returns
+        -------
+        ndarray (3,)
+            (rad/s)².
+        """
         if self.restart_bias_sigma is None:
             return np.diag(initial)[3:6].copy()
         return np.full(3, self.restart_bias_sigma**2)
@@ -192,7 +203,18 @@ class Monitor:
         return (self.window - 1.0) / (self.window + 1.0)
 
     def means(self, nis: Array, degrees: np.ndarray) -> tuple[Array, Array, Array]:
-        """Return the running mean of NIS per degree of freedom (n,), and its lower and upper bound (n,)."""
+        """Return the running mean of NIS per degree of freedom, and its bounds.
+
+        Parameters
+        ----------
+        nis : ndarray (n,)
+        degrees : ndarray (n,)
+            Degrees of freedom of each.
+
+        Returns
+        -------
+        mean, low, high : ndarray (n,)
+        """
         from scipy.signal import lfilter
         from scipy.special import chdtri
 
@@ -204,7 +226,20 @@ class Monitor:
         return total / weight, chdtri(effective, 1.0 - tail) / effective, chdtri(effective, tail) / effective
 
     def watch(self, time: Array, nis: Array, degrees: np.ndarray) -> list[Event]:
-        """Return an event for each stretch of measurements (n,) in which the mean is outside its bounds."""
+        """Return an event for each stretch of measurements in which the running mean is outside its bounds.
+
+        Parameters
+        ----------
+        time : ndarray (n,)
+            s.
+        nis : ndarray (n,)
+        degrees : ndarray (n,)
+            Degrees of freedom of each.
+
+        Returns
+        -------
+        list of Event
+        """
         if len(time) <= self.window:
             return []
         mean, low, high = self.means(nis, degrees)

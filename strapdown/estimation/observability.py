@@ -61,7 +61,17 @@ class Observability:
         return np.asarray(np.sqrt(np.sum(self.directions[self.rank :] ** 2, axis=0)))
 
     def words(self, k: int) -> str:
-        """Say direction k: states and their shares, each in its prior σ, and what one σ left along it is of each in its unit."""
+        """Return one direction in words: states with their shares, each in its prior σ, and in its unit what one σ left along it is.
+
+        Parameters
+        ----------
+        k : int
+            Index of the direction.
+
+        Returns
+        -------
+        str
+        """
         direction = self.directions[k]
         large = np.flatnonzero(np.abs(direction) >= NAMED * np.max(np.abs(direction)))
         large = large[np.argsort(-np.abs(direction[large]), kind="stable")]
@@ -72,7 +82,16 @@ class Observability:
         return " ".join(parts).removeprefix("+")
 
     def weakest(self, number: int = 3) -> tuple[str, ...]:
-        """Say the weakest directions, the weakest first, each with its singular value."""
+        """Return the weakest directions in words, the weakest first, each with its singular value.
+
+        Parameters
+        ----------
+        number : int, default 3
+
+        Returns
+        -------
+        tuple of str
+        """
         places = range(len(self.states) - 1, max(len(self.states) - 1 - number, -1), -1)
         return tuple(f"{self.singular_values[k]:.3g}: {self.words(k)}" for k in places)
 
@@ -95,7 +114,12 @@ class Observability:
         return "\n".join(lines)
 
     def summary(self) -> dict[str, Any]:
-        """Return all of it for JSON, in SI units."""
+        """Return everything as plain values for JSON, in SI units.
+
+        Returns
+        -------
+        dict
+        """
         return {
             "rank": self.rank,
             "threshold": self.threshold,
@@ -140,12 +164,32 @@ def observability(
     *,
     threshold: float = 1.0,
 ) -> Observability:
-    """Return what a record shows of each state of the filter with these blocks.
+    """Return what a record shows of each state of a filter.
 
-    The same record and belief as for :func:`strapdown.estimation.run`; the model is linearised along the smoothed attitude, with no
-    calibration errors. A direction counts as observed from ``threshold`` on: at 1, the record tells as much of it as the prior. Singular
-    values are good to about 1e7; a state that forgets (:class:`strapdown.error_states.GaussMarkov`) is judged by what the record tells of
-    its first value.
+    The model is linearised along the smoothed attitude, with no calibration errors. A direction in the space of the states counts as observed
+    if its singular value is ``threshold`` or more: at 1 the record holds as much information on it as the prior. Singular values are accurate
+    up to about 1e7. A state with a correlation time (:class:`strapdown.estimation.error_states.GaussMarkov`) is judged by what the record
+    shows of its initial value.
+
+    Parameters
+    ----------
+    record : ImuRecord
+    process_noise : ProcessNoise
+    initial : State
+        State at the first edge, with the prior σ.
+    blocks : sequence of ErrorStates, default none
+        Error states beside attitude and bias.
+    threshold : float, default 1
+
+    Returns
+    -------
+    Observability
+        Prints as a table.
+
+    Raises
+    ------
+    InputError
+        If an argument is out of range, or an error state is for a sensor that the record does not have.
     """
     blocks = modelling.as_blocks(blocks)
     positive("threshold", threshold)

@@ -108,9 +108,29 @@ class FilterSetup(ByValue):
 
 
 def matched(scenario: Scenario, *, attitude_sigma: float | None = None, states: bool = False) -> FilterSetup:
-    """Return what a right filter believes of a scenario: the noise of its gyro, and of its sensors what they say of themselves.
+    """Return the filter setup that matches a scenario: the noise of its gyro, and the sensors' own σ.
 
-    With ``states`` it has the optional states that the scenario's errors call for, as :func:`matched_to_record` says.
+    Parameters
+    ----------
+    scenario : Scenario
+    attitude_sigma : float, optional
+        As of :func:`matched_to_record`.
+    states : bool, default False
+        With an error state for each error that the scenario specifies, as :func:`matched_to_record` describes.
+
+    Returns
+    -------
+    FilterSetup
+
+    Raises
+    ------
+    InputError
+        If the gyro has no angle random walk.
+
+    Examples
+    --------
+    >>> from strapdown import scenarios, setup
+    >>> print(setup.to_toml(setup.matched(scenarios.load_scenario("two-stars"))))  # doctest: +SKIP
     """
     return matched_to_record(
         scenario.gyro,
@@ -131,19 +151,37 @@ def matched_to_record(
     sensors: Sequence[Any] = (),
     gravity_f: Sequence[float] = vectors.GRAVITY_F,
 ) -> FilterSetup:
-    """Return what a right filter believes of a record of a gyro of this specification.
+    """Return the filter setup that matches a record of a gyro of this specification.
 
-    Flicker, which no random walk is, is matched in the attitude at the record's rate and quality of measurements
-    (:func:`strapdown.gyro.matched_process_noise`); without measurements it is bounded over the record's length. Errors that the filter
-    has no state for (scale factor, misalignment, quantisation, hard iron) are not covered. Without ``attitude_sigma``, rad, the start is
-    known to 1°, or so much better that the first measurement of the finest sensor is still linear in its error: an extended filter's
-    covariance is not to be believed beyond that.
+    Flicker noise, which is no random walk, is matched in the attitude at the record's rate and quality of measurements
+    (:func:`strapdown.gyro.matched_process_noise`); without measurements it is bounded over the record's length. Errors without a state
+    (scale factor, misalignment, quantisation, hard iron) are not covered: :func:`not_covered` names them.
 
-    With ``states`` the filter has a state for each such error that the specification, or one of ``sensors``, tells of (scale factor,
-    misalignment, sensitivity to the force of ``gravity_f``, flicker and Gauss–Markov drift, hard iron, a sensor's bias, correlated noise,
-    lever arm): taken for one draw of a normal distribution whose σ is the error's size. What remains uncovered :func:`not_covered` tells.
-    Of a motion whose commutation one-sample integration would feel, it then takes a better algorithm of the same rate: measurements between
-    the edges of longer steps would be taken for what a turn at constant rate makes there.
+    Parameters
+    ----------
+    spec : GyroSpec
+    record : ImuRecord
+    attitude_sigma : float, optional
+        σ of the initial attitude error, each axis, rad. Default: 1°, or less where the finest sensor is so fine that its first measurement
+        would not be linear in the error; an extended filter's covariance does not hold beyond that.
+    states : bool, default False
+        With an error state for each error that ``spec`` or ``sensors`` specify: scale factor, misalignment, g-sensitivity, flicker and
+        Gauss–Markov drift, hard iron, a sensor's bias, correlated noise, lever arm. Each is modelled as one draw of a normal distribution
+        whose σ is the error's size. Where one-sample integration would leave a noticeable commutation error, an integration algorithm of
+        the same rate with less is chosen.
+    sensors : sequence, optional
+        Sensors of the scenario (:mod:`strapdown.vectors`), whose errors are specified.
+    gravity_f : sequence of float (3,)
+        Gravity in the fixed frame, m/s², for a g-sensitive gyro.
+
+    Returns
+    -------
+    FilterSetup
+
+    Raises
+    ------
+    InputError
+        If the gyro has no angle random walk.
     """
     walk = np.max(np.square(spec.bias_instability) * np.log(1e3)) / np.pi  # flicker over three decades of time
     stationary = np.where(
@@ -203,9 +241,29 @@ def not_covered(
     *,
     gravity_f: Sequence[float] = vectors.GRAVITY_F,
 ) -> tuple[str, ...]:
-    """Return, in words, the errors of a gyro and of sensors that a filter of attitude and bias, and of ``states``, has no state for.
+    """Return, in words, the specified errors that a filter has no state for.
 
-    Where there is any, a filter that believes the noise alone is too sure of itself; :func:`matched` has states for most, if told to.
+    Where there are any, a filter that models the noise alone is overconfident.
+
+    Parameters
+    ----------
+    spec : GyroSpec
+    sensors : tuple, optional
+        Sensors of the scenario.
+    states : States, optional
+        Error states of the filter; None: attitude and bias alone.
+    gravity_f : sequence of float (3,)
+        Gravity in the fixed frame, m/s².
+
+    Returns
+    -------
+    tuple of str
+
+    Examples
+    --------
+    >>> from strapdown import GyroSpec, setup
+    >>> setup.not_covered(GyroSpec(angle_random_walk=1e-5, scale_factor=(1e-4, 0.0, 0.0)))
+    ("the gyro's scale factor of 100 ppm",)
     """
     found = []
     known = set() if states is None else set(states.names)
@@ -346,9 +404,27 @@ def _by_axis(series: VectorMeasurements, told: tuple[float, float, float], facto
 
 
 def run(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any) -> Estimate:
-    """Run the filter of this setup over a record; ``options`` are those of :func:`strapdown.estimation.run`.
+    """Run the filter of a setup over a record.
 
-    With optional states the estimate is one of :class:`strapdown.records.Estimate`, which tells of them too.
+    Parameters
+    ----------
+    record : ImuRecord
+        At the gyro's rate; the setup's integration algorithm and σ are applied.
+    setup : FilterSetup
+    initial : State
+        State at the first edge.
+    **options
+        Of :func:`strapdown.estimation.run`; ``gate`` and ``robust`` replace the setup's.
+
+    Returns
+    -------
+    Estimate
+        With ``error_states`` where the setup has any.
+
+    Raises
+    ------
+    InputError
+        If the setup has a σ or a state for a sensor that the record does not have, or an argument is out of range.
     """
     chosen = {"gate": setup.gate, "robust": setup.robust, **options}
     if setup.states is not None:
@@ -357,13 +433,26 @@ def run(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any) -
 
 
 def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any) -> Estimate:
-    """Return the fixed-interval smoother's estimate of this setup; ``options`` are those of :func:`strapdown.estimation.smooth`.
+    """Run the fixed-interval smoother of a setup over a record.
+
+    Parameters
+    ----------
+    record : ImuRecord
+        At the gyro's rate.
+    setup : FilterSetup
+    initial : State
+        State at the first edge.
+    **options
+        Of :func:`strapdown.estimation.smooth`.
+
+    Returns
+    -------
+    Estimate
 
     Raises
     ------
     InputError
-        If the record is so long that what the way back needs of the way forth exceeds :data:`MOST_MEMORY`, or a gyro drift is among the
-        states.
+        If the forward pass would need more memory than :data:`MOST_MEMORY`, or a gyro drift is among the states.
     """
     chosen = {"gate": setup.gate, "robust": setup.robust, **options}
     told = believed(record, setup)
@@ -386,7 +475,23 @@ def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any
 
 
 def observability(record: ImuRecord, setup: FilterSetup, initial: State) -> Observability:
-    """Return what a record shows of each state of this setup's filter: see :func:`strapdown.estimation.observability`."""
+    """Return what a record shows of each state of this setup's filter (:func:`strapdown.estimation.observability`).
+
+    Parameters
+    ----------
+    record : ImuRecord
+    setup : FilterSetup
+    initial : State
+
+    Returns
+    -------
+    Observability
+
+    Raises
+    ------
+    InputError
+        If the setup has a σ or a state for a sensor that the record does not have.
+    """
     told = believed(record, setup)
     if setup.states is None:
         return estimation.observability(told, setup.process_noise, initial)
@@ -397,7 +502,25 @@ def observability(record: ImuRecord, setup: FilterSetup, initial: State) -> Obse
 def initial_state(
     setup: FilterSetup, attitude: Array, bias: Array | tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> State:
-    """Return the state that the filter starts from: this attitude and bias, and the setup's σ of both."""
+    """Return the state that the filter starts from, with the setup's σ.
+
+    Parameters
+    ----------
+    setup : FilterSetup
+    attitude : array_like (4,)
+        q_fb.
+    bias : array_like (3,), default zero
+        Gyro bias, rad/s, body axes.
+
+    Returns
+    -------
+    State
+
+    Raises
+    ------
+    InputError
+        If a shape is wrong, or the quaternion is not of unit length.
+    """
     return estimation.initial_state(
         attitude, bias=bias, attitude_sigma=setup.attitude_sigma, bias_sigma=setup.bias_sigma
     )
@@ -498,7 +621,16 @@ def _part(table: Mapping[str, Any], name: str, place: str) -> Mapping[str, Any]:
 
 
 def to_toml(setup: FilterSetup) -> str:
-    """Return a setup as TOML with the table ``[filter]``."""
+    """Return a setup as TOML text with the table ``[filter]``, units in the names of its keys.
+
+    Parameters
+    ----------
+    setup : FilterSetup
+
+    Returns
+    -------
+    str
+    """
     import tomli_w
 
     told = setup.sigma or (setup.states is not None and setup.states.sensors)
@@ -515,11 +647,19 @@ def from_toml(text: str, place: str = "filter") -> FilterSetup:
 
 
 def read_setup(path: str | os.PathLike[str]) -> FilterSetup:
-    """Read the table ``[filter]`` of a TOML file, such as ``strapdown tune`` writes; other tables are left alone.
+    """Read the table ``[filter]`` of a TOML file, such as ``strapdown tune`` writes; other tables are ignored.
+
+    Parameters
+    ----------
+    path : path
+
+    Returns
+    -------
+    FilterSetup
 
     Raises
     ------
     InputError
-        If the file is missing, no TOML, has no such table, or a key that no filter has.
+        If the file is missing, is no TOML, or has no such table or an unknown key.
     """
     return tables.read(path, "filter", "`strapdown tune` writes one", from_table)

@@ -288,9 +288,21 @@ class Prior:
 
 
 def priors_from_gyro(spec: GyroSpec, record: ImuRecord, *, factor: float = 3.0) -> dict[str, Prior]:
-    """Return priors of the gyro's two noises from a specification: a datasheet's, or what an Allan deviation found.
+    """Return priors of the gyro's two noise parameters from a specification: of a datasheet, or of an Allan deviation.
 
-    Flicker is matched as :func:`strapdown.setup.matched_to_record` does; a noise that the specification does not have gets no prior.
+    Flicker noise is matched as by :func:`strapdown.setup.matched_to_record`; a noise that the specification does not have gets no prior.
+
+    Parameters
+    ----------
+    spec : GyroSpec
+    record : ImuRecord
+        For the rate and quality of its measurements.
+    factor : float, default 3
+        One standard deviation of a prior is a factor of this.
+
+    Returns
+    -------
+    dict of str to Prior
     """
     noise = setup.matched_to_record(spec, record).process_noise if _flickers(spec) else None
     found = gyro.process_noise(spec) if noise is None else vars(noise)
