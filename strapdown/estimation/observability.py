@@ -166,10 +166,10 @@ def observability(
 ) -> Observability:
     """Return what a record shows of each state of a filter.
 
-    The model is linearised along the smoothed attitude, with no calibration errors. A direction in the space of the states counts as observed
-    if its singular value is ``threshold`` or more: at 1 the record holds as much information on it as the prior. Singular values are accurate
-    up to about 1e7. A state with a correlation time (:class:`strapdown.estimation.error_states.GaussMarkov`) is judged by what the record
-    shows of its initial value.
+    The model is linearised along the smoothed attitude, with no calibration errors. A direction in the space of the states counts as
+    observed if its singular value is ``threshold`` or more: at 1 the record holds as much information on it as the prior. Singular values
+    are accurate up to about 1e7. A state with a correlation time (:class:`strapdown.estimation.error_states.GaussMarkov`) is judged by
+    what the record shows of its initial value.
 
     Parameters
     ----------
