@@ -1,7 +1,7 @@
 """The coning study: what commutation error does to integration, and what a filter makes of it.
 
 Under coning motion, equation (18), an integration algorithm errs by a constant rate along the cone's axis. A filter that estimates gyro
-bias cannot tell that rate from a bias: its attitude stays good, its bias is wrong by the drift, and only the bias NEES says so.
+bias cannot distinguish that rate from a bias: its attitude stays good, its bias is wrong by the drift, and only the bias NEES says so.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ class FilterOutcome:
     def consistent(self) -> bool:
         """Whether NEES of the state, of the attitude and of the bias and the NIS all lie inside their bounds.
 
-        Four tests: a right filter passes all of them with at least 1 − 4 (1 − ``probability``).
+        Four tests: a consistent filter passes all of them with at least 1 − 4 (1 − ``probability``).
         """
         low, high = self.statistics.nis_bounds(self.probability)
         nees = all(
@@ -157,7 +157,7 @@ class FilterOutcome:
         return nees and low <= self.statistics.mean_nis <= high
 
     def summary(self) -> dict[str, Any]:
-        """Return the outcome in degrees and hours, as ``coning.json`` tells it. ANEES and NIS are per degree of freedom.
+        """Return the outcome in degrees and hours, as in ``coning.json``. ANEES and NIS are per degree of freedom.
 
         RMS errors are over the judged epochs and axes; ``anees`` is the mean over the judged epochs and its bounds are those of one epoch.
         The verdict holds every epoch against simultaneous bounds.

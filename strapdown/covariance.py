@@ -4,7 +4,7 @@ One pass along the true trajectory. The filter's own covariance gives its gains;
 the same gains source by source (Maybeck 1979, section 6.8; Gelb 1974, section 7.2):
 
 - white and coloured noise, and the initial error, give a covariance each. They add up. For a matched filter the sum is its own P, which
-  linearised at the truth is also the posterior Cramér–Rao bound; for a mismatched one it is not, and the expected NEES tells by how much;
+  linearised at the truth is also the posterior Cramér–Rao bound; for a mismatched one it is not, and the expected NEES shows by how much;
 - errors that are the same in every run of the scenario (its scale factor, its hard iron, what the integration of the gyro leaves) give a
   mean error each;
 - errors that the scenario leaves out may be *considered*: a standard deviation each, a contribution each (:class:`Consider`).
@@ -49,7 +49,7 @@ LEAST_ERROR = 1e-12
 LARGEST_SIZE = 1e12
 """No considered or initial error is larger, in the units of :class:`Consider`: its square would leave the range of doubles."""
 LARGEST_LINEAR = 0.15
-"""Errors of attitude or direction above this, rad, are told to be beyond linear: their squares are a tenth of them."""
+"""Errors of attitude or direction above this, rad, are reported as beyond linear: their squares are a tenth of them."""
 
 
 def _size(name: str, value: float, *, unit: str = "") -> float:
@@ -81,7 +81,7 @@ class Consider(ByValue):
     mounting: Mapping[str, float] = field(default_factory=_no_sensors)
     """Of a rotation of the sensor on the body about each axis, rad, by sensor."""
     time_offset: Mapping[str, float] = field(default_factory=_no_sensors)
-    """Of the time by which a sensor measures later than its stamps tell, s, by sensor."""
+    """Of the time by which a sensor measures later than its stamps, s, by sensor."""
 
     def __post_init__(self) -> None:
         """Check every number."""
@@ -98,7 +98,7 @@ class Consider(ByValue):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Analysis(Listed):
-    """What the filter will do, predicted: the error state e = (δθ, δb), rad in the body frame and rad/s."""
+    """Predicted errors of a filter: the error state e = (δθ, δb), rad in the body frame and rad/s."""
 
     time: Array
     """Epochs (m,), s."""
@@ -107,7 +107,7 @@ class Analysis(Listed):
     sources: tuple[str, ...]
     """Names of the sources of random error."""
     contributions: Array
-    """What each makes of the covariance of the actual error (m, s, 6, 6)."""
+    """Contribution of each to the covariance of the actual error (m, s, 6, 6)."""
     fixed: tuple[str, ...]
     """Names of the errors that are the same in every run."""
     fixed_errors: Array
@@ -117,11 +117,11 @@ class Analysis(Listed):
     considered_errors: Array
     """The error that each makes at one standard deviation (m, c, 6)."""
     expected_nis: Mapping[str, float]
-    """Mean NIS per degree of freedom over the whole time, by sensor; 1 for a right filter."""
+    """Mean NIS per degree of freedom over the whole time, by sensor; 1 for a consistent filter."""
     left_out: tuple[str, ...]
     """Errors of the scenario that the analysis leaves out."""
     beyond_linear: tuple[str, ...]
-    """What is too large for an analysis that is linear about the truth, in words: take a Monte Carlo there."""
+    """Errors too large for an analysis that is linear about the truth, in words: use a Monte Carlo there."""
 
     def listing(self) -> Listing:
         """Return the error budget at the last epoch, as a table.
@@ -167,12 +167,12 @@ class Analysis(Listed):
 
     @property
     def filter_sigma(self) -> Array:
-        """What the filter says of its error (m, 6): rad, rad/s."""
+        """The filter's own σ (m, 6): rad, rad/s."""
         return np.sqrt(np.diagonal(self.filter_covariance, axis1=1, axis2=2))
 
     @property
     def expected_nees(self) -> Array:
-        """Mean NEES per state (m, 3) of all six states, of the attitude, of the bias: tr(P⁻¹ E[e eᵀ])/n; 1 for a right filter."""
+        """Mean NEES per state (m, 3) of all six states, of the attitude, of the bias: tr(P⁻¹ E[e eᵀ])/n; 1 for a consistent filter."""
         M, P = self.second_moment, self.filter_covariance
         parts = (slice(0, 6), slice(0, 3), slice(3, 6))
         return np.stack(

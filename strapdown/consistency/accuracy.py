@@ -90,7 +90,7 @@ def distribution(error: ArrayLike) -> Distribution:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReferenceErrors:
-    """Errors of an estimated attitude against a reference, as the BROAD benchmark tells them, rad; NaN where there is no reference."""
+    """Errors of an estimated attitude against a reference, as defined by the BROAD benchmark, rad; NaN where there is no reference."""
 
     total: Array
     """Angle of the whole rotation between both (n,)."""

@@ -174,7 +174,7 @@ class Coverage:
 
     @property
     def attained(self) -> Array:
-        """Probability that a right filter's fraction lies inside the bounds (3,): ``probability`` or a little more."""
+        """Probability that a consistent filter's fraction lies inside the bounds (3,): ``probability`` or a little more."""
         from scipy.stats import binom
 
         low, high = np.round(self.bounds.T * self.samples)
@@ -210,11 +210,11 @@ class Verdict:
     """The mean over independent runs of a χ² statistic, per degree of freedom, at several epochs, against its two-sided bounds."""
 
     mean: Array
-    """Mean over the runs at each epoch, per degree of freedom (epochs,); 1 for a right filter."""
+    """Mean over the runs at each epoch, per degree of freedom (epochs,); 1 for a consistent filter."""
     degrees: int
     runs: int
     probability: float
-    """Probability that one epoch of a right filter lies inside the bounds."""
+    """Probability that one epoch of a consistent filter lies inside the bounds."""
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -223,7 +223,7 @@ class Verdict:
 
     @property
     def simultaneous_bounds(self) -> tuple[float, float]:
-        """Two-sided bounds that all epochs of a right filter keep together with at least ``probability`` (Bonferroni).
+        """Two-sided bounds that all epochs of a consistent filter keep together with at least ``probability`` (Bonferroni).
 
         Errors at different epochs of one run are correlated, a bias error above all, so the number of epochs outside :attr:`bounds` is
         not binomial; this holds however they depend on each other.

@@ -1,4 +1,4 @@
-"""What the innovations of a right filter are: white, normal, of mean zero, independent of those of other sensors.
+"""Tests of what the innovations of a consistent filter are: white, normal, of mean zero, independent of those of other sensors.
 
 All take whitened innovations (m, dof), :attr:`strapdown.records.Innovations.whitened`. Every test is of the shape only: a factor on all
 of them, which NIS shows, changes none.
@@ -227,8 +227,8 @@ def cross_correlation_p_value(
     """Return the correlation of two sensors' whitened innovations (dof, dof), the number of pairs, and the p-value that it is zero.
 
     Each innovation of the one is paired with the next of the other at the same time or later, no other of the one lying between: whatever
-    their times, those of a right filter are independent. Bartlett's test of canonical correlations, −(N − (p + q + 1)/2) Σ ln(1 − ρ²) as χ²
-    with p q degrees of freedom; too few pairs give NaN.
+    their times, those of a consistent filter are independent. Bartlett's test of canonical correlations, −(N − (p + q + 1)/2) Σ ln(1 − ρ²)
+    as χ² with p q degrees of freedom; too few pairs give NaN.
     """
     from scipy.special import chdtrc
 

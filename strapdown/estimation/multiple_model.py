@@ -6,8 +6,8 @@ start. The innovations of the measurements that follow weigh them (multiple-mode
 10); the improbable are dropped, and when those left lie on top of each other their mixture is matched by one Gaussian, which the plain
 filter (:mod:`strapdown.estimation`) takes over.
 
-Where nothing tells the hypotheses apart they stay apart, and :attr:`BankEstimate.reason` says why. A single filter from a wild start
-would have settled on some attitude and been sure of it.
+Where the measurements do not distinguish the hypotheses they stay apart, and :attr:`BankEstimate.reason` says why. A single filter from an
+arbitrary start would have converged to some attitude with a small σ.
 
 A gated filter that was lost starts as wildly: :func:`run_recovering` runs it with a bank at each such recovery.
 """
@@ -55,9 +55,9 @@ LEAST_WEIGHT = 1e-6
 LARGEST_SHARE = 0.15
 """Hypotheses are one Gaussian when less than this part of its covariance lies between them."""
 DOUBTED = 3
-"""Where outliers are reckoned with, so many of the first directions may all lie off."""
+"""With a gate or robust updates: number of first directions that may all be outliers."""
 DOUBT = 1e-3
-"""Weight of what refuses a direction to what takes it in, while nothing but the next one tells which of them lies off: that of lying at the
+"""Weight of a hypothesis that refuses a direction, relative to one that uses it, until the next one decides: that of a measurement at the
 threshold of a gate which refuses a right one with this probability."""
 KNOWN = 3.0 * DEGREE
 """An attitude whose σ about each axis is less is known well enough for one filter, rad."""
@@ -311,11 +311,11 @@ class _LeftOpen:
 
     @property
     def switch(self) -> float:
-        """The time from which on the bank is believed."""
+        """The time from which on the bank's estimate is used."""
         return max(self.recovery.end, self.attempts[0][0])
 
     def parts(self, gated: Estimate) -> list[tuple[float, Estimate]]:
-        """Return each attempt with the time from which on it is believed; in between, if need be, the ``gated`` filter."""
+        """Return each attempt with the time from which on it is used; in between, if need be, the ``gated`` filter."""
         ends = [self.switch, *(max(event.end, self.switch) for event in _recoveries(self.bank.estimate))]
         result = []
         for end, (began, estimate) in zip(ends, self.attempts, strict=True):
@@ -339,7 +339,7 @@ def _left_open(
 ) -> _LeftOpen | None:
     """Return the first recovery of a gated filter that leaves a turn open; None if there is none, or none with kept edges to come.
 
-    Hypotheses begin with a bias of ``least_bias_sigma`` or more if the filter has not taken in enough before it was lost.
+    Hypotheses start with a bias σ of ``least_bias_sigma`` or more if the filter had not processed enough measurements before it was lost.
     """
     if gate.restart_attitude_sigma < UNKNOWN:
         return None
@@ -349,7 +349,7 @@ def _left_open(
             records.cut(record, 0, end), process_noise, initial, every=end, gate=gate, robust=robust
         )
         assert state.gate is not None
-        # What the challenger that took over began with, unless another one has begun before that edge.
+        # The start of the candidate that replaced the filter, unless another one started before that edge.
         memory = state.gate.counts
         began = float(memory[robust_gate.SINCE])
         if began > event.end:
@@ -392,7 +392,7 @@ def _left_open(
 
 
 def _widened(starts: int) -> float:
-    """Return how many times as wide as the first a start is before which so many have failed."""
+    """Return the factor on σ of a start after some have failed."""
     return robust_gate.WIDENING ** (starts % (robust_gate.WIDEST + 1))
 
 
@@ -424,7 +424,7 @@ def _from_where_one(record: ImuRecord, found: BankEstimate) -> tuple[ImuRecord, 
     """Return the record from where the hypotheses became one, and the state there."""
     edge = int(np.searchsorted(record.time, found.became_one))
     rest = records.cut(record, edge, len(record.time) - 1)
-    # The bank has taken in what was measured at that edge, which a cut leaves with a record's first part.
+    # The bank has processed what was measured at that edge, which a cut leaves with a record's first part.
     rest = replace(rest, vectors=tuple(series.taken(series.time > found.became_one) for series in rest.vectors))
     last = found.estimate
     assert last.covariance is not None
@@ -445,7 +445,7 @@ def _until_one(
     robust: Robust | None = None,
     all_weights: bool = True,
 ) -> tuple[BankEstimate, list[tuple[float, Estimate]]]:
-    """Return the bank's own part of :func:`run`: until its hypotheses are one, or to the end; of the weights only the last if told so.
+    """Return the bank's own part of :func:`run`: until its hypotheses are one, or to the end; of the weights only the last if asked for.
 
     Beside it all attempts, the last one too, and when they began: those before it until they recovered.
     """
@@ -521,7 +521,7 @@ def _until_one(
         if at != hypotheses_kernel.LOST:
             break
         assert recovery is not None
-        # What came before is not to be believed: the circle is that of the first refused direction.
+        # What came before may be wrong: the circle is that of the first refused direction.
         again = _directions(events, used)
         if len(again) == 0 or events.time[again[0]] > record.time[::every][-1]:
             recovery = None  # too late for another start

@@ -18,18 +18,18 @@ from strapdown.estimation.states import ProcessNoise, State
 from strapdown.records import ImuRecord
 
 NAMED = 0.25
-"""A state is named in a direction if its share is at least so much of the greatest."""
+"""Smallest share, relative to the largest, of a state that is named in a direction."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Observability:
-    """What the measurements of a record tell of the state at its start, in units of what was known before.
+    """Information of a record's measurements on the initial state, relative to the prior.
 
     With the prior covariance ``P₀ = S Sᵀ`` and the covariance P of the same state after the whole record, the measurements' own
     information is ``O = Sᵀ (P⁻¹ − P₀⁻¹) S``: the observability Gramian, linearised along the estimate, with process noise taken into
     account and every state counted in its own prior σ, so that rad, T and ppm can be compared. A singular value s of
-    ``√O`` is dimensionless: along its direction the record leaves ``1/√(1 + s²)`` of the prior σ. What that is in the units of the states
-    is told with it (``left``): the rows of ``left`` are independent errors of one σ each, ``leftᵀ left = P``.
+    ``√O`` is dimensionless: along its direction the record leaves ``1/√(1 + s²)`` of the prior σ. In the units of the states
+    it is ``left``: the rows of ``left`` are independent errors of one σ each, ``leftᵀ left = P``.
     """
 
     states: tuple[str, ...]
@@ -225,7 +225,7 @@ def observability(
 def without_errors(record: ImuRecord, attitude: Array) -> ImuRecord:
     """Return what ideal sensors would give of a body with these attitudes at the edges (n + 1, 4), turning at constant rate between them.
 
-    A filter started on it stays on it, whatever it believes, so its covariance is linearised along one trajectory: linearised along an
+    A filter started on it stays on it, whatever its noise model, so its covariance is linearised along one trajectory: linearised along an
     estimate that each measurement moves, it would find information in directions that nothing shows.
     """
     turns = quaternion.log(quaternion.multiply(quaternion.conjugate(attitude[:-1]), attitude[1:]))

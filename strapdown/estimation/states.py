@@ -216,7 +216,7 @@ FIRST_SETS = 10
 VERTICAL = math.radians(1.0)
 """A reference so near the fixed z axis is the vertical, rad."""
 ONCE = 10.0
-"""The start is believed so many times less than the measurements it is made from, for the filter takes them in again."""
+"""Factor on σ of a start from measurements, because the filter processes the same measurements again."""
 
 
 def first_state(

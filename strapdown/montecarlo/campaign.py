@@ -97,7 +97,7 @@ _COUNTED = (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Campaign:
-    """A campaign as its file tells it."""
+    """A campaign as stored in its file."""
 
     plan: Plan
     machine: str
@@ -362,7 +362,7 @@ def _put_statistics(group: Any, statistics: Statistics) -> None:
 
 
 def _statistics_of(group: Any, plan: Plan) -> Statistics:
-    """Return the statistics in a group, whose shapes must be those that a plan of so many epochs and sensors has."""
+    """Return the statistics in a group, whose shapes must be those of a plan with these epochs and sensors."""
     told = reading.attributes(group)
     arrays = {f.name: reading.numbers(group, f.name) for f in fields(Statistics) if f.name not in ("runs", "sensors")}
     place = f"{group.file.filename}: {group.name.lstrip('/')}"

@@ -147,7 +147,7 @@ def _result(distributed: Any, future: Any, chunk: tuple[int, int]) -> tuple[str,
 
 
 def _chunk(payload: bytes, first_run: int, runs: int) -> tuple[str, str, Parts]:
-    """Compute a chunk where a worker is; tell the version and arithmetic it was computed with."""
+    """Compute a chunk on a worker; return it with the version and arithmetic that it was computed with."""
     return strapdown.__version__, arithmetic(), _work(payload)(first_run, runs)
 
 

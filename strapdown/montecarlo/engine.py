@@ -37,7 +37,7 @@ class Machine(Protocol):
         """Return why it cannot compute a plan; None if it can."""
 
     def run_chunk(self, plan: Plan, first_run: int, runs: int) -> Statistics:
-        """Return the statistics of so many runs."""
+        """Return the statistics of ``runs`` runs."""
 
     def replay(self, plan: Plan, run: int) -> Replay:
         """Return one run in full detail."""
@@ -59,7 +59,7 @@ class Choice:
     """Why the lanes do not serve; empty where they do, or where the machine was asked for."""
 
     def __str__(self) -> str:
-        """Return one line that tells it."""
+        """Return it as one line."""
         return f"{self.machine} (lanes do not serve: {self.reason})" if self.reason else self.machine
 
 
@@ -143,7 +143,7 @@ class Chunks:
 
 
 def chunks_of(runs: int, chunk: int) -> Chunks:
-    """Return the chunks of so many runs."""
+    """Return the chunks of ``runs`` runs."""
     return Chunks(range(0, runs, chunk), runs, chunk)
 
 

@@ -28,7 +28,7 @@ class Dispersions:
     """What differs from run to run besides the noise; normal, independent axes. The default: initial errors from the filter's prior."""
 
     attitude_sigma: float | None = None
-    """σ of the initial attitude error, each axis, rad; None: the filter's own, so that a right filter is consistent."""
+    """σ of the initial attitude error, each axis, rad; None: the filter's own, so that a matched filter is consistent."""
     bias_sigma: float | None = None
     """σ of the initial bias error, each axis, rad/s; None: the filter's own."""
     attitude_error: Array = field(default_factory=_zeros)
@@ -83,7 +83,7 @@ _FORM: tables.Form = {
 class Plan:
     """All that decides what run number k of a campaign is, and where its statistics are taken.
 
-    Filter and truth are told apart: a ``setup`` that differs from :func:`strapdown.setup.matched` of the scenario is a mismatched filter.
+    Filter and truth are separate: a ``setup`` that differs from :func:`strapdown.setup.matched` of the scenario is a mismatched filter.
     Outages, outliers and correlated noise are the scenario's sensors'. A plan is compared and hashed by identity, so a machine may keep
     what it derives from one in a ``weakref.WeakKeyDictionary``.
     """
@@ -160,7 +160,7 @@ class Plan:
 
 
 def from_table(table: Mapping[str, Any]) -> Plan:
-    """Return the plan that :meth:`Plan.to_table` tells."""
+    """Return the plan of a table that :meth:`Plan.to_table` returned."""
     import tomli_w
 
     return Plan(

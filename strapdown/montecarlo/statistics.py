@@ -70,7 +70,7 @@ SHIFT = 49
 """The bits of a double shifted right by so much are exponent and three digits of the mantissa: its bin, but for a constant."""
 
 COVERED = (0.6826894921370859, 0.9544997361036416, 0.9973002039367398)
-"""What share of a right filter's errors lies inside 1, 2, 3 σ."""
+"""Share of a consistent filter's errors inside 1, 2, 3 σ."""
 
 SUBSETS: dict[str, tuple[int, int]] = {"state": (0, 6), "attitude": (1, 3), "bias": (2, 3)}
 """Column of the NEES and degrees of freedom, by what is judged."""
@@ -199,12 +199,12 @@ class Statistics(Listed):
 
     @property
     def anees(self) -> Array:
-        """NEES averaged over runs and states (m, 3): of all six states, attitude, bias; 1 for a right filter."""
+        """NEES averaged over runs and states (m, 3): of all six states, attitude, bias; 1 for a consistent filter."""
         return _divided(self.nees_sum, self.finite[:, None] * np.array([6.0, 3.0, 3.0]))
 
     @property
     def covered(self) -> Array:
-        """Share of the runs whose error lies inside 1, 2, 3 σ (m, 6, 3); :data:`COVERED` for a right filter."""
+        """Share of the runs whose error lies inside 1, 2, 3 σ (m, 6, 3); :data:`COVERED` for a consistent filter."""
         return _divided(self.coverage, self.finite[:, None, None])
 
     @property
@@ -224,12 +224,12 @@ class Statistics(Listed):
 
     @property
     def nis(self) -> Array:
-        """NIS per degree of freedom, averaged over runs and each span of time (k,); 1 for a right filter, NaN where none was measured."""
+        """NIS per degree of freedom, mean over runs and each span of time (k,); 1 for a consistent filter, NaN without measurements."""
         return _divided(self.nis_sum, self.sensor_degrees.sum(axis=0))
 
     @property
     def mean_nis(self) -> float:
-        """NIS per degree of freedom over the whole time and all runs; innovations of a right filter are white, so no epochs are needed."""
+        """NIS per degree of freedom over the whole time and all runs; as innovations are white, no epochs are needed."""
         return float(_divided(self.nis_sum.sum(), self.sensor_degrees.sum()))
 
     @property
@@ -330,7 +330,7 @@ _EXAMPLES = ("example_run", "example_error", "example_sigma")
 
 
 def merge(a: Statistics, b: Statistics) -> Statistics:
-    """Return the statistics of the runs of both. Sums are added, so the order of merging tells in the last bits."""
+    """Return the statistics of the runs of both. Sums are added, so the order of merging shows in the last bits."""
     for name in _SAME:
         if not np.array_equal(getattr(a, name), getattr(b, name)):
             raise InputError(f"statistics of different {name} cannot be merged; they are of different plans")

@@ -1,4 +1,4 @@
-"""What the statistics of a campaign say of its filter, as one table of numbers for a file or a screen."""
+"""The verdict on the filter from the statistics of a campaign, as a table of numbers for a file or a screen."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from strapdown import consistency, units
 from strapdown.montecarlo.statistics import COVERED, SUBSETS, Counts, Statistics, judged_epochs
 
 QUANTILES = (0.5, 0.95, 0.997)
-"""Quantiles of the last epoch's errors that the summary tells."""
+"""Quantiles of the last epoch's errors in the summary."""
 
 
 def summary(statistics: Statistics, *, epochs: Counts | None = None, probability: float = 0.99) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Scenarios: a motion, a gyro and sensors for so many seconds; simulating one gives a record with its truth.
+"""Scenarios: a motion, a gyro and sensors over a time; simulating one gives a record with its truth.
 
 A scenario is a TOML file, units in the names of its keys; the built-in ones (``SCENARIOS``) are such files beside this module.
 """
@@ -47,7 +47,7 @@ MOST_SAMPLES = 1e9
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
-    """What is simulated."""
+    """A motion, a gyro and sensors, at a sample rate, over a time."""
 
     motion: Motion
     gyro: GyroSpec
@@ -59,7 +59,7 @@ class Scenario:
     name: str = ""
     description: str = ""
     seed: int = 0
-    """The seed that is used where none is given."""
+    """Default seed of :func:`simulate`."""
     gravity_f: tuple[float, ...] = vectors.GRAVITY_F
     """Gravity where the body is held up, m/s², fixed frame: what a g-sensitive gyro feels the reaction to; zeros in free fall."""
     gyro_preset: str = ""
@@ -348,7 +348,7 @@ def load_scenario(name_or_path: str | os.PathLike[str]) -> Scenario:
 
 
 def scenario_from_toml(text: str, place: str = "scenario") -> Scenario:
-    """Return the scenario that a TOML text tells."""
+    """Return the scenario in a TOML text."""
     return _from_table(reading.from_toml(text, place), place)
 
 

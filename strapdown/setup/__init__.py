@@ -1,4 +1,4 @@
-"""How a filter is set up: what it believes of the gyro and of each sensor, where it starts, what integrates the gyro.
+"""Filter setups: noise model of the gyro and of each sensor, initial uncertainty, integration algorithm, gate and error states.
 
 One object for the command line, the Monte Carlo and the tuning. As a file it is the table ``[filter]`` of a TOML document, units in the
 names of its keys; a setup read back is equal to the last bit.
@@ -50,13 +50,13 @@ LINEAR_SHARE = 0.2
 COMMUTATION_SHARE = 0.1
 """Of what the record's white noise leaves of a constant rate: a drift of one-sample integration above it calls for a better algorithm."""
 BETTER = "matched-1-8-8"
-"""The integration algorithm that is then taken: one that keeps the rate of the samples."""
+"""The integration algorithm chosen then: one step a sample."""
 LEAST_SAMPLES = 32
-"""Gyro samples below which nothing is said of commutation."""
+"""Fewest gyro samples for which the commutation error is estimated."""
 LEAST_BIAS_SIGMA = 0.1 * units.DEGREE_PER_HOUR
-"""Standard deviation of the initial bias error of a gyro whose specification tells of no bias, rad/s."""
+"""Standard deviation of the initial bias error of a gyro whose specification has no bias, rad/s."""
 MOST_MEMORY = 8e9
-"""Bytes that the smoother may keep of the filter's way."""
+"""Largest memory for the smoother's forward pass, bytes."""
 
 Sigma = float | tuple[float, float, float]
 """σ of a sensor: one number, or one about (of whole vectors along) each body axis x, y, z."""
@@ -74,7 +74,7 @@ def _sigma(name: str, value: Any) -> Sigma:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FilterSetup(ByValue):
-    """What the filter believes, where it starts, what integrates the gyro."""
+    """The filter's model, its initial uncertainty, and the integration of the gyro."""
 
     process_noise: ProcessNoise
     attitude_sigma: float = ATTITUDE_SIGMA
@@ -84,17 +84,17 @@ class FilterSetup(ByValue):
     integration: coning.Algorithm = field(default_factory=lambda: coning.ALGORITHMS["one-sample"])
     """Coning algorithm that turns its N gyro samples into one filter step."""
     measurement_sigma_factor: float = 1.0
-    """What the filter takes each sensor's σ for, as a multiple of the record's."""
+    """Factor on the record's σ of every sensor."""
     sigma: Mapping[str, Sigma] = field(default_factory=dict)
-    """σ that the filter believes of a sensor instead of the record's, by its name: rad, or of whole vectors the unit of their reference.
-    One number, or three of the body axes x, y, z (of a direction the part across it counts; a heading has one). Of a series whose σ varies
-    it is the root mean square, and the ratios stay; with three, those between samples, not those between axes."""
+    """σ of a sensor, instead of the record's, by its name: rad, or for whole vectors the unit of their reference. One number, or three for
+    the body axes x, y, z (of a direction the part across it counts; a heading has one). Where the record's σ varies, this is its root mean
+    square and the ratios between samples are kept."""
     gate: Gate | None = None
-    """Refuses measurements that no right filter would see, and recovers; None: all are taken."""
+    """Refuses improbable measurements, and recovers; None: all are used."""
     robust: Robust | None = None
-    """Weighs measurements by how far they lie off; None: all alike."""
+    """Weighs measurements by the size of their innovations; None: all alike."""
     states: States | None = None
-    """Optional states beside attitude and bias; None: none. With drifts among them, the bias of the filter is the whole of it."""
+    """Error states beside attitude and bias; None: none. With drifts among them, the estimated bias includes them."""
 
     def __post_init__(self) -> None:
         """Check every number."""
@@ -340,7 +340,7 @@ def _need_white(noise: Mapping[str, float]) -> None:
 def measurement_density(record: ImuRecord) -> float:
     """Return the variance of a measurement about an axis times the interval between measurements, rad² s, over all sensors and axes.
 
-    A direction tells of two axes of three, a heading of one; infinite where there is no measurement.
+    A direction measures two axes of three, a heading one; infinite where there is no measurement.
     """
     information = sum(_information(series) for series in record.vectors)
     length = float(record.time[-1] - record.time[0])
@@ -359,7 +359,7 @@ def _information(series: VectorMeasurements) -> float:
 
 
 def believed(record: ImuRecord, setup: FilterSetup) -> ImuRecord:
-    """Return the record as the filter of this setup takes it: at the rate of its integration algorithm, each σ as it believes it."""
+    """Return the record as the filter of this setup processes it: at the rate of its integration algorithm, with the setup's σ."""
     names = [series.sensor for series in record.vectors]
     for name in setup.sigma:
         one_of("sigma: sensor", name, names)
@@ -568,7 +568,7 @@ def to_table(setup: FilterSetup) -> dict[str, Any]:
 
 
 def from_table(table: Mapping[str, Any], place: str = "filter") -> FilterSetup:
-    """Return the setup that a table tells; unknown keys are refused with the nearest known one."""
+    """Return the setup in a table; an unknown key is an error that names the nearest known one."""
     known_keys(place, table, {*tables.keys(_NOISE_FORM), *tables.keys(_FORM), *_PARTS})
     own = tables.keys(_NOISE_FORM)
     parts: dict[str, Any] = {}
@@ -601,7 +601,7 @@ def from_table(table: Mapping[str, Any], place: str = "filter") -> FilterSetup:
 
 
 def need_angles(setup: FilterSetup, kinds: Mapping[str, str], place: str) -> None:
-    """Refuse a believed σ beyond half a turn of a sensor that measures angles, for it was meant in another unit than rad.
+    """Raise an error for a σ beyond half a turn of a sensor that measures angles: it must have been meant in another unit than rad.
 
     ``kinds`` are those of the sensors by their names; whole vectors ("vector") may have any σ. ``place`` is what is named in the error.
     """

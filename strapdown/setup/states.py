@@ -180,7 +180,7 @@ class States(ByValue):
     gyro_drift_time: tuple[float, ...] = ()
     """Their time constants, s."""
     gyro_fast_bias_sigma: float = 0.0
-    """σ of what of the gyro's bias changes too quickly to be estimated, rad/s: no state, but part of what is told of the bias."""
+    """σ of the part of the gyro's bias that changes too quickly to be estimated, rad/s: no state, but part of the bias's reported σ."""
     gravity_f: tuple[float, ...] = GRAVITY_F
     """Acceleration of gravity, m/s², fixed axes: what the gyro's sensitivity and lever arms are about."""
     sensors: Mapping[str, SensorStates] = field(default_factory=dict)
@@ -430,7 +430,7 @@ def to_table(states: States) -> dict[str, Any]:
 
 
 def from_table(table: Mapping[str, Any], place: str = "states") -> States:
-    """Return the states that a table tells; unknown keys are refused with the nearest known one."""
+    """Return the states in a table; an unknown key is an error that names the nearest known one."""
     known_keys(place, table, {*tables.keys(FORM), "sensors"})
     sensors = table.get("sensors", {})
     if not isinstance(sensors, Mapping):

@@ -34,7 +34,7 @@ ONE_SIDED = 2.705543454095404
 LEAST_INFORMATION = 1e-10
 """Of a log parameter; less is none."""
 NEGLIGIBLE = 1e-3
-"""A gain of the log likelihood that nobody can tell from none."""
+"""A gain of the log likelihood that is not distinguishable from none."""
 
 
 MISFIT = 1.6
@@ -175,7 +175,7 @@ def search(
 
 @dataclass(frozen=True, kw_only=True)
 class Estimated:
-    """One parameter and what is known of it; SI."""
+    """One tuned parameter with its interval; SI."""
 
     name: str
     start: float
@@ -403,7 +403,7 @@ def _curved(objective: Objective, best: Optimum) -> Local:
 
 
 def rescaled(tuning: Tuning, factor: float) -> Tuning:
-    """Return a tuning with all that its filter believes scaled alike: what the size of the attitude error leaves open.
+    """Return a tuning with every σ of its filter scaled alike, which the size of the attitude error does not determine.
 
     ``factor`` is that of ``filter.scale``, tuned by the innovations of the filter that has the smallest errors.
     """

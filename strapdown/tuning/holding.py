@@ -77,7 +77,7 @@ class NeesCourse:
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """Two-sided 99 % bounds of a right filter in each span."""
+        """Two-sided 99 % bounds of a consistent filter in each span."""
         return mean_bounds(3, max(self.effective, 1.0), 0.99)
 
 
@@ -88,7 +88,7 @@ class Performance:
     log_likelihood: float
     """Of all its innovations, in nats an innovation; what a gate refused is left out."""
     nis: float
-    """Mean NIS per degree of freedom; 1 for a right filter."""
+    """Mean NIS per degree of freedom; 1 for a consistent filter."""
     nis_bounds: tuple[float, float]
     """Two-sided 99 % bounds of it."""
     anees: float

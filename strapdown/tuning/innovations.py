@@ -1,7 +1,7 @@
 """The likelihood of filter parameters from the filter's own innovations, with its score and information.
 
 The filter turns a record into independent innovations e with variances s, so its likelihood is ``Π N(e; 0, s)`` (prediction-error
-decomposition; Schweppe 1965, Harvey 1989 section 3.4). Parameters are told by the logarithms of their values.
+decomposition; Schweppe 1965, Harvey 1989 section 3.4). Parameters are the logarithms of their values.
 """
 
 from __future__ import annotations

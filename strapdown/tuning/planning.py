@@ -1,4 +1,4 @@
-"""How well a record of some length will tell each parameter, before it is made: the Cramér–Rao bound from simulated records."""
+"""How well a record of some length will determine each parameter, before it is made: the Cramér–Rao bound from simulated records."""
 
 from __future__ import annotations
 
