@@ -12,7 +12,9 @@ What they take
     ``Scenario``, ``GyroSpec``, ``VectorSensor``, ``FilterSetup``, ``ProcessNoise``, ``Gate``, ``Robust``; ``StepFilter`` filters step by
     step; ``InputError`` is raised on bad input.
 More
-    The submodules, each with its own ``__all__``. Names and submodules load when they are first used.
+    The submodules, each with its own ``__all__``, and below them ``estimation.error_states``, ``estimation.filters``,
+    ``estimation.multiple_model``, ``montecarlo.campaign`` and ``montecarlo.cluster``. Names and submodules load when they are first used.
+    Every other module and name (``kernels``, ``cli``, ``checks``, ``files``, ``reading``, ``tables``, …) is private and may change.
 
 Conventions, the same in code, files and plots
 ----------------------------------------------

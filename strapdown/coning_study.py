@@ -1,7 +1,7 @@
 """The coning study: what commutation error does to integration, and what a filter makes of it.
 
 Under coning motion, equation (18), an integration algorithm errs by a constant rate along the cone's axis. A filter that estimates gyro
-bias cannot tell that rate from a bias: its attitude stays good, its bias is wrong by the drift, and only the bias NEES says so.
+bias cannot distinguish that rate from a bias: its attitude stays good, its bias is wrong by the drift, and only the bias NEES says so.
 """
 
 from __future__ import annotations
@@ -166,7 +166,7 @@ class FilterOutcome:
     def consistent(self) -> bool:
         """Whether NEES of the state, of the attitude and of the bias and the NIS all lie inside their bounds.
 
-        Four tests: a right filter passes all of them with at least 1 − 4 (1 − ``probability``).
+        Four tests: a consistent filter passes all of them with at least 1 − 4 (1 − ``probability``).
         """
         low, high = self.statistics.nis_bounds(self.probability)
         nees = all(
@@ -176,7 +176,7 @@ class FilterOutcome:
         return nees and low <= self.statistics.mean_nis <= high
 
     def summary(self) -> dict[str, Any]:
-        """Return the outcome in degrees and hours, as ``coning.json`` tells it. ANEES and NIS are per degree of freedom.
+        """Return the outcome in degrees and hours, as in ``coning.json``. ANEES and NIS are per degree of freedom.
 
         RMS errors are over the judged epochs and axes; ``anees`` is the mean over the judged epochs and its bounds are those of one epoch.
         The verdict holds every epoch against simultaneous bounds.
@@ -222,7 +222,12 @@ class ConingStudy:
     outcomes: tuple[FilterOutcome, ...]
 
     def summary(self) -> dict[str, Any]:
-        """Return the study as ``coning.json`` holds it: degrees, hours, arcseconds, with the unit in each key."""
+        """Return the study as ``coning.json`` holds it: degrees, hours, arcseconds, with the unit in each key.
+
+        Returns
+        -------
+        dict
+        """
         p = self.parameters
         return {
             "scenario": {
@@ -350,7 +355,28 @@ def manoeuvre_error(motion: Motion, rate: float, algorithm: coning.Algorithm) ->
 
 
 def run(parameters: ConingParameters, *, progress: Callable[[int], None] | None = None) -> ConingStudy:
-    """Run the study; ``progress`` is called with the number of Monte Carlo runs just finished."""
+    """Run the coning study: drift by algorithm, and the same filter on the increments of each.
+
+    Parameters
+    ----------
+    parameters : ConingParameters
+    progress : callable, optional
+        Called with the number of Monte Carlo runs just finished.
+
+    Returns
+    -------
+    ConingStudy
+
+    Raises
+    ------
+    InputError
+        If a parameter is out of range.
+
+    References
+    ----------
+    P. G. Savage, Strapdown inertial navigation integration algorithm design part 1: attitude algorithms, J. Guidance, Control, and
+    Dynamics 21(1), 1998.
+    """
     scenario = parameters.scenario
     algorithms = parameters.algorithms
     motion = Coning(angle=parameters.angle, frequency=parameters.frequency)

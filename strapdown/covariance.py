@@ -4,7 +4,7 @@ One pass along the true trajectory. The filter's own covariance gives its gains;
 the same gains source by source (Maybeck 1979, section 6.8; Gelb 1974, section 7.2):
 
 - white and coloured noise, and the initial error, give a covariance each. They add up. For a matched filter the sum is its own P, which
-  linearised at the truth is also the posterior Cramér–Rao bound; for a mismatched one it is not, and the expected NEES tells by how much;
+  linearised at the truth is also the posterior Cramér–Rao bound; for a mismatched one it is not, and the expected NEES shows by how much;
 - errors that are the same in every run of the scenario (its scale factor, its hard iron, what the integration of the gyro leaves) give a
   mean error each;
 - errors that the scenario leaves out may be *considered*: a standard deviation each, a contribution each (:class:`Consider`).
@@ -49,7 +49,7 @@ LEAST_ERROR = 1e-12
 LARGEST_SIZE = 1e12
 """No considered or initial error is larger, in the units of :class:`Consider`: its square would leave the range of doubles."""
 LARGEST_LINEAR = 0.15
-"""Errors of attitude or direction above this, rad, are told to be beyond linear: their squares are a tenth of them."""
+"""Errors of attitude or direction above this, rad, are reported as beyond linear: their squares are a tenth of them."""
 
 
 def _size(name: str, value: float, *, unit: str = "") -> float:
@@ -81,7 +81,7 @@ class Consider(ByValue):
     mounting: Mapping[str, float] = field(default_factory=_no_sensors)
     """Of a rotation of the sensor on the body about each axis, rad, by sensor."""
     time_offset: Mapping[str, float] = field(default_factory=_no_sensors)
-    """Of the time by which a sensor measures later than its stamps tell, s, by sensor."""
+    """Of the time by which a sensor measures later than its stamps, s, by sensor."""
 
     def __post_init__(self) -> None:
         """Check every number."""
@@ -98,7 +98,7 @@ class Consider(ByValue):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Analysis(Listed):
-    """What the filter will do, predicted: the error state e = (δθ, δb), rad in the body frame and rad/s."""
+    """Predicted errors of a filter: the error state e = (δθ, δb), rad in the body frame and rad/s."""
 
     time: Array
     """Epochs (m,), s."""
@@ -107,7 +107,7 @@ class Analysis(Listed):
     sources: tuple[str, ...]
     """Names of the sources of random error."""
     contributions: Array
-    """What each makes of the covariance of the actual error (m, s, 6, 6)."""
+    """Contribution of each to the covariance of the actual error (m, s, 6, 6)."""
     fixed: tuple[str, ...]
     """Names of the errors that are the same in every run."""
     fixed_errors: Array
@@ -117,14 +117,19 @@ class Analysis(Listed):
     considered_errors: Array
     """The error that each makes at one standard deviation (m, c, 6)."""
     expected_nis: Mapping[str, float]
-    """Mean NIS per degree of freedom over the whole time, by sensor; 1 for a right filter."""
+    """Mean NIS per degree of freedom over the whole time, by sensor; 1 for a consistent filter."""
     left_out: tuple[str, ...]
     """Errors of the scenario that the analysis leaves out."""
     beyond_linear: tuple[str, ...]
-    """What is too large for an analysis that is linear about the truth, in words: take a Monte Carlo there."""
+    """Errors too large for an analysis that is linear about the truth, in words: use a Monte Carlo there."""
 
     def listing(self) -> Listing:
-        """Return the error budget at the last epoch, as a table."""
+        """Return the error budget at the last epoch, as a table.
+
+        Returns
+        -------
+        Listing
+        """
         rows = [
             (name, kind, figure(attitude / ARCSECOND), figure(bias / DEGREE_PER_HOUR))
             for name, kind, attitude, bias in self.budget()
@@ -162,12 +167,12 @@ class Analysis(Listed):
 
     @property
     def filter_sigma(self) -> Array:
-        """What the filter says of its error (m, 6): rad, rad/s."""
+        """The filter's own σ (m, 6): rad, rad/s."""
         return np.sqrt(np.diagonal(self.filter_covariance, axis1=1, axis2=2))
 
     @property
     def expected_nees(self) -> Array:
-        """Mean NEES per state (m, 3) of all six states, of the attitude, of the bias: tr(P⁻¹ E[e eᵀ])/n; 1 for a right filter."""
+        """Mean NEES per state (m, 3) of all six states, of the attitude, of the bias: tr(P⁻¹ E[e eᵀ])/n; 1 for a consistent filter."""
         M, P = self.second_moment, self.filter_covariance
         parts = (slice(0, 6), slice(0, 3), slice(3, 6))
         return np.stack(
@@ -180,10 +185,19 @@ class Analysis(Listed):
         )
 
     def budget(self, epoch: int = -1) -> list[tuple[str, str, float, float]]:
-        """Return one row a source at an epoch: name, kind, RMS error of an attitude axis (rad) and of a bias axis (rad/s).
+        """Return the error budget at an epoch, one row a source.
 
-        Kinds are "random", "fixed" and "considered"; parts of one considered error (its axes) are taken together. Squares of all rows but
-        the fixed ones add up; those add as errors.
+        Squares of all rows but the fixed ones add up; the fixed ones add as errors. The axes of one considered error are one row.
+
+        Parameters
+        ----------
+        epoch : int, default -1
+            Index of the epoch.
+
+        Returns
+        -------
+        list of (str, str, float, float)
+            Name, kind ("random", "fixed" or "considered"), RMS error of an attitude axis (rad) and of a bias axis (rad/s).
         """
         rows: dict[tuple[str, str], Array] = {}
         for name, block in zip(self.sources, self.contributions[epoch], strict=True):
@@ -637,24 +651,39 @@ def analyse(
     initial_bias_sigma: float | None = None,
     epochs: int = 100,
 ) -> Analysis:
-    """Return the predicted errors of a filter on a scenario, from one pass without noise.
+    """Predict the errors of a filter on a scenario, in one pass without noise samples.
 
     Parameters
     ----------
     scenario : Scenario
-    setup : FilterSetup
-        What the filter believes; None: what a right one does (:func:`strapdown.setup.matched`).
-    consider : Consider
+    setup : FilterSetup, optional
+        The filter. Default: matched to the scenario (:func:`strapdown.setup.matched`).
+    consider : Consider, optional
         Errors besides those of the scenario.
-    initial_attitude_sigma, initial_bias_sigma : float
-        Actual standard deviations of the initial errors, rad and rad/s, where they are not what the filter believes.
-    epochs : int
+    initial_attitude_sigma, initial_bias_sigma : float, optional
+        Actual standard deviations of the initial errors, each axis, rad and rad/s. Default: those of the setup.
+    epochs : int, default 100
         Intervals between the epochs of the result; they end on filter steps, as those of :func:`strapdown.montecarlo.run` do.
+
+    Returns
+    -------
+    Analysis
 
     Raises
     ------
     InputError
-        If a considered sensor is not in the scenario or late by more than that lasts, or a sensor is of its own class or without noise.
+        If a considered sensor is not in the scenario, a considered time offset is longer than the scenario, or a sensor is of a class of
+        your own or without noise.
+
+    References
+    ----------
+    A. Gelb (ed.), Applied Optimal Estimation, 1974, chapter 7 (suboptimal filters and sensitivity analysis).
+
+    Examples
+    --------
+    >>> from strapdown import covariance, scenarios
+    >>> found = covariance.analyse(scenarios.load_scenario("two-stars"))  # doctest: +SKIP
+    >>> print(found)  # doctest: +SKIP
     """
     setup = matched(scenario) if setup is None else setup
     consider = Consider() if consider is None else consider

@@ -80,27 +80,35 @@ def test_simulate_estimate_check(tmp_path):
     np.testing.assert_array_equal(sd.estimate(again).attitude, estimate.attitude)
 
 
-def test_a_recording_to_euler_angles(tmp_path):
-    """A unit that turns at a constant rate about the vertical: roll and pitch stay, yaw turns at that rate."""
-    rate = np.radians(20.0)
+RATE = np.radians(20.0)
+"""Of the phone about the vertical after three seconds."""
+
+
+def phone_recording(folder: Path) -> Path:
+    """Write what a phone on a turntable measures."""
     time = np.arange(0.0, 12.0, 0.01)
     moving = time > 3.0
-    yaw = np.where(moving, rate * (time - 3.0), 0.0)
+    yaw = np.where(moving, RATE * (time - 3.0), 0.0)
     noise = np.random.default_rng(5)
-    gyro = np.degrees(np.where(moving, rate, 0.0))[:, None] * [0.0, 0.0, 1.0] + 0.05 * noise.standard_normal(
+    gyro = np.degrees(np.where(moving, RATE, 0.0))[:, None] * [0.0, 0.0, 1.0] + 0.05 * noise.standard_normal(
         (len(time), 3)
     )
     force = np.tile([0.0, 0.0, 1.0], (len(time), 1)) + 0.002 * noise.standard_normal((len(time), 3))
     # The field points North (y) and down; the body's yaw turns it the other way.
     field = 50.0 * np.stack([0.5 * np.sin(yaw), 0.5 * np.cos(yaw), np.full_like(yaw, -0.87)], axis=1)
     table = np.column_stack([time, gyro, force, field + 0.1 * noise.standard_normal((len(time), 3))])
-    path = tmp_path / "phone.csv"
+    path = folder / "phone.csv"
     np.savetxt(path, table, delimiter=",", header="time,gx,gy,gz,ax,ay,az,mx,my,mz", comments="", fmt="%.9g")
+    return path
 
+
+def test_a_recording_to_euler_angles(tmp_path):
+    """A unit that turns at a constant rate about the vertical: roll and pitch stay, yaw turns at that rate."""
+    path = phone_recording(tmp_path)
     phone = sd.read(path, units={"time": "s", "gyro": "deg/s", "accelerometer": "g", "magnetometer": "uT"})
     estimate = sd.estimate(phone)
     angles = estimate.euler("ZYX").angles
-    truth = np.interp(estimate.time, time, yaw)
+    truth = RATE * np.maximum(estimate.time - 3.0, 0.0)
     turned = np.unwrap(angles[:, 0]) - angles[0, 0]
     assert np.degrees(np.abs(turned - truth)).max() < 3.0
     assert np.degrees(np.abs(angles[:, 1:])).max() < 3.0
@@ -149,6 +157,87 @@ def test_monte_carlo_verdict():
     assert (
         sd.check(sd.monte_carlo(scenario(30.0), runs=120, seed=4, setup=wrong, threads=1)).verdict == "not consistent"
     )
+
+
+# ---------------------------------------------------------------------------------------------------- as the commands do it
+
+
+def run_command(*arguments: object) -> None:
+    """Run the command line in this process."""
+    from strapdown.cli.terminal import app
+
+    app([str(one) for one in arguments], standalone_mode=False)
+
+
+@pytest.mark.parametrize(
+    ("options", "keywords"),
+    [
+        ((), {}),
+        (("--gate", "0.99", "--robust", "huber"), {"gate": 0.99, "robust": "huber"}),
+        (("--states",), {"states": True}),
+        (("--state", "gyro.scale"), {"states": ["gyro.scale"]}),
+        (("--smooth", "--variances"), {"smooth": True, "full_covariance": False}),
+    ],
+)
+def test_estimate_of_a_record_is_that_of_the_command(tmp_path, options, keywords):
+    errors = {"scale_factor": (3e-4, 0.0, 0.0), "misalignment": np.full((3, 3), 1e-4) - 1e-4 * np.eye(3)}
+    made = dataclasses.replace(scenario(), gyro=dataclasses.replace(scenario().gyro, **errors))
+    sd.write(sd.simulate(made, seed=9), tmp_path / "record.h5")
+    run_command("estimate", tmp_path / "record.h5", "--out", tmp_path / "out", *options)
+    command = sd.read(tmp_path / "out" / "estimate.h5")
+    call = sd.estimate(sd.read(tmp_path / "record.h5"), **keywords)
+    for name in ("time", "attitude", "bias", "variance", "covariance"):
+        np.testing.assert_array_equal(getattr(call, name), getattr(command, name))
+    # One state for each error that is not zero, in one block: one scale factor and six misalignments.
+    sizes = {name: states.values.shape[1] for name, states in call.error_states.items()}
+    states = keywords.get("states", False)
+    assert sizes == ({"gyro scale": 7} if states is True else {"gyro scale": 1} if states else {})
+
+
+def test_estimate_of_a_recording_is_that_of_the_command(tmp_path):
+    path = phone_recording(tmp_path)
+    run_command(
+        "estimate",
+        path,
+        "--gyro-unit",
+        "deg/s",
+        "--accelerometer-unit",
+        "g",
+        "--time-unit",
+        "s",
+        "--out",
+        tmp_path / "o",
+    )
+    command = sd.read(tmp_path / "o" / "estimate.h5")
+    call = sd.estimate(sd.read(path, units={"time": "s", "gyro": "deg/s", "accelerometer": "g"}))
+    np.testing.assert_array_equal(call.attitude, command.attitude)
+    np.testing.assert_array_equal(call.variance, command.variance)
+
+
+def test_monte_carlo_is_that_of_the_command(tmp_path):
+    sd.write(scenario(10.0), tmp_path / "small.toml")
+    run_command("montecarlo", tmp_path / "small.toml", "--runs", 10, "--out", tmp_path / "runs.h5", "--threads", 1)
+    campaign = sd.read(tmp_path / "runs.h5")
+    call = sd.monte_carlo(tmp_path / "small.toml", runs=10, threads=1)
+    np.testing.assert_array_equal(call.nees_sum, campaign.statistics.nees_sum)
+    assert sd.check(campaign) == sd.check(call)
+
+
+def test_tune_is_that_of_the_command(tmp_path):
+    sd.write(sd.simulate(scenario(60.0)), tmp_path / "record.h5")
+    options = ("--free", "star 1.sigma", "--starts", "2", "--threads", "1", "--out", tmp_path / "filter.toml")
+    run_command("tune", tmp_path / "record.h5", *options)
+    call = sd.tune(sd.read(tmp_path / "record.h5"), free=["star 1.sigma"], starts=2, threads=1)
+    assert sd.setup.read_setup(tmp_path / "filter.toml") == call.setup
+
+
+def test_a_cut_record_is_still_matched():
+    """What a record was simulated from stays with it when it is cut or compressed."""
+    record = sd.simulate(scenario(40.0))
+    half = sd.records.cut(record, 400, 800)
+    assert half.origin is record.origin
+    assert sd.check(sd.estimate(half), half).verdict != "not consistent"
+    assert sd.records.compress(record, "four-sample").origin is record.origin
 
 
 # ----------------------------------------------------------------------------------------------------------------- other calls

@@ -1,4 +1,4 @@
-"""Is the filter's own covariance to be believed? Statistics that say so with known error rates, and a verdict.
+"""Consistency: does a filter's covariance agree with its errors? Statistics with known error rates, and a verdict.
 
 ``manifold``
     The error of an estimate, in the body or the fixed frame, and its normalised square (NEES), for any subset of the states.

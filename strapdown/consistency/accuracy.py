@@ -90,7 +90,7 @@ def distribution(error: ArrayLike) -> Distribution:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReferenceErrors:
-    """Errors of an estimated attitude against a reference, as the BROAD benchmark tells them, rad; NaN where there is no reference."""
+    """Errors of an estimated attitude against a reference, as defined by the BROAD benchmark, rad; NaN where there is no reference."""
 
     total: Array
     """Angle of the whole rotation between both (n,)."""
@@ -113,11 +113,32 @@ class ReferenceErrors:
 
 
 def reference_errors(attitude: ArrayLike, reference: ArrayLike) -> ReferenceErrors:
-    """Return the errors of q_fb (n, 4) against a reference (n, 4) whose fixed frame has its z axis vertical.
+    """Return the attitude errors against a reference whose fixed frame has its z axis vertical.
 
-    With ``d = q_est ⊗ q_ref⁻¹`` in the fixed frame: total 2 acos |d_w|, heading 2 atan |d_z / d_w|, inclination
-    2 acos √(d_w² + d_z²) (Laidig, Caruso, Cereatti & Seel 2021, section 4.1), in forms that keep digits when errors are small. Rows of
-    NaN in the reference give NaN.
+    With ``d = q_est ⊗ q_ref⁻¹`` in the fixed frame: total 2 acos |d_w|, heading 2 atan |d_z / d_w|, inclination 2 acos √(d_w² + d_z²), in
+    forms that keep their digits where errors are small.
+
+    Parameters
+    ----------
+    attitude : array_like (n, 4)
+        Estimated q_fb.
+    reference : array_like (n, 4)
+        Rows of NaN are unknown.
+
+    Returns
+    -------
+    ReferenceErrors
+        Angles, rad; NaN where the reference is unknown.
+
+    Raises
+    ------
+    InputError
+        If the shapes differ, or a reference is the zero quaternion.
+
+    References
+    ----------
+    D. Laidig, M. Caruso, A. Cereatti, T. Seel, BROAD — A benchmark for robust inertial orientation estimation, Data 6(7):72, 2021, section
+    4.1.
     """
     q = array("attitude", attitude, ("n", 4))
     r = array("reference", reference, (len(q), 4), allow_nan=True)

@@ -28,10 +28,36 @@ def two_sided(lower: float, upper: float) -> float:
 
 
 def mean_bounds(degrees: int, samples: float, probability: float = 0.99) -> tuple[float, float]:
-    """Return two-sided bounds of the mean of ``samples`` independent χ² values of ``degrees`` degrees of freedom, *per degree*.
+    """Return two-sided bounds of the mean of independent χ² values, per degree of freedom.
 
-    ``samples · degrees · mean`` is χ² with ``samples · degrees`` degrees of freedom (Bar-Shalom, Li & Kirubarajan 2001, section 5.4.2);
-    a right filter's mean is 1. An effective number of samples need not be whole.
+    ``samples · degrees · mean`` is χ² with ``samples · degrees`` degrees of freedom; the expected mean is 1.
+
+    Parameters
+    ----------
+    degrees : int
+        Degrees of freedom of one value.
+    samples : float
+        Number of independent values; an effective number need not be whole.
+    probability : float, default 0.99
+
+    Returns
+    -------
+    low, high : float
+
+    Raises
+    ------
+    InputError
+        If a number is out of range.
+
+    References
+    ----------
+    Y. Bar-Shalom, X. R. Li, T. Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4.2.
+
+    Examples
+    --------
+    >>> from strapdown import consistency
+    >>> [round(x, 2) for x in consistency.mean_bounds(3, 50, 0.95)]  # 50 runs, 3 states
+    [0.79, 1.24]
     """
     from scipy.stats import chi2
 
@@ -148,7 +174,7 @@ class Coverage:
 
     @property
     def attained(self) -> Array:
-        """Probability that a right filter's fraction lies inside the bounds (3,): ``probability`` or a little more."""
+        """Probability that a consistent filter's fraction lies inside the bounds (3,): ``probability`` or a little more."""
         from scipy.stats import binom
 
         low, high = np.round(self.bounds.T * self.samples)
@@ -184,11 +210,11 @@ class Verdict:
     """The mean over independent runs of a χ² statistic, per degree of freedom, at several epochs, against its two-sided bounds."""
 
     mean: Array
-    """Mean over the runs at each epoch, per degree of freedom (epochs,); 1 for a right filter."""
+    """Mean over the runs at each epoch, per degree of freedom (epochs,); 1 for a consistent filter."""
     degrees: int
     runs: int
     probability: float
-    """Probability that one epoch of a right filter lies inside the bounds."""
+    """Probability that one epoch of a consistent filter lies inside the bounds."""
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -197,7 +223,7 @@ class Verdict:
 
     @property
     def simultaneous_bounds(self) -> tuple[float, float]:
-        """Two-sided bounds that all epochs of a right filter keep together with at least ``probability`` (Bonferroni).
+        """Two-sided bounds that all epochs of a consistent filter keep together with at least ``probability`` (Bonferroni).
 
         Errors at different epochs of one run are correlated, a bias error above all, so the number of epochs outside :attr:`bounds` is
         not binomial; this holds however they depend on each other.

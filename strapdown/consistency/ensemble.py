@@ -32,12 +32,12 @@ class Credibility:
     runs: int
     degrees: int
     anees: float
-    """Mean NEES per degree of freedom: 1 for a right filter."""
+    """Mean NEES per degree of freedom: 1 for a consistent filter."""
     log_nees: float
-    """Mean of ln NEES: ψ(n/2) + ln 2 for a right filter."""
+    """Mean of ln NEES: ψ(n/2) + ln 2 for a consistent filter."""
     non_credibility: float
     """Li & Zhao's index, dB: mean of ``10 |lg(ε/ε*)|``, ε the NEES with the filter's covariance, ε* with the actual mean square error; 0 is
-    perfect, and the sampling of the latter keeps a right filter a little above it."""
+    perfect, and the sampling of the latter keeps a consistent filter a little above it."""
     inclination: float
     """Mean of ``10 lg(ε/ε*)``, dB: above zero the filter is optimistic (too sure), below pessimistic."""
     coverage: Coverage
@@ -83,10 +83,29 @@ class Credibility:
 
 
 def credibility(error: ArrayLike, covariance: ArrayLike, probability: float = 0.99) -> Credibility:
-    """Return the statistics of independent errors (runs, n) with their covariances (runs, n, n).
+    """Return the credibility statistics of independent errors at one epoch.
 
-    X. R. Li & Z. Zhao, *Measuring estimator's credibility: noncredibility index* (Fusion 2006); log-NEES after the same authors. At least
-    n + 1 runs, or the actual mean square error has no inverse.
+    Parameters
+    ----------
+    error : array_like (runs, n)
+        At least n + 1 runs, so that the mean square error has an inverse.
+    covariance : array_like (runs, n, n)
+        The filter's covariance in each run.
+    probability : float, default 0.99
+        Of the bounds.
+
+    Returns
+    -------
+    Credibility
+
+    Raises
+    ------
+    InputError
+        If the shapes do not agree, or a covariance is not positive definite.
+
+    References
+    ----------
+    X. R. Li, Z. Zhao, Measuring estimator's credibility: noncredibility index, Fusion 2006.
     """
     tail(probability)
     white = whitened(error, covariance)
@@ -122,7 +141,7 @@ def credibility_indices(white: Array) -> tuple[Array, Array]:
 
 
 NULL_DRAWS = 20_000
-"""Simulated right filters that the bounds of the indices are quantiles of; a 1 % tail is then known to a tenth of itself."""
+"""Simulated consistent filters that the bounds of the indices are quantiles of; a 1 % tail is then known to a tenth of itself."""
 
 
 @functools.lru_cache(maxsize=16)

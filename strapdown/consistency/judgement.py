@@ -87,7 +87,12 @@ class Judgement(Listed):
     """Probability that a right filter is not called wrong, at least."""
 
     def listing(self) -> Listing:
-        """Return the verdict and each statistic against its bounds, as a table."""
+        """Return the verdict and each statistic with its bounds, as a table.
+
+        Returns
+        -------
+        Listing
+        """
         rows = [
             (
                 one.name,
@@ -112,7 +117,12 @@ class Judgement(Listed):
         return "\n".join(lines)
 
     def summary(self) -> dict[str, Any]:
-        """Return everything as plain values for JSON; what is not a number is None."""
+        """Return the verdict and all findings as plain values for JSON; numbers that are not finite are None.
+
+        Returns
+        -------
+        dict
+        """
         plain = lambda x: None if isinstance(x, float) and not math.isfinite(x) else x  # noqa: E731
         return {
             "verdict": self.verdict,
@@ -135,11 +145,30 @@ def judge(estimate: Estimate, truth: Truth | None = None, *, probability: float 
     Parameters
     ----------
     estimate : Estimate
-        With innovations; with whole covariances if there is a truth.
+        With innovations; with whole covariances if a truth is given.
     truth : Truth, optional
         Attitude and bias at the estimate's own times. Without it only the innovations are judged.
-    probability : float
-        Of all tests together: a right filter is called wrong with at most 1 − ``probability``.
+    probability : float, default 0.99
+        A consistent filter is rejected with at most 1 − ``probability``, all tests together.
+
+    Returns
+    -------
+    Judgement
+
+    Raises
+    ------
+    InputError
+        If the truth has other epochs than the estimate, or the probability is not between 0 and 1.
+
+    References
+    ----------
+    S. Holm, A simple sequentially rejective multiple test procedure, Scandinavian Journal of Statistics 6, 1979.
+    Y. Bar-Shalom, X. R. Li, T. Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 5.4.
+
+    Examples
+    --------
+    >>> from strapdown import consistency
+    >>> print(consistency.judge(estimate, truth))  # doctest: +SKIP
     """
     tail(probability)
     findings: list[Finding] = []

@@ -18,7 +18,34 @@ heading and (0, 1) the inclination where the fixed z axis is vertical."""
 
 
 def errors(attitude: ArrayLike, bias: ArrayLike, true_attitude: ArrayLike, true_bias: ArrayLike) -> Array:
-    """Return the error state e = (Log(q_est⁻¹ ⊗ q_true), b_true − b_est) (..., 6): rad in the body frame, rad/s."""
+    """Return the error state e = (Log(q_est⁻¹ ⊗ q_true), b_true − b_est).
+
+    Parameters
+    ----------
+    attitude : array_like (..., 4)
+        Estimated q_fb.
+    bias : array_like (..., 3)
+        Estimated gyro bias, rad/s, body axes.
+    true_attitude : array_like (..., 4)
+    true_bias : array_like (..., 3)
+
+    Returns
+    -------
+    ndarray (..., 6)
+        Attitude error as a rotation vector in the body frame, rad, and bias error, rad/s.
+
+    Raises
+    ------
+    InputError
+        If the shapes do not agree, or a quaternion is not of unit length.
+
+    Examples
+    --------
+    >>> from strapdown import consistency, quaternion
+    >>> true = quaternion.exp([0.0, 0.0, 0.01])
+    >>> consistency.errors([1.0, 0.0, 0.0, 0.0], [0.0] * 3, true, [1e-5, 0.0, 0.0]).round(6).tolist()
+    [0.0, 0.0, 0.01, 1e-05, 0.0, 0.0]
+    """
     rows = [np.shape(value)[:-1] for value in (attitude, bias, true_attitude, true_bias)]
     try:
         np.broadcast_shapes(*rows)
@@ -31,10 +58,28 @@ def errors(attitude: ArrayLike, bias: ArrayLike, true_attitude: ArrayLike, true_
 
 
 def fixed_frame(error: ArrayLike, covariance: ArrayLike, attitude: ArrayLike) -> tuple[Array, Array]:
-    """Return errors (..., 6) and covariances (..., 6, 6) with the attitude part in fixed axes; the bias stays in body axes.
+    """Return errors and covariances with the attitude part in fixed axes; the bias stays in body axes.
 
     ``q_true = exp(δθ_f) ⊗ q_est`` with ``δθ_f = R_fb δθ_b``: a rotation of coordinates, so the NEES of all six states or of the attitude is
     the same in both frames; that of a part of the attitude is not.
+
+    Parameters
+    ----------
+    error : array_like (..., 6)
+        Body-side errors, rad and rad/s (:func:`errors`).
+    covariance : array_like (..., 6, 6)
+    attitude : array_like (..., 4)
+        Estimated q_fb.
+
+    Returns
+    -------
+    error : ndarray (..., 6)
+    covariance : ndarray (..., 6, 6)
+
+    Raises
+    ------
+    InputError
+        If the shapes do not agree.
     """
     e = array("error", error, (..., 6))
     P = array("covariance", covariance, (..., 6, 6))
@@ -63,10 +108,32 @@ def whitened(error: ArrayLike, covariance: ArrayLike) -> Array:
 
 
 def nees(error: ArrayLike, covariance: ArrayLike, states: tuple[int, ...] | None = None) -> Array:
-    """Return the normalised estimation error squared eᵀ P⁻¹ e (...,), χ² with as many degrees of freedom as states.
+    """Return the normalised estimation error squared, eᵀ P⁻¹ e.
 
-    ``error`` (..., n), ``covariance`` (..., n, n). ``states`` picks a subset (:data:`SUBSETS` or any indices), whose marginal covariance
-    is the block of P; all if not given.
+    Parameters
+    ----------
+    error : array_like (..., n)
+    covariance : array_like (..., n, n)
+    states : tuple of int, optional
+        A subset of the states (values of ``strapdown.consistency.manifold.SUBSETS`` or any indices), whose marginal covariance is the
+        block of P. Default: all.
+
+    Returns
+    -------
+    ndarray (...,)
+        χ² with as many degrees of freedom as states, if the filter is consistent.
+
+    Raises
+    ------
+    InputError
+        If the shapes do not agree, an index repeats, or a covariance is not positive definite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from strapdown import consistency
+    >>> float(consistency.nees([1.0, 2.0], np.diag([1.0, 4.0])))
+    2.0
     """
     if states is not None:
         pick = list(states)

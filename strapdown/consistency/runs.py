@@ -80,12 +80,21 @@ def judge_runs(
 
     Parameters
     ----------
-    statistics : RunStatistics
-        Of :mod:`strapdown.montecarlo`.
+    statistics : Statistics
+        Sums over runs, of :mod:`strapdown.montecarlo`.
     epochs : iterable of int, optional
-        Indices of the epochs that errors are judged at; if not given 20 evenly spread ones, the first, where all is prior, left out.
-    probability : float
-        Of all tests together.
+        Indices of the epochs at which errors are judged. Default: 20 evenly spaced ones; the first, where all is prior, is left out.
+    probability : float, default 0.99
+        A consistent filter is rejected with at most 1 − ``probability``, all tests together.
+
+    Returns
+    -------
+    Judgement
+
+    Raises
+    ------
+    InputError
+        If an epoch is none of the statistics', or the probability is not between 0 and 1.
     """
     tail(probability)
     last = len(statistics.finite) - 1

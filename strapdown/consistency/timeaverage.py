@@ -1,8 +1,8 @@
 """Averages over the time of one run. Errors at different epochs of one run are correlated, so they count for fewer than they are.
 
-The error of a right filter is a Gauss–Markov process: ``e_{k+1} = (I − K H) Φ e_k + noise``. Whitened by the filter's own covariance it
-is a vector autoregression of first order, z_{k+1} = A z_k + …, of covariance I, and the correlation of |z_k|² with |z_{k+τ}|² is ‖A^τ‖²/n.
-That gives the variance of the average, and with it the number of independent samples that would have the same.
+The error of a consistent filter is a Gauss–Markov process: ``e_{k+1} = (I − K H) Φ e_k + noise``. Whitened by the filter's own covariance
+it is a vector autoregression of first order, z_{k+1} = A z_k + …, of covariance I, and the correlation of |z_k|² with |z_{k+τ}|² is
+‖A^τ‖²/n. That gives the variance of the average, and with it the number of independent samples that would have the same.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ class TimeAverage:
     """NEES averaged over the epochs of one run, per degree of freedom."""
 
     mean: float
-    """1 for a right filter."""
+    """1 for a consistent filter."""
     degrees: int
     epochs: int
     effective: float
-    """Independent epochs that would tell as much."""
+    """Number of independent epochs with the same information."""
     probability: float
 
     @property
@@ -86,7 +86,7 @@ def time_average(
 
 
 def _effective(white: np.ndarray, first: int) -> float:
-    """Return the effective samples, by the memory from one epoch to the next, unless that from one to a later one tells of too few.
+    """Return the effective samples, by the memory from one epoch to the next, unless that from one to a later one shows too few.
 
     An error that is the sum of a quick and of a slow part is no Markov process: from one epoch to the next the quick part hides the slow.
     """

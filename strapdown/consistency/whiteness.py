@@ -1,4 +1,4 @@
-"""What the innovations of a right filter are: white, normal, of mean zero, independent of those of other sensors.
+"""Tests of what the innovations of a consistent filter are: white, normal, of mean zero, independent of those of other sensors.
 
 All take whitened innovations (m, dof), :attr:`strapdown.records.Innovations.whitened`. Every test is of the shape only: a factor on all
 of them, which NIS shows, changes none.
@@ -42,10 +42,32 @@ class Autocorrelation:
 
 
 def autocorrelation(whitened: ArrayLike, lags: int | None = None, probability: float = 0.99) -> Autocorrelation:
-    """Return the autocorrelation at lags 1 to ``lags`` (20, or a fiftieth of the samples), each component by itself.
+    """Return the autocorrelation of whitened innovations at lags 1 to ``lags``, each component by itself.
 
-    The mean is known to be zero and is not subtracted. Of white noise the value at lag l has variance (N − l)/(N(N + 2)) (Ljung & Box 1978)
-    and is nearly normal.
+    The mean is known to be zero and is not subtracted. For white noise the value at lag l is nearly normal with variance
+    (N − l)/(N(N + 2)).
+
+    Parameters
+    ----------
+    whitened : array_like (n,) or (n, m)
+        Innovations divided by their σ, in order of time.
+    lags : int, optional
+        Default: 20, or a fiftieth of the samples.
+    probability : float, default 0.99
+        Of the bounds.
+
+    Returns
+    -------
+    Autocorrelation
+
+    Raises
+    ------
+    InputError
+        If there are not more samples than lags.
+
+    References
+    ----------
+    G. M. Ljung, G. E. P. Box, On a measure of lack of fit in time series models, Biometrika 65, 1978.
     """
     from scipy.special import ndtri
 
@@ -69,10 +91,33 @@ def autocorrelation(whitened: ArrayLike, lags: int | None = None, probability: f
 
 
 def ljung_box(whitened: ArrayLike, lags: int | None = None) -> tuple[float, int, float]:
-    """Return the multivariate Ljung–Box statistic, its degrees of freedom and its p-value (one-sided: large is not white).
+    """Return the multivariate Ljung–Box statistic, its degrees of freedom and its p-value.
 
-    Hosking (1980): ``Q = N² Σ_l tr(C_lᵀ C_0⁻¹ C_l C_0⁻¹)/(N − l)`` is χ² with m² L degrees of freedom. Nothing has been fitted, so none are
-    taken off; and with the mean known, N(N + 2/m) in place of N² gives it the right mean in small samples.
+    ``Q = N(N + 2/m) Σ_l tr(C_lᵀ C_0⁻¹ C_l C_0⁻¹)/(N − l)`` is χ² with m² L degrees of freedom if the innovations are white; the test is
+    one-sided, large is not white. No parameters have been fitted, so no degrees of freedom are subtracted; the factor N(N + 2/m), instead
+    of N², gives the right mean in small samples where the mean of the innovations is known.
+
+    Parameters
+    ----------
+    whitened : array_like (n,) or (n, m)
+        Innovations divided by their σ, in order of time.
+    lags : int, optional
+        Default: 20, or a fiftieth of the samples.
+
+    Returns
+    -------
+    statistic : float
+    degrees : int
+    p_value : float
+
+    Raises
+    ------
+    InputError
+        If the samples are too few for the lags.
+
+    References
+    ----------
+    J. R. M. Hosking, The multivariate portmanteau statistic, J. American Statistical Association 75, 1980.
     """
     from scipy.special import chdtrc
 
@@ -182,8 +227,8 @@ def cross_correlation_p_value(
     """Return the correlation of two sensors' whitened innovations (dof, dof), the number of pairs, and the p-value that it is zero.
 
     Each innovation of the one is paired with the next of the other at the same time or later, no other of the one lying between: whatever
-    their times, those of a right filter are independent. Bartlett's test of canonical correlations, −(N − (p + q + 1)/2) Σ ln(1 − ρ²) as χ²
-    with p q degrees of freedom; too few pairs give NaN.
+    their times, those of a consistent filter are independent. Bartlett's test of canonical correlations, −(N − (p + q + 1)/2) Σ ln(1 − ρ²)
+    as χ² with p q degrees of freedom; too few pairs give NaN.
     """
     from scipy.special import chdtrc
 

@@ -11,7 +11,7 @@ from strapdown.consistency import Finding, Judgement
 from strapdown.listing import Listed, Listing, figure
 
 LIKELIER = math.log(20.0)
-"""By so much in ln p the likeliest of two causes is told from the other: odds of 20 to 1, "strong" evidence (Kass & Raftery 1995)."""
+"""Difference in ln p from which on the likelier of two causes is preferred: odds of 20 to 1, "strong" evidence (Kass & Raftery 1995)."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,7 +32,7 @@ class Cause:
     gain: float
     """Twice the log-likelihood gained."""
     log_p: float
-    """Natural logarithm of the probability that a right filter gains as much."""
+    """Natural logarithm of the probability that a consistent filter gains as much."""
     words: str
     """What it says, with its size."""
 
@@ -53,10 +53,15 @@ class Diagnosis(Listed):
     judgement: Judgement
     """The verdict on the filter as it is: statistics and causes taken together (Holm), so that neither contradicts the other."""
     probability: float
-    """Probability that a right filter is neither called wrong nor given a cause, at least."""
+    """Probability, at least, that a consistent filter passes and is given no cause."""
 
     def listing(self) -> Listing:
-        """Return the causes considered, the likeliest first, as a table."""
+        """Return the causes considered, the likeliest first, as a table.
+
+        Returns
+        -------
+        Listing
+        """
         rows = [
             (one.name, one.of, figure(one.gain), figure(one.log_p), "significant" if one in self.causes else "")
             for one in self.considered[:8]
@@ -66,7 +71,7 @@ class Diagnosis(Listed):
 
     @property
     def alternatives(self) -> tuple[Cause, ...]:
-        """The likeliest cause and those that are less likely by a factor of 20 at most: the data do not tell them apart."""
+        """The likeliest cause and those that are less likely by a factor of 20 at most: the data do not distinguish them."""
         return tuple(cause for cause in self.causes if cause.log_p <= self.causes[0].log_p + LIKELIER)
 
     @property
@@ -91,7 +96,12 @@ class Diagnosis(Listed):
         return "\n".join(lines)
 
     def summary(self) -> dict[str, Any]:
-        """Return everything as plain values for JSON."""
+        """Return causes and verdict as plain values for JSON.
+
+        Returns
+        -------
+        dict
+        """
         number = lambda x: float(x) if math.isfinite(x) else None  # noqa: E731
 
         def row(cause: Cause) -> dict[str, Any]:

@@ -38,7 +38,7 @@ def diagnose(
     initial : State
         Where the filter starts.
     probability : float
-        A right filter is neither called wrong nor given a cause with at least this.
+        A consistent filter passes and is given no cause with at least this probability.
     judgement : Judgement, optional
         Of the filter's own estimate, by :func:`strapdown.consistency.judge`; default: the filter is run here and judged.
 

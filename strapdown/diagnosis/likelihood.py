@@ -18,7 +18,7 @@ from strapdown.vectors import VectorMeasurements
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Model:
-    """A record with what the filter believes of it: what a run needs."""
+    """A record with the filter's model: what a run needs."""
 
     record: ImuRecord
     noise: ProcessNoise

@@ -16,9 +16,9 @@ WINDOWS = (5, 7, 9, 11, 13, 17, 21, 25, 31, 37, 45, 53, 61)
 MOST = 20000
 """Samples by which order and window are chosen."""
 LASTING = 4.0
-"""What bends within the window lasts, and counts so many times as much as noise that does not."""
+"""Weight of curvature within the window relative to noise."""
 LEAST = 100
-"""Samples that tell noise from motion."""
+"""Samples needed to separate noise from motion."""
 UNEVEN = 0.01
 """Of the mean interval: how much the gyro's intervals may differ."""
 
@@ -119,6 +119,6 @@ def _lost(slope: Array, sharper: Array, own: Array, common: Array) -> Array:
     it by its length. ``own`` is what the gyro's noise makes of the mean square of a slope, ``common`` of the mean product of both (3,).
     """
     power = np.mean(slope**2, axis=0) - own
-    seen = power > own  # of an axis that hardly turns nothing can be told
+    seen = power > own  # nothing is known of an axis that hardly turns
     shared = np.mean(slope * sharper, axis=0) - common
     return np.where(seen, np.maximum(shared / np.where(seen, power, 1.0), 1.0), 1.0)

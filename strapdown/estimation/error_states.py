@@ -57,15 +57,15 @@ class Effect:
     from the centre of turning, over the strength of what is measured. Of directions and whole vectors only."""
     varying: bool = False
     """Of a direction or heading: whether a and d are fixed in the sensor's own unit while the strength of what it measures changes, as
-    the earth's field does along an orbit. Its σ, which is its noise over that strength, tells how; c is then over the strength at the root
-    mean square σ."""
+    the earth's field does along an orbit. Its σ, which is its noise over that strength, shows how; c is then relative to the strength at
+    the root mean square σ."""
     carried: bool = False
     """Whether d is known only relative to the estimated attitude, and goes along when that is corrected: right for a noise that is alike in
     all directions. Firm in the fixed frame, an estimate of the noise would seem to show the attitude, which it does not: turn both, and
     every measurement and the noise's own law stay as they are. (A filter whose linearisation breaks such a symmetry finds information
     where there is none: Huang, Mourikis & Roumeliotis 2010.) A correction of the attitude turns the states, with their covariance, by
-    itself. For that the block's states are those of the axes x, y and z in turn, alike: ``offset_f`` is ``kron(I, a)`` of a column a. What
-    is told of them is in the axes of the estimated attitude, their covariance too, which leaves out how well that is known."""
+    itself. For that the block's states are those of the axes x, y and z in turn, alike: ``offset_f`` is ``kron(I, a)`` of a column a. They
+    are reported in the axes of the estimated attitude, and so is their covariance, without the uncertainty of that attitude."""
 
 
 class ErrorStates(ByValue):
@@ -135,11 +135,31 @@ class ErrorStates(ByValue):
         return {}
 
     def transition(self, dt: float) -> Array:
-        """Return Φ (size, size) over dt, s."""
+        """Return the transition matrix Φ.
+
+        Parameters
+        ----------
+        dt : float
+            s.
+
+        Returns
+        -------
+        ndarray (size, size)
+        """
         return np.diag(np.exp(-self.decay * dt)) if not np.any(self.feed) else self._chained(dt)[0]
 
     def process_noise(self, dt: float) -> Array:
-        """Return Q (size, size) over dt, s."""
+        """Return the covariance Q of the process noise.
+
+        Parameters
+        ----------
+        dt : float
+            s.
+
+        Returns
+        -------
+        ndarray (size, size)
+        """
         if np.any(self.feed):
             return self._chained(dt)[1]
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -375,7 +395,7 @@ class VectorBias(ErrorStates):
 
     @property
     def units(self) -> tuple[str, ...]:  # type: ignore[override]
-        """As told."""
+        """As declared."""
         return (self.unit,) * 3
 
     @property
@@ -406,7 +426,7 @@ class LeverArm(ErrorStates):
     arm_sigma: float | Array
     """Of each component of r, m, one or one an axis."""
     strength: float = STANDARD_GRAVITY
-    """Specific force over which the sensor's vector is told, m/s²: 1 where it gives whole vectors in m/s²."""
+    """Specific force by which the sensor's vector is divided, m/s²: 1 where it gives whole vectors in m/s²."""
     name: str = ""
 
     def __post_init__(self) -> None:
@@ -543,7 +563,7 @@ class GaussMarkov(_FirstOrder):
 
     @property
     def units(self) -> tuple[str, ...]:  # type: ignore[override]
-        """As told."""
+        """As declared."""
         return (self.unit,) * 3
 
     @property
@@ -585,7 +605,7 @@ class BoundedVelocity(ErrorStates):
     position_time: float = 0.0
     """τ_p, s: about how long a displacement lasts; 0: the position is not bounded, and no state."""
     strength: float = STANDARD_GRAVITY
-    """Specific force over which the sensor's vector is told, m/s²: 1 where it gives whole vectors in m/s²."""
+    """Specific force by which the sensor's vector is divided, m/s²: 1 where it gives whole vectors in m/s²."""
     name: str = ""
 
     def __post_init__(self) -> None:

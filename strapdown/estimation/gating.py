@@ -1,10 +1,11 @@
-"""What keeps a filter right when a measurement is wrong: a gate that recovers, robust updates, and a monitor of divergence.
+"""Protection of a filter against wrong measurements: a gate with recovery, robust updates, and a monitor of divergence.
 
 :class:`Gate`
-    A χ² test of each measurement, with as many degrees of freedom as it has. A filter that is wrong itself refuses good measurements for
-    ever; so at a refusal a *challenger* is started beside it, and takes over when the refused measurements agree with each other.
+    A χ² test of each measurement, with as many degrees of freedom as it has. A filter that is wrong itself would refuse good measurements
+    for ever; so at a refusal a *restart candidate* is started beside it, and replaces it when the refused measurements agree with each
+    other.
 :class:`Robust`
-    Updates that give a measurement less weight the farther it lies off, for noise whose tails are heavier than the normal's.
+    Updates that weigh a measurement the less the larger its innovation, for noise with heavier tails than the normal distribution.
 :class:`Monitor`
     A running mean of the normalised innovation squared, whose excursions are reported with their times.
 
@@ -29,7 +30,7 @@ UNIFORM_SIGMA = gate_rules.UNIFORM_SIGMA
 
 
 LOCK_OUT = 10
-"""A gate without recovery tells when a sensor was refused more often than taken in by more than this."""
+"""A gate without recovery reports a sensor that was refused more often than accepted by more than this."""
 
 
 def _probability(name: str, value: float) -> None:
@@ -39,37 +40,36 @@ def _probability(name: str, value: float) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Gate:
-    """Refuse a measurement whose NIS no right filter would show, and recover from a state in which good ones are refused.
+    """Refuse measurements whose NIS is improbable, and recover when the filter itself is wrong and refuses good ones.
 
-    At the first refusal a challenger is started from the filter's own state made as uncertain as a fresh start: attitude independent of the
-    bias with ``restart_attitude_sigma``, bias variance plus that of ``restart_bias_sigma``, and optional states at their prior, independent
-    of both: whatever led the filter astray has gone into them too. It takes in all that follows, and is dropped as soon as no sensor is
-    being refused any more. When one sensor has been refused ``recovery`` times in a row and the challenger has accepted as many of the
-    measurements that the filter refused, these agree with each other and not with the filter: the challenger takes over, and the estimate
-    holds an event that says so.
+    At the first refusal a restart candidate is started from the filter's state with the uncertainty of a new start: attitude independent of
+    the bias with ``restart_attitude_sigma``, bias variance plus that of ``restart_bias_sigma``, and error states at their prior,
+    independent of both, because the cause of the error may have corrupted them too. It processes all measurements that follow, and is
+    dropped as soon as no sensor is refused any more. When one sensor has been refused ``recovery`` times in a row and the candidate has
+    accepted as many of the refused measurements, these agree with each other and not with the filter: the candidate replaces the filter,
+    and the estimate holds an event of it.
 
-    A challenger fails when it refuses three measurements in a row, or more than 1 + half of those that it accepts; the next starts with σ
-    three times as wide. It is made three times as wide itself, as if it had started so, when its bias moves far for its start (the squares
-    over the first variances beyond the median of χ²₃) or the NIS of what it accepts adds up to more than three standard deviations above
-    the degrees of freedom. σ of the attitude grows up to uniform, that of the bias up to 3⁷ times the first, of which only refusals are
-    counted; then the first comes again. A takeover makes the next one wider too, until the filter has accepted ``5 recovery`` measurements:
-    only then has it helped. The process noise stays what it is. The turn between two measurements that a bias unknown by so much leaves
-    must stay well below a radian.
+    A candidate fails when it refuses three measurements in a row, or more than 1 + half of those that it accepts; the next starts with
+    three times the σ. Its own σ is increased by the same factor, as if it had started so, when its bias moves far from its start (squares
+    over the first variances beyond the median of χ²₃) or the NIS that it accepts adds up to more than three standard deviations above the
+    degrees of freedom. σ of the attitude grows up to uniform, that of the bias up to 3⁷ times the first, with only refusals counted; then
+    the first comes again. A recovery makes the next one wider too, until the filter has accepted ``5 recovery`` measurements. The process
+    noise does not change. The rotation between two measurements that is left unknown by such a bias must stay well below a radian.
 
-    Whether or not that helps, the estimate holds an event of kind ``"lock-out"`` for each stretch in which a sensor was refused more often
-    than taken in by more than ``recovery`` (without recovery, ten); a recovery within twice that number tells of it instead.
+    In either case the estimate holds an event of kind ``"lock-out"`` for each stretch in which a sensor was refused more often than
+    accepted by more than ``recovery`` (without recovery, ten); a recovery within twice that number is reported instead.
     """
 
     probability: float = 0.999
-    """Probability that the gate accepts a measurement of a right filter: the threshold is that quantile of χ², with as many degrees of
+    """Probability that a measurement is accepted if the filter is consistent: the threshold is this quantile of χ², with as many degrees of
     freedom as the measurement has."""
     recovery: int | None = 10
-    """So many refusals in a row of one sensor lead to recovery; None: never."""
+    """Refusals of one sensor in a row that lead to recovery; None: no recovery."""
     restart_attitude_sigma: float = UNIFORM_SIGMA
-    """Standard deviation of the challenger's initial attitude error, rad."""
+    """Standard deviation of a restart candidate's initial attitude error, rad."""
     restart_bias_sigma: float | None = None
-    """Standard deviation added to the first challenger's bias error, rad/s; None: that of the initial state, each axis its own, of a record
-    filtered in parts the state that the first part started from."""
+    """Standard deviation added to the first restart candidate's bias error, rad/s; None: that of the initial state, by axis (of a record
+    filtered in parts: the initial state of the first part)."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -89,11 +89,22 @@ class Gate:
 
     @property
     def lock_out_limit(self) -> int:
-        """A sensor refused more often than taken in by more than this is told."""
+        """A sensor that is refused more often than accepted by more than this is reported."""
         return self.recovery or LOCK_OUT
 
     def restart_bias_variance(self, initial: Array) -> Array:
-        """Return what is added to the variance of the first challenger's bias (3,), (rad/s)², of a filter with this initial P (n, n)."""
+        """Return what is added to the bias variance of the first restart candidate.
+
+        Parameters
+        ----------
+        initial : ndarray (n, n)
+            Initial covariance of the filter.
+
+        Returns
+        -------
+        ndarray (3,)
+            (rad/s)².
+        """
         if self.restart_bias_sigma is None:
             return np.diag(initial)[3:6].copy()
         return np.full(3, self.restart_bias_sigma**2)
@@ -192,7 +203,18 @@ class Monitor:
         return (self.window - 1.0) / (self.window + 1.0)
 
     def means(self, nis: Array, degrees: np.ndarray) -> tuple[Array, Array, Array]:
-        """Return the running mean of NIS per degree of freedom (n,), and its lower and upper bound (n,)."""
+        """Return the running mean of NIS per degree of freedom, and its bounds.
+
+        Parameters
+        ----------
+        nis : ndarray (n,)
+        degrees : ndarray (n,)
+            Degrees of freedom of each.
+
+        Returns
+        -------
+        mean, low, high : ndarray (n,)
+        """
         from scipy.signal import lfilter
         from scipy.special import chdtri
 
@@ -204,7 +226,20 @@ class Monitor:
         return total / weight, chdtri(effective, 1.0 - tail) / effective, chdtri(effective, tail) / effective
 
     def watch(self, time: Array, nis: Array, degrees: np.ndarray) -> list[Event]:
-        """Return an event for each stretch of measurements (n,) in which the mean is outside its bounds."""
+        """Return an event for each stretch of measurements in which the running mean is outside its bounds.
+
+        Parameters
+        ----------
+        time : ndarray (n,)
+            s.
+        nis : ndarray (n,)
+        degrees : ndarray (n,)
+            Degrees of freedom of each.
+
+        Returns
+        -------
+        list of Event
+        """
         if len(time) <= self.window:
             return []
         mean, low, high = self.means(nis, degrees)

@@ -35,7 +35,7 @@ class _Block:
 
 
 def _taken(size: int) -> np.ndarray:
-    """Return uninitialised bytes, at least so many: kept ones if some are neither too few nor more than twice as many."""
+    """Return uninitialised bytes: a stored block of at least that size and at most twice it, or a new one."""
     if size < _SMALL:
         return np.empty(size, np.uint8)
     for _ in range(len(_kept)):

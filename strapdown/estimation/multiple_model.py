@@ -6,8 +6,8 @@ start. The innovations of the measurements that follow weigh them (multiple-mode
 10); the improbable are dropped, and when those left lie on top of each other their mixture is matched by one Gaussian, which the plain
 filter (:mod:`strapdown.estimation`) takes over.
 
-Where nothing tells the hypotheses apart they stay apart, and :attr:`BankEstimate.reason` says why. A single filter from a wild start
-would have settled on some attitude and been sure of it.
+Where the measurements do not distinguish the hypotheses they stay apart, and :attr:`BankEstimate.reason` says why. A single filter from an
+arbitrary start would have converged to some attitude with a small σ.
 
 A gated filter that was lost starts as wildly: :func:`run_recovering` runs it with a bank at each such recovery.
 """
@@ -55,9 +55,9 @@ LEAST_WEIGHT = 1e-6
 LARGEST_SHARE = 0.15
 """Hypotheses are one Gaussian when less than this part of its covariance lies between them."""
 DOUBTED = 3
-"""Where outliers are reckoned with, so many of the first directions may all lie off."""
+"""With a gate or robust updates: number of first directions that may all be outliers."""
 DOUBT = 1e-3
-"""Weight of what refuses a direction to what takes it in, while nothing but the next one tells which of them lies off: that of lying at the
+"""Weight of a hypothesis that refuses a direction, relative to one that uses it, until the next one decides: that of a measurement at the
 threshold of a gate which refuses a right one with this probability."""
 KNOWN = 3.0 * DEGREE
 """An attitude whose σ about each axis is less is known well enough for one filter, rad."""
@@ -111,46 +111,53 @@ def run(
     robust: Robust | None = None,
     monitor: Monitor | None = None,
 ) -> BankEstimate:
-    """Estimate attitude and gyro bias from an unknown start.
+    """Estimate attitude and gyro bias from an unknown initial attitude.
 
-    Measurements before the first direction (or vector, or attitude) are left out and counted as skipped. Until the hypotheses are one, a
-    noise that differs by body axis (``sigma_axes``, ``covariance``) is taken for its largest σ about every axis; then it is what it is.
+    Measurements before the first direction (or vector, or attitude) are left out and counted as skipped. Until one hypothesis is left, a
+    noise that differs by body axis (``sigma_axes``, ``covariance``) is replaced by its largest σ about every axis.
+
+    With a gate or a robust update the first direction may be wrong: further hypotheses leave it out and start from the second, others from
+    the third and the fourth.
 
     Parameters
     ----------
     record : ImuRecord
         Increments corrected for coning (:func:`strapdown.records.compress`), measurements of any kind, at least one of them a direction.
     process_noise : ProcessNoise
-    hypotheses : int
-        Attitudes on the circle, 8 or more. More of them cost time in proportion and are each closer to linear.
-    bias_sigma : float or (3,)
+    hypotheses : int, default 96
+        Initial attitudes on the circle about the first direction, 8 or more. The time is proportional to their number.
+    bias_sigma : float or array_like (3,), default 20 °/h
         Standard deviation of the initial bias error, rad/s.
-    bias : (3,)
-        Initial bias, rad/s.
-    every : int
-        Keep every ``every``-th edge; the hypotheses can become one at kept edges.
+    bias : array_like (3,), default zero
+        Initial bias, rad/s, body axes.
+    every : int, default 1
+        Store every n-th edge; hypotheses can merge into one at stored edges.
     least_weight : float
-        Hypotheses of less than this part of the heaviest one's weight are dropped.
+        Hypotheses of less than this part of the largest weight are dropped.
     largest_share : float
-        The hypotheses are one when less than this part of the covariance lies between them.
+        The hypotheses become one when less than this part of the covariance lies between them.
     gate : Gate, optional
-        Each hypothesis refuses what no right filter would see; what it refuses counts against it as if it lay at the threshold. When
-        most of them have refused ``recovery`` measurements in a row, the bank starts anew from the first of these, its bias three times as
-        uncertain, and an event says so.
-        Once the hypotheses are one, it is the gate of :func:`strapdown.estimation.run`.
+        Each hypothesis refuses improbable measurements; a refused one counts against it as if it lay at the threshold. When most of the
+        hypotheses have refused ``recovery`` measurements in a row, they restart from the first of these, with three times the bias σ, and
+        an event reports it. When one is left, this is the gate of :func:`strapdown.estimation.run`.
     robust : Robust, optional
-        Each hypothesis weighs measurements by how far they lie off, and hypotheses are weighed by likelihoods with heavier tails. Alone it
-        cannot recover where the first measurements mislead it: give a gate too.
+        Each hypothesis weighs measurements by the size of their innovations, and hypotheses are weighed by likelihoods with heavier tails.
+        By itself it cannot recover where the first measurements mislead it: give a gate too.
     monitor : Monitor, optional
-        Report when the running NIS leaves its bounds, once the hypotheses are one.
+        Report when the running NIS leaves its bounds, once one hypothesis is left.
 
-    With a gate or a robust update nothing vouches for the first direction: further hypotheses leave it out and start from the second,
-    others from the third and the fourth.
+    Returns
+    -------
+    BankEstimate
 
     Raises
     ------
     InputError
-        If the record has no direction at all, or an argument makes no sense.
+        If the record has no direction at all, or an argument is out of range.
+
+    References
+    ----------
+    Y. Bar-Shalom, X. R. Li, T. Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 11.6 (multiple models).
     """
     check_arguments(record=record, process_noise=process_noise, gate=gate, robust=robust, monitor=monitor)
     initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1.0, bias_sigma=bias_sigma, bias=bias)  # refuses bad ones
@@ -196,21 +203,22 @@ def run_recovering(
     robust: Robust | None = None,
     monitor: Monitor | None = None,
 ) -> Estimate:
-    """Run the gated filter, and a bank wherever a recovery leaves the turn about one direction open, until it is known.
+    """Run the gated filter, and multiple hypotheses wherever a recovery leaves the rotation about one direction open.
 
     :func:`strapdown.estimation.run` recovers as one Gaussian. Where only one direction is observed, and turns slowly, the rotation about it
     becomes known gradually and not linearly, and some runs are then far too confident. Here a bank of hypotheses starts where that
-    recovery started, processes the same measurements and takes over; when they have become one, the gated filter continues from it. It
+    recovery started, processes the same measurements and replaces it; when one hypothesis is left, the gated filter continues from it. It
     may be lost and recover again.
 
-    A recovery is handed over if the largest σ of the attitude that its measurements leave is between ``KNOWN`` and ``UNKNOWN`` at any edge,
-    or not below ``KNOWN`` at its end. Two directions, or a measured attitude, leave nothing open; nor does a gate whose
-    ``restart_attitude_sigma`` is less than ``UNKNOWN``. With nothing to hand over the estimate equals that of
+    A recovery is replaced if the largest σ of the attitude that its measurements leave is between ``KNOWN`` and ``UNKNOWN`` at any edge, or
+    not below ``KNOWN`` at its end. Two directions, or a measured attitude, leave nothing open; nor does a gate whose
+    ``restart_attitude_sigma`` is less than ``UNKNOWN``. Where nothing is replaced the estimate equals that of
     :func:`strapdown.estimation.run` bit for bit.
 
-    Beside each such recovery stands an event of kind ``"hypotheses"``, from when the bank took over to when it became one, or to the end of
-    the record; ``value`` is the number of hypotheses left then, 0 if they became one. In between, rows are mean and covariance of the
-    mixture and innovations those of the heaviest hypothesis, which the monitor does not watch. A bank has no step-by-step face.
+    Each such recovery has an event of kind ``"hypotheses"``, from the time at which the bank started to that at which one hypothesis was
+    left, or to the end of the record; ``value`` is the number of hypotheses left then, 0 if one was found. In between, rows are mean and
+    covariance of the mixture and innovations those of the hypothesis of the largest weight, which the monitor does not watch. There is no
+    step-by-step form of it.
 
     Parameters
     ----------
@@ -219,16 +227,25 @@ def run_recovering(
     initial : State
         State at the first edge.
     gate : Gate
-        Hypotheses start with the bias that the challenger started with, as uncertain as it was, and three times as uncertain as the bank
-        before if what that one became was lost again before it had taken in ``5 recovery`` measurements.
-    hypotheses : int
-        As for :func:`run`.
-    every : int
-        Keep the state at every ``every``-th edge, the first included; the bank takes over and becomes one at kept edges.
-    full_covariance : bool
-        Keep whole covariance matrices too.
+        Hypotheses start with the bias and the bias σ of the restart candidate, or with three times the σ of the bank before if its result
+        was lost again before it had processed ``5 recovery`` measurements.
+    hypotheses : int, default 96
+        As of :func:`run`.
+    every : int, default 1
+        Store every n-th edge, the first included; the bank starts and ends at stored edges.
+    full_covariance : bool, default False
+        Store whole covariance matrices too.
     robust, monitor : optional
-        As for :func:`strapdown.estimation.run`.
+        As of :func:`strapdown.estimation.run`.
+
+    Returns
+    -------
+    Estimate
+
+    Raises
+    ------
+    InputError
+        If an argument is out of range.
     """
     check_arguments(record=record, process_noise=process_noise, initial=initial, robust=robust, monitor=monitor)
     count("hypotheses", hypotheses, least=8)
@@ -294,11 +311,11 @@ class _LeftOpen:
 
     @property
     def switch(self) -> float:
-        """The time from which on the bank is believed."""
+        """The time from which on the bank's estimate is used."""
         return max(self.recovery.end, self.attempts[0][0])
 
     def parts(self, gated: Estimate) -> list[tuple[float, Estimate]]:
-        """Return each attempt with the time from which on it is believed; in between, if need be, the ``gated`` filter."""
+        """Return each attempt with the time from which on it is used; in between, if need be, the ``gated`` filter."""
         ends = [self.switch, *(max(event.end, self.switch) for event in _recoveries(self.bank.estimate))]
         result = []
         for end, (began, estimate) in zip(ends, self.attempts, strict=True):
@@ -322,7 +339,7 @@ def _left_open(
 ) -> _LeftOpen | None:
     """Return the first recovery of a gated filter that leaves a turn open; None if there is none, or none with kept edges to come.
 
-    Hypotheses begin with a bias of ``least_bias_sigma`` or more if the filter has not taken in enough before it was lost.
+    Hypotheses start with a bias σ of ``least_bias_sigma`` or more if the filter had not processed enough measurements before it was lost.
     """
     if gate.restart_attitude_sigma < UNKNOWN:
         return None
@@ -332,7 +349,7 @@ def _left_open(
             records.cut(record, 0, end), process_noise, initial, every=end, gate=gate, robust=robust
         )
         assert state.gate is not None
-        # What the challenger that took over began with, unless another one has begun before that edge.
+        # The start of the candidate that replaced the filter, unless another one started before that edge.
         memory = state.gate.counts
         began = float(memory[gate_rules.SINCE])
         if began > event.end:
@@ -375,7 +392,7 @@ def _left_open(
 
 
 def _widened(starts: int) -> float:
-    """Return how many times as wide as the first a start is before which so many have failed."""
+    """Return the factor on σ of a start after some have failed."""
     return gate_rules.WIDENING ** (starts % (gate_rules.WIDEST + 1))
 
 
@@ -407,7 +424,7 @@ def _from_where_one(record: ImuRecord, found: BankEstimate) -> tuple[ImuRecord, 
     """Return the record from where the hypotheses became one, and the state there."""
     edge = int(np.searchsorted(record.time, found.became_one))
     rest = records.cut(record, edge, len(record.time) - 1)
-    # The bank has taken in what was measured at that edge, which a cut leaves with a record's first part.
+    # The bank has processed what was measured at that edge, which a cut leaves with a record's first part.
     rest = replace(rest, vectors=tuple(series.taken(series.time > found.became_one) for series in rest.vectors))
     last = found.estimate
     assert last.covariance is not None
@@ -428,7 +445,7 @@ def _until_one(
     robust: Robust | None = None,
     all_weights: bool = True,
 ) -> tuple[BankEstimate, list[tuple[float, Estimate]]]:
-    """Return the bank's own part of :func:`run`: until its hypotheses are one, or to the end; of the weights only the last if told so.
+    """Return the bank's own part of :func:`run`: until its hypotheses are one, or to the end; of the weights only the last if asked for.
 
     Beside it all attempts, the last one too, and when they began: those before it until they recovered.
     """
@@ -504,7 +521,7 @@ def _until_one(
         if at != hypotheses_kernel.LOST:
             break
         assert recovery is not None
-        # What came before is not to be believed: the circle is that of the first refused direction.
+        # What came before may be wrong: the circle is that of the first refused direction.
         again = _directions(events, used)
         if len(again) == 0 or events.time[again[0]] > record.time[::every][-1]:
             recovery = None  # too late for another start

@@ -18,18 +18,18 @@ from strapdown.estimation.states import ProcessNoise, State
 from strapdown.records import ImuRecord
 
 NAMED = 0.25
-"""A state is named in a direction if its share is at least so much of the greatest."""
+"""Smallest share, relative to the largest, of a state that is named in a direction."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Observability:
-    """What the measurements of a record tell of the state at its start, in units of what was known before.
+    """Information of a record's measurements on the initial state, relative to the prior.
 
     With the prior covariance ``P₀ = S Sᵀ`` and the covariance P of the same state after the whole record, the measurements' own
     information is ``O = Sᵀ (P⁻¹ − P₀⁻¹) S``: the observability Gramian, linearised along the estimate, with process noise taken into
     account and every state counted in its own prior σ, so that rad, T and ppm can be compared. A singular value s of
-    ``√O`` is dimensionless: along its direction the record leaves ``1/√(1 + s²)`` of the prior σ. What that is in the units of the states
-    is told with it (``left``): the rows of ``left`` are independent errors of one σ each, ``leftᵀ left = P``.
+    ``√O`` is dimensionless: along its direction the record leaves ``1/√(1 + s²)`` of the prior σ. In the units of the states
+    it is ``left``: the rows of ``left`` are independent errors of one σ each, ``leftᵀ left = P``.
     """
 
     states: tuple[str, ...]
@@ -61,7 +61,17 @@ class Observability:
         return np.asarray(np.sqrt(np.sum(self.directions[self.rank :] ** 2, axis=0)))
 
     def words(self, k: int) -> str:
-        """Say direction k: states and their shares, each in its prior σ, and what one σ left along it is of each in its unit."""
+        """Return one direction in words: states with their shares, each in its prior σ, and in its unit what one σ left along it is.
+
+        Parameters
+        ----------
+        k : int
+            Index of the direction.
+
+        Returns
+        -------
+        str
+        """
         direction = self.directions[k]
         large = np.flatnonzero(np.abs(direction) >= NAMED * np.max(np.abs(direction)))
         large = large[np.argsort(-np.abs(direction[large]), kind="stable")]
@@ -72,7 +82,16 @@ class Observability:
         return " ".join(parts).removeprefix("+")
 
     def weakest(self, number: int = 3) -> tuple[str, ...]:
-        """Say the weakest directions, the weakest first, each with its singular value."""
+        """Return the weakest directions in words, the weakest first, each with its singular value.
+
+        Parameters
+        ----------
+        number : int, default 3
+
+        Returns
+        -------
+        tuple of str
+        """
         places = range(len(self.states) - 1, max(len(self.states) - 1 - number, -1), -1)
         return tuple(f"{self.singular_values[k]:.3g}: {self.words(k)}" for k in places)
 
@@ -95,7 +114,12 @@ class Observability:
         return "\n".join(lines)
 
     def summary(self) -> dict[str, Any]:
-        """Return all of it for JSON, in SI units."""
+        """Return everything as plain values for JSON, in SI units.
+
+        Returns
+        -------
+        dict
+        """
         return {
             "rank": self.rank,
             "threshold": self.threshold,
@@ -140,12 +164,32 @@ def observability(
     *,
     threshold: float = 1.0,
 ) -> Observability:
-    """Return what a record shows of each state of the filter with these blocks.
+    """Return what a record shows of each state of a filter.
 
-    The same record and belief as for :func:`strapdown.estimation.run`; the model is linearised along the smoothed attitude, with no
-    calibration errors. A direction counts as observed from ``threshold`` on: at 1, the record tells as much of it as the prior. Singular
-    values are good to about 1e7; a state that forgets (:class:`strapdown.error_states.GaussMarkov`) is judged by what the record tells of
-    its first value.
+    The model is linearised along the smoothed attitude, with no calibration errors. A direction in the space of the states counts as
+    observed if its singular value is ``threshold`` or more: at 1 the record holds as much information on it as the prior. Singular values
+    are accurate up to about 1e7. A state with a correlation time (:class:`strapdown.estimation.error_states.GaussMarkov`) is judged by
+    what the record shows of its initial value.
+
+    Parameters
+    ----------
+    record : ImuRecord
+    process_noise : ProcessNoise
+    initial : State
+        State at the first edge, with the prior σ.
+    blocks : sequence of ErrorStates, default none
+        Error states beside attitude and bias.
+    threshold : float, default 1
+
+    Returns
+    -------
+    Observability
+        Prints as a table.
+
+    Raises
+    ------
+    InputError
+        If an argument is out of range, or an error state is for a sensor that the record does not have.
     """
     blocks = modelling.as_blocks(blocks)
     positive("threshold", threshold)
@@ -181,7 +225,7 @@ def observability(
 def without_errors(record: ImuRecord, attitude: Array) -> ImuRecord:
     """Return what ideal sensors would give of a body with these attitudes at the edges (n + 1, 4), turning at constant rate between them.
 
-    A filter started on it stays on it, whatever it believes, so its covariance is linearised along one trajectory: linearised along an
+    A filter started on it stays on it, whatever its noise model, so its covariance is linearised along one trajectory: linearised along an
     estimate that each measurement moves, it would find information in directions that nothing shows.
     """
     turns = quaternion.log(quaternion.multiply(quaternion.conjugate(attitude[:-1]), attitude[1:]))

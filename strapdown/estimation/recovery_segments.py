@@ -1,9 +1,9 @@
-"""Smoothing where a gate has recovered: trajectories, each of measurements of its own, and which of them tells which edge.
+"""Smoothing across recoveries of a gate: segments, each with its own measurements, and the edges that each of them covers.
 
-At a recovery the filter's state makes way for a challenger's, which knows nothing of what the filter took in before. So the states
-before and after are two trajectories, and no information crosses from one to the other. The first ends with the first refusal of those that
-led to the recovery; what it said after that was wrong. The second begins where the challenger did, before it took over: with the
-challenger's start at that time the filter is run again up to the recovery, so that the smoother has what the challenger passed through.
+At a recovery a restart candidate, which does not depend on the measurements that the filter processed before, replaces the filter's state.
+So the states before and after are two segments, and no information passes from one to the other. The first ends with the first of the
+refusals that led to the recovery; its states after that are wrong. The second begins where the candidate started, before it replaced the
+filter: from the candidate's start the filter is run again up to the recovery, so that the smoother has the candidate's states.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def recoveries(events: Sequence[Event]) -> list[Event]:
 def part(record: ImuRecord, begin: float, end: float) -> ImuRecord:
     """Return the record between two times, with the measurements from ``begin`` on and before ``end``.
 
-    The others are missing rather than gone, for what is told of a series as a whole.
+    The others are marked missing rather than removed, so that counts of the whole series stay.
     """
     inside = (record.time > begin) & (record.time < end)
     time = np.concatenate([[begin], record.time[inside], [end]])
@@ -104,7 +104,7 @@ def break_of(event: Event, memory: GateMemory | None, begin: float) -> Break:
 
 
 def restarted(gate: Gate, memory: GateMemory) -> tuple[Array, Array, Array]:
-    """Return bias (3,) and variances of attitude and bias (6,) that a challenger started from, as wide as it has become; and its counts."""
+    """Return bias (3,) and variances of attitude and bias (6,) of a restart candidate's start, with its increased σ; and its counts."""
     sigma = restart_attitude(gate.restart_attitude_sigma, memory.counts)
     bias, variance = memory.counts[FIRST_BIAS : FIRST_BIAS + 3], memory.counts[FIRST_BIAS + 3 : FIRST_BIAS + 6]
     counts = memory.counts.copy()
@@ -156,7 +156,7 @@ def trajectories(
 ) -> list[Trajectory]:
     """Return the trajectories of a record with these edges, each of which sees the record up to the edge ``until``.
 
-    ``segments`` are the filter's, ``first`` tells which of them starts at each stop, and ``reruns`` those of each break.
+    ``segments`` are the filter's, ``first`` says which of them starts at each stop, and ``reruns`` those of each break.
     """
     if not breaks:
         every = np.arange(len(time))

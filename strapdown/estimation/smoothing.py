@@ -58,8 +58,8 @@ def smooth(
 ) -> Estimate:
     """Return the smoother's estimate at every edge of a record.
 
-    With a ``lag`` it is the fixed-lag smoother: at each edge t, what the measurements up to the last edge at or before t + lag tell, equal
-    to the fixed-interval smoother on the record cut there. Its work grows with the number of gyro intervals in the lag.
+    With a ``lag`` it is the fixed-lag smoother: at each edge t the estimate from the measurements up to the last edge at or before
+    t + lag, equal to the fixed-interval smoother on the record cut there. Its work grows with the number of gyro intervals in the lag.
 
     Parameters
     ----------

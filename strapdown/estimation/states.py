@@ -126,7 +126,35 @@ class State:
 def initial_state(
     attitude: ArrayLike, *, attitude_sigma: ArrayLike, bias_sigma: ArrayLike, bias: ArrayLike = (0.0, 0.0, 0.0)
 ) -> State:
-    """Return a state with independent errors: ``attitude_sigma`` rad and ``bias_sigma`` rad/s, scalars or one an axis."""
+    """Return a state with independent errors.
+
+    Parameters
+    ----------
+    attitude : array_like (4,)
+        q_fb.
+    attitude_sigma : float or array_like (3,)
+        σ of the attitude error, rad, of each body axis.
+    bias_sigma : float or array_like (3,)
+        σ of the bias error, rad/s, of each body axis.
+    bias : array_like (3,), default zero
+        Gyro bias, rad/s, body axes.
+
+    Returns
+    -------
+    State
+
+    Raises
+    ------
+    InputError
+        If a σ is not positive, a shape is wrong, or the quaternion is not of unit length.
+
+    Examples
+    --------
+    >>> import strapdown as sd
+    >>> start = sd.initial_state([1.0, 0.0, 0.0, 0.0], attitude_sigma=0.1, bias_sigma=1e-4)
+    >>> start.covariance.diagonal().round(10).tolist()
+    [0.01, 0.01, 0.01, 1e-08, 1e-08, 1e-08]
+    """
     sigma = np.concatenate([_by_axis("attitude_sigma", attitude_sigma), _by_axis("bias_sigma", bias_sigma)])
     if not np.all(sigma > 0.0):
         k = int(np.argmin(sigma > 0.0))
@@ -188,7 +216,7 @@ FIRST_SETS = 10
 VERTICAL = math.radians(1.0)
 """A reference so near the fixed z axis is the vertical, rad."""
 ONCE = 10.0
-"""The start is believed so many times less than the measurements it is made from, for the filter takes them in again."""
+"""Factor on σ of a start from measurements, because the filter processes the same measurements again."""
 
 
 def first_state(
@@ -196,8 +224,8 @@ def first_state(
 ) -> State:
     """Return a state at the first edge from the first measurements: a measured attitude, or by Wahba's problem two directions or more.
 
-    Each is taken back to the first edge by the gyro. Its noise grows on the way by that of the gyro and of the bias; the attitude's σ is
-    ``ONCE`` times what all of that leaves, so that these measurements, which the filter takes in again, count once.
+    The gyro carries each measurement back to the first edge, with its noise increased by that of the gyro and of the bias. The attitude's σ
+    is ``ONCE`` times what results, so that these measurements, which the filter processes again, count once.
 
     Parameters
     ----------
@@ -205,15 +233,23 @@ def first_state(
     process_noise : ProcessNoise
     bias_sigma : float
         Standard deviation of the bias error, each axis, rad/s.
-    bias : array_like (3,)
-        Gyro bias, rad/s.
+    bias : array_like (3,), default zero
+        Gyro bias, rad/s, body axes.
+
+    Returns
+    -------
+    State
 
     Raises
     ------
     InputError
         If no measurement gives the attitude: fewer than two directions, or all on one line.
     InconsistentError
-        Of :mod:`strapdown.wahba`: if directions do not fit together.
+        Of :mod:`strapdown.wahba`: if directions contradict each other.
+
+    References
+    ----------
+    F. L. Markley, J. L. Crassidis, Fundamentals of Spacecraft Attitude Determination and Control, 2014, chapter 5.
     """
     positive("bias_sigma", bias_sigma, unit="rad/s")
     b = array("bias", bias, (3,))

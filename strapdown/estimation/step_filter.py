@@ -214,7 +214,12 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         return {name: self._missing.get(name, 0) + self._vertical.get(name, 0) for name in names}
 
     def state(self) -> State:
-        """Return the present state."""
+        """Return the present state.
+
+        Returns
+        -------
+        State
+        """
         P = 0.5 * (self.P + self.P.T)
         return State(attitude=self.attitude, bias=self.bias, values=self.values, covariance=P)
 
@@ -289,14 +294,36 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
     # ---------------------------------------------------------------------------------------------------------------- updates
 
     def update(self, *arguments: Any, **options: Any) -> None:
-        """Refuse filterpy's own update by any ``Hx``: it would leave the correction in ``x``, outside ``attitude`` and ``bias``."""
+        """Refuse filterpy's own update by any ``Hx``: it would leave the correction in ``x``, outside ``attitude`` and ``bias``.
+
+        Parameters
+        ----------
+        *arguments, **options
+            Ignored.
+
+        Raises
+        ------
+        InputError
+            Always; use :meth:`update_direction`, :meth:`update_vector`, :meth:`update_heading` or :meth:`update_attitude`.
+        """
         raise InputError(
             "update() by HJacobian and Hx knows no attitude, and would leave its correction in x; use update_direction, update_vector, "
             "update_heading or update_attitude"
         )
 
     def predict_update(self, *arguments: Any, **options: Any) -> None:
-        """Refuse filterpy's own step, as :meth:`update` does."""
+        """Refuse filterpy's own step, as :meth:`update` does.
+
+        Parameters
+        ----------
+        *arguments, **options
+            Ignored.
+
+        Raises
+        ------
+        InputError
+            Always.
+        """
         raise InputError(
             "predict_update() would update by Hx, which knows no attitude; use predict, then update_direction or another"
         )
@@ -347,7 +374,30 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
     ) -> bool:
         """Update with a measured vector: three degrees of freedom.
 
-        As :meth:`update_direction`; ``vector_b``, ``reference_f`` and the noise are in one unit.
+        Parameters
+        ----------
+        vector_b : array_like (3,)
+            Measured vector in body axes, in the unit of ``reference_f``.
+        reference_f : array_like (3,)
+            The same vector in the fixed frame.
+        sigma : float or array_like (3,), optional
+            σ of each component, in that unit; or one a body axis.
+        sensor : str, optional
+            Name of the sensor, for gate and events.
+        covariance : array_like (3, 3), optional
+            Of the noise, instead of ``sigma``.
+        time : float, optional
+            Time of the measurement, s; a late one needs ``look_back``.
+
+        Returns
+        -------
+        bool
+            Whether it was used.
+
+        Raises
+        ------
+        InputError
+            If a shape is wrong, the noise is missing or not positive, or the time lies before ``look_back``.
         """
         return self._update_by_vector("vector", vector_b, reference_f, (sigma, covariance), sensor, time)
 
@@ -360,9 +410,30 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         *,
         time: float | None = None,
     ) -> bool:
-        """Update with the heading of a measured unit vector's horizontal part: one degree of freedom, ``sigma`` in rad.
+        """Update with the heading of a measured unit vector's horizontal part: one degree of freedom.
 
-        As :meth:`update_direction`. A vector that is vertical at the estimate has no heading and is skipped.
+        Parameters
+        ----------
+        vector_b : array_like (3,)
+            Measured unit vector in body axes; one that is vertical at the estimate has no heading and is skipped.
+        reference_f : array_like (3,)
+            The same vector in the fixed frame, whose z axis is vertical.
+        sigma : float
+            σ of the heading, rad.
+        sensor : str, optional
+            Name of the sensor, for gate and events.
+        time : float, optional
+            Time of the measurement, s; a late one needs ``look_back``.
+
+        Returns
+        -------
+        bool
+            Whether it was used.
+
+        Raises
+        ------
+        InputError
+            If a shape is wrong, σ is not positive, or the time lies before ``look_back``.
         """
         return self._update_by_vector("heading", vector_b, reference_f, (sigma, None), sensor, time)
 
@@ -375,9 +446,30 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         covariance: ArrayLike | None = None,
         time: float | None = None,
     ) -> bool:
-        """Update with a measured attitude q_fb (4,): three degrees of freedom.
+        """Update with a measured attitude: three degrees of freedom.
 
-        As :meth:`update_direction`; the noise is in rad about the body axes.
+        Parameters
+        ----------
+        attitude : array_like (4,)
+            Measured q_fb.
+        sigma : float or array_like (3,), optional
+            σ about the body axes, rad.
+        sensor : str, optional
+            Name of the sensor, for gate and events.
+        covariance : array_like (3, 3), optional
+            Of the noise, rad², body axes, instead of ``sigma``.
+        time : float, optional
+            Time of the measurement, s; a late one needs ``look_back``.
+
+        Returns
+        -------
+        bool
+            Whether it was used.
+
+        Raises
+        ------
+        InputError
+            If a shape is wrong, the noise is missing or not positive, or the time lies before ``look_back``.
         """
         name = _label(sensor, "attitude")
         given = array(name, attitude, (4,), allow_nan=True)

@@ -1,6 +1,6 @@
 """Monte Carlo: many independent runs of one scenario through one filter, and sums over runs at each epoch.
 
-Memory grows with the number of epochs, not with the number of runs: runs are taken in chunks, and the chunks' sums are merged in their
+Memory grows with the number of epochs, not with the number of runs: runs are computed in chunks, and the chunks' sums are merged in their
 order, so the statistics do not depend on the number of threads, processes or hosts.
 
 ``plan``
@@ -12,7 +12,7 @@ order, so the statistics do not depend on the number of threads, processes or ho
 ``engine``
     Choosing a machine, threads, merging: :func:`run_plan`, :func:`run`, :func:`replay`.
 ``verdicts``
-    What statistics say of a filter, as a table: :func:`summary`.
+    Verdict and numbers from statistics, as a table: :func:`summary`.
 ``campaign``
     A run that survives being killed, and its file.
 ``cluster``

@@ -97,7 +97,7 @@ _COUNTED = (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Campaign:
-    """A campaign as its file tells it."""
+    """A campaign as stored in its file."""
 
     plan: Plan
     machine: str
@@ -170,25 +170,29 @@ def run(
     workers: Workers | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Campaign:
-    """Run a plan and keep what is finished in a file.
+    """Run a plan and keep what is finished in a file, so that it survives interruptions.
 
     Parameters
     ----------
     plan : Plan
     path : path
-        HDF5 file. Finished chunks are in it, or will be within a tenth of the time spent so far on the last one written; Ctrl-C writes all.
+        HDF5 file. Finished chunks are written at intervals that keep the time spent on writing below a tenth; Ctrl-C writes all.
     runs : int
-        Runs wanted; more than a file holds extends it.
-    resume : bool
-        Go on from the file if it exists; it must be of the same plan, machine, chunk and version.
-    overwrite : bool
-        Begin anew although the file exists.
+        Total number of runs; more than a file holds extends it.
+    resume : bool, default False
+        Continue from the file if it exists; it must be of the same plan, machine, chunk and version.
+    overwrite : bool, default False
+        Start anew although the file exists.
     chunk : int, optional
         Runs between merges; default the file's, or the machine's.
     machine, threads, workers
         As of :func:`strapdown.montecarlo.run_plan`.
     progress : callable, optional
         Called with the number of runs just finished, first with those that the file held.
+
+    Returns
+    -------
+    Campaign
 
     Raises
     ------
@@ -358,7 +362,7 @@ def _put_statistics(group: Any, statistics: Statistics) -> None:
 
 
 def _statistics_of(group: Any, plan: Plan) -> Statistics:
-    """Return the statistics in a group, whose shapes must be those that a plan of so many epochs and sensors has."""
+    """Return the statistics in a group, whose shapes must be those of a plan with these epochs and sensors."""
     told = reading.attributes(group)
     arrays = {f.name: reading.numbers(group, f.name) for f in fields(Statistics) if f.name not in ("runs", "sensors")}
     place = f"{group.file.filename}: {group.name.lstrip('/')}"
@@ -400,10 +404,18 @@ def _statistics_of(group: Any, plan: Plan) -> Statistics:
 def read(path: str | os.PathLike[str]) -> Campaign:
     """Read a campaign's file, finished or not.
 
+    Parameters
+    ----------
+    path : path
+
+    Returns
+    -------
+    Campaign
+
     Raises
     ------
     InputError
-        If it does not exist, is truncated, is of another kind, or was written by a newer version.
+        If the file does not exist, is truncated, is of another kind, or was written by a newer version.
     """
     return _stored(Path(path))[0]
 

@@ -33,12 +33,24 @@ CONNECT_SECONDS = 15
 
 @contextlib.contextmanager
 def dask_client(*, workers: int | None = None, address: str | None = None) -> Iterator[Any]:
-    """Yield a Dask client: of so many worker processes of this host, one thread each, or of the scheduler at an address.
+    """Yield a Dask client: of worker processes on this host, one thread each, or of the scheduler at an address.
+
+    Parameters
+    ----------
+    workers : int, optional
+        Number of processes on this host.
+    address : str, optional
+        Of a running scheduler, ``tcp://HOST:8786`` or ``tls://HOST:8786``. Scheduler and workers can run any code here: name only one that
+        you trust.
+
+    Yields
+    ------
+    distributed.Client
 
     Raises
     ------
     InputError
-        If Dask is not installed, or nothing answers at the address.
+        If both are given, Dask is not installed, or nothing answers at the address.
     """
     distributed = _distributed()
     if address is not None:
@@ -68,9 +80,23 @@ def dask_client(*, workers: int | None = None, address: str | None = None) -> It
 
 
 def on_dask(client: Any) -> Workers:
-    """Return workers that are those of a Dask client.
+    """Return workers that compute chunks of runs through a Dask client.
 
-    Workers may come and go meanwhile. A chunk is sent at most twice ahead for each thread there is.
+    Workers may come and go meanwhile. At most two chunks are submitted ahead for each thread.
+
+    Parameters
+    ----------
+    client : distributed.Client
+
+    Returns
+    -------
+    Workers
+        For ``workers`` of :func:`strapdown.montecarlo.run_plan` and :func:`strapdown.montecarlo.campaign.run`.
+
+    Raises
+    ------
+    InputError
+        If the cluster has no workers, or another version of this package.
     """
     distributed = _distributed()
 
@@ -121,7 +147,7 @@ def _result(distributed: Any, future: Any, chunk: tuple[int, int]) -> tuple[str,
 
 
 def _chunk(payload: bytes, first_run: int, runs: int) -> tuple[str, str, Parts]:
-    """Compute a chunk where a worker is; tell the version and arithmetic it was computed with."""
+    """Compute a chunk on a worker; return it with the version and arithmetic that it was computed with."""
     return strapdown.__version__, arithmetic(), _work(payload)(first_run, runs)
 
 

@@ -37,7 +37,7 @@ class Machine(Protocol):
         """Return why it cannot compute a plan; None if it can."""
 
     def run_chunk(self, plan: Plan, first_run: int, runs: int) -> Statistics:
-        """Return the statistics of so many runs."""
+        """Return the statistics of ``runs`` runs."""
 
     def replay(self, plan: Plan, run: int) -> Replay:
         """Return one run in full detail."""
@@ -59,7 +59,7 @@ class Choice:
     """Why the lanes do not serve; empty where they do, or where the machine was asked for."""
 
     def __str__(self) -> str:
-        """Return one line that tells it."""
+        """Return it as one line."""
         return f"{self.machine} (lanes do not serve: {self.reason})" if self.reason else self.machine
 
 
@@ -99,7 +99,25 @@ def arithmetic() -> str:
 
 
 def replay(plan: Plan, run: int, *, machine: str = "auto") -> Replay:
-    """Return one run of a plan in full detail, bitwise what it was among the others."""
+    """Compute one run of a plan again, in full detail; it is bitwise what it was in the campaign.
+
+    Parameters
+    ----------
+    plan : Plan
+    run : int
+        Number of the run, from 0.
+    machine : {"auto", "lanes", "scalar"}
+
+    Returns
+    -------
+    Replay
+        Record, initial state and estimate.
+
+    Raises
+    ------
+    InputError
+        If the number is negative, or the machine cannot compute the plan.
+    """
     return machine_named(choose(plan, machine).machine).replay(plan, count("run", run, least=0))
 
 
@@ -125,7 +143,7 @@ class Chunks:
 
 
 def chunks_of(runs: int, chunk: int) -> Chunks:
-    """Return the chunks of so many runs."""
+    """Return the chunks of ``runs`` runs."""
     return Chunks(range(0, runs, chunk), runs, chunk)
 
 
@@ -254,12 +272,20 @@ def run_plan(
         Runs between merges; default the machine's. The statistics depend on it by rounding only.
     threads : int, optional
         Default: one a core.
-    machine : str
-        "auto", "lanes" or "scalar" (:func:`choose`).
+    machine : {"auto", "lanes", "scalar"}
     workers : Workers, optional
-        Who computes the chunks instead of threads (:func:`strapdown.montecarlo.cluster.on_dask`).
+        What computes the chunks instead of threads (:func:`strapdown.montecarlo.cluster.on_dask`).
     progress : callable, optional
         Called with the number of runs just finished.
+
+    Returns
+    -------
+    Statistics
+
+    Raises
+    ------
+    InputError
+        If no machine computes the plan, or a number is out of range.
     """
     chosen = choose(plan, machine).machine
     size = machine_named(chosen).CHUNK if chunk is None else count("chunk", chunk)
@@ -281,10 +307,40 @@ def run(
     machine: str = "scalar",
     progress: Callable[[int], None] | None = None,
 ) -> list[Statistics]:
-    """Return the statistics of ``runs`` independent runs for each filter setup, all fed the same sensor data.
+    """Run several filter setups on the same simulated runs and return the statistics of each.
 
-    As :func:`run_plan` of a plan for each setup; on the scalar machine each run is simulated once for all of them. With "auto" the lanes
-    compute them if they can compute all.
+    As :func:`run_plan` for each setup; the scalar machine simulates each run once for all of them.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    setups : sequence of FilterSetup
+    runs : int
+    seed : int
+    epochs : int, default 100
+        Intervals between the epochs of the statistics.
+    nis_bins : int, default 100
+        Spans of time of the NIS.
+    dispersions : Dispersions, optional
+        Initial errors and gyro parameters that differ from run to run.
+    chunk : int, optional
+        Runs between merges; default the machine's.
+    threads : int, optional
+        Default: one a core.
+    machine : {"scalar", "auto", "lanes"}
+        "auto": the lanes if they support every setup.
+    progress : callable, optional
+        Called with the number of runs just finished.
+
+    Returns
+    -------
+    list of Statistics
+        One a setup.
+
+    Raises
+    ------
+    InputError
+        If no machine computes a setup, or a number is out of range.
     """
     count("runs", runs)
     plans = tuple(

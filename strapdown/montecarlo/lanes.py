@@ -1,8 +1,8 @@
 """The lane machine: eight runs at once in double precision, sixteen in single, noise, sensors, filter and statistics compiled together.
 
 The motion, the times of the measurements and all that does not differ from run to run is worked out once a plan; a run is its noise. Runs
-are told by (seed, run, source) alone, and the filter is the scalar machine's own source, so run k has the same bits whatever the chunk, the
-number of lanes, the threads and the host (with fused multiply-add). The noise is that of the simulator in distribution, not in its
+are named by (seed, run, source) alone, and the filter is the scalar machine's own source, so run k has the same bits whatever the chunk,
+the number of lanes, the threads and the host (with fused multiply-add). The noise is that of the simulator in distribution, not in its
 numbers.
 
 Two things are simpler than in the simulator. With a coning algorithm of N samples the noise is drawn a filter step, exactly as the sum of
@@ -126,7 +126,7 @@ class _Prepared:
     start: montecarlo_run.Start
     events_of_runs: montecarlo_run.Events
     record: ImuRecord
-    """The filter's steps without any noise; its series tell nominal σ."""
+    """The filter's steps without any noise; its series have nominal σ."""
     events: Schedule
     truth: Array
     """True attitudes at the epochs (m, 4)."""
@@ -368,7 +368,7 @@ def _answered(question: Callable[[], bool]) -> bool:
 
 
 class _Group:
-    """Memory of so many runs at once, and the call that advances them."""
+    """Memory of several runs at once, and the call that advances them."""
 
     def __init__(self, plan: Plan, width: int, *, every: int | None = None, detail: bool = False) -> None:
         self.prepared = _prepared(plan)

@@ -28,7 +28,7 @@ class Dispersions:
     """What differs from run to run besides the noise; normal, independent axes. The default: initial errors from the filter's prior."""
 
     attitude_sigma: float | None = None
-    """σ of the initial attitude error, each axis, rad; None: the filter's own, so that a right filter is consistent."""
+    """σ of the initial attitude error, each axis, rad; None: the filter's own, so that a matched filter is consistent."""
     bias_sigma: float | None = None
     """σ of the initial bias error, each axis, rad/s; None: the filter's own."""
     attitude_error: Array = field(default_factory=_zeros)
@@ -59,7 +59,12 @@ class Dispersions:
         return max(self.scale_factor_sigma, self.misalignment_sigma, self.turn_on_bias_sigma) > 0.0
 
     def to_table(self) -> dict[str, Any]:
-        """Return what differs from the default as the table that a file holds, units in the keys."""
+        """Return what differs from the default, as the table that a file holds, with units in the keys.
+
+        Returns
+        -------
+        dict
+        """
         return tables.encode(self, {n: choice for n, choice in _FORM.items() if getattr(self, n) is not None})
 
 
@@ -78,7 +83,7 @@ _FORM: tables.Form = {
 class Plan:
     """All that decides what run number k of a campaign is, and where its statistics are taken.
 
-    Filter and truth are told apart: a ``setup`` that differs from :func:`strapdown.setup.matched` of the scenario is a mismatched filter.
+    Filter and truth are separate: a ``setup`` that differs from :func:`strapdown.setup.matched` of the scenario is a mismatched filter.
     Outages, outliers and correlated noise are the scenario's sensors'. A plan is compared and hashed by identity, so a machine may keep
     what it derives from one in a ``weakref.WeakKeyDictionary``.
     """
@@ -131,7 +136,12 @@ class Plan:
         return tuple(sensor.name for sensor in self.scenario.sensors)
 
     def to_table(self) -> dict[str, Any]:
-        """Return the plan as a table of texts and numbers, by which plans are compared and from which :func:`from_table` makes it anew."""
+        """Return the plan as a table of texts and numbers, by which plans are compared and from which ``from_table`` restores it.
+
+        Returns
+        -------
+        dict
+        """
         return {
             "scenario": scenarios.scenario_to_table(self.scenario),
             "filter": setup.to_table(self.setup),
@@ -150,7 +160,7 @@ class Plan:
 
 
 def from_table(table: Mapping[str, Any]) -> Plan:
-    """Return the plan that :meth:`Plan.to_table` tells."""
+    """Return the plan of a table that :meth:`Plan.to_table` returned."""
     import tomli_w
 
     return Plan(
@@ -162,7 +172,21 @@ def from_table(table: Mapping[str, Any]) -> Plan:
 
 
 def read_dispersions(path: str | os.PathLike[str]) -> Dispersions:
-    """Read the table ``[dispersions]`` of a TOML file; other tables are left alone."""
+    """Read the table ``[dispersions]`` of a TOML file; other tables are ignored.
+
+    Parameters
+    ----------
+    path : path
+
+    Returns
+    -------
+    Dispersions
+
+    Raises
+    ------
+    InputError
+        If the file is missing, is no TOML, or has no such table, an unknown key or a value out of range.
+    """
     remedy = f"its keys are {', '.join(tables.keys(_FORM))}"
     return tables.read(path, "dispersions", remedy, _dispersions)
 

@@ -70,7 +70,7 @@ SHIFT = 49
 """The bits of a double shifted right by so much are exponent and three digits of the mantissa: its bin, but for a constant."""
 
 COVERED = (0.6826894921370859, 0.9544997361036416, 0.9973002039367398)
-"""What share of a right filter's errors lies inside 1, 2, 3 σ."""
+"""Share of a consistent filter's errors inside 1, 2, 3 σ."""
 
 SUBSETS: dict[str, tuple[int, int]] = {"state": (0, 6), "attitude": (1, 3), "bias": (2, 3)}
 """Column of the NEES and degrees of freedom, by what is judged."""
@@ -134,7 +134,12 @@ class Statistics(Listed):
     example_sigma: Array
 
     def listing(self) -> Listing:
-        """Return NEES and NIS per degree of freedom, and the errors at the end, as a table."""
+        """Return NEES and NIS per degree of freedom, and the errors at the end, as a table.
+
+        Returns
+        -------
+        Listing
+        """
         from strapdown.montecarlo.verdicts import summary
 
         report = summary(self)
@@ -212,14 +217,14 @@ class Statistics(Listed):
 
     @property
     def anees(self) -> Array:
-        """NEES averaged over runs and states (m, 3): of all six states, attitude, bias; 1 for a right filter, NaN where no bias is."""
+        """NEES averaged over runs and states (m, 3): of all six, of attitude, of bias; 1 for a consistent filter, NaN without a bias."""
         return _divided(
             self.nees_sum, self.finite[:, None] * np.array([6.0, 3.0, 3.0] if self.has_bias else [0.0, 3.0, 0.0])
         )
 
     @property
     def covered(self) -> Array:
-        """Share of the runs whose error lies inside 1, 2, 3 σ (m, 6, 3); :data:`COVERED` for a right filter."""
+        """Share of the runs whose error lies inside 1, 2, 3 σ (m, 6, 3); :data:`COVERED` for a consistent filter."""
         return _divided(self.coverage, self._runs_of_state[:, :, None])
 
     @property
@@ -239,12 +244,12 @@ class Statistics(Listed):
 
     @property
     def nis(self) -> Array:
-        """NIS per degree of freedom, averaged over runs and each span of time (k,); 1 for a right filter, NaN where none was measured."""
+        """NIS per degree of freedom, mean over runs and each span of time (k,); 1 for a consistent filter, NaN without measurements."""
         return _divided(self.nis_sum, self.sensor_degrees.sum(axis=0))
 
     @property
     def mean_nis(self) -> float:
-        """NIS per degree of freedom over the whole time and all runs; innovations of a right filter are white, so no epochs are needed."""
+        """NIS per degree of freedom over the whole time and all runs; as innovations are white, no epochs are needed."""
         return float(_divided(self.nis_sum.sum(), self.sensor_degrees.sum()))
 
     @property
@@ -253,26 +258,68 @@ class Statistics(Listed):
         return _divided(self.sensor_nis_sum.sum(axis=1), self.sensor_degrees.sum(axis=1))
 
     def nis_bounds(self, probability: float = 0.99, sensor: str | None = None) -> tuple[float, float]:
-        """Return two-sided bounds of :attr:`mean_nis`, or of that of one sensor."""
+        """Return two-sided bounds of the mean NIS per degree of freedom of a consistent filter.
+
+        Parameters
+        ----------
+        probability : float, default 0.99
+        sensor : str, optional
+            Default: all sensors together (:attr:`mean_nis`).
+
+        Returns
+        -------
+        low, high : float
+        """
         rows = slice(None) if sensor is None else self.sensors.index(sensor)
         return consistency.mean_bounds(1, int(self.sensor_degrees[rows].sum()), probability)
 
     def verdict(self, epochs: NDArray[Any], subset: str = "state", probability: float = 0.99) -> Verdict:
-        """Return the two-sided χ² verdict on ``subset`` ("state", "attitude" or "bias") at the epochs of the given indices.
+        """Return the two-sided χ² test of the ANEES at given epochs.
 
-        An epoch at which some run was not finite counts as infinite: no filter that fails is consistent.
+        An epoch at which some run was not finite counts as infinite: a filter that fails in a run is not consistent.
+
+        Parameters
+        ----------
+        epochs : array of int
+            Indices of epochs.
+        subset : {"state", "attitude", "bias"}
+        probability : float, default 0.99
+            Of the bounds at all epochs together.
+
+        Returns
+        -------
+        Verdict
         """
         column, degrees = SUBSETS[subset]
         mean = np.where(self.finite == self.runs, self.anees[:, column], np.inf)[epochs]
         return Verdict(mean=mean, degrees=degrees, runs=self.runs, probability=probability)
 
     def error_quantile(self, probability: float) -> Array:
-        """Return the quantile of |e| at each epoch (m, 6), from the histogram: off by less than half a bin, 6 %, mostly far less."""
+        """Return a quantile of |e| at each epoch, from the histogram; its error is less than half a bin, 6 %.
+
+        Parameters
+        ----------
+        probability : float
+
+        Returns
+        -------
+        ndarray (m, 6)
+            rad, rad/s.
+        """
         found = _quantile(self.histogram[:, :6], probability, bin_edges(ERROR_EXPONENT))
         return np.asarray(np.where(self._runs_of_state > 0.0, found, np.nan))
 
     def nees_quantile(self, probability: float) -> Array:
-        """Return the quantile of the NEES of state, attitude and bias at each epoch (m, 3)."""
+        """Return a quantile of the NEES of state, attitude and bias at each epoch.
+
+        Parameters
+        ----------
+        probability : float
+
+        Returns
+        -------
+        ndarray (m, 3)
+        """
         return _quantile(self.histogram[:, 6:], probability, bin_edges(NEES_EXPONENT))
 
 
@@ -304,7 +351,7 @@ _EXAMPLES = ("example_run", "example_error", "example_sigma")
 
 
 def merge(a: Statistics, b: Statistics) -> Statistics:
-    """Return the statistics of the runs of both. Sums are added, so the order of merging tells in the last bits."""
+    """Return the statistics of the runs of both. Sums are added, so the order of merging shows in the last bits."""
     for name in _SAME:
         if not np.array_equal(getattr(a, name), getattr(b, name)):
             raise InputError(f"statistics of different {name} cannot be merged; they are of different plans")

@@ -1,4 +1,4 @@
-"""What the statistics of a campaign say of its filter, as one table of numbers for a file or a screen."""
+"""The verdict on the filter from the statistics of a campaign, as a table of numbers for a file or a screen."""
 
 from __future__ import annotations
 
@@ -10,21 +10,26 @@ from strapdown import consistency, units
 from strapdown.montecarlo.statistics import COVERED, Counts, Statistics, judged_epochs
 
 QUANTILES = (0.5, 0.95, 0.997)
-"""Quantiles of the last epoch's errors that the summary tells."""
+"""Quantiles of the last epoch's errors in the summary."""
 
 
 def summary(statistics: Statistics, *, epochs: Counts | None = None, probability: float = 0.99) -> dict[str, Any]:
-    """Return the verdict and the figures: ANEES and NIS per degree of freedom, coverage, errors, worst runs; units in the names.
+    """Return verdict and numbers: ANEES and NIS per degree of freedom, coverage, errors, worst runs; units in the names.
 
-    All tests together (three of NEES at all judged epochs, one of NIS for each sensor) pass a right filter with at least ``probability``
-    (Bonferroni); the bounds told are those, and so a little wider than those of one test alone.
+    A consistent filter passes all tests together (three of NEES at all judged epochs, one of NIS for each sensor) with at least
+    ``probability`` (Bonferroni); the bounds reported are those, and so a little wider than those of one test alone.
 
     Parameters
     ----------
     statistics : Statistics
     epochs : array of int, optional
-        Indices of the epochs judged; default :func:`judged_epochs`.
-    probability : float
+        Indices of the epochs judged. Default: 20 evenly spaced ones.
+    probability : float, default 0.99
+
+    Returns
+    -------
+    dict
+        Plain values for JSON.
     """
     chosen = judged_epochs(len(statistics.time) - 1) if epochs is None else epochs
     seen = [i for i in range(len(statistics.sensors)) if statistics.sensor_degrees[i].sum() > 0]

@@ -1,4 +1,4 @@
-"""Scenarios: a motion, a gyro and sensors for so many seconds; simulating one gives a record with its truth.
+"""Scenarios: a motion, a gyro and sensors over a time; simulating one gives a record with its truth.
 
 A scenario is a TOML file, units in the names of its keys; the built-in ones (``SCENARIOS``) are such files beside this module.
 """
@@ -47,7 +47,7 @@ MOST_SAMPLES = 1e9
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
-    """What is simulated."""
+    """A motion, a gyro and sensors, at a sample rate, over a time."""
 
     motion: Motion
     gyro: GyroSpec
@@ -61,7 +61,7 @@ class Scenario:
     description: str = ""
     """What it is, for lists and reports."""
     seed: int = 0
-    """The seed that is used where none is given."""
+    """Default seed of :func:`simulate`."""
     gravity_f: tuple[float, ...] = vectors.GRAVITY_F
     """Gravity where the body is held up, m/s², fixed frame: what a g-sensitive gyro feels the reaction to; zeros in free fall."""
     gyro_preset: str = ""
@@ -99,11 +99,31 @@ class Scenario:
 
 
 def simulate(scenario: Scenario, seed: int | None = None, run: int = 0) -> ImuRecord:
-    """Return run number ``run`` of a scenario: the record that its sensors give, with the truth.
+    """Simulate one run of a scenario: gyro increments, vector measurements and the truth.
 
-    Each sensor draws from its own stream of (seed, run, name), so adding one changes nothing of the others. Without a seed, the scenario's
-    own is used. With sampling jitter the truth is that of the instants really sampled, the stamps those that the gyro tells; lost samples
-    are bridged (:func:`strapdown.gyro.bridge_dropped`).
+    Each sensor draws from a random stream of its own (seed, run, name), so adding one changes nothing of the others. With sampling jitter
+    the truth is that at the actual sampling instants, and the stamps are those that the gyro reports; lost samples are bridged
+    (:func:`strapdown.gyro.bridge_dropped`).
+
+    Parameters
+    ----------
+    scenario : Scenario
+    seed : int, optional
+        Default: the scenario's own.
+    run : int, default 0
+        Runs of one seed are independent.
+
+    Returns
+    -------
+    ImuRecord
+        With ``truth`` and ``origin``.
+
+    Examples
+    --------
+    >>> from strapdown import scenarios
+    >>> record = scenarios.simulate(scenarios.load_scenario("two-stars"))
+    >>> record.increments.shape, record.truth.attitude.shape
+    ((30000, 3), (30001, 4))
     """
     seed = scenario.seed if seed is None else seed
     spec, nominal = scenario.gyro, scenario.edges
@@ -130,11 +150,21 @@ def simulate(scenario: Scenario, seed: int | None = None, run: int = 0) -> ImuRe
 
 
 def drawn(scenario: Scenario, seed: int, run: int = 0) -> Scenario:
-    """Return the scenario with another individual of its gyro and sensors: each fixed error times a standard normal.
+    """Return the scenario with other individuals of its gyro and sensors: each fixed error times a standard normal number.
 
-    The fixed errors (scale factor, misalignment, sensitivity to acceleration, hard iron, a sensor's bias, lever arm) are taken for standard
-    deviations, entry by entry, as a datasheet tells them. A filter with a state for each (``setup.matched(scenario, states=True)``) is
-    right on average over such individuals; on one whose errors all have one size and sign only nearly.
+    The fixed errors (scale factor, misalignment, sensitivity to acceleration, hard iron, a sensor's bias, lever arm) are taken as standard
+    deviations, entry by entry, as in a datasheet. A filter with a state for each (``setup.matched(scenario, states=True)``) is consistent
+    on average over such individuals, and only nearly so on one whose errors all have one size and sign.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    seed : int
+    run : int, default 0
+
+    Returns
+    -------
+    Scenario
     """
     draw = generator(seed, run, "individual")
 
@@ -287,12 +317,27 @@ _TOP = ("name", "description", "seed", "rate_hz", "duration_s", "gravity_f_m_per
 
 
 def load_scenario(name_or_path: str | os.PathLike[str]) -> Scenario:
-    """Return a built-in scenario by name, or the one in a TOML file.
+    """Return a built-in scenario by its name, or the one in a TOML file.
+
+    Parameters
+    ----------
+    name_or_path : str or path
+        A name of :data:`SCENARIOS`, or a path.
+
+    Returns
+    -------
+    Scenario
 
     Raises
     ------
     InputError
-        If there is neither, or the file has an unknown key (the nearest known one is named), a missing one, or is no TOML.
+        If there is neither, or the file is no TOML, lacks a key, or has an unknown one (the nearest known one is named).
+
+    Examples
+    --------
+    >>> from strapdown import scenarios
+    >>> scenarios.load_scenario("two-stars").rate
+    100.0
     """
     text = os.fspath(name_or_path)
     path = Path(text)
@@ -305,7 +350,7 @@ def load_scenario(name_or_path: str | os.PathLike[str]) -> Scenario:
 
 
 def scenario_from_toml(text: str, place: str = "scenario") -> Scenario:
-    """Return the scenario that a TOML text tells."""
+    """Return the scenario in a TOML text."""
     return _from_table(reading.from_toml(text, place), place)
 
 
@@ -450,7 +495,21 @@ def scenario_to_table(scenario: Scenario) -> dict[str, Any]:
 
 
 def scenario_to_toml(scenario: Scenario) -> str:
-    """Return a scenario as TOML; reading it gives the same scenario to the last bit."""
+    """Return a scenario as TOML text; reading it gives the same scenario to the last bit.
+
+    Parameters
+    ----------
+    scenario : Scenario
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    InputError
+        If a part is a Python function or of a class of your own, which has no form in a file.
+    """
     import tomli_w
 
     text = tomli_w.dumps(scenario_to_table(scenario))

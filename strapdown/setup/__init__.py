@@ -1,4 +1,4 @@
-"""How a filter is set up: what it believes of the gyro and of each sensor, where it starts, what integrates the gyro.
+"""Filter setups: noise model of the gyro and of each sensor, initial uncertainty, integration algorithm, gate and error states.
 
 One object for the command line, the Monte Carlo and the tuning. As a file it is the table ``[filter]`` of a TOML document, units in the
 names of its keys; a setup read back is equal to the last bit.
@@ -51,15 +51,15 @@ LINEAR_SHARE = 0.2
 COMMUTATION_SHARE = 0.1
 """Of what the record's white noise leaves of a constant rate: a drift of one-sample integration above it calls for a better algorithm."""
 BETTER = "matched-1-8-8"
-"""The integration algorithm that is then taken: one that keeps the rate of the samples."""
+"""The integration algorithm chosen then: one step a sample."""
 LEAST_SAMPLES = 32
-"""Gyro samples below which nothing is said of commutation."""
+"""Fewest gyro samples for which the commutation error is estimated."""
 LEAST_BIAS_SIGMA = 0.1 * units.DEGREE_PER_HOUR
-"""Standard deviation of the initial bias error of a gyro whose specification tells of no bias, rad/s."""
+"""Standard deviation of the initial bias error of a gyro whose specification has no bias, rad/s."""
 MEKF = "mekf"
 """The estimator that all of this package works with; others run over records, and can be judged."""
 MOST_MEMORY = 8e9
-"""Bytes that the smoother may keep of the filter's way."""
+"""Largest memory for the smoother's forward pass, bytes."""
 
 Sigma = float | tuple[float, float, float]
 """σ of a sensor: one number, or one about (of whole vectors along) each body axis x, y, z."""
@@ -77,7 +77,7 @@ def _sigma(name: str, value: Any) -> Sigma:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FilterSetup(ByValue):
-    """What the filter believes, where it starts, what integrates the gyro."""
+    """The filter's model, its initial uncertainty, and the integration of the gyro."""
 
     process_noise: ProcessNoise
     attitude_sigma: float = ATTITUDE_SIGMA
@@ -87,17 +87,17 @@ class FilterSetup(ByValue):
     integration: coning.Algorithm = field(default_factory=lambda: coning.ALGORITHMS["one-sample"])
     """Coning algorithm that turns its N gyro samples into one filter step."""
     measurement_sigma_factor: float = 1.0
-    """What the filter takes each sensor's σ for, as a multiple of the record's."""
+    """Factor on the record's σ of every sensor."""
     sigma: Mapping[str, Sigma] = field(default_factory=dict)
-    """σ that the filter believes of a sensor instead of the record's, by its name: rad, or of whole vectors the unit of their reference.
-    One number, or three of the body axes x, y, z (of a direction the part across it counts; a heading has one). Of a series whose σ varies
-    it is the root mean square, and the ratios stay; with three, those between samples, not those between axes."""
+    """σ of a sensor, instead of the record's, by its name: rad, or for whole vectors the unit of their reference. One number, or three for
+    the body axes x, y, z (of a direction the part across it counts; a heading has one). Where the record's σ varies, this is its root mean
+    square and the ratios between samples are kept."""
     gate: Gate | None = None
-    """Refuses measurements that no right filter would see, and recovers; None: all are taken."""
+    """Refuses improbable measurements, and recovers; None: all are used."""
     robust: Robust | None = None
-    """Weighs measurements by how far they lie off; None: all alike."""
+    """Weighs measurements by the size of their innovations; None: all alike."""
     states: States | None = None
-    """Optional states beside attitude and bias; None: none. With drifts among them, the bias of the filter is the whole of it."""
+    """Error states beside attitude and bias; None: none. With drifts among them, the estimated bias includes them."""
     estimator: str | Own | OwnFilter | Callable[[ImuRecord, State], Estimate] = MEKF
     """What runs over a record: the name of one of :data:`strapdown.estimation.filters.FILTERS`, or a filter of one's own
     (:mod:`strapdown.estimation.filters.own`). Of the latter, ``process_noise`` is not used; the two σ above are its start's."""
@@ -130,9 +130,29 @@ class FilterSetup(ByValue):
 
 
 def matched(scenario: Scenario, *, attitude_sigma: float | None = None, states: bool = False) -> FilterSetup:
-    """Return what a right filter believes of a scenario: the noise of its gyro, and of its sensors what they say of themselves.
+    """Return the filter setup that matches a scenario: the noise of its gyro, and the sensors' own σ.
 
-    With ``states`` it has the optional states that the scenario's errors call for, as :func:`matched_to_record` says.
+    Parameters
+    ----------
+    scenario : Scenario
+    attitude_sigma : float, optional
+        As of :func:`matched_to_record`.
+    states : bool, default False
+        With an error state for each error that the scenario specifies, as :func:`matched_to_record` describes.
+
+    Returns
+    -------
+    FilterSetup
+
+    Raises
+    ------
+    InputError
+        If the gyro has no angle random walk.
+
+    Examples
+    --------
+    >>> from strapdown import scenarios, setup
+    >>> print(setup.to_toml(setup.matched(scenarios.load_scenario("two-stars"))))  # doctest: +SKIP
     """
     return matched_to_record(
         scenario.gyro,
@@ -153,19 +173,37 @@ def matched_to_record(
     sensors: Sequence[Any] = (),
     gravity_f: Sequence[float] = vectors.GRAVITY_F,
 ) -> FilterSetup:
-    """Return what a right filter believes of a record of a gyro of this specification.
+    """Return the filter setup that matches a record of a gyro of this specification.
 
-    Flicker, which no random walk is, is matched in the attitude at the record's rate and quality of measurements
-    (:func:`strapdown.gyro.matched_process_noise`); without measurements it is bounded over the record's length. Errors that the filter
-    has no state for (scale factor, misalignment, quantisation, hard iron) are not covered. Without ``attitude_sigma``, rad, the start is
-    known to 1°, or so much better that the first measurement of the finest sensor is still linear in its error: an extended filter's
-    covariance is not to be believed beyond that.
+    Flicker noise, which is no random walk, is matched in the attitude at the record's rate and quality of measurements
+    (:func:`strapdown.gyro.matched_process_noise`); without measurements it is bounded over the record's length. Errors without a state
+    (scale factor, misalignment, quantisation, hard iron) are not covered: :func:`not_covered` names them.
 
-    With ``states`` the filter has a state for each such error that the specification, or one of ``sensors``, tells of (scale factor,
-    misalignment, sensitivity to the force of ``gravity_f``, flicker and Gauss–Markov drift, hard iron, a sensor's bias, correlated noise,
-    lever arm): taken for one draw of a normal distribution whose σ is the error's size. What remains uncovered :func:`not_covered` tells.
-    Of a motion whose commutation one-sample integration would feel, it then takes a better algorithm of the same rate: measurements between
-    the edges of longer steps would be taken for what a turn at constant rate makes there.
+    Parameters
+    ----------
+    spec : GyroSpec
+    record : ImuRecord
+    attitude_sigma : float, optional
+        σ of the initial attitude error, each axis, rad. Default: 1°, or less where the finest sensor is so fine that its first measurement
+        would not be linear in the error; an extended filter's covariance does not hold beyond that.
+    states : bool, default False
+        With an error state for each error that ``spec`` or ``sensors`` specify: scale factor, misalignment, g-sensitivity, flicker and
+        Gauss–Markov drift, hard iron, a sensor's bias, correlated noise, lever arm. Each is modelled as one draw of a normal distribution
+        whose σ is the error's size. Where one-sample integration would leave a noticeable commutation error, an integration algorithm of
+        the same rate with less is chosen.
+    sensors : sequence, optional
+        Sensors of the scenario (:mod:`strapdown.vectors`), whose errors are specified.
+    gravity_f : sequence of float (3,)
+        Gravity in the fixed frame, m/s², for a g-sensitive gyro.
+
+    Returns
+    -------
+    FilterSetup
+
+    Raises
+    ------
+    InputError
+        If the gyro has no angle random walk.
     """
     walk = np.max(np.square(spec.bias_instability) * np.log(1e3)) / np.pi  # flicker over three decades of time
     stationary = np.where(
@@ -225,9 +263,29 @@ def not_covered(
     *,
     gravity_f: Sequence[float] = vectors.GRAVITY_F,
 ) -> tuple[str, ...]:
-    """Return, in words, the errors of a gyro and of sensors that a filter of attitude and bias, and of ``states``, has no state for.
+    """Return, in words, the specified errors that a filter has no state for.
 
-    Where there is any, a filter that believes the noise alone is too sure of itself; :func:`matched` has states for most, if told to.
+    Where there are any, a filter that models the noise alone is overconfident.
+
+    Parameters
+    ----------
+    spec : GyroSpec
+    sensors : tuple, optional
+        Sensors of the scenario.
+    states : States, optional
+        Error states of the filter; None: attitude and bias alone.
+    gravity_f : sequence of float (3,)
+        Gravity in the fixed frame, m/s².
+
+    Returns
+    -------
+    tuple of str
+
+    Examples
+    --------
+    >>> from strapdown import GyroSpec, setup
+    >>> setup.not_covered(GyroSpec(angle_random_walk=1e-5, scale_factor=(1e-4, 0.0, 0.0)))
+    ("the gyro's scale factor of 100 ppm",)
     """
     found = []
     known = set() if states is None else set(states.names)
@@ -304,7 +362,7 @@ def _need_white(noise: Mapping[str, float]) -> None:
 def measurement_density(record: ImuRecord) -> float:
     """Return the variance of a measurement about an axis times the interval between measurements, rad² s, over all sensors and axes.
 
-    A direction tells of two axes of three, a heading of one; infinite where there is no measurement.
+    A direction measures two axes of three, a heading one; infinite where there is no measurement.
     """
     information = sum(_information(series) for series in record.vectors)
     length = float(record.time[-1] - record.time[0])
@@ -323,7 +381,7 @@ def _information(series: VectorMeasurements) -> float:
 
 
 def believed(record: ImuRecord, setup: FilterSetup) -> ImuRecord:
-    """Return the record as the filter of this setup takes it: at the rate of its integration algorithm, each σ as it believes it."""
+    """Return the record as the filter of this setup processes it: at the rate of its integration algorithm, with the setup's σ."""
     names = [series.sensor for series in record.vectors]
     for name in setup.sigma:
         one_of("sigma: sensor", name, names)
@@ -368,10 +426,28 @@ def _by_axis(series: VectorMeasurements, told: tuple[float, float, float], facto
 
 
 def run(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any) -> Estimate:
-    """Run the filter of this setup over a record; ``options`` are those of :func:`strapdown.estimation.run`.
+    """Run the filter of a setup over a record.
 
-    With optional states the estimate is one of :class:`strapdown.records.Estimate`, which tells of them too. Other estimators than the
-    mekf take ``every`` and ``full_covariance`` alone.
+    Parameters
+    ----------
+    record : ImuRecord
+        At the gyro's rate; the setup's integration algorithm and σ are applied.
+    setup : FilterSetup
+    initial : State
+        State at the first edge.
+    **options
+        Of :func:`strapdown.estimation.run`; ``gate`` and ``robust`` replace the setup's. Other estimators than the
+        mekf take ``every`` and ``full_covariance`` alone.
+
+    Returns
+    -------
+    Estimate
+        With ``error_states`` where the setup has any.
+
+    Raises
+    ------
+    InputError
+        If the setup has a σ or a state for a sensor that the record does not have, or an argument is out of range.
     """
     if setup.estimator != MEKF:
         return _run_other(believed(record, setup), setup, initial, **options)
@@ -400,13 +476,26 @@ def need_mekf(setup: FilterSetup, what: str) -> None:
 
 
 def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any) -> Estimate:
-    """Return the fixed-interval smoother's estimate of this setup; ``options`` are those of :func:`strapdown.estimation.smooth`.
+    """Run the fixed-interval smoother of a setup over a record.
+
+    Parameters
+    ----------
+    record : ImuRecord
+        At the gyro's rate.
+    setup : FilterSetup
+    initial : State
+        State at the first edge.
+    **options
+        Of :func:`strapdown.estimation.smooth`.
+
+    Returns
+    -------
+    Estimate
 
     Raises
     ------
     InputError
-        If the record is so long that what the way back needs of the way forth exceeds :data:`MOST_MEMORY`, or a gyro drift is among the
-        states.
+        If the forward pass would need more memory than :data:`MOST_MEMORY`, or a gyro drift is among the states.
     """
     need_mekf(setup, "the smoother")
     chosen = {"gate": setup.gate, "robust": setup.robust, **options}
@@ -430,7 +519,23 @@ def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any
 
 
 def observability(record: ImuRecord, setup: FilterSetup, initial: State) -> Observability:
-    """Return what a record shows of each state of this setup's filter: see :func:`strapdown.estimation.observability`."""
+    """Return what a record shows of each state of this setup's filter (:func:`strapdown.estimation.observability`).
+
+    Parameters
+    ----------
+    record : ImuRecord
+    setup : FilterSetup
+    initial : State
+
+    Returns
+    -------
+    Observability
+
+    Raises
+    ------
+    InputError
+        If the setup has a σ or a state for a sensor that the record does not have.
+    """
     need_mekf(setup, "observability")
     told = believed(record, setup)
     if setup.states is None:
@@ -442,7 +547,25 @@ def observability(record: ImuRecord, setup: FilterSetup, initial: State) -> Obse
 def initial_state(
     setup: FilterSetup, attitude: Array, bias: Array | tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> State:
-    """Return the state that the filter starts from: this attitude and bias, and the setup's σ of both."""
+    """Return the state that the filter starts from, with the setup's σ.
+
+    Parameters
+    ----------
+    setup : FilterSetup
+    attitude : array_like (4,)
+        q_fb.
+    bias : array_like (3,), default zero
+        Gyro bias, rad/s, body axes.
+
+    Returns
+    -------
+    State
+
+    Raises
+    ------
+    InputError
+        If a shape is wrong, or the quaternion is not of unit length.
+    """
     return estimation.initial_state(
         attitude, bias=bias, attitude_sigma=setup.attitude_sigma, bias_sigma=setup.bias_sigma
     )
@@ -493,7 +616,7 @@ def to_table(setup: FilterSetup) -> dict[str, Any]:
 
 
 def from_table(table: Mapping[str, Any], place: str = "filter") -> FilterSetup:
-    """Return the setup that a table tells; unknown keys are refused with the nearest known one."""
+    """Return the setup in a table; an unknown key is an error that names the nearest known one."""
     known_keys(place, table, {*tables.keys(_NOISE_FORM), *tables.keys(_FORM), *_PARTS})
     own = tables.keys(_NOISE_FORM)
     parts: dict[str, Any] = {}
@@ -532,7 +655,7 @@ def from_table(table: Mapping[str, Any], place: str = "filter") -> FilterSetup:
 
 
 def need_angles(setup: FilterSetup, kinds: Mapping[str, str], place: str) -> None:
-    """Refuse a believed σ beyond half a turn of a sensor that measures angles, for it was meant in another unit than rad.
+    """Raise an error for a σ beyond half a turn of a sensor that measures angles: it must have been meant in another unit than rad.
 
     ``kinds`` are those of the sensors by their names; whole vectors ("vector") may have any σ. ``place`` is what is named in the error.
     """
@@ -552,7 +675,16 @@ def _part(table: Mapping[str, Any], name: str, place: str) -> Mapping[str, Any]:
 
 
 def to_toml(setup: FilterSetup) -> str:
-    """Return a setup as TOML with the table ``[filter]``."""
+    """Return a setup as TOML text with the table ``[filter]``, units in the names of its keys.
+
+    Parameters
+    ----------
+    setup : FilterSetup
+
+    Returns
+    -------
+    str
+    """
     import tomli_w
 
     told = setup.sigma or (setup.states is not None and setup.states.sensors)
@@ -569,11 +701,19 @@ def from_toml(text: str, place: str = "filter") -> FilterSetup:
 
 
 def read_setup(path: str | os.PathLike[str]) -> FilterSetup:
-    """Read the table ``[filter]`` of a TOML file, such as ``strapdown tune`` writes; other tables are left alone.
+    """Read the table ``[filter]`` of a TOML file, such as ``strapdown tune`` writes; other tables are ignored.
+
+    Parameters
+    ----------
+    path : path
+
+    Returns
+    -------
+    FilterSetup
 
     Raises
     ------
     InputError
-        If the file is missing, no TOML, has no such table, or a key that no filter has.
+        If the file is missing, is no TOML, or has no such table or an unknown key.
     """
     return tables.read(path, "filter", "`strapdown tune` writes one", from_table)

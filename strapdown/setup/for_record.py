@@ -129,7 +129,7 @@ def start(record: ImuRecord, chosen: FilterSetup) -> Start:
         state = estimation.first_state(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
     except InconsistentError as error:
         problem = _without_remedy(error)
-        # A sensor's own errors may be among the states, and then the filter can tell which sensor is right.
+        # A sensor's own errors may be among the states, and then the filter estimates them.
         if chosen.states is None:
             raise InputError(
                 f"{problem}; if a sensor has a bias, give the filter its state (--states; states=True in Python); or {REMEDY}"

@@ -1,4 +1,4 @@
-"""Which optional states the errors that a specification tells of call for, and with what σ."""
+"""The error states, with their σ, that match the errors of a specification."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def matched(spec: GyroSpec, record: ImuRecord, sensors: Sequence[Any], gravity_f
 
     Each error is taken for one draw from a normal distribution whose σ is its size, entry by entry; one of zero is no state. Of flicker,
     parts a decade apart from the record's length down to what the measurements can follow are states (their sum is 1/f within 6 %), what is
-    quicker is white noise of the attitude and a σ of the bias that is told.
+    quicker is white noise of the attitude and a σ of the reported bias.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def matched(spec: GyroSpec, record: ImuRecord, sensors: Sequence[Any], gravity_f
 
 
 def _entries(values: Array) -> Entries:
-    """Return entries as they are told: 0 where there is none."""
+    """Return entries as they are specified: 0 where there is none."""
     return (
         tuple(map(tuple, values.tolist()))
         if values.ndim == 2 and values.any()
@@ -135,7 +135,7 @@ def _of_sensor(sensor: Any, series: VectorMeasurements) -> SensorStates:
     own = float(sensor.sigma) if hasattr(sensor, "sigma") else 0.0
     over, varying = 1.0, False
     if series.kind in ("direction", "heading") and own > 0.0 and hasattr(sensor, "field_f"):
-        # The sensor's noise over the field's strength is what the series tells.
+        # The series gives the sensor's noise over the field's strength.
         level = np.linalg.norm(series.references_f[:, :2], axis=1) if series.kind == "heading" else 1.0
         over = float(np.sqrt(np.mean((series.sigma * level) ** 2))) / own
         varying = bool(np.ptp(strength(series)) > 1e-9)

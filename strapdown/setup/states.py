@@ -119,7 +119,25 @@ class SensorStates:
         return BoundedVelocity(sensor=sensor, strength=strength, **told)
 
     def blocks(self, sensor: str, kind: str, gravity: float) -> tuple[ErrorStates, ...]:
-        """Return them as blocks of a sensor of this kind; ``gravity``, m/s², is what a direction's specific force is over."""
+        """Return the error states of one sensor.
+
+        Parameters
+        ----------
+        sensor : str
+            Its name.
+        kind : {"direction", "vector", "heading", "attitude"}
+        gravity : float
+            m/s²; a direction's specific force is divided by it.
+
+        Returns
+        -------
+        tuple of ErrorStates
+
+        Raises
+        ------
+        InputError
+            If a state does not go with this kind of measurement.
+        """
         one_of(f"{sensor}: kind", kind, KINDS)
         found: list[ErrorStates] = []
         if _any(self.mounting_sigma):
@@ -162,7 +180,7 @@ class States(ByValue):
     gyro_drift_time: tuple[float, ...] = ()
     """Their time constants, s."""
     gyro_fast_bias_sigma: float = 0.0
-    """σ of what of the gyro's bias changes too quickly to be estimated, rad/s: no state, but part of what is told of the bias."""
+    """σ of the part of the gyro's bias that changes too quickly to be estimated, rad/s: no state, but part of the bias's reported σ."""
     gravity_f: tuple[float, ...] = GRAVITY_F
     """Acceleration of gravity, m/s², fixed axes: what the gyro's sensitivity and lever arms are about."""
     sensors: Mapping[str, SensorStates] = field(default_factory=dict)
@@ -199,7 +217,12 @@ class States(ByValue):
         return float(np.linalg.norm(self.gravity_f))
 
     def gyro_blocks(self) -> tuple[ErrorStates, ...]:
-        """Return the blocks of the gyro."""
+        """Return the error states of the gyro.
+
+        Returns
+        -------
+        tuple of ErrorStates
+        """
         found: list[ErrorStates] = []
         if _any(self.gyro_scale_sigma) or _any(self.gyro_misalignment_sigma):
             scale, misalignment = _spread(self.gyro_scale_sigma, self.gyro_misalignment_sigma)
@@ -212,7 +235,22 @@ class States(ByValue):
         return tuple(found)
 
     def blocks(self, kinds: Mapping[str, str]) -> tuple[ErrorStates, ...]:
-        """Return all as blocks of a filter on sensors of these kinds, by name."""
+        """Return all error states of a filter.
+
+        Parameters
+        ----------
+        kinds : mapping of str to str
+            Kind of measurement of each sensor, by its name.
+
+        Returns
+        -------
+        tuple of ErrorStates
+
+        Raises
+        ------
+        InputError
+            If a sensor is unknown, or a state does not go with its kind of measurement.
+        """
         found = list(self.gyro_blocks())
         for name, one in self.sensors.items():
             known = one_of("states: sensor", name, kinds)
@@ -241,7 +279,22 @@ class States(ByValue):
         return tuple(found)
 
     def chosen(self, names: tuple[str, ...]) -> States:
-        """Return those of these names only (:attr:`names`), the others taken for none."""
+        """Return the states of these names alone.
+
+        Parameters
+        ----------
+        names : tuple of str
+            Of :attr:`names`.
+
+        Returns
+        -------
+        States
+
+        Raises
+        ------
+        InputError
+            If a name is unknown.
+        """
         for name in names:
             if not self.names:
                 raise InputError(f"states: {name!r} is asked for, and there is none to choose from")
@@ -377,7 +430,7 @@ def to_table(states: States) -> dict[str, Any]:
 
 
 def from_table(table: Mapping[str, Any], place: str = "states") -> States:
-    """Return the states that a table tells; unknown keys are refused with the nearest known one."""
+    """Return the states in a table; an unknown key is an error that names the nearest known one."""
     known_keys(place, table, {*tables.keys(FORM), "sensors"})
     sensors = table.get("sensors", {})
     if not isinstance(sensors, Mapping):

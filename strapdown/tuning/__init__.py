@@ -1,4 +1,4 @@
-"""Tuning a filter from data: maximum likelihood, how sure one may be of each parameter, and proof on data held out.
+"""Tuning a filter from data: maximum likelihood, an interval for each parameter, and validation on held-out data.
 
 ``procedure``
     :func:`tune`: objective, search and what follows it in one call.
@@ -7,7 +7,7 @@
 ``errors``
     Of the errors against a truth.
 ``credibility``
-    Of whether the filter may be believed: the whole distribution of NIS, or NEES, and whiteness.
+    Consistency: the whole distribution of NIS, or NEES, and whiteness.
 ``outliers``
     Of innovations some of which are outliers, and the gate that suits them.
 ``fitting``
@@ -29,8 +29,8 @@
 
 The likelihood is right for a filter that is right but for its parameters: it gives white innovations. Disturbances that last over many
 samples break it, and the most likely filter may then follow them (:attr:`strapdown.tuning.Tuning.misfit` says so). On such records tune
-``filter.scale`` alone, which leaves the estimates as they are and sets their σ, or against a truth. Outliers want a model of their own
-(:func:`contaminated_likelihood`), and an error without a state looks like noise of the gyro (:func:`unmodelled` tells).
+``filter.scale`` alone, which leaves the estimates as they are and sets their σ, or against a truth. Outliers need a model of their own
+(:func:`contaminated_likelihood`), and an error without a state looks like noise of the gyro (:func:`unmodelled` looks for it).
 """
 
 from strapdown.tuning.credibility import CredibilityObjective as CredibilityObjective

@@ -1,9 +1,9 @@
-"""Tuning by credibility: the squares that have a known distribution in a right filter should have it, the whole of it.
+"""Tuning by credibility: the squares that have a known distribution in a consistent filter should have it, in whole.
 
-The innovations of a right filter are white, and standard normal once they are over their own σ. So the NIS of a measurement with d rows
-is χ² of d degrees of freedom; and so is that of a *block*, the square of the sum of the whitened innovations of L measurements in a row
-over L. Blocks of 1, 2, 4, … measurements are judged, each size and each sensor by itself: what is not white is too much or too little in
-blocks as long as its cause lasts. Against a truth the NEES at epochs that have forgotten each other is judged instead.
+The innovations of a consistent filter are white, and standard normal once they are over their own σ. So the NIS of a measurement with d
+rows is χ² of d degrees of freedom; and so is that of a *block*, the square of the sum of the whitened innovations of L measurements in a
+row over L. Blocks of 1, 2, 4, … measurements are judged, each size and each sensor by itself: what is not white is too much or too little
+in blocks as long as its cause lasts. Against a truth the NEES at epochs that have forgotten each other is judged instead.
 
 Squares x become uniform, ``u = F(x)``, by the probability integral transform. How far they are from it is Neyman's smooth statistic (1937)
 
@@ -13,14 +13,14 @@ P_k Legendre's polynomials: the first components of Anderson & Darling's (Durbin
 in the parameters. Four of them judge single squares; of blocks, whose sums are near normal whatever the noise, the first judges the size.
 Half the sum over all samples is minimised.
 
-*What it can tell.* The size of a sensor's noise where the state is known, with 1.3 times the likelihood's standard error (single squares
+*What it determines.* The size of a sensor's noise where the state is known, with 1.3 times the likelihood's standard error (single squares
 alone have 93 % of its efficiency at one degree of freedom and 96 % at two; the blocks, which see the gyro, add their own scatter). The
 gyro's white noise and the walk of its bias by what they make of long blocks, with about twice the likelihood's. *What it cannot.* Whether
-the errors are small: a filter that throws measurements away and says so is credible. The NEES of attitude and bias tells a common scale
-and hardly more: free one parameter or two against a truth.
+the errors are small: a filter that throws measurements away and says so is credible. The NEES of attitude and bias determines a common
+scale and hardly more: free one parameter or two against a truth.
 
 *Outliers.* A square however large moves ln σ by at most 2.8/n (one degree of freedom) or 1.75/n (two), where the likelihood's pull has no
-bound. But an outlier spoils a block of every size, and moves the filter itself, so many of them want a model of their own
+bound. But an outlier spoils a block of every size, and moves the filter itself, so many of them need a model of their own
 (:mod:`strapdown.tuning.outliers`).
 
 The value is no likelihood and its curvature no information: standard errors and intervals come from the scatter of the estimating function
@@ -125,7 +125,7 @@ def _usual_log(degrees: int) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class CredibilityObjective(Composite):
-    """How far NIS, or NEES, are from what they are of a right filter; built by :func:`credibility_objective`."""
+    """Distance of NIS, or NEES, from their distribution in a consistent filter; built by :func:`credibility_objective`."""
 
     errors: ErrorObjective | None = None
     """Where the errors against a truth are judged; None: innovations."""
@@ -230,7 +230,7 @@ class CredibilityObjective(Composite):
 def credibility_objective(
     cases: Sequence[Case], chosen: FilterSetup, free: Sequence[str], *, truth: bool = False, threads: int = 1
 ) -> CredibilityObjective:
-    """Return the objective that judges the filter by whether it may be believed.
+    """Return the objective of consistency.
 
     Parameters
     ----------

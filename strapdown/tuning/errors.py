@@ -108,7 +108,7 @@ def error_objective(
     free : sequence of str
     measure : "likelihood" or "rmse"
         The likelihood of the errors under the filter's covariance asks that they be small and that the filter know how small;
-        the root mean square of the attitude error asks for the first alone, and cannot tell a common scale of all parameters.
+        the root mean square of the attitude error asks for the first alone, and does not determine a common scale of all parameters.
     threads : int
         Records that are worked on at once.
     """

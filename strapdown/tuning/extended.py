@@ -11,7 +11,7 @@ come, is the observed one, by central differences of the score. :func:`strapdown
 >>> result = tuning.fit(objective, starts=1)  # doctest: +SKIP
 
 The σ of a constant state is known from as many draws as there are such states and records: of a scale factor on three axes, one record
-tells it within a factor of 1.5 at best.
+determines it within a factor of 1.5 at best.
 """
 
 from __future__ import annotations
@@ -261,7 +261,7 @@ def likelihood(
     Parameters
     ----------
     cases : sequence of Case
-        Their initial states tell of the whole bias, as those of :func:`strapdown.tuning.record_case` do.
+        Their initial states are of the whole bias, as those of :func:`strapdown.tuning.record_case` do.
     chosen : FilterSetup
         Where the free parameters start, and what the fixed ones are; its gate and robust weights are not applied. With ``states``, or
         without where a σ of one axis is free.

@@ -34,7 +34,7 @@ ONE_SIDED = 2.705543454095404
 LEAST_INFORMATION = 1e-10
 """Of a log parameter; less is none."""
 NEGLIGIBLE = 1e-3
-"""A gain of the log likelihood that nobody can tell from none."""
+"""A gain of the log likelihood that is not distinguishable from none."""
 
 
 MISFIT = 1.6
@@ -175,7 +175,7 @@ def search(
 
 @dataclass(frozen=True, kw_only=True)
 class Estimated:
-    """One parameter and what is known of it; SI."""
+    """One tuned parameter with its interval; SI."""
 
     name: str
     start: float
@@ -224,7 +224,12 @@ class Tuning(Listed):
     """Whether what was minimised is no likelihood, so that intervals come from the scatter of its gradient (sandwich)."""
 
     def listing(self) -> Listing:
-        """Return the parameters with their intervals, as a table; σ of sensors in rad or the unit of the vector."""
+        """Return the parameters with their intervals, as a table; σ of sensors in rad or the unit of the vector.
+
+        Returns
+        -------
+        Listing
+        """
         rows = []
         for one in self.parameters:
             unit = fixed_unit(one.name)
@@ -277,18 +282,36 @@ def fit(
 
     Parameters
     ----------
-    objective : Likelihood
-        Innovations (:func:`strapdown.tuning.likelihood`) or errors (:func:`strapdown.tuning.error_likelihood`).
-    priors : mapping, optional
-        What is known before, by name; then the most likely point is that of likelihood and prior together.
-    starts, factor, seed : int, float, int
-        The first search begins at the setup's own values, the others off by random factors of up to ``factor`` either way.
-    threads : int
+    objective : Objective
+        Likelihood of the innovations (:func:`likelihood`), of the errors, or another of this package.
+    priors : mapping of str to Prior, optional
+        Prior knowledge by parameter; the result is then the maximum of the posterior density.
+    starts : int, default 4
+        Searches: the first from the setup's own values, the others from random starts.
+    factor : float, default 30
+        Random starts differ from the setup's values by factors of up to this, either way.
+    seed : int, default 0
+        Of the random starts.
+    threads : int, default 1
         Searches at once.
-    intervals : bool
-        Whether to follow the profile likelihood where a parameter is not well known.
+    intervals : bool, default True
+        Follow the profile likelihood where a parameter is not well determined.
     progress : callable, optional
         Called with the number of searches just finished, and again for each parameter's interval.
+
+    Returns
+    -------
+    Tuning
+
+    Raises
+    ------
+    InputError
+        If a prior names no free parameter, ``factor`` is not above 1, or the search does not converge.
+
+    References
+    ----------
+    F. C. Schweppe, Evaluation of likelihood functions for Gaussian signals, IEEE Trans. Information Theory 11(1), 1965.
+    H. White, Maximum likelihood estimation of misspecified models, Econometrica 50(1), 1982 (intervals where the model does not hold).
     """
     known = dict(priors or {})
     known_keys("priors", known, objective.names)
@@ -380,7 +403,7 @@ def _curved(objective: Objective, best: Optimum) -> Local:
 
 
 def rescaled(tuning: Tuning, factor: float) -> Tuning:
-    """Return a tuning with all that its filter believes scaled alike: what the size of the attitude error leaves open.
+    """Return a tuning with every σ of its filter scaled alike, which the size of the attitude error does not determine.
 
     ``factor`` is that of ``filter.scale``, tuned by the innovations of the filter that has the smallest errors.
     """

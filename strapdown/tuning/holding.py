@@ -24,15 +24,24 @@ LEAST_ERRORS = 100
 
 
 def split(cases: Sequence[Case], share: float, by: By = "time") -> tuple[tuple[Case, ...], tuple[Case, ...]]:
-    """Return what is tuned on, and what is held out.
+    """Divide cases into what is tuned on and what is held out.
 
     Parameters
     ----------
     cases : sequence of Case
     share : float
-        Of the data, to be held out: between 0 and 1.
-    by : "time" or "record"
-        The end of every record, which the filter reaches through its beginning; or whole records, the last ones.
+        Share of the data held out, between 0 and 1.
+    by : {"time", "record"}
+        Hold out the end of every record, which the filter reaches through its beginning; or whole records, the last ones.
+
+    Returns
+    -------
+    tuned, held : tuple of Case
+
+    Raises
+    ------
+    InputError
+        If ``share`` is not between 0 and 1, or there are too few records to hold one out.
     """
     if not 0.0 < share < 1.0:
         raise InputError(f"holdout is {share:g}; it must lie between 0 and 1")
@@ -68,7 +77,7 @@ class NeesCourse:
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """Two-sided 99 % bounds of a right filter in each span."""
+        """Two-sided 99 % bounds of a consistent filter in each span."""
         return mean_bounds(3, max(self.effective, 1.0), 0.99)
 
 
@@ -79,7 +88,7 @@ class Performance:
     log_likelihood: float
     """Of all its innovations, in nats an innovation; what a gate refused is left out."""
     nis: float
-    """Mean NIS per degree of freedom; 1 for a right filter."""
+    """Mean NIS per degree of freedom; 1 for a consistent filter."""
     nis_bounds: tuple[float, float]
     """Two-sided 99 % bounds of it."""
     anees: float
@@ -114,7 +123,27 @@ class Comparison:
 def compare(
     cases: Sequence[Case], before: FilterSetup, after: FilterSetup, *, threads: int = 1, bins: int = 40
 ) -> Comparison:
-    """Return how both filters do on held-out data; the initial attitude and bias are the cases', their σ the setups'."""
+    """Return the performance of two filters on held-out data.
+
+    Parameters
+    ----------
+    cases : sequence of Case
+        With the initial attitudes and biases; their σ are those of each setup.
+    before, after : FilterSetup
+    threads : int, default 1
+        Cases filtered at once.
+    bins : int, default 40
+        Spans of time of the averaged NIS and NEES.
+
+    Returns
+    -------
+    Comparison
+
+    Raises
+    ------
+    InputError
+        If a setup has a σ for a sensor that a record does not have.
+    """
     with ThreadPoolExecutor(threads) as pool:
         results = list(pool.map(lambda chosen: performance(cases, chosen, bins=bins), (before, after)))
     return Comparison(before=results[0], after=results[1])

@@ -1,7 +1,7 @@
 """The likelihood of filter parameters from the filter's own innovations, with its score and information.
 
 The filter turns a record into independent innovations e with variances s, so its likelihood is ``Π N(e; 0, s)`` (prediction-error
-decomposition; Schweppe 1965, Harvey 1989 section 3.4). Parameters are told by the logarithms of their values.
+decomposition; Schweppe 1965, Harvey 1989 section 3.4). Parameters are the logarithms of their values.
 """
 
 from __future__ import annotations
@@ -310,22 +310,33 @@ def likelihood(
     parts: int = 20,
     threads: int = 1,
 ) -> Likelihood:
-    """Return the likelihood of the free parameters on these records.
+    """Return the likelihood of the free parameters, by the innovations of the filter on some records.
 
     Parameters
     ----------
     cases : sequence of Case
     chosen : FilterSetup
-        Where the free parameters start, and what the fixed ones are; gates and robust weights of it are not applied.
+        Starting values of the free parameters, and values of the fixed ones; its gate and robust weights are not applied.
     free : sequence of str
-        Names of :mod:`strapdown.tuning.parameters`.
-    spacing : float
-        Measurements of a sensor nearer to each other than this, s, are left out, and those kept weigh as much as all: what disturbs them
-        may last, and only innovations that are white have this likelihood (:func:`thinned`).
-    parts : int
+        Names of parameters: ``"gyro.arw"``, ``"gyro.rrw"``, ``"SENSOR.sigma"``, ``"initial.attitude"``, ``"initial.bias"``, or
+        ``"filter.scale"`` alone.
+    spacing : float, default 0
+        Least time between the measurements of a sensor that are used, s; those kept have the weight of all. For disturbances that last:
+        only white innovations have this likelihood.
+    parts : int, default 20
         Spans of time of each record whose gradients are kept apart.
-    threads : int
-        Records, or points, that are worked on at once.
+    threads : int, default 1
+        Records, or points, evaluated at once.
+
+    Returns
+    -------
+    Likelihood
+        For :func:`fit`.
+
+    Raises
+    ------
+    InputError
+        If there is no record, a name is unknown or comes twice, or a parameter starts from zero.
     """
     setup.need_mekf(chosen, "tuning by name")
     if not cases:

@@ -164,7 +164,7 @@ class TunedGate:
     """The gate that suits the outliers of the records."""
 
     gate: Gate | None
-    """None where the records show no outliers, or so many that they are none: then there is nothing to refuse."""
+    """None where the records show no outliers, or so many that they are noise: then there is nothing to refuse."""
     probability: float
     """That a right measurement passes; NaN where there is no gate, and so its interval."""
     lower: float

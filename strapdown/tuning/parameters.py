@@ -1,6 +1,6 @@
 """What may be tuned: names of parameters, their values in a filter setup, and setups with other values.
 
-The gyro's two noises are shared by its axes, as the filter believes one σ_v and one σ_u: only isotropic noise is the same seen from a body
+The gyro's two noises are shared by its axes, as the filter has one σ_v and one σ_u: only isotropic noise is the same seen from a body
 that turns within a step, and has the closed form of :func:`strapdown.kernels.filter_step.process_noise`.
 
 ``SENSOR.sigma`` is one factor on the σ of all axes, as their root mean square; their ratios are the setup's or the record's.
@@ -31,7 +31,7 @@ INITIAL_ATTITUDE = "initial.attitude"
 INITIAL_BIAS = "initial.bias"
 """Standard deviation of the initial bias error, rad/s."""
 SCALE = "filter.scale"
-"""A factor on every σ that the filter believes, gyro, sensors and initial state alike; to be tuned alone. It leaves the estimates as they
+"""A factor on every σ of the filter, gyro, sensors and initial state alike; to be tuned alone. It leaves the estimates as they
 are and sets their covariance."""
 OUTLIER_SHARE = "outliers.share"
 """Share of the measurements that are outliers (:mod:`strapdown.tuning.outliers`)."""
@@ -50,7 +50,7 @@ OWN = (ARW, RRW, INITIAL_ATTITUDE, INITIAL_BIAS, SCALE)
 
 @dataclass(frozen=True, kw_only=True)
 class Unit:
-    """A unit that a parameter is told in: multiply by ``factor`` to have SI."""
+    """Unit of a parameter in print: multiply by ``factor`` for SI."""
 
     name: str
     factor: float
@@ -90,7 +90,7 @@ def axis_names(records: Sequence[ImuRecord]) -> tuple[str, ...]:
 
 
 def default_names(records: Sequence[ImuRecord]) -> tuple[str, ...]:
-    """Return what is tuned if nobody says: the gyro's two noises and the σ of every sensor."""
+    """Return what is tuned by default: the gyro's two noises and the σ of every sensor."""
     return tuple(name for name in known_names(records) if not name.startswith("initial.") and name != SCALE)
 
 
@@ -142,14 +142,14 @@ def fixed_unit(name: str) -> Unit:
 
 
 def own_sigma(name: str, records: Sequence[ImuRecord]) -> float:
-    """Return the root mean square of the σ that the records tell of a sensor, over all of its measurements."""
+    """Return the root mean square of a sensor's σ in the records, over all of its measurements."""
     sensor = name.removesuffix(SIGMA)
     squares = [np.square(series.sigma) for record in records for series in record.vectors if series.sensor == sensor]
     return float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else 0.0
 
 
 def own_axes(sensor: str, records: Sequence[ImuRecord]) -> Array:
-    """Return the root mean square of the σ that the records tell of each body axis of a sensor (3,), over all of its measurements."""
+    """Return the root mean square of a sensor's σ in the records about each body axis (3,), over all of its measurements."""
     squares = []
     for series in (one for record in records for one in record.vectors if one.sensor == sensor):
         if series.sigma_axes is not None:
@@ -288,9 +288,21 @@ class Prior:
 
 
 def priors_from_gyro(spec: GyroSpec, record: ImuRecord, *, factor: float = 3.0) -> dict[str, Prior]:
-    """Return priors of the gyro's two noises from a specification: a datasheet's, or what an Allan deviation found.
+    """Return priors of the gyro's two noise parameters from a specification: of a datasheet, or of an Allan deviation.
 
-    Flicker is matched as :func:`strapdown.setup.matched_to_record` does; a noise that the specification does not have gets no prior.
+    Flicker noise is matched as by :func:`strapdown.setup.matched_to_record`; a noise that the specification does not have gets no prior.
+
+    Parameters
+    ----------
+    spec : GyroSpec
+    record : ImuRecord
+        For the rate and quality of its measurements.
+    factor : float, default 3
+        One standard deviation of a prior is a factor of this.
+
+    Returns
+    -------
+    dict of str to Prior
     """
     noise = setup.matched_to_record(spec, record).process_noise if _flickers(spec) else None
     found = gyro.process_noise(spec) if noise is None else vars(noise)

@@ -1,4 +1,4 @@
-"""How well a record of some length will tell each parameter, before it is made: the Cramér–Rao bound from simulated records."""
+"""How well a record of some length will determine each parameter, before it is made: the Cramér–Rao bound from simulated records."""
 
 from __future__ import annotations
 
@@ -48,24 +48,35 @@ def plan(
     threads: int = 1,
     progress: Callable[[int], None] | None = None,
 ) -> Plan:
-    """Return the Cramér–Rao bound of log parameters, for records of the given lengths.
+    """Return the Cramér–Rao bound of the logarithms of parameters, for records of given lengths.
 
-    Fisher's information is the mean of that of the sensitivities over ``records`` simulated ones, in which the setup is right.
+    Fisher's information is the mean of that of the sensitivities over ``records`` simulated records for which the setup is exact.
 
     Parameters
     ----------
     scenario : Scenario or ImuRecord
-        A scenario is simulated with its own gyro and sensors; of a record the motion is taken, and sensors that see it at the times of
-        the record's, with the setup's noise (:func:`simulated_again`).
+        A scenario is simulated with its own gyro and sensors; of a record the motion is used, with the setup's noise at the times of its
+        measurements (``simulated_again``).
     chosen : FilterSetup
-        What is assumed true.
+        Taken as true.
     free : sequence of str
-        Names of :mod:`strapdown.tuning.parameters`.
+        Names of parameters, as of :func:`likelihood`.
     lengths : sequence of float
-        Of a record, s.
-    records, seed, threads : int
+        Lengths of a record, s.
+    records : int, default 4
+    seed : int, default 0
+    threads : int, default 1
     progress : callable, optional
-        Called with the number of records just done.
+        Called with the number of records just finished.
+
+    Returns
+    -------
+    Plan
+
+    Raises
+    ------
+    InputError
+        If a length is not above zero, or a name is unknown.
     """
     wanted = np.sort(np.asarray(lengths, float))
     if len(wanted) == 0 or not wanted[0] > 0.0:

@@ -23,9 +23,25 @@ def recording_setup(parameters: AhrsParameters | None = None) -> FilterSetup:
 
 
 def recording_case(recording: Recording, parameters: AhrsParameters | None = None) -> Case:
-    """Return a recording as :func:`strapdown.ahrs.estimate` filters it: from its first quiet second on, the reference beside it.
+    """Return a recording as :func:`strapdown.ahrs.estimate` filters it: from its first quiet second on, with its reference.
 
-    By ``ahrs.MOTIONS["any"]`` if not told, and without what is made good of the delays between sensors.
+    Delays between sensors are not compensated.
+
+    Parameters
+    ----------
+    recording : Recording
+        With an accelerometer.
+    parameters : AhrsParameters, optional
+        Default ``ahrs.MOTIONS["any"]``.
+
+    Returns
+    -------
+    Case
+
+    Raises
+    ------
+    InputError
+        If there is no accelerometer, or the recording is too short.
     """
     if recording.specific_force is None:
         raise InputError(f"{recording.source} has no accelerometer, which shows the vertical; add columns ax, ay, az")
@@ -42,10 +58,28 @@ def recording_case(recording: Recording, parameters: AhrsParameters | None = Non
 
 
 def record_case(record: ImuRecord, chosen: FilterSetup, *, name: str = "", seed: int | None = None) -> Case:
-    """Return a record with where the filter starts on it: from its first measurements, or off its truth by errors drawn with ``seed``.
+    """Return a record with the filter's initial state on it.
 
-    Without a seed the attitude is that of the first measurements (:func:`strapdown.estimation.first_state`), and the bias zero; a setup
-    whose initial σ are large against the measurements forgets both at once.
+    Parameters
+    ----------
+    record : ImuRecord
+    chosen : FilterSetup
+        Its σ of the initial errors.
+    name : str, optional
+        What errors and reports call the record.
+    seed : int, optional
+        Start at the truth with errors drawn from the setup's σ. Default: the attitude of the first measurements
+        (:func:`strapdown.estimation.first_state`) and zero bias; where the initial σ are large against the measurements both are soon
+        forgotten.
+
+    Returns
+    -------
+    Case
+
+    Raises
+    ------
+    InputError
+        If the first measurements do not give the attitude.
     """
     if seed is not None and record.truth is not None:
         draw = generator(seed, 0, "initial error").standard_normal(6)

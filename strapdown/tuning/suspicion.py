@@ -7,7 +7,7 @@ which is Rao's score test (1948): at the tuned walk, and at smaller ones beside 
 Its gain is twice the log-likelihood over the tuned filter's, χ² of three degrees of freedom where θ is zero.
 
 The rate that θ multiplies is the gyro's own less its bias and its noise (:func:`strapdown.diagnosis.turning.turns`), which must not
-explain itself. A prior of ``PLAUSIBLE`` keeps out what rates too small to tell would say.
+explain itself. A prior of ``PLAUSIBLE`` bounds it where the rates are too small to show it.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ LEVELS = (1.0, 0.2, 0.04)
 STEP = 1e-4
 """Of a scale factor, for differences."""
 MOST_TOLD = 2
-"""Failed tests that are told by themselves."""
+"""Largest number of failed tests that are reported one by one."""
 SHAPES = ("whiteness", "normality", "mean innovation", "cross-correlation")
 """Tests of innovations that no tuning of σ makes pass."""
 
@@ -49,7 +49,7 @@ class ScaleFactor:
     """A gyro's scale factor as an explanation of what the tuned filter puts down to noise."""
 
     value: Array
-    """θ of each axis (3,): the gyro tells 1 + θ of the rate."""
+    """θ of each axis (3,): the gyro measures 1 + θ of the rate."""
     standard_error: Array
     """(3,)"""
     gain: float
@@ -143,7 +143,7 @@ def unmodelled(case: Case, chosen: FilterSetup, *, probability: float = 0.99) ->
     chosen : FilterSetup
         The tuned filter.
     probability : float
-        Of the judgement, and of the scale factor: a right filter is suspected by either with at most one less this.
+        Of the judgement, and of the scale factor: a consistent filter fails either with at most 1 − this.
 
     Notes
     -----
@@ -191,7 +191,7 @@ def accepted(record: ImuRecord, estimate: Estimate) -> ImuRecord:
 def scale_factor(record: ImuRecord, noise: ProcessNoise, initial: estimation.State) -> ScaleFactor:
     """Return the scale factor of the gyro that explains most beside a filter of this noise, or of less walk of the bias.
 
-    ``record`` as the filter takes it (:func:`strapdown.setup.believed`).
+    ``record`` as the filter processes it (:func:`strapdown.setup.believed`).
     """
     rate_angle = turns(record, noise, initial)
     levels = LEVELS if noise.rate_random_walk > 0.0 else LEVELS[:1]

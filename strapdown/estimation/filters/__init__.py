@@ -87,7 +87,7 @@ def run(
     every: int = 1,
     full_covariance: bool = False,
 ) -> Estimate:
-    """Run one filter  over a whole record.
+    """Run one filter over a whole record.
 
     Parameters
     ----------
@@ -98,15 +98,19 @@ def run(
     process_noise : ProcessNoise
     initial : State
         State at the first edge, body side.
-    every : int
-        Keep the state at every ``every``-th edge, the first included.
-    full_covariance : bool
-        Keep whole covariance matrices too.
+    every : int, default 1
+        Store every n-th edge, the first included.
+    full_covariance : bool, default False
+        Store whole covariance matrices too.
+
+    Returns
+    -------
+    Estimate
 
     Raises
     ------
     InputError
-        If the name is not known, or an argument is not what it should be.
+        If the name is unknown, or an argument is out of range.
     """
     one_of("filter", name, FILTERS)
     return FILTERS[name](record, process_noise, initial, every=every, full_covariance=full_covariance)
@@ -121,18 +125,30 @@ def compare(
     every: int = 1,
     full_covariance: bool = False,
 ) -> Comparison:
-    """Run several filters  over one record; printed, the result is a table.
+    """Run several filters over one record.
 
-    One record tells how filters differ on it, not which of them may be believed: for that :func:`strapdown.consistency.judge` an estimate,
-    or look at many runs (``sims/filter_family.py``).
+    One record shows how filters differ on it, not which are consistent: for that use :func:`strapdown.consistency.judge` on each estimate,
+    or many runs (``sims/filter_family.py``).
 
     Parameters
     ----------
-    record, process_noise, initial, every, full_covariance
-        As :func:`run`. Of a record with truth the errors are told, of others the differences from the first filter.
-    filters : iterable of str or filter
-        Names of :data:`FILTERS`, and filters of one's own (:mod:`strapdown.estimation.filters.own`). Default: all of this package. The
-        unscented filter takes some tenths of a millisecond a step, the others a microsecond.
+    record : ImuRecord
+        With its truth, errors are compared; without it, the differences from the first filter.
+    process_noise, initial, every, full_covariance
+        As of :func:`run`.
+    filters : iterable of str or filter, default all of :data:`FILTERS`
+        Names, and filters of one's own (:mod:`strapdown.estimation.filters.own`). The unscented filter needs some tenths of a
+        millisecond a step, the others a microsecond.
+
+    Returns
+    -------
+    Comparison
+        Prints as a table.
+
+    Raises
+    ------
+    InputError
+        If a name is unknown, or ``filters`` is empty.
     """
     chosen = [
         one if isinstance(one, str) else as_own(one) for one in ([filters] if isinstance(filters, str) else filters)

@@ -27,10 +27,10 @@ class Comparison:
     """At the times of the estimates."""
 
     def summary(self) -> dict[str, dict[str, float]]:
-        """Return the numbers of each filter by name, in SI; what the record does not tell is NaN.
+        """Return the numbers of each filter by name, in SI; what the record does not show is NaN.
 
         ``attitude_error`` and ``bias_error`` are against the truth, or without one the differences from the first filter;
-        ``attitude_sigma`` and ``bias_sigma`` what the filter says of itself; ``nis`` is the mean normalised innovation squared over the
+        ``attitude_sigma`` and ``bias_sigma`` the filter's own σ; ``nis`` is the mean normalised innovation squared over the
         degrees of freedom, of which there are ``degrees``: 1 for a right filter, give or take √(2/degrees).
         """
         first = next(iter(self.estimates.values()))
@@ -51,7 +51,7 @@ class Comparison:
         return result
 
     def __str__(self) -> str:
-        """Return the table: errors beside what the filter says of itself, which should agree."""
+        """Return the table: errors beside the filter's own σ, which should agree."""
         against = "error" if self.truth is not None else f"from {next(iter(self.estimates))}"
         lines = [
             f"{'filter':16s} {'attitude, °: ' + against:>25s} {'σ':>9s} {'bias, °/h: ' + against:>25s} {'σ':>9s} {'NIS':>9s}"

@@ -4,8 +4,8 @@ The attitude error of each sigma point is three generalised Rodrigues parameters
 ``q_true = q ⊗ δq(p)``, scaled so that p is the rotation vector for small errors. Two points are not the paper's: the process noise is the
 exact one of :mod:`strapdown.estimation`, added after the propagation, where the paper adds half of a trapezoid before and half after; and a
 direction enters with all three components (Shuster's trick: along the direction goes the mean of the two variances across it), its
-innovation told as its two degrees of freedom. A measured attitude enters as its own three parameters about the central quaternion, linear
-in the state: no spread of the points, however wide, cuts it at half a turn.
+innovation reported as its two degrees of freedom. A measured attitude enters as its own three parameters about the central quaternion,
+linear in the state: no spread of the points, however wide, cuts it at half a turn.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ def in_steps(record: ImuRecord, events: Schedule, every: int) -> Steps:
     interval[at_edge] = np.maximum(np.arange(len(edges)) - 1, 0)
     dt = np.diff(time, prepend=edges[0])
     increment = record.increments[interval] * (dt / np.diff(edges)[interval])[:, None]
-    # Parts of a large turn end in steps that neither take in nor keep anything; the last part does.
+    # Parts of a large turn end in steps without measurement or stored row; the last part has both.
     parts = (np.linalg.norm(increment, axis=1) / LARGEST_ANGLE).astype(np.int64) + 1
     whole = np.repeat(np.arange(len(dt)), parts)
     last = np.append(whole[1:] != whole[:-1], True)
