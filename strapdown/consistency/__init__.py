@@ -12,6 +12,8 @@
     Averages over the time of one run, whose errors are correlated: the effective sample size.
 ``accuracy``
     How large errors are: against a reference, against the Cramér–Rao bound, when they have settled, how they are distributed.
+``foreign``
+    The verdict on an estimate from elsewhere: clocks, frames and the reading of its covariance.
 ``judgement``, ``runs``
     The verdict in words, with its evidence, at one stated probability of a false alarm: on one run, and on independent ones.
 """
@@ -36,6 +38,7 @@ from strapdown.consistency.bounds import (
     mean_p_value,
 )
 from strapdown.consistency.ensemble import Credibility, credibility
+from strapdown.consistency.foreign import Checked, check_arrays
 from strapdown.consistency.judgement import Finding, Judgement, concluded, judge
 from strapdown.consistency.manifold import SUBSETS, errors, fixed_frame, nees, whitened
 from strapdown.consistency.runs import judge_runs
@@ -54,6 +57,7 @@ from strapdown.consistency.whiteness import (
 __all__ = [
     "SUBSETS",
     "Autocorrelation",
+    "Checked",
     "Coverage",
     "Credibility",
     "Distribution",
@@ -66,6 +70,7 @@ __all__ = [
     "Verdict",
     "anderson_darling",
     "autocorrelation",
+    "check_arrays",
     "concluded",
     "convergence_time",
     "coverage",
