@@ -27,7 +27,7 @@ from strapdown.motion import Harmonic, HarmonicRates
 from strapdown.outputs import euler, euler_axes, to_ned
 from strapdown.recordings import attitudes, ulog
 from strapdown.recordings.attitudes import read_attitudes
-from strapdown.records import Truth, write_estimate
+from strapdown.records import Truth, read_estimate, read_truth, write_estimate
 from strapdown.units import DEGREE, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
 
 FLIGHT = scenarios.Scenario(
@@ -178,6 +178,22 @@ def test_what_was_judged_can_be_reported(files, run, monkeypatch, capsys):
     assert command(monkeypatch, capsys, "check", out)[0] == 0
     report.write(out, files / "aligned.html")
     assert "consistent" in (files / "aligned.html").read_text(encoding="utf-8")
+
+
+def test_an_estimate_without_a_bias_is_kept_and_reported(files, run, tmp_path):
+    e = run.estimate
+    found = checked(run, covariance=e.covariance[:, :3, :3], bias=None, innovations={})
+    out = tmp_path / "attitude.h5"
+    write_estimate(out, found.estimate, truth=found.truth)
+    read = read_estimate(out)
+    assert not read.has_bias
+    np.testing.assert_array_equal(read.covariance[:, :3, :3], e.covariance[:, :3, :3])
+    assert statistics(consistency.judge(read, read_truth(out))) == statistics(found.judgement)
+    assert {one.of for one in found.judgement.findings} == {"attitude"}
+    report.write(out, tmp_path / "attitude.html")
+    page = (tmp_path / "attitude.html").read_text(encoding="utf-8")
+    assert "gyro bias" not in page
+    assert all("NaN" not in one.read_text() for one in tmp_path.glob("*.json"))
 
 
 # ------------------------------------------------------------------------------------------------------- faults, named

@@ -165,7 +165,7 @@ def check_arrays(
     true_time, true_attitude : array_like (n,), (n, 4)
         The truth, of a clock and frames of its own.
     bias, true_bias : array_like (m, 3), (n, 3), optional
-        Gyro bias, rad/s, body axes.
+        Gyro bias, rad/s, body axes; judged where both are given.
     innovations : mapping, optional
         :class:`strapdown.records.Innovations` by sensor.
     error_frame : {"find", "body", "fixed", "euler"}
@@ -200,6 +200,8 @@ def check_arrays(
     if P is not None and P.shape not in ((len(stamps), 3, 3), (len(stamps), 6, 6)):
         raise InputError(f"covariance has shape {P.shape}, wanted ({len(stamps)}, 3, 3) or ({len(stamps)}, 6, 6)")
     remarks: list[str] = []
+    if P is not None and (bias is None or true_bias is None):
+        bias, P = None, P[:, :3, :3]
     own = _Series(stamps, q, P, None if bias is None else array("bias", bias, (len(stamps), 3)))
     told = _Series(
         true_stamps,
