@@ -559,6 +559,7 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
     with _estimate_file(path) as file:
         time = increasing(_place(file, "time"), _numbers(file, "time", ("n",)))
         rows = len(time)
+        attitude = _attitudes(file, "attitude", rows)
         size = 6 if "bias" in file else 3  # an estimate from elsewhere may have none
         covariance = _numbers(file, "covariance", (rows, size, size)) if "covariance" in file else None
         if covariance is not None:
@@ -568,7 +569,7 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
         sensors = {told["sensor"]: (told, part) for told, part in _parts(file, "innovations")}
         return Estimate(
             time=time,
-            attitude=_attitudes(file, "attitude", rows),
+            attitude=attitude,
             bias=_biases(file, "bias", rows) if size == 6 else np.full((rows, 3), np.nan),
             variance=np.pad(variance, ((0, 0), (0, 6 - size)), constant_values=np.nan),
             covariance=covariance,

@@ -1,9 +1,11 @@
 """Estimates of other filters against a truth: clocks, frames and the reading of their covariance found, faults named."""
 
+import importlib.util
 import json
 import struct
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,6 +31,8 @@ from strapdown.recordings import attitudes, ulog
 from strapdown.recordings.attitudes import read_attitudes
 from strapdown.records import Truth, read_estimate, read_truth, write_estimate
 from strapdown.units import DEGREE, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
+
+SIMS = Path(__file__).resolve().parents[1] / "sims"
 
 FLIGHT = scenarios.Scenario(
     motion=HarmonicRates(
@@ -505,3 +509,17 @@ def test_the_command_refuses(files, monkeypatch, capsys):
 def test_times_without_anything_in_common_are_refused(run):
     with pytest.raises(InputError, match="no two times in common"):
         checked(run, time=run.estimate.time + 1e4, align="none")
+
+
+@pytest.mark.slow
+def test_a_peer_is_right_with_its_noises_told_and_found_out_where_they_are_not():
+    """smsfusion's aided INS over 40 runs; its error is on the body side, as its source says."""
+    pytest.importorskip("smsfusion")
+    spec = importlib.util.spec_from_file_location("peer_judged", SIMS / "peer_judged.py")
+    sim = sys.modules["peer_judged"] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(sim)
+    found = sim.main(runs=40, duration=40.0)
+    assert found.verdicts["as told"].startswith("consistent")
+    assert found.verdicts["datasheet"].startswith("not consistent: the filter is too sure")
+    assert found.verdicts["read as fixed"].startswith("not consistent")
+    assert found.frame_probability["body"] > 0.99

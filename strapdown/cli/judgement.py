@@ -139,10 +139,10 @@ def check(
 
 
 def _is_own(path: Path) -> bool:
-    """Return whether a file is a result of this package; one that is missing is, so that it is told of as such."""
+    """Return whether a file is, or should be by its name, a result of this package; one that is missing is told of as such."""
     from strapdown import reading
 
-    return not path.exists() or (path.is_file() and reading.is_hdf5(path))
+    return not path.exists() or path.suffix.lower() in (".h5", ".hdf5") or (path.is_file() and reading.is_hdf5(path))
 
 
 class _Reading(NamedTuple):
