@@ -112,23 +112,36 @@ def euler(attitude: ArrayLike, sequence: str = "ZYX", covariance: ArrayLike | No
         return Angles(angles, None)
     P = array("covariance", covariance, (len(q), 3, 3))
     intrinsic = sequence == sequence.upper()
-    order = [0, 1, 2] if intrinsic else [2, 1, 0]  # turns about fixed axes are those about body axes, the last first
-    directions = np.eye(3)[["XYZ".index(axes[k]) for k in order]]
-    half = 0.5 * angles[:, order]
-    turns = [
-        np.concatenate([np.cos(half[:, k : k + 1]), np.sin(half[:, k : k + 1]) * directions[k]], axis=1)
-        for k in range(3)
-    ]
-    E = np.empty((len(q), 3, 3))
-    E[:, :, 2] = directions[2]
-    E[:, :, 1] = quaternion.rotate(quaternion.conjugate(turns[2]), directions[1])
-    E[:, :, 0] = quaternion.rotate(quaternion.conjugate(quaternion.multiply(turns[1], turns[2])), directions[0])
+    E = _turn_axes(angles, sequence)
     regular = np.abs(np.linalg.det(E)) > 1e-9
     variance = np.full((len(q), 3), np.inf)
     inverse = np.linalg.inv(E[regular])
     variance[regular] = np.einsum("nij,njk,nik->ni", inverse, P[regular], inverse)
     sigma = np.sqrt(variance)
     return Angles(angles, sigma if intrinsic else sigma[:, ::-1])
+
+
+def euler_axes(attitude: ArrayLike, sequence: str = "ZYX") -> Array:
+    """Return E (n, 3, 3) of ``δθ = E δφ``: its columns are the axes of the three turns of an intrinsic sequence, in the body frame."""
+    return _turn_axes(euler(attitude, sequence).angles, sequence)
+
+
+def _turn_axes(angles: Array, sequence: str) -> Array:
+    axes = [*sequence.upper()]
+    order = (
+        [0, 1, 2] if sequence == sequence.upper() else [2, 1, 0]
+    )  # turns about fixed axes are those about body axes, the last first
+    directions = np.eye(3)[["XYZ".index(axes[k]) for k in order]]
+    half = 0.5 * angles[:, order]
+    turns = [
+        np.concatenate([np.cos(half[:, k : k + 1]), np.sin(half[:, k : k + 1]) * directions[k]], axis=1)
+        for k in range(3)
+    ]
+    E = np.empty((len(angles), 3, 3))
+    E[:, :, 2] = directions[2]
+    E[:, :, 1] = quaternion.rotate(quaternion.conjugate(turns[2]), directions[1])
+    E[:, :, 0] = quaternion.rotate(quaternion.conjugate(quaternion.multiply(turns[1], turns[2])), directions[0])
+    return E
 
 
 def heading(attitude: ArrayLike, covariance: ArrayLike | None = None, *, axis: str = "x") -> Angles:
@@ -269,7 +282,8 @@ def table(
     dict of str to ndarray (m,)
         ``time_s`` (or ``time_ns`` of a clock that counts from 1970), ``qw qx qy qz``, the angles and their σ in degrees,
         ``heading_deg`` of the body x axis from North towards East, bias and σ in °/h, ``rate_*_rad_per_s``,
-        ``free_acceleration_*_m_per_s2``.
+        ``free_acceleration_*_m_per_s2``. Where whole covariances were kept, ``cov_body_xx_rad2`` … of the body-side error,
+        ``b`` before an axis for the bias.
 
     Raises
     ------
@@ -293,6 +307,11 @@ def table(
     for k, axis in enumerate("xyz"):
         found[f"bias_{axis}_deg_per_h"] = estimate.bias[:, k] / DEGREE_PER_HOUR
         found[f"bias_{axis}_sigma_deg_per_h"] = sigma[:, 3 + k] / DEGREE_PER_HOUR
+    if estimate.covariance is not None:
+        size = 6 if np.isfinite(estimate.covariance[:, 3:, 3:]).any() else 3
+        for i, j in itertools.combinations_with_replacement(range(size), 2):
+            unit = ("rad2", "rad2_per_s", "rad2_per_s2")[(i > 2) + (j > 2)]
+            found[f"cov_body_{_STATES[i]}{_STATES[j]}_{unit}"] = estimate.covariance[:, i, j]
     if recording is not None:
         rows = rows_of(estimate, recording)
         rate = recording.rate[rows] - estimate.bias
@@ -302,6 +321,9 @@ def table(
             free = free if frame == "ENU" else free[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
             found |= {f"free_acceleration_{axis}_m_per_s2": free[:, k] for k, axis in enumerate("xyz")}
     return found
+
+
+_STATES = ("x", "y", "z", "bx", "by", "bz")
 
 
 def _angle_names(sequence: str) -> list[str]:

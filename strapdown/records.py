@@ -679,13 +679,17 @@ def write_estimate(
             f"truth has {len(truth.attitude)} rows and the estimate {len(estimate.time)}; take the truth at the estimate's times"
         )
     with result_file(path, "estimate", attributes) as file:
+        size = 6 if estimate.has_bias else 3
         for name, unit in _ESTIMATE_UNITS.items():
             value = getattr(estimate, name)
-            if value is not None:
+            if name in ("variance", "covariance") and value is not None:
+                value = value[:, :size] if name == "variance" else value[:, :size, :size]
+            if value is not None and (name != "bias" or estimate.has_bias):
                 put(file, name, value, unit)
         if truth is not None:
             put(file, "truth/attitude", truth.attitude, "1")
-            put(file, "truth/bias", truth.bias, "rad/s")
+            if np.isfinite(truth.bias).all():
+                put(file, "truth/bias", truth.bias, "rad/s")
         for number, (sensor, innovations) in enumerate(estimate.innovations.items()):
             group = file.create_group(f"innovations/{number}")
             # The sensor is not the group's name: a slash in it would part groups.
@@ -790,7 +794,8 @@ def read_truth(path: str | os.PathLike[str]) -> Truth | None:
         if "truth" not in file:
             return None
         rows = len(_numbers(file, "time", ("n",)))
-        return Truth(attitude=_attitudes(file, "truth/attitude", rows), bias=_biases(file, "truth/bias", rows))
+        bias = _biases(file, "truth/bias", rows) if "truth/bias" in file else np.full((rows, 3), np.nan)
+        return Truth(attitude=_attitudes(file, "truth/attitude", rows), bias=bias)
 
 
 def read_estimate(path: str | os.PathLike[str]) -> Estimate:
@@ -815,15 +820,19 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
     with _estimate_file(path) as file:
         time = increasing(_place(file, "time"), _numbers(file, "time", ("n",)))
         rows = len(time)
-        covariance = _numbers(file, "covariance", (rows, 6, 6)) if "covariance" in file else None
+        attitude = _attitudes(file, "attitude", rows)
+        size = 6 if "bias" in file else 3  # an estimate from elsewhere may have none
+        covariance = _numbers(file, "covariance", (rows, size, size)) if "covariance" in file else None
         if covariance is not None:
             _above_zero(f"{_place(file, 'covariance')}, diagonal", np.diagonal(covariance, axis1=1, axis2=2))
+            covariance = np.pad(covariance, ((0, 0), (0, 6 - size), (0, 6 - size)), constant_values=np.nan)
+        variance = _above_zero(_place(file, "variance"), _numbers(file, "variance", (rows, size)))
         sensors = {told["sensor"]: (told, part) for told, part in _parts(file, "innovations")}
         return Estimate(
             time=time,
-            attitude=_attitudes(file, "attitude", rows),
-            bias=_biases(file, "bias", rows),
-            variance=_above_zero(_place(file, "variance"), _numbers(file, "variance", (rows, 6))),
+            attitude=attitude,
+            bias=_biases(file, "bias", rows) if size == 6 else np.full((rows, 3), np.nan),
+            variance=np.pad(variance, ((0, 0), (0, 6 - size)), constant_values=np.nan),
             covariance=covariance,
             innovations={sensor: _innovations(part) for sensor, (_, part) in sensors.items()},
             skipped={sensor: count("skipped", told["skipped"], least=0) for sensor, (told, _) in sensors.items()},

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, NoReturn
 
 import typer
 from rich.text import Text
@@ -25,6 +25,7 @@ from strapdown.cli.terminal import app, console, counted, show, table, writable,
 
 if TYPE_CHECKING:
     from strapdown.consistency import Judgement
+    from strapdown.consistency.foreign import Checked
     from strapdown.diagnosis import Diagnosis
     from strapdown.records import Estimate, ImuRecord
     from strapdown.setup import FilterSetup
@@ -36,7 +37,11 @@ CONSISTENT, NOT, CANNOT_TELL = 0, 1, 2
 @app.command()
 def check(
     result: Annotated[
-        Path, typer.Argument(help="estimate.h5 of `strapdown estimate`, or the HDF5 file of `strapdown montecarlo`.")
+        Path,
+        typer.Argument(
+            help="estimate.h5 of `strapdown estimate`, the HDF5 file of `strapdown montecarlo`, or with --truth an estimate of "
+            "any filter: CSV, TUM, ROS bag, ULog."
+        ),
     ],
     probability: Annotated[
         float, typer.Option(help="A right filter is not called wrong with at least this, all tests together.")
@@ -52,10 +57,36 @@ def check(
         ),
     ] = None,
     json: Annotated[Path | None, typer.Option("--json", help="File for all statistics.")] = None,
+    truth: Annotated[
+        Path | None,
+        typer.Option(
+            help="Reference attitudes, of any clock and frames: a simulated record, TUM, EuRoC, CSV, ROS bag. What differs is printed."
+        ),
+    ] = None,
+    error_frame: Annotated[
+        str,
+        typer.Option(
+            help="With --truth: how the covariance is meant, body, fixed or euler (roll, pitch, yaw); find takes what the errors fit."
+        ),
+    ] = "find",
+    align: Annotated[
+        str,
+        typer.Option(
+            help="With --truth: what is estimated and removed: any of time,fixed,body (frames), or none; auto: a clock's offset, and "
+            "rotations beyond 5°."
+        ),
+    ] = "auto",
+    topic: Annotated[str | None, typer.Option(help="Topic of the estimate, where a bag holds several.")] = None,
+    truth_topic: Annotated[str | None, typer.Option(help="Topic of the truth, where a bag holds several.")] = None,
+    aligned: Annotated[
+        Path | None,
+        typer.Option(help="With --truth: HDF5 file for the estimate as it was judged, which `strapdown report` reads."),
+    ] = None,
 ) -> None:
     """Tell whether the filter may be believed: exit status 0 consistent, 1 not, 2 cannot tell (or bad input).
 
-    With --record the verdict takes the statistics and the causes that were looked for together.
+    With --record the verdict takes the statistics and the causes that were looked for together. With --truth the estimate may be of any
+    filter; clocks and frames are compared first. An estimate from elsewhere without a truth is judged by its innovations, if it has any.
     """
     from strapdown import consistency, records
     from strapdown.checks import InputError
@@ -63,10 +94,21 @@ def check(
     from strapdown.files import write_json
 
     if json is not None:
-        writable("json", json, suffixes=(".json",), sources=(result, record, filter_file))
+        writable("json", json, suffixes=(".json",), sources=(result, record, filter_file, truth))
     if record is None and filter_file is not None:
         raise InputError("--filter goes with --record: the record is needed to look for causes")
     tail(probability)
+    if truth is not None or not _is_own(result):
+        if record is not None:
+            raise InputError(
+                "--record goes with an estimate of `strapdown estimate`, judged by itself; leave out --truth or --record"
+            )
+        _check_foreign(
+            result, truth, _Reading(error_frame, align, topic or "", truth_topic or "", probability), aligned, json
+        )
+    for name, given in (("--error-frame", error_frame != "find"), ("--align", align != "auto"), ("--aligned", aligned)):
+        if given:
+            raise InputError(f"{name} goes with --truth; give a reference, or leave it out")
     kind = str(records.read_attributes(result)["kind"])
     content: dict[str, Any] = {"source": result.name, "kind": kind}
     if kind == "strapdown montecarlo":
@@ -81,13 +123,13 @@ def check(
         judgement = consistency.judge_runs(held.statistics, probability=probability)
     elif kind == "strapdown estimate":
         estimate = records.read_estimate(result)
-        truth = records.read_truth(result)
+        own_truth = records.read_truth(result)
         console.print(
             f"{result.name}: {len(estimate.time)} epochs over {estimate.time[-1] - estimate.time[0]:.6g} s, "
             f"{sum(len(one.time) for one in estimate.innovations.values())} measurements, "
-            f"{'no truth' if truth is None else 'with its truth'}."
+            f"{'no truth' if own_truth is None else 'with its truth'}."
         )
-        judgement = consistency.judge(estimate, truth, probability=probability)
+        judgement = consistency.judge(estimate, own_truth, probability=probability)
     else:
         raise InputError(f"{result} is a {kind}; pass what `strapdown estimate` or `strapdown montecarlo` wrote")
     _show_statistics(judgement)
@@ -104,6 +146,102 @@ def check(
         write_json(json, content)
         written(json)
     raise typer.Exit({"consistent": CONSISTENT, "not consistent": NOT}.get(judgement.verdict, CANNOT_TELL))
+
+
+def _is_own(path: Path) -> bool:
+    """Return whether a file is, or should be by its name, a result of this package; one that is missing is told of as such."""
+    from strapdown import reading
+
+    return not path.exists() or path.suffix.lower() in (".h5", ".hdf5") or (path.is_file() and reading.is_hdf5(path))
+
+
+class _Reading(NamedTuple):
+    """How an estimate from elsewhere is to be read."""
+
+    error_frame: str
+    align: str
+    topic: str
+    truth_topic: str
+    probability: float
+
+
+def _check_foreign(
+    result: Path, truth: Path | None, told: _Reading, aligned: Path | None, json: Path | None
+) -> NoReturn:
+    """Judge an estimate from elsewhere."""
+    from strapdown import consistency
+    from strapdown.checks import InputError
+    from strapdown.consistency import foreign
+    from strapdown.files import write_json
+    from strapdown.recordings.attitudes import read_attitudes
+    from strapdown.records import write_estimate
+
+    if aligned is not None:
+        writable("aligned", aligned, suffixes=(".h5", ".hdf5"), sources=(result, truth))
+    own = read_attitudes(result, topic=told.topic)
+    length = (own.stamps_ns[-1] - own.stamps_ns[0]) / 1e9
+    console.print(f"{own.source}: {len(own.stamps_ns)} attitudes over {length:.6g} s.")
+    for remark in own.remarks:
+        console.print(remark)
+    content: dict[str, Any] = {"source": own.source, "kind": "estimate from elsewhere"}
+    if truth is None:
+        if not own.innovations:
+            raise InputError(
+                f"{result} holds no innovations, so nothing can be judged without a truth; give --truth, attitudes over the same time"
+            )
+        estimate = foreign.without_truth(own.seconds(int(own.stamps_ns[0])), own.attitude, own.innovations)
+        judgement = consistency.judge(estimate, None, probability=told.probability)
+    else:
+        reference = read_attitudes(truth, topic=told.truth_topic)
+        console.print(f"Truth: {reference.source}, {len(reference.stamps_ns)} attitudes.")
+        # Clocks from 1970 and from the start of a machine: each from the first stamp of both, in whole ns.
+        origin = int(min(own.stamps_ns[0], reference.stamps_ns[0]))
+        frame = own.error_frame if told.error_frame == "find" and own.error_frame else told.error_frame
+        found = foreign.check_arrays(
+            own.seconds(origin),
+            own.attitude,
+            own.covariance,
+            reference.seconds(origin),
+            reference.attitude,
+            bias=own.bias,
+            true_bias=reference.bias,
+            innovations=own.innovations,
+            error_frame=frame,
+            align=told.align,
+            probability=told.probability,
+        )
+        judgement = found.judgement
+        content.update(found.summary())
+        for remark in found.remarks:
+            console.print(f"Note: {remark}.")
+        if frame != told.error_frame:
+            console.print(f"Note: the file says that its covariance is of the {frame} error.")
+        _show_explanations(found)
+        if aligned is not None:
+            write_estimate(
+                aligned, found.estimate, {"source": own.source, "truth": reference.source}, truth=found.truth
+            )
+    _show_statistics(judgement)
+    for limit in judgement.limits:
+        console.print(f"Note: {limit}.")
+    console.print(judgement.words)
+    content.update(judgement.summary())
+    if json is not None:
+        write_json(json, content)
+        written(json)
+    if truth is not None and aligned is not None:
+        written(aligned)
+    raise typer.Exit({"consistent": CONSISTENT, "not consistent": NOT}.get(judgement.verdict, CANNOT_TELL))
+
+
+def _show_explanations(found: Checked) -> None:
+    if not found.explanations:
+        return
+    rows = table("What would explain the attitude errors", "cause", "size", "NEES left", "p-value", "", left=2)
+    for one in found.explanations:
+        mark = Text("likely", style="red") if one.likely else Text("no")
+        rows.add_row(one.name, one.value, f"{one.nees:.4g}", f"{one.p_value:.2g}", mark)
+    show(rows)
 
 
 def _show_statistics(judgement: Judgement) -> None:

@@ -12,6 +12,8 @@
     Averages over the time of one run, whose errors are correlated: the effective sample size.
 ``accuracy``
     How large errors are: against a reference, against the Cramér–Rao bound, when they have settled, how they are distributed.
+``foreign``
+    The verdict on an estimate from elsewhere: clocks, frames and the reading of its covariance.
 ``judgement``, ``runs``
     The verdict in words, with its evidence, at one stated probability of a false alarm: on one run, and on independent ones.
 """
@@ -33,6 +35,7 @@ from strapdown.consistency.bounds import mean_bounds
 from strapdown.consistency.bounds import mean_p_value as mean_p_value
 from strapdown.consistency.ensemble import Credibility as Credibility
 from strapdown.consistency.ensemble import credibility
+from strapdown.consistency.foreign import Checked, check_arrays
 from strapdown.consistency.judgement import Finding, Judgement, judge
 from strapdown.consistency.judgement import concluded as concluded
 from strapdown.consistency.manifold import SUBSETS as SUBSETS
@@ -50,9 +53,11 @@ from strapdown.consistency.whiteness import mean_innovation_p_value as mean_inno
 from strapdown.consistency.whiteness import quantile_pairs as quantile_pairs
 
 __all__ = [
+    "Checked",
     "Finding",
     "Judgement",
     "autocorrelation",
+    "check_arrays",
     "credibility",
     "errors",
     "fixed_frame",

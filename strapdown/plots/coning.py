@@ -111,11 +111,11 @@ def algorithms_compared(study: ConingStudy) -> Figure:
     frequencies = np.geomspace(0.01, 0.4, FREQUENCIES) * p.rate
     for k, algorithm in enumerate(p.algorithms):
         own = algorithm in p.own
-        style = {"color": CYCLE[k % len(CYCLE)], "linestyle": "-" if own or k < len(CYCLE) else "--"}
+        style = {"color": CYCLE[k % len(CYCLE)], "linestyle": "-" if own else "--", "zorder": 2 if own else 3}
         drift = np.abs([step_drift(Coning(angle=p.angle, frequency=f), p.rate, algorithm) for f in frequencies])
         drift = np.where(drift > _ROUNDING * DEGREE_PER_HOUR, drift, np.nan)
         width = 2.4 if own else 1.2
-        left.plot(frequencies, drift / DEGREE_PER_HOUR, label=algorithm.name, linewidth=width, **style)
+        left.plot(frequencies, drift / DEGREE_PER_HOUR, label=algorithm.name, linewidth=width, **style)  # type: ignore[arg-type]
         errors = np.array([manoeuvre_error(motion, p.rate, algorithm) for motion in MANOEUVRES.values()]) / ARCSECOND
         place = np.arange(len(errors)) + 0.7 * ((k + 0.5) / len(p.algorithms) - 0.5)
         size = 9 if own else 6

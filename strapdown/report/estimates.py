@@ -76,16 +76,18 @@ def _key_numbers(estimate: Estimate, truth: Truth | None) -> dict[str, Any]:
         "states": len(estimate.time),
         "duration_s": float(estimate.time[-1] - estimate.time[0]),
         "final_attitude_sigma_rad": estimate.sigma[-1, :3].tolist(),
-        "final_bias_rad_per_s": estimate.bias[-1].tolist(),
-        "final_bias_sigma_rad_per_s": estimate.sigma[-1, 3:].tolist(),
         "measurements": {name: len(one.time) for name, one in estimate.innovations.items()},
         "skipped": dict(estimate.skipped),
         "refused": estimate.refused,
     }
+    if estimate.has_bias:
+        numbers["final_bias_rad_per_s"] = estimate.bias[-1].tolist()
+        numbers["final_bias_sigma_rad_per_s"] = estimate.sigma[-1, 3:].tolist()
     if truth is not None:
         error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)
         half = len(error) // 2
         numbers["rms_attitude_error_second_half_rad"] = np.sqrt(np.mean(error[half:, :3] ** 2, axis=0)).tolist()
+    if truth is not None and estimate.has_bias:
         numbers["rms_bias_error_second_half_rad_per_s"] = np.sqrt(np.mean(error[half:, 3:] ** 2, axis=0)).tolist()
     return numbers
 
@@ -97,7 +99,8 @@ def _numbers(estimate: Estimate, truth: Truth | None) -> str:
     error = None
     if truth is not None:
         error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)[half:]
-    for what, states, unit_of in (("attitude", slice(0, 3), angle_unit), ("gyro bias", slice(3, 6), rate_unit)):
+    parts_of_state = (("attitude", slice(0, 3), angle_unit), ("gyro bias", slice(3, 6), rate_unit))
+    for what, states, unit_of in parts_of_state if estimate.has_bias else parts_of_state[:1]:
         unit, size = unit_of(3.0 * sigma[states])
         for axis, name in enumerate(AXES):
             k = states.start + axis
@@ -145,10 +148,8 @@ def _over_time(estimate: Estimate, truth: Truth | None) -> str:
     settled = slice(len(estimate.time) // 20, None)
     if truth is not None:
         error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)
-        for what, states, unit_of in (
-            ("Attitude error", slice(0, 3), angle_unit),
-            ("Bias error", slice(3, 6), rate_unit),
-        ):
+        parts = (("Attitude error", slice(0, 3), angle_unit), ("Bias error", slice(3, 6), rate_unit))
+        for what, states, unit_of in parts if estimate.has_bias else parts[:1]:
             unit, size = unit_of(3.0 * sigma[settled, states])
             for k, axis in enumerate(AXES):
                 state = states.start + k
@@ -171,10 +172,11 @@ def _over_time(estimate: Estimate, truth: Truth | None) -> str:
                         )
                     )
                 )
-        figure = page.figure(
-            lambda: plots.error_overview(estimate, truth),
-            "Errors against the truth inside the filter's own ±3σ, body frame",
-        )
+        if estimate.has_bias:
+            figure = page.figure(
+                lambda: plots.error_overview(estimate, truth),
+                "Errors against the truth inside the filter's own ±3σ, body frame",
+            )
     else:
         euler = quaternion.to_rotation(estimate.attitude).as_euler("ZYX", degrees=True)[:, ::-1]
         series = tuple(
@@ -225,8 +227,7 @@ def _path(estimate: Estimate, truth: Truth | None) -> str:
     caption = f"Path of the body {AXES[axis]} axis in the fixed frame"
     parts = [page.figure(lambda: plots.sphere_figure(estimate.attitude, true, axis), caption)]
     if true is not None:
-        error = consistency.errors(estimate.attitude, estimate.bias, true, estimate.bias)
-        angle = consistency.distribution(np.linalg.norm(error[:, :3], axis=1))
+        angle = consistency.distribution(quaternion.angle_between(estimate.attitude, true))
 
         def draw() -> Figure:
             figure, ax = plots.new_figure(size=(6.5, 4.2))

@@ -1,0 +1,637 @@
+"""The verdict on an estimate from elsewhere: its attitudes and covariances against a truth of another clock and other axes.
+
+:func:`check_arrays` does it all: clocks and frames are compared, what differs grossly is removed (and said, and its uncertainty added to
+the covariance), the reading of the covariance is found or taken as given, and :func:`strapdown.consistency.judge` judges the rest. Every
+small difference that would explain the errors is told beside the verdict and not removed, unless it is asked for: a constant rotation
+between frames and a constant error of the filter look the same.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from strapdown import quaternion
+from strapdown.checks import Array, InputError, array, increasing, one_of, unit_quaternions
+from strapdown.consistency.judgement import Judgement, judge
+from strapdown.consistency.manifold import whitened
+from strapdown.consistency.timeaverage import effective_samples
+from strapdown.outputs import euler_axes
+from strapdown.records import Estimate, Innovations, Truth
+from strapdown.units import DEGREE
+
+ERROR_FRAMES = ("body", "fixed", "euler")
+"""Readings of an attitude covariance: of δθ with ``q_true = q ⊗ exp(δθ)``; of δφ with ``q_true = exp(δφ) ⊗ q``, as ROS has it for poses; of
+the errors of roll, pitch and yaw, in this order (ZYX)."""
+ALIGNED = ("time", "fixed", "body")
+"""What may be aligned: the clocks, the fixed frames, the body frames."""
+GROSS = 5.0 * DEGREE
+"""A constant rotation beyond this is one of frames and not of a filter."""
+BRIDGED = 0.1
+"""Largest interval of a truth that is interpolated over, s; of a truth that is as slow as the estimate, its own."""
+SCALE = "σ wrong by one factor"
+LIKELY = 1e-3
+"""p-value below which an explanation is likely."""
+LONGEST_OFFSET = 30.0
+"""Offsets between clocks are looked for up to this, s, where the records overlap as they are."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Alignment:
+    """What differs between an estimate's clock and frames and a truth's: ``q_true(t + offset) = exp(fixed) ⊗ q(t) ⊗ exp(body)``."""
+
+    offset: float
+    """s, to be added to the estimate's times."""
+    fixed: Array
+    """Rotation vector (3,), rad, from the estimate's fixed frame to the truth's."""
+    body: Array
+    """Rotation vector (3,), rad, from the truth's body frame to the estimate's."""
+    sigma: Array
+    """Standard deviations of fixed (3), body (3), rad, and offset, s: (7,); 0 of what was not estimated."""
+    covariance: Array
+    """Their covariance (7, 7)."""
+    estimated: tuple[str, ...]
+    """Which of :data:`ALIGNED` were estimated and removed."""
+    residual: float
+    """Root mean square of the angle that is left, rad."""
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """What was removed, a sentence each."""
+        found = []
+        if "time" in self.estimated:
+            found.append(
+                f"clocks differ by {self.offset:.6g} s ± {self.sigma[6]:.2g} s (added to the estimate's times): removed"
+            )
+        for name, rotation, rows in (("fixed", self.fixed, slice(0, 3)), ("body", self.body, slice(3, 6))):
+            if name in self.estimated:
+                text = ", ".join(f"{x / DEGREE:.4g}" for x in rotation)
+                sigma = float(np.sqrt(np.mean(self.sigma[rows] ** 2))) / DEGREE
+                found.append(
+                    f"the {name} frames differ by {np.linalg.norm(rotation) / DEGREE:.4g}° (rotation vector {text}°) ± {sigma:.2g}° an "
+                    "axis: removed; a constant error of the filter would look the same"
+                )
+        return tuple(found)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Explanation:
+    """Something that would explain errors beyond the covariance, and was not removed."""
+
+    name: str
+    value: str
+    nees: float
+    """NEES of the attitude per state that it would leave."""
+    p_value: float
+    """Probability that a right filter gains as much from it by chance; small if it is likely."""
+
+    @property
+    def likely(self) -> bool:
+        """Whether chance hardly gains as much."""
+        return self.p_value < LIKELY
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Checked:
+    """The verdict on an estimate from elsewhere, and how it was come to."""
+
+    judgement: Judgement
+    estimate: Estimate
+    """As it was judged: of the truth's clock and frames, the covariance of the body-side error."""
+    truth: Truth | None
+    """At the estimate's times."""
+    alignment: Alignment | None
+    error_frame: str
+    """The reading of the covariance that was judged, of :data:`ERROR_FRAMES`."""
+    frame_probability: Mapping[str, float]
+    """Probability of each reading, all being as likely beforehand; empty where it was given, or there is no truth."""
+    explanations: tuple[Explanation, ...]
+    """The likeliest first."""
+    remarks: tuple[str, ...]
+
+    def summary(self) -> dict[str, Any]:
+        """Return everything as plain values for JSON."""
+        told: dict[str, Any] = {
+            **self.judgement.summary(),
+            "error_frame": self.error_frame,
+            "error_frame_probability": dict(self.frame_probability),
+            "explanations": [vars(one) for one in self.explanations],
+            "remarks": list(self.remarks),
+        }
+        if self.alignment is not None:
+            a = self.alignment
+            told["alignment"] = {
+                "removed": list(a.estimated),
+                "time_offset_s": a.offset,
+                "fixed_rotation_vector_deg": (a.fixed / DEGREE).tolist(),
+                "body_rotation_vector_deg": (a.body / DEGREE).tolist(),
+                "sigma_fixed_body_deg": (a.sigma[:6] / DEGREE).tolist(),
+                "sigma_time_s": float(a.sigma[6]),
+                "residual_rms_deg": a.residual / DEGREE,
+            }
+        return told
+
+
+def check_arrays(
+    time: ArrayLike,
+    attitude: ArrayLike,
+    covariance: ArrayLike | None,
+    true_time: ArrayLike,
+    true_attitude: ArrayLike,
+    *,
+    bias: ArrayLike | None = None,
+    true_bias: ArrayLike | None = None,
+    innovations: Mapping[str, Innovations] | None = None,
+    error_frame: str = "find",
+    align: str | Iterable[str] = "auto",
+    probability: float = 0.99,
+) -> Checked:
+    """Return the verdict on an estimate of any filter against a truth.
+
+    Parameters
+    ----------
+    time : array_like (m,)
+        s.
+    attitude : array_like (m, 4)
+        q_fb, scalar first.
+    covariance : array_like (m, 3, 3) or (m, 6, 6), or None
+        Of the attitude error, rad², or of attitude and bias error; its rows as ``error_frame`` says. None: there is none, and errors are
+        told but not judged.
+    true_time, true_attitude : array_like (n,), (n, 4)
+        The truth, of a clock and frames of its own.
+    bias, true_bias : array_like (m, 3), (n, 3), optional
+        Gyro bias, rad/s, body axes; judged where both are given.
+    innovations : mapping, optional
+        :class:`strapdown.records.Innovations` by sensor.
+    error_frame : {"find", "body", "fixed", "euler"}
+        How the covariance is meant (:data:`ERROR_FRAMES`). "find" takes the reading that the errors are likeliest under.
+    align : "auto", "none", or any of "time", "fixed", "body"
+        What is estimated and removed. "auto": an offset of the clocks that stands out of its σ, and rotations beyond 5°.
+    probability : float
+        Of all tests together: a right filter is called wrong with at most 1 − ``probability``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from strapdown import quaternion
+    >>> random = np.random.default_rng(1)
+    >>> time = np.arange(400.0)
+    >>> truth = quaternion.exp(np.cumsum(0.1 * random.standard_normal((400, 3)), axis=0) % 2.0)
+    >>> estimate = quaternion.multiply(truth, quaternion.exp(0.01 * random.standard_normal((400, 3))))
+    >>> P = np.tile(1e-4 * np.eye(3), (400, 1, 1))
+    >>> check_arrays(time, estimate, P, time, truth).judgement.verdict
+    'consistent'
+    >>> check_arrays(time, estimate, 0.5 * P, time, truth).judgement.verdict
+    'not consistent'
+    """
+    stamps = increasing("time", time, least=2)
+    q = unit_quaternions("attitude", array("attitude", attitude, (len(stamps), 4)))
+    true_stamps = increasing("true_time", true_time, least=2)
+    reference = unit_quaternions("true_attitude", array("true_attitude", true_attitude, (len(true_stamps), 4)))
+    if error_frame != "find":
+        one_of("error_frame", error_frame, ERROR_FRAMES)
+    wanted = _wanted(align)
+    P = None if covariance is None else np.array(covariance, np.float64)
+    if P is not None and P.shape not in ((len(stamps), 3, 3), (len(stamps), 6, 6)):
+        raise InputError(f"covariance has shape {P.shape}, wanted ({len(stamps)}, 3, 3) or ({len(stamps)}, 6, 6)")
+    remarks: list[str] = []
+    if P is not None and (bias is None or true_bias is None):
+        bias, P = None, P[:, :3, :3]
+    own = _Series(stamps, q, P, None if bias is None else array("bias", bias, (len(stamps), 3)))
+    told = _Series(
+        true_stamps,
+        reference,
+        None,
+        None if true_bias is None else array("true_bias", true_bias, (len(true_stamps), 3)),
+    )
+    own, alignment = _aligned(own, told, wanted, remarks)
+    own, truth = _at_common_times(own, told, alignment.offset)
+    remarks += alignment.words
+    if own.covariance is None:
+        sigma = f"RMS attitude error {alignment.residual / DEGREE:.4g}°"
+        remarks.append(f"the estimate tells no covariance, so its errors are not judged ({sigma})")
+        empty = without_truth(own.time, replace_attitude(own.attitude, alignment), innovations or {})
+        return Checked(
+            judgement=judge(empty, None, probability=probability),
+            estimate=empty,
+            truth=truth,
+            alignment=alignment,
+            error_frame="",
+            frame_probability={},
+            explanations=(),
+            remarks=tuple(remarks),
+        )
+    readings = {name: read_as(name, own.covariance, own.attitude) for name in ERROR_FRAMES}
+    readings = {name: _in_truth_axes(P, own, truth, alignment) for name, P in readings.items()}
+    aligned = replace_attitude(own.attitude, alignment)
+    error = quaternion.log(quaternion.multiply(quaternion.conjugate(aligned), truth.attitude))
+    found = frame_probabilities(error, {name: P[:, :3, :3] for name, P in readings.items()})
+    chosen = max(found, key=lambda name: found[name]) if error_frame == "find" else error_frame
+    if error_frame == "find":
+        remarks.append(_frame_words(chosen, found))
+    elif found[chosen] < 0.01:
+        best = max(found, key=lambda name: found[name])
+        remarks.append(f"the covariance is read as {chosen}, as told; as {best} the errors would fit it better by far")
+    estimate = Estimate.from_arrays(
+        own.time,
+        aligned,
+        readings[chosen],
+        bias=None
+        if own.bias is None
+        else quaternion.rotate(quaternion.conjugate(quaternion.exp(alignment.body)), own.bias),
+        innovations=innovations,
+    )
+    return Checked(
+        judgement=judge(estimate, truth, probability=probability),
+        estimate=estimate,
+        truth=truth,
+        alignment=alignment,
+        error_frame=chosen,
+        frame_probability=found if error_frame == "find" else {},
+        explanations=explanations(error, readings, chosen, truth, own.time, aligned),
+        remarks=tuple(remarks),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Series:
+    time: Array
+    attitude: Array
+    covariance: Array | None = None
+    bias: Array | None = None
+
+
+def _wanted(align: str | Iterable[str]) -> tuple[str, ...] | None:
+    """Return what is to be aligned; None: as the data say."""
+    if align == "auto":
+        return None
+    if align == "none":
+        return ()
+    names = [part.strip() for part in align.split(",")] if isinstance(align, str) else list(align)
+    return tuple(one_of("align", name, (*ALIGNED, "auto", "none")) for name in names)
+
+
+def without_truth(time: Array, attitude: Array, innovations: Mapping[str, Innovations]) -> Estimate:
+    """Return an estimate of which the innovations alone can be judged."""
+    return Estimate.from_arrays(time, attitude, np.full((len(time), 3, 3), np.nan), innovations=innovations)
+
+
+# ------------------------------------------------------------------------------------------------------------ readings
+
+
+def read_as(frame: str, covariance: Array, attitude: Array) -> Array:
+    """Return covariances (m, n, n), n ≥ 3, of the body-side error, given as of one of :data:`ERROR_FRAMES` in their first three rows."""
+    if frame == "body":
+        return covariance
+    R = quaternion.to_matrix(attitude)
+    # δθ_b = Rᵀ δφ; δθ_b = E (yaw, pitch, roll), the columns the other way round for (roll, pitch, yaw).
+    turn = np.swapaxes(R, 1, 2) if frame == "fixed" else euler_axes(attitude)[:, :, ::-1]
+    T = np.tile(np.eye(covariance.shape[1]), (len(R), 1, 1))
+    T[:, :3, :3] = turn
+    return np.asarray(T @ covariance @ np.swapaxes(T, 1, 2))
+
+
+def frame_probabilities(error: Array, readings: Mapping[str, Array]) -> dict[str, float]:
+    """Return the probability of each reading of the covariance (m, 3, 3), given errors (m, 3), all equally likely beforehand.
+
+    The scale of the covariance is free in each, so that a filter that is too sure in general does not hide how its covariance is meant.
+    Errors follow each other, so they count as the effective samples that they are.
+    """
+    scores = {}
+    weight = 1.0
+    for name, P in readings.items():
+        try:
+            white = whitened(error, P)
+        except InputError:  # Euler angles at their singularity
+            scores[name] = -np.inf
+            continue
+        scale = max(float(np.mean(white * white)), 1e-300)
+        scores[name] = -0.5 * (3.0 * math.log(scale) + float(np.mean(np.linalg.slogdet(P)[1])))
+        weight = effective_samples(white / math.sqrt(scale)) if name == "body" else weight
+    best = max(scores.values())
+    likelihood = {name: math.exp(max(weight * (score - best), -700.0)) for name, score in scores.items()}
+    return {name: value / sum(likelihood.values()) for name, value in likelihood.items()}
+
+
+def _frame_words(chosen: str, found: Mapping[str, float]) -> str:
+    said = ", ".join(f"{name} {100.0 * p:.3g} %" for name, p in found.items())
+    if found[chosen] < 0.9:
+        return f"the errors do not tell how the covariance is meant ({said}): it is judged as {chosen}; --error-frame says otherwise"
+    return f"the covariance is read as {chosen} ({said}, found from the errors)"
+
+
+# ----------------------------------------------------------------------------------------------------------- alignment
+
+
+def replace_attitude(attitude: Array, alignment: Alignment) -> Array:
+    """Return attitudes (m, 4) in the truth's frames."""
+    return quaternion.multiply(
+        quaternion.multiply(quaternion.exp(alignment.fixed), attitude), quaternion.exp(alignment.body)
+    )
+
+
+def interpolated(time: Array, stamps: Array, attitude: Array, bridged: float) -> Array:
+    """Return attitudes (n, 4) at ``time`` along the shortest turn; NaN outside, and in gaps longer than ``bridged``, s."""
+    k = np.clip(np.searchsorted(stamps, time, side="right") - 1, 0, len(stamps) - 2)
+    width = stamps[k + 1] - stamps[k]
+    share = (time - stamps[k]) / width
+    usable = (share >= -1e-9 / width) & (share <= 1.0 + 1e-9 / width) & (width <= bridged)
+    turn = quaternion.log(quaternion.multiply(quaternion.conjugate(attitude[k]), attitude[k + 1]))
+    result = quaternion.multiply(attitude[k], quaternion.exp(share[:, None] * turn))
+    for end in (0, 1):  # what is no interpolation keeps its digits
+        exact = time == stamps[k + end]
+        result[exact] = attitude[k[exact] + end]
+        usable |= exact
+    return np.where(usable[:, None], result, np.nan)
+
+
+def _bridged(series: _Series) -> float:
+    return max(BRIDGED, 1.5 * float(np.median(np.diff(series.time))))
+
+
+def _at_common_times(own: _Series, told: _Series, offset: float) -> tuple[_Series, Truth]:
+    """Return the estimate where there is a truth, and the truth there: at the estimate's times, or at those of a truth that is sparser."""
+    sparser = np.median(np.diff(told.time)) > 1.5 * np.median(np.diff(own.time))
+    if sparser:
+        inside = (told.time - offset >= own.time[0]) & (told.time - offset <= own.time[-1])
+        at = told.time[inside] - offset
+        near = np.clip(np.searchsorted(own.time, at), 1, len(own.time) - 1)
+        near -= (at - own.time[near - 1]) < (own.time[near] - at)
+        own = _Series(
+            at,
+            interpolated(at, own.time, own.attitude, _bridged(own)),
+            None if own.covariance is None else own.covariance[near],
+            None if own.bias is None else own.bias[near],
+        )
+        q, bias = told.attitude[inside], None if told.bias is None else told.bias[inside]
+        good = np.isfinite(own.attitude[:, 0])
+    else:
+        q = interpolated(own.time + offset, told.time, told.attitude, _bridged(told))
+        good = np.isfinite(q[:, 0])
+        bias = None
+        if told.bias is not None:
+            bias = np.stack([np.interp(own.time + offset, told.time, told.bias[:, k]) for k in range(3)], axis=1)
+    if good.sum() < 2:
+        raise InputError(
+            f"the estimate goes from {own.time[0] + offset:.6g} to {own.time[-1] + offset:.6g} s of the truth's clock, and the truth from "
+            f"{told.time[0]:.6g} to {told.time[-1]:.6g} s: they have no two times in common; give both of one clock, or --align time"
+        )
+    rows = good
+    return (
+        _Series(
+            own.time[rows] + offset,
+            own.attitude[rows],
+            None if own.covariance is None else own.covariance[rows],
+            None if own.bias is None else own.bias[rows],
+        ),
+        Truth(attitude=q[rows], bias=np.full((int(rows.sum()), 3), np.nan) if bias is None else bias[rows]),
+    )
+
+
+def _rates(series: _Series) -> tuple[Array, Array]:
+    """Return middles of the intervals (m − 1,) and the mean body rate over each (m − 1, 3)."""
+    turn = quaternion.log(quaternion.multiply(quaternion.conjugate(series.attitude[:-1]), series.attitude[1:]))
+    return 0.5 * (series.time[1:] + series.time[:-1]), turn / np.diff(series.time)[:, None]
+
+
+def coarse_offset(own_time: Array, own_speed: Array, true_time: Array, true_speed: Array) -> float:
+    """Return the offset, s, to be added to the first times, at which two series of angular speeds correlate best; 0 if nothing stands out.
+
+    Speeds are the same in all frames.
+    """
+    step = max(float(np.median(np.diff(own_time))), float(np.median(np.diff(true_time))))
+    apart = own_time[-1] < true_time[0] or true_time[-1] < own_time[0]
+    base = true_time[0] - own_time[0] if apart else 0.0
+    first, last = min(own_time[0] + base, true_time[0]), max(own_time[-1] + base, true_time[-1])
+    grid = np.arange(first, last + step, step)
+    a, b = (
+        np.interp(grid, t, s, left=np.nan, right=np.nan)
+        for t, s in ((own_time + base, own_speed), (true_time, true_speed))
+    )
+    a, b = (np.nan_to_num(x - np.nanmean(x)) for x in (a, b))
+    if min(np.std(a), np.std(b)) < 1e-9:
+        return float(base)
+    size = 1 << (2 * len(grid) - 1).bit_length()
+    product = np.fft.irfft(np.conj(np.fft.rfft(a, size)) * np.fft.rfft(b, size), size)
+    lags = np.arange(size)
+    lags = np.where(lags > size // 2, lags - size, lags)
+    near = np.abs(lags * step) <= (np.inf if apart else LONGEST_OFFSET)
+    best = int(np.argmax(np.where(near, product, -np.inf)))
+    share = product[best] / math.sqrt(float(np.sum(a * a) * np.sum(b * b)))
+    return float(base + lags[best] * step) if share > 0.5 else float(base)
+
+
+def _initial_rotations(own: _Series, told: _Series, offset: float) -> list[tuple[Array, Array]]:
+    """Return (fixed, body) quaternions to begin from: none, that of the fixed frames alone, that of the bodies by their rates too."""
+    matched, truth = _at_common_times(own, told, offset)
+    identity = np.array([1.0, 0.0, 0.0, 0.0])
+
+    def fixed_of(body: Array) -> Array:
+        turns = quaternion.multiply(truth.attitude, quaternion.conjugate(quaternion.multiply(matched.attitude, body)))
+        return quaternion.mean(turns)[0]
+
+    found = [(identity, identity), (fixed_of(identity), identity)]
+    _, w_own = _rates(matched)
+    _, w_true = _rates(_Series(matched.time, truth.attitude))
+    # Wahba's problem: w_true = Bᵀ w_own.
+    u, s, vt = np.linalg.svd(w_own.T @ w_true)
+    if s[1] > 1e-3 * s[0]:
+        B = u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt
+        body = quaternion.from_matrix(B)
+        found.append((fixed_of(body), body))
+    return found
+
+
+def fit(own: _Series, told: _Series, names: tuple[str, ...], offset: float) -> Alignment:
+    """Return offset and rotations by least squares of the angle that is left, σ by how long the residuals remember each other."""
+    free = np.array([name in names for name in ("fixed",) * 3 + ("body",) * 3 + ("time",)])
+    starts = _initial_rotations(own, told, offset) if free[:6].any() else [(np.array([1.0, 0, 0, 0]),) * 2]
+    best: Alignment | None = None
+    for fixed, body in starts:
+        if (not free[0] and abs(fixed[0]) < 1.0) or (not free[3] and abs(body[0]) < 1.0):
+            continue
+        found = _descended(own, told, free, fixed, body, offset, names)
+        if best is None or found.residual < 0.999 * best.residual:
+            best = found
+    assert best is not None
+    return best
+
+
+def _descended(
+    own: _Series, told: _Series, free: np.ndarray, fixed: Array, body: Array, offset: float, names: tuple[str, ...]
+) -> Alignment:
+    covariance = np.zeros((7, 7))
+    residual = np.inf
+    for _ in range(20):
+        matched, truth = _at_common_times(own, told, offset)
+        aligned = quaternion.multiply(quaternion.multiply(fixed, matched.attitude), body)
+        r = quaternion.log(quaternion.multiply(quaternion.conjugate(aligned), truth.attitude))
+        now = float(np.sqrt(np.mean(np.sum(r * r, axis=1))))
+        if not free.any():
+            residual = now
+            break
+        J = np.zeros((len(r), 3, 7))
+        J[:, :, :3] = np.swapaxes(quaternion.to_matrix(aligned), 1, 2)
+        J[:, :, 3:6] = np.eye(3)
+        J[:, :, 6] = -_speed_of(matched.time, truth.attitude)
+        J = J[:, :, free]
+        information = np.einsum("mij,mik->jk", J, J)
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+        value, vector = np.linalg.eigh(information * np.outer(scale, scale))
+        seen = value > 1e-6 * value[-1]  # what the motion does not part stays as it is
+        inverse = (vector[:, seen] / value[seen]) @ vector[:, seen].T * np.outer(scale, scale)
+        step = np.zeros(7)
+        step[free] = inverse @ np.einsum("mij,mi->j", J, r)
+        left = r - np.einsum("mij,j->mi", J, step[free])
+        spread = left / max(float(np.sqrt(np.mean(left**2))), 1e-300)
+        share = len(r) / effective_samples(spread) if len(r) > 10 else 1.0
+        covariance = np.zeros((7, 7))
+        covariance[np.ix_(free, free)] = inverse * float(np.mean(left**2)) * share
+        fixed = quaternion.normalize(quaternion.multiply(quaternion.exp(step[:3]), fixed))
+        body = quaternion.normalize(quaternion.multiply(body, quaternion.exp(step[3:6])))
+        offset += float(step[6])
+        residual = float(np.sqrt(np.mean(np.sum(left**2, axis=1))))
+        if np.all(np.abs(step) <= 1e-3 * np.sqrt(np.diag(covariance)) + 1e-12):
+            break
+    return Alignment(
+        offset=offset,
+        fixed=quaternion.log(fixed),
+        body=quaternion.log(body),
+        sigma=np.sqrt(np.diag(covariance)),
+        covariance=covariance,
+        estimated=tuple(name for name in ALIGNED if name in names),
+        residual=residual,
+    )
+
+
+def _speed_of(time: Array, attitude: Array) -> Array:
+    """Return body rates (m, 3) at the times."""
+    middle, rate = _rates(_Series(time, attitude))
+    return np.stack([np.interp(time, middle, rate[:, k]) for k in range(3)], axis=1)
+
+
+def _aligned(
+    own: _Series, told: _Series, wanted: tuple[str, ...] | None, remarks: list[str]
+) -> tuple[_Series, Alignment]:
+    """Return the estimate, its quaternions as they must be meant, and its alignment with the truth."""
+    offset = 0.0
+    if wanted is None or "time" in wanted:
+        own_at, own_rate = _rates(own)
+        true_at, true_rate = _rates(told)
+        speeds = (np.linalg.norm(own_rate, axis=1), np.linalg.norm(true_rate, axis=1))
+        offset = coarse_offset(own_at, speeds[0], true_at, speeds[1])
+    if wanted is not None:
+        return own, fit(own, told, wanted, offset)
+    whole = fit(own, told, ALIGNED, offset)
+    if _gross(whole):
+        others = {words: replace(own, attitude=meant(own.attitude)) for words, meant in _CONVENTIONS.items()}
+        fits = {words: fit(other, told, ALIGNED, offset) for words, other in others.items()}
+        words = min(fits, key=lambda words: _gross(fits[words]))
+        if _gross(fits[words]) < _gross(whole):
+            remarks.append(f"the quaternions fit the truth best if they are {words}: they are read so")
+            own, whole = others[words], fits[words]
+    moved = ("time",) if abs(whole.offset) > 3.0 * whole.sigma[6] + 1e-9 else ()
+    base = whole.offset if moved else 0.0
+    trials = (moved, ("fixed", *moved), ("body", *moved), ("fixed", "body", *moved))
+    for names in trials:
+        found = fit(own, told, names, base)
+        if found.residual < max(GROSS if names == moved else 0.0, 1.5 * whole.residual):
+            break
+    return own, found
+
+
+def _gross(found: Alignment) -> int:
+    """Return how much must be put down to frames: the number of gross rotations, and more than all if even these do not help."""
+    turned = sum(float(np.linalg.norm(vector)) > GROSS for vector in (found.fixed, found.body))
+    return turned + (3 if found.residual > GROSS else 0)
+
+
+_CONVENTIONS = {
+    "the inverse, fixed frame to body": quaternion.conjugate,
+    "scalar last": lambda q: q[:, [3, 0, 1, 2]],
+    "scalar last and the inverse": lambda q: quaternion.conjugate(q[:, [3, 0, 1, 2]]),
+}
+
+
+def _in_truth_axes(P: Array, own: _Series, truth: Truth, alignment: Alignment) -> Array:
+    """Return covariances in the truth's body axes, the uncertainty of the alignment added."""
+    turn = quaternion.to_matrix(quaternion.exp(alignment.body)).T
+    size = P.shape[1]
+    T = np.kron(np.eye(size // 3), turn)
+    result = T @ P @ T.T
+    if alignment.estimated:
+        aligned = replace_attitude(own.attitude, alignment)
+        J = np.zeros((len(P), 3, 7))
+        J[:, :, :3] = np.swapaxes(quaternion.to_matrix(aligned), 1, 2)
+        J[:, :, 3:6] = np.eye(3)
+        J[:, :, 6] = -_speed_of(own.time, truth.attitude)
+        result[:, :3, :3] += J @ alignment.covariance @ np.swapaxes(J, 1, 2)
+    return np.asarray(result)
+
+
+# -------------------------------------------------------------------------------------------------------- explanations
+
+
+def explanations(
+    error: Array, readings: Mapping[str, Array], chosen: str, truth: Truth, time: Array, attitude: Array
+) -> tuple[Explanation, ...]:
+    """Return what would explain the attitude errors (m, 3) better than the covariance alone, the likeliest first.
+
+    Constant rotations and an offset in time are fitted by weighted least squares, and what they gain is held against χ²; a scale of σ too.
+    """
+    from scipy.special import chdtrc
+
+    P = readings[chosen][:, :3, :3]
+    white = whitened(error, P)
+    m = len(error)
+    before = float(np.mean(white * white))
+    effective = effective_samples(white / math.sqrt(max(before, 1e-300))) if m > 10 else 1.0
+    factor = np.linalg.cholesky(P)
+    designs = {
+        "constant rotation of the fixed frame (heading, gravity)": np.swapaxes(quaternion.to_matrix(attitude), 1, 2),
+        "constant rotation of the body frame (mounting)": np.tile(np.eye(3), (m, 1, 1)),
+        "offset of the clock, delay": -_speed_of(time, truth.attitude)[:, :, None],
+    }
+    found = []
+    for name, J in designs.items():
+        A = np.linalg.solve(factor, J)
+        N = np.einsum("mij,mik->jk", A, A)
+        if np.linalg.matrix_rank(N, 1e-12 * max(float(np.trace(N)), 1e-300)) < N.shape[0]:
+            continue
+        x = np.linalg.solve(N, np.einsum("mij,mi->j", A, white))
+        left = white - np.einsum("mij,j->mi", A, x)
+        after = float(np.mean(left**2))
+        # Beside a scale of σ: the gain is a ratio of variances, so that a filter too sure throughout does not make everything significant.
+        samples = effective_samples(left / math.sqrt(max(after, 1e-300))) if m > 10 else 1.0
+        gain = 3.0 * samples * math.log(max(before, 1e-300) / max(after, 1e-300))
+        size = f"{1e3 * x[0]:.4g} ms" if len(x) == 1 else f"{', '.join(f'{v / DEGREE:.3g}' for v in x)}°"
+        found.append(Explanation(name=name, value=size, nees=after, p_value=float(chdtrc(len(x), max(gain, 0.0)))))
+    scale_gain = 3.0 * effective * (before - 1.0 - math.log(max(before, 1e-300)))
+    found.append(
+        Explanation(
+            name=SCALE,
+            value=f"{math.sqrt(before):.3g}",
+            nees=1.0,
+            p_value=float(chdtrc(1, max(scale_gain, 0.0))),
+        )
+    )
+    probabilities = frame_probabilities(error, {name: P[:, :3, :3] for name, P in readings.items()})
+    for name, P_other in readings.items():
+        if name == chosen or probabilities[name] <= probabilities[chosen]:
+            continue
+        other = whitened(error, P_other[:, :3, :3])
+        found.append(
+            Explanation(
+                name=f"covariance meant as {name}",
+                value=f"{100.0 * probabilities[name]:.3g} %",
+                nees=float(np.mean(other * other)),
+                p_value=min(1.0, probabilities[chosen] / max(probabilities[name], 1e-300)),
+            )
+        )
+    # What has a cause comes before a factor on σ, which takes in all of them.
+    return tuple(sorted(found, key=lambda one: (not one.likely, one.name == SCALE, one.p_value)))

@@ -1,0 +1,422 @@
+"""Attitudes over time from files of any filter or reference, with their covariance where the file tells it: what a filter is judged by.
+
+``read_attitudes`` tells formats apart by content:
+
+- results of this package (HDF5): estimate, simulated record (its truth), integrated attitude;
+- TUM trajectories (no covariance) and EuRoC's ground truth;
+- CSV and TSV with the columns of :data:`COLUMNS`, such as `strapdown convert estimate.h5 estimate.csv` writes;
+- ROS bags: ``sensor_msgs/Imu`` (orientation), ``nav_msgs/Odometry``, ``geometry_msgs/PoseWithCovarianceStamped``, ``PoseStamped``,
+  ``QuaternionStamped``;
+- flight logs of PX4 (ULog): ``estimator_states`` with ``estimator_innovations``, or ``vehicle_attitude``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import re
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from strapdown import outputs, quaternion, reading, recordfiles, records
+from strapdown.checks import Array, InputError, array, one_of
+from strapdown.recordings import delimited, ros, trajectories
+from strapdown.recordings.extras import library
+from strapdown.records import Innovations
+from strapdown.units import DEGREE, DEGREE_PER_HOUR
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Attitudes:
+    """Attitudes of a file, in its own frames."""
+
+    source: str
+    stamps_ns: NDArray[np.int64]
+    """(m,), ns of the file's clock, increasing."""
+    attitude: Array
+    """q_fb (m, 4), scalar first."""
+    covariance: Array | None = None
+    """(m, 3, 3) of the attitude error, rad², or (m, 6, 6) with that of the bias."""
+    error_frame: str = ""
+    """What the covariance is of (:data:`strapdown.consistency.foreign.ERROR_FRAMES`), where the format says; else empty."""
+    bias: Array | None = None
+    """Gyro bias (m, 3), rad/s, body axes."""
+    innovations: Mapping[str, Innovations] = field(default_factory=dict)
+    """By sensor; times in s since the first stamp."""
+    remarks: tuple[str, ...] = ()
+
+    def seconds(self, origin_ns: int) -> Array:
+        """Return the stamps in s since an origin of the clock."""
+        return np.asarray((self.stamps_ns - origin_ns) / 1e9)
+
+
+def read_attitudes(path: str | os.PathLike[str], *, topic: str = "") -> Attitudes:
+    """Read the attitudes of a file, or of the folder of a ROS 2 bag.
+
+    Parameters
+    ----------
+    path : path
+    topic : str
+        Of a bag, where several topics hold attitudes.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged, or holds no attitudes.
+    """
+    file = Path(path)
+    if ros.is_folder(file):
+        return _bag(file, topic)
+    reading.existing_file(file)
+    if reading.is_hdf5(file):
+        return _own(file)
+    with reading.opened(file) as stream:
+        head = stream.read(4096)
+    if head.startswith(ros.MAGICS):
+        return _bag(file, topic)
+    if topic:
+        raise InputError(f"{file.name} is no bag; leave --topic out")
+    if head.startswith(b"ULog"):
+        return _ulog(file)
+    if trajectories.is_tum(head + b"\n"):
+        stamps, q = trajectories.read_tum(file)
+        return Attitudes(source=file.name, stamps_ns=stamps, attitude=q, remarks=("TUM trajectory: no covariance.",))
+    return _table(file)
+
+
+def _whole_ns(time: Array) -> NDArray[np.int64]:
+    return np.asarray(np.rint(time * 1e9)).astype(np.int64)
+
+
+def _own(path: Path) -> Attitudes:
+    """Read a result of this package."""
+    kind = str(records.read_attributes(path)["kind"])
+    if kind == "strapdown estimate":
+        estimate = records.read_estimate(path)
+        P = estimate.covariance
+        return Attitudes(
+            source=path.name,
+            stamps_ns=_whole_ns(estimate.time),
+            attitude=quaternion.normalize(estimate.attitude),
+            covariance=P if P is not None else np.apply_along_axis(np.diag, 1, estimate.variance),
+            error_frame="body",
+            bias=estimate.bias,
+            innovations=estimate.innovations,
+        )
+    if recordfiles.is_record(path):
+        record = recordfiles.read_record(path)
+        if record.truth is None:
+            raise InputError(f"{path} is a record without a truth; simulate one, or give another reference")
+        return Attitudes(
+            source=path.name, stamps_ns=_whole_ns(record.time), attitude=record.truth.attitude, bias=record.truth.bias
+        )
+    if kind == "strapdown attitude":
+        with reading.hdf5(path) as file:
+            time, q = reading.numbers(file, "time"), reading.numbers(file, "attitude")
+        return Attitudes(source=path.name, stamps_ns=_whole_ns(time), attitude=q)
+    raise InputError(
+        f"{path} is a {kind}, which holds no attitudes over time; give an estimate, a record or a trajectory"
+    )
+
+
+# ------------------------------------------------------------------------------------------------------------ tables
+
+COLUMNS: dict[str, str] = {
+    "time": r"(time|timestamp|t|stamp|#?timestamp)([ _]?[\[(]?(?P<unit>s|sec|ms|us|ns)[\])]?)?",
+    "q": r"(q|q_|quat_|orientation[._]|rotation[._]|q_rs_)(?P<axis>[wxyz])( \[\])?",
+    "cov": r"(cov|p)_((?P<frame>body|fixed|euler)_)?(?P<one>b?[xyz])(?P<two>b?[xyz])(_(?P<unit>rad2|deg2|rad2_per_s|rad2_per_s2))?",
+    "sigma": r"(sigma|std)_(?P<axis>[xyz])_(?P<unit>rad|deg)",
+    "angle": r"(?P<axis>roll|pitch|yaw)_(sigma|std)_(?P<unit>rad|deg)",
+    "bias": r"(gyro_)?bias_(?P<axis>[xyz])_(?P<unit>rad_per_s|deg_per_h|deg_per_s)",
+}
+"""Columns of a table by what they hold: patterns of whole names, in small letters. ``cov_xy_rad2`` is an element of the covariance of the
+attitude error, ``cov_xby`` one of attitude and bias, ``cov_fixed_xy_rad2`` one that says what it is of; ``sigma_x_deg`` and
+``yaw_sigma_deg`` give a diagonal, of rotation vector or angles."""
+_TIME = {"s": 10**9, "sec": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
+_SIZE = {"rad": 1.0, "deg": DEGREE, "rad_per_s": 1.0, "deg_per_h": DEGREE_PER_HOUR, "deg_per_s": DEGREE}
+_STATES = ("x", "y", "z", "bx", "by", "bz")
+_PATTERNS = {name: re.compile(pattern) for name, pattern in COLUMNS.items()}
+
+
+def _table(path: Path) -> Attitudes:
+    """Read a table of text."""
+    with reading.from_file(path):
+        table = delimited._Table(path.name, io.StringIO(reading.text(path), newline=""))
+        found: dict[str, dict[str, tuple[int, str]]] = {name: {} for name in COLUMNS}
+        frames: set[str] = set()
+        for place, cell in enumerate(table.header):
+            for name, pattern in _PATTERNS.items():
+                match = pattern.fullmatch(cell.strip().lower())
+                if match is None:
+                    continue
+                told = match.groupdict()
+                key = f"{told['one']} {told['two']}" if name == "cov" else str(told.get("axis", ""))
+                if told.get("frame"):
+                    frames.add(told["frame"])
+                if key in found[name]:
+                    raise InputError(
+                        f"{path.name}: column {cell} says the same as column {table.header[found[name][key][0]]}"
+                    )
+                found[name][key] = (place, told.get("unit") or "")
+        if len(frames) > 1:
+            raise InputError(
+                f"{path.name}: its covariance is of {' and '.join(sorted(frames))} axes; name all its columns alike"
+            )
+        if set(found["q"]) != set("wxyz") or not found["time"]:
+            raise InputError(
+                f"{path.name} lacks {'time' if not found['time'] else 'the four columns of a quaternion'}; wanted time_s (or _ns), "
+                f"qw, qx, qy, qz[, cov_xx_rad2, …], and it has: {', '.join(table.header[:12])}"
+            )
+        time_place, time_unit = found["time"][""]
+        places = sorted({place for group in found.values() for place, _ in group.values()})
+        numbers = table.load(places, time_place)
+        whole = table.clock_ns(time_place)
+    columns = {
+        name: {key: (numbers[place], unit) for key, (place, unit) in group.items()} for name, group in found.items()
+    }
+    if whole is not None:
+        stamps = np.rint(whole[0] * 1e9).astype(np.int64) + whole[1]
+    else:
+        stamps = np.rint(numbers[time_place] * _TIME[time_unit or "s"]).astype(np.int64)
+    q = np.stack([columns["q"][axis][0] for axis in "wxyz"], axis=1)
+    known = np.isfinite(q).all(axis=1)
+    covariance, frame, remarks = _covariance(path.name, columns, len(stamps))
+    frame = frame or next(iter(frames), "")
+    bias = None
+    if set(columns["bias"]) == set("xyz"):
+        bias = np.stack([value * _SIZE[unit] for value, unit in (columns["bias"][axis] for axis in "xyz")], axis=1)
+    if covariance is not None and covariance.shape[1] == 6 and bias is None:
+        covariance = covariance[:, :3, :3]
+    if covariance is not None and covariance.shape[1] == 3:
+        bias = None  # of which there is no covariance
+    _need_order(path.name, stamps[known])
+    return Attitudes(
+        source=path.name,
+        stamps_ns=stamps[known],
+        attitude=_unit(path.name, q[known]),
+        covariance=None if covariance is None else covariance[known],
+        error_frame=frame,
+        bias=None if bias is None else bias[known],
+        remarks=tuple(remarks),
+    )
+
+
+def _covariance(
+    name: str, columns: Mapping[str, Mapping[str, tuple[Array, str]]], m: int
+) -> tuple[Array | None, str, list[str]]:
+    """Return the covariance that columns tell, what it is of where they say, and what is to be said of it."""
+    given = columns["cov"]
+    if given:
+        size = 6 if any("b" in key for key in given) else 3
+        P = np.full((m, size, size), np.nan)
+        for key, (value, unit) in given.items():
+            i, j = (_STATES.index(one) for one in key.split())
+            P[:, i, j] = P[:, j, i] = value * (DEGREE**2 if unit == "deg2" else 1.0)
+        if np.isnan(P).any(axis=0).any():
+            i, j = np.argwhere(np.isnan(P).any(axis=0))[0]
+            raise InputError(f"{name}: cov_{_STATES[i]}{_STATES[j]} is missing, or empty in a row; give all elements")
+        return P, "", []
+    for group, axes, frame in (("sigma", "xyz", ""), ("angle", ("roll", "pitch", "yaw"), "euler")):
+        told = columns[group]
+        if set(told) == set(axes):
+            sigma = np.stack([told[axis][0] * _SIZE[told[axis][1]] for axis in axes], axis=1)
+            words = "The file tells σ, no covariance: errors of different axes are taken for independent."
+            return np.apply_along_axis(np.diag, 1, sigma**2), frame, [words]
+    return None, "", ["The table has no covariance."]
+
+
+def _unit(name: str, q: Array) -> Array:
+    length = np.linalg.norm(array(f"{name}: quaternion", q, ("m", 4)), axis=1)
+    bad = np.abs(length - 1.0) > 1e-2
+    if bad.any():
+        raise InputError(f"{name}: quaternion {int(np.argmax(bad)) + 1} has norm {length[np.argmax(bad)]:.4g}, not 1")
+    return quaternion.normalize(q)
+
+
+def _need_order(name: str, stamps: NDArray[np.int64]) -> None:
+    back = np.diff(stamps) <= 0
+    if back.any():
+        raise InputError(
+            f"{name}: row {int(np.argmax(back)) + 2} is not after the one before; sort the rows, or check the unit of time"
+        )
+
+
+# -------------------------------------------------------------------------------------------------------------- bags
+
+_ORIENTED = {
+    "sensor_msgs/msg/Imu": ("orientation", "orientation_covariance"),
+    "nav_msgs/msg/Odometry": ("pose.pose.orientation", "pose.covariance"),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": ("pose.pose.orientation", "pose.covariance"),
+    "geometry_msgs/msg/PoseStamped": ("pose.orientation", ""),
+    "geometry_msgs/msg/QuaternionStamped": ("quaternion", ""),
+}
+"""Where messages hold an orientation, and its covariance: 3 × 3, or the last rows and columns of 6 × 6."""
+
+
+def _bag(path: Path, topic: str) -> Attitudes:
+    """Read the orientations of a bag. Poses have their covariance about fixed axes by REP 103; drivers of Imu do as they like."""
+    highlevel = library("rosbags.highlevel", f"{path.name} is a ROS bag, which")
+    typesys = library("rosbags.typesys", f"{path.name} is a ROS bag, which")
+    rows: list[tuple[int, list[float], Array | None]] = []
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            store = typesys.get_typestore(typesys.Stores.LATEST)
+            with highlevel.AnyReader([ros._named(path, Path(folder))], default_typestore=store) as reader:
+                found = {c.topic: c for c in reader.connections if c.msgtype in _ORIENTED}
+                chosen = _topic(path.name, found, topic)
+                where, beside = _ORIENTED[found[chosen].msgtype]
+                for connection, logged, raw in reader.messages(connections=[found[chosen]]):
+                    message = reader.deserialize(raw, connection.msgtype)
+                    stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+                    q = _at(message, where)
+                    P = np.asarray(_at(message, beside), np.float64) if beside else None
+                    rows.append((stamp or logged, [q.w, q.x, q.y, q.z], P))
+    except InputError:
+        raise
+    except Exception as error:  # the library raises what its parsers do
+        raise InputError(f"{path.name} cannot be read as a ROS bag ({' '.join(str(error).split())})") from None
+    told = [row for row in rows if any(row[1]) and not (row[2] is not None and row[2][0] == -1.0)]
+    if len(told) < 2:
+        raise InputError(f"{path.name}: topic {chosen} says nothing of the orientation in its {len(rows)} messages")
+    told.sort(key=lambda row: row[0])
+    stamps = np.array([row[0] for row in told], np.int64)
+    fresh = np.concatenate([[True], np.diff(stamps) > 0])
+    remarks = [f"Topic {chosen}: {int(fresh.sum())} orientations of {len(rows)} messages."]
+    covariance = None
+    if beside:
+        P = np.array([row[2] for row in told])
+        P = P.reshape(-1, 6, 6)[:, 3:, 3:] if P.shape[1] == 36 else P.reshape(-1, 3, 3)
+        if P.any():
+            covariance = P[fresh]
+        else:
+            remarks.append("Its covariances are zero: unknown.")
+    return Attitudes(
+        source=path.name,
+        stamps_ns=stamps[fresh],
+        attitude=_unit(path.name, np.array([row[1] for row in told])[fresh]),
+        covariance=covariance,
+        remarks=tuple(remarks),
+    )
+
+
+def _topic(name: str, found: Mapping[str, Any], topic: str) -> str:
+    if not found:
+        raise InputError(f"{name} has no topic of {', '.join(kind.rpartition('/')[2] for kind in _ORIENTED)}")
+    if topic:
+        return one_of(f"{name}: topic", topic, found)
+    if len(found) > 1:
+        listed = ", ".join(f"{t} ({c.msgtype.rpartition('/')[2]}, {c.msgcount} messages)" for t, c in found.items())
+        raise InputError(f"{name} has several topics with orientations: {listed}; choose one by --topic")
+    return next(iter(found))
+
+
+def _at(message: Any, where: str) -> Any:
+    for part in where.split("."):
+        message = getattr(message, part)
+    return message
+
+
+# -------------------------------------------------------------------------------------------------------------- ULog
+
+_STATES_TOPIC, _ATTITUDE_TOPIC = "estimator_states", "vehicle_attitude"
+_INNOVATIONS, _VARIANCES = "estimator_innovations", "estimator_innovation_variances"
+
+
+def _ulog(path: Path) -> Attitudes:
+    """Read PX4's own estimate of attitude, body axes forward, right, down, turned to East-North-Up, and its innovations."""
+    pyulog = library("pyulog", f"{path.name} is a flight log of PX4, which")
+    wanted = [_STATES_TOPIC, _ATTITUDE_TOPIC, _INNOVATIONS, _VARIANCES]
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            log = pyulog.ULog(str(path), wanted)
+    except Exception as error:  # of a damaged log the library raises what its parsers do
+        raise InputError(
+            f"{path.name} cannot be read as ULog ({' '.join(str(error).split())}); the log is damaged"
+        ) from None
+    data = {one.name: one.data for one in log.data_list if one.multi_id == 0 and len(one.data["timestamp"]) > 1}
+    remarks: list[str] = []
+    covariance = None
+    if _STATES_TOPIC in data:
+        rows = data[_STATES_TOPIC]
+        stamps, kept = _fresh(rows)
+        ned = np.stack([np.asarray(rows[f"states[{k}]"], np.float64) for k in range(4)], axis=1)[kept]
+        told = np.stack(
+            [np.asarray(rows[f"covariances[{k}]"], np.float64) for k in range(4) if f"covariances[{k}]" in rows], axis=1
+        )[kept]
+        number = sum(name.startswith("covariances[") for name in rows)
+        ned = _unit(path.name, ned)
+        if number == 24:  # variances of the quaternion: δθ = 2 Ξ(q)ᵀ δq
+            xi = np.stack([_quaternion_columns(one) for one in ned])
+            covariance = 4.0 * np.einsum("mqi,mq,mqj->mij", xi, told, xi)
+            remarks.append(
+                "The log holds the variances of the quaternion without their correlations: σ of the attitude is approximate."
+            )
+        elif number > 0:
+            covariance = np.apply_along_axis(np.diag, 1, told[:, :3])
+            remarks.append("The log holds the variances of the attitude error without their correlations.")
+    elif _ATTITUDE_TOPIC in data:
+        rows = data[_ATTITUDE_TOPIC]
+        stamps, kept = _fresh(rows)
+        ned = _unit(path.name, np.stack([np.asarray(rows[f"q[{k}]"], np.float64) for k in range(4)], axis=1)[kept])
+        remarks.append(f"{_ATTITUDE_TOPIC}: no covariance.")
+    else:
+        raise InputError(f"{path.name} holds neither {_STATES_TOPIC} nor {_ATTITUDE_TOPIC}; log one of them")
+    if covariance is not None and not (np.diagonal(covariance, axis1=1, axis2=2) > 0.0).all():
+        covariance = None
+        remarks.append("Its variances are not all above zero: left out.")
+    innovations: dict[str, Innovations] = {}
+    if _INNOVATIONS in data and _VARIANCES in data:
+        innovations = _ulog_innovations(data[_INNOVATIONS], data[_VARIANCES], int(stamps[0]))
+    return Attitudes(
+        source=path.name,
+        stamps_ns=stamps * 1000,
+        attitude=outputs.from_ned(ned),
+        covariance=covariance,
+        error_frame="body" if covariance is not None and number == 24 else "",
+        innovations=innovations,
+        remarks=tuple(remarks),
+    )
+
+
+def _fresh(rows: Mapping[str, Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return stamps, µs, in order and once each, and the rows that they are of; of the sample where that is told."""
+    stamps = np.asarray(rows.get("timestamp_sample", rows["timestamp"])).astype(np.int64)
+    order = np.argsort(stamps, kind="stable")
+    kept = order[np.concatenate([[True], np.diff(stamps[order]) > 0])]
+    return stamps[kept], kept
+
+
+def _quaternion_columns(q: Array) -> Array:
+    """Return Ξ (4, 3) of ``δq = ½ Ξ δθ``, the body-side error."""
+    w, x, y, z = q
+    return np.array([[-x, -y, -z], [w, -z, y], [z, w, -x], [-y, x, w]])
+
+
+def _ulog_innovations(values: Mapping[str, Any], variances: Mapping[str, Any], first: int) -> dict[str, Innovations]:
+    """Return innovations by field; a value that is held from the row before is no new measurement."""
+    at = np.asarray(values["timestamp"]).astype(np.int64)
+    beside = {stamp: k for k, stamp in enumerate(np.asarray(variances["timestamp"]).astype(np.int64).tolist())}
+    rows = np.array([k for k, stamp in enumerate(at.tolist()) if stamp in beside], np.int64)
+    if not len(rows):
+        return {}
+    other = np.array([beside[stamp] for stamp in at[rows].tolist()], np.int64)
+    fields: dict[str, list[str]] = {}
+    for name in values:
+        if not name.startswith("timestamp") and name in variances:
+            fields.setdefault(name.partition("[")[0], []).append(name)
+    found = {}
+    for name, parts in fields.items():
+        e = np.stack([np.asarray(values[part], np.float64)[rows] for part in parts], axis=1)
+        s = np.stack([np.asarray(variances[part], np.float64)[other] for part in parts], axis=1)
+        new = np.isfinite(e).all(axis=1) & np.isfinite(s).all(axis=1) & (s > 0.0).all(axis=1)
+        new &= np.concatenate([[True], np.any(np.diff(e, axis=0) != 0.0, axis=1)])
+        if new.sum() > 1:
+            found[name] = Innovations(time=(at[rows][new] - first) / 1e6, innovation=e[new], variance=s[new])
+    return found

@@ -1,0 +1,525 @@
+"""Estimates of other filters against a truth: clocks, frames and the reading of their covariance found, faults named."""
+
+import importlib.util
+import json
+import struct
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from strapdown import (
+    cli,
+    consistency,
+    montecarlo,
+    quaternion,
+    recordfiles,
+    recordings,
+    report,
+    scenarios,
+    setup,
+    vectors,
+)
+from strapdown.checks import InputError
+from strapdown.consistency import check_arrays, foreign
+from strapdown.gyro import GyroSpec
+from strapdown.motion import Harmonic, HarmonicRates
+from strapdown.outputs import euler, euler_axes, to_ned
+from strapdown.recordings import attitudes, ulog
+from strapdown.recordings.attitudes import read_attitudes
+from strapdown.records import Truth, read_estimate, read_truth, write_estimate
+from strapdown.units import DEGREE, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
+
+SIMS = Path(__file__).resolve().parents[1] / "sims"
+
+FLIGHT = scenarios.Scenario(
+    motion=HarmonicRates(
+        mean=(0.02, -0.03, 0.05),
+        harmonics=(
+            Harmonic(amplitude=(0.3, 0.1, 0.0), frequency=0.07),
+            Harmonic(amplitude=(0.0, 0.2, 0.25), frequency=0.11, phase=1.0),
+        ),
+    ),
+    # A gyro so poor that errors forget each other within seconds: one run then tells much.
+    gyro=GyroSpec(angle_random_walk=20.0 * DEGREE_PER_ROOT_HOUR, rate_random_walk=20.0 * DEGREE_PER_HOUR_PER_ROOT_HOUR),
+    sensors=(
+        vectors.VectorSensor(name="fine", reference_f=np.array([0.0, 0.6, 0.8]), sigma=0.2 * DEGREE, rate=1.0),
+        vectors.VectorSensor(name="coarse", reference_f=np.array([0.8, 0.0, -0.6]), sigma=2.0 * DEGREE, rate=1.0),
+    ),
+    rate=10.0,
+    duration=300.0,
+)
+
+
+@pytest.fixture(scope="module")
+def run():
+    plan = montecarlo.Plan(scenario=FLIGHT, setup=setup.matched(FLIGHT), seed=5, epochs=20)
+    return montecarlo.replay(plan, 0, machine="scalar")
+
+
+def checked(run, **changes):
+    e, t = run.estimate, run.record.truth
+    told = {"time": e.time, "attitude": e.attitude, "covariance": e.covariance, "true_time": e.time}
+    told |= {"true_attitude": t.attitude, "bias": e.bias, "true_bias": t.bias, "innovations": e.innovations}
+    return check_arrays(**{**told, **changes})
+
+
+def carried(P, turn):
+    T = np.tile(np.eye(P.shape[1]), (len(P), 1, 1))
+    T[:, :3, :3] = turn
+    return T @ P @ np.swapaxes(T, 1, 2)
+
+
+def fixed_side(estimate):
+    return carried(estimate.covariance, quaternion.to_matrix(estimate.attitude))
+
+
+def statistics(judgement):
+    return [(one.name, one.of, one.value, one.p_value, one.rejected) for one in judgement.findings]
+
+
+# ---------------------------------------------------------------------------------------------------------- our own
+
+
+def test_our_own_estimate_gets_its_own_verdict(run):
+    own = consistency.judge(run.estimate, run.record.truth)
+    found = checked(run)
+    assert own.verdict == "consistent"
+    assert statistics(found.judgement) == statistics(own)
+    assert found.alignment.estimated == ()
+    assert found.error_frame == "body"
+    assert found.frame_probability["body"] > 0.99
+    assert not any(one.likely for one in found.explanations)
+
+
+def command(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr(sys, "argv", ["strapdown", *map(str, arguments)])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    told = capsys.readouterr()
+    return end.value.code, " ".join(told.out.split()), " ".join(told.err.split())
+
+
+@pytest.fixture(scope="module")
+def files(run, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("foreign")
+    recordfiles.write_record(folder / "record.h5", run.record)
+    write_estimate(folder / "estimate.h5", run.estimate, truth=run.record.truth)
+    recordings.write(run.estimate, folder / "estimate.csv")
+    recordings.write(run.estimate, folder / "estimate.tum")
+    # A bag holds stamps of a recording, which begins one sample after the record's first edge.
+    late = replace(
+        run.estimate,
+        time=run.estimate.time[1:],
+        attitude=run.estimate.attitude[1:],
+        bias=run.estimate.bias[1:],
+        variance=run.estimate.variance[1:],
+        covariance=run.estimate.covariance[1:],
+    )
+    recordings.write(late, folder / "estimate.mcap", recording=recordings.from_record(run.record))
+    return folder
+
+
+@pytest.mark.parametrize("name", ["estimate.csv", "estimate.h5"])
+def test_exported_and_read_back_it_has_the_same_verdict(run, files, name, monkeypatch, capsys):
+    status, said, _ = command(
+        monkeypatch, capsys, "check", files / name, "--truth", files / "record.h5", "--json", files / "out.json"
+    )
+    told = json.loads((files / "out.json").read_text())
+    own = consistency.judge(
+        run.estimate if name.endswith("h5") else replace(run.estimate, innovations={}), run.record.truth
+    )
+    assert told["verdict"] == own.verdict == "consistent"
+    assert status == 0
+    assert [(one["name"], one["of"]) for one in told["findings"]] == [(one.name, one.of) for one in own.findings]
+    np.testing.assert_allclose(
+        [one["value"] for one in told["findings"]], [one.value for one in own.findings], rtol=1e-9
+    )
+    assert told["alignment"]["removed"] == []
+    assert "the file says that its covariance is of the body error" in said
+
+
+def test_a_bag_has_the_attitude_about_fixed_axes(run, files, monkeypatch, capsys):
+    pytest.importorskip("rosbags")
+    status, said, _ = command(
+        monkeypatch, capsys, "check", files / "estimate.mcap", "--truth", files / "record.h5", "--json", files / "b.json",
+        "--topic", "/imu/data",
+    )  # fmt: skip
+    told = json.loads((files / "b.json").read_text())
+    assert told["error_frame"] == "fixed"
+    assert told["error_frame_probability"]["fixed"] > 0.99
+    assert "the covariance is read as fixed" in said
+    e, t = run.estimate, run.record.truth
+    cut = slice(1, None)
+    alone = consistency.judge(
+        replace(
+            e, time=e.time[cut], attitude=e.attitude[cut], bias=np.full_like(e.bias[cut], np.nan), variance=e.variance[cut],
+            covariance=e.covariance[cut], innovations={},
+        ),
+        Truth(attitude=t.attitude[cut], bias=t.bias[cut]),
+    )  # fmt: skip
+    assert (told["verdict"], status) == (alone.verdict, {"consistent": 0, "cannot tell": 2}[alone.verdict])
+    np.testing.assert_allclose(
+        [one["value"] for one in told["findings"]], [one.value for one in alone.findings], rtol=1e-6
+    )
+
+
+def test_a_trajectory_without_covariance_is_not_judged(files, monkeypatch, capsys):
+    status, said, _ = command(monkeypatch, capsys, "check", files / "estimate.tum", "--truth", files / "record.h5")
+    assert status == 2
+    assert "tells no covariance, so its errors are not judged (RMS attitude error" in said
+    assert "cannot tell" in said
+
+
+def test_what_was_judged_can_be_reported(files, run, monkeypatch, capsys):
+    out = files / "aligned.h5"
+    status, _, _ = command(
+        monkeypatch, capsys, "check", files / "estimate.csv", "--truth", files / "record.h5", "--aligned", out
+    )
+    assert status == 0
+    assert command(monkeypatch, capsys, "check", out)[0] == 0
+    report.write(out, files / "aligned.html")
+    assert "consistent" in (files / "aligned.html").read_text(encoding="utf-8")
+
+
+def test_an_estimate_without_a_bias_is_kept_and_reported(files, run, tmp_path):
+    e = run.estimate
+    found = checked(run, covariance=e.covariance[:, :3, :3], bias=None, innovations={})
+    out = tmp_path / "attitude.h5"
+    write_estimate(out, found.estimate, truth=found.truth)
+    read = read_estimate(out)
+    assert not read.has_bias
+    np.testing.assert_array_equal(read.covariance[:, :3, :3], e.covariance[:, :3, :3])
+    assert statistics(consistency.judge(read, read_truth(out))) == statistics(found.judgement)
+    assert {one.of for one in found.judgement.findings} == {"attitude"}
+    report.write(out, tmp_path / "attitude.html")
+    page = (tmp_path / "attitude.html").read_text(encoding="utf-8")
+    assert "gyro bias" not in page
+    assert all("NaN" not in one.read_text() for one in tmp_path.glob("*.json"))
+
+
+# ------------------------------------------------------------------------------------------------------- faults, named
+
+HEADING = quaternion.exp(np.array([0.0, 0.0, 2.0 * DEGREE]))
+MOUNTING = quaternion.exp(np.array([0.0, 1.5 * DEGREE, 0.0]))
+FAULTS = {
+    "too sure": ({"covariance": lambda e: e.covariance / 4.0}, "σ wrong by one factor"),
+    "too modest": ({"covariance": lambda e: e.covariance * 4.0}, "σ wrong by one factor"),
+    "fixed read as body": ({"covariance": fixed_side, "error_frame": "body"}, "covariance meant as fixed"),
+    "late": ({"time": lambda e: e.time + 0.1, "align": "none"}, "offset of the clock, delay"),
+    "heading": (
+        {"attitude": lambda e: quaternion.multiply(HEADING, e.attitude)},
+        "constant rotation of the fixed frame (heading, gravity)",
+    ),
+    "mounting": (
+        {"attitude": lambda e: quaternion.multiply(e.attitude, MOUNTING)},
+        "constant rotation of the body frame (mounting)",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_broken_filter_is_called_wrong_and_its_fault_is_named_first(run, fault):
+    changes, name = FAULTS[fault]
+    made = {key: value(run.estimate) if callable(value) else value for key, value in changes.items()}
+    found = checked(run, **{"error_frame": "body", "innovations": {}, **made})
+    assert found.judgement.verdict == "not consistent"
+    assert found.explanations[0].name == name, [(one.name, one.p_value, one.nees) for one in found.explanations]
+    assert found.explanations[0].likely
+    assert abs(np.log(found.explanations[0].nees)) < np.log(1.5)
+
+
+# ------------------------------------------------------------------------------------------------- reading and aligning
+
+
+def test_the_reading_of_the_covariance_is_found(run):
+    e = run.estimate
+    turn = np.linalg.inv(euler_axes(e.attitude)[:, :, ::-1])
+    for frame, P in (("fixed", fixed_side(e)), ("euler", carried(e.covariance, turn))):
+        found = checked(run, covariance=P)
+        assert found.error_frame == frame
+        assert found.frame_probability[frame] > 0.99
+        np.testing.assert_allclose(found.estimate.covariance, e.covariance, atol=1e-9 * e.covariance.max())
+    wrong = checked(run, covariance=fixed_side(e), error_frame="body")
+    assert any("as fixed the errors would fit it better by far" in words for words in wrong.remarks)
+
+
+def test_equal_axes_leave_the_reading_open(run):
+    m = len(run.estimate.time)
+    found = checked(run, covariance=np.tile(DEGREE**2 * np.eye(3), (m, 1, 1)), bias=None)
+    assert found.frame_probability["body"] == pytest.approx(found.frame_probability["fixed"], rel=1e-6)
+    assert any("do not tell how the covariance is meant" in words for words in found.remarks)
+
+
+def test_euler_axes_are_the_derivative_of_the_angles():
+    q = quaternion.exp(np.random.default_rng(1).standard_normal((20, 3)))
+    angles, E = euler(q).angles, euler_axes(q)
+    for k in range(3):
+        moved = angles.copy()
+        moved[:, k] += 1e-6
+        turn = quaternion.log(quaternion.multiply(quaternion.conjugate(q), quaternion.from_euler(moved))) / 1e-6
+        np.testing.assert_allclose(E[:, :, k], turn, atol=1e-5)
+
+
+F, B = quaternion.exp(np.array([0.1, 0.2, 2.0])), quaternion.exp(np.array([1.5, 0.3, -0.7]))
+
+
+def test_frames_and_clock_are_found_and_removed(run):
+    e = run.estimate
+    turned = quaternion.multiply(quaternion.multiply(F, e.attitude), B)
+    T = np.kron(np.eye(2), quaternion.to_matrix(quaternion.conjugate(B)))
+    found = checked(
+        run, time=e.time + 1e6, attitude=turned, covariance=T @ e.covariance @ T.T, bias=e.bias @ T[:3, :3].T
+    )
+    a = found.alignment
+    assert a.estimated == ("time", "fixed", "body")
+    for rotation, made, rows in ((a.fixed, F, slice(0, 3)), (a.body, B, slice(3, 6))):
+        off = quaternion.log(quaternion.multiply(quaternion.exp(rotation), made))
+        assert np.all(np.abs(off) < 4.5 * a.sigma[rows])
+        assert np.all(a.sigma[rows] < 0.5 * DEGREE)
+    assert abs(a.offset + 1e6) < 4.5 * a.sigma[6] < 0.2
+    assert found.judgement.verdict == "consistent"
+    assert len([words for words in found.remarks if "removed" in words]) == 3
+    # The uncertainty of what was removed is part of the covariance.
+    before, after = (
+        np.trace(e.covariance[:, :3, :3], axis1=1, axis2=2),
+        np.trace(found.estimate.covariance[:, :3, :3], axis1=1, axis2=2),
+    )
+    assert after.mean() > before.mean() + 3.0 * float(np.mean(a.sigma[:6] ** 2))
+
+
+@pytest.mark.parametrize("convention", ["conjugate", "last", "last, conjugate"])
+def test_conventions_of_quaternions_are_found(run, convention):
+    q = run.estimate.attitude
+    q = quaternion.conjugate(q) if "conjugate" in convention else q
+    q = q[:, [1, 2, 3, 0]] if "last" in convention else q
+    found = checked(run, attitude=q)
+    assert found.judgement.verdict == "consistent"
+    assert found.alignment.estimated == ()
+    wanted = {
+        "conjugate": "the inverse, fixed",
+        "last": "are scalar last:",
+        "last, conjugate": "scalar last and the inverse",
+    }
+    assert any(wanted[convention] in words for words in found.remarks)
+
+
+def test_sigma_of_the_alignment_is_honest():
+    """White errors of 1° an axis, 60 draws of seven parameters: their squares over their covariance are χ² of seven degrees."""
+    time = np.arange(0.0, 60.0, 0.2)
+    truth = FLIGHT.motion.attitude(np.arange(-5.0, 65.0, 0.02))
+    squares = []
+    for seed in range(60):
+        noise = DEGREE * np.random.default_rng([7, seed]).standard_normal((len(time), 3))
+        own = quaternion.multiply(FLIGHT.motion.attitude(time), quaternion.exp(noise))
+        a = foreign.fit(
+            foreign._Series(time, own), foreign._Series(np.arange(-5.0, 65.0, 0.02), truth), foreign.ALIGNED, 0.0
+        )
+        x = np.concatenate([a.fixed, a.body, [a.offset]])
+        squares.append(x @ np.linalg.solve(a.covariance, x) / 7.0)
+    low, high = consistency.mean_bounds(7, 60, 0.999)
+    assert low < np.mean(squares) < high * 1.1  # the scatter is estimated, 900 residuals
+
+
+def test_a_sparser_truth_is_taken_at_its_own_times(run):
+    t = run.record.truth
+    every = slice(3, None, 20)
+    found = checked(run, true_time=run.estimate.time[every], true_attitude=t.attitude[every], true_bias=t.bias[every])
+    assert len(found.estimate.time) == len(run.estimate.time[every])
+    np.testing.assert_allclose(found.estimate.attitude, run.estimate.attitude[every], atol=1e-12)
+
+
+def test_what_is_asked_for_is_removed(run):
+    turned = quaternion.multiply(HEADING, run.estimate.attitude)
+    found = checked(run, attitude=turned, align="fixed", error_frame="body")
+    assert found.alignment.estimated == ("fixed",)
+    assert found.judgement.verdict == "consistent"
+
+
+# ---------------------------------------------------------------------------------------------------------------- files
+
+
+def flight_log(path, run, old=True):
+    """A log of PX4's estimator, written byte by byte: states, variances, innovations."""
+    e = run.estimate
+    stamps = np.rint(1e6 * e.time).astype(np.int64)
+    number = 24 if old else 23
+    layouts = {
+        "estimator_states": f"uint64_t timestamp;uint64_t timestamp_sample;float[24] states;float[{number}] covariances;uint8_t n_states;",
+        "estimator_innovations": "uint64_t timestamp;float[3] gravity;float heading;",
+        "estimator_innovation_variances": "uint64_t timestamp;float[3] gravity;float heading;",
+    }
+    content = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0), ulog._message("B", bytes(40))]
+    content += [ulog._message("F", f"{name}:{text}".encode()) for name, text in layouts.items()]
+    content += [ulog._message("A", struct.pack("<BH", 0, k) + name.encode()) for k, name in enumerate(layouts)]
+    ned = to_ned(e.attitude)
+    xi = np.stack([attitudes._quaternion_columns(q) for q in ned])
+    variances = np.einsum("mqi,mij,mqj->mq", 0.5 * xi, e.covariance[:, :3, :3], 0.5 * xi)
+    random = np.random.default_rng(2)
+    for k, stamp in enumerate(stamps.tolist()):
+        states, covariances = np.zeros(24), np.ones(number)
+        states[:4], covariances[:4] = ned[k], variances[k] if old else 1e-4
+        row = struct.pack("<QQ24f", stamp, stamp, *states) + struct.pack(f"<{number}fB", *covariances, number)
+        content.append(ulog._message("D", struct.pack("<H", 0) + row))
+        if k % 10 == 0:
+            values = np.append(0.1 * random.standard_normal(3), 0.02 * random.standard_normal())
+            content.append(ulog._message("D", struct.pack("<HQ4f", 1, stamp, *values)))
+            content.append(ulog._message("D", struct.pack("<HQ4f", 2, stamp, 0.01, 0.01, 0.01, 4e-4)))
+    path.write_bytes(b"".join(content))
+
+
+def test_a_flight_log_is_read_and_judged(run, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("pyulog")
+    log = tmp_path / "flight.ulg"
+    flight_log(log, run)
+    read = read_attitudes(log)
+    np.testing.assert_allclose(np.abs(np.sum(read.attitude * run.estimate.attitude, axis=1)), 1.0, atol=1e-6)
+    # The diagonal of the quaternion's covariance loses the correlations, not the trace: tr P_q = ¼ tr P_θ.
+    np.testing.assert_allclose(
+        np.trace(read.covariance, axis1=1, axis2=2),
+        np.trace(run.estimate.covariance[:, :3, :3], axis1=1, axis2=2),
+        rtol=0.6,
+    )
+    assert set(read.innovations) == {"gravity", "heading"}
+    status, said, _ = command(monkeypatch, capsys, "check", log)
+    assert status == 0
+    assert "consistent" in said
+    recordfiles.write_record(tmp_path / "record.h5", run.record)
+    _, said, _ = command(monkeypatch, capsys, "check", log, "--truth", tmp_path / "record.h5")
+    assert "NEES" in said
+    flight_log(log, run, old=False)
+    np.testing.assert_allclose(
+        read_attitudes(log).covariance, np.tile(1e-4 * np.eye(3), (len(read.attitude), 1, 1)), rtol=1e-6
+    )
+
+
+def test_variances_of_a_quaternion_are_those_of_the_rotation_vector():
+    """δq = ½ Ξ δθ, against the exact perturbed quaternion."""
+    for q in quaternion.exp(np.random.default_rng(3).standard_normal((5, 3))):
+        xi = attitudes._quaternion_columns(q)
+        for k in range(3):
+            moved = quaternion.multiply(q, quaternion.exp(1e-6 * np.eye(3)[k]))
+            np.testing.assert_allclose(0.5 * xi[:, k], (moved - q) / 1e-6, atol=1e-6)
+        np.testing.assert_allclose(xi.T @ xi, np.eye(3), atol=1e-12)
+
+
+def test_odometry_and_poses_are_read_from_bags(run, tmp_path):
+    """Messages made by the library itself; the covariance is the last three rows and columns of six."""
+    rosbag2 = pytest.importorskip("rosbags.rosbag2")
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.LATEST)
+    t = store.types
+    e = run.estimate
+    P = np.zeros((6, 6))
+    P[3:, 3:] = np.diag([1e-4, 4e-4, 9e-4])
+
+    def header(k):
+        whole = round(1e9 * e.time[k]) + 10**18
+        return t["std_msgs/msg/Header"](
+            stamp=t["builtin_interfaces/msg/Time"](sec=whole // 10**9, nanosec=whole % 10**9), frame_id="map"
+        )
+
+    def pose(k):
+        w, x, y, z = e.attitude[k]
+        return t["geometry_msgs/msg/PoseWithCovariance"](
+            pose=t["geometry_msgs/msg/Pose"](
+                position=t["geometry_msgs/msg/Point"](x=0.0, y=0.0, z=0.0),
+                orientation=t["geometry_msgs/msg/Quaternion"](x=x, y=y, z=z, w=w),
+            ),
+            covariance=P.ravel(),
+        )
+
+    zero = t["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0)
+    twist = t["geometry_msgs/msg/TwistWithCovariance"](
+        twist=t["geometry_msgs/msg/Twist"](linear=zero, angular=zero), covariance=np.zeros(36)
+    )
+    made = {
+        "nav_msgs/msg/Odometry": lambda k: t["nav_msgs/msg/Odometry"](
+            header=header(k), child_frame_id="base_link", pose=pose(k), twist=twist
+        ),
+        "geometry_msgs/msg/PoseWithCovarianceStamped": lambda k: t["geometry_msgs/msg/PoseWithCovarianceStamped"](
+            header=header(k), pose=pose(k)
+        ),
+    }
+    folder = tmp_path / "bag"
+    with rosbag2.Writer(folder, version=9) as writer:
+        for kind, make in made.items():
+            connection = writer.add_connection(f"/{kind.rpartition('/')[2].lower()}", kind, typestore=store)
+            for k in range(30):
+                writer.write(connection, k, store.serialize_cdr(make(k), kind))
+    with pytest.raises(InputError, match="several topics with orientations"):
+        read_attitudes(folder)
+    for topic in ("/odometry", "/posewithcovariancestamped"):
+        read = read_attitudes(folder, topic=topic)
+        np.testing.assert_allclose(read.attitude, e.attitude[:30], atol=1e-12)
+        np.testing.assert_array_equal(read.covariance, np.tile(P[3:, 3:], (30, 1, 1)))
+        assert read.stamps_ns[1] - read.stamps_ns[0] == 10**8
+
+
+@pytest.mark.parametrize(
+    ("header", "row", "message"),
+    [
+        ("time_s,qw,qx,qy", "1,1,0,0", "four columns of a quaternion"),
+        ("qw,qx,qy,qz", "1,0,0,0", "lacks time"),
+        ("time_s,qw,qx,qy,qz", "1,2,0,0,0", "norm 2"),
+        ("time_s,qw,qx,qy,qz,cov_xx_rad2,cov_yy_rad2", "1,1,0,0,0,1,1", "cov_zz is missing|cov_xy is missing"),
+        ("time_s,qw,qx,qy,qz,cov_body_xx,cov_fixed_yy", "1,1,0,0,0,1,1", "name all its columns alike"),
+        ("time_s,qw,qx,qy,qz,q_w", "1,1,0,0,0,1", "says the same"),
+    ],
+)
+def test_bad_tables_are_refused(tmp_path, header, row, message):
+    path = tmp_path / "estimate.csv"
+    path.write_text(f"{header}\n{row}\n{row.replace('1', '2', 1)}\n")
+    with pytest.raises(InputError, match=message):
+        read_attitudes(path)
+
+
+def test_tables_of_sigma_and_of_other_units_are_read(tmp_path):
+    path = tmp_path / "estimate.csv"
+    path.write_text(
+        "timestamp_us,qx,qy,qz,qw,roll_sigma_deg,pitch_sigma_deg,yaw_sigma_deg\n5,0,0,0,1,1,2,3\n1000005,0,0,0,1,1,2,3\n"
+    )
+    read = read_attitudes(path)
+    assert read.stamps_ns.tolist() == [5000, 1000005000]
+    assert read.error_frame == "euler"
+    np.testing.assert_allclose(read.covariance[0], np.diag([1.0, 4.0, 9.0]) * DEGREE**2)
+    np.testing.assert_array_equal(read.attitude[0], [1.0, 0.0, 0.0, 0.0])
+
+
+def test_the_command_refuses(files, monkeypatch, capsys):
+    for arguments, message in (
+        (["check", files / "estimate.tum"], "holds no innovations, so nothing can be judged without a truth"),
+        (["check", files / "estimate.h5", "--align", "none"], "--align goes with --truth"),
+        (["check", files / "estimate.csv", "--truth", files / "record.h5", "--align", "clock"], "align"),
+        (["check", files / "estimate.csv", "--truth", files / "record.h5", "--error-frame", "ned"], "error_frame"),
+        (
+            ["check", files / "estimate.csv", "--truth", files / "record.h5", "--record", files / "record.h5"],
+            "leave out --truth",
+        ),
+        (["check", files / "estimate.csv", "--truth", files / "nothing.h5"], "nothing.h5"),
+    ):
+        status, _, error = command(monkeypatch, capsys, *arguments)
+        assert status == 2, arguments
+        assert message in error
+
+
+def test_times_without_anything_in_common_are_refused(run):
+    with pytest.raises(InputError, match="no two times in common"):
+        checked(run, time=run.estimate.time + 1e4, align="none")
+
+
+@pytest.mark.slow
+def test_a_peer_is_right_with_its_noises_told_and_found_out_where_they_are_not():
+    """smsfusion's aided INS over 40 runs; its error is on the body side, as its source says."""
+    pytest.importorskip("smsfusion")
+    spec = importlib.util.spec_from_file_location("peer_judged", SIMS / "peer_judged.py")
+    sim = sys.modules["peer_judged"] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(sim)
+    found = sim.main(runs=40, duration=40.0)
+    assert found.verdicts["as told"].startswith("consistent")
+    assert found.verdicts["datasheet"].startswith("not consistent: the filter is too sure")
+    assert found.verdicts["read as fixed"].startswith("not consistent")
+    assert found.frame_probability["body"] > 0.99
