@@ -7,7 +7,22 @@ from typing import Annotated
 
 import typer
 
-from strapdown.cli.terminal import app, console, counted, progress_bar, show, table, verdict, writable, written
+from strapdown.cli.terminal import (
+    FigureFormat,
+    Format,
+    Tables,
+    app,
+    console,
+    counted,
+    progress_bar,
+    show,
+    table,
+    tables_folder,
+    tables_written,
+    verdict,
+    writable,
+    written,
+)
 
 LEAST_SAMPLES_A_CYCLE = 0.1
 """With fewer a step holds more than ten turns of the cone, and nothing of the study means anything."""
@@ -28,6 +43,8 @@ def coning(
     runs: Annotated[int, typer.Option(help="Monte Carlo runs.")] = 100,
     seed: Annotated[int, typer.Option(help="Seed; the same one gives the same runs.")] = 1,
     out: Annotated[Path, typer.Option(help="Folder for coning.json and the figures.")] = Path("coning-results"),
+    form: Format = FigureFormat.png,
+    tables: Tables = None,
 ) -> None:
     """Study coning: the drift of each integration algorithm, and what a filter makes of it."""
     from strapdown import coning_study
@@ -46,7 +63,8 @@ def coning(
             f"raise the rate, to {LEAST_SAMPLES_A_CYCLE:g} samples a cycle at least"
         )
     usable_folder("out", out)
-    writable("out", *(out / name for name in ("coning.json", "drift.png", "errors.png", "consistency.png")))
+    tables_folder(tables)
+    writable("out", out / "coning.json", *(out / f"{name}.{form}" for name in ("drift", "errors", "consistency")))
     with progress_bar("Monte Carlo runs", runs) as advance:
         study = coning_study.run(parameters, progress=advance)
     summary = study.summary()
@@ -99,5 +117,5 @@ def coning(
     )
     from strapdown import plots
 
-    paths = plots.draw_coning_study(study, out)
-    written(out / "coning.json", *paths)
+    paths = plots.draw_coning_study(study, out, form)
+    written(out / "coning.json", *paths, *tables_written(tables, "coning", summary))

@@ -1,19 +1,19 @@
 """Figures. Each function takes results and an optional ``ax``, draws, and returns the axes; nothing here computes statistics.
 
-Colours are those of Okabe and Ito, told apart by every kind of colour vision. :func:`new_figure` makes a figure that needs no display.
+Colours are those of Okabe and Ito, which every kind of colour vision can tell apart. :func:`new_figure` makes a figure that needs no display.
 
 ``style``
     Colours, themes (light, dark), sizes, saving.
 ``decimation``
-    Long series without loss of extremes.
+    Long series reduced to the extremes of each pixel column.
 ``estimates``
     One estimate over time: attitude, bias, σ, errors.
 ``innovations``
-    Innovations of one record: size, shape, memory.
+    Innovations of one record: NIS, distribution, autocorrelation.
 ``statistics``
     Error statistics over many runs.
 ``sphere``
-    The path of a body axis on the unit sphere, still or moving.
+    The path of a body axis on the unit sphere, still or animated.
 ``coning``
     The coning study.
 ``allan``
@@ -27,8 +27,9 @@ Colours are those of Okabe and Ito, told apart by every kind of colour vision. :
 from strapdown.plots.allan import allan_axis, allan_overview
 from strapdown.plots.budget import error_budget
 from strapdown.plots.coning import coning_consistency, coning_errors, draw_coning_study, drift_by_algorithm
-from strapdown.plots.decimation import decimated
+from strapdown.plots.decimation import decimated, envelope
 from strapdown.plots.estimates import (
+    angle_labels,
     error_overview,
     errors_in_envelope,
     estimate_overview,
@@ -44,7 +45,20 @@ from strapdown.plots.innovations import (
 )
 from strapdown.plots.sphere import animate_body_axis, body_axis_on_sphere, sphere_figure
 from strapdown.plots.statistics import covariance_ellipses, coverage_by_state, fan, nees_over_time, nis_over_time
-from strapdown.plots.style import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION, YELLOW, ink, new_figure, save, theme
+from strapdown.plots.style import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILION,
+    YELLOW,
+    ink,
+    new_figure,
+    save,
+    save_as,
+    theme,
+)
 
 __all__ = [
     "BLUE",
@@ -56,6 +70,7 @@ __all__ = [
     "YELLOW",
     "allan_axis",
     "allan_overview",
+    "angle_labels",
     "animate_body_axis",
     "body_axis_on_sphere",
     "coning_consistency",
@@ -65,6 +80,7 @@ __all__ = [
     "decimated",
     "draw_coning_study",
     "drift_by_algorithm",
+    "envelope",
     "error_budget",
     "error_distribution",
     "error_overview",
@@ -81,6 +97,7 @@ __all__ = [
     "nis_over_time",
     "recording_errors",
     "save",
+    "save_as",
     "sphere_figure",
     "states_over_time",
     "theme",
