@@ -1,6 +1,6 @@
 """Figures. Each function takes results and an optional ``ax``, draws, and returns the axes; nothing here computes statistics.
 
-Colours are those of Okabe and Ito, which every kind of colour vision can tell apart. :func:`new_figure` makes a figure that needs no display.
+Colours are those of Okabe and Ito, which every kind of colour vision can tell apart. :func:`new_figure` needs no display.
 
 ``style``
     Colours, themes (light, dark), sizes, saving.

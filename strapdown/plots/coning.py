@@ -19,7 +19,7 @@ from strapdown.plots.style import (
     ink,
     legend_above,
     legend_below,
-    mark_scales,
+    match_scales,
     new_figure,
     save_as,
 )
@@ -73,7 +73,7 @@ def coning_errors(outcomes: Sequence[FilterOutcome]) -> Figure:
         axes[1, j].set_ylim(-top / DEGREE_PER_HOUR, top / DEGREE_PER_HOUR)
         axes[0, j].set_xlabel("")
     for row in axes:
-        mark_scales(row)
+        match_scales(row)
     axes[0, 0].set_ylabel("attitude error, arcsec")
     axes[1, 0].set_ylabel("bias error, °/h")
     legend_below(figure, [axes[0, 0]])

@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator, NullFormatter
-
 from numpy.typing import NDArray
 
 from strapdown import quaternion
@@ -194,7 +193,8 @@ def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:
         ax.set_ylim(-reach, reach)
         ax.set_ylabel(word)
         edges = "band" if len(members) == 1 else "dotted"
-        ax.set_title(f"{name}; {edges}: {THREE_SIGMA}", loc="left")
+        what = name.replace("scale", "misalignment") if (word, size) == ("mrad", 1e-3) else name
+        ax.set_title(f"{what}; {edges}: {THREE_SIGMA}", loc="left")
         legend_above(ax, ncols=min(len(members), 9))
     axes[-1].set_xlabel("time, s")
     axes[-1].set_xlim(estimate.time[0], estimate.time[-1])

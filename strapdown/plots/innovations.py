@@ -17,7 +17,7 @@ HISTOGRAM_REACH = 5.0
 
 
 def innovation_histogram(whitened: Array, ax: Axes | None = None) -> Axes:
-    """Draw the histogram of whitened innovations (n, dof), all components together, over the standard normal density of a consistent filter."""
+    """Draw the histogram of whitened innovations (n, dof), all components together, and the standard normal density."""
     ax = axes_or_new(ax)
     z = whitened[np.isfinite(whitened)]
     number = int(np.clip(np.sqrt(len(z)), 12, 80))

@@ -26,7 +26,6 @@ from strapdown.plots.style import (
     rate_unit,
 )
 
-
 BOUNDS = "bounds of a consistent filter"
 
 

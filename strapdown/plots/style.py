@@ -144,12 +144,20 @@ def legend_below(figure: Figure, axes: Sequence[Axes], *, ncols: int = 4) -> Non
     figure.legend(found.values(), found.keys(), loc="outside lower center", ncols=ncols, frameon=False)
 
 
-def mark_scales(axes: Sequence[Axes]) -> None:
-    """Mark vertical scales that differ between axes side by side: each larger one says how many times it spans the smallest."""
-    spans = [float(np.ptp(ax.get_ylim())) for ax in axes]
-    for ax, span in zip(axes, spans, strict=True):
-        if span > 1.05 * min(spans):
-            ax.set_title(f"vertical scale ×{span / min(spans):.2g}", loc="right", fontsize="small", color=VERMILION)
+ALIKE = 2.0
+"""Vertical scales of axes side by side that differ by less than this factor become one."""
+
+
+def match_scales(axes: Sequence[Axes]) -> None:
+    """Give axes side by side one vertical scale where it does not hide a curve, and mark those that need a larger one."""
+    spans = np.array([float(np.ptp(ax.get_ylim())) for ax in axes])
+    alike = spans < ALIKE * spans.min()
+    for ax, span, one in zip(axes, spans, alike, strict=True):
+        if one:
+            ax.set_ylim(np.array(ax.get_ylim()) * (spans[alike].max() / span))
+        else:
+            ratio = span / spans[alike].max()
+            ax.set_title(f"vertical scale ×{ratio:.2g}", loc="right", fontsize="small", color=VERMILION)
 
 
 def angle_unit(value: Array) -> tuple[str, float]:

@@ -13,7 +13,7 @@ from strapdown.checks import InputError
 from strapdown.montecarlo import campaign
 from strapdown.montecarlo.statistics import SUBSETS, Statistics
 from strapdown.plots.statistics import STATES, state_unit
-from strapdown.plots.style import legend_above, legend_below, mark_scales
+from strapdown.plots.style import legend_above, legend_below, match_scales
 from strapdown.report import findings, page
 
 
@@ -147,7 +147,7 @@ def _fans(statistics: Statistics) -> Figure:
         for k, ax in enumerate(row):
             plots.fan(statistics, first + k, ax)
             ax.get_legend().remove()
-        mark_scales(row)
+        match_scales(row)
     legend_below(figure, [axes[0, 0]], ncols=3)
     return figure
 

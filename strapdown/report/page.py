@@ -23,6 +23,8 @@ from strapdown.plots.estimates import wraps
 CHART_POINTS = 6000
 """Most times of an interactive chart; longer series are reduced to the extremes of each column."""
 _DOTS_PER_INCH = 120
+_WIDE = 7.0
+"""Inches: wider figures scroll sideways on a narrow page instead of shrinking."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -108,18 +110,21 @@ def number(value: float, digits: int = 4) -> str:
 
 def figure(draw: Callable[[], Figure], caption: str) -> str:
     """Return a figure, drawn once in each theme; the page shows the one that the reader's device prefers."""
-    light, dark = (_image(draw, theme) for theme in ("light", "dark"))
+    (light, wide), (dark, _) = (_image(draw, theme) for theme in ("light", "dark"))
+    kind = " class=wide" if wide else ""
     return (
-        f'<figure><div class="scroll" tabindex="0"><picture><source media="(prefers-color-scheme: dark)" srcset="{dark}">'
+        f'<figure{kind}><div class="scroll" tabindex="0"><picture><source media="(prefers-color-scheme: dark)" srcset="{dark}">'
         f'<img src="{light}" alt="{text(caption)}"></picture></div><figcaption>{text(caption)}</figcaption></figure>'
     )
 
 
-def _image(draw: Callable[[], Figure], theme: str) -> str:
+def _image(draw: Callable[[], Figure], theme: str) -> tuple[str, bool]:
+    """Return a figure as the address of an image, and whether it is too wide to be read when shrunk to a phone."""
     with style.theme(theme):
         buffer = io.BytesIO()
-        draw().savefig(buffer, format="png", dpi=_DOTS_PER_INCH)
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+        drawn = draw()
+        drawn.savefig(buffer, format="png", dpi=_DOTS_PER_INCH)
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode(), drawn.get_figwidth() > _WIDE
 
 
 def chart(one: Chart) -> str:

@@ -244,5 +244,5 @@ def _image(stem: Path, caption: str) -> str:
                 raise InputError(f"{path} is no {suffix.upper()}; take it away, or tune again")
             data = base64.b64encode(found).decode()
             image = f'<img src="data:{kind};base64,{data}" alt="{page.text(caption)}">'
-            return page.section(caption, f'<figure><div class="scroll" tabindex="0">{image}</div></figure>')
+            return page.section(caption, f'<figure class=wide><div class="scroll" tabindex="0">{image}</div></figure>')
     return ""
