@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-
 import xml.etree.ElementTree
 
+import hypothesis
 import matplotlib
 import numpy as np
 import pytest
-from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.colors import to_rgb
 
@@ -93,7 +92,7 @@ def uneven_series(draw):
     return np.cumsum(steps), value, draw(st.integers(1, 60))
 
 
-@given(uneven_series())
+@hypothesis.given(uneven_series())
 def test_an_envelope_is_the_least_and_the_largest_of_each_column(series):
     """By counting: which column of the time axis each sample falls into, and the extremes of the samples there."""
     time, value, columns = series
@@ -115,7 +114,7 @@ def test_an_envelope_is_the_least_and_the_largest_of_each_column(series):
         np.testing.assert_equal(found.high[k], max(seen, default=np.nan) + 1.0)
 
 
-@given(uneven_series())
+@hypothesis.given(uneven_series())
 def test_a_line_keeps_the_extremes_of_each_column(series):
     time, value, columns = series
     when, drawn = plots.decimated(time, value, columns)
