@@ -26,7 +26,7 @@ from strapdown.checks import Array
 from strapdown.estimation import error_states
 from strapdown.estimation.states import ProcessNoise
 from strapdown.motion import Harmonic, HarmonicRates
-from strapdown.plots.style import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION
+from strapdown.plots.style import BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILION, legend_below
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord
 from strapdown.scenarios import Scenario, simulate
@@ -243,7 +243,9 @@ def draw(result: Result, path: Path) -> Path:
     for ax, (_, states, factor, label) in zip(grid.flat, PANELS, strict=True):
         error, sigma = factor * result.errors[0][:, states], factor * result.sigma[:, states]
         envelope = 3.0 * sigma.max(axis=1)
-        ax.fill_between(result.time, -envelope, envelope, color=SKY, alpha=0.3, linewidth=0, label="±3σ, the widest")
+        ax.fill_between(
+            result.time, -envelope, envelope, color=SKY, alpha=0.3, linewidth=0, label="±3σ (99.7 %), the widest"
+        )
         colours = (BLUE, VERMILION, GREEN, ORANGE, PURPLE, "black")
         names = ("x", "y", "z") if error.shape[1] == 3 else ("xy", "xz", "yx", "yz", "zx", "zy")
         for k, name in enumerate(names):
@@ -256,8 +258,7 @@ def draw(result: Result, path: Path) -> Path:
         ax.set_xlabel("time, s")
     for ax in grid[:, 0]:
         ax.set_ylabel("true less estimated")
-    grid[0, 2].legend(ncols=2)
-    grid[1, 0].legend(ncols=2)
+    legend_below(figure, [grid[0, 2], grid[1, 0]], ncols=10)
     return plots.save(figure, path)
 
 

@@ -148,7 +148,7 @@ def draw(statistics: dict[str, Statistics], predictions: dict[str, Prediction], 
     figure, axes = plots.new_figure(1, 3, size=(12.0, 4.6))
     for ax, subset in zip(axes, ("attitude", "bias", None), strict=True):
         low, high = consistency.mean_bounds(3, runs)
-        ax.axhspan(low, high, color=style.ink(), alpha=0.15, linewidth=0, label="99 % bounds of a right filter")
+        ax.axhspan(low, high, color=style.ink(), alpha=0.15, linewidth=0, label="99 % bounds of a consistent filter")
         for k, name in enumerate(FACTORS):
             found, told = statistics[name], predictions[name]
             if subset is None:
@@ -168,7 +168,7 @@ def draw(statistics: dict[str, Statistics], predictions: dict[str, Prediction], 
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=6, frameon=False)
     figure.suptitle(
-        f"Filters that believe Q or R times a factor: {runs} runs (dots) and theory, tr(P⁻¹Σ) along the filter's own gains (lines)"
+        f"Filters whose Q or R is off by a factor: {runs} runs (dots) and theory, tr(P⁻¹Σ) along the filter's own gains (lines)"
     )
     return figure
 

@@ -593,7 +593,7 @@ def draw(result: Result, folder: Path) -> list[Path]:
 
     def saved(name: str, figure: Any) -> None:
         path = folder / f"{name}.png"
-        with written_beside(path) as temporary:
+        with written_beside(path) as temporary, matplotlib.rc_context({"axes.formatter.min_exponent": 3}):
             figure.savefig(temporary, dpi=140, bbox_inches="tight")
         plt.close(figure)
         paths.append(path)

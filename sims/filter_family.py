@@ -260,10 +260,14 @@ def draw(outcomes: Sequence[Outcome], path: Path) -> Path:
         ]
         top.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
         top.tick_params(axis="y", which="minor", labelleft=False)
-        bottom.set(yscale="linear" if case == "small" else "log", xlabel="time, s")
+        scale = "linear" if case == "small" else "log"
+        bottom.set(yscale=scale, xlabel="time, s")
+        bottom.set_title(f"{scale} scale", loc="right", fontsize="small")
     grid[0, 0].set_ylabel("attitude error, 90th percentile, °")
     grid[1, 0].set_ylabel("ANEES / 6")
-    figure.legend(*grid[1, 0].get_legend_handles_labels(), loc="outside lower center", ncols=9, fontsize="small")
+    figure.legend(
+        *grid[1, 0].get_legend_handles_labels(), loc="outside lower center", ncols=9, fontsize="small", frameon=False
+    )
     return plots.save(figure, path)
 
 

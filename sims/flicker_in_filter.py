@@ -201,9 +201,9 @@ def draw(result, *, ax=None):
     ax.axhline(1.0, color="k", lw=0.8)
     ax.set_xlim(-0.5, len(place) - 0.5)
     ax.set_xticks(place, [outcome.preset for outcome in result.outcomes])
-    ax.set_ylabel("mean NEES of the attitude / 3 (1: right)")
+    ax.set_ylabel("mean NEES of the attitude / 3 (1: consistent)")
     ax.set_title(f"{result.runs} runs of {result.duration:g} s; bars: 99 %")
-    ax.legend()
+    style.legend_below(ax.figure, [ax], ncols=len(FILTERS))
     return ax
 
 

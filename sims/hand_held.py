@@ -355,7 +355,7 @@ def draw(result: Result, path: Path) -> Path:
     """Draw the errors of every recording by filter, and their means, and write the figure."""
     treatment = list(result.scores)[-1]
     scores = result.scores[treatment]
-    figure, axes = plots.new_figure(1, 2, size=(13.0, 5.6))
+    figure, axes = plots.new_figure(1, 2, size=(13.0, 5.6), sharey=True)
     places = np.arange(len(result.recordings) + 1)
     for axis, part in zip(axes, (2, 0), strict=True):
         for k, (name, each) in enumerate(scores.items()):
@@ -392,10 +392,10 @@ def draw_worst(found: Sequence[AhrsEstimate], path: Path) -> Path:
         errors = reference_errors(estimate.attitude, used.true_attitude)
         sigma = {"heading": np.sqrt(P[:, 2, 2]), "inclination": np.sqrt(P[:, 0, 0] + P[:, 1, 1])}
         for axis, part in zip(column, sigma, strict=True):
-            axis.fill_between(used.time, 0.0, 2.0 * sigma[part] / DEGREE, color="0.88", label="2σ")
+            axis.fill_between(used.time, 0.0, 2.0 * sigma[part] / DEGREE, color="0.85", label="2σ (95 %) of the filter")
             axis.plot(used.time, getattr(errors, part) / DEGREE, linewidth=0.7, color=style.VERMILION, label="error")
             axis.set(ylabel=f"{part} error, °", xlabel="time, s", title=used.source)
-        column[0].legend(frameon=False)
+    style.legend_below(figure, [axes.flat[0]])
     return plots.save(figure, path)
 
 

@@ -123,7 +123,7 @@ def draw_spectra(result, *, ax):
     ax.set_xlabel("frequency, Hz")
     ax.set_ylabel("two-sided PSD, (°/h)²/Hz")
     ax.set_title(f"{result.preset} at rest (lines: theory)")
-    ax.legend()
+    ax.legend(frameon=False)
     return ax
 
 
@@ -135,10 +135,12 @@ def draw_bias(result, *, ax):
         ax.axhline(-number * band, color="0.5", lw=0.6)
         ax.plot(result.time, values - number * band, color=style.CYCLE[number], lw=0.7, label=axis)
     ax.set_xlabel("time, s")
+    step = float(f"{0.5 * np.abs(bias).max():.0e}")
+    marks = [(k * step - number * band, f"{k * step:g}") for number in range(3) for k in (-1, 0, 1)]
+    ax.set_yticks(*zip(*marks, strict=True))  # each axis about a zero of its own
     ax.set_ylabel("bias less its turn-on part, °/h")
-    ax.set_ylim(-2.6 * band, 0.8 * band)
-    ax.set_title(f"x about 0, y and z {band:.2g} °/h lower each")
-    ax.legend(ncols=3, loc="upper right")
+    ax.set_ylim(-2.6 * band, 0.6 * band)
+    style.legend_above(ax)
     return ax
 
 

@@ -94,7 +94,7 @@ def draw(result, folder, objective):
     figure, (left, right) = plots.new_figure(1, 2, size=(11.0, 4.6))
     for number, one in enumerate((result.too_large, result.too_small)):
         drawing.searches(one, 0, 1, shown, left, label=number == 0)
-    left.set_title(f"{2 * len(result.too_large.starts)} searches")
+    left.set_title(f"{2 * len(result.too_large.starts)} searches", loc="left")
     values(result, right)
     plots.save(figure, folder / "tune_filter.png")
     plots.save(
@@ -108,7 +108,9 @@ def draw(result, folder, objective):
 
 
 def values(result, ax):
-    """Draw tuned values over the truth with their intervals, beside what was foretold."""
+    """Draw tuned values over the truth with their intervals, beside the predicted spread."""
+    from strapdown.plots.style import legend_above
+
     place = np.arange(len(FREE))
     for shift, one, name in ((-0.12, result.too_large, "from 30 times"), (0.12, result.too_small, "from a 30th")):
         ratio = np.array([[p.value, p.lower, p.upper] for p in one.parameters]).T / np.array(
@@ -119,7 +121,7 @@ def values(result, ax):
         )
     half = 1.96 * result.plan.errors[0]
     ax.bar(
-        place, np.exp(half) - np.exp(-half), bottom=np.exp(-half), width=0.6, alpha=0.2, label="foretold, 95 % about 1"
+        place, np.exp(half) - np.exp(-half), bottom=np.exp(-half), width=0.6, alpha=0.2, label="predicted, 95 % about 1"
     )
     ax.axhline(1.0, lw=0.8, color="k")
     ax.set_xticks(place, FREE)
@@ -128,7 +130,7 @@ def values(result, ax):
     ticks = (0.7, 0.8, 0.9, 1.0, 1.1, 1.2, 1.5)
     ax.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
     ax.set_yticks([], minor=True)
-    ax.legend()
+    legend_above(ax)
 
 
 if __name__ == "__main__":

@@ -165,9 +165,9 @@ def draw(outcomes: Sequence[Outcome], path: Path) -> Path:
     left.set(yscale="log", xlabel="time, h", ylabel="attitude error, °")
     left.set_title("Median (line), 95th percentile (dashes)")
     middle.set(yscale="log", xlabel="time, h", ylabel="ANEES / 6")
-    middle.set_title("Consistency: 1 is right")
+    middle.set_title("Consistency, log scale; 1: consistent")
     right.set(xlabel="time, h", ylabel="ANEES / 6")
-    right.set_title(f"The banks alone; grey: 99 % bounds of {most.runs} runs")
+    right.set_title("Banks alone, linear scale; 99 % bounds")
     figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
     return plots.save(figure, path)
 

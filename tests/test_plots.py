@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import xml.etree.ElementTree
 
+import hypothesis
 import matplotlib
 import numpy as np
 import pytest
+from hypothesis import strategies as st
 from matplotlib.colors import to_rgb
 
 from strapdown import (
@@ -24,9 +27,9 @@ from strapdown import (
     units,
 )
 from strapdown.checks import InputError
-from strapdown.coning_study import Drift
+from strapdown.coning_study import Drift, FilterOutcome
 from strapdown.montecarlo.statistics import BINS_PER_OCTAVE
-from strapdown.plots import style
+from strapdown.plots import estimates, style
 from strapdown.plots.sphere import body_axis_path
 
 
@@ -70,10 +73,84 @@ def test_decimation_keeps_every_extreme_and_the_order(samples):
 
 
 def test_decimation_keeps_gaps():
-    value = np.ones(100_000)
+    time = np.arange(100_000.0)
+    value = np.sin(time)
     value[30_000:60_000] = np.nan
-    _, drawn = plots.decimated(np.arange(100_000.0), value)
-    assert 0.25 < np.isnan(drawn).mean() < 0.35
+    when, drawn = plots.decimated(time, value)
+    inside = (when >= 30_000.0) & (when < 60_000.0)
+    assert inside.sum() > 1000
+    np.testing.assert_array_equal(np.isnan(drawn), inside)
+
+
+@st.composite
+def uneven_series(draw):
+    """Times that never go back, with bursts and gaps, values with NaN among them, and a number of columns."""
+    n = draw(st.integers(2, 400))
+    random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    steps = np.where(random.random(n) < 0.1, random.exponential(50.0, n), random.random(n)) * (random.random(n) < 0.9)
+    value = np.where(random.random(n) < draw(st.sampled_from([0.0, 0.5])), np.nan, random.standard_normal(n))
+    return np.cumsum(steps), value, draw(st.integers(1, 60))
+
+
+@hypothesis.given(uneven_series())
+def test_an_envelope_is_the_least_and_the_largest_of_each_column(series):
+    """By counting: which column of the time axis each sample falls into, and the extremes of the samples there."""
+    time, value, columns = series
+    found = plots.envelope(time, value, value + 1.0, columns)
+    if len(time) <= columns:
+        np.testing.assert_array_equal(found.low, value)
+        np.testing.assert_array_equal(found.high, value + 1.0)
+        return
+    held = {}
+    span = time[-1] - time[0]
+    for t, x in zip(time, value, strict=True):
+        column = min(columns - 1, int((t - time[0]) * (columns / span))) if span > 0.0 else 0
+        held.setdefault(column, []).append((t, x))
+    assert len(found.time) == len(held) <= columns
+    for k, samples in enumerate(held.values()):
+        seen = [x for _, x in samples if not np.isnan(x)]
+        assert found.time[k] == samples[0][0]
+        np.testing.assert_equal(found.low[k], min(seen, default=np.nan))
+        np.testing.assert_equal(found.high[k], max(seen, default=np.nan) + 1.0)
+
+
+@hypothesis.given(uneven_series())
+def test_a_line_keeps_the_extremes_of_each_column(series):
+    time, value, columns = series
+    when, drawn = plots.decimated(time, value, columns)
+    whole, kept = plots.envelope(time, value, columns=columns), plots.envelope(when, drawn, columns=columns)
+    assert (when[0], when[-1]) == (time[0], time[-1])
+    assert len(when) <= max(2 * columns + 2, 1)
+    if len(when) > columns:
+        np.testing.assert_array_equal(kept.low, whole.low)
+        np.testing.assert_array_equal(kept.high, whole.high)
+
+
+def test_the_band_of_a_long_record_is_the_envelope_of_sigma():
+    """σ that grows between measurements: dark to its least in each column, light to its largest, both without teeth."""
+    time = np.arange(300_000) / 100.0
+    sigma = 1.0 + np.mod(time, 1.0)
+    _, ax = plots.new_figure()
+    plots.errors_in_envelope(time, np.zeros((1, len(time))), sigma, ax)
+    dark, upper, lower = (band.get_paths()[0].vertices[:, 1] for band in ax.collections)
+    assert np.unique(dark.round(9)).tolist() == pytest.approx([-3.0, 3.0])
+    assert np.unique(upper.round(9)).tolist() == pytest.approx([3.0, 3.0 * 1.99])
+    assert np.unique(lower.round(9)).tolist() == pytest.approx([-3.0 * 1.99, -3.0])
+    assert "99.7 %" in ax.get_legend_handles_labels()[1][0]
+
+
+@pytest.mark.parametrize("turns", [3.2, 5000.3])
+def test_a_line_of_an_angle_breaks_where_it_wraps(turns):
+    time = np.linspace(0.0, 1.0, 200_001)
+    angle = np.mod(360.0 * turns * time + 180.0, 360.0) - 180.0
+    _, drawn = estimates.unbroken(time, angle)
+    jumps = np.abs(np.diff(drawn)) > 180.0
+    if turns < 100.0:
+        assert not jumps.any()
+        assert np.isnan(drawn).sum() == 3
+    else:  # several turns in a column: a filled area, not nothing
+        assert np.isfinite(drawn).mean() > 0.5
+        assert jumps.mean() > 0.4
 
 
 def test_a_long_record_is_drawn_with_few_points():
@@ -226,6 +303,128 @@ def test_figures_are_saved_in_every_form(tmp_path, suffix):
     figure, ax = plots.new_figure()
     ax.plot([0.0, 1.0])
     assert plots.save(figure, tmp_path / f"figure.{suffix}").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("form", ["png", "svg", "pdf"])
+def test_a_figure_in_one_format_replaces_that_in_another_and_is_the_same_twice(tmp_path, form):
+    def draw():
+        figure, ax = plots.new_figure()
+        ax.plot([0.0, 1.0], label="σ")
+        ax.legend()
+        return figure
+
+    for other in ("png", "svg", "pdf"):
+        (tmp_path / f"a.{other}").write_text("old")
+    (tmp_path / "a.json").write_text("{}")
+    assert plots.save_as({tmp_path / "a": draw()}, form) == [tmp_path / f"a.{form}"]
+    assert {path.name for path in tmp_path.iterdir()} == {f"a.{form}", "a.json"}
+    first = (tmp_path / f"a.{form}").read_bytes()
+    if form == "svg":
+        assert xml.etree.ElementTree.fromstring(first).tag.endswith("svg")
+    else:
+        assert first.startswith({"png": b"\x89PNG", "pdf": b"%PDF"}[form])
+    plots.save_as({tmp_path / "a": draw()}, form)
+    assert (tmp_path / f"a.{form}").read_bytes() == first
+    with pytest.raises(InputError, match="png, pdf, svg"):
+        plots.save_as({tmp_path / "a": draw()}, "gif")
+
+
+def figures(run, statistics, outcomes):
+    """Every kind of figure with a legend and time axes, by name."""
+    estimate, truth = run
+    innovations = next(iter(estimate.innovations.values()))
+    reference = consistency.reference_errors(estimate.attitude, truth.attitude)
+
+    def single(draw):
+        figure, ax = plots.new_figure()
+        draw(ax)
+        return figure
+
+    return {
+        "errors": plots.error_overview(estimate, truth, title="record.h5"),
+        "estimate": plots.estimate_overview(estimate, title="record.h5"),
+        "recording": plots.recording_errors(estimate.time, reference),
+        "coning errors": plots.coning_errors(outcomes),
+        "coning consistency": plots.coning_consistency(outcomes),
+        "fan": single(lambda ax: plots.fan(statistics, 0, ax)),
+        "coverage": single(lambda ax: plots.coverage_by_state(statistics, -1, ax)),
+        "histogram": single(lambda ax: plots.innovation_histogram(innovations.whitened, ax)),
+        "nis": single(lambda ax: plots.nis_over_record(innovations, (0.1, 4.0), ax)),
+    }
+
+
+@pytest.fixture(scope="module")
+def outcomes(statistics):
+    epochs = np.array([10, 20])
+    return [
+        FilterOutcome(integration=name, statistics=statistics, probability=0.99, epochs=epochs) for name in ("a", "b")
+    ]
+
+
+def test_no_legend_covers_a_curve_and_ticks_are_plain(run, statistics, outcomes, tmp_path):
+    for name, figure in figures(run, statistics, outcomes).items():
+        plots.save(figure, tmp_path / "figure.png")
+        legends = [*figure.legends, *(ax.get_legend() for ax in figure.axes if ax.get_legend())]
+        for legend in legends:
+            place = legend.get_window_extent()
+            assert place.width > 0.0
+            for ax in figure.axes:
+                inside = ax.get_window_extent().shrunk(0.99, 0.99)
+                assert not place.overlaps(inside), f"{name}: the legend lies over the curves"
+            assert figure.bbox.x0 <= place.x0, f"{name}: the legend is cut off"
+            assert place.x1 <= figure.bbox.x1 + 1.0, f"{name}: the legend is cut off"
+        for ax in figure.axes:
+            for title in (ax.title, ax._left_title, ax._right_title):
+                assert title.get_window_extent().x1 <= figure.bbox.x1 + 1.0, f"{name}: {title.get_text()}"
+            with matplotlib.rc_context(style.STYLE):
+                for axis in (ax.xaxis, ax.yaxis):
+                    labels = axis.get_major_formatter().format_ticks([0.001, 0.01, 1.0, 1000.0])
+                    assert not any("10^" in label for label in labels), f"{name}: {labels}"
+
+
+def test_a_panel_says_where_a_filter_that_passes_leaves_its_bounds(statistics, outcomes):
+    """Between the judged epochs one error is ten times as large: the filter passes, and the panel says what was not judged."""
+    column = 1  # of the attitude
+    inside = statistics.nees_sum.copy()
+    inside[:, column] = 3.0 * statistics.runs
+    for at, said in ((15, True), (None, False)):
+        held = inside.copy()
+        if at is not None:
+            held[at, column] *= 10.0
+        changed = dataclasses.replace(statistics, nees_sum=held)
+        shown = [dataclasses.replace(one, statistics=changed) for one in outcomes]
+        ax = plots.coning_consistency(shown).axes[0]
+        title = ax.get_title(loc="left")
+        assert "2 of 2 pass" in title
+        assert ("not judged" in title) == said
+        judged = next(line for line in ax.lines if line.get_label() == "judged epoch")
+        np.testing.assert_array_equal(judged.get_xdata(), statistics.time[[10, 20]])
+        low, high = changed.verdict(outcomes[0].epochs, "attitude", 0.99).simultaneous_bounds
+        band = next(patch for patch in ax.patches if "99 %" in patch.get_label())
+        np.testing.assert_allclose([band.get_y(), band.get_y() + band.get_height()], [low, high])
+
+
+def test_different_scales_side_by_side_are_marked():
+    _, axes = plots.new_figure(1, 3)
+    for ax, top in zip(axes, (1.0, 1.8, 20.0), strict=True):
+        ax.set_ylim(-top, top)
+    style.match_scales(axes)
+    assert axes[0].get_ylim() == axes[1].get_ylim() == pytest.approx((-1.8, 1.8))
+    assert axes[2].get_ylim() == (-20.0, 20.0)
+    assert [ax.get_title(loc="right") for ax in axes] == ["", "", "vertical scale ×11"]
+
+
+def test_angles_are_named_with_their_sense():
+    """By turning a vector: each angle grows as its label says, in the sequence Z-Y-X."""
+    roll, pitch, yaw = plots.angle_labels("East-North-Up, magnetic North")
+    assert yaw.endswith("from East to North")
+    assert plots.angle_labels()[2].endswith("from fixed x to y")
+    for label, vector, toward in ((roll, 1, 2), (pitch, 2, 0), (yaw, 0, 1)):
+        axis = 3 - vector - toward
+        turned = quaternion.rotate(quaternion.exp(0.1 * np.eye(3)[axis]), np.eye(3)[vector])
+        assert turned[toward] > 0.09
+        if "fixed" not in label:
+            assert label.endswith(f"{'xyz'[vector]} to {'xyz'[toward]}")
 
 
 def test_angle_units_are_those_that_are_read_best():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import html.parser
 import json
 import re
 import shutil
@@ -71,7 +72,7 @@ def test_a_page_needs_nothing_else(folder, name):
         r"""(src|href|srcset)\s*=\s*["']?(?!data:)[a-z/]""", re.sub(r"<script>.*?</script>", "", content, flags=re.S)
     )
     assert "@import" not in content
-    assert content.count("<figure>") == content.count('prefers-color-scheme: dark)" srcset')
+    assert len(re.findall("<figure[ >]", content)) == content.count('prefers-color-scheme: dark)" srcset')
 
 
 @pytest.mark.parametrize(("name", "verdict"), [("right", "consistent"), ("wrong", "not consistent")])
@@ -172,7 +173,7 @@ def test_a_tuning_is_reported_from_its_json(folder, scenario, tmp_path):
     (tmp_path / "filter-heldout.png").write_bytes(figure)
     content = body(report.write(tmp_path / "filter.json").page)
     assert content.count("data:image/png") == 1
-    assert "no data were held out" in content
+    assert "No data were held out" in content
 
 
 def test_gaps_become_null_not_nan():
@@ -181,6 +182,90 @@ def test_gaps_become_null_not_nan():
     )
     assert "NaN" not in page.chart(chart)
     assert "null" in page.chart(chart)
+
+
+def test_the_band_of_a_long_chart_is_its_widest_in_each_column():
+    """Between two measurements σ grows: drawn through its extremes it would be a bar over the errors."""
+    time = np.arange(200_000) / 100.0
+    sigma = 1.0 + np.mod(np.arange(200_000), 50) / 50.0
+    sigma[100_000] = 9.0
+    chart = page.Chart(
+        title="t",
+        unit="u",
+        time=time,
+        series=(
+            page.Series(label="+", value=sigma, band=True),
+            page.Series(label="-", value=-sigma, band=True),
+            page.Series(label="error", value=np.random.default_rng(1).standard_normal(len(time))),
+        ),
+        bands=((0, 1),),
+    )
+    content = json.loads(re.search(r"json\">(.*?)</script>", page.chart(chart), re.S).group(1))
+    when, upper, lower, _ = (np.array(row) for row in content["data"])
+    assert 3000 < len(when) <= 6002
+    assert upper.min() == pytest.approx(1.98)  # each column holds a whole tooth; its least would be 1
+    assert upper.max() == 9.0
+    np.testing.assert_array_equal(lower, -upper)
+
+
+def test_a_chart_of_an_angle_breaks_where_it_wraps():
+    time = np.linspace(0.0, 10.0, 50_001)
+    angle = np.mod(90.0 * time + 180.0, 360.0) - 180.0
+    series = (page.Series(label="yaw", value=angle, wraps=True),)
+    content = page.chart(page.Chart(title="t", unit="°", time=time, series=series))
+    data = json.loads(re.search(r"json\">(.*?)</script>", content, re.S).group(1))["data"][1]
+    assert data.count(None) == 3  # 900° in all: past 180°, 540° and at the end 900°
+    assert np.nanmax(np.abs(np.diff(np.array(data, float)))) < 180.0
+
+
+PARENTS = {"li": "ul", "tr": "table", "td": "tr", "th": "tr", "figcaption": "figure", "source": "picture"}
+"""Elements that stand in one other alone."""
+
+
+class Tags(html.parser.HTMLParser):
+    """Holds a page to closing what it opens, in order, and to the places where HTML allows an element."""
+
+    VOID = frozenset(("meta", "link", "img", "source", "br"))
+    BLOCKS = frozenset(("p", "div", "table", "ul", "figure", "pre", "section"))
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.seen = [], []
+
+    def handle_starttag(self, tag, attributes):
+        assert len({name for name, _ in attributes}) == len(attributes), f"{tag} has an attribute twice"
+        assert tag not in PARENTS or self.open[-1] == PARENTS[tag], f"{tag} stands in {self.open[-1]}"
+        assert not (self.open and self.open[-1] == "p" and tag in self.BLOCKS), f"{tag} stands in a paragraph"
+        self.seen.append(tag)
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open
+        assert self.open.pop() == tag
+
+
+@pytest.mark.parametrize("name", ["right", "blind", "wrong", "campaign"])
+def test_a_page_is_well_formed(folder, name):
+    tags = Tags()
+    content = body(folder / f"{name}.html")
+    tags.feed(content)
+    tags.close()
+    assert tags.open == []
+    assert content.startswith("<!doctype html>")
+    for once in ("html", "head", "title", "body", "h1"):
+        assert tags.seen.count(once) == 1
+    assert all('alt="' in image for image in re.findall(r"<img [^>]*>", content))
+
+
+def test_passing_findings_are_called_pass_and_failing_ones_fail(folder):
+    for name, failing in (("right", False), ("wrong", True)):
+        content = body(folder / f"{name}.html")
+        judgement = json.loads((folder / f"{name}.report.json").read_text())["judgement"]
+        evidence = content.split("<h2>The evidence</h2>")[1].split("</section>")[0]
+        marks = [mark for kind, mark in re.findall(r'<tr><td class="(pass|fail)">(\w+)</td>', evidence) if kind == mark]
+        assert marks == ["fail" if one["rejected"] else "pass" for one in judgement["findings"]]
+        assert ("fail" in marks) == failing
 
 
 def test_bad_input_is_refused_before_anything_is_written(folder, tmp_path):
@@ -216,7 +301,10 @@ def test_the_command_says_the_verdict_and_where_the_page_is(folder, tmp_path):
 PROBE = """<script>window.addEventListener("load", () => setTimeout(() => {
 document.title = JSON.stringify({charts: document.querySelectorAll(".uplot canvas").length,
 hidden: [...document.images].filter((i) => i.naturalWidth === 0 || i.getBoundingClientRect().width < 100).length,
-images: document.images.length, overflow: document.documentElement.scrollWidth - window.innerWidth});}, 300));
+images: document.images.length, tables: [...document.querySelectorAll(".scroll")].filter((e) => e.querySelector("table")).map(
+(e) => { e.scrollLeft = 1e4; const cell = e.querySelector("tr:last-child").lastElementChild.getBoundingClientRect();
+return cell.right <= e.getBoundingClientRect().right + 2 && getComputedStyle(e).overflowX === "auto"; }),
+overflow: document.documentElement.scrollWidth - window.innerWidth});}, 300));
 window.onerror = (message) => { document.body.dataset.error = message; };</script></head>"""
 
 
@@ -249,6 +337,8 @@ def test_a_browser_shows_figures_and_charts(folder, tmp_path, name, width):
     assert found["hidden"] == 0
     assert found["images"] >= 3
     assert found["overflow"] <= 0
+    assert found["tables"]
+    assert all(found["tables"])  # scrolled to its end, a table shows its last column
     assert found["charts"] == (6 if name == "right" else 0)
 
 

@@ -12,6 +12,7 @@ import typer
 
 from strapdown.cli.filters import filter_of_scenario
 from strapdown.cli.terminal import (
+    Tables,
     app,
     console,
     counted,
@@ -20,6 +21,8 @@ from strapdown.cli.terminal import (
     scenario_named,
     show,
     table,
+    tables_folder,
+    tables_written,
     verdict,
     writable,
     written,
@@ -82,6 +85,7 @@ def montecarlo(
     replay: Annotated[
         int | None, typer.Option(help="Compute this one run again and write it in full detail: record and estimate.")
     ] = None,
+    tables: Tables = None,
 ) -> None:
     """Run a scenario many times through a filter; tell whether the filter may be believed."""
     from strapdown import montecarlo as engine
@@ -108,6 +112,7 @@ def montecarlo(
         plan, target = held.plan, out or source
         machine = held.machine if machine == "auto" else machine
     writable("out", target, suffixes=_CAMPAIGN_SUFFIXES)
+    tables_folder(tables)
     if resume and overwrite:
         raise InputError("--resume and --overwrite exclude each other: go on with the file, or start it anew")
     told = target.with_suffix(".json")
@@ -120,6 +125,8 @@ def montecarlo(
         return
     if held is not None and target == source and not (resume or overwrite):
         _tell(held)
+        if tables is not None and held.statistics is not None:
+            written(*tables_written(tables, "montecarlo", engine.summary(held.statistics)))
         return
     if runs is None:
         runs = campaigns.read(target).runs if resume and target.exists() else _RUNS
@@ -162,8 +169,9 @@ def montecarlo(
             raise
     _tell(result)
     report = target.with_suffix(".json")
-    write_json(report, _report(result))
-    written(target, report)
+    content = _report(result)
+    write_json(report, content)
+    written(target, report, *tables_written(tables, "montecarlo", content))
 
 
 @contextlib.contextmanager

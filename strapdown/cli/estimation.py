@@ -22,7 +22,7 @@ from strapdown.cli.reading import (
     Topic,
     told,
 )
-from strapdown.cli.terminal import app, console, doubt, need_own, show, table, writable, written
+from strapdown.cli.terminal import FORMAT, FigureFormat, app, console, doubt, need_own, show, table, writable, written
 
 if TYPE_CHECKING:
     from strapdown.recordings import Recording
@@ -36,11 +36,10 @@ FILES = (
     "states.json",
     "observability.json",
     "calibration.toml",
-    "estimate.png",
-    "errors.png",
-    "states.png",
 )
-"""What the command may write to its folder."""
+"""What the command may write to its folder, beside figures."""
+FIGURES = ("estimate", "errors", "states")
+"""Figures that it may draw there, without the suffix of their format."""
 ABOUT_IT = ("estimate.html", "estimate.report.json")
 """What other commands write there about an estimate."""
 RECORDING_ONLY = ("motion", "latency", "calibration")
@@ -156,9 +155,8 @@ def estimate(
             help="Recording: calibration.toml of an earlier one of the same unit; that of this one is written too."
         ),
     ] = None,
-    figures: Annotated[
-        bool, typer.Option("--figures", help="Draw the estimate, its states and errors as PNG.")
-    ] = False,
+    figures: Annotated[bool, typer.Option("--figures", help="Draw the estimate, its states and errors.")] = False,
+    form: Annotated[FigureFormat | None, FORMAT] = None,
 ) -> None:
     """Estimate attitude and gyro bias from a recording (accelerometer as vertical, magnetometer as heading) or a simulated record."""
     from strapdown import unit_calibration
@@ -168,7 +166,9 @@ def estimate(
     from strapdown.records import read_attributes
 
     usable_folder("out", out)
-    writable("out", *(out / name for name in FILES), sources=(recording, gyro, filter_file, calibration))
+    drawn_as = None if form is None and not figures else form or FigureFormat.png  # --format asks for figures too
+    names = (*FILES, *(f"{name}.{drawn_as or FigureFormat.png}" for name in FIGURES))
+    writable("out", *(out / name for name in names), sources=(recording, gyro, filter_file, calibration))
     need_own(out / FILES[0], "estimate", lambda path: bool(read_attributes(path)["kind"] == "strapdown estimate"))
     units = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
     layout = told(recording, columns=columns, topic=topic, axes=axes, invert=invert, **units)
@@ -192,7 +192,7 @@ def estimate(
             observability,
             smooth,
             exports,
-            figures,
+            drawn_as,
         )
         return
     options = dict(
@@ -222,7 +222,7 @@ def estimate(
         "full_covariance": bool(full_covariance),
         "smooth": smooth,
     }
-    _estimate_recording(recording, out, layout, gyro, motion, latency, observability, figures, exports, options_used)
+    _estimate_recording(recording, out, layout, gyro, motion, latency, observability, drawn_as, exports, options_used)
 
 
 def _exports(
@@ -280,7 +280,7 @@ def _estimate_record(
     observability: bool,
     smooth: bool,
     exports: Sequence[tuple[Path, dict[str, Any]]],
-    figures: bool,
+    form: FigureFormat | None,
 ) -> None:
     """Run the filter over a record, report and write its estimate."""
     import numpy as np
@@ -348,32 +348,32 @@ def _estimate_record(
     if seen:
         each = ", ".join(f"{np.mean(i.nis[i.used]) / i.innovation.shape[1]:.3g} {s}" for s, i in seen.items())
         console.print(f"Mean NIS per degree of freedom (right: 1): {each}. `strapdown check {paths[0]}` judges them.")
-    if figures:
-        paths += _drawn(out, result, path.name, truth=truth)
+    if form is not None:
+        paths += _drawn(out, form, result, path.name, truth=truth)
     written(*paths)
 
 
 def _drawn(
-    out: Path, result: Estimate, title: str, truth: Any = None, used: Any = None, errors: Any = None
+    out: Path,
+    form: FigureFormat,
+    result: Estimate,
+    title: str,
+    truth: Any = None,
+    used: Any = None,
+    errors: Any = None,
+    fixed_frame: str = "",
 ) -> list[Path]:
     """Draw the estimate, its optional states, and its errors beside a truth or a recording's reference; return the files."""
     from strapdown import plots
 
-    figures = {"estimate.png": plots.estimate_overview(result, title=title)}
+    figures = {out / "estimate": plots.estimate_overview(result, title=title, fixed_frame=fixed_frame)}
     if result.error_states:
-        figures["states.png"] = plots.states_over_time(result, title=title)
+        figures[out / "states"] = plots.states_over_time(result, title=title)
     if truth is not None:
-        figures["errors.png"] = plots.error_overview(result, truth, title=title)
+        figures[out / "errors"] = plots.error_overview(result, truth, title=title)
     if errors is not None:
-        figures["errors.png"] = plots.recording_errors(used.time, errors, used.movement)
-    return [plots.save(figure, out / name) for name, figure in figures.items()]
-
-
-_STATE_UNITS = {
-    "gyro scale": {"1": ("ppm", 1e-6), "rad": ("mrad", 1e-3)},
-    "gyro drift": {"rad/s": ("°/h", 0.0)},
-    "gyro force": {"rad s/m": ("°/h/g", 0.0)},
-}
+        figures[out / "errors"] = plots.recording_errors(used.time, errors, used.movement)
+    return plots.save_as(figures, form)
 
 
 def _states(result: Any) -> dict[str, Any]:
@@ -392,18 +392,15 @@ def _states(result: Any) -> dict[str, Any]:
 
 def _tell_states(result: Any, record: ImuRecord) -> dict[str, Any]:
     """Show the optional states at the end, and return them for JSON."""
-    from strapdown.units import DEGREE_PER_HOUR, STANDARD_GRAVITY
+    from strapdown.plots.style import error_state_unit
 
     of_directions = tuple(f"{one.sensor} " for one in record.vectors if one.kind in ("direction", "heading"))
     rows = table("Optional states at the end", "state", "", "unit", "value", "σ", "σ at the start", left=3)
     for name, block in result.error_states.items():
         for k, (component, unit) in enumerate(zip(block.components, block.units, strict=True)):
-            kind = " ".join(name.split()[:2])
-            word, size = _STATE_UNITS.get(kind, {}).get(unit, (unit, 1.0))
+            word, size = error_state_unit(name, unit)
             if unit == "1" and name.startswith(of_directions):
                 word, size = "% of the vector", 0.01
-            if size == 0.0:
-                size = DEGREE_PER_HOUR / (STANDARD_GRAVITY if kind == "gyro force" else 1.0)
             values = (block.values[-1, k], block.sigma[-1, k], block.sigma[0, k])
             rows.add_row(name, component, word, *(f"{value / size:.4g}" for value in values))
     show(rows)
@@ -435,7 +432,8 @@ def _start(record: ImuRecord, chosen: FilterSetup, attitude: str | None, from_tr
 
 def _clear(out: Path) -> None:
     """Remove what an earlier estimate left in the folder, which the next one may not write anew."""
-    for name in (*FILES[1:], *ABOUT_IT):
+    figures = (f"{name}.{form}" for name in FIGURES for form in FigureFormat)
+    for name in (*FILES[1:], *figures, *ABOUT_IT):
         (out / name).unlink(missing_ok=True)
 
 
@@ -482,7 +480,7 @@ def _estimate_recording(
     motion: str | None,
     latency: float | None,
     observability: bool,
-    figures: bool,
+    form: FigureFormat | None,
     exports: Sequence[tuple[Path, dict[str, Any]]],
     options: dict[str, Any],
 ) -> None:
@@ -568,8 +566,8 @@ def _estimate_recording(
         rows.add_row(*(f"{value:.2f}" for value in rms.values()))
         show(rows)
     paths += _export(exports, found, source)
-    if figures:
-        paths += _drawn(out, found, used.source, used=used, errors=errors)
+    if form is not None:
+        paths += _drawn(out, form, found, used.source, used=used, errors=errors, fixed_frame=frame)
     written(*paths)
 
 

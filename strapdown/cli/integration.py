@@ -4,12 +4,24 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from strapdown.cli.reading import RECORDING_HELP, Axes, Columns, GyroUnit, Invert, TimeUnit, Topic, told
-from strapdown.cli.terminal import app, console, need_own, progress_bar, show, table, writable, written
+from strapdown.cli.terminal import (
+    Tables,
+    app,
+    console,
+    need_own,
+    progress_bar,
+    show,
+    table,
+    tables_folder,
+    tables_written,
+    writable,
+    written,
+)
 
 if TYPE_CHECKING:
     from strapdown.recordings import Recording
@@ -19,11 +31,13 @@ if TYPE_CHECKING:
 @app.command()
 def algorithms(
     time: Annotated[bool, typer.Option(help="Measure the time a sample takes on this machine (a few seconds).")] = True,
+    tables: Tables = None,
 ) -> None:
     """List the integration algorithms: samples, orders, drift constant, what they need, time a sample."""
     from strapdown import coning
 
-    rows = coning.algorithm_rows()
+    tables_folder(tables)
+    rows: list[dict[str, Any]] = [*coning.algorithm_rows()]
     listing = table(
         "Integration algorithms: drift under small coning is −C β² ω (ωh)^n",
         "name",
@@ -40,7 +54,8 @@ def algorithms(
             cells = [str(row[key]) for key in ("name", "needs", "samples", "order", "drift order")]
             cells.append(f"{row['drift constant']:.3g}")
             if time:
-                cells.append(f"{coning.time_per_sample(str(row['name'])) * 1e9:.1f}")
+                row["ns_per_sample"] = coning.time_per_sample(str(row["name"])) * 1e9
+                cells.append(f"{row['ns_per_sample']:.1f}")
             listing.add_row(*cells)
             advance(1)
     show(listing)
@@ -49,6 +64,8 @@ def algorithms(
         "shows too small by a part in (ωh)^K, and the drift order falls with it. matched-… are this package's own.\n"
         "matched-1-8-8 is the most exact and looks 8 samples ahead; matched-4-11 works in real time; four-sample serves ordinary work."
     )
+    if tables is not None:
+        written(*tables_written(tables, "algorithms", rows))
 
 
 @app.command()
@@ -118,6 +135,7 @@ def coning_budget(
     rate: Annotated[list[float], typer.Option(help="Gyro samples a second, Hz; may be given several times.")],
     algorithm: Annotated[list[str] | None, typer.Option(help="Algorithm; may be given several times.")] = None,
     json: Annotated[Path | None, typer.Option(help="Write the table as JSON too.")] = None,
+    tables: Tables = None,
 ) -> None:
     """Tell the drift that an angular vibration spectrum leaves, for each algorithm and sample rate."""
     from strapdown import coning
@@ -127,6 +145,7 @@ def coning_budget(
 
     if json is not None:
         writable("json", json, suffixes=(".json",), sources=(psd,))
+    tables_folder(tables)
     lines = coning.read_vibration(psd)
     largest = max(max(line.angle, line.angle_across or 0.0) for line in lines)
     if largest >= _RIGHT_ANGLE:
@@ -143,14 +162,17 @@ def coning_budget(
     for name in budget.algorithms:
         listing.add_row(name, *(f"{budget.drift(name, r) / DEGREE_PER_HOUR:.4g}" for r in rate))
     show(listing)
+    rows = [
+        {
+            "algorithm": row["algorithm"],
+            "sample_rate_hz": row["sample_rate"],
+            "drift_deg_per_hour": float(row["drift"]) / DEGREE_PER_HOUR,
+        }
+        for row in budget.rows()
+    ]
+    paths = tables_written(tables, "coning budget", rows)
     if json is not None:
-        rows = [
-            {
-                "algorithm": row["algorithm"],
-                "sample_rate_hz": row["sample_rate"],
-                "drift_deg_per_hour": float(row["drift"]) / DEGREE_PER_HOUR,
-            }
-            for row in budget.rows()
-        ]
         write_json(json, {"lines": len(lines), "budget": rows})
-        written(json)
+        paths.insert(0, json)
+    if paths:
+        written(*paths)

@@ -8,7 +8,21 @@ from typing import Annotated, Any
 import typer
 
 from strapdown.cli.filters import filter_of_scenario
-from strapdown.cli.terminal import app, console, progress_bar, scenario_named, show, table, writable, written
+from strapdown.cli.terminal import (
+    FigureFormat,
+    Format,
+    Tables,
+    app,
+    console,
+    progress_bar,
+    scenario_named,
+    show,
+    table,
+    tables_folder,
+    tables_written,
+    writable,
+    written,
+)
 
 
 def _named(option: str, values: list[str] | None) -> dict[str, float]:
@@ -73,6 +87,8 @@ def covariance(
     ] = None,
     epochs: Annotated[int, typer.Option(help="Epochs over the scenario's time.")] = 100,
     out: Annotated[Path, typer.Option(help="Folder for covariance.json and the figure.")] = Path("covariance-results"),
+    form: Format = FigureFormat.png,
+    tables: Tables = None,
 ) -> None:
     """Predict a filter's errors and their budget by source, in one pass without noise."""
     from strapdown import covariance as analysis
@@ -91,7 +107,8 @@ def covariance(
         non_negative(option, value, unit=unit)  # in the unit that it was given in
     chosen = scenario_named(scenario)
     usable_folder("out", out)
-    writable("out", out / "covariance.json", out / "budget.png", sources=(scenario, filter_file))
+    tables_folder(tables)
+    writable("out", out / "covariance.json", out / f"budget.{form}", sources=(scenario, filter_file))
     considered = analysis.Consider(
         scale_factor=1e-6 * scale_factor,
         misalignment=1e-3 * misalignment,
@@ -117,8 +134,8 @@ def covariance(
     from strapdown import plots
 
     title = f"{name}: predicted errors, without a Monte Carlo"
-    figure = plots.save(plots.error_budget(found, title=title), out / "budget.png")
-    written(out / "covariance.json", figure)
+    figures = plots.save_as({out / "budget": plots.error_budget(found, title=title)}, form)
+    written(out / "covariance.json", *figures, *tables_written(tables, "covariance", found.budget()))
 
 
 def _tell(name: str, found: Any, integration: str, *, matched: bool) -> None:

@@ -17,7 +17,22 @@ from strapdown.cli.reading import (
     Topic,
     told,
 )
-from strapdown.cli.terminal import app, console, need_own, progress_bar, scenario_named, show, table, writable, written
+from strapdown.cli.terminal import (
+    FigureFormat,
+    Format,
+    Tables,
+    app,
+    console,
+    need_own,
+    progress_bar,
+    scenario_named,
+    show,
+    table,
+    tables_folder,
+    tables_written,
+    writable,
+    written,
+)
 
 if TYPE_CHECKING:
     from strapdown import allan as identification
@@ -128,6 +143,8 @@ def allan(
     ] = False,
     matlab: Annotated[bool, typer.Option("--matlab", help="Write imu_sensor.m, for imuSensor, too.")] = False,
     out: Annotated[Path, typer.Option(help="Folder for gyro.toml, allan.json and the figure.")] = Path("allan-results"),
+    form: Format = FigureFormat.png,
+    tables: Tables = None,
 ) -> None:
     """Identify a sensor's noise from a recording at rest: Allan deviation, fitted coefficients, specification as TOML."""
     from strapdown import noise_parameters
@@ -144,7 +161,10 @@ def allan(
         count("--temperature", temperature)
     usable_folder("out", out)
     exports = {"imu.yaml": kalibr, "px4.params": px4, "imu_sensor.m": matlab}
-    names = [name for one in chosen for name in _names(one)] + [name for name, wanted in exports.items() if wanted]
+    tables_folder(tables)
+    names = [name for one in chosen for name in _names(one, form)] + [
+        name for name, wanted in exports.items() if wanted
+    ]
     writable("out", *(out / name for name in names), sources=(recording,))
     units = {
         "gyro": gyro_unit,
@@ -152,7 +172,9 @@ def allan(
         "magnetometer": magnetometer_unit,
         "time": time_unit,
     }
-    options = _Options(rate, _layout(recording, columns, topic, units), highest_frequency, robust, temperature, out)
+    options = _Options(
+        rate, _layout(recording, columns, topic, units), highest_frequency, robust, temperature, out, form, tables
+    )
     fits = {one: _identify(recording, one, options) for one in chosen}
     made = {
         "imu.yaml": lambda: noise_parameters.to_kalibr(
@@ -180,6 +202,8 @@ class _Options(NamedTuple):
     robust: bool
     temperature: int | None
     out: Path
+    form: FigureFormat
+    tables: Path | None
 
 
 def _layout(recording: Path, columns: str | None, topic: str | None, units: dict[str, str | None]) -> dict[str, Any]:
@@ -189,10 +213,10 @@ def _layout(recording: Path, columns: str | None, topic: str | None, units: dict
     return told(recording, columns=columns, topic=topic, **units)
 
 
-def _names(sensor: str) -> tuple[str, ...]:
+def _names(sensor: str, form: str = FigureFormat.png) -> tuple[str, ...]:
     """Return the files of a sensor: its specification, the numbers, the figure."""
     stem = "allan" if sensor == "gyro" else sensor
-    return (f"{sensor}.toml", f"{stem}.json", f"{stem}.png", f"{sensor}-temperature.toml")
+    return (f"{sensor}.toml", f"{stem}.json", f"{stem}.{form}", f"{sensor}-temperature.toml")
 
 
 def _identify(recording: Path, sensor: str, options: _Options) -> identification.NoiseFit:
@@ -266,7 +290,10 @@ def _identify(recording: Path, sensor: str, options: _Options) -> identification
     with written_beside(out / specification) as temporary:
         temporary.write_text(_specification(fit, f"{recording.name}, {length}", warnings, sensor), encoding="utf-8")
     _write_numbers(out / _names(sensor)[1], recording.name, fit, deviation, rows, sensor)
-    written(out / specification, out / _names(sensor)[1], *paths, plots.save(figure, out / _names(sensor)[2]))
+    paths += plots.save_as({out / _names(sensor)[2]: figure}, options.form)
+    written(
+        out / specification, out / _names(sensor)[1], *paths, *tables_written(options.tables, "allan", rows, sensor)
+    )
     for warning in warnings:
         console.print(f"warning: {warning}", highlight=False)
     if warnings:

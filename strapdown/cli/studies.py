@@ -7,7 +7,22 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from strapdown.cli.terminal import app, console, counted, progress_bar, show, table, verdict, writable, written
+from strapdown.cli.terminal import (
+    FigureFormat,
+    Format,
+    Tables,
+    app,
+    console,
+    counted,
+    progress_bar,
+    show,
+    table,
+    tables_folder,
+    tables_written,
+    verdict,
+    writable,
+    written,
+)
 
 if TYPE_CHECKING:
     from strapdown.coning import Algorithm
@@ -80,6 +95,8 @@ def coning(
             "several times."
         ),
     ] = None,
+    form: Format = FigureFormat.png,
+    tables: Tables = None,
 ) -> None:
     """Study coning: the drift of each integration algorithm, and what a filter makes of it."""
     from strapdown import coning_study
@@ -100,8 +117,9 @@ def coning(
             f"raise the rate, to {LEAST_SAMPLES_A_CYCLE:g} samples a cycle at least"
         )
     usable_folder("out", out)
-    names = ("coning.json", "drift.png", "errors.png", "consistency.png", *(["algorithms.png"] if own else []))
-    writable("out", *(out / name for name in names))
+    names = ("drift", "errors", "consistency", *(["algorithms"] if own else []))
+    tables_folder(tables)
+    writable("out", out / "coning.json", *(out / f"{name}.{form}" for name in names))
     _show_own(own)
     with progress_bar("Monte Carlo runs", runs) as advance:
         study = coning_study.run(parameters, progress=advance)
@@ -155,5 +173,5 @@ def coning(
     )
     from strapdown import plots
 
-    paths = plots.draw_coning_study(study, out)
-    written(out / "coning.json", *paths)
+    paths = plots.draw_coning_study(study, out, form)
+    written(out / "coning.json", *paths, *tables_written(tables, "coning", summary))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import enum
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich import box
@@ -41,6 +42,24 @@ app = typer.Typer(
 # Without markup, so that a file name in brackets is said as it is; a statement is one line, which the terminal wraps.
 console = Console(markup=False, highlight=False, soft_wrap=True)
 errors = Console(stderr=True, markup=False, highlight=False)
+
+
+class FigureFormat(enum.StrEnum):
+    """What figures are written as."""
+
+    png = "png"
+    pdf = "pdf"
+    svg = "svg"
+
+
+FORMAT: Any = typer.Option("--format", help="Format of the figures.")
+Format = Annotated[FigureFormat, FORMAT]
+"""Option of every command that draws."""
+Tables = Annotated[
+    Path | None,
+    typer.Option("--tables", help="Folder to write the tables to as well, as CSV with every digit and as LaTeX."),
+]
+"""Option of every command that prints the tables of a study."""
 
 
 def rate_text(speed: float) -> str:
@@ -105,6 +124,23 @@ def show(rows: Table) -> None:
         console.print(rows, crop=False)
     finally:
         console.width = width
+
+
+def tables_written(folder: Path | None, study: str, *results: Any) -> list[Path]:
+    """Write the tables of a study to the folder of ``--tables``, if one is given, and return the files."""
+    if folder is None:
+        return []
+    from strapdown.report import tables
+
+    return tables.write(tables.STUDIES[study](*results), folder)
+
+
+def tables_folder(folder: Path | None) -> None:
+    """Refuse a folder of ``--tables`` that cannot be written to, before anything is computed."""
+    from strapdown.files import usable_folder
+
+    if folder is not None:
+        usable_folder("--tables", folder)
 
 
 def verdict(good: bool) -> Text:

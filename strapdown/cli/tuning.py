@@ -9,7 +9,22 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from strapdown.cli.terminal import app, console, doubt, need_own, progress_bar, show, table, writable, written
+from strapdown.cli.terminal import (
+    FigureFormat,
+    Format,
+    Tables,
+    app,
+    console,
+    doubt,
+    need_own,
+    progress_bar,
+    show,
+    table,
+    tables_folder,
+    tables_written,
+    writable,
+    written,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -124,6 +139,8 @@ def tune(
     out: Annotated[
         Path, typer.Option("--out", "-o", help="TOML for --filter of other commands; JSON and figures go beside it.")
     ] = Path("filter.toml"),
+    form: Format = FigureFormat.png,
+    tables: Tables = None,
 ) -> None:
     """Tune the filter by maximum likelihood, and tell how sure each parameter is."""
     import os
@@ -159,8 +176,12 @@ def tune(
     sources = (*records, filter_file)
     writable("out", out, suffixes=(".toml",), sources=sources)
     writable(
-        "out", out.with_suffix(".json"), *(out.with_name(f"{out.stem}-{name}.png") for name in FIGURES), sources=sources
+        "out",
+        out.with_suffix(".json"),
+        *(out.with_name(f"{out.stem}-{name}.{form}") for name in FIGURES),
+        sources=sources,
     )
+    tables_folder(tables)
     report = out.with_suffix(".json")
     for target in (out, report):
         need_own(target, "tune", lambda _: bool(tunings.read(report)))
@@ -221,7 +242,19 @@ def tune(
         _tell_comparison(comparison, truth=bool(truth or rmse or credibility))
     objective_name = "credibility" if credibility else "rmse" if rmse else "likelihood"
     of = objective_name + (" of the errors" if truth else "")
-    _write(out, result, objective, comparison, cases, records, of=of, examined=examined, gate=found)
+    _write(
+        out,
+        result,
+        objective,
+        comparison,
+        cases,
+        records,
+        of=of,
+        examined=examined,
+        gate=found,
+        form=form,
+        tables=tables,
+    )
 
 
 def _differs_by_axis(cases: Sequence[Case], chosen: FilterSetup) -> bool:
@@ -400,6 +433,8 @@ def _write(
     of: str,
     examined: Sequence[Unmodelled],
     gate: TunedGate | None,
+    form: FigureFormat,
+    tables: Path | None,
 ) -> None:
     from strapdown import plots, tuning
     from strapdown.files import write_json, written_beside
@@ -408,23 +443,22 @@ def _write(
 
     with written_beside(out) as temporary:
         temporary.write_text(to_toml(result.setup), encoding="utf-8")
-    for name in FIGURES:  # of an earlier tuning, which may have had more of them
-        out.with_name(f"{out.stem}-{name}.png").unlink(missing_ok=True)
+    places = {name: out.with_name(f"{out.stem}-{name}.{form}") for name in FIGURES}
+    for place in places.values():  # of an earlier tuning, which may have had more of them, or in another format
+        for other in FigureFormat:
+            place.with_suffix(f".{other}").unlink(missing_ok=True)
     report = out.with_suffix(".json")
     records = [case.record for case in cases]
     units = [_unit_of(name, records) for name in objective.names]
     own = [_unit_of(one.name, records) for one in result.parameters]
-    write_json(report, _report(result, own, comparison, paths, of, examined, gate))
-    figures = {
-        out.with_name(f"{out.stem}-likelihood.png"): drawing.likelihood_slices(
-            tuning.slices(objective, result), result, units
-        )
-    }
+    content = _report(result, own, comparison, paths, of, examined, gate)
+    write_json(report, content)
+    figures = {places["likelihood"]: drawing.likelihood_slices(tuning.slices(objective, result), result, units)}
     if comparison is not None:
-        figures[out.with_name(f"{out.stem}-heldout.png")] = drawing.before_and_after(
+        figures[places["heldout"]] = drawing.before_and_after(
             comparison, title="The first record, on what was held out"
         )
-    written(out, report, *(plots.save(figure, path) for path, figure in figures.items()))
+    written(out, report, *plots.save_as(figures, form), *tables_written(tables, "tuning", content))
 
 
 def _report(

@@ -1,19 +1,19 @@
 """Figures. Each function takes results and an optional ``ax``, draws, and returns the axes; nothing here computes statistics.
 
-Colours are those of Okabe and Ito, told apart by every kind of colour vision. :func:`new_figure` makes a figure that needs no display.
+Colours are those of Okabe and Ito, which every kind of colour vision can tell apart. :func:`new_figure` needs no display.
 
 ``style``
     Colours, themes (light, dark), sizes, saving.
 ``decimation``
-    Long series without loss of extremes.
+    Long series reduced to the extremes of each pixel column.
 ``estimates``
     One estimate over time: attitude, bias, σ, errors.
 ``innovations``
-    Innovations of one record: size, shape, memory.
+    Innovations of one record: NIS, distribution, autocorrelation.
 ``statistics``
     Error statistics over many runs.
 ``sphere``
-    The path of a body axis on the unit sphere, still or moving.
+    The path of a body axis on the unit sphere, still or animated.
 ``coning``
     The coning study.
 ``allan``
@@ -32,6 +32,8 @@ from strapdown.plots.coning import coning_errors as coning_errors
 from strapdown.plots.coning import draw_coning_study
 from strapdown.plots.coning import drift_by_algorithm as drift_by_algorithm
 from strapdown.plots.decimation import decimated as decimated
+from strapdown.plots.decimation import envelope as envelope
+from strapdown.plots.estimates import angle_labels as angle_labels
 from strapdown.plots.estimates import error_overview, estimate_overview, states_over_time
 from strapdown.plots.estimates import errors_in_envelope as errors_in_envelope
 from strapdown.plots.estimates import recording_errors as recording_errors
@@ -54,6 +56,7 @@ from strapdown.plots.style import VERMILION as VERMILION
 from strapdown.plots.style import YELLOW as YELLOW
 from strapdown.plots.style import ink as ink
 from strapdown.plots.style import new_figure, save
+from strapdown.plots.style import save_as as save_as
 from strapdown.plots.style import theme as theme
 
 __all__ = [

@@ -22,6 +22,7 @@ from strapdown.plots.style import (
     YELLOW,
     axes_or_new,
     ink,
+    legend_below,
     new_figure,
 )
 
@@ -41,7 +42,7 @@ def allan_axis(
     upper = np.where(np.isfinite(deviation.upper[axis]), deviation.upper[axis], np.nan)
     band = (deviation.lower[axis] / scale, upper / scale)
     ax.fill_between(
-        deviation.taus, *band, color=SKY, alpha=0.5, linewidth=0, label=f"{100 * deviation.level:.0f} % band"
+        deviation.taus, *band, color=SKY, alpha=0.5, linewidth=0, label=f"{100 * deviation.level:.0f} % confidence"
     )
     ax.loglog(deviation.taus, deviation.deviation[axis] / scale, "o", color=BLUE, markersize=2.5, label="measured")
     ax.loglog(deviation.taus, curves["total"] / scale, color=ink(), linewidth=1.4, label="fit")
@@ -72,10 +73,9 @@ def allan_overview(
     figure, axes = new_figure(1, number, size=(1.5 + 4.2 * number, 4.8), sharey=True, squeeze=False)
     for axis in range(number):
         ax = allan_axis(deviation, fit, curves[axis], axis, axes[0, axis], sensor=sensor)
-        ax.set_title(AXES[axis])
+        ax.set_title(f"{AXES[axis]} axis", loc="left")
         ax.set_ylabel(f"Allan deviation, {unit}" if axis == 0 else "")
     drawn = deviation.deviation[deviation.deviation > 0.0] / scale
-    axes[0, 0].set_ylim(0.2 * drawn.min(), 3.0 * drawn.max())  # shared: the last axis alone would cut the others off
-    handles = {label: handle for ax in axes[0] for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, frameon=False)
+    axes[0, 0].set_ylim(0.3 * drawn.min(), 3.0 * drawn.max())  # shared: the last axis alone would cut the others off
+    legend_below(figure, list(axes[0]), ncols=8)
     return figure

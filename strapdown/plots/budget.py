@@ -1,4 +1,4 @@
-"""Error budgets: what a covariance analysis predicts, and from which sources it comes."""
+"""Error budgets of a covariance analysis: predicted errors, and the share of each source."""
 
 from __future__ import annotations
 
@@ -9,31 +9,32 @@ from matplotlib.figure import Figure
 
 from strapdown.checks import Array
 from strapdown.covariance import Analysis
-from strapdown.plots.style import BLUE, CYCLE, VERMILION, YELLOW, angle_unit, new_figure, rate_unit
+from strapdown.plots.style import BLUE, CYCLE, VERMILION, YELLOW, angle_unit, legend_above, new_figure, rate_unit
 
 _SHADES = (*CYCLE, YELLOW, "#666666", "#8C564B", "#17BECF", "#AEC7E8", "#C5B0D5")
-_LEAST_SHARE = 0.01  # sources that never make this part of the mean square are drawn together
+_MIN_SHARE = 0.01  # sources below this part of the mean square at all times are drawn together
 
 
 def error_budget(analysis: Analysis, *, title: str = "") -> Figure:
-    """Draw RMS error and the filter's own σ of attitude and bias over time, and below the share of each source in the mean square."""
+    """Draw RMS error and the filter's σ of attitude and bias over time, and below the share of each source in the mean square error."""
     figure, axes = new_figure(2, 2, size=(11.0, 7.0), sharex=True, height_ratios=(1.0, 1.25))
     parts = (slice(0, 3), slice(3, 6))
     shares = [_shares(analysis, part) for part in parts]
-    names = [name for name in shares[0] if max(_largest(share[name]) for share in shares) >= _LEAST_SHARE]
+    names = [name for name in shares[0] if max(_largest(share[name]) for share in shares) >= _MIN_SHARE]
     colours = {name: _SHADES[k % len(_SHADES)] for k, name in enumerate(names)}
     handles: dict[str, Any] = {}
     for column, (part, share) in enumerate(zip(parts, shares, strict=True)):
         top, bottom = axes[:, column]
+        what = ("attitude", "bias")[column]
         rms = np.sqrt(np.mean(analysis.rms[:, part] ** 2, axis=1))
         sigma = np.sqrt(np.mean(analysis.filter_sigma[:, part] ** 2, axis=1))
         # The unit is that of the settled filter: its start is the prior, orders above.
         unit, size = (angle_unit if column == 0 else rate_unit)(rms[len(rms) // 2 :])
         top.semilogy(
-            analysis.time, np.where(rms > 0.0, rms / size, np.nan), color=VERMILION, linewidth=2.4, label="actual RMS"
+            analysis.time, np.where(rms > 0.0, rms / size, np.nan), color=VERMILION, linewidth=2.4, label="RMS error"
         )
-        top.semilogy(analysis.time, sigma / size, color=BLUE, linewidth=1.2, label="the filter's own σ")
-        top.set_ylabel(f"{'attitude' if column == 0 else 'bias'}, one axis, {unit}")
+        top.semilogy(analysis.time, sigma / size, color=BLUE, linewidth=1.2, label="σ of the filter")
+        top.set_ylabel(f"{what} error, one axis, {unit}")
         shown = {name: share[name] for name in names}
         rest = 1.0 - np.sum(list(shown.values()), axis=0)
         if _largest(rest) > 1e-3:
@@ -46,8 +47,8 @@ def error_budget(analysis: Analysis, *, title: str = "") -> Figure:
         )
         handles.update(zip(shown, stack, strict=True))
         bottom.set(ylim=(0.0, 100.0), xlim=(analysis.time[0], analysis.time[-1]), xlabel="time, s")
-        bottom.set_ylabel(f"share of the {'attitude' if column == 0 else 'bias'}'s mean square, %")
-    axes[0, 0].legend(loc="upper right")
+        bottom.set_ylabel(f"share of mean square {what} error, %")
+    legend_above(axes[0, 0])
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, frameon=False)
     if title:
         figure.suptitle(title)

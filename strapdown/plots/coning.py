@@ -22,7 +22,17 @@ from strapdown.coning_study import (
 from strapdown.motion import Coning
 from strapdown.plots.estimates import errors_in_envelope
 from strapdown.plots.statistics import nees_over_time, nis_over_time
-from strapdown.plots.style import CYCLE, SKY, axes_or_new, ink, new_figure, save
+from strapdown.plots.style import (
+    CYCLE,
+    SKY,
+    axes_or_new,
+    ink,
+    legend_above,
+    legend_below,
+    match_scales,
+    new_figure,
+    save_as,
+)
 from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR
 
 _ROUNDING = 1e-6  # °/h: below it a drift is rounding of the run that measures it
@@ -53,8 +63,8 @@ def drift_by_algorithm(drifts: Sequence[Drift], ax: Axes | None = None) -> Axes:
         ax.annotate(text, (place, top), xytext=(0, 5), textcoords="offset points", ha="center")
     ax.set_xticks(places, [drift.algorithm for drift in drifts])
     ax.grid(visible=False, axis="x")
-    ax.set_ylabel("drift, °/h")
-    ax.legend(loc="upper right", frameon=False)
+    ax.set_ylabel("size of the drift about the cone's axis, °/h")
+    legend_above(ax)
     return ax
 
 
@@ -65,38 +75,62 @@ def coning_errors(outcomes: Sequence[FilterOutcome]) -> Figure:
         s = outcome.statistics
         for ax, state, unit in ((axes[0, j], 2, ARCSECOND), (axes[1, j], 5, DEGREE_PER_HOUR)):
             errors_in_envelope(s.time, s.example_error[:, :, state] / unit, s.sigma[:, state] / unit, ax)
-        axes[0, j].set_title(f"{outcome.integration}: {'consistent' if outcome.consistent else 'NOT consistent'}")
+        verdict = "consistent" if outcome.consistent else "NOT consistent"
+        axes[0, j].set_title(f"{outcome.integration}: {verdict}", loc="left")
         late = s.sigma[len(s.time) // 10 :]
         axes[0, j].set_ylim(-1.3 * 3.0 * late[:, 2].max() / ARCSECOND, 1.3 * 3.0 * late[:, 2].max() / ARCSECOND)
         top = max(1.6 * 3.0 * late[:, 5].max(), 1.25 * float(np.abs(s.example_error[:, len(s.time) // 10 :, 5]).max()))
         axes[1, j].set_ylim(-top / DEGREE_PER_HOUR, top / DEGREE_PER_HOUR)
         axes[0, j].set_xlabel("")
+    for row in axes:
+        match_scales(row)
     axes[0, 0].set_ylabel("attitude error, arcsec")
     axes[1, 0].set_ylabel("bias error, °/h")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=2, frameon=False)
+    legend_below(figure, [axes[0, 0]])
     figure.suptitle(
-        "Errors about the cone's axis. Commutation error is a constant rate: the filter takes it for gyro bias."
+        "Errors about the cone's axis. Coning left by the integration is a constant rate, which the filter estimates as gyro bias."
     )
     return figure
 
 
 def coning_consistency(outcomes: Sequence[FilterOutcome]) -> Figure:
-    """Draw NEES of attitude and of bias and NIS over time for each integration algorithm, with the bounds of a right filter."""
-    figure, axes = new_figure(1, 3, size=(12.0, 4.2))
+    """Draw NEES of attitude and of bias and NIS over time for each integration algorithm, with the bounds of a consistent filter.
+
+    Marks below the curves are the epochs that the verdict is about. Where a filter that passes leaves the bounds at an epoch that was not
+    judged, the panel says so.
+    """
+    figure, axes = new_figure(1, 3, size=(12.0, 4.6))
     named = [(outcome.integration, outcome.statistics) for outcome in outcomes]
     first = outcomes[0]
+    percent = f"{100 * first.probability:g} %"
     for ax, subset in zip(axes[:2], ("attitude", "bias"), strict=True):
-        nees_over_time(named, first.statistics.verdict(first.epochs, subset, first.probability).bounds, subset, ax)
+        verdicts = [one.statistics.verdict(one.epochs, subset, one.probability) for one in outcomes]
+        bounds = verdicts[0].simultaneous_bounds
+        nees_over_time(named, bounds, subset, ax, label=f"NEES: {percent} bounds, all judged epochs")
+        ax.plot(
+            first.statistics.time[first.epochs],
+            np.full(len(first.epochs), 0.015),
+            "|",
+            color=ink(),
+            markersize=5,
+            transform=ax.get_xaxis_transform(),
+            label="judged epoch",
+        )
+        passed = [one for one, verdict in zip(outcomes, verdicts, strict=True) if verdict.consistent]
+        title = f"{subset.capitalize()}: {len(passed)} of {len(outcomes)} pass"
+        if any(_leaves(one, subset, bounds) for one in passed):
+            title += "\nOutside the bounds only at epochs not judged"
+        ax.set_title(title, loc="left")
     low, high = axes[0].get_ylim()
     axes[0].set_ylim(min(0.3, low), max(3.0, min(high, 30.0)))
-    nis_over_time(named, axes[2], probability=first.probability)
-    for ax, subset in zip(axes[:2], ("attitude", "bias"), strict=True):
-        passed = sum(o.statistics.verdict(o.epochs, subset, o.probability).consistent for o in outcomes)
-        ax.set_title(f"{subset.capitalize()}: {passed} of {len(outcomes)} pass")
-    axes[2].set_title("Innovations")
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False)
+    nis_over_time(named, axes[2], probability=first.probability, label=f"NIS: {percent} bounds, each interval")
+    passing = [
+        low <= one.statistics.mean_nis <= high
+        for one in outcomes
+        for low, high in [one.statistics.nis_bounds(one.probability)]
+    ]
+    axes[2].set_title(f"NIS: {sum(passing)} of {len(outcomes)} pass\nJudged by its mean over all time", loc="left")
+    legend_below(figure, list(axes))
     return figure
 
 
@@ -132,18 +166,26 @@ def algorithms_compared(study: ConingStudy) -> Figure:
     return figure
 
 
-def draw_coning_study(study: ConingStudy, folder: str | os.PathLike[str]) -> list[Path]:
-    """Write the figures of the coning study to a folder and return their paths."""
+def _leaves(outcome: FilterOutcome, subset: str, bounds: tuple[float, float]) -> bool:
+    """Return whether the ANEES of a subset lies outside its bounds at any epoch, judged or not."""
+    value = outcome.statistics.anees[:, ("state", "attitude", "bias").index(subset)]
+    return bool(((value < bounds[0]) | (value > bounds[1])).any())
+
+
+def draw_coning_study(study: ConingStudy, folder: str | os.PathLike[str], form: str = "png") -> list[Path]:
+    """Write the figures of the coning study to a folder, as ``form`` ("png", "pdf" or "svg"), and return their paths."""
     figure, ax = new_figure(size=(7.0, 4.2))
     drift_by_algorithm(study.drifts, ax)
     p = study.parameters
-    ax.set_title(
+    figure.suptitle(
         f"Coning {p.angle / DEGREE:g}° at {p.frequency:g} Hz, gyro at {p.rate:g} Hz ({p.rate / p.frequency:.3g} samples a cycle)"
     )
     target = Path(folder)
-    return [
-        save(figure, target / "drift.png"),
-        save(coning_errors(study.outcomes), target / "errors.png"),
-        save(coning_consistency(study.outcomes), target / "consistency.png"),
-        *([save(algorithms_compared(study), target / "algorithms.png")] if p.own else []),
-    ]
+    figures = {
+        target / "drift": figure,
+        target / "errors": coning_errors(study.outcomes),
+        target / "consistency": coning_consistency(study.outcomes),
+    }
+    if p.own:
+        figures[target / "algorithms"] = algorithms_compared(study)
+    return save_as(figures, form)

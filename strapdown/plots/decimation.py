@@ -1,37 +1,72 @@
-"""Long series drawn as what a screen can show: of each span of samples its least and its largest, so that no extreme is lost."""
+"""Long series reduced to what a figure can show: the extremes of each column of pixels, so that no peak is lost."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from strapdown.checks import Array
 
-MOST = 4000
-"""Points of a drawn line: two for each pixel of a wide figure."""
+LINE_COLUMNS = 2000
+"""Columns of equal time that a drawn line is reduced to: at least one for each pixel of a wide figure."""
+BAND_COLUMNS = 250
+"""Columns of equal time that a drawn band is reduced to: wide enough to hold a tooth of σ between two measurements."""
 
 
-def decimated(time: Array, value: Array, most: int = MOST) -> tuple[Array, Array]:
-    """Return at most ``most`` points of a series (n,): the least and the largest of each span of samples, in their order.
+class Envelope(NamedTuple):
+    """Extremes of a series in columns of equal time."""
 
-    A series that is short enough comes back as it is. A span that is all NaN gives NaN, so that gaps stay.
+    time: Array
+    """Time of the first sample of each column (k,)."""
+    low: Array
+    """Least value in each column (k,); NaN where it holds NaN alone."""
+    high: Array
+    """Largest value in each column (k,); NaN where it holds NaN alone."""
+
+
+def column_starts(time: Array, columns: int) -> NDArray[np.int64]:
+    """Return the index of the first sample of each column: the span of ``time`` (n,) in equal parts, those without a sample left out."""
+    span = float(time[-1] - time[0])
+    if span <= 0.0:
+        return np.zeros(1, np.int64)
+    column = np.minimum((time - time[0]) * (columns / span), columns - 1).astype(np.int64)
+    return np.flatnonzero(np.diff(column, prepend=-1))
+
+
+def extreme_rows(time: Array, value: Array, columns: int = LINE_COLUMNS) -> NDArray[np.int64]:
+    """Return the indices, in order, of the samples that a line needs: of each column the least and the largest, and both ends.
+
+    A column of NaN keeps two of them, so that gaps stay. A series of at most two samples a column is kept whole.
     """
     n = len(value)
-    if n <= most:
-        return time, value
-    step = -(-n // (most // 2))
-    whole = n // step * step
-    low, high = _extremes(value[:whole].reshape(-1, step))
-    rows = np.arange(0, whole, step)
-    low, high = rows + low, rows + high
-    if whole < n:
-        last_low, last_high = _extremes(value[None, whole:])
-        low, high = np.append(low, whole + last_low), np.append(high, whole + last_high)
-    kept = np.sort(np.stack([low, high], axis=1), axis=1).ravel()
-    return time[kept], value[kept]
+    if n <= 2 * columns:
+        return np.arange(n)
+    starts = column_starts(time, columns)
+    group = np.repeat(np.arange(len(starts)), np.diff(starts, append=n))
+    found = [np.array([0, n - 1])]
+    for reduce, missing in ((np.fmin, starts), (np.fmax, np.append(starts[1:], n) - 1)):
+        hits = np.flatnonzero(value == reduce.reduceat(value, starts)[group])
+        rows = missing.copy()
+        rows[group[hits][::-1]] = hits[::-1]  # the first of equal ones, written last
+        found.append(rows)
+    return np.unique(np.concatenate(found))
 
 
-def _extremes(spans: Array) -> tuple[np.ndarray, np.ndarray]:
-    missing = np.isnan(spans)
-    if not missing.any():
-        return spans.argmin(axis=1), spans.argmax(axis=1)
-    return np.where(missing, np.inf, spans).argmin(axis=1), np.where(missing, -np.inf, spans).argmax(axis=1)
+def decimated(time: Array, value: Array, columns: int = LINE_COLUMNS) -> tuple[Array, Array]:
+    """Return the points of a line (n,) that a figure can show, by :func:`extreme_rows`."""
+    rows = extreme_rows(time, value, columns)
+    return time[rows], value[rows]
+
+
+def envelope(time: Array, low: Array, high: Array | None = None, columns: int = BAND_COLUMNS) -> Envelope:
+    """Return the least of ``low`` and the largest of ``high`` (``low`` if not given) in each column.
+
+    A series of at most one sample a column is kept whole.
+    """
+    high = low if high is None else high
+    if len(time) <= columns:
+        return Envelope(time, low, high)
+    starts = column_starts(time, columns)
+    return Envelope(time[starts], np.fmin.reduceat(low, starts), np.fmax.reduceat(high, starts))

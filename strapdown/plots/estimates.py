@@ -2,24 +2,81 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MultipleLocator, NullFormatter
+from numpy.typing import NDArray
 
 from strapdown import quaternion
 from strapdown.checks import Array
 from strapdown.consistency import ReferenceErrors, errors
-from strapdown.plots.decimation import decimated
-from strapdown.plots.style import AXES, BLUE, CYCLE, SKY, VERMILION, angle_unit, axes_or_new, ink, new_figure, rate_unit
+from strapdown.plots.decimation import BAND_COLUMNS, decimated, envelope, extreme_rows
+from strapdown.plots.style import (
+    AXES,
+    BLUE,
+    CYCLE,
+    SKY,
+    VERMILION,
+    angle_unit,
+    axes_or_new,
+    error_state_unit,
+    ink,
+    legend_above,
+    legend_below,
+    new_figure,
+    rate_unit,
+)
 from strapdown.records import Estimate, Truth
 from strapdown.units import DEGREE
 
+THREE_SIGMA = "±3σ (99.7 %)"
+"""Legend of a band of three standard deviations, with the share of normal errors of one axis that it holds."""
+
+
+def band(ax: Axes, time: Array, low: Array, high: Array, **style: Any) -> None:
+    """Fill between two series (n,); of a long one between the extremes of each column, which hold over the whole column."""
+    found = envelope(time, low, high)
+    if len(time) <= BAND_COLUMNS:
+        ax.fill_between(*found, linewidth=0, **style)
+        return
+    ends = (np.append(found.time, time[-1]), np.append(found.low, found.low[-1]), np.append(found.high, found.high[-1]))
+    ax.fill_between(*ends, step="post", linewidth=0, **style)
+
 
 def errors_in_envelope(time: Array, error: Array, sigma: Array, ax: Axes | None = None) -> Axes:
-    """Draw errors (runs, m) over time inside ±3σ of the filter's own (m,); both in the unit of the axis that the caller labels."""
+    """Draw errors over time inside the filter's ±3σ.
+
+    Of a long series the band is dark up to the least 3σ of each column of pixels and light up to the largest: between two measurements σ
+    grows, and lines through each tooth would be a grey bar that hides the errors.
+
+    Parameters
+    ----------
+    time : (n,)
+        s.
+    error : (runs, n)
+        In the unit of the vertical axis, which the caller labels.
+    sigma : (n,)
+        The filter's standard deviation, in the same unit.
+    ax : Axes, optional
+        A new figure's if not given.
+    """
     ax = axes_or_new(ax)
-    when, spread = decimated(time, 3.0 * sigma)
-    ax.fill_between(when, -spread, spread, color=SKY, alpha=0.35, linewidth=0, label="±3σ of the filter")
+    bound = 3.0 * sigma
+    if len(time) <= BAND_COLUMNS:
+        band(ax, time, -bound, bound, color=SKY, alpha=0.35, label=f"{THREE_SIGMA} of the filter")
+    else:
+        found = envelope(time, bound)
+        edges = np.append(found.time, time[-1])
+        least, most = (np.append(values, values[-1]) for values in (found.low, found.high))
+        inner: dict[str, Any] = {"color": SKY, "alpha": 0.35, "linewidth": 0, "step": "post"}
+        outer = {**inner, "alpha": 0.18}
+        ax.fill_between(edges, -least, least, label=f"{THREE_SIGMA} of the filter", **inner)
+        if (most > 1.02 * least).any():
+            ax.fill_between(edges, least, most, label="where 3σ varies within a pixel", **outer)
+            ax.fill_between(edges, -most, -least, **outer)
     ax.axhline(0.0, color=ink(), linewidth=0.6)
     for k, one in enumerate(error):
         ax.plot(
@@ -27,45 +84,90 @@ def errors_in_envelope(time: Array, error: Array, sigma: Array, ax: Axes | None 
             color=VERMILION,
             linewidth=0.8,
             alpha=0.8,
-            label=f"{len(error)} runs" if k == 0 else None,
+            label=f"error, {len(error)} runs" if k == 0 and len(error) > 1 else "error" if k == 0 else None,
         )
+    ax.set_xlim(time[0], time[-1])
     ax.set_xlabel("time, s")
     return ax
 
 
-def estimate_overview(estimate: Estimate, *, title: str = "") -> Figure:
-    """Draw the attitude as roll, pitch and yaw, the gyro bias, and their standard deviations over time."""
-    figure, axes = new_figure(3, 1, size=(9.0, 7.5), sharex=True)
+def angle_labels(fixed_frame: str = "") -> tuple[str, str, str]:
+    """Return what roll, pitch and yaw of the sequence Z-Y-X are, with the sense in which each grows.
+
+    Parameters
+    ----------
+    fixed_frame : str
+        As an estimate's file gives it; yaw is from East in one that begins with "East-North-Up", else from the fixed x axis.
+    """
+    yaw = "from East to North" if fixed_frame.startswith("East-North-Up") else "from fixed x to y"
+    return "roll about body x, y to z", "pitch about y, z to x", f"yaw about fixed z, {yaw}"
+
+
+def wraps(angle: Array, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the places in ``rows`` before which an angle (n,) in degrees wraps round ±180°, so that its line should break.
+
+    Where it turns by more than half a turn from one row to the next, a line that fills the span is what there is to see.
+    """
+    turned = np.unwrap(angle, period=360.0)[rows]
+    return np.flatnonzero((np.abs(np.diff(angle[rows])) > 180.0) & (np.abs(np.diff(turned)) < 180.0)) + 1
+
+
+def unbroken(time: Array, angle: Array) -> tuple[Array, Array]:
+    """Return the points of a line of an angle in degrees, reduced as any line, with a gap where it wraps round ±180°."""
+    rows = extreme_rows(time, angle)
+    breaks = wraps(angle, rows)
+    return np.insert(time[rows], breaks, time[rows][breaks]), np.insert(angle[rows], breaks, np.nan)
+
+
+def estimate_overview(estimate: Estimate, *, title: str = "", fixed_frame: str = "") -> Figure:
+    """Draw roll, pitch and yaw (sequence Z-Y-X), the gyro bias in its ±3σ, and the attitude's σ over time.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    title : str
+    fixed_frame : str
+        As :func:`angle_labels` takes it.
+    """
+    figure, axes = new_figure(5, 1, size=(9.0, 10.0), sharex=True, height_ratios=(1.0, 1.0, 1.0, 1.7, 1.3))
     euler = quaternion.to_rotation(estimate.attitude).as_euler("ZYX", degrees=True)[:, ::-1]
-    for k, name in enumerate(("roll", "pitch", "yaw")):
-        # Breaks where the angle wraps, so that no line crosses the whole plot.
-        angle = np.where(np.abs(np.diff(euler[:, k], prepend=euler[0, k])) > 180.0, np.nan, euler[:, k])
-        axes[0].plot(*decimated(estimate.time, angle), color=CYCLE[k], linewidth=0.9, label=name)
+    for ax, angle, name in zip(axes, euler.T, angle_labels(fixed_frame), strict=False):
+        ax.plot(*unbroken(estimate.time, angle), color=BLUE, linewidth=0.9)
+        ax.set_ylabel(f"{name.split()[0]}, °")
+        if np.ptp(angle) > 180.0:
+            ax.yaxis.set_major_locator(MultipleLocator(90.0))
+        ax.set_title(f"Euler angles Z-Y-X: {name}", loc="right", fontsize="small")
     sigma = estimate.sigma
     settled = slice(len(estimate.time) // 20, None)
     reach = np.abs(estimate.bias[settled]).max() + 3.0 * sigma[settled, 3:].max()
     unit, size = rate_unit(3.0 * sigma[settled, 3:])
     for k, name in enumerate(AXES):
         bias, spread = estimate.bias[:, k] / size, 3.0 * sigma[:, 3 + k] / size
-        when, low = decimated(estimate.time, bias - spread)
-        high = np.interp(when, estimate.time, bias + spread)
-        axes[1].fill_between(when, low, high, color=CYCLE[k], alpha=0.18, linewidth=0)
-        axes[1].plot(*decimated(estimate.time, bias), color=CYCLE[k], linewidth=1.0, label=f"{name}, ±3σ")
-    axes[2].plot(*decimated(estimate.time, np.linalg.norm(sigma[:, :3], axis=1) / DEGREE), color=ink(), linewidth=1.0)
-    axes[1].set_ylim(-1.2 * reach / size, 1.2 * reach / size)
-    axes[0].set_ylabel("attitude, °")
-    axes[1].set_ylabel(f"gyro bias, {unit}")
-    axes[2].set_ylabel("attitude σ, all axes, °")
-    axes[2].set_ylim(bottom=0.0)
-    axes[2].set_xlabel("time, s")
-    for ax in axes[:2]:  # above the curves, which fill the axes
-        ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1, ncols=3, frameon=False)
+        band(axes[3], estimate.time, bias - spread, bias + spread, color=CYCLE[k], alpha=0.18)
+        axes[3].plot(
+            *decimated(estimate.time, bias), color=CYCLE[k], linewidth=1.0, label=f"{name}, band {THREE_SIGMA}"
+        )
+    axes[3].set_ylim(-1.2 * reach / size, 1.2 * reach / size)
+    axes[3].set_ylabel(f"gyro bias, {unit}")
+    legend_above(axes[3])
+    total = np.linalg.norm(sigma[:, :3], axis=1)
+    unit, size = angle_unit(total[settled])
+    axes[4].plot(*decimated(estimate.time, total / size), color=ink(), linewidth=1.0)
+    axes[4].set_ylabel(f"attitude σ, {unit}")
+    axes[4].set_title("root sum square of the three axes", loc="right", fontsize="small")
+    if total.max() > 5.0 * total[settled].max():  # a start that would flatten all the rest
+        axes[4].set_yscale("log")
+        axes[4].yaxis.set_minor_formatter(NullFormatter())
+    else:
+        axes[4].set_ylim(bottom=0.0)
+    axes[4].set_xlabel("time, s")
+    axes[4].set_xlim(estimate.time[0], estimate.time[-1])
     axes[0].set_title(title, loc="left")
     return figure
 
 
 def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:
-    """Draw the optional states over time inside their ±3σ, one axes a block and unit, in the states' units."""
+    """Draw the optional error states over time inside their ±3σ, one axes for each block and unit."""
     panels = [
         (name, block, unit, [k for k, one in enumerate(block.units) if one == unit])
         for name, block in estimate.error_states.items()
@@ -75,22 +177,27 @@ def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:
     axes = np.atleast_1d(grid)
     settled = slice(len(estimate.time) // 10, None)
     for ax, (name, block, unit, members) in zip(axes, panels, strict=True):
-        values, spread = block.values[:, members], 3.0 * block.sigma[:, members]
+        word, size = error_state_unit(name, unit)
+        values, spread = block.values[:, members] / size, 3.0 * block.sigma[:, members] / size
         for k, member in enumerate(members):
             color = CYCLE[k % len(CYCLE)]
-            when, low = decimated(estimate.time, values[:, k] - spread[:, k])
-            high = np.interp(when, estimate.time, values[:, k] + spread[:, k])
-            ax.fill_between(when, low, high, color=color, alpha=0.15, linewidth=0)
-            label = f"{block.components[member]}, ±3σ"
-            ax.plot(*decimated(estimate.time, values[:, k]), color=color, linewidth=0.9, label=label)
+            low, high = values[:, k] - spread[:, k], values[:, k] + spread[:, k]
+            if len(members) == 1:
+                band(ax, estimate.time, low, high, color=color, alpha=0.18)
+            else:  # filled, the bands of several would hide one another
+                bounds = envelope(estimate.time, low, high)
+                for edge in (bounds.low, bounds.high):
+                    ax.plot(bounds.time, edge, ":", color=color, linewidth=0.9)
+            ax.plot(*decimated(estimate.time, values[:, k]), color=color, linewidth=0.9, label=block.components[member])
         reach = 1.2 * float(np.max(np.abs(values[settled]) + spread[settled]))
         ax.set_ylim(-reach, reach)
-        ax.set_ylabel(unit)
-        ax.set_title(name, loc="left")
-        ax.legend(
-            loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1, ncols=min(len(members), 9), frameon=False
-        )
+        ax.set_ylabel(word)
+        edges = "band" if len(members) == 1 else "dotted"
+        what = name.replace("scale", "misalignment") if (word, size) == ("mrad", 1e-3) else name
+        ax.set_title(f"{what}; {edges}: {THREE_SIGMA}", loc="left")
+        legend_above(ax, ncols=min(len(members), 9))
     axes[-1].set_xlabel("time, s")
+    axes[-1].set_xlim(estimate.time[0], estimate.time[-1])
     if title:
         figure.suptitle(title)
     return figure
@@ -110,17 +217,22 @@ def recording_errors(time: Array, errors: ReferenceErrors, movement: np.ndarray 
             linewidth=0,
             label="movement (judged)" if k == 0 else None,
         )
-    for name, color in (("total", ink()), ("heading", BLUE), ("inclination", VERMILION)):
-        ax.plot(*decimated(time, getattr(errors, name) / DEGREE), color=color, linewidth=0.9, label=name)
+    for name, label, color, width in (
+        ("total", "total", ink(), 1.8),
+        ("heading", "heading, about the vertical", BLUE, 0.8),
+        ("inclination", "inclination, of the vertical", VERMILION, 0.8),
+    ):
+        ax.plot(*decimated(time, getattr(errors, name) / DEGREE), color=color, linewidth=width, label=label)
     ax.set_ylim(bottom=0.0)
+    ax.set_xlim(time[0], time[-1])
     ax.set_xlabel("time, s")
-    ax.set_ylabel("error, °")
-    ax.legend(loc="upper left", ncols=4, frameon=False)
+    ax.set_ylabel("error against the reference, °")
+    legend_above(ax)
     return figure
 
 
 def error_overview(estimate: Estimate, truth: Truth, *, title: str = "") -> Figure:
-    """Draw the six errors against the truth at the estimate's times inside the filter's own ±3σ: attitude left, bias right."""
+    """Draw the six errors against the truth at the estimate's times inside the filter's ±3σ: attitude left, bias right."""
     figure, axes = new_figure(3, 2, size=(10.0, 6.6), sharex=True)
     error = errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)
     settled = slice(len(estimate.time) // 20, None)
@@ -133,10 +245,11 @@ def error_overview(estimate: Estimate, truth: Truth, *, title: str = "") -> Figu
             errors_in_envelope(estimate.time, error[None, :, state] / size, estimate.sigma[:, state] / size, ax)
             reach = max(4.0 * estimate.sigma[settled, state].max(), 1.2 * np.abs(error[settled, state]).max()) / size
             ax.set_ylim(-reach, reach)
-            ax.set_ylabel(f"{what} error {AXES[k]}, {unit}")
+            ax.set_ylabel(f"{what} {AXES[k]}, {unit}")
             if k < 2:
                 ax.set_xlabel("")
-    handles, _ = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, ["±3σ of the filter", "error"], loc="outside lower center", ncols=2)
-    figure.suptitle(title or "Errors against the truth, in the body frame")
+    axes[0, 0].set_title("Attitude error, rotation vector in body axes")
+    axes[0, 1].set_title("Gyro bias error, body axes")
+    legend_below(figure, [axes[0, 0]])
+    figure.suptitle(f"{title}{': e' if title else 'E'}rrors against the truth")
     return figure

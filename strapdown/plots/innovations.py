@@ -9,7 +9,7 @@ from matplotlib.ticker import MaxNLocator
 from strapdown.checks import Array
 from strapdown.consistency import Autocorrelation, Distribution, QuantilePairs
 from strapdown.plots.decimation import decimated
-from strapdown.plots.style import AXES, BLUE, CYCLE, ORANGE, SKY, VERMILION, angle_unit, axes_or_new, ink
+from strapdown.plots.style import AXES, BLUE, CYCLE, ORANGE, SKY, VERMILION, angle_unit, axes_or_new, ink, legend_above
 from strapdown.records import Innovations
 
 HISTOGRAM_REACH = 5.0
@@ -17,7 +17,7 @@ HISTOGRAM_REACH = 5.0
 
 
 def innovation_histogram(whitened: Array, ax: Axes | None = None) -> Axes:
-    """Draw the histogram of whitened innovations (n, dof), all components together, over the standard normal that they ought to be."""
+    """Draw the histogram of whitened innovations (n, dof), all components together, and the standard normal density."""
     ax = axes_or_new(ax)
     z = whitened[np.isfinite(whitened)]
     number = int(np.clip(np.sqrt(len(z)), 12, 80))
@@ -35,15 +35,14 @@ def innovation_histogram(whitened: Array, ax: Axes | None = None) -> Axes:
     beyond = int(np.sum(np.abs(z) > HISTOGRAM_REACH))
     if beyond:
         ax.plot([], [], " ", label=f"{beyond} beyond {HISTOGRAM_REACH:g} σ, in the outermost bins")
-    ax.set_xlabel("innovation over its own σ")
+    ax.set_xlabel("innovation over its σ")
     ax.set_ylabel("density")
-    ax.set_ylim(0.0, 1.35 * ax.get_ylim()[1])
-    ax.legend(loc="upper right")
+    legend_above(ax)
     return ax
 
 
 def innovation_quantiles(pairs: QuantilePairs, ax: Axes | None = None) -> Axes:
-    """Draw sorted whitened innovations over the quantiles of the standard normal, with the band of each by itself."""
+    """Draw sorted whitened innovations over the quantiles of the standard normal, with the bounds of each quantile."""
     ax = axes_or_new(ax)
     ax.fill_between(
         pairs.theoretical,
@@ -52,14 +51,14 @@ def innovation_quantiles(pairs: QuantilePairs, ax: Axes | None = None) -> Axes:
         color=ink(),
         alpha=0.12,
         linewidth=0,
-        label=f"{100 * pairs.probability:g} % of a right filter",
+        label=f"{100 * pairs.probability:g} % bounds, each",
     )
     ends = np.array([pairs.theoretical[0], pairs.theoretical[-1]])
     ax.plot(ends, ends, color=ink(), linewidth=0.8)
     ax.plot(pairs.theoretical, pairs.observed, ".", color=BLUE, markersize=3, label="innovations")
     ax.set_xlabel("quantile of the standard normal")
-    ax.set_ylabel("innovation over its own σ")
-    ax.legend(loc="upper left")
+    ax.set_ylabel("innovation over its σ")
+    legend_above(ax)
     return ax
 
 
@@ -79,29 +78,48 @@ def innovation_autocorrelation(result: Autocorrelation, ax: Axes | None = None) 
         )
     percent = f"{100 * result.probability:g} %"
     for bounds, style, name in (
-        (result.bounds, ":", f"{percent}, each lag"),
-        (result.simultaneous_bounds, "--", f"{percent}, all lags together"),
+        (result.bounds, ":", f"{percent} bounds, each lag"),
+        (result.simultaneous_bounds, "--", f"{percent}, all lags"),
     ):
         for sign in (1.0, -1.0):
             ax.plot(lags, sign * bounds, style, color=ink(), linewidth=1.0, label=name if sign > 0 else None)
     ax.axhline(0.0, color=ink(), linewidth=0.6)
     top = max(1.6 * float(result.simultaneous_bounds.max()), 1.25 * float(np.abs(result.values).max()))
-    ax.set_ylim(-top, 1.5 * top)
+    ax.set_ylim(-top, top)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlabel("lag, measurements")
     ax.set_ylabel("autocorrelation")
-    ax.legend(loc="upper right", ncols=2)
+    legend_above(ax, ncols=5)
     return ax
 
 
 def nis_over_record(
-    innovations: Innovations, bounds: tuple[float, float], ax: Axes | None = None, *, window: int = 50
+    innovations: Innovations,
+    bounds: tuple[float, float],
+    ax: Axes | None = None,
+    *,
+    window: int = 50,
+    probability: float = 0.99,
 ) -> Axes:
-    """Draw the NIS of one sensor per degree of freedom over time, its running mean, and the ``bounds`` of one measurement."""
+    """Draw the NIS of one sensor per degree of freedom over time, its running mean, and the bounds of one measurement.
+
+    Parameters
+    ----------
+    innovations : Innovations
+        Of one sensor.
+    bounds : (float, float)
+        That hold the NIS of one measurement of a consistent filter with ``probability``.
+    ax : Axes, optional
+        A new figure's if not given.
+    window : int
+        Measurements in the running mean.
+    probability : float
+        Confidence level in the legend.
+    """
     ax = axes_or_new(ax)
     degrees = innovations.innovation.shape[1]
     value = innovations.nis / degrees
-    ax.axhspan(*bounds, color=ink(), alpha=0.12, linewidth=0, label="99 % of a right filter's")
+    ax.axhspan(*bounds, color=ink(), alpha=0.12, linewidth=0, label=f"{100 * probability:g} % bounds, each")
     few, low = decimated(innovations.time, np.maximum(value, 1e-4))
     ax.plot(few, low, ".", color=SKY, markersize=2.5, label="one measurement")
     if len(value) >= 2 * window:
@@ -110,10 +128,10 @@ def nis_over_record(
         ax.plot(*decimated(middle, mean), color=VERMILION, linewidth=1.2, label=f"mean of {window}")
     ax.axhline(1.0, color=ink(), linewidth=0.6)
     ax.set_yscale("log")
-    ax.set_ylim(0.3 * min(bounds[0], float(np.quantile(value, 0.01)) + 1e-4), 30.0 * max(bounds[1], float(value.max())))
+    ax.set_ylim(0.3 * min(bounds[0], float(np.quantile(value, 0.01)) + 1e-4), 3.0 * max(bounds[1], float(value.max())))
     ax.set_xlabel("time, s")
     ax.set_ylabel("NIS per degree of freedom")
-    ax.legend(loc="upper right", ncols=3)
+    legend_above(ax)
     return ax
 
 

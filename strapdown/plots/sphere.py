@@ -1,4 +1,4 @@
-"""Where a body axis points: its path on the unit sphere of the fixed frame, still or moving."""
+"""The path of a body axis on the unit sphere of the fixed frame, still or animated."""
 
 from __future__ import annotations
 
@@ -15,31 +15,39 @@ from matplotlib.ticker import MaxNLocator
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, array
 from strapdown.files import written_beside
-from strapdown.plots.style import AXES, BLUE, STYLE, VERMILION, axes_or_new, ink
+from strapdown.plots.style import AXES, BLUE, STYLE, VERMILION, axes_or_new, ink, legend_above
 
 MOST_POINTS = 20_000
-"""Points of a drawn path; of a longer one every so many-th."""
+"""Points of a drawn path; a longer one is thinned evenly."""
 
 
 NARROW = 0.35
-"""A path that stays so near its mean is drawn by itself, without the sphere, which would be all that is seen."""
+"""Reach of a path about its mean, below which it is drawn without the sphere, beside which it could not be seen."""
 
 LEAST_REACH = 1e-6
 """Half the width of the figure of an axis that stands still."""
 
 
 def body_axis_path(attitude: Array, axis: int = 2) -> Array:
-    """Return where a body axis (0, 1, 2: x, y, z) points in the fixed frame (n, 3), unit vectors, of attitudes q_fb (n, 4)."""
+    """Return the direction of a body axis (0, 1, 2: x, y, z) in the fixed frame, unit vectors (n, 3), of attitudes q_fb (n, 4)."""
     if axis not in (0, 1, 2):
         raise InputError(f"axis is {axis!r}; it must be 0, 1 or 2 (x, y, z)")
     return quaternion.rotate(array("attitude", attitude, ("n", 4)), np.eye(3)[axis])
 
 
 def body_axis_on_sphere(estimated: Array, true: Array | None = None, axis: int = 2, ax: Axes | None = None) -> Axes:
-    """Draw the path of a body axis on the unit sphere, estimated and, where it is known, true, seen along its mean direction.
+    """Draw the path of a body axis on the unit sphere, estimated and, where it is known, true, projected along its mean direction.
 
-    ``estimated`` and ``true`` are attitudes q_fb (n, 4). The view is the plane across the mean direction of the path, so a narrow cone
-    fills the figure as a wide one does; its two coordinates are direction components, of no unit.
+    A narrow cone fills the figure as a wide one does; the two coordinates are components of a unit vector.
+
+    Parameters
+    ----------
+    estimated, true : (n, 4)
+        Attitudes q_fb.
+    axis : {0, 1, 2}
+        Body x, y or z.
+    ax : Axes, optional
+        A new figure's if not given.
     """
     ax = axes_or_new(ax)
     paths = [("estimated", body_axis_path(estimated, axis), VERMILION, 0.8)]
@@ -50,9 +58,9 @@ def body_axis_on_sphere(estimated: Array, true: Array | None = None, axis: int =
         flat = (path @ across.T)[:: -(-len(path) // MOST_POINTS)]
         ax.plot(flat[:, 0], flat[:, 1], color=color, linewidth=width, alpha=0.9, label=name)
     ax.set_aspect("equal", adjustable="datalim")
-    ax.set_xlabel(f"body {AXES[axis]} axis, first component across its mean")
+    ax.set_xlabel(f"body {AXES[axis]} axis, first component normal to its mean")
     ax.set_ylabel("second component")
-    ax.legend(loc="best")
+    legend_above(ax)
     return ax
 
 
@@ -88,7 +96,7 @@ def sphere_figure(estimated: Array, true: Array | None = None, axis: int = 2) ->
                 elev=float(np.degrees(np.arctan2(mean[2], np.hypot(mean[0], mean[1])))) * 0.7 + 8.0,
                 azim=float(np.degrees(np.arctan2(mean[1], mean[0]))) + 20.0,
             )
-        ax.legend(loc="upper left")
+        ax.legend(loc="upper left", frameon=False)
         return figure
 
 
@@ -103,7 +111,7 @@ def _wire(ax: Any) -> None:
 
 
 def _dress(ax: Any, axis: int, centre: Array, reach: float) -> None:
-    ax.set_box_aspect((1.0, 1.0, 1.0))
+    ax.set_box_aspect((1.0, 1.0, 1.0), zoom=0.82)  # room for the labels, which the layout does not measure
     for name, middle in zip(AXES, centre, strict=True):
         getattr(ax, f"set_{name}lim")(middle - reach, middle + reach)
         getattr(ax, f"set_{name}label")(f"fixed {name}")
@@ -114,7 +122,7 @@ def _dress(ax: Any, axis: int, centre: Array, reach: float) -> None:
         pane.set_alpha(0.3)
     ax.grid(visible=False)
     ax.tick_params(labelsize="small")
-    ax.set_title(f"Direction of the body {AXES[axis]} axis in the fixed frame")
+    ax.set_title(f"Direction of the body {AXES[axis]} axis in the fixed frame", loc="left")
 
 
 def animate_body_axis(

@@ -13,37 +13,67 @@ from strapdown.checks import Array
 from strapdown.consistency import mean_bounds
 from strapdown.montecarlo import Statistics
 from strapdown.montecarlo.statistics import COVERED
-from strapdown.plots.style import AXES, CYCLE, SKY, VERMILION, angle_unit, axes_or_new, ink, layered, rate_unit
+from strapdown.plots.style import (
+    AXES,
+    CYCLE,
+    SKY,
+    VERMILION,
+    angle_unit,
+    axes_or_new,
+    ink,
+    layered,
+    legend_above,
+    rate_unit,
+)
+
+BOUNDS = "bounds of a consistent filter"
 
 
 def nees_over_time(
-    named: Sequence[tuple[str, Statistics]], bounds: tuple[float, float], subset: str, ax: Axes | None = None
+    named: Sequence[tuple[str, Statistics]],
+    bounds: tuple[float, float],
+    subset: str,
+    ax: Axes | None = None,
+    *,
+    label: str = BOUNDS,
 ) -> Axes:
-    """Draw the ANEES of a ``subset`` ("state", "attitude", "bias") at each epoch with its bounds, on a log axis."""
+    """Draw the ANEES of a subset of the states at each epoch with its bounds, on a log axis.
+
+    Parameters
+    ----------
+    named : sequence of (str, Statistics)
+        What is drawn, with its name in the legend.
+    bounds : (float, float)
+        Lower and upper bound of the ANEES per state.
+    subset : {"state", "attitude", "bias"}
+    ax : Axes, optional
+        A new figure's if not given.
+    label : str
+        Of the bounds in the legend; say their confidence level.
+    """
     ax = axes_or_new(ax)
     column = ("state", "attitude", "bias").index(subset)
-    ax.axhspan(*bounds, color=ink(), alpha=0.12, linewidth=0, label="bounds of a right filter")
+    ax.axhspan(*bounds, color=ink(), alpha=0.12, linewidth=0, label=label)
     for k, (name, statistics) in enumerate(named):
         ax.plot(statistics.time, statistics.anees[:, column], label=name, **layered(k, len(named)))
     ax.set_yscale("log")
     ax.set_xlabel("time, s")
-    ax.set_ylabel(f"NEES of the {subset}, per state")
+    ax.set_ylabel(f"NEES of the {subset}, per state (log scale)")
     return ax
 
 
 def nis_over_time(
-    named: Sequence[tuple[str, Statistics]], ax: Axes | None = None, *, probability: float = 0.99
+    named: Sequence[tuple[str, Statistics]], ax: Axes | None = None, *, probability: float = 0.99, label: str = ""
 ) -> Axes:
-    """Draw the mean NIS per degree of freedom in each bin of time with its bounds."""
+    """Draw the mean NIS per degree of freedom in each interval of time, with the bounds of one interval."""
     ax = axes_or_new(ax)
     for k, (name, statistics) in enumerate(named):
         seen = statistics.nis_degrees > 0
         ax.plot(statistics.nis_time[seen], statistics.nis[seen], label=name, **layered(k, len(named)))
     first = named[0][1]
     typical = round(float(np.median(first.nis_degrees[first.nis_degrees > 0]) * first.runs))
-    ax.axhspan(
-        *mean_bounds(1, typical, probability), color=ink(), alpha=0.12, linewidth=0, label="bounds of a right filter"
-    )
+    words = label or f"{100 * probability:g} % bounds, each interval"
+    ax.axhspan(*mean_bounds(1, typical, probability), color=ink(), alpha=0.12, linewidth=0, label=words)
     ax.set_xlabel("time, s")
     ax.set_ylabel("NIS per degree of freedom")
     return ax
@@ -59,9 +89,9 @@ def state_unit(state: int, value: Array) -> tuple[str, float]:
 
 
 def fan(statistics: Statistics, state: int, ax: Axes | None = None) -> Axes:
-    """Draw, over time, what share of the runs has |error| of a ``state`` (0 to 5) below each line, beside what the filter expects.
+    """Draw quantiles of |error| of a ``state`` (0 to 5) over the runs, beside those that the filter predicts.
 
-    Bands: the runs, 50, 90 and 99 %. Lines: the same shares of a normal error of the filter's own σ.
+    Bands: 50, 90 and 99 % of the runs. Lines: the same quantiles of a normal error of the filter's σ.
     """
     ax = axes_or_new(ax)
     shares = ((0.99, 2.5758), (0.9, 1.6449), (0.5, 0.6745))
@@ -79,7 +109,7 @@ def fan(statistics: Statistics, state: int, ax: Axes | None = None) -> Axes:
             color=SKY,
             alpha=(0.25, 0.45, 0.7)[k],
             linewidth=0,
-            label=f"{100 * share:g} % of the runs",
+            label=f"{100 * share:g} % of the runs below",
         )
         ax.plot(
             statistics.time,
@@ -87,18 +117,19 @@ def fan(statistics: Statistics, state: int, ax: Axes | None = None) -> Axes:
             color=VERMILION,
             linewidth=(0.8, 1.1, 1.4)[k],
             linestyle=(":", "--", "-")[k],
-            label=f"{100 * share:g} % as the filter expects",
+            label=f"{100 * share:g} % predicted by the filter",
         )
     top = max(float(np.nanmax(quantiles[0][settled:])), 2.6 * float(statistics.sigma[settled:, state].max()))
-    ax.set_ylim(0.0, 1.5 * top / size)
+    ax.set_ylim(0.0, 1.15 * top / size)
+    ax.set_xlim(statistics.time[0], statistics.time[-1])
     ax.set_xlabel("time, s")
-    ax.set_ylabel(f"|error| of {STATES[state]}, {unit}")
-    ax.legend(loc="upper right", ncols=2)
+    ax.set_ylabel(f"|{STATES[state]} error|, {unit}")
+    legend_above(ax, ncols=2)
     return ax
 
 
 def coverage_by_state(statistics: Statistics, epoch: int = -1, ax: Axes | None = None) -> Axes:
-    """Draw what share of the runs lies inside 1, 2 and 3 σ at one epoch, by state, with the 99 % binomial bounds of a right filter."""
+    """Draw the share of the runs inside 1, 2 and 3 σ at one epoch, by state, with the 99 % binomial bounds of a consistent filter."""
     from scipy.stats import binom
 
     ax = axes_or_new(ax)
@@ -111,23 +142,34 @@ def coverage_by_state(statistics: Statistics, epoch: int = -1, ax: Axes | None =
             100 * statistics.covered[epoch, :, k],
             "o",
             color=CYCLE[k],
-            label=f"inside {k + 1} σ; band: {100 * expected:.1f} % of a right filter",
+            label=f"inside {k + 1}σ, expected {100 * expected:.1f} %",
         )
     ax.set_xticks(range(6), STATES, rotation=20)
     ax.grid(visible=False, axis="x")
-    ax.set_ylim(-38.0, 104.0)  # room for the legend below the points
-    ax.set_yticks(range(0, 101, 20))
+    ax.plot([], [], color=ink(), alpha=0.2, linewidth=6, label="99 % bounds of a consistent filter")
+    ax.set_ylim(0.0, 104.0)
     ax.set_ylabel(f"share of {runs} runs, %")
-    ax.legend(loc="lower left")
+    legend_above(ax, ncols=2)
     return ax
 
 
 def covariance_ellipses(
     claimed: Array, found: Array, pair: tuple[int, int] = (0, 1), ax: Axes | None = None, *, probability: float = 0.95
 ) -> Axes:
-    """Draw the ellipse of two states that the filter claims to hold ``probability`` of the errors, and that of the errors themselves.
+    """Draw the ellipse of two states that holds ``probability`` of the errors by the filter's covariance, and that of the actual errors.
 
-    ``claimed`` and ``found`` are covariances (6, 6) at one epoch: mean P, and mean e eᵀ over the runs.
+    Parameters
+    ----------
+    claimed : (6, 6)
+        The filter's mean covariance P at one epoch, rad and rad/s.
+    found : (6, 6)
+        Mean e eᵀ over the runs at that epoch.
+    pair : (int, int)
+        The two states, 0 to 5.
+    ax : Axes, optional
+        A new figure's if not given.
+    probability : float
+        Of a normal error of either covariance to lie inside its ellipse.
     """
     from scipy.stats import chi2
 
@@ -141,8 +183,8 @@ def covariance_ellipses(
     scale = np.array([size_i, size_j])
     reach = float(np.sqrt(chi2.ppf(probability, 2)))
     styles: tuple[tuple[str, Array, dict[str, Any]], ...] = (
-        ("the filter's own", claimed, {"edgecolor": VERMILION, "linewidth": 2.0}),
-        ("of the errors", found, {"edgecolor": ink(), "linewidth": 1.2, "linestyle": "--"}),
+        ("filter", claimed, {"edgecolor": VERMILION, "linewidth": 2.0}),
+        ("actual errors", found, {"edgecolor": ink(), "linewidth": 1.2, "linestyle": "--"}),
     )
     for name, matrix, style in styles:
         P = matrix[np.ix_(pair, pair)] / np.outer(scale, scale)
@@ -159,9 +201,9 @@ def covariance_ellipses(
         )
     spread = 1.25 * reach * np.array(largest) / scale
     ax.set_xlim(-spread[0], spread[0])
-    ax.set_ylim(-spread[1], 1.35 * spread[1])
-    ax.set_xlabel(f"error of {STATES[i]}, {unit_i}")
-    ax.set_ylabel(f"error of {STATES[j]}, {unit_j}")
-    ax.set_title(f"{100 * probability:g} % ellipses")
-    ax.legend(loc="upper right", ncols=2)
+    ax.set_ylim(-spread[1], spread[1])
+    ax.set_xlabel(f"{STATES[i]} error, {unit_i}")
+    ax.set_ylabel(f"{STATES[j]} error, {unit_j}")
+    ax.set_title(f"{100 * probability:g} % ellipses", loc="left")
+    legend_above(ax)
     return ax

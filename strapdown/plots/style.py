@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from strapdown.checks import Array, one_of
 from strapdown.files import written_beside
-from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR
+from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR, STANDARD_GRAVITY
 
 BLUE, ORANGE, GREEN, VERMILION, PURPLE, SKY, YELLOW = (
     "#0072B2",
@@ -43,7 +43,13 @@ STYLE: Any = {
     "legend.fontsize": "small",
     "font.size": 9.5,
     "axes.prop_cycle": cycler(color=CYCLE),
+    "axes.formatter.min_exponent": 5,  # log axes: 0.01, 1, 1000; powers of ten only beyond
+    "axes.formatter.useoffset": False,
+    "pdf.fonttype": 42,  # TrueType, which journals ask for
+    "svg.hashsalt": "strapdown",  # the same figure gives the same file
 }
+FORMATS = ("png", "pdf", "svg")
+"""Formats that figures are written in."""
 
 
 _DARK, _LIGHT = "#16181d", "#e4e6eb"
@@ -87,11 +93,34 @@ def new_figure(
 
 
 def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
-    """Write a figure (PNG, PDF or SVG by the suffix); the file appears whole or not at all."""
+    """Write a figure (PNG, PDF or SVG by the suffix); the file appears whole or not at all, and holds no date."""
+    undated: dict[str, Any] = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
     with written_beside(path) as temporary, matplotlib.rc_context(STYLE), warnings.catch_warnings():
         warnings.filterwarnings("ignore", r"Glyph .* missing from font")  # of a file's name: drawn as boxes
-        figure.savefig(temporary)
+        figure.savefig(temporary, metadata=undated.get(Path(path).suffix.lower()))
     return Path(path)
+
+
+def save_as(figures: Mapping[Path, Figure], form: str) -> list[Path]:
+    """Write figures in one format; the same figure of an earlier run in another format is removed.
+
+    Parameters
+    ----------
+    figures : mapping
+        Path of each figure, whose suffix is replaced, and the figure.
+    form : {"png", "pdf", "svg"}
+
+    Returns
+    -------
+    list of Path
+        The files written.
+    """
+    one_of("format", form, FORMATS)
+    written = [save(figure, path.with_suffix(f".{form}")) for path, figure in figures.items()]
+    for path in figures:
+        for other in set(FORMATS) - {form}:
+            path.with_suffix(f".{other}").unlink(missing_ok=True)
+    return written
 
 
 def axes_or_new(ax: Axes | None) -> Axes:
@@ -101,7 +130,34 @@ def axes_or_new(ax: Axes | None) -> Axes:
 
 def layered(k: int, number: int) -> dict[str, Any]:
     """Return the style of line k of several that may lie on each other: the later, the thinner, so that all show."""
-    return {"color": CYCLE[k % len(CYCLE)], "linewidth": 1.0 + 0.8 * (number - 1 - k)}
+    return {"color": CYCLE[k % len(CYCLE)], "linewidth": 0.9 + 0.6 * (number - 1 - k)}
+
+
+def legend_above(ax: Axes, *, ncols: int = 4) -> None:
+    """Put the legend of axes above them on the right, where it covers no curve; a title stands on the left."""
+    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1, ncols=ncols, frameon=False)
+
+
+def legend_below(figure: Figure, axes: Sequence[Axes], *, ncols: int = 4) -> None:
+    """Put one legend of several axes, each label once, below a figure."""
+    found = {label: handle for ax in axes for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
+    figure.legend(found.values(), found.keys(), loc="outside lower center", ncols=ncols, frameon=False)
+
+
+ALIKE = 2.0
+"""Vertical scales of axes side by side that differ by less than this factor become one."""
+
+
+def match_scales(axes: Sequence[Axes]) -> None:
+    """Give axes side by side one vertical scale where it does not hide a curve, and mark those that need a larger one."""
+    spans = np.array([float(np.ptp(ax.get_ylim())) for ax in axes])
+    alike = spans < ALIKE * spans.min()
+    for ax, span, one in zip(axes, spans, alike, strict=True):
+        if one:
+            ax.set_ylim(np.array(ax.get_ylim()) * (spans[alike].max() / span))
+        else:
+            ratio = span / spans[alike].max()
+            ax.set_title(f"vertical scale ×{ratio:.2g}", loc="right", fontsize="small", color=VERMILION)
 
 
 def angle_unit(value: Array) -> tuple[str, float]:
@@ -114,3 +170,16 @@ def rate_unit(value: Array) -> tuple[str, float]:
     """Return the name and size of the unit in which rates of this size (rad/s) are read best."""
     typical = float(np.nanmax(np.abs(value), initial=0.0))
     return ("°/h", DEGREE_PER_HOUR) if typical < 0.1 * DEGREE else ("°/s", DEGREE)
+
+
+_STATE_UNITS = {
+    "gyro scale": {"1": ("ppm", 1e-6), "rad": ("mrad", 1e-3)},
+    "gyro drift": {"rad/s": ("°/h", DEGREE_PER_HOUR)},
+    "gyro force": {"rad s/m": ("°/h/g", DEGREE_PER_HOUR / STANDARD_GRAVITY)},
+}
+
+
+def error_state_unit(name: str, unit: str) -> tuple[str, float]:
+    """Return the name and size of the unit that an optional error state is read in, of its block's name and its SI unit."""
+    word = "dimensionless" if unit == "1" else unit
+    return _STATE_UNITS.get(" ".join(name.split()[:2]), {}).get(unit, (word, 1.0))

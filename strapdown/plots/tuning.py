@@ -10,25 +10,30 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullFormatter
 
 from strapdown.checks import Array
-from strapdown.plots.style import BLUE, CYCLE, SKY, VERMILION, axes_or_new, ink, new_figure
+from strapdown.plots.style import BLUE, CYCLE, SKY, VERMILION, axes_or_new, ink, legend_above, legend_below, new_figure
 from strapdown.tuning import Comparison, Slices, Tuning
 from strapdown.tuning.parameters import Unit
 
 TALLEST = 15.0
-"""Slices are drawn up to this 2 Δℓ."""
+"""Slices are drawn up to this −2 Δ log likelihood."""
 
 
 def likelihood_slice(slices: Slices, tuning: Tuning, number: int, unit: Unit, ax: Axes | None = None) -> Axes:
-    """Draw twice the fall of the log likelihood along one parameter, with its interval and where it was before."""
+    """Draw twice the fall of the log likelihood along one parameter, with its interval and its value before."""
     ax = axes_or_new(ax)
     one = tuning.parameters[number]
     values = slices.values[number] / unit.factor
     ax.semilogx(values, slices.fallen[number], color=BLUE, linewidth=1.4)
     if not tuning.composite:
-        ax.axhline(3.84, color=ink(), linewidth=0.6, linestyle=":")
+        ax.axhline(3.84, color=ink(), linewidth=0.6, linestyle=":", label="3.84: 95 % of χ², one parameter")
     lower, upper = max(one.lower / unit.factor, values[0]), min(one.upper / unit.factor, values[-1])
     ax.axvspan(
-        lower, upper, color=SKY, alpha=0.3, linewidth=0, label="95 % interval" if one.identified else "below the bound"
+        lower,
+        upper,
+        color=SKY,
+        alpha=0.3,
+        linewidth=0,
+        label="95 % interval" if one.identified else "below the 95 % bound",
     )
     ax.axvline(one.value / unit.factor, color=BLUE, linewidth=0.8, label="tuned")
     before = one.start / unit.factor
@@ -66,16 +71,13 @@ def likelihood_slices(slices: Slices, tuning: Tuning, units: Sequence[Unit]) -> 
             continue
         likelihood_slice(slices, tuning, k, units[k], ax)
         if k % columns == 0:
-            ax.set_ylabel("rise of twice the objective" if tuning.composite else "fall of 2 log likelihood")
-    found = {
-        label: handle for ax in axes.ravel() for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
-    }
-    figure.legend(found.values(), found.keys(), loc="outside lower center", ncols=4, frameon=False)
+            ax.set_ylabel("2 Δ objective" if tuning.composite else "−2 Δ log likelihood")
+    legend_below(figure, list(axes.ravel()), ncols=5)
     return figure
 
 
 def before_and_after(comparison: Comparison, *, title: str = "") -> Figure:
-    """Draw NIS, and NEES where there is a truth, on the data held out over time, before and after, with the bounds of a right filter."""
+    """Draw NIS, and NEES where there is a truth, on the data held out, before and after, with the bounds of a consistent filter."""
     from strapdown.consistency import mean_bounds
 
     both = (("before", comparison.before, VERMILION), ("after", comparison.after, BLUE))
@@ -103,36 +105,36 @@ def _course(
     bounds: tuple[float, float],
     label: str,
 ) -> None:
-    """Draw means over spans of time, that should be 1, of the filter before and after."""
+    """Draw means over intervals of time, which are 1 for a consistent filter, of the filter before and after."""
     for name, color, mean, time, values in courses:
         there = np.isfinite(values)
         ax.plot(time[there], values[there], ".-", color=color, linewidth=1.0, label=f"{name}: mean {mean:.3g}")
-    ax.axhspan(*bounds, color=ink(), alpha=0.12, linewidth=0, label="99 % of a right filter, each span")
+    ax.axhspan(*bounds, color=ink(), alpha=0.12, linewidth=0, label="99 % bounds, each interval")
     seen = np.concatenate([values[np.isfinite(values)] for *_, values in courses])
     if seen.max() > 5.0 or seen.min() < 0.2:
         ax.set_yscale("log")
-        ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
         ax.yaxis.set_minor_formatter(NullFormatter())
+        label += " (log scale)"
     ax.axhline(1.0, color=ink(), linewidth=0.6, linestyle=":")
     ax.set_ylabel(label)
-    ax.legend(loc="lower left", ncols=3, bbox_to_anchor=(0.0, 1.0), frameon=False)
+    legend_above(ax)
 
 
 def searches(
     tuning: Tuning, first: int, second: int, units: Sequence[Unit], ax: Axes | None = None, *, label: bool = True
 ) -> Axes:
-    """Draw where each search began and ended in the plane of two parameters."""
+    """Draw the start and the end of each search in the plane of two parameters."""
     ax = axes_or_new(ax)
     pairs = [(first, units[first]), (second, units[second])]
     begin = [np.exp(tuning.starts[:, j]) / unit.factor for j, unit in pairs]
     end = [np.exp(tuning.optima[:, j]) / unit.factor for j, unit in pairs]
     for k in range(len(tuning.starts)):
         ax.plot([begin[0][k], end[0][k]], [begin[1][k], end[1][k]], color=CYCLE[0], linewidth=0.5, alpha=0.5)
-    ax.plot(*begin, "o", color=VERMILION, markersize=3.5, label="starts" if label else None)
-    ax.plot(*end, "o", color=BLUE, markersize=6, label="ends" if label else None)
+    ax.plot(*begin, "o", color=VERMILION, markersize=3.5, label="start of a search" if label else None)
+    ax.plot(*end, "o", color=BLUE, markersize=6, label="end of a search" if label else None)
     ax.set_xscale("log")
     ax.set_yscale("log")
     ax.set_xlabel(f"{tuning.parameters[first].name}, {units[first].name}")
     ax.set_ylabel(f"{tuning.parameters[second].name}, {units[second].name}")
-    ax.legend()
+    legend_above(ax)
     return ax

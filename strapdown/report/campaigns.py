@@ -13,6 +13,7 @@ from strapdown.checks import InputError
 from strapdown.montecarlo import campaign
 from strapdown.montecarlo.statistics import SUBSETS, Statistics
 from strapdown.plots.statistics import STATES, state_unit
+from strapdown.plots.style import legend_above, legend_below, match_scales
 from strapdown.report import findings, page
 
 
@@ -40,18 +41,18 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
             "Over time",
             page.figure(
                 lambda: _consistency(statistics, probability),
-                "ANEES of attitude and bias, and NIS, with the bounds of a right filter",
+                "ANEES of attitude and bias, and NIS, with the bounds of a consistent filter",
             ),
             page.figure(
                 lambda: _fans(statistics),
-                "Errors of the runs: what share lies below each band, and what the filter expects",
+                "Quantiles of the errors over the runs, and those that the filter predicts",
             ),
         ),
         page.section(
             "At the end",
             page.figure(
                 lambda: _end(statistics),
-                "σ-coverage by state, and the covariance of the errors beside the filter's own",
+                "σ-coverage by state, and the covariance of the errors beside the filter's",
             ),
         ),
         _worst(statistics, path),
@@ -129,20 +130,18 @@ def _numbers(statistics: Statistics) -> str:
 
 
 def _consistency(statistics: Statistics, probability: float) -> Figure:
-    figure, axes = plots.new_figure(1, 3, size=(12.0, 4.0))
+    figure, axes = plots.new_figure(1, 3, size=(12.0, 4.2))
     axes[1].set_visible(statistics.has_bias)
+    bounds = consistency.mean_bounds(3, statistics.runs, probability)
+    label = f"{100 * probability:g} % bounds, each epoch"
+    low, high = np.nanmin(statistics.anees), np.nanmax(statistics.anees)
     for ax, subset in zip(axes, ("attitude", "bias") if statistics.has_bias else ("attitude",), strict=False):
-        bounds = consistency.mean_bounds(3, statistics.runs, probability)
-        plots.nees_over_time([("all runs", statistics)], bounds, subset, ax)
-        low, high = np.nanmin(statistics.anees), np.nanmax(statistics.anees)
-        bottom, top = min(0.5, 0.8 * float(low)), max(2.0, 1.3 * float(high))
-        ax.set_ylim(bottom, top * (top / bottom) ** 0.35)  # room for the legend on a log axis
-        ax.legend(loc="upper right")
+        plots.nees_over_time([("all runs", statistics)], bounds, subset, ax, label=label)
+        ax.set_ylim(min(0.5, 0.8 * float(low)), max(2.0, 1.3 * float(high)))
+        legend_above(ax)
     if statistics.sensor_degrees.sum() > 0:
         plots.nis_over_time([("all runs", statistics)], axes[2], probability=probability)
-        low, high = axes[2].get_ylim()
-        axes[2].set_ylim(low, high + 0.3 * (high - low))  # room for the legend
-        axes[2].legend(loc="upper right")
+        legend_above(axes[2])
     else:
         axes[2].set_visible(False)
     return figure
@@ -151,18 +150,19 @@ def _consistency(statistics: Statistics, probability: float) -> Figure:
 def _fans(statistics: Statistics) -> Figure:
     rows = len(_estimated(statistics)) // 3
     figure, axes = plots.new_figure(rows, 3, size=(13.0, 3.5 * rows), squeeze=False)
-    for state, ax in enumerate(axes.ravel()):
-        plots.fan(statistics, state, ax)
-        ax.get_legend().remove()
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3)
+    for row, first in zip(axes, (0, 3), strict=False):
+        for k, ax in enumerate(row):
+            plots.fan(statistics, first + k, ax)
+            ax.get_legend().remove()
+        match_scales(row)
+    legend_below(figure, [axes[0, 0]], ncols=3)
     return figure
 
 
 def _end(statistics: Statistics) -> Figure:
     figure, axes = plots.new_figure(1, 3, size=(13.0, 4.4))
     plots.coverage_by_state(statistics, -1, axes[0])
-    # The bias axis that is claimed worst, beside the attitude about it.
+    # The bias axis whose covariance is furthest from that of its errors, beside the attitude about it.
     ratio = np.diag(statistics.mean_square_error[-1]) / np.diag(statistics.covariance[-1])
     worst = int(np.argmax(np.abs(np.log(np.maximum(ratio[3:], 1e-300)))))
     for ax, pair in zip(axes[1:], ((0, 1), (worst, 3 + worst) if statistics.has_bias else (0, 2)), strict=True):

@@ -22,8 +22,8 @@
           ...chart.series.map((one) => ({
             label: one.label,
             stroke: colour(one.colour),
-            width: one.band ? 1 : 1.5,
-            dash: [],
+            width: one.band ? 0 : 1.5, // the edges of a band would alias into a grey bar over the errors
+            points: { show: one.band ? false : undefined },
             value: shown,
           })),
         ],

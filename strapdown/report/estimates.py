@@ -42,7 +42,7 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
         ),
         _numbers(estimate, truth),
         findings.evidence(judgement),
-        _over_time(estimate, truth),
+        _over_time(estimate, truth, str(attributes.get("fixed_frame", ""))),
         *[_sensor(name, one, probability) for name, one in estimate.innovations.items()],
         _path(estimate, truth),
         page.section(
@@ -66,7 +66,7 @@ def without_a_state(path: Path, attributes: Mapping[str, Any]) -> str:
     try:
         chosen = setup.from_toml(str(attributes["filter"]), f"{path}: filter")
         scenario = scenario_from_toml(str(attributes["scenario"]), f"{path}: scenario")
-    except InputError:  # of another version, which told them otherwise
+    except InputError:  # of another version, which wrote them otherwise
         return ""
     return findings.without_a_state(scenario, chosen.states, "estimate")
 
@@ -141,7 +141,7 @@ def _numbers(estimate: Estimate, truth: Truth | None) -> str:
     return page.section("Key numbers", *parts)
 
 
-def _over_time(estimate: Estimate, truth: Truth | None) -> str:
+def _over_time(estimate: Estimate, truth: Truth | None, fixed_frame: str) -> str:
     sigma = estimate.sigma
     charts = []
     figure = ""
@@ -155,7 +155,7 @@ def _over_time(estimate: Estimate, truth: Truth | None) -> str:
                 state = states.start + k
                 bound, value = 3.0 * sigma[:, state] / size, error[:, state] / size
                 series: tuple[page.Series, ...] = (
-                    page.Series(label="+3σ", value=bound, colour="--faint", band=True),
+                    page.Series(label="+3σ (99.7 %)", value=bound, colour="--faint", band=True),
                     page.Series(label="−3σ", value=-bound, colour="--faint", band=True),
                     page.Series(label=f"{what.lower()} {axis}", value=value, colour=_COLOURS[k]),
                 )
@@ -175,15 +175,19 @@ def _over_time(estimate: Estimate, truth: Truth | None) -> str:
         if estimate.has_bias:
             figure = page.figure(
                 lambda: plots.error_overview(estimate, truth),
-                "Errors against the truth inside the filter's own ±3σ, body frame",
+                "Errors against the truth inside the filter's ±3σ, body axes",
             )
     else:
         euler = quaternion.to_rotation(estimate.attitude).as_euler("ZYX", degrees=True)[:, ::-1]
         series = tuple(
-            page.Series(label=name, value=euler[:, k], colour=_COLOURS[k])
-            for k, name in enumerate(("roll", "pitch", "yaw"))
+            page.Series(label=name, value=euler[:, k], colour=_COLOURS[k], wraps=True)
+            for k, name in enumerate(plots.angle_labels(fixed_frame))
         )
-        charts.append(page.chart(page.Chart(title="Attitude", unit="attitude, °", time=estimate.time, series=series)))
+        charts.append(
+            page.chart(
+                page.Chart(title="Attitude, Euler angles Z-Y-X", unit="angle, °", time=estimate.time, series=series)
+            )
+        )
         unit, size = rate_unit(3.0 * sigma[settled, 3:])
         series = tuple(
             page.Series(label=AXES[k], value=estimate.bias[:, k] / size, colour=_COLOURS[k]) for k in range(3)
@@ -192,11 +196,13 @@ def _over_time(estimate: Estimate, truth: Truth | None) -> str:
             page.chart(page.Chart(title="Gyro bias", unit=f"gyro bias, {unit}", time=estimate.time, series=series))
         )
         spread = np.linalg.norm(sigma[:, :3], axis=1) / DEGREE
-        series = (page.Series(label="σ, all axes", value=spread),)
+        series = (page.Series(label="σ, root sum square of the three axes", value=spread),)
         charts.append(
             page.chart(page.Chart(title="Attitude σ", unit="attitude σ, °", time=estimate.time, series=series))
         )
-        figure = page.figure(lambda: plots.estimate_overview(estimate), "Attitude, gyro bias in ±3σ, attitude σ")
+        figure = page.figure(
+            lambda: plots.estimate_overview(estimate, fixed_frame=fixed_frame), "Attitude, gyro bias in ±3σ, attitude σ"
+        )
     return page.section("Over time", *charts, figure)
 
 
@@ -215,7 +221,7 @@ def _sensor(name: str, innovations: Innovations, probability: float) -> str:
         plots.nis_over_record(innovations, consistency.mean_bounds(white.shape[1], 1, 0.99), axes[1, 1])
         return figure
 
-    caption = f"Innovations of {name} over their own σ: distribution, quantiles, autocorrelation, NIS over time"
+    caption = f"Innovations of {name} over their σ: distribution, quantiles, autocorrelation, NIS over time"
     return page.section(f"Innovations of {name}", page.figure(draw, caption))
 
 

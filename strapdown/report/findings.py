@@ -20,7 +20,8 @@ def evidence(judgement: Judgement) -> str:
     """Return the section with every statistic against its bounds, and what they cannot show."""
     rows = [
         (
-            f"{finding.name}{' (contradicts)' if finding.rejected else ''}",
+            "fail" if finding.rejected else "pass",
+            finding.name,
             finding.of,
             page.number(finding.value),
             page.number(finding.low),
@@ -30,8 +31,8 @@ def evidence(judgement: Judgement) -> str:
         )
         for finding in judgement.findings
     ]
-    head = ("statistic", "of", "value", "from", "to", "p-value", "samples")
-    marked = [finding.rejected for finding in judgement.findings]
+    head = ("", "statistic", "of", "value", "from", "to", "p-value", "samples")
+    marked = ["fail" if finding.rejected else "pass" for finding in judgement.findings]
     percent = 100.0 * judgement.probability
     note = (
         f"Bounds hold one statistic of a right filter with {percent:g} %. The verdict takes all p-values together: a right filter is "

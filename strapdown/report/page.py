@@ -17,10 +17,14 @@ from matplotlib.figure import Figure
 
 from strapdown.checks import Array
 from strapdown.plots import style
+from strapdown.plots.decimation import column_starts, extreme_rows
+from strapdown.plots.estimates import wraps
 
 CHART_POINTS = 6000
-"""Most times of an interactive chart; of longer series the extremes of each span."""
+"""Most times of an interactive chart; longer series are reduced to the extremes of each column."""
 _DOTS_PER_INCH = 120
+_WIDE = 7.0
+"""Inches: wider figures scroll sideways on a narrow page instead of shrinking."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,7 +37,9 @@ class Series:
     colour: str = "--a"
     """A colour of page.css."""
     band: bool = False
-    """Drawn thin and dashed, as an edge of a band."""
+    """An edge of a band, which is filled and not drawn itself."""
+    wraps: bool = False
+    """An angle in degrees, whose line breaks where it wraps round ±180°."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -70,24 +76,31 @@ def code(content: str) -> str:
     return f"<pre>{text(content)}</pre>"
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[Any]], *, numbers: int = 0, marked: Sequence[bool] = ()) -> str:
-    """Return a table; the last ``numbers`` columns are set to the right, the first cell of ``marked`` rows stands out."""
+def table(head: Sequence[str], rows: Sequence[Sequence[Any]], *, numbers: int = 0, marked: Sequence[str] = ()) -> str:
+    """Return a table, which scrolls sideways where the page is narrower.
+
+    Parameters
+    ----------
+    head : sequence of str
+    rows : sequence of sequences
+    numbers : int
+        How many of the last columns hold numbers and are set to the right; a table without any wraps its texts instead of scrolling.
+    marked : sequence of str
+        Class of the first cell of each row: "pass", "fail", "unsure" or "" for none.
+    """
     plain = len(head) - numbers
     heads = [f"<th{' class=number' if j >= plain else ''}>{text(cell)}</th>" for j, cell in enumerate(head)]
     lines = ["<tr>" + "".join(heads) + "</tr>"]
     for k, row in enumerate(rows):
         cells = []
         for j, cell in enumerate(row):
-            kind = (
-                ' class="number"'
-                if j >= plain
-                else ' class="rejected"'
-                if j == 0 and k < len(marked) and marked[k]
-                else ""
-            )
+            mark = marked[k] if j == 0 and k < len(marked) else ""
+            kind = ' class="number"' if j >= plain else f' class="{mark}"' if mark else ""
             cells.append(f"<td{kind}>{text(cell)}</td>")
         lines.append("<tr>" + "".join(cells) + "</tr>")
-    return '<div class="scroll"><table>' + "\n".join(lines) + "</table></div>"
+    kind = "scroll" if numbers else "wrap"
+    focus = ' tabindex="0"' if numbers else ""  # so that the arrow keys scroll it
+    return f'<div class="{kind}"{focus}><table>' + "\n".join(lines) + "</table></div>"
 
 
 def number(value: float, digits: int = 4) -> str:
@@ -97,54 +110,56 @@ def number(value: float, digits: int = 4) -> str:
 
 def figure(draw: Callable[[], Figure], caption: str) -> str:
     """Return a figure, drawn once in each theme; the page shows the one that the reader's device prefers."""
-    light, dark = (_image(draw, theme) for theme in ("light", "dark"))
+    (light, wide), (dark, _) = (_image(draw, theme) for theme in ("light", "dark"))
+    kind = " class=wide" if wide else ""
     return (
-        f'<figure><picture><source media="(prefers-color-scheme: dark)" srcset="{dark}"><img src="{light}" alt="{text(caption)}"></picture>'
-        f"<figcaption>{text(caption)}</figcaption></figure>"
+        f'<figure{kind}><div class="scroll" tabindex="0"><picture><source media="(prefers-color-scheme: dark)" srcset="{dark}">'
+        f'<img src="{light}" alt="{text(caption)}"></picture></div><figcaption>{text(caption)}</figcaption></figure>'
     )
 
 
-def _image(draw: Callable[[], Figure], theme: str) -> str:
+def _image(draw: Callable[[], Figure], theme: str) -> tuple[str, bool]:
+    """Return a figure as the address of an image, and whether it is too wide to be read when shrunk to a phone."""
     with style.theme(theme):
         buffer = io.BytesIO()
-        draw().savefig(buffer, format="png", dpi=_DOTS_PER_INCH)
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+        drawn = draw()
+        drawn.savefig(buffer, format="png", dpi=_DOTS_PER_INCH)
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode(), drawn.get_figwidth() > _WIDE
 
 
 def chart(one: Chart) -> str:
-    """Return the place of an interactive chart with its data."""
-    values = np.stack([series.value for series in one.series])
-    rows = extreme_rows(values)
-    data = [_numbers(one.time[rows]), *(_numbers(row) for row in values[:, rows])]
+    """Return the place of an interactive chart with its data.
+
+    A long series is reduced to the extremes of each column of time, a band to its widest in each column.
+    """
+    lines = [series.value for series in one.series if not series.band]
+    columns = CHART_POINTS // (2 * len(lines))
+    rows = np.unique(np.concatenate([extreme_rows(one.time, value, columns) for value in lines]))
+    reduced = len(rows) < len(one.time)
+    shown = [series.value[rows] for series in one.series]
+    if reduced:
+        starts = column_starts(one.time, columns)
+        group = np.searchsorted(starts, rows, side="right") - 1
+        for upper, lower in one.bands:
+            shown[upper] = np.fmax.reduceat(one.series[upper].value, starts)[group]
+            shown[lower] = np.fmin.reduceat(one.series[lower].value, starts)[group]
+    for k, series in enumerate(one.series):
+        if series.wraps:
+            shown[k] = np.where(np.isin(np.arange(len(rows)), wraps(series.value, rows)), np.nan, shown[k])
     content = {
         "unit": one.unit,
         "series": [{"label": s.label, "colour": s.colour, "band": s.band} for s in one.series],
         "bands": [[1 + upper, 1 + lower] for upper, lower in one.bands],
         "range": None if one.reach is None else [-one.reach, one.reach],
-        "data": data,
+        "data": [_numbers(one.time[rows]), *(_numbers(values) for values in shown)],
     }
     plain = json.dumps(content, allow_nan=False).replace("</", "<\\/")
-    note = "" if len(rows) == len(one.time) else f" ({len(rows)} of {len(one.time)} times, extremes kept)"
+    widest = ", band at its widest" if one.bands else ""
+    note = f" ({len(rows)} of {len(one.time)} times, extremes kept{widest})" if reduced else ""
     return (
         f'<div class="chart"><h3>{text(one.title + note)}</h3><div class="plot"></div>'
         f'<script type="application/json">{plain}</script></div>'
     )
-
-
-def extreme_rows(values: Array, most: int = CHART_POINTS) -> np.ndarray:
-    """Return at most about ``most`` indices of series (k, n) that hold the least and largest of each series in each span."""
-    k, n = values.shape
-    if n <= most:
-        return np.arange(n)
-    step = math.ceil(2 * k * n / most)
-    starts = np.arange(0, n, step)
-    padded = np.full((k, len(starts) * step), np.nan)
-    padded[:, :n] = values
-    spans = padded.reshape(k, len(starts), step)
-    missing = np.isnan(spans)
-    low = np.where(missing, np.inf, spans).argmin(axis=2) + starts
-    high = np.where(missing, -np.inf, spans).argmax(axis=2) + starts
-    return np.unique(np.concatenate([low.ravel(), high.ravel(), [0, n - 1]]))
 
 
 def _numbers(values: Array) -> list[float | None]:
@@ -156,7 +171,8 @@ def verdict(answer: str, reason: str, details: Sequence[str] = ()) -> str:
     kind = {"consistent": "consistent", "not consistent": "not"}.get(answer, "cannot")
     items = "".join(f"<li>{text(detail)}</li>" for detail in details)
     listing = f"<ul>{items}</ul>" if items else ""
-    return f'<div class="verdict {kind}"><strong>{text(answer.capitalize())}.</strong> {text(reason)}{listing}</div>'
+    said = f"{reason[:1].upper()}{reason[1:]}{'' if reason.endswith('.') else '.'}"
+    return f'<div class="verdict {kind}"><strong>{text(answer.capitalize())}.</strong> {text(said)}{listing}</div>'
 
 
 def page(title: str, subtitle: str, *parts: str) -> str:

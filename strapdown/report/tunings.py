@@ -13,13 +13,13 @@ from strapdown.checks import InputError
 from strapdown.report import page
 
 BOUNDS = (
-    "The bounds hold the NIS of a right filter, by itself, with 99 %; the verdict takes all tests of a record together, so that each may "
-    "lie somewhat outside its own"
+    "The bounds hold the NIS of a consistent filter, by itself, with 99 %; the verdict takes all tests of a record together, so each "
+    "statistic may lie somewhat outside its own bounds"
 )
-"""What is said below NIS and a verdict on the data held out."""
+"""Note below NIS and a verdict on the data held out."""
 
 LARGEST_FIGURE = 50_000_000
-"""Bytes of a PNG beside the result that goes into the page."""
+"""Bytes of a figure beside the result that goes into the page."""
 
 
 class _Table(BaseModel):
@@ -105,7 +105,7 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
     content = read(path)
     held = content.get("held_out")
     verdict = _verdict(held)
-    told = path.with_suffix(".toml")
+    toml = path.with_suffix(".toml")
     parts = [
         page.verdict(*verdict),
         page.section("Parameters", *_parameters(content)),
@@ -113,11 +113,11 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
     if held:
         parts.append(page.section("On the data held out", *_held_out(held)))
     drawn = {name: caption for name, caption in _FIGURES.items() if held or name != "heldout"}
-    parts += [_image(path.with_name(f"{path.stem}-{name}.png"), caption) for name, caption in drawn.items()]
+    parts += [_image(path.with_name(f"{path.stem}-{name}"), caption) for name, caption in drawn.items()]
     making = [page.provenance({"records": ", ".join(content["records"]), "units of the JSON": content["units"]})]
-    if told.exists():
-        making += [page.paragraph(f"The filter, {told.name}:"), page.code(reading.text(told, link=False))]
-    making += [page.paragraph("Use it:"), page.code(f"strapdown estimate RECORD.h5 --filter {told.name}")]
+    if toml.exists():
+        making += [page.paragraph(f"The filter, {toml.name}:"), page.code(reading.text(toml, link=False))]
+    making += [page.paragraph("Use it:"), page.code(f"strapdown estimate RECORD.h5 --filter {toml.name}")]
     parts.append(page.section("How it was made", *making))
     searches = content["searches"]
     subtitle = (
@@ -181,17 +181,15 @@ def _parameters(content: dict[str, Any]) -> list[str]:
         )
         for one in content["parameters"]
     ]
-    marked = [not one["identified"] for one in content["parameters"]]
+    marked = ["" if one["identified"] else "unsure" for one in content["parameters"]]
     objective = content["objective"]
     gain = objective["before"] - objective["after"]
-    told = f"The {objective['name']} rose by {gain:.4g} nats."
+    gained = f"The {objective['name']} rose by {gain:.4g} nats."
     if objective["name"] not in ("likelihood", "likelihood of the errors"):
-        told = f"Tuned by {objective['name']}; what was minimised fell by {gain:.4g}."
+        gained = f"Tuned by {objective['name']}; what was minimised fell by {gain:.4g}."
     return [
-        page.table(
-            ("parameter", "what the data tell", "before", "after", "from", "to (95 %)"), rows, numbers=4, marked=marked
-        ),
-        page.paragraph(told, faint=True),
+        page.table(("parameter", "identified", "before", "after", "from", "to (95 %)"), rows, numbers=4, marked=marked),
+        page.paragraph(gained, faint=True),
         *_gate(content.get("gate")),
         *(page.paragraph(words) for one in content.get("unmodelled", []) for words in one["words"]),
     ]
@@ -227,14 +225,24 @@ def _held_out(held: dict[str, Any]) -> list[str]:
     return [page.table(head, rows, numbers=5), page.paragraph(f"{BOUNDS}.", faint=True)]
 
 
-def _image(path: Path, caption: str) -> str:
-    """Return a figure that the tuning drew beside its result; nothing where it is gone."""
-    if not path.exists():
-        return ""
-    found = reading.content(path, link=False, most=LARGEST_FIGURE)
-    if not found.startswith(b"\x89PNG\r\n\x1a\n"):
-        raise InputError(f"{path} is no PNG; take it away, or tune again")
-    data = base64.b64encode(found).decode()
-    return page.section(
-        caption, f'<figure><img src="data:image/png;base64,{data}" alt="{page.text(caption)}"></figure>'
-    )
+_KINDS = {"png": ("image/png", b"\x89PNG\r\n\x1a\n"), "svg": ("image/svg+xml", b"<?xml")}
+"""Type and first bytes of the figures that a page can show."""
+
+
+def _image(stem: Path, caption: str) -> str:
+    """Return a figure that the tuning drew beside its result, or the name of its PDF; nothing where there is none."""
+    pdf = stem.with_name(f"{stem.name}.pdf")
+    if pdf.exists():
+        return page.section(
+            caption, page.paragraph(f"In {pdf.name}, beside the result; tune with --format png or svg to see it here.")
+        )
+    for suffix, (kind, first) in _KINDS.items():
+        path = stem.with_name(f"{stem.name}.{suffix}")
+        if path.exists():
+            found = reading.content(path, link=False, most=LARGEST_FIGURE)
+            if not found.startswith(first):
+                raise InputError(f"{path} is no {suffix.upper()}; take it away, or tune again")
+            data = base64.b64encode(found).decode()
+            image = f'<img src="data:{kind};base64,{data}" alt="{page.text(caption)}">'
+            return page.section(caption, f'<figure class=wide><div class="scroll" tabindex="0">{image}</div></figure>')
+    return ""

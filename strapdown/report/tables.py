@@ -1,0 +1,383 @@
+"""Tables of studies, written as CSV with every digit and as LaTeX for a paper.
+
+A study's numbers are rows with the unit in each key, as its JSON has them; :class:`Table` adds the headings that LaTeX prints.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import os
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from strapdown.files import written_beside
+from strapdown.units import ARCSECOND, DEGREE_PER_HOUR
+
+Value = str | float | int | bool | None
+"""A cell; None and NaN are empty ones."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """One table of a study."""
+
+    name: str
+    """Name of the files."""
+    caption: str
+    headings: Mapping[str, str]
+    """Heading in LaTeX of each key of the rows, in the order of the columns; other keys are not written."""
+    rows: Sequence[Mapping[str, Any]]
+
+    def cells(self) -> list[list[Value]]:
+        """Return the values, one list a row."""
+        return [[row[key] for key in self.headings] for row in self.rows]
+
+
+def write(tables: Sequence[Table], folder: str | os.PathLike[str]) -> list[Path]:
+    r"""Write tables to a folder as ``NAME.csv`` and ``NAME.tex``; return the files.
+
+    Parameters
+    ----------
+    tables : sequence of Table
+    folder : path
+        Made if it is missing.
+
+    Returns
+    -------
+    list of Path
+        Two files for each table. The CSV has the keys as its header and numbers that read back to the bit; the LaTeX is a ``tabular``
+        with four digits, for ``\\input`` into a document that loads ``booktabs``.
+    """
+    written = []
+    for table in tables:
+        for suffix, content in (("csv", to_csv(table)), ("tex", to_latex(table))):
+            written.append(Path(folder) / f"{table.name}.{suffix}")
+            with written_beside(written[-1]) as temporary:
+                temporary.write_text(content, encoding="utf-8", errors="backslashreplace", newline="")
+    return written
+
+
+def to_csv(table: Table) -> str:
+    """Return a table as CSV (RFC 4180), UTF-8, with one header line."""
+    stream = io.StringIO()
+    writer = csv.writer(stream)
+    writer.writerow(table.headings)
+    writer.writerows([["" if _empty(cell) else cell for cell in row] for row in table.cells()])
+    return stream.getvalue()
+
+
+def to_latex(table: Table) -> str:
+    """Return a table as LaTeX: a ``tabular`` with rules of ``booktabs``, texts left and numbers right."""
+    rows = table.cells()
+    sides = [
+        "l" if any(isinstance(row[k], (str, bool, np.bool_)) for row in rows) else "r"
+        for k in range(len(table.headings))
+    ]
+    lines = [f"% {_line(table.caption)}", "% needs \\usepackage{booktabs}", f"\\begin{{tabular}}{{{''.join(sides)}}}"]
+    lines += ["\\toprule", _row(_escaped(heading) for heading in table.headings.values()), "\\midrule"]
+    lines += [_row(_cell(cell) for cell in row) for row in rows]
+    lines += ["\\bottomrule", "\\end{tabular}"]
+    return "\n".join(lines) + "\n"
+
+
+def _empty(cell: Value) -> bool:
+    return cell is None or (isinstance(cell, float) and math.isnan(cell))
+
+
+def _line(text: str) -> str:
+    """Return text on one line, as a comment needs it."""
+    return " ".join(text.split())
+
+
+def _row(cells: Any) -> str:
+    return " & ".join(cells) + r" \\"
+
+
+def _cell(cell: Value) -> str:
+    if _empty(cell):
+        return ""
+    if isinstance(cell, (bool, np.bool_)):
+        return "yes" if cell else "no"
+    if isinstance(cell, str):
+        return _escaped(cell)
+    if math.isinf(cell):  # type: ignore[arg-type]
+        return r"$-\infty$" if cell < 0 else r"$\infty$"  # type: ignore[operator]
+    digits, _, exponent = (str(cell) if isinstance(cell, int) else f"{cell:.4g}").partition("e")
+    power = rf" \times 10^{{{int(exponent)}}}" if exponent else ""
+    return f"${digits}{power}$"
+
+
+_SIGNS = {
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    **{sign: f"\\{sign}" for sign in "&%$#_{}"},
+    "°": r"$^\circ$",
+    "±": r"$\pm$",
+    "−": r"$-$",
+    "²": r"$^2$",
+    "µ": r"$\mu$",
+    "σ": r"$\sigma$",
+    "β": r"$\beta$",
+    "ω": r"$\omega$",
+    "τ": r"$\tau$",
+    "χ": r"$\chi$",
+    "…": r"\dots{}",
+}
+
+
+def _escaped(text: str) -> str:
+    parts = re.split(r"√(\w+)", _line(text))  # every second part stands under a root
+    plain = ["".join(_SIGNS.get(sign, sign) for sign in part) for part in parts]
+    return "".join(rf"$\sqrt{{\mathrm{{{part}}}}}$" if k % 2 else part for k, part in enumerate(plain))
+
+
+def of_coning(summary: Mapping[str, Any]) -> list[Table]:
+    """Return the tables of a coning study's :meth:`~strapdown.coning_study.ConingStudy.summary`: ``drift`` and ``filters``."""
+    scenario = summary["scenario"]
+    case = f"coning {scenario['angle_deg']:g}° at {scenario['frequency_hz']:g} Hz, gyro at {scenario['rate_hz']:g} Hz"
+    rows = [{**row, "bias_mean_z_deg_per_hour": row["bias_mean_deg_per_hour"][2]} for row in summary["filter"]]
+    return [
+        Table(
+            name="drift",
+            caption=f"Drift about the cone's axis by integration algorithm, {case}",
+            headings={
+                "algorithm": "algorithm",
+                "samples": "samples",
+                "drift_deg_per_hour": "measured, °/h",
+                "predicted_deg_per_hour": "predicted, °/h",
+            },
+            rows=summary["integration"],
+        ),
+        Table(
+            name="filters",
+            caption=f"The same filter on each algorithm, {scenario['runs']} runs, {case}",
+            headings={
+                "integration": "algorithm",
+                "attitude_rms_arcsec": "attitude RMS, arcsec",
+                "attitude_sigma_arcsec": "attitude σ, arcsec",
+                "bias_rms_deg_per_hour": "bias RMS, °/h",
+                "bias_sigma_deg_per_hour": "bias σ, °/h",
+                "bias_mean_z_deg_per_hour": "mean bias error z, °/h",
+                "anees_attitude": "ANEES attitude",
+                "anees_bias": "ANEES bias",
+                "nis": "NIS",
+                "consistent": "consistent",
+            },
+            rows=rows,
+        ),
+    ]
+
+
+def of_algorithms(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
+    """Return the table of the integration algorithms, of the rows of :func:`strapdown.coning.algorithm_rows`.
+
+    A key ``ns_per_sample``, where the rows have it, becomes a column.
+    """
+    keyed = [{key.replace(" ", "_"): value for key, value in row.items()} for row in rows]
+    headings = {
+        "name": "algorithm",
+        "needs": "needs",
+        "samples": "N",
+        "previous": "previous",
+        "following": "following",
+        "order": "order",
+        "drift_order": "drift order",
+        "drift_constant": "drift constant",
+        "ns_per_sample": "ns a sample",
+        "source": "source",
+    }
+    shown = {key: heading for key, heading in headings.items() if all(key in row for row in keyed)}
+    caption = (
+        "Integration algorithms: drift under small coning is -C β² ω (ωh)^n, C the drift constant and n the drift order"
+    )
+    return [Table(name="algorithms", caption=caption, headings=shown, rows=keyed)]
+
+
+def of_vibration(rows: Sequence[Mapping[str, Any]]) -> list[Table]:
+    """Return the table of the drift that a vibration spectrum leaves, of rows ``algorithm, sample_rate_hz, drift_deg_per_hour``."""
+    headings = {"algorithm": "algorithm", "sample_rate_hz": "gyro rate, Hz", "drift_deg_per_hour": "drift, °/h"}
+    return [Table(name="coning-budget", caption="Drift left by a vibration spectrum", headings=headings, rows=rows)]
+
+
+def of_montecarlo(summary: Mapping[str, Any]) -> list[Table]:
+    """Return the tables of a Monte Carlo's :func:`strapdown.montecarlo.summary`: ``consistency`` and ``errors`` (last epoch)."""
+    rows = [
+        {"statistic": "NEES", "of": subset, "mean": part["anees"], **_ends(part)} | {key: part[key] for key in _RANGE}
+        for subset, part in summary["nees"].items()
+    ]
+    rows += [
+        {"statistic": "NIS", "of": part["sensor"], "mean": part["nis"], **_ends(part)} | dict.fromkeys(_RANGE)
+        for part in summary["nis"]
+    ]
+    last, coverage = summary["last_epoch"], summary["coverage"]
+    quantiles = sorted(key.split("_")[3] for key in last if key.startswith("attitude_error_quantile_"))
+    errors = [
+        {
+            "state": f"{what} {axis}",
+            "unit": shown,
+            **{key: last[f"{what}_{key}_{unit}"][k] for key in ("mean_error", "rms_error", "sigma")},
+            **{f"error_quantile_{q}": last[f"{what}_error_quantile_{q}_{unit}"][k] for q in quantiles},
+        }
+        for what, unit, shown in (("attitude", "arcsec", "arcsec"), ("bias", "deg_per_hour", "°/h"))
+        for k, axis in enumerate("xyz")
+    ]
+    shares = [
+        {"of": what, **{f"inside_{k + 1}_sigma": share for k, share in enumerate(coverage[what])}}
+        for what in ("expected", "attitude", "bias")
+    ]
+    runs = f"{summary['runs']} runs"
+    return [
+        Table(
+            name="consistency",
+            caption=f"NEES and NIS per degree of freedom, {runs}, bounds {100 * summary['probability']:g} % together",
+            headings={
+                "statistic": "statistic",
+                "of": "of",
+                "mean": "mean",
+                "least": "least",
+                "greatest": "greatest",
+                "lower_bound": "lower bound",
+                "upper_bound": "upper bound",
+                "consistent": "consistent",
+            },
+            rows=rows,
+        ),
+        Table(
+            name="errors",
+            caption=f"Errors at {last['time_s']:g} s, {runs}; quantiles of the absolute error",
+            headings={
+                "state": "state",
+                "unit": "unit",
+                "mean_error": "mean",
+                "rms_error": "RMS",
+                "sigma": "σ of the filter",
+                **{f"error_quantile_{q}": f"{100 * float(q):g} %" for q in quantiles},
+            },
+            rows=errors,
+        ),
+        Table(
+            name="coverage",
+            caption=f"Share of errors inside 1, 2 and 3 σ at the judged epochs, {runs}",
+            headings={"of": "of", **{f"inside_{k}_sigma": f"inside {k}σ" for k in (1, 2, 3)}},
+            rows=shares,
+        ),
+    ]
+
+
+_RANGE = ("least", "greatest")
+
+
+def _ends(part: Mapping[str, Any]) -> dict[str, Any]:
+    low, high = part["bounds"]
+    return {"lower_bound": low, "upper_bound": high, "consistent": part["consistent"]}
+
+
+def of_covariance(budget: Sequence[tuple[str, str, float, float]]) -> list[Table]:
+    """Return the error budget of :meth:`strapdown.covariance.Analysis.budget`, largest attitude error first."""
+    rows = [
+        {
+            "source": source,
+            "kind": kind,
+            "attitude_arcsec": attitude / ARCSECOND,
+            "bias_deg_per_hour": bias / DEGREE_PER_HOUR,
+        }
+        for source, kind, attitude, bias in sorted(budget, key=lambda row: -row[2])
+    ]
+    headings = {
+        "source": "source",
+        "kind": "kind",
+        "attitude_arcsec": "attitude, arcsec",
+        "bias_deg_per_hour": "bias, °/h",
+    }
+    return [Table(name="budget", caption="Error budget at the end, RMS of one axis", headings=headings, rows=rows)]
+
+
+def of_tuning(content: Mapping[str, Any]) -> list[Table]:
+    """Return the tables of a tuning's JSON: ``parameters`` and, where data were held out, ``held-out``."""
+    per = lambda one, key: None if one[key] is None else one[key] / one["si_per_unit"]  # noqa: E731
+    rows = [
+        {**one, "before": per(one, "start"), "after": per(one, "value")}
+        | {"lower_95": per(one, "lower"), "upper_95": per(one, "upper")}
+        for one in content["parameters"]
+    ]
+    tables = [
+        Table(
+            name="parameters",
+            caption="Tuned noise parameters with 95 % intervals",
+            headings={
+                "name": "parameter",
+                "unit": "unit",
+                "before": "before",
+                "after": "after",
+                "lower_95": "from",
+                "upper_95": "to",
+                "identified": "identified",
+            },
+            rows=rows,
+        )
+    ]
+    if "held_out" in content:
+        held = [
+            {**one, "filter": name, "nis_lower": one["nis_bounds"][0], "nis_upper": one["nis_bounds"][1]}
+            for name, one in content["held_out"].items()
+        ]
+        headings = {
+            "filter": "filter",
+            "log_likelihood_per_innovation": "log likelihood an innovation",
+            "nis_per_degree": "NIS",
+            "nis_lower": "lower bound",
+            "nis_upper": "upper bound",
+            "anees_per_state": "ANEES",
+            "attitude_rms_rad": "attitude RMS, rad",
+        }
+        caption = "The filter before and after tuning on data held out; NIS with 99 % bounds"
+        tables.append(Table(name="held-out", caption=caption, headings=headings, rows=held))
+    return tables
+
+
+def of_allan(rows: Sequence[Mapping[str, Any]], sensor: str) -> list[Table]:
+    """Return the noise coefficients of a sensor, of the rows of :func:`strapdown.noise_parameters.table`, as ``SENSOR-noise``.
+
+    The estimate is empty for a term that the record does not show; its upper end bounds what the record could hide.
+    """
+    shown = [
+        {
+            **row,
+            "axis": "xyz"[int(row["axis"])],
+            "term": str(row["term"]).replace("_", " "),
+            **{key: row[key] if row["supported"] else None for key in ("estimate", "lower")},
+        }
+        for row in rows
+    ]
+    headings = {
+        "axis": "axis",
+        "term": "term",
+        "symbol": "symbol",
+        "unit": "unit",
+        "estimate": "estimate",
+        "lower": "from",
+        "upper": "to",
+        "supported": "seen",
+    }
+    caption = f"Noise coefficients of the {sensor} with 95 % intervals"
+    return [Table(name=f"{sensor}-noise", caption=caption, headings=headings, rows=shown)]
+
+
+STUDIES: dict[str, Callable[..., list[Table]]] = {
+    "coning": of_coning,
+    "algorithms": of_algorithms,
+    "coning budget": of_vibration,
+    "montecarlo": of_montecarlo,
+    "covariance": of_covariance,
+    "tuning": of_tuning,
+    "allan": of_allan,
+}
+"""What makes the tables of each study."""

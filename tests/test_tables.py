@@ -1,0 +1,240 @@
+"""Tables of studies: CSV that reads back to the bit, LaTeX that compiles, and the commands that write both, and figures in every format."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from strapdown import cli
+from strapdown.checks import InputError
+from strapdown.report.tables import Table, to_csv, to_latex, write
+
+LATEX = next((path for name in ("pdflatex", "lualatex", "tectonic") if (path := shutil.which(name))), None)
+CELLS = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(-(10**9), 10**9),
+    st.floats(),
+    st.text(st.characters(blacklist_categories=("Cs", "Cc")), max_size=12).filter(lambda text: text != ""),
+)
+
+
+def read_back(text):
+    head, *rows = csv.reader(text.splitlines(keepends=True))
+    return head, rows
+
+
+def tabular(text):
+    """Columns of a tabular, its heading, and its rows as cells; what LaTeX would make of the structure."""
+    (columns,) = re.findall(r"\\begin\{tabular\}\{([lr]+)\}", text)
+    body = text.split("\\toprule\n")[1].split("\\bottomrule")[0]
+    head, rows = body.split("\\midrule\n")
+    cut = lambda line: [cell.strip() for cell in re.split(r"(?<!\\)&", line.removesuffix(r" \\"))]  # noqa: E731
+    return columns, cut(head.strip()), [cut(line) for line in rows.splitlines()]
+
+
+@given(st.lists(st.tuples(CELLS, CELLS, CELLS), max_size=6))
+def test_csv_reads_back_to_the_bit(rows):
+    keys = ("a", "b_deg", "c, d")
+    held = [dict(zip(keys, row, strict=True)) for row in rows]
+    table = Table(name="t", caption="c", headings={key: key for key in keys}, rows=held)
+    head, found = read_back(to_csv(table))
+    assert head == list(keys)
+    for row, given_row in zip(found, rows, strict=True):
+        for text, value in zip(row, given_row, strict=True):
+            if value is None or (isinstance(value, float) and math.isnan(value)):
+                assert text == ""
+            elif isinstance(value, float):
+                assert np.float64(text).tobytes() == np.float64(value).tobytes()
+            else:
+                assert text == str(value)
+
+
+@given(st.lists(st.tuples(CELLS, CELLS, CELLS), min_size=1, max_size=6))
+def test_latex_has_a_cell_for_each_value_and_nothing_unescaped(rows):
+    keys = ("a", "b", "c")
+    held = [dict(zip(keys, row, strict=True)) for row in rows]
+    text = to_latex(Table(name="t", caption="50 % of\nall", headings={key: key for key in keys}, rows=held))
+    columns, head, found = tabular(text)
+    assert (len(columns), head) == (3, list(keys))
+    assert len(found) == len(rows)
+    for k, row in enumerate(found):
+        assert len(row) == 3, text
+        for j, cell in enumerate(row):
+            if not isinstance(rows[k][j], str):
+                assert re.fullmatch(r"|yes|no|\$-?(\d+(\.\d+)?( \\times 10\^\{-?\d+\})?|\\infty)\$", cell), cell
+    bare = re.sub(r"\$[^$]*\$", "", re.sub(r"\\[A-Za-z]+(\{\})?|\\[&%$#_{}\\]", "", "\n".join(text.splitlines()[5:-2])))
+    assert not re.search(r"[%#_^~]", bare), bare
+
+
+def test_latex_rounds_and_aligns():
+    rows = [{"name": "100 % of a_b", "x": 1.23456e-8, "unit": "°/√h"}, {"name": "c", "x": -62.391, "unit": ""}]
+    table = Table(name="t", caption="c", headings={"name": "name", "x": "drift, °/h", "unit": "unit"}, rows=rows)
+    columns, head, found = tabular(to_latex(table))
+    assert columns == "lrl"
+    assert head == ["name", r"drift, $^\circ$/h", "unit"]
+    assert found[0] == [r"100 \% of a\_b", r"$1.235 \times 10^{-8}$", r"$^\circ$/$\sqrt{\mathrm{h}}$"]
+    assert found[1][1] == "$-62.39$"
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """Each command once, with --tables, and --format where it draws: its folder by the command's name."""
+    where = tmp_path_factory.mktemp("studies")
+    rest = where / "rest.npy"
+    np.save(rest, 1e-4 * np.random.default_rng(3).standard_normal((4000, 3)))
+    (where / "lines.csv").write_text("frequency_hz,angle_deg\n10,0.1\n", encoding="utf-8")
+    toml = CliRunner().invoke(cli.app, ["simulate", "two-stars", "--show"]).output
+    (where / "short.toml").write_text(re.sub(r"duration_s = .*", "duration_s = 40.0", toml), encoding="utf-8")
+    commands = {
+        "coning": ["--runs", 2, "--duration", 12, "--format", "svg", "--out", where / "coning"],
+        "algorithms": ["--no-time"],
+        "coning-budget": ["--psd", where / "lines.csv", "--rate", 100, "--rate", 200],
+        "covariance": [where / "short.toml", "--epochs", 4, "--format", "pdf", "--out", where / "covariance"],
+        "allan": [rest, "--rate", 100, "--gyro-unit", "rad/s", "--format", "svg", "--out", where / "allan"],
+        "montecarlo": [where / "short.toml", "--runs", 8, "--out", where / "mc.h5"],
+        "simulate": [where / "short.toml", "--out", where / "record.h5"],
+        "tune": [
+            where / "record.h5",
+            "--free",
+            "star 1.sigma",
+            "--holdout",
+            0.3,
+            "--starts",
+            1,
+            "--format",
+            "svg",
+            "--out",
+            where / "filter.toml",
+        ],
+        "estimate": [where / "record.h5", "--format", "pdf", "--out", where / "estimate"],
+    }
+    for name, options in commands.items():
+        tables = [] if name in ("simulate", "estimate") else ["--tables", where / "tables" / name]
+        result = CliRunner().invoke(cli.app, [str(part) for part in [name, *options, *tables]])
+        assert result.exit_code == 0, (name, result.output, result.exception)
+        for path in (where / "tables" / name).glob("*"):
+            assert path.name in result.output.replace("\n", "")
+    return where
+
+
+WANTED = {
+    "coning": {"drift", "filters"},
+    "algorithms": {"algorithms"},
+    "coning-budget": {"coning-budget"},
+    "covariance": {"budget"},
+    "allan": {"gyro-noise"},
+    "montecarlo": {"consistency", "errors", "coverage"},
+    "tune": {"parameters", "held-out"},
+}
+
+
+@pytest.mark.parametrize("name", WANTED)
+def test_every_study_writes_its_tables(written, name):
+    folder = written / "tables" / name
+    assert {path.name for path in folder.iterdir()} == {
+        f"{one}.{end}" for one in WANTED[name] for end in ("csv", "tex")
+    }
+    for one in WANTED[name]:
+        head, rows = read_back((folder / f"{one}.csv").read_text(encoding="utf-8"))
+        assert rows
+        columns, shown, found = tabular((folder / f"{one}.tex").read_text(encoding="utf-8"))
+        assert len(head) == len(columns) == len(shown)
+        assert [len(row) for row in found] == [len(columns)] * len(rows)
+
+
+def of(written, name, one):
+    head, rows = read_back((written / "tables" / name / f"{one}.csv").read_text(encoding="utf-8"))
+    return [dict(zip(head, row, strict=True)) for row in rows]
+
+
+def test_tables_hold_the_numbers_of_the_json(written):
+    study = json.loads((written / "coning" / "coning.json").read_text())
+    for row, one in zip(of(written, "coning", "drift"), study["integration"], strict=True):
+        assert float(row["drift_deg_per_hour"]) == one["drift_deg_per_hour"]
+    for row, one in zip(of(written, "coning", "filters"), study["filter"], strict=True):
+        assert float(row["bias_mean_z_deg_per_hour"]) == one["bias_mean_deg_per_hour"][2]
+        assert row["consistent"] == str(one["consistent"])
+    last = json.loads((written / "mc.json").read_text())["last_epoch"]
+    errors = of(written, "montecarlo", "errors")
+    assert [row["state"] for row in errors] == [f"{what} {axis}" for what in ("attitude", "bias") for axis in "xyz"]
+    assert [float(row["rms_error"]) for row in errors[3:]] == last["bias_rms_error_deg_per_hour"]
+    assert [float(row["error_quantile_0.95"]) for row in errors[:3]] == last["attitude_error_quantile_0.95_arcsec"]
+    (parameter,) = json.loads((written / "filter.json").read_text())["parameters"]
+    (row,) = of(written, "tune", "parameters")
+    assert float(row["after"]) == parameter["value"] / parameter["si_per_unit"]
+    assert row["unit"] == "arcsec"
+    covariance = json.loads((written / "covariance" / "covariance.json").read_text())
+    for row in of(written, "covariance", "budget"):
+        if row["kind"] == "random":
+            axes = covariance["random"][row["source"]]["attitude_arcsec"][-1]
+            assert float(row["attitude_arcsec"]) == pytest.approx(np.sqrt(np.mean(np.square(axes))), rel=1e-12)
+
+
+def test_figures_are_written_in_the_format_asked_for(written):
+    found = {
+        str(path.relative_to(written)): path.read_bytes()[:5]
+        for path in written.rglob("*")
+        if path.suffix in (".png", ".pdf", ".svg")
+    }
+    svg = {"coning/drift", "coning/errors", "coning/consistency", "allan/allan", "filter-likelihood", "filter-heldout"}
+    pdf = {"covariance/budget", "estimate/estimate", "estimate/errors"}
+    assert found == {
+        **dict.fromkeys((f"{x}.svg" for x in svg), b"<?xml"),
+        **dict.fromkeys((f"{x}.pdf" for x in pdf), b"%PDF-"),
+    }
+
+
+def test_the_report_of_a_tuning_shows_svg_and_names_pdf(written, tmp_path):
+    from strapdown import report
+
+    content = report.write(written / "filter.json", tmp_path / "page.html").page.read_text(encoding="utf-8")
+    assert content.count("data:image/svg+xml;base64,") == 2
+    for path in written.glob("filter.*"):
+        shutil.copy(path, tmp_path)
+    (tmp_path / "filter-likelihood.pdf").write_bytes(b"%PDF-")
+    content = report.write(tmp_path / "filter.json").page.read_text(encoding="utf-8")
+    assert "data:image" not in content
+    assert "In filter-likelihood.pdf, beside the result" in content
+
+
+def test_what_cannot_be_written_is_refused_before_anything_is_computed(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    for command in (["algorithms"], ["coning"], ["covariance", "spin"], ["montecarlo", "spin"]):
+        result = CliRunner().invoke(cli.app, [*command, "--tables", "file"])
+        assert isinstance(result.exception, InputError)
+        assert "--tables is file" in str(result.exception)
+    result = CliRunner().invoke(cli.app, ["coning", "--format", "gif"])
+    assert result.exit_code == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.skipif(LATEX is None, reason="no LaTeX on this machine; install TeX Live to compile the tables")
+def test_the_tables_compile(written, tmp_path):
+    inputs = "\n".join(rf"\input{{{path.as_posix()}}}" + "\n" for path in sorted((written / "tables").rglob("*.tex")))
+    (tmp_path / "all.tex").write_text(
+        "\\documentclass{article}\n\\usepackage{booktabs}\n\\begin{document}\n" + inputs + "\\end{document}\n",
+        encoding="utf-8",
+    )
+    command = [str(LATEX), "all.tex"] if "tectonic" in str(LATEX) else [str(LATEX), "-halt-on-error", "all.tex"]
+    subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, timeout=120)
+    assert (tmp_path / "all.pdf").exists()
+
+
+def test_a_folder_is_made_and_files_appear_whole(tmp_path):
+    table = Table(name="t", caption="c", headings={"a": "a"}, rows=[{"a": 1.0}])
+    assert write([table], tmp_path / "new" / "folder") == [
+        tmp_path / "new" / "folder" / f"t.{end}" for end in ("csv", "tex")
+    ]
+    assert sorted(path.name for path in (tmp_path / "new" / "folder").iterdir()) == ["t.csv", "t.tex"]
