@@ -32,7 +32,7 @@ templates_path = ["_templates"]
 os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(DOCS.parent), os.environ.get("PYTHONPATH", "")]))
 os.environ.update(
-    STRAPDOWN_DOCS=str(DOCS), COLUMNS="96", NO_COLOR="1", TERM="dumb", TTY_COMPATIBLE="0", OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1"
+    STRAPDOWN_DOCS=str(DOCS), COLUMNS="96", NO_COLOR="1", TERM="dumb", OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1"
 )
 os.environ.pop("MPLBACKEND", None)  # pages draw inline
 _profile = tempfile.TemporaryDirectory()
@@ -40,6 +40,8 @@ os.environ["IPYTHONDIR"] = _profile.name
 (Path(_profile.name) / "profile_default").mkdir()
 (Path(_profile.name) / "profile_default/ipython_kernel_config.py").write_text(
     "c.IPKernelApp.log_level = 40\n"
+    f"import sys; sys.path.insert(0, {str(DOCS)!r})\n"
+    "c.InteractiveShellApp.extensions = ['shell_cells']\n"
     "c.InlineBackend.figure_formats = {'svg'}\n"
     "c.InlineBackend.rc = {'figure.figsize': (6.4, 3.6), 'font.size': 9.0, 'svg.fonttype': 'path'}\n"
 )
