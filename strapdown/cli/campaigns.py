@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from strapdown.cli.filters import filter_of_scenario
+from strapdown.cli.filters import default_words, filter_of_scenario
 from strapdown.cli.terminal import (
     app,
     console,
@@ -28,8 +28,11 @@ from strapdown.cli.terminal import (
 if TYPE_CHECKING:
     from types import FrameType
 
+    from strapdown.consistency import Judgement
     from strapdown.montecarlo import Plan
     from strapdown.montecarlo.campaign import Campaign
+    from strapdown.scenarios import Scenario
+    from strapdown.setup import FilterSetup
 
 _RUNS = 1000
 _CAMPAIGN_SUFFIXES = (".h5", ".hdf5")
@@ -63,9 +66,13 @@ def montecarlo(
         int | None, typer.Option(help="Runs between merges and writes; the machine's if not given.")
     ] = None,
     states: Annotated[
-        bool,
-        typer.Option("--states", help="Give the filter a state for each error that the scenario specifies; slower."),
-    ] = False,
+        bool | None,
+        typer.Option(
+            "--states/--no-states",
+            help="With or without a state for each error that the scenario specifies. Default: with them, where there are such errors and "
+            "no filter, --float32 or lanes are asked for.",
+        ),
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="HDF5 file; NAME-montecarlo.h5 if not given.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the file, if it exists.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Begin anew although the file exists.")] = False,
@@ -83,7 +90,7 @@ def montecarlo(
         int | None, typer.Option(help="Compute this one run again and write it in full detail: record and estimate.")
     ] = None,
 ) -> None:
-    """Run a scenario many times through a filter; tell whether the filter may be believed."""
+    """Run a scenario many times through a filter and judge the filter: exit status 0 consistent, 1 not, 2 cannot tell (or bad input)."""
     from strapdown import montecarlo as engine
     from strapdown.checks import InputError, count
     from strapdown.files import write_json
@@ -92,6 +99,8 @@ def montecarlo(
     source = Path(scenario)
     held = campaigns.read(source) if source.suffix.lower() in _CAMPAIGN_SUFFIXES else None
     if held is None:
+        if states is None and (float32 or machine == "lanes"):
+            states = False
         plan = _plan(scenario, filter_file, dispersions, seed, float32, states)
         target = out or Path(f"{plan.scenario.name or source.stem}-montecarlo.h5")
     else:
@@ -100,7 +109,7 @@ def montecarlo(
             "--dispersions": dispersions,
             "--seed": seed,
             "--float32": float32 or None,
-            "--states": states or None,
+            "--states": states,
         }
         for name, value in given.items():
             if value is not None:
@@ -119,8 +128,7 @@ def montecarlo(
         _replay(plan, replay, machine, target)
         return
     if held is not None and target == source and not (resume or overwrite):
-        _tell(held)
-        return
+        raise typer.Exit(_tell(held))
     if runs is None:
         runs = campaigns.read(target).runs if resume and target.exists() else _RUNS
     if workers is not None and cluster is not None:
@@ -160,10 +168,11 @@ def montecarlo(
         except KeyboardInterrupt:
             console.print(f"What is finished is in {target}; go on with --resume.")
             raise
-    _tell(result)
+    status = _tell(result)
     report = target.with_suffix(".json")
     write_json(report, _report(result))
     written(target, report)
+    raise typer.Exit(status)
 
 
 @contextlib.contextmanager
@@ -198,26 +207,48 @@ def _plan(
     dispersions: Path | None,
     seed: int | None,
     float32: bool,
-    states: bool,
+    states: bool | None,
 ) -> Plan:
     from strapdown import montecarlo as engine
-    from strapdown import setup
     from strapdown.checks import InputError
 
-    if states and filter_file is not None:
-        raise InputError("--filter tells the filter's states itself, in [filter.states]; leave --states out")
+    if states is not None and filter_file is not None:
+        raise InputError(
+            "--filter holds the filter's states itself, in [filter.states]; leave --states and --no-states out"
+        )
     loaded = scenario_named(scenario)
-    filter_setup = (
-        setup.matched(loaded, states=states) if filter_file is None else filter_of_scenario(filter_file, loaded)
-    )
+    filter_setup = _matched(loaded, states) if filter_file is None else filter_of_scenario(filter_file, loaded)
+    # A state for a fixed error has a prior; the filter is right on average over individuals of that prior, not on one of them.
+    names = filter_setup.states.names if filter_file is None and filter_setup.states is not None else ()
+    individuals = any(not name.endswith((".drift", ".correlated")) for name in names)
+    if individuals:
+        console.print("Each run draws its own gyro and sensors: the fixed errors specified are standard deviations.")
     return engine.Plan(
         scenario=loaded,
         setup=filter_setup,
         seed=loaded.seed if seed is None else seed,
         epochs=engine.whole_epochs(loaded, filter_setup),
+        individuals=individuals,
         dispersions=engine.Dispersions() if dispersions is None else engine.read_dispersions(dispersions),
         precision="float32" if float32 else "float64",
     )
+
+
+def _matched(scenario: Scenario, states: bool | None) -> FilterSetup:
+    """Return the filter that matches a scenario: with states where asked for, or (None) where errors are specified that call for them."""
+    from strapdown import setup
+
+    plain = setup.matched(scenario)
+    if states is False or (
+        states is None and not setup.not_covered(scenario.gyro, scenario.sensors, gravity_f=scenario.gravity_f)
+    ):
+        return plain
+    found = setup.matched(scenario, states=True)
+    if found.states is None or not found.states.names:
+        return plain
+    if states is None:
+        console.print(default_words(found.states.names))
+    return found
 
 
 def _report(campaign: Campaign) -> dict[str, Any]:
@@ -232,15 +263,25 @@ def _report(campaign: Campaign) -> dict[str, Any]:
         "chunk": campaign.chunk,
         "version": campaign.version,
         "seconds": campaign.seconds,
+        "judgement": _judged(campaign).summary(),
         **summary(campaign.statistics),
     }
 
 
-def _tell(campaign: Campaign) -> None:
+def _judged(campaign: Campaign) -> Judgement:
+    """Return the verdict that `strapdown check` gives of the file."""
+    from strapdown import consistency
+
+    assert campaign.statistics is not None
+    return consistency.judge_runs(campaign.statistics, unmodelled=campaign.plan.unmodelled)
+
+
+def _tell(campaign: Campaign) -> int:
+    """Show the statistics and the verdict; return the exit status."""
     from strapdown.checks import InputError
+    from strapdown.cli.judgement import status_of
     from strapdown.montecarlo import summary
     from strapdown.montecarlo.verdicts import QUANTILES
-    from strapdown.setup import not_covered
 
     if campaign.statistics is None:
         raise InputError("no chunk of the campaign is finished; go on with it (--resume)")
@@ -298,18 +339,17 @@ def _tell(campaign: Campaign) -> None:
     rate = ""
     if campaign.seconds > 0.0:
         rate = f" ({rate_text(campaign.statistics.runs / campaign.seconds)} runs/s, compiling included)"
-    said = "may be believed" if report["consistent"] else "may NOT be believed"
     console.print(
-        f"{counted(report['runs'], 'run')}, {campaign.seconds:.3g} s{rate}. The filter {said}: bounds that a right filter keeps all "
-        f"together with {100.0 * report['probability']:g} %, NEES at {report['epochs_judged']} epochs."
+        f"{counted(report['runs'], 'run')}, {campaign.seconds:.3g} s{rate}. Bounds hold all statistics of a right filter together with "
+        f"{100.0 * report['probability']:g} %, NEES at {report['epochs_judged']} epochs."
     )
-    plan = campaign.plan
-    missing = not_covered(
-        plan.scenario.gyro, plan.scenario.sensors, plan.setup.states, gravity_f=plan.scenario.gravity_f
-    )
-    if missing and not report["consistent"]:
-        remedy = "; --states gives it states for most" if plan.setup.states is None else ""
-        console.print(f"The filter has no state for {', '.join(missing)}{remedy}.")
+    judgement = _judged(campaign)
+    console.print(judgement.words)
+    if judgement.verdict == "cannot tell":
+        console.print("More runs (--runs, with --resume) would tell.")
+    if judgement.unmodelled and campaign.plan.setup.states is None:
+        console.print("--states gives the filter states for most of these errors.")
+    return status_of(judgement)
 
 
 def _worst_axis(values: list[float | None]) -> int:

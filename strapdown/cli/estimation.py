@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from strapdown.cli.filters import filter_for
+from strapdown.cli.filters import ChosenStates, filter_for
 from strapdown.cli.reading import (
     RECORDING_HELP,
     AccelerometerUnit,
@@ -97,12 +97,13 @@ def estimate(
         str | None, typer.Option(help="Record: weigh measurements by how far they lie off: huber or student.")
     ] = None,
     states: Annotated[
-        bool,
+        bool | None,
         typer.Option(
-            "--states",
-            help="Record: with a state for each error that gyro and sensors are specified with: scale, misalignment, drift, hard iron, …",
+            "--states/--no-states",
+            help="Record: with or without a state for each error that gyro and sensors are specified with (scale, misalignment, drift, "
+            "hard iron, …). Default: with them, where there are such errors.",
         ),
-    ] = False,
+    ] = None,
     state: Annotated[
         list[str] | None,
         typer.Option(help="Record: only this one of those states, such as gyro.scale or SENSOR.bias; may be repeated."),
@@ -188,7 +189,7 @@ def estimate(
             filter_file,
             gate,
             robust,
-            tuple(state or ()) if states or state else None,
+            tuple(state or ()) if states or state else states,
             attitude,
             from_truth,
             every,
@@ -204,7 +205,7 @@ def estimate(
             RECORD_ONLY,
             (
                 filter_file,
-                states or None,
+                states,
                 state or None,
                 attitude,
                 from_truth or None,
@@ -276,7 +277,7 @@ def _estimate_record(
     filter_file: Path | None,
     gate: float | None,
     robust: str | None,
-    states: tuple[str, ...] | None,
+    states: ChosenStates,
     attitude: str | None,
     from_truth: bool,
     every: int,
@@ -302,7 +303,7 @@ def _estimate_record(
     if gyro is not None and filter_file is not None:
         raise InputError("--gyro and --filter both tell the filter's belief of the gyro; give one of them")
     held = read_record_file(path)
-    chosen, remarks = filter_for(path, held, gyro, filter_file, states)
+    chosen, remarks = filter_for(path, held, gyro, filter_file, states, smooth=smooth)
     if gate is not None:
         chosen = dataclasses.replace(chosen, gate=Gate(probability=gate))
     if robust is not None:

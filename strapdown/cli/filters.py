@@ -4,62 +4,109 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from strapdown.gyro import GyroSpec
     from strapdown.recordfiles import RecordFile
     from strapdown.scenarios import Scenario
     from strapdown.setup import FilterSetup
 
 
-def filter_for(
-    path: Path, held: RecordFile, gyro: Path | None, filter_file: Path | None, states: tuple[str, ...] | None
-) -> tuple[FilterSetup, list[str]]:
-    """Return the filter, and what to say of it: of a file, or matched to the gyro's specification and what the sensors say of themselves.
+ChosenStates = tuple[str, ...] | Literal[False] | None
+"""Error states by name: empty, all that the specified errors call for; False, none; None, all where there are such errors."""
 
-    ``states`` None: of attitude and bias alone; empty: with all states that the specified errors call for.
+
+def filter_for(
+    path: Path,
+    held: RecordFile,
+    gyro: Path | None,
+    filter_file: Path | None,
+    states: ChosenStates,
+    *,
+    smooth: bool = False,
+) -> tuple[FilterSetup, list[str]]:
+    """Return the filter, and what to say of it: of a file, or matched to the gyro's specification and the record's sensors.
+
+    A filter that is to be smoothed is not given gyro drifts unless ``states`` names them.
     """
     from strapdown import setup
     from strapdown.checks import InputError
     from strapdown.gyro import read_spec
-    from strapdown.scenarios import scenario_from_toml
-    from strapdown.setup.states import States
 
     if filter_file is not None:
         if states is not None:
             raise InputError(
-                "--filter tells the filter's states itself, in [filter.states]; leave --states and --state out"
+                "--filter holds the filter's states itself, in [filter.states]; leave --states, --no-states and --state out"
             )
         chosen = setup.read_setup(filter_file)
         need_angles(filter_file, chosen, held)
         return chosen, no_state_words(without_a_state(path, held, chosen), chosen)
     spec = held.gyro if gyro is None else read_spec(gyro)
     if spec is None:
-        raise InputError(f"{path} does not tell the gyro's specification; give --gyro or --filter, a TOML file")
-    if states is None:
-        chosen = setup.matched_to_record(spec, held.record)
-        return chosen, no_state_words(without_a_state(path, held, chosen), chosen)
-    remarks = []
-    if not held.scenario:
-        chosen = setup.matched_to_record(spec, held.record, states=True)
-        remarks.append(
-            f"{path.name} does not tell its scenario, so the errors of its sensors are not known: no state for them."
-        )
+        raise InputError(f"{path} does not hold the gyro's specification; give --gyro or --filter, a TOML file")
+    plain = setup.matched_to_record(spec, held.record)
+    missing = without_a_state(path, held, plain)
+    if states is False or (states is None and not missing):
+        return plain, no_state_words(missing, plain)
+    chosen, remarks = _with_states(path, held, spec, plain, states or (), without_drift=smooth and states is None)
+    if states is None and chosen.states is None:
+        return plain, no_state_words(missing, plain)
+    if chosen.states is None:
+        remarks.append("No error is specified that would call for an optional state; the filter has none.")
+    elif states is None:
+        remarks.append(default_words(chosen.states.names))
     else:
+        remarks.append(f"Optional states: {', '.join(chosen.states.names)}.")
+    missing = without_a_state(path, held, chosen)
+    return chosen, [*remarks, *([f"Still without a state: {', '.join(missing)}."] if missing else [])]
+
+
+def default_words(names: Sequence[str]) -> str:
+    """Return why a filter has error states that nobody asked for."""
+    return (
+        f"The filter estimates errors that are specified, {', '.join(names)}: without states for them its σ would be too small "
+        "(--no-states leaves them out)."
+    )
+
+
+def _with_states(
+    path: Path,
+    held: RecordFile,
+    spec: GyroSpec,
+    plain: FilterSetup,
+    names: tuple[str, ...],
+    *,
+    without_drift: bool,
+) -> tuple[FilterSetup, list[str]]:
+    """Return the filter with states of these names, or all, for the specified errors, and what to say of it."""
+    from strapdown import setup
+    from strapdown.scenarios import scenario_from_toml
+    from strapdown.setup.states import States
+
+    remarks = []
+    if held.scenario:
         scenario = scenario_from_toml(held.scenario, f"{path}: scenario")
         chosen = setup.matched_to_record(
             spec, held.record, states=True, sensors=scenario.sensors, gravity_f=scenario.gravity_f
         )
-    optional = chosen.states or States()
-    if states:
-        optional = optional.chosen(states)
-    chosen = dataclasses.replace(chosen, states=optional if optional.names else None)
-    if optional.names:
-        remarks.append(f"Optional states: {', '.join(optional.names)}.")
     else:
-        remarks.append("No error is specified that would call for an optional state; the filter has none.")
-    missing = without_a_state(path, held, chosen)
-    return chosen, [*remarks, *([f"Still without a state: {', '.join(missing)}."] if missing else [])]
+        chosen = setup.matched_to_record(spec, held.record, states=True)
+        remarks.append(
+            f"{path.name} does not hold its scenario, so the errors of its sensors are not known: no state for them."
+        )
+    optional = chosen.states or States()
+    if without_drift:
+        names = tuple(name for name in optional.names if name != "gyro.drift")
+        optional = optional.chosen(names) if names else States()
+    elif names:
+        optional = optional.chosen(names)
+    chosen = dataclasses.replace(chosen, states=optional if optional.names else None)
+    if "gyro.drift" not in optional.names:  # flicker without a state is matched by the two noises
+        chosen = dataclasses.replace(chosen, process_noise=plain.process_noise)
+    return chosen, remarks
 
 
 def need_angles(filter_file: Path, chosen: FilterSetup, held: RecordFile) -> None:

@@ -61,6 +61,7 @@ def check(
     from strapdown.checks import InputError
     from strapdown.consistency.bounds import tail
     from strapdown.files import write_json
+    from strapdown.report import findings
 
     if json is not None:
         writable("json", json, suffixes=(".json",), sources=(result, record, filter_file))
@@ -78,7 +79,7 @@ def check(
         if held.statistics is None:
             raise InputError(f"{result} holds no finished run yet; resume it with `strapdown montecarlo --resume`")
         console.print(f"{result.name}: {held.statistics.runs} of {counted(held.runs, 'run')}, machine {held.machine}.")
-        judgement = consistency.judge_runs(held.statistics, probability=probability)
+        judgement = consistency.judge_runs(held.statistics, probability=probability, unmodelled=held.plan.unmodelled)
     elif kind == "strapdown estimate":
         estimate = records.read_estimate(result)
         truth = records.read_truth(result)
@@ -87,7 +88,7 @@ def check(
             f"{sum(len(one.time) for one in estimate.innovations.values())} measurements, "
             f"{'no truth' if truth is None else 'with its truth'}."
         )
-        judgement = consistency.judge(estimate, truth, probability=probability)
+        judgement = findings.judged(result, records.read_attributes(result), probability)
     else:
         raise InputError(f"{result} is a {kind}; pass what `strapdown estimate` or `strapdown montecarlo` wrote")
     _show_statistics(judgement)
@@ -103,7 +104,12 @@ def check(
     if json is not None:
         write_json(json, content)
         written(json)
-    raise typer.Exit({"consistent": CONSISTENT, "not consistent": NOT}.get(judgement.verdict, CANNOT_TELL))
+    raise typer.Exit(status_of(judgement))
+
+
+def status_of(judgement: Judgement) -> int:
+    """Return the exit status of a verdict."""
+    return {"consistent": CONSISTENT, "not consistent": NOT}.get(judgement.verdict, CANNOT_TELL)
 
 
 def _show_statistics(judgement: Judgement) -> None:

@@ -307,7 +307,7 @@ def _cases(
                     raise InputError(
                         f"{path} does not tell its gyro; give a filter to start from, --filter filter.toml"
                     )
-                chosen, remarks = filter_for(path, file, None, None, () if states else None)
+                chosen, remarks = filter_for(path, file, None, None, () if states else False)
                 for remark in remarks:
                     console.print(remark)
             elif filter_file is not None:

@@ -91,6 +91,8 @@ def _reasons(plan: Plan) -> Iterator[str]:
             yield f"{sensor.name}: latency is not among the lanes' terms"
         elif isinstance(plan.setup.sigma.get(sensor.name), tuple) and not isinstance(sensor, AttitudeSensor):
             yield f"{sensor.name}: a sigma of its own for each axis is not among the lanes' terms"
+    if plan.individuals:
+        yield "gyro and sensors drawn anew for each run are not among the lanes' terms"
     for option in ("gate", "robust", "states"):
         if getattr(plan.setup, option, None) is not None:
             yield f"the filter's {option} option is not among the lanes' terms"
