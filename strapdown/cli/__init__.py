@@ -6,6 +6,8 @@ be told.
 
 ``terminal``
     What every command shares.
+``progress``
+    Progress of what takes long.
 ``studies``
     ``coning``
 ``integration``
@@ -55,6 +57,7 @@ from strapdown.cli import (  # noqa: F401  (each registers its commands)
     studies,
     tuning,
 )
+from strapdown.cli.progress import be_quiet
 from strapdown.cli.terminal import app, console, errors
 from strapdown.reading import NoDigestWarning
 
@@ -62,7 +65,12 @@ from strapdown.reading import NoDigestWarning
 @app.callback(invoke_without_command=True)
 def _about(
     version: Annotated[bool, typer.Option("--version", help="Print the version and stop.", is_eager=True)] = False,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", help="Show no progress on standard error; may stand after the command too.")
+    ] = False,
 ) -> None:
+    if quiet:
+        be_quiet()
     if version:
         import strapdown
 
@@ -99,6 +107,8 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # what ASCII or cp1252 has no sign for is a question mark, not the end
             stream.reconfigure(errors="replace")
+    if "--quiet" in sys.argv[1:]:
+        sys.argv = [sys.argv[0], "--quiet", *(argument for argument in sys.argv[1:] if argument != "--quiet")]
     try:
         app(standalone_mode=True)
     except InputError as error:

@@ -22,7 +22,7 @@ from strapdown.cli.reading import (
     Topic,
     told,
 )
-from strapdown.cli.terminal import app, console, doubt, need_own, show, table, writable, written
+from strapdown.cli.terminal import app, console, doubt, need_own, progress_bar, show, table, writable, written
 
 if TYPE_CHECKING:
     from strapdown.estimation.states import State
@@ -313,7 +313,8 @@ def _estimate_record(
         raise InputError(
             f"every is {every}, more than the {len(believed.increments)} filter steps of the record; only the start would be kept"
         )
-    initial, words, first = _initial(believed, held, chosen, attitude, from_truth)
+    with progress_bar("finding the start"):
+        initial, words, first = _initial(believed, held, chosen, attitude, from_truth)
     used = held.record
     if first > 0:
         used = records.cut(used, first * chosen.integration.samples, len(used.increments))
@@ -322,10 +323,11 @@ def _estimate_record(
             raise InputError(
                 f"every is {every}, and {len(believed.increments)} filter steps are left from the start on"
             )
-    if smooth:
-        result = setup.smooth(used, chosen, initial, full_covariance=full_covariance)
-    else:
-        result = setup.run(used, chosen, initial, every=every, full_covariance=full_covariance)
+    with progress_bar("smoothing" if smooth else "filtering"):
+        if smooth:
+            result = setup.smooth(used, chosen, initial, full_covariance=full_covariance)
+        else:
+            result = setup.run(used, chosen, initial, every=every, full_covariance=full_covariance)
     truth = None
     if believed.truth is not None:
         truth = Truth(attitude=believed.truth.attitude[::every], bias=believed.truth.bias[::every])
@@ -349,7 +351,8 @@ def _estimate_record(
         paths.append(out / "states.json")
         write_json(paths[-1], {"source": str(path), **_tell_states(result, used)})
     if observability:
-        shown = setup.observability(used, chosen, initial)
+        with progress_bar("observability"):
+            shown = setup.observability(used, chosen, initial)
         console.print(str(shown))
         paths.append(out / "observability.json")
         write_json(paths[-1], {"source": str(path), **shown.summary()})
@@ -594,12 +597,14 @@ def _estimate_recording(
         options["gate"] = Gate(probability=options["gate"])
     if options["robust"] is not None:
         options["robust"] = Robust(kind=options["robust"])
-    source = recordings.read(recording, **layout)
+    with progress_bar("reading"):
+        source = recordings.read(recording, **layout)
     doubt(source, recording)
     parameters = ahrs.MOTIONS[moved_by]
     if gyro is not None:
         parameters = replace(parameters, **process_noise(read_spec(gyro)))
-    result = ahrs.estimate(source, parameters, latency=late, **options)
+    with progress_bar("smoothing" if options["smooth"] else "filtering"):
+        result = ahrs.estimate(source, parameters, latency=late, **options)
     used, found = result.recording, result.estimate
     errors = None if used.true_attitude is None else reference_errors(found.attitude, used.true_attitude)
     rms = None if errors is None else {name: value / DEGREE for name, value in errors.rms(used.movement).items()}
@@ -649,7 +654,8 @@ def _estimate_recording(
             console.print(f"{number} samples of the {sensor} are missing and were skipped.")
     _tell(replace(found, skipped={}))
     if observability:
-        shown = setup.observability(result.record, parameters.setup, result.initial)
+        with progress_bar("observability"):
+            shown = setup.observability(result.record, parameters.setup, result.initial)
         console.print(str(shown))
         paths.append(out / "observability.json")
         write_json(paths[-1], {"source": used.source, **shown.summary()})

@@ -21,7 +21,7 @@ from strapdown.cli.reading import (
     Topic,
     told,
 )
-from strapdown.cli.terminal import app, console, counted, show, table, writable, written
+from strapdown.cli.terminal import app, console, counted, progress_bar, show, table, writable, written
 
 if TYPE_CHECKING:
     from strapdown.consistency import Judgement
@@ -159,9 +159,10 @@ def _diagnosed(
     P = np.diag(estimate.variance[0]) if estimate.covariance is None else estimate.covariance[0]
     initial = estimation.State(attitude=estimate.attitude[0], bias=estimate.bias[0], covariance=P)
     # The verdict is on the filter with its gate, so what that refused is left out.
-    found = diagnosis.diagnose(
-        accepted(held.record, estimate), chosen, initial, probability=judgement.probability, judgement=judgement
-    )
+    with progress_bar("looking for causes"):
+        found = diagnosis.diagnose(
+            accepted(held.record, estimate), chosen, initial, probability=judgement.probability, judgement=judgement
+        )
     rows = table("Causes by what they would explain", "cause", "of", "gain", "ln p", "", left=2)
     for cause in found.considered[:8]:
         mark = Text("likely", style="red") if cause in found.causes else Text("no")
@@ -233,7 +234,8 @@ def doctor(
     source = recordings.read(
         recording, **told(recording, columns=columns, topic=topic, axes=axes, invert=invert, **given)
     )
-    found = conventions.examine(source)
+    with progress_bar("trying conventions"):
+        found = conventions.examine(source)
     console.print(f"{found.source}: {found.words}")
     for words in found.doubts:
         console.print(f"warning: {words}.")

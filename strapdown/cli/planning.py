@@ -101,7 +101,7 @@ def covariance(
         time_offset={name: 1e-3 * value for name, value in _named("time_offset", time_offset).items()},
     )
     belief = filter_of_scenario(filter_file, chosen) if filter_file else setup.matched(chosen)
-    with progress_bar("covariance analysis", 1) as advance:
+    with progress_bar("covariance analysis"):
         found = analysis.analyse(
             chosen,
             belief,
@@ -110,7 +110,6 @@ def covariance(
             initial_bias_sigma=None if bias_sigma is None else bias_sigma * DEGREE_PER_HOUR,
             epochs=epochs,
         )
-        advance(1)
     name = chosen.name or Path(scenario).stem
     _tell(name, found, belief.integration.name, matched=filter_file is None)
     write_json(out / "covariance.json", _summary(name, found))

@@ -243,7 +243,8 @@ def tune(
     found = tuning.tuned_gate(objective, result) if gate else None
     if found is not None and found.gate is not None:
         result = replace(result, setup=replace(result.setup, gate=found.gate))
-    comparison = tuning.compare(held, believed, result.setup, threads=workers) if held else None
+    with progress_bar("judging on the data held out"):
+        comparison = tuning.compare(held, believed, result.setup, threads=workers) if held else None
     if comparison is not None and gate:
         likely = tuning.log_likelihood(held, objective, result)
         comparison = replace(comparison, after=replace(comparison.after, log_likelihood=likely))
