@@ -104,7 +104,7 @@ class GyroSpec(ByValue):
     turn_on_bias_sigma: Axes = 0.0
     """Standard deviation of a bias drawn anew for every run, rad/s."""
     scale_factor: Array = field(default_factory=_zeros)
-    """Scale-factor errors, (3,), dimensionless: the diagonal of M."""
+    """Scale-factor errors, (3,) or one for all axes, dimensionless: the diagonal of M."""
     asymmetry: Array = field(default_factory=_zeros)
     """Scale-factor asymmetry a, (3,), dimensionless: adds a |w|, so the scale factor is 1 + s ± a by the sign of the rate."""
     misalignment: Array = field(default_factory=_zero_matrix)
@@ -139,7 +139,10 @@ class GyroSpec(ByValue):
         else:
             object.__setattr__(self, "rate_ramp", array("rate_ramp", self.rate_ramp, (3,)))
         for name in ("turn_on_bias", "scale_factor", "asymmetry", "temperature_coefficient"):
-            object.__setattr__(self, name, array(name, getattr(self, name), (3,)))
+            value = getattr(self, name)
+            if not isinstance(value, (bool, str)) and np.ndim(value) == 0:
+                value = np.full(3, finite(name, value))
+            object.__setattr__(self, name, array(name, value, (3,)))
         for name in ("misalignment", "g_sensitivity"):
             object.__setattr__(self, name, array(name, getattr(self, name), (3, 3)))
         if np.any(np.diag(self.misalignment) != 0.0):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import sys
 import time
 
@@ -100,3 +101,15 @@ def test_quiet_may_stand_anywhere(run, monkeypatch):
         heard.append(progress._quiet)
     assert heard == [True, True, False]
     assert sys.argv[-1] == "scenarios"
+
+
+def test_json_on_standard_output_is_all_that_is_there(run, tmp_path):
+    (tmp_path / "lines.csv").write_text("frequency_hz,angle_deg\n10,0.1\n", encoding="utf-8")
+    status, said, other = run(
+        "coning-budget", "--psd", "lines.csv", "--rate", 100, "--algorithm", "one-sample", "--json", "-"
+    )
+    assert status == 0
+    assert json.loads(said)["lines"] == 1
+    assert "Drift about the third axis" in other
+    assert not (tmp_path / "-").exists()
+    assert "Drift about the third axis" in run("coning-budget", "--psd", "lines.csv", "--rate", 100)[1]

@@ -633,8 +633,8 @@ def _estimate_recording(
         paths.append(out / "states.json")
         write_json(paths[-1], {"source": used.source, **_states(found)})
     console.print(
-        f"{used.source}: {len(used.time)} samples over {used.time[-1] - used.time[0]:.1f} s, started in the quiet second "
-        f"from {used.time[0]:.2f} s."
+        f"{used.source}: {len(used.time)} samples over {used.time[-1] - used.time[0]:.1f} s, started in "
+        f"{'the quiet second' if _rested(parameters, result) else 'its quietest second, which is not at rest,'} from {used.time[0]:.2f} s."
     )
     for remark in used.remarks:
         console.print(remark)
@@ -671,6 +671,13 @@ def _estimate_recording(
     written(*paths)
 
 
+def _rested(parameters: Any, result: Any) -> bool:
+    """Return whether the start showed the gyro bias, where the filter takes it from there."""
+    if parameters.rest_bias_sigma == 0.0:
+        return True
+    return bool(result.initial.covariance[3, 3] <= (0.5 * parameters.bias_sigma) ** 2)
+
+
 def _model(moved_by: str, parameters: Any, result: Any) -> str:
     """Return in words the model of a recording's motion, and the bias that the filter started from."""
     import numpy as np
@@ -684,6 +691,6 @@ def _model(moved_by: str, parameters: Any, result: Any) -> str:
         f"Motion: of a hand, {parameters.velocity_sigma:g} m/s with a correlation time of {parameters.velocity_time:g} s. "
         f"Gyro bias at the start: {', '.join(f'{value:.3g}' for value in bias)} °/s, σ {sigma:.2g} °/s"
     )
-    if sigma > 0.5 * parameters.bias_sigma / DEGREE:
+    if not _rested(parameters, result):
         return f"{words}: no second is quiet enough to show it, so the heading may drift at first."
     return f"{words}, from that second."

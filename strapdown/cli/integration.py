@@ -9,7 +9,18 @@ from typing import Annotated
 import typer
 
 from strapdown.cli.reading import RECORDING_HELP, Axes, Columns, GyroUnit, Invert, TimeUnit, Topic, told
-from strapdown.cli.terminal import app, console, need_own, progress_bar, show, table, writable, written
+from strapdown.cli.terminal import (
+    app,
+    console,
+    json_target,
+    need_own,
+    progress_bar,
+    put_json,
+    show,
+    table,
+    writable,
+    written,
+)
 
 
 @app.command()
@@ -121,16 +132,16 @@ def coning_budget(
     ],
     rate: Annotated[list[float], typer.Option(help="Gyro samples a second, Hz; may be given several times.")],
     algorithm: Annotated[list[str] | None, typer.Option(help="Algorithm; may be given several times.")] = None,
-    json: Annotated[Path | None, typer.Option(help="Write the table as JSON too.")] = None,
+    json: Annotated[
+        Path | None, typer.Option(help="Write the table as JSON too, to this file; - for standard output.")
+    ] = None,
 ) -> None:
     """Tell the drift that an angular vibration spectrum leaves, for each algorithm and sample rate."""
     from strapdown import coning
     from strapdown.checks import InputError
-    from strapdown.files import write_json
     from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
-    if json is not None:
-        writable("json", json, suffixes=(".json",), sources=(psd,))
+    json_target(json, psd)
     lines = coning.read_vibration(psd)
     largest = max(max(line.angle, line.angle_across or 0.0) for line in lines)
     if largest >= _RIGHT_ANGLE:
@@ -156,5 +167,4 @@ def coning_budget(
             }
             for row in budget.rows()
         ]
-        write_json(json, {"lines": len(lines), "budget": rows})
-        written(json)
+        put_json(json, {"lines": len(lines), "budget": rows})

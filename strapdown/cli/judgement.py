@@ -21,7 +21,7 @@ from strapdown.cli.reading import (
     Topic,
     told,
 )
-from strapdown.cli.terminal import app, console, counted, progress_bar, show, table, writable, written
+from strapdown.cli.terminal import app, console, counted, json_target, progress_bar, put_json, show, table
 
 if TYPE_CHECKING:
     from strapdown.consistency import Judgement
@@ -51,7 +51,7 @@ def check(
             help="TOML with the table named filter that the estimate was made with; if it does not tell itself.",
         ),
     ] = None,
-    json: Annotated[Path | None, typer.Option("--json", help="File for all statistics.")] = None,
+    json: Annotated[Path | None, typer.Option("--json", help="File for all statistics; - for standard output.")] = None,
 ) -> None:
     """Tell whether the filter may be believed: exit status 0 consistent, 1 not, 2 cannot tell (or bad input).
 
@@ -60,11 +60,9 @@ def check(
     from strapdown import consistency, records
     from strapdown.checks import InputError
     from strapdown.consistency.bounds import tail
-    from strapdown.files import write_json
     from strapdown.report import findings
 
-    if json is not None:
-        writable("json", json, suffixes=(".json",), sources=(result, record, filter_file))
+    json_target(json, result, record, filter_file)
     if record is None and filter_file is not None:
         raise InputError("--filter goes with --record: the record is needed to look for causes")
     tail(probability)
@@ -101,9 +99,7 @@ def check(
         console.print(f"Note: {limit}.")
     console.print(words)
     content.update(judgement.summary())
-    if json is not None:
-        write_json(json, content)
-        written(json)
+    put_json(json, content)
     raise typer.Exit(status_of(judgement))
 
 
@@ -221,15 +217,15 @@ def doctor(
     topic: Topic = None,
     axes: Axes = None,
     invert: Invert = None,
-    json: Annotated[Path | None, typer.Option("--json", help="File for the explanations and their scores.")] = None,
+    json: Annotated[
+        Path | None, typer.Option("--json", help="File for the explanations and their scores; - for standard output.")
+    ] = None,
 ) -> None:
     """Tell which conventions a recording follows, by trying the others: exit status 0 as told, 1 wrong, 2 cannot tell."""
     from strapdown import doctor as conventions
     from strapdown import recordings
-    from strapdown.files import write_json
 
-    if json is not None:
-        writable("json", json, suffixes=(".json",), sources=(recording,))
+    json_target(json, recording)
     given = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
     source = recordings.read(
         recording, **told(recording, columns=columns, topic=topic, axes=axes, invert=invert, **given)
@@ -254,7 +250,5 @@ def doctor(
         show(rows)
     for note in found.notes:
         console.print(f"Note: {note}.")
-    if json is not None:
-        write_json(json, found.summary())
-        written(json)
+    put_json(json, found.summary())
     raise typer.Exit({"as told": CONSISTENT, "wrong convention": NOT}.get(found.verdict, CANNOT_TELL))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,8 +25,10 @@ __all__ = [
     "counted",
     "doubt",
     "errors",
+    "json_target",
     "need_own",
     "progress_bar",
+    "put_json",
     "rate_text",
     "scenario_named",
     "show",
@@ -165,6 +168,28 @@ def doubt(source: Recording, path: Path) -> None:
         doubts = (f"as it seems, {found.reason}",)
     for words in doubts:
         console.print(f"warning: {words}. See `strapdown doctor {path}`.")
+
+
+STANDARD_OUTPUT = Path("-")
+
+
+def json_target(json: Path | None, *sources: Path | None) -> None:
+    """Refuse a file for JSON that cannot be written; "-" is standard output, and what else is printed goes to standard error."""
+    if json == STANDARD_OUTPUT:
+        console.stderr = True
+    elif json is not None:
+        writable("json", json, suffixes=(".json",), sources=sources)
+
+
+def put_json(json: Path | None, content: Any) -> None:
+    """Write JSON where it was asked for."""
+    from strapdown.files import json_text, write_json
+
+    if json == STANDARD_OUTPUT:
+        sys.stdout.write(json_text(content))
+    elif json is not None:
+        write_json(json, content)
+        written(json)
 
 
 def written(*paths: Any) -> None:

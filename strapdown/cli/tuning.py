@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from strapdown.records import ImuRecord
     from strapdown.setup import FilterSetup
     from strapdown.tuning import Case, Comparison, Performance, Plan, TunedGate, Tuning, Unmodelled
+    from strapdown.tuning.fitting import Estimated
     from strapdown.tuning.parameters import Unit
 
 
@@ -127,135 +128,60 @@ def tune(
         Path, typer.Option("--out", "-o", help="TOML for --filter of other commands; JSON and figures go beside it.")
     ] = Path("filter.toml"),
 ) -> None:
-    """Tune the filter by maximum likelihood, and tell how sure each parameter is."""
+    """Tune the filter by maximum likelihood, with an interval for each parameter."""
     import os
 
-    from strapdown import coning, tuning
-    from strapdown.checks import InputError, count, non_negative, one_of
-    from strapdown.report import tunings
+    from strapdown import tuning
+    from strapdown.checks import count
     from strapdown.setup import read_setup
 
     workers = count("threads", threads if threads is not None else os.cpu_count() or 1)
     chosen = read_setup(filter_file) if filter_file is not None else None
-    algorithm = None
-    if integration is not None:
-        algorithm = coning.ALGORITHMS[one_of("integration", integration, coning.ALGORITHMS)]
-    names = None if free is None else [name.strip() for name in free.split(",") if name.strip()]
-    if states and chosen is not None:
-        raise InputError("--filter tells the filter's states itself, in [filter.states]; leave --states out")
-    if plan and (states or (chosen is not None and chosen.states is not None)):
-        raise InputError("--plan knows no optional states; leave --states away, and [filter.states] out of the filter")
+    algorithm = _algorithm(integration)
+    names = _names(free)
+    _check_states(chosen, states=states, plan=plan)
     if plan:
         _plan(records, chosen, algorithm, names, length, workers)
         return
-    if length is not None:
-        raise InputError("--length is for --plan; the records' own length is taken")
-    count("seed", seed, least=0)
-    non_negative("spacing", spacing, unit="s")
-    same = [
-        path
-        for k, path in enumerate(records)
-        if path.exists() and any(path.samefile(other) for other in records[:k] if other.exists())
-    ]
-    if same:
-        raise InputError(f"{same[0]} is given twice; a record counts once")
-    sources = (*records, filter_file)
-    writable("out", out, suffixes=(".toml",), sources=sources)
-    writable(
-        "out", out.with_suffix(".json"), *(out.with_name(f"{out.stem}-{name}.png") for name in FIGURES), sources=sources
+    goal = _Goal(
+        truth=truth,
+        rmse=rmse,
+        credibility=credibility,
+        gate=gate or any(name in GATED for name in names or []),
+        spacing=spacing,
     )
-    report = out.with_suffix(".json")
-    for target in (out, report):
-        need_own(target, "tune", lambda _: bool(tunings.read(report)))
+    if length is not None:
+        raise _refusal("--length is for --plan; the records' own length is taken")
+    count("seed", seed, least=0)
+    _check_files(records, filter_file, out)
     units = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
-    cases, believed, gyros = _cases(
+    cases, before, gyros = _cases(
         records, chosen, filter_file, {name: unit for name, unit in units.items() if unit}, states=states
     )
     if algorithm is not None:
-        believed = replace(believed, integration=algorithm)
+        before = replace(before, integration=algorithm)
     train, held = (tuple(cases), ()) if holdout is None else tuning.split(cases, holdout, _by(holdout_by))
-    gate = gate or any(name in GATED for name in names or [])
     wanted = [name for name in names or [] if name not in GATED]
     wanted = wanted or list(tuning.default_names([case.record for case in cases]))
     if chosen is None or any(name.startswith(("gyro.", "filter.")) for name in wanted):
         tuning.one_gyro(gyros)
-    objective: Any
     if prior is None and prior_factor != PRIOR_FACTOR:
-        raise InputError("--prior-factor goes with --prior, the noise that it is about")
+        raise _refusal("--prior-factor goes with --prior, the noise that it is about")
     if names == []:
-        raise InputError(f"--free is {free!r} and names no parameter; name some, or leave it out")
-    if rmse and truth:
-        raise InputError(
-            "--rmse and --truth both tell what of the errors against the truth is tuned by; give one of them"
-        )
-    if rmse and credibility:
-        raise InputError(
-            "--rmse and --credibility ask for different filters: small errors, or believable ones; give one of them"
-        )
-    if spacing > 0.0 and (truth or rmse or credibility):
-        raise InputError(
-            "--spacing thins the innovations of the likelihood; against a truth, or for credibility, there are none to thin: leave it away"
-        )
-    if gate and (truth or rmse or credibility or spacing > 0.0):
-        raise InputError(
-            "--gate needs the likelihood of all innovations: leave --truth, --rmse, --credibility and --spacing away"
-        )
-    if believed.states is not None and (gate or truth or rmse or credibility or spacing > 0.0):
-        raise InputError(
-            "a filter with optional states is tuned by the likelihood of all innovations: leave --gate, --truth, --rmse, --credibility and "
-            "--spacing away"
-        )
-    by_axis = any(tuning.axis_of(name) for name in wanted)
-    if by_axis and (gate or truth or rmse or credibility or spacing > 0.0):
-        raise InputError(
-            "a sigma of one axis is tuned by the likelihood of all innovations: leave --gate, --truth, --rmse, --credibility and --spacing "
-            "away"
-        )
-    if believed.states is not None or by_axis:
-        from strapdown.tuning import extended
-
-        objective = extended.likelihood(train, believed, wanted, threads=workers)
-    elif gate:
-        objective = tuning.contaminated_likelihood(train, believed, wanted)
-    elif credibility:
-        objective = tuning.credibility_objective(train, believed, wanted, truth=truth, threads=workers)
-    elif truth or rmse:
-        objective = tuning.error_objective(
-            train, believed, wanted, measure="rmse" if rmse else "likelihood", threads=workers
-        )
-    else:
-        objective = tuning.likelihood(train, believed, wanted, spacing=spacing)
+        raise _refusal(f"--free is {free!r} and names no parameter; name some, or leave it out")
+    _check_goal(goal, before, wanted)
+    objective = _objective(goal, train, before, wanted, workers)
     priors = {} if prior is None else _priors(prior, prior_factor, train[0].record, wanted)
-    with progress_bar("searches, intervals", starts + len(wanted)) as advance:
-        result = tuning.fit(
-            objective,
-            priors=priors,
-            starts=starts,
-            factor=factor,
-            seed=seed,
-            threads=1 if truth or rmse or credibility or believed.states is not None or by_axis else workers,
-            progress=advance,
-        )
-    if rmse:
-        # The size of the error leaves a common scale open; the innovations tell it.
-        scaled = tuning.fit(tuning.likelihood(train, result.setup, ["filter.scale"]), starts=2, threads=workers)
-        result = tuning.rescaled(result, scaled["filter.scale"].value)
-    found = tuning.tuned_gate(objective, result) if gate else None
-    if found is not None and found.gate is not None:
-        result = replace(result, setup=replace(result.setup, gate=found.gate))
+    search = {"priors": priors, "starts": starts, "factor": factor, "seed": seed}
+    own_threads = goal.by_errors or goal.credibility or _extended(before, wanted)
+    search["threads"] = 1 if own_threads else workers
+    result, found = _fitted(goal, objective, train, search, workers)
     with progress_bar("judging on the data held out"):
-        comparison = tuning.compare(held, believed, result.setup, threads=workers) if held else None
-    if comparison is not None and gate:
+        comparison = tuning.compare(held, before, result.setup, threads=workers) if held else None
+    if comparison is not None and goal.gate:
         likely = tuning.log_likelihood(held, objective, result)
         comparison = replace(comparison, after=replace(comparison.after, log_likelihood=likely))
-    # What is looked for is what optional states are there for, and by filters that take one σ a sample.
-    suspects = train[:MOST_EXAMINED] if believed.states is None and not _differs_by_axis(train, result.setup) else ()
-    examined = []
-    with progress_bar("what is left unexplained", len(suspects)) as advance:
-        for case in suspects:
-            examined.append(tuning.unmodelled(case, result.setup))
-            advance(1)
-    worst = max(examined, key=lambda one: (one.moves_with_the_rate, one.suspected, len(one.failed)), default=None)
+    examined, worst = _examined(train, before, result)
     if worst is not None:
         result = tuning.doubted(result, worst)
     _tell(result, [case.record for case in cases], credible=credibility)
@@ -264,10 +190,162 @@ def tune(
     for sentence in () if worst is None else worst.words:
         console.print(sentence)
     if comparison is not None:
-        _tell_comparison(comparison, truth=bool(truth or rmse or credibility))
-    objective_name = "credibility" if credibility else "rmse" if rmse else "likelihood"
-    of = objective_name + (" of the errors" if truth else "")
-    _write(out, result, objective, comparison, cases, records, of=of, examined=examined, gate=found)
+        _tell_comparison(comparison, truth=goal.by_errors or credibility)
+    _write(out, result, objective, comparison, cases, records, of=goal.name, examined=examined, gate=found)
+
+
+class _Goal(NamedTuple):
+    """What the filter is tuned by; of nothing else by the likelihood of all innovations."""
+
+    truth: bool
+    rmse: bool
+    credibility: bool
+    gate: bool
+    spacing: float
+
+    @property
+    def by_errors(self) -> bool:
+        """Whether the errors against the truth count."""
+        return self.truth or self.rmse
+
+    @property
+    def plain(self) -> bool:
+        """Whether it is the likelihood of all innovations."""
+        return not (self.by_errors or self.credibility or self.gate or self.spacing > 0.0)
+
+    @property
+    def name(self) -> str:
+        """What the result says."""
+        name = "credibility" if self.credibility else "rmse" if self.rmse else "likelihood"
+        return name + (" of the errors" if self.truth else "")
+
+
+def _refusal(words: str) -> Exception:
+    from strapdown.checks import InputError
+
+    return InputError(words)
+
+
+def _algorithm(name: str | None) -> Any:
+    from strapdown import coning
+    from strapdown.checks import one_of
+
+    return None if name is None else coning.ALGORITHMS[one_of("integration", name, coning.ALGORITHMS)]
+
+
+def _names(free: str | None) -> list[str] | None:
+    return None if free is None else [name.strip() for name in free.split(",") if name.strip()]
+
+
+def _check_states(chosen: FilterSetup | None, *, states: bool, plan: bool) -> None:
+    if states and chosen is not None:
+        raise _refusal("--filter holds the filter's states itself, in [filter.states]; leave --states out")
+    if plan and (states or (chosen is not None and chosen.states is not None)):
+        raise _refusal("--plan knows no optional states; leave --states away, and [filter.states] out of the filter")
+
+
+def _check_files(records: Sequence[Path], filter_file: Path | None, out: Path) -> None:
+    """Refuse a record that is given twice, and files that cannot be written or are not this command's."""
+    from strapdown.report import tunings
+
+    for k, path in enumerate(records):
+        if path.exists() and any(path.samefile(other) for other in records[:k] if other.exists()):
+            raise _refusal(f"{path} is given twice; a record counts once")
+    sources = (*records, filter_file)
+    report = out.with_suffix(".json")
+    writable("out", out, suffixes=(".toml",), sources=sources)
+    writable("out", report, *(out.with_name(f"{out.stem}-{name}.png") for name in FIGURES), sources=sources)
+    for target in (out, report):
+        need_own(target, "tune", lambda _: bool(tunings.read(report)))
+
+
+def _check_goal(goal: _Goal, before: FilterSetup, wanted: Sequence[str]) -> None:
+    """Refuse options that contradict each other."""
+    from strapdown import tuning
+    from strapdown.checks import non_negative
+
+    non_negative("spacing", goal.spacing, unit="s")
+    if goal.rmse and goal.truth:
+        raise _refusal("--rmse and --truth both say which errors against the truth count; give one of them")
+    if goal.rmse and goal.credibility:
+        raise _refusal(
+            "--rmse and --credibility ask for different filters: small errors, or believable ones; give one of them"
+        )
+    if goal.spacing > 0.0 and (goal.by_errors or goal.credibility):
+        raise _refusal(
+            "--spacing thins the innovations of the likelihood; against a truth, or for credibility, there are none to thin: leave it away"
+        )
+    if goal.gate and not goal._replace(gate=False).plain:
+        raise _refusal(
+            "--gate needs the likelihood of all innovations: leave --truth, --rmse, --credibility and --spacing away"
+        )
+    what = ""
+    if before.states is not None:
+        what = "a filter with optional states"
+    elif any(tuning.axis_of(name) for name in wanted):
+        what = "a sigma of one axis"
+    if what and not goal.plain:
+        raise _refusal(
+            f"{what} is tuned by the likelihood of all innovations: leave --gate, --truth, --rmse, --credibility and --spacing away"
+        )
+
+
+def _extended(before: FilterSetup, wanted: Sequence[str]) -> bool:
+    """Return whether the filter has optional states, or a parameter is of one axis."""
+    from strapdown import tuning
+
+    return before.states is not None or any(tuning.axis_of(name) for name in wanted)
+
+
+def _objective(goal: _Goal, train: Sequence[Case], before: FilterSetup, wanted: Sequence[str], workers: int) -> Any:
+    """Return what is minimised."""
+    from strapdown import tuning
+    from strapdown.tuning import extended
+
+    if _extended(before, wanted):
+        return extended.likelihood(train, before, wanted, threads=workers)
+    if goal.gate:
+        return tuning.contaminated_likelihood(train, before, wanted)
+    if goal.credibility:
+        return tuning.credibility_objective(train, before, wanted, truth=goal.truth, threads=workers)
+    if goal.by_errors:
+        measure: Any = "rmse" if goal.rmse else "likelihood"
+        return tuning.error_objective(train, before, wanted, measure=measure, threads=workers)
+    return tuning.likelihood(train, before, wanted, spacing=goal.spacing)
+
+
+def _fitted(
+    goal: _Goal, objective: Any, train: Sequence[Case], search: dict[str, Any], workers: int
+) -> tuple[Tuning, TunedGate | None]:
+    """Return the best parameters, and the gate where one is tuned."""
+    from strapdown import tuning
+
+    with progress_bar("searches, intervals", search["starts"] + len(objective.names)) as advance:
+        result = tuning.fit(objective, progress=advance, **search)
+    if goal.rmse:
+        # The size of the error leaves a common scale open; the innovations show it.
+        scaled = tuning.fit(tuning.likelihood(train, result.setup, ["filter.scale"]), starts=2, threads=workers)
+        result = tuning.rescaled(result, scaled["filter.scale"].value)
+    found = tuning.tuned_gate(objective, result) if goal.gate else None
+    if found is not None and found.gate is not None:
+        result = replace(result, setup=replace(result.setup, gate=found.gate))
+    return result, found
+
+
+def _examined(train: Sequence[Case], before: FilterSetup, result: Tuning) -> tuple[list[Unmodelled], Unmodelled | None]:
+    """Return what the tuned filter leaves unexplained of each record, and the worst of it."""
+    from strapdown import tuning
+
+    # Optional states stand for just that; and the search knows one σ a sample.
+    looked = before.states is None and not _differs_by_axis(train, result.setup)
+    suspects = train[:MOST_EXAMINED] if looked else ()
+    examined = []
+    with progress_bar("what is left unexplained", len(suspects)) as advance:
+        for case in suspects:
+            examined.append(tuning.unmodelled(case, result.setup))
+            advance(1)
+    worst = max(examined, key=lambda one: (one.moves_with_the_rate, one.suspected, len(one.failed)), default=None)
+    return examined, worst
 
 
 def _differs_by_axis(cases: Sequence[Case], chosen: FilterSetup) -> bool:
@@ -352,14 +430,21 @@ def _figure(value: float) -> str:
     return f"{value:.3g}" if math.isfinite(value) else "∞"
 
 
+def _note(one: Estimated, unit: Unit) -> str:
+    """Return how well a parameter is known, in the unit that it is printed in."""
+    if one.identified or "prior" in one.note:
+        return one.note
+    if not math.isfinite(one.upper):
+        return "not identified: these records say nothing of it"
+    return f"not identified: at most {_figure(one.upper / unit.factor)} {unit.name} (95 %)"
+
+
 def _tell(result: Tuning, records: Sequence[ImuRecord], *, credible: bool) -> None:
     rows = table("Tuned, with 95 % intervals", "parameter", "unit", "before", "after", "from", "to", "", left=2)
     for one in result.parameters:
         unit = _unit_of(one.name, records)
-        told = [value / unit.factor for value in (one.start, one.value, one.lower, one.upper)]
-        bounded = f"not identified: < {_figure(told[3])} at 95 %" if math.isfinite(one.upper) else "not identified"
-        note = one.note if one.identified or "prior" in one.note else bounded
-        rows.add_row(one.name, unit.name, *(_figure(value) for value in told), note)
+        values = [value / unit.factor for value in (one.start, one.value, one.lower, one.upper)]
+        rows.add_row(one.name, unit.name, *(_figure(value) for value in values), _note(one, unit))
     show(rows)
     gain = result.before - result.after
     console.print(
@@ -368,8 +453,8 @@ def _tell(result: Tuning, records: Sequence[ImuRecord], *, credible: bool) -> No
     )
     if not all(one.identified for one in result.parameters):
         console.print(
-            "What is not identified has only a bound: these records are too short to say more. The filter takes the mean below it; --prior "
-            "holds it to what is known."
+            "Of a parameter that is not identified these records give an upper bound alone; the filter uses the value in the column "
+            "“after”, the mean below that bound. --prior gives it a prior instead."
         )
     if result.misfit and result.parameters[0].name == "filter.scale":
         console.print(
@@ -450,6 +535,7 @@ def _write(
     from strapdown import plots, tuning
     from strapdown.files import write_json, written_beside
     from strapdown.plots import tuning as drawing
+    from strapdown.report import tunings
     from strapdown.setup import to_toml
 
     with written_beside(out) as temporary:
@@ -460,7 +546,10 @@ def _write(
     records = [case.record for case in cases]
     units = [_unit_of(name, records) for name in objective.names]
     own = [_unit_of(one.name, records) for one in result.parameters]
-    write_json(report, _report(result, own, comparison, paths, of, examined, gate))
+    content = _report(result, own, comparison, paths, of, examined, gate)
+    write_json(report, content)
+    answer, reason, _ = tunings.verdict(content)
+    console.print(f"{answer}: {reason}.")
     figures = {
         out.with_name(f"{out.stem}-likelihood.png"): drawing.likelihood_slices(
             tuning.slices(objective, result), result, units
@@ -488,7 +577,12 @@ def _report(
     content: dict[str, Any] = {
         "records": [path.name for path in paths],
         "parameters": [
-            {**{key: number(value) for key, value in vars(one).items()}, "unit": unit.name, "si_per_unit": unit.factor}
+            {
+                **{key: number(value) for key, value in vars(one).items()},
+                "note": _note(one, unit),
+                "unit": unit.name,
+                "si_per_unit": unit.factor,
+            }
             for one, unit in zip(result.parameters, units, strict=True)
         ],
         "units": "SI: rad, s, and the units of whole vectors; pages and tables tell each in its unit, of so much SI",
