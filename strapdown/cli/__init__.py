@@ -1,8 +1,7 @@
 """The command line. Only this package prints; units are degrees, hours and arcseconds here and radians and seconds below.
 
-A result replaces the one of an earlier run of the same name, whole: what that one had more goes too. ``estimate``, ``simulate``,
-``integrate`` and ``tune`` refuse to replace a file that they did not write, and ``montecarlo``, whose result may have taken hours, wants to
-be told.
+A result replaces all of an earlier result of the same name. ``estimate``, ``simulate``, ``integrate`` and ``tune`` refuse to replace a file
+that they did not write; ``montecarlo``, whose result may have taken hours, needs ``--resume`` or ``--overwrite``.
 
 ``terminal``
     What every command shares.
@@ -80,7 +79,7 @@ def _about(
 
 @app.command()
 def info() -> None:
-    """Tell what the kernels run on."""
+    """Show what the kernels run on."""
     import strapdown
     from strapdown.kernels.machine import describe
 

@@ -113,16 +113,16 @@ def montecarlo(
         }
         for name, value in given.items():
             if value is not None:
-                raise InputError(f"{name} is given, but {source} tells its own; leave it out, or name a scenario")
+                raise InputError(f"{name} is given, but {source} holds its own; leave it out, or name a scenario")
         plan, target = held.plan, out or source
         machine = held.machine if machine == "auto" else machine
     writable("out", target, suffixes=_CAMPAIGN_SUFFIXES)
     if resume and overwrite:
         raise InputError("--resume and --overwrite exclude each other: go on with the file, or start it anew")
-    told = target.with_suffix(".json")
-    if replay is None and told.exists() and not target.exists() and not overwrite:
-        raise InputError(f"{told} exists and would be replaced; move it, choose another --out, or give --overwrite")
-    writable("out", told)
+    beside = target.with_suffix(".json")
+    if replay is None and beside.exists() and not target.exists() and not overwrite:
+        raise InputError(f"{beside} exists and would be replaced; move it, choose another --out, or give --overwrite")
+    writable("out", beside)
     if replay is not None:
         writable("out", *_replayed(target, replay))
         _replay(plan, replay, machine, target)
@@ -346,7 +346,7 @@ def _tell(campaign: Campaign) -> int:
     judgement = _judged(campaign)
     console.print(judgement.words)
     if judgement.verdict == "cannot tell":
-        console.print("More runs (--runs, with --resume) would tell.")
+        console.print("More runs (--runs, with --resume) would show it.")
     if judgement.unmodelled and campaign.plan.setup.states is None:
         console.print("--states gives the filter states for most of these errors.")
     return status_of(judgement)
@@ -376,9 +376,9 @@ def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
     again = engine.replay(plan, run, machine=machine)
     truth = again.record.truth
     assert truth is not None
-    # Of a filter that joins samples to steps some machines tell the record at the samples, some at the steps.
+    # Of a filter that joins samples to steps some machines give the record at the samples, some at the steps.
     edges = slice(None, None, (len(again.record.time) - 1) // (len(again.estimate.time) - 1))
-    told = Truth(attitude=truth.attitude[edges], bias=truth.bias[edges])
+    true = Truth(attitude=truth.attitude[edges], bias=truth.bias[edges])
     attributes: dict[str, Any] = {
         "scenario": scenario_to_toml(plan.scenario),
         "seed": plan.seed,
@@ -397,9 +397,9 @@ def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
         run=run,
         attributes={name: attributes[name] for name in ("machine", "dispersions")},
     )
-    write_estimate(paths[1], again.estimate, attributes, truth=told)
+    write_estimate(paths[1], again.estimate, attributes, truth=true)
     estimate = again.estimate
-    error = consistency.errors(estimate.attitude, estimate.bias, told.attitude, told.bias)
+    error = consistency.errors(estimate.attitude, estimate.bias, true.attitude, true.bias)
     assert estimate.covariance is not None
     nees = consistency.nees(error, estimate.covariance)
     step = int(np.argmax(nees))

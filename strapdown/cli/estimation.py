@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -25,10 +25,11 @@ from strapdown.cli.reading import (
 from strapdown.cli.terminal import app, console, doubt, need_own, progress_bar, show, table, writable, written
 
 if TYPE_CHECKING:
+    from strapdown.ahrs import AhrsEstimate, AhrsParameters
     from strapdown.estimation.states import State
     from strapdown.recordfiles import RecordFile
     from strapdown.recordings import Recording
-    from strapdown.records import Estimate, ImuRecord
+    from strapdown.records import Estimate, ImuRecord, Truth
     from strapdown.setup import FilterSetup
 
 FILES = (
@@ -44,20 +45,17 @@ FILES = (
 """What the command may write to its folder."""
 ABOUT_IT = ("estimate.html", "estimate.report.json")
 """What other commands write there about an estimate."""
-RECORDING_ONLY = ("motion", "latency", "calibration")
-"""Options that go with a recording."""
-RECORD_ONLY = ("filter", "states", "state", "attitude", "from_truth", "every")
-"""Options that go with a record of `strapdown simulate`."""
-
 UNEVEN = 2.0
-"""Largest σ of an attitude over the least, above which both are told."""
+"""Ratio of the largest σ of an attitude to the least above which both are printed."""
 
 
 @app.command()
 def estimate(
     recording: Annotated[
         Path,
-        typer.Argument(help=f"{RECORDING_HELP}; or record of `strapdown simulate` (HDF5)."),
+        typer.Argument(
+            help=f"{RECORDING_HELP}; or the HDF5 file of `strapdown simulate`, which holds its specification and its truth too."
+        ),
     ],
     out: Annotated[Path, typer.Option(help="Folder for estimate.h5, errors.json and the figures.")] = Path(
         "estimate-results"
@@ -72,21 +70,21 @@ def estimate(
     gyro: Annotated[
         Path | None,
         typer.Option(
-            help="TOML with a table named gyro, as `strapdown allan` writes it: the filter believes its noise."
+            help="TOML with a table named gyro, as `strapdown allan` writes it: the gyro noise of the filter."
         ),
     ] = None,
     full_covariance: Annotated[
         bool | None,
         typer.Option(
             "--full-covariance/--variances",
-            help="Write whole 6 x 6 covariances, or only their diagonals; a record's estimate has whole ones unless told.",
+            help="Write whole 6 x 6 covariances, or only their diagonals; whole ones by default where there is a specification.",
         ),
     ] = None,
     filter_file: Annotated[
         Path | None,
         typer.Option(
             "--filter",
-            help="Record: TOML with a table named filter, as `strapdown tune` writes it; without it the filter that matches the record.",
+            help="With a specification: TOML with a table named filter, as `strapdown tune` writes it; by default one that matches.",
         ),
     ] = None,
     gate: Annotated[
@@ -94,43 +92,45 @@ def estimate(
         typer.Option(help="Refuse measurements beyond this quantile (0.999) of chi-squared, and recover."),
     ] = None,
     robust: Annotated[
-        str | None, typer.Option(help="Record: weigh measurements by how far they lie off: huber or student.")
+        str | None, typer.Option(help="Weigh measurements by the size of their innovations: huber or student.")
     ] = None,
     states: Annotated[
         bool | None,
         typer.Option(
             "--states/--no-states",
-            help="Record: with or without a state for each error that gyro and sensors are specified with (scale, misalignment, drift, "
-            "hard iron, …). Default: with them, where there are such errors.",
+            help="With a specification: with or without a state for each error in it (scale, misalignment, drift, hard iron, …). By "
+            "default with them, where there are such errors.",
         ),
     ] = None,
     state: Annotated[
         list[str] | None,
-        typer.Option(help="Record: only this one of those states, such as gyro.scale or SENSOR.bias; may be repeated."),
+        typer.Option(
+            help="With a specification: only this one of those states, such as gyro.scale or SENSOR.bias; may be repeated."
+        ),
     ] = None,
     attitude: Annotated[
         str | None,
-        typer.Option(help="Record: initial attitude body to fixed, w,x,y,z; without it from the first measurements."),
+        typer.Option(
+            help="With a specification: initial attitude body to fixed, w,x,y,z; by default from the first measurements."
+        ),
     ] = None,
     from_truth: Annotated[
-        bool, typer.Option("--from-truth", help="Record: start at the truth, off by errors drawn from the filter's σ.")
+        bool, typer.Option("--from-truth", help="With a truth: start there, off by errors drawn from the filter's σ.")
     ] = False,
-    every: Annotated[int, typer.Option(help="Record: keep each so-manieth step of the filter.")] = 1,
+    every: Annotated[int, typer.Option(help="With a specification: store every n-th filter step.")] = 1,
     observability: Annotated[
         bool,
-        typer.Option(
-            "--observability", help="Report what the measurements show of each state, optional ones included."
-        ),
+        typer.Option("--observability", help="Report how observable each state is, optional ones included."),
     ] = False,
     smooth: Annotated[
         bool,
-        typer.Option("--smooth", help="From all samples, those after each time too, by the fixed-interval smoother."),
+        typer.Option("--smooth", help="Use the samples after each time too, by the fixed-interval smoother."),
     ] = False,
     motion: Annotated[
         str | None,
         typer.Option(
-            help="Recording: what moves the unit: hand (if not given), of bounded velocity, with states for the gyro's scale; or any, "
-            "whose acceleration is white noise, without."
+            help="Without a specification: what moves the unit: hand (default), of bounded velocity, with states for the gyro's scale; or "
+            "any, whose acceleration is white noise, without such states."
         ),
     ] = None,
     to: Annotated[
@@ -152,22 +152,25 @@ def estimate(
     latency: Annotated[
         float | None,
         typer.Option(
-            help="Recording: delay of the gyro's samples, ms, that of its low-pass; 0: point samples. If not given, half a sample interval."
+            help="Without a specification: delay of the gyro's samples, ms, that of its low-pass; 0: point samples. By default half a "
+            "sample interval."
         ),
     ] = None,
     calibration: Annotated[
         Path | None,
         typer.Option(
-            help="Recording: calibration.toml of an earlier one of the same unit; that of this one is written too."
+            help="Without a specification: calibration.toml of an earlier recording of the same unit; a new one is written."
         ),
     ] = None,
     figures: Annotated[
         bool, typer.Option("--figures", help="Draw the estimate, its states and errors as PNG.")
     ] = False,
 ) -> None:
-    """Estimate attitude and gyro bias from a recording (accelerometer as vertical, magnetometer as heading) or a simulated record."""
-    from strapdown import unit_calibration
-    from strapdown.checks import InputError
+    """Estimate attitude and gyro bias from a recording.
+
+    The accelerometer gives the vertical and the magnetometer the heading; where the recording holds its specification, as one of `strapdown
+    simulate` does, the filter is matched to that.
+    """
     from strapdown.files import usable_folder
     from strapdown.recordings import is_record
     from strapdown.records import read_attributes
@@ -177,57 +180,91 @@ def estimate(
     need_own(out / FILES[0], "estimate", lambda path: bool(read_attributes(path)["kind"] == "strapdown estimate"))
     units = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
     layout = told(recording, columns=columns, topic=topic, axes=axes, invert=invert, **units)
-    exports = _exports(to or (), recording, euler, frame, changed=bool(axes or invert))
-    if is_record(recording):
-        for name, text in zip(RECORDING_ONLY, (motion, latency, calibration), strict=True):
-            if text is not None:
-                raise InputError(f"--{name} goes with a recording; {recording} is a record of `strapdown simulate`")
-        _estimate_record(
-            recording,
-            out,
-            gyro,
-            filter_file,
-            gate,
-            robust,
-            tuple(state or ()) if states or state else states,
-            attitude,
-            from_truth,
-            every,
-            full_covariance is not False,
-            observability,
-            smooth,
-            exports,
-            figures,
-        )
-        return
-    options = dict(
-        zip(
-            RECORD_ONLY,
-            (
-                filter_file,
-                states,
-                state or None,
-                attitude,
-                from_truth or None,
-                None if every == 1 else every,
-            ),
-            strict=True,
-        )
+    specified = is_record(recording)
+    _check_kind(
+        recording,
+        specified,
+        with_specification={
+            "filter": filter_file,
+            "states": states,
+            "state": state or None,
+            "attitude": attitude,
+            "from-truth": from_truth or None,
+            "every": None if every == 1 else every,
+        },
+        without={"motion": motion, "latency": latency, "calibration": calibration},
     )
-    for name, value in options.items():
-        if value is not None:
-            raise InputError(
-                f"--{name.replace('_', '-')} goes with a record of `strapdown simulate`; {recording} is none"
-            )
-    carried = None if calibration is None else unit_calibration.read(calibration)
-    options_used = {
-        "calibration": carried,
-        "gate": gate,
-        "robust": robust,
-        "full_covariance": bool(full_covariance),
-        "smooth": smooth,
-    }
-    _estimate_recording(recording, out, layout, gyro, motion, latency, observability, figures, exports, options_used)
+    output = _Output(out, _exports(to or (), recording, euler, frame, changed=bool(axes or invert)), figures)
+    shared = _Shared(gyro, gate, robust, full_covariance, observability, smooth)
+    if specified:
+        chosen = tuple(state or ()) if states or state else states
+        _estimate_specified(recording, shared, _Specified(filter_file, chosen, attitude, from_truth, every), output)
+    else:
+        _estimate_recording(recording, shared, _Recorded(layout, motion or "hand", latency, calibration), output)
+
+
+class _Output(NamedTuple):
+    """Where an estimate goes."""
+
+    folder: Path
+    exports: Sequence[tuple[Path, dict[str, Any]]]
+    figures: bool
+
+
+class _Shared(NamedTuple):
+    """Options of every estimate."""
+
+    gyro: Path | None
+    gate: float | None
+    robust: str | None
+    full_covariance: bool | None
+    observability: bool
+    smooth: bool
+
+    @property
+    def robustness(self) -> dict[str, Any]:
+        """The gate and the weights, as far as they are given."""
+        from strapdown.estimation.gating import Gate, Robust
+
+        gate = None if self.gate is None else Gate(probability=self.gate)
+        robust = None if self.robust is None else Robust(kind=self.robust)  # type: ignore[arg-type]
+        return {name: value for name, value in (("gate", gate), ("robust", robust)) if value is not None}
+
+
+class _Specified(NamedTuple):
+    """Options where the recording holds its specification."""
+
+    filter_file: Path | None
+    states: ChosenStates
+    attitude: str | None
+    from_truth: bool
+    every: int
+
+
+class _Recorded(NamedTuple):
+    """Options where it does not."""
+
+    layout: dict[str, Any]
+    motion: str
+    latency: float | None
+    calibration: Path | None
+
+
+def _check_kind(
+    recording: Path, specified: bool, *, with_specification: dict[str, Any], without: dict[str, Any]
+) -> None:
+    """Refuse options that need a specification where there is none, and the other way round."""
+    from strapdown.checks import InputError
+
+    given = [name for name, value in (without if specified else with_specification).items() if value is not None]
+    if given and specified:
+        raise InputError(
+            f"--{given[0]} goes with a recording without a specification; {recording} holds one, of `strapdown simulate`"
+        )
+    if given:
+        raise InputError(
+            f"--{given[0]} goes with a recording that holds its specification, as those of `strapdown simulate`; {recording} does not"
+        )
 
 
 def _exports(
@@ -270,78 +307,101 @@ def _export(
     return [target for target, _ in exports]
 
 
-def _estimate_record(
-    path: Path,
-    out: Path,
-    gyro: Path | None,
-    filter_file: Path | None,
-    gate: float | None,
-    robust: str | None,
-    states: ChosenStates,
-    attitude: str | None,
-    from_truth: bool,
-    every: int,
-    full_covariance: bool,
-    observability: bool,
-    smooth: bool,
-    exports: Sequence[tuple[Path, dict[str, Any]]],
-    figures: bool,
-) -> None:
-    """Run the filter over a record, report and write its estimate."""
-    import numpy as np
-
-    from strapdown import records, setup
+def _estimate_specified(path: Path, shared: _Shared, options: _Specified, output: _Output) -> None:
+    """Run the filter over a recording that holds its specification, report and write its estimate."""
+    from strapdown import setup
     from strapdown.checks import InputError, count
-    from strapdown.estimation.gating import Gate, Robust
-    from strapdown.files import write_json
     from strapdown.recordfiles import read_record_file
-    from strapdown.records import Truth, write_estimate
+    from strapdown.records import Truth
 
-    count("every", every)
-    if smooth and every > 1:
-        raise InputError("--every keeps some steps of the filter, and the smoother gives all; leave one of them out")
-    if gyro is not None and filter_file is not None:
-        raise InputError("--gyro and --filter both tell the filter's belief of the gyro; give one of them")
+    every = count("every", options.every)
+    if shared.smooth and every > 1:
+        raise InputError("--every stores some filter steps, and the smoother gives all; leave one of them out")
+    if shared.gyro is not None and options.filter_file is not None:
+        raise InputError("--gyro and --filter both give the filter's gyro noise; give one of them")
     held = read_record_file(path)
-    chosen, remarks = filter_for(path, held, gyro, filter_file, states, smooth=smooth)
-    if gate is not None:
-        chosen = dataclasses.replace(chosen, gate=Gate(probability=gate))
-    if robust is not None:
-        chosen = dataclasses.replace(chosen, robust=Robust(kind=robust))  # type: ignore[arg-type]
-    believed = setup.believed(held.record, chosen)
-    if every > len(believed.increments):
-        raise InputError(
-            f"every is {every}, more than the {len(believed.increments)} filter steps of the record; only the start would be kept"
-        )
-    with progress_bar("finding the start"):
-        initial, words, first = _initial(believed, held, chosen, attitude, from_truth)
-    used = held.record
-    if first > 0:
-        used = records.cut(used, first * chosen.integration.samples, len(used.increments))
-        believed = records.cut(believed, first, len(believed.increments))
-        if every > len(believed.increments):
-            raise InputError(
-                f"every is {every}, and {len(believed.increments)} filter steps are left from the start on"
-            )
-    with progress_bar("smoothing" if smooth else "filtering"):
-        if smooth:
-            result = setup.smooth(used, chosen, initial, full_covariance=full_covariance)
+    chosen, remarks = filter_for(path, held, shared.gyro, options.filter_file, options.states, smooth=shared.smooth)
+    chosen = dataclasses.replace(chosen, **shared.robustness)
+    start = _start(held, chosen, options)
+    whole = {"full_covariance": shared.full_covariance is not False}
+    with progress_bar("smoothing" if shared.smooth else "filtering"):
+        if shared.smooth:
+            result = setup.smooth(start.record, chosen, start.state, **whole)
         else:
-            result = setup.run(used, chosen, initial, every=every, full_covariance=full_covariance)
+            result = setup.run(start.record, chosen, start.state, every=every, **whole)
     truth = None
-    if believed.truth is not None:
-        truth = Truth(attitude=believed.truth.attitude[::every], bias=believed.truth.bias[::every])
+    if start.modelled.truth is not None:
+        known = start.modelled.truth
+        truth = Truth(attitude=known.attitude[::every], bias=known.bias[::every])
     length = held.record.time[-1] - held.record.time[0]
     console.print(
         f"{path.name}: {len(held.record.increments)} gyro samples over {length:.6g} s, "
-        f"{', '.join(f'{len(s.time)} of {s.sensor}' for s in held.record.vectors) or 'no measurements'}. {words}"
+        f"{', '.join(f'{len(s.time)} of {s.sensor}' for s in held.record.vectors) or 'no measurements'}. {start.words}"
     )
     for remark in remarks:
         console.print(remark)
     _tell(result)
+    paths = _write_specified(path, held, chosen, start, result, truth, shared, output)
+    if output.figures:
+        paths += _drawn(output.folder, result, path.name, truth=truth)
+    written(*paths)
+
+
+class _Start(NamedTuple):
+    """Where the filter starts."""
+
+    record: ImuRecord
+    """From the start on."""
+    modelled: ImuRecord
+    """The same at the filter's steps."""
+    state: State
+    words: str
+
+
+def _start(held: RecordFile, chosen: FilterSetup, options: _Specified) -> _Start:
+    """Return the start; what would leave nothing to store is refused."""
+    from strapdown import records, setup
+    from strapdown.checks import InputError
+
+    modelled = setup.believed(held.record, chosen)
+    if options.every > len(modelled.increments):
+        raise InputError(
+            f"every is {options.every}, more than the {len(modelled.increments)} filter steps of the record; only the start would be kept"
+        )
+    with progress_bar("finding the start"):
+        state, words, first = _initial(modelled, held, chosen, options.attitude, options.from_truth)
+    used = held.record
+    if first > 0:
+        used = records.cut(used, first * chosen.integration.samples, len(used.increments))
+        modelled = records.cut(modelled, first, len(modelled.increments))
+        if options.every > len(modelled.increments):
+            raise InputError(
+                f"every is {options.every}, and {len(modelled.increments)} filter steps are left from the start on"
+            )
+    return _Start(used, modelled, state, words)
+
+
+def _write_specified(
+    path: Path,
+    held: RecordFile,
+    chosen: FilterSetup,
+    start: _Start,
+    result: Estimate,
+    truth: Truth | None,
+    shared: _Shared,
+    output: _Output,
+) -> list[Path]:
+    """Write the estimate and what is known of it, and print its errors; return the files."""
+    import numpy as np
+
+    from strapdown import setup
+    from strapdown.files import write_json
+    from strapdown.records import write_estimate
+
+    out = output.folder
     paths = [out / "estimate.h5"]
-    attributes: dict[str, Any] = {"source": str(path), "filter": setup.to_toml(chosen), "start": words}
-    attributes["smoothed"] = smooth
+    attributes: dict[str, Any] = {"source": str(path), "filter": setup.to_toml(chosen), "start": start.words}
+    attributes["smoothed"] = shared.smooth
     if held.scenario:
         attributes["scenario"] = held.scenario
     attributes |= {name: value for name, value in (("seed", held.seed), ("run", held.run)) if value is not None}
@@ -349,32 +409,42 @@ def _estimate_record(
     write_estimate(paths[0], result, attributes, truth=truth)
     if result.error_states:
         paths.append(out / "states.json")
-        write_json(paths[-1], {"source": str(path), **_tell_states(result, used)})
-    if observability:
-        with progress_bar("observability"):
-            shown = setup.observability(used, chosen, initial)
-        console.print(str(shown))
-        paths.append(out / "observability.json")
-        write_json(paths[-1], {"source": str(path), **shown.summary()})
+        write_json(paths[-1], {"source": str(path), **_tell_states(result, start.record)})
+    if shared.observability:
+        paths.append(_observability(out, str(path), start.record, chosen, start.state))
     if truth is not None:
         paths.append(out / "errors.json")
         found = _errors(result, truth)
         write_json(paths[-1], {"source": str(path), **found})
-        line = (
-            f"Second half: attitude error RMS {found['attitude_rms_deg']:.4g}° (σ {found['attitude_sigma_deg']:.4g}°), bias error RMS "
-            f"{found['bias_rms_deg_per_h']:.4g} °/h (σ {found['bias_sigma_deg_per_h']:.4g} °/h)"
-        )
-        if "nees_per_state" in found:
-            line += f"; mean NEES per state {found['nees_per_state']:.3g} (right: about 1)"
-        console.print(line + ".")
-    paths += _export(exports, result, None)
+        console.print(_errors_words(found))
+    paths += _export(output.exports, result, None)
     seen = {s: i for s, i in result.innovations.items() if np.sum(i.used)}
     if seen:
         each = ", ".join(f"{np.mean(i.nis[i.used]) / i.innovation.shape[1]:.3g} {s}" for s, i in seen.items())
         console.print(f"Mean NIS per degree of freedom (right: 1): {each}. `strapdown check {paths[0]}` judges them.")
-    if figures:
-        paths += _drawn(out, result, path.name, truth=truth)
-    written(*paths)
+    return paths
+
+
+def _observability(out: Path, source: str, record: ImuRecord, chosen: FilterSetup, initial: State) -> Path:
+    """Print and write how observable each state is; return the file."""
+    from strapdown import setup
+    from strapdown.files import write_json
+
+    with progress_bar("observability"):
+        shown = setup.observability(record, chosen, initial)
+    console.print(str(shown))
+    write_json(out / "observability.json", {"source": source, **shown.summary()})
+    return out / "observability.json"
+
+
+def _errors_words(found: dict[str, float]) -> str:
+    line = (
+        f"Second half: attitude error RMS {found['attitude_rms_deg']:.4g}° (σ {found['attitude_sigma_deg']:.4g}°), bias error RMS "
+        f"{found['bias_rms_deg_per_h']:.4g} °/h (σ {found['bias_sigma_deg_per_h']:.4g} °/h)"
+    )
+    if "nees_per_state" in found:
+        line += f"; mean NEES per state {found['nees_per_state']:.3g} (right: about 1)"
+    return line + "."
 
 
 def _drawn(
@@ -446,7 +516,7 @@ def _initial(
     from strapdown.wahba import InconsistentError
 
     if attitude is not None and from_truth:
-        raise InputError("--attitude and --from-truth both tell the start; give one of them")
+        raise InputError("--attitude and --from-truth both give the start; give one of them")
     if attitude is not None:
         try:
             q = np.array([float(part) for part in attitude.split(",")])
@@ -467,7 +537,7 @@ def _initial(
         state = estimation.first_state(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
     except InconsistentError as error:
         problem = str(error).removesuffix("; give the initial attitude")
-        # A sensor's own errors may be among the states, and then the filter can tell who is right.
+        # A sensor's own errors may be among the states, and then the filter can find out which is right.
         if chosen.states is None:
             raise InputError(
                 f"{problem}; if a sensor has a bias, give the filter its state (--states); or give --attitude, or --from-truth"
@@ -569,50 +639,70 @@ def _errors(result: Estimate, truth: Any) -> dict[str, float]:
     return found
 
 
-def _estimate_recording(
-    recording: Path,
-    out: Path,
-    layout: dict[str, Any],
-    gyro: Path | None,
-    motion: str | None,
-    latency: float | None,
-    observability: bool,
-    figures: bool,
-    exports: Sequence[tuple[Path, dict[str, Any]]],
-    options: dict[str, Any],
-) -> None:
+def _estimate_recording(recording: Path, shared: _Shared, options: _Recorded, output: _Output) -> None:
     """Run the filter over a recording: accelerometer as the vertical, magnetometer as the heading."""
-    from strapdown import ahrs, recordings, setup, unit_calibration
+    from strapdown import ahrs, recordings, unit_calibration
     from strapdown.checks import non_negative, one_of
     from strapdown.consistency import reference_errors
-    from strapdown.estimation.gating import Gate, Robust
-    from strapdown.files import write_json
     from strapdown.gyro import process_noise, read_spec
-    from strapdown.records import write_estimate
-    from strapdown.units import DEGREE
 
-    moved_by = one_of("--motion", motion or "hand", ahrs.MOTIONS)
-    late = None if latency is None else 1e-3 * non_negative("--latency", latency, unit="ms")
-    if options["gate"] is not None:
-        options["gate"] = Gate(probability=options["gate"])
-    if options["robust"] is not None:
-        options["robust"] = Robust(kind=options["robust"])
+    one_of("--motion", options.motion, ahrs.MOTIONS)
+    late = None if options.latency is None else 1e-3 * non_negative("--latency", options.latency, unit="ms")
+    robustness = shared.robustness
+    carried = None if options.calibration is None else unit_calibration.read(options.calibration)
     with progress_bar("reading"):
-        source = recordings.read(recording, **layout)
+        source = recordings.read(recording, **options.layout)
     doubt(source, recording)
-    parameters = ahrs.MOTIONS[moved_by]
-    if gyro is not None:
-        parameters = replace(parameters, **process_noise(read_spec(gyro)))
-    with progress_bar("smoothing" if options["smooth"] else "filtering"):
-        result = ahrs.estimate(source, parameters, latency=late, **options)
-    used, found = result.recording, result.estimate
-    errors = None if used.true_attitude is None else reference_errors(found.attitude, used.true_attitude)
-    rms = None if errors is None else {name: value / DEGREE for name, value in errors.rms(used.movement).items()}
-    frame = (
+    parameters = ahrs.MOTIONS[options.motion]
+    if shared.gyro is not None:
+        parameters = replace(parameters, **process_noise(read_spec(shared.gyro)))
+    with progress_bar("smoothing" if shared.smooth else "filtering"):
+        result = ahrs.estimate(
+            source,
+            parameters,
+            latency=late,
+            calibration=carried,
+            full_covariance=bool(shared.full_covariance),
+            smooth=shared.smooth,
+            **robustness,
+        )
+    used = result.recording
+    errors = None if used.true_attitude is None else reference_errors(result.estimate.attitude, used.true_attitude)
+    chosen = replace(parameters.setup, **robustness)
+    paths = _write_recording(result, parameters, chosen, shared, options, output)
+    _say_recording(result, parameters, options)
+    if shared.observability:
+        paths.append(_observability(output.folder, used.source, result.record, parameters.setup, result.initial))
+    if errors is not None:
+        paths.append(_rms(output.folder, used, errors))
+    paths += _export(output.exports, result.estimate, source)
+    if output.figures:
+        paths += _drawn(output.folder, result.estimate, used.source, used=used, errors=errors)
+    written(*paths)
+
+
+def _fixed_frame(used: Recording) -> str:
+    return (
         "East-North-Up, magnetic North"
         if used.magnetic_field is not None
         else "z up, heading arbitrary (no magnetometer)"
     )
+
+
+def _write_recording(
+    result: AhrsEstimate,
+    parameters: AhrsParameters,
+    chosen: FilterSetup,
+    shared: _Shared,
+    options: _Recorded,
+    output: _Output,
+) -> list[Path]:
+    """Write the estimate, its states and the calibration; return the files."""
+    from strapdown import setup, unit_calibration
+    from strapdown.files import write_json
+    from strapdown.records import write_estimate
+
+    used, found, out = result.recording, result.estimate, output.folder
     paths = [out / "estimate.h5"]
     _clear(out)
     write_estimate(
@@ -620,10 +710,10 @@ def _estimate_recording(
         found,
         {
             "source": used.source,
-            "fixed_frame": frame,
-            "motion": moved_by,
-            "smoothed": options["smooth"],
-            "filter": setup.to_toml(replace(parameters.setup, gate=options["gate"], robust=options["robust"])),
+            "fixed_frame": _fixed_frame(used),
+            "motion": options.motion,
+            "smoothed": shared.smooth,
+            "filter": setup.to_toml(chosen),
             **{f"parameter.{name}": value for name, value in vars(parameters).items()},
             "latency": result.delays.last_gyro,
             "magnetometer_latency": result.delays.last_field,
@@ -632,19 +722,27 @@ def _estimate_recording(
     if found.error_states:
         paths.append(out / "states.json")
         write_json(paths[-1], {"source": used.source, **_states(found)})
+    if result.calibration is not None:
+        paths.append(out / "calibration.toml")
+        paths[-1].write_text(unit_calibration.to_toml(result.calibration), encoding="utf-8")
+    return paths
+
+
+def _say_recording(result: AhrsEstimate, parameters: AhrsParameters, options: _Recorded) -> None:
+    """Print what was read, how the filter started, and what of the samples is not as it should be."""
+    from strapdown import recordings
+
+    used, found = result.recording, result.estimate
     console.print(
         f"{used.source}: {len(used.time)} samples over {used.time[-1] - used.time[0]:.1f} s, started in "
         f"{'the quiet second' if _rested(parameters, result) else 'its quietest second, which is not at rest,'} from {used.time[0]:.2f} s."
     )
     for remark in used.remarks:
         console.print(remark)
-    console.print(f"Fixed frame: {frame}.")
-    console.print(_model(moved_by, parameters, result))
+    console.print(f"Fixed frame: {_fixed_frame(used)}.")
+    console.print(_model(options.motion, parameters, result))
     for sentence in (*result.delays.words, *(f"{one}." for one in result.faults.words)):
         console.print(sentence)
-    if result.calibration is not None:
-        paths.append(out / "calibration.toml")
-        paths[-1].write_text(unit_calibration.to_toml(result.calibration), encoding="utf-8")
     for begin, length in recordings.gaps(used.time):
         console.print(f"Gap of {length:.3g} s after {begin:.3f} s.")
     if used.left_out_words:
@@ -653,32 +751,31 @@ def _estimate_recording(
         if number:
             console.print(f"{number} samples of the {sensor} are missing and were skipped.")
     _tell(replace(found, skipped={}))
-    if observability:
-        with progress_bar("observability"):
-            shown = setup.observability(result.record, parameters.setup, result.initial)
-        console.print(str(shown))
-        paths.append(out / "observability.json")
-        write_json(paths[-1], {"source": used.source, **shown.summary()})
-    if rms is not None:
-        paths.append(out / "errors.json")
-        write_json(paths[-1], {"source": used.source, **{f"{name}_rmse_deg": value for name, value in rms.items()}})
-        rows = table("RMS error over the movement phase, degrees", *rms, left=0)
-        rows.add_row(*(f"{value:.2f}" for value in rms.values()))
-        show(rows)
-    paths += _export(exports, found, source)
-    if figures:
-        paths += _drawn(out, found, used.source, used=used, errors=errors)
-    written(*paths)
 
 
-def _rested(parameters: Any, result: Any) -> bool:
+def _rms(out: Path, used: Recording, errors: Any) -> Path:
+    """Print and write the RMS errors against the reference; return the file."""
+    from strapdown.files import write_json
+    from strapdown.units import DEGREE
+
+    rms = {name: value / DEGREE for name, value in errors.rms(used.movement).items()}
+    write_json(
+        out / "errors.json", {"source": used.source, **{f"{name}_rmse_deg": value for name, value in rms.items()}}
+    )
+    rows = table("RMS error over the movement phase, degrees", *rms, left=0)
+    rows.add_row(*(f"{value:.2f}" for value in rms.values()))
+    show(rows)
+    return out / "errors.json"
+
+
+def _rested(parameters: AhrsParameters, result: AhrsEstimate) -> bool:
     """Return whether the start showed the gyro bias, where the filter takes it from there."""
     if parameters.rest_bias_sigma == 0.0:
         return True
     return bool(result.initial.covariance[3, 3] <= (0.5 * parameters.bias_sigma) ** 2)
 
 
-def _model(moved_by: str, parameters: Any, result: Any) -> str:
+def _model(moved_by: str, parameters: AhrsParameters, result: AhrsEstimate) -> str:
     """Return in words the model of a recording's motion, and the bias that the filter started from."""
     import numpy as np
 

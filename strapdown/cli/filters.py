@@ -1,4 +1,4 @@
-"""The filter that a command runs on a record: of a file, or matched to what the record tells."""
+"""The filter that a command runs on a record: of a file, or matched to what the record specifies."""
 
 from __future__ import annotations
 

@@ -136,7 +136,7 @@ def coning_budget(
         Path | None, typer.Option(help="Write the table as JSON too, to this file; - for standard output.")
     ] = None,
 ) -> None:
-    """Tell the drift that an angular vibration spectrum leaves, for each algorithm and sample rate."""
+    """Predict the drift that an angular vibration spectrum leaves, for each algorithm and sample rate."""
     from strapdown import coning
     from strapdown.checks import InputError
     from strapdown.units import DEGREE, DEGREE_PER_HOUR

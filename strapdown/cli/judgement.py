@@ -1,4 +1,4 @@
-"""Verdicts: whether a filter may be believed, and which conventions a recording follows."""
+"""Verdicts: whether a filter is consistent, and which conventions a recording follows."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def check(
         Path, typer.Argument(help="estimate.h5 of `strapdown estimate`, or the HDF5 file of `strapdown montecarlo`.")
     ],
     probability: Annotated[
-        float, typer.Option(help="A right filter is not called wrong with at least this, all tests together.")
+        float, typer.Option(help="Probability that a right filter passes all tests together, at least.")
     ] = 0.99,
     record: Annotated[
         Path | None, typer.Option(help="Record that an estimate was made from: with it, likely causes are named.")
@@ -48,14 +48,14 @@ def check(
         Path | None,
         typer.Option(
             "--filter",
-            help="TOML with the table named filter that the estimate was made with; if it does not tell itself.",
+            help="TOML with the table named filter that the estimate was made with; by default that in the estimate.",
         ),
     ] = None,
     json: Annotated[Path | None, typer.Option("--json", help="File for all statistics; - for standard output.")] = None,
 ) -> None:
-    """Tell whether the filter may be believed: exit status 0 consistent, 1 not, 2 cannot tell (or bad input).
+    """Judge whether a filter is consistent: exit status 0 consistent, 1 not, 2 cannot tell (or bad input).
 
-    With --record the verdict takes the statistics and the causes that were looked for together.
+    With --record likely causes are looked for, and are part of the verdict.
     """
     from strapdown import consistency, records
     from strapdown.checks import InputError
@@ -180,10 +180,10 @@ def _filter_of(result: Path, filter_file: Path | None) -> FilterSetup:
 
     if filter_file is not None:
         return setup.read_setup(filter_file)
-    told = records.read_attributes(result).get("filter")
-    if told is None:
-        raise InputError(f"{result} does not tell its filter; give --filter, a TOML file with the table [filter]")
-    return setup.from_toml(str(told), f"{result}: filter")
+    text = records.read_attributes(result).get("filter")
+    if text is None:
+        raise InputError(f"{result} does not hold its filter; give --filter, a TOML file with the table [filter]")
+    return setup.from_toml(str(text), f"{result}: filter")
 
 
 def _need_same(result: Path, estimate: Estimate, path: Path, record: ImuRecord) -> None:
@@ -201,7 +201,7 @@ def _need_same(result: Path, estimate: Estimate, path: Path, record: ImuRecord) 
 def _not_of_the_search(chosen: FilterSetup, estimate: Estimate) -> str:
     """Say what a filter did that the search for causes does not; empty if there is nothing."""
     if chosen.robust is not None:
-        return "The filter weighs measurements by how far they lie off, and the search for causes does not"
+        return "The filter weighs measurements by their innovations, and the search for causes does not"
     if any(event.kind == "recovery" for event in estimate.events):
         return "The filter recovered from a lost attitude, and the search for causes does not"
     return ""
@@ -221,7 +221,7 @@ def doctor(
         Path | None, typer.Option("--json", help="File for the explanations and their scores; - for standard output.")
     ] = None,
 ) -> None:
-    """Tell which conventions a recording follows, by trying the others: exit status 0 as told, 1 wrong, 2 cannot tell."""
+    """Find the conventions that a recording follows, by trying the others: exit status 0 as declared, 1 wrong, 2 cannot tell."""
     from strapdown import doctor as conventions
     from strapdown import recordings
 

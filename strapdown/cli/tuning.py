@@ -31,7 +31,7 @@ PRIOR_FACTOR = 3.0
 MOST_EXAMINED = 4
 """Records that are looked at for what the tuned filter leaves unexplained."""
 WORSE = 1.05
-"""An attitude error on the data held out that has grown by more than this is told."""
+"""An attitude error on the data held out that has grown by more than this is reported."""
 
 
 @app.command()
@@ -53,14 +53,14 @@ def tune(
     ] = None,
     filter_file: Annotated[
         Path | None,
-        typer.Option("--filter", help="TOML with a table named filter to start from; else what the records tell."),
+        typer.Option(
+            "--filter", help="TOML with a table named filter to start from; by default one that matches the records."
+        ),
     ] = None,
     integration: Annotated[
         str | None, typer.Option(help="Integration algorithm (`strapdown algorithms`); the filter's if not given.")
     ] = None,
-    truth: Annotated[
-        bool, typer.Option("--truth", help="Tune by the errors against the truth, and how well the filter knows them.")
-    ] = False,
+    truth: Annotated[bool, typer.Option("--truth", help="Tune by the errors against the truth and their σ.")] = False,
     rmse: Annotated[
         bool,
         typer.Option(
@@ -71,7 +71,7 @@ def tune(
         bool,
         typer.Option(
             "--credibility",
-            help="Tune until the filter may be believed: the whole distribution of NIS, and whiteness; with --truth that of NEES.",
+            help="Tune for consistency: the whole distribution of NIS, and whiteness; with --truth that of NEES.",
         ),
     ] = False,
     gate: Annotated[
@@ -113,7 +113,8 @@ def tune(
     seed: Annotated[int, typer.Option(help="Of the random starts.")] = 0,
     threads: Annotated[int | None, typer.Option(help="Threads; one a core if not given.")] = None,
     plan: Annotated[
-        bool, typer.Option("--plan", help="Tell how well records will tell each parameter, before there are any.")
+        bool,
+        typer.Option("--plan", help="Predict how well records will determine each parameter, before there are any."),
     ] = False,
     length: Annotated[
         str | None,
@@ -269,7 +270,7 @@ def _check_goal(goal: _Goal, before: FilterSetup, wanted: Sequence[str]) -> None
         raise _refusal("--rmse and --truth both say which errors against the truth count; give one of them")
     if goal.rmse and goal.credibility:
         raise _refusal(
-            "--rmse and --credibility ask for different filters: small errors, or believable ones; give one of them"
+            "--rmse and --credibility ask for different filters: small errors, or consistent ones; give one of them"
         )
     if goal.spacing > 0.0 and (goal.by_errors or goal.credibility):
         raise _refusal(
@@ -349,7 +350,7 @@ def _examined(train: Sequence[Case], before: FilterSetup, result: Tuning) -> tup
 
 
 def _differs_by_axis(cases: Sequence[Case], chosen: FilterSetup) -> bool:
-    """Return whether the filter believes a noise of a direction or whole vector that differs by axis."""
+    """Return whether the filter has a noise of a direction or whole vector that differs by axis."""
     series = [one for case in cases for one in case.record.vectors]
     return any(
         one.anisotropic or (one.kind != "attitude" and isinstance(chosen.sigma.get(one.sensor), tuple))
@@ -371,7 +372,7 @@ def _cases(
     *,
     states: bool,
 ) -> tuple[list[Case], FilterSetup, dict[str, GyroSpec]]:
-    """Return the records to tune on, the filter to start from, and the gyros of the records that tell theirs."""
+    """Return the records to tune on, the filter to start from, and the gyros of the records that hold theirs."""
     from strapdown import recordfiles, recordings, tuning
     from strapdown.checks import InputError
     from strapdown.cli.filters import filter_for, need_angles
@@ -384,7 +385,7 @@ def _cases(
             if chosen is None:
                 if file.gyro is None:
                     raise InputError(
-                        f"{path} does not tell its gyro; give a filter to start from, --filter filter.toml"
+                        f"{path} does not hold its gyro's specification; give a filter to start from, --filter filter.toml"
                     )
                 chosen, remarks = filter_for(path, file, None, None, () if states else False)
                 for remark in remarks:
@@ -481,7 +482,7 @@ def _tell_gate(found: TunedGate) -> None:
 
 
 def _anees(one: Performance) -> str:
-    """Return the ANEES as a table tells it: of attitude and bias, or where only the attitude is known of that."""
+    """Return the ANEES as a table shows it: of attitude and bias, or where only the attitude is known of that."""
     import numpy as np
 
     if math.isfinite(one.anees):
@@ -498,7 +499,7 @@ def _tell_comparison(comparison: Comparison, *, truth: bool) -> None:
     )
     for name, one in (("before", comparison.before), ("after", comparison.after)):
         verdicts = [judgement.verdict for judgement in one.judgements]
-        told = (
+        answer = (
             verdicts[0] if len(set(verdicts)) == 1 else f"{verdicts.count('consistent')} of {len(verdicts)} consistent"
         )
         listing.add_row(
@@ -508,7 +509,7 @@ def _tell_comparison(comparison: Comparison, *, truth: bool) -> None:
             f"{one.nis_bounds[0]:.3f} to {one.nis_bounds[1]:.3f}",
             _anees(one),
             _figure(one.attitude_rms / DEGREE) if math.isfinite(one.attitude_rms) else "-",
-            told,
+            answer,
         )
     show(listing)
     console.print(f"{tunings.BOUNDS}.")
@@ -585,7 +586,7 @@ def _report(
             }
             for one, unit in zip(result.parameters, units, strict=True)
         ],
-        "units": "SI: rad, s, and the units of whole vectors; pages and tables tell each in its unit, of so much SI",
+        "units": "SI: rad, s, and the units of whole vectors; pages and tables give each in its unit, si_per_unit of it",
         "objective": {"name": of, "before": result.before, "after": result.after},
         "searches": {"number": len(result.starts), "at_the_best_point": result.agreeing},
         "innovations_fit": not result.misfit,
@@ -633,20 +634,22 @@ def _plan(
         file = recordfiles.read_record_file(path)
         source, example = file.record, file.record
         if chosen is None and file.gyro is None:
-            raise InputError(f"{path} does not tell its gyro; give the filter to plan with, --filter filter.toml")
-        believed = chosen or setup.matched_to_record(file.gyro, file.record)  # type: ignore[arg-type]
+            raise InputError(
+                f"{path} does not hold its gyro's specification; give the filter to plan with, --filter filter.toml"
+            )
+        modelled = chosen or setup.matched_to_record(file.gyro, file.record)  # type: ignore[arg-type]
         whole = float(file.record.time[-1] - file.record.time[0])
     else:
         source = scenarios.load_scenario(path)
-        believed = chosen or setup.matched(source)
+        modelled = chosen or setup.matched(source)
         example = scenarios.simulate(source)
         whole = source.duration
     if algorithm is not None:
-        believed = replace(believed, integration=algorithm)
+        modelled = replace(modelled, integration=algorithm)
     lengths = [whole] if length is None else _numbers(length)
     wanted = names or list(tuning.default_names([example]))
     with progress_bar("simulated records", 4) as advance:
-        found = tuning.plan(source, believed, wanted, lengths=lengths, threads=threads, progress=advance)
+        found = tuning.plan(source, modelled, wanted, lengths=lengths, threads=threads, progress=advance)
     _tell_plan(found, [example])
 
 
