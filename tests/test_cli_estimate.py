@@ -275,7 +275,8 @@ def test_the_verdict_names_what_the_filter_has_no_state_for(run, spinning, tmp_p
     page = report.write(tmp_path / "out" / "estimate.h5").page.read_text(encoding="utf-8")
     assert no_state.replace("'", "&#x27;") in page[: page.index("Key numbers")]  # in the headline
     attributes = {"scenario": scenarios.scenario_to_toml(scenario), "filter": "{}"}  # of another version
-    judged = findings.judged(tmp_path / "out" / "estimate.h5", attributes, 0.99)
+    path = tmp_path / "out" / "estimate.h5"
+    judged = findings.judged(path, attributes, read_estimate(path), None, probability=0.99)
     assert judged.unmodelled == ()
 
 
@@ -528,7 +529,7 @@ def test_a_recording_that_is_not_what_it_says_is_doubted(run, recording, tmp_pat
     recording.write_text(recording.read_text().replace("[rad/s]", "[deg/s]").replace("[m/s2]", "[g]"))
     status, said, error = run("estimate", recording, "--out", tmp_path / "out")
     assert (status, error) == (0, "")
-    words = "warning: as it seems, gyro rates are 57.3 times too small (rad/s taken for deg/s); specific force is 9.81"
+    words = "warning: as it seems, gyro rates are 57.3 times too small (rad/s taken for deg/s: --gyro-unit rad/s); specific force is 9.81"
     assert words in said
     assert words in run("tune", recording, "--free", "")[1]  # which then ends for want of a parameter
     assert f"See `strapdown doctor {recording}`." in said

@@ -645,6 +645,7 @@ def _estimate_recording(recording: Path, shared: _Shared, options: _Recorded, ou
     from strapdown.checks import non_negative, one_of
     from strapdown.consistency import reference_errors
     from strapdown.gyro import process_noise, read_spec
+    from strapdown.units import DEGREE
 
     one_of("--motion", options.motion, ahrs.MOTIONS)
     late = None if options.latency is None else 1e-3 * non_negative("--latency", options.latency, unit="ms")
@@ -668,13 +669,14 @@ def _estimate_recording(recording: Path, shared: _Shared, options: _Recorded, ou
         )
     used = result.recording
     errors = None if used.true_attitude is None else reference_errors(result.estimate.attitude, used.true_attitude)
+    rms = None if errors is None else {name: value / DEGREE for name, value in errors.rms(used.movement).items()}
     chosen = replace(parameters.setup, **robustness)
     paths = _write_recording(result, parameters, chosen, shared, options, output)
     _say_recording(result, parameters, options)
     if shared.observability:
         paths.append(_observability(output.folder, used.source, result.record, parameters.setup, result.initial))
-    if errors is not None:
-        paths.append(_rms(output.folder, used, errors))
+    if rms is not None:
+        paths.append(_rms(output.folder, used.source, rms))
     paths += _export(output.exports, result.estimate, source)
     if output.figures:
         paths += _drawn(output.folder, result.estimate, used.source, used=used, errors=errors)
@@ -753,15 +755,11 @@ def _say_recording(result: AhrsEstimate, parameters: AhrsParameters, options: _R
     _tell(replace(found, skipped={}))
 
 
-def _rms(out: Path, used: Recording, errors: Any) -> Path:
-    """Print and write the RMS errors against the reference; return the file."""
+def _rms(out: Path, source: str, rms: dict[str, float]) -> Path:
+    """Print and write the RMS errors against the reference, degrees; return the file."""
     from strapdown.files import write_json
-    from strapdown.units import DEGREE
 
-    rms = {name: value / DEGREE for name, value in errors.rms(used.movement).items()}
-    write_json(
-        out / "errors.json", {"source": used.source, **{f"{name}_rmse_deg": value for name, value in rms.items()}}
-    )
+    write_json(out / "errors.json", {"source": source, **{f"{name}_rmse_deg": value for name, value in rms.items()}})
     rows = table("RMS error over the movement phase, degrees", *rms, left=0)
     rows.add_row(*(f"{value:.2f}" for value in rms.values()))
     show(rows)

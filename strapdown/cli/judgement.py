@@ -86,7 +86,7 @@ def check(
             f"{sum(len(one.time) for one in estimate.innovations.values())} measurements, "
             f"{'no truth' if truth is None else 'with its truth'}."
         )
-        judgement = findings.judged(result, records.read_attributes(result), probability)
+        judgement = findings.judged(result, records.read_attributes(result), estimate, truth, probability=probability)
     else:
         raise InputError(f"{result} is a {kind}; pass what `strapdown estimate` or `strapdown montecarlo` wrote")
     _show_statistics(judgement)

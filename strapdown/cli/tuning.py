@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
+from strapdown.cli.reading import Axes, Invert, told
 from strapdown.cli.terminal import app, console, doubt, need_own, progress_bar, show, table, writable, written
 
 if TYPE_CHECKING:
@@ -125,6 +126,8 @@ def tune(
         str | None, typer.Option(help="Unit of a CSV file's accelerometer: m/s2 or g.")
     ] = None,
     time_unit: Annotated[str | None, typer.Option(help="Unit of a CSV file's time: s, ms, us or ns.")] = None,
+    axes: Axes = None,
+    invert: Invert = None,
     out: Annotated[
         Path, typer.Option("--out", "-o", help="TOML for --filter of other commands; JSON and figures go beside it.")
     ] = Path("filter.toml"),
@@ -155,10 +158,8 @@ def tune(
         raise _refusal("--length is for --plan; the records' own length is taken")
     count("seed", seed, least=0)
     _check_files(records, filter_file, out)
-    units = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
-    cases, before, gyros = _cases(
-        records, chosen, filter_file, {name: unit for name, unit in units.items() if unit}, states=states
-    )
+    layout = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit, "axes": axes, "invert": invert}
+    cases, before, gyros = _cases(records, chosen, filter_file, layout, states=states)
     if algorithm is not None:
         before = replace(before, integration=algorithm)
     train, held = (tuple(cases), ()) if holdout is None else tuning.split(cases, holdout, _by(holdout_by))
@@ -368,7 +369,7 @@ def _cases(
     paths: Sequence[Path],
     chosen: FilterSetup | None,
     filter_file: Path | None,
-    units: dict[str, str],
+    layout: dict[str, Any],
     *,
     states: bool,
 ) -> tuple[list[Case], FilterSetup, dict[str, GyroSpec]]:
@@ -398,7 +399,7 @@ def _cases(
         else:
             if states:
                 raise InputError(f"{path} is a recording, which specifies no errors; --states is for simulated records")
-            recording = recordings.read(path, units=units)
+            recording = recordings.read(path, **told(path, **layout))
             chosen = chosen or tuning.recording_setup()
             if recording.left_out_words:
                 console.print(recording.left_out_words)

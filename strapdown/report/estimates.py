@@ -23,7 +23,7 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
     attributes = records.read_attributes(path)
     estimate = records.read_estimate(path)
     truth = records.read_truth(path)
-    judgement = findings.judged(path, attributes, probability)
+    judgement = findings.judged(path, attributes, estimate, truth, probability=probability)
     span = estimate.time[-1] - estimate.time[0]
     used = sum(len(one.time) for one in estimate.innovations.values())
     content = page.page(

@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from strapdown import consistency, records, setup
+from strapdown import consistency, setup
 from strapdown.checks import InputError
 from strapdown.consistency import Judgement
+from strapdown.records import Estimate, Truth
 from strapdown.report import page
 from strapdown.scenarios import scenario_from_toml
 
@@ -46,12 +47,14 @@ def evidence(judgement: Judgement) -> str:
     return page.section("The evidence", *parts)
 
 
-def judged(path: Path, attributes: Mapping[str, Any], probability: float) -> Judgement:
-    """Return the verdict on the estimate in a file, by the truth in it."""
+def judged(
+    path: Path, attributes: Mapping[str, Any], estimate: Estimate, truth: Truth | None, *, probability: float
+) -> Judgement:
+    """Return the verdict on an estimate by what its file says of the filter beside it."""
     states, unmodelled = _filter_of(path, attributes)
     return consistency.judge(
-        records.read_estimate(path),
-        records.read_truth(path),
+        estimate,
+        truth,
         probability=probability,
         upper_bounds="motion" in attributes,  # the estimate of a recording
         error_states=states,
