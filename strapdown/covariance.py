@@ -251,6 +251,10 @@ def _rows(
     more = 1.0 - faults.outlier_probability + faults.outlier_probability * faults.outlier_scale**2
     moving = np.zeros((m, 1))
     if own.attitude is not None:
+        if own.covariance is not None:
+            raise InputError(
+                f"{own.sensor}: its noise is correlated between body axes, which this analysis does not take; point its boresight along one"
+            )
         assert own.sigma_axes is not None
         assert held.sigma_axes is not None
         assert exact.attitude is not None

@@ -59,13 +59,13 @@ FRAMES: dict[str, Array] = {
 
 GYRO_UNITS: dict[str, float] = {
     "": 1.0,
-    "gyro rates are 57.3 times too large (deg/s taken for rad/s)": math.pi / 180.0,
-    "gyro rates are 57.3 times too small (rad/s taken for deg/s)": 180.0 / math.pi,
+    "gyro rates are 57.3 times too large (deg/s taken for rad/s: --gyro-unit deg/s)": math.pi / 180.0,
+    "gyro rates are 57.3 times too small (rad/s taken for deg/s: --gyro-unit rad/s)": 180.0 / math.pi,
 }
 FORCE_UNITS: dict[str, float] = {
     "": 1.0,
-    "specific force is 9.81 times too small (g taken for m/s²)": STANDARD_GRAVITY,
-    "specific force is 9.81 times too large (m/s² taken for g)": 1.0 / STANDARD_GRAVITY,
+    "specific force is 9.81 times too small (g taken for m/s²: --accelerometer-unit g)": STANDARD_GRAVITY,
+    "specific force is 9.81 times too large (m/s² taken for g: --accelerometer-unit m/s2)": 1.0 / STANDARD_GRAVITY,
 }
 
 PENALTY = 5.0

@@ -159,8 +159,13 @@ def output_file(
     usable_folder(name, target.parent)
 
 
+def json_text(content: Any) -> str:
+    """Return ``content`` as indented JSON; NaN and infinities are refused because JSON has no word for them."""
+    return json.dumps(content, indent=2, allow_nan=False) + "\n"
+
+
 def write_json(path: str | os.PathLike[str], content: Any) -> None:
     """Write ``content`` as indented JSON; NaN and infinities are refused because JSON has no word for them."""
-    text = json.dumps(content, indent=2, allow_nan=False) + "\n"  # before any folder is made
+    text = json_text(content)  # before any folder is made
     with written_beside(path) as temporary:
         temporary.write_text(text, encoding="utf-8")

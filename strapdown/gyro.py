@@ -174,7 +174,10 @@ class GyroSpec(ByValue):
         else:
             object.__setattr__(self, "rate_ramp", array("rate_ramp", self.rate_ramp, (3,)))
         for name in ("turn_on_bias", "scale_factor", "asymmetry", "temperature_coefficient"):
-            object.__setattr__(self, name, array(name, getattr(self, name), (3,)))
+            value = getattr(self, name)
+            if not isinstance(value, (bool, str)) and np.ndim(value) == 0:
+                value = np.full(3, finite(name, value))
+            object.__setattr__(self, name, array(name, value, (3,)))
         for name in ("misalignment", "g_sensitivity"):
             object.__setattr__(self, name, array(name, getattr(self, name), (3, 3)))
         if np.any(np.diag(self.misalignment) != 0.0):

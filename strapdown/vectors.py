@@ -693,6 +693,35 @@ def star_directions(
     )
 
 
+Boresight = str | tuple[float, ...] | tuple[tuple[float, ...], ...]
+
+
+def _boresight(name: str, value: Any) -> str | tuple[float, ...]:
+    """Return a boresight as "x", "y" or "z" where it is along that axis, either way, or as a unit vector."""
+    if isinstance(value, str):
+        return one_of(name, value.removeprefix("-"), ("x", "y", "z"))
+    given = np.asarray(numbers(name, value))
+    if given.shape == (4,):
+        (q,) = unit_quaternions(name, given[None])
+        b = quaternion.rotate(q, np.array([0.0, 0.0, 1.0]))
+    elif given.shape == (3, 3):
+        if not np.allclose(given @ given.T, np.eye(3), atol=1e-6) or np.linalg.det(given) < 0.0:
+            raise InputError(f"{name} is no rotation matrix: its rows must be orthogonal unit vectors, right-handed")
+        b = given[:, 2]
+    elif given.shape == (3,):
+        b = given
+    else:
+        raise InputError(
+            f"{name} has shape {given.shape}; give x, y or z, a direction (3,), or the mounting as a quaternion (4,) or matrix (3, 3)"
+        )
+    length = float(np.linalg.norm(b))
+    if not np.isfinite(length) or length == 0.0:
+        raise InputError(f"{name} is {value!r}, no direction; give x, y or z, or three numbers not all zero")
+    b = b / length
+    k = int(np.argmax(np.abs(b)))
+    return "xyz"[k] if abs(b[k]) > 1.0 - 1e-12 else tuple(b.tolist())
+
+
 @dataclass(frozen=True, kw_only=True)
 class AttitudeSensor:
     """A star tracker that gives the attitude as a quaternion; coarse about its boresight, fine across it.
@@ -707,8 +736,9 @@ class AttitudeSensor:
         Noise about the boresight, rad.
     rate : float
         Measurements per second, Hz.
-    boresight : {"x", "y", "z"}, default "z"
-        Body axis of the boresight, ``"x"``, ``"y"`` or ``"z"``.
+    boresight : {"x", "y", "z"} or array_like (3,), (4,) or (3, 3), default "z"
+        Where it looks: a body axis, a direction in body axes (3,), or its mounting, sensor to body, as a quaternion (4,), scalar first,
+        or a rotation matrix (3, 3), whose z axis is the boresight. Kept as an axis or a unit vector.
     phase : float, default 0.0
         Time of the first measurement after the start, s; 0: one interval after it.
     faults : Faults, default no faults
@@ -719,7 +749,7 @@ class AttitudeSensor:
     sigma_across: float
     sigma_about: float
     rate: float
-    boresight: Literal["x", "y", "z"] = "z"
+    boresight: Boresight = "z"
     phase: float = 0.0
     faults: Faults = field(default_factory=Faults)
 
@@ -727,25 +757,44 @@ class AttitudeSensor:
         """Check every field."""
         _check_sampling(self.name, self.sigma_across, "rad", self.rate, self.phase)
         non_negative(f"{self.name}: sigma_about", self.sigma_about, unit="rad")
-        one_of(f"{self.name}: boresight", self.boresight, ("x", "y", "z"))
+        object.__setattr__(self, "boresight", _boresight(f"{self.name}: boresight", self.boresight))
+
+    @property
+    def covariance(self) -> Array | None:
+        """Covariance of the noise in body axes (3, 3), rad²; None where the boresight is a body axis."""
+        if isinstance(self.boresight, str):
+            return None
+        b = np.asarray(self.boresight)
+        return np.asarray(
+            self.sigma_across**2 * (np.eye(3) - np.outer(b, b)) + self.sigma_about**2 * np.outer(b, b), np.float64
+        )
 
     @property
     def sigma_axes(self) -> Array:
         """Noise about each body axis (3,), rad."""
-        return np.where(np.arange(3) == "xyz".index(self.boresight), self.sigma_about, self.sigma_across)
+        if isinstance(self.boresight, str):
+            return np.where(np.arange(3) == "xyz".index(self.boresight), self.sigma_about, self.sigma_across)
+        assert self.covariance is not None
+        return np.sqrt(np.diag(self.covariance))
 
     def observe(self, motion: Any, start: float, end: float, generator: np.random.Generator) -> VectorMeasurements:
         """Return ``q_measured = q ⊗ exp(v)`` over (start, end]."""
         time = sample_times(self.rate, self.phase, start, end)
         white, correlated = self.faults.noise(time, generator)
         attitude = motion if callable(motion) else motion.attitude
-        error = quaternion.exp(self.sigma_axes * white + correlated)
+        noise = self.sigma_axes * white
+        if not isinstance(self.boresight, str):
+            b = np.asarray(self.boresight)
+            noise = self.sigma_across * white + (self.sigma_about - self.sigma_across) * (white @ b)[:, None] * b
+        error = quaternion.exp(noise + correlated)
+        whole = self.covariance
         series = VectorMeasurements(
             sensor=self.name,
             kind="attitude",
             time=time,
             attitude=quaternion.multiply(attitude(time), error).reshape(-1, 4),
-            sigma_axes=self.sigma_axes,
+            sigma_axes=self.sigma_axes if whole is None else None,
+            covariance=whole,
         )
         return self.faults.heard(series)
 

@@ -295,7 +295,7 @@ def estimate(
     noise: GyroSpec | NoiseFit | ProcessNoise | None = None,
     setup: FilterSetup | None = None,
     initial: State | None = None,
-    states: bool | Sequence[str] = False,
+    states: bool | Sequence[str] | None = None,
     gate: Gate | float | None = None,
     robust: Robust | str | None = None,
     motion: str | None = None,
@@ -320,9 +320,9 @@ def estimate(
         Record: the whole filter, such as :func:`tune` returns it, instead of ``noise`` and ``states``.
     initial : State, optional
         Record: initial state (:func:`initial_state`) at the first edge. Default: from the first measurements.
-    states : bool or sequence of str, default False
+    states : bool or sequence of str, optional
         Record: with an error state for each error that the scenario specifies (scale factor, misalignment, hard iron, …), or for those
-        named alone.
+        named alone; False: without any. Default: with them where there are such errors (smoother: without drifts).
     gate : Gate or float, optional
         Refuse measurements beyond this quantile of χ² (0.999), and recover from a lost attitude.
     robust : Robust or {"huber", "student"}, optional
@@ -376,7 +376,7 @@ def estimate(
             f"source is {type(source).__name__}; give an ImuRecord or a Recording, as simulate and read return them"
         )
     _refuse("a recording", motion=motion, latency=latency, calibration=calibration)
-    chosen = _record_setup(source, noise, setup, initial, states)
+    chosen = _record_setup(source, noise, setup, initial, states, smooth=smooth)
     changed = {name: value for name, value in (("gate", gate), ("robust", robust)) if value is not None}
     chosen = dataclasses.replace(chosen, **changed)  # type: ignore[arg-type]
     start = None if initial is None else for_record.Start(initial, "Started from the state given.")
@@ -438,14 +438,16 @@ def _record_setup(
     noise: GyroSpec | NoiseFit | ProcessNoise | None,
     setup: FilterSetup | None,
     initial: State | None,
-    states: bool | Sequence[str],
+    states: bool | Sequence[str] | None,
+    *,
+    smooth: bool,
 ) -> FilterSetup:
     if setup is not None:
         _refuse("the scenario's own filter, and setup is a whole one", noise=noise, states=states or None)
         return setup
     if not isinstance(noise, ProcessNoise):
         spec = None if noise is None else _specification(noise)
-        return for_record.matched_setup(record, spec, states=states)
+        return for_record.matched_setup(record, spec, states=states, smooth=smooth)
     if initial is None:
         raise InputError(
             "noise is a ProcessNoise, which says nothing of the initial gyro bias; give initial= too, or a GyroSpec as noise"
@@ -586,7 +588,7 @@ def plan(
     *,
     setup: FilterSetup | None = None,
     seed: int | None = None,
-    states: bool = False,
+    states: bool | None = None,
     dispersions: Dispersions | None = None,
     precision: str = "float64",
 ) -> Plan:
@@ -596,11 +598,12 @@ def plan(
     ----------
     scenario : Scenario
     setup : FilterSetup, optional
-        Default: matched to the scenario (:func:`strapdown.setup.matched`).
+        Default: matched to the scenario (:func:`strapdown.setup.for_record.matched_to_scenario`).
     seed : int, optional
         Default: the scenario's own.
-    states : bool, default False
-        Give the matched filter an error state for each error that the scenario specifies.
+    states : bool, optional
+        Whether the matched filter has an error state for each error that the scenario specifies. Default: where there are such errors.
+        Where fixed errors have states, each run draws its own gyro and sensors: the filter is right on average over such individuals.
     dispersions : Dispersions, optional
         Initial errors and gyro parameters that differ from run to run.
     precision : {"float64", "float32"}
@@ -616,14 +619,16 @@ def plan(
     """
     from strapdown import montecarlo
 
-    if states and setup is not None:
+    if states is not None and setup is not None:
         raise InputError("a filter setup has its own states; leave states out")
-    chosen = setups.matched(scenario, states=states) if setup is None else setup
+    chosen = for_record.matched_to_scenario(scenario, states=states) if setup is None else setup
+    names = chosen.states.names if setup is None and chosen.states is not None else ()
     return montecarlo.Plan(
         scenario=scenario,
         setup=chosen,
         seed=scenario.seed if seed is None else seed,
         epochs=montecarlo.whole_epochs(scenario, chosen),
+        individuals=any(not name.endswith((".drift", ".correlated")) for name in names),
         dispersions=dispersions or montecarlo.Dispersions(),
         precision=precision,  # type: ignore[arg-type]
     )
@@ -635,7 +640,7 @@ def monte_carlo(
     runs: int = 1000,
     seed: int | None = None,
     setup: FilterSetup | None = None,
-    states: bool = False,
+    states: bool | None = None,
     dispersions: Dispersions | None = None,
     threads: int | None = None,
     progress: Callable[[int], None] | None = None,

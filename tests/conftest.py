@@ -43,8 +43,12 @@ def run(
 ) -> Callable[..., tuple[int, str, str]]:
     """Run ``strapdown ARGUMENTS`` in an empty folder; return exit status, standard output and standard error."""
     from strapdown import cli
+    from strapdown.cli import progress
 
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(
+        progress, "_quiet", True
+    )  # standard error is what went wrong alone, also where kernels are compiled first
 
     def command(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["strapdown", *map(str, arguments)])

@@ -17,9 +17,11 @@ from strapdown import (
     motion,
     quaternion,
     records,
+    report,
     scenarios,
     setup,
     unit_calibration,
+    units,
 )
 from strapdown.checks import InputError
 from strapdown.cli.filters import filter_for
@@ -27,7 +29,7 @@ from strapdown.estimation.states import ONCE, ProcessNoise
 from strapdown.gyro import GyroSpec
 from strapdown.recordfiles import read_record_file, write_record
 from strapdown.records import ImuRecord, Truth, read_estimate, read_states
-from strapdown.report import estimates
+from strapdown.report import findings
 from strapdown.scenarios import Scenario, simulate
 from strapdown.vectors import Accelerometer, AttitudeSensor, Faults, Magnetometer, VectorSensor
 
@@ -253,23 +255,85 @@ def test_what_the_filter_has_no_state_for_is_told(spinning, record, tmp_path):
     toml = setup.to_toml(setup.matched(scenario))
     (tmp_path / "filter.toml").write_text(toml)
     held = read_record_file(spinning)
-    for file in (None, tmp_path / "filter.toml"):
-        (told,) = filter_for(spinning, held, None, file, None)[1]
+    for file, states in ((None, False), (tmp_path / "filter.toml", None)):
+        (told,) = filter_for(spinning, held, None, file, states)[1]
         assert "no state for: the gyro's scale factor of 100 ppm; --states of `strapdown estimate`" in told
     assert filter_for(record, read_record_file(record), None, None, None)[1] == []
-    attributes = {"scenario": scenarios.scenario_to_toml(scenario), "filter": toml}
-    page = estimates.without_a_state(spinning, attributes)
-    assert "no state for the gyro&#x27;s scale factor of 100 ppm; `strapdown estimate --states`" in page
-    states = setup.to_toml(setup.matched(scenario, states=True))
-    assert estimates.without_a_state(spinning, {**attributes, "filter": states}) == ""
-    assert estimates.without_a_state(spinning, {"filter": toml}) == ""
-    assert estimates.without_a_state(spinning, {**attributes, "filter": "{}"}) == ""
+    chosen, (told,) = filter_for(spinning, held, None, None, None)
+    assert chosen.states.names == ("gyro.scale",)
+    assert told.startswith("The filter estimates errors that are specified, gyro.scale: without states")
+
+
+def test_the_verdict_names_what_the_filter_has_no_state_for(run, spinning, tmp_path):
+    scenario = scenarios.load_scenario("spin")
+    no_state = "; the filter has no state for the gyro's scale factor of 100 ppm"
+    for options, missing in (((), False), (("--no-states",), True)):
+        assert run("estimate", spinning, "--out", tmp_path / "out", "--every", 10, *options)[0] == 0
+        said = run("check", tmp_path / "out" / "estimate.h5")[1]
+        assert (no_state in said) == missing
+        assert ("the σ of gyro.scale is not tested: no truth for it" in said) == (not missing)
+    page = report.write(tmp_path / "out" / "estimate.h5").page.read_text(encoding="utf-8")
+    assert no_state.replace("'", "&#x27;") in page[: page.index("Key numbers")]  # in the headline
+    attributes = {"scenario": scenarios.scenario_to_toml(scenario), "filter": "{}"}  # of another version
+    path = tmp_path / "out" / "estimate.h5"
+    judged = findings.judged(path, attributes, read_estimate(path), None, probability=0.99)
+    assert judged.unmodelled == ()
+
+
+@pytest.fixture(scope="module")
+def satellite(tmp_path_factory):
+    """The specification of a small satellite: 0.15 °/√h, 0.3 °/h bias instability, 200 ppm, a tracker of 5/5/30 arcsec at 2 Hz."""
+    spec = GyroSpec(
+        angle_random_walk=0.15 * units.DEGREE_PER_ROOT_HOUR,
+        bias_instability=0.3 * units.DEGREE_PER_HOUR,
+        scale_factor=np.full(3, 200e-6),
+    )
+    tracker = AttitudeSensor(
+        name="tracker", sigma_across=5.0 * units.ARCSECOND, sigma_about=30.0 * units.ARCSECOND, rate=2.0
+    )
+    body = motion.TorqueFree(inertia=[10.0, 15.0, 20.0], initial_rate=np.radians([0.3, 0.5, 0.2]))
+    scenario = Scenario(
+        motion=body, gyro=spec, sensors=(tracker,), rate=10.0, duration=600.0, seed=3, name="sat", gravity_f=(0.0,) * 3
+    )
+    path = tmp_path_factory.mktemp("satellite") / "sat.toml"
+    path.write_text(scenarios.scenario_to_toml(scenario), encoding="utf-8")
+    return path
+
+
+def test_the_verdict_on_a_satellite_says_no_more_than_one_record_shows(run, satellite, tmp_path):
+    """Without states the bias σ is wrong by 1.5 (a Monte Carlo says so), which one record of ten minutes cannot show."""
+    assert run("simulate", satellite, "--seed", 6, "--out", tmp_path / "sat.h5")[0] == 0
+    assert run("estimate", tmp_path / "sat.h5", "--no-states", "--out", tmp_path / "plain")[0] == 0
+    status, said, _ = run("check", tmp_path / "plain" / "estimate.h5", "--json", tmp_path / "check.json")
+    assert status == 0
+    headline = said[said.index("consistent: none of") :]
+    assert "1.08 of the innovations of tracker" in headline
+    assert "this cannot show the σ of the bias" in headline
+    assert "no state for the gyro's scale factor of 200 ppm, the gyro's flicker of 0.3 °/h" in headline
+    power = {one["of"]: one["factor"] for one in json.loads((tmp_path / "check.json").read_text())["power"]}
+    assert power["attitude"] < 1.5
+    assert power["bias"] > 10.0
+
+
+def test_the_default_filter_of_a_satellite_passes_and_says_why_it_has_states(run, satellite, tmp_path):
+    status, said, _ = run("montecarlo", satellite, "--no-states", "--runs", 120, "--out", tmp_path / "plain.h5")
+    assert status == 1
+    assert "the filter has no state for the gyro's scale factor of 200 ppm" in said
+    plain = json.loads((tmp_path / "plain.json").read_text())
+    assert plain["nees"]["bias"]["anees"] > 1.5**2 * 0.8
+    status, said, _ = run("montecarlo", satellite, "--runs", 120, "--out", tmp_path / "states.h5")
+    assert "The filter estimates errors that are specified, gyro.scale, gyro.drift" in said
+    assert "consistent: none of" in said
+    assert "of the bias" in said
+    assert status == 0
+    assert run("montecarlo", tmp_path / "states.h5")[0] == 0
+    assert run("check", tmp_path / "states.h5")[0] == 0
 
 
 def test_states_of_a_record_that_tells_no_scenario_and_a_gate(run, record, tmp_path):
     status, said, error = run("estimate", record, "--out", tmp_path / "out", "--states", "--gate", 0.999)
     assert (status, error) == (0, "")
-    assert "does not tell its scenario" in said
+    assert "does not hold its scenario" in said
     assert "the filter has none" in said
     assert not (tmp_path / "out" / "states.json").exists()
 
@@ -293,7 +357,7 @@ def test_states_are_refused_where_they_make_no_sense(run, spinning, tmp_path):
     (tmp_path / "rec.csv").write_text("")
     cases = (
         ((spinning, "--state", "gyro.scael"), "did you mean 'gyro.scale'"),
-        ((spinning, "--filter", tmp_path / "filter.toml", "--states"), "leave --states and --state out"),
+        ((spinning, "--filter", tmp_path / "filter.toml", "--states"), "leave --states, --no-states and --state out"),
         ((tmp_path / "rec.csv", "--states"), "goes with a record"),
     )
     for arguments, words in cases:
@@ -465,7 +529,7 @@ def test_a_recording_that_is_not_what_it_says_is_doubted(run, recording, tmp_pat
     recording.write_text(recording.read_text().replace("[rad/s]", "[deg/s]").replace("[m/s2]", "[g]"))
     status, said, error = run("estimate", recording, "--out", tmp_path / "out")
     assert (status, error) == (0, "")
-    words = "warning: as it seems, gyro rates are 57.3 times too small (rad/s taken for deg/s); specific force is 9.81"
+    words = "warning: as it seems, gyro rates are 57.3 times too small (rad/s taken for deg/s: --gyro-unit rad/s); specific force is 9.81"
     assert words in said
     assert words in run("tune", recording, "--free", "")[1]  # which then ends for want of a parameter
     assert f"See `strapdown doctor {recording}`." in said

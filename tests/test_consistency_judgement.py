@@ -144,6 +144,46 @@ def test_holm_steps_down():
     assert [f.rejected for f in holm(findings, 0.05)] == [False, True, False]
 
 
+def test_a_sigma_wrong_by_the_power_stated_is_found():
+    """At the stated factor, too small or too large, the verdict is "not consistent" in 97 % of runs or more, and mostly not at a third of
+    its logarithm."""
+    right = consistency.judge(*estimate())
+    power = {one.of: one.factor for one in right.power}
+    assert set(power) == {"innovations of star 1", "innovations of star 2", "attitude", "bias"}
+    assert right.states == ("attitude", "bias")
+    factor = power["innovations of star 1"]
+    for scale in (factor, 1.0 / factor):
+        found = [consistency.judge(estimate(scale, seed=seed)[0]).verdict for seed in range(40)]
+        assert found.count("not consistent") >= 39
+    near = [consistency.judge(estimate(factor**0.33, seed=seed)[0]).verdict for seed in range(40)]
+    assert near.count("not consistent") < 30
+
+
+def test_a_state_that_nothing_tests_is_named():
+    result, truth = estimate()
+    blind = consistency.judge(result, error_states=["gyro.scale"])
+    assert "the σ of attitude, bias, gyro.scale are not tested: no truth for it" in blind.reason
+    assert all(math.isinf(one.factor) for one in blind.power if not one.of.startswith("innovations"))
+    seen = consistency.judge(result, truth, error_states=["gyro.scale"], unmodelled=["the gyro's asymmetry of 9 ppm"])
+    assert "the σ of gyro.scale is not tested" in seen.reason
+    assert seen.reason.endswith("the filter has no state for the gyro's asymmetry of 9 ppm")
+    assert json.loads(json.dumps(seen.summary(), allow_nan=False))["power"][-1] == {"of": "gyro.scale", "factor": None}
+
+
+def test_upper_bounds_are_contradicted_by_what_exceeds_them_alone():
+    """The noise of a recording's filter covers disturbances that last: innovations a tenth as large, and correlated."""
+    for scale, status in ((0.1, "cannot tell"), (1.0, "cannot tell"), (1.2, "not consistent")):
+        judged = consistency.judge(estimate(scale, correlated=True)[0], upper_bounds=True)
+        assert judged.verdict == status
+        assert {one.name for one in judged.findings} == {"NIS"}
+    assert (
+        "σ of attitude and bias are not tested without a truth"
+        in consistency.judge(estimate(0.1)[0], upper_bounds=True).reason
+    )
+    assert consistency.judge(*estimate(0.1), upper_bounds=True).verdict == "consistent"
+    assert consistency.judge(*estimate(0.1, bias_error=10.0), upper_bounds=True).verdict == "not consistent"
+
+
 def test_resolution_is_the_factor_that_bounds_leave():
     finding = Finding(name="NIS", of="star", value=1.0, p_value=0.5, samples=200, degrees=2)
     low, high = consistency.mean_bounds(2, 200, 0.99)
@@ -262,10 +302,14 @@ def test_check_uses_the_truth_in_the_file(run):
 
 
 def test_check_judges_a_campaign(run, plan, tmp_path):
-    campaign.run(plan, tmp_path / "runs.h5", runs=60)
+    campaign.run(plan, tmp_path / "few.h5", runs=20)
+    status, said, _ = run("check", "few.h5")
+    assert status == 2  # nor attitude nor bias would have been seen to be wrong by 1.5
+    assert "this cannot show the σ of the attitude (only one wrong by a factor of 2" in said
+    campaign.run(plan, tmp_path / "runs.h5", runs=200)
     status, said, _ = run("check", "runs.h5", "--json", "check.json")
     assert status == 0, said
-    assert "60 of 60 runs" in said
+    assert "200 of 200 runs" in said
     assert json.loads((tmp_path / "check.json").read_text())["kind"] == "strapdown montecarlo"
 
 

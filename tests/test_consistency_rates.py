@@ -1,10 +1,12 @@
 """False alarms: of filters that are right, every statistic refuses as many as it says, to a binomial error."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from benchmarks import power
-from strapdown import consistency, estimation, motion, quaternion, scenarios, setup, units, vectors
+from strapdown import consistency, estimation, montecarlo, motion, quaternion, scenarios, setup, units, vectors
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
 from strapdown.records import Truth
@@ -148,3 +150,65 @@ def test_the_real_filter_a_thousand_times():
     assert wrong >= 10  # Holm is conservative, not idle
     for p_values in alone.values():
         within_binomial(np.array(p_values), 3.5)
+
+
+# ------------------------------------------------------------------------------------------ verdicts: what `check` and `montecarlo` say
+
+
+def satellite(duration=300.0):
+    """A datasheet with bias instability and scale factor; the filter that matches it by default has states for both."""
+    scenario = scenarios.Scenario(
+        motion=motion.TorqueFree(inertia=[10.0, 15.0, 20.0], initial_rate=np.radians([0.3, 0.5, 0.2])),
+        gyro=GyroSpec(
+            angle_random_walk=0.15 * units.DEGREE_PER_ROOT_HOUR,
+            bias_instability=0.3 * units.DEGREE_PER_HOUR,
+            scale_factor=200e-6,
+        ),
+        sensors=(
+            vectors.AttitudeSensor(
+                name="tracker", sigma_across=5.0 * units.ARCSECOND, sigma_about=30.0 * units.ARCSECOND, rate=2.0
+            ),
+        ),
+        rate=5.0,
+        duration=duration,
+        gravity_f=(0.0, 0.0, 0.0),
+    )
+    chosen = setup.matched(scenario, states=True)
+    return montecarlo.Plan(scenario=scenario, setup=chosen, epochs=50, individuals=True)
+
+
+def verdicts_of_runs(plan, runs):
+    """The verdict on single runs of a plan, each of its own gyro."""
+    found = []
+    for run in range(runs):
+        again = montecarlo.replay(plan, run, machine="scalar")
+        found.append(consistency.judge(again.estimate, again.record.truth).verdict)
+    return found
+
+
+def verdicts_of_campaigns(campaigns, runs):
+    """The verdict on campaigns of the lanes, of a right filter."""
+    scenario = replace(scenarios.load_scenario("two-stars"), duration=20.0)
+    found = []
+    for seed in range(campaigns):
+        plan = montecarlo.Plan(scenario=scenario, setup=setup.matched(scenario), seed=seed, epochs=40)
+        found.append(consistency.judge_runs(montecarlo.run_plan(plan, runs=runs, threads=1)).verdict)
+    return found
+
+
+def test_few_campaigns_of_a_right_filter_are_called_wrong():
+    found = verdicts_of_campaigns(20, 160)
+    assert found.count("not consistent") <= 2
+    assert found.count("consistent") >= 18  # and 160 runs can tell
+
+
+def test_few_runs_of_a_filter_with_states_are_called_wrong():
+    assert verdicts_of_runs(satellite(100.0), 10).count("not consistent") <= 2
+
+
+@pytest.mark.slow
+def test_verdicts_a_thousand_times():
+    """At most 1 % of right filters are called wrong, to three binomial errors: of single runs with error states, and of campaigns."""
+    most = 1000 * 0.01 + 3.0 * np.sqrt(1000 * 0.01 * 0.99)
+    assert verdicts_of_runs(satellite(), 1000).count("not consistent") <= most
+    assert verdicts_of_campaigns(1000, 160).count("not consistent") <= most

@@ -175,6 +175,7 @@ def run_command(*arguments: object) -> None:
         ((), {}),
         (("--gate", "0.99", "--robust", "huber"), {"gate": 0.99, "robust": "huber"}),
         (("--states",), {"states": True}),
+        (("--no-states",), {"states": False}),
         (("--state", "gyro.scale"), {"states": ["gyro.scale"]}),
         (("--smooth", "--variances"), {"smooth": True, "full_covariance": False}),
     ],
@@ -190,7 +191,7 @@ def test_estimate_of_a_record_is_that_of_the_command(tmp_path, options, keywords
         np.testing.assert_array_equal(getattr(call, name), getattr(command, name))
     # One state for each error that is not zero, in one block: one scale factor and six misalignments.
     sizes = {name: states.values.shape[1] for name, states in call.error_states.items()}
-    states = keywords.get("states", False)
+    states = keywords.get("states", True)
     assert sizes == ({"gyro scale": 7} if states is True else {"gyro scale": 1} if states else {})
 
 

@@ -138,7 +138,7 @@ def test_every_cause_of_check_has_the_p_value_of_its_gain(run, estimated):
 
 
 def test_bounds_of_montecarlo(run):
-    said = run("montecarlo", "two-stars", "--runs", "64")
+    said = run("montecarlo", "two-stars", "--runs", "64", status=2)
     # Two-sided at 1 % together: three subsets and two sensors, the former at 20 epochs.
     for degrees, epochs in ((6 * 64, 20), (3 * 64, 20), (2 * 64 * 300, 1)):
         low, high = chi2.ppf([0.005 / 5 / epochs, 1.0 - 0.005 / 5 / epochs], degrees) / degrees

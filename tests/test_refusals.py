@@ -34,7 +34,7 @@ def folder(tmp_path_factory, short):
         ["montecarlo", str(where / "short.toml"), "--runs", "8", "--out", str(where / "runs.h5")],
     ):
         result = CliRunner().invoke(cli.app, command)
-        assert result.exit_code == 0, result.output
+        assert result.exit_code == (2 if command[0] == "montecarlo" else 0), result.output  # 8 runs cannot tell
     return where
 
 

@@ -290,3 +290,28 @@ def test_a_sensor_has_a_name(name):
     sensors = (dataclasses.replace(scenario.sensors[0], name=name), *scenario.sensors[1:])
     with pytest.raises(InputError, match="no name"):
         dataclasses.replace(scenario, sensors=sensors)
+
+
+def test_one_scale_factor_for_all_axes_and_any_boresight_go_through_a_file():
+    text = """
+rate_hz = 10.0
+duration_s = 10.0
+[motion]
+type = "rest"
+[gyro]
+angle_random_walk_deg_per_sqrt_hour = 0.1
+scale_factor_ppm = 200
+[[sensors]]
+type = "attitude"
+name = "tracker"
+sigma_across_arcsec = 5.0
+sigma_about_arcsec = 30.0
+rate_hz = 2.0
+boresight = [[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]]
+"""
+    found = scenarios.scenario_from_toml(text)
+    np.testing.assert_allclose(found.gyro.scale_factor, [200e-6] * 3, rtol=1e-15)
+    np.testing.assert_allclose(found.sensors[0].boresight, [0.6, 0.0, 0.8])
+    again = scenarios.scenario_from_toml(scenarios.scenario_to_toml(found))
+    assert again.sensors == found.sensors
+    np.testing.assert_array_equal(again.gyro.scale_factor, found.gyro.scale_factor)

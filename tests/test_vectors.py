@@ -465,3 +465,41 @@ def test_masked_measurements_are_missing_ones():
 def test_a_series_has_a_name():
     with pytest.raises(InputError, match="sensor is None"):
         vectors.VectorMeasurements(sensor=None, kind="direction", time=[0.0], vector_b=[[1.0, 0.0, 0.0]], sigma=1e-3)
+
+
+@pytest.mark.parametrize(
+    "boresight",
+    [
+        (0.6, 0.0, 0.8),
+        (3.0, 0.0, 4.0),
+        tuple(np.roll(Rotation.from_euler("y", np.arctan2(0.6, 0.8)).as_quat(), 1)),
+        tuple(map(tuple, Rotation.from_euler("y", np.arctan2(0.6, 0.8)).as_matrix())),
+    ],
+    ids=["direction", "any length", "quaternion", "matrix"],
+)
+def test_a_tracker_looks_where_it_is_mounted(boresight):
+    """Its noise is that of a tracker along z, turned by the mounting: covariance by rotation matrices, and that of the samples."""
+    tracker = AttitudeSensor(name="t", sigma_across=1e-4, sigma_about=1e-3, rate=100.0, boresight=boresight)
+    R = Rotation.from_euler("y", np.arctan2(0.6, 0.8)).as_matrix()
+    expected = R @ np.diag([1e-8, 1e-8, 1e-6]) @ R.T
+    np.testing.assert_allclose(tracker.covariance, expected, atol=1e-20)
+    series = tracker.observe(lambda t: np.tile([1.0, 0.0, 0.0, 0.0], (len(t), 1)), 0.0, 200.0, np.random.default_rng(1))
+    assert series.covariance is not None
+    np.testing.assert_allclose(series.covariance[0], expected, atol=1e-20)
+    error = Rotation.from_quat(np.roll(series.attitude, -1, axis=1)).as_rotvec()
+    np.testing.assert_allclose(error.T @ error / len(error), expected, atol=0.04e-6)
+
+
+@pytest.mark.parametrize(("boresight", "axis"), [("-x", "x"), ((0.0, -2.0, 0.0), "y"), ((1.0, 0.0, 0.0, 0.0), "z")])
+def test_a_boresight_along_a_body_axis_is_that_axis(boresight, axis):
+    tracker = AttitudeSensor(name="t", sigma_across=1e-4, sigma_about=1e-3, rate=1.0, boresight=boresight)
+    assert tracker.boresight == axis
+    assert tracker.covariance is None
+
+
+@pytest.mark.parametrize(
+    "boresight", ["w", (0.0, 0.0, 0.0), (1.0, 0.0), (2.0, 0.0, 0.0, 0.0), ((1.0, 0, 0), (0, 1, 0), (0, 0, -1))]
+)
+def test_what_is_no_boresight_is_refused(boresight):
+    with pytest.raises(InputError, match="boresight"):
+        AttitudeSensor(name="t", sigma_across=1e-4, sigma_about=1e-3, rate=1.0, boresight=boresight)

@@ -1,11 +1,12 @@
 """The command line. Only this package prints; units are degrees, hours and arcseconds here and radians and seconds below.
 
-A result replaces the one of an earlier run of the same name, whole: what that one had more goes too. ``estimate``, ``simulate``,
-``integrate`` and ``tune`` refuse to replace a file that they did not write, and ``montecarlo``, whose result may have taken hours, wants to
-be told.
+A result replaces all of an earlier result of the same name. ``estimate``, ``simulate``, ``integrate`` and ``tune`` refuse to replace a file
+that they did not write; ``montecarlo``, whose result may have taken hours, needs ``--resume`` or ``--overwrite``.
 
 ``terminal``
     What every command shares.
+``progress``
+    Progress of what takes long.
 ``studies``
     ``coning``
 ``integration``
@@ -55,6 +56,7 @@ from strapdown.cli import (  # noqa: F401  (each registers its commands)
     studies,
     tuning,
 )
+from strapdown.cli.progress import be_quiet
 from strapdown.cli.terminal import app, console, errors
 from strapdown.reading import NoDigestWarning
 
@@ -62,7 +64,12 @@ from strapdown.reading import NoDigestWarning
 @app.callback(invoke_without_command=True)
 def _about(
     version: Annotated[bool, typer.Option("--version", help="Print the version and stop.", is_eager=True)] = False,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", help="Show no progress on standard error; may stand after the command too.")
+    ] = False,
 ) -> None:
+    if quiet:
+        be_quiet()
     if version:
         import strapdown
 
@@ -72,7 +79,7 @@ def _about(
 
 @app.command()
 def info() -> None:
-    """Tell what the kernels run on."""
+    """Show what the kernels run on."""
     import strapdown
     from strapdown.kernels.machine import describe
 
@@ -99,6 +106,9 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # what ASCII or cp1252 has no sign for is a question mark, not the end
             stream.reconfigure(errors="replace")
+    console.stderr = False  # --json - of an earlier command in this process
+    if "--quiet" in sys.argv[1:]:
+        sys.argv = [sys.argv[0], "--quiet", *(argument for argument in sys.argv[1:] if argument != "--quiet")]
     try:
         app(standalone_mode=True)
     except InputError as error:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from strapdown.cli.filters import filter_of_scenario
+from strapdown.cli.filters import default_words, filter_of_scenario
 from strapdown.cli.terminal import (
     Tables,
     app,
@@ -31,6 +31,7 @@ from strapdown.cli.terminal import (
 if TYPE_CHECKING:
     from types import FrameType
 
+    from strapdown.consistency import Judgement
     from strapdown.montecarlo import Plan
     from strapdown.montecarlo.campaign import Campaign
 
@@ -66,9 +67,13 @@ def montecarlo(
         int | None, typer.Option(help="Runs between merges and writes; the machine's if not given.")
     ] = None,
     states: Annotated[
-        bool,
-        typer.Option("--states", help="Give the filter a state for each error that the scenario specifies; slower."),
-    ] = False,
+        bool | None,
+        typer.Option(
+            "--states/--no-states",
+            help="With or without a state for each error that the scenario specifies. Default: with them, where there are such errors and "
+            "no filter, --float32 or lanes are asked for.",
+        ),
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="HDF5 file; NAME-montecarlo.h5 if not given.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the file, if it exists.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Begin anew although the file exists.")] = False,
@@ -87,7 +92,7 @@ def montecarlo(
     ] = None,
     tables: Tables = None,
 ) -> None:
-    """Run a scenario many times through a filter; tell whether the filter may be believed."""
+    """Run a scenario many times through a filter and judge the filter: exit status 0 consistent, 1 not, 2 cannot tell (or bad input)."""
     from strapdown import montecarlo as engine
     from strapdown.checks import InputError, count
     from strapdown.files import write_json
@@ -96,6 +101,8 @@ def montecarlo(
     source = Path(scenario)
     held = campaigns.read(source) if source.suffix.lower() in _CAMPAIGN_SUFFIXES else None
     if held is None:
+        if states is None and (float32 or machine == "lanes"):
+            states = False
         plan = _plan(scenario, filter_file, dispersions, seed, float32, states)
         target = out or Path(f"{plan.scenario.name or source.stem}-montecarlo.h5")
     else:
@@ -104,30 +111,30 @@ def montecarlo(
             "--dispersions": dispersions,
             "--seed": seed,
             "--float32": float32 or None,
-            "--states": states or None,
+            "--states": states,
         }
         for name, value in given.items():
             if value is not None:
-                raise InputError(f"{name} is given, but {source} tells its own; leave it out, or name a scenario")
+                raise InputError(f"{name} is given, but {source} holds its own; leave it out, or name a scenario")
         plan, target = held.plan, out or source
         machine = held.machine if machine == "auto" else machine
     writable("out", target, suffixes=_CAMPAIGN_SUFFIXES)
     tables_folder(tables)
     if resume and overwrite:
         raise InputError("--resume and --overwrite exclude each other: go on with the file, or start it anew")
-    told = target.with_suffix(".json")
-    if replay is None and told.exists() and not target.exists() and not overwrite:
-        raise InputError(f"{told} exists and would be replaced; move it, choose another --out, or give --overwrite")
-    writable("out", told)
+    beside = target.with_suffix(".json")
+    if replay is None and beside.exists() and not target.exists() and not overwrite:
+        raise InputError(f"{beside} exists and would be replaced; move it, choose another --out, or give --overwrite")
+    writable("out", beside)
     if replay is not None:
         writable("out", *_replayed(target, replay))
         _replay(plan, replay, machine, target)
         return
     if held is not None and target == source and not (resume or overwrite):
-        _tell(held)
+        status = _tell(held)
         if tables is not None and held.statistics is not None:
             written(*tables_written(tables, "montecarlo", engine.summary(held.statistics)))
-        return
+        raise typer.Exit(status)
     if runs is None:
         runs = campaigns.read(target).runs if resume and target.exists() else _RUNS
     if workers is not None and cluster is not None:
@@ -167,11 +174,12 @@ def montecarlo(
         except KeyboardInterrupt:
             console.print(f"What is finished is in {target}; go on with --resume.")
             raise
-    _tell(result)
+    status = _tell(result)
     report = target.with_suffix(".json")
     content = _report(result)
     write_json(report, content)
     written(target, report, *tables_written(tables, "montecarlo", content))
+    raise typer.Exit(status)
 
 
 @contextlib.contextmanager
@@ -206,16 +214,18 @@ def _plan(
     dispersions: Path | None,
     seed: int | None,
     float32: bool,
-    states: bool,
+    states: bool | None,
 ) -> Plan:
     from strapdown import montecarlo as engine
     from strapdown import workflows
     from strapdown.checks import InputError
 
-    if states and filter_file is not None:
-        raise InputError("--filter tells the filter's states itself, in [filter.states]; leave --states out")
+    if states is not None and filter_file is not None:
+        raise InputError(
+            "--filter holds the filter's states itself, in [filter.states]; leave --states and --no-states out"
+        )
     loaded = scenario_named(scenario)
-    return workflows.plan(
+    plan = workflows.plan(
         loaded,
         setup=None if filter_file is None else filter_of_scenario(filter_file, loaded),
         seed=seed,
@@ -223,6 +233,11 @@ def _plan(
         dispersions=None if dispersions is None else engine.read_dispersions(dispersions),
         precision="float32" if float32 else "float64",
     )
+    if states is None and filter_file is None and plan.setup.states is not None:
+        console.print(default_words(plan.setup.states.names))
+    if plan.individuals:
+        console.print("Each run draws its own gyro and sensors: the fixed errors specified are standard deviations.")
+    return plan
 
 
 def _report(campaign: Campaign) -> dict[str, Any]:
@@ -237,15 +252,25 @@ def _report(campaign: Campaign) -> dict[str, Any]:
         "chunk": campaign.chunk,
         "version": campaign.version,
         "seconds": campaign.seconds,
+        "judgement": _judged(campaign).summary(),
         **summary(campaign.statistics),
     }
 
 
-def _tell(campaign: Campaign) -> None:
+def _judged(campaign: Campaign) -> Judgement:
+    """Return the verdict that `strapdown check` gives of the file."""
+    from strapdown import consistency
+
+    assert campaign.statistics is not None
+    return consistency.judge_runs(campaign.statistics, unmodelled=campaign.plan.unmodelled)
+
+
+def _tell(campaign: Campaign) -> int:
+    """Show the statistics and the verdict; return the exit status."""
     from strapdown.checks import InputError
+    from strapdown.cli.judgement import status_of
     from strapdown.montecarlo import summary
     from strapdown.montecarlo.verdicts import QUANTILES
-    from strapdown.setup import not_covered
 
     if campaign.statistics is None:
         raise InputError("no chunk of the campaign is finished; go on with it (--resume)")
@@ -305,18 +330,17 @@ def _tell(campaign: Campaign) -> None:
     rate = ""
     if campaign.seconds > 0.0:
         rate = f" ({rate_text(campaign.statistics.runs / campaign.seconds)} runs/s, compiling included)"
-    said = "may be believed" if report["consistent"] else "may NOT be believed"
     console.print(
-        f"{counted(report['runs'], 'run')}, {campaign.seconds:.3g} s{rate}. The filter {said}: bounds that a right filter keeps all "
-        f"together with {100.0 * report['probability']:g} %, NEES at {report['epochs_judged']} epochs."
+        f"{counted(report['runs'], 'run')}, {campaign.seconds:.3g} s{rate}. Bounds hold all statistics of a right filter together with "
+        f"{100.0 * report['probability']:g} %, NEES at {report['epochs_judged']} epochs."
     )
-    plan = campaign.plan
-    missing = not_covered(
-        plan.scenario.gyro, plan.scenario.sensors, plan.setup.states, gravity_f=plan.scenario.gravity_f
-    )
-    if missing and not report["consistent"]:
-        remedy = "; --states gives it states for most" if plan.setup.states is None else ""
-        console.print(f"The filter has no state for {', '.join(missing)}{remedy}.")
+    judgement = _judged(campaign)
+    console.print(judgement.words)
+    if judgement.verdict == "cannot tell":
+        console.print("More runs (--runs, with --resume) would show it.")
+    if judgement.unmodelled and campaign.plan.setup.states is None:
+        console.print("--states gives the filter states for most of these errors.")
+    return status_of(judgement)
 
 
 def _worst_axis(values: list[float | None]) -> int:
@@ -343,9 +367,9 @@ def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
     again = engine.replay(plan, run, machine=machine)
     truth = again.record.truth
     assert truth is not None
-    # Of a filter that joins samples to steps some machines tell the record at the samples, some at the steps.
+    # Of a filter that joins samples to steps some machines give the record at the samples, some at the steps.
     edges = slice(None, None, (len(again.record.time) - 1) // (len(again.estimate.time) - 1))
-    told = Truth(attitude=truth.attitude[edges], bias=truth.bias[edges])
+    true = Truth(attitude=truth.attitude[edges], bias=truth.bias[edges])
     attributes: dict[str, Any] = {
         "scenario": scenario_to_toml(plan.scenario),
         "seed": plan.seed,
@@ -364,9 +388,9 @@ def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
         run=run,
         attributes={name: attributes[name] for name in ("machine", "dispersions")},
     )
-    write_estimate(paths[1], again.estimate, attributes, truth=told)
+    write_estimate(paths[1], again.estimate, attributes, truth=true)
     estimate = again.estimate
-    error = consistency.errors(estimate.attitude, estimate.bias, told.attitude, told.bias)
+    error = consistency.errors(estimate.attitude, estimate.bias, true.attitude, true.bias)
     assert estimate.covariance is not None
     nees = consistency.nees(error, estimate.covariance)
     step = int(np.argmax(nees))

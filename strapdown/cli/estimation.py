@@ -6,11 +6,11 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from strapdown.cli.filters import filter_for
+from strapdown.cli.filters import ChosenStates, filter_for
 from strapdown.cli.reading import (
     RECORDING_HELP,
     AccelerometerUnit,
@@ -22,13 +22,29 @@ from strapdown.cli.reading import (
     Topic,
     told,
 )
-from strapdown.cli.terminal import FORMAT, FigureFormat, app, console, doubt, need_own, show, table, writable, written
+from strapdown.cli.terminal import (
+    FORMAT,
+    FigureFormat,
+    app,
+    console,
+    doubt,
+    need_own,
+    progress_bar,
+    show,
+    table,
+    writable,
+    written,
+)
 
 if TYPE_CHECKING:
+    from strapdown.ahrs import AhrsEstimate, AhrsParameters
+    from strapdown.estimation.states import State
+    from strapdown.recordfiles import RecordFile
     from strapdown.recordings import Recording
     from strapdown.records import Estimate, ImuRecord
     from strapdown.setup import FilterSetup
     from strapdown.setup.for_record import Start
+    from strapdown.workflows import RecordRun
 
 FILES = (
     "estimate.h5",
@@ -42,17 +58,15 @@ FIGURES = ("estimate", "errors", "states")
 """Figures that it may draw there, without the suffix of their format."""
 ABOUT_IT = ("estimate.html", "estimate.report.json")
 """What other commands write there about an estimate."""
-RECORDING_ONLY = ("motion", "latency", "calibration")
-"""Options that go with a recording."""
-RECORD_ONLY = ("filter", "states", "state", "attitude", "from_truth", "every")
-"""Options that go with a record of `strapdown simulate`."""
 
 
 @app.command()
 def estimate(
     recording: Annotated[
         Path,
-        typer.Argument(help=f"{RECORDING_HELP}; or record of `strapdown simulate` (HDF5)."),
+        typer.Argument(
+            help=f"{RECORDING_HELP}; or the HDF5 file of `strapdown simulate`, which holds its specification and its truth too."
+        ),
     ],
     out: Annotated[Path, typer.Option(help="Folder for estimate.h5, errors.json and the figures.")] = Path(
         "estimate-results"
@@ -67,21 +81,21 @@ def estimate(
     gyro: Annotated[
         Path | None,
         typer.Option(
-            help="TOML with a table named gyro, as `strapdown allan` writes it: the filter believes its noise."
+            help="TOML with a table named gyro, as `strapdown allan` writes it: the gyro noise of the filter."
         ),
     ] = None,
     full_covariance: Annotated[
         bool | None,
         typer.Option(
             "--full-covariance/--variances",
-            help="Write whole 6 x 6 covariances, or only their diagonals; a record's estimate has whole ones unless told.",
+            help="Write whole 6 x 6 covariances, or only their diagonals; whole ones by default where there is a specification.",
         ),
     ] = None,
     filter_file: Annotated[
         Path | None,
         typer.Option(
             "--filter",
-            help="Record: TOML with a table named filter, as `strapdown tune` writes it; without it the filter that matches the record.",
+            help="With a specification: TOML with a table named filter, as `strapdown tune` writes it; by default one that matches.",
         ),
     ] = None,
     gate: Annotated[
@@ -89,42 +103,45 @@ def estimate(
         typer.Option(help="Refuse measurements beyond this quantile (0.999) of chi-squared, and recover."),
     ] = None,
     robust: Annotated[
-        str | None, typer.Option(help="Record: weigh measurements by how far they lie off: huber or student.")
+        str | None, typer.Option(help="Weigh measurements by the size of their innovations: huber or student.")
     ] = None,
     states: Annotated[
-        bool,
+        bool | None,
         typer.Option(
-            "--states",
-            help="Record: with a state for each error that gyro and sensors are specified with: scale, misalignment, drift, hard iron, …",
+            "--states/--no-states",
+            help="With a specification: with or without a state for each error in it (scale, misalignment, drift, hard iron, …). By "
+            "default with them, where there are such errors.",
         ),
-    ] = False,
+    ] = None,
     state: Annotated[
         list[str] | None,
-        typer.Option(help="Record: only this one of those states, such as gyro.scale or SENSOR.bias; may be repeated."),
+        typer.Option(
+            help="With a specification: only this one of those states, such as gyro.scale or SENSOR.bias; may be repeated."
+        ),
     ] = None,
     attitude: Annotated[
         str | None,
-        typer.Option(help="Record: initial attitude body to fixed, w,x,y,z; without it from the first measurements."),
+        typer.Option(
+            help="With a specification: initial attitude body to fixed, w,x,y,z; by default from the first measurements."
+        ),
     ] = None,
     from_truth: Annotated[
-        bool, typer.Option("--from-truth", help="Record: start at the truth, off by errors drawn from the filter's σ.")
+        bool, typer.Option("--from-truth", help="With a truth: start there, off by errors drawn from the filter's σ.")
     ] = False,
-    every: Annotated[int, typer.Option(help="Record: keep each so-manieth step of the filter.")] = 1,
+    every: Annotated[int, typer.Option(help="With a specification: store every n-th filter step.")] = 1,
     observability: Annotated[
         bool,
-        typer.Option(
-            "--observability", help="Report what the measurements show of each state, optional ones included."
-        ),
+        typer.Option("--observability", help="Report how observable each state is, optional ones included."),
     ] = False,
     smooth: Annotated[
         bool,
-        typer.Option("--smooth", help="From all samples, those after each time too, by the fixed-interval smoother."),
+        typer.Option("--smooth", help="Use the samples after each time too, by the fixed-interval smoother."),
     ] = False,
     motion: Annotated[
         str | None,
         typer.Option(
-            help="Recording: what moves the unit: hand (if not given), of bounded velocity, with states for the gyro's scale; or any, "
-            "whose acceleration is white noise, without."
+            help="Without a specification: what moves the unit: hand (default), of bounded velocity, with states for the gyro's scale; or "
+            "any, whose acceleration is white noise, without such states."
         ),
     ] = None,
     to: Annotated[
@@ -146,21 +163,24 @@ def estimate(
     latency: Annotated[
         float | None,
         typer.Option(
-            help="Recording: delay of the gyro's samples, ms, that of its low-pass; 0: point samples. If not given, half a sample interval."
+            help="Without a specification: delay of the gyro's samples, ms, that of its low-pass; 0: point samples. By default half a "
+            "sample interval."
         ),
     ] = None,
     calibration: Annotated[
         Path | None,
         typer.Option(
-            help="Recording: calibration.toml of an earlier one of the same unit; that of this one is written too."
+            help="Without a specification: calibration.toml of an earlier recording of the same unit; a new one is written."
         ),
     ] = None,
     figures: Annotated[bool, typer.Option("--figures", help="Draw the estimate, its states and errors.")] = False,
     form: Annotated[FigureFormat | None, FORMAT] = None,
 ) -> None:
-    """Estimate attitude and gyro bias from a recording (accelerometer as vertical, magnetometer as heading) or a simulated record."""
-    from strapdown import unit_calibration
-    from strapdown.checks import InputError
+    """Estimate attitude and gyro bias from a recording.
+
+    The accelerometer gives the vertical and the magnetometer the heading; where the recording holds its specification, as one of `strapdown
+    simulate` does, the filter is matched to that.
+    """
     from strapdown.files import usable_folder
     from strapdown.recordings import is_record
     from strapdown.records import read_attributes
@@ -172,57 +192,92 @@ def estimate(
     need_own(out / FILES[0], "estimate", lambda path: bool(read_attributes(path)["kind"] == "strapdown estimate"))
     units = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
     layout = told(recording, columns=columns, topic=topic, axes=axes, invert=invert, **units)
-    exports = _exports(to or (), recording, euler, frame, changed=bool(axes or invert))
-    if is_record(recording):
-        for name, text in zip(RECORDING_ONLY, (motion, latency, calibration), strict=True):
-            if text is not None:
-                raise InputError(f"--{name} goes with a recording; {recording} is a record of `strapdown simulate`")
-        _estimate_record(
-            recording,
-            out,
-            gyro,
-            filter_file,
-            gate,
-            robust,
-            tuple(state or ()) if states or state else None,
-            attitude,
-            from_truth,
-            every,
-            full_covariance is not False,
-            observability,
-            smooth,
-            exports,
-            drawn_as,
-        )
-        return
-    options = dict(
-        zip(
-            RECORD_ONLY,
-            (
-                filter_file,
-                states or None,
-                state or None,
-                attitude,
-                from_truth or None,
-                None if every == 1 else every,
-            ),
-            strict=True,
-        )
+    specified = is_record(recording)
+    _check_kind(
+        recording,
+        specified,
+        with_specification={
+            "filter": filter_file,
+            "states": states,
+            "state": state or None,
+            "attitude": attitude,
+            "from-truth": from_truth or None,
+            "every": None if every == 1 else every,
+        },
+        without={"motion": motion, "latency": latency, "calibration": calibration},
     )
-    for name, value in options.items():
-        if value is not None:
-            raise InputError(
-                f"--{name.replace('_', '-')} goes with a record of `strapdown simulate`; {recording} is none"
-            )
-    carried = None if calibration is None else unit_calibration.read(calibration)
-    options_used = {
-        "calibration": carried,
-        "gate": gate,
-        "robust": robust,
-        "full_covariance": bool(full_covariance),
-        "smooth": smooth,
-    }
-    _estimate_recording(recording, out, layout, gyro, motion, latency, observability, drawn_as, exports, options_used)
+    output = _Output(out, _exports(to or (), recording, euler, frame, changed=bool(axes or invert)), drawn_as)
+    shared = _Shared(gyro, gate, robust, full_covariance, observability, smooth)
+    if specified:
+        chosen = tuple(state or ()) if states or state else states
+        _estimate_specified(recording, shared, _Specified(filter_file, chosen, attitude, from_truth, every), output)
+    else:
+        _estimate_recording(recording, shared, _Recorded(layout, motion or "hand", latency, calibration), output)
+
+
+class _Output(NamedTuple):
+    """Where an estimate goes."""
+
+    folder: Path
+    exports: Sequence[tuple[Path, dict[str, Any]]]
+    form: FigureFormat | None
+    """Of the figures; None: draw none."""
+
+
+class _Shared(NamedTuple):
+    """Options of every estimate."""
+
+    gyro: Path | None
+    gate: float | None
+    robust: str | None
+    full_covariance: bool | None
+    observability: bool
+    smooth: bool
+
+    @property
+    def robustness(self) -> dict[str, Any]:
+        """The gate and the weights, as far as they are given."""
+        from strapdown.estimation.gating import Gate, Robust
+
+        gate = None if self.gate is None else Gate(probability=self.gate)
+        robust = None if self.robust is None else Robust(kind=self.robust)  # type: ignore[arg-type]
+        return {name: value for name, value in (("gate", gate), ("robust", robust)) if value is not None}
+
+
+class _Specified(NamedTuple):
+    """Options where the recording holds its specification."""
+
+    filter_file: Path | None
+    states: ChosenStates
+    attitude: str | None
+    from_truth: bool
+    every: int
+
+
+class _Recorded(NamedTuple):
+    """Options where it does not."""
+
+    layout: dict[str, Any]
+    motion: str
+    latency: float | None
+    calibration: Path | None
+
+
+def _check_kind(
+    recording: Path, specified: bool, *, with_specification: dict[str, Any], without: dict[str, Any]
+) -> None:
+    """Refuse options that need a specification where there is none, and the other way round."""
+    from strapdown.checks import InputError
+
+    given = [name for name, value in (without if specified else with_specification).items() if value is not None]
+    if given and specified:
+        raise InputError(
+            f"--{given[0]} goes with a recording without a specification; {recording} holds one, of `strapdown simulate`"
+        )
+    if given:
+        raise InputError(
+            f"--{given[0]} goes with a recording that holds its specification, as those of `strapdown simulate`; {recording} does not"
+        )
 
 
 def _exports(
@@ -265,60 +320,65 @@ def _export(
     return [target for target, _ in exports]
 
 
-def _estimate_record(
-    path: Path,
-    out: Path,
-    gyro: Path | None,
-    filter_file: Path | None,
-    gate: float | None,
-    robust: str | None,
-    states: tuple[str, ...] | None,
-    attitude: str | None,
-    from_truth: bool,
-    every: int,
-    full_covariance: bool,
-    observability: bool,
-    smooth: bool,
-    exports: Sequence[tuple[Path, dict[str, Any]]],
-    form: FigureFormat | None,
-) -> None:
-    """Run the filter over a record, report and write its estimate."""
-    import numpy as np
-
-    from strapdown import setup, workflows
+def _estimate_specified(path: Path, shared: _Shared, options: _Specified, output: _Output) -> None:
+    """Run the filter over a recording that holds its specification, report and write its estimate."""
+    from strapdown import reading, workflows
     from strapdown.checks import InputError, count
-    from strapdown.estimation.gating import Gate, Robust
-    from strapdown.files import write_json
     from strapdown.recordfiles import read_record_file
-    from strapdown.records import write_estimate
 
-    count("every", every)
-    if smooth and every > 1:
-        raise InputError("--every keeps some steps of the filter, and the smoother gives all; leave one of them out")
-    if gyro is not None and filter_file is not None:
-        raise InputError("--gyro and --filter both tell the filter's belief of the gyro; give one of them")
+    every = count("every", options.every)
+    if shared.smooth and every > 1:
+        raise InputError("--every stores some filter steps, and the smoother gives all; leave one of them out")
+    if shared.gyro is not None and options.filter_file is not None:
+        raise InputError("--gyro and --filter both give the filter's gyro noise; give one of them")
     held = read_record_file(path)
-    chosen, remarks = filter_for(path, held, gyro, filter_file, states)
-    if gate is not None:
-        chosen = dataclasses.replace(chosen, gate=Gate(probability=gate))
-    if robust is not None:
-        chosen = dataclasses.replace(chosen, robust=Robust(kind=robust))  # type: ignore[arg-type]
-    record = held.with_origin(str(path))
-    start = _start(record, chosen, attitude, from_truth)
-    result, used, truth, initial, words = workflows.estimate_record(
-        record, chosen, start, every=every, full_covariance=full_covariance, smooth=smooth
-    )
+    chosen, remarks = filter_for(path, held, shared.gyro, options.filter_file, options.states, smooth=shared.smooth)
+    chosen = dataclasses.replace(chosen, **shared.robustness)
+    with reading.from_file(path):
+        record = held.with_origin(str(path))
+    start = _start(record, chosen, options.attitude, options.from_truth)
+    with progress_bar("smoothing" if shared.smooth else "filtering"):
+        run = workflows.estimate_record(
+            record,
+            chosen,
+            start,
+            every=every,
+            full_covariance=shared.full_covariance is not False,
+            smooth=shared.smooth,
+        )
     length = held.record.time[-1] - held.record.time[0]
     console.print(
         f"{path.name}: {len(held.record.increments)} gyro samples over {length:.6g} s, "
-        f"{', '.join(f'{len(s.time)} of {s.sensor}' for s in held.record.vectors) or 'no measurements'}. {words}"
+        f"{', '.join(f'{len(s.time)} of {s.sensor}' for s in held.record.vectors) or 'no measurements'}. {run.start}"
     )
     for remark in remarks:
         console.print(remark)
-    _tell(result)
+    _tell(run.estimate)
+    paths = _write_specified(path, held, chosen, run, shared, output)
+    if output.form is not None:
+        paths += _drawn(output.folder, output.form, run.estimate, path.name, truth=run.truth)
+    written(*paths)
+
+
+def _write_specified(
+    path: Path,
+    held: RecordFile,
+    chosen: FilterSetup,
+    run: RecordRun,
+    shared: _Shared,
+    output: _Output,
+) -> list[Path]:
+    """Write the estimate and what is known of it, and print its errors; return the files."""
+    import numpy as np
+
+    from strapdown import setup
+    from strapdown.files import write_json
+    from strapdown.records import write_estimate
+
+    out, result, truth = output.folder, run.estimate, run.truth
     paths = [out / "estimate.h5"]
-    attributes: dict[str, Any] = {"source": str(path), "filter": setup.to_toml(chosen), "start": words}
-    attributes["smoothed"] = smooth
+    attributes: dict[str, Any] = {"source": str(path), "filter": setup.to_toml(chosen), "start": run.start}
+    attributes["smoothed"] = shared.smooth
     if held.scenario:
         attributes["scenario"] = held.scenario
     attributes |= {name: value for name, value in (("seed", held.seed), ("run", held.run)) if value is not None}
@@ -326,31 +386,42 @@ def _estimate_record(
     write_estimate(paths[0], result, attributes, truth=truth)
     if result.error_states:
         paths.append(out / "states.json")
-        write_json(paths[-1], {"source": str(path), **_tell_states(result, used)})
-    if observability:
-        shown = setup.observability(used, chosen, initial)
-        console.print(str(shown))
-        paths.append(out / "observability.json")
-        write_json(paths[-1], {"source": str(path), **shown.summary()})
+        write_json(paths[-1], {"source": str(path), **_tell_states(result, run.record)})
+    if shared.observability:
+        paths.append(_observability(out, str(path), run.record, chosen, run.initial))
     if truth is not None:
         paths.append(out / "errors.json")
         found = _errors(result, truth)
         write_json(paths[-1], {"source": str(path), **found})
-        line = (
-            f"Second half: attitude error RMS {found['attitude_rms_deg']:.4g}° (σ {found['attitude_sigma_deg']:.4g}°), bias error RMS "
-            f"{found['bias_rms_deg_per_h']:.4g} °/h (σ {found['bias_sigma_deg_per_h']:.4g} °/h)"
-        )
-        if "nees_per_state" in found:
-            line += f"; mean NEES per state {found['nees_per_state']:.3g} (right: about 1)"
-        console.print(line + ".")
-    paths += _export(exports, result, None)
+        console.print(_errors_words(found))
+    paths += _export(output.exports, result, None)
     seen = {s: i for s, i in result.innovations.items() if np.sum(i.used)}
     if seen:
         each = ", ".join(f"{np.mean(i.nis[i.used]) / i.innovation.shape[1]:.3g} {s}" for s, i in seen.items())
         console.print(f"Mean NIS per degree of freedom (right: 1): {each}. `strapdown check {paths[0]}` judges them.")
-    if form is not None:
-        paths += _drawn(out, form, result, path.name, truth=truth)
-    written(*paths)
+    return paths
+
+
+def _observability(out: Path, source: str, record: ImuRecord, chosen: FilterSetup, initial: State) -> Path:
+    """Print and write how observable each state is; return the file."""
+    from strapdown import setup
+    from strapdown.files import write_json
+
+    with progress_bar("observability"):
+        shown = setup.observability(record, chosen, initial)
+    console.print(str(shown))
+    write_json(out / "observability.json", {"source": source, **shown.summary()})
+    return out / "observability.json"
+
+
+def _errors_words(found: dict[str, float]) -> str:
+    line = (
+        f"Second half: attitude error RMS {found['attitude_rms_deg']:.4g}° (σ {found['attitude_sigma_deg']:.4g}°), bias error RMS "
+        f"{found['bias_rms_deg_per_h']:.4g} °/h (σ {found['bias_sigma_deg_per_h']:.4g} °/h)"
+    )
+    if "nees_per_state" in found:
+        line += f"; mean NEES per state {found['nees_per_state']:.3g} (right: about 1)"
+    return line + "."
 
 
 def _drawn(
@@ -416,7 +487,7 @@ def _start(record: ImuRecord, chosen: FilterSetup, attitude: str | None, from_tr
     from strapdown.setup.for_record import Start, drawn_start
 
     if attitude is not None and from_truth:
-        raise InputError("--attitude and --from-truth both tell the start; give one of them")
+        raise InputError("--attitude and --from-truth both give the start; give one of them")
     if from_truth:
         return drawn_start(record, chosen)
     if attitude is None:
@@ -472,48 +543,75 @@ def _errors(result: Estimate, truth: Any) -> dict[str, float]:
     return found
 
 
-def _estimate_recording(
-    recording: Path,
-    out: Path,
-    layout: dict[str, Any],
-    gyro: Path | None,
-    motion: str | None,
-    latency: float | None,
-    observability: bool,
-    form: FigureFormat | None,
-    exports: Sequence[tuple[Path, dict[str, Any]]],
-    options: dict[str, Any],
-) -> None:
+def _estimate_recording(recording: Path, shared: _Shared, options: _Recorded, output: _Output) -> None:
     """Run the filter over a recording: accelerometer as the vertical, magnetometer as the heading."""
-    from strapdown import ahrs, recordings, setup, unit_calibration
+    from strapdown import ahrs, recordings, unit_calibration
     from strapdown.checks import non_negative, one_of
     from strapdown.consistency import reference_errors
-    from strapdown.estimation.gating import Gate, Robust
-    from strapdown.files import write_json
     from strapdown.gyro import process_noise, read_spec
-    from strapdown.records import write_estimate
     from strapdown.units import DEGREE
 
-    moved_by = one_of("--motion", motion or "hand", ahrs.MOTIONS)
-    late = None if latency is None else 1e-3 * non_negative("--latency", latency, unit="ms")
-    if options["gate"] is not None:
-        options["gate"] = Gate(probability=options["gate"])
-    if options["robust"] is not None:
-        options["robust"] = Robust(kind=options["robust"])
-    source = recordings.read(recording, **layout)
+    one_of("--motion", options.motion, ahrs.MOTIONS)
+    late = None if options.latency is None else 1e-3 * non_negative("--latency", options.latency, unit="ms")
+    robustness = shared.robustness
+    carried = None if options.calibration is None else unit_calibration.read(options.calibration)
+    with progress_bar("reading"):
+        source = recordings.read(recording, **options.layout)
     doubt(source, recording)
-    parameters = ahrs.MOTIONS[moved_by]
-    if gyro is not None:
-        parameters = replace(parameters, **process_noise(read_spec(gyro)))
-    result = ahrs.estimate(source, parameters, latency=late, **options)
-    used, found = result.recording, result.estimate
-    errors = None if used.true_attitude is None else reference_errors(found.attitude, used.true_attitude)
+    parameters = ahrs.MOTIONS[options.motion]
+    if shared.gyro is not None:
+        parameters = replace(parameters, **process_noise(read_spec(shared.gyro)))
+    with progress_bar("smoothing" if shared.smooth else "filtering"):
+        result = ahrs.estimate(
+            source,
+            parameters,
+            latency=late,
+            calibration=carried,
+            full_covariance=bool(shared.full_covariance),
+            smooth=shared.smooth,
+            **robustness,
+        )
+    used = result.recording
+    errors = None if used.true_attitude is None else reference_errors(result.estimate.attitude, used.true_attitude)
     rms = None if errors is None else {name: value / DEGREE for name, value in errors.rms(used.movement).items()}
-    frame = (
+    chosen = replace(parameters.setup, **robustness)
+    paths = _write_recording(result, parameters, chosen, shared, options, output)
+    _say_recording(result, parameters, options)
+    if shared.observability:
+        paths.append(_observability(output.folder, used.source, result.record, parameters.setup, result.initial))
+    if rms is not None:
+        paths.append(_rms(output.folder, used.source, rms))
+    paths += _export(output.exports, result.estimate, source)
+    if output.form is not None:
+        frame = _fixed_frame(used)
+        paths += _drawn(
+            output.folder, output.form, result.estimate, used.source, used=used, errors=errors, fixed_frame=frame
+        )
+    written(*paths)
+
+
+def _fixed_frame(used: Recording) -> str:
+    return (
         "East-North-Up, magnetic North"
         if used.magnetic_field is not None
         else "z up, heading arbitrary (no magnetometer)"
     )
+
+
+def _write_recording(
+    result: AhrsEstimate,
+    parameters: AhrsParameters,
+    chosen: FilterSetup,
+    shared: _Shared,
+    options: _Recorded,
+    output: _Output,
+) -> list[Path]:
+    """Write the estimate, its states and the calibration; return the files."""
+    from strapdown import setup, unit_calibration
+    from strapdown.files import write_json
+    from strapdown.records import write_estimate
+
+    used, found, out = result.recording, result.estimate, output.folder
     paths = [out / "estimate.h5"]
     _clear(out)
     write_estimate(
@@ -521,10 +619,10 @@ def _estimate_recording(
         found,
         {
             "source": used.source,
-            "fixed_frame": frame,
-            "motion": moved_by,
-            "smoothed": options["smooth"],
-            "filter": setup.to_toml(replace(parameters.setup, gate=options["gate"], robust=options["robust"])),
+            "fixed_frame": _fixed_frame(used),
+            "motion": options.motion,
+            "smoothed": shared.smooth,
+            "filter": setup.to_toml(chosen),
             **{f"parameter.{name}": value for name, value in vars(parameters).items()},
             "latency": result.delays.last_gyro,
             "magnetometer_latency": result.delays.last_field,
@@ -533,19 +631,27 @@ def _estimate_recording(
     if found.error_states:
         paths.append(out / "states.json")
         write_json(paths[-1], {"source": used.source, **_states(found)})
-    console.print(
-        f"{used.source}: {len(used.time)} samples over {used.time[-1] - used.time[0]:.1f} s, started in the quiet second "
-        f"from {used.time[0]:.2f} s."
-    )
-    for remark in used.remarks:
-        console.print(remark)
-    console.print(f"Fixed frame: {frame}.")
-    console.print(_model(moved_by, parameters, result))
-    for sentence in (*result.delays.words, *(f"{one}." for one in result.faults.words)):
-        console.print(sentence)
     if result.calibration is not None:
         paths.append(out / "calibration.toml")
         paths[-1].write_text(unit_calibration.to_toml(result.calibration), encoding="utf-8")
+    return paths
+
+
+def _say_recording(result: AhrsEstimate, parameters: AhrsParameters, options: _Recorded) -> None:
+    """Print what was read, how the filter started, and what of the samples is not as it should be."""
+    from strapdown import recordings
+
+    used, found = result.recording, result.estimate
+    console.print(
+        f"{used.source}: {len(used.time)} samples over {used.time[-1] - used.time[0]:.1f} s, started in "
+        f"{'the quiet second' if _rested(parameters, result) else 'its quietest second, which is not at rest,'} from {used.time[0]:.2f} s."
+    )
+    for remark in used.remarks:
+        console.print(remark)
+    console.print(f"Fixed frame: {_fixed_frame(used)}.")
+    console.print(_model(options.motion, parameters, result))
+    for sentence in (*result.delays.words, *(f"{one}." for one in result.faults.words)):
+        console.print(sentence)
     for begin, length in recordings.gaps(used.time):
         console.print(f"Gap of {length:.3g} s after {begin:.3f} s.")
     if used.left_out_words:
@@ -554,24 +660,27 @@ def _estimate_recording(
         if number:
             console.print(f"{number} samples of the {sensor} are missing and were skipped.")
     _tell(replace(found, skipped={}))
-    if observability:
-        shown = setup.observability(result.record, parameters.setup, result.initial)
-        console.print(str(shown))
-        paths.append(out / "observability.json")
-        write_json(paths[-1], {"source": used.source, **shown.summary()})
-    if rms is not None:
-        paths.append(out / "errors.json")
-        write_json(paths[-1], {"source": used.source, **{f"{name}_rmse_deg": value for name, value in rms.items()}})
-        rows = table("RMS error over the movement phase, degrees", *rms, left=0)
-        rows.add_row(*(f"{value:.2f}" for value in rms.values()))
-        show(rows)
-    paths += _export(exports, found, source)
-    if form is not None:
-        paths += _drawn(out, form, found, used.source, used=used, errors=errors, fixed_frame=frame)
-    written(*paths)
 
 
-def _model(moved_by: str, parameters: Any, result: Any) -> str:
+def _rms(out: Path, source: str, rms: dict[str, float]) -> Path:
+    """Print and write the RMS errors against the reference, degrees; return the file."""
+    from strapdown.files import write_json
+
+    write_json(out / "errors.json", {"source": source, **{f"{name}_rmse_deg": value for name, value in rms.items()}})
+    rows = table("RMS error over the movement phase, degrees", *rms, left=0)
+    rows.add_row(*(f"{value:.2f}" for value in rms.values()))
+    show(rows)
+    return out / "errors.json"
+
+
+def _rested(parameters: AhrsParameters, result: AhrsEstimate) -> bool:
+    """Return whether the start showed the gyro bias, where the filter takes it from there."""
+    if parameters.rest_bias_sigma == 0.0:
+        return True
+    return bool(result.initial.covariance[3, 3] <= (0.5 * parameters.bias_sigma) ** 2)
+
+
+def _model(moved_by: str, parameters: AhrsParameters, result: AhrsEstimate) -> str:
     """Return in words the model of a recording's motion, and the bias that the filter started from."""
     import numpy as np
 
@@ -584,6 +693,6 @@ def _model(moved_by: str, parameters: Any, result: Any) -> str:
         f"Motion: of a hand, {parameters.velocity_sigma:g} m/s with a correlation time of {parameters.velocity_time:g} s. "
         f"Gyro bias at the start: {', '.join(f'{value:.3g}' for value in bias)} °/s, σ {sigma:.2g} °/s"
     )
-    if sigma > 0.5 * parameters.bias_sigma / DEGREE:
+    if not _rested(parameters, result):
         return f"{words}: no second is quiet enough to show it, so the heading may drift at first."
     return f"{words}, from that second."

@@ -1,22 +1,34 @@
-"""The filter that a command runs on a record: of a file, or matched to what the record tells."""
+"""The filter that a command runs on a record: of a file, or matched to what the record specifies."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from strapdown.recordfiles import RecordFile
     from strapdown.scenarios import Scenario
     from strapdown.setup import FilterSetup
 
 
-def filter_for(
-    path: Path, held: RecordFile, gyro: Path | None, filter_file: Path | None, states: tuple[str, ...] | None
-) -> tuple[FilterSetup, list[str]]:
-    """Return the filter, and what to say of it: of a file, or matched to the gyro's specification and what the sensors say of themselves.
+ChosenStates = tuple[str, ...] | Literal[False] | None
+"""Error states by name: empty, all that the specified errors call for; False, none; None, all where there are such errors."""
 
-    ``states`` None: of attitude and bias alone; empty: with all states that the specified errors call for.
+
+def filter_for(
+    path: Path,
+    held: RecordFile,
+    gyro: Path | None,
+    filter_file: Path | None,
+    states: ChosenStates,
+    *,
+    smooth: bool = False,
+) -> tuple[FilterSetup, list[str]]:
+    """Return the filter, and what to say of it: of a file, or matched to the gyro's specification and the record's sensors.
+
+    A filter that is to be smoothed is not given gyro drifts unless ``states`` names them.
     """
     from strapdown import reading, setup
     from strapdown.checks import InputError
@@ -26,30 +38,40 @@ def filter_for(
     if filter_file is not None:
         if states is not None:
             raise InputError(
-                "--filter tells the filter's states itself, in [filter.states]; leave --states and --state out"
+                "--filter holds the filter's states itself, in [filter.states]; leave --states, --no-states and --state out"
             )
         chosen = setup.read_setup(filter_file)
         need_angles(filter_file, chosen, held)
         return chosen, no_state_words(without_a_state(path, held, chosen), chosen)
     spec = None if gyro is None else read_spec(gyro)
     if spec is None and held.gyro is None:
-        raise InputError(f"{path} does not tell the gyro's specification; give --gyro or --filter, a TOML file")
+        raise InputError(f"{path} does not hold the gyro's specification; give --gyro or --filter, a TOML file")
     with reading.from_file(path):
         record = held.with_origin(str(path))
-    chosen = matched_setup(record, spec, states=False if states is None else states or True)
+    chosen = matched_setup(record, spec, states=True if states == () else states, smooth=smooth)
     missing = without_a_state(path, held, chosen)
-    if states is None:
+    if states is False or (states is None and chosen.states is None):
         return chosen, no_state_words(missing, chosen)
     remarks = []
     if not held.scenario:
         remarks.append(
-            f"{path.name} does not tell its scenario, so the errors of its sensors are not known: no state for them."
+            f"{path.name} does not hold its scenario, so the errors of its sensors are not known: no state for them."
         )
-    if chosen.states is not None:
-        remarks.append(f"Optional states: {', '.join(chosen.states.names)}.")
-    else:
+    if chosen.states is None:
         remarks.append("No error is specified that would call for an optional state; the filter has none.")
+    elif states is None:
+        remarks.append(default_words(chosen.states.names))
+    else:
+        remarks.append(f"Optional states: {', '.join(chosen.states.names)}.")
     return chosen, [*remarks, *([f"Still without a state: {', '.join(missing)}."] if missing else [])]
+
+
+def default_words(names: Sequence[str]) -> str:
+    """Return why a filter has error states that nobody asked for."""
+    return (
+        f"The filter estimates errors that are specified, {', '.join(names)}: without states for them its σ would be too small "
+        "(--no-states leaves them out)."
+    )
 
 
 def need_angles(filter_file: Path, chosen: FilterSetup, held: RecordFile) -> None:

@@ -13,8 +13,10 @@ from strapdown.cli.terminal import (
     Tables,
     app,
     console,
+    json_target,
     need_own,
     progress_bar,
+    put_json,
     show,
     table,
     tables_folder,
@@ -134,17 +136,17 @@ def coning_budget(
     ],
     rate: Annotated[list[float], typer.Option(help="Gyro samples a second, Hz; may be given several times.")],
     algorithm: Annotated[list[str] | None, typer.Option(help="Algorithm; may be given several times.")] = None,
-    json: Annotated[Path | None, typer.Option(help="Write the table as JSON too.")] = None,
+    json: Annotated[
+        Path | None, typer.Option(help="Write the table as JSON too, to this file; - for standard output.")
+    ] = None,
     tables: Tables = None,
 ) -> None:
-    """Tell the drift that an angular vibration spectrum leaves, for each algorithm and sample rate."""
+    """Predict the drift that an angular vibration spectrum leaves, for each algorithm and sample rate."""
     from strapdown import coning
     from strapdown.checks import InputError
-    from strapdown.files import write_json
     from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
-    if json is not None:
-        writable("json", json, suffixes=(".json",), sources=(psd,))
+    json_target(json, psd)
     tables_folder(tables)
     lines = coning.read_vibration(psd)
     largest = max(max(line.angle, line.angle_across or 0.0) for line in lines)
@@ -172,7 +174,6 @@ def coning_budget(
     ]
     paths = tables_written(tables, "coning budget", rows)
     if json is not None:
-        write_json(json, {"lines": len(lines), "budget": rows})
-        paths.insert(0, json)
+        put_json(json, {"lines": len(lines), "budget": rows})
     if paths:
         written(*paths)

@@ -1,4 +1,4 @@
-"""Verdicts: whether a filter may be believed, and which conventions a recording follows."""
+"""Verdicts: whether a filter is consistent, and which conventions a recording follows."""
 
 from __future__ import annotations
 
@@ -21,7 +21,18 @@ from strapdown.cli.reading import (
     Topic,
     told,
 )
-from strapdown.cli.terminal import app, console, counted, show, table, writable, written
+from strapdown.cli.terminal import (
+    app,
+    console,
+    counted,
+    json_target,
+    progress_bar,
+    put_json,
+    show,
+    table,
+    writable,
+    written,
+)
 
 if TYPE_CHECKING:
     from strapdown.consistency import Judgement
@@ -44,7 +55,7 @@ def check(
         ),
     ],
     probability: Annotated[
-        float, typer.Option(help="A right filter is not called wrong with at least this, all tests together.")
+        float, typer.Option(help="Probability that a right filter passes all tests together, at least.")
     ] = 0.99,
     record: Annotated[
         Path | None, typer.Option(help="Record that an estimate was made from: with it, likely causes are named.")
@@ -53,10 +64,10 @@ def check(
         Path | None,
         typer.Option(
             "--filter",
-            help="TOML with the table named filter that the estimate was made with; if it does not tell itself.",
+            help="TOML with the table named filter that the estimate was made with; by default that in the estimate.",
         ),
     ] = None,
-    json: Annotated[Path | None, typer.Option("--json", help="File for all statistics.")] = None,
+    json: Annotated[Path | None, typer.Option("--json", help="File for all statistics; - for standard output.")] = None,
     truth: Annotated[
         Path | None,
         typer.Option(
@@ -83,7 +94,7 @@ def check(
         typer.Option(help="With --truth: HDF5 file for the estimate as it was judged, which `strapdown report` reads."),
     ] = None,
 ) -> None:
-    """Tell whether the filter may be believed: exit status 0 consistent, 1 not, 2 cannot tell (or bad input).
+    """Judge whether a filter is consistent: exit status 0 consistent, 1 not, 2 cannot tell (or bad input).
 
     With --record the verdict takes the statistics and the causes that were looked for together. With --truth the estimate may be of any
     filter; clocks and frames are compared first. An estimate from elsewhere without a truth is judged by its innovations, if it has any.
@@ -91,10 +102,9 @@ def check(
     from strapdown import consistency, records
     from strapdown.checks import InputError
     from strapdown.consistency.bounds import tail
-    from strapdown.files import write_json
+    from strapdown.report import findings
 
-    if json is not None:
-        writable("json", json, suffixes=(".json",), sources=(result, record, filter_file, truth))
+    json_target(json, result, record, filter_file, truth)
     if record is None and filter_file is not None:
         raise InputError("--filter goes with --record: the record is needed to look for causes")
     tail(probability)
@@ -120,7 +130,7 @@ def check(
         if held.statistics is None:
             raise InputError(f"{result} holds no finished run yet; resume it with `strapdown montecarlo --resume`")
         console.print(f"{result.name}: {held.statistics.runs} of {counted(held.runs, 'run')}, machine {held.machine}.")
-        judgement = consistency.judge_runs(held.statistics, probability=probability)
+        judgement = consistency.judge_runs(held.statistics, probability=probability, unmodelled=held.plan.unmodelled)
     elif kind == "strapdown estimate":
         estimate = records.read_estimate(result)
         own_truth = records.read_truth(result)
@@ -129,7 +139,9 @@ def check(
             f"{sum(len(one.time) for one in estimate.innovations.values())} measurements, "
             f"{'no truth' if own_truth is None else 'with its truth'}."
         )
-        judgement = consistency.judge(estimate, own_truth, probability=probability)
+        judgement = findings.judged(
+            result, records.read_attributes(result), estimate, own_truth, probability=probability
+        )
     else:
         raise InputError(f"{result} is a {kind}; pass what `strapdown estimate` or `strapdown montecarlo` wrote")
     _show_statistics(judgement)
@@ -142,10 +154,13 @@ def check(
         console.print(f"Note: {limit}.")
     console.print(words)
     content.update(judgement.summary())
-    if json is not None:
-        write_json(json, content)
-        written(json)
-    raise typer.Exit({"consistent": CONSISTENT, "not consistent": NOT}.get(judgement.verdict, CANNOT_TELL))
+    put_json(json, content)
+    raise typer.Exit(status_of(judgement))
+
+
+def status_of(judgement: Judgement) -> int:
+    """Return the exit status of a verdict."""
+    return {"consistent": CONSISTENT, "not consistent": NOT}.get(judgement.verdict, CANNOT_TELL)
 
 
 def _is_own(path: Path) -> bool:
@@ -172,7 +187,6 @@ def _check_foreign(
     from strapdown import consistency
     from strapdown.checks import InputError
     from strapdown.consistency import foreign
-    from strapdown.files import write_json
     from strapdown.recordings.attitudes import read_attitudes
     from strapdown.records import write_estimate
 
@@ -226,9 +240,7 @@ def _check_foreign(
         console.print(f"Note: {limit}.")
     console.print(judgement.words)
     content.update(judgement.summary())
-    if json is not None:
-        write_json(json, content)
-        written(json)
+    put_json(json, content)
     if truth is not None and aligned is not None:
         written(aligned)
     raise typer.Exit({"consistent": CONSISTENT, "not consistent": NOT}.get(judgement.verdict, CANNOT_TELL))
@@ -291,9 +303,10 @@ def _diagnosed(
     P = np.diag(estimate.variance[0]) if estimate.covariance is None else estimate.covariance[0]
     initial = estimation.State(attitude=estimate.attitude[0], bias=estimate.bias[0], covariance=P)
     # The verdict is on the filter with its gate, so what that refused is left out.
-    found = diagnosis.diagnose(
-        accepted(held.record, estimate), chosen, initial, probability=judgement.probability, judgement=judgement
-    )
+    with progress_bar("looking for causes"):
+        found = diagnosis.diagnose(
+            accepted(held.record, estimate), chosen, initial, probability=judgement.probability, judgement=judgement
+        )
     rows = table("Causes by what they would explain", "cause", "of", "gain", "ln p", "", left=2)
     for cause in found.considered[:8]:
         mark = Text("likely", style="red") if cause in found.causes else Text("no")
@@ -315,10 +328,10 @@ def _filter_of(result: Path, filter_file: Path | None) -> FilterSetup:
 
     if filter_file is not None:
         return setup.read_setup(filter_file)
-    told = records.read_attributes(result).get("filter")
-    if told is None:
-        raise InputError(f"{result} does not tell its filter; give --filter, a TOML file with the table [filter]")
-    return setup.from_toml(str(told), f"{result}: filter")
+    text = records.read_attributes(result).get("filter")
+    if text is None:
+        raise InputError(f"{result} does not hold its filter; give --filter, a TOML file with the table [filter]")
+    return setup.from_toml(str(text), f"{result}: filter")
 
 
 def _need_same(result: Path, estimate: Estimate, path: Path, record: ImuRecord) -> None:
@@ -336,7 +349,7 @@ def _need_same(result: Path, estimate: Estimate, path: Path, record: ImuRecord) 
 def _not_of_the_search(chosen: FilterSetup, estimate: Estimate) -> str:
     """Say what a filter did that the search for causes does not; empty if there is nothing."""
     if chosen.robust is not None:
-        return "The filter weighs measurements by how far they lie off, and the search for causes does not"
+        return "The filter weighs measurements by their innovations, and the search for causes does not"
     if any(event.kind == "recovery" for event in estimate.events):
         return "The filter recovered from a lost attitude, and the search for causes does not"
     return ""
@@ -352,20 +365,21 @@ def doctor(
     topic: Topic = None,
     axes: Axes = None,
     invert: Invert = None,
-    json: Annotated[Path | None, typer.Option("--json", help="File for the explanations and their scores.")] = None,
+    json: Annotated[
+        Path | None, typer.Option("--json", help="File for the explanations and their scores; - for standard output.")
+    ] = None,
 ) -> None:
-    """Tell which conventions a recording follows, by trying the others: exit status 0 as told, 1 wrong, 2 cannot tell."""
+    """Find the conventions that a recording follows, by trying the others: exit status 0 as declared, 1 wrong, 2 cannot tell."""
     from strapdown import doctor as conventions
     from strapdown import recordings
-    from strapdown.files import write_json
 
-    if json is not None:
-        writable("json", json, suffixes=(".json",), sources=(recording,))
+    json_target(json, recording)
     given = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
     source = recordings.read(
         recording, **told(recording, columns=columns, topic=topic, axes=axes, invert=invert, **given)
     )
-    found = conventions.examine(source)
+    with progress_bar("trying conventions"):
+        found = conventions.examine(source)
     console.print(f"{found.source}: {found.words}")
     for words in found.doubts:
         console.print(f"warning: {words}.")
@@ -384,7 +398,5 @@ def doctor(
         show(rows)
     for note in found.notes:
         console.print(f"Note: {note}.")
-    if json is not None:
-        write_json(json, found.summary())
-        written(json)
+    put_json(json, found.summary())
     raise typer.Exit({"as told": CONSISTENT, "wrong convention": NOT}.get(found.verdict, CANNOT_TELL))

@@ -117,19 +117,18 @@ def covariance(
         mounting={name: value * ARCSECOND for name, value in _named("mounting", mounting).items()},
         time_offset={name: 1e-3 * value for name, value in _named("time_offset", time_offset).items()},
     )
-    belief = filter_of_scenario(filter_file, chosen) if filter_file else setup.matched(chosen)
-    with progress_bar("covariance analysis", 1) as advance:
+    modelled = filter_of_scenario(filter_file, chosen) if filter_file else setup.matched(chosen)
+    with progress_bar("covariance analysis"):
         found = analysis.analyse(
             chosen,
-            belief,
+            modelled,
             consider=considered,
             initial_attitude_sigma=None if attitude_sigma is None else attitude_sigma * DEGREE,
             initial_bias_sigma=None if bias_sigma is None else bias_sigma * DEGREE_PER_HOUR,
             epochs=epochs,
         )
-        advance(1)
     name = chosen.name or Path(scenario).stem
-    _tell(name, found, belief.integration.name, matched=filter_file is None)
+    _tell(name, found, modelled.integration.name, matched=filter_file is None)
     write_json(out / "covariance.json", _summary(name, found))
     from strapdown import plots
 
@@ -148,8 +147,8 @@ def _tell(name: str, found: Any, integration: str, *, matched: bool) -> None:
     rms, sigma = found.rms[-1], found.filter_sigma[-1]
     unit, size = angle_unit(np.concatenate([rms[:3], sigma[:3]]))
     rate_name, rate = rate_unit(np.concatenate([rms[3:], sigma[3:]]))
-    belief = "the filter that matches it" if matched else "the filter given"
-    console.print(f"{name}, {belief}, integration {integration}; errors at {found.time[-1]:g} s, RMS of an axis.\n")
+    what = "the filter that matches it" if matched else "the filter given"
+    console.print(f"{name}, {what}, integration {integration}; errors at {found.time[-1]:g} s, RMS of an axis.\n")
     rows = table("Error budget", "source", "kind", f"attitude\n{unit}", f"bias\n{rate_name}", left=2)
     budget = sorted(found.budget(), key=lambda row: -row[2])
     for source, kind, attitude, bias in budget:

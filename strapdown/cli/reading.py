@@ -1,4 +1,4 @@
-"""Options that tell a recording's units, columns and topic: the same in every command that reads one."""
+"""Options for a recording's units, columns, topic, axes and signs: the same in every command that reads one."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def told(
             what = {"topic": "a bag or a flight log", "axes": "a recording", "invert": "a recording"}.get(
                 name, "a table"
             )
-            own = "tells its units itself" if name.endswith("-unit") else "says itself what it holds"
+            own = "holds its units" if name.endswith("-unit") else "needs none"
             raise InputError(f"--{name} goes with {what}; the record {path} {own}")
     found: dict[str, Any] = {"units": given}
     if columns:

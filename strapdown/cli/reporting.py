@@ -29,8 +29,7 @@ def report(
     existing_file(result)
     page = result.with_suffix(".html") if out is None else out
     writable("out", page, page.with_suffix(".report.json"), sources=(result,))
-    with progress_bar("judging, drawing", 1) as advance:
+    with progress_bar("judging, drawing"):
         done = reports.write(result, out, probability=probability)
-        advance(1)
     console.print(f"{result.name}: {done.verdict}.", highlight=False)
     written(done.page, done.statistics)

@@ -97,7 +97,7 @@ def simulate(
         sigma = series.sigma if series.sigma_axes is None else series.sigma_axes
         if series.covariance is None and (sigma == 0.0).any():
             console.print(
-                f"warning: {series.sensor}: its sigma is zero, which no filter can use; give it noise in the scenario, or tell the filter "
+                f"warning: {series.sensor}: its sigma is zero, which no filter can use; give it noise in the scenario, or give the filter "
                 "another in [filter.sigma]"
             )
     written(*paths)
@@ -220,7 +220,7 @@ def _names(sensor: str, form: str = FigureFormat.png) -> tuple[str, ...]:
 
 
 def _identify(recording: Path, sensor: str, options: _Options) -> identification.NoiseFit:
-    """Identify one sensor, tell and write what was found."""
+    """Identify one sensor, print and write what was found."""
     import numpy as np
 
     from strapdown import allan as identification
@@ -325,7 +325,7 @@ def _plausible(recording: Path, sensor: str, source: GyroSamples) -> None:
 
 
 def _regressed(recording: Path, sensor: str, source: GyroSamples, order: int, out: Path, paths: list[Path]) -> Any:
-    """Return the samples without their dependence on temperature, which is told and written."""
+    """Return the samples without their dependence on temperature, which is printed and written."""
     import numpy as np
     import tomli_w
 

@@ -1,32 +1,43 @@
-"""What every command shares: the application, the two consoles, tables and progress."""
+"""What every command shares: the application, the two consoles, tables."""
 
 from __future__ import annotations
 
 import enum
+import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich import box
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    Task,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from rich.table import Table
 from rich.text import Text
+
+from strapdown.cli.progress import errors, progress_bar, rate_text
 
 if TYPE_CHECKING:
     from strapdown.recordings import Recording
     from strapdown.scenarios import Scenario
+
+__all__ = [
+    "app",
+    "console",
+    "counted",
+    "doubt",
+    "errors",
+    "json_target",
+    "need_own",
+    "progress_bar",
+    "put_json",
+    "rate_text",
+    "scenario_named",
+    "show",
+    "table",
+    "verdict",
+    "writable",
+    "written",
+]
 
 LARGEST_NUMBER = 1e30
 """No number of a scenario is larger in any unit that its file may use; beyond it squares and products leave the range of doubles."""
@@ -41,7 +52,6 @@ app = typer.Typer(
 )
 # Without markup, so that a file name in brackets is said as it is; a statement is one line, which the terminal wraps.
 console = Console(markup=False, highlight=False, soft_wrap=True)
-errors = Console(stderr=True, markup=False, highlight=False)
 
 
 class FigureFormat(enum.StrEnum):
@@ -62,47 +72,9 @@ Tables = Annotated[
 """Option of every command that prints the tables of a study."""
 
 
-def rate_text(speed: float) -> str:
-    """Return a rate in three digits or whole ones."""
-    return f"{speed:.0f}" if speed >= 100.0 else f"{speed:.3g}"
-
-
 def counted(number: int, what: str) -> str:
     """Return a number with what it counts, in the plural unless it is one."""
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
-
-
-class _Rate(ProgressColumn):
-    """Units a second."""
-
-    def __init__(self, unit: str) -> None:
-        super().__init__()
-        self._unit = unit
-
-    def render(self, task: Task) -> Text:
-        """Return the rate of the last while, or of the whole where it is finished."""
-        speed = task.finished_speed or task.speed
-        return Text("" if speed is None else f"{rate_text(speed)} {self._unit}")
-
-
-@contextmanager
-def progress_bar(what: str, total: int, *, rate: str = "") -> Iterator[Any]:
-    """Yield a function that advances a bar by so many units; on standard error, and only on a terminal.
-
-    With ``rate``, its unit, the bar tells how many units a second are done.
-    """
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        *([_Rate(rate)] if rate else []),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=errors, transient=True, disable=not errors.is_terminal) as progress:
-        task = progress.add_task(what, total=total)
-        yield lambda done: progress.advance(task, done)
 
 
 def table(title: str, *columns: str, left: int = 1) -> Table:
@@ -225,12 +197,35 @@ def doubt(source: Recording, path: Path) -> None:
     """Say where a recording seems not to be what it says: of all that is made of it, a wrong unit is the likeliest to be missed."""
     from strapdown import doctor
 
-    found = doctor.examine(source)
+    with progress_bar("trying conventions"):
+        found = doctor.examine(source)
     doubts = found.doubts
     if found.verdict == "wrong convention":
         doubts = (f"as it seems, {found.reason}",)
     for words in doubts:
         console.print(f"warning: {words}. See `strapdown doctor {path}`.")
+
+
+STANDARD_OUTPUT = Path("-")
+
+
+def json_target(json: Path | None, *sources: Path | None) -> None:
+    """Refuse a file for JSON that cannot be written; "-" is standard output, and what else is printed goes to standard error."""
+    if json == STANDARD_OUTPUT:
+        console.stderr = True
+    elif json is not None:
+        writable("json", json, suffixes=(".json",), sources=sources)
+
+
+def put_json(json: Path | None, content: Any) -> None:
+    """Write JSON where it was asked for."""
+    from strapdown.files import json_text, write_json
+
+    if json == STANDARD_OUTPUT:
+        sys.stdout.write(json_text(content))
+    elif json is not None:
+        write_json(json, content)
+        written(json)
 
 
 def written(*paths: Any) -> None:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
+from strapdown.cli.reading import Axes, Invert, told
 from strapdown.cli.terminal import (
     FigureFormat,
     Format,
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from strapdown.records import ImuRecord
     from strapdown.setup import FilterSetup
     from strapdown.tuning import Case, Comparison, Performance, Plan, TunedGate, Tuning, Unmodelled
+    from strapdown.tuning.fitting import Estimated
     from strapdown.tuning.parameters import Unit
 
 
@@ -43,7 +45,7 @@ PRIOR_FACTOR = 3.0
 MOST_EXAMINED = 4
 """Records that are looked at for what the tuned filter leaves unexplained."""
 WORSE = 1.05
-"""An attitude error on the data held out that has grown by more than this is told."""
+"""An attitude error on the data held out that has grown by more than this is reported."""
 
 
 @app.command()
@@ -65,14 +67,14 @@ def tune(
     ] = None,
     filter_file: Annotated[
         Path | None,
-        typer.Option("--filter", help="TOML with a table named filter to start from; else what the records tell."),
+        typer.Option(
+            "--filter", help="TOML with a table named filter to start from; by default one that matches the records."
+        ),
     ] = None,
     integration: Annotated[
         str | None, typer.Option(help="Integration algorithm (`strapdown algorithms`); the filter's if not given.")
     ] = None,
-    truth: Annotated[
-        bool, typer.Option("--truth", help="Tune by the errors against the truth, and how well the filter knows them.")
-    ] = False,
+    truth: Annotated[bool, typer.Option("--truth", help="Tune by the errors against the truth and their σ.")] = False,
     rmse: Annotated[
         bool,
         typer.Option(
@@ -83,7 +85,7 @@ def tune(
         bool,
         typer.Option(
             "--credibility",
-            help="Tune until the filter may be believed: the whole distribution of NIS, and whiteness; with --truth that of NEES.",
+            help="Tune for consistency: the whole distribution of NIS, and whiteness; with --truth that of NEES.",
         ),
     ] = False,
     gate: Annotated[
@@ -125,7 +127,8 @@ def tune(
     seed: Annotated[int, typer.Option(help="Of the random starts.")] = 0,
     threads: Annotated[int | None, typer.Option(help="Threads; one a core if not given.")] = None,
     plan: Annotated[
-        bool, typer.Option("--plan", help="Tell how well records will tell each parameter, before there are any.")
+        bool,
+        typer.Option("--plan", help="Predict how well records will determine each parameter, before there are any."),
     ] = False,
     length: Annotated[
         str | None,
@@ -136,76 +139,58 @@ def tune(
         str | None, typer.Option(help="Unit of a CSV file's accelerometer: m/s2 or g.")
     ] = None,
     time_unit: Annotated[str | None, typer.Option(help="Unit of a CSV file's time: s, ms, us or ns.")] = None,
+    axes: Axes = None,
+    invert: Invert = None,
     out: Annotated[
         Path, typer.Option("--out", "-o", help="TOML for --filter of other commands; JSON and figures go beside it.")
     ] = Path("filter.toml"),
     form: Format = FigureFormat.png,
     tables: Tables = None,
 ) -> None:
-    """Tune the filter by maximum likelihood, and tell how sure each parameter is."""
+    """Tune the filter by maximum likelihood, with an interval for each parameter."""
     import os
 
-    from strapdown import coning, tuning
-    from strapdown.checks import InputError, count, one_of
-    from strapdown.report import tunings
+    from strapdown import tuning
+    from strapdown.checks import count
     from strapdown.setup import read_setup
 
     workers = count("threads", threads if threads is not None else os.cpu_count() or 1)
     chosen = read_setup(filter_file) if filter_file is not None else None
-    algorithm = None
-    if integration is not None:
-        algorithm = coning.ALGORITHMS[one_of("integration", integration, coning.ALGORITHMS)]
-    names = None if free is None else [name.strip() for name in free.split(",") if name.strip()]
-    if states and chosen is not None:
-        raise InputError("--filter tells the filter's states itself, in [filter.states]; leave --states out")
-    if plan and (states or (chosen is not None and chosen.states is not None)):
-        raise InputError("--plan knows no optional states; leave --states away, and [filter.states] out of the filter")
+    algorithm = _algorithm(integration)
+    names = _names(free)
+    _check_states(chosen, states=states, plan=plan)
     if plan:
         _plan(records, chosen, algorithm, names, length, workers)
         return
+    goal = _Goal(
+        truth=truth,
+        rmse=rmse,
+        credibility=credibility,
+        gate=gate or any(name in tuning.GATED for name in names or []),
+        spacing=spacing,
+    )
     if length is not None:
-        raise InputError("--length is for --plan; the records' own length is taken")
+        raise _refusal("--length is for --plan; the records' own length is taken")
     count("seed", seed, least=0)
-    same = [
-        path
-        for k, path in enumerate(records)
-        if path.exists() and any(path.samefile(other) for other in records[:k] if other.exists())
-    ]
-    if same:
-        raise InputError(f"{same[0]} is given twice; a record counts once")
-    sources = (*records, filter_file)
-    writable("out", out, suffixes=(".toml",), sources=sources)
-    writable(
-        "out",
-        out.with_suffix(".json"),
-        *(out.with_name(f"{out.stem}-{name}.{form}") for name in FIGURES),
-        sources=sources,
-    )
-    tables_folder(tables)
-    report = out.with_suffix(".json")
-    for target in (out, report):
-        need_own(target, "tune", lambda _: bool(tunings.read(report)))
-    units = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
-    cases, believed, gyros = _cases(
-        records, chosen, filter_file, {name: unit for name, unit in units.items() if unit}, states=states
-    )
+    _check_files(records, filter_file, out, form, tables)
+    layout = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit, "axes": axes, "invert": invert}
+    cases, before, gyros = _cases(records, chosen, filter_file, layout, states=states)
     if algorithm is not None:
-        believed = replace(believed, integration=algorithm)
+        before = replace(before, integration=algorithm)
     train, held = (tuple(cases), ()) if holdout is None else tuning.split(cases, holdout, _by(holdout_by))
-    gate = gate or any(name in tuning.GATED for name in names or [])
     wanted = [name for name in names or [] if name not in tuning.GATED]
     wanted = wanted or list(tuning.default_names([case.record for case in cases]))
     if chosen is None or any(name.startswith(("gyro.", "filter.")) for name in wanted):
         tuning.one_gyro(gyros)
     if prior is None and prior_factor != PRIOR_FACTOR:
-        raise InputError("--prior-factor goes with --prior, the noise that it is about")
+        raise _refusal("--prior-factor goes with --prior, the noise that it is about")
     if names == []:
-        raise InputError(f"--free is {free!r} and names no parameter; name some, or leave it out")
+        raise _refusal(f"--free is {free!r} and names no parameter; name some, or leave it out")
     priors = {} if prior is None else _priors(prior, prior_factor, train[0].record, wanted)
     with progress_bar("searches, intervals", starts + len(wanted)) as advance:
         result, objective, found = tuning.tune(
             train,
-            believed,
+            before,
             wanted,
             priors=priors,
             starts=starts,
@@ -213,24 +198,14 @@ def tune(
             seed=seed,
             threads=workers,
             progress=advance,
-            gate=gate,
-            truth=truth,
-            rmse=rmse,
-            credibility=credibility,
-            spacing=spacing,
+            **goal._asdict(),
         )
-    comparison = tuning.compare(held, believed, result.setup, threads=workers) if held else None
-    if comparison is not None and gate:
+    with progress_bar("judging on the data held out"):
+        comparison = tuning.compare(held, before, result.setup, threads=workers) if held else None
+    if comparison is not None and goal.gate:
         likely = tuning.log_likelihood(held, objective, result)  # type: ignore[arg-type]
         comparison = replace(comparison, after=replace(comparison.after, log_likelihood=likely))
-    # What is looked for is what optional states are there for, and by filters that take one σ a sample.
-    suspects = train[:MOST_EXAMINED] if believed.states is None and not _differs_by_axis(train, result.setup) else ()
-    examined = []
-    with progress_bar("what is left unexplained", len(suspects)) as advance:
-        for case in suspects:
-            examined.append(tuning.unmodelled(case, result.setup))
-            advance(1)
-    worst = max(examined, key=lambda one: (one.moves_with_the_rate, one.suspected, len(one.failed)), default=None)
+    examined, worst = _examined(train, before, result)
     if worst is not None:
         result = tuning.doubted(result, worst)
     _tell(result, [case.record for case in cases], credible=credibility)
@@ -239,9 +214,7 @@ def tune(
     for sentence in () if worst is None else worst.words:
         console.print(sentence)
     if comparison is not None:
-        _tell_comparison(comparison, truth=bool(truth or rmse or credibility))
-    objective_name = "credibility" if credibility else "rmse" if rmse else "likelihood"
-    of = objective_name + (" of the errors" if truth else "")
+        _tell_comparison(comparison, truth=goal.by_errors or credibility)
     _write(
         out,
         result,
@@ -249,7 +222,7 @@ def tune(
         comparison,
         cases,
         records,
-        of=of,
+        of=goal.name,
         examined=examined,
         gate=found,
         form=form,
@@ -257,8 +230,87 @@ def tune(
     )
 
 
+class _Goal(NamedTuple):
+    """What the filter is tuned by; of nothing else by the likelihood of all innovations."""
+
+    truth: bool
+    rmse: bool
+    credibility: bool
+    gate: bool
+    spacing: float
+
+    @property
+    def by_errors(self) -> bool:
+        """Whether the errors against the truth count."""
+        return self.truth or self.rmse
+
+    @property
+    def name(self) -> str:
+        """What the result says."""
+        name = "credibility" if self.credibility else "rmse" if self.rmse else "likelihood"
+        return name + (" of the errors" if self.truth else "")
+
+
+def _refusal(words: str) -> Exception:
+    from strapdown.checks import InputError
+
+    return InputError(words)
+
+
+def _algorithm(name: str | None) -> Any:
+    from strapdown import coning
+    from strapdown.checks import one_of
+
+    return None if name is None else coning.ALGORITHMS[one_of("integration", name, coning.ALGORITHMS)]
+
+
+def _names(free: str | None) -> list[str] | None:
+    return None if free is None else [name.strip() for name in free.split(",") if name.strip()]
+
+
+def _check_states(chosen: FilterSetup | None, *, states: bool, plan: bool) -> None:
+    if states and chosen is not None:
+        raise _refusal("--filter holds the filter's states itself, in [filter.states]; leave --states out")
+    if plan and (states or (chosen is not None and chosen.states is not None)):
+        raise _refusal("--plan knows no optional states; leave --states away, and [filter.states] out of the filter")
+
+
+def _check_files(
+    records: Sequence[Path], filter_file: Path | None, out: Path, form: FigureFormat, tables: Path | None
+) -> None:
+    """Refuse a record that is given twice, and files that cannot be written or are not this command's."""
+    from strapdown.report import tunings
+
+    for k, path in enumerate(records):
+        if path.exists() and any(path.samefile(other) for other in records[:k] if other.exists()):
+            raise _refusal(f"{path} is given twice; a record counts once")
+    sources = (*records, filter_file)
+    report = out.with_suffix(".json")
+    writable("out", out, suffixes=(".toml",), sources=sources)
+    writable("out", report, *(out.with_name(f"{out.stem}-{name}.{form}") for name in FIGURES), sources=sources)
+    tables_folder(tables)
+    for target in (out, report):
+        need_own(target, "tune", lambda _: bool(tunings.read(report)))
+
+
+def _examined(train: Sequence[Case], before: FilterSetup, result: Tuning) -> tuple[list[Unmodelled], Unmodelled | None]:
+    """Return what the tuned filter leaves unexplained of each record, and the worst of it."""
+    from strapdown import tuning
+
+    # Optional states stand for just that; and the search knows one σ a sample.
+    looked = before.states is None and not _differs_by_axis(train, result.setup)
+    suspects = train[:MOST_EXAMINED] if looked else ()
+    examined = []
+    with progress_bar("what is left unexplained", len(suspects)) as advance:
+        for case in suspects:
+            examined.append(tuning.unmodelled(case, result.setup))
+            advance(1)
+    worst = max(examined, key=lambda one: (one.moves_with_the_rate, one.suspected, len(one.failed)), default=None)
+    return examined, worst
+
+
 def _differs_by_axis(cases: Sequence[Case], chosen: FilterSetup) -> bool:
-    """Return whether the filter believes a noise of a direction or whole vector that differs by axis."""
+    """Return whether the filter has a noise of a direction or whole vector that differs by axis."""
     series = [one for case in cases for one in case.record.vectors]
     return any(
         one.anisotropic or (one.kind != "attitude" and isinstance(chosen.sigma.get(one.sensor), tuple))
@@ -276,11 +328,11 @@ def _cases(
     paths: Sequence[Path],
     chosen: FilterSetup | None,
     filter_file: Path | None,
-    units: dict[str, str],
+    layout: dict[str, Any],
     *,
     states: bool,
 ) -> tuple[list[Case], FilterSetup, dict[str, GyroSpec]]:
-    """Return the records to tune on, the filter to start from, and the gyros of the records that tell theirs."""
+    """Return the records to tune on, the filter to start from, and the gyros of the records that hold theirs."""
     from strapdown import recordfiles, recordings, tuning
     from strapdown.checks import InputError
     from strapdown.cli.filters import filter_for, need_angles
@@ -293,9 +345,9 @@ def _cases(
             if chosen is None:
                 if file.gyro is None:
                     raise InputError(
-                        f"{path} does not tell its gyro; give a filter to start from, --filter filter.toml"
+                        f"{path} does not hold its gyro's specification; give a filter to start from, --filter filter.toml"
                     )
-                chosen, remarks = filter_for(path, file, None, None, () if states else None)
+                chosen, remarks = filter_for(path, file, None, None, () if states else False)
                 for remark in remarks:
                     console.print(remark)
             elif filter_file is not None:
@@ -306,7 +358,7 @@ def _cases(
         else:
             if states:
                 raise InputError(f"{path} is a recording, which specifies no errors; --states is for simulated records")
-            recording = recordings.read(path, units=units)
+            recording = recordings.read(path, **told(path, **layout))
             chosen = chosen or tuning.recording_setup()
             if recording.left_out_words:
                 console.print(recording.left_out_words)
@@ -339,14 +391,21 @@ def _figure(value: float) -> str:
     return f"{value:.3g}" if math.isfinite(value) else "∞"
 
 
+def _note(one: Estimated, unit: Unit) -> str:
+    """Return how well a parameter is known, in the unit that it is printed in."""
+    if one.identified or "prior" in one.note:
+        return one.note
+    if not math.isfinite(one.upper):
+        return "not identified: these records say nothing of it"
+    return f"not identified: at most {_figure(one.upper / unit.factor)} {unit.name} (95 %)"
+
+
 def _tell(result: Tuning, records: Sequence[ImuRecord], *, credible: bool) -> None:
     rows = table("Tuned, with 95 % intervals", "parameter", "unit", "before", "after", "from", "to", "", left=2)
     for one in result.parameters:
         unit = _unit_of(one.name, records)
-        told = [value / unit.factor for value in (one.start, one.value, one.lower, one.upper)]
-        bounded = f"not identified: < {_figure(told[3])} at 95 %" if math.isfinite(one.upper) else "not identified"
-        note = one.note if one.identified or "prior" in one.note else bounded
-        rows.add_row(one.name, unit.name, *(_figure(value) for value in told), note)
+        values = [value / unit.factor for value in (one.start, one.value, one.lower, one.upper)]
+        rows.add_row(one.name, unit.name, *(_figure(value) for value in values), _note(one, unit))
     show(rows)
     gain = result.before - result.after
     console.print(
@@ -355,8 +414,8 @@ def _tell(result: Tuning, records: Sequence[ImuRecord], *, credible: bool) -> No
     )
     if not all(one.identified for one in result.parameters):
         console.print(
-            "What is not identified has only a bound: these records are too short to say more. The filter takes the mean below it; --prior "
-            "holds it to what is known."
+            "Of a parameter that is not identified these records give an upper bound alone; the filter uses the value in the column "
+            "“after”, the mean below that bound. --prior gives it a prior instead."
         )
     if result.misfit and result.parameters[0].name == "filter.scale":
         console.print(
@@ -383,7 +442,7 @@ def _tell_gate(found: TunedGate) -> None:
 
 
 def _anees(one: Performance) -> str:
-    """Return the ANEES as a table tells it: of attitude and bias, or where only the attitude is known of that."""
+    """Return the ANEES as a table shows it: of attitude and bias, or where only the attitude is known of that."""
     import numpy as np
 
     if math.isfinite(one.anees):
@@ -400,7 +459,7 @@ def _tell_comparison(comparison: Comparison, *, truth: bool) -> None:
     )
     for name, one in (("before", comparison.before), ("after", comparison.after)):
         verdicts = [judgement.verdict for judgement in one.judgements]
-        told = (
+        answer = (
             verdicts[0] if len(set(verdicts)) == 1 else f"{verdicts.count('consistent')} of {len(verdicts)} consistent"
         )
         listing.add_row(
@@ -410,7 +469,7 @@ def _tell_comparison(comparison: Comparison, *, truth: bool) -> None:
             f"{one.nis_bounds[0]:.3f} to {one.nis_bounds[1]:.3f}",
             _anees(one),
             _figure(one.attitude_rms / DEGREE) if math.isfinite(one.attitude_rms) else "-",
-            told,
+            answer,
         )
     show(listing)
     console.print(f"{tunings.BOUNDS}.")
@@ -439,6 +498,7 @@ def _write(
     from strapdown import plots, tuning
     from strapdown.files import write_json, written_beside
     from strapdown.plots import tuning as drawing
+    from strapdown.report import tunings
     from strapdown.setup import to_toml
 
     with written_beside(out) as temporary:
@@ -453,6 +513,8 @@ def _write(
     own = [_unit_of(one.name, records) for one in result.parameters]
     content = _report(result, own, comparison, paths, of, examined, gate)
     write_json(report, content)
+    answer, reason, _ = tunings.verdict(content)
+    console.print(f"{answer}: {reason}.")
     figures = {places["likelihood"]: drawing.likelihood_slices(tuning.slices(objective, result), result, units)}
     if comparison is not None:
         figures[places["heldout"]] = drawing.before_and_after(
@@ -476,10 +538,15 @@ def _report(
     content: dict[str, Any] = {
         "records": [path.name for path in paths],
         "parameters": [
-            {**{key: number(value) for key, value in vars(one).items()}, "unit": unit.name, "si_per_unit": unit.factor}
+            {
+                **{key: number(value) for key, value in vars(one).items()},
+                "note": _note(one, unit),
+                "unit": unit.name,
+                "si_per_unit": unit.factor,
+            }
             for one, unit in zip(result.parameters, units, strict=True)
         ],
-        "units": "SI: rad, s, and the units of whole vectors; pages and tables tell each in its unit, of so much SI",
+        "units": "SI: rad, s, and the units of whole vectors; pages and tables give each in its unit, si_per_unit of it",
         "objective": {"name": of, "before": result.before, "after": result.after},
         "searches": {"number": len(result.starts), "at_the_best_point": result.agreeing},
         "innovations_fit": not result.misfit,
@@ -527,20 +594,22 @@ def _plan(
         file = recordfiles.read_record_file(path)
         source, example = file.record, file.record
         if chosen is None and file.gyro is None:
-            raise InputError(f"{path} does not tell its gyro; give the filter to plan with, --filter filter.toml")
-        believed = chosen or setup.matched_to_record(file.gyro, file.record)  # type: ignore[arg-type]
+            raise InputError(
+                f"{path} does not hold its gyro's specification; give the filter to plan with, --filter filter.toml"
+            )
+        modelled = chosen or setup.matched_to_record(file.gyro, file.record)  # type: ignore[arg-type]
         whole = float(file.record.time[-1] - file.record.time[0])
     else:
         source = scenarios.load_scenario(path)
-        believed = chosen or setup.matched(source)
+        modelled = chosen or setup.matched(source)
         example = scenarios.simulate(source)
         whole = source.duration
     if algorithm is not None:
-        believed = replace(believed, integration=algorithm)
+        modelled = replace(modelled, integration=algorithm)
     lengths = [whole] if length is None else _numbers(length)
     wanted = names or list(tuning.default_names([example]))
     with progress_bar("simulated records", 4) as advance:
-        found = tuning.plan(source, believed, wanted, lengths=lengths, threads=threads, progress=advance)
+        found = tuning.plan(source, modelled, wanted, lengths=lengths, threads=threads, progress=advance)
     _tell_plan(found, [example])
 
 

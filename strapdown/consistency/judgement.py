@@ -38,6 +38,9 @@ LEAST_SAMPLES = 50
 RESOLUTION = 1.5
 """A filter that passes is "consistent" if a σ wrong by this factor would have been seen; else nobody can tell."""
 
+STATES = ("attitude", "bias")
+"""States of every filter."""
+
 _TOO_SURE, _TOO_MODEST = "too sure of itself (optimistic)", "too modest (pessimistic)"
 
 
@@ -59,6 +62,8 @@ class Finding:
     """Samples that it rests on; effective ones where they are correlated."""
     degrees: int = 1
     """Degrees of freedom of one sample."""
+    epochs: int = 1
+    """Epochs of which the value is that of the worst (Bonferroni)."""
     rejected: bool = False
     """Whether it contradicts the filter after all findings are taken together (Holm)."""
     means: str = ""
@@ -70,7 +75,23 @@ class Finding:
         return self.name in _RATIOS
 
 
+_INNOVATIONS = "innovations of "
 _RATIOS = ("NIS", "NEES at the end", "time-averaged NEES", "ANEES")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Power:
+    """How wrong a σ must be for the tests to show it."""
+
+    of: str
+    """"innovations of SENSOR", or a state: "attitude", "bias", an error state."""
+    factor: float
+    """A σ too small or too large by this factor is found with a probability of about the verdict's; infinite where nothing tests it."""
+
+    @property
+    def seen(self) -> bool:
+        """Whether it is one that the verdict may speak of."""
+        return self.factor <= RESOLUTION
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,6 +106,15 @@ class Judgement(Listed):
     """What this evidence cannot show."""
     probability: float
     """Probability that a right filter is not called wrong, at least."""
+    power: tuple[Power, ...] = ()
+    """What the tests would have shown, of the innovations of each sensor and of each state."""
+    unmodelled: tuple[str, ...] = ()
+    """Specified errors that the filter has no state for."""
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """States of the filter."""
+        return tuple(one.of for one in self.power if not one.of.startswith(_INNOVATIONS))
 
     def listing(self) -> Listing:
         """Return the verdict and each statistic with its bounds, as a table.
@@ -136,10 +166,20 @@ class Judgement(Listed):
                 for one in self.findings
             ],
             "limits": list(self.limits),
+            "power": [{"of": one.of, "factor": plain(one.factor)} for one in self.power],
+            "unmodelled": list(self.unmodelled),
         }
 
 
-def judge(estimate: Estimate, truth: Truth | None = None, *, probability: float = 0.99) -> Judgement:
+def judge(
+    estimate: Estimate,
+    truth: Truth | None = None,
+    *,
+    probability: float = 0.99,
+    upper_bounds: bool = False,
+    error_states: Sequence[str] | None = None,
+    unmodelled: Sequence[str] = (),
+) -> Judgement:
     """Return the verdict on one run.
 
     Parameters
@@ -150,10 +190,19 @@ def judge(estimate: Estimate, truth: Truth | None = None, *, probability: float 
         Attitude and bias at the estimate's own times. Without it only the innovations are judged.
     probability : float, default 0.99
         A consistent filter is rejected with at most 1 − ``probability``, all tests together.
+    upper_bounds : bool, default False
+        The filter's noise covers disturbances that last over many samples, as that of :mod:`strapdown.ahrs` does: its innovations are
+        neither white nor as large as their variance, and only larger ones contradict it.
+    error_states : sequence of str, optional
+        Names of the filter's error states, where the estimate does not hold them.
+    unmodelled : sequence of str, default empty
+        Errors that are specified and that the filter has no state for (:func:`strapdown.setup.not_covered`); the verdict names them.
 
     Returns
     -------
     Judgement
+        Its ``power`` says for each state how wrong a σ the tests would have shown. An error state has no truth here, and is not
+        tested.
 
     Raises
     ------
@@ -186,7 +235,33 @@ def judge(estimate: Estimate, truth: Truth | None = None, *, probability: float 
         )
     else:
         findings += _of_errors(estimate, truth, probability, limits)
-    return concluded(findings, limits, probability)
+    if upper_bounds:
+        return _bounded(findings, limits, probability, unmodelled)
+    states = (*STATES, *(estimate.error_states if error_states is None else error_states))
+    return concluded(findings, limits, probability, states=states, unmodelled=unmodelled)
+
+
+def _bounded(
+    findings: Sequence[Finding], limits: Sequence[str], probability: float, unmodelled: Sequence[str]
+) -> Judgement:
+    """Return the verdict on a filter whose σ are upper bounds: one-sided, by ratios alone."""
+    ratios = [
+        replace(one, low=0.0, p_value=mean_p_value(one.value, one.degrees, one.samples) if one.value > 1.0 else 1.0)
+        for one in findings
+        if one.is_ratio
+    ]
+    judged = concluded(ratios, limits, probability, states=(), unmodelled=unmodelled)
+    errors_judged = any(one.name != "NIS" for one in ratios)
+    if judged.verdict == "not consistent" or not ratios:
+        return judged
+    sizes = ", ".join(f"{math.sqrt(one.value):.2g} σ of {one.of}" for one in ratios if one.name == "NIS")
+    reason = (
+        "the filter's σ are upper bounds, its noise covering disturbances that last, and nothing exceeds them"
+        f"{f' (RMS innovations {sizes})' if sizes else ''}"
+    )
+    if not errors_judged:
+        reason += "; the σ of attitude and bias are not tested without a truth"
+    return replace(judged, verdict="consistent" if errors_judged else "cannot tell", reason=reason, power=())
 
 
 def _of_sensor(sensor: str, white: Array, nis: Array, probability: float) -> list[Finding]:
@@ -358,9 +433,30 @@ def error_words(what: str, ratio: float) -> str:
     return f"{what} is smaller than the filter says (NEES {ratio:.4g} per state)"
 
 
-def concluded(findings: Sequence[Finding], limits: Sequence[str], probability: float) -> Judgement:
-    """Return the verdict that findings lead to, all taken together; what each was before, rejected or not, does not count."""
+def concluded(
+    findings: Sequence[Finding],
+    limits: Sequence[str],
+    probability: float,
+    *,
+    states: Sequence[str] = STATES,
+    needed: Sequence[str] = (),
+    unmodelled: Sequence[str] = (),
+) -> Judgement:
+    """Return the verdict that findings lead to, all taken together; what each was before, rejected or not, does not count.
+
+    Parameters
+    ----------
+    findings, limits, probability
+        As those of :class:`Judgement`.
+    states : sequence of str
+        States of the filter, whose power is told.
+    needed : sequence of str
+        Those of them whose σ the tests must be able to see for "consistent"; without any the sharpest test decides.
+    unmodelled : sequence of str
+        Errors that the filter has no state for.
+    """
     marked = holm(findings, 1.0 - probability)
+    power = powers(marked, probability, states)
     rejected = [finding for finding in marked if finding.rejected]
     verdict: Answer
     if rejected:
@@ -378,28 +474,75 @@ def concluded(findings: Sequence[Finding], limits: Sequence[str], probability: f
         reason = f"the filter is {leaning}; {len(rejected)} of {len(marked)} tests contradict it"
     elif not marked:
         verdict, reason = "cannot tell", "there is nothing to judge: no innovation, and no truth"
-    elif (seen := resolution(marked, probability)) > RESOLUTION:
-        verdict = "cannot tell"
-        reason = (
-            f"none of {len(marked)} tests contradicts the filter, but a σ wrong by a factor of {seen:.2g} would not be seen either: "
-            "too few samples"
-        )
     else:
-        verdict = "consistent"
-        reason = f"none of {len(marked)} tests contradicts the filter; a σ wrong by a factor of {seen:.3g} would have been seen"
+        sharpest = resolution(marked, probability)
+        unseen = [one.of for one in power if one.of in needed and not one.seen]
+        told = f"none of {len(marked)} tests contradicts the filter"
+        if sharpest > RESOLUTION:
+            verdict = "cannot tell"
+            reason = f"{told}, but a σ wrong by a factor of {sharpest:.2g} would not be seen either: too few samples"
+        else:
+            verdict = "cannot tell" if unseen else "consistent"
+            reason = f"{told}; {power_words(power)}"
+    if unmodelled:
+        reason += f"; the filter has no state for {', '.join(unmodelled)}"
     return Judgement(
-        verdict=verdict, reason=reason, findings=tuple(marked), limits=tuple(limits), probability=probability
+        verdict=verdict,
+        reason=reason,
+        findings=tuple(marked),
+        limits=tuple(limits),
+        probability=probability,
+        power=power,
+        unmodelled=tuple(unmodelled),
     )
+
+
+def powers(findings: Sequence[Finding], probability: float, states: Sequence[str]) -> tuple[Power, ...]:
+    """Return what the tests would have shown of a wrong σ: of the innovations of each sensor, and of each state."""
+    within = (1.0 - probability) / max(len(findings), 1)
+    best = {
+        **{f"{_INNOVATIONS}{one.of}": math.inf for one in findings if one.name == "NIS"},
+        **dict.fromkeys(states, math.inf),
+    }
+    for one in findings:
+        of = f"{_INNOVATIONS}{one.of}" if one.name == "NIS" else one.of
+        if one.is_ratio and of in best:
+            low, high = mean_bounds(one.degrees, one.samples, 1.0 - within / one.epochs)
+            best[of] = min(best[of], math.sqrt(high / low))
+    return tuple(Power(of=of, factor=factor) for of, factor in best.items())
+
+
+def power_words(power: Sequence[Power]) -> str:
+    """Return in words which wrong σ would have been seen, and which not."""
+    seen = [one for one in power if one.seen]
+    coarse = [one for one in power if not one.seen and math.isfinite(one.factor)]
+    untested = [one.of for one in power if math.isinf(one.factor)]
+    words = []
+    if seen:
+        words.append(
+            "a σ wrong by this factor would have been seen: "
+            + ", ".join(f"{math.ceil(100.0 * one.factor) / 100.0:g} of the {one.of}" for one in seen)
+        )
+    if coarse:
+        words.append(
+            "this cannot show the σ of the "
+            + ", ".join(f"{one.of} (only one wrong by a factor of {one.factor:.2g})" for one in coarse)
+        )
+    if untested:
+        words.append(
+            f"the σ of {', '.join(untested)} {'is' if len(untested) == 1 else 'are'} not tested: no truth for it"
+        )
+    return "; ".join(words)
 
 
 def resolution(findings: Iterable[Finding], probability: float) -> float:
     """Return the factor on σ that the sharpest of the findings tells from 1: the root of the ratio of its bounds, Bonferroni and all."""
     marked = list(findings)
-    within = 1.0 - (1.0 - probability) / max(len(marked), 1)
+    within = (1.0 - probability) / max(len(marked), 1)
     factors = [math.inf]
     for finding in marked:
         if finding.is_ratio and finding.samples > 1:
-            low, high = mean_bounds(finding.degrees, finding.samples, within)
+            low, high = mean_bounds(finding.degrees, finding.samples, 1.0 - within / finding.epochs)
             factors.append(math.sqrt(high / low))
     return min(factors)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -18,7 +18,15 @@ from strapdown.consistency.bounds import (
     mean_p_value,
     tail,
 )
-from strapdown.consistency.judgement import Finding, Judgement, concluded, error_words, innovation_words, state_name
+from strapdown.consistency.judgement import (
+    STATES,
+    Finding,
+    Judgement,
+    concluded,
+    error_words,
+    innovation_words,
+    state_name,
+)
 from strapdown.consistency.manifold import SUBSETS
 
 
@@ -74,7 +82,11 @@ EPOCHS = 20
 
 
 def judge_runs(
-    statistics: RunStatistics, *, epochs: Iterable[int] | None = None, probability: float = 0.99
+    statistics: RunStatistics,
+    *,
+    epochs: Iterable[int] | None = None,
+    probability: float = 0.99,
+    unmodelled: Sequence[str] = (),
 ) -> Judgement:
     """Return the verdict on independent runs.
 
@@ -86,10 +98,13 @@ def judge_runs(
         Indices of the epochs at which errors are judged. Default: 20 evenly spaced ones; the first, where all is prior, is left out.
     probability : float, default 0.99
         A consistent filter is rejected with at most 1 − ``probability``, all tests together.
+    unmodelled : sequence of str, default empty
+        Errors that are specified and that the filter has no state for; the verdict names them.
 
     Returns
     -------
     Judgement
+        "consistent" only where the runs would have shown a σ of attitude or bias wrong by :data:`.judgement.RESOLUTION`.
 
     Raises
     ------
@@ -123,6 +138,7 @@ def judge_runs(
                 p_value=verdict.p_value,
                 samples=runs,
                 degrees=len(states),
+                epochs=len(chosen),
                 means=error_words(f"the {subset} error at its worst epoch", value)
                 if failed == 0
                 else f"{failed} of {runs} runs failed: their {subset} error or covariance is not finite",
@@ -150,7 +166,7 @@ def judge_runs(
                 means=innovation_words(sensor, mean),
             )
         )
-    return concluded(findings, [], probability)
+    return concluded(findings, [], probability, needed=STATES, unmodelled=unmodelled)
 
 
 def _log_nees(statistics: RunStatistics, epochs: np.ndarray, column: int, subset: str, probability: float) -> Finding:

@@ -75,7 +75,9 @@ def diagnose(
         considered += conventions(model, base)
     considered.sort(key=lambda cause: (cause.log_p, -cause.gain))
     evidence = [*judgement.findings, *(cause.finding for cause in considered)]
-    together = consistency.concluded(evidence, judgement.limits, probability)
+    together = consistency.concluded(
+        evidence, judgement.limits, probability, states=judgement.states, unmodelled=judgement.unmodelled
+    )
     rejected = [finding.rejected for finding in together.findings[len(judgement.findings) :]]
     return Diagnosis(
         causes=tuple(cause for cause, significant in zip(considered, rejected, strict=True) if significant),

@@ -87,12 +87,16 @@ def _reasons(plan: Plan) -> Iterator[str]:
     for sensor in plan.scenario.sensors:
         if type(sensor) not in _SENSORS:
             yield f"{sensor.name}: a sensor of class {type(sensor).__name__} is not among the lanes' terms"
+        elif isinstance(sensor, AttitudeSensor) and sensor.covariance is not None:
+            yield f"{sensor.name}: a boresight that is no body axis is not among the lanes' terms"
         elif sensor.faults.latency > 0.0:  # type: ignore[attr-defined]
             yield f"{sensor.name}: latency is not among the lanes' terms"
         elif isinstance(plan.setup.sigma.get(sensor.name), tuple) and not isinstance(sensor, AttitudeSensor):
             yield f"{sensor.name}: a sigma of its own for each axis is not among the lanes' terms"
     if plan.setup.estimator != setup.MEKF:
         yield f"the estimator {plan.setup.estimator_name} is not among the lanes' terms"
+    if plan.individuals:
+        yield "gyro and sensors drawn anew for each run are not among the lanes' terms"
     for option in ("gate", "robust", "states"):
         if getattr(plan.setup, option, None) is not None:
             yield f"the filter's {option} option is not among the lanes' terms"

@@ -96,6 +96,9 @@ class Plan:
     nis_bins: int = 100
     """Equal spans of time over which NIS is summed."""
     dispersions: Dispersions = field(default_factory=Dispersions)
+    individuals: bool = False
+    """Whether each run draws its own gyro and sensors (:func:`strapdown.scenarios.drawn`): the errors of the specification are then
+    standard deviations, as a filter with states for them takes them. Without, every run meets exactly those errors."""
     precision: str = "float64"
     """In what the filter and the noise are computed: "float64", or "float32" on a machine that has it."""
 
@@ -135,6 +138,12 @@ class Plan:
         """Names of the sensors, in the scenario's order."""
         return tuple(sensor.name for sensor in self.scenario.sensors)
 
+    @property
+    def unmodelled(self) -> tuple[str, ...]:
+        """Errors, in words, that the scenario specifies and the filter has no state for."""
+        scenario = self.scenario
+        return setup.not_covered(scenario.gyro, scenario.sensors, self.setup.states, gravity_f=scenario.gravity_f)
+
     def to_table(self) -> dict[str, Any]:
         """Return the plan as a table of texts and numbers, by which plans are compared and from which ``from_table`` restores it.
 
@@ -150,6 +159,7 @@ class Plan:
             "nis_bins": self.nis_bins,
             "dispersions": self.dispersions.to_table(),
             "precision": self.precision,
+            **({"individuals": True} if self.individuals else {}),
         }
 
     @property
@@ -167,6 +177,7 @@ def from_table(table: Mapping[str, Any]) -> Plan:
         scenario=scenarios.scenario_from_toml(tomli_w.dumps(dict(table["scenario"]))),
         setup=setup.from_table(table["filter"]),
         dispersions=_dispersions(table["dispersions"], "dispersions"),
+        individuals=bool(table.get("individuals", False)),
         **{name: table[name] for name in ("seed", "epochs", "nis_bins", "precision")},
     )
 

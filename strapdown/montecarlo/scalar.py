@@ -31,7 +31,7 @@ from strapdown.montecarlo.statistics import (
 from strapdown.motion import Motion
 from strapdown.randomness import generator
 from strapdown.records import Estimate, ImuRecord
-from strapdown.scenarios import Scenario, simulate
+from strapdown.scenarios import Scenario, drawn, simulate
 from strapdown.setup import FilterSetup
 
 NAME = "scalar"
@@ -86,8 +86,9 @@ def record_of(plan: Plan, run: int) -> ImuRecord:
     if remembered is None:
         remembered = replace(plan.scenario, motion=_Remembered(plan.scenario.motion))
         _SCENARIOS[plan] = remembered
-    spec = dispersed(remembered.gyro, plan.dispersions, plan.seed, run)
-    return simulate(replace(remembered, gyro=spec), plan.seed, run)
+    one = drawn(remembered, plan.seed, run) if plan.individuals else remembered
+    spec = dispersed(one.gyro, plan.dispersions, plan.seed, run)
+    return simulate(replace(one, gyro=spec), plan.seed, run)
 
 
 class _Remembered:

@@ -24,7 +24,7 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
     statistics = held.statistics
     if statistics is None:
         raise InputError(f"{path} holds no finished run yet; let the campaign go on (--resume) and report then")
-    judgement = consistency.judge_runs(statistics, probability=probability)
+    judgement = consistency.judge_runs(statistics, probability=probability, unmodelled=held.plan.unmodelled)
     name = held.plan.scenario.name or "a scenario"
     unfinished = "" if held.finished else f"; not finished: {statistics.runs} of {held.runs} runs"
     content = page.page(
@@ -32,9 +32,6 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
         f"{statistics.runs} runs of {held.plan.scenario.duration:g} s, seed {held.plan.seed}, {len(statistics.time) - 1} epochs, machine: "
         f"{held.machine}{unfinished}; strapdown {held.version}",
         findings.verdict(judgement),
-        findings.without_a_state(held.plan.scenario, held.plan.setup.states, "montecarlo")
-        if judgement.verdict != "consistent"
-        else "",
         _numbers(statistics),
         findings.evidence(judgement),
         page.section(

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from strapdown import consistency, plots, quaternion, records, setup
-from strapdown.checks import InputError
+from strapdown import consistency, plots, quaternion, records
 from strapdown.plots.sphere import body_axis_path
 from strapdown.plots.style import AXES, angle_unit, rate_unit
 from strapdown.records import Estimate, Innovations, Truth
 from strapdown.report import findings, page
-from strapdown.scenarios import scenario_from_toml
 from strapdown.units import DEGREE
 
 _COLOURS = ("--a", "--b", "--c")
@@ -26,15 +23,15 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
     attributes = records.read_attributes(path)
     estimate = records.read_estimate(path)
     truth = records.read_truth(path)
-    judgement = consistency.judge(estimate, truth, probability=probability)
+    judgement = findings.judged(path, attributes, estimate, truth, probability=probability)
     span = estimate.time[-1] - estimate.time[0]
     used = sum(len(one.time) for one in estimate.innovations.values())
     content = page.page(
         f"Estimate: {path.name}",
-        f"{len(estimate.time)} states over {span:g} s, {used} measurements of {len(estimate.innovations)} sensors, "
+        f"{len(estimate.time)} states over {span:g} s, {used} measurements of {len(estimate.innovations)} "
+        f"sensor{'' if len(estimate.innovations) == 1 else 's'}, "
         f"{'with' if truth is not None else 'without'} truth; strapdown {attributes.get('version', '')}",
         findings.verdict(judgement),
-        without_a_state(path, attributes) if judgement.verdict != "consistent" else "",
         *(
             [page.section("What happened", *[page.paragraph(str(event)) for event in estimate.events])]
             if estimate.events
@@ -57,18 +54,6 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
         "judgement": judgement.summary(),
         "key_numbers": _key_numbers(estimate, truth),
     }
-
-
-def without_a_state(path: Path, attributes: Mapping[str, Any]) -> str:
-    """Return what the scenario of the record specifies and the filter has no state for; nothing where the file does not tell both."""
-    if "scenario" not in attributes or "filter" not in attributes:
-        return ""
-    try:
-        chosen = setup.from_toml(str(attributes["filter"]), f"{path}: filter")
-        scenario = scenario_from_toml(str(attributes["scenario"]), f"{path}: scenario")
-    except InputError:  # of another version, which wrote them otherwise
-        return ""
-    return findings.without_a_state(scenario, chosen.states, "estimate")
 
 
 def _key_numbers(estimate: Estimate, truth: Truth | None) -> dict[str, Any]:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from strapdown import setup
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from strapdown import consistency, setup
+from strapdown.checks import InputError
 from strapdown.consistency import Judgement
+from strapdown.records import Estimate, Truth
 from strapdown.report import page
-from strapdown.scenarios import Scenario
-from strapdown.setup.states import States
+from strapdown.scenarios import scenario_from_toml
 
 
 def verdict(judgement: Judgement) -> str:
@@ -43,10 +48,34 @@ def evidence(judgement: Judgement) -> str:
     return page.section("The evidence", *parts)
 
 
-def without_a_state(scenario: Scenario, states: States | None, command: str) -> str:
-    """Return the paragraph on what the scenario specifies and the filter has no state for; nothing where it has one for all."""
-    missing = setup.not_covered(scenario.gyro, scenario.sensors, states, gravity_f=scenario.gravity_f)
-    if not missing:
-        return ""
-    remedy = f"; `strapdown {command} --states` gives it states for most" if states is None else ""
-    return page.paragraph(f"The filter has no state for {', '.join(missing)}{remedy}.")
+def judged(
+    path: Path, attributes: Mapping[str, Any], estimate: Estimate, truth: Truth | None, *, probability: float
+) -> Judgement:
+    """Return the verdict on an estimate by what its file says of the filter beside it."""
+    states, unmodelled = _filter_of(path, attributes)
+    return consistency.judge(
+        estimate,
+        truth,
+        probability=probability,
+        upper_bounds="motion" in attributes,  # the estimate of a recording
+        error_states=states,
+        unmodelled=unmodelled,
+    )
+
+
+def _filter_of(path: Path, attributes: Mapping[str, Any]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the error states of the filter of an estimate, and the errors, in words, that its scenario specifies beside them.
+
+    Nothing where the file does not hold them, or holds them as another version wrote them.
+    """
+    if "filter" not in attributes:
+        return (), ()
+    try:
+        chosen = setup.from_toml(str(attributes["filter"]), f"{path}: filter")
+        states = () if chosen.states is None else chosen.states.names
+        if "scenario" not in attributes:
+            return states, ()
+        scenario = scenario_from_toml(str(attributes["scenario"]), f"{path}: scenario")
+    except InputError:
+        return (), ()
+    return states, setup.not_covered(scenario.gyro, scenario.sensors, chosen.states, gravity_f=scenario.gravity_f)

@@ -104,10 +104,10 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
     """Return the page and the statistics of a tuning's JSON; ``probability`` is that of the tuning's own verdicts, and not used."""
     content = read(path)
     held = content.get("held_out")
-    verdict = _verdict(held)
+    answer = verdict(content)
     toml = path.with_suffix(".toml")
     parts = [
-        page.verdict(*verdict),
+        page.verdict(*answer),
         page.section("Parameters", *_parameters(content)),
     ]
     if held:
@@ -125,7 +125,7 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
         f"{searches['number']} searches ended at the best point"
     )
     html = page.page(f"Tuning: {path.name}", subtitle, *parts)
-    return html, {"source": path.name, "judgement": {"verdict": verdict[0], "reason": verdict[1]}, "tuning": content}
+    return html, {"source": path.name, "judgement": {"verdict": answer[0], "reason": answer[1]}, "tuning": content}
 
 
 _FIGURES = {
@@ -154,10 +154,14 @@ def read(path: Path) -> dict[str, Any]:
     return content  # type: ignore[no-any-return]
 
 
-def _verdict(held: Any) -> tuple[str, str, list[str]]:
-    """Return the verdict on the tuned filter on held-out data: the worst of its judgements."""
+def verdict(content: dict[str, Any]) -> tuple[str, str, list[str]]:
+    """Return the verdict on the tuned filter, its reason, and what contradicts it: on held-out data the worst of its judgements.
+
+    Without such data it is that on the data that the filter was tuned on, which is said.
+    """
+    held = content.get("held_out")
     if not held:
-        return "cannot tell", "no data were held out to prove it on; tune with --holdout", []
+        return _on_its_own_data(content)
     after = held["after"]["judgements"]
     if not after:
         return "cannot tell", "the data held out were not judged", []
@@ -167,6 +171,18 @@ def _verdict(held: Any) -> tuple[str, str, list[str]]:
     if gain < 0.0:
         details.append("on the data held out the filter before was more likely: keep that one")
     return worst["verdict"], f"{worst['reason']}, on data that the tuning has not seen", details
+
+
+def _on_its_own_data(content: dict[str, Any]) -> tuple[str, str, list[str]]:
+    examined = content.get("unmodelled", [])
+    answers = [one.get("judgement", {}).get("verdict") for one in examined]
+    prove = "--holdout proves a tuning on data that it has not seen"
+    details = [words for one in examined for words in one["words"]]
+    if content.get("innovations_fit") is False or details:
+        return "not consistent", f"the tuned filter does not explain the data that it was tuned on; {prove}", details
+    if "cannot tell" in answers:
+        return "cannot tell", f"the data that the filter was tuned on are too few to judge it; {prove}", []
+    return "consistent", f"the tuned filter explains the data that it was tuned on; {prove}", []
 
 
 def _parameters(content: dict[str, Any]) -> list[str]:

@@ -265,7 +265,7 @@ _SENSORS: dict[str, tuple[type, Form, tables.Choice]] = {
             "name": tables.TEXT,
             "rate": tables.HERTZ,
             "phase": tables.SECONDS,
-            "boresight": tables.TEXT,
+            "boresight": tables.PLAIN,
             "sigma_across": tables.ARCSECONDS,
             "sigma_about": tables.ARCSECONDS,
         },

@@ -15,12 +15,13 @@ from strapdown.estimation.states import State
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Origin
+from strapdown.scenarios import Scenario
 from strapdown.setup import FilterSetup
 from strapdown.setup.states import States
 from strapdown.units import DEGREE
 from strapdown.wahba import InconsistentError
 
-__all__ = ["Start", "drawn_start", "matched_setup", "start", "unmodelled_errors"]
+__all__ = ["Start", "drawn_start", "matched_setup", "matched_to_scenario", "start", "unmodelled_errors"]
 
 UNEVEN = 2.0
 """Ratio of the largest to the smallest σ of an attitude above which both are reported."""
@@ -29,7 +30,11 @@ REMEDY = "give the initial attitude (--attitude, or --from-truth; initial= in Py
 
 
 def matched_setup(
-    record: ImuRecord, gyro: GyroSpec | None = None, *, states: bool | Sequence[str] = False
+    record: ImuRecord,
+    gyro: GyroSpec | None = None,
+    *,
+    states: bool | Sequence[str] | None = None,
+    smooth: bool = False,
 ) -> FilterSetup:
     """Return the filter setup that matches what a record specifies of its gyro and sensors.
 
@@ -39,9 +44,12 @@ def matched_setup(
         With its ``origin``, unless ``gyro`` is given.
     gyro : GyroSpec, optional
         Specification of the gyro, instead of that of ``record.origin``.
-    states : bool or sequence of str, default False
+    states : bool or sequence of str, optional
         True: with an error state for each error that the gyro and the sensors of the scenario are specified with; names such as
-        ``"gyro.scale"``: with these of them alone; False: attitude and gyro bias only.
+        ``"gyro.scale"``: with these of them alone; False: attitude and gyro bias only. Default: with all of them where an error is
+        specified that the filter would have no state for.
+    smooth : bool, default False
+        For a smoother: by default no state for gyro drifts, which smoothing does not have.
 
     Returns
     -------
@@ -58,8 +66,9 @@ def matched_setup(
         raise InputError(
             "the record does not specify its gyro; give the gyro's noise (--gyro; noise= in Python) or a filter (--filter; setup=)"
         )
-    if states is False:
-        return setup.matched_to_record(spec, record)
+    plain = setup.matched_to_record(spec, record)
+    if states is False or (states is None and not unmodelled_errors(record, plain)):
+        return plain
     if origin.scenario is None:
         chosen = setup.matched_to_record(spec, record, states=True)
     else:
@@ -68,9 +77,35 @@ def matched_setup(
             spec, record, states=True, sensors=scenario.sensors, gravity_f=scenario.gravity_f
         )
     optional = chosen.states or States()
-    if states is not True:
-        optional = optional.chosen(tuple(states))
-    return dataclasses.replace(chosen, states=optional if optional.names else None)
+    if states is None and smooth:
+        states = tuple(name for name in optional.names if name != "gyro.drift")
+    if states is not None and states is not True:
+        optional = optional.chosen(tuple(states)) if states else States()
+    if not optional.names:
+        return plain if smooth else dataclasses.replace(chosen, states=None)
+    if "gyro.drift" not in optional.names:  # flicker without a state is matched by the two noises
+        chosen = dataclasses.replace(chosen, process_noise=plain.process_noise)
+    return dataclasses.replace(chosen, states=optional)
+
+
+def matched_to_scenario(scenario: Scenario, *, states: bool | None = None) -> FilterSetup:
+    """Return the filter setup that matches a scenario.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    states : bool, optional
+        With an error state for each error that the scenario specifies, or without. Default: with them where there are such errors.
+
+    Returns
+    -------
+    FilterSetup
+    """
+    plain = setup.matched(scenario)
+    if states is None:
+        states = bool(setup.not_covered(scenario.gyro, scenario.sensors, gravity_f=scenario.gravity_f))
+    found = setup.matched(scenario, states=True) if states else plain
+    return plain if found.states is None or not found.states.names else found
 
 
 def unmodelled_errors(record: ImuRecord, chosen: FilterSetup) -> tuple[str, ...]:

@@ -77,12 +77,10 @@ def objective_for(
     """
     non_negative("spacing", spacing, unit="s")
     if rmse and truth:
-        raise InputError(
-            "--rmse and --truth both tell what of the errors against the truth is tuned by; give one of them"
-        )
+        raise InputError("--rmse and --truth both say which errors against the truth count; give one of them")
     if rmse and credibility:
         raise InputError(
-            "--rmse and --credibility ask for different filters: small errors, or believable ones; give one of them"
+            "--rmse and --credibility ask for different filters: small errors, or consistent ones; give one of them"
         )
     other = truth or rmse or credibility
     if spacing > 0.0 and other:

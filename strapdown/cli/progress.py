@@ -1,0 +1,194 @@
+"""Progress of what takes long: a bar on a terminal, a line every ten seconds elsewhere, and what is compiled; on standard error."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from threading import Event, Thread
+from typing import Any
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.text import Text
+
+errors = Console(stderr=True, markup=False, highlight=False)
+
+LINE_INTERVAL = 10.0
+"""Seconds between two lines off a terminal."""
+_POLL = 0.2
+
+_quiet = False
+
+
+def be_quiet() -> None:
+    """Show no progress from now on."""
+    global _quiet  # noqa: PLW0603 (one process runs one command)
+    _quiet = True
+
+
+def rate_text(speed: float) -> str:
+    """Return a rate in three digits or whole ones."""
+    return f"{speed:.0f}" if speed >= 100.0 else f"{speed:.3g}"
+
+
+class _Rate(ProgressColumn):
+    """Units a second."""
+
+    def __init__(self, unit: str) -> None:
+        super().__init__()
+        self._unit = unit
+
+    def render(self, task: Task) -> Text:
+        """Return the rate of the last while, or of the whole where it is finished."""
+        speed = task.finished_speed or task.speed
+        return Text("" if speed is None else f"{rate_text(speed)} {self._unit}")
+
+
+@contextmanager
+def progress_bar(what: str, total: int | None = None, *, rate: str = "") -> Iterator[Callable[[int], None]]:
+    """Yield a function that advances the progress by so many units.
+
+    Parameters
+    ----------
+    what : str
+        What is done.
+    total : int, optional
+        Units of it; without them only the time is shown.
+    rate : str
+        Unit of a rate that is shown, as runs/s.
+    """
+    if _quiet:
+        yield lambda done: None
+        return
+    ended = Event()
+    with _terminal(what, total, rate) if errors.is_terminal else _lines(what, total) as (advance, say):
+        watcher = Thread(target=_watch, args=(ended, say), daemon=True)
+        watcher.start()
+        try:
+            yield advance
+        finally:
+            ended.set()
+            watcher.join()
+            _compiling.current = ""
+
+
+Say = Callable[[str, float], None]
+"""Shows what is compiled, if anything, and the seconds gone."""
+
+
+@contextmanager
+def _terminal(what: str, total: int | None, rate: str) -> Iterator[tuple[Callable[[int], None], Say]]:
+    known = (MofNCompleteColumn(), *([_Rate(rate)] if rate else []))
+    columns = (TextColumn("{task.description}"), BarColumn(), *(known if total is not None else ()))
+    left = (TextColumn("left"), TimeRemainingColumn()) if total is not None else ()
+    with Progress(*columns, TimeElapsedColumn(), *left, console=errors, transient=True) as progress:
+        task = progress.add_task(what, total=total)
+
+        def say(compiling: str, seconds: float) -> None:
+            progress.update(task, description=compiling or what)
+
+        yield lambda done: progress.advance(task, done), say
+
+
+@contextmanager
+def _lines(what: str, total: int | None) -> Iterator[tuple[Callable[[int], None], Say]]:
+    done, told, announced = 0, LINE_INTERVAL, False
+
+    def advance(number: int) -> None:
+        nonlocal done
+        done += number
+
+    def say(compiling: str, seconds: float) -> None:
+        nonlocal told, announced
+        if compiling and not announced:
+            announced = True
+            errors.print("compiling for this machine, once: later runs start at once", soft_wrap=True)
+        if seconds >= told:
+            told += LINE_INTERVAL
+            share = "" if total is None else f" {done} of {total},"
+            errors.print(f"{compiling or what}:{share} {seconds:.0f} s", soft_wrap=True)
+
+    yield advance, say
+
+
+def _watch(ended: Event, say: Say) -> None:
+    """Show the progress until it ends."""
+    begin = time.monotonic()
+    while not ended.wait(_POLL):
+        _compiling.listen()
+        say(_compiling.current, time.monotonic() - begin)
+
+
+class _Compiling:
+    """What numba compiles, by its own events; nothing is imported for it."""
+
+    def __init__(self) -> None:
+        self.current = ""
+        self._listening = False
+        self._known: set[Any] = set()
+        self._left: set[Any] = set()
+
+    def listen(self) -> None:
+        """Listen as soon as numba is there."""
+        if self._listening or "numba.core.dispatcher" not in sys.modules:
+            return
+        from numba.core import event
+
+        owner = self
+
+        class Listener(event.Listener):  # type: ignore[misc]
+            def on_start(self, happened: Any) -> None:
+                owner.started(happened.data["dispatcher"])
+
+            def on_end(self, happened: Any) -> None:
+                owner.finished(happened.data["dispatcher"])
+
+        event.register("numba:compile", Listener())
+        self._listening = True
+
+    def started(self, dispatcher: Any) -> None:
+        """Take in a function that is being compiled, and all that it calls."""
+        self._left |= _called(dispatcher) - self._known
+        self._known |= self._left
+        self._say()
+
+    def finished(self, dispatcher: Any) -> None:
+        """Take in a function that is compiled."""
+        self._left.discard(dispatcher)
+        self._say()
+
+    def _say(self) -> None:
+        number = len(self._known)
+        done = number - len(self._left)
+        self.current = f"compiling, once: {done} of {number} functions" if self._left else ""
+
+
+def _called(dispatcher: Any) -> set[Any]:
+    """Return a compiled function and those that it names, directly or not."""
+    found: set[Any] = set()
+    open_ones = [dispatcher]
+    while open_ones:
+        one = open_ones.pop()
+        if hasattr(one, "py_func") and one not in found:
+            found.add(one)
+            open_ones += one.py_func.__globals__.values() if _is_twin(one) else []
+    return found
+
+
+def _is_twin(dispatcher: Any) -> bool:
+    """Return whether the function has globals of its own, those that it names (:mod:`strapdown.kernels.machine`)."""
+    return str(dispatcher.py_func.__module__).startswith("strapdown.kernels")
+
+
+_compiling = _Compiling()

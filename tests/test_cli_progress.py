@@ -1,0 +1,115 @@
+"""Progress: lines off a terminal, a bar on one, what is compiled, and silence where it is asked for."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+import time
+
+import pytest
+from rich.console import Console
+
+from strapdown.cli import progress
+
+
+@pytest.fixture
+def said(monkeypatch):
+    """Standard error as a file that is no terminal; lines come every tenth of a second."""
+    text = io.StringIO()
+    monkeypatch.setattr(progress, "errors", Console(file=text, markup=False, highlight=False, width=200))
+    monkeypatch.setattr(progress, "LINE_INTERVAL", 0.1)
+    monkeypatch.setattr(progress, "_POLL", 0.01)
+    monkeypatch.setattr(progress, "_quiet", False)
+    return text
+
+
+def lines_of(text: io.StringIO) -> list[str]:
+    return text.getvalue().splitlines()
+
+
+def test_a_line_tells_what_is_done_of_how_much(said):
+    with progress.progress_bar("runs", 30) as advance:
+        advance(10)
+        time.sleep(0.35)
+        advance(20)
+    lines = lines_of(said)
+    assert 2 <= len(lines) <= 4
+    assert all(line.startswith("runs: 10 of 30, ") for line in lines)
+
+
+def test_a_step_of_unknown_length_tells_its_time(said):
+    with progress.progress_bar("smoothing"):
+        time.sleep(0.15)
+    assert lines_of(said) == ["smoothing: 0 s"]
+
+
+def test_what_is_quick_says_nothing_and_quiet_says_nothing(said, monkeypatch):
+    with progress.progress_bar("quick", 1) as advance:
+        advance(1)
+    monkeypatch.setattr(progress, "_quiet", True)
+    with progress.progress_bar("long", 2):
+        time.sleep(0.15)
+    assert lines_of(said) == []
+
+
+def test_a_terminal_has_a_bar(monkeypatch):
+    text = io.StringIO()
+    monkeypatch.setattr(progress, "errors", Console(file=text, force_terminal=True, width=100))
+    monkeypatch.setattr(progress, "_quiet", False)
+    with progress.progress_bar("runs", 3, rate="runs/s") as advance:
+        advance(2)
+        time.sleep(0.3)
+    assert "2/3" in text.getvalue()
+
+
+def test_a_fault_ends_the_progress(said):
+    with pytest.raises(ZeroDivisionError), progress.progress_bar("runs", 3):
+        _ = 1 / 0
+    number = len(lines_of(said))
+    time.sleep(0.25)
+    assert len(lines_of(said)) == number
+
+
+def test_compiling_is_said_once_with_how_many_of_how_many(said):
+    numba = pytest.importorskip("numba")
+    progress._compiling.listen()
+    module = "strapdown.kernels.none"  # as machine.compiled binds them: each function's globals are those that it names
+    source = {"__name__": module}
+    exec("def inner(x):\n    return x + 1.5\n\ndef outer(x):\n    return inner(x) * 2.0\n", source)
+    source["inner"] = numba.njit(source["inner"])
+    seen = []
+    started, finished = progress._compiling.started, progress._compiling.finished
+    progress._compiling.started = lambda one: (started(one), seen.append(progress._compiling.current))
+    progress._compiling.finished = lambda one: (finished(one), seen.append(progress._compiling.current))
+    try:
+        with progress.progress_bar("filtering"):
+            assert numba.njit(source["outer"])(1.0) == 5.0
+    finally:
+        del progress._compiling.started, progress._compiling.finished
+    assert [one.partition("once: ")[2].split(" of ")[0] for one in seen if one] == ["0", "0", "1"]
+    assert all(one.endswith(" functions") for one in seen if one)
+    assert seen[-1] == ""
+    assert lines_of(said)[:1] == ["compiling for this machine, once: later runs start at once"]
+
+
+def test_quiet_may_stand_anywhere(run, monkeypatch):
+    heard = []
+    for arguments in (("scenarios", "--quiet"), ("--quiet", "scenarios"), ("scenarios",)):
+        monkeypatch.setattr(progress, "_quiet", False)
+        assert run(*arguments)[0] == 0
+        heard.append(progress._quiet)
+    assert heard == [True, True, False]
+    assert sys.argv[-1] == "scenarios"
+
+
+def test_json_on_standard_output_is_all_that_is_there(run, tmp_path):
+    (tmp_path / "lines.csv").write_text("frequency_hz,angle_deg\n10,0.1\n", encoding="utf-8")
+    status, said, other = run(
+        "coning-budget", "--psd", "lines.csv", "--rate", 100, "--algorithm", "one-sample", "--json", "-"
+    )
+    assert status == 0
+    assert json.loads(said)["lines"] == 1
+    assert "Drift about the third axis" in other
+    assert not (tmp_path / "-").exists()
+    assert "Drift about the third axis" in run("coning-budget", "--psd", "lines.csv", "--rate", 100)[1]
