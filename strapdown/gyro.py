@@ -100,7 +100,8 @@ class GyroSpec(ByValue):
     rate_random_walk : float or ndarray (3,), default 0.0
         Rate random walk σ_u (K), rad/s/√s, of the bias, from 0 at the first edge.
     bias_instability : float or ndarray (3,), default 0.0
-        Bias instability B, rad/s: flicker of two-sided PSD B²/(2π f), stationary from the first sample; the floor of the Allan deviation is 0.664 B.
+        Bias instability B, rad/s: flicker of two-sided PSD B²/(2π f), stationary from the first sample; the
+        floor of the Allan deviation is 0.664 B.
     quantization : float or ndarray (3,), default 0.0
         Quantisation Q, rad: the increments are whole multiples of Q√12 and the remainder is carried to the next, which gives 3Q²/τ².
     rate_ramp : float or ndarray (3,), default 0.0
