@@ -237,7 +237,7 @@ def test_a_lost_start_is_recovered_from_and_all_states_are_to_be_believed(case, 
         assert event.end <= 1.2 + 1e-9
         assert event.value >= 10
         assert event.sensor in CASES[case][0]
-        assert f"measurements of {event.sensor} in a row were refused" in str(event)
+        assert f"measurements of {event.sensor} in a row were rejected" in str(event)
     assert_consistent(case, mean, runs)
 
 

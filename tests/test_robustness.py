@@ -291,7 +291,7 @@ def test_a_filter_that_believes_far_too_little_noise_says_that_it_is_locked_out(
     assert {event.sensor for event in told} == {"a", "b"}
     assert sum(estimate.refused.values()) > 1000
     assert sum(event.value for event in told) > 0.9 * sum(estimate.refused.values())
-    assert f"measurements of {told[0].sensor} were refused" in str(told[0])
+    assert f"measurements of {told[0].sensor} were rejected" in str(told[0])
     if not recoveries(estimate):
         assert estimation.smooth(believed, NOISE, started(record, 0), gate=Gate()).events == estimate.events
 
@@ -571,7 +571,7 @@ def test_a_recovery_is_told_in_the_file(tmp_path):
     for sensor, innovations in estimate.innovations.items():
         assert np.array_equal(back.innovations[sensor].weight, innovations.weight)
         assert back.refused[sensor] == innovations.refused > 0
-    assert "in a row were refused" in str(next(event for event in back.events if event.kind == "recovery"))
+    assert "in a row were rejected" in str(next(event for event in back.events if event.kind == "recovery"))
 
 
 # ------------------------------------------------------------------------------------------------------------------- robust updates

@@ -277,10 +277,10 @@ ATTITUDES = {
         ({"sigma": [0.1, 0.1, 0.1, np.nan, 0.1]}, r"s: sigma\[3\] is nan at a measured value"),
         ({"sigma": [0.1, 0.1, 0.1, np.inf, 0.1]}, r"s: sigma\[3\] is inf"),
         ({"sigma": 0.0, "sigma_axes": np.diag([1.0] * 5)[:, :3] * np.nan}, r"s: sigma_axes\[0\] is nan"),
-        ({"sigma": 0.0, "covariance": np.full((5, 3, 3), np.nan)}, r"s: covariance\[0\] is nan beside"),
+        ({"sigma": 0.0, "covariance": np.full((5, 3, 3), np.nan)}, r"s: covariance\[0\] is nan at"),
         ({"sigma": 0.0, "covariance": np.full((3, 3), np.nan)}, r"s: covariance\[0, 0\] is nan"),
-        ({"reference_f": np.vstack([np.eye(3), np.full((2, 3), np.nan)])}, r"s: reference_f\[3\] is nan beside"),
-        ({"arrival": [0.0, 1.0, np.nan, 3.0, 4.0]}, r"s: arrival\[2\] is nan beside"),
+        ({"reference_f": np.vstack([np.eye(3), np.full((2, 3), np.nan)])}, r"s: reference_f\[3\] is nan at"),
+        ({"arrival": [0.0, 1.0, np.nan, 3.0, 4.0]}, r"s: arrival\[2\] is nan at"),
     ],
 )
 def test_what_does_not_fit_the_samples_is_named(change, message):
