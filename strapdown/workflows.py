@@ -32,7 +32,7 @@ from strapdown import (
     scenarios,
 )
 from strapdown import setup as setups
-from strapdown.checks import Array, InputError, count, one_of
+from strapdown.checks import Array, InputError, count, instance, one_of
 from strapdown.consistency import Judgement
 from strapdown.covariance import Analysis, Consider
 from strapdown.estimation.gating import Gate, Robust
@@ -71,6 +71,7 @@ __all__ = [
     "write",
 ]
 
+SOURCE = "give an ImuRecord or a Recording, as simulate and read return them"
 SAME_STAMP = 1e-9
 """Largest difference of two stamps of one epoch, s."""
 
@@ -111,6 +112,9 @@ def simulate(scenario: Scenario | str | os.PathLike[str], *, seed: int | None = 
 
 
 def _scenario(given: Scenario | str | os.PathLike[str]) -> Scenario:
+    instance(
+        "scenario", given, (Scenario, str, os.PathLike), "give a Scenario, a built-in name, or the path of a TOML file"
+    )
     return given if isinstance(given, Scenario) else scenarios.load_scenario(given)
 
 
@@ -195,6 +199,8 @@ def write(
     >>> import strapdown as sd
     >>> sd.write(estimate, "walk-angles.csv", sequence="ZYX")  # doctest: +SKIP
     """
+    kinds = (ImuRecord, Recording, Estimate, Scenario, FilterSetup)
+    instance("content", content, kinds, "give one of these")
     if isinstance(content, (Scenario, FilterSetup)):
         if Path(path).suffix.lower() != ".toml" or options:
             raise InputError(
@@ -371,10 +377,7 @@ def estimate(
             smooth=smooth,
         )
         return found.estimate
-    if not isinstance(source, ImuRecord):
-        raise InputError(
-            f"source is {type(source).__name__}; give an ImuRecord or a Recording, as simulate and read return them"
-        )
+    instance("source", source, ImuRecord, SOURCE)
     _refuse("a recording", motion=motion, latency=latency, calibration=calibration)
     chosen = _record_setup(source, noise, setup, initial, states)
     changed = {name: value for name, value in (("gate", gate), ("robust", robust)) if value is not None}
@@ -441,6 +444,7 @@ def _record_setup(
     states: bool | Sequence[str],
 ) -> FilterSetup:
     if setup is not None:
+        instance("setup", setup, FilterSetup, "give a FilterSetup, as setup.matched or tune returns it")
         _refuse("the scenario's own filter, and setup is a whole one", noise=noise, states=states or None)
         return setup
     if not isinstance(noise, ProcessNoise):
@@ -498,6 +502,7 @@ def integrate(
     >>> found = sd.integrate(sd.simulate("coning"))  # doctest: +SKIP
     """
     chosen = coning.named(algorithm)
+    instance("source", source, (ImuRecord, Recording), SOURCE)
     if isinstance(source, ImuRecord):
         time, increments = source.time, source.increments
         known, place = None if source.truth is None else source.truth.attitude, "the record"
@@ -574,6 +579,8 @@ def _truth_at(result: Estimate, truth: Truth | ImuRecord | None) -> Truth | None
         if np.max(np.abs(truth.time[rows] - result.time)) > SAME_STAMP:
             raise InputError("the record has other stamps than the estimate, which was made from another record")
         return Truth(attitude=truth.truth.attitude[rows], bias=truth.truth.bias[rows])
+    if truth is not None:
+        instance("truth", truth, Truth, "give the record, or a Truth at the epochs of the estimate")
     if truth is not None and len(truth.attitude) != len(result.time):
         raise InputError(
             f"truth has {len(truth.attitude)} epochs and the estimate {len(result.time)}; give the record, whose stamps are matched"
@@ -773,9 +780,11 @@ def tune(
     """
     from strapdown import tuning
 
-    given = [sources] if isinstance(sources, (ImuRecord, Recording)) else list(sources)
+    given = [sources] if isinstance(sources, (ImuRecord, Recording, str, os.PathLike)) else list(sources)
     if not given:
         raise InputError("sources is empty; give a record or recording at least")
+    for one in given:
+        instance("sources", one, (ImuRecord, Recording), SOURCE)
     tuning.one_gyro(
         {
             f"record {k}": one.origin.gyro
