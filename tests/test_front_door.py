@@ -6,6 +6,7 @@ import ast
 import dataclasses
 import importlib
 import math
+import os
 import subprocess
 import sys
 import types
@@ -502,3 +503,28 @@ def test_a_simulation_loads_neither_compiler_nor_plots():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
     assert done.stdout.split() == ["set()"]
+
+
+# ----------------------------------------------------------------------------------------------------------------- the program
+
+
+def test_python_dash_m_is_the_program():
+    done = subprocess.run(
+        [sys.executable, "-m", "strapdown", "--version"], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stdout.split() == ["strapdown", sd.__version__]
+
+
+def test_shells_complete_commands():
+    """As a shell asks: the words so far in the environment, the program's own name before them."""
+    words = {"_STRAPDOWN_COMPLETE": "complete_bash", "COMP_WORDS": "strapdown mon", "COMP_CWORD": "1"}
+    code = "import sys; sys.argv = ['strapdown']; from strapdown.__main__ import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+        env={**os.environ, **words},
+    )
+    assert done.stdout.split() == ["montecarlo"]
