@@ -7,6 +7,7 @@ is the place for more options: :mod:`strapdown.estimation` and :mod:`strapdown.s
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import os
@@ -183,6 +184,7 @@ def write(
     Parameters
     ----------
     content : ImuRecord, Recording, Estimate, Scenario or FilterSetup
+        A record's file holds its origin too, without a scenario of which a part is a Python function or class of your own.
     path : path
         The ending names the format: ``.h5`` or ``.csv`` of a record, ``.toml`` of a scenario or a filter setup,
         and :func:`strapdown.recordings.writers` lists those of recordings and estimates.
@@ -218,7 +220,10 @@ def write(
 def _write_record(record: ImuRecord, path: Path, options: Mapping[str, Any]) -> None:
     origin = record.origin or Origin()
     writer = recordfiles.export_csv if path.suffix.lower() == ".csv" else recordfiles.write_record
-    scenario = "" if origin.scenario is None else scenarios.scenario_to_toml(origin.scenario)
+    scenario = ""
+    if origin.scenario is not None:
+        with contextlib.suppress(InputError):  # a motion or a field of one's own has no form in a file
+            scenario = scenarios.scenario_to_toml(origin.scenario)
     writer(path, record, gyro_spec=origin.gyro, scenario=scenario, seed=origin.seed, run=origin.run, **options)
 
 

@@ -227,6 +227,29 @@ def test_monte_carlo_is_that_of_the_command(tmp_path):
     assert not np.array_equal(call.nees_sum, sd.monte_carlo(scenario(10.0), seed=0, runs=10, threads=1).nees_sum)
 
 
+@pytest.mark.parametrize("machine", ["lanes", "scalar"])
+def test_a_replayed_run_is_a_record_like_any_other(tmp_path, machine):
+    plan = sd.montecarlo.Plan(scenario=scenario(10.0), setup=sd.setup.matched(scenario(10.0)), seed=5, epochs=10)
+    found = sd.montecarlo.replay(plan, 2, machine=machine)
+    sd.write(found.record, tmp_path / "run.h5")
+    origin = sd.read(tmp_path / "run.h5").origin
+    assert (origin.scenario, origin.seed, origin.run) == (scenario(10.0), 5, 2)
+    assert len(sd.estimate(found.record).time) == len(found.record.time)
+
+
+def test_a_record_of_a_motion_of_ones_own_is_written_without_its_scenario(tmp_path):
+    class Own(sd.motion.ConstantRate):
+        pass
+
+    made = dataclasses.replace(scenario(5.0), motion=Own(rate=(0.0, 0.0, 0.1)))
+    record = sd.simulate(made)
+    sd.write(record, tmp_path / "own.h5")
+    again = sd.read(tmp_path / "own.h5")
+    assert again.origin.scenario is None
+    assert again.origin.gyro == made.gyro
+    np.testing.assert_array_equal(sd.estimate(again).attitude, sd.estimate(record).attitude)
+
+
 def test_tune_is_that_of_the_command(tmp_path):
     sd.write(sd.simulate(scenario(60.0)), tmp_path / "record.h5")
     options = ("--free", "star 1.sigma", "--starts", "2", "--threads", "1", "--out", tmp_path / "filter.toml")
