@@ -228,10 +228,11 @@ def one_of(name: str, value: str, choices: Iterable[str]) -> str:
     raise InputError(f"{name} {value!r} is not known{hint} (known: {', '.join(known)})")
 
 
-def instance(name: str, value: object, wanted: type, remedy: str) -> None:
-    """Refuse a value that is not of a class; ``remedy`` says how to come by one."""
+def instance(name: str, value: object, wanted: type | tuple[type, ...], remedy: str) -> None:
+    """Refuse a value that is not of a class, or of one of several; ``remedy`` says how to come by one."""
     if not isinstance(value, wanted):
-        raise InputError(f"{name} is {reprlib.repr(value)}, not of class {wanted.__name__}; {remedy}")
+        classes = " or ".join(one.__name__ for one in (wanted if isinstance(wanted, tuple) else (wanted,)))
+        raise InputError(f"{name} is {reprlib.repr(value)}, not of class {classes}; {remedy}")
 
 
 def known_keys(place: str, given: Iterable[str], known: Iterable[str]) -> None:

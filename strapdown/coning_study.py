@@ -61,7 +61,9 @@ class ConingParameters:
     duration: float = 240.0
     """Length of each run, s; rounded to whole epochs."""
     runs: int = 100
+    """Runs of the Monte Carlo."""
     seed: int = 1
+    """Of the Monte Carlo."""
     angle_random_walk: float = 0.08 * DEGREE_PER_ROOT_HOUR
     """rad/√s."""
     rate_random_walk: float = 1.0 * DEGREE_PER_HOUR_PER_ROOT_HOUR
@@ -218,8 +220,11 @@ class ConingStudy:
     """Result of the study."""
 
     parameters: ConingParameters
+    """What was studied."""
     drifts: tuple[Drift, ...]
+    """Drift by algorithm, measured and predicted."""
     outcomes: tuple[FilterOutcome, ...]
+    """The filter on the increments of each algorithm."""
 
     def summary(self) -> dict[str, Any]:
         """Return the study as ``coning.json`` holds it: degrees, hours, arcseconds, with the unit in each key.

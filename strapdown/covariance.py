@@ -68,7 +68,7 @@ def _no_sensors() -> dict[str, float]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Consider(ByValue):
-    """Errors that neither the scenario nor the filter knows of: one standard deviation each, independent on every axis."""
+    """Errors beyond the scenario and the filter's model: one standard deviation each, independent on every axis."""
 
     scale_factor: float = 0.0
     """Of the gyro's three scale factors, dimensionless."""

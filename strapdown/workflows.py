@@ -7,6 +7,7 @@ is the place for more options: :mod:`strapdown.estimation` and :mod:`strapdown.s
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import os
@@ -32,7 +33,7 @@ from strapdown import (
     scenarios,
 )
 from strapdown import setup as setups
-from strapdown.checks import Array, InputError, count, one_of
+from strapdown.checks import Array, InputError, count, instance, one_of
 from strapdown.consistency import Judgement
 from strapdown.covariance import Analysis, Consider
 from strapdown.estimation.gating import Gate, Robust
@@ -71,6 +72,7 @@ __all__ = [
     "write",
 ]
 
+SOURCE = "give an ImuRecord or a Recording, as simulate and read return them"
 SAME_STAMP = 1e-9
 """Largest difference of two stamps of one epoch, s."""
 
@@ -111,6 +113,9 @@ def simulate(scenario: Scenario | str | os.PathLike[str], *, seed: int | None = 
 
 
 def _scenario(given: Scenario | str | os.PathLike[str]) -> Scenario:
+    instance(
+        "scenario", given, (Scenario, str, os.PathLike), "give a Scenario, a built-in name, or the path of a TOML file"
+    )
     return given if isinstance(given, Scenario) else scenarios.load_scenario(given)
 
 
@@ -179,6 +184,7 @@ def write(
     Parameters
     ----------
     content : ImuRecord, Recording, Estimate, Scenario or FilterSetup
+        A record's file holds its origin too, without a scenario of which a part is a Python function or class of your own.
     path : path
         The ending names the format: ``.h5`` or ``.csv`` of a record, ``.toml`` of a scenario or a filter setup,
         and :func:`strapdown.recordings.writers` lists those of recordings and estimates.
@@ -195,6 +201,8 @@ def write(
     >>> import strapdown as sd
     >>> sd.write(estimate, "walk-angles.csv", sequence="ZYX")  # doctest: +SKIP
     """
+    kinds = (ImuRecord, Recording, Estimate, Scenario, FilterSetup)
+    instance("content", content, kinds, "give one of these")
     if isinstance(content, (Scenario, FilterSetup)):
         if Path(path).suffix.lower() != ".toml" or options:
             raise InputError(
@@ -212,7 +220,10 @@ def write(
 def _write_record(record: ImuRecord, path: Path, options: Mapping[str, Any]) -> None:
     origin = record.origin or Origin()
     writer = recordfiles.export_csv if path.suffix.lower() == ".csv" else recordfiles.write_record
-    scenario = "" if origin.scenario is None else scenarios.scenario_to_toml(origin.scenario)
+    scenario = ""
+    if origin.scenario is not None:
+        with contextlib.suppress(InputError):  # a motion or a field of one's own has no form in a file
+            scenario = scenarios.scenario_to_toml(origin.scenario)
     writer(path, record, gyro_spec=origin.gyro, scenario=scenario, seed=origin.seed, run=origin.run, **options)
 
 
@@ -371,10 +382,7 @@ def estimate(
             smooth=smooth,
         )
         return found.estimate
-    if not isinstance(source, ImuRecord):
-        raise InputError(
-            f"source is {type(source).__name__}; give an ImuRecord or a Recording, as simulate and read return them"
-        )
+    instance("source", source, ImuRecord, SOURCE)
     _refuse("a recording", motion=motion, latency=latency, calibration=calibration)
     chosen = _record_setup(source, noise, setup, initial, states, smooth=smooth)
     changed = {name: value for name, value in (("gate", gate), ("robust", robust)) if value is not None}
@@ -443,6 +451,7 @@ def _record_setup(
     smooth: bool,
 ) -> FilterSetup:
     if setup is not None:
+        instance("setup", setup, FilterSetup, "give a FilterSetup, as setup.matched or tune returns it")
         _refuse("the scenario's own filter, and setup is a whole one", noise=noise, states=states or None)
         return setup
     if not isinstance(noise, ProcessNoise):
@@ -500,6 +509,7 @@ def integrate(
     >>> found = sd.integrate(sd.simulate("coning"))  # doctest: +SKIP
     """
     chosen = coning.named(algorithm)
+    instance("source", source, (ImuRecord, Recording), SOURCE)
     if isinstance(source, ImuRecord):
         time, increments = source.time, source.increments
         known, place = None if source.truth is None else source.truth.attitude, "the record"
@@ -576,6 +586,8 @@ def _truth_at(result: Estimate, truth: Truth | ImuRecord | None) -> Truth | None
         if np.max(np.abs(truth.time[rows] - result.time)) > SAME_STAMP:
             raise InputError("the record has other stamps than the estimate, which was made from another record")
         return Truth(attitude=truth.truth.attitude[rows], bias=truth.truth.bias[rows])
+    if truth is not None:
+        instance("truth", truth, Truth, "give the record, or a Truth at the epochs of the estimate")
     if truth is not None and len(truth.attitude) != len(result.time):
         raise InputError(
             f"truth has {len(truth.attitude)} epochs and the estimate {len(result.time)}; give the record, whose stamps are matched"
@@ -778,9 +790,11 @@ def tune(
     """
     from strapdown import tuning
 
-    given = [sources] if isinstance(sources, (ImuRecord, Recording)) else list(sources)
+    given = [sources] if isinstance(sources, (ImuRecord, Recording, str, os.PathLike)) else list(sources)
     if not given:
         raise InputError("sources is empty; give a record or recording at least")
+    for one in given:
+        instance("sources", one, (ImuRecord, Recording), SOURCE)
     tuning.one_gyro(
         {
             f"record {k}": one.origin.gyro

@@ -47,7 +47,6 @@ MOST_MEASUREMENTS = 1e8
 app = typer.Typer(
     help="Strapdown gyro attitude estimation: simulate, estimate, judge.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 # Without markup, so that a file name in brackets is said as it is; a statement is one line, which the terminal wraps.

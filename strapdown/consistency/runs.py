@@ -109,7 +109,7 @@ def judge_runs(
     Raises
     ------
     InputError
-        If an epoch is none of the statistics', or the probability is not between 0 and 1.
+        If the probability is not between 0 and 1.
     """
     tail(probability)
     last = len(statistics.finite) - 1

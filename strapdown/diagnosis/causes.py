@@ -29,6 +29,7 @@ class Cause:
     standard_error: Array
     """Of θ (k,); NaN where there is none."""
     unit: str
+    """SI unit of θ."""
     gain: float
     """Twice the log-likelihood gained."""
     log_p: float

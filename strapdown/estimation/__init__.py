@@ -26,6 +26,7 @@ tangent space.
     Other filters on the same interface, for comparison.
 """
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from strapdown.estimation.forward import gaps as gaps
@@ -54,6 +55,8 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
+    from strapdown.estimation import filters as filters
+    from strapdown.estimation import multiple_model as multiple_model
     from strapdown.estimation.step_filter import StepFilter
 
 
@@ -62,4 +65,6 @@ def __getattr__(name: str) -> Any:
         from strapdown.estimation.step_filter import StepFilter
 
         return StepFilter
+    if name in ("filters", "multiple_model"):
+        return import_module(f"{__name__}.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

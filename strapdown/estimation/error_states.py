@@ -237,6 +237,7 @@ class GyroScale(ErrorStates):
     misalignment_sigma: float | Array
     """Of each misalignment, rad, one or one an entry (3, 3) with zeros on the diagonal."""
     name: str = "gyro scale"
+    """Name of the block of states."""
 
     def __post_init__(self) -> None:
         """Check both."""
@@ -284,6 +285,7 @@ class GyroForce(ErrorStates):
     gravity_f: Array = field(default_factory=lambda: np.array(GRAVITY_F))
     """Acceleration of gravity (3,), m/s², fixed axes."""
     name: str = "gyro force"
+    """Name of the block of states."""
 
     def __post_init__(self) -> None:
         """Check all."""
@@ -352,8 +354,11 @@ class GyroGaussMarkov(_FirstOrder):
     correlation_time: float
     """s"""
     name: str = "gyro drift"
+    """Name of the block of states."""
     components: tuple[str, ...] = AXES
+    """Name of each state within the block."""
     units: tuple[str, ...] = ("rad/s",) * 3
+    """SI unit of each state."""
 
     def __post_init__(self) -> None:
         """Check both."""
@@ -376,6 +381,7 @@ class VectorBias(ErrorStates):
     """A constant bias of a vector sensor in body axes: hard iron, accelerometer bias."""
 
     sensor: str
+    """Name of the sensor."""
     bias_sigma: float | Array
     """In the unit of the sensor's reference (1 is its length for directions and headings), one or one an axis."""
     rate_random_walk: float = 0.0
@@ -385,7 +391,9 @@ class VectorBias(ErrorStates):
     unit: str = "1"
     """For words and tables."""
     name: str = ""
+    """Name of the block of states."""
     components: tuple[str, ...] = AXES
+    """Name of each state within the block."""
 
     def __post_init__(self) -> None:
         """Check all."""
@@ -423,11 +431,13 @@ class LeverArm(ErrorStates):
     """
 
     sensor: str
+    """Name of the sensor."""
     arm_sigma: float | Array
     """Of each component of r, m, one or one an axis."""
     strength: float = STANDARD_GRAVITY
     """Specific force by which the sensor's vector is divided, m/s²: 1 where it gives whole vectors in m/s²."""
     name: str = ""
+    """Name of the block of states."""
 
     def __post_init__(self) -> None:
         """Check all."""
@@ -470,10 +480,13 @@ class VectorScale(ErrorStates):
     """Scale factors and misalignments of a vector sensor: all nine of S in ``m_b = (I + S) R_fbᵀ r``, constant: soft iron."""
 
     sensor: str
+    """Name of the sensor."""
     scale_sigma: float
     """Of each entry of S, dimensionless."""
     name: str = ""
+    """Name of the block of states."""
     units: tuple[str, ...] = ("1",) * 9
+    """SI unit of each state."""
 
     def __post_init__(self) -> None:
         """Check the deviation."""
@@ -511,11 +524,15 @@ class SensorMounting(ErrorStates):
     """
 
     sensor: str
+    """Name of the sensor."""
     mounting_sigma: float | Array
     """Standard deviation of θ at the start, rad, one or one for each axis (3,)."""
     name: str = ""
+    """Name of the block of states."""
     components: tuple[str, ...] = field(default=AXES)
+    """Name of each state within the block."""
     units: tuple[str, ...] = ("rad",) * 3
+    """SI unit of each state."""
 
     def __post_init__(self) -> None:
         """Check the deviation."""
@@ -539,6 +556,7 @@ class GaussMarkov(_FirstOrder):
     """First-order coloured noise on a vector sensor, stationary: the acceleration of a moving hand on an accelerometer."""
 
     sensor: str
+    """Name of the sensor."""
     noise_sigma: float | Array
     """Stationary standard deviation in the unit of the sensor's reference, one or one an axis."""
     correlation_time: float
@@ -549,8 +567,11 @@ class GaussMarkov(_FirstOrder):
     varying: bool = False
     """As :attr:`Effect.varying`."""
     unit: str = "1"
+    """SI unit of what the sensor measures."""
     name: str = ""
+    """Name of the block of states."""
     components: tuple[str, ...] = field(default=AXES)
+    """Name of each state within the block."""
 
     def __post_init__(self) -> None:
         """Check all."""
@@ -594,6 +615,7 @@ class BoundedVelocity(ErrorStates):
     """
 
     sensor: str
+    """Name of the sensor."""
     velocity_time: float
     """τ_v, s: about how long a velocity lasts."""
     velocity_sigma: float = 0.0
@@ -607,6 +629,7 @@ class BoundedVelocity(ErrorStates):
     strength: float = STANDARD_GRAVITY
     """Specific force by which the sensor's vector is divided, m/s²: 1 where it gives whole vectors in m/s²."""
     name: str = ""
+    """Name of the block of states."""
 
     def __post_init__(self) -> None:
         """Check all, and work out the third of the three that are given by two."""

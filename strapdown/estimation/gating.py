@@ -112,7 +112,7 @@ class Gate:
 
 @dataclass(frozen=True, kw_only=True)
 class Robust:
-    """Weigh each measurement by how far it lies from the estimate that it leads to itself: its variance is divided by the weight.
+    """Weigh each measurement by its residual after the update: its variance is divided by the weight.
 
     With r the residual *after* the update and R the measurement's covariance, the weight is found by iteration (IRLS):
 
@@ -121,11 +121,12 @@ class Robust:
       ``degrees_of_freedom`` and scale cR, d the number of rows (Agamennoni, Nieto & Nebot 2012); c is chosen so that the covariance is
       right to first order where the noise is normal with covariance R after all (:func:`student_scale`).
 
-    In normal noise both cost a few hundredths of accuracy. In contaminated noise they are somewhat overconfident, for an outlier that is
-    weighed down has still drawn: tests/test_robustness.py has the figures.
+    In normal noise both cost a few hundredths of accuracy. In contaminated noise they are somewhat overconfident, because an outlier with
+    little weight still has some effect: tests/test_robustness.py has the figures.
     """
 
     kind: Literal["huber", "student"] = "student"
+    """Weight function."""
     probability: float = 0.82
     """Huber: share of normal measurements that keep their full weight; 0.82 is the textbook's 1.345 σ of one degree of freedom."""
     degrees_of_freedom: float = 4.0
@@ -177,11 +178,11 @@ def student_scale(degrees_of_freedom: float, rows: int) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class Monitor:
-    """Watch the running mean of the NIS per degree of freedom; of a right filter it is 1.
+    """Watch the running mean of the NIS per degree of freedom; 1 for a consistent filter.
 
     ``M ← a M + NIS``, ``D ← a D + d`` with d the degrees of freedom of each measurement, mean M/D. An event begins when the mean leaves the
-    bounds that a right filter keeps with ``probability`` at one measurement, and ends when it is back inside. A refused measurement counts
-    with the gate's threshold in place of its NIS. The first ``window`` measurements are not judged.
+    bounds that a consistent filter keeps with ``probability`` at one measurement, and ends when it is back inside. A refused measurement
+    counts with the gate's threshold in place of its NIS. The first ``window`` measurements are not judged.
 
     The mean is a sum of χ² values with weights aᵏ; its variance is 2/n with ``n = (Σ aᵏ d)²/Σ a²ᵏ d``, after a while
     ``d (1 + a)/(1 − a) = d · window``, and its bounds are those of χ²_n/n (Satterthwaite 1946).

@@ -69,7 +69,7 @@ CONSTANT = 1.0 * DEGREE
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BankEstimate:
-    """What the bank made of a record."""
+    """Estimate of a bank of hypotheses, with the time at which one was left."""
 
     estimate: Estimate
     """The Gaussian of the mixture's mean and covariance (whole) at the kept edges from the first direction on; once the hypotheses are

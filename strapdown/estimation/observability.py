@@ -35,6 +35,7 @@ class Observability:
     states: tuple[str, ...]
     """Name of each state (n)."""
     units: tuple[str, ...]
+    """SI unit of each state."""
     prior_sigma: Array
     """Standard deviations before the record (n,), in ``units``."""
     start_sigma: Array

@@ -21,6 +21,9 @@ order, so the statistics do not depend on the number of threads, processes or ho
 
 from __future__ import annotations
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from strapdown.montecarlo.engine import Choice as Choice
 from strapdown.montecarlo.engine import choose as choose
 from strapdown.montecarlo.engine import in_threads as in_threads
@@ -50,3 +53,13 @@ __all__ = [
     "run_plan",
     "summary",
 ]
+
+if TYPE_CHECKING:
+    from strapdown.montecarlo import campaign as campaign
+    from strapdown.montecarlo import cluster as cluster
+
+
+def __getattr__(name: str) -> Any:
+    if name in ("campaign", "cluster"):  # files and Dask load when they are needed
+        return import_module(f"{__name__}.{name}")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

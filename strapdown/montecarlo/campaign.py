@@ -100,15 +100,19 @@ class Campaign:
     """A campaign as stored in its file."""
 
     plan: Plan
+    """What is computed."""
     machine: str
+    """Machine that computes it: lanes or scalar."""
     reason: str
     """Why the lanes do not serve, if they do not."""
     chunk: int
+    """Runs between merges."""
     runs: int
     """Runs wanted."""
     statistics: Statistics | None
     """Of the runs finished so far, in their order without a gap; None if there is none."""
     version: str = strapdown.__version__
+    """Of the package that computed it."""
     arithmetic: str = ""
     """Processor features that the bits depend on (:func:`strapdown.montecarlo.engine.arithmetic`); empty in files of earlier versions."""
     seconds: float = 0.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from queue import SimpleQueue
 from threading import Thread
 from typing import Any, Protocol
@@ -14,6 +14,7 @@ from strapdown.checks import InputError, count, one_of
 from strapdown.montecarlo import scalar
 from strapdown.montecarlo.plan import Dispersions, Plan
 from strapdown.montecarlo.statistics import Replay, Statistics, merge
+from strapdown.records import Origin
 from strapdown.scenarios import Scenario
 from strapdown.setup import FilterSetup
 
@@ -118,7 +119,13 @@ def replay(plan: Plan, run: int, *, machine: str = "auto") -> Replay:
     InputError
         If the number is negative, or the machine cannot compute the plan.
     """
-    return machine_named(choose(plan, machine).machine).replay(plan, count("run", run, least=0))
+    found = machine_named(choose(plan, machine).machine).replay(plan, count("run", run, least=0))
+    spec = scalar.dispersed(plan.scenario.gyro, plan.dispersions, plan.seed, run)
+    of_this_run = plan.scenario
+    if spec is not plan.scenario.gyro:  # dispersed, and so no preset any more
+        of_this_run = replace(plan.scenario, gyro=spec, gyro_preset="")
+    origin = Origin(gyro=spec, scenario=of_this_run, seed=plan.seed, run=run)
+    return replace(found, record=replace(found.record, origin=origin))
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ def _zeros() -> Array:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Dispersions:
-    """What differs from run to run besides the noise; normal, independent axes. The default: initial errors from the filter's prior."""
+    """Normal, independent dispersions from run to run besides the noise. Default: initial errors from the filter's prior."""
 
     attitude_sigma: float | None = None
     """σ of the initial attitude error, each axis, rad; None: the filter's own, so that a matched filter is consistent."""
@@ -81,7 +81,7 @@ _FORM: tables.Form = {
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Plan:
-    """All that decides what run number k of a campaign is, and where its statistics are taken.
+    """Definition of a campaign: everything that run number k depends on, and the epochs of the statistics.
 
     Filter and truth are separate: a ``setup`` that differs from :func:`strapdown.setup.matched` of the scenario is a mismatched filter.
     Outages, outliers and correlated noise are the scenario's sensors'. A plan is compared and hashed by identity, so a machine may keep
@@ -89,13 +89,17 @@ class Plan:
     """
 
     scenario: Scenario
+    """What is simulated."""
     setup: FilterSetup
+    """The filter."""
     seed: int = 0
+    """Of all random streams, which are named by (seed, run, source)."""
     epochs: int = 100
     """Equally spaced epochs, besides the start, at which errors are taken; each ends on a whole filter step."""
     nis_bins: int = 100
     """Equal spans of time over which NIS is summed."""
     dispersions: Dispersions = field(default_factory=Dispersions)
+    """What differs from run to run besides the noise."""
     individuals: bool = False
     """Whether each run draws its own gyro and sensors (:func:`strapdown.scenarios.drawn`): the errors of the specification are then
     standard deviations, as a filter with states for them takes them. Without, every run meets exactly those errors."""

@@ -113,25 +113,45 @@ class Statistics(Listed):
     """
 
     time: Array
+    """Epochs (m,), s."""
     runs: int
+    """Number of runs."""
     finite: Counts
+    """Runs whose error, P and NEES are finite (m,)."""
     error_sum: Array
+    """Σ e (m, 6)."""
     error_product_sum: Array
+    """Σ e eᵀ (m, 6, 6)."""
     covariance_sum: Array
+    """Σ P (m, 6, 6)."""
     nees_sum: Array
+    """Σ NEES of all six states, attitude, bias (m, 3)."""
     log_nees_sum: Array
+    """Σ ln NEES of the same (m, 3)."""
     coverage: Counts
+    """Runs with |e| within 1, 2, 3 σ (m, 6, 3)."""
     histogram: Counts
+    """Counts of |e| (6) and of NEES (3) by bin (m, 9, bins)."""
     nis_edges: Array
+    """Edges of the spans of time of the NIS (k + 1,), s."""
     sensors: tuple[str, ...]
+    """Names of the sensors (s,)."""
     sensor_nis_sum: Array
+    """Σ NIS by sensor and span of time (s, k)."""
     sensor_degrees: Counts
+    """Degrees of freedom of those (s, k)."""
     sensor_refused: Counts
+    """Measurements refused by the gate (s, k)."""
     worst_run: Counts
+    """Numbers of the runs of the largest NEES, the largest first (w,)."""
     worst_score: Array
+    """Their largest NEES of the state; infinite where the filter failed (w,)."""
     example_run: Counts
+    """Numbers of the runs kept as examples (x,)."""
     example_error: Array
+    """Their errors (x, m, 6), rad and rad/s."""
     example_sigma: Array
+    """The filter's σ in them (x, m, 6)."""
 
     def listing(self) -> Listing:
         """Return NEES and NIS per degree of freedom, and the errors at the end, as a table.

@@ -47,19 +47,36 @@ MOST_SAMPLES = 1e9
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
-    """A motion, a gyro and sensors, at a sample rate, over a time."""
+    """A motion, a gyro and sensors, at a sample rate, over a time.
+
+    Examples
+    --------
+    >>> import strapdown as sd
+    >>> scenario = sd.Scenario(
+    ...     motion=sd.motion.Coning(angle=0.7 * sd.units.DEGREE, frequency=10.0),
+    ...     gyro=sd.GyroSpec(angle_random_walk=0.08 * sd.units.DEGREE_PER_ROOT_HOUR),
+    ...     sensors=(sd.VectorSensor(name="star", reference_f=[1.0, 0.0, 0.0], sigma=1e-4, rate=1.0),),
+    ...     rate=100.0,
+    ...     duration=60.0,
+    ... )
+    >>> len(scenario.edges)
+    6001
+    """
 
     motion: Motion
+    """True attitude and body rate over time (:mod:`strapdown.motion`)."""
     gyro: GyroSpec
+    """The gyro's errors."""
     sensors: tuple[Sensor, ...]
+    """Vector, attitude and heading sensors (:mod:`strapdown.vectors`), each with a name of its own."""
     rate: float
     """Gyro samples a second, Hz."""
     duration: float
     """Length of the record, s; rounded to whole gyro samples."""
     name: str = ""
-    """Name by which its files are called."""
+    """For files and tables."""
     description: str = ""
-    """What it is, for lists and reports."""
+    """A sentence for people."""
     seed: int = 0
     """Default seed of :func:`simulate`."""
     gravity_f: tuple[float, ...] = vectors.GRAVITY_F

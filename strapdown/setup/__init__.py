@@ -80,6 +80,7 @@ class FilterSetup(ByValue):
     """The filter's model, its initial uncertainty, and the integration of the gyro."""
 
     process_noise: ProcessNoise
+    """The filter's model of the gyro's noise."""
     attitude_sigma: float = ATTITUDE_SIGMA
     """Standard deviation of the initial attitude error, each axis, rad; a Monte Carlo draws the true error from it."""
     bias_sigma: float

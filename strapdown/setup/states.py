@@ -61,7 +61,7 @@ VELOCITY = {
 
 @dataclass(frozen=True, kw_only=True)
 class SensorStates:
-    """Optional states of one sensor; what is 0 is no state."""
+    """Error states of one sensor by their σ; 0: no such state."""
 
     mounting_sigma: Entries = 0.0
     """σ of a small constant rotation of the sensor's axes from the body's, rad, one or one an axis; of whole attitudes ``bias_sigma``."""
@@ -165,7 +165,7 @@ class SensorStates:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class States(ByValue):
-    """Optional states of a filter beside attitude and bias, by the standard deviation that each starts with; what is 0 is no state."""
+    """Error states of a filter beside attitude and bias, by their initial standard deviations; 0: no such state."""
 
     gyro_scale_sigma: Entries = 0.0
     """σ of the gyro's scale factors, dimensionless, one or one an axis."""

@@ -199,6 +199,7 @@ class Tuning(Listed):
     """The outcome of a tuning."""
 
     parameters: tuple[Estimated, ...]
+    """The tuned parameters with their intervals."""
     setup: FilterSetup
     """The filter with the tuned values."""
     point: Array

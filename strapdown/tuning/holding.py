@@ -138,11 +138,6 @@ def compare(
     Returns
     -------
     Comparison
-
-    Raises
-    ------
-    InputError
-        If a setup has a σ for a sensor that a record does not have.
     """
     with ThreadPoolExecutor(threads) as pool:
         results = list(pool.map(lambda chosen: performance(cases, chosen, bins=bins), (before, after)))

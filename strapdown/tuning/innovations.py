@@ -46,12 +46,14 @@ MOST = WIDTH - 1
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Case:
-    """A record to tune on, and where the filter starts on it."""
+    """A record to tune on, with the filter's initial state."""
 
     record: ImuRecord
+    """At the gyro's rate."""
     initial: State
     """State at the first edge; its covariance is the setup's where the initial σ are tuned."""
     name: str = ""
+    """What errors and reports call the record."""
     first: float = -np.inf
     """Innovations from this time on count for tuning, s."""
     last: float = np.inf

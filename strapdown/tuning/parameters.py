@@ -268,7 +268,7 @@ def _scaled(chosen: FilterSetup, factor: float) -> FilterSetup:
 
 @dataclass(frozen=True, kw_only=True)
 class Prior:
-    """What is known of a parameter before: log-normal."""
+    """Log-normal prior of a parameter."""
 
     value: float
     """Its median, in SI."""
