@@ -152,7 +152,8 @@ class Result:
 
 def samples(record: ImuRecord) -> tuple[Array, Array, Array]:
     """Return gyro, accelerometer and magnetometer at the ends of the intervals, as peers take them."""
-    return record.rates, *(series.vector_b for series in record.vectors)
+    force, field = record.vectors
+    return record.rates, force.vector_b, field.vector_b
 
 
 def frame_of(peer: Peer, record: ImuRecord, gain: float) -> foreign.Alignment:
