@@ -18,6 +18,8 @@
     The Cramér–Rao bound before there is a record.
 ``suspicion``
     What the tuned filter leaves unexplained, such as a scale factor that the gyro's noise stands for.
+``own``
+    Parameters of a filter of one's own, by the same objectives.
 ``holding``
     What is held out, and the filter before and after on it.
 
@@ -43,6 +45,7 @@ from strapdown.tuning.outliers import (
     log_likelihood,
     tuned_gate,
 )
+from strapdown.tuning.own import OwnTuning, fit_own
 from strapdown.tuning.parameters import (
     Prior,
     axis_names,
@@ -68,6 +71,7 @@ __all__ = [
     "Estimated",
     "Likelihood",
     "NeesCourse",
+    "OwnTuning",
     "Performance",
     "Plan",
     "Prior",
@@ -85,6 +89,7 @@ __all__ = [
     "doubted",
     "error_objective",
     "fit",
+    "fit_own",
     "known_names",
     "likelihood",
     "log_likelihood",
