@@ -83,8 +83,9 @@ class AidedIns:
         n = len(record.increments)
         # The velocity sensor of this run: its noise is drawn anew for each record, and is the same whenever the record is.
         noise = generator(int(record.increments.view(np.uint64).sum() % 2**32), 0, "velocity").standard_normal((n, 3))
-        yaw = euler(attitude.attitude).angles[:, 0]
-        level = np.cos(euler(attitude.attitude).angles[:, 1])
+        assert attitude.attitude is not None
+        angles = euler(attitude.attitude).angles
+        yaw, level = angles[:, 0], np.cos(angles[:, 1])
         heard = {round(t * RATE): k for k, t in enumerate(attitude.time)}
         felt = STANDARD_GRAVITY * np.concatenate([force.vector_b[:1], force.vector_b])  # the record holds directions
         rates = record.increments * RATE

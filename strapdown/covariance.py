@@ -312,7 +312,8 @@ def _flat(
 
 def _all_rows(scenario: Scenario, setup: FilterSetup) -> list[_Rows]:
     start, end = scenario.edges[0], scenario.edges[-1]
-    exact, own = [], []
+    exact: list[VectorMeasurements] = []
+    own: list[VectorMeasurements] = []
     for sensor in scenario.sensors:
         kinds = (
             vectors.VectorSensor,
@@ -320,14 +321,15 @@ def _all_rows(scenario: Scenario, setup: FilterSetup) -> list[_Rows]:
             vectors.Magnetometer,
             vectors.Accelerometer,
             vectors.HeadingPair,
+            vectors.HorizonSensor,
         )
         if not isinstance(sensor, kinds):
             raise InputError(
                 f"{sensor.name} is a {type(sensor).__name__}, whose noise the analysis does not know; leave it out"
             )
-        random = generator(scenario.seed, 0, sensor.name)
-        own.append(sensor.observe(scenario.motion, start, end, random))
-        exact.append(_exact(sensor).observe(scenario.motion, start, end, random))
+        # A generator for each, so that the same samples are lost.
+        for one, found in ((sensor, own), (_exact(sensor), exact)):
+            found.append(one.observe(scenario.motion, start, end, generator(scenario.seed, 0, sensor.name)))
     step = dataclasses.replace(setup, integration=coning.ALGORITHMS["one-sample"])
     record = ImuRecord(time=np.array([start, end]), increments=np.zeros((1, 3)), vectors=tuple(own))
     held = believed(record, step).vectors

@@ -41,6 +41,7 @@ from strapdown.checks import (
 )
 from strapdown.equality import ByValue
 from strapdown.motion import Motion
+from strapdown.orbit import CircularOrbit
 from strapdown.units import STANDARD_GRAVITY
 
 __all__ = [
@@ -483,6 +484,12 @@ class Faults:
         Standard deviation of an additional first-order Gauss–Markov noise of each component, in the unit of sigma.
     correlation_time : float, default 100.0
         Correlation time of that noise, s.
+    drop_probability : float, default 0.0
+        Probability that a sample is lost, independently of the others.
+    duty_period : float, default 0.0
+        Period of a duty cycle, s, counted from time 0; 0: the sensor is always on.
+    duty_share : float, default 1.0
+        Part of each period, from its beginning, in which the sensor is on.
     """
 
     latency: float = 0.0
@@ -491,6 +498,9 @@ class Faults:
     outlier_scale: float = 10.0
     correlated_sigma: float = 0.0
     correlation_time: float = 100.0
+    drop_probability: float = 0.0
+    duty_period: float = 0.0
+    duty_share: float = 1.0
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -508,6 +518,10 @@ class Faults:
         positive("outlier_scale", self.outlier_scale)
         non_negative("correlated_sigma", self.correlated_sigma)
         positive("correlation_time", self.correlation_time, unit="s")
+        for name in ("drop_probability", "duty_share"):
+            if non_negative(name, getattr(self, name)) > 1.0:
+                raise InputError(f"{name} is {getattr(self, name):g}; it must not be above 1")
+        non_negative("duty_period", self.duty_period, unit="s")
 
     def noise(self, time: Array, generator: np.random.Generator) -> tuple[Array, Array]:
         """Return white noise of unit σ with its outliers, and the correlated noise.
@@ -542,13 +556,16 @@ class Faults:
                 correlated[k + 1] = phi * correlated[k] + share * drive[k + 1]
         return white, correlated
 
-    def heard(self, series: VectorMeasurements) -> VectorMeasurements:
-        """Return the series without the samples in outages, with arrival times if there is a latency.
+    def heard(self, series: VectorMeasurements, generator: np.random.Generator) -> VectorMeasurements:
+        """Return the series without the samples in outages, off duty or lost, with arrival times if there is a latency.
+
+        Lost samples are drawn from a child of the generator, so they are the same whatever the noise.
 
         Parameters
         ----------
         series : VectorMeasurements
             Measurements without faults of timing.
+        generator : numpy.random.Generator
 
         Returns
         -------
@@ -557,10 +574,15 @@ class Faults:
         """
         arrival = series.time + self.latency if self.latency > 0.0 else None
         series = dataclasses.replace(series, arrival=arrival)
-        if not self.outages:
-            return series
-        lost = np.any([(series.time >= a) & (series.time <= b) for a, b in self.outages], axis=0)
-        return series.taken(~lost)
+        lost = np.zeros(len(series.time), bool)
+        for a, b in self.outages:
+            lost |= (series.time >= a) & (series.time <= b)
+        if self.duty_period > 0.0:
+            # The tolerance keeps a sample that falls on a switch but for rounding.
+            lost |= np.mod(series.time / self.duty_period + 1e-9, 1.0) > self.duty_share + 2e-9
+        if self.drop_probability > 0.0:
+            lost |= generator.spawn(1)[0].random(len(lost)) < self.drop_probability
+        return series.taken(~lost) if lost.any() else series
 
 
 def sample_times(rate: float, phase: float, start: float, end: float) -> Array:
@@ -651,7 +673,7 @@ class VectorSensor(ByValue):
             reference_f=self.reference_f,
             sigma=np.full(len(time), self.sigma / level),
         )
-        return self.faults.heard(series)
+        return self.faults.heard(series, generator)
 
 
 def star_directions(
@@ -691,6 +713,40 @@ def star_directions(
         )
         for i, star in enumerate(stars)
     )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HorizonSensor(ByValue):
+    """An earth-horizon sensor on an orbit: the direction of the earth's centre, which moves in the fixed frame."""
+
+    name: str
+    orbit: CircularOrbit
+    sigma: float
+    """Noise of each component of the unit direction, rad."""
+    rate: float
+    """Hz."""
+    phase: float = 0.0
+    faults: Faults = field(default_factory=Faults)
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        _check_sampling(self.name, self.sigma, "rad", self.rate, self.phase)
+        instance(f"{self.name}: orbit", self.orbit, CircularOrbit, "give an orbit.CircularOrbit")
+
+    def observe(self, motion: Any, start: float, end: float, generator: np.random.Generator) -> VectorMeasurements:
+        """Return directions over (start, end]."""
+        time = sample_times(self.rate, self.phase, start, end)
+        white, correlated = self.faults.noise(time, generator)
+        down_f = -_unit(self.orbit.position(time).reshape(-1, 3))
+        series = VectorMeasurements(
+            sensor=self.name,
+            kind="direction",
+            time=time,
+            vector_b=_unit(_body(motion, time, down_f) + self.sigma * white + correlated),
+            reference_f=down_f,
+            sigma=np.full(len(time), self.sigma),
+        )
+        return self.faults.heard(series, generator)
 
 
 Boresight = str | tuple[float, ...] | tuple[tuple[float, ...], ...]
@@ -796,7 +852,7 @@ class AttitudeSensor:
             sigma_axes=self.sigma_axes if whole is None else None,
             covariance=whole,
         )
-        return self.faults.heard(series)
+        return self.faults.heard(series, generator)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -873,7 +929,7 @@ class Magnetometer(ByValue):
             reference_f=true_f if varies else np.asarray(self.field_f),
             sigma=self.sigma / scale,
         )
-        return self.faults.heard(series)
+        return self.faults.heard(series, generator)
 
 
 def specific_force(
@@ -984,7 +1040,7 @@ class Accelerometer(ByValue):
             reference_f=-self.gravity_f,
             sigma=np.full(len(time), self.sigma / (1.0 if whole else float(np.linalg.norm(self.gravity_f)))),
         )
-        return self.faults.heard(series)
+        return self.faults.heard(series, generator)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -1038,4 +1094,4 @@ class HeadingPair(ByValue):
             reference_f=measured,
             sigma=self.sigma / level,
         )
-        return self.faults.heard(series)
+        return self.faults.heard(series, generator)

@@ -17,6 +17,8 @@ from strapdown.vectors import VectorMeasurements
 LENGTH = {"coning": 12.0, "tumbling-satellite": 120.0, "low-orbit": 2400.0, "magnetometer-only": 5400.0, "rest": 120.0}
 """Seconds of the runs of the small study; the others are whole."""
 CALLED_FOR = {
+    "earth-observer": (),
+    "ship": (),
     "coning": ("gyro.scale", "gyro.misalignment", "gyro.force", "gyro.drift"),
     "hand-held": ("gyro.drift", "accelerometer.lever", "magnetometer.correlated"),
     "low-orbit": ("gyro.misalignment", "gyro.drift", "magnetometer.bias"),

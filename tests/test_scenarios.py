@@ -5,8 +5,9 @@ import tomllib
 
 import numpy as np
 import pytest
+import scipy.stats
 
-from strapdown import gyro, motion, orbit, scenarios, vectors
+from strapdown import gyro, motion, orbit, quaternion, scenarios, vectors
 from strapdown.checks import InputError
 from strapdown.gyro import GyroSpec
 from strapdown.scenarios import (
@@ -48,6 +49,8 @@ def test_the_built_in_ones_are_those_asked_for():
         "magnetometer-only",
         "hand-held",
         "two-stars",
+        "earth-observer",
+        "ship",
     }
     rows = scenarios.builtin_rows()
     assert [row["name"] for row in rows] == list(SCENARIOS)
@@ -176,8 +179,12 @@ def test_missing_files_and_names(tmp_path):
 
 def test_what_has_no_form_in_a_file_is_refused():
     base = scenario_from_toml(REST)
+
+    class OwnMotion(motion.ConstantRate):
+        """Not a motion of the package, though it moves as one."""
+
     for change in (
-        {"motion": motion.waypoints([0.0, 1.0, 3.0], np.tile([1.0, 0.0, 0.0, 0.0], (3, 1)))},
+        {"motion": OwnMotion(rate=(0.1, 0.2, 0.3))},
         {"sensors": (vectors.Magnetometer(name="m", field_f=lambda t: np.ones((len(t), 3)), sigma=1.0, rate=1.0),)},
         {
             "sensors": (
@@ -315,3 +322,60 @@ boresight = [[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]]
     again = scenarios.scenario_from_toml(scenarios.scenario_to_toml(found))
     assert again.sensors == found.sensors
     np.testing.assert_array_equal(again.gyro.scale_factor, found.gyro.scale_factor)
+
+
+def test_a_duty_cycle_and_lost_samples_leave_the_rest_as_it_was():
+    """On for 3 of every 10 s, a fifth lost; what is left has the noise of the sensor without either."""
+    from strapdown.vectors import Faults, VectorSensor
+
+    def heard(**faults):
+        sensor = VectorSensor(
+            name="star", reference_f=np.array([1.0, 0.0, 0.0]), sigma=1e-3, rate=4.0, faults=Faults(**faults)
+        )
+        return sensor.observe(motion.rest(), 0.0, 4000.0, np.random.default_rng(3))
+
+    whole, cycle, lossy = heard(), heard(duty_period=10.0, duty_share=0.3), heard(drop_probability=0.2)
+    inside = np.mod(whole.time, 10.0) <= 3.0
+    np.testing.assert_array_equal(cycle.time, whole.time[inside])
+    np.testing.assert_array_equal(cycle.vector_b, whole.vector_b[inside])
+    kept = np.isin(whole.time, lossy.time)
+    np.testing.assert_array_equal(lossy.vector_b, whole.vector_b[kept])
+    low, high = scipy.stats.binom.ppf([0.0005, 0.9995], len(kept), 0.8)
+    assert low <= kept.sum() <= high
+    np.testing.assert_array_equal(heard(drop_probability=0.2, outlier_probability=0.3).time, lossy.time)
+    for bad in ({"drop_probability": 1.5}, {"duty_share": -0.1}, {"duty_period": -1.0}):
+        with pytest.raises(InputError, match=next(iter(bad))):
+            Faults(**bad)
+
+
+def test_a_horizon_sensor_sees_the_earths_centre():
+    from strapdown.orbit import CircularOrbit
+    from strapdown.vectors import HorizonSensor
+
+    path = CircularOrbit(altitude=600e3, inclination=1.2)
+    sensor = HorizonSensor(name="horizon", orbit=path, sigma=0.0, rate=0.1)
+    body = motion.ConstantRate(rate=(0.01, 0.02, -0.03))
+    series = sensor.observe(body, 0.0, 3000.0, np.random.default_rng(1))
+    down = quaternion.rotate(body.attitude(series.time), series.vector_b)
+    np.testing.assert_allclose(
+        down * np.linalg.norm(path.position(series.time), axis=1)[:, None],
+        -path.position(series.time),
+        rtol=1e-9,
+        atol=1e-3,
+    )
+    with pytest.raises(InputError, match="orbit is missing"):
+        scenario_from_toml(REST + '[[sensors]]\ntype = "horizon"\nname = "h"\nsigma_deg = 1.0\nrate_hz = 1.0')
+
+
+def test_a_flight_in_samples_is_a_motion_of_a_file():
+    """A recorded flight can be simulated again with other sensors: its attitudes stand in the file."""
+    flown = motion.Coning(angle=0.3, frequency=0.1)
+    time = np.linspace(0.0, 20.0, 201)
+    again = motion.SampledAttitude(time=time, attitudes=flown.attitude(time))
+    scenario = dataclasses.replace(load_scenario("two-stars"), motion=again, duration=20.0)
+    read = scenario_from_toml(scenario_to_toml(scenario))
+    np.testing.assert_array_equal(read.motion.attitudes, again.attitudes)
+    record = simulate(read)
+    np.testing.assert_array_equal(record.truth.attitude, again.attitude(record.time))
+    # A spline of degree 5 through samples a tenth of a second apart, of a cone of ten seconds.
+    assert np.max(quaternion.angle_between(record.truth.attitude, flown.attitude(record.time))) < 1e-6

@@ -91,6 +91,8 @@ def _reasons(plan: Plan) -> Iterator[str]:
             yield f"{sensor.name}: a boresight that is no body axis is not among the lanes' terms"
         elif sensor.faults.latency > 0.0:  # type: ignore[attr-defined]
             yield f"{sensor.name}: latency is not among the lanes' terms"
+        elif sensor.faults.drop_probability > 0.0:  # type: ignore[attr-defined]
+            yield f"{sensor.name}: lost samples are not among the lanes' terms"
         elif isinstance(plan.setup.sigma.get(sensor.name), tuple) and not isinstance(sensor, AttitudeSensor):
             yield f"{sensor.name}: a sigma of its own for each axis is not among the lanes' terms"
     if plan.setup.estimator != setup.MEKF:

@@ -243,6 +243,10 @@ _MOTIONS: dict[str, tuple[type, Form]] = {
             "initial_attitude": tables.PLAIN,
         },
     ),
+    "sampled": (
+        motion.SampledAttitude,
+        {"time": tables.SECONDS, "attitudes": tables.PLAIN, "degree": tables.PLAIN, "ends": tables.TEXT},
+    ),
     "harmonic-rates": (
         motion.HarmonicRates,
         {"mean": tables.DEGREES_PER_SECOND, "initial_attitude": tables.PLAIN},
@@ -266,6 +270,9 @@ def _faults(unit: tables.Choice) -> Form:
         "outlier_scale": tables.PLAIN,
         "correlated_sigma": unit,
         "correlation_time": tables.SECONDS,
+        "drop_probability": tables.PLAIN,
+        "duty_period": tables.SECONDS,
+        "duty_share": tables.PLAIN,
     }
 
 
@@ -310,6 +317,11 @@ _SENSORS: dict[str, tuple[type, Form, tables.Choice]] = {
         },
         tables.METRES_PER_SECOND_SQUARED,
     ),
+    "horizon": (
+        vectors.HorizonSensor,
+        {"name": tables.TEXT, "rate": tables.HERTZ, "phase": tables.SECONDS, "sigma": tables.ARCSECONDS},
+        tables.ARCSECONDS,
+    ),
     "heading-pair": (
         vectors.HeadingPair,
         {
@@ -322,7 +334,8 @@ _SENSORS: dict[str, tuple[type, Form, tables.Choice]] = {
         tables.METRES,
     ),
 }
-"""Sensors by their word in a file: class, keys, unit of the correlated noise. A magnetometer takes a table ``orbit`` for a field."""
+"""Sensors by their word in a file: class, keys, unit of the correlated noise. A magnetometer takes a table ``orbit`` for a field, and a
+horizon sensor has one."""
 
 _TOP_FORM: Form = {
     "seed": tables.PLAIN,
@@ -465,14 +478,17 @@ def _read_sensor(entry: Any, place: str) -> Sensor:
     table = _table(entry, place)
     word = _word(table, place, _SENSORS)
     kind, form, unit = _SENSORS[word]
-    orbit = table.pop("orbit", None) if word == "magnetometer" else None
+    orbit = table.pop("orbit", None) if word in ("magnetometer", "horizon") else None
     faults = _faults(unit)
     known_keys(place, table, {**tables.keys(form), **tables.keys(faults)})
     amiss = {key: table.pop(key) for key in list(table) if key in tables.keys(faults)}
     more: dict[str, Any] = {"faults": tables.build(vectors.Faults, amiss, faults, place)}
     if orbit is not None:
         orbit_place = f"{place}: orbit"
-        more["field_f"] = tables.build(CircularOrbit, _table(orbit, orbit_place), _ORBIT, orbit_place).magnetic_field
+        found = tables.build(CircularOrbit, _table(orbit, orbit_place), _ORBIT, orbit_place)
+        more.update({"orbit": found} if word == "horizon" else {"field_f": found.magnetic_field})
+    elif word == "horizon":
+        raise InputError(f"{place}: orbit is missing; add the table [sensors.orbit]")
     return tables.build(kind, table, form, place, **more)  # type: ignore[no-any-return]
 
 
@@ -483,6 +499,9 @@ def _write_sensor(sensor: Any) -> dict[str, Any]:
     _, form, unit = _SENSORS[word]
     if getattr(sensor, "acceleration_f", None) is not None:
         raise InputError(f"{sensor.name}: acceleration_f is a function, which has no form in a file; keep it in Python")
+    if isinstance(sensor, vectors.HorizonSensor):
+        own = {**tables.encode(sensor, form), **tables.encode(sensor.faults, _faults(unit))}
+        return {"type": word, **own, "orbit": tables.encode(sensor.orbit, _ORBIT)}
     field = getattr(sensor, "field_f", None)
     if not callable(field):
         return {"type": word, **tables.encode(sensor, form), **tables.encode(sensor.faults, _faults(unit))}
