@@ -167,7 +167,7 @@ def draw(outcomes: Sequence[Outcome], path: Path) -> Path:
     middle.set(yscale="log", xlabel="time, h", ylabel="ANEES / 6")
     middle.set_title("Consistency, log scale; 1: consistent")
     right.set(xlabel="time, h", ylabel="ANEES / 6")
-    right.set_title(f"Banks alone, linear scale; 99 % bounds")
+    right.set_title("Banks alone, linear scale; 99 % bounds")
     figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
     return plots.save(figure, path)
 

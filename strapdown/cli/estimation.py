@@ -376,6 +376,7 @@ def _drawn(
 ) -> list[Path]:
     """Draw the estimate, its optional states, and its errors beside a truth or a recording's reference; return the files."""
     from strapdown import plots
+    from strapdown.plots.style import save_as
 
     figures = {out / "estimate": plots.estimate_overview(result, title=title, fixed_frame=fixed_frame)}
     if result.error_states:
@@ -384,7 +385,7 @@ def _drawn(
         figures[out / "errors"] = plots.error_overview(result, truth, title=title)
     if errors is not None:
         figures[out / "errors"] = plots.recording_errors(used.time, errors, used.movement)
-    return plots.save_as(figures, form)
+    return save_as(figures, form)
 
 
 def _states(result: Any) -> dict[str, Any]:

@@ -27,9 +27,8 @@ Colours are those of Okabe and Ito, which every kind of colour vision can tell a
 from strapdown.plots.allan import allan_axis, allan_overview
 from strapdown.plots.budget import error_budget
 from strapdown.plots.coning import coning_consistency, coning_errors, draw_coning_study, drift_by_algorithm
-from strapdown.plots.decimation import decimated, envelope
+from strapdown.plots.decimation import decimated
 from strapdown.plots.estimates import (
-    angle_labels,
     error_overview,
     errors_in_envelope,
     estimate_overview,
@@ -56,7 +55,6 @@ from strapdown.plots.style import (
     ink,
     new_figure,
     save,
-    save_as,
     theme,
 )
 
@@ -70,7 +68,6 @@ __all__ = [
     "YELLOW",
     "allan_axis",
     "allan_overview",
-    "angle_labels",
     "animate_body_axis",
     "body_axis_on_sphere",
     "coning_consistency",
@@ -80,7 +77,6 @@ __all__ = [
     "decimated",
     "draw_coning_study",
     "drift_by_algorithm",
-    "envelope",
     "error_budget",
     "error_distribution",
     "error_overview",
@@ -97,7 +93,6 @@ __all__ = [
     "nis_over_time",
     "recording_errors",
     "save",
-    "save_as",
     "sphere_figure",
     "states_over_time",
     "theme",
