@@ -153,7 +153,9 @@ def estimate(
             help="Recording: calibration.toml of an earlier one of the same unit; that of this one is written too."
         ),
     ] = None,
-    figures: Annotated[bool, typer.Option("--figures", help="Draw the estimate, its states and errors.")] = False,
+    figures: Annotated[
+        bool, typer.Option("--figures", help="Draw the estimate, its states and errors; --format does too.")
+    ] = False,
     form: Annotated[FigureFormat | None, FORMAT] = None,
 ) -> None:
     """Estimate attitude and gyro bias from a recording (accelerometer as vertical, magnetometer as heading) or a simulated record."""
