@@ -92,6 +92,7 @@ def uneven_series(draw):
     return np.cumsum(steps), value, draw(st.integers(1, 60))
 
 
+@hypothesis.settings(deadline=None)
 @hypothesis.given(uneven_series())
 def test_an_envelope_is_the_least_and_the_largest_of_each_column(series):
     """By counting: which column of the time axis each sample falls into, and the extremes of the samples there."""
@@ -114,6 +115,7 @@ def test_an_envelope_is_the_least_and_the_largest_of_each_column(series):
         np.testing.assert_equal(found.high[k], max(seen, default=np.nan) + 1.0)
 
 
+@hypothesis.settings(deadline=None)
 @hypothesis.given(uneven_series())
 def test_a_line_keeps_the_extremes_of_each_column(series):
     time, value, columns = series
