@@ -29,7 +29,7 @@ from strapdown import (
 from strapdown.checks import InputError
 from strapdown.coning_study import Drift, FilterOutcome
 from strapdown.montecarlo.statistics import BINS_PER_OCTAVE
-from strapdown.plots import estimates, style
+from strapdown.plots import decimation, estimates, style
 from strapdown.plots.sphere import body_axis_path
 
 
@@ -92,11 +92,12 @@ def uneven_series(draw):
     return np.cumsum(steps), value, draw(st.integers(1, 60))
 
 
+@hypothesis.settings(deadline=None)
 @hypothesis.given(uneven_series())
 def test_an_envelope_is_the_least_and_the_largest_of_each_column(series):
     """By counting: which column of the time axis each sample falls into, and the extremes of the samples there."""
     time, value, columns = series
-    found = plots.envelope(time, value, value + 1.0, columns)
+    found = decimation.envelope(time, value, value + 1.0, columns)
     if len(time) <= columns:
         np.testing.assert_array_equal(found.low, value)
         np.testing.assert_array_equal(found.high, value + 1.0)
@@ -114,11 +115,12 @@ def test_an_envelope_is_the_least_and_the_largest_of_each_column(series):
         np.testing.assert_equal(found.high[k], max(seen, default=np.nan) + 1.0)
 
 
+@hypothesis.settings(deadline=None)
 @hypothesis.given(uneven_series())
 def test_a_line_keeps_the_extremes_of_each_column(series):
     time, value, columns = series
     when, drawn = plots.decimated(time, value, columns)
-    whole, kept = plots.envelope(time, value, columns=columns), plots.envelope(when, drawn, columns=columns)
+    whole, kept = decimation.envelope(time, value, columns=columns), decimation.envelope(when, drawn, columns=columns)
     assert (when[0], when[-1]) == (time[0], time[-1])
     assert len(when) <= max(2 * columns + 2, 1)
     if len(when) > columns:
@@ -316,17 +318,17 @@ def test_a_figure_in_one_format_replaces_that_in_another_and_is_the_same_twice(t
     for other in ("png", "svg", "pdf"):
         (tmp_path / f"a.{other}").write_text("old")
     (tmp_path / "a.json").write_text("{}")
-    assert plots.save_as({tmp_path / "a": draw()}, form) == [tmp_path / f"a.{form}"]
+    assert style.save_as({tmp_path / "a": draw()}, form) == [tmp_path / f"a.{form}"]
     assert {path.name for path in tmp_path.iterdir()} == {f"a.{form}", "a.json"}
     first = (tmp_path / f"a.{form}").read_bytes()
     if form == "svg":
         assert xml.etree.ElementTree.fromstring(first).tag.endswith("svg")
     else:
         assert first.startswith({"png": b"\x89PNG", "pdf": b"%PDF"}[form])
-    plots.save_as({tmp_path / "a": draw()}, form)
+    style.save_as({tmp_path / "a": draw()}, form)
     assert (tmp_path / f"a.{form}").read_bytes() == first
     with pytest.raises(InputError, match="png, pdf, svg"):
-        plots.save_as({tmp_path / "a": draw()}, "gif")
+        style.save_as({tmp_path / "a": draw()}, "gif")
 
 
 def figures(run, statistics, outcomes):
@@ -416,9 +418,9 @@ def test_different_scales_side_by_side_are_marked():
 
 def test_angles_are_named_with_their_sense():
     """By turning a vector: each angle grows as its label says, in the sequence Z-Y-X."""
-    roll, pitch, yaw = plots.angle_labels("East-North-Up, magnetic North")
+    roll, pitch, yaw = estimates.angle_labels("East-North-Up, magnetic North")
     assert yaw.endswith("from East to North")
-    assert plots.angle_labels()[2].endswith("from fixed x to y")
+    assert estimates.angle_labels()[2].endswith("from fixed x to y")
     for label, vector, toward in ((roll, 1, 2), (pitch, 2, 0), (yaw, 0, 1)):
         axis = 3 - vector - toward
         turned = quaternion.rotate(quaternion.exp(0.1 * np.eye(3)[axis]), np.eye(3)[vector])

@@ -11,7 +11,7 @@ import subprocess
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
@@ -43,6 +43,7 @@ def tabular(text):
     return columns, cut(head.strip()), [cut(line) for line in rows.splitlines()]
 
 
+@settings(deadline=None)
 @given(st.lists(st.tuples(CELLS, CELLS, CELLS), max_size=6))
 def test_csv_reads_back_to_the_bit(rows):
     keys = ("a", "b_deg", "c, d")
@@ -60,6 +61,7 @@ def test_csv_reads_back_to_the_bit(rows):
                 assert text == str(value)
 
 
+@settings(deadline=None)
 @given(st.lists(st.tuples(CELLS, CELLS, CELLS), min_size=1, max_size=6))
 def test_latex_has_a_cell_for_each_value_and_nothing_unescaped(rows):
     keys = ("a", "b", "c")

@@ -173,7 +173,9 @@ def estimate(
             help="Without a specification: calibration.toml of an earlier recording of the same unit; a new one is written."
         ),
     ] = None,
-    figures: Annotated[bool, typer.Option("--figures", help="Draw the estimate, its states and errors.")] = False,
+    figures: Annotated[
+        bool, typer.Option("--figures", help="Draw the estimate, its states and errors; --format does too.")
+    ] = False,
     form: Annotated[FigureFormat | None, FORMAT] = None,
 ) -> None:
     """Estimate attitude and gyro bias from a recording.
@@ -436,6 +438,7 @@ def _drawn(
 ) -> list[Path]:
     """Draw the estimate, its optional states, and its errors beside a truth or a recording's reference; return the files."""
     from strapdown import plots
+    from strapdown.plots.style import save_as
 
     figures = {out / "estimate": plots.estimate_overview(result, title=title, fixed_frame=fixed_frame)}
     if result.error_states:
@@ -444,7 +447,7 @@ def _drawn(
         figures[out / "errors"] = plots.error_overview(result, truth, title=title)
     if errors is not None:
         figures[out / "errors"] = plots.recording_errors(used.time, errors, used.movement)
-    return plots.save_as(figures, form)
+    return save_as(figures, form)
 
 
 def _states(result: Any) -> dict[str, Any]:

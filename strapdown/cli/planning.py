@@ -131,9 +131,10 @@ def covariance(
     _tell(name, found, modelled.integration.name, matched=filter_file is None)
     write_json(out / "covariance.json", _summary(name, found))
     from strapdown import plots
+    from strapdown.plots.style import save_as
 
     title = f"{name}: predicted errors, without a Monte Carlo"
-    figures = plots.save_as({out / "budget": plots.error_budget(found, title=title)}, form)
+    figures = save_as({out / "budget": plots.error_budget(found, title=title)}, form)
     written(out / "covariance.json", *figures, *tables_written(tables, "covariance", found.budget()))
 
 

@@ -227,6 +227,7 @@ def _identify(recording: Path, sensor: str, options: _Options) -> identification
     from strapdown import allan_gaps, noise_parameters, plots, recordings
     from strapdown.checks import InputError
     from strapdown.files import written_beside
+    from strapdown.plots.style import save_as
 
     out, specification = options.out, _names(sensor)[0]
     source = recordings.read_samples(recording, sensor, rate=options.rate, gaps=True, **options.layout)
@@ -290,7 +291,7 @@ def _identify(recording: Path, sensor: str, options: _Options) -> identification
     with written_beside(out / specification) as temporary:
         temporary.write_text(_specification(fit, f"{recording.name}, {length}", warnings, sensor), encoding="utf-8")
     _write_numbers(out / _names(sensor)[1], recording.name, fit, deviation, rows, sensor)
-    paths += plots.save_as({out / _names(sensor)[2]: figure}, options.form)
+    paths += save_as({out / _names(sensor)[2]: figure}, options.form)
     written(
         out / specification, out / _names(sensor)[1], *paths, *tables_written(options.tables, "allan", rows, sensor)
     )

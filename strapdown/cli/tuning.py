@@ -495,9 +495,10 @@ def _write(
     form: FigureFormat,
     tables: Path | None,
 ) -> None:
-    from strapdown import plots, tuning
+    from strapdown import tuning
     from strapdown.files import write_json, written_beside
     from strapdown.plots import tuning as drawing
+    from strapdown.plots.style import save_as
     from strapdown.report import tunings
     from strapdown.setup import to_toml
 
@@ -520,7 +521,7 @@ def _write(
         figures[places["heldout"]] = drawing.before_and_after(
             comparison, title="The first record, on what was held out"
         )
-    written(out, report, *plots.save_as(figures, form), *tables_written(tables, "tuning", content))
+    written(out, report, *save_as(figures, form), *tables_written(tables, "tuning", content))
 
 
 def _report(

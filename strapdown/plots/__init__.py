@@ -32,8 +32,6 @@ from strapdown.plots.coning import coning_errors as coning_errors
 from strapdown.plots.coning import draw_coning_study
 from strapdown.plots.coning import drift_by_algorithm as drift_by_algorithm
 from strapdown.plots.decimation import decimated as decimated
-from strapdown.plots.decimation import envelope as envelope
-from strapdown.plots.estimates import angle_labels as angle_labels
 from strapdown.plots.estimates import error_overview, estimate_overview, states_over_time
 from strapdown.plots.estimates import errors_in_envelope as errors_in_envelope
 from strapdown.plots.estimates import recording_errors as recording_errors
@@ -56,7 +54,6 @@ from strapdown.plots.style import VERMILION as VERMILION
 from strapdown.plots.style import YELLOW as YELLOW
 from strapdown.plots.style import ink as ink
 from strapdown.plots.style import new_figure, save
-from strapdown.plots.style import save_as as save_as
 from strapdown.plots.style import theme as theme
 
 __all__ = [

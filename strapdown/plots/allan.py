@@ -67,7 +67,22 @@ def allan_axis(
 def allan_overview(
     deviation: AllanDeviation, fit: NoiseFit, curves: Sequence[Mapping[str, Array]], *, sensor: str = "gyro"
 ) -> Figure:
-    """Draw each axis of an Allan deviation with its fit, side by side, in the units of a sensor."""
+    """Draw each axis of an Allan deviation with its fit, side by side, in the units of a sensor.
+
+    Parameters
+    ----------
+    deviation : AllanDeviation
+        SI.
+    fit : NoiseFit
+        Of the same samples.
+    curves : sequence of mapping
+        For each axis the fitted terms and their total at the same averaging times, SI, as :func:`strapdown.allan.curves_by_axis` gives.
+    sensor : {"gyro", "accelerometer", "magnetometer"}
+
+    Returns
+    -------
+    Figure
+    """
     unit, scale = UNITS[sensor]["bias_instability"]
     number = len(deviation.deviation)
     figure, axes = new_figure(1, number, size=(1.5 + 4.2 * number, 4.8), sharey=True, squeeze=False)

@@ -16,7 +16,19 @@ _MIN_SHARE = 0.01  # sources below this part of the mean square at all times are
 
 
 def error_budget(analysis: Analysis, *, title: str = "") -> Figure:
-    """Draw RMS error and the filter's σ of attitude and bias over time, and below the share of each source in the mean square error."""
+    """Draw RMS error and the filter's σ of attitude and bias over time, and below the share of each source in the mean square error.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        Of :func:`strapdown.covariance.analyse`.
+    title : str
+
+    Returns
+    -------
+    Figure
+        Sources below 1 % of both mean squares at all times are drawn as one, and so are errors that are the same in every run.
+    """
     figure, axes = new_figure(2, 2, size=(11.0, 7.0), sharex=True, height_ratios=(1.0, 1.25))
     parts = (slice(0, 3), slice(3, 6))
     shares = [_shares(analysis, part) for part in parts]

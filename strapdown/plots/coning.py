@@ -69,7 +69,10 @@ def drift_by_algorithm(drifts: Sequence[Drift], ax: Axes | None = None) -> Axes:
 
 
 def coning_errors(outcomes: Sequence[FilterOutcome]) -> Figure:
-    """Draw, for each integration algorithm, the errors about the cone's axis inside the filter's ±3σ: attitude above, bias below."""
+    """Draw the errors about the cone's axis inside the filter's ±3σ for each integration algorithm: attitude above, bias below.
+
+    The bias panels share one vertical scale where the errors allow it; a larger one is marked.
+    """
     figure, axes = new_figure(2, len(outcomes), size=(3.1 * len(outcomes), 5.2), sharex=True, squeeze=False)
     for j, outcome in enumerate(outcomes):
         s = outcome.statistics
@@ -173,7 +176,20 @@ def _leaves(outcome: FilterOutcome, subset: str, bounds: tuple[float, float]) ->
 
 
 def draw_coning_study(study: ConingStudy, folder: str | os.PathLike[str], form: str = "png") -> list[Path]:
-    """Write the figures of the coning study to a folder, as ``form`` ("png", "pdf" or "svg"), and return their paths."""
+    """Write the figures of the coning study to a folder.
+
+    Parameters
+    ----------
+    study : ConingStudy
+    folder : path
+        Made if it is missing.
+    form : {"png", "pdf", "svg"}
+
+    Returns
+    -------
+    list of Path
+        ``drift``, ``errors`` and ``consistency`` with the suffix of the format.
+    """
     figure, ax = new_figure(size=(7.0, 4.2))
     drift_by_algorithm(study.drifts, ax)
     p = study.parameters

@@ -167,7 +167,18 @@ def estimate_overview(estimate: Estimate, *, title: str = "", fixed_frame: str =
 
 
 def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:
-    """Draw the optional error states over time inside their ±3σ, one axes for each block and unit."""
+    """Draw the optional error states over time inside their ±3σ, one axes for each block and unit.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        With error states.
+    title : str
+
+    Returns
+    -------
+    Figure
+    """
     panels = [
         (name, block, unit, [k for k, one in enumerate(block.units) if one == unit])
         for name, block in estimate.error_states.items()
@@ -204,7 +215,21 @@ def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:
 
 
 def recording_errors(time: Array, errors: ReferenceErrors, movement: np.ndarray | None = None) -> Figure:
-    """Draw total, heading and inclination errors against a reference over time, the movement phase shaded."""
+    """Draw total, heading and inclination errors against a reference over time.
+
+    Parameters
+    ----------
+    time : (n,)
+        s.
+    errors : ReferenceErrors
+        rad, at those times.
+    movement : (n,) of bool, optional
+        Samples that are judged, drawn shaded.
+
+    Returns
+    -------
+    Figure
+    """
     figure, ax = new_figure(size=(9.0, 4.0))
     mask = np.zeros(len(time), int) if movement is None else movement.astype(int)
     inside = np.flatnonzero(np.diff(np.concatenate([[0], mask, [0]])))
@@ -232,7 +257,21 @@ def recording_errors(time: Array, errors: ReferenceErrors, movement: np.ndarray 
 
 
 def error_overview(estimate: Estimate, truth: Truth, *, title: str = "") -> Figure:
-    """Draw the six errors against the truth at the estimate's times inside the filter's ±3σ: attitude left, bias right."""
+    """Draw the six errors against the truth inside the filter's ±3σ: attitude left, bias right.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    truth : Truth
+        At the estimate's times.
+    title : str
+        What was estimated.
+
+    Returns
+    -------
+    Figure
+        Attitude errors as a rotation vector in body axes, ``q_true = q_est ⊗ exp(δθ)``.
+    """
     figure, axes = new_figure(3, 2, size=(10.0, 6.6), sharex=True)
     error = errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)
     settled = slice(len(estimate.time) // 20, None)

@@ -63,7 +63,19 @@ def innovation_quantiles(pairs: QuantilePairs, ax: Axes | None = None) -> Axes:
 
 
 def innovation_autocorrelation(result: Autocorrelation, ax: Axes | None = None) -> Axes:
-    """Draw the autocorrelation of each component with the bounds of one lag and of all lags together."""
+    """Draw the autocorrelation of each component with the bounds of one lag and of all lags together.
+
+    Parameters
+    ----------
+    result : Autocorrelation
+        Of :func:`strapdown.consistency.autocorrelation`.
+    ax : Axes, optional
+        A new figure's if not given.
+
+    Returns
+    -------
+    Axes
+    """
     ax = axes_or_new(ax)
     lags, number = result.lags, result.values.shape[1]
     width = 0.7 / number
@@ -136,7 +148,21 @@ def nis_over_record(
 
 
 def error_distribution(distribution: Distribution, ax: Axes | None = None, *, label: str = "attitude error") -> Axes:
-    """Draw the share of errors (rad) at or below each size, with the median and the 95 % error marked."""
+    """Draw the share of errors at or below each size, with the median and the 95 % error marked.
+
+    Parameters
+    ----------
+    distribution : Distribution
+        Of errors in rad.
+    ax : Axes, optional
+        A new figure's if not given.
+    label : str
+        Name of the error on the horizontal axis.
+
+    Returns
+    -------
+    Axes
+    """
     ax = axes_or_new(ax)
     unit, size = angle_unit(np.array([distribution.quantile(0.99)]))
     ax.plot(*decimated(distribution.values / size, 100.0 * distribution.probability), color=BLUE, label=label)

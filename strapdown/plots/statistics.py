@@ -65,7 +65,23 @@ def nees_over_time(
 def nis_over_time(
     named: Sequence[tuple[str, Statistics]], ax: Axes | None = None, *, probability: float = 0.99, label: str = ""
 ) -> Axes:
-    """Draw the mean NIS per degree of freedom in each interval of time, with the bounds of one interval."""
+    """Draw the mean NIS per degree of freedom in each interval of time, with the bounds of one interval.
+
+    Parameters
+    ----------
+    named : sequence of (str, Statistics)
+        What is drawn, with its name in the legend.
+    ax : Axes, optional
+        A new figure's if not given.
+    probability : float
+        That the mean of a consistent filter over one interval lies inside the bounds.
+    label : str
+        Of the bounds in the legend; their confidence level if not given.
+
+    Returns
+    -------
+    Axes
+    """
     ax = axes_or_new(ax)
     for k, (name, statistics) in enumerate(named):
         seen = statistics.nis_degrees > 0

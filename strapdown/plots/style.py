@@ -86,14 +86,39 @@ def ink() -> str:
 def new_figure(
     rows: int = 1, columns: int = 1, *, size: tuple[float, float] = (8.0, 4.5), **options: Any
 ) -> tuple[Figure, Any]:
-    """Return a figure of ``rows`` × ``columns`` axes (an array of them where there are several), laid out without overlap."""
+    """Return a figure of ``rows`` × ``columns`` axes in the package's style, which needs no display.
+
+    Parameters
+    ----------
+    rows, columns : int
+    size : (float, float)
+        Width and height, inches.
+    **options
+        Of ``Figure.subplots``, such as ``sharex``.
+
+    Returns
+    -------
+    Figure, Axes or array of Axes
+        Laid out so that labels do not overlap.
+    """
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=size, dpi=150, layout="constrained")
         return figure, figure.subplots(rows, columns, **options)
 
 
 def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
-    """Write a figure (PNG, PDF or SVG by the suffix); the file appears whole or not at all, and holds no date."""
+    """Write a figure as PNG, PDF or SVG by the suffix; the file appears whole or not at all, and holds no date.
+
+    Parameters
+    ----------
+    figure : Figure
+    path : path
+
+    Returns
+    -------
+    Path
+        The file written.
+    """
     undated: dict[str, Any] = {".pdf": {"CreationDate": None}, ".svg": {"Date": None}}
     with written_beside(path) as temporary, matplotlib.rc_context(STYLE), warnings.catch_warnings():
         warnings.filterwarnings("ignore", r"Glyph .* missing from font")  # of a file's name: drawn as boxes

@@ -57,7 +57,7 @@ def write(
     out : path, optional
         The page; ``result`` with the suffix .html if not given.
     probability : float
-        That a right filter is not called wrong by any test.
+        That no test rejects a consistent filter.
 
     Raises
     ------

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from strapdown import consistency, plots, quaternion, records
+from strapdown.plots.estimates import angle_labels
 from strapdown.plots.sphere import body_axis_path
 from strapdown.plots.style import AXES, angle_unit, rate_unit
 from strapdown.records import Estimate, Innovations, Truth
@@ -166,7 +167,7 @@ def _over_time(estimate: Estimate, truth: Truth | None, fixed_frame: str) -> str
         euler = quaternion.to_rotation(estimate.attitude).as_euler("ZYX", degrees=True)[:, ::-1]
         series = tuple(
             page.Series(label=name, value=euler[:, k], colour=_COLOURS[k], wraps=True)
-            for k, name in enumerate(plots.angle_labels(fixed_frame))
+            for k, name in enumerate(angle_labels(fixed_frame))
         )
         charts.append(
             page.chart(

@@ -227,11 +227,11 @@ def of_montecarlo(summary: Mapping[str, Any]) -> list[Table]:
             **{f"error_quantile_{q}": last[f"{what}_error_quantile_{q}_{unit}"][k] for q in quantiles},
         }
         for what, unit, shown in (("attitude", "arcsec", "arcsec"), ("bias", "deg_per_hour", "°/h"))
+        if f"{what}_rms_error_{unit}" in last  # a filter may estimate no bias
         for k, axis in enumerate("xyz")
     ]
     shares = [
-        {"of": what, **{f"inside_{k + 1}_sigma": share for k, share in enumerate(coverage[what])}}
-        for what in ("expected", "attitude", "bias")
+        {"of": what, **{f"inside_{k + 1}_sigma": share for k, share in enumerate(coverage[what])}} for what in coverage
     ]
     runs = f"{summary['runs']} runs"
     return [
