@@ -169,7 +169,7 @@ def satellite(duration=300.0):
                 name="tracker", sigma_across=5.0 * units.ARCSECOND, sigma_about=30.0 * units.ARCSECOND, rate=2.0
             ),
         ),
-        rate=5.0,
+        rate=50.0,  # at 5 Hz the states for flicker are 2 % too careful
         duration=duration,
         gravity_f=(0.0, 0.0, 0.0),
     )

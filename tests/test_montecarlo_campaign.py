@@ -348,7 +348,6 @@ SCALAR = ("--machine", "scalar")
 def test_the_command_computes_tells_and_writes(command):
     status, said, error = command("short.toml", "--runs", 30, "--seed", 4, *SCALAR)
     assert (status, error) == (2, "")  # 30 runs cannot tell
-    assert "this cannot show the σ of the attitude" in said
     assert "More runs (--runs, with --resume) would show it." in said
     assert "short: 30 runs, seed 4, machine: scalar." in said
     for words in (
@@ -546,7 +545,7 @@ def test_a_signal_that_whoever_started_the_command_had_ignored_stays_ignored(com
     signal.signal(number, signal.SIG_IGN)
     monkeypatch.setattr(campaign, "_write", interrupted)
     status, _, _ = command("short.toml", "--runs", 20, "--threads", 1, *SCALAR)
-    assert status == 0
+    assert status == 2  # 20 runs cannot tell
     assert campaign.read("short-montecarlo.h5").finished
     assert signal.getsignal(number) is signal.SIG_IGN
 

@@ -141,13 +141,13 @@ class _Compiling:
 
     def listen(self) -> None:
         """Listen as soon as numba is there."""
-        if self._listening or "numba.core.dispatcher" not in sys.modules:
+        numba = sys.modules.get("numba")
+        if self._listening or numba is None or getattr(numba.__spec__, "_initializing", False):
             return
-        from numba.core import event
-
+        event: Any = sys.modules["numba.core.event"]
         owner = self
 
-        class Listener(event.Listener):  # type: ignore[misc]
+        class Listener(event.Listener):
             def on_start(self, happened: Any) -> None:
                 owner.started(happened.data["dispatcher"])
 
