@@ -565,7 +565,7 @@ class AttitudeSensor:
     rate: float
     """Measurements a second, Hz."""
     boresight: Literal["x", "y", "z"] = "z"
-    """Body axis along which it looks, ``"x"``, ``"y"`` or ``"z"``."""
+    """Body axis along which it looks."""
     phase: float = 0.0
     """Time of the first measurement after the start, s; 0 means one interval after it."""
     faults: Faults = field(default_factory=Faults)

@@ -117,7 +117,7 @@ def test_every_key_has_a_meaning_and_texts_name_their_choices():
     for section in SECTIONS:
         for key in section.keys:
             assert len(key.meaning.split()) >= 2, f"{section.header} {section.type}: {key.name} has no docstring"
-            if key.name in ("kind", "boresight"):
+            if key.name == "kind":
                 for word in re.findall(r'`"([a-z]+)"`', key.meaning):
                     assert _refusal(section, key.name, word) == ""
                 assert len(re.findall(r'`"([a-z]+)"`', key.meaning)) >= 2
