@@ -32,13 +32,7 @@ templates_path = ["_templates"]
 os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(DOCS.parent), os.environ.get("PYTHONPATH", "")]))
 os.environ.update(
-    STRAPDOWN_DOCS=str(DOCS),
-    COLUMNS="96",
-    NO_COLOR="1",
-    TERM="dumb",
-    TTY_COMPATIBLE="0",
-    OMP_NUM_THREADS="1",
-    OPENBLAS_NUM_THREADS="1",
+    STRAPDOWN_DOCS=str(DOCS), COLUMNS="96", NO_COLOR="1", TERM="dumb", TTY_COMPATIBLE="0", OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1"
 )
 os.environ.pop("MPLBACKEND", None)  # pages draw inline
 _profile = tempfile.TemporaryDirectory()

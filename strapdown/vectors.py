@@ -567,7 +567,6 @@ class AttitudeSensor:
     boresight: Literal["x", "y", "z"] = "z"
     """Body axis along which it looks."""
     phase: float = 0.0
-    """Time of the first measurement after the start, s; 0 means one interval after it."""
     faults: Faults = field(default_factory=Faults)
 
     def __post_init__(self) -> None:
