@@ -6,18 +6,29 @@ The cells look and act as in any notebook; ``%%bash --no-raise-error`` goes on w
 from __future__ import annotations
 
 import subprocess
-import sys
+import textwrap
 from typing import Any
+
+WIDTH = 88
+"""Characters that fit into a line of a page."""
 
 
 def bash(line: str, cell: str) -> None:
     """Run a cell in Bash until a command fails; print what it wrote."""
-    options = [] if "--no-raise-error" in line else ["-e"]
-    # stderr holds progress bars; commands that show an error redirect it.
-    done = subprocess.run(["bash", *options, "-c", cell], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    sys.stdout.write("\n".join(row.rstrip() for row in done.stdout.splitlines()))
+    options = [] if "--no-raise-error" in line else ["-e", "-o", "pipefail"]
+    # stderr holds progress bars; cells that show an error redirect it.
+    done = subprocess.run(["bash", *options, "-c", cell], capture_output=True, text=True, check=False)
+    print("\n".join(_wrapped(row.rstrip()) for row in done.stdout.splitlines()))
     if done.returncode and options:
         raise RuntimeError(f"exit status {done.returncode}: {done.stderr}")
+
+
+def _wrapped(row: str) -> str:
+    """Wrap a sentence as a terminal would, and leave rows of tables as they are."""
+    if len(row) <= WIDTH or "  " in row.lstrip():
+        return row
+    indent = row[: len(row) - len(row.lstrip())]
+    return textwrap.fill(row, WIDTH, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
 
 
 def load_ipython_extension(shell: Any) -> None:

@@ -27,9 +27,9 @@ class CircularOrbit:
     """A circular orbit in an inertial fixed frame, z to the north pole, its ascending node on the x axis."""
 
     altitude: float = 500e3
-    """m."""
+    """Height above the mean radius of the earth, m."""
     inclination: float = 1.7
-    """rad."""
+    """Angle between the orbit's plane and the equator, rad."""
     phase: float = 0.0
     """Angle from the ascending node at time 0, rad."""
 

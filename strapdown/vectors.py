@@ -421,7 +421,7 @@ class Faults:
     correlated_sigma: float = 0.0
     """Standard deviation of a first-order Gauss–Markov noise on top, of each component, in the unit of sigma."""
     correlation_time: float = 100.0
-    """Its correlation time, s."""
+    """Correlation time of that noise, s."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -498,6 +498,7 @@ class VectorSensor(ByValue):
     """A sensor of one known direction: a star, the sun, a beacon."""
 
     name: str
+    """Name of the sensor, and of its stream of random numbers."""
     reference_f: Array
     """Direction in the fixed frame (3,); its length does not matter."""
     sigma: float
@@ -507,6 +508,7 @@ class VectorSensor(ByValue):
     phase: float = 0.0
     """Time of the first measurement after the start, s; 0 means one interval after it."""
     kind: Kind = "direction"
+    """``"direction"``, or ``"heading"``: only the turn about the fixed z axis."""
     faults: Faults = field(default_factory=Faults)
 
     def __post_init__(self) -> None:
@@ -555,15 +557,17 @@ class AttitudeSensor:
     """A star tracker that gives the attitude as a quaternion; coarse about its boresight, fine across it."""
 
     name: str
+    """Name of the sensor, and of its stream of random numbers."""
     sigma_across: float
     """Noise about the axes across the boresight, rad."""
     sigma_about: float
     """Noise about the boresight, rad."""
     rate: float
-    """Hz."""
+    """Measurements a second, Hz."""
     boresight: Literal["x", "y", "z"] = "z"
-    """Body axis along which it looks."""
+    """Body axis along which it looks, ``"x"``, ``"y"`` or ``"z"``."""
     phase: float = 0.0
+    """Time of the first measurement after the start, s; 0 means one interval after it."""
     faults: Faults = field(default_factory=Faults)
 
     def __post_init__(self) -> None:
@@ -598,19 +602,21 @@ class Magnetometer(ByValue):
     """A magnetometer in a known field: ``m_b = (I + S) R_fbᵀ B_f + h + v``, S soft iron, h hard iron (the calibration left over)."""
 
     name: str
+    """Name of the sensor, and of its stream of random numbers."""
     field_f: Array | VectorField
     """The field in the fixed frame, T: a vector (3,), or a function of time (m,) that returns (m, 3)."""
     sigma: float
     """Noise of each component, T."""
     rate: float
-    """Hz."""
+    """Measurements a second, Hz."""
     hard_iron: Array = field(default_factory=lambda: np.zeros(3))
-    """(3,), T."""
+    """h, field of magnetised parts that turn with the body (3,), T."""
     soft_iron: Array = field(default_factory=lambda: np.zeros((3, 3)))
-    """(3, 3)."""
+    """S, of parts that the outer field magnetises (3, 3)."""
     kind: Kind = "direction"
     """``"direction"``, ``"heading"`` (about the fixed z axis) or ``"vector"`` (T)."""
     phase: float = 0.0
+    """Time of the first measurement after the start, s; 0 means one interval after it."""
     faults: Faults = field(default_factory=Faults)
 
     def __post_init__(self) -> None:
@@ -681,21 +687,23 @@ class Accelerometer(ByValue):
     """An accelerometer taken for a sensor of the vertical: right at rest, wrong by whatever the body accelerates."""
 
     name: str
+    """Name of the sensor, and of its stream of random numbers."""
     sigma: float
     """Noise of each component, m/s²."""
     rate: float
-    """Hz."""
+    """Measurements a second, Hz."""
     lever_arm_b: Array = field(default_factory=lambda: np.zeros(3))
     """Place on the body (3,), m, from the point that moves with ``acceleration_f``."""
     bias: Array = field(default_factory=lambda: np.zeros(3))
-    """(3,), m/s²."""
+    """Constant error of each axis (3,), m/s²."""
     acceleration_f: VectorField | None = None
     """Acceleration of that point in the fixed frame, m/s²; None: none."""
     gravity_f: Array = field(default_factory=lambda: np.array(GRAVITY_F))
-    """(3,), m/s²."""
+    """Acceleration of gravity in the fixed frame (3,), m/s²."""
     kind: Kind = "direction"
     """``"direction"`` or ``"vector"`` (m/s²)."""
     phase: float = 0.0
+    """Time of the first measurement after the start, s; 0 means one interval after it."""
     faults: Faults = field(default_factory=Faults)
 
     def __post_init__(self) -> None:
@@ -734,13 +742,15 @@ class HeadingPair(ByValue):
     """
 
     name: str
+    """Name of the sensor, and of its stream of random numbers."""
     baseline_b: Array
     """From the first antenna to the second (3,), m, body axes."""
     sigma: float
     """Noise of each component of the relative position, m; the heading's is that over the baseline's level length."""
     rate: float
-    """Hz."""
+    """Measurements a second, Hz."""
     phase: float = 0.0
+    """Time of the first measurement after the start, s; 0 means one interval after it."""
     faults: Faults = field(default_factory=Faults)
 
     def __post_init__(self) -> None:

@@ -407,6 +407,13 @@ def _specification(fit: identification.NoiseFit, source: str, warnings: list[str
                 *wholly,
             ]
         )
+    if sensor == "gyro":
+        text += "\n" + _commented(
+            [
+                "Add turn_on_bias_sigma_deg_per_hour from the data sheet, or from several recordings: one does not show how the bias",
+                "differs from one switch-on to the next, and without it a filter takes the bias for known to be near zero.",
+            ]
+        )
     return text
 
 

@@ -84,9 +84,9 @@ class SpinCone:
     Parameters
     ----------
     precession_rate : float
-        Ω_p, rad/s.
+        Ω_p, rate at which the body z axis goes round the cone, rad/s.
     spin_rate : float
-        Ω_s, rad/s.
+        Ω_s, rate about the body z axis, rad/s.
     angle : float
         β, the half-angle of the cone, rad; 0 to π.
     """

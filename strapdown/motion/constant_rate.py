@@ -23,7 +23,7 @@ class ConstantRate:
     Parameters
     ----------
     rate : sequence of 3 floats
-        w_b, rad/s.
+        w_b, rate about each body axis, rad/s.
     initial_attitude : sequence of 4 floats
         q_fb at time 0.
     """

@@ -31,7 +31,7 @@ class Harmonic:
     amplitude : sequence of 3 floats
         a, rad/s along each body axis.
     frequency : float
-        f, Hz.
+        f of this harmonic, Hz.
     phase : float
         φ, rad. Two harmonics of one frequency on different axes make an elliptic vibration, which cones.
     """
@@ -62,7 +62,7 @@ class HarmonicRates:
     ----------
     harmonics : sequence of Harmonic
     mean : sequence of 3 floats
-        rad/s.
+        Mean rate about each body axis, rad/s.
     initial_attitude : sequence of 4 floats
         q_fb at time 0.
     """

@@ -25,9 +25,9 @@ class Slew:
     rotation_vector : sequence of 3 floats
         Φ, the whole turn in body axes, rad; may exceed π.
     duration : float
-        s.
+        Length of the turn, s.
     start : float
-        s.
+        Time at which the turn begins, s.
     initial_attitude : sequence of 4 floats
         q_fb before the slew.
     """

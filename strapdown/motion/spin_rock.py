@@ -22,13 +22,13 @@ class SpinRock:
     Parameters
     ----------
     rock_angle : float
-        A, rad.
+        A, amplitude of the rocking, rad.
     rock_frequency : float
-        f, Hz.
+        f, of the rocking, Hz.
     spin_rate : float
-        Ω_s, rad/s.
+        Ω_s, rate of the spin about body z, rad/s.
     rock_phase : float
-        φ, rad.
+        φ, of the rocking at time 0, rad.
     """
 
     rock_angle: float

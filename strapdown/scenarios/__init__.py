@@ -55,9 +55,11 @@ class Scenario:
     rate: float
     """Gyro samples a second, Hz."""
     duration: float
-    """s; rounded to whole gyro samples."""
+    """Length of the record, s; rounded to whole gyro samples."""
     name: str = ""
+    """Name by which its files are called."""
     description: str = ""
+    """What it is, for lists and reports."""
     seed: int = 0
     """The seed that is used where none is given."""
     gravity_f: tuple[float, ...] = vectors.GRAVITY_F
