@@ -80,7 +80,7 @@ def _mathml(self: Any, node: nodes.Element, *, block: bool) -> None:
         raise ExtensionError(f"{node.source}:{node.line}: {error} in {node.astext()}") from error
     markup = _spaced(markup)
     if block:
-        number = f'<span class="eqno">({node["number"]})</span>' if node.get("number") else ""
+        number = f'<span class="formula-number">({node["number"]})</span>' if node.get("number") else ""
         markup = f'<div class="math">{markup}{number}</div>\n'
     self.body.append(markup)
     raise nodes.SkipNode
