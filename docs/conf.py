@@ -32,7 +32,7 @@ templates_path = ["_templates"]
 os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
 os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(DOCS.parent), os.environ.get("PYTHONPATH", "")]))
 os.environ.update(
-    STRAPDOWN_DOCS=str(DOCS), COLUMNS="96", NO_COLOR="1", TERM="dumb", TTY_COMPATIBLE="0", OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1"
+    STRAPDOWN_DOCS=str(DOCS), COLUMNS="96", NO_COLOR="1", TERM="dumb", OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1"
 )
 os.environ.pop("MPLBACKEND", None)  # pages draw inline
 _profile = tempfile.TemporaryDirectory()
@@ -40,6 +40,8 @@ os.environ["IPYTHONDIR"] = _profile.name
 (Path(_profile.name) / "profile_default").mkdir()
 (Path(_profile.name) / "profile_default/ipython_kernel_config.py").write_text(
     "c.IPKernelApp.log_level = 40\n"
+    f"import sys; sys.path.insert(0, {str(DOCS)!r})\n"
+    "c.InteractiveShellApp.extensions = ['shell_cells']\n"
     "c.InlineBackend.figure_formats = {'svg'}\n"
     "c.InlineBackend.rc = {'figure.figsize': (6.4, 3.6), 'font.size': 9.0, 'svg.fonttype': 'path'}\n"
 )
@@ -78,7 +80,7 @@ def _mathml(self: Any, node: nodes.Element, *, block: bool) -> None:
         raise ExtensionError(f"{node.source}:{node.line}: {error} in {node.astext()}") from error
     markup = _spaced(markup)
     if block:
-        number = f'<span class="eqno">({node["number"]})</span>' if node.get("number") else ""
+        number = f'<span class="formula-number">({node["number"]})</span>' if node.get("number") else ""
         markup = f'<div class="math">{markup}{number}</div>\n'
     self.body.append(markup)
     raise nodes.SkipNode
@@ -95,16 +97,22 @@ def _spaced(markup: str) -> str:
     return re.sub(r"<mo[^>]*>([/|])</mo>", r'<mo lspace="0" rspace="0">\1</mo>', markup)
 
 
-def _absolute_values(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Escape the bars of absolute values outside literals: reStructuredText would take |q| for a substitution."""
+def _plain_marks(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Let docstrings be read as they are meant: |q| is an absolute value and no substitution, a literal may touch a sign, as in ``x``²."""
     for k, line in enumerate(lines):
-        parts = re.split(r"(``.*?``)", line)
-        lines[k] = "".join(part if part.startswith("``") else part.replace("|", r"\|") for part in parts)
+        parts = re.split(r"(``.+?``)", line)
+        for i in range(0, len(parts), 2):  # the texts between literals
+            parts[i] = parts[i].replace("|", r"\|")
+            if i and re.match(r"[^\s.,;:!?'\")\]}>/-]", parts[i]):
+                parts[i] = r"\ " + parts[i]
+            if i + 1 < len(parts) and re.search(r"[^\s'\"(\[{</:-]$", parts[i]):
+                parts[i] += r"\ "
+        lines[k] = "".join(parts)
 
 
 def setup(app: Any) -> None:
     """Register the writer of formulas."""
-    app.connect("autodoc-process-docstring", _absolute_values)
+    app.connect("autodoc-process-docstring", _plain_marks)
     app.add_html_math_renderer(
         "mathml",
         (lambda self, node: _mathml(self, node, block=False), None),

@@ -1,0 +1,149 @@
+"""The documentation says what there is: commands and options in README and site exist, links lead somewhere, the reference is whole.
+
+The pages' code is run by the build of the site (``docs/conf.py``), not here.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import pkgutil
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from typer.main import get_command
+
+import strapdown
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+PAGES = sorted([ROOT / "README.md", *(page for page in DOCS.rglob("*.md") if "_build" not in page.parts)])
+FENCE = re.compile(r"^(`{3,})([^\n]*)\n(.*?)^\1\s*$", re.MULTILINE | re.DOTALL)
+
+
+def without_output(text: str) -> str:
+    """Return the text of a page without its blocks of code."""
+    return FENCE.sub("", text)
+
+
+def shell_lines(page: Path) -> list[str]:
+    """Return the lines that a reader would type into a shell: of ``sh`` blocks and of cells that Bash runs."""
+    lines = []
+    for _, info, body in FENCE.findall(page.read_text(encoding="utf-8")):
+        shell = info.strip() in ("sh", "bash", "console") or (info.startswith("{code-cell}") and "%%bash" in body)
+        lines += body.replace("\\\n", " ").splitlines() if shell else []
+        lines += [row.removeprefix("!") for row in body.splitlines() if row.startswith("!")]
+    return lines
+
+
+def commands(page: Path) -> list[list[str]]:
+    """Return each call of the program on a page as its words, also of those in the running text."""
+    text = page.read_text(encoding="utf-8")
+    told = [f"strapdown {one}" for one in re.findall(r"`strapdown ([^`\n]+)`", without_output(text))]
+    told += re.findall(r"^\| (`strapdown [^|]*`) \|", text, re.MULTILINE)
+    calls = []
+    for line in [*shell_lines(page), *(part for one in told for part in one.replace("`", "").split(", "))]:
+        for part in re.split(r"&&|\|\||[;|](?![^']*'\s)", re.sub(r"(^|\s)#.*", "", line)):
+            try:
+                words = shlex.split(part)
+            except ValueError:  # an apostrophe in the running text
+                words = part.split()
+            if words[:1] == ["strapdown"]:
+                calls.append(words[1:])
+    return calls
+
+
+def unknown(words: list[str]) -> str:
+    """Return what of a call does not exist, "" if all does."""
+    program = get_command(importlib.import_module("strapdown.cli").app)
+    if not words:
+        return ""
+    if words[0].startswith("-"):
+        name, options = "strapdown", program.params
+    else:
+        name = words[0]
+        if name not in program.commands:
+            return f"command {name}"
+        options = program.commands[name].params
+    known = {flag for option in options for flag in (*option.opts, *option.secondary_opts)} | {"--help"}
+    used = [word.split("=")[0] for word in words if re.fullmatch(r"--?[A-Za-z][\w-]*(=.*)?", word)]
+    return ", ".join(f"{name} {flag}" for flag in used if flag not in known)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_command_and_option_exists(page):
+    found = commands(page)
+    assert [problem for words in found if (problem := unknown(words))] == []
+
+
+def test_the_commands_are_seen():
+    """What the test above reads: a page that it read nothing of would pass."""
+    assert ["simulate", "two-stars"] in commands(ROOT / "README.md")
+    assert ["coning-budget", "--psd", "FILE", "--rate", "HZ"] in commands(ROOT / "README.md")
+    assert ["check", "estimate-results/estimate.h5"] in commands(DOCS / "start.md")
+    assert unknown(["simulate", "two-stars", "--sed", "3"]) == "simulate --sed"
+    assert unknown(["simulat"]) == "command simulat"
+
+
+def anchors(page: Path) -> set[str]:
+    """Return what a link into a page may end in: its headings as GitHub and MyST name them, and its labels."""
+    text = page.read_text(encoding="utf-8")
+    heads = re.findall(r"^#{1,6}\s+(.*)$", without_output(text), re.MULTILINE)
+    slugs = {re.sub(r"[^\w\- ]", "", head.lower()).strip().replace(" ", "-") for head in heads}
+    return slugs | set(re.findall(r"^\(([\w-]+)\)=$", text, re.MULTILINE))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_link_resolves(page):
+    text = without_output(page.read_text(encoding="utf-8"))
+    dead = []
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if re.match(r"[a-z]+:", target):
+            continue  # an address on the network
+        path, _, anchor = target.partition("#")
+        file = page.parent / path if path else page
+        if not file.exists() or (anchor and file.suffix == ".md" and anchor not in anchors(file)):
+            labels = {label for other in PAGES for label in anchors(other)}
+            if path or anchor not in labels:
+                dead.append(target)
+    assert dead == []
+
+
+def test_every_page_is_in_a_table_of_contents():
+    listed = {"index"}
+    for page in DOCS.rglob("*.md"):
+        for _, info, body in FENCE.findall(page.read_text(encoding="utf-8")):
+            if info.startswith("{toctree}"):
+                rows = [row.strip() for row in body.splitlines() if row.strip() and not row.startswith(":")]
+                for row in rows:
+                    listed |= {
+                        str(one.relative_to(DOCS).with_suffix("")) for one in (page.parent).glob(f"{row}.md")
+                    } or pytest.fail(f"{page.name} lists {row}, which is not there")
+    pages = {str(page.relative_to(DOCS).with_suffix("")) for page in PAGES if DOCS in page.parents}
+    assert pages - listed == set()
+
+
+def test_the_reference_lists_every_public_module():
+    public = set()
+    for module in pkgutil.walk_packages(strapdown.__path__, "strapdown."):
+        name = module.name.removeprefix("strapdown.")
+        if name.split(".")[0] not in (*strapdown.__all__, "workflows"):
+            continue
+        if hasattr(importlib.import_module(module.name), "__all__"):
+            public.add(name)
+    text = (DOCS / "api/index.md").read_text(encoding="utf-8")
+    assert set(re.findall(r"^   ([\w.]+)$", text, re.MULTILINE)) == public
+
+
+def test_the_validation_data_say_where_they_are_from():
+    data = json.loads((DOCS / "_data/validation.json").read_text(encoding="utf-8"))
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d", data["date"])
+    assert data["version"]
+    assert {"coefficients", "coning_drift", "farrenkopf", "allan", "ukfm"} <= set(data)
+    assert all(row["equal"] for row in data["coefficients"])
+    for row in data["allan"]:
+        assert row["ours"] == pytest.approx(row["published"], rel=1e-6)  # seven digits are published
+    for row in data["farrenkopf"]:
+        assert row["ours"] == pytest.approx(row["published"], rel=1e-9)
