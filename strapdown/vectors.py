@@ -563,7 +563,7 @@ class AttitudeSensor:
     sigma_about: float
     """Noise about the boresight, rad."""
     rate: float
-    """Measurements a second, Hz."""
+    """Hz."""
     boresight: Literal["x", "y", "z"] = "z"
     """Body axis along which it looks."""
     phase: float = 0.0
