@@ -487,12 +487,12 @@ def _estimate_recording(
     options: dict[str, Any],
 ) -> None:
     """Run the filter over a recording: accelerometer as the vertical, magnetometer as the heading."""
-    from strapdown import ahrs, recordings, setup, unit_calibration
+    from strapdown import ahrs, recordings, setup, unit_calibration, workflows
     from strapdown.checks import non_negative, one_of
     from strapdown.consistency import reference_errors
     from strapdown.estimation.gating import Gate, Robust
     from strapdown.files import write_json
-    from strapdown.gyro import process_noise, read_spec
+    from strapdown.gyro import read_spec
     from strapdown.records import write_estimate
     from strapdown.units import DEGREE
 
@@ -506,7 +506,7 @@ def _estimate_recording(
     doubt(source, recording)
     parameters = ahrs.MOTIONS[moved_by]
     if gyro is not None:
-        parameters = replace(parameters, **process_noise(read_spec(gyro)))
+        parameters = workflows.with_gyro_noise(parameters, read_spec(gyro))
     result = ahrs.estimate(source, parameters, latency=late, **options)
     used, found = result.recording, result.estimate
     errors = None if used.true_attitude is None else reference_errors(found.attitude, used.true_attitude)
