@@ -86,7 +86,7 @@ def _mathml(self: Any, node: nodes.Element, *, block: bool) -> None:
         raise ExtensionError(f"{node.source}:{node.line}: {error} in {node.astext()}") from error
     markup = _spaced(markup)
     if block:
-        number = f'<span class="eqno">({node["number"]})</span>' if node.get("number") else ""
+        number = f'<span class="formula-number">({node["number"]})</span>' if node.get("number") else ""
         markup = f'<div class="math">{markup}{number}</div>\n'
     self.body.append(markup)
     raise nodes.SkipNode
@@ -103,16 +103,22 @@ def _spaced(markup: str) -> str:
     return re.sub(r"<mo[^>]*>([/|])</mo>", r'<mo lspace="0" rspace="0">\1</mo>', markup)
 
 
-def _absolute_values(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
-    """Escape the bars of absolute values outside literals: reStructuredText would take |q| for a substitution."""
+def _plain_marks(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Let docstrings be read as they are meant: |q| is an absolute value and no substitution, a literal may touch a sign, as in ``x``²."""
     for k, line in enumerate(lines):
-        parts = re.split(r"(``.*?``)", line)
-        lines[k] = "".join(part if part.startswith("``") else part.replace("|", r"\|") for part in parts)
+        parts = re.split(r"(``.+?``)", line)
+        for i in range(0, len(parts), 2):  # the texts between literals
+            parts[i] = parts[i].replace("|", r"\|")
+            if i and re.match(r"[^\s.,;:!?'\")\]}>/-]", parts[i]):
+                parts[i] = r"\ " + parts[i]
+            if i + 1 < len(parts) and re.search(r"[^\s'\"(\[{</:-]$", parts[i]):
+                parts[i] += r"\ "
+        lines[k] = "".join(parts)
 
 
 def setup(app: Any) -> None:
     """Register the writer of formulas."""
-    app.connect("autodoc-process-docstring", _absolute_values)
+    app.connect("autodoc-process-docstring", _plain_marks)
     app.add_html_math_renderer(
         "mathml",
         (lambda self, node: _mathml(self, node, block=False), None),

@@ -188,6 +188,8 @@ _TYPES = {str: "text", int: "whole number", float: "number", gyro.Axes: "number,
 def _type(hint: Any, default: Any) -> str:
     if hint in _TYPES or typing.get_origin(hint) is Literal:
         return _TYPES.get(hint, "text")
+    if isinstance(default, str):
+        return "text, or list of numbers"
     shape = (3,) if default is dataclasses.MISSING else np.shape(default)
     if shape == (0,):
         return "list of [from, to]"

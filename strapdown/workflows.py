@@ -31,6 +31,7 @@ from strapdown import (
     recordings,
     records,
     scenarios,
+    units,
 )
 from strapdown import setup as setups
 from strapdown.checks import Array, InputError, count, instance, one_of
@@ -438,7 +439,13 @@ def _recording_parameters(motion: str | None, noise: GyroSpec | NoiseFit | Proce
         return dataclasses.replace(
             parameters, angle_random_walk=noise.angle_random_walk, rate_random_walk=noise.rate_random_walk
         )
-    return dataclasses.replace(parameters, **gyro.process_noise(_specification(noise)))
+    return with_gyro_noise(parameters, _specification(noise))
+
+
+def with_gyro_noise(parameters: ahrs.AhrsParameters, spec: GyroSpec) -> ahrs.AhrsParameters:
+    """Return the model of a recorded unit with the noise of its gyro; flicker is matched for the filter of the tilt."""
+    density = (parameters.specific_force_noise / units.STANDARD_GRAVITY) ** 2  # rad² s
+    return dataclasses.replace(parameters, **gyro.matched_process_noise(spec, density))
 
 
 def _record_setup(

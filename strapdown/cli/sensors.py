@@ -438,8 +438,8 @@ def _specification(fit: identification.NoiseFit, source: str, warnings: list[str
     if sensor == "gyro":
         text += "\n" + _commented(
             [
-                "Add turn_on_bias_sigma_deg_per_hour from the data sheet, or from several recordings: one does not show how the bias",
-                "differs from one switch-on to the next, and without it a filter takes the bias for known to be near zero.",
+                "Add turn_on_bias_sigma_deg_per_hour from the data sheet: one recording does not show",
+                "how the bias differs between switch-ons, and filters then take it for near zero.",
             ]
         )
     return text
