@@ -1,0 +1,26 @@
+"""Attitude and heading from a recording: accelerometer as the vertical, magnetometer as the heading only, one filter for both.
+
+The fixed frame is East-North-Up with magnetic North. The disturbances of both vectors last much longer than a sample, so little is lost by
+updating less often than the sensors sample: the samples of a step are turned by the gyro into one frame and averaged there
+(:mod:`strapdown.ahrs.preparing`). The filter is that of :mod:`strapdown.estimation`; its estimate is carried to every stamp.
+"""
+
+from __future__ import annotations
+
+from strapdown.ahrs.estimating import AhrsEstimate, estimate
+from strapdown.ahrs.parameters import HAND_HELD, MOTIONS, AhrsParameters
+from strapdown.ahrs.preparing import Prepared, prepare
+from strapdown.ahrs.starting import quiet_span, resting_bias, start
+
+__all__ = [
+    "HAND_HELD",
+    "MOTIONS",
+    "AhrsEstimate",
+    "AhrsParameters",
+    "Prepared",
+    "estimate",
+    "prepare",
+    "quiet_span",
+    "resting_bias",
+    "start",
+]
