@@ -22,6 +22,8 @@ CHANGE_NOISE = 8e-3
 """Change of the field over that span without iron, each component, share of its strength/√Hz."""
 SIGMA = 0.04
 """Iron that is expected, each component, share of the field's strength."""
+NEGLIGIBLE = 1e-3
+"""Iron below this is none, share of the field's strength."""
 RISE = 3.0
 """Time constant with which iron found so far is taken for iron, s: what lasts shorter is a disturbance of the surroundings."""
 FEIGNED = 0.028
@@ -67,16 +69,19 @@ def find(field: Array, frame: Array, time: Array, known: np.ndarray, strength: f
     iron = np.linalg.solve(matrix + (CHANGE_NOISE / SIGMA) ** 2 * np.eye(3), sums[:, 6:, None])[..., 0]
     size = np.sum(iron**2, axis=1)
     iron *= strength * np.maximum(1.0 - FEIGNED**2 / np.maximum(size, 1e-30), 0.0)[:, None]
-    return _low_pass(iron, interval / RISE) if causal else np.asarray(iron)
+    if causal:
+        iron = _low_pass(iron, interval / RISE)
+        iron[np.linalg.norm(iron, axis=1) < NEGLIGIBLE * strength] = 0.0
+    return np.asarray(iron)
 
 
 def _integral(rows: Array, interval: float) -> Array:
     """Return the integral over time, s, of rows (k, m) up to each, forgotten with :data:`MEMORY`."""
     share = interval / MEMORY
-    return _low_pass(rows, share) * (interval / -np.expm1(-share))
+    return np.asarray(_low_pass(rows, share) * (interval / -np.expm1(-share)))
 
 
-def _low_pass(rows: Array, step: float) -> Array:
-    result = np.empty_like(rows)
+def _low_pass(rows: np.ndarray, step: float) -> Array:
+    result = np.empty(rows.shape)
     compiled(recording_steps.low_pass)(np.ascontiguousarray(rows), -np.expm1(-step), result)
     return result

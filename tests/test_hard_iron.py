@@ -13,11 +13,10 @@ STRENGTH = float(np.linalg.norm(FIELD))
 STEP = 0.03
 
 
-def turned(iron, duration: float = 60.0, size: float = 1.0, noise: float = 0.2, rest: float = 0.0):
-    """Field in the frame that the gyro keeps, turns, and times, of a unit that swings about all axes after some rest; ``iron`` (3,) or a row."""
+def turned(iron, duration: float = 60.0, size: float = 1.0, noise: float = 0.2):
+    """Field in the frame that the gyro keeps, turns, and times, of a unit that swings about all axes; ``iron`` (3,) or (k, 3)."""
     time = STEP * np.arange(1, round(duration / STEP) + 1)
-    since = np.maximum(time - rest, 0.0)
-    angles = size * np.stack([np.sin(0.9 * since), 0.6 * np.sin(1.3 * since), 0.8 * np.sin(0.7 * since)], -1)
+    angles = size * np.stack([np.sin(0.9 * time), 0.6 * np.sin(1.3 * time), 0.8 * np.sin(0.7 * time)], -1)
     R = Rotation.from_euler("XYZ", angles)
     random = np.random.default_rng(4)
     field = (
