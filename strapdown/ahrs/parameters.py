@@ -35,9 +35,9 @@ class AhrsParameters:
     """Time constant over which that deviation is averaged, s: a disturbance does not end where the field happens to look right."""
     iron_sigma: float = 0.012
     """Constant disturbance of the field that nothing shows, share of its strength: part of the σ reported, and not estimated."""
-    step: float = 0.04
+    step: float = 0.03
     """Interval of the filter's steps, s."""
-    heading_interval: float = 0.16
+    heading_interval: float = 0.15
     """Interval of the heading measurements, s."""
     attitude_sigma: float = 3.0 * DEGREE
     """Error of the attitude at the start, each axis, rad."""
