@@ -1,4 +1,7 @@
-"""Faulty samples of a recording: clipped ones, and a gyro that was silent.
+"""Faulty samples of a recording: truncated or clipped ones, and a gyro that was silent.
+
+A gyro whose samples are whole numbers of a step, truncated toward zero, measures every rate half a step too small, and so another bias at
+rest than in motion: half a step is added (:func:`truncation_step`).
 
 A clipped gyro sample is a lower bound of the rate. Between the samples before and after such a run the rate is restored by a cubic
 (:func:`restored`), and its error becomes a variance of the turn, which the filter adds to that of the gyro's noise. So does the turn over a
@@ -14,7 +17,10 @@ import numpy as np
 
 from strapdown.checks import Array
 from strapdown.recordings import Recording
+from strapdown.units import DEGREE
 
+SLOW_RATE = 0.03
+"""Rates below this show by which step a gyro's samples are quantised, rad/s."""
 MIN_CLIPPED_RATE = 1.0
 """Smallest limit of a clipped gyro axis, rad/s; quantised samples at rest repeat their extreme too."""
 MIN_CLIPPED_FORCE = 15.0
@@ -27,6 +33,14 @@ RESTORED_ERROR = 0.5
 """σ of the turn beyond the limit over a clipped run, as a share of what the cubic makes of it."""
 RESTORED_SPAN = 0.3
 """Assumed duration of the angular acceleration at the ends of a clipped run, s."""
+SLOWEST_CROSSING = 64
+"""Samples on either side of zero, at most, between which a rate that crosses it shows the bins of its quantisation about zero."""
+CROSSING_STEPS = 6
+"""Steps beyond zero on either side that make a crossing: noise at rest does not."""
+BINS = 4
+"""Bins on either side of that about zero that it is compared with."""
+TRUNCATED_ODDS = 100.0
+"""Likelihood ratio of truncation to rounding above which samples are taken for truncated."""
 LONG_INTERVAL = 1.5
 """Ratio of an interval between stamps to the usual one above which its rotation is uncertain."""
 
@@ -46,8 +60,14 @@ class Faults:
 def find(recording: Recording) -> Faults:
     """Return the faults of a recording's samples, and the recording without them."""
     words = []
-    rate, variance, clipped = restored(recording.time, recording.rate)
     changes: dict[str, Any] = {}
+    step = truncation_step(recording.rate)
+    if step is not None:
+        recording = replace(recording, rate=untruncated(recording.rate, step))
+        words.append(
+            f"The gyro's samples are multiples of {step / DEGREE:.3g} °/s truncated toward zero: half of it is given back to each"
+        )
+    rate, variance, clipped = restored(recording.time, recording.rate)
     if clipped.any():
         changes["rate"] = rate
         limits = ", ".join(
@@ -74,6 +94,49 @@ def find(recording: Recording) -> Faults:
             "each by what the rate changes in as long a time"
         )
     return Faults(recording=replace(recording, **changes), turn_variance=variance, words=tuple(words))
+
+
+def truncation_step(rate: Array) -> float | None:
+    """Return the step, rad/s, of a gyro whose samples (n, 3) are multiples of it truncated toward zero; None for any other gyro.
+
+    The bin about zero is then twice as wide as the others. Counted are samples in the middle of a crossing of zero, where the rate is in
+    one bin as likely as in another; at rest it is not.
+    """
+    step = _quantisation(rate)
+    if step is None:
+        return None
+    crossing = np.zeros(rate.shape, bool)
+    reach = 2
+    while reach <= SLOWEST_CROSSING and 2 * reach < len(rate):
+        before, after = rate[: -2 * reach], rate[2 * reach :]
+        beyond = np.minimum(np.abs(before), np.abs(after)) > CROSSING_STEPS * step
+        crossing[reach:-reach] |= beyond & (before * after < 0.0)
+        reach *= 2
+    bins = np.abs(rate[crossing]) / step
+    number = np.bincount(np.rint(bins[bins < BINS + 0.5]).astype(int), minlength=1)
+    zero, others = int(number[0]), int(np.sum(number[1:]))
+    # Of 2 B + 1 bins the middle one holds a share of 1 / (2 B + 1), or if it is twice as wide, of 2 / (2 B + 2).
+    truncated, rounded = 1.0 / (BINS + 1), 1.0 / (2 * BINS + 1)
+    odds = zero * np.log(truncated / rounded) + others * np.log((1.0 - truncated) / (1.0 - rounded))
+    return step if odds > np.log(TRUNCATED_ODDS) else None
+
+
+def _quantisation(rate: Array) -> float | None:
+    """Return the step that nearly all the slow ones among the rates (n, 3) are multiples of, zero included; None where there is none."""
+    slow, number = np.unique(np.round(np.abs(rate[np.abs(rate) < SLOW_RATE]), 7), return_counts=True)
+    frequent = slow[number >= 3]
+    if len(frequent) < BINS or frequent[0] != 0.0:
+        return None
+    multiple = slow / np.median(np.diff(frequent))
+    on = np.abs(multiple - np.rint(multiple)) < 0.02
+    if np.sum(number[on]) < 0.8 * np.sum(number) or len(frequent) > 0.1 * np.sum(number):
+        return None
+    return float(np.sum((slow * number)[on]) / np.sum((np.rint(multiple) * number)[on]))
+
+
+def untruncated(rate: Array, step: float) -> Array:
+    """Return rates with half a step given back to each, away from zero; to those that lie within a step of zero, as interpolated, less."""
+    return np.asarray(rate + 0.5 * np.clip(rate, -step, step))
 
 
 def clipped_samples(samples: Array, least: float) -> np.ndarray:

@@ -54,6 +54,7 @@ FLOORS: tuple[tuple[str, ...], ...] = (
         "scenarios",
         "outputs",
         "sensor_faults",
+        "hard_iron",
         "sensor_delays",
         "unit_calibration",
     ),

@@ -830,12 +830,13 @@ def test_broad_trials_by_bounded_velocity(broad):
         if k % 3 == 0:
             late.append(hand_held.gyro_latency(recording)[0])
     white, hand, given, smoothed = (np.array(values) for values in found.values())
-    assert 1.0 < hand[:, 0].mean() < 2.1
-    assert 1.0 < given[:, 0].mean() < 1.9
-    assert np.sort(given[:, 0])[:-1].mean() < 1.4
+    assert 1.0 < hand[:, 0].mean() < 1.8
+    assert 1.0 < given[:, 0].mean() < 1.6
+    assert np.sort(given[:, 0])[:-1].mean() < 1.25
     assert np.sort(smoothed[:, 0])[:-1].mean() < 0.72
-    assert np.sort(given[:, 0])[-2] < 5.0
-    assert given[:, 0].max() < 7.5  # trial 27, the only one beyond 5°
+    assert np.sort(given[:, 0])[-2] < 2.5
+    assert smoothed[:, 0].max() < 4.5
+    assert given[:, 0].max() < 5.0  # trial 27, whose hard iron shows in its motion alone
     assert hand[:, 1].mean() < 0.7
     assert given[:, 1].mean() < 0.48
     assert smoothed[:, 1].mean() < 0.36

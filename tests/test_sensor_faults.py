@@ -139,6 +139,34 @@ def test_sigma_grows_over_a_dropout():
     assert sigma[row + 10] > 1.5 * sigma[row - 20]
 
 
+LSB = 1e-3
+
+
+def quantised(rounding, duration: float = 120.0, noise: float = 1.5) -> tuple[Recording, np.ndarray]:
+    """The swing with a bias and a gyro that gives whole numbers of a step, and the rates before."""
+    plain = swing(duration)
+    random = np.random.default_rng(7)
+    rate = plain.rate + [2.2 * LSB, -3.1 * LSB, 0.4 * LSB] + noise * LSB * random.standard_normal(plain.rate.shape)
+    return dataclasses.replace(plain, rate=LSB * rounding(rate / LSB)), rate
+
+
+@pytest.mark.parametrize("rounding", [np.round, np.floor, np.ceil, lambda x: x])
+@pytest.mark.parametrize("noise", [0.2, 1.5, 3.0])
+def test_only_truncated_rates_are_taken_for_such(rounding, noise):
+    assert sensor_faults.truncation_step(quantised(rounding, noise=noise)[0].rate) is None
+
+
+def test_a_truncated_gyro_shows_the_same_bias_at_rest_and_in_motion():
+    truncated, rate = quantised(np.trunc)
+    assert sensor_faults.truncation_step(truncated.rate) == pytest.approx(LSB, rel=1e-3)
+    found = sensor_faults.find(truncated)
+    assert "multiples of 0.0573 °/s truncated toward zero" in found.words[0]
+    resting = truncated.time < 2.0
+    for samples in (resting, ~resting):
+        assert np.abs(np.mean((found.recording.rate - rate)[samples], axis=0)).max() < 0.1 * LSB
+    assert np.abs(np.mean((truncated.rate - rate)[resting], axis=0)).max() > 0.3 * LSB
+
+
 def test_a_clipped_accelerometer_is_left_out():
     plain = swing()
     force = plain.specific_force + 30.0 * np.sin(40.0 * plain.time)[:, None] * (plain.time > 5.0)[:, None]

@@ -655,6 +655,11 @@ def _say_recording(result: AhrsEstimate, parameters: AhrsParameters, options: _R
     console.print(_model(options.motion, parameters, result))
     for sentence in (*result.delays.words, *(f"{one}." for one in result.faults.words)):
         console.print(sentence)
+    if result.hard_iron.any():
+        iron = ", ".join(f"{value:.3g}" for value in result.hard_iron)
+        console.print(
+            f"Hard iron of {iron} (unit of the magnetometer, body axes, at the end) is subtracted from its samples."
+        )
     for begin, length in recordings.gaps(used.time):
         console.print(f"Gap of {length:.3g} s after {begin:.3f} s.")
     if used.left_out_words:

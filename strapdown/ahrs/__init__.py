@@ -1,0 +1,24 @@
+"""Attitude and heading from a recording: accelerometer as the vertical, magnetometer as the heading only, one filter for both.
+
+The fixed frame is East-North-Up with magnetic North. The disturbances of both vectors last much longer than a sample, so little is lost by
+updating less often than the sensors sample: the samples of a step are turned by the gyro into one frame and averaged there
+(:mod:`strapdown.ahrs.preparing`). The filter is that of :mod:`strapdown.estimation`; its estimate is carried to every stamp.
+"""
+
+from __future__ import annotations
+
+from strapdown.ahrs.estimating import AhrsEstimate, estimate
+from strapdown.ahrs.parameters import HAND_HELD as HAND_HELD
+from strapdown.ahrs.parameters import MOTIONS, AhrsParameters
+from strapdown.ahrs.preparing import Prepared as Prepared
+from strapdown.ahrs.preparing import prepare as prepare
+from strapdown.ahrs.starting import quiet_span as quiet_span
+from strapdown.ahrs.starting import resting_bias as resting_bias
+from strapdown.ahrs.starting import start as start
+
+__all__ = [
+    "MOTIONS",
+    "AhrsEstimate",
+    "AhrsParameters",
+    "estimate",
+]

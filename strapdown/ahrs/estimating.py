@@ -1,0 +1,246 @@
+"""The filter over a recording, and its estimate at every stamp."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from strapdown import estimation, quaternion, sensor_delays, sensor_faults, unit_calibration
+from strapdown.ahrs.parameters import HAND_HELD, AhrsParameters
+from strapdown.ahrs.preparing import Prepared, prepare
+from strapdown.ahrs.starting import quiet_span
+from strapdown.checks import Array, InputError
+from strapdown.estimation.gating import Gate, Robust
+from strapdown.kernels import recording_steps
+from strapdown.kernels.machine import compiled, read_only
+from strapdown.recordings import Recording
+from strapdown.records import ErrorStateEstimate, Estimate, ImuRecord, Innovations, cut
+from strapdown.sensor_delays import Delays
+from strapdown.sensor_faults import Faults
+from strapdown.unit_calibration import UnitCalibration
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AhrsEstimate:
+    """An estimate beside the samples that it was made from, one row for one row."""
+
+    recording: Recording
+    """The recording from its first quiet second on, clipped gyro samples restored."""
+    estimate: Estimate
+    """At the stamps of the recording; the covariance includes timing and constant iron, which the filter does not estimate."""
+    record: ImuRecord
+    """What the filter ran on: increments and vectors averaged over its steps."""
+    initial: estimation.State
+    """Where the filter started."""
+    delays: Delays
+    """Delays of the sensors that are made good."""
+    faults: Faults
+    """What of the samples is not what the unit did."""
+    hard_iron: Array
+    """Hard iron taken off the magnetometer's samples at the end, body axes, in their unit (3,); 0: none is found."""
+    calibration: UnitCalibration | None
+    """What the recording shows of the unit, for its next recording; None where the filter has no states for it."""
+
+
+def estimate(
+    recording: Recording,
+    parameters: AhrsParameters = HAND_HELD,
+    *,
+    latency: float | None = None,
+    calibration: UnitCalibration | None = None,
+    gate: Gate | None = None,
+    robust: Robust | None = None,
+    full_covariance: bool = False,
+    smooth: bool = False,
+) -> AhrsEstimate:
+    """Return attitude and gyro bias over a recording, at its time stamps from the first quiet second on.
+
+    Parameters
+    ----------
+    recording : Recording
+    parameters : AhrsParameters
+    latency : float, optional
+        Delay of the gyro's and the accelerometer's samples, s: the group delay of the sensors; 0: point samples at their stamps. By
+        default each sample is taken for the mean over the interval before its stamp, half of which is its delay. That of the
+        magnetometer beside the gyro is found by :func:`strapdown.sensor_delays.magnetometer_delay`.
+    calibration : UnitCalibration, optional
+        What an earlier recording of the same unit showed: scale and misalignment of its gyro, the magnetometer's delay.
+    gate : Gate, optional
+        Refuse measurements that the filter's model does not explain.
+    robust : Robust, optional
+        Weigh measurements by how far they lie off, each sensor by itself.
+    full_covariance : bool
+        Keep whole covariance matrices too.
+    smooth : bool
+        From all samples, by the fixed-interval smoother, instead of those up to each stamp.
+
+    Returns
+    -------
+    AhrsEstimate
+        Without ``smooth`` each row depends on the samples up to its stamp alone; only the choice of the quiet second does not.
+
+    Raises
+    ------
+    InputError
+        If there is no accelerometer, a sensor has no valid sample in the quiet second, or the recording is too short.
+    """
+    if recording.specific_force is None:
+        raise InputError(f"{recording.source} has no accelerometer, which shows the vertical; add columns ax, ay, az")
+    span = quiet_span(recording)
+    faults = sensor_faults.find(recording.since(span.start))
+    used = faults.recording
+    field_delay = None
+    if calibration is not None:
+        used, field_delay = calibration.applied(used), calibration.magnetometer_delay or None
+        if parameters.gyro_scale_sigma > 0.0:
+            parameters = replace(parameters, gyro_scale_sigma=calibration.sigma)
+    quiet = slice(0, span.stop - span.start)
+    delays = sensor_delays.find(used, latency, field_delay, causal=not smooth)
+    prepared = prepare(used, quiet, parameters, delays.field, causal=not smooth)
+    filtered = _run(prepared, parameters, faults.turn_variance, gate, robust, smooth)
+    found = _at_stamps(filtered, used, prepared, parameters, delays, smooth, full_covariance)
+    scale = found.error_states.get("gyro scale")
+    return AhrsEstimate(
+        recording=used,
+        estimate=found,
+        calibration=None
+        if scale is None
+        else (calibration or unit_calibration.NONE).and_then(scale, delays.last_field, used.source),
+        record=prepared.record,
+        initial=prepared.initial,
+        delays=delays,
+        faults=faults,
+        hard_iron=prepared.iron,
+    )
+
+
+def _run(
+    prepared: Prepared,
+    parameters: AhrsParameters,
+    turn_variance: Array,
+    gate: Gate | None,
+    robust: Robust | None,
+    smooth: bool,
+) -> Estimate:
+    """Return the filter's or the smoother's estimate at the steps.
+
+    Where the gyro does not show how the unit turned, the record is run in parts, each with an angle random walk of its own: that of the
+    gyro, or as much more as makes up ``turn_variance`` (n,), rad², of the sample intervals. Each part is smoothed by itself, for samples
+    after such a part say little about what was before it.
+    """
+    record, own = prepared.record, parameters.setup
+    kinds = {series.sensor: series.kind for series in record.vectors}
+    blocks = () if own.states is None else own.states.blocks(kinds)
+    extra = np.add.reduceat(turn_variance, prepared.edge[:-1].astype(np.intp))
+    change = np.flatnonzero(np.diff(extra > 0.0)) + 1
+    bounds = [0, *change.tolist(), len(extra)]
+    state = prepared.initial
+    parts: list[Estimate] = []
+    for first, last in itertools.pairwise(bounds):
+        part = record if len(bounds) == 2 else cut(record, first, last)
+        walk = parameters.angle_random_walk**2 + float(np.sum(extra[first:last])) / (part.time[-1] - part.time[0])
+        noise = replace(own.process_noise, angle_random_walk=float(np.sqrt(walk)))
+        end = state
+        if not smooth or last < len(extra):
+            found, end = estimation.run_part(part, noise, state, blocks, full_covariance=True, gate=gate, robust=robust)
+        if smooth:
+            found = estimation.smooth(part, noise, state, blocks, full_covariance=True, gate=gate, robust=robust)
+        state = end
+        parts.append(found)
+    return _joined(parts)
+
+
+def _joined(parts: list[Estimate]) -> Estimate:
+    """Return the estimates of successive parts as one; at an edge between two stands the first part's."""
+    if len(parts) == 1:
+        return parts[0]
+
+    def rows(name: str) -> Array:
+        return np.concatenate([getattr(part, name)[k > 0 :] for k, part in enumerate(parts)])
+
+    innovations = {}
+    for sensor in dict.fromkeys(name for part in parts for name in part.innovations):
+        own = [part.innovations[sensor] for part in parts if sensor in part.innovations]
+        weights = [one.weight for one in own if one.weight is not None]
+        innovations[sensor] = Innovations(
+            time=np.concatenate([one.time for one in own]),
+            innovation=np.concatenate([one.innovation for one in own]),
+            variance=np.concatenate([one.variance for one in own]),
+            weight=np.concatenate(weights) if len(weights) == len(own) else None,
+        )
+    blocks = {
+        name: replace(
+            block,
+            values=np.concatenate([part.error_states[name].values[k > 0 :] for k, part in enumerate(parts)]),
+            variance=np.concatenate([part.error_states[name].variance[k > 0 :] for k, part in enumerate(parts)]),
+        )
+        for name, block in parts[0].error_states.items()
+    }
+    return Estimate(
+        time=rows("time"),
+        attitude=rows("attitude"),
+        bias=rows("bias"),
+        variance=rows("variance"),
+        covariance=rows("covariance"),
+        innovations=innovations,
+        events=tuple(event for part in parts for event in part.events),
+        error_states=blocks,
+    )
+
+
+def _at_stamps(
+    filtered: Estimate,
+    used: Recording,
+    prepared: Prepared,
+    parameters: AhrsParameters,
+    delays: Delays,
+    smooth: bool,
+    full_covariance: bool,
+) -> Estimate:
+    """Return the estimate at the recording's stamps: carried on by the gyro from the step before each, and over the delay of the gyro."""
+    edge, turned = prepared.edge, prepared.turned
+    row = np.searchsorted(edge, np.arange(len(used.time)), side="right") - 1
+    bias = filtered.bias[row]
+    late = np.broadcast_to(delays.gyro, used.time.shape)
+    ahead = -sensor_delays.turn_over(used, -late) if smooth else used.rate * late[:, None]
+    ahead = ahead - bias * (used.time - used.time[edge][row] + late)[:, None]
+    step = quaternion.multiply(filtered.attitude, quaternion.conjugate(turned[edge]))
+    assert filtered.covariance is not None
+    R = quaternion.to_matrix(filtered.attitude)
+    fixed = R @ filtered.covariance[:, :3, :3] @ R.transpose(0, 2, 1)
+    iron = 0.0 if prepared.dip is None else (parameters.iron_sigma / np.cos(prepared.dip)) ** 2
+    attitude, own = np.empty((len(row), 4)), np.empty((len(row), 3, 3))
+    compiled(recording_steps.carry_to_stamps)(
+        row, step, fixed, turned, ahead, read_only(used.rate), delays.sigma**2, iron, attitude, own
+    )
+    variance = filtered.variance[row]
+    variance[:, :3] = np.einsum("kii->ki", own)
+    P = None
+    if full_covariance:
+        P = filtered.covariance[row]
+        P[:, :3, :3] = own
+        P[:, :3, 3:] = quaternion.to_matrix(attitude).transpose(0, 2, 1) @ (R @ filtered.covariance[:, :3, 3:])[row]
+        P[:, 3:, :3] = P[:, :3, 3:].transpose(0, 2, 1)
+    sensors = {"accelerometer": used.specific_force, "magnetometer": used.magnetic_field}
+    return Estimate(
+        time=used.time,
+        attitude=attitude,
+        bias=bias,
+        variance=variance,
+        covariance=P,
+        innovations=filtered.innovations,
+        skipped={
+            name: int(np.sum(~(np.isfinite(samples).all(axis=1) & samples.any(axis=1))))
+            for name, samples in sensors.items()
+            if samples is not None
+        },
+        events=filtered.events,
+        error_states={
+            name: ErrorStateEstimate(
+                components=block.components, units=block.units, values=block.values[row], variance=block.variance[row]
+            )
+            for name, block in filtered.error_states.items()
+        },
+    )

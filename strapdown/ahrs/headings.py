@@ -1,0 +1,125 @@
+"""Heading measurements from a magnetometer.
+
+What disturbs the heading, iron in the unit and in the surroundings, shows in the strength and the dip of the field too. The heading's noise
+follows their deviation, and is the larger the steeper the field.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from strapdown import hard_iron, quaternion
+from strapdown.ahrs.parameters import AhrsParameters
+from strapdown.checks import Array
+from strapdown.kernels import recording_steps
+from strapdown.kernels.machine import compiled
+from strapdown.vectors import VectorMeasurements
+
+NORTH = np.array([0.0, 1.0, 0.0])
+VERTICAL_TIME = 1.0
+"""Time constant of the low-pass that gives the vertical beside which the field's dip is judged, s."""
+
+
+class FieldSteps(NamedTuple):
+    """Samples averaged over the filter's steps, in the frame that the gyro keeps."""
+
+    field: Array
+    """Field (k, 3)."""
+    frame: Array
+    """Attitude by the gyro in the middle of each step (k, 4)."""
+    length: Array
+    """Time that the field's samples of each step stand for, s; 0: none (k,)."""
+    force: Array
+    """Specific force (k, 3)."""
+    at_edge: Array
+    """Attitude by the gyro at the steps' edges (k + 1, 4)."""
+    time: Array
+    """Time there, s (k + 1,)."""
+    start: int
+    """Number of steps in the quiet second."""
+
+
+def measured(steps: FieldSteps, parameters: AhrsParameters, *, causal: bool) -> tuple[VectorMeasurements, float, Array]:
+    """Return the heading measurements, the dip at the start, and the hard iron taken off (k, 3), body axes, in the unit of the field."""
+    known = steps.length > 0.0
+    first = known & (np.arange(len(known)) < steps.start)
+    first = first if first.any() else known
+    interval = float(np.median(np.diff(steps.time)))
+    memory = interval / parameters.field_memory
+    vertical = _vertical(steps.force, interval)
+    level = _strength_and_dip(steps.field, vertical)
+    reference = level[first].mean(axis=0)
+    as_measured = _deviation(level, reference, known, memory)
+    iron = hard_iron.find(steps.field, steps.frame, steps.time[1:], known, reference[0], causal=causal)
+    field = steps.field
+    if iron.any():
+        # Iron is taken off where strength and dip do not come farther from those at the start by it: it may have been attached or removed.
+        without = _deviation(
+            _strength_and_dip(field - quaternion.rotate(steps.frame, iron), vertical), reference, known, memory
+        )
+        odds = np.clip((as_measured - without) / (2.0 * parameters.field_deviation**2), -50.0, 0.0)
+        iron *= (2.0 / (1.0 + np.exp(-odds)))[:, None]
+        field = field - quaternion.rotate(steps.frame, iron)
+        level = _strength_and_dip(field, vertical)
+        reference = level[first].mean(axis=0)
+    deviation = _deviation(level, reference, known, memory)
+    dip = float(reference[1])
+    noise = (parameters.field_disturbance / np.cos(dip)) ** 2 * (1.0 + deviation / parameters.field_deviation**2)
+    direction = np.where(known[:, None], field / level[:, :1], 0.0)
+    return _gathered(steps, direction, steps.length / noise, parameters.heading_interval), dip, iron
+
+
+def _gathered(steps: FieldSteps, direction: Array, information: Array, heading_interval: float) -> VectorMeasurements:
+    """Return heading measurements from directions (k, 3) gathered over the heading interval, each with its own information (k,)."""
+    time = steps.time
+    edge = np.flatnonzero(np.diff(np.floor((time[1:] - time[0]) / heading_interval - 1e-6), append=np.inf))
+    begin = np.append(0, edge[:-1] + 1)
+    total = np.add.reduceat(direction * information[:, None], begin, axis=0)
+    information = np.add.reduceat(information, begin)
+    seen = information > 0.0
+    total[seen] /= np.linalg.norm(total[seen], axis=1, keepdims=True)
+    return VectorMeasurements(
+        sensor="magnetometer",
+        kind="heading",
+        time=time[1:][edge][seen],
+        vector_b=quaternion.rotate(quaternion.conjugate(steps.at_edge[1:][edge][seen]), total[seen]),
+        reference_f=NORTH,
+        sigma=1.0 / np.sqrt(information[seen]),
+    )
+
+
+def _vertical(force: Array, interval: float) -> Array:
+    """Return the vertical (k, 3) from specific force twice passed through a low-pass."""
+    share = interval / VERTICAL_TIME
+    vertical = _low_pass(_low_pass(_held(force, np.asarray(force.any(axis=1))), share), share)
+    return np.asarray(vertical / np.linalg.norm(vertical, axis=1, keepdims=True))
+
+
+def _strength_and_dip(field: Array, vertical: Array) -> Array:
+    """Return the strength of a field, and its angle below the level, rad (k, 2)."""
+    strength = np.linalg.norm(field, axis=1)
+    strength[strength == 0.0] = 1.0
+    return np.column_stack(
+        [strength, np.arcsin(np.clip(-np.einsum("ki,ki->k", field, vertical) / strength, -1.0, 1.0))]
+    )
+
+
+def _deviation(level: Array, reference: Array, known: np.ndarray, memory: float) -> Array:
+    """Return the mean square deviation of strength (share) and dip (rad) from those at the start (k,), ``memory`` intervals long."""
+    square = (level[:, 0] / reference[0] - 1.0) ** 2 + (level[:, 1] - reference[1]) ** 2
+    return _low_pass(_held(square[:, None], known), memory)[:, 0]
+
+
+def _held(values: Array, known: np.ndarray) -> Array:
+    """Return rows (k, …) with each that is not known replaced by the last before it that is, or the first of all."""
+    last = np.maximum.accumulate(np.where(known, np.arange(len(values)), -1))
+    return np.asarray(values[np.where(last < 0, int(np.argmax(known)), last)])
+
+
+def _low_pass(values: Array, step: float) -> Array:
+    """Return rows (k, m) after a first-order low-pass from the first one on, ``step`` being the interval over the time constant; causal."""
+    result = np.empty_like(values)
+    compiled(recording_steps.low_pass)(values, -np.expm1(-step), result)
+    return result

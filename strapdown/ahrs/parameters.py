@@ -1,0 +1,97 @@
+"""The filter's model of a unit and of what moves it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from strapdown import estimation
+from strapdown.checks import non_negative, positive
+from strapdown.setup import FilterSetup
+from strapdown.setup.states import SensorStates, States
+from strapdown.units import DEGREE
+
+
+@dataclass(frozen=True, kw_only=True)
+class AhrsParameters:
+    """The filter's model of a unit and of what moves it. The defaults hold for consumer and industrial MEMS units under any motion.
+
+    Noises of the vectors are densities: σ of a mean over one second, whatever the recording's rate. They are much larger than the sensors'
+    own noise, because what disturbs them lasts over many samples. With ``velocity_sigma`` the acceleration has states
+    (:class:`strapdown.error_states.BoundedVelocity`), and ``specific_force_noise`` is what is left beside it.
+    """
+
+    angle_random_walk: float = 3e-3
+    """σ_v, rad/√s; scale-factor and alignment errors of a moving unit included."""
+    rate_random_walk: float = 1e-5
+    """σ_u, rad/s/√s."""
+    specific_force_noise: float = 0.6
+    """Acceleration without states, each component, m/s²/√Hz."""
+    field_disturbance: float = 0.05
+    """Disturbance of a field that is as strong and as steep as at the start, across it, share of its strength/√Hz over its level part's:
+    the heading's noise density is this over the cosine of the dip."""
+    field_deviation: float = 0.025
+    """Deviation of the field's strength (share) and dip (rad), as a root sum of squares, that doubles the variance of that noise."""
+    field_memory: float = 0.5
+    """Time constant over which that deviation is averaged, s: a disturbance does not end where the field happens to look right."""
+    iron_sigma: float = 0.012
+    """Constant disturbance of the field that nothing shows, share of its strength: part of the σ reported, and not estimated."""
+    step: float = 0.03
+    """Interval of the filter's steps, s."""
+    heading_interval: float = 0.15
+    """Interval of the heading measurements, s."""
+    attitude_sigma: float = 3.0 * DEGREE
+    """Error of the attitude at the start, each axis, rad."""
+    bias_sigma: float = 0.5 * DEGREE
+    """Gyro bias at the start, each axis, rad/s."""
+    rest_bias_sigma: float = 0.0
+    """Error of the mean rate of the quiet second as an estimate of the bias, each axis, rad/s; 0: the bias starts at zero."""
+    velocity_sigma: float = 0.0
+    """Velocity of the unit, each component, m/s; 0: no states, all its acceleration is white."""
+    velocity_time: float = 0.3
+    """Correlation time of that velocity, s."""
+    acceleration_time: float = 0.1
+    """Correlation time of the acceleration, s."""
+    gyro_scale_sigma: float = 0.0
+    """Each of the gyro's scale factors (1) and misalignments (rad); 0: no states."""
+
+    def __post_init__(self) -> None:
+        """Check every field."""
+        may_be_zero = ("iron_sigma", "rate_random_walk", "rest_bias_sigma", "velocity_sigma", "gyro_scale_sigma")
+        for name in self.__dataclass_fields__:
+            check = non_negative if name in may_be_zero else positive
+            check(name, getattr(self, name))
+
+    @property
+    def setup(self) -> FilterSetup:
+        """The filter of this model."""
+        sensors = {}
+        if self.velocity_sigma > 0.0:
+            sensors["accelerometer"] = SensorStates(
+                velocity_sigma=self.velocity_sigma,
+                velocity_time=self.velocity_time,
+                acceleration_time=self.acceleration_time,
+            )
+        states = States(
+            gyro_scale_sigma=self.gyro_scale_sigma,
+            gyro_misalignment_sigma=self.gyro_scale_sigma,
+            sensors=sensors,
+        )
+        return FilterSetup(
+            process_noise=estimation.ProcessNoise(
+                angle_random_walk=self.angle_random_walk, rate_random_walk=self.rate_random_walk
+            ),
+            attitude_sigma=self.attitude_sigma,
+            bias_sigma=self.bias_sigma,
+            states=states if states.names else None,
+        )
+
+
+HAND_HELD = AhrsParameters(
+    specific_force_noise=0.06,
+    rest_bias_sigma=0.05 * DEGREE,
+    velocity_sigma=1.0,
+    gyro_scale_sigma=2e-3,
+)
+"""A unit in the hand: its velocity is bounded, and of its gyro, whose turns are large, scale factors and misalignments are states."""
+MOTIONS = {"hand": HAND_HELD, "any": AhrsParameters()}
+"""The model by what moves the unit."""

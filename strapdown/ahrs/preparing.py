@@ -1,0 +1,113 @@
+"""A recording as the filter takes it: increments, specific force and heading over the filter's steps, and the start."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from strapdown import coning, estimation, quaternion, sensor_delays
+from strapdown.ahrs import headings, starting
+from strapdown.ahrs.parameters import AhrsParameters
+from strapdown.checks import Array
+from strapdown.kernels import recording_steps
+from strapdown.kernels.machine import compiled, read_only
+from strapdown.recordings import Recording, increments
+from strapdown.records import ImuRecord
+from strapdown.vectors import VectorMeasurements
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+class Prepared(NamedTuple):
+    """A recording as the filter takes it."""
+
+    record: ImuRecord
+    """Increments and vectors at the filter's steps."""
+    initial: estimation.State
+    edge: np.ndarray
+    """Sample at which each step ends, the first at the start (k + 1,)."""
+    turned: Array
+    """Attitude by the gyro alone at every sample, from the identity at the first one (n, 4)."""
+    dip: float | None
+    """Angle of the field below the level at the start, rad; None without a magnetometer."""
+    iron: Array
+    """Hard iron that is taken off the field at the end, body axes, in its unit (3,)."""
+
+
+def prepare(
+    recording: Recording,
+    quiet: slice,
+    parameters: AhrsParameters,
+    field_delay: Array | float = 0.0,
+    *,
+    causal: bool = True,
+) -> Prepared:
+    """Return the record that the filter runs on, and its start.
+
+    Parameters
+    ----------
+    recording : Recording
+        From its first quiet second on.
+    quiet : slice
+        The samples of that second, over which gravity and the field are those of the start.
+    parameters : AhrsParameters
+    field_delay : float or array_like, (n,)
+        Delay of the magnetometer's samples beside the gyro's, s: each is turned forward by the gyro.
+    causal : bool
+        Find hard iron from the samples up to each step alone; otherwise from all of them, for the start too.
+    """
+    initial = starting.start(recording, quiet, parameters)  # first, for it refuses a sensor without samples
+    turned = coning.integrate(increments(recording), coning.ALGORITHMS["one-sample"])
+    edge = _edges(recording.time, parameters.step)
+    time = recording.time[edge]
+    at_edge = turned[edge]
+    interval = float(np.median(np.diff(recording.time)))
+    assert recording.specific_force is not None
+    force, number = _averages(recording.specific_force, turned, edge)
+    gravity = starting.norm(starting.mean_at_first(recording, recording.specific_force, quiet, "accelerometer")[0])
+    vectors = [
+        VectorMeasurements(
+            sensor="accelerometer",
+            kind="vector",
+            time=time[1:][number > 0],
+            vector_b=quaternion.rotate(quaternion.conjugate(at_edge[1:]), force)[number > 0],
+            reference_f=gravity * UP,
+            sigma=parameters.specific_force_noise / np.sqrt(number[number > 0] * interval),
+        )
+    ]
+    dip, iron = None, np.zeros(3)
+    if recording.magnetic_field is not None:
+        back = quaternion.exp(-sensor_delays.turn_over(recording, field_delay)) if np.any(field_delay) else None
+        frame = turned if back is None else quaternion.multiply(turned, back)
+        field, number = _averages(recording.magnetic_field, frame, edge)
+        samples = headings.FieldSteps(
+            field=field,
+            frame=frame[(edge[:-1] + edge[1:] + 1) // 2],
+            length=number * interval,
+            force=force,
+            at_edge=at_edge,
+            time=time,
+            start=int(np.searchsorted(edge[1:], quiet.stop)),
+        )
+        heading, dip, irons = headings.measured(samples, parameters, causal=causal)
+        vectors.append(heading)
+        iron = irons[-1]
+        if irons[0].any():
+            initial = starting.start(recording, quiet, parameters, irons[0])
+    turn = quaternion.log(quaternion.multiply(quaternion.conjugate(at_edge[:-1]), at_edge[1:]))
+    record = ImuRecord(time=time, increments=turn, vectors=tuple(vectors))
+    return Prepared(record, initial, edge, turned, dip, iron)
+
+
+def _edges(time: Array, step: float) -> np.ndarray:
+    """Return the samples at which steps end (k + 1,): the first, the last before each multiple of ``step``, s, and the last of all."""
+    bins = np.floor((time - time[0]) / step + 1e-6)
+    return np.unique(np.concatenate([[0], np.flatnonzero(np.diff(bins)), [len(time) - 1]]))
+
+
+def _averages(samples: Array, frame: Array, edge: Array) -> tuple[Array, Array]:
+    """Return the mean of each step's samples in the axes that ``frame`` (n, 4) turns them to (k, 3), and their number; 0 where none."""
+    total, number = np.empty((len(edge) - 1, 3)), np.empty(len(edge) - 1)
+    compiled(recording_steps.average_samples)(read_only(samples), read_only(frame), edge, total, number)
+    return total / np.maximum(number, 1.0)[:, None], number

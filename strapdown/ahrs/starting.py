@@ -1,0 +1,125 @@
+"""Where the filter of a recording starts: attitude, gyro bias and their σ from the first quiet second."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from strapdown import coning, estimation, quaternion, wahba
+from strapdown.ahrs.parameters import AhrsParameters
+from strapdown.checks import Array, InputError
+from strapdown.recordings import Recording
+
+QUIET_SPAN = 1.0
+"""Length of the quiet span that the filter starts from, s."""
+
+
+def quiet_span(recording: Recording) -> slice:
+    """Return the samples of the first quiet second: the first whose rate is no more than twice as restless as in the quietest.
+
+    Raises
+    ------
+    InputError
+        If the recording is shorter than that.
+    """
+    length = int(np.searchsorted(recording.time, recording.time[0] + QUIET_SPAN))
+    lasts = recording.time[-1] - recording.time[0]
+    if length >= len(recording.time):
+        raise InputError(
+            f"{recording.source} lasts {lasts:.3g} s; the start needs at least {QUIET_SPAN:g} s of samples (or give the unit of its time)"
+        )
+    if length < 2:
+        raise InputError(
+            f"{recording.source}: its first {QUIET_SPAN:g} s hold one sample, {lasts / (len(recording.time) - 1):.3g} s is the mean "
+            "interval; if its stamps are in ms or us, say so (--time-unit, or units={'time': 'ms'})"
+        )
+    blocks = len(recording.time) // length
+    rate = recording.rate[: blocks * length].reshape(blocks, length, 3)
+    # The mean counts beside the spread, so that a steady turn is not taken for rest; half of it may be bias.
+    restless = np.linalg.norm(rate.std(axis=1), axis=1) + 0.5 * np.linalg.norm(rate.mean(axis=1), axis=1)
+    first = int(np.argmax(restless <= 2.0 * restless.min()))
+    return slice(first * length, (first + 1) * length)
+
+
+def start(
+    recording: Recording, quiet: slice, parameters: AhrsParameters, iron: Array | float = 0.0
+) -> estimation.State:
+    """Return the state at the first of the quiet samples: attitude by TRIAD from the mean vertical and field, any North without a field.
+
+    The means are taken in the frame that the gyro keeps over those samples, and σ grows with the acceleration that is left there.
+    ``iron`` (3,) is the hard iron to be taken off the field, body axes. With
+    ``rest_bias_sigma`` the bias is that of :func:`resting_bias`.
+    """
+    assert recording.specific_force is not None
+    force, spread = mean_at_first(recording, recording.specific_force, quiet, "accelerometer")
+    if recording.magnetic_field is None:
+        # Any horizontal direction will do for a heading that nothing measures.
+        across = np.eye(3)[np.argmin(np.abs(force))]
+    else:
+        across = mean_at_first(recording, recording.magnetic_field, quiet, "magnetometer")[0] - iron
+    bias, bias_sigma = np.zeros(3), parameters.bias_sigma
+    if parameters.rest_bias_sigma > 0.0:
+        bias, bias_sigma = resting_bias(recording, quiet, parameters)
+    return estimation.initial_state(
+        wahba.from_vertical_and_heading(force, across),
+        bias=bias,
+        attitude_sigma=float(np.hypot(parameters.attitude_sigma, spread / norm(force))),
+        bias_sigma=bias_sigma,
+    )
+
+
+def mean_at_first(recording: Recording, samples: Array, quiet: slice, sensor: str) -> tuple[Array, float]:
+    """Return the mean of the quiet samples in the body axes of their first (3,), and how far they spread about it."""
+    turn = 0.5 * (recording.rate[quiet][1:] + recording.rate[quiet][:-1]) * np.diff(recording.time[quiet])[:, None]
+    own = samples[quiet]
+    known = np.isfinite(own).all(axis=1)
+    still = quaternion.rotate(coning.integrate(turn)[known], own[known])
+    mean = _mean(still, recording.source, sensor)
+    return mean, norm(still.std(axis=0))
+
+
+def resting_bias(recording: Recording, quiet: slice, parameters: AhrsParameters) -> tuple[Array, float]:
+    """Return the gyro bias (3,), rad/s, at quiet samples, and its σ: the mean rate weighed with the prior, zero and ``bias_sigma``.
+
+    The mean rate is the bias to within ``rest_bias_sigma`` and what the rate still changes from tenth to tenth of the samples, the hand's
+    turning. Where it is beyond any bias that the prior expects, and the vertical and the field turn as it says, it is a turn and no bias.
+    """
+    rate, prior = recording.rate[quiet], parameters.bias_sigma
+    mean = rate.mean(axis=0)
+    tenths = np.array([part.mean(axis=0) for part in np.array_split(rate, min(10, len(rate)))])
+    sigma = float(np.hypot(parameters.rest_bias_sigma, norm(tenths.std(axis=0))))
+    if norm(mean) > 3.0 * prior and _turns(recording, quiet, mean):
+        sigma = float(np.hypot(sigma, norm(mean)))
+    share = prior**2 / (prior**2 + sigma**2)
+    return share * mean, float(np.sqrt(share)) * sigma
+
+
+def _turns(recording: Recording, quiet: slice, rate: Array) -> bool:
+    """Return whether vertical and field turn at more than half this rate from the first half of the samples to the second."""
+    expected, seen = [], []
+    for samples in (recording.specific_force, recording.magnetic_field):
+        known = np.empty((0, 3)) if samples is None else samples[quiet][np.isfinite(samples[quiet]).all(axis=1)]
+        if len(known) > 1:
+            first, second = (half.mean(axis=0) / norm(known.mean(axis=0)) for half in np.array_split(known, 2))
+            seen.append(second - first)
+            expected.append(-0.5 * QUIET_SPAN * np.cross(rate, 0.5 * (first + second)))
+    e, s = np.ravel(expected), np.ravel(seen)
+    return bool(s @ e > 0.5 * (e @ e))
+
+
+def _mean(samples: Array, source: str, sensor: str) -> Array:
+    """Return the mean of samples (k, 3) of the quiet second, which must show a direction."""
+    if len(samples) == 0:
+        raise InputError(
+            f"{source}: the {sensor} has no valid sample in the first quiet second; cut the recording to where it has"
+        )
+    mean = np.asarray(samples.mean(axis=0))
+    if norm(mean) == 0.0:
+        raise InputError(
+            f"{source}: the {sensor} is zero over the first quiet second and shows no direction; cut the recording to where it has one"
+        )
+    return mean
+
+
+def norm(vector: Array) -> float:
+    """Return the length of a vector."""
+    return float(np.linalg.norm(vector))
