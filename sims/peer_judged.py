@@ -33,7 +33,7 @@ from strapdown.randomness import generator
 from strapdown.records import Estimate, ImuRecord
 from strapdown.units import DEGREE, DEGREE_PER_ROOT_HOUR, STANDARD_GRAVITY
 
-SMALL = {"runs": 4, "duration": 10.0}
+SMALL = {"runs": 3, "duration": 4.0}
 """Arguments of a run that only shows that the script works."""
 
 INSTALLED = importlib.util.find_spec("smsfusion") is not None
