@@ -1,4 +1,4 @@
-"""A gate that recovers beside optional states: lock-in by a wrong start, a gap, a magnet; what a challenger knows; both faces; outliers."""
+"""A gate that recovers beside optional states: lock-in by a wrong start, a gap, a magnet; what a candidate knows; both faces; outliers."""
 
 from __future__ import annotations
 
@@ -286,7 +286,7 @@ def test_a_step_of_the_bias_is_recovered_from(runs):
     assert_consistent("hard iron", mean, runs)
 
 
-def test_by_default_a_challenger_doubts_the_bias_as_at_the_start():
+def test_by_default_a_candidate_doubts_the_bias_as_at_the_start():
     """After a gap the bias is as it was; the default, which allows it to have changed, is on the safe side until it is learnt anew."""
     gate = Gate()
     P = np.diag([1.0, 1.0, 1.0, 1e-4, 2e-4, 3e-4, 5.0])
@@ -320,7 +320,7 @@ def test_without_recovery_it_stays_lost():
 
 @pytest.mark.parametrize("runs", [20, pytest.param(200, marks=pytest.mark.slow)])
 def test_a_right_filter_never_starts_anew(runs):
-    """A tenth of the measurements 30 times as noisy: each starts a challenger, and none takes over."""
+    """A tenth of the measurements 30 times as noisy: each starts a candidate, and none takes over."""
     refused = total = 0
     for run in range(runs):
         one = made("hard iron", run, duration=30.0)
@@ -338,7 +338,7 @@ def test_a_right_filter_never_starts_anew(runs):
     assert 0.9 < refused / total < 1.1
 
 
-# ---------------------------------------------------------------------------------------------------------- what a challenger knows
+# ---------------------------------------------------------------------------------------------------------- what a candidate knows
 
 
 def still_model(decay, density):
@@ -377,7 +377,7 @@ def form_of(model):
 
 
 @pytest.mark.parametrize("level", [0, 2])
-def test_a_challenger_knows_what_the_prior_says_by_now(level):
+def test_a_candidate_knows_what_the_prior_says_by_now(level):
     """Means and covariance of states: one stays, one walks, one forgets, and two hang together; the others' σ is 3^level times as wide."""
     memory, now, width = np.zeros(gate_rules.MEMORY), 7.1, 3.0**level
     memory[gate_rules.LEVEL] = level
@@ -409,13 +409,13 @@ def test_a_challenger_knows_what_the_prior_says_by_now(level):
     assert np.array_equal(x[1, :3], x[0, :3])
     np.testing.assert_allclose(x[1, 3:], kept * values, rtol=1e-14)
     np.testing.assert_allclose(F[0, :size].T @ F[0, :size], P, rtol=1e-14)
-    assert (memory[gate_rules.CHALLENGED], memory[gate_rules.SINCE]) == (1.0, now)
+    assert (memory[gate_rules.CANDIDATE], memory[gate_rules.SINCE]) == (1.0, now)
     assert np.array_equal(memory[gate_rules.FIRST_BIAS : gate_rules.FIRST_VARIANCE], x[0, :3])
     np.testing.assert_allclose(memory[gate_rules.FIRST_VARIANCE :], np.diag(expected)[3:6], rtol=1e-12)
 
 
 @pytest.mark.parametrize("age", [0.0, 0.03, 1.7, 300.0])
-def test_a_challenger_knows_what_the_prior_of_chains_says_by_now(age):
+def test_a_candidate_knows_what_the_prior_of_chains_says_by_now(age):
     """States that feed one another, two and three in a chain, from a prior that is not stationary: the block's own Φ and Q."""
     blocks = (
         error_states.BoundedVelocity(sensor="acc", velocity_time=2.0, velocity_sigma=0.3, acceleration_sigma=1.5),
@@ -447,8 +447,8 @@ def test_a_challenger_knows_what_the_prior_of_chains_says_by_now(age):
     np.testing.assert_allclose(found, Phi @ root.T @ root @ Phi.T + Q, rtol=1e-8, atol=1e-9)
 
 
-def challenger_of(P, bias, values):
-    """A challenger with covariance P, and its memory where its bias, which started at zero, has the σ of ``STARTED``."""
+def candidate_of(P, bias, values):
+    """A candidate with covariance P, and its memory where its bias, which started at zero, has the σ of ``STARTED``."""
     size = len(P)
     form = form_of(still_model(*np.zeros((2, size - 6))))
     form.attitude[:, 0] = 1.0
@@ -462,7 +462,7 @@ def challenger_of(P, bias, values):
 STARTED = np.array([0.1, 0.2, 0.3])
 
 
-def test_a_challenger_that_is_widened_is_what_it_would_be_had_it_started_so():
+def test_a_candidate_that_is_widened_is_what_it_would_be_had_it_started_so():
     """Attitude, bias and three states after five measurements, by information: the start's own is taken out but for a ninth of it."""
     rng = np.random.default_rng(4)
     H = rng.standard_normal((5, 9)) / np.array([0.3, 0.3, 0.3, *STARTED, 1.0, 1.0, 1.0])
@@ -471,7 +471,7 @@ def test_a_challenger_that_is_widened_is_what_it_would_be_had_it_started_so():
     wide = start * np.array([1.0, 1.0, 1.0, 3.0, 3.0, 3.0, 1.0, 1.0, 1.0])
     P, expected = (np.linalg.inv(np.diag(sigma**-2.0) + H.T @ H) for sigma in (start, wide))
     mean, there = P @ H.T @ z, expected @ H.T @ z
-    form, memory = challenger_of(P, mean[3:6], mean[6:])
+    form, memory = candidate_of(P, mean[3:6], mean[6:])
     root_form.widen(form, memory)
     found = form.F[1, :9]
     np.testing.assert_allclose(form.x[1], there[3:], rtol=1e-9, atol=1e-12)
@@ -490,7 +490,7 @@ def test_widening_a_bias_whose_axes_hang_together_leaves_a_covariance():
     """Of a filter's own bias, as uncertain as its start and correlated: more is known of the start than its diagonal says."""
     P = np.eye(6)
     P[3:, 3:] = np.outer(STARTED, STARTED) * (0.2 * np.eye(3) + 0.8)
-    form, memory = challenger_of(P, 0.5 * STARTED, ())
+    form, memory = candidate_of(P, 0.5 * STARTED, ())
     root_form.widen(form, memory)
     found = form.F[1, :6].T @ form.F[1, :6]
     assert np.isfinite(found).all()
@@ -498,7 +498,7 @@ def test_widening_a_bias_whose_axes_hang_together_leaves_a_covariance():
     assert np.all(np.diag(found)[3:] > np.diag(P)[3:])
 
 
-def test_a_start_that_is_surer_than_its_blocks_is_not_believed_by_a_challenger():
+def test_a_start_that_is_surer_than_its_blocks_is_not_believed_by_a_candidate():
     """A start that goes on from an earlier part: its values are kept, and what it knows of them is what the block says at least."""
     one = made("hard iron", 2)
     begun = estimation.with_error_states(one.initial, (IRON,))
@@ -606,7 +606,7 @@ def test_without_blocks_and_errors_of_theirs_it_is_the_plain_filter(case, robust
 @pytest.mark.parametrize("gap", [False, True], ids=["lost start", "gap"])
 @pytest.mark.parametrize("at", [(7,), (20, 21), (40, 90), (5, 10, 15, 100), range(1, 150)], ids=len)
 def test_in_parts_a_gate_goes_on_as_in_one(at, gap):
-    """Cut before, within and after the time that a challenger runs: its state, all counts and the prior of states that change go on."""
+    """Cut before, within and after the time that a candidate runs: its state, all counts and the prior of states that change go on."""
     one = made("hard iron", 3, duration=3.0)
     given = {"gate": Gate(recovery=5), "full_covariance": True}
     start = lost(one.initial, 3)
@@ -690,7 +690,7 @@ def assert_recover_alike(record, start, blocks, robust):
 
 
 @pytest.mark.parametrize("case", ["hard iron", "chains"])
-def test_both_faces_widen_a_challenger_alike(case):
+def test_both_faces_widen_a_candidate_alike(case):
     """The bias is off by thirty times what the gate allows it to have changed."""
     one = made("hard iron", 3, duration=2.0)
     start = dataclasses.replace(lost(one.initial, 3), bias=one.initial.bias + np.array([0.3, -0.2, 0.25]))

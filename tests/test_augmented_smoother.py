@@ -481,8 +481,8 @@ def test_what_is_smoothed_of_a_recovery_and_what_is_not():
     assert difference(both, ahead, -1, -1) < 1e-10
 
 
-def test_a_trajectory_begins_with_its_challenger():
-    """From its start on it is the smoother of a filter that starts there knowing nothing, whatever the challenger went through."""
+def test_a_trajectory_begins_with_its_candidate():
+    """From its start on it is the smoother of a filter that starts there knowing nothing, whatever the candidate went through."""
     record, _, initial = lost_start(2)
     both = estimation.smooth(record, NOISE, initial, (STILL,), gate=GATE, full_covariance=True)
     first = int(np.searchsorted(record.time, recovery_of(both).start)) + 1

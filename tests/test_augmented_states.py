@@ -349,7 +349,7 @@ HELD = error_states.GaussMarkov(sensor="acc", noise_sigma=0.3, correlation_time=
 
 
 def test_the_step_face_goes_on_from_a_part_as_the_record_does():
-    """The gate's whole memory goes along, and what a challenger's blocks know: one constant, one that forgets."""
+    """The gate's whole memory goes along, and what a candidate's blocks know: one constant, one that forgets."""
     record, blocks, gate = simulated(duration=4.0), (IRON, HELD), Gate(recovery=30)
     record = dataclasses.replace(record, time=record.time + 100.0)
     record = dataclasses.replace(

@@ -303,7 +303,7 @@ def test_its_parts_are_the_filter_the_bank_and_the_filter_again():
     early = record.time < recovery.end
     assert np.array_equal(estimate.attitude[early], before.attitude[early])
     assert np.array_equal(estimate.covariance[early], before.covariance[early])
-    # It starts with the bias before the first refusal, as uncertain as the challenger did; from then on it is a bank alone.
+    # It starts with the bias before the first refusal, as uncertain as the candidate did; from then on it is a bank alone.
     first, last = (int(np.searchsorted(record.time, time)) for time in (recovery.start - 1e-9, recovery.end))
     first -= 1
     _, end = estimation.run_part(records.cut(record, 0, last), NOISE, start, gate=Gate())
@@ -452,7 +452,7 @@ def test_a_part_that_begins_amid_refusals_recovers():
 
 
 def test_a_chance_refusal_just_before_it_is_none_of_its_measurements():
-    """A star that is off at 14.9 s: it is the first of the challenger's, but not of those that agree with what follows."""
+    """A star that is off at 14.9 s: it is the first of the candidate's, but not of those that agree with what follows."""
     record, start = lost_record(3, jumps=(15.0,), duration=30.0)
     (one,) = record.vectors
     vector_b = np.array(one.vector_b)

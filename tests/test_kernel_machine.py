@@ -360,7 +360,7 @@ def run(x):
 ASK_PARTS = """
 import importlib, json, sys
 from strapdown.kernels import machine, open_probe
-parts = [importlib.import_module(f"strapdown.kernels.{name}") for name in sys.argv[1:]]
+parts = [importlib.import_module(name) for name in sys.argv[1:]]
 fast = machine.compiled(open_probe.run, *parts)
 print(json.dumps({"value": fast(1.0), "hits": sum(fast.stats.cache_hits.values())}))
 """
@@ -377,7 +377,12 @@ def test_cache_distinguishes_what_open_functions_are_bound_to(copied_kernels):
 
     def ask(*parts: str) -> tuple[float, int]:
         done = subprocess.run(
-            [sys.executable, "-c", ASK_PARTS, *parts],
+            [
+                sys.executable,
+                "-c",
+                ASK_PARTS,
+                *(f"strapdown.kernels.{part}" if "_" in part else part for part in parts),
+            ],
             env=environment,
             cwd=root,
             capture_output=True,
@@ -391,6 +396,11 @@ def test_cache_distinguishes_what_open_functions_are_bound_to(copied_kernels):
     assert ask("term_7") == (14.0, 0)
     assert ask("term_3") == (6.0, 1)
     assert ask("term_7", "term_3") == (14.0, 0)
+    own = root / "own.py"  # a body of one's own, outside the package
+    own.write_text("def term(x):\n    return 3.0 * x\n")
+    assert [ask("own"), ask("own")] == [(6.0, 0), (6.0, 1)]
+    edit(own, "def term(x):\n    return 5.0 * x\n")
+    assert ask("own") == (10.0, 0)
 
 
 def test_digest_depends_on_every_kernel_source(monkeypatch, tmp_path):

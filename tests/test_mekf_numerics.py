@@ -15,7 +15,7 @@ from strapdown.estimation.states import ProcessNoise, covariance_matrices, initi
 from strapdown.estimation.step_filter import StepFilter
 from strapdown.gyro import GyroSpec
 from strapdown.kernels import covariance_form
-from strapdown.kernels.gate_rules import CHALLENGED
+from strapdown.kernels.gate_rules import CANDIDATE
 from strapdown.kernels.measurement import SIGMA_ORIGIN, VALUE_ORIGIN
 from strapdown.kernels.walk import walk
 from strapdown.records import ImuRecord
@@ -191,7 +191,7 @@ def test_an_outage_that_makes_attitude_and_bias_one_leaves_the_covariance_defini
 def test_a_gate_recovers_in_the_square_root_and_in_parts(gate):
     """A lost start and directions 1e-7 as wide as a restart: the filter with no optional states itself, and parts to rounding.
 
-    Cut while sensors are refused, while a challenger runs, and after the recovery.
+    Cut while sensors are refused, while a candidate runs, and after the recovery.
     """
     record, truth = sharp_record(1e-7, steps=60)
     off = quaternion.multiply(truth[0], quaternion.exp([0.4, -0.2, 0.1]))
@@ -206,7 +206,7 @@ def test_a_gate_recovers_in_the_square_root_and_in_parts(gate):
     challenged = []
     for cut in (3, 5, 8, 12, 40):
         first, state = estimation.run_part(records.cut(record, 0, cut), NOISE, start, gate=gate)
-        challenged.append(state.gate.counts[CHALLENGED])
+        challenged.append(state.gate.counts[CANDIDATE])
         rest, end = estimation.run_part(records.cut(record, cut, 60), NOISE, state, gate=gate, full_covariance=True)
         assert np.max(quaternion.angle_between(rest.attitude, estimate.attitude[cut:])) < 1e-13
         assert np.allclose(rest.variance[1:], estimate.variance[cut + 1 :], rtol=1e-6, atol=0.0)

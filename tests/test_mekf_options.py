@@ -263,7 +263,7 @@ def test_both_faces_recover_alike(kind, whole):
 
 @pytest.mark.parametrize("case", ["step", "one direction", "too little noise", "faulty"])
 def test_both_faces_restart_and_tell_of_lock_outs_alike(case):
-    """Failed challengers, widened ones, a turn that is not known, lock-outs that a recovery ends and that it does not."""
+    """Failed candidates, widened ones, a turn that is not known, lock-outs that a recovery ends and that it does not."""
     chosen = sensors(Faults())["direction"]
     if case == "one direction":
         chosen = chosen[:1]

@@ -238,7 +238,7 @@ def whole_nees(estimates, made, after, every=5):
 )
 @pytest.mark.parametrize("runs", [16, pytest.param(200, marks=pytest.mark.slow)])
 def test_a_default_gate_follows_bias_steps_of_any_size(runs, step, bias_sigma, most):
-    """3 to 1000 times the initial σ: a challenger that cannot follow is not started as narrow again and again.
+    """3 to 1000 times the initial σ: a candidate that cannot follow is not started as narrow again and again.
 
     It takes over because its innovations agree, which favours the lucky: over 200 runs NEES per state is up to 1.2 after 2 s, and inside
     its bounds after 5 s. A step of 3σ may be followed without a recovery, once in 200 runs.
@@ -277,7 +277,7 @@ def test_the_restart_is_as_wide_as_the_start_unless_told():
     start = started(record, 0, bias_sigma=0.02)
     lost = replace(start, attitude=quaternion.multiply(start.attitude, quaternion.exp([0.0, 1.57, 0.0])))
     _, end = estimation.run_part(records.cut(record, 0, 20), NOISE, lost, gate=Gate())
-    assert end.gate.counts[gate_rules.CHALLENGED] == 1.0
+    assert end.gate.counts[gate_rules.CANDIDATE] == 1.0
     first = end.gate.counts[gate_rules.FIRST_BIAS + 3 : gate_rules.FIRST_BIAS + 6]
     assert np.all(first > 1.9 * 0.02**2)  # what the filter had left, and the restart's
 
@@ -351,23 +351,23 @@ def test_a_record_in_single_intervals_recovers_as_the_whole_does():
 
 
 def judged(outcomes, recovery=3, limit=4):
-    """Rows of a gate with two sensors after outcomes (sensor, filter's, challenger's or None); verdicts, recoveries and lock-outs."""
+    """Rows of a gate with two sensors after outcomes (sensor, filter's, candidate's or None); verdicts, recoveries and lock-outs."""
     memory, standing = np.zeros(gate_rules.MEMORY), np.zeros((2, gate_rules.STANDING))
-    standing[:, gate_rules.TOLD] = -1.0
+    standing[:, gate_rules.REPORTED] = -1.0
     lock_outs, told, found = np.zeros((9, 4)), 0, []
     for k, (sensor, mine, other) in enumerate(outcomes):
         told, begins = gate_rules.judge_filter(
             mine, float(k), sensor, recovery, limit, standing, memory, lock_outs, told
         )
         if begins:
-            gate_rules.begin_challenge(memory, float(k), np.zeros(3), np.ones(3))
-        if memory[gate_rules.CHALLENGED]:
-            found.append(gate_rules.judge_challenger(other, 2.0, 2, sensor, standing, memory, np.zeros(3)))
+            gate_rules.reset_candidate(memory, float(k), np.zeros(3), np.ones(3))
+        if memory[gate_rules.CANDIDATE]:
+            found.append(gate_rules.judge_candidate(other, 2.0, 2, sensor, standing, memory, np.zeros(3)))
     return memory, standing, lock_outs[:told], found
 
 
 def test_the_rules_of_a_gate():
-    """Plain numbers: when a challenger is dropped, believed, wider; what is told; what a widening sets back."""
+    """Plain numbers: when a candidate is dropped, believed, wider; what is told; what a widening sets back."""
     dropped, followed, narrow = gate_rules.DROPPED, gate_rules.FOLLOWED, gate_rules.TOO_NARROW
     refused, both = (0, REFUSED, ACCEPTED), (0, REFUSED, REFUSED)
     assert judged([refused, refused, (0, ACCEPTED, ACCEPTED)])[3] == [followed, followed, dropped]
@@ -377,12 +377,12 @@ def test_the_rules_of_a_gate():
     ]  # of which the other sensor is none refused
     memory, standing, lock_outs, found = judged([refused, both, both])
     assert found == [followed, followed, dropped]  # two misses are more than 1 + half of one hit
-    assert (memory[gate_rules.LEVEL], memory[gate_rules.CHALLENGED]) == (1.0, 0.0)
+    assert (memory[gate_rules.LEVEL], memory[gate_rules.CANDIDATE]) == (1.0, 0.0)
     assert judged([refused] * 6 + [both] * 3)[3][-2:] == [followed, dropped]  # three in a row
     assert judged([refused] * 6 + [both] * 2 + [refused, both])[3][-1] == followed
     assert judged([refused] * 3 + [(0, ACCEPTED, ACCEPTED)] * 2)[1][0, gate_rules.EXCESS] == 1.0
     memory, standing, _, _ = judged([(0, REFUSED, PASSED_OVER)] * 4)
-    assert not gate_rules.is_believed(0, 3, standing, memory)
+    assert not gate_rules.takes_over(0, 3, standing, memory)
     memory, standing, lock_outs, found = judged([(1, ACCEPTED, None)] * 14 + [refused, both, both, refused])
     assert memory[gate_rules.LEVEL] == 1.0
     for accepted, level in ((14, 1.0), (15, 0.0)):  # 5 × 3 accepted since
@@ -390,20 +390,20 @@ def test_the_rules_of_a_gate():
         assert memory[gate_rules.LEVEL] == level
     memory, standing, lock_outs, found = judged([refused] * 6)
     assert [list(row) for row in lock_outs] == [[0.0, 5.0, 0.0, 6.0]]
-    assert gate_rules.is_believed(0, 3, standing, memory)
-    assert not gate_rules.is_believed(1, 3, standing, memory)
-    assert not gate_rules.is_believed(0, 7, standing, memory)
+    assert gate_rules.takes_over(0, 3, standing, memory)
+    assert not gate_rules.takes_over(1, 3, standing, memory)
+    assert not gate_rules.takes_over(0, 7, standing, memory)
     row = np.zeros(4)
     memory[gate_rules.SINCE] = 2.0
     gate_rules.recover(5.0, 0, 4, standing, memory, row, lock_outs)
     assert list(row) == [5.0, 0.0, 0.0, 6.0]
     assert lock_outs[0, 3] == 0.0
-    assert not standing[:, : gate_rules.TOLD].any()
+    assert not standing[:, : gate_rules.REPORTED].any()
     assert memory[gate_rules.PASSES] == gate_rules.WIDE_PASSES
     memory, standing, _, _ = judged([refused])
     for nis, expected in ((2.0, followed), (40.0, narrow)):
-        assert gate_rules.judge_challenger(ACCEPTED, nis, 2, 0, standing, memory, np.zeros(3)) == expected
-    assert gate_rules.judge_challenger(ACCEPTED, 0.0, 99, 0, standing, memory, np.array([1.6, 0.0, 0.0])) == narrow
+        assert gate_rules.judge_candidate(ACCEPTED, nis, 2, 0, standing, memory, np.zeros(3)) == expected
+    assert gate_rules.judge_candidate(ACCEPTED, 0.0, 99, 0, standing, memory, np.array([1.6, 0.0, 0.0])) == narrow
     assert gate_rules.may_widen(np.full(3, 1.04), memory)
     assert not gate_rules.may_widen([1.0, 1.06, 1.0], memory)
     assert gate_rules.start_undone(0, 1.0, memory) == pytest.approx(-8.0)
@@ -415,7 +415,7 @@ def test_the_rules_of_a_gate():
     assert gate_rules.restart_attitude(1.0, memory) == gating.UNIFORM_SIGMA
 
 
-def test_a_widened_challenger_is_one_that_started_wider():
+def test_a_widened_candidate_is_one_that_started_wider():
     """Of the information of all that it has seen, P⁻¹, that of its start counts a ninth: in matrices, without a gain."""
     from strapdown.estimation.states import covariance_matrices, pack
 

@@ -881,8 +881,8 @@ def test_of_a_filter_that_is_lost_on_its_way_the_part_before_is_smoothed_too() -
     assert np.all(both.sigma[20:middle] < ahead.sigma[20:middle])
 
 
-def test_what_lies_between_the_first_refusal_and_the_last_challenger_is_the_filters() -> None:
-    """Directions at random for a while, which no challenger can follow."""
+def test_what_lies_between_the_first_refusal_and_the_last_candidate_is_the_filters() -> None:
+    """Directions at random for a while, which no candidate can follow."""
     record, initial = far_off(1)
     rng = np.random.default_rng(1)
     vectors = []

@@ -595,7 +595,7 @@ def lost_record():
 
 
 def test_the_step_face_goes_on_from_a_part_as_the_record_does():
-    """The gate's whole memory goes along: a challenger between, refusals counted, and lock-outs that go on."""
+    """The gate's whole memory goes along: a candidate between, refusals counted, and lock-outs that go on."""
     record, initial = lost_record()
     gate, challenged, told = Gate(recovery=12), 0, 0
     whole = estimation.run(record, NOISE, initial, gate=gate)

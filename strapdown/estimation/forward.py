@@ -426,7 +426,7 @@ def _judged_in_blocks(problem: Problem, options: Options) -> Passed:
         return _in_factor(problem, options)
     states = body.states
     candidate = None
-    if judge.memory[gate_rules.CHALLENGED]:
+    if judge.memory[gate_rules.CANDIDATE]:
         candidate = Candidate(
             attitude=states[1, :4], others=states[1, 4:7], covariance=covariance_matrices(states[1, 7:])
         )
@@ -529,8 +529,8 @@ def remembered(gate_: Gate | None, memory: GateMemory | None, sensors: tuple[str
         for row, sensor in zip(standing, sensors, strict=True):
             row[:] = memory.standing.get(sensor, 0.0)
     if gate_ is None or not gate_.recovery:
-        counts[gate_rules.CHALLENGED] = 0.0
-    standing[:, gate_rules.TOLD] = -1.0
+        counts[gate_rules.CANDIDATE] = 0.0
+    standing[:, gate_rules.REPORTED] = -1.0
     return counts, standing
 
 
@@ -668,7 +668,7 @@ def _in_factor(problem: Problem, options: Options) -> Passed:
     )
     if options.whole_bias:
         estimate = _with_whole_bias(estimate, model, out, full=options.full_covariance)
-    candidate = _candidate_in_factor(body, model) if judge.memory[gate_rules.CHALLENGED] else None
+    candidate = _candidate_in_factor(body, model) if judge.memory[gate_rules.CANDIDATE] else None
     memory = judge.remembered(candidate)
     return Passed(
         estimate=estimate,

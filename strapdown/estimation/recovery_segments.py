@@ -18,7 +18,7 @@ from strapdown.checks import Array, InputError
 from strapdown.estimation.forward import Options, Problem, filtered, most_segments
 from strapdown.estimation.gating import Gate
 from strapdown.estimation.states import GateMemory
-from strapdown.kernels.gate_rules import CHALLENGED, FIRST_BIAS, PASSES, SINCE, WIDE_PASSES, restart_attitude
+from strapdown.kernels.gate_rules import CANDIDATE, FIRST_BIAS, PASSES, SINCE, WIDE_PASSES, restart_attitude
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.smoother_loop import locate_edges
 from strapdown.records import Estimate, Event, ImuRecord
@@ -98,7 +98,7 @@ def break_of(event: Event, memory: GateMemory | None, begin: float) -> Break:
     ``memory`` is what the gate remembers just before, None where nobody knows what took over.
     """
     since = event.end
-    if memory is not None and memory.counts[CHALLENGED]:
+    if memory is not None and memory.counts[CANDIDATE]:
         since = min(since, max(begin, float(memory.counts[SINCE])))
     return Break(start=max(begin, event.start), since=since, end=event.end)
 
@@ -108,7 +108,7 @@ def restarted(gate: Gate, memory: GateMemory) -> tuple[Array, Array, Array]:
     sigma = restart_attitude(gate.restart_attitude_sigma, memory.counts)
     bias, variance = memory.counts[FIRST_BIAS : FIRST_BIAS + 3], memory.counts[FIRST_BIAS + 3 : FIRST_BIAS + 6]
     counts = memory.counts.copy()
-    counts[CHALLENGED], counts[PASSES] = 0.0, WIDE_PASSES
+    counts[CANDIDATE], counts[PASSES] = 0.0, WIDE_PASSES
     return bias.copy(), np.concatenate([np.full(3, sigma**2), variance]), counts
 
 

@@ -274,7 +274,7 @@ class Supervision(Generic[Filter]):
     @property
     def has_candidate(self) -> bool:
         """Whether a restart candidate is running; one of an earlier part of a record the filter has to restore itself."""
-        return bool(self.memory[gate_rules.CHALLENGED])
+        return bool(self.memory[gate_rules.CANDIDATE])
 
     @property
     def passes(self) -> int:
@@ -307,7 +307,7 @@ class Supervision(Generic[Filter]):
         if self.candidate is None:
             return
         self._judge_candidate(self.candidate, s, update(self.candidate))
-        if self.candidate is not None and gate_rules.is_believed(s, recovery, standing, memory):
+        if self.candidate is not None and gate_rules.takes_over(s, recovery, standing, memory):
             row = np.empty(4)
             gate_rules.recover(filter.time, s, limit, standing, memory, row, self.lock_outs)
             self.recoveries = np.vstack([self.recoveries, row])
@@ -334,11 +334,11 @@ class Supervision(Generic[Filter]):
     def _start_candidate(self, filter: Filter, gate: Gate) -> None:
         sigma = gate_rules.restart_attitude(gate.restart_attitude_sigma, self.memory)
         self.candidate = filter._restarted(sigma, gate_rules.restart_width(self.memory))
-        gate_rules.begin_challenge(self.memory, filter.time, self.candidate.bias, np.diag(self.candidate.P)[3:6])
+        gate_rules.reset_candidate(self.memory, filter.time, self.candidate.bias, np.diag(self.candidate.P)[3:6])
 
     def _judge_candidate(self, candidate: Filter, sensor: int, outcome: int) -> None:
         """Count the outcome of a measurement for the restart candidate, and drop or widen it."""
-        verdict = gate_rules.judge_challenger(
+        verdict = gate_rules.judge_candidate(
             outcome, candidate.nis, candidate.dim_z, sensor, self.standing, self.memory, candidate.bias
         )
         if verdict == gate_rules.DROPPED:

@@ -32,9 +32,9 @@ from strapdown.kernels.filter_step import predict as propagated
 from strapdown.kernels.filter_step import update_attitude, update_direction, update_heading, update_row
 from strapdown.kernels.gate_rules import (
     FIRST_BIAS,
-    begin_challenge,
     count_widening,
     may_widen,
+    reset_candidate,
     restart_attitude,
     restart_width,
     start_undone,
@@ -401,7 +401,7 @@ def start_candidate(form, memory, now, attitude_sigma, restart):
     states[1, 22] += width * width * bias_variance[0]
     states[1, 25] += width * width * bias_variance[1]
     states[1, 27] += width * width * bias_variance[2]
-    begin_challenge(memory, now, bias_at(form, 1), (states[1, 22], states[1, 25], states[1, 27]))
+    reset_candidate(memory, now, bias_at(form, 1), (states[1, 22], states[1, 25], states[1, 27]))
 
 
 def widen(form, memory):

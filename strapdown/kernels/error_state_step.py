@@ -1,7 +1,7 @@
 """The MEKF with optional states, one step at a time: scalars and tuples for the attitude, arrays for the rest.
 
 State: attitude ``q_fb``; ``x`` = (b, c): gyro bias and optional states c; factor ``F`` of the covariance of (δθ, δb, δc)
-(:mod:`strapdown.kernels.triangle`). The optional states are told by arrays, so that no kernel knows what they are:
+(:mod:`strapdown.kernels.triangle`). The error states are described by arrays, so that no kernel depends on their meaning:
 
 - each decays at its own rate and is driven by its own white noise, ``ċ = −λ c + √q w``: ``decay`` λ, ``density`` q. Those that change come
   first, those with neither come last.
@@ -218,7 +218,7 @@ def move(q, x, dt, part, decay, gyro, gyro_use, force_f, coupling, factor):
 def fill_noise(F, first, columns, dt, rate, D, angle_variance, rate_variance, decay, density, gyro, gyro_use):
     """Write the rows of noise of a step, N with ``Q = Nᵀ N``, from row ``first`` of F on, ``columns`` wide; return the row after them.
 
-    Attitude and bias have the exact Q of :func:`strapdown.kernels.filter_step.process_noise` (the white noise of the gyro is told after
+    Attitude and bias have the exact Q of :func:`strapdown.kernels.filter_step.process_noise` (the white noise of the gyro is given after
     its scale factor), factored as one upper triangle. A state that enters the gyro has its noise at Gauss's three nodes of the step.
     """
     q11, q12, q22 = process_noise(scale(dt, rate), dt, angle_variance, rate_variance)

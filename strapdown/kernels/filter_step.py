@@ -128,7 +128,7 @@ def chosen_matrix(condition, S, T):
 
 
 def update_row(b, A, B, C, h, innovation, variance):
-    """Take in one scalar row ``innovation = h · δθ + v``, Var v = ``variance``.
+    """Update with one scalar row ``innovation = h · δθ + v``, Var v = ``variance``.
 
     Returns the attitude correction, b, A, B, C and the innovation's variance. Joseph's form, written as the short form plus the vector
     ``d = (P − k p) h − r k`` which is nothing but the short form's rounding error: it keeps P positive definite when the measurement is
@@ -178,7 +178,7 @@ def reset(q, A, B, correction):
 
 
 def rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, s1, s12, s22):
-    """Take in two rows of covariance (s1, s12, s22), the second freed of the first: the divisions do not wait for each other.
+    """Update with two rows of covariance (s1, s12, s22), the second freed of the first: the divisions do not wait for each other.
 
     Returns the correction, b, A, B, C, the second row's innovation freed of the first with its variance, and the NIS.
     """
@@ -205,7 +205,7 @@ def rows_at_once(b, A, B, C, pa1, pa2, h1, e1, h2, y2, s1, s12, s22):
 
 
 def row_after_row(b, A, B, C, h1, e1, h2, y2, variance):
-    """Take in two rows one after the other, each by :func:`update_row`; return what :func:`rows_at_once` does."""
+    """Update with two rows one after the other, each by :func:`update_row`; return what :func:`rows_at_once` does."""
     first, b, A, B, C, s1 = update_row(b, A, B, C, h1, e1, variance)
     e2 = y2 - dot(h2, first)  # what the first row has corrected is taken off the second
     second, b, A, B, C, s2 = update_row(b, A, B, C, h2, e2, variance)

@@ -14,15 +14,15 @@ import numpy as np
 
 from strapdown.kernels.algebra import add, factored, matrix_times_vector, scale, solved
 from strapdown.kernels.gate_rules import (
-    CHALLENGED,
+    CANDIDATE,
     DROPPED,
     PASSES,
     TOO_NARROW,
     WIDE_PASSES,
-    is_believed,
-    judge_challenger,
+    judge_candidate,
     judge_filter,
     recover,
+    takes_over,
 )
 from strapdown.kernels.iterated_update import (
     ACCEPTED,
@@ -117,7 +117,7 @@ class Body(NamedTuple):
     standing: np.ndarray
     """(sensors, ``STANDING``), what the gate remembers of each sensor; left at the end."""
     memory: np.ndarray
-    """(``MEMORY``,), of the candidate; left at the end. At the start of a record zeros, but for ``PASSES``, 1, and ``TOLD``, −1."""
+    """(``MEMORY``,), of the candidate; left at the end. At the start of a record zeros, but for ``PASSES``, 1, and ``REPORTED``, −1."""
 
 
 class Outputs(NamedTuple):
@@ -224,7 +224,7 @@ def begin(body):
     # From an array, and not literals: numba would compile the body for that type too.
     none = 0 * len(body.memory)
     running = none + 1
-    if body.memory[CHALLENGED] > 0.0:
+    if body.memory[CANDIDATE] > 0.0:
         running = none + 2
     return running, none, none, none, lost_digits(running, body)
 
@@ -285,22 +285,22 @@ def update(state, e, now, measured, body, out):
         if i == 0:
             out.weight[place] = weight
             store_innovations(out.form.innovation, place, innovation, variance)
-            lock_outs, challenge = judge_filter(
+            lock_outs, start = judge_filter(
                 outcome, now, sensor, options.recovery, options.lock_out, standing, memory, out.lock_outs, lock_outs
             )
-            if challenge:
+            if start:
                 start_candidate(form, memory, now, options.attitude_sigma, body.restart)
                 running = 2
         else:
             nis = 0.0
             for r in range(3):
                 nis += innovation[r] * innovation[r] / variance[r]
-            verdict = judge_challenger(outcome, nis, degrees, sensor, standing, memory, bias_at(form, 1))
+            verdict = judge_candidate(outcome, nis, degrees, sensor, standing, memory, bias_at(form, 1))
             if verdict == DROPPED:
                 running = 1
             elif verdict == TOO_NARROW:
                 widen(form, memory)
-            if verdict != DROPPED and is_believed(sensor, options.recovery, standing, memory):
+            if verdict != DROPPED and takes_over(sensor, options.recovery, standing, memory):
                 recover(now, sensor, options.lock_out, standing, memory, out.recoveries[recoveries], out.lock_outs)
                 recoveries += 1
                 become(form)

@@ -1,13 +1,12 @@
-"""How a gate judges: refusals sensor by sensor, lock-outs, a challenger beside the filter, and restarts that widen.
+"""Rules of a gate: refusals by sensor, lock-outs, a restart candidate beside the filter, and restarts that widen.
 
-The rules of :class:`strapdown.estimation.gating.Gate`; none depends on the form of a state. They work on what a gate remembers:
-``memory`` (``MEMORY``,) of the challenger, and ``standing`` (sensors, ``STANDING``). The record loops of both filters call them compiled
-(:mod:`strapdown.kernels.robust_loop`, :mod:`strapdown.kernels.augmented_robust`), the step faces as they are, by
-:mod:`strapdown.estimation.judging`.
+They implement :class:`strapdown.estimation.gating.Gate` for any form of the state. Their state is ``memory`` (``MEMORY``,), of the restart
+candidate, and ``standing`` (sensors, ``STANDING``), the counters of each sensor. :mod:`strapdown.kernels.gate` calls them compiled,
+:mod:`strapdown.estimation.step_gate` as plain Python.
 
-Of each measurement :func:`judge_filter` counts what the filter has made of it, and may ask for a challenger (:func:`begin_challenge`); then
-:func:`judge_challenger` what the challenger has made of it. One that is too narrow is made wider where :func:`may_widen` says so; one that
-:func:`is_believed` becomes the filter (:func:`recover`).
+For each measurement :func:`judge_filter` counts the filter's outcome and may request a candidate (:func:`reset_candidate`); then
+:func:`judge_candidate` counts the candidate's. A candidate whose start is too narrow is widened where :func:`may_widen` allows it; one
+that :func:`takes_over` becomes the filter (:func:`recover`).
 """
 
 from __future__ import annotations
@@ -20,49 +19,50 @@ BORROWS_ARRAYS = True
 """See :mod:`strapdown.kernels.machine`."""
 
 WIDE_PASSES = 20
-"""Linearisations of one update at most, of a challenger and of a filter that has recovered."""
+"""Maximum number of linearisations of one update, of a candidate and of a filter that has recovered."""
 WIDENING = 3.0
-"""Each challenger that fails makes the next one's σ so many times wider, and so is one made that was too narrow."""
+"""Factor on σ of the next candidate after one has failed, and of a candidate whose start was too narrow."""
 WIDEST = 7
-"""After so many widenings, to 2187 times the first σ, the next challenger is as narrow as the first."""
+"""Number of widenings, to 2187 times the first σ, after which the next candidate is as narrow as the first."""
 UNIFORM_SIGMA = math.pi / math.sqrt(3.0)
-"""Standard deviation of an angle uniform over the whole turn, rad: no widening of the attitude goes beyond."""
+"""Standard deviation of an angle uniform over the whole turn, rad: upper limit of the attitude's σ."""
 BIAS_MOVE = 2.366
-"""Largest squared move of a challenger's bias over its first variance: the median of χ² of three degrees of freedom. One that moves
-farther is held back by its start, and is made wider; one wider than need be does no harm."""
+"""Maximum of the squared change of a candidate's bias over its initial variance: the median of χ² of three degrees of freedom. A
+candidate whose bias changes more is held back by its start and is widened; one that is wider than necessary does no harm."""
 BIAS_GROWN = 1.05
-"""A bias whose variance has grown so many times since the start is not held back by it."""
+"""Growth of the bias variance since the start above which the start no longer holds the bias back."""
 MISFIT = 3.0
-"""The NIS of what a challenger accepts may add up to so many standard deviations above the degrees of freedom, or it is made wider."""
+"""Standard deviations by which the summed NIS of a candidate may exceed its degrees of freedom; above that it is widened."""
 TOLERANCE = 1
-"""A challenger may refuse so many measurements, and half of those that it accepts, before it is dropped."""
+"""A candidate is dropped when it has refused more than this number plus half of those that it has accepted."""
 MISSES_IN_A_ROW = 3
-"""It is dropped when it refuses so many in a row."""
+"""Number of refusals in a row at which it is dropped."""
 FORGOTTEN = 5.0
-"""When the filter has accepted so many times ``recovery`` since a challenger failed or took over, the next is as narrow as the first."""
+"""Multiple of ``recovery``: after that number of accepted measurements since a candidate failed or took over, the next is as narrow as
+the first."""
 
 # Columns of ``memory``.
-CHALLENGED = 0
-"""Whether there is a challenger."""
+CANDIDATE = 0
+"""Whether there is a candidate."""
 PASSES = 1
-"""Linearisations of an update of the filter."""
+"""Maximum number of linearisations of an update of the filter."""
 LEVEL = 2
-"""How often the next challenger's σ is widened."""
+"""Number of widenings of the next candidate's σ."""
 HITS = 3
-"""What the challenger has accepted of what the filter refused."""
+"""Measurements that the filter refused and the candidate accepted."""
 MISSES = 4
-"""What it has refused."""
+"""Measurements that the candidate refused."""
 SINCE = 5
-"""Start of the challenger, s."""
+"""Time of the candidate's start, s."""
 NIS = 6
 DEGREES = 7
-"""The NIS of what it has accepted, added up, and the degrees of freedom."""
+"""Summed NIS of the measurements accepted by the candidate, and their degrees of freedom."""
 MISSED = 8
-"""What it has refused in a row."""
+"""Refusals of the candidate in a row."""
 TRUSTED = 9
-"""What the filter has accepted since a challenger failed or took over."""
+"""Measurements accepted by the filter since a candidate failed or took over."""
 FIRST_BIAS = 10
-"""The challenger's bias at its start, three columns, and the variances of it, three more."""
+"""Bias of the candidate at its start (three columns) and its variances (three more)."""
 FIRST_VARIANCE = 13
 MEMORY = 16
 
@@ -75,21 +75,21 @@ NUMBER = 2
 """Refusals since the excess was zero, the time of the first and of the last of them, s."""
 FIRST = 3
 LAST = 4
-TOLD = 5
-"""Row of ``lock_outs`` that tells of them, −1 while none does."""
+REPORTED = 5
+"""Row of ``lock_outs`` in which they are reported; −1: not reported."""
 STANDING = 6
 
-# What becomes of a challenger.
+# Outcomes for a candidate.
 DROPPED = 0
 FOLLOWED = 1
 TOO_NARROW = 2
 
 
-def judge_filter(outcome, now, sensor, recovery, limit, standing, memory, lock_outs, told):
-    """Count what the filter has made of a measurement; return the lock-outs told, and whether a challenger is to start.
+def judge_filter(outcome, now, sensor, recovery, limit, standing, memory, lock_outs, reported):
+    """Count the filter's outcome of a measurement; return the number of lock-outs reported, and whether a candidate must start.
 
-    ``limit``: so many more of a sensor may be refused than accepted before it is told, in a row of ``lock_outs``: times of the first and of
-    the last refusal, sensor and number. ``recovery``: 0: never.
+    A lock-out is reported when the refusals of a sensor exceed its acceptances by more than ``limit``, in a row of ``lock_outs``: times of
+    the first and last refusal, sensor, number of refusals. ``recovery``: refusals in a row that start a candidate; 0: never.
     """
     seat = standing[sensor]
     if outcome == ACCEPTED:
@@ -97,44 +97,44 @@ def judge_filter(outcome, now, sensor, recovery, limit, standing, memory, lock_o
         seat[EXCESS] = max(seat[EXCESS] - 1.0, 0.0)
         memory[TRUSTED] += 1.0
     if outcome != REFUSED:
-        return told, False
+        return reported, False
     seat[IN_A_ROW] += 1.0
     if seat[EXCESS] == 0.0:
         seat[NUMBER] = 0.0
         seat[FIRST] = now
-        seat[TOLD] = -1.0
+        seat[REPORTED] = -1.0
     seat[EXCESS] = min(seat[EXCESS] + 1.0, 2.0 * limit)
     seat[NUMBER] += 1.0
     seat[LAST] = now
-    if seat[EXCESS] > limit and seat[TOLD] < 0.0:
-        seat[TOLD] = told
-        told += 1
-    if seat[TOLD] >= 0.0:
-        row = lock_outs[int(seat[TOLD])]
+    if seat[EXCESS] > limit and seat[REPORTED] < 0.0:
+        seat[REPORTED] = reported
+        reported += 1
+    if seat[REPORTED] >= 0.0:
+        row = lock_outs[int(seat[REPORTED])]
         row[0] = seat[FIRST]
         row[1] = now
         row[2] = sensor
         row[3] = seat[NUMBER]
-    if recovery == 0 or memory[CHALLENGED] > 0.0:
-        return told, False
+    if recovery == 0 or memory[CANDIDATE] > 0.0:
+        return reported, False
     if memory[TRUSTED] >= FORGOTTEN * recovery:
         memory[LEVEL] = 0.0
-    return told, True
+    return reported, True
 
 
 def restart_width(memory):
-    """Return how many times the first σ the next challenger's is."""
+    """Return the factor on the first σ for the next candidate."""
     return WIDENING ** memory[LEVEL]
 
 
 def restart_attitude(sigma, memory):
-    """Return σ of the next challenger's attitude where that of the first is ``sigma``, rad."""
+    """Return σ of the next candidate's attitude, rad; that of the first is ``sigma``."""
     return max(sigma, min(restart_width(memory) * sigma, UNIFORM_SIGMA))
 
 
-def begin_challenge(memory, now, bias, variance):
-    """Remember the challenger's bias and the variances of it (3,) at its start, and count from zero."""
-    memory[CHALLENGED] = 1.0
+def reset_candidate(memory, now, bias, variance):
+    """Store the candidate's bias (3,) and its variances (3,) at the start, and reset the counters."""
+    memory[CANDIDATE] = 1.0
     memory[HITS] = 0.0
     memory[MISSES] = 0.0
     memory[SINCE] = now
@@ -146,10 +146,10 @@ def begin_challenge(memory, now, bias, variance):
         memory[FIRST_VARIANCE + i] = variance[i]
 
 
-def judge_challenger(outcome, nis, degrees, sensor, standing, memory, bias):
-    """Count what the challenger has made of a measurement that the filter has been judged by, and return what becomes of it.
+def judge_candidate(outcome, nis, degrees, sensor, standing, memory, bias):
+    """Count the candidate's outcome of a measurement, after the filter's, and return whether it is dropped, kept or too narrow.
 
-    It is dropped when the filter is trusted again, no sensor being refused, or when it fails; the next starts wider then.
+    It is dropped when the filter accepts all sensors again, or when it fails itself; then the next one starts wider.
     """
     if outcome == REFUSED:
         memory[MISSES] += 1.0
@@ -165,7 +165,7 @@ def judge_challenger(outcome, nis, degrees, sensor, standing, memory, bias):
         if standing[s, IN_A_ROW] > 0.0:
             trusted = False
     if trusted:
-        memory[CHALLENGED] = 0.0
+        memory[CANDIDATE] = 0.0
         return DROPPED
     if memory[MISSES] > TOLERANCE + 0.5 * memory[HITS] or memory[MISSED] >= MISSES_IN_A_ROW:
         step_aside(memory)
@@ -181,14 +181,14 @@ def judge_challenger(outcome, nis, degrees, sensor, standing, memory, bias):
 
 
 def step_aside(memory):
-    """End a challenge by which the filter did not right itself: the next starts wider."""
-    memory[CHALLENGED] = 0.0
+    """Drop the candidate while the filter is still lost: the next one starts wider."""
+    memory[CANDIDATE] = 0.0
     memory[LEVEL] = (memory[LEVEL] + 1.0) % (WIDEST + 1.0)
     memory[TRUSTED] = 0.0
 
 
 def may_widen(variance, memory):
-    """Return whether the start still holds back a challenger whose bias has these variances (3,)."""
+    """Return whether the start still holds back a candidate whose bias has these variances (3,)."""
     held = True
     for i in range(3):
         held = held and variance[i] <= BIAS_GROWN * memory[FIRST_VARIANCE + i]
@@ -196,11 +196,11 @@ def may_widen(variance, memory):
 
 
 def start_undone(i, variance, memory):
-    """Return 1/s, s the variance of the innovation that gives component i of the bias back what its start took; 0 where nothing is left.
+    """Return 1/s, s the innovation variance of the update that widens the start of component i of the bias; 0 if nothing is left of it.
 
-    The start is a measurement of the bias, of variance σ₀². Taken in again with the variance ``−σ₀²/(1 − 1/WIDENING²)``, it leaves one of
-    ``WIDENING² σ₀²``, as if the challenger had started so, and nothing that it has seen is lost. Where ``variance``, the component's own by
-    now, is beyond that, the components before it have left more than its start allows: it holds nothing back any more.
+    The start is a measurement of the bias with variance σ₀². A second update with the variance ``−σ₀²/(1 − 1/WIDENING²)`` turns it into
+    one of ``WIDENING² σ₀²``, as if the candidate had started with that, and keeps all information of later measurements. If ``variance``,
+    the present one of the component, is larger, widening the components before it has already removed the start of this one.
     """
     s = variance - memory[FIRST_VARIANCE + i] / (1.0 - 1.0 / (WIDENING * WIDENING))
     if s >= 0.0:
@@ -209,7 +209,7 @@ def start_undone(i, variance, memory):
 
 
 def count_widening(memory):
-    """Count a challenger as one that has started wider, and its fit from zero."""
+    """Record that the candidate's start was widened, and reset its fit."""
     for i in range(3):
         memory[FIRST_VARIANCE + i] *= WIDENING * WIDENING
     memory[LEVEL] += 1.0
@@ -217,25 +217,25 @@ def count_widening(memory):
     memory[DEGREES] = 0.0
 
 
-def is_believed(sensor, recovery, standing, memory):
-    """Return whether the challenger takes over: it agrees with as many measurements that the filter refused as this sensor's in a row."""
+def takes_over(sensor, recovery, standing, memory):
+    """Return whether the candidate takes over: it has accepted at least ``recovery`` measurements that the filter refused."""
     return standing[sensor, IN_A_ROW] >= recovery and memory[HITS] >= recovery
 
 
 def recover(now, sensor, limit, standing, memory, row, lock_outs):
-    """Tell of a recovery in a row (4,), time, sensor, time of the first refusal and refusals in a row, and set the counts back.
+    """Report a recovery in ``row`` (4,): time, sensor, time of the first refusal, refusals in a row; reset the counters.
 
-    It tells of the short lock-outs that it ends too: their number is set to zero.
+    It stands for the short lock-outs that it ends: their number is set to zero.
     """
     row[0] = now
     row[1] = sensor
     row[2] = min(memory[SINCE], standing[sensor, FIRST])
     row[3] = standing[sensor, IN_A_ROW]
     for s in range(len(standing)):
-        if standing[s, TOLD] >= 0.0 and standing[s, NUMBER] <= 2.0 * limit and standing[s, EXCESS] > 0.0:
-            lock_outs[int(standing[s, TOLD]), 3] = 0.0
+        if standing[s, REPORTED] >= 0.0 and standing[s, NUMBER] <= 2.0 * limit and standing[s, EXCESS] > 0.0:
+            lock_outs[int(standing[s, REPORTED]), 3] = 0.0
         for j in range(STANDING):
             standing[s, j] = 0.0
-        standing[s, TOLD] = -1.0
+        standing[s, REPORTED] = -1.0
     step_aside(memory)
     memory[PASSES] = WIDE_PASSES

@@ -24,11 +24,12 @@ PACKAGE = __package__
 
 
 @functools.cache
-def sources_digest() -> str:
-    """Return a digest of all kernel sources: numba's own stamp misses an edited helper module or constant."""
+def sources_digest(parts: tuple[ModuleType, ...] = ()) -> str:
+    """Return a digest of all kernel sources and of ``parts``: numba's own stamp misses an edited helper module or constant."""
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("**/*.py")):
-        digest.update(path.read_bytes())
+    own = sorted(Path(__file__).parent.glob("**/*.py"))
+    for path in (*own, *(Path(module.__file__ or "") for module in parts)):
+        digest.update(path.read_bytes() if path.is_file() else b"")
     return digest.hexdigest()
 
 
@@ -127,7 +128,7 @@ def helper(function: FunctionType, parts: tuple[ModuleType, ...] = ()) -> Any:
 
 @functools.cache
 def compiled(function: Callable[..., Any], *parts: ModuleType) -> Any:
-    """Return ``function`` compiled for calls from Python, cached on disk under the digest of all kernel sources.
+    """Return ``function`` compiled for calls from Python, cached on disk under the digest of all kernel sources and those of ``parts``.
 
     ``parts`` are the modules that define the functions left open, the first that has one of them. It releases the GIL, so records can be
     spread over threads.
@@ -138,7 +139,7 @@ def compiled(function: Callable[..., Any], *parts: ModuleType) -> Any:
     class KernelCache(FunctionCache):  # type: ignore[misc]
         def _index_key(self, signature: Any, codegen: Any) -> Any:
             names = tuple(module.__name__ for module in parts)
-            return (*super()._index_key(signature, codegen), names, sources_digest())
+            return (*super()._index_key(signature, codegen), names, sources_digest(parts))
 
     if not _is_kernel(function):
         raise TypeError(f"{function!r} does not live in {PACKAGE}; move it there before compiling it")

@@ -43,9 +43,9 @@ from strapdown.kernels.error_state_step import (
 )
 from strapdown.kernels.gate_rules import (
     FIRST_BIAS,
-    begin_challenge,
     count_widening,
     may_widen,
+    reset_candidate,
     restart_attitude,
     restart_width,
     start_undone,
@@ -267,7 +267,7 @@ def begin(body):
 
 
 def is_small(state, part, dt, body):
-    """Return whether an increment over dt can be taken in one step."""
+    """Return whether an increment over dt can be propagated in one step."""
     return longest_step(state, part, dt, body) >= dt
 
 
@@ -668,7 +668,7 @@ def start_candidate(form, memory, now, attitude_sigma, restart):
         for c in range(r + 1):
             F[1, 3 + r, 3 + c] = fresh[r, c]
     save(form, 1, load(form, 0))
-    begin_challenge(memory, now, bias_at(form, 1), bias_variances(F[1], size))
+    reset_candidate(memory, now, bias_at(form, 1), bias_variances(F[1], size))
 
 
 def bias_variances(F, size):

@@ -2,7 +2,7 @@
 
 A covariance is ``P = S Sᵀ`` with S *upper* triangular, held as its columns: row j of the array ``F`` is column j of S, so ``P = Fᵀ F`` and
 F is lower triangular. A state without process noise that comes last then costs the prediction nothing but its share of the attitude: a
-lower row of S has no noise to take in and stays as it is.
+lower row of S has no noise to absorb and stays as it is.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ CALLED = ("triangularise", "take_row", "variances", "covariances", "whole_bias")
 def triangularise(F, last, dense, first_noise, end_noise, first_extra, end_extra, work):
     """Bring the rows above and the noise rows into the triangle, by Householder reflections: ``Fᵀ F`` stays.
 
-    Row i of the triangle takes in, for i from ``last`` − 1 down to 0, column i of the rows above it that may reach there (those below
+    Row i of the triangle absorbs, for i from ``last`` − 1 down to 0, column i of the rows above it that may reach there (those below
     ``dense``) and of the rows from ``first_noise`` to ``end_noise``. The columns from ``first_extra`` to ``end_extra`` go along: with the
     identity there beside the noise rows they end as the orthogonal matrix's own rows. ``work`` is scratch as long as F is wide.
     """
@@ -75,7 +75,7 @@ def triangularise(F, last, dense, first_noise, end_noise, first_extra, end_extra
 
 
 def take_row(F, size, H, row, variance, gain):
-    """Take in one scalar measurement ``H[row] · x + v``, Var v = ``variance``: Carlson (1973), triangle to triangle.
+    """Update with one scalar measurement ``H[row] · x + v``, Var v = ``variance``: Carlson (1973), triangle to triangle.
 
     Returns the innovation's variance s; ``gain`` is left at P h, so the correction is gain · innovation / s. No difference of squares is
     formed, so the factor stays one however sharp the measurement (Bierman 1977, section V.3).

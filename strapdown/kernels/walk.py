@@ -42,7 +42,7 @@ def begin(body):
 
 
 def is_small(state, part, dt, body):
-    """Return whether an increment over dt can be taken in one step."""
+    """Return whether an increment over dt can be propagated in one step."""
 
 
 def longest_step(state, part, dt, body):
