@@ -2,9 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import FunctionType, ModuleType
+from typing import Any
+
+import numba
+
+from strapdown.kernels.machine import helper
 
 KERNELS = "strapdown.kernels"
+
+
+def called(function: FunctionType, parts: tuple[ModuleType, ...] = ()) -> Callable[..., Any]:
+    """Return a compiled function that calls a kernel's helper: helpers themselves have no wrapper for calls from Python."""
+    made = helper(function, parts)
+    return numba.njit(lambda *arguments: made(*arguments))  # type: ignore[no-any-return]
 
 
 def plain(function: FunctionType, *parts: ModuleType) -> FunctionType:

@@ -7,11 +7,11 @@ from collections.abc import Callable
 import mpmath as mp
 import numpy as np
 import pytest
+from plain_kernels import called
 from scipy.spatial.transform import Rotation
 
 from strapdown import kinematics, quaternion
 from strapdown.kernels import algebra, rotation
-from strapdown.kernels.machine import helper
 from strapdown.kernels.series import LARGEST_ANGLE
 
 EPS = np.finfo(float).eps
@@ -268,7 +268,7 @@ def test_three_machines_agree(name):
     function = KERNELS[name][0]
     drawn = arguments(name)
     together = stacked(function(*drawn))
-    fast = helper(function)
+    fast = called(function)
     for k in range(RUNS):
         one = [row(argument, k) for argument in drawn]
         np.testing.assert_array_equal(stacked(function(*one)), together[k])
@@ -278,7 +278,7 @@ def test_three_machines_agree(name):
 
 def test_square_root():
     assert algebra.square_root(2.0) == np.sqrt(2.0)
-    assert helper(algebra.square_root)(2.0) == np.sqrt(2.0)
+    assert called(algebra.square_root)(2.0) == np.sqrt(2.0)
 
 
 # ---------------------------------------------------------------------------------------------------- rotations over all angles

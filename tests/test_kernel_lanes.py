@@ -10,6 +10,7 @@ import sys
 from types import FunctionType
 
 import numpy as np
+import plain_kernels
 import pytest
 from numba.core.errors import TypingError
 
@@ -55,7 +56,7 @@ def kernel(function: FunctionType) -> object:
     """Compile a function of this file as if it lived among the kernels."""
     twin = FunctionType(function.__code__, function.__globals__, function.__name__, None, function.__closure__)
     twin.__module__ = "strapdown.kernels.probe"
-    return machine.helper(twin)
+    return plain_kernels.called(twin)
 
 
 # ---------------------------------------------------------------------------------------------------- the type
@@ -410,7 +411,7 @@ def test_the_filters_prediction_over_lanes():
     noise = (0.01, 1e-6, 1e-8)
     fast = state.copy()
     kernel(predicted)(state.reshape(-1), phi.reshape(-1), *noise, fast.reshape(-1))
-    scalar = machine.helper(predict)
+    scalar = plain_kernels.called(predict)
     for step in (predict, scalar):
         for i in range(WIDTH):
             run = tuple(map(tuple, np.split(state[:, i], [4, 7, 13, 22])))

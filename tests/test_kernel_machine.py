@@ -87,10 +87,10 @@ def is_nan(x):
 
 def test_nan_and_infinity_survive_compilation():
     """Full fastmath would let the compiler assume there are none."""
-    dot = machine.helper(algebra.dot)
+    dot = plain_kernels.called(algebra.dot)
     assert math.isnan(dot((1.0, 2.0, 3.0), (0.0, math.nan, 0.0)))
     assert math.isinf(dot((1.0, 2.0, 3.0), (0.0, math.inf, 0.0)))
-    watch = machine.helper(foreign(is_nan, math=math))
+    watch = plain_kernels.called(foreign(is_nan, math=math))
     assert watch(math.nan)
     assert not watch(1.0)
 
@@ -169,7 +169,7 @@ def step(state, body):
 def test_a_module_leaves_functions_open_for_others_to_define():
     loop, adds, doubles = module_of("loop", LOOP), module_of("adds", ADDS), module_of("doubles", DOUBLES)
     ones = module_of("ones", "def begin(body):\n    return 1.0\n")
-    for call in (machine.helper, lambda function, parts: plain_kernels.plain(function, *parts)):
+    for call in (plain_kernels.called, lambda function, parts: plain_kernels.plain(function, *parts)):
         assert call(loop.repeated, (adds,))(5, 0.25) == 1.25
         # The first module that has a function defines it.
         assert call(loop.repeated, (doubles, ones))(5, 0.25) == 32.0
@@ -190,7 +190,7 @@ def test_a_part_may_leave_functions_open_in_its_turn():
     inner = module_of(
         "inner", "def inner(body):\n    return 10.0 * body\ndef step(state, body):\n    return state + 100.0\n"
     )
-    assert machine.helper(loop.repeated, (outer, inner))(2, 0.5) == 206.0
+    assert plain_kernels.called(loop.repeated, (outer, inner))(2, 0.5) == 206.0
 
 
 def test_a_missing_definition_is_refused_by_its_name():
@@ -266,7 +266,7 @@ def test_a_literal_argument_compiles_no_helper_twice():
         "def product(n, x):\n    return n * x\n"
         "def both(n, x):\n    return product(3, x) + product(n, x) + product(n=4, x=x)\n",
     )
-    assert machine.helper(module.both)(5, 1.5) == 18.0
+    assert plain_kernels.called(module.both)(5, 1.5) == 18.0
     assert len(machine.helper(module.product, ()).signatures) == 1
 
 
