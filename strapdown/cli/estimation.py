@@ -618,7 +618,9 @@ def _estimate_recording(
         console.print(sentence)
     if result.hard_iron.any():
         iron = ", ".join(f"{value:.3g}" for value in result.hard_iron)
-        console.print(f"Hard iron of {iron} (unit of the magnetometer, body axes, at the end) is taken off its samples.")
+        console.print(
+            f"Hard iron of {iron} (unit of the magnetometer, body axes, at the end) is taken off its samples."
+        )
     if result.calibration is not None:
         paths.append(out / "calibration.toml")
         paths[-1].write_text(unit_calibration.to_toml(result.calibration), encoding="utf-8")
