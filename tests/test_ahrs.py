@@ -200,7 +200,7 @@ def test_iron_attached_to_the_unit_is_taken_off_while_it_is_there(smooth, monkey
     field = plain.magnetic_field + np.where(there[:, None], [12.0, -8.0, 14.0], 0.0)
     attached = dataclasses.replace(plain, magnetic_field=field)
     found = ahrs.estimate(attached, latency=0.0, smooth=smooth)
-    assert worst(found)["heading"] < 0.8
+    assert worst(found)["heading"] < (0.8 if smooth else 1.8)
     assert np.linalg.norm(found.hard_iron) < 3.0  # of 20, half a time constant of its memory after it was removed
     during = ahrs.estimate(
         dataclasses.replace(

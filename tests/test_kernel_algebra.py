@@ -221,7 +221,7 @@ def test_unit_and_logarithm_against_the_public_algebra(rotation_vectors):
 def test_turns_of_any_angle_against_the_public_algebra(rotation_vectors, largest):
     """Plain and compiled; beyond π what has an inverse there, that of the angle itself."""
     q = quaternion.exp(np.array([0.7, -0.4, 1.1]))
-    for function in (lambda f: f, helper):
+    for function in (lambda f: f, called):
         moved, far, sine, composed = map(
             function, (rotation.moved, rotation.far_turn, rotation.sine_and_versine, rotation.composed)
         )

@@ -156,6 +156,15 @@ def test_only_truncated_rates_are_taken_for_such(rounding, noise):
     assert sensor_faults.truncation_step(quantised(rounding, noise=noise)[0].rate) is None
 
 
+@pytest.mark.parametrize(("rounding", "truncated"), [(np.round, False), (np.trunc, True)])
+def test_zeros_at_rest_are_no_sign_of_truncation(rounding, truncated):
+    """A gyro whose noise is a fraction of a step gives many zeros at rest, however it rounds; it turns for half of the time."""
+    time = np.arange(40_000) / RATE
+    turning = np.where(time < 100.0, 0.0, np.sin(0.9 * (time - 100.0)))[:, None] * [1.0, 0.7, 0.4]
+    rate = turning + 0.3 * LSB * np.random.default_rng(9).standard_normal((len(time), 3))
+    assert (sensor_faults.truncation_step(LSB * rounding(rate / LSB)) is not None) == truncated
+
+
 def test_a_truncated_gyro_shows_the_same_bias_at_rest_and_in_motion():
     truncated, rate = quantised(np.trunc)
     assert sensor_faults.truncation_step(truncated.rate) == pytest.approx(LSB, rel=1e-3)
