@@ -147,7 +147,7 @@ class _Compiling:
         event: Any = sys.modules["numba.core.event"]
         owner = self
 
-        class Listener(event.Listener):
+        class Listener(event.Listener):  # type: ignore[misc]
             def on_start(self, happened: Any) -> None:
                 owner.started(happened.data["dispatcher"])
 
