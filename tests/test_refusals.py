@@ -449,7 +449,7 @@ def test_integration_tells_of_samples_that_fill_no_step(there, tmp_path):
     result = CliRunner().invoke(cli.app, ["integrate", str(tmp_path / "short.csv"), *out])
     assert result.exit_code == 0, result.output
     assert "The last 3 of them do not fill a step of 4 and are left out." in result.output
-    assert "units itself" in refused(["integrate", "record.h5", "--gyro-unit", "rad/s", *out])
+    assert "holds its units" in refused(["integrate", "record.h5", "--gyro-unit", "rad/s", *out])
 
 
 def test_want_of_memory_ends_with_one_line(run, monkeypatch):
