@@ -18,7 +18,19 @@ PACKAGE = Path(strapdown.__file__).parent
 
 FLOORS: tuple[tuple[str, ...], ...] = (
     # 0 mathematics, and what everything stands on
-    ("checks", "equality", "listing", "reading", "files", "units", "tables", "randomness", "quaternion", "kinematics", "kernels"),
+    (
+        "checks",
+        "equality",
+        "listing",
+        "reading",
+        "files",
+        "units",
+        "tables",
+        "randomness",
+        "quaternion",
+        "kinematics",
+        "kernels",
+    ),
     # 1 models
     (
         "motion",
