@@ -93,7 +93,9 @@ def _effective(white: np.ndarray, first: int) -> float:
 
     An error that is the sum of a quick and of a slow part is no Markov process: from one epoch to the next the quick part hides the slow.
     """
-    most = max(1, len(white) // (8 * (white.shape[1] + 1)))
+    # Fewer epochs than that could not show that there are enough effective samples.
+    least = max(8 * (white.shape[1] + 1), 2 * int(LEAST_EFFECTIVE))
+    most = max(1, len(white) // least)
     found = [effective_samples(white[:: 2**k], first) for k in range(most.bit_length())]
     by_model = found[0] if min(found) >= LEAST_EFFECTIVE else min(found)
     # Nor are the six states alone where the filter has error states beside them.
