@@ -21,7 +21,6 @@ from numpydoc.docscrape import NumpyDocString, get_doc_object
 from numpydoc.validate import ERROR_MSGS, Validator, validate
 
 TO_BE_DOCUMENTED = (
-    "strapdown",
     "strapdown.ahrs",
     "strapdown.coning_study",
     "strapdown.consistency",
@@ -32,9 +31,6 @@ TO_BE_DOCUMENTED = (
     "strapdown.estimation.filters",
     "strapdown.estimation.filters.own",
     "strapdown.estimation.multiple_model",
-    "strapdown.montecarlo",
-    "strapdown.montecarlo.campaign",
-    "strapdown.montecarlo.cluster",
     "strapdown.plots",
     "strapdown.report",
     "strapdown.scenarios",
