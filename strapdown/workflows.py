@@ -681,8 +681,8 @@ def monte_carlo(
         Default: the scenario's own.
     setup : FilterSetup, optional
         The filter; default: matched to the scenario.
-    states : bool, default False
-        Give the matched filter an error state for each error that the scenario specifies.
+    states : bool, optional
+        Whether the matched filter has an error state for each error that the scenario specifies. Default: where there are such errors.
     dispersions : Dispersions, optional
         Initial errors and gyro parameters that differ from run to run.
     threads : int, optional
