@@ -50,34 +50,51 @@ VERDICT_EPOCHS = 20
 
 @dataclass(frozen=True, kw_only=True)
 class ConingParameters:
-    """Parameters of the study, SI and radians. The defaults show its point: the gyro is sampled only ten times a cycle."""
+    """Parameters of the study, SI and radians. The defaults show its point: the gyro is sampled only ten times a cycle.
+
+    Parameters
+    ----------
+    angle : float, default 0.7°
+        Half-angle β of the cone, rad.
+    frequency : float, default 10.0
+        Coning frequency, Hz.
+    rate : float, default 100.0
+        Gyro samples a second, Hz.
+    duration : float, default 240.0
+        Length of each run, s; rounded to whole epochs.
+    runs : int, default 100
+        Runs of the Monte Carlo.
+    seed : int, default 1
+        Seed of the Monte Carlo.
+    angle_random_walk : float, default 0.08 °/√h
+        Angle random walk σ_v of the gyro, rad/√s.
+    rate_random_walk : float, default 1 °/h/√h
+        Rate random walk σ_u of the gyro, rad/s/√s.
+    direction_sigma : float, default 20″
+        Noise of each component of two measured directions, rad, about once a second.
+    attitude_sigma : float, default 200″
+        σ of the initial attitude error, each body axis, rad.
+    bias_sigma : float, default 20 °/h
+        σ of the initial bias error, each body axis, rad/s.
+    probability : float, default 0.99
+        Probability content of all bounds.
+    own : tuple of Algorithm, default ()
+        Algorithms of one's own, compared beside those of the package.
+    """
 
     angle: float = 0.7 * DEGREE
-    """Half-angle β of the cone, rad."""
     frequency: float = 10.0
-    """Coning frequency, Hz."""
     rate: float = 100.0
-    """Gyro samples a second, Hz."""
     duration: float = 240.0
-    """Length of each run, s; rounded to whole epochs."""
     runs: int = 100
-    """Runs of the Monte Carlo."""
     seed: int = 1
-    """Of the Monte Carlo."""
     angle_random_walk: float = 0.08 * DEGREE_PER_ROOT_HOUR
-    """rad/√s."""
     rate_random_walk: float = 1.0 * DEGREE_PER_HOUR_PER_ROOT_HOUR
-    """rad/s/√s."""
     direction_sigma: float = 20.0 * ARCSECOND
-    """Noise of each component of two measured directions, rad, about once a second."""
     attitude_sigma: float = 200.0 * ARCSECOND
-    """Initial attitude error, each axis, rad."""
     bias_sigma: float = 20.0 * DEGREE_PER_HOUR
-    """Initial bias error, each axis, rad/s."""
     probability: float = 0.99
-    """Probability content of all bounds."""
     own: tuple[coning.Algorithm, ...] = ()
-    """Algorithms of one's own, compared beside those of the package."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -217,14 +234,21 @@ class FilterOutcome:
 
 @dataclass(frozen=True, kw_only=True)
 class ConingStudy:
-    """Result of the study."""
+    """Result of the study.
+
+    Parameters
+    ----------
+    parameters : ConingParameters
+        Parameters of the study.
+    drifts : tuple of Drift
+        Drift of each algorithm, measured and predicted, rad/s along the cone's axis.
+    outcomes : tuple of FilterOutcome
+        Statistics of the filter on the increments of each algorithm.
+    """
 
     parameters: ConingParameters
-    """What was studied."""
     drifts: tuple[Drift, ...]
-    """Drift by algorithm, measured and predicted."""
     outcomes: tuple[FilterOutcome, ...]
-    """The filter on the increments of each algorithm."""
 
     def summary(self) -> dict[str, Any]:
         """Return the study as ``coning.json`` holds it: degrees, hours, arcseconds, with the unit in each key.
@@ -232,6 +256,7 @@ class ConingStudy:
         Returns
         -------
         dict
+            Plain values for JSON: ``scenario``, ``integration`` (drifts), ``filter`` (outcomes), and ``own`` where there is any.
         """
         p = self.parameters
         return {
@@ -365,12 +390,14 @@ def run(parameters: ConingParameters, *, progress: Callable[[int], None] | None 
     Parameters
     ----------
     parameters : ConingParameters
+        Cone, gyro, filter and Monte Carlo.
     progress : callable, optional
         Called with the number of Monte Carlo runs just finished.
 
     Returns
     -------
     ConingStudy
+        Drift of each algorithm, and the statistics of the filter with it on the same runs.
 
     Raises
     ------

@@ -398,12 +398,14 @@ def smooth(source: ImuRecord | Recording, **options: Any) -> Estimate:
     Parameters
     ----------
     source : ImuRecord or Recording
+        What :func:`simulate` or :func:`read` returned, or a record of your own data.
     **options
-        As of :func:`estimate`.
+        Those of :func:`estimate`, except ``smooth``.
 
     Returns
     -------
     Estimate
+        At the same epochs and with the same fields as that of :func:`estimate`.
 
     Raises
     ------
@@ -495,6 +497,7 @@ def integrate(
     Parameters
     ----------
     source : ImuRecord or Recording
+        Its gyro samples alone are used; gyro errors are not corrected.
     algorithm : str or Algorithm, default "four-sample"
         Coning algorithm (``strapdown.coning.ALGORITHMS``).
     initial_attitude : array_like (4,), optional
@@ -673,12 +676,13 @@ def monte_carlo(
     scenario : Scenario, str or path
         As of :func:`simulate`.
     runs : int, default 1000
+        Number of independent runs.
     seed : int, optional
         Default: the scenario's own.
     setup : FilterSetup, optional
         The filter; default: matched to the scenario.
-    states : bool, default False
-        Give the matched filter an error state for each error that the scenario specifies.
+    states : bool, optional
+        Whether the matched filter has an error state for each error that the scenario specifies. Default: where there are such errors.
     dispersions : Dispersions, optional
         Initial errors and gyro parameters that differ from run to run.
     threads : int, optional
@@ -730,6 +734,7 @@ def covariance_analysis(
     Returns
     -------
     Analysis
+        σ of attitude (rad, body axes) and bias (rad/s) over time, actual and by the filter's own covariance, and the error budget.
 
     Raises
     ------
@@ -868,6 +873,7 @@ def allan_deviation(
     Returns
     -------
     AllanDeviation
+        Deviation at each averaging time and axis, in the unit of the samples (increments: that unit per s), and its confidence band.
 
     Raises
     ------
@@ -901,8 +907,14 @@ def fit_noise(
 
     Parameters
     ----------
-    source, sample_interval, sensor, kind
-        As of :func:`allan_deviation`.
+    source : Recording, ImuRecord, GyroSamples or array_like (n,) or (n, axes)
+        Samples at rest; a recording may have gaps.
+    sample_interval : float, optional
+        Of an array: time between its samples, s.
+    sensor : {"gyro", "accelerometer", "magnetometer"}
+        Of a recording.
+    kind : {"rate", "increments"}
+        Of an array: averaged samples, or their integrals over each interval.
     **options
         ``highest_frequency``, ``terms``, ``level`` of :func:`strapdown.allan.fit_noise`.
 

@@ -21,9 +21,7 @@ from numpydoc.docscrape import NumpyDocString, get_doc_object
 from numpydoc.validate import ERROR_MSGS, Validator, validate
 
 TO_BE_DOCUMENTED = (
-    "strapdown",
     "strapdown.ahrs",
-    "strapdown.coning_study",
     "strapdown.consistency",
     "strapdown.covariance",
     "strapdown.diagnosis",
@@ -32,16 +30,8 @@ TO_BE_DOCUMENTED = (
     "strapdown.estimation.filters",
     "strapdown.estimation.filters.own",
     "strapdown.estimation.multiple_model",
-    "strapdown.montecarlo",
-    "strapdown.montecarlo.campaign",
-    "strapdown.montecarlo.cluster",
-    "strapdown.plots",
-    "strapdown.report",
-    "strapdown.scenarios",
     "strapdown.setup",
     "strapdown.setup.for_record",
-    "strapdown.tuning",
-    "strapdown.tuning.procedure",
 )
 """Modules that are not documented in full yet. The list may only shrink: a module that has become complete must leave it."""
 

@@ -97,26 +97,39 @@ _COUNTED = (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Campaign:
-    """A campaign as stored in its file."""
+    """A campaign as stored in its file.
+
+    Parameters
+    ----------
+    plan : Plan
+        Scenario, filter and seed of the campaign.
+    machine : {"lanes", "scalar"}
+        Machine that computes it.
+    reason : str
+        Why the lanes cannot compute it; empty where they do, or where the machine was chosen by name.
+    chunk : int
+        Runs between merges.
+    runs : int
+        Number of runs wanted.
+    statistics : Statistics or None
+        Of the runs finished so far, in their order without a gap; None if there is none.
+    version : str, optional
+        Version of this package that computed it. Default: the one that runs.
+    arithmetic : str, default ""
+        Processor features that the bits depend on (:func:`strapdown.montecarlo.engine.arithmetic`); empty in files of earlier versions.
+    seconds : float, default 0.0
+        Time spent computing, s, over all resumptions.
+    """
 
     plan: Plan
-    """What is computed."""
     machine: str
-    """Machine that computes it: lanes or scalar."""
     reason: str
-    """Why the lanes do not serve, if they do not."""
     chunk: int
-    """Runs between merges."""
     runs: int
-    """Runs wanted."""
     statistics: Statistics | None
-    """Of the runs finished so far, in their order without a gap; None if there is none."""
     version: str = strapdown.__version__
-    """Of the package that computed it."""
     arithmetic: str = ""
-    """Processor features that the bits depend on (:func:`strapdown.montecarlo.engine.arithmetic`); empty in files of earlier versions."""
     seconds: float = 0.0
-    """Time spent computing, s, over all resumptions."""
 
     @property
     def finished(self) -> bool:
@@ -179,6 +192,7 @@ def run(
     Parameters
     ----------
     plan : Plan
+        Scenario, filter and seed.
     path : path
         HDF5 file. Finished chunks are written at intervals that keep the time spent on writing below a tenth; Ctrl-C writes all.
     runs : int
@@ -189,14 +203,19 @@ def run(
         Start anew although the file exists.
     chunk : int, optional
         Runs between merges; default the file's, or the machine's.
-    machine, threads, workers
-        As of :func:`strapdown.montecarlo.run_plan`.
+    machine : {"auto", "lanes", "scalar"}
+        "auto": the lanes if they support every term of the plan.
+    threads : int, optional
+        Default: one a core.
+    workers : Workers, optional
+        What computes the chunks instead of threads (:func:`strapdown.montecarlo.cluster.on_dask`).
     progress : callable, optional
         Called with the number of runs just finished, first with those that the file held.
 
     Returns
     -------
     Campaign
+        All runs finished, as the file holds it.
 
     Raises
     ------
@@ -411,10 +430,12 @@ def read(path: str | os.PathLike[str]) -> Campaign:
     Parameters
     ----------
     path : path
+        HDF5 file that :func:`run` writes.
 
     Returns
     -------
     Campaign
+        With the statistics of the runs finished so far.
 
     Raises
     ------

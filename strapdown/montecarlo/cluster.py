@@ -87,6 +87,7 @@ def on_dask(client: Any) -> Workers:
     Parameters
     ----------
     client : distributed.Client
+        Connected to the workers, such as :func:`dask_client` yields it.
 
     Returns
     -------

@@ -105,6 +105,7 @@ def replay(plan: Plan, run: int, *, machine: str = "auto") -> Replay:
     Parameters
     ----------
     plan : Plan
+        Plan of the campaign.
     run : int
         Number of the run, from 0.
     machine : {"auto", "lanes", "scalar"}
@@ -273,6 +274,7 @@ def run_plan(
     Parameters
     ----------
     plan : Plan
+        Scenario, filter and seed, and where statistics are computed.
     runs : int
         Run k is the same to the bit whatever their number, the chunks, threads and workers.
     chunk : int, optional
@@ -288,6 +290,7 @@ def run_plan(
     Returns
     -------
     Statistics
+        Sums over all the runs, merged in the order of the chunks.
 
     Raises
     ------
@@ -321,9 +324,13 @@ def run(
     Parameters
     ----------
     scenario : Scenario
+        Motion, gyro and sensors that are simulated.
     setups : sequence of FilterSetup
+        Filters to compare.
     runs : int
+        Number of independent runs.
     seed : int
+        Seed of all random streams.
     epochs : int, default 100
         Intervals between the epochs of the statistics.
     nis_bins : int, default 100

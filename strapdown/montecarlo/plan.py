@@ -25,23 +25,34 @@ def _zeros() -> Array:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Dispersions:
-    """Normal, independent dispersions from run to run besides the noise. Default: initial errors from the filter's prior."""
+    """Normal, independent dispersions from run to run besides the noise. Default: initial errors from the filter's prior.
+
+    Parameters
+    ----------
+    attitude_sigma : float, optional
+        σ of the initial attitude error, each body axis, rad. Default: the filter's own, so that a matched filter is consistent.
+    bias_sigma : float, optional
+        σ of the initial bias error, each body axis, rad/s. Default: the filter's own.
+    attitude_error : ndarray (3,), default zeros
+        Fixed part of the initial attitude error δθ in all runs, rad, body axes.
+    bias_error : ndarray (3,), default zeros
+        Fixed part of the initial bias error δb in all runs, rad/s, body axes.
+    scale_factor_sigma : float, default 0.0
+        σ of a scale-factor error of each gyro axis, dimensionless, added to the scenario's.
+    misalignment_sigma : float, default 0.0
+        σ of each of the six misalignments of the gyro, rad, added to the scenario's.
+    turn_on_bias_sigma : float, default 0.0
+        σ of a turn-on bias of each gyro axis, rad/s, added to the scenario's. The filter starts from the true bias less its initial error,
+        so this changes the bias over which the filter is tested, not its initial bias error.
+    """
 
     attitude_sigma: float | None = None
-    """σ of the initial attitude error, each axis, rad; None: the filter's own, so that a matched filter is consistent."""
     bias_sigma: float | None = None
-    """σ of the initial bias error, each axis, rad/s; None: the filter's own."""
     attitude_error: Array = field(default_factory=_zeros)
-    """Fixed part of the initial attitude error δθ (3,), rad, body axes, in all runs."""
     bias_error: Array = field(default_factory=_zeros)
-    """Fixed part of the initial bias error δb (3,), rad/s, in all runs."""
     scale_factor_sigma: float = 0.0
-    """σ of a scale-factor error of each gyro axis, on top of the scenario's."""
     misalignment_sigma: float = 0.0
-    """σ of each of the six misalignments of the gyro, rad, on top of the scenario's."""
     turn_on_bias_sigma: float = 0.0
-    """σ of a turn-on bias of each gyro axis, rad/s, on top of the scenario's. The filter starts from the true bias less its initial error,
-    so this tests the bias that it meets, not the one it starts with."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -64,6 +75,7 @@ class Dispersions:
         Returns
         -------
         dict
+            Values by key; the ending of a key is its unit (``attitude_sigma_deg``).
         """
         return tables.encode(self, {n: choice for n, choice in _FORM.items() if getattr(self, n) is not None})
 
@@ -86,25 +98,36 @@ class Plan:
     Filter and truth are separate: a ``setup`` that differs from :func:`strapdown.setup.matched` of the scenario is a mismatched filter.
     Outages, outliers and correlated noise are the scenario's sensors'. A plan is compared and hashed by identity, so a machine may keep
     what it derives from one in a ``weakref.WeakKeyDictionary``.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Motion, gyro and sensors that are simulated.
+    setup : FilterSetup
+        The filter.
+    seed : int, default 0
+        Seed of all random streams, which are named by (seed, run, source).
+    epochs : int, default 100
+        Number of equal intervals between the epochs at which errors are evaluated; each epoch ends a whole filter step.
+    nis_bins : int, default 100
+        Number of equal spans of time over which NIS is summed.
+    dispersions : Dispersions, default Dispersions()
+        Initial errors and gyro parameters that differ from run to run.
+    individuals : bool, default False
+        Whether each run draws its own gyro and sensors (:func:`strapdown.scenarios.drawn`): the errors of the specification are then
+        standard deviations, as a filter with states for them assumes. Otherwise every run has exactly those errors.
+    precision : {"float64", "float32"}, default "float64"
+        Floating-point format of the filter and the noise; "float32" only on a machine that supports it.
     """
 
     scenario: Scenario
-    """What is simulated."""
     setup: FilterSetup
-    """The filter."""
     seed: int = 0
-    """Of all random streams, which are named by (seed, run, source)."""
     epochs: int = 100
-    """Equally spaced epochs, besides the start, at which errors are taken; each ends on a whole filter step."""
     nis_bins: int = 100
-    """Equal spans of time over which NIS is summed."""
     dispersions: Dispersions = field(default_factory=Dispersions)
-    """What differs from run to run besides the noise."""
     individuals: bool = False
-    """Whether each run draws its own gyro and sensors (:func:`strapdown.scenarios.drawn`): the errors of the specification are then
-    standard deviations, as a filter with states for them takes them. Without, every run meets exactly those errors."""
     precision: str = "float64"
-    """In what the filter and the noise are computed: "float64", or "float32" on a machine that has it."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -154,6 +177,7 @@ class Plan:
         Returns
         -------
         dict
+            Plain values with units in the keys; :attr:`digest` is its hash.
         """
         return {
             "scenario": scenarios.scenario_to_table(self.scenario),
@@ -192,10 +216,12 @@ def read_dispersions(path: str | os.PathLike[str]) -> Dispersions:
     Parameters
     ----------
     path : path
+        TOML file, such as a scenario file with this table added.
 
     Returns
     -------
     Dispersions
+        In SI units and radians, whatever the units of the keys.
 
     Raises
     ------

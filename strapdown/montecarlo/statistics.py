@@ -110,48 +110,71 @@ class Statistics(Listed):
     """Sums over independent runs at each epoch. The head of this module defines each field.
 
     Errors are e = (δθ, δb): rad in the body frame, rad/s.
+
+    Parameters
+    ----------
+    time : ndarray (m,)
+        Epochs, s.
+    runs : int
+        Number of runs.
+    finite : ndarray (m,) of int
+        Runs whose error, covariance P and NEES are finite; the others are left out of all sums of that epoch.
+    error_sum : ndarray (m, 6)
+        Σ e.
+    error_product_sum : ndarray (m, 6, 6)
+        Σ e eᵀ.
+    covariance_sum : ndarray (m, 6, 6)
+        Σ P, the filter's own covariance.
+    nees_sum : ndarray (m, 3)
+        Σ NEES of all six states, of the attitude, of the bias; not divided by the degrees of freedom.
+    log_nees_sum : ndarray (m, 3)
+        Σ ln NEES of the same.
+    coverage : ndarray (m, 6, 3) of int
+        Runs with |e| within 1, 2, 3 σ.
+    histogram : ndarray (m, 9, bins) of int
+        Counts of |e| (columns 0–5) and of the three NEES (columns 6–8) by logarithmic bin.
+    nis_edges : ndarray (k + 1,)
+        Edges of the spans of time of the NIS, s.
+    sensors : tuple of str
+        Names of the s sensors, in the scenario's order.
+    sensor_nis_sum : ndarray (s, k)
+        Σ NIS of the measurements used, by sensor and span of time.
+    sensor_degrees : ndarray (s, k) of int
+        Their degrees of freedom.
+    sensor_refused : ndarray (s, k) of int
+        Measurements refused by the gate.
+    worst_run : ndarray (w,) of int
+        Numbers of the runs with the largest NEES of the state, the largest first.
+    worst_score : ndarray (w,)
+        Their largest NEES of the state; infinite where the filter failed.
+    example_run : ndarray (x,) of int
+        Numbers of the runs whose whole error histories are kept.
+    example_error : ndarray (x, m, 6)
+        Errors of these runs, rad and rad/s.
+    example_sigma : ndarray (x, m, 6)
+        The filter's own σ in these runs, rad and rad/s.
     """
 
     time: Array
-    """Epochs (m,), s."""
     runs: int
-    """Number of runs."""
     finite: Counts
-    """Runs whose error, P and NEES are finite (m,)."""
     error_sum: Array
-    """Σ e (m, 6)."""
     error_product_sum: Array
-    """Σ e eᵀ (m, 6, 6)."""
     covariance_sum: Array
-    """Σ P (m, 6, 6)."""
     nees_sum: Array
-    """Σ NEES of all six states, attitude, bias (m, 3)."""
     log_nees_sum: Array
-    """Σ ln NEES of the same (m, 3)."""
     coverage: Counts
-    """Runs with |e| within 1, 2, 3 σ (m, 6, 3)."""
     histogram: Counts
-    """Counts of |e| (6) and of NEES (3) by bin (m, 9, bins)."""
     nis_edges: Array
-    """Edges of the spans of time of the NIS (k + 1,), s."""
     sensors: tuple[str, ...]
-    """Names of the sensors (s,)."""
     sensor_nis_sum: Array
-    """Σ NIS by sensor and span of time (s, k)."""
     sensor_degrees: Counts
-    """Degrees of freedom of those (s, k)."""
     sensor_refused: Counts
-    """Measurements refused by the gate (s, k)."""
     worst_run: Counts
-    """Numbers of the runs of the largest NEES, the largest first (w,)."""
     worst_score: Array
-    """Their largest NEES of the state; infinite where the filter failed (w,)."""
     example_run: Counts
-    """Numbers of the runs kept as examples (x,)."""
     example_error: Array
-    """Their errors (x, m, 6), rad and rad/s."""
     example_sigma: Array
-    """The filter's σ in them (x, m, 6)."""
 
     def listing(self) -> Listing:
         """Return NEES and NIS per degree of freedom, and the errors at the end, as a table.
@@ -283,12 +306,14 @@ class Statistics(Listed):
         Parameters
         ----------
         probability : float, default 0.99
+            Probability that a consistent filter lies inside the bounds.
         sensor : str, optional
             Default: all sensors together (:attr:`mean_nis`).
 
         Returns
         -------
         low, high : float
+            Per degree of freedom; a mean outside them rejects the filter.
         """
         rows = slice(None) if sensor is None else self.sensors.index(sensor)
         return consistency.mean_bounds(1, int(self.sensor_degrees[rows].sum()), probability)
@@ -309,6 +334,7 @@ class Statistics(Listed):
         Returns
         -------
         Verdict
+            ANEES per degree of freedom at each epoch, with its bounds.
         """
         column, degrees = SUBSETS[subset]
         mean = np.where(self.finite == self.runs, self.anees[:, column], np.inf)[epochs]
@@ -320,6 +346,7 @@ class Statistics(Listed):
         Parameters
         ----------
         probability : float
+            Of the quantile, from 0 to 1.
 
         Returns
         -------
@@ -335,10 +362,12 @@ class Statistics(Listed):
         Parameters
         ----------
         probability : float
+            Of the quantile, from 0 to 1.
 
         Returns
         -------
         ndarray (m, 3)
+            Not divided by the degrees of freedom; NaN where no run was finite.
         """
         return _quantile(self.histogram[:, 6:], probability, bin_edges(NEES_EXPONENT))
 

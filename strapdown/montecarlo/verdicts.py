@@ -22,9 +22,11 @@ def summary(statistics: Statistics, *, epochs: Counts | None = None, probability
     Parameters
     ----------
     statistics : Statistics
+        Of a filter to be tested.
     epochs : array of int, optional
         Indices of the epochs judged. Default: 20 evenly spaced ones.
     probability : float, default 0.99
+        Probability that a consistent filter passes all tests together.
 
     Returns
     -------

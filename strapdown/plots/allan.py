@@ -78,10 +78,12 @@ def allan_overview(
     curves : sequence of mapping
         For each axis the fitted terms and their total at the same averaging times, SI, as :func:`strapdown.allan.curves_by_axis` gives.
     sensor : {"gyro", "accelerometer", "magnetometer"}
+        Determines the units of the vertical axis.
 
     Returns
     -------
     Figure
+        One panel for each axis of the sensor.
     """
     unit, scale = UNITS[sensor]["bias_instability"]
     number = len(deviation.deviation)

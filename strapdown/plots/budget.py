@@ -23,6 +23,7 @@ def error_budget(analysis: Analysis, *, title: str = "") -> Figure:
     analysis : Analysis
         Of :func:`strapdown.covariance.analyse`.
     title : str
+        Of the figure.
 
     Returns
     -------

@@ -181,14 +181,16 @@ def draw_coning_study(study: ConingStudy, folder: str | os.PathLike[str], form: 
     Parameters
     ----------
     study : ConingStudy
+        Of :func:`strapdown.coning_study.run`.
     folder : path
         Made if it is missing.
     form : {"png", "pdf", "svg"}
+        Format of the files.
 
     Returns
     -------
     list of Path
-        ``drift``, ``errors`` and ``consistency`` with the suffix of the format.
+        ``drift``, ``errors`` and ``consistency`` with the suffix of the format; ``algorithms`` too for algorithms of one's own.
     """
     figure, ax = new_figure(size=(7.0, 4.2))
     drift_by_algorithm(study.drifts, ax)

@@ -125,9 +125,16 @@ def estimate_overview(estimate: Estimate, *, title: str = "", fixed_frame: str =
     Parameters
     ----------
     estimate : Estimate
+        Attitude and bias with their σ.
     title : str
+        What was estimated.
     fixed_frame : str
         As :func:`angle_labels` takes it.
+
+    Returns
+    -------
+    Figure
+        Five panels over one time axis.
     """
     figure, axes = new_figure(5, 1, size=(9.0, 10.0), sharex=True, height_ratios=(1.0, 1.0, 1.0, 1.7, 1.3))
     euler = quaternion.to_rotation(estimate.attitude).as_euler("ZYX", degrees=True)[:, ::-1]
@@ -174,10 +181,12 @@ def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:
     estimate : Estimate
         With error states.
     title : str
+        Of the figure.
 
     Returns
     -------
     Figure
+        Panels over one time axis, in the order of the blocks.
     """
     panels = [
         (name, block, unit, [k for k, one in enumerate(block.units) if one == unit])
@@ -262,6 +271,7 @@ def error_overview(estimate: Estimate, truth: Truth, *, title: str = "") -> Figu
     Parameters
     ----------
     estimate : Estimate
+        Attitude and bias with their σ.
     truth : Truth
         At the estimate's times.
     title : str

@@ -75,6 +75,7 @@ def innovation_autocorrelation(result: Autocorrelation, ax: Axes | None = None) 
     Returns
     -------
     Axes
+        What was drawn on.
     """
     ax = axes_or_new(ax)
     lags, number = result.lags, result.values.shape[1]
@@ -127,6 +128,11 @@ def nis_over_record(
         Measurements in the running mean.
     probability : float
         Confidence level in the legend.
+
+    Returns
+    -------
+    Axes
+        What was drawn on.
     """
     ax = axes_or_new(ax)
     degrees = innovations.innovation.shape[1]
@@ -162,6 +168,7 @@ def error_distribution(distribution: Distribution, ax: Axes | None = None, *, la
     Returns
     -------
     Axes
+        What was drawn on.
     """
     ax = axes_or_new(ax)
     unit, size = angle_unit(np.array([distribution.quantile(0.99)]))

@@ -48,6 +48,11 @@ def body_axis_on_sphere(estimated: Array, true: Array | None = None, axis: int =
         Body x, y or z.
     ax : Axes, optional
         A new figure's if not given.
+
+    Returns
+    -------
+    Axes
+        What was drawn on.
     """
     ax = axes_or_new(ax)
     paths = [("estimated", body_axis_path(estimated, axis), VERMILION, 0.8)]

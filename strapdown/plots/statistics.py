@@ -50,6 +50,11 @@ def nees_over_time(
         A new figure's if not given.
     label : str
         Of the bounds in the legend; say their confidence level.
+
+    Returns
+    -------
+    Axes
+        What was drawn on.
     """
     ax = axes_or_new(ax)
     column = ("state", "attitude", "bias").index(subset)
@@ -81,6 +86,7 @@ def nis_over_time(
     Returns
     -------
     Axes
+        What was drawn on.
     """
     ax = axes_or_new(ax)
     for k, (name, statistics) in enumerate(named):

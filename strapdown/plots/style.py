@@ -90,7 +90,10 @@ def new_figure(
 
     Parameters
     ----------
-    rows, columns : int
+    rows : int
+        Number of rows of axes.
+    columns : int
+        Number of columns of axes.
     size : (float, float)
         Width and height, inches.
     **options
@@ -112,7 +115,9 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
     Parameters
     ----------
     figure : Figure
+        Such as the functions of this module return.
     path : path
+        Ends with .png, .pdf or .svg.
 
     Returns
     -------

@@ -59,6 +59,11 @@ def write(
     probability : float
         That no test rejects a consistent filter.
 
+    Returns
+    -------
+    Report
+        Paths of the page and of the statistics (``.report.json``), and the verdict in words.
+
     Raises
     ------
     InputError

@@ -49,6 +49,29 @@ MOST_SAMPLES = 1e9
 class Scenario:
     """A motion, a gyro and sensors, at a sample rate, over a time.
 
+    Parameters
+    ----------
+    motion : Motion
+        True attitude and body rate over time (:mod:`strapdown.motion`).
+    gyro : GyroSpec
+        The gyro's errors.
+    sensors : tuple of Sensor
+        Vector, attitude and heading sensors (:mod:`strapdown.vectors`), each with a name of its own.
+    rate : float
+        Gyro samples a second, Hz.
+    duration : float
+        Length of the record, s; rounded to whole gyro samples.
+    name : str, default ""
+        For files and tables.
+    description : str, default ""
+        A sentence for people.
+    seed : int, default 0
+        Default seed of :func:`simulate`.
+    gravity_f : tuple of 3 floats, default (0, 0, -9.80665)
+        Gravity where the body is held up, m/s², fixed frame: what a g-sensitive gyro feels the reaction to; zeros in free fall.
+    gyro_preset : str, default ""
+        Name of the preset that ``gyro`` is, for files.
+
     Examples
     --------
     >>> import strapdown as sd
@@ -64,25 +87,15 @@ class Scenario:
     """
 
     motion: Motion
-    """True attitude and body rate over time (:mod:`strapdown.motion`)."""
     gyro: GyroSpec
-    """The gyro's errors."""
     sensors: tuple[Sensor, ...]
-    """Vector, attitude and heading sensors (:mod:`strapdown.vectors`), each with a name of its own."""
     rate: float
-    """Gyro samples a second, Hz."""
     duration: float
-    """Length of the record, s; rounded to whole gyro samples."""
     name: str = ""
-    """For files and tables."""
     description: str = ""
-    """A sentence for people."""
     seed: int = 0
-    """Default seed of :func:`simulate`."""
     gravity_f: tuple[float, ...] = vectors.GRAVITY_F
-    """Gravity where the body is held up, m/s², fixed frame: what a g-sensitive gyro feels the reaction to; zeros in free fall."""
     gyro_preset: str = ""
-    """Name of the preset that ``gyro`` is, for files."""
 
     def __post_init__(self) -> None:
         """Check rate, duration, and the names of the sensors."""
@@ -125,6 +138,7 @@ def simulate(scenario: Scenario, seed: int | None = None, run: int = 0) -> ImuRe
     Parameters
     ----------
     scenario : Scenario
+        Motion, gyro and sensors.
     seed : int, optional
         Default: the scenario's own.
     run : int, default 0
@@ -176,12 +190,16 @@ def drawn(scenario: Scenario, seed: int, run: int = 0) -> Scenario:
     Parameters
     ----------
     scenario : Scenario
+        Its fixed errors are standard deviations.
     seed : int
+        Seed of the random numbers.
     run : int, default 0
+        Number of the individual; individuals of one seed are independent.
 
     Returns
     -------
     Scenario
+        With the drawn errors, and without ``gyro_preset``.
     """
     draw = generator(seed, run, "individual")
 
@@ -357,6 +375,7 @@ def load_scenario(name_or_path: str | os.PathLike[str]) -> Scenario:
     Returns
     -------
     Scenario
+        In SI units and radians, whatever the units of the keys.
 
     Raises
     ------
@@ -536,10 +555,12 @@ def scenario_to_toml(scenario: Scenario) -> str:
     Parameters
     ----------
     scenario : Scenario
+        Of motions, gyro and sensors of this package.
 
     Returns
     -------
     str
+        Text of a file that :func:`load_scenario` reads, with the unit in each key.
 
     Raises
     ------

@@ -196,33 +196,49 @@ class Estimated:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Tuning(Listed):
-    """The outcome of a tuning."""
+    """The outcome of a tuning.
+
+    Parameters
+    ----------
+    parameters : tuple of Estimated
+        Tuned parameters with their intervals, SI.
+    setup : FilterSetup
+        The filter with the tuned values.
+    point : ndarray (p,)
+        Natural logarithms of the most likely values, SI.
+    before : float
+        Minus the log likelihood (with priors, without its constant) at the start.
+    after : float
+        The same at the most likely point.
+    covariance : ndarray (p, p)
+        Covariance of the logarithms, from the information.
+    starts : ndarray (k, p)
+        Points at which the searches started.
+    optima : ndarray (k, p)
+        Points at which they ended.
+    optima_values : ndarray (k,)
+        Minus the log likelihood at these points.
+    misfit : bool
+        Whether the gradient scatters over the record by more than the information allows: the innovations are not white, or not of the
+        variance that any such filter gives them, and the most likely filter need not be the best one.
+    agreeing : int
+        Searches that ended within a thousandth of a log likelihood of the best.
+    composite : bool, default False
+        Whether what was minimised is no likelihood, so that intervals come from the scatter of its gradient (sandwich).
+    """
 
     parameters: tuple[Estimated, ...]
-    """The tuned parameters with their intervals."""
     setup: FilterSetup
-    """The filter with the tuned values."""
     point: Array
-    """Logarithms of the tuned values (p,)."""
     before: float
-    """Minus the log likelihood (with priors, without its constant) at the start."""
     after: float
-    """The same at the most likely point."""
     covariance: Array
-    """Of the logarithms, by the information (p, p)."""
     starts: Array
-    """The points searched from (k, p)."""
     optima: Array
-    """Where each search ended (k, p)."""
     optima_values: Array
-    """Minus the log likelihood there (k,)."""
     misfit: bool
-    """Whether the gradient scatters over the record by more than the information allows: the innovations are not white, or not of the
-    variance that any such filter gives them, and the most likely filter need not be the best one."""
     agreeing: int
-    """Searches that ended within a thousandth of a log likelihood of the best."""
     composite: bool = False
-    """Whether what was minimised is no likelihood, so that intervals come from the scatter of its gradient (sandwich)."""
 
     def listing(self) -> Listing:
         """Return the parameters with their intervals, as a table; σ of sensors in rad or the unit of the vector.
@@ -303,6 +319,7 @@ def fit(
     Returns
     -------
     Tuning
+        The tuned filter, parameters with 95 % intervals, and where each search ended.
 
     Raises
     ------

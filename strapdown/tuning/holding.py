@@ -29,6 +29,7 @@ def split(cases: Sequence[Case], share: float, by: By = "time") -> tuple[tuple[C
     Parameters
     ----------
     cases : sequence of Case
+        Records to divide.
     share : float
         Share of the data held out, between 0 and 1.
     by : {"time", "record"}
@@ -37,6 +38,7 @@ def split(cases: Sequence[Case], share: float, by: By = "time") -> tuple[tuple[C
     Returns
     -------
     tuned, held : tuple of Case
+        Cases to tune on, and cases held out. By time both have the same records, with other ``first`` and ``last``.
 
     Raises
     ------
@@ -129,7 +131,10 @@ def compare(
     ----------
     cases : sequence of Case
         With the initial attitudes and biases; their σ are those of each setup.
-    before, after : FilterSetup
+    before : FilterSetup
+        The filter before tuning.
+    after : FilterSetup
+        The tuned filter.
     threads : int, default 1
         Cases filtered at once.
     bins : int, default 40
@@ -138,6 +143,7 @@ def compare(
     Returns
     -------
     Comparison
+        Log likelihood, NIS, NEES and RMS attitude error (rad) of each filter; NaN where they need a truth that is unknown.
     """
     with ThreadPoolExecutor(threads) as pool:
         results = list(pool.map(lambda chosen: performance(cases, chosen, bins=bins), (before, after)))

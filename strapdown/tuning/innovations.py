@@ -46,22 +46,33 @@ MOST = WIDTH - 1
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Case:
-    """A record to tune on, with the filter's initial state."""
+    """A record to tune on, with the filter's initial state.
+
+    Parameters
+    ----------
+    record : ImuRecord
+        Gyro increments and measurements, at the gyro's rate.
+    initial : State
+        State at the first edge; its covariance is the setup's where the initial σ are tuned.
+    name : str, default ""
+        What errors and reports call the record.
+    first : float, default -inf
+        Innovations from this time on count for tuning, s.
+    last : float, default inf
+        Innovations up to this time count for tuning, s; what comes later is held out.
+    true_attitude : ndarray (n + 1, 4), optional
+        q_fb at the edges from a reference system, where the record itself has no truth; rows of NaN are unknown.
+    judged : ndarray (n + 1,) of bool, optional
+        Edges at which errors against ``true_attitude`` count. Default: all.
+    """
 
     record: ImuRecord
-    """At the gyro's rate."""
     initial: State
-    """State at the first edge; its covariance is the setup's where the initial σ are tuned."""
     name: str = ""
-    """What errors and reports call the record."""
     first: float = -np.inf
-    """Innovations from this time on count for tuning, s."""
     last: float = np.inf
-    """Innovations up to this time count for tuning, s; what comes later is held out."""
     true_attitude: Array | None = None
-    """q_fb at the edges (n + 1, 4) where the record itself has no truth, from a reference system; rows of NaN are not known."""
     judged: np.ndarray | None = None
-    """Edges at which errors against it count (n + 1,), bool; None: all."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -317,6 +328,7 @@ def likelihood(
     Parameters
     ----------
     cases : sequence of Case
+        Records, with the filter's initial state on each.
     chosen : FilterSetup
         Starting values of the free parameters, and values of the fixed ones; its gate and robust weights are not applied.
     free : sequence of str

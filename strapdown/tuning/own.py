@@ -39,16 +39,27 @@ MOST_RUNS = 400
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class OwnTuning:
-    """The best parameters found."""
+    """The best parameters found.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Best value of each parameter, in the unit of its starting value.
+    relative_sigma : mapping of str to float
+        Standard deviation of each over its value, from the curvature of the likelihood of white innovations; NaN for other measures.
+    value : float
+        Minus the log likelihood without its constant, or the RMS attitude error of one axis, rad.
+    evaluations : int
+        Number of evaluations of the objective; each runs the filter over all records.
+    estimator : object
+        The filter with these values, as ``make`` returned it.
+    """
 
     values: Mapping[str, float]
     relative_sigma: Mapping[str, float]
-    """Standard deviation of each over its value, from the curvature of the likelihood of white innovations; NaN of other measures."""
     value: float
-    """Minus the log likelihood without its constant, or the RMS error."""
     evaluations: int
     estimator: Any
-    """The filter with these parameters."""
 
 
 def fit_own(
@@ -70,6 +81,11 @@ def fit_own(
         Parameters, all greater than zero, by name: where the search starts.
     measure : {"innovations", "errors", "rmse"}
         Likelihood of the innovations, likelihood of the errors against the truth by the filter's own covariance, or the RMS attitude error.
+
+    Returns
+    -------
+    OwnTuning
+        Best values by name, their relative standard deviations, and the filter with them.
 
     Raises
     ------

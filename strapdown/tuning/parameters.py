@@ -268,12 +268,18 @@ def _scaled(chosen: FilterSetup, factor: float) -> FilterSetup:
 
 @dataclass(frozen=True, kw_only=True)
 class Prior:
-    """Log-normal prior of a parameter."""
+    """Log-normal prior of a parameter.
+
+    Parameters
+    ----------
+    value : float
+        Median of the parameter, SI.
+    factor : float
+        Factor by which one standard deviation multiplies or divides the median; greater than 1.
+    """
 
     value: float
-    """Its median, in SI."""
     factor: float
-    """One standard deviation is a factor of this; greater than 1."""
 
     def __post_init__(self) -> None:
         """Check both."""
@@ -295,6 +301,7 @@ def priors_from_gyro(spec: GyroSpec, record: ImuRecord, *, factor: float = 3.0) 
     Parameters
     ----------
     spec : GyroSpec
+        Its noise coefficients are the medians of the priors.
     record : ImuRecord
         For the rate and quality of its measurements.
     factor : float, default 3
@@ -303,6 +310,7 @@ def priors_from_gyro(spec: GyroSpec, record: ImuRecord, *, factor: float = 3.0) 
     Returns
     -------
     dict of str to Prior
+        For ``"gyro.arw"`` (rad/√s) and ``"gyro.rrw"`` (rad/s/√s).
     """
     noise = setup.matched_to_record(spec, record).process_noise if _flickers(spec) else None
     found = gyro.process_noise(spec) if noise is None else vars(noise)

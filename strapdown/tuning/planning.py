@@ -64,14 +64,18 @@ def plan(
     lengths : sequence of float
         Lengths of a record, s.
     records : int, default 4
+        Number of simulated records over which the information is averaged.
     seed : int, default 0
+        Seed of the simulated records.
     threads : int, default 1
+        Records simulated at once.
     progress : callable, optional
         Called with the number of records just finished.
 
     Returns
     -------
     Plan
+        Least standard error of the logarithm of each parameter, by record length: 0.1 is 10 %.
 
     Raises
     ------

@@ -23,13 +23,21 @@ GATED = ("gate.probability", "outliers.share", "outliers.scale")
 
 
 class Tuned(NamedTuple):
-    """The outcome of :func:`tune`."""
+    """The outcome of :func:`tune`.
+
+    Parameters
+    ----------
+    tuning : Tuning
+        Parameters with their intervals, and the tuned filter.
+    objective : Objective
+        Function that was minimised, for :func:`fit` again or slices of it.
+    gate : TunedGate or None
+        The gate found where outliers were modelled, else None.
+    """
 
     tuning: Tuning
     objective: Objective
-    """What was minimised."""
     gate: TunedGate | None
-    """The gate found, with ``gate``."""
 
 
 def objective_for(
@@ -49,6 +57,7 @@ def objective_for(
     Parameters
     ----------
     cases : sequence of Case
+        Records with their initial states.
     setup : FilterSetup
         The filter to start from; with error states, or with a σ of one axis in ``names``, the likelihood is that of
         :mod:`strapdown.tuning.extended`.
@@ -65,10 +74,12 @@ def objective_for(
     spacing : float, default 0
         Least time between the samples of a sensor that are used, s.
     threads : int, default 1
+        Records filtered at once.
 
     Returns
     -------
     Objective
+        Function of the logarithms of the parameters, for :func:`fit`.
 
     Raises
     ------
@@ -136,9 +147,15 @@ def tune(
     names : sequence of str, optional
         Parameters to tune; those of :data:`GATED` ask for ``gate``. Default: :func:`default_names`.
     priors : mapping of str to Prior, optional
-    starts, factor, seed
-        As of :func:`fit`.
+        Prior knowledge by parameter; the result is then the maximum of the posterior density.
+    starts : int, default 4
+        Searches: the first from the setup's own values, the others from random starts.
+    factor : float, default 30
+        Random starts differ from the setup's values by factors of up to this, either way.
+    seed : int, default 0
+        Seed of the random starts.
     threads : int, default 1
+        Searches, or records, computed at once.
     progress : callable, optional
         As of :func:`fit`.
     gate : bool, default False
@@ -149,6 +166,7 @@ def tune(
     Returns
     -------
     Tuned
+        The tuning, whose ``setup`` is the tuned filter, the objective, and the gate.
 
     Raises
     ------

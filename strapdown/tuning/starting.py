@@ -37,6 +37,7 @@ def recording_case(recording: Recording, parameters: AhrsParameters | None = Non
     Returns
     -------
     Case
+        Fixed frame East-North-Up, as of :func:`strapdown.ahrs.estimate`.
 
     Raises
     ------
@@ -63,6 +64,7 @@ def record_case(record: ImuRecord, chosen: FilterSetup, *, name: str = "", seed:
     Parameters
     ----------
     record : ImuRecord
+        Gyro increments and measurements.
     chosen : FilterSetup
         Its σ of the initial errors.
     name : str, optional
@@ -75,6 +77,7 @@ def record_case(record: ImuRecord, chosen: FilterSetup, *, name: str = "", seed:
     Returns
     -------
     Case
+        The whole record, with the initial state and its covariance from the setup.
 
     Raises
     ------
