@@ -123,7 +123,17 @@ def _motions() -> list[Section]:
     def section(word: str, subject: Any, keys: tuple[Key, ...], more: str = "", header: str = "[motion]") -> Section:
         return Section(group="motion", header=header, type=word, summary=_summary(subject) + more, keys=keys)
 
-    found = [section(word, kind, _keys(kind, form)) for word, (kind, form) in scenarios._MOTIONS.items()]
+    examples = {"time": [0.4 * k for k in range(6)], "attitudes": [[1.0, 0.0, 0.0, 0.0]] * 6}  # of a sampled motion
+
+    def keys_of(word: str, kind: type, form: tables.Form) -> tuple[Key, ...]:
+        keys = _keys(kind, form)
+        sampled = word == "sampled"
+        return tuple(
+            replace(k, example=next((v for n, v in examples.items() if sampled and k.name.startswith(n)), k.example))
+            for k in keys
+        )
+
+    found = [section(word, kind, keys_of(word, kind, form)) for word, (kind, form) in scenarios._MOTIONS.items()]
     harmonic = _keys(motion.Harmonic, scenarios._HARMONIC)
     start = _keys(motion.ConstantRate, {"initial_attitude": tables.PLAIN})
     parts = " Each is a table with a `type` and keys of its own: `[motion.base]`, `[motion.vibration]`."

@@ -54,6 +54,8 @@ def _least(section):
         case "[gyro]":
             scenario["gyro"] = table
         case "[[sensors]]":
+            if section.type == "horizon":
+                table["orbit"] = _required(SECTIONS[NAMES.index("[sensors.orbit]")])
             scenario["sensors"] = [table]
         case "[sensors.orbit]":
             magnetometer = {"type": "magnetometer", "name": "m", "sigma_nt": 1.0, "rate_hz": 1.0, "orbit": table}
