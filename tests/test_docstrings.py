@@ -24,7 +24,6 @@ TO_BE_DOCUMENTED = (
     "strapdown",
     "strapdown.ahrs",
     "strapdown.coning_study",
-    "strapdown.consistency",
     "strapdown.covariance",
     "strapdown.diagnosis",
     "strapdown.estimation",
@@ -38,8 +37,6 @@ TO_BE_DOCUMENTED = (
     "strapdown.plots",
     "strapdown.report",
     "strapdown.scenarios",
-    "strapdown.setup",
-    "strapdown.setup.for_record",
     "strapdown.tuning",
     "strapdown.tuning.procedure",
 )
