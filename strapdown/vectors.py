@@ -566,6 +566,7 @@ class Faults:
         series : VectorMeasurements
             Measurements without faults of timing.
         generator : numpy.random.Generator
+            Random stream of the sensor; a child of it draws the lost samples.
 
         Returns
         -------

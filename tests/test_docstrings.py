@@ -22,15 +22,7 @@ from numpydoc.validate import ERROR_MSGS, Validator, validate
 
 TO_BE_DOCUMENTED = (
     "strapdown",
-    "strapdown.ahrs",
     "strapdown.coning_study",
-    "strapdown.covariance",
-    "strapdown.diagnosis",
-    "strapdown.estimation",
-    "strapdown.estimation.error_states",
-    "strapdown.estimation.filters",
-    "strapdown.estimation.filters.own",
-    "strapdown.estimation.multiple_model",
     "strapdown.montecarlo",
     "strapdown.montecarlo.campaign",
     "strapdown.montecarlo.cluster",

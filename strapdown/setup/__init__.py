@@ -581,7 +581,7 @@ def initial_state(
     Parameters
     ----------
     setup : FilterSetup
-        Filter whose initial σ of attitude and bias, and of its error states, are used.
+        Filter whose initial σ of attitude and bias are used.
     attitude : array_like (4,)
         q_fb.
     bias : array_like (3,), default zero
