@@ -58,7 +58,6 @@ __all__ = [
     "fit_noise",
     "model_deviation",
     "to_gyro_parameters",
-    "upper_bounds",
 ]
 
 TERMS = ("quantization", "angle_random_walk", "bias_instability", "rate_random_walk", "rate_ramp")

@@ -68,20 +68,31 @@ def _no_sensors() -> dict[str, float]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Consider(ByValue):
-    """Errors beyond the scenario and the filter's model: one standard deviation each, independent on every axis."""
+    """Errors beyond the scenario and the filter's model: one standard deviation each, independent on every axis.
+
+    Parameters
+    ----------
+    scale_factor : float, default 0.0
+        σ of the gyro's three scale factors, dimensionless.
+    misalignment : float, default 0.0
+        σ of the six off-diagonal entries of the gyro's error matrix, rad.
+    g_sensitivity : float, default 0.0
+        σ of the nine entries of the gyro's g-sensitivity, rad/s per m/s².
+    sensor_bias : mapping of str to float, default empty
+        By sensor, σ of a constant on each component, body axes, in the unit of its own σ: hard iron, T; of a direction
+        rad.
+    mounting : mapping of str to float, default empty
+        By sensor, σ of a rotation on the body about each axis, rad.
+    time_offset : mapping of str to float, default empty
+        By sensor, σ of the time by which it measures later than its stamps, s.
+    """
 
     scale_factor: float = 0.0
-    """Of the gyro's three scale factors, dimensionless."""
     misalignment: float = 0.0
-    """Of the six off-diagonal entries of the gyro's error matrix, rad."""
     g_sensitivity: float = 0.0
-    """Of the nine entries of the gyro's g-sensitivity, rad/s per m/s²."""
     sensor_bias: Mapping[str, float] = field(default_factory=_no_sensors)
-    """Of a constant on each component, body axes, by sensor, in the unit of its own σ: hard iron, T; of a direction rad."""
     mounting: Mapping[str, float] = field(default_factory=_no_sensors)
-    """Of a rotation of the sensor on the body about each axis, rad, by sensor."""
     time_offset: Mapping[str, float] = field(default_factory=_no_sensors)
-    """Of the time by which a sensor measures later than its stamps, s, by sensor."""
 
     def __post_init__(self) -> None:
         """Check every number."""
@@ -98,30 +109,45 @@ class Consider(ByValue):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Analysis(Listed):
-    """Predicted errors of a filter: the error state e = (δθ, δb), rad in the body frame and rad/s."""
+    """Predicted errors of a filter: the error state e = (δθ, δb), rad in the body frame and rad/s.
+
+    Parameters
+    ----------
+    time : ndarray (m,)
+        Epochs, s.
+    filter_covariance : ndarray (m, 6, 6)
+        P as the filter reports it: rad², rad²/s, (rad/s)².
+    sources : tuple of str (s,)
+        Names of the sources of random error.
+    contributions : ndarray (m, s, 6, 6)
+        Contribution of each source to the covariance of the actual error: rad², rad²/s, (rad/s)².
+    fixed : tuple of str (f,)
+        Names of the errors that are the same in every run.
+    fixed_errors : ndarray (m, f, 6)
+        Mean error that each of them makes, rad and rad/s.
+    considered : tuple of str (c,)
+        Names of the considered errors.
+    considered_errors : ndarray (m, c, 6)
+        Error that each of them makes at one standard deviation, rad and rad/s.
+    expected_nis : mapping of str to float
+        Mean NIS per degree of freedom over the whole time, by sensor; 1 for a consistent filter.
+    left_out : tuple of str
+        Errors of the scenario that the analysis leaves out.
+    beyond_linear : tuple of str
+        Errors too large for an analysis that is linear about the truth, in words: use a Monte Carlo there.
+    """
 
     time: Array
-    """Epochs (m,), s."""
     filter_covariance: Array
-    """P as the filter reports it (m, 6, 6)."""
     sources: tuple[str, ...]
-    """Names of the sources of random error."""
     contributions: Array
-    """Contribution of each to the covariance of the actual error (m, s, 6, 6)."""
     fixed: tuple[str, ...]
-    """Names of the errors that are the same in every run."""
     fixed_errors: Array
-    """The mean error that each makes (m, f, 6)."""
     considered: tuple[str, ...]
-    """Names of the considered errors."""
     considered_errors: Array
-    """The error that each makes at one standard deviation (m, c, 6)."""
     expected_nis: Mapping[str, float]
-    """Mean NIS per degree of freedom over the whole time, by sensor; 1 for a consistent filter."""
     left_out: tuple[str, ...]
-    """Errors of the scenario that the analysis leaves out."""
     beyond_linear: tuple[str, ...]
-    """Errors too large for an analysis that is linear about the truth, in words: use a Monte Carlo there."""
 
     def listing(self) -> Listing:
         """Return the error budget at the last epoch, as a table.
@@ -662,6 +688,7 @@ def analyse(
     Parameters
     ----------
     scenario : Scenario
+        Motion, gyro, sensors and duration.
     setup : FilterSetup, optional
         The filter. Default: matched to the scenario (:func:`strapdown.setup.matched`).
     consider : Consider, optional
@@ -674,6 +701,7 @@ def analyse(
     Returns
     -------
     Analysis
+        Covariance as the filter reports it, and that of the actual error by source, at every epoch.
 
     Raises
     ------

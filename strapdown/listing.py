@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Sequence
 from html import escape
 from typing import NamedTuple
 
 __all__ = ["Listed", "Listing", "figure"]
+
+
+WIDTH = 110
+"""Characters of a line of a title."""
 
 
 class Listing(NamedTuple):
@@ -33,7 +38,8 @@ class Listing(NamedTuple):
             for row in cells
         ]
         table = [lines[0], "-" * len(lines[0]), *lines[1:]] if self.rows else []
-        return "\n".join(line.rstrip() for line in (self.title, *table, *self.notes))
+        title = textwrap.wrap(self.title, WIDTH) or [""]
+        return "\n".join(line.rstrip() for line in (*title, *table, *self.notes))
 
     @property
     def html(self) -> str:

@@ -32,7 +32,6 @@ __all__ = [
     "from_ned",
     "heading",
     "table",
-    "to_dataframe",
     "to_ned",
 ]
 

@@ -49,6 +49,7 @@ __all__ = [
     "AttitudeSensor",
     "Faults",
     "HeadingPair",
+    "HorizonSensor",
     "Magnetometer",
     "VectorMeasurements",
     "VectorSensor",
@@ -566,6 +567,7 @@ class Faults:
         series : VectorMeasurements
             Measurements without faults of timing.
         generator : numpy.random.Generator
+            Random stream of the sensor; a child of it draws the lost samples.
 
         Returns
         -------
@@ -717,14 +719,28 @@ def star_directions(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HorizonSensor(ByValue):
-    """An earth-horizon sensor on an orbit: the direction of the earth's centre, which moves in the fixed frame."""
+    """An earth-horizon sensor on an orbit: the direction of the earth's centre, which moves in the fixed frame.
+
+    Parameters
+    ----------
+    name : str
+        Name of the sensor and of its stream of random numbers.
+    orbit : CircularOrbit
+        Orbit that it flies on, in the fixed frame.
+    sigma : float
+        Noise of each component of the unit direction, rad.
+    rate : float
+        Measurements per second, Hz.
+    phase : float, default 0.0
+        Time of the first measurement after the start, s; 0: one interval after it.
+    faults : Faults, default no faults
+        Errors beyond the white noise.
+    """
 
     name: str
     orbit: CircularOrbit
     sigma: float
-    """Noise of each component of the unit direction, rad."""
     rate: float
-    """Hz."""
     phase: float = 0.0
     faults: Faults = field(default_factory=Faults)
 

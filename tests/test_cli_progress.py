@@ -87,7 +87,8 @@ def test_compiling_is_said_once_with_how_many_of_how_many(said):
             assert numba.njit(source["outer"])(1.0) == 5.0
     finally:
         del progress._compiling.started, progress._compiling.finished
-    assert [one.partition("once: ")[2].split(" of ")[0] for one in seen if one] == ["0", "0", "1"]
+    done = [int(one.partition("once: ")[2].split(" of ")[0]) for one in seen if one]
+    assert [number - done[0] for number in done] == [0, 0, 1]  # other tests may have compiled some before
     assert all(one.endswith(" functions") for one in seen if one)
     assert seen[-1] == ""
     assert lines_of(said)[:1] == ["compiling for this machine, once: later runs start at once"]

@@ -18,6 +18,9 @@ import strapdown
 from strapdown import estimation, gyro, motion, scenarios, setup, vectors
 from strapdown.diagnosis import Cause
 
+FOR_CHECKERS = {"GyroSpec": gyro.GyroSpec, "Scenario": scenarios.Scenario}
+"""Types that a module imports for type checkers alone: they stand above it."""
+
 
 def dataclasses_of_the_package() -> Iterator[type]:
     for module in pkgutil.walk_packages(strapdown.__path__, "strapdown."):
@@ -53,7 +56,7 @@ def dummy(hint: Any) -> Any:  # noqa: PLR0911
 def filled(kind: type) -> Any:
     """An instance whose fields hold values of their types, unchecked."""
     made = object.__new__(kind)
-    hints = typing.get_type_hints(kind)
+    hints = typing.get_type_hints(kind, localns=FOR_CHECKERS)
     for field in dataclasses.fields(kind):
         object.__setattr__(made, field.name, dummy(hints[field.name]))
     return made

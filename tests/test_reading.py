@@ -456,7 +456,7 @@ def test_what_is_no_hdf5_at_all_costs_no_child(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ('boresight = "z"', "boresight = [0, 0, 1]", r"sensors\[0\]: .*boresight"),
+        ('boresight = "z"', "boresight = [0, 0, 0]", r"sensors\[0\]: .*boresight"),
         ('name = "tracker"', "name = 5", r"sensors\[0\]"),
         ('name = "tracker"', "name = [1]", r"sensors\[0\]"),
         ("rate_hz = 1.0", 'rate_hz = "1"', "rate_hz is '1'; it must be a number"),

@@ -24,24 +24,37 @@ from strapdown.unit_calibration import UnitCalibration
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class AhrsEstimate:
-    """An estimate beside the samples that it was made from, one row for one row."""
+    """An estimate beside the samples that it was made from, one row for one row.
+
+    Parameters
+    ----------
+    recording : Recording
+        The recording from its first quiet second on, clipped gyro samples restored.
+    estimate : Estimate
+        Attitude and gyro bias at the stamps of the recording; the covariance includes timing and constant iron, which
+        the filter does not estimate.
+    record : ImuRecord
+        What the filter processed: increments and vectors averaged over its steps.
+    initial : State
+        Where the filter started.
+    delays : Delays
+        Delays of the sensors' samples, s, for which the estimate is corrected.
+    faults : Faults
+        Faults found in the samples, such as clipping and truncation, and the variance that they add.
+    hard_iron : ndarray (3,)
+        Hard iron subtracted from the magnetometer's samples at the end, body axes, in their unit; 0: none was found.
+    calibration : UnitCalibration or None
+        What the recording shows of the unit, for its next recording; None where the filter has no states for it.
+    """
 
     recording: Recording
-    """The recording from its first quiet second on, clipped gyro samples restored."""
     estimate: Estimate
-    """At the stamps of the recording; the covariance includes timing and constant iron, which the filter does not estimate."""
     record: ImuRecord
-    """What the filter ran on: increments and vectors averaged over its steps."""
     initial: estimation.State
-    """Where the filter started."""
     delays: Delays
-    """Delays of the sensors that are made good."""
     faults: Faults
-    """What of the samples is not what the unit did."""
     hard_iron: Array
-    """Hard iron taken off the magnetometer's samples at the end, body axes, in their unit (3,); 0: none is found."""
     calibration: UnitCalibration | None
-    """What the recording shows of the unit, for its next recording; None where the filter has no states for it."""
 
 
 def estimate(
@@ -60,7 +73,9 @@ def estimate(
     Parameters
     ----------
     recording : Recording
+        Samples of gyro, accelerometer and, if there is one, magnetometer.
     parameters : AhrsParameters
+        The filter's model of the unit and of its motion.
     latency : float, optional
         Delay of the gyro's and the accelerometer's samples, s: the group delay of the sensors; 0: point samples at their stamps. By
         default each sample is taken for the mean over the interval before its stamp, half of which is its delay. That of the

@@ -18,41 +18,63 @@ class AhrsParameters:
     Noises of the vectors are densities: σ of a mean over one second, whatever the recording's rate. They are much larger than the sensors'
     own noise, because what disturbs them lasts over many samples. With ``velocity_sigma`` the acceleration has states
     (:class:`strapdown.error_states.BoundedVelocity`), and ``specific_force_noise`` is what is left beside it.
+
+    Parameters
+    ----------
+    angle_random_walk : float, default 3e-3
+        Angle random walk σ_v, rad/√s; includes scale-factor and alignment errors of a moving unit.
+    rate_random_walk : float, default 1e-5
+        Rate random walk σ_u, rad/s/√s.
+    specific_force_noise : float, default 0.6
+        Noise density of the acceleration without states, each component, m/s²/√Hz.
+    field_disturbance : float, default 0.05
+        Noise density of a field that is as strong and as steep as at the start, across it, as a share of its strength,
+        1/√Hz. That of the heading, rad/√Hz, is this over the cosine of the dip.
+    field_deviation : float, default 0.025
+        Deviation of the field's strength (share) and dip (rad), as a root sum of squares, that doubles the variance of
+        that noise.
+    field_memory : float, default 0.5
+        Time constant over which that deviation is averaged, s: a disturbance does not end where the field happens to
+        look right.
+    iron_sigma : float, default 0.012
+        σ of a constant disturbance of the field that cannot be observed, as a share of its strength: part of the
+        reported σ, and not estimated.
+    step : float, default 0.03
+        Interval of the filter's steps, s.
+    heading_interval : float, default 0.15
+        Interval of the heading measurements, s.
+    attitude_sigma : float, default 3°
+        σ of the initial attitude error, each axis, rad.
+    bias_sigma : float, default 0.5 °/s
+        σ of the initial gyro bias, each axis, rad/s.
+    rest_bias_sigma : float, default 0.0
+        σ of the mean rate of the quiet second as an estimate of the bias, each axis, rad/s; 0: the bias starts at zero.
+    velocity_sigma : float, default 0.0
+        σ of the velocity of the unit, each component, m/s; 0: no states, all its acceleration is white.
+    velocity_time : float, default 0.3
+        Time constant of that velocity, s.
+    acceleration_time : float, default 0.1
+        Time constant of the acceleration, s.
+    gyro_scale_sigma : float, default 0.0
+        σ of each of the gyro's scale factors, dimensionless, and misalignments, rad; 0: no states.
     """
 
     angle_random_walk: float = 3e-3
-    """σ_v, rad/√s; scale-factor and alignment errors of a moving unit included."""
     rate_random_walk: float = 1e-5
-    """σ_u, rad/s/√s."""
     specific_force_noise: float = 0.6
-    """Acceleration without states, each component, m/s²/√Hz."""
     field_disturbance: float = 0.05
-    """Disturbance of a field that is as strong and as steep as at the start, across it, share of its strength/√Hz over its level part's:
-    the heading's noise density is this over the cosine of the dip."""
     field_deviation: float = 0.025
-    """Deviation of the field's strength (share) and dip (rad), as a root sum of squares, that doubles the variance of that noise."""
     field_memory: float = 0.5
-    """Time constant over which that deviation is averaged, s: a disturbance does not end where the field happens to look right."""
     iron_sigma: float = 0.012
-    """Constant disturbance of the field that nothing shows, share of its strength: part of the σ reported, and not estimated."""
     step: float = 0.03
-    """Interval of the filter's steps, s."""
     heading_interval: float = 0.15
-    """Interval of the heading measurements, s."""
     attitude_sigma: float = 3.0 * DEGREE
-    """Error of the attitude at the start, each axis, rad."""
     bias_sigma: float = 0.5 * DEGREE
-    """Gyro bias at the start, each axis, rad/s."""
     rest_bias_sigma: float = 0.0
-    """Error of the mean rate of the quiet second as an estimate of the bias, each axis, rad/s; 0: the bias starts at zero."""
     velocity_sigma: float = 0.0
-    """Velocity of the unit, each component, m/s; 0: no states, all its acceleration is white."""
     velocity_time: float = 0.3
-    """Correlation time of that velocity, s."""
     acceleration_time: float = 0.1
-    """Correlation time of the acceleration, s."""
     gyro_scale_sigma: float = 0.0
-    """Each of the gyro's scale factors (1) and misalignments (rad); 0: no states."""
 
     def __post_init__(self) -> None:
         """Check every field."""

@@ -47,8 +47,9 @@ from strapdown.consistency.timeaverage import time_average as time_average
 from strapdown.consistency.whiteness import Autocorrelation as Autocorrelation
 from strapdown.consistency.whiteness import QuantilePairs as QuantilePairs
 from strapdown.consistency.whiteness import anderson_darling as anderson_darling
-from strapdown.consistency.whiteness import autocorrelation, ljung_box
+from strapdown.consistency.whiteness import autocorrelation as autocorrelation
 from strapdown.consistency.whiteness import cross_correlation_p_value as cross_correlation_p_value
+from strapdown.consistency.whiteness import ljung_box as ljung_box
 from strapdown.consistency.whiteness import mean_innovation_p_value as mean_innovation_p_value
 from strapdown.consistency.whiteness import quantile_pairs as quantile_pairs
 
@@ -56,14 +57,12 @@ __all__ = [
     "Checked",
     "Finding",
     "Judgement",
-    "autocorrelation",
     "check_arrays",
     "credibility",
     "errors",
     "fixed_frame",
     "judge",
     "judge_runs",
-    "ljung_box",
     "mean_bounds",
     "nees",
     "reference_errors",

@@ -39,10 +39,12 @@ def mean_bounds(degrees: int, samples: float, probability: float = 0.99) -> tupl
     samples : float
         Number of independent values; an effective number need not be whole.
     probability : float, default 0.99
+        Probability that the mean lies between the bounds.
 
     Returns
     -------
     low, high : float
+        Bounds of the mean, one half of the remaining probability beyond each.
 
     Raises
     ------

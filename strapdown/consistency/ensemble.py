@@ -97,6 +97,7 @@ def credibility(error: ArrayLike, covariance: ArrayLike, probability: float = 0.
     Returns
     -------
     Credibility
+        ANEES, log-NEES, non-credibility index, inclination and coverage, with their bounds.
 
     Raises
     ------

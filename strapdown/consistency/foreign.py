@@ -98,24 +98,47 @@ class Explanation:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Checked:
-    """The verdict on an estimate from elsewhere, and how it was come to."""
+    """The verdict on an estimate from elsewhere, and how it was come to.
+
+    Parameters
+    ----------
+    judgement : Judgement
+        The verdict with its evidence.
+    estimate : Estimate
+        The estimate as it was judged: in the truth's clock and frames, with the covariance of the body-side error.
+    truth : Truth or None
+        The truth at the estimate's times.
+    alignment : Alignment or None
+        What of clocks and frames was estimated and removed.
+    error_frame : str
+        Reading of the covariance that was judged, one of ``ERROR_FRAMES``; empty where there is no covariance.
+    frame_probability : mapping of str to float
+        Probability of each reading, all equally likely beforehand; empty where the reading was given, or there is no
+        truth.
+    explanations : tuple of Explanation
+        Differences that would explain the errors and were not removed, the likeliest first.
+    remarks : tuple of str
+        What was removed, and how the covariance was read, a sentence each.
+    """
 
     judgement: Judgement
     estimate: Estimate
-    """As it was judged: of the truth's clock and frames, the covariance of the body-side error."""
     truth: Truth | None
-    """At the estimate's times."""
     alignment: Alignment | None
     error_frame: str
-    """The reading of the covariance that was judged, of :data:`ERROR_FRAMES`."""
     frame_probability: Mapping[str, float]
-    """Probability of each reading, all being as likely beforehand; empty where it was given, or there is no truth."""
     explanations: tuple[Explanation, ...]
-    """The likeliest first."""
     remarks: tuple[str, ...]
 
     def summary(self) -> dict[str, Any]:
-        """Return everything as plain values for JSON."""
+        """Return everything as plain values for JSON.
+
+        Returns
+        -------
+        dict
+            The verdict as of :meth:`Judgement.summary`, with reading of the covariance, explanations, remarks and
+            alignment (degrees, s).
+        """
         told: dict[str, Any] = {
             **self.judgement.summary(),
             "error_frame": self.error_frame,
@@ -174,6 +197,11 @@ def check_arrays(
         What is estimated and removed. "auto": an offset of the clocks that stands out of its σ, and rotations beyond 5°.
     probability : float
         Of all tests together: a right filter is called wrong with at most 1 − ``probability``.
+
+    Returns
+    -------
+    Checked
+        The verdict, and the alignment and the reading of the covariance that it rests on.
 
     Examples
     --------

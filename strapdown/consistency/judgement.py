@@ -46,28 +46,46 @@ _TOO_SURE, _TOO_MODEST = "too sure of itself (optimistic)", "too modest (pessimi
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """One statistic against what it is of a right filter."""
+    """One statistic against what it is of a right filter.
+
+    Parameters
+    ----------
+    name : str
+        Statistic: "NIS", "whiteness", "normality", "mean innovation", "cross-correlation", "NEES at the end",
+        "time-averaged NEES", "ANEES", …
+    of : str
+        The sensor, or the subset of the states.
+    value : float
+        Value of the statistic; NIS and NEES per degree of freedom, 1 for a consistent filter.
+    low : float, default nan
+        Lower of the two-sided bounds of the value by itself; NaN where there are none.
+    high : float, default nan
+        Upper of these bounds.
+    p_value : float
+        Probability that a consistent filter shows as much or more.
+    samples : float
+        Samples that the value rests on; effective ones where they are correlated.
+    degrees : int, default 1
+        Degrees of freedom of one sample.
+    epochs : int, default 1
+        Number of epochs of which the value is that of the worst (Bonferroni).
+    rejected : bool, default False
+        Whether it contradicts the filter after all findings are taken together (Holm).
+    means : str, default ""
+        What it says of the filter if it is rejected, in words.
+    """
 
     name: str
-    """"NIS", "whiteness", "normality", "mean innovation", "cross-correlation", "NEES at the end", "time-averaged NEES", …"""
     of: str
-    """The sensor, or the subset of the states."""
     value: float
     low: float = math.nan
-    """Two-sided bounds of the value by itself, NaN where there is none."""
     high: float = math.nan
     p_value: float
-    """Probability that a right filter shows as much or more."""
     samples: float
-    """Samples that it rests on; effective ones where they are correlated."""
     degrees: int = 1
-    """Degrees of freedom of one sample."""
     epochs: int = 1
-    """Epochs of which the value is that of the worst (Bonferroni)."""
     rejected: bool = False
-    """Whether it contradicts the filter after all findings are taken together (Holm)."""
     means: str = ""
-    """What it says if it is rejected."""
 
     @property
     def is_ratio(self) -> bool:
@@ -96,20 +114,33 @@ class Power:
 
 @dataclass(frozen=True, kw_only=True)
 class Judgement(Listed):
-    """A verdict with its evidence."""
+    """A verdict with its evidence.
+
+    Parameters
+    ----------
+    verdict : {"consistent", "not consistent", "cannot tell"}
+        Whether the covariance agrees with the errors.
+    reason : str
+        One sentence that says why.
+    findings : tuple of Finding
+        Every statistic with its bounds and p-value.
+    limits : tuple of str
+        What this evidence cannot show.
+    probability : float
+        Probability that a consistent filter is not rejected, at least.
+    power : tuple of Power, default empty
+        For the innovations of each sensor and for each state, the factor on σ that the tests would have shown.
+    unmodelled : tuple of str, default empty
+        Specified errors that the filter has no state for.
+    """
 
     verdict: Answer
     reason: str
-    """One sentence."""
     findings: tuple[Finding, ...]
     limits: tuple[str, ...]
-    """What this evidence cannot show."""
     probability: float
-    """Probability that a right filter is not called wrong, at least."""
     power: tuple[Power, ...] = ()
-    """What the tests would have shown, of the innovations of each sensor and of each state."""
     unmodelled: tuple[str, ...] = ()
-    """Specified errors that the filter has no state for."""
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -152,6 +183,7 @@ class Judgement(Listed):
         Returns
         -------
         dict
+            Verdict, reason, probability, findings, limits, power and unmodelled errors by these names.
         """
         plain = lambda x: None if isinstance(x, float) and not math.isfinite(x) else x  # noqa: E731
         return {

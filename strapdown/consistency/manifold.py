@@ -27,7 +27,9 @@ def errors(attitude: ArrayLike, bias: ArrayLike, true_attitude: ArrayLike, true_
     bias : array_like (..., 3)
         Estimated gyro bias, rad/s, body axes.
     true_attitude : array_like (..., 4)
+        True q_fb.
     true_bias : array_like (..., 3)
+        True gyro bias, rad/s, body axes.
 
     Returns
     -------
@@ -68,13 +70,16 @@ def fixed_frame(error: ArrayLike, covariance: ArrayLike, attitude: ArrayLike) ->
     error : array_like (..., 6)
         Body-side errors, rad and rad/s (:func:`errors`).
     covariance : array_like (..., 6, 6)
+        Covariance of these errors, rad², rad²/s and (rad/s)².
     attitude : array_like (..., 4)
         Estimated q_fb.
 
     Returns
     -------
     error : ndarray (..., 6)
+        Attitude error as a rotation vector in the fixed frame, rad; bias error in body axes, rad/s.
     covariance : ndarray (..., 6, 6)
+        Covariance of the returned errors.
 
     Raises
     ------
@@ -113,7 +118,9 @@ def nees(error: ArrayLike, covariance: ArrayLike, states: tuple[int, ...] | None
     Parameters
     ----------
     error : array_like (..., n)
+        Errors of the states, such as of :func:`errors`.
     covariance : array_like (..., n, n)
+        The filter's covariance of these errors, in their units.
     states : tuple of int, optional
         A subset of the states (values of ``strapdown.consistency.manifold.SUBSETS`` or any indices), whose marginal covariance is the
         block of P. Default: all.

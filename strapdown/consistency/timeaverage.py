@@ -106,11 +106,13 @@ def _effective(white: np.ndarray, first: int) -> float:
 def squares_effective(white: ArrayLike) -> float:
     """Return how many independent samples would average |z|² of a series (m, n) as well, by the autocorrelation of |z|² itself.
 
-    The sum over the lags ends where that of two neighbours is negative (Geyer 1992, initial positive sequence); the mean, n, is known.
+    The sum over the lags ends where that of two neighbours is negative (Geyer 1992, initial positive sequence). The mean is that of the
+    series: with the nominal one, n, a wrong σ would count as correlation.
     """
     z = array("white", white, ("m", "n"))
-    m, n = z.shape
-    x = np.sum(z * z, axis=1) - n
+    m = len(z)
+    x = np.sum(z * z, axis=1)
+    x = x - x.mean()
     length = 2 ** int(np.ceil(np.log2(2 * m)))
     power = np.abs(np.fft.rfft(x, length)) ** 2
     correlation = np.fft.irfft(power, length)[:m]

@@ -59,6 +59,7 @@ def autocorrelation(whitened: ArrayLike, lags: int | None = None, probability: f
     Returns
     -------
     Autocorrelation
+        Values by lag and component, with bounds of each and bounds that all keep together.
 
     Raises
     ------
@@ -107,8 +108,11 @@ def ljung_box(whitened: ArrayLike, lags: int | None = None) -> tuple[float, int,
     Returns
     -------
     statistic : float
+        Q.
     degrees : int
+        Degrees of freedom of Q, m² times the number of lags.
     p_value : float
+        Probability that white innovations give Q or more.
 
     Raises
     ------

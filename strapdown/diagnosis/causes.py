@@ -16,26 +16,38 @@ LIKELIER = math.log(20.0)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Cause:
-    """One hypothesis with the θ that fits best."""
+    """One hypothesis with the θ that fits best.
+
+    Parameters
+    ----------
+    name : str
+        What is wrong: "R too small", "R too large", "Q too small", "Q too large", "outliers", "time offset", "hard
+        iron", "body-fixed bias", "mounting", "misalignment", "scale factor", "reference length", "reference direction",
+        "initial attitude", "initial bias", "commutation", "wrong convention".
+    of : str
+        Of what: a sensor, "gyro", …
+    estimate : ndarray (k,)
+        The θ that fits best, in ``unit``.
+    standard_error : ndarray (k,)
+        Standard error of θ, in ``unit``; NaN where there is none.
+    unit : str
+        SI unit of θ.
+    gain : float
+        Twice the log-likelihood gained.
+    log_p : float
+        Natural logarithm of the probability that a consistent filter gains as much.
+    words : str
+        What it says, with its size.
+    """
 
     name: str
-    """What is wrong: "R too small", "R too large", "Q too small", "Q too large", "outliers", "time offset", "hard iron", "body-fixed bias",
-    "mounting", "misalignment", "scale factor", "reference length", "reference direction", "initial attitude", "initial bias",
-    "commutation", "wrong convention"."""
     of: str
-    """Of what: a sensor, "gyro", …"""
     estimate: Array
-    """θ (k,)."""
     standard_error: Array
-    """Of θ (k,); NaN where there is none."""
     unit: str
-    """SI unit of θ."""
     gain: float
-    """Twice the log-likelihood gained."""
     log_p: float
-    """Natural logarithm of the probability that a consistent filter gains as much."""
     words: str
-    """What it says, with its size."""
 
     @property
     def finding(self) -> Finding:
@@ -45,16 +57,26 @@ class Cause:
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnosis(Listed):
-    """Likely causes, the likeliest first, and the evidence."""
+    """Likely causes, the likeliest first, and the evidence.
+
+    Parameters
+    ----------
+    causes : tuple of Cause
+        Those that are significant, all evidence taken together. After the first, others may only mirror it: correct it
+        and look again.
+    considered : tuple of Cause
+        All hypotheses, by rank.
+    judgement : Judgement
+        The verdict on the filter as it is: statistics and causes taken together (Holm), so that neither contradicts the
+        other.
+    probability : float
+        Probability, at least, that a consistent filter passes and is given no cause.
+    """
 
     causes: tuple[Cause, ...]
-    """Those that are significant, all evidence taken together. After the first, others may only mirror it: correct it and look again."""
     considered: tuple[Cause, ...]
-    """All hypotheses, by rank."""
     judgement: Judgement
-    """The verdict on the filter as it is: statistics and causes taken together (Holm), so that neither contradicts the other."""
     probability: float
-    """Probability, at least, that a consistent filter passes and is given no cause."""
 
     def listing(self) -> Listing:
         """Return the causes considered, the likeliest first, as a table.
@@ -102,6 +124,8 @@ class Diagnosis(Listed):
         Returns
         -------
         dict
+            All hypotheses with their figures and whether they are significant, the probability, and the verdict as of
+            :meth:`strapdown.consistency.Judgement.summary`.
         """
         number = lambda x: float(x) if math.isfinite(x) else None  # noqa: E731
 

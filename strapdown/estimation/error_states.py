@@ -145,6 +145,7 @@ class ErrorStates(ByValue):
         Returns
         -------
         ndarray (size, size)
+            Φ, by which the states of the block change over ``dt``.
         """
         return np.diag(np.exp(-self.decay * dt)) if not np.any(self.feed) else self._chained(dt)[0]
 
@@ -159,6 +160,7 @@ class ErrorStates(ByValue):
         Returns
         -------
         ndarray (size, size)
+            Q of the states of the block over ``dt``, in their units squared.
         """
         if np.any(self.feed):
             return self._chained(dt)[1]
@@ -230,14 +232,20 @@ class GyroScale(ErrorStates):
     """Scale factors and misalignments of the gyro: the entries of M in ``w_meas = (I + M) w_b + b + n``, constant.
 
     Entries of an array whose σ is 0 are taken for exact and are no states.
+
+    Parameters
+    ----------
+    scale_sigma : float or ndarray (3,)
+        Standard deviation of each scale factor, dimensionless.
+    misalignment_sigma : float or ndarray (3, 3)
+        Standard deviation of each misalignment, rad, by entry of M; zeros on the diagonal.
+    name : str, default "gyro scale"
+        Name of the block of states.
     """
 
     scale_sigma: float | Array
-    """Of each scale factor, dimensionless, one or one an axis (3,)."""
     misalignment_sigma: float | Array
-    """Of each misalignment, rad, one or one an entry (3, 3) with zeros on the diagonal."""
     name: str = "gyro scale"
-    """Name of the block of states."""
 
     def __post_init__(self) -> None:
         """Check both."""
@@ -276,16 +284,23 @@ class GyroForce(ErrorStates):
     """Sensitivity of the gyro to specific force: the entries of G in ``w_meas = w_b + b + G f_b + n``, constant.
 
     The force is that of a body held up, the reaction to gravity alone, ``f_b = −R_fbᵀ g_f``. Entries whose σ is 0 are no states.
+
+    Parameters
+    ----------
+    along_sigma : float or ndarray (3,)
+        Standard deviation of each diagonal entry of G, rad/s per m/s².
+    across_sigma : float or ndarray (3, 3), default zeros
+        Standard deviation of each off-diagonal entry of G, rad/s per m/s²; zeros on the diagonal.
+    gravity_f : ndarray (3,), default strapdown.vectors.GRAVITY_F
+        Acceleration of gravity in the fixed frame, m/s².
+    name : str, default "gyro force"
+        Name of the block of states.
     """
 
     along_sigma: float | Array
-    """Of each diagonal entry, rad/s per m/s², one or one an axis."""
     across_sigma: float | Array = field(default_factory=lambda: np.zeros((3, 3)))
-    """Of each off-diagonal entry, rad/s per m/s², one or one an entry (3, 3) with zeros on the diagonal."""
     gravity_f: Array = field(default_factory=lambda: np.array(GRAVITY_F))
-    """Acceleration of gravity (3,), m/s², fixed axes."""
     name: str = "gyro force"
-    """Name of the block of states."""
 
     def __post_init__(self) -> None:
         """Check all."""
@@ -347,18 +362,27 @@ class _FirstOrder(ErrorStates):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GyroGaussMarkov(_FirstOrder):
-    """A second gyro bias that forgets: first-order Gauss–Markov, stationary. Several of different times together cover flicker."""
+    """A second gyro bias that forgets: first-order Gauss–Markov, stationary. Several of different times together cover flicker.
+
+    Parameters
+    ----------
+    bias_sigma : float or ndarray (3,)
+        Stationary standard deviation of the drift, rad/s, by body axis.
+    correlation_time : float
+        Correlation time of the drift, s.
+    name : str, default "gyro drift"
+        Name of the block of states.
+    components : tuple of str, default ("x", "y", "z")
+        Name of each state within the block.
+    units : tuple of str, default ("rad/s",) * 3
+        SI unit of each state.
+    """
 
     bias_sigma: float | Array
-    """Stationary standard deviation, rad/s, one or one an axis."""
     correlation_time: float
-    """s"""
     name: str = "gyro drift"
-    """Name of the block of states."""
     components: tuple[str, ...] = AXES
-    """Name of each state within the block."""
     units: tuple[str, ...] = ("rad/s",) * 3
-    """SI unit of each state."""
 
     def __post_init__(self) -> None:
         """Check both."""
@@ -378,22 +402,34 @@ class GyroGaussMarkov(_FirstOrder):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VectorBias(ErrorStates):
-    """A constant bias of a vector sensor in body axes: hard iron, accelerometer bias."""
+    """A constant bias of a vector sensor in body axes: hard iron, accelerometer bias.
+
+    Parameters
+    ----------
+    sensor : str
+        Name of the sensor.
+    bias_sigma : float or ndarray (3,)
+        Standard deviation of the bias at the start, by body axis, in the unit of the sensor's reference (for directions
+        and headings its length is 1).
+    rate_random_walk : float, default 0.0
+        Random walk of each component, in the unit of ``bias_sigma`` per √s: unlike that of a gyro not in rad/s/√s.
+    varying : bool, default False
+        Whether the bias is constant while the strength of what the sensor measures changes: see :attr:`Effect.varying`.
+    unit : str, default "1"
+        SI unit of the bias, for tables and messages.
+    name : str, default "<sensor> bias"
+        Name of the block of states.
+    components : tuple of str, default ("x", "y", "z")
+        Name of each state within the block.
+    """
 
     sensor: str
-    """Name of the sensor."""
     bias_sigma: float | Array
-    """In the unit of the sensor's reference (1 is its length for directions and headings), one or one an axis."""
     rate_random_walk: float = 0.0
-    """Of each component, unit/√s."""
     varying: bool = False
-    """As :attr:`Effect.varying`."""
     unit: str = "1"
-    """For words and tables."""
     name: str = ""
-    """Name of the block of states."""
     components: tuple[str, ...] = AXES
-    """Name of each state within the block."""
 
     def __post_init__(self) -> None:
         """Check all."""
@@ -428,16 +464,23 @@ class LeverArm(ErrorStates):
 
     Rate and angular acceleration are those of the gyro (:func:`strapdown.estimation.angular_acceleration.turning`), whose noise becomes
     noise of the sensor. Components whose σ is 0 are no states.
+
+    Parameters
+    ----------
+    sensor : str
+        Name of the accelerometer.
+    arm_sigma : float or ndarray (3,)
+        Standard deviation of each component of r, m, body axes.
+    strength : float, default 9.80665
+        Specific force by which the sensor's vector is divided, m/s²: 1 where it gives whole vectors in m/s².
+    name : str, default "<sensor> lever arm"
+        Name of the block of states.
     """
 
     sensor: str
-    """Name of the sensor."""
     arm_sigma: float | Array
-    """Of each component of r, m, one or one an axis."""
     strength: float = STANDARD_GRAVITY
-    """Specific force by which the sensor's vector is divided, m/s²: 1 where it gives whole vectors in m/s²."""
     name: str = ""
-    """Name of the block of states."""
 
     def __post_init__(self) -> None:
         """Check all."""
@@ -477,16 +520,24 @@ class LeverArm(ErrorStates):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VectorScale(ErrorStates):
-    """Scale factors and misalignments of a vector sensor: all nine of S in ``m_b = (I + S) R_fbᵀ r``, constant: soft iron."""
+    """Scale factors and misalignments of a vector sensor: all nine of S in ``m_b = (I + S) R_fbᵀ r``, constant: soft iron.
+
+    Parameters
+    ----------
+    sensor : str
+        Name of the sensor.
+    scale_sigma : float
+        Standard deviation of each entry of S, dimensionless.
+    name : str, default "<sensor> scale"
+        Name of the block of states.
+    units : tuple of str, default ("1",) * 9
+        SI unit of each state.
+    """
 
     sensor: str
-    """Name of the sensor."""
     scale_sigma: float
-    """Of each entry of S, dimensionless."""
     name: str = ""
-    """Name of the block of states."""
     units: tuple[str, ...] = ("1",) * 9
-    """SI unit of each state."""
 
     def __post_init__(self) -> None:
         """Check the deviation."""
@@ -516,6 +567,19 @@ class SensorMounting(ErrorStates):
     It is the C of attitude–bias–calibration filters. A common rotation of all sensors is not observable: leave one sensor without this
     block; that sensor defines the body's axes. For a sensor of whole attitudes the mounting is a :class:`VectorBias`.
 
+    Parameters
+    ----------
+    sensor : str
+        Name of the sensor.
+    mounting_sigma : float or ndarray (3,)
+        Standard deviation of θ at the start, rad, by body axis.
+    name : str, default "<sensor> mounting"
+        Name of the block of states.
+    components : tuple of str, default ("x", "y", "z")
+        Name of each state within the block.
+    units : tuple of str, default ("rad",) * 3
+        SI unit of each state.
+
     Examples
     --------
     >>> mounting = SensorMounting(sensor="star", mounting_sigma=3e-3)
@@ -524,15 +588,10 @@ class SensorMounting(ErrorStates):
     """
 
     sensor: str
-    """Name of the sensor."""
     mounting_sigma: float | Array
-    """Standard deviation of θ at the start, rad, one or one for each axis (3,)."""
     name: str = ""
-    """Name of the block of states."""
     components: tuple[str, ...] = field(default=AXES)
-    """Name of each state within the block."""
     units: tuple[str, ...] = ("rad",) * 3
-    """SI unit of each state."""
 
     def __post_init__(self) -> None:
         """Check the deviation."""
@@ -553,25 +612,38 @@ class SensorMounting(ErrorStates):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GaussMarkov(_FirstOrder):
-    """First-order coloured noise on a vector sensor, stationary: the acceleration of a moving hand on an accelerometer."""
+    """First-order coloured noise on a vector sensor, stationary: the acceleration of a moving hand on an accelerometer.
+
+    Parameters
+    ----------
+    sensor : str
+        Name of the sensor.
+    noise_sigma : float or ndarray (3,)
+        Stationary standard deviation of each component, in the unit of the sensor's reference.
+    correlation_time : float
+        Correlation time, s.
+    frame : {"body", "fixed"}, default "body"
+        Axes in which the noise is correlated: an acceleration keeps its direction in the fixed frame while the body
+        turns. There its σ must be the same for all axes.
+    varying : bool, default False
+        Whether the noise keeps its size while the strength of what the sensor measures changes: see
+        :attr:`Effect.varying`.
+    unit : str, default "1"
+        SI unit of what the sensor measures.
+    name : str, default "<sensor> disturbance"
+        Name of the block of states.
+    components : tuple of str, default ("x", "y", "z")
+        Name of each state within the block.
+    """
 
     sensor: str
-    """Name of the sensor."""
     noise_sigma: float | Array
-    """Stationary standard deviation in the unit of the sensor's reference, one or one an axis."""
     correlation_time: float
-    """s"""
     frame: Literal["body", "fixed"] = "body"
-    """Axes in which it is correlated: an acceleration keeps its direction in the fixed frame while the body turns. There it must be alike
-    in all directions."""
     varying: bool = False
-    """As :attr:`Effect.varying`."""
     unit: str = "1"
-    """SI unit of what the sensor measures."""
     name: str = ""
-    """Name of the block of states."""
     components: tuple[str, ...] = field(default=AXES)
-    """Name of each state within the block."""
 
     def __post_init__(self) -> None:
         """Check all."""
@@ -612,24 +684,35 @@ class BoundedVelocity(ErrorStates):
 
     The noise is alike in all directions. Of ``velocity_sigma``, ``acceleration_sigma`` and ``acceleration_time`` give two: with the rates
     ``d₁ = λ_p λ_v + (λ_p + λ_v) λ_a`` of the three times, 1/τ, ``σ_a = σ_v √d₁`` (λ_p = 0 without a bounded position).
+
+    Parameters
+    ----------
+    sensor : str
+        Name of the accelerometer.
+    velocity_time : float
+        Time constant τ_v of the velocity, s.
+    velocity_sigma : float, default 0.0
+        Stationary σ of each component of v, m/s, fixed axes.
+    acceleration_sigma : float, default 0.0
+        Stationary σ of each component of a, m/s², fixed axes.
+    acceleration_time : float, default 0.0
+        Time constant τ_a of the acceleration, s.
+    position_time : float, default 0.0
+        Time constant τ_p of the position, s; 0: the position is not bounded, and no state.
+    strength : float, default 9.80665
+        Specific force by which the sensor's vector is divided, m/s²: 1 where it gives whole vectors in m/s².
+    name : str, default "<sensor> velocity"
+        Name of the block of states.
     """
 
     sensor: str
-    """Name of the sensor."""
     velocity_time: float
-    """τ_v, s: about how long a velocity lasts."""
     velocity_sigma: float = 0.0
-    """Stationary σ of each component of v, m/s."""
     acceleration_sigma: float = 0.0
-    """Stationary σ of each component of a, m/s²."""
     acceleration_time: float = 0.0
-    """τ_a, s: about how long a push lasts."""
     position_time: float = 0.0
-    """τ_p, s: about how long a displacement lasts; 0: the position is not bounded, and no state."""
     strength: float = STANDARD_GRAVITY
-    """Specific force by which the sensor's vector is divided, m/s²: 1 where it gives whole vectors in m/s²."""
     name: str = ""
-    """Name of the block of states."""
 
     def __post_init__(self) -> None:
         """Check all, and work out the third of the three that are given by two."""

@@ -145,6 +145,7 @@ def run(
     record : ImuRecord
         Increments are used as turns at constant rate: correct them for coning first (:func:`strapdown.records.compress`).
     process_noise : ProcessNoise
+        Angle random walk and rate random walk of the gyro, as the filter models them.
     initial : State
         State at the first edge. Without values, error states start at zero with their own sigma.
     error_states : sequence of ErrorStates
@@ -164,6 +165,7 @@ def run(
     Returns
     -------
     Estimate
+        Attitude, bias and error states with their variances at the kept edges; innovations of every sensor; events.
 
     Raises
     ------

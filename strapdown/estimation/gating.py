@@ -58,18 +58,26 @@ class Gate:
 
     In either case the estimate holds an event of kind ``"lock-out"`` for each stretch in which a sensor was refused more often than
     accepted by more than ``recovery`` (without recovery, ten); a recovery within twice that number is reported instead.
+
+    Parameters
+    ----------
+    probability : float, default 0.999
+        Probability that a measurement is accepted if the filter is consistent: the threshold is this quantile of χ²,
+        with as many degrees of freedom as the measurement has.
+    recovery : int or None, default 10
+        Refusals of one sensor in a row that lead to recovery; None: no recovery.
+    restart_attitude_sigma : float, default π/√3
+        Standard deviation of a restart candidate's initial attitude error, rad, each axis; the default is that of an
+        unknown angle, uniform over a full turn.
+    restart_bias_sigma : float, optional
+        Standard deviation added to the first restart candidate's bias error, rad/s, each axis. Default: that of the
+        initial state, by axis (of a record filtered in parts: of the initial state of the first part).
     """
 
     probability: float = 0.999
-    """Probability that a measurement is accepted if the filter is consistent: the threshold is this quantile of χ², with as many degrees of
-    freedom as the measurement has."""
     recovery: int | None = 10
-    """Refusals of one sensor in a row that lead to recovery; None: no recovery."""
     restart_attitude_sigma: float = UNIFORM_SIGMA
-    """Standard deviation of a restart candidate's initial attitude error, rad."""
     restart_bias_sigma: float | None = None
-    """Standard deviation added to the first restart candidate's bias error, rad/s; None: that of the initial state, by axis (of a record
-    filtered in parts: the initial state of the first part)."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -123,16 +131,24 @@ class Robust:
 
     In normal noise both cost a few hundredths of accuracy. In contaminated noise they are somewhat overconfident, because an outlier with
     little weight still has some effect: tests/test_robustness.py has the figures.
+
+    Parameters
+    ----------
+    kind : {"student", "huber"}, default "student"
+        Weight function.
+    probability : float, default 0.82
+        Huber: share of normal measurements that keep their full weight; 0.82 is the usual 1.345 σ of one degree of
+        freedom.
+    degrees_of_freedom : float, default 4.0
+        Student: ν; the smaller, the heavier the tails.
+    iterations : int, default 5
+        Passes of the iteration.
     """
 
     kind: Literal["huber", "student"] = "student"
-    """Weight function."""
     probability: float = 0.82
-    """Huber: share of normal measurements that keep their full weight; 0.82 is the textbook's 1.345 σ of one degree of freedom."""
     degrees_of_freedom: float = 4.0
-    """Student: ν; the smaller, the heavier the tails."""
     iterations: int = 5
-    """Passes of the iteration."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -186,12 +202,17 @@ class Monitor:
 
     The mean is a sum of χ² values with weights aᵏ; its variance is 2/n with ``n = (Σ aᵏ d)²/Σ a²ᵏ d``, after a while
     ``d (1 + a)/(1 − a) = d · window``, and its bounds are those of χ²_n/n (Satterthwaite 1946).
+
+    Parameters
+    ----------
+    window : int, default 100
+        Measurements that count in effect: a = (window − 1)/(window + 1).
+    probability : float, default 0.9999
+        Probability that the mean of a consistent filter is inside its two-sided bounds at one measurement.
     """
 
     window: int = 100
-    """Measurements that count in effect: a = (window − 1)/(window + 1)."""
     probability: float = 0.9999
-    """Probability that the mean of a right filter is inside its two-sided bounds at one measurement."""
 
     def __post_init__(self) -> None:
         """Check both."""
@@ -209,12 +230,14 @@ class Monitor:
         Parameters
         ----------
         nis : ndarray (n,)
+            NIS of each measurement, in order of time.
         degrees : ndarray (n,)
             Degrees of freedom of each.
 
         Returns
         -------
         mean, low, high : ndarray (n,)
+            Running mean after each measurement, and its two-sided bounds, per degree of freedom.
         """
         from scipy.signal import lfilter
         from scipy.special import chdtri
@@ -234,12 +257,14 @@ class Monitor:
         time : ndarray (n,)
             s.
         nis : ndarray (n,)
+            NIS of each measurement.
         degrees : ndarray (n,)
             Degrees of freedom of each.
 
         Returns
         -------
         list of Event
+            Events of kind ``"divergence"``, each with the largest mean in its stretch.
         """
         if len(time) <= self.window:
             return []

@@ -69,22 +69,33 @@ CONSTANT = 1.0 * DEGREE
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BankEstimate:
-    """Estimate of a bank of hypotheses, with the time at which one was left."""
+    """Estimate of a bank of hypotheses, with the time at which one was left.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        The Gaussian of the mixture's mean and whole covariance at the kept edges from the first direction on; once one
+        hypothesis is left, the plain filter's. Innovations are those of the heaviest hypothesis until then.
+    edges : ndarray of int (m,)
+        Indices of the record's edges at which the rows of ``estimate`` are, at ``record.time[edges]``, s: its truth there is
+        ``record.truth.attitude[edges]``.
+    angles : ndarray (h,)
+        Where the hypotheses started on their circle, rad: the rotation about the first reference from the first of
+        them; with a gate or a robust update then those that each of the next directions left open.
+    weights : ndarray (k, h)
+        Weights of the hypotheses at the first k rows, until one was left.
+    became_one : float
+        Time at which one hypothesis was left, s; infinite if more were left at the end.
+    reason : str
+        Why more than one was left, and what would help; empty if one was.
+    """
 
     estimate: Estimate
-    """The Gaussian of the mixture's mean and covariance (whole) at the kept edges from the first direction on; once the hypotheses are
-    one, the plain filter's. Innovations are those of the heaviest hypothesis until then."""
     edges: np.ndarray
-    """Which edges of the record the rows of ``estimate`` belong to (m,): its truth there is ``record.truth.attitude[edges]``."""
     angles: Array
-    """Where the hypotheses started on their circle (h,), rad: the turn about the first reference from the first of them; with a gate or a
-    robust update then those that each of the next directions left open."""
     weights: Array
-    """Weights of the hypotheses (k, h) at the first k rows, until they became one."""
     became_one: float
-    """Time at which the hypotheses became one, s; infinite if they did not."""
     reason: str
-    """Why they did not, and what would help; empty if they did."""
 
     @property
     def converged(self) -> bool:
@@ -124,6 +135,7 @@ def run(
     record : ImuRecord
         Increments corrected for coning (:func:`strapdown.records.compress`), measurements of any kind, at least one of them a direction.
     process_noise : ProcessNoise
+        Angle random walk and rate random walk of the gyro, as the filter models them.
     hypotheses : int, default 96
         Initial attitudes on the circle about the first direction, 8 or more. The time is proportional to their number.
     bias_sigma : float or array_like (3,), default 20 °/h
@@ -149,6 +161,7 @@ def run(
     Returns
     -------
     BankEstimate
+        Estimate from the first direction on, and the hypotheses with their weights.
 
     Raises
     ------
@@ -223,7 +236,9 @@ def run_recovering(
     Parameters
     ----------
     record : ImuRecord
+        As for :func:`strapdown.estimation.run`.
     process_noise : ProcessNoise
+        Angle random walk and rate random walk of the gyro, as the filter models them.
     initial : State
         State at the first edge.
     gate : Gate
@@ -241,6 +256,7 @@ def run_recovering(
     Returns
     -------
     Estimate
+        Attitude and bias with their variances at the kept edges; innovations; events.
 
     Raises
     ------

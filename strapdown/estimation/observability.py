@@ -30,26 +30,38 @@ class Observability:
     account and every state counted in its own prior σ, so that rad, T and ppm can be compared. A singular value s of
     ``√O`` is dimensionless: along its direction the record leaves ``1/√(1 + s²)`` of the prior σ. In the units of the states
     it is ``left``: the rows of ``left`` are independent errors of one σ each, ``leftᵀ left = P``.
+
+    Parameters
+    ----------
+    states : tuple of str (n,)
+        Name of each state.
+    units : tuple of str (n,)
+        SI unit of each state.
+    prior_sigma : ndarray (n,)
+        Standard deviations at the first edge before any measurement, in ``units``.
+    start_sigma : ndarray (n,)
+        Standard deviations of the same state, at the first edge, after all measurements, in ``units``.
+    final_sigma : ndarray (n,)
+        Standard deviations at the last edge, in ``units``.
+    singular_values : ndarray (n,)
+        Dimensionless, the greatest first.
+    directions : ndarray (n, n)
+        Unit directions in the space of states over their prior σ, one a row, in the order of the singular values.
+    left : ndarray (n, n)
+        One σ of what is left along each direction, one a row, in ``units``.
+    threshold : float
+        Singular value from which on a direction counts as observed.
     """
 
     states: tuple[str, ...]
-    """Name of each state (n)."""
     units: tuple[str, ...]
-    """SI unit of each state."""
     prior_sigma: Array
-    """Standard deviations before the record (n,), in ``units``."""
     start_sigma: Array
-    """Those of the same state, at the first edge, after all measurements (n,)."""
     final_sigma: Array
-    """Those at the last edge (n,)."""
     singular_values: Array
-    """Dimensionless, the greatest first (n,)."""
     directions: Array
-    """Unit directions in the space of states over their prior σ, one a row (n, n), in the order of the singular values."""
     left: Array
-    """What one σ left along each direction is of each state (n, n), in ``units``, a row a direction."""
     threshold: float
-    """Singular value from which on a direction counts as observed."""
 
     @property
     def rank(self) -> int:
@@ -72,6 +84,7 @@ class Observability:
         Returns
         -------
         str
+            States with a notable share in the direction, the largest first.
         """
         direction = self.directions[k]
         large = np.flatnonzero(np.abs(direction) >= NAMED * np.max(np.abs(direction)))
@@ -88,10 +101,12 @@ class Observability:
         Parameters
         ----------
         number : int, default 3
+            How many directions.
 
         Returns
         -------
         tuple of str
+            One line for each direction.
         """
         places = range(len(self.states) - 1, max(len(self.states) - 1 - number, -1), -1)
         return tuple(f"{self.singular_values[k]:.3g}: {self.words(k)}" for k in places)
@@ -120,6 +135,7 @@ class Observability:
         Returns
         -------
         dict
+            Rank and threshold, the σ of each state, and each direction with its singular value.
         """
         return {
             "rank": self.rank,

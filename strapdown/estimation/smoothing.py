@@ -64,7 +64,9 @@ def smooth(
     Parameters
     ----------
     record : ImuRecord
+        As for :func:`strapdown.estimation.run`.
     process_noise : ProcessNoise
+        Angle random walk and rate random walk of the gyro, as the filter models them.
     initial : State
         State at the first edge before any measurement, as for :func:`strapdown.estimation.run`.
     error_states : sequence of ErrorStates

@@ -37,12 +37,17 @@ class ProcessNoise:
     increment φ + ν enters the attitude by the right Jacobian of SO(3), as σ_v² dt J_r(φ) J_r(φ)ᵀ: σ_v² dt about the axis of turn and
     2(1 − cos x)/x² of it across, x = |φ|. So the filter's variance across the axis is too large by a share of about x²/12: 1 % at a turn
     of 0.35 rad a sample, 9 % at 1 rad, 41 % at 2 rad. It is never too small. Where a body turns farther, sample the gyro faster.
+
+    Parameters
+    ----------
+    angle_random_walk : float
+        Angle random walk σ_v, rad/√s; greater than zero.
+    rate_random_walk : float
+        Rate random walk σ_u of the bias, rad/s/√s; 0: the bias is constant.
     """
 
     angle_random_walk: float
-    """σ_v, rad/√s; greater than zero."""
     rate_random_walk: float
-    """σ_u, rad/s/√s; zero is a constant bias."""
 
     def __post_init__(self) -> None:
         """Check both."""
@@ -88,22 +93,34 @@ class GateMemory:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class State:
-    """Attitude, bias and error states of a filter, and the covariance of their errors."""
+    """Attitude, bias and error states of a filter, and the covariance of their errors.
+
+    Parameters
+    ----------
+    attitude : ndarray (4,)
+        Attitude q_fb, scalar first.
+    bias : ndarray (3,)
+        Gyro bias, rad/s, body axes.
+    covariance : ndarray (6 + m, 6 + m)
+        P of the errors (δθ, δb, δc), with δθ in the body frame: rad², rad²/s, (rad/s)², …
+    values : ndarray (m,), default empty
+        Error states c, one block after the other.
+    factor : ndarray (6 + m, 6 + m), optional
+        A root R of P, ``P = Rᵀ R``, of a filter that has one; it may hold what P itself has no digits for.
+    gate : GateMemory, optional
+        What a gate remembers at the end of a part of a record.
+    unit_sigma : mapping of str to float, default empty
+        For sensors with ``varying`` effects, the σ, rad, at whose strength their values are given. Default: the root
+        mean square of the record's.
+    """
 
     attitude: Array
-    """q_fb (4,)."""
     bias: Array
-    """Gyro bias (3,), rad/s."""
     covariance: Array
-    """P (6 + m, 6 + m) of (δθ, δb, δc): rad², rad²/s, (rad/s)², …"""
     values: Array = field(default_factory=lambda: np.empty(0))
-    """Error states c (m,), one declaration after the other; none by default."""
     factor: Array | None = None
-    """A root R of P, ``P = Rᵀ R``, where there is one already: a filter's, which may hold what P itself has no digits for."""
     gate: GateMemory | None = None
-    """Of the end of a part of a record, what its gate remembers."""
     unit_sigma: Mapping[str, float] = field(default_factory=dict)
-    """Of sensors with ``varying`` effects the σ, rad, whose strength is the values' unit; without it, the record's root mean square."""
 
     def __post_init__(self) -> None:
         """Check shapes, the norm and positive definiteness."""
@@ -142,6 +159,7 @@ def initial_state(
     Returns
     -------
     State
+        Attitude and bias with a diagonal covariance.
 
     Raises
     ------
@@ -230,7 +248,9 @@ def first_state(
     Parameters
     ----------
     record : ImuRecord
+        With measurements of an attitude, or of two directions that are not parallel.
     process_noise : ProcessNoise
+        Angle random walk and rate random walk of the gyro, as the filter models them.
     bias_sigma : float
         Standard deviation of the bias error, each axis, rad/s.
     bias : array_like (3,), default zero
@@ -239,6 +259,7 @@ def first_state(
     Returns
     -------
     State
+        Attitude and bias with the covariance of their errors at the first edge.
 
     Raises
     ------

@@ -82,24 +82,17 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
     time : float
         Time of the initial state, s.
 
-    Attributes
-    ----------
-    attitude : ndarray (4,)
-        q_fb.
-    bias : ndarray (3,)
-        Gyro bias, rad/s.
-    values : ndarray (m,)
-        The optional error states, one block after the other.
-    time : float
-        s.
-    nis, weight : float
-        NIS of the last measurement that was not skipped, and its weight; 0 if the gate refused it.
-    refused, skipped : dict of str to int
-        By sensor, how many measurements the gate refused, and how many were missing (NaN) or headings of a vertical vector.
-    late, repeated : int
-        Measurements that came later than ``look_back``, and gyro samples of no duration.
-    events : tuple of Event
-        Recoveries, lock-outs and divergence so far.
+    Notes
+    -----
+    The filter holds, beside what filterpy's has:
+
+    - ``attitude`` q_fb (4,), ``bias`` of the gyro (3,), rad/s, body axes, and ``values`` of the optional error states (m,), one block
+      after the other, all at ``time``, s;
+    - ``nis`` and ``weight`` of the last measurement that was not skipped; the weight is 0 if the gate refused it;
+    - ``refused`` and ``skipped``, by sensor: how many measurements the gate refused, and how many were missing (NaN) or headings of a
+      vertical vector;
+    - ``late`` and ``repeated``: how many measurements came later than ``look_back``, and how many gyro samples had no duration;
+    - ``events``: recoveries, lock-outs and divergence so far.
 
     Examples
     --------
@@ -219,6 +212,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         Returns
         -------
         State
+            Attitude, bias, error states and covariance at ``time``, without what the gate remembers.
         """
         P = 0.5 * (self.P + self.P.T)
         return State(attitude=self.attitude, bias=self.bias, values=self.values, covariance=P)

@@ -40,10 +40,11 @@ from strapdown.recordings.columns import parse_mapping as parse_mapping
 from strapdown.recordings.dataframes import from_table
 from strapdown.recordings.delimited import read_csv as read_csv
 from strapdown.recordings.delimited import write_csv as write_csv
-from strapdown.recordings.formats import FORMATS, from_record, read, write
+from strapdown.recordings.formats import FORMATS, read, write
 from strapdown.recordings.formats import Format as Format
 from strapdown.recordings.formats import estimate_format as estimate_format
 from strapdown.recordings.formats import format_of as format_of
+from strapdown.recordings.formats import from_record as from_record
 from strapdown.recordings.formats import is_estimate as is_estimate
 from strapdown.recordings.formats import is_record as is_record
 from strapdown.recordings.formats import not_held as not_held
@@ -67,7 +68,6 @@ __all__ = [
     "FORMATS",
     "GyroSamples",
     "Recording",
-    "from_record",
     "from_table",
     "gaps",
     "read",

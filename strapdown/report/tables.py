@@ -24,7 +24,7 @@ Value = str | float | int | bool | None
 """A cell; None and NaN are empty ones."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Table:
     """One table of a study."""
 

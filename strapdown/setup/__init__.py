@@ -77,31 +77,45 @@ def _sigma(name: str, value: Any) -> Sigma:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FilterSetup(ByValue):
-    """The filter's model, its initial uncertainty, and the integration of the gyro."""
+    """The filter's model, its initial uncertainty, and the integration of the gyro.
+
+    Parameters
+    ----------
+    process_noise : ProcessNoise
+        Angle random walk and rate random walk of the gyro, as the filter models them.
+    attitude_sigma : float, default 1°
+        Standard deviation of the initial attitude error, each axis, rad; a Monte Carlo draws the true error from it.
+    bias_sigma : float
+        Standard deviation of the initial bias error, each axis, rad/s; a Monte Carlo draws the true error from it.
+    integration : strapdown.coning.Algorithm, default "one-sample"
+        Coning algorithm that turns its N gyro samples into one filter step.
+    measurement_sigma_factor : float, default 1.0
+        Factor on the record's σ of every sensor.
+    sigma : mapping of str to float or tuple (3,), default empty
+        σ of a sensor, by its name, instead of the record's: rad, or for whole vectors the unit of their reference. One
+        number, or one for each body axis (of a direction the part across it counts; a heading has one). Where the
+        record's σ varies, this is its root mean square and the ratios between samples are kept.
+    gate : Gate, optional
+        Refuses improbable measurements, and recovers. Default: all are used.
+    robust : Robust, optional
+        Weighs measurements by the size of their innovations. Default: all alike.
+    states : States, optional
+        Error states beside attitude and bias. Default: none. With drifts among them, the estimated bias includes them.
+    estimator : str, Own, filter or callable, default MEKF
+        Filter that processes a record: a name of :data:`strapdown.estimation.filters.FILTERS`, or a filter of one's own
+        (:mod:`strapdown.estimation.filters.own`), which starts with the two σ above and does not use ``process_noise``.
+    """
 
     process_noise: ProcessNoise
-    """The filter's model of the gyro's noise."""
     attitude_sigma: float = ATTITUDE_SIGMA
-    """Standard deviation of the initial attitude error, each axis, rad; a Monte Carlo draws the true error from it."""
     bias_sigma: float
-    """Standard deviation of the initial bias error, each axis, rad/s; a Monte Carlo draws the true error from it."""
     integration: coning.Algorithm = field(default_factory=lambda: coning.ALGORITHMS["one-sample"])
-    """Coning algorithm that turns its N gyro samples into one filter step."""
     measurement_sigma_factor: float = 1.0
-    """Factor on the record's σ of every sensor."""
     sigma: Mapping[str, Sigma] = field(default_factory=dict)
-    """σ of a sensor, instead of the record's, by its name: rad, or for whole vectors the unit of their reference. One number, or three for
-    the body axes x, y, z (of a direction the part across it counts; a heading has one). Where the record's σ varies, this is its root mean
-    square and the ratios between samples are kept."""
     gate: Gate | None = None
-    """Refuses improbable measurements, and recovers; None: all are used."""
     robust: Robust | None = None
-    """Weighs measurements by the size of their innovations; None: all alike."""
     states: States | None = None
-    """Error states beside attitude and bias; None: none. With drifts among them, the estimated bias includes them."""
     estimator: str | Own | OwnFilter | Callable[[ImuRecord, State], Estimate] = MEKF
-    """What runs over a record: the name of one of :data:`strapdown.estimation.filters.FILTERS`, or a filter of one's own
-    (:mod:`strapdown.estimation.filters.own`). Of the latter, ``process_noise`` is not used; the two σ above are its start's."""
 
     def __post_init__(self) -> None:
         """Check every number."""
@@ -136,6 +150,7 @@ def matched(scenario: Scenario, *, attitude_sigma: float | None = None, states: 
     Parameters
     ----------
     scenario : Scenario
+        Its gyro, its sensors and its motion determine the setup.
     attitude_sigma : float, optional
         As of :func:`matched_to_record`.
     states : bool, default False
@@ -144,6 +159,7 @@ def matched(scenario: Scenario, *, attitude_sigma: float | None = None, states: 
     Returns
     -------
     FilterSetup
+        Setup whose noise model is that of the scenario.
 
     Raises
     ------
@@ -183,7 +199,9 @@ def matched_to_record(
     Parameters
     ----------
     spec : GyroSpec
+        Specification of the gyro.
     record : ImuRecord
+        Its rate, its length and the σ of its measurements determine the noise that stands for flicker.
     attitude_sigma : float, optional
         σ of the initial attitude error, each axis, rad. Default: 1°, or less where the finest sensor is so fine that its first measurement
         would not be linear in the error; an extended filter's covariance does not hold beyond that.
@@ -200,6 +218,7 @@ def matched_to_record(
     Returns
     -------
     FilterSetup
+        Setup with the noise of the gyro, and with error states if asked for.
 
     Raises
     ------
@@ -271,6 +290,7 @@ def not_covered(
     Parameters
     ----------
     spec : GyroSpec
+        Specification of the gyro.
     sensors : tuple, optional
         Sensors of the scenario.
     states : States, optional
@@ -281,6 +301,7 @@ def not_covered(
     Returns
     -------
     tuple of str
+        One phrase for each error, with its size; empty where there is none.
 
     Examples
     --------
@@ -434,6 +455,7 @@ def run(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any) -
     record : ImuRecord
         At the gyro's rate; the setup's integration algorithm and σ are applied.
     setup : FilterSetup
+        Filter whose noise, σ, error states, gate and integration algorithm are applied.
     initial : State
         State at the first edge.
     **options
@@ -484,6 +506,7 @@ def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any
     record : ImuRecord
         At the gyro's rate.
     setup : FilterSetup
+        Filter whose noise, σ, error states, gate and integration algorithm are applied.
     initial : State
         State at the first edge.
     **options
@@ -492,6 +515,7 @@ def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any
     Returns
     -------
     Estimate
+        Smoothed estimate at the edges of the filter's steps.
 
     Raises
     ------
@@ -525,12 +549,16 @@ def observability(record: ImuRecord, setup: FilterSetup, initial: State) -> Obse
     Parameters
     ----------
     record : ImuRecord
+        Gyro increments and measurements along which the filter is linearised.
     setup : FilterSetup
+        Filter whose states, σ and integration algorithm are applied.
     initial : State
+        State at the first edge, whose covariance is the prior.
 
     Returns
     -------
     Observability
+        Singular values and directions, the prior σ of each state and what the record leaves of it.
 
     Raises
     ------
@@ -553,6 +581,7 @@ def initial_state(
     Parameters
     ----------
     setup : FilterSetup
+        Filter whose initial σ of attitude and bias are used.
     attitude : array_like (4,)
         q_fb.
     bias : array_like (3,), default zero
@@ -561,6 +590,7 @@ def initial_state(
     Returns
     -------
     State
+        Attitude and bias with independent errors of these σ.
 
     Raises
     ------
@@ -681,10 +711,12 @@ def to_toml(setup: FilterSetup) -> str:
     Parameters
     ----------
     setup : FilterSetup
+        Setup to be written; of a filter of one's own only the description is.
 
     Returns
     -------
     str
+        TOML text that :func:`read_setup` reads back from a file.
     """
     import tomli_w
 
@@ -707,10 +739,12 @@ def read_setup(path: str | os.PathLike[str]) -> FilterSetup:
     Parameters
     ----------
     path : path
+        The TOML file; keys have their units in their names.
 
     Returns
     -------
     FilterSetup
+        Setup of the table, in SI units and radians.
 
     Raises
     ------

@@ -54,6 +54,7 @@ def matched_setup(
     Returns
     -------
     FilterSetup
+        Setup with the noise of the gyro, the σ of the sensors, and the error states asked for.
 
     Raises
     ------
@@ -94,12 +95,14 @@ def matched_to_scenario(scenario: Scenario, *, states: bool | None = None) -> Fi
     Parameters
     ----------
     scenario : Scenario
+        Its gyro, its sensors and its motion determine the setup.
     states : bool, optional
         With an error state for each error that the scenario specifies, or without. Default: with them where there are such errors.
 
     Returns
     -------
     FilterSetup
+        Setup whose noise model, and error states if there are any, are those of the scenario.
     """
     plain = setup.matched(scenario)
     if states is None:
@@ -114,11 +117,14 @@ def unmodelled_errors(record: ImuRecord, chosen: FilterSetup) -> tuple[str, ...]
     Parameters
     ----------
     record : ImuRecord
+        With its ``origin``, which specifies gyro and sensors.
     chosen : FilterSetup
+        Filter whose error states are compared with the specification.
 
     Returns
     -------
     tuple of str
+        One phrase for each error, with its size.
     """
     origin = record.origin or Origin()
     if origin.gyro is None:
@@ -130,13 +136,21 @@ def unmodelled_errors(record: ImuRecord, chosen: FilterSetup) -> tuple[str, ...]
 
 
 class Start(NamedTuple):
-    """Where a filter starts on a record."""
+    """Where a filter starts on a record.
+
+    Parameters
+    ----------
+    state : State
+        Initial attitude, bias and covariance.
+    words : str
+        How the state was found, in one sentence.
+    edge : int, default 0
+        Edge of the filter's steps at which the filter starts.
+    """
 
     state: State
     words: str
-    """How the state was found."""
     edge: int = 0
-    """Edge of the filter's steps that it starts at."""
 
 
 def start(record: ImuRecord, chosen: FilterSetup) -> Start:
@@ -150,10 +164,12 @@ def start(record: ImuRecord, chosen: FilterSetup) -> Start:
     record : ImuRecord
         As the filter processes it (:func:`strapdown.setup.believed`).
     chosen : FilterSetup
+        Filter whose gyro noise and initial bias σ are applied.
 
     Returns
     -------
     Start
+        State, how it was found, and the edge at which the filter starts with it.
 
     Raises
     ------
@@ -222,10 +238,12 @@ def drawn_start(record: ImuRecord, chosen: FilterSetup) -> Start:
     record : ImuRecord
         With its truth; the errors are drawn with seed and run of its ``origin``.
     chosen : FilterSetup
+        Filter whose initial σ of attitude and bias the errors are drawn with.
 
     Returns
     -------
     Start
+        State at the first edge, with the σ of the setup.
 
     Raises
     ------

@@ -61,34 +61,53 @@ VELOCITY = {
 
 @dataclass(frozen=True, kw_only=True)
 class SensorStates:
-    """Error states of one sensor by their σ; 0: no such state."""
+    """Error states of one sensor by their σ; 0: no such state.
+
+    Parameters
+    ----------
+    mounting_sigma : float or tuple (3,), default 0.0
+        σ of a small constant rotation of the sensor's axes from the body's, about each body axis, rad. A sensor of
+        whole attitudes has ``bias_sigma`` instead.
+    bias_sigma : float or tuple (3,), default 0.0
+        σ of a constant bias on each body axis, such as hard iron: rad, or for whole vectors the unit of their
+        reference.
+    correlated_sigma : float, default 0.0
+        Stationary σ of each component of a first-order Gauss–Markov noise, in the unit of ``bias_sigma``.
+    correlation_time : float, default 0.0
+        Correlation time of that noise, s; above zero where ``correlated_sigma`` is.
+    frame : {"body", "fixed"}, default "body"
+        Axes in which that noise is correlated.
+    varying : bool, default False
+        For a direction or heading whose reference changes in strength, as the earth's field does along an orbit: bias
+        and correlated noise are constant in the sensor's own unit, and their σ above are relative to the strength at
+        the root mean square σ of the series.
+    lever_arm_sigma : float or tuple (3,), default 0.0
+        σ of the position of an accelerometer relative to the point that does not accelerate, on each body axis, m.
+    velocity_time : float, default 0.0
+        Correlation time of the velocity of a hand-held unit, s, which bounds the acceleration that its accelerometer
+        measures (:class:`strapdown.estimation.error_states.BoundedVelocity`). Give two of the next three with it.
+    velocity_sigma : float, default 0.0
+        Stationary σ of each component of the velocity, m/s, fixed axes.
+    acceleration_sigma : float, default 0.0
+        Stationary σ of each component of the acceleration, m/s², fixed axes.
+    acceleration_time : float, default 0.0
+        Correlation time of the acceleration, s.
+    position_time : float, default 0.0
+        Correlation time of the position, s; 0: the position is not bounded.
+    """
 
     mounting_sigma: Entries = 0.0
-    """σ of a small constant rotation of the sensor's axes from the body's, rad, one or one an axis; of whole attitudes ``bias_sigma``."""
     bias_sigma: Entries = 0.0
-    """σ of a constant bias in body axes, hard iron for one, one or one an axis: rad, or of whole vectors the unit of their reference."""
     correlated_sigma: float = 0.0
-    """Stationary σ of each component of a first-order Gauss–Markov noise, in the unit of ``bias_sigma``."""
     correlation_time: float = 0.0
-    """Its time constant, s; above zero where ``correlated_sigma`` is."""
     frame: Literal["body", "fixed"] = "body"
-    """Axes in which it is correlated."""
     varying: bool = False
-    """Of a direction or heading: bias and correlated noise are fixed in the sensor's own unit and the strength of what it measures changes,
-    as that of the earth's field along an orbit; the σ above are over the strength at the root mean square σ of the series."""
     lever_arm_sigma: Entries = 0.0
-    """σ of the place of an accelerometer from the point that does not accelerate, body axes, one or one an axis, m."""
     velocity_time: float = 0.0
-    """How long a velocity lasts of a moving hand with an accelerometer (:class:`strapdown.error_states.BoundedVelocity`), s. With it two of
-    the next three."""
     velocity_sigma: float = 0.0
-    """Stationary σ of each component of the velocity, m/s."""
     acceleration_sigma: float = 0.0
-    """That of the acceleration, m/s²."""
     acceleration_time: float = 0.0
-    """How long a push lasts, s."""
     position_time: float = 0.0
-    """How long a displacement lasts, s; 0: the position is not bounded."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -126,12 +145,14 @@ class SensorStates:
         sensor : str
             Its name.
         kind : {"direction", "vector", "heading", "attitude"}
+            Kind of its measurements.
         gravity : float
             m/s²; a direction's specific force is divided by it.
 
         Returns
         -------
         tuple of ErrorStates
+            One block for each error of the sensor with a σ above zero.
 
         Raises
         ------
@@ -165,26 +186,42 @@ class SensorStates:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class States(ByValue):
-    """Error states of a filter beside attitude and bias, by their initial standard deviations; 0: no such state."""
+    """Error states of a filter beside attitude and bias, by their initial standard deviations; 0: no such state.
+
+    Parameters
+    ----------
+    gyro_scale_sigma : float or tuple (3,), default 0.0
+        σ of the gyro's scale factors, dimensionless, by axis.
+    gyro_misalignment_sigma : float or tuple (3, 3), default 0.0
+        σ of the gyro's misalignments, rad, by entry of its error matrix; zeros on the diagonal.
+    gyro_force_sigma : float or tuple (3,), default 0.0
+        σ of the gyro's sensitivity to specific force along the same axis, rad/s per m/s², by axis.
+    gyro_cross_force_sigma : float or tuple (3, 3), default 0.0
+        σ of the gyro's sensitivity to specific force across axes, rad/s per m/s², by entry; zeros on the diagonal.
+    gyro_drift_sigma : tuple of float, default empty
+        Stationary σ of each Gauss–Markov part of the gyro's bias, rad/s; parts with correlation times a decade apart
+        model flicker.
+    gyro_drift_time : tuple of float, default empty
+        Correlation time of each of these parts, s.
+    gyro_fast_bias_sigma : float, default 0.0
+        σ of the part of the gyro's bias that changes too quickly to be estimated, rad/s: no state, but included in the
+        reported σ of the bias.
+    gravity_f : tuple of float (3,), default strapdown.vectors.GRAVITY_F
+        Acceleration of gravity in the fixed frame, m/s², for the gyro's sensitivity to specific force and for lever
+        arms.
+    sensors : mapping of str to SensorStates, default empty
+        Error states of each sensor, by its name.
+    """
 
     gyro_scale_sigma: Entries = 0.0
-    """σ of the gyro's scale factors, dimensionless, one or one an axis."""
     gyro_misalignment_sigma: Entries = 0.0
-    """σ of its misalignments, rad, one or one an entry (3, 3) with zeros on the diagonal."""
     gyro_force_sigma: Entries = 0.0
-    """σ of its sensitivity to specific force along the same axis, rad/s per m/s², one or one an axis."""
     gyro_cross_force_sigma: Entries = 0.0
-    """σ of that across axes, rad/s per m/s², one or one an entry (3, 3) with zeros on the diagonal."""
     gyro_drift_sigma: tuple[float, ...] = ()
-    """Stationary σ of Gauss–Markov parts of the gyro's bias, rad/s; several with times a decade apart are flicker."""
     gyro_drift_time: tuple[float, ...] = ()
-    """Their time constants, s."""
     gyro_fast_bias_sigma: float = 0.0
-    """σ of the part of the gyro's bias that changes too quickly to be estimated, rad/s: no state, but part of the bias's reported σ."""
     gravity_f: tuple[float, ...] = GRAVITY_F
-    """Acceleration of gravity, m/s², fixed axes: what the gyro's sensitivity and lever arms are about."""
     sensors: Mapping[str, SensorStates] = field(default_factory=dict)
-    """Those of sensors, by name."""
 
     def __post_init__(self) -> None:
         """Check every field."""
@@ -222,6 +259,8 @@ class States(ByValue):
         Returns
         -------
         tuple of ErrorStates
+            One block each for scale and misalignment, sensitivity to specific force, and each drift, where its σ is
+            above zero.
         """
         found: list[ErrorStates] = []
         if _any(self.gyro_scale_sigma) or _any(self.gyro_misalignment_sigma):
@@ -245,6 +284,7 @@ class States(ByValue):
         Returns
         -------
         tuple of ErrorStates
+            Blocks of the gyro, then those of the sensors in the order of ``sensors``.
 
         Raises
         ------
@@ -289,6 +329,7 @@ class States(ByValue):
         Returns
         -------
         States
+            The same σ for these names, and 0 for all others.
 
         Raises
         ------

@@ -96,6 +96,7 @@ def run(
     record : ImuRecord
         With measurements of any kind and noise.
     process_noise : ProcessNoise
+        Angle random walk and rate random walk of the gyro, as the filter models them.
     initial : State
         State at the first edge, body side.
     every : int, default 1
@@ -106,6 +107,7 @@ def run(
     Returns
     -------
     Estimate
+        Attitude and bias with their variances at the kept edges, and the innovations.
 
     Raises
     ------
@@ -134,11 +136,17 @@ def compare(
     ----------
     record : ImuRecord
         With its truth, errors are compared; without it, the differences from the first filter.
-    process_noise, initial, every, full_covariance
-        As of :func:`run`.
+    process_noise : ProcessNoise
+        Angle random walk and rate random walk of the gyro, as the filters model them.
+    initial : State
+        State at the first edge, from which all filters start.
     filters : iterable of str or filter, default all of :data:`FILTERS`
         Names, and filters of one's own (:mod:`strapdown.estimation.filters.own`). The unscented filter needs some tenths of a
         millisecond a step, the others a microsecond.
+    every : int, default 1
+        Store every n-th edge, the first included.
+    full_covariance : bool, default False
+        Store whole covariance matrices too.
 
     Returns
     -------

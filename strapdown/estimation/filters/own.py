@@ -62,10 +62,14 @@ class Own:
     """A filter of one's own with its description; :func:`as_own` makes it. Two of the same description are equal.
 
     Each call works on a deep copy of an object, so that runs share no state: they may go on in several threads, and in any order.
+
+    Parameters
+    ----------
+    given : callable, object with a method ``run``, or mapping
+        The function or object, or the description of one that was read from a file, which cannot run.
     """
 
     given: Any
-    """The function or object, or the description of one that a file holds."""
 
     def __post_init__(self) -> None:
         """Check that it can be called."""
@@ -139,6 +143,16 @@ class Own:
 
 def as_own(filter_: Any) -> Own:
     """Return one's own filter with its description.
+
+    Parameters
+    ----------
+    filter_ : callable or object with a method ``run``
+        Takes a record and an initial state and returns an estimate (:class:`OwnFilter`); an :class:`Own` is returned as it is.
+
+    Returns
+    -------
+    Own
+        The filter, which can be called and compared.
 
     Raises
     ------
