@@ -208,10 +208,10 @@ def check_arrays(
     >>> import numpy as np
     >>> from strapdown import quaternion
     >>> random = np.random.default_rng(1)
-    >>> time = np.arange(400.0)
-    >>> truth = quaternion.exp(np.cumsum(0.1 * random.standard_normal((400, 3)), axis=0) % 2.0)
-    >>> estimate = quaternion.multiply(truth, quaternion.exp(0.01 * random.standard_normal((400, 3))))
-    >>> P = np.tile(1e-4 * np.eye(3), (400, 1, 1))
+    >>> time = np.arange(1000.0)
+    >>> truth = quaternion.exp(np.cumsum(0.1 * random.standard_normal((1000, 3)), axis=0) % 2.0)
+    >>> estimate = quaternion.multiply(truth, quaternion.exp(0.01 * random.standard_normal((1000, 3))))
+    >>> P = np.tile(1e-4 * np.eye(3), (1000, 1, 1))
     >>> check_arrays(time, estimate, P, time, truth).judgement.verdict
     'consistent'
     >>> check_arrays(time, estimate, 0.5 * P, time, truth).judgement.verdict
