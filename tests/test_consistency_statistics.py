@@ -338,6 +338,19 @@ def test_effective_samples_of_part_of_a_markov_process():
     assert timeaverage.effective_samples(white, 1) == pytest.approx(40_000 / (1.0 + 2.0 * total), rel=0.1)
 
 
+@pytest.mark.parametrize("factor", [0.7, 1.0, 1.2, 1.41])
+@pytest.mark.parametrize("epochs", [400, 1000])
+def test_a_wrong_sigma_leaves_the_effective_samples_of_white_errors(epochs, factor):
+    """A constant excess of the NEES is no correlation: nearly every epoch counts, and the average shows the factor."""
+    random = np.random.default_rng(int(1000 * factor) + epochs)
+    error = factor * random.standard_normal((epochs, 3))
+    found = consistency.timeaverage.time_average(error, np.tile(np.eye(3), (epochs, 1, 1)))
+    assert found.reliable
+    assert 0.6 * epochs < found.effective <= epochs
+    assert found.mean == pytest.approx(factor**2, rel=0.15)
+    assert (found.p_value < 1e-3) == (factor != 1.0)
+
+
 def test_time_average_of_a_short_run_says_that_it_is_not_reliable():
     walk = np.cumsum(np.random.default_rng(19).standard_normal((60, 2)), axis=0)
     found = consistency.time_average(walk, np.broadcast_to(30.0 * np.eye(2), (60, 2, 2)))
