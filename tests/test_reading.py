@@ -116,14 +116,14 @@ def spent(refused) -> tuple[float, float]:
 
 
 def processor_seconds(read) -> float:
-    """Least processor time of three attempts: what else the machine does only adds to it."""
-    took = []
-    for _ in range(3):
-        gc.collect()  # what earlier tests left is not this one's to collect
+    """Processor time of a call; the garbage of other tests is not collected in it."""
+    gc.disable()
+    try:
         begun = time.process_time()
         read()
-        took.append(time.process_time() - begun)
-    return min(took)
+        return time.process_time() - begun
+    finally:
+        gc.enable()
 
 
 def test_an_array_that_declares_more_than_it_holds_is_refused_before_memory_is_taken(tmp_path):
@@ -228,10 +228,13 @@ def test_reading_takes_time_in_proportion_to_the_size(known, tmp_path, name, beg
             known[name].read(path)
         assert len(str(refusal.value)) < 5000
 
-    took = []
-    for number in (100_000, 400_000):
-        path.write_text(begin + unit * number + end)
-        took.append(processor_seconds(refused))
+    for _ in range(3):  # what else the machine does only adds to a time: one attempt within the bounds is enough
+        took = []
+        for number in (100_000, 400_000):
+            path.write_text(begin + unit * number + end)
+            took.append(processor_seconds(refused))
+        if took[1] < min(8.0 * took[0] + 0.5, 5.0):
+            break
     assert took[1] < 8.0 * took[0] + 0.5
     assert took[1] < 5.0
 
@@ -241,8 +244,9 @@ def test_a_csv_of_many_columns_is_read(tmp_path):
     extra = 50_000
     rows = "".join(f"{k},1,2,3{',0' * extra}\n" for k in range(3))
     path.write_text("time,gx [deg/s],gy,gz," + ",".join(f"c{k}" for k in range(extra)) + "\n" + rows)
-    assert processor_seconds(lambda: recordings.read(path)) < 3.0
-    assert recordings.read(path).rate.shape == (3, 3)
+    found = []
+    assert processor_seconds(lambda: found.append(recordings.read(path))) < 3.0
+    assert found[0].rate.shape == (3, 3)
 
 
 # --------------------------------------------------------------------------------------------------------------------- links
