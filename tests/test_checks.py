@@ -237,3 +237,11 @@ def test_one_of():
 def test_known_keys():
     checks.known_keys("gyro", ["bias", "noise"], ["noise", "bias", "scale"])
     refused(lambda: checks.known_keys("gyro", ["biass"], ["noise", "bias"]), "gyro: key 'biass'", "'bias'")
+
+
+def test_the_nearest_name_is_one_of_the_same_unit():
+    known = ["turn_on_bias_sigma_rad_per_s", "turn_on_bias_sigma_deg_per_hour"]
+    with pytest.raises(InputError, match="did you mean 'turn_on_bias_sigma_deg_per_hour'"):
+        checks.one_of("key", "turn_on_bias_sigma_deg_per_s", known)
+    with pytest.raises(InputError, match="did you mean 'turn_on_bias_sigma_rad_per_s'"):
+        checks.one_of("key", "turn_on_bias_sigma_rad_per_sec", known)

@@ -169,7 +169,7 @@ def test_a_bag_has_the_attitude_about_fixed_axes(run, files, monkeypatch, capsys
 def test_a_trajectory_without_covariance_is_not_judged(files, monkeypatch, capsys):
     status, said, _ = command(monkeypatch, capsys, "check", files / "estimate.tum", "--truth", files / "record.h5")
     assert status == 2
-    assert "tells no covariance, so its errors are not judged (RMS attitude error" in said
+    assert "has no covariance, so its errors are not judged (RMS attitude error" in said
     assert "cannot tell" in said
 
 
@@ -250,7 +250,8 @@ def test_equal_axes_leave_the_reading_open(run):
     m = len(run.estimate.time)
     found = checked(run, covariance=np.tile(DEGREE**2 * np.eye(3), (m, 1, 1)), bias=None)
     assert found.frame_probability["body"] == pytest.approx(found.frame_probability["fixed"], rel=1e-6)
-    assert any("do not tell how the covariance is meant" in words for words in found.remarks)
+    assert any("do not decide how the covariance is meant" in words for words in found.remarks)
+    assert found.error_frame == "body"
 
 
 def test_euler_axes_are_the_derivative_of_the_angles():

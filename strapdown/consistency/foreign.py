@@ -28,6 +28,8 @@ from strapdown.units import DEGREE
 ERROR_FRAMES = ("body", "fixed", "euler")
 """Readings of an attitude covariance: of δθ with ``q_true = q ⊗ exp(δθ)``; of δφ with ``q_true = exp(δφ) ⊗ q``, as ROS has it for poses; of
 the errors of roll, pitch and yaw, in this order (ZYX)."""
+DECIDED = 0.9
+"""Probability above which the errors decide how the covariance is meant; below, it is taken for the body side, this package's own."""
 ALIGNED = ("time", "fixed", "body")
 """What may be aligned: the clocks, the fixed frames, the body frames."""
 GROSS = 5.0 * DEGREE
@@ -242,10 +244,10 @@ def check_arrays(
     remarks += alignment.words
     if own.covariance is None:
         sigma = f"RMS attitude error {alignment.residual / DEGREE:.4g}°"
-        remarks.append(f"the estimate tells no covariance, so its errors are not judged ({sigma})")
+        remarks.append(f"the estimate has no covariance, so its errors are not judged ({sigma})")
         empty = without_truth(own.time, replace_attitude(own.attitude, alignment), innovations or {})
         return Checked(
-            judgement=judge(empty, None, probability=probability),
+            judgement=replace(judge(empty, None, probability=probability), limits=()),
             estimate=empty,
             truth=truth,
             alignment=alignment,
@@ -259,12 +261,12 @@ def check_arrays(
     aligned = replace_attitude(own.attitude, alignment)
     error = quaternion.log(quaternion.multiply(quaternion.conjugate(aligned), truth.attitude))
     found = frame_probabilities(error, {name: P[:, :3, :3] for name, P in readings.items()})
-    chosen = max(found, key=lambda name: found[name]) if error_frame == "find" else error_frame
+    best = max(found, key=lambda name: found[name])
+    chosen = error_frame if error_frame != "find" else best if found[best] >= DECIDED else "body"
     if error_frame == "find":
         remarks.append(_frame_words(chosen, found))
     elif found[chosen] < 0.01:
-        best = max(found, key=lambda name: found[name])
-        remarks.append(f"the covariance is read as {chosen}, as told; as {best} the errors would fit it better by far")
+        remarks.append(f"the covariance is read as {chosen}, as given; as {best} the errors would fit it better by far")
     estimate = Estimate.from_arrays(
         own.time,
         aligned,
@@ -348,8 +350,8 @@ def frame_probabilities(error: Array, readings: Mapping[str, Array]) -> dict[str
 
 def _frame_words(chosen: str, found: Mapping[str, float]) -> str:
     said = ", ".join(f"{name} {100.0 * p:.3g} %" for name, p in found.items())
-    if found[chosen] < 0.9:
-        return f"the errors do not tell how the covariance is meant ({said}): it is judged as {chosen}; --error-frame says otherwise"
+    if found[chosen] < DECIDED:
+        return f"the errors do not decide how the covariance is meant ({said}): it is judged as {chosen}; --error-frame names another"
     return f"the covariance is read as {chosen} ({said}, found from the errors)"
 
 

@@ -227,9 +227,13 @@ def _covariance(
         told = columns[group]
         if set(told) == set(axes):
             sigma = np.stack([told[axis][0] * _SIZE[told[axis][1]] for axis in axes], axis=1)
-            words = "The file tells σ, no covariance: errors of different axes are taken for independent."
+            words = "The file has σ and no covariance: errors of different axes are taken for independent."
             return np.apply_along_axis(np.diag, 1, sigma**2), frame, [words]
-    return None, "", ["The table has no covariance."]
+    words = (
+        "The table has no covariance. Its columns are cov_body_xx_rad2, cov_body_xy_rad2, … (or cov_fixed_…), or sigma_x_deg, sigma_y_deg, "
+        "sigma_z_deg of the rotation vector, or yaw_sigma_deg, pitch_sigma_deg, roll_sigma_deg."
+    )
+    return None, "", [words]
 
 
 def _unit(name: str, q: Array) -> Array:
