@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         if "slow" in item.keywords:
             item.add_marker(skip)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def what_is_compiled_is_not_collected() -> Iterator[None]:
+    """Leave what a module has compiled out of garbage collection: in a process that has compiled much, each one takes seconds."""
+    yield
+    gc.collect(1)
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

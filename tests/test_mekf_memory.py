@@ -19,15 +19,6 @@ NOISE = estimation.ProcessNoise(angle_random_walk=1e-3, rate_random_walk=1e-5)
 START = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=0.1, bias_sigma=0.01)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def what_others_left_is_not_collected():
-    """In a process that has compiled much, a full collection takes a second."""
-    gc.collect()
-    gc.freeze()
-    yield
-    gc.unfreeze()
-
-
 @pytest.fixture(autouse=True)
 def nothing_kept():
     gc.collect()
