@@ -70,7 +70,7 @@ def find(field: Array, frame: Array, time: Array, known: np.ndarray, strength: f
     size = np.sum(iron**2, axis=1)
     iron *= strength * np.maximum(1.0 - FEIGNED**2 / np.maximum(size, 1e-30), 0.0)[:, None]
     if causal:
-        iron = _low_pass(iron, interval / RISE)
+        iron = low_pass(iron, interval / RISE)
         iron[np.linalg.norm(iron, axis=1) < NEGLIGIBLE * strength] = 0.0
     return np.asarray(iron)
 
@@ -78,10 +78,11 @@ def find(field: Array, frame: Array, time: Array, known: np.ndarray, strength: f
 def _integral(rows: Array, interval: float) -> Array:
     """Return the integral over time, s, of rows (k, m) up to each, forgotten with :data:`MEMORY`."""
     share = interval / MEMORY
-    return np.asarray(_low_pass(rows, share) * (interval / -np.expm1(-share)))
+    return np.asarray(low_pass(rows, share) * (interval / -np.expm1(-share)))
 
 
-def _low_pass(rows: np.ndarray, step: float) -> Array:
+def low_pass(rows: np.ndarray, step: float) -> Array:
+    """Return rows (k, m) after a first-order low-pass from the first one on, ``step`` being the interval over the time constant; causal."""
     result = np.empty(rows.shape)
     compiled(recording_steps.low_pass)(np.ascontiguousarray(rows), -np.expm1(-step), result)
     return result

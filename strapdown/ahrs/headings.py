@@ -13,8 +13,7 @@ import numpy as np
 from strapdown import hard_iron, quaternion
 from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.checks import Array
-from strapdown.kernels import recording_steps
-from strapdown.kernels.machine import compiled
+from strapdown.hard_iron import low_pass
 from strapdown.vectors import VectorMeasurements
 
 NORTH = np.array([0.0, 1.0, 0.0])
@@ -93,7 +92,7 @@ def _gathered(steps: FieldSteps, direction: Array, information: Array, heading_i
 def _vertical(force: Array, interval: float) -> Array:
     """Return the vertical (k, 3) from specific force twice passed through a low-pass."""
     share = interval / VERTICAL_TIME
-    vertical = _low_pass(_low_pass(_held(force, np.asarray(force.any(axis=1))), share), share)
+    vertical = low_pass(low_pass(_held(force, np.asarray(force.any(axis=1))), share), share)
     return np.asarray(vertical / np.linalg.norm(vertical, axis=1, keepdims=True))
 
 
@@ -109,17 +108,10 @@ def _strength_and_dip(field: Array, vertical: Array) -> Array:
 def _deviation(level: Array, reference: Array, known: np.ndarray, memory: float) -> Array:
     """Return the mean square deviation of strength (share) and dip (rad) from those at the start (k,), ``memory`` intervals long."""
     square = (level[:, 0] / reference[0] - 1.0) ** 2 + (level[:, 1] - reference[1]) ** 2
-    return _low_pass(_held(square[:, None], known), memory)[:, 0]
+    return low_pass(_held(square[:, None], known), memory)[:, 0]
 
 
 def _held(values: Array, known: np.ndarray) -> Array:
     """Return rows (k, …) with each that is not known replaced by the last before it that is, or the first of all."""
     last = np.maximum.accumulate(np.where(known, np.arange(len(values)), -1))
     return np.asarray(values[np.where(last < 0, int(np.argmax(known)), last)])
-
-
-def _low_pass(values: Array, step: float) -> Array:
-    """Return rows (k, m) after a first-order low-pass from the first one on, ``step`` being the interval over the time constant; causal."""
-    result = np.empty_like(values)
-    compiled(recording_steps.low_pass)(values, -np.expm1(-step), result)
-    return result
