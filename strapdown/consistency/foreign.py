@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, array, increasing, one_of, unit_quaternions
-from strapdown.consistency.judgement import Judgement, judge
+from strapdown.consistency.judgement import WITHOUT_TRUTH, Judgement, judge
 from strapdown.consistency.manifold import whitened
 from strapdown.consistency.timeaverage import effective_samples
 from strapdown.outputs import euler_axes
@@ -246,8 +246,9 @@ def check_arrays(
         sigma = f"RMS attitude error {alignment.residual / DEGREE:.4g}°"
         remarks.append(f"the estimate has no covariance, so its errors are not judged ({sigma})")
         empty = without_truth(own.time, replace_attitude(own.attitude, alignment), innovations or {})
+        judged = judge(empty, None, probability=probability)
         return Checked(
-            judgement=replace(judge(empty, None, probability=probability), limits=()),
+            judgement=replace(judged, limits=tuple(limit for limit in judged.limits if limit != WITHOUT_TRUTH)),
             estimate=empty,
             truth=truth,
             alignment=alignment,
@@ -411,15 +412,14 @@ def _at_common_times(own: _Series, told: _Series, offset: float) -> tuple[_Serie
             f"the estimate goes from {own.time[0] + offset:.6g} to {own.time[-1] + offset:.6g} s of the truth's clock, and the truth from "
             f"{told.time[0]:.6g} to {told.time[-1]:.6g} s: they have no two times in common; give both of one clock, or --align time"
         )
-    rows = good
     return (
         _Series(
-            own.time[rows] + offset,
-            own.attitude[rows],
-            None if own.covariance is None else own.covariance[rows],
-            None if own.bias is None else own.bias[rows],
+            own.time[good] + offset,
+            own.attitude[good],
+            None if own.covariance is None else own.covariance[good],
+            None if own.bias is None else own.bias[good],
         ),
-        Truth(attitude=q[rows], bias=np.full((int(rows.sum()), 3), np.nan) if bias is None else bias[rows]),
+        Truth(attitude=q[good], bias=np.full((int(good.sum()), 3), np.nan) if bias is None else bias[good]),
     )
 
 

@@ -41,6 +41,12 @@ RESOLUTION = 1.5
 STATES = ("attitude", "bias")
 """States of every filter."""
 
+WITHOUT_TRUTH = (
+    "without a truth only the innovations are judged: they do not show an attitude error that all sensors share, "
+    "nor a bias error that the start hides, such as commutation of coning"
+)
+"""A limit of a judgement."""
+
 _TOO_SURE, _TOO_MODEST = "too sure of itself (optimistic)", "too modest (pessimistic)"
 
 
@@ -261,10 +267,7 @@ def judge(
             limits.append(f"{innovations.refused} measurements of {sensor} that the gate refused are left out")
     findings += _of_pairs(estimate)
     if truth is None:
-        limits.append(
-            "without a truth only the innovations are judged: they do not show an attitude error that all sensors share, "
-            "nor a bias error that the start hides, such as commutation of coning"
-        )
+        limits.append(WITHOUT_TRUTH)
     else:
         findings += _of_errors(estimate, truth, probability, limits)
     if upper_bounds:
