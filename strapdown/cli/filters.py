@@ -33,8 +33,10 @@ def filter_for(
     from strapdown import reading, setup
     from strapdown.checks import InputError
     from strapdown.gyro import read_spec
-    from strapdown.setup.for_record import matched_setup
+    from strapdown.setup.for_record import matched_setup, unmodelled_errors
 
+    with reading.from_file(path):
+        record = held.with_origin(str(path))
     if filter_file is not None:
         if states is not None:
             raise InputError(
@@ -42,14 +44,12 @@ def filter_for(
             )
         chosen = setup.read_setup(filter_file)
         need_angles(filter_file, chosen, held)
-        return chosen, no_state_words(without_a_state(path, held, chosen), chosen)
+        return chosen, no_state_words(unmodelled_errors(record, chosen), chosen)
     spec = None if gyro is None else read_spec(gyro)
     if spec is None and held.gyro is None:
         raise InputError(f"{path} does not hold the gyro's specification; give --gyro or --filter, a TOML file")
-    with reading.from_file(path):
-        record = held.with_origin(str(path))
     chosen = matched_setup(record, spec, states=True if states == () else states, smooth=smooth)
-    missing = without_a_state(path, held, chosen)
+    missing = unmodelled_errors(record, chosen)
     if states is False or (states is None and chosen.states is None):
         return chosen, no_state_words(missing, chosen)
     remarks = []
@@ -92,13 +92,6 @@ def filter_of_scenario(filter_file: Path, scenario: Scenario) -> FilterSetup:
     kinds = {sensor.name: str(getattr(sensor, "kind", "attitude")) for sensor in scenario.sensors}
     setup.need_angles(chosen, kinds, f"{filter_file}: filter")
     return chosen
-
-
-def without_a_state(path: Path, held: RecordFile, chosen: FilterSetup) -> tuple[str, ...]:
-    """Return, in words, what a record specifies and a filter has no state for; nothing where the record specifies nothing."""
-    from strapdown.setup.for_record import unmodelled_errors
-
-    return unmodelled_errors(held.with_origin(str(path)), chosen)
 
 
 def no_state_words(missing: tuple[str, ...], chosen: FilterSetup) -> list[str]:

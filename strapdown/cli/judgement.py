@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, NoReturn
 import typer
 from rich.text import Text
 
-from strapdown.cli.filters import no_state_words, without_a_state
+from strapdown.cli.filters import no_state_words
 from strapdown.cli.reading import (
     RECORDING_HELP,
     AccelerometerUnit,
@@ -287,13 +287,14 @@ def _diagnosed(
     import numpy as np
 
     from strapdown import diagnosis, estimation, recordfiles, records
+    from strapdown.setup.for_record import unmodelled_errors
     from strapdown.tuning.suspicion import accepted
 
     chosen = _filter_of(result, filter_file)
     estimate = records.read_estimate(result)
     held = recordfiles.read_record_file(record)
     _need_same(result, estimate, record, held.record)
-    missing = without_a_state(record, held, chosen)
+    missing = unmodelled_errors(held.with_origin(str(record)), chosen)
     for sentence in no_state_words(missing, chosen):
         console.print(sentence)
     if chosen.states is not None and chosen.states.names:

@@ -158,13 +158,13 @@ class _Compiling:
         self._listening = True
 
     def started(self, dispatcher: Any) -> None:
-        """Take in a function that is being compiled, and all that it calls."""
+        """Count a function that is being compiled, and all that it calls."""
         self._left |= _called(dispatcher) - self._known
         self._known |= self._left
         self._say()
 
     def finished(self, dispatcher: Any) -> None:
-        """Take in a function that is compiled."""
+        """Count a function as compiled."""
         self._left.discard(dispatcher)
         self._say()
 

@@ -104,11 +104,12 @@ def matched_to_scenario(scenario: Scenario, *, states: bool | None = None) -> Fi
     FilterSetup
         Setup whose noise model, and error states if there are any, are those of the scenario.
     """
-    plain = setup.matched(scenario)
     if states is None:
         states = bool(setup.not_covered(scenario.gyro, scenario.sensors, gravity_f=scenario.gravity_f))
-    found = setup.matched(scenario, states=True) if states else plain
-    return plain if found.states is None or not found.states.names else found
+    found = setup.matched(scenario, states=states)
+    if states and (found.states is None or not found.states.names):
+        return setup.matched(scenario)
+    return found
 
 
 def unmodelled_errors(record: ImuRecord, chosen: FilterSetup) -> tuple[str, ...]:
