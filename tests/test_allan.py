@@ -6,6 +6,7 @@ The records come from this file's own simulator, not from the package's gyro.
 import itertools
 import math
 import re
+import types
 
 import allantools
 import numpy as np
@@ -625,6 +626,14 @@ def test_scores_of_chi_squares_are_normal():
     probability = np.array([allan._probability(np.full(60, 6.0), row, 60) for row in ratio])
     assert 0.005 < np.mean(probability < 0.01) < 0.02
     assert 0.47 < np.mean(probability < 0.5) < 0.53
+
+
+def test_each_term_of_the_fit_costs_its_spectrum_a_degree():
+    ratio = np.linspace(0.6, 1.5, 10)
+    bins = types.SimpleNamespace(number=np.full(10, 50.0), square=50.0 * ratio, product=np.zeros(10), ramp=np.zeros(10))
+    best = types.SimpleNamespace(slope=0.0, variance=np.ones(10), theta=np.array([1.0, 0.0, 2.0, 3.0]))
+    score = (np.cbrt(ratio) - 1.0 + 2.0 / 450.0) / np.sqrt(2.0 / 450.0)
+    assert allan._spectrum_probability(bins, best) == pytest.approx(chi2.sf(score @ score, 7), rel=1e-9)
 
 
 @pytest.mark.parametrize("highest_frequency", [None, 0.3])

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.stats
 
 from strapdown import consistency, montecarlo, motion, records, scenarios, setup, vectors
 from strapdown.checks import InputError
@@ -243,6 +244,20 @@ def test_right_runs_are_consistent_and_wrong_ones_are_told(plan):
     assert "mean error" not in names
     modest = consistency.judge_runs(statistics_of(plan, measurement_sigma_factor=1.3))
     assert "pessimistic" in modest.reason
+
+
+def test_the_coverage_of_the_worst_epoch_and_state_stands_for_all(plan):
+    """99 of 100 errors of one state within 1 σ at one epoch, all others the expected number: binomial, times the number of tests."""
+    few = montecarlo.run(plan.scenario, (plan.setup,), runs=100, seed=3, epochs=20, nis_bins=10)[0]
+    usual = np.array([68, 95, 100])
+    counts = np.tile(usual, (21, 6, 1))
+    counts[20, 4, 0] = 82
+    judged = consistency.judge_runs(replace(few, coverage=counts), epochs=np.array([10, 20]))
+    (found,) = (one for one in judged.findings if one.name == "coverage")
+    least = 2.0 * scipy.stats.binom.sf(81, 100, math.erf(math.sqrt(0.5)))
+    assert (found.of, found.value) == ("bias y", 0.82)
+    assert found.p_value == pytest.approx(36 * least, rel=1e-9)
+    assert "82 % of the bias y errors lie within 1 σ" in found.means
 
 
 def test_few_runs_cannot_tell(plan):

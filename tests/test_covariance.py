@@ -129,6 +129,26 @@ def test_the_budget_of_a_matched_filter_adds_up_to_its_own_covariance(name):
         assert value == pytest.approx(1.0, abs=1e-4)
     names = {name for name, *_ in found.budget()}
     assert {"angle random walk", "initial attitude", "initial bias"} <= names
+    for epoch in (2, -1):  # squares add up, as the mean over the axes of attitude and bias
+        squares = np.array([row[2:] for row in found.budget(epoch) if row[1] == "random"]) ** 2
+        whole = np.diag(found.covariance[epoch]).reshape(2, 3).mean(axis=1)
+        assert np.allclose(squares.sum(axis=0), whole, rtol=1e-7, atol=1e-24)
+
+
+def test_the_axes_of_a_considered_error_are_one_row_of_the_budget():
+    scenario = white("spin", 20.0)
+    errors = np.arange(1.0, 25.0).reshape(1, 4, 6)
+    found = dataclasses.replace(
+        covariance.analyse(scenario, setup.matched(scenario), epochs=1),
+        fixed=("start",),
+        fixed_errors=np.repeat(errors[:, :1], 2, axis=0),
+        considered=("mounting, x", "mounting, y", "delay"),
+        considered_errors=np.repeat(errors[:, 1:], 2, axis=0),
+    )
+    rows = {(name, kind): np.square(rms) for name, kind, *rms in found.budget() if kind != "random"}
+    squares = np.square(errors[0]).reshape(4, 2, 3).mean(axis=2)
+    assert list(rows) == [("start", "fixed"), ("mounting", "considered"), ("delay", "considered")]
+    assert np.allclose(list(rows.values()), [squares[0], squares[1] + squares[2], squares[3]], rtol=1e-12)
 
 
 def quiet(scenario, believed_sigma):

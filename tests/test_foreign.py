@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.stats
 
 from strapdown import (
     cli,
@@ -92,6 +93,27 @@ def test_our_own_estimate_gets_its_own_verdict(run):
     assert found.error_frame == "body"
     assert found.frame_probability["body"] > 0.99
     assert not any(one.likely for one in found.explanations)
+
+
+@pytest.mark.parametrize(("m", "factor"), [(400, 1.0), (400, 1.3), (10, 1.3)])
+def test_a_factor_on_sigma_is_as_likely_as_its_likelihood_ratio(m, factor):
+    """Of m white errors, three each, whose mean square is f² the σ²: 2 Δℓ = 3 m (f² − 1 − ln f²), χ² of one degree.
+
+    Up to ten may all be one for what they show of their correlation.
+    """
+    draw = np.random.default_rng(3)
+    error = draw.standard_normal((m, 3))
+    error *= factor / np.sqrt(np.mean(error**2))
+    time, attitude = np.arange(float(m)), quaternion.normalize(draw.standard_normal((m, 4)))
+    truth, P = Truth(attitude=attitude, bias=np.zeros((m, 3))), np.tile(1e-6 * np.eye(6), (m, 1, 1))
+    known = foreign.explanations(1e-3 * error, {"body": P}, "body", truth, time, attitude)
+    (found,) = (one for one in known if one.name == foreign.SCALE)
+    assert float(found.value) == pytest.approx(factor, rel=1e-3)
+    ratio = 3.0 * (m if m > 10 else 1) * (factor**2 - 1.0 - 2.0 * np.log(factor))
+    if factor == 1.0:
+        assert found.p_value == pytest.approx(1.0, abs=1e-6)
+    else:  # but for the whiteness, which is itself estimated: the samples count for m within a fifth
+        assert scipy.stats.chi2.isf(found.p_value, 1) == pytest.approx(ratio, rel=0.2 if m > 10 else 1e-6)
 
 
 def command(monkeypatch, capsys, *arguments):

@@ -270,6 +270,15 @@ def test_summary_bounds_hold_for_all_tests_together():
     assert np.allclose(told["nis"][1]["bounds"], [low, high], rtol=1e-12)
 
 
+def test_summary_takes_coverage_over_the_judged_epochs():
+    counts = np.zeros((PLAN.epochs + 1, 6, 3), int)
+    counts[4], counts[2, :3, 1] = 3, 3
+    sums = replace(scalar.run_chunk(PLAN, 0, 3), coverage=counts)
+    told = montecarlo.summary(sums, epochs=np.array([2, 4]))["coverage"]
+    assert told["attitude"] == [0.5, 1.0, 0.5]
+    assert told["bias"] == [0.5, 0.5, 0.5]
+
+
 # ------------------------------------------------------------------------------------------------------------ plans
 
 

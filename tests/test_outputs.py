@@ -67,6 +67,11 @@ def test_heading_is_from_north_towards_east(yaw, axis, degrees):
     assert abs(found.sigma[0] - 3.0) < 1e-12  # level: a turn about up alone moves it
 
 
+def test_heading_refuses_what_is_no_axis():
+    with pytest.raises(InputError, match="axis 'zz' is not known"):
+        outputs.heading([[1.0, 0, 0, 0]], axis="zz")
+
+
 def test_heading_of_a_tilted_body_has_the_sigma_of_differences():
     q, P = attitudes(), covariances()
     found = outputs.heading(q, P)

@@ -199,6 +199,14 @@ def test_the_histogram_counts_what_lies_beyond():
     assert any("2 beyond" in text.get_text() for text in ax.get_legend().get_texts())
 
 
+@pytest.mark.parametrize("epoch", [0, -1])
+def test_coverage_is_drawn_at_its_epoch(statistics, epoch):
+    drawn = [
+        line.get_ydata() for line in plots.coverage_by_state(statistics, epoch).lines if len(line.get_xdata()) == 6
+    ]
+    np.testing.assert_allclose(np.transpose(drawn), 100.0 * statistics.coverage[epoch] / statistics.finite[epoch])
+
+
 def test_errors_are_drawn_in_the_unit_of_their_label(run):
     estimate, truth = run
     figure = plots.error_overview(estimate, truth)

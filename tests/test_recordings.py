@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from strapdown import estimation, recordfiles, recordings
 from strapdown.checks import InputError
 from strapdown.cli import app
-from strapdown.recordings import Recording, read
+from strapdown.recordings import Recording, read, samples
 from strapdown.records import ImuRecord
 
 HEADER = "time,gx [rad/s],gy,gz,ax [m/s2],ay,az"
@@ -464,3 +464,15 @@ def test_few_repeated_stamps_are_left_out_whatever_their_samples(tmp_path):
     np.savetxt(path, values[195:205], delimiter=",", header="time,gx [rad/s],gy,gz", comments="")
     with pytest.raises(InputError, match="time"):
         read(path)
+
+
+@pytest.mark.parametrize(("shift", "even"), [(0.2, False), (0.3, True)])
+def test_stamps_that_stray_by_more_than_a_quarter_of_the_interval_are_assumed_even(shift, even):
+    """A stamp off by a share of 10 ms, and a second later ten samples lost, which are a gap either way."""
+    time = 0.01 * np.delete(np.arange(200.0), np.s_[150:160])
+    time[40] += 0.01 * shift
+    interval, place, words = samples._grid("log", time)
+    assert interval == pytest.approx(0.01, rel=1e-3)
+    np.testing.assert_array_equal(place, np.delete(np.arange(200), np.s_[150:160]))
+    assert [word.split()[0] for word in words] == (["Intervals", "10"] if even else ["10"])
+    assert not even or f"stray by up to {10.0 * shift:.3g} ms" in words[0]

@@ -412,3 +412,9 @@ def test_a_sigma_that_may_be_zero_has_a_one_sided_bound_and_the_mean_of_its_like
     ratio = np.exp(-0.5 * mode**2) / math.sqrt(2.0 * np.pi) / (0.5 * math.erfc(-mode / math.sqrt(2.0)))
     # Over a range that ends at the bound it is low by 12 to 20 %.
     assert found.mean == pytest.approx(mode + ratio, rel=0.006)
+
+
+@pytest.mark.parametrize("degrees", [1, 2, 6])
+def test_the_usual_logarithm_of_a_chi_square_is_its_mean(degrees):
+    mean = chi2(degrees).expect(lambda x: np.log1p(x / degrees))
+    assert credibility._usual_log.__wrapped__(degrees) == pytest.approx(mean, rel=2e-3)
