@@ -1,9 +1,9 @@
 """Where do the errors come from? The error budget of a filter from one pass without noise, held against a Monte Carlo.
 
 A satellite tumbles, its star tracker is blinded for a minute, its gyro has white noise, a walking bias and flicker, errors of scale factor
-and misalignment that no filter is told of. The covariance analysis (:mod:`strapdown.covariance`) predicts the RMS error, what the filter
+and misalignment that no filter models. The covariance analysis (:mod:`strapdown.covariance`) predicts the RMS error, what the filter
 says of itself, the NEES that comes of the difference, and the part of each source. Independent runs show whether that is so: for the
-filter that matches the noise, and for one that believes a quarter of the process noise.
+filter that matches the noise, and for one that models a quarter of the process noise.
 
 Run it: ``python sims/error_budget.py --out error-budget-results`` (a minute).
 """
@@ -78,7 +78,7 @@ def compare(
         attitude = quaternion.multiply(record.truth.attitude[0], quaternion.exp(-belief.attitude_sigma * draw[:3]))
         initial = setup.initial_state(belief, attitude, record.truth.bias[0] - belief.bias_sigma * draw[3:])
         estimate = setup.run(record, belief, initial, every=every, full_covariance=True)
-        truth = setup.believed(record, belief).truth
+        truth = setup.modelled_record(record, belief).truth
         assert truth is not None
         e = consistency.errors(estimate.attitude, estimate.bias, truth.attitude[::every], truth.bias[::every])
         squares += e**2

@@ -180,13 +180,13 @@ def table(result: Result) -> str:
     ]
     for o in result.outcomes:
         hours = np.sort(o.convergence) / 3600.0
-        told = [float(o.anees[min(int(np.searchsorted(o.time, t)), len(o.time) - 1)]) for t in (360.0, 900.0, 3600.0)]
+        anees = [float(o.anees[min(int(np.searchsorted(o.time, t)), len(o.time) - 1)]) for t in (360.0, 900.0, 3600.0)]
         low, high = o.bounds
         quantiles = [hours[min(int(np.ceil(p * o.runs)) - 1, o.runs - 1)] for p in (0.5, 0.95, 1.0)]
         within = [f"{time:.3f}" if np.isfinite(time) else "never" for time in quantiles]
         lines.append(
             f"{o.filter:16s} {o.runs:5d} {100.0 * np.mean(np.isfinite(hours)):7.0f} % {within[0]:>16s} {within[1]:>7s} "
-            f"{within[2]:>7s} {told[0]:14.3g} {told[1]:9.3g} {told[2]:9.3g} {o.anees[-1]:9.3g}  {low:.3f} to {high:.3f}"
+            f"{within[2]:>7s} {anees[0]:14.3g} {anees[1]:9.3g} {anees[2]:9.3g} {o.anees[-1]:9.3g}  {low:.3f} to {high:.3f}"
         )
     return "\n".join(lines)
 

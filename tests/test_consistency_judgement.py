@@ -81,7 +81,7 @@ def test_a_bias_error_shows_in_the_errors_alone():
     assert "bias error that the start hides" in blind.limits[0]  # and it says what it cannot show
 
 
-def test_an_error_that_hardly_moves_is_not_averaged_over_the_run_and_that_is_told():
+def test_an_error_that_hardly_moves_is_not_averaged_over_the_run_and_that_is_reported():
     """A bias error that drifts by a tenth of its σ over the run is one sample, not 200."""
     result, truth = estimate()
     slow = 1e-5 * (0.6 + 0.1 * np.linspace(0.0, 1.0, 200))[:, None] * np.array([1.0, -1.0, 1.0])
@@ -94,7 +94,7 @@ def test_an_error_that_hardly_moves_is_not_averaged_over_the_run_and_that_is_tol
     assert "attitude" in averaged
 
 
-def test_sensors_that_share_an_error_are_told():
+def test_sensors_that_share_an_error_are_reported():
     judgement = consistency.judge(estimate(correlated=True)[0])
     assert [(f.name, f.of) for f in judgement.findings if f.rejected] == [("cross-correlation", "star 1 and star 2")]
 
@@ -192,10 +192,10 @@ def test_resolution_is_the_factor_that_bounds_leave():
 
 
 def test_the_summary_is_plain():
-    told = json.loads(json.dumps(consistency.judge(*estimate(1.3)).summary(), allow_nan=False))
-    assert told["verdict"] == "not consistent"
-    assert told["findings"][0]["name"] == "NIS"
-    assert told["findings"][1]["low"] is None
+    saved = json.loads(json.dumps(consistency.judge(*estimate(1.3)).summary(), allow_nan=False))
+    assert saved["verdict"] == "not consistent"
+    assert saved["findings"][0]["name"] == "NIS"
+    assert saved["findings"][1]["low"] is None
 
 
 # ------------------------------------------------------------------------------------------------------------ independent runs
@@ -217,20 +217,20 @@ def scenario():
 
 @pytest.fixture(scope="module")
 def plan():
-    believed = setup.FilterSetup(
+    filter_setup = setup.FilterSetup(
         process_noise=setup.ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6),
         attitude_sigma=2e-3,
         bias_sigma=1e-4,
     )
-    return montecarlo.Plan(scenario=scenario(), setup=believed, seed=3, epochs=20, nis_bins=10)
+    return montecarlo.Plan(scenario=scenario(), setup=filter_setup, seed=3, epochs=20, nis_bins=10)
 
 
 def statistics_of(plan, **changes):
-    believed = replace(plan.setup, **changes)
-    return montecarlo.run(plan.scenario, (believed,), runs=200, seed=3, epochs=20, nis_bins=10)[0]
+    filter_setup = replace(plan.setup, **changes)
+    return montecarlo.run(plan.scenario, (filter_setup,), runs=200, seed=3, epochs=20, nis_bins=10)[0]
 
 
-def test_right_runs_are_consistent_and_wrong_ones_are_told(plan):
+def test_right_runs_are_consistent_and_wrong_ones_are_reported(plan):
     good = consistency.judge_runs(statistics_of(plan))
     assert good.verdict == "consistent"
     assert {f.name for f in good.findings} == {"ANEES", "log-NEES", "mean error", "coverage", "NIS"}
@@ -251,7 +251,7 @@ def test_few_runs_cannot_tell(plan):
     assert consistency.judge_runs(starved).verdict == "cannot tell"
 
 
-def test_a_mean_error_is_told(plan):
+def test_a_mean_error_is_reported(plan):
     good = statistics_of(plan)
     shift = 0.5 * good.rms_error[:, 5]
     square = good.error_product_sum.copy()
@@ -288,9 +288,9 @@ def test_check_ends_with_the_status_of_the_verdict(run, tmp_path, made, status, 
     ended, said, _ = run("check", "estimate.h5", "--json", "check.json")
     assert ended == status
     assert verdict in said
-    told = json.loads((tmp_path / "check.json").read_text())
+    saved = json.loads((tmp_path / "check.json").read_text())
     assert said.splitlines()[-1].startswith("Written")
-    assert verdict.startswith(told["verdict"])
+    assert verdict.startswith(saved["verdict"])
 
 
 def test_check_uses_the_truth_in_the_file(run):

@@ -78,8 +78,8 @@ def hosking(z, lags):
 
 def test_every_statistic_of_check(run, estimated):
     said = run("check", "estimate-results/estimate.h5", "--record", "two-stars.h5", "--json", "check.json")
-    told = json.loads(Path("check.json").read_text())
-    found = {(one["name"], one["of"]): one for one in told["findings"]}
+    saved = json.loads(Path("check.json").read_text())
+    found = {(one["name"], one["of"]): one for one in saved["findings"]}
 
     def agrees(name, of, value, p, rel=1e-6):
         one = found[name, of]
@@ -229,7 +229,7 @@ def test_error_budget_of_covariance(run, tmp_path):
         for star, (reference, sigma) in stars.items():
             H = np.hstack(
                 [skew(R_bf @ np.array(reference)), np.zeros((3, 3))]
-            )  # of the whole vector: its length tells nothing
+            )  # of the whole vector: its length carries no information
             K = P @ H.T @ np.linalg.inv(H @ P @ H.T + sigma**2 * np.eye(3))
             keep = np.eye(6) - K @ H
             P = keep @ P @ keep.T + sigma**2 * K @ K.T
@@ -244,5 +244,5 @@ def test_error_budget_of_covariance(run, tmp_path):
     expected = {f"{name} random": row(S) for name, S in parts.items()}
     expected |= {"actual error all": row(sum(parts.values())), "the filter's own σ": row(P)}
     for name, values in expected.items():
-        told = re.search(rf"{name} ([\d.e-]+) ([\d.e-]+)", said)
-        assert [float(x) for x in told.groups()] == pytest.approx(values, rel=0.006), name
+        numbers = re.search(rf"{name} ([\d.e-]+) ([\d.e-]+)", said)
+        assert [float(x) for x in numbers.groups()] == pytest.approx(values, rel=0.006), name

@@ -20,7 +20,7 @@ from strapdown.cli.reading import (
     Invert,
     TimeUnit,
     Topic,
-    told,
+    given_layout,
 )
 from strapdown.cli.terminal import (
     FORMAT,
@@ -193,7 +193,7 @@ def estimate(
     writable("out", *(out / name for name in names), sources=(recording, gyro, filter_file, calibration))
     need_own(out / FILES[0], "estimate", lambda path: bool(read_attributes(path)["kind"] == "strapdown estimate"))
     units = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
-    layout = told(recording, columns=columns, topic=topic, axes=axes, invert=invert, **units)
+    layout = given_layout(recording, columns=columns, topic=topic, axes=axes, invert=invert, **units)
     specified = is_record(recording)
     _check_kind(
         recording,

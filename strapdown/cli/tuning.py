@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from strapdown.cli.reading import Axes, Invert, told
+from strapdown.cli.reading import Axes, Invert, given_layout
 from strapdown.cli.terminal import (
     FigureFormat,
     Format,
@@ -42,7 +42,7 @@ FIGURES = ("likelihood", "heldout")
 """Figures that are drawn beside the filter, by the ends of their names."""
 PRIOR_FACTOR = 3.0
 """One standard deviation of a prior, where none is given."""
-MOST_EXAMINED = 4
+MAX_EXAMINED = 4
 """Records that are looked at for what the tuned filter leaves unexplained."""
 WORSE = 1.05
 """An attitude error on the data held out that has grown by more than this is reported."""
@@ -299,7 +299,7 @@ def _examined(train: Sequence[Case], before: FilterSetup, result: Tuning) -> tup
 
     # Optional states stand for just that; and the search knows one σ a sample.
     looked = before.states is None and not _differs_by_axis(train, result.setup)
-    suspects = train[:MOST_EXAMINED] if looked else ()
+    suspects = train[:MAX_EXAMINED] if looked else ()
     examined = []
     with progress_bar("what is left unexplained", len(suspects)) as advance:
         for case in suspects:
@@ -358,7 +358,7 @@ def _cases(
         else:
             if states:
                 raise InputError(f"{path} is a recording, which specifies no errors; --states is for simulated records")
-            recording = recordings.read(path, **told(path, **layout))
+            recording = recordings.read(path, **given_layout(path, **layout))
             chosen = chosen or tuning.recording_setup()
             if recording.left_out_words:
                 console.print(recording.left_out_words)

@@ -32,7 +32,7 @@ from strapdown.records import Estimate, Truth
 
 Answer = Literal["consistent", "not consistent", "cannot tell"]
 
-LEAST_SAMPLES = 50
+MIN_SAMPLES = 50
 """Fewer innovations of one sensor are not judged for whiteness, normality and mean."""
 
 RESOLUTION = 1.5
@@ -234,7 +234,7 @@ def judge(
     error_states : sequence of str, optional
         Names of the filter's error states, where the estimate does not hold them.
     unmodelled : sequence of str, default empty
-        Errors that are specified and that the filter has no state for (:func:`strapdown.setup.not_covered`); the verdict names them.
+        Errors that are specified and that the filter has no state for (:func:`strapdown.setup.unmodelled_errors`); the verdict names them.
 
     Returns
     -------
@@ -318,7 +318,7 @@ def _of_sensor(sensor: str, white: Array, nis: Array, probability: float) -> lis
             means=innovation_words(sensor, mean),
         )
     ]
-    if samples < LEAST_SAMPLES:
+    if samples < MIN_SAMPLES:
         return findings
     statistic, number, p = ljung_box(white)
     findings.append(
@@ -367,7 +367,7 @@ def _of_pairs(estimate: Estimate) -> list[Finding]:
     for i, one in enumerate(names):
         for other in names[i + 1 :]:
             a, b = estimate.innovations[one], estimate.innovations[other]
-            if min(int(a.used.sum()), int(b.used.sum())) < LEAST_SAMPLES:
+            if min(int(a.used.sum()), int(b.used.sum())) < MIN_SAMPLES:
                 continue
             correlation, pairs, p = cross_correlation_p_value(
                 a.time[a.used], a.whitened[a.used], b.time[b.used], b.whitened[b.used]
@@ -484,7 +484,7 @@ def concluded(
     findings, limits, probability
         As those of :class:`Judgement`.
     states : sequence of str
-        States of the filter, whose power is told.
+        States of the filter, whose power is reported.
     needed : sequence of str
         Those of them whose σ the tests must be able to see for "consistent"; without any the sharpest test decides.
     unmodelled : sequence of str
@@ -512,13 +512,13 @@ def concluded(
     else:
         sharpest = resolution(marked, probability)
         unseen = [one.of for one in power if one.of in needed and not one.seen]
-        told = f"none of {len(marked)} tests contradicts the filter"
+        outcome = f"none of {len(marked)} tests contradicts the filter"
         if sharpest > RESOLUTION:
             verdict = "cannot tell"
-            reason = f"{told}, but a σ wrong by a factor of {sharpest:.2g} would not be seen either: too few samples"
+            reason = f"{outcome}, but a σ wrong by a factor of {sharpest:.2g} would not be seen either: too few samples"
         else:
             verdict = "cannot tell" if unseen else "consistent"
-            reason = f"{told}; {power_words(power)}"
+            reason = f"{outcome}; {power_words(power)}"
     if unmodelled:
         reason += f"; the filter has no state for {', '.join(unmodelled)}"
     return Judgement(
@@ -571,7 +571,7 @@ def power_words(power: Sequence[Power]) -> str:
 
 
 def resolution(findings: Iterable[Finding], probability: float) -> float:
-    """Return the factor on σ that the sharpest of the findings tells from 1: the root of the ratio of its bounds, Bonferroni and all."""
+    """Return the factor on σ that the sharpest finding distinguishes from 1: the root of the ratio of its bounds, Bonferroni included."""
     marked = list(findings)
     within = (1.0 - probability) / max(len(marked), 1)
     factors = [math.inf]

@@ -67,7 +67,7 @@ ERROR_EXPONENT = -40
 NEES_EXPONENT = -16
 """Bins of the NEES begin at 2⁻¹⁶ and end at 2²⁷."""
 SHIFT = 49
-"""The bits of a double shifted right by so much are exponent and three digits of the mantissa: its bin, but for a constant."""
+"""Right shift of a double's bits that leaves the exponent and three bits of the mantissa: its bin, up to a constant."""
 
 COVERED = (0.6826894921370859, 0.9544997361036416, 0.9973002039367398)
 """Share of a consistent filter's errors inside 1, 2, 3 σ."""
