@@ -194,7 +194,7 @@ def study(
 ) -> list[Outcome]:
     """Return the outcomes of the named filters in one case, from independent runs."""
     what = scenario(case, duration)
-    belief = ProcessNoise(angle_random_walk=what.gyro.angle_random_walk, rate_random_walk=what.gyro.rate_random_walk)
+    noise = ProcessNoise(angle_random_walk=what.gyro.angle_random_walk, rate_random_walk=what.gyro.rate_random_walk)
     every = int(what.rate)  # once a second
     errors: dict[str, list[Array]] = {name: [] for name in names}
     nees: dict[str, list[Array]] = {name: [] for name in names}
@@ -206,7 +206,7 @@ def study(
         for name in names:
             if name == "usque" and run >= unscented_runs:
                 continue
-            estimate = filters.run(name, record, belief, initial, every=every, full_covariance=True)
+            estimate = filters.run(name, record, noise, initial, every=every, full_covariance=True)
             e = consistency.errors(estimate.attitude, estimate.bias, truth.attitude[::every], truth.bias[::every])
             nees[name].append(consistency.nees(e, estimate.covariance) / 6.0)
             errors[name].append(

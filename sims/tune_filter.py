@@ -26,7 +26,7 @@ class Result:
     too_large: Tuning
     too_small: Tuning
     plan: Plan
-    """Standard errors foretold before there was a record."""
+    """Standard errors predicted before there was a record."""
     held_out: Comparison
     """The filter that was too sure, before and after, on the end of the record."""
     record: scenarios.ImuRecord

@@ -107,9 +107,7 @@ def study(name: str, *, runs: int, duration: float, seed: int) -> Outcome:
     """Return the outcome of one filter over independent runs."""
     scenario = dataclasses.replace(scenarios.load_scenario("magnetometer-only"), duration=duration)
     gyro = scenario.gyro
-    belief = ProcessNoise(
-        angle_random_walk=float(gyro.angle_random_walk), rate_random_walk=float(gyro.rate_random_walk)
-    )
+    noise = ProcessNoise(angle_random_walk=float(gyro.angle_random_walk), rate_random_walk=float(gyro.rate_random_walk))
     errors, nees, became_one = [], [], []
     first = 0
     for run in range(runs):
@@ -120,13 +118,13 @@ def study(name: str, *, runs: int, duration: float, seed: int) -> Outcome:
         assert record.truth is not None
         if name.startswith("bank"):
             found = multiple_model.run(
-                record, belief, hypotheses=int(name.rpartition(" ")[2]), bias_sigma=BIAS_SIGMA, every=EVERY
+                record, noise, hypotheses=int(name.rpartition(" ")[2]), bias_sigma=BIAS_SIGMA, every=EVERY
             )
             estimate, rows = found.estimate, found.edges
             became_one.append(found.became_one)
         else:
             initial = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=ANYWHERE, bias_sigma=BIAS_SIGMA)
-            estimate = filters.run(name, record, belief, initial, every=EVERY, full_covariance=True)
+            estimate = filters.run(name, record, noise, initial, every=EVERY, full_covariance=True)
             rows = np.arange(0, len(record.time), EVERY)
             became_one.append(0.0)
         truth = record.truth

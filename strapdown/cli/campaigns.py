@@ -131,7 +131,7 @@ def montecarlo(
         _replay(plan, replay, machine, target)
         return
     if held is not None and target == source and not (resume or overwrite):
-        status = _tell(held)
+        status = _print_result(held)
         if tables is not None and held.statistics is not None:
             written(*tables_written(tables, "montecarlo", engine.summary(held.statistics)))
         raise typer.Exit(status)
@@ -174,7 +174,7 @@ def montecarlo(
         except KeyboardInterrupt:
             console.print(f"What is finished is in {target}; go on with --resume.")
             raise
-    status = _tell(result)
+    status = _print_result(result)
     report = target.with_suffix(".json")
     content = _report(result)
     write_json(report, content)
@@ -265,7 +265,7 @@ def _judged(campaign: Campaign) -> Judgement:
     return consistency.judge_runs(campaign.statistics, unmodelled=campaign.plan.unmodelled)
 
 
-def _tell(campaign: Campaign) -> int:
+def _print_result(campaign: Campaign) -> int:
     """Show the statistics and the verdict; return the exit status."""
     from strapdown.checks import InputError
     from strapdown.cli.judgement import status_of

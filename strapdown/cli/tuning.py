@@ -208,13 +208,13 @@ def tune(
     examined, worst = _examined(train, before, result)
     if worst is not None:
         result = tuning.doubted(result, worst)
-    _tell(result, [case.record for case in cases], credible=credibility)
+    _print_result(result, [case.record for case in cases], credible=credibility)
     if found is not None:
-        _tell_gate(found)
+        _print_gate(found)
     for sentence in () if worst is None else worst.words:
         console.print(sentence)
     if comparison is not None:
-        _tell_comparison(comparison, truth=goal.by_errors or credibility)
+        _print_comparison(comparison, truth=goal.by_errors or credibility)
     _write(
         out,
         result,
@@ -400,7 +400,7 @@ def _note(one: Estimated, unit: Unit) -> str:
     return f"not identified: at most {_figure(one.upper / unit.factor)} {unit.name} (95 %)"
 
 
-def _tell(result: Tuning, records: Sequence[ImuRecord], *, credible: bool) -> None:
+def _print_result(result: Tuning, records: Sequence[ImuRecord], *, credible: bool) -> None:
     rows = table("Tuned, with 95 % intervals", "parameter", "unit", "before", "after", "from", "to", "", left=2)
     for one in result.parameters:
         unit = _unit_of(one.name, records)
@@ -429,7 +429,7 @@ def _tell(result: Tuning, records: Sequence[ImuRecord], *, credible: bool) -> No
         )
 
 
-def _tell_gate(found: TunedGate) -> None:
+def _print_gate(found: TunedGate) -> None:
     if found.gate is None:
         why = "no outliers" if not found.share.identified else "noise of two sizes rather than outliers"
         console.print(f"The records show {why}; the filter's gate is left as it was.")
@@ -450,7 +450,7 @@ def _anees(one: Performance) -> str:
     return f"{_figure(float(np.nanmean(one.nees[0].mean)))} (attitude)" if one.nees else "-"
 
 
-def _tell_comparison(comparison: Comparison, *, truth: bool) -> None:
+def _print_comparison(comparison: Comparison, *, truth: bool) -> None:
     from strapdown.report import tunings
     from strapdown.units import DEGREE
 
@@ -611,7 +611,7 @@ def _plan(
     wanted = names or list(tuning.default_names([example]))
     with progress_bar("simulated records", 4) as advance:
         found = tuning.plan(source, modelled, wanted, lengths=lengths, threads=threads, progress=advance)
-    _tell_plan(found, [example])
+    _print_plan(found, [example])
 
 
 def _numbers(text: str) -> list[float]:
@@ -623,7 +623,7 @@ def _numbers(text: str) -> list[float]:
         raise InputError(f"--length is {text!r}; it must be seconds with commas, as in 600,1800") from None
 
 
-def _tell_plan(found: Plan, records: Sequence[ImuRecord]) -> None:
+def _print_plan(found: Plan, records: Sequence[ImuRecord]) -> None:
     columns = [f"{length:g} s" for length in found.lengths]
     listing = table(
         "Least standard error, as a factor (Cramér–Rao)", "parameter", "unit", "value", *columns, "10 % needs", left=2

@@ -665,7 +665,7 @@ def _joined(parts: list[tuple[float, Estimate]], gap_events: list[Event]) -> Est
     ]
 
     def of_rows(name: str) -> Array:
-        return np.concatenate([getattr(one, name)[taken] for (_, one), taken in zip(parts, rows, strict=True)])
+        return np.concatenate([getattr(one, name)[kept] for (_, one), kept in zip(parts, rows, strict=True)])
 
     innovations = {}
     for sensor in parts[0][1].innovations:
@@ -675,11 +675,11 @@ def _joined(parts: list[tuple[float, Estimate]], gap_events: list[Event]) -> Est
             (one.time > since) & (one.time <= until)
             for one, since, until in zip(series, bounds[:-1], bounds[1:], strict=True)
         ]
-        weights = [one.weight[taken] for one, taken in zip(series, mine, strict=True) if one.weight is not None]
+        weights = [one.weight[kept] for one, kept in zip(series, mine, strict=True) if one.weight is not None]
         innovations[sensor] = Innovations(
-            time=np.concatenate([one.time[taken] for one, taken in zip(series, mine, strict=True)]),
-            innovation=np.concatenate([one.innovation[taken] for one, taken in zip(series, mine, strict=True)]),
-            variance=np.concatenate([one.variance[taken] for one, taken in zip(series, mine, strict=True)]),
+            time=np.concatenate([one.time[kept] for one, kept in zip(series, mine, strict=True)]),
+            innovation=np.concatenate([one.innovation[kept] for one, kept in zip(series, mine, strict=True)]),
+            variance=np.concatenate([one.variance[kept] for one, kept in zip(series, mine, strict=True)]),
             weight=np.concatenate(weights) if len(weights) == len(parts) else None,
         )
     events = [event for _, one in parts for event in one.events if event.kind != "gap"]
