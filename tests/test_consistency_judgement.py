@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -269,6 +270,24 @@ def test_runs_that_failed_are_not_consistent(plan):
     judged = consistency.judge_runs(replace(good, finite=finite))
     assert judged.verdict == "not consistent"
     assert "1 of 200 runs failed" in judged.words
+
+
+def test_bounds_are_those_that_decide(plan):
+    """NIS from right to wrong: the value leaves the printed bounds where Holm's procedure rejects it, not at 1 % of it alone."""
+    decided = []
+    for scale in np.linspace(1.0, 1.12, 25):
+        judgement = consistency.judge(*estimate(scale, seed=4))
+        decided += [
+            (one.low <= one.value <= one.high, one.rejected, one.p_value) for one in judgement.findings if one.is_ratio
+        ]
+    assert all(inside is not rejected for inside, rejected, _ in decided)
+    assert any(inside and p < 0.01 for inside, _, p in decided)  # alone it would have been rejected
+    for factor in (1.0, 0.97, 0.8):
+        judgement = consistency.judge_runs(statistics_of(plan, measurement_sigma_factor=factor))
+        bounded = [one for one in judgement.findings if math.isfinite(one.low)]
+        assert {one.name for one in bounded} == {"ANEES", "log-NEES", "NIS"}
+        assert all((one.low <= one.value <= one.high) is not one.rejected for one in bounded)
+        assert all(re.fullmatch(r"worst of 20 epochs \(\d+ s\)", one.at) for one in bounded if one.name != "NIS")
 
 
 # ---------------------------------------------------------------------------------------------------------------- the command

@@ -271,11 +271,11 @@ def _show_statistics(judgement: Judgement) -> None:
     for one in judgement.findings:
         bounds = f"{one.low:.4g} to {one.high:.4g}" if math.isfinite(one.low) else ""
         mark = Text("FAIL", style="red") if one.rejected else Text("pass", style="green")
-        rows.add_row(one.name, one.of, f"{one.value:.4g}", bounds, f"{one.p_value:.2g}", f"{one.samples:.4g}", mark)
+        rows.add_row(one.name, one.label, f"{one.value:.4g}", bounds, f"{one.p_value:.2g}", f"{one.samples:.4g}", mark)
     if judgement.findings:
         show(rows)
         console.print(
-            "Each p-value is that of its statistic alone; pass and FAIL take all together "
+            "Each p-value is that of its statistic alone; bounds, pass and FAIL take all together "
             f"(a right filter fails with at most {100.0 * (1.0 - judgement.probability):.2g} %). NIS and NEES are per degree of freedom."
         )
 
