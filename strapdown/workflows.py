@@ -276,7 +276,7 @@ def estimate_record(
     InputError
         If the measurements do not give the initial attitude, or fewer than ``every`` filter steps are left from the start on.
     """
-    modelled = setups.believed(record, chosen)
+    modelled = setups.modelled_record(record, chosen)
     if count("every", every) > len(modelled.increments):
         raise InputError(
             f"every is {every}, more than the {len(modelled.increments)} filter steps of the record; only the start would be kept"

@@ -257,7 +257,7 @@ def test_a_gate_that_leaves_no_turn_open_hands_nothing_over(gate):
 
 
 def test_a_second_direction_that_comes_at_once_leaves_nothing_open_and_one_that_comes_late_does():
-    """Of two directions that do not turn: the second tells the turn about the first, and it is one filter's from then on."""
+    """Of two directions that do not turn: the second measures the turn about the first, and it is one filter's from then on."""
     record, start = lost_record(1, lost=True, rate=0.0, stars=2, duration=20.0)
     late = record.vectors[1].taken(record.vectors[1].time > 10.0)
     for second, handed in ((record.vectors[1], 0), (late, 1)):
@@ -265,9 +265,9 @@ def test_a_second_direction_that_comes_at_once_leaves_nothing_open_and_one_that_
         estimate = multiple_model.run_recovering(both, NOISE, start, gate=Gate(), full_covariance=True)
         (recovery,) = events(estimate, "recovery")
         assert recovery.end < 2.0
-        told = events(estimate, "hypotheses")
-        assert len(told) == handed
-        for event in told:
+        open_part = events(estimate, "hypotheses")
+        assert len(open_part) == handed
+        for event in open_part:
             assert event.start == recovery.end
             assert 10.0 < event.end < 11.0
             assert event.value == 0.0
@@ -295,9 +295,9 @@ def one_recovery():
 
 def test_its_parts_are_the_filter_the_bank_and_the_filter_again():
     record, start, estimate = one_recovery()
-    (recovery,), (told,) = events(estimate, "recovery"), events(estimate, "hypotheses")
-    assert (told.start, told.sensor, told.value) == (recovery.end, "star 0", 0.0)
-    assert told.start < told.end < record.time[-1]
+    (recovery,), (open_part,) = events(estimate, "recovery"), events(estimate, "hypotheses")
+    assert (open_part.start, open_part.sensor, open_part.value) == (recovery.end, "star 0", 0.0)
+    assert open_part.start < open_part.end < record.time[-1]
     assert np.array_equal(estimate.time, record.time)
     before = estimation.run(record, NOISE, start, gate=Gate(), full_covariance=True)
     early = record.time < recovery.end
@@ -313,18 +313,18 @@ def test_its_parts_are_the_filter_the_bank_and_the_filter_again():
     alone = multiple_model.run(
         rest, NOISE, bias=before.bias[first], bias_sigma=sigma, gate=Gate(restart_bias_sigma=BIAS_SIGMA)
     )
-    assert alone.became_one == told.end
+    assert alone.became_one == open_part.end
     same = np.searchsorted(alone.estimate.time, record.time[~early])
     assert np.array_equal(estimate.attitude[~early], alone.estimate.attitude[same])
     assert np.array_equal(estimate.covariance[~early], alone.estimate.covariance[same])
-    at = int(np.searchsorted(record.time, told.end))
+    at = int(np.searchsorted(record.time, open_part.end))
     one = estimation.State(attitude=estimate.attitude[at], bias=estimate.bias[at], covariance=estimate.covariance[at])
     rest = records.cut(record, at, len(record.time) - 1)
     after = estimation.run(rest, NOISE, one, gate=Gate(restart_bias_sigma=BIAS_SIGMA))
     assert np.array_equal(estimate.attitude[at:], after.attitude)
 
 
-def test_each_measurement_is_told_once_and_what_was_missing_is_counted():
+def test_each_measurement_is_reported_once_and_what_was_missing_is_counted():
     record, start, estimate = one_recovery()
     (one,) = record.vectors
     there = np.isfinite(one.vector_b).all(axis=1)
@@ -356,14 +356,14 @@ def test_it_is_the_same_each_time_and_whatever_is_kept():
     assert again.covariance is None
     for name in ("attitude", "bias", "variance"):
         assert np.array_equal(getattr(again, name), getattr(estimate, name))
-    (told,) = events(estimate, "hypotheses")
+    (open_part,) = events(estimate, "hypotheses")
     coarse = multiple_model.run_recovering(record, NOISE, start, gate=Gate(), every=16)
     assert np.array_equal(coarse.time, record.time[::16])
-    mine = coarse.time <= told.end  # they become one at kept edges
+    mine = coarse.time <= open_part.end  # they become one at kept edges
     assert np.array_equal(coarse.attitude[mine], estimate.attitude[::16][mine])
     (later,) = events(coarse, "hypotheses")
-    assert later.start == told.start
-    assert told.end <= later.end <= told.end + 16 * 0.02 + 1e-9
+    assert later.start == open_part.start
+    assert open_part.end <= later.end <= open_part.end + 16 * 0.02 + 1e-9
     assert quaternion.angle_between(coarse.attitude[-1], estimate.attitude[-1]) < 0.1 * DEGREE
 
 
@@ -379,11 +379,11 @@ def test_a_second_loss_is_recovered_from_as_the_first(second):
         last.append(nees(estimate, record)[-1])
         times = [event.start for event in events(estimate, "recovery")]
         assert np.allclose(times, (15.0, second), atol=0.8)
-        told = events(estimate, "hypotheses")
-        assert told[0].start == events(estimate, "recovery")[0].end
-        assert all(event.value == 0.0 for event in told)
-        if len(told) == 1:
-            assert told[0].end > events(estimate, "recovery")[1].end
+        open_part = events(estimate, "hypotheses")
+        assert open_part[0].start == events(estimate, "recovery")[0].end
+        assert all(event.value == 0.0 for event in open_part)
+        if len(open_part) == 1:
+            assert open_part[0].end > events(estimate, "recovery")[1].end
             own += 1
         # It starts as uncertain of the bias as at first, of which one direction shows two axes at once.
         row = int(np.searchsorted(estimate.time, events(estimate, "recovery")[1].end))
@@ -399,9 +399,9 @@ def test_a_second_loss_is_recovered_from_as_the_first(second):
 def test_a_record_that_ends_before_they_are_one_says_so(rate, duration):
     record, start = lost_record(2, jumps=(15.0,), rate=rate, duration=duration)
     estimate = multiple_model.run_recovering(record, NOISE, start, gate=Gate(), full_covariance=True)
-    (recovery,), (told,) = events(estimate, "recovery"), events(estimate, "hypotheses")
-    assert (told.start, told.end) == (recovery.end, record.time[-1])
-    assert told.value > 8
+    (recovery,), (open_part,) = events(estimate, "recovery"), events(estimate, "hypotheses")
+    assert (open_part.start, open_part.end) == (recovery.end, record.time[-1])
+    assert open_part.value > 8
     assert nees(estimate, record)[-1] < 3.0
     widest = np.sqrt(np.linalg.eigvalsh(estimate.covariance[-1, :3, :3])[-1])
     assert widest > 1.0 * DEGREE if rate else widest > multiple_model.UNKNOWN
@@ -421,11 +421,11 @@ def test_the_monitor_watches_the_filters_parts():
     watched = multiple_model.run_recovering(
         record, NOISE, start, gate=Gate(), monitor=Monitor(window=5, probability=0.5)
     )
-    (told,) = events(estimate, "hypotheses")
+    (open_part,) = events(estimate, "hypotheses")
     times = [(event.start, event.end) for event in events(watched, "divergence")]
-    assert any(end <= told.start for _, end in times)
-    assert any(start > told.end for start, _ in times)
-    assert not any(start < told.end and end > told.start for start, end in times)
+    assert any(end <= open_part.start for _, end in times)
+    assert any(start > open_part.end for start, _ in times)
+    assert not any(start < open_part.end and end > open_part.start for start, end in times)
     assert np.array_equal(watched.attitude, estimate.attitude)
 
 
@@ -444,7 +444,7 @@ def test_a_part_that_begins_amid_refusals_recovers():
     """The end state of one part has six of them; the bank starts from those that this part has."""
     record, start = lost_record(3, jumps=(15.0,), duration=40.0)
     _, state = estimation.run_part(records.cut(record, 0, 778), NOISE, start, gate=Gate())
-    assert state.gate.standing["star 0"][gate_rules.IN_A_ROW] == 6.0
+    assert state.gate.counters["star 0"][gate_rules.IN_A_ROW] == 6.0
     rest = records.cut(record, 778, 2000)
     estimate = multiple_model.run_recovering(rest, NOISE, state, gate=Gate(), every=2, full_covariance=True)
     assert len(events(estimate, "recovery")) == len(events(estimate, "hypotheses")) == 1

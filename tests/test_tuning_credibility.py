@@ -121,24 +121,24 @@ def test_from_forty_times_too_large_it_knows_the_way_back():
 # --------------------------------------------------------------------------------------------------- of noise alone
 
 
-def test_the_size_of_white_noise_with_the_error_that_is_told():
+def test_the_size_of_white_noise_with_the_standard_error_that_is_reported():
     """1.3 times that of the likelihood: the error of ln σ over many records, and what the sandwich says of it."""
     random = np.random.default_rng(3)
-    errors, told = [], []
+    errors, stated = [], []
     for _ in range(25):
         one, sure = white_noise(1e-3 * random.standard_normal((400, 2)))
         objective = tuning.credibility_objective([one], sure, ["star.sigma"])
         found = tuning.fit(objective, starts=1, intervals=False)["star.sigma"]
         errors.append(np.log(found.value / 1e-3))
-        told.append(found.standard_error)
+        stated.append(found.standard_error)
     bound = 1.0 / np.sqrt(2.0 * 800)
     rms = float(np.sqrt(np.mean(np.square(errors))))
     assert bound * 0.95 < rms < 1.75 * bound
-    assert np.median(told) == pytest.approx(rms, rel=0.3)
+    assert np.median(stated) == pytest.approx(rms, rel=0.3)
     assert abs(np.mean(errors)) < 3.5 * rms / np.sqrt(25)
 
 
-def test_one_square_moves_it_by_no_more_than_is_told():
+def test_one_square_moves_it_by_no_more_than_is_documented():
     noise = 1e-3 * np.random.default_rng(1).standard_normal((400, 2))
     struck = noise.copy()
     struck[200] = 0.1  # 100 σ
@@ -359,7 +359,7 @@ def test_tune_by_credibility(run, tmp_path, truth):
         (("--credibility", "--spacing", "1"), "leave it away"),
     ],
 )
-def test_mistakes_are_told_in_one_line(run, tmp_path, arguments, complaint):
+def test_mistakes_are_reported_in_one_line(run, tmp_path, arguments, complaint):
     path = tmp_path / "sat.h5"
     recordfiles.write_record(path, scenarios.simulate(scenario(60.0), 1), gyro_spec=scenario().gyro)
     status, _, said = run("tune", path, *arguments, "-o", tmp_path / "f.toml")
@@ -367,7 +367,7 @@ def test_mistakes_are_told_in_one_line(run, tmp_path, arguments, complaint):
     assert complaint in said.replace("\n", " ")
 
 
-def test_the_constants_are_what_the_docstring_tells():
+def test_the_constants_are_what_the_docstring_says():
     """93 % and 96 % of efficiency, 2.8 and 1.75 of influence: of the best estimating function of ln σ in these components."""
     for degrees, efficiency, influence in ((1, 0.93, 2.8), (2, 0.96, 1.75)):
         nodes, weights = np.polynomial.legendre.leggauss(200)

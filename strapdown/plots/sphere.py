@@ -17,14 +17,14 @@ from strapdown.checks import Array, InputError, array
 from strapdown.files import written_beside
 from strapdown.plots.style import AXES, BLUE, STYLE, VERMILION, axes_or_new, ink, legend_above
 
-MOST_POINTS = 20_000
+MAX_POINTS = 20_000
 """Points of a drawn path; a longer one is thinned evenly."""
 
 
 NARROW = 0.35
 """Reach of a path about its mean, below which it is drawn without the sphere, beside which it could not be seen."""
 
-LEAST_REACH = 1e-6
+MIN_REACH = 1e-6
 """Half the width of the figure of an axis that stands still."""
 
 
@@ -60,7 +60,7 @@ def body_axis_on_sphere(estimated: Array, true: Array | None = None, axis: int =
         paths.insert(0, ("true", body_axis_path(true, axis), BLUE, 2.4))
     across = _plane(paths[0][1])
     for name, path, color, width in paths:
-        flat = (path @ across.T)[:: -(-len(path) // MOST_POINTS)]
+        flat = (path @ across.T)[:: -(-len(path) // MAX_POINTS)]
         ax.plot(flat[:, 0], flat[:, 1], color=color, linewidth=width, alpha=0.9, label=name)
     ax.set_aspect("equal", adjustable="datalim")
     ax.set_xlabel(f"body {AXES[axis]} axis, first component normal to its mean")
@@ -88,10 +88,10 @@ def sphere_figure(estimated: Array, true: Array | None = None, axis: int = 2) ->
         if true is not None:
             paths.insert(0, ("true", body_axis_path(true, axis), BLUE, 2.2))
         for name, path, color, width in paths:
-            few = path[:: -(-len(path) // MOST_POINTS)]
+            few = path[:: -(-len(path) // MAX_POINTS)]
             ax.plot(few[:, 0], few[:, 1], few[:, 2], color=color, linewidth=width, label=name)
         mean = paths[0][1].mean(axis=0)
-        reach = max(float(np.abs(paths[0][1] - mean).max()), LEAST_REACH)
+        reach = max(float(np.abs(paths[0][1] - mean).max()), MIN_REACH)
         narrow = reach < NARROW
         if not narrow:
             _wire(ax)
@@ -164,7 +164,7 @@ def animate_body_axis(
 
     def draw(frame: int) -> list[Any]:
         end = ends[frame]
-        step = -(-end // MOST_POINTS)
+        step = -(-end // MAX_POINTS)
         for line, way in zip(lines, ways, strict=True):
             line.set_data_3d(*way[:end:step].T)
         tip.set_data_3d(*ways[-1][end - 1 : end].T)

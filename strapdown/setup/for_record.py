@@ -105,7 +105,7 @@ def matched_to_scenario(scenario: Scenario, *, states: bool | None = None) -> Fi
         Setup whose noise model, and error states if there are any, are those of the scenario.
     """
     if states is None:
-        states = bool(setup.not_covered(scenario.gyro, scenario.sensors, gravity_f=scenario.gravity_f))
+        states = bool(setup.unmodelled_errors(scenario.gyro, scenario.sensors, gravity_f=scenario.gravity_f))
     found = setup.matched(scenario, states=states)
     if states and (found.states is None or not found.states.names):
         return setup.matched(scenario)
@@ -131,9 +131,9 @@ def unmodelled_errors(record: ImuRecord, chosen: FilterSetup) -> tuple[str, ...]
     if origin.gyro is None:
         return ()
     if origin.scenario is None:
-        return setup.not_covered(origin.gyro, (), chosen.states)
+        return setup.unmodelled_errors(origin.gyro, (), chosen.states)
     scenario = origin.scenario
-    return setup.not_covered(origin.gyro, scenario.sensors, chosen.states, gravity_f=scenario.gravity_f)
+    return setup.unmodelled_errors(origin.gyro, scenario.sensors, chosen.states, gravity_f=scenario.gravity_f)
 
 
 class Start(NamedTuple):
@@ -163,7 +163,7 @@ def start(record: ImuRecord, chosen: FilterSetup) -> Start:
     Parameters
     ----------
     record : ImuRecord
-        As the filter processes it (:func:`strapdown.setup.believed`).
+        As the filter processes it (:func:`strapdown.setup.modelled_record`).
     chosen : FilterSetup
         Filter whose gyro noise and initial bias σ are applied.
 

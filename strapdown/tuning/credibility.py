@@ -47,7 +47,7 @@ ORDER = 4
 FAR = 1.0
 """Mean of ln(1 + x/d) so far from its own that all transforms are near 0 or 1, which know no way back: a square of what lies beyond leads
 there, and is nothing where it ends."""
-LEAST_BLOCKS = 10
+MIN_BLOCKS = 10
 """Blocks of a size that are judged, at least; of all records together."""
 CURVATURE_STEP = 0.05
 """Of a log parameter, for second derivatives."""
@@ -179,7 +179,7 @@ class CredibilityObjective(Composite):
                 (*found[key], before) for found, before in zip(per_record, first[:-1], strict=True) if key in found
             ]
             squares = np.concatenate([x for x, _, _ in having])
-            if len(squares) < LEAST_BLOCKS:
+            if len(squares) < MIN_BLOCKS:
                 continue
             name, length, degrees = key
             yield Sample(
@@ -250,6 +250,6 @@ def credibility_objective(
     if not any(True for _ in objective.samples(base.start[None])):
         what = "epochs with a truth" if truth else "measurements of one sensor"
         raise InputError(
-            f"the records have fewer than {LEAST_BLOCKS} {what}, too few to judge a distribution by; give longer ones"
+            f"the records have fewer than {MIN_BLOCKS} {what}, too few to judge a distribution by; give longer ones"
         )
     return objective

@@ -38,13 +38,13 @@ INCONSISTENT = 6.0
 LARGEST_UNCERTAINTY = 1.0
 """A 1σ of the attitude, rad, beyond which a direction of it counts as undetermined (a uniform angle has 1.8)."""
 
-LEAST_ANGLE = 1e-6
+MIN_ANGLE = 1e-6
 """Smallest angle between two directions and one line, rad, where no σ is given to judge by."""
 
-LEAST_HORIZONTAL_ANGLE = 1e-3
+MIN_HORIZONTAL_ANGLE = 1e-3
 """Angle between magnetic field and vertical, rad, below which there is no heading."""
 
-LEAST_WEIGHT = 1e-12
+MIN_WEIGHT = 1e-12
 """Weights 1/σ² below this part of the largest are lifted to it in the matrices that the methods start from: doubles hold no more."""
 
 ROUNDING = 1e-15
@@ -95,8 +95,8 @@ def triad(
     if sigmas is not None:
         sigma = _sigmas(sigmas, (2,))
         _refuse_inconsistent(_stacked(first_b, second_b), _stacked(first_f, second_f), sigma)
-    _refuse_parallel("primary_b", "secondary_b", first_b, second_b, LEAST_ANGLE)
-    _refuse_parallel("primary_f", "secondary_f", first_f, second_f, LEAST_ANGLE)
+    _refuse_parallel("primary_b", "secondary_b", first_b, second_b, MIN_ANGLE)
+    _refuse_parallel("primary_f", "secondary_f", first_f, second_f, MIN_ANGLE)
     return _triad(first_b, second_b, first_f, second_f)
 
 
@@ -128,7 +128,7 @@ def triad_covariance(
     about u and about e, ``(σ₂² + c² σ₁²)/s²`` about b₁, and ``c σ₁²/s`` between b₁ and u (Shuster & Oh 1981, in other letters).
     """
     first, second = _directions("primary_b", primary_b), _directions("secondary_b", secondary_b)
-    _refuse_parallel("primary_b", "secondary_b", first, second, LEAST_ANGLE)
+    _refuse_parallel("primary_b", "secondary_b", first, second, MIN_ANGLE)
     sigma = _sigmas([primary_sigma, secondary_sigma], (2,))
     axes = _frame(first, second)
     cosine = np.sum(first * second, axis=-1)
@@ -164,7 +164,7 @@ def from_vertical_and_heading(up_b: ArrayLike, magnetic_b: ArrayLike) -> Array:
         If a vector is zero or not finite, or the field is vertical.
     """
     up, field = _directions("up_b", up_b), _directions("magnetic_b", magnetic_b)
-    _refuse_parallel("up_b", "magnetic_b", up, field, LEAST_HORIZONTAL_ANGLE)
+    _refuse_parallel("up_b", "magnetic_b", up, field, MIN_HORIZONTAL_ANGLE)
     return _triad(up, field, np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]))
 
 
@@ -288,7 +288,7 @@ def solve(
     _refuse_undetermined("vectors_b", b, sigma)
 
     # The best known direction has weight 1: only ratios matter. What the floor moves the Gauss–Newton steps move back.
-    weight = np.maximum(np.square(np.min(sigma, axis=-1, keepdims=True) / sigma), LEAST_WEIGHT)
+    weight = np.maximum(np.square(np.min(sigma, axis=-1, keepdims=True) / sigma), MIN_WEIGHT)
     attitude = _METHODS[method](b, r, weight)
     if refine:
         attitude = _refined(attitude, b, r, sigma)
