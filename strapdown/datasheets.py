@@ -143,13 +143,6 @@ def _shaped(name: str, number: float) -> float | Array:
     return number
 
 
-def express(name: str, value: float, unit: str) -> float:
-    """Return an SI value of one of the sheet's quantities in another unit: ``express("arw", spec.angle_random_walk, "deg/sqrt(h)")``."""
-    one_of("quantity", name, _QUANTITIES)
-    _, wanted, example = _QUANTITIES[name]
-    return float(value) / parse(name, f"1 {unit}", wanted, example)
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Preset:
     """A gyro on the market, by its public data sheet.

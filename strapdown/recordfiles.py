@@ -388,34 +388,6 @@ def _write_csv(path: Path, comment: str, names: tuple[str, ...], rows: Array) ->
         np.savetxt(file, rows, delimiter=",", fmt="%.17g")
 
 
-def import_csv(path: str | os.PathLike[str]) -> ImuRecord:
-    """Read a record written by :func:`export_csv`, with the vector series in the same folder.
-
-    Parameters
-    ----------
-    path : path-like
-        File.
-
-    Returns
-    -------
-    ImuRecord
-        The record.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or of another kind, does not reach the time stated in its first line, or a row is cut short, holds no
-        number or no increment (the message names its line).
-
-    Notes
-    -----
-    Measurements of NaN are missing. An increment must not be NaN: the rotation over an interval without one is unknown. If a row is
-    left out, the next one must hold the rotation over both intervals.
-    """
-    with reading.from_file(path):
-        return _read_csv_record(Path(path)).record
-
-
 def _read_csv_record(target: Path) -> RecordFile:
     comment, names, rows = _read_csv(target)
     if not comment.startswith(f"{_MARK} record"):

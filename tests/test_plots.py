@@ -275,18 +275,6 @@ def test_the_sphere_is_drawn_for_wide_paths_only(angle):
     assert (len(figure.axes[0].lines) > 2) == (angle > 0.35)
 
 
-def test_an_animation_is_written_whole(tmp_path):
-    from PIL import Image
-
-    attitude = motion.Coning(angle=0.5, frequency=0.5).attitude(np.linspace(0.0, 2.0, 50))
-    target = plots.animate_body_axis(tmp_path / "cone.gif", attitude, frames=5)
-    with Image.open(target) as image:
-        assert image.n_frames == 5
-    with pytest.raises(InputError, match=r"\.gif or \.mp4"):
-        plots.animate_body_axis(tmp_path / "cone.avi", attitude)
-    assert [path.name for path in tmp_path.iterdir()] == ["cone.gif"]
-
-
 @pytest.mark.parametrize(("theme", "ground"), [("light", "#ffffff"), ("dark", "#16181d")])
 def test_both_themes_keep_ink_apart_from_the_ground(theme, ground, statistics):
     with plots.theme(theme):

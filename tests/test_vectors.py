@@ -420,24 +420,6 @@ def test_the_dipole_has_no_divergence_and_no_curl_and_points_north_at_the_equato
     np.testing.assert_allclose(orbit.dipole_field([0.0, 0.0, orbit.EARTH_RADIUS]), [0.0, 0.0, -5.96e-5], atol=1e-12)
 
 
-@pytest.mark.parametrize("phase", [0.0, 2.0, -3.0])
-@pytest.mark.parametrize("sun", [[1.0, 0.0, 0.0], [0.3, -0.9, 0.5], [-1.0, 2.0, 0.0]])
-def test_eclipses_are_where_the_earth_hides_the_sun(sun, phase):
-    path = orbit.CircularOrbit(inclination=1.0, phase=phase)
-    windows = path.eclipses(sun, 100.0, 15_000.0)
-    time = np.linspace(100.0, 15_000.0, 20_001)
-    r, s = path.position(time), np.array(sun) / np.linalg.norm(sun)
-    along = r @ s
-    hidden = (along < 0.0) & (np.linalg.norm(r - along[:, None] * s, axis=1) < orbit.EARTH_RADIUS)
-    told = np.any([(time >= a) & (time <= b) for a, b in windows], axis=0)
-    assert np.sum(told != hidden) <= 2 * len(windows)
-    assert len(windows) == 0 if sun[1] == -0.9 else 2 <= len(windows) <= 4
-
-
-def test_an_orbit_along_the_terminator_has_no_eclipse():
-    assert orbit.CircularOrbit(inclination=np.pi / 2).eclipses([0.0, 1.0, 0.0], 0.0, 1e4) == ()
-
-
 @pytest.mark.parametrize(("field", "kind"), [([0.0, 0.0, 0.0], "direction"), ([0.0, 0.0, 5e-5], "heading")])
 def test_a_field_without_a_direction_is_told(field, kind):
     with pytest.raises(InputError, match=r"compass: .*field_f is zero, which has no direction"):

@@ -19,11 +19,9 @@
 """
 
 from strapdown.consistency.accuracy import Distribution as Distribution
-from strapdown.consistency.accuracy import Efficiency as Efficiency
 from strapdown.consistency.accuracy import ReferenceErrors as ReferenceErrors
 from strapdown.consistency.accuracy import convergence_time as convergence_time
 from strapdown.consistency.accuracy import distribution as distribution
-from strapdown.consistency.accuracy import efficiency as efficiency
 from strapdown.consistency.accuracy import reference_errors
 from strapdown.consistency.bounds import Coverage as Coverage
 from strapdown.consistency.bounds import Verdict as Verdict

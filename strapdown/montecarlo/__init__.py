@@ -39,7 +39,6 @@ from strapdown.montecarlo.statistics import Replay as Replay
 from strapdown.montecarlo.statistics import Statistics
 from strapdown.montecarlo.statistics import judged_epochs as judged_epochs
 from strapdown.montecarlo.statistics import merge as merge
-from strapdown.montecarlo.statistics import merge_all as merge_all
 from strapdown.montecarlo.verdicts import summary
 from strapdown.setup import FilterSetup as FilterSetup
 

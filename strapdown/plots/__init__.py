@@ -13,7 +13,7 @@ Colours are those of Okabe and Ito, which every kind of colour vision can tell a
 ``statistics``
     Error statistics over many runs.
 ``sphere``
-    The path of a body axis on the unit sphere, still or animated.
+    The path of a body axis on the unit sphere.
 ``coning``
     The coning study.
 ``allan``
@@ -38,7 +38,6 @@ from strapdown.plots.estimates import recording_errors as recording_errors
 from strapdown.plots.innovations import error_distribution, innovation_autocorrelation, nis_over_record
 from strapdown.plots.innovations import innovation_histogram as innovation_histogram
 from strapdown.plots.innovations import innovation_quantiles as innovation_quantiles
-from strapdown.plots.sphere import animate_body_axis as animate_body_axis
 from strapdown.plots.sphere import body_axis_on_sphere
 from strapdown.plots.sphere import sphere_figure as sphere_figure
 from strapdown.plots.statistics import covariance_ellipses as covariance_ellipses

@@ -1,9 +1,7 @@
-"""The path of a body axis on the unit sphere of the fixed frame, still or animated."""
+"""The path of a body axis on the unit sphere of the fixed frame."""
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
 from typing import Any
 
 import matplotlib
@@ -14,7 +12,6 @@ from matplotlib.ticker import MaxNLocator
 
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, array
-from strapdown.files import written_beside
 from strapdown.plots.style import AXES, BLUE, STYLE, VERMILION, axes_or_new, ink, legend_above
 
 MOST_POINTS = 20_000
@@ -128,49 +125,3 @@ def _dress(ax: Any, axis: int, centre: Array, reach: float) -> None:
     ax.grid(visible=False)
     ax.tick_params(labelsize="small")
     ax.set_title(f"Direction of the body {AXES[axis]} axis in the fixed frame", loc="left")
-
-
-def animate_body_axis(
-    path: str | os.PathLike[str],
-    estimated: Array,
-    true: Array | None = None,
-    axis: int = 2,
-    *,
-    frames: int = 120,
-    frames_per_second: int = 24,
-) -> Path:
-    """Write an animation of a body axis moving over the unit sphere, GIF or (where ffmpeg is installed) MP4 by the suffix.
-
-    Raises
-    ------
-    InputError
-        If the suffix is another, or MP4 is asked for without ffmpeg.
-    """
-    from matplotlib import animation
-
-    target = Path(path)
-    writers = {".gif": "pillow", ".mp4": "ffmpeg"}
-    if target.suffix.lower() not in writers:
-        raise InputError(f"{target} ends in {target.suffix!r}; an animation is .gif or .mp4")
-    writer = writers[target.suffix.lower()]
-    if not animation.writers.is_available(writer):
-        raise InputError(f"{target}: writing it needs {writer}; install it, or write a .gif")
-    figure = sphere_figure(estimated, true, axis)
-    ax: Any = figure.axes[0]
-    ways = [body_axis_path(a, axis) for a in ((true, estimated) if true is not None else (estimated,))]
-    lines = ax.lines[-len(ways) :]
-    (tip,) = ax.plot([], [], [], "o", color=ink(), markersize=4)
-    ends = np.linspace(1, len(ways[-1]), frames).astype(int)
-
-    def draw(frame: int) -> list[Any]:
-        end = ends[frame]
-        step = -(-end // MOST_POINTS)
-        for line, way in zip(lines, ways, strict=True):
-            line.set_data_3d(*way[:end:step].T)
-        tip.set_data_3d(*ways[-1][end - 1 : end].T)
-        return [*lines, tip]
-
-    moving = animation.FuncAnimation(figure, draw, frames=frames, blit=False)
-    with written_beside(target) as temporary:
-        moving.save(temporary, writer=writer, fps=frames_per_second, dpi=90)
-    return target

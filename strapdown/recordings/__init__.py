@@ -57,7 +57,6 @@ from strapdown.recordings.recording import TIME_UNITS as TIME_UNITS
 from strapdown.recordings.recording import Recording, gaps
 from strapdown.recordings.recording import increments as increments
 from strapdown.recordings.samples import GyroSamples, read_samples
-from strapdown.recordings.samples import read_gyro as read_gyro
 from strapdown.recordings.samples import samples_of as samples_of
 from strapdown.recordings.trajectories import read_euroc as read_euroc
 from strapdown.recordings.trajectories import read_tum as read_tum
