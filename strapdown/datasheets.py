@@ -52,14 +52,9 @@ def _registry() -> Any:
 
 
 def parse(name: str, text: str, wanted: str, example: str = "") -> float:
-    """Return a quantity given as text, in the unit ``wanted``.
+    """Return a quantity given as text, in the unit ``wanted``; another dimension is refused.
 
     Understands pint's syntax, ``sqrt(…)``, √ and °; ``h`` is the hour, ``g`` standard gravity and ``Hz`` 1/s.
-
-    Raises
-    ------
-    InputError
-        If the text is not a quantity, or has another dimension; the message names both.
     """
     registry = _registry()
     if not isinstance(text, str):

@@ -90,23 +90,7 @@ class CircularOrbit:
 
 
 def dipole_field(position_f: ArrayLike) -> Array:
-    """Return the magnetic field of the axial dipole, whose south magnetic pole lies in the north.
-
-    Parameters
-    ----------
-    position_f : array_like (..., 3)
-        Positions from the centre of the earth, m, z to the north pole.
-
-    Returns
-    -------
-    ndarray (..., 3)
-        Field, T, fixed frame.
-
-    Examples
-    --------
-    >>> dipole_field([EARTH_RADIUS, 0.0, 0.0]).tolist()  # north at the equator
-    [0.0, 0.0, 2.98e-05]
-    """
+    """Return the field (..., 3), T, of the axial dipole, whose south pole lies in the north, at positions (..., 3), m."""
     r = array("position_f", position_f, (..., 3))
     distance = np.linalg.norm(r, axis=-1, keepdims=True)
     up = r / distance

@@ -43,13 +43,7 @@ def is_folder(path: Path) -> bool:
 
 
 def read_euroc(path: str | os.PathLike[str]) -> Recording:
-    """Read a folder of EuRoC or TUM-VI: the inertial unit, and ground truth where there is some.
-
-    Raises
-    ------
-    InputError
-        If there is no ``imu0/data.csv``, or a file of the folder is damaged.
-    """
+    """Read a folder of EuRoC or TUM-VI: the inertial unit, and ground truth where there is some."""
     folder = Path(path)
     root = _root(folder)
     if root is None:
@@ -71,20 +65,7 @@ def _read_truth(path: Path) -> tuple[NDArray[np.int64], Array]:
 
 
 def read_tum(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], Array]:
-    """Read the attitudes of a TUM trajectory.
-
-    Returns
-    -------
-    stamps : (n,) int
-        ns.
-    attitude : (n, 4)
-        Unit quaternions, scalar first.
-
-    Raises
-    ------
-    InputError
-        If a row has not eight numbers.
-    """
+    """Read stamps (n,), ns, and unit quaternions (n, 4), scalar first, of a TUM trajectory."""
     file = Path(path)
     rows = _rows(file, None)
     for k, row in enumerate(rows):

@@ -230,20 +230,7 @@ class CredibilityObjective(Composite):
 def credibility_objective(
     cases: Sequence[Case], chosen: FilterSetup, free: Sequence[str], *, truth: bool = False, threads: int = 1
 ) -> CredibilityObjective:
-    """Return the objective of consistency.
-
-    Parameters
-    ----------
-    cases : sequence of Case
-    chosen : FilterSetup
-        Where the free parameters start, and what the fixed ones are; gates and robust weights of it are not applied.
-    free : sequence of str
-        Names of :mod:`strapdown.tuning.parameters`.
-    truth : bool
-        Judge the NEES against the records' truth rather than the NIS. Against a reference attitude beside the record only the attitude's.
-    threads : int
-        Records that are worked on at once.
-    """
+    """Return the objective of consistency: of the NIS, or with ``truth`` of the NEES against the records' truth or reference attitude."""
     errors = error_objective(cases, chosen, free, threads=threads) if truth else None
     base = errors.base if errors is not None else likelihood(cases, chosen, free, threads=threads)
     objective = CredibilityObjective(base=base, errors=errors)

@@ -98,19 +98,10 @@ def error_objective(
     measure: Measure = "likelihood",
     threads: int = 1,
 ) -> ErrorObjective:
-    """Return the objective that judges the filter by its errors.
+    """Return the objective that judges the filter by its errors on records with a truth, or a reference attitude: then only the attitude.
 
-    Parameters
-    ----------
-    cases : sequence of Case
-        Records with a truth of their own, or with a reference attitude beside them; then only the attitude is judged.
-    chosen : FilterSetup
-    free : sequence of str
-    measure : "likelihood" or "rmse"
-        The likelihood of the errors under the filter's covariance asks that they be small and that the filter know how small;
-        the root mean square of the attitude error asks for the first alone, and does not determine a common scale of all parameters.
-    threads : int
-        Records that are worked on at once.
+    The likelihood of the errors under the filter's covariance asks that they be small and that the filter know how small; the root mean
+    square of the attitude error asks for the first alone, and does not determine a common scale of all parameters.
     """
     one_of("measure", measure, ("likelihood", "rmse"))
     base = likelihood(cases, chosen, free, threads=threads)

@@ -73,15 +73,10 @@ def run(
     full_covariance: bool = False,
     gains: Gains | None = None,
 ) -> Estimate:
-    """Run the filter over a whole record, compiled.
+    """Run the filter over a whole record, compiled; options as :func:`strapdown.estimation.filters.run`.
 
-    Parameters
-    ----------
-    record, process_noise, initial, every, full_covariance
-        As :func:`strapdown.estimation.filters.run`.
-    gains : Gains, optional
-        Default: Farrenkopf's of all sensors together, shared among them by information, for random walks that also carry attitude and bias
-        through their initial standard deviations over the record.
+    Default gains: Farrenkopf's of all sensors together, shared among them by information, for random walks that also carry attitude and
+    bias through their initial standard deviations over the record: a gain that is fixed must serve the start as well as the end.
     """
     events = extended.checked_schedule(record, process_noise, initial, every)
     if gains is not None:

@@ -122,16 +122,7 @@ class Own:
         return Own, (self.given,)
 
     def __call__(self, record: ImuRecord, initial: State, *, times: Array | None = None) -> Estimate:
-        """Run it over a record and check what it returns.
-
-        Parameters
-        ----------
-        record : ImuRecord
-            The truth is taken out before the filter sees it.
-        initial : State
-        times : array, optional
-            Times wanted, of the record's edges; default: those that the filter returns.
-        """
+        """Run it over a record without its truth, and check what it returns; only the ``times`` wanted, of the record's edges, if given."""
         if isinstance(self.given, Mapping):
             raise InputError(
                 f"{self.name} is a filter of your own, whose code no file holds; in Python, give it again: "
