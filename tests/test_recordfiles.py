@@ -8,9 +8,11 @@ import pytest
 from hdf5 import changed
 
 import strapdown
-from strapdown import reading, recordfiles, scenarios, vectors
+from strapdown import scenarios, vectors
 from strapdown.checks import InputError
-from strapdown.recordfiles import export_csv, read_record, read_record_file, write_record
+from strapdown.files import reading
+from strapdown.recordings import recordfiles
+from strapdown.recordings.recordfiles import export_csv, read_record, read_record_file, write_record
 from strapdown.records import ImuRecord
 
 FAULTS = vectors.Faults(latency=0.05, outages=[(0.5, 0.7)])
@@ -187,8 +189,8 @@ def test_foreign_and_damaged_csv_is_refused(made, tmp_path):
     export_csv(path, made[1])
     lines = path.read_text().splitlines()
     for content, message in (
-        ("", "does not begin"),
-        ("a,b\n1,2\n", "does not begin"),
+        ("", "cannot be read as HDF5"),
+        ("a,b\n1,2\n", "cannot be read as HDF5"),
         ("\n".join([lines[0], "time_s,x", "1,2"]), "columns"),
         ("\n".join([*lines[:5], lines[5][:40]]), "line 6"),
         ("\n".join([*lines[:4], lines[4].replace(lines[4].split(",")[2], "abc")]), "line 5"),
