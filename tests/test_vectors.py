@@ -20,7 +20,6 @@ from strapdown.vectors import (
     VectorMeasurements,
     VectorSensor,
     specific_force,
-    star_directions,
     triad,
 )
 
@@ -182,14 +181,6 @@ def test_an_accelerometer_off_the_centre_errs_by_the_acceleration():
     assert np.all(series.vector_b[:, 0] < 0.0)
     biased = observe(Accelerometer(name="a", sigma=0.0, rate=5.0, bias=[0.1, 0.0, 0.0], kind="vector"), motion.rest())
     np.testing.assert_allclose(biased.vector_b, np.tile([0.1, 0.0, 9.80665], (250, 1)), atol=1e-12)
-
-
-def test_star_directions_see_several_stars_at_the_same_times():
-    stars = star_directions("tracker", np.eye(3), sigma=1e-4, rate=2.0, faults=Faults(outages=[(3.0, 4.0)]))
-    series = [observe(star) for star in stars]
-    assert [s.sensor for s in series] == ["tracker 1", "tracker 2", "tracker 3"]
-    assert all(np.array_equal(s.time, series[0].time) for s in series)
-    assert not np.array_equal(series[0].vector_b, series[1].vector_b)
 
 
 def test_an_attitude_sensor_is_coarse_about_its_boresight():

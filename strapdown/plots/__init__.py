@@ -12,8 +12,6 @@ Colours are those of Okabe and Ito, which every kind of colour vision can tell a
     Innovations of one record: NIS, distribution, autocorrelation.
 ``statistics``
     Error statistics over many runs.
-``sphere``
-    The path of a body axis on the unit sphere.
 ``coning``
     The coning study.
 ``allan``
@@ -38,8 +36,6 @@ from strapdown.plots.estimates import recording_errors as recording_errors
 from strapdown.plots.innovations import error_distribution, innovation_autocorrelation, nis_over_record
 from strapdown.plots.innovations import innovation_histogram as innovation_histogram
 from strapdown.plots.innovations import innovation_quantiles as innovation_quantiles
-from strapdown.plots.sphere import body_axis_on_sphere
-from strapdown.plots.sphere import sphere_figure as sphere_figure
 from strapdown.plots.statistics import covariance_ellipses as covariance_ellipses
 from strapdown.plots.statistics import coverage_by_state as coverage_by_state
 from strapdown.plots.statistics import fan as fan
@@ -57,7 +53,6 @@ from strapdown.plots.style import theme as theme
 
 __all__ = [
     "allan_overview",
-    "body_axis_on_sphere",
     "draw_coning_study",
     "error_budget",
     "error_distribution",
