@@ -601,26 +601,9 @@ def flicker_variance(multiples: ArrayLike) -> Array:
 
 
 def model_deviation(parameters: Mapping[str, float], taus: ArrayLike, sample_interval: float) -> dict[str, Array]:
-    """Return the Allan deviation of each noise term and of their sum.
+    """Return the Allan deviation (t,), rad/s, of each noise term and of their sum, ``"total"``, at ``taus``, s.
 
-    Parameters
-    ----------
-    parameters : mapping of str to float
-        Coefficients, SI, by name in :data:`TERMS`; absent ones are zero.
-    taus : array_like (t,)
-        Averaging times, s.
-    sample_interval : float
-        Sample interval, s.
-
-    Returns
-    -------
-    dict of str to ndarray (t,)
-        Allan deviations, rad/s, by term, and ``"total"``.
-
-    Examples
-    --------
-    >>> model_deviation({"angle_random_walk": 3e-5}, [1.0, 9.0], 0.01)["total"].round(9).tolist()
-    [3e-05, 1e-05]
+    ``parameters`` are coefficients, SI, by name in :data:`TERMS`; absent ones are zero.
     """
     checks.known_keys("parameters", parameters, TERMS)
     tau = checks.array("taus", taus, ("t",))

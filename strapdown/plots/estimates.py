@@ -160,20 +160,7 @@ def estimate_overview(estimate: Estimate, *, title: str = "", fixed_frame: str =
 
 
 def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:
-    """Draw the optional error states over time inside their ±3σ, one axes for each block and unit.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        With error states.
-    title : str
-        Of the figure.
-
-    Returns
-    -------
-    Figure
-        Panels over one time axis, in the order of the blocks.
-    """
+    """Draw the error states of an estimate over time inside their ±3σ, one axes for each declaration and unit, in their order."""
     panels = [
         (name, block, unit, [k for k, one in enumerate(block.units) if one == unit])
         for name, block in estimate.error_states.items()

@@ -223,17 +223,7 @@ def increments(recording: Recording) -> Array:
 
 
 def gaps(time: ArrayLike) -> list[tuple[float, float]]:
-    """Return the gaps between stamps, where the motion is unknown.
-
-    Parameters
-    ----------
-    time : array_like (n,)
-        Stamps, s, increasing.
-
-    Returns
-    -------
-    list of (float, float)
-        Begin and length of each gap, s: intervals of more than five usual ones.
+    """Return begin and length, s, of each gap between stamps: intervals of more than five usual ones.
 
     Examples
     --------

@@ -105,29 +105,7 @@ def read_samples(
 def samples_of(
     content: Recording | ImuRecord, sensor: str = "gyro", *, gaps: bool = False, source: str = "record"
 ) -> GyroSamples:
-    """Return the samples of one sensor of a recording or a simulated record, as :func:`read_samples` for its file.
-
-    Parameters
-    ----------
-    content : Recording or ImuRecord
-        Source of the samples.
-    sensor : {"gyro", "accelerometer", "magnetometer"}, default "gyro"
-        Sensor.
-    gaps : bool, default False
-        Whether gaps are allowed: missing samples are then rows of NaN.
-    source : str, default "record"
-        Name of a record, for messages; a recording has its own.
-
-    Returns
-    -------
-    GyroSamples
-        Samples at even intervals.
-
-    Raises
-    ------
-    InputError
-        If the sensor is missing, its unit is unknown, or its samples lie at uneven intervals.
-    """
+    """Return the samples of one sensor of a recording or a simulated record, as :func:`read_samples` for its file."""
     one_of("sensor", sensor, SENSORS)
     if isinstance(content, Recording):
         return _of_recording(content, sensor, gaps)
@@ -213,6 +191,3 @@ def _grid(source: str, time: Array) -> tuple[float, np.ndarray, tuple[str, ...]]
     if missing:
         words += (f"{missing} samples are missing in {int(np.sum(whole > 1.0))} gaps.",)
     return interval, place, words
-
-
-__all__ = ["GyroSamples", "read_samples", "samples_of"]

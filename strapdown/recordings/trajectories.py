@@ -136,25 +136,7 @@ def _whole(path: Path, cells: list[str], factor: int) -> NDArray[np.int64]:
 
 
 def with_reference(recording: Recording, path: str | os.PathLike[str]) -> Recording:
-    """Return a recording with the attitudes of a TUM trajectory as its reference.
-
-    Parameters
-    ----------
-    recording : Recording
-        Recording.
-    path : path-like
-        Trajectory in TUM format, of the same clock and body axes.
-
-    Returns
-    -------
-    Recording
-        Recording with ``true_attitude``.
-
-    Raises
-    ------
-    InputError
-        If the file is not a trajectory, or none of its stamps lies within the recording.
-    """
+    """Return a recording with the attitudes of a TUM trajectory, of the same clock and body axes, as its reference."""
     stamps, attitude = read_tum(path)
     return _with_reference(recording, stamps, attitude, Path(path).name)
 

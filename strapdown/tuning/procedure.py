@@ -15,8 +15,6 @@ from strapdown.tuning.innovations import Case, likelihood
 from strapdown.tuning.outliers import TunedGate, contaminated_likelihood, tuned_gate
 from strapdown.tuning.parameters import Prior, axis_of, default_names
 
-__all__ = ["GATED", "Tuned", "objective_for", "tune"]
-
 GATED = ("gate.probability", "outliers.share", "outliers.scale")
 """Names of parameters that ask for a model of outliers."""
 
@@ -50,37 +48,11 @@ def objective_for(
     spacing: float = 0.0,
     threads: int = 1,
 ) -> Objective:
-    """Return the objective of a tuning: by default the likelihood of the innovations.
+    """Return the objective of a tuning, for :func:`fit`: by default the likelihood of the innovations.
 
-    Parameters
-    ----------
-    cases : sequence of Case
-        Records with their initial states.
-    setup : FilterSetup
-        The filter to start from; with error states, or with a σ of one axis in ``names``, the likelihood is that of
-        :mod:`strapdown.tuning.extended`.
-    names : sequence of str
-        Parameters to tune.
-    truth : bool, default False
-        The likelihood of the errors against the truth.
-    rmse : bool, default False
-        The RMS attitude error against the truth.
-    gate : bool, default False
-        Model outliers too, their share and scale.
-    spacing : float, default 0
-        Least time between the samples of a sensor that are used, s.
-    threads : int, default 1
-        Records filtered at once.
-
-    Returns
-    -------
-    Objective
-        Function of the logarithms of the parameters, for :func:`fit`.
-
-    Raises
-    ------
-    InputError
-        If options exclude each other, or a parameter is unknown.
+    With error states, or with a σ of one axis in ``names``, it is that of :mod:`strapdown.tuning.extended`; ``truth`` that of the errors
+    against the truth, ``rmse`` the RMS attitude error, ``gate`` one that models outliers too. ``spacing`` is the least time between the
+    samples of a sensor that are used, s.
     """
     non_negative("spacing", spacing, unit="s")
     if rmse and truth:
