@@ -492,16 +492,8 @@ def concluded(
 ) -> Judgement:
     """Return the verdict that findings lead to, all taken together; what each was before, rejected or not, does not count.
 
-    Parameters
-    ----------
-    findings, limits, probability
-        As those of :class:`Judgement`.
-    states : sequence of str
-        States of the filter, whose power is reported.
-    needed : sequence of str
-        Those of them whose σ the tests must be able to see for "consistent"; without any the sharpest test decides.
-    unmodelled : sequence of str
-        Errors that the filter has no state for.
+    ``states`` are those of the filter, whose power is told; ``needed`` those of them whose σ the tests must be able to see for "consistent"
+    (without any the sharpest test decides); ``unmodelled`` errors that the filter has no state for.
     """
     marked = holm(findings, 1.0 - probability)
     kept = sum(not one.rejected for one in marked)
