@@ -42,7 +42,6 @@ __all__ = [
     "run",
     "smooth",
     "to_toml",
-    "unmodelled_errors",
 ]
 
 ATTITUDE_SIGMA = 1.0 * units.DEGREE
