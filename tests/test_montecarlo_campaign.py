@@ -206,7 +206,7 @@ def test_killed_at_random_moments_a_campaign_goes_on_to_the_same_bits(tmp_path):
         total = part if total is None else statistics.merge(total, part)
         folds[total.runs] = total
     random = np.random.default_rng(8)
-    for _ in range(60):
+    for _ in range(24):
         if not _killed(path, runs, after=random.uniform(0.02, 0.15)):
             break
         kills += 1
