@@ -401,8 +401,8 @@ def test_the_mean_with_covariances_has_the_least_loss():
 
 @pytest.mark.parametrize("with_covariance", [True, False])
 def test_the_covariance_of_the_mean_is_that_of_its_error(with_covariance):
-    """Normalised squared errors of 2000 means: χ² of three degrees of freedom, or Hotelling's T² where the scatter gives the covariance."""
-    sigma, n, runs = np.array([0.02, 0.01, 0.03]), 20, 2000
+    """Normalised squared errors of 600 means: χ² of three degrees of freedom, or Hotelling's T² where the scatter gives the covariance."""
+    sigma, n, runs = np.array([0.02, 0.01, 0.03]), 20, 600
     squares = []
     for seed in range(runs):
         true, q = scattered(n, sigma, seed)
