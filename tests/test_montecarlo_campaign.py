@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from hdf5 import changed
 
-from strapdown import cli, consistency, montecarlo, records, scenarios
+from strapdown import consistency, montecarlo, records, scenarios
 from strapdown import setup as setups
 from strapdown.checks import InputError
 from strapdown.files import reading
