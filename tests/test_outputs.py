@@ -10,11 +10,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from strapdown import outputs, quaternion, recordings
+from strapdown import quaternion, recordings
 from strapdown.checks import InputError
 from strapdown.cli import app
 from strapdown.recordings import Recording
-from strapdown.records import Estimate, read_estimate
+from strapdown.records import Estimate, outputs, read_estimate
 
 SEQUENCES = ["".join(s) for s in itertools.product("XYZ", repeat=3) if s[0] != s[1] != s[2]]
 
@@ -132,7 +132,7 @@ def case():
     return estimate, recording
 
 
-def test_a_table_tells_all_in_its_names(case):
+def test_a_table_says_all_in_its_names(case):
     estimate, recording = case
     found = outputs.table(estimate, recording=recording)
     assert found["time_ns"][3] == 1_700_000_000_130_000_001

@@ -29,6 +29,8 @@ estimates attitude from it.
 
 from __future__ import annotations
 
+# Imported as itself above and not listed here: for the package alone.
+from strapdown.recordings import unit_calibration as unit_calibration
 from strapdown.recordings.body_axes import SENSORS as SENSORS
 from strapdown.recordings.body_axes import axes_matrix as axes_matrix
 from strapdown.recordings.body_axes import with_axes as with_axes
@@ -54,24 +56,21 @@ from strapdown.recordings.recording import GAP as GAP
 from strapdown.recordings.recording import MAGNETIC_UNITS as MAGNETIC_UNITS
 from strapdown.recordings.recording import RATE_UNITS as RATE_UNITS
 from strapdown.recordings.recording import TIME_UNITS as TIME_UNITS
-from strapdown.recordings.recording import Recording, gaps
+from strapdown.recordings.recording import Recording
+from strapdown.recordings.recording import gaps as gaps
 from strapdown.recordings.recording import increments as increments
 from strapdown.recordings.samples import GyroSamples, read_samples
-from strapdown.recordings.samples import read_gyro as read_gyro
 from strapdown.recordings.samples import samples_of as samples_of
 from strapdown.recordings.trajectories import read_euroc as read_euroc
 from strapdown.recordings.trajectories import read_tum as read_tum
-from strapdown.recordings.trajectories import with_reference
+from strapdown.recordings.trajectories import with_reference as with_reference
 
-# Imported as itself above and not listed here: for the package alone.
 __all__ = [
     "FORMATS",
     "GyroSamples",
     "Recording",
     "from_table",
-    "gaps",
     "read",
     "read_samples",
-    "with_reference",
     "write",
 ]

@@ -14,7 +14,7 @@ means ``B²/(2ω*) + ω* B²/(2ω²) ≥ B²/ω`` for every ω, with equality at
 covariance that is nowhere too small. :func:`best_bandwidth` puts ω* where that costs least: at the natural frequency of the filter.
 
 That bound is safe and rather conservative. :func:`matched_process_noise` scales it so that the filter's attitude variance is the
-actual one. The exact model adds the sixteen states of :class:`strapdown.flicker.Shaping` to the filter, driven by one white noise
+actual one. The exact model adds the sixteen states of :class:`strapdown.gyro.flicker.Shaping` to the filter, driven by one white noise
 per axis.
 
 ``sims/flicker_in_filter.py`` compares them on the presets, each at its natural rate with vector measurements once a second. Mean
@@ -49,19 +49,13 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from strapdown import flicker, tables, units
+from strapdown import units
 from strapdown.checks import Array, InputError, array, finite, increasing, non_negative, positive
-from strapdown.equality import ByValue
+from strapdown.files import tables
+from strapdown.gyro import flicker
 from strapdown.kernels import gyro_errors, noise
 from strapdown.kernels.machine import compiled, read_only
-
-__all__ = [
-    "GyroSpec",
-    "matched_process_noise",
-    "process_noise",
-    "read_spec",
-    "simulate",
-]
+from strapdown.results import ByValue
 
 Axes = float | Array
 """One number for all axes, or an array (3,) of one per axis."""
@@ -535,30 +529,11 @@ def process_noise(spec: GyroSpec, *, bandwidth: float | None = None) -> dict[str
 
 
 def best_bandwidth(spec: GyroSpec, measurement_density: float) -> float:
-    """Return the ω* at which the spectral bound of flicker gives the least attitude variance.
+    """Return the ω*, rad/s, at which the spectral bound of flicker gives the least attitude variance.
 
-    Parameters
-    ----------
-    spec : GyroSpec
-        Specification of the gyro.
-    measurement_density : float
-        r, rad² s: variance of a measurement about an axis times the interval between measurements.
-
-    Returns
-    -------
-    float
-        ω*, rad/s.
-
-    Raises
-    ------
-    InputError
-        If the gyro has neither flicker nor a drifting bias.
-
-    Notes
-    -----
-    A filter with white and random-walk noise and measurements of density r has the steady attitude variance ``√r √(σ_v'² + 2 σ_u'
-    √r)`` about an axis (Farrenkopf 1978, in the limit of frequent measurements). With the bound inserted it is least where ``r ω*⁴
-    = σ_u² + ω* B²/2``, where ω* is the natural frequency of the filter itself.
+    A filter with white and random-walk noise and measurements of density r (variance about an axis times the interval, rad² s) has the
+    steady variance ``√r √(σ_v'² + 2 σ_u' √r)`` about an axis (Farrenkopf 1978, in the limit of frequent measurements). With the bound
+    inserted it is least where ``r ω*⁴ = σ_u² + ω* B²/2``; ω* is the natural frequency of the filter itself.
     """
     _, walk, instability = _filter_terms(spec)
     density = positive("measurement_density", measurement_density, unit="rad² s")
