@@ -50,8 +50,8 @@ SHARPNESS = 1e9
 """Largest ratio of an innovation's variance to the measurement's at which the covariance keeps enough digits."""
 MIN_SHARE = 1e-10
 """Smallest part of a state's variance, given the states after it, at which the covariance keeps enough digits."""
-NO_DIGITS = (1e14, 1e-15)
-"""The same two where the covariance keeps no digit at all."""
+SMOOTHED_DIGITS = (1e11, 1e-11)
+"""The same two for a smoother, which carries the whole record as its factor beyond them: that takes a dozen times as long."""
 HEALTHY_SHARE = 1e-7
 """Part of each variance, given the states after it, from which on the covariance is carried in blocks again."""
 FIRST_SPAN = 64
@@ -218,7 +218,15 @@ def _checked(
     check_arguments(record=record, gate=gate, robust=robust, monitor=monitor)
     problem = prepared(record, process_noise, initial, error_states)
     options = Options(every=count("every", every), full_covariance=full_covariance, gate=gate, robust=robust)
-    return filtered(problem, options)
+    passed = filtered(problem, options)
+    attitude = passed.estimate.attitude
+    if not np.isfinite(attitude[-1]).all():  # what is no number once remains so
+        end = record.time[options.every * int(np.argmin(np.isfinite(attitude).all(axis=1)))]
+        raise InputError(
+            f"the filter diverged before {end:g} s: its attitude is no number; the errors of the start or of the measurements are many "
+            "times their sigmas"
+        )
+    return passed
 
 
 def prepared(
@@ -309,7 +317,7 @@ def _block_outputs(problem: Problem, options: Options, *, judged: bool) -> covar
 
 def _block_body(problem: Problem, options: Options, states: Array) -> covariance_form.Body:
     """Return the filter as the kernels take it."""
-    sharpness, share = NO_DIGITS if options.segments else (SHARPNESS, MIN_SHARE)
+    sharpness, share = SMOOTHED_DIGITS if options.segments else (SHARPNESS, MIN_SHARE)
     angle_variance, rate_variance = problem.variances
     return covariance_form.Body(
         states=states,
