@@ -608,6 +608,7 @@ def plan(
     scenario: Scenario,
     *,
     setup: FilterSetup | None = None,
+    gyro: GyroSpec | None = None,
     seed: int | None = None,
     states: bool | None = None,
     dispersions: Dispersions | None = None,
@@ -620,6 +621,8 @@ def plan(
     scenario : Scenario
     setup : FilterSetup, optional
         Default: matched to the scenario (:func:`strapdown.setup.for_record.matched_to_scenario`).
+    gyro : GyroSpec, optional
+        Specification that the matched filter assumes, such as a data sheet's. Default: that of the scenario.
     seed : int, optional
         Default: the scenario's own.
     states : bool, optional
@@ -636,13 +639,14 @@ def plan(
     Raises
     ------
     InputError
-        If both ``setup`` and ``states`` are given, or the scenario's duration is no whole number of filter steps.
+        If ``setup`` is given together with ``states`` or ``gyro``, or the scenario's duration is no whole number of filter steps.
     """
     from strapdown import montecarlo
 
-    if states is not None and setup is not None:
-        raise InputError("a filter setup has its own states; leave states out")
-    chosen = for_record.matched_to_scenario(scenario, states=states) if setup is None else setup
+    if setup is not None and (states is not None or gyro is not None):
+        raise InputError("a filter setup has its own states and gyro noise; leave states and gyro out")
+    assumed = scenario if gyro is None else dataclasses.replace(scenario, gyro=gyro)
+    chosen = for_record.matched_to_scenario(assumed, states=states) if setup is None else setup
     names = chosen.states.names if setup is None and chosen.states is not None else ()
     return montecarlo.Plan(
         scenario=scenario,

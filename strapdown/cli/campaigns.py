@@ -53,6 +53,12 @@ def montecarlo(
             help="TOML with a table named filter, as `strapdown tune` writes it; without it the filter that matches the scenario.",
         ),
     ] = None,
+    gyro: Annotated[
+        Path | None,
+        typer.Option(
+            help="TOML with a table named gyro, a data sheet's: the filter is matched to it, not to the scenario's gyro."
+        ),
+    ] = None,
     dispersions: Annotated[
         Path | None,
         typer.Option(
@@ -74,7 +80,12 @@ def montecarlo(
             "no filter, --float32 or lanes are asked for.",
         ),
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="HDF5 file; NAME-montecarlo.h5 if not given.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="HDF5 file; NAME-montecarlo.h5 after the name, or the TOML file, of the scenario if not given."
+        ),
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the file, if it exists.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Begin anew although the file exists.")] = False,
     workers: Annotated[
@@ -103,11 +114,12 @@ def montecarlo(
     if held is None:
         if states is None and (float32 or machine == "lanes"):
             states = False
-        plan = _plan(scenario, filter_file, dispersions, seed, float32, states)
-        target = out or Path(f"{plan.scenario.name or source.stem}-montecarlo.h5")
+        plan = _plan(scenario, filter_file, gyro, dispersions, seed, float32, states)
+        target = out or Path(f"{source.stem}-montecarlo.h5")
     else:
         given = {
             "--filter": filter_file,
+            "--gyro": gyro,
             "--dispersions": dispersions,
             "--seed": seed,
             "--float32": float32 or None,
@@ -211,6 +223,7 @@ def asked_to_stop() -> Iterator[Callable[[], None]]:
 def _plan(
     scenario: str,
     filter_file: Path | None,
+    gyro: Path | None,
     dispersions: Path | None,
     seed: int | None,
     float32: bool,
@@ -219,14 +232,18 @@ def _plan(
     from strapdown import montecarlo as engine
     from strapdown import workflows
     from strapdown.checks import InputError
+    from strapdown.gyro import read_spec
 
     if states is not None and filter_file is not None:
         raise InputError(
             "--filter holds the filter's states itself, in [filter.states]; leave --states and --no-states out"
         )
+    if gyro is not None and filter_file is not None:
+        raise InputError("--gyro and --filter both give the filter's gyro noise; give one of them")
     loaded = scenario_named(scenario)
     plan = workflows.plan(
         loaded,
+        gyro=None if gyro is None else read_spec(gyro),
         setup=None if filter_file is None else filter_of_scenario(filter_file, loaded),
         seed=seed,
         states=states,

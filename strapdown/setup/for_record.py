@@ -252,7 +252,9 @@ def drawn_start(record: ImuRecord, chosen: FilterSetup) -> Start:
         If the record has no truth.
     """
     if record.truth is None:
-        raise InputError("--from-truth needs a record with the truth; this one has none")
+        raise InputError(
+            "a start drawn about the truth (--from-truth) needs a record with its truth; this one has none"
+        )
     origin = record.origin or Origin()
     draw = generator(origin.seed or 0, origin.run or 0, "initial error").standard_normal(6)
     q = quaternion.multiply(record.truth.attitude[0], quaternion.exp(-chosen.attitude_sigma * draw[:3]))

@@ -88,20 +88,18 @@ def objective_for(
     """
     non_negative("spacing", spacing, unit="s")
     if rmse and truth:
-        raise InputError("--rmse and --truth both say which errors against the truth count; give one of them")
+        raise InputError("rmse and truth both say which errors against the truth count; give one of them")
     if rmse and credibility:
         raise InputError(
-            "--rmse and --credibility ask for different filters: small errors, or consistent ones; give one of them"
+            "rmse and credibility ask for different filters: small errors, or consistent ones; give one of them"
         )
     other = truth or rmse or credibility
     if spacing > 0.0 and other:
         raise InputError(
-            "--spacing thins the innovations of the likelihood; against a truth, or for credibility, there are none to thin: leave it away"
+            "spacing thins the innovations of the likelihood; against a truth, or for credibility, there are none to thin: leave it out"
         )
     if gate and (other or spacing > 0.0):
-        raise InputError(
-            "--gate needs the likelihood of all innovations: leave --truth, --rmse, --credibility and --spacing away"
-        )
+        raise InputError("gate needs the likelihood of all innovations: leave truth, rmse, credibility and spacing out")
     by_axis = any(axis_of(name) for name in names)
     for whole, what in (
         (setup.states is None, "a filter with optional states"),
@@ -109,7 +107,7 @@ def objective_for(
     ):
         if not whole and (gate or other or spacing > 0.0):
             raise InputError(
-                f"{what} is tuned by the likelihood of all innovations: leave --gate, --truth, --rmse, --credibility and --spacing away"
+                f"{what} is tuned by the likelihood of all innovations: leave gate, truth, rmse, credibility and spacing out"
             )
     if setup.states is not None or by_axis:
         return extended.likelihood(cases, setup, names, threads=threads)
