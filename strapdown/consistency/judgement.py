@@ -108,17 +108,6 @@ class Finding:
         """What the value is of, its epoch included."""
         return f"{self.of}, {self.at}" if self.at else self.of
 
-    def with_bounds(self, error: float) -> Finding:
-        """Return the finding with the bounds of its value beyond which the p-value is below ``error``."""
-        if not (self.is_ratio or self.name == LOG_NEES):
-            return self
-        within = 1.0 - error / self.epochs
-        if self.is_ratio:
-            low, high = mean_bounds(self.degrees, self.samples, within)
-        else:
-            low, high = log_mean_bounds(self.degrees, int(self.samples), within)
-        return replace(self, low=low, high=high)
-
 
 _INNOVATIONS = "innovations of "
 LOG_NEES = "log-NEES"
@@ -547,6 +536,18 @@ def concluded(
         power=power,
         unmodelled=tuple(unmodelled),
     )
+
+
+def _with_bounds(finding: Finding, error: float) -> Finding:
+    """Return the finding with the bounds of its value beyond which the p-value is below ``error``."""
+    within = 1.0 - error / finding.epochs
+    if finding.is_ratio:
+        low, high = mean_bounds(finding.degrees, finding.samples, within)
+    elif finding.name == LOG_NEES:
+        low, high = log_mean_bounds(finding.degrees, int(finding.samples), within)
+    else:
+        return finding
+    return replace(finding, low=low, high=high)
 
 
 def powers(findings: Sequence[Finding], probability: float, states: Sequence[str]) -> tuple[Power, ...]:
