@@ -16,7 +16,7 @@ import numpy as np
 
 from strapdown import consistency
 from strapdown.checks import Array
-from strapdown.consistency import bounds, ensemble, timeaverage, whiteness
+from strapdown.consistency import bounds, timeaverage, whiteness
 from strapdown.files import write_json
 
 
@@ -129,24 +129,16 @@ def single_run_p_values(filters: Filters, *, averages: bool = True) -> dict[str,
 
 
 def many_run_p_values(white: Array) -> dict[str, Array]:
-    """Return p-values (groups,) of independent runs at one epoch, of whitened errors (groups, runs, n).
-
-    Of the two indices whose distribution is simulated they are ranks among simulated right filters.
-    """
+    """Return p-values (groups,) of what independent runs tell at one epoch, of whitened errors (groups, runs, n)."""
     _, runs, n = white.shape
     squares = np.sum(white**2, axis=2)
-    index, inclination = ensemble.credibility_indices(white)
-    null_index, null_inclination = (np.sort(values) for values in ensemble.null_indices(n, runs))
-    below = np.searchsorted(null_inclination, inclination) / len(null_inclination)
     return {
         "ANEES": np.array([bounds.mean_p_value(float(x), n, runs) for x in squares.mean(axis=1) / n]),
         "log-NEES": np.array([bounds.log_mean_p_value(float(x), n, runs) for x in np.log(squares).mean(axis=1)]),
-        "non-credibility": 1.0 - np.searchsorted(null_index, index) / len(null_index),
-        "inclination": 2.0 * np.minimum(below, 1.0 - below),
     }
 
 
-ENSEMBLE = ("ANEES", "log-NEES", "non-credibility", "inclination")
+ENSEMBLE = ("ANEES", "log-NEES")
 
 MISMATCHES: dict[str, Mismatch] = {
     "none": Mismatch(),

@@ -773,7 +773,3 @@ def test_the_bias_is_found_from_twenty_degrees_an_hour():
     e, _ = judged(found, record)
     assert np.abs(record.truth.bias[0]).max() > 5.0 * DEGREE_PER_HOUR
     assert np.abs(e[-1, 3:]).max() < 0.1 * DEGREE_PER_HOUR
-
-
-def test_each_start_is_three_times_as_wide_up_to_the_widest_and_then_as_the_first():
-    assert [multiple_model._widened(starts) for starts in range(10)] == [1, 3, 9, 27, 81, 243, 729, 2187, 1, 3]

@@ -474,12 +474,11 @@ def test_tables_are_readable_and_refuse_unknown_keys():
         ("range", "deg/s", math.pi / 180.0),
     ],
 )
-def test_units_convert_both_ways(name, unit, factor):
+def test_units_convert(name, unit, factor):
     field = datasheets._QUANTITIES[name][0]
     for number in (1.0, 0.15, 3e-4):
         value = getattr(datasheets.from_datasheet(**{name: f"{number} {unit}"}), field)
         assert value == pytest.approx(number * factor, rel=4e-16)
-        assert datasheets.express(name, value, unit) == pytest.approx(number, rel=4e-16)
 
 
 def test_one_degree_a_second_a_root_hertz_is_sixty_degrees_a_root_hour():

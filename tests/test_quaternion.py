@@ -346,21 +346,11 @@ def test_yaw_pitch_and_roll_are_those_of_an_aircraft():
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_other_parameters_keep_leading_axes_and_come_back(shape):
+def test_euler_angles_keep_leading_axes_and_come_back(shape):
     q = random_quaternions(shape)
     positive = np.where(q[..., :1] < 0.0, -q, q)
     close(quaternion.from_euler(quaternion.to_euler(q)), positive, 16.0)
-    close(quaternion.from_mrp(quaternion.to_mrp(q)), positive, 16.0)
-    assert quaternion.to_euler(q).shape == quaternion.to_mrp(q).shape == (*shape, 3)
-
-
-def test_mrp_are_the_tangent_of_a_quarter_of_the_turn():
-    axis = np.array([2.0, -1.0, 2.0]) / 3.0
-    for angle in (1e-8, 0.7, 3.0):
-        close(quaternion.to_mrp(quaternion.exp(angle * axis)), np.tan(angle / 4.0) * axis)
-    p = np.tan(1.0) * axis  # a turn of 4 rad, and the way back of 4 − 2π
-    close(quaternion.from_mrp(p), quaternion.from_mrp(-p / (p @ p)))
-    close(quaternion.to_mrp(quaternion.from_mrp(p)), -p / (p @ p))
+    assert quaternion.to_euler(q).shape == (*shape, 3)
 
 
 @pytest.mark.parametrize("sequence", ["ZYZX", "", "abc", "ZZX", "zYX", 3])

@@ -138,7 +138,7 @@ def test_an_array_that_declares_more_than_it_holds_is_refused_before_memory_is_t
             InputError,
             match=r"bomb\.npy cannot be read \(its header declares 7200000000 bytes of float64, and 0 follow",
         ):
-            recordings.read_gyro(path, rate=100.0, units=UNITS)
+            recordings.read_samples(path, "gyro", rate=100.0, units=UNITS)
 
     seconds, megabytes = spent(refused)
     assert seconds < 1.0
@@ -323,7 +323,7 @@ def test_the_series_of_a_csv_record_are_no_links(tmp_path):
     written[1].rename(tmp_path / "elsewhere.csv")
     written[1].symlink_to(tmp_path / "elsewhere.csv")
     with pytest.raises(InputError, match=r"record-vectors-0\.csv is a symbolic link"):
-        recordfiles.import_csv(written[0])
+        recordfiles.read_record(written[0])
 
 
 def test_a_file_that_the_user_names_may_be_a_link(tmp_path):

@@ -113,7 +113,7 @@ def test_units_of_other_sensors_need_not_be_reported_where_the_gyro_alone_is_use
     alone = read(path, gyro_alone=True)
     assert alone.specific_force is None
     assert read(csv(), gyro_alone=True).specific_force is None
-    assert np.array_equal(recordings.read_gyro(path).values, alone.rate)
+    assert np.array_equal(recordings.read_samples(path, "gyro").values, alone.rate)
     status = CliRunner().invoke(
         app, ["integrate", str(path), "--algorithm", "one-sample", "--out", str(tmp_path / "a.h5")]
     )
@@ -263,7 +263,7 @@ def test_what_is_missing_is_reported_where_a_recording_is_used(csv, tmp_path):
         assert result.exit_code == 0, result.output
         assert "2 rows without a gyro sample, the first at 1.500 s, were left out" in " ".join(result.output.split())
     with pytest.raises(InputError, match=r"the interval after 1.49 s is 0.03 s"):
-        recordings.read_gyro(path)
+        recordings.read_samples(path, "gyro")
 
 
 def test_infinite_accelerations_are_refused(csv):

@@ -696,9 +696,6 @@ FACES = {
     "estimation.observability": estimation.observability,
     "estimation.relinearized_start": estimation.relinearized_start,
     "multiple_model.run": lambda record, noise, initial, **options: multiple_model.run(record, noise, **options),
-    "multiple_model.run_recovering": lambda *given, **options: multiple_model.run_recovering(
-        *given, **{"gate": Gate(), **options}
-    ),
     "filters.run": lambda *given: filters.run("usque", *given),
     "filters.compare": filters.compare,
 }

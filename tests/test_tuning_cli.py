@@ -161,7 +161,7 @@ def test_tune_gives_the_filter_states_for_what_the_record_specifies(run, tmp_pat
     assert names == ["gyro.arw", "gyro.scale_sigma"]
 
 
-@pytest.mark.parametrize("option", [("--truth",), ("--credibility",), ("--gate",), ("--spacing", 2.0), ("--plan",)])
+@pytest.mark.parametrize("option", [("--truth",), ("--gate",), ("--spacing", 2.0), ("--plan",)])
 def test_optional_states_are_tuned_by_the_plain_likelihood_alone(run, tmp_path, scaled, option):
     out = tmp_path / "states.toml"
     status, _, complaint = run("tune", scaled, "--states", *option, "-o", out)

@@ -204,7 +204,7 @@ def test_tuned_from_thirty_times_wrong_the_errors_reach_their_bound():
     assert np.max(predicted) <= 1.03
     bound = covariance.analyse(chosen, epochs=20).filter_covariance[1:]
     (found,) = montecarlo.run(chosen, [tuned], runs=150, seed=3, epochs=20)
-    square = found.error_square_sum[1:] / found.runs
+    square = np.diagonal(found.mean_square_error[1:], axis1=1, axis2=2)
     for part, ratio in zip((slice(0, 3), slice(3, 6)), predicted, strict=True):
         least = bound[:, part, part].trace(axis1=1, axis2=2)
         actual = np.sqrt(np.mean(square[:, part].sum(axis=1) / least))

@@ -20,7 +20,6 @@ from strapdown.vectors import (
     VectorMeasurements,
     VectorSensor,
     specific_force,
-    star_directions,
     triad,
 )
 
@@ -182,14 +181,6 @@ def test_an_accelerometer_off_the_centre_errs_by_the_acceleration():
     assert np.all(series.vector_b[:, 0] < 0.0)
     biased = observe(Accelerometer(name="a", sigma=0.0, rate=5.0, bias=[0.1, 0.0, 0.0], kind="vector"), motion.rest())
     np.testing.assert_allclose(biased.vector_b, np.tile([0.1, 0.0, 9.80665], (250, 1)), atol=1e-12)
-
-
-def test_star_directions_see_several_stars_at_the_same_times():
-    stars = star_directions("tracker", np.eye(3), sigma=1e-4, rate=2.0, faults=Faults(outages=[(3.0, 4.0)]))
-    series = [observe(star) for star in stars]
-    assert [s.sensor for s in series] == ["tracker 1", "tracker 2", "tracker 3"]
-    assert all(np.array_equal(s.time, series[0].time) for s in series)
-    assert not np.array_equal(series[0].vector_b, series[1].vector_b)
 
 
 def test_an_attitude_sensor_is_coarse_about_its_boresight():
@@ -419,24 +410,6 @@ def test_the_dipole_has_no_divergence_and_no_curl_and_points_north_at_the_equato
         np.testing.assert_allclose(jacobian, jacobian.T, atol=1e-6 * scale)
     np.testing.assert_allclose(orbit.dipole_field([orbit.EARTH_RADIUS, 0.0, 0.0]), [0.0, 0.0, 2.98e-5], atol=1e-12)
     np.testing.assert_allclose(orbit.dipole_field([0.0, 0.0, orbit.EARTH_RADIUS]), [0.0, 0.0, -5.96e-5], atol=1e-12)
-
-
-@pytest.mark.parametrize("phase", [0.0, 2.0, -3.0])
-@pytest.mark.parametrize("sun", [[1.0, 0.0, 0.0], [0.3, -0.9, 0.5], [-1.0, 2.0, 0.0]])
-def test_eclipses_are_where_the_earth_hides_the_sun(sun, phase):
-    path = orbit.CircularOrbit(inclination=1.0, phase=phase)
-    windows = path.eclipses(sun, 100.0, 15_000.0)
-    time = np.linspace(100.0, 15_000.0, 20_001)
-    r, s = path.position(time), np.array(sun) / np.linalg.norm(sun)
-    along = r @ s
-    hidden = (along < 0.0) & (np.linalg.norm(r - along[:, None] * s, axis=1) < orbit.EARTH_RADIUS)
-    predicted = np.any([(time >= a) & (time <= b) for a, b in windows], axis=0)
-    assert np.sum(predicted != hidden) <= 2 * len(windows)
-    assert len(windows) == 0 if sun[1] == -0.9 else 2 <= len(windows) <= 4
-
-
-def test_an_orbit_along_the_terminator_has_no_eclipse():
-    assert orbit.CircularOrbit(inclination=np.pi / 2).eclipses([0.0, 1.0, 0.0], 0.0, 1e4) == ()
 
 
 @pytest.mark.parametrize(("field", "kind"), [([0.0, 0.0, 0.0], "direction"), ([0.0, 0.0, 5e-5], "heading")])

@@ -57,17 +57,7 @@ class _Rate(ProgressColumn):
 
 @contextmanager
 def progress_bar(what: str, total: int | None = None, *, rate: str = "") -> Iterator[Callable[[int], None]]:
-    """Yield a function that advances the progress by a number of units.
-
-    Parameters
-    ----------
-    what : str
-        What is done.
-    total : int, optional
-        Units of it; without them only the time is shown.
-    rate : str
-        Unit of a rate that is shown, as runs/s.
-    """
+    """Yield a function that advances the progress by a number of units; without ``total`` only the time is shown."""
     if _quiet:
         yield lambda done: None
         return

@@ -81,13 +81,6 @@ def tune(
             "--rmse", help="Tune by the RMS attitude error against the truth; then all σ alike by innovations."
         ),
     ] = False,
-    credibility: Annotated[
-        bool,
-        typer.Option(
-            "--credibility",
-            help="Tune for consistency: the whole distribution of NIS, and whiteness; with --truth that of NEES.",
-        ),
-    ] = False,
     gate: Annotated[
         bool,
         typer.Option(
@@ -165,7 +158,6 @@ def tune(
     goal = _Goal(
         truth=truth,
         rmse=rmse,
-        credibility=credibility,
         gate=gate or any(name in tuning.GATED for name in names or []),
         spacing=spacing,
     )
@@ -208,13 +200,13 @@ def tune(
     examined, worst = _examined(train, before, result)
     if worst is not None:
         result = tuning.doubted(result, worst)
-    _print_result(result, [case.record for case in cases], credible=credibility)
+    _print_result(result, [case.record for case in cases])
     if found is not None:
         _print_gate(found)
     for sentence in () if worst is None else worst.words:
         console.print(sentence)
     if comparison is not None:
-        _print_comparison(comparison, truth=goal.by_errors or credibility)
+        _print_comparison(comparison, truth=goal.by_errors)
     _write(
         out,
         result,
@@ -235,7 +227,6 @@ class _Goal(NamedTuple):
 
     truth: bool
     rmse: bool
-    credibility: bool
     gate: bool
     spacing: float
 
@@ -247,7 +238,7 @@ class _Goal(NamedTuple):
     @property
     def name(self) -> str:
         """What the result says."""
-        name = "credibility" if self.credibility else "rmse" if self.rmse else "likelihood"
+        name = "rmse" if self.rmse else "likelihood"
         return name + (" of the errors" if self.truth else "")
 
 
@@ -401,7 +392,7 @@ def _note(one: Estimated, unit: Unit) -> str:
     return f"not identified: at most {_figure(one.upper / unit.factor)} {unit.name} (95 %)"
 
 
-def _print_result(result: Tuning, records: Sequence[ImuRecord], *, credible: bool) -> None:
+def _print_result(result: Tuning, records: Sequence[ImuRecord]) -> None:
     rows = table("Tuned, with 95 % intervals", "parameter", "unit", "before", "after", "from", "to", "", left=2)
     for one in result.parameters:
         unit = _unit_of(one.name, records)
@@ -409,10 +400,7 @@ def _print_result(result: Tuning, records: Sequence[ImuRecord], *, credible: boo
         rows.add_row(one.name, unit.name, *(_figure(value) for value in values), _note(one, unit))
     show(rows)
     gain = result.before - result.after
-    console.print(
-        f"{result.agreeing} of {len(result.starts)} searches ended at the best point; "
-        + (f"half Neyman's statistic fell by {gain:.4g}." if credible else f"gain {gain:.4g} nats.")
-    )
+    console.print(f"{result.agreeing} of {len(result.starts)} searches ended at the best point; gain {gain:.4g} nats.")
     if not all(one.identified for one in result.parameters):
         console.print(
             "Of a parameter that is not identified these records give an upper bound alone; the filter uses the value in the column "

@@ -108,6 +108,17 @@ class Finding:
         """What the value is of, its epoch included."""
         return f"{self.of}, {self.at}" if self.at else self.of
 
+    def _with_bounds(self, error: float) -> Finding:
+        """Return the finding with the bounds of its value beyond which the p-value is below ``error``."""
+        if not (self.is_ratio or self.name == LOG_NEES):
+            return self
+        within = 1.0 - error / self.epochs
+        if self.is_ratio:
+            low, high = mean_bounds(self.degrees, self.samples, within)
+        else:
+            low, high = log_mean_bounds(self.degrees, int(self.samples), within)
+        return replace(self, low=low, high=high)
+
 
 _INNOVATIONS = "innovations of "
 LOG_NEES = "log-NEES"
@@ -481,21 +492,13 @@ def concluded(
 ) -> Judgement:
     """Return the verdict that findings lead to, all taken together; what each was before, rejected or not, does not count.
 
-    Parameters
-    ----------
-    findings, limits, probability
-        As those of :class:`Judgement`.
-    states : sequence of str
-        States of the filter, whose power is reported.
-    needed : sequence of str
-        Those of them whose σ the tests must be able to see for "consistent"; without any the sharpest test decides.
-    unmodelled : sequence of str
-        Errors that the filter has no state for.
+    ``states`` are those of the filter, whose power is reported; ``needed`` those of them whose σ the tests must be able to see for
+    "consistent" (without any the sharpest test decides); ``unmodelled`` errors that the filter has no state for.
     """
     marked = holm(findings, 1.0 - probability)
     kept = sum(not one.rejected for one in marked)
     marked = [
-        one.with_bounds((1.0 - probability) / max(kept, 1)) for one in marked
+        one._with_bounds((1.0 - probability) / max(kept, 1)) for one in marked
     ]  # where Holm's procedure has stopped
     power = powers(marked, probability, states)
     rejected = [finding for finding in marked if finding.rejected]
@@ -536,18 +539,6 @@ def concluded(
         power=power,
         unmodelled=tuple(unmodelled),
     )
-
-
-def _with_bounds(finding: Finding, error: float) -> Finding:
-    """Return the finding with the bounds of its value beyond which the p-value is below ``error``."""
-    within = 1.0 - error / finding.epochs
-    if finding.is_ratio:
-        low, high = mean_bounds(finding.degrees, finding.samples, within)
-    elif finding.name == LOG_NEES:
-        low, high = log_mean_bounds(finding.degrees, int(finding.samples), within)
-    else:
-        return finding
-    return replace(finding, low=low, high=high)
 
 
 def powers(findings: Sequence[Finding], probability: float, states: Sequence[str]) -> tuple[Power, ...]:

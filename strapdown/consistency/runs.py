@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from strapdown.checks import Array
 from strapdown.consistency.bounds import (
-    Coverage,
     Verdict,
+    coverage_p_values,
     log_mean_p_value,
     mean_p_value,
     tail,
@@ -149,7 +149,7 @@ def judge_runs(
         if failed == 0:
             findings.append(_log_nees(statistics, chosen, column, subset))
     if failed == 0 and runs >= 3:
-        findings += [_mean_error(statistics, chosen), _run_coverage(statistics, chosen, probability)]
+        findings += [_mean_error(statistics, chosen), _run_coverage(statistics, chosen)]
     for row, sensor in enumerate(statistics.sensors):
         degrees = float(np.sum(statistics.sensor_degrees[row]))
         if degrees < 1.0:
@@ -215,15 +215,10 @@ def _mean_error(statistics: RunStatistics, epochs: np.ndarray) -> Finding:
     )
 
 
-def _run_coverage(statistics: RunStatistics, epochs: np.ndarray, probability: float) -> Finding:
+def _run_coverage(statistics: RunStatistics, epochs: np.ndarray) -> Finding:
     """Return whether the errors of any state lie within 1, 2 or 3 σ too often or too seldom, the worst of all epochs and states."""
     inside = statistics.coverage[epochs][:, _estimated(statistics)] / statistics.runs
-    p = np.array(
-        [
-            [Coverage(samples=statistics.runs, inside=state, probability=probability).p_values for state in epoch]
-            for epoch in inside
-        ]
-    )
+    p = coverage_p_values(inside, statistics.runs)
     _, state, k = np.unravel_index(int(np.argmin(p)), p.shape)
     name = state_name(int(state))
     value = float(inside.reshape(-1)[int(np.argmin(p))])

@@ -56,17 +56,10 @@ class TimeAverage:
 def time_average(
     error: ArrayLike, covariance: ArrayLike, states: tuple[int, ...] | None = None, probability: float = 0.99
 ) -> TimeAverage:
-    """Return the NEES averaged over the epochs of one run, with as many effective samples as its correlation leaves.
+    """Return the NEES averaged over the even epochs of one run, with as many effective samples as its correlation leaves.
 
-    Parameters
-    ----------
-    error : array (epochs, n)
-        Error states at even epochs.
-    covariance : array (epochs, n, n)
-    states : tuple of int, optional
-        Subset that is judged; all are used to learn the correlation, because no subset is a Markov process by itself.
-    probability : float
-        Of the bounds.
+    Error (epochs, n) and covariance (epochs, n, n); ``states`` is the subset judged. All states are used to learn the correlation, because
+    no subset is a Markov process by itself.
     """
     tail(probability)
     e = array("error", error, ("epochs", "n"))

@@ -219,11 +219,8 @@ def npy(path: Name) -> np.ndarray[Any, Any]:
 def hdf5(path: Name) -> Iterator[Any]:
     """Yield an HDF5 file, open for reading, that is whole and holds all its data itself, unpacked no more than :func:`limit`.
 
-    Raises
-    ------
-    InputError
-        If it does not fit its digest, makes the HDF5 library hang or crash, refers to other files (external links, virtual datasets,
-        external storage), or declares more data than it holds.
+    Refused is one that does not fit its digest, makes the HDF5 library hang or crash, refers to other files (external links, virtual
+    datasets, external storage), or declares more data than it holds.
     """
     import h5py
 

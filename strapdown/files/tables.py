@@ -168,11 +168,6 @@ def read(path: str | os.PathLike[str], name: str, remedy: str, make: Callable[[M
     """Return what ``make`` makes of the table ``[name]`` of a TOML file; ``remedy`` says what to do where there is none.
 
     ``make`` is called with the table and what it is called in errors.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, no TOML, has no such table, or ``make`` refuses it.
     """
     with reading.from_file(path):
         table = reading.toml(path).get(name)

@@ -212,23 +212,7 @@ def from_table(table: Mapping[str, Any]) -> Plan:
 
 
 def read_dispersions(path: str | os.PathLike[str]) -> Dispersions:
-    """Read the table ``[dispersions]`` of a TOML file; other tables are ignored.
-
-    Parameters
-    ----------
-    path : path
-        TOML file, such as a scenario file with this table added.
-
-    Returns
-    -------
-    Dispersions
-        In SI units and radians, whatever the units of the keys.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, is no TOML, or has no such table, an unknown key or a value out of range.
-    """
+    """Read the table ``[dispersions]`` of a TOML file, such as a scenario's with this table added."""
     remedy = f"its keys are {', '.join(tables.keys(_FORM))}"
     return tables.read(path, "dispersions", remedy, _dispersions)
 

@@ -38,7 +38,6 @@ time), error e = (δθ, δb) of :func:`strapdown.consistency.errors` and the fil
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -233,11 +232,6 @@ class Statistics(Listed):
         return int(self.runs - self.finite.min())
 
     @property
-    def error_square_sum(self) -> Array:
-        """Σ e² (m, 6)."""
-        return np.diagonal(self.error_product_sum, axis1=1, axis2=2)
-
-    @property
     def mean_error(self) -> Array:
         """Mean error at each epoch (m, 6)."""
         return _divided(self.error_sum, self._runs_of_state)
@@ -362,21 +356,6 @@ class Statistics(Listed):
         found = _quantile(self.histogram[:, :6], probability, bin_edges(ERROR_EXPONENT))
         return np.asarray(np.where(self._runs_of_state > 0.0, found, np.nan))
 
-    def nees_quantile(self, probability: float) -> Array:
-        """Return a quantile of the NEES of state, attitude and bias at each epoch.
-
-        Parameters
-        ----------
-        probability : float
-            Of the quantile, from 0 to 1.
-
-        Returns
-        -------
-        ndarray (m, 3)
-            Not divided by the degrees of freedom; NaN where no run was finite.
-        """
-        return _quantile(self.histogram[:, 6:], probability, bin_edges(NEES_EXPONENT))
-
 
 def _divided(total: Any, number: Any) -> Array:
     """Return total / number, NaN where the number is 0."""
@@ -418,14 +397,6 @@ def merge(a: Statistics, b: Statistics) -> Statistics:
         if field.name not in merged:
             merged[field.name] = getattr(a, field.name) + getattr(b, field.name)
     return Statistics(**merged)
-
-
-def merge_all(parts: Sequence[Statistics]) -> Statistics:
-    """Return the statistics of all parts, merged from the first to the last."""
-    total, *rest = parts
-    for part in rest:
-        total = merge(total, part)
-    return total
 
 
 def worst(run: Counts, score: Array) -> tuple[Counts, Array]:

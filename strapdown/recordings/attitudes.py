@@ -59,19 +59,7 @@ class Attitudes:
 
 
 def read_attitudes(path: str | os.PathLike[str], *, topic: str = "") -> Attitudes:
-    """Read the attitudes of a file, or of the folder of a ROS 2 bag.
-
-    Parameters
-    ----------
-    path : path
-    topic : str
-        Of a bag, where several topics hold attitudes.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, damaged, or holds no attitudes.
-    """
+    """Read the attitudes of a file, or of the folder of a ROS 2 bag; of several topics with attitudes name one."""
     file = Path(path)
     if ros.is_folder(file):
         return _bag(file, topic)

@@ -96,27 +96,9 @@ def write_record(
     run: int | None = None,
     attributes: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write a record to HDF5; the file appears whole or not at all.
+    """Write a record to HDF5, with how it was made; the file appears whole or not at all.
 
-    Parameters
-    ----------
-    path : path-like
-        File.
-    record : ImuRecord
-        Record.
-    gyro_spec : GyroSpec, optional
-        Specification of the gyro that it was simulated with.
-    scenario : str, default ""
-        Scenario as TOML (:func:`strapdown.scenarios.scenario_to_toml`).
-    seed, run : int, optional
-        Seed and run of the random streams.
-    attributes : mapping of str, optional
-        Further attributes of the file.
-
-    Raises
-    ------
-    InputError
-        If an attribute has the name of one that the file has already.
+    ``scenario`` is TOML (:func:`strapdown.scenarios.scenario_to_toml`), ``attributes`` are further ones of the file.
     """
     for name in attributes or {}:
         if name in _RESERVED:
@@ -167,44 +149,15 @@ def _begins(path: str | os.PathLike[str], mark: bytes) -> bool:
 
 
 def read_record(path: str | os.PathLike[str]) -> ImuRecord:
-    """Read the record of a file written by :func:`write_record` or :func:`export_csv`.
-
-    Parameters
-    ----------
-    path : path-like
-        File.
-
-    Returns
-    -------
-    ImuRecord
-        The record.
-
-    Raises
-    ------
-    InputError
-        As :func:`read_record_file`.
-    """
+    """Read the record of a file written by :func:`write_record` or :func:`export_csv`."""
     return read_record_file(path).record
 
 
 def read_record_file(path: str | os.PathLike[str]) -> RecordFile:
     """Read a file written by :func:`write_record` or :func:`export_csv` with all that it holds.
 
-    Parameters
-    ----------
-    path : path-like
-        File.
-
-    Returns
-    -------
-    RecordFile
-        The record and how it was made.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, truncated, of another kind or a newer layout, or its units or conventions are not those of
-        :func:`write_record`.
+    Measurements of NaN are missing. An increment must not be NaN: the rotation over an interval without one is unknown. If a row of a CSV
+    is left out, the next one must hold the rotation over both intervals.
     """
     if _begins(path, _MARK.encode()):
         with reading.from_file(path):
@@ -296,37 +249,13 @@ def export_csv(
     seed: int | None = None,
     run: int | None = None,
 ) -> tuple[Path, ...]:
-    """Write a record as CSV, 17 digits per number.
+    """Write a record as CSV, 17 digits per number; return the files written, the record first.
 
-    Parameters
-    ----------
-    path : path-like
-        File.
-    record : ImuRecord
-        Record.
-    gyro_spec : GyroSpec, optional
-        Specification of the gyro that it was simulated with.
-    scenario : str, default ""
-        Scenario as TOML (:func:`strapdown.scenarios.scenario_to_toml`).
-    seed, run : int, optional
-        Seed and run of the random streams.
-
-    Returns
-    -------
-    tuple of Path
-        Files written: the record, then its vector series.
-
-    Raises
-    ------
-    InputError
-        If the noise of a sensor differs by body axis, for which CSV has no columns; then nothing is written.
-
-    Notes
-    -----
-    ``path`` holds one row per edge: its time, the increment of the interval that ends there (NaN in the first row), and the truth
-    if there is one. Each vector series goes to ``STEM-vectors-N.csv`` in the same folder. The first line of each is a comment with
-    the kind of file, the time of its last row, and for the record the number of its series; the second names the columns, with
-    their units. The record is written last. Superfluous series of an earlier record of the same name are removed.
+    ``path`` holds one row per edge: its time, the increment of the interval that ends there (NaN in the first row), and the truth if there
+    is one. Each vector series goes to ``STEM-vectors-N.csv`` in the same folder. The first line of each is a comment with the kind of file,
+    the time of its last row, and for the record the number of its series; the second names the columns, with their units. The record is
+    written last. Superfluous series of an earlier record of the same name are removed. Noise that differs by body axis is refused, for CSV
+    has no columns for it.
     """
     for series in record.vectors:
         if series.anisotropic:
@@ -390,34 +319,6 @@ def _write_csv(path: Path, comment: str, names: tuple[str, ...], rows: Array) ->
     with written_beside(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
         file.write(f"{comment}\n{','.join(names)}\n")
         np.savetxt(file, rows, delimiter=",", fmt="%.17g")
-
-
-def import_csv(path: str | os.PathLike[str]) -> ImuRecord:
-    """Read a record written by :func:`export_csv`, with the vector series in the same folder.
-
-    Parameters
-    ----------
-    path : path-like
-        File.
-
-    Returns
-    -------
-    ImuRecord
-        The record.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or of another kind, does not reach the time stated in its first line, or a row is cut short, holds no
-        number or no increment (the message names its line).
-
-    Notes
-    -----
-    Measurements of NaN are missing. An increment must not be NaN: the rotation over an interval without one is unknown. If a row is
-    left out, the next one must hold the rotation over both intervals.
-    """
-    with reading.from_file(path):
-        return _read_csv_record(Path(path)).record
 
 
 def _read_csv_record(target: Path) -> RecordFile:

@@ -763,23 +763,7 @@ def _attitudes(group: Any, name: str, rows: int) -> Array:
 
 
 def read_truth(path: str | os.PathLike[str]) -> Truth | None:
-    """Read the truth of a file written by :func:`write_estimate`.
-
-    Parameters
-    ----------
-    path : path-like
-        File.
-
-    Returns
-    -------
-    Truth or None
-        Truth at the times of the estimate; None if the file has none.
-
-    Raises
-    ------
-    InputError
-        As :func:`read_estimate` does.
-    """
+    """Read the truth of a file written by :func:`write_estimate`, at the times of the estimate; None if the file has none."""
     with _estimate_file(path) as file:
         if "truth" not in file:
             return None
@@ -840,23 +824,7 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
 
 
 def read_states(path: str | os.PathLike[str]) -> dict[str, ErrorStateEstimate]:
-    """Read the error states of an estimate written by :func:`write_estimate`.
-
-    Parameters
-    ----------
-    path : path-like
-        File.
-
-    Returns
-    -------
-    dict of str to ErrorStateEstimate
-        Error states by name; empty for a filter without.
-
-    Raises
-    ------
-    InputError
-        As :func:`read_estimate`.
-    """
+    """Read the error states, by name, of an estimate written by :func:`write_estimate`."""
     with _estimate_file(path) as file:
         rows = len(_numbers(file, "time", ("n",)))
         found = {}
@@ -893,13 +861,7 @@ def _innovations(part: Any) -> Innovations:
 
 
 def read_attributes(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read the attributes of a result file of any kind: its kind, version, conventions, and those of the writer.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, not HDF5, or not of this package.
-    """
+    """Read the attributes of a result file of any kind: its kind, version, conventions, and those of the writer."""
     with reading.hdf5(path) as file:
         attributes = reading.attributes(file)
     if not str(attributes.get("kind", "")).startswith("strapdown "):

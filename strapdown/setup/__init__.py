@@ -42,7 +42,6 @@ __all__ = [
     "run",
     "smooth",
     "to_toml",
-    "unmodelled_errors",
 ]
 
 ATTITUDE_SIGMA = 1.0 * units.DEGREE
@@ -284,25 +283,9 @@ def unmodelled_errors(
     *,
     gravity_f: Sequence[float] = vectors.GRAVITY_F,
 ) -> tuple[str, ...]:
-    """Return, in words, the specified errors that a filter has no state for.
+    """Return, in words with their size, the specified errors of gyro and sensors that a filter has no state for.
 
     Where there are any, a filter that models the noise alone is overconfident.
-
-    Parameters
-    ----------
-    spec : GyroSpec
-        Specification of the gyro.
-    sensors : tuple, optional
-        Sensors of the scenario.
-    states : States, optional
-        Error states of the filter; None: attitude and bias alone.
-    gravity_f : sequence of float (3,)
-        Gravity in the fixed frame, m/s².
-
-    Returns
-    -------
-    tuple of str
-        One phrase for each error, with its size; empty where there is none.
 
     Examples
     --------

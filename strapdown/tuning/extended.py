@@ -256,23 +256,10 @@ def likelihood(
     parts: int = 20,
     threads: int = 1,
 ) -> ExtendedLikelihood:
-    """Return the likelihood of the free parameters of a filter with optional states on these records.
+    """Return the likelihood of the free parameters of a filter with error states on these records.
 
-    Parameters
-    ----------
-    cases : sequence of Case
-        Their initial states are of the whole bias, as those of :func:`strapdown.tuning.record_case` do.
-    chosen : FilterSetup
-        Where the free parameters start, and what the fixed ones are; its gate and robust weights are not applied. With ``states``, or
-        without where a σ of one axis is free.
-    free : sequence of str
-        Names of :mod:`strapdown.tuning.parameters` but ``filter.scale``, those of single axes (``SENSOR.sigma.x``) too, and of
-        :func:`state_names`, such as ``gyro.scale_sigma``, ``gyro.drift_time``, ``SENSOR.bias_sigma``, ``SENSOR.correlated_sigma``,
-        ``SENSOR.correlation_time``.
-    parts : int
-        Spans of time of each record whose gradients are kept apart.
-    threads : int
-        Runs at once.
+    The initial states of the cases are of the whole bias. Gate and robust weights of ``chosen`` are not applied. ``free`` are names of
+    :mod:`strapdown.tuning.parameters` but ``filter.scale``, those of single axes (``SENSOR.sigma.x``) too, and of :func:`state_names`.
     """
     if not cases:
         raise InputError("there is no record to tune on; give one")

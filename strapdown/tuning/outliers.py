@@ -136,20 +136,7 @@ def contaminated_likelihood(
     scale: float = SCALE,
     threads: int = 1,
 ) -> ContaminatedLikelihood:
-    """Return the likelihood of the free parameters and of the outliers' share and scale, which are always free.
-
-    Parameters
-    ----------
-    cases : sequence of Case
-    chosen : FilterSetup
-        Where the free parameters start, and what the fixed ones are.
-    free : sequence of str
-        Names of :mod:`strapdown.tuning.parameters`, at most five.
-    share, scale : float
-        Where the search starts: the share of outliers, and their noise over that of the others.
-    threads : int
-        Records, or points, that are worked on at once.
-    """
+    """Return the likelihood of the free parameters, at most five, and of the outliers' share and scale, which are always free."""
     for name, value, (least, most) in (("share", share, SHARES), ("scale", scale, SCALES)):
         if not least <= positive(name, value) <= most:
             raise InputError(f"{name} of the outliers is {value:g}; it must lie between {least:g} and {most:g}")

@@ -128,16 +128,7 @@ def unit_of(name: str, records: Sequence[ImuRecord]) -> Unit:
 
 
 def fixed_unit(name: str) -> Unit:
-    """Return the unit that a parameter is printed in where its records are not known: SI of a sensor's σ.
-
-    Parameters
-    ----------
-    name : str
-
-    Returns
-    -------
-    Unit
-    """
+    """Return the unit that a parameter is printed in where its records are not known: SI of a sensor's σ."""
     return _UNITS.get(name, Unit(name="rad or SI", factor=1.0))
 
 

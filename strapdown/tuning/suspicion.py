@@ -136,17 +136,6 @@ class Unmodelled:
 def unmodelled(case: Case, chosen: FilterSetup, *, probability: float = 0.99) -> Unmodelled:
     """Return what the part of a record that a filter was tuned on says against the tuned filter.
 
-    Parameters
-    ----------
-    case : Case
-        What it was tuned on; what is held out is left out.
-    chosen : FilterSetup
-        The tuned filter.
-    probability : float
-        Of the judgement, and of the scale factor: a consistent filter fails either with at most 1 − this.
-
-    Notes
-    -----
     The filter is run some twenty times; where the innovations are not of the right shape some hundred times more, for their causes.
     """
     tail(probability)

@@ -665,45 +665,6 @@ class VectorSensor(ByValue):
         return self.faults.heard(series, generator)
 
 
-def star_directions(
-    name: str, stars_f: ArrayLike, *, sigma: float, rate: float, phase: float = 0.0, faults: Faults | None = None
-) -> tuple[VectorSensor, ...]:
-    """Return a star tracker that measures several stars as directions: one sensor per star, all at the same times.
-
-    Parameters
-    ----------
-    name : str
-        Name of the tracker; the sensors are numbered after it.
-    stars_f : array_like (k, 3)
-        Directions of the stars, fixed frame.
-    sigma : float
-        Noise of each component of a unit direction, rad.
-    rate : float
-        Measurements per second, Hz.
-    phase : float, default 0.0
-        Time of the first measurement after the start, s; 0: one interval after it.
-    faults : Faults, optional
-        Errors beyond the white noise; None: none.
-
-    Returns
-    -------
-    tuple of VectorSensor
-        The sensors.
-
-    Examples
-    --------
-    >>> [sensor.name for sensor in star_directions("tracker", np.eye(3)[:2], sigma=1e-4, rate=1.0)]
-    ['tracker 1', 'tracker 2']
-    """
-    stars = array(f"{name}: stars_f", stars_f, ("k", 3))
-    return tuple(
-        VectorSensor(
-            name=f"{name} {i + 1}", reference_f=star, sigma=sigma, rate=rate, phase=phase, faults=faults or Faults()
-        )
-        for i, star in enumerate(stars)
-    )
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class HorizonSensor(ByValue):
     """An earth-horizon sensor on an orbit: the direction of the earth's centre, which moves in the fixed frame.
