@@ -130,14 +130,10 @@ def montecarlo(
                 raise InputError(f"{name} is given, but {source} holds its own; leave it out, or name a scenario")
         plan, target = held.plan, out or source
         machine = held.machine if machine == "auto" else machine
-    writable("out", target, suffixes=_CAMPAIGN_SUFFIXES)
     tables_folder(tables)
     if resume and overwrite:
         raise InputError("--resume and --overwrite exclude each other: go on with the file, or start it anew")
-    beside = target.with_suffix(".json")
-    if replay is None and beside.exists() and not target.exists() and not overwrite:
-        raise InputError(f"{beside} exists and would be replaced; move it, choose another --out, or give --overwrite")
-    writable("out", beside)
+    _check_files(target, replaced=overwrite or replay is not None)
     if replay is not None:
         writable("out", *_replayed(target, replay))
         _replay(plan, replay, machine, target)
@@ -155,6 +151,39 @@ def montecarlo(
     count("runs", runs)
     engine.in_threads(threads)  # so that a wrong number is found now
     console.print(f"{plan.scenario.name or source.stem}: {counted(runs, 'run')}, seed {plan.seed}, machine: {choice}.")
+    options: dict[str, Any] = {
+        "resume": resume,
+        "overwrite": overwrite,
+        "chunk": chunk,
+        "machine": machine,
+        "threads": threads,
+    }
+    result = _computed(plan, target, runs, workers, cluster, options)
+    status = _print_result(result)
+    report = target.with_suffix(".json")
+    content = _report(result)
+    write_json(report, content)
+    written(target, report, *tables_written(tables, "montecarlo", content))
+    raise typer.Exit(status)
+
+
+def _check_files(target: Path, *, replaced: bool) -> None:
+    """Refuse a file that cannot be written, or a report beside it that is another's; ``replaced``: what is there may be."""
+    from strapdown.checks import InputError
+
+    writable("out", target, suffixes=_CAMPAIGN_SUFFIXES)
+    beside = target.with_suffix(".json")
+    if beside.exists() and not target.exists() and not replaced:
+        raise InputError(f"{beside} exists and would be replaced; move it, choose another --out, or give --overwrite")
+    writable("out", beside)
+
+
+def _computed(
+    plan: Plan, target: Path, runs: int, workers: int | None, cluster: str | None, options: dict[str, Any]
+) -> Campaign:
+    """Compute the runs, in threads or on Dask, and write them to the file as they are finished."""
+    from strapdown.montecarlo import campaign as campaigns
+
     with contextlib.ExitStack() as stack:
         hands = None
         if workers is not None or cluster is not None:
@@ -171,27 +200,10 @@ def montecarlo(
             stop_if_asked()
 
         try:
-            result = campaigns.run(
-                plan,
-                target,
-                runs=runs,
-                resume=resume,
-                overwrite=overwrite,
-                chunk=chunk,
-                machine=machine,
-                threads=threads,
-                workers=hands,
-                progress=advanced,
-            )
+            return campaigns.run(plan, target, runs=runs, workers=hands, progress=advanced, **options)
         except KeyboardInterrupt:
             console.print(f"What is finished is in {target}; go on with --resume.")
             raise
-    status = _print_result(result)
-    report = target.with_suffix(".json")
-    content = _report(result)
-    write_json(report, content)
-    written(target, report, *tables_written(tables, "montecarlo", content))
-    raise typer.Exit(status)
 
 
 @contextlib.contextmanager
@@ -287,7 +299,6 @@ def _print_result(campaign: Campaign) -> int:
     from strapdown.checks import InputError
     from strapdown.cli.judgement import status_of
     from strapdown.montecarlo import summary
-    from strapdown.montecarlo.verdicts import QUANTILES
 
     if campaign.statistics is None:
         raise InputError("no chunk of the campaign is finished; go on with it (--resume)")
@@ -313,6 +324,33 @@ def _print_result(campaign: Campaign) -> int:
     refused = ", ".join(f"{part['refused']} of {part['sensor']}" for part in report["nis"] if part["refused"])
     if refused:
         console.print(f"The gate refused {refused}.")
+    _print_errors(report)
+    worst = ", ".join(
+        f"{part['run']} ({'failed' if part['largest_nees'] is None else format(part['largest_nees'], '.1f')})"
+        for part in report["worst_runs"][:5]
+    )
+    console.print(f"Worst runs, by their largest NEES of the state: {worst}. See one with --replay.")
+    if report["failed_runs"]:
+        console.print(f"In {counted(report['failed_runs'], 'run')} the filter failed: no finite error or covariance.")
+    rate = ""
+    if campaign.seconds > 0.0:
+        rate = f" ({rate_text(campaign.statistics.runs / campaign.seconds)} runs/s, compiling included)"
+    console.print(
+        f"{counted(report['runs'], 'run')}, {campaign.seconds:.3g} s{rate}. The verdict takes all {len(judgement.findings)} "
+        f"statistics of `strapdown check` together: a right filter passes with {100.0 * report['probability']:g} %."
+    )
+    console.print(judgement.words)
+    if judgement.verdict == "cannot tell":
+        console.print("More runs (--runs, with --resume) would show it.")
+    if judgement.unmodelled and campaign.plan.setup.states is None:
+        console.print("--states gives the filter states for most of these errors.")
+    return status_of(judgement)
+
+
+def _print_errors(report: dict[str, Any]) -> None:
+    """Show the errors at the end, worst axis, and the coverage."""
+    from strapdown.montecarlo.verdicts import QUANTILES
+
     last = report["last_epoch"]
     errors = table(
         f"Errors at {last['time_s']:g} s, worst axis; share of the judged ones inside kσ",
@@ -342,26 +380,6 @@ def _print_result(campaign: Campaign) -> int:
     show(errors)
     expected = ", ".join(f"{100.0 * share:.2f}" for share in report["coverage"]["expected"])
     console.print(f"Of a right filter's errors {expected} % lie inside 1, 2, 3 σ.")
-    worst = ", ".join(
-        f"{part['run']} ({'failed' if part['largest_nees'] is None else format(part['largest_nees'], '.1f')})"
-        for part in report["worst_runs"][:5]
-    )
-    console.print(f"Worst runs, by their largest NEES of the state: {worst}. See one with --replay.")
-    if report["failed_runs"]:
-        console.print(f"In {counted(report['failed_runs'], 'run')} the filter failed: no finite error or covariance.")
-    rate = ""
-    if campaign.seconds > 0.0:
-        rate = f" ({rate_text(campaign.statistics.runs / campaign.seconds)} runs/s, compiling included)"
-    console.print(
-        f"{counted(report['runs'], 'run')}, {campaign.seconds:.3g} s{rate}. The verdict takes all {len(judgement.findings)} "
-        f"statistics of `strapdown check` together: a right filter passes with {100.0 * report['probability']:g} %."
-    )
-    console.print(judgement.words)
-    if judgement.verdict == "cannot tell":
-        console.print("More runs (--runs, with --resume) would show it.")
-    if judgement.unmodelled and campaign.plan.setup.states is None:
-        console.print("--states gives the filter states for most of these errors.")
-    return status_of(judgement)
 
 
 def _worst_axis(values: list[float | None]) -> int:

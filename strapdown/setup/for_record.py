@@ -110,8 +110,9 @@ class Start(NamedTuple):
 def start(record: ImuRecord, chosen: FilterSetup) -> Start:
     """Return the initial state from the first measurements of a record.
 
-    They count as the filter models them (:func:`strapdown.setup.modelled_record`). Where one set of measurements does not give the attitude, or directions contradict each other, a bank of filters with different initial
-    attitudes finds it (:mod:`strapdown.estimation.multiple_model`), and the estimate starts where one of them is left.
+    They count as the filter models them (:func:`strapdown.setup.modelled_record`). Where one set of measurements does not give the
+    attitude, or directions contradict each other, a bank of filters with different initial attitudes finds it
+    (:mod:`strapdown.estimation.multiple_model`), and the estimate starts where one of them is left.
     """
     try:
         state = estimation.first_state(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
