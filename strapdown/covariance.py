@@ -136,6 +136,8 @@ class Analysis(Listed):
         Errors too large for an analysis that is linear about the truth, in words: use a Monte Carlo there.
     """
 
+    _drawn_by = "error_budget"
+
     time: Array
     filter_covariance: Array
     sources: tuple[str, ...]

@@ -306,7 +306,9 @@ def _topic(name: str, found: Mapping[str, Any], topic: str) -> str:
         return one_of(f"{name}: topic", topic, found)
     if len(found) > 1:
         listed = ", ".join(f"{t} ({c.msgtype.rpartition('/')[2]}, {c.msgcount} messages)" for t, c in found.items())
-        raise InputError(f"{name} has several topics with orientations: {listed}; choose one by --topic")
+        raise InputError(
+            f"{name} has several topics with orientations: {listed}; choose one by --topic (topic= in Python)"
+        )
     return next(iter(found))
 
 
