@@ -1,8 +1,8 @@
 """False alarms and power of the consistency statistics, over many simulated filters. ``python benchmarks/power.py [--json FILE]``.
 
 The filters are linear: angle and bias of one axis, a gyro step and two angle measurements a step, the covariance by its own recursion. They
-are simulated all at once, so ten thousand of them take seconds; the truth is then made to differ from what the filter believes, and the
-share of filters that each statistic refuses at 95 and 99 % is told. Of a right filter it should be 5 and 1 %.
+are simulated all at once, so ten thousand of them take seconds; the truth is then made to differ from the filter's model, and the
+share of filters that each statistic refuses at 95 and 99 % is printed. Of a right filter it should be 5 and 1 %.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ class Filters:
 
 @dataclass(frozen=True, kw_only=True)
 class Mismatch:
-    """How the truth differs from what the filter believes. The default is nothing."""
+    """How the truth differs from the filter's model. The default is nothing."""
 
     measurement: float = 1.0
-    """The truth's measurement noise over the believed one."""
+    """The truth's measurement noise over the modelled one."""
     process: float = 1.0
-    """The truth's angle random walk over the believed one."""
+    """The truth's angle random walk over the modelled one."""
     bias_walk: float = 1.0
-    """The truth's rate random walk over the believed one."""
+    """The truth's rate random walk over the modelled one."""
     outliers: float = 0.0
     """Probability that a measurement has ten times the noise."""
     colour: float = 0.0

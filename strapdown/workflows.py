@@ -253,7 +253,7 @@ def estimate_record(
     smooth: bool = False,
 ) -> RecordRun:
     """Run the filter, or with ``smooth`` the smoother, of a setup over a record, by default from its first measurements on."""
-    modelled = setups.believed(record, chosen)
+    modelled = setups.modelled_record(record, chosen)
     if count("every", every) > len(modelled.increments):
         raise InputError(
             f"every is {every}, more than the {len(modelled.increments)} filter steps of the record; only the start would be kept"

@@ -28,7 +28,7 @@ def lines_of(text: io.StringIO) -> list[str]:
     return text.getvalue().splitlines()
 
 
-def test_a_line_tells_what_is_done_of_how_much(said):
+def test_a_line_says_what_is_done_of_how_much(said):
     with progress.progress_bar("runs", 30) as advance:
         advance(10)
         advanced = len(lines_of(said))
@@ -42,7 +42,7 @@ def test_a_line_tells_what_is_done_of_how_much(said):
     assert all(line.startswith("runs: 10 of 30, ") for line in lines)
 
 
-def test_a_step_of_unknown_length_tells_its_time(said):
+def test_a_step_of_unknown_length_prints_its_time(said):
     with progress.progress_bar("smoothing"):
         time.sleep(0.15)
     assert set(lines_of(said)) == {"smoothing: 0 s"}

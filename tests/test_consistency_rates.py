@@ -99,7 +99,7 @@ def right_run(seed):
         duration=300.0,
     )
     record = scenarios.simulate(scenario, seed=seed)
-    believed = setup.FilterSetup(
+    filter_setup = setup.FilterSetup(
         process_noise=estimation.ProcessNoise(
             angle_random_walk=0.3 * units.DEGREE_PER_ROOT_HOUR, rate_random_walk=1e-6
         ),
@@ -108,11 +108,11 @@ def right_run(seed):
     )
     draw = generator(seed, 0, "initial error").standard_normal(6)
     start = setup.initial_state(
-        believed,
+        filter_setup,
         quaternion.multiply(record.truth.attitude[0], quaternion.exp(-1e-3 * draw[:3])),
         record.truth.bias[0] - 1e-5 * draw[3:],
     )
-    estimate = setup.run(record, believed, start, every=5, full_covariance=True)
+    estimate = setup.run(record, filter_setup, start, every=5, full_covariance=True)
     return estimate, Truth(attitude=record.truth.attitude[::5], bias=record.truth.bias[::5])
 
 
@@ -188,7 +188,7 @@ def verdicts_of_campaigns(campaigns, runs):
 def test_few_campaigns_of_a_right_filter_are_called_wrong():
     found = verdicts_of_campaigns(20, 160)
     assert found.count("not consistent") <= 2
-    assert found.count("consistent") >= 18  # and 160 runs can tell
+    assert found.count("consistent") >= 18  # and 160 runs suffice
 
 
 def test_few_runs_of_a_filter_with_states_are_called_wrong():

@@ -33,7 +33,7 @@ def edges_of(intervals):
 # ------------------------------------------------------------------------------------------------------------- deterministic
 
 
-def test_a_perfect_gyro_tells_the_truth():
+def test_a_perfect_gyro_measures_the_truth():
     increments = RNG.normal(size=(700, 3))
     output = simulate(GyroSpec(), increments, edges_of(RNG.uniform(0.001, 1.0, 700)))
     assert np.array_equal(output.increments, increments)
@@ -420,7 +420,7 @@ def test_wrong_fields_are_refused_by_name():
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.floats(1e-12, 1e3), min_size=8, max_size=8), st.booleans())
-def test_a_table_tells_the_specification_to_the_last_bit(values, by_axis):
+def test_a_table_holds_the_specification_to_the_last_bit(values, by_axis):
     a, b, c, d, e, f, g, h = values
     spec = GyroSpec(
         angle_random_walk=np.array([a, b, c]) if by_axis else a,

@@ -96,7 +96,7 @@ def test_nan_and_infinity_survive_compilation():
 
 
 def test_compiled_loop_equals_plain_python(monkeypatch):
-    """The whole filter over a record with every kind of measurement and an interval that is taken in sub-steps."""
+    """The whole filter over a record with every kind of measurement and an interval that is split into sub-steps."""
     random = np.random.default_rng(3)
     edges = np.cumsum(np.r_[0.0, 0.01 + 0.002 * random.random(40)])
     increments = 0.05 * random.standard_normal((40, 3))

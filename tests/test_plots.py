@@ -226,7 +226,7 @@ def test_a_budget_that_starts_without_error_shows_what_comes_after(scenario, tmp
 
 
 @pytest.mark.filterwarnings("error")
-def test_drifts_that_are_rounding_are_told_and_not_drawn(tmp_path):
+def test_drifts_that_are_rounding_are_reported_and_not_drawn(tmp_path):
     size = units.DEGREE_PER_HOUR
     drifts = [
         Drift(algorithm="one-sample", samples=1, measured=-62.0 * size, predicted=-60.0 * size),
@@ -405,7 +405,7 @@ def test_angle_units_are_those_that_are_read_best():
 
 
 def test_axes_beside_each_other_are_in_one_unit(statistics):
-    """Of three attitude errors of which one is large none is told in arcseconds."""
+    """Of three attitude errors of which one is large none is printed in arcseconds."""
     histogram = statistics.histogram.copy()
     for state in (2, 5):
         histogram[:, state] = np.roll(histogram[:, state], 12 * BINS_PER_OCTAVE, axis=-1)

@@ -399,18 +399,18 @@ def test_the_mean_with_covariances_has_the_least_loss():
     np.testing.assert_allclose(P, np.linalg.inv(information.sum(axis=0)), rtol=1e-12)
 
 
-@pytest.mark.parametrize("told", [True, False])
-def test_the_covariance_of_the_mean_is_that_of_its_error(told):
-    """Normalised squared errors of 2000 means: χ² of three degrees of freedom, or Hotelling's T² where the scatter tells."""
+@pytest.mark.parametrize("with_covariance", [True, False])
+def test_the_covariance_of_the_mean_is_that_of_its_error(with_covariance):
+    """Normalised squared errors of 2000 means: χ² of three degrees of freedom, or Hotelling's T² where the scatter gives the covariance."""
     sigma, n, runs = np.array([0.02, 0.01, 0.03]), 20, 2000
     squares = []
     for seed in range(runs):
         true, q = scattered(n, sigma, seed)
-        found, P = quaternion.mean(q, np.diag(sigma**2) if told else None)
+        found, P = quaternion.mean(q, np.diag(sigma**2) if with_covariance else None)
         e = quaternion.log(quaternion.multiply(quaternion.conjugate(found), true))
         squares.append(e @ np.linalg.solve(P, e))
     # T² has the mean 3 (n − 1)/(n − 5) with the mean subtracted, and a larger spread than χ².
-    expected = 3.0 if told else 3.0 * (n - 1.0) / (n - 5.0)
+    expected = 3.0 if with_covariance else 3.0 * (n - 1.0) / (n - 5.0)
     assert np.mean(squares) == pytest.approx(expected, abs=4.0 * np.std(squares) / np.sqrt(runs))
 
 

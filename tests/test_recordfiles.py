@@ -47,7 +47,7 @@ def assert_equal(a, b):
             assert p is None or np.array_equal(p, q, equal_nan=True), (x.sensor, name)
 
 
-def test_hdf5_reads_back_equal_with_all_that_it_tells(made, tmp_path):
+def test_hdf5_reads_back_equal_with_all_that_it_holds(made, tmp_path):
     scenario, record = made
     path = tmp_path / "deep" / "record.h5"
     text = scenarios.scenario_to_toml(scenario)
@@ -266,13 +266,13 @@ def test_csv_leaves_no_series_of_an_earlier_record(made, tmp_path):
     assert sorted(tmp_path.iterdir()) == sorted([*earlier[:2], other])
 
 
-def test_csv_tells_how_it_was_made_as_hdf5_does(made, tmp_path):
+def test_csv_says_how_it_was_made_as_hdf5_does(made, tmp_path):
     scenario, record = made
-    told = {"gyro_spec": scenario.gyro, "scenario": scenarios.scenario_to_toml(scenario), "seed": 3, "run": 1}
-    path = export_csv(tmp_path / "record.csv", record, **told)[0]
+    making = {"gyro_spec": scenario.gyro, "scenario": scenarios.scenario_to_toml(scenario), "seed": 3, "run": 1}
+    path = export_csv(tmp_path / "record.csv", record, **making)[0]
     back = read_record_file(path)
     assert recordfiles.is_record(path)
-    assert (back.gyro, back.scenario, back.seed, back.run) == tuple(told.values())
+    assert (back.gyro, back.scenario, back.seed, back.run) == tuple(making.values())
     first, rest = path.read_text().split("\n", 1)
     path.write_text(first.replace('"seed"', '"sead"') + "\n" + rest)
     with pytest.raises(InputError, match="line 1: how it was made cannot be read"):
@@ -303,7 +303,7 @@ def test_units_and_conventions_that_contradict_are_refused(made, tmp_path, where
     assert_equal(read_record(path), made[1])
 
 
-def test_a_series_without_sigma_is_told_so(made, tmp_path):
+def test_a_series_without_sigma_is_reported_so(made, tmp_path):
     path = tmp_path / "record.h5"
     write_record(path, made[1])
     with changed(path) as file:

@@ -387,7 +387,7 @@ def test_what_the_target_has_no_room_for_is_said(tmp_path):
     np.testing.assert_allclose(back.time, whole.time, rtol=1e-12)
 
 
-def test_what_is_there_is_not_replaced_unless_told(tmp_path):
+def test_what_is_there_is_not_replaced_by_default(tmp_path):
     recordings.write(walk(), tmp_path / "a.csv")
     (tmp_path / "b.csv").write_text("precious")
     for target, words in (

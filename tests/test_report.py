@@ -117,12 +117,12 @@ def test_without_truth_the_page_says_what_it_cannot_show(folder):
     assert "without a truth only the innovations are judged" in body(folder / "blind.html")
 
 
-def test_the_campaign_page_tells_how_to_replay_its_worst_run(folder):
+def test_the_campaign_page_says_how_to_replay_its_worst_run(folder):
     statistics = json.loads((folder / "campaign.report.json").read_text())
     assert f"campaign.h5 --replay {statistics['worst_runs'][0]}" in body(folder / "campaign.html")
 
 
-def test_the_campaign_page_tells_what_the_filter_has_no_state_for(folder, scenario, filter_setup, tmp_path):
+def test_the_campaign_page_says_what_the_filter_has_no_state_for(folder, scenario, filter_setup, tmp_path):
     assert "no state for" not in body(folder / "campaign.html")
     assert ">reason<" not in body(folder / "campaign.html")
     held = campaign.read(folder / "campaign.h5")

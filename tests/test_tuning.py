@@ -418,7 +418,7 @@ def test_what_a_record_cannot_tell_has_a_bound_and_no_confident_value():
     assert max(bounds) < 20.0 * RRW
 
 
-def test_a_parameter_that_nothing_depends_on_is_told_so():
+def test_a_parameter_that_nothing_depends_on_is_reported_so():
     """A sensor at a single instant: its σ is not bounded by any amount of searching."""
     one = case(duration=100.0)
     star = one.record.vectors[0]

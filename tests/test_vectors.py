@@ -51,7 +51,7 @@ EVERY = [
 
 
 @pytest.mark.parametrize("sensor", EVERY, ids=lambda sensor: sensor.name)
-def test_without_noise_a_sensor_tells_its_reference_in_body_axes(sensor):
+def test_without_noise_a_sensor_measures_its_reference_in_body_axes(sensor):
     quiet = {"sigma_across": 0.0, "sigma_about": 0.0} if isinstance(sensor, AttitudeSensor) else {"sigma": 0.0}
     series = observe(dataclasses.replace(sensor, **quiet))
     assert len(series.time) == 200
@@ -67,7 +67,7 @@ def test_without_noise_a_sensor_tells_its_reference_in_body_axes(sensor):
 
 
 @pytest.mark.parametrize("sensor", EVERY, ids=lambda sensor: sensor.name)
-def test_noise_has_the_sigma_that_the_series_tells(sensor):
+def test_noise_has_the_sigma_that_the_series_states(sensor):
     series = observe(sensor, body=motion.rest(), end=5000.0)
     n = len(series.time)
     if series.kind == "attitude":
@@ -413,12 +413,12 @@ def test_the_dipole_has_no_divergence_and_no_curl_and_points_north_at_the_equato
 
 
 @pytest.mark.parametrize(("field", "kind"), [([0.0, 0.0, 0.0], "direction"), ([0.0, 0.0, 5e-5], "heading")])
-def test_a_field_without_a_direction_is_told(field, kind):
+def test_a_field_without_a_direction_is_reported(field, kind):
     with pytest.raises(InputError, match=r"compass: .*field_f is zero, which has no direction"):
         vectors.Magnetometer(name="compass", field_f=np.array(field), sigma=1e-7, rate=1.0, kind=kind)
 
 
-def test_a_sigma_whose_square_vanishes_is_told_by_its_place():
+def test_a_sigma_whose_square_vanishes_is_reported_by_its_place():
     sigma = np.array([1e-3, 1e-300, 1e-3])
     with pytest.raises(InputError, match=r"star: sigma\[1\] is 1e-300, and its square underflows"):
         vectors.VectorMeasurements(

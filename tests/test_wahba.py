@@ -274,7 +274,7 @@ def test_two_orthogonal_equal_directions() -> None:
         r = quaternion.rotate(quaternion.normalize(rng.standard_normal(4)), np.eye(3))
         b = measured(q, r, 0.0, rng)
         P = wahba.solve(b[:2], r[:2], sigma).covariance
-        # One direction tells nothing about the turn about itself, both tell about that across both.
+        # One direction measures nothing of the turn about itself, both measure the turn across both.
         np.testing.assert_allclose(b @ P @ b.T, sigma**2 * np.diag([1.0, 1.0, 0.5]), atol=1e-14 * sigma**2)
 
 

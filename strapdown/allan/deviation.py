@@ -93,7 +93,7 @@ _MEDIAN_EFFICIENCY = (
 )
 _FEWEST_BLOCKS = 30  # below this the lag-1 autocorrelation says little (SP 1065, §5.5.6)
 _MANY_BLOCKS = 128  # its scatter is then well below what moves the power law by one half
-_MOST_BLOCKS = 1 << 17
+_MAX_BLOCKS = 1 << 17
 _STRETCH = 1 << 16
 _BIN_GROWTH = 1.05
 _LARGEST_EXACT = 1 << 16
@@ -444,8 +444,8 @@ def _power_law(phase: Array, m: int, otherwise: int) -> int:
     only be redder than ``otherwise``, the power law of the τ before: by chance they show anything.
     """
     edges = phase[::m]
-    spare = max(0, len(edges) - _MOST_BLOCKS) // 2
-    blocks = np.diff(edges[spare : spare + _MOST_BLOCKS])
+    spare = max(0, len(edges) - _MAX_BLOCKS) // 2
+    blocks = np.diff(edges[spare : spare + _MAX_BLOCKS])
     count = len(blocks)
     if count < _FEWEST_BLOCKS:
         return otherwise

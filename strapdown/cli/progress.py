@@ -93,19 +93,19 @@ def _terminal(what: str, total: int | None, rate: str) -> Iterator[tuple[Callabl
 
 @contextmanager
 def _lines(what: str, total: int | None) -> Iterator[tuple[Callable[[int], None], Say]]:
-    done, told, announced = 0, LINE_INTERVAL, False
+    done, next_line, announced = 0, LINE_INTERVAL, False
 
     def advance(number: int) -> None:
         nonlocal done
         done += number
 
     def say(compiling: str, seconds: float) -> None:
-        nonlocal told, announced
+        nonlocal next_line, announced
         if compiling and not announced:
             announced = True
             errors.print("compiling for this machine, once: later runs start at once", soft_wrap=True)
-        if seconds >= told:
-            told += LINE_INTERVAL
+        if seconds >= next_line:
+            next_line += LINE_INTERVAL
             share = "" if total is None else f" {done} of {total},"
             errors.print(f"{compiling or what}:{share} {seconds:.0f} s", soft_wrap=True)
 

@@ -380,7 +380,7 @@ class Algorithm:
             ]
         else:
             raise InputError(
-                f"{self.name}: an algorithm with solver {self.solver!r} is told in files by its name alone"
+                f"{self.name}: an algorithm with solver {self.solver!r} is written to files by its name alone"
             )
         if self.source:
             table["source"] = self.source
@@ -489,9 +489,9 @@ def read_algorithms(path: str | os.PathLike[str]) -> tuple[Algorithm, ...]:
         If the file is missing, is not TOML, has no such table, or a table is not one of an algorithm.
     """
     with reading.from_file(path):
-        told = reading.toml(path)
-        checks.known_keys(f"{path}", told, ("algorithm",))
-        tables = told.get("algorithm")
+        content = reading.toml(path)
+        checks.known_keys(f"{path}", content, ("algorithm",))
+        tables = content.get("algorithm")
         several = isinstance(tables, list)
         found = [
             (f"{path}: algorithm" + (f"[{k}]" if several else ""), table)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from strapdown.checks import Array, InputError, array, count
 from strapdown.consistency.bounds import tail
 
-MOST_LAGS = 20
+MAX_LAGS = 20
 
 
 def usual_lags(samples: int) -> int:
@@ -23,7 +23,7 @@ def usual_lags(samples: int) -> int:
 
     More of them make the test's χ² distribution worse than its tails at 1 % bear.
     """
-    return max(1, min(MOST_LAGS, samples // 50))
+    return max(1, min(MAX_LAGS, samples // 50))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -141,7 +141,7 @@ class QuantilePairs:
     probability: float
 
 
-MOST_PAIRS = 2000
+MAX_PAIRS = 2000
 
 
 def quantile_pairs(whitened: ArrayLike, probability: float = 0.99) -> QuantilePairs:
@@ -152,7 +152,7 @@ def quantile_pairs(whitened: ArrayLike, probability: float = 0.99) -> QuantilePa
     x = np.sort(_series(whitened).ravel())
     n = len(x)
     ends = np.concatenate([np.arange(min(n, 200)), np.arange(max(n - 200, 0), n)])
-    ranks = np.unique(np.concatenate([np.linspace(0, n - 1, min(n, MOST_PAIRS - 400)).round().astype(int), ends]))
+    ranks = np.unique(np.concatenate([np.linspace(0, n - 1, min(n, MAX_PAIRS - 400)).round().astype(int), ends]))
     k = ranks + 1.0
     return QuantilePairs(
         theoretical=np.asarray(ndtri((k - 0.5) / n)),

@@ -43,7 +43,7 @@ __all__ = ["BankEstimate", "run"]
 HYPOTHESES = 96
 """Hypotheses on the circle where nobody says: 3.75° apart. Fewer find the attitude as soon, but are some too sure of it:
 ``sims/unknown_start.py``."""
-LEAST_WEIGHT = 1e-6
+MIN_WEIGHT = 1e-6
 """A hypothesis of less than this part of the heaviest one's weight is dropped."""
 LARGEST_SHARE = 0.15
 """Hypotheses are one Gaussian when less than this part of its covariance lies between them."""
@@ -105,7 +105,7 @@ def run(
     bias_sigma: ArrayLike = 20.0 * DEGREE_PER_HOUR,
     bias: ArrayLike = (0.0, 0.0, 0.0),
     every: int = 1,
-    least_weight: float = LEAST_WEIGHT,
+    least_weight: float = MIN_WEIGHT,
     largest_share: float = LARGEST_SHARE,
     gate: Gate | None = None,
     robust: Robust | None = None,
@@ -212,7 +212,7 @@ def _until_one(
     bias: ArrayLike,
     bias_sigma: ArrayLike,
     every: int = 1,
-    least_weight: float = LEAST_WEIGHT,
+    least_weight: float = MIN_WEIGHT,
     largest_share: float = LARGEST_SHARE,
     gate: Gate | None = None,
     robust: Robust | None = None,
@@ -222,7 +222,7 @@ def _until_one(
     events = schedule(coarse, record.time[0], record.time[-1])
     doubted = gate is not None or robust is not None
     recovery = None if gate is None else gate.recovery
-    told = gaps(record.time)
+    own_events = gaps(record.time)
     failed = 0
     first = _first_direction(events)
     spread = np.broadcast_to(bias_sigma, 3).astype(np.float64)
@@ -296,7 +296,7 @@ def _until_one(
             recovery = None  # too late for another start
             continue
         failed += 1
-        told.append(
+        own_events.append(
             Event(
                 kind="recovery",
                 start=float(events.time[used]),
@@ -310,7 +310,7 @@ def _until_one(
         sensor: events.skipped[sensor] + int(np.sum(events.sensor[:first] == i))
         for i, sensor in enumerate(events.sensors)
     }
-    estimate = replace(estimate, skipped=skipped, events=_in_order(told))
+    estimate = replace(estimate, skipped=skipped, events=_in_order(own_events))
     return BankEstimate(
         estimate=estimate,
         edges=kept,
@@ -407,8 +407,8 @@ def _innovations(events: Schedule, taken: np.ndarray, rows: Array, weight: Array
     return result
 
 
-def _joined(parts: list[tuple[float, Estimate]], told: list[Event]) -> Estimate:
-    """Return estimates of one record as one, each from its time until the next one's; gaps are those ``told``, beside other events."""
+def _joined(parts: list[tuple[float, Estimate]], gap_events: list[Event]) -> Estimate:
+    """Return estimates of one record as one, each from its time until the next one's, their events with the ``gap_events``."""
     bounds = [*np.maximum.accumulate([since for since, _ in parts]).tolist(), np.inf]
     rows = [
         (one.time >= since) & (one.time < until)
@@ -416,7 +416,7 @@ def _joined(parts: list[tuple[float, Estimate]], told: list[Event]) -> Estimate:
     ]
 
     def of_rows(name: str) -> Array:
-        return np.concatenate([getattr(one, name)[taken] for (_, one), taken in zip(parts, rows, strict=True)])
+        return np.concatenate([getattr(one, name)[kept] for (_, one), kept in zip(parts, rows, strict=True)])
 
     innovations = {}
     for sensor in parts[0][1].innovations:
@@ -426,11 +426,11 @@ def _joined(parts: list[tuple[float, Estimate]], told: list[Event]) -> Estimate:
             (one.time > since) & (one.time <= until)
             for one, since, until in zip(series, bounds[:-1], bounds[1:], strict=True)
         ]
-        weights = [one.weight[taken] for one, taken in zip(series, mine, strict=True) if one.weight is not None]
+        weights = [one.weight[kept] for one, kept in zip(series, mine, strict=True) if one.weight is not None]
         innovations[sensor] = Innovations(
-            time=np.concatenate([one.time[taken] for one, taken in zip(series, mine, strict=True)]),
-            innovation=np.concatenate([one.innovation[taken] for one, taken in zip(series, mine, strict=True)]),
-            variance=np.concatenate([one.variance[taken] for one, taken in zip(series, mine, strict=True)]),
+            time=np.concatenate([one.time[kept] for one, kept in zip(series, mine, strict=True)]),
+            innovation=np.concatenate([one.innovation[kept] for one, kept in zip(series, mine, strict=True)]),
+            variance=np.concatenate([one.variance[kept] for one, kept in zip(series, mine, strict=True)]),
             weight=np.concatenate(weights) if len(weights) == len(parts) else None,
         )
     events = [event for _, one in parts for event in one.events if event.kind != "gap"]
@@ -441,7 +441,7 @@ def _joined(parts: list[tuple[float, Estimate]], told: list[Event]) -> Estimate:
         variance=of_rows("variance"),
         covariance=of_rows("covariance") if all(one.covariance is not None for _, one in parts) else None,
         innovations=innovations,
-        events=_in_order([*events, *told]),
+        events=_in_order([*events, *gap_events]),
     )
 
 
@@ -453,7 +453,7 @@ def _reason(record: ImuRecord, events: Schedule, weight: Array, P: Array, attitu
     """Return why the hypotheses did not become one, in words."""
     values, axes = np.linalg.eigh(P[:3, :3])
     axis = quaternion.rotate(attitude, axes[:, -1])
-    told = (
+    seen = (
         f"{int(np.sum(weight > 0.0))} hypotheses are still possible after {record.time[-1] - record.time[0]:.6g} s; "
         f"the turn about the fixed axis ({axis[0]:+.2f}, {axis[1]:+.2f}, {axis[2]:+.2f}) is known to 1σ "
         f"{np.sqrt(values[-1]) / DEGREE:.3g}°"
@@ -463,10 +463,10 @@ def _reason(record: ImuRecord, events: Schedule, weight: Array, P: Array, attitu
     turned = float(np.arcsin(min(apart, 1.0)))
     if turned < CONSTANT:
         return (
-            f"{told}: all references lie along one line of the fixed frame, and the turn about it cannot be observed, however the body "
+            f"{seen}: all references lie along one line of the fixed frame, and the turn about it cannot be observed, however the body "
             "moves; add a sensor of another direction, or record until the reference has turned"
         )
     return (
-        f"{told}: the references lie up to {turned / DEGREE:.3g}° apart, which has not told the hypotheses apart yet; record longer, or "
+        f"{seen}: the references lie up to {turned / DEGREE:.3g}° apart, which has not separated the hypotheses yet; record longer, or "
         "add a sensor of another direction"
     )

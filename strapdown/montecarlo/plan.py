@@ -170,7 +170,7 @@ class Plan:
     def unmodelled(self) -> tuple[str, ...]:
         """Errors, in words, that the scenario specifies and the filter has no state for."""
         scenario = self.scenario
-        return setup.not_covered(scenario.gyro, scenario.sensors, self.setup.states, gravity_f=scenario.gravity_f)
+        return setup.unmodelled_errors(scenario.gyro, scenario.sensors, self.setup.states, gravity_f=scenario.gravity_f)
 
     def to_table(self) -> dict[str, Any]:
         """Return the plan as a table of texts and numbers, by which plans are compared and from which ``from_table`` restores it.

@@ -66,7 +66,7 @@ ERROR_EXPONENT = -40
 NEES_EXPONENT = -16
 """Bins of the NEES begin at 2⁻¹⁶ and end at 2²⁷."""
 SHIFT = 49
-"""The bits of a double shifted right by so much are exponent and three digits of the mantissa: its bin, but for a constant."""
+"""Right shift of a double's bits that leaves the exponent and three bits of the mantissa: its bin, up to a constant."""
 
 COVERED = (0.6826894921370859, 0.9544997361036416, 0.9973002039367398)
 """Share of a consistent filter's errors inside 1, 2, 3 σ."""
@@ -185,11 +185,15 @@ class Statistics(Listed):
         from strapdown.montecarlo.verdicts import summary
 
         report = summary(self)
-        parts = [(f"NEES of the {subset}", part["anees"], part) for subset, part in report["nees"].items()]
-        parts += [(f"NIS of {part['sensor']}", part["nis"], part) for part in report["nis"]]
         rows = [
-            (name, figure(mean), "{:.4f} to {:.4f}".format(*part["bounds"]), "pass" if part["consistent"] else "FAIL")
-            for name, mean, part in parts
+            (
+                f"{one.name} of {one.label}",
+                figure(one.value),
+                f"{one.low:.4f} to {one.high:.4f}",
+                "FAIL" if one.rejected else "pass",
+            )
+            for one in consistency.judge_runs(self).findings
+            if one.is_ratio
         ]
         last = report["last_epoch"]
         notes = [
@@ -202,7 +206,7 @@ class Statistics(Listed):
         if self.failed:
             notes.append(f"{self.failed} runs failed: no finite error or covariance")
         title = f"{self.runs} runs, per degree of freedom (1 expected); {100.0 * report['probability']:g} % bounds of all together"
-        return Listing(title, ("statistic", "mean", "bounds", ""), rows, notes)
+        return Listing(title, ("statistic", "value", "bounds", ""), rows, notes)
 
     @property
     def has_bias(self) -> bool:

@@ -163,19 +163,19 @@ def read_record_file(path: str | os.PathLike[str]) -> RecordFile:
         with reading.from_file(path):
             return _read_csv_record(Path(path))
     with reading.hdf5(path) as file:
-        told = reading.attributes(file)
-        kind = told.get("kind")
+        attributes = reading.attributes(file)
+        kind = attributes.get("kind")
         if kind != KIND:
             raise InputError(
                 f"{path} is {f'a {kind}' if kind else 'HDF5 of another program'}, not a {KIND}; pass one written by write_record"
             )
-        if count("format", told["format"]) > FORMAT:
+        if count("format", attributes["format"]) > FORMAT:
             raise InputError(
-                f"{path} has layout {told['format']}, this version ({strapdown.__version__}) reads up to {FORMAT}; update it"
+                f"{path} has layout {attributes['format']}, this version ({strapdown.__version__}) reads up to {FORMAT}; update it"
             )
-        if told.get("conventions", CONVENTIONS) != CONVENTIONS:
+        if attributes.get("conventions", CONVENTIONS) != CONVENTIONS:
             raise InputError(
-                f"{path} follows other conventions ({told['conventions']}); convert it to those of this package: {CONVENTIONS}"
+                f"{path} follows other conventions ({attributes['conventions']}); convert it to those of this package: {CONVENTIONS}"
             )
         group = file.get("vectors", {})
         series = tuple(_series(group[str(number)]) for number in range(len(group)))
@@ -185,44 +185,48 @@ def read_record_file(path: str | os.PathLike[str]) -> RecordFile:
         record = ImuRecord(
             time=_values(file, "time", "s"), increments=_values(file, "increments", "rad"), vectors=series, truth=truth
         )
-        more = {name: value for name, value in told.items() if name not in _RESERVED}
-        return RecordFile(record=record, version=str(told["version"]), attributes=more, **_making(told, path))
+        more = {name: value for name, value in attributes.items() if name not in _RESERVED}
+        return RecordFile(
+            record=record, version=str(attributes["version"]), attributes=more, **_making(attributes, path)
+        )
 
 
-def _making(told: Mapping[str, Any], path: str | os.PathLike[str]) -> dict[str, Any]:
+def _making(attributes: Mapping[str, Any], path: str | os.PathLike[str]) -> dict[str, Any]:
     """Return how a record was made, as its file states."""
-    made: dict[str, Any] = {name: count(name, told[name], least=0) for name in ("seed", "run") if name in told}
-    if "gyro" in told:
-        table = told["gyro"]
+    made: dict[str, Any] = {
+        name: count(name, attributes[name], least=0) for name in ("seed", "run") if name in attributes
+    }
+    if "gyro" in attributes:
+        table = attributes["gyro"]
         table = reading.from_json(table, f"{path}: gyro") if isinstance(table, str) else table
         made["gyro"] = gyro.from_table(table, f"{path}: gyro")
-    if "scenario" in told:
-        if not isinstance(told["scenario"], str):
-            raise InputError(f"{path}: scenario is {told['scenario']!r}; it must be TOML text")
-        made["scenario"] = told["scenario"]
+    if "scenario" in attributes:
+        if not isinstance(attributes["scenario"], str):
+            raise InputError(f"{path}: scenario is {attributes['scenario']!r}; it must be TOML text")
+        made["scenario"] = attributes["scenario"]
     return made
 
 
 def _values(group: Any, name: str, unit: str) -> Array:
     """Return an array of a file; its attribute ``unit``, if present, must be the expected one."""
     value = reading.numbers(group, name)
-    told = reading.attributes(group[name]).get("unit", unit)
-    if told != unit:
+    own = reading.attributes(group[name]).get("unit", unit)
+    if own != unit:
         raise InputError(
-            f"{group.file.filename}: {f'{group.name}/{name}'.lstrip('/')} is in {told!r}, and read in {unit!r}; convert it"
+            f"{group.file.filename}: {f'{group.name}/{name}'.lstrip('/')} is in {own!r}, and read in {unit!r}; convert it"
         )
     return value
 
 
 def _series(group: Any) -> VectorMeasurements:
     fields = {name: _values(group, name, unit) for name, unit in _SERIES.items() if name in group}
-    told = reading.attributes(group)
-    if told["kind"] != "attitude" and not fields.keys() & {"sigma", "sigma_axes", "covariance"}:
+    attributes = reading.attributes(group)
+    if attributes["kind"] != "attitude" and not fields.keys() & {"sigma", "sigma_axes", "covariance"}:
         raise InputError(
-            f"{group.file.filename}: {group.name.lstrip('/')} ({told['sensor']}) lacks sigma; give each measurement its standard "
+            f"{group.file.filename}: {group.name.lstrip('/')} ({attributes['sensor']}) lacks sigma; give each measurement its standard "
             "deviation"
         )
-    return VectorMeasurements(sensor=told["sensor"], kind=told["kind"], **fields)
+    return VectorMeasurements(sensor=attributes["sensor"], kind=attributes["kind"], **fields)
 
 
 # --------------------------------------------------------------------------------------------------------------------- CSV
@@ -335,8 +339,8 @@ def _read_csv_record(target: Path) -> RecordFile:
     truth = Truth(attitude=rows[:, 4:8], bias=rows[:, 8:11]) if len(names) > 4 else None
     series = tuple(_import_series(beside) for beside in _series_beside(target, comment))
     record = ImuRecord(time=rows[:, 0], increments=rows[1:, 1:4], vectors=series, truth=truth)
-    told = re.search(r", to (\S+) s,", comment)
-    _need_end(target, rows, float(told[1]) if told else rows[-1, 0])
+    end = re.search(r", to (\S+) s,", comment)
+    _need_end(target, rows, float(end[1]) if end else rows[-1, 0])
     if not made:
         return RecordFile(record=record)
     try:
@@ -349,28 +353,28 @@ def _read_csv_record(target: Path) -> RecordFile:
         ) from None
 
 
-def _need_end(path: Path, rows: Array, told: float | None) -> None:
+def _need_end(path: Path, rows: Array, stated: float | None) -> None:
     """Refuse a file that ends at another time than its first line states (None: no rows): a cut between two lines leaves no other trace."""
     ends = rows[-1, 0] if len(rows) else None
-    if ends != told:
+    if ends != stated:
         raise InputError(
-            f"{path} ends at {ends} s, its first line states {told} s; it was truncated or extended: restore it, or "
+            f"{path} ends at {ends} s, its first line states {stated} s; it was truncated or extended: restore it, or "
             "change the time there if the rows are intended"
         )
 
 
 def _series_beside(target: Path, comment: str) -> list[Path]:
     """Return the files of the vector series of a record: the stated number, or without one all that are numbered in sequence."""
-    told = re.search(rf", (\d+){_COUNTED};", comment)
-    if told is None:
+    stated = re.search(rf", (\d+){_COUNTED};", comment)
+    if stated is None:
         return list(itertools.takewhile(Path.is_file, (_series_file(target, number) for number in itertools.count())))
     files = []
-    for number in range(int(told[1])):
+    for number in range(int(stated[1])):
         file = _series_file(target, number)
         files.append(file)
         if not file.is_file():
             raise InputError(
-                f"{file} does not exist, one of {told[1]} vector series of {target.name}; put it in the folder of the record"
+                f"{file} does not exist, one of {stated[1]} vector series of {target.name}; put it in the folder of the record"
             )
     return files
 

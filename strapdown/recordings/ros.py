@@ -233,7 +233,7 @@ def _messages(path: Path, wanted: tuple[str, ...] = ()) -> _Bag:
 
 
 def _named(path: Path, folder: Path) -> Path:
-    """Return a path whose ending is that of its content, by which the library tells bags apart."""
+    """Return a path whose ending is that of its content, by which the library distinguishes bags."""
     if path.is_dir():
         return path
     with reading.opened(path) as stream:

@@ -71,7 +71,7 @@ def matched_setup(
 def matched_to_scenario(scenario: Scenario, *, states: bool | None = None) -> FilterSetup:
     """Return the filter setup that matches a scenario, by default with error states where the scenario specifies such errors."""
     if states is None:
-        states = bool(setup.not_covered(scenario.gyro, scenario.sensors, gravity_f=scenario.gravity_f))
+        states = bool(setup.unmodelled_errors(scenario.gyro, scenario.sensors, gravity_f=scenario.gravity_f))
     found = setup.matched(scenario, states=states)
     if states and (found.states is None or not found.states.names):
         return setup.matched(scenario)
@@ -84,9 +84,9 @@ def unmodelled_errors(record: ImuRecord, chosen: FilterSetup) -> tuple[str, ...]
     if origin.gyro is None:
         return ()
     if origin.scenario is None:
-        return setup.not_covered(origin.gyro, (), chosen.states)
+        return setup.unmodelled_errors(origin.gyro, (), chosen.states)
     scenario = origin.scenario
-    return setup.not_covered(origin.gyro, scenario.sensors, chosen.states, gravity_f=scenario.gravity_f)
+    return setup.unmodelled_errors(origin.gyro, scenario.sensors, chosen.states, gravity_f=scenario.gravity_f)
 
 
 class Start(NamedTuple):

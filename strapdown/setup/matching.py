@@ -21,7 +21,7 @@ QUICK = 0.3
 """A drift is a state if its time constant is at least this part of the filter's own."""
 UNSEEN = 1e4
 """Part of the record's length that the quickest drift lasts where nothing is measured."""
-LEAST_STEPS = 10.0
+MIN_STEPS = 10.0
 """Gyro intervals that the quickest drift lasts at least."""
 
 
@@ -90,7 +90,7 @@ def _drifts(
         length = float(record.time[-1] - record.time[0])
         step = length / len(record.increments)
         follows = QUICK / bandwidth(spec, density) if np.isfinite(density) else length / UNSEEN
-        shortest = max(follows, LEAST_STEPS * step)
+        shortest = max(follows, MIN_STEPS * step)
         number = max(1, int(np.floor(np.log10(length / shortest))) + 1)
         times = length / DECADE ** np.arange(number)
         each = instability * float(np.sqrt(np.log(DECADE) / np.pi))

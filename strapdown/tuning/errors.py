@@ -19,7 +19,7 @@ from strapdown.setup import FilterSetup
 from strapdown.tuning.innovations import MOST, STEP, Case, Derivatives, Likelihood, likelihood
 
 Measure = Literal["likelihood", "rmse"]
-MOST_EPOCHS = 1000
+MAX_EPOCHS = 1000
 """Epochs taken of one record."""
 
 
@@ -141,7 +141,7 @@ def error_objective(
 
 def _spread(base: Likelihood, number: int, known: np.ndarray, measure: Measure) -> np.ndarray:
     """Return edges far enough apart that the attitude error of the starting filter has forgotten."""
-    picked = known[:: max(1, len(known) // MOST_EPOCHS)]
+    picked = known[:: max(1, len(known) // MAX_EPOCHS)]
     if measure == "rmse" or len(picked) < 100:
         return picked
     case = base.prepared[number]

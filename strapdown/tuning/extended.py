@@ -81,7 +81,7 @@ def state_names(states: States) -> tuple[str, ...]:
 
 def unit_of(name: str) -> Unit:
     """Return the unit that a parameter of the states is printed in."""
-    told = {
+    known = {
         "gyro.scale_sigma": Unit(name="ppm", factor=1e-6),
         "gyro.misalignment_sigma": Unit(name="mrad", factor=1e-3),
         "gyro.force_sigma": Unit(name="°/h/g", factor=units.DEGREE_PER_HOUR / units.STANDARD_GRAVITY),
@@ -92,7 +92,7 @@ def unit_of(name: str) -> Unit:
         "lever_sigma": Unit(name="m", factor=1.0),
         **{name: Unit(name=unit, factor=1.0) for name, unit in VELOCITY.items()},
     }
-    return told.get(name, told.get(name.rpartition(".")[2], Unit(name="rad, or the vector's unit", factor=1.0)))
+    return known.get(name, known.get(name.rpartition(".")[2], Unit(name="rad, or the vector's unit", factor=1.0)))
 
 
 def value_of(states: States, name: str) -> float:
@@ -152,8 +152,8 @@ class ExtendedLikelihood:
         own = set(state_names(self.chosen.states))
         plain = {name: value for name, value in values.items() if name not in own}
         result = parameters.with_values(self.chosen, plain) if plain else self.chosen
-        told = {name: self._bounded(name, value) for name, value in values.items() if name in own}
-        return replace(result, states=with_state_values(self.chosen.states, told))
+        bounded = {name: self._bounded(name, value) for name, value in values.items() if name in own}
+        return replace(result, states=with_state_values(self.chosen.states, bounded))
 
     def _bounded(self, name: str, value: float) -> float:
         """Return the value of a parameter inside what makes a difference, or sense."""
@@ -287,10 +287,10 @@ def likelihood(
     for case in cases:
         _check_case(case, chosen)
     names = tuple(free)
-    told = {name: values[name] for name in names if name in plain}
+    given = {name: values[name] for name in names if name in plain}
     return ExtendedLikelihood(
         names=names,
-        chosen=parameters.with_values(chosen, told) if told else chosen,
+        chosen=parameters.with_values(chosen, given) if given else chosen,
         start=np.log([values[name] for name in names]),
         cases=tuple(cases),
         parts=count("parts", parts),
@@ -323,5 +323,5 @@ def _check_case(case: Case, chosen: FilterSetup) -> None:
         )
     if not isinstance(case.initial, State):
         raise InputError(
-            f"{what}: initial is {case.initial!r}; it must be a estimation.State, which tells of the whole bias"
+            f"{what}: initial is {case.initial!r}; it must be an estimation.State, which holds the whole bias"
         )

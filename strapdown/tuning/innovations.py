@@ -369,7 +369,7 @@ def thinned(series: VectorMeasurements, spacing: float) -> VectorMeasurements:
 def _prepare(case: Case, chosen: FilterSetup, names: tuple[str, ...], parts: int, spacing: float) -> Prepared:
     sensors = [series.sensor for series in case.record.vectors]
     own = {name: value for name, value in chosen.sigma.items() if name in sensors}
-    record = setup.believed(case.record, replace(chosen, sigma=own))
+    record = setup.modelled_record(case.record, replace(chosen, sigma=own))
     for series in record.vectors:
         if series.anisotropic:
             raise InputError(

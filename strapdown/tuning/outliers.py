@@ -46,9 +46,9 @@ SHARES = (1e-4, 0.4)
 """Shares that are searched: what is more frequent is no outlier."""
 SCALES = (2.0, 100.0)
 """Scales that are searched: what is hardly wider is none either."""
-MOST_REFUSED = 0.25
+MAX_REFUSED = 0.25
 """A share above which what is called outliers is a second size of the noise, and nothing to refuse."""
-LEAST_REFUSED = 1e-9
+MIN_REFUSED = 1e-9
 """Share of right measurements that any gate refuses."""
 OWN = (OUTLIER_SHARE, OUTLIER_SCALE)
 
@@ -172,8 +172,8 @@ def tuned_gate(objective: ContaminatedLikelihood, tuning: Tuning, *, draws: int 
     share, scale = tuning[OUTLIER_SHARE], tuning[OUTLIER_SCALE]
     seen = _seen(objective, tuning.point[:-2])
     best, thresholds = _probability(seen, np.array([[share.value, scale.value]]))
-    told = {name: float(value[0]) for name, value in thresholds.items()}
-    if not share.identified or share.value > MOST_REFUSED:
+    chosen = {name: float(value[0]) for name, value in thresholds.items()}
+    if not share.identified or share.value > MAX_REFUSED:
         return TunedGate(
             gate=None, probability=math.nan, lower=math.nan, upper=math.nan, thresholds={}, share=share, scale=scale
         )
@@ -189,7 +189,7 @@ def tuned_gate(objective: ContaminatedLikelihood, tuning: Tuning, *, draws: int 
         probability=float(best[0]),
         lower=float(lower),
         upper=float(upper),
-        thresholds=told,
+        thresholds=chosen,
         share=share,
         scale=scale,
     )
@@ -252,6 +252,6 @@ def _probability(seen: dict[str, _Seen], tried: Array) -> tuple[Array, dict[str,
         wider = 1.0 + (scale**2 - 1.0) * one.noise
         odds = np.log1p(-share) - np.log(share) + 0.5 * one.degrees * np.log(wider)
         thresholds[name] = np.maximum(2.0 * odds / (1.0 - 1.0 / wider), 0.0)
-        refused += one.number * np.log(np.maximum(chdtrc(one.degrees, thresholds[name]), LEAST_REFUSED))
+        refused += one.number * np.log(np.maximum(chdtrc(one.degrees, thresholds[name]), MIN_REFUSED))
         total += one.number
     return 1.0 - np.exp(refused / total), thresholds

@@ -381,7 +381,7 @@ def _covariances(name: str, value: ArrayLike, m: int, missing: np.ndarray) -> Ar
 
 UNIT_TOLERANCE = 1e-6
 """Departure of the length of a measured direction from 1 above which it is an error, not rounding."""
-LEAST_LEVEL = 1e-3
+MIN_LEVEL = 1e-3
 """Horizontal part of a unit reference below which it shows no heading."""
 
 
@@ -400,8 +400,8 @@ def need_unit(name: str, vector: Array) -> None:
 def need_level(name: str, reference: Array) -> None:
     """Refuse unit references (..., 3) of a heading that are vertical."""
     level = np.hypot(reference[..., 0], reference[..., 1])
-    if np.any(level < LEAST_LEVEL):
-        place = f"{name}[{int(np.argmax(level < LEAST_LEVEL))}]" if level.ndim else name
+    if np.any(level < MIN_LEVEL):
+        place = f"{name}[{int(np.argmax(level < MIN_LEVEL))}]" if level.ndim else name
         raise InputError(f"{place} is vertical and shows no heading; give one with a horizontal part")
 
 

@@ -34,13 +34,13 @@ INCONSISTENT = 6.0
 LARGEST_UNCERTAINTY = 1.0
 """A 1σ of the attitude, rad, beyond which a direction of it counts as undetermined (a uniform angle has 1.8)."""
 
-LEAST_ANGLE = 1e-6
+MIN_ANGLE = 1e-6
 """Smallest angle between two directions and one line, rad, where no σ is given to judge by."""
 
-LEAST_HORIZONTAL_ANGLE = 1e-3
+MIN_HORIZONTAL_ANGLE = 1e-3
 """Angle between magnetic field and vertical, rad, below which there is no heading."""
 
-LEAST_WEIGHT = 1e-12
+MIN_WEIGHT = 1e-12
 """Weights 1/σ² below this part of the largest are lifted to it in the matrix that the SVD starts from: doubles hold no more."""
 
 ROUNDING = 1e-15
@@ -91,8 +91,8 @@ def triad(
     if sigmas is not None:
         sigma = _sigmas(sigmas, (2,))
         _refuse_inconsistent(_stacked(first_b, second_b), _stacked(first_f, second_f), sigma)
-    _refuse_parallel("primary_b", "secondary_b", first_b, second_b, LEAST_ANGLE)
-    _refuse_parallel("primary_f", "secondary_f", first_f, second_f, LEAST_ANGLE)
+    _refuse_parallel("primary_b", "secondary_b", first_b, second_b, MIN_ANGLE)
+    _refuse_parallel("primary_f", "secondary_f", first_f, second_f, MIN_ANGLE)
     return _triad(first_b, second_b, first_f, second_f)
 
 
@@ -118,7 +118,7 @@ def from_vertical_and_heading(up_b: ArrayLike, magnetic_b: ArrayLike) -> Array:
         If a vector is zero or not finite, or the field is vertical.
     """
     up, field = _directions("up_b", up_b), _directions("magnetic_b", magnetic_b)
-    _refuse_parallel("up_b", "magnetic_b", up, field, LEAST_HORIZONTAL_ANGLE)
+    _refuse_parallel("up_b", "magnetic_b", up, field, MIN_HORIZONTAL_ANGLE)
     return _triad(up, field, np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]))
 
 
@@ -235,7 +235,7 @@ def solve(vectors_b: ArrayLike, references_f: ArrayLike, sigmas: ArrayLike) -> S
     _refuse_undetermined("vectors_b", b, sigma)
 
     # The best known direction has weight 1: only ratios matter. What the floor moves the Gauss–Newton steps move back.
-    weight = np.maximum(np.square(np.min(sigma, axis=-1, keepdims=True) / sigma), LEAST_WEIGHT)
+    weight = np.maximum(np.square(np.min(sigma, axis=-1, keepdims=True) / sigma), MIN_WEIGHT)
     attitude = _refined(_svd(b, r, weight), b, r, sigma)
     attitude = np.where(attitude[..., :1] < 0.0, -attitude, attitude)
     predicted = _to_body(attitude, r)

@@ -112,7 +112,7 @@ def _write_estimate(path: Path) -> None:
     innovations = records.Innovations(
         time=np.arange(5.0), innovation=draw.standard_normal((5, 2)), variance=np.ones((5, 2))
     )
-    told = records.Estimate(
+    estimate = records.Estimate(
         time=np.arange(float(n)),
         attitude=attitude,
         bias=1e-3 * draw.standard_normal((n, 3)),
@@ -123,7 +123,7 @@ def _write_estimate(path: Path) -> None:
         events=(records.Event(kind="gap", start=1.0, end=2.0, value=3.0),),
     )
     records.write_estimate(
-        path, told, {"filter": "[filter]\n"}, truth=records.Truth(attitude=attitude, bias=np.zeros((n, 3)))
+        path, estimate, {"filter": "[filter]\n"}, truth=records.Truth(attitude=attitude, bias=np.zeros((n, 3)))
     )
 
 
