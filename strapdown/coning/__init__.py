@@ -21,12 +21,10 @@ family is this package's own; :func:`strapdown.coning.coefficients.matched_corre
 from strapdown.coning.algorithms import ALGORITHMS, Algorithm, read_algorithms
 from strapdown.coning.algorithms import algorithm_rows as algorithm_rows
 from strapdown.coning.algorithms import named as named
-from strapdown.coning.drift import (
-    ConingBudget,
-    VibrationLine,
-    predicted_coning_drift,
-    read_vibration,
-)
+from strapdown.coning.drift import ConingBudget as ConingBudget
+from strapdown.coning.drift import VibrationLine as VibrationLine
+from strapdown.coning.drift import predicted_coning_drift
+from strapdown.coning.drift import read_vibration as read_vibration
 from strapdown.coning.drift import (
     small_angle_drift as small_angle_drift,
 )
@@ -37,13 +35,10 @@ from strapdown.coning.stepping import time_per_sample as time_per_sample
 __all__ = [
     "ALGORITHMS",
     "Algorithm",
-    "ConingBudget",
-    "VibrationLine",
     "increments_from_rates",
     "integrate",
     "integrate_rates",
     "predicted_coning_drift",
     "read_algorithms",
-    "read_vibration",
     "rotation_vectors",
 ]

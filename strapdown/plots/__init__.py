@@ -30,8 +30,9 @@ from strapdown.plots.coning import coning_errors as coning_errors
 from strapdown.plots.coning import draw_coning_study as draw_coning_study
 from strapdown.plots.coning import drift_by_algorithm as drift_by_algorithm
 from strapdown.plots.decimation import decimated as decimated
-from strapdown.plots.estimates import error_overview, estimate_overview
+from strapdown.plots.estimates import error_overview
 from strapdown.plots.estimates import errors_in_envelope as errors_in_envelope
+from strapdown.plots.estimates import estimate_overview as estimate_overview
 from strapdown.plots.estimates import recording_errors as recording_errors
 from strapdown.plots.estimates import states_over_time as states_over_time
 from strapdown.plots.innovations import error_distribution as error_distribution
@@ -58,7 +59,6 @@ __all__ = [
     "allan_overview",
     "error_budget",
     "error_overview",
-    "estimate_overview",
     "nees_over_time",
     "new_figure",
     "nis_over_time",

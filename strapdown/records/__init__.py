@@ -39,6 +39,4 @@ __all__ = [
     "Truth",
     "compress",
     "cut",
-    "read_estimate",
-    "write_estimate",
 ]
