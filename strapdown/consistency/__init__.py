@@ -34,7 +34,6 @@ from strapdown.consistency.manifold import SUBSETS as SUBSETS
 from strapdown.consistency.manifold import errors, nees
 from strapdown.consistency.manifold import whitened as whitened
 from strapdown.consistency.runs import judge_runs
-from strapdown.consistency.timeaverage import TimeAverage as TimeAverage
 from strapdown.consistency.timeaverage import time_average as time_average
 from strapdown.consistency.whiteness import Autocorrelation as Autocorrelation
 from strapdown.consistency.whiteness import QuantilePairs as QuantilePairs

@@ -24,19 +24,14 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from strapdown.montecarlo.engine import Choice as Choice
 from strapdown.montecarlo.engine import choose as choose
 from strapdown.montecarlo.engine import in_threads as in_threads
-from strapdown.montecarlo.engine import machine_named as machine_named
 from strapdown.montecarlo.engine import replay, run, run_plan
 from strapdown.montecarlo.plan import Dispersions, Plan
 from strapdown.montecarlo.plan import from_table as from_table
 from strapdown.montecarlo.plan import read_dispersions as read_dispersions
 from strapdown.montecarlo.plan import whole_epochs as whole_epochs
 from strapdown.montecarlo.scalar import start as start
-from strapdown.montecarlo.statistics import EXAMPLES as EXAMPLES
-from strapdown.montecarlo.statistics import WORST as WORST
-from strapdown.montecarlo.statistics import Replay as Replay
 from strapdown.montecarlo.statistics import Statistics
 from strapdown.montecarlo.statistics import judged_epochs as judged_epochs
 from strapdown.montecarlo.statistics import merge as merge

@@ -22,7 +22,6 @@ Colours are those of Okabe and Ito, which every kind of colour vision can tell a
     Likelihood slices, and the statistics before and after.
 """
 
-from strapdown.plots.allan import allan_axis as allan_axis
 from strapdown.plots.allan import allan_overview
 from strapdown.plots.budget import error_budget
 from strapdown.plots.coning import coning_consistency as coning_consistency
