@@ -3,20 +3,13 @@
 Memory grows with the number of epochs, not with the number of runs: runs are computed in chunks, and the chunks' sums are merged in their
 order, so the statistics do not depend on the number of threads, processes or hosts.
 
-``plan``
-    What is computed: :class:`Plan`, :class:`Dispersions`.
-``statistics``
-    Mergeable sums over runs: :class:`Statistics`; what a machine must return.
-``scalar``, ``lanes``
-    The machines: the general one, and the fast one over vectors of runs.
-``engine``
-    Choosing a machine, threads, merging: :func:`run_plan`, :func:`run`, :func:`replay`.
-``verdicts``
-    Verdict and numbers from statistics, as a table: :func:`summary`.
-``campaign``
-    A run that survives being killed, and its file.
-``cluster``
-    Chunks on other processes and hosts, through Dask.
+- ``plan``: What is computed: :class:`Plan`, :class:`Dispersions`.
+- ``statistics``: Mergeable sums over runs: :class:`Statistics`; what a machine must return.
+- ``scalar``, ``lanes``: The machines: the general one, and the fast one over vectors of runs.
+- ``engine``: Choosing a machine, threads, merging: :func:`run_plan`, :func:`run`, :func:`replay`.
+- ``verdicts``: Verdict and numbers from statistics, as a table: :func:`summary`.
+- ``campaign``: A run that survives being killed, and its file.
+- ``cluster``: Chunks on other processes and hosts, through Dask.
 """
 
 from __future__ import annotations

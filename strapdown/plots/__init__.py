@@ -2,24 +2,15 @@
 
 Colours are those of Okabe and Ito, which every kind of colour vision can tell apart. :func:`new_figure` needs no display.
 
-``style``
-    Colours, themes (light, dark), sizes, saving.
-``decimation``
-    Long series reduced to the extremes of each pixel column.
-``estimates``
-    One estimate over time: attitude, bias, σ, errors.
-``innovations``
-    Innovations of one record: NIS, distribution, autocorrelation.
-``statistics``
-    Error statistics over many runs.
-``coning``
-    The coning study.
-``allan``
-    Allan deviations with their fit.
-``budget``
-    Predicted errors by source.
-``tuning``
-    Likelihood slices, and the statistics before and after.
+- ``style``: Colours, themes (light, dark), sizes, saving.
+- ``decimation``: Long series reduced to the extremes of each pixel column.
+- ``estimates``: One estimate over time: attitude, bias, σ, errors.
+- ``innovations``: Innovations of one record: NIS, distribution, autocorrelation.
+- ``statistics``: Error statistics over many runs.
+- ``coning``: The coning study.
+- ``allan``: Allan deviations with their fit.
+- ``budget``: Predicted errors by source.
+- ``tuning``: Likelihood slices, and the statistics before and after.
 """
 
 from strapdown.plots.allan import allan_overview

@@ -3,28 +3,17 @@
 A recording holds point samples of rate, specific force and magnetic field of a device, on one time axis. :mod:`strapdown.ahrs`
 estimates attitude from it.
 
-``formats``
-    The table of formats, :func:`read` by content, :func:`write` by ending.
-``recording``
-    :class:`Recording` and its units.
-``body_axes``
-    Axes and signs that are not the package's: :func:`with_axes`.
-``columns``, ``delimited``, ``dataframes``
-    Tables: roles of columns; CSV and TSV; Parquet, pandas and xarray.
-``ros``
-    ROS bags.
-``ulog``
-    Flight logs of PX4.
-``telemetry``
-    Logs of cameras, flight controllers and phones.
-``trajectories``
-    Folders of EuRoC and TUM-VI, TUM trajectories as references.
-``broad``
-    BROAD HDF5.
-``estimates``
-    Estimates in files of all these kinds.
-``samples``
-    One sensor at rest, for the identification of its noise.
+- ``formats``: The table of formats, :func:`read` by content, :func:`write` by ending.
+- ``recording``: :class:`Recording` and its units.
+- ``body_axes``: Axes and signs that are not the package's: :func:`with_axes`.
+- ``columns``, ``delimited``, ``dataframes``: Tables: roles of columns; CSV and TSV; Parquet, pandas and xarray.
+- ``ros``: ROS bags.
+- ``ulog``: Flight logs of PX4.
+- ``telemetry``: Logs of cameras, flight controllers and phones.
+- ``trajectories``: Folders of EuRoC and TUM-VI, TUM trajectories as references.
+- ``broad``: BROAD HDF5.
+- ``estimates``: Estimates in files of all these kinds.
+- ``samples``: One sensor at rest, for the identification of its noise.
 """
 
 from __future__ import annotations

@@ -1,27 +1,16 @@
 """Tuning a filter from data: maximum likelihood, an interval for each parameter, and validation on held-out data.
 
-``procedure``
-    :func:`tune`: objective, search and what follows it in one call.
-``innovations``
-    Of the filter's innovations, with score and information, eight sets of parameters a pass.
-``errors``
-    Of the errors against a truth.
-``outliers``
-    Of innovations some of which are outliers, and the gate that suits them.
-``fitting``
-    The search from several starts, intervals, what is identified and what is not.
-``parameters``
-    Names, values in a filter setup, priors.
-``starting``
-    Where the filter starts on a record.
-``planning``
-    The Cramér–Rao bound before there is a record.
-``suspicion``
-    What the tuned filter leaves unexplained, such as a scale factor that the gyro's noise stands for.
-``own``
-    Parameters of a filter of one's own, by the same objectives.
-``holding``
-    What is held out, and the filter before and after on it.
+- ``procedure``: :func:`tune`: objective, search and what follows it in one call.
+- ``innovations``: Of the filter's innovations, with score and information, eight sets of parameters a pass.
+- ``errors``: Of the errors against a truth.
+- ``outliers``: Of innovations some of which are outliers, and the gate that suits them.
+- ``fitting``: The search from several starts, intervals, what is identified and what is not.
+- ``parameters``: Names, values in a filter setup, priors.
+- ``starting``: Where the filter starts on a record.
+- ``planning``: The Cramér–Rao bound before there is a record.
+- ``suspicion``: What the tuned filter leaves unexplained, such as a scale factor that the gyro's noise stands for.
+- ``own``: Parameters of a filter of one's own, by the same objectives.
+- ``holding``: What is held out, and the filter before and after on it.
 
 >>> objective = tuning.likelihood([tuning.record_case(record, chosen)], chosen, ["gyro.arw", "star.sigma"])  # doctest: +SKIP
 >>> result = tuning.fit(objective)  # doctest: +SKIP
