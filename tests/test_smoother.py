@@ -376,7 +376,7 @@ def test_equals_least_squares_to_first_order() -> None:
 
 @pytest.mark.parametrize("name", CASES)
 def test_consistent_and_better_than_the_filter(name: str) -> None:
-    case, runs, rng = CASES[name], 100, np.random.default_rng(2024)
+    case, runs, rng = CASES[name], 50, np.random.default_rng(2024)
     nees, squares = [], []
     for _ in range(runs):
         record, initial = simulated(case, rng)

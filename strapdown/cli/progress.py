@@ -57,7 +57,7 @@ class _Rate(ProgressColumn):
 
 @contextmanager
 def progress_bar(what: str, total: int | None = None, *, rate: str = "") -> Iterator[Callable[[int], None]]:
-    """Yield a function that advances the progress by so many units; without ``total`` only the time is shown."""
+    """Yield a function that advances the progress by a number of units; without ``total`` only the time is shown."""
     if _quiet:
         yield lambda done: None
         return

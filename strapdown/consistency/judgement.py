@@ -108,7 +108,7 @@ class Finding:
         """What the value is of, its epoch included."""
         return f"{self.of}, {self.at}" if self.at else self.of
 
-    def with_bounds(self, error: float) -> Finding:
+    def _with_bounds(self, error: float) -> Finding:
         """Return the finding with the bounds of its value beyond which the p-value is below ``error``."""
         if not (self.is_ratio or self.name == LOG_NEES):
             return self
@@ -492,13 +492,13 @@ def concluded(
 ) -> Judgement:
     """Return the verdict that findings lead to, all taken together; what each was before, rejected or not, does not count.
 
-    ``states`` are those of the filter, whose power is told; ``needed`` those of them whose σ the tests must be able to see for "consistent"
+    ``states`` are those of the filter, whose power is reported; ``needed`` those whose σ the tests must be able to see for "consistent"
     (without any the sharpest test decides); ``unmodelled`` errors that the filter has no state for.
     """
     marked = holm(findings, 1.0 - probability)
     kept = sum(not one.rejected for one in marked)
     marked = [
-        one.with_bounds((1.0 - probability) / max(kept, 1)) for one in marked
+        one._with_bounds((1.0 - probability) / max(kept, 1)) for one in marked
     ]  # where Holm's procedure has stopped
     power = powers(marked, probability, states)
     rejected = [finding for finding in marked if finding.rejected]

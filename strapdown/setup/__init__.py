@@ -40,7 +40,6 @@ __all__ = [
     "read_setup",
     "run",
     "smooth",
-    "unmodelled_errors",
 ]
 
 ATTITUDE_SIGMA = 1.0 * units.DEGREE

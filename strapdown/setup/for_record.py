@@ -108,7 +108,7 @@ class Start(NamedTuple):
 
 
 def start(record: ImuRecord, chosen: FilterSetup) -> Start:
-    """Return the initial state from the first measurements of a record, as the filter processes it (:func:`strapdown.setup.believed`).
+    """Return the initial state from the first measurements of a record, as :func:`strapdown.setup.modelled_record` gives it to the filter.
 
     Where one set of measurements does not give the attitude, or directions contradict each other, a bank of filters with different initial
     attitudes finds it (:mod:`strapdown.estimation.multiple_model`), and the estimate starts where one of them is left.
