@@ -372,7 +372,7 @@ def _ulog(path: Path) -> Attitudes:
     return Attitudes(
         source=path.name,
         stamps_ns=stamps * 1000,
-        attitude=outputs.from_ned(ned),
+        attitude=outputs.to_ned(ned),
         covariance=covariance,
         error_frame="body" if covariance is not None and number == 24 else "",
         innovations=innovations,
