@@ -24,6 +24,7 @@ NAMES = {
     "Gate",
     "GyroSpec",
     "InputError",
+    "LiveFilter",
     "ProcessNoise",
     "Robust",
     "Scenario",

@@ -18,6 +18,8 @@ tangent space.
     The smoothers; ``recovery_segments`` what they make of recoveries.
 ``observability``
     What a record shows of each state.
+``live``
+    The compiled filter for data that arrive as they are measured.
 ``step_filter``
     The filter step by step, on filterpy; ``step_gate`` its gate.
 ``multiple_model``
@@ -33,6 +35,7 @@ from strapdown.estimation.forward import gaps as gaps
 from strapdown.estimation.forward import run
 from strapdown.estimation.forward import run_part as run_part
 from strapdown.estimation.gating import Gate, Monitor, Robust
+from strapdown.estimation.live import LiveFilter
 from strapdown.estimation.model import with_error_states as with_error_states
 from strapdown.estimation.observability import Observability, observability
 from strapdown.estimation.smoothing import relinearized_start as relinearized_start
@@ -41,6 +44,7 @@ from strapdown.estimation.states import ProcessNoise, State, first_state, initia
 
 __all__ = [
     "Gate",
+    "LiveFilter",
     "Monitor",
     "Observability",
     "ProcessNoise",
