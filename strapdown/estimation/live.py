@@ -288,11 +288,10 @@ class LiveFilter:
         past = self._intervals
         later: list[_Interval] = []
         oldest = self._time - self.look_back - 4.0 * math.ulp(self._time)
-        # What is measured at the begin of an interval belongs to the one before.
-        if not past or time < max(oldest, past[0].start) or past[0].start == time < past[0].end:
+        if not past or time < max(oldest, past[0].start):
             self.late += len(events)
             return
-        while len(past) > 1 and past[-1].start >= time:
+        while len(past) > 1 and past[-1].start >= time:  # what is measured at its begin belongs to the one before
             later.append(past.pop())
         here = past.pop()
         if len(here.events) + len(events) > MOST:
