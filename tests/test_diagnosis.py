@@ -19,7 +19,6 @@ from strapdown import (
     estimation,
     motion,
     quaternion,
-    recordfiles,
     records,
     scenarios,
     setup,
@@ -30,6 +29,7 @@ from strapdown.checks import InputError
 from strapdown.diagnosis.likelihood import log_p
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
+from strapdown.recordings import recordfiles
 from strapdown.records import ImuRecord
 
 WALK = 1.0 * units.DEGREE_PER_ROOT_HOUR

@@ -8,7 +8,7 @@ from typing import Any
 
 from strapdown.checks import Array
 from strapdown.consistency import Finding, Judgement
-from strapdown.listing import Listed, Listing, figure
+from strapdown.results import Listed, Listing, figure
 
 LIKELIER = math.log(20.0)
 """Difference in ln p from which on the likelier of two causes is preferred: odds of 20 to 1, "strong" evidence (Kass & Raftery 1995)."""
