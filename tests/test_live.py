@@ -36,7 +36,7 @@ def given_in_order(record, live):
         for k, time in enumerate(series.time):
             at.setdefault(time, {})[series.sensor] = sample(series, k)
     for time, increment in zip(record.time[1:], record.increments, strict=True):
-        live.update(time, delta_theta=increment, **at.get(time, {}))
+        live.update(time, delta_theta=increment, **dict(reversed(at.get(time, {}).items())))
     return live
 
 
@@ -287,6 +287,18 @@ def test_bad_declarations_are_refused():
         LiveFilter(NOISE, start(), sensors=[record_of().vectors[0].taken(slice(0))])
     with pytest.raises(TypeError, match="start another one from its state"):
         pickle.dumps(LiveFilter(NOISE, initial_state((1, 0, 0, 0), attitude_sigma=1, bias_sigma=1), sensors=[up]))
+
+
+def test_declared_sensors_are_those_of_a_scenario():
+    up = VectorSensor(name="up", reference_f=[0.0, 0.0, 2.0], sigma=1e-2, rate=10.0)
+    north = VectorSensor(name="north", reference_f=[0.0, 1.0, -2.0], sigma=1e-2, rate=10.0, kind="heading")
+    scenario = Scenario(
+        motion=motion.ConstantRate(rate=(0, 0, 0.3)), gyro=GyroSpec(), sensors=(up, north), rate=10.0, duration=1
+    )
+    record = simulate(scenario)
+    one = given_in_order(record, live_of(record, start()))
+    other = given_in_order(record, LiveFilter(NOISE, start(), sensors=[up, north], time=record.time[0]))
+    assert same(one.state(), other.state())
 
 
 def test_too_many_measurements_in_an_interval():

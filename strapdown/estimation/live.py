@@ -31,7 +31,8 @@ from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.measurement import Measurements
 from strapdown.kernels.walk import walk
 from strapdown.records import LARGEST_TURN, Event, ImuRecord, Innovations
-from strapdown.vectors import KINDS, UNIT_TOLERANCE, VectorMeasurements, VectorSensor, need_level, triad
+from strapdown.vectors import KINDS, VectorMeasurements, VectorSensor, need_level, triad
+from strapdown.vectors.sensors import UNIT_TOLERANCE
 
 MOST = 64
 """Most measurements within one gyro interval."""
@@ -287,11 +288,11 @@ class LiveFilter:
         """Update with measurements of the past, and repeat what came after them."""
         past = self._intervals
         later: list[_Interval] = []
-        oldest = self._time - self.look_back - 4.0 * math.ulp(self._time)
-        if not past or time < max(oldest, past[0].start):
+        # What is measured at the begin of an interval belongs to the one before.
+        if not past or time < past[0].start or time == past[0].start < past[0].end:
             self.late += len(events)
             return
-        while len(past) > 1 and past[-1].start >= time:  # what is measured at its begin belongs to the one before
+        while len(past) > 1 and past[-1].start >= time:
             later.append(past.pop())
         here = past.pop()
         if len(here.events) + len(events) > MOST:

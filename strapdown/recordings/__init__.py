@@ -56,7 +56,8 @@ from strapdown.recordings.recording import GAP as GAP
 from strapdown.recordings.recording import MAGNETIC_UNITS as MAGNETIC_UNITS
 from strapdown.recordings.recording import RATE_UNITS as RATE_UNITS
 from strapdown.recordings.recording import TIME_UNITS as TIME_UNITS
-from strapdown.recordings.recording import Recording, gaps
+from strapdown.recordings.recording import Recording
+from strapdown.recordings.recording import gaps as gaps
 from strapdown.recordings.recording import increments as increments
 from strapdown.recordings.samples import GyroSamples, read_samples
 from strapdown.recordings.samples import read_gyro as read_gyro
@@ -70,7 +71,6 @@ __all__ = [
     "GyroSamples",
     "Recording",
     "from_table",
-    "gaps",
     "read",
     "read_samples",
     "with_reference",
