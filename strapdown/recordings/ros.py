@@ -16,14 +16,16 @@ refuses, is scanned record by record, and what is whole is read.
 from __future__ import annotations
 
 import bz2
+import io
 import os
 import re
 import shutil
 import sqlite3
 import struct
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -49,6 +51,8 @@ TOPICS = {IMU: "/imu/data_raw", FIELD: "/imu/mag", TEMPERATURE: "/imu/temperatur
 """Topics that are written, by the names of REP 145."""
 WITH_ORIENTATION = "/imu/data"
 FRAME = "imu_link"
+BATCH = 1024
+"""Messages that are taken from the library at once: a loop about each one would take as long as the library does."""
 
 ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC = b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\0"
 MAGICS = (ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC)
@@ -57,13 +61,31 @@ _SUFFIX = {ROS1_MAGIC: ".bag", MCAP_MAGIC: ".mcap", SQLITE_MAGIC: ".db3"}
 
 @dataclass
 class _Topic:
-    """The raw messages of one topic, in the order of the bag."""
+    """The raw messages of one topic, in the order of the bag, one after the other: as objects of their own they would not fit the cache."""
 
     name: str
     kind: str
     logged: list[int] = field(default_factory=list)
     """Times of the recorder, ns."""
-    raw: list[bytes] = field(default_factory=list)
+    content: bytearray = field(default_factory=bytearray)
+    lengths: list[int] = field(default_factory=list)
+
+    def add(self, rows: Sequence[tuple[Any, int, bytes]]) -> None:
+        """Append messages: what they come from, time of the recorder, content."""
+        raws = [raw for _, _, raw in rows]
+        self.logged += [logged for _, logged, _ in rows]
+        self.content += b"".join(raws)
+        self.lengths += map(len, raws)
+
+    def __len__(self) -> int:
+        """Return the number of messages."""
+        return len(self.lengths)
+
+    @property
+    def raw(self) -> Iterator[bytes]:
+        """The messages."""
+        stream = io.BytesIO(self.content)
+        return (stream.read(length) for length in self.lengths)
 
 
 class _Bag(NamedTuple):
@@ -116,7 +138,7 @@ def read_bag(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
     time, epoch = relative_time(stamps)
     own: dict[str, Any] = {} if values[0, 28] == -1.0 else {"specific_force": values[:, 25:28]}
     for kind, name in ((FIELD, "magnetic_field"), (TEMPERATURE, "temperature"), (REFERENCE, "true_attitude")):
-        other = _beside(chosen, [t for t in bag.topics.values() if t.kind == kind and t.raw])
+        other = _beside(chosen, [t for t in bag.topics.values() if t.kind == kind and len(t)])
         if isinstance(other, str):
             said.append(other)
         if not isinstance(other, _Topic) or (kind == REFERENCE and not other.name.endswith("reference")):
@@ -138,12 +160,12 @@ def read_bag(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
 def _chosen(name: str, topics: Mapping[str, _Topic], topic: str) -> str:
     """Return the topic of the inertial unit: the one asked for, or the only one."""
     units = {t.name: t for t in topics.values() if t.kind == IMU}
-    listed = ", ".join(f"{t.name} ({len(t.raw)} messages)" for t in units.values())
+    listed = ", ".join(f"{t.name} ({len(t)} messages)" for t in units.values())
     if topic:
         if not units:
             raise InputError(f"{name} has no topic of {IMU} (it has: {', '.join(topics) or 'none that is read'})")
         return one_of(f"{name}: topic", topic, units)
-    filled = [t.name for t in units.values() if t.raw]
+    filled = [t.name for t in units.values() if len(t)]
     if not filled:
         what = f"no message of {IMU}" + (f" on {listed}" if units else "")
         raise InputError(f"{name} holds {what}; give a bag of an inertial unit")
@@ -167,29 +189,31 @@ def _beside(unit: str, found: list[_Topic]) -> _Topic | str | None:
 def _decoded(name: str, topic: _Topic, ros2: bool) -> tuple[NDArray[np.int64], Array, list[str]]:
     """Return stamps (n,), ns, numbers (n, d) of a topic's messages, in order of time, and remarks."""
     wanted = DOUBLES[topic.kind]
-    stamps = np.empty(len(topic.raw), np.int64)
-    values = np.empty((len(topic.raw), wanted))
-    lengths = np.fromiter((len(raw) for raw in topic.raw), np.int64, len(topic.raw))
+    lengths = np.array(topic.lengths, np.int64)
+    ends = np.cumsum(lengths)
+    content = np.frombuffer(topic.content, np.uint8)
+    stamps, values = np.empty(len(ends), np.int64), np.empty((len(ends), wanted))
     for length in np.unique(lengths).tolist():
         rows = np.flatnonzero(lengths == length)
         if length < 16 + 8 * wanted:
             _bad(name, topic, rows, f"{length} bytes long, shorter than its type")
-        raws = topic.raw if len(rows) == len(topic.raw) else [topic.raw[k] for k in rows]
-        table = np.frombuffer(b"".join(raws), np.uint8).reshape(len(rows), length)
+        every = len(rows) == len(ends)
+        table = content.reshape(-1, length) if every else content[(ends[rows] - length)[:, None] + np.arange(length)]
         if ros2 and not np.all((table[:, 0] == 0) & (table[:, 1] == 1)):
             _bad(
                 name, topic, rows[(table[:, 0] != 0) | (table[:, 1] != 1)], "in another encoding than little-endian CDR"
             )
         words = table[:, 4:16].copy().view("<u4")  # seconds, nanoseconds, length of the frame's name
         for frame in np.unique(words[:, 2]).tolist():
-            same = words[:, 2] == frame
+            same = np.flatnonzero(words[:, 2] == frame)
             begin = 16 + frame
             begin += -(begin - 4) % 8 if ros2 else 0  # CDR aligns doubles
             if begin + 8 * wanted > length:
                 _bad(name, topic, rows[same], f"{length} bytes long, shorter than its type")
-            numbers = np.ascontiguousarray(table[same, begin : begin + 8 * wanted]).view("<f8")
-            values[rows[same]] = numbers
-            stamps[rows[same]] = words[same, 0].astype(np.int64) * 10**9 + words[same, 1]
+            part = table if len(same) == len(rows) else table[same]
+            numbers = np.ndarray((len(part), wanted), "<f8", part, begin, (length, 8))  # where they lie, not a copy
+            values[slice(None) if len(same) == len(ends) else rows[same]] = numbers
+        stamps[rows] = words[:, 0].astype(np.int64) * 10**9 + words[:, 1]
     said = []
     if not stamps.any() and len(stamps) > 1:
         stamps = np.array(topic.logged, np.int64)
@@ -228,10 +252,10 @@ def _messages(path: Path, wanted: tuple[str, ...] = ()) -> _Bag:
                 for connection in chosen:
                     topics.setdefault(connection.topic, _Topic(connection.topic, connection.msgtype))
                 if chosen:
-                    for connection, logged, raw in reader.messages(connections=chosen):
-                        topic = topics[connection.topic]
-                        topic.logged.append(logged)
-                        topic.raw.append(raw)
+                    messages = reader.messages(connections=chosen)
+                    while batch := list(islice(messages, BATCH)):
+                        for name in {connection.topic for connection, _, _ in batch}:
+                            topics[name].add([row for row in batch if row[0].topic == name])
                 ros2 = bool(reader.is2)
     except InputError:
         raise
@@ -271,10 +295,8 @@ def _salvaged(path: Path, files: list[Path], wanted: tuple[str, ...], error: Exc
             ros2 = not head.startswith(ROS1_MAGIC)
             for name, kind, logged, raw in scan(file):
                 if not wanted or kind in wanted:
-                    topic = topics.setdefault(name, _Topic(name, kind))
-                    topic.logged.append(logged)
-                    topic.raw.append(raw)
-    number = sum(len(topic.raw) for topic in topics.values())
+                    topics.setdefault(name, _Topic(name, kind)).add([(file, logged, raw)])
+    number = sum(len(topic) for topic in topics.values())
     reason = " ".join(str(error).split()) or type(error).__name__
     if not number:
         raise InputError(
