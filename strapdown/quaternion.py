@@ -26,7 +26,6 @@ __all__ = [
     "exp",
     "from_euler",
     "from_matrix",
-    "from_mrp",
     "from_rotation",
     "inverse",
     "log",
@@ -36,7 +35,6 @@ __all__ = [
     "rotate",
     "to_euler",
     "to_matrix",
-    "to_mrp",
     "to_rotation",
 ]
 
@@ -462,42 +460,6 @@ def _named_sequence(sequence: str) -> Iterator[None]:
         raise InputError(
             f"sequence {sequence!r} is not a sequence of Euler angles ({error}); give three axes, as 'ZYX'"
         ) from None
-
-
-def to_mrp(q: ArrayLike) -> Array:
-    """Return the modified Rodrigues parameters p = tan(θ/4) n of unit quaternions.
-
-    Parameters
-    ----------
-    q : array_like (..., 4)
-        Unit quaternions q_fb.
-
-    Returns
-    -------
-    ndarray (..., 3)
-        Parameters of the shorter rotation, ``|p| ≤ 1`` (Schaub & Junkins 1996).
-    """
-    value = unit_quaternions("q", q)
-    return np.asarray(to_rotation(value.reshape(-1, 4)).as_mrp()).reshape(*value.shape[:-1], 3)
-
-
-def from_mrp(mrp: ArrayLike) -> Array:
-    """Return the unit quaternions of modified Rodrigues parameters.
-
-    Parameters
-    ----------
-    mrp : array_like (..., 3)
-        p = tan(θ/4) n; p and its shadow ``−p/|p|²`` are the same attitude.
-
-    Returns
-    -------
-    ndarray (..., 4)
-        Unit quaternions q_fb, w ≥ 0.
-    """
-    from scipy.spatial.transform import Rotation
-
-    value = array("mrp", mrp, (..., 3))
-    return _with_positive_w(from_rotation(Rotation.from_mrp(value.reshape(-1, 3)))).reshape(*value.shape[:-1], 4)
 
 
 def _with_positive_w(q: Array) -> Array:

@@ -132,7 +132,7 @@ def case():
     return estimate, recording
 
 
-def test_a_table_tells_all_in_its_names(case):
+def test_a_table_says_all_in_its_names(case):
     estimate, recording = case
     found = outputs.table(estimate, recording=recording)
     assert found["time_ns"][3] == 1_700_000_000_130_000_001

@@ -346,21 +346,11 @@ def test_yaw_pitch_and_roll_are_those_of_an_aircraft():
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_other_parameters_keep_leading_axes_and_come_back(shape):
+def test_euler_angles_keep_leading_axes_and_come_back(shape):
     q = random_quaternions(shape)
     positive = np.where(q[..., :1] < 0.0, -q, q)
     close(quaternion.from_euler(quaternion.to_euler(q)), positive, 16.0)
-    close(quaternion.from_mrp(quaternion.to_mrp(q)), positive, 16.0)
-    assert quaternion.to_euler(q).shape == quaternion.to_mrp(q).shape == (*shape, 3)
-
-
-def test_mrp_are_the_tangent_of_a_quarter_of_the_turn():
-    axis = np.array([2.0, -1.0, 2.0]) / 3.0
-    for angle in (1e-8, 0.7, 3.0):
-        close(quaternion.to_mrp(quaternion.exp(angle * axis)), np.tan(angle / 4.0) * axis)
-    p = np.tan(1.0) * axis  # a turn of 4 rad, and the way back of 4 − 2π
-    close(quaternion.from_mrp(p), quaternion.from_mrp(-p / (p @ p)))
-    close(quaternion.to_mrp(quaternion.from_mrp(p)), -p / (p @ p))
+    assert quaternion.to_euler(q).shape == (*shape, 3)
 
 
 @pytest.mark.parametrize("sequence", ["ZYZX", "", "abc", "ZZX", "zYX", 3])
@@ -409,18 +399,18 @@ def test_the_mean_with_covariances_has_the_least_loss():
     np.testing.assert_allclose(P, np.linalg.inv(information.sum(axis=0)), rtol=1e-12)
 
 
-@pytest.mark.parametrize("told", [True, False])
-def test_the_covariance_of_the_mean_is_that_of_its_error(told):
-    """Normalised squared errors of 2000 means: χ² of three degrees of freedom, or Hotelling's T² where the scatter tells."""
-    sigma, n, runs = np.array([0.02, 0.01, 0.03]), 20, 2000
+@pytest.mark.parametrize("with_covariance", [True, False])
+def test_the_covariance_of_the_mean_is_that_of_its_error(with_covariance):
+    """Normalised squared errors of 600 means: χ² of three degrees of freedom, or Hotelling's T² where the scatter gives the covariance."""
+    sigma, n, runs = np.array([0.02, 0.01, 0.03]), 20, 600
     squares = []
     for seed in range(runs):
         true, q = scattered(n, sigma, seed)
-        found, P = quaternion.mean(q, np.diag(sigma**2) if told else None)
+        found, P = quaternion.mean(q, np.diag(sigma**2) if with_covariance else None)
         e = quaternion.log(quaternion.multiply(quaternion.conjugate(found), true))
         squares.append(e @ np.linalg.solve(P, e))
     # T² has the mean 3 (n − 1)/(n − 5) with the mean subtracted, and a larger spread than χ².
-    expected = 3.0 if told else 3.0 * (n - 1.0) / (n - 5.0)
+    expected = 3.0 if with_covariance else 3.0 * (n - 1.0) / (n - 5.0)
     assert np.mean(squares) == pytest.approx(expected, abs=4.0 * np.std(squares) / np.sqrt(runs))
 
 

@@ -37,6 +37,5 @@ __all__ = [
     "NoiseFit",
     "allan_deviation",
     "fit_noise",
-    "model_deviation",
     "to_gyro_parameters",
 ]

@@ -131,7 +131,7 @@ def montecarlo(
         _replay(plan, replay, machine, target)
         return
     if held is not None and target == source and not (resume or overwrite):
-        status = _tell(held)
+        status = _print_result(held)
         if tables is not None and held.statistics is not None:
             written(*tables_written(tables, "montecarlo", engine.summary(held.statistics)))
         raise typer.Exit(status)
@@ -174,7 +174,7 @@ def montecarlo(
         except KeyboardInterrupt:
             console.print(f"What is finished is in {target}; go on with --resume.")
             raise
-    status = _tell(result)
+    status = _print_result(result)
     report = target.with_suffix(".json")
     content = _report(result)
     write_json(report, content)
@@ -265,7 +265,7 @@ def _judged(campaign: Campaign) -> Judgement:
     return consistency.judge_runs(campaign.statistics, unmodelled=campaign.plan.unmodelled)
 
 
-def _tell(campaign: Campaign) -> int:
+def _print_result(campaign: Campaign) -> int:
     """Show the statistics and the verdict; return the exit status."""
     from strapdown.checks import InputError
     from strapdown.cli.judgement import status_of
@@ -278,15 +278,20 @@ def _tell(campaign: Campaign) -> int:
         console.print(f"{campaign.statistics.runs} of {campaign.runs} runs are finished.")
     report = summary(campaign.statistics)
     figure = lambda value: "-" if value is None else f"{value:.4g}" if value >= 1e3 else f"{value:.4f}"  # noqa: E731
+    judgement = _judged(campaign)
+    found = {(one.name, one.of): one for one in judgement.findings}
     rows = table(
-        "Per degree of freedom; 1 is a filter as good as it says", "", "mean", "least", "greatest", "from", "to", ""
+        f"Per degree of freedom; 1 is a filter as good as it says. NEES over {report['epochs_judged']} epochs",
+        *("", "mean", "least", "greatest", "from", "to", ""),
     )
     for subset, part in report["nees"].items():
-        values = (part["anees"], part["least"], part["greatest"], *part["bounds"])
-        rows.add_row(f"NEES of the {subset}", *map(figure, values), verdict(part["consistent"]))
+        one = found["ANEES", subset]
+        values = (part["anees"], part["least"], part["greatest"], one.low, one.high)
+        rows.add_row(f"NEES of the {subset}", *map(figure, values), verdict(not one.rejected))
     for part in report["nis"]:
+        one = found["NIS", part["sensor"]]
         name = f"NIS of {part['sensor']}"
-        rows.add_row(name, figure(part["nis"]), "", "", *map(figure, part["bounds"]), verdict(part["consistent"]))
+        rows.add_row(name, figure(part["nis"]), "", "", *map(figure, (one.low, one.high)), verdict(not one.rejected))
     show(rows)
     refused = ", ".join(f"{part['refused']} of {part['sensor']}" for part in report["nis"] if part["refused"])
     if refused:
@@ -331,10 +336,9 @@ def _tell(campaign: Campaign) -> int:
     if campaign.seconds > 0.0:
         rate = f" ({rate_text(campaign.statistics.runs / campaign.seconds)} runs/s, compiling included)"
     console.print(
-        f"{counted(report['runs'], 'run')}, {campaign.seconds:.3g} s{rate}. Bounds hold all statistics of a right filter together with "
-        f"{100.0 * report['probability']:g} %, NEES at {report['epochs_judged']} epochs."
+        f"{counted(report['runs'], 'run')}, {campaign.seconds:.3g} s{rate}. The verdict takes all {len(judgement.findings)} "
+        f"statistics of `strapdown check` together: a right filter passes with {100.0 * report['probability']:g} %."
     )
-    judgement = _judged(campaign)
     console.print(judgement.words)
     if judgement.verdict == "cannot tell":
         console.print("More runs (--runs, with --resume) would show it.")

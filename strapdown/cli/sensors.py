@@ -15,7 +15,7 @@ from strapdown.cli.reading import (
     MagnetometerUnit,
     TimeUnit,
     Topic,
-    told,
+    given_layout,
 )
 from strapdown.cli.terminal import (
     FigureFormat,
@@ -210,7 +210,7 @@ def _layout(recording: Path, columns: str | None, topic: str | None, units: dict
     """Return how the file is read; of a simulated record and of an array the reader itself refuses what does not go with them."""
     if recording.suffix.lower() == ".npy" or (columns is None and topic is None):
         return {"units": {name: unit for name, unit in units.items() if unit}}
-    return told(recording, columns=columns, topic=topic, **units)
+    return given_layout(recording, columns=columns, topic=topic, **units)
 
 
 def _names(sensor: str, form: str = FigureFormat.png) -> tuple[str, ...]:
@@ -303,7 +303,7 @@ def _identify(recording: Path, sensor: str, options: _Options) -> identification
         console.print(
             f"Cut the recording to where the {sensor} rests, or leave a filter's band out by --highest-frequency."
         )
-        console.print(f"warning: {_DISBELIEF}, nor {specification}.", highlight=False)
+        console.print(f"warning: {_DISTRUST}, nor {specification}.", highlight=False)
     return fit
 
 
@@ -403,7 +403,7 @@ def _write_numbers(
 
 _LARGEST_RATE = 1e12
 """rad/s and Hz: far beyond any gyro, and far from where the fit's squares overflow."""
-_DISBELIEF = "do not believe these intervals"
+_DISTRUST = "do not trust these intervals"
 
 
 def _specification(fit: identification.NoiseFit, source: str, warnings: list[str], sensor: str) -> str:
@@ -416,7 +416,7 @@ def _specification(fit: identification.NoiseFit, source: str, warnings: list[str
     lines = [f"{sensor.capitalize()} noise by `strapdown allan` from {source}."]
     lines += [f"WARNING: {warning}." for warning in warnings]
     if warnings:
-        lines.append(f"WARNING: {_DISBELIEF}, nor this file.")
+        lines.append(f"WARNING: {_DISTRUST}, nor this file.")
     text = _commented(lines) + "\n" + tomli_w.dumps(noise_parameters.to_toml(fit, sensor))
     partly, wholly = [], []
     for term, bound in identification.upper_bounds(fit).items():

@@ -17,7 +17,7 @@ from strapdown.cli.reading import (
     Invert,
     TimeUnit,
     Topic,
-    told,
+    given_layout,
 )
 from strapdown.cli.terminal import (
     FigureFormat,
@@ -51,7 +51,7 @@ FIGURES = ("likelihood", "heldout")
 """Figures that are drawn beside the filter, by the ends of their names."""
 PRIOR_FACTOR = 3.0
 """One standard deviation of a prior, where none is given."""
-MOST_EXAMINED = 4
+MAX_EXAMINED = 4
 """Records that are looked at for what the tuned filter leaves unexplained."""
 WORSE = 1.05
 """An attitude error on the data held out that has grown by more than this is reported."""
@@ -88,13 +88,6 @@ def tune(
         bool,
         typer.Option(
             "--rmse", help="Tune by the RMS attitude error against the truth; then all σ alike by innovations."
-        ),
-    ] = False,
-    credibility: Annotated[
-        bool,
-        typer.Option(
-            "--credibility",
-            help="Tune for consistency: the whole distribution of NIS, and whiteness; with --truth that of NEES.",
         ),
     ] = False,
     gate: Annotated[
@@ -174,7 +167,6 @@ def tune(
     goal = _Goal(
         truth=truth,
         rmse=rmse,
-        credibility=credibility,
         gate=gate or any(name in tuning.GATED for name in names or []),
         spacing=spacing,
     )
@@ -218,13 +210,13 @@ def tune(
     examined, worst = _examined(train, before, result)
     if worst is not None:
         result = tuning.doubted(result, worst)
-    _tell(result, [case.record for case in cases], credible=credibility)
+    _print_result(result, [case.record for case in cases])
     if found is not None:
-        _tell_gate(found)
+        _print_gate(found)
     for sentence in () if worst is None else worst.words:
         console.print(sentence)
     if comparison is not None:
-        _tell_comparison(comparison, truth=goal.by_errors or credibility)
+        _print_comparison(comparison, truth=goal.by_errors)
     _write(
         out,
         result,
@@ -245,7 +237,6 @@ class _Goal(NamedTuple):
 
     truth: bool
     rmse: bool
-    credibility: bool
     gate: bool
     spacing: float
 
@@ -257,7 +248,7 @@ class _Goal(NamedTuple):
     @property
     def name(self) -> str:
         """What the result says."""
-        name = "credibility" if self.credibility else "rmse" if self.rmse else "likelihood"
+        name = "rmse" if self.rmse else "likelihood"
         return name + (" of the errors" if self.truth else "")
 
 
@@ -309,7 +300,7 @@ def _examined(train: Sequence[Case], before: FilterSetup, result: Tuning) -> tup
 
     # Optional states stand for just that; and the search knows one σ a sample.
     looked = before.states is None and not _differs_by_axis(train, result.setup)
-    suspects = train[:MOST_EXAMINED] if looked else ()
+    suspects = train[:MAX_EXAMINED] if looked else ()
     examined = []
     with progress_bar("what is left unexplained", len(suspects)) as advance:
         for case in suspects:
@@ -369,7 +360,7 @@ def _cases(
         else:
             if states:
                 raise InputError(f"{path} is a recording, which specifies no errors; --states is for simulated records")
-            recording = recordings.read(path, **told(path, **layout))
+            recording = recordings.read(path, **given_layout(path, **layout))
             chosen = chosen or tuning.recording_setup()
             if recording.left_out_words:
                 console.print(recording.left_out_words)
@@ -411,7 +402,7 @@ def _note(one: Estimated, unit: Unit) -> str:
     return f"not identified: at most {_figure(one.upper / unit.factor)} {unit.name} (95 %)"
 
 
-def _tell(result: Tuning, records: Sequence[ImuRecord], *, credible: bool) -> None:
+def _print_result(result: Tuning, records: Sequence[ImuRecord]) -> None:
     rows = table("Tuned, with 95 % intervals", "parameter", "unit", "before", "after", "from", "to", "", left=2)
     for one in result.parameters:
         unit = _unit_of(one.name, records)
@@ -419,10 +410,7 @@ def _tell(result: Tuning, records: Sequence[ImuRecord], *, credible: bool) -> No
         rows.add_row(one.name, unit.name, *(_figure(value) for value in values), _note(one, unit))
     show(rows)
     gain = result.before - result.after
-    console.print(
-        f"{result.agreeing} of {len(result.starts)} searches ended at the best point; "
-        + (f"half Neyman's statistic fell by {gain:.4g}." if credible else f"gain {gain:.4g} nats.")
-    )
+    console.print(f"{result.agreeing} of {len(result.starts)} searches ended at the best point; gain {gain:.4g} nats.")
     if not all(one.identified for one in result.parameters):
         console.print(
             "Of a parameter that is not identified these records give an upper bound alone; the filter uses the value in the column "
@@ -440,7 +428,7 @@ def _tell(result: Tuning, records: Sequence[ImuRecord], *, credible: bool) -> No
         )
 
 
-def _tell_gate(found: TunedGate) -> None:
+def _print_gate(found: TunedGate) -> None:
     if found.gate is None:
         why = "no outliers" if not found.share.identified else "noise of two sizes rather than outliers"
         console.print(f"The records show {why}; the filter's gate is left as it was.")
@@ -461,7 +449,7 @@ def _anees(one: Performance) -> str:
     return f"{_figure(float(np.nanmean(one.nees[0].mean)))} (attitude)" if one.nees else "-"
 
 
-def _tell_comparison(comparison: Comparison, *, truth: bool) -> None:
+def _print_comparison(comparison: Comparison, *, truth: bool) -> None:
     from strapdown.report import tunings
     from strapdown.units import DEGREE
 
@@ -623,7 +611,7 @@ def _plan(
     wanted = names or list(tuning.default_names([example]))
     with progress_bar("simulated records", 4) as advance:
         found = tuning.plan(source, modelled, wanted, lengths=lengths, threads=threads, progress=advance)
-    _tell_plan(found, [example])
+    _print_plan(found, [example])
 
 
 def _numbers(text: str) -> list[float]:
@@ -635,7 +623,7 @@ def _numbers(text: str) -> list[float]:
         raise InputError(f"--length is {text!r}; it must be seconds with commas, as in 600,1800") from None
 
 
-def _tell_plan(found: Plan, records: Sequence[ImuRecord]) -> None:
+def _print_plan(found: Plan, records: Sequence[ImuRecord]) -> None:
     columns = [f"{length:g} s" for length in found.lengths]
     listing = table(
         "Least standard error, as a factor (Cramér–Rao)", "parameter", "unit", "value", *columns, "10 % needs", left=2

@@ -43,25 +43,7 @@ def predicted_coning_drift(algorithm: str | Algorithm, angle: float, frequency: 
 
 
 def small_angle_drift(algorithm: str | Algorithm, frequency_ratio: float) -> float:
-    """Return the drift over β²ω for small β, from the whole power series in λ.
-
-    Parameters
-    ----------
-    algorithm : str or Algorithm
-        Name in :data:`ALGORITHMS`, or an algorithm.
-    frequency_ratio : float
-        λ = ω × sample interval, 0 to 1.
-
-    Returns
-    -------
-    float
-        Drift about the cone's axis over β²ω, dimensionless.
-
-    Raises
-    ------
-    InputError
-        If λ is above 1, where the series does not serve.
-    """
+    """Return the drift over β²ω for small β, from the whole power series in λ = ω × sample interval, 0 to 1."""
     table = named(algorithm)
     lam = checks.non_negative("frequency_ratio", frequency_ratio)
     if lam > 1.0:

@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 AXES = ("x", "y", "z")
-MOST_CHAIN_DECAY = 0.2
+MAX_CHAIN_DECAY = 0.2
 """Of λ dt of a state in a chain in one step: its series and Gauss's rule are exact."""
 ENTRIES = tuple(a if a == b else f"{a}{b}" for a in AXES for b in AXES)
 """Entries of a matrix by rows: x, xy, xz, yx, y, …"""
@@ -174,7 +174,7 @@ class ErrorStates(ByValue):
             return np.eye(self.size), np.zeros((self.size, self.size))
         decay, density = np.asarray(self.decay, np.float64), np.asarray(self.density, np.float64)
         link = np.stack([np.asarray(self.feed, np.float64), density], axis=1)
-        doublings = max(0, int(np.ceil(np.log2(max(np.max(decay) * dt / MOST_CHAIN_DECAY, 1e-9)))))
+        doublings = max(0, int(np.ceil(np.log2(max(np.max(decay) * dt / MAX_CHAIN_DECAY, 1e-9)))))
         h = dt / 2**doublings
         phi, Q = np.zeros((2, self.size, self.size))
         for k in range(self.size):
@@ -726,9 +726,9 @@ class BoundedVelocity(ErrorStates):
             for field_name, unit in three.items()
         ]
         velocity, acceleration, time = values
-        told = ", ".join(f"{name} {value:g} {three[name]}" for name, value in zip(three, values, strict=True))
+        given = ", ".join(f"{name} {value:g} {three[name]}" for name, value in zip(three, values, strict=True))
         if sum(value > 0.0 for value in values) < 2:
-            raise InputError(f"{self.name}: of {told} two must be above zero; the third follows from them")
+            raise InputError(f"{self.name}: of {given} two must be above zero; the third follows from them")
         slow, p = 1.0 / self.velocity_time, 1.0 / self.position_time if self.position_time > 0.0 else 0.0
         if time == 0.0:
             rate = ((acceleration / velocity) ** 2 - p * slow) / (p + slow)
@@ -745,7 +745,7 @@ class BoundedVelocity(ErrorStates):
         elif velocity == 0.0:
             object.__setattr__(self, "velocity_sigma", acceleration / ratio)
         elif abs(acceleration / (ratio * velocity) - 1.0) > 1e-9:
-            raise InputError(f"{self.name}: {told} do not go together at these times; give two of them")
+            raise InputError(f"{self.name}: {given} do not go together at these times; give two of them")
 
     @property
     def _rates(self) -> Array:

@@ -455,11 +455,11 @@ class Judge:
         self.gate = options.gate
         self.options = gate_options(options.gate, options.robust)
         sensors = problem.events.sensors
-        self.memory, self.standing = remembered(options.gate, problem.initial.gate, sensors)
+        self.memory, self.counters = remembered(options.gate, problem.initial.gate, sensors)
 
     def body(self, form: covariance_form.Body | root_form.Body, restart: Any) -> gate.Body:
         """Return the body of the walk around a form."""
-        return gate.Body(form=form, options=self.options, restart=restart, standing=self.standing, memory=self.memory)
+        return gate.Body(form=form, options=self.options, restart=restart, standing=self.counters, memory=self.memory)
 
     def outputs(self, form: covariance_form.Outputs | root_form.Outputs) -> gate.Outputs:
         """Return room for what is written beside the form's outputs.
@@ -488,7 +488,7 @@ class Judge:
             first,
             candidate=candidate,
             counts=self.memory,
-            standing=dict(zip(self.problem.events.sensors, self.standing, strict=True)),
+            counters=dict(zip(self.problem.events.sensors, self.counters, strict=True)),
         )
 
     def start(self) -> GateMemory:
@@ -500,7 +500,7 @@ class Judge:
         return GateMemory(
             restart_bias_variance=first_bias_variance(initial),
             counts=np.empty(0),
-            standing={},
+            counters={},
             start=float(self.problem.record.time[0]),
             values=values,
             covariance=P,
@@ -523,17 +523,17 @@ def gate_options(gate_: Gate | None, robust: Robust | None) -> gate.Options:
 
 
 def remembered(gate_: Gate | None, memory: GateMemory | None, sensors: tuple[str, ...]) -> tuple[Array, Array]:
-    """Return what a kernel goes on with: its ``memory``, and ``standing`` of these sensors."""
-    counts, standing = np.zeros(gate_rules.MEMORY), np.zeros((len(sensors), gate_rules.STANDING))
+    """Return what a kernel goes on with: its ``memory``, and ``counters`` of these sensors."""
+    counts, counters = np.zeros(gate_rules.MEMORY), np.zeros((len(sensors), gate_rules.STANDING))
     counts[gate_rules.PASSES] = 1.0
     if gate_ is not None and memory is not None:
         counts[:] = memory.counts
-        for row, sensor in zip(standing, sensors, strict=True):
-            row[:] = memory.standing.get(sensor, 0.0)
+        for row, sensor in zip(counters, sensors, strict=True):
+            row[:] = memory.counters.get(sensor, 0.0)
     if gate_ is None or not gate_.recovery:
         counts[gate_rules.CANDIDATE] = 0.0
-    standing[:, gate_rules.REPORTED] = -1.0
-    return counts, standing
+    counters[:, gate_rules.REPORTED] = -1.0
+    return counts, counters
 
 
 def gate_events(recoveries: Array, lock_outs: Array, sensors: tuple[str, ...]) -> list[Event]:

@@ -29,8 +29,9 @@ from strapdown.montecarlo.engine import choose as choose
 from strapdown.montecarlo.engine import in_threads as in_threads
 from strapdown.montecarlo.engine import machine_named as machine_named
 from strapdown.montecarlo.engine import replay, run, run_plan
-from strapdown.montecarlo.plan import Dispersions, Plan, read_dispersions
+from strapdown.montecarlo.plan import Dispersions, Plan
 from strapdown.montecarlo.plan import from_table as from_table
+from strapdown.montecarlo.plan import read_dispersions as read_dispersions
 from strapdown.montecarlo.plan import whole_epochs as whole_epochs
 from strapdown.montecarlo.scalar import start as start
 from strapdown.montecarlo.statistics import EXAMPLES as EXAMPLES
@@ -39,7 +40,6 @@ from strapdown.montecarlo.statistics import Replay as Replay
 from strapdown.montecarlo.statistics import Statistics
 from strapdown.montecarlo.statistics import judged_epochs as judged_epochs
 from strapdown.montecarlo.statistics import merge as merge
-from strapdown.montecarlo.statistics import merge_all as merge_all
 from strapdown.montecarlo.verdicts import summary
 from strapdown.setup import FilterSetup as FilterSetup
 
@@ -47,7 +47,6 @@ __all__ = [
     "Dispersions",
     "Plan",
     "Statistics",
-    "read_dispersions",
     "replay",
     "run",
     "run_plan",

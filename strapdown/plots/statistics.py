@@ -178,20 +178,9 @@ def coverage_by_state(statistics: Statistics, epoch: int = -1, ax: Axes | None =
 def covariance_ellipses(
     claimed: Array, found: Array, pair: tuple[int, int] = (0, 1), ax: Axes | None = None, *, probability: float = 0.95
 ) -> Axes:
-    """Draw the ellipse of two states that holds ``probability`` of the errors by the filter's covariance, and that of the actual errors.
+    """Draw the ellipses that hold ``probability`` of the errors of two states by the filter's covariance, and of the actual errors.
 
-    Parameters
-    ----------
-    claimed : (6, 6)
-        The filter's mean covariance P at one epoch, rad and rad/s.
-    found : (6, 6)
-        Mean e eᵀ over the runs at that epoch.
-    pair : (int, int)
-        The two states, 0 to 5.
-    ax : Axes, optional
-        A new figure's if not given.
-    probability : float
-        Of a normal error of either covariance to lie inside its ellipse.
+    ``claimed`` is the filter's mean covariance P at one epoch, ``found`` the mean e eᵀ over the runs there (6, 6), rad and rad/s.
     """
     from scipy.stats import chi2
 

@@ -60,11 +60,10 @@ from strapdown.recordings.recording import Recording
 from strapdown.recordings.recording import gaps as gaps
 from strapdown.recordings.recording import increments as increments
 from strapdown.recordings.samples import GyroSamples, read_samples
-from strapdown.recordings.samples import read_gyro as read_gyro
 from strapdown.recordings.samples import samples_of as samples_of
 from strapdown.recordings.trajectories import read_euroc as read_euroc
 from strapdown.recordings.trajectories import read_tum as read_tum
-from strapdown.recordings.trajectories import with_reference
+from strapdown.recordings.trajectories import with_reference as with_reference
 
 __all__ = [
     "FORMATS",
@@ -73,6 +72,5 @@ __all__ = [
     "from_table",
     "read",
     "read_samples",
-    "with_reference",
     "write",
 ]

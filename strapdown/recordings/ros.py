@@ -117,20 +117,7 @@ def _storages(path: Path) -> list[Path]:
 
 
 def read_bag(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
-    """Read the inertial unit of a bag.
-
-    Parameters
-    ----------
-    path : path
-        A bag's file or folder.
-    topic : str
-        Topic of ``sensor_msgs/Imu``, where there are several.
-
-    Raises
-    ------
-    InputError
-        If the bag has no or several such topics, is no bag, or holds no whole message.
-    """
+    """Read the inertial unit of a bag, a file or a folder; of several topics of ``sensor_msgs/Imu`` name one."""
     file = Path(path)
     bag = _messages(file, wanted=tuple(DOUBLES))
     chosen = _chosen(file.name, bag.topics, topic)
@@ -279,7 +266,7 @@ def _messages(path: Path, wanted: tuple[str, ...] = ()) -> _Bag:
 
 
 def _named(path: Path, folder: Path) -> Path:
-    """Return a path whose ending is that of its content, by which the library tells bags apart."""
+    """Return a path whose ending is that of its content, by which the library distinguishes bags."""
     if path.is_dir():
         return path
     with reading.opened(path) as stream:
@@ -480,20 +467,7 @@ def write_estimate(
 ) -> None:
     """Write the samples that an estimate was made from as a bag, with orientation and its covariance filled in.
 
-    Parameters
-    ----------
-    estimate : Estimate
-    path : path
-        ``.bag``, ``.mcap`` or ``.db3``.
-    recording : Recording
-        What the estimate was made from.
-    source : path, optional
-        The bag that the recording was read from: all its other topics go along as they are, if it is of the same ROS.
-
-    Raises
-    ------
-    InputError
-        If no stamp of the recording is the estimate's.
+    Of ``source``, the bag that the recording was read from, all other topics go along as they are, if it is of the same ROS.
     """
     assert recording is not None
     target = Path(path)

@@ -335,13 +335,7 @@ def _angle_names(sequence: str) -> list[str]:
 
 
 def rows_of(estimate: Estimate, recording: Recording) -> NDArray[np.int64]:
-    """Return the row of the recording of each time of an estimate.
-
-    Raises
-    ------
-    InputError
-        If a time of the estimate is no stamp of the recording.
-    """
+    """Return the row of the recording of each time of an estimate, all of which are its stamps."""
     rows = np.clip(np.searchsorted(recording.time, estimate.time - 1e-7), 0, len(recording.time) - 1)
     off = np.abs(recording.time[rows] - estimate.time)
     if off.max() > 1e-6:
@@ -359,25 +353,7 @@ def _clock(estimate: Estimate, recording: Recording | None) -> dict[str, NDArray
 
 
 def to_dataframe(estimate: Estimate, **options: Any) -> Any:
-    """Return an estimate as a pandas ``DataFrame``.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        Estimate.
-    **options : dict
-        Options of :func:`table`.
-
-    Returns
-    -------
-    pandas.DataFrame
-        Columns of :func:`table`, one row per time.
-
-    Raises
-    ------
-    InputError
-        If pandas is not installed.
-    """
+    """Return an estimate as a pandas ``DataFrame`` of the columns of :func:`table`, one row a time; options as there."""
     try:
         import pandas
     except ImportError:

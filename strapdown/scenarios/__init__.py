@@ -42,7 +42,7 @@ SCENARIOS: tuple[str, ...] = tuple(sorted(path.stem for path in _BUILTIN.glob("*
 """Names of the built-in scenarios."""
 
 
-MOST_SAMPLES = 1e9
+MAX_SAMPLES = 1e9
 """Gyro samples that a simulated record may have: beyond it none fits into memory."""
 
 
@@ -102,9 +102,9 @@ class Scenario:
         """Check rate, duration, and the names of the sensors."""
         positive("rate", self.rate, unit="Hz")
         positive("duration", self.duration, unit="s")
-        if self.duration * self.rate > MOST_SAMPLES:
+        if self.duration * self.rate > MAX_SAMPLES:
             raise InputError(
-                f"{self.duration:g} s at {self.rate:g} Hz are {self.duration * self.rate:.3g} gyro samples, more than {MOST_SAMPLES:.0e}; "
+                f"{self.duration:g} s at {self.rate:g} Hz are {self.duration * self.rate:.3g} gyro samples, more than {MAX_SAMPLES:.0e}; "
                 "shorten the run or lower the rate"
             )
         count("seed", self.seed, least=0)

@@ -6,8 +6,6 @@
     Of the filter's innovations, with score and information, eight sets of parameters a pass.
 ``errors``
     Of the errors against a truth.
-``credibility``
-    Consistency: the whole distribution of NIS, or NEES, and whiteness.
 ``outliers``
     Of innovations some of which are outliers, and the gate that suits them.
 ``fitting``
@@ -35,8 +33,6 @@ samples break it, and the most likely filter may then follow them (:attr:`strapd
 (:func:`contaminated_likelihood`), and an error without a state looks like noise of the gyro (:func:`unmodelled` looks for it).
 """
 
-from strapdown.tuning.credibility import CredibilityObjective as CredibilityObjective
-from strapdown.tuning.credibility import credibility_objective as credibility_objective
 from strapdown.tuning.errors import ErrorObjective as ErrorObjective
 from strapdown.tuning.errors import error_objective as error_objective
 from strapdown.tuning.fitting import Estimated as Estimated

@@ -23,7 +23,6 @@ from strapdown.vectors.sensors import VectorSensor as VectorSensor
 from strapdown.vectors.sensors import need_level as need_level
 from strapdown.vectors.sensors import need_unit as need_unit
 from strapdown.vectors.sensors import specific_force as specific_force
-from strapdown.vectors.sensors import star_directions as star_directions
 from strapdown.vectors.sensors import triad as triad
 
 __all__ = [
@@ -36,5 +35,4 @@ __all__ = [
     "VectorMeasurements",
     "VectorSensor",
     "specific_force",
-    "star_directions",
 ]
