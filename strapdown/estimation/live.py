@@ -137,14 +137,14 @@ class LiveFilter:
         # All that changes lies in one piece, of which a copy is a snapshot. Lock-outs that go on are the last rows of the array that the
         # kernel reports new ones in.
         slots = np.zeros((sensors, 4))
-        parts = [slots, body.attitude, body.x, body.F, judge.standing, judge.memory, np.zeros((sensors, 2))]
+        parts = [slots, body.attitude, body.x, body.F, judge.counters, judge.memory, np.zeros((sensors, 2))]
         sizes = np.cumsum([0, *(part.size for part in parts)])
         whole = np.zeros(4 * MOST + sizes[-1])
         self._state = whole[4 * MOST :]
         views = [self._state[a:b].reshape(part.shape) for a, b, part in zip(sizes, sizes[1:], parts, strict=False)]
         for view, part in zip(views, parts, strict=True):
             view[...] = part
-        self._slots, attitude, x, F, judge.standing, judge.memory, self._counts = views
+        self._slots, attitude, x, F, judge.counters, judge.memory, self._counts = views
         self._body = body._replace(attitude=attitude, x=x, F=F, length=np.ones(MOST))
         self._edges, self._increment = np.full(2, self._time), np.zeros(3)
         self._gyro_stores: Any = self._edges.data, self._increment.data
@@ -336,7 +336,7 @@ class LiveFilter:
             return
         _, recovered, locked = result
         self._closed += self._reported(self._recoveries[:recovered], self._slots[:0])
-        opened = self._judge.standing[:, gate_rules.REPORTED]
+        opened = self._judge.counters[:, gate_rules.REPORTED]
         for k, row in enumerate(self._lock_outs[:locked]):
             sensor = int(row[2])
             self._closed += self._reported(self._recoveries[:0], self._slots[sensor : sensor + 1])
