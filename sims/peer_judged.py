@@ -1,10 +1,10 @@
 """Is somebody else's filter as good as it says? The aided INS of smsfusion (a multiplicative EKF of 4Subsea), judged over many runs.
 
 The peer is put into a setup as a filter of one's own: a class with a method ``run``. It gets the same simulated records as any filter here
-(gyro, accelerometer, and the heading of an attitude sensor), and beside them a velocity that is measured to 0.1 m/s, all noises told to it
+(gyro, accelerometer, and the heading of an attitude sensor), and beside them a velocity that is measured to 0.1 m/s, all noises given to it
 as they are. ``strapdown.consistency.check_arrays`` finds from one run what its covariance is of, and the Monte Carlo gives the verdict:
 
-- ``as told``: what it says of itself, all noises right;
+- ``as specified``: what it says of itself, all noises right;
 - ``datasheet``: the same with the noise parameters that the package has for a sensor of this class, not those of the simulated one;
 - ``read as fixed``: the same covariance taken for one about fixed axes, as ROS has it: the commonest mistake in judging a filter.
 
@@ -28,9 +28,9 @@ from strapdown.estimation import State
 from strapdown.files import write_json
 from strapdown.gyro import GyroSpec
 from strapdown.motion import Harmonic, HarmonicRates
-from strapdown.outputs import euler
 from strapdown.randomness import generator
 from strapdown.records import Estimate, ImuRecord
+from strapdown.records.outputs import euler
 from strapdown.units import DEGREE, DEGREE_PER_ROOT_HOUR, STANDARD_GRAVITY
 
 SMALL = {"runs": 3, "duration": 4.0}
@@ -138,13 +138,13 @@ def main(*, runs: int = 200, duration: float = 60.0, seed: int = 1, out: Path | 
     """Judge the peer; verdicts are written to ``out`` if it is given."""
     if not INSTALLED:
         return Result(installed=False)
-    told = {"N": float(GYRO.angle_random_walk), "B": BIAS, "tau_cb": MEMORY}
+    datasheet = {"N": float(GYRO.angle_random_walk), "B": BIAS, "tau_cb": MEMORY}
     from smsfusion import constants
 
     peers = {
-        "as told": AidedIns(told),
+        "as specified": AidedIns(datasheet),
         "datasheet": AidedIns(dict(constants.ERR_GYRO_MOTION2), name="smsfusion-datasheet"),
-        "read as fixed": AidedIns(told, read_as="fixed", name="smsfusion-fixed"),
+        "read as fixed": AidedIns(datasheet, read_as="fixed", name="smsfusion-fixed"),
     }
     scene = flight(duration)
     base = replace(setup.matched(scene), attitude_sigma=1.0 * DEGREE, bias_sigma=BIAS)

@@ -9,8 +9,8 @@ Tasks
     ``simulate``, ``read``, ``write``, ``estimate``, ``smooth``, ``integrate``, ``check``, ``tune``, ``monte_carlo``,
     ``covariance_analysis``, ``allan_deviation``, ``fit_noise``, ``initial_state``
 What they take
-    ``Scenario``, ``GyroSpec``, ``VectorSensor``, ``FilterSetup``, ``ProcessNoise``, ``Gate``, ``Robust``; ``StepFilter`` filters step by
-    step; ``InputError`` is raised on bad input.
+    ``Scenario``, ``GyroSpec``, ``VectorSensor``, ``FilterSetup``, ``ProcessNoise``, ``Gate``, ``Robust``; ``LiveFilter`` and
+    ``StepFilter`` filter sample by sample, compiled and on filterpy; ``InputError`` is raised on bad input.
 More
     The submodules, each with its own ``__all__``, and below them ``estimation.error_states``, ``estimation.filters``,
     ``estimation.multiple_model``, ``montecarlo.campaign`` and ``montecarlo.cluster``. Names and submodules load when they are first used.
@@ -39,22 +39,16 @@ if TYPE_CHECKING:
     from strapdown import (
         ahrs,
         allan,
-        allan_temperature,
         coning,
         coning_study,
         consistency,
         covariance,
-        datasheets,
         diagnosis,
-        doctor,
         estimation,
         gyro,
         kinematics,
         montecarlo,
         motion,
-        noise_parameters,
-        orbit,
-        outputs,
         plots,
         quaternion,
         recordings,
@@ -63,13 +57,11 @@ if TYPE_CHECKING:
         scenarios,
         setup,
         tuning,
-        unit_calibration,
         units,
         vectors,
-        wahba,
     )
     from strapdown.checks import InputError
-    from strapdown.estimation import Gate, ProcessNoise, Robust, StepFilter, initial_state
+    from strapdown.estimation import Gate, LiveFilter, ProcessNoise, Robust, StepFilter, initial_state
     from strapdown.gyro import GyroSpec
     from strapdown.scenarios import Scenario
     from strapdown.setup import FilterSetup
@@ -94,6 +86,7 @@ __all__ = [
     "Gate",
     "GyroSpec",
     "InputError",
+    "LiveFilter",
     "ProcessNoise",
     "Robust",
     "Scenario",
@@ -102,16 +95,13 @@ __all__ = [
     "ahrs",
     "allan",
     "allan_deviation",
-    "allan_temperature",
     "check",
     "coning",
     "coning_study",
     "consistency",
     "covariance",
     "covariance_analysis",
-    "datasheets",
     "diagnosis",
-    "doctor",
     "estimate",
     "estimation",
     "fit_noise",
@@ -122,9 +112,6 @@ __all__ = [
     "monte_carlo",
     "montecarlo",
     "motion",
-    "noise_parameters",
-    "orbit",
-    "outputs",
     "plots",
     "quaternion",
     "read",
@@ -137,10 +124,8 @@ __all__ = [
     "smooth",
     "tune",
     "tuning",
-    "unit_calibration",
     "units",
     "vectors",
-    "wahba",
     "write",
 ]
 
@@ -149,6 +134,7 @@ _HOMES = {
     "Gate": "estimation",
     "GyroSpec": "gyro",
     "InputError": "checks",
+    "LiveFilter": "estimation",
     "ProcessNoise": "estimation",
     "Robust": "estimation",
     "Scenario": "scenarios",

@@ -109,7 +109,7 @@ def test_what_json_cannot_tell_is_refused_and_nothing_is_touched(tmp_path, bad):
 FULL = """
 import resource, signal, sys
 import numpy as np
-from strapdown.recordfiles import write_record
+from strapdown.recordings.recordfiles import write_record
 from strapdown.records import ImuRecord
 
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # so that a write beyond the limit fails as one on a full disk does
@@ -118,7 +118,7 @@ increments = np.random.default_rng(1).standard_normal((20_000, 3))
 try:
     write_record(sys.argv[1], ImuRecord(time=np.arange(20_001.0), increments=increments))
 except OSError as error:
-    print("told:", error)
+    print("error:", error)
 """
 
 
@@ -129,6 +129,6 @@ def test_a_full_disk_is_an_ordinary_error_of_hdf5_too(tmp_path):
     command = [sys.executable, "-c", FULL, str(tmp_path / "record.h5")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.startswith("told: [Errno 27]")
+    assert done.stdout.startswith("error: [Errno 27]")
     assert (tmp_path / "record.h5").read_text() == "old"
     assert names(tmp_path) == ["record.h5"]

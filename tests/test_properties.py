@@ -13,8 +13,11 @@ from hypothesis.extra.numpy import arrays
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from strapdown import datasheets, estimation, files, gyro, kinematics, quaternion, reading, recordfiles, records, units
+from strapdown import estimation, files, gyro, kinematics, quaternion, records, units
 from strapdown.checks import InputError
+from strapdown.files import reading
+from strapdown.gyro import datasheets
+from strapdown.recordings import recordfiles
 from strapdown.records import ImuRecord, Truth
 from strapdown.vectors import VectorMeasurements
 
@@ -177,7 +180,7 @@ def test_a_record_goes_through_hdf5_to_the_last_bit(tmp_path, record, text, seed
 @few
 @given(recorded())
 def test_a_record_goes_through_csv_to_the_last_bit(tmp_path, record):
-    assert_equal(record, recordfiles.import_csv(recordfiles.export_csv(tmp_path / "r.csv", record)[0]))
+    assert_equal(record, recordfiles.read_record(recordfiles.export_csv(tmp_path / "r.csv", record)[0]))
 
 
 @few

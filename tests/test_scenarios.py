@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from strapdown import gyro, motion, orbit, quaternion, scenarios, vectors
+from strapdown import gyro, motion, quaternion, scenarios, vectors
 from strapdown.checks import InputError
 from strapdown.gyro import GyroSpec
+from strapdown.motion import orbit
 from strapdown.scenarios import (
     SCENARIOS,
     Scenario,
@@ -218,7 +219,7 @@ def test_adding_a_sensor_changes_no_other_stream():
         dataclasses.replace(base, sensors=(SENSORS[0], SENSORS[0]))
 
 
-def test_jitter_tells_the_truth_where_it_sampled_and_losses_are_bridged():
+def test_jitter_has_the_truth_where_it_sampled_and_losses_are_bridged():
     spec = GyroSpec(sampling_jitter=1e-3, timestamp_offset=0.5, drop_probability=0.2)
     fast = motion.ConstantRate(rate=[0.0, 0.0, 3.0])
     base = Scenario(
@@ -266,7 +267,7 @@ def test_a_g_sensitive_gyro_feels_gravity_and_not_in_free_fall():
         (("[gyro]", '[gyro]\npreset = "mpu"'), r"two.toml: gyro: preset 'mpu' is not known; did you mean 'mpu-9250'\?"),
     ],
 )
-def test_what_is_wrong_in_a_file_is_told_with_the_file_and_as_typed(tmp_path, change, words):
+def test_what_is_wrong_in_a_file_is_reported_with_the_file_and_as_typed(tmp_path, change, words):
     text = scenarios._BUILTIN.joinpath("two-stars.toml").read_text(encoding="utf-8")
     assert change[0] in text
     (tmp_path / "two.toml").write_text(text.replace(*change, 1), encoding="utf-8")
@@ -349,7 +350,7 @@ def test_a_duty_cycle_and_lost_samples_leave_the_rest_as_it_was():
 
 
 def test_a_horizon_sensor_sees_the_earths_centre():
-    from strapdown.orbit import CircularOrbit
+    from strapdown.motion.orbit import CircularOrbit
     from strapdown.vectors import HorizonSensor
 
     path = CircularOrbit(altitude=600e3, inclination=1.2)

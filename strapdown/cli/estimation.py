@@ -20,7 +20,7 @@ from strapdown.cli.reading import (
     Invert,
     TimeUnit,
     Topic,
-    told,
+    given_layout,
 )
 from strapdown.cli.terminal import (
     FORMAT,
@@ -39,8 +39,8 @@ from strapdown.cli.terminal import (
 if TYPE_CHECKING:
     from strapdown.ahrs import AhrsEstimate, AhrsParameters
     from strapdown.estimation.states import State
-    from strapdown.recordfiles import RecordFile
     from strapdown.recordings import Recording
+    from strapdown.recordings.recordfiles import RecordFile
     from strapdown.records import Estimate, ImuRecord
     from strapdown.setup import FilterSetup
     from strapdown.setup.for_record import Start
@@ -193,7 +193,7 @@ def estimate(
     writable("out", *(out / name for name in names), sources=(recording, gyro, filter_file, calibration))
     need_own(out / FILES[0], "estimate", lambda path: bool(read_attributes(path)["kind"] == "strapdown estimate"))
     units = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
-    layout = told(recording, columns=columns, topic=topic, axes=axes, invert=invert, **units)
+    layout = given_layout(recording, columns=columns, topic=topic, axes=axes, invert=invert, **units)
     specified = is_record(recording)
     _check_kind(
         recording,
@@ -289,8 +289,9 @@ def _exports(
 
     ``changed``: the samples are read in other axes than those of the file.
     """
-    from strapdown import outputs, recordings
+    from strapdown import recordings
     from strapdown.checks import InputError, one_of
+    from strapdown.records import outputs
 
     if frame is not None:
         frame = one_of("--frame", frame.upper(), outputs.FRAMES)
@@ -324,9 +325,10 @@ def _export(
 
 def _estimate_specified(path: Path, shared: _Shared, options: _Specified, output: _Output) -> None:
     """Run the filter over a recording that holds its specification, report and write its estimate."""
-    from strapdown import reading, workflows
+    from strapdown import workflows
     from strapdown.checks import InputError, count
-    from strapdown.recordfiles import read_record_file
+    from strapdown.files import reading
+    from strapdown.recordings.recordfiles import read_record_file
 
     every = count("every", options.every)
     if shared.smooth and every > 1:
@@ -355,7 +357,7 @@ def _estimate_specified(path: Path, shared: _Shared, options: _Specified, output
     )
     for remark in remarks:
         console.print(remark)
-    _tell(run.estimate)
+    _print_result(run.estimate)
     paths = _write_specified(path, held, chosen, run, shared, output)
     if output.form is not None:
         paths += _drawn(output.folder, output.form, run.estimate, path.name, truth=run.truth)
@@ -388,7 +390,7 @@ def _write_specified(
     write_estimate(paths[0], result, attributes, truth=truth)
     if result.error_states:
         paths.append(out / "states.json")
-        write_json(paths[-1], {"source": str(path), **_tell_states(result, run.record)})
+        write_json(paths[-1], {"source": str(path), **_print_states(result, run.record)})
     if shared.observability:
         paths.append(_observability(out, str(path), run.record, chosen, run.initial))
     if truth is not None:
@@ -464,7 +466,7 @@ def _states(result: Any) -> dict[str, Any]:
     }
 
 
-def _tell_states(result: Any, record: ImuRecord) -> dict[str, Any]:
+def _print_states(result: Any, record: ImuRecord) -> dict[str, Any]:
     """Show the optional states at the end, and return them for JSON."""
     from strapdown.plots.style import error_state_unit
 
@@ -511,7 +513,7 @@ def _clear(out: Path) -> None:
         (out / name).unlink(missing_ok=True)
 
 
-def _tell(result: Estimate) -> None:
+def _print_result(result: Estimate) -> None:
     """Say what was not used, and what happened."""
     for sensor, number in result.skipped.items():
         if number:
@@ -548,10 +550,11 @@ def _errors(result: Estimate, truth: Any) -> dict[str, float]:
 
 def _estimate_recording(recording: Path, shared: _Shared, options: _Recorded, output: _Output) -> None:
     """Run the filter over a recording: accelerometer as the vertical, magnetometer as the heading."""
-    from strapdown import ahrs, recordings, unit_calibration, workflows
+    from strapdown import ahrs, recordings, workflows
     from strapdown.checks import non_negative, one_of
     from strapdown.consistency import reference_errors
     from strapdown.gyro import read_spec
+    from strapdown.recordings import unit_calibration
     from strapdown.units import DEGREE
 
     one_of("--motion", options.motion, ahrs.MOTIONS)
@@ -610,8 +613,9 @@ def _write_recording(
     output: _Output,
 ) -> list[Path]:
     """Write the estimate, its states and the calibration; return the files."""
-    from strapdown import setup, unit_calibration
+    from strapdown import setup
     from strapdown.files import write_json
+    from strapdown.recordings import unit_calibration
     from strapdown.records import write_estimate
 
     used, found, out = result.recording, result.estimate, output.folder
@@ -667,7 +671,7 @@ def _say_recording(result: AhrsEstimate, parameters: AhrsParameters, options: _R
     for sensor, number in found.skipped.items():
         if number:
             console.print(f"{number} samples of the {sensor} are missing and were skipped.")
-    _tell(replace(found, skipped={}))
+    _print_result(replace(found, skipped={}))
 
 
 def _rms(out: Path, source: str, rms: dict[str, float]) -> Path:

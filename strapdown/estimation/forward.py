@@ -419,7 +419,7 @@ def _block_result(
 def _judged_in_blocks(problem: Problem, options: Options) -> Passed:
     """Run the filter with a gate, robust weights or noise of any shape; all of it as its factor where digits would be lost."""
     body = _block_body(problem, options, _packed_states(problem.initial))
-    judge = _Judge(problem, options)
+    judge = Judge(problem, options)
     out = _block_outputs(problem, options, judged=True)
     written = judge.outputs(out._replace(segments=out.segments[: options.segments]))
     restart = covariance_form.Restart(bias_variance=restart_bias_variance(options.gate, problem.initial))
@@ -455,7 +455,7 @@ def _judged_in_blocks(problem: Problem, options: Options) -> Passed:
 # ------------------------------------------------------------------------------------------------------------------------------- a gate
 
 
-class _Judge:
+class Judge:
     """A gate and robust weights beside a run: what they remember, and what they report."""
 
     def __init__(self, problem: Problem, options: Options) -> None:
@@ -463,11 +463,11 @@ class _Judge:
         self.gate = options.gate
         self.options = gate_options(options.gate, options.robust)
         sensors = problem.events.sensors
-        self.memory, self.standing = remembered(options.gate, problem.initial.gate, sensors)
+        self.memory, self.counters = remembered(options.gate, problem.initial.gate, sensors)
 
     def body(self, form: covariance_form.Body | root_form.Body, restart: Any) -> gate.Body:
         """Return the body of the walk around a form."""
-        return gate.Body(form=form, options=self.options, restart=restart, standing=self.standing, memory=self.memory)
+        return gate.Body(form=form, options=self.options, restart=restart, standing=self.counters, memory=self.memory)
 
     def outputs(self, form: covariance_form.Outputs | root_form.Outputs) -> gate.Outputs:
         """Return room for what is written beside the form's outputs.
@@ -496,7 +496,7 @@ class _Judge:
             first,
             candidate=candidate,
             counts=self.memory,
-            standing=dict(zip(self.problem.events.sensors, self.standing, strict=True)),
+            counters=dict(zip(self.problem.events.sensors, self.counters, strict=True)),
         )
 
     def start(self) -> GateMemory:
@@ -508,7 +508,7 @@ class _Judge:
         return GateMemory(
             restart_bias_variance=first_bias_variance(initial),
             counts=np.empty(0),
-            standing={},
+            counters={},
             start=float(self.problem.record.time[0]),
             values=values,
             covariance=P,
@@ -531,17 +531,17 @@ def gate_options(gate_: Gate | None, robust: Robust | None) -> gate.Options:
 
 
 def remembered(gate_: Gate | None, memory: GateMemory | None, sensors: tuple[str, ...]) -> tuple[Array, Array]:
-    """Return what a kernel goes on with: its ``memory``, and ``standing`` of these sensors."""
-    counts, standing = np.zeros(gate_rules.MEMORY), np.zeros((len(sensors), gate_rules.STANDING))
+    """Return what a kernel goes on with: its ``memory``, and ``counters`` of these sensors."""
+    counts, counters = np.zeros(gate_rules.MEMORY), np.zeros((len(sensors), gate_rules.STANDING))
     counts[gate_rules.PASSES] = 1.0
     if gate_ is not None and memory is not None:
         counts[:] = memory.counts
-        for row, sensor in zip(standing, sensors, strict=True):
-            row[:] = memory.standing.get(sensor, 0.0)
+        for row, sensor in zip(counters, sensors, strict=True):
+            row[:] = memory.counters.get(sensor, 0.0)
     if gate_ is None or not gate_.recovery:
         counts[gate_rules.CANDIDATE] = 0.0
-    standing[:, gate_rules.REPORTED] = -1.0
-    return counts, standing
+    counters[:, gate_rules.REPORTED] = -1.0
+    return counts, counters
 
 
 def gate_events(recoveries: Array, lock_outs: Array, sensors: tuple[str, ...]) -> list[Event]:
@@ -600,7 +600,7 @@ def scratch(model: Model) -> root_form.Scratch:
     )
 
 
-def _factor_body(problem: Problem, units: Mapping[str, float]) -> root_form.Body:
+def factor_body(problem: Problem, units: Mapping[str, float]) -> root_form.Body:
     """Return the filter as the kernels take it."""
     model, initial = problem.model, problem.initial
     size = 6 + model.states
@@ -630,7 +630,7 @@ def _in_factor(problem: Problem, options: Options) -> Passed:
     record, events, model, every = problem.record, problem.events, problem.model, options.every
     size, rows = 6 + model.states, len(record.increments) // every + 1
     units = unit_sigmas(record, model, problem.initial.unit_sigma)
-    body = _factor_body(problem, units)
+    body = factor_body(problem, units)
     whole_rows = rows if options.whole_bias else 0
     stored = np.empty((options.segments + 1 if options.segments else 0, 5 + size + size * (size + 1) // 2))
     out = root_form.Outputs(
@@ -643,18 +643,11 @@ def _in_factor(problem: Problem, options: Options) -> Passed:
         innovation=np.empty(_innovations(events, judged=options.judged)),
         segments=stored[: options.segments],
     )
-    judge = _Judge(problem, options)
+    judge = Judge(problem, options)
     weight, happened = None, []
     arguments = *problem.gyro, events.measurements, every
     if options.judged:
-        first = judge.start()
-        restart = root_form.Restart(
-            bias_sigma=np.sqrt(restart_bias_variance(options.gate, problem.initial)),
-            values=first.values[model.order],
-            root=modelling.lower_root(first.covariance[np.ix_(model.order, model.order)]),
-            time=first.start,
-            fresh=np.empty((3 * model.states + 6, 3 + model.states)),
-        )
+        restart = restart_in_factor(judge)
         written = judge.outputs(out)
         number, recovered, locked = compiled(walk, gate, root_form)(*arguments, judge.body(body, restart), written)
         weight, happened = written.weight, judge.events(written, recovered, locked)
@@ -678,12 +671,25 @@ def _in_factor(problem: Problem, options: Options) -> Passed:
     )
     if options.whole_bias:
         estimate = _with_whole_bias(estimate, model, out, full=options.full_covariance)
-    candidate = _candidate_in_factor(body, model) if judge.memory[gate_rules.CANDIDATE] else None
+    candidate = candidate_in_factor(body, model) if judge.memory[gate_rules.CANDIDATE] else None
     memory = judge.remembered(candidate)
     return Passed(
         estimate=estimate,
-        make_end=lambda: _end_in_factor(body, model, memory, units),
+        make_end=lambda: end_in_factor(body, model, memory, units),
         segments=stored[: number + 1],
+    )
+
+
+def restart_in_factor(judge: Judge) -> root_form.Restart:
+    """Return what a restart candidate starts from."""
+    problem, first = judge.problem, judge.start()
+    model = problem.model
+    return root_form.Restart(
+        bias_sigma=np.sqrt(restart_bias_variance(judge.gate, problem.initial)),
+        values=first.values[model.order],
+        root=modelling.lower_root(first.covariance[np.ix_(model.order, model.order)]),
+        time=first.start,
+        fresh=np.empty((3 * model.states + 6, 3 + model.states)),
     )
 
 
@@ -698,20 +704,22 @@ def _with_whole_bias(estimate: Estimate, model: Model, out: root_form.Outputs, *
     )
 
 
-def _outside(body: root_form.Body, model: Model, i: int) -> tuple[Array, Array, Array, Array]:
+def outside(body: root_form.Body, model: Model, i: int) -> tuple[Array, Array, Array, Array]:
     """Return attitude, bias, values and factor of state i in the order of the declarations."""
     size = 6 + model.states
     root = body.F[i, :size][:, np.argsort(model.whole_order)]
     return body.attitude[i], body.x[i, :3], body.x[i, 3:][np.argsort(model.order)], root
 
 
-def _candidate_in_factor(body: root_form.Body, model: Model) -> Candidate:
-    attitude, bias, values, root = _outside(body, model, 1)
+def candidate_in_factor(body: root_form.Body, model: Model) -> Candidate:
+    """Return the restart candidate."""
+    attitude, bias, values, root = outside(body, model, 1)
     return Candidate(attitude=attitude, others=np.concatenate([bias, values]), covariance=root.T @ root, factor=root)
 
 
-def _end_in_factor(body: root_form.Body, model: Model, memory: GateMemory | None, units: Mapping[str, float]) -> State:
-    attitude, bias, values, root = _outside(body, model, 0)
+def end_in_factor(body: root_form.Body, model: Model, memory: GateMemory | None, units: Mapping[str, float]) -> State:
+    """Return the state at the end."""
+    attitude, bias, values, root = outside(body, model, 0)
     if not model.states:
         return State(attitude=attitude, bias=bias, covariance=_reported(root.T @ root), gate=memory)
     return State(
@@ -773,7 +781,7 @@ def _span_in_factor(
     (edges, increments), measurements = problem.gyro, events.measurements
     last = len(increments) // every
     start = State(attitude=state[:4], bias=state[4:7], covariance=np.eye(6))
-    body = _factor_body(replace(problem, initial=start), {})
+    body = factor_body(replace(problem, initial=start), {})
     body.F[0, :6] = _singular_triangle(covariance_matrices(state[7:]))
     span = max(1, FIRST_SPAN // every)
     while True:

@@ -44,7 +44,7 @@ PASSES = 16
 """Backward passes of a fixed-lag smoother that go together and share what depends on the filter alone."""
 MIN_SMOOTHED = {"blocks": 1e-9, "factor": 1e-25}
 """Smallest smoothed variance, as a part of what one interval adds, at which backward passes in either form keep enough digits."""
-MOST_GROUPS = 3600
+MAX_GROUPS = 3600
 """Groups of segments of which the fixed-lag smoother keeps the gains, 5.7 kB each; where a lag takes more, it computes them anew."""
 
 
@@ -292,7 +292,7 @@ class _BlockForm:
             # Eight passes at a time, which share nearly all groups with the next eight.
             ahead = np.minimum(np.arange(lagged) + WIDTH - 1, lagged - 1)
             groups = int(np.max(starts[seen[ahead]] - starts[first])) // WIDTH + 2
-            work = np.empty(smoother_lag.lag_work_size(min(groups, MOST_GROUPS)))
+            work = np.empty(smoother_lag.lag_work_size(min(groups, MAX_GROUPS)))
             compiled(smoother_lag.smooth_lagged)(rows, starts, first, seen, *self.problem.variances, work, *outputs)
         compiled(smoother_loop.smooth_back)(
             rows,

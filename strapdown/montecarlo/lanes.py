@@ -25,11 +25,11 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import estimation, flicker, quaternion, setup, vectors
+from strapdown import estimation, quaternion, setup, vectors
 from strapdown.checks import Array, count
 from strapdown.estimation.schedule import Schedule, schedule
 from strapdown.estimation.states import covariance_matrices
-from strapdown.gyro import GyroSpec
+from strapdown.gyro import GyroSpec, flicker
 from strapdown.kernels import gyro_errors, machine, montecarlo_run, montecarlo_statistics
 from strapdown.kernels.machine import compiled
 from strapdown.kernels.noise import minus_two_log
@@ -185,8 +185,8 @@ def _prepare(plan: Plan) -> _Prepared:
     n = algorithm.samples
     series = tuple(_nominal(sensor, scenario, plan.seed) for sensor in scenario.sensors)
     record = replace(steps, vectors=series)
-    believed = setup.believed(replace(quiet, vectors=series), plan.setup)
-    events = schedule(believed.vectors, float(record.time[0]), float(record.time[-1]))
+    modelled = setup.modelled_record(replace(quiet, vectors=series), plan.setup)
+    events = schedule(modelled.vectors, float(record.time[0]), float(record.time[-1]))
     values = [_exact(sensor, scenario, own) for sensor, own in zip(scenario.sensors, series, strict=True)]
     real = _real(plan)
     gyro = montecarlo_run.Gyro(

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import reading
 from strapdown.checks import Array, InputError
+from strapdown.files import reading
 from strapdown.recordings.extras import library, with_ending
 from strapdown.recordings.recording import Recording, with_gyro
 from strapdown.units import DEGREE
@@ -37,13 +37,7 @@ def is_log(head: bytes) -> bool:
 
 
 def read_telemetry(path: str | os.PathLike[str]) -> Recording:
-    """Read the inertial unit of a camera's, flight controller's or phone's log.
-
-    Raises
-    ------
-    InputError
-        If the library does not know the file, or it holds no gyro.
-    """
+    """Read the inertial unit of a camera's, flight controller's or phone's log."""
     file = Path(path)
     parser = library("telemetry_parser", f"{file.name} is a log of a camera or flight controller, which")
     try:

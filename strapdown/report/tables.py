@@ -41,19 +41,10 @@ class Table:
 
 
 def write(tables: Sequence[Table], folder: str | os.PathLike[str]) -> list[Path]:
-    r"""Write tables to a folder as ``NAME.csv`` and ``NAME.tex``; return the files.
+    r"""Write tables to a folder, made if missing, as ``NAME.csv`` and ``NAME.tex``; return the files.
 
-    Parameters
-    ----------
-    tables : sequence of Table
-    folder : path
-        Made if it is missing.
-
-    Returns
-    -------
-    list of Path
-        Two files for each table. The CSV has the keys as its header and numbers that read back to the bit; the LaTeX is a ``tabular``
-        with four digits, for ``\\input`` into a document that loads ``booktabs``.
+    The CSV has the keys as its header and numbers that read back to the bit; the LaTeX is a ``tabular`` with four digits, to input into a
+    document that loads ``booktabs``.
     """
     written = []
     for table in tables:
@@ -344,7 +335,7 @@ def of_tuning(content: Mapping[str, Any]) -> list[Table]:
 
 
 def of_allan(rows: Sequence[Mapping[str, Any]], sensor: str) -> list[Table]:
-    """Return the noise coefficients of a sensor, of the rows of :func:`strapdown.noise_parameters.table`, as ``SENSOR-noise``.
+    """Return the noise coefficients of a sensor, of the rows of :func:`strapdown.allan.parameters.table`, as ``SENSOR-noise``.
 
     The estimate is empty for a term that the record does not show; its upper end bounds what the record could hide.
     """

@@ -33,8 +33,6 @@ from strapdown.checks import Array, InputError, array, increasing, instance
 from strapdown.estimation.states import State
 from strapdown.records import Estimate, ImuRecord
 
-__all__ = ["Own", "OwnFilter", "as_own"]
-
 
 class OwnFilter(Protocol):
     """What a filter of one's own provides; a plain function of the same two arguments does as well."""
@@ -122,16 +120,7 @@ class Own:
         return Own, (self.given,)
 
     def __call__(self, record: ImuRecord, initial: State, *, times: Array | None = None) -> Estimate:
-        """Run it over a record and check what it returns.
-
-        Parameters
-        ----------
-        record : ImuRecord
-            The truth is taken out before the filter sees it.
-        initial : State
-        times : array, optional
-            Times wanted, of the record's edges; default: those that the filter returns.
-        """
+        """Run it over a record without its truth, and check what it returns; only the ``times`` wanted, of the record's edges, if given."""
         if isinstance(self.given, Mapping):
             raise InputError(
                 f"{self.name} is a filter of your own, whose code no file holds; in Python, give it again: "
@@ -142,23 +131,7 @@ class Own:
 
 
 def as_own(filter_: Any) -> Own:
-    """Return one's own filter with its description.
-
-    Parameters
-    ----------
-    filter_ : callable or object with a method ``run``
-        Takes a record and an initial state and returns an estimate (:class:`OwnFilter`); an :class:`Own` is returned as it is.
-
-    Returns
-    -------
-    Own
-        The filter, which can be called and compared.
-
-    Raises
-    ------
-    InputError
-        If it is neither a function nor an object with a method ``run``, or has not two arguments.
-    """
+    """Return one's own filter, a function or an object with a method ``run`` (:class:`OwnFilter`), with its description."""
     return filter_ if isinstance(filter_, Own) else Own(filter_)
 
 

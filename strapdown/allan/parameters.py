@@ -1,0 +1,278 @@
+"""Noise coefficients of gyros, accelerometers and magnetometers in the terms and units of the field, and in the files of other programs.
+
+The coefficients of :class:`strapdown.allan.NoiseFit` are SI of the sampled quantity: N in rad/s, m/s² or T per √Hz (the same as per
+√Hz of a two-sided density, rad/√s), B in the unit itself, K in the unit per √s. Other programs use one number for all axes: the
+largest. Where no axis shows a term, the upper end of its interval is written, which the record cannot exclude, and a comment says
+so.
+
+Kalibr
+    ``imu.yaml``: noise densities N and random walks K of gyro and accelerometer. They are commonly multiplied by 5 to 10 or more,
+    for Kalibr has no terms for vibration, scale and temperature; here by the requested factor, which a comment states.
+PX4
+    Parameters of EKF2, which uses them as the standard deviation of white noise over one step of the filter, ``EKF2_PREDICT_US``:
+    N/√dt for ``EKF2_GYR_NOISE`` (rad/s) and ``EKF2_ACC_NOISE`` (m/s²), K/√dt for ``EKF2_GYR_B_NOISE`` (rad/s²) and
+    ``EKF2_ACC_B_NOISE`` (m/s³).
+MATLAB
+    ``gyroparams``, ``accelparams`` and ``magparams`` of ``imuSensor``, for each axis. ``NoiseType`` must be single-sided for N to
+    be the Allan deviation at 1 s; the default makes it smaller by √2. The magnetometer is in µT there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from strapdown import checks, gyro, units
+from strapdown.allan import deviation as allan
+from strapdown.allan.deviation import NoiseFit
+from strapdown.checks import InputError
+
+__all__ = [
+    "to_kalibr",
+    "to_matlab",
+    "to_px4",
+    "to_toml",
+]
+
+SENSORS = ("gyro", "accelerometer", "magnetometer")
+_MICRO_G = 1e-6 * units.STANDARD_GRAVITY
+UNITS: Mapping[str, Mapping[str, tuple[str, float]]] = {
+    "gyro": allan.UNITS,
+    "accelerometer": {
+        "quantization": ("mm/s", 1e-3),
+        "angle_random_walk": ("µg/√Hz", _MICRO_G),
+        "bias_instability": ("µg", _MICRO_G),
+        "rate_random_walk": ("µg/√h", _MICRO_G / 60.0),
+        "rate_ramp": ("µg/h", _MICRO_G / 3600.0),
+    },
+    "magnetometer": {
+        "quantization": ("nT s", 1e-9),
+        "angle_random_walk": ("nT/√Hz", 1e-9),
+        "bias_instability": ("nT", 1e-9),
+        "rate_random_walk": ("nT/√h", 1e-9 / 60.0),
+        "rate_ramp": ("nT/h", 1e-9 / 3600.0),
+    },
+}
+"""Unit at the rim and its factor to SI, for each term of each sensor."""
+NAMES: Mapping[str, Mapping[str, str]] = {
+    "gyro": {},
+    "accelerometer": {
+        "angle_random_walk": "velocity_random_walk",
+        "rate_random_walk": "acceleration_random_walk",
+        "rate_ramp": "acceleration_ramp",
+    },
+    "magnetometer": {"angle_random_walk": "white_noise", "rate_random_walk": "random_walk", "rate_ramp": "ramp"},
+}
+"""What a term is called of a sensor, where not as of a gyro."""
+_KEYS = {"mm/s": "mm_per_s", "µg/√Hz": "ug_per_sqrt_hz", "µg": "ug", "µg/√h": "ug_per_sqrt_hour", "µg/h": "ug_per_hour"}
+_KEYS |= {"nT s": "nt_s", "nT/√Hz": "nt_per_sqrt_hz", "nT": "nt", "nT/√h": "nt_per_sqrt_hour", "nT/h": "nt_per_hour"}
+PX4_STEP = 0.01
+"""s: EKF2_PREDICT_US as PX4 comes."""
+
+
+def name(sensor: str, term: str) -> str:
+    """Return the name of a term for a sensor."""
+    return NAMES[checks.one_of("sensor", sensor, SENSORS)].get(term, term)
+
+
+def table(fit: NoiseFit, sensor: str = "gyro") -> list[dict[str, object]]:
+    """Return one row per axis and term for printing, as :func:`strapdown.allan.table`, in the names and units of a sensor."""
+    checks.one_of("sensor", sensor, SENSORS)
+    rows = allan.table(fit)
+    for row in rows:
+        term = str(row["term"])
+        unit, factor = UNITS[sensor][term]
+        ratio = allan.UNITS[term][1] / factor
+        if sensor != "gyro":
+            row |= {end: float(row[end]) * ratio for end in ("estimate", "lower", "upper")}  # type: ignore[arg-type]
+        row |= {"term": name(sensor, term), "unit": unit}
+    return rows
+
+
+def key(sensor: str, term: str) -> tuple[str, float]:
+    """Return the key of a term in TOML, its unit in the name, and the unit's factor to SI."""
+    if sensor == "gyro":
+        suffix, factor = gyro.FORM[term][0]
+        return f"{term}_{suffix}", factor
+    unit, factor = UNITS[checks.one_of("sensor", sensor, SENSORS)][term]
+    return f"{name(sensor, term)}_{_KEYS[unit]}", factor
+
+
+def to_toml(fit: NoiseFit, sensor: str = "gyro") -> dict[str, dict[str, Any]]:
+    """Return a sensor's table for TOML: the terms that are supported, 0 on an axis that does not show one.
+
+    Parameters
+    ----------
+    fit : NoiseFit
+        Coefficients of one sensor.
+    sensor : {"gyro", "accelerometer", "magnetometer"}, default "gyro"
+        Kind of the sensor.
+
+    Returns
+    -------
+    dict
+        Table with the unit in each key, to six digits; that of a gyro is the input of :func:`strapdown.gyro.read_spec`.
+    """
+    rounded: dict[str, Any] = {}
+    for term, value in allan.to_gyro_parameters(fit).items():
+        factor = key(sensor, term)[1]
+        rounded[term] = np.array([float(f"{x / factor:.6g}") for x in np.atleast_1d(value)]).reshape(np.shape(value))
+    if sensor == "gyro":
+        spec = gyro.GyroSpec(**{term: value * key(sensor, term)[1] for term, value in rounded.items()})
+        return {sensor: gyro.to_table(spec)}
+    return {sensor: {key(sensor, term)[0]: value.tolist() for term, value in rounded.items()}}
+
+
+def largest(fit: NoiseFit, term: str) -> tuple[float, bool]:
+    """Return the largest coefficient of a term over the axes, SI, and whether any axis shows it; else the largest upper end."""
+    if term not in fit.terms:
+        raise InputError(f"the fit has no {term}; fit it too")
+    i = fit.terms.index(term)
+    seen = fit.supported[:, i]
+    if seen.any():
+        return float(fit.estimate[seen, i].max()), True
+    return float(fit.upper[:, i].max()), False
+
+
+def to_kalibr(fits: Mapping[str, NoiseFit], *, factor: float = 1.0, topic: str = "/imu0", source: str = "") -> str:
+    """Return Kalibr's ``imu.yaml``.
+
+    Parameters
+    ----------
+    fits : mapping of str to NoiseFit
+        Fits of ``"gyro"`` and ``"accelerometer"``.
+    factor : float, default 1.0
+        Factor on all four numbers.
+    topic : str, default "/imu0"
+        Topic of the inertial unit.
+    source : str, default ""
+        Origin of the numbers, for a comment.
+
+    Returns
+    -------
+    str
+        Content of the file.
+
+    Raises
+    ------
+    InputError
+        If a sensor or a term is missing.
+    """
+    _both(fits, "Kalibr")
+    checks.positive("factor", factor)
+    words = "as identified" if factor == 1.0 else f"multiplied by {factor:g}"
+    lines = [
+        f"# {_plain(source)}" if source else "",
+        f"# Noise by `strapdown allan`, the largest of the axes, {words}.",
+    ]
+    for sensor, own, unit in (("accelerometer", "accelerometer", "m/s^2"), ("gyro", "gyroscope", "rad/s")):
+        for term, word, per in (
+            ("angle_random_walk", "noise_density", "1/sqrt(Hz)"),
+            ("rate_random_walk", "random_walk", "1/s/sqrt(Hz)"),
+        ):
+            value, seen = largest(fits[sensor], term)
+            note = "" if seen else "; not seen, the upper end of its interval"
+            lines.append(f"{own}_{word}: {factor * value:.6e}  # {unit} {per}{note}")
+    lines += [f"update_rate: {1.0 / fits['gyro'].sample_interval:.6g}  # Hz", f"rostopic: {topic}"]
+    return "\n".join(line for line in lines if line) + "\n"
+
+
+def to_px4(fits: Mapping[str, NoiseFit], *, step: float = PX4_STEP, source: str = "") -> str:
+    """Return parameters of PX4's EKF2 in QGroundControl's format.
+
+    Parameters
+    ----------
+    fits : mapping of str to NoiseFit
+        Fits of ``"gyro"`` and ``"accelerometer"``.
+    step : float, default 0.01
+        Step of the filter (EKF2_PREDICT_US), s.
+    source : str, default ""
+        Origin of the numbers, for a comment.
+
+    Returns
+    -------
+    str
+        Content of the file.
+
+    Raises
+    ------
+    InputError
+        If a sensor or a term is missing.
+    """
+    _both(fits, "PX4")
+    root = math.sqrt(checks.positive("step", step, unit="s"))
+    lines = [
+        *([f"# {_plain(source)}"] if source else []),
+        f"# Noise by `strapdown allan`, the largest of the axes, over steps of {1e6 * step:.0f} us (EKF2_PREDICT_US).",
+        "# PX4's own values are larger: they include vibration.",
+        "# Vehicle-Id Component-Id Name Value Type",
+    ]
+    for parameter, sensor, term in (
+        ("EKF2_GYR_NOISE", "gyro", "angle_random_walk"),
+        ("EKF2_GYR_B_NOISE", "gyro", "rate_random_walk"),
+        ("EKF2_ACC_NOISE", "accelerometer", "angle_random_walk"),
+        ("EKF2_ACC_B_NOISE", "accelerometer", "rate_random_walk"),
+    ):
+        value, seen = largest(fits[sensor], term)
+        lines += [] if seen else [f"# {parameter}: not seen, the upper end of its interval"]
+        lines.append(f"1\t1\t{parameter}\t{value / root:.6e}\t9")
+    return "\n".join(lines) + "\n"
+
+
+def to_matlab(fits: Mapping[str, NoiseFit], *, source: str = "") -> str:
+    """Return MATLAB code for an ``imuSensor``, each axis with its own noise; a term that an axis does not show is 0.
+
+    Parameters
+    ----------
+    fits : mapping of str to NoiseFit
+        Fits by sensor.
+    source : str, default ""
+        Origin of the numbers, for a comment.
+
+    Returns
+    -------
+    str
+        MATLAB code.
+    """
+    made = {"gyro": ("Gyroscope", "gyroparams", 1.0), "accelerometer": ("Accelerometer", "accelparams", 1.0)}
+    made["magnetometer"] = ("Magnetometer", "magparams", 1e6)
+    rate = 1.0 / next(iter(fits.values())).sample_interval
+    kinds = "-".join(
+        word
+        for sensor, word in (("accelerometer", "accel"), ("gyro", "gyro"), ("magnetometer", "mag"))
+        if sensor in fits
+    )
+    known = {"accel-gyro", "accel-mag", "accel-gyro-mag"}
+    lines = [
+        *([f"% {_plain(source)}"] if source else []),
+        "% Noise by `strapdown allan`, SI; terms that an axis does not show are 0.",
+    ]
+    lines.append(f"imu = imuSensor('{kinds if kinds in known else 'accel-gyro-mag'}', 'SampleRate', {rate:.6g});")
+    for sensor, fit in fits.items():
+        own, make, factor = made[sensor]
+        values = np.where(fit.supported, fit.estimate, 0.0) * factor
+        parts = ["'NoiseType', 'single-sided'"]
+        for term, word in (
+            ("angle_random_walk", "NoiseDensity"),
+            ("bias_instability", "BiasInstability"),
+            ("rate_random_walk", "RandomWalk"),
+        ):
+            column = np.resize(values[:, fit.terms.index(term)], 3)
+            parts.append(f"'{word}', [{' '.join(f'{x:.6e}' for x in column)}]")
+        joined = ", ...\n    ".join(parts)
+        lines.append(f"imu.{own} = {make}({joined});")
+    return "\n".join(lines) + "\n"
+
+
+def _both(fits: Mapping[str, NoiseFit], what: str) -> None:
+    for sensor in ("gyro", "accelerometer"):
+        if sensor not in fits:
+            raise InputError(f"{what} takes the noise of gyro and accelerometer; identify the {sensor} too")
+
+
+def _plain(text: str) -> str:
+    """Return a comment on one line."""
+    return "".join(c if c.isprintable() else "?" for c in text)

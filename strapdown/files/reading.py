@@ -1,0 +1,372 @@
+"""Reading files: the one layer that opens every input file, whatever its format.
+
+A file may be damaged, of another kind, or made to do harm. So each format has one function here that opens it: no other module opens a
+file to read it. Every fault of a file is an :class:`~strapdown.checks.InputError` that names it, raised within
+:func:`from_file`, and sizes are checked before memory is allocated.
+
+HDF5 files of this package begin with a block of 512 bytes (a *user block*, which other programs skip) that holds the SHA-256 of all that
+follows. It is compared before the HDF5 library sees the file, because that library may loop for ever, or crash, on damaged ones. A file
+without such a digest is first read by a child process with a limit of its time. A digest shows damage; it is no signature, and does not
+show who wrote a file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import hashlib
+import io
+import json
+import os
+import re
+import stat
+import subprocess
+import sys
+import tomllib
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from strapdown.checks import InputError
+
+Name = str | os.PathLike[str]
+
+LIMIT = "STRAPDOWN_MAX_MB"
+"""Environment variable: most megabytes that one file may hold, unpacked."""
+DEFAULT_LIMIT = 4096
+TABLE_SHARE = 64
+"""Factor by which TOML and JSON must be smaller than the limit: parsed, they need that much more memory than their text."""
+PACKING = 1100
+"""Greatest ratio of an array to its compressed form: deflate reaches 1032."""
+DOTTED_KEYS = 32
+"""Most parts of a dotted key in TOML: the time to read one grows with the square of their number."""
+LONGEST_MESSAGE = 2000
+
+SEAL = b"strapdown file, SHA-256 of the bytes from 512 on: "
+"""Beginning of the user block."""
+BLOCK = 512
+"""Bytes of the user block."""
+
+
+class NoDigestWarning(UserWarning):
+    """A file of this package has no digest, as those of earlier versions have none, so that damage to it may pass unseen."""
+
+
+# ------------------------------------------------------------------------------------------------------------------ any file
+
+
+@contextlib.contextmanager
+def from_file(path: Name) -> Iterator[None]:
+    """Raise any exception within as an InputError that names the file.
+
+    The content of the file is the input of the code within, so any exception is the file's fault; the original is chained to the error.
+    """
+    try:
+        yield
+    except InputError as error:
+        said = _short(str(error))
+        if said == str(error) and Path(path).name in said:
+            raise
+        raise InputError(said if Path(path).name in said else f"{path}: {said}") from error.__cause__
+    except MemoryError:
+        raise InputError(f"{path} does not fit into memory; cut it into parts") from None
+    except Exception as error:
+        what = _short(f"{type(error).__name__}: {error}" if isinstance(error, LookupError) else str(error))
+        raise InputError(
+            f"{path} cannot be read ({what or type(error).__name__}); the file is truncated, damaged or of another kind"
+        ) from error
+
+
+def _short(text: str) -> str:
+    """Return a message without the middle of what a hostile file makes endless."""
+    half = LONGEST_MESSAGE // 2
+    return text if len(text) <= LONGEST_MESSAGE else f"{text[:half]} … {text[-half:]}"
+
+
+def limit() -> int:
+    """Return how many bytes one file may hold, unpacked: 4 GB, or the environment variable ``STRAPDOWN_MAX_MB``."""
+    value = os.environ.get(LIMIT, str(DEFAULT_LIMIT))
+    if not value.isdecimal() or int(value) == 0:
+        raise InputError(f"the environment variable {LIMIT} is {value!r}; it must be a whole number of megabytes")
+    return int(value) * 1_000_000
+
+
+def existing_file(path: Name) -> None:
+    """Refuse an input that is missing, or no regular file: a folder, a pipe, a device."""
+    with opened(path):
+        pass
+
+
+@contextlib.contextmanager
+def opened(path: Name, *, link: bool = True, most: int | None = None) -> Iterator[io.BufferedReader]:
+    """Yield a regular file of at most ``most`` bytes (by default :func:`limit`), open for reading.
+
+    ``link`` False refuses a symbolic link: of a file that the user did not name, it could expose another file in the result.
+    """
+    most = limit() if most is None else most
+    if not link and Path(path).is_symlink():
+        raise InputError(f"{path} is a symbolic link, which is not followed here; put the file itself there")
+    try:
+        # Without blocking, so that a pipe without a writer is opened and then refused.
+        handle = os.fdopen(os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)), "rb")
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist; check the path") from None
+    except IsADirectoryError:
+        raise InputError(f"{path} is a folder; name the file in it") from None
+    except (OSError, ValueError) as error:
+        if Path(path).is_dir():  # Windows refuses to open a folder as it does a file without permission
+            raise InputError(f"{path} is a folder; name the file in it") from None
+        raise InputError(f"{path} cannot be read ({error}); check the path and its permissions") from None
+    with handle:
+        status = os.fstat(handle.fileno())
+        if stat.S_ISDIR(status.st_mode):
+            raise InputError(f"{path} is a folder; name the file in it")
+        if not stat.S_ISREG(status.st_mode):
+            raise InputError(f"{path} is no regular file but a pipe or a device; write its content to a file first")
+        _need_size(path, status.st_size, most)
+        yield handle
+
+
+def _need_size(path: Name, size: float, most: int) -> None:
+    if size > most:
+        raise InputError(
+            f"{path} holds {size / 1e6:.4g} MB, more than the {most / 1e6:.4g} MB that may be read; if it is meant, raise the limit with "
+            f"the environment variable {LIMIT} ({limit() // 1_000_000} now)"
+        )
+
+
+def content(path: Name, *, link: bool = True, most: int | None = None) -> bytes:
+    """Return the bytes of a regular file."""
+    with from_file(path), opened(path, link=link, most=most) as handle:
+        most = limit() if most is None else most
+        found = handle.read(most + 1)
+        _need_size(path, len(found), most)  # one without a stated size (/proc), or that grows
+        return found
+
+
+def text(path: Name, *, link: bool = True, most: int | None = None) -> str:
+    """Return the text of a file in UTF-8."""
+    found = content(path, link=link, most=most)
+    if b"\0" in found:
+        raise InputError(f"{path} cannot be read as text (it holds zero bytes); the file is damaged or of another kind")
+    try:
+        return found.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} cannot be read as text ({error}); write it in UTF-8") from None
+
+
+# ------------------------------------------------------------------------------------------------------------ TOML, JSON, NPY
+
+_PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_DOTTED = re.compile(rf"(?<![\w-])(?:{_PART}[ \t]*+\.[ \t]*+){{{DOTTED_KEYS}}}")
+
+
+def from_toml(content: str, place: str) -> dict[str, Any]:
+    """Return the table of a TOML text; ``place`` is what it is called in errors."""
+    if _DOTTED.search(content):
+        raise InputError(
+            f"{place} has a key of more than {DOTTED_KEYS} parts joined by dots; it is no file of this kind"
+        )
+    try:
+        return tomllib.loads(content)
+    except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
+        raise InputError(f"{place} is no TOML ({_short(str(error))})") from None
+
+
+def toml(path: Name) -> dict[str, Any]:
+    """Return the table of a TOML file."""
+    return from_toml(text(path, most=limit() // TABLE_SHARE), str(path))
+
+
+def from_json(content: str, place: str) -> Any:
+    """Return what a JSON text holds; NaN and infinities, for which JSON has no word, are refused."""
+
+    def refuse(word: str) -> Any:
+        raise ValueError(f"it holds {word}")
+
+    try:
+        return json.loads(content, parse_constant=refuse)
+    except (RecursionError, ValueError) as error:
+        raise InputError(f"{place} is no JSON ({_short(str(error))}); it is truncated or of another kind") from None
+
+
+def json_file(path: Name) -> Any:
+    """Return what a JSON file holds."""
+    return from_json(text(path, most=limit() // TABLE_SHARE), str(path))
+
+
+def npy(path: Name) -> np.ndarray[Any, Any]:
+    """Return the array of an NPY file, which holds exactly what its header declares; objects (pickles) are refused."""
+    with from_file(path), opened(path) as handle:
+        version = np.lib.format.read_magic(handle)
+        read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read_header(handle)
+        declared = functools.reduce(lambda a, b: a * b, shape, dtype.itemsize)
+        held = os.fstat(handle.fileno()).st_size - handle.tell()
+        if dtype.hasobject or declared != held:
+            raise ValueError(f"its header declares {declared} bytes of {dtype}, and {held} follow")
+        handle.seek(0)
+        return np.lib.format.read_array(handle, allow_pickle=False)
+
+
+# ---------------------------------------------------------------------------------------------------------------------- HDF5
+
+
+@contextlib.contextmanager
+def hdf5(path: Name) -> Iterator[Any]:
+    """Yield an HDF5 file, open for reading, that is whole and holds all its data itself, unpacked no more than :func:`limit`.
+
+    Refused is one that does not fit its digest, makes the HDF5 library hang or crash, refers to other files (external links, virtual
+    datasets, external storage), or declares more data than it holds.
+    """
+    import h5py
+
+    with from_file(path):
+        sealed = has_digest(path)
+        if not is_hdf5(path):
+            raise InputError(
+                f"{path} cannot be read as HDF5 (it has no signature); the file is truncated or of another kind"
+            )
+        if not sealed:
+            _need_readable(path)
+        with h5py.File(path, "r") as file:
+            if not sealed and str(attributes(file).get("kind", "")).startswith("strapdown "):
+                if file.userblock_size:  # which files of earlier versions have not
+                    raise InputError(f"{path} is damaged: its digest is gone; make it again, or take a copy")
+                warnings.warn(NoDigestWarning(f"{path} has no digest, so damage to it may pass unseen"), stacklevel=1)
+            _need_plain(path, file)
+            yield file
+
+
+def is_hdf5(path: Name) -> bool:
+    """Return whether a file has the signature of HDF5, at its beginning or behind a user block."""
+    with opened(path) as handle:
+        place, size = 0, os.fstat(handle.fileno()).st_size
+        while place < size:
+            handle.seek(place)
+            if handle.read(8) == b"\x89HDF\r\n\x1a\n":
+                return True
+            place = max(BLOCK, 2 * place)
+    return False
+
+
+def has_digest(path: Name) -> bool:
+    """Return whether a file begins with the digest of what follows; one that does not fit is refused."""
+    with opened(path) as handle:
+        block = handle.read(BLOCK)
+        if not block.startswith(SEAL):
+            return False
+        found = hashlib.file_digest(handle, "sha256").hexdigest()
+    if block.removeprefix(SEAL)[:64] != found.encode():
+        raise InputError(
+            f"{path} cannot be read: its content does not fit its digest, so it is damaged or truncated; take a copy, or make it "
+            "again (if you changed it on purpose, strapdown.files.seal gives it a new digest)"
+        )
+    return True
+
+
+def _need_plain(path: Name, file: Any) -> None:
+    """Refuse an HDF5 file that refers to others, or declares more than it holds."""
+    import h5py
+
+    links: list[tuple[bytes, int]] = []
+    file.id.links.visit(lambda name, link: links.append((name, link.type)), info=True)
+    kinds = {h5py.h5l.TYPE_EXTERNAL: "an external link", h5py.h5l.TYPE_SOFT: "a soft link"}
+    for name, kind in links:
+        if kind != h5py.h5l.TYPE_HARD:
+            place = f"{path}: {name.decode(errors='replace')}"
+            raise InputError(
+                f"{place} is {kinds.get(kind, 'a link')}, which is not followed; put the data itself there"
+            )
+    total = 0
+    for name, _ in links:
+        dataset = file[name]
+        if not isinstance(dataset, h5py.Dataset):
+            continue
+        place = f"{path}: {name.decode(errors='replace')}"
+        if dataset.is_virtual or dataset.external:
+            raise InputError(f"{place} lies in other files, which are not followed; put the data there")
+        declared, held = (dataset.size or 0) * dataset.dtype.itemsize, dataset.id.get_storage_size()
+        if declared > max(PACKING * held, 65536):
+            raise InputError(
+                f"{place} declares {declared / 1e6:.4g} MB and the file holds {held / 1e6:.3g} MB of it; it is damaged or of another kind"
+            )
+        total += declared
+    _need_size(path, total, limit())
+
+
+def _need_readable(path: Name) -> None:
+    """Refuse a file on which the HDF5 library hangs or crashes: try it in a child process."""
+    status = os.stat(path)
+    fault = _fault_of_child(os.fspath(path), status.st_ino, status.st_size, status.st_mtime_ns)
+    if fault:
+        raise InputError(f"{path} is damaged: the HDF5 library {fault}; take a copy, or make it again")
+
+
+@functools.lru_cache(maxsize=64)
+def _fault_of_child(path: str, *identity: int) -> str:
+    seconds = 2 + identity[1] // 20_000_000
+    # Python itself may be frozen into a program, or the child lack h5py: then it ends with a status of its own, and the file is read here.
+    child = "import sys; sys.path[:0] = [sys.argv[1]]; from strapdown.files import reading; reading.probe(sys.argv[2], int(sys.argv[3]))"
+    command = [sys.executable, "-c", child, str(Path(__file__).parents[2]), path, str(seconds)]
+    try:
+        done = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL, timeout=30 * seconds, check=False)
+    except subprocess.TimeoutExpired:
+        return "does not come to an end"
+    if done.returncode in (-9, -24):  # SIGKILL and SIGXCPU, which the limits of :func:`probe` send
+        return "does not come to an end"
+    return "crashes on it" if done.returncode < 0 else ""
+
+
+def probe(path: str, seconds: int) -> None:
+    """Read all of an HDF5 file, with limits of time and memory on the process: what the child of :func:`hdf5` does."""
+    import h5py
+
+    with contextlib.suppress(ImportError, ValueError, OSError):  # Windows has no such limits
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds + 1))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        resource.setrlimit(resource.RLIMIT_DATA, (limit() + 1_000_000_000,) * 2)
+    with h5py.File(path, "r") as file:
+        _need_plain(path, file)
+        nodes = [file]
+        file.visititems(lambda name, node: nodes.append(node))
+        for node in nodes:
+            with contextlib.suppress(Exception):
+                attributes(node)
+            if isinstance(node, h5py.Dataset) and node.chunks:
+                with contextlib.suppress(Exception):
+                    for part in node.iter_chunks():
+                        node[part]
+
+
+def attributes(node: Any) -> dict[str, Any]:
+    """Return the attributes of an HDF5 file, group or dataset as Python's own values: texts, numbers, lists."""
+    return {name: _plain(value) for name, value in node.attrs.items()}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, bytes):
+        return value.decode("utf-8", "replace")  # another program's may be in another encoding
+    if isinstance(value, (np.ndarray, np.generic)):
+        return _plain(value.tolist()) if value.dtype.kind in "SO" else value.tolist()
+    return [_plain(one) for one in value] if isinstance(value, list) else value
+
+
+def numbers(group: Any, name: str) -> np.ndarray[Any, Any]:
+    """Return an array of numbers of an HDF5 group."""
+    import h5py
+
+    place = f"{group.file.filename}: {f'{group.name}/{name}'.lstrip('/')}"
+    if name not in group:
+        raise InputError(f"{place} is missing; the file is damaged, make it again")
+    node = group[name]
+    if isinstance(node, h5py.Group):
+        raise InputError(f"{place} is a group and not an array; the file is damaged, make it again")
+    if not isinstance(node, h5py.Dataset) or node.dtype.kind not in "fiub" or node.shape is None:
+        raise InputError(f"{place} is no array of numbers; the file is damaged, make it again")
+    return np.asarray(node[()])

@@ -1,0 +1,176 @@
+"""Frozen dataclasses as tables for TOML and JSON, with the unit in the name of each key, exact both ways.
+
+A *form* says for each field of a class which units its key may have: ``{"angle": DEGREES, "frequency": HERTZ}`` reads and writes
+``angle_deg`` and ``frequency_hz``. The first unit of a choice is written; a value that no number in that unit tells to the last bit is
+written in the last, which is SI.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+import numpy as np
+
+from strapdown import units
+from strapdown.checks import Array, InputError, known_keys, numbers
+from strapdown.files import reading
+
+Choice = tuple[tuple[str, float], ...]
+"""Suffixes of the key and their factors to SI."""
+Form = Mapping[str, Choice]
+
+PLAIN: Choice = (("", 1.0),)
+TEXT: Choice = (("", 0.0),)
+"""Words and names; what has this choice holds no number."""
+RATIO: Choice = (("ratio", 1.0),)
+PPM: Choice = (("ppm", 1e-6), ("ratio", 1.0))
+SECONDS: Choice = (("s", 1.0),)
+HERTZ: Choice = (("hz", 1.0),)
+METRES: Choice = (("m", 1.0),)
+DEGREES: Choice = (("deg", units.DEGREE), ("rad", 1.0))
+ARCSECONDS: Choice = (("arcsec", units.ARCSECOND), ("deg", units.DEGREE), ("rad", 1.0))
+MILLIRADIANS: Choice = (("mrad", 1e-3), ("rad", 1.0))
+DEGREES_PER_SECOND: Choice = (("deg_per_s", units.DEGREE), ("rad_per_s", 1.0))
+DEGREES_PER_HOUR: Choice = (("deg_per_hour", units.DEGREE_PER_HOUR), ("rad_per_s", 1.0))
+METRES_PER_SECOND_SQUARED: Choice = (("m_per_s2", 1.0),)
+NANOTESLAS: Choice = (("nt", 1e-9), ("t", 1.0))
+
+
+def keys(form: Form) -> dict[str, tuple[str, float]]:
+    """Return every key that a form knows: its field and factor."""
+    return {
+        f"{name}_{suffix}" if suffix else name: (name, factor)
+        for name, choice in form.items()
+        for suffix, factor in choice
+    }
+
+
+def encode(value: Any, form: Form) -> dict[str, Any]:
+    """Return a dataclass as a table; fields at their default are left out."""
+    table: dict[str, Any] = {}
+    for field in dataclasses.fields(value):
+        if field.name not in form:
+            continue
+        content = getattr(value, field.name)
+        if field.default is not dataclasses.MISSING:
+            default = field.default
+        elif field.default_factory is not dataclasses.MISSING:
+            default = field.default_factory()
+        else:
+            default = None
+        if default is not None and _same(content, default):
+            continue
+        table.update(_entry(field.name, content, form[field.name]))
+    return table
+
+
+def _same(a: Any, b: Any) -> bool:
+    return bool(a == b) if isinstance(a, str) or isinstance(b, str) else np.array_equal(np.asarray(a), np.asarray(b))
+
+
+def _entry(name: str, content: Any, choice: Choice) -> dict[str, Any]:
+    if isinstance(content, str | bool | int):
+        return {name if choice in (PLAIN, TEXT) else f"{name}_{choice[0][0]}": content}
+    for suffix, factor in choice:
+        exact = _exact_quotient(np.asarray(content, np.float64), factor)
+        if exact is not None:
+            return {f"{name}_{suffix}" if suffix else name: exact.tolist()}
+    raise InputError(f"{name} is {content!r}, which cannot be written as a number")
+
+
+def _exact_quotient(value: Array, factor: float) -> Array | None:
+    """Return x, of few digits where that will do, with x · factor equal to ``value`` to the last bit; None if there is no such x."""
+    quotient = value / factor
+    short = np.array([float(f"{x:.12g}") for x in quotient.ravel()]).reshape(quotient.shape)
+    result = np.full(value.shape, np.nan)
+    for candidate in (np.nextafter(quotient, -np.inf), np.nextafter(quotient, np.inf), quotient, short):
+        result = np.where(candidate * factor == value, candidate, result)
+    return None if np.isnan(result).any() else result
+
+
+def decode(table: Mapping[str, Any], form: Form, place: str) -> dict[str, Any]:
+    """Return the fields of a table, in SI; unknown keys are refused with the nearest known one."""
+    known = keys(form)
+    known_keys(place, table, known)
+    values: dict[str, Any] = {}
+    for key, content in table.items():
+        name, factor = known[key]
+        if name in values:
+            raise InputError(f"{place}: {key} gives {name} a second time; keep one of the two")
+        values[name] = _number(content, factor, form[name], f"{place}: {key}")
+    return values
+
+
+def _number(content: Any, factor: float, choice: Choice, place: str) -> Any:
+    if choice == TEXT:
+        if not isinstance(content, str):
+            raise InputError(f"{place} is {content!r}; it must be a text in quotes")
+        return content
+    if choice == PLAIN and isinstance(content, str):
+        return content
+    if isinstance(content, bool) or not isinstance(content, int | float | list):
+        raise InputError(f"{place} is {content!r}; it must be a number or a list of numbers, its unit is in the key")
+    try:
+        if isinstance(content, list):
+            return numbers(place, content) * factor
+        number = float(content) * factor
+        return number if choice != PLAIN else content
+    except (InputError, OverflowError):
+        raise InputError(f"{place} is {content!r}; it must be a list of numbers, rows of one length") from None
+
+
+def build(kind: type, table: Mapping[str, Any], form: Form, place: str, **more: Any) -> Any:
+    """Return ``kind(**fields)`` of a table; a missing field is named by its key."""
+    values = {**decode(table, form, place), **more}
+    for field in dataclasses.fields(kind):
+        if (
+            field.default is dataclasses.MISSING
+            and field.default_factory is dataclasses.MISSING
+            and field.name not in values
+        ):
+            choice = form.get(field.name, PLAIN)
+            key = f"{field.name}_{choice[0][0]}" if choice[0][0] else field.name
+            raise InputError(f"{place}: {key} is missing; add it")
+    return made(kind, values, table, form, place)
+
+
+def made(make: Callable[..., Any], values: Mapping[str, Any], table: Mapping[str, Any], form: Form, place: str) -> Any:
+    """Return ``make(**values)``; what is refused is reported with its place in the file, and the key and the number that stand there.
+
+    The values have the type of a file's (text, number, list), not always that of the field: what ``make`` cannot even compare or convert is
+    refused too.
+    """
+    try:
+        return make(**values)
+    except InputError as error:
+        raise InputError(_with_typed(str(error), table, form, place)) from None
+    except (TypeError, ValueError, ArithmeticError, LookupError) as error:
+        keys = ", ".join(table) or "the values"
+        raise InputError(f"{place}: one of {keys} is of the wrong type or size ({error}); check each") from error
+
+
+def _with_typed(text: str, table: Mapping[str, Any], form: Form, place: str) -> str:
+    said = re.sub(r"\[[\d, ]*\]$", "", text.split(" is ", 1)[0])
+    for key, (name, _) in keys(form).items():
+        if key in table and said.endswith(name):
+            return f"{text} ({place}: {key} = {table[key]!r})"
+    return text if text.startswith(place.split(":", 1)[0]) else f"{place}: {text}"
+
+
+Kind = TypeVar("Kind")
+
+
+def read(path: str | os.PathLike[str], name: str, remedy: str, make: Callable[[Mapping[str, Any], str], Kind]) -> Kind:
+    """Return what ``make`` makes of the table ``[name]`` of a TOML file; ``remedy`` says what to do where there is none.
+
+    ``make`` is called with the table and what it is called in errors.
+    """
+    with reading.from_file(path):
+        table = reading.toml(path).get(name)
+        if not isinstance(table, dict):
+            raise InputError(f"{path} has no table [{name}]; {remedy}")
+        return make(table, f"{path}: {name}")

@@ -1,0 +1,165 @@
+"""Writing files so that a reader never sees half of one: written beside, then renamed over."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import hashlib
+import io
+import json
+import os
+import platform
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from strapdown.checks import InputError
+from strapdown.files.reading import BLOCK, SEAL
+
+
+@contextlib.contextmanager
+def written_beside(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Yield a temporary path in the same folder; on success it replaces ``path``, on any error it is removed.
+
+    Missing parent folders are made. The suffix is kept, so that writers which look at it (matplotlib) are content.
+    """
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{target.stem}-", suffix=target.suffix, dir=target.parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, target)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def whole_hdf5(path: str | os.PathLike[str]) -> Iterator[Any]:
+    """Yield an HDF5 file in memory; at the end its bytes go to ``path`` as those of any file, with their digest before them.
+
+    A disk that is full is then an ordinary OSError: HDF5 itself, stopped in the middle of a write, ends the whole program when it closes.
+    """
+    import h5py
+
+    content = io.BytesIO()
+    with h5py.File(content, "w", userblock_size=BLOCK, libver=("v110", "v110")) as file:  # v110: attributes above 64 kB
+        yield file
+    held = content.getbuffer()
+    held[:BLOCK] = _user_block(held[BLOCK:])
+    Path(path).write_bytes(held)
+
+
+@contextlib.contextmanager
+def locked(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Keep other processes from writing the same output for a while; where one has it already, refuse and say which.
+
+    The lock is a file ``.NAME.lock`` beside the output, and ends with the process, however that ends. Windows has no such lock.
+    """
+    try:
+        import fcntl
+    except ModuleNotFoundError:
+        yield
+        return
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    lock = target.with_name(f".{target.name}.lock")
+    while True:
+        with open(lock, "a+", encoding="utf-8") as handle:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                handle.seek(0)
+                raise InputError(
+                    f"{target} is being written by {handle.read() or 'another process'}; wait for it, or choose another file"
+                ) from None
+            try:
+                if not os.path.samestat(os.fstat(handle.fileno()), os.stat(lock)):
+                    continue  # another process had it and took it away in between
+            except FileNotFoundError:
+                continue
+            try:
+                handle.truncate(0)
+                handle.write(
+                    f"process {os.getpid()} on {platform.node()} since {datetime.datetime.now():%Y-%m-%d %H:%M:%S}"
+                )
+                handle.flush()
+                yield
+            finally:
+                lock.unlink(missing_ok=True)
+            return
+
+
+def _user_block(content: bytes | memoryview) -> bytes:
+    return (SEAL + hashlib.sha256(content).hexdigest().encode() + b"\n").ljust(BLOCK, b"\0")
+
+
+def seal(path: str | os.PathLike[str]) -> None:
+    """Give an HDF5 file of this package a new digest, after it was changed on purpose by another program."""
+    with open(path, "r+b") as file:
+        content = file.read()
+        if not content.startswith(SEAL):
+            raise InputError(f"{path} has no digest; only a file that this version wrote has one")
+        file.seek(0)
+        file.write(_user_block(content[BLOCK:]))
+
+
+def set_attributes(node: Any, values: Mapping[str, Any]) -> None:
+    """Set attributes of an HDF5 file, group or dataset; texts have a fixed length.
+
+    The HDF5 library keeps texts of variable length in a heap, where damage makes it loop for ever.
+    """
+    import h5py
+
+    for name, value in values.items():
+        texts = [value] if isinstance(value, str) else value
+        if isinstance(texts, (list, tuple)) and all(isinstance(one, str) for one in texts):
+            held = [one.encode("utf-8", "backslashreplace") for one in texts]
+            dtype = h5py.string_dtype("utf-8", max((1, *map(len, held))))
+            node.attrs.create(name, held[0] if isinstance(value, str) else np.array(held, dtype), dtype=dtype)
+        else:
+            node.attrs[name] = value
+
+
+def usable_folder(name: str, folder: str | os.PathLike[str]) -> None:
+    """Refuse a folder that results cannot go to, before they are computed: one below a file, or that may not be written.
+
+    Nothing is made; the folder appears with the first file written.
+    """
+    place = Path(folder).absolute()
+    while not place.exists():
+        place = place.parent
+    if not place.is_dir():
+        raise InputError(f"{name} is {folder}, but {place} is a file; choose another folder")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise InputError(f"{name} is {folder}, but {place} may not be written; choose another folder")
+
+
+def output_file(
+    name: str, path: str | os.PathLike[str], suffixes: tuple[str, ...], *sources: str | os.PathLike[str]
+) -> None:
+    """Refuse an output file of another kind than its suffix says, or one that would replace a file that is read."""
+    target = Path(path)
+    if target.suffix.lower() not in suffixes:
+        raise InputError(f"{name} is {target}, but what is written is {' or '.join(suffixes)}; choose such a suffix")
+    for source in sources:
+        if target.exists() and Path(source).exists() and target.samefile(source):
+            raise InputError(f"{name} is {target}, the very file that is read; choose another name")
+    usable_folder(name, target.parent)
+
+
+def json_text(content: Any) -> str:
+    """Return ``content`` as indented JSON; NaN and infinities are refused because JSON has no word for them."""
+    return json.dumps(content, indent=2, allow_nan=False) + "\n"
+
+
+def write_json(path: str | os.PathLike[str], content: Any) -> None:
+    """Write ``content`` as indented JSON; NaN and infinities are refused because JSON has no word for them."""
+    text = json_text(content)  # before any folder is made
+    with written_beside(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")

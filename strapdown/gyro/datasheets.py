@@ -1,0 +1,344 @@
+"""Gyro specifications in the units of data sheets, and presets from public ones.
+
+Units are text and are checked: ``from_datasheet(arw="0.15 deg/sqrt(h)", bias_instability="0.5 deg/h")``. A quantity of another dimension
+is refused by name. A noise density in °/s/√Hz is the same quantity as an angle random walk: 1 °/s/√Hz = 60 °/√h.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from strapdown.checks import Array, InputError, known_keys, one_of
+from strapdown.gyro.model import GyroSpec
+
+__all__ = [
+    "PRESETS",
+    "from_datasheet",
+    "preset",
+]
+
+_QUANTITIES = {
+    "arw": ("angle_random_walk", "rad / second ** 0.5", "deg/sqrt(h) or deg/s/sqrt(Hz)"),
+    "bias_instability": ("bias_instability", "rad / second", "deg/h"),
+    "rrw": ("rate_random_walk", "rad / second ** 1.5", "deg/h/sqrt(h)"),
+    "rate_ramp": ("rate_ramp", "rad / second ** 2", "deg/h/h"),
+    "quantization": ("quantization", "rad", "arcsec"),
+    "angle_resolution": ("quantization", "rad", "arcsec"),
+    "rate_resolution": ("rate_resolution", "rad / second", "deg/s"),
+    "turn_on_bias": ("turn_on_bias_sigma", "rad / second", "deg/h"),
+    "markov_noise": ("markov_noise", "rad / second ** 1.5", "deg/h/sqrt(h)"),
+    "markov_correlation_time": ("markov_correlation_time", "second", "s"),
+    "scale_factor": ("scale_factor", "dimensionless", "ppm"),
+    "asymmetry": ("asymmetry", "dimensionless", "ppm"),
+    "misalignment": ("misalignment", "rad", "mrad"),
+    "g_sensitivity": ("g_sensitivity", "rad / second / (meter / second ** 2)", "deg/h/g"),
+    "bandwidth": ("bandwidth", "1 / second", "Hz"),
+    "range": ("range", "rad / second", "deg/s"),
+}
+"""Name in the sheet: field of the specification, its unit, and an example."""
+
+
+@functools.cache
+def _registry() -> Any:
+    import pint
+
+    return pint.UnitRegistry()
+
+
+def parse(name: str, text: str, wanted: str, example: str = "") -> float:
+    """Return a quantity given as text, in the unit ``wanted``; another dimension is refused.
+
+    Understands pint's syntax, ``sqrt(…)``, √ and °; ``h`` is the hour, ``g`` standard gravity and ``Hz`` 1/s.
+    """
+    registry = _registry()
+    if not isinstance(text, str):
+        raise InputError(f"{name} is {text!r}; give it as text with its unit, such as {example!r}")
+    plain = (
+        text.replace("°", " deg")
+        .replace("√Hz", "sqrt(Hz)")
+        .replace("√h", "sqrt(h)")
+        .replace("√s", "sqrt(s)")
+        .replace("″", " arcsec")
+    )
+    plain = re.sub(r"\bHz\b", "(1/second)", re.sub(r"\bhr?\b", "hour", re.sub(r"\bg\b", "standard_gravity", plain)))
+    plain = re.sub(r"sqrt\(((?:[^()]|\([^()]*\))*)\)", r"((\1) ** 0.5)", plain)
+    try:
+        quantity = registry.Quantity(plain)
+        units = quantity.to_root_units().units
+    except Exception as error:  # pint raises whatever Python raises on a text that is no expression
+        raise InputError(
+            f"{name} is {text!r}, which is not a quantity with a unit ({error}); write for example {example or wanted!r}"
+        ) from None
+    needed = registry.Quantity(1.0, wanted).to_root_units().units
+    # The radian has no dimension, so a forgotten "deg" would pass for radians: compare the units, not the dimensions alone.
+    if units != needed:
+        have = "no unit" if units == registry.dimensionless else f"in {units}"
+        raise InputError(f"{name} is {text!r} ({have}); it wants a quantity in {needed}, such as {example or wanted!r}")
+    return float(quantity.to(wanted).magnitude)
+
+
+def from_datasheet(**quantities: str) -> GyroSpec:
+    """Return the specification of a gyro from the figures of its data sheet, as texts with their units.
+
+    Parameters
+    ----------
+    **quantities : str
+        ``arw`` (or noise density), ``bias_instability`` (B as below), ``rrw``, ``rate_ramp``, ``quantization`` (Q) or
+        ``angle_resolution`` (step, Q√12), ``rate_resolution``, ``turn_on_bias`` (1 σ), ``markov_noise``,
+        ``markov_correlation_time``, ``scale_factor`` and ``asymmetry`` (for all axes), ``misalignment`` (for all entries),
+        ``g_sensitivity`` (along each axis), ``bandwidth``, ``range``.
+
+    Returns
+    -------
+    GyroSpec
+        The specification, SI.
+
+    Raises
+    ------
+    InputError
+        If a quantity is unknown, is not text with a unit, or has another dimension.
+
+    Notes
+    -----
+    IEEE Std 952 defines B by the PSD B²/(2π f), whose Allan deviation is flat at √(2 ln 2/π) B = 0.664 B. Most sheets print the
+    coefficient under the name "bias instability" or the minimum itself under "in-run bias stability", and few say which. The figure
+    is used as B.
+
+    Examples
+    --------
+    >>> from_datasheet(arw="60 deg/sqrt(h)").angle_random_walk == from_datasheet(arw="1 deg/s/sqrt(Hz)").angle_random_walk
+    True
+    """
+    known_keys("from_datasheet", quantities, _QUANTITIES)
+    if "quantization" in quantities and "angle_resolution" in quantities:
+        raise InputError("from_datasheet got quantization and angle_resolution, which are one quantity; keep one")
+    values: dict[str, Any] = {}
+    for name, text in quantities.items():
+        field, wanted, example = _QUANTITIES[name]
+        number = parse(name, text, wanted, example)
+        values[field] = _shaped(name, number)
+    return GyroSpec(**values)
+
+
+def _shaped(name: str, number: float) -> float | Array:
+    if name == "angle_resolution":
+        return float(number / np.sqrt(12.0))
+    if name in ("scale_factor", "asymmetry"):
+        return np.full(3, number)
+    if name == "misalignment":
+        return number * (1.0 - np.eye(3))
+    if name == "g_sensitivity":
+        return number * np.eye(3)
+    return number
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Preset:
+    """A gyro on the market, by its public data sheet.
+
+    Parameters
+    ----------
+    name : str
+        Key in :data:`PRESETS`.
+    title : str
+        Maker, type and range.
+    grade : str
+        Kind of gyro, such as "consumer MEMS".
+    document : str
+        Data sheet of the stated figures.
+    checked : str
+        How the stated figures were checked against that sheet.
+    rate : float
+        A sample rate at which it is commonly run, Hz.
+    stated : mapping of str to str
+        Figures of the sheet, in its own units.
+    assumed : mapping of str to str
+        Figures that the sheet does not give in this form, assumed of the size usual for the grade.
+    """
+
+    name: str
+    title: str
+    grade: str
+    document: str
+    checked: str
+    rate: float
+    stated: Mapping[str, str]
+    assumed: Mapping[str, str]
+
+    @property
+    def spec(self) -> GyroSpec:
+        """The specification."""
+        return from_datasheet(**{**self.assumed, **self.stated})
+
+
+def _preset(
+    name: str,
+    title: str,
+    grade: str,
+    document: str,
+    checked: str,
+    rate: float,
+    stated: dict[str, str],
+    assumed: dict[str, str],
+) -> tuple[str, Preset]:
+    return name, Preset(
+        name=name,
+        title=title,
+        grade=grade,
+        document=document,
+        checked=checked,
+        rate=rate,
+        stated=stated,
+        assumed=assumed,
+    )
+
+
+SHEET = "against the sheet"
+QUOTED = "against others who quote the sheet, and agree"
+
+
+PRESETS: dict[str, Preset] = dict(
+    [
+        _preset(
+            "mpu-9250",
+            "InvenSense MPU-9250, ±250 °/s",
+            "consumer MEMS",
+            "InvenSense PS-MPU-9250A-01 rev. 1.0, Product Specification, table 1",
+            SHEET,
+            200.0,
+            {"arw": "0.01 deg/s/sqrt(Hz)", "range": "250 deg/s"},
+            {
+                "bias_instability": "15 deg/h",
+                "rrw": "60 deg/h/sqrt(h)",
+                "turn_on_bias": "1 deg/s",
+                "rate_resolution": "0.0076293945 deg/s",
+            },
+        ),
+        _preset(
+            "bmi088",
+            "Bosch Sensortec BMI088, ±2000 °/s",
+            "consumer MEMS",
+            "Bosch Sensortec BST-BMI088-DS001, gyroscope specification",
+            QUOTED,
+            400.0,
+            {"arw": "0.014 deg/s/sqrt(Hz)", "range": "2000 deg/s"},
+            {"bias_instability": "4 deg/h", "rrw": "30 deg/h/sqrt(h)", "turn_on_bias": "0.5 deg/s"},
+        ),
+        _preset(
+            "adis16470",
+            "Analog Devices ADIS16470",
+            "industrial MEMS",
+            "Analog Devices ADIS16470 Data Sheet Rev. C, features and specifications",
+            SHEET,
+            500.0,
+            {"arw": "0.008 deg/s/sqrt(Hz)", "bias_instability": "8 deg/h", "range": "2000 deg/s"},
+            {"rrw": "30 deg/h/sqrt(h)", "turn_on_bias": "0.1 deg/s"},
+        ),
+        _preset(
+            "adis16467-1",
+            "Analog Devices ADIS16467-1",
+            "industrial MEMS",
+            "Analog Devices ADIS16467 Data Sheet, features",
+            SHEET,
+            500.0,
+            {
+                "arw": "0.15 deg/sqrt(h)",
+                "bias_instability": "2 deg/h",
+                "range": "125 deg/s",
+                "misalignment": "0.05 deg",
+            },
+            {"rrw": "10 deg/h/sqrt(h)", "turn_on_bias": "0.1 deg/s"},
+        ),
+        _preset(
+            "stim300",
+            "Sensonor STIM300",
+            "tactical MEMS",
+            "Sensonor TS1524 rev. 9, STIM300 Datasheet",
+            SHEET,
+            500.0,
+            {
+                "arw": "0.15 deg/sqrt(h)",
+                "bias_instability": "0.5 deg/h",
+                "range": "400 deg/s",
+                "scale_factor": "500 ppm",
+                "misalignment": "1 mrad",
+                "g_sensitivity": "1 deg/h/g",
+            },
+            {"rrw": "1 deg/h/sqrt(h)", "turn_on_bias": "10 deg/h"},
+        ),
+        _preset(
+            "hg4930",
+            "Honeywell HG4930CA51",
+            "tactical MEMS",
+            "Honeywell HG4930 Inertial Measurement Unit data sheet, model CA51",
+            QUOTED,
+            600.0,
+            {
+                "arw": "0.04 deg/sqrt(h)",
+                "bias_instability": "0.25 deg/h",
+                "turn_on_bias": "7 deg/h",
+                "range": "200 deg/s",
+            },
+            {"rrw": "0.5 deg/h/sqrt(h)"},
+        ),
+        _preset(
+            "dsp-1760",
+            "KVH DSP-1760",
+            "fibre-optic",
+            "KVH 54-0924 Rev. A, DSP-1760 Technical Manual, product specifications",
+            QUOTED,
+            1000.0,
+            {"arw": "0.012 deg/sqrt(h)", "bias_instability": "0.05 deg/h", "range": "490 deg/s"},
+            {"rrw": "0.05 deg/h/sqrt(h)", "turn_on_bias": "2 deg/h"},
+        ),
+        _preset(
+            "hg9900",
+            "Honeywell HG9900, ring laser gyros GG1320AN",
+            "navigation, ring laser",
+            "Honeywell N61-1638-000-000, HG9900 Inertial Measurement Unit brochure",
+            QUOTED,
+            300.0,
+            {"arw": "0.002 deg/sqrt(h)", "turn_on_bias": "0.0035 deg/h", "scale_factor": "5 ppm"},
+            {
+                "bias_instability": "0.002 deg/h",
+                "rrw": "0.001 deg/h/sqrt(h)",
+                "angle_resolution": "1 arcsec",
+                "range": "400 deg/s",
+            },
+        ),
+    ]
+)
+"""Presets by name, from consumer MEMS to navigation grade. Where a sheet gives a turn-on bias by another word (offset, repeatability) or
+leaves the rate random walk out, as nearly all do, the figure is under ``assumed``."""
+
+
+def preset(name: str) -> Preset:
+    """Return a preset by name.
+
+    Parameters
+    ----------
+    name : str
+        Key of :data:`PRESETS`.
+
+    Returns
+    -------
+    Preset
+        The preset.
+
+    Raises
+    ------
+    InputError
+        If the name is unknown; the message names the nearest known one.
+
+    Examples
+    --------
+    >>> preset("stim300").grade
+    'tactical MEMS'
+    """
+    return PRESETS[one_of("preset", name, PRESETS)]

@@ -1,0 +1,172 @@
+"""Delays of a unit's sensors, from the recording itself.
+
+A sensor's low-pass delays its samples by the group delay, and the sensors of one unit differ in it: a magnetometer 11 ms behind the gyro is
+6° off at 500 °/s.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from strapdown import coning, quaternion
+from strapdown.checks import Array, InputError, non_negative
+from strapdown.recordings.recording import Recording, increments
+
+FIELD_SPAN = 0.2
+"""Span over which the change of the field, turned back by the gyro, shows the magnetometer's delay, s."""
+PAIRS_IN_SPAN = 12
+"""Pairs of field samples used for each such span; more are not independent."""
+MAX_DELAY_SIGMA = 2e-3
+"""A delay of the magnetometer with a larger σ is not used, s."""
+MAX_DELAY = 0.05
+"""Nor is one beyond this, which is another error than a delay, s."""
+ASSUMED_SIGMA = 2e-3
+"""σ of a gyro delay that is assumed, s."""
+GIVEN_SIGMA = 3e-4
+"""σ of a gyro delay that is given, s."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Delays:
+    """Delays of a recording's sensors."""
+
+    gyro: Array | float
+    """Delay of the stamps of gyro and accelerometer after the motion, s: one number, or one per sample (n,)."""
+    sigma: float
+    """Its standard deviation, s."""
+    field: Array | float
+    """Delay of the magnetometer's stamps behind the gyro's, s, negative for earlier: one number, or one per sample."""
+    field_sigma: float
+    """σ of the last of them, s; infinite where the recording does not show it."""
+    given: bool
+    """Whether the gyro's delay was given."""
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """Description of the delays."""
+        late, field = 1e3 * self.last_gyro, 1e3 * self.last_field
+        found = [
+            f"Samples are assumed to be stamped {late:.3g} ms late."
+            if self.given
+            else f"Samples are assumed to be stamped {late:.3g} ms late, half a sample interval, σ {1e3 * self.sigma:.2g} ms; "
+            "give --latency (latency= in Python) if it is known (0: point samples)."
+        ]
+        if field:
+            side = "after" if field > 0.0 else "before"
+            found.append(
+                f"The magnetometer's samples come {abs(field):.1f} ms {side} the gyro's, σ {1e3 * self.field_sigma:.1g} ms: compensated."
+            )
+        return tuple(found)
+
+    @property
+    def last_gyro(self) -> float:
+        """The gyro's delay at the end, s."""
+        return float(np.ravel(self.gyro)[-1])
+
+    @property
+    def last_field(self) -> float:
+        """The magnetometer's delay behind the gyro at the end, s."""
+        return float(np.ravel(self.field)[-1])
+
+
+def find(
+    recording: Recording, latency: float | None = None, field: float | None = None, *, causal: bool = False
+) -> Delays:
+    """Return the delays of a recording's sensors.
+
+    ``latency`` is the delay of gyro and accelerometer where it is known, s; by default half a sample interval, as of samples that are means
+    over the interval before their stamp, or as much as the magnetometer is ahead of the gyro, for no sensor shows what is to come.
+    ``field`` is the delay of the magnetometer behind the gyro where it is known, s. ``causal``: each sample's delay from the samples before
+    it, found anew whenever the recording has become twice as long.
+    """
+    length = recording.time[-1] - recording.time[0]
+    if latency is not None and non_negative("latency", latency, unit="s") >= length:
+        raise InputError(f"latency is {latency:g} s, and {recording.source} lasts {length:.3g} s")
+    found = np.full(len(recording.time), field or 0.0)
+    sigma = GIVEN_SIGMA if field is not None else np.inf
+    if field is None and recording.magnetic_field is not None:
+        evidence = _evidence(recording)
+        spans = [1.0] if causal else [length]
+        while spans[-1] < length:
+            spans.append(2.0 * spans[-1])
+        for span in spans:
+            delay, sigma = _fitted(*(part[evidence[0] <= recording.time[0] + span] for part in evidence[1:]))
+            if sigma < MAX_DELAY_SIGMA and 3.0 * sigma < abs(delay) < MAX_DELAY:
+                since = recording.time[0] + span if causal else recording.time[0]
+                found[np.searchsorted(recording.time, since) :] = delay
+    half = 0.5 * float(np.median(np.diff(recording.time)))
+    gyro: Array | float = np.maximum(half, -found) if latency is None else latency
+    return Delays(
+        gyro=gyro,
+        sigma=ASSUMED_SIGMA if latency is None else GIVEN_SIGMA,
+        field=found,
+        field_sigma=sigma,
+        given=latency is not None,
+    )
+
+
+def magnetometer_delay(recording: Recording) -> tuple[float, float]:
+    """Return the delay of the magnetometer's stamps behind the gyro's, s, and its σ; (0, ∞) where it is not observable.
+
+    Rotated back by the gyro alone, the field m is constant over a fraction of a second. Samples that are late by τ are in error by
+    ``−τ ṁ``, ``ṁ = −w × m``, and how that changes over :data:`FIELD_SPAN` is fitted by least squares without the outliers. A field that
+    turns with the body (hard iron) is in quadrature to it in a swing: it does not pass for a delay, but a strong one hides some.
+    """
+    return (0.0, np.inf) if recording.magnetic_field is None else _fitted(*_evidence(recording)[1:])
+
+
+def _evidence(recording: Recording) -> tuple[Array, Array, Array]:
+    """Return times (m,), s, of pairs of field samples, how the field changes between them (m, 3), and what it would by a unit delay."""
+    time, none = recording.time, (np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
+    assert recording.magnetic_field is not None
+    lag = int(np.searchsorted(time, time[0] + FIELD_SPAN))
+    if len(time) < 10 * lag:
+        return none
+    stride = max(1, lag // PAIRS_IN_SPAN)
+    at = np.arange(0, len(time), stride)
+    lag = max(1, lag // stride)
+    attitude = coning.integrate(increments(recording), coning.ALGORITHMS["one-sample"])[at]
+    field = recording.magnetic_field[at]
+    known = np.asarray(np.isfinite(field).all(axis=1) & field.any(axis=1))
+    field = np.where(known[:, None], field, 0.0)
+    still = quaternion.rotate(attitude, field)
+    late = quaternion.rotate(attitude, np.cross(recording.rate[at], field))
+    pairs = known[lag:] & known[:-lag]
+    return time[at][lag:][pairs], (still[lag:] - still[:-lag])[pairs], (late[lag:] - late[:-lag])[pairs]
+
+
+def _fitted(change: Array, wanted: Array) -> tuple[float, float]:
+    """Return the delay, s, and its σ, by which ``wanted`` (m, 3) makes up ``change`` (m, 3), without the farthest."""
+    across, along, total = (
+        np.einsum("ki,ki->k", a, b) for a, b in ((change, wanted), (wanted, wanted), (change, change))
+    )
+    kept = np.full(len(change), True)
+    for _ in range(4):
+        information = float(np.sum(along[kept]))
+        if information == 0.0:
+            return 0.0, np.inf
+        delay = float(np.sum(across[kept])) / information
+        left = total - 2.0 * delay * across + delay**2 * along
+        middle = float(np.median(left))
+        kept = left <= 2.5**2 * middle
+    # Of a normal residual with three components the median length is 1.54 σ; the pairs of one span overlap and are not independent.
+    return delay, float(np.sqrt(max(middle, 0.0) * PAIRS_IN_SPAN / information)) / 1.54
+
+
+def turn_over(recording: Recording, delay: Array | float) -> Array:
+    """Return the rotation vector (n, 3), rad, by which the unit turned over a delay, s, before each stamp, by its gyro alone.
+
+    Over a negative delay it is the turn to come, negative; before the first and after the last sample the unit turns on at their rates. The
+    delay is so short that turns of its parts add up.
+    """
+    time = recording.time
+    late = np.broadcast_to(np.asarray(delay, np.float64), time.shape)
+    sums = np.vstack([np.zeros(3), np.cumsum(increments(recording), axis=0)])
+    then = time - late
+    before = np.stack([np.interp(then, time, one) for one in sums.T], axis=1)
+    outside = then - np.clip(then, time[0], time[-1])
+    before += np.where(outside < 0.0, outside, 0.0)[:, None] * recording.rate[0]
+    before += np.where(outside > 0.0, outside, 0.0)[:, None] * recording.rate[-1]
+    return np.asarray(sums - before)

@@ -1,0 +1,195 @@
+"""Faulty samples of a recording: truncated or clipped ones, and a gyro that was silent.
+
+A gyro whose samples are whole numbers of a step, truncated toward zero, measures every rate half a step too small, and so another bias at
+rest than in motion: half a step is added (:func:`truncation_step`).
+
+A clipped gyro sample is a lower bound of the rate. Between the samples before and after such a run the rate is restored by a cubic
+(:func:`restored`), and its error becomes a variance of the turn, which the filter adds to that of the gyro's noise. So does the turn over a
+gap. A clipped sample of the accelerometer has a false direction and is left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from strapdown.checks import Array
+from strapdown.recordings.recording import Recording
+from strapdown.units import DEGREE
+
+SLOW_RATE = 0.03
+"""Rates below this show by which step a gyro's samples are quantised, rad/s."""
+MIN_CLIPPED_RATE = 1.0
+"""Smallest limit of a clipped gyro axis, rad/s; quantised samples at rest repeat their extreme too."""
+MIN_CLIPPED_FORCE = 15.0
+"""Smallest limit of a clipped accelerometer axis, m/s²."""
+MIN_CLIPPED = 3
+"""Smallest number of samples at the extreme, at least two of them in a row, of a clipped axis."""
+MAX_REPEATS = 0.1
+"""Share of the other samples equal to the one before above which the sensor repeats samples anyway, and clipping is not reported."""
+RESTORED_ERROR = 0.5
+"""σ of the turn beyond the limit over a clipped run, as a share of what the cubic makes of it."""
+RESTORED_SPAN = 0.3
+"""Assumed duration of the angular acceleration at the ends of a clipped run, s."""
+SLOWEST_CROSSING = 64
+"""Samples on either side of zero, at most, between which a rate that crosses it shows the bins of its quantisation about zero."""
+CROSSING_STEPS = 6
+"""Steps beyond zero on either side that make a crossing: noise at rest does not."""
+BINS = 4
+"""Bins on either side of that about zero that it is compared with."""
+TRUNCATED_ODDS = 100.0
+"""Likelihood ratio of truncation to rounding above which samples are taken for truncated."""
+LONG_INTERVAL = 1.5
+"""Ratio of an interval between stamps to the usual one above which its rotation is uncertain."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Faults:
+    """Faults of a recording."""
+
+    recording: Recording
+    """The recording with clipped gyro samples restored and clipped samples of the accelerometer missing."""
+    turn_variance: Array
+    """Variance (n − 1,) of the rotation over each interval beyond the gyro's noise, rad² per axis; mostly 0."""
+    words: tuple[str, ...]
+    """Description of the faults."""
+
+
+def find(recording: Recording) -> Faults:
+    """Return the faults of a recording's samples, and the recording without them."""
+    words = []
+    changes: dict[str, Any] = {}
+    step = truncation_step(recording.rate)
+    if step is not None:
+        recording = replace(recording, rate=untruncated(recording.rate, step))
+        words.append(
+            f"The gyro's samples are multiples of {step / DEGREE:.3g} °/s truncated toward zero: half of it is given back to each"
+        )
+    rate, variance, clipped = restored(recording.time, recording.rate)
+    if clipped.any():
+        changes["rate"] = rate
+        limits = ", ".join(
+            f"{axis} at {np.rad2deg(np.abs(recording.rate[clipped[:, k], k]).max()):.4g} °/s ({clipped[:, k].mean():.2%})"
+            for k, axis in enumerate("xyz")
+            if clipped[:, k].any()
+        )
+        words.append(
+            f"The gyro was clipped: {limits} of the samples. The rate is restored from the samples around, and σ grows over each run"
+        )
+    force = recording.specific_force
+    if force is not None and (saturated := clipped_samples(force, MIN_CLIPPED_FORCE)).any():
+        lost = np.asarray(saturated.any(axis=1))
+        changes["specific_force"] = np.where(lost[:, None], np.nan, force)
+        words.append(f"The accelerometer was clipped in {np.sum(lost)} samples ({lost.mean():.2%}), which are ignored")
+    steps = np.diff(recording.time)
+    usual = float(np.median(steps))
+    long = np.flatnonzero(steps > LONG_INTERVAL * usual)
+    for k in long:
+        variance[k] += turn_variance_over(recording.time, rate, float(steps[k]), usual)
+    if len(long):
+        words.append(
+            f"{len(long)} intervals between stamps are longer than {LONG_INTERVAL:g} usual ones, up to {steps.max():.3g} s: σ grows over "
+            "each by what the rate changes in as long a time"
+        )
+    return Faults(recording=replace(recording, **changes), turn_variance=variance, words=tuple(words))
+
+
+def truncation_step(rate: Array) -> float | None:
+    """Return the step, rad/s, of a gyro whose samples (n, 3) are multiples of it truncated toward zero; None for any other gyro.
+
+    The bin about zero is then twice as wide as the others. Counted are samples in the middle of a crossing of zero, where the rate is in
+    one bin as likely as in another; at rest it is not.
+    """
+    step = _quantisation(rate)
+    if step is None:
+        return None
+    crossing = np.zeros(rate.shape, bool)
+    reach = 2
+    while reach <= SLOWEST_CROSSING and 2 * reach < len(rate):
+        before, after = rate[: -2 * reach], rate[2 * reach :]
+        beyond = np.minimum(np.abs(before), np.abs(after)) > CROSSING_STEPS * step
+        crossing[reach:-reach] |= beyond & (before * after < 0.0)
+        reach *= 2
+    bins = np.abs(rate[crossing]) / step
+    number = np.bincount(np.rint(bins[bins < BINS + 0.5]).astype(int), minlength=1)
+    zero, others = int(number[0]), int(np.sum(number[1:]))
+    # Of 2 B + 1 bins the middle one holds a share of 1 / (2 B + 1), or if it is twice as wide, of 2 / (2 B + 2).
+    truncated, rounded = 1.0 / (BINS + 1), 1.0 / (2 * BINS + 1)
+    odds = zero * np.log(truncated / rounded) + others * np.log((1.0 - truncated) / (1.0 - rounded))
+    return step if odds > np.log(TRUNCATED_ODDS) else None
+
+
+def _quantisation(rate: Array) -> float | None:
+    """Return the step that nearly all the slow ones among the rates (n, 3) are multiples of, zero included; None where there is none."""
+    slow, number = np.unique(np.round(np.abs(rate[np.abs(rate) < SLOW_RATE]), 7), return_counts=True)
+    frequent = slow[number >= 3]
+    if len(frequent) < BINS or frequent[0] != 0.0:
+        return None
+    multiple = slow / np.median(np.diff(frequent))
+    on = np.abs(multiple - np.rint(multiple)) < 0.02
+    if np.sum(number[on]) < 0.8 * np.sum(number) or len(frequent) > 0.1 * np.sum(number):
+        return None
+    return float(np.sum((slow * number)[on]) / np.sum((np.rint(multiple) * number)[on]))
+
+
+def untruncated(rate: Array, step: float) -> Array:
+    """Return rates with half a step given back to each, away from zero; to those that lie within a step of zero, as interpolated, less."""
+    return np.asarray(rate + 0.5 * np.clip(rate, -step, step))
+
+
+def clipped_samples(samples: Array, least: float) -> np.ndarray:
+    """Return which of the samples (n, 3) are at their sensor's limit: those that repeat the extreme of their axis, beyond ``least``."""
+    found = np.zeros(samples.shape, bool)
+    for k, axis in enumerate(samples.T):
+        same = np.append(False, axis[1:] == axis[:-1])
+        extremes = [axis == end for end in (np.nanmax(axis, initial=-np.inf), np.nanmin(axis, initial=np.inf))]
+        between = ~(extremes[0] | extremes[1])
+        if not between.any() or np.mean(same[between]) > MAX_REPEATS:
+            continue
+        for at in extremes:
+            if np.sum(at) >= MIN_CLIPPED and np.any(at & same) and abs(axis[np.argmax(at)]) >= least:
+                found[:, k] |= at
+    return found
+
+
+def restored(time: Array, rate: Array) -> tuple[Array, Array, np.ndarray]:
+    """Return rates (n, 3) with clipped runs restored, the variance of the turn (n − 1,) over each interval, and which samples were clipped.
+
+    A run is bridged by the cubic of the values and slopes beside it, but stays beyond the limit. The turn beyond the limit over a whole
+    run is uncertain by :data:`RESTORED_ERROR` of itself; its variance is spread evenly over the intervals of the run.
+    """
+    clipped = clipped_samples(rate, MIN_CLIPPED_RATE)
+    result, variance = rate.copy(), np.zeros(len(time) - 1)
+    for k in np.flatnonzero(clipped.any(axis=0)):
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], clipped[:, k].astype(int), [0]])))
+        for first, stop in edges.reshape(-1, 2):
+            limit = rate[first, k]
+            if first < 2 or stop + 1 >= len(time):
+                variance[max(first - 1, 0) : stop] += (RESTORED_ERROR * limit * (time[1] - time[0])) ** 2
+                continue
+            t0, t1 = time[first - 1], time[stop]
+            u = (time[first:stop] - t0) / (t1 - t0)
+            start, end = rate[first - 1, k], rate[stop, k]
+            span = min(t1 - t0, RESTORED_SPAN)
+            rise = (start - rate[first - 2, k]) / (t0 - time[first - 2]) * span
+            fall = (rate[stop + 1, k] - end) / (time[stop + 1] - t1) * span
+            cubic = start + u * (
+                rise + u * (3.0 * (end - start) - 2.0 * rise - fall + u * (2.0 * (start - end) + rise + fall))
+            )
+            beyond = np.maximum(np.sign(limit) * (cubic - limit), 0.0)
+            result[first:stop, k] = limit + np.sign(limit) * beyond
+            turn = float(np.sum(beyond)) * (t1 - t0) / (stop - first + 1)
+            variance[first - 1 : stop] += (RESTORED_ERROR * turn) ** 2 / (stop - first + 1)
+    return result, variance, clipped
+
+
+def turn_variance_over(time: Array, rate: Array, length: float, usual: float) -> float:
+    """Return the variance, rad² per axis, of a rotation computed from the rates at the ends of an interval of this length, s.
+
+    With D the mean square change of the rate over as long a time elsewhere in the recording, a rate that wanders between both ends as a
+    Brownian bridge turns by ``T² D/12`` about the mean of both.
+    """
+    lag = min(max(1, round(length / usual)), len(time) - 1)
+    return length**2 / 12.0 * float(np.mean((rate[lag:] - rate[:-lag]) ** 2))

@@ -1,0 +1,160 @@
+"""What frozen dataclasses of arrays share: equality by value, and printing as a short table. Private.
+
+Specifications (of a gyro, a sensor, a filter) derive from :class:`ByValue`: they are written to files and read back, and two with the same
+numbers are the same. Data and results are compared by identity; for them ``@dataclass(eq=False)`` is enough. Results derive from
+:class:`Listed`.
+"""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import io
+import math
+import textwrap
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+__all__ = ["ByValue", "Listed", "Listing", "figure"]
+
+WIDTH = 110
+"""Characters of a line of a title."""
+
+
+class Listing(NamedTuple):
+    """A table of text with a title above and notes below."""
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    notes: Sequence[str] = ()
+    left: int = 1
+    """Number of first columns that hold words, the others hold numbers."""
+
+    @property
+    def text(self) -> str:
+        """The table as lines of text."""
+        cells = [list(self.columns), *(list(row) for row in self.rows)]
+        widths = [max(len(row[k]) for row in cells) for k in range(len(self.columns))]
+        lines = [
+            "  ".join(
+                f"{cell:{'<' if k < self.left else '>'}{width}}"
+                for k, (cell, width) in enumerate(zip(row, widths, strict=True))
+            )
+            for row in cells
+        ]
+        table = [lines[0], "-" * len(lines[0]), *lines[1:]] if self.rows else []
+        title = textwrap.wrap(self.title, WIDTH) or [""]
+        return "\n".join(line.rstrip() for line in (*title, *table, *self.notes))
+
+    @property
+    def html(self) -> str:
+        """The table as HTML, for notebooks."""
+
+        def row(cells: Sequence[str], tag: str) -> str:
+            sides = ("left" if k < self.left else "right" for k in range(len(cells)))
+            return "".join(
+                f'<{tag} style="text-align:{side}">{escape(cell)}</{tag}>'
+                for side, cell in zip(sides, cells, strict=True)
+            )
+
+        body = "".join(f"<tr>{row(cells, 'td')}</tr>" for cells in self.rows)
+        table = f"<table><thead><tr>{row(self.columns, 'th')}</tr></thead><tbody>{body}</tbody></table>"
+        notes = "".join(f"<p>{escape(line)}</p>" for note in self.notes for line in note.splitlines())
+        return f"<div><p><b>{escape(self.title)}</b></p>{table if self.rows else ''}{notes}</div>"
+
+
+class Listed:
+    """Base of a result that prints as a short table.
+
+    Examples
+    --------
+    >>> class Result(Listed):
+    ...     def listing(self):
+    ...         return Listing("Errors", ("axis", "deg"), [("x", "0.1"), ("y", "12.3")])
+    >>> print(Result())
+    Errors
+    axis   deg
+    ----------
+    x      0.1
+    y     12.3
+    """
+
+    _drawn_by: ClassVar[str] = ""
+    """Name of the function of ``strapdown.plots`` whose figure a notebook shows below the table."""
+
+    def listing(self) -> Listing:
+        """Return the result as a table."""
+        raise NotImplementedError
+
+    def __str__(self) -> str:
+        return self.listing().text
+
+    def _repr_html_(self) -> str:
+        html = self.listing().html
+        if not self._drawn_by:
+            return html
+        import strapdown  # the front door loads plots, which stand above
+
+        buffer = io.BytesIO()
+        getattr(strapdown.plots, self._drawn_by)(self).savefig(buffer, format="png", dpi=90)
+        data = base64.b64encode(buffer.getvalue()).decode()
+        return f'<div>{html}<img alt="{self._drawn_by}" src="data:image/png;base64,{data}" /></div>'
+
+
+def figure(value: float | None, digits: int = 4) -> str:
+    """Return a number with so many significant digits; a dash where there is none.
+
+    Examples
+    --------
+    >>> figure(0.123456), figure(float("nan")), figure(float("inf"))
+    ('0.1235', '-', '∞')
+    """
+    if value is None or math.isnan(value):
+        return "-"
+    if math.isinf(value):
+        return "∞" if value > 0.0 else "-∞"
+    return f"{value:.{digits}g}"
+
+
+class ByValue:
+    """Base of a frozen dataclass, declared with ``eq=False``, whose instances are equal if all their fields are.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from dataclasses import dataclass
+    >>> @dataclass(frozen=True, eq=False)
+    ... class Direction(ByValue):
+    ...     axis: np.ndarray
+    >>> Direction(np.array([0.0, 0.0, 1.0])) == Direction(np.array([0.0, 0.0, 1.0]))
+    True
+    """
+
+    def __eq__(self, other: object) -> bool:
+        """Compare all fields, arrays element by element."""
+        if type(self) is not type(other):
+            return NotImplemented
+        return _contents(self) == _contents(other)
+
+    def __hash__(self) -> int:
+        """Return a hash that equal instances share."""
+        return hash((type(self), _contents(self)))
+
+
+def _contents(instance: Any) -> tuple[Any, ...]:
+    return tuple(_plain(getattr(instance, field.name)) for field in dataclasses.fields(instance))
+
+
+def _plain(value: Any) -> Any:
+    """Return a value with its arrays and containers as tuples, and mappings as sets of items, which compare and hash by value."""
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, Mapping):
+        return frozenset((key, _plain(content)) for key, content in value.items())
+    if isinstance(value, (list, tuple)):
+        return tuple(_plain(one) for one in value)
+    return value

@@ -1,0 +1,382 @@
+"""Attitude from vector observations at one instant: TRIAD, and the optimal solution of Wahba's problem with its covariance.
+
+Directions ``b_i`` measured in the body frame are known as ``r_i`` in the fixed frame; wanted is the attitude ``q_fb``, matrix R,
+that minimises Wahba's loss ``½ Σ |b_i − Rᵀ r_i|² / σ_i²`` (Wahba 1965, SIAM Review 7). ``σ_i`` is the noise of each of the *two*
+components across the direction, rad: ``E[n nᵀ] = σ² (I − b bᵀ)``, the QUEST measurement model (Shuster & Oh 1981, J. Guidance and
+Control 4).
+
+Only directions count: every vector is divided by its length.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from strapdown import quaternion
+from strapdown.checks import Array, InputError, array
+from strapdown.kinematics import skew
+from strapdown.units import DEGREE
+
+__all__ = [
+    "InconsistentError",
+    "Solution",
+    "from_vertical_and_heading",
+    "solve",
+    "triad",
+]
+
+INCONSISTENT = 6.0
+"""Two measured directions whose angle is off by more than this many σ are inconsistent: chance exceeds it twice in 1e9 pairs."""
+
+LARGEST_UNCERTAINTY = 1.0
+"""A 1σ of the attitude, rad, beyond which a direction of it counts as undetermined (a uniform angle has 1.8)."""
+
+MIN_ANGLE = 1e-6
+"""Smallest angle between two directions and one line, rad, where no σ is given to judge by."""
+
+MIN_HORIZONTAL_ANGLE = 1e-3
+"""Angle between magnetic field and vertical, rad, below which there is no heading."""
+
+MIN_WEIGHT = 1e-12
+"""Weights 1/σ² below this part of the largest are lifted to it in the matrix that the SVD starts from: doubles hold no more."""
+
+ROUNDING = 1e-15
+"""Rounding error of the direction of a unit vector, rad."""
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Two directions
+
+
+def triad(
+    primary_b: ArrayLike,
+    secondary_b: ArrayLike,
+    primary_f: ArrayLike,
+    secondary_f: ArrayLike,
+    *,
+    sigmas: ArrayLike | None = None,
+) -> Array:
+    """Return the attitude from two directions: the first is met exactly, the second fixes the rotation about it.
+
+    Parameters
+    ----------
+    primary_b, secondary_b : array_like (..., 3)
+        Directions measured in the body frame; the more accurate one first.
+    primary_f, secondary_f : array_like (..., 3)
+        The same directions in the fixed frame.
+    sigmas : array_like (2,), optional
+        Noise of both, rad. If given, the angle between the two must agree in both frames within the noise; it is not checked
+        otherwise.
+
+    Returns
+    -------
+    ndarray (..., 4)
+        Unit quaternions q_fb (TRIAD; Black 1964).
+
+    Raises
+    ------
+    InputError
+        If two directions of one frame lie on one line, or their angles disagree beyond the noise.
+
+    Examples
+    --------
+    >>> triad([0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]).tolist()
+    [1.0, 0.0, 0.0, 0.0]
+    """
+    first_b, second_b = _directions("primary_b", primary_b), _directions("secondary_b", secondary_b)
+    first_f, second_f = _directions("primary_f", primary_f), _directions("secondary_f", secondary_f)
+    if sigmas is not None:
+        sigma = _sigmas(sigmas, (2,))
+        _refuse_inconsistent(_stacked(first_b, second_b), _stacked(first_f, second_f), sigma)
+    _refuse_parallel("primary_b", "secondary_b", first_b, second_b, MIN_ANGLE)
+    _refuse_parallel("primary_f", "secondary_f", first_f, second_f, MIN_ANGLE)
+    return _triad(first_b, second_b, first_f, second_f)
+
+
+def from_vertical_and_heading(up_b: ArrayLike, magnetic_b: ArrayLike) -> Array:
+    """Return the attitude in the East-North-Up frame (x East, y magnetic North, z up).
+
+    Parameters
+    ----------
+    up_b : array_like (..., 3)
+        Specific force of a body at rest (an accelerometer then measures *up*), any unit, body axes.
+    magnetic_b : array_like (..., 3)
+        Magnetic field without hard and soft iron, any unit, body axes.
+
+    Returns
+    -------
+    ndarray (..., 4)
+        Unit quaternions q_fb. The vertical is met exactly; of the field only the horizontal part counts, which points North
+        whatever the dip.
+
+    Raises
+    ------
+    InputError
+        If a vector is zero or not finite, or the field is vertical.
+    """
+    up, field = _directions("up_b", up_b), _directions("magnetic_b", magnetic_b)
+    _refuse_parallel("up_b", "magnetic_b", up, field, MIN_HORIZONTAL_ANGLE)
+    return _triad(up, field, np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]))
+
+
+def _stacked(first: Array, second: Array) -> Array:
+    return np.stack(np.broadcast_arrays(first, second), axis=-2)
+
+
+def _frame(first: Array, second: Array) -> Array:
+    """Return the axes (b₁, u, e) as columns (..., 3, 3): e along b₁ × b₂, u = e × b₁."""
+    normal = np.cross(first, second)
+    normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+    return np.stack(np.broadcast_arrays(first, np.cross(normal, first), normal), axis=-1)
+
+
+def _triad(first_b: Array, second_b: Array, first_f: Array, second_f: Array) -> Array:
+    return quaternion.from_matrix(_frame(first_f, second_f) @ np.swapaxes(_frame(first_b, second_b), -1, -2))
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Any number of directions
+
+
+class InconsistentError(InputError):
+    """Directions whose angles differ between the frames by more than their noise explains."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Solution:
+    """The attitude that minimises Wahba's loss, and its uncertainty.
+
+    Parameters
+    ----------
+    attitude : ndarray (..., 4)
+        Unit quaternions q_fb, w ≥ 0.
+    covariance : ndarray (..., 3, 3)
+        Covariance of the body-side error δθ, q_true = q ⊗ exp(δθ), rad²: ``[Σ (I − b bᵀ)/σ²]⁻¹``.
+    loss : ndarray (...,)
+        Wahba's loss ``½ Σ |b − Rᵀ r|²/σ²`` at the minimum.
+    dof : int
+        Degrees of freedom of the residual: two per direction, less three.
+    """
+
+    attitude: Array
+    covariance: Array
+    loss: Array
+    dof: int
+
+    @property
+    def chi_square(self) -> Array:
+        """Twice the loss: χ² with ``dof`` degrees of freedom if directions and σ are right."""
+        return np.asarray(2.0 * self.loss)
+
+    @property
+    def probability(self) -> Array:
+        """Probability that right data leave a residual at least as large (...,). Near 0: an outlier, a wrong reference or a σ too small."""
+        from scipy.special import chdtrc
+
+        return np.asarray(chdtrc(self.dof, self.chi_square))
+
+
+def solve(vectors_b: ArrayLike, references_f: ArrayLike, sigmas: ArrayLike) -> Solution:
+    """Return the attitude that minimises Wahba's loss, with its covariance and residual.
+
+    Markley's SVD method, then Gauss–Newton steps on the residuals: the matrix that the SVD starts from holds 1/σ², so that its rounding
+    rotates the attitude by up to 1e-16 (σ_max/σ_min)² rad about the worst known axis; the residuals hold 1/σ and do not.
+
+    Parameters
+    ----------
+    vectors_b : array_like (..., n, 3)
+        Directions measured in the body frame.
+    references_f : array_like (..., n, 3)
+        The same directions in the fixed frame, in the same order.
+    sigmas : array_like (..., n) or float
+        Noise of each component across each direction, rad.
+
+    Returns
+    -------
+    Solution
+        Attitude, covariance, loss and degrees of freedom.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two directions, one is zero or not finite, all lie on one line within the noise, or the angle of a
+        pair differs between the frames by more than the noise explains (:class:`InconsistentError`).
+
+    Examples
+    --------
+    >>> found = solve([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], 1e-3)
+    >>> found.attitude.tolist(), found.dof
+    ([1.0, 0.0, 0.0, 0.0], 1)
+    """
+    b, r = _directions("vectors_b", vectors_b), _directions("references_f", references_f)
+    for name, value in (("vectors_b", b), ("references_f", r)):
+        if value.ndim < 2:
+            raise InputError(f"{name} has shape {value.shape}, wanted (..., n, 3); pass one row a direction")
+    if b.shape[-2] != r.shape[-2]:
+        raise InputError(
+            f"vectors_b has {b.shape[-2]} directions but references_f has {r.shape[-2]}; pass them in pairs"
+        )
+    if b.shape[-2] < 2:
+        raise InputError(
+            f"vectors_b has {b.shape[-2]} direction(s), which leaves the rotation about it undetermined; give two or more, not on one line"
+        )
+    try:
+        b, r = (np.asarray(value) for value in np.broadcast_arrays(b, r))
+    except ValueError:
+        raise InputError(
+            f"vectors_b has shape {b.shape} and references_f {r.shape}, which do not broadcast; give both the same leading axes"
+        ) from None
+    sigma = _sigmas(sigmas, b.shape[:-1])
+    _refuse_inconsistent(b, r, sigma)
+    _refuse_undetermined("references_f", r, sigma)
+    _refuse_undetermined("vectors_b", b, sigma)
+
+    # The best known direction has weight 1: only ratios matter. What the floor moves the Gauss–Newton steps move back.
+    weight = np.maximum(np.square(np.min(sigma, axis=-1, keepdims=True) / sigma), MIN_WEIGHT)
+    attitude = _refined(_svd(b, r, weight), b, r, sigma)
+    attitude = np.where(attitude[..., :1] < 0.0, -attitude, attitude)
+    predicted = _to_body(attitude, r)
+    root = np.linalg.inv(_factorised(predicted, b - predicted, sigma)[0])
+    return Solution(
+        attitude=attitude,
+        covariance=np.asarray(root @ np.swapaxes(root, -1, -2)),
+        loss=0.5 * np.sum(np.square((b - predicted) / sigma[..., None]), axis=(-2, -1)),
+        dof=2 * b.shape[-2] - 3,
+    )
+
+
+def _to_body(attitude: Array, vectors_f: Array) -> Array:
+    return quaternion.rotate(quaternion.conjugate(attitude)[..., None, :], vectors_f)
+
+
+def _profile(b: Array, r: Array, weight: Array) -> Array:
+    """Return the attitude profile matrix B = Σ a r bᵀ: the best R maximises tr(R Bᵀ)."""
+    return np.asarray(np.swapaxes(weight[..., None] * r, -1, -2) @ b)
+
+
+def _svd(b: Array, r: Array, weight: Array) -> Array:
+    """R = U diag(1, 1, det U det V) Vᵀ for B = U S Vᵀ (Markley 1988, J. Astronautical Sciences 36)."""
+    U, _, Vt = np.linalg.svd(_profile(b, r, weight))
+    handed = np.linalg.det(U) * np.linalg.det(Vt)
+    U = U * np.stack([np.ones_like(handed), np.ones_like(handed), np.sign(handed)], axis=-1)[..., None, :]
+    return quaternion.from_matrix(U @ Vt)
+
+
+def _factorised(predicted: Array, residual: Array, sigma: Array) -> tuple[Array, Array]:
+    """Return (T, y): δθ = T⁻¹ y minimises Σ |residual − [predicted] δθ|²/σ², and its covariance is T⁻¹ T⁻ᵀ.
+
+    By orthogonal factorisation, which keeps the digits of the least weight beside the largest; the normal equations lose them.
+    """
+    scale = sigma[..., None, None]
+    rows = (skew(predicted) / scale).reshape(*predicted.shape[:-2], -1, 3)
+    right = (residual[..., None] / scale).reshape(*rows.shape[:-1], 1)
+    Q, triangle = np.linalg.qr(rows)
+    return triangle, np.swapaxes(Q, -1, -2) @ right
+
+
+def _refined(attitude: Array, b: Array, r: Array, sigma: Array) -> Array:
+    """Return the attitude after Gauss–Newton steps on Wahba's loss, until they are lost in rounding."""
+    for _ in range(_GAUSS_NEWTON_STEPS):
+        predicted = _to_body(attitude, r)
+        triangle, right = _factorised(predicted, b - predicted, sigma)
+        step = np.linalg.solve(triangle, right)[..., 0]
+        attitude = quaternion.normalize(quaternion.multiply(attitude, quaternion.exp(step)))
+        if np.max(np.abs(step), initial=0.0) < ROUNDING:
+            break
+    return attitude
+
+
+_GAUSS_NEWTON_STEPS = 10
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Checks of the input
+
+
+def _place(name: str, *index: int | np.intp) -> str:
+    return f"{name}[{', '.join(str(int(i)) for i in index)}]" if index else name
+
+
+def _directions(name: str, value: ArrayLike) -> Array:
+    """Return vectors (..., 3) divided by their lengths."""
+    vector = array(name, value, (..., 3))
+    largest = np.max(np.abs(vector), axis=-1, keepdims=True, initial=0.0)
+    if np.any(largest == 0.0):
+        index = np.argwhere(largest[..., 0] == 0.0)[0]
+        raise InputError(f"{_place(name, *index)} is the zero vector, which has no direction; leave it out")
+    # Scaled by the largest component first, so that no square leaves the range of a float.
+    scaled = vector / largest
+    return np.asarray(scaled / np.linalg.norm(scaled, axis=-1, keepdims=True))
+
+
+def _sigmas(value: ArrayLike, shape: tuple[int, ...]) -> Array:
+    sigma = array("sigmas", value, (...,))
+    try:
+        sigma = np.broadcast_to(sigma, shape)
+    except ValueError:
+        raise InputError(
+            f"sigmas has shape {sigma.shape}, wanted {shape}; give one number a direction, or one for all"
+        ) from None
+    if np.any(sigma <= 0.0):
+        index = np.argwhere(sigma <= 0.0)[0]
+        raise InputError(
+            f"{_place('sigmas', *index)} is {sigma[tuple(index)]:g} rad; every direction needs a noise greater than zero"
+        )
+    return sigma
+
+
+def _angle(u: Array, v: Array) -> Array:
+    return np.asarray(np.arctan2(np.linalg.norm(np.cross(u, v), axis=-1), np.sum(u * v, axis=-1)))
+
+
+def _refuse_parallel(first_name: str, second_name: str, first: Array, second: Array, least: float) -> None:
+    angle = np.asarray(_angle(first, second))
+    bad = np.minimum(angle, np.pi - angle) < least
+    if np.any(bad):
+        index = np.argwhere(bad)[0]
+        raise InputError(
+            f"{_place(first_name, *index)} and {_place(second_name, *index)} are {angle[tuple(index)] / DEGREE:.6g}° apart, less than "
+            f"{least / DEGREE:.2g}° from one line: the rotation about it is not determined; give a second direction away from the first"
+        )
+
+
+def _refuse_inconsistent(b: Array, r: Array, sigma: Array) -> None:
+    """Refuse pairs whose angle differs between the frames by more than the noise explains."""
+    i, j = np.triu_indices(b.shape[-2], 1)
+    angle_b, angle_f = _angle(b[..., i, :], b[..., j, :]), _angle(r[..., i, :], r[..., j, :])
+    allowed = INCONSISTENT * np.hypot(sigma[..., i], sigma[..., j]) + 4.0 * ROUNDING
+    excess = np.abs(angle_b - angle_f) / allowed
+    if np.any(excess > 1.0):
+        *index, k = np.unravel_index(int(np.argmax(excess)), excess.shape)
+        here = (*index, k)
+        allowed_here = float(np.broadcast_to(allowed, excess.shape)[here])
+        raise InconsistentError(
+            f"directions {i[k]} and {j[k]}{' of set ' + str([int(n) for n in index]) if index else ''} are "
+            f"{np.broadcast_to(angle_b, excess.shape)[here] / DEGREE:.6g}° apart in the body frame but "
+            f"{np.broadcast_to(angle_f, excess.shape)[here] / DEGREE:.6g}° in the fixed frame, where the noise allows a difference of "
+            f"{allowed_here / DEGREE:.3g}° ({INCONSISTENT:g} σ); look for a mixed-up pair, a reference in another frame, an outlier "
+            "or a σ too small"
+        )
+
+
+def _refuse_undetermined(name: str, vectors: Array, sigma: Array) -> None:
+    """Refuse sets of directions that leave a turn undetermined: all on one line, as seen by the noise."""
+    rows = skew(vectors) / np.maximum(sigma, ROUNDING)[..., None, None]
+    least = np.linalg.svd(rows.reshape(*rows.shape[:-3], -1, 3), compute_uv=False)[..., -1]
+    bad = least < 1.0 / LARGEST_UNCERTAINTY
+    if np.any(bad):
+        index = tuple(np.argwhere(bad)[0]) if np.ndim(bad) else ()
+        one = vectors[index]
+        i, j = np.triu_indices(one.shape[-2], 1)
+        angle = _angle(one[i], one[j])
+        widest = int(np.argmax(np.minimum(angle, np.pi - angle)))
+        uncertainty = "without bound" if least[index] == 0.0 else f"{1.0 / least[index]:.3g} rad"
+        raise InputError(
+            f"{_place(name, *index)}: the attitude is not determined, the 1σ of its worst known turn is "
+            f"{uncertainty}; of all pairs, directions {i[widest]} and {j[widest]} are furthest from one line, "
+            f"{angle[widest] / DEGREE:.6g}° "
+            "apart; add a direction away from that line, or give smaller sigmas (rad) if the noise is smaller"
+        )
