@@ -21,7 +21,7 @@ from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Truth
 from strapdown.setup import FilterSetup
-from strapdown.tuning import fitting, innovations, planning
+from strapdown.tuning import fitting, innovations, parameters, planning
 from strapdown.tuning.parameters import own_sigma
 from strapdown.vectors import VectorMeasurements
 
@@ -484,6 +484,15 @@ def test_the_tuned_setup_is_what_it_says_and_goes_through_its_file(tmp_path):
     assert plain(one.record, found.setup, one.initial.attitude, one.initial.bias) == pytest.approx(
         found.after, abs=0.02
     )
+
+
+def test_the_scale_of_a_filter_multiplies_each_of_its_sigmas():
+    chosen = dataclasses.replace(BELIEVED, measurement_sigma_factor=3.0)
+    twice = parameters.with_values(chosen, {parameters.SCALE: 2.0})
+    assert twice.measurement_sigma_factor == 6.0
+    assert twice.process_noise.angle_random_walk == 2.0 * chosen.process_noise.angle_random_walk
+    assert twice.process_noise.rate_random_walk == 2.0 * chosen.process_noise.rate_random_walk
+    assert (twice.attitude_sigma, twice.bias_sigma) == (2.0 * chosen.attitude_sigma, 2.0 * chosen.bias_sigma)
 
 
 def test_a_factor_on_every_sigma_of_the_setup_is_kept_apart():
