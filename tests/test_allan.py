@@ -635,7 +635,7 @@ def test_each_term_of_the_fit_costs_its_spectrum_a_degree():
     bins = types.SimpleNamespace(number=np.full(10, 50.0), square=50.0 * ratio, product=np.zeros(10), ramp=np.zeros(10))
     best = types.SimpleNamespace(slope=0.0, variance=np.ones(10), theta=np.array([1.0, 0.0, 2.0, 3.0]))
     score = (np.cbrt(ratio) - 1.0 + 2.0 / 450.0) / np.sqrt(2.0 / 450.0)
-    assert allan._spectrum_probability(bins, best) == pytest.approx(chi2.sf(score @ score, 7), rel=1e-9)
+    assert allan.deviation._spectrum_probability(bins, best) == pytest.approx(chi2.sf(score @ score, 7), rel=1e-9)
 
 
 @pytest.mark.parametrize("highest_frequency", [None, 0.3])
