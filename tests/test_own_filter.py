@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import two_stars
 
-from strapdown import cli, consistency, covariance, estimation, montecarlo, setup, tuning
+from strapdown import cli, consistency, covariance, estimation, montecarlo, quaternion, scenarios, setup, tuning
 from strapdown.checks import InputError
 from strapdown.estimation import filters
 from strapdown.montecarlo import Plan, campaign
-from strapdown.records import Estimate, Truth
+from strapdown.records import Estimate, Truth, read_estimate, read_truth
 from strapdown.report import campaigns
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -141,6 +141,122 @@ def test_a_too_modest_filter_is_found_out():
     assert consistency.judge_runs(statistics).verdict == "not consistent"
 
 
+MINE = """
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from beside import NOISE
+from strapdown import estimation
+from strapdown.records import Estimate
+
+
+@dataclass
+class Scaled:
+    factor: float = 1.0
+
+    def run(self, record, initial):
+        estimate = estimation.run(record, NOISE, initial, full_covariance=True)
+        return replace(estimate, covariance=self.factor**2 * estimate.covariance)
+
+
+def alone(record, initial):
+    estimate = estimator.run(record, initial)
+    rows = [k * k for k in range(1, 11)]
+    return Estimate.from_arrays(estimate.time[rows], estimate.attitude[rows], estimate.covariance[rows, :3, :3])
+
+
+estimator = Scaled()
+modest = Scaled(2.0)
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with a scenario, a filter in a Python file, and what that imports."""
+    noise = SETUP.process_noise
+    numbers = f"angle_random_walk={noise.angle_random_walk!r}, rate_random_walk={noise.rate_random_walk!r}"
+    (tmp_path / "scene.toml").write_text(scenarios.scenario_to_toml(SCENARIO))
+    (tmp_path / "mine.py").write_text(MINE)
+    (tmp_path / "beside.py").write_text(
+        f"from strapdown.estimation.states import ProcessNoise\nNOISE = ProcessNoise({numbers})\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    yield tmp_path
+    sys.modules.pop("beside", None)
+
+
+def command(*arguments):
+    return cli.app(["montecarlo", *map(str, arguments)], standalone_mode=False)
+
+
+@pytest.mark.parametrize("machine", ["threads", "processes"])
+def test_a_filter_of_a_python_file_is_run_from_the_command_line(own, folder, capsys, machine):
+    """The same statistics to the bit as those of the package's filter."""
+    workers = ("--threads", 2) if machine == "threads" else ("--workers", 1)
+    if machine == "processes":
+        pytest.importorskip("distributed")
+    code = command("scene.toml", "--filter", "mine.py", "--runs", 12, "--chunk", 5, "--seed", 3, *workers)
+    assert code == 2  # 12 runs cannot tell
+    assert "Executing mine.py: it can do whatever you can." in capsys.readouterr().out
+    plan = replace(PLAN, epochs=100, nis_bins=100)
+    held = campaign.read(folder / "scene-montecarlo.h5")
+    same(montecarlo.run_plan(plan, runs=12, machine="scalar", chunk=5), held.statistics)
+    assert held.plan.setup.estimator.table["file"] == "mine.py:estimator"
+    assert "mine" not in sys.modules
+    command("scene.toml", "--filter", "mine.py:modest", "--runs", 12, "--chunk", 5, "--seed", 3, "--out", "modest.h5")
+    modest = campaign.read(folder / "modest.h5").statistics
+    np.testing.assert_allclose(modest.nees_sum, 0.25 * held.statistics.nees_sum, rtol=1e-12)
+
+
+def test_its_campaign_goes_on_and_is_replayed_where_the_code_is_given_again(folder):
+    command("scene.toml", "--filter", "mine.py", "--runs", 5, "--out", "own.h5")
+    with pytest.raises(InputError, match=r"give it again: --filter mine.py:estimator"):
+        command("own.h5", "--runs", 8, "--resume")
+    command("own.h5", "--filter", "mine.py", "--runs", 8, "--resume")
+    assert campaign.read(folder / "own.h5").statistics.runs == 8
+    command("own.h5", "--filter", "mine.py:estimator", "--replay", 6)
+    assert (folder / "own-run-6-estimate.h5").exists()
+    with pytest.raises(InputError, match=r"is not the filter of own\.h5"):
+        command("own.h5", "--filter", "mine.py:modest", "--runs", 9, "--resume")
+    (folder / "mine.py").write_text(MINE + "# edited\n")
+    with pytest.raises(InputError, match=r"is not the filter of own\.h5"):
+        command("own.h5", "--filter", "mine.py", "--replay", 6)
+    with pytest.raises(InputError, match="source_sha256"):
+        command("scene.toml", "--filter", "mine.py", "--runs", 9, "--out", "own.h5", "--resume")
+
+
+def test_a_run_of_a_filter_without_a_bias_and_at_times_of_its_own_is_replayed_and_judged(folder, capsys):
+    command("scene.toml", "--filter", "mine.py:alone", "--runs", 3, "--out", "own.h5", "--replay", 1)
+    assert "of three states" in capsys.readouterr().out
+    files = ["own-run-1-estimate.h5", "--truth", "own-run-1-record.h5"]
+    cli.app(["check", *files], standalone_mode=False)
+    assert "none of 1 tests contradicts the filter" in capsys.readouterr().out
+    read, truth = read_estimate("own-run-1-estimate.h5"), read_truth("own-run-1-estimate.h5")
+    turn = quaternion.log(quaternion.multiply(quaternion.conjugate(read.attitude), truth.attitude))
+    assert np.max(np.abs(turn)) < 5.0 * np.max(read.sigma[:, :3])  # the truth of these times, not of others
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "message"),
+    [
+        (None, "", "mine.py: there is no such Python file"),
+        ("1 +", "", "mine.py fails when it is executed: SyntaxError"),
+        ("x = 1\n1 / 0", "", "mine.py, line 2 fails when it is executed: ZeroDivisionError"),
+        ("x = 1", "", "mine.py defines no estimator; give the name of the filter, mine.py:NAME"),
+        ("x = 1", ":x", "1 is no filter"),
+        ("class F: run = None", ":F", "F is a class; give an object of it"),
+    ],
+)
+def test_a_file_that_holds_no_filter_is_refused(folder, text, name, message):
+    (folder / "mine.py").unlink()
+    if text is not None:
+        (folder / "mine.py").write_text(text)
+    with pytest.raises(InputError, match=message):
+        command("scene.toml", "--filter", f"mine.py{name}", "--runs", 2)
+    assert not (folder / "scene-montecarlo.h5").exists()
+
+
 def test_a_campaign_goes_on_and_is_replayed(own, tmp_path):
     plan, path = with_filter(Wrapped()), tmp_path / "own.h5"
     campaign.run(plan, path, runs=5, chunk=5)
@@ -153,7 +269,7 @@ def test_a_campaign_goes_on_and_is_replayed(own, tmp_path):
     read = campaign.read(path).plan
     assert read.digest == plan.digest
     assert read.setup == plan.setup
-    with pytest.raises(InputError, match="Wrapped is a filter of your own, whose code no file holds"):
+    with pytest.raises(InputError, match="Wrapped is a filter of your own, whose code no result file holds"):
         montecarlo.replay(read, 0)
     assert "textbook" not in campaigns.report(path, 0.99)[0]
 
