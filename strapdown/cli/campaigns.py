@@ -264,6 +264,7 @@ def _with_filter(held: Campaign, own: Own, source: Path) -> Campaign:
 
 def _report(campaign: Campaign) -> dict[str, Any]:
     from strapdown.montecarlo import summary
+    from strapdown.montecarlo.verdicts import bound_of
 
     assert campaign.statistics is not None
     return {
@@ -275,7 +276,7 @@ def _report(campaign: Campaign) -> dict[str, Any]:
         "version": campaign.version,
         "seconds": campaign.seconds,
         "judgement": _judged(campaign).summary(),
-        **summary(campaign.statistics),
+        **summary(campaign.statistics, bound=bound_of(campaign.plan)),
     }
 
 
@@ -292,13 +293,13 @@ def _tell(campaign: Campaign) -> int:
     from strapdown.checks import InputError
     from strapdown.cli.judgement import status_of
     from strapdown.montecarlo import summary
-    from strapdown.montecarlo.verdicts import QUANTILES
+    from strapdown.montecarlo.verdicts import QUANTILES, bound_of
 
     if campaign.statistics is None:
         raise InputError("no chunk of the campaign is finished; go on with it (--resume)")
     if not campaign.finished:
         console.print(f"{campaign.statistics.runs} of {campaign.runs} runs are finished.")
-    report = summary(campaign.statistics)
+    report = summary(campaign.statistics, bound=bound_of(campaign.plan))
     figure = lambda value: "-" if value is None else f"{value:.4g}" if value >= 1e3 else f"{value:.4f}"  # noqa: E731
     rows = table(
         "Per degree of freedom; 1 is a filter as good as it says", "", "mean", "least", "greatest", "from", "to", ""
@@ -342,6 +343,13 @@ def _tell(campaign: Campaign) -> int:
     show(errors)
     expected = ", ".join(f"{100.0 * share:.2f}" for share in report["coverage"]["expected"])
     console.print(f"Of a right filter's errors {expected} % lie inside 1, 2, 3 σ.")
+    if (efficiency := report.get("rms_over_root_cramer_rao_bound")) is not None:
+        low, high = efficiency.pop("bounds_of_an_efficient_filter")
+        ratios = "; ".join(f"{name} {', '.join(f'{x:.3f}' for x in axes)}" for name, axes in efficiency.items())
+        console.print(
+            f"RMS error over the root of the Cramér–Rao bound, which no filter can beat, by axis: {ratios} "
+            f"(at one epoch {low:.3f} to {high:.3f} for a filter that attains it)."
+        )
     worst = ", ".join(
         f"{part['run']} ({'failed' if part['largest_nees'] is None else format(part['largest_nees'], '.1f')})"
         for part in report["worst_runs"][:5]

@@ -33,6 +33,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from strapdown import reading
 from strapdown.checks import Array, InputError, array, increasing, instance
 from strapdown.estimation.states import State
 from strapdown.records import Estimate, ImuRecord
@@ -204,7 +205,7 @@ def read_filter(place: str | os.PathLike[str]) -> Own:
         raise InputError(
             f"{file or place}: there is no such Python file; give FILE.py:NAME, or FILE.py for {DEFAULT_NAME}"
         )
-    code = path.read_bytes()
+    code = reading.content(path)
     module = types.ModuleType(path.stem)
     module.__file__ = str(path)
     # Known by its name while it is executed, as dataclasses need, and not after: so it is sent to other processes by value.
