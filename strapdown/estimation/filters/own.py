@@ -33,9 +33,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from strapdown import reading
 from strapdown.checks import Array, InputError, array, increasing, instance
 from strapdown.estimation.states import State
+from strapdown.files import reading
 from strapdown.records import Estimate, ImuRecord
 
 __all__ = ["Own", "OwnFilter", "as_own", "read_filter"]
