@@ -135,6 +135,13 @@ def test_without_a_bias_the_attitude_alone_is_judged(own, tmp_path, capsys):
     assert "bias" not in told
 
 
+def test_without_a_bias_it_is_consistent_where_the_attitude_shows_it():
+    judgement = consistency.judge_runs(montecarlo.run_plan(with_filter(attitude_only), runs=250))
+    assert judgement.verdict == "consistent"
+    assert [one.of for one in judgement.power] == ["attitude"]
+    assert "bias" not in judgement.words
+
+
 def test_a_filter_that_fails_in_a_run_is_counted(own):
     def failing(record, initial):
         estimate = wrapped(record, initial)

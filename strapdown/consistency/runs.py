@@ -166,7 +166,8 @@ def judge_runs(
                 means=innovation_words(sensor, mean),
             )
         )
-    return concluded(findings, [], probability, needed=STATES, unmodelled=unmodelled)
+    states = [name for name in STATES if name in statistics.subsets]
+    return concluded(findings, [], probability, states=states, needed=states, unmodelled=unmodelled)
 
 
 def _log_nees(statistics: RunStatistics, epochs: np.ndarray, column: int, subset: str, probability: float) -> Finding:
