@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -153,15 +154,16 @@ def _run(
     bounds = [0, *change.tolist(), len(extra)]
     state = prepared.initial
     parts: list[Estimate] = []
+    options: dict[str, Any] = {"full_covariance": True, "error_state_covariance": False, "gate": gate, "robust": robust}
     for first, last in itertools.pairwise(bounds):
         part = record if len(bounds) == 2 else cut(record, first, last)
         walk = parameters.angle_random_walk**2 + float(np.sum(extra[first:last])) / (part.time[-1] - part.time[0])
         noise = replace(own.process_noise, angle_random_walk=float(np.sqrt(walk)))
         end = state
         if not smooth or last < len(extra):
-            found, end = estimation.run_part(part, noise, state, blocks, full_covariance=True, gate=gate, robust=robust)
+            found, end = estimation.run_part(part, noise, state, blocks, **options)
         if smooth:
-            found = estimation.smooth(part, noise, state, blocks, full_covariance=True, gate=gate, robust=robust)
+            found = estimation.smooth(part, noise, state, blocks, **options)
         state = end
         parts.append(found)
     return _joined(parts)
