@@ -14,6 +14,7 @@ from strapdown.ahrs.preparing import Prepared, prepare
 from strapdown.ahrs.starting import quiet_span
 from strapdown.checks import Array, InputError
 from strapdown.estimation.gating import Gate, Robust
+from strapdown.hard_iron import low_pass
 from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings import Recording
@@ -21,6 +22,13 @@ from strapdown.records import ErrorStateEstimate, Estimate, ImuRecord, Innovatio
 from strapdown.sensor_delays import Delays
 from strapdown.sensor_faults import Faults
 from strapdown.unit_calibration import UnitCalibration
+
+LEVEL_TIME = 5.0
+"""Time constant over which the level of the acceleration is found, s."""
+OWN_SHARE = 0.1
+"""Share of the tilt's modelled variance that does not follow the acceleration's level: the accelerometer's own errors."""
+ACCELERATION_SHARE = 0.7
+"""Share of it that follows that level: the steady-state variance goes as the σ of the acceleration."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,8 +40,8 @@ class AhrsEstimate:
     recording : Recording
         The recording from its first quiet second on, clipped gyro samples restored.
     estimate : Estimate
-        Attitude and gyro bias at the stamps of the recording; the covariance includes timing and constant iron, which
-        the filter does not estimate.
+        Attitude and gyro bias at the stamps of the recording; the covariance of the tilt follows the acceleration's level
+        as the innovations show it, and includes timing and constant iron, which the filter does not estimate.
     record : ImuRecord
         What the filter processed: increments and vectors averaged over its steps.
     initial : State
@@ -227,6 +235,9 @@ def _at_stamps(
     assert filtered.covariance is not None
     R = quaternion.to_matrix(filtered.attitude)
     fixed = R @ filtered.covariance[:, :3, :3] @ R.transpose(0, 2, 1)
+    scale = np.ones((len(fixed), 3))
+    scale[:, :2] = _tilt_scale(filtered, fixed[:, 0, 0] + fixed[:, 1, 1], smooth)[:, None]
+    fixed *= scale[:, :, None] * scale[:, None, :]
     iron = 0.0 if prepared.dip is None else (parameters.iron_sigma / np.cos(prepared.dip)) ** 2
     attitude, own = np.empty((len(row), 4)), np.empty((len(row), 3, 3))
     compiled(recording_steps.carry_to_stamps)(
@@ -238,7 +249,7 @@ def _at_stamps(
     if full_covariance:
         P = filtered.covariance[row]
         P[:, :3, :3] = own
-        P[:, :3, 3:] = quaternion.to_matrix(attitude).transpose(0, 2, 1) @ (R @ filtered.covariance[:, :3, 3:])[row]
+        P[:, :3, 3:] = quaternion.to_matrix(attitude).transpose(0, 2, 1) @ (scale[:, :, None] * (R @ filtered.covariance[:, :3, 3:]))[row]
         P[:, 3:, :3] = P[:, :3, 3:].transpose(0, 2, 1)
     sensors = {"accelerometer": used.specific_force, "magnetometer": used.magnetic_field}
     return Estimate(
@@ -261,3 +272,23 @@ def _at_stamps(
             for name, block in filtered.error_states.items()
         },
     )
+
+
+def _tilt_scale(filtered: Estimate, variance: Array, smooth: bool) -> Array:
+    """Return the factor (k,) of the tilt's σ at the steps, of which ``variance`` (k,) is that modelled, by the acceleration's level.
+
+    One model holds for slow and fast motion, so most motion is slower. What exceeds the least variance so far, after a gap or a clipped
+    gyro, is none of the acceleration's and stays.
+    """
+    seen = filtered.innovations["accelerometer"]
+    known = np.isfinite(seen.nis)
+    time, nis = seen.time[known], seen.nis[known, None] / seen.innovation.shape[1]
+    if len(time) < 2:
+        return np.ones(len(variance))
+    step = float(np.median(np.diff(time))) / LEVEL_TIME
+    level, usual = low_pass(nis, step), np.minimum.accumulate(variance)
+    if smooth:
+        level, usual = 0.5 * (level + low_pass(nis[::-1], step)[::-1]), np.minimum(usual, variance.min())
+    level = level[np.maximum(np.searchsorted(time, filtered.time, side="right") - 1, 0), 0]
+    share = OWN_SHARE + ACCELERATION_SHARE * np.sqrt(level)
+    return np.asarray(np.sqrt(1.0 - (1.0 - share) * usual / variance))
