@@ -18,7 +18,10 @@ from typing import Any, Literal
 import numpy as np
 from numpydoc.docscrape import NumpyDocString
 
-from strapdown import datasheets, gyro, motion, orbit, scenarios, tables, vectors
+from strapdown import gyro, motion, scenarios, vectors
+from strapdown.files import tables
+from strapdown.gyro import datasheets
+from strapdown.motion import orbit
 
 SYMBOLS = {
     "": "",

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from strapdown import coning, consistency, estimation, gyro, plots, quaternion, records, wahba
+from strapdown import coning, consistency, estimation, gyro, plots, quaternion, records
 from strapdown.checks import Array
 from strapdown.estimation import error_states
 from strapdown.estimation.states import ProcessNoise
@@ -31,7 +31,7 @@ from strapdown.randomness import generator
 from strapdown.records import ImuRecord
 from strapdown.scenarios import Scenario, simulate
 from strapdown.units import DEGREE, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
-from strapdown.vectors import Accelerometer, Magnetometer
+from strapdown.vectors import Accelerometer, Magnetometer, wahba
 
 FIELD = np.array([0.0, 20e-6, -43e-6])
 """T, East-North-Up."""

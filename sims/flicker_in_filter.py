@@ -9,7 +9,7 @@ For each preset and run, a record at the gyro's natural rate with vector measure
 ``matched``
     the MEKF with :func:`strapdown.gyro.matched_process_noise`;
 ``augmented``
-    a linear Kalman filter, one an axis, with the sixteen states of :class:`strapdown.flicker.Shaping` beside the attitude and the drift.
+    a linear Kalman filter, one an axis, with the sixteen states of :class:`strapdown.gyro.flicker.Shaping` beside attitude and drift.
 
 and ``control`` is the MEKF of ``own`` on the same gyro without flicker. Told is the NEES of the attitude over its three degrees of freedom,
 averaged over runs and late epochs (1 if the covariance is right), with the scatter of that mean over the runs, and the rms error.
@@ -26,7 +26,8 @@ from pathlib import Path
 
 import numpy as np
 
-from strapdown import consistency, datasheets, estimation, flicker, gyro, motion, plots, quaternion
+from strapdown import consistency, estimation, gyro, motion, plots, quaternion
+from strapdown.gyro import datasheets, flicker
 from strapdown.plots import style
 from strapdown.randomness import generator
 from strapdown.scenarios import Scenario, simulate

@@ -28,9 +28,9 @@ from strapdown.estimation import State
 from strapdown.files import write_json
 from strapdown.gyro import GyroSpec
 from strapdown.motion import Harmonic, HarmonicRates
-from strapdown.outputs import euler
 from strapdown.randomness import generator
 from strapdown.records import Estimate, ImuRecord
+from strapdown.records.outputs import euler
 from strapdown.units import DEGREE, DEGREE_PER_ROOT_HOUR, STANDARD_GRAVITY
 
 SMALL = {"runs": 3, "duration": 4.0}

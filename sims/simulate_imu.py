@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from strapdown import datasheets, gyro, plots, units
+from strapdown import gyro, plots, units
+from strapdown.gyro import datasheets
 from strapdown.plots import style
 from strapdown.randomness import generator
 

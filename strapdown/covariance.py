@@ -21,16 +21,15 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import coning, flicker, gyro, kinematics, quaternion, vectors
+from strapdown import coning, gyro, kinematics, quaternion, vectors
 from strapdown.checks import Array, InputError, count, known_keys, non_negative
-from strapdown.equality import ByValue
 from strapdown.estimation.states import covariance_matrices
-from strapdown.gyro import GyroSpec
+from strapdown.gyro import GyroSpec, flicker
 from strapdown.kernels import covariance_loop
 from strapdown.kernels.machine import compiled
-from strapdown.listing import Listed, Listing, figure
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord
+from strapdown.results import ByValue, Listed, Listing, figure
 from strapdown.scenarios import Scenario
 from strapdown.setup import FilterSetup, believed, matched, need_mekf
 from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR

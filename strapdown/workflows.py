@@ -21,19 +21,18 @@ from numpy.typing import ArrayLike
 from strapdown import (
     ahrs,
     allan,
-    allan_gaps,
     coning,
     consistency,
     covariance,
     gyro,
     quaternion,
-    recordfiles,
     recordings,
     records,
     scenarios,
     units,
 )
 from strapdown import setup as setups
+from strapdown.allan import gaps as allan_gaps
 from strapdown.checks import Array, InputError, count, instance, one_of
 from strapdown.consistency import Judgement
 from strapdown.covariance import Analysis, Consider
@@ -41,7 +40,7 @@ from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import ProcessNoise, State
 from strapdown.files import written_beside
 from strapdown.gyro import GyroSpec
-from strapdown.recordings import Recording
+from strapdown.recordings import Recording, recordfiles
 from strapdown.records import Estimate, ImuRecord, Origin, Truth
 from strapdown.scenarios import Scenario
 from strapdown.setup import FilterSetup, for_record
@@ -51,8 +50,8 @@ if TYPE_CHECKING:
     from strapdown.montecarlo import Dispersions, Plan, Statistics
     from strapdown.montecarlo.campaign import Campaign
     from strapdown.recordings import GyroSamples
+    from strapdown.recordings.unit_calibration import UnitCalibration
     from strapdown.tuning import Prior, Tuning
-    from strapdown.unit_calibration import UnitCalibration
 
 __all__ = [
     "AttitudeHistory",
@@ -168,7 +167,7 @@ def read(path: str | os.PathLike[str], **options: Any) -> ImuRecord | Recording 
 
 def _kind(file: Path) -> str:
     """Return which of this package's other files it is; empty: none of them."""
-    from strapdown import reading
+    from strapdown.files import reading
 
     if not reading.is_hdf5(file):
         return ""
@@ -860,7 +859,7 @@ def allan_deviation(
     Parameters
     ----------
     source : Recording, ImuRecord, GyroSamples or array_like (n,) or (n, axes)
-        A recording may have gaps (:mod:`strapdown.allan_gaps`).
+        A recording may have gaps (:mod:`strapdown.allan.gaps`).
     sample_interval : float, optional
         Of an array: time between its samples, s.
     sensor : {"gyro", "accelerometer", "magnetometer"}

@@ -10,11 +10,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sims import hand_held
-from strapdown import ahrs, hard_iron, quaternion, sensor_delays, setup
+from strapdown import ahrs, quaternion, setup
 from strapdown.ahrs import AhrsParameters
 from strapdown.checks import InputError
 from strapdown.consistency import reference_errors
-from strapdown.recordings import Recording, read
+from strapdown.recordings import Recording, hard_iron, read, sensor_delays
 from strapdown.units import DEGREE
 
 RATE = 200.0

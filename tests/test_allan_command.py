@@ -8,7 +8,8 @@ import tomllib
 import numpy as np
 import pytest
 
-from strapdown import allan, datasheets, gyro, units
+from strapdown import allan, gyro, units
+from strapdown.gyro import datasheets
 from strapdown.randomness import generator
 
 NOISE = units.DEGREE_PER_ROOT_HOUR

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from strapdown import allan, allan_gaps
+from strapdown import allan
+from strapdown.allan import gaps as allan_gaps
 from strapdown.checks import InputError
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from strapdown import allan_temperature
+from strapdown.allan import temperature as allan_temperature
 from strapdown.checks import InputError
 
 DT, N, K = 0.1, 1e-3, 2e-4

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import graphlib
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -16,56 +17,11 @@ import strapdown
 
 PACKAGE = Path(strapdown.__file__).parent
 
-FLOORS: tuple[tuple[str, ...], ...] = (
-    # 0 mathematics, and what everything stands on
-    (
-        "checks",
-        "equality",
-        "listing",
-        "reading",
-        "files",
-        "units",
-        "tables",
-        "randomness",
-        "quaternion",
-        "kinematics",
-        "kernels",
-    ),
-    # 1 models
-    (
-        "motion",
-        "coning",
-        "flicker",
-        "gyro",
-        "datasheets",
-        "orbit",
-        "vectors",
-        "wahba",
-        "allan",
-        "allan_gaps",
-        "allan_temperature",
-        "noise_parameters",
-    ),
-    # 2 data
-    (
-        "records",
-        "recordings",
-        "recordfiles",
-        "scenarios",
-        "outputs",
-        "sensor_faults",
-        "hard_iron",
-        "sensor_delays",
-        "unit_calibration",
-    ),
-    # 3 estimators
-    ("estimation", "setup", "ahrs"),
-    # 4 analysis
-    ("consistency", "covariance", "montecarlo", "coning_study", "diagnosis", "doctor", "tuning", "workflows"),
-    # 5 faces
-    ("plots", "report", "cli", "__main__"),
+TABLE = (
+    (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8").partition("| floor |")[2].partition("\n\n")[0]
 )
-"""Modules and sub-packages of ``strapdown`` by floor, from the ground up. An import may go down or stay on its floor, never up."""
+FLOORS = tuple(tuple(re.findall(r"`(\w+)`", row)) for row in reversed(TABLE.splitlines()[2:]))
+"""Modules and sub-packages of ``strapdown`` by floor, from the ground up, as in the README: imports go down or stay on their floor."""
 
 STRANGERS = (("motion", "coning"),)
 """Pairs that never import each other: the closed-form truth and the integrator, so that neither can hide the other's fault."""
@@ -80,9 +36,7 @@ def floor(unit: str) -> int:
     for k, units in enumerate(FLOORS):
         if unit in units:
             return k
-    pytest.fail(
-        f"strapdown/{unit} stands on no floor; add it to FLOORS in {__file__} after shared/design/architecture.md"
-    )
+    pytest.fail(f"strapdown/{unit} stands on no floor; add it to the README's table")
 
 
 @cache
@@ -184,7 +138,7 @@ NOT_OF_THE_USER = ("kernels.machine", "report.page")
 """They read files of the package itself."""
 
 
-@pytest.mark.parametrize("module", [name for name in sources() if name not in ("reading", *NOT_OF_THE_USER)])
+@pytest.mark.parametrize("module", [name for name in sources() if name not in ("files.reading", *NOT_OF_THE_USER)])
 def test_every_file_passes_the_reading_layer(module):
     """Nobody else opens a file to read it, or parses one: limits, names of files and digests are in one place."""
     for node in ast.walk(sources()[module]):

@@ -148,7 +148,7 @@ def test_the_quicker_part_of_flicker_is_told_of_the_bias():
     np.testing.assert_allclose(one.variance[:, 3:] - other.variance[:, 3:], fast, rtol=1e-9)
     np.testing.assert_allclose(np.einsum("kii->ki", one.covariance), one.variance, rtol=1e-12)
     # What the drifts and it hold together is the flicker of the simulator but for what does not change within the record.
-    from strapdown import flicker
+    from strapdown.gyro import flicker
 
     whole = scenario.gyro.bias_instability**2 * flicker.shaping(len(record.increments)).variance
     held = fast + sum(sigma**2 for sigma in chosen.states.gyro_drift_sigma)

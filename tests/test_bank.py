@@ -10,7 +10,7 @@ from plain_kernels import plain
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
-from strapdown import consistency, estimation, kinematics, quaternion, records, scenarios, wahba
+from strapdown import consistency, estimation, kinematics, quaternion, records, scenarios
 from strapdown.checks import InputError
 from strapdown.estimation import multiple_model
 from strapdown.estimation.forward import gate_options
@@ -24,7 +24,7 @@ from strapdown.kernels.walk import walk
 from strapdown.motion import ConstantRate
 from strapdown.records import ImuRecord
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
-from strapdown.vectors import Faults, VectorMeasurements
+from strapdown.vectors import Faults, VectorMeasurements, wahba
 
 QUIET = ProcessNoise(angle_random_walk=1e-7, rate_random_walk=1e-10)
 

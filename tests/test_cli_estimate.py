@@ -20,14 +20,14 @@ from strapdown import (
     report,
     scenarios,
     setup,
-    unit_calibration,
     units,
 )
 from strapdown.checks import InputError
 from strapdown.cli.filters import filter_for
 from strapdown.estimation.states import ONCE, ProcessNoise
 from strapdown.gyro import GyroSpec
-from strapdown.recordfiles import read_record_file, write_record
+from strapdown.recordings import unit_calibration
+from strapdown.recordings.recordfiles import read_record_file, write_record
 from strapdown.records import ImuRecord, Truth, read_estimate, read_states
 from strapdown.report import findings
 from strapdown.scenarios import Scenario, simulate

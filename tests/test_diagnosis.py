@@ -19,7 +19,6 @@ from strapdown import (
     estimation,
     motion,
     quaternion,
-    recordfiles,
     records,
     scenarios,
     setup,
@@ -30,6 +29,7 @@ from strapdown.checks import InputError
 from strapdown.diagnosis.likelihood import log_p
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
+from strapdown.recordings import recordfiles
 from strapdown.records import ImuRecord
 
 WALK = 1.0 * units.DEGREE_PER_ROOT_HOUR
@@ -429,6 +429,23 @@ def test_check_names_a_wrong_axis_on_the_command_line(run, tmp_path, matrix):
 
 
 # ------------------------------------------------------------------------------------------------------------- one of these causes
+
+
+def test_an_axis_that_is_flipped_while_the_rate_is_constant_may_be_a_bias(run):
+    """Two stars' body turns at a constant rate: a flipped axis is a constant error there, and neither may be named alone."""
+    record_file = (
+        recordfiles.read_record_file("a.h5") if run("simulate", "two-stars", "--out", "a.h5")[0] == 0 else None
+    )
+    assert record_file is not None
+    increments = record_file.record.increments * [-1.0, 1.0, 1.0]
+    made = {"gyro_spec": record_file.gyro, "scenario": record_file.scenario, "seed": 1, "run": 0}
+    recordfiles.write_record("flip.h5", replace(record_file.record, increments=increments), **made)
+    assert run("estimate", "flip.h5", "--out", "out")[0] == 0
+    status, said, _ = run("check", "out/estimate.h5", "--record", "flip.h5", "--json", "check.json")
+    assert status == 1
+    assert "One of these causes" in said
+    assert "axes should be read as (−x, y, z)" in said
+    assert "the bias at the start was off" in said
 
 
 def test_of_two_directions_nobody_can_tell_whose_reference_is_off():

@@ -45,7 +45,7 @@ UNITS = {
 }
 """Units that the parameters of these names have everywhere, and their descriptions name."""
 
-PROTOCOLS = ("strapdown.motion.Motion", "strapdown.vectors.Sensor", "strapdown.listing.Listed")
+PROTOCOLS = ("strapdown.motion.Motion", "strapdown.vectors.Sensor", "strapdown.results.Listed")
 """What documents its methods for all classes that have them; there a line is enough."""
 
 

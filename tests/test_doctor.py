@@ -11,9 +11,10 @@ import h5py
 import numpy as np
 import pytest
 
-from strapdown import cli, doctor, motion, quaternion, recordings, vectors
+from strapdown import cli, motion, quaternion, recordings, vectors
+from strapdown.ahrs import doctor
+from strapdown.ahrs.doctor import AXES, FRAMES
 from strapdown.checks import InputError
-from strapdown.doctor import AXES, FRAMES
 from strapdown.recordings import Recording
 
 EAST_NORTH_UP_FIELD = np.array([0.0, 18e-6, -45e-6])

@@ -13,7 +13,9 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.linalg import solve_continuous_are
 
-from strapdown import allan, coning, gyro, kinematics, motion, orbit, quaternion, wahba
+from strapdown import allan, coning, gyro, kinematics, motion, quaternion
+from strapdown.motion import orbit
+from strapdown.vectors import wahba
 
 
 @pytest.mark.parametrize(("angle", "axis"), [(1e-3, (1.0, 2.0, -2.0)), (1.0, (2.0, -1.0, 2.0)), (6.0, (0.0, 3.0, 4.0))])
@@ -83,8 +85,8 @@ def test_efficiency_of_the_median_of_gaussian_sizes():
         f = 2 * mp.npdf(z)  # density of |x| at its median
         efficiency = (1 / mp.mpf(2)) / (1 / (4 * f**2) / z**2)
         assert efficiency == pytest.approx(float(8 * (z * mp.npdf(z)) ** 2), rel=1e-20)
-        assert pytest.approx(float(efficiency), rel=2e-4) == allan._MEDIAN_EFFICIENCY
-        assert pytest.approx(float(z), rel=1e-15) == allan._MEDIAN_OF_NORMAL
+        assert pytest.approx(float(efficiency), rel=2e-4) == allan.deviation._MEDIAN_EFFICIENCY
+        assert pytest.approx(float(z), rel=1e-15) == allan.deviation._MEDIAN_OF_NORMAL
 
 
 @pytest.mark.parametrize(("name", "gain"), [("matched-4-11", 24.0), ("matched-2-8", 2.1), ("matched-1-8-8", 0.12)])

@@ -109,7 +109,7 @@ def test_what_json_cannot_tell_is_refused_and_nothing_is_touched(tmp_path, bad):
 FULL = """
 import resource, signal, sys
 import numpy as np
-from strapdown.recordfiles import write_record
+from strapdown.recordings.recordfiles import write_record
 from strapdown.records import ImuRecord
 
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # so that a write beyond the limit fails as one on a full disk does

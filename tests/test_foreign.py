@@ -10,26 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from strapdown import (
-    cli,
-    consistency,
-    montecarlo,
-    quaternion,
-    recordfiles,
-    recordings,
-    report,
-    scenarios,
-    setup,
-    vectors,
-)
+from strapdown import cli, consistency, montecarlo, quaternion, recordings, report, scenarios, setup, vectors
 from strapdown.checks import InputError
 from strapdown.consistency import check_arrays, foreign
 from strapdown.gyro import GyroSpec
 from strapdown.motion import Harmonic, HarmonicRates
-from strapdown.outputs import euler, euler_axes, to_ned
-from strapdown.recordings import attitudes, ulog
+from strapdown.recordings import attitudes, recordfiles, ulog
 from strapdown.recordings.attitudes import read_attitudes
 from strapdown.records import Truth, read_estimate, read_truth, write_estimate
+from strapdown.records.outputs import euler, euler_axes, to_ned
 from strapdown.units import DEGREE, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
 
 SIMS = Path(__file__).resolve().parents[1] / "sims"

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import strapdown as sd
-from strapdown import listing
+from strapdown import results as listing
 
 NAMES = {
     "FilterSetup",
@@ -479,11 +479,19 @@ def test_dir_shows_the_names_and_the_public_submodules_alone():
 
 
 BELOW = (
+    "ahrs.doctor",
+    "allan.parameters",
+    "allan.temperature",
     "estimation.error_states",
     "estimation.filters",
     "estimation.multiple_model",
+    "gyro.datasheets",
     "montecarlo.campaign",
     "montecarlo.cluster",
+    "motion.orbit",
+    "recordings.unit_calibration",
+    "records.outputs",
+    "vectors.wahba",
 )
 """Public modules below the public submodules."""
 

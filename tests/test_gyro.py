@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from scipy import linalg, signal, stats
 
 from sims import flicker_in_filter, simulate_imu
-from strapdown import datasheets, flicker, gyro, units
+from strapdown import gyro, units
 from strapdown.checks import InputError
-from strapdown.gyro import GyroSpec
+from strapdown.gyro import GyroSpec, datasheets, flicker
 from strapdown.kernels import gyro_errors
 from strapdown.randomness import generator
 

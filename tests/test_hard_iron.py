@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from strapdown import hard_iron
+from strapdown.recordings import hard_iron
 
 FIELD = np.array([0.0, 18.0, -40.0])
 STRENGTH = float(np.linalg.norm(FIELD))

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from strapdown import consistency, estimation, montecarlo, motion, quaternion, recordfiles
+from strapdown import consistency, estimation, montecarlo, motion, quaternion
 from strapdown.checks import InputError
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.schedule import schedule
@@ -14,6 +14,7 @@ from strapdown.estimation.states import ProcessNoise, initial_state
 from strapdown.estimation.step_filter import StepFilter
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
+from strapdown.recordings import recordfiles
 from strapdown.records import ImuRecord
 from strapdown.scenarios import Scenario, simulate
 from strapdown.setup import FilterSetup

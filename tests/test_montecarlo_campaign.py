@@ -18,10 +18,12 @@ import numpy as np
 import pytest
 from hdf5 import changed
 
-from strapdown import cli, consistency, montecarlo, reading, recordfiles, records, scenarios
+from strapdown import cli, consistency, montecarlo, records, scenarios
 from strapdown import setup as setups
 from strapdown.checks import InputError
+from strapdown.files import reading
 from strapdown.montecarlo import campaign, engine, scalar, statistics
+from strapdown.recordings import recordfiles
 
 SCENARIO = replace(scenarios.load_scenario("spin"), duration=2.4)
 SETUP = setups.matched(SCENARIO)

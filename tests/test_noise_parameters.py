@@ -9,7 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from strapdown import allan, gyro, noise_parameters, recordings, scenarios
+from strapdown import allan, gyro, recordings, scenarios
+from strapdown.allan import parameters as noise_parameters
 from strapdown.checks import InputError
 from strapdown.recordings import Recording
 from strapdown.units import DEGREE_PER_ROOT_HOUR, STANDARD_GRAVITY

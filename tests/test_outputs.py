@@ -10,11 +10,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
-from strapdown import outputs, quaternion, recordings
+from strapdown import quaternion, recordings
 from strapdown.checks import InputError
 from strapdown.cli import app
 from strapdown.recordings import Recording
-from strapdown.records import Estimate, read_estimate
+from strapdown.records import Estimate, outputs, read_estimate
 
 SEQUENCES = ["".join(s) for s in itertools.product("XYZ", repeat=3) if s[0] != s[1] != s[2]]
 

@@ -13,8 +13,11 @@ from hypothesis.extra.numpy import arrays
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from strapdown import datasheets, estimation, files, gyro, kinematics, quaternion, reading, recordfiles, records, units
+from strapdown import estimation, files, gyro, kinematics, quaternion, records, units
 from strapdown.checks import InputError
+from strapdown.files import reading
+from strapdown.gyro import datasheets
+from strapdown.recordings import recordfiles
 from strapdown.records import ImuRecord, Truth
 from strapdown.vectors import VectorMeasurements
 

@@ -19,9 +19,11 @@ import pytest
 from hdf5 import changed
 from targets import targets
 
-from strapdown import coning, files, montecarlo, reading, recordfiles, recordings, records, report, scenarios
+from strapdown import coning, files, montecarlo, recordings, records, report, scenarios
 from strapdown.checks import InputError
+from strapdown.files import reading
 from strapdown.montecarlo import campaign, engine
+from strapdown.recordings import recordfiles
 from strapdown.records import ImuRecord
 from strapdown.report import tunings
 

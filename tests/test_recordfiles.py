@@ -8,9 +8,11 @@ import pytest
 from hdf5 import changed
 
 import strapdown
-from strapdown import reading, recordfiles, scenarios, vectors
+from strapdown import scenarios, vectors
 from strapdown.checks import InputError
-from strapdown.recordfiles import export_csv, import_csv, read_record, read_record_file, write_record
+from strapdown.files import reading
+from strapdown.recordings import recordfiles
+from strapdown.recordings.recordfiles import export_csv, import_csv, read_record, read_record_file, write_record
 from strapdown.records import ImuRecord
 
 FAULTS = vectors.Faults(latency=0.05, outages=[(0.5, 0.7)])

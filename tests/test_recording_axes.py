@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from strapdown import doctor, recordings
+from strapdown import recordings
+from strapdown.ahrs import doctor
 from strapdown.checks import InputError
 from strapdown.recordings import Recording
 

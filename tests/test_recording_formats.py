@@ -11,10 +11,11 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 from typer.testing import CliRunner
 
-from strapdown import outputs, quaternion, recordings
+from strapdown import quaternion, recordings
 from strapdown.checks import InputError
 from strapdown.cli import app
 from strapdown.recordings import Recording, read, trajectories
+from strapdown.records import outputs
 
 START = 1_700_000_000_123_456_789
 MISSING = "is not installed: pip install 'strapdown[formats]'"
@@ -403,7 +404,7 @@ def test_what_is_there_is_not_replaced_unless_told(tmp_path):
 
 def test_a_simulated_record_and_an_estimate_are_converted(tmp_path):
     from strapdown import scenarios
-    from strapdown.recordfiles import write_record
+    from strapdown.recordings.recordfiles import write_record
 
     record = scenarios.simulate(replace(scenarios.load_scenario("rest"), duration=20.0), 3)
     write_record(tmp_path / "r.h5", record)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from strapdown import estimation, recordfiles, recordings
+from strapdown import estimation, recordings
 from strapdown.checks import InputError
 from strapdown.cli import app
-from strapdown.recordings import Recording, read
+from strapdown.recordings import Recording, read, recordfiles
 from strapdown.records import ImuRecord
 
 HEADER = "time,gx [rad/s],gy,gz,ax [m/s2],ay,az"

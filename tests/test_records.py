@@ -10,8 +10,9 @@ import pytest
 from hdf5 import changed
 
 import strapdown
-from strapdown import coning, quaternion, reading
+from strapdown import coning, quaternion
 from strapdown.checks import InputError
+from strapdown.files import reading
 from strapdown.records import (
     CONVENTIONS,
     Estimate,

@@ -12,9 +12,11 @@ import pytest
 from hdf5 import changed
 from typer.testing import CliRunner
 
-from strapdown import cli, consistency, reading, recordfiles, records, scenarios, setup
+from strapdown import cli, consistency, records, scenarios, setup
 from strapdown.checks import InputError, count
 from strapdown.cli.terminal import scenario_named
+from strapdown.files import reading
+from strapdown.recordings import recordfiles
 from strapdown.setup.states import States
 
 

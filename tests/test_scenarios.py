@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from strapdown import gyro, motion, orbit, quaternion, scenarios, vectors
+from strapdown import gyro, motion, quaternion, scenarios, vectors
 from strapdown.checks import InputError
 from strapdown.gyro import GyroSpec
+from strapdown.motion import orbit
 from strapdown.scenarios import (
     SCENARIOS,
     Scenario,
@@ -349,7 +350,7 @@ def test_a_duty_cycle_and_lost_samples_leave_the_rest_as_it_was():
 
 
 def test_a_horizon_sensor_sees_the_earths_centre():
-    from strapdown.orbit import CircularOrbit
+    from strapdown.motion.orbit import CircularOrbit
     from strapdown.vectors import HorizonSensor
 
     path = CircularOrbit(altitude=600e3, inclination=1.2)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from strapdown import ahrs, quaternion, sensor_faults
-from strapdown.recordings import Recording
+from strapdown import ahrs, quaternion
+from strapdown.recordings import Recording, sensor_faults
 from strapdown.units import DEGREE
 
 RATE = 200.0

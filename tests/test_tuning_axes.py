@@ -8,22 +8,11 @@ import json
 import numpy as np
 import pytest
 
-from strapdown import (
-    covariance,
-    gyro,
-    montecarlo,
-    motion,
-    quaternion,
-    recordfiles,
-    scenarios,
-    setup,
-    tuning,
-    units,
-    vectors,
-)
+from strapdown import covariance, gyro, montecarlo, motion, quaternion, scenarios, setup, tuning, units, vectors
 from strapdown.checks import InputError
 from strapdown.montecarlo import lanes
 from strapdown.montecarlo.scalar import start
+from strapdown.recordings import recordfiles
 from strapdown.scenarios import Scenario
 from strapdown.tuning import extended, parameters
 

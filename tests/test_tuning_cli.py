@@ -8,8 +8,9 @@ import json
 import numpy as np
 import pytest
 
-from strapdown import gyro, motion, recordfiles, scenarios, setup, tuning, vectors
+from strapdown import gyro, motion, scenarios, setup, tuning, vectors
 from strapdown.checks import InputError
+from strapdown.recordings import recordfiles
 from strapdown.setup import FilterSetup
 
 SCENARIO = scenarios.Scenario(

@@ -13,9 +13,10 @@ from scipy.special import eval_sh_legendre
 from scipy.stats import chi2, norm
 from two_stars import BELIEVED, FREE, TRUTH, WRONG, case, scenario
 
-from strapdown import consistency, recordfiles, scenarios, setup, tuning
+from strapdown import consistency, scenarios, setup, tuning
 from strapdown.checks import InputError
 from strapdown.estimation.states import ProcessNoise
+from strapdown.recordings import recordfiles
 from strapdown.records import ImuRecord
 from strapdown.setup import FilterSetup
 from strapdown.tuning import credibility, fitting

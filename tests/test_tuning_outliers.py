@@ -11,10 +11,11 @@ import two_stars
 from scipy.stats import chi2, norm
 from two_stars import BELIEVED, FREE, TRUTH, WRONG
 
-from strapdown import gyro, motion, quaternion, recordfiles, scenarios, setup, tuning, vectors
+from strapdown import gyro, motion, quaternion, scenarios, setup, tuning, vectors
 from strapdown.checks import InputError
 from strapdown.estimation.gating import Gate
 from strapdown.estimation.states import ProcessNoise
+from strapdown.recordings import recordfiles
 from strapdown.records import ImuRecord
 from strapdown.report import tunings
 from strapdown.setup import FilterSetup

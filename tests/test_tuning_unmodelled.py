@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from strapdown import motion, recordfiles, scenarios, setup, tuning, vectors
+from strapdown import motion, scenarios, setup, tuning, vectors
 from strapdown.checks import InputError
 from strapdown.diagnosis import Cause, turning
 from strapdown.estimation.gating import Gate
 from strapdown.gyro import GyroSpec
+from strapdown.recordings import recordfiles
 from strapdown.report import tunings
 from strapdown.tuning import suspicion
 

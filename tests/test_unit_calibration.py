@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from sims import hand_held
-from strapdown import ahrs, unit_calibration
+from strapdown import ahrs
 from strapdown.checks import InputError
 from strapdown.consistency import reference_errors
+from strapdown.recordings import unit_calibration
+from strapdown.recordings.unit_calibration import UnitCalibration
 from strapdown.records import ErrorStateEstimate
-from strapdown.unit_calibration import UnitCalibration
 
 MATRIX = np.array([[0.02, 0.004, -0.003], [0.0, -0.015, 0.002], [0.005, 0.0, 0.01]])
 

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from strapdown import motion, orbit, quaternion, vectors
+from strapdown import motion, quaternion, vectors
 from strapdown.checks import InputError
+from strapdown.motion import orbit
 from strapdown.randomness import generator
 from strapdown.vectors import (
     Accelerometer,

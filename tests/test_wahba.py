@@ -11,8 +11,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from strapdown import quaternion, wahba
+from strapdown import quaternion
 from strapdown.checks import InputError
+from strapdown.vectors import wahba
 
 METHODS = ("svd", "davenport", "quest", "foam")
 BATCHES = [(), (1,), (5,), (2, 3)]

@@ -7,6 +7,7 @@ updating less often than the sensors sample: the samples of a step are turned by
 
 from __future__ import annotations
 
+from strapdown.ahrs import doctor as doctor
 from strapdown.ahrs.estimating import AhrsEstimate, estimate
 from strapdown.ahrs.parameters import HAND_HELD as HAND_HELD
 from strapdown.ahrs.parameters import MOTIONS, AhrsParameters

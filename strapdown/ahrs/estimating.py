@@ -8,20 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import estimation, quaternion, sensor_delays, sensor_faults, unit_calibration
+from strapdown import estimation, quaternion
 from strapdown.ahrs.parameters import HAND_HELD, AhrsParameters
 from strapdown.ahrs.preparing import Prepared, prepare
 from strapdown.ahrs.starting import quiet_span
 from strapdown.checks import Array, InputError
 from strapdown.estimation.gating import Gate, Robust
-from strapdown.hard_iron import low_pass
 from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.recordings import Recording
+from strapdown.recordings import Recording, sensor_delays, sensor_faults, unit_calibration
+from strapdown.recordings.hard_iron import low_pass
+from strapdown.recordings.sensor_delays import Delays
+from strapdown.recordings.sensor_faults import Faults
+from strapdown.recordings.unit_calibration import UnitCalibration
 from strapdown.records import ErrorStateEstimate, Estimate, ImuRecord, Innovations, cut
-from strapdown.sensor_delays import Delays
-from strapdown.sensor_faults import Faults
-from strapdown.unit_calibration import UnitCalibration
 
 LEVEL_TIME = 5.0
 """Time constant over which the level of the acceleration is found, s."""
@@ -88,7 +88,7 @@ def estimate(
     latency : float, optional
         Delay of the gyro's and the accelerometer's samples, s: the group delay of the sensors; 0: point samples at their stamps. By
         default each sample is taken for the mean over the interval before its stamp, half of which is its delay. That of the
-        magnetometer beside the gyro is found by :func:`strapdown.sensor_delays.magnetometer_delay`.
+        magnetometer beside the gyro is found by :func:`strapdown.recordings.sensor_delays.magnetometer_delay`.
     calibration : UnitCalibration, optional
         What an earlier recording of the same unit showed: scale and misalignment of its gyro, the magnetometer's delay.
     gate : Gate, optional

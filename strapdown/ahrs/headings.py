@@ -10,10 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from strapdown import hard_iron, quaternion
+from strapdown import quaternion
 from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.checks import Array
-from strapdown.hard_iron import low_pass
+from strapdown.recordings import hard_iron
+from strapdown.recordings.hard_iron import low_pass
 from strapdown.vectors import VectorMeasurements
 
 NORTH = np.array([0.0, 1.0, 0.0])

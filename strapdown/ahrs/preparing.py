@@ -6,13 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from strapdown import coning, estimation, quaternion, sensor_delays
+from strapdown import coning, estimation, quaternion
 from strapdown.ahrs import headings, starting
 from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.checks import Array
 from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.recordings import Recording, increments
+from strapdown.recordings import Recording, increments, sensor_delays
 from strapdown.records import ImuRecord
 from strapdown.vectors import VectorMeasurements
 

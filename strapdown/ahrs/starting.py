@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from strapdown import coning, estimation, quaternion, wahba
+from strapdown import coning, estimation, quaternion
 from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.checks import Array, InputError
 from strapdown.recordings import Recording
+from strapdown.vectors import wahba
 
 QUIET_SPAN = 1.0
 """Length of the quiet span that the filter starts from, s."""

@@ -58,7 +58,7 @@ from strapdown.cli import (  # noqa: F401  (each registers its commands)
 )
 from strapdown.cli.progress import be_quiet
 from strapdown.cli.terminal import app, console, errors
-from strapdown.reading import NoDigestWarning
+from strapdown.files.reading import NoDigestWarning
 
 
 @app.callback(invoke_without_command=True)

@@ -358,8 +358,9 @@ def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
 
     import numpy as np
 
-    from strapdown import consistency, recordfiles, setup
+    from strapdown import consistency, setup
     from strapdown import montecarlo as engine
+    from strapdown.recordings import recordfiles
     from strapdown.records import Truth, write_estimate
     from strapdown.scenarios import scenario_to_toml
 

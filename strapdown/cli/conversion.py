@@ -89,7 +89,7 @@ def convert(
         )
     else:
         if recordings.is_record(source):
-            from strapdown.recordfiles import read_record
+            from strapdown.recordings.recordfiles import read_record
 
             content = recordings.from_record(read_record(source), source.name)
             console.print(

@@ -39,8 +39,8 @@ from strapdown.cli.terminal import (
 if TYPE_CHECKING:
     from strapdown.ahrs import AhrsEstimate, AhrsParameters
     from strapdown.estimation.states import State
-    from strapdown.recordfiles import RecordFile
     from strapdown.recordings import Recording
+    from strapdown.recordings.recordfiles import RecordFile
     from strapdown.records import Estimate, ImuRecord
     from strapdown.setup import FilterSetup
     from strapdown.setup.for_record import Start
@@ -289,8 +289,9 @@ def _exports(
 
     ``changed``: the samples are read in other axes than those of the file.
     """
-    from strapdown import outputs, recordings
+    from strapdown import recordings
     from strapdown.checks import InputError, one_of
+    from strapdown.records import outputs
 
     if frame is not None:
         frame = one_of("--frame", frame.upper(), outputs.FRAMES)
@@ -324,9 +325,10 @@ def _export(
 
 def _estimate_specified(path: Path, shared: _Shared, options: _Specified, output: _Output) -> None:
     """Run the filter over a recording that holds its specification, report and write its estimate."""
-    from strapdown import reading, workflows
+    from strapdown import workflows
     from strapdown.checks import InputError, count
-    from strapdown.recordfiles import read_record_file
+    from strapdown.files import reading
+    from strapdown.recordings.recordfiles import read_record_file
 
     every = count("every", options.every)
     if shared.smooth and every > 1:
@@ -548,10 +550,11 @@ def _errors(result: Estimate, truth: Any) -> dict[str, float]:
 
 def _estimate_recording(recording: Path, shared: _Shared, options: _Recorded, output: _Output) -> None:
     """Run the filter over a recording: accelerometer as the vertical, magnetometer as the heading."""
-    from strapdown import ahrs, recordings, unit_calibration
+    from strapdown import ahrs, recordings
     from strapdown.checks import non_negative, one_of
     from strapdown.consistency import reference_errors
     from strapdown.gyro import read_spec
+    from strapdown.recordings import unit_calibration
     from strapdown.units import DEGREE
 
     one_of("--motion", options.motion, ahrs.MOTIONS)
@@ -612,8 +615,9 @@ def _write_recording(
     output: _Output,
 ) -> list[Path]:
     """Write the estimate, its states and the calibration; return the files."""
-    from strapdown import setup, unit_calibration
+    from strapdown import setup
     from strapdown.files import write_json
+    from strapdown.recordings import unit_calibration
     from strapdown.records import write_estimate
 
     used, found, out = result.recording, result.estimate, output.folder

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from strapdown.recordfiles import RecordFile
+    from strapdown.recordings.recordfiles import RecordFile
     from strapdown.scenarios import Scenario
     from strapdown.setup import FilterSetup
 
@@ -30,8 +30,9 @@ def filter_for(
 
     A filter that is to be smoothed is not given gyro drifts unless ``states`` names them.
     """
-    from strapdown import reading, setup
+    from strapdown import setup
     from strapdown.checks import InputError
+    from strapdown.files import reading
     from strapdown.gyro import read_spec
     from strapdown.setup.for_record import matched_setup, unmodelled_errors
 

@@ -85,7 +85,9 @@ def integrate(
     """Integrate a gyro recording to attitude, starting at the true attitude if the file holds it, else at the identity."""
     import numpy as np
 
-    from strapdown import coning, quaternion, reading, recordfiles, recordings, records, workflows
+    from strapdown import coning, quaternion, recordings, records, workflows
+    from strapdown.files import reading
+    from strapdown.recordings import recordfiles
 
     writable("out", out, suffixes=(".h5", ".hdf5"), sources=(recording,))
     need_own(out, "integrate", lambda path: bool(records.read_attributes(path)["kind"] == "strapdown attitude"))

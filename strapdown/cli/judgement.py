@@ -165,7 +165,7 @@ def status_of(judgement: Judgement) -> int:
 
 def _is_own(path: Path) -> bool:
     """Return whether a file is, or should be by its name, a result of this package; one that is missing is told of as such."""
-    from strapdown import reading
+    from strapdown.files import reading
 
     return not path.exists() or path.suffix.lower() in (".h5", ".hdf5") or (path.is_file() and reading.is_hdf5(path))
 
@@ -286,7 +286,8 @@ def _diagnosed(
     """Show the causes that a record gives evidence of; return them as plain values, and with the verdict by all evidence, if any."""
     import numpy as np
 
-    from strapdown import diagnosis, estimation, recordfiles, records
+    from strapdown import diagnosis, estimation, records
+    from strapdown.recordings import recordfiles
     from strapdown.setup.for_record import unmodelled_errors
     from strapdown.tuning.suspicion import accepted
 
@@ -371,8 +372,8 @@ def doctor(
     ] = None,
 ) -> None:
     """Find the conventions that a recording follows, by trying the others: exit status 0 as declared, 1 wrong, 2 cannot tell."""
-    from strapdown import doctor as conventions
     from strapdown import recordings
+    from strapdown.ahrs import doctor as conventions
 
     json_target(json, recording)
     given = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}

@@ -24,7 +24,7 @@ def report(
 ) -> None:
     """Write a self-contained HTML page about a result: verdict in words, numbers, figures, how to reproduce it; the statistics as JSON."""
     from strapdown import report as reports
-    from strapdown.reading import existing_file
+    from strapdown.files.reading import existing_file
 
     existing_file(result)
     page = result.with_suffix(".html") if out is None else out

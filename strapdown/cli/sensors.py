@@ -64,8 +64,8 @@ def simulate(
     ] = False,
 ) -> None:
     """Simulate a scenario: a record with its truth."""
-    from strapdown import recordfiles
     from strapdown import scenarios as catalogue
+    from strapdown.recordings import recordfiles
 
     chosen = scenario_named(scenario)
     toml = catalogue.scenario_to_toml(chosen)
@@ -147,7 +147,7 @@ def allan(
     tables: Tables = None,
 ) -> None:
     """Identify a sensor's noise from a recording at rest: Allan deviation, fitted coefficients, specification as TOML."""
-    from strapdown import noise_parameters
+    from strapdown.allan import parameters as noise_parameters
     from strapdown.checks import InputError, count, one_of, positive
     from strapdown.files import usable_folder, written_beside
 
@@ -224,7 +224,9 @@ def _identify(recording: Path, sensor: str, options: _Options) -> identification
     import numpy as np
 
     from strapdown import allan as identification
-    from strapdown import allan_gaps, noise_parameters, plots, recordings
+    from strapdown import plots, recordings
+    from strapdown.allan import gaps as allan_gaps
+    from strapdown.allan import parameters as noise_parameters
     from strapdown.checks import InputError
     from strapdown.files import written_beside
     from strapdown.plots.style import save_as
@@ -330,7 +332,7 @@ def _regressed(recording: Path, sensor: str, source: GyroSamples, order: int, ou
     import numpy as np
     import tomli_w
 
-    from strapdown import allan_temperature
+    from strapdown.allan import temperature as allan_temperature
     from strapdown.checks import InputError
     from strapdown.files import written_beside
 
@@ -409,7 +411,7 @@ def _specification(fit: identification.NoiseFit, source: str, warnings: list[str
     import tomli_w
 
     from strapdown import allan as identification
-    from strapdown import noise_parameters
+    from strapdown.allan import parameters as noise_parameters
 
     lines = [f"{sensor.capitalize()} noise by `strapdown allan` from {source}."]
     lines += [f"WARNING: {warning}." for warning in warnings]

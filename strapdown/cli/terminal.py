@@ -194,7 +194,7 @@ def need_own(target: Path, command: str, own: Callable[[Path], bool]) -> None:
 
 def doubt(source: Recording, path: Path) -> None:
     """Say where a recording seems not to be what it says: of all that is made of it, a wrong unit is the likeliest to be missed."""
-    from strapdown import doctor
+    from strapdown.ahrs import doctor
 
     with progress_bar("trying conventions"):
         found = doctor.examine(source)

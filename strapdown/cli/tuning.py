@@ -333,9 +333,10 @@ def _cases(
     states: bool,
 ) -> tuple[list[Case], FilterSetup, dict[str, GyroSpec]]:
     """Return the records to tune on, the filter to start from, and the gyros of the records that hold theirs."""
-    from strapdown import recordfiles, recordings, tuning
+    from strapdown import recordings, tuning
     from strapdown.checks import InputError
     from strapdown.cli.filters import filter_for, need_angles
+    from strapdown.recordings import recordfiles
 
     cases: list[Case] = []
     gyros: dict[str, GyroSpec] = {}
@@ -369,8 +370,8 @@ def _cases(
 
 
 def _priors(source: str, factor: float, record: ImuRecord, names: Sequence[str]) -> dict[str, Any]:
-    from strapdown import datasheets, tuning
-    from strapdown.gyro import read_spec
+    from strapdown import tuning
+    from strapdown.gyro import datasheets, read_spec
 
     spec: GyroSpec = read_spec(source) if Path(source).suffix == ".toml" else datasheets.preset(source).spec
     return {
@@ -584,8 +585,9 @@ def _plan(
     length: str | None,
     threads: int,
 ) -> None:
-    from strapdown import recordfiles, scenarios, setup, tuning
+    from strapdown import scenarios, setup, tuning
     from strapdown.checks import InputError
+    from strapdown.recordings import recordfiles
 
     if len(records) != 1:
         raise InputError(f"--plan takes one record or scenario; {len(records)} are given")

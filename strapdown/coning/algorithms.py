@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import checks, reading
+from strapdown import checks
 from strapdown.checks import Array, InputError
 from strapdown.coning import coefficients as exact
 from strapdown.coning.coefficients import Rationals, Table
+from strapdown.files import reading
 
 SOLVERS = {
     "compressed": "rotation vector with one cross product",

@@ -8,9 +8,10 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from strapdown import checks, reading
+from strapdown import checks
 from strapdown.checks import InputError
 from strapdown.coning.algorithms import Algorithm, named
+from strapdown.files import reading
 from strapdown.units import DEGREE
 
 

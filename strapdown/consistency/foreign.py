@@ -21,8 +21,8 @@ from strapdown.checks import Array, InputError, array, increasing, one_of, unit_
 from strapdown.consistency.judgement import WITHOUT_TRUTH, Judgement, judge
 from strapdown.consistency.manifold import whitened
 from strapdown.consistency.timeaverage import effective_samples
-from strapdown.outputs import euler_axes
 from strapdown.records import Estimate, Innovations, Truth
+from strapdown.records.outputs import euler_axes
 from strapdown.units import DEGREE
 
 ERROR_FRAMES = ("body", "fixed", "euler")

@@ -27,8 +27,8 @@ from strapdown.consistency.whiteness import (
     ljung_box,
     mean_innovation_p_value,
 )
-from strapdown.listing import Listed, Listing, figure
 from strapdown.records import Estimate, Truth
+from strapdown.results import Listed, Listing, figure
 
 Answer = Literal["consistent", "not consistent", "cannot tell"]
 

@@ -10,11 +10,11 @@ from typing import cast
 import numpy as np
 
 from strapdown import estimation, quaternion
+from strapdown.ahrs.doctor import ATTITUDE_READINGS, AXES, axes_words
 from strapdown.checks import Array
 from strapdown.diagnosis.causes import Cause
 from strapdown.diagnosis.likelihood import Hypothesis, Model, Run, log_p, run
 from strapdown.diagnosis.turning import PLAUSIBLE, turns
-from strapdown.doctor import ATTITUDE_READINGS, AXES, axes_words
 from strapdown.vectors import VectorMeasurements
 
 

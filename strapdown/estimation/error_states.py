@@ -13,8 +13,8 @@ from typing import Literal
 import numpy as np
 
 from strapdown.checks import Array, InputError, array, non_negative, one_of, positive
-from strapdown.equality import ByValue
 from strapdown.kernels import chains
+from strapdown.results import ByValue
 from strapdown.units import STANDARD_GRAVITY
 from strapdown.vectors import GRAVITY_F
 

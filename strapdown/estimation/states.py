@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from strapdown import quaternion, wahba
+from strapdown import quaternion
 from strapdown.checks import (
     Array,
     InputError,
@@ -24,6 +24,7 @@ from strapdown.checks import (
 from strapdown.estimation.gating import Gate, Monitor, Robust
 from strapdown.kernels.measurement import heading_row
 from strapdown.records import ImuRecord
+from strapdown.vectors import wahba
 
 LARGEST_NOISE = 1e9
 """Noise of a gyro in SI beyond which it is a mistake."""
@@ -266,7 +267,7 @@ def first_state(
     InputError
         If no measurement gives the attitude: fewer than two directions, or all on one line.
     InconsistentError
-        Of :mod:`strapdown.wahba`: if directions contradict each other.
+        Of :mod:`strapdown.vectors.wahba`: if directions contradict each other.
 
     References
     ----------

@@ -25,9 +25,9 @@ from typing import Any
 import numpy as np
 
 import strapdown
-from strapdown import reading, scenarios, setup
+from strapdown import scenarios, setup
 from strapdown.checks import InputError, count, finite, one_of
-from strapdown.files import locked, set_attributes, whole_hdf5
+from strapdown.files import locked, reading, set_attributes, whole_hdf5
 from strapdown.montecarlo.engine import MACHINES, Chunks, Work, Workers, arithmetic, choose, in_threads, machine_named
 from strapdown.montecarlo.plan import Plan, from_table
 from strapdown.montecarlo.statistics import BINS, Statistics, merge

@@ -25,11 +25,11 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import estimation, flicker, quaternion, setup, vectors
+from strapdown import estimation, quaternion, setup, vectors
 from strapdown.checks import Array, count
 from strapdown.estimation.schedule import Schedule, schedule
 from strapdown.estimation.states import covariance_matrices
-from strapdown.gyro import GyroSpec
+from strapdown.gyro import GyroSpec, flicker
 from strapdown.kernels import gyro_errors, machine, montecarlo_run, montecarlo_statistics
 from strapdown.kernels.machine import compiled
 from strapdown.kernels.noise import minus_two_log

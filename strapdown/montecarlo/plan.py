@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import scenarios, setup, tables
+from strapdown import scenarios, setup
 from strapdown.checks import Array, InputError, array, count, non_negative, one_of
+from strapdown.files import tables
 from strapdown.scenarios import Scenario
 from strapdown.setup import FilterSetup
 

@@ -48,8 +48,8 @@ from numpy.typing import ArrayLike, NDArray
 from strapdown import consistency, estimation
 from strapdown.checks import Array, InputError
 from strapdown.consistency import Verdict
-from strapdown.listing import Listed, Listing, figure
 from strapdown.records import Estimate, ImuRecord
+from strapdown.results import Listed, Listing, figure
 
 Counts = NDArray[np.int64]
 

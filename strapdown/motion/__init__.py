@@ -33,6 +33,7 @@ Shared parts: ``parameters`` checks and stores the parameters; ``exact_phase`` f
 Hz motion is as accurate as its first second; ``quadrature`` integrates a rate that has no closed integral.
 """
 
+from strapdown.motion import orbit as orbit
 from strapdown.motion.composed import Composed
 from strapdown.motion.cones import Coning, SpinCone
 from strapdown.motion.constant_rate import ConstantRate, rest

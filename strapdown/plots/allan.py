@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from strapdown.allan import AllanDeviation, NoiseFit
+from strapdown.allan.parameters import UNITS, name
 from strapdown.checks import Array
-from strapdown.noise_parameters import UNITS, name
 from strapdown.plots.style import (
     AXES,
     BLUE,

@@ -29,6 +29,8 @@ estimates attitude from it.
 
 from __future__ import annotations
 
+# Imported as itself above and not listed here: for the package alone.
+from strapdown.recordings import unit_calibration as unit_calibration
 from strapdown.recordings.body_axes import SENSORS as SENSORS
 from strapdown.recordings.body_axes import axes_matrix as axes_matrix
 from strapdown.recordings.body_axes import with_axes as with_axes
@@ -63,7 +65,6 @@ from strapdown.recordings.trajectories import read_euroc as read_euroc
 from strapdown.recordings.trajectories import read_tum as read_tum
 from strapdown.recordings.trajectories import with_reference
 
-# Imported as itself above and not listed here: for the package alone.
 __all__ = [
     "FORMATS",
     "GyroSamples",

@@ -25,11 +25,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from strapdown import outputs, quaternion, reading, recordfiles, records
+from strapdown import quaternion, records
 from strapdown.checks import Array, InputError, array, one_of
-from strapdown.recordings import delimited, ros, trajectories
+from strapdown.files import reading
+from strapdown.recordings import delimited, recordfiles, ros, trajectories
 from strapdown.recordings.extras import library
-from strapdown.records import Innovations
+from strapdown.records import Innovations, outputs
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
 

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from strapdown import reading, recordfiles
 from strapdown.checks import InputError, positive
-from strapdown.files import whole_hdf5, written_beside
+from strapdown.files import reading, whole_hdf5, written_beside
+from strapdown.recordings import recordfiles
 from strapdown.recordings.recording import MAGNETIC_UNITS, Recording, with_gyro
 
 

@@ -25,10 +25,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from strapdown import reading, recordfiles
 from strapdown.checks import Array, InputError
-from strapdown.files import written_beside
+from strapdown.files import reading, written_beside
 from strapdown.recordings import columns as naming
+from strapdown.recordings import recordfiles
 from strapdown.recordings.recording import CLOCK_OFFSET, Recording
 
 SEPARATORS = ",;\t|"

@@ -1,4 +1,4 @@
-"""Estimates in files: CSV and TSV, Parquet, TUM trajectories, HDF5, Rerun. What the columns are: :func:`strapdown.outputs.table`."""
+"""Estimates in files: CSV and TSV, Parquet, TUM, HDF5, Rerun. What the columns are: :func:`strapdown.records.outputs.table`."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import outputs
 from strapdown.checks import Array
 from strapdown.files import written_beside
 from strapdown.recordings.dataframes import write_parquet_columns
 from strapdown.recordings.delimited import write_columns
 from strapdown.recordings.extras import library
 from strapdown.recordings.recording import Recording
-from strapdown.records import Estimate
+from strapdown.records import Estimate, outputs
 from strapdown.records import write_estimate as write_result
 from strapdown.units import DEGREE
 
@@ -23,14 +22,14 @@ from strapdown.units import DEGREE
 def write_csv(
     estimate: Estimate, path: str | os.PathLike[str], *, recording: Recording | None = None, **options: Any
 ) -> None:
-    """Write an estimate as a table of text; ``sequence`` and ``frame`` as :func:`strapdown.outputs.table` takes them."""
+    """Write an estimate as a table of text; ``sequence`` and ``frame`` as :func:`strapdown.records.outputs.table` takes them."""
     write_columns(path, outputs.table(estimate, recording=recording, **options))
 
 
 def write_parquet(
     estimate: Estimate, path: str | os.PathLike[str], *, recording: Recording | None = None, **options: Any
 ) -> None:
-    """Write an estimate as Parquet; ``sequence`` and ``frame`` as :func:`strapdown.outputs.table` takes them."""
+    """Write an estimate as Parquet; ``sequence`` and ``frame`` as :func:`strapdown.records.outputs.table` takes them."""
     write_parquet_columns(path, outputs.table(estimate, recording=recording, **options))
 
 

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import reading, recordfiles
 from strapdown.checks import InputError
-from strapdown.recordings import ros, telemetry, trajectories
+from strapdown.files import reading
+from strapdown.recordings import recordfiles, ros, telemetry, trajectories
 from strapdown.recordings.body_axes import with_axes
 from strapdown.recordings.recording import Recording, with_gyro
 from strapdown.records import Estimate, ImuRecord
@@ -390,5 +390,5 @@ def is_estimate(path: str | os.PathLike[str]) -> bool:
 
 
 def is_record(path: str | os.PathLike[str]) -> bool:
-    """Return whether a path is a simulated record (:mod:`strapdown.recordfiles`); a folder is none."""
+    """Return whether a path is a simulated record (:mod:`strapdown.recordings.recordfiles`); a folder is none."""
     return not Path(path).is_dir() and recordfiles.is_record(path)

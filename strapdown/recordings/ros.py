@@ -30,8 +30,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from strapdown import quaternion, reading
+from strapdown import quaternion
 from strapdown.checks import Array, InputError, one_of
+from strapdown.files import reading
 from strapdown.recordings.extras import library, with_ending
 from strapdown.recordings.recording import MAGNETIC_UNITS, Recording, at_nearest, relative_time, with_gyro
 from strapdown.records import Estimate

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from strapdown import reading, recordfiles
 from strapdown.checks import Array, InputError, array, one_of, positive
-from strapdown.recordings import formats
+from strapdown.files import reading
+from strapdown.recordings import formats, recordfiles
 from strapdown.recordings.broad import sample_interval
 from strapdown.recordings.columns import SENSORS, UNITS
 from strapdown.recordings.recording import GAP, Recording

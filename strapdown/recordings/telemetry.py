@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import reading
 from strapdown.checks import Array, InputError
+from strapdown.files import reading
 from strapdown.recordings.extras import library, with_ending
 from strapdown.recordings.recording import Recording, with_gyro
 from strapdown.units import DEGREE

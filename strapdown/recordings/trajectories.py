@@ -22,8 +22,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from strapdown import quaternion, reading
+from strapdown import quaternion
 from strapdown.checks import Array, InputError
+from strapdown.files import reading
 from strapdown.recordings.delimited import read_csv
 from strapdown.recordings.recording import Recording
 

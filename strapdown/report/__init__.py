@@ -21,7 +21,7 @@ from typing import Any
 from strapdown import records
 from strapdown.checks import InputError
 from strapdown.files import write_json, written_beside
-from strapdown.reading import existing_file, from_file
+from strapdown.files.reading import existing_file, from_file
 from strapdown.report import campaigns, estimates, tunings
 
 __all__ = [

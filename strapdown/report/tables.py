@@ -344,7 +344,7 @@ def of_tuning(content: Mapping[str, Any]) -> list[Table]:
 
 
 def of_allan(rows: Sequence[Mapping[str, Any]], sensor: str) -> list[Table]:
-    """Return the noise coefficients of a sensor, of the rows of :func:`strapdown.noise_parameters.table`, as ``SENSOR-noise``.
+    """Return the noise coefficients of a sensor, of the rows of :func:`strapdown.allan.parameters.table`, as ``SENSOR-noise``.
 
     The estimate is empty for a term that the record does not show; its upper end bounds what the record could hide.
     """

@@ -8,8 +8,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from strapdown import reading
 from strapdown.checks import InputError
+from strapdown.files import reading
 from strapdown.report import page
 
 BOUNDS = (

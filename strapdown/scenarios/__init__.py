@@ -16,14 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import gyro, motion, reading, tables, vectors
+from strapdown import gyro, motion, vectors
 from strapdown.checks import Array, InputError, array, count, known_keys, one_of, positive
+from strapdown.files import reading, tables
+from strapdown.files.tables import Form
 from strapdown.gyro import GyroSpec
 from strapdown.motion import Motion
-from strapdown.orbit import CircularOrbit
+from strapdown.motion.orbit import CircularOrbit
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Origin, Truth
-from strapdown.tables import Form
 from strapdown.vectors import Sensor
 
 __all__ = [
@@ -483,7 +484,7 @@ def _read_gyro(table: dict[str, Any], place: str) -> tuple[str, GyroSpec]:
     name = table.pop("preset", "")
     if not name:
         return "", gyro.from_table(table, place)
-    from strapdown import datasheets
+    from strapdown.gyro import datasheets
 
     known_keys(place, table, {**tables.keys(gyro.FORM), "preset": None})
     spec = datasheets.PRESETS[one_of(f"{place}: preset", name, datasheets.PRESETS)].spec

@@ -13,16 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import coning, estimation, gyro, quaternion, reading, tables, units, vectors
+from strapdown import coning, estimation, gyro, quaternion, units, vectors
 from strapdown.checks import Array, InputError, known_keys, one_of, positive
-from strapdown.equality import ByValue
 from strapdown.estimation import Observability, filters
 from strapdown.estimation.error_states import ErrorStates
 from strapdown.estimation.filters.own import Own, OwnFilter, as_own
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import ProcessNoise, State
+from strapdown.files import reading, tables
 from strapdown.gyro import GyroSpec
 from strapdown.records import Estimate, ImuRecord, compress
+from strapdown.results import ByValue
 from strapdown.scenarios import Scenario, simulate
 from strapdown.setup import matching
 from strapdown.setup import states as optional

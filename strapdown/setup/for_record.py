@@ -19,7 +19,7 @@ from strapdown.scenarios import Scenario
 from strapdown.setup import FilterSetup
 from strapdown.setup.states import States
 from strapdown.units import DEGREE
-from strapdown.wahba import InconsistentError
+from strapdown.vectors.wahba import InconsistentError
 
 __all__ = ["Start", "drawn_start", "matched_setup", "matched_to_scenario", "start", "unmodelled_errors"]
 

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import flicker
 from strapdown.checks import Array
 from strapdown.estimation.forward import strength
-from strapdown.gyro import GyroSpec
+from strapdown.gyro import GyroSpec, flicker
 from strapdown.records import ImuRecord
 from strapdown.setup.states import Entries, SensorStates, States
 from strapdown.vectors import VectorMeasurements

@@ -8,9 +8,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from strapdown import tables, units
+from strapdown import units
 from strapdown.checks import Array, InputError, array, known_keys, non_negative, one_of, positive
-from strapdown.equality import ByValue
 from strapdown.estimation import forward
 from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import (
@@ -26,7 +25,9 @@ from strapdown.estimation.error_states import (
 )
 from strapdown.estimation.gating import Gate, Monitor, Robust
 from strapdown.estimation.states import ProcessNoise, State
+from strapdown.files import tables
 from strapdown.records import Estimate, ImuRecord
+from strapdown.results import ByValue
 from strapdown.vectors import GRAVITY_F, KINDS
 
 Entries = float | tuple[float, ...] | tuple[tuple[float, ...], ...]

@@ -15,7 +15,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from strapdown.checks import Array, InputError, count, known_keys, positive
-from strapdown.listing import Listed, Listing, figure
+from strapdown.results import Listed, Listing, figure
 from strapdown.setup import FilterSetup
 from strapdown.tuning.innovations import Derivatives
 from strapdown.tuning.parameters import RRW, SCALE, Prior, fixed_unit, with_values

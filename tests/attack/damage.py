@@ -10,8 +10,8 @@ import re
 import h5py
 import numpy as np
 
-from strapdown.files import _user_block
-from strapdown.reading import BLOCK, SEAL
+from strapdown.files.reading import BLOCK, SEAL
+from strapdown.files.writing import _user_block
 
 SECTOR = 512
 

@@ -13,9 +13,10 @@ import damage
 import h5py
 import numpy as np
 
-from strapdown import coning, gyro, montecarlo, quaternion, recordfiles, recordings, records, scenarios, setup
+from strapdown import coning, gyro, montecarlo, quaternion, recordings, records, scenarios, setup
 from strapdown.montecarlo import campaign
 from strapdown.montecarlo import statistics as sums
+from strapdown.recordings import recordfiles
 from strapdown.report import tunings
 
 Damage = Callable[..., bytes]

@@ -16,7 +16,7 @@ from pathlib import Path
 from targets import Target, targets
 
 from strapdown.checks import InputError
-from strapdown.reading import BLOCK, SEAL
+from strapdown.files.reading import BLOCK, SEAL
 
 DEFAULT = 20_000
 CPU_SECONDS = 60.0

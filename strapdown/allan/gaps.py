@@ -21,8 +21,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from strapdown import allan, checks
-from strapdown.allan import NOISE_TYPES, TERMS, AllanDeviation, NoiseFit
+from strapdown import checks
+from strapdown.allan import deviation as allan
+from strapdown.allan.deviation import NOISE_TYPES, TERMS, AllanDeviation, NoiseFit
 from strapdown.checks import Array, InputError
 
 SHORTEST = 64

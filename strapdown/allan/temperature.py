@@ -18,7 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from strapdown import allan, checks
+from strapdown import checks
+from strapdown.allan import deviation as allan
 from strapdown.checks import Array, InputError
 
 __all__ = [

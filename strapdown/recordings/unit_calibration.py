@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import tables
 from strapdown.checks import Array, InputError, array, finite, known_keys, non_negative
-from strapdown.recordings import Recording
+from strapdown.files import tables
+from strapdown.recordings.recording import Recording
 from strapdown.records import ErrorStateEstimate
 
 __all__ = [

@@ -1,15 +1,22 @@
-"""Results as short tables: for ``print`` and for notebooks. Private; results derive from :class:`Listed`."""
+"""What frozen dataclasses of arrays share: equality by value, and printing as a short table. Private.
+
+Specifications (of a gyro, a sensor, a filter) derive from :class:`ByValue`: they are written to files and read back, and two with the same
+numbers are the same. Data and results are compared by identity; for them ``@dataclass(eq=False)`` is enough. Results derive from
+:class:`Listed`.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-__all__ = ["Listed", "Listing", "figure"]
+import numpy as np
 
+__all__ = ["ByValue", "Listed", "Listing", "figure"]
 
 WIDTH = 110
 """Characters of a line of a title."""
@@ -98,3 +105,43 @@ def figure(value: float | None, digits: int = 4) -> str:
     if math.isinf(value):
         return "∞" if value > 0.0 else "-∞"
     return f"{value:.{digits}g}"
+
+
+class ByValue:
+    """Base of a frozen dataclass, declared with ``eq=False``, whose instances are equal if all their fields are.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from dataclasses import dataclass
+    >>> @dataclass(frozen=True, eq=False)
+    ... class Direction(ByValue):
+    ...     axis: np.ndarray
+    >>> Direction(np.array([0.0, 0.0, 1.0])) == Direction(np.array([0.0, 0.0, 1.0]))
+    True
+    """
+
+    def __eq__(self, other: object) -> bool:
+        """Compare all fields, arrays element by element."""
+        if type(self) is not type(other):
+            return NotImplemented
+        return _contents(self) == _contents(other)
+
+    def __hash__(self) -> int:
+        """Return a hash that equal instances share."""
+        return hash((type(self), _contents(self)))
+
+
+def _contents(instance: Any) -> tuple[Any, ...]:
+    return tuple(_plain(getattr(instance, field.name)) for field in dataclasses.fields(instance))
+
+
+def _plain(value: Any) -> Any:
+    """Return a value with its arrays and containers as tuples, and mappings as sets of items, which compare and hash by value."""
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, Mapping):
+        return frozenset((key, _plain(content)) for key, content in value.items())
+    if isinstance(value, (list, tuple)):
+        return tuple(_plain(one) for one in value)
+    return value

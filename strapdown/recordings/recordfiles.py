@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 import strapdown
-from strapdown import gyro, reading
+from strapdown import gyro
 from strapdown.checks import Array, InputError, count, known_keys
-from strapdown.files import set_attributes, written_beside
+from strapdown.files import reading, set_attributes, written_beside
 from strapdown.gyro import GyroSpec
 from strapdown.records import CONVENTIONS, ImuRecord, Origin, Truth, put, result_file
 from strapdown.scenarios import scenario_from_toml
@@ -503,7 +503,7 @@ def _import_series(path: Path) -> VectorMeasurements:
 
 
 def _read_csv(path: Path, *, link: bool = True) -> tuple[str, tuple[str, ...], Array]:
-    """Return the comment, the names of the columns and the rows; ``link`` as of :func:`strapdown.reading.opened`."""
+    """Return the comment, the names of the columns and the rows; ``link`` as of :func:`strapdown.files.reading.opened`."""
     lines = reading.text(path, link=link).splitlines()
     if len(lines) < 2 or not lines[0].startswith(_MARK):
         raise InputError(f"{path} does not begin with '{_MARK}'; it is not a file written by export_csv")

@@ -25,9 +25,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from strapdown import ahrs, coning, quaternion
+from strapdown import coning, quaternion
+from strapdown.ahrs.starting import quiet_span
 from strapdown.checks import Array, InputError
-from strapdown.recordings import Recording, increments
+from strapdown.recordings.recording import Recording, increments
 from strapdown.units import DEGREE, STANDARD_GRAVITY
 
 __all__ = [
@@ -295,7 +296,7 @@ def _resting(recording: Recording) -> tuple[float, float, float | None] | None:
     """Return the share of gravity along the body's z axis, the reading there, m/s², and the field's dip, rad; None without rest."""
     force = recording.specific_force
     try:
-        quiet = ahrs.quiet_span(recording)
+        quiet = quiet_span(recording)
     except InputError:  # too short to say
         return None
     if force is None or not (known := np.isfinite(force[quiet]).all(axis=1)).any():

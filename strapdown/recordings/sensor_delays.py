@@ -12,7 +12,7 @@ import numpy as np
 
 from strapdown import coning, quaternion
 from strapdown.checks import Array, InputError, non_negative
-from strapdown.recordings import Recording, increments
+from strapdown.recordings.recording import Recording, increments
 
 FIELD_SPAN = 0.2
 """Span over which the change of the field, turned back by the gyro, shows the magnetometer's delay, s."""

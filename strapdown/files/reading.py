@@ -313,8 +313,8 @@ def _need_readable(path: Name) -> None:
 def _fault_of_child(path: str, *identity: int) -> str:
     seconds = 2 + identity[1] // 20_000_000
     # Python itself may be frozen into a program, or the child lack h5py: then it ends with a status of its own, and the file is read here.
-    child = "import sys; sys.path[:0] = [sys.argv[1]]; from strapdown import reading; reading.probe(sys.argv[2], int(sys.argv[3]))"
-    command = [sys.executable, "-c", child, str(Path(__file__).parents[1]), path, str(seconds)]
+    child = "import sys; sys.path[:0] = [sys.argv[1]]; from strapdown.files import reading; reading.probe(sys.argv[2], int(sys.argv[3]))"
+    command = [sys.executable, "-c", child, str(Path(__file__).parents[2]), path, str(seconds)]
     try:
         done = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL, timeout=30 * seconds, check=False)
     except subprocess.TimeoutExpired:

@@ -17,10 +17,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 import strapdown
-from strapdown import coning, outputs, quaternion, reading
+from strapdown import coning, quaternion
 from strapdown.checks import Array, InputError, array, count, finite, increasing, instance, one_of, unit_quaternions
-from strapdown.files import set_attributes, whole_hdf5, written_beside
-from strapdown.listing import Listed, Listing, figure
+from strapdown.files import reading, set_attributes, whole_hdf5, written_beside
+from strapdown.records import outputs
+from strapdown.results import Listed, Listing, figure
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 from strapdown.vectors import VectorMeasurements
 
@@ -30,19 +31,6 @@ if TYPE_CHECKING:
     from strapdown.gyro import GyroSpec
     from strapdown.scenarios import Scenario
 
-__all__ = [
-    "ErrorStateEstimate",
-    "Estimate",
-    "Event",
-    "ImuRecord",
-    "Innovations",
-    "Origin",
-    "Truth",
-    "compress",
-    "cut",
-    "read_estimate",
-    "write_estimate",
-]
 
 CONVENTIONS = (
     "quaternions Hamilton, scalar first, body to fixed frame: v_f = q v_b q^-1; error state (dtheta, db): "
@@ -577,7 +565,7 @@ class Estimate(Listed):
         return quaternion.to_rotation(self.attitude)
 
     def euler(self, sequence: str = "ZYX") -> outputs.Angles:
-        """Return Euler angles and their standard deviations, as :func:`strapdown.outputs.euler`.
+        """Return Euler angles and their standard deviations, as :func:`strapdown.records.outputs.euler`.
 
         Parameters
         ----------
@@ -592,7 +580,7 @@ class Estimate(Listed):
         return outputs.euler(self.attitude, sequence, outputs.attitude_covariance(self))
 
     def heading(self, axis: str = "x") -> outputs.Angles:
-        """Return the heading of a body axis, as :func:`strapdown.outputs.heading`.
+        """Return the heading of a body axis, as :func:`strapdown.records.outputs.heading`.
 
         Parameters
         ----------
@@ -607,12 +595,12 @@ class Estimate(Listed):
         return outputs.heading(self.attitude, outputs.attitude_covariance(self), axis=axis)
 
     def to_dataframe(self, **options: Any) -> Any:
-        """Return the estimate as a pandas ``DataFrame``, as :func:`strapdown.outputs.to_dataframe`.
+        """Return the estimate as a pandas ``DataFrame``, as :func:`strapdown.records.outputs.to_dataframe`.
 
         Parameters
         ----------
         **options : dict
-            Options of :func:`strapdown.outputs.table`.
+            Options of :func:`strapdown.records.outputs.table`.
 
         Returns
         -------

@@ -23,7 +23,7 @@ from strapdown.units import DEGREE, DEGREE_PER_HOUR, STANDARD_GRAVITY
 
 if TYPE_CHECKING:
     from strapdown.recordings import Recording
-    from strapdown.records import Estimate
+    from strapdown.records.record import Estimate
 
 __all__ = [
     "Angles",

@@ -39,23 +39,10 @@ from strapdown.checks import (
     positive,
     unit_quaternions,
 )
-from strapdown.equality import ByValue
 from strapdown.motion import Motion
-from strapdown.orbit import CircularOrbit
+from strapdown.motion.orbit import CircularOrbit
+from strapdown.results import ByValue
 from strapdown.units import STANDARD_GRAVITY
-
-__all__ = [
-    "Accelerometer",
-    "AttitudeSensor",
-    "Faults",
-    "HeadingPair",
-    "HorizonSensor",
-    "Magnetometer",
-    "VectorMeasurements",
-    "VectorSensor",
-    "specific_force",
-    "star_directions",
-]
 
 Kind = Literal["direction", "heading", "vector", "attitude"]
 KINDS: dict[str, int] = {"direction": 2, "heading": 1, "vector": 3, "attitude": 3}

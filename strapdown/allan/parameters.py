@@ -25,8 +25,9 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import allan, checks, gyro, units
-from strapdown.allan import NoiseFit
+from strapdown import checks, gyro, units
+from strapdown.allan import deviation as allan
+from strapdown.allan.deviation import NoiseFit
 from strapdown.checks import InputError
 
 __all__ = [

@@ -14,7 +14,7 @@ means ``B²/(2ω*) + ω* B²/(2ω²) ≥ B²/ω`` for every ω, with equality at
 covariance that is nowhere too small. :func:`best_bandwidth` puts ω* where that costs least: at the natural frequency of the filter.
 
 That bound is safe and rather conservative. :func:`matched_process_noise` scales it so that the filter's attitude variance is the
-actual one. The exact model adds the sixteen states of :class:`strapdown.flicker.Shaping` to the filter, driven by one white noise
+actual one. The exact model adds the sixteen states of :class:`strapdown.gyro.flicker.Shaping` to the filter, driven by one white noise
 per axis.
 
 ``sims/flicker_in_filter.py`` compares them on the presets, each at its natural rate with vector measurements once a second. Mean
@@ -49,19 +49,13 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from strapdown import flicker, tables, units
+from strapdown import units
 from strapdown.checks import Array, InputError, array, finite, increasing, non_negative, positive
-from strapdown.equality import ByValue
+from strapdown.files import tables
+from strapdown.gyro import flicker
 from strapdown.kernels import gyro_errors, noise
 from strapdown.kernels.machine import compiled, read_only
-
-__all__ = [
-    "GyroSpec",
-    "matched_process_noise",
-    "process_noise",
-    "read_spec",
-    "simulate",
-]
+from strapdown.results import ByValue
 
 Axes = float | Array
 """One number for all axes, or an array (3,) of one per axis."""

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from strapdown.checks import Array, InputError, known_keys, one_of
-from strapdown.gyro import GyroSpec
+from strapdown.gyro.model import GyroSpec
 
 __all__ = [
     "PRESETS",

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from strapdown.checks import InputError
-from strapdown.reading import BLOCK, SEAL
+from strapdown.files.reading import BLOCK, SEAL
 
 
 @contextlib.contextmanager

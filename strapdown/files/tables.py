@@ -15,8 +15,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from strapdown import reading, units
+from strapdown import units
 from strapdown.checks import Array, InputError, known_keys, numbers
+from strapdown.files import reading
 
 Choice = tuple[tuple[str, float], ...]
 """Suffixes of the key and their factors to SI."""

@@ -49,16 +49,7 @@ from strapdown import checks, units
 from strapdown.checks import Array, InputError
 from strapdown.kernels.allan import accumulate, second_difference_sizes, second_difference_squares
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.listing import Listed, Listing, figure
-
-__all__ = [
-    "AllanDeviation",
-    "NoiseFit",
-    "allan_deviation",
-    "fit_noise",
-    "model_deviation",
-    "to_gyro_parameters",
-]
+from strapdown.results import Listed, Listing, figure
 
 TERMS = ("quantization", "angle_random_walk", "bias_instability", "rate_random_walk", "rate_ramp")
 """The noise terms, in the order of every array over terms; also the names of the gyro specification."""

@@ -1,0 +1,36 @@
+"""The gyro: its errors as a specification, and increments that contain them.
+
+``model``
+    :class:`GyroSpec`, :func:`simulate`, and the process noise of a filter matched to a specification.
+``flicker``
+    Flicker noise (bias instability) as a sum of Gauss-Markov processes.
+``datasheets``
+    Specifications in the units of datasheets.
+"""
+
+from __future__ import annotations
+
+from strapdown.gyro import datasheets as datasheets
+from strapdown.gyro.model import FORM as FORM
+from strapdown.gyro.model import Axes as Axes
+from strapdown.gyro.model import GyroSpec as GyroSpec
+from strapdown.gyro.model import best_bandwidth as best_bandwidth
+from strapdown.gyro.model import bridge_dropped as bridge_dropped
+from strapdown.gyro.model import dropped as dropped
+from strapdown.gyro.model import flicker_share as flicker_share
+from strapdown.gyro.model import from_table as from_table
+from strapdown.gyro.model import low_pass_step as low_pass_step
+from strapdown.gyro.model import matched_process_noise as matched_process_noise
+from strapdown.gyro.model import process_noise as process_noise
+from strapdown.gyro.model import read_spec as read_spec
+from strapdown.gyro.model import sampling as sampling
+from strapdown.gyro.model import simulate as simulate
+from strapdown.gyro.model import to_table as to_table
+
+__all__ = [
+    "GyroSpec",
+    "matched_process_noise",
+    "process_noise",
+    "read_spec",
+    "simulate",
+]
