@@ -124,7 +124,7 @@ def estimate(
     delays = sensor_delays.find(used, latency, field_delay, causal=not smooth)
     prepared = prepare(used, quiet, parameters, delays.field, causal=not smooth)
     filtered = _run(prepared, parameters, faults.turn_variance, gate, robust, smooth)
-    found = _at_stamps(filtered, used, prepared, parameters, delays, smooth, full_covariance)
+    found = _at_stamps(filtered, used, prepared, parameters, delays, faults.turn_variance, smooth, full_covariance)
     scale = found.error_states.get("gyro scale")
     return AhrsEstimate(
         recording=used,
@@ -157,7 +157,7 @@ def _run(
     record, own = prepared.record, parameters.setup
     kinds = {series.sensor: series.kind for series in record.vectors}
     blocks = () if own.states is None else own.states.blocks(kinds)
-    extra = np.add.reduceat(turn_variance, prepared.edge[:-1].astype(np.intp))
+    extra = _over_steps(turn_variance, prepared.edge)
     change = np.flatnonzero(np.diff(extra > 0.0)) + 1
     bounds = [0, *change.tolist(), len(extra)]
     state = prepared.initial
@@ -175,6 +175,11 @@ def _run(
         state = end
         parts.append(found)
     return _joined(parts)
+
+
+def _over_steps(variance: Array, edge: np.ndarray) -> Array:
+    """Return the sum over each step (k,) of a variance of each sample interval (n − 1,)."""
+    return np.asarray(np.add.reduceat(variance, edge[:-1].astype(np.intp)))
 
 
 def _joined(parts: list[Estimate]) -> Estimate:
@@ -221,6 +226,7 @@ def _at_stamps(
     prepared: Prepared,
     parameters: AhrsParameters,
     delays: Delays,
+    turn_variance: Array,
     smooth: bool,
     full_covariance: bool,
 ) -> Estimate:
@@ -236,7 +242,7 @@ def _at_stamps(
     R = quaternion.to_matrix(filtered.attitude)
     fixed = R @ filtered.covariance[:, :3, :3] @ R.transpose(0, 2, 1)
     scale = np.ones((len(fixed), 3))
-    scale[:, :2] = _tilt_scale(filtered, fixed[:, 0, 0] + fixed[:, 1, 1], smooth)[:, None]
+    scale[:, :2] = _tilt_scale(filtered, _over_steps(turn_variance, edge) > 0.0)[:, None]
     fixed *= scale[:, :, None] * scale[:, None, :]
     iron = 0.0 if prepared.dip is None else (parameters.iron_sigma / np.cos(prepared.dip)) ** 2
     attitude, own = np.empty((len(row), 4)), np.empty((len(row), 3, 3))
@@ -274,21 +280,17 @@ def _at_stamps(
     )
 
 
-def _tilt_scale(filtered: Estimate, variance: Array, smooth: bool) -> Array:
-    """Return the factor (k,) of the tilt's σ at the steps, of which ``variance`` (k,) is that modelled, by the acceleration's level.
+def _tilt_scale(filtered: Estimate, uncertain: np.ndarray) -> Array:
+    """Return the factor (k + 1,) of the tilt's modelled σ at the edges of the steps, by the level of the acceleration so far.
 
-    One model holds for slow and fast motion, so most motion is slower. What exceeds the least variance so far, after a gap or a clipped
-    gyro, is none of the acceleration's and stays.
+    One model holds for slow and fast motion, so most motion is slower than modelled. Without a measurement, and at first and in steps
+    whose turn is ``uncertain`` (k,), the level is taken for that modelled.
     """
     seen = filtered.innovations["accelerometer"]
-    known = np.isfinite(seen.nis)
-    time, nis = seen.time[known], seen.nis[known, None] / seen.innovation.shape[1]
-    if len(time) < 2:
-        return np.ones(len(variance))
-    step = float(np.median(np.diff(time))) / LEVEL_TIME
-    level, usual = low_pass(nis, step), np.minimum.accumulate(variance)
-    if smooth:
-        level, usual = 0.5 * (level + low_pass(nis[::-1], step)[::-1]), np.minimum(usual, variance.min())
-    level = level[np.maximum(np.searchsorted(time, filtered.time, side="right") - 1, 0), 0]
-    share = OWN_SHARE + ACCELERATION_SHARE * np.sqrt(level)
-    return np.asarray(np.sqrt(1.0 - (1.0 - share) * usual / variance))
+    nis = np.ones((len(filtered.time), 1))
+    nis[np.searchsorted(filtered.time, seen.time), 0] = np.where(np.isfinite(seen.nis), seen.nis / 3.0, 1.0)
+    step = float(np.median(np.diff(filtered.time))) / LEVEL_TIME
+    begin = np.append(0, np.flatnonzero(uncertain) + 1)
+    nis[begin] = 1.0
+    level = np.concatenate([low_pass(part, step) for part in np.split(nis, begin[1:])])[:, 0]
+    return np.asarray(np.sqrt(OWN_SHARE + ACCELERATION_SHARE * np.sqrt(level)))

@@ -2,8 +2,7 @@
 
 Turned back by the gyro, the field of the surroundings changes little over a second, while iron that is fixed in the unit turns with it.
 With R the attitude by the gyro and b the iron, the field there changes by ``(R − R') b`` from one time to another, which is linear in b. A
-field that varies along the path of a moved unit feigns some iron too, so that only what is well beyond that is taken for iron. The longer
-a unit is turned and moved, the less that leaves in the mean, so all changes so far count alike.
+field that varies along the path of a moved unit feigns some iron too, so that only what is well beyond that is taken for iron.
 """
 
 from __future__ import annotations
@@ -17,12 +16,16 @@ from strapdown.kernels.machine import compiled
 
 SPAN = 1.0
 """Span over which the change of the field is looked at, s."""
+MEMORY = 60.0
+"""Time constant with which earlier changes are forgotten, s."""
 CHANGE_NOISE = 8e-3
 """Change of the field over that span without iron, each component, share of its strength/√Hz."""
 SIGMA = 0.04
 """Iron that is expected, each component, share of the field's strength."""
 NEGLIGIBLE = 1e-3
 """Iron below this is none, share of the field's strength."""
+RISE = 3.0
+"""Time constant with which iron found so far is taken for iron, s: what lasts shorter is a disturbance of the surroundings."""
 FEIGNED = 0.028
 """Iron that the field along a path feigns, share of its strength: as much is taken off the square of what is found."""
 
@@ -57,17 +60,25 @@ def find(field: Array, frame: Array, time: Array, known: np.ndarray, strength: f
     right = quaternion.rotate(now, change) - quaternion.rotate(then, change)
     # Over a gap the gyro does not show the turn.
     pair = known[lag:] & known[:-lag] & (np.abs(time[lag:] - time[:-lag] - SPAN) < 2.0 * interval)
-    own = np.column_stack([normal, right]) * (interval * pair[:, None])
-    sums = np.zeros((len(time), own.shape[1]))
-    sums[lag:] = np.cumsum(own, axis=0)
+    own = np.column_stack([normal, right]) * pair[:, None]
+    before = np.zeros((lag, own.shape[1]))
+    sums = _integral(np.concatenate([before, own]), interval)
     if not causal:
-        sums[:] = sums[-1]
+        sums = sums + _integral(np.concatenate([before, own[::-1]]), interval)[::-1]
     matrix = sums[:, [0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(-1, 3, 3)
     iron = np.linalg.solve(matrix + (CHANGE_NOISE / SIGMA) ** 2 * np.eye(3), sums[:, 6:, None])[..., 0]
     size = np.sum(iron**2, axis=1)
     iron *= strength * np.maximum(1.0 - FEIGNED**2 / np.maximum(size, 1e-30), 0.0)[:, None]
-    iron[np.linalg.norm(iron, axis=1) < NEGLIGIBLE * strength] = 0.0
+    if causal:
+        iron = low_pass(iron, interval / RISE)
+        iron[np.linalg.norm(iron, axis=1) < NEGLIGIBLE * strength] = 0.0
     return np.asarray(iron)
+
+
+def _integral(rows: Array, interval: float) -> Array:
+    """Return the integral over time, s, of rows (k, m) up to each, forgotten with :data:`MEMORY`."""
+    share = interval / MEMORY
+    return np.asarray(low_pass(rows, share) * (interval / -np.expm1(-share)))
 
 
 def low_pass(rows: np.ndarray, step: float) -> Array:
