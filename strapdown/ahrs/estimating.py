@@ -255,7 +255,10 @@ def _at_stamps(
     if full_covariance:
         P = filtered.covariance[row]
         P[:, :3, :3] = own
-        P[:, :3, 3:] = quaternion.to_matrix(attitude).transpose(0, 2, 1) @ (scale[:, :, None] * (R @ filtered.covariance[:, :3, 3:]))[row]
+        P[:, :3, 3:] = (
+            quaternion.to_matrix(attitude).transpose(0, 2, 1)
+            @ (scale[:, :, None] * (R @ filtered.covariance[:, :3, 3:]))[row]
+        )
         P[:, 3:, :3] = P[:, :3, 3:].transpose(0, 2, 1)
     sensors = {"accelerometer": used.specific_force, "magnetometer": used.magnetic_field}
     return Estimate(
