@@ -6,6 +6,7 @@ what it has.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
@@ -254,11 +255,11 @@ class GyroScale(ErrorStates):
     def _sigmas(self) -> Array:
         return _matrix(self.name, self.scale_sigma, self.misalignment_sigma, ("scale_sigma", "misalignment_sigma"))
 
-    @property
+    @functools.cached_property
     def _entries(self) -> np.ndarray:
         return np.flatnonzero(self._sigmas().ravel())
 
-    @property
+    @functools.cached_property
     def components(self) -> tuple[str, ...]:  # type: ignore[override]
         """M by rows: x, y, z are the scale factors; xy is how much of the rate about y shows on axis x."""
         return tuple(ENTRIES[k] for k in self._entries)
