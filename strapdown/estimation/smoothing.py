@@ -56,6 +56,7 @@ def smooth(
     *,
     lag: float = np.inf,
     full_covariance: bool = False,
+    error_state_covariance: bool = True,
     gate: Gate | None = None,
     robust: Robust | None = None,
 ) -> Estimate:
@@ -78,6 +79,8 @@ def smooth(
         s; 0 is the filter. Default: the whole record.
     full_covariance : bool
         Keep whole covariance matrices too.
+    error_state_covariance : bool
+        Those of all states; otherwise of attitude and bias alone, in less time.
     gate, robust : optional
         As for :func:`strapdown.estimation.run`: what the filter refused or weighed down, the smoother does not use either.
 
@@ -97,7 +100,13 @@ def smooth(
     check_arguments(record=record, gate=gate, robust=robust)
     lag = lag if lag == np.inf else non_negative("lag", lag, unit="s")
     problem = forward.prepared(record, process_noise, initial, error_states)
-    options = Options(every=len(record.time), full_covariance=full_covariance, gate=gate, robust=robust)
+    options = Options(
+        every=len(record.time),
+        full_covariance=full_covariance,
+        error_state_covariance=error_state_covariance,
+        gate=gate,
+        robust=robust,
+    )
     if not problem.model.states:
         with contextlib.suppress(LostDigitsError):
             estimate = _Smoother(problem, options, _BlockForm(problem)).smoothed(lag)
@@ -179,7 +188,7 @@ class _Smoother:
         recovered = recovery_segments.recoveries(estimate.events)
         breaks, reruns = self._reruns(recovered, event_time, segments) if recovered else ([], [])
         edges = len(record.time)
-        outputs = self.form.outputs(edges, self.options.full_covariance)
+        outputs = self.form.outputs(edges, self.options)
         until = recovery_segments.last_seen(record.time, lag)
         if len(segments) == edges and not breaks:  # each interval in one segment
             first = np.arange(edges)
@@ -196,7 +205,7 @@ class _Smoother:
                     if len(out):
                         out[one.row] = there[one.edge]
         return replace(
-            self.form.estimate(outputs, self.options.full_covariance),
+            self.form.estimate(outputs, self.options),
             innovations=estimate.innovations,
             skipped=estimate.skipped,
             events=estimate.events,
@@ -262,12 +271,12 @@ class _BlockForm:
 
     problem: Problem
 
-    def outputs(self, edges: int, full_covariance: bool) -> list[Array]:
+    def outputs(self, edges: int, options: Options) -> list[Array]:
         """Return room for the smoothed states."""
-        shapes = (edges, 4), (edges, 3), (edges, 6), (edges if full_covariance else 0, 21)
+        shapes = (edges, 4), (edges, 3), (edges, 6), (edges if options.full_covariance else 0, 21)
         return side_by_side(*((shape, float) for shape in shapes))
 
-    def estimate(self, outputs: Sequence[Array], full_covariance: bool) -> Estimate:
+    def estimate(self, outputs: Sequence[Array], options: Options) -> Estimate:
         """Return the smoothed states as an estimate."""
         attitude, bias, variance, blocks = outputs
         return Estimate(
@@ -275,7 +284,7 @@ class _BlockForm:
             attitude=attitude,
             bias=bias,
             variance=variance,
-            covariance=covariance_matrices(blocks) if full_covariance else None,
+            covariance=covariance_matrices(blocks) if options.full_covariance else None,
         )
 
     def go_back(self, one: Trajectory, part: slice, outputs: Sequence[Array]) -> None:
@@ -310,16 +319,18 @@ class _FactorForm:
 
     problem: Problem
 
-    def outputs(self, edges: int, full_covariance: bool) -> list[Array]:
+    def outputs(self, edges: int, options: Options) -> list[Array]:
         """Return room for the smoothed states."""
         size = 6 + self.problem.model.states
-        shapes = (edges, 4), (edges, size - 3), (edges, size), (edges if full_covariance else 0, size, size)
+        kept = size if options.error_state_covariance else 6
+        whole = (edges if options.full_covariance else 0, kept, kept)
+        shapes = (edges, 4), (edges, size - 3), (edges, size), whole
         return [np.empty(shape) for shape in shapes]
 
-    def estimate(self, outputs: Sequence[Array], full_covariance: bool) -> Estimate:
+    def estimate(self, outputs: Sequence[Array], options: Options) -> Estimate:
         """Return the smoothed states as an estimate."""
         attitude, x, variance, P = outputs
-        return forward.factor_estimate(self.problem, 1, attitude, x, variance, P if full_covariance else None)
+        return forward.factor_estimate(self.problem, 1, attitude, x, variance, P if options.full_covariance else None)
 
     def go_back(self, one: Trajectory, part: slice, outputs: Sequence[Array]) -> None:
         """Write the estimates of a part of a trajectory's edges, each from the last edge that it sees."""
