@@ -30,13 +30,6 @@ def turning(record: ImuRecord, time: Array) -> tuple[Array, Array]:
     within the window. That is seen from how the slope differs from that over half the window, which a motion bends sixteen times less or
     better, less what noise alone would make; the order and window of the least sum are taken. σ is that of the rates' fifth differences,
     in which a smooth motion is nothing: ``σ² = E(Δ⁵)²/252``.
-
-    Parameters
-    ----------
-    record : ImuRecord
-        Its gyro intervals must be alike.
-    time : (m,)
-        s, inside the record.
     """
     from scipy.signal import savgol_coeffs, savgol_filter
 

@@ -27,7 +27,7 @@ STAMP_TOLERANCE = 1e-6
 """Of the mean gyro interval: an edge that lies beyond t + lag by no more is taken for one at t + lag."""
 
 
-MOST_CUT = 64
+MAX_CUT = 64
 """Times the segments that a record takes by its increments: a filter that takes more is lost."""
 
 
@@ -41,7 +41,7 @@ def filtered_whole(problem: Problem, options: Options) -> tuple[Estimate, Array]
             return passed.estimate, passed.segments
         # Steps are cut by the turn without the bias, which is known only when they are taken.
         most *= 4
-        if most > MOST_CUT * usual:
+        if most > MAX_CUT * usual:
             raise InputError(
                 "the filter lost its way: by the bias that it found the body turns many times round in each gyro interval; "
                 "look at the record and the start with estimation.run first"

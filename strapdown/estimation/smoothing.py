@@ -19,13 +19,14 @@ Nothing is learnt across: not even the bias, which the candidate starts from as 
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from strapdown import kinematics, quaternion
-from strapdown.checks import Array, count, non_negative
+from strapdown.checks import Array, InputError, count, non_negative
 from strapdown.estimation import forward, recovery_segments
 from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import ErrorStates
@@ -41,7 +42,9 @@ from strapdown.records import Estimate, Event, ImuRecord
 
 PASSES = 16
 """Backward passes of a fixed-lag smoother that go together and share what depends on the filter alone."""
-MOST_GROUPS = 3600
+MIN_SMOOTHED = {"blocks": 1e-9, "factor": 1e-25}
+"""Smallest smoothed variance, as a part of what one interval adds, at which backward passes in either form keep enough digits."""
+MAX_GROUPS = 3600
 """Groups of segments of which the fixed-lag smoother keeps the gains, 5.7 kB each; where a lag takes more, it computes them anew."""
 
 
@@ -105,11 +108,33 @@ def smooth(
         robust=robust,
     )
     if not problem.model.states:
-        try:
-            return _Smoother(problem, options, _BlockForm(problem)).smoothed(lag)
-        except LostDigitsError:
-            options = replace(options, factor=True)
-    return _Smoother(problem, options, _FactorForm(problem)).smoothed(lag)
+        with contextlib.suppress(LostDigitsError):
+            estimate = _Smoother(problem, options, _BlockForm(problem)).smoothed(lag)
+            if _digits_lost(problem, estimate, MIN_SMOOTHED["blocks"]) is None:
+                return estimate
+        options = replace(options, factor=True)
+    estimate = _Smoother(problem, options, _FactorForm(problem)).smoothed(lag)
+    lost = _digits_lost(problem, estimate, MIN_SMOOTHED["factor"])
+    if lost is not None:
+        raise InputError(
+            f"the smoothed variances at {record.time[lost]:g} s have no digits left: the sigmas of the start and the process noise of an "
+            "interval lie too many orders of magnitude apart; raise the smallest of them"
+        )
+    return estimate
+
+
+def _digits_lost(problem: Problem, estimate: Estimate, share: float) -> int | None:
+    """Return the first edge whose smoothed variances have lost their digits, None if there is none.
+
+    A step back subtracts what the interval had added: the process noise, and at the start the uncertainty of the bias.
+    """
+    angle, rate = problem.variances
+    dt = np.diff(problem.record.time, append=problem.record.time[-1])
+    added = np.stack([angle * dt + rate * dt**3 / 3.0, rate * dt])
+    added[0, 0] += dt[0] ** 2 * np.diag(problem.initial.covariance)[3:6].max()
+    least = np.minimum.reduceat(estimate.variance[:, :6], [0, 3], axis=1).T
+    kept = np.isfinite(estimate.attitude).all(axis=1) & ((least > share * added) & (least > 0.0)).all(axis=0)
+    return None if kept.all() else int(np.argmin(kept))
 
 
 def relinearized_start(
@@ -276,7 +301,7 @@ class _BlockForm:
             # Eight passes at a time, which share nearly all groups with the next eight.
             ahead = np.minimum(np.arange(lagged) + WIDTH - 1, lagged - 1)
             groups = int(np.max(starts[seen[ahead]] - starts[first])) // WIDTH + 2
-            work = np.empty(smoother_lag.lag_work_size(min(groups, MOST_GROUPS)))
+            work = np.empty(smoother_lag.lag_work_size(min(groups, MAX_GROUPS)))
             compiled(smoother_lag.smooth_lagged)(rows, starts, first, seen, *self.problem.variances, work, *outputs)
         compiled(smoother_loop.smooth_back)(
             rows,

@@ -82,7 +82,7 @@ class GateMemory:
     candidate: Candidate | None = None
     counts: Array
     """Whether there is a candidate, how it does, and how wide the next one starts, as :mod:`strapdown.kernels.gate_rules` holds them."""
-    standing: Mapping[str, Array]
+    counters: Mapping[str, Array]
     """Refusals of each sensor, as held there."""
     start: float = 0.0
     """Time that the first part of the record began, s."""

@@ -79,8 +79,10 @@ def choose(plan: Plan, machine: str = "auto") -> Choice:
         if reason is None:
             return Choice(machine=name, reason=reasons.get("lanes", ""))
         reasons[name] = reason
-    told = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
-    raise InputError(f"no machine computes this plan ({told}); take a plainer filter or scenario, or precision float64")
+    refusals = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
+    raise InputError(
+        f"no machine computes this plan ({refusals}); take a plainer filter or scenario, or precision float64"
+    )
 
 
 def arithmetic() -> str:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from strapdown.checks import Array
@@ -23,6 +24,7 @@ from strapdown.plots.style import (
     ink,
     layered,
     legend_above,
+    new_figure,
     rate_unit,
 )
 
@@ -105,6 +107,25 @@ STATES = tuple(f"{what} {axis}" for what in ("attitude", "bias") for axis in AXE
 """Names of the six states of the error (δθ, δb)."""
 
 
+def runs_overview(statistics: Statistics, probability: float = 0.99) -> Figure:
+    """Draw ANEES of attitude and bias, and the NIS, over time, with the bounds of a consistent filter."""
+    figure, axes = new_figure(1, 3, size=(12.0, 4.2))
+    axes[1].set_visible(statistics.has_bias)
+    bounds = mean_bounds(3, statistics.runs, probability)
+    label = f"{100 * probability:g} % bounds, each epoch"
+    low, high = np.nanmin(statistics.anees), np.nanmax(statistics.anees)
+    for ax, subset in zip(axes, ("attitude", "bias") if statistics.has_bias else ("attitude",), strict=False):
+        nees_over_time([("all runs", statistics)], bounds, subset, ax, label=label)
+        ax.set_ylim(min(0.5, 0.8 * float(low)), max(2.0, 1.3 * float(high)))
+        legend_above(ax)
+    if statistics.sensor_degrees.sum() > 0:
+        nis_over_time([("all runs", statistics)], axes[2], probability=probability)
+        legend_above(axes[2])
+    else:
+        axes[2].set_visible(False)
+    return figure
+
+
 def state_unit(state: int, value: Array) -> tuple[str, float]:
     """Return the unit that an error of this size of a state (0 to 5) is read in."""
     return angle_unit(value) if state < 3 else rate_unit(value)
@@ -178,20 +199,9 @@ def coverage_by_state(statistics: Statistics, epoch: int = -1, ax: Axes | None =
 def covariance_ellipses(
     claimed: Array, found: Array, pair: tuple[int, int] = (0, 1), ax: Axes | None = None, *, probability: float = 0.95
 ) -> Axes:
-    """Draw the ellipse of two states that holds ``probability`` of the errors by the filter's covariance, and that of the actual errors.
+    """Draw the ellipses that hold ``probability`` of the errors of two states by the filter's covariance, and of the actual errors.
 
-    Parameters
-    ----------
-    claimed : (6, 6)
-        The filter's mean covariance P at one epoch, rad and rad/s.
-    found : (6, 6)
-        Mean e eᵀ over the runs at that epoch.
-    pair : (int, int)
-        The two states, 0 to 5.
-    ax : Axes, optional
-        A new figure's if not given.
-    probability : float
-        Of a normal error of either covariance to lie inside its ellipse.
+    ``claimed`` is the filter's mean covariance P at one epoch, ``found`` the mean e eᵀ over the runs there (6, 6), rad and rad/s.
     """
     from scipy.stats import chi2
 

@@ -51,7 +51,7 @@ class Delays:
             f"Samples are assumed to be stamped {late:.3g} ms late."
             if self.given
             else f"Samples are assumed to be stamped {late:.3g} ms late, half a sample interval, σ {1e3 * self.sigma:.2g} ms; "
-            "give --latency if it is known (0: point samples)."
+            "give --latency (latency= in Python) if it is known (0: point samples)."
         ]
         if field:
             side = "after" if field > 0.0 else "before"
@@ -76,21 +76,10 @@ def find(
 ) -> Delays:
     """Return the delays of a recording's sensors.
 
-    Parameters
-    ----------
-    recording : Recording
-    latency : float, optional
-        Delay of gyro and accelerometer where it is known, s. By default half a sample interval, as of samples that are means over the
-        interval before their stamp; or as much as the magnetometer is ahead of the gyro, for no sensor shows what is to come.
-    field : float, optional
-        Delay of the magnetometer behind the gyro where it is known, s. By default it is found from the recording.
-    causal : bool
-        Each sample's delay from the samples before it: found anew whenever the recording has become twice as long.
-
-    Raises
-    ------
-    InputError
-        If ``latency`` is negative, or longer than the recording.
+    ``latency`` is the delay of gyro and accelerometer where it is known, s; by default half a sample interval, as of samples that are means
+    over the interval before their stamp, or as much as the magnetometer is ahead of the gyro, for no sensor shows what is to come.
+    ``field`` is the delay of the magnetometer behind the gyro where it is known, s. ``causal``: each sample's delay from the samples before
+    it, found anew whenever the recording has become twice as long.
     """
     length = recording.time[-1] - recording.time[0]
     if latency is not None and non_negative("latency", latency, unit="s") >= length:

@@ -135,13 +135,7 @@ _FIGURES = {
 
 
 def read(path: Path) -> dict[str, Any]:
-    """Read the JSON of a tuning.
-
-    Raises
-    ------
-    InputError
-        If it is missing, no JSON, or not written by `strapdown tune`.
-    """
+    """Read the JSON of a tuning."""
     content = reading.json_file(path)
     try:
         _Tuning.model_validate_json(reading.text(path))

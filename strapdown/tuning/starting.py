@@ -18,7 +18,7 @@ from strapdown.tuning.innovations import Case
 
 
 def recording_setup(parameters: AhrsParameters | None = None) -> FilterSetup:
-    """Return the setup of the filter that :func:`strapdown.ahrs.estimate` runs, of ``ahrs.MOTIONS["any"]`` if not told."""
+    """Return the setup of the filter that :func:`strapdown.ahrs.estimate` runs, of ``ahrs.MOTIONS["any"]`` by default."""
     return (parameters or ahrs.MOTIONS["any"]).setup
 
 

@@ -60,13 +60,8 @@ def run(
 ) -> Estimate:
     """Run the filter over a whole record, in NumPy: some tenths of a millisecond a step.
 
-    Parameters
-    ----------
-    record, process_noise, initial, every, full_covariance
-        As :func:`strapdown.estimation.filters.run`.
-    points : object, optional
-        ``filterpy.kalman.JulierSigmaPoints`` or ``MerweScaledSigmaPoints`` of 6 states. Default: Julier's with κ = 1, the paper's λ, all
-        weights positive.
+    ``points`` are filterpy's sigma points of 6 states; default: Julier's with κ = 1, the paper's λ, all weights positive. Other options as
+    :func:`strapdown.estimation.filters.run`.
     """
     from filterpy.kalman import JulierSigmaPoints  # with SciPy's statistics, half a second that few uses need
 
