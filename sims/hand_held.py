@@ -64,7 +64,7 @@ CANDIDATES = {
 }
 """Sets of numbers that leave-one-out chooses from."""
 IRON = {
-    "as released": {},
+    "as released": {"FEIGNED": hard_iron.FEIGNED},
     "none": {"FEIGNED": 1e9},
     "feigned 2 %": {"FEIGNED": 0.02},
     "feigned 4 %": {"FEIGNED": 0.04},
