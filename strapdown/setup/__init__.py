@@ -49,7 +49,7 @@ ATTITUDE_SIGMA = 1.0 * units.DEGREE
 LINEAR_SHARE = 0.2
 """The second-order error of a first measurement, half the square of the initial error, may be about this share of half its σ."""
 COMMUTATION_SHARE = 0.1
-"""Part of the σ that white noise leaves of a constant rate over the record; a drift of one-sample integration above it calls for a better algorithm."""
+"""Part of the σ of a constant rate, by white noise over the record; a one-sample drift above it calls for a better algorithm."""
 ACCURATE_ALGORITHM = "matched-1-8-8"
 """The integration algorithm chosen then: one step a sample."""
 MIN_SAMPLES = 32
