@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
+from matplotlib.ticker import LogFormatter
 
 from strapdown.checks import Array
 from strapdown.consistency import mean_bounds
@@ -64,8 +65,10 @@ def nees_over_time(
     for k, (name, statistics) in enumerate(named):
         ax.plot(statistics.time, statistics.anees[:, column], label=name, **layered(k, len(named)))
     ax.set_yscale("log")
+    ax.yaxis.set_major_formatter(LogFormatter())  # 2 instead of 2 × 10⁰
+    ax.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2.0, 0.5)))
     ax.set_xlabel("time, s")
-    ax.set_ylabel(f"NEES of the {subset}, per state (log scale)")
+    ax.set_ylabel(f"NEES of the {subset},\nper state (log scale)")
     return ax
 
 
