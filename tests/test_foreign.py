@@ -38,7 +38,7 @@ FLIGHT = scenarios.Scenario(
         vectors.VectorSensor(name="coarse", reference_f=np.array([0.8, 0.0, -0.6]), sigma=2.0 * DEGREE, rate=1.0),
     ),
     rate=10.0,
-    duration=300.0,
+    duration=150.0,
 )
 
 

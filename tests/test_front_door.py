@@ -27,6 +27,7 @@ NAMES = {
     "Gate",
     "GyroSpec",
     "InputError",
+    "LiveFilter",
     "ProcessNoise",
     "Robust",
     "Scenario",

@@ -12,13 +12,14 @@ import sys
 import time
 import weakref
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hdf5 import changed
 
-from strapdown import cli, consistency, montecarlo, records, scenarios
+from strapdown import consistency, montecarlo, records, scenarios
 from strapdown import setup as setups
 from strapdown.checks import InputError
 from strapdown.files import reading
@@ -210,7 +211,7 @@ def test_killed_at_random_moments_a_campaign_goes_on_to_the_same_bits(tmp_path):
         total = part if total is None else statistics.merge(total, part)
         folds[total.runs] = total
     random = np.random.default_rng(8)
-    for _ in range(60):
+    for _ in range(24):
         if not _killed(path, runs, after=random.uniform(0.02, 0.15)):
             break
         kills += 1
@@ -328,22 +329,10 @@ def test_a_plan_without_a_form_in_a_file_is_refused_before_anything_is_computed(
 
 
 @pytest.fixture
-def command(monkeypatch, capsys, tmp_path):
-    """Run ``strapdown montecarlo ARGUMENTS`` in an empty folder; return exit status, standard output and standard error."""
-    monkeypatch.chdir(tmp_path)
+def command(run, tmp_path):
+    """``strapdown montecarlo ARGUMENTS`` in an empty folder: exit status, standard output and standard error."""
     Path("short.toml").write_text(scenarios.scenario_to_toml(replace(SCENARIO, name="short")), encoding="utf-8")
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["strapdown", "montecarlo", *map(str, arguments)])
-        try:
-            cli.main()
-            status = 0
-        except SystemExit as end:
-            status = end.code or 0
-        said = capsys.readouterr()
-        return status, said.out, said.err
-
-    return run
+    return partial(run, "montecarlo")
 
 
 SCALAR = ("--machine", "scalar")

@@ -412,9 +412,10 @@ def _means(recording: Recording, attitude: Array, vectors: Array, strength: floa
     if len(chosen) == 0:
         return _Means(product=np.empty((0, 3, 3, 3)))
     used = seen & np.isin(window, chosen)
-    products = np.einsum("kab,kc->kabc", quaternion.to_matrix(q[used]), v[used])
-    sums = np.add.reduceat(products, np.flatnonzero(np.diff(window[used], prepend=-1)), axis=0)
-    return _Means(product=sums / counts[chosen, None, None, None])
+    begin = np.flatnonzero(np.diff(window[used], prepend=-1))[1:]
+    turned, taken = quaternion.to_matrix(q[used]).reshape(-1, 9), v[used]
+    sums = [R.T @ w for R, w in zip(np.split(turned, begin), np.split(taken, begin), strict=True)]
+    return _Means(product=np.reshape(sums, (-1, 3, 3, 3)) / counts[chosen, None, None, None])
 
 
 def _strength(vectors: Array) -> float:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import contextlib
 import signal
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from strapdown.cli.filters import default_words, filter_of_scenario
+from strapdown.cli.filters import default_words, filter_of_scenario, own_filter
 from strapdown.cli.terminal import (
     Tables,
     app,
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from types import FrameType
 
     from strapdown.consistency import Judgement
+    from strapdown.estimation.filters.own import Own
     from strapdown.montecarlo import Plan
     from strapdown.montecarlo.campaign import Campaign
 
@@ -50,7 +52,8 @@ def montecarlo(
         Path | None,
         typer.Option(
             "--filter",
-            help="TOML with a table named filter, as `strapdown tune` writes it; without it the filter that matches the scenario.",
+            help="TOML with a table named filter, as `strapdown tune` writes it; or FILE.py:NAME, a filter of your own in a Python file, "
+            "which is executed. Default: the filter that matches the scenario.",
         ),
     ] = None,
     gyro: Annotated[
@@ -117,6 +120,8 @@ def montecarlo(
         plan = _plan(scenario, filter_file, gyro, dispersions, seed, float32, states)
         target = out or Path(f"{source.stem}-montecarlo.h5")
     else:
+        if filter_file is not None and (own := own_filter(filter_file)) is not None:
+            held, filter_file = _with_filter(held, own, source), None
         given = {
             "--filter": filter_file,
             "--gyro": gyro,
@@ -245,6 +250,7 @@ def _plan(
     from strapdown import workflows
     from strapdown.checks import InputError
     from strapdown.gyro import read_spec
+    from strapdown.setup import matched
 
     if states is not None and filter_file is not None:
         raise InputError(
@@ -253,10 +259,14 @@ def _plan(
     if gyro is not None and filter_file is not None:
         raise InputError("--gyro and --filter both give the filter's gyro noise; give one of them")
     loaded = scenario_named(scenario)
+    chosen = None
+    if filter_file is not None:
+        own = own_filter(filter_file)
+        chosen = filter_of_scenario(filter_file, loaded) if own is None else replace(matched(loaded), estimator=own)
     plan = workflows.plan(
         loaded,
         gyro=None if gyro is None else read_spec(gyro),
-        setup=None if filter_file is None else filter_of_scenario(filter_file, loaded),
+        setup=chosen,
         seed=seed,
         states=states,
         dispersions=None if dispersions is None else engine.read_dispersions(dispersions),
@@ -269,8 +279,21 @@ def _plan(
     return plan
 
 
+def _with_filter(held: Campaign, own: Own, source: Path) -> Campaign:
+    """Return a campaign with its filter's code, which its file does not hold."""
+    from strapdown.checks import InputError
+
+    if held.plan.setup.estimator != own:
+        raise InputError(
+            f"{own.name} as its file stands is not the filter of {source}, {held.plan.setup.estimator_name}; take the file as it was, or "
+            "start anew with the scenario and another --out"
+        )
+    return replace(held, plan=replace(held.plan, setup=replace(held.plan.setup, estimator=own)))
+
+
 def _report(campaign: Campaign) -> dict[str, Any]:
     from strapdown.montecarlo import summary
+    from strapdown.montecarlo.verdicts import bound_of
 
     assert campaign.statistics is not None
     return {
@@ -282,7 +305,7 @@ def _report(campaign: Campaign) -> dict[str, Any]:
         "version": campaign.version,
         "seconds": campaign.seconds,
         "judgement": _judged(campaign).summary(),
-        **summary(campaign.statistics),
+        **summary(campaign.statistics, bound=bound_of(campaign.plan)),
     }
 
 
@@ -299,12 +322,13 @@ def _print_result(campaign: Campaign) -> int:
     from strapdown.checks import InputError
     from strapdown.cli.judgement import status_of
     from strapdown.montecarlo import summary
+    from strapdown.montecarlo.verdicts import bound_of
 
     if campaign.statistics is None:
         raise InputError("no chunk of the campaign is finished; go on with it (--resume)")
     if not campaign.finished:
         console.print(f"{campaign.statistics.runs} of {campaign.runs} runs are finished.")
-    report = summary(campaign.statistics)
+    report = summary(campaign.statistics, bound=bound_of(campaign.plan))
     figure = lambda value: "-" if value is None else f"{value:.4g}" if value >= 1e3 else f"{value:.4f}"  # noqa: E731
     judgement = _judged(campaign)
     found = {(one.name, one.of): one for one in judgement.findings}
@@ -380,6 +404,13 @@ def _print_errors(report: dict[str, Any]) -> None:
     show(errors)
     expected = ", ".join(f"{100.0 * share:.2f}" for share in report["coverage"]["expected"])
     console.print(f"Of a right filter's errors {expected} % lie inside 1, 2, 3 σ.")
+    if (efficiency := report.get("rms_over_root_cramer_rao_bound")) is not None:
+        low, high = efficiency.pop("bounds_of_an_efficient_filter")
+        ratios = "; ".join(f"{name} {', '.join(f'{x:.3f}' for x in axes)}" for name, axes in efficiency.items())
+        console.print(
+            f"RMS error over the root of the Cramér–Rao bound, which no filter can beat, by axis: {ratios} "
+            f"(at one epoch {low:.3f} to {high:.3f} for a filter that attains it)."
+        )
 
 
 def _worst_axis(values: list[float | None]) -> int:
@@ -408,7 +439,7 @@ def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
     truth = again.record.truth
     assert truth is not None
     # Of a filter that joins samples to steps some machines give the record at the samples, some at the steps.
-    edges = slice(None, None, (len(again.record.time) - 1) // (len(again.estimate.time) - 1))
+    edges = np.searchsorted(again.record.time, again.estimate.time - 1e-9)
     true = Truth(attitude=truth.attitude[edges], bias=truth.bias[edges])
     attributes: dict[str, Any] = {
         "scenario": scenario_to_toml(plan.scenario),
@@ -430,12 +461,13 @@ def _replay(plan: Plan, run: int, machine: str, target: Path) -> None:
     )
     write_estimate(paths[1], again.estimate, attributes, truth=true)
     estimate = again.estimate
-    error = consistency.errors(estimate.attitude, estimate.bias, true.attitude, true.bias)
+    size, states = (6, "six") if estimate.has_bias else (3, "three")
+    error = consistency.errors(estimate.attitude, np.nan_to_num(estimate.bias), true.attitude, true.bias)[:, :size]
     assert estimate.covariance is not None
-    nees = consistency.nees(error, estimate.covariance)
+    nees = consistency.nees(error, estimate.covariance[:, :size, :size])
     step = int(np.argmax(nees))
     console.print(
-        f"Run {run} of seed {plan.seed}, machine: {choice}. Its largest NEES is {nees[step]:.4g}, of six states, "
+        f"Run {run} of seed {plan.seed}, machine: {choice}. Its largest NEES is {nees[step]:.4g}, of {states} states, "
         f"at {estimate.time[step]:g} s."
     )
     written(*paths)

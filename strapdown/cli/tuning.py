@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from strapdown.cli.reading import Axes, Invert, given_layout
+from strapdown.cli.reading import (
+    AccelerometerUnit,
+    Axes,
+    Columns,
+    GyroUnit,
+    Invert,
+    TimeUnit,
+    Topic,
+    given_layout,
+)
 from strapdown.cli.terminal import (
     FigureFormat,
     Format,
@@ -127,11 +136,11 @@ def tune(
         str | None,
         typer.Option(help="For --plan: lengths of a record, s, with commas; that of the scenario if not given."),
     ] = None,
-    gyro_unit: Annotated[str | None, typer.Option(help="Unit of a CSV file's gyro: rad/s or deg/s.")] = None,
-    accelerometer_unit: Annotated[
-        str | None, typer.Option(help="Unit of a CSV file's accelerometer: m/s2 or g.")
-    ] = None,
-    time_unit: Annotated[str | None, typer.Option(help="Unit of a CSV file's time: s, ms, us or ns.")] = None,
+    gyro_unit: GyroUnit = None,
+    accelerometer_unit: AccelerometerUnit = None,
+    time_unit: TimeUnit = None,
+    columns: Columns = None,
+    topic: Topic = None,
     axes: Axes = None,
     invert: Invert = None,
     out: Annotated[
@@ -165,7 +174,8 @@ def tune(
         raise _refusal("--length is for --plan; the records' own length is taken")
     count("seed", seed, least=0)
     _check_files(records, filter_file, out, form, tables)
-    layout = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit, "axes": axes, "invert": invert}
+    units = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
+    layout = {"columns": columns, "topic": topic, "axes": axes, "invert": invert, **units}
     cases, before, gyros = _cases(records, chosen, filter_file, layout, states=states)
     if algorithm is not None:
         before = replace(before, integration=algorithm)

@@ -467,7 +467,7 @@ def _initial_rotations(own: _Series, theirs: _Series, offset: float) -> list[tup
 
     def fixed_of(body: Array) -> Array:
         turns = quaternion.multiply(truth.attitude, quaternion.conjugate(quaternion.multiply(matched.attitude, body)))
-        return quaternion.mean(turns)[0]
+        return quaternion.from_rotation(quaternion.to_rotation(turns).mean())
 
     found = [(identity, identity), (fixed_of(identity), identity)]
     _, w_own = _rates(matched)
