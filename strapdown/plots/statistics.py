@@ -32,6 +32,13 @@ from strapdown.plots.style import (
 BOUNDS = "bounds of a consistent filter"
 
 
+class _Plain(LogFormatter):
+    """Labels of a log axis as plain numbers: 0.8 and 2, not 8 × 10⁻¹ and 2 × 10⁰."""
+
+    def _num_to_string(self, x: float, vmin: float, vmax: float) -> str:
+        return f"{x:g}"
+
+
 def nees_over_time(
     named: Sequence[tuple[str, Statistics]],
     bounds: tuple[float, float],
@@ -65,8 +72,8 @@ def nees_over_time(
     for k, (name, statistics) in enumerate(named):
         ax.plot(statistics.time, statistics.anees[:, column], label=name, **layered(k, len(named)))
     ax.set_yscale("log")
-    ax.yaxis.set_major_formatter(LogFormatter())  # 2 instead of 2 × 10⁰
-    ax.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2.0, 0.5)))
+    ax.yaxis.set_major_formatter(_Plain())
+    ax.yaxis.set_minor_formatter(_Plain(minor_thresholds=(2.0, 0.5)))
     ax.set_xlabel("time, s")
     ax.set_ylabel(f"NEES of the {subset},\nper state (log scale)")
     return ax
