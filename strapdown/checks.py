@@ -36,7 +36,7 @@ def _first(mask: NDArray[np.bool_]) -> tuple[np.intp, ...]:
 
 
 _NO_NUMBERS = {"b": "True or False", "S": "text", "U": "text", "c": "complex numbers", "M": "dates", "m": "time spans"}
-"""What NumPy would turn into floats though it is none, by the kind of its dtype."""
+"""Kinds of dtype that NumPy would turn into floats though they hold no numbers."""
 
 
 def _truth_value(value: object) -> bool:

@@ -44,7 +44,7 @@ __all__ = [
 AXES = ("x", "y", "z")
 
 MIN_ERROR = 1e-12
-"""What is smaller in every step and measurement is rounding, rad."""
+"""Errors of each step and measurement below this are rounding, rad."""
 LARGEST_SIZE = 1e12
 """No considered or initial error is larger, in the units of :class:`Consider`: its square would leave the range of doubles."""
 LARGEST_LINEAR = 0.15
@@ -280,7 +280,7 @@ class _Rows:
     error: Array
     """Innovation at the truth without noise (r,): what the sensor's fixed errors make."""
     moving: Array
-    """What a second of lateness makes of the row through the change of the reference (r,)."""
+    """Change of the row per second of delay, by the motion of the reference (r,)."""
 
 
 def _exact(sensor: Any) -> Any:
@@ -510,7 +510,7 @@ class _Path:
     """Stations (n + 1,), s."""
     attitude: Array
     dt: Array
-    """Of the segments between them (n,), s."""
+    """Durations of the segments between them (n,), s."""
     phi: Array
     """True turns (n, 3), rad."""
     interval: np.ndarray
@@ -518,7 +518,7 @@ class _Path:
     rows: dict[str, Array]
     """Fields of :class:`_Rows`, sensors together."""
     sensor: np.ndarray
-    """Of each row."""
+    """Number of the sensor of each row."""
     kept: np.ndarray
     """Gyro edges at the epochs."""
 

@@ -1,4 +1,4 @@
-"""What frozen dataclasses of arrays share: equality by value, and printing as a short table. Private.
+"""Base classes of frozen dataclasses of arrays: equality by value, and printing as a short table. Private.
 
 Specifications (of a gyro, a sensor, a filter) derive from :class:`ByValue`: they are written to files and read back, and two with the same
 numbers are the same. Data and results are compared by identity; for them ``@dataclass(eq=False)`` is enough. Results derive from

@@ -53,11 +53,11 @@ FILES = (
     "observability.json",
     "calibration.toml",
 )
-"""What the command may write to its folder, beside figures."""
+"""Files that the command may write to its folder, beside figures."""
 FIGURES = ("estimate", "errors", "states")
 """Figures that it may draw there, without the suffix of their format."""
 ABOUT_IT = ("estimate.html", "estimate.report.json")
-"""What other commands write there about an estimate."""
+"""Files that other commands write there about an estimate."""
 
 
 @app.command()
@@ -223,7 +223,7 @@ class _Output(NamedTuple):
     folder: Path
     exports: Sequence[tuple[Path, dict[str, Any]]]
     form: FigureFormat | None
-    """Of the figures; None: draw none."""
+    """Format of the figures; None: draw none."""
 
 
 class _Shared(NamedTuple):

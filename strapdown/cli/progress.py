@@ -121,7 +121,7 @@ def _watch(ended: Event, say: Say) -> None:
 
 
 class _Compiling:
-    """What numba compiles, by its own events; nothing is imported for it."""
+    """Functions that numba is compiling, by its own events; nothing is imported for it."""
 
     def __init__(self) -> None:
         self.current = ""

@@ -1,4 +1,4 @@
-"""What every command shares: the application, the two consoles, tables."""
+"""Shared by every command: the application, the two consoles, tables."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ __all__ = [
 LARGEST_NUMBER = 1e30
 """No number of a scenario is larger in any unit that its file may use; beyond it squares and products leave the range of doubles."""
 MAX_MEASUREMENTS = 1e8
-"""Of one sensor in a scenario: more do not fit into memory."""
+"""Most measurements of one sensor in a scenario; more do not fit into memory."""
 
 app = typer.Typer(
     help="Strapdown gyro attitude estimation: simulate, estimate, judge.",
@@ -54,7 +54,7 @@ console = Console(markup=False, highlight=False, soft_wrap=True)
 
 
 class FigureFormat(enum.StrEnum):
-    """What figures are written as."""
+    """Formats of figures."""
 
     png = "png"
     pdf = "pdf"

@@ -230,7 +230,7 @@ def tune(
 
 
 class _Goal(NamedTuple):
-    """What the filter is tuned by; of nothing else by the likelihood of all innovations."""
+    """Objective of the tuning; by default the likelihood of all innovations."""
 
     truth: bool
     rmse: bool
@@ -244,7 +244,7 @@ class _Goal(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What the result says."""
+        """Name of the objective in the result."""
         name = "rmse" if self.rmse else "likelihood"
         return name + (" of the errors" if self.truth else "")
 

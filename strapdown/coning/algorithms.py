@@ -31,7 +31,7 @@ SOLVERS = {
 """How an algorithm turns the increments of a step into its rotation."""
 
 Coefficient = int | float | str | Fraction
-"""What may be given for a coefficient: 27/20 as "27/20", 1.35, "1.35" or Fraction(27, 20)."""
+"""Forms of a coefficient: 27/20 as "27/20", 1.35, "1.35" or Fraction(27, 20)."""
 
 _TABLES = {"compressed": "coefficients", "pairs": "pairs", "polynomial": "correction"}
 """The table that a solver reads. The other solvers read none, and no increments but those of the step."""

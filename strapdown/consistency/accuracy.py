@@ -55,7 +55,7 @@ class ReferenceErrors:
     heading: Array
     """Its part about the vertical (n,)."""
     inclination: Array
-    """What is left: the angle between the vertical of both (n,)."""
+    """Remaining error, the angle between the two verticals (n,)."""
 
     def rms(self, movement: np.ndarray | None = None) -> dict[str, float]:
         """Return the RMS of each error, rad, over the samples with a reference, and only those of the ``movement`` mask if given."""

@@ -31,7 +31,7 @@ the errors of roll, pitch and yaw, in this order (ZYX)."""
 DECIDED = 0.9
 """Probability above which the errors decide how the covariance is meant; below, it is taken for the body side, this package's own."""
 ALIGNED = ("time", "fixed", "body")
-"""What may be aligned: the clocks, the fixed frames, the body frames."""
+"""Parts of an alignment: clocks, fixed frames, body frames."""
 GROSS = 5.0 * DEGREE
 """A constant rotation beyond this is one of frames and not of a filter."""
 BRIDGED = 0.1
@@ -45,7 +45,7 @@ LONGEST_OFFSET = 30.0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Alignment:
-    """What differs between an estimate's clock and frames and a truth's: ``q_true(t + offset) = exp(fixed) ⊗ q(t) ⊗ exp(body)``."""
+    """Difference between an estimate's clock and frames and a truth's: ``q_true(t + offset) = exp(fixed) ⊗ q(t) ⊗ exp(body)``."""
 
     offset: float
     """s, to be added to the estimate's times."""
@@ -64,7 +64,7 @@ class Alignment:
 
     @property
     def words(self) -> tuple[str, ...]:
-        """What was removed, a sentence each."""
+        """Differences that were removed, a sentence each."""
         found = []
         if "time" in self.estimated:
             found.append(

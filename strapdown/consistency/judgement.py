@@ -37,7 +37,7 @@ MIN_SAMPLES = 50
 """Fewer innovations of one sensor are not judged for whiteness, normality and mean."""
 
 RESOLUTION = 1.5
-"""A filter that passes is "consistent" if a σ wrong by this factor would have been seen; else nobody can tell."""
+"""A filter that passes is "consistent" if a σ wrong by this factor would have been seen; else the verdict is "cannot tell"."""
 
 STATES = ("attitude", "bias")
 """States of every filter."""
@@ -105,7 +105,7 @@ class Finding:
 
     @property
     def label(self) -> str:
-        """What the value is of, its epoch included."""
+        """Sensor or states, with the epoch."""
         return f"{self.of}, {self.at}" if self.at else self.of
 
     def _with_bounds(self, error: float) -> Finding:

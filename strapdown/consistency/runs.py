@@ -30,7 +30,7 @@ from strapdown.consistency.manifold import SUBSETS
 
 
 class RunStatistics(Protocol):
-    """What :func:`judge_runs` wants of the statistics of a Monte Carlo: sums over independent runs at each epoch."""
+    """Statistics that :func:`judge_runs` needs: sums over independent runs at each epoch."""
 
     @property
     def runs(self) -> int:

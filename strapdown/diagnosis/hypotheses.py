@@ -1,4 +1,4 @@
-"""What may be wrong: each hypothesis as a change of the record or of the filter's beliefs."""
+"""Possible faults: each hypothesis as a change of the record or of the filter's model."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ __all__ = [
 
 AXES = ("x", "y", "z")
 MAX_CHAIN_DECAY = 0.2
-"""Of λ dt of a state in a chain in one step: its series and Gauss's rule are exact."""
+"""Largest λ dt of a state in a chain in one step, where its series and Gauss's rule are exact."""
 ENTRIES = tuple(a if a == b else f"{a}{b}" for a in AXES for b in AXES)
 """Entries of a matrix by rows: x, xy, xz, yx, y, …"""
 
@@ -586,7 +586,7 @@ class GaussMarkov(_FirstOrder):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BoundedVelocity(ErrorStates):
-    """What an accelerometer on a moving hand feels of the motion: an acceleration whose velocity is bounded, stationary, in fixed axes.
+    """Acceleration of a moving hand that an accelerometer measures: an acceleration whose velocity is bounded, stationary, in fixed axes.
 
     ``f_b = R_fbᵀ (a_f − g_f)`` with ``a = v̇``: on each axis ``v̇ = −v/τ_v + u``, ``u̇ = −u/τ_a + w``. The spectrum of a is that of
     first-order coloured noise at high frequency and vanishes at zero, as that of every body does which stays about where it is; a part of

@@ -20,7 +20,7 @@ from strapdown.kernels.chains import CHAIN, chain_start
 from strapdown.kernels.error_state_step import CARRIED, FIXED, FORCE, LEVER, NOISE_NODES, OFFSET, SCALE
 
 MAX_DECAY = 0.5
-"""Of λ dt in one step: a step back is well conditioned. For states that enter the gyro a tenth, where Gauss's rule is exact."""
+"""Largest λ dt of one step, for a well conditioned step back; a tenth for states that enter the gyro, where Gauss's rule is exact."""
 
 
 def as_blocks(blocks: Sequence[ErrorStates]) -> tuple[ErrorStates, ...]:

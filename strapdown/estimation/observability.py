@@ -1,4 +1,4 @@
-"""What a record shows of each state: rank, singular values, and the weakest directions in words."""
+"""Observability of each state over a record: rank, singular values, and the weakest directions in words."""
 
 from __future__ import annotations
 

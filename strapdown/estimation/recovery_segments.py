@@ -24,7 +24,7 @@ from strapdown.kernels.smoother_loop import locate_edges
 from strapdown.records import Estimate, Event, ImuRecord
 
 STAMP_TOLERANCE = 1e-6
-"""Of the mean gyro interval: an edge that lies beyond t + lag by no more is taken for one at t + lag."""
+"""Part of the mean gyro interval by which an edge may lie beyond t + lag and still count as one at t + lag."""
 
 
 MAX_CUT = 64
@@ -123,9 +123,9 @@ class Trajectory:
     edge: np.ndarray
     """Stops to write, in order."""
     last: np.ndarray
-    """Of each the stop from which on nothing is known."""
+    """Stop of each from which on nothing is known."""
     row: np.ndarray
-    """Of each the edge of the record that it is."""
+    """Edge of the record of each."""
 
 
 def stops(time: Array, breaks: Sequence[Break]) -> Array:

@@ -54,7 +54,7 @@ class Schedule:
 
     @cached_property
     def order(self) -> tuple[Array, np.ndarray, np.ndarray]:
-        """Of each event in order of time (events,): its time, its row where one sensor comes after the other, and its sensor."""
+        """Time, row (one sensor after the other) and sensor of each event, in order of time (events,)."""
         number = int(self.bounds[-1])
         # A byte for the sensor where it will do: the loops read it with each event.
         narrow = np.uint8 if len(self.sensors) <= 256 else np.uint32

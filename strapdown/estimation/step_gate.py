@@ -1,4 +1,4 @@
-"""What the step-by-step filter does with one measurement beyond the textbook's update, in matrices over any number of states.
+"""Gate, weights and iterated update of the step-by-step filter, in matrices over any number of states.
 
 - :func:`linearize`: the measurement linearised at the estimate that its update leads to (iterated update), its NIS, and its robust weight.
 - :class:`Supervision`: the gate's counters, the restart candidate that it runs beside the filter, and the NIS that a monitor judges.
@@ -40,7 +40,7 @@ class Rows(NamedTuple):
     noise: Array
     """Covariance of the noise (d, d)."""
     angle: float
-    """Of a direction or vector the angle θ from the predicted one, rad; of other kinds 0."""
+    """Angle θ of a direction or vector from the predicted one, rad; 0 for other kinds."""
     arc: float
     """θ over the length of the residual's part across the predicted direction; of other kinds 1."""
 
@@ -220,7 +220,7 @@ class Supervised(Protocol):
     bias: Array
     P: Array
     nis: float
-    """Of the last measurement."""
+    """NIS of the last measurement."""
     dim_z: int
     """Its degrees of freedom."""
     _passes: int

@@ -81,7 +81,7 @@ _BY_EPOCH = (
     "coverage",
     "histogram",
 )
-"""What has one row an epoch; all are sums over runs whose numbers are finite."""
+"""Arrays with one row an epoch, sums over runs whose numbers are finite."""
 
 _COUNTED = (
     "finite",
@@ -92,7 +92,7 @@ _COUNTED = (
     "worst_run",
     "example_run",
 )
-"""What counts: whole numbers."""
+"""Arrays of counts, whole numbers."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -139,7 +139,7 @@ class Campaign:
 
 @dataclass
 class _Progress:
-    """What is finished: the fold over whole chunks from the first on, and chunks finished early, by their first run."""
+    """Finished chunks: the fold over whole chunks from the first on, and chunks finished early, by their first run."""
 
     whole: Statistics | None
     early: dict[int, Statistics]
@@ -160,7 +160,7 @@ class _Progress:
 
     @property
     def statistics(self) -> Statistics | None:
-        """Of all runs from the first on without a gap, a short last chunk with them."""
+        """Statistics of all runs from the first without a gap, a short last chunk included."""
         last = self.early.get(self.merged)
         if last is None:
             return self.whole

@@ -29,7 +29,7 @@ AHEAD = 4
 
 
 class Machine(Protocol):
-    """What :mod:`strapdown.montecarlo.statistics` asks of a machine."""
+    """Interface of a machine, as :mod:`strapdown.montecarlo.statistics` uses it."""
 
     NAME: str
     CHUNK: int
@@ -159,7 +159,7 @@ def chunks_of(runs: int, chunk: int) -> Chunks:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Work:
-    """What computes a chunk; it can be sent to another process."""
+    """Function that computes a chunk; picklable, for other processes."""
 
     plans: tuple[Plan, ...]
     """Plans that differ in the filter alone: the runs' sensors give the same to all."""

@@ -1,4 +1,4 @@
-"""What a Monte Carlo campaign computes: scenario, filter, seed, what differs from run to run, where statistics are taken."""
+"""Plan of a Monte Carlo campaign: scenario, filter, seed, dispersions from run to run, epochs of the statistics."""
 
 from __future__ import annotations
 

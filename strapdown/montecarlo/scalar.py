@@ -244,7 +244,7 @@ class Sums:
 
     @property
     def statistics(self) -> Statistics:
-        """What the runs added so far make."""
+        """Statistics of the runs added so far."""
         run, score = (np.array(column) for column in zip(*self.scores, strict=True))
         worst_run, worst_score = worst(run.astype(np.int64), score.astype(np.float64))
         m = len(self.time)

@@ -97,11 +97,11 @@ class Replay:
     """One run in full detail."""
 
     record: ImuRecord
-    """What the sensors gave, with the truth."""
+    """Simulated measurements, with the truth."""
     initial: estimation.State
     """Where the filter started."""
     estimate: Estimate
-    """What the filter made of it, at every step, with whole covariances."""
+    """Estimate at every filter step, with whole covariances."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -217,7 +217,7 @@ class Statistics(Listed):
 
     @property
     def subsets(self) -> tuple[str, ...]:
-        """What is judged: "state", "attitude" and "bias", or "attitude" alone where no bias is estimated."""
+        """Subsets of the states that are judged: "state", "attitude" and "bias", or "attitude" alone where no bias is estimated."""
         return tuple(SUBSETS) if self.has_bias else ("attitude",)
 
     @property

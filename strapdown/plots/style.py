@@ -1,4 +1,4 @@
-"""What all figures share: colours, sizes, saving."""
+"""Style of all figures: colours, sizes, saving."""
 
 from __future__ import annotations
 

@@ -46,11 +46,11 @@ class Attitudes:
     covariance: Array | None = None
     """(m, 3, 3) of the attitude error, rad², or (m, 6, 6) with that of the bias."""
     error_frame: str = ""
-    """What the covariance is of (:data:`strapdown.consistency.foreign.ERROR_FRAMES`), where the format says; else empty."""
+    """Error that the covariance describes (:data:`strapdown.consistency.foreign.ERROR_FRAMES`), where the format says; else empty."""
     bias: Array | None = None
     """Gyro bias (m, 3), rad/s, body axes."""
     innovations: Mapping[str, Innovations] = field(default_factory=dict)
-    """By sensor; times in s since the first stamp."""
+    """Innovations by sensor; times in s since the first stamp."""
     remarks: tuple[str, ...] = ()
 
     def seconds(self, origin_ns: int) -> Array:

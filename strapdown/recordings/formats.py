@@ -45,7 +45,7 @@ class Format:
     estimate_options: tuple[str, ...] = ()
     """Keywords that the writer of estimates takes."""
     lacks: tuple[str, ...] = ()
-    """What a recording may hold and the format cannot: ``"temperature"``, ``"reference"``, ``"movement"``, ``"clock"``."""
+    """Contents of a recording that the format cannot hold: ``"temperature"``, ``"reference"``, ``"movement"``, ``"clock"``."""
     with_samples: bool = False
     """Whether an estimate is written with the recording's samples, and so never without a recording."""
 

@@ -371,4 +371,4 @@ STUDIES: dict[str, Callable[..., list[Table]]] = {
     "tuning": of_tuning,
     "allan": of_allan,
 }
-"""What makes the tables of each study."""
+"""Functions that make the tables of each study."""

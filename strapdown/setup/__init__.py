@@ -47,7 +47,7 @@ ATTITUDE_SIGMA = 1.0 * units.DEGREE
 LINEAR_SHARE = 0.2
 """The second-order error of a first measurement, half the square of the initial error, may be about this share of half its σ."""
 COMMUTATION_SHARE = 0.1
-"""Of what the record's white noise leaves of a constant rate: a drift of one-sample integration above it calls for a better algorithm."""
+"""Part of the σ of a constant rate, by white noise over the record; a one-sample drift above it calls for a better algorithm."""
 ACCURATE_ALGORITHM = "matched-1-8-8"
 """The integration algorithm chosen then: one step a sample."""
 MIN_SAMPLES = 32
@@ -584,7 +584,7 @@ _ROBUST_FORM: tables.Form = {
 }
 _PARTS = ("integration", "sigma", "gate", "robust", "states", "estimator")
 NEVER = 0
-"""What stands in a file for the ``recovery`` of a gate that never recovers, as TOML has no word for nothing."""
+"""Value of ``recovery`` in a file for a gate that never recovers, as TOML has no null."""
 
 
 def to_table(setup: FilterSetup) -> dict[str, Any]:

@@ -300,7 +300,7 @@ class States(ByValue):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What is declared, in the words by which :func:`chosen` takes it."""
+        """Names of the declared states, as :func:`chosen` accepts them."""
         gyro = (
             ("gyro.scale", _any(self.gyro_scale_sigma)),
             ("gyro.misalignment", _any(self.gyro_misalignment_sigma)),

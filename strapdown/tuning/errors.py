@@ -25,7 +25,7 @@ MAX_EPOCHS = 1000
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ErrorObjective:
-    """What the errors of the state say of the parameters; built by :func:`error_objective`."""
+    """Objective of the parameters, from the errors of the state; built by :func:`error_objective`."""
 
     base: Likelihood
     measure: Measure

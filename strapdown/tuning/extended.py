@@ -55,7 +55,7 @@ SENSOR = {
 LARGEST_SCALE = 0.1
 """σ of scale factors and misalignments from which on a filter that is linear in them makes no sense: noise would pass for a turn."""
 QUICKEST, SLOWEST = 0.05, 100.0
-"""Of a time constant: the least part of the interval between measurements, the most times the record's length, that make a difference."""
+"""Range of a time constant that makes a difference: from this part of the interval between measurements to this multiple of the record."""
 
 
 def _size(value: Entries) -> float:

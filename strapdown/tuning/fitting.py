@@ -21,7 +21,7 @@ from strapdown.tuning.innovations import Derivatives
 from strapdown.tuning.parameters import RRW, SCALE, Prior, fixed_unit, with_values
 
 LONGEST_STEP = 2.0
-"""Of a log parameter in one step of the search."""
+"""Largest change of a log parameter in one step of the search."""
 REACH = 16.0
 """How far a log parameter may go from where it starts."""
 WELL_KNOWN = 0.1
@@ -32,7 +32,7 @@ ONE_SIDED = 2.705543454095404
 """90 % quantile: the bound that is passed on one side with 5 %, and the test against zero, where half the probability is a point
 (Self & Liang 1987)."""
 MIN_INFORMATION = 1e-10
-"""Of a log parameter; less is none."""
+"""Least information on a log parameter; below it there is none."""
 NEGLIGIBLE = 1e-3
 """A gain of the log likelihood that is not distinguishable from none."""
 
@@ -42,7 +42,7 @@ MISFIT = 1.6
 
 
 class Objective(Protocol):
-    """What is minimised: minus a log likelihood, or what stands for one."""
+    """Objective to minimise: minus a log likelihood, or a substitute."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -187,11 +187,11 @@ class Estimated:
     upper: float
     """Upper end of the 95 % interval; infinite where nothing bounds it."""
     standard_error: float
-    """Of the logarithm, by the information, or by the sandwich where :attr:`Tuning.misfit` or against a truth."""
+    """Standard error of the logarithm, by the information, or by the sandwich where :attr:`Tuning.misfit` or against a truth."""
     identified: bool
     """Whether zero is refuted at 95 %, and an upper end found."""
     note: str
-    """What to make of it, in words."""
+    """Interpretation, in words."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -443,7 +443,7 @@ class Slices:
 
     names: tuple[str, ...]
     values: Array
-    """Of the parameter (p, k), SI."""
+    """Values of the parameter (p, k), SI."""
     fallen: Array
     """2 Δℓ: by how much twice the log likelihood lies below its best (p, k)."""
 

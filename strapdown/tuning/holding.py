@@ -88,7 +88,7 @@ class Performance:
     """One filter on held-out data."""
 
     log_likelihood: float
-    """Of all its innovations, in nats an innovation; what a gate refused is left out."""
+    """Log likelihood per innovation, nats, without those that a gate refused."""
     nis: float
     """Mean NIS per degree of freedom; 1 for a consistent filter."""
     nis_bounds: tuple[float, float]

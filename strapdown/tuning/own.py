@@ -28,11 +28,11 @@ from strapdown.tuning.innovations import Case
 OwnMeasure = Literal["innovations", "errors", "rmse"]
 OWN_MEASURES = ("innovations", "errors", "rmse")
 FIRST_STEP = 0.5
-"""Of the simplex at the start, in the logarithm of each parameter."""
+"""Initial size of the simplex, in the logarithm of each parameter."""
 TOLERANCE = 1e-4
-"""Of the logarithms at the end."""
+"""Final tolerance of the logarithms."""
 CURVATURE_STEP = 0.05
-"""Of a log parameter, for second derivatives."""
+"""Step of a log parameter for second derivatives."""
 MAX_RUNS = 400
 """Evaluations for each parameter after which the search is given up."""
 

@@ -1,4 +1,4 @@
-"""What may be tuned: names of parameters, their values in a filter setup, and setups with other values.
+"""Tunable parameters: their names, their values in a filter setup, and setups with other values.
 
 The gyro's two noises are shared by its axes, as the filter has one σ_v and one σ_u: only isotropic noise is the same seen from a body
 that turns within a step, and has the closed form of :func:`strapdown.kernels.filter_step.process_noise`.
@@ -40,10 +40,10 @@ OUTLIER_SCALE = "outliers.scale"
 GATE = "gate.probability"
 """Probability that the gate lets a right measurement pass: what share and scale of the outliers make it."""
 SIGMA = ".sigma"
-"""What the name of a sensor's σ ends with."""
+"""Suffix of a sensor's σ."""
 
 AXES = tuple(f"{SIGMA}.{axis}" for axis in "xyz")
-"""What the names of a sensor's σ of one body axis end with."""
+"""Suffixes of a sensor's σ of one body axis."""
 
 OWN = (ARW, RRW, INITIAL_ATTITUDE, INITIAL_BIAS, SCALE)
 

@@ -105,7 +105,7 @@ NOISES = (
     "quantization",
     "rate_resolution",
 )
-"""What of a gyro's specification its two tuned noises stand for."""
+"""Parameters of a gyro that its two tuned noises represent."""
 
 
 def one_gyro(specs: Mapping[str, GyroSpec]) -> None:

@@ -1,4 +1,4 @@
-"""What the tuned filter leaves unexplained: whether the data it was tuned on contradict it still, and an error that moves with the rate.
+"""Residual checks of a tuned filter: whether the data it was tuned on contradict it still, and an error that moves with the rate.
 
 Tuning gives every parameter its most likely value, right model or wrong. A gyro's scale-factor error moves its bias with the rate, so the
 walk of the bias is made as large as that takes; it looks identified, and the innovations look white. Then the question is not whether
@@ -37,7 +37,7 @@ from strapdown.tuning.parameters import RRW
 LEVELS = (1.0, 0.2, 0.04)
 """Multiples of the tuned walk of the bias beside which a scale factor is tried."""
 STEP = 1e-4
-"""Of a scale factor, for differences."""
+"""Step of a scale factor for differences."""
 MAX_REPORTED = 2
 """Largest number of failed tests that are reported one by one."""
 SHAPES = ("whiteness", "normality", "mean innovation", "cross-correlation")
@@ -60,12 +60,12 @@ class ScaleFactor:
 
 @dataclass(frozen=True, kw_only=True)
 class Unmodelled:
-    """What the data that a filter was tuned on say against it."""
+    """Evidence against a filter in the data that it was tuned on."""
 
     record: str
     """Name of the record."""
     judgement: Judgement
-    """Of the tuned filter, on what it was tuned on; with a truth its errors too."""
+    """Judgement of the tuned filter on its own data; with a truth of its errors too."""
     scale_factor: ScaleFactor
     causes: tuple[Cause, ...] = ()
     """Likely causes, where the innovations are not of the right shape."""
@@ -79,7 +79,7 @@ class Unmodelled:
 
     @property
     def failed(self) -> tuple[str, ...]:
-        """What is wrong after tuning, in words, one a test; a filter that is too modest has no error that it does not know of."""
+        """Remaining faults in words, one a test; a pessimistic filter has none that it does not model."""
         return tuple(
             one.means for one in self.judgement.findings if one.rejected and not (one.is_ratio and one.value < 1.0)
         )

@@ -21,7 +21,7 @@ from strapdown.records import Estimate, ImuRecord
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Gains:
-    """What one measurement of each sensor, in the order of the record, does with ``ω_mes = z × R̂ᵀ r``."""
+    """Gains of each sensor, in the order of the record, for ``ω_mes = z × R̂ᵀ r``."""
 
     attitude: Array
     """Turn of the attitude, rad a rad (sensors,): k_P times the weight of the sensor times its sample interval."""

@@ -43,7 +43,7 @@ DEFAULT_NAME = "estimator"
 
 
 class OwnFilter(Protocol):
-    """What a filter of one's own provides; a plain function of the same two arguments does as well."""
+    """Interface of a filter of one's own; a plain function of the same two arguments does as well."""
 
     def run(self, record: ImuRecord, initial: State) -> Estimate:
         """Return the estimate at the record's edges, or at some of them.
@@ -92,7 +92,7 @@ class Own:
 
     @functools.cached_property
     def table(self) -> dict[str, Any]:
-        """What identifies it in files: name, parameters, and the SHA-256 of its source where Python knows that."""
+        """Identity in files: name, parameters, and the SHA-256 of its source where Python knows that."""
         if isinstance(self.given, Mapping):
             return dict(self.given)
         inner, parameters = self.given, {}
