@@ -12,6 +12,7 @@ import typer
 
 from strapdown.cli.filters import default_words, filter_of_scenario
 from strapdown.cli.terminal import (
+    FilterFile,
     Tables,
     app,
     console,
@@ -46,13 +47,7 @@ def montecarlo(
         typer.Argument(help="Name of a built-in scenario, a TOML file, or the HDF5 file of a campaign: its own plan."),
     ],
     runs: Annotated[int | None, typer.Option(help="Runs; 1000, or what a resumed file wants.")] = None,
-    filter_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--filter",
-            help="TOML with a table named filter, as `strapdown tune` writes it; without it the filter that matches the scenario.",
-        ),
-    ] = None,
+    filter_file: FilterFile = None,
     dispersions: Annotated[
         Path | None,
         typer.Option(
