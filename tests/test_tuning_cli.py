@@ -112,7 +112,7 @@ def test_plan_says_how_long_a_record_is_needed(run, tmp_path, record):
         (("--holdout", "1.5"), "between 0 and 1"),
         (("--holdout", "0.3", "--holdout-by", "week"), "holdout-by 'week'"),
         (("--out", "filter.json"), ".toml"),
-        (("--truth", "--spacing", "1"), "leave it away"),
+        (("--truth", "--spacing", "1"), "leave it out"),
         (("--prior", "no-such-gyro"), "no-such-gyro"),
         (("--integration", "five"), "five"),
         (("--plan", "--length", "100;300"), "seconds with commas"),
@@ -175,3 +175,17 @@ def test_the_plain_likelihood_refuses_a_filter_with_states(scaled):
     chosen = setup.matched_to_record(file.gyro, file.record, states=True)
     with pytest.raises(InputError, match=r"extended\.likelihood"):
         tuning.likelihood([tuning.record_case(file.record, chosen)], chosen, ["gyro.arw"])
+
+
+@pytest.mark.parametrize("option", ["--columns", "--topic"])
+def test_columns_and_topic_are_read_as_estimate_reads_them(run, tmp_path, option):
+    """A layout that the file does not have is refused before the search, which shows that the option reached the reader."""
+    path = tmp_path / "walk.csv"
+    path.write_text("stamp,p,q,r\n" + "".join(f"{10 * k},0.1,0.2,0.3\n" for k in range(50)))
+    good = {"--columns": "time=stamp(ms),gx=p(dps),gy=q(dps),gz=r(dps)", "--topic": "/imu"}[option]
+    bad = {"--columns": "time=stamp(ms),gx=p(dps),gy=q(dps),gz=s(dps)", "--topic": "/imu"}[option]
+    status, _, complaint = run("tune", path, option, bad)
+    assert status == 2
+    assert {"--columns": "no column 's(dps)'", "--topic": "topic"}[option] in complaint
+    _, _, complaint = run("tune", path, option, good)
+    assert {"--columns": "no accelerometer", "--topic": "topic"}[option] in complaint

@@ -10,7 +10,6 @@ import typer
 from strapdown.cli.filters import filter_of_scenario
 from strapdown.cli.terminal import (
     FigureFormat,
-    FilterFile,
     Format,
     Tables,
     app,
@@ -57,7 +56,13 @@ def _in_own_units(biases: dict[str, float], sensors: Any) -> dict[str, float]:
 @app.command()
 def covariance(
     scenario: Annotated[str, typer.Argument(help="Name of a built-in scenario, or a TOML file.")],
-    filter_file: FilterFile = None,
+    filter_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--filter",
+            help="TOML with a table named filter, as `strapdown tune` writes it; without it the filter that matches the scenario.",
+        ),
+    ] = None,
     scale_factor: Annotated[float, typer.Option(help="Consider gyro scale factors of this 1σ, ppm.")] = 0.0,
     misalignment: Annotated[float, typer.Option(help="Consider gyro misalignments of this 1σ, mrad.")] = 0.0,
     g_sensitivity: Annotated[float, typer.Option(help="Consider gyro g-sensitivities of this 1σ, °/h/g.")] = 0.0,

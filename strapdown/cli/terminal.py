@@ -64,14 +64,6 @@ class FigureFormat(enum.StrEnum):
 FORMAT: Any = typer.Option("--format", help="Format of the figures.")
 Format = Annotated[FigureFormat, FORMAT]
 """Option of every command that draws."""
-FilterFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--filter",
-        help="TOML with a table named filter, as `strapdown tune` writes it; without it the filter that matches the scenario.",
-    ),
-]
-"""Option of the commands that run scenarios."""
 Tables = Annotated[
     Path | None,
     typer.Option("--tables", help="Folder to write the tables to as well, as CSV with every digit and as LaTeX."),

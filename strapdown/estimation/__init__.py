@@ -11,6 +11,7 @@ tangent space.
 - ``forward``: The filter over whole records.
 - ``smoothing``: The smoothers; ``recovery_segments`` what they make of recoveries.
 - ``observability``: What a record shows of each state.
+- ``live``: The compiled filter for data that arrive as they are measured.
 - ``step_filter``: The filter step by step, on filterpy; ``step_gate`` its gate.
 - ``multiple_model``: Unknown start, one vector at a time.
 - ``filters``: Other filters on the same interface, for comparison.
@@ -23,6 +24,7 @@ from strapdown.estimation.forward import gaps as gaps
 from strapdown.estimation.forward import run
 from strapdown.estimation.forward import run_part as run_part
 from strapdown.estimation.gating import Gate, Monitor, Robust
+from strapdown.estimation.live import LiveFilter
 from strapdown.estimation.model import with_error_states as with_error_states
 from strapdown.estimation.observability import Observability, observability
 from strapdown.estimation.smoothing import relinearized_start as relinearized_start
@@ -31,6 +33,7 @@ from strapdown.estimation.states import ProcessNoise, State, first_state, initia
 
 __all__ = [
     "Gate",
+    "LiveFilter",
     "Monitor",
     "Observability",
     "ProcessNoise",

@@ -34,6 +34,7 @@ from strapdown.plots.statistics import covariance_ellipses as covariance_ellipse
 from strapdown.plots.statistics import coverage_by_state as coverage_by_state
 from strapdown.plots.statistics import fan as fan
 from strapdown.plots.statistics import nees_over_time, nis_over_time
+from strapdown.plots.statistics import runs_overview as runs_overview
 from strapdown.plots.style import BLUE as BLUE
 from strapdown.plots.style import GREEN as GREEN
 from strapdown.plots.style import ORANGE as ORANGE

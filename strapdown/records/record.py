@@ -398,6 +398,8 @@ class Estimate(Listed):
         Covariance of attitude and whole bias.
     """
 
+    _drawn_by = "estimate_overview"
+
     time: Array
     attitude: Array
     bias: Array
