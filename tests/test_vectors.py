@@ -22,6 +22,7 @@ from strapdown.vectors import (
     specific_force,
     triad,
 )
+from strapdown.vectors.sensors import sample_times
 
 CONE = motion.Coning(angle=0.3, frequency=0.7)
 FIELD = np.array([2e-5, 1e-5, -4e-5])
@@ -105,11 +106,11 @@ def test_outages_and_latency_change_no_other_sample(sensor):
 
 def test_rates_and_phases():
     sensor = VectorSensor(name="s", reference_f=[1.0, 0.0, 0.0], sigma=0.0, rate=4.0)
-    np.testing.assert_allclose(sensor.times(10.0, 11.0), [10.25, 10.5, 10.75, 11.0])
-    np.testing.assert_allclose(dataclasses.replace(sensor, phase=0.1).times(10.0, 11.0), [10.1, 10.35, 10.6, 10.85])
-    assert len(sensor.times(0.0, 0.2)) == 0
+    np.testing.assert_allclose(sample_times(4.0, 0.0, 10.0, 11.0), [10.25, 10.5, 10.75, 11.0])
+    np.testing.assert_allclose(sample_times(4.0, 0.1, 10.0, 11.0), [10.1, 10.35, 10.6, 10.85])
+    assert len(sample_times(4.0, 0.0, 0.0, 0.2)) == 0
     assert len(observe(sensor, end=0.2).time) == 0
-    assert len(dataclasses.replace(sensor, rate=3.0).times(0.0, 1e4)) == 30_000
+    assert len(sample_times(3.0, 0.0, 0.0, 1e4)) == 30_000
 
 
 def test_outliers_are_a_contaminated_normal():

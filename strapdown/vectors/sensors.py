@@ -632,24 +632,9 @@ class VectorSensor(ByValue):
         _check_sampling(self.name, self.sigma, "rad", self.rate, self.phase)
         one_of(f"{self.name}: kind", self.kind, ("direction", "heading"))
 
-    def times(self, start: float, end: float) -> Array:
-        """Return the measurement times.
-
-        Parameters
-        ----------
-        start, end : float
-            Interval (start, end], s.
-
-        Returns
-        -------
-        ndarray (m,)
-            Times, s.
-        """
-        return sample_times(self.rate, self.phase, start, end)
-
     def observe(self, motion: Any, start: float, end: float, generator: np.random.Generator) -> VectorMeasurements:
         """Return noisy measurements over (start, end] of a motion, or of an attitude q_fb given as a function of time."""
-        time = self.times(start, end)
+        time = sample_times(self.rate, self.phase, start, end)
         white, correlated = self.faults.noise(time, generator)
         noisy = _body(motion, time, self.reference_f) + self.sigma * white + correlated
         # The noise of a heading is that across the direction over its horizontal part.
