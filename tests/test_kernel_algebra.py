@@ -170,6 +170,8 @@ KERNELS: dict[str, tuple[Callable, tuple[int, ...], Callable]] = {
     "arcsine": (rotation.arcsine, (S,), lambda x: np.arcsin(np.sqrt(x)) / np.sqrt(x)),
     "arcsine_series": (rotation.arcsine_series, (S,), lambda x: 2.0 * np.arcsin(np.sqrt(x)) / np.sqrt(x)),
 }
+NORMALIZING = ("renormalized", "turned")
+"""They bring a quaternion that is not quite of unit length nearer to it."""
 RUNS = 11
 LARGEST_SQUARE = {"arcsine": np.sin(0.5 * LARGEST_ANGLE) ** 2, "arcsine_series": rotation.SHORT}
 """Of the sine in the range of a polynomial in it."""
@@ -182,7 +184,7 @@ def arguments(name: str) -> list:
     for size in KERNELS[name][1]:
         value = random.standard_normal((max(size, 1), RUNS))
         if size == Q:
-            value /= np.linalg.norm(value, axis=0)
+            value *= (random.uniform(0.99, 1.01, RUNS) if name in NORMALIZING else 1.0) / np.linalg.norm(value, axis=0)
         if size == V and KERNELS[name][0].__module__ == rotation.__name__:
             value *= random.uniform(0.3, LARGEST_ANGLE, RUNS) / np.linalg.norm(value, axis=0)
         if name in LARGEST_SQUARE:

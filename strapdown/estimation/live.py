@@ -454,7 +454,7 @@ def _order(one: _Measured) -> tuple[float, int]:
     return one[0], one[1]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _Sensor:
     """A sensor as it was declared."""
 

@@ -60,7 +60,7 @@ MAGICS = (ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC)
 _SUFFIX = {ROS1_MAGIC: ".bag", MCAP_MAGIC: ".mcap", SQLITE_MAGIC: ".db3"}
 
 
-@dataclass
+@dataclass(eq=False)
 class _Topic:
     """The messages of one topic in the order of the bag: decoded as they come, or, to be copied, as they are."""
 
