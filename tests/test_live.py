@@ -217,6 +217,9 @@ def test_covariances_of_sensors():
     vectors = (
         VectorMeasurements(sensor="a", kind="direction", time=times, vector_b=z[0], reference_f=r[0], covariance=whole),
         VectorMeasurements(sensor="b", kind="direction", time=times, vector_b=z[1], reference_f=r[1], sigma=0.01),
+        VectorMeasurements(
+            sensor="c", kind="vector", time=times, vector_b=3.0 * z[1], reference_f=3.0 * r[1], covariance=whole
+        ),
     )
     record = ImuRecord(time=np.arange(6) / 10.0, increments=np.full((5, 3), 0.01), vectors=vectors)
     live = given_in_order(record, live_of(record, start()))
