@@ -585,6 +585,7 @@ def plan(
     scenario: Scenario,
     *,
     setup: FilterSetup | None = None,
+    gyro: GyroSpec | None = None,
     seed: int | None = None,
     states: bool | None = None,
     dispersions: Dispersions | None = None,
@@ -592,14 +593,16 @@ def plan(
 ) -> Plan:
     """Return the plan of a Monte Carlo: a scenario through the filter that matches it, or another ``setup``.
 
+    ``gyro``: what the matched filter assumes of its gyro, such as a data sheet; by default the scenario's.
     ``states``: whether the matched filter has an error state for each error that the scenario specifies, by default where there are such.
     Where fixed errors have states, each run draws its own gyro and sensors: the filter is right on average over such individuals.
     """
     from strapdown import montecarlo
 
-    if states is not None and setup is not None:
-        raise InputError("a filter setup has its own states; leave states out")
-    chosen = for_record.matched_to_scenario(scenario, states=states) if setup is None else setup
+    if setup is not None and (states is not None or gyro is not None):
+        raise InputError("a filter setup has its own states and gyro noise; leave states and gyro out")
+    assumed = scenario if gyro is None else dataclasses.replace(scenario, gyro=gyro)
+    chosen = for_record.matched_to_scenario(assumed, states=states) if setup is None else setup
     names = chosen.states.names if setup is None and chosen.states is not None else ()
     return montecarlo.Plan(
         scenario=scenario,

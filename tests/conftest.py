@@ -41,6 +41,10 @@ def what_is_compiled_is_not_collected() -> Iterator[None]:
     gc.freeze()
 
 
+def pytest_sessionfinish() -> None:
+    gc.freeze()  # pytest collects five times at its end, ten seconds in a process that has compiled much
+
+
 @pytest.fixture(scope="session")
 def broad() -> Path:
     """Folder of the BROAD trials."""

@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from sims import hand_held
 from strapdown import ahrs, quaternion, setup
-from strapdown.ahrs import AhrsParameters
+from strapdown.ahrs import AhrsParameters, estimating
 from strapdown.checks import InputError
 from strapdown.consistency import reference_errors
 from strapdown.recordings import Recording, hard_iron, read, sensor_delays
+from strapdown.records import Estimate, Innovations
 from strapdown.units import DEGREE
 
 RATE = 200.0
@@ -556,6 +557,38 @@ def test_sigma_holds_on_broad_trials(broad):
             _, score = hand_held.ours(recording, None, smooth=smooth)
             assert score.coverage[0] > 0.9, (number, smooth, score)
             assert score.errors[0] < score.sigma < 4.0 * score.errors[0], (number, smooth, score)
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_the_inclinations_sigma_is_neither_too_small_nor_too_large(broad, smooth):
+    """The 95 % regions of the inclination, as recorded, over slow and fast motion."""
+    held = [hand_held.ours(read(file), None, smooth=smooth)[1].coverage[2] for file in sorted(broad.glob("*.hdf5"))]
+    assert 0.92 < np.mean(held) < 0.985, held
+    assert min(held) > 0.8, held
+
+
+def test_the_tilts_sigma_follows_the_level_of_the_acceleration():
+    """The share of the modelled variance that is left, in closed form: of no acceleration, and after a turn that is uncertain."""
+    steps, interval = 4000, 0.03
+    time = interval * np.arange(steps + 1)
+    seen = Innovations(time=time[1:], innovation=np.zeros((steps, 3)), variance=np.ones((steps, 3)))
+    nothing = np.zeros((steps + 1, 6))
+    still = Estimate(
+        time=time,
+        attitude=np.tile([1.0, 0.0, 0.0, 0.0], (steps + 1, 1)),
+        bias=nothing[:, :3],
+        variance=nothing + 1.0,
+        innovations={"accelerometer": seen},
+    )
+    uncertain = np.arange(steps) == 2999
+    share = estimating._tilt_scale(still, uncertain) ** 2
+    own, level = estimating.OWN_SHARE, estimating.ACCELERATION_SHARE
+    since = np.minimum(time, np.where(time >= time[3000], time - time[3000], np.inf))
+    expected = own + level * np.exp(-0.5 * since / estimating.LEVEL_TIME)
+    np.testing.assert_allclose(share, expected, rtol=1e-9)
+    moved = dataclasses.replace(seen, innovation=np.ones((steps, 3)))
+    as_modelled = dataclasses.replace(still, innovations={"accelerometer": moved})
+    np.testing.assert_allclose(estimating._tilt_scale(as_modelled, uncertain) ** 2, own + level, rtol=1e-12)
 
 
 def test_a_disturbed_field_leaves_the_heading_of_a_recording(broad):

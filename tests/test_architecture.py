@@ -28,7 +28,7 @@ STRANGERS = (("motion", "coning"),)
 
 DRAWING = ("plots", "report")
 PRINTING = ("cli", "__main__")
-MACHINES = ("kernels.machine", "kernels.lanes", "kernels.packed")
+MACHINES = ("kernels.machine", "kernels.lanes", "kernels.packed", "kernels.compiler", "kernels.tracing")
 """Kernel modules that know of compilers; all others are plain Python."""
 
 
@@ -263,9 +263,6 @@ def test_help_loads_neither_compiler_nor_plots(option):
 
 def test_modules_load_neither_compiler_nor_plots():
     """All but the drawing ones, in one process: numba and matplotlib come when first needed."""
-    extends_the_compiler = {
-        "kernels.lanes",
-        "kernels.packed",
-    }  # loaded by kernels.machine alone, when a kernel is compiled over lanes
+    extends_the_compiler = {*MACHINES} - {"kernels.machine"}  # loaded by that one, when a kernel is compiled
     names = sorted(n for n in sources() if n and unit(n) not in DRAWING and n not in extends_the_compiler)
     assert not loaded_by(EACH.format(names)) & {"numba", "llvmlite", "matplotlib"}

@@ -54,7 +54,7 @@ def test_uneven_intervals_are_corrected_for(stamps, name, times, gain):
     edges = STAMPS[stamps]
     corrected = error(name, edges)
     assert corrected < times * error(name, EVEN)
-    assert gain * corrected < error(name, edges, corrected=False)
+    assert gain * corrected < error(name, edges, with_edges=False)
 
 
 def test_two_samples_have_the_known_closed_form():

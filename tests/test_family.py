@@ -1380,7 +1380,7 @@ def anees(name, kind, form, runs, factor):
 @pytest.mark.parametrize("name", [name for name in filters.FILTERS if name != "usque"])
 @pytest.mark.parametrize(("kind", "form"), SHARPEST)
 def test_consistent_for_every_kind(name, kind, form):
-    """ANEES inside its two-sided bounds (99.9 % each, there are many); above them when it is modelled at a third of what it is."""
+    """ANEES inside its two-sided bounds (99.9 % each); above them when the noise is modelled at a third of what it is."""
     # A bias that is not estimated counts by its draw alone, which no measurement changes: that wants more runs.
     runs = 100 if name == "schmidt" else 25
     right, doubted = (anees(name, kind, form, runs, factor) for factor in (1.0, 1.0 / 3.0))

@@ -263,11 +263,57 @@ def test_every_body_defines_all_that_is_left_open_with_the_same_arguments(parts)
 def test_a_literal_argument_compiles_no_helper_twice():
     module = module_of(
         "literals",
-        "def product(n, x):\n    return n * x\n"
+        "def product(n, x):\n    return n * x if x > 0.0 else x\n"
         "def both(n, x):\n    return product(3, x) + product(n, x) + product(n=4, x=x)\n",
     )
     assert plain_kernels.called(module.both)(5, 1.5) == 18.0
-    assert len(machine.helper(module.product, ()).signatures) == 1
+    assert len(machine.helper(module.product, ()).formula.plain.signatures) == 1
+
+
+FORMULAS = """
+import math
+from typing import NamedTuple
+
+class Pair(NamedTuple):
+    first: float
+    second: float
+
+def product(a, b):
+    return a * b, -b, 2.0 / a
+
+def formula(a, i, row):
+    both = Pair(first=product(b=i, a=a)[0], second=math.sqrt(abs(a)))
+    row[i, 0], row[0, 1] = both
+    below = row[0, 1] < a
+    return (both, row[i, 0] + math.cos(0.0)), below
+
+def branch(a):
+    return a if a > 0.0 else product(a, a)[0]
+
+def loop(a, n):
+    for _ in range(n):
+        a = a + 1.0
+    return a
+
+def part(row, i):
+    return row[i]
+
+def everything(a, n, row):
+    (both, more), below = formula(a, 1, row)
+    return both.second, more, below, branch(a), loop(a, n), part(row, 1)[0]
+"""
+
+
+def test_formulas_are_traced_and_what_decides_or_repeats_is_compiled():
+    module = module_of("formulas", FORMULAS)
+    here, there = np.zeros((2, 2)), np.zeros((2, 2))
+    for a in (2.25, -0.5):
+        assert plain_kernels.called(module.everything)(a, 3, here) == module.everything(a, 3, there)
+        np.testing.assert_array_equal(here, there)
+    for name in ("product", "formula"):
+        assert not machine.helper(getattr(module, name), ()).formula.plain.signatures
+    for name in ("branch", "loop", "part"):
+        assert len(machine.helper(getattr(module, name), ()).formula.plain.signatures) == 1
 
 
 # ---------------------------------------------------------------------------------------------------- what it runs on

@@ -364,6 +364,21 @@ def test_the_command_computes_prints_and_writes(command):
     assert held.plan.epochs == 80
 
 
+def test_the_command_matches_the_filter_to_a_data_sheet(command):
+    """``--gyro`` changes the filter alone; the file is named after that of the scenario, whatever name the scenario has."""
+    Path("other.toml").write_text(Path("short.toml").read_text(), encoding="utf-8")
+    sheet = "[gyro]\nangle_random_walk_deg_per_sqrt_hour = 0.9\nrate_random_walk_deg_per_hour_per_sqrt_hour = 6.0\n"
+    Path("gyro.toml").write_text(sheet, encoding="utf-8")
+    assert command("other.toml", "--runs", 4, "--no-states", "--gyro", "gyro.toml", *SCALAR)[0] in (1, 2)
+    plan = campaign.read("other-montecarlo.h5").plan
+    assert plan.scenario.gyro == SCENARIO.gyro
+    assert plan.setup.process_noise.angle_random_walk == pytest.approx(0.9 * np.pi / 10800.0)
+    assert plan.setup.process_noise.rate_random_walk == pytest.approx(6.0 * np.pi / 180.0 / 3600.0 / 60.0)
+    status, _, error = command("short.toml", "--gyro", "gyro.toml", "--filter", "filter.toml")
+    assert status == 2
+    assert "--gyro and --filter both give" in error
+
+
 def test_the_command_resumes_extends_and_shows(command):
     assert command("short.toml", "--runs", 20, *SCALAR)[0] == 2
     status, _, error = command("short.toml", "--runs", 20, *SCALAR)

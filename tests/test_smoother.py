@@ -1287,3 +1287,90 @@ def test_what_is_no_argument_is_refused_by_name(name):
     record, noise, initial = (wrong.pop(one) for one in ("record", "process_noise", "initial"))
     with pytest.raises(InputError, match=name):
         estimation.smooth(record, noise, initial, **wrong)
+
+
+# ----------------------------------------------------------------------------------------------------------- sigmas of any magnitude
+
+
+def linear_sigma(dt, measured, arw, rrw, attitude_sigma, bias_sigma, sigma):
+    """σ of angle and bias about one axis at rest at each edge, in 70 digits: Kalman filter and Rauch–Tung–Striebel smoother."""
+    with mpmath.workdps(70):
+        dt, arw, rrw, sigma = (mpmath.mpf(float(x)) for x in (dt, arw, rrw, sigma))
+        F = mpmath.matrix([[1, -dt], [0, 1]])
+        Q = mpmath.matrix(
+            [[arw**2 * dt + rrw**2 * dt**3 / 3, -(rrw**2) * dt**2 / 2], [-(rrw**2) * dt**2 / 2, rrw**2 * dt]]
+        )
+        P = mpmath.diag([mpmath.mpf(attitude_sigma) ** 2, mpmath.mpf(bias_sigma) ** 2])
+        filtered = []
+        for k, seen in enumerate(measured):
+            P = F * P * F.T + Q if k else P
+            P = P - P[:, 0] * P[0, :] / (P[0, 0] + sigma**2) if seen else P
+            filtered.append(P)
+        found = [P]
+        for before in reversed(filtered[:-1]):
+            ahead = F * before * F.T + Q
+            G = before * F.T * ahead**-1
+            P = before + G * (P - ahead) * G.T
+            found.append(P)
+        return np.array([[float(mpmath.sqrt(P[i, i])) for i in range(2)] for P in reversed(found)])
+
+
+def test_sigmas_of_any_magnitude_are_smoothed_right() -> None:
+    """Noise, start and measurements over up to 22 decades; the body rests and is measured alike about each axis."""
+    rng = np.random.default_rng(11)
+    far, refused = 0, 0
+    for _ in range(100):
+        (dt, arw, rrw, sigma), n = 10.0 ** rng.uniform([-3, -18, -18, -12], [0, 0, 0, 0]), int(rng.integers(2, 7))
+        attitude_sigma, bias_sigma = 10.0 ** rng.uniform([-14, -22], [0, 0.5])
+        time, measured = np.arange(n + 1) * dt, rng.random(n + 1) < 0.5
+        at = time[measured]
+        series = tuple(
+            VectorMeasurements(
+                sensor=str(k),
+                kind="vector",
+                time=at,
+                vector_b=np.tile(axis, (len(at), 1)),
+                reference_f=axis,
+                sigma=np.full(len(at), np.sqrt(2.0) * sigma),  # each shows two of three axes
+            )
+            for k, axis in enumerate(np.eye(3))
+        )
+        record = ImuRecord(time=time, increments=np.zeros((n, 3)), vectors=series if len(at) else ())
+        noise = ProcessNoise(angle_random_walk=arw, rate_random_walk=rrw)
+        start = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=attitude_sigma, bias_sigma=bias_sigma)
+        try:
+            found = estimation.smooth(record, noise, start)
+        except InputError as error:
+            assert "no digits left" in str(error)  # noqa: PT017
+            assert min(attitude_sigma, bias_sigma) < 1e-12 * max(arw, rrw, bias_sigma)
+            refused += 1
+            continue
+        right = linear_sigma(dt, measured, arw, rrw, attitude_sigma, bias_sigma, sigma)
+        np.testing.assert_allclose(found.sigma, np.repeat(right, 3, axis=1), rtol=1e-3)
+        assert np.isfinite(found.attitude).all()
+        far += right[:, 0].max() > 1e6 * right[:, 0].min()
+    assert far > 10
+    assert refused < 15
+
+
+def test_a_filter_that_diverges_is_an_error() -> None:
+    """From a start that is off by a radian, measurements to 1e-12 rad: rates without end."""
+    time, rate = np.arange(41) * 1e-3, np.array([0.1, -0.2, 0.3])
+    at = time[3::4]
+    attitude = quaternion.exp(at[:, None] * rate)
+    series = VectorMeasurements(
+        sensor="field",
+        kind="vector",
+        time=at,
+        vector_b=quaternion.rotate(quaternion.conjugate(attitude), DOWN),
+        reference_f=DOWN,
+        sigma=np.full(len(at), 1e-12),
+    )
+    record = ImuRecord(time=time, increments=np.tile(1e-3 * rate, (40, 1)), vectors=(series,))
+    start = quaternion.exp(0.6 * np.random.default_rng(21).standard_normal(3))
+    initial = estimation.initial_state(start, attitude_sigma=1.7, bias_sigma=0.04)
+    noise = ProcessNoise(angle_random_walk=1e-16, rate_random_walk=1e-15)
+    with pytest.raises(InputError, match=r"diverged before 0\.011 s"):
+        estimation.run(record, noise, initial)
+    with pytest.raises(InputError, match="lost its way"):
+        estimation.smooth(record, noise, initial)

@@ -112,7 +112,7 @@ def test_plan_says_how_long_a_record_is_needed(run, tmp_path, record):
         (("--holdout", "1.5"), "between 0 and 1"),
         (("--holdout", "0.3", "--holdout-by", "week"), "holdout-by 'week'"),
         (("--out", "filter.json"), ".toml"),
-        (("--truth", "--spacing", "1"), "leave it away"),
+        (("--truth", "--spacing", "1"), "leave it out"),
         (("--prior", "no-such-gyro"), "no-such-gyro"),
         (("--integration", "five"), "five"),
         (("--plan", "--length", "100;300"), "seconds with commas"),

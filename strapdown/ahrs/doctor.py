@@ -58,15 +58,22 @@ FRAMES: dict[str, Array] = {
 }
 """Fixed frames, and what takes their components to East-North-Up."""
 
+
+def _unit(fault: str, taken: str, sensor: str, unit: str) -> str:
+    """Return a wrong unit with its remedy."""
+    return f"{fault} ({taken}: --{sensor}-unit {unit}; units={{{sensor!r}: {unit!r}}} in Python)"
+
+
 GYRO_UNITS: dict[str, float] = {
     "": 1.0,
-    "gyro rates are 57.3 times too large (deg/s taken for rad/s: --gyro-unit deg/s)": math.pi / 180.0,
-    "gyro rates are 57.3 times too small (rad/s taken for deg/s: --gyro-unit rad/s)": 180.0 / math.pi,
+    _unit("gyro rates are 57.3 times too large", "deg/s taken for rad/s", "gyro", "deg/s"): math.pi / 180.0,
+    _unit("gyro rates are 57.3 times too small", "rad/s taken for deg/s", "gyro", "rad/s"): 180.0 / math.pi,
 }
 FORCE_UNITS: dict[str, float] = {
     "": 1.0,
-    "specific force is 9.81 times too small (g taken for m/s²: --accelerometer-unit g)": STANDARD_GRAVITY,
-    "specific force is 9.81 times too large (m/s² taken for g: --accelerometer-unit m/s2)": 1.0 / STANDARD_GRAVITY,
+    _unit("specific force is 9.81 times too small", "g taken for m/s²", "accelerometer", "g"): STANDARD_GRAVITY,
+    _unit("specific force is 9.81 times too large", "m/s² taken for g", "accelerometer", "m/s2"): 1.0
+    / STANDARD_GRAVITY,
 }
 
 PENALTY = 5.0
@@ -280,17 +287,18 @@ def at_rest(recording: Recording) -> list[str]:
             f"the field points {-dip / DEGREE:.0f}° upward by the accelerometer, as south of the magnetic equator only"
         )
         if upward > DOWN:
-            return [f"{field}; elsewhere the magnetometer is inverted (--invert magnetometer)"]
+            return [f"{field}; elsewhere the magnetometer is inverted (--invert magnetometer; invert= in Python)"]
         return [
-            f"{reads}, and {field}; elsewhere the accelerometer is inverted, as those of iPhones (--invert accelerometer)"
+            f"{reads}, and {field}; elsewhere the accelerometer is inverted, as those of iPhones "
+            "(--invert accelerometer; invert= in Python)"
         ]
     if upward >= -DOWN:
         return []
     where = " south of the magnetic equator" if dip is not None and dip > MIN_DIP else ""
     return [
-        f"{reads}: the body's z axis points down (--axes x,-y,-z reads forward-right-down axes as forward-left-up ones; --frame ned keeps "
-        f"them and gives the output in North-East-Down), or the unit lies upside down, or{where} the accelerometer is inverted "
-        "(--invert accelerometer)"
+        f"{reads}: the body's z axis points down (--axes x,-y,-z, axes= in Python, reads forward-right-down as forward-left-up; "
+        f"--frame ned keeps them and gives the output in North-East-Down), or the unit lies upside down, or{where} the accelerometer is "
+        "inverted (--invert accelerometer; invert= in Python)"
     ]
 
 
@@ -404,9 +412,10 @@ def _means(recording: Recording, attitude: Array, vectors: Array, strength: floa
     if len(chosen) == 0:
         return _Means(product=np.empty((0, 3, 3, 3)))
     used = seen & np.isin(window, chosen)
-    products = np.einsum("kab,kc->kabc", quaternion.to_matrix(q[used]), v[used])
-    sums = np.add.reduceat(products, np.flatnonzero(np.diff(window[used], prepend=-1)), axis=0)
-    return _Means(product=sums / counts[chosen, None, None, None])
+    begin = np.flatnonzero(np.diff(window[used], prepend=-1))[1:]
+    turned, taken = quaternion.to_matrix(q[used]).reshape(-1, 9), v[used]
+    sums = [R.T @ w for R, w in zip(np.split(turned, begin), np.split(taken, begin), strict=True)]
+    return _Means(product=np.reshape(sums, (-1, 3, 3, 3)) / counts[chosen, None, None, None])
 
 
 def _strength(vectors: Array) -> float:
@@ -531,12 +540,12 @@ def _combined(common: tuple[str, ...], parts: dict[str, _Fits]) -> Iterator[Cand
 @functools.cache
 def _axes_change(name: str, k: int) -> str:
     if np.array_equal(AXES[k], -np.eye(3)):
-        return f"axes of the {name} are inverted" + (f" (--invert {name})" if name != "whole unit" else "")
+        return f"axes of the {name} are inverted" + (
+            f" (--invert {name}; invert= in Python)" if name != "whole unit" else ""
+        )
     words = axes_words(AXES[k])
     option = words.replace("−", "-").replace(" ", "")
-    return (
-        f"axes of the {name} should be read as ({words}) (--axes {'' if name == 'whole unit' else f'{name}='}{option})"
-    )
+    return f"axes of the {name} should be read as ({words}) (--axes {'' if name == 'whole unit' else f'{name}='}{option}; axes= in Python)"
 
 
 def _candidate(changes: tuple[str, ...], misfit: dict[str, float], kind: str = "reference") -> Candidate:

@@ -561,7 +561,7 @@ def _errors(result: Estimate, truth: Any) -> dict[str, float]:
 
 def _estimate_recording(recording: Path, shared: _Shared, options: _Recorded, output: _Output) -> None:
     """Run the filter over a recording: accelerometer as the vertical, magnetometer as the heading."""
-    from strapdown import ahrs, recordings, workflows
+    from strapdown import ahrs, recordings
     from strapdown.checks import non_negative, one_of
     from strapdown.consistency import reference_errors
     from strapdown.gyro import read_spec
@@ -578,6 +578,8 @@ def _estimate_recording(recording: Path, shared: _Shared, options: _Recorded, ou
     doubt(source, recording)
     parameters = ahrs.MOTIONS[options.motion]
     if shared.gyro is not None:
+        from strapdown import workflows  # which imports much more
+
         parameters = workflows.with_gyro_noise(parameters, read_spec(shared.gyro))
     if warm is not None:
         source, walk = warm.applied(source)

@@ -56,7 +56,12 @@ def scenarios() -> None:
 @app.command()
 def simulate(
     scenario: Annotated[str, typer.Argument(help="Name of a built-in scenario, or a TOML file.")],
-    out: Annotated[Path | None, typer.Option(help="HDF5 file, or CSV by its suffix; NAME.h5 if not given.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="HDF5 file, or CSV by its suffix; by default .h5 after the name, or the TOML file, of the scenario."
+        ),
+    ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed; the scenario's own if not given.")] = None,
     run: Annotated[int, typer.Option(help="Number of the run of this seed.")] = 0,
     show: Annotated[
@@ -73,7 +78,7 @@ def simulate(
         console.print(toml)
         return
     used = chosen.seed if seed is None else seed
-    target = out or Path(f"{chosen.name or Path(scenario).stem}.h5")
+    target = out or Path(f"{Path(scenario).stem}.h5")
     writable("out", target, suffixes=(".h5", ".hdf5", ".csv"), sources=(scenario,))
     beside = [target.with_name(f"{target.stem}-vectors-{number}.csv") for number in range(len(chosen.sensors))]
     writable("out", *(beside if target.suffix.lower() == ".csv" else ()))

@@ -180,14 +180,14 @@ def tune(
     if algorithm is not None:
         before = replace(before, integration=algorithm)
     train, held = (tuple(cases), ()) if holdout is None else tuning.split(cases, holdout, _by(holdout_by))
+    if names == []:
+        raise _refusal(f"--free is {free!r} and names no parameter; name some, or leave it out")
     wanted = [name for name in names or [] if name not in tuning.GATED]
     wanted = wanted or list(tuning.default_names([case.record for case in cases]))
     if chosen is None or any(name.startswith(("gyro.", "filter.")) for name in wanted):
         tuning.one_gyro(gyros)
     if prior is None and prior_factor != PRIOR_FACTOR:
         raise _refusal("--prior-factor goes with --prior, the noise that it is about")
-    if names == []:
-        raise _refusal(f"--free is {free!r} and names no parameter; name some, or leave it out")
     priors = {} if prior is None else _priors(prior, prior_factor, train[0].record, wanted)
     with progress_bar("searches, intervals", starts + len(wanted)) as advance:
         result, objective, found = tuning.tune(
@@ -202,19 +202,16 @@ def tune(
             progress=advance,
             **goal._asdict(),
         )
-    with progress_bar("judging on the data held out"):
-        comparison = tuning.compare(held, before, result.setup, threads=workers) if held else None
-    if comparison is not None and goal.gate:
-        likely = tuning.log_likelihood(held, objective, result)  # type: ignore[arg-type]
-        comparison = replace(comparison, after=replace(comparison.after, log_likelihood=likely))
+    comparison = _compared(held, before, objective, result, workers, gated=goal.gate)
     examined, worst = _examined(train, before, result)
     if worst is not None:
         result = tuning.doubted(result, worst)
     _print_result(result, [case.record for case in cases])
     if found is not None:
         _print_gate(found)
-    for sentence in () if worst is None else worst.words:
-        console.print(sentence)
+    if worst is not None:
+        for sentence in worst.words:
+            console.print(sentence)
     if comparison is not None:
         _print_comparison(comparison, truth=goal.by_errors)
     _write(
@@ -292,6 +289,22 @@ def _check_files(
     tables_folder(tables)
     for target in (out, report):
         need_own(target, "tune", lambda _: bool(tunings.read(report)))
+
+
+def _compared(
+    held: Sequence[Case], before: FilterSetup, objective: Any, result: Tuning, threads: int, *, gated: bool
+) -> Comparison | None:
+    """Return the filter before and after on the data held out, if any; ``gated``: the likelihood after is that with the gate."""
+    from strapdown import tuning
+
+    if not held:
+        return None
+    with progress_bar("judging on the data held out"):
+        comparison = tuning.compare(held, before, result.setup, threads=threads)
+    if not gated:
+        return comparison
+    likely = tuning.log_likelihood(held, objective, result)
+    return replace(comparison, after=replace(comparison.after, log_likelihood=likely))
 
 
 def _examined(train: Sequence[Case], before: FilterSetup, result: Tuning) -> tuple[list[Unmodelled], Unmodelled | None]:

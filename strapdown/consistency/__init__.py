@@ -1,19 +1,13 @@
 """Consistency: does a filter's covariance agree with its errors? Statistics with known error rates, and a verdict.
 
-``manifold``
-    The error of an estimate and its normalised square (NEES), for any subset of the states.
-``bounds``
-    Exact two-sided bounds of averages over independent runs: ANEES and NIS, log-NEES, coverage.
-``whiteness``
-    What innovations should be: white, normal, of mean zero, independent of other sensors'.
-``timeaverage``
-    Averages over the time of one run, whose errors are correlated: the effective sample size.
-``accuracy``
-    How large errors are: against a reference, against the Cramér–Rao bound, when they have settled, how they are distributed.
-``foreign``
-    The verdict on an estimate from elsewhere: clocks, frames and the reading of its covariance.
-``judgement``, ``runs``
-    The verdict in words, with its evidence, at one stated probability of a false alarm: on one run, and on independent ones.
+- ``manifold``: The error of an estimate and its normalised square (NEES), for any subset of the states.
+- ``bounds``: Exact two-sided bounds of averages over independent runs: ANEES and NIS, log-NEES, coverage.
+- ``whiteness``: What innovations should be: white, normal, of mean zero, independent of other sensors'.
+- ``timeaverage``: Averages over the time of one run, whose errors are correlated: the effective sample size.
+- ``accuracy``: How large errors are: against a reference, against the Cramér–Rao bound, when they have settled, how they are distributed.
+- ``foreign``: The verdict on an estimate from elsewhere: clocks, frames and the reading of its covariance.
+- ``judgement``, ``runs``: The verdict in words, with its evidence, at one stated probability of a false alarm: on one run, and on
+  independent ones.
 """
 
 from strapdown.consistency.accuracy import Distribution as Distribution
@@ -34,7 +28,6 @@ from strapdown.consistency.manifold import SUBSETS as SUBSETS
 from strapdown.consistency.manifold import errors, nees
 from strapdown.consistency.manifold import whitened as whitened
 from strapdown.consistency.runs import judge_runs
-from strapdown.consistency.timeaverage import TimeAverage as TimeAverage
 from strapdown.consistency.timeaverage import time_average as time_average
 from strapdown.consistency.whiteness import Autocorrelation as Autocorrelation
 from strapdown.consistency.whiteness import QuantilePairs as QuantilePairs

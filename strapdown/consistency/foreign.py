@@ -352,7 +352,10 @@ def frame_probabilities(error: Array, readings: Mapping[str, Array]) -> dict[str
 def _frame_words(chosen: str, found: Mapping[str, float]) -> str:
     said = ", ".join(f"{name} {100.0 * p:.3g} %" for name, p in found.items())
     if found[chosen] < DECIDED:
-        return f"the errors do not decide how the covariance is meant ({said}): it is judged as {chosen}; --error-frame names another"
+        return (
+            f"the errors do not decide how the covariance is meant ({said}): it is judged as {chosen}; "
+            "--error-frame (error_frame= in Python) names another"
+        )
     return f"the covariance is read as {chosen} ({said}, found from the errors)"
 
 
@@ -410,7 +413,8 @@ def _at_common_times(own: _Series, theirs: _Series, offset: float) -> tuple[_Ser
     if good.sum() < 2:
         raise InputError(
             f"the estimate goes from {own.time[0] + offset:.6g} to {own.time[-1] + offset:.6g} s of the truth's clock, and the truth from "
-            f"{theirs.time[0]:.6g} to {theirs.time[-1]:.6g} s: they have no two times in common; give both of one clock, or --align time"
+            f"{theirs.time[0]:.6g} to {theirs.time[-1]:.6g} s: they have no two times in common; "
+            "give both of one clock, or --align time (align= in Python)"
         )
     return (
         _Series(
@@ -463,7 +467,7 @@ def _initial_rotations(own: _Series, theirs: _Series, offset: float) -> list[tup
 
     def fixed_of(body: Array) -> Array:
         turns = quaternion.multiply(truth.attitude, quaternion.conjugate(quaternion.multiply(matched.attitude, body)))
-        return quaternion.mean(turns)[0]
+        return quaternion.from_rotation(quaternion.to_rotation(turns).mean())
 
     found = [(identity, identity), (fixed_of(identity), identity)]
     _, w_own = _rates(matched)

@@ -492,8 +492,8 @@ def concluded(
 ) -> Judgement:
     """Return the verdict that findings lead to, all taken together; what each was before, rejected or not, does not count.
 
-    ``states`` are those of the filter, whose power is reported; ``needed`` those whose σ the tests must be able to see for "consistent"
-    (without any the sharpest test decides); ``unmodelled`` errors that the filter has no state for.
+    ``states`` are those of the filter, whose power is reported; ``needed`` those of them whose σ the tests must be able to see for
+    "consistent" (without any the sharpest test decides); ``unmodelled`` errors that the filter has no state for.
     """
     marked = holm(findings, 1.0 - probability)
     kept = sum(not one.rejected for one in marked)

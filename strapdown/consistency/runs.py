@@ -165,7 +165,8 @@ def judge_runs(
                 means=innovation_words(sensor, mean),
             )
         )
-    return concluded(findings, [], probability, needed=STATES, unmodelled=unmodelled)
+    tested = [name for name in STATES if name in statistics.subsets]
+    return concluded(findings, [], probability, states=tested, needed=tested, unmodelled=unmodelled)
 
 
 def _at(statistics: RunStatistics, epochs: np.ndarray, worst: int) -> str:

@@ -8,6 +8,7 @@ part of the kernel's. And types of operators are resolved once, not at each plac
 from __future__ import annotations
 
 import gc
+import operator
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, ClassVar
@@ -63,10 +64,15 @@ class _Typing:
         builtin = function if isinstance(function, types.Type) else context._lookup_global(function)
         if kws or type(builtin) is not types.Function:
             return context.resolve_function_type(function, args, kws)
+        if getattr(builtin.typing_key, "__module__", "") == "_operator" and not isinstance(args[0], types.BaseTuple):
+            args = tuple(map(types.unliteral, args))  # numbers' and arrays' operators do not look at literals
         signatures = self._known.setdefault(id(builtin), (builtin, {}))[1]
         if args not in signatures:
             signatures[args] = context.resolve_function_type(function, args, kws)
         return signatures[args]
+
+    def resolve_setitem(self, target: types.Type, index: types.Type, value: types.Type) -> Any:
+        return self.resolve_function_type(operator.setitem, (target, index, value), {})
 
 
 class KernelCompiler(Compiler):  # type: ignore[misc]

@@ -111,6 +111,7 @@ def helper(function: FunctionType, parts: tuple[ModuleType, ...] = ()) -> Any:
     import numba
 
     from strapdown.kernels.compiler import HelperCompiler
+    from strapdown.kernels.tracing import traced
 
     if function.__module__ == f"{PACKAGE}.lane_values":
         from strapdown.kernels.lanes import INTRINSICS
@@ -119,13 +120,9 @@ def helper(function: FunctionType, parts: tuple[ModuleType, ...] = ()) -> Any:
     called = function.__name__ in function.__globals__.get("CALLED", ())
     # Nothing calls it from Python or C: without those two wrappers it compiles in two thirds of the time.
     options = {"forceinline": not called, "no_cpython_wrapper": True, "no_cfunc_wrapper": True, **_options(function)}
-    plain = _without_literals(numba.njit(pipeline_class=HelperCompiler, **options)(_twin(function, parts)))
-    if function.__module__ == f"{PACKAGE}.algebra":
-        from strapdown.kernels.packed import PACKED, packed
-
-        if function.__name__ in PACKED:
-            return packed(function.__name__, plain)
-    return plain
+    twin = _twin(function, parts)
+    plain = _without_literals(numba.njit(pipeline_class=HelperCompiler, **options)(twin))
+    return traced(twin, plain, called=called)
 
 
 @functools.cache

@@ -227,7 +227,8 @@ def run(
     table = plan.to_table()
     if target.exists() and not resume and not overwrite:
         raise InputError(
-            f"{target} exists; go on with it (--resume), write over it (--overwrite), or choose another name (--out)"
+            f"{target} exists; go on with it (--resume; resume=True in Python), write over it (--overwrite; overwrite=True), or choose "
+            "another name"
         )
     chosen = choose(plan, machine)
     with locked(target):

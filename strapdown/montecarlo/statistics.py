@@ -154,6 +154,8 @@ class Statistics(Listed):
         The filter's own σ in these runs, rad and rad/s.
     """
 
+    _drawn_by = "runs_overview"
+
     time: Array
     runs: int
     finite: Counts

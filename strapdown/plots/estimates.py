@@ -106,22 +106,7 @@ def unbroken(time: Array, angle: Array) -> tuple[Array, Array]:
 
 
 def estimate_overview(estimate: Estimate, *, title: str = "", fixed_frame: str = "") -> Figure:
-    """Draw roll, pitch and yaw (sequence Z-Y-X), the gyro bias in its ±3σ, and the attitude's σ over time.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        Attitude and bias with their σ.
-    title : str
-        What was estimated.
-    fixed_frame : str
-        As :func:`angle_labels` takes it.
-
-    Returns
-    -------
-    Figure
-        Five panels over one time axis.
-    """
+    """Draw roll, pitch and yaw (sequence Z-Y-X), the gyro bias in its ±3σ, and the attitude's σ over time."""
     figure, axes = new_figure(5, 1, size=(9.0, 10.0), sharex=True, height_ratios=(1.0, 1.0, 1.0, 1.7, 1.3))
     euler = quaternion.to_rotation(estimate.attitude).as_euler("ZYX", degrees=True)[:, ::-1]
     for ax, angle, name in zip(axes, euler.T, angle_labels(fixed_frame), strict=False):

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from strapdown.checks import Array
@@ -23,6 +24,7 @@ from strapdown.plots.style import (
     ink,
     layered,
     legend_above,
+    new_figure,
     rate_unit,
 )
 
@@ -103,6 +105,25 @@ def nis_over_time(
 
 STATES = tuple(f"{what} {axis}" for what in ("attitude", "bias") for axis in AXES)
 """Names of the six states of the error (δθ, δb)."""
+
+
+def runs_overview(statistics: Statistics, probability: float = 0.99) -> Figure:
+    """Draw ANEES of attitude and bias, and the NIS, over time, with the bounds of a consistent filter."""
+    figure, axes = new_figure(1, 3, size=(12.0, 4.2))
+    axes[1].set_visible(statistics.has_bias)
+    bounds = mean_bounds(3, statistics.runs, probability)
+    label = f"{100 * probability:g} % bounds, each epoch"
+    low, high = np.nanmin(statistics.anees), np.nanmax(statistics.anees)
+    for ax, subset in zip(axes, ("attitude", "bias") if statistics.has_bias else ("attitude",), strict=False):
+        nees_over_time([("all runs", statistics)], bounds, subset, ax, label=label)
+        ax.set_ylim(min(0.5, 0.8 * float(low)), max(2.0, 1.3 * float(high)))
+        legend_above(ax)
+    if statistics.sensor_degrees.sum() > 0:
+        nis_over_time([("all runs", statistics)], axes[2], probability=probability)
+        legend_above(axes[2])
+    else:
+        axes[2].set_visible(False)
+    return figure
 
 
 def state_unit(state: int, value: Array) -> tuple[str, float]:

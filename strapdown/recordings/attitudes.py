@@ -89,14 +89,17 @@ def _own(path: Path) -> Attitudes:
     kind = str(records.read_attributes(path)["kind"])
     if kind == "strapdown estimate":
         estimate = records.read_estimate(path)
+        size = 6 if estimate.has_bias else 3
         P = estimate.covariance
+        if P is None:
+            P = np.apply_along_axis(np.diag, 1, estimate.variance)
         return Attitudes(
             source=path.name,
             stamps_ns=_whole_ns(estimate.time),
             attitude=quaternion.normalize(estimate.attitude),
-            covariance=P if P is not None else np.apply_along_axis(np.diag, 1, estimate.variance),
+            covariance=P[:, :size, :size],
             error_frame="body",
-            bias=estimate.bias,
+            bias=estimate.bias if estimate.has_bias else None,
             innovations=estimate.innovations,
         )
     if recordfiles.is_record(path):
@@ -306,7 +309,9 @@ def _topic(name: str, found: Mapping[str, Any], topic: str) -> str:
         return one_of(f"{name}: topic", topic, found)
     if len(found) > 1:
         listed = ", ".join(f"{t} ({c.msgtype.rpartition('/')[2]}, {c.msgcount} messages)" for t, c in found.items())
-        raise InputError(f"{name} has several topics with orientations: {listed}; choose one by --topic")
+        raise InputError(
+            f"{name} has several topics with orientations: {listed}; choose one by --topic (topic= in Python)"
+        )
     return next(iter(found))
 
 
@@ -370,7 +375,7 @@ def _ulog(path: Path) -> Attitudes:
     return Attitudes(
         source=path.name,
         stamps_ns=stamps * 1000,
-        attitude=outputs.from_ned(ned),
+        attitude=outputs.to_ned(ned),
         covariance=covariance,
         error_frame="body" if covariance is not None and number == 24 else "",
         innovations=innovations,

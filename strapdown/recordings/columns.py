@@ -207,7 +207,7 @@ def _lacks(source: str, missing: Sequence[str], columns: Sequence[Column]) -> st
     has = ", ".join(one.name for one in columns)
     return (
         f"{source}: the header lacks {', '.join(missing)} (it has: {has}); name the columns, as in "
-        f"--columns {missing[0]}=NAME,…"
+        f"--columns {missing[0]}=NAME,… (columns= in Python)"
     )
 
 
@@ -284,7 +284,8 @@ def _guess(source: str, group: str, columns: Sequence[Column]) -> tuple[tuple[in
         said = " or ".join(columns[axes[0][0]].said for _, axes in whole)
         role = GROUPS[group][0]
         raise InputError(
-            f"{source}: the {group} may be that of {said}; say which, as in --columns {role}={columns[whole[0][1][0][0]].name},…"
+            f"{source}: the {group} may be that of {said}; say which, as in "
+            f"--columns {role}={columns[whole[0][1][0][0]].name},… (columns= in Python)"
         )
     if not whole:
         return None

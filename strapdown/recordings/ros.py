@@ -162,7 +162,9 @@ def _chosen(name: str, topics: Mapping[str, _Topic], topic: str) -> str:
         what = f"no message of {IMU}" + (f" on {listed}" if units else "")
         raise InputError(f"{name} holds {what}; give a bag of an inertial unit")
     if len(filled) > 1:
-        raise InputError(f"{name} has several inertial units: {listed}; choose one, --topic {filled[0]}")
+        raise InputError(
+            f"{name} has several inertial units: {listed}; choose one, --topic {filled[0]} (topic= in Python)"
+        )
     return filled[0]
 
 

@@ -51,7 +51,7 @@ class Delays:
             f"Samples are assumed to be stamped {late:.3g} ms late."
             if self.given
             else f"Samples are assumed to be stamped {late:.3g} ms late, half a sample interval, σ {1e3 * self.sigma:.2g} ms; "
-            "give --latency if it is known (0: point samples)."
+            "give --latency (latency= in Python) if it is known (0: point samples)."
         ]
         if field:
             side = "after" if field > 0.0 else "before"

@@ -85,7 +85,7 @@ def read_ulog(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
     if ATTITUDE in data and len(data[ATTITUDE]["timestamp"]) > 1:
         at, kept, words = _stamps(ATTITUDE, data[ATTITUDE])
         ned = quaternion.normalize(_columns(data[ATTITUDE], "q", 4)[kept])
-        own["true_attitude"] = interpolated(time, (at * 1000 - epoch) / 1e9, outputs.from_ned(ned))
+        own["true_attitude"] = interpolated(time, (at * 1000 - epoch) / 1e9, outputs.to_ned(ned))
         remarks += [f"Reference: {ATTITUDE}, the vehicle's own estimate.", *words]
     return with_gyro(
         source=file.name, time=time, rate=rate, specific_force=force, epoch_ns=epoch, remarks=tuple(remarks), **own

@@ -398,6 +398,8 @@ class Estimate(Listed):
         Covariance of attitude and whole bias.
     """
 
+    _drawn_by = "estimate_overview"
+
     time: Array
     attitude: Array
     bias: Array
@@ -644,23 +646,9 @@ def write_estimate(
     *,
     truth: Truth | None = None,
 ) -> None:
-    """Write an estimate to HDF5, units and conventions as attributes; the file appears whole or not at all.
+    """Write an estimate, and the truth at its times if given, to HDF5; the file appears whole or not at all.
 
-    Parameters
-    ----------
-    path : path-like
-        File.
-    estimate : Estimate
-        Estimate. Values and variances of error states are written (:func:`read_states`); a whole covariance is not.
-    attributes : mapping of str, optional
-        Further attributes of the file.
-    truth : Truth, optional
-        Truth at the times of the estimate, so that the file can be judged on its own.
-
-    Raises
-    ------
-    InputError
-        If the truth has another number of rows than the estimate, or the file cannot be written.
+    Values and variances of error states are written (:func:`read_states`); a whole covariance is not.
     """
     if truth is not None and len(truth.attitude) != len(estimate.time):
         raise InputError(
@@ -771,23 +759,10 @@ def read_truth(path: str | os.PathLike[str]) -> Truth | None:
 
 
 def read_estimate(path: str | os.PathLike[str]) -> Estimate:
-    """Read an estimate written by :func:`write_estimate`.
+    """Read an estimate written by :func:`write_estimate`, without its error states (:func:`read_states`).
 
-    Parameters
-    ----------
-    path : path-like
-        File.
-
-    Returns
-    -------
-    Estimate
-        The estimate without its error states (:func:`read_states`).
-
-    Raises
-    ------
-    InputError
-        If the file is missing, truncated, not HDF5 or of another kind, or holds what no filter estimates: shapes that do not fit
-        each other, decreasing times, quaternions that are not of unit norm, variances of zero or less, biases above 1e6 rad/s.
+    What no filter estimates is refused: shapes that do not fit each other, decreasing times, quaternions that are not of unit norm,
+    variances of zero or less, biases above 1e6 rad/s.
     """
     with _estimate_file(path) as file:
         time = increasing(_place(file, "time"), _numbers(file, "time", ("n",)))

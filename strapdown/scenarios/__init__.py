@@ -32,7 +32,6 @@ __all__ = [
     "Scenario",
     "drawn",
     "load_scenario",
-    "scenario_to_toml",
     "simulate",
 ]
 
@@ -551,23 +550,7 @@ def scenario_to_table(scenario: Scenario) -> dict[str, Any]:
 
 
 def scenario_to_toml(scenario: Scenario) -> str:
-    """Return a scenario as TOML text; reading it gives the same scenario to the last bit.
-
-    Parameters
-    ----------
-    scenario : Scenario
-        Of motions, gyro and sensors of this package.
-
-    Returns
-    -------
-    str
-        Text of a file that :func:`load_scenario` reads, with the unit in each key.
-
-    Raises
-    ------
-    InputError
-        If a part is a Python function or of a class of your own, which has no form in a file.
-    """
+    """Return a scenario as TOML text, with the unit in each key; reading it gives the same scenario to the last bit."""
     import tomli_w
 
     text = tomli_w.dumps(scenario_to_table(scenario))

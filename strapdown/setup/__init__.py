@@ -37,11 +37,9 @@ __all__ = [
     "initial_state",
     "matched",
     "matched_to_record",
-    "observability",
     "read_setup",
     "run",
     "smooth",
-    "to_toml",
 ]
 
 ATTITUDE_SIGMA = 1.0 * units.DEGREE
@@ -528,27 +526,7 @@ def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any
 
 
 def observability(record: ImuRecord, setup: FilterSetup, initial: State) -> Observability:
-    """Return what a record shows of each state of this setup's filter (:func:`strapdown.estimation.observability`).
-
-    Parameters
-    ----------
-    record : ImuRecord
-        Gyro increments and measurements along which the filter is linearised.
-    setup : FilterSetup
-        Filter whose states, σ and integration algorithm are applied.
-    initial : State
-        State at the first edge, whose covariance is the prior.
-
-    Returns
-    -------
-    Observability
-        Singular values and directions, the prior σ of each state and what the record leaves of it.
-
-    Raises
-    ------
-    InputError
-        If the setup has a σ or a state for a sensor that the record does not have.
-    """
+    """Return what a record shows of each state of this setup's filter (:func:`strapdown.estimation.observability`)."""
     need_mekf(setup, "observability")
     modelled = modelled_record(record, setup)
     if setup.states is None:
@@ -692,18 +670,7 @@ def _part(table: Mapping[str, Any], name: str, place: str) -> Mapping[str, Any]:
 
 
 def to_toml(setup: FilterSetup) -> str:
-    """Return a setup as TOML text with the table ``[filter]``, units in the names of its keys.
-
-    Parameters
-    ----------
-    setup : FilterSetup
-        Setup to be written; of a filter of one's own only the description is.
-
-    Returns
-    -------
-    str
-        TOML text that :func:`read_setup` reads back from a file.
-    """
+    """Return a setup as TOML text with the table ``[filter]``, units in the names of its keys; :func:`read_setup` reads it back."""
     import tomli_w
 
     sensors = setup.sigma or (setup.states is not None and setup.states.sensors)

@@ -108,10 +108,11 @@ class Start(NamedTuple):
 
 
 def start(record: ImuRecord, chosen: FilterSetup) -> Start:
-    """Return the initial state from the first measurements of a record, as :func:`strapdown.setup.modelled_record` gives it to the filter.
+    """Return the initial state from the first measurements of a record.
 
-    Where one set of measurements does not give the attitude, or directions contradict each other, a bank of filters with different initial
-    attitudes finds it (:mod:`strapdown.estimation.multiple_model`), and the estimate starts where one of them is left.
+    They count as the filter models them (:func:`strapdown.setup.modelled_record`). Where one set of measurements does not give the
+    attitude, or directions contradict each other, a bank of filters with different initial attitudes finds it
+    (:mod:`strapdown.estimation.multiple_model`), and the estimate starts where one of them is left.
     """
     try:
         state = estimation.first_state(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
@@ -170,7 +171,9 @@ def _sigma_words(state: State) -> str:
 def drawn_start(record: ImuRecord, chosen: FilterSetup) -> Start:
     """Return the true initial state with errors drawn from the σ of the setup, by seed and run of the record's ``origin``."""
     if record.truth is None:
-        raise InputError("--from-truth needs a record with the truth; this one has none")
+        raise InputError(
+            "a start drawn about the truth (--from-truth) needs a record with its truth; this one has none"
+        )
     origin = record.origin or Origin()
     draw = generator(origin.seed or 0, origin.run or 0, "initial error").standard_normal(6)
     q = quaternion.multiply(record.truth.attitude[0], quaternion.exp(-chosen.attitude_sigma * draw[:3]))

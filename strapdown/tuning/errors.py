@@ -132,7 +132,7 @@ def error_objective(
         prepared = base.prepared[number]
         if prepared.true_attitude is None or not prepared.judged.any():
             raise InputError(
-                f"{case.name or 'record'} has no truth where it is to be judged; tune by the innovations instead (leave --truth away)"
+                f"{case.name or 'record'} has no truth where it is to be judged; tune by the innovations instead (leave truth out)"
             )
         known = np.flatnonzero(prepared.judged)
         epochs.append(_spread(base, number, known, measure))

@@ -501,6 +501,7 @@ def _profiled(
 
     ``swollen`` is how many times too fast it falls.
     """
+    from scipy.integrate import simpson
     from scipy.optimize import brentq
 
     centre = best.point[j]
@@ -541,11 +542,11 @@ def _profiled(
     if not identified and top is not None:
         # Mean of σ under the profile likelihood, every σ of zero or more alike: between nothing and the bound, never either.
         warm[:] = best.point
-        grid = np.linspace(0.0, 1.6 * upper, 17)
+        grid = np.linspace(0.0, 2.0 * upper, 17)
         with np.errstate(divide="ignore"):
             logs = np.log(grid)
         weight = np.array([np.exp(-0.5 * max(fallen(x if k else nothing), 0.0)) for k, x in enumerate(logs)])
-        value = float(np.sum(grid * weight) / np.sum(weight))
+        value = float(simpson(grid * weight, x=grid) / simpson(weight, x=grid))
     return _Known(lower=lower, upper=upper, mean=value, identified=identified)
 
 

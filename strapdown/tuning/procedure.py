@@ -56,14 +56,14 @@ def objective_for(
     """
     non_negative("spacing", spacing, unit="s")
     if rmse and truth:
-        raise InputError("--rmse and --truth both say which errors against the truth count; give one of them")
+        raise InputError("rmse and truth both say which errors against the truth count; give one of them")
     other = truth or rmse
     if spacing > 0.0 and other:
         raise InputError(
-            "--spacing thins the innovations of the likelihood; against a truth there are none to thin: leave it away"
+            "spacing thins the innovations of the likelihood; against a truth there are none to thin: leave it out"
         )
     if gate and (other or spacing > 0.0):
-        raise InputError("--gate needs the likelihood of all innovations: leave --truth, --rmse and --spacing away")
+        raise InputError("gate needs the likelihood of all innovations: leave truth, rmse and spacing out")
     by_axis = any(axis_of(name) for name in names)
     for whole, what in (
         (setup.states is None, "a filter with optional states"),
@@ -71,7 +71,7 @@ def objective_for(
     ):
         if not whole and (gate or other or spacing > 0.0):
             raise InputError(
-                f"{what} is tuned by the likelihood of all innovations: leave --gate, --truth, --rmse and --spacing away"
+                f"{what} is tuned by the likelihood of all innovations: leave gate, truth, rmse and spacing out"
             )
     if setup.states is not None or by_axis:
         return extended.likelihood(cases, setup, names, threads=threads)
