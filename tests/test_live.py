@@ -108,6 +108,7 @@ def test_late_measurements_lead_to_the_same_bits(states, option, shifts):
     initial = begun(record_of(), option)
     draw = generator(3, 0, "latency")
     latency = [draw.uniform(0.0, 0.2, len(series.time)) for series in record.vectors]
+    latency[-1][:] = 0.0  # in time, but last in the order of the sensors
     live = given_late(record, live_of(record, initial, blocks, look_back=0.25, **given), latency)
     problem = forward.prepared(record, NOISE, initial, blocks)
     options = forward.Options(factor=True, gate=given.get("gate"), robust=given.get("robust"))
@@ -216,6 +217,9 @@ def test_covariances_of_sensors():
     vectors = (
         VectorMeasurements(sensor="a", kind="direction", time=times, vector_b=z[0], reference_f=r[0], covariance=whole),
         VectorMeasurements(sensor="b", kind="direction", time=times, vector_b=z[1], reference_f=r[1], sigma=0.01),
+        VectorMeasurements(
+            sensor="c", kind="vector", time=times, vector_b=3.0 * z[1], reference_f=3.0 * r[1], covariance=whole
+        ),
     )
     record = ImuRecord(time=np.arange(6) / 10.0, increments=np.full((5, 3), 0.01), vectors=vectors)
     live = given_in_order(record, live_of(record, start()))

@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from strapdown import allan, gyro, recordings, scenarios
+from strapdown import allan, gyro, recordings, records, scenarios
 from strapdown.allan import parameters as noise_parameters
 from strapdown.checks import InputError
-from strapdown.recordings import Recording
+from strapdown.recordings import Recording, gyro_temperature
 from strapdown.units import DEGREE_PER_ROOT_HOUR, STANDARD_GRAVITY
 
 DT = 0.01
@@ -195,6 +195,48 @@ def test_temperature_is_regressed_out_and_written(run, tmp_path):
     assert "rate_ramp_deg_per_hour_per_hour" not in noise_of
     plain = run("allan", "warm.csv", "--out", "plain")
     assert "warning" in plain[1] or "rate_ramp" in (tmp_path / "plain" / "gyro.toml").read_text()
+
+
+def test_the_bias_over_temperature_is_subtracted_and_its_error_becomes_a_walk():
+    """At a constant rise of a K/s the error σ₁ a t of the slope is largest over √t at the end: σ₁ a √t."""
+    time, rise = np.linspace(0.0, 100.0, 101), 0.05
+    T = 24.0 + rise * time
+    warm = Recording(source="warm", time=time, rate=np.ones((101, 3)), temperature=T)
+    given = {"reference_degc": 25.0, "lowest_degc": 20.0, "highest_degc": 27.0}
+    given |= {"bias_rad_per_s": [0.1, 0.2, 0.3], "bias_rad_per_s_per_k": [1e-2, 0.0, 0.0]}
+    given |= {"bias_rad_per_s_per_k2": [0.0, 1e-3, 0.0]}
+    given |= {"sigma_rad_per_s_per_k": [0.0, 0.0, 2e-4], "sigma_rad_per_s_per_k2": [0.0, 0.0, 0.0]}
+    found, walk = gyro_temperature._from_table(given, "file: gyro").applied(warm)
+    held = np.minimum(T, 27.0) - 25.0  # beyond the table's range the bias at its end
+    expected = 1.0 - np.stack([0.1 + 1e-2 * held, 0.2 + 1e-3 * held**2, np.full(101, 0.3)], axis=1)
+    np.testing.assert_allclose(found.rate, expected, rtol=0, atol=1e-15)
+    assert walk == pytest.approx(2e-4 * rise * np.sqrt(60.0), rel=1e-12)  # 3 K, which it takes 60 s for
+    assert "40 samples are beyond 20 to 27 °C" in found.remarks[-1]
+    with pytest.raises(InputError, match="warm has no temperature for every sample"):
+        gyro_temperature._from_table(given, "file: gyro").applied(replace(warm, temperature=None))
+    with pytest.raises(InputError, match="file: gyro lacks bias_rad_per_s"):
+        gyro_temperature._from_table({k: v for k, v in given.items() if k != "bias_rad_per_s"}, "file: gyro")
+
+
+def test_estimate_reads_the_table_that_allan_writes(run, tmp_path):
+    """The unit warms up again, another way: its estimated bias is that of a unit without the dependence, to the slope's interval."""
+    for name, seed, constant, slope in (("first", 1, 60.0, 2e-3), ("second", 2, 20.0, 2e-3), ("without", 2, 20.0, 0.0)):
+        whole = at_rest(20_000, seed)
+        T = 25.0 + 10.0 * (1.0 - np.exp(-whole.time / constant))
+        bias = slope * (T - 30.0)[:, None] * [1.0, -1.0, 0.0]
+        recordings.write(replace(whole, rate=whole.rate + bias, temperature=T), tmp_path / f"{name}.csv")
+    assert run("allan", "first.csv", "--temperature", 1)[0] == 0
+    path = tmp_path / "allan-results" / "gyro-temperature.toml"
+    table = tomllib.loads(path.read_text())["gyro"]
+    status, said, error = run("estimate", "second.csv", "--temperature", path, "--out", "second")
+    assert (status, "bias over temperature is subtracted" in said) == (0, True), error
+    assert run("estimate", "without.csv", "--out", "without")[0] == 0
+    second, without = (records.read_estimate(tmp_path / name / "estimate.h5") for name in ("second", "without"))
+    # The mean belongs to the first recording, and neither filter knows its bias at once.
+    change = (second.bias - without.bias)[len(without.bias) // 20 :]
+    reach = 4.0 * np.array(table["sigma_rad_per_s_per_k"])
+    assert (np.abs(change - change[-1]) < reach * 10.0).all()
+    assert reach.max() < 1e-3  # less than half the slope that was subtracted
 
 
 def through_a_bag(folder, seed: int, duration: float) -> list[bool]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -173,6 +174,13 @@ def estimate(
             help="Without a specification: calibration.toml of an earlier recording of the same unit; a new one is written."
         ),
     ] = None,
+    temperature: Annotated[
+        Path | None,
+        typer.Option(
+            help="Without a specification: gyro-temperature.toml of `strapdown allan --temperature`, the gyro's bias over temperature, "
+            "subtracted first."
+        ),
+    ] = None,
     figures: Annotated[
         bool, typer.Option("--figures", help="Draw the estimate, its states and errors; --format does too.")
     ] = False,
@@ -190,7 +198,7 @@ def estimate(
     usable_folder("out", out)
     drawn_as = None if form is None and not figures else form or FigureFormat.png  # --format asks for figures too
     names = (*FILES, *(f"{name}.{drawn_as or FigureFormat.png}" for name in FIGURES))
-    writable("out", *(out / name for name in names), sources=(recording, gyro, filter_file, calibration))
+    writable("out", *(out / name for name in names), sources=(recording, gyro, filter_file, calibration, temperature))
     need_own(out / FILES[0], "estimate", lambda path: bool(read_attributes(path)["kind"] == "strapdown estimate"))
     units = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
     layout = given_layout(recording, columns=columns, topic=topic, axes=axes, invert=invert, **units)
@@ -206,7 +214,7 @@ def estimate(
             "from-truth": from_truth or None,
             "every": None if every == 1 else every,
         },
-        without={"motion": motion, "latency": latency, "calibration": calibration},
+        without={"motion": motion, "latency": latency, "calibration": calibration, "temperature": temperature},
     )
     output = _Output(out, _exports(to or (), recording, euler, frame, changed=bool(axes or invert)), drawn_as)
     shared = _Shared(gyro, gate, robust, full_covariance, observability, smooth)
@@ -214,7 +222,9 @@ def estimate(
         chosen = tuple(state or ()) if states or state else states
         _estimate_specified(recording, shared, _Specified(filter_file, chosen, attitude, from_truth, every), output)
     else:
-        _estimate_recording(recording, shared, _Recorded(layout, motion or "hand", latency, calibration), output)
+        _estimate_recording(
+            recording, shared, _Recorded(layout, motion or "hand", latency, calibration, temperature), output
+        )
 
 
 class _Output(NamedTuple):
@@ -263,6 +273,7 @@ class _Recorded(NamedTuple):
     motion: str
     latency: float | None
     calibration: Path | None
+    temperature: Path | None
 
 
 def _check_kind(
@@ -554,13 +565,14 @@ def _estimate_recording(recording: Path, shared: _Shared, options: _Recorded, ou
     from strapdown.checks import non_negative, one_of
     from strapdown.consistency import reference_errors
     from strapdown.gyro import read_spec
-    from strapdown.recordings import unit_calibration
+    from strapdown.recordings import gyro_temperature, unit_calibration
     from strapdown.units import DEGREE
 
     one_of("--motion", options.motion, ahrs.MOTIONS)
     late = None if options.latency is None else 1e-3 * non_negative("--latency", options.latency, unit="ms")
     robustness = shared.robustness
     carried = None if options.calibration is None else unit_calibration.read(options.calibration)
+    warm = None if options.temperature is None else gyro_temperature.read(options.temperature)
     with progress_bar("reading"):
         source = recordings.read(recording, **options.layout)
     doubt(source, recording)
@@ -569,6 +581,9 @@ def _estimate_recording(recording: Path, shared: _Shared, options: _Recorded, ou
         from strapdown import workflows  # which imports much more
 
         parameters = workflows.with_gyro_noise(parameters, read_spec(shared.gyro))
+    if warm is not None:
+        source, walk = warm.applied(source)
+        parameters = replace(parameters, rate_random_walk=math.hypot(parameters.rate_random_walk, walk))
     with progress_bar("smoothing" if shared.smooth else "filtering"):
         result = ahrs.estimate(
             source,
