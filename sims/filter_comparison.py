@@ -1,69 +1,82 @@
 """How do attitude filters compare on the same records? Ours and peers: accuracy against the bound, consistency, time a sample.
 
-A hand-held unit at one place: a MEMS gyro, an accelerometer and a magnetometer at 50 Hz, all noises white and known. Errors are root mean
-squares over runs and the second half of each, divided by what no estimator can beat: the posterior Cramér–Rao bound, which for a gyro read
-as an input and small errors is the Riccati recursion along the true trajectory (``covariance.analyse``).
+*Simulated*: a hand-held unit at one place: a MEMS gyro, an accelerometer and a magnetometer at 50 Hz, all noises white and known. Errors
+are root mean squares over runs and the second half of each, divided by what no estimator can beat, the root of the posterior Cramér–Rao
+bound. Filters with a noise model get the true noises and start from the truth off by 1° an axis; the others find their start themselves.
 
-Nothing is tuned for ours that is not tuned alike for peers. Filters with a noise model (the Kalman filters) get the true noises; filters
-with gains (VQF, imufusion, ahrs) get the gains that are best by RMS error on records of other seeds, by a search over powers of two; the
-start is the truth off by 1° an axis, or the filter's own. Their fixed frames are compared by their attitudes on those records, and what
-differs by a multiple of a right angle is taken out.
+*Recorded*: hand-held units of the BROAD data set beside an optical reference. Errors are over the movement.
 
-``pip install vqf imufusion ahrs``, then ``python sims/filter_comparison.py`` (some minutes): it writes ``filter_comparison.json`` and
-``filter_comparison.md``, a table. Peers that are not installed are left out. Where several sensors disagree, from a large start and with
-disturbances the order is another: ``filter_family.py`` and ``hand_held.py`` look there.
+Nothing is tuned for ours that is not tuned alike for peers: every filter with a gain gets the one with the least RMS error elsewhere, of
+the same powers of two over its default. Simulated: on records of other seeds. Recorded: on the first half minute of movement of the
+*other* recordings; of ``strapdown estimate`` the gain is that on the accelerometer (``velocity_sigma``). What a peer's frames differ by
+from ours, in right angles, is found there too and taken out.
+
+``pip install vqf imufusion ahrs smsfusion``, then ``python sims/filter_comparison.py [--out docs/_data] [RECORDING...]`` (some minutes),
+recordings being files of the BROAD data set; it writes ``filter_comparison.json``, which the page *Comparison* of the documentation
+prints. Without recordings the part of a file that is there already stays. Peers that are not installed are left out. Where sensors
+disagree, from a large start and with disturbances the order is another: ``filter_family.py`` and ``hand_held.py`` look there.
 """
 
 from __future__ import annotations
 
 import argparse
+import datetime
 import importlib.util
+import json
+import sys
 import time as clock
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from strapdown import consistency, covariance, montecarlo, quaternion, scenarios, setup, vectors
+import strapdown
+from strapdown import ahrs, consistency, covariance, montecarlo, quaternion, recordings, scenarios, setup, vectors
+from strapdown.ahrs import HAND_HELD
 from strapdown.checks import Array
-from strapdown.consistency import foreign
+from strapdown.consistency import foreign, reference_errors
 from strapdown.estimation import State, filters
+from strapdown.estimation.states import ProcessNoise
 from strapdown.files import write_json
 from strapdown.gyro import GyroSpec
 from strapdown.motion import Harmonic, HarmonicRates
+from strapdown.recordings import Recording
 from strapdown.records import ImuRecord
+from strapdown.records.outputs import euler
 from strapdown.units import DEGREE, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
 
 SMALL = {"runs": 2, "unscented_runs": 1, "training": 1, "duration": 8.0, "own": ("mekf", "usque", "mahony")}
 """Arguments of a run that only shows that the script works."""
 
 RATE = 50.0
+FORCE_NOISE = 0.01 * 9.81 / np.sqrt(RATE)
+"""White noise of the specific force, m/s²/√Hz."""
 FIELD = np.array([0.0, 0.45, -0.89])
 """Magnetic North and down, fixed frame East-North-Up."""
 OWN = ("mekf", "right-invariant", "equivariant", "geometric", "usque", "mahony")
 
-Peer = Callable[[Array, Array, Array, float], Array]
-"""Attitudes (n, 4) of gyro (n, 3), rad/s, accelerometer and magnetometer (n, 3) and a gain."""
+Peer = Callable[[Array, Array, Array, float, float], Array]
+"""Attitudes (n, 4) of gyro (n, 3), rad/s, accelerometer (n, 3), g, magnetometer (n, 3), interval, s, and gain over the default."""
 
 
-def vqf_peer(gyro: Array, acc: Array, mag: Array, gain: float) -> Array:
+def vqf_peer(gyro: Array, acc: Array, mag: Array, interval: float, gain: float) -> Array:
     """VQF (Laidig & Seel 2023), C++; the gain shortens both time constants."""
     import vqf
 
-    found = vqf.VQF(1.0 / RATE, tauAcc=3.0 / gain, tauMag=9.0 / gain).updateBatch(
+    found = vqf.VQF(interval, tauAcc=3.0 / gain, tauMag=9.0 / gain).updateBatch(
         *(np.ascontiguousarray(x) for x in (gyro, 9.81 * acc, mag))
     )
     return np.asarray(found["quat9D"])
 
 
-def imufusion_peer(gyro: Array, acc: Array, mag: Array, gain: float) -> Array:
+def imufusion_peer(gyro: Array, acc: Array, mag: Array, interval: float, gain: float) -> Array:
     """Fusion by x-io (Madgwick's revised filter), C."""
     import imufusion
 
     settings = imufusion.AhrsSettings()
-    settings.sample_rate, settings.convention, settings.gain = RATE, imufusion.CONVENTION_ENU, 0.5 * gain
+    settings.sample_rate, settings.convention, settings.gain = 1.0 / interval, imufusion.CONVENTION_ENU, 0.5 * gain
     ahrs = imufusion.Ahrs()
     ahrs.set_settings(settings)
     result = np.empty((len(gyro), 4))
@@ -73,20 +86,60 @@ def imufusion_peer(gyro: Array, acc: Array, mag: Array, gain: float) -> Array:
     return result
 
 
-def madgwick_peer(gyro: Array, acc: Array, mag: Array, gain: float) -> Array:
+def madgwick_peer(gyro: Array, acc: Array, mag: Array, interval: float, gain: float) -> Array:
     """Madgwick's filter (2010) of ahrs, Python."""
     from ahrs.filters import Madgwick
 
-    return np.asarray(Madgwick(gyr=gyro, acc=acc, mag=mag, frequency=RATE, gain=0.1 * gain).Q)
+    return np.asarray(Madgwick(gyr=gyro, acc=acc, mag=mag, frequency=1.0 / interval, gain=0.041 * gain).Q)
+
+
+def smsfusion_peer(gyro: Array, acc: Array, mag: Array, interval: float, gain: float) -> Array:
+    """AHRS of smsfusion (a multiplicative EKF), numba; the gain is that on its zero velocity, 10 m/s; σ of the heading 5°."""
+    import smsfusion
+
+    up = acc[0] / np.linalg.norm(acc[0])
+    east = np.cross(mag[0], up)
+    east /= np.linalg.norm(east)
+    x0 = np.zeros(16)
+    x0[6:10] = quaternion.from_matrix(np.stack([east, np.cross(up, east), up]))
+    P0 = np.diag(np.repeat([1e-6, 1e-6, (2.0 * DEGREE) ** 2, (0.1 * DEGREE) ** 2], 3))
+    ahrs = smsfusion.AHRS(
+        1.0 / interval,
+        x0_prior=x0,
+        P0_prior=P0,
+        err_acc={"N": FORCE_NOISE, "B": 1e-9, "tau_cb": 1e6},
+        nav_frame="ENU",
+        cold_start=False,
+        ignore_bias_acc=True,
+    )
+    velocity, heading = np.full(3, (10.0 / gain) ** 2), (5.0 * DEGREE) ** 2
+    result = np.empty((len(gyro), 4))
+    q = x0[6:10]
+    for k, rate in enumerate(np.roll(gyro, -1, axis=0)):  # it corrects first, and goes on with the rate given
+        field = quaternion.rotate(q, mag[k])
+        yaw = euler(q[None]).angles[0, 0] + np.arctan2(field[0], field[1])  # the field's horizontal part points North
+        ahrs.update(9.81 * acc[k], rate, head=yaw, head_var=heading, head_degrees=False, vel_var=velocity)
+        result[k] = ahrs.quaternion()
+        w = 0.5 * interval * (rate - ahrs.bias_gyro())
+        q = quaternion.normalize(
+            quaternion.multiply(result[k], np.array([1.0, *w]))
+        )  # where it will be at the next sample
+    return result
 
 
 PEERS: dict[str, tuple[str, Peer]] = {
     "VQF 9D": ("vqf", vqf_peer),
     "imufusion": ("imufusion", imufusion_peer),
+    "smsfusion": ("smsfusion", smsfusion_peer),
     "ahrs Madgwick": ("ahrs", madgwick_peer),
 }
 """The package that each needs, and how it is run."""
-GAINS = tuple(2.0**k for k in range(-5, 4))
+GAINS = tuple(2.0**k for k in range(-4, 5))
+RECORDED_GAINS = tuple(4.0**k for k in range(-2, 3))
+SEARCHED = 20.0
+"""Of the movement of a recording, s, that gains are searched on."""
+SLOW = {"smsfusion": 4, "ahrs Madgwick": 4}
+"""Samples of a recording that are averaged into one, of filters that Python runs sample by sample."""
 
 
 def scenario(duration: float) -> scenarios.Scenario:
@@ -132,12 +185,35 @@ class Outcome:
 
     def summary(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        told = {"filter": self.name, "runs": self.runs, "rms_deg": self.rms / DEGREE, "rms_over_root_pcrb": self.ratio}
-        return told | {
+        row = {"filter": self.name, "runs": self.runs, "rms_deg": self.rms / DEGREE, "rms_over_root_pcrb": self.ratio}
+        return row | {
             "anees_attitude": None if np.isnan(self.anees) else self.anees,
             "consistent": self.consistent,
             "microseconds_a_sample": self.microseconds,
             "gain_over_default": None if np.isnan(self.gain) else self.gain,
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recorded:
+    """One filter on all recordings."""
+
+    errors: Array
+    """RMS over the movement (recordings, 3), rad: total, heading, inclination."""
+    default: Array
+    """The same with its default gain."""
+    gains: Array
+    """Over the default, by recording, found on the others."""
+    microseconds: float
+    """A sample."""
+
+    def summary(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        return {
+            "errors_deg": (self.errors / DEGREE).tolist(),
+            "default_errors_deg": (self.default / DEGREE).tolist(),
+            "gains_over_default": self.gains.tolist(),
+            "microseconds_a_sample": self.microseconds,
         }
 
 
@@ -148,21 +224,21 @@ class Result:
     outcomes: tuple[Outcome, ...]
     bound: float
     """Root of the bound, an axis, rad: of the second half of the runs."""
+    recorded: dict[str, Recorded]
+    """By filter."""
 
 
-def samples(record: ImuRecord) -> tuple[Array, Array, Array]:
-    """Return gyro, accelerometer and magnetometer at the ends of the intervals, as peers take them."""
+def samples(record: ImuRecord) -> tuple[Array, Array, Array, float]:
+    """Return gyro, accelerometer and magnetometer at the ends of the intervals, and their length, as peers take them."""
     force, field = record.vectors
-    return record.rates, force.vector_b, field.vector_b
+    return record.rates, force.vector_b, field.vector_b, 1.0 / RATE
 
 
-def frame_of(peer: Peer, record: ImuRecord, gain: float) -> foreign.Alignment:
-    """Return what a peer's frames differ by from ours, in right angles."""
-    assert record.truth is not None
-    half = slice(len(record.increments) // 2, None)
-    series = foreign._Series(record.time[1:][half], quaternion.normalize(peer(*samples(record), gain))[half])
-    truth = foreign._Series(record.time[1:][half], record.truth.attitude[1:][half])
-    found = foreign.fit(series, truth, ("fixed", "body"), 0.0)
+def frame_of(attitude: Array, time: Array, truth: Array) -> foreign.Alignment:
+    """Return what a peer's frames differ by from ours, in right angles, by its attitudes in the second half of a record."""
+    half = slice(len(time) // 2, None)
+    series = foreign._Series(time[half], quaternion.normalize(attitude)[half])
+    found = foreign.fit(series, foreign._Series(time[half], truth[half]), ("fixed", "body"), 0.0)
     snapped = {name: _snapped(getattr(found, name)) for name in ("fixed", "body")}
     return foreign.Alignment(**{**vars(found), **snapped})
 
@@ -198,23 +274,25 @@ def main(
     duration: float = 60.0,
     seed: int = 1,
     own: Sequence[str] = OWN,
+    files: Sequence[Path] = (),
     out: Path | str | None = None,
+    progress: Callable[[str], None] | None = None,
 ) -> Result:
-    """Run the study; JSON and the table are written to ``out`` if it is given."""
+    """Run the study; JSON is written to ``out`` if it is given."""
     scene = scenario(duration)
     base = setup.matched(scene)
     plan = montecarlo.Plan(scenario=scene, setup=base, seed=seed, epochs=20)
     predicted = covariance.analyse(scene, base, epochs=20)
-    bound = float(np.sqrt(np.mean(np.diagonal(predicted.covariance, axis1=1, axis2=2)[10:, :3])))
+    bound = float(np.sqrt(np.mean(np.diagonal(predicted.cramer_rao, axis1=1, axis2=2)[10:, :3])))
     records = [scenarios.simulate(scene, seed, run) for run in range(runs)]
     outcomes = []
     for name in own:
         squares, nees, spent = [], [], []
         filters.run(name, records[0], base.process_noise, starts(records[0], plan, 0))  # compiles
         for run, record in enumerate(records[: unscented_runs if name == "usque" else runs]):
-            begun = clock.perf_counter()
+            begun = clock.process_time()
             estimate = filters.run(name, record, base.process_noise, starts(record, plan, run), full_covariance=True)
-            spent.append(clock.perf_counter() - begun)
+            spent.append(clock.process_time() - begun)
             error = errors_of(estimate.attitude, record)
             squares.append(np.mean(error**2))
             assert estimate.covariance is not None
@@ -227,14 +305,15 @@ def main(
     for name, (package, peer) in PEERS.items():
         if importlib.util.find_spec(package) is None:
             continue
-        frame = frame_of(peer, trained[0], 1.0)
+        assert trained[0].truth is not None
+        frame = frame_of(peer(*samples(trained[0]), 1.0), trained[0].time[1:], trained[0].truth.attitude[1:])
 
         def attitude(
             record: ImuRecord, gain: float, peer: Peer = peer, frame: foreign.Alignment = frame
         ) -> tuple[Array, float]:
-            begun = clock.perf_counter()
+            begun = clock.process_time()
             q = peer(*samples(record), gain)
-            return foreign.replace_attitude(quaternion.normalize(q), frame), clock.perf_counter() - begun
+            return foreign.replace_attitude(quaternion.normalize(q), frame), clock.process_time() - begun
 
         scores = [np.mean([np.mean(errors_of(attitude(r, gain)[0], r) ** 2) for r in trained]) for gain in GAINS]
         best = GAINS[int(np.argmin(scores))]
@@ -242,15 +321,123 @@ def main(
         squares = [np.mean(errors_of(q, record) ** 2) for (q, _), record in found]
         spent = [seconds for (_, seconds), _ in found]
         outcomes.append(_outcome(name, squares, spent, bound, len(records[0].increments), np.nan, None, best))
-    result = Result(outcomes=tuple(outcomes), bound=bound)
+    result = Result(outcomes=tuple(outcomes), bound=bound, recorded=on_recordings(files, progress) if files else {})
     if out is not None:
+        path = Path(out) / "filter_comparison.json"
+        before = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+        content = {
+            "version": strapdown.__version__,
+            "date": datetime.date.today().isoformat(),
+            "seed": seed,
+            "duration_s": duration,
+            "root_pcrb_deg": bound / DEGREE,
+            "outcomes": [one.summary() for one in result.outcomes],
+            "recordings": [Path(file).stem for file in files] or before.get("recordings", []),
+            "recorded": {name: one.summary() for name, one in result.recorded.items()} or before.get("recorded", {}),
+        }
         Path(out).mkdir(parents=True, exist_ok=True)
-        content = {"seed": seed, "duration_s": duration, "root_pcrb_deg": bound / DEGREE}
-        write_json(
-            Path(out) / "filter_comparison.json", content | {"outcomes": [one.summary() for one in result.outcomes]}
-        )
-        (Path(out) / "filter_comparison.md").write_text(table(result) + "\n", encoding="utf-8")
+        write_json(path, content)
     return result
+
+
+# ---------------------------------------------------------------------------------------------------------------- recordings
+
+
+def ours(recording: Recording, gain: float) -> tuple[Array, Array]:
+    """Return the stamps and attitudes of ``strapdown estimate``."""
+    chosen = replace(HAND_HELD, velocity_sigma=HAND_HELD.velocity_sigma / gain)
+    found = ahrs.estimate(recording, chosen)
+    return found.recording.time, found.estimate.attitude
+
+
+def complementary(recording: Recording, gain: float) -> tuple[Array, Array]:
+    """Return the stamps and attitudes of this package's complementary filter (Mahony's), with the measurements of the MEKF."""
+    found = ahrs.estimate(recording, ahrs.MOTIONS["any"])
+    noise = HAND_HELD.setup.process_noise
+    scaled = ProcessNoise(
+        angle_random_walk=gain * noise.angle_random_walk, rate_random_walk=gain**2 * noise.rate_random_walk
+    )
+    return found.record.time, filters.run("mahony", found.record, scaled, found.initial).attitude
+
+
+def peer_on(peer: Peer, every: int) -> Callable[[Recording, float], tuple[Array, Array]]:
+    """Return a peer as a function of a recording and a gain, on means of so many samples."""
+
+    def run(recording: Recording, gain: float) -> tuple[Array, Array]:
+        assert recording.specific_force is not None
+        assert recording.magnetic_field is not None
+        n = len(recording.time) // every
+        fed = (recording.rate, recording.specific_force / 9.81, recording.magnetic_field)
+        means = (np.ascontiguousarray(x[: n * every].reshape(n, every, 3).mean(axis=1)) for x in fed)
+        time = recording.time[every - 1 : n * every : every]
+        return time, quaternion.normalize(peer(*means, float(np.median(np.diff(time))), gain))
+
+    return run
+
+
+def on_recordings(files: Sequence[Path], progress: Callable[[str], None] | None = None) -> dict[str, Recorded]:
+    """Return what each filter makes of recordings with a reference, its gain chosen on the others."""
+    read = [recordings.read(file) for file in files]
+    begun = [int(np.searchsorted(one.time, ahrs.estimate(one).recording.time[0])) for one in read]
+    whole = [one.since(first) for one, first in zip(read, begun, strict=True)]  # all start where ours does
+    short = [_until(one, float(one.time[np.argmax(one.movement)]) + SEARCHED) for one in whole]
+    chosen: dict[str, Callable[[Recording, float], tuple[Array, Array]]] = {
+        "strapdown estimate": ours,
+        "complementary": complementary,
+    }
+    chosen |= {
+        name: peer_on(f, SLOW.get(name, 1)) for name, (package, f) in PEERS.items() if importlib.util.find_spec(package)
+    }
+    result = {}
+    for name, run in chosen.items():
+        frame = None
+        if name in PEERS:
+            time, q = run(short[0], 1.0)
+            assert short[0].true_attitude is not None
+            truth = short[0].true_attitude[np.searchsorted(short[0].time, time)]
+            known = np.isfinite(truth).all(axis=1)
+            frame = frame_of(q[known], time[known], truth[known])
+        search = np.array([[_errors(run, frame, one, gain)[0][0] for gain in RECORDED_GAINS] for one in short])
+        others = search.sum(axis=0) - search
+        gains = np.array(RECORDED_GAINS)[np.argmin(others, axis=1)]
+        found = [_errors(run, frame, one, gain) for one, gain in zip(whole, gains, strict=True)]
+        plain = [
+            f if g == 1.0 else _errors(run, frame, one, 1.0) for f, g, one in zip(found, gains, whole, strict=True)
+        ]
+        result[name] = Recorded(
+            errors=np.array([one for one, _ in found]),
+            default=np.array([one for one, _ in plain]),
+            gains=gains,
+            microseconds=1e6 * float(np.median([spent for _, spent in found])),
+        )
+        if progress is not None:
+            mean = ", ".join(f"{x:.2f}" for x in result[name].errors.mean(axis=0) / DEGREE)
+            progress(f"{name}: total, heading, inclination {mean}°, gains {sorted(set(gains.tolist()))}")
+    return result
+
+
+def _until(recording: Recording, end: float) -> Recording:
+    rows = slice(0, int(np.searchsorted(recording.time, end)))
+    names = ("time", "rate", "specific_force", "magnetic_field", "true_attitude", "movement")
+    return replace(recording, **{name: getattr(recording, name)[rows] for name in names})
+
+
+def _errors(
+    run: Callable[[Recording, float], tuple[Array, Array]],
+    frame: foreign.Alignment | None,
+    recording: Recording,
+    gain: float,
+) -> tuple[list[float], float]:
+    """Return the RMS errors over the movement, total, heading and inclination, rad, and the time that a sample took, s."""
+    begun = clock.process_time()
+    time, q = run(recording, gain)
+    spent = clock.process_time() - begun
+    attitude = q if frame is None else foreign.replace_attitude(q, frame)
+    rows = np.searchsorted(recording.time, time)
+    assert recording.true_attitude is not None
+    assert recording.movement is not None
+    errors = reference_errors(attitude, recording.true_attitude[rows]).rms(recording.movement[rows])
+    return [errors[part] for part in ("total", "heading", "inclination")], spent / len(time)
 
 
 def _outcome(
@@ -294,11 +481,11 @@ def table(result: Result) -> str:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("files", nargs="*", type=Path, metavar="RECORDING", help="BROAD files")
     parser.add_argument("--runs", type=int, default=50)
     parser.add_argument("--unscented-runs", type=int, default=10)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("results/filter_comparison"))
-    arguments = parser.parse_args()
-    found = main(runs=arguments.runs, unscented_runs=arguments.unscented_runs, seed=arguments.seed, out=arguments.out)
+    found = main(**vars(parser.parse_args()), progress=lambda line: print(line, file=sys.stderr))
     print(f"Root of the bound: {found.bound / DEGREE:.4f}° an axis.\n\n{table(found)}")

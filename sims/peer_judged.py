@@ -1,14 +1,20 @@
-"""Is somebody else's filter as good as it says? The aided INS of smsfusion (a multiplicative EKF of 4Subsea), judged over many runs.
+"""Are other people's filters as good as they say? Three of them, run as they come and judged over many runs.
 
-The peer is put into a setup as a filter of one's own: a class with a method ``run``. It gets the same simulated records as any filter here
-(gyro, accelerometer, and the heading of an attitude sensor), and beside them a velocity that is measured to 0.1 m/s, all noises told to it
-as they are. ``strapdown.consistency.check_arrays`` finds from one run what its covariance is of, and the Monte Carlo gives the verdict:
+Each is put into a setup as a filter of one's own: a class with a method ``run``. It gets the same simulated records as any filter here
+(gyro, accelerometer, attitude sensor), and beside them a velocity that is measured to 0.1 m/s, all noises given to it as they are:
 
-- ``as told``: what it says of itself, all noises right;
-- ``datasheet``: the same with the noise parameters that the package has for a sensor of this class, not those of the simulated one;
-- ``read as fixed``: the same covariance taken for one about fixed axes, as ROS has it: the commonest mistake in judging a filter.
+- smsfusion (4Subsea), aided INS, a multiplicative EKF: velocity and heading;
+- AttiPy (V. R. Solum), AHRS, a multiplicative EKF: velocity and heading;
+- GTSAM (Georgia Tech), ``NavStateImuEKF``, on a manifold and without a gyro bias: velocity and attitude, the gyro without a bias.
 
-``pip install smsfusion``, then ``python sims/peer_judged.py`` (some minutes). Without it the script says so.
+And what it makes of them where something is wrong, which the verdict must find:
+
+- smsfusion with the noise parameters that the package has for a sensor of this class, not those of the simulated one;
+- its covariance, right as it is, read as one about fixed axes, as ROS has it: the commonest mistake in judging a filter;
+- GTSAM's filter with a gyro that has the bias which it does not model.
+
+``pip install smsfusion attipy gtsam``, then ``python sims/peer_judged.py`` (some minutes): it writes ``peer_judged.json`` and
+``peer_judged.md``, a table. Peers that are not installed are left out.
 """
 
 from __future__ import annotations
@@ -17,7 +23,7 @@ import argparse
 import importlib.util
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,7 +42,6 @@ from strapdown.units import DEGREE, DEGREE_PER_ROOT_HOUR, STANDARD_GRAVITY
 SMALL = {"runs": 3, "duration": 4.0}
 """Arguments of a run that only shows that the script works."""
 
-INSTALLED = importlib.util.find_spec("smsfusion") is not None
 RATE = 50.0
 ACCELEROMETER = 2e-3
 """White noise of the specific force, m/s²/√Hz."""
@@ -52,9 +57,37 @@ GYRO = GyroSpec(
 )
 
 
+class Samples(NamedTuple):
+    """What a peer is fed: readings at the edges 0 … n − 1, and aids at some of them."""
+
+    number: int
+    rates: Array
+    """(n, 3), rad/s, over the interval after each edge."""
+    force: Array
+    """(n, 3), m/s²."""
+    velocity: Array
+    """(n, 3), m/s: what the velocity sensor gives of a unit at rest."""
+    attitude: Array
+    """(m, 4), of the attitude sensor."""
+    aided: dict[int, int]
+    """Row of the attitude sensor by edge; the velocity is measured there too."""
+
+
+def samples(record: ImuRecord) -> Samples:
+    """Return a record as peers take it."""
+    force, attitude = record.vectors
+    assert attitude.attitude is not None
+    n = len(record.increments)
+    # The velocity sensor of this run: its noise is drawn anew for each record, and is the same whenever the record is.
+    noise = generator(int(record.increments.view(np.uint64).sum() % 2**32), 0, "velocity").standard_normal((n, 3))
+    felt = STANDARD_GRAVITY * np.concatenate([force.vector_b[:1], force.vector_b])  # the record holds directions
+    aided = {round(t * RATE): k for k, t in enumerate(attitude.time)}
+    return Samples(n, record.increments * RATE, felt[:n], VELOCITY * noise, attitude.attitude, aided)
+
+
 @dataclass(frozen=True)
 class AidedIns:
-    """smsfusion's AidedINS over a record. Its error state: position, velocity, attitude, gyro bias."""
+    """smsfusion's AidedINS. Its error state: position, velocity, attitude, gyro bias."""
 
     gyro: dict[str, float]
     """N, rad/s/√Hz; B, rad/s; tau_cb, s."""
@@ -66,7 +99,6 @@ class AidedIns:
         """Return its attitude and gyro bias at all edges but the last."""
         import smsfusion
 
-        force, attitude = record.vectors
         P0 = 1e-6 * np.eye(12)
         P0[6:, 6:] = initial.covariance
         x0 = np.concatenate([np.zeros(6), initial.attitude, np.zeros(3), initial.bias])
@@ -80,29 +112,117 @@ class AidedIns:
             ignore_bias_acc=True,
             cold_start=False,
         )
-        n = len(record.increments)
-        # The velocity sensor of this run: its noise is drawn anew for each record, and is the same whenever the record is.
-        noise = generator(int(record.increments.view(np.uint64).sum() % 2**32), 0, "velocity").standard_normal((n, 3))
-        assert attitude.attitude is not None
-        angles = euler(attitude.attitude).angles
-        yaw, level = angles[:, 0], np.cos(angles[:, 1])
-        heard = {round(t * RATE): k for k, t in enumerate(attitude.time)}
-        felt = STANDARD_GRAVITY * np.concatenate([force.vector_b[:1], force.vector_b])  # the record holds directions
-        rates = record.increments * RATE
-        q, b, P = np.empty((n, 4)), np.empty((n, 3)), np.empty((n, 6, 6))
-        for k in range(n):
+        given = samples(record)
+        angles = euler(given.attitude).angles
+        q, b, P = np.empty((given.number, 4)), np.empty((given.number, 3)), np.empty((given.number, 6, 6))
+        for k in range(given.number):
             aid: dict[str, Any] = {}
-            if k in heard:
-                j = heard[k]
-                aid = {"head": yaw[j], "head_var": (HEADING / level[j]) ** 2, "head_degrees": False}
-                aid |= {"vel": VELOCITY * noise[k], "vel_var": np.full(3, VELOCITY**2)}
-            ins.update(felt[k], rates[k], **aid)
+            if (j := given.aided.get(k)) is not None:
+                variance = (HEADING / np.cos(angles[j, 1])) ** 2
+                aid = {"head": angles[j, 0], "head_var": variance, "head_degrees": False}
+                aid |= {"vel": given.velocity[k], "vel_var": np.full(3, VELOCITY**2)}
+            ins.update(given.force[k], given.rates[k], **aid)
             q[k], b[k], P[k] = ins.quaternion(), ins.bias_gyro(), ins.P[6:, 6:]
         return Estimate.from_arrays(record.time[:-1], q, foreign.read_as(self.read_as, P, q), bias=b)
 
 
-def flight(duration: float) -> scenarios.Scenario:
-    """Return a unit that rocks about all its axes at one place, heading measured five times a second."""
+def heading_gradient(attitude: Array) -> Array:
+    """Return the derivative (3,) of the yaw angle by a small rotation in body axes: (0, sin φ, cos φ)/cos θ."""
+    _, pitch, roll = euler(attitude[None]).angles[0]
+    return np.array([0.0, np.sin(roll), np.cos(roll)]) / np.cos(pitch)
+
+
+@dataclass(frozen=True)
+class AttiPy:
+    """AttiPy's AHRS. Its error state: attitude, gyro bias, velocity."""
+
+    gyro: dict[str, float]
+    """N, rad/s/√Hz; B, rad/s; tau_cb, s."""
+    mended: bool = False
+    """With :func:`heading_gradient` instead of its own."""
+    name: str = "attipy"
+
+    def run(self, record: ImuRecord, initial: State) -> Estimate:
+        """Return its attitude and gyro bias at all edges but the last."""
+        import attipy
+
+        given = samples(record)
+        P0 = 1e-6 * np.eye(9)
+        P0[:6, :6] = initial.covariance
+        ahrs = attipy.AHRS(
+            RATE,
+            q_nb=initial.attitude,
+            bg_b=initial.bias,
+            w_b=given.rates[0] - initial.bias,
+            P=P0,
+            g=STANDARD_GRAVITY,
+            nav_frame="ENU",
+            acc_noise_density=ACCELEROMETER,
+            gyro_noise_density=self.gyro["N"],
+            gyro_bias_stability=self.gyro["B"],
+            bias_corr_time=self.gyro["tau_cb"],
+        )
+        if self.mended:
+            own = ahrs._dhdx[3]
+
+            def row(q: Array) -> Array:
+                own[:3] = heading_gradient(q)
+                return own
+
+            ahrs._dhdx_yaw = row
+        ahrs._dx = np.zeros(9)  # version 0.0.7 has one for all objects of the class, and runs go on in several threads
+        angles = euler(given.attitude).angles
+        q, b, P = np.empty((given.number, 4)), np.empty((given.number, 3)), np.empty((given.number, 6, 6))
+        q[0], b[0], P[0] = initial.attitude, initial.bias, initial.covariance
+        for k in range(1, given.number):  # a call goes on to this edge with the reading before, and keeps this one
+            aid: dict[str, Any] = {"v_n": None}
+            if (j := given.aided.get(k)) is not None:
+                aid = {"v_n": given.velocity[k], "v_var": np.full(3, VELOCITY**2)}
+                aid |= {"yaw": angles[j, 0], "yaw_var": (HEADING / np.cos(angles[j, 1])) ** 2}
+            ahrs.update(given.force[k], given.rates[k], **aid)
+            q[k], b[k], P[k] = ahrs.q_nb, ahrs.bg_b, ahrs.P[:6, :6]
+        return Estimate.from_arrays(record.time[:-1], q, P, bias=b)
+
+
+@dataclass(frozen=True)
+class Gtsam:
+    """GTSAM's NavStateImuEKF. Its error state: attitude, position, velocity, all in body axes."""
+
+    angle_random_walk: float
+    """rad/√s."""
+    name: str = "gtsam"
+
+    def run(self, record: ImuRecord, initial: State) -> Estimate:
+        """Return its attitude at all edges but the last."""
+        import gtsam
+
+        given = samples(record)
+        noise = gtsam.PreintegrationParams.MakeSharedU(STANDARD_GRAVITY)
+        noise.setGyroscopeCovariance(self.angle_random_walk**2 * np.eye(3))
+        noise.setAccelerometerCovariance(ACCELEROMETER**2 * np.eye(3))
+        noise.setIntegrationCovariance(1e-12 * np.eye(3))
+        P0 = 1e-6 * np.eye(9)
+        P0[:3, :3] = initial.covariance[:3, :3]
+        start = gtsam.NavState(gtsam.Rot3(quaternion.to_matrix(initial.attitude)), np.zeros(3), np.zeros(3))
+        ekf = gtsam.NavStateImuEKF(start, P0, noise)
+        q, P = np.empty((given.number, 4)), np.empty((given.number, 3, 3))
+        q[0], P[0] = initial.attitude, initial.covariance[:3, :3]
+        eye, zero = np.eye(3), np.zeros((3, 3))
+        for k in range(1, given.number):
+            ekf.predict(given.rates[k - 1], given.force[k - 1 : k + 1].mean(axis=0), 1.0 / RATE)
+            if (j := given.aided.get(k)) is not None:
+                R = ekf.state().attitude().matrix()
+                H = np.hstack([zero, zero, R])
+                ekf.updateWithVector(ekf.state().velocity(), H, given.velocity[k], VELOCITY**2 * eye)
+                now = quaternion.from_matrix(ekf.state().attitude().matrix())
+                seen = quaternion.log(quaternion.multiply(quaternion.conjugate(now), given.attitude[j]))
+                ekf.updateWithVector(np.zeros(3), np.hstack([eye, zero, zero]), seen, HEADING**2 * eye)
+            q[k], P[k] = quaternion.from_matrix(ekf.state().attitude().matrix()), ekf.covariance()[:3, :3]
+        return Estimate.from_arrays(record.time[:-1], q, P)
+
+
+def flight(duration: float, gyro: GyroSpec = GYRO) -> scenarios.Scenario:
+    """Return a unit that rocks about all its axes at one place, its attitude measured five times a second."""
     return scenarios.Scenario(
         motion=HarmonicRates(
             mean=(0.0, 0.0, 0.1),
@@ -111,7 +231,7 @@ def flight(duration: float) -> scenarios.Scenario:
                 Harmonic(amplitude=(0.0, 0.3, 0.1), frequency=0.13, phase=1.0),
             ),
         ),
-        gyro=GYRO,
+        gyro=gyro,
         sensors=(
             vectors.Accelerometer(
                 name="accelerometer", sigma=ACCELEROMETER * np.sqrt(RATE) / STANDARD_GRAVITY, rate=RATE
@@ -123,45 +243,92 @@ def flight(duration: float) -> scenarios.Scenario:
     )
 
 
+def cases(duration: float) -> dict[str, tuple[str, scenarios.Scenario, Any]]:
+    """Return by name what is judged: the package that it needs, the scenario, the filter."""
+    datasheet_noise = {"N": float(GYRO.angle_random_walk), "B": BIAS, "tau_cb": MEMORY}
+    noise = float(GYRO.angle_random_walk)
+    scene, steady = flight(duration), flight(duration, GyroSpec(angle_random_walk=noise))
+    found: dict[str, tuple[str, scenarios.Scenario, Any]] = {
+        "smsfusion": ("smsfusion", scene, AidedIns(datasheet_noise))
+    }
+    found["AttiPy"] = ("attipy", scene, AttiPy(datasheet_noise))
+    found["AttiPy, heading's derivative mended"] = (
+        "attipy",
+        scene,
+        AttiPy(datasheet_noise, mended=True, name="attipy-mended"),
+    )
+    found["GTSAM"] = ("gtsam", steady, Gtsam(noise))
+    if importlib.util.find_spec("smsfusion") is not None:
+        from smsfusion import constants
+
+        datasheet = AidedIns(dict(constants.ERR_GYRO_MOTION2), name="smsfusion-datasheet")
+        found["smsfusion, noises of another sensor"] = ("smsfusion", scene, datasheet)
+    fixed = AidedIns(datasheet_noise, read_as="fixed", name="smsfusion-fixed")
+    found["smsfusion, covariance read as fixed"] = ("smsfusion", scene, fixed)
+    found["GTSAM, gyro with a bias"] = ("gtsam", scene, Gtsam(noise, name="gtsam-bias"))
+    return {name: case for name, case in found.items() if importlib.util.find_spec(case[0]) is not None}
+
+
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """What the peer says of itself against what is true."""
+    """What peers say of themselves against what is true."""
 
-    installed: bool
-    verdicts: dict[str, str] = field(default_factory=dict)
-    statistics: dict[str, montecarlo.Statistics] = field(default_factory=dict)
+    judgements: dict[str, consistency.Judgement]
+    statistics: dict[str, montecarlo.Statistics]
     frame_probability: dict[str, float] = field(default_factory=dict)
-    """Of each reading of its covariance, found from one run."""
+    """Of each reading of smsfusion's covariance, found from its errors."""
 
 
-def main(*, runs: int = 200, duration: float = 60.0, seed: int = 1, out: Path | str | None = None) -> Result:
-    """Judge the peer; verdicts are written to ``out`` if it is given."""
-    if not INSTALLED:
-        return Result(installed=False)
-    told = {"N": float(GYRO.angle_random_walk), "B": BIAS, "tau_cb": MEMORY}
-    from smsfusion import constants
-
-    peers = {
-        "as told": AidedIns(told),
-        "datasheet": AidedIns(dict(constants.ERR_GYRO_MOTION2), name="smsfusion-datasheet"),
-        "read as fixed": AidedIns(told, read_as="fixed", name="smsfusion-fixed"),
-    }
-    scene = flight(duration)
-    base = replace(setup.matched(scene), attitude_sigma=1.0 * DEGREE, bias_sigma=BIAS)
-    setups = [replace(base, estimator=one) for one in peers.values()]
-    found = montecarlo.run(scene, setups, runs=runs, seed=seed, epochs=10)
-    judgements = {name: consistency.judge_runs(one) for name, one in zip(peers, found, strict=True)}
-    probability = _frames(montecarlo.Plan(scenario=scene, setup=setups[0], seed=seed, epochs=10), min(runs, 20))
+def main(*, runs: int = 200, duration: float = 40.0, seed: int = 1, out: Path | str | None = None) -> Result:
+    """Judge the peers; verdicts and the table are written to ``out`` if it is given."""
+    given = cases(duration)
+    found, plans = {}, {}
+    for name, (_, scene, estimator) in given.items():
+        chosen = replace(setup.matched(scene), attitude_sigma=1.0 * DEGREE, bias_sigma=BIAS, estimator=estimator)
+        plans[name] = montecarlo.Plan(scenario=scene, setup=chosen, seed=seed, epochs=10)
+        found[name] = montecarlo.run_plan(plans[name], runs=runs)
+    result = Result(
+        judgements={name: consistency.judge_runs(one) for name, one in found.items()},
+        statistics=found,
+        frame_probability=_frames(plans["smsfusion"], min(runs, 20)) if "smsfusion" in plans else {},
+    )
     if out is not None:
         Path(out).mkdir(parents=True, exist_ok=True)
-        content = {"error_frame_probability": probability, **{name: one.summary() for name, one in judgements.items()}}
+        content: dict[str, Any] = {"error_frame_probability": result.frame_probability}
+        content |= {name: {"rows": rows(found[name]), **one.summary()} for name, one in result.judgements.items()}
         write_json(Path(out) / "peer_judged.json", content)
-    return Result(
-        installed=True,
-        verdicts={name: one.words for name, one in judgements.items()},
-        statistics=dict(zip(peers, found, strict=True)),
-        frame_probability=probability,
-    )
+        (Path(out) / "peer_judged.md").write_text(table(result) + "\n", encoding="utf-8")
+    return result
+
+
+def rows(statistics: montecarlo.Statistics) -> dict[str, Any]:
+    """Return what a peer says of itself and what is true, over the judged epochs."""
+    judged = montecarlo.judged_epochs(len(statistics.time) - 1)
+    size = 6 if statistics.has_bias else 3
+    rms = np.sqrt(np.mean(statistics.rms_error[judged] ** 2, axis=0))[:size]
+    sigma = np.sqrt(np.mean(statistics.sigma[judged] ** 2, axis=0))[:size]
+    verdicts = {name: statistics.verdict(judged, name) for name in statistics.subsets}
+    return {
+        "anees": {name: float(one.mean.mean()) for name, one in verdicts.items()},
+        "bounds": {name: list(one.bounds) for name, one in verdicts.items()},
+        "rms_si": rms.tolist(),
+        "sigma_si": sigma.tolist(),
+    }
+
+
+def table(result: Result) -> str:
+    """Return what peers say of themselves and what is true as a table in Markdown."""
+    lines = [
+        "| filter | ANEES state | attitude | bias | RMS/σ attitude x, y, z | RMS/σ bias x, y, z | verdict |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, one in result.statistics.items():
+        row = rows(one)
+        ratio = np.array(row["rms_si"]) / np.array(row["sigma_si"])
+        anees = [f"{row['anees'][part]:.3g}" if part in row["anees"] else "" for part in ("state", "attitude", "bias")]
+        ratios = [", ".join(f"{x:.3g}" for x in part) for part in (ratio[:3], ratio[3:])]
+        lines.append(f"| {' | '.join([name, *anees, *ratios, result.judgements[name].verdict])} |")
+    return "\n".join(lines)
 
 
 def _frames(plan: montecarlo.Plan, runs: int) -> dict[str, float]:
@@ -191,10 +358,9 @@ if __name__ == "__main__":
     parser.add_argument("--out", type=Path, default=Path("results/peer_judged"))
     arguments = parser.parse_args()
     result = main(runs=arguments.runs, seed=arguments.seed, out=arguments.out)
-    if not result.installed:
-        print("smsfusion is not installed: pip install smsfusion")
-    for name, words in result.verdicts.items():
-        print(f"\n{name}: {words}")
-    if result.installed:
+    print(table(result) if result.statistics else "No peer is installed: pip install smsfusion attipy gtsam")
+    for name, one in result.judgements.items():
+        print(f"\n{name}: {one.words}")
+    if result.frame_probability:
         said = ", ".join(f"{name} {100.0 * p:.3g} %" for name, p in result.frame_probability.items())
-        print(f"\nIts covariance is of the attitude error read as: {said}.")
+        print(f"\nsmsfusion's covariance is of the attitude error read as: {said}.")

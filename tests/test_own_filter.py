@@ -10,11 +10,24 @@ import numpy as np
 import pytest
 import two_stars
 
-from strapdown import cli, consistency, covariance, estimation, montecarlo, setup, tuning
+from strapdown import (
+    cli,
+    consistency,
+    covariance,
+    estimation,
+    montecarlo,
+    motion,
+    quaternion,
+    scenarios,
+    setup,
+    tuning,
+    vectors,
+)
 from strapdown.checks import InputError
 from strapdown.estimation import filters
-from strapdown.montecarlo import Plan, campaign
-from strapdown.records import Estimate, Truth
+from strapdown.gyro import GyroSpec
+from strapdown.montecarlo import Plan, campaign, verdicts
+from strapdown.records import Estimate, Truth, read_estimate, read_truth
 from strapdown.report import campaigns
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -118,8 +131,15 @@ def test_without_a_bias_the_attitude_alone_is_judged(own, tmp_path, capsys):
     assert "bias x" not in page
     assert "nan" not in json.dumps(numbers).lower()
     cli.app(["montecarlo", str(tmp_path / "own.h5")], standalone_mode=False)
-    assert "NEES of the attitude" in (told := capsys.readouterr().out)
-    assert "bias" not in told
+    assert "NEES of the attitude" in (output := capsys.readouterr().out)
+    assert "bias" not in output
+
+
+def test_without_a_bias_it_is_consistent_where_the_attitude_shows_it():
+    judgement = consistency.judge_runs(montecarlo.run_plan(with_filter(attitude_only), runs=250))
+    assert judgement.verdict == "consistent"
+    assert [one.of for one in judgement.power] == ["attitude"]
+    assert "bias" not in judgement.words
 
 
 def test_a_filter_that_fails_in_a_run_is_counted(own):
@@ -141,6 +161,122 @@ def test_a_too_modest_filter_is_found_out():
     assert consistency.judge_runs(statistics).verdict == "not consistent"
 
 
+MINE = """
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from beside import NOISE
+from strapdown import estimation
+from strapdown.records import Estimate
+
+
+@dataclass
+class Scaled:
+    factor: float = 1.0
+
+    def run(self, record, initial):
+        estimate = estimation.run(record, NOISE, initial, full_covariance=True)
+        return replace(estimate, covariance=self.factor**2 * estimate.covariance)
+
+
+def alone(record, initial):
+    estimate = estimator.run(record, initial)
+    rows = [k * k for k in range(1, 11)]
+    return Estimate.from_arrays(estimate.time[rows], estimate.attitude[rows], estimate.covariance[rows, :3, :3])
+
+
+estimator = Scaled()
+modest = Scaled(2.0)
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with a scenario, a filter in a Python file, and what that imports."""
+    noise = SETUP.process_noise
+    numbers = f"angle_random_walk={noise.angle_random_walk!r}, rate_random_walk={noise.rate_random_walk!r}"
+    (tmp_path / "scene.toml").write_text(scenarios.scenario_to_toml(SCENARIO))
+    (tmp_path / "mine.py").write_text(MINE)
+    (tmp_path / "beside.py").write_text(
+        f"from strapdown.estimation.states import ProcessNoise\nNOISE = ProcessNoise({numbers})\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    yield tmp_path
+    sys.modules.pop("beside", None)
+
+
+def command(*arguments):
+    return cli.app(["montecarlo", *map(str, arguments)], standalone_mode=False)
+
+
+@pytest.mark.parametrize("machine", ["threads", "processes"])
+def test_a_filter_of_a_python_file_is_run_from_the_command_line(own, folder, capsys, machine):
+    """The same statistics to the bit as those of the package's filter."""
+    workers = ("--threads", 2) if machine == "threads" else ("--workers", 1)
+    if machine == "processes":
+        pytest.importorskip("distributed")
+    code = command("scene.toml", "--filter", "mine.py", "--runs", 12, "--chunk", 5, "--seed", 3, *workers)
+    assert code == 2  # 12 runs cannot tell
+    assert "Executing mine.py: it can do whatever you can." in capsys.readouterr().out
+    plan = replace(PLAN, epochs=100, nis_bins=100)
+    held = campaign.read(folder / "scene-montecarlo.h5")
+    same(montecarlo.run_plan(plan, runs=12, machine="scalar", chunk=5), held.statistics)
+    assert held.plan.setup.estimator.table["file"] == "mine.py:estimator"
+    assert "mine" not in sys.modules
+    command("scene.toml", "--filter", "mine.py:modest", "--runs", 12, "--chunk", 5, "--seed", 3, "--out", "modest.h5")
+    modest = campaign.read(folder / "modest.h5").statistics
+    np.testing.assert_allclose(modest.nees_sum, 0.25 * held.statistics.nees_sum, rtol=1e-12)
+
+
+def test_its_campaign_goes_on_and_is_replayed_where_the_code_is_given_again(folder):
+    command("scene.toml", "--filter", "mine.py", "--runs", 5, "--out", "own.h5")
+    with pytest.raises(InputError, match=r"give it again: --filter mine.py:estimator"):
+        command("own.h5", "--runs", 8, "--resume")
+    command("own.h5", "--filter", "mine.py", "--runs", 8, "--resume")
+    assert campaign.read(folder / "own.h5").statistics.runs == 8
+    command("own.h5", "--filter", "mine.py:estimator", "--replay", 6)
+    assert (folder / "own-run-6-estimate.h5").exists()
+    with pytest.raises(InputError, match=r"is not the filter of own\.h5"):
+        command("own.h5", "--filter", "mine.py:modest", "--runs", 9, "--resume")
+    (folder / "mine.py").write_text(MINE + "# edited\n")
+    with pytest.raises(InputError, match=r"is not the filter of own\.h5"):
+        command("own.h5", "--filter", "mine.py", "--replay", 6)
+    with pytest.raises(InputError, match="source_sha256"):
+        command("scene.toml", "--filter", "mine.py", "--runs", 9, "--out", "own.h5", "--resume")
+
+
+def test_a_run_of_a_filter_without_a_bias_and_at_times_of_its_own_is_replayed_and_judged(folder, capsys):
+    command("scene.toml", "--filter", "mine.py:alone", "--runs", 3, "--out", "own.h5", "--replay", 1)
+    assert "of three states" in capsys.readouterr().out
+    files = ["own-run-1-estimate.h5", "--truth", "own-run-1-record.h5"]
+    cli.app(["check", *files], standalone_mode=False)
+    assert "none of 1 tests contradicts the filter" in capsys.readouterr().out
+    read, truth = read_estimate("own-run-1-estimate.h5"), read_truth("own-run-1-estimate.h5")
+    turn = quaternion.log(quaternion.multiply(quaternion.conjugate(read.attitude), truth.attitude))
+    assert np.max(np.abs(turn)) < 5.0 * np.max(read.sigma[:, :3])  # the truth of these times, not of others
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "message"),
+    [
+        (None, "", "mine.py: there is no such Python file"),
+        ("1 +", "", "mine.py fails when it is executed: SyntaxError"),
+        ("x = 1\n1 / 0", "", "mine.py, line 2 fails when it is executed: ZeroDivisionError"),
+        ("x = 1", "", "mine.py defines no estimator; give the name of the filter, mine.py:NAME"),
+        ("x = 1", ":x", "1 is no filter"),
+        ("class F: run = None", ":F", "F is a class; give an object of it"),
+    ],
+)
+def test_a_file_that_holds_no_filter_is_refused(folder, text, name, message):
+    (folder / "mine.py").unlink()
+    if text is not None:
+        (folder / "mine.py").write_text(text)
+    with pytest.raises(InputError, match=message):
+        command("scene.toml", "--filter", f"mine.py{name}", "--runs", 2)
+    assert not (folder / "scene-montecarlo.h5").exists()
+
+
 def test_a_campaign_goes_on_and_is_replayed(own, tmp_path):
     plan, path = with_filter(Wrapped()), tmp_path / "own.h5"
     campaign.run(plan, path, runs=5, chunk=5)
@@ -153,7 +289,7 @@ def test_a_campaign_goes_on_and_is_replayed(own, tmp_path):
     read = campaign.read(path).plan
     assert read.digest == plan.digest
     assert read.setup == plan.setup
-    with pytest.raises(InputError, match="Wrapped is a filter of your own, whose code no file holds"):
+    with pytest.raises(InputError, match="Wrapped is a filter of your own, whose code no result file holds"):
         montecarlo.replay(read, 0)
     assert "textbook" not in campaigns.report(path, 0.99)[0]
 
@@ -328,3 +464,106 @@ def test_it_is_tuned_against_a_truth_too():
     ):
         with pytest.raises(InputError, match=message):
             tuning.fit_own(*arguments)
+
+
+# ------------------------------------------------------------------------------------------------- the Cramér–Rao bound
+
+
+def star_tracker(rate=1.0, duration=2000.0, **gyro):
+    """A body at rest whose three axes are measured alike."""
+    spec = GyroSpec(**{"angle_random_walk": 1e-5, "rate_random_walk": 1e-6, **gyro})
+    tracker = vectors.AttitudeSensor(name="tracker", sigma_across=1e-4, sigma_about=1e-4, rate=rate)
+    rest = motion.ConstantRate(rate=(0.0, 0.0, 0.0))
+    return scenarios.Scenario(motion=rest, gyro=spec, sensors=(tracker,), rate=2.0, duration=duration)
+
+
+def cramer_rao(scene, attitude_sigma, bias_sigma, epochs):
+    chosen = replace(setup.matched(scene), attitude_sigma=attitude_sigma, bias_sigma=bias_sigma)
+    return covariance.analyse(scene, chosen, epochs=epochs).cramer_rao
+
+
+def test_the_bound_ends_in_farrenkopfs_steady_state():
+    """Farrenkopf 1978, one axis at rest, just after an update."""
+    su, sv, sn, dt = 1e-6, 1e-5, 1e-4, 1.0
+    S_u, S_v = su * dt**1.5 / sn, sv * dt**0.5 / sn
+    gamma = np.sqrt(1.0 + S_v**2 / 4.0 + S_u**2 / 48.0)
+    zeta = gamma + S_u / 4.0 + 0.5 * np.sqrt(2.0 * gamma * S_u + S_v**2 + S_u**2 / 3.0)
+    bound = cramer_rao(star_tracker(), attitude_sigma=1e-3, bias_sigma=1e-5, epochs=10)
+    variances = [sn**2 * (1.0 - zeta**-2)] * 3 + [su * sn / np.sqrt(dt) * (zeta - 1.0 / zeta) - 0.5 * su**2 * dt] * 3
+    np.testing.assert_allclose(np.diag(bound[-1]), variances, rtol=1e-8)
+    np.testing.assert_allclose(np.diag(bound[0]), [1e-6] * 3 + [1e-10] * 3, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "gyro", [{"bias_instability": 1e-6}, {"rate_random_walk": (1e-6, 1e-6, 3e-6)}], ids=["flicker", "axes"]
+)
+def test_there_is_no_bound_where_the_noise_is_not_that_of_the_recursion(gyro):
+    scene = star_tracker(duration=100.0, **gyro)
+    with pytest.raises(InputError, match="the filter's noise is not that of the scenario"):
+        cramer_rao(scene, attitude_sigma=1e-3, bias_sigma=1e-5, epochs=10)
+    plan = Plan(scenario=scene, setup=replace(setup.matched(scene), estimator=wrapped), epochs=10)
+    assert verdicts.bound_of(plan) is None
+
+
+def test_a_filter_that_leaves_measurements_out_stays_above_the_bound_by_just_that(tmp_path, capsys):
+    """Every other attitude: the bound of a tracker of half the rate, in closed recursion, says how much that costs."""
+    scene = star_tracker(duration=60.0)
+    base = replace(setup.matched(scene), attitude_sigma=1e-3, bias_sigma=1e-5)
+
+    def half(record, initial):
+        (tracker,) = record.vectors
+        odd = np.flatnonzero(np.isclose(tracker.time % 2.0, 0.0))
+        of_half = {name: getattr(tracker, name)[odd] for name in ("time", "attitude", "sigma", "sigma_axes")}
+        kept = replace(tracker, **of_half)
+        return estimation.run(replace(record, vectors=(kept,)), base.process_noise, initial, full_covariance=True)
+
+    plan = Plan(scenario=scene, setup=replace(base, estimator=half), seed=5, epochs=6)
+    bound = verdicts.bound_of(plan)
+    lesser = cramer_rao(star_tracker(rate=0.5, duration=60.0), attitude_sigma=1e-3, bias_sigma=1e-5, epochs=6)
+    predicted = np.sqrt(np.diagonal(lesser, axis1=1, axis2=2) / np.diagonal(bound, axis1=1, axis2=2))
+    assert predicted[-1, 0] > 1.1
+    for given, sigma in ((montecarlo.Dispersions(), 1e-3), (montecarlo.Dispersions(attitude_sigma=3e-3), 3e-3)):
+        least = cramer_rao(scene, attitude_sigma=sigma, bias_sigma=1e-5, epochs=6)
+        np.testing.assert_array_equal(verdicts.bound_of(replace(plan, dispersions=given)), least)
+    assert verdicts.bound_of(replace(plan, dispersions=montecarlo.Dispersions(attitude_error=(1e-3, 0, 0)))) is None
+    runs = 300
+    statistics = campaign.run(plan, tmp_path / "half.h5", runs=runs).statistics
+    ratio = verdicts.efficiency(statistics, bound)
+    low, high = consistency.mean_bounds(1, runs, 1.0 - 0.01 / 36)
+    assert np.all(ratio[1:] / predicted[1:] > low**0.5)
+    assert np.all(ratio[1:] / predicted[1:] < high**0.5)
+    said = montecarlo.summary(statistics, bound=bound)["rms_over_root_cramer_rao_bound"]
+    np.testing.assert_allclose(said["attitude"], np.sqrt(np.mean(ratio[1:, :3] ** 2, axis=0)), rtol=1e-12)
+    cli.app(["montecarlo", str(tmp_path / "half.h5")], standalone_mode=False)
+    assert f"by axis: attitude {said['attitude'][0]:.3f}" in capsys.readouterr().out
+    page, numbers = campaigns.report(tmp_path / "half.h5", 0.99)
+    np.testing.assert_allclose(numbers["rms_over_root_cramer_rao_bound"], ratio, rtol=1e-12)
+    assert "Cramér–Rao" in page
+    assert verdicts.bound_of(replace(plan, setup=base)) is None  # of the package's own filter its σ says it
+
+
+def test_a_comparison_gives_errors_over_the_bound():
+    scene = star_tracker(duration=60.0)
+    base = setup.matched(scene)
+    one = montecarlo.replay(Plan(scenario=scene, setup=base, seed=5, epochs=6), 0, machine="scalar")
+    bound = cramer_rao(
+        scene, attitude_sigma=base.attitude_sigma, bias_sigma=base.bias_sigma, epochs=len(one.record.increments)
+    )
+
+    def mine(record, initial):
+        return estimation.run(record, base.process_noise, initial, full_covariance=True)
+
+    found = filters.compare(
+        one.record, base.process_noise, one.initial, filters=["mekf", mine], every=2, bound=bound[::2]
+    )
+    error = found.estimates["mine"]
+    turn = quaternion.log(
+        quaternion.multiply(quaternion.conjugate(error.attitude), one.record.truth.attitude[::2])
+    ) / np.sqrt(np.diagonal(bound[::2], axis1=1, axis2=2)[:, :3])
+    expected = np.sqrt(np.mean(turn[error.time >= 30.0] ** 2))
+    assert found.summary()["mine"]["attitude_over_bound"] == pytest.approx(expected, rel=1e-12)
+    assert f"{expected:.3f}" in str(found)
+    for bad, message in ((bound, r"bound has shape"), (bound[::2], "no truth")):
+        record = replace(one.record, truth=None) if message == "no truth" else one.record
+        with pytest.raises(InputError, match=message):
+            filters.compare(record, base.process_noise, one.initial, filters=["mekf"], every=2, bound=bad)

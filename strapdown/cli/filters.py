@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from strapdown.estimation.filters.own import Own
     from strapdown.recordings.recordfiles import RecordFile
     from strapdown.scenarios import Scenario
     from strapdown.setup import FilterSetup
@@ -93,6 +94,17 @@ def filter_of_scenario(filter_file: Path, scenario: Scenario) -> FilterSetup:
     kinds = {sensor.name: str(getattr(sensor, "kind", "attitude")) for sensor in scenario.sensors}
     setup.need_angles(chosen, kinds, f"{filter_file}: filter")
     return chosen
+
+
+def own_filter(place: Path) -> Own | None:
+    """Return the filter of a Python file, ``FILE.py:NAME``, which is executed; None of any other file."""
+    from strapdown.cli.terminal import console
+    from strapdown.estimation.filters.own import read_filter
+
+    if not (place.suffix == ".py" or ".py:" in place.name):
+        return None
+    console.print(f"Executing {place.name.partition(':')[0]}: it can do whatever you can.")
+    return read_filter(place)
 
 
 def no_state_words(missing: tuple[str, ...], chosen: FilterSetup) -> list[str]:

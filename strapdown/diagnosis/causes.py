@@ -12,6 +12,8 @@ from strapdown.results import Listed, Listing, figure
 
 LIKELIER = math.log(20.0)
 """Difference in ln p from which on the likelier of two causes is preferred: odds of 20 to 1, "strong" evidence (Kass & Raftery 1995)."""
+APPROXIMATION = 0.01
+"""Relative error of ln p itself: a hypothesis keeps the filter's start and is linearised, which shows where a fault is gross."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -94,8 +96,9 @@ class Diagnosis(Listed):
 
     @property
     def alternatives(self) -> tuple[Cause, ...]:
-        """The likeliest cause and those that are less likely by a factor of 20 at most: the data do not distinguish them."""
-        return tuple(cause for cause in self.causes if cause.log_p <= self.causes[0].log_p + LIKELIER)
+        """The likeliest cause and those less likely by a factor of 20 or 1 % of ln p at most: the data do not distinguish them."""
+        best = self.causes[0].log_p if self.causes else 0.0
+        return tuple(cause for cause in self.causes if cause.log_p <= best + max(LIKELIER, APPROXIMATION * -best))
 
     @property
     def words(self) -> str:

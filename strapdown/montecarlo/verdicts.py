@@ -2,18 +2,49 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from strapdown import consistency, units
+from strapdown import consistency, covariance, units
+from strapdown.checks import Array, InputError
+from strapdown.montecarlo.plan import Plan
 from strapdown.montecarlo.statistics import COVERED, Counts, Statistics, judged_epochs
+from strapdown.setup import MEKF, matched
 
 QUANTILES = (0.5, 0.95, 0.997)
 """Quantiles of the last epoch's errors in the summary."""
 
 
-def summary(statistics: Statistics, *, epochs: Counts | None = None, probability: float = 0.99) -> dict[str, Any]:
+def bound_of(plan: Plan) -> Array | None:
+    """Return the Cramér–Rao bound (m, 6, 6) at a plan's epochs for another estimator than the MEKF; None where it does not hold.
+
+    The σ of a matched MEKF is its root. It holds for scenarios of white noise whose initial errors have no fixed part.
+    """
+    given = plan.dispersions
+    if plan.setup.estimator == MEKF or np.any(given.attitude_error) or np.any(given.bias_error):
+        return None
+    sigma = {
+        name: getattr(plan.setup if getattr(given, name) is None else given, name)
+        for name in ("attitude_sigma", "bias_sigma")
+    }
+    try:
+        return covariance.analyse(
+            plan.scenario, replace(matched(plan.scenario), **sigma), epochs=plan.epochs
+        ).cramer_rao
+    except InputError:
+        return None
+
+
+def efficiency(statistics: Statistics, bound: Array) -> Array:
+    """Return the RMS error over the root of the Cramér–Rao bound at each epoch and state (m, 6)."""
+    return np.asarray(statistics.rms_error / np.sqrt(np.diagonal(bound, axis1=1, axis2=2)))
+
+
+def summary(
+    statistics: Statistics, *, epochs: Counts | None = None, probability: float = 0.99, bound: Array | None = None
+) -> dict[str, Any]:
     """Return verdict and numbers: ANEES and NIS per degree of freedom, coverage, errors, worst runs; units in the names.
 
     A consistent filter passes all tests together (three of NEES at all judged epochs, one of NIS for each sensor) with at least
@@ -27,6 +58,8 @@ def summary(statistics: Statistics, *, epochs: Counts | None = None, probability
         Indices of the epochs judged. Default: 20 evenly spaced ones.
     probability : float, default 0.99
         Probability that a consistent filter passes all tests together.
+    bound : ndarray (m, 6, 6), optional
+        Cramér–Rao bound at the epochs (:attr:`strapdown.covariance.Analysis.cramer_rao`), which the errors are compared with.
 
     Returns
     -------
@@ -70,6 +103,7 @@ def summary(statistics: Statistics, *, epochs: Counts | None = None, probability
         "nis": nis,
         "coverage": {"expected": list(COVERED), **_coverage(statistics, chosen)},
         "last_epoch": _last_epoch(statistics),
+        **({} if bound is None else {"rms_over_root_cramer_rao_bound": _efficiency(statistics, bound, chosen)}),
         "worst_runs": [
             {"run": int(run), "largest_nees": _number(score)}
             for run, score in zip(statistics.worst_run, statistics.worst_score, strict=True)
@@ -88,6 +122,17 @@ def _coverage(statistics: Statistics, epochs: Counts) -> dict[str, list[float | 
     return {
         name: [_number(x) for x in covered[:, rows].mean(axis=(0, 1))]
         for name, rows in (("attitude", slice(0, 3)), ("bias", slice(3, 6)))
+    }
+
+
+def _efficiency(statistics: Statistics, bound: Array, epochs: Counts) -> dict[str, list[float | None]]:
+    """Return the RMS over the judged epochs of the RMS error over the root of the bound, by axis, and its bounds at one epoch."""
+    ratio = np.sqrt(np.mean(efficiency(statistics, bound)[epochs] ** 2, axis=0))
+    parts = {"attitude": ratio[:3], "bias": ratio[3:]}
+    low, high = consistency.mean_bounds(1, statistics.runs)
+    return {
+        **{name: [_number(x) for x in values] for name, values in parts.items() if np.isfinite(values).all()},
+        "bounds_of_an_efficient_filter": [low**0.5, high**0.5],
     }
 
 

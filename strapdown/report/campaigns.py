@@ -9,11 +9,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from strapdown import consistency, plots, records
-from strapdown.checks import InputError
-from strapdown.montecarlo import campaign
+from strapdown.checks import Array, InputError
+from strapdown.montecarlo import campaign, verdicts
 from strapdown.montecarlo.statistics import SUBSETS, Statistics
 from strapdown.plots.statistics import STATES, state_unit
-from strapdown.plots.style import legend_above, legend_below, match_scales
+from strapdown.plots.style import legend_below, match_scales
 from strapdown.report import findings, page
 
 
@@ -25,6 +25,7 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
     if statistics is None:
         raise InputError(f"{path} holds no finished run yet; let the campaign go on (--resume) and report then")
     judgement = consistency.judge_runs(statistics, probability=probability, unmodelled=held.plan.unmodelled)
+    bound = verdicts.bound_of(held.plan)
     name = held.plan.scenario.name or "a scenario"
     unfinished = "" if held.finished else f"; not finished: {statistics.runs} of {held.runs} runs"
     content = page.page(
@@ -32,12 +33,12 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
         f"{statistics.runs} runs of {held.plan.scenario.duration:g} s, seed {held.plan.seed}, {len(statistics.time) - 1} epochs, machine: "
         f"{held.machine}{unfinished}; strapdown {held.version}",
         findings.verdict(judgement),
-        _numbers(statistics),
+        _numbers(statistics, bound),
         findings.evidence(judgement),
         page.section(
             "Over time",
             page.figure(
-                lambda: _consistency(statistics, probability),
+                lambda: plots.runs_overview(statistics, probability),
                 "ANEES of attitude and bias, and NIS, with the bounds of a consistent filter",
             ),
             page.figure(
@@ -67,6 +68,11 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
         "anees": {name: statistics.anees[:, SUBSETS[name][0]].tolist() for name in statistics.subsets},
         "rms_error_si": statistics.rms_error[:, : len(_estimated(statistics))].tolist(),
         "sigma_si": statistics.sigma[:, : len(_estimated(statistics))].tolist(),
+        **(
+            {}
+            if bound is None
+            else {"rms_over_root_cramer_rao_bound": [_plain(x) for x in _over_bound(statistics, bound)]}
+        ),
         "nis_by_sensor": dict(zip(statistics.sensors, _plain(statistics.sensor_nis), strict=True)),
         "worst_runs": statistics.worst_run.tolist(),
     }
@@ -81,7 +87,12 @@ def _plain(values: Any) -> list[float | None]:
     return [float(x) if np.isfinite(x) else None for x in values]
 
 
-def _numbers(statistics: Statistics) -> str:
+def _over_bound(statistics: Statistics, bound: Array) -> Array:
+    """Return the RMS error over the root of the Cramér–Rao bound, by epoch and estimated state."""
+    return verdicts.efficiency(statistics, bound)[:, : len(_estimated(statistics))]
+
+
+def _numbers(statistics: Statistics, bound: Array | None) -> str:
     rows = []
     for k, name in enumerate(_estimated(statistics)):
         unit, size = state_unit(k, 3.0 * statistics.sigma[-1:, k // 3 * 3 : k // 3 * 3 + 3])
@@ -94,6 +105,7 @@ def _numbers(statistics: Statistics) -> str:
                 page.number(float(statistics.mean_error[-1, k] / size), 3),
                 *quantiles,
                 *(f"{100 * share:.1f}" for share in statistics.covered[-1, k]),
+                *(() if bound is None else (page.number(float(_over_bound(statistics, bound)[-1, k]), 3),)),
             )
         )
     head = (
@@ -106,6 +118,7 @@ def _numbers(statistics: Statistics) -> str:
         "in 1σ, %",
         "in 2σ, %",
         "in 3σ, %",
+        *(() if bound is None else ("RMS / √Cramér–Rao bound",)),
     )
     nis = [
         (name, page.number(float(value)), *(f"{bound:.4f}" for bound in statistics.nis_bounds(0.99, name)))
@@ -114,7 +127,7 @@ def _numbers(statistics: Statistics) -> str:
         )
         if degrees.sum() > 0
     ]
-    parts = [page.table(head, rows, numbers=8)]
+    parts = [page.table(head, rows, numbers=len(head) - 1)]
     if nis:
         parts.append(page.table(("sensor", "NIS per degree of freedom", "from", "to (99 %)"), nis, numbers=3))
     if statistics.failed:
@@ -124,24 +137,6 @@ def _numbers(statistics: Statistics) -> str:
             )
         )
     return page.section("Key numbers", *parts)
-
-
-def _consistency(statistics: Statistics, probability: float) -> Figure:
-    figure, axes = plots.new_figure(1, 3, size=(12.0, 4.2))
-    axes[1].set_visible(statistics.has_bias)
-    bounds = consistency.mean_bounds(3, statistics.runs, probability)
-    label = f"{100 * probability:g} % bounds, each epoch"
-    low, high = np.nanmin(statistics.anees), np.nanmax(statistics.anees)
-    for ax, subset in zip(axes, ("attitude", "bias") if statistics.has_bias else ("attitude",), strict=False):
-        plots.nees_over_time([("all runs", statistics)], bounds, subset, ax, label=label)
-        ax.set_ylim(min(0.5, 0.8 * float(low)), max(2.0, 1.3 * float(high)))
-        legend_above(ax)
-    if statistics.sensor_degrees.sum() > 0:
-        plots.nis_over_time([("all runs", statistics)], axes[2], probability=probability)
-        legend_above(axes[2])
-    else:
-        axes[2].set_visible(False)
-    return figure
 
 
 def _fans(statistics: Statistics) -> Figure:

@@ -32,7 +32,9 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Protocol
 
-from strapdown.checks import InputError, one_of
+from numpy.typing import ArrayLike
+
+from strapdown.checks import InputError, array, one_of
 from strapdown.estimation import forward
 from strapdown.estimation.filters import complementary, extended, unscented
 from strapdown.estimation.filters.comparison import Comparison as Comparison
@@ -50,7 +52,7 @@ __all__ = [
 
 
 class Filter(Protocol):
-    """What runs a filter over a record."""
+    """Function that runs a filter over a record."""
 
     def __call__(
         self,
@@ -126,6 +128,7 @@ def compare(
     filters: Iterable[str | OwnFilter | Callable[[ImuRecord, State], Estimate]] = tuple(FILTERS),
     every: int = 1,
     full_covariance: bool = False,
+    bound: ArrayLike | None = None,
 ) -> Comparison:
     """Run several filters over one record.
 
@@ -147,6 +150,8 @@ def compare(
         Store every n-th edge, the first included.
     full_covariance : bool, default False
         Store whole covariance matrices too.
+    bound : array_like (n, 6, 6), optional
+        Cramér–Rao bound at the kept edges (:attr:`strapdown.covariance.Analysis.cramer_rao`): errors are compared with its root.
 
     Returns
     -------
@@ -177,5 +182,10 @@ def compare(
         for name, one in zip(names, chosen, strict=True)
     }
     truth = record.truth
+    if bound is not None and truth is None:
+        raise InputError(
+            "bound is given, but the record has no truth, so there are no errors to compare with it; leave bound out"
+        )
+    least = None if bound is None else array("bound", bound, (len(record.time[::every]), 6, 6))
     kept = None if truth is None else Truth(attitude=truth.attitude[::every], bias=truth.bias[::every])
-    return Comparison(estimates=estimates, truth=kept)
+    return Comparison(estimates=estimates, truth=kept, bound=least)

@@ -22,22 +22,28 @@ import functools
 import hashlib
 import inspect
 import json
+import os
+import sys
+import traceback
 import types
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
 from strapdown.checks import Array, InputError, array, increasing, instance
 from strapdown.estimation.states import State
+from strapdown.files import reading
 from strapdown.records import Estimate, ImuRecord
 
-__all__ = ["Own", "OwnFilter", "as_own"]
+DEFAULT_NAME = "estimator"
+"""Name of the filter in a Python file where none is given."""
 
 
 class OwnFilter(Protocol):
-    """What a filter of one's own provides; a plain function of the same two arguments does as well."""
+    """Interface of a filter of one's own; a plain function of the same two arguments does as well."""
 
     def run(self, record: ImuRecord, initial: State) -> Estimate:
         """Return the estimate at the record's edges, or at some of them.
@@ -67,9 +73,12 @@ class Own:
     ----------
     given : callable, object with a method ``run``, or mapping
         The function or object, or the description of one that was read from a file, which cannot run.
+    source : mapping, default empty
+        Of a filter read from a Python file: that file and its SHA-256, which stand in the description.
     """
 
     given: Any
+    source: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check that it can be called."""
@@ -83,7 +92,7 @@ class Own:
 
     @functools.cached_property
     def table(self) -> dict[str, Any]:
-        """What identifies it in files: name, parameters, and the SHA-256 of its source where Python knows that."""
+        """Identity in files: name, parameters, and the SHA-256 of its source where Python knows that."""
         if isinstance(self.given, Mapping):
             return dict(self.given)
         inner, parameters = self.given, {}
@@ -103,6 +112,8 @@ class Own:
         plain = {key: _plain(value) for key, value in sorted(parameters.items()) if key != "name"}
         if plain:
             table["parameters"] = plain
+        if self.source:
+            return table | dict(self.source)
         try:
             table["source_sha256"] = hashlib.sha256(inspect.getsource(code).encode()).hexdigest()
         except (OSError, TypeError):  # typed at a prompt, or compiled
@@ -119,22 +130,14 @@ class Own:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Send the filter itself; its description is made anew."""
-        return Own, (self.given,)
+        return Own, (self.given, self.source)
 
     def __call__(self, record: ImuRecord, initial: State, *, times: Array | None = None) -> Estimate:
-        """Run it over a record and check what it returns.
-
-        Parameters
-        ----------
-        record : ImuRecord
-            The truth is taken out before the filter sees it.
-        initial : State
-        times : array, optional
-            Times wanted, of the record's edges; default: those that the filter returns.
-        """
+        """Run it over a record without its truth, and check what it returns; only the ``times`` wanted, of the record's edges, if given."""
         if isinstance(self.given, Mapping):
+            again = f"--filter {self.table['file']}" if "file" in self.table else "--filter FILE.py:NAME"
             raise InputError(
-                f"{self.name} is a filter of your own, whose code no file holds; in Python, give it again: "
+                f"{self.name} is a filter of your own, whose code no result file holds; give it again: {again}, or in Python "
                 "replace(plan, setup=replace(plan.setup, estimator=…))"
             )
         estimate = _function(_copied(self.given, self.name))(replace(record, truth=None), initial)
@@ -142,24 +145,63 @@ class Own:
 
 
 def as_own(filter_: Any) -> Own:
-    """Return one's own filter with its description.
+    """Return one's own filter, a function or an object with a method ``run`` (:class:`OwnFilter`), with its description."""
+    return filter_ if isinstance(filter_, Own) else Own(filter_)
+
+
+def read_filter(place: str | os.PathLike[str]) -> Own:
+    """Return a filter of one's own from a Python file. The file is executed, with all that it imports.
 
     Parameters
     ----------
-    filter_ : callable or object with a method ``run``
-        Takes a record and an initial state and returns an estimate (:class:`OwnFilter`); an :class:`Own` is returned as it is.
+    place : path
+        ``FILE.py:NAME``, or ``FILE.py`` for the name ``estimator``. Files beside it can be imported while it is executed.
 
     Returns
     -------
     Own
-        The filter, which can be called and compared.
+        The function or object of that name. The hash of the file is part of its description.
 
     Raises
     ------
     InputError
-        If it is neither a function nor an object with a method ``run``, or has not two arguments.
+        If the file is missing or fails, or has no filter of that name.
+
+    Examples
+    --------
+    >>> from strapdown.estimation.filters.own import read_filter
+    >>> mine = read_filter("mine.py:textbook")  # doctest: +SKIP
     """
-    return filter_ if isinstance(filter_, Own) else Own(filter_)
+    file, _, name = str(place).rpartition(":") if not str(place).endswith(".py") else (str(place), "", DEFAULT_NAME)
+    path = Path(file).resolve()
+    if not file.endswith(".py") or not path.is_file():
+        raise InputError(
+            f"{file or place}: there is no such Python file; give FILE.py:NAME, or FILE.py for {DEFAULT_NAME}"
+        )
+    code = reading.content(path)
+    module = types.ModuleType(path.stem)
+    module.__file__ = str(path)
+    # Known by its name while it is executed, as dataclasses need, and not after: so it is sent to other processes by value.
+    before = sys.modules.get(path.stem)
+    sys.modules[path.stem] = module
+    sys.path.insert(0, str(path.parent))
+    try:
+        exec(compile(code, str(path), "exec"), module.__dict__)
+    except Exception as error:
+        line = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)][-1:]
+        at = f", line {line[0]}" if line else ""
+        raise InputError(f"{file}{at} fails when it is executed: {type(error).__name__}: {error}") from error
+    finally:
+        sys.path.remove(str(path.parent))
+        if before is None:
+            sys.modules.pop(path.stem, None)
+        else:
+            sys.modules[path.stem] = before
+    if name not in module.__dict__:
+        raise InputError(f"{file} defines no {name}; give the name of the filter, {file}:NAME")
+    return Own(
+        getattr(module, name), {"file": f"{path.name}:{name}", "source_sha256": hashlib.sha256(code).hexdigest()}
+    )
 
 
 def _function(given: Any) -> Any:
