@@ -298,9 +298,12 @@ def loop(a, n):
 def part(row, i):
     return row[i]
 
+def power(a):
+    return 2.0 ** a
+
 def everything(a, n, row):
     (both, more), below = formula(a, 1, row)
-    return both.second, more, below, branch(a), loop(a, n), part(row, 1)[0]
+    return both.second, more, below, branch(a), loop(a, n), power(a), part(row, 1)[0]
 """
 
 
@@ -312,7 +315,7 @@ def test_formulas_are_traced_and_what_decides_or_repeats_is_compiled():
         np.testing.assert_array_equal(here, there)
     for name in ("product", "formula"):
         assert not machine.helper(getattr(module, name), ()).formula.plain.signatures
-    for name in ("branch", "loop", "part"):
+    for name in ("branch", "loop", "part", "power"):
         assert len(machine.helper(getattr(module, name), ()).formula.plain.signatures) == 1
 
 

@@ -137,7 +137,7 @@ for _name in ("add", "sub", "mul", "truediv", "and_", "or_"):
 for _name in ("lt", "le", "gt", "ge", "eq", "ne", "neg", "invert", "getitem", "setitem"):
     setattr(Symbol, f"__{_name}__", _operation(getattr(operator, _name)))
 Symbol.__abs__ = _operation(abs)  # type: ignore[attr-defined]
-for _name in ("bool", "int", "float", "index", "len", "iter", "getattr", "pow", "mod", "lshift", "rshift", "xor"):
+for _name in ("bool", "int", "float", "index", "len", "iter", "getattr", "pow", "rpow", "mod", "floordiv"):
     setattr(Symbol, f"__{_name}__", _refuse)
 
 
@@ -184,7 +184,7 @@ class Formula:
         if trace.builder is None and key not in self.known and not self.never:
             try:
                 result = self.function(*arguments)
-            except NotAFormula:
+            except (NotAFormula, TypeError):  # what Python cannot do with symbols, numba may
                 self.known[key] = False
             else:
                 self.known[key] = True
