@@ -27,6 +27,7 @@ import sys
 import time as clock
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -77,6 +78,8 @@ def imufusion_peer(gyro: Array, acc: Array, mag: Array, interval: float, gain: f
 
     settings = imufusion.AhrsSettings()
     settings.sample_rate, settings.convention, settings.gain = 1.0 / interval, imufusion.CONVENTION_ENU, 0.5 * gain
+    settings.gyroscope_range, settings.rejection_timeout = 2000.0, 5.0
+    settings.acceleration_rejection = settings.magnetic_rejection = 10.0
     ahrs = imufusion.Ahrs()
     ahrs.set_settings(settings)
     result = np.empty((len(gyro), 4))
@@ -330,6 +333,7 @@ def main(
             "date": datetime.date.today().isoformat(),
             "seed": seed,
             "duration_s": duration,
+            "peers": {package: version(package) for package, _ in PEERS.values() if importlib.util.find_spec(package)},
             "root_pcrb_deg": bound / DEGREE,
             "outcomes": [one.summary() for one in result.outcomes],
             "recordings": [Path(file).stem for file in files] or before.get("recordings", []),
@@ -354,8 +358,9 @@ def complementary(recording: Recording, gain: float) -> tuple[Array, Array]:
     """Return the stamps and attitudes of this package's complementary filter (Mahony's), with the measurements of the MEKF."""
     found = ahrs.estimate(recording, ahrs.MOTIONS["any"])
     noise = HAND_HELD.setup.process_noise
+    factor = 8.0 * gain  # fixed gains must follow the disturbances too
     scaled = ProcessNoise(
-        angle_random_walk=gain * noise.angle_random_walk, rate_random_walk=gain**2 * noise.rate_random_walk
+        angle_random_walk=factor * noise.angle_random_walk, rate_random_walk=factor**2 * noise.rate_random_walk
     )
     return found.record.time, filters.run("mahony", found.record, scaled, found.initial).attitude
 

@@ -13,20 +13,27 @@ And what it makes of them where something is wrong, which the verdict must find:
 - its covariance, right as it is, read as one about fixed axes, as ROS has it: the commonest mistake in judging a filter;
 - GTSAM's filter with a gyro that has the bias which it does not model.
 
-``pip install smsfusion attipy gtsam``, then ``python sims/peer_judged.py`` (some minutes): it writes ``peer_judged.json`` and
-``peer_judged.md``, a table. Peers that are not installed are left out.
+What it found besides: smsfusion and AttiPy take the yaw's derivative by the whole Gibbs vector of the attitude for that by a small rotation
+(:func:`heading_gradient`). It is too small by cos²(ψ/2): half at 90°, none at 180°, so that σ about the vertical is too large; with the
+right one AttiPy's filter is consistent.
+
+``pip install smsfusion attipy gtsam``, then ``python sims/peer_judged.py [--out docs/_data]`` (some minutes): it writes
+``peer_judged.json``, which the page *Comparison* of the documentation prints. Peers that are not installed are left out.
 """
 
 from __future__ import annotations
 
 import argparse
+import datetime
 import importlib.util
 from dataclasses import dataclass, field, replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+import strapdown
 from strapdown import consistency, montecarlo, quaternion, scenarios, setup, vectors
 from strapdown.checks import Array
 from strapdown.consistency import foreign
@@ -280,7 +287,7 @@ class Result:
 
 
 def main(*, runs: int = 200, duration: float = 40.0, seed: int = 1, out: Path | str | None = None) -> Result:
-    """Judge the peers; verdicts and the table are written to ``out`` if it is given."""
+    """Judge the peers; JSON is written to ``out`` if it is given."""
     given = cases(duration)
     found, plans = {}, {}
     for name, (_, scene, estimator) in given.items():
@@ -293,11 +300,18 @@ def main(*, runs: int = 200, duration: float = 40.0, seed: int = 1, out: Path | 
         frame_probability=_frames(plans["smsfusion"], min(runs, 20)) if "smsfusion" in plans else {},
     )
     if out is not None:
+        content = {
+            "version": strapdown.__version__,
+            "date": datetime.date.today().isoformat(),
+            "runs": runs,
+            "seed": seed,
+            "duration_s": duration,
+            "peers": {one: version(one) for one in sorted({package for package, _, _ in given.values()})},
+            "error_frame_probability": result.frame_probability,
+            "cases": {name: {**rows(found[name]), **one.summary()} for name, one in result.judgements.items()},
+        }
         Path(out).mkdir(parents=True, exist_ok=True)
-        content: dict[str, Any] = {"error_frame_probability": result.frame_probability}
-        content |= {name: {"rows": rows(found[name]), **one.summary()} for name, one in result.judgements.items()}
         write_json(Path(out) / "peer_judged.json", content)
-        (Path(out) / "peer_judged.md").write_text(table(result) + "\n", encoding="utf-8")
     return result
 
 
