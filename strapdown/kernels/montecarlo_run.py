@@ -87,7 +87,7 @@ class Gyro(NamedTuple):
     poles: np.ndarray
     gains: np.ndarray
     poles_start: np.ndarray
-    """Flicker (:class:`strapdown.flicker.Shaping`) (16,), (16,), and what makes stationary states of normals (16, 16) or (0, 16)."""
+    """Flicker (:class:`strapdown.gyro.flicker.Shaping`) (16,), (16,), and what makes stationary states of normals (16, 16) or (0, 16)."""
     dispersion: np.ndarray
     """σ of the entries of the error matrix (3, 3)."""
 
