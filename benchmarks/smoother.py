@@ -30,7 +30,7 @@ WANTED = {"filter": 6.0, "vqf": 5.0}
 
 
 def least_times(functions: dict[str, Callable[[], object]], seconds: float) -> dict[str, float]:
-    """Return the least time of one call of each, s, taken in turns so that what else the machine does strikes all alike."""
+    """Return the least time of one call of each, s, timed in turns so that other load of the machine affects all alike."""
     best = dict.fromkeys(functions, math.inf)
     for function in functions.values():
         function()
@@ -123,10 +123,10 @@ def main(arguments: list[str] | None = None) -> dict:
             f"{figures['smoother_over_filter']:.2f} times the filter (wanted: {WANTED['filter']:g} at most)"
         )
         if "vqf_ns" in figures:
-            told = f"wanted: {WANTED['vqf']:g} at least" if SPACING[name] == 1 else "with vectors at every sample"
+            target = f"wanted: {WANTED['vqf']:g} at least" if SPACING[name] == 1 else "with vectors at every sample"
             print(
                 f"{'vqf.offlineVQF':30s} {figures['vqf_ns']:.1f} ns a sample: {figures['vqf_over_smoother']:.2f} times the "
-                f"smoother ({told})"
+                f"smoother ({target})"
             )
     print(f"fixed lag of 100 samples       {result['fixed_lag_of_100_samples_ns']:.0f} ns a sample")
     for name in result["absent"]:

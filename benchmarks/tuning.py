@@ -3,7 +3,7 @@
 Run ``python benchmarks/tuning.py``.
 
 Each optimiser starts from parameters wrong by a factor and has the same likelihood to work on; derivatives come from one pass of lanes, or
-from differences of whole filter runs. The filterpy face is timed a pass, and its tuning told from the passes of the derivative-free search.
+from differences of whole filter runs. The filterpy face is timed a pass; its tuning is computed from the search without derivatives.
 """
 
 from __future__ import annotations
@@ -55,14 +55,14 @@ def seconds(work: Callable[[], Any], repeats: int) -> float:
 
 def step_seconds(one: tuning.Case, chosen: setup.FilterSetup, samples: int) -> float:
     """Return processor seconds a gyro sample of the filterpy face, measurements and all."""
-    believed = setup.believed(one.record, chosen)
+    modelled = setup.modelled_record(one.record, chosen)
     filter_ = StepFilter(chosen.process_noise, one.initial)
-    first, second = believed.vectors
-    dt = float(believed.time[1] - believed.time[0])
+    first, second = modelled.vectors
+    dt = float(modelled.time[1] - modelled.time[0])
     every = round(1.0 / dt)
     start = time.process_time()
     for k in range(samples):
-        filter_.predict(believed.increments[k], dt)
+        filter_.predict(modelled.increments[k], dt)
         if (k + 1) % every == 0:
             place = (k + 1) // every - 1
             for series in (first, second):
@@ -96,7 +96,7 @@ def main(*, duration: float = 1800.0, rate: float = 100.0, wrong: float = 30.0, 
     best = tuning.fit(objective, starts=4, intervals=False)
     rows = []
 
-    def tell(name: str, work: Callable[[], tuple[np.ndarray, int]]) -> None:
+    def report(name: str, work: Callable[[], tuple[np.ndarray, int]]) -> None:
         start = time.process_time()
         point, number = work()
         used = time.process_time() - start
@@ -135,12 +135,12 @@ def main(*, duration: float = 1800.0, rate: float = 100.0, wrong: float = 30.0, 
 
         return work
 
-    tell("scoring, lanes (ours)", ours)
-    tell("BFGS, gradient by lanes", quasi_newton)
-    tell("BFGS, differences of runs", differences)
-    tell("Nelder-Mead", free_of_derivatives("Nelder-Mead", {"xatol": 1e-3, "fatol": 1e-3}))
-    tell("Powell", free_of_derivatives("Powell", {"xtol": 1e-3, "ftol": 1e-9}))
-    tell("COBYLA (linear models in a trust region)", free_of_derivatives("COBYLA", {"tol": 1e-3, "rhobeg": 1.0}))
+    report("scoring, lanes (ours)", ours)
+    report("BFGS, gradient by lanes", quasi_newton)
+    report("BFGS, differences of runs", differences)
+    report("Nelder-Mead", free_of_derivatives("Nelder-Mead", {"xatol": 1e-3, "fatol": 1e-3}))
+    report("Powell", free_of_derivatives("Powell", {"xtol": 1e-3, "ftol": 1e-9}))
+    report("COBYLA (linear models in a trust region)", free_of_derivatives("COBYLA", {"tol": 1e-3, "rhobeg": 1.0}))
 
     start = time.perf_counter()
     whole = tuning.fit(tuning.likelihood([one], off, FREE), starts=20, threads=2)

@@ -221,18 +221,18 @@ def ukfm(runs: int) -> dict[str, Any]:
 
 def broad(path: Path) -> dict[str, Any]:
     """Return the mean errors by filter from the file that ``sims/hand_held.py`` wrote about BROAD recordings."""
-    told = json.loads(path.read_text(encoding="utf-8"))
+    published = json.loads(path.read_text(encoding="utf-8"))
     scores = {
         treatment: {
             name: [float(x) for x in np.mean([one["errors"] for one in each], axis=0) / DEGREE]
-            for name, each in told["scores"][treatment].items()
+            for name, each in published["scores"][treatment].items()
         }
         for treatment in ("as recorded", "compensated")
     }
-    coverage = [one["coverage"] for one in told["scores"]["as recorded"]["strapdown"]]
+    coverage = [one["coverage"] for one in published["scores"]["as recorded"]["strapdown"]]
     return {
-        "recordings": told["recordings"],
-        "latency_ms": told["latency_ms"],
+        "recordings": published["recordings"],
+        "latency_ms": published["latency_ms"],
         "errors_deg": scores,
         "coverage": [float(x) for x in np.mean(coverage, axis=0)],
     }

@@ -5,7 +5,7 @@ iron left; an accelerometer with 0.1 m/s² of bias, in a hand that accelerates b
 all axes. One filter (:mod:`strapdown.estimation`, 24 states) estimates attitude, gyro bias, the nine entries of the gyro's scale matrix,
 hard iron, accelerometer bias and the acceleration of the hand. It starts from the first samples, so its heading is off by a fifth of a
 radian, which is what the hard iron does to it; so it starts anew from where the smoother puts that start
-(:func:`strapdown.estimation.relinearized_start`), and what becomes of it otherwise is told beside.
+(:func:`strapdown.estimation.relinearized_start`), and the result without it is reported beside.
 
 Told are, for each state, what was known before and after, whether the errors of all runs are what the covariance says, and what the plain
 filter makes of the same records. The figure shows one run's errors in the filter's own ±3σ.
@@ -175,13 +175,13 @@ def main(*, runs: int = 20, duration: float = 120.0, seed: int = 1, out: Path | 
         assert record.truth is not None
         initial = start(record)
         attitude, bias = record.truth.attitude[::every], record.truth.bias[::every]
-        told = {**truth, SWAY.name: sway[::every]}
+        reference = {**truth, SWAY.name: sway[::every]}
         first = estimation.run(record, noise, initial, BLOCKS, every=every, full_covariance=True)
         anew = estimation.relinearized_start(record, noise, initial, BLOCKS)
         estimate = estimation.run(record, noise, anew, BLOCKS, every=every, full_covariance=True)
         assert estimate.whole_covariance is not None
         for one, kept in ((first, first_nees), (estimate, nees)):
-            error = one.errors(attitude, bias, told)
+            error = one.errors(attitude, bias, reference)
             kept.append(consistency.nees(error[-1], one.whole_covariance[-1]) / error.shape[1])
         errors.append(error)
         spread = np.sqrt(np.einsum("kii->ki", estimate.whole_covariance))
@@ -221,9 +221,9 @@ def without_blocks(record: ImuRecord, noise: ProcessNoise, initial: estimation.S
         "magnetometer": IRON.sigma[0] * np.sqrt(50.0),
     }
     series = tuple(s.noise_scaled(spread[s.sensor] / s.sigma[0]) for s in record.vectors)
-    believed = ImuRecord(time=record.time, increments=record.increments, vectors=series)
+    modelled = ImuRecord(time=record.time, increments=record.increments, vectors=series)
     wider = ProcessNoise(angle_random_walk=0.015, rate_random_walk=noise.rate_random_walk)
-    return estimation.run(believed, wider, initial, every=every).attitude
+    return estimation.run(modelled, wider, initial, every=every).attitude
 
 
 PANELS = (

@@ -1,6 +1,6 @@
 """A Monte Carlo against theory: a right filter passes, and a mismatched one fails by as much as its mismatch says.
 
-A body at rest, a gyro with white and random-walk noise, an attitude sensor once a second. The filter believes too much or too little of
+A body at rest, a gyro with white and random-walk noise, an attitude sensor once a second. The filter models too much or too little of
 its noises by a known factor. Then the covariance of its true errors is known too: it goes by the filter's own gains, but with the true
 noises (Joseph's form). From both follow the mean NEES and NIS at every moment, before any run. ``python sims/campaign.py``
 """
@@ -61,7 +61,7 @@ class Prediction:
     """What theory says of one axis at each epoch, the start included."""
 
     covariance: np.ndarray
-    """What the filter believes (m, 2, 2): attitude, bias."""
+    """The filter's covariance (m, 2, 2): attitude, bias."""
     true_covariance: np.ndarray
     """The covariance of its true errors (m, 2, 2)."""
     nis: np.ndarray
@@ -83,14 +83,14 @@ class Prediction:
 
 
 def predict(factor_q: float, factor_r: float, epochs: int) -> Prediction:
-    """Return what theory says of a filter that believes ``factor_q`` times Q and ``factor_r`` times R, at rest, one axis by itself."""
+    """Return what theory says of a filter that models ``factor_q`` times Q and ``factor_r`` times R, at rest, one axis by itself."""
     T, white, walk = INTERVAL, float(GYRO.angle_random_walk) ** 2, float(GYRO.rate_random_walk) ** 2
     phi = np.array([[1.0, -T], [0.0, 1.0]])
     Q = np.array([[white * T + walk * T**3 / 3.0, -walk * T**2 / 2.0], [-walk * T**2 / 2.0, walk * T]])
     R, H = SIGMA**2, np.array([[1.0, 0.0]])
     P = np.diag([RIGHT.attitude_sigma**2, RIGHT.bias_sigma**2])
     S = P.copy()
-    believed, true, nis = [P], [S], []
+    modelled, true, nis = [P], [S], []
     for _ in range(round(SCENARIO.duration / T)):
         P = phi @ P @ phi.T + factor_q * Q
         S = phi @ S @ phi.T + Q
@@ -100,10 +100,10 @@ def predict(factor_q: float, factor_r: float, epochs: int) -> Prediction:
         left = np.eye(2) - K @ H
         P = left @ P @ left.T + factor_r * R * (K @ K.T)
         S = left @ S @ left.T + R * (K @ K.T)
-        believed.append(P)
+        modelled.append(P)
         true.append(S)
     every = slice(None, None, round(SCENARIO.duration / T) // epochs)
-    return Prediction(covariance=np.array(believed)[every], true_covariance=np.array(true)[every], nis=np.array(nis))
+    return Prediction(covariance=np.array(modelled)[every], true_covariance=np.array(true)[every], nis=np.array(nis))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +117,7 @@ class Result:
 
 
 def plan(factor_q: float, factor_r: float, seed: int) -> Plan:
-    """Return the plan of a filter that believes ``factor_q`` times Q and ``factor_r`` times R."""
+    """Return the plan of a filter that models ``factor_q`` times Q and ``factor_r`` times R."""
     root = float(np.sqrt(factor_q))
     noise = ProcessNoise(
         angle_random_walk=root * RIGHT.process_noise.angle_random_walk,
@@ -150,14 +150,14 @@ def draw(statistics: dict[str, Statistics], predictions: dict[str, Prediction], 
         low, high = consistency.mean_bounds(3, runs)
         ax.axhspan(low, high, color=style.ink(), alpha=0.15, linewidth=0, label="99 % bounds of a consistent filter")
         for k, name in enumerate(FACTORS):
-            found, told = statistics[name], predictions[name]
+            found, predicted = statistics[name], predictions[name]
             if subset is None:
                 ax.plot(found.nis_time[::3], found.nis[::3], ".", markersize=3, color=style.CYCLE[k], label=name)
-                ax.plot(found.nis_time, told.nis, color=style.CYCLE[k], linewidth=1.0)
+                ax.plot(found.nis_time, predicted.nis, color=style.CYCLE[k], linewidth=1.0)
             else:
                 column = ("state", "attitude", "bias").index(subset)
                 ax.plot(found.time, found.anees[:, column], ".", markersize=3, color=style.CYCLE[k], label=name)
-                ax.plot(found.time, told.anees(subset), color=style.CYCLE[k], linewidth=1.0)
+                ax.plot(found.time, predicted.anees(subset), color=style.CYCLE[k], linewidth=1.0)
         ax.set_yscale("log")
         ax.set_yticks([0.25, 0.5, 1.0, 2.0, 4.0], ["¼", "½", "1", "2", "4"])
         ax.minorticks_off()
@@ -184,11 +184,11 @@ if __name__ == "__main__":
         f"{arguments.runs} runs of each, machine: {result.machine}. At the end, per degree of freedom, found (predicted):"
     )
     for name, found in result.statistics.items():
-        told = result.predictions[name]
+        predicted = result.predictions[name]
         parts = [
-            f"{subset} {found.anees[-1, k]:.3f} ({told.anees(subset)[-1]:.3f})"
+            f"{subset} {found.anees[-1, k]:.3f} ({predicted.anees(subset)[-1]:.3f})"
             for k, subset in ((1, "attitude"), (2, "bias"))
         ]
         verdict = "consistent" if montecarlo.summary(found)["consistent"] else "NOT consistent"
-        print(f"{name:6s} NEES of {', '.join(parts)}, NIS {found.nis[-1]:.3f} ({told.nis[-1]:.3f}): {verdict}")
+        print(f"{name:6s} NEES of {', '.join(parts)}, NIS {found.nis[-1]:.3f} ({predicted.nis[-1]:.3f}): {verdict}")
     print("figures:", *result.figures)

@@ -63,7 +63,7 @@ def main(*, runs: int = 100, duration: float = 240.0, seed: int = 1, out: Path |
         for algorithm in algorithms
     )
 
-    # 5. The same filter on each. It believes exactly what the gyro's noise is; it knows nothing of coning.
+    # 5. The same filter on each. Its model of the gyro's noise is exact; it knows nothing of coning.
     noise = ProcessNoise(angle_random_walk=gyro.angle_random_walk, rate_random_walk=gyro.rate_random_walk)
     setups = tuple(
         montecarlo.FilterSetup(

@@ -1,9 +1,9 @@
 """Where do the errors come from? The error budget of a filter from one pass without noise, held against a Monte Carlo.
 
 A satellite tumbles, its star tracker is blinded for a minute, its gyro has white noise, a walking bias and flicker, errors of scale factor
-and misalignment that no filter is told of. The covariance analysis (:mod:`strapdown.covariance`) predicts the RMS error, what the filter
+and misalignment that no filter models. The covariance analysis (:mod:`strapdown.covariance`) predicts the RMS error, what the filter
 says of itself, the NEES that comes of the difference, and the part of each source. Independent runs show whether that is so: for the
-filter that matches the noise, and for one that believes a quarter of the process noise.
+filter that matches the noise, and for one that models a quarter of the process noise.
 
 Run it: ``python sims/error_budget.py --out error-budget-results`` (a minute).
 """
@@ -57,28 +57,30 @@ class Result:
     figures: tuple[Path, ...]
 
 
-def more_sure(belief: FilterSetup) -> FilterSetup:
+def more_sure(filter_setup: FilterSetup) -> FilterSetup:
     """Return the setup with a quarter of the process noise."""
-    noise = belief.process_noise
+    noise = filter_setup.process_noise
     half = ProcessNoise(angle_random_walk=0.5 * noise.angle_random_walk, rate_random_walk=0.5 * noise.rate_random_walk)
-    return dataclasses.replace(belief, process_noise=half)
+    return dataclasses.replace(filter_setup, process_noise=half)
 
 
 def compare(
-    name: str, scenario: scenarios.Scenario, belief: FilterSetup, *, runs: int, epochs: int, seed: int
+    name: str, scenario: scenarios.Scenario, filter_setup: FilterSetup, *, runs: int, epochs: int, seed: int
 ) -> Comparison:
     """Return prediction and Monte Carlo of one filter."""
-    analysis = covariance.analyse(scenario, belief, epochs=epochs)
-    every = (len(scenario.edges) - 1) // belief.integration.samples // epochs
+    analysis = covariance.analyse(scenario, filter_setup, epochs=epochs)
+    every = (len(scenario.edges) - 1) // filter_setup.integration.samples // epochs
     squares, nees = np.zeros_like(analysis.rms), np.zeros(len(analysis.time))
     for run in range(runs):
         record = scenarios.simulate(scenario, seed, run)
         assert record.truth is not None
         draw = generator(seed, run, "initial error").standard_normal(6)
-        attitude = quaternion.multiply(record.truth.attitude[0], quaternion.exp(-belief.attitude_sigma * draw[:3]))
-        initial = setup.initial_state(belief, attitude, record.truth.bias[0] - belief.bias_sigma * draw[3:])
-        estimate = setup.run(record, belief, initial, every=every, full_covariance=True)
-        truth = setup.believed(record, belief).truth
+        attitude = quaternion.multiply(
+            record.truth.attitude[0], quaternion.exp(-filter_setup.attitude_sigma * draw[:3])
+        )
+        initial = setup.initial_state(filter_setup, attitude, record.truth.bias[0] - filter_setup.bias_sigma * draw[3:])
+        estimate = setup.run(record, filter_setup, initial, every=every, full_covariance=True)
+        truth = setup.modelled_record(record, filter_setup).truth
         assert truth is not None
         e = consistency.errors(estimate.attitude, estimate.bias, truth.attitude[::every], truth.bias[::every])
         squares += e**2
@@ -143,7 +145,9 @@ def main(
         chosen = dataclasses.replace(chosen, duration=duration)
     matched = setup.matched(chosen, attitude_sigma=0.1 * DEGREE)
     filters = (("matched", matched), ("a quarter of Q", more_sure(matched)))
-    comparisons = tuple(compare(name, chosen, belief, runs=runs, epochs=epochs, seed=seed) for name, belief in filters)
+    comparisons = tuple(
+        compare(name, chosen, filter_setup, runs=runs, epochs=epochs, seed=seed) for name, filter_setup in filters
+    )
     if out is None:
         return Result(comparisons=comparisons, figures=())
     folder = Path(out)

@@ -188,8 +188,8 @@ class Outcome:
 
     def summary(self) -> dict[str, Any]:
         """Return plain values for JSON."""
-        told = {"filter": self.name, "runs": self.runs, "rms_deg": self.rms / DEGREE, "rms_over_root_pcrb": self.ratio}
-        return told | {
+        row = {"filter": self.name, "runs": self.runs, "rms_deg": self.rms / DEGREE, "rms_over_root_pcrb": self.ratio}
+        return row | {
             "anees_attitude": None if np.isnan(self.anees) else self.anees,
             "consistent": self.consistent,
             "microseconds_a_sample": self.microseconds,

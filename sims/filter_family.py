@@ -5,7 +5,7 @@ One tumbling body, a MEMS gyro, and four cases:
 - ``small``: two directions, the initial error 1° an axis, drawn from the filter's own prior;
 - ``large``: the same, the initial error 60° to 150° about any axis;
 - ``one direction``: as large, with one constant reference only. The turn about it can never be observed. The error shown is the angle
-  between the true and the estimated reference in the body; the NEES tells whether a filter knows what it cannot know.
+  between the true and the estimated reference in the body; the NEES shows whether a filter knows what it cannot know.
 - ``tracker``: as large, with a star tracker that gives whole attitudes, ten times as coarse about its boresight as across it.
 
 All filters run on the same records and start from the same states. Run it:
@@ -15,10 +15,10 @@ and what the numbers say of each case, and writes both with the figure and ``fil
 Why they differ. While errors are small all Kalman filters carry the same Gaussian in other coordinates, and only the fixed gains of
 Mahony's filter cost accuracy: one number a sensor, which cannot weigh a tracker's axes either. From a large error, what the first direction
 hides is a turn about an axis that is fixed in the fixed frame; seen in body axes that axis moves by the correction. The invariant filters
-carry their covariance the whole way with it, the MEKF's reset half the way, the geometric filter not at all: in that order what they
-believe of the hidden turn is wrong, and slow to be unlearnt. Fixed gains never become too sure. Of the Kalman filters the unscented one is
-the quickest where one measurement tells all that can be known, and the slowest where two must agree on it. A start this poor wants another
-tool than any of them: ``wahba`` where the first measurements give the attitude, ``bank`` where not.
+carry their covariance the whole way with it, the MEKF's reset half the way, the geometric filter not at all: in that order their covariance
+of the hidden turn is wrong, and slow to recover. Fixed gains never become overconfident. Of the Kalman filters the unscented one is the
+fastest to converge where one measurement gives all that can be known, and the slowest where two must agree on it. A start this poor wants
+another tool than any of them: ``wahba`` where the first measurements give the attitude, ``multiple_model`` where not.
 """
 
 from __future__ import annotations
@@ -194,7 +194,7 @@ def study(
 ) -> list[Outcome]:
     """Return the outcomes of the named filters in one case, from independent runs."""
     what = scenario(case, duration)
-    belief = ProcessNoise(angle_random_walk=what.gyro.angle_random_walk, rate_random_walk=what.gyro.rate_random_walk)
+    noise = ProcessNoise(angle_random_walk=what.gyro.angle_random_walk, rate_random_walk=what.gyro.rate_random_walk)
     every = int(what.rate)  # once a second
     errors: dict[str, list[Array]] = {name: [] for name in names}
     nees: dict[str, list[Array]] = {name: [] for name in names}
@@ -206,7 +206,7 @@ def study(
         for name in names:
             if name == "usque" and run >= unscented_runs:
                 continue
-            estimate = filters.run(name, record, belief, initial, every=every, full_covariance=True)
+            estimate = filters.run(name, record, noise, initial, every=every, full_covariance=True)
             e = consistency.errors(estimate.attitude, estimate.bias, truth.attitude[::every], truth.bias[::every])
             nees[name].append(consistency.nees(e, estimate.covariance) / 6.0)
             errors[name].append(
@@ -303,7 +303,7 @@ def findings(result: Result) -> list[str]:
             parts.append(f"not there in nine runs of ten: {', '.join(never)}")
         right = [o.filter for o in whole if o.consistent]
         said = "all" if len(right) == len(whole) else ", ".join(right) or "none"
-        parts.append(f"to be believed (ANEES inside its bounds in the second half): {said}")
+        parts.append(f"consistent (ANEES inside its bounds in the second half): {said}")
         wrong = sorted((o for o in whole if not o.consistent), key=_misjudged)
         if wrong:
             others = ", ".join(f"{o.filter} {_late_anees(o):.3g}" for o in wrong)
@@ -374,5 +374,5 @@ if __name__ == "__main__":
     parser.add_argument("--runs", type=int, default=100)
     parser.add_argument("--unscented-runs", type=int, default=40)
     parser.add_argument("--seed", type=int, default=1)
-    told = main(**vars(parser.parse_args()))
-    print("\n".join([table(told), "", *findings(told)]))
+    found = main(**vars(parser.parse_args()))
+    print("\n".join([table(found), "", *findings(found)]))

@@ -214,8 +214,8 @@ if __name__ == "__main__":
     parser.add_argument("--runs", type=int, default=40)
     parser.add_argument("--seed", type=int, default=1)
     for outcome in main(**vars(parser.parse_args())).outcomes:
-        told = ", ".join(
+        ratios = ", ".join(
             f"{name} {outcome.anees[name]:.3f} ± {outcome.scatter[name]:.3f} ({outcome.rms[name] / ARCSECOND:.3g}″)"
             for name in FILTERS
         )
-        print(f"{outcome.preset:12s} {told}")
+        print(f"{outcome.preset:12s} {ratios}")

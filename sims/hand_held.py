@@ -10,7 +10,8 @@ by itself; compensated, every filter's samples are shifted by ``--latency``.
 - *coverage*: share of the movement in which the 95 % regions of our σ hold the error: of all angles, the heading, the inclination.
 - *NIS*: normalised innovation squared per degree of freedom, accelerometer and magnetometer. Far below 1: their noise is modelled as white
   at the level that its slow part has, because it is far from white.
-- *left out*: the error on each recording with the numbers (:data:`CANDIDATES`) that are best on all the others.
+- *left out*: the error on each recording with the numbers (:data:`CANDIDATES`), or the constants of the hard iron (:data:`IRON`), that
+  are best on all the others.
 - *modified*: recordings with a clipped gyro, dropouts, uneven stamps, no magnetometer, no rest at the start: error, σ and coverage.
 
 Without recordings the unit is simulated: at rest for two seconds, then turned and moved about on smooth paths that are not the filter's own
@@ -24,8 +25,10 @@ import os
 import sys
 import time as clock
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -41,7 +44,7 @@ from strapdown.files import write_json
 from strapdown.motion import Harmonic, HarmonicRates
 from strapdown.plots import style
 from strapdown.randomness import generator
-from strapdown.recordings import Recording
+from strapdown.recordings import Recording, hard_iron
 from strapdown.units import DEGREE
 
 QUIET = replace(ahrs.MOTIONS["any"], rest_bias_sigma=HAND_HELD.rest_bias_sigma)
@@ -60,6 +63,20 @@ CANDIDATES = {
     "no deviation of the field": replace(HAND_HELD, field_deviation=1e3),
 }
 """Sets of numbers that leave-one-out chooses from."""
+IRON = {
+    "as released": {"FEIGNED": hard_iron.FEIGNED},
+    "none": {"FEIGNED": 1e9},
+    "feigned 2 %": {"FEIGNED": 0.02},
+    "feigned 4 %": {"FEIGNED": 0.04},
+    "half the prior": {"SIGMA": 0.02},
+    "twice the prior": {"SIGMA": 0.08},
+    "half the span": {"SPAN": 0.5},
+    "twice the span": {"SPAN": 2.0},
+    "a third of the memory": {"MEMORY": 20.0},
+    "five times the memory": {"MEMORY": 300.0},
+    "at once": {"RISE": 0.3},
+}
+"""Constants of :mod:`strapdown.recordings.hard_iron` that it chooses from, with the numbers as released."""
 PARTS = ("total", "heading", "inclination")
 COLOURS = {
     "strapdown": style.VERMILION,
@@ -84,7 +101,7 @@ class Score:
     errors: tuple[float, ...]
     """RMS error over the movement: total, heading, inclination, rad."""
     time: float
-    """Time taken, s a sample."""
+    """Processor time taken, s a sample."""
     coverage: tuple[float, ...] | None = None
     """Share of the movement in which the 95 % regions hold the error: of all angles, heading, inclination."""
     sigma: float = np.nan
@@ -266,13 +283,13 @@ def ours(
     recording: Recording, latency: float | None, parameters: AhrsParameters = HAND_HELD, smooth: bool = False
 ) -> tuple[AhrsEstimate, Score]:
     """Return our estimate and its score."""
-    begin = clock.perf_counter()
+    begin = clock.process_time()
     result = ahrs.estimate(recording, parameters, latency=latency, smooth=smooth, full_covariance=True)
-    return result, scored(result, clock.perf_counter() - begin)
+    return result, scored(result, clock.process_time() - begin)
 
 
 def peers(used: Recording) -> dict[str, tuple[Array, float]]:
-    """Return what the installed ones of other filters make of a recording whose samples are all there, and the time that each took, s."""
+    """Return what the installed ones of other filters make of a recording whose samples are all there, and its processor time, s."""
     if used.magnetic_field is None or used.specific_force is None:
         return {}
     interval = float(np.median(np.diff(used.time)))
@@ -280,8 +297,8 @@ def peers(used: Recording) -> dict[str, tuple[Array, float]]:
     found: dict[str, tuple[Array, float]] = {}
 
     def timed(name: str, call: Callable[[], Array]) -> None:
-        begin = clock.perf_counter()
-        found[name] = (call(), clock.perf_counter() - begin)
+        begin = clock.process_time()
+        found[name] = (call(), clock.process_time() - begin)
 
     try:
         import vqf
@@ -344,9 +361,16 @@ def compared(recording: Recording, latency: float | None) -> tuple[dict[str, Sco
     return {name: scores[name] for name in COLOURS if name in scores}, found
 
 
-def leave_one_out(read: Sequence[Recording], latency: float, smooth: bool) -> Array:
-    """Return the total error on each recording with the candidate that has the least mean error on the others (recordings,), rad."""
-    errors = np.array([[ours(one, latency, p, smooth)[1].errors[0] for p in CANDIDATES.values()] for one in read])
+def leave_one_out(read: Sequence[Recording], latency: float, smooth: bool, iron: bool) -> Array:
+    """Return the total error on each recording with the candidate that has the least mean error on the others (recordings,), rad.
+
+    ``iron``: the candidates are the constants of the hard iron.
+    """
+    errors = np.empty((len(read), len(IRON if iron else CANDIDATES)))
+    for k, one in enumerate(read):
+        for c, candidate in enumerate((IRON if iron else CANDIDATES).values()):
+            with patch.multiple(hard_iron, **candidate) if iron else nullcontext():
+                errors[k, c] = ours(one, latency, HAND_HELD if iron else candidate, smooth)[1].errors[0]
     others = errors.sum(axis=0) - errors
     return np.asarray(errors[np.arange(len(read)), np.argmin(others, axis=1)])
 
@@ -413,7 +437,9 @@ def _heads(names: Sequence[str]) -> list[str]:
 
 def table(result: Result) -> str:
     """Return the figures as text."""
-    width = 2 + max(len(name) for name in (*COLOURS, *result.modified))
+    width = 2 + max(
+        len(name) for name in (*COLOURS, *result.modified, *(f"left out, {one}" for one in result.left_out))
+    )
     lines = []
     for treatment, scores in result.scores.items():
         lines.append(f"RMS error over the movement, °, {treatment}".upper())
@@ -485,7 +511,11 @@ def main(
     result = Result(
         recordings=tuple(Path(one.source).stem for one in read),
         scores=scores,
-        left_out={name: leave_one_out(read, late, name == "smoothed") for name in ("online", "smoothed")},
+        left_out={
+            f"{name}{', hard iron' if iron else ''}": leave_one_out(read, late, name == "smoothed", iron)
+            for iron in (False, True)
+            for name in ("online", "smoothed")
+        },
         modified=changed,
         latencies=np.array([gyro_latency(one)[0] for one in read]),
         figures=(),

@@ -1,7 +1,7 @@
 """Are other people's filters as good as they say? Three of them, run as they come and judged over many runs.
 
 Each is put into a setup as a filter of one's own: a class with a method ``run``. It gets the same simulated records as any filter here
-(gyro, accelerometer, attitude sensor), and beside them a velocity that is measured to 0.1 m/s, all noises told to it as they are:
+(gyro, accelerometer, attitude sensor), and beside them a velocity that is measured to 0.1 m/s, all noises given to it as they are:
 
 - smsfusion (4Subsea), aided INS, a multiplicative EKF: velocity and heading;
 - AttiPy (V. R. Solum), AHRS, a multiplicative EKF: velocity and heading;
@@ -252,19 +252,25 @@ def flight(duration: float, gyro: GyroSpec = GYRO) -> scenarios.Scenario:
 
 def cases(duration: float) -> dict[str, tuple[str, scenarios.Scenario, Any]]:
     """Return by name what is judged: the package that it needs, the scenario, the filter."""
-    told = {"N": float(GYRO.angle_random_walk), "B": BIAS, "tau_cb": MEMORY}
+    datasheet_noise = {"N": float(GYRO.angle_random_walk), "B": BIAS, "tau_cb": MEMORY}
     noise = float(GYRO.angle_random_walk)
     scene, steady = flight(duration), flight(duration, GyroSpec(angle_random_walk=noise))
-    found: dict[str, tuple[str, scenarios.Scenario, Any]] = {"smsfusion": ("smsfusion", scene, AidedIns(told))}
-    found["AttiPy"] = ("attipy", scene, AttiPy(told))
-    found["AttiPy, heading's derivative mended"] = ("attipy", scene, AttiPy(told, mended=True, name="attipy-mended"))
+    found: dict[str, tuple[str, scenarios.Scenario, Any]] = {
+        "smsfusion": ("smsfusion", scene, AidedIns(datasheet_noise))
+    }
+    found["AttiPy"] = ("attipy", scene, AttiPy(datasheet_noise))
+    found["AttiPy, heading's derivative mended"] = (
+        "attipy",
+        scene,
+        AttiPy(datasheet_noise, mended=True, name="attipy-mended"),
+    )
     found["GTSAM"] = ("gtsam", steady, Gtsam(noise))
     if importlib.util.find_spec("smsfusion") is not None:
         from smsfusion import constants
 
         datasheet = AidedIns(dict(constants.ERR_GYRO_MOTION2), name="smsfusion-datasheet")
         found["smsfusion, noises of another sensor"] = ("smsfusion", scene, datasheet)
-    fixed = AidedIns(told, read_as="fixed", name="smsfusion-fixed")
+    fixed = AidedIns(datasheet_noise, read_as="fixed", name="smsfusion-fixed")
     found["smsfusion, covariance read as fixed"] = ("smsfusion", scene, fixed)
     found["GTSAM, gyro with a bias"] = ("gtsam", scene, Gtsam(noise, name="gtsam-bias"))
     return {name: case for name, case in found.items() if importlib.util.find_spec(case[0]) is not None}

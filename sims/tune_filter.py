@@ -26,7 +26,7 @@ class Result:
     too_large: Tuning
     too_small: Tuning
     plan: Plan
-    """Standard errors foretold before there was a record."""
+    """Standard errors predicted before there was a record."""
     held_out: Comparison
     """The filter that was too sure, before and after, on the end of the record."""
     record: scenarios.ImuRecord
@@ -62,7 +62,7 @@ def main(*, duration=1800.0, rate=20.0, wrong=30.0, starts=20, seed=1, out=None)
         duration=duration,
     )
     right = setup.matched(scenario, attitude_sigma=0.1 * units.DEGREE)
-    foretold = tuning.plan(scenario, right, FREE, lengths=[0.7 * duration], seed=seed)
+    predicted = tuning.plan(scenario, right, FREE, lengths=[0.7 * duration], seed=seed)
     record = scenarios.simulate(scenario, seed)
     whole = tuning.record_case(record, right, seed=seed)
     (train,), test = tuning.split([whole], 0.3)
@@ -76,7 +76,7 @@ def main(*, duration=1800.0, rate=20.0, wrong=30.0, starts=20, seed=1, out=None)
         truth=truth,
         too_large=tuned["too large"],
         too_small=tuned["too small"],
-        plan=foretold,
+        plan=predicted,
         held_out=tuning.compare(test, before["too small"], tuned["too small"].setup),
         record=record,
     )

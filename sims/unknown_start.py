@@ -107,9 +107,7 @@ def study(name: str, *, runs: int, duration: float, seed: int) -> Outcome:
     """Return the outcome of one filter over independent runs."""
     scenario = dataclasses.replace(scenarios.load_scenario("magnetometer-only"), duration=duration)
     gyro = scenario.gyro
-    belief = ProcessNoise(
-        angle_random_walk=float(gyro.angle_random_walk), rate_random_walk=float(gyro.rate_random_walk)
-    )
+    noise = ProcessNoise(angle_random_walk=float(gyro.angle_random_walk), rate_random_walk=float(gyro.rate_random_walk))
     errors, nees, became_one = [], [], []
     first = 0
     for run in range(runs):
@@ -120,13 +118,13 @@ def study(name: str, *, runs: int, duration: float, seed: int) -> Outcome:
         assert record.truth is not None
         if name.startswith("bank"):
             found = multiple_model.run(
-                record, belief, hypotheses=int(name.rpartition(" ")[2]), bias_sigma=BIAS_SIGMA, every=EVERY
+                record, noise, hypotheses=int(name.rpartition(" ")[2]), bias_sigma=BIAS_SIGMA, every=EVERY
             )
             estimate, rows = found.estimate, found.edges
             became_one.append(found.became_one)
         else:
             initial = estimation.initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=ANYWHERE, bias_sigma=BIAS_SIGMA)
-            estimate = filters.run(name, record, belief, initial, every=EVERY, full_covariance=True)
+            estimate = filters.run(name, record, noise, initial, every=EVERY, full_covariance=True)
             rows = np.arange(0, len(record.time), EVERY)
             became_one.append(0.0)
         truth = record.truth
@@ -180,13 +178,13 @@ def table(result: Result) -> str:
     ]
     for o in result.outcomes:
         hours = np.sort(o.convergence) / 3600.0
-        told = [float(o.anees[min(int(np.searchsorted(o.time, t)), len(o.time) - 1)]) for t in (360.0, 900.0, 3600.0)]
+        anees = [float(o.anees[min(int(np.searchsorted(o.time, t)), len(o.time) - 1)]) for t in (360.0, 900.0, 3600.0)]
         low, high = o.bounds
         quantiles = [hours[min(int(np.ceil(p * o.runs)) - 1, o.runs - 1)] for p in (0.5, 0.95, 1.0)]
         within = [f"{time:.3f}" if np.isfinite(time) else "never" for time in quantiles]
         lines.append(
             f"{o.filter:16s} {o.runs:5d} {100.0 * np.mean(np.isfinite(hours)):7.0f} % {within[0]:>16s} {within[1]:>7s} "
-            f"{within[2]:>7s} {told[0]:14.3g} {told[1]:9.3g} {told[2]:9.3g} {o.anees[-1]:9.3g}  {low:.3f} to {high:.3f}"
+            f"{within[2]:>7s} {anees[0]:14.3g} {anees[1]:9.3g} {anees[2]:9.3g} {o.anees[-1]:9.3g}  {low:.3f} to {high:.3f}"
         )
     return "\n".join(lines)
 

@@ -9,8 +9,8 @@ Tasks
     ``simulate``, ``read``, ``write``, ``estimate``, ``smooth``, ``integrate``, ``check``, ``tune``, ``monte_carlo``,
     ``covariance_analysis``, ``allan_deviation``, ``fit_noise``, ``initial_state``
 What they take
-    ``Scenario``, ``GyroSpec``, ``VectorSensor``, ``FilterSetup``, ``ProcessNoise``, ``Gate``, ``Robust``; ``StepFilter`` filters step by
-    step; ``InputError`` is raised on bad input.
+    ``Scenario``, ``GyroSpec``, ``VectorSensor``, ``FilterSetup``, ``ProcessNoise``, ``Gate``, ``Robust``; ``LiveFilter`` and
+    ``StepFilter`` filter sample by sample, compiled and on filterpy; ``InputError`` is raised on bad input.
 More
     The submodules, each with its own ``__all__``, and below them ``estimation.error_states``, ``estimation.filters``,
     ``estimation.multiple_model``, ``montecarlo.campaign`` and ``montecarlo.cluster``. Names and submodules load when they are first used.
@@ -61,7 +61,7 @@ if TYPE_CHECKING:
         vectors,
     )
     from strapdown.checks import InputError
-    from strapdown.estimation import Gate, ProcessNoise, Robust, StepFilter, initial_state
+    from strapdown.estimation import Gate, LiveFilter, ProcessNoise, Robust, StepFilter, initial_state
     from strapdown.gyro import GyroSpec
     from strapdown.scenarios import Scenario
     from strapdown.setup import FilterSetup
@@ -86,6 +86,7 @@ __all__ = [
     "Gate",
     "GyroSpec",
     "InputError",
+    "LiveFilter",
     "ProcessNoise",
     "Robust",
     "Scenario",
@@ -133,6 +134,7 @@ _HOMES = {
     "Gate": "estimation",
     "GyroSpec": "gyro",
     "InputError": "checks",
+    "LiveFilter": "estimation",
     "ProcessNoise": "estimation",
     "Robust": "estimation",
     "Scenario": "scenarios",

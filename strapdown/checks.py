@@ -36,7 +36,7 @@ def _first(mask: NDArray[np.bool_]) -> tuple[np.intp, ...]:
 
 
 _NO_NUMBERS = {"b": "True or False", "S": "text", "U": "text", "c": "complex numbers", "M": "dates", "m": "time spans"}
-"""What NumPy would turn into floats though it is none, by the kind of its dtype."""
+"""Kinds of dtype that NumPy would turn into floats though they hold no numbers."""
 
 
 def _truth_value(value: object) -> bool:
@@ -138,7 +138,7 @@ def finite(name: str, value: float, *, unit: str = "") -> float:
     return number
 
 
-MOST_COUNTED = 2.0**63
+MAX_COUNTED = 2.0**63
 """Whole numbers stay below it, so that they fit into any array."""
 
 
@@ -147,7 +147,7 @@ def count(name: str, value: int, *, least: int = 1) -> int:
     whole = (
         isinstance(value, (int, float, np.integer, np.floating))
         and not isinstance(value, bool)
-        and abs(value) < MOST_COUNTED  # NaN and infinity are not
+        and abs(value) < MAX_COUNTED  # NaN and infinity are not
     )
     if whole is False and isinstance(value, int) and not isinstance(value, bool):
         raise InputError(f"{name} is {value}; it must be a whole number of {least} or more, and below 2^63")

@@ -124,7 +124,7 @@ class ConingParameters:
 
     @property
     def algorithms(self) -> tuple[coning.Algorithm, ...]:
-        """What is compared: the package's (:data:`ALGORITHMS`), then one's own."""
+        """Algorithms compared: the package's (:data:`ALGORITHMS`), then one's own."""
         return (*(coning.ALGORITHMS[name] for name in ALGORITHMS), *self.own)
 
     @property
@@ -166,14 +166,14 @@ class Drift:
     algorithm: str
     samples: int
     measured: float
-    """Of a long noise-free run against the closed form."""
+    """Measured drift of a long noise-free run against the closed form."""
     predicted: float
-    """By the formula; NaN where it does not serve."""
+    """Drift by the formula; NaN where it does not apply."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FilterOutcome:
-    """What the filter made of one integration algorithm."""
+    """Errors of the filter with one integration algorithm."""
 
     integration: str
     statistics: Statistics

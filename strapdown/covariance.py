@@ -31,7 +31,7 @@ from strapdown.randomness import generator
 from strapdown.records import ImuRecord
 from strapdown.results import ByValue, Listed, Listing, figure
 from strapdown.scenarios import Scenario
-from strapdown.setup import FilterSetup, believed, matched, need_mekf
+from strapdown.setup import FilterSetup, matched, modelled_record, need_mekf
 from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR
 from strapdown.vectors import VectorMeasurements
 
@@ -43,8 +43,8 @@ __all__ = [
 
 AXES = ("x", "y", "z")
 
-LEAST_ERROR = 1e-12
-"""What is smaller in every step and measurement is rounding, rad."""
+MIN_ERROR = 1e-12
+"""Errors of each step and measurement below this are rounding, rad."""
 LARGEST_SIZE = 1e12
 """No considered or initial error is larger, in the units of :class:`Consider`: its square would leave the range of doubles."""
 LARGEST_LINEAR = 0.15
@@ -135,6 +135,8 @@ class Analysis(Listed):
     beyond_linear : tuple of str
         Errors too large for an analysis that is linear about the truth, in words: use a Monte Carlo there.
     """
+
+    _drawn_by = "error_budget"
 
     time: Array
     filter_covariance: Array
@@ -278,7 +280,7 @@ class _Rows:
     error: Array
     """Innovation at the truth without noise (r,): what the sensor's fixed errors make."""
     moving: Array
-    """What a second of lateness makes of the row through the change of the reference (r,)."""
+    """Change of the row per second of delay, by the motion of the reference (r,)."""
 
 
 def _exact(sensor: Any) -> Any:
@@ -380,7 +382,7 @@ def _all_rows(scenario: Scenario, setup: FilterSetup) -> list[_Rows]:
             found.append(one.observe(scenario.motion, start, end, generator(scenario.seed, 0, sensor.name)))
     step = dataclasses.replace(setup, integration=coning.ALGORITHMS["one-sample"])
     record = ImuRecord(time=np.array([start, end]), increments=np.zeros((1, 3)), vectors=tuple(own))
-    held = believed(record, step).vectors
+    held = modelled_record(record, step).vectors
     for series in held:
         if series.anisotropic:
             raise InputError(
@@ -508,7 +510,7 @@ class _Path:
     """Stations (n + 1,), s."""
     attitude: Array
     dt: Array
-    """Of the segments between them (n,), s."""
+    """Durations of the segments between them (n,), s."""
     phi: Array
     """True turns (n, 3), rad."""
     interval: np.ndarray
@@ -516,7 +518,7 @@ class _Path:
     rows: dict[str, Array]
     """Fields of :class:`_Rows`, sensors together."""
     sensor: np.ndarray
-    """Of each row."""
+    """Number of the sensor of each row."""
     kept: np.ndarray
     """Gyro edges at the epochs."""
 
@@ -643,13 +645,13 @@ def _fixed_columns(scenario: Scenario, setup: FilterSetup, path: _Path) -> list[
     """Return the errors that are the same in every run."""
     columns = [_Column(name=name, rate=value[path.interval]) for name, value in _fixed_rates(scenario).items()]
     integration = _integration_rate(scenario, setup, path.stamps, path.attitude, path.phi)
-    if np.abs(integration * path.dt[:, None]).max() > LEAST_ERROR:
+    if np.abs(integration * path.dt[:, None]).max() > MIN_ERROR:
         columns.append(_Column(name=f"integration ({setup.integration.name})", rate=integration))
     if np.any(_axes(scenario.gyro.rate_ramp) != 0.0):
         columns.append(_Column(name="rate ramp", ramp=_axes(scenario.gyro.rate_ramp)))
     for i, sensor in enumerate(scenario.sensors):
         mine = np.where(path.sensor == i, path.rows["error"], 0.0)
-        if np.abs(mine).max(initial=0.0) > LEAST_ERROR:
+        if np.abs(mine).max(initial=0.0) > MIN_ERROR:
             columns.append(_Column(name=f"{sensor.name} (fixed)", rows=mine))
     return columns
 

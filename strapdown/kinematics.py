@@ -196,19 +196,10 @@ def _joined(x: Array, coefficients: Array, closed_form: Array) -> Array:
 
 
 def right_jacobian(rotation_vector: ArrayLike) -> Array:
-    """Return the right Jacobian J_r(φ) of the rotation vector: w_b = J_r(φ) φ̇.
+    """Return the right Jacobian J_r(φ) (..., 3, 3) of rotation vectors (..., 3), rad, of any length θ: w_b = J_r(φ) φ̇.
 
-    To first order in δ, exp(φ + δ) = exp(φ) ⊗ exp(J_r(φ) δ).
-
-    Parameters
-    ----------
-    rotation_vector : array_like (..., 3)
-        φ, rad, of any length θ.
-
-    Returns
-    -------
-    ndarray (..., 3, 3)
-        ``J_r = I − (1 − cos θ)/θ² [φ] + (θ − sin θ)/θ³ [φ]²`` (Solà, Deray & Atchuthan 2018, *A micro Lie theory*, eq. (143)).
+    ``J_r = I − (1 − cos θ)/θ² [φ] + (θ − sin θ)/θ³ [φ]²`` (Solà, Deray & Atchuthan 2018, *A micro Lie theory*, eq. (143)); to first order
+    in δ, exp(φ + δ) = exp(φ) ⊗ exp(J_r(φ) δ).
     """
     phi = array("rotation_vector", rotation_vector, (..., 3))
     theta = np.linalg.norm(phi, axis=-1)
@@ -222,22 +213,9 @@ def right_jacobian(rotation_vector: ArrayLike) -> Array:
 
 
 def inverse_right_jacobian(rotation_vector: ArrayLike) -> Array:
-    """Return J_r(φ)⁻¹ of the Bortz equation φ̇ = J_r(φ)⁻¹ w_b.
+    """Return J_r(φ)⁻¹ (..., 3, 3) of the Bortz equation φ̇ = J_r(φ)⁻¹ w_b, φ (..., 3), rad, shorter than 2π, where J_r is singular.
 
-    Parameters
-    ----------
-    rotation_vector : array_like (..., 3)
-        φ, rad, shorter than 2π.
-
-    Returns
-    -------
-    ndarray (..., 3, 3)
-        ``J_r⁻¹ = I + ½ [φ] + (1 − (θ/2) cot(θ/2))/θ² [φ]²`` (Solà et al. 2018, eq. (144); Bortz 1971, eq. (12)).
-
-    Raises
-    ------
-    InputError
-        If a vector is 2π long or more, where J_r is singular.
+    ``J_r⁻¹ = I + ½ [φ] + (1 − (θ/2) cot(θ/2))/θ² [φ]²`` (Solà et al. 2018, eq. (144); Bortz 1971, eq. (12)).
     """
     phi = array("rotation_vector", rotation_vector, (..., 3))
     theta = np.linalg.norm(phi, axis=-1)

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown.checks import Array, InputError, array, unit_quaternions
-from strapdown.checks import covariance as checked
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -26,17 +25,14 @@ __all__ = [
     "exp",
     "from_euler",
     "from_matrix",
-    "from_mrp",
     "from_rotation",
     "inverse",
     "log",
-    "mean",
     "multiply",
     "normalize",
     "rotate",
     "to_euler",
     "to_matrix",
-    "to_mrp",
     "to_rotation",
 ]
 
@@ -47,8 +43,6 @@ LONGEST = 1e150
 """Largest component of a rotation vector, rad; the square of a larger one overflows."""
 ROTATION_MATRIX_TOLERANCE = 1e-6
 """Largest entry of ``R Rᵀ − I`` that counts as rounding."""
-UNDETERMINED = 1e-9
-"""Relative gap between the two smallest losses of a mean below which the mean is not unique."""
 
 
 def multiply(p: ArrayLike, q: ArrayLike) -> Array:
@@ -464,99 +458,5 @@ def _named_sequence(sequence: str) -> Iterator[None]:
         ) from None
 
 
-def to_mrp(q: ArrayLike) -> Array:
-    """Return the modified Rodrigues parameters p = tan(θ/4) n of unit quaternions.
-
-    Parameters
-    ----------
-    q : array_like (..., 4)
-        Unit quaternions q_fb.
-
-    Returns
-    -------
-    ndarray (..., 3)
-        Parameters of the shorter rotation, ``|p| ≤ 1`` (Schaub & Junkins 1996).
-    """
-    value = unit_quaternions("q", q)
-    return np.asarray(to_rotation(value.reshape(-1, 4)).as_mrp()).reshape(*value.shape[:-1], 3)
-
-
-def from_mrp(mrp: ArrayLike) -> Array:
-    """Return the unit quaternions of modified Rodrigues parameters.
-
-    Parameters
-    ----------
-    mrp : array_like (..., 3)
-        p = tan(θ/4) n; p and its shadow ``−p/|p|²`` are the same attitude.
-
-    Returns
-    -------
-    ndarray (..., 4)
-        Unit quaternions q_fb, w ≥ 0.
-    """
-    from scipy.spatial.transform import Rotation
-
-    value = array("mrp", mrp, (..., 3))
-    return _with_positive_w(from_rotation(Rotation.from_mrp(value.reshape(-1, 3)))).reshape(*value.shape[:-1], 4)
-
-
 def _with_positive_w(q: Array) -> Array:
     return np.asarray(np.where(q[..., :1] < 0.0, -q, q))
-
-
-def mean(q: ArrayLike, covariance: ArrayLike | None = None) -> tuple[Array, Array]:
-    """Return the mean of attitudes and the covariance of its error.
-
-    The mean is the most likely attitude for small errors: the unit quaternion that minimises ``Σ v_iᵀ R_i⁻¹ v_i``, v_i the vector
-    part of ``q_i⁻¹ ⊗ q``, found as an eigenvector of a 4 × 4 matrix (Markley, Cheng, Crassidis & Oshman 2007, J. Guid. Control Dyn.
-    30). The signs of the quaternions do not matter.
-
-    Parameters
-    ----------
-    q : array_like (n, 4)
-        Unit quaternions q_fb.
-    covariance : array_like (3, 3) or (n, 3, 3), optional
-        Covariance R_i of each error δθ, ``q_i = q ⊗ exp(δθ)``, rad², body axes. Default: equal weights, and the covariance of the
-        mean comes from the scatter of two attitudes or more.
-
-    Returns
-    -------
-    mean : ndarray (4,)
-        Unit quaternion q_fb, w ≥ 0.
-    covariance : ndarray (3, 3)
-        Covariance of its error δθ, rad², body axes.
-
-    Raises
-    ------
-    InputError
-        If the mean is not unique, as of attitudes half a turn apart, or a covariance is not symmetric and positive definite.
-
-    Examples
-    --------
-    >>> q, P = mean([[1.0, 0.0, 0.0, 0.0], exp([0.0, 0.0, 0.02])])
-    >>> float(log(q)[2].round(6))
-    0.01
-    """
-    value = unit_quaternions("q", array("q", q, ("n", 4)))
-    n = len(value)
-    if covariance is None:
-        if n < 2:
-            raise InputError(f"q holds {n} attitudes; the scatter needs two or more, or give the covariance of each")
-        information = np.broadcast_to(np.eye(3), (n, 3, 3))
-    else:
-        if n < 1:
-            raise InputError("q holds no attitude; give one or more")
-        given = np.asarray(covariance)
-        whole = array("covariance", given if given.ndim != 2 else np.broadcast_to(given, (n, *given.shape)), (n, 3, 3))
-        information = np.linalg.inv(np.array([checked(f"covariance[{k}]", R, 3) for k, R in enumerate(whole)]))
-    # Rows (3, 4) that take q to the vector part of q_i⁻¹ ⊗ q.
-    w, v = value[:, 0, None, None], value[:, 1:]
-    rows = np.concatenate([-v[:, :, None], w * np.eye(3) - np.cross(np.eye(3), v[:, None, :])], axis=2)
-    loss, vectors = np.linalg.eigh(np.einsum("nia,nij,njb->ab", rows, information, rows))
-    if loss[1] - loss[0] < UNDETERMINED * loss[-1]:
-        raise InputError("the mean of the attitudes is not unique; are two of them half a turn apart?")
-    best = _with_positive_w(vectors[:, 0])
-    if covariance is not None:
-        return best, np.asarray(np.linalg.inv(np.sum(information, axis=0)))
-    error = log(multiply(conjugate(best), value))
-    return best, np.asarray(error.T @ error / (n * (n - 1.0)))

@@ -12,22 +12,8 @@ from strapdown.checks import count
 def generator(seed: int, run: int, source: str) -> np.random.Generator:
     """Return the random stream of one source in one run.
 
-    The stream depends on these three alone: adding a sensor, or changing the order of runs or the number of workers, changes no
+    Its key is (seed, run, CRC-32 of the source's name): adding a sensor, or changing the order of runs or the number of workers, changes no
     other stream.
-
-    Parameters
-    ----------
-    seed : int
-        Seed of the study, ≥ 0.
-    run : int
-        Number of the run, ≥ 0.
-    source : str
-        Name of the source, such as ``"gyro"`` or ``"star tracker"``.
-
-    Returns
-    -------
-    numpy.random.Generator
-        The stream, of ``SeedSequence(seed)`` with the run and the CRC-32 of the source's name as spawn key.
 
     Examples
     --------

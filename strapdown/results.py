@@ -1,4 +1,4 @@
-"""What frozen dataclasses of arrays share: equality by value, and printing as a short table. Private.
+"""Base classes of frozen dataclasses of arrays: equality by value, and printing as a short table. Private.
 
 Specifications (of a gyro, a sensor, a filter) derive from :class:`ByValue`: they are written to files and read back, and two with the same
 numbers are the same. Data and results are compared by identity; for them ``@dataclass(eq=False)`` is enough. Results derive from
@@ -7,12 +7,14 @@ numbers are the same. Data and results are compared by identity; for them ``@dat
 
 from __future__ import annotations
 
+import base64
 import dataclasses
+import io
 import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from html import escape
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -81,6 +83,9 @@ class Listed:
     y     12.3
     """
 
+    _drawn_by: ClassVar[str] = ""
+    """Name of the function of ``strapdown.plots`` whose figure a notebook shows below the table."""
+
     def listing(self) -> Listing:
         """Return the result as a table."""
         raise NotImplementedError
@@ -89,7 +94,15 @@ class Listed:
         return self.listing().text
 
     def _repr_html_(self) -> str:
-        return self.listing().html
+        html = self.listing().html
+        if not self._drawn_by:
+            return html
+        import strapdown  # the front door loads plots, which stand above
+
+        buffer = io.BytesIO()
+        getattr(strapdown.plots, self._drawn_by)(self).savefig(buffer, format="png", dpi=90)
+        data = base64.b64encode(buffer.getvalue()).decode()
+        return f'<div>{html}<img alt="{self._drawn_by}" src="data:image/png;base64,{data}" /></div>'
 
 
 def figure(value: float | None, digits: int = 4) -> str:

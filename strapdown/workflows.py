@@ -252,31 +252,8 @@ def estimate_record(
     full_covariance: bool = True,
     smooth: bool = False,
 ) -> RecordRun:
-    """Run the filter, or the smoother, of a setup over a record, from its first measurements on.
-
-    Parameters
-    ----------
-    record : ImuRecord
-    chosen : FilterSetup
-    start : strapdown.setup.for_record.Start, optional
-        Default: from the first measurements (:func:`strapdown.setup.for_record.start`).
-    every : int, default 1
-        Store every n-th filter step; not with ``smooth``.
-    full_covariance : bool, default True
-        Store whole covariance matrices, not their diagonals alone.
-    smooth : bool, default False
-        Estimate each epoch from all measurements (fixed-interval smoother).
-
-    Returns
-    -------
-    RecordRun
-
-    Raises
-    ------
-    InputError
-        If the measurements do not give the initial attitude, or fewer than ``every`` filter steps are left from the start on.
-    """
-    modelled = setups.believed(record, chosen)
+    """Run the filter, or with ``smooth`` the smoother, of a setup over a record, by default from its first measurements on."""
+    modelled = setups.modelled_record(record, chosen)
     if count("every", every) > len(modelled.increments):
         raise InputError(
             f"every is {every}, more than the {len(modelled.increments)} filter steps of the record; only the start would be kept"
@@ -608,41 +585,24 @@ def plan(
     scenario: Scenario,
     *,
     setup: FilterSetup | None = None,
+    gyro: GyroSpec | None = None,
     seed: int | None = None,
     states: bool | None = None,
     dispersions: Dispersions | None = None,
     precision: str = "float64",
 ) -> Plan:
-    """Return the plan of a Monte Carlo: a scenario through the filter that matches it, or another.
+    """Return the plan of a Monte Carlo: a scenario through the filter that matches it, or another ``setup``.
 
-    Parameters
-    ----------
-    scenario : Scenario
-    setup : FilterSetup, optional
-        Default: matched to the scenario (:func:`strapdown.setup.for_record.matched_to_scenario`).
-    seed : int, optional
-        Default: the scenario's own.
-    states : bool, optional
-        Whether the matched filter has an error state for each error that the scenario specifies. Default: where there are such errors.
-        Where fixed errors have states, each run draws its own gyro and sensors: the filter is right on average over such individuals.
-    dispersions : Dispersions, optional
-        Initial errors and gyro parameters that differ from run to run.
-    precision : {"float64", "float32"}
-
-    Returns
-    -------
-    Plan
-
-    Raises
-    ------
-    InputError
-        If both ``setup`` and ``states`` are given, or the scenario's duration is no whole number of filter steps.
+    ``gyro``: what the matched filter assumes of its gyro, such as a data sheet; by default the scenario's.
+    ``states``: whether the matched filter has an error state for each error that the scenario specifies, by default where there are such.
+    Where fixed errors have states, each run draws its own gyro and sensors: the filter is right on average over such individuals.
     """
     from strapdown import montecarlo
 
-    if states is not None and setup is not None:
-        raise InputError("a filter setup has its own states; leave states out")
-    chosen = for_record.matched_to_scenario(scenario, states=states) if setup is None else setup
+    if setup is not None and (states is not None or gyro is not None):
+        raise InputError("a filter setup has its own states and gyro noise; leave states and gyro out")
+    assumed = scenario if gyro is None else dataclasses.replace(scenario, gyro=gyro)
+    chosen = for_record.matched_to_scenario(assumed, states=states) if setup is None else setup
     names = chosen.states.names if setup is None and chosen.states is not None else ()
     return montecarlo.Plan(
         scenario=scenario,

@@ -22,12 +22,15 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    if config.getoption("--slow"):
-        return
-    skip = pytest.mark.skip(reason="a statistical study of minutes; run it with --slow")
-    for item in items:
-        if "slow" in item.keywords:
-            item.add_marker(skip)
+    # Workers take file after file: with the two halves of the list dealt in turn, two workers seldom compile the same kernels at once,
+    # and neighbours, which share kernels, often run in one process.
+    files = list(dict.fromkeys(item.path for item in items))
+    half = -(-len(files) // 2)
+    place = {path: (k % half, k) for k, path in enumerate(files)}
+    items.sort(key=lambda item: place[item.path])
+    if not config.getoption("--slow"):
+        config.hook.pytest_deselected(items=[item for item in items if "slow" in item.keywords])
+        items[:] = [item for item in items if "slow" not in item.keywords]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -36,6 +39,10 @@ def what_is_compiled_is_not_collected() -> Iterator[None]:
     yield
     gc.collect(1)
     gc.freeze()
+
+
+def pytest_sessionfinish() -> None:
+    gc.freeze()  # pytest collects five times at its end, ten seconds in a process that has compiled much
 
 
 @pytest.fixture(scope="session")

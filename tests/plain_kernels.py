@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from types import FunctionType, ModuleType
 from typing import Any
 
@@ -13,6 +14,7 @@ from strapdown.kernels.machine import helper
 KERNELS = "strapdown.kernels"
 
 
+@cache
 def called(function: FunctionType, parts: tuple[ModuleType, ...] = ()) -> Callable[..., Any]:
     """Return a compiled function that calls a kernel's helper: helpers themselves have no wrapper for calls from Python."""
     made = helper(function, parts)

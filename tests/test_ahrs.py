@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from sims import hand_held
 from strapdown import ahrs, quaternion, setup
-from strapdown.ahrs import AhrsParameters
+from strapdown.ahrs import AhrsParameters, estimating
 from strapdown.checks import InputError
 from strapdown.consistency import reference_errors
 from strapdown.recordings import Recording, hard_iron, read, sensor_delays
+from strapdown.records import Estimate, Innovations
 from strapdown.units import DEGREE
 
 RATE = 200.0
@@ -75,7 +76,7 @@ def worst(result: ahrs.AhrsEstimate, after: float = 0.0) -> dict[str, float]:
 
 @pytest.fixture(params=ahrs.MOTIONS)
 def parameters(request) -> AhrsParameters:
-    """What the filter believes of each motion."""
+    """The filter's model of each motion."""
     return ahrs.MOTIONS[request.param]
 
 
@@ -273,7 +274,7 @@ def test_too_short_a_recording_is_refused():
         ahrs.estimate(short)
 
 
-def test_stamps_in_milliseconds_and_dead_sensors_are_told():
+def test_stamps_in_milliseconds_and_dead_sensors_are_reported():
     whole = recording(5.0)
     slow = dataclasses.replace(whole, time=1e3 * whole.time)
     with pytest.raises(InputError, match=r"hold one sample, 5 s is the mean interval; .* in ms or us, say so"):
@@ -315,7 +316,7 @@ def test_bad_parameters_are_refused(name, value):
 
 
 def quiet_second(rate, noise=1e-3, turn=(0.0, 0.0, 0.0), field=True) -> Recording:
-    """A second of constant rate ``turn`` of the body, °/s, that the gyro tells as ``rate``, °/s, and two of its noise."""
+    """A second of constant rate ``turn`` of the body, °/s, that the gyro measures as ``rate``, °/s, and two of its noise."""
     time = np.arange(round(3.0 * RATE)) / RATE
     attitude = START * Rotation.from_rotvec(np.outer(time, np.array(turn) * DEGREE))
     random = np.random.default_rng(5)
@@ -352,7 +353,7 @@ def test_a_steady_turn_is_no_bias(turn, field):
     assert 0.45 < sigma < 0.5
 
 
-def test_a_hand_that_moves_tells_no_bias():
+def test_a_moving_hand_gives_no_bias():
     plain = quiet_second((0.0, 0.0, 0.0))
     swing = 20.0 * DEGREE * np.sin(2.0 * np.pi * 0.7 * plain.time)[:, None] * np.array([1.0, 0.0, 0.5])
     bias, sigma = bias_of(dataclasses.replace(plain, rate=plain.rate + swing))
@@ -465,10 +466,10 @@ def test_the_filter_is_causal(latency):
 def test_a_latency_that_is_given_is_made_good():
     """At up to 9 rad/s 10 ms are 5°."""
     delayed = late(gyro=0.01)
-    told, untold = ahrs.estimate(delayed, latency=0.01), ahrs.estimate(delayed, latency=0.0)
-    assert worst(untold)["total"] > 4.0
-    assert worst(told)["total"] < 0.3 * worst(untold)["total"]
-    np.testing.assert_array_equal(told.estimate.time, delayed.time)
+    compensated, plain = ahrs.estimate(delayed, latency=0.01), ahrs.estimate(delayed, latency=0.0)
+    assert worst(plain)["total"] > 4.0
+    assert worst(compensated)["total"] < 0.3 * worst(plain)["total"]
+    np.testing.assert_array_equal(compensated.estimate.time, delayed.time)
 
 
 @pytest.mark.parametrize(
@@ -482,7 +483,7 @@ def test_bad_latencies_are_refused(value, words):
 # ---------------------------------------------------------------------------------------------------- smoothed
 
 
-def test_all_samples_tell_more_than_those_before(parameters):
+def test_all_samples_hold_more_than_those_before(parameters):
     plain = recording(60.0, bias=(0.004, -0.003, 0.002), noise=1.0)
     found, smoothed = (ahrs.estimate(plain, parameters, smooth=smooth) for smooth in (False, True))
     rms = [
@@ -542,7 +543,7 @@ def test_mean_error_over_the_broad_trials(broad):
 
 
 def test_the_magnetometer_of_the_broad_trials_is_late(broad):
-    """By 11 ms beside the gyro, in every trial by itself as far as it can tell."""
+    """By 11 ms beside the gyro, in every trial by itself to within its σ."""
     found = np.array([sensor_delays.magnetometer_delay(read(file)) for file in sorted(broad.glob("*.hdf5"))])
     assert np.all(np.abs(found[:, 0] - 0.0112) < 3.0 * found[:, 1] + 3e-4)
     assert np.sum(found[:, 1] < 5e-4) >= 5
@@ -556,6 +557,38 @@ def test_sigma_holds_on_broad_trials(broad):
             _, score = hand_held.ours(recording, None, smooth=smooth)
             assert score.coverage[0] > 0.9, (number, smooth, score)
             assert score.errors[0] < score.sigma < 4.0 * score.errors[0], (number, smooth, score)
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_the_inclinations_sigma_is_neither_too_small_nor_too_large(broad, smooth):
+    """The 95 % regions of the inclination, as recorded, over slow and fast motion."""
+    held = [hand_held.ours(read(file), None, smooth=smooth)[1].coverage[2] for file in sorted(broad.glob("*.hdf5"))]
+    assert 0.92 < np.mean(held) < 0.985, held
+    assert min(held) > 0.8, held
+
+
+def test_the_tilts_sigma_follows_the_level_of_the_acceleration():
+    """The share of the modelled variance that is left, in closed form: of no acceleration, and after a turn that is uncertain."""
+    steps, interval = 4000, 0.03
+    time = interval * np.arange(steps + 1)
+    seen = Innovations(time=time[1:], innovation=np.zeros((steps, 3)), variance=np.ones((steps, 3)))
+    nothing = np.zeros((steps + 1, 6))
+    still = Estimate(
+        time=time,
+        attitude=np.tile([1.0, 0.0, 0.0, 0.0], (steps + 1, 1)),
+        bias=nothing[:, :3],
+        variance=nothing + 1.0,
+        innovations={"accelerometer": seen},
+    )
+    uncertain = np.arange(steps) == 2999
+    share = estimating._tilt_scale(still, uncertain) ** 2
+    own, level = estimating.OWN_SHARE, estimating.ACCELERATION_SHARE
+    since = np.minimum(time, np.where(time >= time[3000], time - time[3000], np.inf))
+    expected = own + level * np.exp(-0.5 * since / estimating.LEVEL_TIME)
+    np.testing.assert_allclose(share, expected, rtol=1e-9)
+    moved = dataclasses.replace(seen, innovation=np.ones((steps, 3)))
+    as_modelled = dataclasses.replace(still, innovations={"accelerometer": moved})
+    np.testing.assert_allclose(estimating._tilt_scale(as_modelled, uncertain) ** 2, own + level, rtol=1e-12)
 
 
 def test_a_disturbed_field_leaves_the_heading_of_a_recording(broad):

@@ -6,6 +6,7 @@ The records come from this file's own simulator, not from the package's gyro.
 import itertools
 import math
 import re
+import types
 
 import allantools
 import numpy as np
@@ -629,6 +630,14 @@ def test_scores_of_chi_squares_are_normal():
     assert 0.47 < np.mean(probability < 0.5) < 0.53
 
 
+def test_each_term_of_the_fit_costs_its_spectrum_a_degree():
+    ratio = np.linspace(0.6, 1.5, 10)
+    bins = types.SimpleNamespace(number=np.full(10, 50.0), square=50.0 * ratio, product=np.zeros(10), ramp=np.zeros(10))
+    best = types.SimpleNamespace(slope=0.0, variance=np.ones(10), theta=np.array([1.0, 0.0, 2.0, 3.0]))
+    score = (np.cbrt(ratio) - 1.0 + 2.0 / 450.0) / np.sqrt(2.0 / 450.0)
+    assert allan.deviation._spectrum_probability(bins, best) == pytest.approx(chi2.sf(score @ score, 7), rel=1e-9)
+
+
 @pytest.mark.parametrize("highest_frequency", [None, 0.3])
 def test_misfit_probability_is_one(highest_frequency):
     """Below 0.2 and 0.5 in as many records or somewhat fewer: three tests share it, none of them exact."""
@@ -639,10 +648,10 @@ def test_misfit_probability_is_one(highest_frequency):
             terms=("angle_random_walk", "rate_random_walk"),
             highest_frequency=highest_frequency,
         ).misfit_probability[0]
-        for seed in range(100)
+        for seed in range(60)
     ]
     for level, least in ((0.2, 0.05), (0.5, 0.25)):
-        assert least < np.mean(np.array(probability) < level) < level + 3.0 * math.sqrt(level * (1.0 - level) / 100)
+        assert least < np.mean(np.array(probability) < level) < level + 3.0 * math.sqrt(level * (1.0 - level) / 60)
 
 
 def test_expected_errors_by_the_full_information():

@@ -99,12 +99,12 @@ def test_a_record_of_something_else_is_said_in_the_file_and_last(run, tmp_path, 
     np.save(tmp_path / "gyro.npy", rates)
     status, said, _ = run("allan", "gyro.npy", *AT_100_HZ)
     assert status == 0
-    assert "do not believe" in said.splitlines()[-1]
+    assert "do not trust" in said.splitlines()[-1]
     assert words in " ".join(said.split())
     assert "axis x" not in said
     _, text = written(tmp_path)
     assert words in text
-    assert "# WARNING: do not believe" in text
+    assert "# WARNING: do not trust" in text
     content = json.loads((tmp_path / "allan-results" / "allan.json").read_text(encoding="utf-8"))
     assert content["misfit_probability"][1] < 1e-3
     assert min(content["misfit_probability"][0], content["misfit_probability"][2]) > 1e-3
@@ -113,10 +113,10 @@ def test_a_record_of_something_else_is_said_in_the_file_and_last(run, tmp_path, 
 def test_highest_frequency_leaves_a_line_out(run, tmp_path):
     rates = white(4000, axes=1) + 3e-3 * np.sin(2.0 * np.pi * 31.0 * 0.01 * np.arange(4000))[:, None]
     np.save(tmp_path / "gyro.npy", rates)
-    assert "do not believe" in run("allan", "gyro.npy", *AT_100_HZ)[1]
+    assert "do not trust" in run("allan", "gyro.npy", *AT_100_HZ)[1]
     status, said, _ = run("allan", "gyro.npy", *AT_100_HZ, "--highest-frequency", 25, "--robust")
     assert status == 0
-    assert "do not believe" not in said
+    assert "do not trust" not in said
     spec, _ = written(tmp_path)
     assert np.all(np.abs(spec.angle_random_walk / NOISE - 1.0) < 0.05)
     content = json.loads((tmp_path / "allan-results" / "allan.json").read_text(encoding="utf-8"))

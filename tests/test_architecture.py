@@ -28,7 +28,7 @@ STRANGERS = (("motion", "coning"),)
 
 DRAWING = ("plots", "report")
 PRINTING = ("cli", "__main__")
-MACHINES = ("kernels.machine", "kernels.lanes", "kernels.packed")
+MACHINES = ("kernels.machine", "kernels.lanes", "kernels.packed", "kernels.compiler", "kernels.tracing")
 """Kernel modules that know of compilers; all others are plain Python."""
 
 
@@ -94,14 +94,14 @@ def test_no_module_is_listed_twice():
     assert len(set(listed)) == len(listed)
 
 
-@pytest.mark.parametrize("module", sources())
-def test_imports_run_downwards(module):
-    for name in imports(sources()[module]):
-        other = internal(name)
-        if other is None or not other or unit(other) == unit(module):
-            continue
-        assert module, f"strapdown/__init__.py imports {other}; the front door loads nothing"
-        assert floor(unit(other)) <= floor(unit(module)), f"{module} imports {other}, which stands on a higher floor"
+def test_imports_run_downwards():
+    for module, tree in sources().items():
+        for name in imports(tree):
+            other = internal(name)
+            if other is None or not other or unit(other) == unit(module):
+                continue
+            assert module, f"strapdown/__init__.py imports {other}; the front door loads nothing"
+            assert floor(unit(other)) <= floor(unit(module)), f"{module} imports {other}, on a higher floor"
 
 
 def test_no_circle_of_imports():
@@ -138,13 +138,19 @@ NOT_OF_THE_USER = ("kernels.machine", "report.page")
 """They read files of the package itself."""
 
 
-@pytest.mark.parametrize("module", [name for name in sources() if name not in ("files.reading", *NOT_OF_THE_USER)])
-def test_every_file_passes_the_reading_layer(module):
+def calls() -> Iterator[tuple[str, ast.Call, str]]:
+    """Every call of the package: its module, itself and the words of what is called."""
+    for module, tree in sources().items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Call):
+                yield module, node, ast.unparse(node.func)
+
+
+def test_every_file_passes_the_reading_layer():
     """Nobody else opens a file to read it, or parses one: limits, names of files and digests are in one place."""
-    for node in ast.walk(sources()[module]):
-        if not isinstance(node, ast.Call):
+    for module, node, call in calls():
+        if module in ("files.reading", *NOT_OF_THE_USER):
             continue
-        call = ast.unparse(node.func)
         if call in READERS or call.endswith(OF_A_PATH):
             words = ast.unparse(node)
             writes = any(mode in words for mode in ("'w'", "'wb'", "'a+'", "'r+b'")) or "reading.opened" in words
@@ -156,41 +162,38 @@ def top_names(tree: ast.AST) -> set[str]:
     return {name.partition(".")[0] for name in imports(tree)}
 
 
-@pytest.mark.parametrize("module", sources())
-def test_only_the_drawing_modules_import_matplotlib(module):
-    if unit(module) not in DRAWING:
-        assert not top_names(sources()[module]) & {"matplotlib", "mpl_toolkits"}
+def test_only_the_drawing_modules_import_matplotlib():
+    for module, tree in sources().items():
+        if unit(module) not in DRAWING:
+            assert not top_names(tree) & {"matplotlib", "mpl_toolkits"}, module
 
 
-@pytest.mark.parametrize("module", sources())
-def test_only_the_command_line_prints(module):
-    if unit(module) in PRINTING:
-        return
-    tree = sources()[module]
-    assert not top_names(tree) & {"rich", "typer", "click", "logging"}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Call):
-            call = ast.unparse(node.func)
+def test_only_the_command_line_prints():
+    for module, tree in sources().items():
+        if unit(module) not in PRINTING:
+            assert not top_names(tree) & {"rich", "typer", "click", "logging"}, module
+    for module, node, call in calls():
+        if unit(module) not in PRINTING:
             assert call != "print", f"{module} line {node.lineno} prints"
             assert not call.startswith(("sys.stdout", "sys.stderr")), f"{module} line {node.lineno} prints"
 
 
-@pytest.mark.parametrize("module", [name for name in sources() if unit(name) == "kernels"])
-def test_kernels_are_plain_python(module):
+def test_kernels_are_plain_python():
     """They import one another, by name, and nothing but ``math`` and NumPy's number types; the machine knows numba, when asked."""
-    tree = sources()[module]
-    for name in imports(tree):
-        other = internal(name)
-        assert other is None or unit(other) == "kernels", f"{module} imports {other}"
-    if module in MACHINES:
-        return
-    assert top_names(tree) <= {"__future__", "math", "numpy", "strapdown", "typing"}
-    for name in imports(tree):
-        other = internal(name)
-        assert other not in MACHINES, f"{module} imports {other}; kernels do not know what compiles them"
-        assert other is None or name != f"strapdown.{other}", (
-            f"{module} imports the module {name}; import its functions by name"
-        )
+    for module, tree in sources().items():
+        if unit(module) != "kernels":
+            continue
+        for name in imports(tree):
+            other = internal(name)
+            assert other is None or unit(other) == "kernels", f"{module} imports {other}"
+            if module in MACHINES:
+                continue
+            assert other not in MACHINES, f"{module} imports {other}; kernels do not know what compiles them"
+            assert other is None or name != f"strapdown.{other}", (
+                f"{module} imports the module {name}; import its functions by name"
+            )
+        if module not in MACHINES:
+            assert top_names(tree) <= {"__future__", "math", "numpy", "strapdown", "typing"}, module
 
 
 def test_the_machine_loads_its_compiler_when_asked():
@@ -198,25 +201,19 @@ def test_the_machine_loads_its_compiler_when_asked():
     assert not outside & {"numba", "llvmlite"}
 
 
-@pytest.mark.parametrize("module", sources())
-def test_global_random_numbers_are_not_used(module):
+RANDOM = ("default_rng", "Generator", "BitGenerator", "SeedSequence", "PCG64", "PCG64DXSM", "Philox", "SFC64")
+
+
+def test_global_random_numbers_are_not_used():
     """Randomness is an argument."""
-    for node in ast.walk(sources()[module]):
-        if isinstance(node, ast.Attribute) and ast.unparse(node.value) in ("np.random", "numpy.random"):
-            known = (
-                "default_rng",
-                "Generator",
-                "BitGenerator",
-                "SeedSequence",
-                "PCG64",
-                "PCG64DXSM",
-                "Philox",
-                "SFC64",
-            )
-            assert node.attr in known, f"{module} line {node.lineno}: {ast.unparse(node)}"
-        if isinstance(node, ast.Call) and ast.unparse(node.func).endswith(("default_rng", "SeedSequence")):
+    for module, tree in sources().items():
+        assert "random" not in top_names(tree), module
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Attribute) and ast.unparse(node.value) in ("np.random", "numpy.random"):
+                assert node.attr in RANDOM, f"{module} line {node.lineno}: {ast.unparse(node)}"
+    for module, node, call in calls():
+        if call.endswith(("default_rng", "SeedSequence")):
             assert node.args or node.keywords, f"{module} line {node.lineno}: {ast.unparse(node)} without a seed"
-    assert "random" not in top_names(sources()[module])
 
 
 def loaded_by(code: str) -> set[str]:
@@ -266,9 +263,6 @@ def test_help_loads_neither_compiler_nor_plots(option):
 
 def test_modules_load_neither_compiler_nor_plots():
     """All but the drawing ones, in one process: numba and matplotlib come when first needed."""
-    extends_the_compiler = {
-        "kernels.lanes",
-        "kernels.packed",
-    }  # loaded by kernels.machine alone, when a kernel is compiled over lanes
+    extends_the_compiler = {*MACHINES} - {"kernels.machine"}  # loaded by that one, when a kernel is compiled
     names = sorted(n for n in sources() if n and unit(n) not in DRAWING and n not in extends_the_compiler)
     assert not loaded_by(EACH.format(names)) & {"numba", "llvmlite", "matplotlib"}

@@ -226,6 +226,18 @@ def test_both_faces_are_one_filter(option):
     np.testing.assert_allclose(step.state.covariance, step.whole_covariance[-1], rtol=1e-9, atol=1e-30)
 
 
+def test_covariances_of_attitude_and_bias_alone_are_the_same():
+    record, blocks = record_of(duration=2.0, anisotropic=True), OPTIONS["all"]
+    for pass_over in (lambda *data, **options: estimation.run_part(*data, **options)[0], estimation.smooth):
+        data = (record, NOISE, start(), blocks)
+        whole = pass_over(*data, full_covariance=True)
+        alone = pass_over(*data, full_covariance=True, error_state_covariance=False)
+        assert whole.whole_covariance is not None
+        assert alone.whole_covariance is None
+        np.testing.assert_array_equal(alone.covariance, whole.covariance)
+        np.testing.assert_array_equal(alone.variance, whole.variance)
+
+
 # -------------------------------------------------------------------------------------------------------------------- exact models
 
 
@@ -246,7 +258,7 @@ GYRO_OPTIONS = {
 
 @pytest.mark.parametrize("option", GYRO_OPTIONS)
 def test_the_turn_is_what_the_gyro_model_says(option):
-    """Turn by (I + M)⁻¹ of what the gyro tells less bias and drift, the drift averaged over the step."""
+    """Turn by (I + M)⁻¹ of what the gyro measures less bias and drift, the drift averaged over the step."""
     blocks = GYRO_OPTIONS[option]
     face = face_at(blocks)
     part, dt = np.array([0.1, -0.2, 0.15]), 0.05
@@ -715,7 +727,7 @@ HAND = motion.HarmonicRates(
 
 
 def test_hard_iron_needs_a_turn():
-    """Still, the field's horizontal part and the heading are one; turned about, all is told."""
+    """Still, the field's horizontal part and the heading are one; turned about, all is observable."""
     blocks = (error_states.VectorBias(sensor="mag", bias_sigma=1e-5, unit="T"),)
     initial = estimation.initial_state(quaternion.IDENTITY, attitude_sigma=0.3, bias_sigma=5e-3)
     still = estimation.observability(plain_record(motion.rest()), NOISE, initial, blocks)
@@ -725,8 +737,8 @@ def test_hard_iron_needs_a_turn():
     expected = np.zeros(9)
     expected[[2, 6]] = np.array([1.0 / 0.3, -2e-5 / 1e-5]) / np.hypot(1.0 / 0.3, 2e-5 / 1e-5)
     assert abs(still.directions[-1] @ expected) > 0.99
-    assert "attitude z" in still.weakest(1)[0]
-    assert "mag bias x" in still.weakest(1)[0]
+    assert "attitude z" in still.words(-1)
+    assert "mag bias x" in still.words(-1)
     turned = estimation.observability(plain_record(HAND), NOISE, initial, blocks)
     assert turned.rank == 9
     assert np.all(turned.unobserved == 0.0)
@@ -772,7 +784,7 @@ def test_singular_values_are_those_of_the_stacked_rows():
     assert found.rank == 2
 
 
-def test_what_is_left_along_each_direction_is_told_in_the_units_of_the_states():
+def test_what_is_left_along_each_direction_is_reported_in_the_units_of_the_states():
     """Its rows are independent errors that make up the covariance; along the weakest the prior is left, state by state."""
     blocks = (error_states.VectorBias(sensor="mag", bias_sigma=1e-5, unit="T"),)
     correlated = start().covariance * np.outer([3.0, 1.0, 2.0, 1.0, 1.0, 5.0], [3.0, 1.0, 2.0, 1.0, 1.0, 5.0])
@@ -790,8 +802,8 @@ def test_what_is_left_along_each_direction_is_told_in_the_units_of_the_states():
     prior = initial.covariance
     sizes = [one[:6] @ np.linalg.solve(prior, one[:6]) + np.sum((one[6:] / 1e-5) ** 2) for one in found.left]
     np.testing.assert_allclose(sizes, 1.0 / (1.0 + found.singular_values**2), rtol=1e-6)
-    told = found.weakest(1)[0]
-    assert f"attitude z ({abs(found.left[-1, 2]):.2g} rad)" in told
+    weakest = found.words(-1)
+    assert f"attitude z ({abs(found.left[-1, 2]):.2g} rad)" in weakest
     assert found.words(8) in str(found)
     written = json.loads(json.dumps(found.summary()))
     assert written["rank"] == found.rank

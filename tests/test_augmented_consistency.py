@@ -1,4 +1,4 @@
-"""Monte Carlo of the filter with optional states: its covariance is to be believed with each block, and not with the block left out."""
+"""Monte Carlo of the filter with optional states: its covariance is consistent with each error state, and not with one left out."""
 
 from __future__ import annotations
 
@@ -133,9 +133,9 @@ def runs(case: str, number: int, duration: float, seed: int = 11) -> tuple[Run, 
 
 
 def judged(case: str, blocks, number: int, duration: float, *, smoothed=False, known=None, seed=11):
-    """Return the verdict on all states whose truth is told at an instant, at five epochs of the second half.
+    """Return the verdict on all states whose truth is known at an instant, at five epochs of the second half.
 
-    Of an acceleration the package's simulator tells no truth, so it is left out of the error, and its own covariance with it.
+    Of an acceleration the package's simulator gives no truth, so it is left out of the error, and its own covariance with it.
     """
     epochs = None
     values = []
@@ -148,10 +148,10 @@ def judged(case: str, blocks, number: int, duration: float, *, smoothed=False, k
         true_bias = one.record.truth.bias
         if case == "gyro drift":
             true_bias = true_bias - one.truth[DRIFT.name]
-        told = {block.name: one.truth[block.name] for block in blocks if block is not SWAY}
+        truth = {block.name: one.truth[block.name] for block in blocks if block is not SWAY}
         if any(block is SWAY or block.name == SWAY.name for block in blocks):
-            told[SWAY.name] = np.zeros(3)
-        error = estimate.errors(one.record.truth.attitude, true_bias, told)[epochs]
+            truth[SWAY.name] = np.zeros(3)
+        error = estimate.errors(one.record.truth.attitude, true_bias, truth)[epochs]
         P = (estimate.whole_covariance if blocks else estimate.covariance)[epochs]
         names = state_names(blocks)[0]
         kept = [k for k, name in enumerate(names) if not name.startswith(SWAY.name)]
@@ -162,7 +162,7 @@ def judged(case: str, blocks, number: int, duration: float, *, smoothed=False, k
 
 @pytest.mark.parametrize("smoothed", [False, True], ids=["filter", "smoother"])
 @pytest.mark.parametrize("case", CASES)
-def test_the_covariance_is_to_be_believed(case, smoothed):
+def test_the_covariance_is_consistent(case, smoothed):
     verdict = judged(case, CASES[case], 40, 12.0, smoothed=smoothed)
     assert verdict.consistent, (verdict.mean, verdict.simultaneous_bounds)
 
@@ -170,7 +170,7 @@ def test_the_covariance_is_to_be_believed(case, smoothed):
 @pytest.mark.slow
 @pytest.mark.parametrize("smoothed", [False, True], ids=["filter", "smoother"])
 @pytest.mark.parametrize("case", CASES)
-def test_the_covariance_is_to_be_believed_in_many_runs(case, smoothed):
+def test_the_covariance_is_consistent_in_many_runs(case, smoothed):
     verdict = judged(case, CASES[case], 600, 40.0, smoothed=smoothed, seed=12)
     assert verdict.consistent, (verdict.mean, verdict.simultaneous_bounds)
 
@@ -300,7 +300,7 @@ def test_an_acceleration_shows_no_heading(sigma):
 
 
 def test_a_start_off_by_tenths_of_a_radian_is_moved_to_where_it_belongs():
-    """A heading that hard iron has turned: linearised there, the filter believes too much for good; started anew, it is right."""
+    """A heading that hard iron has turned: linearised there, the filter is overconfident for good; started anew, it is right."""
     number, sigma = 25, np.repeat([0.4, 3e-3], 3)
     first, anew = [], []
     for k in range(number):

@@ -125,14 +125,14 @@ def measured(name, time, truth, rng, magnet) -> VectorMeasurements:
     def white(sigma):
         return sigma * rng.standard_normal((len(time), 3))
 
-    def told(kind, reference, value, sigma):
+    def series(kind, reference, value, sigma):
         return VectorMeasurements(
             sensor=name, kind=kind, time=time, vector_b=value, reference_f=reference, sigma=np.full(len(time), sigma)
         )
 
     if name == "mag":
         off = truth[IRON.name] + np.where(time[:, None] < magnet, 3.3e-6 * np.array([0.6, -0.8, 0.0]), 0.0)
-        return told("vector", FIELD, seen(FIELD) + off + white(3e-7), 3e-7)
+        return series("vector", FIELD, seen(FIELD) + off + white(3e-7), 3e-7)
     if name == "acc":
         coloured = np.zeros((len(time), 3))
         if np.any(truth.get(SWAY.name, 0.0)):
@@ -141,17 +141,17 @@ def measured(name, time, truth, rng, magnet) -> VectorMeasurements:
             coloured[0] = truth[SWAY.name]
             for k in range(1, len(time)):
                 coloured[k] = keep[k] * coloured[k - 1] + drive[k]
-        return told("vector", UP, seen(UP) + coloured + white(0.05), 0.05)
+        return series("vector", UP, seen(UP) + coloured + white(0.05), 0.05)
     if name == "mag direction":
         value = seen(FIELD / np.linalg.norm(FIELD)) + truth[f"{name} bias"] + white(5e-3)
-        return told("direction", FIELD, unit(value), 5e-3)
+        return series("direction", FIELD, unit(value), 5e-3)
     if name == "compass":
         # σ of a heading is the sensor's own noise over the level part of what it measures.
         value = seen(STAR) + truth[f"{name} bias"] + white(5e-3)
-        return told("heading", STAR, unit(value), 5e-3 / np.hypot(*STAR[:2]))
+        return series("heading", STAR, unit(value), 5e-3 / np.hypot(*STAR[:2]))
     if name == "star":
         reference = np.array([0.3, -0.2, 1.0])
-        return told("direction", reference, unit(seen(unit(reference)) + white(3e-3)), 3e-3)
+        return series("direction", reference, unit(seen(unit(reference)) + white(3e-3)), 3e-3)
     turned = quaternion.multiply(HAND.attitude(time), quaternion.exp(truth["mounting"]))
     value = quaternion.multiply(turned, quaternion.exp(white(3e-3)))
     return VectorMeasurements(
@@ -189,25 +189,25 @@ def recoveries(estimate):
 def judged(case: str, runs: int, make: Callable[[int], Made], after, since: float = 0.0, bias_sigma: float = 1e-5):
     """Return of each run the recoveries, and ANEES of attitude, bias and blocks at times after the first that ends after ``since``.
 
-    ``bias_sigma`` is how far the bias has jumped. Of an acceleration no truth is told, and it is left out.
+    ``bias_sigma`` is how far the bias has jumped. There is no truth of an acceleration, and it is left out.
     """
     gate = Gate(restart_bias_sigma=bias_sigma)
     blocks = CASES[case][1]
-    told, found = [], []
+    recovered, found = [], []
     for run in range(runs):
         one = make(run)
         estimate = estimation.run(one.record, NOISE, one.initial, blocks, gate=gate, full_covariance=True)
-        told.append([event for event in recoveries(estimate) if event.end > since])
-        if not told[-1]:
+        recovered.append([event for event in recoveries(estimate) if event.end > since])
+        if not recovered[-1]:
             continue
         values = {block.name: np.zeros(3) if block is SWAY else one.truth[block.name] for block in blocks}
         error = estimate.errors(one.record.truth.attitude, one.record.truth.bias, values)
         last = 6 + sum(block.size for block in blocks if block is not SWAY)  # which comes last
-        rows = np.searchsorted(estimate.time, told[-1][0].end + np.asarray(after) - 1e-9)
+        rows = np.searchsorted(estimate.time, recovered[-1][0].end + np.asarray(after) - 1e-9)
         parts = slice(0, 3), slice(3, 6), slice(6, last)
         P = estimate.whole_covariance
         found.append([[consistency.nees(error[k, s], P[k][s, s]) / len(error[k, s]) for s in parts] for k in rows])
-    return told, np.mean(found, axis=0)
+    return recovered, np.mean(found, axis=0)
 
 
 def assert_consistent(case: str, mean, runs: int) -> None:
@@ -225,13 +225,13 @@ RUNS = [40, pytest.param(400, marks=pytest.mark.slow)]
 
 @pytest.mark.parametrize("runs", RUNS)
 @pytest.mark.parametrize("case", CASES)
-def test_a_lost_start_is_recovered_from_and_all_states_are_to_be_believed(case, runs):
+def test_a_lost_start_is_recovered_from_and_all_states_are_consistent(case, runs):
     def make(run):
         one = made(case, run)
         return dataclasses.replace(one, initial=lost(one.initial, run))
 
-    told, mean = judged(case, runs, make, (0.1, 1.0, 3.0, 8.0))
-    for events in told:
+    recovered, mean = judged(case, runs, make, (0.1, 1.0, 3.0, 8.0))
+    for events in recovered:
         (event,) = events
         assert event.start <= 0.1 + 1e-9
         assert event.end <= 1.2 + 1e-9
@@ -245,10 +245,10 @@ def test_a_lost_start_is_recovered_from_and_all_states_are_to_be_believed(case, 
 @pytest.mark.parametrize("case", ["hard iron", "all", "mounting"])
 def test_a_turn_in_a_gap_of_the_gyro_is_recovered_from(case, runs):
     """20 s of calibration, then 2 s without a gyro: the attitude is off by up to half a turn, and all else is as it was."""
-    told, mean = judged(
+    recovered, mean = judged(
         case, runs, lambda run: without_gyro(made(case, run, 35.0), 20.0, 22.0), (0.1, 1.0, 3.0, 11.0), since=20.0
     )
-    for events in told:
+    for events in recovered:
         (event,) = events
         assert 19.0 <= event.start <= 22.3  # from the first refusal on, which may be one by chance right before the gap
         assert event.end <= 23.5
@@ -258,10 +258,10 @@ def test_a_turn_in_a_gap_of_the_gyro_is_recovered_from(case, runs):
 @pytest.mark.parametrize("runs", RUNS)
 def test_a_state_that_was_led_astray_recovers_too(runs):
     """A magnet is carried for 15 s and learnt as hard iron; taken away, that is off by 3.3 σ of the prior, and by 50 of its own."""
-    told, mean = judged(
+    recovered, mean = judged(
         "hard iron", runs, lambda run: made("hard iron", run, 27.0, magnet=15.0), (0.1, 1.0, 3.0, 10.0), since=15.0
     )
-    for events in told:
+    for events in recovered:
         (event,) = events
         assert 14.9 < event.start < 15.2
         assert event.sensor == "mag"
@@ -281,8 +281,8 @@ def test_a_step_of_the_bias_is_recovered_from(runs):
         stepped = dataclasses.replace(record, increments=record.increments + 0.02 * later * step, truth=truth)
         return dataclasses.replace(one, record=stepped)
 
-    told, mean = judged("hard iron", runs, make, (0.1, 1.0, 3.0, 9.0), since=12.0, bias_sigma=0.3)
-    assert all(len(events) == 1 and events[0].start < 13.2 for events in told)
+    recovered, mean = judged("hard iron", runs, make, (0.1, 1.0, 3.0, 9.0), since=12.0, bias_sigma=0.3)
+    assert all(len(events) == 1 and events[0].start < 13.2 for events in recovered)
     assert_consistent("hard iron", mean, runs)
 
 
@@ -308,9 +308,9 @@ def test_without_recovery_it_stays_lost():
     one = made("hard iron", 1)
     estimate = estimation.run(one.record, NOISE, lost(one.initial, 1), (IRON,), gate=Gate(recovery=None))
     assert not recoveries(estimate)
-    told = {event.sensor: event for event in estimate.events}
-    assert set(told) == {"mag", "acc"}
-    for sensor, event in told.items():
+    by_sensor = {event.sensor: event for event in estimate.events}
+    assert set(by_sensor) == {"mag", "acc"}
+    for sensor, event in by_sensor.items():
         assert event.kind == "lock-out"
         assert event.start < 0.2
         assert event.value == pytest.approx(estimate.refused[sensor], abs=3)
@@ -498,7 +498,7 @@ def test_widening_a_bias_whose_axes_hang_together_leaves_a_covariance():
     assert np.all(np.diag(found)[3:] > np.diag(P)[3:])
 
 
-def test_a_start_that_is_surer_than_its_blocks_is_not_believed_by_a_candidate():
+def test_a_start_that_is_surer_than_its_blocks_is_not_accepted_by_a_candidate():
     """A start that goes on from an earlier part: its values are kept, and what it knows of them is what the block says at least."""
     one = made("hard iron", 2)
     begun = estimation.with_error_states(one.initial, (IRON,))
@@ -569,7 +569,7 @@ def test_without_blocks_it_is_the_plain_filter(case, robust):
         start = lost(one.initial, run)
         plain = estimation.run(one.record, NOISE, start, **given)
         other = estimation.run(one.record, NOISE, start, (), **given)
-        assert plain.events  # it has recovered, or tells that it is locked out
+        assert plain.events  # it has recovered, or reports that it is locked out
         assert_same_events(plain, other)
         error = consistency.errors(other.attitude, other.bias, plain.attitude, plain.bias)
         assert np.max(np.abs(error) / plain.sigma) < 1e-9
@@ -613,14 +613,14 @@ def test_in_parts_a_gate_goes_on_as_in_one(at, gap):
     if gap:
         one, start = without_gyro(made("hard iron", 3, duration=4.0), 1.5, 2.5), one.initial
     whole, end = estimation.run_part(one.record, NOISE, start, (WALKING, HELD), **given)
-    (told,) = recoveries(whole)
+    (recovered,) = recoveries(whole)
     state, found, events = start, [], []
     for first, last in itertools.pairwise((0, *at, len(one.record.increments))):
         part = records.cut(one.record, first, last)
         estimate, state = estimation.run_part(part, NOISE, state, (WALKING, HELD), **given)
         found.append(estimate.attitude[0 if first == 0 else 1 :])
         events += recoveries(estimate)
-    assert events == [told]
+    assert events == [recovered]
     assert np.array_equal(np.concatenate(found), whole.attitude)
     assert np.array_equal(state.covariance, end.covariance)
     assert np.array_equal(state.values, end.values)
@@ -734,15 +734,15 @@ def test_the_smoother_does_not_smooth_across_a_recovery():
 # ------------------------------------------------------------------------------------------------------------------------- setups
 
 
-def test_a_setup_with_states_and_a_gate_recovers_and_tells_the_whole_bias(tmp_path):
+def test_a_setup_with_states_and_a_gate_recovers_and_reports_the_whole_bias(tmp_path):
     """Drifts beside the bias, and hard iron; the setup from its file. Events are in order of time, those of gaps among them."""
     one = without_gyro(made("hard iron", 4, duration=20.0), 8.0, 8.5)
     states = States(gyro_drift_sigma=(1e-4,), gyro_drift_time=(5.0,), sensors={"mag": SensorStates(bias_sigma=1e-6)})
-    believes = FilterSetup(
+    filter_setup = FilterSetup(
         process_noise=NOISE, attitude_sigma=ATTITUDE_SIGMA, bias_sigma=BIAS_SIGMA, states=states, gate=Gate(recovery=7)
     )
     path = tmp_path / "filter.toml"
-    path.write_text(setup.to_toml(believes), encoding="utf-8")
+    path.write_text(setup.to_toml(filter_setup), encoding="utf-8")
     assert "recovery = 7" in path.read_text(encoding="utf-8")
     estimate = setup.run(one.record, setup.read_setup(path), lost(one.initial, 4), full_covariance=True)
     first = recoveries(estimate)[0]
@@ -769,8 +769,8 @@ def test_a_lever_arm_recovers():
     )
 
 
-def test_a_campaign_of_lost_starts_with_states_ends_believed():
-    """A Monte Carlo gives the gate of a setup with states its records; starts a radian off on each axis, believed to 2°, all recover."""
+def test_a_campaign_of_lost_starts_with_states_ends_consistent():
+    """A Monte Carlo gives the gate of a setup with states its records; starts a radian off on each axis with a σ of 2° all recover."""
     scenario = Scenario(
         motion=HAND,
         gyro=GyroSpec(angle_random_walk=1e-3, rate_random_walk=1e-5),
@@ -782,13 +782,13 @@ def test_a_campaign_of_lost_starts_with_states_ends_believed():
         duration=6.0,
     )
     states = States(sensors={"mag": SensorStates(bias_sigma=1e-7)})
-    believes = FilterSetup(
+    filter_setup = FilterSetup(
         process_noise=NOISE, attitude_sigma=0.03, bias_sigma=1e-4, states=states, gate=Gate(restart_bias_sigma=1e-5)
     )
     far = montecarlo.Dispersions(attitude_sigma=1.0)
     gated, blind = montecarlo.run(
         scenario,
-        (believes, dataclasses.replace(believes, gate=Gate(recovery=None))),
+        (filter_setup, dataclasses.replace(filter_setup, gate=Gate(recovery=None))),
         runs=12,
         seed=3,
         epochs=10,

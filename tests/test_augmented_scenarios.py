@@ -65,7 +65,7 @@ def studied(scenario, chosen, runs, *, seed=100, individuals=True) -> Study:
         initial = start(record, chosen, seed, run)
         every = len(record.increments) // chosen.integration.samples // 20
         estimate = setup.run(record, chosen, initial, every=every, full_covariance=True)
-        truth = setup.believed(record, chosen).truth
+        truth = setup.modelled_record(record, chosen).truth
         epochs = np.linspace(4, len(estimate.time) - 1, 5).astype(int)
         error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude[::every], truth.bias[::every])
         for subset, states in consistency.SUBSETS.items():
@@ -99,7 +99,7 @@ def test_every_built_in_scenario_is_here():
 def test_the_states_are_those_that_the_errors_call_for(name):
     chosen, scenario = matched(name), scenarios.load_scenario(name)
     assert chosen.states.names == CALLED_FOR[name]
-    missing = setup.not_covered(scenario.gyro, scenario.sensors, chosen.states, gravity_f=scenario.gravity_f)
+    missing = setup.unmodelled_errors(scenario.gyro, scenario.sensors, chosen.states, gravity_f=scenario.gravity_f)
     assert missing == (("the gyro's quantisation",) if name == "hand-held" else ())
 
 
@@ -118,10 +118,10 @@ def test_they_are_not_without_the_states(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("individuals", [True, False], ids=["individuals", "as told"])
+@pytest.mark.parametrize("individuals", [True, False], ids=["individuals", "as specified"])
 @pytest.mark.parametrize("name", CALLED_FOR)
 def test_nis_and_anees_are_inside_their_bounds_over_many_runs(name, individuals):
-    """On individuals whose errors are drawn, and on the one that the scenario tells, whose errors have all one sign.
+    """On individuals whose errors are drawn, and on the one that the scenario specifies, whose errors have all one sign.
 
     At rest nothing is measured, and the attitude is unknown beyond what is linear after minutes; it is judged over two.
     """
@@ -136,8 +136,8 @@ def test_nis_and_anees_are_inside_their_bounds_over_many_runs(name, individuals)
     assert wrong == []
 
 
-def test_the_quicker_part_of_flicker_is_told_of_the_bias():
-    """Without it the bias of a filter with drifts is told too well, for the truth holds all of the flicker."""
+def test_the_quicker_part_of_flicker_is_reported_of_the_bias():
+    """Without it the bias of a filter with drifts has too small a σ, for the truth holds all of the flicker."""
     scenario = scenarios.load_scenario("hand-held")
     chosen = matched("hand-held")
     record = scenarios.simulate(scenario, 1)

@@ -1,4 +1,4 @@
-"""The smoother with optional states: one least-squares problem for each kind of block, fixed lag, recoveries, blocks told by functions."""
+"""The smoother with error states: one least-squares problem for each kind of block, fixed lag, recoveries, states given by functions."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ UP, FIELD = np.array([0.0, 0.0, 9.81]), np.array([0.0, 0.6, -0.8])
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Small:
-    """A short record of a body that turns, and what is believed at its start."""
+    """A short record of a body that turns, and the state at its start."""
 
     record: ImuRecord
     noise: ProcessNoise
@@ -128,7 +128,7 @@ def optimum(small: Small, guess: np.ndarray, q0: np.ndarray):
     prior = root_inverse(initial.covariance)
     phi = transition_of(blocks, dt)
     whitening = np.array([root_inverse(driven(blocks, small.noise, one / dt, dt)) for one in record.increments])
-    told = [(s, np.searchsorted(record.time, s.time), turning_matrices(blocks, record, s)) for s in record.vectors]
+    rows = [(s, np.searchsorted(record.time, s.time), turning_matrices(blocks, record, s)) for s in record.vectors]
 
     def residuals(x):
         q, b, c = quaternion.multiply(q0, quaternion.exp(x[:, :3])), x[:, 3:6], x[:, 6:]
@@ -142,13 +142,13 @@ def optimum(small: Small, guess: np.ndarray, q0: np.ndarray):
             prior @ np.concatenate([off, b[0] - initial.bias, c[0] - initial.values]),
             np.einsum("nij,nj->ni", whitening, step).ravel(),
         ]
-        for series, at, W in told:
+        for series, at, W in rows:
             miss = series.vector_b - predicted_vectors(blocks, series, q[at], c[at], W)
             parts.append((miss / series.sigma[:, None]).ravel())
         return np.concatenate(parts)
 
     # Gauss–Newton. An edge meets its neighbours only: the columns of every third one are differenced together.
-    owner = [np.zeros(n, int), *(np.full(n, k) for k in range(edges - 1)), *(np.repeat(at, 3) for _, at, _ in told)]
+    owner = [np.zeros(n, int), *(np.full(n, k) for k in range(edges - 1)), *(np.repeat(at, 3) for _, at, _ in rows)]
     later = [np.zeros(n, int), *(np.full(n, k + 1) for k in range(edges - 1)), *owner[edges:]]
     owner, later = np.concatenate(owner), np.concatenate(later)
     x = guess.copy()
@@ -288,21 +288,21 @@ def pushed(kind: str, runs: int) -> np.ndarray:
         rng = np.random.default_rng([run, 8])
         small = small_record((CARRIED[kind],), 0.03, seed=100 + run, late=True, off=rng.standard_normal(3))
         estimate = estimation.smooth(small.record, small.noise, small.initial, small.blocks, full_covariance=True)
-        told = next(iter(estimate.error_states.values())).values
+        values = next(iter(estimate.error_states.values())).values
         # Relative to the estimated attitude, of which alone it is known.
         turn = quaternion.to_matrix(quaternion.multiply(estimate.attitude, quaternion.conjugate(small.attitude)))
-        true = np.einsum("kij,kjp->kip", turn, small.values.reshape(len(turn), 3, -1)).reshape(told.shape)
+        true = np.einsum("kij,kjp->kip", turn, small.values.reshape(len(turn), 3, -1)).reshape(values.shape)
         edges = [-1, len(turn) // 2]
         P = estimate.whole_covariance[edges, 6:, 6:]
-        found[run] = consistency.nees((true - told)[edges], P) / told.shape[1]
+        found[run] = consistency.nees((true - values)[edges], P) / values.shape[1]
     return found
 
 
 @pytest.mark.parametrize(
     "kind", [kind if kind == "coloured, fixed axes" else pytest.param(kind, marks=pytest.mark.slow) for kind in CARRIED]
 )
-def test_what_is_carried_is_to_be_believed(kind):
-    """Of a heading found at the end; untold of the turn, the filter's push of several tenths of g was off by 3 of its σ."""
+def test_what_is_carried_is_consistent(kind):
+    """Of a heading found at the end; without the turn carried along, the filter's push of several tenths of g was off by 3 of its σ."""
     found = pushed(kind, 60)
     low, high = consistency.mean_bounds(CARRIED[kind].size, 60, 0.999)
     assert np.all((low < found.mean(axis=0)) & (found.mean(axis=0) < high)), found.mean(axis=0)
@@ -327,7 +327,7 @@ BODY = motion.HarmonicRates(
 
 
 def swaying(duration=2.0, seed=1, start_error=(0.05, -0.02, 0.03)):
-    """A record of a swaying body, sensors at times of their own, some on edges and an event just beside one; and what is believed."""
+    """A record of a swaying body, sensors at times of their own, some on edges and an event just beside one; and the initial state."""
     rng = np.random.default_rng(seed)
     time = np.arange(round(50 * duration) + 1) / 50.0
     turns = BODY.increments(time) + 1e-3 * math.sqrt(0.02) * rng.standard_normal((len(time) - 1, 3))
@@ -401,7 +401,7 @@ def test_any_number_of_passes_go_together(passes, monkeypatch):
 
 
 def test_a_bias_that_turns_more_than_the_increments_say_loses_no_segments():
-    """A still gyro with a large bias: steps are cut by the turn without the bias, and are more than the increments tell."""
+    """A still gyro with a large bias: steps are cut by the turn without the bias, and are more than the increments suggest."""
     rng = np.random.default_rng(5)
     time = np.arange(21.0)
     z = np.tile([0.0, 0.0, 1.0], (20, 1)) + 0.02 * rng.standard_normal((20, 3))
@@ -424,7 +424,7 @@ def test_a_bias_that_turns_more_than_the_increments_say_loses_no_segments():
 
 
 def lost_start(seed: int, duration: float = 2.5, blocks=(IRON,)):
-    """A record of a body with constant hard iron, the truth of it, and a start radians off that believes to be within 3°."""
+    """A record of a body with constant hard iron, the truth of it, and a start radians off with a σ of 3°."""
     rng = np.random.default_rng([3, seed])
     record, initial = swaying(duration, [4, seed])
     iron = 0.05 * rng.standard_normal(3)
@@ -551,20 +551,20 @@ def recovered(runs: int) -> np.ndarray:
     return np.array(nees)
 
 
-def test_a_lost_stretch_is_smoothed_to_be_believed():
+def test_a_lost_stretch_is_smoothed_consistent():
     mean = recovered(16).mean(axis=0) / 9.0
     low, high = consistency.mean_bounds(9, 16, 0.999)
     assert np.all((low < mean) & (mean < high)), (mean, low, high)
 
 
 @pytest.mark.slow
-def test_a_lost_stretch_is_smoothed_to_be_believed_over_many_runs():
+def test_a_lost_stretch_is_smoothed_consistent_over_many_runs():
     nees = recovered(300)
     verdict = consistency.Verdict(mean=nees.mean(axis=0) / 9.0, degrees=9, runs=300, probability=0.99)
     assert verdict.consistent, (verdict.mean, verdict.simultaneous_bounds)
 
 
-def test_lock_outs_are_told():
+def test_lock_outs_are_reported():
     """A sensor that is refused over and over with no way to follow it: the event is the smoother's too."""
     record, _, initial = lost_start(1)
     acc, mag = record.vectors

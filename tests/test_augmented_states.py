@@ -162,8 +162,8 @@ def chosen(states, **more) -> FilterSetup:
     return FilterSetup(process_noise=NOISE, attitude_sigma=0.02, bias_sigma=3e-3, states=states, **more)
 
 
-def run(record, believes, **options):
-    return setup.run(record, believes, begun(record), **options)
+def run(record, filter_setup, **options):
+    return setup.run(record, filter_setup, begun(record), **options)
 
 
 def uneven() -> ImuRecord:
@@ -259,7 +259,7 @@ def test_the_whole_bias_is_that_of_all_states():
     record = simulated(markov_noise=1e-3, markov_correlation_time=8.0)
     states = States(gyro_drift_sigma=(2e-3, 1e-3), gyro_drift_time=(8.0, 1.5), gyro_fast_bias_sigma=1e-4)
     initial = begun(record)
-    told = optional.run(record, NOISE, initial, states, every=50, full_covariance=True)
+    reported = optional.run(record, NOISE, initial, states, every=50, full_covariance=True)
     blocks = states.blocks({"mag": "vector", "acc": "vector"})
     begin = optional.initial_state(initial, blocks)
     whole = estimation.run(record, NOISE, begin, blocks, every=50, full_covariance=True)
@@ -268,10 +268,10 @@ def test_the_whole_bias_is_that_of_all_states():
     sum_of[3:, 6:9] = sum_of[3:, 9:] = np.eye(3)
     expected = sum_of @ whole.whole_covariance @ sum_of.T
     expected[:, [3, 4, 5], [3, 4, 5]] += 1e-8
-    np.testing.assert_allclose(told.covariance, expected, rtol=1e-9, atol=1e-18)
-    np.testing.assert_allclose(told.variance, np.einsum("kii->ki", expected), rtol=1e-11)
+    np.testing.assert_allclose(reported.covariance, expected, rtol=1e-9, atol=1e-18)
+    np.testing.assert_allclose(reported.variance, np.einsum("kii->ki", expected), rtol=1e-11)
     np.testing.assert_allclose(
-        told.bias, whole.bias + sum(one.values for one in whole.error_states.values()), rtol=0, atol=1e-15
+        reported.bias, whole.bias + sum(one.values for one in whole.error_states.values()), rtol=0, atol=1e-15
     )
     # The start is what it says of the whole bias, whatever the parts are.
     at_start = sum_of @ begin.covariance @ sum_of.T
@@ -358,7 +358,7 @@ def test_the_step_face_goes_on_from_a_part_as_the_record_does():
     initial = begun(record)
     turned = quaternion.multiply(initial.attitude, quaternion.exp([1.0, 0.5, -1.0]))
     initial = dataclasses.replace(initial, attitude=turned)
-    challenged, told = 0, 0
+    challenged, reported = 0, 0
     for cut in (7, 20, 33, 60, 120):
         first, rest = records.cut(record, 0, cut), records.cut(record, cut, len(record.increments))
         _, middle = estimation.run_part(first, NOISE, initial, blocks, gate=gate)
@@ -371,9 +371,9 @@ def test_the_step_face_goes_on_from_a_part_as_the_record_does():
         np.testing.assert_allclose(last.values / sigma[6:], end.values / sigma[6:], rtol=0.0, atol=1e-8)
         assert np.abs((last.covariance - end.covariance) / np.outer(sigma, sigma)).max() < 1e-8
         assert sorted(map(str, step.events)) == sorted(map(str, second.events))
-        told += any(event.kind == "recovery" for event in step.events)
+        reported += any(event.kind == "recovery" for event in step.events)
     assert challenged >= 2
-    assert told >= 2
+    assert reported >= 2
     with pytest.raises(InputError, match=r"time is 0 s, before the record of initial began, 100 s; give the time"):
         StepFilter(NOISE, middle, blocks, gate=gate)
 
@@ -408,11 +408,11 @@ def test_a_lever_arm_is_found(kind):
         rate=200.0,
         duration=20.0,
     )
-    believes = setup.matched(scenario, states=True)
+    filter_setup = setup.matched(scenario, states=True)
     ratios = []
     for seed in range(6):
         record = scenarios.simulate(scenario, seed)
-        estimate = setup.run(record, believes, begun(record, 0.01, 1e-4, seed))
+        estimate = setup.run(record, filter_setup, begun(record, 0.01, 1e-4, seed))
         block = estimate.error_states["acc lever arm"]
         assert block.units == ("m", "m", "m")
         assert np.all(block.sigma[-1] < 0.01)
@@ -423,13 +423,13 @@ def test_a_lever_arm_is_found(kind):
 
 
 def test_hard_iron_in_a_field_that_changes_is_found_in_its_own_unit():
-    """Its share of a direction changes with the field's strength: told so, the filter is right, and else not."""
+    """Its share of a direction changes with the field's strength: with that model the filter is consistent, and without it not."""
     scenario = dataclasses.replace(scenarios.load_scenario("low-orbit"), duration=4000.0)
     iron = np.array([2e-6, -1.5e-6, 1e-6])
     sensors = tuple(dataclasses.replace(s, hard_iron=iron) if s.name == "magnetometer" else s for s in scenario.sensors)
     scenario = dataclasses.replace(scenario, sensors=sensors)
-    believes = setup.matched(scenario, states=True)
-    own = believes.states.sensors["magnetometer"]
+    filter_setup = setup.matched(scenario, states=True)
+    own = filter_setup.states.sensors["magnetometer"]
     assert own.varying
     record = scenarios.simulate(scenario, 5)
     series = record.vectors[1]
@@ -437,10 +437,12 @@ def test_hard_iron_in_a_field_that_changes_is_found_in_its_own_unit():
     assert np.ptp(field) > 5e-6
     assert np.asarray(own.bias_sigma) == pytest.approx(np.abs(iron) * np.sqrt(np.mean(field**-2.0)))
     firm = dataclasses.replace(
-        believes,
-        states=dataclasses.replace(believes.states, sensors={"magnetometer": dataclasses.replace(own, varying=False)}),
+        filter_setup,
+        states=dataclasses.replace(
+            filter_setup.states, sensors={"magnetometer": dataclasses.replace(own, varying=False)}
+        ),
     )
-    right, wrong = (setup.run(record, which, begun(record, 0.01, 1e-3)) for which in (believes, firm))
+    right, wrong = (setup.run(record, which, begun(record, 0.01, 1e-3)) for which in (filter_setup, firm))
     nis = [one.innovations["magnetometer"].nis[300:].mean() / 2.0 for one in (right, wrong)]
     assert abs(nis[0] - 1.0) < 0.08
     assert nis[1] > 1.3
@@ -497,7 +499,7 @@ def test_drifts_a_decade_apart_are_flicker():
     assert np.mean(held * w) == pytest.approx(1.0, abs=0.03)
 
 
-def test_what_a_specification_tells_is_matched_entry_by_entry():
+def test_what_a_specification_gives_is_matched_entry_by_entry():
     scenario = scenarios.load_scenario("spin")
     chosen = setup.matched(scenario, states=True)
     assert chosen.states == States(gyro_scale_sigma=tuple(scenario.gyro.scale_factor))
@@ -513,11 +515,11 @@ def test_what_a_specification_tells_is_matched_entry_by_entry():
 
 
 def test_a_motion_that_commutes_badly_gets_a_better_integration():
-    assert setup.matched(scenarios.load_scenario("coning"), states=True).integration.name == setup.BETTER
+    assert setup.matched(scenarios.load_scenario("coning"), states=True).integration.name == setup.ACCURATE_ALGORITHM
     assert setup.matched(scenarios.load_scenario("spin"), states=True).integration.name == "one-sample"
 
 
-def test_individuals_are_drawn_with_the_told_errors_for_sigma():
+def test_individuals_are_drawn_with_the_reported_errors_for_sigma():
     scenario = scenarios.load_scenario("low-orbit")
     drawn = [scenarios.drawn(scenario, 7, k) for k in range(300)]
     irons = np.array([one.sensors[1].hard_iron for one in drawn])
@@ -543,15 +545,15 @@ def test_an_estimate_with_states_is_judged_like_any_other(tmp_path):
     from strapdown.records import read_estimate, write_estimate
 
     scenario = scenarios.load_scenario("spin")
-    believes = setup.matched(scenario, states=True)
+    filter_setup = setup.matched(scenario, states=True)
     record = scenarios.simulate(scenarios.drawn(scenario, 2), 2)
     draw = generator(2, 0, "start").standard_normal(6)
     initial = setup.initial_state(
-        believes,
-        quaternion.multiply(record.truth.attitude[0], quaternion.exp(-believes.attitude_sigma * draw[:3])),
-        record.truth.bias[0] - believes.bias_sigma * draw[3:],
+        filter_setup,
+        quaternion.multiply(record.truth.attitude[0], quaternion.exp(-filter_setup.attitude_sigma * draw[:3])),
+        record.truth.bias[0] - filter_setup.bias_sigma * draw[3:],
     )
-    estimate = setup.run(record, believes, initial, full_covariance=True)
+    estimate = setup.run(record, filter_setup, initial, full_covariance=True)
     write_estimate(tmp_path / "e.h5", estimate, {})
     again = read_estimate(tmp_path / "e.h5")
     truth = Truth(attitude=record.truth.attitude, bias=record.truth.bias)
@@ -560,7 +562,7 @@ def test_an_estimate_with_states_is_judged_like_any_other(tmp_path):
     assert kinematics.skew(estimate.bias[0]).shape == (3, 3)
 
 
-def test_the_acceleration_of_a_vibration_is_not_told_too_small():
+def test_the_acceleration_of_a_vibration_is_not_reported_too_small():
     """Noise has a window of 37 samples taken, of which 0.9 % of a vibration of 8 Hz is lost: a lever arm would make up for it."""
     chosen = scenarios.load_scenario("hand-held")
     gains = []

@@ -208,14 +208,14 @@ def test_sigmas_are_those_of_the_spectrum_which_vanishes_at_zero(poles):
     np.testing.assert_allclose(block.effects["acc"].offset_f, np.kron(np.eye(3), rows["acceleration"][:, None]))
 
 
-def test_two_of_three_tell_the_third():
+def test_two_of_three_give_the_third():
     for poles in POLES:
         whole = block_of(poles)
         three = {name: getattr(whole, name) for name in ("velocity_sigma", "acceleration_sigma", "acceleration_time")}
         times = {name: getattr(whole, name) for name in ("velocity_time", "position_time")}
         for left_out, third in three.items():
-            told = {name: value for name, value in three.items() if name != left_out}
-            other = error_states.BoundedVelocity(sensor="acc", strength=1.0, **times, **told)
+            given = {name: value for name, value in three.items() if name != left_out}
+            other = error_states.BoundedVelocity(sensor="acc", strength=1.0, **times, **given)
             assert getattr(other, left_out) == pytest.approx(third, rel=1e-12)
             np.testing.assert_allclose(other.covariance, whole.covariance, rtol=1e-9)
         assert dataclasses.replace(whole, name="other").acceleration_sigma == whole.acceleration_sigma
@@ -275,9 +275,9 @@ def test_impossible_blocks_are_refused(fields, words):
 )
 def test_impossible_chains_are_refused(fields, words):
     n = 2 if len(fields["feed"]) == 3 else len(fields["feed"])
-    told = {name: property(lambda self, value=value: np.asarray(value)) for name, value in fields.items()}
+    given = {name: property(lambda self, value=value: np.asarray(value)) for name, value in fields.items()}
     names = {"name": "x", "components": tuple("abcd"[:n]), "units": ("1",) * n, "sigma": np.ones(n)}
-    block = type("Foreign", (error_states.ErrorStates,), {**told, **names})()
+    block = type("Foreign", (error_states.ErrorStates,), {**given, **names})()
     with pytest.raises(InputError, match=words):
         assemble((block,), {"acc": "vector"})
 
@@ -564,12 +564,12 @@ def judged(
         face = estimation.smooth if smoothed else estimation.run
         estimate = face(record, NOISE, initial, blocks, full_covariance=True)
         epochs = (np.linspace(0.5, 0.97, 5) * (len(record.time) - 1)).astype(int)
-        told = {}
+        truths = {}
         if model == "bounded velocity":
-            told = {truth_block.name: _as_estimated(truth["states"], truth["attitude"], estimate.attitude)}
+            truths = {truth_block.name: _as_estimated(truth["states"], truth["attitude"], estimate.attitude)}
         elif blocks:
-            told = {blocks[0].name: np.zeros(3)}
-        e = estimate.errors(truth["attitude"], truth["bias"], told)[epochs]
+            truths = {blocks[0].name: np.zeros(3)}
+        e = estimate.errors(truth["attitude"], truth["bias"], truths)[epochs]
         P = (estimate.whole_covariance if blocks else estimate.covariance)[epochs]
         parts = {"attitude": slice(0, 3), "bias": slice(3, 6), "block": slice(6, None), "all": slice(None)}
         for name, part in parts.items():
@@ -600,7 +600,7 @@ def test_the_filter_is_consistent_on_what_it_models(poles, smoothed):
 
 def test_other_models_of_the_acceleration_are_worse():
     """As many runs: what lasts of first-order noise passes for tilt, white noise as large gives up what the velocity bounds, and without
-    any the filter believes each push.
+    any the filter follows each push.
     """
     found = {model: judged("velocity", model, 24, 12.0) for model in MODELS}
     tilt = {model: np.sqrt(np.mean(one["error"] ** 2)) for model, one in found.items()}
@@ -734,9 +734,9 @@ def test_the_command_line_takes_it_from_a_filter_file(run):
     held = dataclasses.replace(chosen.states.sensors.get(acc, SensorStates()), **dataclasses.asdict(TOLD))
     chosen = dataclasses.replace(chosen, states=dataclasses.replace(chosen.states, sensors={acc: held}))
     Path("filter.toml").write_text(setup.to_toml(chosen), encoding="utf-8")
-    status, told, error = run("estimate", "record.h5", "--filter", "filter.toml", "--out", "out")
+    status, output, error = run("estimate", "record.h5", "--filter", "filter.toml", "--out", "out")
     assert status == 0, error
-    assert f"{acc} velocity" in told
+    assert f"{acc} velocity" in output
     found = json.loads(Path("out/states.json").read_text(encoding="utf-8"))[f"{acc} velocity"]
     assert found["components"][:2] == ["velocity x", "drive x"]
     assert found["units"] == ["m/s", "m/s²"] * 3
@@ -744,12 +744,12 @@ def test_the_command_line_takes_it_from_a_filter_file(run):
     assert np.all(np.abs(found["values"]) < 4.0 * np.array(found["sigma"]))
 
 
-def test_what_no_state_covers_is_told():
+def test_what_no_state_covers_is_reported():
     moved = Accelerometer(name="acc", sigma=0.05, rate=25.0, acceleration_f=lambda t: np.zeros((*np.shape(t), 3)))
     words = "the acceleration of the point that the acc is at"
-    assert words in setup.not_covered(GyroSpec(), (moved,))
-    assert words not in setup.not_covered(GyroSpec(), (moved,), States(sensors={"acc": TOLD}))
-    assert words not in setup.not_covered(GyroSpec(), (dataclasses.replace(moved, acceleration_f=None),))
+    assert words in setup.unmodelled_errors(GyroSpec(), (moved,))
+    assert words not in setup.unmodelled_errors(GyroSpec(), (moved,), States(sensors={"acc": TOLD}))
+    assert words not in setup.unmodelled_errors(GyroSpec(), (dataclasses.replace(moved, acceleration_f=None),))
 
 
 # ------------------------------------------------------------------------------------------------------------------ in the hand
@@ -813,32 +813,31 @@ def test_the_latency_of_a_gyro_beside_a_reference():
     assert hand_held.gyro_latency(delayed)[0] == pytest.approx(-0.004, abs=2e-4)
 
 
+def errors_over(broad: Path, parameters: ahrs.AhrsParameters, **options) -> np.ndarray:
+    """Total error and inclination (n, 2) of each BROAD trial, degrees."""
+    errors = (errors_by(read(file), parameters, **options) for file in sorted(broad.glob("*.hdf5")))
+    return np.array([[one["total"], one["inclination"]] for one in errors])
+
+
 def test_broad_trials_by_bounded_velocity(broad):
     """One set of numbers for all, held against VQF on the same trials (2.6°); at rest the field of trial 27 is 4.6° off."""
-    found: dict[str, list[list[float]]] = {"white": [], "hand": [], "given": [], "smoothed": []}
-    late = []
-    for k, file in enumerate(sorted(broad.glob("*.hdf5"))):
-        recording = read(file)
-        for name, parameters, options in (
-            ("white", hand_held.QUIET, {}),
-            ("hand", ahrs.HAND_HELD, {}),
-            ("given", ahrs.HAND_HELD, {"latency": 4.1e-3}),
-            ("smoothed", ahrs.HAND_HELD, {"latency": 4.1e-3, "smooth": True}),
-        ):
-            errors = errors_by(recording, parameters, **options)
-            found[name].append([errors["total"], errors["inclination"]])
-        if k % 3 == 0:
-            late.append(hand_held.gyro_latency(recording)[0])
-    white, hand, given, smoothed = (np.array(values) for values in found.values())
-    assert 1.0 < hand[:, 0].mean() < 1.8
+    given = errors_over(broad, ahrs.HAND_HELD, latency=4.1e-3)
     assert 1.0 < given[:, 0].mean() < 1.6
     assert np.sort(given[:, 0])[:-1].mean() < 1.25
-    assert np.sort(smoothed[:, 0])[:-1].mean() < 0.72
     assert np.sort(given[:, 0])[-2] < 2.5
-    assert smoothed[:, 0].max() < 4.5
     assert given[:, 0].max() < 5.0  # trial 27, whose hard iron shows in its motion alone
-    assert hand[:, 1].mean() < 0.7
     assert given[:, 1].mean() < 0.48
-    assert smoothed[:, 1].mean() < 0.36
-    assert given[:, 1].mean() < 0.8 * white[:, 1].mean()
+    late = [hand_held.gyro_latency(read(file))[0] for file in sorted(broad.glob("*.hdf5"))[::3]]
     np.testing.assert_allclose(late, 4.15e-3, atol=1.5e-4)
+
+
+@pytest.mark.slow
+def test_broad_trials_otherwise(broad):
+    hand, given = errors_over(broad, ahrs.HAND_HELD), errors_over(broad, ahrs.HAND_HELD, latency=4.1e-3)
+    assert 1.0 < hand[:, 0].mean() < 1.8
+    assert hand[:, 1].mean() < 0.7
+    assert given[:, 1].mean() < 0.8 * errors_over(broad, hand_held.QUIET)[:, 1].mean()
+    smoothed = errors_over(broad, ahrs.HAND_HELD, latency=4.1e-3, smooth=True)
+    assert np.sort(smoothed[:, 0])[:-1].mean() < 0.72
+    assert smoothed[:, 0].max() < 4.5
+    assert smoothed[:, 1].mean() < 0.36

@@ -315,11 +315,11 @@ def test_estimate_on_csv(run, tmp_path):
     wanted = np.deg2rad(20.0) * np.maximum(columns[:, 0] - 2.0, 0.0)
     np.testing.assert_allclose(yaw_of(estimate.attitude), wanted, atol=np.deg2rad(0.3))
     assert estimate.covariance is None
-    told = read_attributes(tmp_path / "out" / "estimate.h5")
-    assert told["source"] == "walk.csv"
-    assert "scalar first" in told["conventions"]
-    assert "East-North-Up" in told["fixed_frame"]
-    assert told["parameter.field_disturbance"] > 0.0
+    attributes = read_attributes(tmp_path / "out" / "estimate.h5")
+    assert attributes["source"] == "walk.csv"
+    assert "scalar first" in attributes["conventions"]
+    assert "East-North-Up" in attributes["fixed_frame"]
+    assert attributes["parameter.field_disturbance"] > 0.0
 
 
 def test_estimate_takes_units_by_option(run, tmp_path):
@@ -343,7 +343,7 @@ def test_estimate_without_a_magnetometer(run, tmp_path):
     assert read_estimate(tmp_path / "out" / "estimate.h5").attitude.shape == (800, 4)
 
 
-def test_estimate_tells_of_missing_samples(run, tmp_path):
+def test_estimate_reports_missing_samples(run, tmp_path):
     columns = walk()
     columns[500:507, 4:7] = np.nan
     _, said, _ = run("estimate", write_csv(tmp_path / "walk.csv", columns, UNITS), "--out", tmp_path / "out")
@@ -463,7 +463,7 @@ def test_units_in_the_help_are_those_that_are_known(run):
 
 
 def test_a_statement_is_one_line_wherever_it_goes(run, monkeypatch):
-    """What a narrow terminal would break is whole in a file, so that a command told in it can be copied and searched for."""
+    """What a narrow terminal would break is whole in a file, so that a command printed in it can be copied and searched for."""
     monkeypatch.setenv("COLUMNS", "40")
     status, said, _ = run("scenarios")
     assert status == 0

@@ -120,7 +120,7 @@ def test_a_lost_filter_says_that_it_recovered(run, record, tmp_path):
     assert "were refused by the gate" in said
 
 
-def test_what_a_record_does_not_tell_is_asked_for(run, record, tmp_path):
+def test_what_a_record_does_not_hold_is_asked_for(run, record, tmp_path):
     bare = tmp_path / "bare.h5"
     whole = simulate(made(STARS[:1]), 4)
     write_record(bare, ImuRecord(time=whole.time, increments=whole.increments, vectors=whole.vectors))
@@ -220,15 +220,15 @@ def test_states_that_the_errors_call_for(run, spinning, tmp_path):
         [kept.values[-1], kept.sigma[-1]], [[*states["gyro scale"][n]] for n in ("values", "sigma")]
     )
     assert (tmp_path / "out" / "states.png").stat().st_size > 10_000
-    told = setup.from_toml(records.read_attributes(tmp_path / "out" / "estimate.h5")["filter"])
-    assert told == setup.matched_to_record(
+    saved = setup.from_toml(records.read_attributes(tmp_path / "out" / "estimate.h5")["filter"])
+    assert saved == setup.matched_to_record(
         scenarios.load_scenario("spin").gyro, simulate(scenarios.load_scenario("spin"), 3), states=True
     )
     status, _, _ = run("check", tmp_path / "out" / "estimate.h5")
     assert status == 0
     status, _, _ = run("report", tmp_path / "out" / "estimate.h5")
     assert status == 0
-    (tmp_path / "filter.toml").write_text(setup.to_toml(told))
+    (tmp_path / "filter.toml").write_text(setup.to_toml(saved))
     options = ("--filter", tmp_path / "filter.toml", "--from-truth", "--every", 100)
     status, _, error = run("estimate", spinning, "--out", tmp_path / "again", *options)
     assert (status, error) == (0, "")
@@ -242,26 +242,26 @@ def test_what_a_record_shows_of_each_state(run, spinning, tmp_path, states):
     status, said, _ = run("estimate", spinning, "--out", tmp_path / "out", "--observability", *states)
     assert status == 0
     assert "directions are observed" in said
-    told = json.loads((tmp_path / "out" / "observability.json").read_text())
-    names = [one["state"] for one in told["states"]]
-    assert len(names) == len(told["directions"]) >= (7 if states else 6)
-    assert told["rank"] == sum(one["singular_value"] >= told["threshold"] for one in told["directions"])
-    assert {one["unit"] for one in told["states"][:6]} == {"rad", "rad/s"}
-    assert set(told["directions"][0]["one_sigma_left"]) == set(names)
+    saved = json.loads((tmp_path / "out" / "observability.json").read_text())
+    names = [one["state"] for one in saved["states"]]
+    assert len(names) == len(saved["directions"]) >= (7 if states else 6)
+    assert saved["rank"] == sum(one["singular_value"] >= saved["threshold"] for one in saved["directions"])
+    assert {one["unit"] for one in saved["states"][:6]} == {"rad", "rad/s"}
+    assert set(saved["directions"][0]["one_sigma_left"]) == set(names)
 
 
-def test_what_the_filter_has_no_state_for_is_told(spinning, record, tmp_path):
+def test_what_the_filter_has_no_state_for_is_reported(spinning, record, tmp_path):
     scenario = scenarios.load_scenario("spin")
     toml = setup.to_toml(setup.matched(scenario))
     (tmp_path / "filter.toml").write_text(toml)
     held = read_record_file(spinning)
     for file, states in ((None, False), (tmp_path / "filter.toml", None)):
-        (told,) = filter_for(spinning, held, None, file, states)[1]
-        assert "no state for: the gyro's scale factor of 100 ppm; --states of `strapdown estimate`" in told
+        (message,) = filter_for(spinning, held, None, file, states)[1]
+        assert "no state for: the gyro's scale factor of 100 ppm; --states of `strapdown estimate`" in message
     assert filter_for(record, read_record_file(record), None, None, None)[1] == []
-    chosen, (told,) = filter_for(spinning, held, None, None, None)
+    chosen, (message,) = filter_for(spinning, held, None, None, None)
     assert chosen.states.names == ("gyro.scale",)
-    assert told.startswith("The filter estimates errors that are specified, gyro.scale: without states")
+    assert message.startswith("The filter estimates errors that are specified, gyro.scale: without states")
 
 
 def test_the_verdict_names_what_the_filter_has_no_state_for(run, spinning, tmp_path):
@@ -330,7 +330,7 @@ def test_the_default_filter_of_a_satellite_passes_and_says_why_it_has_states(run
     assert run("check", tmp_path / "states.h5")[0] == 0
 
 
-def test_states_of_a_record_that_tells_no_scenario_and_a_gate(run, record, tmp_path):
+def test_states_of_a_record_without_a_scenario_and_a_gate(run, record, tmp_path):
     status, said, error = run("estimate", record, "--out", tmp_path / "out", "--states", "--gate", 0.999)
     assert (status, error) == (0, "")
     assert "does not hold its scenario" in said
@@ -339,11 +339,11 @@ def test_states_of_a_record_that_tells_no_scenario_and_a_gate(run, record, tmp_p
 
 
 def test_a_lost_filter_with_states_recovers(run, spinning, tmp_path):
-    told = ("--states", "--gate", 0.999, "--every", 100)
-    status, said, error = run("estimate", spinning, "--out", tmp_path / "right", *told)
+    options = ("--states", "--gate", 0.999, "--every", 100)
+    status, said, error = run("estimate", spinning, "--out", tmp_path / "right", *options)
     assert (status, error) == (0, "")
     assert "Recovered at" not in said
-    status, said, error = run("estimate", spinning, "--out", tmp_path / "lost", *told, "--attitude", "0,0,1,0.1")
+    status, said, error = run("estimate", spinning, "--out", tmp_path / "lost", *options, "--attitude", "0,0,1,0.1")
     assert (status, error) == (0, "")
     assert "Recovered at" in said
     one, other = (read_estimate(tmp_path / name / "estimate.h5") for name in ("right", "lost"))
@@ -440,7 +440,7 @@ def test_a_record_is_smoothed(run, record, tmp_path):
         assert file.attrs["smoothed"]
 
 
-def test_hard_iron_and_a_start_are_told_in_units_that_people_know(run, tmp_path):
+def test_hard_iron_and_a_start_are_reported_in_units_that_people_know(run, tmp_path):
     iron = dataclasses.replace(HAND[1], kind="direction", hard_iron=np.array([2e-6, 0.0, 0.0]))
     scenario = made((HAND[0], iron))
     path = tmp_path / "iron.h5"
@@ -453,7 +453,7 @@ def test_hard_iron_and_a_start_are_told_in_units_that_people_know(run, tmp_path)
     assert states["north bias"]["first_sigma"][0] == pytest.approx(0.04472, rel=1e-3)
 
 
-def test_smoothing_with_states_tells_of_them(run, tmp_path):
+def test_smoothing_with_states_holds_them(run, tmp_path):
     path = tmp_path / "record.h5"
     scenario = dataclasses.replace(scenarios.load_scenario("spin"), duration=20.0)
     write_record(path, simulate(scenario, 2), gyro_spec=scenario.gyro, scenario=scenarios.scenario_to_toml(scenario))
@@ -499,12 +499,16 @@ def test_a_recording_is_taken_for_that_of_a_hand(run, recording, tmp_path):
     assert "°/s, from that second." in said
     assert "Samples are assumed to be stamped 2.5 ms late, half a sample interval, σ 2 ms" in said
     assert "warning" not in said
-    told = records.read_attributes(tmp_path / "out" / "estimate.h5")
+    attributes = records.read_attributes(tmp_path / "out" / "estimate.h5")
     states = json.loads((tmp_path / "out" / "states.json").read_text())
     assert states["accelerometer velocity"]["units"] == ["m/s", "m/s²"] * 3
     assert len(states["gyro scale"]["values"]) == 9
-    assert (told["motion"], told["smoothed"], told["latency"]) == ("hand", False, pytest.approx(0.0025))
-    assert setup.from_toml(told["filter"]) == ahrs.HAND_HELD.setup
+    assert (attributes["motion"], attributes["smoothed"], attributes["latency"]) == (
+        "hand",
+        False,
+        pytest.approx(0.0025),
+    )
+    assert setup.from_toml(attributes["filter"]) == ahrs.HAND_HELD.setup
     assert off(tmp_path / "out", 0.0) < 1.5
 
 
@@ -574,7 +578,7 @@ def test_a_clipped_gyro_is_reported(run, recording, tmp_path):
     assert "The gyro was clipped: x at 68.75 °/s" in said
 
 
-def test_a_hand_that_never_rests_is_told(run, recording, tmp_path):
+def test_a_hand_that_never_rests_is_reported(run, recording, tmp_path):
     lines = recording.read_text().splitlines()
     moving = tmp_path / "moving.csv"
     moving.write_text("\n".join([lines[0], *lines[800:]]) + "\n")

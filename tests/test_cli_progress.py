@@ -28,21 +28,21 @@ def lines_of(text: io.StringIO) -> list[str]:
     return text.getvalue().splitlines()
 
 
-def test_a_line_tells_what_is_done_of_how_much(said):
+def test_a_line_says_what_is_done_of_how_much(said):
     with progress.progress_bar("runs", 30) as advance:
         advance(10)
         advanced = len(lines_of(said))
         for _ in range(1000):
             time.sleep(0.01)
-            if len(lines_of(said)) >= advanced + 2:
+            if len(lines_of(said)) >= advanced + 3:
                 break
+        lines = lines_of(said)[advanced + 1 :]  # the first may have been begun before the ten runs
         advance(20)
-    lines = lines_of(said)[advanced:]
     assert len(lines) >= 2
     assert all(line.startswith("runs: 10 of 30, ") for line in lines)
 
 
-def test_a_step_of_unknown_length_tells_its_time(said):
+def test_a_step_of_unknown_length_prints_its_time(said):
     with progress.progress_bar("smoothing"):
         time.sleep(0.15)
     assert set(lines_of(said)) == {"smoothing: 0 s"}

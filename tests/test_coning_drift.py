@@ -38,12 +38,12 @@ def double_precision_drift(name, angle, ratio):
 
 
 @pytest.mark.parametrize("name", list(ALGORITHMS))
-@pytest.mark.parametrize(("angle", "ratio"), [(0.02, 0.3), (0.3, 0.21), (0.3, 0.6)])
-def test_double_precision_agrees_with_fifty_digits(name, angle, ratio):
-    true = float(exact_error(name, angle, ratio, digits=30).drift)
-    step = ALGORITHMS[name].samples * ratio
-    rounding = 6e-16 / step / min(abs(math.sin(0.5 * step)), 1.0)
-    assert double_precision_drift(name, angle, ratio) == pytest.approx(true, rel=0.01, abs=rounding)
+def test_double_precision_agrees_with_thirty_digits(name):
+    for angle, ratio in ((0.02, 0.3), (0.3, 0.6)):
+        true = float(exact_error(name, angle, ratio, digits=30).drift)
+        step = ALGORITHMS[name].samples * ratio
+        rounding = 6e-16 / step / min(abs(math.sin(0.5 * step)), 1.0)
+        assert double_precision_drift(name, angle, ratio) == pytest.approx(true, rel=0.01, abs=rounding)
 
 
 COMPRESSED = [
@@ -75,10 +75,10 @@ def test_drift_order_and_constant_of_every_table(name):
 
 
 @pytest.mark.parametrize("name", list(ALGORITHMS))
-@pytest.mark.parametrize("ratio", [0.1, 0.5, 1.0])
-def test_small_angle_drift_is_the_whole_series(name, ratio):
-    true = float(exact_error(name, 1e-15, ratio, digits=70).drift / mp.mpf(1e-15) ** 2)
-    assert coning.small_angle_drift(name, ratio) == pytest.approx(true, rel=1e-6, abs=1e-17)
+def test_small_angle_drift_is_the_whole_series(name):
+    for ratio in (0.1, 1.0):
+        true = float(exact_error(name, 1e-15, ratio, digits=70).drift / mp.mpf(1e-15) ** 2)
+        assert coning.small_angle_drift(name, ratio) == pytest.approx(true, rel=1e-6, abs=1e-17)
 
 
 def test_one_sample_drift_is_exact_at_any_angle():
@@ -96,15 +96,9 @@ def test_one_sample_drift_is_exact_at_any_angle():
 @pytest.mark.parametrize(
     ("angle_degrees", "ratio"),
     [
-        (0.01, 0.1),
         (0.01, 1.0),
-        (0.3, 0.9),
         (3.0, 0.6),
-        (3.0, 1.0),
-        (20.0, 0.3),
         (45.0, 0.02),
-        (45.0, 0.6),
-        (45.0, 0.95),
         (45.0, 1.0),
     ],
 )

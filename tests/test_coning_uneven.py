@@ -25,11 +25,13 @@ STAMPS = {
 }
 
 
-def error(name, edges, body=CONE, *, told=True):
+def error(name, edges, body=CONE, *, with_edges=True):
     """Return the greatest angle between the truth and the attitude integrated from exact increments, rad."""
     n = ALGORITHMS[name].samples
     edges = edges[: (len(edges) - 1) // n * n + 1]
-    attitude = coning.integrate(body.increments(edges), name, body.attitude(edges[0]), edges=edges if told else None)
+    attitude = coning.integrate(
+        body.increments(edges), name, body.attitude(edges[0]), edges=edges if with_edges else None
+    )
     true = body.attitude(edges[::n])
     return np.linalg.norm(quaternion.log(quaternion.multiply(quaternion.conjugate(attitude), true)), axis=-1).max()
 
@@ -50,9 +52,9 @@ def error(name, edges, body=CONE, *, told=True):
 @pytest.mark.parametrize("stamps", STAMPS)
 def test_uneven_intervals_are_corrected_for(stamps, name, times, gain):
     edges = STAMPS[stamps]
-    told = error(name, edges)
-    assert told < times * error(name, EVEN)
-    assert gain * told < error(name, edges, told=False)
+    corrected = error(name, edges)
+    assert corrected < times * error(name, EVEN)
+    assert gain * corrected < error(name, edges, with_edges=False)
 
 
 def test_two_samples_have_the_known_closed_form():
@@ -104,8 +106,8 @@ def test_even_intervals_are_what_they_were():
     microseconds = np.round(np.arange(2401) / 997.0, 6) + 1.7e3
     for name in ("one-sample", "two-sample", "four-sample", "matched-4-11", "magnus-6"):
         for edges in (EVEN, microseconds):
-            told = coning.rotation_vectors(increments, name, edges=edges)
-            np.testing.assert_array_equal(told, coning.rotation_vectors(increments, name))
+            corrected = coning.rotation_vectors(increments, name, edges=edges)
+            np.testing.assert_array_equal(corrected, coning.rotation_vectors(increments, name))
             np.testing.assert_array_equal(
                 coning.integrate(increments, name, edges=edges), coning.integrate(increments, name)
             )

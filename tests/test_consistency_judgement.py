@@ -2,10 +2,12 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.stats
 
 from strapdown import consistency, montecarlo, motion, records, scenarios, setup, vectors
 from strapdown.checks import InputError
@@ -81,7 +83,7 @@ def test_a_bias_error_shows_in_the_errors_alone():
     assert "bias error that the start hides" in blind.limits[0]  # and it says what it cannot show
 
 
-def test_an_error_that_hardly_moves_is_not_averaged_over_the_run_and_that_is_told():
+def test_an_error_that_hardly_moves_is_not_averaged_over_the_run_and_that_is_reported():
     """A bias error that drifts by a tenth of its σ over the run is one sample, not 200."""
     result, truth = estimate()
     slow = 1e-5 * (0.6 + 0.1 * np.linspace(0.0, 1.0, 200))[:, None] * np.array([1.0, -1.0, 1.0])
@@ -94,7 +96,7 @@ def test_an_error_that_hardly_moves_is_not_averaged_over_the_run_and_that_is_tol
     assert "attitude" in averaged
 
 
-def test_sensors_that_share_an_error_are_told():
+def test_sensors_that_share_an_error_are_reported():
     judgement = consistency.judge(estimate(correlated=True)[0])
     assert [(f.name, f.of) for f in judgement.findings if f.rejected] == [("cross-correlation", "star 1 and star 2")]
 
@@ -192,10 +194,10 @@ def test_resolution_is_the_factor_that_bounds_leave():
 
 
 def test_the_summary_is_plain():
-    told = json.loads(json.dumps(consistency.judge(*estimate(1.3)).summary(), allow_nan=False))
-    assert told["verdict"] == "not consistent"
-    assert told["findings"][0]["name"] == "NIS"
-    assert told["findings"][1]["low"] is None
+    saved = json.loads(json.dumps(consistency.judge(*estimate(1.3)).summary(), allow_nan=False))
+    assert saved["verdict"] == "not consistent"
+    assert saved["findings"][0]["name"] == "NIS"
+    assert saved["findings"][1]["low"] is None
 
 
 # ------------------------------------------------------------------------------------------------------------ independent runs
@@ -217,20 +219,20 @@ def scenario():
 
 @pytest.fixture(scope="module")
 def plan():
-    believed = setup.FilterSetup(
+    filter_setup = setup.FilterSetup(
         process_noise=setup.ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6),
         attitude_sigma=2e-3,
         bias_sigma=1e-4,
     )
-    return montecarlo.Plan(scenario=scenario(), setup=believed, seed=3, epochs=20, nis_bins=10)
+    return montecarlo.Plan(scenario=scenario(), setup=filter_setup, seed=3, epochs=20, nis_bins=10)
 
 
 def statistics_of(plan, **changes):
-    believed = replace(plan.setup, **changes)
-    return montecarlo.run(plan.scenario, (believed,), runs=200, seed=3, epochs=20, nis_bins=10)[0]
+    filter_setup = replace(plan.setup, **changes)
+    return montecarlo.run(plan.scenario, (filter_setup,), runs=200, seed=3, epochs=20, nis_bins=10)[0]
 
 
-def test_right_runs_are_consistent_and_wrong_ones_are_told(plan):
+def test_right_runs_are_consistent_and_wrong_ones_are_reported(plan):
     good = consistency.judge_runs(statistics_of(plan))
     assert good.verdict == "consistent"
     assert {f.name for f in good.findings} == {"ANEES", "log-NEES", "mean error", "coverage", "NIS"}
@@ -245,13 +247,27 @@ def test_right_runs_are_consistent_and_wrong_ones_are_told(plan):
     assert "pessimistic" in modest.reason
 
 
+def test_the_coverage_of_the_worst_epoch_and_state_stands_for_all(plan):
+    """99 of 100 errors of one state within 1 σ at one epoch, all others the expected number: binomial, times the number of tests."""
+    few = montecarlo.run(plan.scenario, (plan.setup,), runs=100, seed=3, epochs=20, nis_bins=10)[0]
+    usual = np.array([68, 95, 100])
+    counts = np.tile(usual, (21, 6, 1))
+    counts[20, 4, 0] = 82
+    judged = consistency.judge_runs(replace(few, coverage=counts), epochs=np.array([10, 20]))
+    (found,) = (one for one in judged.findings if one.name == "coverage")
+    least = 2.0 * scipy.stats.binom.sf(81, 100, math.erf(math.sqrt(0.5)))
+    assert (found.of, found.value) == ("bias y", 0.82)
+    assert found.p_value == pytest.approx(36 * least, rel=1e-9)
+    assert "82 % of the bias y errors lie within 1 σ" in found.means
+
+
 def test_few_runs_cannot_tell(plan):
     few = montecarlo.run(plan.scenario, (plan.setup,), runs=2, seed=3, epochs=20, nis_bins=10)[0]
     starved = replace(few, sensor_degrees=0 * few.sensor_degrees)
     assert consistency.judge_runs(starved).verdict == "cannot tell"
 
 
-def test_a_mean_error_is_told(plan):
+def test_a_mean_error_is_reported(plan):
     good = statistics_of(plan)
     shift = 0.5 * good.rms_error[:, 5]
     square = good.error_product_sum.copy()
@@ -271,6 +287,24 @@ def test_runs_that_failed_are_not_consistent(plan):
     assert "1 of 200 runs failed" in judged.words
 
 
+def test_bounds_are_those_that_decide(plan):
+    """NIS from right to wrong: the value leaves the printed bounds where Holm's procedure rejects it, not at 1 % of it alone."""
+    decided = []
+    for scale in np.linspace(1.0, 1.12, 25):
+        judgement = consistency.judge(*estimate(scale, seed=4))
+        decided += [
+            (one.low <= one.value <= one.high, one.rejected, one.p_value) for one in judgement.findings if one.is_ratio
+        ]
+    assert all(inside is not rejected for inside, rejected, _ in decided)
+    assert any(inside and p < 0.01 for inside, _, p in decided)  # alone it would have been rejected
+    for factor in (1.0, 0.97, 0.8):
+        judgement = consistency.judge_runs(statistics_of(plan, measurement_sigma_factor=factor))
+        bounded = [one for one in judgement.findings if math.isfinite(one.low)]
+        assert {one.name for one in bounded} == {"ANEES", "log-NEES", "NIS"}
+        assert all((one.low <= one.value <= one.high) is not one.rejected for one in bounded)
+        assert all(re.fullmatch(r"worst of 20 epochs \(\d+ s\)", one.at) for one in bounded if one.name != "NIS")
+
+
 # ---------------------------------------------------------------------------------------------------------------- the command
 
 
@@ -288,9 +322,9 @@ def test_check_ends_with_the_status_of_the_verdict(run, tmp_path, made, status, 
     ended, said, _ = run("check", "estimate.h5", "--json", "check.json")
     assert ended == status
     assert verdict in said
-    told = json.loads((tmp_path / "check.json").read_text())
+    saved = json.loads((tmp_path / "check.json").read_text())
     assert said.splitlines()[-1].startswith("Written")
-    assert verdict.startswith(told["verdict"])
+    assert verdict.startswith(saved["verdict"])
 
 
 def test_check_uses_the_truth_in_the_file(run):

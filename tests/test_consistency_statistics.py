@@ -11,9 +11,9 @@ import scipy.optimize
 import scipy.signal
 import scipy.stats
 
-from strapdown import consistency, quaternion
+from strapdown import consistency
 from strapdown.checks import InputError
-from strapdown.consistency import bounds, ensemble, timeaverage, whiteness
+from strapdown.consistency import bounds, timeaverage, whiteness
 
 
 def random_covariances(generator, shape, n=6):
@@ -22,21 +22,6 @@ def random_covariances(generator, shape, n=6):
 
 
 # ------------------------------------------------------------------------------------------------------------------ manifold
-
-
-def test_fixed_frame_rotates_the_attitude_error_and_leaves_the_nees():
-    generator = np.random.default_rng(0)
-    q = quaternion.normalize(generator.normal(size=(7, 4)))
-    delta = 1e-3 * generator.normal(size=(7, 3))
-    true = quaternion.multiply(q, quaternion.exp(delta))
-    e = consistency.errors(q, np.zeros((7, 3)), true, np.ones((7, 3)))
-    P = random_covariances(generator, (7,))
-    fixed, P_fixed = consistency.fixed_frame(e, P, q)
-    assert np.allclose(quaternion.multiply(quaternion.exp(fixed[:, :3]), q), true, atol=1e-12)
-    assert np.allclose(fixed[:, 3:], 1.0)
-    for states in (None, (0, 1, 2), (3, 4, 5)):
-        assert np.allclose(consistency.nees(fixed, P_fixed, states), consistency.nees(e, P, states), rtol=1e-9)
-    assert not np.allclose(consistency.nees(fixed, P_fixed, (2,)), consistency.nees(e, P, (2,)), rtol=1e-3)
 
 
 def test_nees_of_a_subset_takes_the_marginal_covariance():
@@ -127,73 +112,6 @@ def test_log_mean_bounds_hold_their_tails(degrees, samples):
     if samples == 1000:  # nearly normal
         mean, variance = consistency.log_moments(degrees)
         assert low == pytest.approx(mean - 2.5758 * math.sqrt(variance / samples), rel=2e-3)
-
-
-def test_coverage_bounds_are_binomial():
-    found = consistency.coverage(np.array([0.5, -1.5, 2.5, 3.5]), 1.0, 0.95)
-    assert np.allclose(found.inside, [0.25, 0.5, 0.75])
-    assert np.allclose(found.expected, [0.682689492, 0.954499736, 0.997300204])
-    many = consistency.Coverage(samples=1000, inside=np.array([0.68, 0.95, 0.99]), probability=0.99)
-    for k in range(3):
-        low, high = np.round(many.bounds[k] * 1000)
-        law = scipy.stats.binom(1000, many.expected[k])
-        assert law.cdf(low - 1) <= 0.005 < law.cdf(low)
-        assert law.sf(high) <= 0.005 < law.sf(high - 1)
-        assert many.attained[k] == pytest.approx(law.cdf(high) - law.cdf(low - 1))
-    assert np.all(many.attained >= 0.99)
-    assert many.p_values[0] > 0.5
-    assert many.p_values[2] < 0.001  # 10 of 1000 beyond 3 σ instead of 2.7
-
-
-def test_coverage_takes_each_error_by_its_own_sigma():
-    found = consistency.coverage(np.array([1.0, 1.0, 1.0]), np.array([0.1, 0.6, 1.1]))
-    assert np.allclose(found.inside, [1 / 3, 2 / 3, 2 / 3])
-
-
-@pytest.mark.parametrize("sigma", [0.0, -1.0])
-def test_coverage_refuses_a_sigma_that_is_none(sigma):
-    with pytest.raises(InputError, match=r"sigma\[0\]"):
-        consistency.coverage(np.ones(2), sigma)
-
-
-# ------------------------------------------------------------------------------------------------------------------ ensemble
-
-
-def test_credibility_indices_by_the_definition():
-    generator = np.random.default_rng(3)
-    P = random_covariances(generator, (), 3)
-    e = generator.multivariate_normal(np.zeros(3), 2.0 * P, size=40)
-    actual = sum(np.outer(x, x) for x in e) / 40
-    ratios = [10.0 * math.log10((x @ np.linalg.inv(P) @ x) / (x @ np.linalg.inv(actual) @ x)) for x in e]
-    found = consistency.credibility(e, np.broadcast_to(P, (40, 3, 3)))
-    assert found.non_credibility == pytest.approx(np.mean(np.abs(ratios)))
-    assert found.inclination == pytest.approx(np.mean(ratios))
-    assert found.leaning == "optimistic"
-    assert found.anees == pytest.approx(np.mean([x @ np.linalg.inv(P) @ x for x in e]) / 3)
-    assert found.log_nees == pytest.approx(np.mean([math.log(x @ np.linalg.inv(P) @ x) for x in e]))
-
-
-@pytest.mark.parametrize(("factor", "decibel", "leaning"), [(4.0, 6.02, "optimistic"), (0.25, -6.02, "pessimistic")])
-def test_inclination_is_the_factor_in_decibel(factor, decibel, leaning):
-    e = math.sqrt(factor) * np.random.default_rng(4).standard_normal((20_000, 6))
-    white = consistency.credibility(e, np.broadcast_to(np.eye(6), (20_000, 6, 6)))
-    assert white.inclination == pytest.approx(decibel, abs=0.1)
-    assert white.non_credibility == pytest.approx(abs(decibel), abs=0.1)
-    ensemble_of_100 = consistency.credibility(e[:100], np.broadcast_to(np.eye(6), (100, 6, 6)))
-    assert ensemble_of_100.leaning == leaning
-    assert ensemble_of_100.non_credibility > ensemble_of_100.non_credibility_bound
-
-
-def test_a_right_ensemble_lies_inside_all_its_bounds():
-    generator = np.random.default_rng(5)
-    P = random_covariances(generator, (100,))
-    e = (np.linalg.cholesky(P) @ generator.standard_normal((100, 6, 1)))[..., 0]
-    found = consistency.credibility(e, P)
-    assert found.leaning == "credible"
-    assert found.anees_bounds[0] < found.anees < found.anees_bounds[1]
-    assert found.log_nees_bounds[0] < found.log_nees < found.log_nees_bounds[1]
-    assert found.non_credibility < found.non_credibility_bound
-    assert min(found.p_values.values()) > 0.01
 
 
 # ----------------------------------------------------------------------------------------------------------------- whiteness
@@ -363,15 +281,6 @@ def test_time_average_of_a_short_run_says_that_it_is_not_reliable():
 # ------------------------------------------------------------------------------------------------------------------ accuracy
 
 
-def test_efficiency_of_an_efficient_filter_is_one():
-    error = np.random.default_rng(20).standard_normal((2000, 5)) * np.array([1.0, 2.0, 3.0, 4.0, 5.0])
-    found = consistency.efficiency(error, np.array([1.0, 4.0, 9.0, 16.0, 25.0]))
-    assert np.all((found.ratio > found.bounds[0]) & (found.ratio < found.bounds[1]))
-    assert consistency.efficiency(error, np.ones(5)).ratio[4] == pytest.approx(5.0, rel=0.1)
-    with pytest.raises(InputError, match=r"bound\[1\]"):
-        consistency.efficiency(error, np.array([1.0, 0.0, 1.0, 1.0, 1.0]))
-
-
 def test_convergence_time_is_that_of_the_last_excursion():
     time = np.arange(6.0)
     assert consistency.convergence_time(time, [5.0, 1.0, 3.0, 1.0, -1.0, 0.5], 1.0) == 3.0
@@ -384,25 +293,12 @@ def test_distribution_and_its_quantiles():
     assert np.array_equal(found.values, [1.0, 2.0, 3.0, 4.0])
     assert np.allclose(found.probability, [0.25, 0.5, 0.75, 1.0])
     assert found.quantile(0.5) == 2.0
-    many = np.random.default_rng(21).exponential(size=(400, 100))
-    held = 0
-    for sample in many:
-        low, high = consistency.distribution(sample).quantile_interval(0.5)
-        held += low <= math.log(2.0) <= high
-    assert 0.93 < held / 400 <= 1.0
-
-
-def test_non_credibility_needs_more_runs_than_states():
-    with pytest.raises(InputError, match="7 or more"):
-        consistency.credibility(np.ones((6, 6)), np.broadcast_to(np.eye(6), (6, 6, 6)))
-    index, inclination = ensemble.credibility_indices(np.random.default_rng(22).standard_normal((4, 10, 2)))
-    assert index.shape == inclination.shape == (4,)
 
 
 @pytest.mark.parametrize(("samples", "inside"), [(10, 3), (10, 9), (10, 10), (50, 40), (50, 30), (7, 0)])
 def test_the_p_value_of_a_coverage_counts_what_is_as_far_off_or_farther(samples, inside):
     """Twice the smaller of P(N ≤ k) and P(N ≥ k), both with k itself, by sums of binomial terms."""
-    found = consistency.Coverage(samples=samples, inside=np.full(3, inside / samples), probability=0.99).p_values
+    found = bounds.coverage_p_values(np.full(3, inside / samples), samples)
     for k, p in enumerate(math.erf(s / math.sqrt(2.0)) for s in (1, 2, 3)):
         terms = [math.comb(samples, j) * p**j * (1.0 - p) ** (samples - j) for j in range(samples + 1)]
         wanted = min(1.0, 2.0 * min(math.fsum(terms[: inside + 1]), math.fsum(terms[inside:])))

@@ -129,23 +129,43 @@ def test_the_budget_of_a_matched_filter_adds_up_to_its_own_covariance(name):
         assert value == pytest.approx(1.0, abs=1e-4)
     names = {name for name, *_ in found.budget()}
     assert {"angle random walk", "initial attitude", "initial bias"} <= names
+    for epoch in (2, -1):  # squares add up, as the mean over the axes of attitude and bias
+        squares = np.array([row[2:] for row in found.budget(epoch) if row[1] == "random"]) ** 2
+        whole = np.diag(found.covariance[epoch]).reshape(2, 3).mean(axis=1)
+        assert np.allclose(squares.sum(axis=0), whole, rtol=1e-7, atol=1e-24)
 
 
-def quiet(scenario, believed_sigma):
-    """The scenario without noise, and the filter that believes there is some."""
+def test_the_axes_of_a_considered_error_are_one_row_of_the_budget():
+    scenario = white("spin", 20.0)
+    errors = np.arange(1.0, 25.0).reshape(1, 4, 6)
+    found = dataclasses.replace(
+        covariance.analyse(scenario, setup.matched(scenario), epochs=1),
+        fixed=("start",),
+        fixed_errors=np.repeat(errors[:, :1], 2, axis=0),
+        considered=("mounting, x", "mounting, y", "delay"),
+        considered_errors=np.repeat(errors[:, 1:], 2, axis=0),
+    )
+    rows = {(name, kind): np.square(rms) for name, kind, *rms in found.budget() if kind != "random"}
+    squares = np.square(errors[0]).reshape(4, 2, 3).mean(axis=2)
+    assert list(rows) == [("start", "fixed"), ("mounting", "considered"), ("delay", "considered")]
+    assert np.allclose(list(rows.values()), [squares[0], squares[1] + squares[2], squares[3]], rtol=1e-12)
+
+
+def quiet(scenario, sigma):
+    """The scenario without noise, and a filter that models some."""
     sensors = []
     for sensor in scenario.sensors:
         small = {name: 1e-12 for name in ("sigma", "sigma_across", "sigma_about") if hasattr(sensor, name)}
         if hasattr(sensor, "field_f"):
             small["sigma"] = 1e-19
         sensors.append(dataclasses.replace(sensor, **small))
-    return dataclasses.replace(scenario, sensors=tuple(sensors)), dataclasses.replace(BELIEF, sigma=believed_sigma)
+    return dataclasses.replace(scenario, sensors=tuple(sensors)), dataclasses.replace(BELIEF, sigma=sigma)
 
 
 def run_quiet(record, belief, every):
     initial = setup.initial_state(belief, record.truth.attitude[0], record.truth.bias[0])
     estimate = setup.run(record, belief, initial, every=every, full_covariance=True)
-    truth = setup.believed(record, belief).truth
+    truth = setup.modelled_record(record, belief).truth
     return estimate, consistency.errors(estimate.attitude, estimate.bias, truth.attitude[::every], truth.bias[::every])
 
 
@@ -257,7 +277,7 @@ def test_the_source_runs_uncompiled(monkeypatch):
 
 
 def rotated(record, name, epsilon):
-    """The record of a sensor that is turned on the body by a rotation vector: it tells of an attitude q exp(ε)."""
+    """The record of a sensor that is turned on the body by a rotation vector: it measures an attitude q exp(ε)."""
     turn = quaternion.exp(np.asarray(epsilon))
     series = []
     for one in record.vectors:
@@ -271,7 +291,7 @@ def rotated(record, name, epsilon):
 
 
 def late(scenario, name, seconds):
-    """The record of a sensor that measures later than its stamps tell."""
+    """The record of a sensor that measures later than its stamps say."""
     shifted = []
     for sensor in scenario.sensors:
         if sensor.name == name:
@@ -367,7 +387,7 @@ def test_an_error_of_the_scenario_makes_what_it_makes(name, gyro):
     assert np.abs((error - found.mean_error) / scale).max() < 0.02
 
 
-def test_coning_shows_as_the_bias_that_the_formula_tells():
+def test_coning_shows_as_the_bias_that_the_formula_gives():
     angle, frequency, rate = 0.7 * DEGREE, 10.0, 100.0
     scenario = Scenario(
         motion=motion.Coning(angle=angle, frequency=frequency),
@@ -403,7 +423,7 @@ def monte_carlo(scenario, belief, runs, epochs, seed=3):
     errors, nees = [], []
     for run in range(runs):
         record = simulate(scenario, seed, run)
-        used = setup.believed(record, belief)
+        used = setup.modelled_record(record, belief)
         estimate = estimation.run(
             used,
             belief.process_noise,
@@ -451,7 +471,7 @@ def quarter(belief):
     return dataclasses.replace(belief, process_noise=half)
 
 
-def test_a_filter_that_believes_a_quarter_of_the_process_noise_agrees_too():
+def test_a_filter_that_models_a_quarter_of_the_process_noise_agrees_too():
     scenario = dataclasses.replace(white("spin", 120.0, scale_factor=np.array([0.0, 0.0, 1e-6])), rate=20.0)
     found, _ = check_monte_carlo(scenario, quarter(setup.matched(scenario)), runs=150, epochs=5)
     assert found.expected_nees[-1, 0] > 1.5  # the mismatch is one to see
@@ -500,16 +520,16 @@ def beyond_the_bound(square, mean, runs):
     At one epoch runs are independent, so a mean square is χ² with as many degrees. One over several epochs is, however they are correlated,
     no farther from 1 than one of a single epoch.
     """
-    told = []
+    beyond = []
     for what, value in (("mean square", square), ("mean square over time", square.mean(axis=0, keepdims=True))):
         low, high = consistency.mean_bounds(1, runs, 1.0 - 0.01 / 3.0 / value.size)
-        told += [(what, int(k), int(i)) for k, i in np.argwhere((value < low) | (value > high))]
+        beyond += [(what, int(k), int(i)) for k, i in np.argwhere((value < low) | (value > high))]
     limit = norm.isf(0.5 * 0.01 / 3.0 / mean.size) / np.sqrt(runs)
-    return told + [("mean", int(k), int(i)) for k, i in np.argwhere(np.abs(mean) > limit)]
+    return beyond + [("mean", int(k), int(i)) for k, i in np.argwhere(np.abs(mean) > limit)]
 
 
 @pytest.mark.parametrize("name", WELL_CONDITIONED)
-def test_every_state_is_as_near_the_bound_as_runs_can_tell(name):
+def test_every_state_is_as_near_the_bound_as_runs_can_show(name):
     runs = 4000
     square, mean = against_the_bound(name, WELL_CONDITIONED[name], duration=20.0, runs=runs, epochs=5)
     assert beyond_the_bound(square, mean, runs) == []
@@ -518,9 +538,9 @@ def test_every_state_is_as_near_the_bound_as_runs_can_tell(name):
 def test_integration_that_neglects_commutation_is_seen_against_the_bound():
     """The bias about the cone's axis, by its mean and by nothing else yet after 20 s."""
     square, mean = against_the_bound("slew-vibration", "one-sample", duration=20.0, runs=1000, epochs=5)
-    told = beyond_the_bound(square, mean, 1000)
-    assert ("mean", 4, 5) in told
-    assert {(what, state) for what, _, state in told} == {("mean", 5)}
+    beyond = beyond_the_bound(square, mean, 1000)
+    assert ("mean", 4, 5) in beyond
+    assert {(what, state) for what, _, state in beyond} == {("mean", 5)}
 
 
 @pytest.mark.slow
@@ -537,7 +557,7 @@ def test_every_state_is_within_three_percent_of_the_bound_at_every_epoch(name):
 # ------------------------------------------------------------------------------------------------------------------- the rim
 
 
-def test_initial_errors_may_differ_from_what_the_filter_believes():
+def test_initial_errors_may_differ_from_the_filters_model():
     scenario = white("spin", 30.0)
     belief = setup.matched(scenario)
     right = covariance.analyse(scenario, belief, epochs=3)
@@ -550,7 +570,7 @@ def test_initial_errors_may_differ_from_what_the_filter_believes():
     assert np.array_equal(wrong.filter_covariance, right.filter_covariance)
 
 
-def test_what_is_left_out_or_beyond_linear_is_told():
+def test_what_is_left_out_or_beyond_linear_is_reported():
     scenario = dataclasses.replace(load_scenario("hand-held"), duration=4.0)
     found = covariance.analyse(scenario, epochs=2)
     assert found.left_out == ("gyro rate resolution",)
@@ -560,7 +580,7 @@ def test_what_is_left_out_or_beyond_linear_is_told():
     assert covariance.analyse(white("spin", 10.0), epochs=2).beyond_linear == ()
 
 
-def test_what_is_considered_too_large_is_told():
+def test_what_is_considered_too_large_is_reported():
     scenario = white("spin", 10.0)
     for considered, word in (
         (Consider(scale_factor=0.2), "scale factor, 1σ 20 %"),
@@ -573,7 +593,7 @@ def test_what_is_considered_too_large_is_told():
     assert covariance.analyse(scenario, consider=small, epochs=2).beyond_linear == ()
 
 
-def test_an_attitude_error_beyond_linear_is_told_with_its_time():
+def test_an_attitude_error_beyond_linear_is_reported_with_its_time():
     """A gyro alone: the initial bias turns the attitude away in proportion to time."""
     scenario = dataclasses.replace(load_scenario("rest"), duration=100.0)
     belief = dataclasses.replace(setup.matched(scenario, attitude_sigma=1e-3), bias_sigma=1e-2)
@@ -629,7 +649,7 @@ def test_a_scenario_without_sensors_is_dead_reckoning():
 # ------------------------------------------------------------------------------------------------------- the command line
 
 
-def test_the_command_tells_a_budget_and_writes_it(run, tmp_path):
+def test_the_command_prints_a_budget_and_writes_it(run, tmp_path):
     status, said, _ = run("covariance", "spin", "--epochs", 10, "--misalignment", 0.1, "--time-offset", "star=2")
     assert status == 0
     for word in ("angle random walk", "gyro scale factor", "misalignment", "star time offset", "the filter's own σ"):

@@ -110,7 +110,7 @@ class Case:
     """What θ should be, and how near."""
     near: float = 0.0
     bias_error: Any = None
-    """Of the start, rad/s; drawn as the right filter believes it if not given."""
+    """Of the start, rad/s; drawn from the right filter's initial covariance by default."""
 
 
 HARD_IRON = np.array([3e-7, -1e-7, 2e-7])
@@ -213,11 +213,11 @@ CASES = {
 }
 
 
-def start(record: ImuRecord, believed: setup.FilterSetup, seed: int, bias_sigma: float) -> estimation.State:
+def start(record: ImuRecord, filter_setup: setup.FilterSetup, seed: int, bias_sigma: float) -> estimation.State:
     draw = generator(seed, 0, "initial error").standard_normal(6)
     return setup.initial_state(
-        believed,
-        quaternion.multiply(record.truth.attitude[0], quaternion.exp(-believed.attitude_sigma * draw[:3])),
+        filter_setup,
+        quaternion.multiply(record.truth.attitude[0], quaternion.exp(-filter_setup.attitude_sigma * draw[:3])),
         record.truth.bias[0] - bias_sigma * draw[3:],
     )
 
@@ -306,7 +306,7 @@ CONING = scenarios.Scenario(
 
 
 def cone(algorithm: str, seed: int, truth: bool) -> diagnosis.Diagnosis:
-    believed = setup.FilterSetup(
+    filter_setup = setup.FilterSetup(
         process_noise=estimation.ProcessNoise(
             angle_random_walk=0.08 * units.DEGREE_PER_ROOT_HOUR, rate_random_walk=5e-9
         ),
@@ -315,8 +315,8 @@ def cone(algorithm: str, seed: int, truth: bool) -> diagnosis.Diagnosis:
         integration=coning.ALGORITHMS[algorithm],
     )
     record = scenarios.simulate(CONING, seed=seed)
-    first = start(record, believed, seed, 1e-4)
-    return diagnosis.diagnose(record if truth else replace(record, truth=None), believed, first)
+    first = start(record, filter_setup, seed, 1e-4)
+    return diagnosis.diagnose(record if truth else replace(record, truth=None), filter_setup, first)
 
 
 @pytest.mark.parametrize("algorithm", ["one-sample", "two-sample"])
@@ -369,10 +369,10 @@ def test_log_p_goes_on_where_the_function_underflows(degrees):
 
 def test_the_summary_is_plain():
     found = diagnosed(CASES["late star"], 0)
-    told = json.loads(json.dumps(found.summary(), allow_nan=False))
-    assert told["causes"][0]["name"] == "time offset"
-    assert told["causes"][0]["significant"]
-    assert told["causes"][0]["unit"] == "s"
+    saved = json.loads(json.dumps(found.summary(), allow_nan=False))
+    assert saved["causes"][0]["name"] == "time offset"
+    assert saved["causes"][0]["significant"]
+    assert saved["causes"][0]["unit"] == "s"
     assert "too late" in found.words
     assert len(found.considered) > len(found.causes)
     assert found.judgement.verdict == "not consistent"
@@ -448,7 +448,7 @@ def test_an_axis_that_is_flipped_while_the_rate_is_constant_may_be_a_bias(run):
     assert "the bias at the start was off" in said
 
 
-def test_of_two_directions_nobody_can_tell_whose_reference_is_off():
+def test_of_two_directions_it_is_undecided_whose_reference_is_off():
     """Two directions show the angle between their references alone: turn one or the other."""
     off = quaternion.exp(np.array([2e-3, 0.0, 0.0]))
     turned = sensed("star", lambda s: replace(s, reference_f=quaternion.rotate(off, s.reference_f)))
@@ -458,11 +458,13 @@ def test_of_two_directions_nobody_can_tell_whose_reference_is_off():
         ("reference direction", "magnetometer"),
     }
     assert "One of these causes, which the data do not tell apart:" in found.words
-    told = {row["of"]: row["alternative"] for row in found.summary()["causes"] if row["name"] == "reference direction"}
-    assert told == {"star": True, "magnetometer": True}
+    alternatives = {
+        row["of"]: row["alternative"] for row in found.summary()["causes"] if row["name"] == "reference direction"
+    }
+    assert alternatives == {"star": True, "magnetometer": True}
 
 
-def test_of_three_directions_the_one_is_told():
+def test_of_three_directions_the_one_is_named():
     """A quarter of a milliradian across the reference of one of three fine sensors, which only the angles to the others show."""
     theta = np.array([2e-4, -1.2e-4, 0.9e-4])
     names = {"star": [0.0, 0.6, 0.8], "sun": [1.0, 0.3, 0.0], "beacon": [-0.5, 0.5, -0.7]}
@@ -476,7 +478,7 @@ def test_of_three_directions_the_one_is_told():
     assert found.causes[0].estimate == pytest.approx(theta, abs=6e-5)
 
 
-def test_of_one_sensor_nobody_can_tell_whether_it_or_the_gyro_is_turned():
+def test_of_one_sensor_it_is_undecided_whether_it_or_the_gyro_is_turned():
     whole = scenario()
     alone = replace(whole, sensors=whole.sensors[1:])
     turn = quaternion.to_matrix(quaternion.exp(-np.array([8e-3, 6e-3, -7e-3])))
@@ -510,8 +512,8 @@ def test_the_verdict_is_that_of_all_evidence(run, tmp_path):
     assert "Likeliest cause: the gyro's rate random walk of the bias is" in said
     assert "not consistent: the filter is" in said
     assert ": consistent" not in said.replace("not consistent", "")
-    told = json.loads((tmp_path / "check.json").read_text())
-    assert told["verdict"] == told["diagnosis"]["judgement"]["verdict"] == "not consistent"
+    saved = json.loads((tmp_path / "check.json").read_text())
+    assert saved["verdict"] == saved["diagnosis"]["judgement"]["verdict"] == "not consistent"
 
 
 @pytest.mark.parametrize("name", ["R too small", "scale factor", "late star"])
@@ -556,8 +558,8 @@ def test_of_a_robust_filter_the_causes_are_no_part_of_the_verdict(run, tmp_path)
     assert (status, error) == (alone, "")
     assert "so the causes are no part of the verdict" in " ".join(said.split())
     assert "Likeliest cause: the gyro's rate random walk" in said
-    told = json.loads((tmp_path / "check.json").read_text())
-    assert len(told["findings"]) < len(told["diagnosis"]["judgement"]["findings"])
+    saved = json.loads((tmp_path / "check.json").read_text())
+    assert len(saved["findings"]) < len(saved["diagnosis"]["judgement"]["findings"])
 
 
 @pytest.mark.slow

@@ -25,7 +25,7 @@ def test_the_closed_form_of_the_module(sigma):
 
 
 @pytest.mark.parametrize(("sigma", "share"), [(0.05, 0.0025), (0.1, 0.010), (0.2, 0.042), (0.3, 0.10)])
-def test_the_shares_that_the_module_tells(sigma, share):
+def test_the_shares_that_the_module_states(sigma, share):
     assert 1.0 - variance_across(sigma) / sigma**2 == pytest.approx(share, rel=0.03)
 
 

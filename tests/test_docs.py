@@ -41,10 +41,10 @@ def shell_lines(page: Path) -> list[str]:
 def commands(page: Path) -> list[list[str]]:
     """Return each call of the program on a page as its words, also of those in the running text."""
     text = page.read_text(encoding="utf-8")
-    told = [f"strapdown {one}" for one in re.findall(r"`strapdown ([^`\n]+)`", without_output(text))]
-    told += re.findall(r"^\| (`strapdown [^|]*`) \|", text, re.MULTILINE)
+    lines = [f"strapdown {one}" for one in re.findall(r"`strapdown ([^`\n]+)`", without_output(text))]
+    lines += re.findall(r"^\| (`strapdown [^|]*`) \|", text, re.MULTILINE)
     calls = []
-    for line in [*shell_lines(page), *(part for one in told for part in one.replace("`", "").split(", "))]:
+    for line in [*shell_lines(page), *(part for one in lines for part in one.replace("`", "").split(", "))]:
         for part in re.split(r"&&|\|\||[;|](?![^']*'\s)", re.sub(r"(^|\s)#.*", "", line)):
             try:
                 words = shlex.split(part)

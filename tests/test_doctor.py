@@ -1,4 +1,4 @@
-"""Recordings with one convention broken: the doctor names it; whole ones it calls as told; poor ones it does not call wrong."""
+"""Recordings with one convention broken: the doctor names it; whole ones it finds as declared; poor ones it does not call wrong."""
 
 from __future__ import annotations
 
@@ -103,18 +103,18 @@ def broken(recording: Recording, seed: int) -> dict[str, tuple[Recording, str]]:
 @pytest.mark.parametrize("reference", [True, False], ids=["reference", "sensors alone"])
 def test_one_mistake_in_a_simulated_recording_is_named(seed, reference):
     recording = simulated(seed, reference=reference)
-    assert doctor.examine(recording).verdict == "as told"
+    assert doctor.examine(recording).verdict == "as declared"
     for name, (wrong, words) in broken(recording, seed).items():
         found = doctor.examine(wrong)
         assert found.verdict == "wrong convention", name
-        # Without a reference a sensor inverted as a whole fits as well, and is told beside.
+        # Without a reference a sensor inverted as a whole fits as well, and is reported beside.
         assert words in " ".join([found.reason, *(() if reference else found.notes)]), (name, found.reason)
 
 
 def test_one_mistake_in_a_broad_trial_is_named(broad):
     for k, path in enumerate(sorted(broad.glob("*.hdf5"))[:1]):
         recording = recordings.read(path)
-        assert doctor.examine(recording).verdict == "as told", path.name
+        assert doctor.examine(recording).verdict == "as declared", path.name
         for name, (wrong, words) in broken(recording, k).items():
             found = doctor.examine(wrong)
             assert words in found.reason, (path.name, name, found.reason)
@@ -126,7 +126,7 @@ def test_one_mistake_in_all_broad_trials_with_reference_and_without(broad):
         whole = recordings.read(path)
         for recording in (whole, replace(whole, true_attitude=None)):
             plain = doctor.examine(recording)
-            assert plain.verdict == "as told" or (recording is not whole and plain.verdict == "cannot tell")
+            assert plain.verdict == "as declared" or (recording is not whole and plain.verdict == "cannot tell")
             for name, (wrong, words) in broken(recording, k).items():
                 found = doctor.examine(wrong)
                 if recording is not whole and found.verdict == "cannot tell":
@@ -144,7 +144,7 @@ def test_two_mistakes_are_named_together():
 
 def test_the_gyro_and_the_accelerometer_alone():
     recording = replace(simulated(5, reference=False), magnetic_field=None)
-    assert doctor.examine(recording).verdict == "as told"
+    assert doctor.examine(recording).verdict == "as declared"
     found = doctor.examine(replace(recording, rate=-recording.rate))
     assert found.reason.startswith("axes of the gyro are inverted")
     swapped = replace(recording, rate=recording.rate[:, [1, 0, 2]])
@@ -211,7 +211,7 @@ def test_all_axes_are_signed_permutations_the_identity_first():
 
 
 @pytest.mark.parametrize(
-    ("mistake", "status", "verdict"), [(None, 0, "as told"), ("conjugated", 1, "wrong convention")]
+    ("mistake", "status", "verdict"), [(None, 0, "as declared"), ("conjugated", 1, "wrong convention")]
 )
 def test_doctor_ends_with_the_status_of_the_verdict(monkeypatch, capsys, tmp_path, mistake, status, verdict):
     recording = simulated(1, duration=30.0)
@@ -227,9 +227,9 @@ def test_doctor_ends_with_the_status_of_the_verdict(monkeypatch, capsys, tmp_pat
         cli.main()
     assert (ended.value.code or 0) == status
     assert f"trial.hdf5: {verdict}: " in capsys.readouterr().out
-    told = json.loads((tmp_path / "doctor.json").read_text())
-    assert told["verdict"] == verdict
-    assert told["candidates"][0]["score"] >= told["candidates"][1]["score"]
+    saved = json.loads((tmp_path / "doctor.json").read_text())
+    assert saved["verdict"] == verdict
+    assert saved["candidates"][0]["score"] >= saved["candidates"][1]["score"]
 
 
 @pytest.mark.parametrize("angle", [0.03, 0.1])

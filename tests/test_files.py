@@ -118,7 +118,7 @@ increments = np.random.default_rng(1).standard_normal((20_000, 3))
 try:
     write_record(sys.argv[1], ImuRecord(time=np.arange(20_001.0), increments=increments))
 except OSError as error:
-    print("told:", error)
+    print("error:", error)
 """
 
 
@@ -129,6 +129,6 @@ def test_a_full_disk_is_an_ordinary_error_of_hdf5_too(tmp_path):
     command = [sys.executable, "-c", FULL, str(tmp_path / "record.h5")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.startswith("told: [Errno 27]")
+    assert done.stdout.startswith("error: [Errno 27]")
     assert (tmp_path / "record.h5").read_text() == "old"
     assert names(tmp_path) == ["record.h5"]

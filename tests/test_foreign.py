@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.stats
 
 from strapdown import cli, consistency, montecarlo, quaternion, recordings, report, scenarios, setup, vectors
 from strapdown.checks import InputError
@@ -31,14 +32,14 @@ FLIGHT = scenarios.Scenario(
             Harmonic(amplitude=(0.0, 0.2, 0.25), frequency=0.11, phase=1.0),
         ),
     ),
-    # A gyro so poor that errors forget each other within seconds: one run then tells much.
+    # A gyro so poor that errors forget each other within seconds: one run then has much power.
     gyro=GyroSpec(angle_random_walk=20.0 * DEGREE_PER_ROOT_HOUR, rate_random_walk=20.0 * DEGREE_PER_HOUR_PER_ROOT_HOUR),
     sensors=(
         vectors.VectorSensor(name="fine", reference_f=np.array([0.0, 0.6, 0.8]), sigma=0.2 * DEGREE, rate=1.0),
         vectors.VectorSensor(name="coarse", reference_f=np.array([0.8, 0.0, -0.6]), sigma=2.0 * DEGREE, rate=1.0),
     ),
     rate=10.0,
-    duration=300.0,
+    duration=150.0,
 )
 
 
@@ -50,9 +51,9 @@ def run():
 
 def checked(run, **changes):
     e, t = run.estimate, run.record.truth
-    told = {"time": e.time, "attitude": e.attitude, "covariance": e.covariance, "true_time": e.time}
-    told |= {"true_attitude": t.attitude, "bias": e.bias, "true_bias": t.bias, "innovations": e.innovations}
-    return check_arrays(**{**told, **changes})
+    arrays = {"time": e.time, "attitude": e.attitude, "covariance": e.covariance, "true_time": e.time}
+    arrays |= {"true_attitude": t.attitude, "bias": e.bias, "true_bias": t.bias, "innovations": e.innovations}
+    return check_arrays(**{**arrays, **changes})
 
 
 def carried(P, turn):
@@ -83,12 +84,33 @@ def test_our_own_estimate_gets_its_own_verdict(run):
     assert not any(one.likely for one in found.explanations)
 
 
+@pytest.mark.parametrize(("m", "factor"), [(400, 1.0), (400, 1.3), (10, 1.3)])
+def test_a_factor_on_sigma_is_as_likely_as_its_likelihood_ratio(m, factor):
+    """Of m white errors, three each, whose mean square is f² the σ²: 2 Δℓ = 3 m (f² − 1 − ln f²), χ² of one degree.
+
+    Up to ten may all be one for what they show of their correlation.
+    """
+    draw = np.random.default_rng(3)
+    error = draw.standard_normal((m, 3))
+    error *= factor / np.sqrt(np.mean(error**2))
+    time, attitude = np.arange(float(m)), quaternion.normalize(draw.standard_normal((m, 4)))
+    truth, P = Truth(attitude=attitude, bias=np.zeros((m, 3))), np.tile(1e-6 * np.eye(6), (m, 1, 1))
+    known = foreign.explanations(1e-3 * error, {"body": P}, "body", truth, time, attitude)
+    (found,) = (one for one in known if one.name == foreign.SCALE)
+    assert float(found.value) == pytest.approx(factor, rel=1e-3)
+    ratio = 3.0 * (m if m > 10 else 1) * (factor**2 - 1.0 - 2.0 * np.log(factor))
+    if factor == 1.0:
+        assert found.p_value == pytest.approx(1.0, abs=1e-6)
+    else:  # but for the whiteness, which is itself estimated: the samples count for m within a fifth
+        assert scipy.stats.chi2.isf(found.p_value, 1) == pytest.approx(ratio, rel=0.2 if m > 10 else 1e-6)
+
+
 def command(monkeypatch, capsys, *arguments):
     monkeypatch.setattr(sys, "argv", ["strapdown", *map(str, arguments)])
     with pytest.raises(SystemExit) as end:
         cli.main()
-    told = capsys.readouterr()
-    return end.value.code, " ".join(told.out.split()), " ".join(told.err.split())
+    captured = capsys.readouterr()
+    return end.value.code, " ".join(captured.out.split()), " ".join(captured.err.split())
 
 
 @pytest.fixture(scope="module")
@@ -116,17 +138,17 @@ def test_exported_and_read_back_it_has_the_same_verdict(run, files, name, monkey
     status, said, _ = command(
         monkeypatch, capsys, "check", files / name, "--truth", files / "record.h5", "--json", files / "out.json"
     )
-    told = json.loads((files / "out.json").read_text())
+    saved = json.loads((files / "out.json").read_text())
     own = consistency.judge(
         run.estimate if name.endswith("h5") else replace(run.estimate, innovations={}), run.record.truth
     )
-    assert told["verdict"] == own.verdict == "consistent"
+    assert saved["verdict"] == own.verdict == "consistent"
     assert status == 0
-    assert [(one["name"], one["of"]) for one in told["findings"]] == [(one.name, one.of) for one in own.findings]
+    assert [(one["name"], one["of"]) for one in saved["findings"]] == [(one.name, one.of) for one in own.findings]
     np.testing.assert_allclose(
-        [one["value"] for one in told["findings"]], [one.value for one in own.findings], rtol=1e-9
+        [one["value"] for one in saved["findings"]], [one.value for one in own.findings], rtol=1e-9
     )
-    assert told["alignment"]["removed"] == []
+    assert saved["alignment"]["removed"] == []
     assert "the file says that its covariance is of the body error" in said
 
 
@@ -136,9 +158,9 @@ def test_a_bag_has_the_attitude_about_fixed_axes(run, files, monkeypatch, capsys
         monkeypatch, capsys, "check", files / "estimate.mcap", "--truth", files / "record.h5", "--json", files / "b.json",
         "--topic", "/imu/data",
     )  # fmt: skip
-    told = json.loads((files / "b.json").read_text())
-    assert told["error_frame"] == "fixed"
-    assert told["error_frame_probability"]["fixed"] > 0.99
+    saved = json.loads((files / "b.json").read_text())
+    assert saved["error_frame"] == "fixed"
+    assert saved["error_frame_probability"]["fixed"] > 0.99
     assert "the covariance is read as fixed" in said
     e, t = run.estimate, run.record.truth
     cut = slice(1, None)
@@ -149,9 +171,9 @@ def test_a_bag_has_the_attitude_about_fixed_axes(run, files, monkeypatch, capsys
         ),
         Truth(attitude=t.attitude[cut], bias=t.bias[cut]),
     )  # fmt: skip
-    assert (told["verdict"], status) == (alone.verdict, {"consistent": 0, "cannot tell": 2}[alone.verdict])
+    assert (saved["verdict"], status) == (alone.verdict, {"consistent": 0, "cannot tell": 2}[alone.verdict])
     np.testing.assert_allclose(
-        [one["value"] for one in told["findings"]], [one.value for one in alone.findings], rtol=1e-6
+        [one["value"] for one in saved["findings"]], [one.value for one in alone.findings], rtol=1e-6
     )
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import ast
+import base64
 import dataclasses
 import importlib
+import io
 import math
 import os
 import subprocess
@@ -13,6 +15,7 @@ import types
 import xml.etree.ElementTree
 from pathlib import Path
 
+import matplotlib.image
 import numpy as np
 import pytest
 
@@ -24,6 +27,7 @@ NAMES = {
     "Gate",
     "GyroSpec",
     "InputError",
+    "LiveFilter",
     "ProcessNoise",
     "Robust",
     "Scenario",
@@ -446,6 +450,12 @@ def test_results_print_as_short_tables():
         rows = xml.etree.ElementTree.fromstring(one._repr_html_())
         widths = {len(row) for row in rows.iter("tr")}
         assert len(widths) == 1
+        images = [image.get("src") for image in rows.iter("img")]
+        assert len(images) == (type(one).__name__ in ("Estimate", "Statistics", "Analysis")), one
+        for image in images:
+            pixels = matplotlib.image.imread(io.BytesIO(base64.b64decode(image.partition(",")[2])))
+            assert pixels.shape[1] > 500
+            assert pixels[..., :3].std() > 0.05  # something is drawn
     # Of another sensor than a gyro the units are not the gyro's.
     assert "°/√h" in str(sd.fit_noise(samples, 0.01))
     assert "°" not in str(sd.fit_noise(samples, 0.01, sensor="accelerometer"))

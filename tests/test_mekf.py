@@ -159,7 +159,7 @@ def test_a_split_run_is_the_whole_run_to_the_bit(at):
 
 
 def noise_free(record, body_motion):
-    """The same record with exact increments and vectors; the filter still believes in noise."""
+    """The same record with exact increments and vectors; the filter still models noise."""
     series = tuple(
         replace(s, vector_b=quaternion.rotate(quaternion.conjugate(body_motion.attitude(s.time)), s.reference_f))
         for s in record.vectors
@@ -318,8 +318,8 @@ def test_an_attitude_and_a_diffuse_prior_is_the_attitude():
 
 def test_scaled_noise_reaches_every_kind():
     record = with_attitude_series(with_vector_series(simulate(scenario(duration=2.0), 1)))
-    believed = replace(record, vectors=tuple(series.noise_scaled(3.0) for series in record.vectors))
-    plain, scaled = schedule(record.vectors, 0.0, 2.0), schedule(believed.vectors, 0.0, 2.0)
+    modelled = replace(record, vectors=tuple(series.noise_scaled(3.0) for series in record.vectors))
+    plain, scaled = schedule(record.vectors, 0.0, 2.0), schedule(modelled.vectors, 0.0, 2.0)
     attitude = plain.kind == measurement.ATTITUDE
     assert np.allclose(scaled.variance, 9.0 * plain.variance, rtol=1e-14)
     assert np.allclose(scaled.vector_b[attitude], 9.0 * plain.vector_b[attitude], rtol=1e-14)

@@ -120,8 +120,8 @@ def test_events_come_in_order_of_time_and_of_sensors(sensors, times):
         shift = 1e-4 * i if times == "apart" else 0.0
         vectors.append(replace(up.taken(picked), sensor=f"s{i}", time=up.time[picked] - shift))
     events = schedule(tuple(vectors), whole.time[0], whole.time[-1])
-    standing = np.concatenate([each.time for each in vectors]) if vectors else np.empty(0)
-    order = np.argsort(standing, kind="stable")
+    held_time = np.concatenate([each.time for each in vectors]) if vectors else np.empty(0)
+    order = np.argsort(held_time, kind="stable")
     assert np.array_equal(events.row, order)
-    assert np.array_equal(events.time, standing[order])
+    assert np.array_equal(events.time, held_time[order])
     assert np.array_equal(events.sensor, np.repeat(np.arange(sensors), [len(each.time) for each in vectors])[order])

@@ -32,7 +32,7 @@ def least_eigenvalue(P):
 
 
 def sharp_record(sigma, steps=400):
-    """A turning body that sees three directions in turn, exactly, believed to ``sigma`` rad."""
+    """A turning body that sees three directions in turn, exactly, with a modelled noise of ``sigma`` rad."""
     body = motion.ConstantRate(rate=(0.3, -0.5, 0.4))
     time = 0.02 * np.arange(steps + 1)
     series = []
@@ -123,7 +123,7 @@ def reference_variances(record, noise, prior):
 
 
 def by_covariance(series):
-    """The same measurements with their noise told as a covariance."""
+    """The same measurements with their noise given as a covariance."""
     return VectorMeasurements(
         sensor=series.sensor,
         kind=series.kind,
@@ -167,7 +167,7 @@ def test_no_digit_is_lost_where_the_covariance_holds_none(options, sensors, sigm
 
 
 def test_an_outage_that_makes_attitude_and_bias_one_leaves_the_covariance_definite():
-    """After 1e7 s the attitude's error is the bias's, to 1e-18 of its variance; a measurement then tells both."""
+    """After 1e7 s the attitude's error is the bias's, to 1e-18 of its variance; a measurement then determines both."""
     time = np.concatenate([[0.0, 1.0], 1e7 + np.arange(3.0)])
     series = tuple(
         VectorMeasurements(

@@ -12,13 +12,14 @@ import sys
 import time
 import weakref
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hdf5 import changed
 
-from strapdown import cli, consistency, montecarlo, records, scenarios
+from strapdown import consistency, montecarlo, records, scenarios
 from strapdown import setup as setups
 from strapdown.checks import InputError
 from strapdown.files import reading
@@ -62,10 +63,10 @@ def one_by_one(order, stop_after):
 
 def test_the_file_holds_what_a_plain_run_gives(tmp_path):
     path = tmp_path / "deeper" / "c.h5"
-    told = []
-    result = go(path, 21, progress=told.append)
+    reported = []
+    result = go(path, 21, progress=reported.append)
     assert result.finished
-    assert sum(told) == 21
+    assert sum(reported) == 21
     assert_same(result.statistics, straight(21))
     held = campaign.read(path)
     assert_same(held.statistics, result.statistics)
@@ -78,13 +79,15 @@ def test_the_file_describes_itself(tmp_path):
     path = tmp_path / "c.h5"
     go(path, 21)
     with reading.hdf5(path) as file:
-        told = reading.attributes(file)
-        assert told["kind"] == "strapdown montecarlo"
-        assert scenarios.scenario_to_toml(scenarios.scenario_from_toml(told["scenario"])) == told["scenario"]
-        assert "[filter]" in told["filter"]
-        assert told["finished_runs"] == 21
-        assert {"python", "numpy", "numba", "h5py"} == set(json.loads(told["versions"]))
-        assert "quaternions Hamilton" in told["conventions"]
+        attributes = reading.attributes(file)
+        assert attributes["kind"] == "strapdown montecarlo"
+        assert (
+            scenarios.scenario_to_toml(scenarios.scenario_from_toml(attributes["scenario"])) == attributes["scenario"]
+        )
+        assert "[filter]" in attributes["filter"]
+        assert attributes["finished_runs"] == 21
+        assert {"python", "numpy", "numba", "h5py"} == set(json.loads(attributes["versions"]))
+        assert "quaternions Hamilton" in attributes["conventions"]
         for dataset in file["statistics"].values():
             assert reading.attributes(dataset).keys() >= {"unit", "meaning"}
         names = {field.name for field in fields(statistics.Statistics)} - {"runs", "sensors"}
@@ -105,14 +108,14 @@ def test_a_campaign_can_be_extended_to_the_same_bits(tmp_path, end):
 def test_resuming_a_finished_campaign_computes_nothing(tmp_path):
     path = tmp_path / "c.h5"
     first = go(path, 21)
-    told = []
+    reported = []
 
     def idle(work, chunks):
         assert not chunks
         return iter(())
 
-    again = go(path, 21, resume=True, workers=idle, progress=told.append)
-    assert told == [21]
+    again = go(path, 21, resume=True, workers=idle, progress=reported.append)
+    assert reported == [21]
     assert_same(first.statistics, again.statistics)
     assert again.seconds >= first.seconds
 
@@ -208,7 +211,7 @@ def test_killed_at_random_moments_a_campaign_goes_on_to_the_same_bits(tmp_path):
         total = part if total is None else statistics.merge(total, part)
         folds[total.runs] = total
     random = np.random.default_rng(8)
-    for _ in range(60):
+    for _ in range(24):
         if not _killed(path, runs, after=random.uniform(0.02, 0.15)):
             break
         kills += 1
@@ -326,28 +329,16 @@ def test_a_plan_without_a_form_in_a_file_is_refused_before_anything_is_computed(
 
 
 @pytest.fixture
-def command(monkeypatch, capsys, tmp_path):
-    """Run ``strapdown montecarlo ARGUMENTS`` in an empty folder; return exit status, standard output and standard error."""
-    monkeypatch.chdir(tmp_path)
+def command(run, tmp_path):
+    """``strapdown montecarlo ARGUMENTS`` in an empty folder: exit status, standard output and standard error."""
     Path("short.toml").write_text(scenarios.scenario_to_toml(replace(SCENARIO, name="short")), encoding="utf-8")
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["strapdown", "montecarlo", *map(str, arguments)])
-        try:
-            cli.main()
-            status = 0
-        except SystemExit as end:
-            status = end.code or 0
-        said = capsys.readouterr()
-        return status, said.out, said.err
-
-    return run
+    return partial(run, "montecarlo")
 
 
 SCALAR = ("--machine", "scalar")
 
 
-def test_the_command_computes_tells_and_writes(command):
+def test_the_command_computes_prints_and_writes(command):
     status, said, error = command("short.toml", "--runs", 30, "--seed", 4, *SCALAR)
     assert (status, error) == (2, "")  # 30 runs cannot tell
     assert "More runs (--runs, with --resume) would show it." in said
@@ -371,6 +362,21 @@ def test_the_command_computes_tells_and_writes(command):
     assert {name: report[name] for name in expected} == json.loads(json.dumps(expected))
     assert held.plan.seed == 4
     assert held.plan.epochs == 80
+
+
+def test_the_command_matches_the_filter_to_a_data_sheet(command):
+    """``--gyro`` changes the filter alone; the file is named after that of the scenario, whatever name the scenario has."""
+    Path("other.toml").write_text(Path("short.toml").read_text(), encoding="utf-8")
+    sheet = "[gyro]\nangle_random_walk_deg_per_sqrt_hour = 0.9\nrate_random_walk_deg_per_hour_per_sqrt_hour = 6.0\n"
+    Path("gyro.toml").write_text(sheet, encoding="utf-8")
+    assert command("other.toml", "--runs", 4, "--no-states", "--gyro", "gyro.toml", *SCALAR)[0] in (1, 2)
+    plan = campaign.read("other-montecarlo.h5").plan
+    assert plan.scenario.gyro == SCENARIO.gyro
+    assert plan.setup.process_noise.angle_random_walk == pytest.approx(0.9 * np.pi / 10800.0)
+    assert plan.setup.process_noise.rate_random_walk == pytest.approx(6.0 * np.pi / 180.0 / 3600.0 / 60.0)
+    status, _, error = command("short.toml", "--gyro", "gyro.toml", "--filter", "filter.toml")
+    assert status == 2
+    assert "--gyro and --filter both give" in error
 
 
 def test_the_command_resumes_extends_and_shows(command):
@@ -448,7 +454,7 @@ def test_a_replay_is_the_run_of_the_campaign_to_the_bit(command, machine):
     )
     assert np.array_equal(error, held.statistics.example_error[5])
     assert np.array_equal(np.sqrt(estimate.variance[rows]), held.statistics.example_sigma[5])
-    # Causes can be sought in it: it tells its filter as any estimate does.
+    # Causes can be sought in it: it holds its filter as any estimate does.
     assert setups.from_toml(records.read_attributes("short-montecarlo-run-5-estimate.h5")["filter"]) == held.plan.setup
 
 
@@ -521,7 +527,7 @@ def test_a_signal_whose_exception_python_drops_is_heeded_after_the_chunk(command
 
     def interrupted(*arguments):
         written.append(arguments)
-        if len(written) == 1:  # in the thread that signals are told to
+        if len(written) == 1:  # in the thread that receives signals
             gone = {1}
             reference = weakref.ref(gone, cleared)
             del gone

@@ -49,11 +49,11 @@ def client():
 
 
 def test_dask_gives_the_bits_of_one_process(client):
-    told = []
+    reported = []
     found = montecarlo.run_plan(
-        PLAN, runs=43, chunk=4, machine="scalar", workers=cluster.on_dask(client), progress=told.append
+        PLAN, runs=43, chunk=4, machine="scalar", workers=cluster.on_dask(client), progress=reported.append
     )
-    assert sum(told) == 43
+    assert sum(reported) == 43
     assert_same(found, alone(43, 4))
 
 
@@ -144,7 +144,7 @@ def test_the_help_says_what_trust_a_scheduler_takes(monkeypatch, capsys):
     assert "can run any code here" in " ".join(capsys.readouterr().out.replace("│", " ").split())
 
 
-def test_without_the_extra_the_remedy_is_told(monkeypatch, capsys, tmp_path):
+def test_without_the_extra_the_remedy_is_reported(monkeypatch, capsys, tmp_path):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"pip install 'strapdown\[cluster\]'"), cluster.dask_client(workers=2):
         pass

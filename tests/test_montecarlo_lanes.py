@@ -174,7 +174,7 @@ def test_fixed_errors_and_dispersions():
     ],
 )
 def test_gyro_noise_has_its_closed_form(spec, exact):
-    """A filter that starts right, told nothing and measuring nothing, has the gyro's errors: angle and bias, at rest."""
+    """A filter that starts right, with no noise model and no measurement, has the gyro's errors: angle and bias, at rest."""
     still = replace(SCENARIO, gyro=spec, sensors=(), motion=motion.rest())
     given = Dispersions(attitude_sigma=0.0, bias_sigma=0.0)
     plan = Plan(scenario=still, setup=SETUP, epochs=20, dispersions=given)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import threading
 import time
@@ -65,9 +66,9 @@ def test_quantiles_are_those_of_the_sample(probability):
         exponent = ERROR_EXPONENT if column < 6 else NEES_EXPONENT
         histogram[0, column] = np.bincount(bin_of(error if column < 6 else nees, exponent), minlength=BINS)
     total = replace(scalar.run_chunk(PLAN, 0, 1), histogram=histogram)
-    for found, sample in ((total.error_quantile(probability), error), (total.nees_quantile(probability), nees)):
-        # Between the edges of the bin that holds it, and in the midst of the sample far closer.
-        assert np.all(np.abs(found / np.quantile(sample, probability) - 1.0) < (0.03 if probability > 0.05 else 0.07))
+    # Between the edges of the bin that holds it, and in the midst of the sample far closer.
+    ratio = total.error_quantile(probability) / np.quantile(error, probability)
+    assert np.all(np.abs(ratio - 1.0) < (0.03 if probability > 0.05 else 0.07))
 
 
 def test_quantiles_at_the_ends():
@@ -167,7 +168,7 @@ def test_coverage_counts_errors_inside_one_two_three_sigma_their_ends_too():
 def test_merging_parts_is_the_whole():
     whole = scalar.run_chunk(PLAN, 0, 12)
     parts = [scalar.run_chunk(PLAN, first, runs) for first, runs in ((0, 5), (5, 1), (6, 6))]
-    merged = montecarlo.merge_all(parts)
+    merged = functools.reduce(montecarlo.merge, parts)
     exact = ["runs", "finite", "coverage", "histogram", "sensor_degrees", "sensor_refused", "time", "sensors"]
     exact += ["worst_run", "worst_score", "example_run", "example_error", "example_sigma"]
     assert not same(whole, merged, exact)
@@ -191,7 +192,7 @@ def test_statistics_of_different_plans_are_not_merged():
         montecarlo.merge(scalar.run_chunk(PLAN, 0, 1), scalar.run_chunk(planned(epochs=3), 0, 1))
 
 
-def test_a_run_that_fails_is_counted_told_and_left_out(monkeypatch):
+def test_a_run_that_fails_is_counted_reported_and_left_out(monkeypatch):
     """One run of five turns to NaN half way: sums go on without it, the verdict does not."""
     original = setups.run
 
@@ -216,10 +217,10 @@ def test_a_run_that_fails_is_counted_told_and_left_out(monkeypatch):
     verdict = total.verdict(np.arange(7))
     assert np.isinf(verdict.mean[3:]).all()
     assert not verdict.consistent
-    told = montecarlo.summary(total)
-    assert told["failed_runs"] == 1
-    assert not told["consistent"]
-    assert told["worst_runs"][0] == {"run": 2, "largest_nees": None}
+    summary = montecarlo.summary(total)
+    assert summary["failed_runs"] == 1
+    assert not summary["consistent"]
+    assert summary["worst_runs"][0] == {"run": 2, "largest_nees": None}
     early = montecarlo.summary(total, epochs=np.array([1, 2]))  # before it failed
     assert all(part["consistent"] for part in (*early["nees"].values(), *early["nis"]))
     assert not early["consistent"]
@@ -249,10 +250,10 @@ def test_measurements_that_a_gate_refuses_are_counted_apart(monkeypatch):
 def test_summary_of_a_right_filter_and_of_a_wrong_one():
     perfect = replace(SCENARIO, gyro=replace(SCENARIO.gyro, scale_factor=np.zeros(3)))
     right = montecarlo.run_plan(planned(scenario=perfect), runs=200, machine="scalar")
-    told = montecarlo.summary(right)
-    assert told["consistent"]
-    assert [part["sensor"] for part in told["nis"]] == ["sun sensor", "star"]
-    for share, expected in zip(told["coverage"]["attitude"], told["coverage"]["expected"], strict=True):
+    summary = montecarlo.summary(right)
+    assert summary["consistent"]
+    assert [part["sensor"] for part in summary["nis"]] == ["sun sensor", "star"]
+    for share, expected in zip(summary["coverage"]["attitude"], summary["coverage"]["expected"], strict=True):
         assert abs(share - expected) < 4.0 * np.sqrt(expected * (1.0 - expected) / 200)  # 3 axes, correlated epochs
     wrong = montecarlo.run_plan(
         planned(scenario=perfect, setup=replace(SETUP, measurement_sigma_factor=0.5)), runs=200, machine="scalar"
@@ -262,12 +263,21 @@ def test_summary_of_a_right_filter_and_of_a_wrong_one():
 
 def test_summary_bounds_hold_for_all_tests_together():
     """The level of each of the five tests, spent over its epochs, adds up to what is asked for."""
-    told = montecarlo.summary(scalar.run_chunk(PLAN, 0, 3), epochs=np.array([2, 4]), probability=0.95)
+    summary = montecarlo.summary(scalar.run_chunk(PLAN, 0, 3), epochs=np.array([2, 4]), probability=0.95)
     single = 1.0 - 0.05 / 5.0
     low, high = scipy.stats.chi2.ppf([0.25 * (1.0 - single), 1.0 - 0.25 * (1.0 - single)], 9) / 9.0
-    assert np.allclose(told["nees"]["bias"]["bounds"], [low, high], rtol=1e-12)
+    assert np.allclose(summary["nees"]["bias"]["bounds"], [low, high], rtol=1e-12)
     low, high = scipy.stats.chi2.ppf([0.5 * (1.0 - single), 1.0 - 0.5 * (1.0 - single)], 6) / 6.0
-    assert np.allclose(told["nis"][1]["bounds"], [low, high], rtol=1e-12)
+    assert np.allclose(summary["nis"][1]["bounds"], [low, high], rtol=1e-12)
+
+
+def test_summary_takes_coverage_over_the_judged_epochs():
+    counts = np.zeros((PLAN.epochs + 1, 6, 3), int)
+    counts[4], counts[2, :3, 1] = 3, 3
+    sums = replace(scalar.run_chunk(PLAN, 0, 3), coverage=counts)
+    told = montecarlo.summary(sums, epochs=np.array([2, 4]))["coverage"]
+    assert told["attitude"] == [0.5, 1.0, 0.5]
+    assert told["bias"] == [0.5, 0.5, 0.5]
 
 
 # ------------------------------------------------------------------------------------------------------------ plans
@@ -290,7 +300,7 @@ def test_a_plan_goes_through_its_table_and_back():
         assert not same(scalar.run_chunk(one, 0, 2), scalar.run_chunk(again, 0, 2))
 
 
-def test_every_part_of_a_plan_tells_in_its_digest():
+def test_every_part_of_a_plan_counts_in_its_digest():
     others = [
         planned(seed=5),
         planned(epochs=3),
@@ -390,7 +400,7 @@ COUNTED = ["runs", "finite", "coverage", "histogram", "sensor_degrees", "worst_r
 
 @pytest.mark.parametrize("chunk", [1, 7, 1000])
 def test_runs_are_the_same_to_the_bit_in_chunks_of_any_size(chunk):
-    """Every run tells in the counts, and the worst and the first ones in all their bits."""
+    """Every run counts, and the worst and the first ones in all their bits."""
     one = montecarlo.run_plan(PLAN, runs=60, chunk=10, threads=1, machine="scalar")
     other = montecarlo.run_plan(PLAN, runs=60, chunk=chunk, threads=2, machine="scalar")
     assert not same(one, other, COUNTED)
@@ -520,7 +530,7 @@ def test_bad_numbers_are_refused(options, message):
         montecarlo.run_plan(PLAN, **options)
 
 
-def test_the_machine_is_chosen_by_the_plan_and_told():
+def test_the_machine_is_chosen_by_the_plan_and_reported():
     rough = planned(scenario=replace(SCENARIO, gyro=replace(SCENARIO.gyro, quantization=1e-6)))
     chosen = montecarlo.choose(rough)
     assert chosen.machine == "scalar"

@@ -209,7 +209,7 @@ def test_lane_normals_have_the_same_bits_in_any_lane_and_precision():
 
 
 def libm_normals(words):
-    """Return two normals of each word of 64 by libm in double precision: the lower half tells the radius, the upper the angle."""
+    """Return two normals of each word of 64 by libm in double precision: the lower half gives the radius, the upper the angle."""
     low, high = (words & WORD(0xFFFFFFFF)).astype(np.int64), (words >> WORD(32)).astype(np.int64)
     # Evenly spread over (0, 1]: the middle of what 32 leading binary digits leave open; of numbers below 2^-16 there are 48 digits.
     u = (low + 0.5 * 2.0 ** -(32 - np.frexp(low.astype(float))[1])) * 2.0**-32

@@ -132,8 +132,8 @@ def test_without_a_bias_the_attitude_alone_is_judged(own, tmp_path, capsys):
     assert "bias x" not in page
     assert "nan" not in json.dumps(numbers).lower()
     cli.app(["montecarlo", str(tmp_path / "own.h5")], standalone_mode=False)
-    assert "NEES of the attitude" in (told := capsys.readouterr().out)
-    assert "bias" not in told
+    assert "NEES of the attitude" in (output := capsys.readouterr().out)
+    assert "bias" not in output
 
 
 def test_without_a_bias_it_is_consistent_where_the_attitude_shows_it():

@@ -18,7 +18,6 @@ from strapdown import (
     covariance,
     gyro,
     montecarlo,
-    motion,
     plots,
     quaternion,
     records,
@@ -30,7 +29,6 @@ from strapdown.checks import InputError
 from strapdown.coning_study import Drift, FilterOutcome
 from strapdown.montecarlo.statistics import BINS_PER_OCTAVE
 from strapdown.plots import decimation, estimates, style
-from strapdown.plots.sphere import body_axis_path
 
 
 @pytest.fixture(scope="module")
@@ -178,7 +176,6 @@ def test_every_function_draws_into_the_axes_it_is_given(run, statistics):
         lambda ax: plots.innovation_autocorrelation(consistency.autocorrelation(white), ax),
         lambda ax: plots.nis_over_record(innovations, consistency.mean_bounds(2, 1), ax),
         lambda ax: plots.error_distribution(size, ax),
-        lambda ax: plots.body_axis_on_sphere(estimate.attitude, truth.attitude, 2, ax),
         lambda ax: plots.fan(statistics, 0, ax),
         lambda ax: plots.fan(statistics, 4, ax),
         lambda ax: plots.coverage_by_state(statistics, -1, ax),
@@ -197,6 +194,14 @@ def test_the_histogram_counts_what_lies_beyond():
     white = np.concatenate([np.zeros(100), [9.0, -7.0]])[:, None]
     ax = plots.innovation_histogram(white)
     assert any("2 beyond" in text.get_text() for text in ax.get_legend().get_texts())
+
+
+@pytest.mark.parametrize("epoch", [0, -1])
+def test_coverage_is_drawn_at_its_epoch(statistics, epoch):
+    drawn = [
+        line.get_ydata() for line in plots.coverage_by_state(statistics, epoch).lines if len(line.get_xdata()) == 6
+    ]
+    np.testing.assert_allclose(np.transpose(drawn), 100.0 * statistics.coverage[epoch] / statistics.finite[epoch])
 
 
 def test_errors_are_drawn_in_the_unit_of_their_label(run):
@@ -229,7 +234,7 @@ def test_a_budget_that_starts_without_error_shows_what_comes_after(scenario, tmp
 
 
 @pytest.mark.filterwarnings("error")
-def test_drifts_that_are_rounding_are_told_and_not_drawn(tmp_path):
+def test_drifts_that_are_rounding_are_reported_and_not_drawn(tmp_path):
     size = units.DEGREE_PER_HOUR
     drifts = [
         Drift(algorithm="one-sample", samples=1, measured=-62.0 * size, predicted=-60.0 * size),
@@ -256,35 +261,6 @@ def test_the_ellipse_holds_its_share():
     points = (factor @ random.standard_normal((2, 20_000))).T / units.DEGREE
     inside = ellipse.contains_points(ax.transData.transform(points))
     assert inside.mean() == pytest.approx(0.95, abs=0.01)
-
-
-def test_the_path_is_that_of_the_axis():
-    cone = motion.Coning(angle=0.4, frequency=0.5)
-    path = body_axis_path(cone.attitude(np.linspace(0.0, 2.0, 50)), 2)
-    np.testing.assert_allclose(np.linalg.norm(path, axis=1), 1.0, atol=1e-14)
-    np.testing.assert_allclose(path[:, 2], np.cos(0.4), atol=1e-12)  # equation (18): the axis stays on its cone
-    with pytest.raises(InputError, match="0, 1 or 2"):
-        body_axis_path(np.array([[1.0, 0.0, 0.0, 0.0]]), 3)
-
-
-@pytest.mark.parametrize("angle", [0.01, 0.8])
-def test_the_sphere_is_drawn_for_wide_paths_only(angle):
-    attitude = motion.Coning(angle=angle, frequency=0.5).attitude(np.linspace(0.0, 2.0, 50))
-    figure = plots.sphere_figure(attitude, attitude)
-    figure.canvas.draw()
-    assert (len(figure.axes[0].lines) > 2) == (angle > 0.35)
-
-
-def test_an_animation_is_written_whole(tmp_path):
-    from PIL import Image
-
-    attitude = motion.Coning(angle=0.5, frequency=0.5).attitude(np.linspace(0.0, 2.0, 50))
-    target = plots.animate_body_axis(tmp_path / "cone.gif", attitude, frames=5)
-    with Image.open(target) as image:
-        assert image.n_frames == 5
-    with pytest.raises(InputError, match=r"\.gif or \.mp4"):
-        plots.animate_body_axis(tmp_path / "cone.avi", attitude)
-    assert [path.name for path in tmp_path.iterdir()] == ["cone.gif"]
 
 
 @pytest.mark.parametrize(("theme", "ground"), [("light", "#ffffff"), ("dark", "#16181d")])
@@ -436,13 +412,8 @@ def test_angle_units_are_those_that_are_read_best():
     assert style.rate_unit(np.array([0.1]))[0] == "°/s"
 
 
-def test_wrapped_quaternions_do_not_matter_to_the_path():
-    q = quaternion.exp(np.array([[0.1, 0.2, 0.3]]))
-    np.testing.assert_allclose(body_axis_path(q), body_axis_path(-q), atol=1e-15)
-
-
 def test_axes_beside_each_other_are_in_one_unit(statistics):
-    """Of three attitude errors of which one is large none is told in arcseconds."""
+    """Of three attitude errors of which one is large none is printed in arcseconds."""
     histogram = statistics.histogram.copy()
     for state in (2, 5):
         histogram[:, state] = np.roll(histogram[:, state], 12 * BINS_PER_OCTAVE, axis=-1)

@@ -180,7 +180,7 @@ def test_a_record_goes_through_hdf5_to_the_last_bit(tmp_path, record, text, seed
 @few
 @given(recorded())
 def test_a_record_goes_through_csv_to_the_last_bit(tmp_path, record):
-    assert_equal(record, recordfiles.import_csv(recordfiles.export_csv(tmp_path / "r.csv", record)[0]))
+    assert_equal(record, recordfiles.read_record(recordfiles.export_csv(tmp_path / "r.csv", record)[0]))
 
 
 @few

@@ -138,7 +138,7 @@ def test_an_array_that_declares_more_than_it_holds_is_refused_before_memory_is_t
             InputError,
             match=r"bomb\.npy cannot be read \(its header declares 7200000000 bytes of float64, and 0 follow",
         ):
-            recordings.read_gyro(path, rate=100.0, units=UNITS)
+            recordings.read_samples(path, "gyro", rate=100.0, units=UNITS)
 
     seconds, megabytes = spent(refused)
     assert seconds < 1.0
@@ -323,7 +323,7 @@ def test_the_series_of_a_csv_record_are_no_links(tmp_path):
     written[1].rename(tmp_path / "elsewhere.csv")
     written[1].symlink_to(tmp_path / "elsewhere.csv")
     with pytest.raises(InputError, match=r"record-vectors-0\.csv is a symbolic link"):
-        recordfiles.import_csv(written[0])
+        recordfiles.read_record(written[0])
 
 
 def test_a_file_that_the_user_names_may_be_a_link(tmp_path):
@@ -509,7 +509,7 @@ with locked(sys.argv[1]):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no such lock there")
-def test_of_two_processes_on_one_output_the_second_is_told_who_writes(known, tmp_path):
+def test_of_two_processes_on_one_output_the_second_is_reported_who_writes(known, tmp_path):
     path = tmp_path / "runs.h5"
     other = subprocess.Popen(
         [sys.executable, "-c", HOLD, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -560,16 +560,16 @@ def test_a_campaign_goes_on_only_on_a_processor_that_rounds_alike(known, tmp_pat
         campaign.run(plan, path, runs=4, resume=True, chunk=4, machine="lanes")
 
 
-def test_the_arithmetic_tells_vectors_and_fused_multiply_add():
-    told = engine.arithmetic().split(", ")
-    assert len(told) == 3
-    assert told[1] in ("vectors", "no vectors")
-    assert told[2] in ("FMA", "no FMA")
+def test_the_arithmetic_names_vectors_and_fused_multiply_add():
+    parts = engine.arithmetic().split(", ")
+    assert len(parts) == 3
+    assert parts[1] in ("vectors", "no vectors")
+    assert parts[2] in ("FMA", "no FMA")
     cpu = Path("/proc/cpuinfo")
-    if told[0] == "x86_64" and cpu.exists():
+    if parts[0] == "x86_64" and cpu.exists():
         flags = next(line for line in cpu.read_text().splitlines() if line.startswith("flags")).split()
-        assert (told[2] == "FMA") == ("fma" in flags)
-        assert (told[1] == "vectors") == ({"fma", "avx2"} <= set(flags))
+        assert (parts[2] == "FMA") == ("fma" in flags)
+        assert (parts[1] == "vectors") == ({"fma", "avx2"} <= set(flags))
 
 
 # -------------------------------------------------------------------------------------------------------- the command line
@@ -596,11 +596,15 @@ def test_a_json_that_is_no_tuning_is_refused_with_its_place(tmp_path, content):
         report.write(tmp_path / "tuning.json")
 
 
-def test_the_refusal_of_a_tuning_names_the_entry(known, tmp_path):
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [("value", "2", "Input should be a valid number"), ("si_per_unit", 0, "Input should be greater than 0")],
+)
+def test_the_refusal_of_a_tuning_names_the_entry(known, tmp_path, key, value, words):
     tuning = json.loads(known["tuning.json"].content)
-    tuning["parameters"][0]["value"] = "2"
+    tuning["parameters"][0][key] = value
     (tmp_path / "tuning.json").write_text(json.dumps(tuning))
-    with pytest.raises(InputError, match=r"tuning\.json: parameters\.0\.value: Input should be a valid number"):
+    with pytest.raises(InputError, match=rf"tuning\.json: parameters\.0\.{key}: {words}"):
         report.write(tmp_path / "tuning.json")
 
 
@@ -613,7 +617,7 @@ def test_readers_of_vibration_and_dispersions_name_the_file(tmp_path):
         montecarlo.read_dispersions(tmp_path / "d.toml")
 
 
-def test_a_tuning_that_tells_no_unit_is_shown_in_si(known, tmp_path):
+def test_a_tuning_without_a_unit_is_shown_in_si(known, tmp_path):
     tuning = json.loads(known["tuning.json"].content)
     (tuning["parameters"][0]).update(value=0.0123, upper=0.0456)
     for key in ("unit", "si_per_unit"):

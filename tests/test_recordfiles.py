@@ -12,7 +12,7 @@ from strapdown import scenarios, vectors
 from strapdown.checks import InputError
 from strapdown.files import reading
 from strapdown.recordings import recordfiles
-from strapdown.recordings.recordfiles import export_csv, import_csv, read_record, read_record_file, write_record
+from strapdown.recordings.recordfiles import export_csv, read_record, read_record_file, write_record
 from strapdown.records import ImuRecord
 
 FAULTS = vectors.Faults(latency=0.05, outages=[(0.5, 0.7)])
@@ -47,7 +47,7 @@ def assert_equal(a, b):
             assert p is None or np.array_equal(p, q, equal_nan=True), (x.sensor, name)
 
 
-def test_hdf5_reads_back_equal_with_all_that_it_tells(made, tmp_path):
+def test_hdf5_reads_back_equal_with_all_that_it_holds(made, tmp_path):
     scenario, record = made
     path = tmp_path / "deep" / "record.h5"
     text = scenarios.scenario_to_toml(scenario)
@@ -89,7 +89,7 @@ def test_a_bare_record_needs_no_extras(tmp_path):
     assert back.gyro is None
     assert back.seed is None
     export_csv(tmp_path / "bare.csv", bare)
-    assert_equal(import_csv(tmp_path / "bare.csv"), bare)
+    assert_equal(read_record(tmp_path / "bare.csv"), bare)
 
 
 def test_csv_reads_back_equal(made, tmp_path):
@@ -98,7 +98,7 @@ def test_csv_reads_back_equal(made, tmp_path):
     record = made[1]
     # A constant reference of an empty series is the one thing that CSV cannot tell.
     kept = dataclasses.replace(record, vectors=tuple(s for s in record.vectors if len(s.time)))
-    back = import_csv(written[0])
+    back = read_record(written[0])
     assert_equal(dataclasses.replace(back, vectors=tuple(s for s in back.vectors if len(s.time))), kept)
 
 
@@ -107,15 +107,15 @@ def test_csv_reads_as_many_series_as_the_record_has(made, tmp_path):
     fewer = dataclasses.replace(made[1], vectors=made[1].vectors[:1])
     export_csv(tmp_path / "record.csv", made[1])
     written = export_csv(tmp_path / "record.csv", fewer)
-    assert_equal(import_csv(written[0]), fewer)
+    assert_equal(read_record(written[0]), fewer)
     written[1].unlink()
     with pytest.raises(InputError, match=r"record-vectors-0.csv does not exist, one of 1 vector series of record.csv"):
-        import_csv(written[0])
+        read_record(written[0])
     # A file that does not say has what is numbered in turn.
     first, rest = written[0].read_text().split("\n", 1)
     written[0].write_text("# strapdown record\n" + rest)
     assert "1 vector series" in first
-    assert import_csv(written[0]).vectors == ()
+    assert read_record(written[0]).vectors == ()
 
 
 def test_what_csv_cannot_hold_is_refused_before_anything_is_written(made, tmp_path):
@@ -185,12 +185,12 @@ def test_a_failed_write_leaves_the_old_file(made, tmp_path):
 def test_foreign_and_damaged_csv_is_refused(made, tmp_path):
     path = tmp_path / "record.csv"
     with pytest.raises(InputError, match="does not exist"):
-        import_csv(path)
+        read_record(path)
     export_csv(path, made[1])
     lines = path.read_text().splitlines()
     for content, message in (
-        ("", "does not begin"),
-        ("a,b\n1,2\n", "does not begin"),
+        ("", "cannot be read as HDF5"),
+        ("a,b\n1,2\n", "cannot be read as HDF5"),
         ("\n".join([lines[0], "time_s,x", "1,2"]), "columns"),
         ("\n".join([*lines[:5], lines[5][:40]]), "line 6"),
         ("\n".join([*lines[:4], lines[4].replace(lines[4].split(",")[2], "abc")]), "line 5"),
@@ -199,15 +199,15 @@ def test_foreign_and_damaged_csv_is_refused(made, tmp_path):
     ):
         path.write_text(content)
         with pytest.raises(InputError, match=message):
-            import_csv(path)
+            read_record(path)
     path.write_bytes(b"\xff\xfe\x00\x01")
     with pytest.raises(InputError, match="cannot be read"):
-        import_csv(path)
+        read_record(path)
     export_csv(path, made[1])
     beside = tmp_path / "record-vectors-1.csv"
     beside.write_text(beside.read_text().replace('"magnetometer"', "magnetometer"))
     with pytest.raises(InputError, match="not a vector series"):
-        import_csv(path)
+        read_record(path)
     assert recordfiles.KIND == "strapdown record"
 
 
@@ -218,9 +218,9 @@ def test_a_row_without_an_increment_is_named_with_what_to_do(tmp_path):
     cells = lines[4].split(",")
     path.write_text("\n".join([*lines[:4], ",".join([*cells[:2], "nan", cells[3]]), *lines[5:]]))
     with pytest.raises(InputError, match="line 5: increment_y_rad is nan; leave the row out"):
-        import_csv(path)
+        read_record(path)
     path.write_text("\n".join([*lines[:4], *lines[5:]]))
-    np.testing.assert_array_equal(import_csv(path).time, [0.0, 1.0, 3.0, 4.0])
+    np.testing.assert_array_equal(read_record(path).time, [0.0, 1.0, 3.0, 4.0])
 
 
 def test_missing_samples_of_every_kind_go_through_both_files(made, tmp_path):
@@ -234,13 +234,13 @@ def test_missing_samples_of_every_kind_go_through_both_files(made, tmp_path):
     record = dataclasses.replace(record, vectors=tuple(s for s in holed if len(s.time)))
     write_record(tmp_path / "record.h5", record)
     assert_equal(read_record(tmp_path / "record.h5"), record)
-    assert_equal(import_csv(export_csv(tmp_path / "record.csv", record)[0]), record)
+    assert_equal(read_record(export_csv(tmp_path / "record.csv", record)[0]), record)
 
 
 def test_csv_cut_at_the_end_of_a_line_is_refused(made, tmp_path):
     written = export_csv(tmp_path / "record.csv", made[1])
     empty = next(k for k, series in enumerate(made[1].vectors) if not len(series.time))
-    assert import_csv(written[0]).vectors[empty].time.shape == (0,)
+    assert read_record(written[0]).vectors[empty].time.shape == (0,)
     for path in written[:2]:
         whole = path.read_text()
         lines = whole.splitlines()
@@ -249,12 +249,12 @@ def test_csv_cut_at_the_end_of_a_line_is_refused(made, tmp_path):
             with pytest.raises(
                 InputError, match=rf"{path.name} ends at .* s, its first line states .* s; it was truncated or"
             ):
-                import_csv(written[0])
+                read_record(written[0])
         path.write_text(whole)
     lines = written[1].read_text().splitlines()
     written[1].write_text("\n".join(lines[:2]) + "\n")
     with pytest.raises(InputError, match=r"record-vectors-0.csv ends at None s"):
-        import_csv(written[0])
+        read_record(written[0])
 
 
 def test_csv_leaves_no_series_of_an_earlier_record(made, tmp_path):
@@ -266,14 +266,13 @@ def test_csv_leaves_no_series_of_an_earlier_record(made, tmp_path):
     assert sorted(tmp_path.iterdir()) == sorted([*earlier[:2], other])
 
 
-def test_csv_tells_how_it_was_made_as_hdf5_does(made, tmp_path):
+def test_csv_says_how_it_was_made_as_hdf5_does(made, tmp_path):
     scenario, record = made
-    told = {"gyro_spec": scenario.gyro, "scenario": scenarios.scenario_to_toml(scenario), "seed": 3, "run": 1}
-    path = export_csv(tmp_path / "record.csv", record, **told)[0]
+    making = {"gyro_spec": scenario.gyro, "scenario": scenarios.scenario_to_toml(scenario), "seed": 3, "run": 1}
+    path = export_csv(tmp_path / "record.csv", record, **making)[0]
     back = read_record_file(path)
     assert recordfiles.is_record(path)
-    assert_equal(read_record(path), import_csv(path))
-    assert (back.gyro, back.scenario, back.seed, back.run) == tuple(told.values())
+    assert (back.gyro, back.scenario, back.seed, back.run) == tuple(making.values())
     first, rest = path.read_text().split("\n", 1)
     path.write_text(first.replace('"seed"', '"sead"') + "\n" + rest)
     with pytest.raises(InputError, match="line 1: how it was made cannot be read"):
@@ -304,7 +303,7 @@ def test_units_and_conventions_that_contradict_are_refused(made, tmp_path, where
     assert_equal(read_record(path), made[1])
 
 
-def test_a_series_without_sigma_is_told_so(made, tmp_path):
+def test_a_series_without_sigma_is_reported_so(made, tmp_path):
     path = tmp_path / "record.h5"
     write_record(path, made[1])
     with changed(path) as file:

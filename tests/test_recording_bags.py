@@ -224,9 +224,10 @@ def test_a_message_of_another_layout_is_named(bag):
     """A type of the right name and another definition: its message is too short."""
     from strapdown.recordings import ros
 
-    topic = ros._Topic("/imu", ros.IMU, [0, 1], [bytes([0, 1, 0, 0]) + bytes(340), bytes([0, 1, 0, 0]) + bytes(20)])
+    topic = ros._Topic("/imu", ros.IMU)
+    topic.add([(None, k, bytes([0, 1, 0, 0]) + bytes(size)) for k, size in enumerate((340, 20))])
     with pytest.raises(InputError, match=r"x.bag, topic /imu: message 2 is 24 bytes long, shorter than its type"):
-        ros._decoded("x.bag", topic, True)
+        ros._joined("x.bag", topic)
 
 
 def walk(n: int = 60, epoch: int = START) -> Recording:

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from strapdown import estimation, recordings
 from strapdown.checks import InputError
 from strapdown.cli import app
-from strapdown.recordings import Recording, read, recordfiles
+from strapdown.recordings import Recording, read, recordfiles, samples
 from strapdown.records import ImuRecord
 
 HEADER = "time,gx [rad/s],gy,gz,ax [m/s2],ay,az"
@@ -107,13 +107,13 @@ def test_undeclared_units_are_refused_not_guessed(csv):
     refused(csv("time,gx [rad/s],gy,gz,ax,ay,az"), "unit of its accelerometer", "ax [m/s2]", "m/s2 or g")
 
 
-def test_units_of_other_sensors_need_not_be_told_where_the_gyro_alone_is_used(csv, tmp_path):
+def test_units_of_other_sensors_need_not_be_reported_where_the_gyro_alone_is_used(csv, tmp_path):
     path = csv("time,gx [rad/s],gy,gz,ax,ay,az")
     refused(path, "unit of its accelerometer")
     alone = read(path, gyro_alone=True)
     assert alone.specific_force is None
     assert read(csv(), gyro_alone=True).specific_force is None
-    assert np.array_equal(recordings.read_gyro(path).values, alone.rate)
+    assert np.array_equal(recordings.read_samples(path, "gyro").values, alone.rate)
     status = CliRunner().invoke(
         app, ["integrate", str(path), "--algorithm", "one-sample", "--out", str(tmp_path / "a.h5")]
     )
@@ -156,14 +156,14 @@ def test_other_separators_are_read_and_their_decimals_may_have_commas(csv, mark)
         np.testing.assert_array_equal(recording.specific_force, plain.specific_force)
 
 
-def test_decimal_commas_between_commas_are_told(csv):
+def test_decimal_commas_between_commas_are_reported(csv):
     commas = "0,00,0,1,0,2,0,3,1,0,2,0,9,8"
     refused(csv(rows=[commas]), "data row 1 has 14 fields, the header 7", "decimals seem to have commas: write points")
     refused(csv(rows=[ROWS[0] + ",1.5"]), "8 fields", "truncated or damaged")
 
 
 @pytest.mark.parametrize(("columns", "name"), [("ax [m/s2],ay,az", "specific_force"), ("mx,my,mz", "magnetic_field")])
-def test_a_sensor_of_zeros_is_told(csv, columns, name):
+def test_a_sensor_of_zeros_is_reported(csv, columns, name):
     rows = [f"{k / 100},0.1,0.2,0.3,0,0,{'' if k == 1 else 0}" for k in range(3)]
     refused(csv(f"time,gx [rad/s],gy,gz,{columns}", rows), f"{name} is 0 in every row", "leave its columns out")
     read(csv(f"time,gx [rad/s],gy,gz,{columns}", [*rows, "1,1,1,1,0,0,1"]))
@@ -205,7 +205,7 @@ def test_an_infinite_rate_is_refused(csv, bad):
 
 
 @pytest.mark.parametrize("bad", ["nan", "", " "])
-def test_rows_without_a_gyro_sample_are_left_out_and_told(csv, bad):
+def test_rows_without_a_gyro_sample_are_left_out_and_reported(csv, bad):
     """What the turn across them is nobody knows: the intervals beside one are joined, and a filter's covariance grows over all of it."""
     rows = [f"{0.01 * k:.2f},{0.1 * k},0,0,{k},2,9" for k in range(8)]
     for k in (0, 3, 4):
@@ -227,7 +227,7 @@ def test_rows_without_a_gyro_sample_are_left_out_and_told(csv, bad):
     np.testing.assert_allclose(np.diff(growth), 1e-6 * np.diff(recording.time), rtol=1e-6)
 
 
-def test_rows_that_repeat_the_row_before_are_left_out_and_told(csv):
+def test_rows_that_repeat_the_row_before_are_left_out_and_reported(csv):
     """A logger that writes a row twice; the same stamp with another sample is refused, and named."""
     rows = [f"{0.01 * k:.2f},{0.1 * k},0,0,{k},2,9" for k in range(6)]
     once = read(csv(rows=rows))
@@ -252,7 +252,7 @@ def test_a_file_of_hardly_a_gyro_sample_is_refused(csv):
     refused(csv(rows=[ROWS[0], "0.02,,0,0,0,0,9", "0.01,1,0,0,0,0,9", ROWS[2]]), "time[2] goes back to 0.01 s")
 
 
-def test_what_is_missing_is_told_where_a_recording_is_used(csv, tmp_path):
+def test_what_is_missing_is_reported_where_a_recording_is_used(csv, tmp_path):
     rows = [f"{0.01 * k:.2f},{'' if k in (150, 151) else 0.0},0,0,0,0,9.8" for k in range(300)]
     path = csv(rows=rows)
     for command in (
@@ -263,7 +263,7 @@ def test_what_is_missing_is_told_where_a_recording_is_used(csv, tmp_path):
         assert result.exit_code == 0, result.output
         assert "2 rows without a gyro sample, the first at 1.500 s, were left out" in " ".join(result.output.split())
     with pytest.raises(InputError, match=r"the interval after 1.49 s is 0.03 s"):
-        recordings.read_gyro(path)
+        recordings.read_samples(path, "gyro")
 
 
 def test_infinite_accelerations_are_refused(csv):
@@ -277,7 +277,7 @@ def test_stamps_out_of_order_are_refused(csv):
     refused(csv(rows=[ROWS[0], ",0,0,0,0,0,9"]), "time[1] is nan")
 
 
-def test_stamps_with_too_few_digits_are_told_as_they_stand(csv):
+def test_stamps_with_too_few_digits_are_reported_as_they_stand(csv):
     rows = [f"{1.7e9 + 0.01 * k:.10g},{0.1 * k},0,0,0,0,9" for k in range(300)]
     refused(
         csv(rows=rows),
@@ -386,7 +386,7 @@ def test_a_sampling_rate_that_is_none_is_refused(hdf5, rate):
 
 
 def test_units_for_hdf5_are_refused(hdf5):
-    """Its layout says the units; an option that does nothing would be believed."""
+    """Its layout says the units; an option without effect would mislead."""
     with pytest.raises(InputError, match="unit"):
         read(hdf5(), units={"gyro": "deg/s"})
 
@@ -464,3 +464,15 @@ def test_few_repeated_stamps_are_left_out_whatever_their_samples(tmp_path):
     np.savetxt(path, values[195:205], delimiter=",", header="time,gx [rad/s],gy,gz", comments="")
     with pytest.raises(InputError, match="time"):
         read(path)
+
+
+@pytest.mark.parametrize(("shift", "even"), [(0.2, False), (0.3, True)])
+def test_stamps_that_stray_by_more_than_a_quarter_of_the_interval_are_assumed_even(shift, even):
+    """A stamp off by a share of 10 ms, and a second later ten samples lost, which are a gap either way."""
+    time = 0.01 * np.delete(np.arange(200.0), np.s_[150:160])
+    time[40] += 0.01 * shift
+    interval, place, words = samples._grid("log", time)
+    assert interval == pytest.approx(0.01, rel=1e-3)
+    np.testing.assert_array_equal(place, np.delete(np.arange(200), np.s_[150:160]))
+    assert [word.split()[0] for word in words] == (["Intervals", "10"] if even else ["10"])
+    assert not even or f"stray by up to {10.0 * shift:.3g} ms" in words[0]

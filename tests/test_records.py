@@ -103,7 +103,7 @@ def test_compress(name):
     np.testing.assert_array_equal(small.truth.bias, r.truth.bias[: kept * n + 1 : n])
     assert small.increments.shape == (kept, 3)
     assert small.vectors == r.vectors
-    if n == 2:  # the two-sample algorithm, written out; of unequal intervals, tests/test_coning_uneven.py tells
+    if n == 2:  # the two-sample algorithm, written out; of unequal intervals, see tests/test_coning_uneven.py
         even = compress(dataclasses.replace(r, time=5.0 + np.arange(14.0)), algorithm)
         first, second = r.increments[0:26:2][:kept], r.increments[1:26:2][:kept]
         np.testing.assert_allclose(even.increments, first + second + 2.0 / 3.0 * np.cross(first, second), atol=1e-16)
@@ -194,13 +194,13 @@ def test_estimate_round_trip_is_exact(tmp_path, full):
     assert [path.name for path in (tmp_path / "new folder").iterdir()] == ["estimate.h5"]
 
 
-def test_estimate_file_tells_units_conventions_and_attributes(tmp_path):
+def test_estimate_file_holds_units_conventions_and_attributes(tmp_path):
     write_estimate(tmp_path / "estimate.h5", estimate(full=True), {"source": "test", "parameter.sigma": 0.5})
     with reading.hdf5(tmp_path / "estimate.h5") as file:
-        told = reading.attributes(file)
-        assert told["conventions"] == CONVENTIONS
-        assert told["version"] == strapdown.__version__
-        assert (told["source"], told["parameter.sigma"]) == ("test", 0.5)
+        attributes = reading.attributes(file)
+        assert attributes["conventions"] == CONVENTIONS
+        assert attributes["version"] == strapdown.__version__
+        assert (attributes["source"], attributes["parameter.sigma"]) == ("test", 0.5)
         units = {
             name: reading.attributes(file[name])["unit"]
             for name in ("time", "attitude", "bias", "variance", "covariance")
@@ -310,7 +310,7 @@ def test_what_no_filter_estimates_is_refused(tmp_path, name, damage, words):
         (read_truth if name.startswith("truth") else read_estimate)(path)
 
 
-def test_a_turn_that_nothing_makes_is_told_by_its_place():
+def test_a_turn_that_nothing_makes_is_reported_by_its_place():
     """Deep inside it would end as an attitude of NaN."""
     increments = np.zeros((4, 3))
     increments[2, 1] = -1e10
@@ -318,7 +318,7 @@ def test_a_turn_that_nothing_makes_is_told_by_its_place():
         ImuRecord(time=0.5 * np.arange(5), increments=increments)
 
 
-def test_vectors_that_are_none_are_told():
+def test_vectors_that_are_none_are_reported():
     with pytest.raises(InputError, match=r"vectors is None.*give a tuple of series, empty for none"):
         ImuRecord(time=[0.0, 1.0], increments=np.zeros((1, 3)), vectors=None)
 

@@ -1,7 +1,7 @@
 """Every numbered equation of *Quaternion differentiation*, (1) to (18), by its number.
 
-The oracle is one rotating body, told in 50 digits by three Euler angles that change with time: its attitude as a product of 2×2 complex
-matrices, its rates from the derivative of its rotation matrix. Derivatives are mpmath's. The package under test enters none of it.
+The oracle is one rotating body, evaluated to 50 digits by three Euler angles that change with time: its attitude as a product of 2×2
+complex matrices, its rates from the derivative of its rotation matrix. Derivatives are mpmath's. The package under test enters none of it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Errors against a reference, as the BROAD benchmark tells them, against formulas of their own on SciPy rotations."""
+"""Errors against a reference, as the BROAD benchmark defines them, against formulas of their own on SciPy rotations."""
 
 from __future__ import annotations
 

@@ -83,7 +83,8 @@ def test_a_campaign_does_not_replace_a_json_of_another_maker(folder, tmp_path):
 
 @pytest.mark.parametrize("value", [10**30, -(10**30), float("inf"), float("nan"), 2.0**63])
 def test_counts_too_large_are_refused_by_name(value):
-    with pytest.raises(InputError, match="seed"):
+    below = " and below 2\\^63" if isinstance(value, int) else ""
+    with pytest.raises(InputError, match=f"seed is .*; it must be a whole number of 1 or more,?{below}$"):
         count("seed", value)
 
 
@@ -155,7 +156,7 @@ def test_causes_are_sought_in_the_record_that_was_estimated(folder, tmp_path):
     assert "made from another record" in said
 
 
-def test_the_filter_that_the_estimate_tells_is_enough_to_seek_causes(folder):
+def test_the_filter_in_the_estimate_is_enough_to_seek_causes(folder):
     command = ["check", str(folder / "run" / "estimate.h5"), "--record", str(folder / "record.h5")]
     result = CliRunner().invoke(cli.app, command)
     assert result.exit_code in (0, 2), result.output
@@ -193,7 +194,9 @@ def test_no_cause_is_named_of_a_filter_that_the_search_does_not_know(folder, sho
     assert set(diagnosis) == {"not_looked_for", "without_a_state"}
 
 
-def test_what_the_record_specifies_and_the_filter_has_no_state_for_is_told_beside_the_causes(folder, short, tmp_path):
+def test_what_the_record_specifies_and_the_filter_has_no_state_for_is_reported_beside_the_causes(
+    folder, short, tmp_path
+):
     spec = dataclasses.replace(short.gyro, scale_factor=np.full(3, 1e-3))
     held = recordfiles.read_record_file(folder / "record.h5")
     toml = scenarios.scenario_to_toml(dataclasses.replace(short, gyro=spec))
@@ -216,7 +219,7 @@ def test_errors_are_taken_at_the_same_times(folder):
         consistency.errors(estimate.attitude, estimate.bias, estimate.attitude[:-1], estimate.bias[:-1])
 
 
-def test_numbers_that_nothing_can_be_are_told_before_anything_else(there, tmp_path):
+def test_numbers_that_nothing_can_be_are_reported_before_anything_else(there, tmp_path):
     for command in (
         ["montecarlo", "short.toml", "--runs", 0, "--out", tmp_path / "x.h5"],
         ["check", "run/estimate.h5", "--probability", 1],
@@ -226,7 +229,7 @@ def test_numbers_that_nothing_can_be_are_told_before_anything_else(there, tmp_pa
 
 
 @pytest.mark.parametrize("command", ["check", "report", "estimate", "integrate", "doctor", "tune", "allan"])
-def test_a_folder_for_a_file_is_told_in_one_line(tmp_path, command):
+def test_a_folder_for_a_file_is_reported_in_one_line(tmp_path, command):
     (tmp_path / "d.h5").mkdir()
     said = refused([command, tmp_path / "d.h5", *(["--algorithm", "one-sample"] if command == "integrate" else [])])
     assert said.startswith(f"{tmp_path / 'd.h5'} is a folder; name ")
@@ -284,7 +287,7 @@ def there(folder, monkeypatch):
 
 
 def refused_at_once(command):
-    """Return what a command says in refusing, and hold it to having told and made nothing before."""
+    """Return what a command says in refusing, and check that it printed and wrote nothing before."""
     result = CliRunner().invoke(cli.app, [str(part) for part in command])
     assert isinstance(result.exception, InputError), (result.exception, result.output)
     assert result.output == ""
@@ -304,7 +307,7 @@ def test_every_command_that_writes_is_held_to_it():
 
 
 @pytest.mark.parametrize(("name", "file"), [(name, file) for name, (_, files) in FOLDERS.items() for file in files])
-def test_a_folder_in_the_place_of_a_result_is_told_before_the_work(there, tmp_path, name, file):
+def test_a_folder_in_the_place_of_a_result_is_reported_before_the_work(there, tmp_path, name, file):
     (tmp_path / file).mkdir()
     said = refused_at_once([*FOLDERS[name][0], "--out", tmp_path])
     assert f"{tmp_path / file} is a folder" in said
@@ -314,7 +317,7 @@ def test_a_folder_in_the_place_of_a_result_is_told_before_the_work(there, tmp_pa
 @pytest.mark.parametrize(
     ("name", "file"), [(name, file) for name, (_, *files) in FILES.items() for file in (files[0], *files[1])]
 )
-def test_a_folder_in_the_place_of_a_file_is_told_before_the_work(there, tmp_path, name, file):
+def test_a_folder_in_the_place_of_a_file_is_reported_before_the_work(there, tmp_path, name, file):
     command, target, _ = FILES[name]
     if (name, file) == ("montecarlo replay", target):
         return  # names the campaign, which a replay leaves as it is
@@ -326,13 +329,13 @@ def test_a_folder_in_the_place_of_a_file_is_told_before_the_work(there, tmp_path
 
 @pytest.mark.parametrize("name", [*FOLDERS, *FILES])
 @pytest.mark.parametrize("place", ["below a file", "not to be written"])
-def test_a_place_that_cannot_be_written_is_told_before_the_work(there, tmp_path, monkeypatch, name, place):
+def test_a_place_that_cannot_be_written_is_reported_before_the_work(there, tmp_path, monkeypatch, name, place):
     command, target = (FILES[name][0], FILES[name][1]) if name in FILES else ([*FOLDERS[name][0], "--out"], "")
     if place == "below a file":
         (tmp_path / "a").write_text("")
         said = refused_at_once([*command, tmp_path / "a" / "b" / target])
         assert f"{tmp_path / 'a'} is a file" in said
-    else:  # told by the system, whoever runs the tests
+    else:  # reported by the system, whoever runs the tests
         monkeypatch.setattr("os.access", lambda path, mode, **_: not mode & os.W_OK)
         said = refused_at_once([*command, tmp_path / "b" / target])
         assert f"{tmp_path} may not be written" in said
@@ -364,7 +367,9 @@ def test_missing_folders_above_a_result_are_made(there, tmp_path, name):
         (("rate_hz = 1.0", "rate_hz = 1e9"), "star 1 would measure 2e+10 times"),
     ],
 )
-def test_scenarios_of_impossible_numbers_are_told_by_their_keys(folder, tmp_path, monkeypatch, command, change, words):
+def test_scenarios_of_impossible_numbers_are_reported_by_their_keys(
+    folder, tmp_path, monkeypatch, command, change, words
+):
     monkeypatch.chdir(tmp_path)
     text = (folder / "short.toml").read_text(encoding="utf-8")
     assert change[0] in text
@@ -405,9 +410,9 @@ def test_covariance_refuses_errors_that_nothing_has(there, tmp_path, options, wo
     ("command", "source"),
     [("estimate", "record.h5"), ("tune", "record.h5"), ("montecarlo", "short.toml"), ("covariance", "short.toml")],
 )
-def test_sigma_of_an_angle_in_another_unit_is_told(folder, short, tmp_path, command, source):
-    believed = dataclasses.replace(setup.matched(short), sigma={"star 1": 20.0})
-    (tmp_path / "filter.toml").write_text(setup.to_toml(believed))
+def test_sigma_of_an_angle_in_another_unit_is_reported(folder, short, tmp_path, command, source):
+    filter_setup = dataclasses.replace(setup.matched(short), sigma={"star 1": 20.0})
+    (tmp_path / "filter.toml").write_text(setup.to_toml(filter_setup))
     out = tmp_path / {"tune": "new.toml", "montecarlo": "new.h5"}.get(command, "new")
     said = refused([command, folder / source, "--filter", tmp_path / "filter.toml", "--out", out])
     assert "sigma: star 1 is 20 rad, beyond half a turn; sigma is in rad, and 20 arcsec would be 9.696e-05" in said
@@ -441,7 +446,7 @@ def test_a_budget_of_no_vibration_is_refused(folder, tmp_path):
     assert "an amplitude of 90°" in refused(["coning-budget", "--psd", tmp_path / "lines.csv", "--rate", 100])
 
 
-def test_integration_tells_of_samples_that_fill_no_step(there, tmp_path):
+def test_integration_reports_samples_that_fill_no_step(there, tmp_path):
     rows = "".join(f"{k / 100.0},0.1,0.2,0.3\n" for k in range(8))
     (tmp_path / "short.csv").write_text("time [s],gx [rad/s],gy,gz\n" + rows, encoding="utf-8")
     out = ["--out", str(tmp_path / "attitude.h5")]

@@ -56,8 +56,11 @@ def folder(tmp_path_factory, scenario, filter_setup):
         scenario=dataclasses.replace(scenario, duration=20.0), setup=filter_setup, epochs=25, nis_bins=20
     )
     campaign.run(plan, where / "campaign.h5", runs=16)
-    for name in ("right", "blind", "wrong", "campaign"):
+    for name in ("right", "blind", "campaign"):
         report.write(where / f"{name}.h5")
+    result = CliRunner().invoke(cli.app, ["report", str(where / "wrong.h5"), "-o", str(where / "wrong.html")])
+    assert result.exit_code == 0, result.output
+    assert "not consistent" in result.output
     return where
 
 
@@ -117,12 +120,12 @@ def test_without_truth_the_page_says_what_it_cannot_show(folder):
     assert "without a truth only the innovations are judged" in body(folder / "blind.html")
 
 
-def test_the_campaign_page_tells_how_to_replay_its_worst_run(folder):
+def test_the_campaign_page_says_how_to_replay_its_worst_run(folder):
     statistics = json.loads((folder / "campaign.report.json").read_text())
     assert f"campaign.h5 --replay {statistics['worst_runs'][0]}" in body(folder / "campaign.html")
 
 
-def test_the_campaign_page_tells_what_the_filter_has_no_state_for(folder, scenario, filter_setup, tmp_path):
+def test_the_campaign_page_says_what_the_filter_has_no_state_for(folder, scenario, filter_setup, tmp_path):
     assert "no state for" not in body(folder / "campaign.html")
     assert ">reason<" not in body(folder / "campaign.html")
     held = campaign.read(folder / "campaign.h5")
@@ -291,14 +294,6 @@ def test_a_folder_without_a_name_is_no_result(place):
         report.write(place)
     found = CliRunner().invoke(cli.app, ["report", place])
     assert isinstance(found.exception, InputError)
-
-
-def test_the_command_says_the_verdict_and_where_the_page_is(folder, tmp_path):
-    result = CliRunner().invoke(cli.app, ["report", str(folder / "wrong.h5"), "-o", str(tmp_path / "out.html")])
-    assert result.exit_code == 0, result.output
-    assert "not consistent" in result.output
-    assert (tmp_path / "out.html").exists()
-    assert (tmp_path / "out.report.json").exists()
 
 
 PROBE = """<script>window.addEventListener("load", () => setTimeout(() => {

@@ -133,7 +133,7 @@ def test_a_gate_that_refuses_nothing_is_the_plain_filter():
 
 
 def lost_runs(runs, recovery=10, every=50):
-    """Runs that start anywhere at all, and believe themselves right to half a degree."""
+    """Runs that start anywhere at all, with an initial σ of half a degree."""
     estimates, made = [], []
     for run in range(runs):
         record = simulate(scenario(), 3, run)
@@ -185,7 +185,7 @@ def stepped_bias(record, step, at):
 
 @pytest.mark.parametrize("runs", [40, pytest.param(400, marks=pytest.mark.slow)])
 def test_a_bias_step_is_recovered_from(runs):
-    """The gyro bias jumps by 3 °/s, 900 times its standard deviation by then: refused at once, learnt anew, believed with right."""
+    """The gyro bias jumps by 3 °/s, 900 times its standard deviation by then: refused at once, estimated anew, consistent."""
     step = np.array([0.03, -0.03, 0.03])
     estimates, made = [], []
     gate = Gate(restart_bias_sigma=0.03)
@@ -269,7 +269,7 @@ def test_a_long_run_after_a_step_is_right_to_its_end():
         assert quaternion.angle_between(estimate.attitude[-1], record.truth.attitude[-1]) < 3e-3
 
 
-def test_the_restart_is_as_wide_as_the_start_unless_told():
+def test_the_restart_is_as_wide_as_the_start_by_default():
     P = np.diag([1.0, 1.0, 1.0, 4.0, 9.0, 16.0])
     assert np.array_equal(Gate().restart_bias_variance(P), [4.0, 9.0, 16.0])
     assert np.array_equal(Gate(restart_bias_sigma=3.0).restart_bias_variance(P), [9.0, 9.0, 9.0])
@@ -283,17 +283,17 @@ def test_the_restart_is_as_wide_as_the_start_unless_told():
 
 
 @pytest.mark.parametrize("factor", [5.0, 30.0])
-def test_a_filter_that_believes_far_too_little_noise_says_that_it_is_locked_out(factor):
+def test_a_filter_that_models_far_too_little_noise_says_that_it_is_locked_out(factor):
     record = simulate(scenario(duration=60.0), 5)
-    believed = replace(record, vectors=tuple(s.noise_scaled(1.0 / factor) for s in record.vectors))
-    estimate = estimation.run(believed, NOISE, started(record, 0), gate=Gate())
-    told = [event for event in estimate.events if event.kind == "lock-out"]
-    assert {event.sensor for event in told} == {"a", "b"}
+    modelled = replace(record, vectors=tuple(s.noise_scaled(1.0 / factor) for s in record.vectors))
+    estimate = estimation.run(modelled, NOISE, started(record, 0), gate=Gate())
+    lock_outs = [event for event in estimate.events if event.kind == "lock-out"]
+    assert {event.sensor for event in lock_outs} == {"a", "b"}
     assert sum(estimate.refused.values()) > 1000
-    assert sum(event.value for event in told) > 0.9 * sum(estimate.refused.values())
-    assert f"measurements of {told[0].sensor} were rejected" in str(told[0])
+    assert sum(event.value for event in lock_outs) > 0.9 * sum(estimate.refused.values())
+    assert f"measurements of {lock_outs[0].sensor} were rejected" in str(lock_outs[0])
     if not recoveries(estimate):
-        assert estimation.smooth(believed, NOISE, started(record, 0), gate=Gate()).events == estimate.events
+        assert estimation.smooth(modelled, NOISE, started(record, 0), gate=Gate()).events == estimate.events
 
 
 def test_outliers_alone_lead_to_no_event():
@@ -319,55 +319,55 @@ def test_a_record_in_parts_recovers_as_the_whole_does(case):
         noise = 0.03
     record = replace(record, vectors=tuple(s.noise_scaled(noise) for s in record.vectors))
     whole, _ = estimation.run_part(record, NOISE, start, gate=Gate(), full_covariance=True)
-    state, parts, told = start, [], []
+    state, parts, reported = start, [], []
     for first, last in ((0, 23), (23, 250), (250, 337), (337, 600)):
         part, state = estimation.run_part(
             records.cut(record, first, last), NOISE, state, gate=Gate(), full_covariance=True
         )
         parts.append(part)
-        told += [event for event in part.events if event.kind == "recovery" or last == 600]
+        reported += [event for event in part.events if event.kind == "recovery" or last == 600]
     for name in ("attitude", "bias", "covariance"):
         joined = np.concatenate([getattr(parts[0], name)[:1], *(getattr(part, name)[1:] for part in parts)])
         assert np.array_equal(joined, getattr(whole, name)), name
-    assert sorted(map(str, told)) == sorted(map(str, whole.events))
+    assert sorted(map(str, reported)) == sorted(map(str, whole.events))
     assert whole.events
 
 
 def test_a_record_in_single_intervals_recovers_as_the_whole_does():
-    """Most refusals that lead to the recovery are of earlier parts: that in which it comes holds one measurement, and tells of it."""
+    """Most refusals that lead to the recovery are of earlier parts: the part in which it comes holds one measurement, and reports it."""
     record = simulate(scenario(duration=3.0), 4)
     start = started(record, 0)
     start = replace(start, attitude=quaternion.multiply(start.attitude, quaternion.exp([0.0, 1.57, 0.0])))
     in_turn = tuple(s.taken(np.arange(len(s.time)) % 2 == k) for k, s in enumerate(record.vectors))
     record = replace(record, vectors=in_turn)
     whole, end = estimation.run_part(record, NOISE, start, gate=Gate())
-    state, told = start, []
+    state, reported = start, []
     for k in range(len(record.increments)):
         part, state = estimation.run_part(records.cut(record, k, k + 1), NOISE, state, gate=Gate())
-        told += [event for event in part.events if event.kind == "recovery"]
+        reported += [event for event in part.events if event.kind == "recovery"]
         assert np.array_equal(part.attitude[1], whole.attitude[k + 1])
-    assert told == recoveries(whole) != []
+    assert reported == recoveries(whole) != []
     assert np.array_equal(state.covariance, end.covariance)
 
 
 def judged(outcomes, recovery=3, limit=4):
     """Rows of a gate with two sensors after outcomes (sensor, filter's, candidate's or None); verdicts, recoveries and lock-outs."""
-    memory, standing = np.zeros(gate_rules.MEMORY), np.zeros((2, gate_rules.STANDING))
-    standing[:, gate_rules.REPORTED] = -1.0
-    lock_outs, told, found = np.zeros((9, 4)), 0, []
+    memory, counters = np.zeros(gate_rules.MEMORY), np.zeros((2, gate_rules.STANDING))
+    counters[:, gate_rules.REPORTED] = -1.0
+    lock_outs, count, found = np.zeros((9, 4)), 0, []
     for k, (sensor, mine, other) in enumerate(outcomes):
-        told, begins = gate_rules.judge_filter(
-            mine, float(k), sensor, recovery, limit, standing, memory, lock_outs, told
+        count, begins = gate_rules.judge_filter(
+            mine, float(k), sensor, recovery, limit, counters, memory, lock_outs, count
         )
         if begins:
             gate_rules.reset_candidate(memory, float(k), np.zeros(3), np.ones(3))
         if memory[gate_rules.CANDIDATE]:
-            found.append(gate_rules.judge_candidate(other, 2.0, 2, sensor, standing, memory, np.zeros(3)))
-    return memory, standing, lock_outs[:told], found
+            found.append(gate_rules.judge_candidate(other, 2.0, 2, sensor, counters, memory, np.zeros(3)))
+    return memory, counters, lock_outs[:count], found
 
 
 def test_the_rules_of_a_gate():
-    """Plain numbers: when a candidate is dropped, believed, wider; what is told; what a widening sets back."""
+    """Plain numbers: when a candidate is dropped, accepted, wider; what is reported; what a widening resets."""
     dropped, followed, narrow = gate_rules.DROPPED, gate_rules.FOLLOWED, gate_rules.TOO_NARROW
     refused, both = (0, REFUSED, ACCEPTED), (0, REFUSED, REFUSED)
     assert judged([refused, refused, (0, ACCEPTED, ACCEPTED)])[3] == [followed, followed, dropped]
@@ -375,35 +375,35 @@ def test_the_rules_of_a_gate():
         followed,
         followed,
     ]  # of which the other sensor is none refused
-    memory, standing, lock_outs, found = judged([refused, both, both])
+    memory, counters, lock_outs, found = judged([refused, both, both])
     assert found == [followed, followed, dropped]  # two misses are more than 1 + half of one hit
     assert (memory[gate_rules.LEVEL], memory[gate_rules.CANDIDATE]) == (1.0, 0.0)
     assert judged([refused] * 6 + [both] * 3)[3][-2:] == [followed, dropped]  # three in a row
     assert judged([refused] * 6 + [both] * 2 + [refused, both])[3][-1] == followed
     assert judged([refused] * 3 + [(0, ACCEPTED, ACCEPTED)] * 2)[1][0, gate_rules.EXCESS] == 1.0
-    memory, standing, _, _ = judged([(0, REFUSED, PASSED_OVER)] * 4)
-    assert not gate_rules.takes_over(0, 3, standing, memory)
-    memory, standing, lock_outs, found = judged([(1, ACCEPTED, None)] * 14 + [refused, both, both, refused])
+    memory, counters, _, _ = judged([(0, REFUSED, PASSED_OVER)] * 4)
+    assert not gate_rules.takes_over(0, 3, counters, memory)
+    memory, counters, lock_outs, found = judged([(1, ACCEPTED, None)] * 14 + [refused, both, both, refused])
     assert memory[gate_rules.LEVEL] == 1.0
     for accepted, level in ((14, 1.0), (15, 0.0)):  # 5 × 3 accepted since
         memory, _, _, _ = judged([refused, both, both] + [(1, ACCEPTED, ACCEPTED)] * accepted + [refused])
         assert memory[gate_rules.LEVEL] == level
-    memory, standing, lock_outs, found = judged([refused] * 6)
+    memory, counters, lock_outs, found = judged([refused] * 6)
     assert [list(row) for row in lock_outs] == [[0.0, 5.0, 0.0, 6.0]]
-    assert gate_rules.takes_over(0, 3, standing, memory)
-    assert not gate_rules.takes_over(1, 3, standing, memory)
-    assert not gate_rules.takes_over(0, 7, standing, memory)
+    assert gate_rules.takes_over(0, 3, counters, memory)
+    assert not gate_rules.takes_over(1, 3, counters, memory)
+    assert not gate_rules.takes_over(0, 7, counters, memory)
     row = np.zeros(4)
     memory[gate_rules.SINCE] = 2.0
-    gate_rules.recover(5.0, 0, 4, standing, memory, row, lock_outs)
+    gate_rules.recover(5.0, 0, 4, counters, memory, row, lock_outs)
     assert list(row) == [5.0, 0.0, 0.0, 6.0]
     assert lock_outs[0, 3] == 0.0
-    assert not standing[:, : gate_rules.REPORTED].any()
+    assert not counters[:, : gate_rules.REPORTED].any()
     assert memory[gate_rules.PASSES] == gate_rules.WIDE_PASSES
-    memory, standing, _, _ = judged([refused])
+    memory, counters, _, _ = judged([refused])
     for nis, expected in ((2.0, followed), (40.0, narrow)):
-        assert gate_rules.judge_candidate(ACCEPTED, nis, 2, 0, standing, memory, np.zeros(3)) == expected
-    assert gate_rules.judge_candidate(ACCEPTED, 0.0, 99, 0, standing, memory, np.array([1.6, 0.0, 0.0])) == narrow
+        assert gate_rules.judge_candidate(ACCEPTED, nis, 2, 0, counters, memory, np.zeros(3)) == expected
+    assert gate_rules.judge_candidate(ACCEPTED, 0.0, 99, 0, counters, memory, np.array([1.6, 0.0, 0.0])) == narrow
     assert gate_rules.may_widen(np.full(3, 1.04), memory)
     assert not gate_rules.may_widen([1.0, 1.06, 1.0], memory)
     assert gate_rules.start_undone(0, 1.0, memory) == pytest.approx(-8.0)
@@ -416,7 +416,7 @@ def test_the_rules_of_a_gate():
 
 
 def test_a_widened_candidate_is_one_that_started_wider():
-    """Of the information of all that it has seen, P⁻¹, that of its start counts a ninth: in matrices, without a gain."""
+    """Of the information of all its measurements, P⁻¹, that of its start counts a ninth: in matrices, without a gain."""
     from strapdown.estimation.states import covariance_matrices, pack
 
     rng = np.random.default_rng(3)
@@ -522,7 +522,7 @@ def test_a_recovery_on_one_direction_knows_what_it_does_not_know(runs):
 
 @pytest.mark.parametrize("bias_sigma", [1e-3, 2e-2])
 @pytest.mark.parametrize("runs", [40, pytest.param(400, marks=pytest.mark.slow)])
-def test_after_a_recovery_on_one_direction_a_second_one_tells_the_turn(runs, bias_sigma):
+def test_after_a_recovery_on_one_direction_a_second_one_measures_the_turn(runs, bias_sigma):
     """NEES per state used to be 4 and 18 after it: what ties tilt and bias together does not turn about the first direction."""
     estimates, made = [], []
     for run in range(runs):
@@ -545,7 +545,7 @@ def test_after_a_recovery_on_one_direction_a_second_one_tells_the_turn(runs, bia
 
 
 def test_a_sensor_that_contradicts_two_others_is_refused_and_not_followed():
-    """Three sensors, one of which is turned by 20° from the start of the record on: the two that agree are believed."""
+    """Three sensors, one of which is turned by 20° from the start of the record on: the two that agree are used."""
     third = VectorSensor(name="c", reference_f=np.array([0.3, -1.0, 1.0]), sigma=1e-3, rate=10.0)
     record = simulate(replace(scenario(), sensors=(*scenario().sensors, third)), 6)
     a, b, c = record.vectors
@@ -560,7 +560,7 @@ def test_a_sensor_that_contradicts_two_others_is_refused_and_not_followed():
     assert quaternion.angle_between(estimate.attitude[-1], record.truth.attitude[-1]) < 5e-3
 
 
-def test_a_recovery_is_told_in_the_file(tmp_path):
+def test_a_recovery_is_reported_in_the_file(tmp_path):
     record = simulate(scenario(duration=3.0), 3)
     lost = replace(started(record, 0), attitude=quaternion.multiply(record.truth.attitude[0], [0.0, 0.6, 0.8, 0.0]))
     estimate = estimation.run(record, NOISE, lost, gate=Gate(), robust=Robust(), monitor=Monitor(window=20))
@@ -733,10 +733,10 @@ def test_the_monitor_is_silent_on_a_right_filter_and_keeps_its_false_alarm_rate(
 
 
 @pytest.mark.parametrize("factor", [0.5, 2.0], ids=["pessimistic", "optimistic"])
-def test_a_filter_that_believes_the_wrong_noise_is_reported(factor):
+def test_a_filter_that_models_the_wrong_noise_is_reported(factor):
     record = simulate(scenario(duration=30.0), 5)
-    believed = replace(record, vectors=tuple(s.noise_scaled(1.0 / factor) for s in record.vectors))
-    estimate = estimation.run(believed, NOISE, started(record, 0), monitor=Monitor())
+    modelled = replace(record, vectors=tuple(s.noise_scaled(1.0 / factor) for s in record.vectors))
+    estimate = estimation.run(modelled, NOISE, started(record, 0), monitor=Monitor())
     assert [event.kind for event in estimate.events] == ["divergence"]
     (event,) = estimate.events
     assert event.start < 8.0

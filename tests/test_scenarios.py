@@ -219,7 +219,7 @@ def test_adding_a_sensor_changes_no_other_stream():
         dataclasses.replace(base, sensors=(SENSORS[0], SENSORS[0]))
 
 
-def test_jitter_tells_the_truth_where_it_sampled_and_losses_are_bridged():
+def test_jitter_has_the_truth_where_it_sampled_and_losses_are_bridged():
     spec = GyroSpec(sampling_jitter=1e-3, timestamp_offset=0.5, drop_probability=0.2)
     fast = motion.ConstantRate(rate=[0.0, 0.0, 3.0])
     base = Scenario(
@@ -267,7 +267,7 @@ def test_a_g_sensitive_gyro_feels_gravity_and_not_in_free_fall():
         (("[gyro]", '[gyro]\npreset = "mpu"'), r"two.toml: gyro: preset 'mpu' is not known; did you mean 'mpu-9250'\?"),
     ],
 )
-def test_what_is_wrong_in_a_file_is_told_with_the_file_and_as_typed(tmp_path, change, words):
+def test_what_is_wrong_in_a_file_is_reported_with_the_file_and_as_typed(tmp_path, change, words):
     text = scenarios._BUILTIN.joinpath("two-stars.toml").read_text(encoding="utf-8")
     assert change[0] in text
     (tmp_path / "two.toml").write_text(text.replace(*change, 1), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Filter setups: what a right filter believes of a scenario, and their files."""
+"""Filter setups: the model of a right filter for a scenario, and their files."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ def test_the_gate_of_a_setup_is_that_of_its_filter():
     vector = first.vector_b.copy()
     vector[-3] = -vector[-3]
     record = dataclasses.replace(record, vectors=(dataclasses.replace(first, vector_b=vector), *rest))
-    believes = setup.matched(scenario())
-    start = setup.initial_state(believes, record.truth.attitude[0], record.truth.bias[0])
-    gated = dataclasses.replace(believes, gate=Gate())
+    filter_setup = setup.matched(scenario())
+    start = setup.initial_state(filter_setup, record.truth.attitude[0], record.truth.bias[0])
+    gated = dataclasses.replace(filter_setup, gate=Gate())
     assert setup.run(record, gated, start).refused[first.sensor] == 1
     assert setup.run(record, gated, start, gate=None).refused[first.sensor] == 0
-    assert setup.run(record, believes, start).refused[first.sensor] == 0
+    assert setup.run(record, filter_setup, start).refused[first.sensor] == 0
 
 
 @pytest.mark.parametrize(
@@ -134,7 +134,7 @@ def test_a_gyro_without_noise_is_refused():
         setup.matched(scenario(gyro=GyroSpec()))
 
 
-def test_measurement_density_counts_what_each_kind_tells():
+def test_measurement_density_counts_what_each_kind_measures():
     record = scenarios.simulate(scenario())
     sigma = record.vectors[0].sigma[0]
     number = sum(len(series.time) for series in record.vectors)
@@ -143,36 +143,36 @@ def test_measurement_density_counts_what_each_kind_tells():
     assert setup.measurement_density(dataclasses.replace(record, vectors=())) == np.inf
 
 
-def test_believed_replaces_sigmas_by_name_and_keeps_ratios():
+def test_modelled_record_replaces_sigmas_by_name_and_keeps_ratios():
     record = scenarios.simulate(scenario())
     first, *rest = record.vectors
     uneven = dataclasses.replace(first, sigma=np.linspace(1.0, 2.0, len(first.time)) * 1e-3)
     record = dataclasses.replace(record, vectors=(uneven, *rest))
     one = dataclasses.replace(SETUP, sigma={first.sensor: 5e-4}, measurement_sigma_factor=1.0)
-    taken = setup.believed(record, one).vectors
+    taken = setup.modelled_record(record, one).vectors
     assert np.sqrt(np.mean(taken[0].sigma ** 2)) == pytest.approx(5e-4)
     np.testing.assert_allclose(taken[0].sigma / taken[0].sigma[0], uneven.sigma / uneven.sigma[0])
     assert taken[1] is rest[0]
     with pytest.raises(InputError, match="star 1"):
-        setup.believed(record, dataclasses.replace(one, sigma={"star one": 1e-3}))
+        setup.modelled_record(record, dataclasses.replace(one, sigma={"star one": 1e-3}))
 
 
 def test_the_matched_filter_of_a_scenario_is_consistent():
     # A gyro of noise alone: the errors of shape that presets have too are nothing that the filter has states for.
     noise = GyroSpec(angle_random_walk=5e-5, rate_random_walk=1e-6, turn_on_bias_sigma=1e-4)
     chosen = scenario(gyro=noise, gyro_preset="", duration=30.0)
-    believes = setup.matched(chosen)
-    believes = dataclasses.replace(believes, integration=coning.ALGORITHMS["four-sample"])
+    filter_setup = setup.matched(chosen)
+    filter_setup = dataclasses.replace(filter_setup, integration=coning.ALGORITHMS["four-sample"])
     runs, last = 60, []
     for run in range(runs):
         record = scenarios.simulate(chosen, 11, run)
         draw = generator(11, run, "initial error").standard_normal(6)
         start = setup.initial_state(
-            believes,
-            quaternion.multiply(record.truth.attitude[0], quaternion.exp(-believes.attitude_sigma * draw[:3])),
-            record.truth.bias[0] - believes.bias_sigma * draw[3:],
+            filter_setup,
+            quaternion.multiply(record.truth.attitude[0], quaternion.exp(-filter_setup.attitude_sigma * draw[:3])),
+            record.truth.bias[0] - filter_setup.bias_sigma * draw[3:],
         )
-        estimate = setup.run(record, believes, start, full_covariance=True)
+        estimate = setup.run(record, filter_setup, start, full_covariance=True)
         error = consistency.errors(
             estimate.attitude[-1], estimate.bias[-1], record.truth.attitude[-1], record.truth.bias[-1]
         )
@@ -183,8 +183,8 @@ def test_the_matched_filter_of_a_scenario_is_consistent():
 
 def test_truth_travels_in_the_estimate_file(tmp_path):
     record = scenarios.simulate(scenario(duration=5.0))
-    believes = setup.matched(scenario())
-    estimate = setup.run(record, believes, setup.initial_state(believes, record.truth.attitude[0]))
+    filter_setup = setup.matched(scenario())
+    estimate = setup.run(record, filter_setup, setup.initial_state(filter_setup, record.truth.attitude[0]))
     records.write_estimate(tmp_path / "with.h5", estimate, truth=record.truth)
     records.write_estimate(tmp_path / "without.h5", estimate)
     truth = records.read_truth(tmp_path / "with.h5")
@@ -198,15 +198,15 @@ def test_truth_travels_in_the_estimate_file(tmp_path):
     assert not (tmp_path / "bad.h5").exists()
 
 
-def test_what_the_filter_has_no_state_for_is_told_in_words():
+def test_what_the_filter_has_no_state_for_is_reported_in_words():
     clean = scenarios.load_scenario("two-stars")
-    assert setup.not_covered(clean.gyro, clean.sensors) == ()
+    assert setup.unmodelled_errors(clean.gyro, clean.sensors) == ()
     orbit = scenarios.load_scenario("low-orbit")
-    words = " and ".join(setup.not_covered(orbit.gyro, orbit.sensors))
+    words = " and ".join(setup.unmodelled_errors(orbit.gyro, orbit.sensors))
     for part in ("misalignment", "flicker of 2 °/h", "hard iron of the magnetometer"):
         assert part in words
     held = scenarios.load_scenario("hand-held")
-    words = " and ".join(setup.not_covered(held.gyro, held.sensors))
+    words = " and ".join(setup.unmodelled_errors(held.gyro, held.sensors))
     for part in ("quantisation", "lever arm", "correlated noise of the magnetometer"):
         assert part in words
 
@@ -214,26 +214,28 @@ def test_what_the_filter_has_no_state_for_is_told_in_words():
 def test_with_states_there_is_less_that_is_not_covered():
     for name in ("spin", "low-orbit", "coning", "tumbling-satellite"):
         chosen = scenarios.load_scenario(name)
-        believes = setup.matched(chosen, states=True)
-        assert setup.not_covered(chosen.gyro, chosen.sensors)
-        assert setup.not_covered(chosen.gyro, chosen.sensors, believes.states, gravity_f=chosen.gravity_f) == ()
+        filter_setup = setup.matched(chosen, states=True)
+        assert setup.unmodelled_errors(chosen.gyro, chosen.sensors)
+        assert (
+            setup.unmodelled_errors(chosen.gyro, chosen.sensors, filter_setup.states, gravity_f=chosen.gravity_f) == ()
+        )
     held = scenarios.load_scenario("hand-held")
     part = setup.matched(held, states=True).states.chosen(("gyro.drift", "accelerometer.lever"))
-    words = " and ".join(setup.not_covered(held.gyro, held.sensors, part))
+    words = " and ".join(setup.unmodelled_errors(held.gyro, held.sensors, part))
     assert "correlated noise of the magnetometer" in words
     assert "lever arm" not in words
     assert "flicker" not in words
 
 
-def test_an_estimate_of_a_setup_with_states_tells_of_them():
+def test_an_estimate_of_a_setup_with_states_holds_them():
     chosen = dataclasses.replace(scenarios.load_scenario("spin"), duration=30.0)
-    believes = setup.matched(chosen, states=True)
+    filter_setup = setup.matched(chosen, states=True)
     record = scenarios.simulate(chosen)
-    start = setup.initial_state(believes, record.truth.attitude[0], record.truth.bias[0])
-    estimate = setup.run(record, believes, start, every=10, full_covariance=True)
+    start = setup.initial_state(filter_setup, record.truth.attitude[0], record.truth.bias[0])
+    estimate = setup.run(record, filter_setup, start, every=10, full_covariance=True)
     assert estimate.covariance.shape == (301, 6, 6)
     assert list(estimate.error_states) == ["gyro scale"]
-    plain = setup.run(record, dataclasses.replace(believes, states=None), start, every=10)
+    plain = setup.run(record, dataclasses.replace(filter_setup, states=None), start, every=10)
     assert np.all(estimate.variance[-1, 5] > 2.0 * plain.variance[-1, 5])
 
 
@@ -245,30 +247,30 @@ def test_smoothing_by_a_setup_is_that_of_the_smoother(states):
     chosen = scenarios.load_scenario("spin") if states else scenario(duration=10.0)
     chosen = dataclasses.replace(chosen, duration=10.0)
     record = scenarios.simulate(chosen, 3)
-    believes = setup.matched(chosen, states=states)
-    start = setup.initial_state(believes, record.truth.attitude[0])
-    found = setup.smooth(record, believes, start, full_covariance=True)
-    told = setup.believed(record, believes)
+    filter_setup = setup.matched(chosen, states=states)
+    start = setup.initial_state(filter_setup, record.truth.attitude[0])
+    found = setup.smooth(record, filter_setup, start, full_covariance=True)
+    modelled = setup.modelled_record(record, filter_setup)
     if states:
-        blocks = believes.states.blocks({series.sensor: series.kind for series in told.vectors})
-        same = estimation.smooth(told, believes.process_noise, start, blocks, full_covariance=True)
+        blocks = filter_setup.states.blocks({series.sensor: series.kind for series in modelled.vectors})
+        same = estimation.smooth(modelled, filter_setup.process_noise, start, blocks, full_covariance=True)
         assert list(found.error_states) == [block.name for block in blocks]
     else:
-        same = estimation.smooth(told, believes.process_noise, start, full_covariance=True)
+        same = estimation.smooth(modelled, filter_setup.process_noise, start, full_covariance=True)
     np.testing.assert_array_equal(found.attitude, same.attitude)
     np.testing.assert_array_equal(found.covariance, same.covariance)
-    plain = setup.run(record, believes, start)
+    plain = setup.run(record, filter_setup, start)
     assert np.all(found.variance <= plain.variance * (1.0 + 1e-9))
 
 
 def test_what_cannot_be_smoothed_is_refused(monkeypatch):
     chosen = scenario(duration=10.0)
     record = scenarios.simulate(chosen, 3)
-    believes = setup.matched(chosen)
-    start = setup.initial_state(believes, record.truth.attitude[0])
+    filter_setup = setup.matched(chosen)
+    start = setup.initial_state(filter_setup, record.truth.attitude[0])
     drifting = states.States(gyro_drift_sigma=(1e-5,), gyro_drift_time=(10.0,))
-    with pytest.raises(InputError, match="does not tell a gyro drift"):
-        setup.smooth(record, dataclasses.replace(believes, states=drifting), start)
-    monkeypatch.setattr(setup, "MOST_MEMORY", 1e5)
+    with pytest.raises(InputError, match="does not estimate a gyro drift"):
+        setup.smooth(record, dataclasses.replace(filter_setup, states=drifting), start)
+    monkeypatch.setattr(setup, "MAX_MEMORY", 1e5)
     with pytest.raises(InputError, match=r"with 6 states takes .* GB, more than 0.0001; cut the record"):
-        setup.smooth(record, believes, start)
+        setup.smooth(record, filter_setup, start)

@@ -44,7 +44,7 @@ def test_sim_is_a_script_with_a_main(path):
     guards = [ast.unparse(node.test) for node in tree.body if isinstance(node, ast.If)]
     assert "__name__ == '__main__'" in guards, "let the file run by itself"
     names = {ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
-    assert "argparse.ArgumentParser" in names, "take options by argparse, so that --help tells of them"
+    assert "argparse.ArgumentParser" in names, "take options by argparse, so that --help lists them"
     assert "sys.argv" not in names, "an option unknown to the script must not be taken for a file's name"
     options = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
     assert {"--out", "--seed"} <= options

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import math
+import types
 
 import mpmath
 import numpy as np
@@ -19,7 +21,7 @@ from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Truth
 from strapdown.setup import FilterSetup
-from strapdown.tuning import fitting, innovations, planning
+from strapdown.tuning import fitting, innovations, parameters, planning
 from strapdown.tuning.parameters import own_sigma
 from strapdown.vectors import VectorMeasurements
 
@@ -416,7 +418,7 @@ def test_what_a_record_cannot_tell_has_a_bound_and_no_confident_value():
     assert max(bounds) < 20.0 * RRW
 
 
-def test_a_parameter_that_nothing_depends_on_is_told_so():
+def test_a_parameter_that_nothing_depends_on_is_reported_so():
     """A sensor at a single instant: its σ is not bounded by any amount of searching."""
     one = case(duration=100.0)
     star = one.record.vectors[0]
@@ -482,6 +484,15 @@ def test_the_tuned_setup_is_what_it_says_and_goes_through_its_file(tmp_path):
     assert plain(one.record, found.setup, one.initial.attitude, one.initial.bias) == pytest.approx(
         found.after, abs=0.02
     )
+
+
+def test_the_scale_of_a_filter_multiplies_each_of_its_sigmas():
+    chosen = dataclasses.replace(BELIEVED, measurement_sigma_factor=3.0)
+    twice = parameters.with_values(chosen, {parameters.SCALE: 2.0})
+    assert twice.measurement_sigma_factor == 6.0
+    assert twice.process_noise.angle_random_walk == 2.0 * chosen.process_noise.angle_random_walk
+    assert twice.process_noise.rate_random_walk == 2.0 * chosen.process_noise.rate_random_walk
+    assert (twice.attitude_sigma, twice.bias_sigma) == (2.0 * chosen.attitude_sigma, 2.0 * chosen.bias_sigma)
 
 
 def test_a_factor_on_every_sigma_of_the_setup_is_kept_apart():
@@ -794,3 +805,36 @@ def test_before_and_after_are_drawn_for_nis_and_for_nees_where_there_is_a_truth(
     assert len(drawing.before_and_after(tuning.compare([bare], off, BELIEVED)).axes) == 1
     beside = dataclasses.replace(bare, true_attitude=one.record.truth.attitude)
     assert [course.of for course in tuning.compare([beside], off, BELIEVED).after.nees] == ["attitude"]
+
+
+def test_the_sandwich_takes_the_scatter_of_the_parts_about_their_mean_without_bias():
+    """Of n parts of a score with covariance C the sum has n C, and C is the scatter over n − 1."""
+    scores = np.array([[1.0, 0.0], [-1.0, 2.0], [3.0, 4.0]])
+    information = np.diag([4.0, 0.25])
+    local = types.SimpleNamespace(information=information, derivatives=types.SimpleNamespace(score=scores))
+    plain, robust = fitting.covariances(local)
+    inverse = np.diag([0.25, 4.0])
+    np.testing.assert_allclose(plain, inverse, rtol=1e-12)
+    np.testing.assert_allclose(robust, inverse @ (3.0 * np.cov(scores.T, ddof=1)) @ inverse, rtol=1e-12)
+
+
+@pytest.mark.parametrize("mode", [0.01, 0.3, 0.8, 1.2])
+def test_a_sigma_that_may_be_zero_has_a_one_sided_bound_and_the_mean_of_its_likelihood(monkeypatch, mode):
+    """Of a profile that is a parabola in σ with its least at ``mode``: the bound is at mode + 1.645, the mean that of a cut normal."""
+
+    def at(objective, point, priors, *, fixed, steps):
+        sigma = np.exp(point[0])
+        return types.SimpleNamespace(
+            point=np.array(point), local=types.SimpleNamespace(value=0.5 * (sigma - mode) ** 2)
+        )
+
+    monkeypatch.setattr(fitting, "search", at)
+    objective = types.SimpleNamespace(names=("star.sigma",), start=np.array([0.0]))
+    best = types.SimpleNamespace(point=np.array([np.log(mode)]), local=types.SimpleNamespace(value=0.0))
+    found = fitting._profiled(objective, best, 0, {}, 1.0, 1.0)
+    assert not found.identified
+    assert found.lower == 0.0
+    assert found.upper == pytest.approx(mode + 1.6448536269514722, rel=0.006)
+    ratio = np.exp(-0.5 * mode**2) / math.sqrt(2.0 * np.pi) / (0.5 * math.erfc(-mode / math.sqrt(2.0)))
+    # Over a range that ends at the bound it is low by 12 to 20 %.
+    assert found.mean == pytest.approx(mode + ratio, rel=0.006)

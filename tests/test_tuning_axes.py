@@ -1,4 +1,4 @@
-"""A sensor's σ of each body axis: what the filter believes of it, who refuses it, and that tuning recovers it."""
+"""A sensor's σ of each body axis: how a filter models it, who refuses it, and that tuning recovers it."""
 
 from __future__ import annotations
 
@@ -57,10 +57,10 @@ def case_of(scenario, chosen, seed) -> tuning.Case:
     return tuning.Case(record=record, initial=start(record, chosen, seed, 0), name=f"seed {seed}")
 
 
-# -------------------------------------------------------------------------------------------------------------- what is believed
+# -------------------------------------------------------------------------------------------------------------- the modelled noise
 
 
-def test_believed_gives_a_series_three_and_keeps_its_course():
+def test_modelled_record_gives_a_series_three_and_keeps_its_course():
     record = scenarios.simulate(swaying(duration=2.0), 1)
     course = np.linspace(1.0, 2.0, len(record.vectors[0].time))
     varying = dataclasses.replace(record.vectors[0], sigma=course * 1e-7)
@@ -68,7 +68,7 @@ def test_believed_gives_a_series_three_and_keeps_its_course():
     chosen = dataclasses.replace(
         setup.matched(swaying(duration=2.0)), sigma={"mag": (1e-7, 2e-7, 3e-7)}, measurement_sigma_factor=2.0
     )
-    mag, acc = setup.believed(record, chosen).vectors
+    mag, acc = setup.modelled_record(record, chosen).vectors
     np.testing.assert_allclose(np.sqrt(np.mean(mag.sigma_axes**2, axis=0)), [2e-7, 4e-7, 6e-7], rtol=1e-14)
     np.testing.assert_allclose(mag.sigma_axes / mag.sigma_axes[0], (course / course[0])[:, None] * np.ones(3))
     np.testing.assert_allclose(mag.sigma, np.sqrt(np.mean(mag.sigma_axes**2, axis=1)))
@@ -77,21 +77,21 @@ def test_believed_gives_a_series_three_and_keeps_its_course():
     assert not acc.anisotropic
 
 
-def test_believed_replaces_the_axes_of_an_attitude_and_any_covariance():
+def test_modelled_record_replaces_the_axes_of_an_attitude_and_any_covariance():
     record = scenarios.simulate(tracked(5.0), 1)
     whole = dataclasses.replace(record.vectors[0], sigma_axes=None, covariance=np.diag(STAR**2) + 1e-10)
     chosen = dataclasses.replace(setup.matched(tracked(5.0)), sigma={"star": (3e-5, 1e-5, 2e-5)})
     for series in (record.vectors[0], whole):
-        (star,) = setup.believed(dataclasses.replace(record, vectors=(series,)), chosen).vectors
+        (star,) = setup.modelled_record(dataclasses.replace(record, vectors=(series,)), chosen).vectors
         np.testing.assert_allclose(star.sigma_axes, np.tile([3e-5, 1e-5, 2e-5], (len(star.time), 1)))
         assert star.covariance is None
 
 
-def test_of_a_record_without_sigma_it_is_what_is_told():
+def test_of_a_record_without_sigma_it_is_what_is_given():
     record = scenarios.simulate(tracked(5.0), 1)
     silent = dataclasses.replace(record.vectors[0], sigma_axes=np.zeros(3))
     chosen = dataclasses.replace(setup.matched(tracked(5.0)), sigma={"star": (3e-5, 1e-5, 2e-5)})
-    (star,) = setup.believed(dataclasses.replace(record, vectors=(silent,)), chosen).vectors
+    (star,) = setup.modelled_record(dataclasses.replace(record, vectors=(silent,)), chosen).vectors
     np.testing.assert_array_equal(star.sigma_axes[0], [3e-5, 1e-5, 2e-5])
 
 
@@ -111,7 +111,7 @@ def test_a_heading_has_one():
     record = scenarios.simulate(scenario, 1)
     chosen = setup.matched(scenario)
     with pytest.raises(InputError, match=r"mag is .*three numbers, and a heading has one degree of freedom; give one"):
-        setup.believed(record, dataclasses.replace(chosen, sigma={"mag": (0.1, 0.1, 0.1)}))
+        setup.modelled_record(record, dataclasses.replace(chosen, sigma={"mag": (0.1, 0.1, 0.1)}))
     case = case_of(scenario, chosen, 1)
     with pytest.raises(InputError, match=r"mag\.sigma\.x: a heading has one degree of freedom; give mag\.sigma"):
         extended.likelihood([case], chosen, ["mag.sigma.x"])
@@ -119,8 +119,8 @@ def test_a_heading_has_one():
 
 
 def test_the_monte_carlo_takes_three_of_an_attitude_in_lanes_and_others_on_the_scalar_machine():
-    told = {"star": (3e-5, 6e-5, 1.5e-4)}
-    chosen = dataclasses.replace(setup.matched(tracked(20.0)), sigma=told)
+    sigma = {"star": (3e-5, 6e-5, 1.5e-4)}
+    chosen = dataclasses.replace(setup.matched(tracked(20.0)), sigma=sigma)
     plan = montecarlo.Plan(scenario=tracked(20.0), setup=chosen, epochs=4)
     assert lanes.supports(plan) is None
     by_lanes, scalar = (montecarlo.run_plan(plan, runs=8, machine=name) for name in ("lanes", "scalar"))
@@ -261,7 +261,7 @@ def test_the_command_tunes_the_axes_of_a_record(run, tmp_path):
     assert found.states is None
     np.testing.assert_allclose(found.sigma["star"], STAR, rtol=0.4)
     assert [one["name"] for one in json.loads(out.with_suffix(".json").read_text())["parameters"]] == list(AXES)
-    for more, words in ((("--truth",), "leave --gate, --truth"), (("--plan",), "which this objective does not tune")):
+    for more, words in ((("--truth",), "leave gate, truth"), (("--plan",), "which this objective does not tune")):
         status, _, complaint = run(*command, *more)
         assert status == 2
         assert words in " ".join(complaint.split())

@@ -1,4 +1,4 @@
-"""``strapdown tune`` as its users run it: files in, table and files out, mistakes told in one line."""
+"""``strapdown tune`` as its users run it: files in, table and files out, mistakes reported in one line."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ def record(tmp_path):
 def wrong(tmp_path):
     """A filter wrong by ten."""
     path = tmp_path / "wrong.toml"
-    believed = setup.matched(SCENARIO)
+    filter_setup = setup.matched(SCENARIO)
     values = {"gyro.arw": 1e-3, "gyro.rrw": 3e-7, "sun.sigma": 1e-5, "star.sigma": 2e-3}
-    path.write_text(setup.to_toml(tuning.with_values(believed, values)), encoding="utf-8")
+    path.write_text(setup.to_toml(tuning.with_values(filter_setup, values)), encoding="utf-8")
     return path
 
 
@@ -86,11 +86,11 @@ def test_tune_by_the_size_of_the_error(run, tmp_path, record, wrong):
     held = found["held_out"]
     assert held["after"]["attitude_rms_rad"] < held["before"]["attitude_rms_rad"]
     assert setup.read_setup(out).measurement_sigma_factor != 1.0
-    told = {one["name"]: one["value"] for one in found["parameters"]}
-    assert setup.read_setup(out).process_noise.angle_random_walk == pytest.approx(told["gyro.arw"])
+    values = {one["name"]: one["value"] for one in found["parameters"]}
+    assert setup.read_setup(out).process_noise.angle_random_walk == pytest.approx(values["gyro.arw"])
 
 
-def test_plan_tells_how_long_a_record_is_needed(run, tmp_path, record):
+def test_plan_says_how_long_a_record_is_needed(run, tmp_path, record):
     status, said, complaint = run("tune", "--plan", record, "--length", "100,300")
     assert status == 0, complaint
     assert "100 s" in said
@@ -112,7 +112,7 @@ def test_plan_tells_how_long_a_record_is_needed(run, tmp_path, record):
         (("--holdout", "1.5"), "between 0 and 1"),
         (("--holdout", "0.3", "--holdout-by", "week"), "holdout-by 'week'"),
         (("--out", "filter.json"), ".toml"),
-        (("--truth", "--spacing", "1"), "leave it away"),
+        (("--truth", "--spacing", "1"), "leave it out"),
         (("--prior", "no-such-gyro"), "no-such-gyro"),
         (("--integration", "five"), "five"),
         (("--plan", "--length", "100;300"), "seconds with commas"),
@@ -121,14 +121,14 @@ def test_plan_tells_how_long_a_record_is_needed(run, tmp_path, record):
         (("--truth", "--rmse"), "give one of them"),
     ],
 )
-def test_mistakes_are_told_in_one_line(run, tmp_path, record, arguments, complaint):
+def test_mistakes_are_reported_in_one_line(run, tmp_path, record, arguments, complaint):
     status, _, said = run("tune", record, *arguments)
     assert status == 2
     assert complaint in said.replace("\n", " ")
     assert not (tmp_path / "filter.toml").exists()
 
 
-def test_a_record_that_does_not_tell_its_gyro_needs_a_filter(run, tmp_path):
+def test_a_record_that_does_not_specify_its_gyro_needs_a_filter(run, tmp_path):
     bare = tmp_path / "bare.h5"
     recordfiles.write_record(bare, scenarios.simulate(SCENARIO, 1))
     for more in ((), ("--plan",)):
@@ -139,7 +139,7 @@ def test_a_record_that_does_not_tell_its_gyro_needs_a_filter(run, tmp_path):
 
 @pytest.fixture
 def scaled(tmp_path):
-    """A record whose gyro has a scale factor, which its scenario tells."""
+    """A record whose gyro has a scale factor, given by its scenario."""
     scenario = dataclasses.replace(SCENARIO, gyro=dataclasses.replace(SCENARIO.gyro, scale_factor=np.full(3, 2e-3)))
     path = tmp_path / "scaled.h5"
     record = scenarios.simulate(scenario, 2)
@@ -161,7 +161,7 @@ def test_tune_gives_the_filter_states_for_what_the_record_specifies(run, tmp_pat
     assert names == ["gyro.arw", "gyro.scale_sigma"]
 
 
-@pytest.mark.parametrize("option", [("--truth",), ("--credibility",), ("--gate",), ("--spacing", 2.0), ("--plan",)])
+@pytest.mark.parametrize("option", [("--truth",), ("--gate",), ("--spacing", 2.0), ("--plan",)])
 def test_optional_states_are_tuned_by_the_plain_likelihood_alone(run, tmp_path, scaled, option):
     out = tmp_path / "states.toml"
     status, _, complaint = run("tune", scaled, "--states", *option, "-o", out)
@@ -175,3 +175,17 @@ def test_the_plain_likelihood_refuses_a_filter_with_states(scaled):
     chosen = setup.matched_to_record(file.gyro, file.record, states=True)
     with pytest.raises(InputError, match=r"extended\.likelihood"):
         tuning.likelihood([tuning.record_case(file.record, chosen)], chosen, ["gyro.arw"])
+
+
+@pytest.mark.parametrize("option", ["--columns", "--topic"])
+def test_columns_and_topic_are_read_as_estimate_reads_them(run, tmp_path, option):
+    """A layout that the file does not have is refused before the search, which shows that the option reached the reader."""
+    path = tmp_path / "walk.csv"
+    path.write_text("stamp,p,q,r\n" + "".join(f"{10 * k},0.1,0.2,0.3\n" for k in range(50)))
+    good = {"--columns": "time=stamp(ms),gx=p(dps),gy=q(dps),gz=r(dps)", "--topic": "/imu"}[option]
+    bad = {"--columns": "time=stamp(ms),gx=p(dps),gy=q(dps),gz=s(dps)", "--topic": "/imu"}[option]
+    status, _, complaint = run("tune", path, option, bad)
+    assert status == 2
+    assert {"--columns": "no column 's(dps)'", "--topic": "topic"}[option] in complaint
+    _, _, complaint = run("tune", path, option, good)
+    assert {"--columns": "no accelerometer", "--topic": "topic"}[option] in complaint

@@ -122,20 +122,20 @@ def without_unmodelled(chosen: scenarios.Scenario) -> scenarios.Scenario:
 
 def tuned_and_judged(chosen: scenarios.Scenario, records: int, held: int) -> tuple[float, tuple, np.ndarray, tuple]:
     """Tune on some records from a filter wrong by 3 and 1/3; return NIS and ANEES over others, with their bounds."""
-    believed = setup.matched(chosen)
+    filter_setup = setup.matched(chosen)
     if chosen.name in INTEGRATION:
-        believed = dataclasses.replace(believed, integration=coning.ALGORITHMS[INTEGRATION[chosen.name]])
-    train = [tuning.record_case(scenarios.simulate(chosen, 5, k), believed, seed=k) for k in range(records)]
+        filter_setup = dataclasses.replace(filter_setup, integration=coning.ALGORITHMS[INTEGRATION[chosen.name]])
+    train = [tuning.record_case(scenarios.simulate(chosen, 5, k), filter_setup, seed=k) for k in range(records)]
     free = tuning.default_names([one.record for one in train])
-    values = tuning.values_of(believed, free, [one.record for one in train])
+    values = tuning.values_of(filter_setup, free, [one.record for one in train])
     wrong = {name: value * (3.0 if k % 2 else 1.0 / 3.0) for k, (name, value) in enumerate(values.items())}
-    found = tuning.fit(tuning.likelihood(train, tuning.with_values(believed, wrong), free), starts=2).setup
+    found = tuning.fit(tuning.likelihood(train, tuning.with_values(filter_setup, wrong), free), starts=2).setup
     squares, number, nees = 0.0, 0, []
     for k in range(held):
         one = tuning.record_case(scenarios.simulate(chosen, 6, k), found, seed=1000 + k)
         every = max(1, (len(one.record.increments) // found.integration.samples) // 10)
         estimate = setup.run(one.record, found, one.initial, every=every, full_covariance=True)
-        truth = setup.believed(one.record, found).truth
+        truth = setup.modelled_record(one.record, found).truth
         error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude[::every], truth.bias[::every])
         nees.append(consistency.nees(error, estimate.covariance))
         squares += sum(float(part.nis.sum()) for part in estimate.innovations.values())
@@ -184,14 +184,14 @@ def efficiencies(chosen: scenarios.Scenario, tuned: FilterSetup) -> tuple[np.nda
 
 def tuned_from_thirty_times_wrong(chosen: scenarios.Scenario, records: int) -> tuple[FilterSetup, FilterSetup]:
     """Return the filter wrong by 30, one parameter up and the next down, and what tuning makes of it."""
-    believed = setup.matched(chosen)
+    filter_setup = setup.matched(chosen)
     if chosen.name in INTEGRATION:
-        believed = dataclasses.replace(believed, integration=coning.ALGORITHMS[INTEGRATION[chosen.name]])
-    train = [tuning.record_case(scenarios.simulate(chosen, 5, k), believed, seed=k) for k in range(records)]
+        filter_setup = dataclasses.replace(filter_setup, integration=coning.ALGORITHMS[INTEGRATION[chosen.name]])
+    train = [tuning.record_case(scenarios.simulate(chosen, 5, k), filter_setup, seed=k) for k in range(records)]
     free = tuning.default_names([one.record for one in train])
-    values = tuning.values_of(believed, free, [one.record for one in train])
+    values = tuning.values_of(filter_setup, free, [one.record for one in train])
     off = {name: value * (30.0 if k % 2 else 1.0 / 30.0) for k, (name, value) in enumerate(values.items())}
-    wrong = tuning.with_values(believed, off)
+    wrong = tuning.with_values(filter_setup, off)
     return wrong, tuning.fit(tuning.likelihood(train, wrong, free), starts=2).setup
 
 
@@ -204,7 +204,7 @@ def test_tuned_from_thirty_times_wrong_the_errors_reach_their_bound():
     assert np.max(predicted) <= 1.03
     bound = covariance.analyse(chosen, epochs=20).filter_covariance[1:]
     (found,) = montecarlo.run(chosen, [tuned], runs=150, seed=3, epochs=20)
-    square = found.error_square_sum[1:] / found.runs
+    square = np.diagonal(found.mean_square_error[1:], axis1=1, axis2=2)
     for part, ratio in zip((slice(0, 3), slice(3, 6)), predicted, strict=True):
         least = bound[:, part, part].trace(axis1=1, axis2=2)
         actual = np.sqrt(np.mean(square[:, part].sum(axis=1) / least))
@@ -214,7 +214,7 @@ def test_tuned_from_thirty_times_wrong_the_errors_reach_their_bound():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_tuned_from_thirty_times_wrong_the_errors_reach_their_bound_in_every_scenario(name):
-    """Four records, errors without a state taken out. The bias of ``slew-vibration`` hardly walks, and is told to 1.014 over time."""
+    """Four records, errors without a state taken out. The bias of ``slew-vibration`` hardly walks, and is known to 1.014 over time."""
     chosen = without_unmodelled(scenarios.load_scenario(name))
     wrong, tuned = tuned_from_thirty_times_wrong(chosen, 4)
     before, after = efficiencies(chosen, wrong), efficiencies(chosen, tuned)
@@ -239,15 +239,15 @@ def rmse(one: tuning.Case, chosen: FilterSetup) -> float:
 
 
 def held_out_of_recordings(cases: list[tuning.Case]) -> None:
-    believed = tuning.recording_setup()
-    assert believed.attitude_sigma == AhrsParameters().attitude_sigma
+    filter_setup = tuning.recording_setup()
+    assert filter_setup.attitude_sigma == AhrsParameters().attitude_sigma
     train, test = tuning.split(cases, 0.5)
-    found = tuning.fit(tuning.likelihood(train, believed, ["filter.scale"]), starts=1)
+    found = tuning.fit(tuning.likelihood(train, filter_setup, ["filter.scale"]), starts=1)
     assert found.misfit  # disturbances of a moving hand last: the fit says so
     assert found["filter.scale"].upper < 1.0
-    compared = tuning.compare(test, believed, found.setup)
+    compared = tuning.compare(test, filter_setup, found.setup)
     assert compared.after.log_likelihood > compared.before.log_likelihood + 0.3
-    before, after = (np.array([rmse(one, chosen) for one in test]) for chosen in (believed, found.setup))
+    before, after = (np.array([rmse(one, chosen) for one in test]) for chosen in (filter_setup, found.setup))
     np.testing.assert_allclose(after, before, rtol=1e-5)
     assert abs(np.log(compared.after.nis)) < abs(np.log(compared.before.nis))
 
@@ -264,9 +264,11 @@ def test_all_recordings_tuned_on_their_first_halves_are_likelier_in_their_second
 @pytest.mark.slow
 def test_recordings_tuned_on_half_of_the_trials_are_likelier_on_the_others_and_no_worse(broad):
     cases = recorded(broad, slice(None))
-    believed = tuning.recording_setup()
+    filter_setup = tuning.recording_setup()
     for train, test in ((cases[::2], cases[1::2]), (cases[1::2], cases[::2])):
-        found = tuning.fit(tuning.likelihood(train, believed, ["filter.scale"]), starts=1).setup
-        compared = tuning.compare(test, believed, found)
+        found = tuning.fit(tuning.likelihood(train, filter_setup, ["filter.scale"]), starts=1).setup
+        compared = tuning.compare(test, filter_setup, found)
         assert compared.better
-        np.testing.assert_allclose([rmse(one, found) for one in test], [rmse(one, believed) for one in test], rtol=1e-5)
+        np.testing.assert_allclose(
+            [rmse(one, found) for one in test], [rmse(one, filter_setup) for one in test], rtol=1e-5
+        )

@@ -37,14 +37,14 @@ def scenario(scale_factor: float = 0.0, duration: float = 900.0) -> scenarios.Sc
 
 def tuned(seed: int, scale_factor: float = 0.0) -> tuple[tuning.Case, tuning.Tuning]:
     chosen = scenario(scale_factor)
-    believed = setup.matched(chosen)
-    one = tuning.record_case(scenarios.simulate(chosen, seed), believed, name=f"record {seed}", seed=seed)
+    filter_setup = setup.matched(chosen)
+    one = tuning.record_case(scenarios.simulate(chosen, seed), filter_setup, name=f"record {seed}", seed=seed)
     names = tuning.default_names([one.record])
-    return one, tuning.fit(tuning.likelihood([one], believed, names), starts=1)
+    return one, tuning.fit(tuning.likelihood([one], filter_setup, names), starts=1)
 
 
 def test_a_scale_factor_that_the_walk_of_the_bias_stands_for_is_found_with_its_size():
-    told = 0
+    doubted = 0
     for seed in (1, 2):
         one, result = tuned(seed, 1e-3)
         bare = dataclasses.replace(one, record=dataclasses.replace(one.record, truth=None))
@@ -55,10 +55,10 @@ def test_a_scale_factor_that_the_walk_of_the_bias_stands_for_is_found_with_its_s
         assert np.all(size.standard_error[:2] < 4e-4)
         assert any("scale factor of the gyro" in words for words in found.words)
         notes = {parameter.name: parameter.note for parameter in tuning.doubted(result, found).parameters}
-        told += "in doubt" in notes["gyro.rrw"]
+        doubted += "in doubt" in notes["gyro.rrw"]
         assert not any("in doubt" in note for name, note in notes.items() if name != "gyro.rrw")
         assert json.dumps(found.summary())
-    assert told >= 1  # where the walk is called identified it is put in doubt
+    assert doubted >= 1  # where the walk is called identified it is put in doubt
 
 
 def test_of_right_filters_hardly_one_is_suspected():
@@ -77,7 +77,9 @@ def test_of_right_filters_hardly_one_is_suspected():
 
 def test_the_p_value_is_that_of_three_degrees_of_freedom_at_each_level():
     one, result = tuned(1, 1e-3)
-    found = suspicion.scale_factor(setup.believed(one.record, result.setup), result.setup.process_noise, one.initial)
+    found = suspicion.scale_factor(
+        setup.modelled_record(one.record, result.setup), result.setup.process_noise, one.initial
+    )
     assert found.p_value == pytest.approx(3.0 * chi2.sf(found.gain, 3), rel=1e-9)
 
 
@@ -94,24 +96,24 @@ def test_the_turns_are_those_of_the_body_without_its_bias():
 
 def test_the_turns_leave_out_a_large_bias():
     chosen = dataclasses.replace(scenario(), gyro=dataclasses.replace(SPEC, turn_on_bias=np.full(3, 1e-2)))
-    believed = dataclasses.replace(setup.matched(chosen), bias_sigma=1e-2)
-    one = tuning.record_case(scenarios.simulate(chosen, 1), believed, seed=1)
-    found = turning.turns(one.record, believed.process_noise, one.initial)
+    filter_setup = dataclasses.replace(setup.matched(chosen), bias_sigma=1e-2)
+    one = tuning.record_case(scenarios.simulate(chosen, 1), filter_setup, seed=1)
+    found = turning.turns(one.record, filter_setup.process_noise, one.initial)
     excess = (found - chosen.motion.increments(one.record.time))[2000:-100] * 10.0
     assert np.abs(excess.mean(axis=0)).max() < 2e-4
 
 
 def test_the_noise_of_a_body_at_rest_explains_nothing():
-    """All that its rate tells is the gyro's noise, and taking off all of it would help; no scale factor is so large."""
+    """All that its rate shows is the gyro's noise, and taking off all of it would help; no scale factor is so large."""
     still = dataclasses.replace(
         scenario(),
         motion=motion.ConstantRate(rate=np.zeros(3)),
         gyro=dataclasses.replace(SPEC, angle_random_walk=1e-4, rate_random_walk=2e-5),
     )
-    believed = setup.matched(still)
+    filter_setup = setup.matched(still)
     for seed in range(3):
-        one = tuning.record_case(scenarios.simulate(still, seed), believed, seed=seed)
-        found = suspicion.scale_factor(one.record, believed.process_noise, one.initial)
+        one = tuning.record_case(scenarios.simulate(still, seed), filter_setup, seed=seed)
+        found = suspicion.scale_factor(one.record, filter_setup.process_noise, one.initial)
         assert found.p_value > 0.05
         assert np.abs(found.value).max() < 5.0 * turning.PLAUSIBLE
 
@@ -125,9 +127,9 @@ def test_noise_over_a_long_time_explains_nothing():
         sensors=tuple(dataclasses.replace(sensor, sigma=2e-3) for sensor in scenario().sensors),
         rate=4.0,
     )
-    believed = setup.matched(long)
-    one = tuning.record_case(scenarios.simulate(long, 1), believed, seed=1)
-    found = suspicion.scale_factor(one.record, believed.process_noise, one.initial)
+    filter_setup = setup.matched(long)
+    one = tuning.record_case(scenarios.simulate(long, 1), filter_setup, seed=1)
+    found = suspicion.scale_factor(one.record, filter_setup.process_noise, one.initial)
     assert found.p_value > 0.05
     assert np.all(np.abs(found.value) < 3.0 * found.standard_error)
 
@@ -144,15 +146,15 @@ def test_what_the_gate_refuses_is_left_out():
     chosen = dataclasses.replace(
         scenario(), sensors=tuple(dataclasses.replace(sensor, faults=faults) for sensor in scenario().sensors)
     )
-    believed = dataclasses.replace(setup.matched(chosen), gate=Gate(probability=0.999))
+    filter_setup = dataclasses.replace(setup.matched(chosen), gate=Gate(probability=0.999))
     suspected = 0
     for seed in range(2):
-        one = tuning.record_case(scenarios.simulate(chosen, seed), believed, seed=seed)
-        found = tuning.unmodelled(one, believed)
+        one = tuning.record_case(scenarios.simulate(chosen, seed), filter_setup, seed=seed)
+        found = tuning.unmodelled(one, filter_setup)
         assert not {finding.name for finding in found.judgement.findings} & {"NIS", "normality"}
         suspected += found.suspected
     assert suspected <= 1  # of two
-    estimate = setup.run(one.record, believed, one.initial)
+    estimate = setup.run(one.record, filter_setup, one.initial)
     left = suspicion.accepted(one.record, estimate)
     for series, before in zip(left.vectors, one.record.vectors, strict=True):
         assert len(series.time) == len(before.time) - estimate.innovations[series.sensor].refused
@@ -186,9 +188,9 @@ def test_what_is_held_out_is_left_out():
 
 def test_a_hard_iron_is_named_where_the_innovations_are_not_white():
     chosen = scenarios.load_scenario("low-orbit")
-    believed = setup.matched(chosen)
-    one = tuning.record_case(scenarios.simulate(dataclasses.replace(chosen, duration=1200.0), 5), believed, seed=5)
-    found = tuning.unmodelled(one, believed)
+    filter_setup = setup.matched(chosen)
+    one = tuning.record_case(scenarios.simulate(dataclasses.replace(chosen, duration=1200.0), 5), filter_setup, seed=5)
+    found = tuning.unmodelled(one, filter_setup)
     assert found.causes
     assert found.causes[0].name == "hard iron"
     assert not found.moves_with_the_rate
@@ -221,7 +223,7 @@ def test_records_of_two_kinds_are_refused(change, complaint):
 # -------------------------------------------------------------------------------------------------- the command line
 
 
-def test_the_command_tells_of_it_and_refuses_two_kinds(run, tmp_path):
+def test_the_command_reports_it_and_refuses_two_kinds(run, tmp_path):
     first, second, out = tmp_path / "a.h5", tmp_path / "b.h5", tmp_path / "tuned.toml"
     chosen = scenario(1e-3)
     recordfiles.write_record(first, scenarios.simulate(chosen, 2), gyro_spec=chosen.gyro)
@@ -229,9 +231,9 @@ def test_the_command_tells_of_it_and_refuses_two_kinds(run, tmp_path):
     assert status == 0, complaint
     assert "scale factor of the gyro" in said
     assert "in doubt" in said
-    (told,) = json.loads(out.with_suffix(".json").read_text())["unmodelled"]
-    assert told["moves_with_the_rate"]
-    np.testing.assert_allclose(told["scale_factor"]["value"][:2], 1e-3, atol=1e-3)
+    (finding,) = json.loads(out.with_suffix(".json").read_text())["unmodelled"]
+    assert finding["moves_with_the_rate"]
+    np.testing.assert_allclose(finding["scale_factor"]["value"][:2], 1e-3, atol=1e-3)
     page, _ = tunings.report(out.with_suffix(".json"), 0.99)
     assert "A scale factor of the gyro" in page
     other = dataclasses.replace(chosen.gyro, angle_random_walk=6e-5)

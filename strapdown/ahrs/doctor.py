@@ -58,15 +58,22 @@ FRAMES: dict[str, Array] = {
 }
 """Fixed frames, and what takes their components to East-North-Up."""
 
+
+def _unit(fault: str, taken: str, sensor: str, unit: str) -> str:
+    """Return a wrong unit with its remedy."""
+    return f"{fault} ({taken}: --{sensor}-unit {unit}; units={{{sensor!r}: {unit!r}}} in Python)"
+
+
 GYRO_UNITS: dict[str, float] = {
     "": 1.0,
-    "gyro rates are 57.3 times too large (deg/s taken for rad/s: --gyro-unit deg/s)": math.pi / 180.0,
-    "gyro rates are 57.3 times too small (rad/s taken for deg/s: --gyro-unit rad/s)": 180.0 / math.pi,
+    _unit("gyro rates are 57.3 times too large", "deg/s taken for rad/s", "gyro", "deg/s"): math.pi / 180.0,
+    _unit("gyro rates are 57.3 times too small", "rad/s taken for deg/s", "gyro", "rad/s"): 180.0 / math.pi,
 }
 FORCE_UNITS: dict[str, float] = {
     "": 1.0,
-    "specific force is 9.81 times too small (g taken for m/s²: --accelerometer-unit g)": STANDARD_GRAVITY,
-    "specific force is 9.81 times too large (m/s² taken for g: --accelerometer-unit m/s2)": 1.0 / STANDARD_GRAVITY,
+    _unit("specific force is 9.81 times too small", "g taken for m/s²", "accelerometer", "g"): STANDARD_GRAVITY,
+    _unit("specific force is 9.81 times too large", "m/s² taken for g", "accelerometer", "m/s2"): 1.0
+    / STANDARD_GRAVITY,
 }
 
 PENALTY = 5.0
@@ -78,11 +85,11 @@ INDEPENDENT = 20
 """Effective number of windows: their disturbances are not independent."""
 MARGIN = 5.0
 """Difference in score that separates one explanation from another."""
-MOST_EQUAL = 8
+MAX_EQUAL = 8
 """Largest number of equally good explanations that can be symmetries of the relations; with more the recording is too poor."""
 POOR = 0.4
 """Misfit of the gyro above which even the best explanation is rejected."""
-LEAST_TURN = 0.5
+MIN_TURN = 0.5
 """Rotation, rad, summed over the windows used, below which nothing can be decided."""
 FASTEST = 4000.0 * DEGREE
 """Rate, rad/s, beyond the range of nearly all gyros."""
@@ -129,7 +136,7 @@ class Examination:
     ----------
     source : str
         Name of the recording.
-    verdict : {"as told", "wrong convention", "cannot tell"}
+    verdict : {"as declared", "wrong convention", "cannot tell"}
         Verdict.
     reason : str
         Why, in one sentence.
@@ -142,7 +149,7 @@ class Examination:
     """
 
     source: str
-    verdict: Literal["as told", "wrong convention", "cannot tell"]
+    verdict: Literal["as declared", "wrong convention", "cannot tell"]
     reason: str
     candidates: tuple[Candidate, ...]
     notes: tuple[str, ...] = field(default=())
@@ -210,7 +217,7 @@ def examine(recording: Recording) -> Examination:
             notes=tuple(notes),
             doubts=tuple(upright + doubts),
         )
-    told = [
+    candidates = [
         Candidate(
             changes=(*one.changes, *unit_changes),
             score=one.score - PENALTY * len(unit_changes),
@@ -218,38 +225,40 @@ def examine(recording: Recording) -> Examination:
         )
         for one in found
     ]
-    told.sort(key=lambda one: -one.score)
-    result = _concluded(recording.source, told, unit_changes, notes)
-    if upright and result.verdict == "as told":
+    candidates.sort(key=lambda one: -one.score)
+    result = _concluded(recording.source, candidates, unit_changes, notes)
+    if upright and result.verdict == "as declared":
         result = replace(
             result, verdict="cannot tell", reason="the sensors agree with each other; see the warning on their sign"
         )
     return replace(result, doubts=tuple(upright + doubts))
 
 
-def _concluded(source: str, told: list[Candidate], sure: tuple[str, ...], notes: list[str]) -> Examination:
-    best = told[0]
-    plain = next(one for one in told if len(one.changes) == len(sure))
+def _concluded(source: str, candidates: list[Candidate], sure: tuple[str, ...], notes: list[str]) -> Examination:
+    best = candidates[0]
+    plain = next(one for one in candidates if len(one.changes) == len(sure))
     named = best if best.score - plain.score >= MARGIN else plain
-    fit = {id(one): one.score + PENALTY * len(one.changes) for one in told}
-    equal = [one for one in told if one is not named and fit[id(one)] > fit[id(named)] - MARGIN]
-    verdict: Literal["as told", "wrong convention", "cannot tell"]
+    fit = {id(one): one.score + PENALTY * len(one.changes) for one in candidates}
+    equal = [one for one in candidates if one is not named and fit[id(one)] > fit[id(named)] - MARGIN]
+    verdict: Literal["as declared", "wrong convention", "cannot tell"]
     if min(best.misfit.values()) > POOR:
         verdict = "cannot tell"
         reason = "no explanation tried fits: the best leaves " + ", ".join(
             f"{name} with a misfit of {value:.2f}" for name, value in best.misfit.items()
         )
-    elif len(equal) > MOST_EQUAL:
+    elif len(equal) > MAX_EQUAL:
         verdict = "cannot tell"
         reason = f"{len(equal)} other explanations fit as well as “{named.words}”: the recording turns too little, or about one axis only"
     elif named is plain:
-        verdict = "wrong convention" if sure else "as told"
+        verdict = "wrong convention" if sure else "as declared"
         reason = "; ".join(sure) if sure else "no change explains the recording better than its declared conventions"
     else:
         verdict, reason = "wrong convention", named.words
     if equal and verdict != "cannot tell":
         notes = [*notes, "fits as well: " + " / ".join(one.words for one in equal)]
-    return Examination(source=source, verdict=verdict, reason=reason, candidates=tuple(told[:12]), notes=tuple(notes))
+    return Examination(
+        source=source, verdict=verdict, reason=reason, candidates=tuple(candidates[:12]), notes=tuple(notes)
+    )
 
 
 REST_SPREAD = 0.05
@@ -258,37 +267,38 @@ REST_STRENGTH = 0.15
 """Deviation of the mean specific force from gravity, as a share of it, above which it is not gravity alone."""
 DOWN = 0.7
 """Share of gravity along the body's −z axis above which z points down."""
-LEAST_DIP = 10.0 * DEGREE
-"""Angle of the field to the horizontal below which it does not tell up from down."""
+MIN_DIP = 10.0 * DEGREE
+"""Angle of the field to the horizontal below which it does not distinguish up from down."""
 
 
 def at_rest(recording: Recording) -> list[str]:
     """Return what gravity and the field at rest say against body axes with z up and an accelerometer that reads +g upward.
 
     The sensors of a body whose z axis points down agree with each other, and so do those of a unit with an inverted accelerometer; the
-    attitude is then half a turn off what is expected. A reference attitude tells, and is compared by :func:`examine`.
+    attitude is then half a turn off what is expected. A reference attitude shows it, and is compared by :func:`examine`.
     """
     seen = None if recording.true_attitude is not None else _resting(recording)
     if seen is None:
         return []
     upward, reading, dip = seen
     reads = f"at rest the accelerometer reads {reading:.3g} m/s² along z"
-    if dip is not None and dip < -LEAST_DIP:
+    if dip is not None and dip < -MIN_DIP:
         field = (
             f"the field points {-dip / DEGREE:.0f}° upward by the accelerometer, as south of the magnetic equator only"
         )
         if upward > DOWN:
-            return [f"{field}; elsewhere the magnetometer is inverted (--invert magnetometer)"]
+            return [f"{field}; elsewhere the magnetometer is inverted (--invert magnetometer; invert= in Python)"]
         return [
-            f"{reads}, and {field}; elsewhere the accelerometer is inverted, as those of iPhones (--invert accelerometer)"
+            f"{reads}, and {field}; elsewhere the accelerometer is inverted, as those of iPhones "
+            "(--invert accelerometer; invert= in Python)"
         ]
     if upward >= -DOWN:
         return []
-    where = " south of the magnetic equator" if dip is not None and dip > LEAST_DIP else ""
+    where = " south of the magnetic equator" if dip is not None and dip > MIN_DIP else ""
     return [
-        f"{reads}: the body's z axis points down (--axes x,-y,-z reads forward-right-down axes as forward-left-up ones; --frame ned keeps "
-        f"them and gives the output in North-East-Down), or the unit lies upside down, or{where} the accelerometer is inverted "
-        "(--invert accelerometer)"
+        f"{reads}: the body's z axis points down (--axes x,-y,-z, axes= in Python, reads forward-right-down as forward-left-up; "
+        f"--frame ned keeps them and gives the output in North-East-Down), or the unit lies upside down, or{where} the accelerometer is "
+        "inverted (--invert accelerometer; invert= in Python)"
     ]
 
 
@@ -368,7 +378,7 @@ def _score(misfit: float, kind: str = "reference") -> float:
 
 SPAN = 4.0
 """Length of the windows over which vectors are averaged, s: accelerations average out, a gyro's bias does not turn far."""
-LEAST_INTERVAL = 0.01
+MIN_INTERVAL = 0.01
 """Vectors are taken at most so often, s."""
 
 
@@ -387,7 +397,7 @@ class _Means:
 
 def _means(recording: Recording, attitude: Array, vectors: Array, strength: float) -> _Means:
     """Return the means of vectors turned by an attitude (n, 4), over the windows in which the body turns most."""
-    step = max(1, round(LEAST_INTERVAL / float(np.median(np.diff(recording.time)))))
+    step = max(1, round(MIN_INTERVAL / float(np.median(np.diff(recording.time)))))
     rows = slice(None, None, step)
     time, v, q = recording.time[rows], vectors[rows] / strength, attitude[rows]
     seen = np.isfinite(v).all(axis=1) & np.isfinite(q).all(axis=1)
@@ -402,9 +412,10 @@ def _means(recording: Recording, attitude: Array, vectors: Array, strength: floa
     if len(chosen) == 0:
         return _Means(product=np.empty((0, 3, 3, 3)))
     used = seen & np.isin(window, chosen)
-    products = np.einsum("kab,kc->kabc", quaternion.to_matrix(q[used]), v[used])
-    sums = np.add.reduceat(products, np.flatnonzero(np.diff(window[used], prepend=-1)), axis=0)
-    return _Means(product=sums / counts[chosen, None, None, None])
+    begin = np.flatnonzero(np.diff(window[used], prepend=-1))[1:]
+    turned, taken = quaternion.to_matrix(q[used]).reshape(-1, 9), v[used]
+    sums = [R.T @ w for R, w in zip(np.split(turned, begin), np.split(taken, begin), strict=True)]
+    return _Means(product=np.reshape(sums, (-1, 3, 3, 3)) / counts[chosen, None, None, None])
 
 
 def _strength(vectors: Array) -> float:
@@ -428,7 +439,7 @@ def _with_reference(recording: Recording) -> Iterator[Candidate]:
         q = np.full(recording.true_attitude.shape, np.nan)
         q[known] = quaternion.normalize(read(recording.true_attitude[known]))
         reference = quaternion.log(quaternion.multiply(quaternion.conjugate(q[first]), q[last]))
-        if np.sum(np.linalg.norm(reference, axis=1)) < LEAST_TURN:
+        if np.sum(np.linalg.norm(reference, axis=1)) < MIN_TURN:
             return
         gyro = _gyro_fits(turn, reference)
         force = _sensor_means(recording, q, recording.specific_force)
@@ -529,12 +540,12 @@ def _combined(common: tuple[str, ...], parts: dict[str, _Fits]) -> Iterator[Cand
 @functools.cache
 def _axes_change(name: str, k: int) -> str:
     if np.array_equal(AXES[k], -np.eye(3)):
-        return f"axes of the {name} are inverted" + (f" (--invert {name})" if name != "whole unit" else "")
+        return f"axes of the {name} are inverted" + (
+            f" (--invert {name}; invert= in Python)" if name != "whole unit" else ""
+        )
     words = axes_words(AXES[k])
     option = words.replace("−", "-").replace(" ", "")
-    return (
-        f"axes of the {name} should be read as ({words}) (--axes {'' if name == 'whole unit' else f'{name}='}{option})"
-    )
+    return f"axes of the {name} should be read as ({words}) (--axes {'' if name == 'whole unit' else f'{name}='}{option}; axes= in Python)"
 
 
 def _candidate(changes: tuple[str, ...], misfit: dict[str, float], kind: str = "reference") -> Candidate:

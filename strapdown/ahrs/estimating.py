@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -16,10 +17,18 @@ from strapdown.estimation.gating import Gate, Robust
 from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings import Recording, sensor_delays, sensor_faults, unit_calibration
+from strapdown.recordings.hard_iron import low_pass
 from strapdown.recordings.sensor_delays import Delays
 from strapdown.recordings.sensor_faults import Faults
 from strapdown.recordings.unit_calibration import UnitCalibration
 from strapdown.records import ErrorStateEstimate, Estimate, ImuRecord, Innovations, cut
+
+LEVEL_TIME = 5.0
+"""Time constant over which the level of the acceleration is found, s."""
+OWN_SHARE = 0.1
+"""Share of the tilt's modelled variance that does not follow the acceleration's level: the accelerometer's own errors."""
+ACCELERATION_SHARE = 0.7
+"""Share of it that follows that level: the steady-state variance goes as the σ of the acceleration."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -31,8 +40,8 @@ class AhrsEstimate:
     recording : Recording
         The recording from its first quiet second on, clipped gyro samples restored.
     estimate : Estimate
-        Attitude and gyro bias at the stamps of the recording; the covariance includes timing and constant iron, which
-        the filter does not estimate.
+        Attitude and gyro bias at the stamps of the recording; the covariance of the tilt follows the acceleration's level
+        as the innovations show it, and includes timing and constant iron, which the filter does not estimate.
     record : ImuRecord
         What the filter processed: increments and vectors averaged over its steps.
     initial : State
@@ -115,7 +124,7 @@ def estimate(
     delays = sensor_delays.find(used, latency, field_delay, causal=not smooth)
     prepared = prepare(used, quiet, parameters, delays.field, causal=not smooth)
     filtered = _run(prepared, parameters, faults.turn_variance, gate, robust, smooth)
-    found = _at_stamps(filtered, used, prepared, parameters, delays, smooth, full_covariance)
+    found = _at_stamps(filtered, used, prepared, parameters, delays, faults.turn_variance, smooth, full_covariance)
     scale = found.error_states.get("gyro scale")
     return AhrsEstimate(
         recording=used,
@@ -148,23 +157,29 @@ def _run(
     record, own = prepared.record, parameters.setup
     kinds = {series.sensor: series.kind for series in record.vectors}
     blocks = () if own.states is None else own.states.blocks(kinds)
-    extra = np.add.reduceat(turn_variance, prepared.edge[:-1].astype(np.intp))
+    extra = _over_steps(turn_variance, prepared.edge)
     change = np.flatnonzero(np.diff(extra > 0.0)) + 1
     bounds = [0, *change.tolist(), len(extra)]
     state = prepared.initial
     parts: list[Estimate] = []
+    options: dict[str, Any] = {"full_covariance": True, "error_state_covariance": False, "gate": gate, "robust": robust}
     for first, last in itertools.pairwise(bounds):
         part = record if len(bounds) == 2 else cut(record, first, last)
         walk = parameters.angle_random_walk**2 + float(np.sum(extra[first:last])) / (part.time[-1] - part.time[0])
         noise = replace(own.process_noise, angle_random_walk=float(np.sqrt(walk)))
         end = state
         if not smooth or last < len(extra):
-            found, end = estimation.run_part(part, noise, state, blocks, full_covariance=True, gate=gate, robust=robust)
+            found, end = estimation.run_part(part, noise, state, blocks, **options)
         if smooth:
-            found = estimation.smooth(part, noise, state, blocks, full_covariance=True, gate=gate, robust=robust)
+            found = estimation.smooth(part, noise, state, blocks, **options)
         state = end
         parts.append(found)
     return _joined(parts)
+
+
+def _over_steps(variance: Array, edge: np.ndarray) -> Array:
+    """Return the sum over each step (k,) of a variance of each sample interval (n − 1,)."""
+    return np.asarray(np.add.reduceat(variance, edge[:-1].astype(np.intp)))
 
 
 def _joined(parts: list[Estimate]) -> Estimate:
@@ -211,6 +226,7 @@ def _at_stamps(
     prepared: Prepared,
     parameters: AhrsParameters,
     delays: Delays,
+    turn_variance: Array,
     smooth: bool,
     full_covariance: bool,
 ) -> Estimate:
@@ -225,6 +241,9 @@ def _at_stamps(
     assert filtered.covariance is not None
     R = quaternion.to_matrix(filtered.attitude)
     fixed = R @ filtered.covariance[:, :3, :3] @ R.transpose(0, 2, 1)
+    scale = np.ones((len(fixed), 3))
+    scale[:, :2] = _tilt_scale(filtered, _over_steps(turn_variance, edge) > 0.0)[:, None]
+    fixed *= scale[:, :, None] * scale[:, None, :]
     iron = 0.0 if prepared.dip is None else (parameters.iron_sigma / np.cos(prepared.dip)) ** 2
     attitude, own = np.empty((len(row), 4)), np.empty((len(row), 3, 3))
     compiled(recording_steps.carry_to_stamps)(
@@ -236,7 +255,10 @@ def _at_stamps(
     if full_covariance:
         P = filtered.covariance[row]
         P[:, :3, :3] = own
-        P[:, :3, 3:] = quaternion.to_matrix(attitude).transpose(0, 2, 1) @ (R @ filtered.covariance[:, :3, 3:])[row]
+        P[:, :3, 3:] = (
+            quaternion.to_matrix(attitude).transpose(0, 2, 1)
+            @ (scale[:, :, None] * (R @ filtered.covariance[:, :3, 3:]))[row]
+        )
         P[:, 3:, :3] = P[:, :3, 3:].transpose(0, 2, 1)
     sensors = {"accelerometer": used.specific_force, "magnetometer": used.magnetic_field}
     return Estimate(
@@ -259,3 +281,19 @@ def _at_stamps(
             for name, block in filtered.error_states.items()
         },
     )
+
+
+def _tilt_scale(filtered: Estimate, uncertain: np.ndarray) -> Array:
+    """Return the factor (k + 1,) of the tilt's modelled σ at the edges of the steps, by the level of the acceleration so far.
+
+    One model holds for slow and fast motion, so most motion is slower than modelled. Without a measurement, and at first and in steps
+    whose turn is ``uncertain`` (k,), the level is taken for that modelled.
+    """
+    seen = filtered.innovations["accelerometer"]
+    nis = np.ones((len(filtered.time), 1))
+    nis[np.searchsorted(filtered.time, seen.time), 0] = np.where(np.isfinite(seen.nis), seen.nis / 3.0, 1.0)
+    step = float(np.median(np.diff(filtered.time))) / LEVEL_TIME
+    begin = np.append(0, np.flatnonzero(uncertain) + 1)
+    nis[begin] = 1.0
+    level = np.concatenate([low_pass(part, step) for part in np.split(nis, begin[1:])])[:, 0]
+    return np.asarray(np.sqrt(OWN_SHARE + ACCELERATION_SHARE * np.sqrt(level)))

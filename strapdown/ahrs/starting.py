@@ -46,7 +46,7 @@ def start(
 ) -> estimation.State:
     """Return the state at the first of the quiet samples: attitude by TRIAD from the mean vertical and field, any North without a field.
 
-    The means are taken in the frame that the gyro keeps over those samples, and σ grows with the acceleration that is left there.
+    The means are formed in the frame that the gyro keeps over those samples, and σ grows with the acceleration that is left there.
     ``iron`` (3,) is the hard iron to be taken off the field, body axes. With
     ``rest_bias_sigma`` the bias is that of :func:`resting_bias`.
     """

@@ -1,13 +1,9 @@
 """Noise of a sensor at rest: Allan deviation, the fit of its coefficients, and the parameters that other programs want.
 
-``deviation``
-    :func:`allan_deviation` with confidence intervals, :func:`fit_noise` by maximum likelihood.
-``gaps``
-    Allan deviation of a record with gaps.
-``temperature``
-    Bias as a polynomial in temperature.
-``parameters``
-    Noise parameters of a six-axis unit, as Kalibr, PX4 and MATLAB write them.
+- ``deviation``: :func:`allan_deviation` with confidence intervals, :func:`fit_noise` by maximum likelihood.
+- ``gaps``: Allan deviation of a record with gaps.
+- ``temperature``: Bias as a polynomial in temperature.
+- ``parameters``: Noise parameters of a six-axis unit, as Kalibr, PX4 and MATLAB write them.
 """
 
 from __future__ import annotations
@@ -37,6 +33,5 @@ __all__ = [
     "NoiseFit",
     "allan_deviation",
     "fit_noise",
-    "model_deviation",
     "to_gyro_parameters",
 ]

@@ -93,7 +93,7 @@ _MEDIAN_EFFICIENCY = (
 )
 _FEWEST_BLOCKS = 30  # below this the lag-1 autocorrelation says little (SP 1065, §5.5.6)
 _MANY_BLOCKS = 128  # its scatter is then well below what moves the power law by one half
-_MOST_BLOCKS = 1 << 17
+_MAX_BLOCKS = 1 << 17
 _STRETCH = 1 << 16
 _BIN_GROWTH = 1.05
 _LARGEST_EXACT = 1 << 16
@@ -345,14 +345,6 @@ def equivalent_degrees_of_freedom(alpha: int, samples: int, m: int, estimator: s
     phase of a noise that is white, flicker or random walk in continuous time has the generalised covariances −|t|, t² ln|t| and |t|³,
     which need no further approximation; quantisation is white phase. The sum of the phase, whose third differences the modified Allan
     deviation squares, has the second integrals of these.
-
-    Parameters
-    ----------
-    alpha : int
-        Power law of the rate, a key of :data:`NOISE_TYPES`.
-    samples, m : int
-    estimator : str
-        One of :data:`ESTIMATORS`; ``"robust"`` as ``"overlapping"``, whose median has 0.37 times as many.
     """
     if alpha not in NOISE_TYPES:
         raise InputError(f"alpha is {alpha!r}; it must be one of {', '.join(map(str, NOISE_TYPES))}")
@@ -452,8 +444,8 @@ def _power_law(phase: Array, m: int, otherwise: int) -> int:
     only be redder than ``otherwise``, the power law of the τ before: by chance they show anything.
     """
     edges = phase[::m]
-    spare = max(0, len(edges) - _MOST_BLOCKS) // 2
-    blocks = np.diff(edges[spare : spare + _MOST_BLOCKS])
+    spare = max(0, len(edges) - _MAX_BLOCKS) // 2
+    blocks = np.diff(edges[spare : spare + _MAX_BLOCKS])
     count = len(blocks)
     if count < _FEWEST_BLOCKS:
         return otherwise
@@ -555,31 +547,10 @@ def fit_noise(
 
 
 def expected_errors(parameters: Mapping[str, float], samples: int, sample_interval: float) -> dict[str, float]:
-    """Return the standard errors that a fit of all terms would have: how long a record must be.
+    """Return the standard errors, SI, that a fit of all terms would have: how long a record must be.
 
-    Parameters
-    ----------
-    parameters : mapping of str to float
-        Coefficients, SI, by name in :data:`TERMS`; absent or zero ones are fitted too.
-    samples : int
-        Samples of the record, at least 64.
-    sample_interval : float
-        Sample interval, s.
-
-    Returns
-    -------
-    dict of str to float
-        Standard error, SI, of each term that is not zero.
-
-    Raises
-    ------
-    InputError
-        If no random noise is given or a name is unknown.
-
-    Notes
-    -----
-    The Cramér–Rao bound of the cosine coefficients, which the fit attains where an error is well below the coefficient itself;
-    elsewhere the record does not support the term.
+    ``parameters`` are coefficients, SI, by name in :data:`TERMS`. The Cramér–Rao bound of the cosine coefficients, which the fit attains
+    where an error is well below the coefficient itself; elsewhere the record does not support the term.
     """
     checks.known_keys("parameters", parameters, TERMS)
     dt = checks.positive("sample_interval", sample_interval, unit="s")
@@ -611,11 +582,6 @@ def flicker_variance(multiples: ArrayLike) -> Array:
 
     ``∫ (4/(2π f)) sin⁴(π f m)/(m sin π f)² df`` over f in (0, ½), as a sum over the autocovariance −Cin(π k)/π of the samples. It tends
     to 2 ln 2/π as 1/m² (to 1e-7 at m = 4096, beyond which the limit is returned), from above: one sample shows 19 % more.
-
-    Parameters
-    ----------
-    multiples : array_like of int
-        Averaging times in samples, m ≥ 1.
     """
     m_all = np.atleast_1d(checks.array("multiples", multiples, (...,)))
     limit = int(min(m_all.max(initial=1.0), _FLICKER_SUM_LIMIT))
@@ -635,26 +601,9 @@ def flicker_variance(multiples: ArrayLike) -> Array:
 
 
 def model_deviation(parameters: Mapping[str, float], taus: ArrayLike, sample_interval: float) -> dict[str, Array]:
-    """Return the Allan deviation of each noise term and of their sum.
+    """Return the Allan deviation (t,), rad/s, of each noise term and of their sum, ``"total"``, at ``taus``, s.
 
-    Parameters
-    ----------
-    parameters : mapping of str to float
-        Coefficients, SI, by name in :data:`TERMS`; absent ones are zero.
-    taus : array_like (t,)
-        Averaging times, s.
-    sample_interval : float
-        Sample interval, s.
-
-    Returns
-    -------
-    dict of str to ndarray (t,)
-        Allan deviations, rad/s, by term, and ``"total"``.
-
-    Examples
-    --------
-    >>> model_deviation({"angle_random_walk": 3e-5}, [1.0, 9.0], 0.01)["total"].round(9).tolist()
-    [3e-05, 1e-05]
+    ``parameters`` are coefficients, SI, by name in :data:`TERMS`; absent ones are zero.
     """
     checks.known_keys("parameters", parameters, TERMS)
     tau = checks.array("taus", taus, ("t",))
@@ -698,18 +647,9 @@ def to_gyro_parameters(fit: NoiseFit) -> dict[str, float | tuple[float, ...]]:
 
 
 def upper_bounds(fit: NoiseFit) -> dict[str, float | tuple[float, ...]]:
-    """Return the upper ends of the intervals of the terms that some axis does not support.
+    """Return the upper ends, SI, by term, one or one an axis, of the intervals of the terms that some axis does not support.
 
-    Parameters
-    ----------
-    fit : NoiseFit
-        Coefficients of one sensor.
-
-    Returns
-    -------
-    dict of str to float or tuple of float
-        Upper ends by name, SI, one number or one per axis. The record cannot exclude coefficients up to these; a filter that must
-        not be overconfident may use them.
+    The record cannot exclude coefficients up to these; a filter that must not be overconfident may use them.
     """
     return _by_name(fit, fit.upper, np.asarray(~fit.supported.all(axis=0)))
 

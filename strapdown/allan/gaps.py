@@ -37,30 +37,10 @@ RUNS = 400
 def allan_deviation(
     values: ArrayLike, sample_interval: float, *, taus: ArrayLike | None = None, level: float = 0.95, seed: int = 0
 ) -> AllanDeviation:
-    """Return the Allan deviation of a record with gaps, and its confidence band.
+    """Return the Allan deviation of averaged samples with gaps (NaN), estimator ``"gaps"``, and its confidence band.
 
-    Parameters
-    ----------
-    values : array_like (n,) or (n, axes)
-        Averaged samples on an even grid, SI; a row with a NaN is missing.
-    sample_interval : float
-        Sample interval, s.
-    taus : array_like, optional
-        Averaging times, s. Default: 12 a decade, up to a tenth of the record.
-    level : float, default 0.95
-        Confidence of the band, 0.5 to 1.
-    seed : int, default 0
-        Seed of the simulated records that the band comes from.
-
-    Returns
-    -------
-    AllanDeviation
-        The deviation with the estimator ``"gaps"``; NaN where too few pairs of samples are that far apart.
-
-    Raises
-    ------
-    InputError
-        If too few samples are present, or a τ is outside [sample interval, half the record].
+    By default at 12 averaging times a decade, up to a tenth of the record; NaN where too few pairs of samples are that far apart. The band
+    comes from simulated records (``seed``).
     """
     dt = checks.positive("sample_interval", sample_interval, unit="s")
     if not 0.5 < level < 1.0:
@@ -241,31 +221,10 @@ def fit_noise(
     highest_frequency: float | None = None,
     level: float = 0.95,
 ) -> NoiseFit:
-    """Return the noise coefficients of a record with gaps, with intervals.
+    """Return the noise coefficients of averaged samples with gaps (NaN), with intervals; options as :func:`strapdown.allan.fit_noise`.
 
-    Parameters
-    ----------
-    values : array_like (n,) or (n, axes)
-        Averaged samples on an even grid, SI; a row with a NaN is missing.
-    sample_interval : float
-        Sample interval, s.
-    terms : sequence of str, default TERMS
-        Terms to fit, of :data:`strapdown.allan.TERMS`.
-    highest_frequency : float, optional
-        Frequency, Hz, above which the spectrum is left out.
-    level : float, default 0.95
-        Confidence of the intervals, 0.5 to 1.
-
-    Returns
-    -------
-    NoiseFit
-        Coefficients from the segments of at least :data:`SHORTEST` samples, which ``samples`` counts. ``misfit_probability`` is
-        that of the worst segment, times their number.
-
-    Raises
-    ------
-    InputError
-        If no segment is long enough, or as :func:`strapdown.allan.fit_noise`.
+    They come from the segments of at least :data:`SHORTEST` samples, which ``samples`` counts; ``misfit_probability`` is that of the worst
+    segment, times their number.
     """
     dt = checks.positive("sample_interval", sample_interval, unit="s")
     record, known = _record(values)

@@ -66,7 +66,7 @@ NAMES: Mapping[str, Mapping[str, str]] = {
     },
     "magnetometer": {"angle_random_walk": "white_noise", "rate_random_walk": "random_walk", "rate_ramp": "ramp"},
 }
-"""What a term is called of a sensor, where not as of a gyro."""
+"""Name of a term by sensor, where it differs from that of a gyro."""
 _KEYS = {"mm/s": "mm_per_s", "µg/√Hz": "ug_per_sqrt_hz", "µg": "ug", "µg/√h": "ug_per_sqrt_hour", "µg/h": "ug_per_hour"}
 _KEYS |= {"nT s": "nt_s", "nT/√Hz": "nt_per_sqrt_hz", "nT": "nt", "nT/√h": "nt_per_sqrt_hour", "nT/h": "nt_per_hour"}
 PX4_STEP = 0.01

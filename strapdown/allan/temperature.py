@@ -27,7 +27,7 @@ __all__ = [
     "fit_temperature",
 ]
 
-MOST_PASSES = 50
+MAX_PASSES = 50
 """Most iterations of the regression, each with the noise of the last residuals."""
 SETTLED = 1e-3
 """Convergence: largest change of a coefficient, in σ, and relative change of the noise's spectrum."""
@@ -173,7 +173,7 @@ def _regression(x: Array, powers: Array, dt: float) -> tuple[Array, Array]:
     found = np.linalg.lstsq(A, y, rcond=None)[0]
     variance = np.maximum(binned((y - A @ found) ** 2) / number, 1e-300)
     errors = np.full(len(found), np.inf)
-    for _ in range(MOST_PASSES):
+    for _ in range(MAX_PASSES):
         weight = np.repeat(1.0 / np.sqrt(variance), number.astype(np.int64))
         Q, R = np.linalg.qr(A * weight[:, None])
         before, found = found, np.linalg.solve(R, Q.T @ (y * weight))

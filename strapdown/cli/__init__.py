@@ -3,32 +3,19 @@
 A result replaces all of an earlier result of the same name. ``estimate``, ``simulate``, ``integrate`` and ``tune`` refuse to replace a file
 that they did not write; ``montecarlo``, whose result may have taken hours, needs ``--resume`` or ``--overwrite``.
 
-``terminal``
-    What every command shares.
-``progress``
-    Progress of what takes long.
-``studies``
-    ``coning``
-``integration``
-    ``algorithms``, ``integrate``, ``coning-budget``
-``estimation``
-    ``estimate``
-``reading``
-    Options of every command that reads a recording.
-``conversion``
-    ``convert``
-``campaigns``
-    ``montecarlo``
-``judgement``
-    ``check``, ``doctor``
-``planning``
-    ``covariance``
-``reporting``
-    ``report``
-``sensors``
-    ``simulate``, ``scenarios``, ``allan``
-``tuning``
-    ``tune``
+- ``terminal``: What every command shares.
+- ``progress``: Progress of what takes long.
+- ``studies``: ``coning``
+- ``integration``: ``algorithms``, ``integrate``, ``coning-budget``
+- ``estimation``: ``estimate``
+- ``reading``: Options of every command that reads a recording.
+- ``conversion``: ``convert``
+- ``campaigns``: ``montecarlo``
+- ``judgement``: ``check``, ``doctor``
+- ``planning``: ``covariance``
+- ``reporting``: ``report``
+- ``sensors``: ``simulate``, ``scenarios``, ``allan``
+- ``tuning``: ``tune``
 """
 
 from __future__ import annotations

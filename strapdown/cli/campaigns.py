@@ -56,6 +56,12 @@ def montecarlo(
             "which is executed. Default: the filter that matches the scenario.",
         ),
     ] = None,
+    gyro: Annotated[
+        Path | None,
+        typer.Option(
+            help="TOML with a table named gyro, a data sheet's: the filter is matched to it, not to the scenario's gyro."
+        ),
+    ] = None,
     dispersions: Annotated[
         Path | None,
         typer.Option(
@@ -77,7 +83,12 @@ def montecarlo(
             "no filter, --float32 or lanes are asked for.",
         ),
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="HDF5 file; NAME-montecarlo.h5 if not given.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="HDF5 file; NAME-montecarlo.h5 after the name, or the TOML file, of the scenario if not given."
+        ),
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the file, if it exists.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Begin anew although the file exists.")] = False,
     workers: Annotated[
@@ -106,13 +117,14 @@ def montecarlo(
     if held is None:
         if states is None and (float32 or machine == "lanes"):
             states = False
-        plan = _plan(scenario, filter_file, dispersions, seed, float32, states)
-        target = out or Path(f"{plan.scenario.name or source.stem}-montecarlo.h5")
+        plan = _plan(scenario, filter_file, gyro, dispersions, seed, float32, states)
+        target = out or Path(f"{source.stem}-montecarlo.h5")
     else:
         if filter_file is not None and (own := own_filter(filter_file)) is not None:
             held, filter_file = _with_filter(held, own, source), None
         given = {
             "--filter": filter_file,
+            "--gyro": gyro,
             "--dispersions": dispersions,
             "--seed": seed,
             "--float32": float32 or None,
@@ -123,20 +135,16 @@ def montecarlo(
                 raise InputError(f"{name} is given, but {source} holds its own; leave it out, or name a scenario")
         plan, target = held.plan, out or source
         machine = held.machine if machine == "auto" else machine
-    writable("out", target, suffixes=_CAMPAIGN_SUFFIXES)
     tables_folder(tables)
     if resume and overwrite:
         raise InputError("--resume and --overwrite exclude each other: go on with the file, or start it anew")
-    beside = target.with_suffix(".json")
-    if replay is None and beside.exists() and not target.exists() and not overwrite:
-        raise InputError(f"{beside} exists and would be replaced; move it, choose another --out, or give --overwrite")
-    writable("out", beside)
+    _check_files(target, replaced=overwrite or replay is not None)
     if replay is not None:
         writable("out", *_replayed(target, replay))
         _replay(plan, replay, machine, target)
         return
     if held is not None and target == source and not (resume or overwrite):
-        status = _tell(held)
+        status = _print_result(held)
         if tables is not None and held.statistics is not None:
             written(*tables_written(tables, "montecarlo", engine.summary(held.statistics)))
         raise typer.Exit(status)
@@ -148,6 +156,39 @@ def montecarlo(
     count("runs", runs)
     engine.in_threads(threads)  # so that a wrong number is found now
     console.print(f"{plan.scenario.name or source.stem}: {counted(runs, 'run')}, seed {plan.seed}, machine: {choice}.")
+    options: dict[str, Any] = {
+        "resume": resume,
+        "overwrite": overwrite,
+        "chunk": chunk,
+        "machine": machine,
+        "threads": threads,
+    }
+    result = _computed(plan, target, runs, workers, cluster, options)
+    status = _print_result(result)
+    report = target.with_suffix(".json")
+    content = _report(result)
+    write_json(report, content)
+    written(target, report, *tables_written(tables, "montecarlo", content))
+    raise typer.Exit(status)
+
+
+def _check_files(target: Path, *, replaced: bool) -> None:
+    """Refuse a file that cannot be written, or a report beside it that is another's; ``replaced``: what is there may be."""
+    from strapdown.checks import InputError
+
+    writable("out", target, suffixes=_CAMPAIGN_SUFFIXES)
+    beside = target.with_suffix(".json")
+    if beside.exists() and not target.exists() and not replaced:
+        raise InputError(f"{beside} exists and would be replaced; move it, choose another --out, or give --overwrite")
+    writable("out", beside)
+
+
+def _computed(
+    plan: Plan, target: Path, runs: int, workers: int | None, cluster: str | None, options: dict[str, Any]
+) -> Campaign:
+    """Compute the runs, in threads or on Dask, and write them to the file as they are finished."""
+    from strapdown.montecarlo import campaign as campaigns
+
     with contextlib.ExitStack() as stack:
         hands = None
         if workers is not None or cluster is not None:
@@ -164,27 +205,10 @@ def montecarlo(
             stop_if_asked()
 
         try:
-            result = campaigns.run(
-                plan,
-                target,
-                runs=runs,
-                resume=resume,
-                overwrite=overwrite,
-                chunk=chunk,
-                machine=machine,
-                threads=threads,
-                workers=hands,
-                progress=advanced,
-            )
+            return campaigns.run(plan, target, runs=runs, workers=hands, progress=advanced, **options)
         except KeyboardInterrupt:
             console.print(f"What is finished is in {target}; go on with --resume.")
             raise
-    status = _tell(result)
-    report = target.with_suffix(".json")
-    content = _report(result)
-    write_json(report, content)
-    written(target, report, *tables_written(tables, "montecarlo", content))
-    raise typer.Exit(status)
 
 
 @contextlib.contextmanager
@@ -216,6 +240,7 @@ def asked_to_stop() -> Iterator[Callable[[], None]]:
 def _plan(
     scenario: str,
     filter_file: Path | None,
+    gyro: Path | None,
     dispersions: Path | None,
     seed: int | None,
     float32: bool,
@@ -224,12 +249,15 @@ def _plan(
     from strapdown import montecarlo as engine
     from strapdown import workflows
     from strapdown.checks import InputError
+    from strapdown.gyro import read_spec
     from strapdown.setup import matched
 
     if states is not None and filter_file is not None:
         raise InputError(
             "--filter holds the filter's states itself, in [filter.states]; leave --states and --no-states out"
         )
+    if gyro is not None and filter_file is not None:
+        raise InputError("--gyro and --filter both give the filter's gyro noise; give one of them")
     loaded = scenario_named(scenario)
     chosen = None
     if filter_file is not None:
@@ -237,6 +265,7 @@ def _plan(
         chosen = filter_of_scenario(filter_file, loaded) if own is None else replace(matched(loaded), estimator=own)
     plan = workflows.plan(
         loaded,
+        gyro=None if gyro is None else read_spec(gyro),
         setup=chosen,
         seed=seed,
         states=states,
@@ -288,12 +317,12 @@ def _judged(campaign: Campaign) -> Judgement:
     return consistency.judge_runs(campaign.statistics, unmodelled=campaign.plan.unmodelled)
 
 
-def _tell(campaign: Campaign) -> int:
+def _print_result(campaign: Campaign) -> int:
     """Show the statistics and the verdict; return the exit status."""
     from strapdown.checks import InputError
     from strapdown.cli.judgement import status_of
     from strapdown.montecarlo import summary
-    from strapdown.montecarlo.verdicts import QUANTILES, bound_of
+    from strapdown.montecarlo.verdicts import bound_of
 
     if campaign.statistics is None:
         raise InputError("no chunk of the campaign is finished; go on with it (--resume)")
@@ -301,19 +330,51 @@ def _tell(campaign: Campaign) -> int:
         console.print(f"{campaign.statistics.runs} of {campaign.runs} runs are finished.")
     report = summary(campaign.statistics, bound=bound_of(campaign.plan))
     figure = lambda value: "-" if value is None else f"{value:.4g}" if value >= 1e3 else f"{value:.4f}"  # noqa: E731
+    judgement = _judged(campaign)
+    found = {(one.name, one.of): one for one in judgement.findings}
     rows = table(
-        "Per degree of freedom; 1 is a filter as good as it says", "", "mean", "least", "greatest", "from", "to", ""
+        f"Per degree of freedom; 1 is a filter as good as it says. NEES over {report['epochs_judged']} epochs",
+        *("", "mean", "least", "greatest", "from", "to", ""),
     )
     for subset, part in report["nees"].items():
-        values = (part["anees"], part["least"], part["greatest"], *part["bounds"])
-        rows.add_row(f"NEES of the {subset}", *map(figure, values), verdict(part["consistent"]))
+        one = found["ANEES", subset]
+        values = (part["anees"], part["least"], part["greatest"], one.low, one.high)
+        rows.add_row(f"NEES of the {subset}", *map(figure, values), verdict(not one.rejected))
     for part in report["nis"]:
+        one = found["NIS", part["sensor"]]
         name = f"NIS of {part['sensor']}"
-        rows.add_row(name, figure(part["nis"]), "", "", *map(figure, part["bounds"]), verdict(part["consistent"]))
+        rows.add_row(name, figure(part["nis"]), "", "", *map(figure, (one.low, one.high)), verdict(not one.rejected))
     show(rows)
     refused = ", ".join(f"{part['refused']} of {part['sensor']}" for part in report["nis"] if part["refused"])
     if refused:
         console.print(f"The gate refused {refused}.")
+    _print_errors(report)
+    worst = ", ".join(
+        f"{part['run']} ({'failed' if part['largest_nees'] is None else format(part['largest_nees'], '.1f')})"
+        for part in report["worst_runs"][:5]
+    )
+    console.print(f"Worst runs, by their largest NEES of the state: {worst}. See one with --replay.")
+    if report["failed_runs"]:
+        console.print(f"In {counted(report['failed_runs'], 'run')} the filter failed: no finite error or covariance.")
+    rate = ""
+    if campaign.seconds > 0.0:
+        rate = f" ({rate_text(campaign.statistics.runs / campaign.seconds)} runs/s, compiling included)"
+    console.print(
+        f"{counted(report['runs'], 'run')}, {campaign.seconds:.3g} s{rate}. The verdict takes all {len(judgement.findings)} "
+        f"statistics of `strapdown check` together: a right filter passes with {100.0 * report['probability']:g} %."
+    )
+    console.print(judgement.words)
+    if judgement.verdict == "cannot tell":
+        console.print("More runs (--runs, with --resume) would show it.")
+    if judgement.unmodelled and campaign.plan.setup.states is None:
+        console.print("--states gives the filter states for most of these errors.")
+    return status_of(judgement)
+
+
+def _print_errors(report: dict[str, Any]) -> None:
+    """Show the errors at the end, worst axis, and the coverage."""
+    from strapdown.montecarlo.verdicts import QUANTILES
+
     last = report["last_epoch"]
     errors = table(
         f"Errors at {last['time_s']:g} s, worst axis; share of the judged ones inside kσ",
@@ -350,27 +411,6 @@ def _tell(campaign: Campaign) -> int:
             f"RMS error over the root of the Cramér–Rao bound, which no filter can beat, by axis: {ratios} "
             f"(at one epoch {low:.3f} to {high:.3f} for a filter that attains it)."
         )
-    worst = ", ".join(
-        f"{part['run']} ({'failed' if part['largest_nees'] is None else format(part['largest_nees'], '.1f')})"
-        for part in report["worst_runs"][:5]
-    )
-    console.print(f"Worst runs, by their largest NEES of the state: {worst}. See one with --replay.")
-    if report["failed_runs"]:
-        console.print(f"In {counted(report['failed_runs'], 'run')} the filter failed: no finite error or covariance.")
-    rate = ""
-    if campaign.seconds > 0.0:
-        rate = f" ({rate_text(campaign.statistics.runs / campaign.seconds)} runs/s, compiling included)"
-    console.print(
-        f"{counted(report['runs'], 'run')}, {campaign.seconds:.3g} s{rate}. Bounds hold all statistics of a right filter together with "
-        f"{100.0 * report['probability']:g} %, NEES at {report['epochs_judged']} epochs."
-    )
-    judgement = _judged(campaign)
-    console.print(judgement.words)
-    if judgement.verdict == "cannot tell":
-        console.print("More runs (--runs, with --resume) would show it.")
-    if judgement.unmodelled and campaign.plan.setup.states is None:
-        console.print("--states gives the filter states for most of these errors.")
-    return status_of(judgement)
 
 
 def _worst_axis(values: list[float | None]) -> int:

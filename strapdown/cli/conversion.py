@@ -17,7 +17,7 @@ from strapdown.cli.reading import (
     MagnetometerUnit,
     TimeUnit,
     Topic,
-    told,
+    given_layout,
 )
 from strapdown.cli.terminal import app, console, writable, written
 
@@ -66,7 +66,7 @@ def convert(
         "magnetometer": magnetometer_unit,
         "time": time_unit,
     }
-    options = told(source, columns=columns, topic=topic, axes=axes, invert=invert, **units)
+    options = given_layout(source, columns=columns, topic=topic, axes=axes, invert=invert, **units)
     estimate = recordings.is_estimate(source)
     writable(
         "OUT",

@@ -20,7 +20,7 @@ from strapdown.cli.reading import (
     Invert,
     TimeUnit,
     Topic,
-    told,
+    given_layout,
 )
 from strapdown.cli.terminal import (
     FORMAT,
@@ -53,11 +53,11 @@ FILES = (
     "observability.json",
     "calibration.toml",
 )
-"""What the command may write to its folder, beside figures."""
+"""Files that the command may write to its folder, beside figures."""
 FIGURES = ("estimate", "errors", "states")
 """Figures that it may draw there, without the suffix of their format."""
 ABOUT_IT = ("estimate.html", "estimate.report.json")
-"""What other commands write there about an estimate."""
+"""Files that other commands write there about an estimate."""
 
 
 @app.command()
@@ -193,7 +193,7 @@ def estimate(
     writable("out", *(out / name for name in names), sources=(recording, gyro, filter_file, calibration))
     need_own(out / FILES[0], "estimate", lambda path: bool(read_attributes(path)["kind"] == "strapdown estimate"))
     units = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
-    layout = told(recording, columns=columns, topic=topic, axes=axes, invert=invert, **units)
+    layout = given_layout(recording, columns=columns, topic=topic, axes=axes, invert=invert, **units)
     specified = is_record(recording)
     _check_kind(
         recording,
@@ -223,7 +223,7 @@ class _Output(NamedTuple):
     folder: Path
     exports: Sequence[tuple[Path, dict[str, Any]]]
     form: FigureFormat | None
-    """Of the figures; None: draw none."""
+    """Format of the figures; None: draw none."""
 
 
 class _Shared(NamedTuple):
@@ -357,7 +357,7 @@ def _estimate_specified(path: Path, shared: _Shared, options: _Specified, output
     )
     for remark in remarks:
         console.print(remark)
-    _tell(run.estimate)
+    _print_result(run.estimate)
     paths = _write_specified(path, held, chosen, run, shared, output)
     if output.form is not None:
         paths += _drawn(output.folder, output.form, run.estimate, path.name, truth=run.truth)
@@ -390,7 +390,7 @@ def _write_specified(
     write_estimate(paths[0], result, attributes, truth=truth)
     if result.error_states:
         paths.append(out / "states.json")
-        write_json(paths[-1], {"source": str(path), **_tell_states(result, run.record)})
+        write_json(paths[-1], {"source": str(path), **_print_states(result, run.record)})
     if shared.observability:
         paths.append(_observability(out, str(path), run.record, chosen, run.initial))
     if truth is not None:
@@ -466,7 +466,7 @@ def _states(result: Any) -> dict[str, Any]:
     }
 
 
-def _tell_states(result: Any, record: ImuRecord) -> dict[str, Any]:
+def _print_states(result: Any, record: ImuRecord) -> dict[str, Any]:
     """Show the optional states at the end, and return them for JSON."""
     from strapdown.plots.style import error_state_unit
 
@@ -513,7 +513,7 @@ def _clear(out: Path) -> None:
         (out / name).unlink(missing_ok=True)
 
 
-def _tell(result: Estimate) -> None:
+def _print_result(result: Estimate) -> None:
     """Say what was not used, and what happened."""
     for sensor, number in result.skipped.items():
         if number:
@@ -550,7 +550,7 @@ def _errors(result: Estimate, truth: Any) -> dict[str, float]:
 
 def _estimate_recording(recording: Path, shared: _Shared, options: _Recorded, output: _Output) -> None:
     """Run the filter over a recording: accelerometer as the vertical, magnetometer as the heading."""
-    from strapdown import ahrs, recordings, workflows
+    from strapdown import ahrs, recordings
     from strapdown.checks import non_negative, one_of
     from strapdown.consistency import reference_errors
     from strapdown.gyro import read_spec
@@ -566,6 +566,8 @@ def _estimate_recording(recording: Path, shared: _Shared, options: _Recorded, ou
     doubt(source, recording)
     parameters = ahrs.MOTIONS[options.motion]
     if shared.gyro is not None:
+        from strapdown import workflows  # which imports much more
+
         parameters = workflows.with_gyro_noise(parameters, read_spec(shared.gyro))
     with progress_bar("smoothing" if shared.smooth else "filtering"):
         result = ahrs.estimate(
@@ -671,7 +673,7 @@ def _say_recording(result: AhrsEstimate, parameters: AhrsParameters, options: _R
     for sensor, number in found.skipped.items():
         if number:
             console.print(f"{number} samples of the {sensor} are missing and were skipped.")
-    _tell(replace(found, skipped={}))
+    _print_result(replace(found, skipped={}))
 
 
 def _rms(out: Path, source: str, rms: dict[str, float]) -> Path:

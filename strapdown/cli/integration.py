@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from strapdown.cli.reading import RECORDING_HELP, Axes, Columns, GyroUnit, Invert, TimeUnit, Topic, told
+from strapdown.cli.reading import RECORDING_HELP, Axes, Columns, GyroUnit, Invert, TimeUnit, Topic, given_layout
 from strapdown.cli.terminal import (
     Tables,
     app,
@@ -92,7 +92,9 @@ def integrate(
     writable("out", out, suffixes=(".h5", ".hdf5"), sources=(recording,))
     need_own(out, "integrate", lambda path: bool(records.read_attributes(path)["kind"] == "strapdown attitude"))
     chosen = coning.named(algorithm)
-    layout = told(recording, columns=columns, topic=topic, axes=axes, invert=invert, gyro=gyro_unit, time=time_unit)
+    layout = given_layout(
+        recording, columns=columns, topic=topic, axes=axes, invert=invert, gyro=gyro_unit, time=time_unit
+    )
     gaps: list[tuple[float, float]] = []
     words = ""
     with progress_bar("reading, integrating, writing", 3) as advance:

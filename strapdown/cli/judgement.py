@@ -19,7 +19,7 @@ from strapdown.cli.reading import (
     Invert,
     TimeUnit,
     Topic,
-    told,
+    given_layout,
 )
 from strapdown.cli.terminal import (
     app,
@@ -164,7 +164,7 @@ def status_of(judgement: Judgement) -> int:
 
 
 def _is_own(path: Path) -> bool:
-    """Return whether a file is, or should be by its name, a result of this package; one that is missing is told of as such."""
+    """Return whether a file is, or should be by its name, a result of this package; one that is missing is reported as such."""
     from strapdown.files import reading
 
     return not path.exists() or path.suffix.lower() in (".h5", ".hdf5") or (path.is_file() and reading.is_hdf5(path))
@@ -181,7 +181,7 @@ class _Reading(NamedTuple):
 
 
 def _check_foreign(
-    result: Path, truth: Path | None, told: _Reading, aligned: Path | None, json: Path | None
+    result: Path, truth: Path | None, layout: _Reading, aligned: Path | None, json: Path | None
 ) -> NoReturn:
     """Judge an estimate from elsewhere."""
     from strapdown import consistency
@@ -192,7 +192,7 @@ def _check_foreign(
 
     if aligned is not None:
         writable("aligned", aligned, suffixes=(".h5", ".hdf5"), sources=(result, truth))
-    own = read_attitudes(result, topic=told.topic)
+    own = read_attitudes(result, topic=layout.topic)
     length = (own.stamps_ns[-1] - own.stamps_ns[0]) / 1e9
     console.print(f"{own.source}: {len(own.stamps_ns)} attitudes over {length:.6g} s.")
     for remark in own.remarks:
@@ -204,13 +204,13 @@ def _check_foreign(
                 f"{result} holds no innovations, so nothing can be judged without a truth; give --truth, attitudes over the same time"
             )
         estimate = foreign.without_truth(own.seconds(int(own.stamps_ns[0])), own.attitude, own.innovations)
-        judgement = consistency.judge(estimate, None, probability=told.probability)
+        judgement = consistency.judge(estimate, None, probability=layout.probability)
     else:
-        reference = read_attitudes(truth, topic=told.truth_topic)
+        reference = read_attitudes(truth, topic=layout.truth_topic)
         console.print(f"Truth: {reference.source}, {len(reference.stamps_ns)} attitudes.")
         # Clocks from 1970 and from the start of a machine: each from the first stamp of both, in whole ns.
         origin = int(min(own.stamps_ns[0], reference.stamps_ns[0]))
-        frame = own.error_frame if told.error_frame == "find" and own.error_frame else told.error_frame
+        frame = own.error_frame if layout.error_frame == "find" and own.error_frame else layout.error_frame
         found = foreign.check_arrays(
             own.seconds(origin),
             own.attitude,
@@ -221,14 +221,14 @@ def _check_foreign(
             true_bias=reference.bias,
             innovations=own.innovations,
             error_frame=frame,
-            align=told.align,
-            probability=told.probability,
+            align=layout.align,
+            probability=layout.probability,
         )
         judgement = found.judgement
         content.update(found.summary())
         for remark in found.remarks:
             console.print(f"Note: {remark}.")
-        if frame != told.error_frame:
+        if frame != layout.error_frame:
             console.print(f"Note: the file says that its covariance is of the {frame} error.")
         _show_explanations(found)
         if aligned is not None:
@@ -271,11 +271,11 @@ def _show_statistics(judgement: Judgement) -> None:
     for one in judgement.findings:
         bounds = f"{one.low:.4g} to {one.high:.4g}" if math.isfinite(one.low) else ""
         mark = Text("FAIL", style="red") if one.rejected else Text("pass", style="green")
-        rows.add_row(one.name, one.of, f"{one.value:.4g}", bounds, f"{one.p_value:.2g}", f"{one.samples:.4g}", mark)
+        rows.add_row(one.name, one.label, f"{one.value:.4g}", bounds, f"{one.p_value:.2g}", f"{one.samples:.4g}", mark)
     if judgement.findings:
         show(rows)
         console.print(
-            "Each p-value is that of its statistic alone; pass and FAIL take all together "
+            "Each p-value is that of its statistic alone; bounds, pass and FAIL take all together "
             f"(a right filter fails with at most {100.0 * (1.0 - judgement.probability):.2g} %). NIS and NEES are per degree of freedom."
         )
 
@@ -378,7 +378,7 @@ def doctor(
     json_target(json, recording)
     given = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
     source = recordings.read(
-        recording, **told(recording, columns=columns, topic=topic, axes=axes, invert=invert, **given)
+        recording, **given_layout(recording, columns=columns, topic=topic, axes=axes, invert=invert, **given)
     )
     with progress_bar("trying conventions"):
         found = conventions.examine(source)
@@ -401,4 +401,4 @@ def doctor(
     for note in found.notes:
         console.print(f"Note: {note}.")
     put_json(json, found.summary())
-    raise typer.Exit({"as told": CONSISTENT, "wrong convention": NOT}.get(found.verdict, CANNOT_TELL))
+    raise typer.Exit({"as declared": CONSISTENT, "wrong convention": NOT}.get(found.verdict, CANNOT_TELL))

@@ -128,7 +128,7 @@ def covariance(
             epochs=epochs,
         )
     name = chosen.name or Path(scenario).stem
-    _tell(name, found, modelled.integration.name, matched=filter_file is None)
+    _print_result(name, found, modelled.integration.name, matched=filter_file is None)
     write_json(out / "covariance.json", _summary(name, found))
     from strapdown import plots
     from strapdown.plots.style import save_as
@@ -138,7 +138,7 @@ def covariance(
     written(out / "covariance.json", *figures, *tables_written(tables, "covariance", found.budget()))
 
 
-def _tell(name: str, found: Any, integration: str, *, matched: bool) -> None:
+def _print_result(name: str, found: Any, integration: str, *, matched: bool) -> None:
     import numpy as np
 
     from strapdown.covariance import LARGEST_LINEAR

@@ -57,17 +57,7 @@ class _Rate(ProgressColumn):
 
 @contextmanager
 def progress_bar(what: str, total: int | None = None, *, rate: str = "") -> Iterator[Callable[[int], None]]:
-    """Yield a function that advances the progress by so many units.
-
-    Parameters
-    ----------
-    what : str
-        What is done.
-    total : int, optional
-        Units of it; without them only the time is shown.
-    rate : str
-        Unit of a rate that is shown, as runs/s.
-    """
+    """Yield a function that advances the progress by a number of units; without ``total`` only the time is shown."""
     if _quiet:
         yield lambda done: None
         return
@@ -103,19 +93,19 @@ def _terminal(what: str, total: int | None, rate: str) -> Iterator[tuple[Callabl
 
 @contextmanager
 def _lines(what: str, total: int | None) -> Iterator[tuple[Callable[[int], None], Say]]:
-    done, told, announced = 0, LINE_INTERVAL, False
+    done, next_line, announced = 0, LINE_INTERVAL, False
 
     def advance(number: int) -> None:
         nonlocal done
         done += number
 
     def say(compiling: str, seconds: float) -> None:
-        nonlocal told, announced
+        nonlocal next_line, announced
         if compiling and not announced:
             announced = True
             errors.print("compiling for this machine, once: later runs start at once", soft_wrap=True)
-        if seconds >= told:
-            told += LINE_INTERVAL
+        if seconds >= next_line:
+            next_line += LINE_INTERVAL
             share = "" if total is None else f" {done} of {total},"
             errors.print(f"{compiling or what}:{share} {seconds:.0f} s", soft_wrap=True)
 
@@ -131,7 +121,7 @@ def _watch(ended: Event, say: Say) -> None:
 
 
 class _Compiling:
-    """What numba compiles, by its own events; nothing is imported for it."""
+    """Functions that numba is compiling, by its own events; nothing is imported for it."""
 
     def __init__(self) -> None:
         self.current = ""

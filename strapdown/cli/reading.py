@@ -54,7 +54,7 @@ RECORDING_HELP = (
 )
 
 
-def told(
+def given_layout(
     path: Path,
     *,
     columns: str | None = None,

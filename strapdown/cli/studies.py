@@ -27,7 +27,7 @@ from strapdown.cli.terminal import (
 if TYPE_CHECKING:
     from strapdown.coning import Algorithm
 
-LEAST_SAMPLES_A_CYCLE = 0.1
+MIN_SAMPLES_A_CYCLE = 0.1
 """With fewer a step holds more than ten turns of the cone, and nothing of the study means anything."""
 
 
@@ -53,7 +53,7 @@ def _show_own(own: tuple[Algorithm, ...]) -> None:
         "best n, C of as many increments",
     )
     for one in own:
-        told = own_summary(one)
+        row = own_summary(one)
         constant = one.drift_constant
         exact = f" = {constant}" if constant.denominator < _SHOWN_DENOMINATOR else ""
         rows.add_row(
@@ -62,7 +62,7 @@ def _show_own(own: tuple[Algorithm, ...]) -> None:
             str(one.order),
             str(one.drift_order),
             f"{float(constant):.4g}{exact}",
-            f"{told['best_drift_order']}, {told['best_drift_constant']:.4g}",
+            f"{row['best_drift_order']}, {row['best_drift_constant']:.4g}",
         )
     show(rows)
     for one in own:
@@ -111,10 +111,10 @@ def coning(
     parameters = coning_study.ConingParameters(
         angle=angle * DEGREE, frequency=frequency, rate=rate, duration=duration, runs=runs, seed=seed, own=own
     )
-    if rate < LEAST_SAMPLES_A_CYCLE * frequency:
+    if rate < MIN_SAMPLES_A_CYCLE * frequency:
         raise InputError(
             f"rate is {rate:g} Hz, {rate / frequency:.3g} samples of a cone's cycle at {frequency:g} Hz; no algorithm follows it: "
-            f"raise the rate, to {LEAST_SAMPLES_A_CYCLE:g} samples a cycle at least"
+            f"raise the rate, to {MIN_SAMPLES_A_CYCLE:g} samples a cycle at least"
         )
     usable_folder("out", out)
     names = ("drift", "errors", "consistency", *(["algorithms"] if own else []))

@@ -1,4 +1,4 @@
-"""What every command shares: the application, the two consoles, tables."""
+"""Shared by every command: the application, the two consoles, tables."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ __all__ = [
 
 LARGEST_NUMBER = 1e30
 """No number of a scenario is larger in any unit that its file may use; beyond it squares and products leave the range of doubles."""
-MOST_MEASUREMENTS = 1e8
-"""Of one sensor in a scenario: more do not fit into memory."""
+MAX_MEASUREMENTS = 1e8
+"""Most measurements of one sensor in a scenario; more do not fit into memory."""
 
 app = typer.Typer(
     help="Strapdown gyro attitude estimation: simulate, estimate, judge.",
@@ -54,7 +54,7 @@ console = Console(markup=False, highlight=False, soft_wrap=True)
 
 
 class FigureFormat(enum.StrEnum):
-    """What figures are written as."""
+    """Formats of figures."""
 
     png = "png"
     pdf = "pdf"
@@ -123,7 +123,7 @@ def scenario_named(name: str) -> Scenario:
     """Return the scenario of a name or a TOML file whose numbers can be computed with, not only read.
 
     Refused are numbers beyond :data:`LARGEST_NUMBER`, a duration shorter than one gyro sample, and more measurements of a sensor than
-    :data:`MOST_MEASUREMENTS`: each would end deep inside, as an infinity or for want of memory.
+    :data:`MAX_MEASUREMENTS`: each would end deep inside, as an infinity or for want of memory.
     """
     from strapdown.checks import InputError
     from strapdown.scenarios import load_scenario, scenario_to_table
@@ -138,9 +138,9 @@ def scenario_named(name: str) -> Scenario:
         )
     for sensor in chosen.sensors:
         measurements = chosen.duration * getattr(sensor, "rate", 0.0)
-        if measurements > MOST_MEASUREMENTS:
+        if measurements > MAX_MEASUREMENTS:
             raise InputError(
-                f"{name}: {sensor.name} would measure {measurements:.3g} times, more than {MOST_MEASUREMENTS:.0e}; lower its rate or "
+                f"{name}: {sensor.name} would measure {measurements:.3g} times, more than {MAX_MEASUREMENTS:.0e}; lower its rate or "
                 "shorten the run"
             )
     return chosen

@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from strapdown.cli.reading import Axes, Invert, told
+from strapdown.cli.reading import (
+    AccelerometerUnit,
+    Axes,
+    Columns,
+    GyroUnit,
+    Invert,
+    TimeUnit,
+    Topic,
+    given_layout,
+)
 from strapdown.cli.terminal import (
     FigureFormat,
     Format,
@@ -42,7 +51,7 @@ FIGURES = ("likelihood", "heldout")
 """Figures that are drawn beside the filter, by the ends of their names."""
 PRIOR_FACTOR = 3.0
 """One standard deviation of a prior, where none is given."""
-MOST_EXAMINED = 4
+MAX_EXAMINED = 4
 """Records that are looked at for what the tuned filter leaves unexplained."""
 WORSE = 1.05
 """An attitude error on the data held out that has grown by more than this is reported."""
@@ -79,13 +88,6 @@ def tune(
         bool,
         typer.Option(
             "--rmse", help="Tune by the RMS attitude error against the truth; then all σ alike by innovations."
-        ),
-    ] = False,
-    credibility: Annotated[
-        bool,
-        typer.Option(
-            "--credibility",
-            help="Tune for consistency: the whole distribution of NIS, and whiteness; with --truth that of NEES.",
         ),
     ] = False,
     gate: Annotated[
@@ -134,11 +136,11 @@ def tune(
         str | None,
         typer.Option(help="For --plan: lengths of a record, s, with commas; that of the scenario if not given."),
     ] = None,
-    gyro_unit: Annotated[str | None, typer.Option(help="Unit of a CSV file's gyro: rad/s or deg/s.")] = None,
-    accelerometer_unit: Annotated[
-        str | None, typer.Option(help="Unit of a CSV file's accelerometer: m/s2 or g.")
-    ] = None,
-    time_unit: Annotated[str | None, typer.Option(help="Unit of a CSV file's time: s, ms, us or ns.")] = None,
+    gyro_unit: GyroUnit = None,
+    accelerometer_unit: AccelerometerUnit = None,
+    time_unit: TimeUnit = None,
+    columns: Columns = None,
+    topic: Topic = None,
     axes: Axes = None,
     invert: Invert = None,
     out: Annotated[
@@ -165,7 +167,6 @@ def tune(
     goal = _Goal(
         truth=truth,
         rmse=rmse,
-        credibility=credibility,
         gate=gate or any(name in tuning.GATED for name in names or []),
         spacing=spacing,
     )
@@ -173,19 +174,20 @@ def tune(
         raise _refusal("--length is for --plan; the records' own length is taken")
     count("seed", seed, least=0)
     _check_files(records, filter_file, out, form, tables)
-    layout = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit, "axes": axes, "invert": invert}
+    units = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
+    layout = {"columns": columns, "topic": topic, "axes": axes, "invert": invert, **units}
     cases, before, gyros = _cases(records, chosen, filter_file, layout, states=states)
     if algorithm is not None:
         before = replace(before, integration=algorithm)
     train, held = (tuple(cases), ()) if holdout is None else tuning.split(cases, holdout, _by(holdout_by))
+    if names == []:
+        raise _refusal(f"--free is {free!r} and names no parameter; name some, or leave it out")
     wanted = [name for name in names or [] if name not in tuning.GATED]
     wanted = wanted or list(tuning.default_names([case.record for case in cases]))
     if chosen is None or any(name.startswith(("gyro.", "filter.")) for name in wanted):
         tuning.one_gyro(gyros)
     if prior is None and prior_factor != PRIOR_FACTOR:
         raise _refusal("--prior-factor goes with --prior, the noise that it is about")
-    if names == []:
-        raise _refusal(f"--free is {free!r} and names no parameter; name some, or leave it out")
     priors = {} if prior is None else _priors(prior, prior_factor, train[0].record, wanted)
     with progress_bar("searches, intervals", starts + len(wanted)) as advance:
         result, objective, found = tuning.tune(
@@ -200,21 +202,18 @@ def tune(
             progress=advance,
             **goal._asdict(),
         )
-    with progress_bar("judging on the data held out"):
-        comparison = tuning.compare(held, before, result.setup, threads=workers) if held else None
-    if comparison is not None and goal.gate:
-        likely = tuning.log_likelihood(held, objective, result)  # type: ignore[arg-type]
-        comparison = replace(comparison, after=replace(comparison.after, log_likelihood=likely))
+    comparison = _compared(held, before, objective, result, workers, gated=goal.gate)
     examined, worst = _examined(train, before, result)
     if worst is not None:
         result = tuning.doubted(result, worst)
-    _tell(result, [case.record for case in cases], credible=credibility)
+    _print_result(result, [case.record for case in cases])
     if found is not None:
-        _tell_gate(found)
-    for sentence in () if worst is None else worst.words:
-        console.print(sentence)
+        _print_gate(found)
+    if worst is not None:
+        for sentence in worst.words:
+            console.print(sentence)
     if comparison is not None:
-        _tell_comparison(comparison, truth=goal.by_errors or credibility)
+        _print_comparison(comparison, truth=goal.by_errors)
     _write(
         out,
         result,
@@ -231,11 +230,10 @@ def tune(
 
 
 class _Goal(NamedTuple):
-    """What the filter is tuned by; of nothing else by the likelihood of all innovations."""
+    """Objective of the tuning; by default the likelihood of all innovations."""
 
     truth: bool
     rmse: bool
-    credibility: bool
     gate: bool
     spacing: float
 
@@ -246,8 +244,8 @@ class _Goal(NamedTuple):
 
     @property
     def name(self) -> str:
-        """What the result says."""
-        name = "credibility" if self.credibility else "rmse" if self.rmse else "likelihood"
+        """Name of the objective in the result."""
+        name = "rmse" if self.rmse else "likelihood"
         return name + (" of the errors" if self.truth else "")
 
 
@@ -293,13 +291,29 @@ def _check_files(
         need_own(target, "tune", lambda _: bool(tunings.read(report)))
 
 
+def _compared(
+    held: Sequence[Case], before: FilterSetup, objective: Any, result: Tuning, threads: int, *, gated: bool
+) -> Comparison | None:
+    """Return the filter before and after on the data held out, if any; ``gated``: the likelihood after is that with the gate."""
+    from strapdown import tuning
+
+    if not held:
+        return None
+    with progress_bar("judging on the data held out"):
+        comparison = tuning.compare(held, before, result.setup, threads=threads)
+    if not gated:
+        return comparison
+    likely = tuning.log_likelihood(held, objective, result)
+    return replace(comparison, after=replace(comparison.after, log_likelihood=likely))
+
+
 def _examined(train: Sequence[Case], before: FilterSetup, result: Tuning) -> tuple[list[Unmodelled], Unmodelled | None]:
     """Return what the tuned filter leaves unexplained of each record, and the worst of it."""
     from strapdown import tuning
 
     # Optional states stand for just that; and the search knows one σ a sample.
     looked = before.states is None and not _differs_by_axis(train, result.setup)
-    suspects = train[:MOST_EXAMINED] if looked else ()
+    suspects = train[:MAX_EXAMINED] if looked else ()
     examined = []
     with progress_bar("what is left unexplained", len(suspects)) as advance:
         for case in suspects:
@@ -359,7 +373,7 @@ def _cases(
         else:
             if states:
                 raise InputError(f"{path} is a recording, which specifies no errors; --states is for simulated records")
-            recording = recordings.read(path, **told(path, **layout))
+            recording = recordings.read(path, **given_layout(path, **layout))
             chosen = chosen or tuning.recording_setup()
             if recording.left_out_words:
                 console.print(recording.left_out_words)
@@ -401,7 +415,7 @@ def _note(one: Estimated, unit: Unit) -> str:
     return f"not identified: at most {_figure(one.upper / unit.factor)} {unit.name} (95 %)"
 
 
-def _tell(result: Tuning, records: Sequence[ImuRecord], *, credible: bool) -> None:
+def _print_result(result: Tuning, records: Sequence[ImuRecord]) -> None:
     rows = table("Tuned, with 95 % intervals", "parameter", "unit", "before", "after", "from", "to", "", left=2)
     for one in result.parameters:
         unit = _unit_of(one.name, records)
@@ -409,10 +423,7 @@ def _tell(result: Tuning, records: Sequence[ImuRecord], *, credible: bool) -> No
         rows.add_row(one.name, unit.name, *(_figure(value) for value in values), _note(one, unit))
     show(rows)
     gain = result.before - result.after
-    console.print(
-        f"{result.agreeing} of {len(result.starts)} searches ended at the best point; "
-        + (f"half Neyman's statistic fell by {gain:.4g}." if credible else f"gain {gain:.4g} nats.")
-    )
+    console.print(f"{result.agreeing} of {len(result.starts)} searches ended at the best point; gain {gain:.4g} nats.")
     if not all(one.identified for one in result.parameters):
         console.print(
             "Of a parameter that is not identified these records give an upper bound alone; the filter uses the value in the column "
@@ -430,7 +441,7 @@ def _tell(result: Tuning, records: Sequence[ImuRecord], *, credible: bool) -> No
         )
 
 
-def _tell_gate(found: TunedGate) -> None:
+def _print_gate(found: TunedGate) -> None:
     if found.gate is None:
         why = "no outliers" if not found.share.identified else "noise of two sizes rather than outliers"
         console.print(f"The records show {why}; the filter's gate is left as it was.")
@@ -451,7 +462,7 @@ def _anees(one: Performance) -> str:
     return f"{_figure(float(np.nanmean(one.nees[0].mean)))} (attitude)" if one.nees else "-"
 
 
-def _tell_comparison(comparison: Comparison, *, truth: bool) -> None:
+def _print_comparison(comparison: Comparison, *, truth: bool) -> None:
     from strapdown.report import tunings
     from strapdown.units import DEGREE
 
@@ -613,7 +624,7 @@ def _plan(
     wanted = names or list(tuning.default_names([example]))
     with progress_bar("simulated records", 4) as advance:
         found = tuning.plan(source, modelled, wanted, lengths=lengths, threads=threads, progress=advance)
-    _tell_plan(found, [example])
+    _print_plan(found, [example])
 
 
 def _numbers(text: str) -> list[float]:
@@ -625,7 +636,7 @@ def _numbers(text: str) -> list[float]:
         raise InputError(f"--length is {text!r}; it must be seconds with commas, as in 600,1800") from None
 
 
-def _tell_plan(found: Plan, records: Sequence[ImuRecord]) -> None:
+def _print_plan(found: Plan, records: Sequence[ImuRecord]) -> None:
     columns = [f"{length:g} s" for length in found.lengths]
     listing = table(
         "Least standard error, as a factor (Cramér–Rao)", "parameter", "unit", "value", *columns, "10 % needs", left=2

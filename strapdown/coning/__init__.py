@@ -3,14 +3,10 @@
 An increment Δθ is the integral of the body rate over one sample interval. A step combines N of them, and perhaps p before and f
 after, into its rotation δq; attitude advances by ``q ← q ⊗ δq``, the solution of equation (17) of *Quaternion differentiation*.
 
-``coefficients``
-    The mathematics of the tables, in exact rationals.
-``algorithms``
-    :class:`Algorithm`, the catalogue :data:`ALGORITHMS`, and :func:`algorithm_rows`, its printed table.
-``stepping``
-    :func:`integrate`, :func:`integrate_rates`, :func:`rotation_vectors`: from records to attitude.
-``drift``
-    :func:`predicted_coning_drift`, :class:`ConingBudget`: the drift that vibration leaves.
+- ``coefficients``: The mathematics of the tables, in exact rationals.
+- ``algorithms``: :class:`Algorithm`, the catalogue :data:`ALGORITHMS`, and :func:`algorithm_rows`, its printed table.
+- ``stepping``: :func:`integrate`, :func:`integrate_rates`, :func:`rotation_vectors`: from records to attitude.
+- ``drift``: :func:`predicted_coning_drift`, :class:`ConingBudget`: the drift that vibration leaves.
 
 What to choose: ``"four-sample"`` for ordinary work; ``"matched-1-8-8"`` for recorded data or where a delay of eight samples is
 allowed; ``"matched-2-8"`` in real time; ``"matched-4-11"`` in real time with a quiet gyro. (Its long one-sided fit amplifies noise
@@ -21,12 +17,10 @@ family is this package's own; :func:`strapdown.coning.coefficients.matched_corre
 from strapdown.coning.algorithms import ALGORITHMS, Algorithm, read_algorithms
 from strapdown.coning.algorithms import algorithm_rows as algorithm_rows
 from strapdown.coning.algorithms import named as named
-from strapdown.coning.drift import (
-    ConingBudget,
-    VibrationLine,
-    predicted_coning_drift,
-    read_vibration,
-)
+from strapdown.coning.drift import ConingBudget as ConingBudget
+from strapdown.coning.drift import VibrationLine as VibrationLine
+from strapdown.coning.drift import predicted_coning_drift
+from strapdown.coning.drift import read_vibration as read_vibration
 from strapdown.coning.drift import (
     small_angle_drift as small_angle_drift,
 )
@@ -37,13 +31,10 @@ from strapdown.coning.stepping import time_per_sample as time_per_sample
 __all__ = [
     "ALGORITHMS",
     "Algorithm",
-    "ConingBudget",
-    "VibrationLine",
     "increments_from_rates",
     "integrate",
     "integrate_rates",
     "predicted_coning_drift",
     "read_algorithms",
-    "read_vibration",
     "rotation_vectors",
 ]

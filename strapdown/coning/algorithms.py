@@ -31,7 +31,7 @@ SOLVERS = {
 """How an algorithm turns the increments of a step into its rotation."""
 
 Coefficient = int | float | str | Fraction
-"""What may be given for a coefficient: 27/20 as "27/20", 1.35, "1.35" or Fraction(27, 20)."""
+"""Forms of a coefficient: 27/20 as "27/20", 1.35, "1.35" or Fraction(27, 20)."""
 
 _TABLES = {"compressed": "coefficients", "pairs": "pairs", "polynomial": "correction"}
 """The table that a solver reads. The other solvers read none, and no increments but those of the step."""
@@ -380,7 +380,7 @@ class Algorithm:
             ]
         else:
             raise InputError(
-                f"{self.name}: an algorithm with solver {self.solver!r} is told in files by its name alone"
+                f"{self.name}: an algorithm with solver {self.solver!r} is written to files by its name alone"
             )
         if self.source:
             table["source"] = self.source
@@ -489,9 +489,9 @@ def read_algorithms(path: str | os.PathLike[str]) -> tuple[Algorithm, ...]:
         If the file is missing, is not TOML, has no such table, or a table is not one of an algorithm.
     """
     with reading.from_file(path):
-        told = reading.toml(path)
-        checks.known_keys(f"{path}", told, ("algorithm",))
-        tables = told.get("algorithm")
+        content = reading.toml(path)
+        checks.known_keys(f"{path}", content, ("algorithm",))
+        tables = content.get("algorithm")
         several = isinstance(tables, list)
         found = [
             (f"{path}: algorithm" + (f"[{k}]" if several else ""), table)
@@ -713,18 +713,7 @@ ALGORITHMS: Mapping[str, Algorithm] = Catalogue(_makers())
 
 
 def named(algorithm: str | Algorithm) -> Algorithm:
-    """Return the algorithm of that name or file, or the one given.
-
-    Parameters
-    ----------
-    algorithm : str or Algorithm
-        Name in :data:`ALGORITHMS`, FILE.toml (:meth:`Algorithm.from_toml`), or an algorithm.
-
-    Returns
-    -------
-    Algorithm
-        The algorithm.
-    """
+    """Return the algorithm of a name in :data:`ALGORITHMS` or of a FILE.toml (:meth:`Algorithm.from_toml`), or the one given."""
     if isinstance(algorithm, Algorithm):
         return algorithm
     if isinstance(algorithm, str) and algorithm.lower().endswith(".toml"):
@@ -733,13 +722,9 @@ def named(algorithm: str | Algorithm) -> Algorithm:
 
 
 def algorithm_rows() -> list[dict[str, str | int | float]]:
-    """Return the printed table of the catalogue, one row per algorithm.
+    """Return the printed table of the catalogue, one row an algorithm.
 
-    Returns
-    -------
-    list of dict
-        Name, samples, previous, following, order, drift order, drift constant, needs, method, source. The drift constant is C of
-        the leading drift −C β² ω λ^(drift order) under small coning, λ = ω × sample interval.
+    The drift constant is C of the leading drift −C β² ω λ^(drift order) under small coning, λ = ω × sample interval.
     """
     return [
         {

@@ -218,7 +218,7 @@ def second_order(pairs: Table, samples: int, previous: int = 0) -> int:
     return 4
 
 
-MOST_DENOMINATOR = 10**6
+MAX_DENOMINATOR = 10**6
 """Largest denominator of a fraction that a float is taken for."""
 
 
@@ -231,7 +231,7 @@ def rational(value: float | str | Fraction) -> Fraction:
     if isinstance(value, bool):
         raise TypeError("a truth value is no coefficient")
     if isinstance(value, float):
-        near = Fraction(value).limit_denominator(MOST_DENOMINATOR)
+        near = Fraction(value).limit_denominator(MAX_DENOMINATOR)
         return near if float(near) == value else Fraction(repr(value))
     return Fraction(value)
 

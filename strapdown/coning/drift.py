@@ -43,25 +43,7 @@ def predicted_coning_drift(algorithm: str | Algorithm, angle: float, frequency: 
 
 
 def small_angle_drift(algorithm: str | Algorithm, frequency_ratio: float) -> float:
-    """Return the drift over β²ω for small β, from the whole power series in λ.
-
-    Parameters
-    ----------
-    algorithm : str or Algorithm
-        Name in :data:`ALGORITHMS`, or an algorithm.
-    frequency_ratio : float
-        λ = ω × sample interval, 0 to 1.
-
-    Returns
-    -------
-    float
-        Drift about the cone's axis over β²ω, dimensionless.
-
-    Raises
-    ------
-    InputError
-        If λ is above 1, where the series does not serve.
-    """
+    """Return the drift over β²ω for small β, from the whole power series in λ = ω × sample interval, 0 to 1."""
     table = named(algorithm)
     lam = checks.non_negative("frequency_ratio", frequency_ratio)
     if lam > 1.0:
@@ -154,37 +136,11 @@ class ConingBudget:
                 )
 
     def drift(self, algorithm: str, sample_rate: float) -> float:
-        """Return the sum of the drifts of the lines.
-
-        Parameters
-        ----------
-        algorithm : str
-            Name in :data:`ALGORITHMS`.
-        sample_rate : float
-            Sample rate, Hz.
-
-        Returns
-        -------
-        float
-            Drift about the third axis, rad/s.
-        """
+        """Return the sum of the drifts of the lines about the third axis, rad/s, at a sample rate, Hz."""
         return math.fsum(self.drifts(algorithm, sample_rate))
 
     def drifts(self, algorithm: str, sample_rate: float) -> tuple[float, ...]:
-        """Return the drift of each line.
-
-        Parameters
-        ----------
-        algorithm : str
-            Name in :data:`ALGORITHMS`.
-        sample_rate : float
-            Sample rate, Hz.
-
-        Returns
-        -------
-        tuple of float
-            Drifts about the third axis, rad/s, in the order of the lines.
-        """
+        """Return the drift of each line about the third axis, rad/s, at a sample rate, Hz."""
         table = named(algorithm)
         omegas = [2.0 * math.pi * line.frequency for line in self.lines]
         return tuple(
@@ -193,13 +149,7 @@ class ConingBudget:
         )
 
     def rows(self) -> list[dict[str, str | float]]:
-        """Return the drifts as a table, one row per algorithm and rate.
-
-        Returns
-        -------
-        list of dict
-            ``algorithm``, ``sample_rate`` (Hz) and ``drift`` (rad/s).
-        """
+        """Return the drifts as a table, one row per algorithm and rate."""
         return [
             {"algorithm": name, "sample_rate": rate, "drift": self.drift(name, rate)}
             for name in self.algorithms
@@ -211,23 +161,9 @@ _COLUMNS = ("frequency_hz", "angle_deg", "angle_across_deg", "phase_deg")
 
 
 def read_vibration(path: str | os.PathLike[str]) -> tuple[VibrationLine, ...]:
-    """Read vibration lines from CSV.
+    """Read vibration lines from CSV with the columns ``frequency_hz, angle_deg[, angle_across_deg][, phase_deg]``.
 
-    Parameters
-    ----------
-    path : path-like
-        File with the columns ``frequency_hz, angle_deg[, angle_across_deg][, phase_deg]``. Without the optional columns the second
-        axis has the amplitude of the first and lags it by 90°: coning.
-
-    Returns
-    -------
-    tuple of VibrationLine
-        The lines.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, a column is unknown or missing, or a field is not a number.
+    Without the optional columns the second axis has the amplitude of the first and lags it by 90°: coning.
     """
     file = Path(path)
     with reading.from_file(file):

@@ -231,22 +231,7 @@ def rotation_vectors(
 
 
 def time_per_sample(algorithm: str | Algorithm, samples: int = 20_160, repeats: int = 5) -> float:
-    """Return the least time per sample that :func:`integrate` needs here, compilation excluded.
-
-    Parameters
-    ----------
-    algorithm : str or Algorithm
-        Name in :data:`ALGORITHMS`, or an algorithm.
-    samples : int, default 20160
-        Samples of the record that is timed.
-    repeats : int, default 5
-        Timed calls.
-
-    Returns
-    -------
-    float
-        Time, s.
-    """
+    """Return the least time per sample, s, that :func:`integrate` needs here, compilation excluded."""
     table = named(algorithm)
     checks.count("samples", samples, least=table.window)
     increments = 1e-3 * np.random.default_rng(0).standard_normal((samples, 3))

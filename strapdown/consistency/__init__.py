@@ -1,48 +1,33 @@
 """Consistency: does a filter's covariance agree with its errors? Statistics with known error rates, and a verdict.
 
-``manifold``
-    The error of an estimate, in the body or the fixed frame, and its normalised square (NEES), for any subset of the states.
-``bounds``
-    Exact two-sided bounds of averages over independent runs: ANEES and NIS, log-NEES, coverage.
-``ensemble``
-    All statistics of independent errors at one epoch: ANEES, log-NEES, non-credibility index, inclination, σ-coverage.
-``whiteness``
-    What innovations should be: white, normal, of mean zero, independent of other sensors'.
-``timeaverage``
-    Averages over the time of one run, whose errors are correlated: the effective sample size.
-``accuracy``
-    How large errors are: against a reference, against the Cramér–Rao bound, when they have settled, how they are distributed.
-``foreign``
-    The verdict on an estimate from elsewhere: clocks, frames and the reading of its covariance.
-``judgement``, ``runs``
-    The verdict in words, with its evidence, at one stated probability of a false alarm: on one run, and on independent ones.
+- ``manifold``: The error of an estimate and its normalised square (NEES), for any subset of the states.
+- ``bounds``: Exact two-sided bounds of averages over independent runs: ANEES and NIS, log-NEES, coverage.
+- ``whiteness``: What innovations should be: white, normal, of mean zero, independent of other sensors'.
+- ``timeaverage``: Averages over the time of one run, whose errors are correlated: the effective sample size.
+- ``accuracy``: How large errors are: against a reference, against the Cramér–Rao bound, when they have settled, how they are distributed.
+- ``foreign``: The verdict on an estimate from elsewhere: clocks, frames and the reading of its covariance.
+- ``judgement``, ``runs``: The verdict in words, with its evidence, at one stated probability of a false alarm: on one run, and on
+  independent ones.
 """
 
 from strapdown.consistency.accuracy import Distribution as Distribution
-from strapdown.consistency.accuracy import Efficiency as Efficiency
 from strapdown.consistency.accuracy import ReferenceErrors as ReferenceErrors
 from strapdown.consistency.accuracy import convergence_time as convergence_time
 from strapdown.consistency.accuracy import distribution as distribution
-from strapdown.consistency.accuracy import efficiency as efficiency
 from strapdown.consistency.accuracy import reference_errors
-from strapdown.consistency.bounds import Coverage as Coverage
 from strapdown.consistency.bounds import Verdict as Verdict
-from strapdown.consistency.bounds import coverage as coverage
 from strapdown.consistency.bounds import log_mean_bounds as log_mean_bounds
 from strapdown.consistency.bounds import log_mean_p_value as log_mean_p_value
 from strapdown.consistency.bounds import log_moments as log_moments
 from strapdown.consistency.bounds import mean_bounds
 from strapdown.consistency.bounds import mean_p_value as mean_p_value
-from strapdown.consistency.ensemble import Credibility as Credibility
-from strapdown.consistency.ensemble import credibility
 from strapdown.consistency.foreign import Checked, check_arrays
 from strapdown.consistency.judgement import Finding, Judgement, judge
 from strapdown.consistency.judgement import concluded as concluded
 from strapdown.consistency.manifold import SUBSETS as SUBSETS
-from strapdown.consistency.manifold import errors, fixed_frame, nees
+from strapdown.consistency.manifold import errors, nees
 from strapdown.consistency.manifold import whitened as whitened
 from strapdown.consistency.runs import judge_runs
-from strapdown.consistency.timeaverage import TimeAverage as TimeAverage
 from strapdown.consistency.timeaverage import time_average as time_average
 from strapdown.consistency.whiteness import Autocorrelation as Autocorrelation
 from strapdown.consistency.whiteness import QuantilePairs as QuantilePairs
@@ -58,9 +43,7 @@ __all__ = [
     "Finding",
     "Judgement",
     "check_arrays",
-    "credibility",
     "errors",
-    "fixed_frame",
     "judge",
     "judge_runs",
     "mean_bounds",

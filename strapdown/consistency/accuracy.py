@@ -10,36 +10,6 @@ from numpy.typing import ArrayLike
 
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, array, count, increasing, positive
-from strapdown.consistency.bounds import mean_bounds, tail
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Efficiency:
-    """RMS error over independent runs against the square root of the posterior Cramér–Rao bound, at each epoch."""
-
-    ratio: Array
-    """RMSE/√PCRB (epochs,): 1 for an efficient filter, and more for any other."""
-    bounds: tuple[float, float]
-    """Two-sided bounds of the ratio of an efficient filter of normal errors at one epoch."""
-    probability: float
-
-
-def efficiency(error: ArrayLike, bound: ArrayLike, probability: float = 0.99) -> Efficiency:
-    """Return RMSE/√PCRB of one state's errors (runs, epochs) of which ``bound`` (epochs,) is the least possible variance.
-
-    The bound is the Riccati recursion along the true trajectory.
-    """
-    e = array("error", error, ("runs", "epochs"))
-    least = array("bound", bound, (e.shape[1],))
-    count("the number of runs", len(e))
-    if np.any(least <= 0.0):
-        raise InputError(f"bound[{int(np.argmax(least <= 0.0))}] is not greater than zero; it is a variance")
-    low, high = mean_bounds(1, len(e), probability)
-    return Efficiency(
-        ratio=np.sqrt(np.mean(e * e, axis=0) / least),
-        bounds=(math.sqrt(low), math.sqrt(high)),
-        probability=probability,
-    )
 
 
 def convergence_time(time: ArrayLike, magnitude: ArrayLike, threshold: float) -> float:
@@ -67,18 +37,6 @@ class Distribution:
         """Return the error that ``fraction`` of all do not exceed: 0.5 is the median, 0.95 the 95 % error."""
         return float(np.quantile(self.values, fraction, method="inverted_cdf"))
 
-    def quantile_interval(self, fraction: float, confidence: float = 0.95) -> tuple[float, float]:
-        """Return an interval that holds the true quantile with at least ``confidence``; the errors must be independent."""
-        from scipy.stats import binom
-
-        outside = tail(confidence)
-        n = len(self.values)
-        low, high = int(binom.ppf(outside, n, fraction)) - 1, int(binom.ppf(1.0 - outside, n, fraction))
-        return (
-            -math.inf if low < 0 else float(self.values[low]),
-            math.inf if high >= n else float(self.values[high]),
-        )
-
 
 def distribution(error: ArrayLike) -> Distribution:
     """Return the distribution of errors (n,); NaN, where there is no reference, is left out."""
@@ -97,7 +55,7 @@ class ReferenceErrors:
     heading: Array
     """Its part about the vertical (n,)."""
     inclination: Array
-    """What is left: the angle between the vertical of both (n,)."""
+    """Remaining error, the angle between the two verticals (n,)."""
 
     def rms(self, movement: np.ndarray | None = None) -> dict[str, float]:
         """Return the RMS of each error, rad, over the samples with a reference, and only those of the ``movement`` mask if given."""

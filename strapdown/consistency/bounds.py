@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from strapdown.checks import Array, InputError, array, count
+from strapdown.checks import Array, InputError, count
 
 SIGMAS = (1.0, 2.0, 3.0)
 """Multiples of σ whose coverage is counted."""
@@ -147,64 +147,15 @@ def log_mean_p_value(mean: float, degrees: int, samples: int) -> float:
     return two_sided(below, 1.0 - below)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Coverage:
-    """How many of independent errors lie within k σ, for k of :data:`SIGMAS`."""
+def coverage_p_values(inside: ArrayLike, samples: int) -> Array:
+    """Return the two-sided binomial p-values of fractions (..., 3) of independent errors inside 1, 2, 3 σ."""
+    from scipy.special import erf
+    from scipy.stats import binom
 
-    samples: int
-    inside: Array
-    """Fraction inside by k (3,)."""
-    probability: float
-    """Probability that the bounds are meant to hold; being discrete they hold it at least (:attr:`attained`)."""
-
-    @property
-    def expected(self) -> Array:
-        """Fractions of a normal distribution (3,): 0.6827, 0.9545, 0.9973."""
-        from scipy.special import erf
-
-        return np.asarray(erf(np.array(SIGMAS) / math.sqrt(2.0)))
-
-    @property
-    def bounds(self) -> Array:
-        """Two-sided binomial bounds of each fraction (3, 2), inclusive."""
-        from scipy.stats import binom
-
-        outside = tail(self.probability)
-        low = binom.ppf(outside, self.samples, self.expected)
-        high = binom.isf(outside, self.samples, self.expected)
-        return np.stack([low, high], axis=1) / self.samples
-
-    @property
-    def attained(self) -> Array:
-        """Probability that a consistent filter's fraction lies inside the bounds (3,): ``probability`` or a little more."""
-        from scipy.stats import binom
-
-        low, high = np.round(self.bounds.T * self.samples)
-        return np.asarray(
-            binom.cdf(high, self.samples, self.expected) - binom.cdf(low - 1.0, self.samples, self.expected)
-        )
-
-    @property
-    def p_values(self) -> Array:
-        """Two-sided p-value of each fraction (3,)."""
-        from scipy.stats import binom
-
-        number = np.round(self.inside * self.samples)
-        lower = binom.cdf(number, self.samples, self.expected)
-        upper = binom.sf(number - 1.0, self.samples, self.expected)
-        return np.asarray(np.minimum(1.0, 2.0 * np.minimum(lower, upper)))
-
-
-def coverage(error: ArrayLike, sigma: ArrayLike, probability: float = 0.99) -> Coverage:
-    """Return how many independent errors (n,) lie within 1, 2 and 3 of their own σ (n,)."""
-    tail(probability)
-    e = array("error", error, ("n",))
-    s = array("sigma", np.broadcast_to(sigma, e.shape), (len(e),))
-    count("the number of errors", len(e))
-    if np.any(s <= 0.0):
-        raise InputError(f"sigma[{int(np.argmax(s <= 0.0))}] is not greater than zero")
-    inside = np.abs(e[:, None]) <= np.array(SIGMAS) * s[:, None]
-    return Coverage(samples=len(e), inside=inside.mean(axis=0), probability=probability)
+    expected = erf(np.array(SIGMAS) / math.sqrt(2.0))
+    number = np.round(np.asarray(inside) * samples)
+    lower, upper = binom.cdf(number, samples, expected), binom.sf(number - 1.0, samples, expected)
+    return np.asarray(np.minimum(1.0, 2.0 * np.minimum(lower, upper)))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

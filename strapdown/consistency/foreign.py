@@ -2,7 +2,7 @@
 
 :func:`check_arrays` does it all: clocks and frames are compared, what differs grossly is removed (and said, and its uncertainty added to
 the covariance), the reading of the covariance is found or taken as given, and :func:`strapdown.consistency.judge` judges the rest. Every
-small difference that would explain the errors is told beside the verdict and not removed, unless it is asked for: a constant rotation
+small difference that would explain the errors is reported beside the verdict and not removed, unless it is asked for: a constant rotation
 between frames and a constant error of the filter look the same.
 """
 
@@ -31,7 +31,7 @@ the errors of roll, pitch and yaw, in this order (ZYX)."""
 DECIDED = 0.9
 """Probability above which the errors decide how the covariance is meant; below, it is taken for the body side, this package's own."""
 ALIGNED = ("time", "fixed", "body")
-"""What may be aligned: the clocks, the fixed frames, the body frames."""
+"""Parts of an alignment: clocks, fixed frames, body frames."""
 GROSS = 5.0 * DEGREE
 """A constant rotation beyond this is one of frames and not of a filter."""
 BRIDGED = 0.1
@@ -45,7 +45,7 @@ LONGEST_OFFSET = 30.0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Alignment:
-    """What differs between an estimate's clock and frames and a truth's: ``q_true(t + offset) = exp(fixed) ⊗ q(t) ⊗ exp(body)``."""
+    """Difference between an estimate's clock and frames and a truth's: ``q_true(t + offset) = exp(fixed) ⊗ q(t) ⊗ exp(body)``."""
 
     offset: float
     """s, to be added to the estimate's times."""
@@ -64,7 +64,7 @@ class Alignment:
 
     @property
     def words(self) -> tuple[str, ...]:
-        """What was removed, a sentence each."""
+        """Differences that were removed, a sentence each."""
         found = []
         if "time" in self.estimated:
             found.append(
@@ -141,7 +141,7 @@ class Checked:
             The verdict as of :meth:`Judgement.summary`, with reading of the covariance, explanations, remarks and
             alignment (degrees, s).
         """
-        told: dict[str, Any] = {
+        table: dict[str, Any] = {
             **self.judgement.summary(),
             "error_frame": self.error_frame,
             "error_frame_probability": dict(self.frame_probability),
@@ -150,7 +150,7 @@ class Checked:
         }
         if self.alignment is not None:
             a = self.alignment
-            told["alignment"] = {
+            table["alignment"] = {
                 "removed": list(a.estimated),
                 "time_offset_s": a.offset,
                 "fixed_rotation_vector_deg": (a.fixed / DEGREE).tolist(),
@@ -159,7 +159,7 @@ class Checked:
                 "sigma_time_s": float(a.sigma[6]),
                 "residual_rms_deg": a.residual / DEGREE,
             }
-        return told
+        return table
 
 
 def check_arrays(
@@ -186,7 +186,7 @@ def check_arrays(
         q_fb, scalar first.
     covariance : array_like (m, 3, 3) or (m, 6, 6), or None
         Of the attitude error, rad², or of attitude and bias error; its rows as ``error_frame`` says. None: there is none, and errors are
-        told but not judged.
+        reported but not judged.
     true_time, true_attitude : array_like (n,), (n, 4)
         The truth, of a clock and frames of its own.
     bias, true_bias : array_like (m, 3), (n, 3), optional
@@ -233,14 +233,14 @@ def check_arrays(
     if P is not None and (bias is None or true_bias is None):
         bias, P = None, P[:, :3, :3]
     own = _Series(stamps, q, P, None if bias is None else array("bias", bias, (len(stamps), 3)))
-    told = _Series(
+    theirs = _Series(
         true_stamps,
         reference,
         None,
         None if true_bias is None else array("true_bias", true_bias, (len(true_stamps), 3)),
     )
-    own, alignment = _aligned(own, told, wanted, remarks)
-    own, truth = _at_common_times(own, told, alignment.offset)
+    own, alignment = _aligned(own, theirs, wanted, remarks)
+    own, truth = _at_common_times(own, theirs, alignment.offset)
     remarks += alignment.words
     if own.covariance is None:
         sigma = f"RMS attitude error {alignment.residual / DEGREE:.4g}°"
@@ -352,7 +352,10 @@ def frame_probabilities(error: Array, readings: Mapping[str, Array]) -> dict[str
 def _frame_words(chosen: str, found: Mapping[str, float]) -> str:
     said = ", ".join(f"{name} {100.0 * p:.3g} %" for name, p in found.items())
     if found[chosen] < DECIDED:
-        return f"the errors do not decide how the covariance is meant ({said}): it is judged as {chosen}; --error-frame names another"
+        return (
+            f"the errors do not decide how the covariance is meant ({said}): it is judged as {chosen}; "
+            "--error-frame (error_frame= in Python) names another"
+        )
     return f"the covariance is read as {chosen} ({said}, found from the errors)"
 
 
@@ -385,12 +388,12 @@ def _bridged(series: _Series) -> float:
     return max(BRIDGED, 1.5 * float(np.median(np.diff(series.time))))
 
 
-def _at_common_times(own: _Series, told: _Series, offset: float) -> tuple[_Series, Truth]:
+def _at_common_times(own: _Series, theirs: _Series, offset: float) -> tuple[_Series, Truth]:
     """Return the estimate where there is a truth, and the truth there: at the estimate's times, or at those of a truth that is sparser."""
-    sparser = np.median(np.diff(told.time)) > 1.5 * np.median(np.diff(own.time))
+    sparser = np.median(np.diff(theirs.time)) > 1.5 * np.median(np.diff(own.time))
     if sparser:
-        inside = (told.time - offset >= own.time[0]) & (told.time - offset <= own.time[-1])
-        at = told.time[inside] - offset
+        inside = (theirs.time - offset >= own.time[0]) & (theirs.time - offset <= own.time[-1])
+        at = theirs.time[inside] - offset
         near = np.clip(np.searchsorted(own.time, at), 1, len(own.time) - 1)
         near -= (at - own.time[near - 1]) < (own.time[near] - at)
         own = _Series(
@@ -399,18 +402,19 @@ def _at_common_times(own: _Series, told: _Series, offset: float) -> tuple[_Serie
             None if own.covariance is None else own.covariance[near],
             None if own.bias is None else own.bias[near],
         )
-        q, bias = told.attitude[inside], None if told.bias is None else told.bias[inside]
+        q, bias = theirs.attitude[inside], None if theirs.bias is None else theirs.bias[inside]
         good = np.isfinite(own.attitude[:, 0])
     else:
-        q = interpolated(own.time + offset, told.time, told.attitude, _bridged(told))
+        q = interpolated(own.time + offset, theirs.time, theirs.attitude, _bridged(theirs))
         good = np.isfinite(q[:, 0])
         bias = None
-        if told.bias is not None:
-            bias = np.stack([np.interp(own.time + offset, told.time, told.bias[:, k]) for k in range(3)], axis=1)
+        if theirs.bias is not None:
+            bias = np.stack([np.interp(own.time + offset, theirs.time, theirs.bias[:, k]) for k in range(3)], axis=1)
     if good.sum() < 2:
         raise InputError(
             f"the estimate goes from {own.time[0] + offset:.6g} to {own.time[-1] + offset:.6g} s of the truth's clock, and the truth from "
-            f"{told.time[0]:.6g} to {told.time[-1]:.6g} s: they have no two times in common; give both of one clock, or --align time"
+            f"{theirs.time[0]:.6g} to {theirs.time[-1]:.6g} s: they have no two times in common; "
+            "give both of one clock, or --align time (align= in Python)"
         )
     return (
         _Series(
@@ -456,14 +460,14 @@ def coarse_offset(own_time: Array, own_speed: Array, true_time: Array, true_spee
     return float(base + lags[best] * step) if share > 0.5 else float(base)
 
 
-def _initial_rotations(own: _Series, told: _Series, offset: float) -> list[tuple[Array, Array]]:
+def _initial_rotations(own: _Series, theirs: _Series, offset: float) -> list[tuple[Array, Array]]:
     """Return (fixed, body) quaternions to begin from: none, that of the fixed frames alone, that of the bodies by their rates too."""
-    matched, truth = _at_common_times(own, told, offset)
+    matched, truth = _at_common_times(own, theirs, offset)
     identity = np.array([1.0, 0.0, 0.0, 0.0])
 
     def fixed_of(body: Array) -> Array:
         turns = quaternion.multiply(truth.attitude, quaternion.conjugate(quaternion.multiply(matched.attitude, body)))
-        return quaternion.mean(turns)[0]
+        return quaternion.from_rotation(quaternion.to_rotation(turns).mean())
 
     found = [(identity, identity), (fixed_of(identity), identity)]
     _, w_own = _rates(matched)
@@ -477,15 +481,15 @@ def _initial_rotations(own: _Series, told: _Series, offset: float) -> list[tuple
     return found
 
 
-def fit(own: _Series, told: _Series, names: tuple[str, ...], offset: float) -> Alignment:
+def fit(own: _Series, theirs: _Series, names: tuple[str, ...], offset: float) -> Alignment:
     """Return offset and rotations by least squares of the angle that is left, σ by how long the residuals remember each other."""
     free = np.array([name in names for name in ("fixed",) * 3 + ("body",) * 3 + ("time",)])
-    starts = _initial_rotations(own, told, offset) if free[:6].any() else [(np.array([1.0, 0, 0, 0]),) * 2]
+    starts = _initial_rotations(own, theirs, offset) if free[:6].any() else [(np.array([1.0, 0, 0, 0]),) * 2]
     best: Alignment | None = None
     for fixed, body in starts:
         if (not free[0] and abs(fixed[0]) < 1.0) or (not free[3] and abs(body[0]) < 1.0):
             continue
-        found = _descended(own, told, free, fixed, body, offset, names)
+        found = _descended(own, theirs, free, fixed, body, offset, names)
         if best is None or found.residual < 0.999 * best.residual:
             best = found
     assert best is not None
@@ -493,12 +497,12 @@ def fit(own: _Series, told: _Series, names: tuple[str, ...], offset: float) -> A
 
 
 def _descended(
-    own: _Series, told: _Series, free: np.ndarray, fixed: Array, body: Array, offset: float, names: tuple[str, ...]
+    own: _Series, theirs: _Series, free: np.ndarray, fixed: Array, body: Array, offset: float, names: tuple[str, ...]
 ) -> Alignment:
     covariance = np.zeros((7, 7))
     residual = np.inf
     for _ in range(20):
-        matched, truth = _at_common_times(own, told, offset)
+        matched, truth = _at_common_times(own, theirs, offset)
         aligned = quaternion.multiply(quaternion.multiply(fixed, matched.attitude), body)
         r = quaternion.log(quaternion.multiply(quaternion.conjugate(aligned), truth.attitude))
         now = float(np.sqrt(np.mean(np.sum(r * r, axis=1))))
@@ -546,21 +550,21 @@ def _speed_of(time: Array, attitude: Array) -> Array:
 
 
 def _aligned(
-    own: _Series, told: _Series, wanted: tuple[str, ...] | None, remarks: list[str]
+    own: _Series, theirs: _Series, wanted: tuple[str, ...] | None, remarks: list[str]
 ) -> tuple[_Series, Alignment]:
     """Return the estimate, its quaternions as they must be meant, and its alignment with the truth."""
     offset = 0.0
     if wanted is None or "time" in wanted:
         own_at, own_rate = _rates(own)
-        true_at, true_rate = _rates(told)
+        true_at, true_rate = _rates(theirs)
         speeds = (np.linalg.norm(own_rate, axis=1), np.linalg.norm(true_rate, axis=1))
         offset = coarse_offset(own_at, speeds[0], true_at, speeds[1])
     if wanted is not None:
-        return own, fit(own, told, wanted, offset)
-    whole = fit(own, told, ALIGNED, offset)
+        return own, fit(own, theirs, wanted, offset)
+    whole = fit(own, theirs, ALIGNED, offset)
     if _gross(whole):
         others = {words: replace(own, attitude=meant(own.attitude)) for words, meant in _CONVENTIONS.items()}
-        fits = {words: fit(other, told, ALIGNED, offset) for words, other in others.items()}
+        fits = {words: fit(other, theirs, ALIGNED, offset) for words, other in others.items()}
         words = min(fits, key=lambda words: _gross(fits[words]))
         if _gross(fits[words]) < _gross(whole):
             remarks.append(f"the quaternions fit the truth best if they are {words}: they are read so")
@@ -569,7 +573,7 @@ def _aligned(
     base = whole.offset if moved else 0.0
     trials = (moved, ("fixed", *moved), ("body", *moved), ("fixed", "body", *moved))
     for names in trials:
-        found = fit(own, told, names, base)
+        found = fit(own, theirs, names, base)
         if found.residual < max(GROSS if names == moved else 0.0, 1.5 * whole.residual):
             break
     return own, found
@@ -663,5 +667,5 @@ def explanations(
                 p_value=min(1.0, probabilities[chosen] / max(probabilities[name], 1e-300)),
             )
         )
-    # What has a cause comes before a factor on σ, which takes in all of them.
+    # Specific causes come before a factor on σ, which would absorb all of them.
     return tuple(sorted(found, key=lambda one: (not one.likely, one.name == SCALE, one.p_value)))

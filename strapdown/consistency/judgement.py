@@ -15,6 +15,7 @@ import numpy as np
 
 from strapdown.checks import Array, InputError, unit_quaternions
 from strapdown.consistency.bounds import (
+    log_mean_bounds,
     mean_bounds,
     mean_p_value,
     tail,
@@ -32,11 +33,11 @@ from strapdown.results import Listed, Listing, figure
 
 Answer = Literal["consistent", "not consistent", "cannot tell"]
 
-LEAST_SAMPLES = 50
+MIN_SAMPLES = 50
 """Fewer innovations of one sensor are not judged for whiteness, normality and mean."""
 
 RESOLUTION = 1.5
-"""A filter that passes is "consistent" if a σ wrong by this factor would have been seen; else nobody can tell."""
+"""A filter that passes is "consistent" if a σ wrong by this factor would have been seen; else the verdict is "cannot tell"."""
 
 STATES = ("attitude", "bias")
 """States of every filter."""
@@ -64,7 +65,8 @@ class Finding:
     value : float
         Value of the statistic; NIS and NEES per degree of freedom, 1 for a consistent filter.
     low : float, default nan
-        Lower of the two-sided bounds of the value by itself; NaN where there are none.
+        Lower of the two-sided bounds that decide, all findings taken together: the value is outside where ``rejected``. NaN where a
+        statistic has none, and before a judgement.
     high : float, default nan
         Upper of these bounds.
     p_value : float
@@ -75,6 +77,8 @@ class Finding:
         Degrees of freedom of one sample.
     epochs : int, default 1
         Number of epochs of which the value is that of the worst (Bonferroni).
+    at : str, default ""
+        That epoch in words.
     rejected : bool, default False
         Whether it contradicts the filter after all findings are taken together (Holm).
     means : str, default ""
@@ -90,6 +94,7 @@ class Finding:
     samples: float
     degrees: int = 1
     epochs: int = 1
+    at: str = ""
     rejected: bool = False
     means: str = ""
 
@@ -98,8 +103,25 @@ class Finding:
         """Whether the value is that of a χ² per degree of freedom: its root is the factor by which σ is too small."""
         return self.name in _RATIOS
 
+    @property
+    def label(self) -> str:
+        """Sensor or states, with the epoch."""
+        return f"{self.of}, {self.at}" if self.at else self.of
+
+    def _with_bounds(self, error: float) -> Finding:
+        """Return the finding with the bounds of its value beyond which the p-value is below ``error``."""
+        if not (self.is_ratio or self.name == LOG_NEES):
+            return self
+        within = 1.0 - error / self.epochs
+        if self.is_ratio:
+            low, high = mean_bounds(self.degrees, self.samples, within)
+        else:
+            low, high = log_mean_bounds(self.degrees, int(self.samples), within)
+        return replace(self, low=low, high=high)
+
 
 _INNOVATIONS = "innovations of "
+LOG_NEES = "log-NEES"
 _RATIOS = ("NIS", "NEES at the end", "time-averaged NEES", "ANEES")
 
 
@@ -163,7 +185,7 @@ class Judgement(Listed):
         rows = [
             (
                 one.name,
-                one.of,
+                one.label,
                 figure(one.value),
                 f"{figure(one.low)} to {figure(one.high)}" if math.isfinite(one.low) else "",
                 figure(one.p_value, 2),
@@ -234,7 +256,7 @@ def judge(
     error_states : sequence of str, optional
         Names of the filter's error states, where the estimate does not hold them.
     unmodelled : sequence of str, default empty
-        Errors that are specified and that the filter has no state for (:func:`strapdown.setup.not_covered`); the verdict names them.
+        Errors that are specified and that the filter has no state for (:func:`strapdown.setup.unmodelled_errors`); the verdict names them.
 
     Returns
     -------
@@ -262,14 +284,14 @@ def judge(
     limits: list[str] = []
     for sensor, innovations in estimate.innovations.items():
         used = innovations.used
-        findings += _of_sensor(sensor, innovations.whitened[used], innovations.nis[used], probability)
+        findings += _of_sensor(sensor, innovations.whitened[used], innovations.nis[used])
         if innovations.refused:
             limits.append(f"{innovations.refused} measurements of {sensor} that the gate refused are left out")
     findings += _of_pairs(estimate)
     if truth is None:
         limits.append(WITHOUT_TRUTH)
     else:
-        findings += _of_errors(estimate, truth, probability, limits)
+        findings += _of_errors(estimate, truth, limits)
     if upper_bounds:
         return _bounded(findings, limits, probability, unmodelled)
     states = (*STATES, *(estimate.error_states if error_states is None else error_states))
@@ -299,26 +321,23 @@ def _bounded(
     return replace(judged, verdict="consistent" if errors_judged else "cannot tell", reason=reason, power=())
 
 
-def _of_sensor(sensor: str, white: Array, nis: Array, probability: float) -> list[Finding]:
+def _of_sensor(sensor: str, white: Array, nis: Array) -> list[Finding]:
     samples, degrees = white.shape
     if samples == 0:
         return []
     mean = float(nis.mean() / degrees)
-    low, high = mean_bounds(degrees, samples, probability)
     findings = [
         Finding(
             name="NIS",
             of=sensor,
             value=mean,
-            low=low,
-            high=high,
             p_value=mean_p_value(mean, degrees, samples),
             samples=samples,
             degrees=degrees,
             means=innovation_words(sensor, mean),
         )
     ]
-    if samples < LEAST_SAMPLES:
+    if samples < MIN_SAMPLES:
         return findings
     statistic, number, p = ljung_box(white)
     findings.append(
@@ -367,7 +386,7 @@ def _of_pairs(estimate: Estimate) -> list[Finding]:
     for i, one in enumerate(names):
         for other in names[i + 1 :]:
             a, b = estimate.innovations[one], estimate.innovations[other]
-            if min(int(a.used.sum()), int(b.used.sum())) < LEAST_SAMPLES:
+            if min(int(a.used.sum()), int(b.used.sum())) < MIN_SAMPLES:
                 continue
             correlation, pairs, p = cross_correlation_p_value(
                 a.time[a.used], a.whitened[a.used], b.time[b.used], b.whitened[b.used]
@@ -387,7 +406,7 @@ def _of_pairs(estimate: Estimate) -> list[Finding]:
     return found
 
 
-def _of_errors(estimate: Estimate, truth: Truth, probability: float, limits: list[str]) -> list[Finding]:
+def _of_errors(estimate: Estimate, truth: Truth, limits: list[str]) -> list[Finding]:
     m = len(estimate.time)
     attitude = unit_quaternions("truth.attitude", truth.attitude)
     if attitude.shape != (m, 4) or np.shape(truth.bias) != (m, 3):
@@ -422,14 +441,11 @@ def _of_errors(estimate: Estimate, truth: Truth, probability: float, limits: lis
         if max(states) >= known:
             continue
         value = float(nees(e[-1], P[-1], states)) / len(states)
-        low, high = mean_bounds(len(states), 1, probability)
         found.append(
             Finding(
                 name="NEES at the end",
                 of=subset,
                 value=value,
-                low=low,
-                high=high,
                 p_value=mean_p_value(value, len(states), 1),
                 samples=1,
                 degrees=len(states),
@@ -438,20 +454,17 @@ def _of_errors(estimate: Estimate, truth: Truth, probability: float, limits: lis
         )
         if m < 20:
             continue
-        average = time_average(e, P, states, probability)
+        average = time_average(e, P, states)
         if not average.reliable:
             limits.append(
                 f"the {subset} error changes too slowly for this run to average over: {average.effective:.3g} effective samples"
             )
             continue
-        low, high = average.bounds
         found.append(
             Finding(
                 name="time-averaged NEES",
                 of=subset,
                 value=average.mean,
-                low=low,
-                high=high,
                 p_value=average.p_value,
                 samples=average.effective,
                 degrees=len(states),
@@ -479,18 +492,14 @@ def concluded(
 ) -> Judgement:
     """Return the verdict that findings lead to, all taken together; what each was before, rejected or not, does not count.
 
-    Parameters
-    ----------
-    findings, limits, probability
-        As those of :class:`Judgement`.
-    states : sequence of str
-        States of the filter, whose power is told.
-    needed : sequence of str
-        Those of them whose σ the tests must be able to see for "consistent"; without any the sharpest test decides.
-    unmodelled : sequence of str
-        Errors that the filter has no state for.
+    ``states`` are those of the filter, whose power is reported; ``needed`` those of them whose σ the tests must be able to see for
+    "consistent" (without any the sharpest test decides); ``unmodelled`` errors that the filter has no state for.
     """
     marked = holm(findings, 1.0 - probability)
+    kept = sum(not one.rejected for one in marked)
+    marked = [
+        one._with_bounds((1.0 - probability) / max(kept, 1)) for one in marked
+    ]  # where Holm's procedure has stopped
     power = powers(marked, probability, states)
     rejected = [finding for finding in marked if finding.rejected]
     verdict: Answer
@@ -512,13 +521,13 @@ def concluded(
     else:
         sharpest = resolution(marked, probability)
         unseen = [one.of for one in power if one.of in needed and not one.seen]
-        told = f"none of {len(marked)} tests contradicts the filter"
+        outcome = f"none of {len(marked)} tests contradicts the filter"
         if sharpest > RESOLUTION:
             verdict = "cannot tell"
-            reason = f"{told}, but a σ wrong by a factor of {sharpest:.2g} would not be seen either: too few samples"
+            reason = f"{outcome}, but a σ wrong by a factor of {sharpest:.2g} would not be seen either: too few samples"
         else:
             verdict = "cannot tell" if unseen else "consistent"
-            reason = f"{told}; {power_words(power)}"
+            reason = f"{outcome}; {power_words(power)}"
     if unmodelled:
         reason += f"; the filter has no state for {', '.join(unmodelled)}"
     return Judgement(
@@ -571,7 +580,7 @@ def power_words(power: Sequence[Power]) -> str:
 
 
 def resolution(findings: Iterable[Finding], probability: float) -> float:
-    """Return the factor on σ that the sharpest of the findings tells from 1: the root of the ratio of its bounds, Bonferroni and all."""
+    """Return the factor on σ that the sharpest finding distinguishes from 1: the root of the ratio of its bounds, Bonferroni included."""
     marked = list(findings)
     within = (1.0 - probability) / max(len(marked), 1)
     factors = [math.inf]

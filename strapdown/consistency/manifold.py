@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import quaternion
-from strapdown.checks import Array, InputError, array, unit_quaternions
+from strapdown.checks import Array, InputError, array
 
 SUBSETS: dict[str, tuple[int, ...]] = {
     "state": (0, 1, 2, 3, 4, 5),
@@ -57,41 +57,6 @@ def errors(attitude: ArrayLike, bias: ArrayLike, true_attitude: ArrayLike, true_
         ) from None
     estimate = quaternion.multiply(quaternion.conjugate(attitude), true_attitude)
     return np.concatenate([quaternion.log(estimate), np.asarray(true_bias) - np.asarray(bias)], axis=-1)
-
-
-def fixed_frame(error: ArrayLike, covariance: ArrayLike, attitude: ArrayLike) -> tuple[Array, Array]:
-    """Return errors and covariances with the attitude part in fixed axes; the bias stays in body axes.
-
-    ``q_true = exp(δθ_f) ⊗ q_est`` with ``δθ_f = R_fb δθ_b``: a rotation of coordinates, so the NEES of all six states or of the attitude is
-    the same in both frames; that of a part of the attitude is not.
-
-    Parameters
-    ----------
-    error : array_like (..., 6)
-        Body-side errors, rad and rad/s (:func:`errors`).
-    covariance : array_like (..., 6, 6)
-        Covariance of these errors, rad², rad²/s and (rad/s)².
-    attitude : array_like (..., 4)
-        Estimated q_fb.
-
-    Returns
-    -------
-    error : ndarray (..., 6)
-        Attitude error as a rotation vector in the fixed frame, rad; bias error in body axes, rad/s.
-    covariance : ndarray (..., 6, 6)
-        Covariance of the returned errors.
-
-    Raises
-    ------
-    InputError
-        If the shapes do not agree.
-    """
-    e = array("error", error, (..., 6))
-    P = array("covariance", covariance, (..., 6, 6))
-    T = np.zeros(P.shape)
-    T[..., :3, :3] = quaternion.to_matrix(unit_quaternions("attitude", attitude))
-    T[..., [3, 4, 5], [3, 4, 5]] = 1.0
-    return (T @ e[..., None])[..., 0], T @ P @ np.swapaxes(T, -1, -2)
 
 
 def whitened(error: ArrayLike, covariance: ArrayLike) -> Array:

@@ -10,15 +10,14 @@ from numpy.typing import NDArray
 
 from strapdown.checks import Array
 from strapdown.consistency.bounds import (
-    Coverage,
     Verdict,
-    log_mean_bounds,
+    coverage_p_values,
     log_mean_p_value,
-    mean_bounds,
     mean_p_value,
     tail,
 )
 from strapdown.consistency.judgement import (
+    LOG_NEES,
     STATES,
     Finding,
     Judgement,
@@ -31,11 +30,15 @@ from strapdown.consistency.manifold import SUBSETS
 
 
 class RunStatistics(Protocol):
-    """What :func:`judge_runs` wants of the statistics of a Monte Carlo: sums over independent runs at each epoch."""
+    """Statistics that :func:`judge_runs` needs: sums over independent runs at each epoch."""
 
     @property
     def runs(self) -> int:
         """Number of independent runs."""
+
+    @property
+    def time(self) -> Array:
+        """Times of the epochs (m,), s."""
 
     @property
     def finite(self) -> NDArray[np.int64]:
@@ -126,66 +129,65 @@ def judge_runs(
             continue
         verdict = statistics.verdict(chosen, subset, probability)
         extreme = np.abs(np.log(np.clip(verdict.mean, 1e-300, 1e300)))
-        value = float(verdict.mean[int(np.argmax(extreme))])
-        low, high = verdict.simultaneous_bounds
+        worst = int(np.argmax(extreme))
+        value = float(verdict.mean[worst])
         findings.append(
             Finding(
                 name="ANEES",
                 of=subset,
                 value=value,
-                low=low,
-                high=high,
                 p_value=verdict.p_value,
                 samples=runs,
                 degrees=len(states),
                 epochs=len(chosen),
+                at=_at(statistics, chosen, worst),
                 means=error_words(f"the {subset} error at its worst epoch", value)
                 if failed == 0
                 else f"{failed} of {runs} runs failed: their {subset} error or covariance is not finite",
             )
         )
         if failed == 0:
-            findings.append(_log_nees(statistics, chosen, column, subset, probability))
+            findings.append(_log_nees(statistics, chosen, column, subset))
     if failed == 0 and runs >= 3:
-        findings += [_mean_error(statistics, chosen), _run_coverage(statistics, chosen, probability)]
+        findings += [_mean_error(statistics, chosen), _run_coverage(statistics, chosen)]
     for row, sensor in enumerate(statistics.sensors):
         degrees = float(np.sum(statistics.sensor_degrees[row]))
         if degrees < 1.0:
             continue
         mean = float(np.sum(statistics.sensor_nis_sum[row]) / degrees)
-        low, high = mean_bounds(1, degrees, probability)
         findings.append(
             Finding(
                 name="NIS",
                 of=sensor,
                 value=mean,
-                low=low,
-                high=high,
                 p_value=mean_p_value(mean, 1, degrees),
                 samples=degrees,
                 means=innovation_words(sensor, mean),
             )
         )
-    states = [name for name in STATES if name in statistics.subsets]
-    return concluded(findings, [], probability, states=states, needed=states, unmodelled=unmodelled)
+    tested = [name for name in STATES if name in statistics.subsets]
+    return concluded(findings, [], probability, states=tested, needed=tested, unmodelled=unmodelled)
 
 
-def _log_nees(statistics: RunStatistics, epochs: np.ndarray, column: int, subset: str, probability: float) -> Finding:
+def _at(statistics: RunStatistics, epochs: np.ndarray, worst: int) -> str:
+    return f"worst of {len(epochs)} epochs ({statistics.time[epochs[worst]]:g} s)"
+
+
+def _log_nees(statistics: RunStatistics, epochs: np.ndarray, column: int, subset: str) -> Finding:
     runs, degrees = statistics.runs, len(SUBSETS[subset])
     means = statistics.log_nees_sum[epochs, column] / runs
     p = np.array([log_mean_p_value(float(mean), degrees, runs) for mean in means])
     worst = int(np.argmin(p))
-    low, high = log_mean_bounds(degrees, runs, 1.0 - (1.0 - probability) / len(epochs))
     return Finding(
-        name="log-NEES",
+        name=LOG_NEES,
         of=subset,
         value=float(means[worst]),
-        low=low,
-        high=high,
         p_value=min(1.0, len(epochs) * float(p[worst])),
         samples=runs,
         degrees=degrees,
-        means=f"the mean of ln NEES of the {subset} at its worst epoch is {means[worst]:.4g}, outside {low:.4g} to {high:.4g}",
+        epochs=len(epochs),
+        at=_at(statistics, epochs, worst),
+        means=f"the mean of ln NEES of the {subset} at its worst epoch is {means[worst]:.4g}",
     )
 
 
@@ -214,15 +216,10 @@ def _mean_error(statistics: RunStatistics, epochs: np.ndarray) -> Finding:
     )
 
 
-def _run_coverage(statistics: RunStatistics, epochs: np.ndarray, probability: float) -> Finding:
+def _run_coverage(statistics: RunStatistics, epochs: np.ndarray) -> Finding:
     """Return whether the errors of any state lie within 1, 2 or 3 σ too often or too seldom, the worst of all epochs and states."""
     inside = statistics.coverage[epochs][:, _estimated(statistics)] / statistics.runs
-    p = np.array(
-        [
-            [Coverage(samples=statistics.runs, inside=state, probability=probability).p_values for state in epoch]
-            for epoch in inside
-        ]
-    )
+    p = coverage_p_values(inside, statistics.runs)
     _, state, k = np.unravel_index(int(np.argmin(p)), p.shape)
     name = state_name(int(state))
     value = float(inside.reshape(-1)[int(np.argmin(p))])

@@ -16,13 +16,13 @@ from strapdown.checks import InputError, array
 from strapdown.consistency.bounds import mean_bounds, mean_p_value, tail
 from strapdown.consistency.manifold import whitened
 
-LEAST_EFFECTIVE = 50.0
+MIN_EFFECTIVE = 50.0
 """Below this many effective samples the correlation is not known well enough from the run itself for bounds that hold."""
 
 MARKOV = 0.6
 """Where the correlation of the NEES itself leaves less than this share of the samples that the vector autoregression does, it counts."""
 
-MOST_EPOCHS = 4000
+MAX_EPOCHS = 4000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +40,7 @@ class TimeAverage:
     @property
     def reliable(self) -> bool:
         """Whether the run is long against the correlation of its errors; if not, the bounds do not hold."""
-        return self.effective >= LEAST_EFFECTIVE
+        return self.effective >= MIN_EFFECTIVE
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -56,17 +56,10 @@ class TimeAverage:
 def time_average(
     error: ArrayLike, covariance: ArrayLike, states: tuple[int, ...] | None = None, probability: float = 0.99
 ) -> TimeAverage:
-    """Return the NEES averaged over the epochs of one run, with as many effective samples as its correlation leaves.
+    """Return the NEES averaged over the even epochs of one run, with as many effective samples as its correlation leaves.
 
-    Parameters
-    ----------
-    error : array (epochs, n)
-        Error states at even epochs.
-    covariance : array (epochs, n, n)
-    states : tuple of int, optional
-        Subset that is judged; all are used to learn the correlation, because no subset is a Markov process by itself.
-    probability : float
-        Of the bounds.
+    Error (epochs, n) and covariance (epochs, n, n); ``states`` is the subset judged. All states are used to learn the correlation, because
+    no subset is a Markov process by itself.
     """
     tail(probability)
     e = array("error", error, ("epochs", "n"))
@@ -75,7 +68,7 @@ def time_average(
     chosen = list(range(n)) if states is None else list(states)
     if len(e) < 2 * n + 2:
         raise InputError(f"{len(e)} epochs are too few for a time average of {n} states; keep more of the run")
-    stride = -(-len(e) // MOST_EPOCHS)
+    stride = -(-len(e) // MAX_EPOCHS)
     order = [*chosen, *(k for k in range(n) if k not in chosen)]
     white = whitened(e[::stride][:, order], P[::stride][:, order][:, :, order])
     mine = white[:, : len(chosen)]
@@ -94,10 +87,10 @@ def _effective(white: np.ndarray, first: int) -> float:
     An error that is the sum of a quick and of a slow part is no Markov process: from one epoch to the next the quick part hides the slow.
     """
     # Fewer epochs than that could not show that there are enough effective samples.
-    least = max(8 * (white.shape[1] + 1), 2 * int(LEAST_EFFECTIVE))
+    least = max(8 * (white.shape[1] + 1), 2 * int(MIN_EFFECTIVE))
     most = max(1, len(white) // least)
     found = [effective_samples(white[:: 2**k], first) for k in range(most.bit_length())]
-    by_model = found[0] if min(found) >= LEAST_EFFECTIVE else min(found)
+    by_model = found[0] if min(found) >= MIN_EFFECTIVE else min(found)
     # Nor are the six states alone where the filter has error states beside them.
     direct = squares_effective(white[:, :first])
     return direct if direct < MARKOV * by_model else by_model

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from strapdown.checks import Array, InputError, array, count
 from strapdown.consistency.bounds import tail
 
-MOST_LAGS = 20
+MAX_LAGS = 20
 
 
 def usual_lags(samples: int) -> int:
@@ -23,7 +23,7 @@ def usual_lags(samples: int) -> int:
 
     More of them make the test's χ² distribution worse than its tails at 1 % bear.
     """
-    return max(1, min(MOST_LAGS, samples // 50))
+    return max(1, min(MAX_LAGS, samples // 50))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -42,33 +42,10 @@ class Autocorrelation:
 
 
 def autocorrelation(whitened: ArrayLike, lags: int | None = None, probability: float = 0.99) -> Autocorrelation:
-    """Return the autocorrelation of whitened innovations at lags 1 to ``lags``, each component by itself.
+    """Return the autocorrelation of whitened innovations (n,) or (n, m) at lags 1 to ``lags``, each component by itself.
 
-    The mean is known to be zero and is not subtracted. For white noise the value at lag l is nearly normal with variance
-    (N − l)/(N(N + 2)).
-
-    Parameters
-    ----------
-    whitened : array_like (n,) or (n, m)
-        Innovations divided by their σ, in order of time.
-    lags : int, optional
-        Default: 20, or a fiftieth of the samples.
-    probability : float, default 0.99
-        Of the bounds.
-
-    Returns
-    -------
-    Autocorrelation
-        Values by lag and component, with bounds of each and bounds that all keep together.
-
-    Raises
-    ------
-    InputError
-        If there are not more samples than lags.
-
-    References
-    ----------
-    G. M. Ljung, G. E. P. Box, On a measure of lack of fit in time series models, Biometrika 65, 1978.
+    By default 20 lags, or a fiftieth of the samples. The mean is known to be zero and is not subtracted. For white noise the value at lag l
+    is nearly normal with variance (N − l)/(N(N + 2)) (Ljung & Box 1978, Biometrika 65).
     """
     from scipy.special import ndtri
 
@@ -92,36 +69,11 @@ def autocorrelation(whitened: ArrayLike, lags: int | None = None, probability: f
 
 
 def ljung_box(whitened: ArrayLike, lags: int | None = None) -> tuple[float, int, float]:
-    """Return the multivariate Ljung–Box statistic, its degrees of freedom and its p-value.
+    """Return the multivariate Ljung–Box statistic of whitened innovations (n,) or (n, m), its degrees of freedom and its p-value.
 
     ``Q = N(N + 2/m) Σ_l tr(C_lᵀ C_0⁻¹ C_l C_0⁻¹)/(N − l)`` is χ² with m² L degrees of freedom if the innovations are white; the test is
     one-sided, large is not white. No parameters have been fitted, so no degrees of freedom are subtracted; the factor N(N + 2/m), instead
-    of N², gives the right mean in small samples where the mean of the innovations is known.
-
-    Parameters
-    ----------
-    whitened : array_like (n,) or (n, m)
-        Innovations divided by their σ, in order of time.
-    lags : int, optional
-        Default: 20, or a fiftieth of the samples.
-
-    Returns
-    -------
-    statistic : float
-        Q.
-    degrees : int
-        Degrees of freedom of Q, m² times the number of lags.
-    p_value : float
-        Probability that white innovations give Q or more.
-
-    Raises
-    ------
-    InputError
-        If the samples are too few for the lags.
-
-    References
-    ----------
-    J. R. M. Hosking, The multivariate portmanteau statistic, J. American Statistical Association 75, 1980.
+    of N², gives the right mean in small samples where the mean is known (Hosking 1980, J. American Statistical Association 75).
     """
     from scipy.special import chdtrc
 
@@ -189,7 +141,7 @@ class QuantilePairs:
     probability: float
 
 
-MOST_PAIRS = 2000
+MAX_PAIRS = 2000
 
 
 def quantile_pairs(whitened: ArrayLike, probability: float = 0.99) -> QuantilePairs:
@@ -200,7 +152,7 @@ def quantile_pairs(whitened: ArrayLike, probability: float = 0.99) -> QuantilePa
     x = np.sort(_series(whitened).ravel())
     n = len(x)
     ends = np.concatenate([np.arange(min(n, 200)), np.arange(max(n - 200, 0), n)])
-    ranks = np.unique(np.concatenate([np.linspace(0, n - 1, min(n, MOST_PAIRS - 400)).round().astype(int), ends]))
+    ranks = np.unique(np.concatenate([np.linspace(0, n - 1, min(n, MAX_PAIRS - 400)).round().astype(int), ends]))
     k = ranks + 1.0
     return QuantilePairs(
         theoretical=np.asarray(ndtri((k - 0.5) / n)),

@@ -12,16 +12,11 @@ off) both are named.
 Commutation error is the exception: to the innovations it *is* a gyro bias, which the filter estimates. It is computed from the increments
 themselves, by a better integration algorithm, and held against the filter's own σ of the bias, and against the truth if there is one.
 
-``diagnosing``
-    :func:`diagnose`.
-``causes``
-    What it returns.
-``hypotheses``, ``commutation``
-    What may be wrong.
-``turning``
-    What a gyro's scale factor, misalignment and mounting act on.
-``likelihood``
-    How well a hypothesis explains the record.
+- ``diagnosing``: :func:`diagnose`.
+- ``causes``: What it returns.
+- ``hypotheses``, ``commutation``: What may be wrong.
+- ``turning``: What a gyro's scale factor, misalignment and mounting act on.
+- ``likelihood``: How well a hypothesis explains the record.
 """
 
 from strapdown.diagnosis.causes import Cause, Diagnosis

@@ -16,7 +16,7 @@ from strapdown.records import Estimate, ImuRecord, Truth
 from strapdown.setup import FilterSetup
 from strapdown.units import DEGREE_PER_HOUR
 
-BETTER = "matched-1-8-8"
+ACCURATE_ALGORITHM = "matched-1-8-8"
 """Integration algorithm that others are held against."""
 
 
@@ -33,7 +33,7 @@ def commutation_drift(record: ImuRecord, algorithm: coning.Algorithm) -> tuple[A
     increments = record.increments[: blocks * n]
     edges = record.time[: blocks * n + 1]
     own = quaternion.exp(coning.rotation_vectors(increments, algorithm, edges=edges))
-    best = quaternion.exp(coning.rotation_vectors(increments, BETTER, edges=edges)).reshape(blocks, n, 4)
+    best = quaternion.exp(coning.rotation_vectors(increments, ACCURATE_ALGORITHM, edges=edges)).reshape(blocks, n, 4)
     turn = best[:, 0]
     for k in range(1, n):
         turn = quaternion.multiply(turn, best[:, k])

@@ -13,7 +13,7 @@ from strapdown.diagnosis.commutation import commutation
 from strapdown.diagnosis.hypotheses import conventions, mean_hypotheses, noise_hypotheses, outliers
 from strapdown.diagnosis.likelihood import Model, by_mean, by_variance, run
 from strapdown.records import ImuRecord, Truth
-from strapdown.setup import FilterSetup, believed, need_mekf
+from strapdown.setup import FilterSetup, modelled_record, need_mekf
 
 GROSS = 3.0
 """Discrete conventions are tried where the NIS per degree of freedom of some sensor exceeds this: a wrong one is not subtle."""
@@ -56,7 +56,7 @@ def diagnose(
     if not any(len(series.time) for series in record.vectors):
         raise InputError("record has no vector measurements, so there are no innovations to diagnose from")
     need_mekf(setup, "the search for causes")
-    model = Model(record=believed(record, setup), noise=setup.process_noise, initial=initial)
+    model = Model(record=modelled_record(record, setup), noise=setup.process_noise, initial=initial)
     every = max(1, len(model.record.increments) // 1000)
     estimate = estimation.run(model.record, model.noise, model.initial, every=every, full_covariance=True)
     truth = model.record.truth

@@ -1,4 +1,4 @@
-"""What may be wrong: each hypothesis as a change of the record or of the filter's beliefs."""
+"""Possible faults: each hypothesis as a change of the record or of the filter's model."""
 
 from __future__ import annotations
 
@@ -235,9 +235,7 @@ def noise_hypotheses(model: Model) -> Iterator[Hypothesis]:
             steps=np.array([0.1]),
             limit=6.0,
             apply=lambda m, theta, name=name: m.with_series(name, lambda s: s.noise_scaled(factor(theta))),  # type: ignore[misc]
-            words=lambda theta, _, name=name: (
-                f"the noise of {name} is {factor(theta):.3g} times what the filter believes"
-            ),  # type: ignore[misc]
+            words=lambda theta, _, name=name: f"the noise of {name} is {factor(theta):.3g} times the filter's model",  # type: ignore[misc]
         )
     for term, words in (
         ("angle_random_walk", "angle random walk"),
@@ -254,12 +252,12 @@ def noise_hypotheses(model: Model) -> Iterator[Hypothesis]:
                     m, noise=replace(m.noise, **{term: getattr(m.noise, term) * factor(theta)})
                 ),
                 words=lambda theta, _, words=words: (  # type: ignore[misc]
-                    f"the gyro's {words} is {factor(theta):.3g} times what the filter believes"
+                    f"the gyro's {words} is {factor(theta):.3g} times the filter's model"
                 ),
             )
 
 
-MOST_OUTLIERS = 0.25
+MAX_OUTLIERS = 0.25
 
 
 def outliers(sensor: str, white: Array) -> Cause:
@@ -275,7 +273,7 @@ def outliers(sensor: str, white: Array) -> Cause:
         ratio = 0.5 * square * (1.0 - 1.0 / spread) - 0.5 * degrees * math.log(spread)
         log_odds = ratio + math.log(share) - math.log1p(-share)
         belongs = np.where(log_odds > 0.0, 1.0, np.exp(np.minimum(log_odds, 0.0))) / (1.0 + np.exp(-np.abs(log_odds)))
-        share = float(np.clip(belongs.mean(), 1e-4, MOST_OUTLIERS))
+        share = float(np.clip(belongs.mean(), 1e-4, MAX_OUTLIERS))
         spread = float(max(np.sum(belongs * square) / max(degrees * belongs.sum(), 1e-12), 9.0))
     ratio = 0.5 * square * (1.0 - 1.0 / spread) - 0.5 * degrees * math.log(spread)
     gain = 2.0 * float(np.sum(np.logaddexp(math.log1p(-share), ratio + math.log(share))))

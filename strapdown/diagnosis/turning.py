@@ -1,4 +1,4 @@
-"""What a gyro's scale factor, misalignment and mounting act on: the body's turns, without the gyro's bias and hardly with its noise."""
+"""The body's turns, on which a gyro's scale factor, misalignment and mounting act, without the gyro's bias and hardly with its noise."""
 
 from __future__ import annotations
 

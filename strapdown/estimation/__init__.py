@@ -4,26 +4,17 @@ The process model is equation (17), ``q̇ = ½ q ⊗ (w_meas − b)``; the error
 ``δb = b_true − b``. Transition and process noise are exact at constant rate; after each correction the covariance is carried to the new
 tangent space.
 
-``states``
-    Process noise, state, where the filter starts.
-``error_states``
-    Declarations of states beside attitude and gyro bias; ``model`` turns them into arrays.
-``gating``
-    Gate, robust weights and monitor.
-``schedule``
-    Measurements in order of time.
-``forward``
-    The filter over whole records.
-``smoothing``
-    The smoothers; ``recovery_segments`` what they make of recoveries.
-``observability``
-    What a record shows of each state.
-``step_filter``
-    The filter step by step, on filterpy; ``step_gate`` its gate.
-``multiple_model``
-    Unknown start, one vector at a time.
-``filters``
-    Other filters on the same interface, for comparison.
+- ``states``: Process noise, state, where the filter starts.
+- ``error_states``: Declarations of states beside attitude and gyro bias; ``model`` turns them into arrays.
+- ``gating``: Gate, robust weights and monitor.
+- ``schedule``: Measurements in order of time.
+- ``forward``: The filter over whole records.
+- ``smoothing``: The smoothers; ``recovery_segments`` what they make of recoveries.
+- ``observability``: What a record shows of each state.
+- ``live``: The compiled filter for data that arrive as they are measured.
+- ``step_filter``: The filter step by step, on filterpy; ``step_gate`` its gate.
+- ``multiple_model``: Unknown start, one vector at a time.
+- ``filters``: Other filters on the same interface, for comparison.
 """
 
 from importlib import import_module
@@ -33,6 +24,7 @@ from strapdown.estimation.forward import gaps as gaps
 from strapdown.estimation.forward import run
 from strapdown.estimation.forward import run_part as run_part
 from strapdown.estimation.gating import Gate, Monitor, Robust
+from strapdown.estimation.live import LiveFilter
 from strapdown.estimation.model import with_error_states as with_error_states
 from strapdown.estimation.observability import Observability, observability
 from strapdown.estimation.smoothing import relinearized_start as relinearized_start
@@ -41,6 +33,7 @@ from strapdown.estimation.states import ProcessNoise, State, first_state, initia
 
 __all__ = [
     "Gate",
+    "LiveFilter",
     "Monitor",
     "Observability",
     "ProcessNoise",

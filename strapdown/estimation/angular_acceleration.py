@@ -10,7 +10,7 @@ from strapdown.checks import Array, InputError
 from strapdown.records import ImuRecord
 
 ORDERS = (3, 5, 7)
-"""Of the polynomial fitted to the rate over a window; its slope at the middle is the angular acceleration (Savitzky & Golay 1964)."""
+"""Degrees of the polynomial fitted to the rate over a window; its slope at the middle is the acceleration (Savitzky & Golay 1964)."""
 WINDOWS = (5, 7, 9, 11, 13, 17, 21, 25, 31, 37, 45, 53, 61)
 """Windows tried, samples."""
 MOST = 20000
@@ -20,7 +20,7 @@ LASTING = 4.0
 LEAST = 100
 """Samples needed to separate noise from motion."""
 UNEVEN = 0.01
-"""Of the mean interval: how much the gyro's intervals may differ."""
+"""Tolerated difference of the gyro's intervals, as a part of their mean."""
 
 
 def turning(record: ImuRecord, time: Array) -> tuple[Array, Array]:
@@ -30,13 +30,6 @@ def turning(record: ImuRecord, time: Array) -> tuple[Array, Array]:
     within the window. That is seen from how the slope differs from that over half the window, which a motion bends sixteen times less or
     better, less what noise alone would make; the order and window of the least sum are taken. σ is that of the rates' fifth differences,
     in which a smooth motion is nothing: ``σ² = E(Δ⁵)²/252``.
-
-    Parameters
-    ----------
-    record : ImuRecord
-        Its gyro intervals must be alike.
-    time : (m,)
-        s, inside the record.
     """
     from scipy.signal import savgol_coeffs, savgol_filter
 

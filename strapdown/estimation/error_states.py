@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -32,8 +32,8 @@ __all__ = [
 ]
 
 AXES = ("x", "y", "z")
-MOST_CHAIN_DECAY = 0.2
-"""Of λ dt of a state in a chain in one step: its series and Gauss's rule are exact."""
+MAX_CHAIN_DECAY = 0.2
+"""Largest λ dt of a state in a chain in one step, where its series and Gauss's rule are exact."""
 ENTRIES = tuple(a if a == b else f"{a}{b}" for a in AXES for b in AXES)
 """Entries of a matrix by rows: x, xy, xz, yx, y, …"""
 
@@ -83,6 +83,11 @@ class ErrorStates(ByValue):
     """Unit of each state."""
     sigma: Array
     """Standard deviation of each state at the start (size,), above zero; all are expected to be zero then."""
+
+    def _set(self, **values: Any) -> None:
+        """Set attributes of a frozen declaration."""
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
 
     @property
     def size(self) -> int:
@@ -174,7 +179,7 @@ class ErrorStates(ByValue):
             return np.eye(self.size), np.zeros((self.size, self.size))
         decay, density = np.asarray(self.decay, np.float64), np.asarray(self.density, np.float64)
         link = np.stack([np.asarray(self.feed, np.float64), density], axis=1)
-        doublings = max(0, int(np.ceil(np.log2(max(np.max(decay) * dt / MOST_CHAIN_DECAY, 1e-9)))))
+        doublings = max(0, int(np.ceil(np.log2(max(np.max(decay) * dt / MAX_CHAIN_DECAY, 1e-9)))))
         h = dt / 2**doublings
         phi, Q = np.zeros((2, self.size, self.size))
         for k in range(self.size):
@@ -227,6 +232,17 @@ def _matrix(name: str, diagonal: float | Array, off_diagonal: float | Array, uni
     return whole
 
 
+def _entries(sigmas: Array) -> tuple[tuple[str, ...], Array]:
+    """Return the names and the σ of the entries of a matrix that are states."""
+    chosen = np.flatnonzero(sigmas.ravel())
+    return tuple(ENTRIES[k] for k in chosen), np.asarray(sigmas.ravel()[chosen])
+
+
+def _units_of_entries(names: tuple[str, ...]) -> Array:
+    """Return for each entry the matrix (3, 3) that is 1 there."""
+    return np.asarray(np.eye(9)[[ENTRIES.index(name) for name in names]].reshape(-1, 3, 3))
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GyroScale(ErrorStates):
     """Scale factors and misalignments of the gyro: the entries of M in ``w_meas = (I + M) w_b + b + n``, constant.
@@ -248,35 +264,15 @@ class GyroScale(ErrorStates):
     name: str = "gyro scale"
 
     def __post_init__(self) -> None:
-        """Check both."""
-        self._sigmas()
-
-    def _sigmas(self) -> Array:
-        return _matrix(self.name, self.scale_sigma, self.misalignment_sigma, ("scale_sigma", "misalignment_sigma"))
-
-    @property
-    def _entries(self) -> np.ndarray:
-        return np.flatnonzero(self._sigmas().ravel())
-
-    @property
-    def components(self) -> tuple[str, ...]:  # type: ignore[override]
-        """M by rows: x, y, z are the scale factors; xy is how much of the rate about y shows on axis x."""
-        return tuple(ENTRIES[k] for k in self._entries)
-
-    @property
-    def units(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Dimensionless, rad."""
-        return tuple("1" if entry in AXES else "rad" for entry in self.components)
-
-    @property
-    def sigma(self) -> Array:  # type: ignore[override]
-        """Both as given."""
-        return np.asarray(self._sigmas().ravel()[self._entries])
+        """Check both; the states are the entries of M by rows, xy being how much of the rate about y shows on axis x."""
+        sigmas = _matrix(self.name, self.scale_sigma, self.misalignment_sigma, ("scale_sigma", "misalignment_sigma"))
+        components, sigma = _entries(sigmas)
+        self._set(components=components, units=tuple("1" if one in AXES else "rad" for one in components), sigma=sigma)
 
     @property
     def gyro_scale(self) -> Array:
         """One entry of M a state."""
-        return np.asarray(np.eye(9)[self._entries].reshape(-1, 3, 3))
+        return _units_of_entries(self.components)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -303,40 +299,20 @@ class GyroForce(ErrorStates):
     name: str = "gyro force"
 
     def __post_init__(self) -> None:
-        """Check all."""
-        self._sigmas()
-        object.__setattr__(self, "gravity_f", array(f"{self.name}: gravity_f", self.gravity_f, (3,)))
+        """Check all; the states are the entries of G by rows, xy being the bias about x that a force along y makes."""
+        sigmas = _matrix(self.name, self.along_sigma, self.across_sigma, ("along_sigma", "across_sigma"))
+        components, sigma = _entries(sigmas)
+        gravity = array(f"{self.name}: gravity_f", self.gravity_f, (3,))
+        self._set(components=components, units=("rad s/m",) * len(components), sigma=sigma, gravity_f=gravity)
         if not np.any(self.gravity_f):
             raise InputError(
                 f"{self.name}: gravity_f is zero, and a body in free fall feels no force; leave the block out"
             )
 
-    def _sigmas(self) -> Array:
-        return _matrix(self.name, self.along_sigma, self.across_sigma, ("along_sigma", "across_sigma"))
-
-    @property
-    def _entries(self) -> np.ndarray:
-        return np.flatnonzero(self._sigmas().ravel())
-
-    @property
-    def components(self) -> tuple[str, ...]:  # type: ignore[override]
-        """G by rows: xy is the bias about x that a force along y makes."""
-        return tuple(ENTRIES[k] for k in self._entries)
-
-    @property
-    def units(self) -> tuple[str, ...]:  # type: ignore[override]
-        """All alike."""
-        return ("rad s/m",) * self.size
-
-    @property
-    def sigma(self) -> Array:  # type: ignore[override]
-        """Both as given."""
-        return np.asarray(self._sigmas().ravel()[self._entries])
-
     @property
     def gyro_force(self) -> Array:
         """One entry of G a state."""
-        return np.asarray(np.eye(9)[self._entries].reshape(-1, 3, 3))
+        return _units_of_entries(self.components)
 
     @property
     def force_f(self) -> Array:
@@ -372,27 +348,19 @@ class GyroGaussMarkov(_FirstOrder):
         Correlation time of the drift, s.
     name : str, default "gyro drift"
         Name of the block of states.
-    components : tuple of str, default ("x", "y", "z")
-        Name of each state within the block.
-    units : tuple of str, default ("rad/s",) * 3
-        SI unit of each state.
     """
 
     bias_sigma: float | Array
     correlation_time: float
     name: str = "gyro drift"
-    components: tuple[str, ...] = AXES
-    units: tuple[str, ...] = ("rad/s",) * 3
+    components = AXES
+    units = ("rad/s",) * 3
 
     def __post_init__(self) -> None:
         """Check both."""
-        object.__setattr__(self, "bias_sigma", _spread(f"{self.name}: bias_sigma", self.bias_sigma, "rad/s"))
+        sigma = _spread(f"{self.name}: bias_sigma", self.bias_sigma, "rad/s")
+        self._set(bias_sigma=sigma, sigma=sigma)
         positive(f"{self.name}: correlation_time", self.correlation_time, unit="s")
-
-    @property
-    def sigma(self) -> Array:  # type: ignore[override]
-        """The stationary one."""
-        return np.asarray(self.bias_sigma)
 
     @property
     def gyro_offset(self) -> Array:
@@ -419,8 +387,6 @@ class VectorBias(ErrorStates):
         SI unit of the bias, for tables and messages.
     name : str, default "<sensor> bias"
         Name of the block of states.
-    components : tuple of str, default ("x", "y", "z")
-        Name of each state within the block.
     """
 
     sensor: str
@@ -429,23 +395,14 @@ class VectorBias(ErrorStates):
     varying: bool = False
     unit: str = "1"
     name: str = ""
-    components: tuple[str, ...] = AXES
+    components = AXES
 
     def __post_init__(self) -> None:
         """Check all."""
-        object.__setattr__(self, "name", self.name or f"{self.sensor} bias")
-        object.__setattr__(self, "bias_sigma", _spread(f"{self.name}: bias_sigma", self.bias_sigma, self.unit))
+        self._set(name=self.name or f"{self.sensor} bias", units=(self.unit,) * 3)
+        sigma = _spread(f"{self.name}: bias_sigma", self.bias_sigma, self.unit)
+        self._set(bias_sigma=sigma, sigma=sigma)
         non_negative(f"{self.name}: rate_random_walk", self.rate_random_walk)
-
-    @property
-    def units(self) -> tuple[str, ...]:  # type: ignore[override]
-        """As declared."""
-        return (self.unit,) * 3
-
-    @property
-    def sigma(self) -> Array:  # type: ignore[override]
-        """As given."""
-        return np.asarray(self.bias_sigma)
 
     @property
     def density(self) -> Array:
@@ -484,38 +441,22 @@ class LeverArm(ErrorStates):
 
     def __post_init__(self) -> None:
         """Check all."""
-        object.__setattr__(self, "name", self.name or f"{self.sensor} lever arm")
+        self._set(name=self.name or f"{self.sensor} lever arm")
         positive(f"{self.name}: strength", self.strength, unit="m/s²")
         spread = array(f"{self.name}: arm_sigma", np.broadcast_to(np.asarray(self.arm_sigma, np.float64), (3,)), (3,))
         for k, one in enumerate(spread):
             non_negative(f"{self.name}: arm_sigma[{k}]", one, unit="m")
         if not spread.any():
             raise InputError(f"{self.name}: arm_sigma is 0; give one above zero, or leave the block out")
-        object.__setattr__(self, "arm_sigma", spread.copy())
-
-    @property
-    def _axes(self) -> np.ndarray:
-        return np.flatnonzero(self.arm_sigma)
-
-    @property
-    def components(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Those whose σ is above zero."""
-        return tuple(AXES[k] for k in self._axes)
-
-    @property
-    def units(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Metres."""
-        return ("m",) * self.size
-
-    @property
-    def sigma(self) -> Array:  # type: ignore[override]
-        """As given."""
-        return np.asarray(np.asarray(self.arm_sigma)[self._axes])
+        used = np.flatnonzero(spread)
+        components = tuple(AXES[k] for k in used)
+        self._set(arm_sigma=spread.copy(), components=components, units=("m",) * len(used), sigma=spread[used])
 
     @property
     def effects(self) -> Mapping[str, Effect]:
         """One axis a state."""
-        return {self.sensor: Effect(lever=np.eye(3)[self._axes] / self.strength)}
+        used = np.flatnonzero(self.arm_sigma)
+        return {self.sensor: Effect(lever=np.eye(3)[used] / self.strength)}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -530,29 +471,18 @@ class VectorScale(ErrorStates):
         Standard deviation of each entry of S, dimensionless.
     name : str, default "<sensor> scale"
         Name of the block of states.
-    units : tuple of str, default ("1",) * 9
-        SI unit of each state.
     """
 
     sensor: str
     scale_sigma: float
     name: str = ""
-    units: tuple[str, ...] = ("1",) * 9
+    components = ENTRIES
+    units = ("1",) * 9
 
     def __post_init__(self) -> None:
         """Check the deviation."""
-        object.__setattr__(self, "name", self.name or f"{self.sensor} scale")
-        positive(f"{self.name}: scale_sigma", self.scale_sigma)
-
-    @property
-    def components(self) -> tuple[str, ...]:  # type: ignore[override]
-        """S by rows."""
-        return ENTRIES
-
-    @property
-    def sigma(self) -> Array:  # type: ignore[override]
-        """As given."""
-        return np.full(9, self.scale_sigma)
+        self._set(name=self.name or f"{self.sensor} scale")
+        self._set(sigma=np.full(9, positive(f"{self.name}: scale_sigma", self.scale_sigma)))
 
     @property
     def effects(self) -> Mapping[str, Effect]:
@@ -575,10 +505,6 @@ class SensorMounting(ErrorStates):
         Standard deviation of θ at the start, rad, by body axis.
     name : str, default "<sensor> mounting"
         Name of the block of states.
-    components : tuple of str, default ("x", "y", "z")
-        Name of each state within the block.
-    units : tuple of str, default ("rad",) * 3
-        SI unit of each state.
 
     Examples
     --------
@@ -590,18 +516,14 @@ class SensorMounting(ErrorStates):
     sensor: str
     mounting_sigma: float | Array
     name: str = ""
-    components: tuple[str, ...] = field(default=AXES)
-    units: tuple[str, ...] = ("rad",) * 3
+    components = AXES
+    units = ("rad",) * 3
 
     def __post_init__(self) -> None:
         """Check the deviation."""
-        object.__setattr__(self, "name", self.name or f"{self.sensor} mounting")
-        object.__setattr__(self, "mounting_sigma", _spread(f"{self.name}: mounting_sigma", self.mounting_sigma, "rad"))
-
-    @property
-    def sigma(self) -> Array:  # type: ignore[override]
-        """Standard deviation of each angle."""
-        return np.asarray(self.mounting_sigma)
+        self._set(name=self.name or f"{self.sensor} mounting")
+        sigma = _spread(f"{self.name}: mounting_sigma", self.mounting_sigma, "rad")
+        self._set(mounting_sigma=sigma, sigma=sigma)
 
     @property
     def effects(self) -> Mapping[str, Effect]:
@@ -632,8 +554,6 @@ class GaussMarkov(_FirstOrder):
         SI unit of what the sensor measures.
     name : str, default "<sensor> disturbance"
         Name of the block of states.
-    components : tuple of str, default ("x", "y", "z")
-        Name of each state within the block.
     """
 
     sensor: str
@@ -643,26 +563,17 @@ class GaussMarkov(_FirstOrder):
     varying: bool = False
     unit: str = "1"
     name: str = ""
-    components: tuple[str, ...] = field(default=AXES)
+    components = AXES
 
     def __post_init__(self) -> None:
         """Check all."""
-        object.__setattr__(self, "name", self.name or f"{self.sensor} disturbance")
-        object.__setattr__(self, "noise_sigma", _spread(f"{self.name}: noise_sigma", self.noise_sigma, self.unit))
+        self._set(name=self.name or f"{self.sensor} disturbance", units=(self.unit,) * 3)
+        sigma = _spread(f"{self.name}: noise_sigma", self.noise_sigma, self.unit)
+        self._set(noise_sigma=sigma, sigma=sigma)
         positive(f"{self.name}: correlation_time", self.correlation_time, unit="s")
         one_of(f"{self.name}: frame", self.frame, ("body", "fixed"))
         if self.frame == "fixed" and len(set(self.sigma)) > 1:
             raise InputError(f"{self.name}: noise_sigma differs by axis; in fixed axes give one for all")
-
-    @property
-    def units(self) -> tuple[str, ...]:  # type: ignore[override]
-        """As declared."""
-        return (self.unit,) * 3
-
-    @property
-    def sigma(self) -> Array:  # type: ignore[override]
-        """The stationary one."""
-        return np.asarray(self.noise_sigma)
 
     @property
     def effects(self) -> Mapping[str, Effect]:
@@ -675,7 +586,7 @@ class GaussMarkov(_FirstOrder):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BoundedVelocity(ErrorStates):
-    """What an accelerometer on a moving hand feels of the motion: an acceleration whose velocity is bounded, stationary, in fixed axes.
+    """Acceleration of a moving hand that an accelerometer measures: an acceleration whose velocity is bounded, stationary, in fixed axes.
 
     ``f_b = R_fbᵀ (a_f − g_f)`` with ``a = v̇``: on each axis ``v̇ = −v/τ_v + u``, ``u̇ = −u/τ_a + w``. The spectrum of a is that of
     first-order coloured noise at high frequency and vanishes at zero, as that of every body does which stays about where it is; a part of
@@ -716,7 +627,7 @@ class BoundedVelocity(ErrorStates):
 
     def __post_init__(self) -> None:
         """Check all, and work out the third of the three that are given by two."""
-        object.__setattr__(self, "name", self.name or f"{self.sensor} velocity")
+        self._set(name=self.name or f"{self.sensor} velocity")
         positive(f"{self.name}: velocity_time", self.velocity_time, unit="s")
         positive(f"{self.name}: strength", self.strength, unit="m/s²")
         non_negative(f"{self.name}: position_time", self.position_time, unit="s")
@@ -726,9 +637,9 @@ class BoundedVelocity(ErrorStates):
             for field_name, unit in three.items()
         ]
         velocity, acceleration, time = values
-        told = ", ".join(f"{name} {value:g} {three[name]}" for name, value in zip(three, values, strict=True))
+        given = ", ".join(f"{name} {value:g} {three[name]}" for name, value in zip(three, values, strict=True))
         if sum(value > 0.0 for value in values) < 2:
-            raise InputError(f"{self.name}: of {told} two must be above zero; the third follows from them")
+            raise InputError(f"{self.name}: of {given} two must be above zero; the third follows from them")
         slow, p = 1.0 / self.velocity_time, 1.0 / self.position_time if self.position_time > 0.0 else 0.0
         if time == 0.0:
             rate = ((acceleration / velocity) ** 2 - p * slow) / (p + slow)
@@ -737,15 +648,15 @@ class BoundedVelocity(ErrorStates):
                     f"{self.name}: acceleration_sigma is {acceleration:g} m/s² beside a velocity_sigma of {velocity:g} m/s, less than "
                     f"velocity_time and position_time alone make ({velocity * np.sqrt(p * slow):g} m/s²); give more, or longer times"
                 )
-            object.__setattr__(self, "acceleration_time", 1.0 / rate)
+            self._set(acceleration_time=1.0 / rate)
             return
         ratio = float(np.sqrt(p * slow + (p + slow) / time))
         if acceleration == 0.0:
-            object.__setattr__(self, "acceleration_sigma", ratio * velocity)
+            self._set(acceleration_sigma=ratio * velocity)
         elif velocity == 0.0:
-            object.__setattr__(self, "velocity_sigma", acceleration / ratio)
+            self._set(velocity_sigma=acceleration / ratio)
         elif abs(acceleration / (ratio * velocity) - 1.0) > 1e-9:
-            raise InputError(f"{self.name}: {told} do not go together at these times; give two of them")
+            raise InputError(f"{self.name}: {given} do not go together at these times; give two of them")
 
     @property
     def _rates(self) -> Array:

@@ -159,7 +159,7 @@ class Robust:
 
     @property
     def parameters(self) -> Array:
-        """What the weight's formula takes for one, two and three degrees of freedom (3, 2): Huber k², 0; Student cν, ν + d."""
+        """Constants of the weight's formula for one, two and three degrees of freedom (3, 2): Huber k², 0; Student cν, ν + d."""
         from scipy.special import chdtri
 
         d = np.array([1.0, 2.0, 3.0])

@@ -13,14 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from strapdown.checks import Array, InputError, array, one_of
-from strapdown.estimation.error_states import MOST_CHAIN_DECAY, Effect, ErrorStates, check
+from strapdown.estimation.error_states import MAX_CHAIN_DECAY, Effect, ErrorStates, check
 from strapdown.estimation.states import Candidate, State, check_arguments
 from strapdown.kernels import error_state_step
 from strapdown.kernels.chains import CHAIN, chain_start
 from strapdown.kernels.error_state_step import CARRIED, FIXED, FORCE, LEVER, NOISE_NODES, OFFSET, SCALE
 
-MOST_DECAY = 0.5
-"""Of λ dt in one step: a step back is well conditioned. For states that enter the gyro a tenth, where Gauss's rule is exact."""
+MAX_DECAY = 0.5
+"""Largest λ dt of one step, for a well conditioned step back; a tenth for states that enter the gyro, where Gauss's rule is exact."""
 
 
 def as_blocks(blocks: Sequence[ErrorStates]) -> tuple[ErrorStates, ...]:
@@ -172,7 +172,7 @@ def assemble(blocks: tuple[ErrorStates, ...], kinds: Mapping[str, str]) -> Model
             "effect on the gyro"
         )
     chains = np.stack([feed, np.where(fed, density, 0.0), stride], axis=1)
-    quickened = np.where(linked, MOST_DECAY / MOST_CHAIN_DECAY, np.where(gyro_use & OFFSET, 5.0, 1.0))
+    quickened = np.where(linked, MAX_DECAY / MAX_CHAIN_DECAY, np.where(gyro_use & OFFSET, 5.0, 1.0))
     fastest = float(np.max(decay * quickened, initial=0.0))
     return Model(
         order=order,
@@ -180,7 +180,7 @@ def assemble(blocks: tuple[ErrorStates, ...], kinds: Mapping[str, str]) -> Model
         density=np.where(fed, 0.0, density)[order],
         chains=chains[order] if np.any(linked | bound) else np.empty((0, 3)),
         changing=int(np.sum(moves)),
-        limit=MOST_DECAY / fastest if fastest > 0.0 else np.inf,
+        limit=MAX_DECAY / fastest if fastest > 0.0 else np.inf,
         gyro=np.ascontiguousarray(gyro[order]),
         gyro_use=gyro_use[order],
         sensors=np.ascontiguousarray(sensors[:, order]),
@@ -234,7 +234,7 @@ def _force(blocks: tuple[ErrorStates, ...], both: np.ndarray) -> Array:
     for one in known[1:]:
         if not np.array_equal(one, known[0]):
             raise InputError(
-                f"two blocks tell forces {known[0].tolist()} and {one.tolist()}; give both the same gravity_f"
+                f"two error states give forces {known[0].tolist()} and {one.tolist()}; give both the same gravity_f"
             )
     return array("force_f", known[0], (3,)) if known else np.zeros(3)
 

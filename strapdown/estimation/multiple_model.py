@@ -8,8 +8,6 @@ filter (:mod:`strapdown.estimation`) takes over.
 
 Where the measurements do not distinguish the hypotheses they stay apart, and :attr:`BankEstimate.reason` says why. A single filter from an
 arbitrary start would have converged to some attitude with a small σ.
-
-A gated filter that was lost starts as wildly: :func:`run_recovering` runs it with a bank at each such recovery.
 """
 
 from __future__ import annotations
@@ -20,9 +18,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import estimation, quaternion, records, vectors
-from strapdown.checks import Array, InputError, array, count, finite, instance, positive
+from strapdown.checks import Array, InputError, array, count, finite, positive
 from strapdown.estimation.forward import after, gaps, gate_options
-from strapdown.estimation.gating import UNIFORM_SIGMA, Gate, Monitor, Robust
+from strapdown.estimation.gating import Gate, Monitor, Robust
 from strapdown.estimation.schedule import Schedule, schedule
 from strapdown.estimation.states import (
     ProcessNoise,
@@ -31,7 +29,6 @@ from strapdown.estimation.states import (
     covariance_matrices,
     initial_state,
     pack,
-    restart_bias_variance,
 )
 from strapdown.kernels import gate_rules, measurement
 from strapdown.kernels import hypotheses as hypotheses_kernel
@@ -41,16 +38,12 @@ from strapdown.records import Estimate, Event, ImuRecord, Innovations
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 from strapdown.vectors import VectorMeasurements
 
-__all__ = [
-    "BankEstimate",
-    "run",
-    "run_recovering",
-]
+__all__ = ["BankEstimate", "run"]
 
 HYPOTHESES = 96
 """Hypotheses on the circle where nobody says: 3.75° apart. Fewer find the attitude as soon, but are some too sure of it:
 ``sims/unknown_start.py``."""
-LEAST_WEIGHT = 1e-6
+MIN_WEIGHT = 1e-6
 """A hypothesis of less than this part of the heaviest one's weight is dropped."""
 LARGEST_SHARE = 0.15
 """Hypotheses are one Gaussian when less than this part of its covariance lies between them."""
@@ -59,10 +52,6 @@ DOUBTED = 3
 DOUBT = 1e-3
 """Weight of a hypothesis that refuses a direction, relative to one that uses it, until the next one decides: that of a measurement at the
 threshold of a gate which refuses a right one with this probability."""
-KNOWN = 3.0 * DEGREE
-"""An attitude whose σ about each axis is less is known well enough for one filter, rad."""
-UNKNOWN = 0.9 * UNIFORM_SIGMA
-"""A turn whose σ is more is not known at all, rad."""
 CONSTANT = 1.0 * DEGREE
 """References that turn by less than this over a record count as constant, rad."""
 
@@ -116,7 +105,7 @@ def run(
     bias_sigma: ArrayLike = 20.0 * DEGREE_PER_HOUR,
     bias: ArrayLike = (0.0, 0.0, 0.0),
     every: int = 1,
-    least_weight: float = LEAST_WEIGHT,
+    least_weight: float = MIN_WEIGHT,
     largest_share: float = LARGEST_SHARE,
     gate: Gate | None = None,
     robust: Robust | None = None,
@@ -179,7 +168,7 @@ def run(
     for name, value in (("least_weight", least_weight), ("largest_share", largest_share)):
         if not 0.0 < finite(name, value) < 1.0:
             raise InputError(f"{name} is {value:g}; it must lie between 0 and 1")
-    found, _ = _until_one(
+    found = _until_one(
         record,
         process_noise,
         hypotheses=hypotheses,
@@ -204,238 +193,6 @@ def run(
     return replace(found, estimate=replace(whole, skipped=found.estimate.skipped))
 
 
-def run_recovering(
-    record: ImuRecord,
-    process_noise: ProcessNoise,
-    initial: State,
-    *,
-    gate: Gate,
-    hypotheses: int = HYPOTHESES,
-    every: int = 1,
-    full_covariance: bool = False,
-    robust: Robust | None = None,
-    monitor: Monitor | None = None,
-) -> Estimate:
-    """Run the gated filter, and multiple hypotheses wherever a recovery leaves the rotation about one direction open.
-
-    :func:`strapdown.estimation.run` recovers as one Gaussian. Where only one direction is observed, and turns slowly, the rotation about it
-    becomes known gradually and not linearly, and some runs are then far too confident. Here a bank of hypotheses starts where that
-    recovery started, processes the same measurements and replaces it; when one hypothesis is left, the gated filter continues from it. It
-    may be lost and recover again.
-
-    A recovery is replaced if the largest σ of the attitude that its measurements leave is between ``KNOWN`` and ``UNKNOWN`` at any edge, or
-    not below ``KNOWN`` at its end. Two directions, or a measured attitude, leave nothing open; nor does a gate whose
-    ``restart_attitude_sigma`` is less than ``UNKNOWN``. Where nothing is replaced the estimate equals that of
-    :func:`strapdown.estimation.run` bit for bit.
-
-    Each such recovery has an event of kind ``"hypotheses"``, from the time at which the bank started to that at which one hypothesis was
-    left, or to the end of the record; ``value`` is the number of hypotheses left then, 0 if one was found. In between, rows are mean and
-    covariance of the mixture and innovations those of the hypothesis of the largest weight, which the monitor does not watch. There is no
-    step-by-step form of it.
-
-    Parameters
-    ----------
-    record : ImuRecord
-        As for :func:`strapdown.estimation.run`.
-    process_noise : ProcessNoise
-        Angle random walk and rate random walk of the gyro, as the filter models them.
-    initial : State
-        State at the first edge.
-    gate : Gate
-        Hypotheses start with the bias and the bias σ of the restart candidate, or with three times the σ of the bank before if its result
-        was lost again before it had processed ``5 recovery`` measurements.
-    hypotheses : int, default 96
-        As of :func:`run`.
-    every : int, default 1
-        Store every n-th edge, the first included; the bank starts and ends at stored edges.
-    full_covariance : bool, default False
-        Store whole covariance matrices too.
-    robust, monitor : optional
-        As of :func:`strapdown.estimation.run`.
-
-    Returns
-    -------
-    Estimate
-        Attitude and bias with their variances at the kept edges; innovations; events.
-
-    Raises
-    ------
-    InputError
-        If an argument is out of range.
-    """
-    check_arguments(record=record, process_noise=process_noise, initial=initial, robust=robust, monitor=monitor)
-    count("hypotheses", hypotheses, least=8)
-    instance("gate", gate, Gate, "give estimation.Gate(probability=0.999)")
-
-    def filtered(part: ImuRecord, state: State, gate: Gate) -> Estimate:
-        return estimation.run(
-            part,
-            process_noise,
-            state,
-            every=every,
-            full_covariance=full_covariance,
-            gate=gate,
-            robust=robust,
-            monitor=monitor,
-        )
-
-    parts: list[tuple[float, Estimate]] = []
-    handed: list[Event] = []
-    since, rest, state, own = -np.inf, record, initial, gate
-    least = np.zeros(3)
-    while True:
-        estimate = filtered(rest, state, own)
-        lost = _left_open(
-            rest, process_noise, state, estimate, least, gate=own, robust=robust, hypotheses=hypotheses, every=every
-        )
-        if lost is None:
-            parts.append((since, estimate))
-            break
-        before = records.cut(rest, 0, int(np.searchsorted(rest.time, lost.switch)))
-        parts += [(since, filtered(before, state, own)), *lost.parts(estimate)]
-        since = max(min(lost.bank.became_one, float(record.time[-1])), parts[-1][0])
-        left = 0.0 if lost.bank.converged else float(lost.bank.left)
-        handed.append(Event(kind="hypotheses", start=lost.switch, end=since, sensor=lost.recovery.sensor, value=left))
-        if lost.bank.became_one >= record.time[-1]:
-            break
-        rest, state = _from_where_one(lost.record, lost.bank)
-        restart = np.sqrt(restart_bias_variance(gate, initial))
-        own = replace(gate, restart_bias_sigma=float(np.max(restart)))
-        least = np.minimum(gate_rules.WIDENING * lost.bias_sigma, gate_rules.WIDENING**gate_rules.WIDEST * restart)
-    if not handed:
-        return estimate
-    whole = _joined(parts, gaps(record.time) + handed)
-    skipped = {
-        series.sensor: len(series.time) - len(whole.innovations[series.sensor].time) for series in record.vectors
-    }
-    return replace(whole, skipped=skipped)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _LeftOpen:
-    """A recovery that left a turn open."""
-
-    recovery: Event
-    record: ImuRecord
-    """From the measurements that led to it on."""
-    bank: BankEstimate
-    """What hypotheses make of that, until they are one."""
-    attempts: list[tuple[float, Estimate]]
-    """When they began, s, and what they made of it until they had to recover, or were one."""
-    bias_sigma: Array
-    """σ of the bias that they began with in the end (3,), rad/s."""
-
-    @property
-    def switch(self) -> float:
-        """The time from which on the bank's estimate is used."""
-        return max(self.recovery.end, self.attempts[0][0])
-
-    def parts(self, gated: Estimate) -> list[tuple[float, Estimate]]:
-        """Return each attempt with the time from which on it is used; in between, if need be, the ``gated`` filter."""
-        ends = [self.switch, *(max(event.end, self.switch) for event in _recoveries(self.bank.estimate))]
-        result = []
-        for end, (began, estimate) in zip(ends, self.attempts, strict=True):
-            if began > end:
-                result.append((end, replace(gated, events=())))
-            result.append((max(began, end), estimate))
-        return result
-
-
-def _left_open(
-    record: ImuRecord,
-    process_noise: ProcessNoise,
-    initial: State,
-    estimate: Estimate,
-    least_bias_sigma: Array,
-    *,
-    gate: Gate,
-    robust: Robust | None,
-    hypotheses: int,
-    every: int,
-) -> _LeftOpen | None:
-    """Return the first recovery of a gated filter that leaves a turn open; None if there is none, or none with kept edges to come.
-
-    Hypotheses start with a bias σ of ``least_bias_sigma`` or more if the filter had not processed enough measurements before it was lost.
-    """
-    if gate.restart_attitude_sigma < UNKNOWN:
-        return None
-    for event in _recoveries(estimate):
-        end = int(np.searchsorted(record.time, event.end))
-        _, state = estimation.run_part(
-            records.cut(record, 0, end), process_noise, initial, every=end, gate=gate, robust=robust
-        )
-        assert state.gate is not None
-        # The start of the candidate that replaced the filter, unless another one started before that edge.
-        memory = state.gate.counts
-        began = float(memory[gate_rules.SINCE])
-        if began > event.end:
-            began = event.start
-        bias, variance = np.split(memory[gate_rules.FIRST_BIAS : gate_rules.FIRST_BIAS + 6], 2)
-        sigma = np.sqrt(variance)
-        first = max(int(np.searchsorted(record.time, began)) - 1, 0)
-        taken = sum(np.sum(one.used & (one.time < event.start)) for one in estimate.innovations.values())
-        if taken < gate_rules.FORGOTTEN * (gate.recovery or 0):
-            sigma = np.maximum(sigma, least_bias_sigma)
-        seen = _measured_from(began, record, first, end)
-        if _can_start(seen, 1):
-            alone, _ = _until_one(seen, process_noise, hypotheses=hypotheses, bias=bias, bias_sigma=sigma)
-            if _settled(alone.estimate):
-                continue
-        rest = _measured_from(began, record, first // every * every, len(record.time) - 1)
-        if not _can_start(rest, every):
-            continue
-        bank, attempts = _until_one(
-            rest,
-            process_noise,
-            hypotheses=hypotheses,
-            bias=bias,
-            bias_sigma=sigma,
-            every=every,
-            gate=gate,
-            robust=robust,
-            all_weights=False,
-        )
-        found = _LeftOpen(
-            recovery=event,
-            record=rest,
-            bank=bank,
-            attempts=attempts,
-            bias_sigma=sigma * _widened(len(attempts) - 1),
-        )
-        if found.switch <= estimate.time[-1]:
-            return found
-    return None
-
-
-def _widened(starts: int) -> float:
-    """Return the factor on σ of a start after some have failed."""
-    return gate_rules.WIDENING ** (starts % (gate_rules.WIDEST + 1))
-
-
-def _settled(estimate: Estimate) -> bool:
-    """Return whether the attitude was known, or the turn about a direction not at all, at each edge, and is known at the last."""
-    assert estimate.covariance is not None
-    widest = np.sqrt(np.linalg.eigvalsh(estimate.covariance[:, :3, :3])[:, -1])
-    return bool(widest[-1] < KNOWN and np.all((widest < KNOWN) | (widest > UNKNOWN)))
-
-
-def _recoveries(estimate: Estimate) -> list[Event]:
-    return [event for event in estimate.events if event.kind == "recovery"]
-
-
-def _measured_from(time: float, record: ImuRecord, first: int, last: int) -> ImuRecord:
-    """Return the record from edge ``first`` to edge ``last`` with what was measured from a time on."""
-    part = records.cut(record, first, last)
-    return replace(part, vectors=tuple(series.taken(series.time >= time) for series in part.vectors))
-
-
-def _can_start(record: ImuRecord, every: int) -> bool:
-    """Return whether a direction comes before the last kept edge."""
-    events = schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True)
-    more = _directions(events, 0)
-    return len(more) > 0 and bool(events.time[more[0]] <= record.time[::every][-1])
-
-
 def _from_where_one(record: ImuRecord, found: BankEstimate) -> tuple[ImuRecord, State]:
     """Return the record from where the hypotheses became one, and the state there."""
     edge = int(np.searchsorted(record.time, found.became_one))
@@ -455,26 +212,22 @@ def _until_one(
     bias: ArrayLike,
     bias_sigma: ArrayLike,
     every: int = 1,
-    least_weight: float = LEAST_WEIGHT,
+    least_weight: float = MIN_WEIGHT,
     largest_share: float = LARGEST_SHARE,
     gate: Gate | None = None,
     robust: Robust | None = None,
-    all_weights: bool = True,
-) -> tuple[BankEstimate, list[tuple[float, Estimate]]]:
-    """Return the bank's own part of :func:`run`: until its hypotheses are one, or to the end; of the weights only the last if asked for.
-
-    Beside it all attempts, the last one too, and when they began: those before it until they recovered.
-    """
+) -> BankEstimate:
+    """Return the bank's own part of :func:`run`: until its hypotheses are one, or to the end."""
     coarse = tuple(_isotropic(series) for series in record.vectors)
     events = schedule(coarse, record.time[0], record.time[-1])
     doubted = gate is not None or robust is not None
     recovery = None if gate is None else gate.recovery
-    told = gaps(record.time)
-    failed: list[tuple[float, Estimate]] = []
+    own_events = gaps(record.time)
+    failed = 0
     first = _first_direction(events)
     spread = np.broadcast_to(bias_sigma, 3).astype(np.float64)
     while True:
-        wide = _widened(len(failed)) * spread
+        wide = gate_rules.WIDENING ** (failed % (gate_rules.WIDEST + 1)) * spread
         states, angles = start(record, events, first, hypotheses, bias=bias, bias_sigma=wide)
         later = _directions(events, first + 1)[: DOUBTED if doubted else 0]
         sets = [len(states)]
@@ -496,7 +249,7 @@ def _until_one(
             attitude=np.empty((len(kept), 4)),
             bias=np.empty((len(kept), 3)),
             covariance=np.empty((len(kept), 21)),
-            weights=np.empty((len(kept) if all_weights else 0, number)),
+            weights=np.empty((len(kept), number)),
             innovation=np.empty((len(events.time), 6)),
             share=np.empty(len(events.time)),
         )
@@ -542,8 +295,8 @@ def _until_one(
         if len(again) == 0 or events.time[again[0]] > record.time[::every][-1]:
             recovery = None  # too late for another start
             continue
-        failed.append((began, estimate))
-        told.append(
+        failed += 1
+        own_events.append(
             Event(
                 kind="recovery",
                 start=float(events.time[used]),
@@ -557,17 +310,15 @@ def _until_one(
         sensor: events.skipped[sensor] + int(np.sum(events.sensor[:first] == i))
         for i, sensor in enumerate(events.sensors)
     }
-    estimate = replace(estimate, skipped=skipped, events=_in_order(told))
-    attempts = [*failed, (began, estimate)]
-    found = BankEstimate(
+    estimate = replace(estimate, skipped=skipped, events=_in_order(own_events))
+    return BankEstimate(
         estimate=estimate,
         edges=kept,
         angles=angles,
-        weights=out.weights[:rows] if all_weights else weight[None],
+        weights=out.weights[:rows],
         became_one=float(record.time[at]) if at >= 0 else np.inf,
         reason="" if at >= 0 else _reason(record, events, weight, P[-1], out.attitude[rows - 1]),
     )
-    return found, attempts
 
 
 def _from_time(record: ImuRecord, time: float) -> tuple[Array, Array, int]:
@@ -656,8 +407,8 @@ def _innovations(events: Schedule, taken: np.ndarray, rows: Array, weight: Array
     return result
 
 
-def _joined(parts: list[tuple[float, Estimate]], told: list[Event]) -> Estimate:
-    """Return estimates of one record as one, each from its time until the next one's; gaps are those ``told``, beside other events."""
+def _joined(parts: list[tuple[float, Estimate]], gap_events: list[Event]) -> Estimate:
+    """Return estimates of one record as one, each from its time until the next one's, their events with the ``gap_events``."""
     bounds = [*np.maximum.accumulate([since for since, _ in parts]).tolist(), np.inf]
     rows = [
         (one.time >= since) & (one.time < until)
@@ -665,7 +416,7 @@ def _joined(parts: list[tuple[float, Estimate]], told: list[Event]) -> Estimate:
     ]
 
     def of_rows(name: str) -> Array:
-        return np.concatenate([getattr(one, name)[taken] for (_, one), taken in zip(parts, rows, strict=True)])
+        return np.concatenate([getattr(one, name)[kept] for (_, one), kept in zip(parts, rows, strict=True)])
 
     innovations = {}
     for sensor in parts[0][1].innovations:
@@ -675,11 +426,11 @@ def _joined(parts: list[tuple[float, Estimate]], told: list[Event]) -> Estimate:
             (one.time > since) & (one.time <= until)
             for one, since, until in zip(series, bounds[:-1], bounds[1:], strict=True)
         ]
-        weights = [one.weight[taken] for one, taken in zip(series, mine, strict=True) if one.weight is not None]
+        weights = [one.weight[kept] for one, kept in zip(series, mine, strict=True) if one.weight is not None]
         innovations[sensor] = Innovations(
-            time=np.concatenate([one.time[taken] for one, taken in zip(series, mine, strict=True)]),
-            innovation=np.concatenate([one.innovation[taken] for one, taken in zip(series, mine, strict=True)]),
-            variance=np.concatenate([one.variance[taken] for one, taken in zip(series, mine, strict=True)]),
+            time=np.concatenate([one.time[kept] for one, kept in zip(series, mine, strict=True)]),
+            innovation=np.concatenate([one.innovation[kept] for one, kept in zip(series, mine, strict=True)]),
+            variance=np.concatenate([one.variance[kept] for one, kept in zip(series, mine, strict=True)]),
             weight=np.concatenate(weights) if len(weights) == len(parts) else None,
         )
     events = [event for _, one in parts for event in one.events if event.kind != "gap"]
@@ -690,7 +441,7 @@ def _joined(parts: list[tuple[float, Estimate]], told: list[Event]) -> Estimate:
         variance=of_rows("variance"),
         covariance=of_rows("covariance") if all(one.covariance is not None for _, one in parts) else None,
         innovations=innovations,
-        events=_in_order([*events, *told]),
+        events=_in_order([*events, *gap_events]),
     )
 
 
@@ -702,7 +453,7 @@ def _reason(record: ImuRecord, events: Schedule, weight: Array, P: Array, attitu
     """Return why the hypotheses did not become one, in words."""
     values, axes = np.linalg.eigh(P[:3, :3])
     axis = quaternion.rotate(attitude, axes[:, -1])
-    told = (
+    seen = (
         f"{int(np.sum(weight > 0.0))} hypotheses are still possible after {record.time[-1] - record.time[0]:.6g} s; "
         f"the turn about the fixed axis ({axis[0]:+.2f}, {axis[1]:+.2f}, {axis[2]:+.2f}) is known to 1σ "
         f"{np.sqrt(values[-1]) / DEGREE:.3g}°"
@@ -712,10 +463,10 @@ def _reason(record: ImuRecord, events: Schedule, weight: Array, P: Array, attitu
     turned = float(np.arcsin(min(apart, 1.0)))
     if turned < CONSTANT:
         return (
-            f"{told}: all references lie along one line of the fixed frame, and the turn about it cannot be observed, however the body "
+            f"{seen}: all references lie along one line of the fixed frame, and the turn about it cannot be observed, however the body "
             "moves; add a sensor of another direction, or record until the reference has turned"
         )
     return (
-        f"{told}: the references lie up to {turned / DEGREE:.3g}° apart, which has not told the hypotheses apart yet; record longer, or "
+        f"{seen}: the references lie up to {turned / DEGREE:.3g}° apart, which has not separated the hypotheses yet; record longer, or "
         "add a sensor of another direction"
     )

@@ -1,4 +1,4 @@
-"""What a record shows of each state: rank, singular values, and the weakest directions in words."""
+"""Observability of each state over a record: rank, singular values, and the weakest directions in words."""
 
 from __future__ import annotations
 
@@ -94,22 +94,6 @@ class Observability:
             f"{sign * direction[i]:+.2f} {self.states[i]} ({abs(self.left[k, i]):.2g} {self.units[i]})" for i in large
         ]
         return " ".join(parts).removeprefix("+")
-
-    def weakest(self, number: int = 3) -> tuple[str, ...]:
-        """Return the weakest directions in words, the weakest first, each with its singular value.
-
-        Parameters
-        ----------
-        number : int, default 3
-            How many directions.
-
-        Returns
-        -------
-        tuple of str
-            One line for each direction.
-        """
-        places = range(len(self.states) - 1, max(len(self.states) - 1 - number, -1), -1)
-        return tuple(f"{self.singular_values[k]:.3g}: {self.words(k)}" for k in places)
 
     def __str__(self) -> str:
         """Say all of it."""

@@ -24,10 +24,10 @@ from strapdown.kernels.smoother_loop import locate_edges
 from strapdown.records import Estimate, Event, ImuRecord
 
 STAMP_TOLERANCE = 1e-6
-"""Of the mean gyro interval: an edge that lies beyond t + lag by no more is taken for one at t + lag."""
+"""Part of the mean gyro interval by which an edge may lie beyond t + lag and still count as one at t + lag."""
 
 
-MOST_CUT = 64
+MAX_CUT = 64
 """Times the segments that a record takes by its increments: a filter that takes more is lost."""
 
 
@@ -41,7 +41,7 @@ def filtered_whole(problem: Problem, options: Options) -> tuple[Estimate, Array]
             return passed.estimate, passed.segments
         # Steps are cut by the turn without the bias, which is known only when they are taken.
         most *= 4
-        if most > MOST_CUT * usual:
+        if most > MAX_CUT * usual:
             raise InputError(
                 "the filter lost its way: by the bias that it found the body turns many times round in each gyro interval; "
                 "look at the record and the start with estimation.run first"
@@ -123,9 +123,9 @@ class Trajectory:
     edge: np.ndarray
     """Stops to write, in order."""
     last: np.ndarray
-    """Of each the stop from which on nothing is known."""
+    """Stop of each from which on nothing is known."""
     row: np.ndarray
-    """Of each the edge of the record that it is."""
+    """Edge of the record of each."""
 
 
 def stops(time: Array, breaks: Sequence[Break]) -> Array:

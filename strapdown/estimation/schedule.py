@@ -36,7 +36,7 @@ class Schedule:
     """Measured vectors over the length of their references (m, 3) of each sensor; of an attitude its three variances."""
     series_sigma: tuple[Array, ...]
     """σ of each component of the vector (m,) of each sensor."""
-    standing_noise: Array | None = None
+    noise_by_axis: Array | None = None
     """Upper triangles of the covariances in body axes (events, 6), over the squared lengths of the references, one sensor after the
     other, if any is anisotropic."""
     bounds: np.ndarray
@@ -54,7 +54,7 @@ class Schedule:
 
     @cached_property
     def order(self) -> tuple[Array, np.ndarray, np.ndarray]:
-        """Of each event in order of time (events,): its time, its row where one sensor comes after the other, and its sensor."""
+        """Time, row (one sensor after the other) and sensor of each event, in order of time (events,)."""
         number = int(self.bounds[-1])
         # A byte for the sensor where it will do: the loops read it with each event.
         narrow = np.uint8 if len(self.sensors) <= 256 else np.uint32
@@ -63,8 +63,8 @@ class Schedule:
         if all(np.array_equal(first, other) for other in others):
             compiled(measurement.common_order)(first, len(self.sensors), time, row, sensor)
         else:
-            standing = np.concatenate(self.series_time)
-            compiled(measurement.merge_order)(standing, self.bounds[:-1].copy(), self.bounds[1:], time, row, sensor)
+            held_time = np.concatenate(self.series_time)
+            compiled(measurement.merge_order)(held_time, self.bounds[:-1].copy(), self.bounds[1:], time, row, sensor)
         return time, row, sensor
 
     @property
@@ -95,7 +95,7 @@ class Schedule:
     @cached_property
     def noise(self) -> Array | None:
         """Upper triangles of the covariances in order of time (events, 6), if any is anisotropic."""
-        return None if self.standing_noise is None else self._ordered(self.standing_noise)
+        return None if self.noise_by_axis is None else self._ordered(self.noise_by_axis)
 
     @cached_property
     def kind(self) -> np.ndarray:
@@ -119,7 +119,7 @@ class Schedule:
         first = self.bounds[:-1]
         columns = (values - 3 * first, sigmas - first, first, self.codes, *self.frames.T)
         time, place, sensor = self.order
-        noise = np.empty((0, 6)) if self.standing_noise is None else self.standing_noise
+        noise = np.empty((0, 6)) if self.noise_by_axis is None else self.noise_by_axis
         series = np.stack([np.asarray(column, np.int64) for column in columns], axis=1)
         return measurement.Measurements(
             *(read_only(column) for column in (time, place, sensor, value, sigma, noise, series, self.triads))
@@ -156,7 +156,7 @@ def schedule(
         series_time=tuple(read_only(part.time) for part in parts),
         series_vector_b=tuple(read_only(part.value) for part in parts),
         series_sigma=tuple(read_only(part.sigma) for part in parts),
-        standing_noise=_joined([part.noise for part in parts], (0, 6)) if any(s.anisotropic for s in vectors) else None,
+        noise_by_axis=_joined([part.noise for part in parts], (0, 6)) if any(s.anisotropic for s in vectors) else None,
         bounds=bounds,
         codes=np.array([KIND_CODES[series.kind] for series in vectors], np.uint8),
         frames=np.array(

@@ -19,13 +19,14 @@ Nothing is learnt across: not even the bias, which the candidate starts from as 
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from strapdown import kinematics, quaternion
-from strapdown.checks import Array, count, non_negative
+from strapdown.checks import Array, InputError, count, non_negative
 from strapdown.estimation import forward, recovery_segments
 from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import ErrorStates
@@ -41,7 +42,9 @@ from strapdown.records import Estimate, Event, ImuRecord
 
 PASSES = 16
 """Backward passes of a fixed-lag smoother that go together and share what depends on the filter alone."""
-MOST_GROUPS = 3600
+MIN_SMOOTHED = {"blocks": 1e-9, "factor": 1e-25}
+"""Smallest smoothed variance, as a part of what one interval adds, at which backward passes in either form keep enough digits."""
+MAX_GROUPS = 3600
 """Groups of segments of which the fixed-lag smoother keeps the gains, 5.7 kB each; where a lag takes more, it computes them anew."""
 
 
@@ -53,6 +56,7 @@ def smooth(
     *,
     lag: float = np.inf,
     full_covariance: bool = False,
+    error_state_covariance: bool = True,
     gate: Gate | None = None,
     robust: Robust | None = None,
 ) -> Estimate:
@@ -75,6 +79,8 @@ def smooth(
         s; 0 is the filter. Default: the whole record.
     full_covariance : bool
         Keep whole covariance matrices too.
+    error_state_covariance : bool
+        Those of all states; otherwise of attitude and bias alone, in less time.
     gate, robust : optional
         As for :func:`strapdown.estimation.run`: what the filter refused or weighed down, the smoother does not use either.
 
@@ -94,13 +100,41 @@ def smooth(
     check_arguments(record=record, gate=gate, robust=robust)
     lag = lag if lag == np.inf else non_negative("lag", lag, unit="s")
     problem = forward.prepared(record, process_noise, initial, error_states)
-    options = Options(every=len(record.time), full_covariance=full_covariance, gate=gate, robust=robust)
+    options = Options(
+        every=len(record.time),
+        full_covariance=full_covariance,
+        error_state_covariance=error_state_covariance,
+        gate=gate,
+        robust=robust,
+    )
     if not problem.model.states:
-        try:
-            return _Smoother(problem, options, _BlockForm(problem)).smoothed(lag)
-        except LostDigitsError:
-            options = replace(options, factor=True)
-    return _Smoother(problem, options, _FactorForm(problem)).smoothed(lag)
+        with contextlib.suppress(LostDigitsError):
+            estimate = _Smoother(problem, options, _BlockForm(problem)).smoothed(lag)
+            if _digits_lost(problem, estimate, MIN_SMOOTHED["blocks"]) is None:
+                return estimate
+        options = replace(options, factor=True)
+    estimate = _Smoother(problem, options, _FactorForm(problem)).smoothed(lag)
+    lost = _digits_lost(problem, estimate, MIN_SMOOTHED["factor"])
+    if lost is not None:
+        raise InputError(
+            f"the smoothed variances at {record.time[lost]:g} s have no digits left: the sigmas of the start and the process noise of an "
+            "interval lie too many orders of magnitude apart; raise the smallest of them"
+        )
+    return estimate
+
+
+def _digits_lost(problem: Problem, estimate: Estimate, share: float) -> int | None:
+    """Return the first edge whose smoothed variances have lost their digits, None if there is none.
+
+    A step back subtracts what the interval had added: the process noise, and at the start the uncertainty of the bias.
+    """
+    angle, rate = problem.variances
+    dt = np.diff(problem.record.time, append=problem.record.time[-1])
+    added = np.stack([angle * dt + rate * dt**3 / 3.0, rate * dt])
+    added[0, 0] += dt[0] ** 2 * np.diag(problem.initial.covariance)[3:6].max()
+    least = np.minimum.reduceat(estimate.variance[:, :6], [0, 3], axis=1).T
+    kept = np.isfinite(estimate.attitude).all(axis=1) & ((least > share * added) & (least > 0.0)).all(axis=0)
+    return None if kept.all() else int(np.argmin(kept))
 
 
 def relinearized_start(
@@ -154,7 +188,7 @@ class _Smoother:
         recovered = recovery_segments.recoveries(estimate.events)
         breaks, reruns = self._reruns(recovered, event_time, segments) if recovered else ([], [])
         edges = len(record.time)
-        outputs = self.form.outputs(edges, self.options.full_covariance)
+        outputs = self.form.outputs(edges, self.options)
         until = recovery_segments.last_seen(record.time, lag)
         if len(segments) == edges and not breaks:  # each interval in one segment
             first = np.arange(edges)
@@ -171,7 +205,7 @@ class _Smoother:
                     if len(out):
                         out[one.row] = there[one.edge]
         return replace(
-            self.form.estimate(outputs, self.options.full_covariance),
+            self.form.estimate(outputs, self.options),
             innovations=estimate.innovations,
             skipped=estimate.skipped,
             events=estimate.events,
@@ -237,12 +271,12 @@ class _BlockForm:
 
     problem: Problem
 
-    def outputs(self, edges: int, full_covariance: bool) -> list[Array]:
+    def outputs(self, edges: int, options: Options) -> list[Array]:
         """Return room for the smoothed states."""
-        shapes = (edges, 4), (edges, 3), (edges, 6), (edges if full_covariance else 0, 21)
+        shapes = (edges, 4), (edges, 3), (edges, 6), (edges if options.full_covariance else 0, 21)
         return side_by_side(*((shape, float) for shape in shapes))
 
-    def estimate(self, outputs: Sequence[Array], full_covariance: bool) -> Estimate:
+    def estimate(self, outputs: Sequence[Array], options: Options) -> Estimate:
         """Return the smoothed states as an estimate."""
         attitude, bias, variance, blocks = outputs
         return Estimate(
@@ -250,7 +284,7 @@ class _BlockForm:
             attitude=attitude,
             bias=bias,
             variance=variance,
-            covariance=covariance_matrices(blocks) if full_covariance else None,
+            covariance=covariance_matrices(blocks) if options.full_covariance else None,
         )
 
     def go_back(self, one: Trajectory, part: slice, outputs: Sequence[Array]) -> None:
@@ -267,7 +301,7 @@ class _BlockForm:
             # Eight passes at a time, which share nearly all groups with the next eight.
             ahead = np.minimum(np.arange(lagged) + WIDTH - 1, lagged - 1)
             groups = int(np.max(starts[seen[ahead]] - starts[first])) // WIDTH + 2
-            work = np.empty(smoother_lag.lag_work_size(min(groups, MOST_GROUPS)))
+            work = np.empty(smoother_lag.lag_work_size(min(groups, MAX_GROUPS)))
             compiled(smoother_lag.smooth_lagged)(rows, starts, first, seen, *self.problem.variances, work, *outputs)
         compiled(smoother_loop.smooth_back)(
             rows,
@@ -285,16 +319,18 @@ class _FactorForm:
 
     problem: Problem
 
-    def outputs(self, edges: int, full_covariance: bool) -> list[Array]:
+    def outputs(self, edges: int, options: Options) -> list[Array]:
         """Return room for the smoothed states."""
         size = 6 + self.problem.model.states
-        shapes = (edges, 4), (edges, size - 3), (edges, size), (edges if full_covariance else 0, size, size)
+        kept = size if options.error_state_covariance else 6
+        whole = (edges if options.full_covariance else 0, kept, kept)
+        shapes = (edges, 4), (edges, size - 3), (edges, size), whole
         return [np.empty(shape) for shape in shapes]
 
-    def estimate(self, outputs: Sequence[Array], full_covariance: bool) -> Estimate:
+    def estimate(self, outputs: Sequence[Array], options: Options) -> Estimate:
         """Return the smoothed states as an estimate."""
         attitude, x, variance, P = outputs
-        return forward.factor_estimate(self.problem, 1, attitude, x, variance, P if full_covariance else None)
+        return forward.factor_estimate(self.problem, 1, attitude, x, variance, P if options.full_covariance else None)
 
     def go_back(self, one: Trajectory, part: slice, outputs: Sequence[Array]) -> None:
         """Write the estimates of a part of a trajectory's edges, each from the last edge that it sees."""

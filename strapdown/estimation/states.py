@@ -75,14 +75,14 @@ class Candidate:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GateMemory:
-    """What a gate remembers at the end of a part of a record, for the next part to go on from."""
+    """Memory of a gate at the end of a part of a record, from which the next part continues."""
 
     restart_bias_variance: Array
-    """What the first candidate's bias variance grows by where the gate does not say (3,), (rad/s)²."""
+    """Default increase of the first candidate's bias variance (3,), (rad/s)²."""
     candidate: Candidate | None = None
     counts: Array
     """Whether there is a candidate, how it does, and how wide the next one starts, as :mod:`strapdown.kernels.gate_rules` holds them."""
-    standing: Mapping[str, Array]
+    counters: Mapping[str, Array]
     """Refusals of each sensor, as held there."""
     start: float = 0.0
     """Time that the first part of the record began, s."""
@@ -212,13 +212,13 @@ NEEDED = {
     "process_noise": (ProcessNoise, "give estimation.ProcessNoise(angle_random_walk=…, …)"),
     "initial": (State, "make it by estimation.initial_state, or from a record by estimation.first_state"),
 }
-"""What filters are given, by name: its class, and how to come by one."""
+"""Arguments of filters by name: class, and how to make one."""
 OPTIONAL = {
     "gate": (Gate, "give estimation.Gate(probability=0.999), or None"),
     "robust": (Robust, "give estimation.Robust(kind='huber'), or None"),
     "monitor": (Monitor, "give estimation.Monitor(), or None"),
 }
-"""What they may be given beside it."""
+"""Optional arguments."""
 
 
 def check_arguments(**given: object) -> None:

@@ -705,7 +705,7 @@ class _Measurement:
     frame: tuple[float, ...]
     """The triad of the reference by rows, or the measured quaternion and zeros."""
     length: float = 1.0
-    """Of the reference of a vector; else 1."""
+    """Length of a vector's reference; else 1."""
     noise: Array
     """Covariance of ``z``, body axes (3, 3); of a heading the variance stands on the diagonal."""
 
@@ -730,7 +730,7 @@ class _Measurement:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Prior:
-    """What is known of the optional error states before any measurement, from which a restart candidate starts."""
+    """Prior of the optional error states, from which a restart candidate starts."""
 
     time: float
     values: Array
@@ -743,7 +743,7 @@ class _Clock:
 
     start: float
     rest: float = 0.0
-    """What the sum of steps lacks by rounding, s."""
+    """Rounding error of the sum of steps, s."""
     steps: int = 0
     """Steps since the last stamp."""
     longest: float = 0.0
@@ -807,7 +807,7 @@ class _Entry:
 
 @dataclass
 class _History:
-    """What the filter may have to repeat; one object, because filterpy's ``Saver`` makes an array of a list, and finds no shape."""
+    """Steps that the filter may have to repeat; one object, because filterpy's ``Saver`` makes an array of a list, and finds no shape."""
 
     entries: list[_Entry] = field(default_factory=list)
 

@@ -1,4 +1,4 @@
-"""What the step-by-step filter does with one measurement beyond the textbook's update, in matrices over any number of states.
+"""Gate, weights and iterated update of the step-by-step filter, in matrices over any number of states.
 
 - :func:`linearize`: the measurement linearised at the estimate that its update leads to (iterated update), its NIS, and its robust weight.
 - :class:`Supervision`: the gate's counters, the restart candidate that it runs beside the filter, and the NIS that a monitor judges.
@@ -40,7 +40,7 @@ class Rows(NamedTuple):
     noise: Array
     """Covariance of the noise (d, d)."""
     angle: float
-    """Of a direction or vector the angle θ from the predicted one, rad; of other kinds 0."""
+    """Angle θ of a direction or vector from the predicted one, rad; 0 for other kinds."""
     arc: float
     """θ over the length of the residual's part across the predicted direction; of other kinds 1."""
 
@@ -220,7 +220,7 @@ class Supervised(Protocol):
     bias: Array
     P: Array
     nis: float
-    """Of the last measurement."""
+    """NIS of the last measurement."""
     dim_z: int
     """Its degrees of freedom."""
     _passes: int
@@ -266,8 +266,8 @@ class Supervision(Generic[Filter]):
         # that has gone back to a copy overwrites what follows, and never returns to it.
         self.nis_history: list[tuple[float, float, int]] = []
         self.number = 0
-        self.sensors: tuple[str, ...] = () if memory is None else tuple(memory.standing)
-        self.memory, self.standing = remembered(gate, memory, self.sensors)
+        self.sensors: tuple[str, ...] = () if memory is None else tuple(memory.counters)
+        self.memory, self.counters = remembered(gate, memory, self.sensors)
         self.candidate: Filter | None = None
         self.recoveries, self.lock_outs = np.empty((0, 4)), np.empty((0, 4))
 
@@ -297,9 +297,9 @@ class Supervision(Generic[Filter]):
         if self.gate is None:
             return
         s, recovery, limit = self._row_of(sensor), self.gate.recovery or 0, self.gate.lock_out_limit
-        memory, standing, room = self.memory, self.standing, np.vstack([self.lock_outs, np.empty((1, 4))])
+        memory, counters, room = self.memory, self.counters, np.vstack([self.lock_outs, np.empty((1, 4))])
         number, restart = gate_rules.judge_filter(
-            outcome, filter.time, s, recovery, limit, standing, memory, room, len(self.lock_outs)
+            outcome, filter.time, s, recovery, limit, counters, memory, room, len(self.lock_outs)
         )
         self.lock_outs = room[:number]
         if restart:
@@ -307,9 +307,9 @@ class Supervision(Generic[Filter]):
         if self.candidate is None:
             return
         self._judge_candidate(self.candidate, s, update(self.candidate))
-        if self.candidate is not None and gate_rules.takes_over(s, recovery, standing, memory):
+        if self.candidate is not None and gate_rules.takes_over(s, recovery, counters, memory):
             row = np.empty(4)
-            gate_rules.recover(filter.time, s, limit, standing, memory, row, self.lock_outs)
+            gate_rules.recover(filter.time, s, limit, counters, memory, row, self.lock_outs)
             self.recoveries = np.vstack([self.recoveries, row])
             filter._become(self.candidate)
             filter._passes = self.passes
@@ -319,7 +319,7 @@ class Supervision(Generic[Filter]):
         """Return a sensor's row of the counters."""
         if sensor not in self.sensors:
             self.sensors = (*self.sensors, sensor)
-            self.standing = np.vstack([self.standing, remembered(None, None, (sensor,))[1]])
+            self.counters = np.vstack([self.counters, remembered(None, None, (sensor,))[1]])
         return self.sensors.index(sensor)
 
     def _record_nis(self, filter: Filter, outcome: int) -> None:
@@ -339,7 +339,7 @@ class Supervision(Generic[Filter]):
     def _judge_candidate(self, candidate: Filter, sensor: int, outcome: int) -> None:
         """Count the outcome of a measurement for the restart candidate, and drop or widen it."""
         verdict = gate_rules.judge_candidate(
-            outcome, candidate.nis, candidate.dim_z, sensor, self.standing, self.memory, candidate.bias
+            outcome, candidate.nis, candidate.dim_z, sensor, self.counters, self.memory, candidate.bias
         )
         if verdict == gate_rules.DROPPED:
             self.candidate = None
@@ -363,6 +363,6 @@ class Supervision(Generic[Filter]):
     def copied(self) -> Self:
         """Return it as it is now."""
         other = copy.copy(self)
-        other.memory, other.standing, other.lock_outs = self.memory.copy(), self.standing.copy(), self.lock_outs.copy()
+        other.memory, other.counters, other.lock_outs = self.memory.copy(), self.counters.copy(), self.lock_outs.copy()
         other.candidate = copy.deepcopy(self.candidate)
         return other

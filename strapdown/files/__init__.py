@@ -1,11 +1,8 @@
 """Files: every one that is read passes ``reading``, every one that is written passes ``writing``.
 
-``reading``
-    Limits, names of files in errors, digests.
-``writing``
-    Files that are never half written, locked while written, sealed with a digest.
-``tables``
-    Frozen dataclasses as TOML and JSON tables with the unit in each key.
+- ``reading``: Limits, names of files in errors, digests.
+- ``writing``: Files that are never half written, locked while written, sealed with a digest.
+- ``tables``: Frozen dataclasses as TOML and JSON tables with the unit in each key.
 """
 
 from __future__ import annotations

@@ -88,10 +88,10 @@ def _short(text: str) -> str:
 
 def limit() -> int:
     """Return how many bytes one file may hold, unpacked: 4 GB, or the environment variable ``STRAPDOWN_MAX_MB``."""
-    told = os.environ.get(LIMIT, str(DEFAULT_LIMIT))
-    if not told.isdecimal() or int(told) == 0:
-        raise InputError(f"the environment variable {LIMIT} is {told!r}; it must be a whole number of megabytes")
-    return int(told) * 1_000_000
+    value = os.environ.get(LIMIT, str(DEFAULT_LIMIT))
+    if not value.isdecimal() or int(value) == 0:
+        raise InputError(f"the environment variable {LIMIT} is {value!r}; it must be a whole number of megabytes")
+    return int(value) * 1_000_000
 
 
 def existing_file(path: Name) -> None:
@@ -121,12 +121,12 @@ def opened(path: Name, *, link: bool = True, most: int | None = None) -> Iterato
             raise InputError(f"{path} is a folder; name the file in it") from None
         raise InputError(f"{path} cannot be read ({error}); check the path and its permissions") from None
     with handle:
-        told = os.fstat(handle.fileno())
-        if stat.S_ISDIR(told.st_mode):
+        status = os.fstat(handle.fileno())
+        if stat.S_ISDIR(status.st_mode):
             raise InputError(f"{path} is a folder; name the file in it")
-        if not stat.S_ISREG(told.st_mode):
+        if not stat.S_ISREG(status.st_mode):
             raise InputError(f"{path} is no regular file but a pipe or a device; write its content to a file first")
-        _need_size(path, told.st_size, most)
+        _need_size(path, status.st_size, most)
         yield handle
 
 
@@ -164,14 +164,14 @@ _PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _DOTTED = re.compile(rf"(?<![\w-])(?:{_PART}[ \t]*+\.[ \t]*+){{{DOTTED_KEYS}}}")
 
 
-def from_toml(told: str, place: str) -> dict[str, Any]:
+def from_toml(content: str, place: str) -> dict[str, Any]:
     """Return the table of a TOML text; ``place`` is what it is called in errors."""
-    if _DOTTED.search(told):
+    if _DOTTED.search(content):
         raise InputError(
             f"{place} has a key of more than {DOTTED_KEYS} parts joined by dots; it is no file of this kind"
         )
     try:
-        return tomllib.loads(told)
+        return tomllib.loads(content)
     except (tomllib.TOMLDecodeError, RecursionError, ValueError) as error:
         raise InputError(f"{place} is no TOML ({_short(str(error))})") from None
 
@@ -181,14 +181,14 @@ def toml(path: Name) -> dict[str, Any]:
     return from_toml(text(path, most=limit() // TABLE_SHARE), str(path))
 
 
-def from_json(told: str, place: str) -> Any:
+def from_json(content: str, place: str) -> Any:
     """Return what a JSON text holds; NaN and infinities, for which JSON has no word, are refused."""
 
     def refuse(word: str) -> Any:
         raise ValueError(f"it holds {word}")
 
     try:
-        return json.loads(told, parse_constant=refuse)
+        return json.loads(content, parse_constant=refuse)
     except (RecursionError, ValueError) as error:
         raise InputError(f"{place} is no JSON ({_short(str(error))}); it is truncated or of another kind") from None
 
@@ -219,11 +219,8 @@ def npy(path: Name) -> np.ndarray[Any, Any]:
 def hdf5(path: Name) -> Iterator[Any]:
     """Yield an HDF5 file, open for reading, that is whole and holds all its data itself, unpacked no more than :func:`limit`.
 
-    Raises
-    ------
-    InputError
-        If it does not fit its digest, makes the HDF5 library hang or crash, refers to other files (external links, virtual datasets,
-        external storage), or declares more data than it holds.
+    Refused is one that does not fit its digest, makes the HDF5 library hang or crash, refers to other files (external links, virtual
+    datasets, external storage), or declares more data than it holds.
     """
     import h5py
 
@@ -303,8 +300,8 @@ def _need_plain(path: Name, file: Any) -> None:
 
 def _need_readable(path: Name) -> None:
     """Refuse a file on which the HDF5 library hangs or crashes: try it in a child process."""
-    told = os.stat(path)
-    fault = _fault_of_child(os.fspath(path), told.st_ino, told.st_size, told.st_mtime_ns)
+    status = os.stat(path)
+    fault = _fault_of_child(os.fspath(path), status.st_ino, status.st_size, status.st_mtime_ns)
     if fault:
         raise InputError(f"{path} is damaged: the HDF5 library {fault}; take a copy, or make it again")
 

@@ -76,9 +76,9 @@ def _entry(name: str, content: Any, choice: Choice) -> dict[str, Any]:
     if isinstance(content, str | bool | int):
         return {name if choice in (PLAIN, TEXT) else f"{name}_{choice[0][0]}": content}
     for suffix, factor in choice:
-        told = _exact_quotient(np.asarray(content, np.float64), factor)
-        if told is not None:
-            return {f"{name}_{suffix}" if suffix else name: told.tolist()}
+        exact = _exact_quotient(np.asarray(content, np.float64), factor)
+        if exact is not None:
+            return {f"{name}_{suffix}" if suffix else name: exact.tolist()}
     raise InputError(f"{name} is {content!r}, which cannot be written as a number")
 
 
@@ -93,7 +93,7 @@ def _exact_quotient(value: Array, factor: float) -> Array | None:
 
 
 def decode(table: Mapping[str, Any], form: Form, place: str) -> dict[str, Any]:
-    """Return the fields that a table tells, in SI; unknown keys are refused with the nearest known one."""
+    """Return the fields of a table, in SI; unknown keys are refused with the nearest known one."""
     known = keys(form)
     known_keys(place, table, known)
     values: dict[str, Any] = {}
@@ -139,7 +139,7 @@ def build(kind: type, table: Mapping[str, Any], form: Form, place: str, **more: 
 
 
 def made(make: Callable[..., Any], values: Mapping[str, Any], table: Mapping[str, Any], form: Form, place: str) -> Any:
-    """Return ``make(**values)``; what is refused is told with its place in the file, and the key and the number that stand there.
+    """Return ``make(**values)``; what is refused is reported with its place in the file, and the key and the number that stand there.
 
     The values have the type of a file's (text, number, list), not always that of the field: what ``make`` cannot even compare or convert is
     refused too.
@@ -168,11 +168,6 @@ def read(path: str | os.PathLike[str], name: str, remedy: str, make: Callable[[M
     """Return what ``make`` makes of the table ``[name]`` of a TOML file; ``remedy`` says what to do where there is none.
 
     ``make`` is called with the table and what it is called in errors.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, no TOML, has no such table, or ``make`` refuses it.
     """
     with reading.from_file(path):
         table = reading.toml(path).get(name)

@@ -100,13 +100,7 @@ def _user_block(content: bytes | memoryview) -> bytes:
 
 
 def seal(path: str | os.PathLike[str]) -> None:
-    """Give an HDF5 file of this package a new digest, after it was changed on purpose by another program.
-
-    Raises
-    ------
-    InputError
-        If the file has no digest: it is of another program, or of an earlier version.
-    """
+    """Give an HDF5 file of this package a new digest, after it was changed on purpose by another program."""
     with open(path, "r+b") as file:
         content = file.read()
         if not content.startswith(SEAL):

@@ -1,11 +1,8 @@
 """The gyro: its errors as a specification, and increments that contain them.
 
-``model``
-    :class:`GyroSpec`, :func:`simulate`, and the process noise of a filter matched to a specification.
-``flicker``
-    Flicker noise (bias instability) as a sum of Gauss-Markov processes.
-``datasheets``
-    Specifications in the units of datasheets.
+- ``model``: :class:`GyroSpec`, :func:`simulate`, and the process noise of a filter matched to a specification.
+- ``flicker``: Flicker noise (bias instability) as a sum of Gauss-Markov processes.
+- ``datasheets``: Specifications in the units of datasheets.
 """
 
 from __future__ import annotations

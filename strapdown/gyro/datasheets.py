@@ -52,14 +52,9 @@ def _registry() -> Any:
 
 
 def parse(name: str, text: str, wanted: str, example: str = "") -> float:
-    """Return a quantity given as text, in the unit ``wanted``.
+    """Return a quantity given as text, in the unit ``wanted``; another dimension is refused.
 
     Understands pint's syntax, ``sqrt(…)``, √ and °; ``h`` is the hour, ``g`` standard gravity and ``Hz`` 1/s.
-
-    Raises
-    ------
-    InputError
-        If the text is not a quantity, or has another dimension; the message names both.
     """
     registry = _registry()
     if not isinstance(text, str):
@@ -141,13 +136,6 @@ def _shaped(name: str, number: float) -> float | Array:
     if name == "g_sensitivity":
         return number * np.eye(3)
     return number
-
-
-def express(name: str, value: float, unit: str) -> float:
-    """Return an SI value of one of the sheet's quantities in another unit: ``express("arw", spec.angle_random_walk, "deg/sqrt(h)")``."""
-    one_of("quantity", name, _QUANTITIES)
-    _, wanted, example = _QUANTITIES[name]
-    return float(value) / parse(name, f"1 {unit}", wanted, example)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

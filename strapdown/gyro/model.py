@@ -529,30 +529,11 @@ def process_noise(spec: GyroSpec, *, bandwidth: float | None = None) -> dict[str
 
 
 def best_bandwidth(spec: GyroSpec, measurement_density: float) -> float:
-    """Return the ω* at which the spectral bound of flicker gives the least attitude variance.
+    """Return the ω*, rad/s, at which the spectral bound of flicker gives the least attitude variance.
 
-    Parameters
-    ----------
-    spec : GyroSpec
-        Specification of the gyro.
-    measurement_density : float
-        r, rad² s: variance of a measurement about an axis times the interval between measurements.
-
-    Returns
-    -------
-    float
-        ω*, rad/s.
-
-    Raises
-    ------
-    InputError
-        If the gyro has neither flicker nor a drifting bias.
-
-    Notes
-    -----
-    A filter with white and random-walk noise and measurements of density r has the steady attitude variance ``√r √(σ_v'² + 2 σ_u'
-    √r)`` about an axis (Farrenkopf 1978, in the limit of frequent measurements). With the bound inserted it is least where ``r ω*⁴
-    = σ_u² + ω* B²/2``, where ω* is the natural frequency of the filter itself.
+    A filter with white and random-walk noise and measurements of density r (variance about an axis times the interval, rad² s) has the
+    steady variance ``√r √(σ_v'² + 2 σ_u' √r)`` about an axis (Farrenkopf 1978, in the limit of frequent measurements). With the bound
+    inserted it is least where ``r ω*⁴ = σ_u² + ω* B²/2``; ω* is the natural frequency of the filter itself.
     """
     _, walk, instability = _filter_terms(spec)
     density = positive("measurement_density", measurement_density, unit="rad² s")

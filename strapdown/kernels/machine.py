@@ -110,6 +110,9 @@ def helper(function: FunctionType, parts: tuple[ModuleType, ...] = ()) -> Any:
     """
     import numba
 
+    from strapdown.kernels.compiler import HelperCompiler
+    from strapdown.kernels.tracing import traced
+
     if function.__module__ == f"{PACKAGE}.lane_values":
         from strapdown.kernels.lanes import INTRINSICS
 
@@ -117,13 +120,9 @@ def helper(function: FunctionType, parts: tuple[ModuleType, ...] = ()) -> Any:
     called = function.__name__ in function.__globals__.get("CALLED", ())
     # Nothing calls it from Python or C: without those two wrappers it compiles in two thirds of the time.
     options = {"forceinline": not called, "no_cpython_wrapper": True, "no_cfunc_wrapper": True, **_options(function)}
-    plain = _without_literals(numba.njit(**options)(_twin(function, parts)))
-    if function.__module__ == f"{PACKAGE}.algebra":
-        from strapdown.kernels.packed import PACKED, packed
-
-        if function.__name__ in PACKED:
-            return packed(function.__name__, plain)
-    return plain
+    twin = _twin(function, parts)
+    plain = _without_literals(numba.njit(pipeline_class=HelperCompiler, **options)(twin))
+    return traced(twin, plain, called=called)
 
 
 @functools.cache
@@ -136,6 +135,8 @@ def compiled(function: Callable[..., Any], *parts: ModuleType) -> Any:
     import numba
     from numba.core.caching import FunctionCache
 
+    from strapdown.kernels.compiler import KernelCompiler
+
     class KernelCache(FunctionCache):  # type: ignore[misc]
         def _index_key(self, signature: Any, codegen: Any) -> Any:
             names = tuple(module.__name__ for module in parts)
@@ -143,7 +144,8 @@ def compiled(function: Callable[..., Any], *parts: ModuleType) -> Any:
 
     if not _is_kernel(function):
         raise TypeError(f"{function!r} does not live in {PACKAGE}; move it there before compiling it")
-    dispatcher = numba.njit(**_options(function))(_twin(function, parts))  # type: ignore[arg-type]
+    options = {"pipeline_class": KernelCompiler, **_options(function)}  # type: ignore[arg-type]
+    dispatcher = numba.njit(**options)(_twin(function, parts))  # type: ignore[arg-type]
     with contextlib.suppress(RuntimeError):  # no writable place for a cache: compile in every process
         dispatcher._cache = KernelCache(dispatcher.py_func)
     return dispatcher

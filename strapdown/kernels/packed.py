@@ -10,23 +10,18 @@ Only what was measured to gain is here: products with vectors, symmetric product
 about what they gain.
 """
 
-# ruff: noqa: PLW0108 - numba wants functions here, not what they call
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
 
-import numba
 from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic, overload
 
 _ROW = ir.VectorType(ir.DoubleType(), 4)
 """Three numbers and a spare."""
 _INDEX = ir.IntType(32)
 _NOWHERE = ir.Constant(_ROW, ir.Undefined)
 _FUSED = ("contract",)
-_OPTIONS = {"forceinline": True, "fastmath": {"contract"}, "error_model": "numpy", "nogil": True}
 
 
 def _row(builder: Any, numbers: Any) -> Any:
@@ -75,59 +70,9 @@ def _minus_outer(builder: Any, matrix: Any, left: Any, right: Any) -> list[Any]:
     return _numbers(builder, [builder.fsub(rows[i], _times(builder, left[i], row), flags=_FUSED) for i in range(3)])
 
 
-_EMIT: dict[str, tuple[Callable[..., list[Any]], tuple[int, ...]]] = {
-    "multiply": (_multiply, (9, 9)),
-    "multiply_add": (_multiply_add, (9, 9, 9)),
-    "minus_outer": (_minus_outer, (9, 3, 3)),
+EMIT: dict[str, Callable[..., list[Any]]] = {
+    "multiply": _multiply,
+    "multiply_add": _multiply_add,
+    "minus_outer": _minus_outer,
 }
-"""By name of a function of :mod:`strapdown.kernels.algebra`: what emits it, and how many numbers each argument has."""
-
-PACKED = frozenset(_EMIT)
-
-
-def _doubles(count: int) -> types.UniTuple:
-    return types.UniTuple(types.float64, count)
-
-
-def packed(name: str, plain: Any) -> Any:
-    """Return the function of this name as kernels call it: in vectors where all is doubles, else ``plain``, its compiled source."""
-    emit, counts = _EMIT[name]
-    wanted = tuple(map(_doubles, counts))
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        unpacked = [
-            [builder.extract_value(argument, i) for i in range(count)]
-            for argument, count in zip(arguments, counts, strict=True)
-        ]
-        return context.make_tuple(builder, signature.return_type, emit(builder, *unpacked))
-
-    # numba wants the number of arguments spelled out.
-    if len(counts) == 2:
-
-        @intrinsic  # type: ignore[untyped-decorator]
-        def in_vectors_of_two(typing: Any, a: Any, b: Any) -> Any:
-            return _doubles(9)(*wanted), generate
-
-        def of_two(a, b):  # type: ignore[no-untyped-def]
-            raise NotImplementedError
-
-        @overload(of_two, jit_options=_OPTIONS)  # type: ignore[untyped-decorator]
-        def choose_of_two(a, b):  # type: ignore[no-untyped-def]
-            return (lambda a, b: in_vectors_of_two(a, b)) if (a, b) == wanted else (lambda a, b: plain(a, b))
-
-        return numba.njit(**_OPTIONS)(lambda a, b: of_two(a, b))
-
-    @intrinsic  # type: ignore[untyped-decorator]
-    def in_vectors_of_three(typing: Any, a: Any, b: Any, c: Any) -> Any:
-        return _doubles(9)(*wanted), generate
-
-    def of_three(a, b, c):  # type: ignore[no-untyped-def]
-        raise NotImplementedError
-
-    @overload(of_three, jit_options=_OPTIONS)  # type: ignore[untyped-decorator]
-    def choose_of_three(a, b, c):  # type: ignore[no-untyped-def]
-        return (
-            (lambda a, b, c: in_vectors_of_three(a, b, c)) if (a, b, c) == wanted else (lambda a, b, c: plain(a, b, c))
-        )
-
-    return numba.njit(**_OPTIONS)(lambda a, b, c: of_three(a, b, c))
+"""By name of a function of :mod:`strapdown.kernels.algebra` what emits it, of lists of doubles."""

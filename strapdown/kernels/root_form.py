@@ -170,7 +170,7 @@ class Outputs(NamedTuple):
     x: np.ndarray
     variance: np.ndarray
     covariance: np.ndarray
-    """(rows, n, n), or (0, n, n)."""
+    """(rows, m, m), of the first m states, or (0, m, m)."""
     whole_variance: np.ndarray
     """Of attitude and whole gyro bias (rows, 6), or (0, 6)."""
     whole_covariance: np.ndarray

@@ -61,7 +61,7 @@ class Workspace(NamedTuple):
     noise: np.ndarray
     """(p, n): the rows of noise of a segment."""
     gain: np.ndarray
-    """(p, n): ``Y S⁻⁻¹``."""
+    """(n, p): ``Y S⁻⁻¹``, transposed."""
     left: np.ndarray
     """(p, n): ``Z N``."""
     coupling: np.ndarray
@@ -80,20 +80,20 @@ class Outputs(NamedTuple):
     x: np.ndarray
     variance: np.ndarray
     covariance: np.ndarray
-    """(edges, n, n), or (0, n, n)."""
+    """(edges, m, m), of the first m states, or (0, m, m)."""
 
 
 def workspace(states, rows, chained, together):
     """Return room for so many error states, rows of noise and passes at once."""
     size = 6 + states
-    prepared = np.empty((3, rows, size))
+    prepared = np.empty((2, rows, size))
     return Workspace(
         links=np.empty((chained, LINKS)),
         x=np.empty(size - 3),
         F=np.empty((size + rows, size + rows)),
         noise=prepared[0],
-        gain=prepared[1],
-        left=prepared[2],
+        gain=np.empty((size, rows)),
+        left=prepared[1],
         coupling=np.empty((states, 3)),
         factor=np.empty(states),
         work=np.empty(size + rows),
@@ -144,12 +144,14 @@ def prepare_step(segments, j, model, space):
         for i in range(size, size + p):
             F[r, i] = 1.0 if r == i else 0.0
     triangularise(F, noisy, 3, size, rows, size, rows, work)
-    for w in range(p):
-        for c in range(size):
-            total = F[c, size + w]
-            for i in range(c):
-                total -= gain[w, i] * F[c, i]
-            gain[w, c] = total / F[c, c]
+    for c in range(size):
+        for w in range(p):
+            work[w] = F[c, size + w]
+        for i in range(c):
+            for w in range(p):
+                work[w] -= gain[i, w] * F[c, i]
+        for w in range(p):
+            gain[c, w] = work[w] / F[c, c]
     for r in range(p):
         for i in range(size):
             left[r, i] = 0.0
@@ -189,10 +191,12 @@ def step_back(segments, j, prepared, model, space, pass_, later_q):
     for r in range(rows + 1):
         if r < size or r == rows:
             for w in range(p):
-                total = 0.0
-                for i in range(size):
-                    total += gain[w, i] * later_F[r, i]
-                work[w] = total
+                work[w] = 0.0
+            for i in range(size):
+                f = later_F[r, i]
+                if f != 0.0:
+                    for w in range(p):
+                        work[w] += gain[i, w] * f
             for w in range(p):
                 for i in range(noisy):
                     later_F[r, i] -= work[w] * noise[w, i]

@@ -102,21 +102,26 @@ def take_row(F, size, H, row, variance, gain):
 def variances(F, size, out, row):
     """Write the diagonal of ``Fᵀ F`` to a row of ``out``."""
     for i in range(size):
-        total = 0.0
-        for j in range(i, size):
-            total += F[j, i] * F[j, i]
-        out[row, i] = total
+        out[row, i] = 0.0
+    for j in range(size):
+        for i in range(j + 1):
+            out[row, i] += F[j, i] * F[j, i]
 
 
 def covariances(F, size, out, row):
-    """Write ``Fᵀ F`` to out[row] (size, size)."""
-    for a in range(size):
-        for b in range(a, size):
-            total = 0.0
-            for j in range(b, size):
-                total += F[j, a] * F[j, b]
-            out[row, a, b] = total
-            out[row, b, a] = total
+    """Write the first rows and columns of ``Fᵀ F``, as many as ``out`` has room for, to out[row]."""
+    first = out.shape[1]
+    for a in range(first):
+        for b in range(first):
+            out[row, a, b] = 0.0
+    for j in range(size):
+        end = min(j + 1, first)
+        for a in range(end):
+            for b in range(a, end):
+                out[row, a, b] += F[j, a] * F[j, b]
+    for a in range(first):
+        for b in range(a):
+            out[row, a, b] = out[row, b, a]
 
 
 def whole_bias(F, size, gyro, gyro_use, mark, variance_out, covariance_out, row, work):

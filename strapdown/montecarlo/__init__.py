@@ -3,20 +3,13 @@
 Memory grows with the number of epochs, not with the number of runs: runs are computed in chunks, and the chunks' sums are merged in their
 order, so the statistics do not depend on the number of threads, processes or hosts.
 
-``plan``
-    What is computed: :class:`Plan`, :class:`Dispersions`.
-``statistics``
-    Mergeable sums over runs: :class:`Statistics`; what a machine must return.
-``scalar``, ``lanes``
-    The machines: the general one, and the fast one over vectors of runs.
-``engine``
-    Choosing a machine, threads, merging: :func:`run_plan`, :func:`run`, :func:`replay`.
-``verdicts``
-    Verdict and numbers from statistics, as a table: :func:`summary`.
-``campaign``
-    A run that survives being killed, and its file.
-``cluster``
-    Chunks on other processes and hosts, through Dask.
+- ``plan``: What is computed: :class:`Plan`, :class:`Dispersions`.
+- ``statistics``: Mergeable sums over runs: :class:`Statistics`; what a machine must return.
+- ``scalar``, ``lanes``: The machines: the general one, and the fast one over vectors of runs.
+- ``engine``: Choosing a machine, threads, merging: :func:`run_plan`, :func:`run`, :func:`replay`.
+- ``verdicts``: Verdict and numbers from statistics, as a table: :func:`summary`.
+- ``campaign``: A run that survives being killed, and its file.
+- ``cluster``: Chunks on other processes and hosts, through Dask.
 """
 
 from __future__ import annotations
@@ -24,22 +17,17 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from strapdown.montecarlo.engine import Choice as Choice
 from strapdown.montecarlo.engine import choose as choose
 from strapdown.montecarlo.engine import in_threads as in_threads
-from strapdown.montecarlo.engine import machine_named as machine_named
 from strapdown.montecarlo.engine import replay, run, run_plan
-from strapdown.montecarlo.plan import Dispersions, Plan, read_dispersions
+from strapdown.montecarlo.plan import Dispersions, Plan
 from strapdown.montecarlo.plan import from_table as from_table
+from strapdown.montecarlo.plan import read_dispersions as read_dispersions
 from strapdown.montecarlo.plan import whole_epochs as whole_epochs
 from strapdown.montecarlo.scalar import start as start
-from strapdown.montecarlo.statistics import EXAMPLES as EXAMPLES
-from strapdown.montecarlo.statistics import WORST as WORST
-from strapdown.montecarlo.statistics import Replay as Replay
 from strapdown.montecarlo.statistics import Statistics
 from strapdown.montecarlo.statistics import judged_epochs as judged_epochs
 from strapdown.montecarlo.statistics import merge as merge
-from strapdown.montecarlo.statistics import merge_all as merge_all
 from strapdown.montecarlo.verdicts import summary
 from strapdown.setup import FilterSetup as FilterSetup
 
@@ -47,7 +35,6 @@ __all__ = [
     "Dispersions",
     "Plan",
     "Statistics",
-    "read_dispersions",
     "replay",
     "run",
     "run_plan",

@@ -81,7 +81,7 @@ _BY_EPOCH = (
     "coverage",
     "histogram",
 )
-"""What has one row an epoch; all are sums over runs whose numbers are finite."""
+"""Arrays with one row an epoch, sums over runs whose numbers are finite."""
 
 _COUNTED = (
     "finite",
@@ -92,7 +92,7 @@ _COUNTED = (
     "worst_run",
     "example_run",
 )
-"""What counts: whole numbers."""
+"""Arrays of counts, whole numbers."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -139,7 +139,7 @@ class Campaign:
 
 @dataclass
 class _Progress:
-    """What is finished: the fold over whole chunks from the first on, and chunks finished early, by their first run."""
+    """Finished chunks: the fold over whole chunks from the first on, and chunks finished early, by their first run."""
 
     whole: Statistics | None
     early: dict[int, Statistics]
@@ -160,7 +160,7 @@ class _Progress:
 
     @property
     def statistics(self) -> Statistics | None:
-        """Of all runs from the first on without a gap, a short last chunk with them."""
+        """Statistics of all runs from the first without a gap, a short last chunk included."""
         last = self.early.get(self.merged)
         if last is None:
             return self.whole
@@ -227,7 +227,8 @@ def run(
     table = plan.to_table()
     if target.exists() and not resume and not overwrite:
         raise InputError(
-            f"{target} exists; go on with it (--resume), write over it (--overwrite), or choose another name (--out)"
+            f"{target} exists; go on with it (--resume; resume=True in Python), write over it (--overwrite; overwrite=True), or choose "
+            "another name"
         )
     chosen = choose(plan, machine)
     with locked(target):
@@ -386,7 +387,7 @@ def _put_statistics(group: Any, statistics: Statistics) -> None:
 
 def _statistics_of(group: Any, plan: Plan) -> Statistics:
     """Return the statistics in a group, whose shapes must be those of a plan with these epochs and sensors."""
-    told = reading.attributes(group)
+    attributes = reading.attributes(group)
     arrays = {f.name: reading.numbers(group, f.name) for f in fields(Statistics) if f.name not in ("runs", "sensors")}
     place = f"{group.file.filename}: {group.name.lstrip('/')}"
     epochs, spans, sensors = plan.epochs + 1, plan.nis_bins, len(plan.sensors)
@@ -418,10 +419,10 @@ def _statistics_of(group: Any, plan: Plan) -> Statistics:
             )
         if value.dtype.kind != ("i" if name in _COUNTED else "f"):
             raise InputError(f"{place}: {name} is of type {value.dtype}; the file is damaged: run the campaign anew")
-    names = tuple(reading.from_json(told["sensors"], f"{place}: sensors"))
+    names = tuple(reading.from_json(attributes["sensors"], f"{place}: sensors"))
     if names != plan.sensors:
         raise InputError(f"{place}: sensors are {names}, those of the plan {plan.sensors}; run the campaign anew")
-    return Statistics(runs=count(f"{place}: runs", told["runs"]), sensors=names, **arrays)
+    return Statistics(runs=count(f"{place}: runs", attributes["runs"]), sensors=names, **arrays)
 
 
 def read(path: str | os.PathLike[str]) -> Campaign:
@@ -447,26 +448,26 @@ def read(path: str | os.PathLike[str]) -> Campaign:
 
 def _stored(path: Path) -> tuple[Campaign, _Progress]:
     with reading.hdf5(path) as file:
-        told = reading.attributes(file)
-        if told.get("kind") != KIND:
+        attributes = reading.attributes(file)
+        if attributes.get("kind") != KIND:
             raise InputError(f"{path} is no Monte Carlo campaign; `strapdown montecarlo` writes one")
-        if count("format", told["format"]) > FORMAT:
+        if count("format", attributes["format"]) > FORMAT:
             raise InputError(
-                f"{path} has format {told['format']}, newer than this package knows; install strapdown {told['version']}"
+                f"{path} has format {attributes['format']}, newer than this package knows; install strapdown {attributes['version']}"
             )
-        plan = from_table(reading.from_json(told["plan"], f"{path}: plan"))
-        if told["digest"] != plan.digest:
+        plan = from_table(reading.from_json(attributes["plan"], f"{path}: plan"))
+        if attributes["digest"] != plan.digest:
             raise InputError(f"{path}: digest is not that of the plan; the file is damaged: run the campaign anew")
         campaign = Campaign(
             plan=plan,
-            machine=one_of("machine", told["machine"], MACHINES),
-            reason=str(told["reason"]),
-            chunk=count("chunk", told["chunk"]),
-            runs=count("runs", told["runs"]),
+            machine=one_of("machine", attributes["machine"], MACHINES),
+            reason=str(attributes["reason"]),
+            chunk=count("chunk", attributes["chunk"]),
+            runs=count("runs", attributes["runs"]),
             statistics=_statistics_of(file["statistics"], plan) if "statistics" in file else None,
-            version=str(told["version"]),
-            arithmetic=str(told.get("arithmetic", "")),
-            seconds=finite("seconds", told["seconds"], unit="s"),
+            version=str(attributes["version"]),
+            arithmetic=str(attributes.get("arithmetic", "")),
+            seconds=finite("seconds", attributes["seconds"], unit="s"),
         )
         early = file.get("resume", {})
         return campaign, _Progress(

@@ -29,7 +29,7 @@ AHEAD = 4
 
 
 class Machine(Protocol):
-    """What :mod:`strapdown.montecarlo.statistics` asks of a machine."""
+    """Interface of a machine, as :mod:`strapdown.montecarlo.statistics` uses it."""
 
     NAME: str
     CHUNK: int
@@ -79,8 +79,10 @@ def choose(plan: Plan, machine: str = "auto") -> Choice:
         if reason is None:
             return Choice(machine=name, reason=reasons.get("lanes", ""))
         reasons[name] = reason
-    told = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
-    raise InputError(f"no machine computes this plan ({told}); take a plainer filter or scenario, or precision float64")
+    refusals = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
+    raise InputError(
+        f"no machine computes this plan ({refusals}); take a plainer filter or scenario, or precision float64"
+    )
 
 
 def arithmetic() -> str:
@@ -157,7 +159,7 @@ def chunks_of(runs: int, chunk: int) -> Chunks:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Work:
-    """What computes a chunk; it can be sent to another process."""
+    """Function that computes a chunk; picklable, for other processes."""
 
     plans: tuple[Plan, ...]
     """Plans that differ in the filter alone: the runs' sensors give the same to all."""

@@ -185,8 +185,8 @@ def _prepare(plan: Plan) -> _Prepared:
     n = algorithm.samples
     series = tuple(_nominal(sensor, scenario, plan.seed) for sensor in scenario.sensors)
     record = replace(steps, vectors=series)
-    believed = setup.believed(replace(quiet, vectors=series), plan.setup)
-    events = schedule(believed.vectors, float(record.time[0]), float(record.time[-1]))
+    modelled = setup.modelled_record(replace(quiet, vectors=series), plan.setup)
+    events = schedule(modelled.vectors, float(record.time[0]), float(record.time[-1]))
     values = [_exact(sensor, scenario, own) for sensor, own in zip(scenario.sensors, series, strict=True)]
     real = _real(plan)
     gyro = montecarlo_run.Gyro(

@@ -1,4 +1,4 @@
-"""What a Monte Carlo campaign computes: scenario, filter, seed, what differs from run to run, where statistics are taken."""
+"""Plan of a Monte Carlo campaign: scenario, filter, seed, dispersions from run to run, epochs of the statistics."""
 
 from __future__ import annotations
 
@@ -170,7 +170,7 @@ class Plan:
     def unmodelled(self) -> tuple[str, ...]:
         """Errors, in words, that the scenario specifies and the filter has no state for."""
         scenario = self.scenario
-        return setup.not_covered(scenario.gyro, scenario.sensors, self.setup.states, gravity_f=scenario.gravity_f)
+        return setup.unmodelled_errors(scenario.gyro, scenario.sensors, self.setup.states, gravity_f=scenario.gravity_f)
 
     def to_table(self) -> dict[str, Any]:
         """Return the plan as a table of texts and numbers, by which plans are compared and from which ``from_table`` restores it.
@@ -212,23 +212,7 @@ def from_table(table: Mapping[str, Any]) -> Plan:
 
 
 def read_dispersions(path: str | os.PathLike[str]) -> Dispersions:
-    """Read the table ``[dispersions]`` of a TOML file; other tables are ignored.
-
-    Parameters
-    ----------
-    path : path
-        TOML file, such as a scenario file with this table added.
-
-    Returns
-    -------
-    Dispersions
-        In SI units and radians, whatever the units of the keys.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, is no TOML, or has no such table, an unknown key or a value out of range.
-    """
+    """Read the table ``[dispersions]`` of a TOML file, such as a scenario's with this table added."""
     remedy = f"its keys are {', '.join(tables.keys(_FORM))}"
     return tables.read(path, "dispersions", remedy, _dispersions)
 

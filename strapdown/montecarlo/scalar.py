@@ -193,13 +193,13 @@ class Sums:
         rows = slice(None) if regular else _at_epochs(estimate.time, self.time)
         edges = np.searchsorted(record.time, estimate.time[rows])
         P = estimate.covariance[rows]
-        told = np.isfinite(estimate.attitude[rows]).all(axis=1)
+        known = np.isfinite(estimate.attitude[rows]).all(axis=1)
         error = np.full((len(P), 6), np.nan)
-        error[told] = consistency.errors(
-            estimate.attitude[rows][told],
-            estimate.bias[rows][told],
-            record.truth.attitude[edges[told]],
-            record.truth.bias[edges[told]],
+        error[known] = consistency.errors(
+            estimate.attitude[rows][known],
+            estimate.bias[rows][known],
+            record.truth.attitude[edges[known]],
+            record.truth.bias[edges[known]],
         )
         self._add_errors(run, error, P)
         self._add_innovations(estimate)
@@ -244,7 +244,7 @@ class Sums:
 
     @property
     def statistics(self) -> Statistics:
-        """What the runs added so far make."""
+        """Statistics of the runs added so far."""
         run, score = (np.array(column) for column in zip(*self.scores, strict=True))
         worst_run, worst_score = worst(run.astype(np.int64), score.astype(np.float64))
         m = len(self.time)

@@ -38,7 +38,6 @@ time), error e = (δθ, δb) of :func:`strapdown.consistency.errors` and the fil
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -67,7 +66,7 @@ ERROR_EXPONENT = -40
 NEES_EXPONENT = -16
 """Bins of the NEES begin at 2⁻¹⁶ and end at 2²⁷."""
 SHIFT = 49
-"""The bits of a double shifted right by so much are exponent and three digits of the mantissa: its bin, but for a constant."""
+"""Right shift of a double's bits that leaves the exponent and three bits of the mantissa: its bin, up to a constant."""
 
 COVERED = (0.6826894921370859, 0.9544997361036416, 0.9973002039367398)
 """Share of a consistent filter's errors inside 1, 2, 3 σ."""
@@ -98,11 +97,11 @@ class Replay:
     """One run in full detail."""
 
     record: ImuRecord
-    """What the sensors gave, with the truth."""
+    """Simulated measurements, with the truth."""
     initial: estimation.State
     """Where the filter started."""
     estimate: Estimate
-    """What the filter made of it, at every step, with whole covariances."""
+    """Estimate at every filter step, with whole covariances."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -155,6 +154,8 @@ class Statistics(Listed):
         The filter's own σ in these runs, rad and rad/s.
     """
 
+    _drawn_by = "runs_overview"
+
     time: Array
     runs: int
     finite: Counts
@@ -186,11 +187,15 @@ class Statistics(Listed):
         from strapdown.montecarlo.verdicts import summary
 
         report = summary(self)
-        parts = [(f"NEES of the {subset}", part["anees"], part) for subset, part in report["nees"].items()]
-        parts += [(f"NIS of {part['sensor']}", part["nis"], part) for part in report["nis"]]
         rows = [
-            (name, figure(mean), "{:.4f} to {:.4f}".format(*part["bounds"]), "pass" if part["consistent"] else "FAIL")
-            for name, mean, part in parts
+            (
+                f"{one.name} of {one.label}",
+                figure(one.value),
+                f"{one.low:.4f} to {one.high:.4f}",
+                "FAIL" if one.rejected else "pass",
+            )
+            for one in consistency.judge_runs(self).findings
+            if one.is_ratio
         ]
         last = report["last_epoch"]
         notes = [
@@ -203,7 +208,7 @@ class Statistics(Listed):
         if self.failed:
             notes.append(f"{self.failed} runs failed: no finite error or covariance")
         title = f"{self.runs} runs, per degree of freedom (1 expected); {100.0 * report['probability']:g} % bounds of all together"
-        return Listing(title, ("statistic", "mean", "bounds", ""), rows, notes)
+        return Listing(title, ("statistic", "value", "bounds", ""), rows, notes)
 
     @property
     def has_bias(self) -> bool:
@@ -212,7 +217,7 @@ class Statistics(Listed):
 
     @property
     def subsets(self) -> tuple[str, ...]:
-        """What is judged: "state", "attitude" and "bias", or "attitude" alone where no bias is estimated."""
+        """Subsets of the states that are judged: "state", "attitude" and "bias", or "attitude" alone where no bias is estimated."""
         return tuple(SUBSETS) if self.has_bias else ("attitude",)
 
     @property
@@ -225,11 +230,6 @@ class Statistics(Listed):
     def failed(self) -> int:
         """Runs that were not finite at some epoch, at the least."""
         return int(self.runs - self.finite.min())
-
-    @property
-    def error_square_sum(self) -> Array:
-        """Σ e² (m, 6)."""
-        return np.diagonal(self.error_product_sum, axis1=1, axis2=2)
 
     @property
     def mean_error(self) -> Array:
@@ -356,21 +356,6 @@ class Statistics(Listed):
         found = _quantile(self.histogram[:, :6], probability, bin_edges(ERROR_EXPONENT))
         return np.asarray(np.where(self._runs_of_state > 0.0, found, np.nan))
 
-    def nees_quantile(self, probability: float) -> Array:
-        """Return a quantile of the NEES of state, attitude and bias at each epoch.
-
-        Parameters
-        ----------
-        probability : float
-            Of the quantile, from 0 to 1.
-
-        Returns
-        -------
-        ndarray (m, 3)
-            Not divided by the degrees of freedom; NaN where no run was finite.
-        """
-        return _quantile(self.histogram[:, 6:], probability, bin_edges(NEES_EXPONENT))
-
 
 def _divided(total: Any, number: Any) -> Array:
     """Return total / number, NaN where the number is 0."""
@@ -412,14 +397,6 @@ def merge(a: Statistics, b: Statistics) -> Statistics:
         if field.name not in merged:
             merged[field.name] = getattr(a, field.name) + getattr(b, field.name)
     return Statistics(**merged)
-
-
-def merge_all(parts: Sequence[Statistics]) -> Statistics:
-    """Return the statistics of all parts, merged from the first to the last."""
-    total, *rest = parts
-    for part in rest:
-        total = merge(total, part)
-    return total
 
 
 def worst(run: Counts, score: Array) -> tuple[Counts, Array]:

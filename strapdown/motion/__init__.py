@@ -4,30 +4,21 @@ Every motion is a frozen dataclass that satisfies :class:`Motion`. None of them 
 increment is a difference of attitudes or of angles: each is the integral of the body rate over its own interval, accurate to
 rounding relative to its own size, however short the interval and however far from the origin of time.
 
-``protocol``
-    :class:`Motion`: the methods of a motion, and how one declares its breaks.
+- ``protocol``: :class:`Motion`: the methods of a motion, and how one declares its breaks.
 
 Closed forms:
 
-``constant_rate``
-    :class:`ConstantRate`, and :func:`rest`.
-``cones``
-    :class:`Coning`, equation (18) of *Quaternion differentiation*, and :class:`SpinCone`.
-``spin_rock``
-    :class:`SpinRock`: a spinning body whose axis rocks.
-``slew``
-    :class:`Slew`: a rotation about one axis from rest to rest.
-``torque_free``
-    :class:`TorqueFree`: the free rigid body, solved in ``euler_poinsot`` by the functions of ``elliptic``.
+- ``constant_rate``: :class:`ConstantRate`, and :func:`rest`.
+- ``cones``: :class:`Coning`, equation (18) of *Quaternion differentiation*, and :class:`SpinCone`.
+- ``spin_rock``: :class:`SpinRock`: a spinning body whose axis rocks.
+- ``slew``: :class:`Slew`: a rotation about one axis from rest to rest.
+- ``torque_free``: :class:`TorqueFree`: the free rigid body, solved in ``euler_poinsot`` by the functions of ``elliptic``.
 
 From given rates, attitudes or motions:
 
-``harmonic``
-    :class:`HarmonicRates` of :class:`Harmonic` terms: vibration on any axes.
-``sampled``
-    :class:`SampledAttitude` and :func:`waypoints`: smooth motion through given attitudes.
-``composed``
-    :class:`Composed`: a vibration on a base motion.
+- ``harmonic``: :class:`HarmonicRates` of :class:`Harmonic` terms: vibration on any axes.
+- ``sampled``: :class:`SampledAttitude` and :func:`waypoints`: smooth motion through given attitudes.
+- ``composed``: :class:`Composed`: a vibration on a base motion.
 
 Shared parts: ``parameters`` checks and stores the parameters; ``exact_phase`` forms ω t as exact products, so that an hour of a 100
 Hz motion is as accurate as its first second; ``quadrature`` integrates a rate that has no closed integral.

@@ -18,7 +18,7 @@ from strapdown.motion.parameters import IDENTITY, edge_stamps, store_attitude, s
 
 _TERMS = 26
 _TRUNCATION = 1e-21
-_MOST_NODES = 10_000_000
+_MAX_NODES = 10_000_000
 _NODE_CHUNK = 1 << 15
 
 
@@ -177,10 +177,10 @@ class HarmonicRates:
             return np.empty((*t.shape, 4))
         node = np.rint(flat / self._spacing)
         reach = float(np.abs(node).max())
-        if reach > _MOST_NODES:
+        if reach > _MAX_NODES:
             k = int(np.argmax(np.abs(node)))
             raise checks.InputError(
-                f"time[{k}] is {flat[k]:g} s from time 0, more than {_MOST_NODES * self._spacing:g} s; "
+                f"time[{k}] is {flat[k]:g} s from time 0, more than {_MAX_NODES * self._spacing:g} s; "
                 "the attitude of harmonic rates is integrated from time 0, so use a nearer time origin"
             )
         order = np.argsort(node, kind="stable")

@@ -1,4 +1,4 @@
-"""A circular low orbit: position, eclipses and magnetic field along it."""
+"""A circular low orbit: position and magnetic field along it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from strapdown.checks import Array, InputError, array, finite, positive
+from strapdown.checks import Array, array, finite, positive
 
 __all__ = [
     "CircularOrbit",
@@ -88,68 +88,9 @@ class CircularOrbit:
         """
         return dipole_field(self.position(time))
 
-    def eclipses(self, sun_f: ArrayLike, start: float, end: float) -> tuple[tuple[float, float], ...]:
-        """Return the windows in the earth's shadow, a cylinder away from the sun's direction.
-
-        Parameters
-        ----------
-        sun_f : array_like (3,)
-            Direction of the sun, fixed frame, of any length.
-        start, end : float
-            Interval [start, end], s.
-
-        Returns
-        -------
-        tuple of (float, float)
-            Windows (from, to), s.
-
-        Raises
-        ------
-        InputError
-            If ``sun_f`` is zero.
-        """
-        sun = array("sun_f", sun_f, (3,))
-        if not np.linalg.norm(sun) > 0.0:
-            raise InputError("sun_f is the zero vector, which has no direction")
-        sun = sun / np.linalg.norm(sun)
-        # ŝ·r̂ = A cos(θ − θ₀) over the orbit; shadow where it is below −√(1 − (R/r)²).
-        first = sun[0]
-        second = np.cos(self.inclination) * sun[1] + np.sin(self.inclination) * sun[2]
-        amplitude = float(np.hypot(first, second))
-        limit = float(np.sqrt(1.0 - (EARTH_RADIUS / self.radius) ** 2))
-        if amplitude <= limit:
-            return ()
-        middle = float(np.arctan2(second, first)) + np.pi
-        half = float(np.arccos(limit / amplitude))
-        lowest = np.floor((self.phase + self.rate * start - middle - half) / (2.0 * np.pi))
-        highest = np.ceil((self.phase + self.rate * end - middle + half) / (2.0 * np.pi))
-        windows = []
-        for turn in np.arange(lowest, highest + 1.0):
-            centre = middle + 2.0 * np.pi * turn - self.phase
-            a, b = (max(start, (centre - half) / self.rate), min(end, (centre + half) / self.rate))
-            if a < b:
-                windows.append((float(a), float(b)))
-        return tuple(windows)
-
 
 def dipole_field(position_f: ArrayLike) -> Array:
-    """Return the magnetic field of the axial dipole, whose south magnetic pole lies in the north.
-
-    Parameters
-    ----------
-    position_f : array_like (..., 3)
-        Positions from the centre of the earth, m, z to the north pole.
-
-    Returns
-    -------
-    ndarray (..., 3)
-        Field, T, fixed frame.
-
-    Examples
-    --------
-    >>> dipole_field([EARTH_RADIUS, 0.0, 0.0]).tolist()  # north at the equator
-    [0.0, 0.0, 2.98e-05]
-    """
+    """Return the field (..., 3), T, of the axial dipole, whose south pole lies in the north, at positions (..., 3), m."""
     r = array("position_f", position_f, (..., 3))
     distance = np.linalg.norm(r, axis=-1, keepdims=True)
     up = r / distance

@@ -1,4 +1,4 @@
-"""What every motion asks of its parameters and times, and the shape of what it returns."""
+"""Checks of every motion's parameters and times, and the shape of its results."""
 
 from __future__ import annotations
 

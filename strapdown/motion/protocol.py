@@ -1,4 +1,4 @@
-"""What a motion is."""
+"""Interface of a motion."""
 
 from __future__ import annotations
 

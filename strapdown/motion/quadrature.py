@@ -19,7 +19,7 @@ _DERIVATIVE = (
 )
 _QUADRATURE_TOLERANCE = 1e-16
 _ROUNDING_FLOOR = 1e-14
-_MOST_BISECTIONS = 40
+_MAX_BISECTIONS = 40
 _QUADRATURE_CHUNK = 1 << 14
 
 
@@ -40,7 +40,7 @@ def interval_integrals(rate: Callable[[Array], Array], edges: Array, breaks: Arr
         owner = np.searchsorted(part, start, side="right") - 1
         total = result[first : first + len(part) - 1]
         size = np.zeros(len(total))
-        for level in range(_MOST_BISECTIONS + 1):
+        for level in range(_MAX_BISECTIONS + 1):
             step = stop - start
             time, cut_off = exact_sum(start[:, None], 0.5 * (1.0 + _GAUSS_NODES) * step[:, None])
             values = rate(time)
@@ -55,7 +55,7 @@ def interval_integrals(rate: Callable[[Array], Array], edges: Array, breaks: Arr
                 high_share > _ROUNDING_FLOOR * size[owner]
             )
             middle = start + 0.5 * step
-            rough &= (level < _MOST_BISECTIONS) & (middle > start)
+            rough &= (level < _MAX_BISECTIONS) & (middle > start)
             done = ~rough
             values = 0.5 * step[:, None, None] * values + cut_off[..., None] * (_DERIVATIVE @ values)
             np.add.at(total, owner[done], _GAUSS_WEIGHTS @ values[done])

@@ -2,49 +2,39 @@
 
 Colours are those of Okabe and Ito, which every kind of colour vision can tell apart. :func:`new_figure` needs no display.
 
-``style``
-    Colours, themes (light, dark), sizes, saving.
-``decimation``
-    Long series reduced to the extremes of each pixel column.
-``estimates``
-    One estimate over time: attitude, bias, σ, errors.
-``innovations``
-    Innovations of one record: NIS, distribution, autocorrelation.
-``statistics``
-    Error statistics over many runs.
-``sphere``
-    The path of a body axis on the unit sphere, still or animated.
-``coning``
-    The coning study.
-``allan``
-    Allan deviations with their fit.
-``budget``
-    Predicted errors by source.
-``tuning``
-    Likelihood slices, and the statistics before and after.
+- ``style``: Colours, themes (light, dark), sizes, saving.
+- ``decimation``: Long series reduced to the extremes of each pixel column.
+- ``estimates``: One estimate over time: attitude, bias, σ, errors.
+- ``innovations``: Innovations of one record: NIS, distribution, autocorrelation.
+- ``statistics``: Error statistics over many runs.
+- ``coning``: The coning study.
+- ``allan``: Allan deviations with their fit.
+- ``budget``: Predicted errors by source.
+- ``tuning``: Likelihood slices, and the statistics before and after.
 """
 
-from strapdown.plots.allan import allan_axis as allan_axis
 from strapdown.plots.allan import allan_overview
 from strapdown.plots.budget import error_budget
 from strapdown.plots.coning import coning_consistency as coning_consistency
 from strapdown.plots.coning import coning_errors as coning_errors
-from strapdown.plots.coning import draw_coning_study
+from strapdown.plots.coning import draw_coning_study as draw_coning_study
 from strapdown.plots.coning import drift_by_algorithm as drift_by_algorithm
 from strapdown.plots.decimation import decimated as decimated
-from strapdown.plots.estimates import error_overview, estimate_overview, states_over_time
+from strapdown.plots.estimates import error_overview
 from strapdown.plots.estimates import errors_in_envelope as errors_in_envelope
+from strapdown.plots.estimates import estimate_overview as estimate_overview
 from strapdown.plots.estimates import recording_errors as recording_errors
-from strapdown.plots.innovations import error_distribution, innovation_autocorrelation, nis_over_record
+from strapdown.plots.estimates import states_over_time as states_over_time
+from strapdown.plots.innovations import error_distribution as error_distribution
+from strapdown.plots.innovations import innovation_autocorrelation as innovation_autocorrelation
 from strapdown.plots.innovations import innovation_histogram as innovation_histogram
 from strapdown.plots.innovations import innovation_quantiles as innovation_quantiles
-from strapdown.plots.sphere import animate_body_axis as animate_body_axis
-from strapdown.plots.sphere import body_axis_on_sphere
-from strapdown.plots.sphere import sphere_figure as sphere_figure
+from strapdown.plots.innovations import nis_over_record as nis_over_record
 from strapdown.plots.statistics import covariance_ellipses as covariance_ellipses
 from strapdown.plots.statistics import coverage_by_state as coverage_by_state
 from strapdown.plots.statistics import fan as fan
 from strapdown.plots.statistics import nees_over_time, nis_over_time
+from strapdown.plots.statistics import runs_overview as runs_overview
 from strapdown.plots.style import BLUE as BLUE
 from strapdown.plots.style import GREEN as GREEN
 from strapdown.plots.style import ORANGE as ORANGE
@@ -58,17 +48,10 @@ from strapdown.plots.style import theme as theme
 
 __all__ = [
     "allan_overview",
-    "body_axis_on_sphere",
-    "draw_coning_study",
     "error_budget",
-    "error_distribution",
     "error_overview",
-    "estimate_overview",
-    "innovation_autocorrelation",
     "nees_over_time",
     "new_figure",
-    "nis_over_record",
     "nis_over_time",
     "save",
-    "states_over_time",
 ]

@@ -176,21 +176,9 @@ def _leaves(outcome: FilterOutcome, subset: str, bounds: tuple[float, float]) ->
 
 
 def draw_coning_study(study: ConingStudy, folder: str | os.PathLike[str], form: str = "png") -> list[Path]:
-    """Write the figures of the coning study to a folder.
+    """Write the figures of a coning study to a folder, made if it is missing; return the files.
 
-    Parameters
-    ----------
-    study : ConingStudy
-        Of :func:`strapdown.coning_study.run`.
-    folder : path
-        Made if it is missing.
-    form : {"png", "pdf", "svg"}
-        Format of the files.
-
-    Returns
-    -------
-    list of Path
-        ``drift``, ``errors`` and ``consistency`` with the suffix of the format; ``algorithms`` too for algorithms of one's own.
+    ``drift``, ``errors`` and ``consistency``; ``algorithms`` too for algorithms of one's own.
     """
     figure, ax = new_figure(size=(7.0, 4.2))
     drift_by_algorithm(study.drifts, ax)

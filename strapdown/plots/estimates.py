@@ -47,21 +47,10 @@ def band(ax: Axes, time: Array, low: Array, high: Array, **style: Any) -> None:
 
 
 def errors_in_envelope(time: Array, error: Array, sigma: Array, ax: Axes | None = None) -> Axes:
-    """Draw errors over time inside the filter's ±3σ.
+    """Draw errors (runs, n) over time (n,), s, inside the filter's ±3σ (n,), in the unit of the axis, which the caller labels.
 
     Of a long series the band is dark up to the least 3σ of each column of pixels and light up to the largest: between two measurements σ
     grows, and lines through each tooth would be a grey bar that hides the errors.
-
-    Parameters
-    ----------
-    time : (n,)
-        s.
-    error : (runs, n)
-        In the unit of the vertical axis, which the caller labels.
-    sigma : (n,)
-        The filter's standard deviation, in the same unit.
-    ax : Axes, optional
-        A new figure's if not given.
     """
     ax = axes_or_new(ax)
     bound = 3.0 * sigma
@@ -94,10 +83,7 @@ def errors_in_envelope(time: Array, error: Array, sigma: Array, ax: Axes | None 
 def angle_labels(fixed_frame: str = "") -> tuple[str, str, str]:
     """Return what roll, pitch and yaw of the sequence Z-Y-X are, with the sense in which each grows.
 
-    Parameters
-    ----------
-    fixed_frame : str
-        As an estimate's file gives it; yaw is from East in one that begins with "East-North-Up", else from the fixed x axis.
+    Yaw is from East in a ``fixed_frame`` that begins with "East-North-Up", else from the fixed x axis.
     """
     yaw = "from East to North" if fixed_frame.startswith("East-North-Up") else "from fixed x to y"
     return "roll about body x, y to z", "pitch about y, z to x", f"yaw about fixed z, {yaw}"
@@ -120,22 +106,7 @@ def unbroken(time: Array, angle: Array) -> tuple[Array, Array]:
 
 
 def estimate_overview(estimate: Estimate, *, title: str = "", fixed_frame: str = "") -> Figure:
-    """Draw roll, pitch and yaw (sequence Z-Y-X), the gyro bias in its ±3σ, and the attitude's σ over time.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        Attitude and bias with their σ.
-    title : str
-        What was estimated.
-    fixed_frame : str
-        As :func:`angle_labels` takes it.
-
-    Returns
-    -------
-    Figure
-        Five panels over one time axis.
-    """
+    """Draw roll, pitch and yaw (sequence Z-Y-X), the gyro bias in its ±3σ, and the attitude's σ over time."""
     figure, axes = new_figure(5, 1, size=(9.0, 10.0), sharex=True, height_ratios=(1.0, 1.0, 1.0, 1.7, 1.3))
     euler = quaternion.to_rotation(estimate.attitude).as_euler("ZYX", degrees=True)[:, ::-1]
     for ax, angle, name in zip(axes, euler.T, angle_labels(fixed_frame), strict=False):
@@ -174,20 +145,7 @@ def estimate_overview(estimate: Estimate, *, title: str = "", fixed_frame: str =
 
 
 def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:
-    """Draw the optional error states over time inside their ±3σ, one axes for each block and unit.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        With error states.
-    title : str
-        Of the figure.
-
-    Returns
-    -------
-    Figure
-        Panels over one time axis, in the order of the blocks.
-    """
+    """Draw the error states of an estimate over time inside their ±3σ, one axes for each declaration and unit, in their order."""
     panels = [
         (name, block, unit, [k for k, one in enumerate(block.units) if one == unit])
         for name, block in estimate.error_states.items()
@@ -224,21 +182,7 @@ def states_over_time(estimate: Estimate, *, title: str = "") -> Figure:
 
 
 def recording_errors(time: Array, errors: ReferenceErrors, movement: np.ndarray | None = None) -> Figure:
-    """Draw total, heading and inclination errors against a reference over time.
-
-    Parameters
-    ----------
-    time : (n,)
-        s.
-    errors : ReferenceErrors
-        rad, at those times.
-    movement : (n,) of bool, optional
-        Samples that are judged, drawn shaded.
-
-    Returns
-    -------
-    Figure
-    """
+    """Draw total, heading and inclination errors, rad, against a reference over time, s; the ``movement`` that is judged is shaded."""
     figure, ax = new_figure(size=(9.0, 4.0))
     mask = np.zeros(len(time), int) if movement is None else movement.astype(int)
     inside = np.flatnonzero(np.diff(np.concatenate([[0], mask, [0]])))

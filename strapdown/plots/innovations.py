@@ -63,20 +63,7 @@ def innovation_quantiles(pairs: QuantilePairs, ax: Axes | None = None) -> Axes:
 
 
 def innovation_autocorrelation(result: Autocorrelation, ax: Axes | None = None) -> Axes:
-    """Draw the autocorrelation of each component with the bounds of one lag and of all lags together.
-
-    Parameters
-    ----------
-    result : Autocorrelation
-        Of :func:`strapdown.consistency.autocorrelation`.
-    ax : Axes, optional
-        A new figure's if not given.
-
-    Returns
-    -------
-    Axes
-        What was drawn on.
-    """
+    """Draw the autocorrelation of each component with the bounds of one lag and of all lags together."""
     ax = axes_or_new(ax)
     lags, number = result.lags, result.values.shape[1]
     width = 0.7 / number
@@ -114,25 +101,9 @@ def nis_over_record(
     window: int = 50,
     probability: float = 0.99,
 ) -> Axes:
-    """Draw the NIS of one sensor per degree of freedom over time, its running mean, and the bounds of one measurement.
+    """Draw the NIS of one sensor per degree of freedom over time, its running mean over ``window``, and the bounds of one measurement.
 
-    Parameters
-    ----------
-    innovations : Innovations
-        Of one sensor.
-    bounds : (float, float)
-        That hold the NIS of one measurement of a consistent filter with ``probability``.
-    ax : Axes, optional
-        A new figure's if not given.
-    window : int
-        Measurements in the running mean.
-    probability : float
-        Confidence level in the legend.
-
-    Returns
-    -------
-    Axes
-        What was drawn on.
+    ``bounds`` hold the NIS of one measurement of a consistent filter with ``probability``.
     """
     ax = axes_or_new(ax)
     degrees = innovations.innovation.shape[1]
@@ -154,22 +125,7 @@ def nis_over_record(
 
 
 def error_distribution(distribution: Distribution, ax: Axes | None = None, *, label: str = "attitude error") -> Axes:
-    """Draw the share of errors at or below each size, with the median and the 95 % error marked.
-
-    Parameters
-    ----------
-    distribution : Distribution
-        Of errors in rad.
-    ax : Axes, optional
-        A new figure's if not given.
-    label : str
-        Name of the error on the horizontal axis.
-
-    Returns
-    -------
-    Axes
-        What was drawn on.
-    """
+    """Draw the share of errors, rad, at or below each size, with the median and the 95 % error marked."""
     ax = axes_or_new(ax)
     unit, size = angle_unit(np.array([distribution.quantile(0.99)]))
     ax.plot(*decimated(distribution.values / size, 100.0 * distribution.probability), color=BLUE, label=label)

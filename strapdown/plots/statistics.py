@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
+from matplotlib.ticker import LogFormatter
 
 from strapdown.checks import Array
 from strapdown.consistency import mean_bounds
@@ -23,10 +25,18 @@ from strapdown.plots.style import (
     ink,
     layered,
     legend_above,
+    new_figure,
     rate_unit,
 )
 
 BOUNDS = "bounds of a consistent filter"
+
+
+class _Plain(LogFormatter):
+    """Labels of a log axis as plain numbers: 0.8 and 2, not 8 × 10⁻¹ and 2 × 10⁰."""
+
+    def _num_to_string(self, x: float, vmin: float, vmax: float) -> str:
+        return f"{x:g}"
 
 
 def nees_over_time(
@@ -62,8 +72,10 @@ def nees_over_time(
     for k, (name, statistics) in enumerate(named):
         ax.plot(statistics.time, statistics.anees[:, column], label=name, **layered(k, len(named)))
     ax.set_yscale("log")
+    ax.yaxis.set_major_formatter(_Plain())
+    ax.yaxis.set_minor_formatter(_Plain(minor_thresholds=(2.0, 0.5)))
     ax.set_xlabel("time, s")
-    ax.set_ylabel(f"NEES of the {subset}, per state (log scale)")
+    ax.set_ylabel(f"NEES of the {subset},\nper state (log scale)")
     return ax
 
 
@@ -103,6 +115,25 @@ def nis_over_time(
 
 STATES = tuple(f"{what} {axis}" for what in ("attitude", "bias") for axis in AXES)
 """Names of the six states of the error (δθ, δb)."""
+
+
+def runs_overview(statistics: Statistics, probability: float = 0.99) -> Figure:
+    """Draw ANEES of attitude and bias, and the NIS, over time, with the bounds of a consistent filter."""
+    figure, axes = new_figure(1, 3, size=(12.0, 4.2))
+    axes[1].set_visible(statistics.has_bias)
+    bounds = mean_bounds(3, statistics.runs, probability)
+    label = f"{100 * probability:g} % bounds, each epoch"
+    low, high = np.nanmin(statistics.anees), np.nanmax(statistics.anees)
+    for ax, subset in zip(axes, ("attitude", "bias") if statistics.has_bias else ("attitude",), strict=False):
+        nees_over_time([("all runs", statistics)], bounds, subset, ax, label=label)
+        ax.set_ylim(min(0.5, 0.8 * float(low)), max(2.0, 1.3 * float(high)))
+        legend_above(ax)
+    if statistics.sensor_degrees.sum() > 0:
+        nis_over_time([("all runs", statistics)], axes[2], probability=probability)
+        legend_above(axes[2])
+    else:
+        axes[2].set_visible(False)
+    return figure
 
 
 def state_unit(state: int, value: Array) -> tuple[str, float]:
@@ -178,20 +209,9 @@ def coverage_by_state(statistics: Statistics, epoch: int = -1, ax: Axes | None =
 def covariance_ellipses(
     claimed: Array, found: Array, pair: tuple[int, int] = (0, 1), ax: Axes | None = None, *, probability: float = 0.95
 ) -> Axes:
-    """Draw the ellipse of two states that holds ``probability`` of the errors by the filter's covariance, and that of the actual errors.
+    """Draw the ellipses that hold ``probability`` of the errors of two states by the filter's covariance, and of the actual errors.
 
-    Parameters
-    ----------
-    claimed : (6, 6)
-        The filter's mean covariance P at one epoch, rad and rad/s.
-    found : (6, 6)
-        Mean e eᵀ over the runs at that epoch.
-    pair : (int, int)
-        The two states, 0 to 5.
-    ax : Axes, optional
-        A new figure's if not given.
-    probability : float
-        Of a normal error of either covariance to lie inside its ellipse.
+    ``claimed`` is the filter's mean covariance P at one epoch, ``found`` the mean e eᵀ over the runs there (6, 6), rad and rad/s.
     """
     from scipy.stats import chi2
 

@@ -1,4 +1,4 @@
-"""What all figures share: colours, sizes, saving."""
+"""Style of all figures: colours, sizes, saving."""
 
 from __future__ import annotations
 
@@ -132,18 +132,9 @@ def save(figure: Figure, path: str | os.PathLike[str]) -> Path:
 
 
 def save_as(figures: Mapping[Path, Figure], form: str) -> list[Path]:
-    """Write figures in one format; the same figure of an earlier run in another format is removed.
+    """Write figures, by path, whose suffix is replaced, in one format; return the files.
 
-    Parameters
-    ----------
-    figures : mapping
-        Path of each figure, whose suffix is replaced, and the figure.
-    form : {"png", "pdf", "svg"}
-
-    Returns
-    -------
-    list of Path
-        The files written.
+    The same figure of an earlier run in another format is removed.
     """
     one_of("format", form, FORMATS)
     written = [save(figure, path.with_suffix(f".{form}")) for path, figure in figures.items()]

@@ -3,28 +3,17 @@
 A recording holds point samples of rate, specific force and magnetic field of a device, on one time axis. :mod:`strapdown.ahrs`
 estimates attitude from it.
 
-``formats``
-    The table of formats, :func:`read` by content, :func:`write` by ending.
-``recording``
-    :class:`Recording` and its units.
-``body_axes``
-    Axes and signs that are not the package's: :func:`with_axes`.
-``columns``, ``delimited``, ``dataframes``
-    Tables: roles of columns; CSV and TSV; Parquet, pandas and xarray.
-``ros``
-    ROS bags.
-``ulog``
-    Flight logs of PX4.
-``telemetry``
-    Logs of cameras, flight controllers and phones.
-``trajectories``
-    Folders of EuRoC and TUM-VI, TUM trajectories as references.
-``broad``
-    BROAD HDF5.
-``estimates``
-    Estimates in files of all these kinds.
-``samples``
-    One sensor at rest, for the identification of its noise.
+- ``formats``: The table of formats, :func:`read` by content, :func:`write` by ending.
+- ``recording``: :class:`Recording` and its units.
+- ``body_axes``: Axes and signs that are not the package's: :func:`with_axes`.
+- ``columns``, ``delimited``, ``dataframes``: Tables: roles of columns; CSV and TSV; Parquet, pandas and xarray.
+- ``ros``: ROS bags.
+- ``ulog``: Flight logs of PX4.
+- ``telemetry``: Logs of cameras, flight controllers and phones.
+- ``trajectories``: Folders of EuRoC and TUM-VI, TUM trajectories as references.
+- ``broad``: BROAD HDF5.
+- ``estimates``: Estimates in files of all these kinds.
+- ``samples``: One sensor at rest, for the identification of its noise.
 """
 
 from __future__ import annotations
@@ -34,16 +23,9 @@ from strapdown.recordings import unit_calibration as unit_calibration
 from strapdown.recordings.body_axes import SENSORS as SENSORS
 from strapdown.recordings.body_axes import axes_matrix as axes_matrix
 from strapdown.recordings.body_axes import with_axes as with_axes
-from strapdown.recordings.broad import EVEN as EVEN
-from strapdown.recordings.broad import read_broad as read_broad
-from strapdown.recordings.broad import write_broad as write_broad
-from strapdown.recordings.columns import SHORT_STAMPS as SHORT_STAMPS
 from strapdown.recordings.columns import parse_mapping as parse_mapping
 from strapdown.recordings.dataframes import from_table
-from strapdown.recordings.delimited import read_csv as read_csv
-from strapdown.recordings.delimited import write_csv as write_csv
 from strapdown.recordings.formats import FORMATS, read, write
-from strapdown.recordings.formats import Format as Format
 from strapdown.recordings.formats import estimate_format as estimate_format
 from strapdown.recordings.formats import format_of as format_of
 from strapdown.recordings.formats import from_record as from_record
@@ -52,27 +34,22 @@ from strapdown.recordings.formats import is_record as is_record
 from strapdown.recordings.formats import not_held as not_held
 from strapdown.recordings.formats import writers as writers
 from strapdown.recordings.recording import FORCE_UNITS as FORCE_UNITS
-from strapdown.recordings.recording import GAP as GAP
-from strapdown.recordings.recording import MAGNETIC_UNITS as MAGNETIC_UNITS
 from strapdown.recordings.recording import RATE_UNITS as RATE_UNITS
 from strapdown.recordings.recording import TIME_UNITS as TIME_UNITS
-from strapdown.recordings.recording import Recording, gaps
+from strapdown.recordings.recording import Recording
+from strapdown.recordings.recording import gaps as gaps
 from strapdown.recordings.recording import increments as increments
 from strapdown.recordings.samples import GyroSamples, read_samples
-from strapdown.recordings.samples import read_gyro as read_gyro
 from strapdown.recordings.samples import samples_of as samples_of
-from strapdown.recordings.trajectories import read_euroc as read_euroc
 from strapdown.recordings.trajectories import read_tum as read_tum
-from strapdown.recordings.trajectories import with_reference
+from strapdown.recordings.trajectories import with_reference as with_reference
 
 __all__ = [
     "FORMATS",
     "GyroSamples",
     "Recording",
     "from_table",
-    "gaps",
     "read",
     "read_samples",
-    "with_reference",
     "write",
 ]

@@ -1,6 +1,6 @@
-"""Attitudes over time from files of any filter or reference, with their covariance where the file tells it: what a filter is judged by.
+"""Attitudes over time from files of any filter or reference, with their covariance where the file gives it: what a filter is judged by.
 
-``read_attitudes`` tells formats apart by content:
+``read_attitudes`` distinguishes formats by content:
 
 - results of this package (HDF5): estimate, simulated record (its truth), integrated attitude;
 - TUM trajectories (no covariance) and EuRoC's ground truth;
@@ -46,11 +46,11 @@ class Attitudes:
     covariance: Array | None = None
     """(m, 3, 3) of the attitude error, rad², or (m, 6, 6) with that of the bias."""
     error_frame: str = ""
-    """What the covariance is of (:data:`strapdown.consistency.foreign.ERROR_FRAMES`), where the format says; else empty."""
+    """Error that the covariance describes (:data:`strapdown.consistency.foreign.ERROR_FRAMES`), where the format says; else empty."""
     bias: Array | None = None
     """Gyro bias (m, 3), rad/s, body axes."""
     innovations: Mapping[str, Innovations] = field(default_factory=dict)
-    """By sensor; times in s since the first stamp."""
+    """Innovations by sensor; times in s since the first stamp."""
     remarks: tuple[str, ...] = ()
 
     def seconds(self, origin_ns: int) -> Array:
@@ -59,19 +59,7 @@ class Attitudes:
 
 
 def read_attitudes(path: str | os.PathLike[str], *, topic: str = "") -> Attitudes:
-    """Read the attitudes of a file, or of the folder of a ROS 2 bag.
-
-    Parameters
-    ----------
-    path : path
-    topic : str
-        Of a bag, where several topics hold attitudes.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, damaged, or holds no attitudes.
-    """
+    """Read the attitudes of a file, or of the folder of a ROS 2 bag; of several topics with attitudes name one."""
     file = Path(path)
     if ros.is_folder(file):
         return _bag(file, topic)
@@ -160,15 +148,15 @@ def _table(path: Path) -> Attitudes:
                 match = pattern.fullmatch(cell.strip().lower())
                 if match is None:
                     continue
-                told = match.groupdict()
-                key = f"{told['one']} {told['two']}" if name == "cov" else str(told.get("axis", ""))
-                if told.get("frame"):
-                    frames.add(told["frame"])
+                parts = match.groupdict()
+                key = f"{parts['one']} {parts['two']}" if name == "cov" else str(parts.get("axis", ""))
+                if parts.get("frame"):
+                    frames.add(parts["frame"])
                 if key in found[name]:
                     raise InputError(
                         f"{path.name}: column {cell} says the same as column {table.header[found[name][key][0]]}"
                     )
-                found[name][key] = (place, told.get("unit") or "")
+                found[name][key] = (place, parts.get("unit") or "")
         if len(frames) > 1:
             raise InputError(
                 f"{path.name}: its covariance is of {' and '.join(sorted(frames))} axes; name all its columns alike"
@@ -215,7 +203,7 @@ def _table(path: Path) -> Attitudes:
 def _covariance(
     name: str, columns: Mapping[str, Mapping[str, tuple[Array, str]]], m: int
 ) -> tuple[Array | None, str, list[str]]:
-    """Return the covariance that columns tell, what it is of where they say, and what is to be said of it."""
+    """Return the covariance in columns, the states it is of where they are named, and remarks."""
     given = columns["cov"]
     if given:
         size = 6 if any("b" in key for key in given) else 3
@@ -228,9 +216,9 @@ def _covariance(
             raise InputError(f"{name}: cov_{_STATES[i]}{_STATES[j]} is missing, or empty in a row; give all elements")
         return P, "", []
     for group, axes, frame in (("sigma", "xyz", ""), ("angle", ("roll", "pitch", "yaw"), "euler")):
-        told = columns[group]
-        if set(told) == set(axes):
-            sigma = np.stack([told[axis][0] * _SIZE[told[axis][1]] for axis in axes], axis=1)
+        entries = columns[group]
+        if set(entries) == set(axes):
+            sigma = np.stack([entries[axis][0] * _SIZE[entries[axis][1]] for axis in axes], axis=1)
             words = "The file has σ and no covariance: errors of different axes are taken for independent."
             return np.apply_along_axis(np.diag, 1, sigma**2), frame, [words]
     words = (
@@ -290,16 +278,16 @@ def _bag(path: Path, topic: str) -> Attitudes:
         raise
     except Exception as error:  # the library raises what its parsers do
         raise InputError(f"{path.name} cannot be read as a ROS bag ({' '.join(str(error).split())})") from None
-    told = [row for row in rows if any(row[1]) and not (row[2] is not None and row[2][0] == -1.0)]
-    if len(told) < 2:
+    known = [row for row in rows if any(row[1]) and not (row[2] is not None and row[2][0] == -1.0)]
+    if len(known) < 2:
         raise InputError(f"{path.name}: topic {chosen} says nothing of the orientation in its {len(rows)} messages")
-    told.sort(key=lambda row: row[0])
-    stamps = np.array([row[0] for row in told], np.int64)
+    known.sort(key=lambda row: row[0])
+    stamps = np.array([row[0] for row in known], np.int64)
     fresh = np.concatenate([[True], np.diff(stamps) > 0])
     remarks = [f"Topic {chosen}: {int(fresh.sum())} orientations of {len(rows)} messages."]
     covariance = None
     if beside:
-        P = np.array([row[2] for row in told])
+        P = np.array([row[2] for row in known])
         P = P.reshape(-1, 6, 6)[:, 3:, 3:] if P.shape[1] == 36 else P.reshape(-1, 3, 3)
         if P.any():
             covariance = P[fresh]
@@ -308,7 +296,7 @@ def _bag(path: Path, topic: str) -> Attitudes:
     return Attitudes(
         source=path.name,
         stamps_ns=stamps[fresh],
-        attitude=_unit(path.name, np.array([row[1] for row in told])[fresh]),
+        attitude=_unit(path.name, np.array([row[1] for row in known])[fresh]),
         covariance=covariance,
         remarks=tuple(remarks),
     )
@@ -321,7 +309,9 @@ def _topic(name: str, found: Mapping[str, Any], topic: str) -> str:
         return one_of(f"{name}: topic", topic, found)
     if len(found) > 1:
         listed = ", ".join(f"{t} ({c.msgtype.rpartition('/')[2]}, {c.msgcount} messages)" for t, c in found.items())
-        raise InputError(f"{name} has several topics with orientations: {listed}; choose one by --topic")
+        raise InputError(
+            f"{name} has several topics with orientations: {listed}; choose one by --topic (topic= in Python)"
+        )
     return next(iter(found))
 
 
@@ -355,19 +345,19 @@ def _ulog(path: Path) -> Attitudes:
         rows = data[_STATES_TOPIC]
         stamps, kept = _fresh(rows)
         ned = np.stack([np.asarray(rows[f"states[{k}]"], np.float64) for k in range(4)], axis=1)[kept]
-        told = np.stack(
+        known = np.stack(
             [np.asarray(rows[f"covariances[{k}]"], np.float64) for k in range(4) if f"covariances[{k}]" in rows], axis=1
         )[kept]
         number = sum(name.startswith("covariances[") for name in rows)
         ned = _unit(path.name, ned)
         if number == 24:  # variances of the quaternion: δθ = 2 Ξ(q)ᵀ δq
             xi = np.stack([_quaternion_columns(one) for one in ned])
-            covariance = 4.0 * np.einsum("mqi,mq,mqj->mij", xi, told, xi)
+            covariance = 4.0 * np.einsum("mqi,mq,mqj->mij", xi, known, xi)
             remarks.append(
                 "The log holds the variances of the quaternion without their correlations: σ of the attitude is approximate."
             )
         elif number > 0:
-            covariance = np.apply_along_axis(np.diag, 1, told[:, :3])
+            covariance = np.apply_along_axis(np.diag, 1, known[:, :3])
             remarks.append("The log holds the variances of the attitude error without their correlations.")
     elif _ATTITUDE_TOPIC in data:
         rows = data[_ATTITUDE_TOPIC]
@@ -385,7 +375,7 @@ def _ulog(path: Path) -> Attitudes:
     return Attitudes(
         source=path.name,
         stamps_ns=stamps * 1000,
-        attitude=outputs.from_ned(ned),
+        attitude=outputs.to_ned(ned),
         covariance=covariance,
         error_frame="body" if covariance is not None and number == 24 else "",
         innovations=innovations,
@@ -394,7 +384,7 @@ def _ulog(path: Path) -> Attitudes:
 
 
 def _fresh(rows: Mapping[str, Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return stamps, µs, in order and once each, and the rows that they are of; of the sample where that is told."""
+    """Return stamps, µs, in order and once each, and the rows that they are of; of the sample where the file gives it."""
     stamps = np.asarray(rows.get("timestamp_sample", rows["timestamp"])).astype(np.int64)
     order = np.argsort(stamps, kind="stable")
     kept = order[np.concatenate([[True], np.diff(stamps[order]) > 0])]

@@ -22,11 +22,6 @@ SENSORS = {"gyro": "rate", "accelerometer": "specific_force", "magnetometer": "m
 def axes_matrix(text: str, name: str = "axes") -> Array:
     """Return the signed permutation C (3, 3) of a text such as ``"x,-y,-z"``: ``v = C v_recorded``.
 
-    Raises
-    ------
-    InputError
-        If the text does not name each of x, y, z once.
-
     Examples
     --------
     >>> axes_matrix("y,-x,z") @ [1.0, 2.0, 3.0]
@@ -44,26 +39,10 @@ def axes_matrix(text: str, name: str = "axes") -> Array:
 def with_axes(
     recording: Recording, axes: str | Mapping[str, str] | None = None, invert: str | Iterable[str] = ()
 ) -> Recording:
-    """Return a recording in other body axes, or with the axes of single sensors corrected.
+    """Return a recording in other body axes, or with the axes of single sensors corrected; its ``remarks`` say what was changed.
 
-    Parameters
-    ----------
-    recording : Recording
-    axes : str or mapping, optional
-        The recorded axes that become x, y, z: ``"x,-y,-z"`` turns forward-right-down axes to forward-left-up ones. Of the whole unit,
-        its reference attitude included; or by sensor, ``{"magnetometer": "y,x,-z"}``.
-    invert : str or iterable of str
-        Sensors whose sign is inverted on all axes: gyro, accelerometer, magnetometer.
-
-    Returns
-    -------
-    Recording
-        Its ``remarks`` say what was changed.
-
-    Raises
-    ------
-    InputError
-        If the axes are none, the recording has no such sensor, or a mirrored unit has a reference attitude.
+    ``axes`` are the recorded axes that become x, y, z, ``"x,-y,-z"`` from forward-right-down to forward-left-up, of the whole unit, its
+    reference attitude included; or by sensor, ``{"magnetometer": "y,x,-z"}``. ``invert`` names sensors whose sign is inverted on all axes.
     """
     whole, single = (None, dict(axes)) if isinstance(axes, Mapping) else (axes, {})
     matrices = {sensor: axes_matrix(text, f"axes of the {sensor}") for sensor, text in single.items()}

@@ -115,13 +115,7 @@ def unit_of(group: str, text: str) -> str:
 
 
 def parse_mapping(text: str) -> dict[str, str]:
-    """Return the columns of ``time=timestamp,gx=gyro_x[dps],…`` by role, as ``--columns`` takes them.
-
-    Raises
-    ------
-    InputError
-        If a part has no ``=``, a role is not known, or is given twice.
-    """
+    """Return the columns of ``time=timestamp,gx=gyro_x[dps],…`` by role, as ``--columns`` takes them."""
     roles = [role for members in GROUPS.values() for role in members]
     found: dict[str, str] = {}
     for part in text.split(","):
@@ -148,22 +142,10 @@ def recording(
 ) -> Recording:
     """Return the recording of a table.
 
-    Parameters
-    ----------
-    source : str
-        What errors call the table.
-    header : sequence of str
-        Names of the columns, perhaps with their units.
-    load : callable
-        Returns the numbers (n,) of columns, empty fields NaN, of their places and that of the time; called once.
-    clock_ns : callable
-        Returns (time, epoch_ns) of a loaded column that holds stamps as whole ns or dates, None of one that holds numbers.
-    units : mapping, optional
-        Units of ``time``, ``gyro``, ``accelerometer``, ``magnetometer`` where the header does not declare them.
-    mapping : mapping, optional
-        Names of columns by role, perhaps with a unit: ``{"gx": "gyro_x [dps]"}``; the others are found by their names.
-    gyro_alone : bool
-        Leave the columns of the other sensors alone.
+    ``load`` returns the numbers (n,) of columns, empty fields NaN, of their places and that of the time, and is called once; ``clock_ns``
+    returns (time, epoch_ns) of a loaded column that holds stamps as whole ns or dates, None of one that holds numbers. ``units`` serve
+    where the header declares none; ``mapping`` names columns by role, perhaps with a unit, ``{"gx": "gyro_x [dps]"}``, the others are found
+    by their names.
     """
     known_keys("units", units or {}, [group for group in UNITS if group != "temperature"])
     columns = [column(cell) for cell in header]
@@ -225,7 +207,7 @@ def _lacks(source: str, missing: Sequence[str], columns: Sequence[Column]) -> st
     has = ", ".join(one.name for one in columns)
     return (
         f"{source}: the header lacks {', '.join(missing)} (it has: {has}); name the columns, as in "
-        f"--columns {missing[0]}=NAME,…"
+        f"--columns {missing[0]}=NAME,… (columns= in Python)"
     )
 
 
@@ -302,7 +284,8 @@ def _guess(source: str, group: str, columns: Sequence[Column]) -> tuple[tuple[in
         said = " or ".join(columns[axes[0][0]].said for _, axes in whole)
         role = GROUPS[group][0]
         raise InputError(
-            f"{source}: the {group} may be that of {said}; say which, as in --columns {role}={columns[whole[0][1][0][0]].name},…"
+            f"{source}: the {group} may be that of {said}; say which, as in "
+            f"--columns {role}={columns[whole[0][1][0][0]].name},… (columns= in Python)"
         )
     if not whole:
         return None

@@ -46,24 +46,8 @@ def read_csv(
     """Read a table of text, by default of columns ``time, gx, gy, gz[, ax, ay, az[, mx, my, mz]]`` in any order.
 
     Other columns are left alone. Empty fields of accelerometer and magnetometer are missing samples; rows with an empty field of the gyro
-    are left out and named in ``missing_gyro``, as are rows that repeat the row before, in ``repeated``.
-
-    Parameters
-    ----------
-    path : path
-        Text in UTF-8.
-    units : mapping, optional
-        Units of ``time``, ``gyro``, ``accelerometer``, ``magnetometer`` where the header does not declare them.
-    gyro_alone : bool
-        Leave the columns of the other sensors alone, whose units need not be known then.
-    columns : mapping, optional
-        Names of columns by role where they are not the usual ones: ``{"time": "timestamp [us]", "gx": "gyro_x[dps]"}``.
-
-    Raises
-    ------
-    InputError
-        If the file is no such table, a row is cut short or holds no number, a unit is unknown, undeclared or contradicted, or a column is
-        missing or could be one of several.
+    are left out and named in ``missing_gyro``, as are rows that repeat the row before, in ``repeated``. Options as
+    :func:`strapdown.recordings.read`; with ``gyro_alone`` the units of the other sensors need not be known.
     """
     file = Path(path)
     if recordfiles.is_record(file):

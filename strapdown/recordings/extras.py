@@ -19,7 +19,7 @@ def library(name: str, what: str, extra: str = "formats") -> Any:
 
 
 def with_ending(path: Path, ending: str, folder: Path) -> Path:
-    """Return a path to the same file with that ending, by which some libraries tell formats apart: a link in ``folder`` if need be."""
+    """Return a path to the same file with that ending, by which some libraries distinguish formats: a link in ``folder`` if need be."""
     if path.suffix.lower() == ending:
         return path
     link = folder / f"{path.stem}{ending}"

@@ -45,7 +45,7 @@ class Format:
     estimate_options: tuple[str, ...] = ()
     """Keywords that the writer of estimates takes."""
     lacks: tuple[str, ...] = ()
-    """What a recording may hold and the format cannot: ``"temperature"``, ``"reference"``, ``"movement"``, ``"clock"``."""
+    """Contents of a recording that the format cannot hold: ``"temperature"``, ``"reference"``, ``"movement"``, ``"clock"``."""
     with_samples: bool = False
     """Whether an estimate is written with the recording's samples, and so never without a recording."""
 
@@ -146,13 +146,7 @@ FORMATS: tuple[Format, ...] = (
 
 
 def format_of(path: str | os.PathLike[str]) -> Format:
-    """Return the format of a file or folder by its content, or by its ending where the content is not conclusive.
-
-    Raises
-    ------
-    InputError
-        If there is no such file or folder, or it is of no known format.
-    """
+    """Return the format of a file or folder by its content, or by its ending where the content is not conclusive."""
     file = Path(path)
     if not file.exists():
         raise InputError(f"{path} does not exist; check the path")
@@ -302,13 +296,7 @@ def write(
 def estimate_format(path: str | os.PathLike[str], options: Iterable[str] = (), *, recording: bool = True) -> Format:
     """Return the format that an estimate's file is written in, so that what cannot be is refused before anything is computed.
 
-    Parameters
-    ----------
-    path : path
-    options : iterable of str
-        Options of the writer that are to be used.
-    recording : bool
-        Whether the estimate was made from a recording, whose samples some formats need.
+    ``options`` are those of the writer that are to be used, ``recording`` whether there is one, whose samples some formats need.
     """
     found = _by_ending(path, "write_estimate")
     for name in options:
@@ -339,21 +327,10 @@ def _by_ending(path: str | os.PathLike[str], kind: str) -> Format:
 
 
 def from_record(record: ImuRecord, source: str = "record") -> Recording:
-    """Return a simulated record as a device would have recorded it.
+    """Return a simulated record of n intervals as a device would have recorded it: n samples.
 
-    Parameters
-    ----------
-    record : ImuRecord
-        Record of n intervals.
-    source : str, default "record"
-        Name of the recording.
-
-    Returns
-    -------
-    Recording
-        Recording of n samples. The rate at each stamp is the mean over the sample interval that ends there, as of an integrating
-        gyro: half an interval late. Vector series named accelerometer and magnetometer are included where they have samples at the
-        stamps; the truth is the reference.
+    The rate at each stamp is the mean over the sample interval that ends there, as of an integrating gyro: half an interval late. Vector
+    series named accelerometer and magnetometer are included where they have samples at the stamps; the truth is the reference.
     """
     steps = np.diff(record.time)[:, None]
     own: dict[str, Any] = {}

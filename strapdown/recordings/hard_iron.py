@@ -33,20 +33,8 @@ FEIGNED = 0.028
 def find(field: Array, frame: Array, time: Array, known: np.ndarray, strength: float, *, causal: bool) -> Array:
     """Return the hard iron at each row (k, 3), in the unit of the field and body axes.
 
-    Parameters
-    ----------
-    field : (k, 3)
-        Field in the frame that the gyro keeps.
-    frame : (k, 4)
-        Attitude there by the gyro.
-    time : (k,)
-        Times, s, nearly even.
-    known : (k,) bool
-        Rows with a field.
-    strength : float
-        Strength of the field.
-    causal : bool
-        From the rows up to each alone; otherwise from those after it too.
+    ``field`` (k, 3) is in the frame that the gyro keeps, ``frame`` (k, 4) the attitude there by the gyro, ``time`` (k,) nearly even, s,
+    ``known`` (k,) the rows with a field. ``causal``: from the rows up to each alone; otherwise from those after it too.
     """
     interval = float(np.median(np.diff(time)))
     lag = max(1, round(SPAN / interval))

@@ -96,27 +96,9 @@ def write_record(
     run: int | None = None,
     attributes: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write a record to HDF5; the file appears whole or not at all.
+    """Write a record to HDF5, with how it was made; the file appears whole or not at all.
 
-    Parameters
-    ----------
-    path : path-like
-        File.
-    record : ImuRecord
-        Record.
-    gyro_spec : GyroSpec, optional
-        Specification of the gyro that it was simulated with.
-    scenario : str, default ""
-        Scenario as TOML (:func:`strapdown.scenarios.scenario_to_toml`).
-    seed, run : int, optional
-        Seed and run of the random streams.
-    attributes : mapping of str, optional
-        Further attributes of the file.
-
-    Raises
-    ------
-    InputError
-        If an attribute has the name of one that the file has already.
+    ``scenario`` is TOML (:func:`strapdown.scenarios.scenario_to_toml`), ``attributes`` are further ones of the file.
     """
     for name in attributes or {}:
         if name in _RESERVED:
@@ -167,62 +149,33 @@ def _begins(path: str | os.PathLike[str], mark: bytes) -> bool:
 
 
 def read_record(path: str | os.PathLike[str]) -> ImuRecord:
-    """Read the record of a file written by :func:`write_record` or :func:`export_csv`.
-
-    Parameters
-    ----------
-    path : path-like
-        File.
-
-    Returns
-    -------
-    ImuRecord
-        The record.
-
-    Raises
-    ------
-    InputError
-        As :func:`read_record_file`.
-    """
+    """Read the record of a file written by :func:`write_record` or :func:`export_csv`."""
     return read_record_file(path).record
 
 
 def read_record_file(path: str | os.PathLike[str]) -> RecordFile:
     """Read a file written by :func:`write_record` or :func:`export_csv` with all that it holds.
 
-    Parameters
-    ----------
-    path : path-like
-        File.
-
-    Returns
-    -------
-    RecordFile
-        The record and how it was made.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, truncated, of another kind or a newer layout, or its units or conventions are not those of
-        :func:`write_record`.
+    Measurements of NaN are missing. An increment must not be NaN: the rotation over an interval without one is unknown. If a row of a CSV
+    is left out, the next one must hold the rotation over both intervals.
     """
     if _begins(path, _MARK.encode()):
         with reading.from_file(path):
             return _read_csv_record(Path(path))
     with reading.hdf5(path) as file:
-        told = reading.attributes(file)
-        kind = told.get("kind")
+        attributes = reading.attributes(file)
+        kind = attributes.get("kind")
         if kind != KIND:
             raise InputError(
                 f"{path} is {f'a {kind}' if kind else 'HDF5 of another program'}, not a {KIND}; pass one written by write_record"
             )
-        if count("format", told["format"]) > FORMAT:
+        if count("format", attributes["format"]) > FORMAT:
             raise InputError(
-                f"{path} has layout {told['format']}, this version ({strapdown.__version__}) reads up to {FORMAT}; update it"
+                f"{path} has layout {attributes['format']}, this version ({strapdown.__version__}) reads up to {FORMAT}; update it"
             )
-        if told.get("conventions", CONVENTIONS) != CONVENTIONS:
+        if attributes.get("conventions", CONVENTIONS) != CONVENTIONS:
             raise InputError(
-                f"{path} follows other conventions ({told['conventions']}); convert it to those of this package: {CONVENTIONS}"
+                f"{path} follows other conventions ({attributes['conventions']}); convert it to those of this package: {CONVENTIONS}"
             )
         group = file.get("vectors", {})
         series = tuple(_series(group[str(number)]) for number in range(len(group)))
@@ -232,44 +185,48 @@ def read_record_file(path: str | os.PathLike[str]) -> RecordFile:
         record = ImuRecord(
             time=_values(file, "time", "s"), increments=_values(file, "increments", "rad"), vectors=series, truth=truth
         )
-        more = {name: value for name, value in told.items() if name not in _RESERVED}
-        return RecordFile(record=record, version=str(told["version"]), attributes=more, **_making(told, path))
+        more = {name: value for name, value in attributes.items() if name not in _RESERVED}
+        return RecordFile(
+            record=record, version=str(attributes["version"]), attributes=more, **_making(attributes, path)
+        )
 
 
-def _making(told: Mapping[str, Any], path: str | os.PathLike[str]) -> dict[str, Any]:
+def _making(attributes: Mapping[str, Any], path: str | os.PathLike[str]) -> dict[str, Any]:
     """Return how a record was made, as its file states."""
-    made: dict[str, Any] = {name: count(name, told[name], least=0) for name in ("seed", "run") if name in told}
-    if "gyro" in told:
-        table = told["gyro"]
+    made: dict[str, Any] = {
+        name: count(name, attributes[name], least=0) for name in ("seed", "run") if name in attributes
+    }
+    if "gyro" in attributes:
+        table = attributes["gyro"]
         table = reading.from_json(table, f"{path}: gyro") if isinstance(table, str) else table
         made["gyro"] = gyro.from_table(table, f"{path}: gyro")
-    if "scenario" in told:
-        if not isinstance(told["scenario"], str):
-            raise InputError(f"{path}: scenario is {told['scenario']!r}; it must be TOML text")
-        made["scenario"] = told["scenario"]
+    if "scenario" in attributes:
+        if not isinstance(attributes["scenario"], str):
+            raise InputError(f"{path}: scenario is {attributes['scenario']!r}; it must be TOML text")
+        made["scenario"] = attributes["scenario"]
     return made
 
 
 def _values(group: Any, name: str, unit: str) -> Array:
     """Return an array of a file; its attribute ``unit``, if present, must be the expected one."""
     value = reading.numbers(group, name)
-    told = reading.attributes(group[name]).get("unit", unit)
-    if told != unit:
+    own = reading.attributes(group[name]).get("unit", unit)
+    if own != unit:
         raise InputError(
-            f"{group.file.filename}: {f'{group.name}/{name}'.lstrip('/')} is in {told!r}, and read in {unit!r}; convert it"
+            f"{group.file.filename}: {f'{group.name}/{name}'.lstrip('/')} is in {own!r}, and read in {unit!r}; convert it"
         )
     return value
 
 
 def _series(group: Any) -> VectorMeasurements:
     fields = {name: _values(group, name, unit) for name, unit in _SERIES.items() if name in group}
-    told = reading.attributes(group)
-    if told["kind"] != "attitude" and not fields.keys() & {"sigma", "sigma_axes", "covariance"}:
+    attributes = reading.attributes(group)
+    if attributes["kind"] != "attitude" and not fields.keys() & {"sigma", "sigma_axes", "covariance"}:
         raise InputError(
-            f"{group.file.filename}: {group.name.lstrip('/')} ({told['sensor']}) lacks sigma; give each measurement its standard "
+            f"{group.file.filename}: {group.name.lstrip('/')} ({attributes['sensor']}) lacks sigma; give each measurement its standard "
             "deviation"
         )
-    return VectorMeasurements(sensor=told["sensor"], kind=told["kind"], **fields)
+    return VectorMeasurements(sensor=attributes["sensor"], kind=attributes["kind"], **fields)
 
 
 # --------------------------------------------------------------------------------------------------------------------- CSV
@@ -292,37 +249,13 @@ def export_csv(
     seed: int | None = None,
     run: int | None = None,
 ) -> tuple[Path, ...]:
-    """Write a record as CSV, 17 digits per number.
+    """Write a record as CSV, 17 digits per number; return the files written, the record first.
 
-    Parameters
-    ----------
-    path : path-like
-        File.
-    record : ImuRecord
-        Record.
-    gyro_spec : GyroSpec, optional
-        Specification of the gyro that it was simulated with.
-    scenario : str, default ""
-        Scenario as TOML (:func:`strapdown.scenarios.scenario_to_toml`).
-    seed, run : int, optional
-        Seed and run of the random streams.
-
-    Returns
-    -------
-    tuple of Path
-        Files written: the record, then its vector series.
-
-    Raises
-    ------
-    InputError
-        If the noise of a sensor differs by body axis, for which CSV has no columns; then nothing is written.
-
-    Notes
-    -----
-    ``path`` holds one row per edge: its time, the increment of the interval that ends there (NaN in the first row), and the truth
-    if there is one. Each vector series goes to ``STEM-vectors-N.csv`` in the same folder. The first line of each is a comment with
-    the kind of file, the time of its last row, and for the record the number of its series; the second names the columns, with
-    their units. The record is written last. Superfluous series of an earlier record of the same name are removed.
+    ``path`` holds one row per edge: its time, the increment of the interval that ends there (NaN in the first row), and the truth if there
+    is one. Each vector series goes to ``STEM-vectors-N.csv`` in the same folder. The first line of each is a comment with the kind of file,
+    the time of its last row, and for the record the number of its series; the second names the columns, with their units. The record is
+    written last. Superfluous series of an earlier record of the same name are removed. Noise that differs by body axis is refused, for CSV
+    has no columns for it.
     """
     for series in record.vectors:
         if series.anisotropic:
@@ -388,34 +321,6 @@ def _write_csv(path: Path, comment: str, names: tuple[str, ...], rows: Array) ->
         np.savetxt(file, rows, delimiter=",", fmt="%.17g")
 
 
-def import_csv(path: str | os.PathLike[str]) -> ImuRecord:
-    """Read a record written by :func:`export_csv`, with the vector series in the same folder.
-
-    Parameters
-    ----------
-    path : path-like
-        File.
-
-    Returns
-    -------
-    ImuRecord
-        The record.
-
-    Raises
-    ------
-    InputError
-        If the file is missing or of another kind, does not reach the time stated in its first line, or a row is cut short, holds no
-        number or no increment (the message names its line).
-
-    Notes
-    -----
-    Measurements of NaN are missing. An increment must not be NaN: the rotation over an interval without one is unknown. If a row is
-    left out, the next one must hold the rotation over both intervals.
-    """
-    with reading.from_file(path):
-        return _read_csv_record(Path(path)).record
-
-
 def _read_csv_record(target: Path) -> RecordFile:
     comment, names, rows = _read_csv(target)
     if not comment.startswith(f"{_MARK} record"):
@@ -434,8 +339,8 @@ def _read_csv_record(target: Path) -> RecordFile:
     truth = Truth(attitude=rows[:, 4:8], bias=rows[:, 8:11]) if len(names) > 4 else None
     series = tuple(_import_series(beside) for beside in _series_beside(target, comment))
     record = ImuRecord(time=rows[:, 0], increments=rows[1:, 1:4], vectors=series, truth=truth)
-    told = re.search(r", to (\S+) s,", comment)
-    _need_end(target, rows, float(told[1]) if told else rows[-1, 0])
+    end = re.search(r", to (\S+) s,", comment)
+    _need_end(target, rows, float(end[1]) if end else rows[-1, 0])
     if not made:
         return RecordFile(record=record)
     try:
@@ -448,28 +353,28 @@ def _read_csv_record(target: Path) -> RecordFile:
         ) from None
 
 
-def _need_end(path: Path, rows: Array, told: float | None) -> None:
+def _need_end(path: Path, rows: Array, stated: float | None) -> None:
     """Refuse a file that ends at another time than its first line states (None: no rows): a cut between two lines leaves no other trace."""
     ends = rows[-1, 0] if len(rows) else None
-    if ends != told:
+    if ends != stated:
         raise InputError(
-            f"{path} ends at {ends} s, its first line states {told} s; it was truncated or extended: restore it, or "
+            f"{path} ends at {ends} s, its first line states {stated} s; it was truncated or extended: restore it, or "
             "change the time there if the rows are intended"
         )
 
 
 def _series_beside(target: Path, comment: str) -> list[Path]:
     """Return the files of the vector series of a record: the stated number, or without one all that are numbered in sequence."""
-    told = re.search(rf", (\d+){_COUNTED};", comment)
-    if told is None:
+    stated = re.search(rf", (\d+){_COUNTED};", comment)
+    if stated is None:
         return list(itertools.takewhile(Path.is_file, (_series_file(target, number) for number in itertools.count())))
     files = []
-    for number in range(int(told[1])):
+    for number in range(int(stated[1])):
         file = _series_file(target, number)
         files.append(file)
         if not file.is_file():
             raise InputError(
-                f"{file} does not exist, one of {told[1]} vector series of {target.name}; put it in the folder of the record"
+                f"{file} does not exist, one of {stated[1]} vector series of {target.name}; put it in the folder of the record"
             )
     return files
 

@@ -214,20 +214,8 @@ def at_nearest(time: Array, other: Array, values: Array) -> tuple[Array, int]:
 
 
 def increments(recording: Recording) -> Array:
-    """Return body increments over the intervals between the stamps, by the trapezoid rule.
+    """Return body increments (n − 1, 3), rad, over the intervals between the stamps, by the trapezoid rule.
 
-    Parameters
-    ----------
-    recording : Recording
-        Recording of n samples.
-
-    Returns
-    -------
-    ndarray (n − 1, 3)
-        Rotation increments, rad, body axes.
-
-    Notes
-    -----
     At uneven stamps point samples of rate support no higher order; at even ones :func:`strapdown.coning.increments_from_rates` fits
     higher polynomials.
     """
@@ -235,17 +223,7 @@ def increments(recording: Recording) -> Array:
 
 
 def gaps(time: ArrayLike) -> list[tuple[float, float]]:
-    """Return the gaps between stamps, where the motion is unknown.
-
-    Parameters
-    ----------
-    time : array_like (n,)
-        Stamps, s, increasing.
-
-    Returns
-    -------
-    list of (float, float)
-        Begin and length of each gap, s: intervals of more than five usual ones.
+    """Return begin and length, s, of each gap between stamps: intervals of more than five usual ones.
 
     Examples
     --------

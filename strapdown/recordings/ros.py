@@ -22,8 +22,9 @@ import shutil
 import sqlite3
 import struct
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -45,10 +46,14 @@ IMU, FIELD, TEMPERATURE, REFERENCE = (
 )
 DOUBLES = {IMU: 37, FIELD: 12, TEMPERATURE: 2, REFERENCE: 4}
 """Numbers behind the header of each message."""
+READ = {IMU: (13, 29), FIELD: (0, 3), TEMPERATURE: (0, 1), REFERENCE: (0, 4)}
+"""First and last of them that are read: of an inertial unit rate (3), its covariance (9), specific force (3), one of its covariance."""
 TOPICS = {IMU: "/imu/data_raw", FIELD: "/imu/mag", TEMPERATURE: "/imu/temperature", REFERENCE: "/imu/reference"}
 """Topics that are written, by the names of REP 145."""
 WITH_ORIENTATION = "/imu/data"
 FRAME = "imu_link"
+BATCH = 1024
+"""Messages that are taken from the library at once: a loop about each one would take as long as the library does."""
 
 ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC = b"#ROSBAG V2.0\n", b"\x89MCAP0\r\n", b"SQLite format 3\0"
 MAGICS = (ROS1_MAGIC, MCAP_MAGIC, SQLITE_MAGIC)
@@ -57,13 +62,35 @@ _SUFFIX = {ROS1_MAGIC: ".bag", MCAP_MAGIC: ".mcap", SQLITE_MAGIC: ".db3"}
 
 @dataclass
 class _Topic:
-    """The raw messages of one topic, in the order of the bag."""
+    """The messages of one topic in the order of the bag: decoded as they come, or, to be copied, as they are."""
 
     name: str
     kind: str
+    ros2: bool = True
+    decodes: bool = True
     logged: list[int] = field(default_factory=list)
     """Times of the recorder, ns."""
+    parts: list[tuple[NDArray[np.int64], Array]] = field(default_factory=list)
+    """Stamps, ns, and numbers of some messages."""
+    fault: str = ""
+    """What is wrong with the first message that cannot be decoded."""
     raw: list[bytes] = field(default_factory=list)
+
+    def add(self, rows: Sequence[tuple[Any, int, bytes]]) -> None:
+        """Append messages: what they come from, time of the recorder, content."""
+        raws = [raw for _, _, raw in rows]
+        if not self.decodes:
+            self.raw += raws
+        elif not self.fault:
+            try:
+                self.parts.append(_decoded(raws, self.kind, self.ros2, len(self.logged)))
+            except _UnreadableError as error:
+                self.fault = str(error)
+        self.logged += [logged for _, logged, _ in rows]
+
+    def __len__(self) -> int:
+        """Return the number of messages."""
+        return len(self.logged)
 
 
 class _Bag(NamedTuple):
@@ -90,38 +117,25 @@ def _storages(path: Path) -> list[Path]:
 
 
 def read_bag(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
-    """Read the inertial unit of a bag.
-
-    Parameters
-    ----------
-    path : path
-        A bag's file or folder.
-    topic : str
-        Topic of ``sensor_msgs/Imu``, where there are several.
-
-    Raises
-    ------
-    InputError
-        If the bag has no or several such topics, is no bag, or holds no whole message.
-    """
+    """Read the inertial unit of a bag, a file or a folder; of several topics of ``sensor_msgs/Imu`` name one."""
     file = Path(path)
     bag = _messages(file, wanted=tuple(DOUBLES))
     chosen = _chosen(file.name, bag.topics, topic)
-    stamps, values, order_words = _decoded(file.name, bag.topics[chosen], bag.ros2)
+    stamps, values, order_words = _joined(file.name, bag.topics[chosen])
     said = [f"Topic {chosen}: {len(stamps)} messages.", *bag.remarks, *order_words]
-    if values[0, 16] == -1.0:
+    if values[0, 3] == -1.0:
         raise InputError(
             f"{file.name}, topic {chosen}: message 1 declares that it has no angular velocity; choose another topic"
         )
     time, epoch = relative_time(stamps)
-    own: dict[str, Any] = {} if values[0, 28] == -1.0 else {"specific_force": values[:, 25:28]}
+    own: dict[str, Any] = {} if values[0, 15] == -1.0 else {"specific_force": values[:, 12:15]}
     for kind, name in ((FIELD, "magnetic_field"), (TEMPERATURE, "temperature"), (REFERENCE, "true_attitude")):
-        other = _beside(chosen, [t for t in bag.topics.values() if t.kind == kind and t.raw])
+        other = _beside(chosen, [t for t in bag.topics.values() if t.kind == kind and len(t)])
         if isinstance(other, str):
             said.append(other)
         if not isinstance(other, _Topic) or (kind == REFERENCE and not other.name.endswith("reference")):
             continue
-        other_stamps, other_values, words = _decoded(file.name, other, bag.ros2)
+        other_stamps, other_values, words = _joined(file.name, other)
         places = {FIELD: [0, 1, 2], TEMPERATURE: [0], REFERENCE: [3, 0, 1, 2]}[kind]  # a quaternion of ROS ends in w
         own[name], lost = at_nearest(time, (other_stamps - epoch) / 1e9, other_values[:, places])
         said += [
@@ -132,23 +146,25 @@ def read_bag(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
         own["magnetic_unit"] = "T"
     if "temperature" in own:
         own["temperature"] = own["temperature"][:, 0]
-    return with_gyro(source=file.name, time=time, rate=values[:, 13:16], epoch_ns=epoch, remarks=tuple(said), **own)
+    return with_gyro(source=file.name, time=time, rate=values[:, :3], epoch_ns=epoch, remarks=tuple(said), **own)
 
 
 def _chosen(name: str, topics: Mapping[str, _Topic], topic: str) -> str:
     """Return the topic of the inertial unit: the one asked for, or the only one."""
     units = {t.name: t for t in topics.values() if t.kind == IMU}
-    listed = ", ".join(f"{t.name} ({len(t.raw)} messages)" for t in units.values())
+    listed = ", ".join(f"{t.name} ({len(t)} messages)" for t in units.values())
     if topic:
         if not units:
             raise InputError(f"{name} has no topic of {IMU} (it has: {', '.join(topics) or 'none that is read'})")
         return one_of(f"{name}: topic", topic, units)
-    filled = [t.name for t in units.values() if t.raw]
+    filled = [t.name for t in units.values() if len(t)]
     if not filled:
         what = f"no message of {IMU}" + (f" on {listed}" if units else "")
         raise InputError(f"{name} holds {what}; give a bag of an inertial unit")
     if len(filled) > 1:
-        raise InputError(f"{name} has several inertial units: {listed}; choose one, --topic {filled[0]}")
+        raise InputError(
+            f"{name} has several inertial units: {listed}; choose one, --topic {filled[0]} (topic= in Python)"
+        )
     return filled[0]
 
 
@@ -164,51 +180,57 @@ def _beside(unit: str, found: list[_Topic]) -> _Topic | str | None:
     return f"None of {names} was taken, for none alone stands beside {unit}."
 
 
-def _decoded(name: str, topic: _Topic, ros2: bool) -> tuple[NDArray[np.int64], Array, list[str]]:
-    """Return stamps (n,), ns, numbers (n, d) of a topic's messages, in order of time, and remarks."""
-    wanted = DOUBLES[topic.kind]
-    stamps = np.empty(len(topic.raw), np.int64)
-    values = np.empty((len(topic.raw), wanted))
-    lengths = np.fromiter((len(raw) for raw in topic.raw), np.int64, len(topic.raw))
+class _UnreadableError(ValueError):
+    """A message is not of the type of its topic."""
+
+
+def _decoded(raws: list[bytes], kind: str, ros2: bool, before: int) -> tuple[NDArray[np.int64], Array]:
+    """Return stamps (n,), ns, and numbers (n, d) of messages of a type, of which so many came before."""
+    wanted, (first, last) = DOUBLES[kind], READ[kind]
+    lengths = np.fromiter(map(len, raws), np.int64, len(raws))
+    stamps, values = np.empty(len(raws), np.int64), np.empty((len(raws), last - first))
+
+    def refuse(rows: NDArray[np.int64], what: str) -> None:
+        raise _UnreadableError(f"message {before + int(rows[0]) + 1} is {what}")
+
     for length in np.unique(lengths).tolist():
         rows = np.flatnonzero(lengths == length)
         if length < 16 + 8 * wanted:
-            _bad(name, topic, rows, f"{length} bytes long, shorter than its type")
-        raws = topic.raw if len(rows) == len(topic.raw) else [topic.raw[k] for k in rows]
-        table = np.frombuffer(b"".join(raws), np.uint8).reshape(len(rows), length)
+            refuse(rows, f"{length} bytes long, shorter than its type")
+        table = np.frombuffer(b"".join([raws[k] for k in rows.tolist()]), np.uint8).reshape(len(rows), length)
         if ros2 and not np.all((table[:, 0] == 0) & (table[:, 1] == 1)):
-            _bad(
-                name, topic, rows[(table[:, 0] != 0) | (table[:, 1] != 1)], "in another encoding than little-endian CDR"
-            )
+            refuse(rows[(table[:, 0] != 0) | (table[:, 1] != 1)], "in another encoding than little-endian CDR")
         words = table[:, 4:16].copy().view("<u4")  # seconds, nanoseconds, length of the frame's name
         for frame in np.unique(words[:, 2]).tolist():
-            same = words[:, 2] == frame
+            same = np.flatnonzero(words[:, 2] == frame)
             begin = 16 + frame
             begin += -(begin - 4) % 8 if ros2 else 0  # CDR aligns doubles
             if begin + 8 * wanted > length:
-                _bad(name, topic, rows[same], f"{length} bytes long, shorter than its type")
-            numbers = np.ascontiguousarray(table[same, begin : begin + 8 * wanted]).view("<f8")
+                refuse(rows[same], f"{length} bytes long, shorter than its type")
+            numbers = table[:, begin + 8 * first : begin + 8 * last][same].view("<f8")
             values[rows[same]] = numbers
-            stamps[rows[same]] = words[same, 0].astype(np.int64) * 10**9 + words[same, 1]
+        stamps[rows] = words[:, 0].astype(np.int64) * 10**9 + words[:, 1]
+    return stamps, values
+
+
+def _joined(name: str, topic: _Topic) -> tuple[NDArray[np.int64], Array, list[str]]:
+    """Return stamps (n,), ns, numbers (n, d) of a topic's messages, in order of time, and remarks."""
+    if topic.fault:
+        raise InputError(f"{name}, topic {topic.name}: {topic.fault}; the bag is damaged or of another type")
+    stamps, values = (np.concatenate(column) for column in zip(*topic.parts, strict=True))
     said = []
     if not stamps.any() and len(stamps) > 1:
         stamps = np.array(topic.logged, np.int64)
         said.append(f"The headers of {topic.name} have no stamps: time is that of the recorder.")
     back = int(np.sum(np.diff(stamps) < 0))
     if back:
-        first = int(np.argmax(np.diff(stamps) < 0)) + 2
+        number = int(np.argmax(np.diff(stamps) < 0)) + 2
         order = np.argsort(stamps, kind="stable")
         stamps, values = stamps[order], values[order]
         said.append(
-            f"{back} messages of {topic.name}, the first of them number {first}, came after later ones and were sorted."
+            f"{back} messages of {topic.name}, the first of them number {number}, came after later ones and were sorted."
         )
     return stamps, values, said
-
-
-def _bad(name: str, topic: _Topic, rows: NDArray[np.int64], what: str) -> None:
-    raise InputError(
-        f"{name}, topic {topic.name}: message {int(rows[0]) + 1} is {what}; the bag is damaged or of another type"
-    )
 
 
 def _messages(path: Path, wanted: tuple[str, ...] = ()) -> _Bag:
@@ -224,15 +246,15 @@ def _messages(path: Path, wanted: tuple[str, ...] = ()) -> _Bag:
             named = [_named(one, Path(folder)) for one in files]
             store = typesys.get_typestore(typesys.Stores.LATEST)
             with highlevel.AnyReader(named, default_typestore=store) as reader:
-                chosen = [c for c in reader.connections if not wanted or c.msgtype in wanted]
-                for connection in chosen:
-                    topics.setdefault(connection.topic, _Topic(connection.topic, connection.msgtype))
-                if chosen:
-                    for connection, logged, raw in reader.messages(connections=chosen):
-                        topic = topics[connection.topic]
-                        topic.logged.append(logged)
-                        topic.raw.append(raw)
                 ros2 = bool(reader.is2)
+                chosen = [c for c in reader.connections if not wanted or c.msgtype in wanted]
+                for c in chosen:
+                    topics.setdefault(c.topic, _Topic(c.topic, c.msgtype, ros2=ros2, decodes=bool(wanted)))
+                if chosen:
+                    messages = reader.messages(connections=chosen)
+                    while batch := list(islice(messages, BATCH)):
+                        for name in {connection.topic for connection, _, _ in batch}:
+                            topics[name].add([row for row in batch if row[0].topic == name])
     except InputError:
         raise
     except Exception as error:  # the library raises what its parsers do: of a cut file, anything
@@ -246,7 +268,7 @@ def _messages(path: Path, wanted: tuple[str, ...] = ()) -> _Bag:
 
 
 def _named(path: Path, folder: Path) -> Path:
-    """Return a path whose ending is that of its content, by which the library tells bags apart."""
+    """Return a path whose ending is that of its content, by which the library distinguishes bags."""
     if path.is_dir():
         return path
     with reading.opened(path) as stream:
@@ -269,12 +291,13 @@ def _salvaged(path: Path, files: list[Path], wanted: tuple[str, ...], error: Exc
             if scan is None:
                 continue
             ros2 = not head.startswith(ROS1_MAGIC)
-            for name, kind, logged, raw in scan(file):
-                if not wanted or kind in wanted:
-                    topic = topics.setdefault(name, _Topic(name, kind))
-                    topic.logged.append(logged)
-                    topic.raw.append(raw)
-    number = sum(len(topic.raw) for topic in topics.values())
+            found = scan(file)
+            while batch := list(islice(found, BATCH)):
+                for name, kind in dict.fromkeys(row[:2] for row in batch):
+                    if not wanted or kind in wanted:
+                        topic = topics.setdefault(name, _Topic(name, kind, ros2=ros2, decodes=bool(wanted)))
+                        topic.add([(None, *row[2:]) for row in batch if row[0] == name])
+    number = sum(len(topic) for topic in topics.values())
     reason = " ".join(str(error).split()) or type(error).__name__
     if not number:
         raise InputError(
@@ -446,20 +469,7 @@ def write_estimate(
 ) -> None:
     """Write the samples that an estimate was made from as a bag, with orientation and its covariance filled in.
 
-    Parameters
-    ----------
-    estimate : Estimate
-    path : path
-        ``.bag``, ``.mcap`` or ``.db3``.
-    recording : Recording
-        What the estimate was made from.
-    source : path, optional
-        The bag that the recording was read from: all its other topics go along as they are, if it is of the same ROS.
-
-    Raises
-    ------
-    InputError
-        If no stamp of the recording is the estimate's.
+    Of ``source``, the bag that the recording was read from, all other topics go along as they are, if it is of the same ROS.
     """
     assert recording is not None
     target = Path(path)

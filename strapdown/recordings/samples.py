@@ -43,43 +43,6 @@ class GyroSamples:
     remarks: tuple[str, ...] = field(default=())
 
 
-def read_gyro(
-    path: str | os.PathLike[str],
-    *,
-    rate: float | None = None,
-    units: Mapping[str, str] | None = None,
-    columns: Mapping[str, str] | None = None,
-    topic: str = "",
-) -> GyroSamples:
-    """Read the gyro of a recording of any format, of a simulated record, or of a NPY array (n,) or (n, 3) of rates.
-
-    Parameters
-    ----------
-    path : path-like
-        File. An array states neither its rate nor its unit: give ``rate`` and ``units={"gyro": ...}``.
-    rate : float, optional
-        Sample rate of a bare array, Hz.
-    units : mapping of str to str, optional
-        Units as in :func:`strapdown.recordings.read`; of a bare array by the name of the sensor.
-    columns : mapping of str to str, optional
-        For tables: names of columns by role, perhaps with a unit, ``{"time": "timestamp [us]", "gx": "gyro_x[dps]"}``; the others
-        are found by their names.
-    topic : str, default ""
-        For bags and flight logs: topic of the inertial unit, where there are several.
-
-    Returns
-    -------
-    GyroSamples
-        Samples at even intervals.
-
-    Raises
-    ------
-    InputError
-        If there is no gyro, its unit is unknown, or its samples lie at uneven intervals.
-    """
-    return read_samples(path, "gyro", rate=rate, units=units, columns=columns, topic=topic)
-
-
 def read_samples(
     path: str | os.PathLike[str],
     sensor: str = "gyro",
@@ -142,29 +105,7 @@ def read_samples(
 def samples_of(
     content: Recording | ImuRecord, sensor: str = "gyro", *, gaps: bool = False, source: str = "record"
 ) -> GyroSamples:
-    """Return the samples of one sensor of a recording or a simulated record, as :func:`read_samples` for its file.
-
-    Parameters
-    ----------
-    content : Recording or ImuRecord
-        Source of the samples.
-    sensor : {"gyro", "accelerometer", "magnetometer"}, default "gyro"
-        Sensor.
-    gaps : bool, default False
-        Whether gaps are allowed: missing samples are then rows of NaN.
-    source : str, default "record"
-        Name of a record, for messages; a recording has its own.
-
-    Returns
-    -------
-    GyroSamples
-        Samples at even intervals.
-
-    Raises
-    ------
-    InputError
-        If the sensor is missing, its unit is unknown, or its samples lie at uneven intervals.
-    """
+    """Return the samples of one sensor of a recording or a simulated record, as :func:`read_samples` for its file."""
     one_of("sensor", sensor, SENSORS)
     if isinstance(content, Recording):
         return _of_recording(content, sensor, gaps)
@@ -250,6 +191,3 @@ def _grid(source: str, time: Array) -> tuple[float, np.ndarray, tuple[str, ...]]
     if missing:
         words += (f"{missing} samples are missing in {int(np.sum(whole > 1.0))} gaps.",)
     return interval, place, words
-
-
-__all__ = ["GyroSamples", "read_gyro", "read_samples", "samples_of"]

@@ -51,7 +51,7 @@ class Delays:
             f"Samples are assumed to be stamped {late:.3g} ms late."
             if self.given
             else f"Samples are assumed to be stamped {late:.3g} ms late, half a sample interval, σ {1e3 * self.sigma:.2g} ms; "
-            "give --latency if it is known (0: point samples)."
+            "give --latency (latency= in Python) if it is known (0: point samples)."
         ]
         if field:
             side = "after" if field > 0.0 else "before"
@@ -76,21 +76,10 @@ def find(
 ) -> Delays:
     """Return the delays of a recording's sensors.
 
-    Parameters
-    ----------
-    recording : Recording
-    latency : float, optional
-        Delay of gyro and accelerometer where it is known, s. By default half a sample interval, as of samples that are means over the
-        interval before their stamp; or as much as the magnetometer is ahead of the gyro, for no sensor shows what is to come.
-    field : float, optional
-        Delay of the magnetometer behind the gyro where it is known, s. By default it is found from the recording.
-    causal : bool
-        Each sample's delay from the samples before it: found anew whenever the recording has become twice as long.
-
-    Raises
-    ------
-    InputError
-        If ``latency`` is negative, or longer than the recording.
+    ``latency`` is the delay of gyro and accelerometer where it is known, s; by default half a sample interval, as of samples that are means
+    over the interval before their stamp, or as much as the magnetometer is ahead of the gyro, for no sensor shows what is to come.
+    ``field`` is the delay of the magnetometer behind the gyro where it is known, s. ``causal``: each sample's delay from the samples before
+    it, found anew whenever the recording has become twice as long.
     """
     length = recording.time[-1] - recording.time[0]
     if latency is not None and non_negative("latency", latency, unit="s") >= length:
@@ -103,7 +92,8 @@ def find(
         while spans[-1] < length:
             spans.append(2.0 * spans[-1])
         for span in spans:
-            delay, sigma = _fitted(*(part[evidence[0] <= recording.time[0] + span] for part in evidence[1:]))
+            until = np.searchsorted(evidence[0], recording.time[0] + span, side="right")
+            delay, sigma = _fitted(*(part[:until] for part in evidence[1:]))
             if sigma < MAX_DELAY_SIGMA and 3.0 * sigma < abs(delay) < MAX_DELAY:
                 since = recording.time[0] + span if causal else recording.time[0]
                 found[np.searchsorted(recording.time, since) :] = delay
@@ -128,9 +118,9 @@ def magnetometer_delay(recording: Recording) -> tuple[float, float]:
     return (0.0, np.inf) if recording.magnetic_field is None else _fitted(*_evidence(recording)[1:])
 
 
-def _evidence(recording: Recording) -> tuple[Array, Array, Array]:
-    """Return times (m,), s, of pairs of field samples, how the field changes between them (m, 3), and what it would by a unit delay."""
-    time, none = recording.time, (np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
+def _evidence(recording: Recording) -> tuple[Array, Array, Array, Array]:
+    """Return times (m,), s, of pairs of field samples, and what :func:`_fitted` needs of their changes and of those by a unit delay."""
+    time, none = recording.time, (np.empty(0),) * 4
     assert recording.magnetic_field is not None
     lag = int(np.searchsorted(time, time[0] + FIELD_SPAN))
     if len(time) < 10 * lag:
@@ -145,15 +135,14 @@ def _evidence(recording: Recording) -> tuple[Array, Array, Array]:
     still = quaternion.rotate(attitude, field)
     late = quaternion.rotate(attitude, np.cross(recording.rate[at], field))
     pairs = known[lag:] & known[:-lag]
-    return time[at][lag:][pairs], (still[lag:] - still[:-lag])[pairs], (late[lag:] - late[:-lag])[pairs]
+    change, wanted = (still[lag:] - still[:-lag])[pairs], (late[lag:] - late[:-lag])[pairs]
+    products = (np.einsum("ki,ki->k", a, b) for a, b in ((change, wanted), (wanted, wanted), (change, change)))
+    return time[at][lag:][pairs], *products
 
 
-def _fitted(change: Array, wanted: Array) -> tuple[float, float]:
-    """Return the delay, s, and its σ, by which ``wanted`` (m, 3) makes up ``change`` (m, 3), without the farthest."""
-    across, along, total = (
-        np.einsum("ki,ki->k", a, b) for a, b in ((change, wanted), (wanted, wanted), (change, change))
-    )
-    kept = np.full(len(change), True)
+def _fitted(across: Array, along: Array, total: Array) -> tuple[float, float]:
+    """Return the delay, s, and its σ, by which w makes up c, without the farthest; c·w, w·w and c·c of each pair (m,) are given."""
+    kept = np.full(len(total), True)
     for _ in range(4):
         information = float(np.sum(along[kept]))
         if information == 0.0:

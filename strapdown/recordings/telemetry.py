@@ -37,13 +37,7 @@ def is_log(head: bytes) -> bool:
 
 
 def read_telemetry(path: str | os.PathLike[str]) -> Recording:
-    """Read the inertial unit of a camera's, flight controller's or phone's log.
-
-    Raises
-    ------
-    InputError
-        If the library does not know the file, or it holds no gyro.
-    """
+    """Read the inertial unit of a camera's, flight controller's or phone's log."""
     file = Path(path)
     parser = library("telemetry_parser", f"{file.name} is a log of a camera or flight controller, which")
     try:

@@ -44,13 +44,7 @@ def is_folder(path: Path) -> bool:
 
 
 def read_euroc(path: str | os.PathLike[str]) -> Recording:
-    """Read a folder of EuRoC or TUM-VI: the inertial unit, and ground truth where there is some.
-
-    Raises
-    ------
-    InputError
-        If there is no ``imu0/data.csv``, or a file of the folder is damaged.
-    """
+    """Read a folder of EuRoC or TUM-VI: the inertial unit, and ground truth where there is some."""
     folder = Path(path)
     root = _root(folder)
     if root is None:
@@ -72,20 +66,7 @@ def _read_truth(path: Path) -> tuple[NDArray[np.int64], Array]:
 
 
 def read_tum(path: str | os.PathLike[str]) -> tuple[NDArray[np.int64], Array]:
-    """Read the attitudes of a TUM trajectory.
-
-    Returns
-    -------
-    stamps : (n,) int
-        ns.
-    attitude : (n, 4)
-        Unit quaternions, scalar first.
-
-    Raises
-    ------
-    InputError
-        If a row has not eight numbers.
-    """
+    """Read stamps (n,), ns, and unit quaternions (n, 4), scalar first, of a TUM trajectory."""
     file = Path(path)
     rows = _rows(file, None)
     for k, row in enumerate(rows):
@@ -155,25 +136,7 @@ def _whole(path: Path, cells: list[str], factor: int) -> NDArray[np.int64]:
 
 
 def with_reference(recording: Recording, path: str | os.PathLike[str]) -> Recording:
-    """Return a recording with the attitudes of a TUM trajectory as its reference.
-
-    Parameters
-    ----------
-    recording : Recording
-        Recording.
-    path : path-like
-        Trajectory in TUM format, of the same clock and body axes.
-
-    Returns
-    -------
-    Recording
-        Recording with ``true_attitude``.
-
-    Raises
-    ------
-    InputError
-        If the file is not a trajectory, or none of its stamps lies within the recording.
-    """
+    """Return a recording with the attitudes of a TUM trajectory, of the same clock and body axes, as its reference."""
     stamps, attitude = read_tum(path)
     return _with_reference(recording, stamps, attitude, Path(path).name)
 

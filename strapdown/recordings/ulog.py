@@ -37,19 +37,7 @@ LATE = 0.5
 
 
 def read_ulog(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
-    """Read the inertial unit of a flight log.
-
-    Parameters
-    ----------
-    path : path
-    topic : str
-        ``sensor_combined``, or with a number behind a colon where there are several.
-
-    Raises
-    ------
-    InputError
-        If the log has no such topic, or is no log.
-    """
+    """Read the inertial unit of a flight log."""
     file = Path(path)
     pyulog = library("pyulog", f"{file.name} is a flight log of PX4, which")
     try:
@@ -97,7 +85,7 @@ def read_ulog(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
     if ATTITUDE in data and len(data[ATTITUDE]["timestamp"]) > 1:
         at, kept, words = _stamps(ATTITUDE, data[ATTITUDE])
         ned = quaternion.normalize(_columns(data[ATTITUDE], "q", 4)[kept])
-        own["true_attitude"] = interpolated(time, (at * 1000 - epoch) / 1e9, outputs.from_ned(ned))
+        own["true_attitude"] = interpolated(time, (at * 1000 - epoch) / 1e9, outputs.to_ned(ned))
         remarks += [f"Reference: {ATTITUDE}, the vehicle's own estimate.", *words]
     return with_gyro(
         source=file.name, time=time, rate=rate, specific_force=force, epoch_ns=epoch, remarks=tuple(remarks), **own
@@ -148,13 +136,7 @@ _TYPES = {"float": "<f4", "int32_t": "<i4", "uint64_t": "<u8"}
 
 
 def write_ulog(recording: Recording, path: str | os.PathLike[str]) -> None:
-    """Write a recording as a flight log: numbers in single precision, stamps in whole µs; body axes stay as they are.
-
-    Raises
-    ------
-    InputError
-        If there is no accelerometer, the magnetometer's unit is unknown, two stamps are less than 1 µs apart, or time is negative.
-    """
+    """Write a recording as a flight log: numbers in single precision, stamps in whole µs; body axes stay as they are."""
     stamps = np.rint(recording.clock_ns / 1000).astype(np.int64)
     if recording.specific_force is None:
         raise InputError(

@@ -1,9 +1,7 @@
 """Records of an IMU with their truth, and estimates of a filter.
 
-``record``
-    :class:`ImuRecord`, :class:`Estimate` and their parts, and estimates in HDF5.
-``outputs``
-    An estimate in other quantities: Euler angles, heading, NED, specific force, each with its covariance.
+- ``record``: :class:`ImuRecord`, :class:`Estimate` and their parts, and estimates in HDF5.
+- ``outputs``: An estimate in other quantities: Euler angles, heading, NED, specific force, each with its covariance.
 """
 
 from __future__ import annotations
@@ -39,6 +37,4 @@ __all__ = [
     "Truth",
     "compress",
     "cut",
-    "read_estimate",
-    "write_estimate",
 ]

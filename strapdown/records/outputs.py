@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from strapdown import quaternion
-from strapdown.checks import Array, InputError, array, finite, one_of, unit_quaternions
+from strapdown.checks import Array, InputError, array, one_of, unit_quaternions
+from strapdown.kinematics import skew
 from strapdown.units import DEGREE, DEGREE_PER_HOUR, STANDARD_GRAVITY
 
 if TYPE_CHECKING:
@@ -28,18 +29,13 @@ if TYPE_CHECKING:
 __all__ = [
     "Angles",
     "euler",
-    "free_acceleration",
-    "from_ned",
     "heading",
     "table",
-    "to_ned",
 ]
 
 FRAMES = ("ENU", "NED")
 NED_OF_ENU = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
 """Turns East-North-Up to North-East-Down and back: half a turn about the horizontal line to the north-east."""
-FRD_OF_FLU = np.array([0.0, 1.0, 0.0, 0.0])
-"""Turns forward-left-up body axes to forward-right-down ones and back: half a turn about x."""
 NAMES = {"Z": "yaw", "Y": "pitch", "X": "roll"}
 """Names of the angles of a sequence of three different axes."""
 
@@ -175,7 +171,7 @@ def heading(attitude: ArrayLike, covariance: ArrayLike | None = None, *, axis: s
     if covariance is None:
         return Angles(angle, None)
     P = array("covariance", covariance, (len(q), 3, 3))
-    change = -R @ _skew(forward)  # d(R f)/dδθ
+    change = -R @ skew(forward)  # d(R f)/dδθ
     level = v[:, 0] ** 2 + v[:, 1] ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
         row = (v[:, 1, None] * change[:, 0] - v[:, 0, None] * change[:, 1]) / level[:, None]
@@ -183,81 +179,15 @@ def heading(attitude: ArrayLike, covariance: ArrayLike | None = None, *, axis: s
     return Angles(angle, np.where(level > 1e-18, sigma, np.inf))
 
 
-def _skew(v: Array) -> Array:
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+def to_ned(attitude: ArrayLike) -> Array:
+    """Return attitudes q_fb (n, 4) relative to East-North-Up as relative to North-East-Down, or back: half a turn either way."""
+    return quaternion.multiply(NED_OF_ENU, array("attitude", attitude, (..., 4)))
 
 
-def to_ned(attitude: ArrayLike, *, body_flu: bool = False) -> Array:
-    """Return attitudes relative to East-North-Up as attitudes relative to North-East-Down.
-
-    Parameters
-    ----------
-    attitude : array_like (n, 4)
-        Unit quaternions q_fb, fixed frame East-North-Up.
-    body_flu : bool, default False
-        Whether the body axes are forward-left-up and are to become forward-right-down; they stay as they are otherwise.
-
-    Returns
-    -------
-    ndarray (n, 4)
-        Unit quaternions, fixed frame North-East-Down.
-    """
-    turned = quaternion.multiply(NED_OF_ENU, array("attitude", attitude, (..., 4)))
-    return quaternion.multiply(turned, FRD_OF_FLU) if body_flu else turned
-
-
-def from_ned(attitude: ArrayLike, *, body_frd: bool = False) -> Array:
-    """Return attitudes relative to North-East-Down as attitudes relative to East-North-Up, the inverse of :func:`to_ned`.
-
-    Parameters
-    ----------
-    attitude : array_like (n, 4)
-        Unit quaternions q_fb, fixed frame North-East-Down.
-    body_frd : bool, default False
-        Whether the body axes are forward-right-down and are to become forward-left-up; they stay as they are otherwise.
-
-    Returns
-    -------
-    ndarray (n, 4)
-        Unit quaternions, fixed frame East-North-Up.
-    """
-    turned = quaternion.multiply(NED_OF_ENU, array("attitude", attitude, (..., 4)))
-    return quaternion.multiply(turned, FRD_OF_FLU) if body_frd else turned
-
-
-def free_acceleration(
-    attitude: ArrayLike, specific_force: ArrayLike, *, gravity: float = STANDARD_GRAVITY, fixed: bool = True
-) -> Array:
-    """Return the acceleration without gravity, ``R f − g up``.
-
-    Parameters
-    ----------
-    attitude : array_like (n, 4)
-        Unit quaternions q_fb, fixed z axis up.
-    specific_force : array_like (n, 3)
-        Specific force, m/s², body axes; rows of NaN stay NaN.
-    gravity : float, default 9.80665
-        Acceleration of gravity, m/s².
-    fixed : bool, default True
-        Axes of the result: fixed, or body.
-
-    Returns
-    -------
-    ndarray (n, 3)
-        Acceleration, m/s².
-
-    Examples
-    --------
-    >>> free_acceleration([[1.0, 0.0, 0.0, 0.0]], [[0.5, 0.0, STANDARD_GRAVITY]]).tolist()
-    [[0.5, 0.0, 0.0]]
-    """
-    q = unit_quaternions("attitude", array("attitude", attitude, ("n", 4)))
-    f = array("specific_force", specific_force, (len(q), 3), allow_nan=True)
-    R = quaternion.to_matrix(q)
-    up = np.array([0.0, 0.0, finite("gravity", gravity, unit="m/s²")])
-    if fixed:
-        return np.asarray(np.einsum("nij,nj->ni", R, f) - up)
-    return np.asarray(f - np.einsum("nji,j->ni", R, up))
+def free_acceleration(attitude: Array, specific_force: Array) -> Array:
+    """Return the acceleration without gravity (n, 3), ``R f − g up``, m/s², fixed axes; ``specific_force`` (n, 3) may be NaN."""
+    felt = np.einsum("nij,nj->ni", quaternion.to_matrix(attitude), specific_force)
+    return np.asarray(felt - np.array([0.0, 0.0, STANDARD_GRAVITY]))
 
 
 def table(
@@ -335,13 +265,7 @@ def _angle_names(sequence: str) -> list[str]:
 
 
 def rows_of(estimate: Estimate, recording: Recording) -> NDArray[np.int64]:
-    """Return the row of the recording of each time of an estimate.
-
-    Raises
-    ------
-    InputError
-        If a time of the estimate is no stamp of the recording.
-    """
+    """Return the row of the recording of each time of an estimate, all of which are its stamps."""
     rows = np.clip(np.searchsorted(recording.time, estimate.time - 1e-7), 0, len(recording.time) - 1)
     off = np.abs(recording.time[rows] - estimate.time)
     if off.max() > 1e-6:
@@ -359,25 +283,7 @@ def _clock(estimate: Estimate, recording: Recording | None) -> dict[str, NDArray
 
 
 def to_dataframe(estimate: Estimate, **options: Any) -> Any:
-    """Return an estimate as a pandas ``DataFrame``.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        Estimate.
-    **options : dict
-        Options of :func:`table`.
-
-    Returns
-    -------
-    pandas.DataFrame
-        Columns of :func:`table`, one row per time.
-
-    Raises
-    ------
-    InputError
-        If pandas is not installed.
-    """
+    """Return an estimate as a pandas ``DataFrame`` of the columns of :func:`table`, one row a time; options as there."""
     try:
         import pandas
     except ImportError:

@@ -398,6 +398,8 @@ class Estimate(Listed):
         Covariance of attitude and whole bias.
     """
 
+    _drawn_by = "estimate_overview"
+
     time: Array
     attitude: Array
     bias: Array
@@ -483,8 +485,8 @@ class Estimate(Listed):
         stamps = increasing("time", time)
         m = len(stamps)
         q = array("attitude", attitude, (m, 4), allow_nan=True)
-        told = np.isfinite(q).all(axis=1)
-        unit_quaternions("attitude", q[told])
+        known = np.isfinite(q).all(axis=1)
+        unit_quaternions("attitude", q[known])
         P = np.asarray(covariance, np.float64)
         if P.shape not in ((m, 3, 3), (m, 6, 6)):
             raise InputError(
@@ -644,23 +646,9 @@ def write_estimate(
     *,
     truth: Truth | None = None,
 ) -> None:
-    """Write an estimate to HDF5, units and conventions as attributes; the file appears whole or not at all.
+    """Write an estimate, and the truth at its times if given, to HDF5; the file appears whole or not at all.
 
-    Parameters
-    ----------
-    path : path-like
-        File.
-    estimate : Estimate
-        Estimate. Values and variances of error states are written (:func:`read_states`); a whole covariance is not.
-    attributes : mapping of str, optional
-        Further attributes of the file.
-    truth : Truth, optional
-        Truth at the times of the estimate, so that the file can be judged on its own.
-
-    Raises
-    ------
-    InputError
-        If the truth has another number of rows than the estimate, or the file cannot be written.
+    Values and variances of error states are written (:func:`read_states`); a whole covariance is not.
     """
     if truth is not None and len(truth.attitude) != len(estimate.time):
         raise InputError(
@@ -761,23 +749,7 @@ def _attitudes(group: Any, name: str, rows: int) -> Array:
 
 
 def read_truth(path: str | os.PathLike[str]) -> Truth | None:
-    """Read the truth of a file written by :func:`write_estimate`.
-
-    Parameters
-    ----------
-    path : path-like
-        File.
-
-    Returns
-    -------
-    Truth or None
-        Truth at the times of the estimate; None if the file has none.
-
-    Raises
-    ------
-    InputError
-        As :func:`read_estimate` does.
-    """
+    """Read the truth of a file written by :func:`write_estimate`, at the times of the estimate; None if the file has none."""
     with _estimate_file(path) as file:
         if "truth" not in file:
             return None
@@ -787,23 +759,10 @@ def read_truth(path: str | os.PathLike[str]) -> Truth | None:
 
 
 def read_estimate(path: str | os.PathLike[str]) -> Estimate:
-    """Read an estimate written by :func:`write_estimate`.
+    """Read an estimate written by :func:`write_estimate`, without its error states (:func:`read_states`).
 
-    Parameters
-    ----------
-    path : path-like
-        File.
-
-    Returns
-    -------
-    Estimate
-        The estimate without its error states (:func:`read_states`).
-
-    Raises
-    ------
-    InputError
-        If the file is missing, truncated, not HDF5 or of another kind, or holds what no filter estimates: shapes that do not fit
-        each other, decreasing times, quaternions that are not of unit norm, variances of zero or less, biases above 1e6 rad/s.
+    What no filter estimates is refused: shapes that do not fit each other, decreasing times, quaternions that are not of unit norm,
+    variances of zero or less, biases above 1e6 rad/s.
     """
     with _estimate_file(path) as file:
         time = increasing(_place(file, "time"), _numbers(file, "time", ("n",)))
@@ -815,7 +774,7 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
             _above_zero(f"{_place(file, 'covariance')}, diagonal", np.diagonal(covariance, axis1=1, axis2=2))
             covariance = np.pad(covariance, ((0, 0), (0, 6 - size), (0, 6 - size)), constant_values=np.nan)
         variance = _above_zero(_place(file, "variance"), _numbers(file, "variance", (rows, size)))
-        sensors = {told["sensor"]: (told, part) for told, part in _parts(file, "innovations")}
+        sensors = {attributes["sensor"]: (attributes, part) for attributes, part in _parts(file, "innovations")}
         return Estimate(
             time=time,
             attitude=attitude,
@@ -823,48 +782,34 @@ def read_estimate(path: str | os.PathLike[str]) -> Estimate:
             variance=np.pad(variance, ((0, 0), (0, 6 - size)), constant_values=np.nan),
             covariance=covariance,
             innovations={sensor: _innovations(part) for sensor, (_, part) in sensors.items()},
-            skipped={sensor: count("skipped", told["skipped"], least=0) for sensor, (told, _) in sensors.items()},
+            skipped={
+                sensor: count("skipped", attributes["skipped"], least=0) for sensor, (attributes, _) in sensors.items()
+            },
             events=tuple(
                 Event(
-                    kind=one_of("kind of an event", told["kind"], EVENT_KINDS),
-                    sensor=str(told["sensor"]),
-                    **{name: finite(f"{name} of an event", told[name]) for name in ("start", "end", "value")},
+                    kind=one_of("kind of an event", attributes["kind"], EVENT_KINDS),
+                    sensor=str(attributes["sensor"]),
+                    **{name: finite(f"{name} of an event", attributes[name]) for name in ("start", "end", "value")},
                 )
-                for told, _ in _parts(file, "events")
+                for attributes, _ in _parts(file, "events")
             ),
         )
 
 
 def read_states(path: str | os.PathLike[str]) -> dict[str, ErrorStateEstimate]:
-    """Read the error states of an estimate written by :func:`write_estimate`.
-
-    Parameters
-    ----------
-    path : path-like
-        File.
-
-    Returns
-    -------
-    dict of str to ErrorStateEstimate
-        Error states by name; empty for a filter without.
-
-    Raises
-    ------
-    InputError
-        As :func:`read_estimate`.
-    """
+    """Read the error states, by name, of an estimate written by :func:`write_estimate`."""
     with _estimate_file(path) as file:
         rows = len(_numbers(file, "time", ("n",)))
         found = {}
-        for told, part in _parts(file, "states"):
-            values = _numbers(part, "values", (rows, len(told["components"])))
-            if len(told["units"]) != len(told["components"]):
+        for attributes, part in _parts(file, "states"):
+            values = _numbers(part, "values", (rows, len(attributes["components"])))
+            if len(attributes["units"]) != len(attributes["components"]):
                 raise InputError(
                     f"{_place(part, 'units')} are not as many as the components; the file is damaged, make it again"
                 )
-            found[str(told["name"])] = ErrorStateEstimate(
-                components=tuple(str(one) for one in told["components"]),
-                units=tuple(str(one) for one in told["units"]),
+            found[str(attributes["name"])] = ErrorStateEstimate(
+                components=tuple(str(one) for one in attributes["components"]),
+                units=tuple(str(one) for one in attributes["units"]),
                 values=values,
                 variance=_above_zero(_place(part, "variance"), _numbers(part, "variance", values.shape)),
             )
@@ -889,13 +834,7 @@ def _innovations(part: Any) -> Innovations:
 
 
 def read_attributes(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read the attributes of a result file of any kind: its kind, version, conventions, and those of the writer.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, not HDF5, or not of this package.
-    """
+    """Read the attributes of a result file of any kind: its kind, version, conventions, and those of the writer."""
     with reading.hdf5(path) as file:
         attributes = reading.attributes(file)
     if not str(attributes.get("kind", "")).startswith("strapdown "):

@@ -1,13 +1,10 @@
 """Reports: one self-contained HTML page for a result file. The verdict in words first, then numbers, figures and provenance.
 
-``page``
-    HTML, figures and interactive charts on one page without network. The charts are drawn by uPlot (MIT licence), bundled in ``uplot/``.
-``estimates``
-    The page of one estimate.
-``campaigns``
-    The page of a Monte Carlo.
-``tunings``
-    The page of a tuning.
+- ``page``: HTML, figures and interactive charts on one page without network. The charts are drawn by uPlot (MIT licence), bundled in
+  ``uplot/``.
+- ``estimates``: The page of one estimate.
+- ``campaigns``: The page of a Monte Carlo.
+- ``tunings``: The page of a tuning.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from strapdown.checks import Array, InputError
 from strapdown.montecarlo import campaign, verdicts
 from strapdown.montecarlo.statistics import SUBSETS, Statistics
 from strapdown.plots.statistics import STATES, state_unit
-from strapdown.plots.style import legend_above, legend_below, match_scales
+from strapdown.plots.style import legend_below, match_scales
 from strapdown.report import findings, page
 
 
@@ -38,7 +38,7 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
         page.section(
             "Over time",
             page.figure(
-                lambda: _consistency(statistics, probability),
+                lambda: plots.runs_overview(statistics, probability),
                 "ANEES of attitude and bias, and NIS, with the bounds of a consistent filter",
             ),
             page.figure(
@@ -137,24 +137,6 @@ def _numbers(statistics: Statistics, bound: Array | None) -> str:
             )
         )
     return page.section("Key numbers", *parts)
-
-
-def _consistency(statistics: Statistics, probability: float) -> Figure:
-    figure, axes = plots.new_figure(1, 3, size=(12.0, 4.2))
-    axes[1].set_visible(statistics.has_bias)
-    bounds = consistency.mean_bounds(3, statistics.runs, probability)
-    label = f"{100 * probability:g} % bounds, each epoch"
-    low, high = np.nanmin(statistics.anees), np.nanmax(statistics.anees)
-    for ax, subset in zip(axes, ("attitude", "bias") if statistics.has_bias else ("attitude",), strict=False):
-        plots.nees_over_time([("all runs", statistics)], bounds, subset, ax, label=label)
-        ax.set_ylim(min(0.5, 0.8 * float(low)), max(2.0, 1.3 * float(high)))
-        legend_above(ax)
-    if statistics.sensor_degrees.sum() > 0:
-        plots.nis_over_time([("all runs", statistics)], axes[2], probability=probability)
-        legend_above(axes[2])
-    else:
-        axes[2].set_visible(False)
-    return figure
 
 
 def _fans(statistics: Statistics) -> Figure:

@@ -10,7 +10,6 @@ from matplotlib.figure import Figure
 
 from strapdown import consistency, plots, quaternion, records
 from strapdown.plots.estimates import angle_labels
-from strapdown.plots.sphere import body_axis_path
 from strapdown.plots.style import AXES, angle_unit, rate_unit
 from strapdown.records import Estimate, Innovations, Truth
 from strapdown.report import findings, page
@@ -42,7 +41,7 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
         findings.evidence(judgement),
         _over_time(estimate, truth, str(attributes.get("fixed_frame", ""))),
         *[_sensor(name, one, probability) for name, one in estimate.innovations.items()],
-        _path(estimate, truth),
+        *_distribution(estimate, truth),
         page.section(
             "How it was made",
             page.provenance(attributes),
@@ -211,20 +210,15 @@ def _sensor(name: str, innovations: Innovations, probability: float) -> str:
     return page.section(f"Innovations of {name}", page.figure(draw, caption))
 
 
-def _path(estimate: Estimate, truth: Truth | None) -> str:
-    true = None if truth is None else truth.attitude
-    # The axis that moves the most: about its own axis a spinning body shows nothing.
-    spread = [float(np.ptp(body_axis_path(estimate.attitude, k), axis=0).max()) for k in range(3)]
-    axis = int(np.argmax(spread))
-    caption = f"Path of the body {AXES[axis]} axis in the fixed frame"
-    parts = [page.figure(lambda: plots.sphere_figure(estimate.attitude, true, axis), caption)]
-    if true is not None:
-        angle = consistency.distribution(quaternion.angle_between(estimate.attitude, true))
+def _distribution(estimate: Estimate, truth: Truth | None) -> list[str]:
+    if truth is None:
+        return []
+    angle = consistency.distribution(quaternion.angle_between(estimate.attitude, truth.attitude))
 
-        def draw() -> Figure:
-            figure, ax = plots.new_figure(size=(6.5, 4.2))
-            plots.error_distribution(angle, ax)
-            return figure
+    def draw() -> Figure:
+        figure, ax = plots.new_figure(size=(6.5, 4.2))
+        plots.error_distribution(angle, ax)
+        return figure
 
-        parts.append(page.figure(draw, "Share of the time at which the whole attitude error is at or below each size"))
-    return page.section("Attitude", *parts)
+    caption = "Share of the time at which the whole attitude error is at or below each size"
+    return [page.section("Attitude", page.figure(draw, caption))]

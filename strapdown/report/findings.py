@@ -78,4 +78,4 @@ def _filter_of(path: Path, attributes: Mapping[str, Any]) -> tuple[tuple[str, ..
         scenario = scenario_from_toml(str(attributes["scenario"]), f"{path}: scenario")
     except InputError:
         return (), ()
-    return states, setup.not_covered(scenario.gyro, scenario.sensors, chosen.states, gravity_f=scenario.gravity_f)
+    return states, setup.unmodelled_errors(scenario.gyro, scenario.sensors, chosen.states, gravity_f=scenario.gravity_f)

@@ -79,14 +79,8 @@ def code(content: str) -> str:
 def table(head: Sequence[str], rows: Sequence[Sequence[Any]], *, numbers: int = 0, marked: Sequence[str] = ()) -> str:
     """Return a table, which scrolls sideways where the page is narrower.
 
-    Parameters
-    ----------
-    head : sequence of str
-    rows : sequence of sequences
-    numbers : int
-        How many of the last columns hold numbers and are set to the right; a table without any wraps its texts instead of scrolling.
-    marked : sequence of str
-        Class of the first cell of each row: "pass", "fail", "unsure" or "" for none.
+    The last ``numbers`` columns hold numbers and are set to the right; a table without any wraps its texts instead of scrolling. ``marked``
+    is the class of the first cell of each row: "pass", "fail", "unsure" or "" for none.
     """
     plain = len(head) - numbers
     heads = [f"<th{' class=number' if j >= plain else ''}>{text(cell)}</th>" for j, cell in enumerate(head)]

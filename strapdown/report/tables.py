@@ -41,19 +41,10 @@ class Table:
 
 
 def write(tables: Sequence[Table], folder: str | os.PathLike[str]) -> list[Path]:
-    r"""Write tables to a folder as ``NAME.csv`` and ``NAME.tex``; return the files.
+    r"""Write tables to a folder, made if missing, as ``NAME.csv`` and ``NAME.tex``; return the files.
 
-    Parameters
-    ----------
-    tables : sequence of Table
-    folder : path
-        Made if it is missing.
-
-    Returns
-    -------
-    list of Path
-        Two files for each table. The CSV has the keys as its header and numbers that read back to the bit; the LaTeX is a ``tabular``
-        with four digits, for ``\\input`` into a document that loads ``booktabs``.
+    The CSV has the keys as its header and numbers that read back to the bit; the LaTeX is a ``tabular`` with four digits, to input into a
+    document that loads ``booktabs``.
     """
     written = []
     for table in tables:
@@ -380,4 +371,4 @@ STUDIES: dict[str, Callable[..., list[Table]]] = {
     "tuning": of_tuning,
     "allan": of_allan,
 }
-"""What makes the tables of each study."""
+"""Functions that make the tables of each study."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import base64
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from strapdown.checks import InputError
 from strapdown.files import reading
@@ -37,7 +37,7 @@ class _Parameter(_Table):
     lower: float | None
     upper: float | None
     unit: str = ""
-    si_per_unit: float = 1.0
+    si_per_unit: Annotated[float, Field(gt=0.0)] = 1.0
 
 
 class _Objective(_Table):
@@ -135,13 +135,7 @@ _FIGURES = {
 
 
 def read(path: Path) -> dict[str, Any]:
-    """Read the JSON of a tuning.
-
-    Raises
-    ------
-    InputError
-        If it is missing, no JSON, or not written by `strapdown tune`.
-    """
+    """Read the JSON of a tuning."""
     content = reading.json_file(path)
     try:
         _Tuning.model_validate_json(reading.text(path))

@@ -32,7 +32,6 @@ __all__ = [
     "Scenario",
     "drawn",
     "load_scenario",
-    "scenario_to_toml",
     "simulate",
 ]
 
@@ -42,7 +41,7 @@ SCENARIOS: tuple[str, ...] = tuple(sorted(path.stem for path in _BUILTIN.glob("*
 """Names of the built-in scenarios."""
 
 
-MOST_SAMPLES = 1e9
+MAX_SAMPLES = 1e9
 """Gyro samples that a simulated record may have: beyond it none fits into memory."""
 
 
@@ -102,9 +101,9 @@ class Scenario:
         """Check rate, duration, and the names of the sensors."""
         positive("rate", self.rate, unit="Hz")
         positive("duration", self.duration, unit="s")
-        if self.duration * self.rate > MOST_SAMPLES:
+        if self.duration * self.rate > MAX_SAMPLES:
             raise InputError(
-                f"{self.duration:g} s at {self.rate:g} Hz are {self.duration * self.rate:.3g} gyro samples, more than {MOST_SAMPLES:.0e}; "
+                f"{self.duration:g} s at {self.rate:g} Hz are {self.duration * self.rate:.3g} gyro samples, more than {MAX_SAMPLES:.0e}; "
                 "shorten the run or lower the rate"
             )
         count("seed", self.seed, least=0)
@@ -551,23 +550,7 @@ def scenario_to_table(scenario: Scenario) -> dict[str, Any]:
 
 
 def scenario_to_toml(scenario: Scenario) -> str:
-    """Return a scenario as TOML text; reading it gives the same scenario to the last bit.
-
-    Parameters
-    ----------
-    scenario : Scenario
-        Of motions, gyro and sensors of this package.
-
-    Returns
-    -------
-    str
-        Text of a file that :func:`load_scenario` reads, with the unit in each key.
-
-    Raises
-    ------
-    InputError
-        If a part is a Python function or of a class of your own, which has no form in a file.
-    """
+    """Return a scenario as TOML text, with the unit in each key; reading it gives the same scenario to the last bit."""
     import tomli_w
 
     text = tomli_w.dumps(scenario_to_table(scenario))

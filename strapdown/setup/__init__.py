@@ -37,12 +37,9 @@ __all__ = [
     "initial_state",
     "matched",
     "matched_to_record",
-    "not_covered",
-    "observability",
     "read_setup",
     "run",
     "smooth",
-    "to_toml",
 ]
 
 ATTITUDE_SIGMA = 1.0 * units.DEGREE
@@ -50,16 +47,16 @@ ATTITUDE_SIGMA = 1.0 * units.DEGREE
 LINEAR_SHARE = 0.2
 """The second-order error of a first measurement, half the square of the initial error, may be about this share of half its σ."""
 COMMUTATION_SHARE = 0.1
-"""Of what the record's white noise leaves of a constant rate: a drift of one-sample integration above it calls for a better algorithm."""
-BETTER = "matched-1-8-8"
+"""Part of the σ of a constant rate, by white noise over the record; a one-sample drift above it calls for a better algorithm."""
+ACCURATE_ALGORITHM = "matched-1-8-8"
 """The integration algorithm chosen then: one step a sample."""
-LEAST_SAMPLES = 32
+MIN_SAMPLES = 32
 """Fewest gyro samples for which the commutation error is estimated."""
-LEAST_BIAS_SIGMA = 0.1 * units.DEGREE_PER_HOUR
+MIN_BIAS_SIGMA = 0.1 * units.DEGREE_PER_HOUR
 """Standard deviation of the initial bias error of a gyro whose specification has no bias, rad/s."""
 MEKF = "mekf"
 """The estimator that all of this package works with; others run over records, and can be judged."""
-MOST_MEMORY = 8e9
+MAX_MEMORY = 8e9
 """Largest memory for the smoother's forward pass, bytes."""
 
 Sigma = float | tuple[float, float, float]
@@ -125,8 +122,8 @@ class FilterSetup(ByValue):
         positive("attitude_sigma", self.attitude_sigma, unit="rad")
         positive("bias_sigma", self.bias_sigma, unit="rad/s")
         positive("measurement_sigma_factor", self.measurement_sigma_factor)
-        believed_sigma = {str(name): _sigma(f"sigma[{name!r}]", s) for name, s in self.sigma.items()}
-        object.__setattr__(self, "sigma", believed_sigma)
+        sigma = {str(name): _sigma(f"sigma[{name!r}]", s) for name, s in self.sigma.items()}
+        object.__setattr__(self, "sigma", sigma)
         self._check_estimator()
 
     def _check_estimator(self) -> None:
@@ -195,7 +192,7 @@ def matched_to_record(
 
     Flicker noise, which is no random walk, is matched in the attitude at the record's rate and quality of measurements
     (:func:`strapdown.gyro.matched_process_noise`); without measurements it is bounded over the record's length. Errors without a state
-    (scale factor, misalignment, quantisation, hard iron) are not covered: :func:`not_covered` names them.
+    (scale factor, misalignment, quantisation, hard iron) are not covered: :func:`unmodelled_errors` names them.
 
     Parameters
     ----------
@@ -241,13 +238,13 @@ def matched_to_record(
         noise = _noise_beside_states(spec, found.white)
         more["states"] = found.states
         if _commutes_badly(record, noise["angle_random_walk"]):
-            more["integration"] = coning.ALGORITHMS[BETTER]
+            more["integration"] = coning.ALGORITHMS[ACCURATE_ALGORITHM]
     else:
         noise = _noise(spec, record)
     return FilterSetup(
         process_noise=ProcessNoise(**noise),
         attitude_sigma=_linear_sigma(record) if attitude_sigma is None else attitude_sigma,
-        bias_sigma=float(max(np.sqrt(spread), LEAST_BIAS_SIGMA)),
+        bias_sigma=float(max(np.sqrt(spread), MIN_BIAS_SIGMA)),
         **more,
     )
 
@@ -267,8 +264,8 @@ def _noise_beside_states(spec: GyroSpec, white: float) -> dict[str, float]:
 
 def _commutes_badly(record: ImuRecord, white: float) -> bool:
     """Return whether a turn at constant rate over each sample drifts by more than the record can leave unnoticed."""
-    better = coning.ALGORITHMS[BETTER]
-    if len(record.increments) < LEAST_SAMPLES:
+    better = coning.ALGORITHMS[ACCURATE_ALGORITHM]
+    if len(record.increments) < MIN_SAMPLES:
         return False
     one = coning.integrate(record.increments, coning.ALGORITHMS["one-sample"])[-1]
     other = coning.integrate(record.increments, better, edges=record.time)[-1]
@@ -277,37 +274,21 @@ def _commutes_badly(record: ImuRecord, white: float) -> bool:
     return bool(drift > COMMUTATION_SHARE * white / np.sqrt(length))
 
 
-def not_covered(
+def unmodelled_errors(
     spec: GyroSpec,
     sensors: tuple[Any, ...] = (),
     states: States | None = None,
     *,
     gravity_f: Sequence[float] = vectors.GRAVITY_F,
 ) -> tuple[str, ...]:
-    """Return, in words, the specified errors that a filter has no state for.
+    """Return, in words with their size, the specified errors of gyro and sensors that a filter has no state for.
 
     Where there are any, a filter that models the noise alone is overconfident.
-
-    Parameters
-    ----------
-    spec : GyroSpec
-        Specification of the gyro.
-    sensors : tuple, optional
-        Sensors of the scenario.
-    states : States, optional
-        Error states of the filter; None: attitude and bias alone.
-    gravity_f : sequence of float (3,)
-        Gravity in the fixed frame, m/s².
-
-    Returns
-    -------
-    tuple of str
-        One phrase for each error, with its size; empty where there is none.
 
     Examples
     --------
     >>> from strapdown import GyroSpec, setup
-    >>> setup.not_covered(GyroSpec(angle_random_walk=1e-5, scale_factor=(1e-4, 0.0, 0.0)))
+    >>> setup.unmodelled_errors(GyroSpec(angle_random_walk=1e-5, scale_factor=(1e-4, 0.0, 0.0)))
     ("the gyro's scale factor of 100 ppm",)
     """
     found = []
@@ -377,7 +358,7 @@ def _noise(spec: GyroSpec, record: ImuRecord) -> dict[str, float]:
 def _need_white(noise: Mapping[str, float]) -> None:
     if noise["angle_random_walk"] == 0.0:
         raise InputError(
-            "the gyro's specification has no angle random walk, and a filter must believe one greater than zero; "
+            "the gyro's specification has no angle random walk, and a filter needs one greater than zero; "
             "give it, or a filter setup of your own"
         )
 
@@ -403,7 +384,7 @@ def _information(series: VectorMeasurements) -> float:
     return share * float(np.sum((length[seen] / series.sigma[seen]) ** 2))
 
 
-def believed(record: ImuRecord, setup: FilterSetup) -> ImuRecord:
+def modelled_record(record: ImuRecord, setup: FilterSetup) -> ImuRecord:
     """Return the record as the filter of this setup processes it: at the rate of its integration algorithm, with the setup's σ."""
     names = [series.sensor for series in record.vectors]
     for name in setup.sigma:
@@ -415,36 +396,36 @@ def believed(record: ImuRecord, setup: FilterSetup) -> ImuRecord:
     )
     if setup.measurement_sigma_factor == 1.0 and not setup.sigma:
         return used
-    return replace(used, vectors=tuple(_believed(series, setup) for series in record.vectors))
+    return replace(used, vectors=tuple(_modelled_series(series, setup) for series in record.vectors))
 
 
-def _believed(series: VectorMeasurements, setup: FilterSetup) -> VectorMeasurements:
+def _modelled_series(series: VectorMeasurements, setup: FilterSetup) -> VectorMeasurements:
     factor = setup.measurement_sigma_factor
     if series.sensor in setup.sigma:
-        told = setup.sigma[series.sensor]
-        if isinstance(told, tuple):
-            return _by_axis(series, told, factor)
+        given = setup.sigma[series.sensor]
+        if isinstance(given, tuple):
+            return _by_axis(series, given, factor)
         own = float(np.sqrt(np.mean(series.sigma**2))) if len(series.time) else 0.0
         if own == 0.0:
             if series.attitude is not None:
-                return replace(series, sigma_axes=np.full(3, factor * told))
-            return replace(series, sigma=np.full(len(series.time), factor * told))
-        factor *= told / own
+                return replace(series, sigma_axes=np.full(3, factor * given))
+            return replace(series, sigma=np.full(len(series.time), factor * given))
+        factor *= given / own
     return series if factor == 1.0 else series.noise_scaled(factor)
 
 
-def _by_axis(series: VectorMeasurements, told: tuple[float, float, float], factor: float) -> VectorMeasurements:
+def _by_axis(series: VectorMeasurements, given: tuple[float, float, float], factor: float) -> VectorMeasurements:
     """Return the series with a σ of its own about each body axis; from sample to sample they vary as its own does."""
     if series.kind == "heading":
         raise InputError(
-            f"sigma: {series.sensor} is {told}, three numbers, and a heading has one degree of freedom; give one number"
+            f"sigma: {series.sensor} is {given}, three numbers, and a heading has one degree of freedom; give one number"
         )
     m = len(series.time)
     own = float(np.sqrt(np.mean(series.sigma**2))) if m else 0.0
     level = series.sigma / own if own > 0.0 else np.ones(m)
     # The root mean square over the axes is made from them.
     return replace(
-        series, sigma=np.zeros(m), sigma_axes=factor * level[:, None] * np.asarray(told)[None], covariance=None
+        series, sigma=np.zeros(m), sigma_axes=factor * level[:, None] * np.asarray(given)[None], covariance=None
     )
 
 
@@ -474,11 +455,11 @@ def run(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any) -
         If the setup has a σ or a state for a sensor that the record does not have, or an argument is out of range.
     """
     if setup.estimator != MEKF:
-        return _run_other(believed(record, setup), setup, initial, **options)
+        return _run_other(modelled_record(record, setup), setup, initial, **options)
     chosen = {"gate": setup.gate, "robust": setup.robust, **options}
     if setup.states is not None:
-        return optional.run(believed(record, setup), setup.process_noise, initial, setup.states, **chosen)
-    return estimation.run(believed(record, setup), setup.process_noise, initial, **chosen)
+        return optional.run(modelled_record(record, setup), setup.process_noise, initial, setup.states, **chosen)
+    return estimation.run(modelled_record(record, setup), setup.process_noise, initial, **chosen)
 
 
 def _run_other(
@@ -521,57 +502,37 @@ def smooth(record: ImuRecord, setup: FilterSetup, initial: State, **options: Any
     Raises
     ------
     InputError
-        If the forward pass would need more memory than :data:`MOST_MEMORY`, or a gyro drift is among the states.
+        If the forward pass would need more memory than :data:`MAX_MEMORY`, or a gyro drift is among the states.
     """
     need_mekf(setup, "the smoother")
     chosen = {"gate": setup.gate, "robust": setup.robust, **options}
-    told = believed(record, setup)
+    modelled = modelled_record(record, setup)
     blocks: tuple[ErrorStates, ...] = ()
     if setup.states is not None:
         if setup.states.gyro_drift_sigma:
             raise InputError(
-                "the smoother does not tell a gyro drift as part of the whole bias; leave gyro.drift out, or do not smooth"
+                "the smoother does not estimate a gyro drift as part of the whole bias; leave gyro.drift out, or do not smooth"
             )
-        blocks = setup.states.blocks({series.sensor: series.kind for series in told.vectors})
+        blocks = setup.states.blocks({series.sensor: series.kind for series in modelled.vectors})
     n = 6 + sum(block.size for block in blocks)
-    segments = len(told.increments) + sum(len(series.time) for series in told.vectors)
+    segments = len(modelled.increments) + sum(len(series.time) for series in modelled.vectors)
     need = 8 * (n * (n + 1) // 2 + n + 5) * segments
-    if need > MOST_MEMORY:
+    if need > MAX_MEMORY:
         raise InputError(
-            f"smoothing {len(told.increments)} samples with {n} states takes {need / 1e9:.3g} GB, more than {MOST_MEMORY / 1e9:g}; cut the "
-            "record, or do not smooth"
+            f"smoothing {len(modelled.increments)} samples with {n} states takes {need / 1e9:.3g} GB, more than {MAX_MEMORY / 1e9:g}; "
+            "cut the record, or do not smooth"
         )
-    return estimation.smooth(told, setup.process_noise, initial, blocks, **chosen)
+    return estimation.smooth(modelled, setup.process_noise, initial, blocks, **chosen)
 
 
 def observability(record: ImuRecord, setup: FilterSetup, initial: State) -> Observability:
-    """Return what a record shows of each state of this setup's filter (:func:`strapdown.estimation.observability`).
-
-    Parameters
-    ----------
-    record : ImuRecord
-        Gyro increments and measurements along which the filter is linearised.
-    setup : FilterSetup
-        Filter whose states, σ and integration algorithm are applied.
-    initial : State
-        State at the first edge, whose covariance is the prior.
-
-    Returns
-    -------
-    Observability
-        Singular values and directions, the prior σ of each state and what the record leaves of it.
-
-    Raises
-    ------
-    InputError
-        If the setup has a σ or a state for a sensor that the record does not have.
-    """
+    """Return what a record shows of each state of this setup's filter (:func:`strapdown.estimation.observability`)."""
     need_mekf(setup, "observability")
-    told = believed(record, setup)
+    modelled = modelled_record(record, setup)
     if setup.states is None:
-        return estimation.observability(told, setup.process_noise, initial)
-    blocks = setup.states.blocks({series.sensor: series.kind for series in told.vectors})
-    return estimation.observability(told, setup.process_noise, optional.initial_state(initial, blocks), blocks)
+        return estimation.observability(modelled, setup.process_noise, initial)
+    blocks = setup.states.blocks({series.sensor: series.kind for series in modelled.vectors})
+    return estimation.observability(modelled, setup.process_noise, optional.initial_state(initial, blocks), blocks)
 
 
 def initial_state(
@@ -623,7 +584,7 @@ _ROBUST_FORM: tables.Form = {
 }
 _PARTS = ("integration", "sigma", "gate", "robust", "states", "estimator")
 NEVER = 0
-"""What stands in a file for the ``recovery`` of a gate that never recovers, as TOML has no word for nothing."""
+"""Value of ``recovery`` in a file for a gate that never recovers, as TOML has no null."""
 
 
 def to_table(setup: FilterSetup) -> dict[str, Any]:
@@ -653,14 +614,14 @@ def from_table(table: Mapping[str, Any], place: str = "filter") -> FilterSetup:
     own = tables.keys(_NOISE_FORM)
     parts: dict[str, Any] = {}
     if "integration" in table:
-        told = table["integration"]
-        if isinstance(told, Mapping):
-            parts["integration"] = coning.Algorithm.from_table(told, f"{place}: integration")
+        algorithm = table["integration"]
+        if isinstance(algorithm, Mapping):
+            parts["integration"] = coning.Algorithm.from_table(algorithm, f"{place}: integration")
         else:
-            parts["integration"] = coning.ALGORITHMS[one_of(f"{place}: integration", told, coning.ALGORITHMS)]
+            parts["integration"] = coning.ALGORITHMS[one_of(f"{place}: integration", algorithm, coning.ALGORITHMS)]
     if "sigma" in table:
-        believed_sigma = _part(table, "sigma", place)
-        parts["sigma"] = {name: _sigma(f"{place}: sigma: {name}", value) for name, value in believed_sigma.items()}
+        sigma = _part(table, "sigma", place)
+        parts["sigma"] = {name: _sigma(f"{place}: sigma: {name}", value) for name, value in sigma.items()}
     if "gate" in table:
         content = dict(_part(table, "gate", place))
         if content.get("recovery") == NEVER:
@@ -674,8 +635,10 @@ def from_table(table: Mapping[str, Any], place: str = "filter") -> FilterSetup:
     if "states" in table:
         parts["states"] = optional.from_table(_part(table, "states", place), f"{place}: states")
     if "estimator" in table:
-        told = table["estimator"]  # a table describes a filter of one's own, whose code no file holds
-        parts["estimator"] = Own(told) if isinstance(told, Mapping) and "name" in told else str(told)
+        estimator = table["estimator"]  # a table describes a filter of one's own, whose code no file holds
+        parts["estimator"] = (
+            Own(estimator) if isinstance(estimator, Mapping) and "name" in estimator else str(estimator)
+        )
     return tables.build(  # type: ignore[no-any-return]
         FilterSetup,
         {key: value for key, value in table.items() if key not in own and key not in _PARTS},
@@ -691,8 +654,8 @@ def need_angles(setup: FilterSetup, kinds: Mapping[str, str], place: str) -> Non
 
     ``kinds`` are those of the sensors by their names; whole vectors ("vector") may have any σ. ``place`` is what is named in the error.
     """
-    for name, told in setup.sigma.items():
-        largest = float(np.max(told))
+    for name, sigma in setup.sigma.items():
+        largest = float(np.max(sigma))
         if kinds.get(name, "vector") != "vector" and largest > np.pi:
             raise InputError(
                 f"{place}: sigma: {name} is {largest:g} rad, beyond half a turn; sigma is in rad, and {largest:g} arcsec would be "
@@ -707,22 +670,13 @@ def _part(table: Mapping[str, Any], name: str, place: str) -> Mapping[str, Any]:
 
 
 def to_toml(setup: FilterSetup) -> str:
-    """Return a setup as TOML text with the table ``[filter]``, units in the names of its keys.
-
-    Parameters
-    ----------
-    setup : FilterSetup
-        Setup to be written; of a filter of one's own only the description is.
-
-    Returns
-    -------
-    str
-        TOML text that :func:`read_setup` reads back from a file.
-    """
+    """Return a setup as TOML text with the table ``[filter]``, units in the names of its keys; :func:`read_setup` reads it back."""
     import tomli_w
 
-    told = setup.sigma or (setup.states is not None and setup.states.sensors)
-    note = "# sigma of sensors: rad, or of one that measures whole vectors the unit of its reference\n" if told else ""
+    sensors = setup.sigma or (setup.states is not None and setup.states.sensors)
+    note = (
+        "# sigma of sensors: rad, or of one that measures whole vectors the unit of its reference\n" if sensors else ""
+    )
     return note + tomli_w.dumps({"filter": to_table(setup)})
 
 

@@ -21,8 +21,6 @@ from strapdown.setup.states import States
 from strapdown.units import DEGREE
 from strapdown.vectors.wahba import InconsistentError
 
-__all__ = ["Start", "drawn_start", "matched_setup", "matched_to_scenario", "start", "unmodelled_errors"]
-
 UNEVEN = 2.0
 """Ratio of the largest to the smallest σ of an attitude above which both are reported."""
 
@@ -36,30 +34,11 @@ def matched_setup(
     states: bool | Sequence[str] | None = None,
     smooth: bool = False,
 ) -> FilterSetup:
-    """Return the filter setup that matches what a record specifies of its gyro and sensors.
+    """Return the filter setup that matches what a record's ``origin`` specifies of its gyro (or ``gyro`` does) and sensors.
 
-    Parameters
-    ----------
-    record : ImuRecord
-        With its ``origin``, unless ``gyro`` is given.
-    gyro : GyroSpec, optional
-        Specification of the gyro, instead of that of ``record.origin``.
-    states : bool or sequence of str, optional
-        True: with an error state for each error that the gyro and the sensors of the scenario are specified with; names such as
-        ``"gyro.scale"``: with these of them alone; False: attitude and gyro bias only. Default: with all of them where an error is
-        specified that the filter would have no state for.
-    smooth : bool, default False
-        For a smoother: by default no state for gyro drifts, which smoothing does not have.
-
-    Returns
-    -------
-    FilterSetup
-        Setup with the noise of the gyro, the σ of the sensors, and the error states asked for.
-
-    Raises
-    ------
-    InputError
-        If neither ``gyro`` nor the record's origin specifies the gyro, or a name in ``states`` is none of the specified errors.
+    ``states``: True, with an error state for each error that is specified; names such as ``"gyro.scale"``, with these of them alone; False,
+    attitude and gyro bias only. By default with all of them where an error is specified that the filter would have no state for. For a
+    smoother (``smooth``) by default no state for gyro drifts, which smoothing does not have.
     """
     origin = record.origin or Origin()
     spec = gyro or origin.gyro
@@ -90,22 +69,9 @@ def matched_setup(
 
 
 def matched_to_scenario(scenario: Scenario, *, states: bool | None = None) -> FilterSetup:
-    """Return the filter setup that matches a scenario.
-
-    Parameters
-    ----------
-    scenario : Scenario
-        Its gyro, its sensors and its motion determine the setup.
-    states : bool, optional
-        With an error state for each error that the scenario specifies, or without. Default: with them where there are such errors.
-
-    Returns
-    -------
-    FilterSetup
-        Setup whose noise model, and error states if there are any, are those of the scenario.
-    """
+    """Return the filter setup that matches a scenario, by default with error states where the scenario specifies such errors."""
     if states is None:
-        states = bool(setup.not_covered(scenario.gyro, scenario.sensors, gravity_f=scenario.gravity_f))
+        states = bool(setup.unmodelled_errors(scenario.gyro, scenario.sensors, gravity_f=scenario.gravity_f))
     found = setup.matched(scenario, states=states)
     if states and (found.states is None or not found.states.names):
         return setup.matched(scenario)
@@ -113,27 +79,14 @@ def matched_to_scenario(scenario: Scenario, *, states: bool | None = None) -> Fi
 
 
 def unmodelled_errors(record: ImuRecord, chosen: FilterSetup) -> tuple[str, ...]:
-    """Return, in words, the specified errors of a record that a filter has no state for; empty where nothing is specified.
-
-    Parameters
-    ----------
-    record : ImuRecord
-        With its ``origin``, which specifies gyro and sensors.
-    chosen : FilterSetup
-        Filter whose error states are compared with the specification.
-
-    Returns
-    -------
-    tuple of str
-        One phrase for each error, with its size.
-    """
+    """Return, in words, the specified errors of a record that a filter has no state for; empty where nothing is specified."""
     origin = record.origin or Origin()
     if origin.gyro is None:
         return ()
     if origin.scenario is None:
-        return setup.not_covered(origin.gyro, (), chosen.states)
+        return setup.unmodelled_errors(origin.gyro, (), chosen.states)
     scenario = origin.scenario
-    return setup.not_covered(origin.gyro, scenario.sensors, chosen.states, gravity_f=scenario.gravity_f)
+    return setup.unmodelled_errors(origin.gyro, scenario.sensors, chosen.states, gravity_f=scenario.gravity_f)
 
 
 class Start(NamedTuple):
@@ -157,25 +110,9 @@ class Start(NamedTuple):
 def start(record: ImuRecord, chosen: FilterSetup) -> Start:
     """Return the initial state from the first measurements of a record.
 
-    Where one set of measurements does not give the attitude, or directions contradict each other, a bank of filters with different initial
-    attitudes finds it (:mod:`strapdown.estimation.multiple_model`), and the estimate starts where one of them is left.
-
-    Parameters
-    ----------
-    record : ImuRecord
-        As the filter processes it (:func:`strapdown.setup.believed`).
-    chosen : FilterSetup
-        Filter whose gyro noise and initial bias σ are applied.
-
-    Returns
-    -------
-    Start
-        State, how it was found, and the edge at which the filter starts with it.
-
-    Raises
-    ------
-    InputError
-        If the measurements do not give the attitude.
+    They count as the filter models them (:func:`strapdown.setup.modelled_record`). Where one set of measurements does not give the
+    attitude, or directions contradict each other, a bank of filters with different initial attitudes finds it
+    (:mod:`strapdown.estimation.multiple_model`), and the estimate starts where one of them is left.
     """
     try:
         state = estimation.first_state(record, chosen.process_noise, bias_sigma=chosen.bias_sigma)
@@ -232,27 +169,11 @@ def _sigma_words(state: State) -> str:
 
 
 def drawn_start(record: ImuRecord, chosen: FilterSetup) -> Start:
-    """Return the true initial state of a record with errors added that are drawn from the σ of the setup.
-
-    Parameters
-    ----------
-    record : ImuRecord
-        With its truth; the errors are drawn with seed and run of its ``origin``.
-    chosen : FilterSetup
-        Filter whose initial σ of attitude and bias the errors are drawn with.
-
-    Returns
-    -------
-    Start
-        State at the first edge, with the σ of the setup.
-
-    Raises
-    ------
-    InputError
-        If the record has no truth.
-    """
+    """Return the true initial state with errors drawn from the σ of the setup, by seed and run of the record's ``origin``."""
     if record.truth is None:
-        raise InputError("--from-truth needs a record with the truth; this one has none")
+        raise InputError(
+            "a start drawn about the truth (--from-truth) needs a record with its truth; this one has none"
+        )
     origin = record.origin or Origin()
     draw = generator(origin.seed or 0, origin.run or 0, "initial error").standard_normal(6)
     q = quaternion.multiply(record.truth.attitude[0], quaternion.exp(-chosen.attitude_sigma * draw[:3]))

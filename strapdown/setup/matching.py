@@ -21,7 +21,7 @@ QUICK = 0.3
 """A drift is a state if its time constant is at least this part of the filter's own."""
 UNSEEN = 1e4
 """Part of the record's length that the quickest drift lasts where nothing is measured."""
-LEAST_STEPS = 10.0
+MIN_STEPS = 10.0
 """Gyro intervals that the quickest drift lasts at least."""
 
 
@@ -39,18 +39,8 @@ def matched(spec: GyroSpec, record: ImuRecord, sensors: Sequence[Any], gravity_f
 
     Each error is taken for one draw from a normal distribution whose σ is its size, entry by entry; one of zero is no state. Of flicker,
     parts a decade apart from the record's length down to what the measurements can follow are states (their sum is 1/f within 6 %), what is
-    quicker is white noise of the attitude and a σ of the reported bias.
-
-    Parameters
-    ----------
-    spec : GyroSpec
-    record : ImuRecord
-    sensors : sequence of sensors
-        Those of the scenario (:mod:`strapdown.vectors`); series of the record without one have no states.
-    gravity_f : (3,)
-        m/s².
-    density : float
-        Variance about an axis of a measurement times the interval between measurements, rad² s; infinite without any.
+    quicker is white noise of the attitude and a σ of the reported bias. ``density`` is the variance about an axis of a measurement times
+    the interval between measurements, rad² s, infinite without any.
     """
     drift_sigma, drift_time, fast, white = _drifts(spec, record, density)
     force = np.abs(spec.g_sensitivity) if np.any(gravity_f) else np.zeros((3, 3))
@@ -100,7 +90,7 @@ def _drifts(
         length = float(record.time[-1] - record.time[0])
         step = length / len(record.increments)
         follows = QUICK / bandwidth(spec, density) if np.isfinite(density) else length / UNSEEN
-        shortest = max(follows, LEAST_STEPS * step)
+        shortest = max(follows, MIN_STEPS * step)
         number = max(1, int(np.floor(np.log10(length / shortest))) + 1)
         times = length / DECADE ** np.arange(number)
         each = instability * float(np.sqrt(np.log(DECADE) / np.pi))

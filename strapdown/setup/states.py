@@ -42,8 +42,8 @@ def _entries(name: str, value: Any, shape: tuple[int, ...], unit: str) -> Entrie
     if np.any(values < 0.0):
         index = tuple(int(i) for i in np.argwhere(values < 0.0)[0])
         raise InputError(f"{name}{list(index)} is {values[index]:g} {unit}; it must not be negative")
-    told: Any = values.tolist()
-    return tuple(tuple(row) if isinstance(row, list) else row for row in told)
+    rows: Any = values.tolist()
+    return tuple(tuple(row) if isinstance(row, list) else row for row in rows)
 
 
 def _any(value: Entries) -> bool:
@@ -135,8 +135,8 @@ class SensorStates:
             self._velocity("accelerometer", 1.0)
 
     def _velocity(self, sensor: str, strength: float) -> BoundedVelocity:
-        told = {name: getattr(self, name) for name in VELOCITY}
-        return BoundedVelocity(sensor=sensor, strength=strength, **told)
+        given = {name: getattr(self, name) for name in VELOCITY}
+        return BoundedVelocity(sensor=sensor, strength=strength, **given)
 
     def blocks(self, sensor: str, kind: str, gravity: float) -> tuple[ErrorStates, ...]:
         """Return the error states of one sensor.
@@ -300,7 +300,7 @@ class States(ByValue):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What is declared, in the words by which :func:`chosen` takes it."""
+        """Names of the declared states, as :func:`chosen` accepts them."""
         gyro = (
             ("gyro.scale", _any(self.gyro_scale_sigma)),
             ("gyro.misalignment", _any(self.gyro_misalignment_sigma)),
@@ -477,14 +477,14 @@ def from_table(table: Mapping[str, Any], place: str = "states") -> States:
     sensors = table.get("sensors", {})
     if not isinstance(sensors, Mapping):
         raise InputError(f"{place}: sensors is {sensors!r}; it must be a table of tables, [{place}.sensors.NAME]")
-    told = {}
+    by_sensor = {}
     for name, content in sensors.items():
         where = f"{place}: sensors: {name}"
         if not isinstance(content, Mapping):
             raise InputError(f"{where} is {content!r}; it must be a table, [{place}.sensors.{name}]")
-        told[name] = _placed(where, SensorStates, _plain(where, content), SENSOR_FORM)
+        by_sensor[name] = _placed(where, SensorStates, _plain(where, content), SENSOR_FORM)
     own = {key: value for key, value in table.items() if key != "sensors"}
-    return _placed(place, States, own, FORM, sensors=told)  # type: ignore[no-any-return]
+    return _placed(place, States, own, FORM, sensors=by_sensor)  # type: ignore[no-any-return]
 
 
 def _plain(place: str, content: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,29 +1,16 @@
 """Tuning a filter from data: maximum likelihood, an interval for each parameter, and validation on held-out data.
 
-``procedure``
-    :func:`tune`: objective, search and what follows it in one call.
-``innovations``
-    Of the filter's innovations, with score and information, eight sets of parameters a pass.
-``errors``
-    Of the errors against a truth.
-``credibility``
-    Consistency: the whole distribution of NIS, or NEES, and whiteness.
-``outliers``
-    Of innovations some of which are outliers, and the gate that suits them.
-``fitting``
-    The search from several starts, intervals, what is identified and what is not.
-``parameters``
-    Names, values in a filter setup, priors.
-``starting``
-    Where the filter starts on a record.
-``planning``
-    The Cramér–Rao bound before there is a record.
-``suspicion``
-    What the tuned filter leaves unexplained, such as a scale factor that the gyro's noise stands for.
-``own``
-    Parameters of a filter of one's own, by the same objectives.
-``holding``
-    What is held out, and the filter before and after on it.
+- ``procedure``: :func:`tune`: objective, search and what follows it in one call.
+- ``innovations``: Of the filter's innovations, with score and information, eight sets of parameters a pass.
+- ``errors``: Of the errors against a truth.
+- ``outliers``: Of innovations some of which are outliers, and the gate that suits them.
+- ``fitting``: The search from several starts, intervals, what is identified and what is not.
+- ``parameters``: Names, values in a filter setup, priors.
+- ``starting``: Where the filter starts on a record.
+- ``planning``: The Cramér–Rao bound before there is a record.
+- ``suspicion``: What the tuned filter leaves unexplained, such as a scale factor that the gyro's noise stands for.
+- ``own``: Parameters of a filter of one's own, by the same objectives.
+- ``holding``: What is held out, and the filter before and after on it.
 
 >>> objective = tuning.likelihood([tuning.record_case(record, chosen)], chosen, ["gyro.arw", "star.sigma"])  # doctest: +SKIP
 >>> result = tuning.fit(objective)  # doctest: +SKIP
@@ -35,26 +22,17 @@ samples break it, and the most likely filter may then follow them (:attr:`strapd
 (:func:`contaminated_likelihood`), and an error without a state looks like noise of the gyro (:func:`unmodelled` looks for it).
 """
 
-from strapdown.tuning.credibility import CredibilityObjective as CredibilityObjective
-from strapdown.tuning.credibility import credibility_objective as credibility_objective
-from strapdown.tuning.errors import ErrorObjective as ErrorObjective
 from strapdown.tuning.errors import error_objective as error_objective
-from strapdown.tuning.fitting import Estimated as Estimated
 from strapdown.tuning.fitting import Slices as Slices
 from strapdown.tuning.fitting import Tuning, fit
 from strapdown.tuning.fitting import rescaled as rescaled
 from strapdown.tuning.fitting import search as search
 from strapdown.tuning.fitting import slices as slices
 from strapdown.tuning.holding import Comparison as Comparison
-from strapdown.tuning.holding import NeesCourse as NeesCourse
 from strapdown.tuning.holding import Performance as Performance
 from strapdown.tuning.holding import compare, split
-from strapdown.tuning.holding import performance as performance
 from strapdown.tuning.innovations import Case, likelihood
-from strapdown.tuning.innovations import Derivatives as Derivatives
-from strapdown.tuning.innovations import Likelihood as Likelihood
 from strapdown.tuning.innovations import thinned as thinned
-from strapdown.tuning.outliers import ContaminatedLikelihood as ContaminatedLikelihood
 from strapdown.tuning.outliers import TunedGate as TunedGate
 from strapdown.tuning.outliers import contaminated_likelihood as contaminated_likelihood
 from strapdown.tuning.outliers import log_likelihood as log_likelihood
@@ -72,13 +50,10 @@ from strapdown.tuning.planning import Plan as Plan
 from strapdown.tuning.planning import plan
 from strapdown.tuning.planning import simulated_again as simulated_again
 from strapdown.tuning.procedure import GATED as GATED
-from strapdown.tuning.procedure import Tuned as Tuned
-from strapdown.tuning.procedure import objective_for as objective_for
 from strapdown.tuning.procedure import tune
 from strapdown.tuning.starting import one_gyro as one_gyro
 from strapdown.tuning.starting import record_case, recording_case
 from strapdown.tuning.starting import recording_setup as recording_setup
-from strapdown.tuning.suspicion import ScaleFactor as ScaleFactor
 from strapdown.tuning.suspicion import Unmodelled as Unmodelled
 from strapdown.tuning.suspicion import doubted as doubted
 from strapdown.tuning.suspicion import unmodelled as unmodelled

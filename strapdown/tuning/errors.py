@@ -16,21 +16,41 @@ from strapdown import consistency
 from strapdown.checks import Array, InputError, one_of
 from strapdown.estimation.states import covariance_matrices
 from strapdown.setup import FilterSetup
-from strapdown.tuning.innovations import MOST, STEP, Case, Composite, Derivatives, Likelihood, likelihood
+from strapdown.tuning.innovations import MOST, STEP, Case, Derivatives, Likelihood, likelihood
 
 Measure = Literal["likelihood", "rmse"]
-MOST_EPOCHS = 1000
+MAX_EPOCHS = 1000
 """Epochs taken of one record."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ErrorObjective(Composite):
-    """What the errors of the state say of the parameters; built by :func:`error_objective`."""
+class ErrorObjective:
+    """Objective of the parameters, from the errors of the state; built by :func:`error_objective`."""
 
+    base: Likelihood
     measure: Measure
     epochs: tuple[np.ndarray, ...] = field(repr=False)
     """Edges judged, of each record."""
     parts: int = 20
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free parameters."""
+        return self.base.names
+
+    @property
+    def start(self) -> Array:
+        """Logarithms of their first values."""
+        return self.base.start
+
+    @property
+    def composite(self) -> bool:
+        """Whether the curvature is no information."""
+        return True
+
+    def setup(self, point: Array) -> FilterSetup:
+        """Return the setup of a point."""
+        return self.base.setup(point)
 
     def minus_log(self, points: Array) -> Array:
         """Return the value at several points (k, p): (k,)."""
@@ -98,19 +118,10 @@ def error_objective(
     measure: Measure = "likelihood",
     threads: int = 1,
 ) -> ErrorObjective:
-    """Return the objective that judges the filter by its errors.
+    """Return the objective that judges the filter by its errors on records with a truth, or a reference attitude: then only the attitude.
 
-    Parameters
-    ----------
-    cases : sequence of Case
-        Records with a truth of their own, or with a reference attitude beside them; then only the attitude is judged.
-    chosen : FilterSetup
-    free : sequence of str
-    measure : "likelihood" or "rmse"
-        The likelihood of the errors under the filter's covariance asks that they be small and that the filter know how small;
-        the root mean square of the attitude error asks for the first alone, and does not determine a common scale of all parameters.
-    threads : int
-        Records that are worked on at once.
+    The likelihood of the errors under the filter's covariance asks that they be small and that the filter know how small; the root mean
+    square of the attitude error asks for the first alone, and does not determine a common scale of all parameters.
     """
     one_of("measure", measure, ("likelihood", "rmse"))
     base = likelihood(cases, chosen, free, threads=threads)
@@ -121,7 +132,7 @@ def error_objective(
         prepared = base.prepared[number]
         if prepared.true_attitude is None or not prepared.judged.any():
             raise InputError(
-                f"{case.name or 'record'} has no truth where it is to be judged; tune by the innovations instead (leave --truth away)"
+                f"{case.name or 'record'} has no truth where it is to be judged; tune by the innovations instead (leave truth out)"
             )
         known = np.flatnonzero(prepared.judged)
         epochs.append(_spread(base, number, known, measure))
@@ -130,7 +141,7 @@ def error_objective(
 
 def _spread(base: Likelihood, number: int, known: np.ndarray, measure: Measure) -> np.ndarray:
     """Return edges far enough apart that the attitude error of the starting filter has forgotten."""
-    picked = known[:: max(1, len(known) // MOST_EPOCHS)]
+    picked = known[:: max(1, len(known) // MAX_EPOCHS)]
     if measure == "rmse" or len(picked) < 100:
         return picked
     case = base.prepared[number]

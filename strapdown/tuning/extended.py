@@ -55,7 +55,7 @@ SENSOR = {
 LARGEST_SCALE = 0.1
 """σ of scale factors and misalignments from which on a filter that is linear in them makes no sense: noise would pass for a turn."""
 QUICKEST, SLOWEST = 0.05, 100.0
-"""Of a time constant: the least part of the interval between measurements, the most times the record's length, that make a difference."""
+"""Range of a time constant that makes a difference: from this part of the interval between measurements to this multiple of the record."""
 
 
 def _size(value: Entries) -> float:
@@ -81,7 +81,7 @@ def state_names(states: States) -> tuple[str, ...]:
 
 def unit_of(name: str) -> Unit:
     """Return the unit that a parameter of the states is printed in."""
-    told = {
+    known = {
         "gyro.scale_sigma": Unit(name="ppm", factor=1e-6),
         "gyro.misalignment_sigma": Unit(name="mrad", factor=1e-3),
         "gyro.force_sigma": Unit(name="°/h/g", factor=units.DEGREE_PER_HOUR / units.STANDARD_GRAVITY),
@@ -92,7 +92,7 @@ def unit_of(name: str) -> Unit:
         "lever_sigma": Unit(name="m", factor=1.0),
         **{name: Unit(name=unit, factor=1.0) for name, unit in VELOCITY.items()},
     }
-    return told.get(name, told.get(name.rpartition(".")[2], Unit(name="rad, or the vector's unit", factor=1.0)))
+    return known.get(name, known.get(name.rpartition(".")[2], Unit(name="rad, or the vector's unit", factor=1.0)))
 
 
 def value_of(states: States, name: str) -> float:
@@ -152,8 +152,8 @@ class ExtendedLikelihood:
         own = set(state_names(self.chosen.states))
         plain = {name: value for name, value in values.items() if name not in own}
         result = parameters.with_values(self.chosen, plain) if plain else self.chosen
-        told = {name: self._bounded(name, value) for name, value in values.items() if name in own}
-        return replace(result, states=with_state_values(self.chosen.states, told))
+        bounded = {name: self._bounded(name, value) for name, value in values.items() if name in own}
+        return replace(result, states=with_state_values(self.chosen.states, bounded))
 
     def _bounded(self, name: str, value: float) -> float:
         """Return the value of a parameter inside what makes a difference, or sense."""
@@ -256,23 +256,10 @@ def likelihood(
     parts: int = 20,
     threads: int = 1,
 ) -> ExtendedLikelihood:
-    """Return the likelihood of the free parameters of a filter with optional states on these records.
+    """Return the likelihood of the free parameters of a filter with error states on these records.
 
-    Parameters
-    ----------
-    cases : sequence of Case
-        Their initial states are of the whole bias, as those of :func:`strapdown.tuning.record_case` do.
-    chosen : FilterSetup
-        Where the free parameters start, and what the fixed ones are; its gate and robust weights are not applied. With ``states``, or
-        without where a σ of one axis is free.
-    free : sequence of str
-        Names of :mod:`strapdown.tuning.parameters` but ``filter.scale``, those of single axes (``SENSOR.sigma.x``) too, and of
-        :func:`state_names`, such as ``gyro.scale_sigma``, ``gyro.drift_time``, ``SENSOR.bias_sigma``, ``SENSOR.correlated_sigma``,
-        ``SENSOR.correlation_time``.
-    parts : int
-        Spans of time of each record whose gradients are kept apart.
-    threads : int
-        Runs at once.
+    The initial states of the cases are of the whole bias. Gate and robust weights of ``chosen`` are not applied. ``free`` are names of
+    :mod:`strapdown.tuning.parameters` but ``filter.scale``, those of single axes (``SENSOR.sigma.x``) too, and of :func:`state_names`.
     """
     if not cases:
         raise InputError("there is no record to tune on; give one")
@@ -300,10 +287,10 @@ def likelihood(
     for case in cases:
         _check_case(case, chosen)
     names = tuple(free)
-    told = {name: values[name] for name in names if name in plain}
+    given = {name: values[name] for name in names if name in plain}
     return ExtendedLikelihood(
         names=names,
-        chosen=parameters.with_values(chosen, told) if told else chosen,
+        chosen=parameters.with_values(chosen, given) if given else chosen,
         start=np.log([values[name] for name in names]),
         cases=tuple(cases),
         parts=count("parts", parts),
@@ -336,5 +323,5 @@ def _check_case(case: Case, chosen: FilterSetup) -> None:
         )
     if not isinstance(case.initial, State):
         raise InputError(
-            f"{what}: initial is {case.initial!r}; it must be a estimation.State, which tells of the whole bias"
+            f"{what}: initial is {case.initial!r}; it must be an estimation.State, which holds the whole bias"
         )

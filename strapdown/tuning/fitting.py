@@ -2,7 +2,7 @@
 
 The search is Fisher's scoring, damped (Levenberg–Marquardt) and confined to steps of a factor e² in each parameter. Where the data pin
 a parameter well, its interval is that of the information; where they do not, it comes from the profile likelihood, which knows what a
-parabola does not: that zero may be as likely as the best value. Then only a bound is told.
+parabola does not: that zero may be as likely as the best value. Then only a bound is reported.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from strapdown.tuning.innovations import Derivatives
 from strapdown.tuning.parameters import RRW, SCALE, Prior, fixed_unit, with_values
 
 LONGEST_STEP = 2.0
-"""Of a log parameter in one step of the search."""
+"""Largest change of a log parameter in one step of the search."""
 REACH = 16.0
 """How far a log parameter may go from where it starts."""
 WELL_KNOWN = 0.1
@@ -31,8 +31,8 @@ TWO_SIDED = 3.841458820694124
 ONE_SIDED = 2.705543454095404
 """90 % quantile: the bound that is passed on one side with 5 %, and the test against zero, where half the probability is a point
 (Self & Liang 1987)."""
-LEAST_INFORMATION = 1e-10
-"""Of a log parameter; less is none."""
+MIN_INFORMATION = 1e-10
+"""Least information on a log parameter; below it there is none."""
 NEGLIGIBLE = 1e-3
 """A gain of the log likelihood that is not distinguishable from none."""
 
@@ -42,7 +42,7 @@ MISFIT = 1.6
 
 
 class Objective(Protocol):
-    """What is minimised: minus a log likelihood, or what stands for one."""
+    """Objective to minimise: minus a log likelihood, or a substitute."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -187,11 +187,11 @@ class Estimated:
     upper: float
     """Upper end of the 95 % interval; infinite where nothing bounds it."""
     standard_error: float
-    """Of the logarithm, by the information, or by the sandwich where :attr:`Tuning.misfit` or against a truth."""
+    """Standard error of the logarithm, by the information, or by the sandwich where :attr:`Tuning.misfit` or against a truth."""
     identified: bool
     """Whether zero is refuted at 95 %, and an upper end found."""
     note: str
-    """What to make of it, in words."""
+    """Interpretation, in words."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -335,12 +335,12 @@ def fit(
     known_keys("priors", known, objective.names)
     if not factor > 1.0:
         raise InputError(f"factor is {factor}; random starts need one greater than 1")
-    told = progress or (lambda done: None)
+    report = progress or (lambda done: None)
     points = np.clip(random_starts(objective.start, starts, factor, np.random.default_rng(seed)), *limits_of(objective))
 
     def one(point: Array) -> Optimum:
         result = search(objective, point, known)
-        told(1)
+        report(1)
         return result
 
     with ThreadPoolExecutor(threads) as pool:
@@ -348,7 +348,7 @@ def fit(
     best = min(optima, key=lambda optimum: optimum.local.value)
     if not best.converged:
         raise InputError(
-            "the search did not settle in 200 steps; free fewer parameters, or give priors for those that the record cannot tell"
+            "the search did not settle in 200 steps; free fewer parameters, or give priors for those that the record does not determine"
         )
     covariance, robust = covariances(_curved(objective, best))
     curvature, sandwich = np.sqrt(np.diag(covariance)), np.sqrt(np.diag(robust))
@@ -368,7 +368,7 @@ def fit(
             if loose and intervals
             else _wald(best, j, float(error[j]))
         )
-        told(1)
+        report(1)
         return result
 
     with ThreadPoolExecutor(threads) as pool:
@@ -443,7 +443,7 @@ class Slices:
 
     names: tuple[str, ...]
     values: Array
-    """Of the parameter (p, k), SI."""
+    """Values of the parameter (p, k), SI."""
     fallen: Array
     """2 Δℓ: by how much twice the log likelihood lies below its best (p, k)."""
 
@@ -471,7 +471,7 @@ def covariances(local: Local) -> tuple[Array, Array]:
     for innovations that are not white). Where there is no information the variance is infinite, to a large number.
     """
     # A parameter that nothing depends on has no row to invert; a pseudo-inverse would make its variance zero.
-    F = local.information + np.diag(np.maximum(LEAST_INFORMATION - np.diag(local.information), 0.0))
+    F = local.information + np.diag(np.maximum(MIN_INFORMATION - np.diag(local.information), 0.0))
     scale = np.sqrt(np.diag(F))
     inverse = np.linalg.pinv(F / np.outer(scale, scale), rcond=1e-10, hermitian=True) / np.outer(scale, scale)
     parts = local.derivatives.score
@@ -501,6 +501,7 @@ def _profiled(
 
     ``swollen`` is how many times too fast it falls.
     """
+    from scipy.integrate import simpson
     from scipy.optimize import brentq
 
     centre = best.point[j]
@@ -541,11 +542,11 @@ def _profiled(
     if not identified and top is not None:
         # Mean of σ under the profile likelihood, every σ of zero or more alike: between nothing and the bound, never either.
         warm[:] = best.point
-        grid = np.linspace(0.0, 1.6 * upper, 17)
+        grid = np.linspace(0.0, 2.0 * upper, 17)
         with np.errstate(divide="ignore"):
             logs = np.log(grid)
         weight = np.array([np.exp(-0.5 * max(fallen(x if k else nothing), 0.0)) for k, x in enumerate(logs)])
-        value = float(np.sum(grid * weight) / np.sum(weight))
+        value = float(simpson(grid * weight, x=grid) / simpson(weight, x=grid))
     return _Known(lower=lower, upper=upper, mean=value, identified=identified)
 
 

@@ -17,10 +17,10 @@ from strapdown.setup import FilterSetup
 from strapdown.tuning.innovations import Case
 
 By = Literal["time", "record"]
-MOST_ROWS = 20_000
+MAX_ROWS = 20_000
 """States that are kept of one record to judge."""
-LEAST_ERRORS = 100
-"""Errors against a truth below which their course is not told."""
+MIN_ERRORS = 100
+"""Fewest errors against a truth of which the course is reported."""
 
 
 def split(cases: Sequence[Case], share: float, by: By = "time") -> tuple[tuple[Case, ...], tuple[Case, ...]]:
@@ -88,7 +88,7 @@ class Performance:
     """One filter on held-out data."""
 
     log_likelihood: float
-    """Of all its innovations, in nats an innovation; what a gate refused is left out."""
+    """Log likelihood per innovation, nats, without those that a gate refused."""
     nis: float
     """Mean NIS per degree of freedom; 1 for a consistent filter."""
     nis_bounds: tuple[float, float]
@@ -194,9 +194,9 @@ def _judged(case: Case, chosen: FilterSetup) -> tuple[Estimate, Truth | None, Ar
     """Return the part of the filter's estimate that is to be judged, with the truth, or the reference attitude, at its times."""
     own = [series.sensor for series in case.record.vectors]
     used = replace(chosen, sigma={name: value for name, value in chosen.sigma.items() if name in own})
-    record = setup.believed(case.record, used)
+    record = setup.modelled_record(case.record, used)
     reference = case.true_attitude
-    every = 1 if reference is not None else max(1, len(record.increments) // MOST_ROWS)
+    every = 1 if reference is not None else max(1, len(record.increments) // MAX_ROWS)
     initial = setup.initial_state(used, case.initial.attitude, case.initial.bias)
     estimate = setup.run(
         case.record, used, initial, every=every, full_covariance=record.truth is not None or reference is not None
@@ -255,7 +255,7 @@ def _nees_courses(
     assert attitude is not None
     assert estimate.covariance is not None
     known = np.isfinite(attitude).all(axis=1)
-    if int(known.sum()) < LEAST_ERRORS:
+    if int(known.sum()) < MIN_ERRORS:
         return ()
     bias = estimate.bias if truth is None else truth.bias
     error = consistency.errors(estimate.attitude[known], estimate.bias[known], attitude[known], bias[known])

@@ -282,32 +282,6 @@ def run_lanes(
     compiled(walk, *parts)(read_only(case.time), read_only(case.increments), case.events.measurements, 1, body, out)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Composite:
-    """What an objective that is no likelihood has in common with the likelihood whose runs of the filter it judges."""
-
-    base: Likelihood
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the free parameters."""
-        return self.base.names
-
-    @property
-    def start(self) -> Array:
-        """Logarithms of their first values."""
-        return self.base.start
-
-    @property
-    def composite(self) -> bool:
-        """Whether the curvature is no information."""
-        return True
-
-    def setup(self, point: Array) -> FilterSetup:
-        """Return the setup of a point."""
-        return self.base.setup(point)
-
-
 def _pairs_of_groups(p: int) -> list[tuple[int, ...]]:
     """Return blocks of at most six parameters such that every two share one: each pair of groups of three."""
     groups = [range(first, min(first + 3, p)) for first in range(0, p, 3)]
@@ -395,7 +369,7 @@ def thinned(series: VectorMeasurements, spacing: float) -> VectorMeasurements:
 def _prepare(case: Case, chosen: FilterSetup, names: tuple[str, ...], parts: int, spacing: float) -> Prepared:
     sensors = [series.sensor for series in case.record.vectors]
     own = {name: value for name, value in chosen.sigma.items() if name in sensors}
-    record = setup.believed(case.record, replace(chosen, sigma=own))
+    record = setup.modelled_record(case.record, replace(chosen, sigma=own))
     for series in record.vectors:
         if series.anisotropic:
             raise InputError(

@@ -46,9 +46,9 @@ SHARES = (1e-4, 0.4)
 """Shares that are searched: what is more frequent is no outlier."""
 SCALES = (2.0, 100.0)
 """Scales that are searched: what is hardly wider is none either."""
-MOST_REFUSED = 0.25
+MAX_REFUSED = 0.25
 """A share above which what is called outliers is a second size of the noise, and nothing to refuse."""
-LEAST_REFUSED = 1e-9
+MIN_REFUSED = 1e-9
 """Share of right measurements that any gate refuses."""
 OWN = (OUTLIER_SHARE, OUTLIER_SCALE)
 
@@ -136,20 +136,7 @@ def contaminated_likelihood(
     scale: float = SCALE,
     threads: int = 1,
 ) -> ContaminatedLikelihood:
-    """Return the likelihood of the free parameters and of the outliers' share and scale, which are always free.
-
-    Parameters
-    ----------
-    cases : sequence of Case
-    chosen : FilterSetup
-        Where the free parameters start, and what the fixed ones are.
-    free : sequence of str
-        Names of :mod:`strapdown.tuning.parameters`, at most five.
-    share, scale : float
-        Where the search starts: the share of outliers, and their noise over that of the others.
-    threads : int
-        Records, or points, that are worked on at once.
-    """
+    """Return the likelihood of the free parameters, at most five, and of the outliers' share and scale, which are always free."""
     for name, value, (least, most) in (("share", share, SHARES), ("scale", scale, SCALES)):
         if not least <= positive(name, value) <= most:
             raise InputError(f"{name} of the outliers is {value:g}; it must lie between {least:g} and {most:g}")
@@ -185,8 +172,8 @@ def tuned_gate(objective: ContaminatedLikelihood, tuning: Tuning, *, draws: int 
     share, scale = tuning[OUTLIER_SHARE], tuning[OUTLIER_SCALE]
     seen = _seen(objective, tuning.point[:-2])
     best, thresholds = _probability(seen, np.array([[share.value, scale.value]]))
-    told = {name: float(value[0]) for name, value in thresholds.items()}
-    if not share.identified or share.value > MOST_REFUSED:
+    chosen = {name: float(value[0]) for name, value in thresholds.items()}
+    if not share.identified or share.value > MAX_REFUSED:
         return TunedGate(
             gate=None, probability=math.nan, lower=math.nan, upper=math.nan, thresholds={}, share=share, scale=scale
         )
@@ -202,7 +189,7 @@ def tuned_gate(objective: ContaminatedLikelihood, tuning: Tuning, *, draws: int 
         probability=float(best[0]),
         lower=float(lower),
         upper=float(upper),
-        thresholds=told,
+        thresholds=chosen,
         share=share,
         scale=scale,
     )
@@ -265,6 +252,6 @@ def _probability(seen: dict[str, _Seen], tried: Array) -> tuple[Array, dict[str,
         wider = 1.0 + (scale**2 - 1.0) * one.noise
         odds = np.log1p(-share) - np.log(share) + 0.5 * one.degrees * np.log(wider)
         thresholds[name] = np.maximum(2.0 * odds / (1.0 - 1.0 / wider), 0.0)
-        refused += one.number * np.log(np.maximum(chdtrc(one.degrees, thresholds[name]), LEAST_REFUSED))
+        refused += one.number * np.log(np.maximum(chdtrc(one.degrees, thresholds[name]), MIN_REFUSED))
         total += one.number
     return 1.0 - np.exp(refused / total), thresholds

@@ -22,18 +22,18 @@ from strapdown.checks import Array, InputError, one_of, positive
 from strapdown.consistency import whitened
 from strapdown.estimation.filters.own import as_own
 from strapdown.records import Estimate
-from strapdown.tuning.errors import MOST_EPOCHS
+from strapdown.tuning.errors import MAX_EPOCHS
 from strapdown.tuning.innovations import Case
 
 OwnMeasure = Literal["innovations", "errors", "rmse"]
 OWN_MEASURES = ("innovations", "errors", "rmse")
 FIRST_STEP = 0.5
-"""Of the simplex at the start, in the logarithm of each parameter."""
+"""Initial size of the simplex, in the logarithm of each parameter."""
 TOLERANCE = 1e-4
-"""Of the logarithms at the end."""
+"""Final tolerance of the logarithms."""
 CURVATURE_STEP = 0.05
-"""Of a log parameter, for second derivatives."""
-MOST_RUNS = 400
+"""Step of a log parameter for second derivatives."""
+MAX_RUNS = 400
 """Evaluations for each parameter after which the search is given up."""
 
 
@@ -113,11 +113,11 @@ def fit_own(
     if not np.isfinite(objective(first)):
         raise InputError("the filter fails with the first values: its likelihood is not finite; start from others")
     simplex = np.concatenate([first[None], first + FIRST_STEP * np.eye(len(first))])
-    options = {"initial_simplex": simplex, "xatol": TOLERANCE, "fatol": 1e-9, "maxfev": MOST_RUNS * len(first)}
+    options = {"initial_simplex": simplex, "xatol": TOLERANCE, "fatol": 1e-9, "maxfev": MAX_RUNS * len(first)}
     found = minimize(objective, first, method="Nelder-Mead", options=options)
     if not found.success:
         raise InputError(
-            f"the search did not settle in {MOST_RUNS * len(first)} runs of the filter; tune fewer parameters, or start nearer"
+            f"the search did not settle in {MAX_RUNS * len(first)} runs of the filter; tune fewer parameters, or start nearer"
         )
     values = dict(zip(names, np.exp(found.x).tolist(), strict=True))
     sigma = _sigma(objective, found.x) if measure == "innovations" else np.full(len(names), np.nan)
@@ -160,7 +160,7 @@ def _errors(estimate: Estimate, case: Case) -> tuple[Array, Array]:
     known &= estimate.time <= case.last
     if case.judged is not None:
         known &= case.judged[edges]
-    rows = np.flatnonzero(known)[:: -(-int(known.sum()) // MOST_EPOCHS) or 1]
+    rows = np.flatnonzero(known)[:: -(-int(known.sum()) // MAX_EPOCHS) or 1]
     turn = quaternion.multiply(quaternion.conjugate(estimate.attitude[rows]), attitude[edges[rows]])
     error, size = quaternion.log(turn), 3
     if truth is not None and estimate.has_bias:

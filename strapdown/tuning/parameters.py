@@ -1,4 +1,4 @@
-"""What may be tuned: names of parameters, their values in a filter setup, and setups with other values.
+"""Tunable parameters: their names, their values in a filter setup, and setups with other values.
 
 The gyro's two noises are shared by its axes, as the filter has one σ_v and one σ_u: only isotropic noise is the same seen from a body
 that turns within a step, and has the closed form of :func:`strapdown.kernels.filter_step.process_noise`.
@@ -40,10 +40,10 @@ OUTLIER_SCALE = "outliers.scale"
 GATE = "gate.probability"
 """Probability that the gate lets a right measurement pass: what share and scale of the outliers make it."""
 SIGMA = ".sigma"
-"""What the name of a sensor's σ ends with."""
+"""Suffix of a sensor's σ."""
 
 AXES = tuple(f"{SIGMA}.{axis}" for axis in "xyz")
-"""What the names of a sensor's σ of one body axis end with."""
+"""Suffixes of a sensor's σ of one body axis."""
 
 OWN = (ARW, RRW, INITIAL_ATTITUDE, INITIAL_BIAS, SCALE)
 
@@ -107,7 +107,7 @@ def checked_names(free: Sequence[str], records: Sequence[ImuRecord]) -> tuple[st
         if list(free).count(name) > 1:
             raise InputError(f"free names {name} twice; once is enough")
     if SCALE in free and len(free) > 1:
-        raise InputError(f"{SCALE} scales all that the filter believes, other parameters too; tune it alone")
+        raise InputError(f"{SCALE} scales all noise of the filter, other parameters included; tune it alone")
     return tuple(free)
 
 
@@ -128,16 +128,7 @@ def unit_of(name: str, records: Sequence[ImuRecord]) -> Unit:
 
 
 def fixed_unit(name: str) -> Unit:
-    """Return the unit that a parameter is printed in where its records are not known: SI of a sensor's σ.
-
-    Parameters
-    ----------
-    name : str
-
-    Returns
-    -------
-    Unit
-    """
+    """Return the unit that a parameter is printed in where its records are not known: SI of a sensor's σ."""
     return _UNITS.get(name, Unit(name="rad or SI", factor=1.0))
 
 
@@ -165,14 +156,14 @@ def by_axis(chosen: FilterSetup, names: Sequence[str], records: Sequence[ImuReco
     """Return the setup with three σ for each sensor that ``names`` has one axis of: those that it, or the records, say at present."""
     sigma = dict(chosen.sigma)
     for sensor in dict.fromkeys(part[0] for part in map(axis_of, names) if part is not None):
-        told = sigma.get(sensor)
-        if isinstance(told, tuple):
+        given = sigma.get(sensor)
+        if isinstance(given, tuple):
             continue
         own = own_axes(sensor, records)
         size = float(np.sqrt(np.mean(own**2)))
-        if told is None and size == 0.0:
+        if given is None and size == 0.0:
             raise InputError(f"{sensor}: the records say that its sigma is 0; give one to start from in [filter.sigma]")
-        x, y, z = (own if told is None else told * (own / size if size > 0.0 else np.ones(3))).tolist()
+        x, y, z = (own if given is None else given * (own / size if size > 0.0 else np.ones(3))).tolist()
         sigma[sensor] = x, y, z
     return replace(chosen, sigma=sigma)
 
@@ -237,18 +228,18 @@ def _set(sigma: dict[str, Sigma], name: str, value: float) -> None:
     part = axis_of(name)
     if part is None:
         sensor = name.removesuffix(SIGMA)
-        told = sigma.get(sensor)
-        if isinstance(told, tuple):
-            x, y, z = (value * one / _size(told) for one in told)
+        given = sigma.get(sensor)
+        if isinstance(given, tuple):
+            x, y, z = (value * one / _size(given) for one in given)
             sigma[sensor] = x, y, z
         else:
             sigma[sensor] = value
         return
     sensor, axis = part
-    told = sigma.get(sensor)
-    if not isinstance(told, tuple):
+    given = sigma.get(sensor)
+    if not isinstance(given, tuple):
         raise InputError(f"{name}: the setup has no three sigmas of {sensor}; make them with tuning.parameters.by_axis")
-    x, y, z = (value if k == axis else one for k, one in enumerate(told))
+    x, y, z = (value if k == axis else one for k, one in enumerate(given))
     sigma[sensor] = x, y, z
 
 

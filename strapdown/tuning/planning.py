@@ -146,8 +146,8 @@ def simulated_again(record: ImuRecord, chosen: FilterSetup, draw: np.random.Gene
     The measured increments are taken for the true ones; where the first attitude is not known it is the identity. Only what the filter
     can use is made: of a heading, a vector that is level and as long as a direction.
     """
-    believed = setup.believed(record, chosen)
-    time, dt = believed.time, np.diff(believed.time)
+    modelled = setup.modelled_record(record, chosen)
+    time, dt = modelled.time, np.diff(modelled.time)
     noise = chosen.process_noise
     steps = noise.rate_random_walk * np.sqrt(dt)[:, None] * draw.standard_normal((len(dt), 3))
     first = chosen.bias_sigma * draw.standard_normal(3)
@@ -155,16 +155,16 @@ def simulated_again(record: ImuRecord, chosen: FilterSetup, draw: np.random.Gene
     white = noise.angle_random_walk * np.sqrt(dt)[:, None] * draw.standard_normal((len(dt), 3))
     between = noise.rate_random_walk * np.sqrt(dt**3 / 12.0)[:, None] * draw.standard_normal((len(dt), 3))
     attitude = np.empty((len(time), 4))
-    attitude[0] = (1.0, 0.0, 0.0, 0.0) if believed.truth is None else believed.truth.attitude[0]
-    turns = quaternion.exp(believed.increments)
+    attitude[0] = (1.0, 0.0, 0.0, 0.0) if modelled.truth is None else modelled.truth.attitude[0]
+    turns = quaternion.exp(modelled.increments)
     for k in range(len(dt)):
         attitude[k + 1] = quaternion.multiply(attitude[k], turns[k])
     attitude = quaternion.normalize(attitude)
     series = []
-    for one in believed.vectors:
+    for one in modelled.vectors:
         at = np.clip(np.searchsorted(time, one.time, side="right") - 1, 0, len(dt) - 1)
         share = ((one.time - time[at]) / dt[at])[:, None]
-        q = quaternion.multiply(attitude[at], quaternion.exp(share * believed.increments[at]))
+        q = quaternion.multiply(attitude[at], quaternion.exp(share * modelled.increments[at]))
         if one.attitude is not None:
             assert one.sigma_axes is not None
             error = one.sigma_axes * draw.standard_normal((len(q), 3))
@@ -180,7 +180,7 @@ def simulated_again(record: ImuRecord, chosen: FilterSetup, draw: np.random.Gene
             seen /= np.linalg.norm(seen, axis=1, keepdims=True)
         seen[~np.isfinite(one.vector_b).all(axis=1)] = np.nan
         series.append(replace(one, vector_b=seen))
-    increments = believed.increments + white + 0.5 * (bias[1:] + bias[:-1]) * dt[:, None] + between
+    increments = modelled.increments + white + 0.5 * (bias[1:] + bias[:-1]) * dt[:, None] + between
     return ImuRecord(time=time, increments=increments, vectors=tuple(series), truth=Truth(attitude=attitude, bias=bias))
 
 

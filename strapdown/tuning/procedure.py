@@ -9,14 +9,11 @@ from typing import Any, NamedTuple
 from strapdown.checks import InputError, non_negative
 from strapdown.setup import FilterSetup
 from strapdown.tuning import extended
-from strapdown.tuning.credibility import credibility_objective
 from strapdown.tuning.errors import error_objective
 from strapdown.tuning.fitting import Objective, Tuning, fit, rescaled
 from strapdown.tuning.innovations import Case, likelihood
 from strapdown.tuning.outliers import TunedGate, contaminated_likelihood, tuned_gate
 from strapdown.tuning.parameters import Prior, axis_of, default_names
-
-__all__ = ["GATED", "Tuned", "objective_for", "tune"]
 
 GATED = ("gate.probability", "outliers.share", "outliers.scale")
 """Names of parameters that ask for a model of outliers."""
@@ -47,61 +44,26 @@ def objective_for(
     *,
     truth: bool = False,
     rmse: bool = False,
-    credibility: bool = False,
     gate: bool = False,
     spacing: float = 0.0,
     threads: int = 1,
 ) -> Objective:
-    """Return the objective of a tuning: by default the likelihood of the innovations.
+    """Return the objective of a tuning, for :func:`fit`: by default the likelihood of the innovations.
 
-    Parameters
-    ----------
-    cases : sequence of Case
-        Records with their initial states.
-    setup : FilterSetup
-        The filter to start from; with error states, or with a σ of one axis in ``names``, the likelihood is that of
-        :mod:`strapdown.tuning.extended`.
-    names : sequence of str
-        Parameters to tune.
-    truth : bool, default False
-        The likelihood of the errors against the truth; with ``credibility`` the distribution of NEES instead of NIS.
-    rmse : bool, default False
-        The RMS attitude error against the truth.
-    credibility : bool, default False
-        The whole distribution of NIS, and whiteness.
-    gate : bool, default False
-        Model outliers too, their share and scale.
-    spacing : float, default 0
-        Least time between the samples of a sensor that are used, s.
-    threads : int, default 1
-        Records filtered at once.
-
-    Returns
-    -------
-    Objective
-        Function of the logarithms of the parameters, for :func:`fit`.
-
-    Raises
-    ------
-    InputError
-        If options exclude each other, or a parameter is unknown.
+    With error states, or with a σ of one axis in ``names``, it is that of :mod:`strapdown.tuning.extended`; ``truth`` that of the errors
+    against the truth, ``rmse`` the RMS attitude error, ``gate`` one that models outliers too. ``spacing`` is the least time between the
+    samples of a sensor that are used, s.
     """
     non_negative("spacing", spacing, unit="s")
     if rmse and truth:
-        raise InputError("--rmse and --truth both say which errors against the truth count; give one of them")
-    if rmse and credibility:
-        raise InputError(
-            "--rmse and --credibility ask for different filters: small errors, or consistent ones; give one of them"
-        )
-    other = truth or rmse or credibility
+        raise InputError("rmse and truth both say which errors against the truth count; give one of them")
+    other = truth or rmse
     if spacing > 0.0 and other:
         raise InputError(
-            "--spacing thins the innovations of the likelihood; against a truth, or for credibility, there are none to thin: leave it away"
+            "spacing thins the innovations of the likelihood; against a truth there are none to thin: leave it out"
         )
     if gate and (other or spacing > 0.0):
-        raise InputError(
-            "--gate needs the likelihood of all innovations: leave --truth, --rmse, --credibility and --spacing away"
-        )
+        raise InputError("gate needs the likelihood of all innovations: leave truth, rmse and spacing out")
     by_axis = any(axis_of(name) for name in names)
     for whole, what in (
         (setup.states is None, "a filter with optional states"),
@@ -109,14 +71,12 @@ def objective_for(
     ):
         if not whole and (gate or other or spacing > 0.0):
             raise InputError(
-                f"{what} is tuned by the likelihood of all innovations: leave --gate, --truth, --rmse, --credibility and --spacing away"
+                f"{what} is tuned by the likelihood of all innovations: leave gate, truth, rmse and spacing out"
             )
     if setup.states is not None or by_axis:
         return extended.likelihood(cases, setup, names, threads=threads)
     if gate:
         return contaminated_likelihood(cases, setup, names)
-    if credibility:
-        return credibility_objective(cases, setup, names, truth=truth, threads=threads)
     if truth or rmse:
         return error_objective(cases, setup, names, measure="rmse" if rmse else "likelihood", threads=threads)
     return likelihood(cases, setup, names, spacing=spacing)
@@ -161,7 +121,7 @@ def tune(
     gate : bool, default False
         Model outliers too, and set the gate where an outlier is the likelier explanation.
     **objective
-        ``truth``, ``rmse``, ``credibility``, ``spacing`` of :func:`objective_for`.
+        ``truth``, ``rmse``, ``spacing`` of :func:`objective_for`.
 
     Returns
     -------
@@ -178,8 +138,7 @@ def tune(
     made = objective_for(cases, setup, wanted, gate=gate, threads=threads, **objective)
     # Objectives that filter the records in threads of their own are searched one start at a time.
     plain = gate or not (
-        any(objective.get(name) for name in ("truth", "rmse", "credibility"))
-        or isinstance(made, extended.ExtendedLikelihood)
+        any(objective.get(name) for name in ("truth", "rmse")) or isinstance(made, extended.ExtendedLikelihood)
     )
     result = fit(
         made,

@@ -18,7 +18,7 @@ from strapdown.tuning.innovations import Case
 
 
 def recording_setup(parameters: AhrsParameters | None = None) -> FilterSetup:
-    """Return the setup of the filter that :func:`strapdown.ahrs.estimate` runs, of ``ahrs.MOTIONS["any"]`` if not told."""
+    """Return the setup of the filter that :func:`strapdown.ahrs.estimate` runs, of ``ahrs.MOTIONS["any"]`` by default."""
     return (parameters or ahrs.MOTIONS["any"]).setup
 
 
@@ -105,7 +105,7 @@ NOISES = (
     "quantization",
     "rate_resolution",
 )
-"""What of a gyro's specification its two tuned noises stand for."""
+"""Parameters of a gyro that its two tuned noises represent."""
 
 
 def one_gyro(specs: Mapping[str, GyroSpec]) -> None:

@@ -1,4 +1,4 @@
-"""What the tuned filter leaves unexplained: whether the data it was tuned on contradict it still, and an error that moves with the rate.
+"""Residual checks of a tuned filter: whether the data it was tuned on contradict it still, and an error that moves with the rate.
 
 Tuning gives every parameter its most likely value, right model or wrong. A gyro's scale-factor error moves its bias with the rate, so the
 walk of the bias is made as large as that takes; it looks identified, and the innovations look white. Then the question is not whether
@@ -37,8 +37,8 @@ from strapdown.tuning.parameters import RRW
 LEVELS = (1.0, 0.2, 0.04)
 """Multiples of the tuned walk of the bias beside which a scale factor is tried."""
 STEP = 1e-4
-"""Of a scale factor, for differences."""
-MOST_TOLD = 2
+"""Step of a scale factor for differences."""
+MAX_REPORTED = 2
 """Largest number of failed tests that are reported one by one."""
 SHAPES = ("whiteness", "normality", "mean innovation", "cross-correlation")
 """Tests of innovations that no tuning of σ makes pass."""
@@ -60,12 +60,12 @@ class ScaleFactor:
 
 @dataclass(frozen=True, kw_only=True)
 class Unmodelled:
-    """What the data that a filter was tuned on say against it."""
+    """Evidence against a filter in the data that it was tuned on."""
 
     record: str
     """Name of the record."""
     judgement: Judgement
-    """Of the tuned filter, on what it was tuned on; with a truth its errors too."""
+    """Judgement of the tuned filter on its own data; with a truth of its errors too."""
     scale_factor: ScaleFactor
     causes: tuple[Cause, ...] = ()
     """Likely causes, where the innovations are not of the right shape."""
@@ -79,7 +79,7 @@ class Unmodelled:
 
     @property
     def failed(self) -> tuple[str, ...]:
-        """What is wrong after tuning, in words, one a test; a filter that is too modest has no error that it does not know of."""
+        """Remaining faults in words, one a test; a pessimistic filter has none that it does not model."""
         return tuple(
             one.means for one in self.judgement.findings if one.rejected and not (one.is_ratio and one.value < 1.0)
         )
@@ -94,7 +94,7 @@ class Unmodelled:
         """Sentences for people; none if nothing is suspected."""
         if not self.suspected:
             return ()
-        told = [
+        sentences = [
             f"After tuning, {self.record or 'the record'} still holds what no σ explains: an error that the filter has no state for."
         ]
         if self.moves_with_the_rate:
@@ -102,18 +102,18 @@ class Unmodelled:
             sizes = ", ".join(
                 f"{1e6 * x:.0f} ± {1e6 * e:.0f}" for x, e in zip(one.value, one.standard_error, strict=True)
             )
-            told.append(
+            sentences.append(
                 f"A scale factor of the gyro of [{sizes}] ppm explains the innovations better than its noise does (gain {one.gain:.3g}, "
                 f"p = {one.p_value:.1g}): the tuned noise of the gyro stands for it. Calibrate it, or estimate with a state for it."
             )
-        told += [f"{what[0].upper()}{what[1:]}." for what in self.failed[:MOST_TOLD]]
-        if len(self.failed) > MOST_TOLD:
-            told.append(
-                f"And {len(self.failed) - MOST_TOLD} more of {len(self.judgement.findings)} tests contradict the tuned filter."
+        sentences += [f"{what[0].upper()}{what[1:]}." for what in self.failed[:MAX_REPORTED]]
+        if len(self.failed) > MAX_REPORTED:
+            sentences.append(
+                f"And {len(self.failed) - MAX_REPORTED} more of {len(self.judgement.findings)} tests contradict the tuned filter."
             )
         if self.causes:
-            told.append(f"Likeliest cause: {self.causes[0].words}.")
-        return tuple(told)
+            sentences.append(f"Likeliest cause: {self.causes[0].words}.")
+        return tuple(sentences)
 
     def summary(self) -> dict[str, Any]:
         """Return everything as plain values for JSON."""
@@ -136,17 +136,6 @@ class Unmodelled:
 def unmodelled(case: Case, chosen: FilterSetup, *, probability: float = 0.99) -> Unmodelled:
     """Return what the part of a record that a filter was tuned on says against the tuned filter.
 
-    Parameters
-    ----------
-    case : Case
-        What it was tuned on; what is held out is left out.
-    chosen : FilterSetup
-        The tuned filter.
-    probability : float
-        Of the judgement, and of the scale factor: a consistent filter fails either with at most 1 − this.
-
-    Notes
-    -----
     The filter is run some twenty times; where the innovations are not of the right shape some hundred times more, for their causes.
     """
     tail(probability)
@@ -166,7 +155,7 @@ def unmodelled(case: Case, chosen: FilterSetup, *, probability: float = 0.99) ->
     return Unmodelled(
         record=case.name,
         judgement=judgement,
-        scale_factor=scale_factor(setup.believed(record, used), used.process_noise, initial),
+        scale_factor=scale_factor(setup.modelled_record(record, used), used.process_noise, initial),
         causes=causes,
         probability=probability,
     )
@@ -191,7 +180,7 @@ def accepted(record: ImuRecord, estimate: Estimate) -> ImuRecord:
 def scale_factor(record: ImuRecord, noise: ProcessNoise, initial: estimation.State) -> ScaleFactor:
     """Return the scale factor of the gyro that explains most beside a filter of this noise, or of less walk of the bias.
 
-    ``record`` as the filter processes it (:func:`strapdown.setup.believed`).
+    ``record`` as the filter processes it (:func:`strapdown.setup.modelled_record`).
     """
     rate_angle = turns(record, noise, initial)
     levels = LEVELS if noise.rate_random_walk > 0.0 else LEVELS[:1]

@@ -1,9 +1,7 @@
 """Vector and attitude sensors, and attitude from their measurements at one time.
 
-``sensors``
-    Star trackers, sun and horizon sensors, magnetometers, accelerometers: what they measure, with noise and faults.
-``wahba``
-    Attitude from two or more vectors by least squares (Wahba's problem), with its covariance.
+- ``sensors``: Star trackers, sun and horizon sensors, magnetometers, accelerometers: what they measure, with noise and faults.
+- ``wahba``: Attitude from two or more vectors by least squares (Wahba's problem), with its covariance.
 """
 
 from __future__ import annotations
@@ -23,7 +21,6 @@ from strapdown.vectors.sensors import VectorSensor as VectorSensor
 from strapdown.vectors.sensors import need_level as need_level
 from strapdown.vectors.sensors import need_unit as need_unit
 from strapdown.vectors.sensors import specific_force as specific_force
-from strapdown.vectors.sensors import star_directions as star_directions
 from strapdown.vectors.sensors import triad as triad
 
 __all__ = [
@@ -36,5 +33,4 @@ __all__ = [
     "VectorMeasurements",
     "VectorSensor",
     "specific_force",
-    "star_directions",
 ]

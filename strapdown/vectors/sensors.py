@@ -381,7 +381,7 @@ def _covariances(name: str, value: ArrayLike, m: int, missing: np.ndarray) -> Ar
 
 UNIT_TOLERANCE = 1e-6
 """Departure of the length of a measured direction from 1 above which it is an error, not rounding."""
-LEAST_LEVEL = 1e-3
+MIN_LEVEL = 1e-3
 """Horizontal part of a unit reference below which it shows no heading."""
 
 
@@ -400,8 +400,8 @@ def need_unit(name: str, vector: Array) -> None:
 def need_level(name: str, reference: Array) -> None:
     """Refuse unit references (..., 3) of a heading that are vertical."""
     level = np.hypot(reference[..., 0], reference[..., 1])
-    if np.any(level < LEAST_LEVEL):
-        place = f"{name}[{int(np.argmax(level < LEAST_LEVEL))}]" if level.ndim else name
+    if np.any(level < MIN_LEVEL):
+        place = f"{name}[{int(np.argmax(level < MIN_LEVEL))}]" if level.ndim else name
         raise InputError(f"{place} is vertical and shows no heading; give one with a horizontal part")
 
 
@@ -632,24 +632,9 @@ class VectorSensor(ByValue):
         _check_sampling(self.name, self.sigma, "rad", self.rate, self.phase)
         one_of(f"{self.name}: kind", self.kind, ("direction", "heading"))
 
-    def times(self, start: float, end: float) -> Array:
-        """Return the measurement times.
-
-        Parameters
-        ----------
-        start, end : float
-            Interval (start, end], s.
-
-        Returns
-        -------
-        ndarray (m,)
-            Times, s.
-        """
-        return sample_times(self.rate, self.phase, start, end)
-
     def observe(self, motion: Any, start: float, end: float, generator: np.random.Generator) -> VectorMeasurements:
         """Return noisy measurements over (start, end] of a motion, or of an attitude q_fb given as a function of time."""
-        time = self.times(start, end)
+        time = sample_times(self.rate, self.phase, start, end)
         white, correlated = self.faults.noise(time, generator)
         noisy = _body(motion, time, self.reference_f) + self.sigma * white + correlated
         # The noise of a heading is that across the direction over its horizontal part.
@@ -663,45 +648,6 @@ class VectorSensor(ByValue):
             sigma=np.full(len(time), self.sigma / level),
         )
         return self.faults.heard(series, generator)
-
-
-def star_directions(
-    name: str, stars_f: ArrayLike, *, sigma: float, rate: float, phase: float = 0.0, faults: Faults | None = None
-) -> tuple[VectorSensor, ...]:
-    """Return a star tracker that measures several stars as directions: one sensor per star, all at the same times.
-
-    Parameters
-    ----------
-    name : str
-        Name of the tracker; the sensors are numbered after it.
-    stars_f : array_like (k, 3)
-        Directions of the stars, fixed frame.
-    sigma : float
-        Noise of each component of a unit direction, rad.
-    rate : float
-        Measurements per second, Hz.
-    phase : float, default 0.0
-        Time of the first measurement after the start, s; 0: one interval after it.
-    faults : Faults, optional
-        Errors beyond the white noise; None: none.
-
-    Returns
-    -------
-    tuple of VectorSensor
-        The sensors.
-
-    Examples
-    --------
-    >>> [sensor.name for sensor in star_directions("tracker", np.eye(3)[:2], sigma=1e-4, rate=1.0)]
-    ['tracker 1', 'tracker 2']
-    """
-    stars = array(f"{name}: stars_f", stars_f, ("k", 3))
-    return tuple(
-        VectorSensor(
-            name=f"{name} {i + 1}", reference_f=star, sigma=sigma, rate=rate, phase=phase, faults=faults or Faults()
-        )
-        for i, star in enumerate(stars)
-    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -10,15 +10,13 @@ Only directions count: every vector is divided by its length.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import quaternion
-from strapdown.checks import Array, InputError, array, one_of
+from strapdown.checks import Array, InputError, array
 from strapdown.kinematics import skew
 from strapdown.units import DEGREE
 
@@ -30,22 +28,20 @@ __all__ = [
     "triad",
 ]
 
-Method = Literal["svd", "davenport", "quest", "foam"]
-
 INCONSISTENT = 6.0
 """Two measured directions whose angle is off by more than this many σ are inconsistent: chance exceeds it twice in 1e9 pairs."""
 
 LARGEST_UNCERTAINTY = 1.0
 """A 1σ of the attitude, rad, beyond which a direction of it counts as undetermined (a uniform angle has 1.8)."""
 
-LEAST_ANGLE = 1e-6
+MIN_ANGLE = 1e-6
 """Smallest angle between two directions and one line, rad, where no σ is given to judge by."""
 
-LEAST_HORIZONTAL_ANGLE = 1e-3
+MIN_HORIZONTAL_ANGLE = 1e-3
 """Angle between magnetic field and vertical, rad, below which there is no heading."""
 
-LEAST_WEIGHT = 1e-12
-"""Weights 1/σ² below this part of the largest are lifted to it in the matrices that the methods start from: doubles hold no more."""
+MIN_WEIGHT = 1e-12
+"""Weights 1/σ² below this part of the largest are lifted to it in the matrix that the SVD starts from: doubles hold no more."""
 
 ROUNDING = 1e-15
 """Rounding error of the direction of a unit vector, rad."""
@@ -95,51 +91,9 @@ def triad(
     if sigmas is not None:
         sigma = _sigmas(sigmas, (2,))
         _refuse_inconsistent(_stacked(first_b, second_b), _stacked(first_f, second_f), sigma)
-    _refuse_parallel("primary_b", "secondary_b", first_b, second_b, LEAST_ANGLE)
-    _refuse_parallel("primary_f", "secondary_f", first_f, second_f, LEAST_ANGLE)
+    _refuse_parallel("primary_b", "secondary_b", first_b, second_b, MIN_ANGLE)
+    _refuse_parallel("primary_f", "secondary_f", first_f, second_f, MIN_ANGLE)
     return _triad(first_b, second_b, first_f, second_f)
-
-
-def triad_covariance(
-    primary_b: ArrayLike, secondary_b: ArrayLike, primary_sigma: float, secondary_sigma: float
-) -> Array:
-    """Return the covariance of TRIAD's body-side error δθ, q_true = q ⊗ exp(δθ).
-
-    Parameters
-    ----------
-    primary_b, secondary_b : array_like (..., 3)
-        Directions in the body frame.
-    primary_sigma, secondary_sigma : float
-        Noise of each component across them, rad.
-
-    Returns
-    -------
-    ndarray (..., 3, 3)
-        Covariance, rad², body axes.
-
-    Raises
-    ------
-    InputError
-        If the two directions lie on one line.
-
-    Notes
-    -----
-    With c, s the cosine and sine of the angle between the two and (b₁, u, e) the right-handed axes in which b₂ = c b₁ + s u: σ₁²
-    about u and about e, ``(σ₂² + c² σ₁²)/s²`` about b₁, and ``c σ₁²/s`` between b₁ and u (Shuster & Oh 1981, in other letters).
-    """
-    first, second = _directions("primary_b", primary_b), _directions("secondary_b", secondary_b)
-    _refuse_parallel("primary_b", "secondary_b", first, second, LEAST_ANGLE)
-    sigma = _sigmas([primary_sigma, secondary_sigma], (2,))
-    axes = _frame(first, second)
-    cosine = np.sum(first * second, axis=-1)
-    sine = np.linalg.norm(np.cross(first, second), axis=-1)
-    # δθ in (b₁, u, e) as a matrix times three independent unit normals, so that the product is never indefinite.
-    factor = np.zeros((*cosine.shape, 3, 3))
-    factor[..., 0, 0] = sigma[1] / sine
-    factor[..., 0, 1] = sigma[0] * cosine / sine
-    factor[..., 1, 1] = factor[..., 2, 2] = sigma[0]
-    root = axes @ factor
-    return np.asarray(root @ np.swapaxes(root, -1, -2))
 
 
 def from_vertical_and_heading(up_b: ArrayLike, magnetic_b: ArrayLike) -> Array:
@@ -156,7 +110,7 @@ def from_vertical_and_heading(up_b: ArrayLike, magnetic_b: ArrayLike) -> Array:
     -------
     ndarray (..., 4)
         Unit quaternions q_fb. The vertical is met exactly; of the field only the horizontal part counts, which points North
-        whatever the dip. The covariance is :func:`triad_covariance` of the same two vectors.
+        whatever the dip.
 
     Raises
     ------
@@ -164,7 +118,7 @@ def from_vertical_and_heading(up_b: ArrayLike, magnetic_b: ArrayLike) -> Array:
         If a vector is zero or not finite, or the field is vertical.
     """
     up, field = _directions("up_b", up_b), _directions("magnetic_b", magnetic_b)
-    _refuse_parallel("up_b", "magnetic_b", up, field, LEAST_HORIZONTAL_ANGLE)
+    _refuse_parallel("up_b", "magnetic_b", up, field, MIN_HORIZONTAL_ANGLE)
     return _triad(up, field, np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]))
 
 
@@ -225,10 +179,11 @@ class Solution:
         return np.asarray(chdtrc(self.dof, self.chi_square))
 
 
-def solve(
-    vectors_b: ArrayLike, references_f: ArrayLike, sigmas: ArrayLike, *, method: Method = "svd", refine: bool = True
-) -> Solution:
+def solve(vectors_b: ArrayLike, references_f: ArrayLike, sigmas: ArrayLike) -> Solution:
     """Return the attitude that minimises Wahba's loss, with its covariance and residual.
+
+    Markley's SVD method, then Gauss–Newton steps on the residuals: the matrix that the SVD starts from holds 1/σ², so that its rounding
+    rotates the attitude by up to 1e-16 (σ_max/σ_min)² rad about the worst known axis; the residuals hold 1/σ and do not.
 
     Parameters
     ----------
@@ -238,13 +193,6 @@ def solve(
         The same directions in the fixed frame, in the same order.
     sigmas : array_like (..., n) or float
         Noise of each component across each direction, rad.
-    method : {"svd", "davenport", "quest", "foam"}, default "svd"
-        Methods with the same minimum and different arithmetic. ``foam`` needs n³ operations as implemented here, to keep its
-        digits.
-    refine : bool, default True
-        End with Gauss–Newton steps on the residuals. The matrix that all methods start from holds 1/σ², so that its rounding
-        rotates the attitude by up to 1e-16 (σ_max/σ_min)² rad about the worst known axis; the residuals hold 1/σ and do not.
-        Without these steps keep σ_max/σ_min below 1e6.
 
     Returns
     -------
@@ -263,7 +211,6 @@ def solve(
     >>> found.attitude.tolist(), found.dof
     ([1.0, 0.0, 0.0, 0.0], 1)
     """
-    one_of("method", method, _METHODS)
     b, r = _directions("vectors_b", vectors_b), _directions("references_f", references_f)
     for name, value in (("vectors_b", b), ("references_f", r)):
         if value.ndim < 2:
@@ -288,10 +235,8 @@ def solve(
     _refuse_undetermined("vectors_b", b, sigma)
 
     # The best known direction has weight 1: only ratios matter. What the floor moves the Gauss–Newton steps move back.
-    weight = np.maximum(np.square(np.min(sigma, axis=-1, keepdims=True) / sigma), LEAST_WEIGHT)
-    attitude = _METHODS[method](b, r, weight)
-    if refine:
-        attitude = _refined(attitude, b, r, sigma)
+    weight = np.maximum(np.square(np.min(sigma, axis=-1, keepdims=True) / sigma), MIN_WEIGHT)
+    attitude = _refined(_svd(b, r, weight), b, r, sigma)
     attitude = np.where(attitude[..., :1] < 0.0, -attitude, attitude)
     predicted = _to_body(attitude, r)
     root = np.linalg.inv(_factorised(predicted, b - predicted, sigma)[0])
@@ -318,111 +263,6 @@ def _svd(b: Array, r: Array, weight: Array) -> Array:
     handed = np.linalg.det(U) * np.linalg.det(Vt)
     U = U * np.stack([np.ones_like(handed), np.ones_like(handed), np.sign(handed)], axis=-1)[..., None, :]
     return quaternion.from_matrix(U @ Vt)
-
-
-def _davenport(b: Array, r: Array, weight: Array) -> Array:
-    """The eigenvector of K's largest eigenvalue: tr(R Bᵀ) = qᵀ K q (Davenport's q method; Markley & Mortari 2000, section 3)."""
-    B = _profile(b, r, weight)
-    trace = np.trace(B, axis1=-2, axis2=-1)
-    K = np.empty((*trace.shape, 4, 4))
-    K[..., 0, 0] = trace
-    K[..., 0, 1:] = K[..., 1:, 0] = np.sum(weight[..., None] * np.cross(b, r), axis=-2)
-    K[..., 1:, 1:] = B + np.swapaxes(B, -1, -2) - trace[..., None, None] * np.eye(3)
-    return np.asarray(np.linalg.eigh(K)[1][..., -1])
-
-
-def _best_pair(b: Array, r: Array, weight: Array) -> Array:
-    """Return TRIAD of the best known direction and that which fixes the turn about it best."""
-    first = np.argmax(weight, axis=-1)[..., None]
-    lead = np.take_along_axis(r, first[..., None], axis=-2)
-    cosine = np.sum(lead * r, axis=-1)
-    sine = np.linalg.norm(np.cross(lead, r), axis=-1)
-    # inverse of TRIAD's variance about the first direction, (σ₂² + c² σ₁²)/s², in units of 1/σ₁²
-    second = np.argmax(sine**2 * weight / (1.0 + weight * cosine**2), axis=-1)[..., None]
-    chosen = [np.take_along_axis(v, k[..., None], axis=-2)[..., 0, :] for v in (b, r) for k in (first, second)]
-    return _triad(*chosen)
-
-
-def _quest(b: Array, r: Array, weight: Array) -> Array:
-    """Gibbs vector by Newton's method on the characteristic equation of K, in a frame turned to a first attitude (Shuster & Oh 1981).
-
-    Shuster's sequential rotations, but to TRIAD's attitude of the best pair instead of by 180° about an axis: there the answer is a
-    small turn, far from the singularity at 180°, and λ = Σa − L with a small L. With z = Σ a b × r and
-    ``M = Σ a [(1 + b·r) I − b rᵀ − r bᵀ]`` the Gibbs vector is ``g = (M − L I)⁻¹ z`` and the characteristic equation
-    ``L = ½ Σ a |b − r|² − z·g``: no difference of large numbers, where the polynomial in λ loses all digits with unequal weights.
-    """
-    start = _best_pair(b, r, weight)
-    turned = quaternion.rotate(start[..., None, :], b)
-    a = weight[..., None]
-    z = np.sum(a * np.cross(turned, r), axis=-2)
-    outer = np.swapaxes(a * turned, -1, -2) @ r
-    total = np.sum(weight * (1.0 + np.sum(turned * r, axis=-1)), axis=-1)
-    M = total[..., None, None] * np.eye(3) - outer - np.swapaxes(outer, -1, -2)
-    half = 0.5 * np.sum(a * np.square(turned - r), axis=(-2, -1))
-    pole = np.linalg.eigvalsh(M)[..., 0]
-    L = np.zeros_like(half)
-    for _ in range(_NEWTON_STEPS):
-        g = np.linalg.solve(M - L[..., None, None] * np.eye(3), z[..., None])[..., 0]
-        # f(L) = L − half + z·g rises and is convex up to the pole at M's least eigenvalue; f′ = 1 + g·g.
-        step = (half - L - np.sum(z * g, axis=-1)) / (1.0 + np.sum(g * g, axis=-1))
-        following = np.where(L + step < pole, L + step, 0.5 * (L + pole))
-        if np.array_equal(following, L):
-            break
-        L = following
-    turn = quaternion.normalize(np.concatenate([np.ones((*g.shape[:-1], 1)), g], axis=-1))
-    return quaternion.multiply(turn, start)
-
-
-def _foam(b: Array, r: Array, weight: Array) -> Array:
-    """R = [(κ + |B|²) B + λ cof B − B Bᵀ B]/(κ λ − det B), κ = ½(λ² − |B|²) (FOAM; Markley 1993, J. Astronautical Sciences 41).
-
-    λ is the largest root of ``(λ² − |B|²)² − 8 λ det B − 4 |cof B|²``. Written for L = Σa − λ, with its coefficients as sums over pairs and
-    triples of directions (Cauchy–Binet), so that what cancels for consistent data is never formed.
-    """
-    i, j = np.triu_indices(b.shape[-2], 1)
-    pair = weight[..., i] * weight[..., j]
-    across_b, across_r = np.cross(b[..., i, :], b[..., j, :]), np.cross(r[..., i, :], r[..., j, :])
-    cosine_b, cosine_r = np.sum(b[..., i, :] * b[..., j, :], axis=-1), np.sum(r[..., i, :] * r[..., j, :], axis=-1)
-    # 1 − c c′ = ½ (s² + s′² + (c − c′)²)
-    unlike = np.sum(across_b**2, axis=-1) + np.sum(across_r**2, axis=-1) + (cosine_b - cosine_r) ** 2
-    gap = np.sum(pair * unlike, axis=-1)  # (Σa)² − |B|²
-    cofactor = np.swapaxes(pair[..., None] * across_r, -1, -2) @ across_b
-    determinant = np.zeros(gap.shape)
-    for k in range(2, b.shape[-2]):
-        volume_b = np.sum(across_b * b[..., k : k + 1, :], axis=-1)
-        volume_r = np.sum(across_r * r[..., k : k + 1, :], axis=-1)
-        determinant += weight[..., k] * np.sum(np.where(j < k, pair * volume_b * volume_r, 0.0), axis=-1)
-    cofactor_squared = np.sum(cofactor**2, axis=(-2, -1))
-    total = np.sum(weight, axis=-1)
-    L = np.zeros_like(gap)
-    for _ in range(_NEWTON_STEPS):
-        difference = gap - L * (2.0 * total - L)
-        value = difference**2 - 8.0 * (total - L) * determinant - 4.0 * cofactor_squared
-        following = L + value / (4.0 * difference * (total - L) - 8.0 * determinant)
-        if np.array_equal(following, L):
-            break
-        L = following
-    largest = total - L
-    kappa = 0.5 * (gap - L * (2.0 * total - L))
-    B = _profile(b, r, weight)
-    squared = np.sum(B * B, axis=(-2, -1))
-    R = (kappa + squared)[..., None, None] * B + largest[..., None, None] * cofactor - B @ np.swapaxes(B, -1, -2) @ B
-    R /= (kappa * largest - determinant)[..., None, None]
-    for _ in range(
-        3
-    ):  # Rounding leaves R orthogonal to 1e-16 (σ_max/σ_min)²; each step to the nearest rotation squares the defect.
-        R = R @ (1.5 * np.eye(3) - 0.5 * np.swapaxes(R, -1, -2) @ R)
-    return quaternion.from_matrix(R)
-
-
-_NEWTON_STEPS = 30
-
-_METHODS: dict[str, Callable[[Array, Array, Array], Array]] = {
-    "svd": _svd,
-    "davenport": _davenport,
-    "quest": _quest,
-    "foam": _foam,
-}
 
 
 def _factorised(predicted: Array, residual: Array, sigma: Array) -> tuple[Array, Array]:

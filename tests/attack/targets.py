@@ -84,9 +84,9 @@ def targets(folder: Path) -> list[Target]:
         target("estimate.h5", _whole_estimate, structure, 0.015),
         target("campaign.h5", campaign.read, structure, 0.015),
         target("broad.hdf5", recordings.read, (*bytewise, damage.change_hdf5), 0.001),
-        target("alone.csv", recordfiles.import_csv, damage.TEXT, 0.1),
+        target("alone.csv", recordfiles.read_record, damage.TEXT, 0.1),
         target("walk.csv", recordings.read, damage.TEXT, 0.12),
-        target("gyro.npy", lambda path: recordings.read_gyro(path, rate=100.0, units=units), (*bytewise, damage.replace_word), 0.08),
+        target("gyro.npy", lambda path: recordings.read_samples(path, rate=100.0, units=units), (*bytewise, damage.replace_word), 0.08),
         target("scenario.toml", scenarios.load_scenario, damage.TEXT, 0.04),
         target("attitude.toml", scenarios.load_scenario, damage.TEXT, 0.05),
         target("filter.toml", setup.read_setup, damage.TEXT, 0.06),
@@ -112,7 +112,7 @@ def _write_estimate(path: Path) -> None:
     innovations = records.Innovations(
         time=np.arange(5.0), innovation=draw.standard_normal((5, 2)), variance=np.ones((5, 2))
     )
-    told = records.Estimate(
+    estimate = records.Estimate(
         time=np.arange(float(n)),
         attitude=attitude,
         bias=1e-3 * draw.standard_normal((n, 3)),
@@ -123,7 +123,7 @@ def _write_estimate(path: Path) -> None:
         events=(records.Event(kind="gap", start=1.0, end=2.0, value=3.0),),
     )
     records.write_estimate(
-        path, told, {"filter": "[filter]\n"}, truth=records.Truth(attitude=attitude, bias=np.zeros((n, 3)))
+        path, estimate, {"filter": "[filter]\n"}, truth=records.Truth(attitude=attitude, bias=np.zeros((n, 3)))
     )
 
 

@@ -52,7 +52,7 @@ __all__ = [
 
 
 class Filter(Protocol):
-    """What runs a filter over a record."""
+    """Function that runs a filter over a record."""
 
     def __call__(
         self,

@@ -16,13 +16,13 @@ from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Comparison:
-    """What several filters made of one record. Printed, it is a table.
+    """Estimates of one record by several filters. Printed, it is a table.
 
     The numbers are of the second half of the record, when filters that find their way have found it: root mean squares over time and axes.
     """
 
     estimates: Mapping[str, Estimate]
-    """By filter."""
+    """Estimates by filter."""
     truth: Truth | None = None
     """At the times of the estimates."""
     bound: Array | None = None

@@ -21,7 +21,7 @@ from strapdown.records import Estimate, ImuRecord
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Gains:
-    """What one measurement of each sensor, in the order of the record, does with ``ω_mes = z × R̂ᵀ r``."""
+    """Gains of each sensor, in the order of the record, for ``ω_mes = z × R̂ᵀ r``."""
 
     attitude: Array
     """Turn of the attitude, rad a rad (sensors,): k_P times the weight of the sensor times its sample interval."""
@@ -43,16 +43,6 @@ def farrenkopf_gains(
     zeta = gamma + su / 4.0 + 0.5 * math.sqrt(2.0 * gamma * su + sv * sv + su * su / 3.0)
     # (ζ² − 1)/ζ² written by (ζ − 1), which keeps its digits when the gain is small.
     return (zeta - 1.0) * (zeta + 1.0) / (zeta * zeta), -su / (interval * zeta)
-
-
-def steady_gains(record: ImuRecord, process_noise: ProcessNoise, initial: State) -> Gains:
-    """Return gains for a record: Farrenkopf's of all its sensors together, shared among them by information.
-
-    A gain that is fixed must serve the start as well as the end. It is designed for random walks that would carry attitude and bias through
-    their initial standard deviations over the record, on top of the gyro's own.
-    """
-    events = extended.checked_schedule(record, process_noise, initial, 1)
-    return _steady_gains(record, events, process_noise, initial)
 
 
 def _steady_gains(record: ImuRecord, events: Schedule, process_noise: ProcessNoise, initial: State) -> Gains:
@@ -83,14 +73,10 @@ def run(
     full_covariance: bool = False,
     gains: Gains | None = None,
 ) -> Estimate:
-    """Run the filter over a whole record, compiled.
+    """Run the filter over a whole record, compiled; options as :func:`strapdown.estimation.filters.run`.
 
-    Parameters
-    ----------
-    record, process_noise, initial, every, full_covariance
-        As :func:`strapdown.estimation.filters.run`.
-    gains : Gains, optional
-        Default: :func:`steady_gains`.
+    Default gains: Farrenkopf's of all sensors together, shared among them by information, for random walks that also carry attitude and
+    bias through their initial standard deviations over the record: a gain that is fixed must serve the start as well as the end.
     """
     events = extended.checked_schedule(record, process_noise, initial, every)
     if gains is not None:

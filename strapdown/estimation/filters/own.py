@@ -38,14 +38,12 @@ from strapdown.estimation.states import State
 from strapdown.files import reading
 from strapdown.records import Estimate, ImuRecord
 
-__all__ = ["Own", "OwnFilter", "as_own", "read_filter"]
-
 DEFAULT_NAME = "estimator"
 """Name of the filter in a Python file where none is given."""
 
 
 class OwnFilter(Protocol):
-    """What a filter of one's own provides; a plain function of the same two arguments does as well."""
+    """Interface of a filter of one's own; a plain function of the same two arguments does as well."""
 
     def run(self, record: ImuRecord, initial: State) -> Estimate:
         """Return the estimate at the record's edges, or at some of them.
@@ -94,7 +92,7 @@ class Own:
 
     @functools.cached_property
     def table(self) -> dict[str, Any]:
-        """What identifies it in files: name, parameters, and the SHA-256 of its source where Python knows that."""
+        """Identity in files: name, parameters, and the SHA-256 of its source where Python knows that."""
         if isinstance(self.given, Mapping):
             return dict(self.given)
         inner, parameters = self.given, {}
@@ -135,16 +133,7 @@ class Own:
         return Own, (self.given, self.source)
 
     def __call__(self, record: ImuRecord, initial: State, *, times: Array | None = None) -> Estimate:
-        """Run it over a record and check what it returns.
-
-        Parameters
-        ----------
-        record : ImuRecord
-            The truth is taken out before the filter sees it.
-        initial : State
-        times : array, optional
-            Times wanted, of the record's edges; default: those that the filter returns.
-        """
+        """Run it over a record without its truth, and check what it returns; only the ``times`` wanted, of the record's edges, if given."""
         if isinstance(self.given, Mapping):
             again = f"--filter {self.table['file']}" if "file" in self.table else "--filter FILE.py:NAME"
             raise InputError(
@@ -156,23 +145,7 @@ class Own:
 
 
 def as_own(filter_: Any) -> Own:
-    """Return one's own filter with its description.
-
-    Parameters
-    ----------
-    filter_ : callable or object with a method ``run``
-        Takes a record and an initial state and returns an estimate (:class:`OwnFilter`); an :class:`Own` is returned as it is.
-
-    Returns
-    -------
-    Own
-        The filter, which can be called and compared.
-
-    Raises
-    ------
-    InputError
-        If it is neither a function nor an object with a method ``run``, or has not two arguments.
-    """
+    """Return one's own filter, a function or an object with a method ``run`` (:class:`OwnFilter`), with its description."""
     return filter_ if isinstance(filter_, Own) else Own(filter_)
 
 

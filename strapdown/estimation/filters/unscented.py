@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from filterpy.kalman import JulierSigmaPoints, unscented_transform
 from numpy.typing import ArrayLike
 
 from strapdown import quaternion
@@ -61,14 +60,11 @@ def run(
 ) -> Estimate:
     """Run the filter over a whole record, in NumPy: some tenths of a millisecond a step.
 
-    Parameters
-    ----------
-    record, process_noise, initial, every, full_covariance
-        As :func:`strapdown.estimation.filters.run`.
-    points : object, optional
-        ``filterpy.kalman.JulierSigmaPoints`` or ``MerweScaledSigmaPoints`` of 6 states. Default: Julier's with κ = 1, the paper's λ, all
-        weights positive.
+    ``points`` are filterpy's sigma points of 6 states; default: Julier's with κ = 1, the paper's λ, all weights positive. Other options as
+    :func:`strapdown.estimation.filters.run`.
     """
+    from filterpy.kalman import JulierSigmaPoints  # with SciPy's statistics, half a second that few uses need
+
     points = JulierSigmaPoints(6, kappa=1.0) if points is None else points
     if getattr(points, "n", None) != 6:
         what = f"are of {points.n} states" if hasattr(points, "n") else f"is {points!r}"
@@ -157,8 +153,16 @@ def _predict(
     attitudes = _product(attitudes, quaternion.exp(increment - dt * sigma[:, 3:]))
     sigma[:, :3] = quaternion_to_rodrigues(_product(attitudes[0] * _CONJUGATE, attitudes))
     noise = _process_noise(increment - dt * b, dt, process_noise)
-    mean, covariance = unscented_transform(sigma, points.Wm, points.Wc, noise)
+    mean, covariance = _transformed(sigma, points, noise)
     return _moved(attitudes[0], mean), mean[3:], 0.5 * (covariance + covariance.T)
+
+
+def _transformed(sigma: Array, points: Any, noise: Array) -> tuple[Array, Array]:
+    """Return mean and covariance of sigma points with noise added."""
+    from filterpy.kalman import unscented_transform
+
+    mean, covariance = unscented_transform(sigma, points.Wm, points.Wc, noise)
+    return mean, covariance
 
 
 def _process_noise(phi: Array, dt: float, process_noise: ProcessNoise) -> Array:
@@ -206,7 +210,7 @@ def _update(
             degrees = 2
             noise[2, :2] = noise[:2, 2] = 0.0
             noise[2, 2] = 0.5 * (noise[0, 0] + noise[1, 1])
-    mean, S = unscented_transform(residuals, points.Wm, points.Wc, noise)
+    mean, S = _transformed(residuals, points, noise)
     prior = np.concatenate([np.zeros(3), b])
     cross = -(points.Wc[:, None] * (sigma - prior)).T @ (residuals - mean)
     gain = np.linalg.solve(S, cross.T).T

@@ -1,0 +1,156 @@
+"""Filters called once a sample, side by side in one process and thread: µs a call, and ratios. ``python benchmarks/live.py``.
+
+Each is given the same samples one by one, as lists or arrays, whichever it takes faster: gyro, accelerometer, magnetometer. They do not
+estimate the same states or aim at the same thing; the table compares what a user waits for. smsfusion and AttiPy take a heading in place
+of the magnetometer. What numba itself needs to find out the types of the kernel's arguments and to unpack them is measured too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from strapdown import VectorSensor
+from strapdown.estimation import Gate, LiveFilter, ProcessNoise, StepFilter, initial_state
+from strapdown.estimation.error_states import GyroScale
+from strapdown.files import write_json
+from strapdown.kernels.machine import describe
+
+RATE = 100.0
+NOISE = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6)
+START = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-2, bias_sigma=1e-3)
+UP, FIELD = [0.0, 0.0, 1.0], [20.0, 0.0, -40.0]
+SENSORS = [
+    VectorSensor(name="accelerometer", reference_f=UP, sigma=0.01, rate=RATE),
+    VectorSensor(name="magnetometer", reference_f=FIELD, sigma=0.01, rate=RATE),
+]
+OURS = "strapdown LiveFilter, two vectors"
+
+Call = Callable[[int], object]
+
+
+def ours(rate: list[Any], force: list[Any], field: list[Any]) -> dict[str, tuple[Call, int]]:
+    """Return a call of each of our own filters with a sample, and how many samples it gets."""
+    n = len(rate)
+
+    def live(two: bool = True, **options: Any) -> Call:
+        f = LiveFilter(NOISE, START, sensors=SENSORS, **options)
+        if two:
+            return lambda k: f.update(f.time + 0.01, rate[k], accelerometer=force[k], magnetometer=field[k])
+        return lambda k: f.update(f.time + 0.01, rate[k], accelerometer=force[k])
+
+    step = StepFilter(NOISE, START)
+
+    def steps(k: int) -> None:
+        step.predict(np.array(rate[k]) / RATE, 1.0 / RATE)
+        step.update_direction(np.array(force[k]) / np.linalg.norm(force[k]), UP, 0.01)
+        step.update_direction(np.array(field[k]) / np.linalg.norm(field[k]), FIELD, 0.01)
+
+    return {
+        OURS: (live(), n),
+        "the same, one vector": (live(two=False), n),
+        "the same, gate": (live(gate=Gate()), n),
+        "the same, look-back of 0.5 s": (live(look_back=0.5), n),
+        "the same, nine error states": (live(error_states=(GyroScale(scale_sigma=1e-3, misalignment_sigma=1e-3),)), n),
+        "numba: a call of nothing with the kernel's arguments": (unpacking(), n),
+        "strapdown StepFilter on filterpy, two vectors": (steps, 500),
+    }
+
+
+def unpacking() -> Call:
+    """Return a call of a compiled function that does nothing, with the arguments of a step."""
+    import numba
+
+    arguments = LiveFilter(NOISE, START, sensors=SENSORS)._arguments(2, 1)
+    nothing = numba.njit(lambda edges, increments, measured, every, body, out: 0)
+    return lambda k: nothing(*arguments)
+
+
+def peers(rate: np.ndarray, force: np.ndarray, field: np.ndarray) -> dict[str, tuple[Call, int]]:
+    """Return a call of each installed peer with a sample, and how many samples it gets."""
+    found: dict[str, tuple[Call, int]] = {}
+    n, few = len(rate), 2000
+    try:
+        import imufusion
+
+        fusion, degrees = imufusion.Ahrs(), np.degrees(rate)
+        fusion.set_sample_period(1.0 / RATE)
+        found["imufusion update (C)"] = (lambda k: fusion.update(degrees[k], force[k], field[k]), n)
+    except ImportError:
+        pass
+    try:
+        from vqf import VQF, PyVQF
+
+        vqf, plain = VQF(1.0 / RATE), PyVQF(1.0 / RATE)
+        found["vqf VQF.update 9D (C++)"] = (lambda k: vqf.update(rate[k], force[k], field[k]), n)
+        found["vqf PyVQF.update 9D (Python)"] = (lambda k: plain.update(rate[k], force[k], field[k]), few)
+    except ImportError:
+        pass
+    try:
+        import smsfusion
+
+        sms = smsfusion.AHRS(RATE)
+        found["smsfusion AHRS.update, heading (numba)"] = (
+            lambda k: sms.update(force[k], rate[k], head=0.0, head_var=0.01, head_degrees=False),
+            few,
+        )
+    except ImportError:
+        pass
+    try:
+        import attipy
+
+        atti = attipy.AHRS(RATE, nav_frame="ENU")
+        found["AttiPy AHRS.update, yaw (numba)"] = (
+            lambda k: atti.update(force[k], rate[k], yaw=0.0, yaw_var=0.01),
+            few,
+        )
+    except ImportError:
+        pass
+    return found
+
+
+def main(*, n: int = 20_000, repeats: int = 5) -> dict[str, Any]:
+    """Return µs a call (median and least) of each, and the ratios to ours with two vectors."""
+    generator = np.random.default_rng(0)
+    rate = 0.1 * generator.standard_normal((n, 3))
+    force = np.array([0.0, 0.0, 9.81]) + 0.1 * generator.standard_normal((n, 3))
+    field = np.array(FIELD) + 0.1 * generator.standard_normal((n, 3))
+    works = {**ours(rate.tolist(), force.tolist(), field.tolist()), **peers(rate, force, field)}
+    for call, _ in works.values():
+        call(0)
+    # Taken in turn, so that a drift of the machine's speed falls on all alike.
+    times: dict[str, list[float]] = {name: [] for name in works}
+    for _ in range(repeats):
+        for name, (call, count) in works.items():
+            start = time.process_time()  # what else the machine does is not counted
+            for k in range(count):
+                call(k)
+            times[name].append((time.process_time() - start) / count * 1e6)
+    base = statistics.median(times[OURS])
+    rows = [
+        {"name": name, "us_per_call": statistics.median(t), "least": min(t), "ratio": statistics.median(t) / base}
+        for name, t in times.items()
+    ]
+    return {"machine": describe(), "samples": n, "rows": rows}
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--samples", type=int, default=20_000)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--json", type=Path)
+    arguments = parser.parse_args()
+    result = main(n=arguments.samples, repeats=arguments.repeats)
+    print(json.dumps(result["machine"]))
+    print(f"{'':56s} {'µs/call':>9s} {'least':>9s} {'ratio':>8s}")
+    for row in result["rows"]:
+        print(f"{row['name']:56s} {row['us_per_call']:9.2f} {row['least']:9.2f} {row['ratio']:8.2f}")
+    if arguments.json:
+        write_json(arguments.json, result)

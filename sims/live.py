@@ -1,0 +1,199 @@
+"""Attitude while it is measured: samples from a socket at 1 kHz, filtered and drawn as they come.
+
+A thread plays an inertial unit: it sends each sample of a simulated hand motion as a datagram to the loopback at the time it is due, the
+magnetometer's at 100 Hz and 20 ms late. The main thread reads the socket, filters by :class:`strapdown.LiveFilter`, whose look-back takes
+the late ones at their time, and draws ten times a second: with ``--show`` in a window, else once, into ``--out``, at the end.
+
+Run it: ``python sims/live.py --show --duration 30``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import socket
+import struct
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import strapdown as sd
+from strapdown import plots, quaternion
+from strapdown.checks import Array
+from strapdown.estimation import LiveFilter
+from strapdown.records import ImuRecord
+from strapdown.units import DEGREE
+
+RATE = 1000.0
+LATENCY = 0.02
+"""Of the magnetometer, s."""
+SAMPLE = struct.Struct("<Bd3d")
+"""Sensor, time of the sample in s, and its three numbers; the gyro's are its rate since the sample before."""
+GYRO, ACCELEROMETER, MAGNETOMETER, END = range(4)
+NAMES = {ACCELEROMETER: "accelerometer", MAGNETOMETER: "magnetometer"}
+DRAWN = 0.1
+"""From one drawing to the next, s."""
+
+SMALL = {"duration": 1.0}
+"""Arguments of a run that only shows that the script works."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Result:
+    """What was seen of the stream."""
+
+    time: Array
+    """Of the estimates (n,), s."""
+    error: Array
+    """Angle between estimated and true attitude (n,), rad."""
+    sigma: Array
+    """Root of the trace of the attitude's covariance (n,), rad."""
+    update: float
+    """Median time of an update, s."""
+    behind: float
+    """99th percentile of the time from when a gyro sample was due to when its estimate was there, s."""
+    late: int
+    """Measurements that came later than the look-back."""
+    figure: Path | None
+
+
+def simulated(duration: float, seed: int) -> ImuRecord:
+    """Return what a hand-held unit measures."""
+    motion = sd.motion.SpinCone(angle=0.4, precession_rate=2.0, spin_rate=-1.5)
+    noise = sd.GyroSpec(angle_random_walk=1e-4, rate_random_walk=1e-5, turn_on_bias_sigma=5e-3)
+    up = sd.VectorSensor(name="accelerometer", reference_f=[0.0, 0.0, 1.0], sigma=0.02, rate=RATE)
+    field = sd.VectorSensor(name="magnetometer", reference_f=[0.0, 1.0, -2.0], sigma=0.02, rate=RATE / 10.0)
+    return sd.simulate(
+        sd.Scenario(motion=motion, gyro=noise, sensors=(up, field), rate=RATE, duration=duration), seed=seed
+    )
+
+
+def datagrams(record: ImuRecord) -> list[tuple[float, bytes]]:
+    """Return the samples of a record, each with the time at which it is due, s."""
+    rates = record.increments / np.diff(record.time)[:, None]
+    due = [(t, GYRO, t, value) for t, value in zip(record.time[1:].tolist(), rates.tolist(), strict=True)]
+    for sensor, series in zip(NAMES, record.vectors, strict=True):
+        delay = LATENCY if sensor == MAGNETOMETER else 0.0
+        pairs = zip(series.time.tolist(), series.vector_b.tolist(), strict=True)
+        due += [(t + delay, sensor, t, value) for t, value in pairs]
+    return [(at, SAMPLE.pack(sensor, t, *value)) for at, sensor, t, value in sorted(due)]
+
+
+def send(due: list[tuple[float, bytes]], address: tuple[str, int], begin: float) -> None:
+    """Send each sample when it is due; the clock that started at ``begin`` is :func:`time.perf_counter`."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
+        for at, sample in due:
+            wait = begin + at - time.perf_counter()
+            if wait > 0.0:
+                time.sleep(wait)
+            out.sendto(sample, address)
+        out.sendto(SAMPLE.pack(END, 0.0, 0.0, 0.0, 0.0), address)
+
+
+class Screen:
+    """Error and ±1σ over the last ten seconds, or over all."""
+
+    def __init__(self, *, show: bool) -> None:
+        self.show = show
+        if show:
+            import matplotlib.pyplot as plt
+
+            self.figure, self.axes = plt.subplots()
+            plt.show(block=False)
+        else:
+            self.figure, self.axes = plots.new_figure()
+        (self.error,) = self.axes.plot([], [], label="error")
+        (self.sigma,) = self.axes.plot([], [], label="σ, all axes")
+        self.axes.set(xlabel="time, s", ylabel="attitude, °", yscale="log")
+        self.axes.legend()
+
+    def draw(self, rows: Array) -> None:
+        """Draw rows of time, error and σ."""
+        for line, values in ((self.error, rows[:, 1]), (self.sigma, rows[:, 2])):
+            line.set_data(rows[:, 0], values / DEGREE)
+        self.axes.relim()
+        self.axes.autoscale_view()
+        if self.show:
+            self.figure.canvas.draw_idle()
+            self.figure.canvas.flush_events()
+
+
+def receive(inlet: socket.socket, live: LiveFilter, record: ImuRecord, begin: float, screen: Screen) -> Any:
+    """Filter what comes until the stream ends; return time, error and σ (n, 3), and the times that updates and samples took."""
+    assert record.truth is not None
+    truth, rows, took, behind, drawn = record.truth.attitude, [], [], [], 0.0
+    while True:
+        sensor, t, *value = SAMPLE.unpack(inlet.recv(SAMPLE.size))
+        if sensor == END:
+            return np.array(rows), took, behind
+        start = time.perf_counter()
+        if sensor == GYRO:
+            live.update(t, value)
+        else:
+            live.update(t, **{NAMES[sensor]: value})
+        end = time.perf_counter()
+        took.append(end - start)
+        if sensor != GYRO:
+            continue
+        behind.append(end - begin - t)
+        if t >= drawn:
+            drawn = t + DRAWN / (1.0 if screen.show else 20.0)
+            error = quaternion.angle_between(truth[round(t * RATE)], live.attitude)
+            rows.append((t, float(error), float(np.sqrt(np.trace(live.covariance[:3, :3])))))
+            if screen.show:
+                screen.draw(np.array(rows[-100:]))
+
+
+def main(
+    *, duration: float = 10.0, show: bool = False, seed: int = 1, out: str | os.PathLike[str] | None = None
+) -> Result:
+    """Send and filter a stream of ``duration`` seconds. The figure is written to ``out`` if it is given."""
+    record = simulated(duration, seed)
+    assert record.truth is not None
+    start = sd.initial_state(
+        quaternion.multiply(record.truth.attitude[0], quaternion.exp([0.1, -0.1, 0.2])),
+        attitude_sigma=0.2,
+        bias_sigma=5e-3,
+    )
+    noise = sd.ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-5)
+    live = LiveFilter(noise, start, sensors=record.vectors, look_back=10.0 * LATENCY)
+    screen, due = Screen(show=show), datagrams(record)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as inlet:
+        inlet.bind(("127.0.0.1", 0))
+        inlet.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 22)
+        inlet.settimeout(5.0)
+        begin = time.perf_counter() + 0.1
+        unit = threading.Thread(target=send, args=(due, inlet.getsockname(), begin), daemon=True)
+        unit.start()
+        rows, took, behind = receive(inlet, live, record, begin, screen)
+    figure = None
+    if out is not None:
+        screen.draw(rows)
+        Path(out).mkdir(parents=True, exist_ok=True)
+        figure = plots.save(screen.figure, Path(out) / "live.png")
+    return Result(
+        time=rows[:, 0],
+        error=rows[:, 1],
+        sigma=rows[:, 2],
+        update=float(np.median(took)),
+        behind=float(np.quantile(behind, 0.99)),
+        late=live.late,
+        figure=figure,
+    )
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("results/live"))
+    parser.add_argument("--duration", type=float, default=10.0, help="s")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--show", action="store_true", help="draw in a window while it runs")
+    found = main(**vars(parser.parse_args()))
+    print(
+        f"{1e6 * found.update:.1f} µs an update, {1e3 * found.behind:.2f} ms behind at most (99 %), {found.late} too late; "
+        f"at the end {found.error[-1] / DEGREE:.2f}° of error, σ {found.sigma[-1] / DEGREE:.2f}°"
+    )

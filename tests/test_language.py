@@ -1,0 +1,44 @@
+"""Names and prose are in the field's words, not in the dialect that the package once had."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PLACES = ("README.md", "strapdown/**/*.py", "docs/**/*.py", "docs/**/*.md", "sims/*.py", "benchmarks/*.py")
+FILES = sorted(path for place in PLACES for path in ROOT.glob(place) if "_build" not in path.parts)
+DIALECT = {
+    r"(?<![A-Za-z])(un|fore)?told(?![A-Za-z])": "given, specified, reported",
+    r"(?<![A-Za-z])(dis)?belie(f|ve[ds]?|ving)(?![A-Za-z])": "modelled, the filter's model, trusted",
+    r"\b(tak(e|es|en|ing)|took) (it |them )?in(to the filter)?\b": "process, update with",
+    r"\bso-manieth\b|\bby so (much|many)\b": "every n-th, by a given amount",
+    r"not_covered": "unmodelled_errors",
+    r"\bchallengers?\b": "restart candidate",
+    r"\b_?(LEAST|MOST)_[A-Z]": "MIN_, MAX_",
+    r"\b(has|have) seen\b": "the measurements so far",
+    r"\b[Ss]ource document\b": "Quaternion differentiation",
+}
+
+
+def dialect(text: str) -> list[str]:
+    """Return what of the dialect a text holds, each with its line and the field's words."""
+    return [
+        f"{text.count(chr(10), 0, found.start()) + 1}: {found.group()!r}; better: {better}"
+        for words, better in DIALECT.items()
+        for found in re.finditer(words, text)
+    ]
+
+
+def test_prose_and_names_are_the_fields():
+    found = {str(path.relative_to(ROOT)): dialect(path.read_text(encoding="utf-8")) for path in FILES}
+    assert {path: words for path, words in found.items() if words} == {}
+
+
+@pytest.mark.parametrize(
+    "text", ["the filter is told", "M_told", "what it believes", "is taken in", "by so much", "LEAST_SIGMA = 1"]
+)
+def test_the_dialect_is_recognised(text):
+    assert dialect(text)
