@@ -137,8 +137,8 @@ PEERS: dict[str, tuple[str, Peer]] = {
     "ahrs Madgwick": ("ahrs", madgwick_peer),
 }
 """The package that each needs, and how it is run."""
-GAINS = tuple(2.0**k for k in range(-4, 5))
-RECORDED_GAINS = tuple(4.0**k for k in range(-2, 3))
+GAINS = tuple(2.0**k for k in range(-4, 7))
+RECORDED_GAINS = tuple(4.0**k for k in range(-2, 4))
 SEARCHED = 20.0
 """Of the movement of a recording, s, that gains are searched on."""
 SLOW = {"smsfusion": 4, "ahrs Madgwick": 4}
