@@ -533,7 +533,10 @@ def test_a_recording_that_is_not_what_it_says_is_doubted(run, recording, tmp_pat
     recording.write_text(recording.read_text().replace("[rad/s]", "[deg/s]").replace("[m/s2]", "[g]"))
     status, said, error = run("estimate", recording, "--out", tmp_path / "out")
     assert (status, error) == (0, "")
-    words = "warning: as it seems, gyro rates are 57.3 times too small (rad/s taken for deg/s: --gyro-unit rad/s); specific force is 9.81"
+    words = (
+        "warning: as it seems, gyro rates are 57.3 times too small (rad/s taken for deg/s: --gyro-unit rad/s; units={'gyro': 'rad/s'} in "
+        "Python); specific force is 9.81"
+    )
     assert words in said
     assert words in run("tune", recording, "--free", "")[1]  # which then ends for want of a parameter
     assert f"See `strapdown doctor {recording}`." in said
