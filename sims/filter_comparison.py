@@ -282,6 +282,7 @@ def main(
     progress: Callable[[str], None] | None = None,
 ) -> Result:
     """Run the study; JSON is written to ``out`` if it is given."""
+    recorded = [recordings.read(file) for file in files]  # what cannot be read is refused first
     scene = scenario(duration)
     base = setup.matched(scene)
     plan = montecarlo.Plan(scenario=scene, setup=base, seed=seed, epochs=20)
@@ -324,7 +325,9 @@ def main(
         squares = [np.mean(errors_of(q, record) ** 2) for (q, _), record in found]
         spent = [seconds for (_, seconds), _ in found]
         outcomes.append(_outcome(name, squares, spent, bound, len(records[0].increments), np.nan, None, best))
-    result = Result(outcomes=tuple(outcomes), bound=bound, recorded=on_recordings(files, progress) if files else {})
+    result = Result(
+        outcomes=tuple(outcomes), bound=bound, recorded=on_recordings(recorded, progress) if recorded else {}
+    )
     if out is not None:
         path = Path(out) / "filter_comparison.json"
         before = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
@@ -380,9 +383,8 @@ def peer_on(peer: Peer, every: int) -> Callable[[Recording, float], tuple[Array,
     return run
 
 
-def on_recordings(files: Sequence[Path], progress: Callable[[str], None] | None = None) -> dict[str, Recorded]:
+def on_recordings(read: Sequence[Recording], progress: Callable[[str], None] | None = None) -> dict[str, Recorded]:
     """Return what each filter makes of recordings with a reference, its gain chosen on the others."""
-    read = [recordings.read(file) for file in files]
     begun = [int(np.searchsorted(one.time, ahrs.estimate(one).recording.time[0])) for one in read]
     whole = [one.since(first) for one, first in zip(read, begun, strict=True)]  # all start where ours does
     short = [_until(one, float(one.time[np.argmax(one.movement)]) + SEARCHED) for one in whole]
