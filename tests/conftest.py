@@ -7,8 +7,12 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import hypothesis
 import numpy as np
 import pytest
+
+hypothesis.settings.register_profile("fixed", derandomize=True)
+hypothesis.settings.load_profile("fixed")  # the same examples in every run
 
 BROAD = Path(__file__).resolve().parents[1] / ".." / "shared" / "data" / "broad"
 

@@ -28,8 +28,12 @@ quaternions = (
     .filter(lambda q: np.linalg.norm(q) > 1e-3)
     .map(lambda q: q / np.linalg.norm(q))
 )
-quick = settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-few = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+quick = settings(
+    derandomize=True, max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+few = settings(
+    derandomize=True, max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 
 
 def scipy_of(q) -> Rotation:
@@ -112,9 +116,8 @@ def test_a_density_and_a_random_walk_are_one_quantity(value):
 
 
 @quick
-@given(st.floats(1e-300, 1e15), st.lists(st.floats(-0.5, 0.5), min_size=3, max_size=3))
+@given(st.floats(1e-300, 1e9, exclude_max=True), st.lists(st.floats(-0.5, 0.5), min_size=3, max_size=3))
 def test_a_specification_goes_through_its_table_to_the_last_bit(walk, scale):
-    assume(walk < 1e9)
     spec = gyro.GyroSpec(angle_random_walk=walk, scale_factor=np.array(scale))
     back = gyro.from_table(json.loads(json.dumps(gyro.to_table(spec))))
     assert back.angle_random_walk == walk
