@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 import strapdown as sd
-from strapdown import results as listing
+from strapdown import results
 
 NAMES = {
     "FilterSetup",
@@ -390,7 +390,7 @@ def test_covariance_analysis_is_that_of_the_matched_filter():
 
 
 def test_a_listing_is_aligned_text_and_escaped_html():
-    made = listing.Listing(
+    made = results.Listing(
         "A < B", ("state", "", "σ"), [("x", "rad", "1.5"), ("long name", "", "12")], ["a note"], left=2
     )
     assert made.text.splitlines() == [
@@ -411,7 +411,7 @@ def test_a_listing_is_aligned_text_and_escaped_html():
     ("value", "text"), [(0.00012345, "0.0001234"), (None, "-"), (math.nan, "-"), (math.inf, "∞"), (-math.inf, "-∞")]
 )
 def test_figures(value, text):
-    assert listing.figure(value) == text
+    assert results.figure(value) == text
 
 
 def test_an_estimate_prints_what_is_known_at_the_end():

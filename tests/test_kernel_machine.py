@@ -240,7 +240,6 @@ def test_every_body_of_the_walk_is_listed_here():
         ("root_form",),
         ("gate", "covariance_form"),
         ("gate", "root_form"),
-        ("gate_kernel", "root_form"),
         ("*parts",),
         ("hypotheses_kernel",),
         ("definition", "kernel", "body_side"),

@@ -7,7 +7,9 @@ updating less often than the sensors sample: the samples of a step are turned by
 
 from __future__ import annotations
 
-from strapdown.ahrs import doctor as doctor
+from importlib import import_module
+from typing import Any
+
 from strapdown.ahrs.estimating import AhrsEstimate, estimate
 from strapdown.ahrs.parameters import HAND_HELD as HAND_HELD
 from strapdown.ahrs.parameters import MOTIONS, AhrsParameters
@@ -23,3 +25,10 @@ __all__ = [
     "AhrsParameters",
     "estimate",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Load a submodule when it is first used (PEP 562)."""
+    if name == "doctor":
+        return import_module(f"{__name__}.{name}")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

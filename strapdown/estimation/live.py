@@ -25,8 +25,7 @@ from strapdown.estimation.forward import Judge, Options, gate_events
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.schedule import KIND_CODES
 from strapdown.estimation.states import ProcessNoise, State, check_arguments
-from strapdown.kernels import gate as gate_kernel
-from strapdown.kernels import gate_rules, root_form
+from strapdown.kernels import gate, gate_rules, root_form
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.measurement import Measurements
 from strapdown.kernels.walk import walk
@@ -167,11 +166,9 @@ class LiveFilter:
         self._given: Any = self._body
         dispatcher = compiled(walk, root_form)
         if self._judged:
-            out = gate_kernel.Outputs(
-                form=out, weight=self._weight, recoveries=self._recoveries, lock_outs=self._lock_outs
-            )
+            out = gate.Outputs(form=out, weight=self._weight, recoveries=self._recoveries, lock_outs=self._lock_outs)
             self._given = judge.body(self._body, forward.restart_in_factor(judge))
-            dispatcher = compiled(walk, gate_kernel, root_form)
+            dispatcher = compiled(walk, gate, root_form)
         self._out = out
         self._arguments = functools.cache(self._new_arguments)
         # What a dispatcher does beside the work, finding out the types of sixty arrays, takes longer than the work.

@@ -102,7 +102,7 @@ def _reasons(plan: Plan) -> Iterator[str]:
     for option in ("gate", "robust", "states"):
         if getattr(plan.setup, option, None) is not None:
             yield f"the filter's {option} option is not among the lanes' terms"
-    if _start_sigma(plan)[0] > LARGEST_START:
+    if plan.dispersions.initial_sigmas(plan.setup)[0] > LARGEST_START:
         yield f"the initial attitude error's sigma is above {LARGEST_START} rad"
     if plan.setup.integration.samples > 1 and plan.dispersions.of_the_gyro:
         yield "gyro parameters that differ from run to run need one gyro sample a filter step"
@@ -111,14 +111,6 @@ def _reasons(plan: Plan) -> Iterator[str]:
         yield "the gyro's range is near what the motion asks for, and saturation is not among the lanes' terms"
     if plan.precision == "float32" and prepared.finest < FINEST_SINGLE:
         yield f"float32 serves sensors of {FINEST_SINGLE:g} rad or coarser, and one has {prepared.finest:.2g} rad"
-
-
-def _start_sigma(plan: Plan) -> tuple[float, float]:
-    given = plan.dispersions
-    return (
-        plan.setup.attitude_sigma if given.attitude_sigma is None else given.attitude_sigma,
-        plan.setup.bias_sigma if given.bias_sigma is None else given.bias_sigma,
-    )
 
 
 # ---------------------------------------------------------------------------------------------- what all runs share
@@ -200,7 +192,13 @@ def _prepare(plan: Plan) -> _Prepared:
     noise = plan.setup.process_noise
     start = montecarlo_run.Start(
         attitude=np.ascontiguousarray(quiet.truth.attitude[0]),
-        error=np.array([*_start_sigma(plan), *plan.dispersions.attitude_error, *plan.dispersions.bias_error]),
+        error=np.array(
+            [
+                *plan.dispersions.initial_sigmas(plan.setup),
+                *plan.dispersions.attitude_error,
+                *plan.dispersions.bias_error,
+            ]
+        ),
         variance=np.array([plan.setup.attitude_sigma, plan.setup.bias_sigma]) ** 2,
         noise=np.array([noise.angle_random_walk, noise.rate_random_walk]) ** 2,
     )

@@ -65,6 +65,24 @@ class Dispersions:
         for name, unit in (("scale_factor_sigma", ""), ("misalignment_sigma", "rad"), ("turn_on_bias_sigma", "rad/s")):
             object.__setattr__(self, name, non_negative(f"dispersions: {name}", getattr(self, name), unit=unit))
 
+    def initial_sigmas(self, setup: FilterSetup) -> tuple[float, float]:
+        """Return the σ of the initial attitude error, rad, and bias error, rad/s: those of the filter's prior where none are given.
+
+        Parameters
+        ----------
+        setup : FilterSetup
+            Filter whose prior counts.
+
+        Returns
+        -------
+        tuple of float
+            σ of each axis of the attitude error, rad, and of the bias error, rad/s.
+        """
+        return (
+            setup.attitude_sigma if self.attitude_sigma is None else self.attitude_sigma,
+            setup.bias_sigma if self.bias_sigma is None else self.bias_sigma,
+        )
+
     @property
     def of_the_gyro(self) -> bool:
         """Whether the gyro's parameters differ from run to run."""

@@ -54,8 +54,7 @@ def start(
         raise InputError("record has no truth to start from; simulate one, or give an initial state to estimation.run")
     given = Dispersions() if dispersions is None else dispersions
     draw = generator(seed, run, "initial error").standard_normal(6)
-    attitude_sigma = filter_setup.attitude_sigma if given.attitude_sigma is None else given.attitude_sigma
-    bias_sigma = filter_setup.bias_sigma if given.bias_sigma is None else given.bias_sigma
+    attitude_sigma, bias_sigma = given.initial_sigmas(filter_setup)
     # What is added is negated, not subtracted, so that an error of no fixed part is the same to the bit.
     delta_theta = -attitude_sigma * draw[:3] - given.attitude_error
     return setup.initial_state(

@@ -25,14 +25,10 @@ def bound_of(plan: Plan) -> Array | None:
     given = plan.dispersions
     if plan.setup.estimator == MEKF or np.any(given.attitude_error) or np.any(given.bias_error):
         return None
-    sigma = {
-        name: getattr(plan.setup if getattr(given, name) is None else given, name)
-        for name in ("attitude_sigma", "bias_sigma")
-    }
+    attitude_sigma, bias_sigma = given.initial_sigmas(plan.setup)
+    chosen = replace(matched(plan.scenario), attitude_sigma=attitude_sigma, bias_sigma=bias_sigma)
     try:
-        return covariance.analyse(
-            plan.scenario, replace(matched(plan.scenario), **sigma), epochs=plan.epochs
-        ).cramer_rao
+        return covariance.analyse(plan.scenario, chosen, epochs=plan.epochs).cramer_rao
     except InputError:
         return None
 
