@@ -262,6 +262,11 @@ def tune(
     cases, before, gyros = _cases(records, chosen, start, layout)
     if algorithm is not None:
         before = replace(before, integration=algorithm)
+    if (before.gate or before.robust) and not (goal.truth or goal.gate):
+        console.print(
+            "The filter's gate and weights are not applied: what passes a gate is the likelier the narrower it is. --gate models outliers, "
+            "and --truth tunes the filter as it runs."
+        )
     found = _tuned(cases, before, gyros, start, goal, search, workers)
     records_used = [case.record for case in cases]
     _print_result(found.result, records_used)
