@@ -44,7 +44,7 @@ from strapdown.cli import (  # noqa: F401  (each registers its commands)
     tuning,
 )
 from strapdown.cli.progress import be_quiet
-from strapdown.cli.terminal import app, console, errors
+from strapdown.cli.terminal import app, command, console, errors
 from strapdown.files.reading import NoDigestWarning
 
 
@@ -64,7 +64,7 @@ def _about(
         raise typer.Exit
 
 
-@app.command()
+@command
 def info() -> None:
     """Show what the kernels run on."""
     import strapdown
