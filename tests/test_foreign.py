@@ -354,7 +354,7 @@ def test_what_is_asked_for_is_removed(run):
 
 
 def flight_log(path, run, old=True):
-    """A log of PX4's estimator, written byte by byte: states, variances, innovations."""
+    """A log of PX4's estimator, written byte by byte: states, variances, innovations; a second instance of it that never turned."""
     e = run.estimate
     stamps = np.rint(1e6 * e.time).astype(np.int64)
     number = 24 if old else 23
@@ -366,6 +366,7 @@ def flight_log(path, run, old=True):
     content = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0), ulog._message("B", bytes(40))]
     content += [ulog._message("F", f"{name}:{text}".encode()) for name, text in layouts.items()]
     content += [ulog._message("A", struct.pack("<BH", 0, k) + name.encode()) for k, name in enumerate(layouts)]
+    content.append(ulog._message("A", struct.pack("<BH", 1, 3) + b"estimator_states"))
     ned = to_ned(e.attitude)
     xi = np.stack([attitudes._quaternion_columns(q) for q in ned])
     variances = np.einsum("mqi,mij,mqj->mq", 0.5 * xi, e.covariance[:, :3, :3], 0.5 * xi)
@@ -375,6 +376,8 @@ def flight_log(path, run, old=True):
         states[:4], covariances[:4] = ned[k], variances[k] if old else 1e-4
         row = struct.pack("<QQ24f", stamp, stamp, *states) + struct.pack(f"<{number}fB", *covariances, number)
         content.append(ulog._message("D", struct.pack("<H", 0) + row))
+        level = struct.pack("<24f", 1.0, *np.zeros(23))
+        content.append(ulog._message("D", struct.pack("<H", 3) + row[:16] + level + row[16 + len(level) :]))
         if k % 10 == 0:
             values = np.append(0.1 * random.standard_normal(3), 0.02 * random.standard_normal())
             content.append(ulog._message("D", struct.pack("<HQ4f", 1, stamp, *values)))
