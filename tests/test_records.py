@@ -59,8 +59,9 @@ def test_rates_are_increments_over_intervals():
 
 
 def test_records_are_frozen_and_lists_are_welcome():
-    r = ImuRecord(time=[0, 1, 2], increments=[[0, 0, 1], [0, 0, 2]], vectors=[])
-    assert r.increments.dtype == np.float64
+    truth = Truth(attitude=[[1, 0, 0, 0]] * 3, bias=[[0, 0, 0]] * 3)
+    r = ImuRecord(time=[0, 1, 2], increments=[[0, 0, 1], [0, 0, 2]], vectors=[], truth=truth)
+    assert r.increments.dtype == r.truth.attitude.dtype == r.truth.bias.dtype == np.float64
     assert r.vectors == ()
     with pytest.raises(dataclasses.FrozenInstanceError):
         r.time = np.arange(3.0)
