@@ -114,6 +114,8 @@ def test_units_of_other_sensors_need_not_be_reported_where_the_gyro_alone_is_use
     assert alone.specific_force is None
     assert read(csv(), gyro_alone=True).specific_force is None
     assert np.array_equal(recordings.read_samples(path, "gyro").values, alone.rate)
+    with pytest.raises(InputError, match="states its own rate; drop the option rate"):
+        recordings.read_samples(path, "gyro", rate=100.0)
     status = CliRunner().invoke(
         app, ["integrate", str(path), "--algorithm", "one-sample", "--out", str(tmp_path / "a.h5")]
     )

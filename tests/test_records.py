@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 
 import h5py
 import numpy as np
@@ -16,6 +17,7 @@ from strapdown.files import reading
 from strapdown.records import (
     CONVENTIONS,
     Estimate,
+    Event,
     ImuRecord,
     Innovations,
     Truth,
@@ -309,6 +311,22 @@ def test_what_no_filter_estimates_is_refused(tmp_path, name, damage, words):
             file[name] = value
     with pytest.raises(InputError, match=f"^{path}.*{words}"):
         (read_truth if name.startswith("truth") else read_estimate)(path)
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("recovery", r"Recovered at 3.5 s: 7 measurements of compass .* from 1 s on;"),
+        ("hypotheses", r"From 1 s to 3.5 s hypotheses .* compass left a rotation ambiguous: 7 of them were left"),
+        ("lock-out", r"Locked out from 1 s to 3.5 s: 7 measurements of compass were rejected,"),
+        ("divergence", r"The mean NIS left its bounds from 1 s to 3.5 s, up to 7 per degree of freedom"),
+        ("gap", r"Gap of 2.5 s after 1 s:"),
+    ],
+)
+def test_an_event_is_described_by_its_kind(kind, words):
+    assert re.match(words, str(Event(kind=kind, start=1.0, end=3.5, sensor="compass", value=7.0)))
+    one = str(Event(kind="hypotheses", start=1.0, end=3.5, sensor="compass"))
+    assert one.endswith("ambiguous: then one was chosen.")
 
 
 def test_a_turn_that_nothing_makes_is_reported_by_its_place():
