@@ -207,7 +207,7 @@ def test_foreign_and_damaged_csv_is_refused(made, tmp_path):
     beside = tmp_path / "record-vectors-1.csv"
     for content in (beside.read_text().replace('"magnetometer"', "magnetometer"), path.read_text()):
         beside.write_text(content)
-        with pytest.raises(InputError, match="vectors-1.csv is not a vector series"):
+        with pytest.raises(InputError, match=r"vectors-1.csv is not a vector series"):
             read_record(path)
     assert recordfiles.KIND == "strapdown record"
 
