@@ -329,6 +329,21 @@ def test_an_event_is_described_by_its_kind(kind, words):
     assert one.endswith("ambiguous: then one was chosen.")
 
 
+def test_the_listing_of_an_estimate_has_sigma_at_its_end_and_at_its_start():
+    """σ of 1, 2 and 3 ° in the first row, 4, 5 and 6 ° in the second, 7, 8 and 9 ° in the last; of the bias as many °/h."""
+    sigma = np.arange(1.0, 10.0).reshape(3, 3)
+    P = [np.diag(np.radians(np.append(one, one / 3600.0)) ** 2) for one in sigma]
+    bias = np.radians([[0, 0, 0], [1, 1, 1], [10, -20, 30]]) / 3600.0
+    rows = Estimate.from_arrays([0.0, 1.0, 2.0], [[1, 0, 0, 0]] * 3, P, bias=bias).listing().rows
+    assert [row[1:] for row in rows] == [
+        *[("°", "", last, first) for last, first in (("7", "1"), ("8", "2"), ("9", "3"))],
+        *[
+            ("°/h", value, last, first)
+            for value, last, first in (("10", "7", "1"), ("-20", "8", "2"), ("30", "9", "3"))
+        ],
+    ]
+
+
 def test_a_turn_that_nothing_makes_is_reported_by_its_place():
     """Deep inside it would end as an attitude of NaN."""
     increments = np.zeros((4, 3))
