@@ -331,19 +331,16 @@ def _print_result(campaign: Campaign) -> int:
     report = summary(campaign.statistics, bound=bound_of(campaign.plan))
     figure = lambda value: "-" if value is None else f"{value:.4g}" if value >= 1e3 else f"{value:.4f}"  # noqa: E731
     judgement = _judged(campaign)
-    found = {(one.name, one.of): one for one in judgement.findings}
     rows = table(
         f"Per degree of freedom; 1 is a filter as good as it says. NEES over {report['epochs_judged']} epochs",
         *("", "mean", "least", "greatest", "from", "to", ""),
     )
     for subset, part in report["nees"].items():
-        one = found["ANEES", subset]
-        values = (part["anees"], part["least"], part["greatest"], one.low, one.high)
-        rows.add_row(f"NEES of the {subset}", *map(figure, values), verdict(not one.rejected))
+        values = (part["anees"], part["least"], part["greatest"], *part["bounds"])
+        rows.add_row(f"NEES of the {subset}", *map(figure, values), verdict(part["consistent"]))
     for part in report["nis"]:
-        one = found["NIS", part["sensor"]]
         name = f"NIS of {part['sensor']}"
-        rows.add_row(name, figure(part["nis"]), "", "", *map(figure, (one.low, one.high)), verdict(not one.rejected))
+        rows.add_row(name, figure(part["nis"]), "", "", *map(figure, part["bounds"]), verdict(part["consistent"]))
     show(rows)
     refused = ", ".join(f"{part['refused']} of {part['sensor']}" for part in report["nis"] if part["refused"])
     if refused:
