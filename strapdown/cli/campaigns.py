@@ -70,8 +70,13 @@ def montecarlo(
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed; the scenario's own if not given.")] = None,
     threads: Annotated[int | None, typer.Option(help="Threads; one a core if not given.")] = None,
-    float32: Annotated[bool, typer.Option("--float32", help="Compute in single precision, where lanes serve.")] = False,
-    machine: Annotated[str, typer.Option(help="lanes, scalar, or auto: the lanes wherever they serve.")] = "auto",
+    float32: Annotated[bool, typer.Option("--float32", help="Compute in single precision; with lanes only.")] = False,
+    machine: Annotated[
+        str,
+        typer.Option(
+            help="lanes: eight runs at once in vector registers; scalar: any scenario and filter; auto: lanes where they can."
+        ),
+    ] = "auto",
     chunk: Annotated[
         int | None, typer.Option(help="Runs between merges and writes; the machine's if not given.")
     ] = None,
@@ -253,9 +258,7 @@ def _plan(
     from strapdown.setup import matched
 
     if states is not None and filter_file is not None:
-        raise InputError(
-            "--filter holds the filter's states itself, in [filter.states]; leave --states and --no-states out"
-        )
+        raise InputError("--filter names the whole filter, its states too; leave --states and --no-states out")
     if gyro is not None and filter_file is not None:
         raise InputError("--gyro and --filter both give the filter's gyro noise; give one of them")
     loaded = scenario_named(scenario)
@@ -323,6 +326,7 @@ def _print_result(campaign: Campaign) -> int:
     from strapdown.cli.judgement import status_of
     from strapdown.montecarlo import summary
     from strapdown.montecarlo.verdicts import bound_of
+    from strapdown.setup import MEKF
 
     if campaign.statistics is None:
         raise InputError("no chunk of the campaign is finished; go on with it (--resume)")
@@ -332,7 +336,7 @@ def _print_result(campaign: Campaign) -> int:
     figure = lambda value: "-" if value is None else f"{value:.4g}" if value >= 1e3 else f"{value:.4f}"  # noqa: E731
     judgement = _judged(campaign)
     rows = table(
-        f"Per degree of freedom; 1 is a filter as good as it says. NEES over {report['epochs_judged']} epochs",
+        f"Per degree of freedom; 1 for a consistent filter. NEES over {report['epochs_judged']} epochs",
         *("", "mean", "least", "greatest", "from", "to", ""),
     )
     for subset, part in report["nees"].items():
@@ -363,7 +367,7 @@ def _print_result(campaign: Campaign) -> int:
     console.print(judgement.words)
     if judgement.verdict == "cannot tell":
         console.print("More runs (--runs, with --resume) would show it.")
-    if judgement.unmodelled and campaign.plan.setup.states is None:
+    if judgement.unmodelled and campaign.plan.setup.states is None and campaign.plan.setup.estimator == MEKF:
         console.print("--states gives the filter states for most of these errors.")
     return status_of(judgement)
 

@@ -1,4 +1,4 @@
-"""The verdict: is the filter as good as it says? In words, with the evidence, at one stated probability of a false alarm.
+"""The verdict: does the filter's covariance agree with its errors? In words, with the evidence, at one stated probability of a false alarm.
 
 Every statistic gives a p-value, exact or nearly so, and Holm's procedure (1979) takes them together: whatever their dependence, the
 probability that a right filter is called wrong by any of them is at most 1 − ``probability``.
@@ -48,7 +48,10 @@ WITHOUT_TRUTH = (
 )
 """A limit of a judgement."""
 
-_TOO_SURE, _TOO_MODEST = "too sure of itself (optimistic)", "too modest (pessimistic)"
+_OPTIMISTIC, _PESSIMISTIC = (
+    "the filter is optimistic (its σ are too small)",
+    "the filter is pessimistic (its σ are too large)",
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -377,7 +380,7 @@ def _of_sensor(sensor: str, white: Array, nis: Array) -> list[Finding]:
 
 def innovation_words(sensor: str, mean: float) -> str:
     """Say what a NIS per degree of freedom means."""
-    return f"innovations of {sensor} are {math.sqrt(mean):.3g} times what the filter says (NIS {mean:.4g} per degree of freedom)"
+    return f"innovations of {sensor} are {math.sqrt(mean):.3g} times their σ (NIS {mean:.4g} per degree of freedom)"
 
 
 def _of_pairs(estimate: Estimate) -> list[Finding]:
@@ -495,9 +498,7 @@ def _averages(subset: str, beside: Sequence[str]) -> bool:
 
 def error_words(what: str, ratio: float) -> str:
     """Say what a NEES per state means."""
-    if ratio >= 1.0:
-        return f"{what} is {math.sqrt(ratio):.3g} times what the filter says (NEES {ratio:.4g} per state)"
-    return f"{what} is smaller than the filter says (NEES {ratio:.4g} per state)"
+    return f"{what} is {math.sqrt(ratio):.3g} times the filter's σ (NEES {ratio:.4g} per state)"
 
 
 def concluded(
@@ -526,15 +527,15 @@ def concluded(
         verdict = "not consistent"
         ratios = [finding.value > 1.0 for finding in rejected if finding.is_ratio]
         leaning = (
-            "not as it says of itself"
+            "the filter's model does not hold"
             if not ratios
-            else _TOO_SURE
+            else _OPTIMISTIC
             if all(ratios)
-            else _TOO_MODEST
+            else _PESSIMISTIC
             if not any(ratios)
-            else "too sure in part and too modest in part"
+            else "the filter's σ are too small in part and too large in part"
         )
-        reason = f"the filter is {leaning}; {len(rejected)} of {len(marked)} tests contradict it"
+        reason = f"{leaning}; {len(rejected)} of {len(marked)} tests contradict it"
     elif not marked:
         verdict, reason = "cannot tell", "there is nothing to judge: no innovation, and no truth"
     else:

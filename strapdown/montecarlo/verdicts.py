@@ -128,7 +128,7 @@ def _efficiency(statistics: Statistics, bound: Array, epochs: Counts) -> dict[st
 
 
 def _last_epoch(statistics: Statistics) -> dict[str, Any]:
-    """Return the errors at the end: mean, root mean square, what the filter says, quantiles of the absolute error by axis."""
+    """Return the errors at the end: mean, root mean square, the filter's σ, quantiles of the absolute error by axis."""
     result: dict[str, Any] = {"time_s": float(statistics.time[-1])}
     for name, rows, unit, factor in (
         ("attitude", slice(0, 3), "arcsec", units.ARCSECOND),

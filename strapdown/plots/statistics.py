@@ -25,6 +25,7 @@ from strapdown.plots.style import (
     ink,
     layered,
     legend_above,
+    legend_below,
     new_figure,
     rate_unit,
 )
@@ -123,7 +124,7 @@ def runs_overview(statistics: Statistics, probability: float = 0.99) -> Figure:
     axes[1].set_visible(statistics.has_bias)
     findings = judge_runs(statistics, probability=probability).findings
     judged = judged_epochs(len(statistics.time) - 1)
-    label = f"{100 * probability:g} % bounds, all tests and epochs judged"
+    label = f"{100 * probability:g} % bounds, all tests together"
     low, high = np.nanmin(statistics.anees), np.nanmax(statistics.anees)
     for ax, subset in zip(axes, ("attitude", "bias") if statistics.has_bias else ("attitude",), strict=False):
         bounds = next((one.low, one.high) for one in findings if (one.name, one.of) == ("ANEES", subset))
@@ -131,12 +132,11 @@ def runs_overview(statistics: Statistics, probability: float = 0.99) -> Figure:
         anees = statistics.anees[judged, ("state", "attitude", "bias").index(subset)]
         ax.plot(statistics.time[judged], anees, ".", color=CYCLE[0], label="epochs judged")
         ax.set_ylim(min(0.5, 0.8 * float(low)), max(2.0, 1.3 * float(high)))
-        legend_above(ax)
     if statistics.sensor_degrees.sum() > 0:
-        nis_over_time([("all runs", statistics)], axes[2], probability=probability)
-        legend_above(axes[2])
+        nis_over_time([("all runs", statistics)], axes[2], probability=probability, label=f"{100 * probability:g} % bounds, each interval")
     else:
         axes[2].set_visible(False)
+    legend_below(figure, [one for one in axes if one.get_visible()], ncols=4)
     return figure
 
 
