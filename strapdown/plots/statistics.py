@@ -133,7 +133,12 @@ def runs_overview(statistics: Statistics, probability: float = 0.99) -> Figure:
         ax.plot(statistics.time[judged], anees, ".", color=CYCLE[0], label="epochs judged")
         ax.set_ylim(min(0.5, 0.8 * float(low)), max(2.0, 1.3 * float(high)))
     if statistics.sensor_degrees.sum() > 0:
-        nis_over_time([("all runs", statistics)], axes[2], probability=probability, label=f"{100 * probability:g} % bounds, each interval")
+        nis_over_time(
+            [("all runs", statistics)],
+            axes[2],
+            probability=probability,
+            label=f"{100 * probability:g} % bounds, each interval",
+        )
     else:
         axes[2].set_visible(False)
     legend_below(figure, [one for one in axes if one.get_visible()], ncols=4)
