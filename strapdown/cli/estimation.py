@@ -178,7 +178,7 @@ def estimate(
         Path | None,
         typer.Option(
             help="Without a specification: gyro-temperature.toml of `strapdown allan --temperature`, the gyro's bias over temperature, "
-            "subtracted first."
+            "subtracted first; the error of its slope is estimated (with --smooth it becomes a random walk)."
         ),
     ] = None,
     figures: Annotated[
@@ -565,6 +565,7 @@ def _estimate_recording(recording: Path, shared: _Shared, options: _Recorded, ou
     from strapdown.checks import non_negative, one_of
     from strapdown.consistency import reference_errors
     from strapdown.gyro import read_spec
+    from strapdown.gyro import temperature as thermal
     from strapdown.recordings import gyro_temperature, unit_calibration
     from strapdown.units import DEGREE
 
@@ -572,7 +573,7 @@ def _estimate_recording(recording: Path, shared: _Shared, options: _Recorded, ou
     late = None if options.latency is None else 1e-3 * non_negative("--latency", options.latency, unit="ms")
     robustness = shared.robustness
     carried = None if options.calibration is None else unit_calibration.read(options.calibration)
-    warm = None if options.temperature is None else gyro_temperature.read(options.temperature)
+    warm = None if options.temperature is None else thermal.read(options.temperature)
     with progress_bar("reading"):
         source = recordings.read(recording, **options.layout)
     doubt(source, recording)
@@ -582,8 +583,12 @@ def _estimate_recording(recording: Path, shared: _Shared, options: _Recorded, ou
 
         parameters = workflows.with_gyro_noise(parameters, read_spec(shared.gyro))
     if warm is not None:
-        source, walk = warm.applied(source)
-        parameters = replace(parameters, rate_random_walk=math.hypot(parameters.rate_random_walk, walk))
+        source = gyro_temperature.applied(source, warm)
+        if shared.smooth:  # which has no bias driven by temperature: a walk covers the error of the slope
+            walk = warm.walk(gyro_temperature.temperature_at_samples(source), source.time)
+            parameters = replace(parameters, rate_random_walk=math.hypot(parameters.rate_random_walk, walk))
+        else:
+            parameters = replace(parameters, gyro_temperature_sigma=tuple(warm.slope_sigma.tolist()))
     with progress_bar("smoothing" if shared.smooth else "filtering"):
         result = ahrs.estimate(
             source,
