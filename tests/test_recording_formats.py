@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 from typer.testing import CliRunner
 
+import strapdown as sd
 from strapdown import quaternion, recordings
 from strapdown.checks import InputError
 from strapdown.cli import app
@@ -101,6 +102,7 @@ def test_a_data_frame_is_a_recording():
     assert recording.epoch_ns == 1_709_294_400 * 10**9
     assert recording.magnetic_field[:, 0].tolist()[::2] == [1.0, 3.0]
     assert np.isnan(recording.magnetic_field[1, 0])
+    np.testing.assert_array_equal(sd.read(frame, units={"magnetometer": "uT"}).rate, recording.rate)
     with pytest.raises(InputError, match=r"frame: .*lacks gy"):
         recordings.from_table(frame.drop(columns="gy"), source="frame")
     frame["gx [dps]"] = ["fast", "slow", "still"]
@@ -119,6 +121,7 @@ def test_a_dataset_is_a_recording():
         },
         coords={"time": ("time", [10, 20, 30, 40], {"units": "ms"}), "axis": ["x", "y", "z"]},
     )
+    assert sd.read(dataset).time[-1] == 0.04
     recording = recordings.from_table(dataset)
     np.testing.assert_allclose(recording.time, [0.01, 0.02, 0.03, 0.04], rtol=1e-15)
     np.testing.assert_allclose(recording.rate, np.radians(values), rtol=1e-15)
@@ -128,6 +131,9 @@ def test_a_dataset_is_a_recording():
 def test_arrays_by_name_are_a_recording():
     columns = {"time": np.arange(3.0), "gx": [1, 2, 3], "gy": np.zeros(3), "gz": np.zeros(3)}
     assert recordings.from_table(columns, units={"gyro": "rad/s"}).rate[2, 0] == 3.0
+    assert sd.read(columns, units={"gyro": "rad/s"}).rate[2, 0] == 3.0
+    with pytest.raises(InputError, match="path is 3, .*give a path, a DataFrame"):
+        sd.read(3)
     with pytest.raises(InputError, match=r"table: column gz has shape \(2,\), the first \(3,\)"):
         recordings.from_table({**columns, "gz": np.zeros(2)}, units={"gyro": "rad/s"})
 
