@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from dataclasses import replace
 
@@ -291,7 +292,7 @@ def test_a_simulated_unit_goes_through_allan_and_its_table_into_the_filter(run, 
     both = tomllib.loads(text + path.read_text())["gyro"]  # the two files in one are a gyro's table
     assert gyro.from_table(both).temperature.span == (found["lowest_degc"], found["highest_degc"])
     assert run("convert", "use.h5", "use.db3")[0] == 0
-    status, said, error = run("estimate", "use.db3", "--temperature", path)
+    status, _, error = run("estimate", "use.db3", "--temperature", path)
     assert status == 0, error
     estimate = records.read_estimate(tmp_path / "estimate-results" / "estimate.h5")
     slope = records.read_states(tmp_path / "estimate-results" / "estimate.h5")["gyro temperature"]
@@ -302,33 +303,65 @@ def test_a_simulated_unit_goes_through_allan_and_its_table_into_the_filter(run, 
     assert estimate.sigma[-1, 3] < 5e-4
 
 
-def through_a_bag(folder, seed: int, duration: float) -> list[bool]:
-    """Return, axis by axis and for N and K, whether the interval of a simulated gyro that went through a ROS 2 bag holds the truth."""
-    N, K = 1e-3, 2e-3
-    scenario = scenarios.Scenario(
-        motion=scenarios.load_scenario("rest").motion,
-        gyro=gyro.GyroSpec(angle_random_walk=N, rate_random_walk=K),
-        sensors=(),
-        rate=100.0,
-        duration=duration,
-    )
+def through_a_bag(folder, seed: int, duration: float) -> tuple[list[bool], list[bool]]:
+    """Return whether the intervals of a simulated unit that went through a ROS 2 bag hold the truth: by axis, and those of imu.yaml."""
+    truth = {"gyro": (1e-3, 2e-3), "accelerometer": (2e-3, 5e-3)}  # N and K
+    units = [
+        scenarios.Scenario(
+            motion=scenarios.load_scenario("rest").motion,
+            gyro=gyro.GyroSpec(angle_random_walk=N, rate_random_walk=K),
+            sensors=(),
+            rate=100.0,
+            duration=duration,
+        )
+        for N, K in truth.values()
+    ]
+    # An accelerometer's two noises are those of a gyro, in its own unit.
+    turning, pulling = (recordings.from_record(scenarios.simulate(unit, 2 * seed + k)) for k, unit in enumerate(units))
     path = folder / f"{seed}.mcap"
-    recordings.write(scenarios.simulate(scenario, seed), path)
-    samples = recordings.read_samples(path, "gyro")
-    fit = allan.fit_noise(samples.values, samples.sample_interval, terms=("angle_random_walk", "rate_random_walk"))
+    recordings.write(replace(turning, specific_force=pulling.rate + np.array([0.0, 0.0, STANDARD_GRAVITY])), path)
+    fits, axes, numbers = {}, [], []
+    for sensor in truth:
+        samples = recordings.read_samples(path, sensor)
+        terms = ("angle_random_walk", "rate_random_walk")
+        fits[sensor] = allan.fit_noise(samples.values, samples.sample_interval, terms=terms)
     path.unlink()
-    return [bool(fit.lower[k, i] <= truth <= fit.upper[k, i]) for i, truth in enumerate((N, K)) for k in range(3)]
+    text = noise_parameters.to_kalibr(fits)
+    for (sensor, fit), own in zip(fits.items(), ("gyroscope", "accelerometer"), strict=True):
+        for i, (name, value) in enumerate(zip(("noise_density", "random_walk"), truth[sensor], strict=True)):
+            axes += [bool(fit.lower[k, i] <= value <= fit.upper[k, i]) for k in range(3)]
+            low, high = re.search(rf"{own}_{name}: .* 95 % interval (\S+) to (\S+)\n", text).groups()
+            numbers.append(float(low) <= value <= float(high))
+    return axes, numbers
 
 
-def test_a_simulated_gyro_through_a_bag_is_found_again(tmp_path):
+def test_a_simulated_unit_through_a_bag_is_found_again(tmp_path):
     pytest.importorskip("rosbags", reason="rosbags is not installed: pip install 'strapdown[formats]'")
-    inside = np.array([through_a_bag(tmp_path, seed, 30.0) for seed in range(8)])
-    assert 40 <= inside.sum() <= 48  # of 48 at 95 %: 45.6, σ 1.5
+    axes, numbers = zip(*(through_a_bag(tmp_path, seed, 30.0) for seed in range(5)), strict=True)
+    assert 51 <= np.sum(axes) <= 60  # of 60 at 95 %: 57, σ 1.7
+    assert 16 <= np.sum(numbers) <= 20
 
 
 @pytest.mark.slow
-def test_a_simulated_gyro_through_a_bag_is_covered(tmp_path):
-    """200 runs of three axes and two coefficients: 95 ± 2 %."""
+def test_a_simulated_unit_through_a_bag_is_covered(tmp_path):
+    """200 runs of gyro and accelerometer with two coefficients each, of the axes and of imu.yaml: 95 ± 2 %."""
     pytest.importorskip("rosbags", reason="rosbags is not installed: pip install 'strapdown[formats]'")
-    inside = np.array([through_a_bag(tmp_path, seed, 30.0) for seed in range(200)])
-    assert 0.93 <= inside.mean() <= 0.97
+    for inside in zip(*(through_a_bag(tmp_path, seed, 30.0) for seed in range(200)), strict=True):
+        assert 0.93 <= np.mean(inside) <= 0.97
+
+
+@pytest.mark.parametrize("others", [1.0, 0.2], ids=["axes alike", "one much larger"])
+@pytest.mark.parametrize("axes", [1, 3])
+def test_the_interval_of_the_largest_axis_covers_it(axes, others):
+    """Estimates that are log-normal about the truth, σ 5 %, as their intervals say: 5,000 of them."""
+    truth = np.array([2.0, *[2.0 * others] * (axes - 1)])
+    draws = np.random.default_rng(5).standard_normal((5_000, axes))
+    one = allan.fit_noise(draws[:500], 0.01, terms=("angle_random_walk",))
+    estimate = truth * np.exp(0.05 * draws)
+    reach = np.exp(0.05 * 1.959964)
+    inside = []
+    for row in estimate:
+        fit = replace(one, estimate=row[:, None], lower=row[:, None] / reach, upper=row[:, None] * reach)
+        low, high = noise_parameters.largest_interval(fit, "angle_random_walk")
+        inside.append(low <= 2.0 <= high)
+    assert abs(np.mean(inside) - 0.95) < 4.0 * np.sqrt(0.95 * 0.05 / 5_000)

@@ -132,7 +132,7 @@ def test_arrays_by_name_are_a_recording():
     columns = {"time": np.arange(3.0), "gx": [1, 2, 3], "gy": np.zeros(3), "gz": np.zeros(3)}
     assert recordings.from_table(columns, units={"gyro": "rad/s"}).rate[2, 0] == 3.0
     assert sd.read(columns, units={"gyro": "rad/s"}).rate[2, 0] == 3.0
-    with pytest.raises(InputError, match="path is 3, .*give a path, a DataFrame"):
+    with pytest.raises(InputError, match=r"path is 3, .*give a path, a DataFrame"):
         sd.read(3)
     with pytest.raises(InputError, match=r"table: column gz has shape \(2,\), the first \(3,\)"):
         recordings.from_table({**columns, "gz": np.zeros(2)}, units={"gyro": "rad/s"})
@@ -179,14 +179,29 @@ def test_the_library_reads_the_attitude_as_px4_has_it(ulog):
 def test_a_truncated_flight_log_gives_what_is_whole(ulog):
     path, whole = ulog
     content = path.read_bytes()
+    assert "truncated" not in " ".join(read(path).remarks)
     path.write_bytes(content[: int(0.7 * len(content))])
     recording = read(path)
     n = len(recording.time)
     assert 30 < n < 50
+    assert "theirs.ulg is truncated: read is what is whole." in recording.remarks
     np.testing.assert_array_equal(recording.rate, whole.rate[:n])
     path.write_bytes(content[:200])
     with pytest.raises(InputError, match=r"theirs.ulg (holds no message of sensor_combined|cannot be read)"):
         read(path)
+
+
+def test_the_end_of_a_long_flight_log_shows_whether_it_is_whole(ulog, monkeypatch):
+    """From anywhere in the file: messages that fit each other lead to its end, or beyond."""
+    from strapdown.recordings import ulog as reader
+
+    path, _ = ulog
+    content = path.read_bytes()
+    for tail in (700, 1500, 10**6):
+        monkeypatch.setattr(reader, "TAIL", tail)
+        for cut in (0, 1, 2, 3, 20):
+            path.write_bytes(content[: len(content) - cut])
+            assert reader._is_cut(path) == (cut > 0)
 
 
 def test_what_a_flight_log_cannot_hold_is_refused(tmp_path):

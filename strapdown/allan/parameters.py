@@ -146,16 +146,16 @@ def largest_interval(fit: NoiseFit, term: str) -> tuple[float, float]:
     probability by which it is too high for axes alike, and the upper end with what is left, so that both cases have the same confidence.
     The ends are moved there from the fit's own tails in the logarithm.
     """
-    from scipy.stats import norm
+    from scipy.special import ndtri
 
     i = fit.terms.index(term)
     tail = 1.0 - fit.level
     below = min(1.0 - fit.level ** (1.0 / len(fit.estimate)), 0.5 * tail)
-    usual, seen = norm.isf(0.5 * tail), fit.supported[:, i]
+    usual, seen = ndtri(0.5 * tail), fit.supported[:, i]
     centre = np.where(seen, fit.estimate[:, i], 1.0)
 
     def moved(end: np.ndarray, probability: float) -> float:
-        return float(np.max(np.where(seen, centre * (end / centre) ** (norm.isf(probability) / usual), end)))
+        return float(np.max(np.where(seen, centre * (end / centre) ** (ndtri(probability) / usual), end)))
 
     return moved(fit.lower[:, i], below), moved(fit.upper[:, i], tail - below)
 
@@ -198,10 +198,9 @@ def to_kalibr(fits: Mapping[str, NoiseFit], *, factor: float = 1.0, topic: str =
         ):
             value, seen = largest(fits[sensor], term)
             low, high = (factor * end for end in largest_interval(fits[sensor], term))
+            interval = f"{100.0 * fits[sensor].level:g} % interval {low:.6e} to {high:.6e}"
             note = "" if seen else "; not seen, the upper end of its interval"
-            lines.append(
-                f"{own}_{word}: {factor * value:.6e}  # {unit} {per}, {100.0 * fits[sensor].level:g} % interval {low:.6e} to {high:.6e}{note}"
-            )
+            lines.append(f"{own}_{word}: {factor * value:.6e}  # {unit} {per}, {interval}{note}")
     lines += [f"update_rate: {1.0 / fits['gyro'].sample_interval:.6g}  # Hz", f"rostopic: {topic}"]
     return "\n".join(line for line in lines if line) + "\n"
 
