@@ -7,12 +7,13 @@ import pytest
 from scipy.stats import chi2
 
 import strapdown as sd
-from strapdown import consistency, estimation, records, scenarios, setup
+from strapdown import consistency, estimation, montecarlo, records, scenarios, setup
 from strapdown.checks import InputError
 from strapdown.estimation import error_states
 from strapdown.estimation import temperature as driven
 from strapdown.estimation.gating import Gate
 from strapdown.gyro.temperature import from_table, to_table
+from strapdown.montecarlo import lanes
 from strapdown.recordings import formats, recordfiles
 from strapdown.setup.for_record import drawn_start
 from strapdown.units import DEGREE_PER_HOUR, DEGREE_PER_ROOT_HOUR
@@ -240,3 +241,51 @@ def test_a_filter_with_the_slope_is_consistent_over_units_and_one_without_is_not
     assert (low < anees).all()
     assert (anees < high).all()
     assert np.mean(nees[False]) / 6.0 > 2.0
+
+
+def test_the_matched_filter_has_the_slope_and_a_plain_one_is_named_for_lacking_it():
+    scenario = scenarios.scenario_from_toml(TOML)
+    warm = replace(
+        scenario.gyro.temperature, coefficients=np.array([[0.0] * 3, [1e-5, -2e-5, 0.0]]), sigma=np.zeros((2, 3))
+    )
+    linear = replace(scenario, gyro=replace(scenario.gyro, temperature=warm))
+    states = setup.matched(linear, states=True).states
+    np.testing.assert_allclose(states.gyro_temperature_sigma, [1e-5, 2e-5, 0.0], rtol=1e-12)
+    assert "gyro.temperature" in states.names
+    assert states.chosen(("gyro.temperature",)).gyro_temperature_sigma == states.gyro_temperature_sigma
+    assert states.chosen(()).names == ()
+    (block,) = states.gyro_blocks()
+    np.testing.assert_allclose(block.sigma, [1e-5, 2e-5, 2e-11], rtol=1e-12)  # an axis without one is none, in effect
+    missing = "the gyro's bias over temperature"
+    assert missing in setup.unmodelled_errors(linear.gyro)
+    assert missing not in setup.unmodelled_errors(linear.gyro, (), states)
+    # With a quadratic bias c₂ (T − T₀)² over T₀ ± h the mean square of the slope 2 c₂ (T − T₀) is (2 c₂ h)²/3.
+    bent = replace(warm, coefficients=np.array([[0.0] * 3, [0.0] * 3, [1e-6] * 3]), sigma=np.zeros((3, 3)))
+    course = scenarios.Temperature(start=20.0, end=40.0)
+    curved = replace(scenario, gyro=replace(scenario.gyro, temperature=bent), temperature=course)
+    found = setup.matched(curved, states=True).states.gyro_temperature_sigma
+    np.testing.assert_allclose(found, 2e-6 * 10.0 / np.sqrt(3.0), rtol=1e-3)
+    plan = montecarlo.Plan(scenario=linear, setup=setup.matched(linear, states=True))
+    assert "bias over temperature" in lanes.supports(plan)
+    drawn_only = replace(warm, coefficients=np.zeros((2, 3)), sigma=np.array([[0.0] * 3, [SLOPE] * 3]))
+    of_units = replace(scenario, gyro=replace(scenario.gyro, temperature=drawn_only))
+    np.testing.assert_allclose(setup.matched(of_units, states=True).states.gyro_temperature_sigma, SLOPE, rtol=1e-12)
+
+
+def test_lost_samples_and_locked_out_sensors():
+    scenario = scenarios.scenario_from_toml(TOML)
+    record = scenarios.simulate(replace(scenario, gyro=replace(scenario.gyro, drop_probability=0.1)))
+    T = 40.0 - 20.0 * np.exp(-record.time / 100.0)
+    assert len(T) < 14_000
+    np.testing.assert_allclose(record.temperature, T, rtol=1e-14)
+    # A sensor that is wrong all the time is locked out once, however many stretches it lasts.
+    record, _ = _still(2, np.zeros(3), 25.0 + 0.01 * np.arange(4001), 0.05, 1e-5, 1e-3)
+    random = np.random.default_rng(1).standard_normal((400, 4))
+    scattered = replace(record.vectors[0], attitude=random / np.linalg.norm(random, axis=1)[:, None])
+    start = estimation.initial_state([1.0, 0, 0, 0], attitude_sigma=0.001, bias_sigma=1e-4)
+    noise = estimation.ProcessNoise(angle_random_walk=1e-5, rate_random_walk=1e-7)
+    block = error_states.GyroTemperature(slope_sigma=1e-5)
+    locked = replace(record, vectors=(scattered,))
+    found = estimation.run(locked, noise, start, (block,), gate=Gate(probability=0.999, recovery=None))
+    assert [event.kind for event in found.events] == ["lock-out"]
+    assert found.events[0].value == 400

@@ -69,7 +69,7 @@ def matched(spec: GyroSpec, record: ImuRecord, sensors: Sequence[Any], gravity_f
 
 
 def _slope(spec: GyroSpec, record: ImuRecord) -> Entries:
-    """Return the root mean square slope of the bias over the record's temperature (3,), rad/s/K; 0 where it does not change."""
+    """Return the size of the bias's slope over the record's temperature (3,), rad/s/K: its root mean square and its σ; 0 without any."""
     if spec.temperature is None or record.temperature is None or np.ptp(record.temperature) == 0.0:
         return 0.0
     steps = np.diff(record.temperature)[:, None]
@@ -77,7 +77,7 @@ def _slope(spec: GyroSpec, record: ImuRecord) -> Entries:
     size = np.sqrt(
         np.sum(change * change / np.where(steps == 0.0, np.inf, np.abs(steps)), axis=0) / np.sum(np.abs(steps))
     )
-    return tuple(size.tolist())
+    return tuple(np.hypot(size, spec.temperature.slope_sigma).tolist())
 
 
 def _entries(values: Array) -> Entries:
