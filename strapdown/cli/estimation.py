@@ -566,7 +566,7 @@ def _estimate_recording(recording: Path, shared: _Shared, options: _Recorded, ou
     from strapdown.consistency import reference_errors
     from strapdown.gyro import read_spec
     from strapdown.recordings import gyro_temperature, unit_calibration
-    from strapdown.units import DEGREE
+    from strapdown.units import DEGREE, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
 
     one_of("--motion", options.motion, ahrs.MOTIONS)
     late = None if options.latency is None else 1e-3 * non_negative("--latency", options.latency, unit="ms")
@@ -600,6 +600,11 @@ def _estimate_recording(recording: Path, shared: _Shared, options: _Recorded, ou
     chosen = replace(parameters.setup, **robustness)
     paths = _write_recording(result, parameters, chosen, shared, options, output)
     _say_recording(result, parameters, options)
+    if shared.gyro is not None:
+        console.print(
+            f"Gyro noise from {shared.gyro}, flicker included: {parameters.angle_random_walk / DEGREE_PER_ROOT_HOUR:.3g} °/√h, bias random walk "
+            f"{parameters.rate_random_walk / DEGREE_PER_HOUR_PER_ROOT_HOUR:.3g} °/h/√h."
+        )
     if shared.observability:
         paths.append(_observability(output.folder, used.source, result.record, parameters.setup, result.initial))
     if rms is not None:

@@ -40,8 +40,8 @@ def evidence(judgement: Judgement) -> str:
     marked = ["fail" if finding.rejected else "pass" for finding in judgement.findings]
     percent = 100.0 * judgement.probability
     note = (
-        f"Bounds, pass and fail take all tests together: a consistent filter fails with at most {100.0 - percent:g} %. Each p-value is that "
-        "of its statistic alone. Samples that are correlated count as the independent ones that show as much."
+        f"Bounds, pass and fail take all tests together: a consistent filter fails with at most {100.0 - percent:g} %. Each p-value is "
+        "that of its statistic alone. Samples that are correlated count as the independent ones that show as much."
     )
     parts = [page.table(head, rows, numbers=5, marked=marked), page.paragraph(note, faint=True)]
     parts += [page.paragraph(f"What this does not show: {limit}.", faint=True) for limit in judgement.limits]
