@@ -5,7 +5,7 @@ that they did not write; ``montecarlo``, whose result may have taken hours, need
 
 - ``terminal``: What every command shares.
 - ``progress``: Progress of what takes long.
-- ``layout``: Groups, order and examples of ``--help``.
+- ``layout``: Groups, order and examples of the commands.
 - ``studies``: ``coning``
 - ``integration``: ``algorithms``, ``integrate``, ``coning-budget``
 - ``estimation``: ``estimate``
@@ -46,7 +46,7 @@ from strapdown.cli import (  # noqa: F401  (each registers its commands)
 )
 from strapdown.cli.layout import lay_out
 from strapdown.cli.progress import be_quiet
-from strapdown.cli.terminal import app, console, errors
+from strapdown.cli.terminal import app, command, console, errors
 from strapdown.files.reading import NoDigestWarning
 
 
@@ -66,7 +66,7 @@ def _about(
         raise typer.Exit
 
 
-@app.command()
+@command
 def info() -> None:
     """Show the versions and the processor features that compiled code uses here."""
     import strapdown

@@ -1,11 +1,8 @@
-"""The layout of ``--help``: commands in the order of the work with an example each, and options in the same groups in every command."""
+"""The layout of ``--help``: commands in groups, in the order of the work, each with examples."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import typer
-from typer.core import TyperCommand
 
 COMMANDS: dict[str, dict[str, tuple[str, ...]]] = {
     "Simulate, estimate, judge": {
@@ -44,38 +41,14 @@ COMMANDS: dict[str, dict[str, tuple[str, ...]]] = {
 }
 """Commands by group, each with its examples."""
 
-OPTIONS = {
-    "Reading the file": "gyro_unit accelerometer_unit magnetometer_unit time_unit columns topic truth_topic sensor",
-    "Axes, signs and frames": "axes invert align error_frame",
-    "Model and filter": "filter_file gyro states state gate robust motion latency calibration temperature integration algorithm",
-    "Start": "attitude from_truth attitude_sigma bias_sigma",
-    "Computing": "runs seed run threads machine float32 chunk workers cluster resume overwrite replay starts smooth every observability",
-    "Output": "out to euler frame full_covariance figures form tables json kalibr px4 matlab show",
-}
-"""Options of all commands by group; what is in none stands first, under "Options"."""
-
-
-class Command(TyperCommand):
-    """A command whose options are shown in groups."""
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        group = {name: title for title, names in OPTIONS.items() for name in names.split()}
-        order = list(OPTIONS)
-        for one in self.params:
-            if getattr(one, "name", None) in group and one.param_type_name == "option":
-                one.rich_help_panel = group[one.name]  # type: ignore[attr-defined, index]
-        self.params.sort(key=lambda one: order.index(group[one.name]) if one.name in group else -1)
-
 
 def lay_out(app: typer.Typer) -> None:
     """Put the commands of an application in order and in groups, each with its examples."""
     places = {name: title for title, names in COMMANDS.items() for name in names}
     order = list(places)
-    name_of = lambda one: one.name or one.callback.__name__  # noqa: E731
+    name_of = lambda one: one.name or one.callback.__name__.replace("_", "-")  # noqa: E731
     app.registered_commands.sort(key=lambda one: order.index(name_of(one)))
     for one in app.registered_commands:
-        one.cls = Command
         one.rich_help_panel = places[name_of(one)]
         examples = COMMANDS[places[name_of(one)]][name_of(one)]
         one.epilog = "\n\n".join(("Examples:", *(f"  {line}" for line in examples))) if examples else None
