@@ -30,6 +30,7 @@ SYMBOLS = {
     "hz": "Hz",
     "m": "m",
     "km": "km",
+    "degc": "°C",
     "kg_m2": "kg m²",
     "deg": "°",
     "rad": "rad",
@@ -45,12 +46,10 @@ SYMBOLS = {
     "deg_per_hour_per_sqrt_hour": "°/h/√h",
     "deg_per_hour_per_hour": "°/h²",
     "deg_per_hour_per_g": "°/h/g",
-    "deg_per_hour_per_kelvin": "°/h/K",
     "rad_per_s": "rad/s",
     "rad_per_sqrt_s": "rad/√s",
     "rad_per_s_per_sqrt_s": "rad/s/√s",
     "rad_per_s2": "rad/s²",
-    "rad_per_s_per_kelvin": "rad/s/K",
     "rad_s_per_m": "rad s/m",
     "m_per_s2": "m/s²",
 }
@@ -93,7 +92,13 @@ def sections() -> list[Section]:
     names = (_text(name, said.get(name, "")) for name in ("name", "description"))
     keys = (*names, *_keys(scenarios.Scenario, scenarios._TOP_FORM))
     top = Section(group="top", header="top of the file", summary="before the first table.", keys=keys)
-    return [top, *_motions(), _gyro(), *_sensors()]
+    warm = Section(
+        group="gyro",
+        header="[temperature]",
+        summary=_summary(scenarios.Temperature),
+        keys=_keys(scenarios.Temperature, scenarios._TEMPERATURE),
+    )
+    return [top, *_motions(), _gyro(), warm, *_sensors()]
 
 
 def markdown(group: str) -> str:
@@ -158,7 +163,11 @@ def _gyro() -> Section:
     preset = _text("preset", f"A gyro on the market, of which other keys change what they name. One of {names}.")
     own = (replace(k, type=_TYPES[gyro.Axes]) if k.type == "list of 3" else k for k in _keys(gyro.GyroSpec, gyro.FORM))
     keys = (replace(preset, example=next(iter(datasheets.PRESETS))), *own)
-    return Section(group="gyro", header="[gyro]", summary="the gyro; what is left out is perfect.", keys=keys)
+    summary = (
+        "the gyro; what is left out is perfect. A bias over temperature is a table `[gyro.temperature]`, as `strapdown allan "
+        "--temperature` writes it to `gyro-temperature.toml`."
+    )
+    return Section(group="gyro", header="[gyro]", summary=summary, keys=keys)
 
 
 def _sensors() -> list[Section]:

@@ -30,7 +30,7 @@ if not (DOCS / "toml_reference.py").exists():
 reference = _load()
 SECTIONS = reference.sections()
 NAMES = [f"{section.header} {section.type}".strip() for section in SECTIONS]
-TABLES = {"motion", "gyro", "sensors", "base", "vibration"}
+TABLES = {"motion", "gyro", "temperature", "sensors", "base", "vibration"}
 """Keys that hold tables: headers of the reference."""
 
 
@@ -51,8 +51,8 @@ def _least(section):
                 table.update(base={"type": "rest"}, vibration={"type": "rest"})
         case "[[motion.harmonics]]":
             scenario["motion"] = {"type": "harmonic-rates", "harmonics": [table]}
-        case "[gyro]":
-            scenario["gyro"] = table
+        case "[gyro]" | "[temperature]":
+            scenario[section.header.strip("[]")] = table
         case "[[sensors]]":
             if section.type == "horizon":
                 table["orbit"] = _required(SECTIONS[NAMES.index("[sensors.orbit]")])

@@ -36,6 +36,7 @@ from strapdown.estimation.gating import Gate, Monitor, Robust
 from strapdown.estimation.schedule import KIND_CODES
 from strapdown.estimation.states import ProcessNoise, State, check_arguments, restart_bias_variance
 from strapdown.estimation.step_gate import Events, Linearization, Rows, Supervision, linearize, seen_from, tilt_unknown
+from strapdown.estimation.temperature import need_none
 from strapdown.kernels import chains, error_state_step
 from strapdown.kernels.algebra import cross, dot
 from strapdown.kernels.gate_rules import WIDE_PASSES
@@ -173,6 +174,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
 
     def _model(self, sensor: str, kind: str) -> modelling.Model:
         """Return the error states as arrays, in the filter's own order, with their effects on one sensor alone."""
+        need_none(self.error_states, "this filter")
         kinds = {name: "vector" for block in self.error_states for name in block.effects} | {sensor: kind}
         model = modelling.assemble(self.error_states, kinds)
         if model.levers.any() or model.varying:

@@ -81,6 +81,8 @@ def supports(plan: Plan) -> str | None:
 
 def _reasons(plan: Plan) -> Iterator[str]:
     spec = plan.scenario.gyro
+    if spec.temperature is not None:
+        yield "the gyro's bias over temperature is not among the lanes' terms"
     for name, none in _NOT_OF_THE_GYRO.items():
         if np.any(np.asarray(getattr(spec, name)) != none):
             yield f"the gyro's {name}"

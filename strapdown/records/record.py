@@ -102,6 +102,8 @@ class ImuRecord(Listed):
         True attitude and bias, where known.
     origin : Origin, optional
         How it was simulated, so that a filter can be matched to the scenario; None for measured data.
+    temperature : ndarray (n + 1,), optional
+        Temperature of the gyro at the edges, °C, where known.
     """
 
     time: Array
@@ -109,10 +111,13 @@ class ImuRecord(Listed):
     vectors: tuple[VectorMeasurements, ...] = ()
     truth: Truth | None = None
     origin: Origin | None = None
+    temperature: Array | None = None
 
     def __post_init__(self) -> None:
         """Check shapes, order and finiteness."""
         time = increasing("time", self.time, least=2)
+        if self.temperature is not None:
+            object.__setattr__(self, "temperature", array("temperature", self.temperature, (len(time),)))
         increments = array("increments", self.increments, (len(time) - 1, 3))
         for index in (np.argmax(increments), np.argmin(increments)):
             row, axis = (int(i) for i in np.unravel_index(index, increments.shape))
@@ -198,6 +203,7 @@ def compress(record: ImuRecord, algorithm: str | coning.Algorithm) -> ImuRecord:
         time=record.time[every],
         increments=coning.rotation_vectors(record.increments[:kept], table, edges=record.time[: kept + 1]),
         truth=truth,
+        temperature=None if record.temperature is None else record.temperature[every],
     )
 
 
@@ -242,6 +248,7 @@ def cut(record: ImuRecord, first: int, last: int) -> ImuRecord:
         increments=record.increments[first:last],
         vectors=tuple(vectors),
         truth=truth,
+        temperature=None if record.temperature is None else record.temperature[edges],
     )
 
 
