@@ -467,8 +467,8 @@ def _left_out(scenario: Scenario, setup: FilterSetup) -> tuple[str, ...]:
         "drop_probability",
     )
     found = [f"gyro {name.replace('_', ' ')}" for name in names if np.any(np.asarray(getattr(spec, name)) > 0.0)]
-    if np.any(spec.temperature_coefficient != 0.0):
-        found.append("gyro temperature coefficient")
+    if spec.temperature is not None:
+        found.append("gyro bias over temperature")
     found += [name for name in ("gate", "robust", "states") if getattr(setup, name, None) is not None]
     return tuple(found)
 

@@ -6,7 +6,8 @@ largest. Where no axis shows a term, the upper end of its interval is written, w
 so.
 
 Kalibr
-    ``imu.yaml``: noise densities N and random walks K of gyro and accelerometer. They are commonly multiplied by 5 to 10 or more,
+    ``imu.yaml``: noise densities N and random walks K of gyro and accelerometer, each with the interval of the largest axis's
+    (:func:`largest_interval`) as a comment, since Kalibr has no key for it. They are commonly multiplied by 5 to 10 or more,
     for Kalibr has no terms for vibration, scale and temperature; here by the requested factor, which a comment states.
 PX4
     Parameters of EKF2, which uses them as the standard deviation of white noise over one step of the filter, ``EKF2_PREDICT_US``:
@@ -137,6 +138,28 @@ def largest(fit: NoiseFit, term: str) -> tuple[float, bool]:
     return float(fit.upper[:, i].max()), False
 
 
+def largest_interval(fit: NoiseFit, term: str) -> tuple[float, float]:
+    """Return the interval of the largest of the axes' coefficients, SI, at the confidence of the fit.
+
+    Below it are the lower ends of all axes, above it only the upper end of the largest: of axes that are alike any lower end may be too
+    high and all upper ends would have to be too low; of one that is by far the largest its own alone count. A lower end fails with the
+    probability by which it is too high for axes alike, and the upper end with what is left, so that both cases have the same confidence.
+    The ends are moved there from the fit's own tails in the logarithm.
+    """
+    from scipy.special import ndtri
+
+    i = fit.terms.index(term)
+    tail = 1.0 - fit.level
+    below = min(1.0 - fit.level ** (1.0 / len(fit.estimate)), 0.5 * tail)
+    usual, seen = ndtri(0.5 * tail), fit.supported[:, i]
+    centre = np.where(seen, fit.estimate[:, i], 1.0)
+
+    def moved(end: np.ndarray, probability: float) -> float:
+        return float(np.max(np.where(seen, centre * (end / centre) ** (ndtri(probability) / usual), end)))
+
+    return moved(fit.lower[:, i], below), moved(fit.upper[:, i], tail - below)
+
+
 def to_kalibr(fits: Mapping[str, NoiseFit], *, factor: float = 1.0, topic: str = "/imu0", source: str = "") -> str:
     """Return Kalibr's ``imu.yaml``.
 
@@ -174,8 +197,10 @@ def to_kalibr(fits: Mapping[str, NoiseFit], *, factor: float = 1.0, topic: str =
             ("rate_random_walk", "random_walk", "1/s/sqrt(Hz)"),
         ):
             value, seen = largest(fits[sensor], term)
+            low, high = (factor * end for end in largest_interval(fits[sensor], term))
+            interval = f"{100.0 * fits[sensor].level:g} % interval {low:.6e} to {high:.6e}"
             note = "" if seen else "; not seen, the upper end of its interval"
-            lines.append(f"{own}_{word}: {factor * value:.6e}  # {unit} {per}{note}")
+            lines.append(f"{own}_{word}: {factor * value:.6e}  # {unit} {per}, {interval}{note}")
     lines += [f"update_rate: {1.0 / fits['gyro'].sample_interval:.6g}  # Hz", f"rostopic: {topic}"]
     return "\n".join(line for line in lines if line) + "\n"
 

@@ -159,7 +159,8 @@ class _Recorded:
     temperature: Annotated[
         Path | None,
         typer.Option(
-            help="gyro-temperature.toml of `strapdown allan --temperature`, the gyro's bias over temperature, subtracted first."
+            help="gyro-temperature.toml of `strapdown allan --temperature`, the gyro's bias over temperature, subtracted first; the error "
+            "of its slope is estimated (with --smooth it becomes a random walk)."
         ),
     ] = None
 
@@ -527,7 +528,7 @@ def _estimate_recording(
     late = None if options.latency is None else 1e-3 * non_negative("--latency", options.latency, unit="ms")
     robustness = shared.robustness
     carried = None if options.calibration is None else unit_calibration.read(options.calibration)
-    source, parameters = _read_recording(recording, layout, ahrs.MOTIONS[motion], shared.gyro, options.temperature)
+    source, parameters = _read_recording(recording, layout, ahrs.MOTIONS[motion], shared, options.temperature)
     with progress_bar("smoothing" if shared.smooth else "filtering"):
         result = ahrs.estimate(
             source,
@@ -555,25 +556,30 @@ def _estimate_recording(
 
 
 def _read_recording(
-    recording: Path, layout: dict[str, Any], parameters: AhrsParameters, gyro: Path | None, temperature: Path | None
+    recording: Path, layout: dict[str, Any], parameters: AhrsParameters, shared: _Shared, temperature: Path | None
 ) -> tuple[Recording, AhrsParameters]:
     """Return the recording, its bias over temperature subtracted, and the filter's parameters with the noise of the gyro given."""
     from strapdown import recordings
     from strapdown.gyro import read_spec
+    from strapdown.gyro import temperature as thermal
     from strapdown.recordings import gyro_temperature
 
-    warm = None if temperature is None else gyro_temperature.read(temperature)
+    warm = None if temperature is None else thermal.read(temperature)
     with progress_bar("reading"):
         source = recordings.read(recording, **layout)
     doubt(source, recording)
-    if gyro is not None:
+    if shared.gyro is not None:
         from strapdown import workflows  # which imports much more
 
-        parameters = workflows.with_gyro_noise(parameters, read_spec(gyro))
-    if warm is not None:
-        source, walk = warm.applied(source)
-        parameters = replace(parameters, rate_random_walk=math.hypot(parameters.rate_random_walk, walk))
-    return source, parameters
+        parameters = workflows.with_gyro_noise(parameters, read_spec(shared.gyro))
+    if warm is None:
+        return source, parameters
+    source = gyro_temperature.applied(source, warm)
+    if not shared.smooth:
+        return source, replace(parameters, gyro_temperature_sigma=tuple(warm.slope_sigma.tolist()))
+    # The smoother has no bias driven by temperature: a walk covers the error of the slope.
+    walk = warm.walk(gyro_temperature.temperature_at_samples(source), source.time)
+    return source, replace(parameters, rate_random_walk=math.hypot(parameters.rate_random_walk, walk))
 
 
 def _fixed_frame(used: Recording) -> str:

@@ -367,10 +367,17 @@ def doctor(
             "Explanations: score (log-likelihood) and misfit, 0 perfect, 1 unrelated, 2 opposite",
             "explanation",
             "score",
-            *names,
+            *(
+                name.replace("accelerometer", "acc").replace("magnetometer", "mag").replace(" and ", "–")
+                for name in names
+            ),
         )
         for one in found.candidates[:8]:
-            rows.add_row(one.words, f"{one.score:.1f}", *(f"{one.misfit[name]:.3f}" for name in names))
+            rows.add_row(
+                one.words.partition(" (--")[0].partition(" (deg")[0],
+                f"{one.score:.1f}",
+                *(f"{one.misfit[name]:.3f}" for name in names),
+            )
         show(rows)
     for note in found.notes:
         console.print(f"Note: {note}.")

@@ -191,17 +191,17 @@ def _print_result(name: str, found: Any, integration: str, *, matched: bool) -> 
     if largest > LARGEST_LINEAR:
         console.print(
             f"With an attitude error of {largest / DEGREE:.3g}° the analysis, linear about the truth, cannot tell whether the filter "
-            "will be as good as it says."
+            "will be consistent."
         )
     elif max(attitude, bias) > 1.1:
         worst = "bias" if bias > attitude else "attitude"
         console.print(
-            f"The filter will be too sure of its {worst}: its errors are {np.sqrt(max(attitude, bias)):.3g} times what it says."
+            f"The filter will be optimistic in {worst}: its errors will be {np.sqrt(max(attitude, bias)):.3g} times its σ."
         )
     elif min(attitude, bias) < 0.9:
-        console.print("The filter will be more modest than it need be.")
+        console.print("The filter will be pessimistic: its σ will be larger than its errors.")
     else:
-        console.print("The filter will be as good as it says.")
+        console.print("The filter will be consistent.")
     if found.left_out:
         console.print(f"Left out: {', '.join(found.left_out)}.")
     for one in found.beyond_linear:

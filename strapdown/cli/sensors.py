@@ -342,39 +342,38 @@ def _regressed(recording: Path, sensor: str, source: GyroSamples, order: int, ou
     from strapdown.allan import temperature as allan_temperature
     from strapdown.checks import InputError
     from strapdown.files import written_beside
+    from strapdown.gyro.temperature import STEM, BiasOverTemperature, to_table
 
-    if source.temperature is None or not np.isfinite(source.temperature).all():
-        raise InputError("no temperature is recorded for every sample; leave --temperature out")
+    if source.temperature is None:
+        raise InputError("no temperature is recorded; leave --temperature out")
     if np.isnan(source.values).any():
         raise InputError("there are gaps, with which --temperature does not go; cut the recording between them")
-    fit = allan_temperature.fit_temperature(source.values, source.temperature, source.sample_interval, order=order)
+    scale = source.sample_interval if source.kind == "increments" else 1.0
+    fit = allan_temperature.fit_temperature(
+        source.values / scale, source.temperature, source.sample_interval, order=order
+    )
     unit = {"gyro": "rad/s", "accelerometer": "m/s2", "magnetometer": "T"}[sensor]
-    key = {"gyro": "rad_per_s", "accelerometer": "m_per_s2", "magnetometer": "t"}[sensor]
+    stem = {"gyro": STEM, "accelerometer": "m_per_s2", "magnetometer": "t"}[sensor]
     listing = table(
         f"Bias over temperature, T − {fit.reference:.3f} °C", "axis", "power", "unit", "estimate", "from", "to", left=3
     )
-    content: dict[str, Any] = {
-        "reference_degc": fit.reference,
-        "lowest_degc": fit.span[0],
-        "highest_degc": fit.span[1],
-    }
     for k in range(order + 1):
-        per = f"{key}_per_k{k if k > 1 else ''}" if k else key
-        content[f"bias_{per}"] = [float(x) for x in fit.coefficients[:, k]]
-        if k:
-            content[f"sigma_{per}"] = [float(x) for x in fit.sigma[:, k]]
         for axis in range(len(fit.coefficients)):
             ends = (f"{fit.lower[axis, k]:.4g}", f"{fit.upper[axis, k]:.4g}") if k else ("", "")
             said = f"{unit}/K{k if k > 1 else ''}" if k else unit
             listing.add_row("xyz"[axis], str(k), said, f"{fit.coefficients[axis, k]:.4g}", *ends)
     show(listing)
+    found = BiasOverTemperature(
+        reference=fit.reference, span=fit.span, coefficients=fit.coefficients.T, sigma=fit.sigma.T
+    )
     paths.append(out / _names(sensor)[3])
     with written_beside(paths[-1]) as temporary:
         text = _commented(
             [f"Bias over temperature by `strapdown allan` from {recording.name}, a polynomial in T - reference."]
         )
-        temporary.write_text(text + "\n" + tomli_w.dumps({sensor: content}), encoding="utf-8")
-    return fit.left
+        content = {sensor: {"temperature": to_table(found, stem)}}
+        temporary.write_text(text + "\n" + tomli_w.dumps(content), encoding="utf-8")
+    return fit.left * scale
 
 
 def _write_numbers(

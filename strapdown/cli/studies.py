@@ -167,7 +167,7 @@ def _print_study(motion: _Scenario, summary: dict[str, Any]) -> None:
         )
     show(drift)
     verdicts = table(
-        "The same noisy filter on each: RMS error / what the filter says of itself",
+        "The same noisy filter on each: RMS error / the filter's own σ",
         "integration",
         "attitude\narcsec",
         "bias\n°/h",
@@ -192,6 +192,6 @@ def _print_study(motion: _Scenario, summary: dict[str, Any]) -> None:
     low, high = summary["filter"][0]["anees_bias_bounds"]
     nis_low, nis_high = summary["filter"][0]["nis_bounds"]
     console.print(
-        f"ANEES and NIS are per degree of freedom: 1 is a filter as good as it says. 99 % bounds: ANEES of attitude and of bias "
+        f"ANEES and NIS are per degree of freedom: 1 for a consistent filter. 99 % bounds: ANEES of attitude and of bias "
         f"{low:.3f} to {high:.3f} at one epoch, NIS {nis_low:.4f} to {nis_high:.4f}.\n"
     )

@@ -451,7 +451,9 @@ def _print_result(result: Tuning, records: Sequence[ImuRecord]) -> None:
         rows.add_row(one.name, unit.name, *(_figure(value) for value in values), _note(one, unit))
     show(rows)
     gain = result.before - result.after
-    console.print(f"{result.agreeing} of {len(result.starts)} searches ended at the best point; gain {gain:.4g} nats.")
+    console.print(
+        f"{result.agreeing} of {len(result.starts)} searches ended at the best point; log-likelihood + {gain:.4g}."
+    )
     if not all(one.identified for one in result.parameters):
         console.print(
             "Of a parameter that is not identified these records give an upper bound alone; the filter uses the value in the column "
@@ -514,7 +516,8 @@ def _print_comparison(comparison: Comparison, *, truth: bool) -> None:
     show(listing)
     console.print(f"{tunings.BOUNDS}.")
     for judgement in comparison.after.judgements[:1]:
-        console.print("After: " + judgement.words)
+        for line in judgement.words.splitlines()[1:]:
+            console.print("After:" + line[3:])
     if not comparison.better and not truth:
         console.print("On the data held out the tuned filter is less likely than the one before: keep that one.")
     elif comparison.after.attitude_rms > WORSE * comparison.before.attitude_rms:

@@ -42,7 +42,7 @@ from strapdown.vectors import VectorMeasurements
 __all__ = ["BankEstimate", "run"]
 
 HYPOTHESES = 96
-"""Hypotheses on the circle where nobody says: 3.75° apart. Fewer find the attitude as soon, but are some too sure of it:
+"""Hypotheses on the circle where nobody says: 3.75° apart. Fewer find the attitude as soon, but some are optimistic:
 ``sims/unknown_start.py``."""
 MIN_WEIGHT = 1e-6
 """A hypothesis of less than this part of the heaviest one's weight is dropped."""

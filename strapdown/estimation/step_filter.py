@@ -31,6 +31,7 @@ from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import ErrorStates
 from strapdown.estimation.schedule import KIND_CODES
 from strapdown.estimation.states import ProcessNoise, State, check_arguments
+from strapdown.estimation.temperature import need_none
 from strapdown.kernels import chains, error_state_step
 from strapdown.kernels.measurement import has_heading
 from strapdown.kernels.rotation import rotation_matrix
@@ -123,6 +124,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
 
     def _model(self, sensor: str, kind: str) -> modelling.Model:
         """Return the error states as arrays, in the filter's own order, with their effects on one sensor alone."""
+        need_none(self.error_states, "this filter")
         kinds = {name: "vector" for block in self.error_states for name in block.effects} | {sensor: kind}
         model = modelling.assemble(self.error_states, kinds)
         if model.levers.any() or model.varying:

@@ -348,6 +348,7 @@ def from_record(record: ImuRecord, source: str = "record") -> Recording:
         time=record.time[1:],
         rate=record.increments / steps,
         true_attitude=None if record.truth is None else record.truth.attitude[1:],
+        temperature=None if record.temperature is None else record.temperature[1:],
         **own,
     )
 

@@ -105,9 +105,10 @@ def is_folder(path: Path) -> bool:
 
 
 def _storages(path: Path) -> list[Path]:
-    """Return the storage files of a folder in their order: named as the folder, or that and a number."""
+    """Return the storage files of a folder in their order: with metadata all, else those named as the folder, or that and a number."""
     found = [one for suffix in (".mcap", ".db3") for one in path.glob(f"*{suffix}")]
-    numbers = {one: re.fullmatch(rf"{re.escape(path.absolute().name)}(?:_(\d+))?", one.stem) for one in found}
+    name = ".*?" if (path / "metadata.yaml").is_file() else re.escape(path.absolute().name)
+    numbers = {one: re.fullmatch(rf"{name}(?:_(\d+))?", one.stem) for one in found}
     return sorted(
         (one for one, number in numbers.items() if number), key=lambda one: int((numbers[one] or [0, 0])[1] or 0)
     )
