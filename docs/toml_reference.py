@@ -10,6 +10,7 @@ import dataclasses
 import inspect
 import itertools
 import math
+import re
 import textwrap
 import typing
 from dataclasses import dataclass, replace
@@ -119,9 +120,15 @@ def _section(section: Section) -> str:
     head = f"**`{section.header}`{type_line}**: {section.summary}"
     rows = ["| key | unit | value | default | meaning |", "|---|---|---|---|---|"]
     for key in section.keys:
-        other = "".join(f"<br>or `{name}`" for name in key.others)
-        rows.append(f"| `{key.name}`{other} | {key.unit} | {key.type} | {key.default} | {key.meaning} |")
+        names = "<br>or ".join(_broken(name) for name in (key.name, *key.others))
+        rows.append(f"| {names} | {key.unit} | {key.type} | {key.default} | {key.meaning} |")
     return "\n".join([head, "", *(rows if section.keys else [])])
+
+
+def _broken(name: str) -> str:
+    """Return a key as HTML that may break after its underscores, as 43 letters in a column must."""
+    broken = name.replace("_", "_<wbr>") if len(name) > 20 else name
+    return f'<code class="key">{broken}</code>'
 
 
 # ---------------------------------------------------------------------------------------------------------------- the tables
@@ -131,15 +138,13 @@ def _motions() -> list[Section]:
     def section(word: str, subject: Any, keys: tuple[Key, ...], more: str = "", header: str = "[motion]") -> Section:
         return Section(group="motion", header=header, type=word, summary=_summary(subject) + more, keys=keys)
 
-    examples = {"time": [0.4 * k for k in range(6)], "attitudes": [[1.0, 0.0, 0.0, 0.0]] * 6}  # of a sampled motion
+    lists: dict[str, dict[str, Any]] = {  # of a sampled motion
+        "time_s": {"type": "list of numbers", "example": [0.4 * k for k in range(6)]},
+        "attitudes": {"type": "list of quaternions", "example": [[1.0, 0.0, 0.0, 0.0]] * 6},
+    }
 
     def keys_of(word: str, kind: type, form: tables.Form) -> tuple[Key, ...]:
-        keys = _keys(kind, form)
-        sampled = word == "sampled"
-        return tuple(
-            replace(k, example=next((v for n, v in examples.items() if sampled and k.name.startswith(n)), k.example))
-            for k in keys
-        )
+        return tuple(replace(k, **lists.get(k.name, {})) if word == "sampled" else k for k in _keys(kind, form))
 
     found = [section(word, kind, keys_of(word, kind, form)) for word, (kind, form) in scenarios._MOTIONS.items()]
     harmonic = _keys(motion.Harmonic, scenarios._HARMONIC)
@@ -156,7 +161,8 @@ def _motions() -> list[Section]:
 def _gyro() -> Section:
     names = ", ".join(f"`{name}`" for name in datasheets.PRESETS)
     preset = _text("preset", f"A gyro on the market, of which other keys change what they name. One of {names}.")
-    keys = (replace(preset, example=next(iter(datasheets.PRESETS))), *_keys(gyro.GyroSpec, gyro.FORM))
+    own = (replace(k, type=_TYPES[gyro.Axes]) if k.type == "list of 3" else k for k in _keys(gyro.GyroSpec, gyro.FORM))
+    keys = (replace(preset, example=next(iter(datasheets.PRESETS))), *own)
     summary = (
         "the gyro; what is left out is perfect. A bias over temperature is a table `[gyro.temperature]`, as `strapdown allan "
         "--temperature` writes it to `gyro-temperature.toml`."
@@ -256,4 +262,5 @@ def _meanings(kind: type) -> dict[str, str]:
             and isinstance(below.value.value, str)
         ):
             said[ast.unparse(statement.target)] = below.value.value
+    said = {name: re.sub(r":\w+:`", "`", text) for name, text in said.items()}
     return {name: " ".join(text.split()).replace("``", "`").replace("|", "\\|") for name, text in said.items()}

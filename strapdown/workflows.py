@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import functools
 import os
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -352,6 +353,8 @@ def estimate(
     robust = Robust(kind=robust) if isinstance(robust, str) else robust  # type: ignore[arg-type]
     if isinstance(source, Recording):
         _refuse("a record", setup=setup, initial=initial, states=states or None)
+        for words in ahrs.doctor.at_rest(source):
+            warnings.warn(f"{source.source}: {words}", stacklevel=2)
         found = ahrs.estimate(
             source,
             _recording_parameters(motion, noise),

@@ -25,10 +25,10 @@ def transition_and_noise(phi, dt, process_noise):
     return F, covariance_matrices(np.array([*q11, *q12, q22, 0.0, 0.0, q22, 0.0, q22]))
 
 
-def update(f, series, k, time=None):
+def update(f, series, k):
     """Give sample k of a series to a filter; return whether it was used."""
     noise = {"covariance": series.covariances[k]} if series.kind != "heading" else {"sigma": series.sigma[k]}
-    given = {"sensor": series.sensor, "time": time, **noise}
+    given = {"sensor": series.sensor, **noise}
     if series.kind == "attitude":
         return f.update_attitude(series.attitude[k], **given)
     return getattr(f, f"update_{series.kind}")(series.vector_b[k], series.references_f[k], **given)

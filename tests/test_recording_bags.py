@@ -155,6 +155,16 @@ def test_headers_without_stamps_and_stamps_out_of_order_are_said(bag):
     )
 
 
+def test_equal_stamps_are_not_out_of_order(bag):
+    """Of a gyro they are refused, by their own name; of a magnetometer the sample is taken."""
+    _, content = imu()
+    field = [("/imu/mag", "MagneticField", START + 5_000_001 * k, "m", [1e-5, 0, 0]) for k in (1, 2, 2, 3)]
+    assert not any("sorted" in remark for remark in read(bag("mcap", content + field)).remarks)
+    content[2] = (*content[2][:2], content[1][2], *content[2][3:])
+    with pytest.raises(InputError, match=r"time\[2\] repeats"):
+        read(bag("mcap", content, name="again"))
+
+
 def test_bags_without_an_inertial_unit_and_what_is_no_bag_are_refused(bag, tmp_path):
     with pytest.raises(InputError, match=r"holds no message of sensor_msgs/msg/Imu; give a bag"):
         read(bag("bag", [("/chatter", "String", START, "", "x")]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import types
 from dataclasses import replace
 
 import h5py
@@ -266,6 +267,15 @@ def test_a_cameras_log_is_read(tmp_path):
     (tmp_path / "none.mp4").write_bytes(b"\0\0\0\x18ftypmp42" + bytes(200))
     with pytest.raises(InputError, match=r"none.mp4 (cannot be read by telemetry-parser|.*holds no gyro samples)"):
         read(tmp_path / "none.mp4")
+
+
+@pytest.mark.parametrize("rows", [[], [{"timestamp_ms": 0.0, "gyro": [1, 2, 3]}], [{"timestamp_ms": 0.0}] * 3])
+def test_a_cameras_log_without_gyro_samples_is_refused(tmp_path, monkeypatch, rows):
+    parser = types.SimpleNamespace(camera="GoPro", model="H9", normalized_imu=lambda: rows)
+    monkeypatch.setitem(sys.modules, "telemetry_parser", types.SimpleNamespace(Parser=lambda path: parser))
+    (tmp_path / "video.log").write_text(GCSV)
+    with pytest.raises(InputError, match=r"video.log \(GoPro\) holds no gyro samples; give a log with raw"):
+        read(tmp_path / "video.log")
 
 
 def test_a_decoded_blackbox_is_a_table(tmp_path):

@@ -27,8 +27,8 @@ from typing import Any
 import numpy as np
 
 from strapdown import checks, gyro, units
-from strapdown.allan import deviation as allan
-from strapdown.allan.deviation import NoiseFit
+from strapdown.allan import noise_fit
+from strapdown.allan.noise_fit import NoiseFit
 from strapdown.checks import InputError
 
 __all__ = [
@@ -41,7 +41,7 @@ __all__ = [
 SENSORS = ("gyro", "accelerometer", "magnetometer")
 _MICRO_G = 1e-6 * units.STANDARD_GRAVITY
 UNITS: Mapping[str, Mapping[str, tuple[str, float]]] = {
-    "gyro": allan.UNITS,
+    "gyro": noise_fit.UNITS,
     "accelerometer": {
         "quantization": ("mm/s", 1e-3),
         "angle_random_walk": ("µg/√Hz", _MICRO_G),
@@ -82,11 +82,11 @@ def name(sensor: str, term: str) -> str:
 def table(fit: NoiseFit, sensor: str = "gyro") -> list[dict[str, object]]:
     """Return one row per axis and term for printing, as :func:`strapdown.allan.table`, in the names and units of a sensor."""
     checks.one_of("sensor", sensor, SENSORS)
-    rows = allan.table(fit)
+    rows = noise_fit.table(fit)
     for row in rows:
         term = str(row["term"])
         unit, factor = UNITS[sensor][term]
-        ratio = allan.UNITS[term][1] / factor
+        ratio = noise_fit.UNITS[term][1] / factor
         if sensor != "gyro":
             row |= {end: float(row[end]) * ratio for end in ("estimate", "lower", "upper")}  # type: ignore[arg-type]
         row |= {"term": name(sensor, term), "unit": unit}
@@ -118,7 +118,7 @@ def to_toml(fit: NoiseFit, sensor: str = "gyro") -> dict[str, dict[str, Any]]:
         Table with the unit in each key, to six digits; that of a gyro is the input of :func:`strapdown.gyro.read_spec`.
     """
     rounded: dict[str, Any] = {}
-    for term, value in allan.to_gyro_parameters(fit).items():
+    for term, value in noise_fit.to_gyro_parameters(fit).items():
         factor = key(sensor, term)[1]
         rounded[term] = np.array([float(f"{x / factor:.6g}") for x in np.atleast_1d(value)]).reshape(np.shape(value))
     if sensor == "gyro":

@@ -1,4 +1,4 @@
-"""The filter step by step, on filterpy: for data that arrive as they are measured, and for looking inside.
+"""The filter step by step, on filterpy, for looking inside.
 
 :class:`StepFilter` is the filter of :mod:`strapdown.estimation`, on whole covariance matrices. Motion model and measurement rows are the
 kernels' own functions, run as plain Python; gates, restarts and iterated updates are in :mod:`strapdown.estimation.step_gate`.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -46,8 +46,6 @@ from strapdown.kernels.rotation import rotation_matrix
 from strapdown.records import LARGEST_TURN
 from strapdown.vectors import KINDS, need_level, need_unit, triad
 
-CLOCK_SHARE = 1e-3
-"""Largest rounding of a clock, as a share of the longest step."""
 NO_LEVER = (0.0,) * 9
 """The matrix by which a lever arm enters a measurement: of none."""
 
@@ -73,15 +71,15 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         Weighs each measurement by its distance from the estimate.
     monitor : Monitor, optional
         Reports in ``events`` when the running mean of the NIS leaves its bounds. Memory grows by a few numbers a measurement.
-    look_back : float
-        How late a measurement may be given, s. The filter then goes back to its time, processes it, and repeats what followed: the result
-        is that of the filter that had it in order. Memory holds the states of that span. Measurements of one time are then processed in
-        the order of ``sensors``, in whatever order they are given; without a look-back, in that in which they are given.
     sensors : sequence of str, optional
-        Names of the sensors in the order of the record's series; others follow in the order of their first measurement. With error states
-        no other name is accepted. Default: with error states the sensors that those are about, if any; else none.
+        Names of the sensors; with error states no other name is accepted. Default: with error states the sensors that those are about, if
+        any; else any.
     time : float
         Time of the initial state, s.
+
+    See Also
+    --------
+    LiveFilter : The same filter compiled, two hundred times faster, which takes late measurements too.
 
     Notes
     -----
@@ -92,14 +90,14 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
     - ``nis`` and ``weight`` of the last measurement that was not skipped; the weight is 0 if the gate refused it;
     - ``refused`` and ``skipped``, by sensor: how many measurements the gate refused, and how many were missing (NaN) or headings of a
       vertical vector;
-    - ``late`` and ``repeated``: how many measurements came later than ``look_back``, and how many gyro samples had no duration;
+    - ``repeated``: how many gyro samples had no duration;
     - ``events``: recoveries, lock-outs and divergence so far.
 
     Examples
     --------
-    >>> live = StepFilter(noise, start, look_back=0.5)  # doctest: +SKIP
-    >>> live.predict(delta_theta, time=10.02)  # doctest: +SKIP
-    >>> live.update_direction(vector_b, reference_f, 1e-3, "star tracker", time=9.9)  # doctest: +SKIP
+    >>> steps = StepFilter(noise, start)  # doctest: +SKIP
+    >>> steps.predict(delta_theta, time=10.02)  # doctest: +SKIP
+    >>> steps.update_direction(vector_b, reference_f, 1e-3, "star tracker")  # doctest: +SKIP
     """
 
     def __init__(
@@ -111,7 +109,6 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         gate: Gate | None = None,
         robust: Robust | None = None,
         monitor: Monitor | None = None,
-        look_back: float = 0.0,
         sensors: Sequence[str] = (),
         time: float = 0.0,
     ) -> None:
@@ -131,11 +128,9 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         self.process_noise = process_noise
         self.gate = gate
         self.robust = robust
-        self.look_back = non_negative("look_back", look_back, unit="s")
         self.time = finite("time", time, unit="s")
         self.nis = 0.0
         self.weight = 1.0
-        self.late = 0
         self.repeated = 0
         self.refused: dict[str, int] = {}
         self._missing: dict[str, int] = {}
@@ -144,9 +139,6 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         self._motion = self._model("", "vector")
         self._sensor_models: dict[str, modelling.Model] = {}
         self._thresholds = np.full(3, np.inf) if gate is None else gate.thresholds
-        self._clock = _Clock(start=self.time)
-        self._history = _History()
-        self._order = {name: place for place, name in enumerate(names or self.sensors)}
         self._begin_gate(state, monitor)
 
     events = Events()
@@ -229,25 +221,33 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         delta_theta : array_like (3,)
             The rate integrated over the step, rad, body axes.
         dt : float, optional
-            Length of the step, s; the clock is then their compensated sum. A step of no length is counted as ``repeated``.
+            Length of the step, s. A step of no length is counted as ``repeated``.
         time : float, optional
-            End of the step, s, where samples have stamps; the clock is then theirs.
+            In its place the end of the step, s.
 
         Raises
         ------
         InputError
-            If neither is given, if they contradict each other or the clock, or if the increment is too large to be an angle.
+            If neither or both are given, if the end lies before the filter's time, or if the increment is too large to be an angle.
         """
         increment = array("delta_theta", delta_theta, (3,))
         if np.max(np.abs(increment)) > LARGEST_TURN:
             raise InputError(
                 f"delta_theta is {increment}, and nothing turns so far between two samples; it is the rate times dt, rad: check the unit"
             )
-        step, end = self._clock.step(self.time, dt, time)
+        if dt is not None and time is None:
+            step = non_negative("dt", dt, unit="s")
+            end = self.time + step
+        elif time is not None and dt is None:
+            end = finite("time", time, unit="s")
+            step = end - self.time
+        else:
+            raise InputError("give either dt, the length of the step in s, or time, when it ends")
+        if step < 0.0:
+            raise InputError(f"time is {end:.9g} s, before the filter's {self.time:.9g} s; give the samples in order")
         if step == 0.0:
             self.repeated += 1
             return
-        self._remember(_Entry(before=self._snapshot(), end=end, dt=step, increment=increment))
         self._predict(increment, step, end)
 
     def _predict(self, increment: Array, step: float, end: float) -> None:
@@ -332,7 +332,6 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         sensor: str = "",
         *,
         covariance: ArrayLike | None = None,
-        time: float | None = None,
     ) -> bool:
         """Update with a measured unit direction: two degrees of freedom.
 
@@ -348,15 +347,13 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             Its name, by which the gate counts.
         covariance : array_like (3, 3), optional
             Of the noise, body axes, in place of ``sigma``; the part across the direction counts.
-        time : float, optional
-            Time of validity, s; default: now.
 
         Returns
         -------
         bool
-            Whether the measurement was used: not refused, missing or too late.
+            Whether the measurement was used: neither refused nor missing.
         """
-        return self._update_by_vector("direction", vector_b, reference_f, (sigma, covariance), sensor, time)
+        return self._update_by_vector("direction", vector_b, reference_f, (sigma, covariance), sensor)
 
     def update_vector(
         self,
@@ -366,7 +363,6 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         sensor: str = "",
         *,
         covariance: ArrayLike | None = None,
-        time: float | None = None,
     ) -> bool:
         """Update with a measured vector: three degrees of freedom.
 
@@ -382,8 +378,6 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             Name of the sensor, for gate and events.
         covariance : array_like (3, 3), optional
             Of the noise, instead of ``sigma``.
-        time : float, optional
-            Time of the measurement, s; a late one needs ``look_back``.
 
         Returns
         -------
@@ -393,9 +387,9 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         Raises
         ------
         InputError
-            If a shape is wrong, the noise is missing or not positive, or the time lies before ``look_back``.
+            If a shape is wrong, the noise is missing or not positive.
         """
-        return self._update_by_vector("vector", vector_b, reference_f, (sigma, covariance), sensor, time)
+        return self._update_by_vector("vector", vector_b, reference_f, (sigma, covariance), sensor)
 
     def update_heading(
         self,
@@ -403,8 +397,6 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         reference_f: ArrayLike,
         sigma: float,
         sensor: str = "",
-        *,
-        time: float | None = None,
     ) -> bool:
         """Update with the heading of a measured unit vector's horizontal part: one degree of freedom.
 
@@ -418,8 +410,6 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             σ of the heading, rad.
         sensor : str, optional
             Name of the sensor, for gate and events.
-        time : float, optional
-            Time of the measurement, s; a late one needs ``look_back``.
 
         Returns
         -------
@@ -429,9 +419,9 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         Raises
         ------
         InputError
-            If a shape is wrong, σ is not positive, or the time lies before ``look_back``.
+            If a shape is wrong, σ is not positive.
         """
-        return self._update_by_vector("heading", vector_b, reference_f, (sigma, None), sensor, time)
+        return self._update_by_vector("heading", vector_b, reference_f, (sigma, None), sensor)
 
     def update_attitude(
         self,
@@ -440,7 +430,6 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         sensor: str = "",
         *,
         covariance: ArrayLike | None = None,
-        time: float | None = None,
     ) -> bool:
         """Update with a measured attitude: three degrees of freedom.
 
@@ -454,8 +443,6 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             Name of the sensor, for gate and events.
         covariance : array_like (3, 3), optional
             Of the noise, rad², body axes, instead of ``sigma``.
-        time : float, optional
-            Time of the measurement, s; a late one needs ``look_back``.
 
         Returns
         -------
@@ -465,7 +452,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         Raises
         ------
         InputError
-            If a shape is wrong, the noise is missing or not positive, or the time lies before ``look_back``.
+            If a shape is wrong, the noise is missing or not positive.
         """
         name = _label(sensor, "attitude")
         given = array(name, attitude, (4,), allow_nan=True)
@@ -473,7 +460,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             return self._skip(sensor)
         frame = (*unit_quaternions(name, given).tolist(), 0.0, 0.0, 0.0, 0.0, 0.0)
         noise = _noise_covariance(sensor, sigma, covariance)
-        return self._measure(_Measurement(kind="attitude", z=(0.0, 0.0, 0.0), frame=frame, noise=noise), sensor, time)
+        return self._measure(_Measurement(kind="attitude", z=(0.0, 0.0, 0.0), frame=frame, noise=noise), sensor)
 
     def _update_by_vector(
         self,
@@ -482,7 +469,6 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         reference_f: ArrayLike,
         noise: tuple[ArrayLike | None, ArrayLike | None],
         sensor: str,
-        time: float | None,
     ) -> bool:
         name, reference = _label(sensor, "vector_b"), _label(sensor, "reference_f")
         z = array(name, vector_b, (3,), allow_nan=True)
@@ -499,7 +485,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         C = _noise_covariance(sensor, *noise) / length**2
         frame_9 = tuple(frame.ravel().tolist())
         z_3 = tuple((z / length).tolist())
-        return self._measure(_Measurement(kind=kind, z=z_3, frame=frame_9, length=length, noise=C), sensor, time)
+        return self._measure(_Measurement(kind=kind, z=z_3, frame=frame_9, length=length, noise=C), sensor)
 
     def _need_known(self, sensor: str) -> None:
         if self.sensors and sensor not in self.sensors:
@@ -513,47 +499,13 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         self._missing[sensor] = self._missing.get(sensor, 0) + 1
         return False
 
-    def _measure(self, measurement: _Measurement, sensor: str, time: float | None) -> bool:
-        """Process a measurement at its time and its sensor's place among those of that time, and repeat what comes after it."""
+    def _measure(self, measurement: _Measurement, sensor: str) -> bool:
+        """Update with a measurement; count the outcome for the gate."""
         self._need_known(sensor)
         if self.error_states and self._kinds.setdefault(sensor, measurement.kind) != measurement.kind:
             raise InputError(
                 f"{sensor or 'the sensor'} gave kind {self._kinds[sensor]!r} before, now {measurement.kind!r}; name each sensor"
             )
-        when = self.time if time is None else finite("time", time, unit="s")
-        room = self._clock.rounding(self.time, when)
-        when = self.time if abs(when - self.time) <= room else when
-        if when > self.time:
-            raise InputError(f"time is {when:.9g} s, after the filter's {self.time:.9g} s; predict up to it first")
-        place = self._order.setdefault(sensor, len(self._order))
-        past = self._history.entries
-        if when < self.time and (not past or when < max(self.time - self.look_back, past[0].before["time"]) - room):
-            self.late += 1
-            return False
-        first = len(past)
-        while first and self._comes_after(past[first - 1], when, place, room):
-            first -= 1
-        after, self._history.entries = past[first:], past[:first]
-        if not after:
-            return self._process(measurement, sensor)
-        self._restore(after[0].before)
-        head, tail = after[0].split(when if when > self.time + room else self.time)
-        if head is not None:
-            self._repeat(head)
-        accepted = self._process(measurement, sensor)
-        for entry in (tail, *after[1:]):
-            self._repeat(entry)
-        return accepted
-
-    def _comes_after(self, entry: _Entry, when: float, place: int, room: float) -> bool:
-        """Return whether an entry of the history comes after a measurement of that time and that place among the sensors."""
-        if entry.end > when + room:
-            return True
-        return entry.measurement is not None and entry.end >= when - room and self._order[entry.sensor] > place
-
-    def _process(self, measurement: _Measurement, sensor: str) -> bool:
-        """Update with a measurement of now; count the outcome for the gate."""
-        self._remember(_Entry(before=self._snapshot(), end=self.time, measurement=measurement, sensor=sensor))
         has_direction = measurement.has_direction(self.attitude)
         outcome = self._correct(measurement, sensor)
         if not has_direction:
@@ -657,45 +609,6 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         """Take over the state of a restart candidate."""
         self.attitude, self.bias, self.values, self.P = other.attitude, other.bias, other.values, other.P
 
-    # ---------------------------------------------------------------------------------------------------------------- history
-
-    def _remember(self, entry: _Entry) -> None:
-        """Keep an entry as long as a measurement may still come before it."""
-        if self.look_back == 0.0:
-            return
-        self._history.entries.append(entry)
-        oldest = self.time - self.look_back - self._clock.rounding(self.time, self.time)
-        while self._history.entries[0].end < oldest:
-            del self._history.entries[0]
-
-    def _repeat(self, entry: _Entry) -> None:
-        """Do again what an entry of the history did, from the present state."""
-        if entry.measurement is None:
-            self._remember(replace(entry, before=self._snapshot()))
-            self._predict(entry.increment, entry.dt, entry.end)
-        else:
-            self._process(entry.measurement, entry.sensor)
-
-    def _snapshot(self) -> dict[str, Any]:
-        """Return what has to be restored when the filter goes back to this moment; nothing where it never does."""
-        if self.look_back == 0.0:
-            return {}
-        return {
-            "time": self.time,
-            "attitude": self.attitude,
-            "bias": self.bias,
-            "values": self.values,
-            "P": self.P.copy(),
-            "refused": dict(self.refused),
-            "_vertical": dict(self._vertical),
-            "_passes": self._passes,
-            "_supervision": self._supervision.copied(),
-        }
-
-    def _restore(self, snapshot: dict[str, Any]) -> None:
-        for name, value in snapshot.items():
-            setattr(self, name, value)
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Measurement:
@@ -739,81 +652,6 @@ class _Prior:
     covariance: Array
 
 
-@dataclass(kw_only=True)
-class _Clock:
-    """The filter's clock: a compensated sum of steps, or the stamps of the samples."""
-
-    start: float
-    rest: float = 0.0
-    """Rounding error of the sum of steps, s."""
-    steps: int = 0
-    """Steps since the last stamp."""
-    longest: float = 0.0
-    """Longest step, s."""
-
-    def step(self, now: float, dt: float | None, time: float | None) -> tuple[float, float]:
-        """Return the length and the end of a step from now, s, given its length, its end or both."""
-        if time is None:
-            if dt is None:
-                raise InputError("dt is None; give it, the length of the step in s, or time, when it ends")
-            step = non_negative("dt", dt, unit="s")
-            end, self.rest = _sum_and_rest(now, step + self.rest)
-            self.steps += 1
-        else:
-            end = finite("time", time, unit="s")
-            step = self._length(now, dt, end)
-            self.steps, self.rest = 0, 0.0
-        self.longest = max(self.longest, step)
-        return step, end
-
-    def _length(self, now: float, dt: float | None, end: float) -> float:
-        """Return the length of a step to a stamp, s."""
-        room = self.rounding(now, end)
-        if end < now - room:
-            raise InputError(f"time is {end:.9g} s, before the filter's {now:.9g} s; give the samples in order")
-        step = max(end - now, 0.0)
-        if dt is not None and abs(non_negative("dt", dt, unit="s") - step) > room + CLOCK_SHARE * step:
-            raise InputError(
-                f"dt is {dt:.9g} s, but from {now:.9g} s to time it is {step:.9g} s; leave out one of them"
-            )
-        return step
-
-    def rounding(self, now: float, time: float) -> float:
-        """Return how far a time may lie from the clock and still mean now, s: the rounding of as many sums as there were."""
-        ulp = float(np.spacing(max(abs(time), abs(now), abs(self.start))))
-        gathered = self.steps * ulp
-        return 4.0 * ulp + (min(gathered, CLOCK_SHARE * self.longest) if self.longest else gathered)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Entry:
-    """A prediction or a measurement of the past, with the state before it."""
-
-    before: dict[str, Any]
-    end: float
-    """Time after it, s."""
-    dt: float = 0.0
-    increment: Array = field(default_factory=lambda: np.zeros(3))
-    measurement: _Measurement | None = None
-    sensor: str = ""
-
-    def split(self, time: float) -> tuple[_Entry | None, _Entry]:
-        """Return a prediction as its parts before and after a time; None and itself where that is its begin, or where it is none."""
-        begin = float(self.before["time"])
-        if self.measurement is not None or time <= begin:
-            return None, self
-        share = (time - begin) / (self.end - begin)
-        head = replace(self, end=time, dt=share * self.dt, increment=share * self.increment)
-        return head, replace(self, dt=self.dt - head.dt, increment=self.increment - head.increment)
-
-
-@dataclass
-class _History:
-    """Steps that the filter may have to repeat; one object, because filterpy's ``Saver`` makes an array of a list, and finds no shape."""
-
-    entries: list[_Entry] = field(default_factory=list)
-
-
 def _sensor_names(sensors: Sequence[str]) -> tuple[str, ...]:
     """Return names of sensors as a tuple; one by itself is refused."""
     if isinstance(sensors, str):
@@ -824,13 +662,6 @@ def _sensor_names(sensors: Sequence[str]) -> tuple[str, ...]:
 def _label(sensor: str, name: str) -> str:
     """Return what a value is called in messages."""
     return f"{sensor}: {name}" if sensor else name
-
-
-def _sum_and_rest(a: float, b: float) -> tuple[float, float]:
-    """Return the sum and what it lacks by rounding (Knuth 1998, theorem 4.2.2B)."""
-    total = a + b
-    b_in_it = total - a
-    return total, (a - (total - b_in_it)) + (b - b_in_it)
 
 
 def _noise_covariance(sensor: str, sigma: ArrayLike | None, covariance_b: ArrayLike | None) -> Array:

@@ -9,7 +9,6 @@ Methods, thresholds and their reasons are those of the kernels: :mod:`strapdown.
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -262,10 +261,8 @@ class Supervision(Generic[Filter]):
     def __init__(self, gate: Gate | None, memory: GateMemory | None, monitor: Monitor | None = None) -> None:
         self.gate = gate
         self.monitor = monitor
-        # Time, NIS and degrees of freedom of each measurement. Copies share the list and each knows how many entries are its own: a filter
-        # that has gone back to a copy overwrites what follows, and never returns to it.
         self.nis_history: list[tuple[float, float, int]] = []
-        self.number = 0
+        """Time, NIS and degrees of freedom of each measurement."""
         self.sensors: tuple[str, ...] = () if memory is None else tuple(memory.counters)
         self.memory, self.counters = remembered(gate, memory, self.sensors)
         self.candidate: Filter | None = None
@@ -285,8 +282,8 @@ class Supervision(Generic[Filter]):
     def events(self) -> tuple[Event, ...]:
         """Recoveries, lock-outs and divergence so far, in order of time."""
         found = gate_events(self.recoveries, self.lock_outs, self.sensors)
-        if self.monitor is not None and self.number:
-            time, nis, degrees = (np.array(column) for column in zip(*self.nis_history[: self.number], strict=True))
+        if self.monitor is not None and self.nis_history:
+            time, nis, degrees = (np.array(column) for column in zip(*self.nis_history, strict=True))
             found += self.monitor.watch(time, nis, degrees)
         return tuple(sorted(found, key=lambda event: event.start))
 
@@ -327,9 +324,7 @@ class Supervision(Generic[Filter]):
         degrees, nis = filter.dim_z, filter.nis
         if self.gate is not None and outcome != iterated_update.ACCEPTED:
             nis = float(self.gate.thresholds[degrees - 1])
-        del self.nis_history[self.number :]
         self.nis_history.append((filter.time, nis, degrees))
-        self.number += 1
 
     def _start_candidate(self, filter: Filter, gate: Gate) -> None:
         sigma = gate_rules.restart_attitude(gate.restart_attitude_sigma, self.memory)
@@ -359,10 +354,3 @@ class Supervision(Generic[Filter]):
             P -= np.outer(gain, P[3 + i])
         candidate._reset(correction, P, far=True)
         gate_rules.count_widening(self.memory)
-
-    def copied(self) -> Self:
-        """Return it as it is now."""
-        other = copy.copy(self)
-        other.memory, other.counters, other.lock_outs = self.memory.copy(), self.counters.copy(), self.lock_outs.copy()
-        other.candidate = copy.deepcopy(self.candidate)
-        return other
