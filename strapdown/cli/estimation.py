@@ -653,7 +653,7 @@ def _say_recording(result: AhrsEstimate, parameters: AhrsParameters, motion: str
         console.print(used.left_out_words)
     for sensor, number in found.skipped.items():
         if number:
-            console.print(f"{number} samples of the {sensor} are missing and were skipped.")
+            console.print(f"{number} of the gyro's samples have none of the {sensor} beside them.")
     _print_result(replace(found, skipped={}))
 
 
