@@ -128,7 +128,7 @@ def test_what_shows_nothing_is_refused(values, words):
 
 @pytest.mark.parametrize("level", [0.5, 1.0, np.nan])
 def test_no_confidence_is_refused(level):
-    with pytest.raises(InputError, match="a confidence lies between 0.5 and 1"):
+    with pytest.raises(InputError, match=r"a confidence lies between 0.5 and 1"):
         allan_gaps.allan_deviation(np.arange(100.0) % 3, 1.0, level=level)
 
 
