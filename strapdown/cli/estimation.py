@@ -159,8 +159,8 @@ class _Recorded:
     temperature: Annotated[
         Path | None,
         typer.Option(
-            help="gyro-temperature.toml of `strapdown allan --temperature`, the gyro's bias over temperature, subtracted first; the error "
-            "of its slope is estimated (with --smooth it becomes a random walk)."
+            help="gyro-temperature.toml of `strapdown allan --temperature`, the gyro's bias over temperature, subtracted first; the "
+            "error of its slope is estimated (with --smooth and --observability it becomes a random walk)."
         ),
     ] = None
 
@@ -578,14 +578,15 @@ def _read_recording(
         from strapdown import workflows  # which imports much more
 
         parameters = workflows.with_gyro_noise(parameters, read_spec(shared.gyro))
-    if warm is None:
-        return source, parameters
-    source = gyro_temperature.applied(source, warm)
-    if not shared.smooth:
-        return source, replace(parameters, gyro_temperature_sigma=tuple(warm.slope_sigma.tolist()))
-    # The smoother has no bias driven by temperature: a walk covers the error of the slope.
-    walk = warm.walk(gyro_temperature.temperature_at_samples(source), source.time)
-    return source, replace(parameters, rate_random_walk=math.hypot(parameters.rate_random_walk, walk))
+    if warm is not None:
+        source = gyro_temperature.applied(source, warm)
+        if shared.smooth or shared.observability:
+            # They have no bias driven by temperature: a walk covers the slope's error.
+            walk = warm.walk(gyro_temperature.temperature_at_samples(source), source.time)
+            parameters = replace(parameters, rate_random_walk=math.hypot(parameters.rate_random_walk, walk))
+        else:
+            parameters = replace(parameters, gyro_temperature_sigma=tuple(warm.slope_sigma.tolist()))
+    return source, parameters
 
 
 def _fixed_frame(used: Recording) -> str:
@@ -657,7 +658,7 @@ def _say_recording(result: AhrsEstimate, parameters: AhrsParameters, motion: str
         console.print(used.left_out_words)
     for sensor, number in found.skipped.items():
         if number:
-            console.print(f"{number} samples of the {sensor} are missing and were skipped.")
+            console.print(f"{number} of the gyro's samples have none of the {sensor} beside them.")
     _print_result(replace(found, skipped={}))
 
 
