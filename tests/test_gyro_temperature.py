@@ -12,6 +12,7 @@ from strapdown.checks import InputError
 from strapdown.estimation import error_states
 from strapdown.estimation import temperature as driven
 from strapdown.estimation.gating import Gate
+from strapdown.estimation.states import Candidate, GateMemory
 from strapdown.gyro.temperature import from_table, to_table
 from strapdown.montecarlo import lanes
 from strapdown.recordings import formats, recordfiles
@@ -289,3 +290,30 @@ def test_lost_samples_and_locked_out_sensors():
     found = estimation.run(locked, noise, start, (block,), gate=Gate(probability=0.999, recovery=None))
     assert [event.kind for event in found.events] == ["lock-out"]
     assert found.events[0].value == 400
+
+
+def test_a_change_of_temperature_moves_the_filter_and_its_restart_candidate_alike():
+    """By hand: b + c ΔT, whose variance is P_bb + 2 ΔT P_bc + ΔT² P_cc, with and without the factor."""
+    random = np.random.default_rng(3)
+    root = np.tril(random.standard_normal((10, 10))) + 5.0 * np.eye(10)  # attitude, bias, another state, the slopes
+    P, values = root.T @ root, random.standard_normal(4)
+    own, change, axis = slice(1, 4), 2.5, np.arange(3)
+    for factor in (root, None):
+        one = Candidate(attitude=np.eye(4)[0], others=np.concatenate([axis, values]), covariance=P, factor=factor)
+        memory = GateMemory(restart_bias_variance=np.ones(3), counts=np.zeros(1), counters={}, candidate=one)
+        state = estimation.State(
+            attitude=np.eye(4)[0], bias=axis, values=values, covariance=P, factor=factor, gate=memory
+        )
+        found = driven.shifted(state, own, change)
+        bias = axis + change * values[1:]
+        wanted = np.diag(P)[3:6] + 2.0 * change * P[axis + 3, axis + 7] + change**2 * np.diag(P)[7:]
+        np.testing.assert_allclose(found.bias, bias)
+        np.testing.assert_allclose(found.gate.candidate.others, np.concatenate([bias, values]))
+        for moved in (found, found.gate.candidate):
+            np.testing.assert_allclose(np.diag(moved.covariance)[3:6], wanted)
+            np.testing.assert_allclose(moved.covariance[:3, 3:6], P[:3, 3:6] + change * P[:3, 7:])
+            assert (moved.factor is None) == (factor is None)
+            if factor is not None:
+                np.testing.assert_allclose(moved.factor.T @ moved.factor, moved.covariance)
+        back = driven.shifted(found, own, -change)
+        np.testing.assert_allclose(back.covariance, P, rtol=1e-12)

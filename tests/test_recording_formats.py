@@ -454,6 +454,9 @@ def test_a_simulated_record_and_an_estimate_are_converted(tmp_path):
     assert status == 0, said
     np.testing.assert_array_equal(np.loadtxt(tmp_path / "e.tum")[:, 4:], q[:, [1, 2, 3, 0]])
     assert convert(tmp_path / "e.h5", tmp_path / "e.bag")[0] == 1
+    write_record(tmp_path / "s.h5", scenarios.simulate(replace(scenarios.load_scenario("two-stars"), duration=5.0)))
+    status, said = convert(tmp_path / "s.h5", tmp_path / "s.csv")
+    assert (status, "Left out: star 1 (direction), star 2 (direction)." in said) == (0, True), said
 
 
 def test_a_trajectory_goes_along_as_reference(tmp_path):

@@ -159,8 +159,8 @@ class _Recorded:
     temperature: Annotated[
         Path | None,
         typer.Option(
-            help="gyro-temperature.toml of `strapdown allan --temperature`, the gyro's bias over temperature, subtracted first; the error "
-            "of its slope is estimated (with --smooth it becomes a random walk)."
+            help="gyro-temperature.toml of `strapdown allan --temperature`, the gyro's bias over temperature, subtracted first; the "
+            "error of its slope is estimated (with --smooth and --observability it becomes a random walk)."
         ),
     ] = None
 
@@ -522,7 +522,7 @@ def _estimate_recording(
     from strapdown.checks import non_negative, one_of
     from strapdown.consistency import reference_errors
     from strapdown.recordings import unit_calibration
-    from strapdown.units import DEGREE
+    from strapdown.units import DEGREE, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
 
     motion = one_of("--motion", options.motion or "hand", ahrs.MOTIONS)
     late = None if options.latency is None else 1e-3 * non_negative("--latency", options.latency, unit="ms")
@@ -544,6 +544,12 @@ def _estimate_recording(
     rms = None if errors is None else {name: value / DEGREE for name, value in errors.rms(used.movement).items()}
     paths = _write_recording(result, parameters, replace(parameters.setup, **robustness), motion, shared.smooth, out)
     _say_recording(result, parameters, motion)
+    if shared.gyro is not None:
+        arw, rrw = parameters.angle_random_walk, parameters.rate_random_walk
+        console.print(
+            f"Gyro noise from {shared.gyro}, flicker included: {arw / DEGREE_PER_ROOT_HOUR:.3g} °/√h, bias random walk "
+            f"{rrw / DEGREE_PER_HOUR_PER_ROOT_HOUR:.3g} °/h/√h."
+        )
     if shared.observability:
         paths.append(_observability(out, used.source, result.record, parameters.setup, result.initial))
     if rms is not None:
@@ -572,14 +578,15 @@ def _read_recording(
         from strapdown import workflows  # which imports much more
 
         parameters = workflows.with_gyro_noise(parameters, read_spec(shared.gyro))
-    if warm is None:
-        return source, parameters
-    source = gyro_temperature.applied(source, warm)
-    if not shared.smooth:
-        return source, replace(parameters, gyro_temperature_sigma=tuple(warm.slope_sigma.tolist()))
-    # The smoother has no bias driven by temperature: a walk covers the error of the slope.
-    walk = warm.walk(gyro_temperature.temperature_at_samples(source), source.time)
-    return source, replace(parameters, rate_random_walk=math.hypot(parameters.rate_random_walk, walk))
+    if warm is not None:
+        source = gyro_temperature.applied(source, warm)
+        if shared.smooth or shared.observability:
+            # They have no bias driven by temperature: a walk covers the slope's error.
+            walk = warm.walk(gyro_temperature.temperature_at_samples(source), source.time)
+            parameters = replace(parameters, rate_random_walk=math.hypot(parameters.rate_random_walk, walk))
+        else:
+            parameters = replace(parameters, gyro_temperature_sigma=tuple(warm.slope_sigma.tolist()))
+    return source, parameters
 
 
 def _fixed_frame(used: Recording) -> str:
@@ -651,7 +658,7 @@ def _say_recording(result: AhrsEstimate, parameters: AhrsParameters, motion: str
         console.print(used.left_out_words)
     for sensor, number in found.skipped.items():
         if number:
-            console.print(f"{number} samples of the {sensor} are missing and were skipped.")
+            console.print(f"{number} of the gyro's samples have none of the {sensor} beside them.")
     _print_result(replace(found, skipped={}))
 
 
