@@ -216,6 +216,8 @@ def test_the_bias_over_temperature_is_subtracted_and_its_error_becomes_a_walk():
     assert walk == pytest.approx(2e-4 * rise * np.sqrt(60.0), rel=1e-12)  # 3 K, which it takes 60 s for
     assert "40 samples are beyond 20 to 27 °C" in found.remarks[-1]
     np.testing.assert_allclose(table.slope_sigma, [0.0, 0.0, 2e-4])
+    bent = from_table({**given, "sigma_rad_per_s_per_k2": [0.0, 3e-5, 3e-5]}, "file")  # 2 σ₂ (T − T₀) at 20 °C, 5 K off
+    np.testing.assert_allclose(bent.slope_sigma, [0.0, 3e-4, np.hypot(2e-4, 3e-4)])
     # A thermometer that is slower than the gyro: between its samples the line.
     slow = np.where(np.arange(101) % 10 == 0, T, np.nan)
     np.testing.assert_allclose(
