@@ -6,13 +6,13 @@ from dataclasses import replace
 import in_steps
 import numpy as np
 import pytest
+from gated_steps import GatedStepFilter
 
 from strapdown import consistency, estimation, montecarlo, motion, quaternion
 from strapdown.checks import InputError
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.schedule import schedule
 from strapdown.estimation.states import ProcessNoise, initial_state
-from strapdown.estimation.step_filter import StepFilter
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
 from strapdown.recordings import recordfiles
@@ -114,7 +114,7 @@ OPTIONS = {
 
 def stepped(record, initial, **options):
     """Run the step face over a record in a plain loop."""
-    f = StepFilter(NOISE, initial, time=record.time[0], **options)
+    f = GatedStepFilter(NOISE, initial, time=record.time[0], **options)
     events = sorted((t, i, k) for i, s in enumerate(record.vectors) for k, t in enumerate(s.time))
     out, results = [], []
     for n, delta in enumerate(record.increments):
@@ -294,7 +294,7 @@ def test_both_faces_restart_and_report_lock_outs_alike(case):
 
 def test_a_repeated_gyro_sample_changes_nothing_and_is_counted():
     record = simulate(scenario((), duration=0.1), 5)
-    f = StepFilter(NOISE, near(record))
+    f = GatedStepFilter(NOISE, near(record))
     f.predict(record.increments[0], 0.02)
     attitude, P = f.attitude.copy(), f.P.copy()
     f.predict(record.increments[0], 0.0)

@@ -521,7 +521,7 @@ def _estimate_recording(
     from strapdown.checks import non_negative, one_of
     from strapdown.consistency import reference_errors
     from strapdown.recordings import unit_calibration
-    from strapdown.units import DEGREE
+    from strapdown.units import DEGREE, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
 
     motion = one_of("--motion", options.motion or "hand", ahrs.MOTIONS)
     late = None if options.latency is None else 1e-3 * non_negative("--latency", options.latency, unit="ms")
@@ -543,6 +543,12 @@ def _estimate_recording(
     rms = None if errors is None else {name: value / DEGREE for name, value in errors.rms(used.movement).items()}
     paths = _write_recording(result, parameters, replace(parameters.setup, **robustness), motion, shared.smooth, out)
     _say_recording(result, parameters, motion)
+    if shared.gyro is not None:
+        arw, rrw = parameters.angle_random_walk, parameters.rate_random_walk
+        console.print(
+            f"Gyro noise from {shared.gyro}, flicker included: {arw / DEGREE_PER_ROOT_HOUR:.3g} °/√h, bias random walk "
+            f"{rrw / DEGREE_PER_HOUR_PER_ROOT_HOUR:.3g} °/h/√h."
+        )
     if shared.observability:
         paths.append(_observability(out, used.source, result.record, parameters.setup, result.initial))
     if rms is not None:

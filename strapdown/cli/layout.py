@@ -41,6 +41,7 @@ COMMANDS: dict[str, dict[str, tuple[str, ...]]] = {
 }
 """Commands by group, each with its examples."""
 
+
 def lay_out(app: typer.Typer) -> None:
     """Put the commands of an application in order and in groups, each with its examples."""
     places = {name: title for title, names in COMMANDS.items() for name in names}

@@ -148,6 +148,11 @@ def covariance(
         )
     name = chosen.name or Path(scenario).stem
     _print_result(name, found, modelled.integration.name, matched=filter_file is None)
+    missing = setup.unmodelled_errors(chosen.gyro, chosen.sensors, modelled.states, gravity_f=chosen.gravity_f)
+    if missing and filter_file is None:
+        console.print(
+            f"This is the filter of attitude and bias alone. `estimate` and `montecarlo` by default add states for {', '.join(missing)}.\n"
+        )
     write_json(out / "covariance.json", _summary(name, found))
     title = f"{name}: predicted errors, without a Monte Carlo"
     figures = save_as({out / "budget": plots.error_budget(found, title=title)}, form)
@@ -180,7 +185,7 @@ def _print_result(name: str, found: Any, integration: str, *, matched: bool) -> 
     show(rows)
     console.print(
         "random: squares add. fixed: the same in every run, adds as an error. considered: 1σ of an error that neither the scenario nor the "
-        "filter knows of.\n"
+        "filter has.\n"
     )
     state, attitude, bias = found.expected_nees[-1]
     nis = ", ".join(f"{sensor} {value:.3g}" for sensor, value in found.expected_nis.items())

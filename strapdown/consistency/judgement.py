@@ -306,11 +306,12 @@ def _bounded(
 ) -> Judgement:
     """Return the verdict on a filter whose σ are upper bounds: one-sided, by ratios alone."""
     ratios = [
-        replace(one, low=0.0, p_value=mean_p_value(one.value, one.degrees, one.samples) if one.value > 1.0 else 1.0)
+        replace(one, p_value=mean_p_value(one.value, one.degrees, one.samples) if one.value > 1.0 else 1.0)
         for one in findings
         if one.is_ratio
     ]
     judged = concluded(ratios, limits, probability, states=(), unmodelled=unmodelled)
+    judged = replace(judged, findings=tuple(replace(one, low=0.0) for one in judged.findings))
     errors_judged = any(one.name != "NIS" for one in ratios)
     if judged.verdict == "not consistent" or not ratios:
         return judged
@@ -493,7 +494,7 @@ def _averages(subset: str, beside: Sequence[str]) -> bool:
     happens to be small, what is left looks both quick and too small, and a consistent filter would be called pessimistic (20 % of single
     runs with states for flicker). Through gyro states that part reaches the bias; the attitude has it only from states of the sensors.
     """
-    return not beside or (subset == "attitude" and all(name.startswith("gyro ") for name in beside))
+    return not beside or (subset == "attitude" and all(name.startswith(("gyro ", "gyro.")) for name in beside))
 
 
 def error_words(what: str, ratio: float) -> str:

@@ -1,15 +1,13 @@
 """The filter step by step, on filterpy, for looking inside.
 
 :class:`StepFilter` is the filter of :mod:`strapdown.estimation`, on whole covariance matrices. Motion model and measurement rows are the
-kernels' own functions, run as plain Python; gates, restarts and iterated updates are in :mod:`strapdown.estimation.step_gate`.
+kernels' own functions, run as plain Python.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import filterpy.kalman
@@ -31,20 +29,14 @@ from strapdown.checks import (
 )
 from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import ErrorStates
-from strapdown.estimation.forward import restart_states
-from strapdown.estimation.gating import Gate, Monitor, Robust
 from strapdown.estimation.schedule import KIND_CODES
-from strapdown.estimation.states import ProcessNoise, State, check_arguments, restart_bias_variance
-from strapdown.estimation.step_gate import Events, Linearization, Rows, Supervision, linearize, seen_from, tilt_unknown
+from strapdown.estimation.states import ProcessNoise, State, check_arguments
 from strapdown.estimation.temperature import need_none
 from strapdown.kernels import chains, error_state_step
-from strapdown.kernels.algebra import cross, dot
-from strapdown.kernels.gate_rules import WIDE_PASSES
-from strapdown.kernels.iterated_update import ACCEPTED, KNOWN, PASSED_OVER, REFUSED
 from strapdown.kernels.measurement import has_heading
 from strapdown.kernels.rotation import rotation_matrix
 from strapdown.records import LARGEST_TURN
-from strapdown.vectors import KINDS, need_level, need_unit, triad
+from strapdown.vectors import need_level, need_unit, triad
 
 NO_LEVER = (0.0,) * 9
 """The matrix by which a lever arm enters a measurement: of none."""
@@ -61,16 +53,9 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
     process_noise : ProcessNoise
         Noise of the gyro.
     initial : State
-        Where the filter starts. The end state of :func:`strapdown.estimation.run_part` continues that run, its gate included; give its
-        ``time``.
+        Where the filter starts. The end state of :func:`strapdown.estimation.run_part` continues that run; give its ``time``.
     error_states : sequence of ErrorStates, optional
         Optional error states of the gyro and the sensors.
-    gate : Gate, optional
-        Refuses outliers, and recovers from a wrong state.
-    robust : Robust, optional
-        Weighs each measurement by its distance from the estimate.
-    monitor : Monitor, optional
-        Reports in ``events`` when the running mean of the NIS leaves its bounds. Memory grows by a few numbers a measurement.
     sensors : sequence of str, optional
         Names of the sensors; with error states no other name is accepted. Default: with error states the sensors that those are about, if
         any; else any.
@@ -79,7 +64,7 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
 
     See Also
     --------
-    LiveFilter : The same filter compiled, two hundred times faster, which takes late measurements too.
+    LiveFilter : The same filter compiled, two hundred times faster, with a gate and robust weights, which takes late measurements too.
 
     Notes
     -----
@@ -87,11 +72,9 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
 
     - ``attitude`` q_fb (4,), ``bias`` of the gyro (3,), rad/s, body axes, and ``values`` of the optional error states (m,), one block
       after the other, all at ``time``, s;
-    - ``nis`` and ``weight`` of the last measurement that was not skipped; the weight is 0 if the gate refused it;
-    - ``refused`` and ``skipped``, by sensor: how many measurements the gate refused, and how many were missing (NaN) or headings of a
-      vertical vector;
-    - ``repeated``: how many gyro samples had no duration;
-    - ``events``: recoveries, lock-outs and divergence so far.
+    - ``nis`` of the last measurement that was not skipped;
+    - ``skipped``, by sensor: how many measurements were missing (NaN) or headings of a vertical vector;
+    - ``repeated``: how many gyro samples had no duration.
 
     Examples
     --------
@@ -106,13 +89,10 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         initial: State,
         error_states: Sequence[ErrorStates] = (),
         *,
-        gate: Gate | None = None,
-        robust: Robust | None = None,
-        monitor: Monitor | None = None,
         sensors: Sequence[str] = (),
         time: float = 0.0,
     ) -> None:
-        check_arguments(process_noise=process_noise, gate=gate, robust=robust, monitor=monitor)
+        check_arguments(process_noise=process_noise)
         self.error_states = modelling.as_blocks(error_states)
         state = modelling.begin(initial, self.error_states)
         names = _sensor_names(sensors)
@@ -126,22 +106,14 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         self.values: Array = state.values.copy()
         self.P = state.covariance.copy()
         self.process_noise = process_noise
-        self.gate = gate
-        self.robust = robust
         self.time = finite("time", time, unit="s")
         self.nis = 0.0
-        self.weight = 1.0
         self.repeated = 0
-        self.refused: dict[str, int] = {}
         self._missing: dict[str, int] = {}
         self._vertical: dict[str, int] = {}
         self._kinds: dict[str, str] = {}
         self._motion = self._model("", "vector")
         self._sensor_models: dict[str, modelling.Model] = {}
-        self._thresholds = np.full(3, np.inf) if gate is None else gate.thresholds
-        self._begin_gate(state, monitor)
-
-    events = Events()
 
     def _sensors_of_states(self, names: tuple[str, ...]) -> tuple[str, ...]:
         """Return the only sensors that may be updated by; none: any may. Error states about other sensors are refused."""
@@ -149,28 +121,6 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         for sensor, block in about.items() if names else ():
             one_of(f"{block}: sensor", sensor, names)
         return (names or tuple(about)) if self.error_states else ()
-
-    def _begin_gate(self, state: State, monitor: Monitor | None) -> None:
-        """Set up gate and monitor; continue with the gate's memory and its restart candidate where the state has them."""
-        gate, memory = self.gate, state.gate
-        self._restart_bias_variance = restart_bias_variance(gate, state)
-        self._supervision: Supervision[StepFilter] = Supervision(gate, memory, monitor)
-        self._passes = self._supervision.passes
-        values, P = restart_states(state, self.error_states)
-        self._restart_prior = _Prior(time=self.time, values=values, covariance=P)
-        if gate is None or memory is None:
-            return
-        if self.time < memory.start:
-            raise InputError(
-                f"time is {self.time:.9g} s, before the record of initial began, {memory.start:.9g} s; give the time of initial"
-            )
-        self._restart_prior = _Prior(time=memory.start, values=memory.values, covariance=memory.covariance)
-        one = memory.candidate
-        if one is not None and self._supervision.has_candidate:
-            bias, values = one.others[:3], one.others[3:]
-            self._supervision.candidate = self._candidate(
-                State(attitude=one.attitude, bias=bias, values=values, covariance=one.covariance, factor=one.factor)
-            )
 
     def _model(self, sensor: str, kind: str) -> modelling.Model:
         """Return the error states as arrays, in the filter's own order, with their effects on one sensor alone."""
@@ -251,19 +201,15 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         self._predict(increment, step, end)
 
     def _predict(self, increment: Array, step: float, end: float) -> None:
-        """Propagate the filter, and a restart candidate beside it, in common sub-steps: as long as series and decaying states allow."""
-        candidate = self._supervision.candidate
-        running = [self] if candidate is None else [self, candidate]
-        left, limit = step, self._motion.limit
+        """Propagate in sub-steps: as long as series and decaying states allow."""
+        left = step
         while left > 0.0:
-            turns = [(increment - left * one.bias).tolist() for one in running]
-            longest = float(min(error_state_step.longest_step(left, tuple(turn), limit) for turn in turns))
+            turn = tuple((increment - left * self.bias).tolist())
+            longest = float(error_state_step.longest_step(left, turn, self._motion.limit))
             part = increment * (longest / left)
-            for one in running:
-                one._sub_step(part, longest)
+            self._sub_step(part, longest)
             increment, left = increment - part, left - longest if longest < left else 0.0
-        for one in running:
-            one.time = end
+        self.time = end
 
     def _sub_step(self, part: Array, dt: float) -> None:
         """Propagate over an increment at constant rate, by the kernels' own functions."""
@@ -500,72 +446,41 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         return False
 
     def _measure(self, measurement: _Measurement, sensor: str) -> bool:
-        """Update with a measurement; count the outcome for the gate."""
+        """Update with a measurement."""
         self._need_known(sensor)
         if self.error_states and self._kinds.setdefault(sensor, measurement.kind) != measurement.kind:
             raise InputError(
                 f"{sensor or 'the sensor'} gave kind {self._kinds[sensor]!r} before, now {measurement.kind!r}; name each sensor"
             )
-        has_direction = measurement.has_direction(self.attitude)
-        outcome = self._correct(measurement, sensor)
-        if not has_direction:
-            self._vertical[sensor] = self._vertical.get(sensor, 0) + 1
-        elif outcome != ACCEPTED:
-            self.refused[sensor] = self.refused.get(sensor, 0) + 1
-        self._supervision.judge(self, sensor, outcome, lambda candidate: candidate._correct(measurement, sensor))
-        return outcome == ACCEPTED
-
-    def _correct(self, measurement: _Measurement, sensor: str) -> int:
-        """Update with a measurement; return ``ACCEPTED``, ``REFUSED`` or ``PASSED_OVER``."""
         if not measurement.has_direction(self.attitude):
-            return PASSED_OVER
-        threshold = float(self._thresholds[KINDS[measurement.kind] - 1])
-        others = np.concatenate([self.bias, self.values])
-        rows = partial(self._rows, measurement, self._sensor_model(sensor, measurement.kind))
-        seen = linearize(rows, self.attitude, others, self.P, self._motion.chains, self._passes, threshold)
-        self.nis = seen.nis
-        self.dim_z = len(seen.rows.residual)
-        unknown = self._passes > 1 and measurement.kind == "heading" and tilt_unknown(self.attitude, self.P)
-        if unknown or not seen.acceptable(threshold):
-            self.weight = 0.0
-            self._show_refused(seen, measurement.length)
-            return PASSED_OVER if unknown else REFUSED
-        self.weight = 1.0 if self.robust is None else seen.weight(self.robust)
-        self._accept(seen, measurement.length)
-        return ACCEPTED
+            self._vertical[sensor] = self._vertical.get(sensor, 0) + 1
+            return False
+        residual, H, noise = self._rows(measurement, sensor)
+        self.dim_z = len(residual)
+        self.nis = float(residual @ np.linalg.solve(H @ self.P @ H.T + noise, residual))
+        unit = measurement.length
+        correction = self._filterpy_update(unit * residual, unit * H, unit**2 * noise)
+        G = np.eye(len(self.P))
+        G[:3, :3] = kinematics.right_jacobian(correction[:3])
+        self._move(correction, G @ self.P @ G.T)
+        return True
 
-    def _accept(self, seen: Linearization, unit: float) -> None:
-        """Correct the state by filterpy's update, from the state at which a measurement is linearised; its rows are in this unit."""
-        self.attitude, self.bias, self.values = seen.attitude, seen.others[:3], seen.others[3:]
-        self.P, self.x = seen.covariance, seen.prior
-        H, R = unit * seen.rows.H, seen.rows.noise * (unit**2 / self.weight)
-        super().update(unit * seen.rows.residual, HJacobian=lambda x: H, Hx=lambda x: H @ x, R=R)
+    def _filterpy_update(self, residual: Array, H: Array, R: Array) -> Array:
+        """Return the correction (n,) that filterpy's own update makes; P is then that about the corrected state."""
+        super().update(residual, HJacobian=lambda x: H, Hx=lambda x: H @ x, R=R)
         correction, self.x = self.x, np.zeros(len(self.x))
-        self._reset(correction, self.P, far=self._passes > 1 and bool(np.trace(self.P[:3, :3]) > KNOWN))
-        self.P_post = self.P.copy()
+        return np.asarray(correction)
 
-    def _reset(self, correction: Array, P: Array, *, far: bool) -> None:
-        """Correct the state, and move P to its tangent space; ``far`` where an attitude hardly known has turned by a large angle."""
-        before, turn = self.attitude, quaternion.exp(correction[:3])
-        self.attitude = quaternion.normalize(quaternion.multiply(before, turn))
+    def _move(self, correction: Array, P: Array) -> None:
+        """Add the correction to attitude, bias and error states; P is that of the tangent space there."""
+        before = self.attitude
+        self.attitude = quaternion.normalize(quaternion.multiply(before, quaternion.exp(correction[:3])))
         self.bias, self.values = self.bias + correction[3:6], self.values + correction[6:]
-        if far:
-            P, _ = seen_from(turn, P)
-        else:
-            G = np.eye(len(P))
-            G[:3, :3] = kinematics.right_jacobian(correction[:3])
-            P = G @ P @ G.T
         if len(self._motion.chains):
             T = modelling.turning_matrix(self._motion.chains, len(P), before, self.attitude)
             self.values, P = T[6:, 6:] @ self.values, T @ P @ T.T
         self.P = P
-
-    def _show_refused(self, seen: Linearization, unit: float) -> None:
-        """Set what filterpy shows of an update to that of a refused measurement: its residual and covariance, and no gain."""
-        self.z, self.y = unit * seen.rows.residual, unit * seen.innovation
-        self.S = unit**2 * (seen.predicted + seen.rows.noise)
-        self.SI, self.K = np.linalg.inv(self.S), np.zeros((len(self.x), len(self.y)))
-        self._log_likelihood = self._likelihood = self._mahalanobis = None  # to be computed anew
+        self.P_post = P.copy()
 
     def _sensor_model(self, sensor: str, kind: str) -> modelling.Model:
         if not self.error_states:
@@ -574,40 +489,15 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
             self._sensor_models[sensor] = self._model(sensor, kind)
         return self._sensor_models[sensor]
 
-    def _rows(self, measurement: _Measurement, model: modelling.Model, attitude: Array, others: Array) -> Rows:
-        """Return a measurement's rows at an attitude (4,) and (b, c) (3 + m,), by the kernels' own function."""
-        H, y, basis = np.empty((3, 3 + len(others))), np.empty(3), np.empty((3, 3))
-        q = tuple(attitude.tolist())
+    def _rows(self, measurement: _Measurement, sensor: str) -> tuple[Array, Array, Array]:
+        """Return residual (d,), H (d, n) and noise (d, d) of a measurement, by the kernels' own function."""
+        model, others = self._sensor_model(sensor, measurement.kind), np.concatenate([self.bias, self.values])
+        H, y, basis = np.empty((3, len(self.x))), np.empty(3), np.empty((3, 3))
+        q = tuple(self.attitude.tolist())
         given = KIND_CODES[measurement.kind], measurement.z, measurement.frame, measurement.length
         effects = 0, model.sensors, model.sensor_use, NO_LEVER
         d = error_state_step.fill_rows(q, rotation_matrix(q), others, *given, *effects, H, y, basis)
-        angle, arc = measurement.arc(y, basis)
-        return Rows(y[:d].copy(), H[:d].copy(), (basis @ measurement.noise @ basis.T)[:d, :d], angle, arc)
-
-    # ------------------------------------------------------------------------------------------------------ restart candidates
-
-    def _restarted(self, attitude_sigma: float, bias_width: float) -> StepFilter:
-        """Return a restart candidate: optional states at their prior, attitude and bias independent of it and as uncertain as given."""
-        prior, m = self._restart_prior, len(self.values)
-        values, Pc = modelling.aged_prior(self.error_states, prior.values, prior.covariance, self.time - prior.time)
-        P = np.zeros((6 + m, 6 + m))
-        P[:3, :3] = attitude_sigma**2 * np.eye(3)
-        P[3:6, 3:6] = self.P[3:6, 3:6] + bias_width**2 * np.diag(self._restart_bias_variance)
-        P[6:, 6:] = Pc
-        return self._candidate(State(attitude=self.attitude, bias=self.bias, values=values, covariance=P))
-
-    def _candidate(self, state: State) -> StepFilter:
-        """Return a restart candidate in this state."""
-        candidate = StepFilter(
-            self.process_noise, state, self.error_states, gate=self.gate, robust=self.robust, time=self.time
-        )
-        candidate._sensor_models = self._sensor_models
-        candidate._passes = WIDE_PASSES
-        return candidate
-
-    def _become(self, other: StepFilter) -> None:
-        """Take over the state of a restart candidate."""
-        self.attitude, self.bias, self.values, self.P = other.attitude, other.bias, other.values, other.P
+        return y[:d], H[:d], (basis @ measurement.noise @ basis.T)[:d, :d]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -629,27 +519,6 @@ class _Measurement:
         if self.kind != "heading":
             return True
         return bool(has_heading(rotation_matrix(tuple(attitude.tolist())), self.z))
-
-    def arc(self, y: Array, basis: Array) -> tuple[float, float]:
-        """Return the angle θ between measured and predicted vector, rad, and θ over sin θ; 0 and 1 of other kinds."""
-        if self.kind not in ("direction", "vector"):
-            return 0.0, 1.0
-        along = y[2] + 1.0
-        if self.kind == "direction":
-            predicted = cross(tuple(basis[0].tolist()), tuple(basis[1].tolist()))
-            along = dot(predicted, self.z) / math.sqrt(dot(predicted, predicted))
-        sine = math.hypot(y[0], y[1])
-        angle = math.atan2(sine, along)
-        return angle, 1.0 if sine < 1e-9 else angle / sine
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Prior:
-    """Prior of the optional error states, from which a restart candidate starts."""
-
-    time: float
-    values: Array
-    covariance: Array
 
 
 def _sensor_names(sensors: Sequence[str]) -> tuple[str, ...]:

@@ -346,7 +346,9 @@ def from_record(record: ImuRecord, source: str = "record") -> Recording:
             own[field] = values
         else:
             left_out.append(f"{series.sensor} ({series.kind})")
-    words = f"Left out: {', '.join(left_out)}. Recordings hold whole vectors of an accelerometer and a magnetometer alone."
+    words = (
+        f"Left out: {', '.join(left_out)}. Recordings hold whole vectors of an accelerometer and a magnetometer alone."
+    )
     return with_gyro(
         source=source,
         time=record.time[1:],

@@ -396,7 +396,9 @@ def _import_series(path: Path) -> VectorMeasurements:
     comment, names, rows = _read_csv(path, link=False)
     mark = f"{_MARK} vectors "
     try:
-        head = reading.from_json(comment.removeprefix(mark), str(path))  # of another kind, the mark stays and is no JSON
+        head = reading.from_json(
+            comment.removeprefix(mark), str(path)
+        )  # of another kind, the mark stays and is no JSON
         attitude = head["kind"] == "attitude"
         wanted = _ATTITUDE_COLUMNS if attitude else _VECTOR_COLUMNS
         if names[:8] != wanted or names[8:] not in ((), (_ARRIVAL,)):

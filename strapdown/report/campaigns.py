@@ -121,7 +121,7 @@ def _numbers(statistics: Statistics, bound: Array | None, judgement: consistency
         *(() if bound is None else ("RMS / √Cramér–Rao bound",)),
     )
     nis = [
-        (one.of, page.number(one.value), f"{one.low:.4f}", f"{one.high:.4f}")
+        (one.of, f"{one.value:.4f}", f"{one.low:.4f}", f"{one.high:.4f}")
         for one in judgement.findings
         if one.name == "NIS"
     ]

@@ -62,7 +62,7 @@ class Comparison(Listed):
         """Return errors beside the filter's own σ, which should agree, as a table."""
         against = "error" if self.truth is not None else f"from {next(iter(self.estimates))}"
         found = self.summary()
-        rows = []
+        rows: list[tuple[str, ...]] = []
         for name, row in found.items():
             itself = self.truth is None and not rows  # its difference from itself
             bias, bias_sigma = row["bias_error"] / DEGREE_PER_HOUR, row["bias_sigma"] / DEGREE_PER_HOUR
