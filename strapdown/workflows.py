@@ -355,9 +355,12 @@ def estimate(
         _refuse("a record", setup=setup, initial=initial, states=states or None)
         for words in ahrs.doctor.at_rest(source):
             warnings.warn(f"{source.source}: {words}", stacklevel=2)
+        parameters = _recording_parameters(motion, noise)
+        if isinstance(noise, GyroSpec) and noise.temperature is not None:
+            source, parameters = ahrs.without_temperature(source, parameters, noise.temperature, walks=smooth)
         found = ahrs.estimate(
             source,
-            _recording_parameters(motion, noise),
+            parameters,
             latency=latency,
             calibration=calibration,
             gate=gate,

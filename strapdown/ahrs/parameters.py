@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from strapdown import estimation
 from strapdown.checks import non_negative, positive
 from strapdown.setup import FilterSetup
@@ -82,6 +84,8 @@ class AhrsParameters:
     def __post_init__(self) -> None:
         """Check every field."""
         may_be_zero = ("iron_sigma", "rate_random_walk", "rest_bias_sigma", "velocity_sigma", "gyro_scale_sigma")
+        for axis in np.atleast_1d(self.gyro_temperature_sigma):
+            non_negative("gyro_temperature_sigma", float(axis))
         for name in set(self.__dataclass_fields__) - {"gyro_temperature_sigma"}:
             check = non_negative if name in may_be_zero else positive
             check(name, getattr(self, name))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -565,10 +564,9 @@ def _read_recording(
     recording: Path, layout: dict[str, Any], parameters: AhrsParameters, shared: _Shared, temperature: Path | None
 ) -> tuple[Recording, AhrsParameters]:
     """Return the recording, its bias over temperature subtracted, and the filter's parameters with the noise of the gyro given."""
-    from strapdown import recordings
+    from strapdown import ahrs, recordings
     from strapdown.gyro import read_spec
     from strapdown.gyro import temperature as thermal
-    from strapdown.recordings import gyro_temperature
 
     warm = None if temperature is None else thermal.read(temperature)
     with progress_bar("reading"):
@@ -577,15 +575,11 @@ def _read_recording(
     if shared.gyro is not None:
         from strapdown import workflows  # which imports much more
 
-        parameters = workflows.with_gyro_noise(parameters, read_spec(shared.gyro))
+        spec = read_spec(shared.gyro)
+        parameters, warm = workflows.with_gyro_noise(parameters, spec), warm or spec.temperature
     if warm is not None:
-        source = gyro_temperature.applied(source, warm)
-        if shared.smooth or shared.observability:
-            # They have no bias driven by temperature: a walk covers the slope's error.
-            walk = warm.walk(gyro_temperature.temperature_at_samples(source), source.time)
-            parameters = replace(parameters, rate_random_walk=math.hypot(parameters.rate_random_walk, walk))
-        else:
-            parameters = replace(parameters, gyro_temperature_sigma=tuple(warm.slope_sigma.tolist()))
+        walks = shared.smooth or shared.observability
+        source, parameters = ahrs.without_temperature(source, parameters, warm, walks=walks)
     return source, parameters
 
 
