@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from strapdown.consistency import Judgement
     from strapdown.consistency.foreign import Checked
     from strapdown.diagnosis import Diagnosis
-    from strapdown.records import Estimate, ImuRecord
+    from strapdown.records import Estimate, ImuRecord, Truth
     from strapdown.setup import FilterSetup
 
 CONSISTENT, NOT, CANNOT_TELL = 0, 1, 2
@@ -137,7 +137,7 @@ def check(
         console.print(
             f"{result.name}: {len(estimate.time)} epochs over {estimate.time[-1] - estimate.time[0]:.6g} s, "
             f"{sum(len(one.time) for one in estimate.innovations.values())} measurements, "
-            f"{'no truth' if own_truth is None else 'with its truth'}."
+            f"{_truth_words(own_truth, records.read_reference(result))}."
         )
         judgement = findings.judged(
             result, records.read_attributes(result), estimate, own_truth, probability=probability
@@ -156,6 +156,10 @@ def check(
     content.update(judgement.summary())
     put_json(json, content)
     raise typer.Exit(status_of(judgement))
+
+
+def _truth_words(truth: Truth | None, reference: Truth | None) -> str:
+    return "with its truth" if truth is not None else "no truth" if reference is None else "with a reference attitude"
 
 
 def status_of(judgement: Judgement) -> int:
