@@ -89,7 +89,8 @@ def estimate(
         bool | None,
         typer.Option(
             "--full-covariance/--variances",
-            help="Write whole 6 x 6 covariances, or only their diagonals; whole ones by default where there is a specification.",
+            help="Write whole 6 x 6 covariances, or only their diagonals; whole ones by default where there is a specification or a "
+            "reference attitude.",
         ),
     ] = None,
     filter_file: Annotated[
@@ -590,11 +591,13 @@ def _estimate_recording(recording: Path, shared: _Shared, options: _Recorded, ou
             parameters,
             latency=late,
             calibration=carried,
-            full_covariance=bool(shared.full_covariance),
+            full_covariance=source.true_attitude is not None
+            if shared.full_covariance is None
+            else shared.full_covariance,
             smooth=shared.smooth,
             **robustness,
         )
-    used = result.recording
+    used, parameters = result.recording, result.parameters
     errors = None if used.true_attitude is None else reference_errors(result.estimate.attitude, used.true_attitude)
     rms = None if errors is None else {name: value / DEGREE for name, value in errors.rms(used.movement).items()}
     chosen = replace(parameters.setup, **robustness)
@@ -651,6 +654,7 @@ def _write_recording(
             "latency": result.delays.last_gyro,
             "magnetometer_latency": result.delays.last_field,
         },
+        reference=used.true_attitude,
     )
     if found.error_states:
         paths.append(out / "states.json")
@@ -718,8 +722,9 @@ def _model(moved_by: str, parameters: AhrsParameters, result: AhrsEstimate) -> s
     if moved_by == "any":
         return "Motion: any, its acceleration modelled as white noise."
     bias, sigma = result.initial.bias / DEGREE, np.sqrt(result.initial.covariance[3, 3]) / DEGREE
+    shown = ", as the recording shows," if parameters.velocity_from_record else ""
     words = (
-        f"Motion: of a hand, {parameters.velocity_sigma:g} m/s with a correlation time of {parameters.velocity_time:g} s. "
+        f"Motion: of a hand, {parameters.velocity_sigma:.2g} m/s{shown} with a correlation time of {parameters.velocity_time:g} s. "
         f"Gyro bias at the start: {', '.join(f'{value:.3g}' for value in bias)} °/s, σ {sigma:.2g} °/s"
     )
     if not _rested(parameters, result):
