@@ -869,3 +869,17 @@ def test_a_sigma_that_may_be_zero_has_a_one_sided_bound_and_the_mean_of_its_like
     ratio = np.exp(-0.5 * mode**2) / math.sqrt(2.0 * np.pi) / (0.5 * math.erfc(-mode / math.sqrt(2.0)))
     # Over a range that ends at the bound it is low by 12 to 20 %.
     assert found.mean == pytest.approx(mode + ratio, rel=0.006)
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "error", "note"),
+    [
+        (0.0, 2.0, 0.01, "identified, but poorly"),
+        (1.0, 4.1, 0.01, "identified, but poorly"),
+        (1.0, 3.9, 0.01, "identified"),
+        (1.0, 3.9, 1.0, "identified roughly"),
+    ],
+)
+def test_a_parameter_known_within_a_factor_of_four_is_identified(lower, upper, error, note):
+    known = fitting._Known(lower=lower, upper=upper, mean=1.0, identified=True)
+    assert fitting._note("star.sigma", known, error, None, 0, {}, doubtful=False) == note
