@@ -568,7 +568,7 @@ def test_peers_are_right_where_all_is_and_found_out_where_it_is_not():
     for right in ("AttiPy, heading's derivative mended", "GTSAM"):
         assert found.judgements[right].verdict != "not consistent"
     for wrong in ("smsfusion, noises of another sensor", "GTSAM, gyro with a bias"):
-        assert found.judgements[wrong].words.startswith("not consistent: the filter is too sure")
+        assert found.judgements[wrong].words.startswith("not consistent: the filter is optimistic")
     assert found.judgements["smsfusion, covariance read as fixed"].verdict == "not consistent"
     assert found.frame_probability["body"] > 0.99
 

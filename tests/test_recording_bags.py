@@ -203,6 +203,18 @@ def test_a_folder_whose_recorder_was_killed_is_read_from_its_files(bag):
     assert "has no metadata.yaml" in " ".join(recording.remarks)
 
 
+def test_a_truncated_bag_in_a_renamed_folder_gives_what_is_whole(bag, tmp_path):
+    values, content = imu(2000)
+    folder = bag("folder", content).rename(tmp_path / "renamed")
+    (file,) = folder.glob("*.mcap")
+    assert file.stem != "renamed"
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    recording = read(folder)
+    assert 800 < len(recording.time) < 1200
+    np.testing.assert_array_equal(recording.rate, values[: len(recording.time), :3])
+    assert "truncated or damaged" in " ".join(recording.remarks)
+
+
 def test_a_folder_of_several_bags_is_none(bag, tmp_path):
     """Bags of other names in one folder are not the parts of one."""
     for name in ("one", "two"):
