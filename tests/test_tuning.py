@@ -323,6 +323,25 @@ def test_thinned_measurements_weigh_as_much_as_all():
     assert np.sum(thin.sigma**-2.0) == pytest.approx(np.sum(series.sigma[usable] ** -2.0))
     assert np.isfinite(thin.vector_b).all()
     assert tuning.thinned(thin, 0.1) is thin
+    # The likelihood of a record is that of its thinned series, at less than a second too.
+    time = 0.1 * np.arange(1, 100)
+    star = VectorMeasurements(
+        sensor="star",
+        kind="direction",
+        time=time,
+        vector_b=np.tile([1.0, 0.0, 0.0], (99, 1)),
+        reference_f=[1.0, 0, 0],
+        sigma=1e-3,
+    )
+    record = ImuRecord(time=0.1 * np.arange(101), increments=np.zeros((100, 3)), vectors=(star,))
+    sparse = dataclasses.replace(record, vectors=(tuning.thinned(star, 0.5),))
+    assert len(sparse.vectors[0].time) == 20
+    initial = setup.initial_state(BELIEVED, np.array([1.0, 0.0, 0.0, 0.0]))
+    of = lambda one, spacing: tuning.likelihood(  # noqa: E731
+        [tuning.Case(record=one, initial=initial)], BELIEVED, ("gyro.arw",), spacing=spacing
+    )
+    at = of(record, 0.5).start
+    assert of(record, 0.5).minus_log(at) == pytest.approx(of(sparse, 0.0).minus_log(at), rel=1e-12)
 
 
 def test_thinning_finds_the_sigma_that_disturbances_which_last_ask_for():
