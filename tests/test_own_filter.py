@@ -142,11 +142,13 @@ def test_without_a_bias_it_is_consistent_where_the_attitude_shows_it():
     assert "bias" not in judgement.words
 
 
-def test_a_filter_that_fails_in_a_run_is_counted(own):
+@pytest.mark.parametrize(("part", "value"), [("attitude", np.nan), ("bias", np.nan), ("covariance", 0.0)])
+def test_a_filter_that_fails_in_a_run_is_counted(own, part, value):
     def failing(record, initial):
         estimate = wrapped(record, initial)
-        late = estimate.time > 10.0
-        return replace(estimate, attitude=np.where(late[:, None], np.nan, estimate.attitude))
+        content = getattr(estimate, part).copy()
+        content[estimate.time > 10.0] = value
+        return replace(estimate, **{part: content})
 
     statistics = montecarlo.run_plan(with_filter(failing), runs=3)
     assert statistics.failed == 3
