@@ -196,3 +196,11 @@ def test_several_algorithms_need_names_of_their_own(tmp_path):
     path.write_text("x = 1\n")
     with pytest.raises(InputError, match="x"):
         coning.read_algorithms(path)
+
+
+@pytest.mark.parametrize(("name", "best"), [("two-sample", 60), ("three-sample", 280)])
+def test_the_best_drift_constant_is_that_of_the_compressed_algorithm_of_as_many_increments(name, best):
+    """(M!)²/(2 (2M + 1)!): 1/12, 1/60, 1/280, …, which the frequency-series algorithms reach."""
+    found = coning_study.own_summary(ALGORITHMS[name])
+    assert found["best_drift_constant"] == pytest.approx(1.0 / best, rel=1e-12)
+    assert found["drift_constant_value"] == pytest.approx(1.0 / best, rel=1e-12)

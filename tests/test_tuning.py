@@ -88,6 +88,21 @@ def test_every_lane_is_the_filter_itself():
     np.testing.assert_allclose(objective.minus_log(points), expected, rtol=1e-10)
 
 
+def test_a_common_scale_takes_a_start_whose_attitude_and_bias_are_correlated_as_a_whole():
+    record = every_kind()
+    initial = tuning.record_case(record, KINDS, seed=3).initial
+    sigma = np.sqrt(np.diag(initial.covariance))
+    correlated = (np.eye(6) + 0.9 * (np.eye(6, k=3) + np.eye(6, k=-3))) * np.outer(sigma, sigma)
+    initial = dataclasses.replace(initial, covariance=correlated)
+    objective = tuning.likelihood([tuning.Case(record=record, initial=initial)], KINDS, (parameters.SCALE,))
+    points = objective.start + np.array([[-1.0], [0.0], [0.7]])
+    for point, found in zip(points, objective.minus_log(points), strict=True):
+        scaled = dataclasses.replace(initial, covariance=np.exp(2.0 * point) * correlated)
+        seen = setup.run(record, objective.setup(point), scaled).innovations.values()
+        expected = sum(0.5 * np.sum(np.log(one.variance) + one.innovation**2 / one.variance) for one in seen)
+        assert found == pytest.approx(expected, rel=1e-10)
+
+
 @pytest.mark.parametrize("bias_sigma", [1e-2, 3.0, 60.0], ids=["right", "wild", "wilder"])
 def test_a_start_that_makes_the_bias_wild_is_cut_into_sub_steps_as_by_the_filter(bias_sigma):
     """A bias of tens of rad/s turns the body, step by step, beyond the range of the polynomials, though its gyro hardly turns."""
@@ -308,6 +323,25 @@ def test_thinned_measurements_weigh_as_much_as_all():
     assert np.sum(thin.sigma**-2.0) == pytest.approx(np.sum(series.sigma[usable] ** -2.0))
     assert np.isfinite(thin.vector_b).all()
     assert tuning.thinned(thin, 0.1) is thin
+    # The likelihood of a record is that of its thinned series, at less than a second too.
+    time = 0.1 * np.arange(1, 100)
+    star = VectorMeasurements(
+        sensor="star",
+        kind="direction",
+        time=time,
+        vector_b=np.tile([1.0, 0.0, 0.0], (99, 1)),
+        reference_f=[1.0, 0, 0],
+        sigma=1e-3,
+    )
+    record = ImuRecord(time=0.1 * np.arange(101), increments=np.zeros((100, 3)), vectors=(star,))
+    sparse = dataclasses.replace(record, vectors=(tuning.thinned(star, 0.5),))
+    assert len(sparse.vectors[0].time) == 20
+    initial = setup.initial_state(BELIEVED, np.array([1.0, 0.0, 0.0, 0.0]))
+    of = lambda one, spacing: tuning.likelihood(  # noqa: E731
+        [tuning.Case(record=one, initial=initial)], BELIEVED, ("gyro.arw",), spacing=spacing
+    )
+    at = of(record, 0.5).start
+    assert of(record, 0.5).minus_log(at) == pytest.approx(of(sparse, 0.0).minus_log(at), rel=1e-12)
 
 
 def test_thinning_finds_the_sigma_that_disturbances_which_last_ask_for():
@@ -712,6 +746,16 @@ def test_a_record_made_again_misses_what_the_record_misses():
     assert np.flatnonzero(np.isnan(camera.attitude).any(axis=1)).tolist() == [7]
 
 
+def test_a_plan_takes_records_of_just_the_lengths_asked_for(monkeypatch):
+    seen = []
+    monkeypatch.setattr(
+        planning, "likelihood", lambda cases, *rest: seen.append(cases[0].record) or likelihood(cases, *rest)
+    )
+    likelihood = tuning.likelihood
+    tuning.plan(scenario(duration=30.0), BELIEVED, FREE, lengths=[30.0, 7.5], records=1)
+    assert [record.time[-1] - record.time[0] for record in seen] == pytest.approx([7.5, 30.0], rel=1e-9)
+
+
 def test_a_plan_foretells_the_standard_errors():
     chosen = scenario(duration=600.0)
     planned = tuning.plan(chosen, BELIEVED, FREE, lengths=[600.0, 150.0], records=3)
@@ -819,6 +863,12 @@ def test_before_and_after_are_drawn_for_nis_and_for_nees_where_there_is_a_truth(
     assert mean == pytest.approx(np.mean(expected), rel=0.02)
     low, high = nees["attitude"].bounds
     assert low < 1.0 < high
+    seen = [(s.time, s.nis, np.full(len(s.time), s.innovation.shape[1])) for s in estimate.innovations.values()]
+    time, nis, degrees = (np.concatenate(part) for part in zip(*seen, strict=True))
+    edges = np.linspace(time.min(), time.max() + 1e-9, len(compared.after.nis_course) + 1)
+    sums, numbers = (np.histogram(time, edges, weights=one)[0] for one in (nis, degrees))
+    np.testing.assert_allclose(compared.after.nis_course, sums / numbers, rtol=1e-9)
+    np.testing.assert_array_equal(compared.after.nis_degrees, numbers)
     assert compared.before.nees[1].mean.mean() < 0.5 * compared.after.nees[1].mean.mean()
     figure = drawing.before_and_after(compared, title="both")
     assert [ax.get_ylabel().split(",")[0] for ax in figure.axes] == [
@@ -863,3 +913,17 @@ def test_a_sigma_that_may_be_zero_has_a_one_sided_bound_and_the_mean_of_its_like
     ratio = np.exp(-0.5 * mode**2) / math.sqrt(2.0 * np.pi) / (0.5 * math.erfc(-mode / math.sqrt(2.0)))
     # Over a range that ends at the bound it is low by 12 to 20 %.
     assert found.mean == pytest.approx(mode + ratio, rel=0.006)
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "error", "note"),
+    [
+        (0.0, 2.0, 0.01, "identified, but poorly"),
+        (1.0, 4.1, 0.01, "identified, but poorly"),
+        (1.0, 3.9, 0.01, "identified"),
+        (1.0, 3.9, 1.0, "identified roughly"),
+    ],
+)
+def test_a_parameter_known_within_a_factor_of_four_is_identified(lower, upper, error, note):
+    known = fitting._Known(lower=lower, upper=upper, mean=1.0, identified=True)
+    assert fitting._note("star.sigma", known, error, None, 0, {}, doubtful=False) == note

@@ -13,7 +13,7 @@ from strapdown.montecarlo.scalar import start
 from strapdown.randomness import generator
 from strapdown.scenarios import Scenario
 from strapdown.setup.states import SensorStates, States
-from strapdown.tuning import extended
+from strapdown.tuning import extended, parameters
 
 SWAY = motion.HarmonicRates(
     harmonics=(
@@ -207,6 +207,7 @@ def test_a_state_that_nothing_shows_is_not_identified():
         [case_of(scenario, chosen, 2)], chosen, ["gyro.scale_sigma", "acc.correlated_sigma"]
     )
     found = tuning.fit(objective, starts=1)
+    assert not found.composite  # the curvature of innovations is their information
     assert not found["gyro.scale_sigma"].identified
     assert "not identified" in found["gyro.scale_sigma"].note
     assert found["acc.correlated_sigma"].identified
@@ -312,3 +313,14 @@ def test_a_case_of_first_measurements_is_taken_too():
     objective = extended.likelihood([case], chosen, ["gyro.arw", "initial.bias", "star.sigma"])
     assert np.all(np.isfinite(objective.derivatives(objective.start).information))
     assert objective.setup(objective.start + np.log(2.0)).bias_sigma == pytest.approx(2.0 * chosen.bias_sigma)
+
+
+def test_a_parameter_is_printed_in_the_unit_by_whose_factor_it_is_divided():
+    degree, g = np.pi / 180.0, 9.80665
+    size = {"s": 1.0, "1": 1.0, "m": 1.0, "m/s": 1.0, "m/s²": 1.0, "rad or SI": 1.0, "rad, or the vector's unit": 1.0}
+    size |= {"%": 0.01, "ppm": 1e-6, "mrad": 1e-3, "°": degree, "°/h": degree / 3600.0, "°/h/g": degree / 3600.0 / g}
+    size |= {"°/√h": degree / 60.0, "°/h/√h": degree / 3600.0 / 60.0}
+    for name in (*parameters.OWN, *parameters._UNITS, "star.sigma"):
+        assert parameters.fixed_unit(name).factor == pytest.approx(size[parameters.fixed_unit(name).name], rel=1e-12)
+    for name in (*extended.GYRO, *(f"mag.{one}" for one in extended.SENSOR)):
+        assert extended.unit_of(name).factor == pytest.approx(size[extended.unit_of(name).name], rel=1e-12), name
