@@ -369,7 +369,7 @@ def test_estimate_reports_missing_samples(run, tmp_path):
     columns = walk()
     columns[500:507, 4:7] = np.nan
     _, said, _ = run("estimate", write_csv(tmp_path / "walk.csv", columns, UNITS), "--out", tmp_path / "out")
-    assert "7 samples of the accelerometer" in said
+    assert "7 of the gyro's samples have none of the accelerometer beside them" in said
 
 
 def test_estimate_on_broad(run, broad, tmp_path):
