@@ -247,6 +247,14 @@ def test_degrees_of_freedom_of_third_differences_against_greenhall(estimator, al
     assert_allclose(allan.equivalent_degrees_of_freedom(alpha, samples, m, estimator), expected, rtol=0.03)
 
 
+@pytest.mark.parametrize("estimator", ["overlapping", "modified"])
+@pytest.mark.parametrize("alpha", [1, 0, -1, -2])
+def test_degrees_of_freedom_do_not_jump_where_the_sum_goes_over_from_lags_to_cells(alpha, estimator):
+    """Beyond m = 1000 cells of several lags are summed; the third differences of a smooth function of m are small."""
+    found = [allan.equivalent_degrees_of_freedom(alpha, 20_000, m, estimator) for m in range(998, 1004)]
+    assert np.abs(np.diff(found, n=3)).max() < 1e-5 * found[0]
+
+
 @pytest.mark.parametrize(
     ("estimator", "m"),
     [("overlapping", 90), *itertools.product(["overlapping", "modified", "hadamard"], [1, 4, 30, 60])],

@@ -60,9 +60,18 @@ def test_the_estimator_is_unbiased_whatever_the_gaps(kind, lost):
 @pytest.mark.parametrize("lost", ["single", "long"])
 def test_its_band_covers_the_truth(kind, lost):
     """95 % intervals over 300 records at each τ up to a tenth of the record: between 89 and 99.5 %."""
-    samples, runs = 500, 300
-    m = np.array([1, 3, 10, 30, 50])
-    known = gaps(samples, lost, seed=1)
+    covers(kind, gaps(500, lost, seed=1), np.array([1, 3, 10, 30, 50]))
+
+
+@pytest.mark.parametrize("kind", ["white", "walk"])
+def test_the_band_of_a_record_longer_than_those_simulated_covers_the_truth(monkeypatch, kind):
+    """Of white noise the estimator is worse, at one share of the record, the more samples there are."""
+    monkeypatch.setattr(allan_gaps, "SIMULATED", 100)
+    covers(kind, gaps(2003, "long", seed=1), np.array([1, 7, 30, 45, 60]))
+
+
+def covers(kind: str, known: np.ndarray, m: np.ndarray) -> None:
+    samples, runs = len(known), 300
     truth = true_variance(kind, m.astype(float))
     records = noise(kind, (runs, samples), 11)
     records[:, ~known] = np.nan

@@ -33,6 +33,8 @@ SIMULATED = 1 << 12
 """Largest number of samples of a simulated record; several samples of a longer record are one there."""
 RUNS = 400
 """Simulated records for each power law."""
+WHOLE_RUNS = 50
+"""The same of records longer than :data:`SIMULATED`, with all their samples."""
 
 
 def allan_deviation(
@@ -148,8 +150,9 @@ def _spread(
 ) -> tuple[Array, Array, Array]:
     """Return how the estimator spreads over simulated records with the same gaps: degrees of freedom, low and high quantile over its mean.
 
-    Below one sample of the simulation, of records longer than :data:`SIMULATED`, a χ² replaces it, with as many
-    more degrees of freedom as averages fit in.
+    Of records longer than :data:`SIMULATED` the simulation with fewer samples gives the shape of the distribution (χ² below one of its
+    samples), and a few records of all samples its variance: of white noise the estimator spreads more, at one share of the record, the
+    more samples there are.
     """
     from scipy.stats import chi2
 
@@ -165,20 +168,31 @@ def _spread(
     usable = np.unique(np.clip(np.rint(at).astype(np.int64), 1, max(1, rows // 2 - 1)))
     pairs = _Pairs.of(there, int(usable[-1]))
     place = np.searchsorted(usable, np.clip(np.rint(at).astype(np.int64), usable[0], usable[-1]))
+    whole = _Pairs.of(known, int(multiples[-1]))
     tail = 0.5 - 0.5 * level
     edf, low, high = (np.empty(alphas.shape) for _ in range(3))
     for law in np.unique(alphas).tolist():
         found = np.stack([pairs.variance(_noise(law, rows, random), usable) for _ in range(RUNS)])
-        mean = found.mean(axis=0)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            freedom = np.fmax(2.0 * mean**2 / found.var(axis=0, ddof=1), 1.0)
-            quantiles = np.quantile(found / mean, [tail, 1.0 - tail], axis=0)
-        more = freedom[place] * np.maximum(1.0, usable[0] / at)
-        fine = at < 1.0
-        ends = [np.where(fine, chi2.ppf(p, more) / more, quantiles[k][place]) for k, p in enumerate((tail, 1.0 - tail))]
-        for target, values in ((edf, more), (low, ends[0]), (high, ends[1])):
+        freedom, quantiles = _freedom(found)[place], np.quantile(found / found.mean(axis=0), [tail, 1.0 - tail], axis=0)
+        more = freedom
+        if coarse > 1:
+            more = _freedom(
+                np.stack([whole.variance(_noise(law, len(known), random), multiples) for _ in range(WHOLE_RUNS)])
+            )
+        wider = np.sqrt(freedom / more)
+        ends = [
+            np.where(at < 1.0, chi2.ppf(p, more) / more, 1.0 + wider * (quantiles[k][place] - 1.0))
+            for k, p in enumerate((tail, 1.0 - tail))
+        ]
+        for target, values in ((edf, np.fmax(more, 1.0)), (low, ends[0]), (high, ends[1])):
             target[alphas == law] = np.broadcast_to(values, alphas.shape)[alphas == law]
     return edf, low, high
+
+
+def _freedom(found: Array) -> Array:
+    """Return the degrees of freedom of the χ² with the mean and variance of each column."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(2.0 * found.mean(axis=0) ** 2 / found.var(axis=0, ddof=1))
 
 
 def _noise(alpha: int, samples: int, random: np.random.Generator) -> Array:
