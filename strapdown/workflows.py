@@ -423,7 +423,10 @@ def _recording_parameters(motion: str | None, noise: GyroSpec | NoiseFit | Proce
 def with_gyro_noise(parameters: ahrs.AhrsParameters, spec: GyroSpec) -> ahrs.AhrsParameters:
     """Return the model of a recorded unit with the noise of its gyro; flicker is matched for the filter of the tilt."""
     density = (parameters.specific_force_noise / units.STANDARD_GRAVITY) ** 2  # rad² s
-    return dataclasses.replace(parameters, **gyro.matched_process_noise(spec, density))
+    noise = gyro.matched_process_noise(spec, density)
+    return dataclasses.replace(
+        parameters, angle_random_walk=noise["angle_random_walk"], rate_random_walk=noise["rate_random_walk"]
+    )
 
 
 def _record_setup(

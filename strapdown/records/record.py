@@ -671,7 +671,7 @@ def write_estimate(
                 put(file, "truth/bias", truth.bias, "rad/s")
         if reference is not None:
             known = np.isfinite(reference).all(axis=1)
-            put(file, "reference/row", np.flatnonzero(known), "1", "row of the estimate")
+            put(file, "reference/row", np.flatnonzero(known).astype(np.float64), "1", "row of the estimate")
             put(file, "reference/attitude", quaternion.normalize(reference[known]), "1")
         for number, (sensor, innovations) in enumerate(estimate.innovations.items()):
             group = file.create_group(f"innovations/{number}")
