@@ -178,6 +178,16 @@ def test_half_the_rate_gives_the_same_within_the_trapezoid_rule(parameters):
     np.testing.assert_allclose(whole.sigma[::2][100:], sparse.sigma[100:], rtol=0.03)
 
 
+def test_a_heading_stands_at_the_end_of_its_interval():
+    """Of samples at 10 ms and headings gathered over 0.15 s, each has the last stamp before a multiple of that."""
+    found = ahrs.estimate(recording(20.0, noise=0.0), latency=0.0)
+    since = found.estimate.innovations["magnetometer"].time - found.recording.time[0]
+    interval = float(np.diff(found.recording.time).mean())
+    assert len(since) > 100
+    assert np.all((-since % 0.15)[:-1] < interval + 1e-9)
+    np.testing.assert_allclose(np.diff(since)[:-1], 0.15, atol=1e-9)
+
+
 def disturbed(length: float, turn: float = 40.0) -> Recording:
     """A minute in which something magnetic turns the field by 40° and makes it stronger from 20 s on."""
     plain = recording(60.0, bias=(0.002, -0.001, 0.001), noise=0.3)

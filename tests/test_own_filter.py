@@ -446,6 +446,8 @@ def test_its_parameters_are_tuned_to_those_of_the_package():
     other = tuning.fit(tuning.likelihood([case], two_stars.BELIEVED, free), starts=2)
     for name in free:
         assert found.values[name] == pytest.approx(other[name].value, rel=2e-3)
+        # The curvature itself beside its expectation.
+        assert found.relative_sigma[name] == pytest.approx(other[name].standard_error, rel=0.1)
     assert 0.02 < found.relative_sigma["gyro.arw"] < 0.5
     for name, true in zip(free, (two_stars.ARW, two_stars.SIGMAS[0]), strict=True):
         assert abs(np.log(found.values[name] / true)) < 4.0 * found.relative_sigma[name]

@@ -343,6 +343,14 @@ def test_what_belongs_to_a_missing_sample_may_be_missing_too(kind, also):
     np.testing.assert_array_equal(again.sigma, series.sigma)
 
 
+def test_the_reference_of_a_missing_sample_is_that_of_the_only_one_there_is():
+    reference, vector = np.array([[np.nan] * 3, [0.6, 0.8, 0.0]]), np.array([[np.nan] * 3, [0.0, 0.0, 1.0]])
+    series = VectorMeasurements(
+        sensor="star", kind="direction", time=[0.0, 1.0], reference_f=reference, vector_b=vector, sigma=0.1
+    )
+    np.testing.assert_array_equal(series.references_f, [[0.6, 0.8, 0.0]] * 2)
+
+
 @pytest.mark.parametrize("kind", vectors.KINDS)
 def test_a_series_may_be_missing_altogether(kind):
     empty = {

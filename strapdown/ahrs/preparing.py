@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -10,9 +11,10 @@ from strapdown import coning, estimation, quaternion
 from strapdown.ahrs import headings, starting
 from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.checks import Array
+from strapdown.gyro.temperature import BiasOverTemperature
 from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.recordings import Recording, increments, sensor_delays
+from strapdown.recordings import Recording, gyro_temperature, increments, sensor_delays
 from strapdown.records import ImuRecord
 from strapdown.vectors import VectorMeasurements
 
@@ -101,8 +103,24 @@ def prepare(
         if irons[0].any():
             initial = starting.start(recording, quiet, parameters, irons[0])
     turn = quaternion.log(quaternion.multiply(quaternion.conjugate(at_edge[:-1]), at_edge[1:]))
-    record = ImuRecord(time=time, increments=turn, vectors=tuple(vectors))
+    known = recording.temperature is not None and bool(np.isfinite(recording.temperature).all())
+    temperature = recording.temperature[edge] if known and recording.temperature is not None else None
+    record = ImuRecord(time=time, increments=turn, vectors=tuple(vectors), temperature=temperature)
     return Prepared(record, initial, edge, turned, dip, iron, _liveliest(force, shown, parameters.step))
+
+
+def without_temperature(
+    recording: Recording, parameters: AhrsParameters, warm: BiasOverTemperature, *, walks: bool
+) -> tuple[Recording, AhrsParameters]:
+    """Return a recording without the gyro's bias over temperature, and the model with the error of its slope.
+
+    The error is a state that the temperature drives, or where the estimator has none (``walks``) covered by a random walk.
+    """
+    used = gyro_temperature.applied(recording, warm)
+    if not walks:
+        return used, replace(parameters, gyro_temperature_sigma=tuple(warm.slope_sigma.tolist()))
+    walk = warm.walk(gyro_temperature.temperature_at_samples(used), used.time)
+    return used, replace(parameters, rate_random_walk=float(np.hypot(parameters.rate_random_walk, walk)))
 
 
 def _edges(time: Array, step: float) -> np.ndarray:

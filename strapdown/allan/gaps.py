@@ -22,8 +22,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from strapdown import checks
-from strapdown.allan import deviation as allan
-from strapdown.allan.deviation import NOISE_TYPES, TERMS, AllanDeviation, NoiseFit
+from strapdown.allan.deviation import NOISE_TYPES, TERMS, AllanDeviation
+from strapdown.allan.noise_fit import NoiseFit, fit_axis, misfit_of, of_axes
+from strapdown.allan.spectrum import Bins, bin_starts, cosine_transform, mean_power, ramp_coefficients
 from strapdown.checks import Array, InputError
 
 SHORTEST = 64
@@ -32,6 +33,8 @@ SIMULATED = 1 << 12
 """Largest number of samples of a simulated record; several samples of a longer record are one there."""
 RUNS = 400
 """Simulated records for each power law."""
+WHOLE_RUNS = 50
+"""The same of records longer than :data:`SIMULATED`, with all their samples."""
 
 
 def allan_deviation(
@@ -147,8 +150,9 @@ def _spread(
 ) -> tuple[Array, Array, Array]:
     """Return how the estimator spreads over simulated records with the same gaps: degrees of freedom, low and high quantile over its mean.
 
-    Below one sample of the simulation, of records longer than :data:`SIMULATED`, a χ² replaces it, with as many
-    more degrees of freedom as averages fit in.
+    Of records longer than :data:`SIMULATED` the simulation with fewer samples gives the shape of the distribution (χ² below one of its
+    samples), and a few records of all samples its variance: of white noise the estimator spreads more, at one share of the record, the
+    more samples there are.
     """
     from scipy.stats import chi2
 
@@ -164,20 +168,31 @@ def _spread(
     usable = np.unique(np.clip(np.rint(at).astype(np.int64), 1, max(1, rows // 2 - 1)))
     pairs = _Pairs.of(there, int(usable[-1]))
     place = np.searchsorted(usable, np.clip(np.rint(at).astype(np.int64), usable[0], usable[-1]))
+    whole = _Pairs.of(known, int(multiples[-1]))
     tail = 0.5 - 0.5 * level
     edf, low, high = (np.empty(alphas.shape) for _ in range(3))
     for law in np.unique(alphas).tolist():
         found = np.stack([pairs.variance(_noise(law, rows, random), usable) for _ in range(RUNS)])
-        mean = found.mean(axis=0)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            freedom = np.fmax(2.0 * mean**2 / found.var(axis=0, ddof=1), 1.0)
-            quantiles = np.quantile(found / mean, [tail, 1.0 - tail], axis=0)
-        more = freedom[place] * np.maximum(1.0, usable[0] / at)
-        fine = at < 1.0
-        ends = [np.where(fine, chi2.ppf(p, more) / more, quantiles[k][place]) for k, p in enumerate((tail, 1.0 - tail))]
-        for target, values in ((edf, more), (low, ends[0]), (high, ends[1])):
+        freedom, quantiles = _freedom(found)[place], np.quantile(found / found.mean(axis=0), [tail, 1.0 - tail], axis=0)
+        more = freedom
+        if coarse > 1:
+            more = _freedom(
+                np.stack([whole.variance(_noise(law, len(known), random), multiples) for _ in range(WHOLE_RUNS)])
+            )
+        wider = np.sqrt(freedom / more)
+        ends = [
+            np.where(at < 1.0, chi2.ppf(p, more) / more, 1.0 + wider * (quantiles[k][place] - 1.0))
+            for k, p in enumerate((tail, 1.0 - tail))
+        ]
+        for target, values in ((edf, np.fmax(more, 1.0)), (low, ends[0]), (high, ends[1])):
             target[alphas == law] = np.broadcast_to(values, alphas.shape)[alphas == law]
     return edf, low, high
+
+
+def _freedom(found: Array) -> Array:
+    """Return the degrees of freedom of the χ² with the mean and variance of each column."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(2.0 * found.mean(axis=0) ** 2 / found.var(axis=0, ddof=1))
 
 
 def _noise(alpha: int, samples: int, random: np.random.Generator) -> Array:
@@ -244,19 +259,19 @@ def fit_noise(
             raise InputError(
                 f"values, axis {axis}, holds no noise (it is constant or a straight line); pass a recorded sensor"
             )
-        fit = allan._fit_axis(whole, random_terms, "rate_ramp" in chosen, level)
+        fit = fit_axis(whole, random_terms, "rate_ramp" in chosen, level)
         fits.append(fit)
         found = []
         for part, bins, place in zip(parts, each, places, strict=True):
             best = fit.best._replace(variance=fit.best.theta @ bins.basis)
-            probability, what = allan._misfit(part.coefficient, bins, best, random_terms, part.starts, part.last, dt)
+            probability, what = misfit_of(part.coefficient, bins, best, random_terms, part.starts, part.last, dt)
             found.append(
                 (probability, what if len(places) == 1 else f"in the segment from {place.start * dt:.6g} s {what}")
             )
         least = min(found, key=lambda one: one[0])
         misfits.append((min(1.0, len(found) * least[0]), least[1]))
     samples = sum(place.stop - place.start for place in places)
-    return allan._of_axes(chosen, fits, misfits, level=level, samples=samples, sample_interval=dt)
+    return of_axes(chosen, fits, misfits, level=level, samples=samples, sample_interval=dt)
 
 
 def _stretch(x: Array, dt: float, random_terms: tuple[str, ...], highest_frequency: float | None) -> _Stretch:
@@ -268,14 +283,14 @@ def _stretch(x: Array, dt: float, random_terms: tuple[str, ...], highest_frequen
             raise InputError(
                 f"highest_frequency is {highest_frequency:g} Hz: a segment of {samples} samples has nothing below; raise it"
             )
-    starts = allan._bin_starts(last)
-    basis = np.stack([allan._basis(term, samples, dt, starts, last) for term in random_terms])
-    return _Stretch(allan._cosine_transform(x, 1.0), starts, last, basis)
+    starts = bin_starts(last)
+    basis = np.stack([mean_power(term, samples, dt, starts, last) for term in random_terms])
+    return _Stretch(cosine_transform(x, 1.0), starts, last, basis)
 
 
-def _bins(parts: Sequence[_Stretch], dt: float) -> tuple[list[allan._Bins], allan._Bins]:
+def _bins(parts: Sequence[_Stretch], dt: float) -> tuple[list[Bins], Bins]:
     """Return the sums over bins of each segment and of all, the lowest frequencies first; one ramp goes through all of them."""
-    ramps = [dt * allan._ramp_coefficients(len(p.coefficient), np.arange(1, p.last + 1)) for p in parts]
+    ramps = [dt * ramp_coefficients(len(p.coefficient), np.arange(1, p.last + 1)) for p in parts]
     slope = float(
         sum(r @ p.coefficient[1 : p.last + 1] for r, p in zip(ramps, parts, strict=True)) / sum(r @ r for r in ramps)
     )
@@ -284,9 +299,9 @@ def _bins(parts: Sequence[_Stretch], dt: float) -> tuple[list[allan._Bins], alla
         rest = part.coefficient[1 : part.last + 1] - slope * ramp
         begin = part.starts - 1
         sums = [np.add.reduceat(one, begin) for one in (np.ones_like(rest), rest * rest, rest * ramp, ramp * ramp)]
-        each.append(allan._Bins(sums[0], sums[1], sums[2], sums[3], part.basis, slope))
+        each.append(Bins(sums[0], sums[1], sums[2], sums[3], part.basis, slope))
         frequency.append(part.starts / len(part.coefficient))
     order = np.argsort(np.concatenate(frequency), kind="stable")
     number, square, product, ramps_squared = (np.concatenate([one[k] for one in each])[order] for k in range(4))
     basis = np.concatenate([one.basis for one in each], axis=1)[:, order]
-    return each, allan._Bins(number, square, product, ramps_squared, basis, slope)
+    return each, Bins(number, square, product, ramps_squared, basis, slope)
