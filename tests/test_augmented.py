@@ -680,6 +680,26 @@ def test_the_smoother_is_never_worse_than_the_filter(option):
         )
 
 
+@pytest.mark.parametrize(
+    "option", ["gyro scale", "gyro drift", "hard iron that walks", "a carried offset of a heading", "all"]
+)
+def test_the_factor_takes_steps_together_as_one_by_one(option):
+    """Up to thirty steps between two measurements, rows kept in their midst, and sub-steps: within 1e-12 of a σ."""
+    record, blocks = record_of(), OPTIONS[option]
+    rare = dataclasses.replace(record, vectors=tuple(one.taken(slice(2, None, 9)) for one in record.vectors))
+    alone = estimation.run(rare, NOISE, start(), blocks, full_covariance=True)
+    together = estimation.run(rare, NOISE, start(), blocks, full_covariance=True, every=8)
+    expected = alone.whole_covariance[::8]
+    sigma = np.sqrt(np.einsum("kii->ki", expected))
+    assert np.max(np.abs(scaled(together.whole_covariance - expected, sigma))) < 1e-12
+    turn = quaternion.log(quaternion.multiply(quaternion.conjugate(alone.attitude[::8]), together.attitude))
+    assert np.max(np.abs(turn) / sigma[:, :3]) < 1e-12
+    assert np.max(np.abs(together.bias - alone.bias[::8]) / sigma[:, 3:6]) < 1e-12
+    for block in blocks:
+        one, both = alone.error_states[block.name], together.error_states[block.name]
+        assert np.max(np.abs(both.values - one.values[::8]) / one.sigma[::8]) < 1e-12
+
+
 def test_a_gap_of_many_correlation_times_does_no_harm():
     """What a coloured noise was before the gap says nothing of what it is after it; the steps within are bounded."""
     record = record_of()

@@ -202,30 +202,45 @@ def move(q, x, dt, part, decay, gyro, gyro_use, force_f, top, factor):
     if scaled:
         phi12 = multiply(phi12, D)
     rate = scale(1.0 / dt, phi)
-    E = IDENTITY
-    held = 0.0  # the decay that E is of; states of one block have the same
-    for k in range(len(decay)):
-        column = (0.0, 0.0, 0.0)
-        if gyro_use[k] & OFFSET:
-            e = (gyro[k, 0], gyro[k, 1], gyro[k, 2])
-            if decay[k] > 0.0:
-                if decay[k] != held:
-                    E, _ = response(rate, dt, decay[k])
-                    E, held = multiply(E, D), decay[k]
-                column = scale(-1.0, matrix_times_vector(E, e))
-            else:
-                column = matrix_times_vector(phi12, e)
-        if gyro_use[k] & SCALE:
-            column = add(column, matrix_times_vector(phi12, gyro_matrix_times(gyro, k, rate)))
-        if gyro_use[k] & FORCE:
-            column = add(column, matrix_times_vector(phi12, gyro_matrix_times(gyro, k, force)))
-        top[6 + k, 0], top[6 + k, 1], top[6 + k, 2] = column
-        x[3 + k] *= factor[k]
     for i in range(3):
         top[i, 0], top[i, 1], top[i, 2] = phi11[i], phi11[3 + i], phi11[6 + i]
         top[3 + i, 0], top[3 + i, 1], top[3 + i, 2] = phi12[i], phi12[3 + i], phi12[6 + i]
+    top[3, 3] = 0.0
+    four = lanes_of(FOUR)
+    j0, j1, j2 = load_like(top, 12, four), load_like(top, 16, four), load_like(top, 20, four)
+    a0, a1, a2 = rate[0] * j0, rate[0] * j1, rate[0] * j2
+    b0, b1, b2 = rate[1] * j0, rate[1] * j1, rate[1] * j2
+    c0, c1, c2 = rate[2] * j0, rate[2] * j1, rate[2] * j2
+    E = IDENTITY
+    held = 0.0  # the decay that E is of; states of one block have the same
+    for k in range(len(decay)):
+        x[3 + k] *= factor[k]
+        use = gyro_use[k]
+        if use != 0:
+            column = four
+            if use & OFFSET and decay[k] == 0.0:
+                column = gyro[k, 0] * j0 + gyro[k, 1] * j1 + gyro[k, 2] * j2
+            if use & SCALE:
+                column = column + (gyro[k, 3] * a0 + gyro[k, 4] * b0 + gyro[k, 5] * c0)
+                column = column + (gyro[k, 6] * a1 + gyro[k, 7] * b1 + gyro[k, 8] * c1)
+                column = column + (gyro[k, 9] * a2 + gyro[k, 10] * b2 + gyro[k, 11] * c2)
+            store_like(top, 24 + 4 * k, column)
+            if use & OFFSET and decay[k] > 0.0:
+                if decay[k] != held:
+                    E, _ = response(rate, dt, decay[k])
+                    E, held = multiply(E, D), decay[k]
+                add_column(top, k, scale(-1.0, matrix_times_vector(E, (gyro[k, 0], gyro[k, 1], gyro[k, 2]))))
+            if use & FORCE:
+                add_column(top, k, matrix_times_vector(phi12, gyro_matrix_times(gyro, k, force)))
     top[3, 3] = 1.0
     return turned(q, phi), phi11, rate, D
+
+
+def add_column(top, k, column):
+    """Add what state k makes of the attitude."""
+    top[6 + k, 0] += column[0]
+    top[6 + k, 1] += column[1]
+    top[6 + k, 2] += column[2]
 
 
 def step_noise(noise, dt, rate, D, angle_variance, rate_variance, decay, density, gyro, gyro_use):
@@ -238,7 +253,7 @@ def step_noise(noise, dt, rate, D, angle_variance, rate_variance, decay, density
     for i in range(3):
         noise[3 + i, 0], noise[3 + i, 1], noise[3 + i, 2], noise[3 + i, 3] = q12[i], q12[3 + i], q12[6 + i], q22
     E = (IDENTITY, IDENTITY, IDENTITY)
-    size, kept = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+    kept = (1.0, 1.0, 1.0)
     mean = 0.0
     held = alone = -1.0  # the decays that the former are of, and the mean
     for k in range(len(decay)):
