@@ -5,6 +5,7 @@ Every page is executed when it is built, in an empty folder, and nothing is fetc
 
 import os
 import re
+import shutil
 import sys
 import tempfile
 from pathlib import Path
@@ -23,6 +24,8 @@ project = "strapdown"
 author = "The strapdown founders"
 copyright = "The strapdown founders, MIT licence"
 version = release = strapdown.__version__
+
+shutil.rmtree(DOCS / "api/generated", ignore_errors=True)  # pages of modules that are no more would be read too
 
 extensions = ["myst_nb", "numpydoc", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.viewcode"]
 exclude_patterns = ["_build", "jupyter_execute", "_data", "_templates", "**.ipynb_checkpoints"]

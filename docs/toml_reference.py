@@ -10,6 +10,7 @@ import dataclasses
 import inspect
 import itertools
 import math
+import re
 import textwrap
 import typing
 from dataclasses import dataclass, replace
@@ -29,6 +30,7 @@ SYMBOLS = {
     "hz": "Hz",
     "m": "m",
     "km": "km",
+    "degc": "°C",
     "kg_m2": "kg m²",
     "deg": "°",
     "rad": "rad",
@@ -44,12 +46,10 @@ SYMBOLS = {
     "deg_per_hour_per_sqrt_hour": "°/h/√h",
     "deg_per_hour_per_hour": "°/h²",
     "deg_per_hour_per_g": "°/h/g",
-    "deg_per_hour_per_kelvin": "°/h/K",
     "rad_per_s": "rad/s",
     "rad_per_sqrt_s": "rad/√s",
     "rad_per_s_per_sqrt_s": "rad/s/√s",
     "rad_per_s2": "rad/s²",
-    "rad_per_s_per_kelvin": "rad/s/K",
     "rad_s_per_m": "rad s/m",
     "m_per_s2": "m/s²",
 }
@@ -92,7 +92,13 @@ def sections() -> list[Section]:
     names = (_text(name, said.get(name, "")) for name in ("name", "description"))
     keys = (*names, *_keys(scenarios.Scenario, scenarios._TOP_FORM))
     top = Section(group="top", header="top of the file", summary="before the first table.", keys=keys)
-    return [top, *_motions(), _gyro(), *_sensors()]
+    warm = Section(
+        group="gyro",
+        header="[temperature]",
+        summary=_summary(scenarios.Temperature),
+        keys=_keys(scenarios.Temperature, scenarios._TEMPERATURE),
+    )
+    return [top, *_motions(), _gyro(), warm, *_sensors()]
 
 
 def markdown(group: str) -> str:
@@ -114,9 +120,15 @@ def _section(section: Section) -> str:
     head = f"**`{section.header}`{type_line}**: {section.summary}"
     rows = ["| key | unit | value | default | meaning |", "|---|---|---|---|---|"]
     for key in section.keys:
-        other = "".join(f"<br>or `{name}`" for name in key.others)
-        rows.append(f"| `{key.name}`{other} | {key.unit} | {key.type} | {key.default} | {key.meaning} |")
+        names = "<br>or ".join(_broken(name) for name in (key.name, *key.others))
+        rows.append(f"| {names} | {key.unit} | {key.type} | {key.default} | {key.meaning} |")
     return "\n".join([head, "", *(rows if section.keys else [])])
+
+
+def _broken(name: str) -> str:
+    """Return a key as HTML that may break after its underscores, as 43 letters in a column must."""
+    broken = name.replace("_", "_<wbr>") if len(name) > 20 else name
+    return f'<code class="key">{broken}</code>'
 
 
 # ---------------------------------------------------------------------------------------------------------------- the tables
@@ -126,15 +138,13 @@ def _motions() -> list[Section]:
     def section(word: str, subject: Any, keys: tuple[Key, ...], more: str = "", header: str = "[motion]") -> Section:
         return Section(group="motion", header=header, type=word, summary=_summary(subject) + more, keys=keys)
 
-    examples = {"time": [0.4 * k for k in range(6)], "attitudes": [[1.0, 0.0, 0.0, 0.0]] * 6}  # of a sampled motion
+    lists: dict[str, dict[str, Any]] = {  # of a sampled motion
+        "time_s": {"type": "list of numbers", "example": [0.4 * k for k in range(6)]},
+        "attitudes": {"type": "list of quaternions", "example": [[1.0, 0.0, 0.0, 0.0]] * 6},
+    }
 
     def keys_of(word: str, kind: type, form: tables.Form) -> tuple[Key, ...]:
-        keys = _keys(kind, form)
-        sampled = word == "sampled"
-        return tuple(
-            replace(k, example=next((v for n, v in examples.items() if sampled and k.name.startswith(n)), k.example))
-            for k in keys
-        )
+        return tuple(replace(k, **lists.get(k.name, {})) if word == "sampled" else k for k in _keys(kind, form))
 
     found = [section(word, kind, keys_of(word, kind, form)) for word, (kind, form) in scenarios._MOTIONS.items()]
     harmonic = _keys(motion.Harmonic, scenarios._HARMONIC)
@@ -151,8 +161,13 @@ def _motions() -> list[Section]:
 def _gyro() -> Section:
     names = ", ".join(f"`{name}`" for name in datasheets.PRESETS)
     preset = _text("preset", f"A gyro on the market, of which other keys change what they name. One of {names}.")
-    keys = (replace(preset, example=next(iter(datasheets.PRESETS))), *_keys(gyro.GyroSpec, gyro.FORM))
-    return Section(group="gyro", header="[gyro]", summary="the gyro; what is left out is perfect.", keys=keys)
+    own = (replace(k, type=_TYPES[gyro.Axes]) if k.type == "list of 3" else k for k in _keys(gyro.GyroSpec, gyro.FORM))
+    keys = (replace(preset, example=next(iter(datasheets.PRESETS))), *own)
+    summary = (
+        "the gyro; what is left out is perfect. A bias over temperature is a table `[gyro.temperature]`, as `strapdown allan "
+        "--temperature` writes it to `gyro-temperature.toml`."
+    )
+    return Section(group="gyro", header="[gyro]", summary=summary, keys=keys)
 
 
 def _sensors() -> list[Section]:
@@ -247,4 +262,5 @@ def _meanings(kind: type) -> dict[str, str]:
             and isinstance(below.value.value, str)
         ):
             said[ast.unparse(statement.target)] = below.value.value
+    said = {name: re.sub(r":\w+:`", "`", text) for name, text in said.items()}
     return {name: " ".join(text.split()).replace("``", "`").replace("|", "\\|") for name, text in said.items()}

@@ -1,8 +1,8 @@
 """Where do the errors come from? The error budget of a filter from one pass without noise, held against a Monte Carlo.
 
 A satellite tumbles, its star tracker is blinded for a minute, its gyro has white noise, a walking bias and flicker, errors of scale factor
-and misalignment that no filter models. The covariance analysis (:mod:`strapdown.covariance`) predicts the RMS error, what the filter
-says of itself, the NEES that comes of the difference, and the part of each source. Independent runs show whether that is so: for the
+and misalignment that no filter models. The covariance analysis (:mod:`strapdown.covariance`) predicts the RMS error, the filter's
+σ, the NEES that comes of the difference, and the part of each source. Independent runs show whether that is so: for the
 filter that matches the noise, and for one that models a quarter of the process noise.
 
 Run it: ``python sims/error_budget.py --out error-budget-results`` (a minute).

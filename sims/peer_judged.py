@@ -1,4 +1,4 @@
-"""Are other people's filters as good as they say? Three of them, run as they come and judged over many runs.
+"""Are other people's filters consistent? Three of them, run as they come and judged over many runs.
 
 Each is put into a setup as a filter of one's own: a class with a method ``run``. It gets the same simulated records as any filter here
 (gyro, accelerometer, attitude sensor), and beside them a velocity that is measured to 0.1 m/s, all noises given to it as they are:
@@ -278,7 +278,7 @@ def cases(duration: float) -> dict[str, tuple[str, scenarios.Scenario, Any]]:
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """What peers say of themselves against what is true."""
+    """The peers' σ against their errors."""
 
     judgements: dict[str, consistency.Judgement]
     statistics: dict[str, montecarlo.Statistics]
@@ -316,7 +316,7 @@ def main(*, runs: int = 200, duration: float = 40.0, seed: int = 1, out: Path | 
 
 
 def rows(statistics: montecarlo.Statistics) -> dict[str, Any]:
-    """Return what a peer says of itself and what is true, over the judged epochs."""
+    """Return a peer's σ and its RMS errors over the judged epochs."""
     judged = montecarlo.judged_epochs(len(statistics.time) - 1)
     size = 6 if statistics.has_bias else 3
     rms = np.sqrt(np.mean(statistics.rms_error[judged] ** 2, axis=0))[:size]
@@ -331,7 +331,7 @@ def rows(statistics: montecarlo.Statistics) -> dict[str, Any]:
 
 
 def table(result: Result) -> str:
-    """Return what peers say of themselves and what is true as a table in Markdown."""
+    """Return the peers' σ and their RMS errors as a table in Markdown."""
     lines = [
         "| filter | ANEES state | attitude | bias | RMS/σ attitude x, y, z | RMS/σ bias x, y, z | verdict |",
         "|---|---|---|---|---|---|---|",

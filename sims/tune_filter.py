@@ -28,7 +28,7 @@ class Result:
     plan: Plan
     """Standard errors predicted before there was a record."""
     held_out: Comparison
-    """The filter that was too sure, before and after, on the end of the record."""
+    """The optimistic filter, before and after, on the end of the record."""
     record: scenarios.ImuRecord
 
 
@@ -102,7 +102,9 @@ def draw(result, folder, objective):
         folder / "tune_filter-likelihood.png",
     )
     plots.save(
-        drawing.before_and_after(result.held_out, title="On what was held out, from a filter 30 times too sure"),
+        drawing.before_and_after(
+            result.held_out, title="On what was held out, from a filter whose σ were 30 times too small"
+        ),
         folder / "tune_filter-heldout.png",
     )
 

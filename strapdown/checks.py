@@ -223,7 +223,11 @@ def one_of(name: str, value: str, choices: Iterable[str]) -> str:
     known = list(choices)
     if value in known:
         return value
+    begun = [
+        name for name in known if value and name.startswith(str(value))
+    ]  # an ending left out, such as that of a unit
     near = difflib.get_close_matches(str(value), known, n=5) or [name for name in known if value and str(value) in name]
+    near = [*begun, *near]
     near.sort(key=lambda one: ("_deg" in str(value)) != ("_deg" in one))  # another unit is no slip of the pen
     hint = f"; did you mean {near[0]!r}?" if near else ""
     raise InputError(f"{name} {value!r} is not known{hint} (known: {', '.join(known)})")

@@ -467,8 +467,8 @@ def _left_out(scenario: Scenario, setup: FilterSetup) -> tuple[str, ...]:
         "drop_probability",
     )
     found = [f"gyro {name.replace('_', ' ')}" for name in names if np.any(np.asarray(getattr(spec, name)) > 0.0)]
-    if np.any(spec.temperature_coefficient != 0.0):
-        found.append("gyro temperature coefficient")
+    if spec.temperature is not None:
+        found.append("gyro bias over temperature")
     found += [name for name in ("gate", "robust", "states") if getattr(setup, name, None) is not None]
     return tuple(found)
 
@@ -745,6 +745,50 @@ def analyse(
     """
     setup = matched(scenario) if setup is None else setup
     consider = Consider() if consider is None else consider
+    _check_considered(scenario, consider)
+    edges = scenario.edges
+    attitude_sigma = setup.attitude_sigma if initial_attitude_sigma is None else initial_attitude_sigma
+    bias_sigma = setup.bias_sigma if initial_bias_sigma is None else initial_bias_sigma
+    _size("initial_attitude_sigma", attitude_sigma, unit="rad")
+    _size("initial_bias_sigma", bias_sigma, unit="rad/s")
+    path = _path(scenario, setup, epochs)
+    random = _Random(setup)
+    random.add("initial attitude", block=_diagonal(attitude_sigma, 0.0))
+    random.add("initial bias", block=_diagonal(0.0, bias_sigma))
+    random.add_gyro(scenario.gyro, float(edges[1] - edges[0]), len(edges) - 1)
+    for i, sensor in enumerate(scenario.sensors):
+        random.add_sensor(i, sensor)
+    fixed = _fixed_columns(scenario, setup, path)
+    columns = [*fixed, *_considered_columns(scenario, consider, path)]
+    out = _propagated(path, edges, random, columns, len(fixed), len(scenario.sensors))
+    whole = covariance_matrices(out.blocks)
+    found = Analysis(
+        time=edges[path.kept],
+        filter_covariance=whole[:, 0],
+        sources=tuple(random.names[1:]),
+        contributions=whole[:, 1:],
+        fixed=tuple(column.name for column in fixed),
+        fixed_errors=out.columns[:, : len(fixed)],
+        considered=tuple(column.name for column in columns[len(fixed) :]),
+        considered_errors=out.columns[:, len(fixed) :],
+        expected_nis={
+            sensor.name: float(total / seen)
+            for sensor, (total, seen) in zip(scenario.sensors, out.nis, strict=True)
+            if seen > 0.0
+        },
+        left_out=_left_out(scenario, setup),
+        beyond_linear=(),
+    )
+    beyond = _beyond_linear(attitude_sigma, columns, consider)
+    errors = found.rms[:, :3].max(axis=1)
+    epoch = int(np.argmax(errors))
+    if errors[epoch] > LARGEST_LINEAR:
+        beyond.append(f"the attitude error itself, {errors[epoch] / DEGREE:.3g}° at {found.time[epoch]:.6g} s")
+    return dataclasses.replace(found, beyond_linear=tuple(beyond))
+
+
+def _check_considered(scenario: Scenario, consider: Consider) -> None:
+    """Refuse considered errors that the scenario cannot have."""
     names = [sensor.name for sensor in scenario.sensors]
     for part in ("sensor_bias", "mounting", "time_offset"):
         known_keys(f"consider: {part}", getattr(consider, part), names)
@@ -757,24 +801,16 @@ def analyse(
                 f"consider: time_offset of {name} is {offset:g} s, and the scenario lasts {scenario.duration:g} s; nothing is measured "
                 "outside of it: give seconds of this scenario"
             )
-    edges = scenario.edges
-    attitude_sigma = setup.attitude_sigma if initial_attitude_sigma is None else initial_attitude_sigma
-    bias_sigma = setup.bias_sigma if initial_bias_sigma is None else initial_bias_sigma
-    _size("initial_attitude_sigma", attitude_sigma, unit="rad")
-    _size("initial_bias_sigma", bias_sigma, unit="rad/s")
-    path = _path(scenario, setup, epochs)
-    rows = path.rows
 
-    random = _Random(setup)
-    random.add("initial attitude", block=_diagonal(attitude_sigma, 0.0))
-    random.add("initial bias", block=_diagonal(0.0, bias_sigma))
-    random.add_gyro(scenario.gyro, float(edges[1] - edges[0]), len(edges) - 1)
-    for i, sensor in enumerate(scenario.sensors):
-        random.add_sensor(i, sensor)
-    coloured = random.coloured
 
-    fixed = _fixed_columns(scenario, setup, path)
-    columns = [*fixed, *_considered_columns(scenario, consider, path)]
+def _propagated(
+    path: _Path, edges: Array, random: _Random, columns: list[_Column], fixed: int, sensors: int
+) -> covariance_loop.Outputs:
+    """Propagate the covariance of each random source and each error without noise through the filter's gains.
+
+    ``fixed``: number of the columns, the first of them, that are fixed errors.
+    """
+    rows, coloured = path.rows, random.coloured
     with_rate = [k for k, column in enumerate(columns) if column.rate is not None]
     place = np.full(len(columns), -1)
     place[with_rate] = np.arange(len(with_rate))
@@ -792,7 +828,7 @@ def analyse(
         stations=stations,
         blocks=np.empty((len(stations), len(random.names), 21)),
         columns=np.empty((len(stations), len(columns), 6)),
-        nis=np.zeros((len(names), 2)),
+        nis=np.zeros((sensors, 2)),
     )
     compiled(covariance_loop.run_covariance)(
         covariance_loop.Path(path.dt, np.ascontiguousarray(path.phi), path.new_sample, path.row_bounds),
@@ -819,30 +855,9 @@ def analyse(
             rate=column_rate,
             place=place,
             ramp=np.array([column.ramp for column in columns]).reshape(-1, 3),
-            fixed=len(fixed),
+            fixed=fixed,
             value=np.zeros((len(columns), 6)),
         ),
         out,
     )
-    whole = covariance_matrices(out.blocks)
-    found = Analysis(
-        time=edges[path.kept],
-        filter_covariance=whole[:, 0],
-        sources=tuple(random.names[1:]),
-        contributions=whole[:, 1:],
-        fixed=tuple(column.name for column in fixed),
-        fixed_errors=out.columns[:, : len(fixed)],
-        considered=tuple(column.name for column in columns[len(fixed) :]),
-        considered_errors=out.columns[:, len(fixed) :],
-        expected_nis={
-            name: float(total / seen) for name, (total, seen) in zip(names, out.nis, strict=True) if seen > 0.0
-        },
-        left_out=_left_out(scenario, setup),
-        beyond_linear=(),
-    )
-    beyond = _beyond_linear(attitude_sigma, columns, consider)
-    errors = found.rms[:, :3].max(axis=1)
-    epoch = int(np.argmax(errors))
-    if errors[epoch] > LARGEST_LINEAR:
-        beyond.append(f"the attitude error itself, {errors[epoch] / DEGREE:.3g}° at {found.time[epoch]:.6g} s")
-    return dataclasses.replace(found, beyond_linear=tuple(beyond))
+    return out

@@ -20,8 +20,8 @@ import numpy as np
 
 __all__ = ["ByValue", "Listed", "Listing", "figure"]
 
-WIDTH = 110
-"""Characters of a line of a title."""
+WIDTH = 88
+"""Characters of a line of a title or a note."""
 
 
 class Listing(NamedTuple):
@@ -48,7 +48,13 @@ class Listing(NamedTuple):
         ]
         table = [lines[0], "-" * len(lines[0]), *lines[1:]] if self.rows else []
         title = textwrap.wrap(self.title, WIDTH) or [""]
-        return "\n".join(line.rstrip() for line in (*title, *table, *self.notes))
+        notes = [
+            part
+            for note in self.notes
+            for line in note.splitlines()
+            for part in textwrap.wrap(line, WIDTH, subsequent_indent="  ", break_long_words=False)
+        ]
+        return "\n".join(line.rstrip() for line in (*title, *table, *notes))
 
     @property
     def html(self) -> str:
@@ -89,6 +95,10 @@ class Listed:
     def listing(self) -> Listing:
         """Return the result as a table."""
         raise NotImplementedError
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        cls.__repr__ = Listed.__str__  # type: ignore[method-assign, assignment]  # a dataclass would show all its arrays
 
     def __str__(self) -> str:
         return self.listing().text

@@ -11,6 +11,7 @@ import contextlib
 import dataclasses
 import functools
 import os
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -119,14 +120,15 @@ def _scenario(given: Scenario | str | os.PathLike[str]) -> Scenario:
     return given if isinstance(given, Scenario) else scenarios.load_scenario(given)
 
 
-def read(path: str | os.PathLike[str], **options: Any) -> ImuRecord | Recording | Estimate | Campaign:
-    """Read a file of any known kind, recognised by its content.
+def read(path: Any, **options: Any) -> ImuRecord | Recording | Estimate | Campaign:
+    """Read a file of any known kind, recognised by its content, or a table in memory.
 
     Parameters
     ----------
-    path : path
+    path : path, DataFrame, Dataset or mapping
         A simulated record, an estimate or a Monte Carlo of this package, or a recording of any format of
-        :data:`strapdown.recordings.FORMATS` (CSV, ROS bag, ULog, EuRoC folder, …).
+        :data:`strapdown.recordings.FORMATS` (CSV, ROS bag, ULog, EuRoC folder, …); or a recording's columns as
+        :func:`strapdown.recordings.from_table` takes them (pandas, xarray, arrays by name).
     **options
         For recordings: ``units``, ``columns`` and ``topic`` of :func:`strapdown.recordings.read`.
 
@@ -146,6 +148,9 @@ def read(path: str | os.PathLike[str], **options: Any) -> ImuRecord | Recording 
     >>> import strapdown as sd
     >>> walk = sd.read("walk.csv", units={"gyro": "deg/s", "accelerometer": "g"})  # doctest: +SKIP
     """
+    if isinstance(path, Mapping) or hasattr(path, "columns") or hasattr(path, "data_vars"):
+        return recordings.from_table(path, **options)
+    instance("path", path, (str, os.PathLike), "give a path, a DataFrame, a Dataset, or arrays by name")
     file = Path(path)
     kind = ""
     if file.is_file():
@@ -348,6 +353,8 @@ def estimate(
     robust = Robust(kind=robust) if isinstance(robust, str) else robust  # type: ignore[arg-type]
     if isinstance(source, Recording):
         _refuse("a record", setup=setup, initial=initial, states=states or None)
+        for words in ahrs.doctor.at_rest(source):
+            warnings.warn(f"{source.source}: {words}", stacklevel=2)
         found = ahrs.estimate(
             source,
             _recording_parameters(motion, noise),

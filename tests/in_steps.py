@@ -5,10 +5,10 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import numpy as np
+from gated_steps import GatedStepFilter
 
 from strapdown import estimation
 from strapdown.estimation.states import covariance_matrices
-from strapdown.estimation.step_filter import StepFilter
 from strapdown.kernels import filter_step
 
 
@@ -25,10 +25,10 @@ def transition_and_noise(phi, dt, process_noise):
     return F, covariance_matrices(np.array([*q11, *q12, q22, 0.0, 0.0, q22, 0.0, q22]))
 
 
-def update(f, series, k, time=None):
+def update(f, series, k):
     """Give sample k of a series to a filter; return whether it was used."""
     noise = {"covariance": series.covariances[k]} if series.kind != "heading" else {"sigma": series.sigma[k]}
-    given = {"sensor": series.sensor, "time": time, **noise}
+    given = {"sensor": series.sensor, **noise}
     if series.kind == "attitude":
         return f.update_attitude(series.attitude[k], **given)
     return getattr(f, f"update_{series.kind}")(series.vector_b[k], series.references_f[k], **given)
@@ -37,7 +37,7 @@ def update(f, series, k, time=None):
 def run(record, process_noise, initial, error_states=(), **options):
     """Return what the step-by-step filter makes of a record: the states at every edge, and innovations, counts and events."""
     sensors = [series.sensor for series in record.vectors]
-    f = StepFilter(process_noise, initial, error_states, time=record.time[0], sensors=sensors, **options)
+    f = GatedStepFilter(process_noise, initial, error_states, time=record.time[0], sensors=sensors, **options)
     events = sorted((t, i, k) for i, series in enumerate(record.vectors) for k, t in enumerate(series.time))
     events = [event for event in events if event[0] >= record.time[0]]
     rows, seen = [], {sensor: [] for sensor in sensors}

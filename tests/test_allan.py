@@ -349,7 +349,7 @@ COVARIANCES = {
 def test_spectrum_of_the_cosine_transform_is_exact(term, samples):
     rows = dct(np.eye(samples), axis=0, norm="ortho")
     transformed = (rows @ COVARIANCES[term](samples) @ rows.T)[1:, 1:]
-    expected = allan.deviation._expected_power(term, samples, 1.0, np.arange(1, samples))
+    expected = allan.spectrum.expected_power(term, samples, 1.0, np.arange(1, samples))
     assert_allclose(np.diag(transformed), expected, rtol=1e-9)
     if term in ("angle_random_walk", "rate_random_walk"):  # independent coefficients: nothing off the diagonal
         assert_allclose(transformed, np.diag(expected), atol=1e-10 * expected.max())
@@ -357,18 +357,18 @@ def test_spectrum_of_the_cosine_transform_is_exact(term, samples):
 
 def test_flicker_spectrum_of_long_records_continues_that_of_short_ones():
     j = np.array([1, 2, 3, 10, 100, 5000])
-    short = allan.deviation._expected_power("bias_instability", 1 << 16, 1.0, j) / (1 << 16)
-    long = allan.deviation._expected_power("bias_instability", 1 << 22, 1.0, j) / (1 << 22)
+    short = allan.spectrum.expected_power("bias_instability", 1 << 16, 1.0, j) / (1 << 16)
+    long = allan.spectrum.expected_power("bias_instability", 1 << 22, 1.0, j) / (1 << 22)
     assert_allclose(long, short, rtol=1e-4)
     j = np.array([8190, 8191, 8192, 8193])
-    power = allan.deviation._expected_power("bias_instability", 1 << 22, 1.0, j) * j
+    power = allan.spectrum.expected_power("bias_instability", 1 << 22, 1.0, j) * j
     assert_allclose(power / power[0], 1.0, rtol=1e-4)
 
 
 def test_ramp_coefficients():
     for samples in (16, 33):
         expected = dct(np.arange(samples) * 1.0, norm="ortho")[1:]
-        assert_allclose(allan.deviation._ramp_coefficients(samples, np.arange(1, samples)), expected, atol=1e-11)
+        assert_allclose(allan.spectrum.ramp_coefficients(samples, np.arange(1, samples)), expected, atol=1e-11)
 
 
 @pytest.mark.parametrize("m", [1, 2, 5, 12])
@@ -469,7 +469,7 @@ def test_intervals_cover_where_a_term_is_at_the_edge_of_being_seen():
     terms = ("angle_random_walk", "bias_instability")
     j = np.arange(1, samples)
     sigma = np.sqrt(
-        sum(c**2 * allan.deviation._expected_power(t, samples, 1.0, j) for t, c in zip(terms, (N, B), strict=True))
+        sum(c**2 * allan.spectrum.expected_power(t, samples, 1.0, j) for t, c in zip(terms, (N, B), strict=True))
     )
     generator = np.random.default_rng(12)
     inside, above, seen = [], [], []
@@ -562,7 +562,7 @@ def test_bound_is_where_the_likelihood_falls():
     rate = simulate([3, 10], 2048, 1.0, N=1.0)
     fit = allan.fit_noise(rate, 1.0, terms=("quantization", "angle_random_walk"))
     power = dct(rate, norm="ortho")[1:] ** 2
-    basis = allan.deviation._expected_power("quantization", 2048, 1.0, np.arange(1, 2048))
+    basis = allan.spectrum.expected_power("quantization", 2048, 1.0, np.arange(1, 2048))
 
     def loss(q, n):
         return 0.5 * np.sum(np.log(q * basis + n) + power / (q * basis + n))
@@ -581,16 +581,16 @@ def test_fit_is_the_restricted_maximum():
     """At the optimum no small step in any coefficient raises the likelihood restricted for the ramp."""
     rate = simulate([4, 11], 2048, 1.0, **corners(2048, 60.0, 20.0))
     terms = allan.TERMS[:4]
-    starts = allan.deviation._bin_starts(2047)
-    basis = np.stack([allan.deviation._basis(term, 2048, 1.0, starts, 2047) for term in terms])
-    coefficient = allan.deviation._cosine_transform(rate, 1.0)
-    bins = allan.deviation._binned(coefficient, basis, starts, axis=0, largest=np.abs(rate).max(), dt=1.0, last=2047)
-    best = allan.deviation._maximise(bins, allan.deviation._first_guess(bins))
+    starts = allan.spectrum.bin_starts(2047)
+    basis = np.stack([allan.spectrum.mean_power(term, 2048, 1.0, starts, 2047) for term in terms])
+    coefficient = allan.spectrum.cosine_transform(rate, 1.0)
+    bins = allan.spectrum.binned(coefficient, basis, starts, axis=0, largest=np.abs(rate).max(), dt=1.0, last=2047)
+    best = allan.noise_fit._maximise(bins, allan.noise_fit._first_guess(bins))
     for i in range(4):
         for factor in (0.999, 1.001):
             moved = best.theta.copy()
             moved[i] *= factor
-            assert allan.deviation._loss(bins, moved, None, True).loss >= best.loss - 1e-8
+            assert allan.noise_fit._loss(bins, moved, None, True).loss >= best.loss - 1e-8
 
 
 def test_misfit_is_reported():
@@ -625,7 +625,7 @@ def test_misfit_says_what(spoil, words):
 
 def test_scores_of_chi_squares_are_normal():
     ratio = np.random.default_rng(14).chisquare(6.0, (4000, 60)) / 6.0
-    probability = np.array([allan.deviation._probability(np.full(60, 6.0), row, 60) for row in ratio])
+    probability = np.array([allan.noise_fit._probability(np.full(60, 6.0), row, 60) for row in ratio])
     assert 0.005 < np.mean(probability < 0.01) < 0.02
     assert 0.47 < np.mean(probability < 0.5) < 0.53
 
@@ -635,7 +635,7 @@ def test_each_term_of_the_fit_costs_its_spectrum_a_degree():
     bins = types.SimpleNamespace(number=np.full(10, 50.0), square=50.0 * ratio, product=np.zeros(10), ramp=np.zeros(10))
     best = types.SimpleNamespace(slope=0.0, variance=np.ones(10), theta=np.array([1.0, 0.0, 2.0, 3.0]))
     score = (np.cbrt(ratio) - 1.0 + 2.0 / 450.0) / np.sqrt(2.0 / 450.0)
-    assert allan.deviation._spectrum_probability(bins, best) == pytest.approx(chi2.sf(score @ score, 7), rel=1e-9)
+    assert allan.noise_fit._spectrum_probability(bins, best) == pytest.approx(chi2.sf(score @ score, 7), rel=1e-9)
 
 
 @pytest.mark.parametrize("highest_frequency", [None, 0.3])

@@ -75,9 +75,11 @@ def test_its_band_covers_the_truth(kind, lost):
     assert (share < 0.995).all(), share
 
 
-def test_without_gaps_the_fit_is_that_of_the_whole_record():
+@pytest.mark.parametrize("options", [{}, {"highest_frequency": 20.0}, {"terms": allan.TERMS[:2]}], ids=str)
+def test_without_gaps_the_fit_is_that_of_the_whole_record(options):
     x = 1e-3 * noise("white", (1, 4000), 3)[0] + 2e-5 * noise("walk", (1, 4000), 4)[0]
-    whole, gappy = allan.fit_noise(x, 0.01), allan_gaps.fit_noise(x, 0.01)
+    whole, gappy = allan.fit_noise(x, 0.01, **options), allan_gaps.fit_noise(x, 0.01, **options)
+    assert gappy.terms == whole.terms
     np.testing.assert_array_equal(whole.supported, gappy.supported)
     for name in ("estimate", "lower", "upper", "misfit_probability"):
         np.testing.assert_allclose(getattr(gappy, name), getattr(whole, name), rtol=1e-4, err_msg=name)
@@ -122,6 +124,12 @@ def test_a_stretch_that_moves_is_seen():
 def test_what_shows_nothing_is_refused(values, words):
     with pytest.raises(InputError, match=words):
         allan_gaps.fit_noise(values, 0.01)
+
+
+@pytest.mark.parametrize("level", [0.5, 1.0, np.nan])
+def test_no_confidence_is_refused(level):
+    with pytest.raises(InputError, match=r"a confidence lies between 0.5 and 1"):
+        allan_gaps.allan_deviation(np.arange(100.0) % 3, 1.0, level=level)
 
 
 def test_taus_beyond_half_the_record_are_refused():

@@ -9,13 +9,13 @@ from collections.abc import Callable
 import in_steps
 import numpy as np
 import pytest
+from gated_steps import GatedStepFilter
 
 from strapdown import consistency, estimation, montecarlo, motion, quaternion, records, setup
 from strapdown.estimation import error_states, forward
 from strapdown.estimation.gating import UNIFORM_SIGMA, Gate, Robust
 from strapdown.estimation.model import Model, assemble
 from strapdown.estimation.states import ProcessNoise
-from strapdown.estimation.step_filter import StepFilter
 from strapdown.gyro import GyroSpec
 from strapdown.kernels import gate_rules, iterated_update, root_form
 from strapdown.kernels.gate_rules import WIDE_PASSES
@@ -531,7 +531,7 @@ def test_attitude_and_hard_iron_from_nothing_are_the_batch_solution(seed):
     mag = quaternion.rotate(quaternion.conjugate(true), FIELD) + iron + 3e-7 * rng.standard_normal(3)
     acc = quaternion.rotate(quaternion.conjugate(true), UP) + 0.05 * rng.standard_normal(3)
     start = estimation.initial_state(guess, attitude_sigma=UNIFORM_SIGMA, bias_sigma=BIAS_SIGMA)
-    face = StepFilter(NOISE, start, (IRON,), sensors=("mag", "acc"))
+    face = GatedStepFilter(NOISE, start, (IRON,), sensors=("mag", "acc"))
     face._passes = WIDE_PASSES
     assert face.update_vector(mag, FIELD, 3e-7, "mag")
     assert face.update_vector(acc, UP, 0.05, "acc")
@@ -712,7 +712,7 @@ def test_both_faces_widen_a_candidate_alike(case):
 
 def test_the_step_face_says_what_it_took():
     one = made("hard iron", 0, duration=1.0)
-    face = StepFilter(NOISE, one.initial, (IRON,), gate=Gate())
+    face = GatedStepFilter(NOISE, one.initial, (IRON,), gate=Gate())
     mag = one.record.vectors[0]
     assert face.update_vector(mag.vector_b[0], FIELD, 3e-7, "mag")
     assert (face.weight, face.refused) == (1.0, {})

@@ -7,13 +7,13 @@ import dataclasses
 import in_steps
 import numpy as np
 import pytest
+from gated_steps import GatedStepFilter
 
 from strapdown import consistency, estimation, kinematics, motion, quaternion, records, scenarios, setup, vectors
 from strapdown.checks import InputError
 from strapdown.estimation import angular_acceleration, error_states, forward
 from strapdown.estimation.gating import Gate, Monitor, Robust
 from strapdown.estimation.states import ProcessNoise
-from strapdown.estimation.step_filter import StepFilter
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Truth
@@ -313,7 +313,7 @@ def test_force_s_transition_is_the_derivative():
 
     def moved(values):
         state = dataclasses.replace(estimation.with_error_states(initial, (block,)), values=values)
-        face = StepFilter(NOISE, state, (block,))
+        face = GatedStepFilter(NOISE, state, (block,))
         face.predict(np.array([0.02, -0.03, 0.01]), 0.05)
         return face
 
@@ -375,7 +375,7 @@ def test_the_step_face_goes_on_from_a_part_as_the_record_does():
     assert challenged >= 2
     assert reported >= 2
     with pytest.raises(InputError, match=r"time is 0 s, before the record of initial began, 100 s; give the time"):
-        StepFilter(NOISE, middle, blocks, gate=gate)
+        GatedStepFilter(NOISE, middle, blocks, gate=gate)
 
 
 # ------------------------------------------------------------------------------------------------------------------- sensors

@@ -11,9 +11,12 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import typer
 
 import strapdown
 from strapdown import cli, recordings, scenarios
+from strapdown.cli import layout
+from strapdown.cli.terminal import app
 from strapdown.coning_study import ALGORITHMS
 from strapdown.records import read_attributes, read_estimate
 
@@ -38,6 +41,25 @@ def test_help_names_the_commands(run):
     for command in ("coning", "estimate"):
         assert command in said
         assert run(command, "--help")[0] == 0
+
+
+def test_help_shows_options_in_groups_and_examples_that_parse(run):
+    """Each example names options and arguments that its command takes; each heading stands over its options."""
+    commands = typer.main.get_command(app).commands
+    for examples in layout.COMMANDS.values():
+        for name, lines in examples.items():
+            for line in lines:
+                program, command, *words = line.split()
+                assert (program, command) == ("strapdown", name)
+                commands[name].make_context(name, words)
+    said = " ".join(run("estimate", "--help")[1].split())
+    assert (
+        said.index("─ Filter ─")
+        < said.index("--gate")
+        < said.index("─ Layout of the recording ─")
+        < said.index("--gyro-unit")
+    )
+    assert "strapdown estimate two-stars.h5" in said
 
 
 def test_the_installed_script_is_this_one():
@@ -397,7 +419,7 @@ def bad_csv(folder: Path, case: str) -> Path:
     [
         (
             "undeclared",
-            "does not say the unit of its gyro columns; declare it in the header, as in gx [rad/s], or by option",
+            "does not say the unit of its gyro columns; declare it in the header, as in gx [rad/s], or by --gyro-unit",
         ),
         ("unsorted", "time[11] goes back to 0.1 s after 0.11 s; sort the stamps"),
         ("infinite", "rate[7, 1] is inf"),

@@ -96,6 +96,25 @@ def test_an_error_that_hardly_moves_is_not_averaged_over_the_run_and_that_is_rep
     assert "attitude" in averaged
 
 
+@pytest.mark.parametrize(
+    ("states", "averaged"),
+    [
+        ((), {"attitude", "bias", "state"}),
+        (("gyro.drift",), {"attitude"}),
+        (("gyro scale",), {"attitude"}),
+        (("star 1.correlated",), set()),
+    ],
+)
+def test_what_error_states_reach_is_not_averaged_over_one_run(states, averaged):
+    """Their part of the errors may last longer than the run, which does not show it."""
+    judgement = consistency.judge(*estimate(), error_states=states)
+    assert {finding.of for finding in judgement.findings if finding.name == "time-averaged NEES"} <= averaged
+    assert ("attitude" in averaged) == any(
+        f.name == "time-averaged NEES" and f.of == "attitude" for f in judgement.findings
+    )
+    assert any("further error states" in limit for limit in judgement.limits) == bool(states)
+
+
 def test_sensors_that_share_an_error_are_reported():
     judgement = consistency.judge(estimate(correlated=True)[0])
     assert [(f.name, f.of) for f in judgement.findings if f.rejected] == [("cross-correlation", "star 1 and star 2")]
@@ -182,7 +201,9 @@ def test_upper_bounds_are_contradicted_by_what_exceeds_them_alone():
         "σ of attitude and bias are not tested without a truth"
         in consistency.judge(estimate(0.1)[0], upper_bounds=True).reason
     )
-    assert consistency.judge(*estimate(0.1), upper_bounds=True).verdict == "consistent"
+    small = consistency.judge(*estimate(0.1), upper_bounds=True)
+    assert small.verdict == "consistent"
+    assert all(one.low <= one.value <= one.high for one in small.findings)  # as it passes
     assert consistency.judge(*estimate(0.1, bias_error=10.0), upper_bounds=True).verdict == "not consistent"
 
 

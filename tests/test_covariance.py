@@ -654,7 +654,7 @@ def test_the_command_prints_a_budget_and_writes_it(run, tmp_path):
     assert status == 0
     for word in ("angle random walk", "gyro scale factor", "misalignment", "star time offset", "the filter's own σ"):
         assert word in said
-    assert "too sure of its bias" in " ".join(said.split())
+    assert "optimistic in bias" in " ".join(said.split())
     found = json.loads((tmp_path / "covariance-results" / "covariance.json").read_text(encoding="utf-8"))
     assert len(found["time_s"]) == 11
     direct = covariance.analyse(
@@ -688,12 +688,12 @@ def test_the_command_takes_a_filter_and_units(run, tmp_path):
 def test_the_command_gives_no_verdict_beyond_the_linear_range(run):
     status, said, _ = run("covariance", "rest", "--epochs", 4)
     assert status == 0
-    assert "as good as it says" in said
-    assert "linear about the truth, cannot tell whether the filter will be as good as it says" in said
+    assert "will be consistent" in said
+    assert "linear about the truth, cannot tell whether the filter will be consistent" in said
     assert "The filter will be" not in said
     assert "Beyond linear: the attitude error itself" in said
     _, said, _ = run("covariance", "two-stars", "--epochs", 4)
-    assert "The filter will be as good as it says." in said
+    assert "The filter will be consistent." in said
 
 
 def test_the_command_refuses_in_one_line(run):

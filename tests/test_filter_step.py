@@ -68,9 +68,9 @@ def test_process_noise_of_the_rate_alone_at_forty_digits():
     assert np.allclose(q12, exact12, rtol=1e-12, atol=1e-13 * dt**2)
 
 
-def random_state(generator, spread=1.0):
+def random_state(generator, spread=1.0, bias_sigma=3e-3):
     root = generator.normal(size=(6, 6)) * 0.4 + np.eye(6)
-    D = np.diag([2e-2 * spread] * 3 + [3e-3] * 3)
+    D = np.diag([2e-2 * spread] * 3 + [bias_sigma] * 3)
     attitude = quaternion.normalize(generator.normal(size=4))
     return State(attitude=attitude, bias=generator.normal(size=3) * 1e-3, covariance=D @ root @ root.T @ D)
 
@@ -85,10 +85,11 @@ def matrix(A, B, C):
 
 
 @pytest.mark.parametrize("sigma", [1e-7, 1e-4, 1e-2, 1.0, 20.0])
+@pytest.mark.parametrize("bias_sigma", [3e-3, 1e-9])
 @pytest.mark.parametrize("seed", range(4))
-def test_update_of_rows_is_the_kalman_update_at_fifty_digits(sigma, seed):
+def test_update_of_rows_is_the_kalman_update_at_fifty_digits(sigma, bias_sigma, seed):
     generator = np.random.default_rng(seed)
-    P = random_state(generator).covariance
+    P = random_state(generator, bias_sigma=bias_sigma).covariance
     A, B, C = blocks(P)
     H = np.zeros((2, 6))
     H[:, :3] = np.linalg.qr(generator.normal(size=(3, 3)))[0][:2]

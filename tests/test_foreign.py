@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy.stats
+from scipy.spatial.transform import Rotation
 
 from strapdown import cli, consistency, montecarlo, quaternion, recordings, report, scenarios, setup, vectors
 from strapdown.checks import InputError
@@ -354,7 +355,10 @@ def test_what_is_asked_for_is_removed(run):
 
 
 def flight_log(path, run, old=True):
-    """A log of PX4's estimator, written byte by byte: states, variances, innovations."""
+    """A log of PX4's estimator, written byte by byte: states, variances, innovations; a second instance that never turned.
+
+    Returns the attitude in PX4's axes and the variances of its quaternion.
+    """
     e = run.estimate
     stamps = np.rint(1e6 * e.time).astype(np.int64)
     number = 24 if old else 23
@@ -366,6 +370,7 @@ def flight_log(path, run, old=True):
     content = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0), ulog._message("B", bytes(40))]
     content += [ulog._message("F", f"{name}:{text}".encode()) for name, text in layouts.items()]
     content += [ulog._message("A", struct.pack("<BH", 0, k) + name.encode()) for k, name in enumerate(layouts)]
+    content.append(ulog._message("A", struct.pack("<BH", 1, 3) + b"estimator_states"))
     ned = to_ned(e.attitude)
     xi = np.stack([attitudes._quaternion_columns(q) for q in ned])
     variances = np.einsum("mqi,mij,mqj->mq", 0.5 * xi, e.covariance[:, :3, :3], 0.5 * xi)
@@ -375,17 +380,20 @@ def flight_log(path, run, old=True):
         states[:4], covariances[:4] = ned[k], variances[k] if old else 1e-4
         row = struct.pack("<QQ24f", stamp, stamp, *states) + struct.pack(f"<{number}fB", *covariances, number)
         content.append(ulog._message("D", struct.pack("<H", 0) + row))
+        level = struct.pack("<24f", 1.0, *np.zeros(23))
+        content.append(ulog._message("D", struct.pack("<H", 3) + row[:16] + level + row[16 + len(level) :]))
         if k % 10 == 0:
             values = np.append(0.1 * random.standard_normal(3), 0.02 * random.standard_normal())
             content.append(ulog._message("D", struct.pack("<HQ4f", 1, stamp, *values)))
             content.append(ulog._message("D", struct.pack("<HQ4f", 2, stamp, 0.01, 0.01, 0.01, 4e-4)))
     path.write_bytes(b"".join(content))
+    return ned, variances
 
 
 def test_a_flight_log_is_read_and_judged(run, tmp_path, monkeypatch, capsys):
     pytest.importorskip("pyulog")
     log = tmp_path / "flight.ulg"
-    flight_log(log, run)
+    ned, variances = flight_log(log, run)
     read = read_attitudes(log)
     np.testing.assert_allclose(np.abs(np.sum(read.attitude * run.estimate.attitude, axis=1)), 1.0, atol=1e-6)
     # The diagonal of the quaternion's covariance loses the correlations, not the trace: tr P_q = ¼ tr P_θ.
@@ -394,6 +402,9 @@ def test_a_flight_log_is_read_and_judged(run, tmp_path, monkeypatch, capsys):
         np.trace(run.estimate.covariance[:, :3, :3], axis1=1, axis2=2),
         rtol=0.6,
     )
+    # With V that diagonal, tr 4 Ξᵀ V Ξ = 4 Σ V_m (1 − q_m²), because Ξ Ξᵀ = I − q qᵀ.
+    exact = 4.0 * np.sum(variances * (1.0 - ned**2), axis=1)
+    np.testing.assert_allclose(np.trace(read.covariance, axis1=1, axis2=2), exact, rtol=1e-5)
     assert set(read.innovations) == {"gravity", "heading"}
     status, said, _ = command(monkeypatch, capsys, "check", log)
     assert status == 0
@@ -405,6 +416,24 @@ def test_a_flight_log_is_read_and_judged(run, tmp_path, monkeypatch, capsys):
     np.testing.assert_allclose(
         read_attitudes(log).covariance, np.tile(1e-4 * np.eye(3), (len(read.attitude), 1, 1)), rtol=1e-6
     )
+
+
+def test_a_flight_log_of_the_attitude_alone_is_turned_sorted_and_has_no_covariance(tmp_path):
+    """R from body axes to North-East-Down becomes M R from the same axes to East-North-Up."""
+    pytest.importorskip("pyulog")
+    ned = Rotation.from_rotvec(np.random.default_rng(3).standard_normal((4, 3)))
+    content = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0), ulog._message("B", bytes(40))]
+    content.append(ulog._message("F", b"vehicle_attitude:uint64_t timestamp;float[4] q;"))
+    content.append(ulog._message("A", struct.pack("<BH", 0, 0) + b"vehicle_attitude"))
+    for stamp, (x, y, z, w) in zip((7000, 3000, 5000, 5000), ned.as_quat(), strict=True):
+        content.append(ulog._message("D", struct.pack("<HQ4f", 0, stamp, w, x, y, z)))
+    (tmp_path / "flight.ulg").write_bytes(b"".join(content))
+    read = read_attitudes(tmp_path / "flight.ulg")
+    assert read.stamps_ns.tolist() == [3_000_000, 5_000_000, 7_000_000]
+    M = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
+    np.testing.assert_allclose(quaternion.to_matrix(read.attitude), M @ ned[[1, 2, 0]].as_matrix(), atol=1e-6)
+    assert read.covariance is None
+    assert read.innovations == {}
 
 
 def test_variances_of_a_quaternion_are_those_of_the_rotation_vector():
@@ -469,6 +498,10 @@ def test_odometry_and_poses_are_read_from_bags(run, tmp_path):
         np.testing.assert_allclose(read.attitude, e.attitude[:30], atol=1e-12)
         np.testing.assert_array_equal(read.covariance, np.tile(P[3:, 3:], (30, 1, 1)))
         assert read.stamps_ns[1] - read.stamps_ns[0] == 10**8
+    storage = next(one for one in folder.iterdir() if one.suffix != ".yaml")
+    storage.write_bytes(storage.read_bytes()[: storage.stat().st_size // 2])
+    with pytest.raises(InputError, match="bag cannot be read as a ROS bag"):
+        read_attitudes(folder, topic="/odometry")
 
 
 @pytest.mark.parametrize(
@@ -535,7 +568,7 @@ def test_peers_are_right_where_all_is_and_found_out_where_it_is_not():
     for right in ("AttiPy, heading's derivative mended", "GTSAM"):
         assert found.judgements[right].verdict != "not consistent"
     for wrong in ("smsfusion, noises of another sensor", "GTSAM, gyro with a bias"):
-        assert found.judgements[wrong].words.startswith("not consistent: the filter is too sure")
+        assert found.judgements[wrong].words.startswith("not consistent: the filter is optimistic")
     assert found.judgements["smsfusion, covariance read as fixed"].verdict == "not consistent"
     assert found.frame_probability["body"] > 0.99
 

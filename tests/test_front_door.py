@@ -375,6 +375,18 @@ def test_check_refuses_the_truth_of_another_record():
         sd.check(estimate, sd.simulate(scenario(5.0)).truth)
 
 
+def test_an_inverted_accelerometer_is_warned_of():
+    """What the command warns of, Python does too: at rest it reads -g upward."""
+    n = 400
+    force = np.tile([0.0, 0.0, -9.81], (n, 1)) + 0.01 * np.random.default_rng(1).standard_normal((n, 3))
+    rate = 1e-3 * np.random.default_rng(2).standard_normal((n, 3))
+    walk = sd.recordings.Recording(source="walk.csv", time=0.01 * np.arange(n), rate=rate, specific_force=force)
+    with pytest.warns(
+        UserWarning, match=r"walk.csv: at rest the accelerometer reads -9.81 m/s² along z.*invert= in Python"
+    ):
+        sd.estimate(walk)
+
+
 def test_covariance_analysis_is_that_of_the_matched_filter():
     found = sd.covariance_analysis(scenario(20.0), epochs=10)
     estimate = sd.estimate(
@@ -433,7 +445,15 @@ def test_results_print_as_short_tables():
     estimate = sd.estimate(record)
     statistics = sd.monte_carlo(scenario(30.0), runs=20, threads=1)
     samples = np.random.default_rng(1).standard_normal((2000, 3))
+    recording = sd.recordings.Recording(
+        source="walk.csv",
+        time=0.01 * np.arange(100),
+        rate=np.zeros((100, 3)),
+        specific_force=np.tile([0, 0, 9.8], (100, 1)),
+    )
     results = [
+        record,
+        recording,
         estimate,
         sd.check(estimate, record),
         statistics,
@@ -445,7 +465,8 @@ def test_results_print_as_short_tables():
     ]
     for one in results:
         lines = str(one).splitlines()
-        assert 4 < len(lines) < 30, one
+        assert 3 < len(lines) < 30, one
+        assert repr(one) == str(one)
         assert max(map(len, lines)) < 140, one
         rows = xml.etree.ElementTree.fromstring(one._repr_html_())
         widths = {len(row) for row in rows.iter("tr")}

@@ -14,6 +14,7 @@ from sims import flicker_in_filter, simulate_imu
 from strapdown import gyro, units
 from strapdown.checks import InputError
 from strapdown.gyro import GyroSpec, datasheets, flicker
+from strapdown.gyro.temperature import BiasOverTemperature
 from strapdown.kernels import gyro_errors
 from strapdown.randomness import generator
 
@@ -42,6 +43,10 @@ def test_a_perfect_gyro_measures_the_truth():
 
 def test_rate_form_with_every_deterministic_term():
     rate, force = np.array([0.3, -0.2, 0.1]), np.array([1.0, 2.0, 9.0])
+    slope = np.array([1e-5, 2e-5, -1e-5])
+    warm = BiasOverTemperature(
+        reference=0.0, span=(-1e3, 1e3), coefficients=np.stack([np.zeros(3), slope]), sigma=np.zeros((2, 3))
+    )
     spec = GyroSpec(
         turn_on_bias=[1e-3, 2e-3, 3e-3],
         rate_ramp=[1e-4, 0.0, -2e-4],
@@ -49,7 +54,7 @@ def test_rate_form_with_every_deterministic_term():
         asymmetry=[1e-4, -2e-4, 3e-4],
         misalignment=[[0.0, 1e-3, 2e-3], [3e-3, 0.0, 4e-3], [5e-3, 6e-3, 0.0]],
         g_sensitivity=RNG.normal(size=(3, 3)) * 1e-5,
-        temperature_coefficient=[1e-5, 2e-5, -1e-5],
+        temperature=warm,
     )
     dt = RNG.uniform(0.01, 0.5, 600)
     edges = edges_of(dt)
@@ -57,10 +62,10 @@ def test_rate_form_with_every_deterministic_term():
     output = simulate(spec, rate * dt[:, None], edges, specific_force=np.tile(force, (600, 1)), temperature=temperature)
     matrix = np.eye(3) + np.array([[1e-3, 1e-3, 2e-3], [3e-3, 2e-3, 4e-3], [5e-3, 6e-3, -1e-3]])
     middle = 0.5 * (edges[1:] + edges[:-1])[:, None]
-    drift = spec.turn_on_bias + spec.rate_ramp * middle + spec.temperature_coefficient * 0.3 * middle
+    drift = spec.turn_on_bias + spec.rate_ramp * middle + slope * 0.3 * middle
     wanted = matrix @ rate + spec.asymmetry * np.abs(rate) + spec.g_sensitivity @ force + drift
     np.testing.assert_allclose(output.rates, wanted, rtol=1e-11)
-    bias = spec.turn_on_bias + (spec.rate_ramp + 0.3 * spec.temperature_coefficient) * edges[:, None]
+    bias = spec.turn_on_bias + (spec.rate_ramp + 0.3 * slope) * edges[:, None]
     np.testing.assert_allclose(output.bias, bias, rtol=1e-12, atol=1e-18)
 
 
@@ -68,7 +73,13 @@ def test_missing_specific_force_or_temperature_is_refused():
     with pytest.raises(InputError, match="specific_force"):
         simulate(GyroSpec(g_sensitivity=np.eye(3)))
     with pytest.raises(InputError, match="temperature"):
-        simulate(GyroSpec(temperature_coefficient=[1.0, 0.0, 0.0]))
+        simulate(
+            GyroSpec(
+                temperature=BiasOverTemperature(
+                    reference=0.0, span=(0.0, 1.0), coefficients=np.ones((2, 3)), sigma=np.zeros((2, 3))
+                )
+            )
+        )
 
 
 def test_saturation_clips_the_rate():

@@ -19,6 +19,7 @@ DIALECT = {
     r"\bchallengers?\b": "restart candidate",
     r"\b_?(LEAST|MOST)_[A-Z]": "MIN_, MAX_",
     r"\b(has|have) seen\b": "the measurements so far",
+    r"as good as (it|they) says?\b|too sure\b|too modest\b|says? of (itself|themselves)\b": "consistent, optimistic, pessimistic",
     r"\b[Ss]ource document\b": "Quaternion differentiation",
 }
 
@@ -38,7 +39,16 @@ def test_prose_and_names_are_the_fields():
 
 
 @pytest.mark.parametrize(
-    "text", ["the filter is told", "M_told", "what it believes", "is taken in", "by so much", "LEAST_SIGMA = 1"]
+    "text",
+    [
+        "the filter is told",
+        "M_told",
+        "what it believes",
+        "is taken in",
+        "by so much",
+        "LEAST_SIGMA = 1",
+        "too sure of itself",
+    ],
 )
 def test_the_dialect_is_recognised(text):
     assert dialect(text)

@@ -3,15 +3,16 @@
 import functools
 from dataclasses import replace
 
+import in_steps
 import numpy as np
 import pytest
+from gated_steps import GatedStepFilter
 
 from strapdown import consistency, estimation, montecarlo, motion, quaternion
 from strapdown.checks import InputError
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.schedule import schedule
 from strapdown.estimation.states import ProcessNoise, initial_state
-from strapdown.estimation.step_filter import StepFilter
 from strapdown.gyro import GyroSpec
 from strapdown.randomness import generator
 from strapdown.recordings import recordfiles
@@ -111,32 +112,20 @@ OPTIONS = {
 }
 
 
-def stepped(record, initial, look_back=0.0, arrivals=None, **options):
-    """Run the step face over a record in a plain loop; ``arrivals`` (series, sample): when each measurement is handed over."""
-    f = StepFilter(NOISE, initial, time=record.time[0], look_back=look_back, **options)
-    events = sorted(
-        (arrivals[i][k] if arrivals else t, t, i, k) for i, s in enumerate(record.vectors) for k, t in enumerate(s.time)
-    )
+def stepped(record, initial, **options):
+    """Run the step face over a record in a plain loop."""
+    f = GatedStepFilter(NOISE, initial, time=record.time[0], **options)
+    events = sorted((t, i, k) for i, s in enumerate(record.vectors) for k, t in enumerate(s.time))
     out, results = [], []
-
-    def give(series, k, time):
-        noise = {"covariance": series.covariances[k]} if series.kind != "heading" else {"sigma": series.sigma[k]}
-        common = {"sensor": series.sensor, "time": time, **noise}
-        if series.kind == "attitude":
-            results.append(f.update_attitude(series.attitude[k], **common))
-        else:
-            update = {"direction": f.update_direction, "vector": f.update_vector, "heading": f.update_heading}
-            results.append(update[series.kind](series.vector_b[k], series.references_f[k], **common))
-
     for n, delta in enumerate(record.increments):
         now, end = record.time[n], record.time[n + 1]
         whole = end - now
         while events and events[0][0] <= end:
-            handed, t, i, k = events.pop(0)
-            if handed > now:
-                f.predict(delta * ((handed - now) / whole), handed - now)
-                now = handed
-            give(record.vectors[i], k, None if t == handed else t)
+            t, i, k = events.pop(0)
+            if t > now:
+                f.predict(delta * ((t - now) / whole), t - now)
+                now = t
+            results.append(in_steps.update(f, record.vectors[i], k))
         if end > now:
             f.predict(delta * ((end - now) / whole), end - now)
         out.append((f.attitude, f.bias, f.P))
@@ -303,49 +292,9 @@ def test_both_faces_restart_and_report_lock_outs_alike(case):
         assert (mine.start, mine.end, mine.value) == pytest.approx((other.start, other.end, other.value))
 
 
-@pytest.mark.parametrize("option", ["plain", "gate, Student", "lost"])
-def test_late_measurements_equal_the_filter_that_had_them_in_order(option):
-    """Each sensor with its own latency, which vary; the order of arrival is not that of time."""
-    record = simulate(scenario(SCHEDULES["asynchronous"](sensors()["direction"]), duration=2.0), 5)
-    given, start = OPTIONS["gate, Student"][0], near(record)
-    if option == "plain":
-        given = {}
-    elif option == "lost":
-        given, start = {"gate": Gate(recovery=4)}, near(record, error=(1.0, 0.5, -1.0))
-    draw = generator(3, 0, "latency")
-    arrivals = [s.time + draw.uniform(0.0, 0.2, len(s.time)) for s in record.vectors]
-    end = record.time[-1]
-    kept = [arrival <= end for arrival in arrivals]
-    record = replace(record, vectors=tuple(s.taken(k) for s, k in zip(record.vectors, kept, strict=True)))
-    arrivals = [arrival[k] for arrival, k in zip(arrivals, kept, strict=True)]
-    ordered, (attitude, bias, P), _ = stepped(record, start, **given)
-    late, (attitude_late, bias_late, P_late), _ = stepped(record, start, look_back=0.25, arrivals=arrivals, **given)
-    assert late.late == 0
-    assert late.refused == ordered.refused
-    assert [event.kind for event in late.events] == [event.kind for event in ordered.events]
-    d = np.sqrt(np.diag(P[-1]))
-    assert quaternion.angle_between(attitude_late[-1], attitude[-1]) < 1e-12
-    assert np.abs(bias_late[-1] - bias[-1]).max() < 1e-12
-    assert np.abs((P_late[-1] - P[-1]) / np.outer(d, d)).max() < 1e-12
-    assert not np.allclose(attitude_late[20], attitude[20], rtol=0.0, atol=1e-12)  # before they came, it did not know
-    estimate = estimation.run(record, NOISE, start, full_covariance=True, **given)
-    assert quaternion.angle_between(estimate.attitude[-1], attitude_late[-1]) < 1e-10
-
-
-def test_what_comes_later_than_the_look_back_is_refused_and_counted():
-    record = simulate(scenario(sensors(Faults())["direction"], duration=1.0), 5)
-    f, _, taken = stepped(
-        record, near(record), look_back=0.05, arrivals=[np.minimum(s.time + 0.1, 1.0) for s in record.vectors]
-    )
-    assert f.late == sum(not one for one in taken)
-    assert f.late == 2 * 9  # the last of each comes at once
-    with pytest.raises(InputError, match="predict up to it first"):
-        f.update_direction([1.0, 0.0, 0.0], [1.0, 0.0, 0.0], 1e-3, time=2.0)
-
-
 def test_a_repeated_gyro_sample_changes_nothing_and_is_counted():
     record = simulate(scenario((), duration=0.1), 5)
-    f = StepFilter(NOISE, near(record))
+    f = GatedStepFilter(NOISE, near(record))
     f.predict(record.increments[0], 0.02)
     attitude, P = f.attitude.copy(), f.P.copy()
     f.predict(record.increments[0], 0.0)

@@ -399,7 +399,7 @@ def test_the_command_resumes_extends_and_shows(command):
 def test_the_command_gives_the_filter_states_where_asked(command, tmp_path):
     status, said, error = command("short.toml", "--runs", 2, "--states")
     assert status == 2, error
-    assert "drawn anew for each run are not among the lanes' terms" in said
+    assert "lanes do not cover gyro and sensors drawn anew for each run" in said
     held = campaign.read(tmp_path / "short-montecarlo.h5")
     assert held.plan.individuals
     assert held.plan.setup.states is not None

@@ -261,14 +261,41 @@ def test_summary_of_a_right_filter_and_of_a_wrong_one():
     assert not montecarlo.summary(wrong)["consistent"]
 
 
-def test_summary_bounds_hold_for_all_tests_together():
-    """The level of each of the five tests, spent over its epochs, adds up to what is asked for."""
-    summary = montecarlo.summary(scalar.run_chunk(PLAN, 0, 3), epochs=np.array([2, 4]), probability=0.95)
-    single = 1.0 - 0.05 / 5.0
-    low, high = scipy.stats.chi2.ppf([0.25 * (1.0 - single), 1.0 - 0.25 * (1.0 - single)], 9) / 9.0
+def test_summary_bounds_are_those_that_decide():
+    """The level is shared by the ten tests of the verdict, none of which rejects, and within each by its two epochs."""
+    sums, epochs = scalar.run_chunk(PLAN, 0, 3), np.array([2, 4])
+    summary = montecarlo.summary(sums, epochs=epochs, probability=0.95)
+    judgement = consistency.judge_runs(sums, epochs=epochs, probability=0.95)
+    assert len(judgement.findings) == 10
+    assert not any(one.rejected for one in judgement.findings)
+    single = 0.05 / 10.0
+    low, high = scipy.stats.chi2.ppf([0.25 * single, 1.0 - 0.25 * single], 9) / 9.0
     assert np.allclose(summary["nees"]["bias"]["bounds"], [low, high], rtol=1e-12)
-    low, high = scipy.stats.chi2.ppf([0.5 * (1.0 - single), 1.0 - 0.5 * (1.0 - single)], 6) / 6.0
+    low, high = scipy.stats.chi2.ppf([0.5 * single, 1.0 - 0.5 * single], 6) / 6.0
     assert np.allclose(summary["nis"][1]["bounds"], [low, high], rtol=1e-12)
+
+
+def test_summary_and_verdict_agree_where_holm_is_sharper_than_bonferroni():
+    """With nine of ten tests rejected the last has the whole level: an ANEES that Bonferroni passes is rejected, and shown outside."""
+    sums = scalar.run_chunk(PLAN, 0, 3)
+    epochs = np.array([4])
+    low = (
+        scipy.stats.chi2.ppf(0.5 * 0.05 / 4.0, 9) / 9.0
+    )  # between the bounds of one of five tests and those of one of few
+    nees = sums.nees_sum.copy()
+    nees[4] = 18.0 * 50.0, 9.0 * 0.9 * low, 9.0 * 50.0
+    odd = replace(sums, nees_sum=nees, sensor_nis_sum=50.0 * sums.sensor_nis_sum, log_nees_sum=sums.log_nees_sum + 30.0)
+    summary = montecarlo.summary(odd, epochs=epochs, probability=0.95)
+    found = {
+        one.of: one
+        for one in consistency.judge_runs(odd, epochs=epochs, probability=0.95).findings
+        if one.name == "ANEES"
+    }
+    assert found["attitude"].rejected
+    for subset, part in summary["nees"].items():
+        assert part["consistent"] == (not found[subset].rejected)
+        assert part["bounds"] == [found[subset].low, found[subset].high]
+        assert part["epochs_outside"] == int(found[subset].rejected)
 
 
 def test_summary_takes_coverage_over_the_judged_epochs():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from dataclasses import replace
 
@@ -12,8 +13,9 @@ import pytest
 from strapdown import allan, gyro, recordings, records, scenarios
 from strapdown.allan import parameters as noise_parameters
 from strapdown.checks import InputError
+from strapdown.gyro.temperature import from_table
 from strapdown.recordings import Recording, gyro_temperature
-from strapdown.units import DEGREE_PER_ROOT_HOUR, STANDARD_GRAVITY
+from strapdown.units import DEGREE_PER_HOUR, DEGREE_PER_ROOT_HOUR, STANDARD_GRAVITY
 
 DT = 0.01
 GYRO = (2e-4, 2e-4)
@@ -184,7 +186,7 @@ def test_temperature_is_regressed_out_and_written(run, tmp_path):
     status, said, error = run("allan", "warm.csv", "--temperature", 1)
     assert status == 0, error
     assert "Bias over temperature" in said
-    table = tomllib.loads((tmp_path / "allan-results" / "gyro-temperature.toml").read_text())["gyro"]
+    table = tomllib.loads((tmp_path / "allan-results" / "gyro-temperature.toml").read_text())["gyro"]["temperature"]
     slope, sigma = np.array(table["bias_rad_per_s_per_k"]), np.array(table["sigma_rad_per_s_per_k"])
     assert (np.abs(slope - [2e-3, -2e-3, 0.0]) < 4.0 * sigma).all()
     assert abs(table["reference_degc"] - T.mean()) < 1e-9
@@ -206,16 +208,23 @@ def test_the_bias_over_temperature_is_subtracted_and_its_error_becomes_a_walk():
     given |= {"bias_rad_per_s": [0.1, 0.2, 0.3], "bias_rad_per_s_per_k": [1e-2, 0.0, 0.0]}
     given |= {"bias_rad_per_s_per_k2": [0.0, 1e-3, 0.0]}
     given |= {"sigma_rad_per_s_per_k": [0.0, 0.0, 2e-4], "sigma_rad_per_s_per_k2": [0.0, 0.0, 0.0]}
-    found, walk = gyro_temperature._from_table(given, "file: gyro").applied(warm)
+    table = from_table(given, "file: gyro")
+    found, walk = gyro_temperature.applied(warm, table), table.walk(T, time)
     held = np.minimum(T, 27.0) - 25.0  # beyond the table's range the bias at its end
     expected = 1.0 - np.stack([0.1 + 1e-2 * held, 0.2 + 1e-3 * held**2, np.full(101, 0.3)], axis=1)
     np.testing.assert_allclose(found.rate, expected, rtol=0, atol=1e-15)
     assert walk == pytest.approx(2e-4 * rise * np.sqrt(60.0), rel=1e-12)  # 3 K, which it takes 60 s for
     assert "40 samples are beyond 20 to 27 °C" in found.remarks[-1]
-    with pytest.raises(InputError, match="warm has no temperature for every sample"):
-        gyro_temperature._from_table(given, "file: gyro").applied(replace(warm, temperature=None))
+    np.testing.assert_allclose(table.slope_sigma, [0.0, 0.0, 2e-4])
+    # A thermometer that is slower than the gyro: between its samples the line.
+    slow = np.where(np.arange(101) % 10 == 0, T, np.nan)
+    np.testing.assert_allclose(
+        gyro_temperature.applied(replace(warm, temperature=slow), table).rate, expected, atol=1e-15
+    )
+    with pytest.raises(InputError, match="warm has no temperature, over which"):
+        gyro_temperature.applied(replace(warm, temperature=None), table)
     with pytest.raises(InputError, match="file: gyro lacks bias_rad_per_s"):
-        gyro_temperature._from_table({k: v for k, v in given.items() if k != "bias_rad_per_s"}, "file: gyro")
+        from_table({k: v for k, v in given.items() if k != "bias_rad_per_s"}, "file: gyro")
 
 
 def test_estimate_reads_the_table_that_allan_writes(run, tmp_path):
@@ -227,7 +236,7 @@ def test_estimate_reads_the_table_that_allan_writes(run, tmp_path):
         recordings.write(replace(whole, rate=whole.rate + bias, temperature=T), tmp_path / f"{name}.csv")
     assert run("allan", "first.csv", "--temperature", 1)[0] == 0
     path = tmp_path / "allan-results" / "gyro-temperature.toml"
-    table = tomllib.loads(path.read_text())["gyro"]
+    table = tomllib.loads(path.read_text())["gyro"]["temperature"]
     status, said, error = run("estimate", "second.csv", "--temperature", path, "--out", "second")
     assert (status, "bias over temperature is subtracted" in said) == (0, True), error
     assert run("estimate", "without.csv", "--out", "without")[0] == 0
@@ -239,33 +248,120 @@ def test_estimate_reads_the_table_that_allan_writes(run, tmp_path):
     assert reach.max() < 1e-3  # less than half the slope that was subtracted
 
 
-def through_a_bag(folder, seed: int, duration: float) -> list[bool]:
-    """Return, axis by axis and for N and K, whether the interval of a simulated gyro that went through a ROS 2 bag holds the truth."""
-    N, K = 1e-3, 2e-3
-    scenario = scenarios.Scenario(
-        motion=scenarios.load_scenario("rest").motion,
-        gyro=gyro.GyroSpec(angle_random_walk=N, rate_random_walk=K),
-        sensors=(),
-        rate=100.0,
-        duration=duration,
-    )
+def test_a_simulated_unit_goes_through_allan_and_its_table_into_the_filter(run, tmp_path):
+    """Round trip: the scenario's polynomial lies inside the intervals, and the filter that reads the table finds the turn-on bias."""
+    rest = """
+    rate_hz = 100.0
+    duration_s = {duration}
+    motion.type = "rest"
+    gyro.angle_random_walk_deg_per_sqrt_hour = 0.3
+    gyro.turn_on_bias_deg_per_hour = {bias}
+    [gyro.temperature]
+    reference_degc = 30.0
+    lowest_degc = 10.0
+    highest_degc = 50.0
+    bias_rad_per_s = [0.0, 0.0, 0.0]
+    bias_rad_per_s_per_k = [2e-4, -1e-4, 0.0]
+    sigma_rad_per_s_per_k = [0.0, 0.0, 0.0]
+    bias_rad_per_s_per_k2 = [0.0, 4e-6, 0.0]
+    sigma_rad_per_s_per_k2 = [0.0, 0.0, 0.0]
+    [temperature]
+    start_degc = {start}
+    end_degc = {end}
+    time_constant_s = 60.0
+    [[sensors]]
+    type = "accelerometer"
+    name = "accelerometer"
+    rate_hz = 100.0
+    kind = "vector"
+    sigma_m_per_s2 = 0.01
+    """
+    (tmp_path / "lab.toml").write_text(rest.format(duration=300.0, bias=[0.0] * 3, start=20.0, end=40.0))
+    (tmp_path / "use.toml").write_text(rest.format(duration=60.0, bias=[360.0, 0.0, -360.0], start=38.0, end=22.0))
+    for name in ("lab", "use"):
+        assert run("simulate", f"{name}.toml")[0] == 0
+    status, _, error = run("allan", "lab.h5", "--temperature", 2)
+    assert status == 0, error
+    path = tmp_path / "allan-results" / "gyro-temperature.toml"
+    found = tomllib.loads(path.read_text())["gyro"]["temperature"]
+    T0 = found["reference_degc"] - 30.0
+    for key, truth in (("k", [2e-4, -1e-4 + 8e-6 * T0, 0.0]), ("k2", [0.0, 4e-6, 0.0])):
+        off = np.array(found[f"bias_rad_per_s_per_{key}"]) - truth
+        assert (np.abs(off) < 4.0 * np.array(found[f"sigma_rad_per_s_per_{key}"])).all()
+    text = (tmp_path / "allan-results" / "gyro.toml").read_text()
+    both = tomllib.loads(text + path.read_text())["gyro"]  # the two files in one are a gyro's table
+    assert gyro.from_table(both).temperature.span == (found["lowest_degc"], found["highest_degc"])
+    assert run("convert", "use.h5", "use.db3")[0] == 0
+    status, _, error = run("estimate", "use.db3", "--temperature", path)
+    assert status == 0, error
+    estimate = records.read_estimate(tmp_path / "estimate-results" / "estimate.h5")
+    slope = records.read_states(tmp_path / "estimate-results" / "estimate.h5")["gyro temperature"]
+    assert (slope.sigma[0] < 1e-4).all()
+    # About the two level axes, which the accelerometer shows: the bias at turn-on, and c_0 has no interval.
+    error = np.abs(estimate.bias[-1] - np.array([360.0, 0.0, -360.0]) * DEGREE_PER_HOUR)
+    assert (error < 4.0 * estimate.sigma[-1, 3:])[:2].all()
+    assert estimate.sigma[-1, 3] < 5e-4
+
+
+def through_a_bag(folder, seed: int, duration: float) -> tuple[list[bool], list[bool]]:
+    """Return whether the intervals of a simulated unit that went through a ROS 2 bag hold the truth: by axis, and those of imu.yaml."""
+    truth = {"gyro": (1e-3, 2e-3), "accelerometer": (2e-3, 5e-3)}  # N and K
+    units = [
+        scenarios.Scenario(
+            motion=scenarios.load_scenario("rest").motion,
+            gyro=gyro.GyroSpec(angle_random_walk=N, rate_random_walk=K),
+            sensors=(),
+            rate=100.0,
+            duration=duration,
+        )
+        for N, K in truth.values()
+    ]
+    # An accelerometer's two noises are those of a gyro, in its own unit.
+    turning, pulling = (recordings.from_record(scenarios.simulate(unit, 2 * seed + k)) for k, unit in enumerate(units))
     path = folder / f"{seed}.mcap"
-    recordings.write(scenarios.simulate(scenario, seed), path)
-    samples = recordings.read_samples(path, "gyro")
-    fit = allan.fit_noise(samples.values, samples.sample_interval, terms=("angle_random_walk", "rate_random_walk"))
+    recordings.write(replace(turning, specific_force=pulling.rate + np.array([0.0, 0.0, STANDARD_GRAVITY])), path)
+    fits, axes, numbers = {}, [], []
+    for sensor in truth:
+        samples = recordings.read_samples(path, sensor)
+        terms = ("angle_random_walk", "rate_random_walk")
+        fits[sensor] = allan.fit_noise(samples.values, samples.sample_interval, terms=terms)
     path.unlink()
-    return [bool(fit.lower[k, i] <= truth <= fit.upper[k, i]) for i, truth in enumerate((N, K)) for k in range(3)]
+    text = noise_parameters.to_kalibr(fits)
+    for (sensor, fit), own in zip(fits.items(), ("gyroscope", "accelerometer"), strict=True):
+        for i, (name, value) in enumerate(zip(("noise_density", "random_walk"), truth[sensor], strict=True)):
+            axes += [bool(fit.lower[k, i] <= value <= fit.upper[k, i]) for k in range(3)]
+            low, high = re.search(rf"{own}_{name}: .* 95 % interval (\S+) to (\S+)\n", text).groups()
+            numbers.append(float(low) <= value <= float(high))
+    return axes, numbers
 
 
-def test_a_simulated_gyro_through_a_bag_is_found_again(tmp_path):
+def test_a_simulated_unit_through_a_bag_is_found_again(tmp_path):
     pytest.importorskip("rosbags", reason="rosbags is not installed: pip install 'strapdown[formats]'")
-    inside = np.array([through_a_bag(tmp_path, seed, 30.0) for seed in range(8)])
-    assert 40 <= inside.sum() <= 48  # of 48 at 95 %: 45.6, σ 1.5
+    axes, numbers = zip(*(through_a_bag(tmp_path, seed, 30.0) for seed in range(5)), strict=True)
+    assert 51 <= np.sum(axes) <= 60  # of 60 at 95 %: 57, σ 1.7
+    assert 16 <= np.sum(numbers) <= 20
 
 
 @pytest.mark.slow
-def test_a_simulated_gyro_through_a_bag_is_covered(tmp_path):
-    """200 runs of three axes and two coefficients: 95 ± 2 %."""
+def test_a_simulated_unit_through_a_bag_is_covered(tmp_path):
+    """200 runs of gyro and accelerometer with two coefficients each, of the axes and of imu.yaml: 95 ± 2 %."""
     pytest.importorskip("rosbags", reason="rosbags is not installed: pip install 'strapdown[formats]'")
-    inside = np.array([through_a_bag(tmp_path, seed, 30.0) for seed in range(200)])
-    assert 0.93 <= inside.mean() <= 0.97
+    for inside in zip(*(through_a_bag(tmp_path, seed, 30.0) for seed in range(200)), strict=True):
+        assert 0.93 <= np.mean(inside) <= 0.97
+
+
+@pytest.mark.parametrize("others", [1.0, 0.2], ids=["axes alike", "one much larger"])
+@pytest.mark.parametrize("axes", [1, 3])
+def test_the_interval_of_the_largest_axis_covers_it(axes, others):
+    """Estimates that are log-normal about the truth, σ 5 %, as their intervals say: 5,000 of them."""
+    truth = np.array([2.0, *[2.0 * others] * (axes - 1)])
+    draws = np.random.default_rng(5).standard_normal((5_000, axes))
+    one = allan.fit_noise(draws[:500], 0.01, terms=("angle_random_walk",))
+    estimate = truth * np.exp(0.05 * draws)
+    reach = np.exp(0.05 * 1.959964)
+    inside = []
+    for row in estimate:
+        fit = replace(one, estimate=row[:, None], lower=row[:, None] / reach, upper=row[:, None] * reach)
+        low, high = noise_parameters.largest_interval(fit, "angle_random_walk")
+        inside.append(low <= 2.0 <= high)
+    assert abs(np.mean(inside) - 0.95) < 4.0 * np.sqrt(0.95 * 0.05 / 5_000)

@@ -68,7 +68,7 @@ def test_derived_orders_are_those_that_the_catalogue_claims_and_checks():
 OWN = [Algorithm.from_coefficients("own", c) for c in ([], ["1/2"], ["2/3"], ["9/20", "27/20"], ["1/20", "27/20"])]
 
 
-@pytest.mark.parametrize(("own", "order"), zip([*OWN, MILLER], (2, 2, 4, 3, 2, 4), strict=True))
+@pytest.mark.parametrize(("own", "order"), list(zip([*OWN, MILLER], (2, 2, 4, 3, 2, 4), strict=True)))
 def test_the_order_of_convergence_shows_over_a_manoeuvre(own, order):
     """Halving the sample interval divides the error by 2 to the order: three axes at once, the truth by the Taylor series."""
     path = coning_study.MANOEUVRES["three axes at once"]

@@ -1,5 +1,6 @@
 """The README's code runs as it stands there."""
 
+import json
 import re
 from pathlib import Path
 
@@ -30,6 +31,29 @@ def write_walk(path):
     )
     np.savetxt(path, rows, delimiter=",", header="time,gx,gy,gz,ax,ay,az", comments="")
     return angle
+
+
+def test_the_table_of_recordings_is_that_of_the_validation_page():
+    """Total and inclination of the same data file, to the digits printed."""
+    data = README.parent / "docs" / "_data" / "validation.json"
+    broad = json.loads(data.read_text(encoding="utf-8"))["broad"]
+    rows = {
+        "`estimate`": "strapdown",
+        "`estimate --smooth`": "strapdown, smoother",
+        "VQF 9D": "VQF",
+        "offline VQF": "offline VQF",
+    }
+    text = README.read_text(encoding="utf-8")
+    for words, name in rows.items():
+        (row,) = re.findall(rf"^\| {re.escape(words)} \| (.*) / (.*) \| (.*) / (.*) \|$", text, re.MULTILINE)
+        found = [broad["errors_deg"][treatment][name] for treatment in ("as recorded", "compensated")]
+        assert row == tuple(
+            f"{angle:.{digits}f}" for total, _, tilt in found for angle, digits in ((total, 1), (tilt, 2))
+        )
+    means = [100.0 * broad["coverage"][name]["mean"][2] for name in ("strapdown", "strapdown, smoother")]
+    least = 100.0 * min(one["least"][2] for one in broad["coverage"].values())
+    words = "hold the inclination in {:.0f} % of the movement (smoothed {:.0f} %), in no trial less than {:.0f} %"
+    assert words.format(*means, least) in " ".join(text.split())
 
 
 def test_the_code_of_the_readme_runs(blocks, tmp_path, monkeypatch, capsys):

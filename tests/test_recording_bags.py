@@ -155,6 +155,16 @@ def test_headers_without_stamps_and_stamps_out_of_order_are_said(bag):
     )
 
 
+def test_equal_stamps_are_not_out_of_order(bag):
+    """Of a gyro they are refused, by their own name; of a magnetometer the sample is taken."""
+    _, content = imu()
+    field = [("/imu/mag", "MagneticField", START + 5_000_001 * k, "m", [1e-5, 0, 0]) for k in (1, 2, 2, 3)]
+    assert not any("sorted" in remark for remark in read(bag("mcap", content + field)).remarks)
+    content[2] = (*content[2][:2], content[1][2], *content[2][3:])
+    with pytest.raises(InputError, match=r"time\[2\] repeats"):
+        read(bag("mcap", content, name="again"))
+
+
 def test_bags_without_an_inertial_unit_and_what_is_no_bag_are_refused(bag, tmp_path):
     with pytest.raises(InputError, match=r"holds no message of sensor_msgs/msg/Imu; give a bag"):
         read(bag("bag", [("/chatter", "String", START, "", "x")]))
@@ -191,6 +201,18 @@ def test_a_folder_whose_recorder_was_killed_is_read_from_its_files(bag):
     recording = read(path)
     np.testing.assert_array_equal(recording.rate, values[:, :3])
     assert "has no metadata.yaml" in " ".join(recording.remarks)
+
+
+def test_a_truncated_bag_in_a_renamed_folder_gives_what_is_whole(bag, tmp_path):
+    values, content = imu(2000)
+    folder = bag("folder", content).rename(tmp_path / "renamed")
+    (file,) = folder.glob("*.mcap")
+    assert file.stem != "renamed"
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    recording = read(folder)
+    assert 800 < len(recording.time) < 1200
+    np.testing.assert_array_equal(recording.rate, values[: len(recording.time), :3])
+    assert "truncated or damaged" in " ".join(recording.remarks)
 
 
 def test_a_folder_of_several_bags_is_none(bag, tmp_path):

@@ -40,6 +40,8 @@ HEADERS = {
     "ros": "time,angular_velocity.x [°/s],angular_velocity.y,angular_velocity.z,linear_acceleration.x [g],linear_acceleration.y,"
     "linear_acceleration.z,magnetic_field.x [uT],magnetic_field.y,magnetic_field.z",
     "imu prefix": "Time [s],imu_gyro_x [dps],imu_gyro_y,imu_gyro_z,imu_acc_x [g],imu_acc_y,imu_acc_z,imu_mag_x [uT],imu_mag_y,imu_mag_z",
+    "logger": "loggingTime(s),gyroRotationX(deg/s),gyroRotationY(deg/s),gyroRotationZ(deg/s),accelerometerAccelerationX(G),"
+    "accelerometerAccelerationY(G),accelerometerAccelerationZ(G),magnetometerX(µT),magnetometerY(µT),magnetometerZ(µT)",
     "joined": "seconds_elapsed,wx [deg/s],wy,wz,accx [g],accy,accz,magx [uT],magy,magz",
 }
 
@@ -177,6 +179,17 @@ def test_a_time_may_be_a_date(tmp_path):
     path.write_text(path.read_text().replace("2024-03-01 12", "2024-13-01 12"))
     with pytest.raises(InputError, match=r"data row 3, column timestamp is '2024-13-01 12:00:00.020250', not a number"):
         read(path)
+
+
+def test_milliseconds_since_1970_keep_every_nanosecond(table):
+    """Doubles of this size are 64 ns apart in seconds, 256 in nanoseconds; the product is taken in integers."""
+    stamps = 1_763_850_000_009 + np.array([0, 10, 21])
+    path = table("Time since start in ms,wx [dps],wy,wz")
+    rows = [f"{stamp},1,2,3" for stamp in stamps]
+    path.write_text("\n".join([path.read_text().splitlines()[0], *rows]) + "\n", encoding="utf-8")
+    recording = read(path)
+    assert recording.epoch_ns == 1_763_850_000_009_000_000
+    np.testing.assert_allclose(recording.time, [0.0, 0.01, 0.021], rtol=1e-15)
 
 
 def test_columns_that_nobody_asks_for_may_hold_anything(table, tmp_path):

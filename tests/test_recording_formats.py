@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import types
 from dataclasses import replace
 
 import h5py
@@ -11,6 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 from typer.testing import CliRunner
 
+import strapdown as sd
 from strapdown import quaternion, recordings
 from strapdown.checks import InputError
 from strapdown.cli import app
@@ -101,6 +103,7 @@ def test_a_data_frame_is_a_recording():
     assert recording.epoch_ns == 1_709_294_400 * 10**9
     assert recording.magnetic_field[:, 0].tolist()[::2] == [1.0, 3.0]
     assert np.isnan(recording.magnetic_field[1, 0])
+    np.testing.assert_array_equal(sd.read(frame, units={"magnetometer": "uT"}).rate, recording.rate)
     with pytest.raises(InputError, match=r"frame: .*lacks gy"):
         recordings.from_table(frame.drop(columns="gy"), source="frame")
     frame["gx [dps]"] = ["fast", "slow", "still"]
@@ -119,6 +122,7 @@ def test_a_dataset_is_a_recording():
         },
         coords={"time": ("time", [10, 20, 30, 40], {"units": "ms"}), "axis": ["x", "y", "z"]},
     )
+    assert sd.read(dataset).time[-1] == 0.04
     recording = recordings.from_table(dataset)
     np.testing.assert_allclose(recording.time, [0.01, 0.02, 0.03, 0.04], rtol=1e-15)
     np.testing.assert_allclose(recording.rate, np.radians(values), rtol=1e-15)
@@ -128,6 +132,9 @@ def test_a_dataset_is_a_recording():
 def test_arrays_by_name_are_a_recording():
     columns = {"time": np.arange(3.0), "gx": [1, 2, 3], "gy": np.zeros(3), "gz": np.zeros(3)}
     assert recordings.from_table(columns, units={"gyro": "rad/s"}).rate[2, 0] == 3.0
+    assert sd.read(columns, units={"gyro": "rad/s"}).rate[2, 0] == 3.0
+    with pytest.raises(InputError, match=r"path is 3, .*give a path, a DataFrame"):
+        sd.read(3)
     with pytest.raises(InputError, match=r"table: column gz has shape \(2,\), the first \(3,\)"):
         recordings.from_table({**columns, "gz": np.zeros(2)}, units={"gyro": "rad/s"})
 
@@ -173,14 +180,29 @@ def test_the_library_reads_the_attitude_as_px4_has_it(ulog):
 def test_a_truncated_flight_log_gives_what_is_whole(ulog):
     path, whole = ulog
     content = path.read_bytes()
+    assert "truncated" not in " ".join(read(path).remarks)
     path.write_bytes(content[: int(0.7 * len(content))])
     recording = read(path)
     n = len(recording.time)
     assert 30 < n < 50
+    assert "theirs.ulg is truncated: read is what is whole." in recording.remarks
     np.testing.assert_array_equal(recording.rate, whole.rate[:n])
     path.write_bytes(content[:200])
     with pytest.raises(InputError, match=r"theirs.ulg (holds no message of sensor_combined|cannot be read)"):
         read(path)
+
+
+def test_the_end_of_a_long_flight_log_shows_whether_it_is_whole(ulog, monkeypatch):
+    """From anywhere in the file: messages that fit each other lead to its end, or beyond."""
+    from strapdown.recordings import ulog as reader
+
+    path, _ = ulog
+    content = path.read_bytes()
+    for tail in (700, 1500, 10**6):
+        monkeypatch.setattr(reader, "TAIL", tail)
+        for cut in (0, 1, 2, 3, 20):
+            path.write_bytes(content[: len(content) - cut])
+            assert reader._is_cut(path) == (cut > 0)
 
 
 def test_what_a_flight_log_cannot_hold_is_refused(tmp_path):
@@ -245,6 +267,15 @@ def test_a_cameras_log_is_read(tmp_path):
     (tmp_path / "none.mp4").write_bytes(b"\0\0\0\x18ftypmp42" + bytes(200))
     with pytest.raises(InputError, match=r"none.mp4 (cannot be read by telemetry-parser|.*holds no gyro samples)"):
         read(tmp_path / "none.mp4")
+
+
+@pytest.mark.parametrize("rows", [[], [{"timestamp_ms": 0.0, "gyro": [1, 2, 3]}], [{"timestamp_ms": 0.0}] * 3])
+def test_a_cameras_log_without_gyro_samples_is_refused(tmp_path, monkeypatch, rows):
+    parser = types.SimpleNamespace(camera="GoPro", model="H9", normalized_imu=lambda: rows)
+    monkeypatch.setitem(sys.modules, "telemetry_parser", types.SimpleNamespace(Parser=lambda path: parser))
+    (tmp_path / "video.log").write_text(GCSV)
+    with pytest.raises(InputError, match=r"video.log \(GoPro\) holds no gyro samples; give a log with raw"):
+        read(tmp_path / "video.log")
 
 
 def test_a_decoded_blackbox_is_a_table(tmp_path):
@@ -423,6 +454,9 @@ def test_a_simulated_record_and_an_estimate_are_converted(tmp_path):
     assert status == 0, said
     np.testing.assert_array_equal(np.loadtxt(tmp_path / "e.tum")[:, 4:], q[:, [1, 2, 3, 0]])
     assert convert(tmp_path / "e.h5", tmp_path / "e.bag")[0] == 1
+    write_record(tmp_path / "s.h5", scenarios.simulate(replace(scenarios.load_scenario("two-stars"), duration=5.0)))
+    status, said = convert(tmp_path / "s.h5", tmp_path / "s.csv")
+    assert (status, "Left out: star 1 (direction), star 2 (direction)." in said) == (0, True), said
 
 
 def test_a_trajectory_goes_along_as_reference(tmp_path):

@@ -12,6 +12,7 @@ from strapdown.checks import InputError
 from strapdown.cli import app
 from strapdown.recordings import Recording, read, recordfiles, samples
 from strapdown.records import ImuRecord
+from strapdown.vectors import VectorMeasurements
 
 HEADER = "time,gx [rad/s],gy,gz,ax [m/s2],ay,az"
 ROWS = ("0.00,0.1,0.2,0.3,1,2,9", "0.01,0.4,0.5,0.6,3,4,8", "0.02,0.7,0.8,0.9,5,6,7")
@@ -114,6 +115,8 @@ def test_units_of_other_sensors_need_not_be_reported_where_the_gyro_alone_is_use
     assert alone.specific_force is None
     assert read(csv(), gyro_alone=True).specific_force is None
     assert np.array_equal(recordings.read_samples(path, "gyro").values, alone.rate)
+    with pytest.raises(InputError, match="states its own rate; drop the option rate"):
+        recordings.read_samples(path, "gyro", rate=100.0)
     status = CliRunner().invoke(
         app, ["integrate", str(path), "--algorithm", "one-sample", "--out", str(tmp_path / "a.h5")]
     )
@@ -476,3 +479,23 @@ def test_stamps_that_stray_by_more_than_a_quarter_of_the_interval_are_assumed_ev
     np.testing.assert_array_equal(place, np.delete(np.arange(200), np.s_[150:160]))
     assert [word.split()[0] for word in words] == (["Intervals", "10"] if even else ["10"])
     assert not even or f"stray by up to {10.0 * shift:.3g} ms" in words[0]
+
+
+def test_samples_of_a_simulated_record_are_its_increments_and_what_its_sensors_measured(tmp_path):
+    random, time = np.random.default_rng(4), 0.01 * np.arange(201)
+    force = VectorMeasurements(
+        sensor="accelerometer",
+        kind="vector",
+        time=time[4::4],
+        reference_f=[0.0, 0.0, 9.8],
+        vector_b=random.standard_normal((50, 3)),
+        sigma=0.1,
+    )
+    record = ImuRecord(time=time, increments=1e-3 * random.standard_normal((200, 3)), vectors=(force,))
+    recordfiles.write_record(tmp_path / "record.h5", record)
+    gyro = recordings.read_samples(tmp_path / "record.h5", "gyro")
+    np.testing.assert_array_equal(gyro.values, record.increments)
+    assert (gyro.kind, gyro.sample_interval) == ("increments", pytest.approx(0.01, rel=1e-12))
+    other = recordings.read_samples(tmp_path / "record.h5", "accelerometer")
+    np.testing.assert_array_equal(other.values, force.vector_b)
+    assert (other.kind, other.sample_interval) == ("rate", pytest.approx(0.04, rel=1e-12))

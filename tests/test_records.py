@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 
 import h5py
 import numpy as np
@@ -16,6 +17,7 @@ from strapdown.files import reading
 from strapdown.records import (
     CONVENTIONS,
     Estimate,
+    Event,
     ImuRecord,
     Innovations,
     Truth,
@@ -59,8 +61,9 @@ def test_rates_are_increments_over_intervals():
 
 
 def test_records_are_frozen_and_lists_are_welcome():
-    r = ImuRecord(time=[0, 1, 2], increments=[[0, 0, 1], [0, 0, 2]], vectors=[])
-    assert r.increments.dtype == np.float64
+    truth = Truth(attitude=[[1, 0, 0, 0]] * 3, bias=[[0, 0, 0]] * 3)
+    r = ImuRecord(time=[0, 1, 2], increments=[[0, 0, 1], [0, 0, 2]], vectors=[], truth=truth)
+    assert r.increments.dtype == r.truth.attitude.dtype == r.truth.bias.dtype == np.float64
     assert r.vectors == ()
     with pytest.raises(dataclasses.FrozenInstanceError):
         r.time = np.arange(3.0)
@@ -308,6 +311,37 @@ def test_what_no_filter_estimates_is_refused(tmp_path, name, damage, words):
             file[name] = value
     with pytest.raises(InputError, match=f"^{path}.*{words}"):
         (read_truth if name.startswith("truth") else read_estimate)(path)
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("recovery", r"Recovered at 3.5 s: 7 measurements of compass .* from 1 s on;"),
+        ("hypotheses", r"From 1 s to 3.5 s hypotheses .* compass left a rotation ambiguous: 7 of them were left"),
+        ("lock-out", r"Locked out from 1 s to 3.5 s: 7 measurements of compass were rejected,"),
+        ("divergence", r"The mean NIS left its bounds from 1 s to 3.5 s, up to 7 per degree of freedom"),
+        ("gap", r"Gap of 2.5 s after 1 s:"),
+    ],
+)
+def test_an_event_is_described_by_its_kind(kind, words):
+    assert re.match(words, str(Event(kind=kind, start=1.0, end=3.5, sensor="compass", value=7.0)))
+    one = str(Event(kind="hypotheses", start=1.0, end=3.5, sensor="compass"))
+    assert one.endswith("ambiguous: then one was chosen.")
+
+
+def test_the_listing_of_an_estimate_has_sigma_at_its_end_and_at_its_start():
+    """σ of 1, 2 and 3 ° in the first row, 4, 5 and 6 ° in the second, 7, 8 and 9 ° in the last; of the bias as many °/h."""
+    sigma = np.arange(1.0, 10.0).reshape(3, 3)
+    P = [np.diag(np.radians(np.append(one, one / 3600.0)) ** 2) for one in sigma]
+    bias = np.radians([[0, 0, 0], [1, 1, 1], [10, -20, 30]]) / 3600.0
+    rows = Estimate.from_arrays([0.0, 1.0, 2.0], [[1, 0, 0, 0]] * 3, P, bias=bias).listing().rows
+    assert [row[1:] for row in rows] == [
+        *[("°", "", last, first) for last, first in (("7", "1"), ("8", "2"), ("9", "3"))],
+        *[
+            ("°/h", value, last, first)
+            for value, last, first in (("10", "7", "1"), ("-20", "8", "2"), ("30", "9", "3"))
+        ],
+    ]
 
 
 def test_a_turn_that_nothing_makes_is_reported_by_its_place():

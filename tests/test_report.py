@@ -371,7 +371,22 @@ def test_what_a_campaign_page_says_of_the_end_is_of_the_last_epoch(folder, monke
     for state, name in enumerate([f"{what} {axis}" for what in ("attitude", "bias") for axis in "xyz"]):
         shown = rows_of(content, f"(?:gyro )?{name}")
         np.testing.assert_allclose(shown[-3:], inside[-1, state], atol=0.051)
-    drawn = []
+    drawn, ellipses = [], []
     monkeypatch.setattr(plots, "coverage_by_state", lambda statistics, epoch, ax: drawn.append(epoch))
+    monkeypatch.setattr(plots, "covariance_ellipses", lambda *given: ellipses.append(given[:3]))
     report.write(folder / "campaign.h5", folder / "again.html")
     assert set(drawn) == {-1}
+    far = np.abs(np.log(np.diag(held.mean_square_error[-1]) / np.diag(held.covariance[-1])))[3:].argmax()
+    assert {pair for _, _, pair in ellipses} == {(0, 1), (far, 3 + far)}
+    for covariance, mean_square, _ in ellipses:
+        np.testing.assert_array_equal(covariance, held.covariance[-1])
+        np.testing.assert_array_equal(mean_square, held.mean_square_error[-1])
+
+
+@pytest.mark.parametrize("name", ["right", "blind", "wrong", "campaign"])
+def test_no_panel_of_a_figure_is_empty(folder, monkeypatch, name):
+    drawn, new = [], plots.new_figure
+    monkeypatch.setattr(plots, "new_figure", lambda *size, **options: drawn.append(new(*size, **options)) or drawn[-1])
+    report.write(folder / f"{name}.h5", folder / "again.html")
+    assert len(drawn) > 3
+    assert [figure for figure, _ in drawn for ax in figure.axes if not ax.has_data()] == []

@@ -62,6 +62,8 @@ def test_quantised_rest_and_held_samples_are_not_clipped():
     assert not sensor_faults.clipped_samples(rest, 1.0).any()
     held = np.repeat(swing().rate[::4], 4, axis=0)
     assert not sensor_faults.clipped_samples(held, 1.0).any()
+    peaks = np.sin(0.5 * np.pi * np.arange(1, 18))[:, None] * [5.0, 0.0, 0.0]  # from its largest value on, each alone
+    assert not sensor_faults.clipped_samples(peaks, 1.0).any()
 
 
 @pytest.mark.parametrize("limit", [5.0, 6.5])
@@ -87,6 +89,19 @@ def test_a_clipped_rate_is_restored_to_within_its_sigma(limit):
     assert 0.3 * beyond < np.sqrt(np.mean(sigma**2)) < 0.7 * beyond
     np.testing.assert_array_equal(rate[~at], plain.rate[~at])
     assert np.all(np.abs(rate[at]) >= limit)
+
+
+def test_the_variance_of_a_restored_turn_is_spread_over_its_intervals():
+    """σ of the turn beyond the limit is half of it, whatever the number of intervals from the sample before the run to that after it."""
+    plain = swing()
+    only_x = dataclasses.replace(plain, rate=plain.rate * [1.0, 0.0, 0.0])
+    rate, variance, at = sensor_faults.restored(plain.time, with_rate(only_x, 5.0).rate)
+    expected = np.zeros(len(variance))
+    for first, stop in np.flatnonzero(np.diff(at[:, 0].astype(int))).reshape(-1, 2) + 1:
+        turn = np.sum(np.abs(rate[first:stop, 0]) - 5.0) / RATE
+        expected[first - 1 : stop] += (0.5 * turn) ** 2 / (stop - first + 1)
+    np.testing.assert_allclose(variance, expected, rtol=1e-9, atol=1e-18)
+    assert np.count_nonzero(variance) > 1000
 
 
 def test_the_turn_over_a_gap_is_that_of_a_brownian_bridge():

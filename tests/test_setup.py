@@ -129,6 +129,16 @@ def test_flicker_raises_both_noises():
     assert blind.rate_random_walk < noise.rate_random_walk  # bounded over the whole record
 
 
+def test_beside_states_the_rate_random_walk_is_that_of_the_worst_axis_alone():
+    """A Gauss–Markov drift of finite correlation time is a state; of infinite time it is a random walk more, σ² added."""
+    walks = {"angle_random_walk": 2e-5, "rate_random_walk": (1e-8, 3e-8, 2e-8), "markov_noise": 4e-8}
+    for time, sigma in ((800.0, 3e-8), (np.inf, 5e-8)):
+        spec = GyroSpec(**walks, markov_correlation_time=time)
+        noise = setup.matched(scenario(gyro=spec), states=True).process_noise
+        assert noise.rate_random_walk == pytest.approx(sigma, rel=1e-12)
+        assert noise.angle_random_walk == pytest.approx(2e-5, rel=1e-12)
+
+
 def test_a_gyro_without_noise_is_refused():
     with pytest.raises(InputError, match="angle random walk"):
         setup.matched(scenario(gyro=GyroSpec()))

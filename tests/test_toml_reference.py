@@ -30,7 +30,7 @@ if not (DOCS / "toml_reference.py").exists():
 reference = _load()
 SECTIONS = reference.sections()
 NAMES = [f"{section.header} {section.type}".strip() for section in SECTIONS]
-TABLES = {"motion", "gyro", "sensors", "base", "vibration"}
+TABLES = {"motion", "gyro", "temperature", "sensors", "base", "vibration"}
 """Keys that hold tables: headers of the reference."""
 
 
@@ -51,8 +51,8 @@ def _least(section):
                 table.update(base={"type": "rest"}, vibration={"type": "rest"})
         case "[[motion.harmonics]]":
             scenario["motion"] = {"type": "harmonic-rates", "harmonics": [table]}
-        case "[gyro]":
-            scenario["gyro"] = table
+        case "[gyro]" | "[temperature]":
+            scenario[section.header.strip("[]")] = table
         case "[[sensors]]":
             if section.type == "horizon":
                 table["orbit"] = _required(SECTIONS[NAMES.index("[sensors.orbit]")])
@@ -98,7 +98,7 @@ def test_every_accepted_key_is_in_the_reference(section):
 
 def test_every_section_and_key_is_printed():
     page = "\n".join(reference.markdown(group) for group in ("top", "motion", "gyro", "sensors"))
-    printed = set(re.findall(r"`([a-z0-9_]+)`", page))
+    printed = set(re.findall(r"<code class=\"key\">([a-z0-9_]+)</code>", page.replace("<wbr>", "")))
     for section in SECTIONS:
         assert f"`{section.header}`" in page
         assert f'type = "{section.type}"' in page or not section.type
@@ -117,7 +117,7 @@ def test_every_type_of_motion_and_sensor_of_the_parser_is_in_the_reference():
 
 def test_every_printed_key_has_a_meaning():
     for group in ("top", "motion", "gyro", "sensors"):
-        rows = [row.split(" | ") for row in reference.markdown(group).splitlines() if row.startswith("| `")]
+        rows = [row.split(" | ") for row in reference.markdown(group).splitlines() if row.startswith("| <code")]
         assert rows
         for key, *_, meaning in rows:
             assert len(meaning.strip(" |").split()) >= 2, f"{group}: {key} has no docstring"

@@ -9,11 +9,13 @@ import types
 import mpmath
 import numpy as np
 import pytest
+import two_stars
 from scipy.optimize import brentq
 from two_stars import ARW, BELIEVED, FREE, RRW, case, scenario
 
 from strapdown import consistency, gyro, motion, quaternion, scenarios, setup, tuning, units, vectors
 from strapdown.checks import InputError
+from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import ProcessNoise
 from strapdown.kernels import likelihood
 from strapdown.kernels.lane_values import WIDTH
@@ -21,6 +23,7 @@ from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.randomness import generator
 from strapdown.records import ImuRecord, Truth
 from strapdown.setup import FilterSetup
+from strapdown.setup.states import States
 from strapdown.tuning import fitting, innovations, parameters, planning
 from strapdown.tuning.parameters import own_sigma
 from strapdown.vectors import VectorMeasurements
@@ -519,13 +522,23 @@ def test_the_gradient_against_a_truth_is_that_of_its_value(measure):
     )
 
 
-def test_the_likelihood_of_the_errors_is_that_of_a_normal_vector():
+AS_IT_RUNS = {
+    "plain": BELIEVED,
+    "gate": dataclasses.replace(BELIEVED, gate=Gate(probability=0.99)),
+    "Huber": dataclasses.replace(BELIEVED, robust=Robust(kind="huber")),
+    "states": dataclasses.replace(BELIEVED, states=States(gyro_scale_sigma=1e-3)),
+}
+
+
+@pytest.mark.parametrize("chosen", AS_IT_RUNS.values(), ids=AS_IT_RUNS)
+def test_the_likelihood_of_the_errors_is_that_of_a_normal_vector(chosen):
+    """Of the filter as it runs: with its gate, its weights and its error states."""
     from scipy.stats import multivariate_normal
 
-    one = case(1)
-    objective = tuning.error_objective([one], BELIEVED, FREE)
-    epochs = objective.epochs[0]
-    estimate = setup.run(one.record, BELIEVED, one.initial, full_covariance=True)
+    one = case(1, outliers=0.05)
+    objective = tuning.error_objective([one], chosen, FREE)
+    epochs = objective.references[0].epochs
+    estimate = setup.run(one.record, chosen, one.initial, full_covariance=True)
     truth = one.record.truth
     error = consistency.errors(estimate.attitude, estimate.bias, truth.attitude, truth.bias)[epochs]
     expected = -sum(
@@ -534,6 +547,18 @@ def test_the_likelihood_of_the_errors_is_that_of_a_normal_vector():
     )
     constant = 0.5 * 6 * len(epochs) * np.log(2.0 * np.pi)
     assert objective.derivatives(objective.start).value.sum() + constant == pytest.approx(expected, rel=1e-6)
+
+
+def test_with_its_gate_a_filter_is_tuned_to_the_noise_of_what_passes():
+    """Outliers of ten σ, one in twenty: a filter that uses them all is right with a larger σ, one that refuses them with the sensor's."""
+    cases = [case(seed, outliers=0.05) for seed in range(3)]
+    values = {}
+    for name in ("plain", "gate"):
+        objective = tuning.error_objective(cases, AS_IT_RUNS[name], ["star 1.sigma", "star 2.sigma"])
+        found = tuning.fit(objective, starts=1, intervals=False)
+        values[name] = [one.value / sigma for one, sigma in zip(found.parameters, two_stars.SIGMAS, strict=True)]
+    assert min(values["plain"]) > 1.4
+    np.testing.assert_allclose(values["gate"], 1.0, rtol=0.35)
 
 
 def test_the_size_of_the_error_does_not_know_a_common_scale():
@@ -585,7 +610,7 @@ def test_a_reference_attitude_beside_the_record_serves_as_truth():
         judged=truth.attitude[:, 0] < 2.0,
     )
     objective = tuning.error_objective([bare], BELIEVED, FREE)
-    assert objective.epochs[0].min() >= 50
+    assert objective.references[0].epochs.min() >= 50
     assert np.isfinite(objective.derivatives(objective.start).value).all()
     compared = tuning.compare([bare], BELIEVED, BELIEVED)
     assert np.isnan(compared.after.anees)

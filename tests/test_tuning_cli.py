@@ -10,6 +10,7 @@ import pytest
 
 from strapdown import gyro, motion, scenarios, setup, tuning, vectors
 from strapdown.checks import InputError
+from strapdown.estimation.gating import Gate
 from strapdown.recordings import recordfiles
 from strapdown.setup import FilterSetup
 
@@ -161,8 +162,23 @@ def test_tune_gives_the_filter_states_for_what_the_record_specifies(run, tmp_pat
     assert names == ["gyro.arw", "gyro.scale_sigma"]
 
 
-@pytest.mark.parametrize("option", [("--truth",), ("--gate",), ("--spacing", 2.0), ("--plan",)])
-def test_optional_states_are_tuned_by_the_plain_likelihood_alone(run, tmp_path, scaled, option):
+def test_a_filter_with_states_and_a_gate_is_tuned_against_the_truth(run, tmp_path, scaled):
+    first, out = tmp_path / "first.toml", tmp_path / "states.toml"
+    file = recordfiles.read_record_file(scaled)
+    gated = dataclasses.replace(setup.matched_to_record(file.gyro, file.record, states=True), gate=Gate())
+    first.write_text(setup.to_toml(gated), encoding="utf-8")
+    given = ("tune", scaled, "--filter", first, "--free", "gyro.arw", "--starts", 1, "-o", out)
+    status, said, complaint = run(*given, "--truth")
+    assert status == 0, complaint
+    found = setup.read_setup(out)
+    assert found.states == gated.states
+    assert found.gate == gated.gate
+    assert "as it runs" not in said
+    assert run(*given)[1].count("--truth tunes the filter as it runs") == 1
+
+
+@pytest.mark.parametrize("option", [("--rmse",), ("--gate",), ("--spacing", 2.0), ("--plan",)])
+def test_optional_states_are_tuned_by_likelihoods_alone(run, tmp_path, scaled, option):
     out = tmp_path / "states.toml"
     status, _, complaint = run("tune", scaled, "--states", *option, "-o", out)
     assert status != 0

@@ -138,7 +138,6 @@ def test_values_scale_all_axes_alike_and_the_rest_stays():
 @pytest.mark.parametrize(
     ("change", "free", "words"),
     [
-        ({"states": None}, ["gyro.arw"], "has no optional states"),
         ({}, ["acc.correlated_time"], "did you mean 'acc.correlation_time'"),
         ({}, [], "free names no parameter"),
         ({}, ["acc.correlated_sigma"] * 2, "twice"),

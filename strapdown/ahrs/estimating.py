@@ -14,6 +14,7 @@ from strapdown.ahrs.preparing import Prepared, prepare
 from strapdown.ahrs.starting import quiet_span
 from strapdown.checks import Array, InputError
 from strapdown.estimation.gating import Gate, Robust
+from strapdown.estimation.temperature import joined
 from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings import Recording, sensor_delays, sensor_faults, unit_calibration
@@ -21,7 +22,7 @@ from strapdown.recordings.hard_iron import low_pass
 from strapdown.recordings.sensor_delays import Delays
 from strapdown.recordings.sensor_faults import Faults
 from strapdown.recordings.unit_calibration import UnitCalibration
-from strapdown.records import ErrorStateEstimate, Estimate, ImuRecord, Innovations, cut
+from strapdown.records import ErrorStateEstimate, Estimate, ImuRecord, cut
 
 LEVEL_TIME = 5.0
 """Time constant over which the level of the acceleration is found, s."""
@@ -174,50 +175,12 @@ def _run(
             found = estimation.smooth(part, noise, state, blocks, **options)
         state = end
         parts.append(found)
-    return _joined(parts)
+    return joined(parts)
 
 
 def _over_steps(variance: Array, edge: np.ndarray) -> Array:
     """Return the sum over each step (k,) of a variance of each sample interval (n − 1,)."""
     return np.asarray(np.add.reduceat(variance, edge[:-1].astype(np.intp)))
-
-
-def _joined(parts: list[Estimate]) -> Estimate:
-    """Return the estimates of successive parts as one; at an edge between two stands the first part's."""
-    if len(parts) == 1:
-        return parts[0]
-
-    def rows(name: str) -> Array:
-        return np.concatenate([getattr(part, name)[k > 0 :] for k, part in enumerate(parts)])
-
-    innovations = {}
-    for sensor in dict.fromkeys(name for part in parts for name in part.innovations):
-        own = [part.innovations[sensor] for part in parts if sensor in part.innovations]
-        weights = [one.weight for one in own if one.weight is not None]
-        innovations[sensor] = Innovations(
-            time=np.concatenate([one.time for one in own]),
-            innovation=np.concatenate([one.innovation for one in own]),
-            variance=np.concatenate([one.variance for one in own]),
-            weight=np.concatenate(weights) if len(weights) == len(own) else None,
-        )
-    blocks = {
-        name: replace(
-            block,
-            values=np.concatenate([part.error_states[name].values[k > 0 :] for k, part in enumerate(parts)]),
-            variance=np.concatenate([part.error_states[name].variance[k > 0 :] for k, part in enumerate(parts)]),
-        )
-        for name, block in parts[0].error_states.items()
-    }
-    return Estimate(
-        time=rows("time"),
-        attitude=rows("attitude"),
-        bias=rows("bias"),
-        variance=rows("variance"),
-        covariance=rows("covariance"),
-        innovations=innovations,
-        events=tuple(event for part in parts for event in part.events),
-        error_states=blocks,
-    )
 
 
 def _at_stamps(

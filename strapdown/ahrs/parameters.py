@@ -57,6 +57,8 @@ class AhrsParameters:
         Time constant of the acceleration, s.
     gyro_scale_sigma : float, default 0.0
         σ of each of the gyro's scale factors, dimensionless, and misalignments, rad; 0: no states.
+    gyro_temperature_sigma : float or tuple (3,), default 0.0
+        σ of the slope of the gyro's bias over temperature, rad/s/K, by axis; 0: no states.
     """
 
     angle_random_walk: float = 3e-3
@@ -75,11 +77,12 @@ class AhrsParameters:
     velocity_time: float = 0.3
     acceleration_time: float = 0.1
     gyro_scale_sigma: float = 0.0
+    gyro_temperature_sigma: float | tuple[float, ...] = 0.0
 
     def __post_init__(self) -> None:
         """Check every field."""
         may_be_zero = ("iron_sigma", "rate_random_walk", "rest_bias_sigma", "velocity_sigma", "gyro_scale_sigma")
-        for name in self.__dataclass_fields__:
+        for name in set(self.__dataclass_fields__) - {"gyro_temperature_sigma"}:
             check = non_negative if name in may_be_zero else positive
             check(name, getattr(self, name))
 
@@ -96,6 +99,7 @@ class AhrsParameters:
         states = States(
             gyro_scale_sigma=self.gyro_scale_sigma,
             gyro_misalignment_sigma=self.gyro_scale_sigma,
+            gyro_temperature_sigma=self.gyro_temperature_sigma,
             sensors=sensors,
         )
         return FilterSetup(

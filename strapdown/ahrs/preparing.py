@@ -96,7 +96,9 @@ def prepare(
         if irons[0].any():
             initial = starting.start(recording, quiet, parameters, irons[0])
     turn = quaternion.log(quaternion.multiply(quaternion.conjugate(at_edge[:-1]), at_edge[1:]))
-    record = ImuRecord(time=time, increments=turn, vectors=tuple(vectors))
+    known = recording.temperature is not None and bool(np.isfinite(recording.temperature).all())
+    temperature = recording.temperature[edge] if known and recording.temperature is not None else None
+    record = ImuRecord(time=time, increments=turn, vectors=tuple(vectors), temperature=temperature)
     return Prepared(record, initial, edge, turned, dip, iron)
 
 

@@ -1,6 +1,7 @@
 """Noise of a sensor at rest: Allan deviation, the fit of its coefficients, and the parameters that other programs want.
 
-- ``deviation``: :func:`allan_deviation` with confidence intervals, :func:`fit_noise` by maximum likelihood.
+- ``deviation``: :func:`allan_deviation` with confidence intervals.
+- ``noise_fit``: :func:`fit_noise` by maximum likelihood, on the ``spectrum`` of the cosine transform.
 - ``gaps``: Allan deviation of a record with gaps.
 - ``temperature``: Bias as a polynomial in temperature.
 - ``parameters``: Noise parameters of a six-axis unit, as Kalibr, PX4 and MATLAB write them.
@@ -11,22 +12,22 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-from strapdown.allan.deviation import MISFIT_PROBABILITY as MISFIT_PROBABILITY
 from strapdown.allan.deviation import NOISE_TYPES as NOISE_TYPES
 from strapdown.allan.deviation import TERMS as TERMS
-from strapdown.allan.deviation import UNITS as UNITS
 from strapdown.allan.deviation import AllanDeviation as AllanDeviation
-from strapdown.allan.deviation import NoiseFit as NoiseFit
 from strapdown.allan.deviation import allan_deviation as allan_deviation
-from strapdown.allan.deviation import curves_by_axis as curves_by_axis
 from strapdown.allan.deviation import equivalent_degrees_of_freedom as equivalent_degrees_of_freedom
-from strapdown.allan.deviation import expected_errors as expected_errors
-from strapdown.allan.deviation import fit_noise as fit_noise
 from strapdown.allan.deviation import flicker_variance as flicker_variance
 from strapdown.allan.deviation import model_deviation as model_deviation
-from strapdown.allan.deviation import table as table
-from strapdown.allan.deviation import to_gyro_parameters as to_gyro_parameters
-from strapdown.allan.deviation import upper_bounds as upper_bounds
+from strapdown.allan.noise_fit import MISFIT_PROBABILITY as MISFIT_PROBABILITY
+from strapdown.allan.noise_fit import UNITS as UNITS
+from strapdown.allan.noise_fit import NoiseFit as NoiseFit
+from strapdown.allan.noise_fit import curves_by_axis as curves_by_axis
+from strapdown.allan.noise_fit import expected_errors as expected_errors
+from strapdown.allan.noise_fit import fit_noise as fit_noise
+from strapdown.allan.noise_fit import table as table
+from strapdown.allan.noise_fit import to_gyro_parameters as to_gyro_parameters
+from strapdown.allan.noise_fit import upper_bounds as upper_bounds
 
 __all__ = [
     "AllanDeviation",

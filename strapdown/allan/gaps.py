@@ -22,8 +22,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from strapdown import checks
-from strapdown.allan import deviation as allan
-from strapdown.allan.deviation import NOISE_TYPES, TERMS, AllanDeviation, NoiseFit
+from strapdown.allan.deviation import NOISE_TYPES, TERMS, AllanDeviation
+from strapdown.allan.noise_fit import NoiseFit, fit_axis, misfit_of, of_axes
+from strapdown.allan.spectrum import Bins, bin_starts, cosine_transform, mean_power, ramp_coefficients
 from strapdown.checks import Array, InputError
 
 SHORTEST = 64
@@ -244,19 +245,19 @@ def fit_noise(
             raise InputError(
                 f"values, axis {axis}, holds no noise (it is constant or a straight line); pass a recorded sensor"
             )
-        fit = allan._fit_axis(whole, random_terms, "rate_ramp" in chosen, level)
+        fit = fit_axis(whole, random_terms, "rate_ramp" in chosen, level)
         fits.append(fit)
         found = []
         for part, bins, place in zip(parts, each, places, strict=True):
             best = fit.best._replace(variance=fit.best.theta @ bins.basis)
-            probability, what = allan._misfit(part.coefficient, bins, best, random_terms, part.starts, part.last, dt)
+            probability, what = misfit_of(part.coefficient, bins, best, random_terms, part.starts, part.last, dt)
             found.append(
                 (probability, what if len(places) == 1 else f"in the segment from {place.start * dt:.6g} s {what}")
             )
         least = min(found, key=lambda one: one[0])
         misfits.append((min(1.0, len(found) * least[0]), least[1]))
     samples = sum(place.stop - place.start for place in places)
-    return allan._of_axes(chosen, fits, misfits, level=level, samples=samples, sample_interval=dt)
+    return of_axes(chosen, fits, misfits, level=level, samples=samples, sample_interval=dt)
 
 
 def _stretch(x: Array, dt: float, random_terms: tuple[str, ...], highest_frequency: float | None) -> _Stretch:
@@ -268,14 +269,14 @@ def _stretch(x: Array, dt: float, random_terms: tuple[str, ...], highest_frequen
             raise InputError(
                 f"highest_frequency is {highest_frequency:g} Hz: a segment of {samples} samples has nothing below; raise it"
             )
-    starts = allan._bin_starts(last)
-    basis = np.stack([allan._basis(term, samples, dt, starts, last) for term in random_terms])
-    return _Stretch(allan._cosine_transform(x, 1.0), starts, last, basis)
+    starts = bin_starts(last)
+    basis = np.stack([mean_power(term, samples, dt, starts, last) for term in random_terms])
+    return _Stretch(cosine_transform(x, 1.0), starts, last, basis)
 
 
-def _bins(parts: Sequence[_Stretch], dt: float) -> tuple[list[allan._Bins], allan._Bins]:
+def _bins(parts: Sequence[_Stretch], dt: float) -> tuple[list[Bins], Bins]:
     """Return the sums over bins of each segment and of all, the lowest frequencies first; one ramp goes through all of them."""
-    ramps = [dt * allan._ramp_coefficients(len(p.coefficient), np.arange(1, p.last + 1)) for p in parts]
+    ramps = [dt * ramp_coefficients(len(p.coefficient), np.arange(1, p.last + 1)) for p in parts]
     slope = float(
         sum(r @ p.coefficient[1 : p.last + 1] for r, p in zip(ramps, parts, strict=True)) / sum(r @ r for r in ramps)
     )
@@ -284,9 +285,9 @@ def _bins(parts: Sequence[_Stretch], dt: float) -> tuple[list[allan._Bins], alla
         rest = part.coefficient[1 : part.last + 1] - slope * ramp
         begin = part.starts - 1
         sums = [np.add.reduceat(one, begin) for one in (np.ones_like(rest), rest * rest, rest * ramp, ramp * ramp)]
-        each.append(allan._Bins(sums[0], sums[1], sums[2], sums[3], part.basis, slope))
+        each.append(Bins(sums[0], sums[1], sums[2], sums[3], part.basis, slope))
         frequency.append(part.starts / len(part.coefficient))
     order = np.argsort(np.concatenate(frequency), kind="stable")
     number, square, product, ramps_squared = (np.concatenate([one[k] for one in each])[order] for k in range(4))
     basis = np.concatenate([one.basis for one in each], axis=1)[:, order]
-    return each, allan._Bins(number, square, product, ramps_squared, basis, slope)
+    return each, Bins(number, square, product, ramps_squared, basis, slope)

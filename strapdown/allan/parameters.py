@@ -6,7 +6,8 @@ largest. Where no axis shows a term, the upper end of its interval is written, w
 so.
 
 Kalibr
-    ``imu.yaml``: noise densities N and random walks K of gyro and accelerometer. They are commonly multiplied by 5 to 10 or more,
+    ``imu.yaml``: noise densities N and random walks K of gyro and accelerometer, each with the interval of the largest axis's
+    (:func:`largest_interval`) as a comment, since Kalibr has no key for it. They are commonly multiplied by 5 to 10 or more,
     for Kalibr has no terms for vibration, scale and temperature; here by the requested factor, which a comment states.
 PX4
     Parameters of EKF2, which uses them as the standard deviation of white noise over one step of the filter, ``EKF2_PREDICT_US``:
@@ -26,8 +27,8 @@ from typing import Any
 import numpy as np
 
 from strapdown import checks, gyro, units
-from strapdown.allan import deviation as allan
-from strapdown.allan.deviation import NoiseFit
+from strapdown.allan import noise_fit
+from strapdown.allan.noise_fit import NoiseFit
 from strapdown.checks import InputError
 
 __all__ = [
@@ -40,7 +41,7 @@ __all__ = [
 SENSORS = ("gyro", "accelerometer", "magnetometer")
 _MICRO_G = 1e-6 * units.STANDARD_GRAVITY
 UNITS: Mapping[str, Mapping[str, tuple[str, float]]] = {
-    "gyro": allan.UNITS,
+    "gyro": noise_fit.UNITS,
     "accelerometer": {
         "quantization": ("mm/s", 1e-3),
         "angle_random_walk": ("µg/√Hz", _MICRO_G),
@@ -81,11 +82,11 @@ def name(sensor: str, term: str) -> str:
 def table(fit: NoiseFit, sensor: str = "gyro") -> list[dict[str, object]]:
     """Return one row per axis and term for printing, as :func:`strapdown.allan.table`, in the names and units of a sensor."""
     checks.one_of("sensor", sensor, SENSORS)
-    rows = allan.table(fit)
+    rows = noise_fit.table(fit)
     for row in rows:
         term = str(row["term"])
         unit, factor = UNITS[sensor][term]
-        ratio = allan.UNITS[term][1] / factor
+        ratio = noise_fit.UNITS[term][1] / factor
         if sensor != "gyro":
             row |= {end: float(row[end]) * ratio for end in ("estimate", "lower", "upper")}  # type: ignore[arg-type]
         row |= {"term": name(sensor, term), "unit": unit}
@@ -117,7 +118,7 @@ def to_toml(fit: NoiseFit, sensor: str = "gyro") -> dict[str, dict[str, Any]]:
         Table with the unit in each key, to six digits; that of a gyro is the input of :func:`strapdown.gyro.read_spec`.
     """
     rounded: dict[str, Any] = {}
-    for term, value in allan.to_gyro_parameters(fit).items():
+    for term, value in noise_fit.to_gyro_parameters(fit).items():
         factor = key(sensor, term)[1]
         rounded[term] = np.array([float(f"{x / factor:.6g}") for x in np.atleast_1d(value)]).reshape(np.shape(value))
     if sensor == "gyro":
@@ -135,6 +136,28 @@ def largest(fit: NoiseFit, term: str) -> tuple[float, bool]:
     if seen.any():
         return float(fit.estimate[seen, i].max()), True
     return float(fit.upper[:, i].max()), False
+
+
+def largest_interval(fit: NoiseFit, term: str) -> tuple[float, float]:
+    """Return the interval of the largest of the axes' coefficients, SI, at the confidence of the fit.
+
+    Below it are the lower ends of all axes, above it only the upper end of the largest: of axes that are alike any lower end may be too
+    high and all upper ends would have to be too low; of one that is by far the largest its own alone count. A lower end fails with the
+    probability by which it is too high for axes alike, and the upper end with what is left, so that both cases have the same confidence.
+    The ends are moved there from the fit's own tails in the logarithm.
+    """
+    from scipy.special import ndtri
+
+    i = fit.terms.index(term)
+    tail = 1.0 - fit.level
+    below = min(1.0 - fit.level ** (1.0 / len(fit.estimate)), 0.5 * tail)
+    usual, seen = ndtri(0.5 * tail), fit.supported[:, i]
+    centre = np.where(seen, fit.estimate[:, i], 1.0)
+
+    def moved(end: np.ndarray, probability: float) -> float:
+        return float(np.max(np.where(seen, centre * (end / centre) ** (ndtri(probability) / usual), end)))
+
+    return moved(fit.lower[:, i], below), moved(fit.upper[:, i], tail - below)
 
 
 def to_kalibr(fits: Mapping[str, NoiseFit], *, factor: float = 1.0, topic: str = "/imu0", source: str = "") -> str:
@@ -174,8 +197,10 @@ def to_kalibr(fits: Mapping[str, NoiseFit], *, factor: float = 1.0, topic: str =
             ("rate_random_walk", "random_walk", "1/s/sqrt(Hz)"),
         ):
             value, seen = largest(fits[sensor], term)
+            low, high = (factor * end for end in largest_interval(fits[sensor], term))
+            interval = f"{100.0 * fits[sensor].level:g} % interval {low:.6e} to {high:.6e}"
             note = "" if seen else "; not seen, the upper end of its interval"
-            lines.append(f"{own}_{word}: {factor * value:.6e}  # {unit} {per}{note}")
+            lines.append(f"{own}_{word}: {factor * value:.6e}  # {unit} {per}, {interval}{note}")
     lines += [f"update_rate: {1.0 / fits['gyro'].sample_interval:.6g}  # Hz", f"rostopic: {topic}"]
     return "\n".join(line for line in lines if line) + "\n"
 

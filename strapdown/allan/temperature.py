@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import checks
-from strapdown.allan import deviation as allan
+from strapdown.allan.deviation import TERMS
+from strapdown.allan.spectrum import bin_starts, mean_power
 from strapdown.checks import Array, InputError
 
 __all__ = [
@@ -163,8 +164,8 @@ def _regression(x: Array, powers: Array, dt: float) -> tuple[Array, Array]:
     scale = np.linalg.norm(powers - powers.mean(axis=0), axis=0)
     A = dct((powers - powers.mean(axis=0)) / scale, type=2, norm="ortho", axis=0)[1:]
     y = dct(x - x.mean(), type=2, norm="ortho")[1:]
-    starts = allan._bin_starts(samples - 1)
-    basis = np.stack([allan._basis(term, samples, dt, starts, samples - 1) for term in allan.TERMS[:4]])
+    starts = bin_starts(samples - 1)
+    basis = np.stack([mean_power(term, samples, dt, starts, samples - 1) for term in TERMS[:4]])
     number = np.diff(np.append(starts, samples)).astype(np.float64)
 
     def binned(values: Array) -> Array:

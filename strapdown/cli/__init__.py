@@ -5,6 +5,7 @@ that they did not write; ``montecarlo``, whose result may have taken hours, need
 
 - ``terminal``: What every command shares.
 - ``progress``: Progress of what takes long.
+- ``layout``: Groups, order and examples of the commands.
 - ``studies``: ``coning``
 - ``integration``: ``algorithms``, ``integrate``, ``coning-budget``
 - ``estimation``: ``estimate``
@@ -43,8 +44,9 @@ from strapdown.cli import (  # noqa: F401  (each registers its commands)
     studies,
     tuning,
 )
+from strapdown.cli.layout import lay_out
 from strapdown.cli.progress import be_quiet
-from strapdown.cli.terminal import app, console, errors
+from strapdown.cli.terminal import app, command, console, errors
 from strapdown.files.reading import NoDigestWarning
 
 
@@ -64,15 +66,18 @@ def _about(
         raise typer.Exit
 
 
-@app.command()
+@command
 def info() -> None:
-    """Show what the kernels run on."""
+    """Show the versions and the processor features that compiled code uses here."""
     import strapdown
     from strapdown.kernels.machine import describe
 
     console.print(f"strapdown {strapdown.__version__}")
     for name, value in describe().items():
         console.print(f"{name}: {value}")
+
+
+lay_out(app)
 
 
 def _say(usual: Callable[..., None], message: Warning | str, category: type[Warning], *place: Any) -> None:

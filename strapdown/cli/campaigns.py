@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import signal
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,9 +14,10 @@ import typer
 from strapdown.cli.filters import default_words, filter_of_scenario, own_filter
 from strapdown.cli.terminal import (
     Tables,
-    app,
+    command,
     console,
     counted,
+    given,
     progress_bar,
     rate_text,
     scenario_named,
@@ -41,13 +42,10 @@ _RUNS = 1000
 _CAMPAIGN_SUFFIXES = (".h5", ".hdf5")
 
 
-@app.command()
-def montecarlo(
-    scenario: Annotated[
-        str,
-        typer.Argument(help="Name of a built-in scenario, a TOML file, or the HDF5 file of a campaign: its own plan."),
-    ],
-    runs: Annotated[int | None, typer.Option(help="Runs; 1000, or what a resumed file wants.")] = None,
+@dataclass(frozen=True)
+class _Model:
+    """Filter and errors; a file of a campaign has its own."""
+
     filter_file: Annotated[
         Path | None,
         typer.Option(
@@ -55,26 +53,21 @@ def montecarlo(
             help="TOML with a table named filter, as `strapdown tune` writes it; or FILE.py:NAME, a filter of your own in a Python file, "
             "which is executed. Default: the filter that matches the scenario.",
         ),
-    ] = None,
+    ] = None
     gyro: Annotated[
         Path | None,
         typer.Option(
             help="TOML with a table named gyro, a data sheet's: the filter is matched to it, not to the scenario's gyro."
         ),
-    ] = None,
+    ] = None
     dispersions: Annotated[
         Path | None,
         typer.Option(
             help="TOML with a table named dispersions: initial errors and gyro parameters that differ from run to run."
         ),
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed; the scenario's own if not given.")] = None,
-    threads: Annotated[int | None, typer.Option(help="Threads; one a core if not given.")] = None,
-    float32: Annotated[bool, typer.Option("--float32", help="Compute in single precision, where lanes serve.")] = False,
-    machine: Annotated[str, typer.Option(help="lanes, scalar, or auto: the lanes wherever they serve.")] = "auto",
-    chunk: Annotated[
-        int | None, typer.Option(help="Runs between merges and writes; the machine's if not given.")
-    ] = None,
+    ] = None
+    seed: Annotated[int | None, typer.Option(help="Seed; the scenario's own if not given.")] = None
+    float32: Annotated[bool, typer.Option("--float32", help="Compute in single precision; with lanes only.")] = False
     states: Annotated[
         bool | None,
         typer.Option(
@@ -82,94 +75,109 @@ def montecarlo(
             help="With or without a state for each error that the scenario specifies. Default: with them, where there are such errors and "
             "no filter, --float32 or lanes are asked for.",
         ),
-    ] = None,
-    out: Annotated[
-        Path | None,
+    ] = None
+
+
+@dataclass(frozen=True)
+class _Computing:
+    """Runs and what computes them."""
+
+    runs: Annotated[int | None, typer.Option(help="Runs; 1000, or what a resumed file wants.")] = None
+    threads: Annotated[int | None, typer.Option(help="Threads; one a core if not given.")] = None
+    machine: Annotated[
+        str,
         typer.Option(
-            help="HDF5 file; NAME-montecarlo.h5 after the name, or the TOML file, of the scenario if not given."
+            help="lanes: eight runs at once in vector registers; scalar: any scenario and filter; auto: lanes where they can."
         ),
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the file, if it exists.")] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Begin anew although the file exists.")] = False,
+    ] = "auto"
+    chunk: Annotated[int | None, typer.Option(help="Runs between merges and writes; the machine's if not given.")] = (
+        None
+    )
     workers: Annotated[
         int | None, typer.Option(help="Compute in so many processes instead of threads (needs Dask).")
-    ] = None,
+    ] = None
     cluster: Annotated[
         str | None,
         typer.Option(
             help="Compute on the Dask scheduler at this address, tcp://HOST:8786, or tls:// with Dask's certificates configured. Scheduler "
             "and workers can run any code here (they send pickles): name only one that you trust as you trust your own account."
         ),
-    ] = None,
+    ] = None
+
+
+@dataclass(frozen=True)
+class _Output:
+    """Output."""
+
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="HDF5 file; NAME-montecarlo.h5 after the name, or the TOML file, of the scenario if not given."
+        ),
+    ] = None
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the file, if it exists.")] = False
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Begin anew although the file exists.")] = False
     replay: Annotated[
         int | None, typer.Option(help="Compute this one run again and write it in full detail: record and estimate.")
-    ] = None,
-    tables: Tables = None,
+    ] = None
+    tables: Tables = None
+
+
+@command
+def montecarlo(
+    scenario: Annotated[
+        str,
+        typer.Argument(help="Name of a built-in scenario, a TOML file, or the HDF5 file of a campaign: its own plan."),
+    ],
+    model: _Model,
+    computing: _Computing,
+    output: _Output,
 ) -> None:
     """Run a scenario many times through a filter and judge the filter: exit status 0 consistent, 1 not, 2 cannot tell (or bad input)."""
-    from strapdown import montecarlo as engine
-    from strapdown.checks import InputError, count
+    from strapdown.checks import InputError
     from strapdown.files import write_json
-    from strapdown.montecarlo import campaign as campaigns
+    from strapdown.montecarlo import summary
 
     source = Path(scenario)
-    held = campaigns.read(source) if source.suffix.lower() in _CAMPAIGN_SUFFIXES else None
-    if held is None:
-        if states is None and (float32 or machine == "lanes"):
-            states = False
-        plan = _plan(scenario, filter_file, gyro, dispersions, seed, float32, states)
-        target = out or Path(f"{source.stem}-montecarlo.h5")
-    else:
-        if filter_file is not None and (own := own_filter(filter_file)) is not None:
-            held, filter_file = _with_filter(held, own, source), None
-        given = {
-            "--filter": filter_file,
-            "--gyro": gyro,
-            "--dispersions": dispersions,
-            "--seed": seed,
-            "--float32": float32 or None,
-            "--states": states,
-        }
-        for name, value in given.items():
-            if value is not None:
-                raise InputError(f"{name} is given, but {source} holds its own; leave it out, or name a scenario")
-        plan, target = held.plan, out or source
-        machine = held.machine if machine == "auto" else machine
-    tables_folder(tables)
-    if resume and overwrite:
+    held, plan = _planned(source, scenario, model, computing.machine)
+    machine = held.machine if held is not None and computing.machine == "auto" else computing.machine
+    target = output.out or (source if held is not None else Path(f"{source.stem}-montecarlo.h5"))
+    tables_folder(output.tables)
+    if output.resume and output.overwrite:
         raise InputError("--resume and --overwrite exclude each other: go on with the file, or start it anew")
-    _check_files(target, replaced=overwrite or replay is not None)
-    if replay is not None:
-        writable("out", *_replayed(target, replay))
-        _replay(plan, replay, machine, target)
+    _check_files(target, replaced=output.overwrite or output.replay is not None)
+    if output.replay is not None:
+        writable("out", *_replayed(target, output.replay))
+        _replay(plan, output.replay, machine, target)
         return
-    if held is not None and target == source and not (resume or overwrite):
+    if held is not None and target == source and not (output.resume or output.overwrite):
         status = _print_result(held)
-        if tables is not None and held.statistics is not None:
-            written(*tables_written(tables, "montecarlo", engine.summary(held.statistics)))
+        if output.tables is not None and held.statistics is not None:
+            written(*tables_written(output.tables, "montecarlo", summary(held.statistics)))
         raise typer.Exit(status)
-    if runs is None:
-        runs = campaigns.read(target).runs if resume and target.exists() else _RUNS
-    if workers is not None and cluster is not None:
-        raise InputError("--workers and --cluster exclude each other: a cluster has workers of its own")
-    choice = engine.choose(plan, machine)
-    count("runs", runs)
-    engine.in_threads(threads)  # so that a wrong number is found now
-    console.print(f"{plan.scenario.name or source.stem}: {counted(runs, 'run')}, seed {plan.seed}, machine: {choice}.")
-    options: dict[str, Any] = {
-        "resume": resume,
-        "overwrite": overwrite,
-        "chunk": chunk,
-        "machine": machine,
-        "threads": threads,
-    }
-    result = _computed(plan, target, runs, workers, cluster, options)
+    result = _computed(plan, target, source.stem, replace(computing, machine=machine), output)
     status = _print_result(result)
-    report = target.with_suffix(".json")
     content = _report(result)
-    write_json(report, content)
-    written(target, report, *tables_written(tables, "montecarlo", content))
+    write_json(target.with_suffix(".json"), content)
+    written(target, target.with_suffix(".json"), *tables_written(output.tables, "montecarlo", content))
     raise typer.Exit(status)
+
+
+def _planned(source: Path, scenario: str, model: _Model, machine: str) -> tuple[Campaign | None, Plan]:
+    """Return the campaign that a file holds, if it is one's, and the plan."""
+    from strapdown.checks import InputError
+    from strapdown.montecarlo import campaign as campaigns
+
+    if source.suffix.lower() not in _CAMPAIGN_SUFFIXES:
+        if model.states is None and (model.float32 or machine == "lanes"):
+            model = replace(model, states=False)
+        return None, _plan(scenario, model)
+    held = campaigns.read(source)
+    if model.filter_file is not None and (own := own_filter(model.filter_file)) is not None:
+        held, model = _with_filter(held, own, source), replace(model, filter_file=None)
+    for name in given(model):
+        raise InputError(f"{name} is given, but {source} holds its own; leave it out, or name a scenario")
+    return held, held.plan
 
 
 def _check_files(target: Path, *, replaced: bool) -> None:
@@ -183,18 +191,27 @@ def _check_files(target: Path, *, replaced: bool) -> None:
     writable("out", beside)
 
 
-def _computed(
-    plan: Plan, target: Path, runs: int, workers: int | None, cluster: str | None, options: dict[str, Any]
-) -> Campaign:
+def _computed(plan: Plan, target: Path, name: str, computing: _Computing, output: _Output) -> Campaign:
     """Compute the runs, in threads or on Dask, and write them to the file as they are finished."""
+    from strapdown import montecarlo as engine
+    from strapdown.checks import InputError, count
     from strapdown.montecarlo import campaign as campaigns
 
+    runs = computing.runs
+    if runs is None:
+        runs = campaigns.read(target).runs if output.resume and target.exists() else _RUNS
+    if computing.workers is not None and computing.cluster is not None:
+        raise InputError("--workers and --cluster exclude each other: a cluster has workers of its own")
+    choice = engine.choose(plan, computing.machine)
+    count("runs", runs)
+    engine.in_threads(computing.threads)  # so that a wrong number is found now
+    console.print(f"{plan.scenario.name or name}: {counted(runs, 'run')}, seed {plan.seed}, machine: {choice}.")
     with contextlib.ExitStack() as stack:
         hands = None
-        if workers is not None or cluster is not None:
+        if computing.workers is not None or computing.cluster is not None:
             from strapdown.montecarlo.cluster import dask_client, on_dask
 
-            client = stack.enter_context(dask_client(workers=workers, address=cluster))
+            client = stack.enter_context(dask_client(workers=computing.workers, address=computing.cluster))
             hands = on_dask(client)
             console.print(f"Dask at {client.scheduler.address}: {sum(client.nthreads().values())} worker threads.")
         stop_if_asked = stack.enter_context(asked_to_stop())
@@ -205,7 +222,18 @@ def _computed(
             stop_if_asked()
 
         try:
-            return campaigns.run(plan, target, runs=runs, workers=hands, progress=advanced, **options)
+            return campaigns.run(
+                plan,
+                target,
+                runs=runs,
+                resume=output.resume,
+                overwrite=output.overwrite,
+                chunk=computing.chunk,
+                machine=computing.machine,
+                threads=computing.threads,
+                workers=hands,
+                progress=advanced,
+            )
         except KeyboardInterrupt:
             console.print(f"What is finished is in {target}; go on with --resume.")
             raise
@@ -237,42 +265,34 @@ def asked_to_stop() -> Iterator[Callable[[], None]]:
             signal.signal(one, handler)
 
 
-def _plan(
-    scenario: str,
-    filter_file: Path | None,
-    gyro: Path | None,
-    dispersions: Path | None,
-    seed: int | None,
-    float32: bool,
-    states: bool | None,
-) -> Plan:
+def _plan(scenario: str, model: _Model) -> Plan:
     from strapdown import montecarlo as engine
     from strapdown import workflows
     from strapdown.checks import InputError
     from strapdown.gyro import read_spec
     from strapdown.setup import matched
 
-    if states is not None and filter_file is not None:
-        raise InputError(
-            "--filter holds the filter's states itself, in [filter.states]; leave --states and --no-states out"
-        )
-    if gyro is not None and filter_file is not None:
+    if model.states is not None and model.filter_file is not None:
+        raise InputError("--filter names the whole filter, its states too; leave --states and --no-states out")
+    if model.gyro is not None and model.filter_file is not None:
         raise InputError("--gyro and --filter both give the filter's gyro noise; give one of them")
     loaded = scenario_named(scenario)
     chosen = None
-    if filter_file is not None:
-        own = own_filter(filter_file)
-        chosen = filter_of_scenario(filter_file, loaded) if own is None else replace(matched(loaded), estimator=own)
+    if model.filter_file is not None:
+        own = own_filter(model.filter_file)
+        chosen = (
+            filter_of_scenario(model.filter_file, loaded) if own is None else replace(matched(loaded), estimator=own)
+        )
     plan = workflows.plan(
         loaded,
-        gyro=None if gyro is None else read_spec(gyro),
+        gyro=None if model.gyro is None else read_spec(model.gyro),
         setup=chosen,
-        seed=seed,
-        states=states,
-        dispersions=None if dispersions is None else engine.read_dispersions(dispersions),
-        precision="float32" if float32 else "float64",
+        seed=model.seed,
+        states=model.states,
+        dispersions=None if model.dispersions is None else engine.read_dispersions(model.dispersions),
+        precision="float32" if model.float32 else "float64",
     )
-    if states is None and filter_file is None and plan.setup.states is not None:
+    if model.states is None and model.filter_file is None and plan.setup.states is not None:
         console.print(default_words(plan.setup.states.names))
     if plan.individuals:
         console.print("Each run draws its own gyro and sensors: the fixed errors specified are standard deviations.")
@@ -323,6 +343,7 @@ def _print_result(campaign: Campaign) -> int:
     from strapdown.cli.judgement import status_of
     from strapdown.montecarlo import summary
     from strapdown.montecarlo.verdicts import bound_of
+    from strapdown.setup import MEKF
 
     if campaign.statistics is None:
         raise InputError("no chunk of the campaign is finished; go on with it (--resume)")
@@ -331,19 +352,16 @@ def _print_result(campaign: Campaign) -> int:
     report = summary(campaign.statistics, bound=bound_of(campaign.plan))
     figure = lambda value: "-" if value is None else f"{value:.4g}" if value >= 1e3 else f"{value:.4f}"  # noqa: E731
     judgement = _judged(campaign)
-    found = {(one.name, one.of): one for one in judgement.findings}
     rows = table(
-        f"Per degree of freedom; 1 is a filter as good as it says. NEES over {report['epochs_judged']} epochs",
+        f"Per degree of freedom; 1 for a consistent filter. NEES over {report['epochs_judged']} epochs",
         *("", "mean", "least", "greatest", "from", "to", ""),
     )
     for subset, part in report["nees"].items():
-        one = found["ANEES", subset]
-        values = (part["anees"], part["least"], part["greatest"], one.low, one.high)
-        rows.add_row(f"NEES of the {subset}", *map(figure, values), verdict(not one.rejected))
+        values = (part["anees"], part["least"], part["greatest"], *part["bounds"])
+        rows.add_row(f"NEES of the {subset}", *map(figure, values), verdict(part["consistent"]))
     for part in report["nis"]:
-        one = found["NIS", part["sensor"]]
         name = f"NIS of {part['sensor']}"
-        rows.add_row(name, figure(part["nis"]), "", "", *map(figure, (one.low, one.high)), verdict(not one.rejected))
+        rows.add_row(name, figure(part["nis"]), "", "", *map(figure, part["bounds"]), verdict(part["consistent"]))
     show(rows)
     refused = ", ".join(f"{part['refused']} of {part['sensor']}" for part in report["nis"] if part["refused"])
     if refused:
@@ -366,7 +384,7 @@ def _print_result(campaign: Campaign) -> int:
     console.print(judgement.words)
     if judgement.verdict == "cannot tell":
         console.print("More runs (--runs, with --resume) would show it.")
-    if judgement.unmodelled and campaign.plan.setup.states is None:
+    if judgement.unmodelled and campaign.plan.setup.states is None and campaign.plan.setup.estimator == MEKF:
         console.print("--states gives the filter states for most of these errors.")
     return status_of(judgement)
 

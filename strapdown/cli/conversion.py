@@ -7,25 +7,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from strapdown.cli.reading import (
-    RECORDING_HELP,
-    AccelerometerUnit,
-    Axes,
-    Columns,
-    GyroUnit,
-    Invert,
-    MagnetometerUnit,
-    TimeUnit,
-    Topic,
-    given_layout,
-)
-from strapdown.cli.terminal import app, console, writable, written
+from strapdown.cli.reading import RECORDING_HELP, Layout
+from strapdown.cli.terminal import command, console, writable, written
 
 if TYPE_CHECKING:
     from strapdown.recordings import Recording
 
 
-@app.command()
+@command
 def convert(
     source: Annotated[
         Path,
@@ -42,14 +31,7 @@ def convert(
             "estimate .csv, .tsv, .parquet, .tum, .rrd.",
         ),
     ],
-    gyro_unit: GyroUnit = None,
-    accelerometer_unit: AccelerometerUnit = None,
-    magnetometer_unit: MagnetometerUnit = None,
-    time_unit: TimeUnit = None,
-    columns: Columns = None,
-    topic: Topic = None,
-    axes: Axes = None,
-    invert: Invert = None,
+    layout: Layout,
     reference: Annotated[
         Path | None, typer.Option(help="TUM trajectory whose attitudes become the recording's reference.")
     ] = None,
@@ -60,13 +42,7 @@ def convert(
     from strapdown.checks import InputError
     from strapdown.records import read_estimate
 
-    units = {
-        "gyro": gyro_unit,
-        "accelerometer": accelerometer_unit,
-        "magnetometer": magnetometer_unit,
-        "time": time_unit,
-    }
-    options = given_layout(source, columns=columns, topic=topic, axes=axes, invert=invert, **units)
+    options = layout.options(source)
     estimate = recordings.is_estimate(source)
     writable(
         "OUT",
@@ -78,7 +54,7 @@ def convert(
         raise InputError(f"{target} exists; move it, choose another name, or say --force")
     if estimate:
         recordings.estimate_format(target, recording=False)
-        if axes or invert:
+        if layout.axes or layout.invert:
             raise InputError("--axes and --invert go with a recording; estimate again with them")
         if reference is not None:
             raise InputError("--reference goes with a recording; an estimate has attitudes of its own")

@@ -2,33 +2,23 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from strapdown.cli.filters import ChosenStates, filter_for
-from strapdown.cli.reading import (
-    RECORDING_HELP,
-    AccelerometerUnit,
-    Axes,
-    Columns,
-    GyroUnit,
-    Invert,
-    TimeUnit,
-    Topic,
-    given_layout,
-)
+from strapdown.cli.reading import RECORDING_HELP, Layout
 from strapdown.cli.terminal import (
     FORMAT,
     FigureFormat,
-    app,
+    command,
     console,
     doubt,
+    given,
     need_own,
     progress_bar,
     show,
@@ -47,6 +37,9 @@ if TYPE_CHECKING:
     from strapdown.setup.for_record import Start
     from strapdown.workflows import RecordRun
 
+    Exports = Sequence[tuple[Path, dict[str, Any]]]
+    """Further files of an estimate, with the options of their writers."""
+
 FILES = (
     "estimate.h5",
     "errors.json",
@@ -61,190 +54,38 @@ ABOUT_IT = ("estimate.html", "estimate.report.json")
 """Files that other commands write there about an estimate."""
 
 
-@app.command()
-def estimate(
-    recording: Annotated[
-        Path,
-        typer.Argument(
-            help=f"{RECORDING_HELP}; or the HDF5 file of `strapdown simulate`, which holds its specification and its truth too."
-        ),
-    ],
-    out: Annotated[Path, typer.Option(help="Folder for estimate.h5, errors.json and the figures.")] = Path(
-        "estimate-results"
-    ),
-    gyro_unit: GyroUnit = None,
-    accelerometer_unit: AccelerometerUnit = None,
-    time_unit: TimeUnit = None,
-    columns: Columns = None,
-    topic: Topic = None,
-    axes: Axes = None,
-    invert: Invert = None,
+@dataclass(frozen=True)
+class _Shared:
+    """Filter."""
+
     gyro: Annotated[
         Path | None,
         typer.Option(
             help="TOML with a table named gyro, as `strapdown allan` writes it: the gyro noise of the filter."
         ),
-    ] = None,
+    ] = None
+    gate: Annotated[
+        float | None,
+        typer.Option(help="Refuse measurements beyond this quantile (0.999) of chi-squared, and recover."),
+    ] = None
+    robust: Annotated[
+        str | None, typer.Option(help="Weigh measurements by the size of their innovations: huber or student.")
+    ] = None
     full_covariance: Annotated[
         bool | None,
         typer.Option(
             "--full-covariance/--variances",
             help="Write whole 6 x 6 covariances, or only their diagonals; whole ones by default where there is a specification.",
         ),
-    ] = None,
-    filter_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--filter",
-            help="With a specification: TOML with a table named filter, as `strapdown tune` writes it; by default one that matches.",
-        ),
-    ] = None,
-    gate: Annotated[
-        float | None,
-        typer.Option(help="Refuse measurements beyond this quantile (0.999) of chi-squared, and recover."),
-    ] = None,
-    robust: Annotated[
-        str | None, typer.Option(help="Weigh measurements by the size of their innovations: huber or student.")
-    ] = None,
-    states: Annotated[
-        bool | None,
-        typer.Option(
-            "--states/--no-states",
-            help="With a specification: with or without a state for each error in it (scale, misalignment, drift, hard iron, …). By "
-            "default with them, where there are such errors.",
-        ),
-    ] = None,
-    state: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="With a specification: only this one of those states, such as gyro.scale or SENSOR.bias; may be repeated."
-        ),
-    ] = None,
-    attitude: Annotated[
-        str | None,
-        typer.Option(
-            help="With a specification: initial attitude body to fixed, w,x,y,z; by default from the first measurements."
-        ),
-    ] = None,
-    from_truth: Annotated[
-        bool, typer.Option("--from-truth", help="With a truth: start there, off by errors drawn from the filter's σ.")
-    ] = False,
-    every: Annotated[int, typer.Option(help="With a specification: store every n-th filter step.")] = 1,
+    ] = None
     observability: Annotated[
         bool,
         typer.Option("--observability", help="Report how observable each state is, optional ones included."),
-    ] = False,
+    ] = False
     smooth: Annotated[
         bool,
         typer.Option("--smooth", help="Use the samples after each time too, by the fixed-interval smoother."),
-    ] = False,
-    motion: Annotated[
-        str | None,
-        typer.Option(
-            help="Without a specification: what moves the unit: hand (default), of bounded velocity, with states for the gyro's scale; or "
-            "any, whose acceleration is white noise, without such states."
-        ),
-    ] = None,
-    to: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Write the estimate to this file too, in the format of its ending: .csv, .tsv, .parquet, .tum, .h5, .rrd (Rerun), and of "
-            "a recording .bag, .mcap or .db3 with orientation and covariance filled in; may be repeated."
-        ),
-    ] = None,
-    euler: Annotated[
-        str | None, typer.Option(help="With --to a table: Euler angles of this sequence, ZYX if not given.")
-    ] = None,
-    frame: Annotated[
-        str | None,
-        typer.Option(
-            help="With --to: fixed frame of the output, enu (if not given) or ned; body axes stay as they are."
-        ),
-    ] = None,
-    latency: Annotated[
-        float | None,
-        typer.Option(
-            help="Without a specification: delay of the gyro's samples, ms, that of its low-pass; 0: point samples. By default half a "
-            "sample interval."
-        ),
-    ] = None,
-    calibration: Annotated[
-        Path | None,
-        typer.Option(
-            help="Without a specification: calibration.toml of an earlier recording of the same unit; a new one is written."
-        ),
-    ] = None,
-    temperature: Annotated[
-        Path | None,
-        typer.Option(
-            help="Without a specification: gyro-temperature.toml of `strapdown allan --temperature`, the gyro's bias over temperature, "
-            "subtracted first."
-        ),
-    ] = None,
-    figures: Annotated[
-        bool, typer.Option("--figures", help="Draw the estimate, its states and errors; --format does too.")
-    ] = False,
-    form: Annotated[FigureFormat | None, FORMAT] = None,
-) -> None:
-    """Estimate attitude and gyro bias from a recording.
-
-    The accelerometer gives the vertical and the magnetometer the heading; where the recording holds its specification, as one of `strapdown
-    simulate` does, the filter is matched to that.
-    """
-    from strapdown.files import usable_folder
-    from strapdown.recordings import is_record
-    from strapdown.records import read_attributes
-
-    usable_folder("out", out)
-    drawn_as = None if form is None and not figures else form or FigureFormat.png  # --format asks for figures too
-    names = (*FILES, *(f"{name}.{drawn_as or FigureFormat.png}" for name in FIGURES))
-    writable("out", *(out / name for name in names), sources=(recording, gyro, filter_file, calibration, temperature))
-    need_own(out / FILES[0], "estimate", lambda path: bool(read_attributes(path)["kind"] == "strapdown estimate"))
-    units = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
-    layout = given_layout(recording, columns=columns, topic=topic, axes=axes, invert=invert, **units)
-    specified = is_record(recording)
-    _check_kind(
-        recording,
-        specified,
-        with_specification={
-            "filter": filter_file,
-            "states": states,
-            "state": state or None,
-            "attitude": attitude,
-            "from-truth": from_truth or None,
-            "every": None if every == 1 else every,
-        },
-        without={"motion": motion, "latency": latency, "calibration": calibration, "temperature": temperature},
-    )
-    output = _Output(out, _exports(to or (), recording, euler, frame, changed=bool(axes or invert)), drawn_as)
-    shared = _Shared(gyro, gate, robust, full_covariance, observability, smooth)
-    if specified:
-        chosen = tuple(state or ()) if states or state else states
-        _estimate_specified(recording, shared, _Specified(filter_file, chosen, attitude, from_truth, every), output)
-    else:
-        _estimate_recording(
-            recording, shared, _Recorded(layout, motion or "hand", latency, calibration, temperature), output
-        )
-
-
-class _Output(NamedTuple):
-    """Where an estimate goes."""
-
-    folder: Path
-    exports: Sequence[tuple[Path, dict[str, Any]]]
-    form: FigureFormat | None
-    """Format of the figures; None: draw none."""
-
-
-class _Shared(NamedTuple):
-    """Options of every estimate."""
-
-    gyro: Path | None
-    gate: float | None
-    robust: str | None
-    full_covariance: bool | None
-    observability: bool
-    smooth: bool
+    ] = False
 
     @property
     def robustness(self) -> dict[str, Any]:
@@ -256,47 +97,163 @@ class _Shared(NamedTuple):
         return {name: value for name, value in (("gate", gate), ("robust", robust)) if value is not None}
 
 
-class _Specified(NamedTuple):
-    """Options where the recording holds its specification."""
+@dataclass(frozen=True)
+class _Specified:
+    """With a specification, as in recordings of `strapdown simulate`."""
 
-    filter_file: Path | None
-    states: ChosenStates
-    attitude: str | None
-    from_truth: bool
-    every: int
+    filter_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--filter",
+            help="TOML with a table named filter, as `strapdown tune` writes it; by default one that matches.",
+        ),
+    ] = None
+    states: Annotated[
+        bool | None,
+        typer.Option(
+            "--states/--no-states",
+            help="With or without a state for each error in it (scale, misalignment, drift, hard iron, …). By default with them, where "
+            "there are such errors.",
+        ),
+    ] = None
+    state: Annotated[
+        list[str] | None,
+        typer.Option(help="Only this one of those states, such as gyro.scale or SENSOR.bias; may be repeated."),
+    ] = None
+    attitude: Annotated[
+        str | None,
+        typer.Option(help="Initial attitude body to fixed, w,x,y,z; by default from the first measurements."),
+    ] = None
+    from_truth: Annotated[
+        bool, typer.Option("--from-truth", help="With a truth: start there, off by errors drawn from the filter's σ.")
+    ] = False
+    every: Annotated[int, typer.Option(help="Store every n-th filter step.")] = 1
+
+    @property
+    def chosen_states(self) -> ChosenStates:
+        """Optional states that are asked for."""
+        return tuple(self.state or ()) if self.states or self.state else False if self.states is False else None
 
 
-class _Recorded(NamedTuple):
-    """Options where it does not."""
+@dataclass(frozen=True)
+class _Recorded:
+    """Without a specification."""
 
-    layout: dict[str, Any]
-    motion: str
-    latency: float | None
-    calibration: Path | None
-    temperature: Path | None
+    motion: Annotated[
+        str | None,
+        typer.Option(
+            help="What moves the unit: hand (default), of bounded velocity, with states for the gyro's scale; or any, whose acceleration "
+            "is white noise, without such states."
+        ),
+    ] = None
+    latency: Annotated[
+        float | None,
+        typer.Option(
+            help="Delay of the gyro's samples, ms, that of its low-pass; 0: point samples. By default half a sample interval."
+        ),
+    ] = None
+    calibration: Annotated[
+        Path | None,
+        typer.Option(help="calibration.toml of an earlier recording of the same unit; a new one is written."),
+    ] = None
+    temperature: Annotated[
+        Path | None,
+        typer.Option(
+            help="gyro-temperature.toml of `strapdown allan --temperature`, the gyro's bias over temperature, subtracted first; the "
+            "error of its slope is estimated (with --smooth and --observability it becomes a random walk)."
+        ),
+    ] = None
 
 
-def _check_kind(
-    recording: Path, specified: bool, *, with_specification: dict[str, Any], without: dict[str, Any]
+@dataclass(frozen=True)
+class _Output:
+    """Output."""
+
+    out: Annotated[Path, typer.Option(help="Folder for estimate.h5, errors.json and the figures.")] = Path(
+        "estimate-results"
+    )
+    to: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Write the estimate to this file too, in the format of its ending: .csv, .tsv, .parquet, .tum, .h5, .rrd (Rerun), and of "
+            "a recording .bag, .mcap or .db3 with orientation and covariance filled in; may be repeated."
+        ),
+    ] = None
+    euler: Annotated[
+        str | None, typer.Option(help="With --to a table: Euler angles of this sequence, ZYX if not given.")
+    ] = None
+    frame: Annotated[
+        str | None,
+        typer.Option(
+            help="With --to: fixed frame of the output, enu (if not given) or ned; body axes stay as they are."
+        ),
+    ] = None
+    figures: Annotated[
+        bool, typer.Option("--figures", help="Draw the estimate, its states and errors; --format does too.")
+    ] = False
+    form: Annotated[FigureFormat | None, FORMAT] = None
+
+    @property
+    def drawn_as(self) -> FigureFormat | None:
+        """Format of the figures; None: draw none."""
+        return None if self.form is None and not self.figures else self.form or FigureFormat.png
+
+
+@command
+def estimate(
+    recording: Annotated[
+        Path,
+        typer.Argument(
+            help=f"{RECORDING_HELP}; or the HDF5 file of `strapdown simulate`, which holds its specification and its truth too."
+        ),
+    ],
+    shared: _Shared,
+    specified: _Specified,
+    recorded: _Recorded,
+    layout: Layout,
+    output: _Output,
 ) -> None:
+    """Estimate attitude and gyro bias from a recording.
+
+    The accelerometer gives the vertical and the magnetometer the heading; where the recording holds its specification, as one of `strapdown
+    simulate` does, the filter is matched to that.
+    """
+    from strapdown.files import usable_folder
+    from strapdown.recordings import is_record
+    from strapdown.records import read_attributes
+
+    out = output.out
+    usable_folder("out", out)
+    names = (*FILES, *(f"{name}.{output.drawn_as or FigureFormat.png}" for name in FIGURES))
+    sources = (recording, shared.gyro, specified.filter_file, recorded.calibration, recorded.temperature)
+    writable("out", *(out / name for name in names), sources=sources)
+    need_own(out / FILES[0], "estimate", lambda path: bool(read_attributes(path)["kind"] == "strapdown estimate"))
+    reading_options = layout.options(recording)
+    simulated = is_record(recording)
+    _check_kind(recording, given(recorded if simulated else specified), simulated)
+    exports = _exports(output, recording, changed=bool(layout.axes or layout.invert))
+    if simulated:
+        _estimate_specified(recording, shared, specified, output, exports)
+    else:
+        _estimate_recording(recording, reading_options, shared, recorded, output, exports)
+
+
+def _check_kind(recording: Path, options: list[str], specified: bool) -> None:
     """Refuse options that need a specification where there is none, and the other way round."""
     from strapdown.checks import InputError
 
-    given = [name for name, value in (without if specified else with_specification).items() if value is not None]
-    if given and specified:
+    if options and specified:
         raise InputError(
-            f"--{given[0]} goes with a recording without a specification; {recording} holds one, of `strapdown simulate`"
+            f"{options[0]} goes with a recording without a specification; {recording} holds one, of `strapdown simulate`"
         )
-    if given:
+    if options:
         raise InputError(
-            f"--{given[0]} goes with a recording that holds its specification, as those of `strapdown simulate`; {recording} does not"
+            f"{options[0]} goes with a recording that holds its specification, as those of `strapdown simulate`; {recording} does not"
         )
 
 
-def _exports(
-    to: Sequence[Path], recording: Path, euler: str | None, frame: str | None, *, changed: bool
-) -> list[tuple[Path, dict[str, Any]]]:
-    """Return the further files of an estimate with the options of their writers; what cannot be written is refused.
+def _exports(output: _Output, recording: Path, *, changed: bool) -> Exports:
+    """Return the further files of an estimate; what cannot be written is refused.
 
     ``changed``: the samples are read in other axes than those of the file.
     """
@@ -304,18 +261,17 @@ def _exports(
     from strapdown.checks import InputError, one_of
     from strapdown.records import outputs
 
-    if frame is not None:
-        frame = one_of("--frame", frame.upper(), outputs.FRAMES)
-    if euler is not None:
-        outputs.euler([[1.0, 0.0, 0.0, 0.0]], euler)
-    given = {name: value for name, value in (("sequence", euler), ("frame", frame)) if value is not None}
-    if given and not to:
+    frame = None if output.frame is None else one_of("--frame", output.frame.upper(), outputs.FRAMES)
+    if output.euler is not None:
+        outputs.euler([[1.0, 0.0, 0.0, 0.0]], output.euler)
+    wanted = {name: value for name, value in (("sequence", output.euler), ("frame", frame)) if value is not None}
+    if wanted and not output.to:
         raise InputError("--euler and --frame go with --to FILE; give the file")
     found = []
-    for target in to:
+    for target in output.to or ():
         writable("to", target, suffixes=recordings.writers("write_estimate"), sources=(recording,))
-        options: dict[str, Any] = dict(given)
-        chosen = recordings.estimate_format(target, given, recording=not recordings.is_record(recording))
+        options: dict[str, Any] = dict(wanted)
+        chosen = recordings.estimate_format(target, wanted, recording=not recordings.is_record(recording))
         # A copy of the file with the orientation filled in would put it beside samples in other axes.
         if "source" in chosen.estimate_options and recordings.format_of(recording) is chosen and not changed:
             options["source"] = recording
@@ -323,9 +279,7 @@ def _exports(
     return found
 
 
-def _export(
-    exports: Sequence[tuple[Path, dict[str, Any]]], estimate: Estimate, recording: Recording | None
-) -> list[Path]:
+def _export(exports: Exports, estimate: Estimate, recording: Recording | None) -> list[Path]:
     """Write an estimate to its further files and return them."""
     from strapdown import recordings
 
@@ -334,7 +288,7 @@ def _export(
     return [target for target, _ in exports]
 
 
-def _estimate_specified(path: Path, shared: _Shared, options: _Specified, output: _Output) -> None:
+def _estimate_specified(path: Path, shared: _Shared, options: _Specified, output: _Output, exports: Exports) -> None:
     """Run the filter over a recording that holds its specification, report and write its estimate."""
     from strapdown import workflows
     from strapdown.checks import InputError, count
@@ -347,8 +301,10 @@ def _estimate_specified(path: Path, shared: _Shared, options: _Specified, output
     if shared.gyro is not None and options.filter_file is not None:
         raise InputError("--gyro and --filter both give the filter's gyro noise; give one of them")
     held = read_record_file(path)
-    chosen, remarks = filter_for(path, held, shared.gyro, options.filter_file, options.states, smooth=shared.smooth)
-    chosen = dataclasses.replace(chosen, **shared.robustness)
+    chosen, remarks = filter_for(
+        path, held, shared.gyro, options.filter_file, options.chosen_states, smooth=shared.smooth
+    )
+    chosen = replace(chosen, **shared.robustness)
     with reading.from_file(path):
         record = held.with_origin(str(path))
     start = _start(record, chosen, options.attitude, options.from_truth)
@@ -369,28 +325,23 @@ def _estimate_specified(path: Path, shared: _Shared, options: _Specified, output
     for remark in remarks:
         console.print(remark)
     _print_result(run.estimate)
-    paths = _write_specified(path, held, chosen, run, shared, output)
-    if output.form is not None:
-        paths += _drawn(output.folder, output.form, run.estimate, path.name, truth=run.truth)
+    paths = _write_specified(path, held, chosen, run, shared, output.out)
+    paths += _export(exports, run.estimate, None)
+    _say_nis(run.estimate, paths[0])
+    if output.drawn_as is not None:
+        paths += _drawn(output.out, output.drawn_as, run.estimate, path.name, truth=run.truth)
     written(*paths)
 
 
 def _write_specified(
-    path: Path,
-    held: RecordFile,
-    chosen: FilterSetup,
-    run: RecordRun,
-    shared: _Shared,
-    output: _Output,
+    path: Path, held: RecordFile, chosen: FilterSetup, run: RecordRun, shared: _Shared, out: Path
 ) -> list[Path]:
     """Write the estimate and what is known of it, and print its errors; return the files."""
-    import numpy as np
-
     from strapdown import setup
     from strapdown.files import write_json
     from strapdown.records import write_estimate
 
-    out, result, truth = output.folder, run.estimate, run.truth
+    result, truth = run.estimate, run.truth
     paths = [out / "estimate.h5"]
     attributes: dict[str, Any] = {"source": str(path), "filter": setup.to_toml(chosen), "start": run.start}
     attributes["smoothed"] = shared.smooth
@@ -409,12 +360,16 @@ def _write_specified(
         found = _errors(result, truth)
         write_json(paths[-1], {"source": str(path), **found})
         console.print(_errors_words(found))
-    paths += _export(output.exports, result, None)
+    return paths
+
+
+def _say_nis(result: Estimate, path: Path) -> None:
+    import numpy as np
+
     seen = {s: i for s, i in result.innovations.items() if np.sum(i.used)}
     if seen:
         each = ", ".join(f"{np.mean(i.nis[i.used]) / i.innovation.shape[1]:.3g} {s}" for s, i in seen.items())
-        console.print(f"Mean NIS per degree of freedom (right: 1): {each}. `strapdown check {paths[0]}` judges them.")
-    return paths
+        console.print(f"Mean NIS per degree of freedom (right: 1): {each}. `strapdown check {path}` judges them.")
 
 
 def _observability(out: Path, source: str, record: ImuRecord, chosen: FilterSetup, initial: State) -> Path:
@@ -559,31 +514,21 @@ def _errors(result: Estimate, truth: Any) -> dict[str, float]:
     return found
 
 
-def _estimate_recording(recording: Path, shared: _Shared, options: _Recorded, output: _Output) -> None:
+def _estimate_recording(
+    recording: Path, layout: dict[str, Any], shared: _Shared, options: _Recorded, output: _Output, exports: Exports
+) -> None:
     """Run the filter over a recording: accelerometer as the vertical, magnetometer as the heading."""
-    from strapdown import ahrs, recordings
+    from strapdown import ahrs
     from strapdown.checks import non_negative, one_of
     from strapdown.consistency import reference_errors
-    from strapdown.gyro import read_spec
-    from strapdown.recordings import gyro_temperature, unit_calibration
-    from strapdown.units import DEGREE
+    from strapdown.recordings import unit_calibration
+    from strapdown.units import DEGREE, DEGREE_PER_HOUR_PER_ROOT_HOUR, DEGREE_PER_ROOT_HOUR
 
-    one_of("--motion", options.motion, ahrs.MOTIONS)
+    motion = one_of("--motion", options.motion or "hand", ahrs.MOTIONS)
     late = None if options.latency is None else 1e-3 * non_negative("--latency", options.latency, unit="ms")
     robustness = shared.robustness
     carried = None if options.calibration is None else unit_calibration.read(options.calibration)
-    warm = None if options.temperature is None else gyro_temperature.read(options.temperature)
-    with progress_bar("reading"):
-        source = recordings.read(recording, **options.layout)
-    doubt(source, recording)
-    parameters = ahrs.MOTIONS[options.motion]
-    if shared.gyro is not None:
-        from strapdown import workflows  # which imports much more
-
-        parameters = workflows.with_gyro_noise(parameters, read_spec(shared.gyro))
-    if warm is not None:
-        source, walk = warm.applied(source)
-        parameters = replace(parameters, rate_random_walk=math.hypot(parameters.rate_random_walk, walk))
+    source, parameters = _read_recording(recording, layout, ahrs.MOTIONS[motion], shared, options.temperature)
     with progress_bar("smoothing" if shared.smooth else "filtering"):
         result = ahrs.estimate(
             source,
@@ -594,23 +539,54 @@ def _estimate_recording(recording: Path, shared: _Shared, options: _Recorded, ou
             smooth=shared.smooth,
             **robustness,
         )
-    used = result.recording
+    used, out = result.recording, output.out
     errors = None if used.true_attitude is None else reference_errors(result.estimate.attitude, used.true_attitude)
     rms = None if errors is None else {name: value / DEGREE for name, value in errors.rms(used.movement).items()}
-    chosen = replace(parameters.setup, **robustness)
-    paths = _write_recording(result, parameters, chosen, shared, options, output)
-    _say_recording(result, parameters, options)
-    if shared.observability:
-        paths.append(_observability(output.folder, used.source, result.record, parameters.setup, result.initial))
-    if rms is not None:
-        paths.append(_rms(output.folder, used.source, rms))
-    paths += _export(output.exports, result.estimate, source)
-    if output.form is not None:
-        frame = _fixed_frame(used)
-        paths += _drawn(
-            output.folder, output.form, result.estimate, used.source, used=used, errors=errors, fixed_frame=frame
+    paths = _write_recording(result, parameters, replace(parameters.setup, **robustness), motion, shared.smooth, out)
+    _say_recording(result, parameters, motion)
+    if shared.gyro is not None:
+        arw, rrw = parameters.angle_random_walk, parameters.rate_random_walk
+        console.print(
+            f"Gyro noise from {shared.gyro}, flicker included: {arw / DEGREE_PER_ROOT_HOUR:.3g} °/√h, bias random walk "
+            f"{rrw / DEGREE_PER_HOUR_PER_ROOT_HOUR:.3g} °/h/√h."
         )
+    if shared.observability:
+        paths.append(_observability(out, used.source, result.record, parameters.setup, result.initial))
+    if rms is not None:
+        paths.append(_rms(out, used.source, rms))
+    paths += _export(exports, result.estimate, source)
+    if output.drawn_as is not None:
+        frame = _fixed_frame(used)
+        paths += _drawn(out, output.drawn_as, result.estimate, used.source, used=used, errors=errors, fixed_frame=frame)
     written(*paths)
+
+
+def _read_recording(
+    recording: Path, layout: dict[str, Any], parameters: AhrsParameters, shared: _Shared, temperature: Path | None
+) -> tuple[Recording, AhrsParameters]:
+    """Return the recording, its bias over temperature subtracted, and the filter's parameters with the noise of the gyro given."""
+    from strapdown import recordings
+    from strapdown.gyro import read_spec
+    from strapdown.gyro import temperature as thermal
+    from strapdown.recordings import gyro_temperature
+
+    warm = None if temperature is None else thermal.read(temperature)
+    with progress_bar("reading"):
+        source = recordings.read(recording, **layout)
+    doubt(source, recording)
+    if shared.gyro is not None:
+        from strapdown import workflows  # which imports much more
+
+        parameters = workflows.with_gyro_noise(parameters, read_spec(shared.gyro))
+    if warm is not None:
+        source = gyro_temperature.applied(source, warm)
+        if shared.smooth or shared.observability:
+            # They have no bias driven by temperature: a walk covers the slope's error.
+            walk = warm.walk(gyro_temperature.temperature_at_samples(source), source.time)
+            parameters = replace(parameters, rate_random_walk=math.hypot(parameters.rate_random_walk, walk))
+        else:
+            parameters = replace(parameters, gyro_temperature_sigma=tuple(warm.slope_sigma.tolist()))
+    return source, parameters
 
 
 def _fixed_frame(used: Recording) -> str:
@@ -622,12 +598,7 @@ def _fixed_frame(used: Recording) -> str:
 
 
 def _write_recording(
-    result: AhrsEstimate,
-    parameters: AhrsParameters,
-    chosen: FilterSetup,
-    shared: _Shared,
-    options: _Recorded,
-    output: _Output,
+    result: AhrsEstimate, parameters: AhrsParameters, chosen: FilterSetup, motion: str, smoothed: bool, out: Path
 ) -> list[Path]:
     """Write the estimate, its states and the calibration; return the files."""
     from strapdown import setup
@@ -635,7 +606,7 @@ def _write_recording(
     from strapdown.recordings import unit_calibration
     from strapdown.records import write_estimate
 
-    used, found, out = result.recording, result.estimate, output.folder
+    used, found = result.recording, result.estimate
     paths = [out / "estimate.h5"]
     _clear(out)
     write_estimate(
@@ -644,8 +615,8 @@ def _write_recording(
         {
             "source": used.source,
             "fixed_frame": _fixed_frame(used),
-            "motion": options.motion,
-            "smoothed": shared.smooth,
+            "motion": motion,
+            "smoothed": smoothed,
             "filter": setup.to_toml(chosen),
             **{f"parameter.{name}": value for name, value in vars(parameters).items()},
             "latency": result.delays.last_gyro,
@@ -661,7 +632,7 @@ def _write_recording(
     return paths
 
 
-def _say_recording(result: AhrsEstimate, parameters: AhrsParameters, options: _Recorded) -> None:
+def _say_recording(result: AhrsEstimate, parameters: AhrsParameters, motion: str) -> None:
     """Print what was read, how the filter started, and what of the samples is not as it should be."""
     from strapdown import recordings
 
@@ -673,7 +644,7 @@ def _say_recording(result: AhrsEstimate, parameters: AhrsParameters, options: _R
     for remark in used.remarks:
         console.print(remark)
     console.print(f"Fixed frame: {_fixed_frame(used)}.")
-    console.print(_model(options.motion, parameters, result))
+    console.print(_model(motion, parameters, result))
     for sentence in (*result.delays.words, *(f"{one}." for one in result.faults.words)):
         console.print(sentence)
     if result.hard_iron.any():
@@ -687,7 +658,7 @@ def _say_recording(result: AhrsEstimate, parameters: AhrsParameters, options: _R
         console.print(used.left_out_words)
     for sensor, number in found.skipped.items():
         if number:
-            console.print(f"{number} samples of the {sensor} are missing and were skipped.")
+            console.print(f"{number} of the gyro's samples have none of the {sensor} beside them.")
     _print_result(replace(found, skipped={}))
 
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from strapdown.cli.reading import RECORDING_HELP, Axes, Columns, GyroUnit, Invert, TimeUnit, Topic, given_layout
+from strapdown.cli.reading import RECORDING_HELP, Layout
 from strapdown.cli.terminal import (
     Tables,
-    app,
+    command,
     console,
     json_target,
     need_own,
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from strapdown.records import ImuRecord
 
 
-@app.command()
+@command
 def algorithms(
     time: Annotated[bool, typer.Option(help="Measure the time a sample takes on this machine (a few seconds).")] = True,
     tables: Tables = None,
@@ -70,17 +70,12 @@ def algorithms(
         written(*tables_written(tables, "algorithms", rows))
 
 
-@app.command()
+@command
 def integrate(
     recording: Annotated[Path, typer.Argument(help=f"Simulated record (HDF5). {RECORDING_HELP}.")],
+    layout: Layout,
     algorithm: Annotated[str, typer.Option(help="Name of the algorithm; see `strapdown algorithms`.")] = "four-sample",
     out: Annotated[Path, typer.Option(help="HDF5 file for the attitude.")] = Path("attitude.h5"),
-    gyro_unit: GyroUnit = None,
-    time_unit: TimeUnit = None,
-    columns: Columns = None,
-    topic: Topic = None,
-    axes: Axes = None,
-    invert: Invert = None,
 ) -> None:
     """Integrate a gyro recording to attitude, starting at the true attitude if the file holds it, else at the identity."""
     import numpy as np
@@ -92,9 +87,7 @@ def integrate(
     writable("out", out, suffixes=(".h5", ".hdf5"), sources=(recording,))
     need_own(out, "integrate", lambda path: bool(records.read_attributes(path)["kind"] == "strapdown attitude"))
     chosen = coning.named(algorithm)
-    layout = given_layout(
-        recording, columns=columns, topic=topic, axes=axes, invert=invert, gyro=gyro_unit, time=time_unit
-    )
+    reading_options = layout.options(recording)
     gaps: list[tuple[float, float]] = []
     words = ""
     with progress_bar("reading, integrating, writing", 3) as advance:
@@ -104,7 +97,7 @@ def integrate(
             samples = len(source.increments)
             truth = None if source.truth is None else source.truth.attitude
         else:
-            source = recordings.read(recording, **layout, gyro_alone=True)
+            source = recordings.read(recording, **reading_options, gyro_alone=True)
             samples, truth = len(source.time) - 1, source.true_attitude
             gaps, words = recordings.gaps(source.time), " ".join([*source.remarks, source.left_out_words]).strip()
         advance(1)
@@ -133,7 +126,7 @@ def integrate(
 _RIGHT_ANGLE = 0.5 * math.pi
 
 
-@app.command("coning-budget")
+@command
 def coning_budget(
     psd: Annotated[
         Path, typer.Option(help="CSV of vibration lines: frequency_hz, angle_deg[, angle_across_deg, phase_deg].")

@@ -3,28 +3,20 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.text import Text
 
 from strapdown.cli.filters import no_state_words
-from strapdown.cli.reading import (
-    RECORDING_HELP,
-    AccelerometerUnit,
-    Axes,
-    Columns,
-    GyroUnit,
-    Invert,
-    TimeUnit,
-    Topic,
-    given_layout,
-)
+from strapdown.cli.reading import RECORDING_HELP, Layout
 from strapdown.cli.terminal import (
-    app,
+    command,
     console,
     counted,
+    given,
     json_target,
     progress_bar,
     put_json,
@@ -45,7 +37,37 @@ CONSISTENT, NOT, CANNOT_TELL = 0, 1, 2
 """Exit status of a verdict. Bad input ends with 2 too, and an error on standard error."""
 
 
-@app.command()
+@dataclass(frozen=True)
+class _Foreign:
+    """With a truth: an estimate of any filter."""
+
+    truth: Annotated[
+        Path | None,
+        typer.Option(
+            help="Reference attitudes, of any clock and frames: a simulated record, TUM, EuRoC, CSV, ROS bag. What differs is printed."
+        ),
+    ] = None
+    error_frame: Annotated[
+        str,
+        typer.Option(
+            help="How the covariance is meant, body, fixed or euler (roll, pitch, yaw); find takes what the errors fit."
+        ),
+    ] = "find"
+    align: Annotated[
+        str,
+        typer.Option(
+            help="What is estimated and removed: any of time,fixed,body (frames), or none; auto: a clock's offset, and rotations beyond 5°."
+        ),
+    ] = "auto"
+    aligned: Annotated[
+        Path | None,
+        typer.Option(help="HDF5 file for the estimate as it was judged, which `strapdown report` reads."),
+    ] = None
+    topic: Annotated[str | None, typer.Option(help="Topic of the estimate, where a bag holds several.")] = None
+    truth_topic: Annotated[str | None, typer.Option(help="Topic of the truth, where a bag holds several.")] = None
+
+
+@command
 def check(
     result: Annotated[
         Path,
@@ -54,6 +76,7 @@ def check(
             "any filter: CSV, TUM, ROS bag, ULog."
         ),
     ],
+    foreign: _Foreign,
     probability: Annotated[
         float, typer.Option(help="Probability that a right filter passes all tests together, at least.")
     ] = 0.99,
@@ -68,84 +91,33 @@ def check(
         ),
     ] = None,
     json: Annotated[Path | None, typer.Option("--json", help="File for all statistics; - for standard output.")] = None,
-    truth: Annotated[
-        Path | None,
-        typer.Option(
-            help="Reference attitudes, of any clock and frames: a simulated record, TUM, EuRoC, CSV, ROS bag. What differs is printed."
-        ),
-    ] = None,
-    error_frame: Annotated[
-        str,
-        typer.Option(
-            help="With --truth: how the covariance is meant, body, fixed or euler (roll, pitch, yaw); find takes what the errors fit."
-        ),
-    ] = "find",
-    align: Annotated[
-        str,
-        typer.Option(
-            help="With --truth: what is estimated and removed: any of time,fixed,body (frames), or none; auto: a clock's offset, and "
-            "rotations beyond 5°."
-        ),
-    ] = "auto",
-    topic: Annotated[str | None, typer.Option(help="Topic of the estimate, where a bag holds several.")] = None,
-    truth_topic: Annotated[str | None, typer.Option(help="Topic of the truth, where a bag holds several.")] = None,
-    aligned: Annotated[
-        Path | None,
-        typer.Option(help="With --truth: HDF5 file for the estimate as it was judged, which `strapdown report` reads."),
-    ] = None,
 ) -> None:
     """Judge whether a filter is consistent: exit status 0 consistent, 1 not, 2 cannot tell (or bad input).
 
     With --record the verdict takes the statistics and the causes that were looked for together. With --truth the estimate may be of any
     filter; clocks and frames are compared first. An estimate from elsewhere without a truth is judged by its innovations, if it has any.
     """
-    from strapdown import consistency, records
     from strapdown.checks import InputError
     from strapdown.consistency.bounds import tail
-    from strapdown.report import findings
 
-    json_target(json, result, record, filter_file, truth)
+    json_target(json, result, record, filter_file, foreign.truth)
     if record is None and filter_file is not None:
         raise InputError("--filter goes with --record: the record is needed to look for causes")
     tail(probability)
-    if truth is not None or not _is_own(result):
-        if record is not None:
-            raise InputError(
-                "--record goes with an estimate of `strapdown estimate`, judged by itself; leave out --truth or --record"
-            )
-        _check_foreign(
-            result, truth, _Reading(error_frame, align, topic or "", truth_topic or "", probability), aligned, json
+    own = _is_own(result)
+    if record is not None and (foreign.truth is not None or not own):
+        raise InputError(
+            "--record goes with an estimate of `strapdown estimate`, judged by itself; leave out --truth or --record"
         )
-    for name, given in (("--error-frame", error_frame != "find"), ("--align", align != "auto"), ("--aligned", aligned)):
-        if given:
+    for name in given(foreign) if foreign.truth is None else ():
+        if name not in ("--topic", "--truth-topic"):
             raise InputError(f"{name} goes with --truth; give a reference, or leave it out")
-    kind = str(records.read_attributes(result)["kind"])
-    content: dict[str, Any] = {"source": result.name, "kind": kind}
-    if kind == "strapdown montecarlo":
-        from strapdown.montecarlo import campaign
-
-        if record is not None:
-            raise InputError("--record and --filter go with an estimate; of a Monte Carlo replay a run first")
-        held = campaign.read(result)
-        if held.statistics is None:
-            raise InputError(f"{result} holds no finished run yet; resume it with `strapdown montecarlo --resume`")
-        console.print(f"{result.name}: {held.statistics.runs} of {counted(held.runs, 'run')}, machine {held.machine}.")
-        judgement = consistency.judge_runs(held.statistics, probability=probability, unmodelled=held.plan.unmodelled)
-    elif kind == "strapdown estimate":
-        estimate = records.read_estimate(result)
-        own_truth = records.read_truth(result)
-        console.print(
-            f"{result.name}: {len(estimate.time)} epochs over {estimate.time[-1] - estimate.time[0]:.6g} s, "
-            f"{sum(len(one.time) for one in estimate.innovations.values())} measurements, "
-            f"{'no truth' if own_truth is None else 'with its truth'}."
-        )
-        judgement = findings.judged(
-            result, records.read_attributes(result), estimate, own_truth, probability=probability
-        )
+    if foreign.truth is not None or not own:
+        judgement, content = _judged_foreign(result, foreign, probability)
     else:
-        raise InputError(f"{result} is a {kind}; pass what `strapdown estimate` or `strapdown montecarlo` wrote")
-    _show_statistics(judgement)
+        judgement, content = _judged_own(result, probability, with_record=record is not None)
     words = judgement.words
+    _show_statistics(judgement)
     if record is not None:
         content["diagnosis"], found = _diagnosed(result, record, filter_file, judgement)
         if found is not None:
@@ -155,7 +127,41 @@ def check(
     console.print(words)
     content.update(judgement.summary())
     put_json(json, content)
+    if foreign.aligned is not None:
+        written(foreign.aligned)
     raise typer.Exit(status_of(judgement))
+
+
+def _judged_own(result: Path, probability: float, *, with_record: bool) -> tuple[Judgement, dict[str, Any]]:
+    """Judge a result of this package; return the verdict and what the JSON says of it."""
+    from strapdown import consistency, records
+    from strapdown.checks import InputError
+    from strapdown.report import findings
+
+    attributes = records.read_attributes(result)
+    kind = str(attributes["kind"])
+    if kind == "strapdown montecarlo":
+        from strapdown.montecarlo import campaign
+
+        if with_record:
+            raise InputError("--record and --filter go with an estimate; of a Monte Carlo replay a run first")
+        held = campaign.read(result)
+        if held.statistics is None:
+            raise InputError(f"{result} holds no finished run yet; resume it with `strapdown montecarlo --resume`")
+        console.print(f"{result.name}: {held.statistics.runs} of {counted(held.runs, 'run')}, machine {held.machine}.")
+        judgement = consistency.judge_runs(held.statistics, probability=probability, unmodelled=held.plan.unmodelled)
+    elif kind == "strapdown estimate":
+        estimate = records.read_estimate(result)
+        truth = records.read_truth(result)
+        console.print(
+            f"{result.name}: {len(estimate.time)} epochs over {estimate.time[-1] - estimate.time[0]:.6g} s, "
+            f"{sum(len(one.time) for one in estimate.innovations.values())} measurements, "
+            f"{'no truth' if truth is None else 'with its truth'}."
+        )
+        judgement = findings.judged(result, attributes, estimate, truth, probability=probability)
+    else:
+        raise InputError(f"{result} is a {kind}; pass what `strapdown estimate` or `strapdown montecarlo` wrote")
+    return judgement, {"source": result.name, "kind": kind}
 
 
 def status_of(judgement: Judgement) -> int:
@@ -170,80 +176,57 @@ def _is_own(path: Path) -> bool:
     return not path.exists() or path.suffix.lower() in (".h5", ".hdf5") or (path.is_file() and reading.is_hdf5(path))
 
 
-class _Reading(NamedTuple):
-    """How an estimate from elsewhere is to be read."""
-
-    error_frame: str
-    align: str
-    topic: str
-    truth_topic: str
-    probability: float
-
-
-def _check_foreign(
-    result: Path, truth: Path | None, layout: _Reading, aligned: Path | None, json: Path | None
-) -> NoReturn:
-    """Judge an estimate from elsewhere."""
+def _judged_foreign(result: Path, options: _Foreign, probability: float) -> tuple[Judgement, dict[str, Any]]:
+    """Judge an estimate from elsewhere; return the verdict and what the JSON says of it."""
     from strapdown import consistency
     from strapdown.checks import InputError
     from strapdown.consistency import foreign
     from strapdown.recordings.attitudes import read_attitudes
     from strapdown.records import write_estimate
 
-    if aligned is not None:
-        writable("aligned", aligned, suffixes=(".h5", ".hdf5"), sources=(result, truth))
-    own = read_attitudes(result, topic=layout.topic)
+    if options.aligned is not None:
+        writable("aligned", options.aligned, suffixes=(".h5", ".hdf5"), sources=(result, options.truth))
+    own = read_attitudes(result, topic=options.topic or "")
     length = (own.stamps_ns[-1] - own.stamps_ns[0]) / 1e9
     console.print(f"{own.source}: {len(own.stamps_ns)} attitudes over {length:.6g} s.")
     for remark in own.remarks:
         console.print(remark)
     content: dict[str, Any] = {"source": own.source, "kind": "estimate from elsewhere"}
-    if truth is None:
+    if options.truth is None:
         if not own.innovations:
             raise InputError(
                 f"{result} holds no innovations, so nothing can be judged without a truth; give --truth, attitudes over the same time"
             )
         estimate = foreign.without_truth(own.seconds(int(own.stamps_ns[0])), own.attitude, own.innovations)
-        judgement = consistency.judge(estimate, None, probability=layout.probability)
-    else:
-        reference = read_attitudes(truth, topic=layout.truth_topic)
-        console.print(f"Truth: {reference.source}, {len(reference.stamps_ns)} attitudes.")
-        # Clocks from 1970 and from the start of a machine: each from the first stamp of both, in whole ns.
-        origin = int(min(own.stamps_ns[0], reference.stamps_ns[0]))
-        frame = own.error_frame if layout.error_frame == "find" and own.error_frame else layout.error_frame
-        found = foreign.check_arrays(
-            own.seconds(origin),
-            own.attitude,
-            own.covariance,
-            reference.seconds(origin),
-            reference.attitude,
-            bias=own.bias,
-            true_bias=reference.bias,
-            innovations=own.innovations,
-            error_frame=frame,
-            align=layout.align,
-            probability=layout.probability,
-        )
-        judgement = found.judgement
-        content.update(found.summary())
-        for remark in found.remarks:
-            console.print(f"Note: {remark}.")
-        if frame != layout.error_frame:
-            console.print(f"Note: the file says that its covariance is of the {frame} error.")
-        _show_explanations(found)
-        if aligned is not None:
-            write_estimate(
-                aligned, found.estimate, {"source": own.source, "truth": reference.source}, truth=found.truth
-            )
-    _show_statistics(judgement)
-    for limit in judgement.limits:
-        console.print(f"Note: {limit}.")
-    console.print(judgement.words)
-    content.update(judgement.summary())
-    put_json(json, content)
-    if truth is not None and aligned is not None:
-        written(aligned)
-    raise typer.Exit({"consistent": CONSISTENT, "not consistent": NOT}.get(judgement.verdict, CANNOT_TELL))
+        return consistency.judge(estimate, None, probability=probability), content
+    reference = read_attitudes(options.truth, topic=options.truth_topic or "")
+    console.print(f"Truth: {reference.source}, {len(reference.stamps_ns)} attitudes.")
+    # Clocks from 1970 and from the start of a machine: each from the first stamp of both, in whole ns.
+    origin = int(min(own.stamps_ns[0], reference.stamps_ns[0]))
+    frame = own.error_frame if options.error_frame == "find" and own.error_frame else options.error_frame
+    found = foreign.check_arrays(
+        own.seconds(origin),
+        own.attitude,
+        own.covariance,
+        reference.seconds(origin),
+        reference.attitude,
+        bias=own.bias,
+        true_bias=reference.bias,
+        innovations=own.innovations,
+        error_frame=frame,
+        align=options.align,
+        probability=probability,
+    )
+    content.update(found.summary())
+    for remark in found.remarks:
+        console.print(f"Note: {remark}.")
+    if frame != options.error_frame:
+        console.print(f"Note: the file says that its covariance is of the {frame} error.")
+    _show_explanations(found)
+    if options.aligned is not None:
+        attributes = {"source": own.source, "truth": reference.source}
+        write_estimate(options.aligned, found.estimate, attributes, truth=found.truth)
+    return found.judgement, content
 
 
 def _show_explanations(found: Checked) -> None:
@@ -357,16 +340,10 @@ def _not_of_the_search(chosen: FilterSetup, estimate: Estimate) -> str:
     return ""
 
 
-@app.command()
+@command
 def doctor(
     recording: Annotated[Path, typer.Argument(help=f"{RECORDING_HELP}.")],
-    gyro_unit: GyroUnit = None,
-    accelerometer_unit: AccelerometerUnit = None,
-    time_unit: TimeUnit = None,
-    columns: Columns = None,
-    topic: Topic = None,
-    axes: Axes = None,
-    invert: Invert = None,
+    layout: Layout,
     json: Annotated[
         Path | None, typer.Option("--json", help="File for the explanations and their scores; - for standard output.")
     ] = None,
@@ -376,10 +353,7 @@ def doctor(
     from strapdown.ahrs import doctor as conventions
 
     json_target(json, recording)
-    given = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
-    source = recordings.read(
-        recording, **given_layout(recording, columns=columns, topic=topic, axes=axes, invert=invert, **given)
-    )
+    source = recordings.read(recording, **layout.options(recording))
     with progress_bar("trying conventions"):
         found = conventions.examine(source)
     console.print(f"{found.source}: {found.words}")
@@ -393,10 +367,17 @@ def doctor(
             "Explanations: score (log-likelihood) and misfit, 0 perfect, 1 unrelated, 2 opposite",
             "explanation",
             "score",
-            *names,
+            *(
+                name.replace("accelerometer", "acc").replace("magnetometer", "mag").replace(" and ", "–")
+                for name in names
+            ),
         )
         for one in found.candidates[:8]:
-            rows.add_row(one.words, f"{one.score:.1f}", *(f"{one.misfit[name]:.3f}" for name in names))
+            rows.add_row(
+                one.words.partition(" (--")[0].partition(" (deg")[0],
+                f"{one.score:.1f}",
+                *(f"{one.misfit[name]:.3f}" for name in names),
+            )
         show(rows)
     for note in found.notes:
         console.print(f"Note: {note}.")

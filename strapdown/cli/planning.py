@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,7 +13,7 @@ from strapdown.cli.terminal import (
     FigureFormat,
     Format,
     Tables,
-    app,
+    command,
     console,
     progress_bar,
     scenario_named,
@@ -23,6 +24,9 @@ from strapdown.cli.terminal import (
     writable,
     written,
 )
+
+if TYPE_CHECKING:
+    from strapdown.covariance import Consider
 
 
 def _named(option: str, values: list[str] | None) -> dict[str, float]:
@@ -53,37 +57,66 @@ def _in_own_units(biases: dict[str, float], sensors: Any) -> dict[str, float]:
     return {name: value * sizes.get(name, 1.0) for name, value in biases.items()}
 
 
-@app.command()
+@dataclass(frozen=True)
+class _Errors:
+    """Errors besides those that the filter models."""
+
+    scale_factor: Annotated[float, typer.Option(help="Consider gyro scale factors of this 1σ, ppm.")] = 0.0
+    misalignment: Annotated[float, typer.Option(help="Consider gyro misalignments of this 1σ, mrad.")] = 0.0
+    g_sensitivity: Annotated[float, typer.Option(help="Consider gyro g-sensitivities of this 1σ, °/h/g.")] = 0.0
+    sensor_bias: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Consider a sensor's bias of this 1σ on each axis, NAME=VALUE: nT, m/s², or arcsec. Repeatable."
+        ),
+    ] = None
+    mounting: Annotated[
+        list[str] | None,
+        typer.Option(help="Consider a sensor turned on the body by this 1σ about each axis, NAME=ARCSEC. Repeatable."),
+    ] = None
+    time_offset: Annotated[
+        list[str] | None, typer.Option(help="Consider a sensor that measures late by this 1σ, NAME=MS. Repeatable.")
+    ] = None
+    attitude_sigma: Annotated[
+        float | None, typer.Option(help="Actual 1σ of the initial attitude, each axis, degrees; else the filter's.")
+    ] = None
+    bias_sigma: Annotated[
+        float | None, typer.Option(help="Actual 1σ of the initial bias, each axis, °/h; else the filter's.")
+    ] = None
+
+    def check(self) -> None:
+        """Refuse negative σ, in the unit that they were given in."""
+        from strapdown.checks import non_negative
+
+        units = {"scale_factor": "ppm", "misalignment": "mrad", "g_sensitivity": "°/h/g"}
+        for name, unit in (units | {"attitude_sigma": "degrees", "bias_sigma": "°/h"}).items():
+            non_negative("--" + name.replace("_", "-"), getattr(self, name) or 0.0, unit=unit)
+
+    def considered(self, sensors: Any) -> Consider:
+        """Return the errors in SI, for a scenario's sensors."""
+        from strapdown.covariance import Consider
+        from strapdown.units import ARCSECOND, DEGREE_PER_HOUR, STANDARD_GRAVITY
+
+        return Consider(
+            scale_factor=1e-6 * self.scale_factor,
+            misalignment=1e-3 * self.misalignment,
+            g_sensitivity=self.g_sensitivity * DEGREE_PER_HOUR / STANDARD_GRAVITY,
+            sensor_bias=_in_own_units(_named("sensor_bias", self.sensor_bias), sensors),
+            mounting={name: value * ARCSECOND for name, value in _named("mounting", self.mounting).items()},
+            time_offset={name: 1e-3 * value for name, value in _named("time_offset", self.time_offset).items()},
+        )
+
+
+@command
 def covariance(
     scenario: Annotated[str, typer.Argument(help="Name of a built-in scenario, or a TOML file.")],
+    errors: _Errors,
     filter_file: Annotated[
         Path | None,
         typer.Option(
             "--filter",
             help="TOML with a table named filter, as `strapdown tune` writes it; without it the filter that matches the scenario.",
         ),
-    ] = None,
-    scale_factor: Annotated[float, typer.Option(help="Consider gyro scale factors of this 1σ, ppm.")] = 0.0,
-    misalignment: Annotated[float, typer.Option(help="Consider gyro misalignments of this 1σ, mrad.")] = 0.0,
-    g_sensitivity: Annotated[float, typer.Option(help="Consider gyro g-sensitivities of this 1σ, °/h/g.")] = 0.0,
-    sensor_bias: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Consider a sensor's bias of this 1σ on each axis, NAME=VALUE: nT, m/s², or arcsec. Repeatable."
-        ),
-    ] = None,
-    mounting: Annotated[
-        list[str] | None,
-        typer.Option(help="Consider a sensor turned on the body by this 1σ about each axis, NAME=ARCSEC. Repeatable."),
-    ] = None,
-    time_offset: Annotated[
-        list[str] | None, typer.Option(help="Consider a sensor that measures late by this 1σ, NAME=MS. Repeatable.")
-    ] = None,
-    attitude_sigma: Annotated[
-        float | None, typer.Option(help="Actual 1σ of the initial attitude, each axis, degrees; else the filter's.")
-    ] = None,
-    bias_sigma: Annotated[
-        float | None, typer.Option(help="Actual 1σ of the initial bias, each axis, °/h; else the filter's.")
     ] = None,
     epochs: Annotated[int, typer.Option(help="Epochs over the scenario's time.")] = 100,
     out: Annotated[Path, typer.Option(help="Folder for covariance.json and the figure.")] = Path("covariance-results"),
@@ -92,47 +125,35 @@ def covariance(
 ) -> None:
     """Predict a filter's errors and their budget by source, in one pass without noise."""
     from strapdown import covariance as analysis
-    from strapdown import setup
-    from strapdown.checks import non_negative
+    from strapdown import plots, setup
     from strapdown.files import usable_folder, write_json
-    from strapdown.units import ARCSECOND, DEGREE, DEGREE_PER_HOUR, STANDARD_GRAVITY
+    from strapdown.plots.style import save_as
+    from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
-    for option, value, unit in (
-        ("--scale-factor", scale_factor, "ppm"),
-        ("--misalignment", misalignment, "mrad"),
-        ("--g-sensitivity", g_sensitivity, "°/h/g"),
-        ("--attitude-sigma", attitude_sigma or 0.0, "degrees"),
-        ("--bias-sigma", bias_sigma or 0.0, "°/h"),
-    ):
-        non_negative(option, value, unit=unit)  # in the unit that it was given in
+    errors.check()
     chosen = scenario_named(scenario)
     usable_folder("out", out)
     tables_folder(tables)
     writable("out", out / "covariance.json", out / f"budget.{form}", sources=(scenario, filter_file))
-    considered = analysis.Consider(
-        scale_factor=1e-6 * scale_factor,
-        misalignment=1e-3 * misalignment,
-        g_sensitivity=g_sensitivity * DEGREE_PER_HOUR / STANDARD_GRAVITY,
-        sensor_bias=_in_own_units(_named("sensor_bias", sensor_bias), chosen.sensors),
-        mounting={name: value * ARCSECOND for name, value in _named("mounting", mounting).items()},
-        time_offset={name: 1e-3 * value for name, value in _named("time_offset", time_offset).items()},
-    )
+    considered = errors.considered(chosen.sensors)
     modelled = filter_of_scenario(filter_file, chosen) if filter_file else setup.matched(chosen)
     with progress_bar("covariance analysis"):
         found = analysis.analyse(
             chosen,
             modelled,
             consider=considered,
-            initial_attitude_sigma=None if attitude_sigma is None else attitude_sigma * DEGREE,
-            initial_bias_sigma=None if bias_sigma is None else bias_sigma * DEGREE_PER_HOUR,
+            initial_attitude_sigma=None if errors.attitude_sigma is None else errors.attitude_sigma * DEGREE,
+            initial_bias_sigma=None if errors.bias_sigma is None else errors.bias_sigma * DEGREE_PER_HOUR,
             epochs=epochs,
         )
     name = chosen.name or Path(scenario).stem
     _print_result(name, found, modelled.integration.name, matched=filter_file is None)
+    missing = setup.unmodelled_errors(chosen.gyro, chosen.sensors, modelled.states, gravity_f=chosen.gravity_f)
+    if missing and filter_file is None:
+        console.print(
+            f"This is the filter of attitude and bias alone. `estimate` and `montecarlo` by default add states for {', '.join(missing)}.\n"
+        )
     write_json(out / "covariance.json", _summary(name, found))
-    from strapdown import plots
-    from strapdown.plots.style import save_as
-
     title = f"{name}: predicted errors, without a Monte Carlo"
     figures = save_as({out / "budget": plots.error_budget(found, title=title)}, form)
     written(out / "covariance.json", *figures, *tables_written(tables, "covariance", found.budget()))
@@ -164,7 +185,7 @@ def _print_result(name: str, found: Any, integration: str, *, matched: bool) -> 
     show(rows)
     console.print(
         "random: squares add. fixed: the same in every run, adds as an error. considered: 1σ of an error that neither the scenario nor the "
-        "filter knows of.\n"
+        "filter has.\n"
     )
     state, attitude, bias = found.expected_nees[-1]
     nis = ", ".join(f"{sensor} {value:.3g}" for sensor, value in found.expected_nis.items())
@@ -175,17 +196,17 @@ def _print_result(name: str, found: Any, integration: str, *, matched: bool) -> 
     if largest > LARGEST_LINEAR:
         console.print(
             f"With an attitude error of {largest / DEGREE:.3g}° the analysis, linear about the truth, cannot tell whether the filter "
-            "will be as good as it says."
+            "will be consistent."
         )
     elif max(attitude, bias) > 1.1:
         worst = "bias" if bias > attitude else "attitude"
         console.print(
-            f"The filter will be too sure of its {worst}: its errors are {np.sqrt(max(attitude, bias)):.3g} times what it says."
+            f"The filter will be optimistic in {worst}: its errors will be {np.sqrt(max(attitude, bias)):.3g} times its σ."
         )
     elif min(attitude, bias) < 0.9:
-        console.print("The filter will be more modest than it need be.")
+        console.print("The filter will be pessimistic: its σ will be larger than its errors.")
     else:
-        console.print("The filter will be as good as it says.")
+        console.print("The filter will be consistent.")
     if found.left_out:
         console.print(f"Left out: {', '.join(found.left_out)}.")
     for one in found.beyond_linear:

@@ -2,96 +2,101 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
+from strapdown.cli.terminal import given
 
-GyroUnit = Annotated[
-    str | None, typer.Option("--gyro-unit", help="Table: unit of the gyro, rad/s, deg/s, mrad/s or mdeg/s.")
-]
-AccelerometerUnit = Annotated[
-    str | None, typer.Option("--accelerometer-unit", help="Table: unit of the accelerometer, m/s2, g or mg.")
-]
-MagnetometerUnit = Annotated[
-    str | None, typer.Option("--magnetometer-unit", help="Table: unit of the magnetometer, T, mT, uT, nT, G or mG.")
-]
-TimeUnit = Annotated[str | None, typer.Option("--time-unit", help="Table: unit of the time, s, ms, us or ns.")]
-Columns = Annotated[
-    str | None,
-    typer.Option(
-        "--columns",
-        metavar="ROLE=NAME,…",
-        help="Table: its columns where they are not the usual ones, unit in parentheses: time=timestamp(us),gx=gyro_x(dps),gy=….",
-    ),
-]
-Topic = Annotated[
-    str | None, typer.Option("--topic", help="Bag or flight log: topic of the inertial unit, where there are several.")
-]
-Axes = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--axes",
-        metavar="[SENSOR=]AXES",
-        help="Recorded axes that become the body's x, y, z: x,-y,-z of a unit whose z axis points down, magnetometer=y,x,-z of one sensor; "
-        "may be repeated.",
-    ),
-]
-Invert = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--invert",
-        metavar="SENSOR",
-        help="Sensor of inverted sign: accelerometer (of one that reads -g upward at rest), magnetometer or gyro; may be repeated.",
-    ),
-]
 RECORDING_HELP = (
     "Recording of any format: table (CSV, TSV, Parquet) with time, gx, gy, gz[, ax, ay, az[, mx, my, mz]], ROS bag, ULog, EuRoC folder, "
     "BROAD HDF5, camera or phone log"
 )
 
 
-def given_layout(
-    path: Path,
-    *,
-    columns: str | None = None,
-    topic: str | None = None,
-    axes: Sequence[str] | None = None,
-    invert: Sequence[str] | None = None,
-    **units: str | None,
-) -> dict[str, Any]:
-    """Return the options of :func:`strapdown.recordings.read` that the command line gives; a simulated record takes none of them."""
-    from strapdown import recordings
-    from strapdown.checks import InputError, one_of
+@dataclass(frozen=True)
+class Samples:
+    """Layout of the recording."""
 
-    given = {name.removesuffix("_unit"): unit for name, unit in units.items() if unit}
-    if recordings.is_record(path):
-        options = [
-            *(f"{name}-unit" for name in given),
-            *(["columns"] if columns else []),
-            *(["topic"] if topic else []),
-            *(["axes"] if axes else []),
-            *(["invert"] if invert else []),
-        ]
-        for name in options:
-            what = {"topic": "a bag or a flight log", "axes": "a recording", "invert": "a recording"}.get(
-                name, "a table"
-            )
-            own = "holds its units" if name.endswith("-unit") else "needs none"
-            raise InputError(f"--{name} goes with {what}; the record {path} {own}")
-    found: dict[str, Any] = {"units": given}
-    if columns:
-        found["columns"] = recordings.parse_mapping(columns)
-    if topic:
-        found["topic"] = topic
-    if axes:
-        found["axes"] = _axes(axes)
-    if invert:
-        found["invert"] = tuple(one_of("--invert", sensor, recordings.SENSORS) for sensor in invert)
-    return found
+    gyro_unit: Annotated[str | None, typer.Option(help="Table: unit of the gyro, rad/s, deg/s, mrad/s or mdeg/s.")] = (
+        None
+    )
+    accelerometer_unit: Annotated[str | None, typer.Option(help="Table: unit of the accelerometer, m/s2, g or mg.")] = (
+        None
+    )
+    magnetometer_unit: Annotated[
+        str | None, typer.Option(help="Table: unit of the magnetometer, T, mT, uT, nT, G or mG.")
+    ] = None
+    time_unit: Annotated[str | None, typer.Option(help="Table: unit of the time, s, ms, us or ns.")] = None
+    columns: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ROLE=NAME,…",
+            help="Table: its columns where they are not the usual ones, unit in parentheses: time=timestamp(us),gx=gyro_x(dps),gy=….",
+        ),
+    ] = None
+    topic: Annotated[
+        str | None, typer.Option(help="Bag or flight log: topic of the inertial unit, where there are several.")
+    ] = None
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units given, by quantity."""
+        names = ("gyro", "accelerometer", "magnetometer", "time")
+        return {name: unit for name in names if (unit := getattr(self, f"{name}_unit"))}
+
+    def options(self, path: Path) -> dict[str, Any]:
+        """Return the options of :func:`strapdown.recordings.read` that are given; a simulated record takes none of them."""
+        from strapdown import recordings
+        from strapdown.checks import InputError
+
+        if recordings.is_record(path):
+            for option in given(self):
+                what = {"--topic": "a bag or a flight log", "--axes": "a recording", "--invert": "a recording"}
+                own = "holds its units" if option.endswith("-unit") else "needs none"
+                raise InputError(f"{option} goes with {what.get(option, 'a table')}; the record {path} {own}")
+        found: dict[str, Any] = {"units": self.units}
+        if self.columns:
+            found["columns"] = recordings.parse_mapping(self.columns)
+        if self.topic:
+            found["topic"] = self.topic
+        return found
+
+
+@dataclass(frozen=True)
+class Layout(Samples):
+    """Layout of the recording."""
+
+    axes: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="[SENSOR=]AXES",
+            help="Recorded axes that become the body's x, y, z: x,-y,-z of a unit whose z axis points down, magnetometer=y,x,-z of one "
+            "sensor; may be repeated.",
+        ),
+    ] = None
+    invert: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="SENSOR",
+            help="Sensor of inverted sign: accelerometer (of one that reads -g upward at rest), magnetometer or gyro; may be repeated.",
+        ),
+    ] = None
+
+    def options(self, path: Path) -> dict[str, Any]:
+        """Return the options of :func:`strapdown.recordings.read` that are given; a simulated record takes none of them."""
+        from strapdown import recordings
+        from strapdown.checks import one_of
+
+        found = super().options(path)
+        if self.axes:
+            found["axes"] = _axes(self.axes)
+        if self.invert:
+            found["invert"] = tuple(one_of("--invert", sensor, recordings.SENSORS) for sensor in self.invert)
+        return found
 
 
 def _axes(texts: Sequence[str]) -> str | dict[str, str]:

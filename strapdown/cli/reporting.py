@@ -7,10 +7,10 @@ from typing import Annotated
 
 import typer
 
-from strapdown.cli.terminal import app, console, progress_bar, writable, written
+from strapdown.cli.terminal import command, console, progress_bar, writable, written
 
 
-@app.command()
+@command
 def report(
     result: Annotated[
         Path, typer.Argument(help="HDF5 file of `strapdown estimate` or `montecarlo`, or the JSON of `strapdown tune`.")

@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from strapdown.cli.reading import (
-    RECORDING_HELP,
-    AccelerometerUnit,
-    Columns,
-    GyroUnit,
-    MagnetometerUnit,
-    TimeUnit,
-    Topic,
-    given_layout,
-)
+from strapdown.cli.reading import RECORDING_HELP, Samples
 from strapdown.cli.terminal import (
     FigureFormat,
     Format,
     Tables,
-    app,
+    command,
     console,
     need_own,
     progress_bar,
@@ -39,7 +31,7 @@ if TYPE_CHECKING:
     from strapdown.recordings import GyroSamples
 
 
-@app.command()
+@command
 def scenarios() -> None:
     """List the built-in scenarios."""
     from strapdown.scenarios import builtin_rows
@@ -53,7 +45,7 @@ def scenarios() -> None:
         console.print(f"{row['name']}: {row['description']}")
 
 
-@app.command()
+@command
 def simulate(
     scenario: Annotated[str, typer.Argument(help="Name of a built-in scenario, or a TOML file.")],
     out: Annotated[
@@ -108,114 +100,122 @@ def simulate(
     written(*paths)
 
 
-@app.command()
-def allan(
-    recording: Annotated[
-        Path,
-        typer.Argument(help=f"Sensor at rest: simulated record (HDF5), NPY. {RECORDING_HELP}."),
-    ],
-    sensor: Annotated[
-        list[str] | None,
-        typer.Option(help="gyro (if not given), accelerometer or magnetometer; may be repeated."),
-    ] = None,
-    rate: Annotated[float | None, typer.Option(help="Samples a second, Hz; for NPY.")] = None,
-    gyro_unit: GyroUnit = None,
-    accelerometer_unit: AccelerometerUnit = None,
-    magnetometer_unit: MagnetometerUnit = None,
-    time_unit: TimeUnit = None,
-    columns: Columns = None,
-    topic: Topic = None,
+@dataclass(frozen=True)
+class _Identification:
+    """Identification."""
+
+    rate: Annotated[float | None, typer.Option(help="Samples a second, Hz; for NPY.")] = None
     highest_frequency: Annotated[
         float | None,
         typer.Option(help="Hz; the fit leaves out what lies above: a low-pass filter's shape, vibration."),
-    ] = None,
+    ] = None
     robust: Annotated[
         bool, typer.Option(help="Draw the deviation by medians, which stands outliers; the fit stays as it is.")
-    ] = False,
+    ] = False
     temperature: Annotated[
         int | None,
         typer.Option(
             metavar="ORDER",
             help="Regress the bias on the recorded temperature, by a polynomial of this order, and identify the noise of what is left.",
         ),
-    ] = None,
-    kalibr: Annotated[bool, typer.Option("--kalibr", help="Write imu.yaml too; needs gyro and accelerometer.")] = False,
+    ] = None
+
+
+@dataclass(frozen=True)
+class _Exports:
+    """Files for other programs."""
+
+    kalibr: Annotated[bool, typer.Option("--kalibr", help="Write imu.yaml too; needs gyro and accelerometer.")] = False
     factor: Annotated[
         float, typer.Option(help="What the numbers of imu.yaml are multiplied by; people take 5 to 10.")
-    ] = 1.0,
-    px4: Annotated[
-        bool, typer.Option("--px4", help="Write px4.params of EKF2 too; needs gyro and accelerometer.")
-    ] = False,
-    matlab: Annotated[bool, typer.Option("--matlab", help="Write imu_sensor.m, for imuSensor, too.")] = False,
-    out: Annotated[Path, typer.Option(help="Folder for gyro.toml, allan.json and the figure.")] = Path("allan-results"),
-    form: Format = FigureFormat.png,
-    tables: Tables = None,
+    ] = 1.0
+    px4: Annotated[bool, typer.Option("--px4", help="Write px4.params of EKF2 too; needs gyro and accelerometer.")] = (
+        False
+    )
+    matlab: Annotated[bool, typer.Option("--matlab", help="Write imu_sensor.m, for imuSensor, too.")] = False
+
+    @property
+    def files(self) -> list[str]:
+        """Names of the files asked for."""
+        wanted = {"imu.yaml": self.kalibr, "px4.params": self.px4, "imu_sensor.m": self.matlab}
+        return [name for name, asked in wanted.items() if asked]
+
+    def check(self, sensors: list[str]) -> None:
+        """Refuse files that need another sensor, and a factor that is none."""
+        from strapdown.checks import InputError, positive
+
+        if (self.kalibr or self.px4) and not {"gyro", "accelerometer"} <= set(sensors):
+            raise InputError("--kalibr and --px4 need both: --sensor gyro --sensor accelerometer")
+        positive("--factor", self.factor)
+
+    def write(self, fits: dict[str, identification.NoiseFit], out: Path, source: str, topic: str | None) -> None:
+        """Write the files that are asked for."""
+        from strapdown.allan import parameters
+        from strapdown.files import written_beside
+
+        made = {
+            "imu.yaml": lambda: parameters.to_kalibr(fits, factor=self.factor, topic=topic or "/imu0", source=source),
+            "px4.params": lambda: parameters.to_px4(fits, source=source),
+            "imu_sensor.m": lambda: parameters.to_matlab(fits, source=source),
+        }
+        for name in self.files:
+            with written_beside(out / name) as temporary:
+                temporary.write_text(made[name](), encoding="utf-8")
+        if self.files:
+            written(*(out / name for name in self.files))
+        if self.kalibr:
+            console.print(f"imu.yaml holds the largest of the axes, times {self.factor:g} (--factor).")
+
+
+@dataclass(frozen=True)
+class _Output:
+    """Output."""
+
+    out: Annotated[Path, typer.Option(help="Folder for gyro.toml, allan.json and the figure.")] = Path("allan-results")
+    form: Format = FigureFormat.png
+    tables: Tables = None
+
+
+@command
+def allan(
+    recording: Annotated[
+        Path,
+        typer.Argument(help=f"Sensor at rest: simulated record (HDF5), NPY. {RECORDING_HELP}."),
+    ],
+    samples: Samples,
+    options: _Identification,
+    exports: _Exports,
+    output: _Output,
+    sensor: Annotated[
+        list[str] | None,
+        typer.Option(help="gyro (if not given), accelerometer or magnetometer; may be repeated."),
+    ] = None,
 ) -> None:
     """Identify a sensor's noise from a recording at rest: Allan deviation, fitted coefficients, specification as TOML."""
     from strapdown.allan import parameters as noise_parameters
-    from strapdown.checks import InputError, count, one_of, positive
-    from strapdown.files import usable_folder, written_beside
+    from strapdown.checks import count, one_of
+    from strapdown.files import usable_folder
 
     chosen = list(dict.fromkeys(sensor or ["gyro"]))
     for one in chosen:
         one_of("--sensor", one, noise_parameters.SENSORS)
-    if (kalibr or px4) and not {"gyro", "accelerometer"} <= set(chosen):
-        raise InputError("--kalibr and --px4 need both: --sensor gyro --sensor accelerometer")
-    positive("--factor", factor)
-    if temperature is not None:
-        count("--temperature", temperature)
-    usable_folder("out", out)
-    exports = {"imu.yaml": kalibr, "px4.params": px4, "imu_sensor.m": matlab}
-    tables_folder(tables)
-    names = [name for one in chosen for name in _names(one, form)] + [
-        name for name, wanted in exports.items() if wanted
-    ]
-    writable("out", *(out / name for name in names), sources=(recording,))
-    units = {
-        "gyro": gyro_unit,
-        "accelerometer": accelerometer_unit,
-        "magnetometer": magnetometer_unit,
-        "time": time_unit,
-    }
-    options = _Options(
-        rate, _layout(recording, columns, topic, units), highest_frequency, robust, temperature, out, form, tables
-    )
-    fits = {one: _identify(recording, one, options) for one in chosen}
-    made = {
-        "imu.yaml": lambda: noise_parameters.to_kalibr(
-            fits, factor=factor, topic=topic or "/imu0", source=recording.name
-        ),
-        "px4.params": lambda: noise_parameters.to_px4(fits, source=recording.name),
-        "imu_sensor.m": lambda: noise_parameters.to_matlab(fits, source=recording.name),
-    }
-    further = [out / name for name, wanted in exports.items() if wanted]
-    for path in further:
-        with written_beside(path) as temporary:
-            temporary.write_text(made[path.name](), encoding="utf-8")
-    if further:
-        written(*further)
-    if kalibr:
-        console.print(f"imu.yaml holds the largest of the axes, times {factor:g} (--factor).")
+    exports.check(chosen)
+    if options.temperature is not None:
+        count("--temperature", options.temperature)
+    usable_folder("out", output.out)
+    tables_folder(output.tables)
+    names = [*(name for one in chosen for name in _names(one, output.form)), *exports.files]
+    writable("out", *(output.out / name for name in names), sources=(recording,))
+    layout = _layout(recording, samples)
+    fits = {one: _identify(recording, one, layout, options, output) for one in chosen}
+    exports.write(fits, output.out, recording.name, samples.topic)
 
 
-class _Options(NamedTuple):
-    """How a recording is read and identified."""
-
-    rate: float | None
-    layout: dict[str, Any]
-    highest_frequency: float | None
-    robust: bool
-    temperature: int | None
-    out: Path
-    form: FigureFormat
-    tables: Path | None
-
-
-def _layout(recording: Path, columns: str | None, topic: str | None, units: dict[str, str | None]) -> dict[str, Any]:
+def _layout(recording: Path, samples: Samples) -> dict[str, Any]:
     """Return how the file is read; of a simulated record and of an array the reader itself refuses what does not go with them."""
-    if recording.suffix.lower() == ".npy" or (columns is None and topic is None):
-        return {"units": {name: unit for name, unit in units.items() if unit}}
-    return given_layout(recording, columns=columns, topic=topic, **units)
+    if recording.suffix.lower() == ".npy" or (samples.columns is None and samples.topic is None):
+        return {"units": samples.units}
+    return samples.options(recording)
 
 
 def _names(sensor: str, form: str = FigureFormat.png) -> tuple[str, ...]:
@@ -224,7 +224,9 @@ def _names(sensor: str, form: str = FigureFormat.png) -> tuple[str, ...]:
     return (f"{sensor}.toml", f"{stem}.json", f"{stem}.{form}", f"{sensor}-temperature.toml")
 
 
-def _identify(recording: Path, sensor: str, options: _Options) -> identification.NoiseFit:
+def _identify(
+    recording: Path, sensor: str, layout: dict[str, Any], options: _Identification, output: _Output
+) -> identification.NoiseFit:
     """Identify one sensor, print and write what was found."""
     import numpy as np
 
@@ -236,8 +238,8 @@ def _identify(recording: Path, sensor: str, options: _Options) -> identification
     from strapdown.files import written_beside
     from strapdown.plots.style import save_as
 
-    out, specification = options.out, _names(sensor)[0]
-    source = recordings.read_samples(recording, sensor, rate=options.rate, gaps=True, **options.layout)
+    out, (specification, numbers, figure_name, _) = output.out, _names(sensor, output.form)
+    source = recordings.read_samples(recording, sensor, rate=options.rate, gaps=True, **layout)
     _plausible(recording, sensor, source)
     gaps = bool(np.isnan(source.values).any())
     if gaps and options.robust:
@@ -248,20 +250,8 @@ def _identify(recording: Path, sensor: str, options: _Options) -> identification
         if options.temperature is not None:
             values = _regressed(recording, sensor, source, options.temperature, out, paths)
         with progress_bar("fit, deviation, figure", 3) as advance:
-            if gaps:
-                fit = allan_gaps.fit_noise(values, source.sample_interval, highest_frequency=options.highest_frequency)
-                advance(1)
-                deviation = allan_gaps.allan_deviation(values, source.sample_interval)
-            else:
-                fit = identification.fit_noise(
-                    values, source.sample_interval, kind=source.kind, highest_frequency=options.highest_frequency
-                )
-                advance(1)
-                estimator = "robust" if options.robust else "overlapping"
-                deviation = identification.allan_deviation(
-                    values, source.sample_interval, kind=source.kind, estimator=estimator
-                )
-            advance(1)
+            fit, deviation = _fitted(values, source, options, gaps=gaps)
+            advance(2)
             figure = plots.allan_overview(deviation, fit, identification.curves_by_axis(fit, deviation), sensor=sensor)
             advance(1)
     except InputError as error:
@@ -276,20 +266,7 @@ def _identify(recording: Path, sensor: str, options: _Options) -> identification
             f"With gaps: the fit uses {fit.samples} samples in stretches of {allan_gaps.SHORTEST} or more, the deviation all there are."
         )
     rows = noise_parameters.table(fit, sensor)
-    listing = table("Noise coefficients with 95 % intervals", "axis", "term", "unit", "estimate", "from", "to", left=3)
-    for row in rows:
-        estimate = f"{row['estimate']:.4g}" if row["supported"] else "not seen"
-        lower = f"{row['lower']:.4g}" if row["supported"] else ""
-        listing.add_row(
-            "xyz"[int(str(row["axis"]))],
-            f"{row['term']} ({row['symbol']})",
-            str(row["unit"]),
-            estimate,
-            lower,
-            f"{row['upper']:.4g}",
-        )
-    show(listing)
-    console.print("Of a term not seen in this record, the last column bounds what it could hide.")
+    _show_coefficients(rows)
     warnings = [
         f"axis {'xyz'[axis]} holds more than such noises: {what} (probability {max(probability, 1e-99):.0e})"
         for axis, (probability, what) in enumerate(zip(fit.misfit_probability, fit.misfit, strict=True))
@@ -297,11 +274,9 @@ def _identify(recording: Path, sensor: str, options: _Options) -> identification
     ]
     with written_beside(out / specification) as temporary:
         temporary.write_text(_specification(fit, f"{recording.name}, {length}", warnings, sensor), encoding="utf-8")
-    _write_numbers(out / _names(sensor)[1], recording.name, fit, deviation, rows, sensor)
-    paths += save_as({out / _names(sensor)[2]: figure}, options.form)
-    written(
-        out / specification, out / _names(sensor)[1], *paths, *tables_written(options.tables, "allan", rows, sensor)
-    )
+    _write_numbers(out / numbers, recording.name, fit, deviation, rows, sensor)
+    paths += save_as({out / figure_name: figure}, output.form)
+    written(out / specification, out / numbers, *paths, *tables_written(output.tables, "allan", rows, sensor))
     for warning in warnings:
         console.print(f"warning: {warning}", highlight=False)
     if warnings:
@@ -310,6 +285,33 @@ def _identify(recording: Path, sensor: str, options: _Options) -> identification
         )
         console.print(f"warning: {_DISTRUST}, nor {specification}.", highlight=False)
     return fit
+
+
+def _fitted(
+    values: Any, source: GyroSamples, options: _Identification, *, gaps: bool
+) -> tuple[identification.NoiseFit, identification.AllanDeviation]:
+    """Return the noise coefficients and the Allan deviation of samples, which may have gaps."""
+    from strapdown import allan as identification
+    from strapdown.allan import gaps as allan_gaps
+
+    interval, highest = source.sample_interval, options.highest_frequency
+    if gaps:
+        fit = allan_gaps.fit_noise(values, interval, highest_frequency=highest)
+        return fit, allan_gaps.allan_deviation(values, interval)
+    fit = identification.fit_noise(values, interval, kind=source.kind, highest_frequency=highest)
+    estimator = "robust" if options.robust else "overlapping"
+    return fit, identification.allan_deviation(values, interval, kind=source.kind, estimator=estimator)
+
+
+def _show_coefficients(rows: list[dict[str, Any]]) -> None:
+    listing = table("Noise coefficients with 95 % intervals", "axis", "term", "unit", "estimate", "from", "to", left=3)
+    for row in rows:
+        estimate = f"{row['estimate']:.4g}" if row["supported"] else "not seen"
+        lower = f"{row['lower']:.4g}" if row["supported"] else ""
+        term = f"{row['term']} ({row['symbol']})"
+        listing.add_row("xyz"[int(row["axis"])], term, str(row["unit"]), estimate, lower, f"{row['upper']:.4g}")
+    show(listing)
+    console.print("Of a term not seen in this record, the last column bounds what it could hide.")
 
 
 def _plausible(recording: Path, sensor: str, source: GyroSamples) -> None:
@@ -340,39 +342,38 @@ def _regressed(recording: Path, sensor: str, source: GyroSamples, order: int, ou
     from strapdown.allan import temperature as allan_temperature
     from strapdown.checks import InputError
     from strapdown.files import written_beside
+    from strapdown.gyro.temperature import STEM, BiasOverTemperature, to_table
 
-    if source.temperature is None or not np.isfinite(source.temperature).all():
-        raise InputError("no temperature is recorded for every sample; leave --temperature out")
+    if source.temperature is None:
+        raise InputError("no temperature is recorded; leave --temperature out")
     if np.isnan(source.values).any():
         raise InputError("there are gaps, with which --temperature does not go; cut the recording between them")
-    fit = allan_temperature.fit_temperature(source.values, source.temperature, source.sample_interval, order=order)
+    scale = source.sample_interval if source.kind == "increments" else 1.0
+    fit = allan_temperature.fit_temperature(
+        source.values / scale, source.temperature, source.sample_interval, order=order
+    )
     unit = {"gyro": "rad/s", "accelerometer": "m/s2", "magnetometer": "T"}[sensor]
-    key = {"gyro": "rad_per_s", "accelerometer": "m_per_s2", "magnetometer": "t"}[sensor]
+    stem = {"gyro": STEM, "accelerometer": "m_per_s2", "magnetometer": "t"}[sensor]
     listing = table(
         f"Bias over temperature, T − {fit.reference:.3f} °C", "axis", "power", "unit", "estimate", "from", "to", left=3
     )
-    content: dict[str, Any] = {
-        "reference_degc": fit.reference,
-        "lowest_degc": fit.span[0],
-        "highest_degc": fit.span[1],
-    }
     for k in range(order + 1):
-        per = f"{key}_per_k{k if k > 1 else ''}" if k else key
-        content[f"bias_{per}"] = [float(x) for x in fit.coefficients[:, k]]
-        if k:
-            content[f"sigma_{per}"] = [float(x) for x in fit.sigma[:, k]]
         for axis in range(len(fit.coefficients)):
             ends = (f"{fit.lower[axis, k]:.4g}", f"{fit.upper[axis, k]:.4g}") if k else ("", "")
             said = f"{unit}/K{k if k > 1 else ''}" if k else unit
             listing.add_row("xyz"[axis], str(k), said, f"{fit.coefficients[axis, k]:.4g}", *ends)
     show(listing)
+    found = BiasOverTemperature(
+        reference=fit.reference, span=fit.span, coefficients=fit.coefficients.T, sigma=fit.sigma.T
+    )
     paths.append(out / _names(sensor)[3])
     with written_beside(paths[-1]) as temporary:
         text = _commented(
             [f"Bias over temperature by `strapdown allan` from {recording.name}, a polynomial in T - reference."]
         )
-        temporary.write_text(text + "\n" + tomli_w.dumps({sensor: content}), encoding="utf-8")
-    return fit.left
+        content = {sensor: {"temperature": to_table(found, stem)}}
+        temporary.write_text(text + "\n" + tomli_w.dumps(content), encoding="utf-8")
+    return fit.left * scale
 
 
 def _write_numbers(

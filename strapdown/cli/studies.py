@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -11,7 +12,7 @@ from strapdown.cli.terminal import (
     FigureFormat,
     Format,
     Tables,
-    app,
+    command,
     console,
     counted,
     progress_bar,
@@ -26,6 +27,7 @@ from strapdown.cli.terminal import (
 
 if TYPE_CHECKING:
     from strapdown.coning import Algorithm
+    from strapdown.coning_study import ConingParameters
 
 MIN_SAMPLES_A_CYCLE = 0.1
 """With fewer a step holds more than ten turns of the cone, and nothing of the study means anything."""
@@ -79,14 +81,38 @@ _ROUNDED = 1e-3
 """A drift constant below this in an order that the increments could do without is likely that of rounded coefficients."""
 
 
-@app.command()
+@dataclass(frozen=True)
+class _Scenario:
+    """Motion and runs."""
+
+    angle: Annotated[float, typer.Option(help="Half-angle of the cone, degrees.")] = 0.7
+    frequency: Annotated[float, typer.Option(help="Coning frequency, Hz.")] = 10.0
+    rate: Annotated[float, typer.Option(help="Gyro samples a second, Hz.")] = 100.0
+    duration: Annotated[float, typer.Option(help="Length of each run, s.")] = 240.0
+    runs: Annotated[int, typer.Option(help="Monte Carlo runs.")] = 100
+    seed: Annotated[int, typer.Option(help="Seed; the same one gives the same runs.")] = 1
+
+    def parameters(self, own: tuple[Algorithm, ...]) -> ConingParameters:
+        """Return the parameters of the study, ``own`` algorithms compared too; what no algorithm follows is refused."""
+        from strapdown import coning_study
+        from strapdown.checks import InputError, positive
+        from strapdown.units import DEGREE
+
+        if positive("--angle", self.angle, unit="degrees") >= 90.0:  # in the unit that it was given in
+            raise InputError(f"--angle is {self.angle:g} degrees; a cone's half-angle is below a right angle")
+        found = coning_study.ConingParameters(**{**vars(self), "angle": self.angle * DEGREE, "own": own})
+        cycle = self.rate / self.frequency
+        if cycle < MIN_SAMPLES_A_CYCLE:
+            raise InputError(
+                f"rate is {self.rate:g} Hz, {cycle:.3g} samples of a cone's cycle at {self.frequency:g} Hz; no algorithm follows it: "
+                f"raise the rate, to {MIN_SAMPLES_A_CYCLE:g} samples a cycle at least"
+            )
+        return found
+
+
+@command
 def coning(
-    angle: Annotated[float, typer.Option(help="Half-angle of the cone, degrees.")] = 0.7,
-    frequency: Annotated[float, typer.Option(help="Coning frequency, Hz.")] = 10.0,
-    rate: Annotated[float, typer.Option(help="Gyro samples a second, Hz.")] = 100.0,
-    duration: Annotated[float, typer.Option(help="Length of each run, s.")] = 240.0,
-    runs: Annotated[int, typer.Option(help="Monte Carlo runs.")] = 100,
-    seed: Annotated[int, typer.Option(help="Seed; the same one gives the same runs.")] = 1,
+    motion: _Scenario,
     out: Annotated[Path, typer.Option(help="Folder for coning.json and the figures.")] = Path("coning-results"),
     algorithm: Annotated[
         list[Path] | None,
@@ -99,39 +125,37 @@ def coning(
     tables: Tables = None,
 ) -> None:
     """Study coning: the drift of each integration algorithm, and what a filter makes of it."""
-    from strapdown import coning_study
-    from strapdown.checks import InputError, positive
+    from strapdown import coning_study, plots
     from strapdown.coning import read_algorithms
     from strapdown.files import usable_folder, write_json
-    from strapdown.units import DEGREE
 
-    if positive("--angle", angle, unit="degrees") >= 90.0:  # in the unit that it was given in
-        raise InputError(f"--angle is {angle:g} degrees; a cone's half-angle is below a right angle")
     own = tuple(one for path in algorithm or () for one in read_algorithms(path))
-    parameters = coning_study.ConingParameters(
-        angle=angle * DEGREE, frequency=frequency, rate=rate, duration=duration, runs=runs, seed=seed, own=own
-    )
-    if rate < MIN_SAMPLES_A_CYCLE * frequency:
-        raise InputError(
-            f"rate is {rate:g} Hz, {rate / frequency:.3g} samples of a cone's cycle at {frequency:g} Hz; no algorithm follows it: "
-            f"raise the rate, to {MIN_SAMPLES_A_CYCLE:g} samples a cycle at least"
-        )
+    parameters = motion.parameters(own)
     usable_folder("out", out)
     names = ("drift", "errors", "consistency", *(["algorithms"] if own else []))
     tables_folder(tables)
     writable("out", out / "coning.json", *(out / f"{name}.{form}" for name in names))
     _show_own(own)
-    with progress_bar("Monte Carlo runs", runs) as advance:
+    with progress_bar("Monte Carlo runs", motion.runs) as advance:
         study = coning_study.run(parameters, progress=advance)
     summary = study.summary()
     write_json(out / "coning.json", summary)
+    _print_study(motion, summary)
+    paths = plots.draw_coning_study(study, out, form)
+    written(out / "coning.json", *paths, *tables_written(tables, "coning", summary))
+
+
+def _print_study(motion: _Scenario, summary: dict[str, Any]) -> None:
     scenario = summary["scenario"]
     console.print(
-        f"Coning of {angle:g}° at {frequency:g} Hz, gyro sampled at {rate:g} Hz ({rate / frequency:.3g} samples a cycle); "
-        f"{counted(runs, 'run')} of {scenario['duration_s']:g} s, seed {seed}.\n"
+        f"Coning of {motion.angle:g}° at {motion.frequency:g} Hz, gyro sampled at {motion.rate:g} Hz "
+        f"({motion.rate / motion.frequency:.3g} samples a cycle); "
+        f"{counted(motion.runs, 'run')} of {scenario['duration_s']:g} s, seed {motion.seed}.\n"
     )
-    if scenario["duration_s"] != duration:
-        console.print(f"Runs are {scenario['duration_s']:g} s long, not {duration:g}: whole epochs of whole steps.\n")
+    if scenario["duration_s"] != motion.duration:
+        console.print(
+            f"Runs are {scenario['duration_s']:g} s long, not {motion.duration:g}: whole epochs of whole steps.\n"
+        )
     drift = table(
         "Drift of the integration, °/h about the cone's axis", "algorithm", "samples", "measured", "predicted"
     )
@@ -143,7 +167,7 @@ def coning(
         )
     show(drift)
     verdicts = table(
-        "The same noisy filter on each: RMS error / what the filter says of itself",
+        "The same noisy filter on each: RMS error / the filter's own σ",
         "integration",
         "attitude\narcsec",
         "bias\n°/h",
@@ -168,10 +192,6 @@ def coning(
     low, high = summary["filter"][0]["anees_bias_bounds"]
     nis_low, nis_high = summary["filter"][0]["nis_bounds"]
     console.print(
-        f"ANEES and NIS are per degree of freedom: 1 is a filter as good as it says. 99 % bounds: ANEES of attitude and of bias "
+        f"ANEES and NIS are per degree of freedom: 1 for a consistent filter. 99 % bounds: ANEES of attitude and of bias "
         f"{low:.3f} to {high:.3f} at one epoch, NIS {nis_low:.4f} to {nis_high:.4f}.\n"
     )
-    from strapdown import plots
-
-    paths = plots.draw_coning_study(study, out, form)
-    written(out / "coning.json", *paths, *tables_written(tables, "coning", summary))

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 import enum
+import functools
+import inspect
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 from rich import box
@@ -22,10 +26,12 @@ if TYPE_CHECKING:
 
 __all__ = [
     "app",
+    "command",
     "console",
     "counted",
     "doubt",
     "errors",
+    "given",
     "json_target",
     "need_own",
     "progress_bar",
@@ -51,6 +57,54 @@ app = typer.Typer(
 )
 # Without markup, so that a file name in brackets is said as it is; a statement is one line, which the terminal wraps.
 console = Console(markup=False, highlight=False, soft_wrap=True)
+
+
+def command(function: Callable[..., None]) -> Callable[..., None]:
+    """Register a command. A parameter whose type is a dataclass stands for the options that are its fields, under one heading of --help."""
+    hints = get_type_hints(function, include_extras=True)
+    groups: dict[str, Any] = {name: hint for name, hint in hints.items() if dataclasses.is_dataclass(hint)}
+    parameters = []
+    for name, parameter in inspect.signature(function).parameters.items():
+        if name in groups:
+            parameters += _options(groups[name])
+        else:
+            parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=hints[name]))
+
+    @functools.wraps(function)
+    def run(**values: Any) -> None:
+        grouped = {
+            name: group(**{field.name: values.pop(field.name) for field in dataclasses.fields(group)})
+            for name, group in groups.items()
+        }
+        function(**values, **grouped)
+
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {one.name: one.annotation for one in parameters}
+    return app.command()(run)
+
+
+def _options(group: Any) -> list[inspect.Parameter]:
+    """Return the fields of a group as parameters; the first line of its docstring is their heading in --help."""
+    hints = get_type_hints(group, include_extras=True)
+    found = []
+    for field in dataclasses.fields(group):
+        option = copy.copy(hints[field.name].__metadata__[0])
+        option.rich_help_panel = group.__doc__.partition("\n")[0].rstrip(".")
+        annotation: Any = Annotated[hints[field.name].__origin__, option]
+        kind = inspect.Parameter.KEYWORD_ONLY
+        found.append(inspect.Parameter(field.name, kind, default=field.default, annotation=annotation))
+    return found
+
+
+def given(group: Any) -> list[str]:
+    """Return the options of a group that were given, as on the command line."""
+    hints = get_type_hints(type(group), include_extras=True)
+    flags = []
+    for field in dataclasses.fields(group):
+        if getattr(group, field.name) not in (field.default, []):
+            flag = hints[field.name].__metadata__[0].default
+            flags.append(flag.partition("/")[0] if isinstance(flag, str) else "--" + field.name.replace("_", "-"))
+    return flags
 
 
 class FigureFormat(enum.StrEnum):

@@ -3,27 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from strapdown.cli.reading import (
-    AccelerometerUnit,
-    Axes,
-    Columns,
-    GyroUnit,
-    Invert,
-    TimeUnit,
-    Topic,
-    given_layout,
-)
+from strapdown.cli.reading import Layout
 from strapdown.cli.terminal import (
     FigureFormat,
     Format,
     Tables,
-    app,
+    command,
     console,
     doubt,
     need_own,
@@ -57,7 +48,187 @@ WORSE = 1.05
 """An attitude error on the data held out that has grown by more than this is reported."""
 
 
-@app.command()
+@dataclass(frozen=True)
+class _Filter:
+    """Filter to start from."""
+
+    free: Annotated[
+        str | None,
+        typer.Option(
+            help="Parameters to tune, with commas: gyro.arw, gyro.rrw, SENSOR.sigma, initial.attitude, initial.bias, "
+            "gate.probability (as --gate); SENSOR.sigma.x, .y, .z (about one body axis); or filter.scale alone. If not given the "
+            "gyro's two and every sensor's."
+        ),
+    ] = None
+    filter_file: Annotated[
+        Path | None,
+        typer.Option("--filter", help="TOML with a table named filter; by default one that matches the records."),
+    ] = None
+    integration: Annotated[
+        str | None, typer.Option(help="Integration algorithm (`strapdown algorithms`); the filter's if not given.")
+    ] = None
+    states: Annotated[
+        bool,
+        typer.Option(
+            "--states",
+            help="Give the filter the optional states that the record's specified errors call for; --free may name their sizes too, such "
+            "as gyro.scale_sigma, SENSOR.correlated_sigma, SENSOR.correlation_time.",
+        ),
+    ] = False
+    prior: Annotated[
+        str | None,
+        typer.Option(help="Weak prior of the gyro's noise: TOML of `strapdown allan`, or the name of a preset."),
+    ] = None
+    prior_factor: Annotated[float, typer.Option(help="One standard deviation of the prior is a factor of this.")] = (
+        PRIOR_FACTOR
+    )
+
+    @property
+    def names(self) -> list[str] | None:
+        """Parameters named, if any are."""
+        return None if self.free is None else [name.strip() for name in self.free.split(",") if name.strip()]
+
+    @property
+    def algorithm(self) -> Any:
+        """Integration algorithm, if one is named."""
+        from strapdown import coning
+        from strapdown.checks import one_of
+
+        name = self.integration
+        return None if name is None else coning.ALGORITHMS[one_of("integration", name, coning.ALGORITHMS)]
+
+    def setup(self, *, plan: bool) -> FilterSetup | None:
+        """Return the filter of the file, if there is one; states that it or a plan cannot have are refused."""
+        from strapdown.setup import read_setup
+
+        chosen = None if self.filter_file is None else read_setup(self.filter_file)
+        if self.states and chosen is not None:
+            raise _refusal("--filter holds the filter's states itself, in [filter.states]; leave --states out")
+        if plan and (self.states or (chosen is not None and chosen.states is not None)):
+            raise _refusal(
+                "--plan knows no optional states; leave --states away, and [filter.states] out of the filter"
+            )
+        return chosen
+
+    def wanted(self, cases: Sequence[Case], gyros: dict[str, GyroSpec]) -> list[str]:
+        """Return the parameters to tune on these records; refused are those of a gyro that the records do not share."""
+        from strapdown import tuning
+
+        if self.names == []:
+            raise _refusal(f"--free is {self.free!r} and names no parameter; name some, or leave it out")
+        wanted = [name for name in self.names or [] if name not in tuning.GATED]
+        wanted = wanted or list(tuning.default_names([case.record for case in cases]))
+        if self.filter_file is None or any(name.startswith(("gyro.", "filter.")) for name in wanted):
+            tuning.one_gyro(gyros)
+        return wanted
+
+    def priors(self, record: ImuRecord, names: Sequence[str]) -> dict[str, Any]:
+        """Return the priors of the parameters named."""
+        from strapdown import tuning
+        from strapdown.gyro import datasheets, read_spec
+
+        if self.prior is None:
+            if self.prior_factor != PRIOR_FACTOR:
+                raise _refusal("--prior-factor goes with --prior, the noise that it is about")
+            return {}
+        spec = read_spec(self.prior) if Path(self.prior).suffix == ".toml" else datasheets.preset(self.prior).spec
+        found = tuning.priors_from_gyro(spec, record, factor=self.prior_factor)
+        return {name: prior for name, prior in found.items() if name in names}
+
+
+@dataclass(frozen=True)
+class _Objective:
+    """Objective, by default the likelihood of all innovations."""
+
+    truth: Annotated[bool, typer.Option("--truth", help="Tune by the errors against the truth and their σ.")] = False
+    rmse: Annotated[
+        bool,
+        typer.Option(
+            "--rmse", help="Tune by the RMS attitude error against the truth; then all σ alike by innovations."
+        ),
+    ] = False
+    gate: Annotated[
+        bool,
+        typer.Option(
+            "--gate",
+            help="Model outliers too, their share and scale, and set the filter's gate where an outlier is the likelier explanation.",
+        ),
+    ] = False
+    spacing: Annotated[
+        float,
+        typer.Option(
+            help="Take a sensor's samples so many seconds apart, the weight of all on them: disturbances last."
+        ),
+    ] = 0.0
+    holdout: Annotated[
+        float | None, typer.Option(help="Share of the data held out, to judge the filter before and after on.")
+    ] = None
+    holdout_by: Annotated[str, typer.Option(help="Hold out the end of each record (time), or whole ones (record).")] = (
+        "time"
+    )
+
+    @property
+    def name(self) -> str:
+        """Name of the objective in the result."""
+        name = "rmse" if self.rmse else "likelihood"
+        return name + (" of the errors" if self.truth else "")
+
+    def split(self, cases: Sequence[Case]) -> tuple[tuple[Case, ...], tuple[Case, ...]]:
+        """Return the data to tune on and those held out."""
+        from strapdown import tuning
+        from strapdown.checks import one_of
+
+        if self.holdout is None:
+            return tuple(cases), ()
+        return tuning.split(cases, self.holdout, one_of("holdout-by", self.holdout_by, ("time", "record")))  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class _Search:
+    """Search."""
+
+    starts: Annotated[int, typer.Option(help="Searches: one from the filter, the others from random starts.")] = 4
+    factor: Annotated[float, typer.Option(help="Random starts are off by up to this factor, either way.")] = 30.0
+    seed: Annotated[int, typer.Option(help="Of the random starts.")] = 0
+    threads: Annotated[int | None, typer.Option(help="Threads; one a core if not given.")] = None
+
+
+@dataclass(frozen=True)
+class _Planning:
+    """Plan, before there are records."""
+
+    plan: Annotated[bool, typer.Option("--plan", help="Predict how well records will determine each parameter.")] = (
+        False
+    )
+    length: Annotated[
+        str | None, typer.Option(help="Lengths of a record, s, with commas; that of the scenario if not given.")
+    ] = None
+
+
+@dataclass(frozen=True)
+class _Output:
+    """Output."""
+
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="TOML for --filter of other commands; JSON and figures go beside it.")
+    ] = Path("filter.toml")
+    form: Format = FigureFormat.png
+    tables: Tables = None
+
+
+class _Found(NamedTuple):
+    """What a tuning found."""
+
+    result: Tuning
+    objective: Any
+    gate: TunedGate | None
+    comparison: Comparison | None
+    examined: Sequence[Unmodelled]
+    """What the tuned filter leaves unexplained of each record."""
+    worst: Unmodelled | None
+
+
+@command
 def tune(
     records: Annotated[
         list[Path],
@@ -66,187 +237,85 @@ def tune(
             "name or TOML file of a scenario."
         ),
     ],
-    free: Annotated[
-        str | None,
-        typer.Option(
-            help="Parameters to tune, with commas: gyro.arw, gyro.rrw, SENSOR.sigma, initial.attitude, initial.bias, "
-            "gate.probability (as --gate); SENSOR.sigma.x, .y, .z (about one body axis); or filter.scale alone. If not given the "
-            "gyro's two and every sensor's."
-        ),
-    ] = None,
-    filter_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--filter", help="TOML with a table named filter to start from; by default one that matches the records."
-        ),
-    ] = None,
-    integration: Annotated[
-        str | None, typer.Option(help="Integration algorithm (`strapdown algorithms`); the filter's if not given.")
-    ] = None,
-    truth: Annotated[bool, typer.Option("--truth", help="Tune by the errors against the truth and their σ.")] = False,
-    rmse: Annotated[
-        bool,
-        typer.Option(
-            "--rmse", help="Tune by the RMS attitude error against the truth; then all σ alike by innovations."
-        ),
-    ] = False,
-    gate: Annotated[
-        bool,
-        typer.Option(
-            "--gate",
-            help="Model outliers too, their share and scale, and set the filter's gate where an outlier is the likelier explanation.",
-        ),
-    ] = False,
-    states: Annotated[
-        bool,
-        typer.Option(
-            "--states",
-            help="Give the filter the optional states that the record's specified errors call for; --free may name their sizes too, such "
-            "as gyro.scale_sigma, SENSOR.correlated_sigma, SENSOR.correlation_time.",
-        ),
-    ] = False,
-    holdout: Annotated[
-        float | None, typer.Option(help="Share of the data held out, to judge the filter before and after on.")
-    ] = None,
-    holdout_by: Annotated[
-        str, typer.Option(help="Hold out the end of each record (time), or whole ones (record).")
-    ] = "time",
-    prior: Annotated[
-        str | None,
-        typer.Option(help="Weak prior of the gyro's noise: TOML of `strapdown allan`, or the name of a preset."),
-    ] = None,
-    prior_factor: Annotated[
-        float, typer.Option(help="One standard deviation of the prior is a factor of this.")
-    ] = PRIOR_FACTOR,
-    spacing: Annotated[
-        float,
-        typer.Option(
-            help="Take a sensor's samples so many seconds apart, the weight of all on them: disturbances last."
-        ),
-    ] = 0.0,
-    starts: Annotated[int, typer.Option(help="Searches: one from the filter, the others from random starts.")] = 4,
-    factor: Annotated[float, typer.Option(help="Random starts are off by up to this factor, either way.")] = 30.0,
-    seed: Annotated[int, typer.Option(help="Of the random starts.")] = 0,
-    threads: Annotated[int | None, typer.Option(help="Threads; one a core if not given.")] = None,
-    plan: Annotated[
-        bool,
-        typer.Option("--plan", help="Predict how well records will determine each parameter, before there are any."),
-    ] = False,
-    length: Annotated[
-        str | None,
-        typer.Option(help="For --plan: lengths of a record, s, with commas; that of the scenario if not given."),
-    ] = None,
-    gyro_unit: GyroUnit = None,
-    accelerometer_unit: AccelerometerUnit = None,
-    time_unit: TimeUnit = None,
-    columns: Columns = None,
-    topic: Topic = None,
-    axes: Axes = None,
-    invert: Invert = None,
-    out: Annotated[
-        Path, typer.Option("--out", "-o", help="TOML for --filter of other commands; JSON and figures go beside it.")
-    ] = Path("filter.toml"),
-    form: Format = FigureFormat.png,
-    tables: Tables = None,
+    start: _Filter,
+    goal: _Objective,
+    search: _Search,
+    planning: _Planning,
+    layout: Layout,
+    output: _Output,
 ) -> None:
     """Tune the filter by maximum likelihood, with an interval for each parameter."""
     import os
 
-    from strapdown import tuning
     from strapdown.checks import count
-    from strapdown.setup import read_setup
 
-    workers = count("threads", threads if threads is not None else os.cpu_count() or 1)
-    chosen = read_setup(filter_file) if filter_file is not None else None
-    algorithm = _algorithm(integration)
-    names = _names(free)
-    _check_states(chosen, states=states, plan=plan)
-    if plan:
-        _plan(records, chosen, algorithm, names, length, workers)
+    workers = count("threads", search.threads if search.threads is not None else os.cpu_count() or 1)
+    algorithm = start.algorithm
+    chosen = start.setup(plan=planning.plan)
+    if planning.plan:
+        _plan(records, chosen, algorithm, start.names, planning.length, workers)
         return
-    goal = _Goal(
-        truth=truth,
-        rmse=rmse,
-        gate=gate or any(name in tuning.GATED for name in names or []),
-        spacing=spacing,
-    )
-    if length is not None:
+    if planning.length is not None:
         raise _refusal("--length is for --plan; the records' own length is taken")
-    count("seed", seed, least=0)
-    _check_files(records, filter_file, out, form, tables)
-    units = {"gyro": gyro_unit, "accelerometer": accelerometer_unit, "time": time_unit}
-    layout = {"columns": columns, "topic": topic, "axes": axes, "invert": invert, **units}
-    cases, before, gyros = _cases(records, chosen, filter_file, layout, states=states)
+    count("seed", search.seed, least=0)
+    _check_files(records, start.filter_file, output)
+    cases, before, gyros = _cases(records, chosen, start, layout)
     if algorithm is not None:
         before = replace(before, integration=algorithm)
-    train, held = (tuple(cases), ()) if holdout is None else tuning.split(cases, holdout, _by(holdout_by))
-    if names == []:
-        raise _refusal(f"--free is {free!r} and names no parameter; name some, or leave it out")
-    wanted = [name for name in names or [] if name not in tuning.GATED]
-    wanted = wanted or list(tuning.default_names([case.record for case in cases]))
-    if chosen is None or any(name.startswith(("gyro.", "filter.")) for name in wanted):
-        tuning.one_gyro(gyros)
-    if prior is None and prior_factor != PRIOR_FACTOR:
-        raise _refusal("--prior-factor goes with --prior, the noise that it is about")
-    priors = {} if prior is None else _priors(prior, prior_factor, train[0].record, wanted)
-    with progress_bar("searches, intervals", starts + len(wanted)) as advance:
-        result, objective, found = tuning.tune(
+    if (before.gate or before.robust) and not (goal.truth or goal.gate):
+        console.print(
+            "The filter's gate and weights are not applied: what passes a gate is the likelier the narrower it is. --gate models outliers, "
+            "and --truth tunes the filter as it runs."
+        )
+    found = _tuned(cases, before, gyros, start, goal, search, workers)
+    records_used = [case.record for case in cases]
+    _print_result(found.result, records_used)
+    if found.gate is not None:
+        _print_gate(found.gate)
+    for sentence in () if found.worst is None else found.worst.words:
+        console.print(sentence)
+    if found.comparison is not None:
+        _print_comparison(found.comparison, truth=goal.truth or goal.rmse)
+    _write(found, records_used, records, goal.name, output)
+
+
+def _tuned(
+    cases: Sequence[Case],
+    before: FilterSetup,
+    gyros: dict[str, GyroSpec],
+    start: _Filter,
+    goal: _Objective,
+    search: _Search,
+    workers: int,
+) -> _Found:
+    """Tune, compare on the data held out, and look at what the tuned filter leaves unexplained."""
+    from strapdown import tuning
+
+    train, held = goal.split(cases)
+    wanted = start.wanted(cases, gyros)
+    gated = goal.gate or any(name in tuning.GATED for name in start.names or [])
+    priors = start.priors(train[0].record, wanted)
+    with progress_bar("searches, intervals", search.starts + len(wanted)) as advance:
+        result, objective, gate = tuning.tune(
             train,
             before,
             wanted,
+            truth=goal.truth,
+            rmse=goal.rmse,
+            gate=gated,
+            spacing=goal.spacing,
             priors=priors,
-            starts=starts,
-            factor=factor,
-            seed=seed,
+            starts=search.starts,
+            factor=search.factor,
+            seed=search.seed,
             threads=workers,
             progress=advance,
-            **goal._asdict(),
         )
-    comparison = _compared(held, before, objective, result, workers, gated=goal.gate)
+    comparison = _compared(held, before, objective, result, workers, gated=gated)
     examined, worst = _examined(train, before, result)
     if worst is not None:
         result = tuning.doubted(result, worst)
-    _print_result(result, [case.record for case in cases])
-    if found is not None:
-        _print_gate(found)
-    if worst is not None:
-        for sentence in worst.words:
-            console.print(sentence)
-    if comparison is not None:
-        _print_comparison(comparison, truth=goal.by_errors)
-    _write(
-        out,
-        result,
-        objective,
-        comparison,
-        cases,
-        records,
-        of=goal.name,
-        examined=examined,
-        gate=found,
-        form=form,
-        tables=tables,
-    )
-
-
-class _Goal(NamedTuple):
-    """Objective of the tuning; by default the likelihood of all innovations."""
-
-    truth: bool
-    rmse: bool
-    gate: bool
-    spacing: float
-
-    @property
-    def by_errors(self) -> bool:
-        """Whether the errors against the truth count."""
-        return self.truth or self.rmse
-
-    @property
-    def name(self) -> str:
-        """Name of the objective in the result."""
-        name = "rmse" if self.rmse else "likelihood"
-        return name + (" of the errors" if self.truth else "")
+    return _Found(result, objective, gate, comparison, examined, worst)
 
 
 def _refusal(words: str) -> Exception:
@@ -255,38 +324,18 @@ def _refusal(words: str) -> Exception:
     return InputError(words)
 
 
-def _algorithm(name: str | None) -> Any:
-    from strapdown import coning
-    from strapdown.checks import one_of
-
-    return None if name is None else coning.ALGORITHMS[one_of("integration", name, coning.ALGORITHMS)]
-
-
-def _names(free: str | None) -> list[str] | None:
-    return None if free is None else [name.strip() for name in free.split(",") if name.strip()]
-
-
-def _check_states(chosen: FilterSetup | None, *, states: bool, plan: bool) -> None:
-    if states and chosen is not None:
-        raise _refusal("--filter holds the filter's states itself, in [filter.states]; leave --states out")
-    if plan and (states or (chosen is not None and chosen.states is not None)):
-        raise _refusal("--plan knows no optional states; leave --states away, and [filter.states] out of the filter")
-
-
-def _check_files(
-    records: Sequence[Path], filter_file: Path | None, out: Path, form: FigureFormat, tables: Path | None
-) -> None:
+def _check_files(records: Sequence[Path], filter_file: Path | None, output: _Output) -> None:
     """Refuse a record that is given twice, and files that cannot be written or are not this command's."""
     from strapdown.report import tunings
 
     for k, path in enumerate(records):
         if path.exists() and any(path.samefile(other) for other in records[:k] if other.exists()):
             raise _refusal(f"{path} is given twice; a record counts once")
-    sources = (*records, filter_file)
+    sources, out = (*records, filter_file), output.out
     report = out.with_suffix(".json")
     writable("out", out, suffixes=(".toml",), sources=sources)
-    writable("out", report, *(out.with_name(f"{out.stem}-{name}.{form}") for name in FIGURES), sources=sources)
-    tables_folder(tables)
+    writable("out", report, *(out.with_name(f"{out.stem}-{name}.{output.form}") for name in FIGURES), sources=sources)
+    tables_folder(output.tables)
     for target in (out, report):
         need_own(target, "tune", lambda _: bool(tunings.read(report)))
 
@@ -332,19 +381,8 @@ def _differs_by_axis(cases: Sequence[Case], chosen: FilterSetup) -> bool:
     )
 
 
-def _by(text: str) -> Any:
-    from strapdown.checks import one_of
-
-    return one_of("holdout-by", text, ("time", "record"))
-
-
 def _cases(
-    paths: Sequence[Path],
-    chosen: FilterSetup | None,
-    filter_file: Path | None,
-    layout: dict[str, Any],
-    *,
-    states: bool,
+    paths: Sequence[Path], chosen: FilterSetup | None, start: _Filter, layout: Layout
 ) -> tuple[list[Case], FilterSetup, dict[str, GyroSpec]]:
     """Return the records to tune on, the filter to start from, and the gyros of the records that hold theirs."""
     from strapdown import recordings, tuning
@@ -362,18 +400,18 @@ def _cases(
                     raise InputError(
                         f"{path} does not hold its gyro's specification; give a filter to start from, --filter filter.toml"
                     )
-                chosen, remarks = filter_for(path, file, None, None, () if states else False)
+                chosen, remarks = filter_for(path, file, None, None, () if start.states else False)
                 for remark in remarks:
                     console.print(remark)
-            elif filter_file is not None:
-                need_angles(filter_file, chosen, file)
+            elif start.filter_file is not None:
+                need_angles(start.filter_file, chosen, file)
             if file.gyro is not None:
                 gyros[str(path)] = file.gyro
             cases.append(tuning.record_case(file.record, chosen, name=path.name))
         else:
-            if states:
+            if start.states:
                 raise InputError(f"{path} is a recording, which specifies no errors; --states is for simulated records")
-            recording = recordings.read(path, **given_layout(path, **layout))
+            recording = recordings.read(path, **layout.options(path))
             chosen = chosen or tuning.recording_setup()
             if recording.left_out_words:
                 console.print(recording.left_out_words)
@@ -381,16 +419,6 @@ def _cases(
             doubt(recording, path)
     assert chosen is not None
     return cases, chosen, gyros
-
-
-def _priors(source: str, factor: float, record: ImuRecord, names: Sequence[str]) -> dict[str, Any]:
-    from strapdown import tuning
-    from strapdown.gyro import datasheets, read_spec
-
-    spec: GyroSpec = read_spec(source) if Path(source).suffix == ".toml" else datasheets.preset(source).spec
-    return {
-        name: prior for name, prior in tuning.priors_from_gyro(spec, record, factor=factor).items() if name in names
-    }
 
 
 def _unit_of(name: str, records: Sequence[ImuRecord]) -> Unit:
@@ -423,7 +451,9 @@ def _print_result(result: Tuning, records: Sequence[ImuRecord]) -> None:
         rows.add_row(one.name, unit.name, *(_figure(value) for value in values), _note(one, unit))
     show(rows)
     gain = result.before - result.after
-    console.print(f"{result.agreeing} of {len(result.starts)} searches ended at the best point; gain {gain:.4g} nats.")
+    console.print(
+        f"{result.agreeing} of {len(result.starts)} searches ended at the best point; log-likelihood + {gain:.4g}."
+    )
     if not all(one.identified for one in result.parameters):
         console.print(
             "Of a parameter that is not identified these records give an upper bound alone; the filter uses the value in the column "
@@ -486,27 +516,15 @@ def _print_comparison(comparison: Comparison, *, truth: bool) -> None:
     show(listing)
     console.print(f"{tunings.BOUNDS}.")
     for judgement in comparison.after.judgements[:1]:
-        console.print("After: " + judgement.words)
+        for line in judgement.words.splitlines()[1:]:
+            console.print("After:" + line[3:])
     if not comparison.better and not truth:
         console.print("On the data held out the tuned filter is less likely than the one before: keep that one.")
     elif comparison.after.attitude_rms > WORSE * comparison.before.attitude_rms:
         console.print("On the data held out the attitude error has grown: keep the filter before.")
 
 
-def _write(
-    out: Path,
-    result: Tuning,
-    objective: Any,
-    comparison: Comparison | None,
-    cases: Sequence[Case],
-    paths: Sequence[Path],
-    *,
-    of: str,
-    examined: Sequence[Unmodelled],
-    gate: TunedGate | None,
-    form: FigureFormat,
-    tables: Path | None,
-) -> None:
+def _write(found: _Found, records: Sequence[ImuRecord], paths: Sequence[Path], of: str, output: _Output) -> None:
     from strapdown import tuning
     from strapdown.files import write_json, written_beside
     from strapdown.plots import tuning as drawing
@@ -514,40 +532,32 @@ def _write(
     from strapdown.report import tunings
     from strapdown.setup import to_toml
 
+    out, result = output.out, found.result
     with written_beside(out) as temporary:
         temporary.write_text(to_toml(result.setup), encoding="utf-8")
-    places = {name: out.with_name(f"{out.stem}-{name}.{form}") for name in FIGURES}
+    places = {name: out.with_name(f"{out.stem}-{name}.{output.form}") for name in FIGURES}
     for place in places.values():  # of an earlier tuning, which may have had more of them, or in another format
         for other in FigureFormat:
             place.with_suffix(f".{other}").unlink(missing_ok=True)
     report = out.with_suffix(".json")
-    records = [case.record for case in cases]
-    units = [_unit_of(name, records) for name in objective.names]
-    own = [_unit_of(one.name, records) for one in result.parameters]
-    content = _report(result, own, comparison, paths, of, examined, gate)
+    units = [_unit_of(name, records) for name in found.objective.names]
+    content = _report(found, [_unit_of(one.name, records) for one in result.parameters], paths, of)
     write_json(report, content)
     answer, reason, _ = tunings.verdict(content)
     console.print(f"{answer}: {reason}.")
-    figures = {places["likelihood"]: drawing.likelihood_slices(tuning.slices(objective, result), result, units)}
-    if comparison is not None:
+    figures = {places["likelihood"]: drawing.likelihood_slices(tuning.slices(found.objective, result), result, units)}
+    if found.comparison is not None:
         figures[places["heldout"]] = drawing.before_and_after(
-            comparison, title="The first record, on what was held out"
+            found.comparison, title="The first record, on what was held out"
         )
-    written(out, report, *save_as(figures, form), *tables_written(tables, "tuning", content))
+    written(out, report, *save_as(figures, output.form), *tables_written(output.tables, "tuning", content))
 
 
-def _report(
-    result: Tuning,
-    units: Sequence[Unit],
-    comparison: Comparison | None,
-    paths: Sequence[Path],
-    of: str,
-    examined: Sequence[Unmodelled],
-    gate: TunedGate | None,
-) -> dict[str, Any]:
+def _report(found: _Found, units: Sequence[Unit], paths: Sequence[Path], of: str) -> dict[str, Any]:
     import numpy as np
 
     number = lambda value: None if isinstance(value, float) and not math.isfinite(value) else value  # noqa: E731
+    result, gate, comparison = found.result, found.gate, found.comparison
     content: dict[str, Any] = {
         "records": [path.name for path in paths],
         "parameters": [
@@ -563,7 +573,7 @@ def _report(
         "objective": {"name": of, "before": result.before, "after": result.after},
         "searches": {"number": len(result.starts), "at_the_best_point": result.agreeing},
         "innovations_fit": not result.misfit,
-        "unmodelled": [one.summary() for one in examined],
+        "unmodelled": [one.summary() for one in found.examined],
     }
     if gate is not None:
         content["gate"] = {

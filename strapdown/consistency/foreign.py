@@ -330,7 +330,7 @@ def read_as(frame: str, covariance: Array, attitude: Array) -> Array:
 def frame_probabilities(error: Array, readings: Mapping[str, Array]) -> dict[str, float]:
     """Return the probability of each reading of the covariance (m, 3, 3), given errors (m, 3), all equally likely beforehand.
 
-    The scale of the covariance is free in each, so that a filter that is too sure in general does not hide how its covariance is meant.
+    The scale of the covariance is free in each, so that a filter that is optimistic in general does not hide how its covariance is meant.
     Errors follow each other, so they count as the effective samples that they are.
     """
     scores = {}
@@ -640,7 +640,7 @@ def explanations(
         x = np.linalg.solve(N, np.einsum("mij,mi->j", A, white))
         left = white - np.einsum("mij,j->mi", A, x)
         after = float(np.mean(left**2))
-        # Beside a scale of σ: the gain is a ratio of variances, so that a filter too sure throughout does not make everything significant.
+        # Beside a scale of σ: the gain is a ratio of variances, so that an optimistic filter does not make everything significant.
         samples = effective_samples(left / math.sqrt(max(after, 1e-300))) if m > 10 else 1.0
         gain = 3.0 * samples * math.log(max(before, 1e-300) / max(after, 1e-300))
         size = f"{1e3 * x[0]:.4g} ms" if len(x) == 1 else f"{', '.join(f'{v / DEGREE:.3g}' for v in x)}°"

@@ -12,7 +12,7 @@ tangent space.
 - ``smoothing``: The smoothers; ``recovery_segments`` what they make of recoveries.
 - ``observability``: What a record shows of each state.
 - ``live``: The compiled filter for data that arrive as they are measured.
-- ``step_filter``: The filter step by step, on filterpy; ``step_gate`` its gate.
+- ``step_filter``: The filter step by step, on filterpy.
 - ``multiple_model``: Unknown start, one vector at a time.
 - ``filters``: Other filters on the same interface, for comparison.
 """

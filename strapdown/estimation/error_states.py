@@ -25,6 +25,7 @@ __all__ = [
     "GyroForce",
     "GyroGaussMarkov",
     "GyroScale",
+    "GyroTemperature",
     "LeverArm",
     "SensorMounting",
     "VectorBias",
@@ -318,6 +319,29 @@ class GyroForce(ErrorStates):
     def force_f(self) -> Array:
         """The reaction to gravity."""
         return -np.asarray(self.gravity_f)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class GyroTemperature(ErrorStates):
+    """Slopes of the gyro's bias over temperature c, constant, which the record's temperature drives: ``ḃ = c Ṫ + n_u``.
+
+    The bias b of the filter is the whole one, at the temperature of its time (:mod:`strapdown.estimation.temperature`).
+
+    Parameters
+    ----------
+    slope_sigma : float or ndarray (3,)
+        Standard deviation of the slope about each body axis, rad/s/K.
+    name : str, default "gyro temperature"
+        Name of the block of states.
+    """
+
+    slope_sigma: float | Array
+    name: str = "gyro temperature"
+
+    def __post_init__(self) -> None:
+        """Check the standard deviation."""
+        sigma = _spread(f"{self.name}: slope_sigma", self.slope_sigma, "rad/s/K")
+        self._set(components=AXES, units=("rad/s/K",) * 3, sigma=sigma)
 
 
 class _FirstOrder(ErrorStates):

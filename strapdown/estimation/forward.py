@@ -14,6 +14,7 @@ import numpy as np
 
 from strapdown.checks import Array, InputError, count
 from strapdown.estimation import model as modelling
+from strapdown.estimation import temperature
 from strapdown.estimation.angular_acceleration import turning
 from strapdown.estimation.error_states import ErrorStates
 from strapdown.estimation.gating import LOCK_OUT, Gate, Monitor, Robust
@@ -40,7 +41,7 @@ from strapdown.kernels.measurement import Measurements
 from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.kernels.triangle import padded
 from strapdown.kernels.walk import walk
-from strapdown.records import ErrorStateEstimate, Estimate, Event, ImuRecord
+from strapdown.records import ErrorStateEstimate, Estimate, Event, ImuRecord, cut
 from strapdown.vectors import KINDS, VectorMeasurements
 
 GAP_FACTOR = 5.0
@@ -230,7 +231,7 @@ def _passed(
 ) -> Passed:
     """Return the filter's pass over a record; arguments of the wrong kind, and a filter that diverges, are refused."""
     check_arguments(record=record, gate=options.gate, robust=options.robust, monitor=monitor)
-    passed = filtered(prepared(record, process_noise, initial, error_states), options)
+    passed = filtered(prepared(record, process_noise, initial, error_states, driven=True), options)
     attitude = passed.estimate.attitude
     if not np.isfinite(attitude[-1]).all():  # what is no number once remains so
         end = record.time[options.every * int(np.argmin(np.isfinite(attitude).all(axis=1)))]
@@ -242,11 +243,21 @@ def _passed(
 
 
 def prepared(
-    record: ImuRecord, process_noise: ProcessNoise, initial: State, error_states: Sequence[ErrorStates]
+    record: ImuRecord,
+    process_noise: ProcessNoise,
+    initial: State,
+    error_states: Sequence[ErrorStates],
+    *,
+    driven: bool = False,
 ) -> Problem:
-    """Return a record with its measurements in order of time, and the error states as arrays."""
+    """Return a record with its measurements in order of time, and the error states as arrays.
+
+    ``driven``: a bias driven by temperature may be among them, for :func:`filtered`.
+    """
     check_arguments(process_noise=process_noise)
     declared = modelling.as_blocks(error_states)
+    if not driven:
+        temperature.need_none(declared, "this estimator")
     state = modelling.begin(initial, declared)
     events = schedule(record.vectors, record.time[0], record.time[-1], anisotropic=True)
     model = modelling.assemble(declared, dict(zip(events.sensors, events.kinds, strict=True)))
@@ -261,6 +272,29 @@ def prepared(
 
 
 def filtered(problem: Problem, options: Options) -> Passed:
+    """Run the filter over a prepared record, a bias driven by temperature in stretches of nearly one temperature."""
+    slopes = temperature.slopes(problem.error_states)
+    if slopes is None:
+        return _filtered(problem, options)
+    record, initial = problem.record, problem.initial
+    T = temperature.of(record)
+    state = replace(initial, unit_sigma=unit_sigmas(record, problem.model, initial.unit_sigma))
+    parts: list[Estimate] = []
+    before = float(T[0])
+    for first, last, mean in temperature.stretches(record, options.every):
+        state = temperature.shifted(state, slopes, mean - before)
+        part, off = temperature.at_mean(cut(record, first, last), mean, state.values[slopes])
+        declared = prepared(part, problem.process_noise, state, problem.error_states, driven=True)
+        passed = _filtered(declared, options)
+        parts.append(temperature.at_edges(passed.estimate, slopes, off[:: options.every]))
+        state, before = passed.end, mean
+    end = temperature.shifted(state, slopes, float(T[-1]) - before)
+    estimate = temperature.joined(parts)
+    skipped = skipped_too(problem.events, estimate.innovations)
+    return Passed(estimate=replace(estimate, skipped=skipped), make_end=lambda: end, segments=np.empty((0, 0)))
+
+
+def _filtered(problem: Problem, options: Options) -> Passed:
     """Run the filter over a prepared record, in the form that it needs."""
     if problem.model.states or options.factor or options.whole_bias:
         return _in_factor(problem, options)

@@ -9,7 +9,7 @@
 :class:`Monitor`
     A running mean of the normalised innovation squared, whose excursions are reported with their times.
 
-They are options of :func:`strapdown.estimation.run`, of :class:`strapdown.estimation.StepFilter` and of the other estimators there.
+They are options of :func:`strapdown.estimation.run`, of :class:`strapdown.estimation.LiveFilter` and of the other estimators there.
 """
 
 from __future__ import annotations

@@ -13,6 +13,7 @@ arbitrary start would have converged to some attitude with a small σ.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -41,7 +42,7 @@ from strapdown.vectors import VectorMeasurements
 __all__ = ["BankEstimate", "run"]
 
 HYPOTHESES = 96
-"""Hypotheses on the circle where nobody says: 3.75° apart. Fewer find the attitude as soon, but are some too sure of it:
+"""Hypotheses on the circle where nobody says: 3.75° apart. Fewer find the attitude as soon, but some are optimistic:
 ``sims/unknown_start.py``."""
 MIN_WEIGHT = 1e-6
 """A hypothesis of less than this part of the heaviest one's weight is dropped."""
@@ -168,18 +169,17 @@ def run(
     for name, value in (("least_weight", least_weight), ("largest_share", largest_share)):
         if not 0.0 < finite(name, value) < 1.0:
             raise InputError(f"{name} is {value:g}; it must lie between 0 and 1")
-    found = _until_one(
-        record,
-        process_noise,
-        hypotheses=hypotheses,
-        bias=bias,
-        bias_sigma=bias_sigma,
-        every=every,
-        least_weight=least_weight,
-        largest_share=largest_share,
-        gate=gate,
-        robust=robust,
+    options = _Options(
+        hypotheses,
+        array("bias", bias, (3,)),
+        np.broadcast_to(bias_sigma, 3).astype(np.float64),
+        every,
+        least_weight,
+        largest_share,
+        gate,
+        robust,
     )
+    found = _until_one(record, process_noise, options)
     if found.became_one >= record.time[-1]:
         return found
     rest, one = _from_where_one(record, found)
@@ -204,104 +204,65 @@ def _from_where_one(record: ImuRecord, found: BankEstimate) -> tuple[ImuRecord, 
     return rest, State(attitude=last.attitude[-1], bias=last.bias[-1], covariance=last.covariance[-1])
 
 
-def _until_one(
-    record: ImuRecord,
-    process_noise: ProcessNoise,
-    *,
-    hypotheses: int,
-    bias: ArrayLike,
-    bias_sigma: ArrayLike,
-    every: int = 1,
-    least_weight: float = MIN_WEIGHT,
-    largest_share: float = LARGEST_SHARE,
-    gate: Gate | None = None,
-    robust: Robust | None = None,
-) -> BankEstimate:
+class _Options(NamedTuple):
+    """Options of :func:`run` until one hypothesis is left."""
+
+    hypotheses: int
+    bias: Array
+    bias_sigma: Array
+    every: int
+    min_weight: float
+    max_share: float
+    gate: Gate | None
+    robust: Robust | None
+
+    @property
+    def doubted(self) -> bool:
+        """Whether the first directions may be outliers."""
+        return self.gate is not None or self.robust is not None
+
+
+class _Walked(NamedTuple):
+    """Bank from one first direction on."""
+
+    estimate: Estimate
+    kept: np.ndarray
+    """Edges of the record at which rows are stored; the estimate has the first of them."""
+    angles: Array
+    weights: Array
+    weight: Array
+    """Weights at the end."""
+    at: int
+    """Edge at which one hypothesis was left, or ``NEVER`` or ``LOST``."""
+    used: int
+    """Events processed; if lost, the first of those that were refused."""
+
+
+def _until_one(record: ImuRecord, process_noise: ProcessNoise, options: _Options) -> BankEstimate:
     """Return the bank's own part of :func:`run`: until its hypotheses are one, or to the end."""
     coarse = tuple(_isotropic(series) for series in record.vectors)
     events = schedule(coarse, record.time[0], record.time[-1])
-    doubted = gate is not None or robust is not None
-    recovery = None if gate is None else gate.recovery
+    recovery = 0 if options.gate is None else options.gate.recovery or 0
     own_events = gaps(record.time)
     failed = 0
     first = _first_direction(events)
-    spread = np.broadcast_to(bias_sigma, 3).astype(np.float64)
     while True:
-        wide = gate_rules.WIDENING ** (failed % (gate_rules.WIDEST + 1)) * spread
-        states, angles = start(record, events, first, hypotheses, bias=bias, bias_sigma=wide)
-        later = _directions(events, first + 1)[: DOUBTED if doubted else 0]
-        sets = [len(states)]
-        for one in later:
-            more, turns = start(record, events, int(one), hypotheses, bias=bias, bias_sigma=wide)
-            states, angles = np.concatenate([states, more]), np.concatenate([angles, turns])
-            sets.append(len(states))
-        log_weight = np.where(np.arange(len(states)) < sets[0], 0.0, -np.inf)
-        began = float(events.time[first])
-        kept = np.arange(0, len(record.time), every)
-        kept = kept[record.time[kept] >= began]
-        if len(kept) == 0:
-            raise InputError(
-                f"the first direction comes at {began:.6g} s, after the last kept edge; keep more edges or give a longer record"
-            )
-        number, doubt = len(states), -2.0 * np.log(DOUBT)
-        weight = np.empty(number)
-        out = hypotheses_kernel.Outputs(
-            attitude=np.empty((len(kept), 4)),
-            bias=np.empty((len(kept), 3)),
-            covariance=np.empty((len(kept), 21)),
-            weights=np.empty((len(kept), number)),
-            innovation=np.empty((len(events.time), 6)),
-            share=np.empty(len(events.time)),
-        )
-        edges, increments, first_edge = _from_time(record, began)
-        body = hypotheses_kernel.Body(
-            angle_variance=process_noise.angle_random_walk**2,
-            rate_variance=process_noise.rate_random_walk**2,
-            states=states,
-            log_weight=log_weight,
-            weight=weight,
-            later=later - (first + 1),
-            sets=np.array(sets),
-            charge=doubt,
-            options=gate_options(gate, robust)._replace(recovery=recovery or 0),
-            min_weight=least_weight,
-            max_share=largest_share,
-            first_edge=first_edge,
-            on_edge=bool(edges[0] == record.time[first_edge]),
-            every=every,
-            room=np.empty(40),
-        )
-        rows, at, used = compiled(walk, hypotheses_kernel)(
-            edges, increments, after(events.measurements, first + 1), 1, body, out
-        )
-        used += first + 1
-        taken = used if at != hypotheses_kernel.LOST or recovery is None else used + recovery
-        P = covariance_matrices(out.covariance[:rows])
-        estimate = Estimate(
-            time=record.time[kept[:rows]],
-            attitude=out.attitude[:rows],
-            bias=out.bias[:rows],
-            variance=np.ascontiguousarray(np.diagonal(P, axis1=1, axis2=2)),
-            covariance=P,
-            innovations=_innovations(
-                events, np.arange(first + 1, taken), out.innovation, out.share if doubted else None
-            ),
-        )
-        if at != hypotheses_kernel.LOST:
+        wide = gate_rules.WIDENING ** (failed % (gate_rules.WIDEST + 1)) * options.bias_sigma
+        found = _walked(record, process_noise, events, first, options._replace(bias_sigma=wide), recovery)
+        if found.at != hypotheses_kernel.LOST:
             break
-        assert recovery is not None
         # What came before may be wrong: the circle is that of the first refused direction.
-        again = _directions(events, used)
-        if len(again) == 0 or events.time[again[0]] > record.time[::every][-1]:
-            recovery = None  # too late for another start
+        again = _directions(events, found.used)
+        if len(again) == 0 or events.time[again[0]] > record.time[:: options.every][-1]:
+            recovery = 0  # too late for another start
             continue
         failed += 1
         own_events.append(
             Event(
                 kind="recovery",
-                start=float(events.time[used]),
-                end=float(events.time[taken - 1]),
-                sensor=events.sensors[events.sensor[used]],
+                start=float(events.time[found.used]),
+                end=float(events.time[found.used + recovery - 1]),
+                sensor=events.sensors[events.sensor[found.used]],
                 value=float(recovery),
             )
         )
@@ -310,15 +271,78 @@ def _until_one(
         sensor: events.skipped[sensor] + int(np.sum(events.sensor[:first] == i))
         for i, sensor in enumerate(events.sensors)
     }
-    estimate = replace(estimate, skipped=skipped, events=_in_order(own_events))
+    estimate = replace(found.estimate, skipped=skipped, events=_in_order(own_events))
+    one = found.at >= 0
     return BankEstimate(
         estimate=estimate,
-        edges=kept,
-        angles=angles,
-        weights=out.weights[:rows],
-        became_one=float(record.time[at]) if at >= 0 else np.inf,
-        reason="" if at >= 0 else _reason(record, events, weight, P[-1], out.attitude[rows - 1]),
+        edges=found.kept,
+        angles=found.angles,
+        weights=found.weights,
+        became_one=float(record.time[found.at]) if one else np.inf,
+        reason="" if one else _reason(record, events, found.weight, estimate),
     )
+
+
+def _walked(
+    record: ImuRecord, process_noise: ProcessNoise, events: Schedule, first: int, options: _Options, recovery: int
+) -> _Walked:
+    """Walk over the record with the hypotheses that the first direction leaves open, and where it is doubted the next ones'."""
+    later = _directions(events, first + 1)[: DOUBTED if options.doubted else 0]
+    sets = [
+        start(record, events, int(one), options.hypotheses, bias=options.bias, bias_sigma=options.bias_sigma)
+        for one in (first, *later)
+    ]
+    states, angles = (np.concatenate(parts) for parts in zip(*sets, strict=True))
+    number = np.cumsum([len(of_set) for of_set, _ in sets])
+    began = float(events.time[first])
+    kept = np.arange(0, len(record.time), options.every)
+    kept = kept[record.time[kept] >= began]
+    if len(kept) == 0:
+        raise InputError(
+            f"the first direction comes at {began:.6g} s, after the last kept edge; keep more edges or give a longer record"
+        )
+    weight = np.empty(len(states))
+    out = hypotheses_kernel.Outputs(
+        attitude=np.empty((len(kept), 4)),
+        bias=np.empty((len(kept), 3)),
+        covariance=np.empty((len(kept), 21)),
+        weights=np.empty((len(kept), len(states))),
+        innovation=np.empty((len(events.time), 6)),
+        share=np.empty(len(events.time)),
+    )
+    edges, increments, first_edge = _from_time(record, began)
+    body = hypotheses_kernel.Body(
+        angle_variance=process_noise.angle_random_walk**2,
+        rate_variance=process_noise.rate_random_walk**2,
+        states=states,
+        log_weight=np.where(np.arange(len(states)) < number[0], 0.0, -np.inf),
+        weight=weight,
+        later=later - (first + 1),
+        sets=number,
+        charge=-2.0 * np.log(DOUBT),
+        options=gate_options(options.gate, options.robust)._replace(recovery=recovery),
+        min_weight=options.min_weight,
+        max_share=options.max_share,
+        first_edge=first_edge,
+        on_edge=bool(edges[0] == record.time[first_edge]),
+        every=options.every,
+        room=np.empty(40),
+    )
+    rows, at, used = compiled(walk, hypotheses_kernel)(
+        edges, increments, after(events.measurements, first + 1), 1, body, out
+    )
+    used += first + 1
+    taken = np.arange(first + 1, used + recovery if at == hypotheses_kernel.LOST else used)
+    P = covariance_matrices(out.covariance[:rows])
+    estimate = Estimate(
+        time=record.time[kept[:rows]],
+        attitude=out.attitude[:rows],
+        bias=out.bias[:rows],
+        variance=np.ascontiguousarray(np.diagonal(P, axis1=1, axis2=2)),
+        covariance=P,
+        innovations=_innovations(events, taken, out.innovation, out.share if options.doubted else None),
+    )
+    return _Walked(estimate, kept, angles, out.weights[:rows], weight, at, used)
 
 
 def _from_time(record: ImuRecord, time: float) -> tuple[Array, Array, int]:
@@ -449,10 +473,11 @@ def _in_order(events: list[Event]) -> tuple[Event, ...]:
     return tuple(sorted(events, key=lambda event: event.start))
 
 
-def _reason(record: ImuRecord, events: Schedule, weight: Array, P: Array, attitude: Array) -> str:
+def _reason(record: ImuRecord, events: Schedule, weight: Array, estimate: Estimate) -> str:
     """Return why the hypotheses did not become one, in words."""
-    values, axes = np.linalg.eigh(P[:3, :3])
-    axis = quaternion.rotate(attitude, axes[:, -1])
+    assert estimate.covariance is not None
+    values, axes = np.linalg.eigh(estimate.covariance[-1, :3, :3])
+    axis = quaternion.rotate(estimate.attitude[-1], axes[:, -1])
     seen = (
         f"{int(np.sum(weight > 0.0))} hypotheses are still possible after {record.time[-1] - record.time[0]:.6g} s; "
         f"the turn about the fixed axis ({axis[0]:+.2f}, {axis[1]:+.2f}, {axis[2]:+.2f}) is known to 1σ "

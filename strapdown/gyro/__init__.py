@@ -2,6 +2,7 @@
 
 - ``model``: :class:`GyroSpec`, :func:`simulate`, and the process noise of a filter matched to a specification.
 - ``flicker``: Flicker noise (bias instability) as a sum of Gauss-Markov processes.
+- ``temperature``: Bias over temperature.
 - ``datasheets``: Specifications in the units of datasheets.
 """
 

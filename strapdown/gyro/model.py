@@ -41,18 +41,21 @@ which the simulator's bias holds too. Judge such a filter by its attitude.
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from strapdown import units
-from strapdown.checks import Array, InputError, array, finite, increasing, non_negative, positive
+from strapdown.checks import Array, InputError, array, finite, increasing, known_keys, non_negative, positive
 from strapdown.files import tables
 from strapdown.gyro import flicker
+from strapdown.gyro import temperature as thermal
+from strapdown.gyro.temperature import BiasOverTemperature
 from strapdown.kernels import gyro_errors, noise
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.results import ByValue
@@ -116,8 +119,8 @@ class GyroSpec(ByValue):
         Off-diagonal part of M, rad; entry (i, j) is the share of the rate about axis j that axis i senses.
     g_sensitivity : ndarray (3, 3), default zeros
         Bias per specific force, rad/s per m/s², body axes.
-    temperature_coefficient : ndarray (3,), default zeros
-        Bias per temperature above that of calibration, rad/s/K.
+    temperature : BiasOverTemperature, optional
+        Bias over temperature in °C (:class:`strapdown.gyro.temperature.BiasOverTemperature`). Default: none.
     bandwidth : float, default inf
         Natural frequency of a second-order low-pass, Hz; needs uniform edges. Infinite: none.
     damping : float, default √½
@@ -149,7 +152,7 @@ class GyroSpec(ByValue):
     asymmetry: Array = field(default_factory=_zeros)
     misalignment: Array = field(default_factory=_zero_matrix)
     g_sensitivity: Array = field(default_factory=_zero_matrix)
-    temperature_coefficient: Array = field(default_factory=_zeros)
+    temperature: BiasOverTemperature | None = None
     bandwidth: float = np.inf
     damping: float = 0.7071067811865476
     range: float = np.inf
@@ -167,7 +170,7 @@ class GyroSpec(ByValue):
             object.__setattr__(self, "rate_ramp", finite("rate_ramp", cast(float, self.rate_ramp), unit="rad/s²"))
         else:
             object.__setattr__(self, "rate_ramp", array("rate_ramp", self.rate_ramp, (3,)))
-        for name in ("turn_on_bias", "scale_factor", "asymmetry", "temperature_coefficient"):
+        for name in ("turn_on_bias", "scale_factor", "asymmetry"):
             value = getattr(self, name)
             if not isinstance(value, (bool, str)) and np.ndim(value) == 0:
                 value = np.full(3, finite(name, value))
@@ -261,7 +264,7 @@ def simulate(
     specific_force : array_like (n, 3), optional
         Mean specific force over each interval, m/s², body axes; required if the specification has a g-sensitivity.
     temperature : array_like (n + 1,), optional
-        Temperature at the edges above that of calibration, K; required if the specification has a temperature coefficient.
+        Temperature at the edges, °C; required if the specification has a bias over temperature.
 
     Returns
     -------
@@ -332,12 +335,13 @@ def simulate(
         if specific_force is None:
             raise InputError("the specification has a g_sensitivity; pass specific_force (n, 3) in m/s²")
         increments += array("specific_force", specific_force, (n, 3)) @ spec.g_sensitivity.T * np.diff(stamps)[:, None]
-    if np.any(spec.temperature_coefficient != 0.0):
+    if spec.temperature is not None:
         if temperature is None:
             raise InputError(
-                "the specification has a temperature_coefficient; pass temperature (n + 1,) in K above calibration"
+                "the gyro has a bias over temperature, and there is no temperature; add the table [temperature] to the scenario "
+                "(temperature (n + 1,), °C, in Python)"
             )
-        drift = array("temperature", temperature, (n + 1,))[:, None] * spec.temperature_coefficient
+        drift = spec.temperature.bias(array("temperature", temperature, (n + 1,)))
         bias += drift
         increments += 0.5 * (drift[1:] + drift[:-1]) * np.diff(stamps)[:, None]
     if low_passed:
@@ -628,7 +632,6 @@ FORM: tables.Form = {
     "asymmetry": tables.PPM,
     "misalignment": tables.MILLIRADIANS,
     "g_sensitivity": (("deg_per_hour_per_g", units.DEGREE_PER_HOUR / units.STANDARD_GRAVITY), ("rad_s_per_m", 1.0)),
-    "temperature_coefficient": (("deg_per_hour_per_kelvin", units.DEGREE_PER_HOUR), ("rad_per_s_per_kelvin", 1.0)),
     "bandwidth": tables.HERTZ,
     "damping": tables.RATIO,
     "range": tables.DEGREES_PER_SECOND,
@@ -638,17 +641,26 @@ FORM: tables.Form = {
     "timestamp_offset": tables.SECONDS,
     "drop_probability": tables.RATIO,
 }
-"""Keys of the specification in files."""
+"""Keys of the specification in files, but for the table ``temperature``."""
 
 
 def to_table(spec: GyroSpec) -> dict[str, Any]:
     """Return the departures from a perfect gyro as a table for TOML or JSON, units in the key names; exact both ways."""
-    return tables.encode(spec, FORM)
+    warm = {} if spec.temperature is None else {"temperature": thermal.to_table(spec.temperature)}
+    return tables.encode(spec, FORM) | warm
 
 
-def from_table(table: Mapping[str, Any], place: str = "gyro") -> GyroSpec:
-    """Return the specification in a table with units in the key names; an unknown key is refused with the nearest known one."""
-    return tables.build(GyroSpec, table, FORM, place)  # type: ignore[no-any-return]
+def from_table(table: Mapping[str, Any], place: str = "gyro", base: GyroSpec | None = None) -> GyroSpec:
+    """Return the specification in a table with units in the key names, changes of ``base`` if given.
+
+    An unknown key is refused with the nearest known one.
+    """
+    known_keys(place, table, [*tables.keys(FORM), "temperature", *(["preset"] if base else [])])
+    own = {key: value for key, value in table.items() if key != "temperature"}
+    values = tables.decode(own, FORM, place)
+    if "temperature" in table:
+        values["temperature"] = thermal.from_table(table["temperature"], f"{place}: temperature")
+    return tables.made(functools.partial(replace, base or GyroSpec()), values, own, FORM, place)  # type: ignore[no-any-return]
 
 
 def read_spec(path: str | os.PathLike[str]) -> GyroSpec:

@@ -32,6 +32,7 @@ from strapdown.montecarlo.engine import MACHINES, Chunks, Work, Workers, arithme
 from strapdown.montecarlo.plan import Plan, from_table
 from strapdown.montecarlo.statistics import BINS, Statistics, merge
 from strapdown.records import CONVENTIONS, put
+from strapdown.results import Listed, Listing
 
 __all__ = [
     "Campaign",
@@ -96,7 +97,7 @@ _COUNTED = (
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Campaign:
+class Campaign(Listed):
     """A campaign as stored in its file.
 
     Parameters
@@ -130,6 +131,12 @@ class Campaign:
     version: str = strapdown.__version__
     arithmetic: str = ""
     seconds: float = 0.0
+
+    def listing(self) -> Listing:
+        """Return the statistics of the runs finished so far as a table."""
+        if self.statistics is None:
+            return Listing(f"Monte Carlo of {self.runs} runs, none of them finished", (), ())
+        return self.statistics.listing()
 
     @property
     def finished(self) -> bool:

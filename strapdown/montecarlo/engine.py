@@ -57,11 +57,11 @@ class Choice:
 
     machine: str
     reason: str = ""
-    """Why the lanes do not serve; empty where they do, or where the machine was asked for."""
+    """What the lanes do not cover; empty where they cover all, or where the machine was asked for."""
 
     def __str__(self) -> str:
         """Return it as one line."""
-        return f"{self.machine} (lanes do not serve: {self.reason})" if self.reason else self.machine
+        return f"{self.machine} (lanes do not cover {self.reason})" if self.reason else self.machine
 
 
 def choose(plan: Plan, machine: str = "auto") -> Choice:
@@ -75,13 +75,13 @@ def choose(plan: Plan, machine: str = "auto") -> Choice:
         try:
             reason = machine_named(name).supports(plan)
         except ModuleNotFoundError as error:
-            reason = f"{error.name} is not installed"
+            reason = f"a machine without {error.name}"
         if reason is None:
             return Choice(machine=name, reason=reasons.get("lanes", ""))
         reasons[name] = reason
     refusals = "; ".join(f"{name}: {reason}" for name, reason in reasons.items())
     raise InputError(
-        f"no machine computes this plan ({refusals}); take a plainer filter or scenario, or precision float64"
+        f"no machine covers this plan ({refusals}); take a plainer filter or scenario, or precision float64"
     )
 
 

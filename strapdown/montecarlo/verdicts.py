@@ -43,8 +43,8 @@ def summary(
 ) -> dict[str, Any]:
     """Return verdict and numbers: ANEES and NIS per degree of freedom, coverage, errors, worst runs; units in the names.
 
-    A consistent filter passes all tests together (three of NEES at all judged epochs, one of NIS for each sensor) with at least
-    ``probability`` (Bonferroni); the bounds reported are those, and so a little wider than those of one test alone.
+    The bounds are those that decide (:func:`strapdown.consistency.judge_runs`): all its tests together reject a consistent filter with at
+    most 1 − ``probability``.
 
     Parameters
     ----------
@@ -64,32 +64,31 @@ def summary(
     """
     chosen = judged_epochs(len(statistics.time) - 1) if epochs is None else epochs
     seen = [i for i in range(len(statistics.sensors)) if statistics.sensor_degrees[i].sum() > 0]
-    single = 1.0 - (1.0 - probability) / (len(statistics.subsets) + len(seen))
+    judgement = consistency.judge_runs(statistics, epochs=chosen, probability=probability)
+    found = {(one.name, one.of): one for one in judgement.findings}
     nees = {}
     for subset in statistics.subsets:
-        verdict = statistics.verdict(chosen, subset, single)
+        mean, one = statistics.verdict(chosen, subset).mean, found["ANEES", subset]
         nees[subset] = {
-            "anees": _number(verdict.mean.mean()),
-            "least": _number(verdict.mean.min()),
-            "greatest": _number(verdict.mean.max()),
-            "bounds": list(verdict.simultaneous_bounds),
-            "epochs_outside": verdict.outside,
-            "consistent": verdict.consistent,
+            "anees": _number(mean.mean()),
+            "least": _number(mean.min()),
+            "greatest": _number(mean.max()),
+            "bounds": [one.low, one.high],
+            "epochs_outside": int(np.sum(~((mean >= one.low) & (mean <= one.high)))),
+            "consistent": not one.rejected,
         }
-    nis = []
-    for i in seen:
-        low, high = consistency.mean_bounds(1, int(statistics.sensor_degrees[i].sum()), single)
-        value = float(statistics.sensor_nis[i])
-        nis.append(
-            {
-                "sensor": statistics.sensors[i],
-                "nis": _number(value),
-                "bounds": [low, high],
-                "degrees_of_freedom": int(statistics.sensor_degrees[i].sum()),
-                "refused": int(statistics.sensor_refused[i].sum()),
-                "consistent": bool(low <= value <= high),
-            }
-        )
+    nis = [
+        {
+            "sensor": statistics.sensors[i],
+            "nis": _number(statistics.sensor_nis[i]),
+            "bounds": [one.low, one.high],
+            "degrees_of_freedom": int(statistics.sensor_degrees[i].sum()),
+            "refused": int(statistics.sensor_refused[i].sum()),
+            "consistent": not one.rejected,
+        }
+        for i in seen
+        for one in [found["NIS", statistics.sensors[i]]]
+    ]
     return {
         "runs": statistics.runs,
         "failed_runs": statistics.failed,
@@ -104,11 +103,7 @@ def summary(
             {"run": int(run), "largest_nees": _number(score)}
             for run, score in zip(statistics.worst_run, statistics.worst_score, strict=True)
         ],
-        "consistent": bool(
-            statistics.failed == 0
-            and all(part["consistent"] for part in nees.values())
-            and all(part["consistent"] for part in nis)
-        ),
+        "consistent": statistics.failed == 0 and judgement.verdict != "not consistent",
     }
 
 
@@ -133,7 +128,7 @@ def _efficiency(statistics: Statistics, bound: Array, epochs: Counts) -> dict[st
 
 
 def _last_epoch(statistics: Statistics) -> dict[str, Any]:
-    """Return the errors at the end: mean, root mean square, what the filter says, quantiles of the absolute error by axis."""
+    """Return the errors at the end: mean, root mean square, the filter's σ, quantiles of the absolute error by axis."""
     result: dict[str, Any] = {"time_s": float(statistics.time[-1])}
     for name, rows, unit, factor in (
         ("attitude", slice(0, 3), "arcsec", units.ARCSECOND),

@@ -61,7 +61,7 @@ def drift_by_algorithm(drifts: Sequence[Drift], ax: Axes | None = None) -> Axes:
         text = f"{value:.3g}" if value > _ROUNDING else "rounding"
         top = max(value, np.nan_to_num(line), low)
         ax.annotate(text, (place, top), xytext=(0, 5), textcoords="offset points", ha="center")
-    ax.set_xticks(places, [drift.algorithm for drift in drifts])
+    ax.set_xticks(places, [drift.algorithm.replace("-", "-\n", 1) for drift in drifts])
     ax.grid(visible=False, axis="x")
     ax.set_ylabel("size of the drift about the cone's axis, °/h")
     legend_above(ax)

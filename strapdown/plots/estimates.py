@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MultipleLocator, NullFormatter
+from matplotlib.ticker import LogFormatter, MultipleLocator
 from numpy.typing import NDArray
 
 from strapdown import quaternion
@@ -130,12 +130,18 @@ def estimate_overview(estimate: Estimate, *, title: str = "", fixed_frame: str =
     legend_above(axes[3])
     total = np.linalg.norm(sigma[:, :3], axis=1)
     unit, size = angle_unit(total[settled])
-    axes[4].plot(*decimated(estimate.time, total / size), color=ink(), linewidth=1.0)
+    words = "root sum square of the three axes"
+    if len(total) <= BAND_COLUMNS:
+        axes[4].plot(estimate.time, total / size, color=ink(), linewidth=1.0)
+    else:  # a line through each tooth between two measurements would be a black bar
+        band(axes[4], estimate.time, total / size, total / size, color=SKY)
+        axes[4].plot(*envelope(estimate.time, total / size)[::2], color=ink(), linewidth=0.8)
+        words += ", least to largest of each pixel"
     axes[4].set_ylabel(f"attitude σ, {unit}")
-    axes[4].set_title("root sum square of the three axes", loc="right", fontsize="small")
+    axes[4].set_title(words, loc="right", fontsize="small")
     if total.max() > 5.0 * total[settled].max():  # a start that would flatten all the rest
         axes[4].set_yscale("log")
-        axes[4].yaxis.set_minor_formatter(NullFormatter())
+        axes[4].yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(2.0, 0.5)))
     else:
         axes[4].set_ylim(bottom=0.0)
     axes[4].set_xlabel("time, s")

@@ -12,9 +12,9 @@ from matplotlib.patches import Ellipse
 from matplotlib.ticker import LogFormatter
 
 from strapdown.checks import Array
-from strapdown.consistency import mean_bounds
+from strapdown.consistency import judge_runs, mean_bounds
 from strapdown.montecarlo import Statistics
-from strapdown.montecarlo.statistics import COVERED
+from strapdown.montecarlo.statistics import COVERED, judged_epochs
 from strapdown.plots.style import (
     AXES,
     CYCLE,
@@ -25,6 +25,7 @@ from strapdown.plots.style import (
     ink,
     layered,
     legend_above,
+    legend_below,
     new_figure,
     rate_unit,
 )
@@ -118,21 +119,29 @@ STATES = tuple(f"{what} {axis}" for what in ("attitude", "bias") for axis in AXE
 
 
 def runs_overview(statistics: Statistics, probability: float = 0.99) -> Figure:
-    """Draw ANEES of attitude and bias, and the NIS, over time, with the bounds of a consistent filter."""
+    """Draw ANEES of attitude and bias, and the NIS, over time, with the bounds of a consistent filter; dots are the epochs judged."""
     figure, axes = new_figure(1, 3, size=(12.0, 4.2))
     axes[1].set_visible(statistics.has_bias)
-    bounds = mean_bounds(3, statistics.runs, probability)
-    label = f"{100 * probability:g} % bounds, each epoch"
+    findings = judge_runs(statistics, probability=probability).findings
+    judged = judged_epochs(len(statistics.time) - 1)
+    label = f"{100 * probability:g} % bounds, all tests together"
     low, high = np.nanmin(statistics.anees), np.nanmax(statistics.anees)
     for ax, subset in zip(axes, ("attitude", "bias") if statistics.has_bias else ("attitude",), strict=False):
+        bounds = next((one.low, one.high) for one in findings if (one.name, one.of) == ("ANEES", subset))
         nees_over_time([("all runs", statistics)], bounds, subset, ax, label=label)
+        anees = statistics.anees[judged, ("state", "attitude", "bias").index(subset)]
+        ax.plot(statistics.time[judged], anees, ".", color=CYCLE[0], label="epochs judged")
         ax.set_ylim(min(0.5, 0.8 * float(low)), max(2.0, 1.3 * float(high)))
-        legend_above(ax)
     if statistics.sensor_degrees.sum() > 0:
-        nis_over_time([("all runs", statistics)], axes[2], probability=probability)
-        legend_above(axes[2])
+        nis_over_time(
+            [("all runs", statistics)],
+            axes[2],
+            probability=probability,
+            label=f"{100 * probability:g} % bounds, each interval",
+        )
     else:
         axes[2].set_visible(False)
+    legend_below(figure, [one for one in axes if one.get_visible()], ncols=4)
     return figure
 
 

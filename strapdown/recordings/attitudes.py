@@ -140,7 +140,7 @@ _PATTERNS = {name: re.compile(pattern) for name, pattern in COLUMNS.items()}
 def _table(path: Path) -> Attitudes:
     """Read a table of text."""
     with reading.from_file(path):
-        table = delimited._Table(path.name, io.StringIO(reading.text(path), newline=""))
+        table = delimited.Table(path.name, io.StringIO(reading.text(path), newline=""))
         found: dict[str, dict[str, tuple[int, str]]] = {name: {} for name in COLUMNS}
         frames: set[str] = set()
         for place, cell in enumerate(table.header):
@@ -264,7 +264,7 @@ def _bag(path: Path, topic: str) -> Attitudes:
     try:
         with tempfile.TemporaryDirectory() as folder:
             store = typesys.get_typestore(typesys.Stores.LATEST)
-            with highlevel.AnyReader([ros._named(path, Path(folder))], default_typestore=store) as reader:
+            with highlevel.AnyReader([ros.named_as(path, Path(folder))], default_typestore=store) as reader:
                 found = {c.topic: c for c in reader.connections if c.msgtype in _ORIENTED}
                 chosen = _topic(path.name, found, topic)
                 where, beside = _ORIENTED[found[chosen].msgtype]

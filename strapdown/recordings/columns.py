@@ -330,7 +330,9 @@ def _guess_time(columns: Sequence[Column]) -> tuple[tuple[int, ...], str] | None
                 unit = unit_of("time", "".join(words[size:])) if words[size:] else ""
                 if unit or not words[size:]:
                     return (k,), unit
-    return None
+    # loggingTime(ms), Time since start in ms: where only one column is of a time
+    hits = [k for k, one in enumerate(columns) if {"time", "timestamp"} & set(_words(one.name))]
+    return ((hits[0],), unit_of("time", _end(columns[hits[0]].name))) if len(hits) == 1 else None
 
 
 def _end(name: str) -> str:
@@ -352,7 +354,8 @@ def _units(
         if not unit and group != "magnetometer":
             raise InputError(
                 f"{source} does not say the unit of its {group} columns; declare it in the header, as in "
-                f"{GROUPS[group][0]} [{next(iter(units))}], or by option ({' or '.join(units)})"
+                f"{GROUPS[group][0]} [{next(iter(units))}], or by "
+                f"--{group}-unit ({', '.join(units)}; units= in Python)"
             )
         if option and declared.get(group) and option != declared[group]:
             raise InputError(
@@ -388,8 +391,12 @@ def _need_digits(source: str, values: Callable[[int], Array], roles: Mapping[str
 def _seconds(stamps: Array, factor: float) -> tuple[Array, int]:
     """Return stamps as time in s and the clock's reading at its start, ns; those of a clock that counts from 1970 begin at 0."""
     beyond = len(stamps) > 0 and abs(stamps[0] * factor) > CLOCK_OFFSET
-    origin = stamps[0] if beyond else 0.0
-    return np.asarray((stamps - origin) * factor), round(float(origin) * factor * 1e9) if beyond else 0
+    origin = float(stamps[0]) if beyond else 0.0
+    whole, scale = (
+        int(origin),
+        round(1e9 * factor),
+    )  # the product in integers: doubles since 1970 are good to 0.2 µs only
+    return np.asarray((stamps - origin) * factor), whole * scale + round((origin - whole) * scale)
 
 
 USUAL_INTERVALS = (1e-6, 2.0)
@@ -403,5 +410,5 @@ def _need_time_unit(source: str, name: str, time: Array) -> None:
     if not USUAL_INTERVALS[0] <= usual <= USUAL_INTERVALS[1]:
         raise InputError(
             f"{source}: the stamps of {name} are {usual:g} apart, which are hardly seconds; declare their unit, as in {name} [us], or by "
-            f"option ({' or '.join(TIME_UNITS)})"
+            f"--time-unit ({', '.join(TIME_UNITS)}; units= in Python)"
         )

@@ -55,7 +55,7 @@ def read_csv(
             f"{file.name} is a simulated record, not a recording; integrate it (`strapdown integrate`) or filter it (`strapdown estimate`)"
         )
     with reading.from_file(file):
-        table = _Table(file.name, io.StringIO(reading.text(file), newline=""))
+        table = Table(file.name, io.StringIO(reading.text(file), newline=""))
         return naming.recording(
             file.name,
             table.header,
@@ -67,7 +67,7 @@ def read_csv(
         )
 
 
-class _Table:
+class Table:
     """A header and rows of numbers, of which only the columns that are asked for are read: the others may hold anything."""
 
     def __init__(self, source: str, lines: Iterator[str]) -> None:

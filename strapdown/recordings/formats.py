@@ -334,6 +334,7 @@ def from_record(record: ImuRecord, source: str = "record") -> Recording:
     """
     steps = np.diff(record.time)[:, None]
     own: dict[str, Any] = {}
+    left_out = []
     for series in record.vectors:
         field = {"accelerometer": "specific_force", "magnetometer": "magnetic_field"}.get(series.sensor)
         if field is not None and series.kind == "vector":
@@ -343,11 +344,18 @@ def from_record(record: ImuRecord, source: str = "record") -> Recording:
             same[same] &= np.abs(record.time[1:][places[same]] - series.time[same]) < 1e-9
             values[places[same]] = series.vector_b[same]
             own[field] = values
+        else:
+            left_out.append(f"{series.sensor} ({series.kind})")
+    words = (
+        f"Left out: {', '.join(left_out)}. Recordings hold whole vectors of an accelerometer and a magnetometer alone."
+    )
     return with_gyro(
         source=source,
         time=record.time[1:],
         rate=record.increments / steps,
         true_attitude=None if record.truth is None else record.truth.attitude[1:],
+        temperature=None if record.temperature is None else record.temperature[1:],
+        remarks=(words,) if left_out else (),
         **own,
     )
 

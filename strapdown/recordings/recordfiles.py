@@ -131,6 +131,8 @@ def write_record(
         if record.truth is not None:
             put(file, "truth/attitude", record.truth.attitude, "1", "q_fb at the edges")
             put(file, "truth/bias", record.truth.bias, "rad/s", "gyro bias at the edges, body axes")
+        if record.temperature is not None:
+            put(file, "temperature", record.temperature, "degC", "of the gyro, at the edges")
 
 
 def is_record(path: str | os.PathLike[str]) -> bool:
@@ -183,7 +185,11 @@ def read_record_file(path: str | os.PathLike[str]) -> RecordFile:
         if "truth" in file:
             truth = Truth(attitude=_values(file, "truth/attitude", "1"), bias=_values(file, "truth/bias", "rad/s"))
         record = ImuRecord(
-            time=_values(file, "time", "s"), increments=_values(file, "increments", "rad"), vectors=series, truth=truth
+            time=_values(file, "time", "s"),
+            increments=_values(file, "increments", "rad"),
+            vectors=series,
+            truth=truth,
+            temperature=_values(file, "temperature", "degC") if "temperature" in file else None,
         )
         more = {name: value for name, value in attributes.items() if name not in _RESERVED}
         return RecordFile(
@@ -233,6 +239,7 @@ def _series(group: Any) -> VectorMeasurements:
 
 _GYRO_COLUMNS: tuple[str, ...] = ("time_s", "increment_x_rad", "increment_y_rad", "increment_z_rad")
 _TRUTH_COLUMNS = ("q_w", "q_x", "q_y", "q_z", "bias_x_rad_per_s", "bias_y_rad_per_s", "bias_z_rad_per_s")
+_TEMPERATURE = "temperature_degc"
 _VECTOR_COLUMNS = ("time_s", "x_b", "y_b", "z_b", "sigma", "x_f", "y_f", "z_f")
 _ATTITUDE_COLUMNS = ("time_s", "q_w", "q_x", "q_y", "q_z", "sigma_x_rad", "sigma_y_rad", "sigma_z_rad")
 _ARRIVAL = "arrival_s"
@@ -267,6 +274,9 @@ def export_csv(
     if record.truth is not None:
         columns += [record.truth.attitude, record.truth.bias]
         names += _TRUTH_COLUMNS
+    if record.temperature is not None:
+        columns.append(record.temperature[:, None])
+        names += (_TEMPERATURE,)
     table = np.concatenate(columns, axis=1)
     comment = (
         f"{_MARK} record, version {strapdown.__version__}, to {record.time[-1]:.17g} s, {len(record.vectors)}{_COUNTED}; "
@@ -325,9 +335,11 @@ def _read_csv_record(target: Path) -> RecordFile:
     comment, names, rows = _read_csv(target)
     if not comment.startswith(f"{_MARK} record"):
         raise InputError(f"{target} does not begin with '{_MARK} record'; it is not a record written by export_csv")
-    if names not in (_GYRO_COLUMNS, _GYRO_COLUMNS + _TRUTH_COLUMNS):
+    warm = names[-1:] == (_TEMPERATURE,)
+    if names[: len(names) - warm] not in (_GYRO_COLUMNS, _GYRO_COLUMNS + _TRUTH_COLUMNS):
         raise InputError(
-            f"{target} has the columns {', '.join(names)}; wanted {', '.join(_GYRO_COLUMNS)} and perhaps {', '.join(_TRUTH_COLUMNS)}"
+            f"{target} has the columns {', '.join(names)}; wanted {', '.join(_GYRO_COLUMNS)} and perhaps "
+            f"{', '.join((*_TRUTH_COLUMNS, _TEMPERATURE))}"
         )
     comment, _, made = comment.partition(_MADE)
     lost = np.argwhere(np.isnan(rows[1:, 1:4]))
@@ -336,9 +348,10 @@ def _read_csv_record(target: Path) -> RecordFile:
         raise InputError(
             f"{target}, line {row + 4}: {names[column + 1]} is nan; leave the row out; the next one needs the rotation over both"
         )
-    truth = Truth(attitude=rows[:, 4:8], bias=rows[:, 8:11]) if len(names) > 4 else None
+    truth = Truth(attitude=rows[:, 4:8], bias=rows[:, 8:11]) if len(names) > 5 else None
     series = tuple(_import_series(beside) for beside in _series_beside(target, comment))
-    record = ImuRecord(time=rows[:, 0], increments=rows[1:, 1:4], vectors=series, truth=truth)
+    temperature = rows[:, -1] if warm else None
+    record = ImuRecord(time=rows[:, 0], increments=rows[1:, 1:4], vectors=series, truth=truth, temperature=temperature)
     end = re.search(r", to (\S+) s,", comment)
     _need_end(target, rows, float(end[1]) if end else rows[-1, 0])
     if not made:
@@ -383,9 +396,9 @@ def _import_series(path: Path) -> VectorMeasurements:
     comment, names, rows = _read_csv(path, link=False)
     mark = f"{_MARK} vectors "
     try:
-        if not comment.startswith(mark):
-            raise ValueError
-        head = reading.from_json(comment.removeprefix(mark), str(path))
+        head = reading.from_json(
+            comment.removeprefix(mark), str(path)
+        )  # of another kind, the mark stays and is no JSON
         attitude = head["kind"] == "attitude"
         wanted = _ATTITUDE_COLUMNS if attitude else _VECTOR_COLUMNS
         if names[:8] != wanted or names[8:] not in ((), (_ARRIVAL,)):

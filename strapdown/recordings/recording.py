@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from strapdown.checks import Array, InputError, array, increasing, one_of
+from strapdown.results import Listed, Listing, figure
 from strapdown.units import DEGREE, STANDARD_GRAVITY
 
 RATE_UNITS = {"rad/s": 1.0, "deg/s": DEGREE, "mrad/s": 1e-3, "mdeg/s": 1e-3 * DEGREE}
@@ -37,7 +38,7 @@ thousands of steps."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Recording:
+class Recording(Listed):
     """A recording of one inertial measurement unit.
 
     Parameters
@@ -116,6 +117,22 @@ class Recording:
             object.__setattr__(self, name, array(f"{self.source}: {name}", getattr(self, name), ("k",)))
         if self.movement is not None and np.shape(self.movement) != (n,):
             raise InputError(f"{self.source}: movement has shape {np.shape(self.movement)}, wanted ({n},)")
+
+    def listing(self) -> Listing:
+        """Return each sensor with the sizes of its samples, which show a wrong unit, and what the reader remarked, as a table."""
+        span = self.time[-1] - self.time[0]
+        rows = []
+        for name, unit, values in (
+            ("gyro", "°/s", self.rate / DEGREE),
+            ("accelerometer", "m/s²", self.specific_force),
+            ("magnetometer", self.magnetic_unit or "?", self.magnetic_field),
+        ):
+            if values is not None:
+                size = np.linalg.norm(values[~np.isnan(values).any(axis=1)], axis=1)
+                ends = (figure(float(np.median(size))), figure(float(size.max()))) if len(size) else ("-", "-")
+                rows.append((name, unit, str(len(size)), *ends))
+        title = f"{self.source}: {len(self.time)} samples over {span:.6g} s, {(len(self.time) - 1) / span:.4g} Hz"
+        return Listing(title, ("sensor", "unit", "samples", "median size", "largest"), rows, self.remarks, left=2)
 
     def since(self, first: int) -> Recording:
         """Return the recording from one sample on.

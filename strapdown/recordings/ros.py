@@ -105,9 +105,10 @@ def is_folder(path: Path) -> bool:
 
 
 def _storages(path: Path) -> list[Path]:
-    """Return the storage files of a folder in their order: named as the folder, or that and a number."""
+    """Return the storage files of a folder in their order: with metadata all, else those named as the folder, or that and a number."""
     found = [one for suffix in (".mcap", ".db3") for one in path.glob(f"*{suffix}")]
-    numbers = {one: re.fullmatch(rf"{re.escape(path.absolute().name)}(?:_(\d+))?", one.stem) for one in found}
+    name = ".*?" if (path / "metadata.yaml").is_file() else re.escape(path.absolute().name)
+    numbers = {one: re.fullmatch(rf"{name}(?:_(\d+))?", one.stem) for one in found}
     return sorted(
         (one for one, number in numbers.items() if number), key=lambda one: int((numbers[one] or [0, 0])[1] or 0)
     )
@@ -243,7 +244,7 @@ def _messages(path: Path, wanted: tuple[str, ...] = ()) -> _Bag:
     topics: dict[str, _Topic] = {}
     try:
         with tempfile.TemporaryDirectory() as folder:
-            named = [_named(one, Path(folder)) for one in files]
+            named = [named_as(one, Path(folder)) for one in files]
             store = typesys.get_typestore(typesys.Stores.LATEST)
             with highlevel.AnyReader(named, default_typestore=store) as reader:
                 ros2 = bool(reader.is2)
@@ -267,7 +268,7 @@ def _messages(path: Path, wanted: tuple[str, ...] = ()) -> _Bag:
     return _Bag(topics, ros2, words)
 
 
-def _named(path: Path, folder: Path) -> Path:
+def named_as(path: Path, folder: Path) -> Path:
     """Return a path whose ending is that of its content, by which the library distinguishes bags."""
     if path.is_dir():
         return path
@@ -602,7 +603,7 @@ def _copied(writer: Any, topics: list[_Topic], source: Path) -> list[tuple[int, 
     queue = []
     with tempfile.TemporaryDirectory() as folder:
         store = typesys.get_typestore(typesys.Stores.LATEST)
-        with highlevel.AnyReader([_named(source, Path(folder))], default_typestore=store) as reader:
+        with highlevel.AnyReader([named_as(source, Path(folder))], default_typestore=store) as reader:
             for topic in topics:
                 connection = writer.add_connection(topic.name, topic.kind, typestore=reader.typestore)
                 queue += [(logged, connection, raw) for logged, raw in zip(topic.logged, topic.raw, strict=True)]

@@ -14,6 +14,7 @@ from strapdown.files import reading
 from strapdown.recordings import formats, recordfiles
 from strapdown.recordings.broad import sample_interval
 from strapdown.recordings.columns import SENSORS, UNITS
+from strapdown.recordings.gyro_temperature import temperature_at_samples
 from strapdown.recordings.recording import GAP, Recording
 from strapdown.records import ImuRecord
 
@@ -111,7 +112,10 @@ def samples_of(
         return _of_recording(content, sensor, gaps)
     if sensor == "gyro":
         interval = sample_interval(Recording(source=source, time=content.time[1:], rate=content.increments))
-        return GyroSamples(values=content.increments, sample_interval=interval, kind="increments")
+        temperature = None if content.temperature is None else content.temperature[1:]
+        return GyroSamples(
+            values=content.increments, sample_interval=interval, kind="increments", temperature=temperature
+        )
     return _of_recording(formats.from_record(content, source), sensor, gaps)
 
 
@@ -144,7 +148,7 @@ def _of_recording(recording: Recording, sensor: str, gaps: bool) -> GyroSamples:
         factor = UNITS["magnetometer"][recording.magnetic_unit]
     known = np.asarray(~np.isnan(values).any(axis=1))
     time, samples = recording.time[known], values[known] * factor
-    temperature = None if recording.temperature is None else recording.temperature[known]
+    temperature = None if recording.temperature is None else temperature_at_samples(recording)[known]
     remarks = recording.remarks
     own = Recording(source=recording.source, time=time, rate=np.zeros((len(time), 3)))
     try:

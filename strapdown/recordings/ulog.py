@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from strapdown import quaternion
 from strapdown.checks import Array, InputError, one_of
-from strapdown.files import written_beside
+from strapdown.files import reading, written_beside
 from strapdown.recordings.extras import library
 from strapdown.recordings.recording import MAGNETIC_UNITS, Recording, at_nearest, relative_time, with_gyro
 from strapdown.recordings.trajectories import interpolated
@@ -32,6 +32,10 @@ from strapdown.records import outputs
 UNIT, FIELD, ATTITUDE = "sensor_combined", "vehicle_magnetometer", "vehicle_attitude"
 NO_SAMPLE = 0x7FFFFFFF
 """``accelerometer_timestamp_relative`` where there is no new sample."""
+HEADER, TAIL = 16, 1 << 17
+"""Bytes before the first message, and of the end that is looked at: twice the longest message."""
+KINDS = b"ABCDFILMOPQRST"
+"""Letters of the messages."""
 LATE = 0.5
 """Share of the sample interval beyond which the accelerometer's own offset in time is reported."""
 
@@ -54,6 +58,8 @@ def read_ulog(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
     chosen = one_of(f"{file.name}: topic", topic or units[0], units)
     stamps, order, remarks = _stamps(chosen, data[chosen])
     remarks = [f"Topic {chosen}: {len(stamps)} messages.", *remarks]
+    if _is_cut(file):
+        remarks.append(f"{file.name} is truncated: read is what is whole.")
     if log.file_corruption:
         remarks.append(f"{file.name} is damaged: read is what is whole.")
     if log.dropouts:
@@ -90,6 +96,22 @@ def read_ulog(path: str | os.PathLike[str], *, topic: str = "") -> Recording:
     return with_gyro(
         source=file.name, time=time, rate=rate, specific_force=force, epoch_ns=epoch, remarks=tuple(remarks), **own
     )
+
+
+def _is_cut(file: Path) -> bool:
+    """Return whether a log ends within a message, as the chain of messages shows that leads there, or near the end any eight of one."""
+    with reading.opened(file) as stream:
+        begin = max(HEADER, stream.seek(0, io.SEEK_END) - TAIL)
+        stream.seek(begin)
+        data = stream.read()
+    for first in range(1 if begin == HEADER else len(data)):
+        place, number = first, 0
+        while place + 3 <= len(data) and data[place + 2] in KINDS:
+            place += 3 + int.from_bytes(data[place : place + 2], "little")
+            number += 1
+        if place + 3 > len(data) and (number >= 8 or begin == HEADER):
+            return place != len(data)
+    return False
 
 
 def _columns(rows: dict[str, Any], name: str, size: int) -> Array:

@@ -84,7 +84,7 @@ class Origin:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ImuRecord:
+class ImuRecord(Listed):
     """Gyro increments and vector measurements over one run.
 
     Arrays of floats are kept without a copy, for a long record fills much of the memory: pass a copy of a buffer that is written to
@@ -102,6 +102,8 @@ class ImuRecord:
         True attitude and bias, where known.
     origin : Origin, optional
         How it was simulated, so that a filter can be matched to the scenario; None for measured data.
+    temperature : ndarray (n + 1,), optional
+        Temperature of the gyro at the edges, °C, where known.
     """
 
     time: Array
@@ -109,10 +111,13 @@ class ImuRecord:
     vectors: tuple[VectorMeasurements, ...] = ()
     truth: Truth | None = None
     origin: Origin | None = None
+    temperature: Array | None = None
 
     def __post_init__(self) -> None:
         """Check shapes, order and finiteness."""
         time = increasing("time", self.time, least=2)
+        if self.temperature is not None:
+            object.__setattr__(self, "temperature", array("temperature", self.temperature, (len(time),)))
         increments = array("increments", self.increments, (len(time) - 1, 3))
         for index in (np.argmax(increments), np.argmin(increments)):
             row, axis = (int(i) for i in np.unravel_index(index, increments.shape))
@@ -140,6 +145,17 @@ class ImuRecord:
                 bias=array("truth.bias", self.truth.bias, (len(time), 3)),
             )
             object.__setattr__(self, "truth", truth)
+
+    def listing(self) -> Listing:
+        """Return gyro and sensors with their samples, and where the record comes from, as a table."""
+        span, count_ = self.time[-1] - self.time[0], len(self.increments)
+        rows = [("gyro", "increments", str(count_), f"{count_ / span:.4g}")]
+        rows += [(one.sensor, one.kind, str(len(one.time)), f"{len(one.time) / span:.4g}") for one in self.vectors]
+        notes = [f"Truth: {'attitude and gyro bias' if self.truth is not None else 'not known'}."]
+        if self.origin is not None and self.origin.scenario is not None:
+            name = self.origin.scenario.name or "a scenario"
+            notes.append(f"Simulated: {name}, seed {self.origin.seed}, run {self.origin.run}.")
+        return Listing(f"Record over {span:.6g} s", ("sensor", "measures", "samples", "Hz"), rows, notes, left=2)
 
     @property
     def rates(self) -> Array:
@@ -187,6 +203,7 @@ def compress(record: ImuRecord, algorithm: str | coning.Algorithm) -> ImuRecord:
         time=record.time[every],
         increments=coning.rotation_vectors(record.increments[:kept], table, edges=record.time[: kept + 1]),
         truth=truth,
+        temperature=None if record.temperature is None else record.temperature[every],
     )
 
 
@@ -231,6 +248,7 @@ def cut(record: ImuRecord, first: int, last: int) -> ImuRecord:
         increments=record.increments[first:last],
         vectors=tuple(vectors),
         truth=truth,
+        temperature=None if record.temperature is None else record.temperature[edges],
     )
 
 
@@ -425,13 +443,16 @@ class Estimate(Listed):
         for name, states in self.error_states.items():
             for k, (component, unit) in enumerate(zip(states.components, states.units, strict=True)):
                 ends = (figure(states.sigma[row, k], 3) for row in (-1, 0))
-                rows.append((f"{name} {component}".strip(), unit, figure(states.values[-1, k]), *ends))
-        notes = [f"Attitude at the end, body to fixed (w, x, y, z): {', '.join(f'{q:.6f}' for q in self.attitude[-1])}"]
+                label = f"{name} {component.removeprefix(name.split()[-1]).strip()}".strip()
+                rows.append((label, unit, figure(states.values[-1, k]), *ends))
+        notes = [f"Attitude at the end, q_fb (w, x, y, z): {', '.join(f'{q:.6f}' for q in self.attitude[-1])}"]
         for sensor, one in self.innovations.items():
             if np.any(one.used):
                 nis = np.mean(one.nis[one.used]) / one.innovation.shape[1]
                 gate = f", {one.refused} refused by the gate" if one.refused else ""
-                notes.append(f"{sensor}: {len(one.time)} measurements{gate}, mean NIS per degree of freedom {nis:.3f}")
+                notes.append(
+                    f"{sensor}: {len(one.time)} measurements{gate}, mean NIS per degree of freedom {figure(nis, 3)}"
+                )
         return Listing(
             f"Estimate at {len(self.time)} epochs over {self.time[-1] - self.time[0]:.6g} s",
             ("state", "unit", "at the end", "σ", "σ at the start"),

@@ -33,7 +33,7 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
         f"{statistics.runs} runs of {held.plan.scenario.duration:g} s, seed {held.plan.seed}, {len(statistics.time) - 1} epochs, machine: "
         f"{held.machine}{unfinished}; strapdown {held.version}",
         findings.verdict(judgement),
-        _numbers(statistics, bound),
+        _numbers(statistics, bound, judgement),
         findings.evidence(judgement),
         page.section(
             "Over time",
@@ -92,7 +92,7 @@ def _over_bound(statistics: Statistics, bound: Array) -> Array:
     return verdicts.efficiency(statistics, bound)[:, : len(_estimated(statistics))]
 
 
-def _numbers(statistics: Statistics, bound: Array | None) -> str:
+def _numbers(statistics: Statistics, bound: Array | None, judgement: consistency.Judgement) -> str:
     rows = []
     for k, name in enumerate(_estimated(statistics)):
         unit, size = state_unit(k, 3.0 * statistics.sigma[-1:, k // 3 * 3 : k // 3 * 3 + 3])
@@ -121,15 +121,19 @@ def _numbers(statistics: Statistics, bound: Array | None) -> str:
         *(() if bound is None else ("RMS / √Cramér–Rao bound",)),
     )
     nis = [
-        (name, page.number(float(value)), *(f"{bound:.4f}" for bound in statistics.nis_bounds(0.99, name)))
-        for name, value, degrees in zip(
-            statistics.sensors, statistics.sensor_nis, statistics.sensor_degrees, strict=True
-        )
-        if degrees.sum() > 0
+        (one.of, f"{one.value:.4f}", f"{one.low:.4f}", f"{one.high:.4f}")
+        for one in judgement.findings
+        if one.name == "NIS"
     ]
     parts = [page.table(head, rows, numbers=len(head) - 1)]
     if nis:
-        parts.append(page.table(("sensor", "NIS per degree of freedom", "from", "to (99 %)"), nis, numbers=3))
+        parts.append(
+            page.table(
+                ("sensor", "NIS per degree of freedom", "from", f"to ({100.0 * judgement.probability:g} %, all tests)"),
+                nis,
+                numbers=3,
+            )
+        )
     if statistics.failed:
         parts.append(
             page.paragraph(

@@ -28,7 +28,7 @@ def report(path: Path, probability: float) -> tuple[str, dict[str, Any]]:
     used = sum(len(one.time) for one in estimate.innovations.values())
     content = page.page(
         f"Estimate: {path.name}",
-        f"{len(estimate.time)} states over {span:g} s, {used} measurements of {len(estimate.innovations)} "
+        f"{len(estimate.time)} epochs over {span:g} s, {used} measurements of {len(estimate.innovations)} "
         f"sensor{'' if len(estimate.innovations) == 1 else 's'}, "
         f"{'with' if truth is not None else 'without'} truth; strapdown {attributes.get('version', '')}",
         findings.verdict(judgement),

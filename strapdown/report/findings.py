@@ -32,7 +32,7 @@ def evidence(judgement: Judgement) -> str:
             page.number(finding.low),
             page.number(finding.high),
             page.number(finding.p_value, 3),
-            page.number(finding.samples, 6),
+            page.number(finding.samples, 4 if finding.samples % 1.0 else 9),
         )
         for finding in judgement.findings
     ]
@@ -40,8 +40,8 @@ def evidence(judgement: Judgement) -> str:
     marked = ["fail" if finding.rejected else "pass" for finding in judgement.findings]
     percent = 100.0 * judgement.probability
     note = (
-        f"Bounds hold one statistic of a right filter with {percent:g} %. The verdict takes all p-values together: a right filter is "
-        f"called wrong with at most {100.0 - percent:g} %. Of correlated samples only their worth in independent ones is counted."
+        f"Bounds, pass and fail take all tests together: a consistent filter fails with at most {100.0 - percent:g} %. Each p-value is "
+        "that of its statistic alone. Samples that are correlated count as the independent ones that show as much."
     )
     parts = [page.table(head, rows, numbers=5, marked=marked), page.paragraph(note, faint=True)]
     parts += [page.paragraph(f"What this does not show: {limit}.", faint=True) for limit in judgement.limits]

@@ -193,7 +193,9 @@ def provenance(attributes: Mapping[str, Any]) -> str:
     short: list[tuple[str, str]] = []
     long: list[tuple[str, str]] = []
     for name, value in attributes.items():
-        content = str(value.decode() if isinstance(value, bytes) else value)
+        content = (
+            f"{value:.6g}" if isinstance(value, float) else str(value.decode() if isinstance(value, bytes) else value)
+        )
         (long if "\n" in content or len(content) > 160 else short).append((name.replace("_", " "), content))
     parts = [table(("what", "value"), short)] if short else []
     parts += [f"<p>{text(name)}</p>" + code(content) for name, content in long]

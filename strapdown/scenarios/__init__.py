@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from strapdown import gyro, motion, vectors
-from strapdown.checks import Array, InputError, array, count, known_keys, one_of, positive
+from strapdown.checks import Array, InputError, array, count, finite, known_keys, one_of, positive
 from strapdown.files import reading, tables
 from strapdown.files.tables import Form
 from strapdown.gyro import GyroSpec
@@ -30,6 +30,7 @@ from strapdown.vectors import Sensor
 __all__ = [
     "SCENARIOS",
     "Scenario",
+    "Temperature",
     "drawn",
     "load_scenario",
     "simulate",
@@ -43,6 +44,49 @@ SCENARIOS: tuple[str, ...] = tuple(sorted(path.stem for path in _BUILTIN.glob("*
 
 MAX_SAMPLES = 1e9
 """Gyro samples that a simulated record may have: beyond it none fits into memory."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Temperature:
+    """Temperature of the unit: exponentially from one to another, or without a time constant at a constant rate over the record.
+
+    Parameters
+    ----------
+    start : float
+        At the start, °C.
+    end : float
+        That it tends to, or without a time constant that at the end of the record, °C.
+    time_constant : float, default inf
+        Thermal time constant, s.
+    """
+
+    start: float
+    end: float
+    time_constant: float = np.inf
+
+    def __post_init__(self) -> None:
+        """Check all."""
+        finite("start", self.start, unit="°C")
+        finite("end", self.end, unit="°C")
+        if self.time_constant != np.inf:
+            positive("time_constant", self.time_constant, unit="s")
+
+    def at(self, time: Array) -> Array:
+        """Return the temperature over a record.
+
+        Parameters
+        ----------
+        time : ndarray (n + 1,)
+            Edges of the record, s.
+
+        Returns
+        -------
+        ndarray (n + 1,)
+            Temperature at the edges, °C.
+        """
+        elapsed = time - time[0]
+        share = elapsed / elapsed[-1] if self.time_constant == np.inf else -np.expm1(-elapsed / self.time_constant)
+        return np.asarray(self.start + (self.end - self.start) * share)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,6 +115,8 @@ class Scenario:
         Gravity where the body is held up, m/s², fixed frame: what a g-sensitive gyro feels the reaction to; zeros in free fall.
     gyro_preset : str, default ""
         Name of the preset that ``gyro`` is, for files.
+    temperature : Temperature, optional
+        Temperature of the unit, °C, over which a gyro may have a bias; it is recorded. Default: none.
 
     Examples
     --------
@@ -96,6 +142,7 @@ class Scenario:
     seed: int = 0
     gravity_f: tuple[float, ...] = vectors.GRAVITY_F
     gyro_preset: str = ""
+    temperature: Temperature | None = None
 
     def __post_init__(self) -> None:
         """Check rate, duration, and the names of the sensors."""
@@ -163,29 +210,39 @@ def simulate(scenario: Scenario, seed: int | None = None, run: int = 0) -> ImuRe
     if np.any(spec.g_sensitivity != 0.0):
         middle = 0.5 * (edges[1:] + edges[:-1])
         force = vectors.specific_force(scenario.motion, middle, gravity_f=scenario.gravity_f)
+    temperature = None if scenario.temperature is None else scenario.temperature.at(edges)
     output = gyro.simulate(
-        spec, scenario.motion.increments(edges), edges, generator(seed, run, "gyro"), specific_force=force
+        spec,
+        scenario.motion.increments(edges),
+        edges,
+        generator(seed, run, "gyro"),
+        specific_force=force,
+        temperature=temperature,
     )
     increments, bias = output.increments, output.bias
     if spec.drop_probability > 0.0:
         lost = gyro.dropped(spec, len(increments), generator(seed, run, "gyro losses"))
         increments, left = gyro.bridge_dropped(increments, stamps, lost)
         edges, stamps, bias = edges[left], stamps[left], bias[left]
+        temperature = None if temperature is None else temperature[left]
     series = tuple(
         sensor.observe(scenario.motion, nominal[0], nominal[-1], generator(seed, run, sensor.name))
         for sensor in scenario.sensors
     )
     truth = Truth(attitude=scenario.motion.attitude(edges), bias=bias)
     origin = Origin(gyro=spec, scenario=scenario, seed=seed, run=run)
-    return ImuRecord(time=stamps, increments=increments, vectors=series, truth=truth, origin=origin)
+    return ImuRecord(
+        time=stamps, increments=increments, vectors=series, truth=truth, origin=origin, temperature=temperature
+    )
 
 
 def drawn(scenario: Scenario, seed: int, run: int = 0) -> Scenario:
     """Return the scenario with other individuals of its gyro and sensors: each fixed error times a standard normal number.
 
     The fixed errors (scale factor, misalignment, sensitivity to acceleration, hard iron, a sensor's bias, lever arm) are taken as standard
-    deviations, entry by entry, as in a datasheet. A filter with a state for each (``setup.matched(scenario, states=True)``) is consistent
-    on average over such individuals, and only nearly so on one whose errors all have one size and sign.
+    deviations, entry by entry, as in a datasheet; to the coefficients of a bias over temperature errors of their own σ are added. A filter
+    with a state for each (``setup.matched(scenario, states=True)``) is consistent on average over such individuals, and only nearly so on
+    one whose errors all have one size and sign.
 
     Parameters
     ----------
@@ -207,6 +264,9 @@ def drawn(scenario: Scenario, seed: int, run: int = 0) -> Scenario:
         return np.asarray(np.asarray(errors) * draw.standard_normal(np.shape(errors)))
 
     errors: dict[str, Any] = {name: each(getattr(scenario.gyro, name)) for name in _FIXED_OF_THE_GYRO}
+    warm = scenario.gyro.temperature
+    if warm is not None:
+        errors["temperature"] = dataclasses.replace(warm, coefficients=warm.coefficients + each(warm.sigma))
     spec = dataclasses.replace(scenario.gyro, **errors)
     sensors = []
     for sensor in scenario.sensors:
@@ -361,7 +421,9 @@ _TOP_FORM: Form = {
     "duration": tables.SECONDS,
     "gravity_f": tables.METRES_PER_SECOND_SQUARED,
 }
-_TOP = ("name", "description", "seed", "rate_hz", "duration_s", "gravity_f_m_per_s2", "motion", "gyro", "sensors")
+_TABLES = ("motion", "gyro", "temperature", "sensors")
+_TOP = ("name", "description", "seed", "rate_hz", "duration_s", "gravity_f_m_per_s2", *_TABLES)
+_TEMPERATURE: Form = {"start": tables.DEGREES_CELSIUS, "end": tables.DEGREES_CELSIUS, "time_constant": tables.SECONDS}
 
 
 def load_scenario(name_or_path: str | os.PathLike[str]) -> Scenario:
@@ -427,6 +489,9 @@ def _from_table(table: dict[str, Any], place: str) -> Scenario:
         "gyro_preset": preset,
         "sensors": tuple(_read_sensor(entry, f"{place}: sensors[{i}]") for i, entry in enumerate(sensors)),
     }
+    if "temperature" in table:
+        where = f"{place}: temperature"
+        values["temperature"] = tables.build(Temperature, _table(table["temperature"], where), _TEMPERATURE, where)
     return tables.made(Scenario, values, table, _TOP_FORM, place)  # type: ignore[no-any-return]
 
 
@@ -485,12 +550,8 @@ def _read_gyro(table: dict[str, Any], place: str) -> tuple[str, GyroSpec]:
         return "", gyro.from_table(table, place)
     from strapdown.gyro import datasheets
 
-    known_keys(place, table, {**tables.keys(gyro.FORM), "preset": None})
     spec = datasheets.PRESETS[one_of(f"{place}: preset", name, datasheets.PRESETS)].spec
-    if not table:
-        return name, spec
-    change = functools.partial(dataclasses.replace, spec)
-    return "", tables.made(change, tables.decode(table, gyro.FORM, place), table, gyro.FORM, place)
+    return ("", gyro.from_table(table, place, spec)) if table else (name, spec)
 
 
 def _read_sensor(entry: Any, place: str) -> Sensor:
@@ -545,6 +606,8 @@ def scenario_to_table(scenario: Scenario) -> dict[str, Any]:
         table["gravity_f_m_per_s2"] = list(scenario.gravity_f)
     table["motion"] = _write_motion(scenario.motion)
     table["gyro"] = {"preset": scenario.gyro_preset} if scenario.gyro_preset else gyro.to_table(scenario.gyro)
+    if scenario.temperature is not None:
+        table["temperature"] = tables.encode(scenario.temperature, _TEMPERATURE)
     table["sensors"] = [_write_sensor(sensor) for sensor in scenario.sensors]
     return table
 

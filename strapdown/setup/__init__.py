@@ -204,10 +204,10 @@ def matched_to_record(
         σ of the initial attitude error, each axis, rad. Default: 1°, or less where the finest sensor is so fine that its first measurement
         would not be linear in the error; an extended filter's covariance does not hold beyond that.
     states : bool, default False
-        With an error state for each error that ``spec`` or ``sensors`` specify: scale factor, misalignment, g-sensitivity, flicker and
-        Gauss–Markov drift, hard iron, a sensor's bias, correlated noise, lever arm. Each is modelled as one draw of a normal distribution
-        whose σ is the error's size. Where one-sample integration would leave a noticeable commutation error, an integration algorithm of
-        the same rate with less is chosen.
+        With an error state for each error that ``spec`` or ``sensors`` specify: scale factor, misalignment, g-sensitivity, slope of the
+        bias over the record's temperature, flicker and Gauss–Markov drift, hard iron, a sensor's bias, correlated noise, lever arm. Each is
+        modelled as one draw of a normal distribution whose σ is the error's size. Where one-sample integration would leave a noticeable
+        commutation error, an integration algorithm of the same rate with less is chosen.
     sensors : sequence, optional
         Sensors of the scenario (:mod:`strapdown.vectors`), whose errors are specified.
     gravity_f : sequence of float (3,)
@@ -308,6 +308,8 @@ def unmodelled_errors(
     felt = np.any(np.asarray(spec.g_sensitivity) != 0.0) and np.any(np.asarray(gravity_f) != 0.0)
     if felt and "gyro.force" not in known:
         found.append("the gyro's sensitivity to acceleration")
+    if spec.temperature is not None and "gyro.temperature" not in known:
+        found.append("the gyro's bias over temperature")
     if float(np.max(spec.quantization)) > 0.0 or float(np.max(spec.rate_resolution)) > 0.0:
         found.append("the gyro's quantisation")
     for sensor in sensors:

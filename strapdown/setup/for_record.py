@@ -1,4 +1,4 @@
-"""The filter for a record, from what the record says of itself: the setup that matches its origin, and the initial state."""
+"""The filter for a record, from what the record holds of its origin: the setup that matches its origin, and the initial state."""
 
 from __future__ import annotations
 

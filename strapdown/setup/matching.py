@@ -57,6 +57,7 @@ def matched(spec: GyroSpec, record: ImuRecord, sensors: Sequence[Any], gravity_f
             gyro_misalignment_sigma=_entries(np.abs(spec.misalignment)),
             gyro_force_sigma=_entries(np.diag(force)),
             gyro_cross_force_sigma=_entries(force - np.diag(np.diag(force))),
+            gyro_temperature_sigma=_slope(spec, record),
             gyro_drift_sigma=drift_sigma,
             gyro_drift_time=drift_time,
             gyro_fast_bias_sigma=fast,
@@ -65,6 +66,18 @@ def matched(spec: GyroSpec, record: ImuRecord, sensors: Sequence[Any], gravity_f
         ),
         white=white,
     )
+
+
+def _slope(spec: GyroSpec, record: ImuRecord) -> Entries:
+    """Return the size of the bias's slope over the record's temperature (3,), rad/s/K: its root mean square and its σ; 0 without any."""
+    if spec.temperature is None or record.temperature is None or np.ptp(record.temperature) == 0.0:
+        return 0.0
+    steps = np.diff(record.temperature)[:, None]
+    change = np.diff(spec.temperature.bias(record.temperature), axis=0)
+    size = np.sqrt(
+        np.sum(change * change / np.where(steps == 0.0, np.inf, np.abs(steps)), axis=0) / np.sum(np.abs(steps))
+    )
+    return tuple(np.hypot(size, spec.temperature.slope_sigma).tolist())
 
 
 def _entries(values: Array) -> Entries:

@@ -19,6 +19,7 @@ from strapdown.estimation.error_states import (
     GyroForce,
     GyroGaussMarkov,
     GyroScale,
+    GyroTemperature,
     LeverArm,
     SensorMounting,
     VectorBias,
@@ -199,6 +200,8 @@ class States(ByValue):
         σ of the gyro's sensitivity to specific force along the same axis, rad/s per m/s², by axis.
     gyro_cross_force_sigma : float or tuple (3, 3), default 0.0
         σ of the gyro's sensitivity to specific force across axes, rad/s per m/s², by entry; zeros on the diagonal.
+    gyro_temperature_sigma : float or tuple (3,), default 0.0
+        σ of the slope of the gyro's bias over the temperature of the record, rad/s/K, by axis.
     gyro_drift_sigma : tuple of float, default empty
         Stationary σ of each Gauss–Markov part of the gyro's bias, rad/s; parts with correlation times a decade apart
         model flicker.
@@ -218,6 +221,7 @@ class States(ByValue):
     gyro_misalignment_sigma: Entries = 0.0
     gyro_force_sigma: Entries = 0.0
     gyro_cross_force_sigma: Entries = 0.0
+    gyro_temperature_sigma: Entries = 0.0
     gyro_drift_sigma: tuple[float, ...] = ()
     gyro_drift_time: tuple[float, ...] = ()
     gyro_fast_bias_sigma: float = 0.0
@@ -231,6 +235,7 @@ class States(ByValue):
             ("gyro_misalignment_sigma", (3, 3), "rad"),
             ("gyro_force_sigma", (3,), "rad s/m"),
             ("gyro_cross_force_sigma", (3, 3), "rad s/m"),
+            ("gyro_temperature_sigma", (3,), "rad/s/K"),
         ):
             object.__setattr__(self, name, _entries(name, getattr(self, name), shape, unit))
         for name, unit in (("gyro_drift_sigma", "rad/s"), ("gyro_drift_time", "s")):
@@ -260,8 +265,8 @@ class States(ByValue):
         Returns
         -------
         tuple of ErrorStates
-            One block each for scale and misalignment, sensitivity to specific force, and each drift, where its σ is
-            above zero.
+            One block each for scale and misalignment, sensitivity to specific force, slope over temperature, and each
+            drift, where its σ is above zero.
         """
         found: list[ErrorStates] = []
         if _any(self.gyro_scale_sigma) or _any(self.gyro_misalignment_sigma):
@@ -270,6 +275,9 @@ class States(ByValue):
         if _any(self.gyro_force_sigma) or _any(self.gyro_cross_force_sigma):
             along, across = _spread(self.gyro_force_sigma, self.gyro_cross_force_sigma)
             found.append(GyroForce(along_sigma=along, across_sigma=across, gravity_f=np.array(self.gravity_f)))
+        if _any(self.gyro_temperature_sigma):  # on an axis of σ 0 as small as makes no difference
+            slope = _spread(self.gyro_temperature_sigma, 0.0)[0]
+            found.append(GyroTemperature(slope_sigma=np.maximum(slope, 1e-6 * slope.max())))
         for sigma, time in zip(self.gyro_drift_sigma, self.gyro_drift_time, strict=True):
             found.append(GyroGaussMarkov(bias_sigma=sigma, correlation_time=time, name=f"gyro drift {time:g} s"))
         return tuple(found)
@@ -305,6 +313,7 @@ class States(ByValue):
             ("gyro.scale", _any(self.gyro_scale_sigma)),
             ("gyro.misalignment", _any(self.gyro_misalignment_sigma)),
             ("gyro.force", _any(self.gyro_force_sigma) or _any(self.gyro_cross_force_sigma)),
+            ("gyro.temperature", _any(self.gyro_temperature_sigma)),
             ("gyro.drift", bool(self.gyro_drift_sigma)),
         )
         found = [name for name, there in gyro if there]
@@ -347,6 +356,7 @@ class States(ByValue):
             gyro_misalignment_sigma=self.gyro_misalignment_sigma if "gyro.misalignment" in names else 0.0,
             gyro_force_sigma=self.gyro_force_sigma if "gyro.force" in names else 0.0,
             gyro_cross_force_sigma=self.gyro_cross_force_sigma if "gyro.force" in names else 0.0,
+            gyro_temperature_sigma=self.gyro_temperature_sigma if "gyro.temperature" in names else 0.0,
             gyro_drift_sigma=self.gyro_drift_sigma if "gyro.drift" in names else (),
             gyro_drift_time=self.gyro_drift_time if "gyro.drift" in names else (),
             gyro_fast_bias_sigma=self.gyro_fast_bias_sigma if "gyro.drift" in names else 0.0,
@@ -413,7 +423,7 @@ def run(
     """
     error_states = states.blocks({series.sensor: series.kind for series in record.vectors})
     state = initial if len(initial.values) else initial_state(initial, error_states)
-    problem = forward.prepared(record, process_noise, state, error_states)
+    problem = forward.prepared(record, process_noise, state, error_states, driven=True)
     options = forward.Options(
         every=every, full_covariance=full_covariance, gate=gate, robust=robust, whole_bias=True, together=True
     )
@@ -442,6 +452,10 @@ FORM: tables.Form = {
     "gyro_misalignment_sigma": tables.MILLIRADIANS,
     "gyro_force_sigma": _FORCE,
     "gyro_cross_force_sigma": _FORCE,
+    "gyro_temperature_sigma": (
+        ("deg_per_hour_per_kelvin", units.DEGREE_PER_HOUR),
+        ("rad_per_s_per_kelvin", 1.0),
+    ),
     "gyro_drift_sigma": tables.DEGREES_PER_HOUR,
     "gyro_drift_time": tables.SECONDS,
     "gyro_fast_bias_sigma": tables.DEGREES_PER_HOUR,

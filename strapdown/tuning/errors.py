@@ -1,5 +1,8 @@
 """Tuning against a truth: the likelihood of the state errors under the filter's covariance, or the size of the attitude error.
 
+The likelihood is that of the filter as it runs, with its error states, its gate and its robust weights; where it has none of them, eight
+points are computed at once.
+
 Errors at neighbouring times are alike, so epochs are taken as far apart as the attitude error remembers, and the likelihood of all of them
 is a composite one (Lindsay 1988): its maximum is right, its curvature is not an information, and standard errors come from the sandwich.
 """
@@ -8,15 +11,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from strapdown import consistency
 from strapdown.checks import Array, InputError, one_of
-from strapdown.estimation.states import covariance_matrices
 from strapdown.setup import FilterSetup
+from strapdown.tuning import extended
+from strapdown.tuning.extended import ExtendedLikelihood
 from strapdown.tuning.innovations import MOST, STEP, Case, Derivatives, Likelihood, likelihood
+from strapdown.tuning.parameters import axis_of
 
 Measure = Literal["likelihood", "rmse"]
 MAX_EPOCHS = 1000
@@ -27,10 +32,10 @@ MAX_EPOCHS = 1000
 class ErrorObjective:
     """Objective of the parameters, from the errors of the state; built by :func:`error_objective`."""
 
-    base: Likelihood
+    base: Likelihood | ExtendedLikelihood
     measure: Measure
-    epochs: tuple[np.ndarray, ...] = field(repr=False)
-    """Edges judged, of each record."""
+    references: tuple[Reference, ...] = field(repr=False)
+    """Truth at the edges judged, of each record."""
     parts: int = 20
 
     @property
@@ -59,20 +64,19 @@ class ErrorObjective:
     def derivatives(self, point: Array) -> Derivatives:
         """Return value, gradient and curvature at a point."""
         rows = np.concatenate([point[None], point + STEP * np.eye(len(point))])
-        found = self.base.each(lambda number: self.errors_of(number, rows), range(len(self.epochs)))
+        found = self.base.each(lambda number: self.errors_of(number, rows), range(len(self.references)))
         error = np.concatenate([e for e, _ in found])
         P = np.concatenate([covariance for _, covariance in found])
         return self._squares(error) if self.measure == "rmse" else self._likelihood(error, P)
 
     def errors_of(self, number: int, rows: Array) -> tuple[Array, Array]:
         """Return errors (m, lanes, n) and covariances (m, lanes, n, n) of one record; n is 3 where the true bias is not known."""
-        case, epochs = self.base.prepared[number], self.epochs[number]
-        states = np.moveaxis(self.base.states(number, rows, epochs), 1, 2)
-        assert case.true_attitude is not None
-        bias = states[..., 4:7] if case.true_bias is None else case.true_bias[epochs][:, None]
-        error = consistency.errors(states[..., :4], states[..., 4:7], case.true_attitude[epochs][:, None], bias)
-        n = 3 if case.true_bias is None or self.measure == "rmse" else 6
-        return error[..., :n], covariance_matrices(states[..., 7:])[..., :n, :n]
+        truth = self.references[number]
+        attitude, bias, P = self.base.estimates(number, rows, truth.epochs)
+        true_bias = bias if truth.bias is None else truth.bias[:, None]
+        error = consistency.errors(attitude, bias, truth.attitude[:, None], true_bias)
+        n = 3 if truth.bias is None or self.measure == "rmse" else 6
+        return error[..., :n], P[..., :n, :n]
 
     def _likelihood(self, error: Array, P: Array) -> Derivatives:
         scale = np.sqrt(np.einsum("mii->mi", P[:, 0]))  # rad beside rad/s
@@ -121,36 +125,67 @@ def error_objective(
     """Return the objective that judges the filter by its errors on records with a truth, or a reference attitude: then only the attitude.
 
     The likelihood of the errors under the filter's covariance asks that they be small and that the filter know how small; the root mean
-    square of the attitude error asks for the first alone, and does not determine a common scale of all parameters.
+    square of the attitude error asks for the first alone, and does not determine a common scale of all parameters; it is that of a filter
+    of attitude and bias without gate and robust weights.
     """
     one_of("measure", measure, ("likelihood", "rmse"))
-    base = likelihood(cases, chosen, free, threads=threads)
-    if len(base.names) > MOST:
-        raise InputError(f"{len(base.names)} parameters are free; against a truth at most {MOST} can be")
-    epochs = []
-    for number, case in enumerate(cases):
-        prepared = base.prepared[number]
-        if prepared.true_attitude is None or not prepared.judged.any():
-            raise InputError(
-                f"{case.name or 'record'} has no truth where it is to be judged; tune by the innovations instead (leave truth out)"
-            )
-        known = np.flatnonzero(prepared.judged)
-        epochs.append(_spread(base, number, known, measure))
-    return ErrorObjective(base=base, measure=measure, epochs=tuple(epochs))
+    plain = measure == "rmse" or (chosen.states is None and chosen.gate is None and chosen.robust is None)
+    base: Likelihood | ExtendedLikelihood
+    if plain and not any(axis_of(name) for name in free):
+        base = likelihood(cases, chosen, free, threads=threads)
+        if len(base.names) > MOST:
+            raise InputError(f"{len(base.names)} parameters are free; against a truth at most {MOST} can be")
+    else:
+        base = extended.likelihood(cases, chosen, free, threads=threads)
+    known = [_reference(case, base.chosen) for case in cases]
+    references = tuple(_spread(base, number, one, measure) for number, one in enumerate(known))
+    return ErrorObjective(base=base, measure=measure, references=references)
 
 
-def _spread(base: Likelihood, number: int, known: np.ndarray, measure: Measure) -> np.ndarray:
+class Reference(NamedTuple):
+    """Truth of one record at some of the edges of the filter's steps."""
+
+    epochs: np.ndarray
+    """Edges (m,)."""
+    attitude: Array
+    """q_fb (m, 4)."""
+    bias: Array | None
+    """(m, 3), where it is known."""
+
+    def at(self, rows: Any) -> Reference:
+        """Return some rows of it."""
+        return Reference(self.epochs[rows], self.attitude[rows], None if self.bias is None else self.bias[rows])
+
+
+def _reference(case: Case, chosen: FilterSetup) -> Reference:
+    """Return the truth of a record where it is known and counts for tuning."""
+    every, time, truth = chosen.integration.samples, case.record.time, case.record.truth
+    edges = np.arange(0, len(time), every)
+    attitude = case.true_attitude if truth is None else truth.attitude
+    judged = (time[edges] >= case.first) & (time[edges] <= case.last)
+    if case.judged is not None:
+        judged &= case.judged[edges]
+    if attitude is not None:
+        judged &= np.isfinite(attitude[edges]).all(axis=1)
+    if attitude is None or not judged.any():
+        raise InputError(
+            f"{case.name or 'record'} has no truth where it is to be judged; tune by the innovations instead (leave truth out)"
+        )
+    rows = edges[judged]
+    return Reference(np.flatnonzero(judged), attitude[rows], None if truth is None else truth.bias[rows])
+
+
+def _spread(base: Likelihood | ExtendedLikelihood, number: int, known: Reference, measure: Measure) -> Reference:
     """Return edges far enough apart that the attitude error of the starting filter has forgotten."""
-    picked = known[:: max(1, len(known) // MAX_EPOCHS)]
-    if measure == "rmse" or len(picked) < 100:
+    picked = known.at(slice(None, None, max(1, len(known.epochs) // MAX_EPOCHS)))
+    m = len(picked.epochs)
+    if measure == "rmse" or m < 100:
         return picked
-    case = base.prepared[number]
-    assert case.true_attitude is not None
-    states = base.states(number, base.start[None], picked)[..., 0]
-    none = np.zeros((len(picked), 3))
-    error = consistency.errors(states[:, :4], none, case.true_attitude[picked], none)[:, :3]
-    white = error / np.sqrt(states[:, [7, 10, 12]])
+    attitude, _, P = base.estimates(number, base.start[None], picked.epochs)
+    none = np.zeros((m, 3))
+    error = consistency.errors(attitude[:, 0], none, picked.attitude, none)[:, :3]
+    white = error / np.sqrt(np.diagonal(P[:, 0, :3, :3], axis1=1, axis2=2))
     lag = 1
-    while lag < len(picked) // 50 and np.sum(white[lag:] * white[:-lag]) > 0.2 * np.sum(white**2):
+    while lag < m // 50 and np.sum(white[lag:] * white[:-lag]) > 0.2 * np.sum(white**2):
         lag += 1
-    return picked[::lag]
+    return picked.at(slice(None, None, lag))

@@ -16,7 +16,7 @@ determines it within a factor of 1.5 at best.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -26,7 +26,7 @@ import numpy as np
 from strapdown import setup, units
 from strapdown.checks import Array, InputError, count, one_of
 from strapdown.estimation.states import State
-from strapdown.records import ImuRecord
+from strapdown.records import Estimate, ImuRecord
 from strapdown.setup import FilterSetup
 from strapdown.setup.states import VELOCITY, Entries, SensorStates, States
 from strapdown.tuning import parameters
@@ -211,23 +211,38 @@ class ExtendedLikelihood:
     def _runs(self, points: Array) -> list[list[tuple[Array, Array, np.ndarray, np.ndarray]]]:
         """Return innovations, their variances, and the parts and measurements they belong to, of every point and record."""
         setups = [self.setup(point) for point in points]
-        jobs = [(chosen, case) for chosen in setups for case in self.cases]
-        if self.threads == 1:
-            found = [self._run(*job) for job in jobs]
-        else:
-            with ThreadPoolExecutor(self.threads) as pool:
-                found = list(pool.map(lambda job: self._run(*job), jobs))
+        found = self.each(lambda job: self._run(*job), [(chosen, case) for chosen in setups for case in self.cases])
         return [found[k : k + len(self.cases)] for k in range(0, len(found), len(self.cases))]
 
-    def _run(self, chosen: FilterSetup, case: Case) -> tuple[Array, Array, np.ndarray, np.ndarray]:
+    def each(self, work: Callable[[Any], Any], jobs: Sequence[Any]) -> list[Any]:
+        """Return ``work`` of every job, spread over the threads."""
+        if self.threads == 1:
+            return [work(job) for job in jobs]
+        with ThreadPoolExecutor(self.threads) as pool:
+            return list(pool.map(work, jobs))
+
+    def estimates(self, number: int, points: Array, epochs: np.ndarray) -> tuple[Array, Array, Array]:
+        """Return q_fb (m, k, 4), bias (m, k, 3) and P (m, k, 6, 6) on record ``number`` at edges (m,), at points (k, p).
+
+        The filter is that of the setup, with its gate and robust weights.
+        """
+        found = [self._estimate(self.setup(point), self.cases[number], full_covariance=True) for point in points]
+        rows = [(one.attitude[epochs], one.bias[epochs], one.covariance[epochs]) for one in found]  # type: ignore[index]
+        attitude, bias, P = (np.stack(parts, axis=1) for parts in zip(*rows, strict=True))
+        return attitude, bias, P
+
+    def _estimate(self, chosen: FilterSetup, case: Case, **options: Any) -> Estimate:
         own = [series.sensor for series in case.record.vectors]
         used = replace(chosen, sigma={name: value for name, value in chosen.sigma.items() if name in own})
-        # The filter of optional states has the innovations of measurements whose noise differs by axis, with none too.
-        used = replace(used, states=States() if used.states is None else used.states)
         initial = case.initial
         if {INITIAL_ATTITUDE, INITIAL_BIAS} & set(self.names):
             initial = setup.initial_state(used, case.initial.attitude, case.initial.bias)
-        estimate = setup.run(case.record, used, initial, every=_rows_away(case, used), gate=None, robust=None)
+        return setup.run(case.record, used, initial, **options)
+
+    def _run(self, chosen: FilterSetup, case: Case) -> tuple[Array, Array, np.ndarray, np.ndarray]:
+        # The filter of optional states has the innovations of measurements whose noise differs by axis, with none too.
+        used = replace(chosen, states=States() if chosen.states is None else chosen.states)
+        estimate = self._estimate(used, case, every=_rows_away(case, used), gate=None, robust=None)
         first, last = max(case.first, case.record.time[0]), min(case.last, case.record.time[-1])
         errors, variances, places, numbers, seen = [], [], [], [], 0
         for one in estimate.innovations.values():
@@ -265,10 +280,6 @@ def likelihood(
         raise InputError("there is no record to tune on; give one")
     records = [case.record for case in cases]
     _check_axes(free, records)
-    if chosen.states is None and not any(parameters.axis_of(name) for name in free):
-        raise InputError(
-            "the setup has no optional states; give it some (setup.matched(…, states=True)), or use tuning.likelihood"
-        )
     own = () if chosen.states is None else state_names(chosen.states)
     plain = [name for name in parameters.known_names(records) if name != SCALE] + list(parameters.axis_names(records))
     if not free:

@@ -7,10 +7,10 @@ parabola does not: that zero may be as likely as the best value. Then only a bou
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -35,10 +35,10 @@ MIN_INFORMATION = 1e-10
 """Least information on a log parameter; below it there is none."""
 NEGLIGIBLE = 1e-3
 """A gain of the log likelihood that is not distinguishable from none."""
-
-
 MISFIT = 1.6
 """Sandwich error over that of the information beyond which the innovations are not what the filter takes them for."""
+
+T = TypeVar("T")
 
 
 class Objective(Protocol):
@@ -338,75 +338,98 @@ def fit(
     report = progress or (lambda done: None)
     points = np.clip(random_starts(objective.start, starts, factor, np.random.default_rng(seed)), *limits_of(objective))
 
-    def one(point: Array) -> Optimum:
-        result = search(objective, point, known)
-        report(1)
-        return result
-
     with ThreadPoolExecutor(threads) as pool:
-        optima = list(pool.map(one, points))
+        optima = list(_reported(report, pool.map(lambda point: search(objective, point, known), points)))
     best = min(optima, key=lambda optimum: optimum.local.value)
     if not best.converged:
         raise InputError(
             "the search did not settle in 200 steps; free fewer parameters, or give priors for those that the record does not determine"
         )
-    covariance, robust = covariances(_curved(objective, best))
-    curvature, sandwich = np.sqrt(np.diag(covariance)), np.sqrt(np.diag(robust))
-    misfit = bool(np.any(sandwich > MISFIT * curvature))
-    # A likelihood whose curvature promises too much falls too fast by the square of that.
-    swollen = (
-        np.maximum(sandwich / curvature, 0.0 if objective.composite else 1.0)
-        if misfit or objective.composite
-        else np.ones(len(best.point))
-    )
-    error = swollen * curvature
+    errors = _errors(objective, best)
 
     def interval(j: int) -> _Known:
-        loose = not error[j] < WELL_KNOWN
-        result = (
-            _profiled(objective, best, j, known, float(error[j]), float(swollen[j]) ** 2)
-            if loose and intervals
-            else _wald(best, j, float(error[j]))
-        )
-        report(1)
-        return result
+        if intervals and not errors.standard[j] < WELL_KNOWN:
+            return _profiled(objective, best, j, known, float(errors.standard[j]), float(errors.swollen[j]) ** 2)
+        return _wald(best, j, float(errors.standard[j]))
 
     with ThreadPoolExecutor(threads) as pool:
-        ranges = list(pool.map(interval, range(len(points[0]))))
+        ranges = list(_reported(report, pool.map(interval, range(len(points[0])))))
     point = best.point.copy()
     loose = [j for j in range(len(ranges)) if not ranges[j].identified]
     if loose:
         point[loose] = np.log([ranges[j].mean for j in loose])
         point = search(objective, point, known, fixed=loose).point
-    estimated = tuple(
-        Estimated(
-            name=name,
-            start=float(np.exp(objective.start[j])),
-            value=float(np.exp(point[j])),
-            most_likely=float(np.exp(best.point[j])) if _above_nothing(best, j) else 0.0,
-            lower=ranges[j].lower,
-            upper=ranges[j].upper,
-            standard_error=float(error[j]),
-            identified=ranges[j].identified,
-            note=_note(
-                name, ranges[j], float(error[j]), best.local, j, known, doubtful=misfit and not objective.composite
-            ),
-        )
-        for j, name in enumerate(objective.names)
-    )
     return Tuning(
-        parameters=estimated,
+        parameters=tuple(
+            _estimated(objective, best, known, errors, j, one, float(np.exp(point[j]))) for j, one in enumerate(ranges)
+        ),
         setup=objective.setup(point),
         point=point,
         before=local_at(objective, objective.start, known).value,
         after=best.local.value,
-        covariance=covariance,
-        misfit=misfit and not objective.composite,
+        covariance=errors.covariance,
+        misfit=errors.misfit and not objective.composite,
         composite=objective.composite,
         starts=points,
         optima=np.array([optimum.point for optimum in optima]),
         optima_values=np.array([optimum.local.value for optimum in optima]),
         agreeing=sum(1 for optimum in optima if optimum.local.value < best.local.value + NEGLIGIBLE),
+    )
+
+
+def _reported(report: Callable[[int], None], results: Iterable[T]) -> Iterator[T]:
+    """Yield the results, each reported when it is there."""
+    for result in results:
+        report(1)
+        yield result
+
+
+class _Errors(NamedTuple):
+    """How well the best point is known."""
+
+    covariance: Array
+    """Covariance of the logarithms by the information (p, p)."""
+    standard: Array
+    """Standard errors of the logarithms (p,)."""
+    swollen: Array
+    """Standard errors over those by the information (p,)."""
+    misfit: bool
+
+
+def _errors(objective: Objective, best: Optimum) -> _Errors:
+    """Return the errors of the best point: by the information, or by the sandwich where the objective is not the innovations' own."""
+    covariance, robust = covariances(_curved(objective, best))
+    curvature, sandwich = np.sqrt(np.diag(covariance)), np.sqrt(np.diag(robust))
+    misfit = bool(np.any(sandwich > MISFIT * curvature))
+    # A likelihood whose curvature promises too much falls too fast by the square of that.
+    swollen = np.ones(len(best.point))
+    if misfit or objective.composite:
+        swollen = np.maximum(sandwich / curvature, 0.0 if objective.composite else 1.0)
+    return _Errors(covariance, swollen * curvature, swollen, misfit)
+
+
+def _estimated(
+    objective: Objective,
+    best: Optimum,
+    priors: Mapping[str, Prior],
+    errors: _Errors,
+    j: int,
+    found: _Known,
+    value: float,
+) -> Estimated:
+    """Return parameter j with its interval."""
+    name, error = objective.names[j], float(errors.standard[j])
+    doubtful = errors.misfit and not objective.composite
+    return Estimated(
+        name=name,
+        start=float(np.exp(objective.start[j])),
+        value=value,
+        most_likely=float(np.exp(best.point[j])) if _above_nothing(best, j) else 0.0,
+        lower=found.lower,
+        upper=found.upper,
+        standard_error=error,
+        identified=found.identified,
+        note=_note(name, found, error, best.local, j, priors, doubtful=doubtful),
     )
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from strapdown import setup
 from strapdown.checks import Array, InputError, count
 from strapdown.estimation.schedule import Schedule, schedule
-from strapdown.estimation.states import State, pack
+from strapdown.estimation.states import State, covariance_matrices, pack
 from strapdown.kernels import likelihood as kernel
 from strapdown.kernels import likelihood_outliers
 from strapdown.kernels.lane_values import WIDTH
@@ -101,12 +101,6 @@ class Prepared:
     used: np.ndarray
     """Which parts count (parts,), bool."""
     sensors: tuple[str, ...]
-    true_attitude: Array | None
-    """(edges, 4)"""
-    true_bias: Array | None
-    """(edges, 3)"""
-    judged: np.ndarray
-    """Edges where the truth is known and counts for tuning (edges,), bool."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -190,9 +184,11 @@ class Likelihood:
         used = case.used
         return found["minus_log"][used, 0], found["score"][used], *(part[used].sum(axis=0) for part in whole)
 
-    def states(self, number: int, points: Array, epochs: np.ndarray) -> Array:
-        """Return the filter's states (epochs, 28, k) on record ``number`` at edges ``epochs``, at up to eight points (k, p)."""
-        return self._pass(self.prepared[number], points, epochs=epochs)["states"][:, :, : len(points)]
+    def estimates(self, number: int, points: Array, epochs: np.ndarray) -> tuple[Array, Array, Array]:
+        """Return q_fb (m, k, 4), bias (m, k, 3) and P (m, k, 6, 6) on record ``number`` at edges (m,), at up to eight points (k, p)."""
+        found = self._pass(self.prepared[number], points, epochs=epochs)["states"][:, :, : len(points)]
+        states = np.moveaxis(found, 1, 2)
+        return states[..., :4], states[..., 4:7], covariance_matrices(states[..., 7:])
 
     def innovations(self, number: int, points: Array) -> tuple[Array, Array]:
         """Return innovations and variances (events, 3, k) of record ``number`` at up to eight points (k, p), rows a measurement lacks 0."""
@@ -397,21 +393,7 @@ def _prepare(case: Case, chosen: FilterSetup, names: tuple[str, ...], parts: int
     covariance = case.initial.covariance
     if {INITIAL_ATTITUDE, INITIAL_BIAS} & set(names):
         covariance = np.diag(np.repeat([chosen.attitude_sigma**2, chosen.bias_sigma**2], 3))
-    attitude, bias = case.true_attitude, None
-    every = chosen.integration.samples
-    if record.truth is not None:
-        attitude, bias = record.truth.attitude, record.truth.bias
-    elif attitude is not None:
-        attitude = attitude[::every][: len(record.time)]
-    judged = (record.time >= first) & (record.time <= last)
-    if case.judged is not None:
-        judged &= case.judged[::every][: len(record.time)]
-    if attitude is not None:
-        judged &= np.isfinite(attitude).all(axis=1)
     return Prepared(
-        true_attitude=attitude,
-        true_bias=bias,
-        judged=judged,
         time=record.time,
         increments=np.ascontiguousarray(record.increments),
         events=events,

@@ -51,8 +51,9 @@ def objective_for(
     """Return the objective of a tuning, for :func:`fit`: by default the likelihood of the innovations.
 
     With error states, or with a σ of one axis in ``names``, it is that of :mod:`strapdown.tuning.extended`; ``truth`` that of the errors
-    against the truth, ``rmse`` the RMS attitude error, ``gate`` one that models outliers too. ``spacing`` is the least time between the
-    samples of a sensor that are used, s.
+    against the truth, of the filter as it runs, its gate included; ``rmse`` the RMS attitude error. Innovations are those of the filter
+    without its gate, because what passes one is the likelier the narrower it is; ``gate`` models outliers. ``spacing`` is the least time
+    between the samples of a sensor that are used, s.
     """
     non_negative("spacing", spacing, unit="s")
     if rmse and truth:
@@ -69,11 +70,11 @@ def objective_for(
         (setup.states is None, "a filter with optional states"),
         (not by_axis, "a sigma of one axis"),
     ):
-        if not whole and (gate or other or spacing > 0.0):
+        if not whole and (gate or rmse or spacing > 0.0):
             raise InputError(
-                f"{what} is tuned by the likelihood of all innovations: leave gate, truth, rmse and spacing out"
+                f"{what} is tuned by the likelihood of all innovations, or of the errors (truth): leave gate, rmse and spacing out"
             )
-    if setup.states is not None or by_axis:
+    if not other and (setup.states is not None or by_axis):
         return extended.likelihood(cases, setup, names, threads=threads)
     if gate:
         return contaminated_likelihood(cases, setup, names)

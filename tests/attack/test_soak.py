@@ -15,7 +15,7 @@ CHUNK = 100_000
 def passes(request) -> int:
     steps = request.config.getoption("--soak")
     if not steps:
-        pytest.skip("hours; run it with --soak STEPS")
+        pytest.skip("minutes; run it with --soak STEPS")
     return steps
 
 

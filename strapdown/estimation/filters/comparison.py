@@ -11,11 +11,12 @@ import numpy as np
 from strapdown import quaternion
 from strapdown.checks import Array
 from strapdown.records import Estimate, Truth
+from strapdown.results import Listed, Listing, figure
 from strapdown.units import DEGREE, DEGREE_PER_HOUR
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Comparison:
+class Comparison(Listed):
     """Estimates of one record by several filters. Printed, it is a table.
 
     The numbers are of the second half of the record, when filters that find their way have found it: root mean squares over time and axes.
@@ -57,38 +58,34 @@ class Comparison:
                 result[name]["bias_over_bound"] = _root_mean_square(((bias - estimate.bias) / least[:, 3:])[late])
         return result
 
-    def __str__(self) -> str:
-        """Return the table: errors beside the filter's own σ, which should agree."""
+    def listing(self) -> Listing:
+        """Return errors beside the filter's own σ, which should agree, as a table."""
         against = "error" if self.truth is not None else f"from {next(iter(self.estimates))}"
-        head = f"{'filter':16s} {'attitude, °: ' + against:>25s} {'σ':>9s} {'bias, °/h: ' + against:>25s} {'σ':>9s} {'NIS':>9s}"
-        lines = [head if self.bound is None else f"{head}   error/√bound"]
-        degrees = 0.0
-        for name, row in self.summary().items():
-            degrees = max(degrees, row["degrees"])
-            errors = f"{row['attitude_error'] / DEGREE:.4g}", f"{row['bias_error'] / DEGREE_PER_HOUR:.4g}"
-            if self.truth is None and len(lines) == 1:  # from itself
-                errors = "-", "-"
-            lines.append(
-                f"{name:16s} {errors[0]:>25s} {row['attitude_sigma'] / DEGREE:9.4g} "
-                f"{errors[1]:>25s} {row['bias_sigma'] / DEGREE_PER_HOUR:9.4g} {row['nis']:9.4g}"
-                + (
-                    f"   {row['attitude_over_bound']:.3f} {row['bias_over_bound']:.3f}"
-                    if "bias_over_bound" in row
-                    else ""
-                )
-            )
-        lines.append(
+        found = self.summary()
+        rows: list[tuple[str, ...]] = []
+        for name, row in found.items():
+            itself = self.truth is None and not rows  # its difference from itself
+            bias, bias_sigma = row["bias_error"] / DEGREE_PER_HOUR, row["bias_sigma"] / DEGREE_PER_HOUR
+            angle = "-" if itself else figure(row["attitude_error"] / DEGREE)
+            numbers = (row["attitude_sigma"] / DEGREE, math.nan if itself else bias, bias_sigma, row["nis"])
+            over = [figure(row[key], 3) for key in ("attitude_over_bound", "bias_over_bound") if key in row]
+            rows.append((name, angle, *map(figure, numbers), *over))
+        bounded = self.bound is not None
+        notes = [
             f"RMS over time and axes of the second half{'' if self.truth is None else '; error and σ should agree'}."
+        ]
+        if bounded:
+            notes.append(
+                "error/√bound: error over the root of the Cramér–Rao bound, about 1 over many runs of the best filter."
+            )
+        if degrees := max(row["degrees"] for row in found.values()):
+            notes.append(
+                f"NIS per degree of freedom: 1 ± {2.0 * math.sqrt(2.0 / degrees):.3f} for a consistent filter."
+            )
+        columns = ("filter", f"attitude {against}, °", "σ", f"bias {against}, °/h", "σ", "NIS")
+        return Listing(
+            "Filters over one record", (*columns, *(("error/√bound", "bias") if bounded else ())), rows, notes
         )
-        if self.bound is not None:
-            lines.append(
-                "error/√bound: of attitude and bias, over the root of the Cramér–Rao bound; about 1 over many runs, of the best."
-            )
-        if degrees:
-            lines.append(
-                f"NIS a degree of freedom: {1.0:.3f} ± {2.0 * math.sqrt(2.0 / degrees):.3f} of a right filter."
-            )
-        return "\n".join(lines)
 
 
 def _root_mean_square(values: Array) -> float:

@@ -1,4 +1,6 @@
-"""Gate, weights and iterated update of the step-by-step filter, in matrices over any number of states.
+"""The step-by-step filter with gate, recovery, robust weights and monitor: what the compiled filter's are compared with.
+
+In matrices over any number of states.
 
 - :func:`linearize`: the measurement linearised at the estimate that its update leads to (iterated update), its NIS, and its robust weight.
 - :class:`Supervision`: the gate's counters, the restart candidate that it runs beside the filter, and the NIS that a monitor judges.
@@ -9,23 +11,42 @@ Methods, thresholds and their reasons are those of the kernels: :mod:`strapdown.
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Generic, NamedTuple, Protocol, Self, TypeVar, overload
+from functools import partial
+from typing import Any, NamedTuple
 
+import filterpy.kalman
 import numpy as np
 
-from strapdown import quaternion
-from strapdown.checks import Array
-from strapdown.estimation.forward import gate_events, remembered
+from strapdown import kinematics, quaternion
+from strapdown.checks import Array, InputError
+from strapdown.estimation import model as modelling
+from strapdown.estimation.forward import gate_events, remembered, restart_states
 from strapdown.estimation.gating import Gate, Monitor, Robust
 from strapdown.estimation.model import turning_matrix
-from strapdown.estimation.states import GateMemory
-from strapdown.kernels import gate_rules, iterated_update
-from strapdown.kernels.iterated_update import ONE_AXIS, RELINEARIZED, SETTLED, TURN_ASIDE, UNKNOWN, UNKNOWN_TILT
+from strapdown.estimation.schedule import KIND_CODES
+from strapdown.estimation.states import GateMemory, State, check_arguments, restart_bias_variance
+from strapdown.estimation.step_filter import NO_LEVER, StepFilter
+from strapdown.kernels import error_state_step, gate_rules, iterated_update
+from strapdown.kernels.algebra import cross, dot
+from strapdown.kernels.gate_rules import WIDE_PASSES
+from strapdown.kernels.iterated_update import (
+    ACCEPTED,
+    KNOWN,
+    ONE_AXIS,
+    PASSED_OVER,
+    REFUSED,
+    RELINEARIZED,
+    SETTLED,
+    TURN_ASIDE,
+    UNKNOWN,
+    UNKNOWN_TILT,
+)
+from strapdown.kernels.rotation import rotation_matrix
 from strapdown.records import Event
+from strapdown.vectors import KINDS
 
 # ------------------------------------------------------------------------------------------------------ one measurement, linearised
 
@@ -212,63 +233,28 @@ def tilt_unknown(attitude: Array, covariance: Array) -> bool:
 # -------------------------------------------------------------------------------------------------------------- gate and monitor
 
 
-class Supervised(Protocol):
-    """A step-by-step filter as a gate and a monitor see it."""
-
-    time: float
-    attitude: Array
-    bias: Array
-    P: Array
-    nis: float
-    """NIS of the last measurement."""
-    dim_z: int
-    """Its degrees of freedom."""
-    _passes: int
-    """Most linearisations of an update."""
-
-    def _restarted(self, attitude_sigma: float, bias_width: float) -> Self:
-        """Return a restart candidate with this σ of the attitude, rad, and ``bias_width`` times what the gate adds to that of the bias."""
-
-    def _reset(self, correction: Array, P: Array, *, far: bool) -> None:
-        """Correct the state, and move P to its tangent space."""
-
-    def _become(self, other: Self) -> None:
-        """Take over the state of another filter."""
-
-
 class Events:
     """Descriptor of a filter's ``events``: recoveries, lock-outs and divergence so far, in order of time.
 
     Not a property: filterpy's ``Saver`` makes an array of every property, for which a growing tuple has no shape.
     """
 
-    @overload
-    def __get__(self, filter: None, owner: type) -> Self: ...
-
-    @overload
-    def __get__(self, filter: object, owner: type) -> tuple[Event, ...]: ...
-
-    def __get__(self, filter: Any, owner: type) -> Self | tuple[Event, ...]:
+    def __get__(self, filter: Any, owner: type) -> Any:
         """Return those of a filter."""
-        return self if filter is None else filter._supervision.events  # type: ignore[no-any-return]
+        return self if filter is None else filter._supervision.events
 
 
-Filter = TypeVar("Filter", bound=Supervised)
-
-
-class Supervision(Generic[Filter]):
+class Supervision:
     """A gate and a monitor beside a step-by-step filter: counters, restart candidate and the events reported so far."""
 
     def __init__(self, gate: Gate | None, memory: GateMemory | None, monitor: Monitor | None = None) -> None:
         self.gate = gate
         self.monitor = monitor
-        # Time, NIS and degrees of freedom of each measurement. Copies share the list and each knows how many entries are its own: a filter
-        # that has gone back to a copy overwrites what follows, and never returns to it.
         self.nis_history: list[tuple[float, float, int]] = []
-        self.number = 0
+        """Time, NIS and degrees of freedom of each measurement."""
         self.sensors: tuple[str, ...] = () if memory is None else tuple(memory.counters)
         self.memory, self.counters = remembered(gate, memory, self.sensors)
-        self.candidate: Filter | None = None
+        self.candidate: GatedStepFilter | None = None
         self.recoveries, self.lock_outs = np.empty((0, 4)), np.empty((0, 4))
 
     @property
@@ -285,12 +271,12 @@ class Supervision(Generic[Filter]):
     def events(self) -> tuple[Event, ...]:
         """Recoveries, lock-outs and divergence so far, in order of time."""
         found = gate_events(self.recoveries, self.lock_outs, self.sensors)
-        if self.monitor is not None and self.number:
-            time, nis, degrees = (np.array(column) for column in zip(*self.nis_history[: self.number], strict=True))
+        if self.monitor is not None and self.nis_history:
+            time, nis, degrees = (np.array(column) for column in zip(*self.nis_history, strict=True))
             found += self.monitor.watch(time, nis, degrees)
         return tuple(sorted(found, key=lambda event: event.start))
 
-    def judge(self, filter: Filter, sensor: str, outcome: int, update: Callable[[Filter], int]) -> None:
+    def judge(self, filter: Any, sensor: str, outcome: int, update: Callable[[Any], int]) -> None:
         """Count the outcome of a measurement for a filter; ``update`` gives the same measurement to the restart candidate."""
         if self.monitor is not None and outcome != iterated_update.PASSED_OVER:
             self._record_nis(filter, outcome)
@@ -322,21 +308,19 @@ class Supervision(Generic[Filter]):
             self.counters = np.vstack([self.counters, remembered(None, None, (sensor,))[1]])
         return self.sensors.index(sensor)
 
-    def _record_nis(self, filter: Filter, outcome: int) -> None:
+    def _record_nis(self, filter: Any, outcome: int) -> None:
         """Keep the NIS of the last measurement for the monitor; of a refused one the gate's threshold."""
         degrees, nis = filter.dim_z, filter.nis
         if self.gate is not None and outcome != iterated_update.ACCEPTED:
             nis = float(self.gate.thresholds[degrees - 1])
-        del self.nis_history[self.number :]
         self.nis_history.append((filter.time, nis, degrees))
-        self.number += 1
 
-    def _start_candidate(self, filter: Filter, gate: Gate) -> None:
+    def _start_candidate(self, filter: Any, gate: Gate) -> None:
         sigma = gate_rules.restart_attitude(gate.restart_attitude_sigma, self.memory)
         self.candidate = filter._restarted(sigma, gate_rules.restart_width(self.memory))
         gate_rules.reset_candidate(self.memory, filter.time, self.candidate.bias, np.diag(self.candidate.P)[3:6])
 
-    def _judge_candidate(self, candidate: Filter, sensor: int, outcome: int) -> None:
+    def _judge_candidate(self, candidate: Any, sensor: int, outcome: int) -> None:
         """Count the outcome of a measurement for the restart candidate, and drop or widen it."""
         verdict = gate_rules.judge_candidate(
             outcome, candidate.nis, candidate.dim_z, sensor, self.counters, self.memory, candidate.bias
@@ -346,7 +330,7 @@ class Supervision(Generic[Filter]):
         elif verdict == gate_rules.TOO_NARROW:
             self._widen(candidate)
 
-    def _widen(self, candidate: Filter) -> None:
+    def _widen(self, candidate: Any) -> None:
         """Make the candidate what it would be if its bias had started with a larger σ, where that start holds it back."""
         P = candidate.P.copy()
         if not gate_rules.may_widen(np.diag(P)[3:6], self.memory):
@@ -360,9 +344,182 @@ class Supervision(Generic[Filter]):
         candidate._reset(correction, P, far=True)
         gate_rules.count_widening(self.memory)
 
-    def copied(self) -> Self:
-        """Return it as it is now."""
-        other = copy.copy(self)
-        other.memory, other.counters, other.lock_outs = self.memory.copy(), self.counters.copy(), self.lock_outs.copy()
-        other.candidate = copy.deepcopy(self.candidate)
-        return other
+
+# ------------------------------------------------------------------------------------------------------------------- the filter
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Prior:
+    """Prior of the optional error states, from which a restart candidate starts."""
+
+    time: float
+    values: Array
+    covariance: Array
+
+
+def arc_of(measurement: Any, y: Array, basis: Array) -> tuple[float, float]:
+    """Return the angle θ between measured and predicted vector, rad, and θ over sin θ; 0 and 1 of other kinds."""
+    if measurement.kind not in ("direction", "vector"):
+        return 0.0, 1.0
+    along = y[2] + 1.0
+    if measurement.kind == "direction":
+        predicted = cross(tuple(basis[0].tolist()), tuple(basis[1].tolist()))
+        along = dot(predicted, measurement.z) / math.sqrt(dot(predicted, predicted))
+    sine = math.hypot(y[0], y[1])
+    angle = math.atan2(sine, along)
+    return angle, 1.0 if sine < 1e-9 else angle / sine
+
+
+class GatedStepFilter(StepFilter):
+    """:class:`strapdown.StepFilter` with a gate, robust weights and a monitor; ``weight`` is that of the last measurement."""
+
+    def __init__(self, process_noise, initial, error_states=(), *, gate=None, robust=None, monitor=None, **options):
+        check_arguments(gate=gate, robust=robust, monitor=monitor)
+        super().__init__(process_noise, initial, error_states, **options)
+        self.gate, self.robust = gate, robust
+        self.weight = 1.0
+        self.refused: dict[str, int] = {}
+        self._thresholds = np.full(3, np.inf) if gate is None else gate.thresholds
+        self._begin_gate(modelling.begin(initial, self.error_states), monitor)
+
+    events = Events()
+
+    def _begin_gate(self, state: State, monitor: Monitor | None) -> None:
+        """Set up gate and monitor; continue with the gate's memory and its restart candidate where the state has them."""
+        gate, memory = self.gate, state.gate
+        self._restart_bias_variance = restart_bias_variance(gate, state)
+        self._supervision: Supervision = Supervision(gate, memory, monitor)
+        self._passes = self._supervision.passes
+        values, P = restart_states(state, self.error_states)
+        self._restart_prior = _Prior(time=self.time, values=values, covariance=P)
+        if gate is None or memory is None:
+            return
+        if self.time < memory.start:
+            raise InputError(
+                f"time is {self.time:.9g} s, before the record of initial began, {memory.start:.9g} s; give the time of initial"
+            )
+        self._restart_prior = _Prior(time=memory.start, values=memory.values, covariance=memory.covariance)
+        one = memory.candidate
+        if one is not None and self._supervision.has_candidate:
+            bias, values = one.others[:3], one.others[3:]
+            self._supervision.candidate = self._candidate(
+                State(attitude=one.attitude, bias=bias, values=values, covariance=one.covariance, factor=one.factor)
+            )
+
+    def _predict(self, increment: Array, step: float, end: float) -> None:
+        """Propagate the filter, and a restart candidate beside it, in common sub-steps: as long as series and decaying states allow."""
+        candidate = self._supervision.candidate
+        running = [self] if candidate is None else [self, candidate]
+        left, limit = step, self._motion.limit
+        while left > 0.0:
+            turns = [(increment - left * one.bias).tolist() for one in running]
+            longest = float(min(error_state_step.longest_step(left, tuple(turn), limit) for turn in turns))
+            part = increment * (longest / left)
+            for one in running:
+                one._sub_step(part, longest)
+            increment, left = increment - part, left - longest if longest < left else 0.0
+        for one in running:
+            one.time = end
+
+    def _measure(self, measurement, sensor):
+        """Update with a measurement; count the outcome for the gate."""
+        self._need_known(sensor)
+        if self.error_states and self._kinds.setdefault(sensor, measurement.kind) != measurement.kind:
+            raise InputError(
+                f"{sensor or 'the sensor'} gave kind {self._kinds[sensor]!r} before, now {measurement.kind!r}; name each sensor"
+            )
+        has_direction = measurement.has_direction(self.attitude)
+        outcome = self._correct(measurement, sensor)
+        if not has_direction:
+            self._vertical[sensor] = self._vertical.get(sensor, 0) + 1
+        elif outcome != ACCEPTED:
+            self.refused[sensor] = self.refused.get(sensor, 0) + 1
+        self._supervision.judge(self, sensor, outcome, lambda candidate: candidate._correct(measurement, sensor))
+        return outcome == ACCEPTED
+
+    def _correct(self, measurement: Any, sensor: str) -> int:
+        """Update with a measurement; return ``ACCEPTED``, ``REFUSED`` or ``PASSED_OVER``."""
+        if not measurement.has_direction(self.attitude):
+            return PASSED_OVER
+        threshold = float(self._thresholds[KINDS[measurement.kind] - 1])
+        others = np.concatenate([self.bias, self.values])
+        rows = partial(self._rows_at, measurement, self._sensor_model(sensor, measurement.kind))
+        seen = linearize(rows, self.attitude, others, self.P, self._motion.chains, self._passes, threshold)
+        self.nis = seen.nis
+        self.dim_z = len(seen.rows.residual)
+        unknown = self._passes > 1 and measurement.kind == "heading" and tilt_unknown(self.attitude, self.P)
+        if unknown or not seen.acceptable(threshold):
+            self.weight = 0.0
+            self._show_refused(seen, measurement.length)
+            return PASSED_OVER if unknown else REFUSED
+        self.weight = 1.0 if self.robust is None else seen.weight(self.robust)
+        self._accept(seen, measurement.length)
+        return ACCEPTED
+
+    def _accept(self, seen: Linearization, unit: float) -> None:
+        """Correct the state by filterpy's update, from the state at which a measurement is linearised; its rows are in this unit."""
+        self.attitude, self.bias, self.values = seen.attitude, seen.others[:3], seen.others[3:]
+        self.P, self.x = seen.covariance, seen.prior
+        H, R = unit * seen.rows.H, seen.rows.noise * (unit**2 / self.weight)
+        filterpy.kalman.ExtendedKalmanFilter.update(
+            self, unit * seen.rows.residual, HJacobian=lambda x: H, Hx=lambda x: H @ x, R=R
+        )
+        correction, self.x = self.x, np.zeros(len(self.x))
+        self._reset(correction, self.P, far=self._passes > 1 and bool(np.trace(self.P[:3, :3]) > KNOWN))
+        self.P_post = self.P.copy()
+
+    def _reset(self, correction: Array, P: Array, *, far: bool) -> None:
+        """Correct the state, and move P to its tangent space; ``far`` where an attitude hardly known has turned by a large angle."""
+        before, turn = self.attitude, quaternion.exp(correction[:3])
+        self.attitude = quaternion.normalize(quaternion.multiply(before, turn))
+        self.bias, self.values = self.bias + correction[3:6], self.values + correction[6:]
+        if far:
+            P, _ = seen_from(turn, P)
+        else:
+            G = np.eye(len(P))
+            G[:3, :3] = kinematics.right_jacobian(correction[:3])
+            P = G @ P @ G.T
+        if len(self._motion.chains):
+            T = modelling.turning_matrix(self._motion.chains, len(P), before, self.attitude)
+            self.values, P = T[6:, 6:] @ self.values, T @ P @ T.T
+        self.P = P
+
+    def _show_refused(self, seen: Linearization, unit: float) -> None:
+        """Set what filterpy shows of an update to that of a refused measurement: its residual and covariance, and no gain."""
+        self.z, self.y = unit * seen.rows.residual, unit * seen.innovation
+        self.S = unit**2 * (seen.predicted + seen.rows.noise)
+        self.SI, self.K = np.linalg.inv(self.S), np.zeros((len(self.x), len(self.y)))
+        self._log_likelihood = self._likelihood = self._mahalanobis = None  # to be computed anew
+
+    def _rows_at(self, measurement: Any, model: Any, attitude: Array, others: Array) -> Rows:
+        """Return a measurement's rows at an attitude (4,) and (b, c) (3 + m,), by the kernels' own function."""
+        H, y, basis = np.empty((3, 3 + len(others))), np.empty(3), np.empty((3, 3))
+        q = tuple(attitude.tolist())
+        given = KIND_CODES[measurement.kind], measurement.z, measurement.frame, measurement.length
+        effects = 0, model.sensors, model.sensor_use, NO_LEVER
+        d = error_state_step.fill_rows(q, rotation_matrix(q), others, *given, *effects, H, y, basis)
+        angle, arc = arc_of(measurement, y, basis)
+        return Rows(y[:d].copy(), H[:d].copy(), (basis @ measurement.noise @ basis.T)[:d, :d], angle, arc)
+
+    def _restarted(self, attitude_sigma: float, bias_width: float) -> GatedStepFilter:
+        """Return a restart candidate: optional states at their prior, attitude and bias independent of it and as uncertain as given."""
+        prior, m = self._restart_prior, len(self.values)
+        values, Pc = modelling.aged_prior(self.error_states, prior.values, prior.covariance, self.time - prior.time)
+        P = np.zeros((6 + m, 6 + m))
+        P[:3, :3] = attitude_sigma**2 * np.eye(3)
+        P[3:6, 3:6] = self.P[3:6, 3:6] + bias_width**2 * np.diag(self._restart_bias_variance)
+        P[6:, 6:] = Pc
+        return self._candidate(State(attitude=self.attitude, bias=self.bias, values=values, covariance=P))
+
+    def _candidate(self, state: State) -> GatedStepFilter:
+        """Return a restart candidate in this state."""
+        candidate = GatedStepFilter(
+            self.process_noise, state, self.error_states, gate=self.gate, robust=self.robust, time=self.time
+        )
+        candidate._sensor_models = self._sensor_models
+        candidate._passes = WIDE_PASSES
+        return candidate
+
+    def _become(self, other: GatedStepFilter) -> None:
+        """Take over the state of a restart candidate."""
+        self.attitude, self.bias, self.values, self.P = other.attitude, other.bias, other.values, other.P

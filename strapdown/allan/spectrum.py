@@ -1,0 +1,137 @@
+"""Spectrum of a record by the cosine transform: exact variances of its coefficients under each noise, in bins of 5 %."""
+
+from __future__ import annotations
+
+import functools
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from strapdown.checks import Array, InputError
+
+BIN_GROWTH = 1.05
+
+
+LARGEST_EXACT = 1 << 16
+
+
+def bin_starts(last: int) -> NDArray[np.int64]:
+    """Return the first index of each bin of DCT coefficients 1 … last; each bin spans 5 % or one coefficient."""
+    starts = [1]
+    while (following := max(starts[-1] + 1, math.ceil(starts[-1] * BIN_GROWTH))) <= last:
+        starts.append(following)
+    return np.array(starts, dtype=np.int64)
+
+
+def bin_slices(starts: NDArray[np.int64], last: int) -> list[slice]:
+    """Return the coefficients of each bin."""
+    return [slice(int(a), int(b)) for a, b in zip(starts, [*starts[1:], last + 1], strict=True)]
+
+
+def mean_power(term: str, samples: int, dt: float, starts: NDArray[np.int64], last: int) -> Array:
+    """Return the mean over each bin of the expected squared DCT-II coefficient for a unit coefficient of ``term``."""
+    return np.array(
+        [
+            float(np.mean(expected_power(term, samples, dt, np.arange(s.start, s.stop))))
+            for s in bin_slices(starts, last)
+        ]
+    )
+
+
+def expected_power(term: str, samples: int, dt: float, j: NDArray[np.int64]) -> Array:
+    """Return the expected square of the orthonormal DCT-II coefficients j of averaged-rate samples, unit coefficient of ``term``.
+
+    With θ = πj/n: white rate is white. The difference of averaged random-walk samples has covariance dt (2/3, 1/6 at lag 1), which the
+    sine transform diagonalises as the cosine transform does for the samples. Quantised phase, differenced, is the same Laplacian plus
+    its two corners.
+    """
+    theta = np.pi * j / samples
+    laplacian = 4.0 * np.sin(0.5 * theta) ** 2
+    if term == "angle_random_walk":
+        return np.full(j.shape, 1.0 / dt)
+    if term == "rate_random_walk":
+        return np.asarray(dt * (2.0 / 3.0 + np.cos(theta) / 3.0) / laplacian)
+    if term == "quantization":
+        return np.asarray((laplacian + 4.0 / samples * np.cos(0.5 * theta) ** 2) / dt**2)
+    spectrum = samples / (np.pi * j)  # B²/(2π f dt) at f dt = j/2n
+    ratio = flicker_leakage(min(samples, LARGEST_EXACT))
+    known = (
+        len(ratio) if samples <= LARGEST_EXACT else len(ratio) // 8
+    )  # far from both ends the ratio depends on j alone, and tends to 1
+    return np.asarray(spectrum * np.where(j < known, ratio[np.minimum(j, known - 1)], 1.0))
+
+
+def flicker_covariance(count: int) -> Array:
+    """Return the generalised autocovariance −Cin(πk)/π of unit flicker samples band-limited at Nyquist, k = 0 … count − 1.
+
+    Flicker has infinite variance; the constant that is left out cancels in every combination of samples whose weights sum to zero.
+    """
+    from scipy.special import sici
+
+    x = np.pi * np.arange(1, count)
+    return np.concatenate([[0.0], -(np.euler_gamma + np.log(x) - sici(x)[1]) / np.pi])
+
+
+@functools.lru_cache(maxsize=8)
+def flicker_leakage(samples: int) -> Array:
+    """Return the expected squared DCT-II coefficients of flicker over its spectrum, by index j (entry 0 unused).
+
+    ``E c_j² = γ_0 + (2/n) Σ_h γ_h ((n − h) cos hθ − sin hθ / sin θ)``, θ = πj/n: the autocorrelation of a cosine row, summed.
+    """
+    from scipy.fft import rfft
+
+    lag = np.arange(samples)
+    covariance = flicker_covariance(samples)
+    j = np.arange(1, samples)
+    cosine_sum = rfft(covariance * (samples - lag), 2 * samples).real[1:samples]
+    sine_sum = -rfft(covariance, 2 * samples).imag[1:samples]
+    power = 2.0 / samples * (cosine_sum - sine_sum / np.sin(np.pi * j / samples))
+    return np.concatenate([[1.0], power * np.pi * j / samples])
+
+
+def ramp_coefficients(samples: int, j: NDArray[np.int64]) -> Array:
+    """Return the orthonormal DCT-II coefficients j ≥ 1 of the sequence 0, 1, 2, …: −√(2/n) cos(θ/2)/(2 sin² θ/2) for odd j, else 0."""
+    half = 0.5 * np.pi * j / samples
+    return np.asarray(np.where(j % 2 == 1, -math.sqrt(2.0 / samples) * np.cos(half) / (2.0 * np.sin(half) ** 2), 0.0))
+
+
+class Bins(NamedTuple):
+    """Sums over each bin: of squared coefficients less a first slope, their product with the ramp's, the ramp's squares."""
+
+    number: Array
+    square: Array
+    product: Array
+    ramp: Array
+    basis: Array
+    first_slope: float
+
+
+def cosine_transform(values: Array, scale: float) -> Array:
+    """Return the orthonormal DCT-II of values less their mean, times ``scale``."""
+    from scipy.fft import dct
+
+    coefficient = dct(values - values.mean(), type=2, norm="ortho", overwrite_x=True)
+    coefficient *= scale
+    return np.asarray(coefficient)
+
+
+def binned(
+    coefficient: Array, basis: Array, starts: NDArray[np.int64], *, axis: int, largest: float, dt: float, last: int
+) -> Bins:
+    """Return the sums over bins of coefficients 1 … last; ``largest`` is the record's largest size, against rounding."""
+    low = np.arange(1, min(last, 1 << 20) + 1)
+    ramp = dt * ramp_coefficients(len(coefficient), low)
+    slope = float(ramp @ coefficient[1 : len(low) + 1] / (ramp @ ramp))
+    sums = []
+    for s in bin_slices(starts, last):
+        ramp = dt * ramp_coefficients(len(coefficient), np.arange(s.start, s.stop))
+        rest = coefficient[s] - slope * ramp
+        sums.append((len(rest), rest @ rest, rest @ ramp, ramp @ ramp))
+    count, square, product, ramp_square = np.array(sums, dtype=float).T
+    if not np.any(square > (1e-13 * largest) ** 2 * count):
+        raise InputError(
+            f"values, axis {axis}, holds no noise (it is constant or a straight line); pass a recorded gyro"
+        )
+    return Bins(count, square, product, ramp_square, basis, slope)

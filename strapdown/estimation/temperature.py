@@ -1,0 +1,142 @@
+"""The gyro's bias driven by temperature: a record in stretches of nearly one temperature, between which the slopes change the bias.
+
+The state of a stretch has the bias at the stretch's mean temperature. At the next one it is ``b + c ΔT`` (:func:`shifted`, an exact linear
+step of mean and covariance, no kernel's matter). Within a stretch the slopes estimated at its start are applied to each sample, so that
+what is neglected is the slopes' error over 1/200 of the range of temperature, about its mean; and the σ is that at the mean.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from strapdown.checks import Array, InputError
+from strapdown.estimation.error_states import ErrorStates, GyroTemperature
+from strapdown.estimation.states import State
+from strapdown.records import Estimate, ImuRecord, Innovations
+
+LEVELS = 200
+"""Stretches over the range of temperature, at the least."""
+BLOCKS = 1000
+"""Parts of the record whose means show the temperature, at the most: a noisy thermometer makes as many stretches."""
+
+
+def slopes(error_states: Sequence[ErrorStates]) -> slice | None:
+    """Return where the slopes stand among the error states; None where there are none."""
+    first = 0
+    for one in error_states:
+        if isinstance(one, GyroTemperature):
+            return slice(first, first + one.size)
+        first += one.size
+    return None
+
+
+def need_none(error_states: Sequence[ErrorStates], what: str) -> None:
+    """Refuse slopes where nothing drives them."""
+    if slopes(error_states) is not None:
+        raise InputError(f"{what} has no bias driven by temperature; leave that state out")
+
+
+def of(record: ImuRecord) -> Array:
+    """Return the temperature of a record (n + 1,), °C."""
+    if record.temperature is None:
+        raise InputError(
+            "the record has no temperature, which drives the gyro's bias; give it, or leave that state out"
+        )
+    return record.temperature
+
+
+def stretches(record: ImuRecord, every: int) -> Iterator[tuple[int, int, float]]:
+    """Yield first and last edge and mean temperature, °C, of stretches of whole numbers of ``every`` intervals."""
+    T = of(record)
+    middle, dt = 0.5 * (T[1:] + T[:-1]), np.diff(record.time)
+    starts = np.arange(0, len(dt), every * max(1, -(-len(dt) // (BLOCKS * every))))
+    mean = np.add.reduceat(middle * dt, starts) / np.add.reduceat(dt, starts)
+    step = np.ptp(mean) / LEVELS
+    bounds, level = [0], mean[0]
+    for start, value in zip(starts[1:].tolist(), mean[1:], strict=True):
+        if abs(value - level) > step:
+            bounds.append(start)
+            level = value
+    for first, last in itertools.pairwise([*bounds, len(dt)]):
+        yield first, last, float(np.average(middle[first:last], weights=dt[first:last]))
+
+
+def shifted(state: State, own: slice, change: float) -> State:
+    """Return a state, and the restart candidate of its gate, after a change of temperature, K: ``b + c ΔT``."""
+    columns = slice(6 + own.start, 6 + own.stop)
+    J = np.eye(6 + len(state.values))
+    J[3:6, columns] = change * np.eye(3)
+
+    def turned(P: Array, root: Array | None) -> dict[str, Any]:
+        if root is None:
+            return {"covariance": J @ P @ J.T}
+        return {"covariance": (root @ J.T).T @ (root @ J.T), "factor": root @ J.T}
+
+    memory = state.gate
+    if memory is not None and memory.candidate is not None:
+        one = memory.candidate
+        others = J[3:, 3:] @ one.others
+        memory = replace(memory, candidate=replace(one, others=others, **turned(one.covariance, one.factor)))
+    bias = state.bias + change * state.values[own]
+    return replace(state, bias=bias, gate=memory, **turned(state.covariance, state.factor))
+
+
+def at_mean(record: ImuRecord, mean: float, slope: Array) -> tuple[ImuRecord, Array]:
+    """Return a stretch with the increments that it would have at its mean temperature, and the temperature's differences (n + 1,), K."""
+    off = of(record) - mean
+    turns = 0.5 * ((off[1:] + off[:-1]) * np.diff(record.time))[:, None] * slope
+    return replace(record, increments=record.increments - turns), off
+
+
+def at_edges(estimate: Estimate, own: slice, off: Array) -> Estimate:
+    """Return an estimate of a stretch with the bias at the temperatures of its edges, ``off`` K from the mean."""
+    values = np.concatenate([one.values for one in estimate.error_states.values()], axis=1)[:, own]
+    change = values * off[:, None]
+    whole = None if estimate.whole_bias is None else estimate.whole_bias + change
+    return replace(estimate, bias=estimate.bias + change, whole_bias=whole)
+
+
+def joined(parts: Sequence[Estimate]) -> Estimate:
+    """Return the estimates of successive parts of a record as one; at an edge between two stands the first part's."""
+    if len(parts) == 1:
+        return parts[0]
+
+    def rows(*values: Array | None) -> Any:
+        return (
+            None if values[0] is None else np.concatenate([v[k > 0 :] for k, v in enumerate(values) if v is not None])
+        )
+
+    names = ["time", "attitude", "bias", "variance", "covariance"]
+    names += ["whole_covariance", "whole_bias", "whole_bias_variance", "whole_bias_covariance"]
+    innovations = {}
+    for sensor in dict.fromkeys(name for part in parts for name in part.innovations):
+        own = [part.innovations[sensor] for part in parts if sensor in part.innovations]
+        weights = [one.weight for one in own if one.weight is not None]
+        innovations[sensor] = Innovations(
+            time=np.concatenate([one.time for one in own]),
+            innovation=np.concatenate([one.innovation for one in own]),
+            variance=np.concatenate([one.variance for one in own]),
+            weight=np.concatenate(weights) if len(weights) == len(own) else None,
+        )
+    blocks = {
+        name: replace(
+            block,
+            values=rows(*(part.error_states[name].values for part in parts)),
+            variance=rows(*(part.error_states[name].variance for part in parts)),
+        )
+        for name, block in parts[0].error_states.items()
+    }
+    # A lock-out that goes on is reported by each part, by the last as a whole.
+    events = {(event.kind, event.sensor, event.start): event for part in parts for event in part.events}
+    return replace(
+        parts[0],
+        innovations=innovations,
+        events=tuple(events.values()),
+        error_states=blocks,
+        **{name: rows(*(getattr(part, name) for part in parts)) for name in names},
+    )

@@ -1,0 +1,115 @@
+"""Bias of a gyro over temperature: the polynomial that ``strapdown allan --temperature`` identifies, which simulator and filter read."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from strapdown.checks import Array, InputError, array, finite, known_keys
+from strapdown.files import tables
+from strapdown.results import ByValue
+
+STEM = "rad_per_s"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BiasOverTemperature(ByValue):
+    """Bias of each axis over temperature, ``Σ c_k (T − T_0)^k``.
+
+    Parameters
+    ----------
+    reference : float
+        T_0, °C.
+    span : (float, float)
+        Lowest and highest temperature that it holds for, °C; beyond them it is that of the end.
+    coefficients : ndarray (order + 1, 3)
+        c, rad/s/K^k.
+    sigma : ndarray (order + 1, 3)
+        Standard deviations of them; 0 of c_0, which the filter estimates.
+    """
+
+    reference: float
+    span: tuple[float, float]
+    coefficients: Array
+    sigma: Array
+
+    def powers(self, temperature: ArrayLike) -> Array:
+        """Return ``(T − T_0)^k`` (..., order + 1) at temperatures (...), °C, within the span."""
+        T = np.clip(np.asarray(temperature, np.float64), *self.span) - self.reference
+        return np.asarray(T[..., None] ** np.arange(len(self.coefficients)))
+
+    def bias(self, temperature: ArrayLike) -> Array:
+        """Return the bias (..., 3), rad/s, at temperatures (...), °C."""
+        return np.asarray(self.powers(temperature) @ self.coefficients)
+
+    @property
+    def slope_sigma(self) -> Array:
+        """Largest σ of the slope dbias/dT within the span (3,), rad/s/K, the coefficients' errors taken for independent."""
+        reach = max(abs(end - self.reference) for end in self.span)
+        k = np.arange(1, len(self.sigma))
+        return np.asarray(np.sqrt((k * reach ** (k - 1)) ** 2 @ self.sigma[1:] ** 2))
+
+    def walk(self, temperature: ArrayLike, time: ArrayLike) -> float:
+        """Return the rate random walk, rad/s/√s, that covers the error of the polynomial.
+
+        The error follows the temperature: the walk's variance is at every stamp at least that of its change since the first one.
+        """
+        powers = self.powers(temperature)
+        changed = np.max((powers - powers[0]) ** 2 @ self.sigma**2, axis=1)
+        elapsed = np.asarray(time) - np.asarray(time)[0]
+        return float(np.sqrt(np.max(changed[1:] / elapsed[1:], initial=0.0)))
+
+
+def to_table(warm: BiasOverTemperature, stem: str = STEM) -> dict[str, Any]:
+    """Return the polynomial as a table for TOML; ``stem`` is the unit of the bias in its keys."""
+    table = {"reference_degc": warm.reference, "lowest_degc": warm.span[0], "highest_degc": warm.span[1]}
+    keys = _keys(stem, len(warm.coefficients))
+    return (
+        table
+        | {f"bias_{key}": row.tolist() for key, row in zip(keys, warm.coefficients, strict=True)}
+        | {f"sigma_{key}": row.tolist() for key, row in zip(keys[1:], warm.sigma[1:], strict=True)}
+    )
+
+
+def from_table(table: Any, place: str = "temperature") -> BiasOverTemperature:
+    """Return the polynomial in a table such as :func:`to_table` gives."""
+    if not isinstance(table, Mapping):
+        raise InputError(f"{place} is {table!r}; it must be a table, as `strapdown allan --temperature` writes it")
+    keys = [key for key in _keys(STEM, len(table)) if key == STEM or f"bias_{key}" in table]
+    limits = ("reference_degc", "lowest_degc", "highest_degc")
+    needed = [*limits, *(f"bias_{key}" for key in keys), *(f"sigma_{key}" for key in keys[1:])]
+    known_keys(place, table, needed)
+    missing = [key for key in needed if key not in table]
+    if missing:
+        raise InputError(f"{place} lacks {', '.join(missing)}")
+    reference, lowest, highest = (finite(f"{place}: {key}", table[key]) for key in limits)
+    if not lowest <= reference <= highest:
+        raise InputError(f"{place}: reference_degc is {reference:g}, outside lowest_degc to highest_degc")
+    rows = {key: array(f"{place}: {key}", table[key], (3,)) for key in needed[3:]}
+    sigma = [rows[f"sigma_{key}"] for key in keys[1:]]
+    return BiasOverTemperature(
+        reference=reference,
+        span=(lowest, highest),
+        coefficients=np.array([rows[f"bias_{key}"] for key in keys]),
+        sigma=np.array([np.zeros(3), *sigma]),
+    )
+
+
+def _keys(stem: str, number: int) -> list[str]:
+    return [stem, f"{stem}_per_k", *(f"{stem}_per_k{k}" for k in range(2, number))][:number]
+
+
+def read(path: str | os.PathLike[str]) -> BiasOverTemperature:
+    """Read the table ``[gyro.temperature]`` of a TOML file such as ``gyro-temperature.toml``."""
+
+    def found(table: Mapping[str, Any], place: str) -> BiasOverTemperature:
+        if "temperature" not in table:
+            raise InputError(f"{place} has no table [gyro.temperature]; `strapdown allan --temperature` writes one")
+        return from_table(table["temperature"], f"{place}: temperature")
+
+    return tables.read(path, "gyro", "`strapdown allan --temperature` writes one", found)  # type: ignore[no-any-return]

@@ -1,0 +1,319 @@
+"""The gyro's bias over temperature in simulator, files and filter: closed forms, a linear filter as oracle, consistency over runs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+import strapdown as sd
+from strapdown import consistency, estimation, montecarlo, records, scenarios, setup
+from strapdown.checks import InputError
+from strapdown.estimation import error_states
+from strapdown.estimation import temperature as driven
+from strapdown.estimation.gating import Gate
+from strapdown.estimation.states import Candidate, GateMemory
+from strapdown.gyro.temperature import from_table, to_table
+from strapdown.montecarlo import lanes
+from strapdown.recordings import formats, recordfiles
+from strapdown.setup.for_record import drawn_start
+from strapdown.units import DEGREE_PER_HOUR, DEGREE_PER_ROOT_HOUR
+from strapdown.vectors import VectorMeasurements
+
+SLOPE = 20.0 * DEGREE_PER_HOUR  # rad/s/K
+RUNS = 40
+TOML = """
+rate_hz = 50.0
+duration_s = 300.0
+
+[motion]
+type = "constant-rate"
+rate_deg_per_s = [0.0, 0.0, 2.0]
+
+[gyro]
+angle_random_walk_deg_per_sqrt_hour = 0.3
+rate_random_walk_deg_per_hour_per_sqrt_hour = 3.0
+turn_on_bias_deg_per_hour = [50.0, 0.0, 0.0]
+
+[gyro.temperature]
+reference_degc = 30.0
+lowest_degc = 15.0
+highest_degc = 45.0
+bias_rad_per_s = [1e-4, 0.0, 0.0]
+bias_rad_per_s_per_k = [1e-5, -2e-5, 0.0]
+sigma_rad_per_s_per_k = [1e-4, 1e-4, 1e-4]
+bias_rad_per_s_per_k2 = [0.0, 1e-6, 0.0]
+sigma_rad_per_s_per_k2 = [0.0, 0.0, 0.0]
+
+[temperature]
+start_degc = 20.0
+end_degc = 40.0
+time_constant_s = 100.0
+
+[[sensors]]
+type = "attitude"
+name = "tracker"
+rate_hz = 1.0
+sigma_across_arcsec = 60.0
+sigma_about_arcsec = 60.0
+"""
+
+
+def test_the_simulated_bias_is_the_polynomial_of_the_course(tmp_path):
+    scenario = scenarios.scenario_from_toml(TOML)
+    assert scenarios.scenario_from_toml(scenarios.scenario_to_toml(scenario)) == scenario
+    assert from_table(to_table(scenario.gyro.temperature)) == scenario.gyro.temperature
+    quiet = replace(scenario.gyro, angle_random_walk=0.0, rate_random_walk=0.0)
+    record = scenarios.simulate(replace(scenario, gyro=quiet))
+    T = 40.0 - 20.0 * np.exp(-record.time / 100.0)
+    np.testing.assert_allclose(record.temperature, T, rtol=1e-14)
+    expected = np.zeros((len(T), 3))
+    expected[:, 0] = 50.0 * DEGREE_PER_HOUR + 1e-4 + 1e-5 * (T - 30.0)
+    expected[:, 1] = -2e-5 * (T - 30.0) + 1e-6 * (T - 30.0) ** 2
+    np.testing.assert_allclose(record.truth.bias, expected, rtol=0.0, atol=1e-16)
+    still = scenario.motion.increments(record.time)
+    mean = 0.5 * (expected[1:] + expected[:-1]) * 0.02
+    np.testing.assert_allclose(record.increments - still, mean, rtol=0.0, atol=1e-15)
+    # Beyond the polynomial's span the bias is that at its end; a course without a time constant is a straight line.
+    ramp = replace(scenario, temperature=scenarios.Temperature(start=20.0, end=60.0))
+    hot = scenarios.simulate(replace(ramp, gyro=quiet))
+    np.testing.assert_allclose(hot.temperature, np.linspace(20.0, 60.0, len(hot.time)), rtol=1e-14)
+    assert hot.truth.bias[-1, 1] == pytest.approx(-2e-5 * 15.0 + 1e-6 * 225.0, rel=1e-12)
+    for name in ("record.h5", "record.csv"):
+        path = tmp_path / name
+        (recordfiles.write_record if name.endswith("h5") else recordfiles.export_csv)(path, record)
+        np.testing.assert_array_equal(recordfiles.read_record(path).temperature, record.temperature)
+    np.testing.assert_array_equal(formats.from_record(record).temperature, record.temperature[1:])
+    part = records.cut(record, 10, 20)
+    np.testing.assert_array_equal(part.temperature, record.temperature[10:21])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        (
+            "[temperature]\nstart_degc = 20.0\nend_degc = 40.0\ntime_constant_s = 100.0",
+            "",
+            "add the table \\[temperature\\]",
+        ),
+        ("time_constant_s = 100.0", "time_constant_s = 0.0", "temperature: time_constant_s = 0.0"),
+        ("start_degc = 20.0\n", "", "temperature: start_degc is missing"),
+        ("reference_degc = 30.0", "reference_degc = 50.0", "gyro: temperature: reference_degc is 50, outside"),
+        ("sigma_rad_per_s_per_k =", "sigma_rad_per_s_per_c =", "sigma_rad_per_s_per_c"),
+        ("lowest_degc = 15.0\n", "", "gyro: temperature lacks lowest_degc"),
+    ],
+)
+def test_a_wrong_table_is_refused_by_its_place(old, new, words):
+    with pytest.raises(InputError, match=words):
+        scenarios.simulate(scenarios.scenario_from_toml(TOML.replace(old, new)))
+
+
+def _still(seed, slope, T, dt, white, sensor):
+    """Return a record at rest with an attitude sensor every tenth sample, whose bias has a slope over T, and its initial state."""
+    random = np.random.default_rng(seed)
+    n = len(T) - 1
+    time = dt * np.arange(n + 1)
+    middle = 0.5 * (T[1:] + T[:-1])
+    turns = slope * (middle - T[0])[:, None] * dt + white * np.sqrt(dt) * random.standard_normal((n, 3))
+    at = time[10::10]
+    seen = sensor * random.standard_normal((len(at), 3))
+    series = VectorMeasurements(
+        sensor="tracker",
+        kind="attitude",
+        time=at,
+        attitude=sd.quaternion.exp(seen),
+        sigma_axes=np.full((len(at), 3), sensor),
+    )
+    return records.ImuRecord(time=time, increments=turns, vectors=(series,), temperature=T), seen
+
+
+def test_the_driven_bias_is_that_of_a_linear_filter_with_the_temperature_in_every_sample():
+    """The oracle: one axis at rest, states (θ, b, c), ``θ' = θ − (b + c (T − T₀)) dt`` in each sample, T up and down again."""
+    n, dt, white, walk, sensor, prior = 6000, 0.05, 1e-5, 1e-7, 1e-3, 5e-4
+    T = 25.0 + 8.0 * np.sin(np.linspace(0.0, 5.0, n + 1))
+    record, seen = _still(1, np.array([3e-4, -2e-4, 0.0]), T, dt, white, sensor)
+    start = estimation.initial_state([1.0, 0, 0, 0], attitude_sigma=0.01, bias_sigma=1e-3)
+    noise = estimation.ProcessNoise(angle_random_walk=white, rate_random_walk=walk)
+    block = error_states.GyroTemperature(slope_sigma=prior)
+    found = estimation.run(record, noise, start, (block,), every=10)
+    middle = 0.5 * (T[1:] + T[:-1]) - T[0]
+    H = np.array([1.0, 0.0, 0.0])
+    for axis in range(3):
+        x, P = np.zeros(3), np.diag([0.01, 1e-3, prior]) ** 2
+        rows, spreads = [x], [np.diag(P)]
+        for k in range(n):
+            F = np.array([[1.0, -dt, -middle[k] * dt], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+            Q = np.zeros((3, 3))
+            Q[:2, :2] = [
+                [white**2 * dt + walk**2 * dt**3 / 3.0, -(walk**2) * dt**2 / 2.0],
+                [-(walk**2) * dt**2 / 2.0, walk**2 * dt],
+            ]
+            x = F @ x
+            x[0] += record.increments[k, axis]
+            P = F @ P @ F.T + Q
+            if (k + 1) % 10 == 0:
+                K = P @ H / (P[0, 0] + sensor**2)
+                x, P = x + K * (seen[(k + 1) // 10 - 1, axis] - x[0]), P - np.outer(K, H @ P)
+                J = np.array([1.0, T[k + 1] - T[0]])
+                rows.append(np.array([x[0], x[1] + x[2] * J[1], x[2]]))
+                spreads.append(np.array([P[0, 0], J @ P[1:, 1:] @ J, P[2, 2]]))
+        expected, sigma = np.array(rows)[1:], np.sqrt(np.array(spreads))[1:]
+        slopes = found.error_states["gyro temperature"]
+        ours = np.stack([found.rotation.as_rotvec()[:, axis], found.bias[:, axis], slopes.values[:, axis]], axis=1)[1:]
+        # The axes turn into each other by the error's own size.
+        assert np.abs((ours - expected) / sigma)[20:].max() < 0.1
+        spread = np.stack([found.sigma[:, axis], found.sigma[:, 3 + axis], slopes.sigma[:, axis]], axis=1)[1:]
+        assert np.abs(spread / sigma - 1.0)[100:].max() < 0.05  # the σ is that at the mean temperature of the stretch
+    assert len(list(driven.stretches(record, 10))) > driven.LEVELS
+
+
+def test_parts_of_a_record_and_a_gate_agree_with_the_whole():
+    T = 25.0 + 0.01 * np.arange(4001)
+    record, _ = _still(2, np.array([3e-4, -2e-4, 1e-4]), T, 0.05, 1e-5, 1e-3)
+    start = estimation.initial_state([1.0, 0, 0, 0], attitude_sigma=0.01, bias_sigma=1e-3)
+    noise = estimation.ProcessNoise(angle_random_walk=1e-5, rate_random_walk=1e-7)
+    blocks = (
+        error_states.GyroScale(scale_sigma=1e-4, misalignment_sigma=np.zeros((3, 3))),
+        error_states.GyroTemperature(slope_sigma=5e-4),
+    )
+    whole = estimation.run(record, noise, start, blocks, full_covariance=True)
+    assert whole.whole_covariance.shape == (4001, 12, 12)
+    assert whole.skipped == {"tracker": 0}
+    assert len(whole.innovations["tracker"].time) == 400
+    middle = estimation.run_part(records.cut(record, 0, 2000), noise, start, blocks)[1]
+    second, end = estimation.run_part(records.cut(record, 2000, 4000), noise, middle, blocks)
+    sigma = np.sqrt(np.diag(end.covariance))
+    np.testing.assert_allclose((second.bias[-1] - whole.bias[-1]) / sigma[3:6], 0.0, atol=0.04)
+    np.testing.assert_allclose(end.bias, second.bias[-1], rtol=1e-9)  # both at the temperature of the last edge
+    # An outlier and a lasting fault of the sensor: the gate's candidate goes along with the temperature.
+    series = record.vectors[0]
+    wrong = sd.quaternion.multiply(series.attitude, sd.quaternion.exp([0.0, 0.2, 0.0]))
+    bad = np.where((series.time > 100.0)[:, None], wrong, series.attitude)
+    faulty = replace(record, vectors=(replace(series, attitude=bad),))
+    gated = estimation.run(faulty, noise, start, blocks, gate=Gate(probability=0.999, recovery=5))
+    assert [event.kind for event in gated.events] == ["recovery"]
+    slope = gated.error_states["gyro temperature"]
+    assert (np.abs(slope.values[-1] - [3e-4, -2e-4, 1e-4]) < 4.0 * slope.sigma[-1]).all()
+
+
+def test_where_nothing_drives_the_bias_the_state_is_refused():
+    T = 25.0 + 0.01 * np.arange(101)
+    record, _ = _still(2, np.zeros(3), T, 0.05, 1e-5, 1e-3)
+    start = estimation.initial_state([1.0, 0, 0, 0], attitude_sigma=0.01, bias_sigma=1e-3)
+    noise = estimation.ProcessNoise(angle_random_walk=1e-5, rate_random_walk=1e-7)
+    blocks = (error_states.GyroTemperature(slope_sigma=5e-4),)
+    with pytest.raises(InputError, match="the record has no temperature, which drives the gyro's bias"):
+        estimation.run(replace(record, temperature=None), noise, start, blocks)
+    with pytest.raises(InputError, match="has no bias driven by temperature"):
+        estimation.smooth(record, noise, start, blocks)
+    with pytest.raises(InputError, match="has no bias driven by temperature"):
+        estimation.observability(record, noise, start, blocks)
+    with pytest.raises(InputError, match="slope_sigma"):
+        error_states.GyroTemperature(slope_sigma=[1e-4, 0.0, 1e-4])
+
+
+def test_a_filter_with_the_slope_is_consistent_over_units_and_one_without_is_not():
+    """Each unit has its own slope, drawn from the specification; ANEES of attitude and bias at three times, two-sided."""
+    scenario = scenarios.scenario_from_toml(TOML)
+    flat = replace(
+        scenario.gyro.temperature, coefficients=np.zeros((3, 3)), sigma=np.array([[0.0] * 3, [SLOPE] * 3, [0.0] * 3])
+    )
+    scenario = replace(
+        scenario, gyro=replace(scenario.gyro, temperature=flat, turn_on_bias=np.zeros(3)), duration=120.0
+    )
+    states = setup.States(gyro_temperature_sigma=SLOPE)
+    noise = estimation.ProcessNoise(
+        angle_random_walk=0.3 * DEGREE_PER_ROOT_HOUR, rate_random_walk=3.0 * DEGREE_PER_HOUR / 60.0
+    )
+    chosen = setup.FilterSetup(
+        process_noise=noise, attitude_sigma=1e-3, bias_sigma=50.0 * DEGREE_PER_HOUR, states=states
+    )
+    nees = {True: [], False: []}
+    for run in range(RUNS):
+        record = scenarios.simulate(scenarios.drawn(scenario, 7, run), 7, run)
+        start, truth = drawn_start(record, chosen).state, record.truth
+        for driven_too, values in nees.items():
+            used = chosen if driven_too else replace(chosen, states=None)
+            found = setup.run(record, used, start, every=50, full_covariance=True)
+            error = consistency.errors(found.attitude, found.bias, truth.attitude[::50], truth.bias[::50])
+            values.append(consistency.nees(error, found.covariance)[[20, 60, -1]])
+    low, high = chi2.ppf([0.0005, 0.9995], RUNS * 6) / (RUNS * 6)
+    anees = np.mean(nees[True], axis=0) / 6.0
+    assert (low < anees).all()
+    assert (anees < high).all()
+    assert np.mean(nees[False]) / 6.0 > 2.0
+
+
+def test_the_matched_filter_has_the_slope_and_a_plain_one_is_named_for_lacking_it():
+    scenario = scenarios.scenario_from_toml(TOML)
+    warm = replace(
+        scenario.gyro.temperature, coefficients=np.array([[0.0] * 3, [1e-5, -2e-5, 0.0]]), sigma=np.zeros((2, 3))
+    )
+    linear = replace(scenario, gyro=replace(scenario.gyro, temperature=warm))
+    states = setup.matched(linear, states=True).states
+    np.testing.assert_allclose(states.gyro_temperature_sigma, [1e-5, 2e-5, 0.0], rtol=1e-12)
+    assert "gyro.temperature" in states.names
+    assert states.chosen(("gyro.temperature",)).gyro_temperature_sigma == states.gyro_temperature_sigma
+    assert states.chosen(()).names == ()
+    (block,) = states.gyro_blocks()
+    np.testing.assert_allclose(block.sigma, [1e-5, 2e-5, 2e-11], rtol=1e-12)  # an axis without one is none, in effect
+    missing = "the gyro's bias over temperature"
+    assert missing in setup.unmodelled_errors(linear.gyro)
+    assert missing not in setup.unmodelled_errors(linear.gyro, (), states)
+    # With a quadratic bias c₂ (T − T₀)² over T₀ ± h the mean square of the slope 2 c₂ (T − T₀) is (2 c₂ h)²/3.
+    bent = replace(warm, coefficients=np.array([[0.0] * 3, [0.0] * 3, [1e-6] * 3]), sigma=np.zeros((3, 3)))
+    course = scenarios.Temperature(start=20.0, end=40.0)
+    curved = replace(scenario, gyro=replace(scenario.gyro, temperature=bent), temperature=course)
+    found = setup.matched(curved, states=True).states.gyro_temperature_sigma
+    np.testing.assert_allclose(found, 2e-6 * 10.0 / np.sqrt(3.0), rtol=1e-3)
+    plan = montecarlo.Plan(scenario=linear, setup=setup.matched(linear, states=True))
+    assert "bias over temperature" in lanes.supports(plan)
+    drawn_only = replace(warm, coefficients=np.zeros((2, 3)), sigma=np.array([[0.0] * 3, [SLOPE] * 3]))
+    of_units = replace(scenario, gyro=replace(scenario.gyro, temperature=drawn_only))
+    np.testing.assert_allclose(setup.matched(of_units, states=True).states.gyro_temperature_sigma, SLOPE, rtol=1e-12)
+
+
+def test_lost_samples_and_locked_out_sensors():
+    scenario = scenarios.scenario_from_toml(TOML)
+    record = scenarios.simulate(replace(scenario, gyro=replace(scenario.gyro, drop_probability=0.1)))
+    T = 40.0 - 20.0 * np.exp(-record.time / 100.0)
+    assert len(T) < 14_000
+    np.testing.assert_allclose(record.temperature, T, rtol=1e-14)
+    # A sensor that is wrong all the time is locked out once, however many stretches it lasts.
+    record, _ = _still(2, np.zeros(3), 25.0 + 0.01 * np.arange(4001), 0.05, 1e-5, 1e-3)
+    random = np.random.default_rng(1).standard_normal((400, 4))
+    scattered = replace(record.vectors[0], attitude=random / np.linalg.norm(random, axis=1)[:, None])
+    start = estimation.initial_state([1.0, 0, 0, 0], attitude_sigma=0.001, bias_sigma=1e-4)
+    noise = estimation.ProcessNoise(angle_random_walk=1e-5, rate_random_walk=1e-7)
+    block = error_states.GyroTemperature(slope_sigma=1e-5)
+    locked = replace(record, vectors=(scattered,))
+    found = estimation.run(locked, noise, start, (block,), gate=Gate(probability=0.999, recovery=None))
+    assert [event.kind for event in found.events] == ["lock-out"]
+    assert found.events[0].value == 400
+
+
+def test_a_change_of_temperature_moves_the_filter_and_its_restart_candidate_alike():
+    """By hand: b + c ΔT, whose variance is P_bb + 2 ΔT P_bc + ΔT² P_cc, with and without the factor."""
+    random = np.random.default_rng(3)
+    root = np.tril(random.standard_normal((10, 10))) + 5.0 * np.eye(10)  # attitude, bias, another state, the slopes
+    P, values = root.T @ root, random.standard_normal(4)
+    own, change, axis = slice(1, 4), 2.5, np.arange(3)
+    for factor in (root, None):
+        one = Candidate(attitude=np.eye(4)[0], others=np.concatenate([axis, values]), covariance=P, factor=factor)
+        memory = GateMemory(restart_bias_variance=np.ones(3), counts=np.zeros(1), counters={}, candidate=one)
+        state = estimation.State(
+            attitude=np.eye(4)[0], bias=axis, values=values, covariance=P, factor=factor, gate=memory
+        )
+        found = driven.shifted(state, own, change)
+        bias = axis + change * values[1:]
+        wanted = np.diag(P)[3:6] + 2.0 * change * P[axis + 3, axis + 7] + change**2 * np.diag(P)[7:]
+        np.testing.assert_allclose(found.bias, bias)
+        np.testing.assert_allclose(found.gate.candidate.others, np.concatenate([bias, values]))
+        for moved in (found, found.gate.candidate):
+            np.testing.assert_allclose(np.diag(moved.covariance)[3:6], wanted)
+            np.testing.assert_allclose(moved.covariance[:3, 3:6], P[:3, 3:6] + change * P[:3, 7:])
+            assert (moved.factor is None) == (factor is None)
+            if factor is not None:
+                np.testing.assert_allclose(moved.factor.T @ moved.factor, moved.covariance)
+        back = driven.shifted(found, own, -change)
+        np.testing.assert_allclose(back.covariance, P, rtol=1e-12)
