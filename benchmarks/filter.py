@@ -19,18 +19,26 @@ from typing import Any
 
 import numpy as np
 
-from strapdown import estimation
+from strapdown import ahrs, estimation
+from strapdown.estimation.error_states import GyroScale, VectorBias
 from strapdown.estimation.gating import Gate, Robust
 from strapdown.estimation.states import ProcessNoise, initial_state
 from strapdown.estimation.step_filter import StepFilter
 from strapdown.files import write_json
 from strapdown.kernels.machine import describe
-from strapdown.records import ImuRecord
+from strapdown.recordings import Recording
+from strapdown.records import ImuRecord, cut
 from strapdown.vectors import VectorMeasurements
 
 RATE = 100.0
 NOISE = ProcessNoise(angle_random_walk=1e-4, rate_random_walk=1e-6)
 START = initial_state((1.0, 0.0, 0.0, 0.0), attitude_sigma=1e-2, bias_sigma=1e-3)
+STATES = (
+    GyroScale(scale_sigma=1e-3, misalignment_sigma=1e-3),
+    VectorBias(sensor="up", bias_sigma=1e-2),
+    VectorBias(sensor="field", bias_sigma=1e-2),
+)
+"""15 error states."""
 
 
 def samples(n: int, vectors: int) -> tuple[ImuRecord, np.ndarray, np.ndarray, np.ndarray]:
@@ -69,6 +77,28 @@ def at_edges(record: ImuRecord) -> ImuRecord:
     interval = np.searchsorted(record.time, times[:-1], side="right") - 1
     share = np.diff(times) / np.diff(record.time)[interval]
     return replace(record, time=times, increments=share[:, None] * record.increments[interval])
+
+
+def with_states(record: ImuRecord, recording: Recording) -> dict[str, tuple[Callable[[], Any], int]]:
+    """Return the filters with error states: the record's, also with measurements at each fiftieth sample, and that of recordings."""
+    n, few = len(record.increments), len(recording.time)
+    rare = replace(record, vectors=tuple(one.taken(slice(49, None, 50)) for one in record.vectors))
+    return {
+        "strapdown estimation.run, two vectors, 15 error states": (
+            lambda: estimation.run(record, NOISE, START, STATES),
+            n,
+        ),
+        "strapdown estimation.run, the same at every 50th sample, every=50": (
+            lambda: estimation.run(rare, NOISE, START, STATES, every=50),
+            n,
+        ),
+        "strapdown estimation.smooth, two vectors, 15 error states": (
+            lambda: estimation.smooth(record, NOISE, START, STATES),
+            n,
+        ),
+        "strapdown ahrs.estimate, 9D": (lambda: ahrs.estimate(recording), few),
+        "strapdown ahrs.estimate, 9D, smooth": (lambda: ahrs.estimate(recording, smooth=True), few),
+    }
 
 
 def peers(rate: np.ndarray, force: np.ndarray, field: np.ndarray) -> dict[str, tuple[Callable[[], Any], int]]:
@@ -139,6 +169,7 @@ def main(*, n: int = 200_000, repeats: int = 7) -> dict[str, Any]:
     between = asynchronous(two)
     edges = at_edges(between)
     gate, robust = Gate(recovery=None), Robust()
+    few = n // 10
     works = {
         "strapdown estimation.run, one vector": (lambda: estimation.run(one, NOISE, START), n),
         "strapdown estimation.run, two vectors": (lambda: estimation.run(two, NOISE, START), n),
@@ -151,6 +182,16 @@ def main(*, n: int = 200_000, repeats: int = 7) -> dict[str, Any]:
         "strapdown estimation.run, two vectors, Student's t": (
             lambda: estimation.run(two, NOISE, START, robust=robust),
             n,
+        ),
+        **with_states(
+            cut(two, 0, few),
+            Recording(
+                source="benchmark",
+                time=np.arange(n) / RATE,
+                rate=rate,
+                specific_force=force,
+                magnetic_field=field,
+            ),
         ),
         **peers(rate, force, field),
         "strapdown StepFilter on filterpy": (step_by_step(one, 1000), 1000),

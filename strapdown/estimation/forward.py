@@ -39,6 +39,7 @@ from strapdown.kernels.error_state_step import OFFSET
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.kernels.measurement import Measurements
 from strapdown.kernels.series import LARGEST_ANGLE
+from strapdown.kernels.triangle import padded
 from strapdown.kernels.walk import walk
 from strapdown.records import ErrorStateEstimate, Estimate, Event, ImuRecord, cut
 from strapdown.vectors import KINDS, VectorMeasurements
@@ -75,6 +76,8 @@ class Options:
     """Keep by ``full_covariance`` the covariance of the error states too."""
     gate: Gate | None = None
     robust: Robust | None = None
+    together: bool = False
+    """The factor takes all steps between two measurements at once: for few rows of a long record."""
     segments: int = 0
     """How many predictions to keep for a smoother."""
     whole_bias: bool = False
@@ -175,7 +178,9 @@ def run(
     InputError
         If an argument is not what it should be.
     """
-    options = Options(every=count("every", every), full_covariance=full_covariance, gate=gate, robust=robust)
+    options = Options(
+        every=count("every", every), full_covariance=full_covariance, gate=gate, robust=robust, together=every > 1
+    )
     return watched(_passed(record, process_noise, initial, error_states, options, monitor).estimate, monitor, gate)
 
 
@@ -630,28 +635,28 @@ def model_arrays(model: Model, variances: tuple[float, float]) -> root_form.Mode
 
 def scratch(model: Model) -> root_form.Scratch:
     """Return work space for the kernels."""
-    m, size = model.states, 6 + model.states
+    m, width = model.states, padded(6 + model.states)
     return root_form.Scratch(
-        rows=np.empty((3, 3, size)),
-        lines=np.empty((root_form.LINES, size + model.noise_rows)),
+        rows=np.zeros((3, 3, width)),
+        lines=np.zeros((root_form.LINES, width)),
         threes=np.empty((5, 3)),
-        coupling=np.empty((m, 3)),
+        steps=np.zeros((2, 2, 6 + m, 4)),
         links=np.empty((len(model.chains), LINKS)),
         six=np.empty((6, 6)),
     )
 
 
-def factor_body(problem: Problem, units: Mapping[str, float]) -> root_form.Body:
+def factor_body(problem: Problem, units: Mapping[str, float], *, together: bool = False) -> root_form.Body:
     """Return the filter as the kernels take it."""
     model, initial = problem.model, problem.initial
     size = 6 + model.states
-    attitude, x, F = np.zeros((2, 4)), np.zeros((2, size - 3)), np.zeros((2, size + model.noise_rows, size))
+    attitude, x, F = np.zeros((2, 4)), np.zeros((2, size - 3)), np.zeros((2, size + model.noise_rows, padded(size)))
     attitude[0], x[0] = initial.attitude, np.concatenate([initial.bias, initial.values[model.order]])
-    F[0, :size] = modelling.triangle(initial, model)
+    F[0, :size, :size] = modelling.triangle(initial, model)
     if initial.gate is not None and initial.gate.candidate is not None:
         one = initial.gate.candidate
         attitude[1], x[1] = one.attitude, np.concatenate([one.others[:3], one.others[3:][model.order]])
-        F[1, :size] = modelling.triangle(one, model)
+        F[1, :size, :size] = modelling.triangle(one, model)
     return root_form.Body(
         model=model_arrays(model, problem.variances),
         attitude=attitude,
@@ -660,6 +665,7 @@ def factor_body(problem: Problem, units: Mapping[str, float]) -> root_form.Body:
         length=lengths(problem.record, problem.events, model, units),
         turning=_turns(problem.record, problem.events, model),
         scratch=scratch(model),
+        together=together and not len(model.chains),
         sharpness=np.inf,
         least_share=0.0,
         check=CHECK_INTERVALS,
@@ -671,10 +677,12 @@ def _in_factor(problem: Problem, options: Options) -> Passed:
     record, events, model, every = problem.record, problem.events, problem.model, options.every
     size, rows = 6 + model.states, len(record.increments) // every + 1
     units = unit_sigmas(record, model, problem.initial.unit_sigma)
-    body = factor_body(problem, units)
+    body = factor_body(problem, units, together=options.together)
     whole_rows = rows if options.whole_bias else 0
     kept = size if options.error_state_covariance else 6
-    stored = np.empty((options.segments + 1 if options.segments else 0, 5 + size + size * (size + 1) // 2))
+    stands = np.tri(size, dtype=bool)
+    stands[: model.loose, : model.loose] = True
+    stored = np.empty((options.segments + 1 if options.segments else 0, 5 + size + np.sum(stands)))
     out = root_form.Outputs(
         attitude=np.empty((rows, 4)),
         x=np.empty((rows, size - 3)),
@@ -701,7 +709,7 @@ def _in_factor(problem: Problem, options: Options) -> Passed:
         stored[number, :4] = 0.0
         stored[number, 4:8] = body.attitude[0]
         stored[number, 8 : 5 + size] = body.x[0]
-        stored[number, 5 + size :] = body.F[0, :size][np.tril_indices(size)]
+        stored[number, 5 + size :] = body.F[0, :size, :size][stands]
     innovations = innovations_by_sensor(events, out.innovation, weight)
     estimate = replace(
         factor_estimate(
@@ -731,7 +739,7 @@ def restart_in_factor(judge: Judge) -> root_form.Restart:
         values=first.values[model.order],
         root=modelling.lower_root(first.covariance[np.ix_(model.order, model.order)]),
         time=first.start,
-        fresh=np.empty((3 * model.states + 6, 3 + model.states)),
+        fresh=np.empty((3 * model.states + 6, padded(3 + model.states))),
     )
 
 
@@ -827,7 +835,7 @@ def _span_in_factor(
     last = len(increments) // every
     start = State(attitude=state[:4], bias=state[4:7], covariance=np.eye(6))
     body = factor_body(replace(problem, initial=start), {})
-    body.F[0, :6] = _singular_triangle(covariance_matrices(state[7:]))
+    body.F[0, :6, :6] = _singular_triangle(covariance_matrices(state[7:]))
     span = max(1, FIRST_SPAN // every)
     while True:
         to_row = min(row + span, last)
@@ -857,7 +865,7 @@ def _span_in_factor(
             out.covariance[rows] = covariance_blocks(_reported(whole))
         row, event = to_row, beyond
         span *= 2
-        F = body.F[0, :6]
+        F = modelling.lower(body.F[0, :6, :6])
         if end == len(increments) or np.all(np.diag(F) ** 2 >= HEALTHY_SHARE * np.sum(F**2, axis=0)):
             break
     state[:4], state[4:7] = body.attitude[0], body.x[0]

@@ -161,7 +161,7 @@ class LiveFilter:
             whole_variance=np.empty((0, 6)),
             whole_covariance=np.empty((0, 6, 6)),
             innovation=self._innovation,
-            segments=np.empty((0, 5 + size + size * (size + 1) // 2)),
+            segments=np.empty((0, 0)),
         )
         self._given: Any = self._body
         dispatcher = compiled(walk, root_form)

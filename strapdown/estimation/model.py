@@ -17,7 +17,7 @@ from strapdown.estimation.error_states import MAX_CHAIN_DECAY, Effect, ErrorStat
 from strapdown.estimation.states import Candidate, State, check_arguments
 from strapdown.kernels import error_state_step
 from strapdown.kernels.chains import CHAIN, chain_start
-from strapdown.kernels.error_state_step import CARRIED, FIXED, FORCE, LEVER, NOISE_NODES, OFFSET, SCALE
+from strapdown.kernels.error_state_step import CARRIED, FIXED, FORCE, LEVER, OFFSET, SCALE
 
 MAX_DECAY = 0.5
 """Largest λ dt of one step, for a well conditioned step back; a tenth for states that enter the gyro, where Gauss's rule is exact."""
@@ -96,12 +96,15 @@ class Model:
         return len(self.order)
 
     @property
+    def loose(self) -> int:
+        """How many rows of the factor come first that the kernels leave loose (:func:`strapdown.kernels.root_form.loose`)."""
+        return 6 + self.changing if len(self.chains) else 3
+
+    @property
     def noise_rows(self) -> int:
         """Number of rows of noise of a step."""
-        driven = self.density > 0.0
-        rows = np.where(self.gyro_use & OFFSET, NOISE_NODES, 1)
         chained = sum(int(k - chain_start(self.chains, k) + 1) for k in np.flatnonzero(self.chains[:, 1]))
-        return 6 + int(np.sum(rows[driven])) + chained
+        return 6 + int(np.sum(self.density > 0.0)) + chained
 
     @property
     def whole_order(self) -> np.ndarray:
@@ -298,9 +301,16 @@ def triangle(state: State | Candidate, model: Model) -> Array:
     if state.factor is None:
         return lower_root(state.covariance[np.ix_(order, order)])
     root = state.factor[:, order]
-    if not np.array_equal(root, np.tril(root)):
-        root = np.asarray(np.linalg.qr(root[:, ::-1], mode="r"))[::-1, ::-1]
-    return np.ascontiguousarray(root)
+    if np.array_equal(root[:, model.loose :], np.tril(root)[:, model.loose :]):  # goes on as it is, to the bit
+        return np.ascontiguousarray(root)
+    return lower(root)
+
+
+def lower(root: Array) -> Array:
+    """Return the lower triangle F with the same ``Fᵀ F``."""
+    if np.array_equal(root, np.tril(root)):
+        return root
+    return np.ascontiguousarray(np.linalg.qr(root[:, ::-1], mode="r")[::-1, ::-1])
 
 
 def turning_matrix(chains: Array, size: int, before: Array, after: Array) -> Array:

@@ -216,16 +216,16 @@ class StepFilter(filterpy.kalman.ExtendedKalmanFilter):  # type: ignore[misc]
         model, m, n = self._motion, len(self.values), len(self.x)
         q, phi, x = tuple(self.attitude.tolist()), tuple(part.tolist()), np.concatenate([self.bias, self.values])
         gyro, force = (model.gyro, model.gyro_use), tuple(model.force_f.tolist())
-        coupling, factor = np.empty((m, 3)), np.empty(m)
-        attitude, phi11, phi12, rate, D = error_state_step.move(
-            q, x, dt, phi, model.decay, *gyro, force, coupling, factor
-        )
+        top, factor = np.zeros((n, 4)), np.empty(m)
+        attitude, _, rate, D = error_state_step.move(q, x, dt, phi, model.decay, *gyro, force, top, factor)
         # Rows 0 to n become Φᵀ, the rows after them N with Q = Nᵀ N.
         rows = np.zeros((n + model.noise_rows, n))
         rows[:n] = np.eye(n)
-        error_state_step.carry(rows, 0, n, phi11, phi12, coupling, factor, model.gyro_use, m)
+        error_state_step.carry(rows, n, 0, top, factor, m)
         white = self.process_noise.angle_random_walk**2, self.process_noise.rate_random_walk**2
-        row = error_state_step.fill_noise(rows, n, n, dt, rate, D, *white, model.decay, model.density, *gyro)
+        noise = np.zeros((n, 4))
+        error_state_step.step_noise(noise, dt, rate, D, *white, model.decay, model.density, *gyro)
+        row = error_state_step.fill_noise(rows, n, noise, n)
         links = np.empty((len(model.chains), chains.LINKS))
         chains.step_chains(rows, n, row, x, dt, model.decay, model.chains, links)
         self.F, self.Q = rows[:n].T.copy(), rows[n:].T @ rows[n:]

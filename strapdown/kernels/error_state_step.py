@@ -31,18 +31,22 @@ from strapdown.kernels.algebra import (
     scale,
     skew_polynomial,
     subtract,
+    symmetric_minus_outer,
     symmetric_times_vector,
     transpose_times_vector,
 )
 from strapdown.kernels.filter_step import process_noise, transition
+from strapdown.kernels.lane_values import lanes_of, load_like, store_like
 from strapdown.kernels.measurement import ATTITUDE, DIRECTION, HEADING, VERTICAL, heading_error
 from strapdown.kernels.rotation import logarithm, moved, quaternion_multiply, rotation_matrix, turned
-from strapdown.kernels.series import LARGEST_ANGLE, second, sinc
+from strapdown.kernels.series import LARGEST_ANGLE
 from strapdown.kernels.walk import MAX_TURN
 
 CALLED = (
     "response",
     "move",
+    "step_noise",
+    "follow",
     "fill_noise",
     "carry",
     "carry_back",
@@ -61,9 +65,8 @@ CARRIED = 8
 FORCE = 16
 LEVER = 32
 
-NOISE_NODES = 3
-"""Rows of noise of a state that enters the gyro: its own white noise at so many instants of a step stands for the whole of it."""
-
+FOUR = (0.0, 0.0, 0.0, 0.0)
+"""So many lanes."""
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 # Gauss–Legendre on [0, 1], five and three nodes.
@@ -71,6 +74,8 @@ _FIVE = (math.sqrt(5.0 - 2.0 * math.sqrt(10.0 / 7.0)) / 3.0, math.sqrt(5.0 + 2.0
 NODES = (0.5 - 0.5 * _FIVE[1], 0.5 - 0.5 * _FIVE[0], 0.5, 0.5 + 0.5 * _FIVE[0], 0.5 + 0.5 * _FIVE[1])
 _WEIGHT = ((322.0 - 13.0 * math.sqrt(70.0)) / 1800.0, (322.0 + 13.0 * math.sqrt(70.0)) / 1800.0)
 WEIGHTS = (_WEIGHT[0], _WEIGHT[1], 128.0 / 450.0, _WEIGHT[1], _WEIGHT[0])
+FACTORIALS = tuple(1.0 / math.factorial(k) for k in range(16, 1, -1))
+"""1/16! to 1/2!."""
 THREE_NODES = (0.5 - 0.5 * math.sqrt(0.6), 0.5, 0.5 + 0.5 * math.sqrt(0.6))
 THREE_WEIGHTS = (5.0 / 18.0, 8.0 / 18.0, 5.0 / 18.0)
 
@@ -95,21 +100,23 @@ def inverse(A):
 
 
 def response(rate, u, decay):
-    """Return the matrix ``∫₀ᵘ exp(−[ω](u − s)) e^{−λs} ds``: the attitude error that a decaying rate error makes in the time u.
+    """Return the matrix ``∫₀ᵘ exp(−[ω](u − s)) e^{−λs} ds``, the attitude error that a decaying rate error makes in the time u, and
+    ``∫₀ᵘ e^{−λs} ds``.
 
-    Gauss's rule of five nodes: to rounding for |ω| u ≤ 1/3 and λ u ≤ 1/2.
-    """
-    squared = dot(rate, rate)
-    identity = linear = quadratic = 0.0
-    for i in range(5):
-        s = u * NODES[i]
-        left = u - s
-        weight = u * WEIGHTS[i] * math.exp(-decay * s)
-        y = left * left * squared
-        identity += weight
-        linear -= weight * left * sinc(y)
-        quadratic += weight * left * left * second(y)
-    return skew_polynomial(identity, linear, quadratic, rate)
+    With ``φ_k = Σ (−λu)^i/(i + k)!`` and y = −ω²u² the matrix is ``u φ₁ − u² (φ₂ + φ₄ y + …) [ω] + u³ (φ₃ + φ₅ y + …) [ω]²``: to rounding
+    for |ω| u ≤ 1/3 and λ u ≤ 1/2.
+    """  # noqa: D205
+    z = -decay * u
+    y = -u * u * dot(rate, rate)
+    phi = FACTORIALS[0]
+    linear = quadratic = 0.0
+    for k in range(1, 14, 2):
+        phi = FACTORIALS[k] + z * phi
+        quadratic = phi + y * quadratic
+        phi = FACTORIALS[k + 1] + z * phi
+        linear = phi + y * linear
+    mean = u * (1.0 + z * phi)
+    return skew_polynomial(mean, -u * u * linear, u * u * u * quadratic, rate), mean
 
 
 def longest_step(dt, theta, limit):
@@ -147,10 +154,11 @@ def turning_matrix(rate, acceleration):
     )
 
 
-def move(q, x, dt, part, decay, gyro, gyro_use, force_f, coupling, factor):
-    """Move attitude and optional states over an increment ``part``; return q, Φ11, Φ12 and the rate.
+def move(q, x, dt, part, decay, gyro, gyro_use, force_f, top, factor):
+    """Move attitude and optional states over an increment ``part``; return q, Φ11, the rate and (I + M)⁻¹.
 
-    Leaves in ``coupling`` (states, 3) the attitude's share of each optional state, Φ_θc, and in ``factor`` their own e^{−λ dt}.
+    Leaves in ``factor`` the states' own e^{−λ dt}, and in ``top`` (n, 4) what each of all n states makes of the attitude and of the first
+    bias, which Φ leaves as it is: the columns of Φ's first four rows.
     With M = Σ c T the turn is ``φ = (I + M)⁻¹ (Δθ − b dt − Σ e ∫c dt)``, and its error ``−(I + M)⁻¹ (δb + Σ e δc + Σ T ω δc)`` a second.
     The specific force is taken at the middle of the step; how it changes with the attitude *error* is neglected, as it is small beside
     the bias that it makes.
@@ -194,130 +202,181 @@ def move(q, x, dt, part, decay, gyro, gyro_use, force_f, coupling, factor):
     if scaled:
         phi12 = multiply(phi12, D)
     rate = scale(1.0 / dt, phi)
+    for i in range(3):
+        top[i, 0], top[i, 1], top[i, 2] = phi11[i], phi11[3 + i], phi11[6 + i]
+        top[3 + i, 0], top[3 + i, 1], top[3 + i, 2] = phi12[i], phi12[3 + i], phi12[6 + i]
+    top[3, 3] = 0.0
+    four = lanes_of(FOUR)
+    j0, j1, j2 = load_like(top, 12, four), load_like(top, 16, four), load_like(top, 20, four)
+    a0, a1, a2 = rate[0] * j0, rate[0] * j1, rate[0] * j2
+    b0, b1, b2 = rate[1] * j0, rate[1] * j1, rate[1] * j2
+    c0, c1, c2 = rate[2] * j0, rate[2] * j1, rate[2] * j2
     E = IDENTITY
     held = 0.0  # the decay that E is of; states of one block have the same
     for k in range(len(decay)):
-        column = (0.0, 0.0, 0.0)
-        if gyro_use[k] & OFFSET:
-            e = (gyro[k, 0], gyro[k, 1], gyro[k, 2])
-            if decay[k] > 0.0:
-                if decay[k] != held:
-                    E, held = multiply(response(rate, dt, decay[k]), D), decay[k]
-                column = scale(-1.0, matrix_times_vector(E, e))
-            else:
-                column = matrix_times_vector(phi12, e)
-        if gyro_use[k] & SCALE:
-            column = add(column, matrix_times_vector(phi12, gyro_matrix_times(gyro, k, rate)))
-        if gyro_use[k] & FORCE:
-            column = add(column, matrix_times_vector(phi12, gyro_matrix_times(gyro, k, force)))
-        coupling[k, 0], coupling[k, 1], coupling[k, 2] = column
         x[3 + k] *= factor[k]
-    return turned(q, phi), phi11, phi12, rate, D
+        use = gyro_use[k]
+        if use != 0:
+            column = four
+            if use & OFFSET and decay[k] == 0.0:
+                column = gyro[k, 0] * j0 + gyro[k, 1] * j1 + gyro[k, 2] * j2
+            if use & SCALE:
+                column = column + (gyro[k, 3] * a0 + gyro[k, 4] * b0 + gyro[k, 5] * c0)
+                column = column + (gyro[k, 6] * a1 + gyro[k, 7] * b1 + gyro[k, 8] * c1)
+                column = column + (gyro[k, 9] * a2 + gyro[k, 10] * b2 + gyro[k, 11] * c2)
+            store_like(top, 24 + 4 * k, column)
+            if use & OFFSET and decay[k] > 0.0:
+                if decay[k] != held:
+                    E, _ = response(rate, dt, decay[k])
+                    E, held = multiply(E, D), decay[k]
+                add_column(top, k, scale(-1.0, matrix_times_vector(E, (gyro[k, 0], gyro[k, 1], gyro[k, 2]))))
+            if use & FORCE:
+                add_column(top, k, matrix_times_vector(phi12, gyro_matrix_times(gyro, k, force)))
+    top[3, 3] = 1.0
+    return turned(q, phi), phi11, rate, D
 
 
-def fill_noise(F, first, columns, dt, rate, D, angle_variance, rate_variance, decay, density, gyro, gyro_use):
-    """Write the rows of noise of a step, N with ``Q = Nᵀ N``, from row ``first`` of F on, ``columns`` wide; return the row after them.
+def add_column(top, k, column):
+    """Add what state k makes of the attitude."""
+    top[6 + k, 0] += column[0]
+    top[6 + k, 1] += column[1]
+    top[6 + k, 2] += column[2]
+
+
+def step_noise(noise, dt, rate, D, angle_variance, rate_variance, decay, density, gyro, gyro_use):
+    """Write the covariance Q of the noise of a step: rows (n, 4), of the attitude Q_θθ, of any other state i Q_θi and Q_ii.
 
     Attitude and bias have the exact Q of :func:`strapdown.kernels.filter_step.process_noise` (the white noise of the gyro is given after
-    its scale factor), factored as one upper triangle. A state that enters the gyro has its noise at Gauss's three nodes of the step.
+    its scale factor). A state that enters the gyro has its noise at Gauss's three nodes of the step.
     """
     q11, q12, q22 = process_noise(scale(dt, rate), dt, angle_variance, rate_variance)
-    root = math.sqrt(q22)
-    inverse_root = 1.0 / root if root > 0.0 else 0.0
-    for r in range(6):
-        for i in range(columns):
-            F[first + r, i] = 0.0
-    a = (
-        inverse_root * q12[0],
-        inverse_root * q12[3],
-        inverse_root * q12[6],
-        inverse_root * q12[1],
-        inverse_root * q12[4],
-        inverse_root * q12[7],
-        inverse_root * q12[2],
-        inverse_root * q12[5],
-        inverse_root * q12[8],
-    )
-    c00 = q11[0] - a[0] * a[0] - a[3] * a[3] - a[6] * a[6]
-    c01 = q11[1] - a[0] * a[1] - a[3] * a[4] - a[6] * a[7]
-    c02 = q11[2] - a[0] * a[2] - a[3] * a[5] - a[6] * a[8]
-    c11 = q11[3] - a[1] * a[1] - a[4] * a[4] - a[7] * a[7]
-    c12 = q11[4] - a[1] * a[2] - a[4] * a[5] - a[7] * a[8]
-    c22 = q11[5] - a[2] * a[2] - a[5] * a[5] - a[8] * a[8]
-    u22 = math.sqrt(c22)
-    u12 = c12 / u22
-    u02 = c02 / u22
-    u11 = math.sqrt(c11 - u12 * u12)
-    u01 = (c01 - u02 * u12) / u11
-    F[first, 0] = math.sqrt(c00 - u01 * u01 - u02 * u02)
-    F[first + 1, 0], F[first + 1, 1] = u01, u11
-    F[first + 2, 0], F[first + 2, 1], F[first + 2, 2] = u02, u12, u22
     for i in range(3):
-        for j in range(3):
-            F[first + 3 + i, j] = a[3 * i + j]
-        F[first + 3 + i, 3 + i] = root
-    row = first + 6
-    nodes = (
-        dt * (1.0 - THREE_NODES[0]),
-        dt * (1.0 - THREE_NODES[1]),
-        dt * (1.0 - THREE_NODES[2]),
-    )  # what is left of the step
+        noise[3 + i, 0], noise[3 + i, 1], noise[3 + i, 2], noise[3 + i, 3] = q12[i], q12[3 + i], q12[6 + i], q22
     E = (IDENTITY, IDENTITY, IDENTITY)
     kept = (1.0, 1.0, 1.0)
-    held = -1.0  # the decay that both are of
+    mean = 0.0
+    held = alone = -1.0  # the decays that the former are of, and the mean
     for k in range(len(decay)):
-        if density[k] > 0.0:
-            rows = NOISE_NODES if gyro_use[k] & OFFSET else 1
-            if rows > 1 and decay[k] != held:
+        if density[k] > 0.0 and gyro_use[k] & OFFSET:
+            if decay[k] != held:
                 held = decay[k]
-                E = (
-                    multiply(response(rate, nodes[0], held), D),
-                    multiply(response(rate, nodes[1], held), D),
-                    multiply(response(rate, nodes[2], held), D),
-                )
-                kept = (math.exp(-held * nodes[0]), math.exp(-held * nodes[1]), math.exp(-held * nodes[2]))
-            for r in range(rows):
-                for i in range(columns):
-                    F[row + r, i] = 0.0
-                if rows == 1:
-                    mean = -0.5 * math.expm1(-2.0 * decay[k] * dt) / decay[k] if decay[k] > 0.0 else dt
-                    F[row, 6 + k] = math.sqrt(mean * density[k])
-                else:
-                    size = math.sqrt(THREE_WEIGHTS[r] * dt * density[k])
-                    t = scale(-size, matrix_times_vector(E[r], (gyro[k, 0], gyro[k, 1], gyro[k, 2])))
-                    F[row + r, 0], F[row + r, 1], F[row + r, 2] = t
-                    F[row + r, 6 + k] = size * kept[r]
-            row += rows
+                E0, m0 = response(rate, dt * (1.0 - THREE_NODES[0]), held)
+                E1, m1 = response(rate, dt * (1.0 - THREE_NODES[1]), held)
+                E2, m2 = response(rate, dt * (1.0 - THREE_NODES[2]), held)
+                E = (multiply(E0, D), multiply(E1, D), multiply(E2, D))
+                kept = (1.0 - held * m0, 1.0 - held * m1, 1.0 - held * m2)
+            e = (gyro[k, 0], gyro[k, 1], gyro[k, 2])
+            own = 0.0
+            with_attitude = (0.0, 0.0, 0.0)
+            for r in range(3):
+                q = THREE_WEIGHTS[r] * dt * density[k]
+                t = matrix_times_vector(E[r], e)
+                with_attitude = combine(1.0, with_attitude, -q * kept[r], t)
+                own += q * kept[r] * kept[r]
+                q11 = symmetric_minus_outer(q11, scale(-q, t), t)
+            noise[6 + k, 0], noise[6 + k, 1], noise[6 + k, 2] = with_attitude
+            noise[6 + k, 3] = own
+        elif density[k] > 0.0:
+            if decay[k] != alone:
+                alone = decay[k]
+                mean = -0.5 * math.expm1(-2.0 * decay[k] * dt) / decay[k] if decay[k] > 0.0 else dt
+            noise[6 + k, 3] = mean * density[k]
+    noise[0, 0], noise[0, 1], noise[0, 2] = q11[0], q11[1], q11[2]
+    noise[1, 0], noise[1, 1], noise[1, 2] = q11[1], q11[3], q11[4]
+    noise[2, 0], noise[2, 1], noise[2, 2] = q11[2], q11[4], q11[5]
+
+
+def follow(top, factor, noise, next_top, next_factor, next_noise, size, changing):
+    """Make one step of two, of which ``next_`` comes after the other: ``Φ₂ Φ₁`` and ``Φ₂ Q₁ Φ₂ᵀ + Q₂``."""
+    four = lanes_of(FOUR)
+    p0, p1, p2 = load_like(next_top, 0, four), load_like(next_top, 4, four), load_like(next_top, 8, four)
+    for i in range(size):
+        kept = factor[i - 6] if 6 <= i < 6 + changing else 1.0
+        t = top[i, 0] * p0 + top[i, 1] * p1 + top[i, 2] * p2
+        if i >= 3:
+            t = t + kept * load_like(next_top, 4 * i, four)
+        store_like(top, 4 * i, t)
+    a0 = noise[0, 0] * p0 + noise[0, 1] * p1 + noise[0, 2] * p2  # rows of Q_θθ Φ11ᵀ
+    a1 = noise[1, 0] * p0 + noise[1, 1] * p1 + noise[1, 2] * p2
+    a2 = noise[2, 0] * p0 + noise[2, 1] * p1 + noise[2, 2] * p2
+    b0 = next_top[0, 0] * a0 + next_top[1, 0] * a1 + next_top[2, 0] * a2 + load_like(next_noise, 0, four)
+    b1 = next_top[0, 1] * a0 + next_top[1, 1] * a1 + next_top[2, 1] * a2 + load_like(next_noise, 4, four)
+    b2 = next_top[0, 2] * a0 + next_top[1, 2] * a1 + next_top[2, 2] * a2 + load_like(next_noise, 8, four)
+    for i in range(3, 6 + changing):
+        own = noise[i, 3]
+        if own > 0.0 or next_noise[i, 3] > 0.0:
+            ahead = load_like(next_top, 4 * i, four)
+            u = noise[i, 0] * p0 + noise[i, 1] * p1 + noise[i, 2] * p2
+            v = u + own * ahead  # what the first step's noise has of the attitude after the second
+            store_like(noise, 4 * i, v)
+            b0 = b0 + noise[i, 0] * ahead + next_top[i, 0] * u
+            b1 = b1 + noise[i, 1] * ahead + next_top[i, 1] * u
+            b2 = b2 + noise[i, 2] * ahead + next_top[i, 2] * u
+            kept = next_factor[i - 6] if i >= 6 else 1.0
+            store_like(noise, 4 * i, kept * v + load_like(next_noise, 4 * i, four))
+            noise[i, 3] = kept * kept * own + next_noise[i, 3]
+    store_like(noise, 0, b0)
+    store_like(noise, 4, b1)
+    store_like(noise, 8, b2)
+    for k in range(changing):
+        factor[k] *= next_factor[k]
+
+
+def fill_noise(F, first, noise, noisy):
+    """Write the rows of noise, N with ``Q = Nᵀ N``, from row ``first`` of F on, of so many states; return the row after them."""
+    q11 = (noise[0, 0], noise[0, 1], noise[0, 2], noise[1, 1], noise[1, 2], noise[2, 2])
+    row = first + 3
+    for i in range(3, noisy):
+        if noise[i, 3] > 0.0:
+            root = math.sqrt(noise[i, 3])
+            a = scale(1.0 / root, (noise[i, 0], noise[i, 1], noise[i, 2]))
+            for c in range(3, noisy):
+                F[row, c] = 0.0
+            F[row, 0], F[row, 1], F[row, 2] = a
+            F[row, i] = root
+            q11 = symmetric_minus_outer(q11, a, a)
+            row += 1
+    for r in range(first, first + 3):
+        for c in range(noisy):
+            F[r, c] = 0.0
+    u22 = math.sqrt(q11[5])
+    u12 = q11[4] / u22
+    u02 = q11[2] / u22
+    u11 = math.sqrt(q11[3] - u12 * u12)
+    u01 = (q11[1] - u02 * u12) / u11
+    F[first, 0] = math.sqrt(q11[0] - u01 * u01 - u02 * u02)
+    F[first + 1, 0], F[first + 1, 1] = u01, u11
+    F[first + 2, 0], F[first + 2, 1], F[first + 2, 2] = u02, u12, u22
     return row
 
 
-def carry(F, first, end, phi11, phi12, coupling, factor, gyro_use, changing):
-    """Carry rows of a triangle, the attitude's three columns full, over a step: each is a column of S, so ``S ← Φ S``."""
-    for j in range(first, end):
-        t = matrix_times_vector(phi11, (F[j, 0], F[j, 1], F[j, 2]))
-        if j >= 3:
-            t = add(t, matrix_times_vector(phi12, (F[j, 3], F[j, 4], F[j, 5])))
-        for k in range(min(j - 5, len(factor))):
-            f = F[j, 6 + k]
-            t = (t[0] + coupling[k, 0] * f, t[1] + coupling[k, 1] * f, t[2] + coupling[k, 2] * f)
-        for k in range(min(j - 5, changing)):
+def carry(F, size, loose, top, factor, changing):
+    """Carry a factor, as many rows of it loose, over a step: each row is a column of S, so ``S ← Φ S``."""
+    width = F.shape[1]
+    four = lanes_of(FOUR)
+    for j in range(size):
+        t = four
+        for i in range(max(j + 1, loose)):
+            t = t + F[j, i] * load_like(top, 4 * i, four)
+        for k in range(min(max(j + 1, loose) - 6, changing)):
             F[j, 6 + k] *= factor[k]
-        F[j, 0], F[j, 1], F[j, 2] = t
+        store_like(F, width * j, t)
 
 
-def carry_back(F, first, end, phi11, phi12, coupling, factor, gyro_use, changing):
-    """Undo :func:`carry`: rows by ``Φ⁻¹``."""
-    for j in range(first, end):
-        t = subtract((F[j, 0], F[j, 1], F[j, 2]), matrix_times_vector(phi12, (F[j, 3], F[j, 4], F[j, 5])))
-        for k in range(len(factor)):
-            f = F[j, 6 + k]
-            if f != 0.0:
-                if k < changing:
-                    f = f / factor[k]
-                    F[j, 6 + k] = f
-                if gyro_use[k] != 0:
-                    t = (t[0] - coupling[k, 0] * f, t[1] - coupling[k, 1] * f, t[2] - coupling[k, 2] * f)
-        F[j, 0], F[j, 1], F[j, 2] = transpose_times_vector(phi11, t)
+def carry_back(F, size, end, phi11, top, inverse, changing):
+    """Undo :func:`carry` of full rows, to ``end``: rows by ``Φ⁻¹``. ``inverse`` has the reciprocals of ``factor``."""
+    width = F.shape[1]
+    four = lanes_of(FOUR)
+    for j in range(end):
+        for k in range(changing):
+            F[j, 6 + k] *= inverse[k]
+        t = load_like(F, width * j, four)
+        for i in range(3, size):
+            t = t - F[j, i] * load_like(top, 4 * i, four)
+        first = F[j, 3]
+        store_like(F, width * j, t)
+        F[j, 0], F[j, 1], F[j, 2] = transpose_times_vector(phi11, (F[j, 0], F[j, 1], F[j, 2]))
+        F[j, 3] = first
 
 
 def turn_rows(F, end, G):

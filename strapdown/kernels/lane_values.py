@@ -2,7 +2,7 @@
 
 A kernel reads and writes lanes by the functions below and computes with them by the same arithmetic as with floats. As plain Python they
 work on NumPy arrays of ``WIDTH``; compiled, :mod:`strapdown.kernels.lanes` puts machine vectors in their place. Nothing is checked:
-the caller answers for every row being inside its array. Arrays are flat and contiguous.
+the caller answers for every row being inside its array. Arrays are contiguous.
 
 ``WIDTH`` is the number of lanes where nothing else is said. A kernel for any number of them takes a ``pattern``, a tuple of as many
 floats: :func:`lanes_of` makes zeros of its count and type, and ``like`` such a value :func:`load_like` and the rest fill theirs. One lane
@@ -21,8 +21,8 @@ WIDTH = 8
 
 
 def load(array, start):
-    """Return ``array[start : start + WIDTH]``."""
-    return array[start : start + WIDTH].copy()
+    """Return ``array[start : start + WIDTH]``, an array of several dimensions read by rows."""
+    return array.reshape(-1)[start : start + WIDTH].copy()
 
 
 def load_triples(array, start, stride):
@@ -38,8 +38,8 @@ def load_quadruples(array, start, stride):
 
 
 def store(array, start, value):
-    """Write lanes to ``array[start : start + WIDTH]``."""
-    array[start : start + WIDTH] = value
+    """Write lanes to ``array[start : start + WIDTH]``, likewise."""
+    array.reshape(-1)[start : start + WIDTH] = value
 
 
 def store_quadruples(array, start, stride, q):
@@ -63,7 +63,7 @@ def lanes_of(pattern):
 
 def load_like(array, start, like):
     """Return as many elements of ``array`` from ``start`` on as ``like`` has lanes; their type is the array's."""
-    return array[start : start + len(like)].copy()
+    return array.reshape(-1)[start : start + len(like)].copy()
 
 
 def element(array, place):
@@ -77,7 +77,7 @@ def fetch_ahead(array, place):
 
 def store_like(array, start, value):
     """Write lanes of any number to ``array[start : …]``, converted to the precision of the array."""
-    array[start : start + len(value)] = value
+    array.reshape(-1)[start : start + len(value)] = value
 
 
 def narrowed(x, like):

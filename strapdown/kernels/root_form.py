@@ -34,8 +34,10 @@ from strapdown.kernels.error_state_step import (
     fill_noise,
     fill_rows,
     fixed_turn,
+    follow,
     move,
     put_row,
+    step_noise,
     turn_columns,
     turn_rows,
     turn_values,
@@ -63,7 +65,7 @@ from strapdown.kernels.measurement import (
     vector_at,
 )
 from strapdown.kernels.rotation import far_turn, quaternion_multiply, right_jacobian, rotation_matrix, turned, unit
-from strapdown.kernels.triangle import covariances, take_row, triangularise, variances, whole_bias
+from strapdown.kernels.triangle import covariances, dot_rows, take_row, triangularise, variances, whole_bias
 from strapdown.kernels.walk import step_within, turn_squared
 
 CALLED = ("store_segment", "age_chains", "aged_chain")
@@ -102,13 +104,14 @@ class Scratch(NamedTuple):
     """Work space of a step and of an update, in few arrays: each one more costs a kernel's compiling. n states in all, m error states."""
 
     rows: np.ndarray
-    """(3, 3, n): H of a measurement, H turned to the prior's tangent space, and F Hᵀ."""
+    """(3, 3, width of F): H of a measurement, H turned to the prior's tangent space, and F Hᵀ."""
     lines: np.ndarray
-    """(6, length of F): in the order of the constants below."""
+    """(9, width of F): in the order of the constants below."""
     threes: np.ndarray
     """(5, 3): y, variances of the rows, and the body axes that the rows measure along."""
-    coupling: np.ndarray
-    """(m, 3): the attitude's share of each error state over a step."""
+    steps: np.ndarray
+    """(2, 2, n, 4): of the steps since the factor's, and of the next, Φ and Q as :func:`strapdown.kernels.error_state_step.move` and
+    :func:`strapdown.kernels.error_state_step.step_noise` leave them."""
     links: np.ndarray
     """(chained states, ``LINKS``)"""
     six: np.ndarray
@@ -122,9 +125,11 @@ STEP = 1
 NOW_X = 2
 """Bias and error states at the linearisation (n − 3,)."""
 FACTOR = 3
-"""What of each error state is left after a step (m,)."""
-WORK = 4
-LINES = 5
+"""What of each error state is left after those steps, and after the next (m,) each."""
+WORK = 5
+ROWS = 6
+"""From here on three lines of :func:`strapdown.kernels.triangle.take_row`."""
+LINES = 9
 
 
 class Body(NamedTuple):
@@ -136,12 +141,14 @@ class Body(NamedTuple):
     x: np.ndarray
     """(2, n − 3)"""
     F: np.ndarray
-    """(2, rows, n), the triangle at the top and room for rows of noise below."""
+    """(2, rows, width), the triangle at the top and room for rows of noise below, each :func:`strapdown.kernels.triangle.padded`."""
     length: np.ndarray
     """What each measurement's effects are divided by, in order of time (events,)."""
     turning: np.ndarray
     """Measured rate, angular acceleration and the latter's variances at each measurement (events, 9); (0, 9) without lever arms."""
     scratch: Scratch
+    together: bool
+    """Whether the factor takes all steps between two measurements at once."""
     sharpness: float
     """Infinite: no measurement is too sharp."""
     least_share: float
@@ -160,7 +167,7 @@ class Restart(NamedTuple):
     """Their covariance ``rootᵀ root`` (m, m)."""
     time: float
     fresh: np.ndarray
-    """Scratch (3 m + 6, 3 + m)."""
+    """Scratch (3 m + 6, 3 + m), padded."""
 
 
 class Outputs(NamedTuple):
@@ -180,8 +187,8 @@ class Outputs(NamedTuple):
     """What a smoother needs of each prediction: dt, increment (3), attitude (4), x and the rows of the triangle."""
 
 
-def store_segment(out, k, dt, part, q, x, F, size):
-    """Write row k of the segments: dt, increment (3), attitude (4), x, and the rows of the triangle."""
+def store_segment(out, k, dt, part, q, x, F, loose):
+    """Write row k of the segments: dt, increment (3), attitude (4), x, and the rows of the factor, of which the first are loose."""
     out[k, 0] = dt
     out[k, 1], out[k, 2], out[k, 3] = part
     out[k, 4], out[k, 5], out[k, 6], out[k, 7] = q
@@ -189,22 +196,28 @@ def store_segment(out, k, dt, part, q, x, F, size):
     for i in range(len(x)):
         out[k, place + i] = x[i]
     place += len(x)
-    for j in range(size):
-        for i in range(j + 1):
+    for j in range(len(x) + 3):
+        end = max(j + 1, loose)
+        for i in range(end):
             out[k, place + i] = F[j, i]
-        place += j + 1
+        place += end
 
 
 def keep_row(form, q, row, out):
     """Write the filter's state to a row of the outputs, covariances and the whole bias where there is room."""
-    x, F = form.x[0], form.F[0]
+    write_row(form, 0, q, row, out)
+
+
+def write_row(form, i, q, row, out):
+    """Write the filter's state with the i-th factor to a row of the outputs."""
+    x, F = form.x[0], form.F[i]
     size = len(x) + 3
     out.attitude[row, 0], out.attitude[row, 1], out.attitude[row, 2], out.attitude[row, 3] = q
-    for i in range(len(x)):
-        out.x[row, i] = x[i]
-    variances(F, size, out.variance, row)
+    for j in range(len(x)):
+        out.x[row, j] = x[j]
+    variances(F, size, out.variance, row, form.scratch.lines[WORK])
     if row < len(out.covariance):
-        covariances(F, size, out.covariance, row)
+        covariances(F, size, out.covariance, row, form.scratch.lines[WORK])
     if row < len(out.whole_variance):
         model = form.model
         whole_bias(
@@ -214,23 +227,18 @@ def keep_row(form, q, row, out):
 
 def advance(model, scratch, q, x, F, dt, part):
     """Propagate a state over an increment ``part``, ``x`` and ``F`` in place; return q."""
-    size = len(x) + 3
-    coupling, factor = scratch.coupling, scratch.lines[FACTOR, : size - 6]
-    q, phi11, phi12, rate, D = move(
-        q, x, dt, part, model.decay, model.gyro, model.gyro_use, model.force_f, coupling, factor
-    )
-    carry(F, 0, size, phi11, phi12, coupling, factor, model.gyro_use, model.changing)
-    rows = step_noise(model, scratch.links, F, size, dt, rate, D, x)
-    triangularise(F, 6 + model.changing, 3, size, rows, 0, 0, scratch.lines[WORK])
+    q = step(model, scratch, q, x, dt, part, False)
+    absorb(model, scratch, x, F, dt)
     return q
 
 
-def step_noise(model, links, F, size, dt, rate, D, x):
-    """Write the rows of noise of a step under the triangle, and take states in chains and their columns over it; return the row after."""
-    rows = fill_noise(
-        F,
-        size,
-        size,
+def step(model, scratch, q, x, dt, part, more):
+    """Propagate attitude and ``x`` alone, and add the step to those that the factor is behind by, where there are ``more``; return q."""
+    now = 1 if more else 0
+    top, noise, factor = scratch.steps[now, 0], scratch.steps[now, 1], scratch.lines[FACTOR + now]
+    q, _, rate, D = move(q, x, dt, part, model.decay, model.gyro, model.gyro_use, model.force_f, top, factor)
+    step_noise(
+        noise,
         dt,
         rate,
         D,
@@ -241,29 +249,43 @@ def step_noise(model, links, F, size, dt, rate, D, x):
         model.gyro,
         model.gyro_use,
     )
+    if more:
+        size, first = len(x) + 3, scratch.lines[FACTOR]
+        follow(scratch.steps[0, 0], first, scratch.steps[0, 1], top, factor, noise, size, model.changing)
+    return q
+
+
+def absorb(model, scratch, x, F, dt):
+    """Take the factor over the steps that it is behind by. With states in chains that is one step, over dt, which takes those along."""
+    size, noisy = len(x) + 3, 6 + model.changing
+    carry(F, size, loose(model), scratch.steps[0, 0], scratch.lines[FACTOR], model.changing)
+    rows = fill_noise(F, size, scratch.steps[0, 1], noisy)
     if len(model.chains) > 0:
-        rows = step_chains(F, size, rows, x, dt, model.decay, model.chains, links)
-    return rows
+        rows = step_chains(F, size, rows, x, dt, model.decay, model.chains, scratch.links)
+    triangularise(F, noisy, loose(model), size, rows, 0, 0, scratch.lines[WORK])
 
 
-def settle(model, scratch, F, before, after, x):
-    """Turn what goes along with a corrected attitude, and bring the factor, of which the attitude's columns are loose, to a triangle."""
-    size = len(x) + 3
-    loose = 3
+def loose(model):
+    """Return how many rows of a factor come first that a correction leaves loose."""
+    return 3 if len(model.chains) == 0 else 6 + model.changing
+
+
+def settle(model, F, before, after, x):
+    """Turn what goes along with a corrected attitude."""
     if len(model.chains) > 0:
         A = fixed_turn(before, after)
         turn_values(model.chains, A, x, 3)
-        loose = turn_columns(model.chains, A, F, size)
-    triangularise(F, loose, loose, size, size, 0, 0, scratch.lines[WORK])
+        turn_columns(model.chains, A, F, len(x) + 3)
 
 
 # --------------------------------------------------------------------------------------------------------------- the filter without a gate
 
 
 def begin(body):
-    """Return the attitude and the number of segments."""
+    """Return the attitude, the number of segments, and how many steps the factor is behind by."""
     # From an array, and not the literal 0: numba would compile the body for that type too.
-    return load(body, 0), 0 * len(body.length)
+    none = 0 * len(body.length)
+    return load(body, 0), none, none
 
 
 def is_small(state, part, dt, body):
@@ -278,16 +300,22 @@ def longest_step(state, part, dt, body):
 
 def predict(state, part, dt, body, out):
     """Propagate, and store what a smoother needs."""
-    q, segments = state
+    q, segments, behind = state
+    model, scratch, x, F = body.model, body.scratch, body.x[0], body.F[0]
     if segments < len(out.segments):
-        store_segment(out.segments, segments, dt, part, q, body.x[0], body.F[0], body.F.shape[2])
+        store_prediction(body, 0, q, segments, part, dt, out)
         segments += 1
-    return advance(body.model, body.scratch, q, body.x[0], body.F[0], dt, part), segments
+    q = step(model, scratch, q, x, dt, part, behind > 0)
+    behind += 1
+    if not body.together:
+        absorb(model, scratch, x, F, dt)
+        behind = 0 * behind
+    return q, segments, behind
 
 
 def update(state, e, now, measured, body, out):
     """Update with a measurement."""
-    q, segments = state
+    q, segments, behind = state
     model, scratch, x, F = body.model, body.scratch, body.x[0], body.F[0]
     H, y, spread, step, work = (
         scratch.rows[0],
@@ -297,6 +325,8 @@ def update(state, e, now, measured, body, out):
         scratch.lines[WORK],
     )
     size = len(x) + 3
+    if behind > 0:
+        absorb(model, scratch, x, F, 0.0)
     place = measured.place[e]
     s = measured.sensor[e]
     kind = measured.series[s, KIND]
@@ -325,13 +355,13 @@ def update(state, e, now, measured, body, out):
             elif kind == DIRECTION:
                 basis = scratch.threes[2:]
                 spread[r] *= basis[r, 0] ** 2 + basis[r, 1] ** 2 + basis[r, 2] ** 2
-    for i in range(size):
+    for i in range(len(step)):
         step[i] = 0.0
     for r in range(rows):
         error = y[r]
-        for i in range(size):
-            error -= H[r, i] * step[i]  # what the rows before it have corrected
-        s2 = take_row(F, size, H, r, spread[r], work)
+        if r > 0:
+            error -= dot_rows(H, r, scratch.lines, STEP)  # what the rows before it have corrected
+        s2 = take_row(F, size, loose(model), H, r, spread[r], work, scratch.lines[ROWS:])
         for i in range(size):
             step[i] += error / s2 * work[i]
         out.innovation[place, 2 * r] = error
@@ -349,8 +379,8 @@ def update(state, e, now, measured, body, out):
     for i in range(len(x)):
         x[i] += step[3 + i]
     turn_rows(F, size, G)
-    settle(model, scratch, F, before, q, x)
-    return q, segments
+    settle(model, F, before, q, x)
+    return q, segments, 0 * behind
 
 
 def seen_rows(form, e, q, x, kind, z, frame, sensor):
@@ -382,8 +412,14 @@ def seen_rows(form, e, q, x, kind, z, frame, sensor):
 
 
 def keep(state, row, e, body, out):
-    """Write a row."""
-    keep_row(body, state[0], row, out)
+    """Write a row; the factor stays as far behind, so that what it becomes does not depend on the rows that are kept."""
+    q, _, behind = state
+    if behind > 0:
+        for j in range(len(body.x[0]) + 3):
+            for c in range(body.F.shape[2]):
+                body.F[1, j, c] = body.F[0, j, c]
+        absorb(body.model, body.scratch, body.x[0], body.F[1], 0.0)
+    write_row(body, 1 if behind > 0 else 0, q, row, out)
     return state
 
 
@@ -394,8 +430,11 @@ def stopped(state):
 
 def finish(state, row, e, body):
     """Leave the end state and return the number of segments."""
-    save(body, 0, state[0])
-    return state[1]
+    q, segments, behind = state
+    if behind > 0:
+        absorb(body.model, body.scratch, body.x[0], body.F[0], 0.0)
+    save(body, 0, q)
+    return segments
 
 
 # --------------------------------------------------------------------------------------------------------------------------- for the gate
@@ -415,7 +454,7 @@ def save(form, i, q):
 
 def become(form):
     """Let the filter be what the restart candidate is."""
-    size = form.F.shape[2]
+    size = form.x.shape[1] + 3
     save(form, 0, load(form, 1))
     for j in range(size - 3):
         form.x[0, j] = form.x[1, j]
@@ -451,14 +490,14 @@ def propagate(form, i, q, part, dt):
 
 def store_prediction(form, i, q, k, part, dt, out):
     """Write what a smoother needs of a prediction."""
-    store_segment(out.segments, k, dt, part, q, form.x[i], form.F[i], form.F.shape[2])
+    store_segment(out.segments, k, dt, part, q, form.x[i], form.F[i], loose(form.model))
 
 
 def attitude_covariance(form, i, q):
     """Return the covariance of the attitude (6-tuple)."""
     F = form.F[i]
     s00 = s01 = s02 = s11 = s12 = s22 = 0.0
-    for j in range(F.shape[1]):
+    for j in range(form.x.shape[1] + 3):
         a, b, c = F[j, 0], F[j, 1], F[j, 2]
         s00 += a * a
         s01 += a * b
@@ -485,7 +524,7 @@ def linearised(form, i, e, now_q, q, M, z, frame, noise, kind, sensor, prior):
     """
     model, scratch = form.model, form.scratch
     H, y, spread, prior_H = scratch.rows[0], scratch.threes[0], scratch.threes[1], scratch.rows[1]
-    size = form.F.shape[2]
+    size = form.x.shape[1] + 3
     now_x = scratch.lines[NOW_X, : size - 3]
     rows = seen_rows(form, e, now_q, now_x, kind, z, frame, sensor)
     far, along = seen_from_afar(kind, z, rows, y, scratch.threes[2:])
@@ -495,6 +534,9 @@ def linearised(form, i, e, now_q, q, M, z, frame, noise, kind, sensor, prior):
         C = arm_noise(now_x, sensor, model.sensors, model.sensor_use, form.length[e], arm, noise)
     decorrelate(H, y, rows, scratch.threes[2:], C, spread)
     p0 = p1 = p2 = 0.0
+    for j in range(size, H.shape[1]):
+        for r in range(3):
+            prior_H[r, j] = 0.0
     for j in range(size):
         for r in range(3):
             prior_H[r, j] = H[r, j]
@@ -529,14 +571,10 @@ def seen_from_afar(kind, z, rows, y, basis):
 def innovation_covariance(form, i, q, rows):
     """Return H P Hᵀ (6-tuple), rows that are not there as zeros; leave ``F Hᵀ`` in ``seen``."""
     F, H, seen = form.F[i], form.scratch.rows[1], form.scratch.rows[2]
-    size = form.F.shape[2]
+    size = form.x.shape[1] + 3
     for r in range(3):
         for j in range(size):
-            total = 0.0
-            if r < rows:
-                for c in range(j + 1):
-                    total += F[j, c] * H[r, c]
-            seen[r, j] = total
+            seen[r, j] = dot_rows(F, j, H, r) if r < rows else 0.0
     s00 = s01 = s02 = s11 = s12 = s22 = 0.0
     for j in range(size):
         a, b, c = seen[0, j], seen[1, j], seen[2, j]
@@ -556,12 +594,12 @@ def step_of(form, i, state, rows, u, M, prior, q, now_q):
     """
     scratch, F = form.scratch, form.F[i]
     step, seen, H = scratch.lines[STEP], scratch.rows[2], scratch.rows[0]
-    size = form.F.shape[2]
+    size = form.x.shape[1] + 3
     for j in range(size):
         step[j] = 0.0
     for j in range(size):
         w = u[0] * seen[0, j] + u[1] * seen[1, j] + u[2] * seen[2, j]
-        for c in range(j + 1):
+        for c in range(size):
             step[c] += F[j, c] * w
     step[0], step[1], step[2] = matrix_times_vector(M, (step[0], step[1], step[2]))
     if len(form.model.chains) > 0:
@@ -596,15 +634,14 @@ def correct(form, i, q, rows, e, variance):
     """Update with independent rows of innovations e (3,), prior's tangent space; return q and the attitude's correction."""
     scratch, x, F = form.scratch, form.x[i], form.F[i]
     H, step, work = scratch.rows[1], scratch.lines[STEP], scratch.lines[WORK]
-    size = form.F.shape[2]
-    for j in range(size):
+    size = form.x.shape[1] + 3
+    for j in range(len(step)):
         step[j] = 0.0
     for r in range(rows):
         left = e[0] if r == 0 else (e[1] if r == 1 else e[2])
         noise = variance[0] if r == 0 else (variance[1] if r == 1 else variance[2])
-        for j in range(size):
-            left -= H[r, j] * step[j]  # what the rows before it have corrected
-        s2 = take_row(F, size, H, r, noise, work)
+        left -= dot_rows(H, r, scratch.lines, STEP)  # what the rows before it have corrected
+        s2 = take_row(F, size, loose(form.model), H, r, noise, work, scratch.lines[ROWS:])
         for j in range(size):
             step[j] += left / s2 * work[j]
     for j in range(len(x)):
@@ -614,13 +651,13 @@ def correct(form, i, q, rows, e, variance):
 
 def turn_tangent(form, i, q, M):
     """Carry the factor to another tangent space by M, no triangle then."""
-    turn_rows(form.F[i], form.F.shape[2], M)
+    turn_rows(form.F[i], form.x.shape[1] + 3, M)
     return q
 
 
 def set_attitude(form, i, state, q, before):
-    """Bring the factor back to a triangle at the corrected attitude, with what goes along."""
-    settle(form.model, form.scratch, form.F[i], before, q, form.x[i])
+    """Turn what goes along with the corrected attitude."""
+    settle(form.model, form.F[i], before, q, form.x[i])
     return q
 
 
@@ -632,12 +669,13 @@ def start_candidate(form, memory, now, attitude_sigma, restart):
     """
     model, scratch, x, F = form.model, form.scratch, form.x, form.F
     decay, density, chains, fresh = model.decay, model.density, model.chains, restart.fresh
-    size = F.shape[2]
+    size = x.shape[1] + 3
     age = now - restart.time
     width = restart_width(memory)
     m = len(restart.values)
+    triangularise(F[0], loose(model), loose(model), size, size, 0, 0, scratch.lines[WORK])
     for r in range(3 * m + 6):
-        for c in range(3 + m):
+        for c in range(fresh.shape[1]):
             fresh[r, c] = 0.0
     for r in range(3):
         fresh[r, r] = width * restart.bias_sigma[r]
@@ -659,7 +697,7 @@ def start_candidate(form, memory, now, attitude_sigma, restart):
             fresh[3 + 2 * m + r, c] = F[0, 3 + r, 3 + c]
     triangularise(fresh, 3 + m, 0, 3 + m, 3 * m + 6, 0, 0, scratch.lines[WORK])
     for r in range(size):
-        for c in range(size):
+        for c in range(F.shape[2]):
             F[1, r, c] = 0.0
     for r in range(3):
         F[1, r, r] = restart_attitude(attitude_sigma, memory)
@@ -761,7 +799,7 @@ def widen(form, memory):
     more of the factor.
     """
     scratch, x, F = form.scratch, form.x[1], form.F[1]
-    size = F.shape[1]
+    size = len(x) + 3
     if not may_widen(bias_variances(F, size), memory):
         return
     column = scratch.lines[PRIOR]
@@ -769,7 +807,7 @@ def widen(form, memory):
     for i in range(3):
         for c in range(size):
             column[c] = 0.0
-            for j in range(max(c, 3 + i), size):
+            for j in range(size):
                 column[c] += F[j, c] * F[j, 3 + i]
         inverse = start_undone(i, column[3 + i], memory)
         share = inverse * (memory[FIRST_BIAS + i] - x[i])
@@ -779,11 +817,11 @@ def widen(form, memory):
         root = math.sqrt(-inverse)
         for c in range(size):
             F[size, c] = root * column[c]
-        triangularise(F, size, 0, size, size + 1, 0, 0, scratch.lines[WORK])
+        triangularise(F, size, loose(form.model), size, size + 1, 0, 0, scratch.lines[WORK])
     before = load(form, 1)
     q, G = seen_from(turn, attitude_covariance(form, 1, before))
     after = quaternion_multiply(before, q)
     turn_rows(F, size, G)
-    settle(form.model, scratch, F, before, after, x)
+    settle(form.model, F, before, after, x)
     save(form, 1, after)
     count_widening(memory)

@@ -17,19 +17,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from strapdown.kernels.chains import LINKS, carry_chains_back
+from strapdown.kernels.chains import LINKS, carry_chains_back, step_chains
 from strapdown.kernels.error_state_step import (
     carry,
     carry_back,
+    fill_noise,
     fixed_turn,
     move,
+    step_noise,
     turn_columns,
     turn_rows,
     turn_values,
 )
-from strapdown.kernels.root_form import step_noise
+from strapdown.kernels.lane_values import WIDTH, load, spread, store
+from strapdown.kernels.root_form import loose
 from strapdown.kernels.rotation import inverse_right_jacobian, logarithm, moved, quaternion_multiply
-from strapdown.kernels.triangle import covariances, triangularise, variances
+from strapdown.kernels.triangle import covariances, padded, triangularise, variances
 
 CALLED = ("load_segment",)
 
@@ -51,24 +54,25 @@ class Passes(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """Scratch of n states, p rows of noise and several passes that go together."""
+    """Scratch of n states, p rows of noise and several passes that go together; columns are :func:`strapdown.kernels.triangle.padded`."""
 
     links: np.ndarray
     x: np.ndarray
     """(n − 3,), the predicted values of a segment."""
     F: np.ndarray
-    """(n + p, n + p)"""
+    """(n + p, columns for n and p)"""
     noise: np.ndarray
-    """(p, n): the rows of noise of a segment."""
+    """(p, columns for n): the rows of noise of a segment."""
     gain: np.ndarray
-    """(n, p): ``Y S⁻⁻¹``, transposed."""
+    """(n, columns for p): ``Y S⁻⁻¹``, transposed."""
     left: np.ndarray
-    """(p, n): ``Z N``."""
-    coupling: np.ndarray
+    """(p, columns for n): ``Z N``."""
+    step: np.ndarray
+    """(2, n, 4): Φ and Q of a segment, as in :class:`strapdown.kernels.root_form.Scratch`."""
     factor: np.ndarray
     work: np.ndarray
     later_q: np.ndarray
-    """Of each pass, what is known at the end of the segment: attitude (4,), x (n − 3,), and the triangle (n + p + 1, n)."""
+    """Of each pass, what is known at the end of the segment: attitude (4,), x (n − 3,), and the triangle (n + p + 1, columns for n)."""
     later_x: np.ndarray
     later_F: np.ndarray
 
@@ -86,79 +90,100 @@ class Outputs(NamedTuple):
 def workspace(states, rows, chained, together):
     """Return room for so many error states, rows of noise and passes at once."""
     size = 6 + states
-    prepared = np.empty((2, rows, size))
+    width = padded(size)
+    both = width + padded(rows)
     return Workspace(
         links=np.empty((chained, LINKS)),
         x=np.empty(size - 3),
-        F=np.empty((size + rows, size + rows)),
-        noise=prepared[0],
-        gain=np.empty((size, rows)),
-        left=prepared[1],
-        coupling=np.empty((states, 3)),
+        F=np.zeros((size + rows, both)),
+        noise=np.zeros((rows, width)),
+        gain=np.empty((size, both - width)),
+        left=np.zeros((rows, width)),
+        step=np.zeros((2, size, 4)),
         factor=np.empty(states),
-        work=np.empty(size + rows),
+        work=np.zeros(both),
         later_q=np.empty((together, 4)),
         later_x=np.empty((together, size - 3)),
-        later_F=np.empty((together, size + rows + 1, size)),
+        later_F=np.zeros((together, size + rows + 1, width)),
     )
 
 
-def load_segment(segments, k, x, F, size):
-    """Read x and the triangle of row k; return the attitude."""
+def load_segment(segments, k, x, F, loose):
+    """Read x and the factor of row k; return the attitude."""
     place = 8
     for i in range(len(x)):
         x[i] = segments[k, place + i]
     place += len(x)
+    size = len(x) + 3
     for j in range(size):
-        for i in range(j + 1):
+        end = max(j + 1, loose)
+        for i in range(end):
             F[j, i] = segments[k, place + i]
-        for i in range(j + 1, size):
+        for i in range(end, size):
             F[j, i] = 0.0
-        place += j + 1
+        place += end
     return (segments[k, 4], segments[k, 5], segments[k, 6], segments[k, 7])
 
 
 def prepare_step(segments, j, model, space):
-    """Prepare what segment j makes of any later knowledge; return the predicted attitude, Φ11, Φ12 and the rows of F in use.
+    """Prepare what segment j makes of any later knowledge; return the predicted attitude, Φ11 and the rows of F in use.
 
     Leaves ``noise``, ``gain``, ``left`` and ``x`` of the work space, and Φ's own numbers there.
     """
     x, F, noise, gain, left = space.x, space.F, space.noise, space.gain, space.left
-    coupling, factor, work = space.coupling, space.factor, space.work
-    gyro_use, changing = model.gyro_use, model.changing
+    top, driven, factor, work = space.step[0], space.step[1], space.factor, space.work
     size = len(x) + 3
-    noisy = 6 + changing
-    q = load_segment(segments, j, x, F, size)
+    noisy = 6 + model.changing
+    width, room = noise.shape[1], gain.shape[1]
+    q = load_segment(segments, j, x, F, loose(model))
     dt = segments[j, 0]
     part = (segments[j, 1], segments[j, 2], segments[j, 3])
-    predicted, phi11, phi12, rate, D = move(
-        q, x, dt, part, model.decay, model.gyro, gyro_use, model.force_f, coupling, factor
+    predicted, phi11, rate, D = move(
+        q, x, dt, part, model.decay, model.gyro, model.gyro_use, model.force_f, top, factor
     )
-    carry(F, 0, size, phi11, phi12, coupling, factor, gyro_use, changing)
-    rows = step_noise(model, space.links, F, size, dt, rate, D, x)
-    p = rows - size
-    for r in range(p):
-        for i in range(size):
-            noise[r, i] = F[size + r, i]
-    for r in range(size + p):
-        for i in range(size, size + p):
-            F[r, i] = 1.0 if r == i else 0.0
-    triangularise(F, noisy, 3, size, rows, size, rows, work)
-    for c in range(size):
-        for w in range(p):
-            work[w] = F[c, size + w]
-        for i in range(c):
-            for w in range(p):
-                work[w] -= gain[i, w] * F[c, i]
-        for w in range(p):
-            gain[c, w] = work[w] / F[c, c]
-    for r in range(p):
-        for i in range(size):
-            left[r, i] = 0.0
-        for w in range(p):
-            for i in range(noisy):
-                left[r, i] += F[size + r, size + w] * noise[w, i]
-    return predicted, phi11, phi12, rows
+    carry(F, size, loose(model), top, factor, model.changing)
+    for k in range(model.changing):
+        factor[k] = 1.0 / factor[k]  # as the way back needs it
+    step_noise(
+        driven,
+        dt,
+        rate,
+        D,
+        model.angle_variance,
+        model.rate_variance,
+        model.decay,
+        model.density,
+        model.gyro,
+        model.gyro_use,
+    )
+    rows = fill_noise(F, size, driven, noisy)
+    if len(model.chains) > 0:
+        rows = step_chains(F, size, rows, x, dt, model.decay, model.chains, space.links)
+    for r in range(rows):
+        for c in range(width, width + room, WIDTH):
+            store(F, (width + room) * r + c, spread(0.0))
+    for r in range(rows - size):
+        F[size + r, width + r] = 1.0
+        for c in range(0, width, WIDTH):
+            store(noise, width * r + c, load(F, (width + room) * (size + r) + c))
+    triangularise(F, noisy, loose(model), size, rows, width, width + room, work)
+    for i in range(size):
+        for c in range(0, room, WIDTH):
+            store(gain, room * i + c, load(F, (width + room) * i + width + c))
+    for i in range(size):
+        inverse = 1.0 / F[i, i]
+        for c in range(0, room, WIDTH):
+            g = inverse * load(gain, room * i + c)
+            store(gain, room * i + c, g)
+            for r in range(i + 1, size):
+                store(gain, room * r + c, load(gain, room * r + c) - F[r, i] * g)
+    for r in range(rows - size):
+        for c in range(0, noisy, WIDTH):
+            z = spread(0.0)
+            for w in range(rows - size):
+                z = z + F[size + r, width + w] * load(noise, width * w + c)
+            store(left, width * r + c, z)
+    return predicted, phi11, rows
 
 
 def step_back(segments, j, prepared, model, space, pass_, later_q):
@@ -166,13 +191,13 @@ def step_back(segments, j, prepared, model, space, pass_, later_q):
 
     The pass's ``later_x`` and ``later_F`` are left there.
     """
-    predicted, phi11, phi12, rows = prepared
+    predicted, phi11, rows = prepared
     x, noise, gain, left, work = space.x, space.noise, space.gain, space.left, space.work
     later_x, later_F = space.later_x[pass_], space.later_F[pass_]
     chains, changing = model.chains, model.changing
     size = len(x) + 3
     noisy = 6 + changing
-    p = rows - size
+    width, room = noise.shape[1], gain.shape[1]
     # From the tangent space at the smoothed attitude to that at the predicted one: exp(a) ⊗ exp(ε) = exp(a + J_r(a)⁻¹ ε).
     inverse = (predicted[0], -predicted[1], -predicted[2], -predicted[3])
     a = logarithm(quaternion_multiply(inverse, later_q))
@@ -185,24 +210,25 @@ def step_back(segments, j, prepared, model, space, pass_, later_q):
     later_F[rows, 0], later_F[rows, 1], later_F[rows, 2] = a
     for i in range(len(x)):
         later_F[rows, 3 + i] = later_x[i] - x[i]
-    for r in range(p):
-        for i in range(size):
-            later_F[size + r, i] = left[r, i]
+    for r in range(rows - size):
+        for c in range(0, width, WIDTH):
+            store(later_F, width * (size + r) + c, load(left, width * r + c))
     for r in range(rows + 1):
         if r < size or r == rows:
-            for w in range(p):
-                work[w] = 0.0
-            for i in range(size):
-                f = later_F[r, i]
-                if f != 0.0:
-                    for w in range(p):
-                        work[w] += gain[i, w] * f
-            for w in range(p):
-                for i in range(noisy):
-                    later_F[r, i] -= work[w] * noise[w, i]
+            used = size if r == rows else max(r + 1, loose(model))
+            for c in range(0, room, WIDTH):
+                told = spread(0.0)
+                for i in range(used):
+                    told = told + later_F[r, i] * load(gain, room * i + c)
+                store(work, c, told)
+            for c in range(0, noisy, WIDTH):
+                t = load(later_F, width * r + c)
+                for w in range(rows - size):
+                    t = t - work[w] * load(noise, width * w + c)
+                store(later_F, width * r + c, t)
     if len(chains) > 0:
         carry_chains_back(later_F, 0, rows + 1, space.links)
-    carry_back(later_F, 0, rows + 1, phi11, phi12, space.coupling, space.factor, model.gyro_use, changing)
+    carry_back(later_F, size, rows + 1, phi11, space.step[0], space.factor, changing)
     filtered = (segments[j, 4], segments[j, 5], segments[j, 6], segments[j, 7])
     q, J = moved(filtered, (later_F[rows, 0], later_F[rows, 1], later_F[rows, 2]))
     for i in range(len(x)):
@@ -230,11 +256,11 @@ def smooth_augmented(passes, model, space, out):
         s = starts[last[begin + joining]]
         while True:
             while joining >= 0 and starts[last[begin + joining]] == s:
-                q = load_segment(segments, s, later_x[joining], later_F[joining], size)
+                q = load_segment(segments, s, later_x[joining], later_F[joining], loose(model))
                 later_q[joining, 0], later_q[joining, 1], later_q[joining, 2], later_q[joining, 3] = q
                 joining -= 1
             while leaving >= 0 and starts[edge] == s:
-                write_smoothed(out, edge, later_q[leaving], later_x[leaving], later_F[leaving], size)
+                write_smoothed(out, edge, later_q[leaving], later_x[leaving], later_F[leaving], size, space.work)
                 if edge > first[begin + leaving]:
                     edge -= 1
                 else:
@@ -250,12 +276,12 @@ def smooth_augmented(passes, model, space, out):
                 later_q[i, 0], later_q[i, 1], later_q[i, 2], later_q[i, 3] = q
 
 
-def write_smoothed(out, edge, q, x, F, size):
+def write_smoothed(out, edge, q, x, F, size, work):
     """Write a smoothed state to the row of an edge."""
     for i in range(4):
         out.attitude[edge, i] = q[i]
     for i in range(len(x)):
         out.x[edge, i] = x[i]
-    variances(F, size, out.variance, edge)
+    variances(F, size, out.variance, edge, work)
     if edge < len(out.covariance):
-        covariances(F, size, out.covariance, edge)
+        covariances(F, size, out.covariance, edge, work)

@@ -424,7 +424,9 @@ def run(
     error_states = states.blocks({series.sensor: series.kind for series in record.vectors})
     state = initial if len(initial.values) else initial_state(initial, error_states)
     problem = forward.prepared(record, process_noise, state, error_states, driven=True)
-    options = forward.Options(every=every, full_covariance=full_covariance, gate=gate, robust=robust, whole_bias=True)
+    options = forward.Options(
+        every=every, full_covariance=full_covariance, gate=gate, robust=robust, whole_bias=True, together=True
+    )
     found = forward.filtered(problem, options).estimate
     assert found.whole_bias is not None
     assert found.whole_bias_variance is not None
