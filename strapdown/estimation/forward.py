@@ -157,7 +157,7 @@ def run(
     error_states : sequence of ErrorStates
         States beside attitude and gyro bias. Default: none.
     every : int
-        Keep the state at every ``every``-th edge, the first included.
+        Keep the state at every ``every``-th edge, the first included. With error states the rows of different ``every`` agree to rounding.
     full_covariance : bool
         Keep whole covariance matrices too.
     gate : Gate, optional

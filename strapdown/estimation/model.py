@@ -310,7 +310,7 @@ def lower(root: Array) -> Array:
     """Return the lower triangle F with the same ``Fᵀ F``."""
     if np.array_equal(root, np.tril(root)):
         return root
-    return np.ascontiguousarray(np.linalg.qr(root[:, ::-1], mode="r")[::-1, ::-1])
+    return np.ascontiguousarray(np.asarray(np.linalg.qr(root[:, ::-1], mode="r"))[::-1, ::-1])
 
 
 def turning_matrix(chains: Array, size: int, before: Array, after: Array) -> Array:
