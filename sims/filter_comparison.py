@@ -352,7 +352,7 @@ def main(
 
 def ours(recording: Recording, gain: float) -> tuple[Array, Array]:
     """Return the stamps and attitudes of ``strapdown estimate``."""
-    chosen = replace(HAND_HELD, velocity_sigma=HAND_HELD.velocity_sigma / gain)
+    chosen = replace(HAND_HELD, velocity_from_record=False, velocity_sigma=HAND_HELD.velocity_sigma / gain)
     found = ahrs.estimate(recording, chosen)
     return found.recording.time, found.estimate.attitude
 

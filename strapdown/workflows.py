@@ -355,9 +355,12 @@ def estimate(
         _refuse("a record", setup=setup, initial=initial, states=states or None)
         for words in ahrs.doctor.at_rest(source):
             warnings.warn(f"{source.source}: {words}", stacklevel=2)
+        parameters = _recording_parameters(motion, noise)
+        if isinstance(noise, GyroSpec) and noise.temperature is not None:
+            source, parameters = ahrs.without_temperature(source, parameters, noise.temperature, walks=smooth)
         found = ahrs.estimate(
             source,
-            _recording_parameters(motion, noise),
+            parameters,
             latency=latency,
             calibration=calibration,
             gate=gate,
@@ -430,7 +433,8 @@ def _recording_parameters(motion: str | None, noise: GyroSpec | NoiseFit | Proce
 def with_gyro_noise(parameters: ahrs.AhrsParameters, spec: GyroSpec) -> ahrs.AhrsParameters:
     """Return the model of a recorded unit with the noise of its gyro; flicker is matched for the filter of the tilt."""
     density = (parameters.specific_force_noise / units.STANDARD_GRAVITY) ** 2  # rad² s
-    return dataclasses.replace(parameters, **gyro.matched_process_noise(spec, density))
+    noise: dict[str, Any] = gyro.matched_process_noise(spec, density)
+    return dataclasses.replace(parameters, **noise)
 
 
 def _record_setup(

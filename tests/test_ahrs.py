@@ -15,7 +15,15 @@ from strapdown.ahrs import AhrsParameters, estimating
 from strapdown.checks import InputError
 from strapdown.consistency import reference_errors
 from strapdown.recordings import Recording, hard_iron, read, sensor_delays
-from strapdown.records import Estimate, Innovations
+from strapdown.records import (
+    Estimate,
+    Innovations,
+    read_attributes,
+    read_estimate,
+    read_reference,
+    write_estimate,
+)
+from strapdown.report import findings
 from strapdown.units import DEGREE
 
 RATE = 200.0
@@ -577,11 +585,11 @@ def test_the_inclinations_sigma_is_neither_too_small_nor_too_large(broad, smooth
     assert min(held) > 0.8, held
 
 
-def test_the_tilts_sigma_follows_the_level_of_the_acceleration():
-    """The share of the modelled variance that is left, in closed form: of no acceleration, and after a turn that is uncertain."""
+def test_the_level_of_the_acceleration_and_the_innovations_variance_by_it():
+    """In closed form: of no acceleration, after a turn that is uncertain, and of as much as modelled."""
     steps, interval = 4000, 0.03
     time = interval * np.arange(steps + 1)
-    seen = Innovations(time=time[1:], innovation=np.zeros((steps, 3)), variance=np.ones((steps, 3)))
+    seen = Innovations(time=time[1:], innovation=np.zeros((steps, 3)), variance=np.full((steps, 3), 2.0))
     nothing = np.zeros((steps + 1, 6))
     still = Estimate(
         time=time,
@@ -591,14 +599,55 @@ def test_the_tilts_sigma_follows_the_level_of_the_acceleration():
         innovations={"accelerometer": seen},
     )
     uncertain = np.arange(steps) == 2999
-    share = estimating._tilt_scale(still, uncertain) ** 2
-    own, level = estimating.OWN_SHARE, estimating.ACCELERATION_SHARE
+    level = estimating._level(still, uncertain)
     since = np.minimum(time, np.where(time >= time[3000], time - time[3000], np.inf))
-    expected = own + level * np.exp(-0.5 * since / estimating.LEVEL_TIME)
-    np.testing.assert_allclose(share, expected, rtol=1e-9)
-    moved = dataclasses.replace(seen, innovation=np.ones((steps, 3)))
+    np.testing.assert_allclose(level, np.exp(-since / estimating.LEVEL_TIME), rtol=1e-9)
+    variance = estimating._innovations(still, level)["accelerometer"].variance
+    own = estimating.OWN_SHARE
+    np.testing.assert_allclose(variance[:, 0], 2.0 * (own + (1.0 - own) * level[:-1]), rtol=1e-12)
+    moved = dataclasses.replace(seen, innovation=np.full((steps, 3), np.sqrt(2.0)))
     as_modelled = dataclasses.replace(still, innovations={"accelerometer": moved})
-    np.testing.assert_allclose(estimating._tilt_scale(as_modelled, uncertain) ** 2, own + level, rtol=1e-12)
+    np.testing.assert_allclose(estimating._level(as_modelled, uncertain), 1.0, rtol=1e-12)
+
+
+def test_the_velocity_of_a_hand_is_that_which_the_recording_shows():
+    """A sine of 3 m/s² along one axis over ten of sixty seconds: its RMS over the three axes is 3/√6, whatever the rest and its turns."""
+    plain = recording(60.0, noise=0.0)
+    since = plain.time - plain.time[0]
+    push = np.where((since > 20.0) & (since < 30.0), 3.0 * np.sin(2.0 * np.pi * since), 0.0)
+    inverse = quaternion.conjugate(plain.true_attitude)
+    force = plain.specific_force + quaternion.rotate(inverse, push[:, None] * np.array([0.6, 0.0, 0.8]))
+    moved = dataclasses.replace(plain, specific_force=force)
+    expected = 3.0 / np.sqrt(6.0) * np.sqrt(ahrs.HAND_HELD.velocity_time * ahrs.HAND_HELD.acceleration_time)
+    assert ahrs.estimate(moved, latency=0.0).parameters.velocity_sigma == pytest.approx(expected, rel=0.05)
+    assert ahrs.estimate(plain, latency=0.0).parameters.velocity_sigma == 0.1
+    own = dataclasses.replace(ahrs.HAND_HELD, velocity_from_record=False, velocity_sigma=0.7)
+    assert ahrs.estimate(moved, own, latency=0.0).parameters == own
+
+
+def test_innovations_of_broad_are_as_large_as_their_variance_says(broad):
+    """NIS per degree of freedom; between 0.005 and 0.35 with one motion for all."""
+    found = [hand_held.ours(read(file), 4.1e-3)[1].nis[0] for file in sorted(broad.glob("*.hdf5"))]
+    assert 0.2 < min(found) < max(found) < 0.9, found
+
+
+def test_an_estimate_is_judged_by_the_reference_kept_beside_it(tmp_path):
+    """A reference that is missing at first and at last; turned about the level by 20°, it contradicts the estimate."""
+    plain = recording(60.0, noise=1.0)
+    result = ahrs.estimate(plain, latency=0.0, full_covariance=True)
+    turned = quaternion.multiply(quaternion.exp([np.deg2rad(20.0), 0.0, 0.0]), result.recording.true_attitude)
+    verdicts = []
+    for reference in (2.0 * result.recording.true_attitude, turned):
+        known = reference.copy()
+        known[:300] = known[-7:] = np.nan
+        path = tmp_path / "estimate.h5"
+        write_estimate(path, result.estimate, {"motion": "hand"}, reference=known)
+        read_back = read_reference(path)
+        np.testing.assert_array_equal(np.isnan(read_back.attitude), np.isnan(known))
+        np.testing.assert_allclose(np.linalg.norm(read_back.attitude[300:-7], axis=1), 1.0, rtol=1e-12)
+        judged = findings.judged(path, read_attributes(path), read_estimate(path), None, probability=0.99)
+        verdicts.append(judged.verdict)
+    assert verdicts == ["consistent", "not consistent"]
 
 
 def test_a_disturbed_field_leaves_the_heading_of_a_recording(broad):

@@ -495,7 +495,7 @@ def off(folder, shift):
 def test_a_recording_is_taken_for_that_of_a_hand(run, recording, tmp_path):
     status, said, error = run("estimate", recording, "--out", tmp_path / "out")
     assert (status, error) == (0, "")
-    assert "Motion: of a hand, 1 m/s with a correlation time of 0.3 s." in said
+    assert "Motion: of a hand, 0.1 m/s, as the recording shows, with a correlation time of 0.3 s." in said
     assert "°/s, from that second." in said
     assert "Samples are assumed to be stamped 2.5 ms late, half a sample interval, σ 2 ms" in said
     assert "warning" not in said
@@ -508,7 +508,7 @@ def test_a_recording_is_taken_for_that_of_a_hand(run, recording, tmp_path):
         False,
         pytest.approx(0.0025),
     )
-    assert setup.from_toml(attributes["filter"]) == ahrs.HAND_HELD.setup
+    assert setup.from_toml(attributes["filter"]) == dataclasses.replace(ahrs.HAND_HELD, velocity_sigma=0.1).setup
     assert off(tmp_path / "out", 0.0) < 1.5
 
 

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import strapdown as sd
 from strapdown import allan, gyro, recordings, records, scenarios
 from strapdown.allan import parameters as noise_parameters
 from strapdown.checks import InputError
@@ -216,6 +217,8 @@ def test_the_bias_over_temperature_is_subtracted_and_its_error_becomes_a_walk():
     assert walk == pytest.approx(2e-4 * rise * np.sqrt(60.0), rel=1e-12)  # 3 K, which it takes 60 s for
     assert "40 samples are beyond 20 to 27 °C" in found.remarks[-1]
     np.testing.assert_allclose(table.slope_sigma, [0.0, 0.0, 2e-4])
+    bent = from_table({**given, "sigma_rad_per_s_per_k2": [0.0, 3e-5, 3e-5]}, "file")  # 2 σ₂ (T − T₀) at 20 °C, 5 K off
+    np.testing.assert_allclose(bent.slope_sigma, [0.0, 3e-4, np.hypot(2e-4, 3e-4)])
     # A thermometer that is slower than the gyro: between its samples the line.
     slow = np.where(np.arange(101) % 10 == 0, T, np.nan)
     np.testing.assert_allclose(
@@ -277,7 +280,7 @@ def test_a_simulated_unit_goes_through_allan_and_its_table_into_the_filter(run, 
     sigma_m_per_s2 = 0.01
     """
     (tmp_path / "lab.toml").write_text(rest.format(duration=300.0, bias=[0.0] * 3, start=20.0, end=40.0))
-    (tmp_path / "use.toml").write_text(rest.format(duration=60.0, bias=[360.0, 0.0, -360.0], start=38.0, end=22.0))
+    (tmp_path / "use.toml").write_text(rest.format(duration=60.0, bias=[360.0, 0.0, -360.0], start=38.0, end=12.0))
     for name in ("lab", "use"):
         assert run("simulate", f"{name}.toml")[0] == 0
     status, _, error = run("allan", "lab.h5", "--temperature", 2)
@@ -297,6 +300,13 @@ def test_a_simulated_unit_goes_through_allan_and_its_table_into_the_filter(run, 
     estimate = records.read_estimate(tmp_path / "estimate-results" / "estimate.h5")
     slope = records.read_states(tmp_path / "estimate-results" / "estimate.h5")["gyro temperature"]
     assert (slope.sigma[0] < 1e-4).all()
+    # The two files in one, as the gyro's noise, do the same.
+    (tmp_path / "whole.toml").write_text(text + path.read_text())
+    again = sd.estimate(recordings.read(tmp_path / "use.db3"), noise=gyro.read_spec(tmp_path / "whole.toml"))
+    assert run("estimate", "use.db3", "--gyro", "whole.toml")[0] == 0
+    by_command = records.read_estimate(tmp_path / "estimate-results" / "estimate.h5")
+    np.testing.assert_array_equal(again.bias, by_command.bias)
+    np.testing.assert_allclose(again.bias[-1], estimate.bias[-1], atol=3.0 * estimate.sigma[-1, 3])
     # About the two level axes, which the accelerometer shows: the bias at turn-on, and c_0 has no interval.
     error = np.abs(estimate.bias[-1] - np.array([360.0, 0.0, -360.0]) * DEGREE_PER_HOUR)
     assert (error < 4.0 * estimate.sigma[-1, 3:])[:2].all()

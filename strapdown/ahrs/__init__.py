@@ -15,6 +15,7 @@ from strapdown.ahrs.parameters import HAND_HELD as HAND_HELD
 from strapdown.ahrs.parameters import MOTIONS, AhrsParameters
 from strapdown.ahrs.preparing import Prepared as Prepared
 from strapdown.ahrs.preparing import prepare as prepare
+from strapdown.ahrs.preparing import without_temperature as without_temperature
 from strapdown.ahrs.starting import quiet_span as quiet_span
 from strapdown.ahrs.starting import resting_bias as resting_bias
 from strapdown.ahrs.starting import start as start

@@ -22,14 +22,14 @@ from strapdown.recordings.hard_iron import low_pass
 from strapdown.recordings.sensor_delays import Delays
 from strapdown.recordings.sensor_faults import Faults
 from strapdown.recordings.unit_calibration import UnitCalibration
-from strapdown.records import ErrorStateEstimate, Estimate, ImuRecord, cut
+from strapdown.records import ErrorStateEstimate, Estimate, ImuRecord, Innovations, cut
 
 LEVEL_TIME = 5.0
 """Time constant over which the level of the acceleration is found, s."""
 OWN_SHARE = 0.1
-"""Share of the tilt's modelled variance that does not follow the acceleration's level: the accelerometer's own errors."""
+"""Share of the modelled variance, of the tilt or an innovation, that does not follow the acceleration's level: the sensor's own errors."""
 ACCELERATION_SHARE = 0.7
-"""Share of it that follows that level: the steady-state variance goes as the σ of the acceleration."""
+"""Share of the tilt's that follows the root of that level: the steady-state variance goes as the σ of the acceleration."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -41,12 +41,15 @@ class AhrsEstimate:
     recording : Recording
         The recording from its first quiet second on, clipped gyro samples restored.
     estimate : Estimate
-        Attitude and gyro bias at the stamps of the recording; the covariance of the tilt follows the acceleration's level
-        as the innovations show it, and includes timing and constant iron, which the filter does not estimate.
+        Attitude and gyro bias at the stamps of the recording; the covariance of the tilt and the variance of the
+        accelerometer's innovations follow the acceleration's level so far, and the former includes timing and constant
+        iron, which the filter does not estimate.
     record : ImuRecord
         What the filter processed: increments and vectors averaged over its steps.
     initial : State
         Where the filter started.
+    parameters : AhrsParameters
+        The filter's model, with the velocity that the recording shows.
     delays : Delays
         Delays of the sensors' samples, s, for which the estimate is corrected.
     faults : Faults
@@ -61,6 +64,7 @@ class AhrsEstimate:
     estimate: Estimate
     record: ImuRecord
     initial: estimation.State
+    parameters: AhrsParameters
     delays: Delays
     faults: Faults
     hard_iron: Array
@@ -104,7 +108,8 @@ def estimate(
     Returns
     -------
     AhrsEstimate
-        Without ``smooth`` each row depends on the samples up to its stamp alone; only the choice of the quiet second does not.
+        Without ``smooth`` each row depends on the samples up to its stamp alone, but for the choice of the quiet second and, with
+        ``velocity_from_record``, of the velocity: both are from the whole recording.
 
     Raises
     ------
@@ -124,6 +129,7 @@ def estimate(
     quiet = slice(0, span.stop - span.start)
     delays = sensor_delays.find(used, latency, field_delay, causal=not smooth)
     prepared = prepare(used, quiet, parameters, delays.field, causal=not smooth)
+    parameters = parameters.matched(prepared.acceleration)
     filtered = _run(prepared, parameters, faults.turn_variance, gate, robust, smooth)
     found = _at_stamps(filtered, used, prepared, parameters, delays, faults.turn_variance, smooth, full_covariance)
     scale = found.error_states.get("gyro scale")
@@ -135,6 +141,7 @@ def estimate(
         else (calibration or unit_calibration.NONE).and_then(scale, delays.last_field, used.source),
         record=prepared.record,
         initial=prepared.initial,
+        parameters=parameters,
         delays=delays,
         faults=faults,
         hard_iron=prepared.iron,
@@ -196,7 +203,7 @@ def _at_stamps(
     """Return the estimate at the recording's stamps: carried on by the gyro from the step before each, and over the delay of the gyro."""
     edge, turned = prepared.edge, prepared.turned
     row = np.searchsorted(edge, np.arange(len(used.time)), side="right") - 1
-    bias = filtered.bias[row]
+    bias = filtered.bias.take(row, axis=0)
     late = np.broadcast_to(delays.gyro, used.time.shape)
     ahead = -sensor_delays.turn_over(used, -late) if smooth else used.rate * late[:, None]
     ahead = ahead - bias * (used.time - used.time[edge][row] + late)[:, None]
@@ -205,18 +212,19 @@ def _at_stamps(
     R = quaternion.to_matrix(filtered.attitude)
     fixed = R @ filtered.covariance[:, :3, :3] @ R.transpose(0, 2, 1)
     scale = np.ones((len(fixed), 3))
-    scale[:, :2] = _tilt_scale(filtered, _over_steps(turn_variance, edge) > 0.0)[:, None]
+    level = _level(filtered, _over_steps(turn_variance, edge) > 0.0)
+    scale[:, :2] = np.sqrt(OWN_SHARE + ACCELERATION_SHARE * np.sqrt(level))[:, None]
     fixed *= scale[:, :, None] * scale[:, None, :]
     iron = 0.0 if prepared.dip is None else (parameters.iron_sigma / np.cos(prepared.dip)) ** 2
     attitude, own = np.empty((len(row), 4)), np.empty((len(row), 3, 3))
     compiled(recording_steps.carry_to_stamps)(
         row, step, fixed, turned, ahead, read_only(used.rate), delays.sigma**2, iron, attitude, own
     )
-    variance = filtered.variance[row]
+    variance = filtered.variance.take(row, axis=0)
     variance[:, :3] = np.einsum("kii->ki", own)
     P = None
     if full_covariance:
-        P = filtered.covariance[row]
+        P = filtered.covariance.take(row, axis=0)
         P[:, :3, :3] = own
         P[:, :3, 3:] = (
             quaternion.to_matrix(attitude).transpose(0, 2, 1)
@@ -230,7 +238,7 @@ def _at_stamps(
         bias=bias,
         variance=variance,
         covariance=P,
-        innovations=filtered.innovations,
+        innovations=_innovations(filtered, level),
         skipped={
             name: int(np.sum(~(np.isfinite(samples).all(axis=1) & samples.any(axis=1))))
             for name, samples in sensors.items()
@@ -239,15 +247,18 @@ def _at_stamps(
         events=filtered.events,
         error_states={
             name: ErrorStateEstimate(
-                components=block.components, units=block.units, values=block.values[row], variance=block.variance[row]
+                components=block.components,
+                units=block.units,
+                values=block.values.take(row, axis=0),
+                variance=block.variance.take(row, axis=0),
             )
             for name, block in filtered.error_states.items()
         },
     )
 
 
-def _tilt_scale(filtered: Estimate, uncertain: np.ndarray) -> Array:
-    """Return the factor (k + 1,) of the tilt's modelled σ at the edges of the steps, by the level of the acceleration so far.
+def _level(filtered: Estimate, uncertain: np.ndarray) -> Array:
+    """Return the level (k + 1,) of the acceleration so far at the edges of the steps: its variance, as a share of that modelled.
 
     One model holds for slow and fast motion, so most motion is slower than modelled. Without a measurement, and at first and in steps
     whose turn is ``uncertain`` (k,), the level is taken for that modelled.
@@ -258,5 +269,12 @@ def _tilt_scale(filtered: Estimate, uncertain: np.ndarray) -> Array:
     step = float(np.median(np.diff(filtered.time))) / LEVEL_TIME
     begin = np.append(0, np.flatnonzero(uncertain) + 1)
     nis[begin] = 1.0
-    level = np.concatenate([low_pass(part, step) for part in np.split(nis, begin[1:])])[:, 0]
-    return np.asarray(np.sqrt(OWN_SHARE + ACCELERATION_SHARE * np.sqrt(level)))
+    return np.concatenate([low_pass(part, step) for part in np.split(nis, begin[1:])])[:, 0]
+
+
+def _innovations(filtered: Estimate, level: Array) -> dict[str, Innovations]:
+    """Return the innovations, the variance of the accelerometer's by the level before each, as that of the tilt."""
+    own = filtered.innovations["accelerometer"]
+    before = level[np.searchsorted(filtered.time, own.time) - 1]
+    share = OWN_SHARE + (1.0 - OWN_SHARE) * before
+    return {**filtered.innovations, "accelerometer": replace(own, variance=own.variance * share[:, None])}

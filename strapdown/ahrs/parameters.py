@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from strapdown import estimation
-from strapdown.checks import non_negative, positive
+from strapdown.checks import instance, non_negative, positive
 from strapdown.setup import FilterSetup
 from strapdown.setup.states import SensorStates, States
 from strapdown.units import DEGREE
+
+MIN_VELOCITY = 0.1
+"""σ of the velocity, m/s, of a unit that a recording shows at rest: it may have been moved slowly."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +57,9 @@ class AhrsParameters:
         σ of the mean rate of the quiet second as an estimate of the bias, each axis, rad/s; 0: the bias starts at zero.
     velocity_sigma : float, default 0.0
         σ of the velocity of the unit, each component, m/s; 0: no states, all its acceleration is white.
+    velocity_from_record : bool, default False
+        Whether a recording's own acceleration gives ``velocity_sigma`` (:attr:`strapdown.ahrs.Prepared.acceleration`); the
+        value here then stands only where there is no recording.
     velocity_time : float, default 0.3
         Time constant of that velocity, s.
     acceleration_time : float, default 0.1
@@ -74,6 +83,7 @@ class AhrsParameters:
     bias_sigma: float = 0.5 * DEGREE
     rest_bias_sigma: float = 0.0
     velocity_sigma: float = 0.0
+    velocity_from_record: bool = False
     velocity_time: float = 0.3
     acceleration_time: float = 0.1
     gyro_scale_sigma: float = 0.0
@@ -82,9 +92,22 @@ class AhrsParameters:
     def __post_init__(self) -> None:
         """Check every field."""
         may_be_zero = ("iron_sigma", "rate_random_walk", "rest_bias_sigma", "velocity_sigma", "gyro_scale_sigma")
-        for name in set(self.__dataclass_fields__) - {"gyro_temperature_sigma"}:
+        for axis in np.atleast_1d(self.gyro_temperature_sigma):
+            non_negative("gyro_temperature_sigma", float(axis))
+        instance("velocity_from_record", self.velocity_from_record, bool, "give true or false")
+        for name in set(self.__dataclass_fields__) - {"gyro_temperature_sigma", "velocity_from_record"}:
             check = non_negative if name in may_be_zero else positive
             check(name, getattr(self, name))
+
+    def matched(self, acceleration: float) -> AhrsParameters:
+        """Return the parameters for a unit moved with this acceleration, RMS of each component, m/s².
+
+        That of a bounded velocity has σ ``velocity_sigma / √(velocity_time acceleration_time)``.
+        """
+        if not self.velocity_from_record:
+            return self
+        sigma = acceleration * math.sqrt(self.velocity_time * self.acceleration_time)
+        return replace(self, velocity_sigma=max(sigma, MIN_VELOCITY))
 
     @property
     def setup(self) -> FilterSetup:
@@ -116,8 +139,10 @@ HAND_HELD = AhrsParameters(
     specific_force_noise=0.06,
     rest_bias_sigma=0.05 * DEGREE,
     velocity_sigma=1.0,
+    velocity_from_record=True,
     gyro_scale_sigma=2e-3,
 )
-"""A unit in the hand: its velocity is bounded, and of its gyro, whose turns are large, scale factors and misalignments are states."""
+"""A unit in the hand: its velocity is bounded, by as much as the recording shows, and of its gyro, whose turns are large, scale factors
+and misalignments are states."""
 MOTIONS = {"hand": HAND_HELD, "any": AhrsParameters()}
 """The model by what moves the unit."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -10,13 +11,16 @@ from strapdown import coning, estimation, quaternion
 from strapdown.ahrs import headings, starting
 from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.checks import Array
+from strapdown.gyro.temperature import BiasOverTemperature
 from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.recordings import Recording, increments, sensor_delays
+from strapdown.recordings import Recording, gyro_temperature, increments, sensor_delays
 from strapdown.records import ImuRecord
 from strapdown.vectors import VectorMeasurements
 
 UP = np.array([0.0, 0.0, 1.0])
+LIVELY_SPAN = 5.0
+"""Span over which the acceleration is averaged to find how lively a unit is moved, s."""
 
 
 class Prepared(NamedTuple):
@@ -33,6 +37,8 @@ class Prepared(NamedTuple):
     """Angle of the field below the level at the start, rad; None without a magnetometer."""
     iron: Array
     """Hard iron that is taken off the field at the end, body axes, in its unit (3,)."""
+    acceleration: float
+    """Acceleration over the liveliest :data:`LIVELY_SPAN`, RMS of each component, m/s²."""
 
 
 def prepare(
@@ -65,15 +71,16 @@ def prepare(
     interval = float(np.median(np.diff(recording.time)))
     assert recording.specific_force is not None
     force, number = _averages(recording.specific_force, turned, edge)
+    shown = number > 0
     gravity = starting.norm(starting.mean_at_first(recording, recording.specific_force, quiet, "accelerometer")[0])
     vectors = [
         VectorMeasurements(
             sensor="accelerometer",
             kind="vector",
-            time=time[1:][number > 0],
-            vector_b=quaternion.rotate(quaternion.conjugate(at_edge[1:]), force)[number > 0],
+            time=time[1:][shown],
+            vector_b=quaternion.rotate(quaternion.conjugate(at_edge[1:]), force)[shown],
             reference_f=gravity * UP,
-            sigma=parameters.specific_force_noise / np.sqrt(number[number > 0] * interval),
+            sigma=parameters.specific_force_noise / np.sqrt(number[shown] * interval),
         )
     ]
     dip, iron = None, np.zeros(3)
@@ -99,7 +106,21 @@ def prepare(
     known = recording.temperature is not None and bool(np.isfinite(recording.temperature).all())
     temperature = recording.temperature[edge] if known and recording.temperature is not None else None
     record = ImuRecord(time=time, increments=turn, vectors=tuple(vectors), temperature=temperature)
-    return Prepared(record, initial, edge, turned, dip, iron)
+    return Prepared(record, initial, edge, turned, dip, iron, _liveliest(force, shown, parameters.step))
+
+
+def without_temperature(
+    recording: Recording, parameters: AhrsParameters, warm: BiasOverTemperature, *, walks: bool
+) -> tuple[Recording, AhrsParameters]:
+    """Return a recording without the gyro's bias over temperature, and the model with the error of its slope.
+
+    The error is a state that the temperature drives, or where the estimator has none (``walks``) covered by a random walk.
+    """
+    used = gyro_temperature.applied(recording, warm)
+    if not walks:
+        return used, replace(parameters, gyro_temperature_sigma=tuple(warm.slope_sigma.tolist()))
+    walk = warm.walk(gyro_temperature.temperature_at_samples(used), used.time)
+    return used, replace(parameters, rate_random_walk=float(np.hypot(parameters.rate_random_walk, walk)))
 
 
 def _edges(time: Array, step: float) -> np.ndarray:
@@ -113,3 +134,13 @@ def _averages(samples: Array, frame: Array, edge: Array) -> tuple[Array, Array]:
     total, number = np.empty((len(edge) - 1, 3)), np.empty(len(edge) - 1)
     compiled(recording_steps.average_samples)(read_only(samples), read_only(frame), edge, total, number)
     return total / np.maximum(number, 1.0)[:, None], number
+
+
+def _liveliest(force: Array, shown: np.ndarray, step: float) -> float:
+    """Return the largest RMS deviation, each component, of the specific force (k, 3) from its mean over spans of :data:`LIVELY_SPAN`.
+
+    In the frame that the gyro keeps gravity is constant, so what varies is acceleration, or at the level of the sensor's noise nothing.
+    """
+    own = force[shown]
+    spans = max(1, len(own) // round(LIVELY_SPAN / step))
+    return max(float(np.sqrt(np.mean(np.var(part, axis=0)))) for part in np.array_split(own, spans))

@@ -82,7 +82,7 @@ class _Model:
 class _Computing:
     """Runs and what computes them."""
 
-    runs: Annotated[int | None, typer.Option(help="Runs; 1000, or what a resumed file wants.")] = None
+    runs: Annotated[int | None, typer.Option(help="Number of runs; 1000, or that of the file resumed.")] = None
     threads: Annotated[int | None, typer.Option(help="Threads; one a core if not given.")] = None
     machine: Annotated[
         str,
@@ -93,9 +93,9 @@ class _Computing:
     chunk: Annotated[int | None, typer.Option(help="Runs between merges and writes; the machine's if not given.")] = (
         None
     )
-    workers: Annotated[
-        int | None, typer.Option(help="Compute in so many processes instead of threads (needs Dask).")
-    ] = None
+    workers: Annotated[int | None, typer.Option(help="Number of processes to use instead of threads (needs Dask).")] = (
+        None
+    )
     cluster: Annotated[
         str | None,
         typer.Option(

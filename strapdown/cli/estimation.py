@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -75,7 +74,8 @@ class _Shared:
         bool | None,
         typer.Option(
             "--full-covariance/--variances",
-            help="Write whole 6 x 6 covariances, or only their diagonals; whole ones by default where there is a specification.",
+            help="Write whole 6 x 6 covariances, or only their diagonals; whole ones by default where there is a specification or a "
+            "reference attitude.",
         ),
     ] = None
     observability: Annotated[
@@ -535,11 +535,13 @@ def _estimate_recording(
             parameters,
             latency=late,
             calibration=carried,
-            full_covariance=bool(shared.full_covariance),
+            full_covariance=source.true_attitude is not None
+            if shared.full_covariance is None
+            else shared.full_covariance,
             smooth=shared.smooth,
             **robustness,
         )
-    used, out = result.recording, output.out
+    used, parameters, out = result.recording, result.parameters, output.out
     errors = None if used.true_attitude is None else reference_errors(result.estimate.attitude, used.true_attitude)
     rms = None if errors is None else {name: value / DEGREE for name, value in errors.rms(used.movement).items()}
     paths = _write_recording(result, parameters, replace(parameters.setup, **robustness), motion, shared.smooth, out)
@@ -565,10 +567,9 @@ def _read_recording(
     recording: Path, layout: dict[str, Any], parameters: AhrsParameters, shared: _Shared, temperature: Path | None
 ) -> tuple[Recording, AhrsParameters]:
     """Return the recording, its bias over temperature subtracted, and the filter's parameters with the noise of the gyro given."""
-    from strapdown import recordings
+    from strapdown import ahrs, recordings
     from strapdown.gyro import read_spec
     from strapdown.gyro import temperature as thermal
-    from strapdown.recordings import gyro_temperature
 
     warm = None if temperature is None else thermal.read(temperature)
     with progress_bar("reading"):
@@ -577,15 +578,11 @@ def _read_recording(
     if shared.gyro is not None:
         from strapdown import workflows  # which imports much more
 
-        parameters = workflows.with_gyro_noise(parameters, read_spec(shared.gyro))
+        spec = read_spec(shared.gyro)
+        parameters, warm = workflows.with_gyro_noise(parameters, spec), warm or spec.temperature
     if warm is not None:
-        source = gyro_temperature.applied(source, warm)
-        if shared.smooth or shared.observability:
-            # They have no bias driven by temperature: a walk covers the slope's error.
-            walk = warm.walk(gyro_temperature.temperature_at_samples(source), source.time)
-            parameters = replace(parameters, rate_random_walk=math.hypot(parameters.rate_random_walk, walk))
-        else:
-            parameters = replace(parameters, gyro_temperature_sigma=tuple(warm.slope_sigma.tolist()))
+        walks = shared.smooth or shared.observability
+        source, parameters = ahrs.without_temperature(source, parameters, warm, walks=walks)
     return source, parameters
 
 
@@ -622,6 +619,7 @@ def _write_recording(
             "latency": result.delays.last_gyro,
             "magnetometer_latency": result.delays.last_field,
         },
+        reference=used.true_attitude,
     )
     if found.error_states:
         paths.append(out / "states.json")
@@ -689,8 +687,9 @@ def _model(moved_by: str, parameters: AhrsParameters, result: AhrsEstimate) -> s
     if moved_by == "any":
         return "Motion: any, its acceleration modelled as white noise."
     bias, sigma = result.initial.bias / DEGREE, np.sqrt(result.initial.covariance[3, 3]) / DEGREE
+    shown = ", as the recording shows," if parameters.velocity_from_record else ""
     words = (
-        f"Motion: of a hand, {parameters.velocity_sigma:g} m/s with a correlation time of {parameters.velocity_time:g} s. "
+        f"Motion: of a hand, {parameters.velocity_sigma:.2g} m/s{shown} with a correlation time of {parameters.velocity_time:g} s. "
         f"Gyro bias at the start: {', '.join(f'{value:.3g}' for value in bias)} °/s, σ {sigma:.2g} °/s"
     )
     if not _rested(parameters, result):

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from strapdown.consistency import Judgement
     from strapdown.consistency.foreign import Checked
     from strapdown.diagnosis import Diagnosis
-    from strapdown.records import Estimate, ImuRecord
+    from strapdown.records import Estimate, ImuRecord, Truth
     from strapdown.setup import FilterSetup
 
 CONSISTENT, NOT, CANNOT_TELL = 0, 1, 2
@@ -156,12 +156,16 @@ def _judged_own(result: Path, probability: float, *, with_record: bool) -> tuple
         console.print(
             f"{result.name}: {len(estimate.time)} epochs over {estimate.time[-1] - estimate.time[0]:.6g} s, "
             f"{sum(len(one.time) for one in estimate.innovations.values())} measurements, "
-            f"{'no truth' if truth is None else 'with its truth'}."
+            f"{_truth_words(truth, records.read_reference(result))}."
         )
         judgement = findings.judged(result, attributes, estimate, truth, probability=probability)
     else:
         raise InputError(f"{result} is a {kind}; pass what `strapdown estimate` or `strapdown montecarlo` wrote")
     return judgement, {"source": result.name, "kind": kind}
+
+
+def _truth_words(truth: Truth | None, reference: Truth | None) -> str:
+    return "with its truth" if truth is not None else "no truth" if reference is None else "with a reference attitude"
 
 
 def status_of(judgement: Judgement) -> int:

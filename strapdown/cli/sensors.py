@@ -110,7 +110,7 @@ class _Identification:
         typer.Option(help="Hz; the fit leaves out what lies above: a low-pass filter's shape, vibration."),
     ] = None
     robust: Annotated[
-        bool, typer.Option(help="Draw the deviation by medians, which stands outliers; the fit stays as it is.")
+        bool, typer.Option(help="Deviation by medians, which outliers hardly change; the fit is not affected.")
     ] = False
     temperature: Annotated[
         int | None,
@@ -126,9 +126,7 @@ class _Exports:
     """Files for other programs."""
 
     kalibr: Annotated[bool, typer.Option("--kalibr", help="Write imu.yaml too; needs gyro and accelerometer.")] = False
-    factor: Annotated[
-        float, typer.Option(help="What the numbers of imu.yaml are multiplied by; people take 5 to 10.")
-    ] = 1.0
+    factor: Annotated[float, typer.Option(help="Factor on the noise in imu.yaml; 5 to 10 are usual.")] = 1.0
     px4: Annotated[bool, typer.Option("--px4", help="Write px4.params of EKF2 too; needs gyro and accelerometer.")] = (
         False
     )

@@ -157,7 +157,7 @@ class _Objective:
     spacing: Annotated[
         float,
         typer.Option(
-            help="Take a sensor's samples so many seconds apart, the weight of all on them: disturbances last."
+            help="Use a sensor's samples this many seconds apart, with the weight of all: for disturbances that last."
         ),
     ] = 0.0
     holdout: Annotated[

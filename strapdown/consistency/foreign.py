@@ -219,62 +219,32 @@ def check_arrays(
     >>> check_arrays(time, estimate, 0.5 * P, time, truth).judgement.verdict
     'not consistent'
     """
-    stamps = increasing("time", time, least=2)
-    q = unit_quaternions("attitude", array("attitude", attitude, (len(stamps), 4)))
-    true_stamps = increasing("true_time", true_time, least=2)
-    reference = unit_quaternions("true_attitude", array("true_attitude", true_attitude, (len(true_stamps), 4)))
     if error_frame != "find":
         one_of("error_frame", error_frame, ERROR_FRAMES)
     wanted = _wanted(align)
-    P = None if covariance is None else np.array(covariance, np.float64)
-    if P is not None and P.shape not in ((len(stamps), 3, 3), (len(stamps), 6, 6)):
-        raise InputError(f"covariance has shape {P.shape}, wanted ({len(stamps)}, 3, 3) or ({len(stamps)}, 6, 6)")
+    own = _series("", time, attitude, covariance, bias)
+    theirs = _series("true_", true_time, true_attitude, None, true_bias)
+    if own.covariance is not None and (own.bias is None or theirs.bias is None):
+        own = replace(own, bias=None, covariance=own.covariance[:, :3, :3])
     remarks: list[str] = []
-    if P is not None and (bias is None or true_bias is None):
-        bias, P = None, P[:, :3, :3]
-    own = _Series(stamps, q, P, None if bias is None else array("bias", bias, (len(stamps), 3)))
-    theirs = _Series(
-        true_stamps,
-        reference,
-        None,
-        None if true_bias is None else array("true_bias", true_bias, (len(true_stamps), 3)),
-    )
     own, alignment = _aligned(own, theirs, wanted, remarks)
     own, truth = _at_common_times(own, theirs, alignment.offset)
     remarks += alignment.words
+    aligned = replace_attitude(own.attitude, alignment)
     if own.covariance is None:
-        sigma = f"RMS attitude error {alignment.residual / DEGREE:.4g}°"
-        remarks.append(f"the estimate has no covariance, so its errors are not judged ({sigma})")
-        empty = without_truth(own.time, replace_attitude(own.attitude, alignment), innovations or {})
-        judged = judge(empty, None, probability=probability)
-        return Checked(
-            judgement=replace(judged, limits=tuple(limit for limit in judged.limits if limit != WITHOUT_TRUTH)),
-            estimate=empty,
-            truth=truth,
-            alignment=alignment,
-            error_frame="",
-            frame_probability={},
-            explanations=(),
-            remarks=tuple(remarks),
-        )
+        return _without_covariance(own.time, aligned, truth, alignment, innovations or {}, remarks, probability)
     readings = {name: read_as(name, own.covariance, own.attitude) for name in ERROR_FRAMES}
     readings = {name: _in_truth_axes(P, own, truth, alignment) for name, P in readings.items()}
-    aligned = replace_attitude(own.attitude, alignment)
     error = quaternion.log(quaternion.multiply(quaternion.conjugate(aligned), truth.attitude))
     found = frame_probabilities(error, {name: P[:, :3, :3] for name, P in readings.items()})
-    best = max(found, key=lambda name: found[name])
-    chosen = error_frame if error_frame != "find" else best if found[best] >= DECIDED else "body"
-    if error_frame == "find":
-        remarks.append(_frame_words(chosen, found))
-    elif found[chosen] < 0.01:
-        remarks.append(f"the covariance is read as {chosen}, as given; as {best} the errors would fit it better by far")
+    chosen, words = _chosen_frame(error_frame, found)
+    remarks += words
+    body = quaternion.conjugate(quaternion.exp(alignment.body))
     estimate = Estimate.from_arrays(
         own.time,
         aligned,
         readings[chosen],
-        bias=None
-        if own.bias is None
-        else quaternion.rotate(quaternion.conjugate(quaternion.exp(alignment.body)), own.bias),
+        bias=None if own.bias is None else quaternion.rotate(body, own.bias),
         innovations=innovations,
     )
     return Checked(
@@ -289,12 +259,61 @@ def check_arrays(
     )
 
 
+def _chosen_frame(given: str, found: Mapping[str, float]) -> tuple[str, list[str]]:
+    """Return the frame that the covariance is read in, given or found, and what to say of it."""
+    best = max(found, key=lambda name: found[name])
+    if given == "find":
+        chosen = best if found[best] >= DECIDED else "body"
+        return chosen, [_frame_words(chosen, found)]
+    if found[given] < 0.01:
+        return given, [f"the covariance is read as {given}, as given; as {best} the errors would fit it better by far"]
+    return given, []
+
+
+def _without_covariance(
+    time: Array,
+    attitude: Array,
+    truth: Truth,
+    alignment: Alignment,
+    innovations: Mapping[str, Innovations],
+    remarks: list[str],
+    probability: float,
+) -> Checked:
+    """Return the verdict on the innovations alone, and the errors against the truth in words."""
+    sigma = f"RMS attitude error {alignment.residual / DEGREE:.4g}°"
+    estimate = without_truth(time, attitude, innovations)
+    judged = judge(estimate, None, probability=probability)
+    return Checked(
+        judgement=replace(judged, limits=tuple(limit for limit in judged.limits if limit != WITHOUT_TRUTH)),
+        estimate=estimate,
+        truth=truth,
+        alignment=alignment,
+        error_frame="",
+        frame_probability={},
+        explanations=(),
+        remarks=(*remarks, f"the estimate has no covariance, so its errors are not judged ({sigma})"),
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class _Series:
     time: Array
     attitude: Array
     covariance: Array | None = None
     bias: Array | None = None
+
+
+def _series(
+    prefix: str, time: ArrayLike, attitude: ArrayLike, covariance: ArrayLike | None, bias: ArrayLike | None
+) -> _Series:
+    """Return a history, checked; ``prefix`` is that of its names in messages."""
+    stamps = increasing(f"{prefix}time", time, least=2)
+    m = len(stamps)
+    q = unit_quaternions(f"{prefix}attitude", array(f"{prefix}attitude", attitude, (m, 4)))
+    P = None if covariance is None else np.array(covariance, np.float64)
+    if P is not None and P.shape not in ((m, 3, 3), (m, 6, 6)):
+        raise InputError(f"covariance has shape {P.shape}, wanted ({m}, 3, 3) or ({m}, 6, 6)")
+    return _Series(stamps, q, P, None if bias is None else array(f"{prefix}bias", bias, (m, 3)))
 
 
 def _wanted(align: str | Iterable[str]) -> tuple[str, ...] | None:

@@ -250,7 +250,7 @@ def judge(
     estimate : Estimate
         With innovations; with whole covariances if a truth is given.
     truth : Truth, optional
-        Attitude and bias at the estimate's own times. Without it only the innovations are judged.
+        Attitude and bias at the estimate's own times, NaN where a reference has none. Without it only the innovations are judged.
     probability : float, default 0.99
         A consistent filter is rejected with at most 1 − ``probability``, all tests together.
     upper_bounds : bool, default False
@@ -412,20 +412,26 @@ def _of_pairs(estimate: Estimate) -> list[Finding]:
 
 def _of_errors(estimate: Estimate, truth: Truth, limits: list[str], beside: Sequence[str]) -> list[Finding]:
     m = len(estimate.time)
-    attitude = unit_quaternions("truth.attitude", truth.attitude)
-    if attitude.shape != (m, 4) or np.shape(truth.bias) != (m, 3):
+    if np.shape(truth.attitude) != (m, 4) or np.shape(truth.bias) != (m, 3):
         raise InputError(
-            f"truth has {len(attitude)} attitudes and {len(np.atleast_1d(truth.bias))} biases, the estimate {m} times; "
+            f"truth has {len(truth.attitude)} attitudes and {len(np.atleast_1d(truth.bias))} biases, the estimate {m} times; "
             "give the truth at the estimate's own times"
         )
-    e = errors(estimate.attitude, estimate.bias, attitude, truth.bias)
+    seen = ~np.isnan(truth.attitude).all(axis=1)
+    if not seen.any():
+        limits.append("the reference has no attitude")
+        return []
+    attitude = unit_quaternions("truth.attitude", truth.attitude[seen])
+    e = errors(estimate.attitude[seen], estimate.bias[seen], attitude, truth.bias[seen])
+    variance = estimate.variance[seen]
     if estimate.covariance is None:
         limits.append(
             "the estimate holds variances only, so errors are judged axis by axis at the end; keep whole covariances"
         )
-        ratio = float(np.max(e[-1] ** 2 / estimate.variance[-1]))
-        p = min(1.0, 6.0 * min(mean_p_value(float(x), 1, 1) for x in e[-1] ** 2 / estimate.variance[-1]))
-        worst = int(np.argmax(e[-1] ** 2 / estimate.variance[-1]))
+        squares = (e[-1] ** 2 / variance[-1])[np.isfinite(e[-1])]
+        ratio = float(np.max(squares))
+        p = min(1.0, len(squares) * min(mean_p_value(float(x), 1, 1) for x in squares))
+        worst = int(np.argmax(squares))
         name = state_name(worst)
         return [
             Finding(
@@ -438,8 +444,8 @@ def _of_errors(estimate: Estimate, truth: Truth, limits: list[str], beside: Sequ
             )
         ]
     # Neither a filter nor a reference need have a bias.
-    known = 6 if np.isfinite(e[:, 3:]).any() and np.isfinite(estimate.variance[:, 3:]).any() else 3
-    e, P = e[:, :known], estimate.covariance[:, :known, :known]
+    known = 6 if np.isfinite(e[:, 3:]).any() and np.isfinite(variance[:, 3:]).any() else 3
+    e, P = e[:, :known], estimate.covariance[seen][:, :known, :known]
     found: list[Finding] = []
     hidden: list[str] = []
     for subset, states in SUBSETS.items():
@@ -457,7 +463,7 @@ def _of_errors(estimate: Estimate, truth: Truth, limits: list[str], beside: Sequ
                 means=error_words(f"the {subset} error at the end", value),
             )
         )
-        if m < 20:
+        if len(e) < 20:
             continue
         if not _averages(subset, beside):
             hidden.append(subset)

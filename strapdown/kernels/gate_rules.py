@@ -1,8 +1,7 @@
 """Rules of a gate: refusals by sensor, lock-outs, a restart candidate beside the filter, and restarts that widen.
 
 They implement :class:`strapdown.estimation.gating.Gate` for any form of the state. Their state is ``memory`` (``MEMORY``,), of the restart
-candidate, and ``standing`` (sensors, ``STANDING``), the counters of each sensor. :mod:`strapdown.kernels.gate` calls them compiled,
-:mod:`strapdown.estimation.step_gate` as plain Python.
+candidate, and ``standing`` (sensors, ``STANDING``), the counters of each sensor. :mod:`strapdown.kernels.gate` calls them compiled.
 
 For each measurement :func:`judge_filter` counts the filter's outcome and may request a candidate (:func:`reset_candidate`); then
 :func:`judge_candidate` counts the candidate's. A candidate whose start is too narrow is widened where :func:`may_widen` allows it; one

@@ -16,7 +16,7 @@ def temperature_at_samples(recording: Recording) -> Array:
     T = recording.temperature
     known = np.zeros(0, bool) if T is None else np.isfinite(T)
     if T is None or not known.any():
-        raise InputError(f"{recording.source} has no temperature, over which the sensor's bias is given")
+        raise InputError(f"{recording.source} has no temperature, over which the gyro's bias is given; leave that out")
     return np.asarray(np.interp(recording.time, recording.time[known], T[known]))
 
 

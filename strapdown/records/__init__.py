@@ -21,6 +21,7 @@ from strapdown.records.record import cut as cut
 from strapdown.records.record import put as put
 from strapdown.records.record import read_attributes as read_attributes
 from strapdown.records.record import read_estimate as read_estimate
+from strapdown.records.record import read_reference as read_reference
 from strapdown.records.record import read_states as read_states
 from strapdown.records.record import read_truth as read_truth
 from strapdown.records.record import result_file as result_file

@@ -666,8 +666,11 @@ def write_estimate(
     attributes: Mapping[str, Any] | None = None,
     *,
     truth: Truth | None = None,
+    reference: Array | None = None,
 ) -> None:
     """Write an estimate, and the truth at its times if given, to HDF5; the file appears whole or not at all.
+
+    ``reference`` are attitudes (m, 4) of a reference system instead, NaN where it has none.
 
     Values and variances of error states are written (:func:`read_states`); a whole covariance is not.
     """
@@ -687,6 +690,10 @@ def write_estimate(
             put(file, "truth/attitude", truth.attitude, "1")
             if np.isfinite(truth.bias).all():
                 put(file, "truth/bias", truth.bias, "rad/s")
+        if reference is not None:
+            known = np.isfinite(reference).all(axis=1)
+            put(file, "reference/row", np.flatnonzero(known).astype(np.float64), "1", "row of the estimate")
+            put(file, "reference/attitude", quaternion.normalize(reference[known]), "1")
         for number, (sensor, innovations) in enumerate(estimate.innovations.items()):
             group = file.create_group(f"innovations/{number}")
             # The sensor is not the group's name: a slash in it would part groups.
@@ -777,6 +784,22 @@ def read_truth(path: str | os.PathLike[str]) -> Truth | None:
         rows = len(_numbers(file, "time", ("n",)))
         bias = _biases(file, "truth/bias", rows) if "truth/bias" in file else np.full((rows, 3), np.nan)
         return Truth(attitude=_attitudes(file, "truth/attitude", rows), bias=bias)
+
+
+def read_reference(path: str | os.PathLike[str]) -> Truth | None:
+    """Read the reference of a file written by :func:`write_estimate` as a truth, NaN where it has none; None if the file has none."""
+    with _estimate_file(path) as file:
+        if "reference" not in file:
+            return None
+        size = len(_numbers(file, "time", ("n",)))
+        row = _numbers(file, "reference/row", ("m",)).astype(np.intp)
+        if np.any(np.diff(row, prepend=-1) <= 0) or np.any(row >= size):
+            raise InputError(
+                f"{_place(file, 'reference/row')} are not increasing rows of the estimate; the file is damaged"
+            )
+        attitude = np.full((size, 4), np.nan)
+        attitude[row] = _attitudes(file, "reference/attitude", len(row))
+        return Truth(attitude=attitude, bias=np.full((size, 3), np.nan))
 
 
 def read_estimate(path: str | os.PathLike[str]) -> Estimate:

@@ -9,7 +9,7 @@ from typing import Any
 from strapdown import consistency, setup
 from strapdown.checks import InputError
 from strapdown.consistency import Judgement
-from strapdown.records import Estimate, Truth
+from strapdown.records import Estimate, Truth, read_reference
 from strapdown.report import page
 from strapdown.scenarios import scenario_from_toml
 
@@ -53,6 +53,8 @@ def judged(
 ) -> Judgement:
     """Return the verdict on an estimate by what its file says of the filter beside it."""
     states, unmodelled = _filter_of(path, attributes)
+    if truth is None:
+        truth = read_reference(path)
     return consistency.judge(
         estimate,
         truth,

@@ -9,6 +9,7 @@
 - ``starting``: Where the filter starts on a record.
 - ``planning``: The Cramér–Rao bound before there is a record.
 - ``suspicion``: What the tuned filter leaves unexplained, such as a scale factor that the gyro's noise stands for.
+- ``own``: Parameters of a filter of one's own, by the same objectives.
 - ``holding``: What is held out, and the filter before and after on it.
 
 >>> objective = tuning.likelihood([tuning.record_case(record, chosen)], chosen, ["gyro.arw", "star.sigma"])  # doctest: +SKIP
@@ -36,6 +37,7 @@ from strapdown.tuning.outliers import TunedGate as TunedGate
 from strapdown.tuning.outliers import contaminated_likelihood as contaminated_likelihood
 from strapdown.tuning.outliers import log_likelihood as log_likelihood
 from strapdown.tuning.outliers import tuned_gate as tuned_gate
+from strapdown.tuning.own import OwnTuning, fit_own
 from strapdown.tuning.parameters import Prior, priors_from_gyro
 from strapdown.tuning.parameters import axis_names as axis_names
 from strapdown.tuning.parameters import axis_of as axis_of
@@ -58,10 +60,12 @@ from strapdown.tuning.suspicion import unmodelled as unmodelled
 
 __all__ = [
     "Case",
+    "OwnTuning",
     "Prior",
     "Tuning",
     "compare",
     "fit",
+    "fit_own",
     "likelihood",
     "plan",
     "priors_from_gyro",

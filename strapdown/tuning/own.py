@@ -1,0 +1,195 @@
+"""Parameters of a filter of one's own (:mod:`strapdown.estimation.filters.own`), by the objectives of the package's filter.
+
+The objective is evaluated run by run of the filter, whatever it computes in, so the search needs no derivatives: Nelder & Mead's simplex
+in the logarithms of the parameters, for a handful of them.
+
+>>> def make(values):  # doctest: +SKIP
+...     return MyFilter(white=values["white"], walk=values["walk"])
+>>> found = tuning.fit_own(make, [tuning.record_case(record, setup)], {"white": 1e-4, "walk": 1e-6})  # doctest: +SKIP
+>>> found.values, replace(setup, estimator=found.estimator)  # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from strapdown import consistency, quaternion
+from strapdown.checks import Array, InputError, one_of, positive
+from strapdown.consistency import whitened
+from strapdown.estimation.filters.own import as_own
+from strapdown.records import Estimate
+from strapdown.tuning.errors import MAX_EPOCHS
+from strapdown.tuning.innovations import Case
+
+OwnMeasure = Literal["innovations", "errors", "rmse"]
+OWN_MEASURES = ("innovations", "errors", "rmse")
+FIRST_STEP = 0.5
+"""Initial size of the simplex, in the logarithm of each parameter."""
+TOLERANCE = 1e-4
+"""Final tolerance of the logarithms."""
+CURVATURE_STEP = 0.05
+"""Step of a log parameter for second derivatives."""
+MAX_RUNS = 400
+"""Evaluations for each parameter after which the search is given up."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OwnTuning:
+    """The best parameters found.
+
+    Parameters
+    ----------
+    values : mapping of str to float
+        Best value of each parameter, in the unit of its starting value.
+    relative_sigma : mapping of str to float
+        Standard deviation of each over its value, from the curvature of the likelihood of white innovations; NaN for other measures.
+    value : float
+        Minus the log likelihood without its constant, or the RMS attitude error of one axis, rad.
+    evaluations : int
+        Number of evaluations of the objective; each runs the filter over all records.
+    estimator : object
+        The filter with these values, as ``make`` returned it.
+    """
+
+    values: Mapping[str, float]
+    relative_sigma: Mapping[str, float]
+    value: float
+    evaluations: int
+    estimator: Any
+
+
+def fit_own(
+    make: Callable[[dict[str, float]], Any],
+    cases: Sequence[Case],
+    start: Mapping[str, float],
+    *,
+    measure: OwnMeasure = "innovations",
+) -> OwnTuning:
+    """Return the parameters of a filter of one's own that suit records best.
+
+    Parameters
+    ----------
+    make : callable
+        Takes the values by name and returns the filter.
+    cases : sequence of Case
+        Records and where the filter starts (:func:`strapdown.tuning.record_case`).
+    start : mapping
+        Parameters, all greater than zero, by name: where the search starts.
+    measure : {"innovations", "errors", "rmse"}
+        Likelihood of the innovations, likelihood of the errors against the truth by the filter's own covariance, or the RMS attitude error.
+
+    Returns
+    -------
+    OwnTuning
+        Best values by name, their relative standard deviations, and the filter with them.
+
+    Raises
+    ------
+    InputError
+        If there is no record or parameter, the filter gives no innovations (or the records no truth), or the search does not settle.
+    """
+    from scipy.optimize import minimize
+
+    one_of("measure", measure, OWN_MEASURES)
+    if not cases:
+        raise InputError("there is no record to tune on; give one")
+    names = list(start)
+    if not names:
+        raise InputError("start names no parameter; give each with its first value")
+    first = np.log([positive(f"start: {name}", start[name]) for name in names])
+
+    def objective(point: Array) -> float:
+        values = dict(zip(names, np.exp(point).tolist(), strict=True))
+        chosen = as_own(make(values))
+        total = np.sum([_measured(chosen(case.record, case.initial), case, measure) for case in cases], axis=0)
+        if measure == "rmse":
+            return float(np.sqrt(total[0] / total[1]))
+        return float(total[0]) if np.isfinite(total[0]) else np.inf
+
+    if not np.isfinite(objective(first)):
+        raise InputError("the filter fails with the first values: its likelihood is not finite; start from others")
+    simplex = np.concatenate([first[None], first + FIRST_STEP * np.eye(len(first))])
+    options = {"initial_simplex": simplex, "xatol": TOLERANCE, "fatol": 1e-9, "maxfev": MAX_RUNS * len(first)}
+    found = minimize(objective, first, method="Nelder-Mead", options=options)
+    if not found.success:
+        raise InputError(
+            f"the search did not settle in {MAX_RUNS * len(first)} runs of the filter; tune fewer parameters, or start nearer"
+        )
+    values = dict(zip(names, np.exp(found.x).tolist(), strict=True))
+    sigma = _sigma(objective, found.x) if measure == "innovations" else np.full(len(names), np.nan)
+    return OwnTuning(
+        values=values,
+        relative_sigma=dict(zip(names, sigma.tolist(), strict=True)),
+        value=float(found.fun),
+        evaluations=int(found.nfev),
+        estimator=make(values),
+    )
+
+
+def _measured(estimate: Estimate, case: Case, measure: OwnMeasure) -> Array:
+    """Return what a record adds to the objective, and how many numbers it rests on."""
+    if measure == "innovations":
+        total, number = 0.0, 0
+        for innovations in estimate.innovations.values():
+            inside = innovations.used & (innovations.time > case.first) & (innovations.time <= case.last)
+            e, s = innovations.innovation[inside], innovations.variance[inside]
+            total += 0.5 * float(np.sum(np.log(s) + e * e / s))
+            number += e.size
+        if not number:
+            raise InputError("the filter gives no innovations; return them in its estimate, or tune by errors")
+        return np.array([total, number])
+    error, P = _errors(estimate, case)
+    if measure == "rmse":
+        return np.array([float(np.sum(error[:, :3] ** 2)), error[:, :3].size])
+    white = whitened(error, P)
+    return np.array([0.5 * float(np.sum(white * white) + np.sum(np.linalg.slogdet(P)[1])), error.size])
+
+
+def _errors(estimate: Estimate, case: Case) -> tuple[Array, Array]:
+    """Return errors and covariances at up to so many epochs with a truth, the start left out."""
+    truth = case.record.truth
+    attitude = case.true_attitude if truth is None else truth.attitude
+    if attitude is None:
+        raise InputError("the record has no truth; tune by innovations, or give a reference")
+    edges = np.searchsorted(case.record.time, estimate.time)
+    known = np.isfinite(attitude[edges]).all(axis=1) & (estimate.time > max(case.first, estimate.time[0]))
+    known &= estimate.time <= case.last
+    if case.judged is not None:
+        known &= case.judged[edges]
+    rows = np.flatnonzero(known)[:: -(-int(known.sum()) // MAX_EPOCHS) or 1]
+    turn = quaternion.multiply(quaternion.conjugate(estimate.attitude[rows]), attitude[edges[rows]])
+    error, size = quaternion.log(turn), 3
+    if truth is not None and estimate.has_bias:
+        error, size = (
+            consistency.errors(
+                estimate.attitude[rows], estimate.bias[rows], truth.attitude[edges[rows]], truth.bias[edges[rows]]
+            ),
+            6,
+        )
+    assert estimate.covariance is not None
+    return error, estimate.covariance[rows, :size, :size]
+
+
+def _sigma(objective: Callable[[Array], float], point: Array) -> Array:
+    """Return the standard deviations of log parameters by the curvature there; NaN where it is not that of a minimum."""
+    n = len(point)
+    steps = CURVATURE_STEP * np.eye(n)
+    middle = objective(point)
+    H = np.empty((n, n))
+    for i in range(n):
+        for j in range(i + 1):
+            H[i, j] = H[j, i] = (
+                objective(point + steps[i] + steps[j])
+                - objective(point + steps[i] - steps[j])
+                - objective(point - steps[i] + steps[j])
+                + objective(point - steps[i] - steps[j])
+                if i != j
+                else 4.0 * (objective(point + steps[i]) - 2.0 * middle + objective(point - steps[i]))
+            ) / (4.0 * CURVATURE_STEP**2)
+    if not np.all(np.linalg.eigvalsh(H) > 0.0):
+        return np.full(n, np.nan)
+    return np.asarray(np.sqrt(np.diag(np.linalg.inv(H))))
