@@ -261,6 +261,10 @@ def test_the_ellipse_holds_its_share():
     points = (factor @ random.standard_normal((2, 20_000))).T / units.DEGREE
     inside = ellipse.contains_points(ax.transData.transform(points))
     assert inside.mean() == pytest.approx(0.95, abs=0.01)
+    edge = ax.transData.inverted().transform(ellipse.get_transform().transform_path(ellipse.get_path()).vertices)
+    for (low, high), axis in zip((ax.get_xlim(), ax.get_ylim()), edge.T, strict=True):
+        assert low == -high
+        assert axis.max() < high < 2.0 * axis.max()  # all of it is seen
 
 
 @pytest.mark.parametrize(("theme", "ground"), [("light", "#ffffff"), ("dark", "#16181d")])
