@@ -217,10 +217,10 @@ def step_back(segments, j, prepared, model, space, pass_, later_q):
         if r < size or r == rows:
             used = size if r == rows else max(r + 1, loose(model))
             for c in range(0, room, WIDTH):
-                told = spread(0.0)
+                product = spread(0.0)
                 for i in range(used):
-                    told = told + later_F[r, i] * load(gain, room * i + c)
-                store(work, c, told)
+                    product = product + later_F[r, i] * load(gain, room * i + c)
+                store(work, c, product)
             for c in range(0, noisy, WIDTH):
                 t = load(later_F, width * r + c)
                 for w in range(rows - size):
