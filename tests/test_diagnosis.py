@@ -510,7 +510,7 @@ def test_the_verdict_is_that_of_all_evidence(run, tmp_path):
     said = " ".join(said.split())
     assert (status, error) == (1, "")
     assert "Likeliest cause: the gyro's rate random walk of the bias is" in said
-    assert "not consistent: the filter is" in said
+    assert "not consistent: the filter's model does not hold" in said
     assert ": consistent" not in said.replace("not consistent", "")
     saved = json.loads((tmp_path / "check.json").read_text())
     assert saved["verdict"] == saved["diagnosis"]["judgement"]["verdict"] == "not consistent"

@@ -100,9 +100,19 @@ class AhrsParameters:
             check(name, getattr(self, name))
 
     def matched(self, acceleration: float) -> AhrsParameters:
-        """Return the parameters for a unit moved with this acceleration, RMS of each component, m/s².
+        """Return the parameters for a unit moved with this acceleration.
 
-        That of a bounded velocity has σ ``velocity_sigma / √(velocity_time acceleration_time)``.
+        The acceleration of a bounded velocity has σ ``velocity_sigma / √(velocity_time acceleration_time)``.
+
+        Parameters
+        ----------
+        acceleration : float
+            RMS of each component, m/s².
+
+        Returns
+        -------
+        AhrsParameters
+            With the ``velocity_sigma`` of that acceleration where ``velocity_from_record`` is set; unchanged else.
         """
         if not self.velocity_from_record:
             return self

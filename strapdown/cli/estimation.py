@@ -97,7 +97,7 @@ class _Shared:
         return {name: value for name, value in (("gate", gate), ("robust", robust)) if value is not None}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Specified:
     """With a specification, as in recordings of `strapdown simulate`."""
 
@@ -165,7 +165,7 @@ class _Recorded:
     ] = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Output:
     """Output."""
 

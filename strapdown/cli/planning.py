@@ -57,7 +57,7 @@ def _in_own_units(biases: dict[str, float], sensors: Any) -> dict[str, float]:
     return {name: value * sizes.get(name, 1.0) for name, value in biases.items()}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Errors:
     """Errors besides those that the filter models."""
 

@@ -66,7 +66,7 @@ class Samples:
         return found
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Layout(Samples):
     """Layout of the recording."""
 

@@ -121,7 +121,7 @@ class _Identification:
     ] = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Exports:
     """Files for other programs."""
 

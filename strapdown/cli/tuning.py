@@ -48,7 +48,7 @@ WORSE = 1.05
 """An attitude error on the data held out that has grown by more than this is reported."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Filter:
     """Filter to start from."""
 
