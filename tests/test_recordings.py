@@ -104,7 +104,12 @@ def test_empty_fields_of_accelerometer_and_magnetometer_are_missing_samples(csv)
 
 
 def test_undeclared_units_are_refused_not_guessed(csv):
-    refused(csv("time,gx,gy,gz,ax [m/s2],ay,az"), "does not say the unit of its gyro", "gx [rad/s]", "rad/s, deg/s, mrad/s, mdeg/s")
+    refused(
+        csv("time,gx,gy,gz,ax [m/s2],ay,az"),
+        "does not say the unit of its gyro",
+        "gx [rad/s]",
+        "rad/s, deg/s, mrad/s, mdeg/s",
+    )
     refused(csv("time,gx [rad/s],gy,gz,ax,ay,az"), "unit of its accelerometer", "ax [m/s2]", "(m/s2, g, mg;")
 
 
