@@ -584,6 +584,23 @@ def test_a_replayed_run_is_the_same_to_the_bit():
         assert np.array_equal(np.sqrt(estimate.variance[edges]), total.example_sigma[run])
 
 
+@pytest.mark.parametrize("machine", ["scalar", "lanes"])
+def test_the_examples_are_the_first_runs_by_their_numbers(machine):
+    """Chunks begin and end among them."""
+    total = montecarlo.run_plan(PLAN, runs=12, chunk=5, threads=1, machine=machine)
+    assert total.example_run.tolist() == list(range(statistics.EXAMPLES))
+
+
+def test_degrees_of_freedom_are_those_of_the_states_judged():
+    total = scalar.run_chunk(PLAN, 0, 8)
+    epochs = np.array([2, 4])
+    assert {name: total.verdict(epochs, name).degrees for name in total.subsets} == {
+        "state": 6,
+        "attitude": 3,
+        "bias": 3,
+    }
+
+
 def test_lost_samples_and_jitter_go_through_too():
     """Epochs stay at their times, whatever samples were lost before them."""
     spec = replace(SCENARIO.gyro, drop_probability=0.2, sampling_jitter=1e-4)

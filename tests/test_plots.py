@@ -335,6 +335,14 @@ def figures(run, statistics, outcomes):
     }
 
 
+def test_the_bias_is_drawn_in_the_unit_of_its_axis(run):
+    estimate, _ = run
+    (ax,) = (ax for ax in plots.estimate_overview(estimate).axes if ax.get_ylabel().startswith("gyro bias"))
+    size = {"gyro bias, °/h": np.pi / 180.0 / 3600.0, "gyro bias, °/s": np.pi / 180.0}[ax.get_ylabel()]
+    for k, line in enumerate(ax.get_lines()[:3]):
+        assert line.get_ydata()[-1] * size == pytest.approx(estimate.bias[-1, k], rel=1e-12)
+
+
 @pytest.fixture(scope="module")
 def outcomes(statistics):
     epochs = np.array([10, 20])
