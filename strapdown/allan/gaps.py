@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from strapdown import checks
 from strapdown.allan.deviation import NOISE_TYPES, TERMS, AllanDeviation
 from strapdown.allan.noise_fit import NoiseFit, fit_axis, misfit_of, of_axes
-from strapdown.allan.spectrum import Bins, bin_starts, cosine_transform, mean_power, ramp_coefficients
+from strapdown.allan.spectrum import Bins, bin_starts, cosine_transform, last_coefficient, mean_power, ramp_coefficients
 from strapdown.checks import Array, InputError
 
 SHORTEST = 64
@@ -276,13 +276,11 @@ def fit_noise(
 
 def _stretch(x: Array, dt: float, random_terms: tuple[str, ...], highest_frequency: float | None) -> _Stretch:
     samples = len(x)
-    last = samples - 1
-    if highest_frequency is not None:
-        last = min(last, int(2.0 * samples * dt * checks.positive("highest_frequency", highest_frequency, unit="Hz")))
-        if last < 1:
-            raise InputError(
-                f"highest_frequency is {highest_frequency:g} Hz: a segment of {samples} samples has nothing below; raise it"
-            )
+    last = last_coefficient(samples, dt, highest_frequency)
+    if highest_frequency is not None and last < 1:
+        raise InputError(
+            f"highest_frequency is {highest_frequency:g} Hz: a segment of {samples} samples has nothing below; raise it"
+        )
     starts = bin_starts(last)
     basis = np.stack([mean_power(term, samples, dt, starts, last) for term in random_terms])
     return _Stretch(cosine_transform(x, 1.0), starts, last, basis)

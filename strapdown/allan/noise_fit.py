@@ -32,6 +32,7 @@ from strapdown.allan.spectrum import (
     binned,
     cosine_transform,
     expected_power,
+    last_coefficient,
     mean_power,
     ramp_coefficients,
 )
@@ -183,13 +184,9 @@ def fit_noise(
     samples = record.shape[0]
     if samples < 64:
         raise InputError(f"values has {samples} samples; at least 64 are needed to separate the noises")
-    last = samples - 1
-    if highest_frequency is not None:
-        last = min(last, int(2.0 * samples * dt * checks.positive("highest_frequency", highest_frequency, unit="Hz")))
-        if last < 32:
-            raise InputError(
-                f"highest_frequency is {highest_frequency:g} Hz: only {last} coefficients lie below; raise it"
-            )
+    last = last_coefficient(samples, dt, highest_frequency)
+    if highest_frequency is not None and last < 32:
+        raise InputError(f"highest_frequency is {highest_frequency:g} Hz: only {last} coefficients lie below; raise it")
     starts = bin_starts(last)
     random_terms = tuple(term for term in chosen if term != "rate_ramp")
     basis = np.stack([mean_power(term, samples, dt, starts, last) for term in random_terms])

@@ -9,12 +9,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from strapdown.checks import Array, InputError
+from strapdown.checks import Array, InputError, positive
 
 BIN_GROWTH = 1.05
 
 
 LARGEST_EXACT = 1 << 16
+
+
+def last_coefficient(samples: int, dt: float, highest_frequency: float | None) -> int:
+    """Return the index of the last DCT coefficient below a frequency, Hz; None: of the last of all."""
+    if highest_frequency is None:
+        return samples - 1
+    return min(samples - 1, int(2.0 * samples * dt * positive("highest_frequency", highest_frequency, unit="Hz")))
 
 
 def bin_starts(last: int) -> NDArray[np.int64]:

@@ -392,10 +392,8 @@ def _seconds(stamps: Array, factor: float) -> tuple[Array, int]:
     """Return stamps as time in s and the clock's reading at its start, ns; those of a clock that counts from 1970 begin at 0."""
     beyond = len(stamps) > 0 and abs(stamps[0] * factor) > CLOCK_OFFSET
     origin = float(stamps[0]) if beyond else 0.0
-    whole, scale = (
-        int(origin),
-        round(1e9 * factor),
-    )  # the product in integers: doubles since 1970 are good to 0.2 µs only
+    # The product in integers: doubles since 1970 are good to 0.2 µs only.
+    whole, scale = int(origin), round(1e9 * factor)
     return np.asarray((stamps - origin) * factor), whole * scale + round((origin - whole) * scale)
 
 
