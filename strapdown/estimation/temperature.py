@@ -75,7 +75,8 @@ def shifted(state: State, own: slice, change: float) -> State:
     def turned(P: Array, root: Array | None) -> dict[str, Any]:
         if root is None:
             return {"covariance": J @ P @ J.T}
-        return {"covariance": (root @ J.T).T @ (root @ J.T), "factor": root @ J.T}
+        after = root @ J.T
+        return {"covariance": after.T @ after, "factor": after}
 
     memory = state.gate
     if memory is not None and memory.candidate is not None:
