@@ -71,10 +71,6 @@ from strapdown.kernels.walk import step_within, turn_squared
 CALLED = ("store_segment", "age_chains", "aged_chain")
 """Not inlined. Only functions of few arrays are: each array of a NamedTuple is handed over as seven numbers."""
 
-BORROWS_ARRAYS = True
-"""See :mod:`strapdown.kernels.machine`."""
-
-
 SHORT = 0.2
 """Of λ dt of a state in a chain: its series is exact."""
 
