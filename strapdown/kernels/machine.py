@@ -143,7 +143,7 @@ def compiled(function: Callable[..., Any], *parts: ModuleType) -> Any:
 
     if not _is_kernel(function):
         raise TypeError(f"{function!r} does not live in {PACKAGE}; move it there before compiling it")
-    options = {"pipeline_class": KernelCompiler, **_options()}  # type: ignore[arg-type]
+    options = {"pipeline_class": KernelCompiler, "no_cfunc_wrapper": True, **_options()}
     dispatcher = numba.njit(**options)(_twin(function, parts))  # type: ignore[arg-type]
     with contextlib.suppress(RuntimeError):  # no writable place for a cache: compile in every process
         dispatcher._cache = KernelCache(dispatcher.py_func)
