@@ -324,7 +324,8 @@ def longer(row):
     return len(row), row.shape[0]
 
 def inner(a, i, j):
-    return a[1, i, j] + 10.0 * a[i, j, 0] + len(a[1, i:])
+    later, column = a[1, i:], a[:, i]
+    return a[1, i, j] + 10.0 * a[i, j, 0] + len(later) + 100.0 * later[1, j] + 1000.0 * column[1, j]
 
 def elements(a, flags, words, rows, thin):
     words[0] = 7
