@@ -39,7 +39,9 @@ def takes(problem: Problem) -> bool:
     """Return whether a record can be filtered beside others: its model has no chains, no offset in fixed axes and no temperature."""
     model = problem.model
     return (
-        temperature.slopes(problem.error_states) is None and not len(model.chains) and not (model.sensor_use & FIXED).any()
+        temperature.slopes(problem.error_states) is None
+        and not len(model.chains)
+        and not (model.sensor_use & FIXED).any()
     )
 
 
@@ -142,6 +144,7 @@ def _filtered(problems: Sequence[Problem], every: int) -> list[Estimate | None]:
             ((3, n, WIDTH), float),
             ((6, n, WIDTH), float),
             ((2, n), float),
+            ((n - 5, 4, 12), float),
             ((WIDTH,), float),
             ((2 * n + 22, WIDTH), float),
         )
@@ -150,7 +153,7 @@ def _filtered(problems: Sequence[Problem], every: int) -> list[Estimate | None]:
     work.attitude[:] = _in_lanes([one.attitude for one in initials])
     work.x[:] = _in_lanes([np.concatenate([one.bias, one.values[model.order]]) for one in initials])
     work.P[0] = _in_lanes([one.covariance[np.ix_(order, order)] for one in initials])
-    work.lost[:] = 0.0
+    work.table[-1], work.lost[:] = 0.0, 0.0
     levers = [turns(problem.record, problem.events, model) for problem in problems]
     taken = lane_states.Runs(
         increments=_in_lanes([problem.record.increments for problem in problems]),

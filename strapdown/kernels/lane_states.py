@@ -25,6 +25,7 @@ from strapdown.kernels.algebra import (
     matrix_times_vector,
     multiply,
     scale,
+    skew_polynomial,
     square_root,
     subtract,
     symmetric_minus_outer,
@@ -34,6 +35,7 @@ from strapdown.kernels.algebra import (
     transpose_times_vector,
 )
 from strapdown.kernels.error_state_step import (
+    FACTORIALS,
     FORCE,
     LEVER,
     OFFSET,
@@ -44,7 +46,6 @@ from strapdown.kernels.error_state_step import (
     inverse,
     matrix_at,
     offset_of,
-    response,
     turning_matrix,
 )
 from strapdown.kernels.filter_step import SHORT_FORM, process_noise, reset, transition
@@ -58,7 +59,8 @@ from strapdown.kernels.walk import SQUARED_RANGE
 CALLED = (
     "step",
     "follow",
-    "node",
+    "fill_table",
+    "at_node",
     "absorb",
     "product",
     "minus_outer",
@@ -79,6 +81,10 @@ MISS, GAIN, STEP, AXES = 0, 1, 2, 3
 """Lines of n states: P h less the gain times the noise, P h, the correction, and from the last on three of the three axes."""
 OWN, KEPT = 0, 1
 """Lines of n numbers, the same in all lanes: noise of a state by itself, and what is left of it, in the steps since P's."""
+LEFT, MEAN, OF_NOISE, TIME, SERIES = 0, 1, 10, 11, 10
+"""Columns of a state's table: e^{−λu}, ``∫₀ᵘ e^{−λs} ds``, ``∫₀ᵘ e^{−2λs} ds``, u; between them ``Σ (−λu)ⁱ/(i + k)!`` in column k."""
+SAME = 1e-9
+"""Part of a step within which another one has the same table."""
 SHARPEST = 1e9
 """Largest ratio of an innovation's variance to the measurement's at which P keeps digits enough."""
 LEAST_SHARE = 1e-9
@@ -133,6 +139,8 @@ class Work(NamedTuple):
     """(6, n, W): :data:`MISS` to :data:`AXES`."""
     alone: np.ndarray
     """(2, n): :data:`OWN` and :data:`KEPT`."""
+    table: np.ndarray
+    """What a step makes of each state, and last the step that it is of (m + 1, 4, 12)."""
     lost: np.ndarray
     """1 where the run is lost (W,)."""
     written: np.ndarray
@@ -191,24 +199,21 @@ def mark(work, like, good):
 def step(model, work, like, q, turn, noise, dt, part):
     """Propagate attitude and ``x`` over an increment, and add the step to those since P's; return q, Φ_θθ and Q_θθ of all of them."""
     gyro, gyro_use, decay, density = model.gyro, model.gyro_use, model.decay, model.density
-    x = work.x
+    x, table = work.x, work.table
+    if abs(dt - table[len(decay), 0, 0]) > SAME * dt:
+        fill_table(table, decay, dt)
     r = combine(1.0, part, -dt, triple(x, 0, like))
     force = (like, like, like)
     if dot(model.force_f, model.force_f) > 0.0:
         force = transpose_times_vector(rotation_matrix(turned(q, scale(0.5, r))), model.force_f)
     D = identity(like)
     coupled = False
-    held = -1.0
-    mean = dt
     for k in range(len(decay)):
         use = gyro_use[k]
         if use != 0:
             c = one_of(x, 3 + k, like)
             if use & OFFSET:
-                if decay[k] != held:
-                    held = decay[k]
-                    mean = -math.expm1(-held * dt) / held if held > 0.0 else dt
-                r = combine(1.0, r, -mean * c, (gyro[k, 0], gyro[k, 1], gyro[k, 2]))
+                r = combine(1.0, r, -table[k, 3, MEAN] * c, (gyro[k, 0], gyro[k, 1], gyro[k, 2]))
             if use & FORCE:
                 r = combine(1.0, r, -dt * c, gyro_matrix_times(gyro, k, force))
             if use & SCALE:
@@ -239,65 +244,73 @@ def step(model, work, like, q, turn, noise, dt, part):
         column = (phi12[i], phi12[3 + i], phi12[6 + i])
         noise = follow(work, like, 3 + i, phi11, column, (q12[i], q12[3 + i], q12[6 + i]), q22, 1.0, noise)
     E = E0 = E1 = E2 = D
-    held = alone = -1.0
-    kept = own = 1.0
+    held = -1.0
     for k in range(len(decay)):
-        use = gyro_use[k]
-        if decay[k] != alone:
-            alone = decay[k]
-            kept = math.exp(-alone * dt) if alone > 0.0 else 1.0
-            own = -0.5 * math.expm1(-2.0 * alone * dt) / alone if alone > 0.0 else dt
+        use, kept, own = gyro_use[k], table[k, 3, LEFT], density[k] * table[k, 3, OF_NOISE]
         put(x, 3 + k, like, kept * one_of(x, 3 + k, like))
         if use == 0:
-            work.alone[OWN, 6 + k] = kept * kept * work.alone[OWN, 6 + k] + own * density[k]
+            work.alone[OWN, 6 + k] = kept * kept * work.alone[OWN, 6 + k] + own
             work.alone[KEPT, 6 + k] *= kept
         else:
             e = (gyro[k, 0], gyro[k, 1], gyro[k, 2])
-            drifts = use & OFFSET and decay[k] > 0.0
             w = (like, like, like)
-            if use & OFFSET and not drifts:
-                w = add(w, e)
             if use & SCALE:
                 w = add(w, gyro_matrix_times(gyro, k, rate))
             if use & FORCE:
                 w = add(w, gyro_matrix_times(gyro, k, force))
             column = matrix_times_vector(phi12, w)
             share = (like, like, like)
-            added = own * density[k]
-            if use & OFFSET and (drifts or density[k] > 0.0):
+            if use & OFFSET:
                 if decay[k] != held:
                     held = decay[k]
-                    E = node(rate, dt, held, D, coupled)
-                    E0 = node(rate, dt * (1.0 - THREE_NODES[0]), held, D, coupled)
-                    E1 = node(rate, dt * (1.0 - THREE_NODES[1]), held, D, coupled)
-                    E2 = node(rate, dt * (1.0 - THREE_NODES[2]), held, D, coupled)
-                if drifts:
-                    column = subtract(column, matrix_times_vector(E, e))
+                    E0, E1 = at_node(table, k, 0, rate, D, coupled), at_node(table, k, 1, rate, D, coupled)
+                    E2, E = at_node(table, k, 2, rate, D, coupled), at_node(table, k, 3, rate, D, coupled)
+                column = subtract(column, matrix_times_vector(E, e))
                 if density[k] > 0.0:
-                    noise, share, added = driven(noise, share, 0.0, E0, e, held, dt, density[k], 0)
-                    noise, share, added = driven(noise, share, added, E1, e, held, dt, density[k], 1)
-                    noise, share, added = driven(noise, share, added, E2, e, held, dt, density[k], 2)
-            noise = follow(work, like, 6 + k, phi11, column, share, added, kept, noise)
+                    noise, share = driven(table, k, 0, density[k], E0, e, noise, share)
+                    noise, share = driven(table, k, 1, density[k], E1, e, noise, share)
+                    noise, share = driven(table, k, 2, density[k], E2, e, noise, share)
+            noise = follow(work, like, 6 + k, phi11, column, share, own, kept, noise)
     return turned(q, r), multiply(phi11, turn), noise
 
 
-def node(rate, u, decay, D, coupled):
-    """Return :func:`response` over the time u, times (I + M)⁻¹."""
-    E, _ = response(rate, u, decay)
+def fill_table(table, decay, dt):
+    """Write what a step of dt makes of each state by itself: rows of the nodes of its noise, and of its end."""
+    table[len(decay), 0, 0] = dt
+    for k in range(len(decay)):
+        for i in range(4):
+            u = dt * (1.0 - THREE_NODES[i]) if i < 3 else dt
+            z = -decay[k] * u
+            phi = FACTORIALS[0]
+            for j in range(1, 15):
+                phi = FACTORIALS[j] + z * phi
+                if 16 - j < SERIES:
+                    table[k, i, 16 - j] = phi
+            table[k, i, TIME] = u
+            table[k, i, MEAN] = u * (1.0 + z * phi)
+            table[k, i, LEFT] = math.exp(z)
+        table[k, 3, OF_NOISE] = -0.5 * math.expm1(-2.0 * decay[k] * dt) / decay[k] if decay[k] > 0.0 else dt
+
+
+def at_node(table, k, i, rate, D, coupled):
+    """Return :func:`strapdown.kernels.error_state_step.response` up to a node of state k's noise, times (I + M)⁻¹.
+
+    Of each series four terms: to 1e-10 in the range of a step.
+    """
+    f = table[k, i]
+    u = f[TIME]
+    y = -u * u * dot(rate, rate)
+    linear = f[2] + y * (f[4] + y * (f[6] + y * f[8]))
+    quadratic = f[3] + y * (f[5] + y * (f[7] + y * f[9]))
+    E = skew_polynomial(f[MEAN], -u * u * linear, u * u * u * quadratic, rate)
     return multiply(E, D) if coupled else E
 
 
-def driven(noise, share, own, E, e, decay, dt, density, i):
-    """Add what a state's white noise makes at Gauss's node i: of Q_θθ, of Q with the attitude, of Q by itself."""
-    u = dt * (1.0 - THREE_NODES[i])
-    kept = math.exp(-decay * u)
-    weight = THREE_WEIGHTS[i] * dt * density
+def driven(table, k, i, density, E, e, noise, share):
+    """Add what state k's white noise makes at Gauss's node i: of Q_θθ, and of Q with the attitude."""
+    weight = THREE_WEIGHTS[i] * density * table[k, 3, TIME]
     t = matrix_times_vector(E, e)
-    return (
-        symmetric_minus_outer(noise, scale(-weight, t), t),
-        combine(1.0, share, -weight * kept, t),
-        own + weight * kept * kept,
-    )
+    return symmetric_minus_outer(noise, scale(-weight, t), t), combine(1.0, share, -weight * table[k, i, LEFT], t)
 
 
 def follow(work, like, i, phi11, column, share, own, kept, noise):
@@ -399,11 +412,13 @@ def product(work, like, use, r, line):
     """Write P h of a row of H, of a sensor whose states are marked in ``use``, to a line."""
     n = work.alone.shape[1]
     for j in range(n):
-        p = like
-        for i in range(n):
-            if i < 3 or (i >= 6 and use[i - 6] != 0):
-                p = p + one_of(work.rows, n * r + i, like) * seen(work, like, place_of(n, i, j))
-        put(work.lines, n * line + j, like, p)
+        put(work.lines, n * line + j, like, like)
+    for i in range(n):
+        if i < 3 or (i >= 6 and use[i - 6] != 0):
+            h = one_of(work.rows, n * r + i, like)
+            for j in range(n):
+                p = one_of(work.lines, n * line + j, like) + h * seen(work, like, place_of(n, i, j))
+                put(work.lines, n * line + j, like, p)
 
 
 def against(work, like, use, r, line):
