@@ -75,7 +75,8 @@ def run(problems: Sequence[Problem], every: int, alone: Callable[[Problem], Esti
         for first in range(0, len(group), WIDTH):
             together = group[first : first + WIDTH]
             found.update(zip(together, _filtered([problems[i] for i in together], every), strict=True))
-    return [found.get(i) or alone(problem) for i, problem in enumerate(problems)]
+    found_or_none = [found.get(i) for i in range(len(problems))]
+    return [alone(problem) if one is None else one for problem, one in zip(problems, found_or_none, strict=True)]
 
 
 def _alike(one: Problem, other: Problem) -> bool:

@@ -51,7 +51,7 @@ from strapdown.kernels.error_state_step import (
 from strapdown.kernels.filter_step import SHORT_FORM, process_noise, reset, transition
 from strapdown.kernels.lane_angles import arctangent, rotation_vector
 from strapdown.kernels.lane_values import anywhere, chosen, lanes_of, load_like, store_like
-from strapdown.kernels.measurement import ATTITUDE, DIRECTION, HEADING, VERTICAL
+from strapdown.kernels.measurement import ATTITUDE, DIRECTION, HEADING, VERTICAL, frame_at, six_at
 from strapdown.kernels.montecarlo_run import store_four, store_triple, triple
 from strapdown.kernels.rotation import exponential, quaternion_multiply, right_jacobian, rotation_matrix, turned
 from strapdown.kernels.walk import SQUARED_RANGE
@@ -87,7 +87,7 @@ SAME = 1e-9
 """Part of a step within which another one has the same table."""
 SHARPEST = 1e9
 """Largest ratio of an innovation's variance to the measurement's at which P keeps digits enough."""
-LEAST_SHARE = 1e-9
+LEAST_SHARE = 1e-6
 """Smallest part of a state's variance, given the states before it, at which P keeps digits enough."""
 CHECK = 1024
 """Intervals from one look at the digits to the next."""
@@ -182,6 +182,37 @@ def identity(like):
     return (one, like, like, like, one, like, like, like, one)
 
 
+def error_matrix(gyro, k):
+    """Return the matrix of a state of the gyro."""
+    return (
+        gyro[k, 3],
+        gyro[k, 4],
+        gyro[k, 5],
+        gyro[k, 6],
+        gyro[k, 7],
+        gyro[k, 8],
+        gyro[k, 9],
+        gyro[k, 10],
+        gyro[k, 11],
+    )
+
+
+def four(array, place, like):
+    """Return four neighbouring places."""
+    return (
+        one_of(array, place, like),
+        one_of(array, place + 1, like),
+        one_of(array, place + 2, like),
+        one_of(array, place + 3, like),
+    )
+
+
+def spread_six(like, array, e):
+    """Return row e of an array in all lanes."""
+    a = six_at(array, e)
+    return (like + a[0], like + a[1], like + a[2], like + a[3], like + a[4], like + a[5])
+
+
 def scaled(c, A):
     """Return c A of a 9-tuple."""
     return (c * A[0], c * A[1], c * A[2], c * A[3], c * A[4], c * A[5], c * A[6], c * A[7], c * A[8])
@@ -218,18 +249,7 @@ def step(model, work, like, q, turn, noise, dt, part):
                 r = combine(1.0, r, -dt * c, gyro_matrix_times(gyro, k, force))
             if use & SCALE:
                 coupled = True
-                T = (
-                    gyro[k, 3],
-                    gyro[k, 4],
-                    gyro[k, 5],
-                    gyro[k, 6],
-                    gyro[k, 7],
-                    gyro[k, 8],
-                    gyro[k, 9],
-                    gyro[k, 10],
-                    gyro[k, 11],
-                )
-                D = add_matrices(D, scaled(c, T))
+                D = add_matrices(D, scaled(c, error_matrix(gyro, k)))
     if coupled:
         D = inverse(D)
         r = matrix_times_vector(D, r)
@@ -470,18 +490,20 @@ def take_row(work, like, use, r, y, variance):
 
 
 def sensed(work, model, like, s, length, W):
-    """Return the offset, body axes, and I + M of what a sensor measures."""
+    """Return the offset, body axes, and I + M of what a sensor measures, and whether any state is about it."""
     use = model.sensor_use
     offset = (like, like, like)
     M = identity(like)
+    coupled = False
     for k in range(use.shape[1]):
         if use[s, k] != 0:
+            coupled = True
             c = one_of(work.x, 3 + k, like)
             if use[s, k] & (OFFSET | LEVER):
                 offset = combine(1.0, offset, c / length, offset_of(model.sensors, use, s, k, W))
             if use[s, k] & SCALE:
                 M = add_matrices(M, scaled(c, matrix_at(model.sensors, s, k)))
-    return offset, M
+    return offset, M, coupled
 
 
 def put_row(work, like, n, r, h):
@@ -492,7 +514,7 @@ def put_row(work, like, n, r, h):
 def attitude_rows(model, work, like, q, measured, s):
     """Write H of a measured attitude; return y (3)."""
     n, use = work.alone.shape[1], model.sensor_use
-    offset, _ = sensed(work, model, like, s, 1.0, identity(like))
+    offset, _, _ = sensed(work, model, like, s, 1.0, identity(like))
     mark(work, like, dot(offset, offset) <= SQUARED_RANGE)
     predicted = turned(q, offset)
     E = transpose(rotation_matrix(exponential(offset)))
@@ -511,10 +533,7 @@ def heading_rows(model, work, like, q, z, reference, length, s):
     """Write H of the heading of a vector; return y."""
     n, use = work.alone.shape[1], model.sensor_use
     R = rotation_matrix(q)
-    offset, M = sensed(work, model, like, s, length, identity(like))
-    coupled = False
-    for k in range(use.shape[1]):
-        coupled = coupled or use[s, k] != 0
+    offset, M, coupled = sensed(work, model, like, s, length, identity(like))
     D = inverse(M)
     m = matrix_times_vector(R, matrix_times_vector(D, subtract(z, offset)))
     level = m[0] * m[0] + m[1] * m[1]
@@ -552,10 +571,7 @@ def vector_rows(model, work, like, q, z, frame, length, s, W, rows):
     """Write H of a direction (two rows) or a whole vector (three); return y (3) and the rows' axes."""
     n, use = work.alone.shape[1], model.sensor_use
     R = rotation_matrix(q)
-    offset, M = sensed(work, model, like, s, length, W)
-    coupled = False
-    for k in range(use.shape[1]):
-        coupled = coupled or use[s, k] != 0
+    offset, M, coupled = sensed(work, model, like, s, length, W)
     u = transpose_times_vector(R, (frame[0], frame[1], frame[2]))
     v = transpose_times_vector(R, (frame[3], frame[4], frame[5]))
     third = transpose_times_vector(R, (frame[6], frame[7], frame[8]))
@@ -627,23 +643,17 @@ def update(model, work, like, q, e, events, runs, out):
     n = work.alone.shape[1]
     s, kind, length = events.sensor[e], events.kind[e], events.length[e]
     use = model.sensor_use[s]
-    value = (
-        one_of(runs.value, 4 * e, like),
-        one_of(runs.value, 4 * e + 1, like),
-        one_of(runs.value, 4 * e + 2, like),
-        one_of(runs.value, 4 * e + 3, like),
-    )
+    value = four(runs.value, 4 * e, like)
     z = (value[0], value[1], value[2])
-    f, c = events.frame, events.noise
+    frame, C = frame_at(events.frame, e), spread_six(like, events.noise, e)
     one = like + 1.0
-    C = (like + c[e, 0], like + c[e, 1], like + c[e, 2], like + c[e, 3], like + c[e, 4], like + c[e, 5])
     T = ((one, like, like), (like, one, like), (like, like, one))
     rows = 3
     if kind == ATTITUDE:
         y = attitude_rows(model, work, like, q, value, s)
     elif kind == HEADING:
         rows = 1
-        error = heading_rows(model, work, like, q, z, (f[e, 6], f[e, 7], f[e, 8]), length, s)
+        error = heading_rows(model, work, like, q, z, (frame[6], frame[7], frame[8]), length, s)
         y = (error, like, like)
     else:
         rows = 2 if kind == DIRECTION else 3
@@ -652,7 +662,6 @@ def update(model, work, like, q, e, events, runs, out):
             turn = subtract(triple(runs.turning, 9 * e, like), triple(work.x, 0, like))
             W = turning_matrix(turn, triple(runs.turning, 9 * e + 3, like))
             C = arm_noise(model, work, like, s, length, triple(runs.turning, 9 * e + 6, like), C)
-        frame = (f[e, 0], f[e, 1], f[e, 2], f[e, 3], f[e, 4], f[e, 5], f[e, 6], f[e, 7], f[e, 8])
         y, t0, t1, t2 = vector_rows(model, work, like, q, z, frame, length, s, W, rows)
         T = (t0, t1, t2)
     y, variance = decorrelate(work, like, use, rows, y, T, C)
@@ -692,26 +701,22 @@ def keep(model, work, like, base, q, row, out):
         put(written, 4 + i, like, one_of(work.x, i, like))
     for i in range(n):
         put(written, n + 1 + i, like, seen(work, like, base + n * i + i))
-    # Covariances of each state with the whole bias, b + Σ c e.
-    for a in range(3):
+    # Covariances of each state with attitude and whole bias, b + Σ c e, and of those among themselves.
+    reported = work.lines.shape[0]
+    for a in range(reported):
         for j in range(n):
-            t = seen(work, like, base + place_of(n, 3 + a, j))
-            for k in range(n - 6):
+            t = seen(work, like, base + place_of(n, a, j))
+            for k in range(n - 6 if a >= 3 else 0):
                 if model.gyro_use[k] & OFFSET:
-                    t = t + model.gyro[k, a] * seen(work, like, base + place_of(n, 6 + k, j))
-            put(work.lines, n * (AXES + a) + j, like, t)
+                    t = t + model.gyro[k, a - 3] * seen(work, like, base + place_of(n, 6 + k, j))
+            put(work.lines, n * a + j, like, t)
     here = 2 * n + 1
-    for a in range(6):
-        for b in range(a, 6):
-            if b < 3:
-                t = seen(work, like, base + n * a + b)
-            else:
-                line = n * (AXES + b - 3)
-                t = one_of(work.lines, line + a, like)
-                if a >= 3:
-                    for k in range(n - 6):
-                        if model.gyro_use[k] & OFFSET:
-                            t = t + model.gyro[k, a - 3] * one_of(work.lines, line + 6 + k, like)
+    for a in range(reported):
+        for b in range(a, reported):
+            t = one_of(work.lines, n * b + a, like)
+            for k in range(n - 6 if a >= 3 else 0):
+                if model.gyro_use[k] & OFFSET:
+                    t = t + model.gyro[k, a - 3] * one_of(work.lines, n * b + 6 + k, like)
             put(written, here, like, t)
             here += 1
     hand_out(work, like, out, row, here)
@@ -753,12 +758,7 @@ def advance(pattern, edges, every, model, events, runs, work, out):
     unmoved = identity(like)
     still = (like, like, like, like, like, like)
     turn, noise = unmoved, still
-    q = (
-        one_of(work.attitude, 0, like),
-        one_of(work.attitude, 1, like),
-        one_of(work.attitude, 2, like),
-        one_of(work.attitude, 3, like),
-    )
+    q = four(work.attitude, 0, like)
     start_steps(work, like)
     count, e, row, countdown = len(events.time), 0, 0, 0
     behind = False
@@ -788,7 +788,7 @@ def advance(pattern, edges, every, model, events, runs, work, out):
                     turn, noise, behind = unmoved, still, False
                 q = update(model, work, like, q, e, events, runs, out)
                 e += 1
-            elif now >= end:
+            if now >= end and (e == count or events.time[e] > end):
                 break
         if countdown == 0:
             countdown = every
