@@ -262,7 +262,7 @@ def test_runs_whose_times_differ_are_filtered_one_by_one(fault):
 
 
 def test_the_filter_with_states_is_as_good_as_it_says():
-    """Over individuals, whose errors are drawn as the states assume: ANEES and NIS inside their bounds, and outside with states left out."""
+    """Over individuals, whose errors are drawn as the states assume: ANEES inside its bounds, and outside with the states left out."""
     scenario = replace(plan("heading").scenario, duration=10.0)
     verdicts = []
     for states in (True, False):

@@ -85,9 +85,9 @@ LEFT, MEAN, OF_NOISE, TIME, SERIES = 0, 1, 10, 11, 10
 """Columns of a state's table: e^{−λu}, ``∫₀ᵘ e^{−λs} ds``, ``∫₀ᵘ e^{−2λs} ds``, u; between them ``Σ (−λu)ⁱ/(i + k)!`` in column k."""
 SAME = 1e-9
 """Part of a step within which another one has the same table."""
-SHARPEST = 1e9
+MAX_SHARPNESS = 1e9
 """Largest ratio of an innovation's variance to the measurement's at which P keeps digits enough."""
-LEAST_SHARE = 1e-6
+MIN_SHARE = 1e-6
 """Smallest part of a state's variance, given the states before it, at which P keeps digits enough."""
 CHECK = 1024
 """Intervals from one look at the digits to the next."""
@@ -298,7 +298,11 @@ def fill_table(table, decay, dt):
     """Write what a step of dt makes of each state by itself: rows of the nodes of its noise, and of its end."""
     table[len(decay), 0, 0] = dt
     for k in range(len(decay)):
-        for i in range(4):
+        same = k > 0 and decay[k] == decay[k - 1]
+        for i in range(12 if same else 0):
+            for r in range(4):
+                table[k, r, i] = table[k - 1, r, i]
+        for i in range(0 if same else 4):
             u = dt * (1.0 - THREE_NODES[i]) if i < 3 else dt
             z = -decay[k] * u
             phi = FACTORIALS[0]
@@ -309,7 +313,8 @@ def fill_table(table, decay, dt):
             table[k, i, TIME] = u
             table[k, i, MEAN] = u * (1.0 + z * phi)
             table[k, i, LEFT] = math.exp(z)
-        table[k, 3, OF_NOISE] = -0.5 * math.expm1(-2.0 * decay[k] * dt) / decay[k] if decay[k] > 0.0 else dt
+        if not same:
+            table[k, 3, OF_NOISE] = -0.5 * math.expm1(-2.0 * decay[k] * dt) / decay[k] if decay[k] > 0.0 else dt
 
 
 def at_node(table, k, i, rate, D, coupled):
@@ -485,7 +490,7 @@ def take_row(work, like, use, r, y, variance):
             put(work.lines, here, like, chosen(precise, missed, like))
         minus_outer(work, like, MISS, GAIN, inverted)
     mark(work, like, s >= variance)
-    mark(work, like, s <= SHARPEST * variance)
+    mark(work, like, s <= MAX_SHARPNESS * variance)
     return error, s
 
 
@@ -802,4 +807,4 @@ def advance(pattern, edges, every, model, events, runs, work, out):
             row += 1
         countdown -= 1
         if (k + 1) % CHECK == 0 or k == len(edges) - 2:
-            mark(work, like, least_share(work, like) >= LEAST_SHARE)
+            mark(work, like, least_share(work, like) >= MIN_SHARE)
