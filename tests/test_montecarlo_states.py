@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from strapdown import consistency, montecarlo, motion, scenarios, setup, vectors
-from strapdown.estimation import side_by_side
+from strapdown.estimation import together
 from strapdown.estimation.states import ProcessNoise
 from strapdown.gyro import GyroSpec
 from strapdown.montecarlo import scalar, statistics
@@ -132,15 +132,15 @@ def bits(estimate):
 @pytest.mark.parametrize("name", MODELS)
 def test_each_run_is_what_the_factor_makes_of_it(name, monkeypatch):
     """Errors, σ, correlations, NIS and error states, to 1e-8 of σ; none is left to the factor itself."""
-    filtered, found = side_by_side._filtered, []
-    monkeypatch.setattr(side_by_side, "_filtered", lambda *given: found.extend(filtered(*given)) or found[-3:])
+    filtered, found = together._filtered, []
+    monkeypatch.setattr(together, "_filtered", lambda *given: found.extend(filtered(*given)) or found[-3:])
     records, initials = runs(name, 3)
     chosen = plan(name).setup
     for every in (1, 50):
-        together = setup.run_together(records, chosen, initials, every)
+        eight = setup.run_together(records, chosen, initials, every)
         assert len(found) >= 3
         assert None not in found
-        for record, initial, one in zip(records, initials, together, strict=True):
+        for record, initial, one in zip(records, initials, eight, strict=True):
             other = setup.run(record, chosen, initial, every=every, full_covariance=True)
             sigma = np.sqrt(other.variance)
             apart = consistency.errors(one.attitude, one.bias, other.attitude, other.bias) / sigma

@@ -10,7 +10,7 @@ import numpy as np
 
 from strapdown import units
 from strapdown.checks import Array, InputError, array, known_keys, non_negative, one_of, positive
-from strapdown.estimation import forward, side_by_side
+from strapdown.estimation import forward, together
 from strapdown.estimation import model as modelling
 from strapdown.estimation.error_states import (
     BoundedVelocity,
@@ -432,10 +432,10 @@ def run(
 def run_together(
     records: Sequence[ImuRecord], process_noise: ProcessNoise, initials: Sequence[State], states: States, every: int
 ) -> list[Estimate]:
-    """Run the filter over several records, eight at once where it can (:mod:`strapdown.estimation.side_by_side`), with full covariance."""
+    """Run the filter over several records, eight at once where it can (:mod:`strapdown.estimation.together`), with full covariance."""
     problems = [prepared(one, process_noise, start, states) for one, start in zip(records, initials, strict=True)]
     options = forward.Options(every=every, full_covariance=True, whole_bias=True, together=True)
-    found = side_by_side.run(problems, every, lambda problem: forward.filtered(problem, options).estimate)
+    found = together.run(problems, every, lambda problem: forward.filtered(problem, options).estimate)
     return [_reported(one, states) for one in found]
 
 
