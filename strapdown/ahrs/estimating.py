@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,6 +20,7 @@ from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
 from strapdown.recordings import Recording, sensor_delays, sensor_faults, unit_calibration
 from strapdown.recordings.hard_iron import low_pass
+from strapdown.recordings.recording import sampled
 from strapdown.recordings.sensor_delays import Delays
 from strapdown.recordings.sensor_faults import Faults
 from strapdown.recordings.unit_calibration import UnitCalibration
@@ -132,7 +134,7 @@ def estimate(
     parameters = parameters.matched(prepared.acceleration)
     filtered = _run(prepared, parameters, faults.turn_variance, gate, robust, smooth)
     found = _at_stamps(filtered, used, prepared, parameters, delays, faults.turn_variance, smooth, full_covariance)
-    scale = found.error_states.get("gyro scale")
+    scale = filtered.error_states.get("gyro scale")
     return AhrsEstimate(
         recording=used,
         estimate=found,
@@ -202,11 +204,11 @@ def _at_stamps(
 ) -> Estimate:
     """Return the estimate at the recording's stamps: carried on by the gyro from the step before each, and over the delay of the gyro."""
     edge, turned = prepared.edge, prepared.turned
-    row = np.searchsorted(edge, np.arange(len(used.time)), side="right") - 1
+    row = np.repeat(np.arange(len(edge)), np.diff(edge, append=len(used.time)))
     bias = filtered.bias.take(row, axis=0)
     late = np.broadcast_to(delays.gyro, used.time.shape)
     ahead = -sensor_delays.turn_over(used, -late) if smooth else used.rate * late[:, None]
-    ahead = ahead - bias * (used.time - used.time[edge][row] + late)[:, None]
+    ahead -= bias * (used.time - filtered.time.take(row) + late)[:, None]
     step = quaternion.multiply(filtered.attitude, quaternion.conjugate(turned[edge]))
     assert filtered.covariance is not None
     R = quaternion.to_matrix(filtered.attitude)
@@ -240,21 +242,32 @@ def _at_stamps(
         covariance=P,
         innovations=_innovations(filtered, level),
         skipped={
-            name: int(np.sum(~(np.isfinite(samples).all(axis=1) & samples.any(axis=1))))
+            name: len(samples) - int(np.count_nonzero(sampled(samples)))
             for name, samples in sensors.items()
             if samples is not None
         },
         events=filtered.events,
-        error_states={
-            name: ErrorStateEstimate(
-                components=block.components,
-                units=block.units,
-                values=block.values.take(row, axis=0),
-                variance=block.variance.take(row, axis=0),
-            )
-            for name, block in filtered.error_states.items()
-        },
+        error_states=_OfRows(filtered.error_states, row),
     )
+
+
+class _OfRows(Mapping[str, ErrorStateEstimate]):
+    """Error states at some of the rows ``row`` (n,), each gathered when it is asked for."""
+
+    def __init__(self, states: Mapping[str, ErrorStateEstimate], row: np.ndarray) -> None:
+        self.states, self.row = states, row
+
+    def __getitem__(self, name: str) -> ErrorStateEstimate:
+        block = self.states[name]
+        return replace(
+            block, values=block.values.take(self.row, axis=0), variance=block.variance.take(self.row, axis=0)
+        )
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.states)
+
+    def __len__(self) -> int:
+        return len(self.states)
 
 
 def _level(filtered: Estimate, uncertain: np.ndarray) -> Array:

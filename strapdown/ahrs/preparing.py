@@ -126,7 +126,8 @@ def without_temperature(
 def _edges(time: Array, step: float) -> np.ndarray:
     """Return the samples at which steps end (k + 1,): the first, the last before each multiple of ``step``, s, and the last of all."""
     bins = np.floor((time - time[0]) / step + 1e-6)
-    return np.unique(np.concatenate([[0], np.flatnonzero(np.diff(bins)), [len(time) - 1]]))
+    inner = np.flatnonzero(bins[1:] != bins[:-1])
+    return np.concatenate([[0], inner[inner > 0], [len(time) - 1]])
 
 
 def _averages(samples: Array, frame: Array, edge: Array) -> tuple[Array, Array]:

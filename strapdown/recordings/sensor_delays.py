@@ -12,7 +12,7 @@ import numpy as np
 
 from strapdown import coning, quaternion
 from strapdown.checks import Array, InputError, non_negative
-from strapdown.recordings.recording import Recording, increments
+from strapdown.recordings.recording import Recording, increments, sampled
 
 FIELD_SPAN = 0.2
 """Span over which the change of the field, turned back by the gyro, shows the magnetometer's delay, s."""
@@ -130,10 +130,11 @@ def _evidence(recording: Recording) -> tuple[Array, Array, Array, Array]:
     lag = max(1, lag // stride)
     attitude = coning.integrate(increments(recording), coning.ALGORITHMS["one-sample"])[at]
     field = recording.magnetic_field[at]
-    known = np.asarray(np.isfinite(field).all(axis=1) & field.any(axis=1))
+    known = sampled(field)
     field = np.where(known[:, None], field, 0.0)
     still = quaternion.rotate(attitude, field)
-    late = quaternion.rotate(attitude, np.cross(recording.rate[at], field))
+    (x, y, z), (fx, fy, fz) = recording.rate[at].T, field.T
+    late = quaternion.rotate(attitude, np.stack([y * fz - z * fy, z * fx - x * fz, x * fy - y * fx], axis=1))
     pairs = known[lag:] & known[:-lag]
     change, wanted = (still[lag:] - still[:-lag])[pairs], (late[lag:] - late[:-lag])[pairs]
     products = (np.einsum("ki,ki->k", a, b) for a, b in ((change, wanted), (wanted, wanted), (change, change)))
@@ -163,10 +164,10 @@ def turn_over(recording: Recording, delay: Array | float) -> Array:
     """
     time = recording.time
     late = np.broadcast_to(np.asarray(delay, np.float64), time.shape)
-    sums = np.vstack([np.zeros(3), np.cumsum(increments(recording), axis=0)])
+    sums = np.zeros((len(time), 3))
+    np.cumsum(increments(recording), axis=0, out=sums[1:])
     then = time - late
     before = np.stack([np.interp(then, time, one) for one in sums.T], axis=1)
-    outside = then - np.clip(then, time[0], time[-1])
-    before += np.where(outside < 0.0, outside, 0.0)[:, None] * recording.rate[0]
-    before += np.where(outside > 0.0, outside, 0.0)[:, None] * recording.rate[-1]
-    return np.asarray(sums - before)
+    for outside, end in ((then < time[0], 0), (then > time[-1], -1)):
+        before[outside] += (then[outside] - time[end])[:, None] * recording.rate[end]
+    return np.subtract(sums, before, out=before)
