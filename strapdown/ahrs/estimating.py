@@ -15,6 +15,7 @@ from strapdown.ahrs.preparing import Prepared, prepare
 from strapdown.ahrs.starting import quiet_span
 from strapdown.checks import Array, InputError
 from strapdown.estimation.gating import Gate, Robust
+from strapdown.estimation.memory import side_by_side
 from strapdown.estimation.temperature import joined
 from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
@@ -129,8 +130,9 @@ def estimate(
         if parameters.gyro_scale_sigma > 0.0:
             parameters = replace(parameters, gyro_scale_sigma=calibration.sigma)
     quiet = slice(0, span.stop - span.start)
-    delays = sensor_delays.find(used, latency, field_delay, causal=not smooth)
-    prepared = prepare(used, quiet, parameters, delays.field, causal=not smooth)
+    turned = sensor_delays.gyro_attitude(used)
+    delays = sensor_delays.find(used, latency, field_delay, causal=not smooth, turned=turned)
+    prepared = prepare(used, quiet, parameters, delays.field, causal=not smooth, turned=turned)
     parameters = parameters.matched(prepared.acceleration)
     filtered = _run(prepared, parameters, faults.turn_variance, gate, robust, smooth)
     found = _at_stamps(filtered, used, prepared, parameters, delays, faults.turn_variance, smooth, full_covariance)
@@ -205,7 +207,10 @@ def _at_stamps(
     """Return the estimate at the recording's stamps: carried on by the gyro from the step before each, and over the delay of the gyro."""
     edge, turned = prepared.edge, prepared.turned
     row = np.repeat(np.arange(len(edge)), np.diff(edge, append=len(used.time)))
-    bias = filtered.bias.take(row, axis=0)
+    n = len(row)
+    attitude, bias, variance = side_by_side(*(((n, width), float) for width in (4, 3, 6)))
+    (own,) = side_by_side(((n, 3, 3), float))
+    filtered.bias.take(row, axis=0, out=bias, mode="clip")  # any other mode copies to a buffer first
     late = np.broadcast_to(delays.gyro, used.time.shape)
     ahead = -sensor_delays.turn_over(used, -late) if smooth else used.rate * late[:, None]
     ahead -= bias * (used.time - filtered.time.take(row) + late)[:, None]
@@ -218,11 +223,10 @@ def _at_stamps(
     scale[:, :2] = np.sqrt(OWN_SHARE + ACCELERATION_SHARE * np.sqrt(level))[:, None]
     fixed *= scale[:, :, None] * scale[:, None, :]
     iron = 0.0 if prepared.dip is None else (parameters.iron_sigma / np.cos(prepared.dip)) ** 2
-    attitude, own = np.empty((len(row), 4)), np.empty((len(row), 3, 3))
     compiled(recording_steps.carry_to_stamps)(
         row, step, fixed, turned, ahead, read_only(used.rate), delays.sigma**2, iron, attitude, own
     )
-    variance = filtered.variance.take(row, axis=0)
+    filtered.variance.take(row, axis=0, out=variance, mode="clip")
     variance[:, :3] = np.einsum("kii->ki", own)
     P = None
     if full_covariance:

@@ -7,14 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from strapdown import coning, estimation, quaternion
+from strapdown import estimation, quaternion
 from strapdown.ahrs import headings, starting
 from strapdown.ahrs.parameters import AhrsParameters
 from strapdown.checks import Array
 from strapdown.gyro.temperature import BiasOverTemperature
 from strapdown.kernels import recording_steps
 from strapdown.kernels.machine import compiled, read_only
-from strapdown.recordings import Recording, gyro_temperature, increments, sensor_delays
+from strapdown.recordings import Recording, gyro_temperature, sensor_delays
 from strapdown.records import ImuRecord
 from strapdown.vectors import VectorMeasurements
 
@@ -48,6 +48,7 @@ def prepare(
     field_delay: Array | float = 0.0,
     *,
     causal: bool = True,
+    turned: Array | None = None,
 ) -> Prepared:
     """Return the record that the filter runs on, and its start.
 
@@ -62,9 +63,12 @@ def prepare(
         Delay of the magnetometer's samples beside the gyro's, s: each is turned forward by the gyro.
     causal : bool
         Find hard iron from the samples up to each step alone; otherwise from all of them, for the start too.
+    turned : ndarray (n, 4), optional
+        Attitude by the gyro alone at the samples, if it is at hand.
     """
     initial = starting.start(recording, quiet, parameters)  # first, for it refuses a sensor without samples
-    turned = coning.integrate(increments(recording), coning.ALGORITHMS["one-sample"])
+    if turned is None:
+        turned = sensor_delays.gyro_attitude(recording)
     edge = _edges(recording.time, parameters.step)
     time = recording.time[edge]
     at_edge = turned[edge]

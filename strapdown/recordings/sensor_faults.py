@@ -125,7 +125,10 @@ def truncation_step(rate: Array) -> float | None:
 
 def _quantisation(rate: Array) -> float | None:
     """Return the step that nearly all the slow ones among the rates (n, 3) are multiples of, zero included; None where there is none."""
-    slow, number = np.unique(np.round(np.abs(rate[np.abs(rate) < SLOW_RATE]), 7), return_counts=True)
+    sizes = np.abs(rate)
+    counted = np.bincount(np.rint(1e7 * sizes[sizes < SLOW_RATE]).astype(np.intp))
+    values = np.flatnonzero(counted)
+    slow, number = values / 1e7, counted[values]
     frequent = slow[number >= 3]
     if len(frequent) < BINS or frequent[0] != 0.0:
         return None
