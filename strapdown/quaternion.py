@@ -160,12 +160,12 @@ def normalize(q: ArrayLike) -> Array:
     """
     value = array("q", q, (..., 4))
     value = value / _scale(value)
-    return np.asarray(value / np.linalg.norm(value, axis=-1, keepdims=True))
+    return np.asarray(value / lengths(value)[..., None])
 
 
 def _scale(value: Array) -> Array:
     """Return powers of two (..., 1) near the largest entry, over which squares neither overflow nor vanish and no bit is lost."""
-    largest = np.max(np.abs(value), axis=-1, keepdims=True)
+    largest = functools.reduce(np.maximum, np.moveaxis(np.abs(value), -1, 0))[..., None]
     zero = largest[..., 0] == 0.0
     if np.any(zero):
         place = [int(i) for i in np.argwhere(zero)[0]] if zero.ndim else []
