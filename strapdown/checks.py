@@ -181,7 +181,7 @@ def unit_quaternions(name: str, value: ArrayLike) -> Array:
 
 
 def lengths(vectors: Array) -> Array:
-    """Return the lengths (...,) of short vectors (..., k), a component at a time: NumPy's sum over a short last axis takes five times as long."""
+    """Return the lengths (...,) of vectors (..., k), a component at a time: a sum over a short last axis takes five times as long."""
     total = vectors[..., 0] ** 2
     for k in range(1, vectors.shape[-1]):
         total = total + vectors[..., k] ** 2

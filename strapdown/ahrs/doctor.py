@@ -403,9 +403,7 @@ def _means(recording: Recording, attitude: Array, vectors: Array, strength: floa
     seen = np.isfinite(lengths(v)) & np.isfinite(lengths(q))
     window = np.floor((time - time[0]) / SPAN).astype(int)
     number = int(window[-1]) + 1
-    turning = np.bincount(window, lengths(recording.rate[rows]), number) / np.bincount(
-        window, minlength=number
-    ).clip(1)
+    turning = np.bincount(window, lengths(recording.rate[rows]), number) / np.bincount(window, minlength=number).clip(1)
     counts = np.bincount(window[seen], minlength=number)
     full = np.flatnonzero(counts >= 0.5 * max(1.0, SPAN / float(np.median(np.diff(time)))))
     chosen = np.sort(full[np.argsort(-turning[full])][:WINDOWS])
