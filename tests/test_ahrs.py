@@ -334,9 +334,9 @@ def test_bad_parameters_are_refused(name, value):
 # ---------------------------------------------------------------------------------------------------- the bias at the start
 
 
-def quiet_second(rate, noise=1e-3, turn=(0.0, 0.0, 0.0), field=True) -> Recording:
-    """A second of constant rate ``turn`` of the body, °/s, that the gyro measures as ``rate``, °/s, and two of its noise."""
-    time = np.arange(round(3.0 * RATE)) / RATE
+def quiet_second(rate, noise=1e-3, turn=(0.0, 0.0, 0.0), field=True, length=3.0) -> Recording:
+    """Three seconds, or ``length``, of constant rate ``turn`` of the body, °/s, that the gyro measures as ``rate``, °/s."""
+    time = np.arange(round(length * RATE)) / RATE
     attitude = START * Rotation.from_rotvec(np.outer(time, np.array(turn) * DEGREE))
     random = np.random.default_rng(5)
     seen = {
@@ -419,10 +419,16 @@ def test_acceleration_that_lasts_is_a_vehicles_and_does_not_pass_for_tilt():
 
 @pytest.mark.parametrize("run", range(3))
 def test_a_hand_is_a_hand_however_it_was_recorded(run):
-    """Clipped, with dropouts, without a magnetometer or rest, and at rest alone."""
+    """Clipped, with dropouts, without a magnetometer or rest, with a bias that nothing shows, and at rest alone."""
     plain = hand_held.simulated(5, run, 60.0)
-    at_rest = hand_held._rows(plain, np.arange(len(plain.time)) < 2.0 * hand_held.RATE)
-    for words, one in {"plain": plain, "at rest": at_rest, **hand_held.modified(plain)}.items():
+    limit = 0.5 * np.abs(plain.rate).max()
+    faulty = {
+        "too short": hand_held._rows(plain, np.arange(len(plain.time)) < 2.0 * hand_held.RATE),
+        "clipped at half": dataclasses.replace(plain, rate=np.clip(plain.rate, -limit, limit)),
+        "bias without rest": recording(60.0, bias=(1.5 * DEGREE, 0.0, 0.0), noise=1.0).since(1000),
+        "at rest": quiet_second((0.0, 0.0, 0.0), length=60.0),
+    }
+    for words, one in {"plain": plain, **faulty, **hand_held.modified(plain)}.items():
         assert motions.chosen(one)[0] == "hand", words
     assert motions.chosen(plain)[1] > 30.0
     assert motions.chosen(plain, "any") == ("any", np.inf)
