@@ -200,6 +200,7 @@ def spinning(tmp_path):
     return path
 
 
+@pytest.mark.draws
 def test_states_that_the_errors_call_for(run, spinning, tmp_path):
     status, said, error = run(
         "estimate", spinning, "--out", tmp_path / "out", "--states", "--from-truth", "--every", 100, "--figures"

@@ -628,6 +628,7 @@ def judged(outcome):
     assert outcome.rms["augmented"] <= 1.005 * outcome.rms["bound"] <= 1.03 * outcome.rms["own"]
 
 
+@pytest.mark.draws
 def test_filters_on_presets_with_flicker(tmp_path):
     result = flicker_in_filter.main(
         presets=("mpu-9250", "adis16470", "stim300"), runs=24, duration=300.0, rate=20.0, out=tmp_path
@@ -645,6 +646,7 @@ def test_filters_on_presets_at_their_natural_rates(name):
     judged(flicker_in_filter.main(presets=(name,), runs=60, duration=600.0).outcomes[0])
 
 
+@pytest.mark.draws
 def test_the_sim_finds_the_spectra_of_its_specification(tmp_path):
     result = simulate_imu.main(samples=1 << 16, out=tmp_path)
     assert (tmp_path / "simulate_imu.png").stat().st_size > 10_000
