@@ -340,7 +340,7 @@ def test_shaping_states_are_stationary():
     shaping = flicker.shaping(10**4)
     P, p = shaping.covariance, shaping.poles
     np.testing.assert_allclose(P, p[:, None] * P * p + 1.0, rtol=1e-7)
-    frequency = (np.arange(1 << 20) + 0.5) / (1 << 21)
+    frequency = (np.arange(1 << 18) + 0.5) / (1 << 19)
     assert shaping.variance == pytest.approx(np.mean(shaping.spectrum(frequency)), rel=2e-3)
     starts = shaping.start(np.random.default_rng(1).standard_normal((20_000, 16)))
     scale = np.sqrt(np.diag(P))
