@@ -7,6 +7,7 @@ import re
 import h5py
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from sims import hand_held
 from strapdown import (
@@ -200,7 +201,8 @@ def spinning(tmp_path):
     return path
 
 
-def test_states_that_the_errors_call_for(run, spinning, tmp_path):
+@pytest.mark.draws
+def test_states_that_the_errors_call_for(run, spinning, tmp_path, monkeypatch, blank):
     status, said, error = run(
         "estimate", spinning, "--out", tmp_path / "out", "--states", "--from-truth", "--every", 100, "--figures"
     )
@@ -226,6 +228,7 @@ def test_states_that_the_errors_call_for(run, spinning, tmp_path):
     )
     status, _, _ = run("check", tmp_path / "out" / "estimate.h5")
     assert status == 0
+    monkeypatch.setattr(Figure, "savefig", blank)
     status, _, _ = run("report", tmp_path / "out" / "estimate.h5")
     assert status == 0
     (tmp_path / "filter.toml").write_text(setup.to_toml(saved))

@@ -46,6 +46,7 @@ def wrong(tmp_path):
     return path
 
 
+@pytest.mark.draws
 def test_tune_writes_the_filter_the_report_and_the_figures(run, tmp_path, record, wrong):
     out = tmp_path / "results" / "tuned.toml"
     status, said, complaint = run("tune", record, "--filter", wrong, "--holdout", 0.3, "--starts", 3, "-o", out)
