@@ -629,17 +629,12 @@ def test_intervals_average_over_the_terms_that_may_be_there():
         assert_allclose(fit.estimate[axis, 1], estimate, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("ramp", "noise"), [(False, {"N": 1.0}), (True, {"N": 1.0, "K": 0.05}), (True, {"N": 1.0, "B": 1.0, "K": 0.1})]
-)
+@pytest.mark.parametrize(("samples", "noise"), [(4096, {"N": 1.0}), (16384, {"N": 1.0, "B": 1.5, "K": 0.15})])
 @pytest.mark.slow
-def test_intervals_cover_where_other_terms_are_absent(ramp, noise):
+def test_intervals_cover_where_other_terms_are_absent(samples, noise):
     """Three axes alike, all terms fitted, 200 records: of the terms that are there 95 ± 2 %, and neither end fails throughout."""
-    samples, terms = 4096, allan.TERMS if ramp else allan.TERMS[:4]
     fits = [
-        allan.fit_noise(
-            np.stack([simulate([seed, k, 16], samples, 1.0, **noise) for k in range(3)], axis=1), 1.0, terms=terms
-        )
+        allan.fit_noise(np.stack([simulate([seed, k, 16], samples, 1.0, **noise) for k in range(3)], axis=1), 1.0)
         for seed in range(200)
     ]
     for i, symbol in enumerate("QNBK"):
@@ -647,7 +642,8 @@ def test_intervals_cover_where_other_terms_are_absent(ramp, noise):
         low = np.mean([fit.lower[:, i] > truth for fit in fits])
         high = np.mean([fit.upper[:, i] < truth for fit in fits])
         if truth == 0.0:  # the interval begins there
-            assert (low, high) <= (0.02, 0.0)
+            assert low <= 0.02
+            assert high == 0.0
             continue
         assert 0.93 <= 1.0 - low - high <= 0.97, symbol
         assert low >= 0.008
