@@ -120,7 +120,11 @@ def magnetometer_delay(recording: Recording) -> tuple[float, float]:
     ``−τ ṁ``, ``ṁ = −w × m``, and how that changes over :data:`FIELD_SPAN` is fitted by least squares without the outliers. A field that
     turns with the body (hard iron) is in quadrature to it in a swing: it does not pass for a delay, but a strong one hides some.
     """
-    return (0.0, np.inf) if recording.magnetic_field is None else _fitted(*_evidence(recording, gyro_attitude(recording))[1:])
+    return (
+        (0.0, np.inf)
+        if recording.magnetic_field is None
+        else _fitted(*_evidence(recording, gyro_attitude(recording))[1:])
+    )
 
 
 def gyro_attitude(recording: Recording) -> Array:
