@@ -242,7 +242,7 @@ def increments(recording: Recording) -> Array:
 def sampled(samples: Array) -> np.ndarray:
     """Return which rows (n, 3) of a sensor are samples (n,): neither NaN nor 0 throughout."""
     x, y, z = samples.T
-    return ~np.isnan(x + y + z) & ((x != 0.0) | (y != 0.0) | (z != 0.0))
+    return np.asarray(~np.isnan(x + y + z) & ((x != 0.0) | (y != 0.0) | (z != 0.0)))
 
 
 def gaps(time: ArrayLike) -> list[tuple[float, float]]:
